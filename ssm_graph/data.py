@@ -1,0 +1,232 @@
+"""Frozen values that everything else works on: SI units, radians, body axes forward-right-down.
+
+Arrays are copied in, checked for shape and made read-only. Times are seconds on the mission's own
+clock; velocities and sigmas labelled ``enu`` are along east, north, up at the vehicle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ssm_graph.earth import LocalFrame
+from ssm_graph.errors import DataError
+
+Array = NDArray[np.float64]
+
+N_BEAMS = 4
+
+
+def read_only(name: str, value: ArrayLike, shape: Sequence[int | None]) -> Array:
+    """Return a read-only float copy of ``value`` after checking its shape (None matches any)."""
+    array = np.array(value, dtype=np.float64)
+    expected = tuple(shape)
+    if array.ndim != len(expected) or any(
+        want is not None and got != want for got, want in zip(array.shape, expected, strict=False)
+    ):
+        wanted = tuple("N" if size is None else size for size in expected)
+        raise DataError(f"{name}: expected an array of shape {wanted}, got {array.shape}")
+    array.setflags(write=False)
+    return array
+
+
+class _Frozen:
+    """Apply :func:`read_only` to every array field, by the shape kept in the field's metadata.
+
+    The letter ``N`` in a shape stands for the length of ``time_s``.
+    """
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None:
+        length: int | None = None
+        for spec in fields(self):  # type: ignore[arg-type]
+            shape = spec.metadata.get("shape")
+            value = getattr(self, spec.name)
+            if shape is None or value is None:
+                continue
+            wanted = [length if size == "N" else size for size in shape]
+            array = read_only(f"{type(self).__name__}.{spec.name}", value, wanted)
+            if length is None and shape[0] == "N":
+                length = len(array)
+            object.__setattr__(self, spec.name, array)
+
+
+def _array(*shape: int | str) -> Array:
+    return field(metadata={"shape": shape})  # type: ignore[no-any-return]
+
+
+def _optional_array(*shape: int | str) -> Array | None:
+    return field(default=None, metadata={"shape": shape})  # type: ignore[no-any-return]
+
+
+@dataclass(frozen=True, slots=True)
+class ImuNoise:
+    """Noise of the inertial sensors, as continuous-time densities."""
+
+    gyro_density: float
+    """Angular random walk, rad/s/sqrt(Hz)."""
+    accel_density: float
+    """Velocity random walk, m/s^2/sqrt(Hz)."""
+    gyro_bias_sigma: float
+    """Turn-on gyro bias, 1 sigma, rad/s."""
+    accel_bias_sigma: float
+    """Turn-on accelerometer bias, 1 sigma, m/s^2."""
+    gyro_bias_density: float = 0.0
+    """Random walk of the gyro bias, rad/s/sqrt(s)."""
+    accel_bias_density: float = 0.0
+    """Random walk of the accelerometer bias, m/s^2/sqrt(s)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuLog(_Frozen):
+    """Gyro and accelerometer readings, each the mean over its interval.
+
+    Sample ``k`` covers ``(time_s[k-1], time_s[k]]``; the first begins at ``start_s``.
+    """
+
+    start_s: float
+    """Begin of the first averaging interval, s."""
+    noise: ImuNoise
+    time_s: Array = _array("N")
+    """(N,) end of each averaging interval, s, strictly increasing."""
+    gyro_b: Array = _array("N", 3)
+    """(N, 3) body rate relative to inertial space, rad/s."""
+    accel_b: Array = _array("N", 3)
+    """(N, 3) specific force, m/s^2; at rest (0, 0, -9.8)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DvlMount(_Frozen):
+    """Geometry of the DVL: beams in the instrument, instrument in the body."""
+
+    beams_d: Array = _array(N_BEAMS, 3)
+    """(4, 3) beam directions as rows, instrument axes, out of the transducer."""
+    R_bd: Array = _array(3, 3)
+    """(3, 3) instrument to body."""
+    lever_arm_b: Array = _array(3)
+    """(3,) body origin to instrument, m."""
+    misalignment_sigma: float = 0.0
+    """Prior sigma of each mounting angle, rad; above zero asks for its calibration."""
+    scale_sigma: float = 0.0
+    """Prior sigma of the scale error, 1; above zero asks for its calibration."""
+    time_offset_s: float = 0.0
+    """How late the DVL's stamps are, s: a ping was taken at ``stamp - time_offset_s``."""
+    time_offset_sigma_s: float = 0.0
+    """Prior sigma of the time offset, s; above zero asks for its calibration."""
+
+    @property
+    def beams_b(self) -> Array:
+        """(4, 3) beam directions as rows, body axes."""
+        return np.asarray(self.beams_d @ self.R_bd.T)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DvlLog(_Frozen):
+    """Bottom-track pings; a beam speed is positive when the instrument moves along the beam."""
+
+    mount: DvlMount
+    time_s: Array = _array("N")
+    """(N,) s as stamped, strictly increasing; the mount's time offset is not yet applied."""
+    speed: Array = _array("N", N_BEAMS)
+    """(N, 4) beam speeds, m/s; NaN marks a beam without bottom lock."""
+    sigma: Array = _array("N", N_BEAMS)
+    """(N, 4) standard deviation of each speed, m/s, above zero."""
+    range_m: Array | None = _optional_array("N", N_BEAMS)
+    """(N, 4) range along each beam, m; NaN where unknown."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthLog(_Frozen):
+    """Depth: minus the ellipsoidal height of the sensor."""
+
+    sigma: float
+    """Standard deviation, m."""
+    time_s: Array = _array("N")
+    """(N,) s, strictly increasing."""
+    depth: Array = _array("N")
+    """(N,) m, positive down."""
+    lever_arm_b: Array = _array(3)
+    """(3,) body origin to sensor, m."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GnssLog(_Frozen):
+    """Position fixes of a GNSS antenna."""
+
+    time_s: Array = _array("N")
+    """(N,) s, strictly increasing."""
+    lat: Array = _array("N")
+    """(N,) rad"""
+    lon: Array = _array("N")
+    """(N,) rad"""
+    height: Array = _array("N")
+    """(N,) m above the ellipsoid"""
+    sigma_enu: Array = _array("N", 3)
+    """(N, 3) m, east, north, up, above zero."""
+    lever_arm_b: Array = _array(3)
+    """(3,) body origin to antenna, m."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InitialState(_Frozen):
+    """State at the start with its standard deviations."""
+
+    time_s: float
+    lat: float
+    """rad"""
+    lon: float
+    """rad"""
+    height: float
+    """m"""
+    roll: float
+    """rad"""
+    pitch: float
+    """rad"""
+    heading: float
+    """rad, clockwise from north"""
+    velocity_enu: Array = _array(3)
+    """(3,) m/s"""
+    position_sigma_enu: Array = _array(3)
+    """(3,) m"""
+    velocity_sigma_enu: Array = _array(3)
+    """(3,) m/s"""
+    attitude_sigma: Array = _array(3)
+    """(3,) rad, roll, pitch, heading"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reference(_Frozen):
+    """An outside trajectory, only ever compared with; NaN where a quantity is unknown."""
+
+    time_s: Array = _array("N")
+    lat: Array = _array("N")
+    """(N,) rad"""
+    lon: Array = _array("N")
+    """(N,) rad"""
+    height: Array = _array("N")
+    """(N,) m"""
+    velocity_enu: Array = _array("N", 3)
+    """(N, 3) m/s, or NaN"""
+    roll_pitch_heading: Array = _array("N", 3)
+    """(N, 3) rad, or NaN"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mission:
+    """One recorded run: everything that an estimator may look at, and the reference."""
+
+    name: str
+    frame: LocalFrame
+    """The navigation frame: origin of the file, else the first GNSS fix, else the initial state."""
+    imu: ImuLog
+    dvl: DvlLog
+    depth: DepthLog | None = None
+    gnss: GnssLog | None = None
+    initial: InitialState | None = None
+    reference: Reference | None = None
+    notes: tuple[str, ...] = ()
+    """What the reader noticed and a user should know, one sentence each."""

@@ -1,0 +1,39 @@
+"""Errors of this package; every message says where, what was expected, what came, what to try."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+
+class SsmGraphError(Exception):
+    """Base of all errors that this package raises on purpose."""
+
+
+class ConfigError(SsmGraphError):
+    """A setting is missing, unknown or out of range."""
+
+
+class DataError(SsmGraphError):
+    """A sensor table holds something that cannot be used as it is."""
+
+
+class SolverError(SsmGraphError):
+    """An estimator could not produce a finite result."""
+
+
+class MissingExtraError(SsmGraphError):
+    """An optional dependency is needed and not installed."""
+
+    def __init__(self, package: str, *, extra: str, purpose: str) -> None:
+        super().__init__(
+            f"{purpose} needs {package!r}, which is not installed: "
+            f"try  pip install 'ssm-graph[{extra}]'"
+        )
+
+
+def nearest_hint(name: str, known: Iterable[str]) -> str:
+    """Return the tail of a message that names the nearest known spelling of ``name``."""
+    choices = sorted(known)
+    close = get_close_matches(name, choices, n=1)
+    return f"did you mean {close[0]!r}?" if close else f"known are: {', '.join(choices)}"

@@ -1,0 +1,100 @@
+"""What every estimator returns: a trajectory with covariances, beam weights, and why it stopped."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from ssm_graph.data import Array, InitialState, _array, _Frozen
+
+
+class Status(Enum):
+    """Why an estimator stopped; the text is shown to the user."""
+
+    CONVERGED = "updates below their share of the posterior sigma, weights settled"
+    MAX_ITERATIONS = "iteration limit reached before updates and weights settled"
+    SUSPECT = "settled, but on an answer that the data contradict"
+    DIVERGED = "the solution became non-finite or ran away"
+
+    @property
+    def is_good(self) -> bool:
+        """True only for a result that may be used without a second look."""
+        return self is Status.CONVERGED
+
+
+@dataclass(frozen=True, slots=True)
+class Iteration:
+    """One pass of the similarity loop."""
+
+    update_sigmas: float
+    """Largest update of any state component, in its own posterior sigmas."""
+    weight_change: float
+    """Largest change of any beam weight."""
+    kernel: str
+    """The kernel in force, as text."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BeamTable(_Frozen):
+    """One row for every beam speed that was used."""
+
+    time_s: Array = _array("N")
+    """(N,) s, when the ping was taken (time offset applied)."""
+    beam: Array = _array("N")
+    """(N,) beam number, 1 to 4."""
+    innovation: Array = _array("N")
+    """(N,) measured minus predicted, m/s."""
+    mahalanobis_sq: Array = _array("N")
+    """(N,) the t of the similarity measure, posterior variance included."""
+    weight: Array = _array("N")
+    """(N,) similarity weight, 1 = nominal."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory(_Frozen):
+    """States at the keyframes with their posterior uncertainty."""
+
+    time_s: Array = _array("N")
+    lat: Array = _array("N")
+    """(N,) rad"""
+    lon: Array = _array("N")
+    """(N,) rad"""
+    height: Array = _array("N")
+    """(N,) m above the ellipsoid"""
+    velocity_enu: Array = _array("N", 3)
+    """(N, 3) m/s"""
+    roll_pitch_heading: Array = _array("N", 3)
+    """(N, 3) rad"""
+    gyro_bias: Array = _array("N", 3)
+    """(N, 3) rad/s, body axes"""
+    accel_bias: Array = _array("N", 3)
+    """(N, 3) m/s^2, body axes"""
+    position_cov_enu: Array = _array("N", 3, 3)
+    """(N, 3, 3) m^2"""
+    velocity_sigma_enu: Array = _array("N", 3)
+    """(N, 3) m/s"""
+    attitude_sigma: Array = _array("N", 3)
+    """(N, 3) rad, of roll, pitch and heading"""
+    n_beams: Array = _array("N")
+    """(N,) beam speeds used at the keyframe"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """The answer of one estimator on one mission."""
+
+    method: str
+    """For example ``smoother``."""
+    kernel: str
+    """Kernel with its parameter, for example ``log(dof=5)``."""
+    status: Status
+    reason: str
+    """One sentence: why it stopped, with numbers."""
+    trajectory: Trajectory
+    beams: BeamTable
+    iterations: tuple[Iteration, ...]
+    wall_s: float
+    start: InitialState
+    """The initial state that was used, from the mission or from alignment."""
+    notes: tuple[str, ...] = ()
+    """What a user should know about the run, one sentence each."""

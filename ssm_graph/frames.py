@@ -1,0 +1,62 @@
+"""Attitude conversions between heading-pitch-roll and rotation matrices.
+
+Letters: ``n`` navigation frame, ``l`` local east-north-up axes at the vehicle, ``b`` body
+(forward-right-down), ``d`` DVL instrument.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+
+R_ENU_NED: Final[Array] = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+"""North-east-down to east-north-up; its own inverse."""
+R_ENU_NED.setflags(write=False)
+
+
+def rotation_zyx(yaw: Array | float, pitch: Array | float, roll: Array | float) -> Array:
+    """Return ``Rz(yaw) Ry(pitch) Rx(roll)``, (..., 3, 3), radians."""
+    angles = np.stack(np.broadcast_arrays(yaw, pitch, roll), axis=-1).astype(float)
+    matrix = Rotation.from_euler("ZYX", angles.reshape(-1, 3)).as_matrix()
+    return np.asarray(matrix).reshape(*angles.shape, 3)
+
+
+def R_lb_from_roll_pitch_heading(
+    roll: Array | float, pitch: Array | float, heading: Array | float
+) -> Array:
+    """Return rotations (..., 3, 3) from body to local east-north-up axes; heading from north."""
+    return np.asarray(R_ENU_NED @ rotation_zyx(heading, pitch, roll))
+
+
+def roll_pitch_heading_from_R_lb(R_lb: Array) -> tuple[Array, Array, Array]:
+    """Return roll, pitch (-pi/2..pi/2) and heading (0..2 pi), radians."""
+    R_ned_b = R_ENU_NED @ R_lb
+    roll = np.arctan2(R_ned_b[..., 2, 1], R_ned_b[..., 2, 2])
+    pitch = np.arcsin(np.clip(-R_ned_b[..., 2, 0], -1.0, 1.0))
+    heading = np.arctan2(R_ned_b[..., 1, 0], R_ned_b[..., 0, 0]) % (2.0 * np.pi)
+    return roll, pitch, heading
+
+
+def phi_D_roll_pitch_heading(roll: Array | float, pitch: Array | float) -> Array:
+    """Return the Jacobian (..., 3, 3) of body-axes rotation ``phi`` to (roll, pitch, heading).
+
+    ``R_lb(rph + d) = R_lb(rph) Exp(J d)`` to first order; singular at a pitch of 90 degrees.
+    """
+    roll, pitch = np.broadcast_arrays(np.asarray(roll, float), np.asarray(pitch, float))
+    zero, one = np.zeros_like(roll), np.ones_like(roll)
+    rows = [
+        [one, zero, -np.sin(pitch)],
+        [zero, np.cos(roll), np.sin(roll) * np.cos(pitch)],
+        [zero, -np.sin(roll), np.cos(roll) * np.cos(pitch)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def wrap_to_pi(angle: Array | float) -> Array:
+    """Return the angle in [-pi, pi)."""
+    return np.asarray((np.asarray(angle) + np.pi) % (2.0 * np.pi) - np.pi)
