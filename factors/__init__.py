@@ -1,0 +1,1 @@
+"""Measurement factors, one file each; NumPy and GTSAM only."""

@@ -1,0 +1,1 @@
+"""Factor-graph smoothing of inertial and DVL navigation with a weight for every beam."""

@@ -33,7 +33,7 @@ def read_only(name: str, value: ArrayLike, shape: Sequence[int | None]) -> Array
     return array
 
 
-class _Frozen:
+class FrozenArrays:
     """Apply :func:`read_only` to every array field, by the shape kept in the field's metadata.
 
     The letter ``N`` in a shape stands for the length of ``time_s``.
@@ -43,7 +43,7 @@ class _Frozen:
 
     def __post_init__(self) -> None:
         length: int | None = None
-        for spec in fields(self):  # type: ignore[arg-type]
+        for spec in fields(self):
             shape = spec.metadata.get("shape")
             value = getattr(self, spec.name)
             if shape is None or value is None:
@@ -55,11 +55,11 @@ class _Frozen:
             object.__setattr__(self, spec.name, array)
 
 
-def _array(*shape: int | str) -> Array:
+def shaped(*shape: int | str) -> Array:
     return field(metadata={"shape": shape})  # type: ignore[no-any-return]
 
 
-def _optional_array(*shape: int | str) -> Array | None:
+def optional_shaped(*shape: int | str) -> Array | None:
     return field(default=None, metadata={"shape": shape})  # type: ignore[no-any-return]
 
 
@@ -82,7 +82,7 @@ class ImuNoise:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ImuLog(_Frozen):
+class ImuLog(FrozenArrays):
     """Gyro and accelerometer readings, each the mean over its interval.
 
     Sample ``k`` covers ``(time_s[k-1], time_s[k]]``; the first begins at ``start_s``.
@@ -91,23 +91,23 @@ class ImuLog(_Frozen):
     start_s: float
     """Begin of the first averaging interval, s."""
     noise: ImuNoise
-    time_s: Array = _array("N")
+    time_s: Array = shaped("N")
     """(N,) end of each averaging interval, s, strictly increasing."""
-    gyro_b: Array = _array("N", 3)
+    gyro_b: Array = shaped("N", 3)
     """(N, 3) body rate relative to inertial space, rad/s."""
-    accel_b: Array = _array("N", 3)
+    accel_b: Array = shaped("N", 3)
     """(N, 3) specific force, m/s^2; at rest (0, 0, -9.8)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DvlMount(_Frozen):
+class DvlMount(FrozenArrays):
     """Geometry of the DVL: beams in the instrument, instrument in the body."""
 
-    beams_d: Array = _array(N_BEAMS, 3)
+    beams_d: Array = shaped(N_BEAMS, 3)
     """(4, 3) beam directions as rows, instrument axes, out of the transducer."""
-    R_bd: Array = _array(3, 3)
+    R_bd: Array = shaped(3, 3)
     """(3, 3) instrument to body."""
-    lever_arm_b: Array = _array(3)
+    lever_arm_b: Array = shaped(3)
     """(3,) body origin to instrument, m."""
     misalignment_sigma: float = 0.0
     """Prior sigma of each mounting angle, rad; above zero asks for its calibration."""
@@ -125,54 +125,54 @@ class DvlMount(_Frozen):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DvlLog(_Frozen):
+class DvlLog(FrozenArrays):
     """Bottom-track pings; a beam speed is positive when the instrument moves along the beam."""
 
     mount: DvlMount
-    time_s: Array = _array("N")
+    time_s: Array = shaped("N")
     """(N,) s as stamped, strictly increasing; the mount's time offset is not yet applied."""
-    speed: Array = _array("N", N_BEAMS)
+    speed: Array = shaped("N", N_BEAMS)
     """(N, 4) beam speeds, m/s; NaN marks a beam without bottom lock."""
-    sigma: Array = _array("N", N_BEAMS)
+    sigma: Array = shaped("N", N_BEAMS)
     """(N, 4) standard deviation of each speed, m/s, above zero."""
-    range_m: Array | None = _optional_array("N", N_BEAMS)
+    range_m: Array | None = optional_shaped("N", N_BEAMS)
     """(N, 4) range along each beam, m; NaN where unknown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DepthLog(_Frozen):
+class DepthLog(FrozenArrays):
     """Depth: minus the ellipsoidal height of the sensor."""
 
     sigma: float
     """Standard deviation, m."""
-    time_s: Array = _array("N")
+    time_s: Array = shaped("N")
     """(N,) s, strictly increasing."""
-    depth: Array = _array("N")
+    depth: Array = shaped("N")
     """(N,) m, positive down."""
-    lever_arm_b: Array = _array(3)
+    lever_arm_b: Array = shaped(3)
     """(3,) body origin to sensor, m."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class GnssLog(_Frozen):
+class GnssLog(FrozenArrays):
     """Position fixes of a GNSS antenna."""
 
-    time_s: Array = _array("N")
+    time_s: Array = shaped("N")
     """(N,) s, strictly increasing."""
-    lat: Array = _array("N")
+    lat: Array = shaped("N")
     """(N,) rad"""
-    lon: Array = _array("N")
+    lon: Array = shaped("N")
     """(N,) rad"""
-    height: Array = _array("N")
+    height: Array = shaped("N")
     """(N,) m above the ellipsoid"""
-    sigma_enu: Array = _array("N", 3)
+    sigma_enu: Array = shaped("N", 3)
     """(N, 3) m, east, north, up, above zero."""
-    lever_arm_b: Array = _array(3)
+    lever_arm_b: Array = shaped(3)
     """(3,) body origin to antenna, m."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class InitialState(_Frozen):
+class InitialState(FrozenArrays):
     """State at the start with its standard deviations."""
 
     time_s: float
@@ -188,30 +188,30 @@ class InitialState(_Frozen):
     """rad"""
     heading: float
     """rad, clockwise from north"""
-    velocity_enu: Array = _array(3)
+    velocity_enu: Array = shaped(3)
     """(3,) m/s"""
-    position_sigma_enu: Array = _array(3)
+    position_sigma_enu: Array = shaped(3)
     """(3,) m"""
-    velocity_sigma_enu: Array = _array(3)
+    velocity_sigma_enu: Array = shaped(3)
     """(3,) m/s"""
-    attitude_sigma: Array = _array(3)
+    attitude_sigma: Array = shaped(3)
     """(3,) rad, roll, pitch, heading"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Reference(_Frozen):
+class Reference(FrozenArrays):
     """An outside trajectory, only ever compared with; NaN where a quantity is unknown."""
 
-    time_s: Array = _array("N")
-    lat: Array = _array("N")
+    time_s: Array = shaped("N")
+    lat: Array = shaped("N")
     """(N,) rad"""
-    lon: Array = _array("N")
+    lon: Array = shaped("N")
     """(N,) rad"""
-    height: Array = _array("N")
+    height: Array = shaped("N")
     """(N,) m"""
-    velocity_enu: Array = _array("N", 3)
+    velocity_enu: Array = shaped("N", 3)
     """(N, 3) m/s, or NaN"""
-    roll_pitch_heading: Array = _array("N", 3)
+    roll_pitch_heading: Array = shaped("N", 3)
     """(N, 3) rad, or NaN"""
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-from ssm_graph.data import Array, InitialState, _array, _Frozen
+from ssm_graph.data import Array, FrozenArrays, InitialState, shaped
 
 
 class Status(Enum):
@@ -35,47 +35,47 @@ class Iteration:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class BeamTable(_Frozen):
+class BeamTable(FrozenArrays):
     """One row for every beam speed that was used."""
 
-    time_s: Array = _array("N")
+    time_s: Array = shaped("N")
     """(N,) s, when the ping was taken (time offset applied)."""
-    beam: Array = _array("N")
+    beam: Array = shaped("N")
     """(N,) beam number, 1 to 4."""
-    innovation: Array = _array("N")
+    innovation: Array = shaped("N")
     """(N,) measured minus predicted, m/s."""
-    mahalanobis_sq: Array = _array("N")
+    mahalanobis_sq: Array = shaped("N")
     """(N,) the t of the similarity measure, posterior variance included."""
-    weight: Array = _array("N")
+    weight: Array = shaped("N")
     """(N,) similarity weight, 1 = nominal."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Trajectory(_Frozen):
+class Trajectory(FrozenArrays):
     """States at the keyframes with their posterior uncertainty."""
 
-    time_s: Array = _array("N")
-    lat: Array = _array("N")
+    time_s: Array = shaped("N")
+    lat: Array = shaped("N")
     """(N,) rad"""
-    lon: Array = _array("N")
+    lon: Array = shaped("N")
     """(N,) rad"""
-    height: Array = _array("N")
+    height: Array = shaped("N")
     """(N,) m above the ellipsoid"""
-    velocity_enu: Array = _array("N", 3)
+    velocity_enu: Array = shaped("N", 3)
     """(N, 3) m/s"""
-    roll_pitch_heading: Array = _array("N", 3)
+    roll_pitch_heading: Array = shaped("N", 3)
     """(N, 3) rad"""
-    gyro_bias: Array = _array("N", 3)
+    gyro_bias: Array = shaped("N", 3)
     """(N, 3) rad/s, body axes"""
-    accel_bias: Array = _array("N", 3)
+    accel_bias: Array = shaped("N", 3)
     """(N, 3) m/s^2, body axes"""
-    position_cov_enu: Array = _array("N", 3, 3)
+    position_cov_enu: Array = shaped("N", 3, 3)
     """(N, 3, 3) m^2"""
-    velocity_sigma_enu: Array = _array("N", 3)
+    velocity_sigma_enu: Array = shaped("N", 3)
     """(N, 3) m/s"""
-    attitude_sigma: Array = _array("N", 3)
+    attitude_sigma: Array = shaped("N", 3)
     """(N, 3) rad, of roll, pitch and heading"""
-    n_beams: Array = _array("N")
+    n_beams: Array = shaped("N")
     """(N,) beam speeds used at the keyframe"""
 
 

@@ -1,0 +1,1 @@
+"""Errors, consistency and drift of an estimate against a reference."""

@@ -1,0 +1,1 @@
+"""The factor graph of a mission: alignment, first values, linearisation, marginals."""

@@ -1,0 +1,1 @@
+"""From raw samples to preintegrated inertial measurements."""

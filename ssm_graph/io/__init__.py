@@ -1,0 +1,1 @@
+"""Border to the outside: mission folders in, result folders out, one file per format."""

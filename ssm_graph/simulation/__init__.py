@@ -1,0 +1,1 @@
+"""Simulated missions with truth; shares no formula with the estimators."""
