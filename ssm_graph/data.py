@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -43,7 +44,7 @@ class FrozenArrays:
 
     def __post_init__(self) -> None:
         length: int | None = None
-        for spec in fields(self):
+        for spec in fields(cast(Any, self)):
             shape = spec.metadata.get("shape")
             value = getattr(self, spec.name)
             if shape is None or value is None:
@@ -56,11 +57,15 @@ class FrozenArrays:
 
 
 def shaped(*shape: int | str) -> Array:
-    return field(metadata={"shape": shape})  # type: ignore[no-any-return]
+    """Declare an array field of :class:`FrozenArrays` with its shape."""
+    declared: Array = field(metadata={"shape": shape})
+    return declared
 
 
 def optional_shaped(*shape: int | str) -> Array | None:
-    return field(default=None, metadata={"shape": shape})  # type: ignore[no-any-return]
+    """Declare an array field that may be None."""
+    declared: Array | None = field(default=None, metadata={"shape": shape})
+    return declared
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,1 +1,54 @@
-"""Simulated missions with truth; shares no formula with the estimators."""
+"""Simulated missions with truth; shares no formula with the estimators but the Earth itself.
+
+``simulate(scenario_config("survey", grade=Grade.TACTICAL, seed=3)).mission``
+"""
+
+from ssm_graph.simulation.aids import DepthSettings, GnssSettings
+from ssm_graph.simulation.config import SimulationConfig
+from ssm_graph.simulation.dvl_model import DvlSettings, default_mount, janus_beams
+from ssm_graph.simulation.faults import Fault, Loss, OutlierKind, Outliers
+from ssm_graph.simulation.grades import IMU_NOISE, START_SIGMAS, Grade, StartSigmas
+from ssm_graph.simulation.mission import SimulatedMission, simulate
+from ssm_graph.simulation.routes import (
+    DepthProfile,
+    DiveRoute,
+    HoverRoute,
+    Route,
+    SpiralRoute,
+    SurveyRoute,
+    TransitRoute,
+)
+from ssm_graph.simulation.scenarios import SCENARIOS, Scenario, scenario_config
+from ssm_graph.simulation.trajectory import CALM, Trajectory, Waves
+
+__all__ = [
+    "CALM",
+    "IMU_NOISE",
+    "SCENARIOS",
+    "START_SIGMAS",
+    "DepthProfile",
+    "DepthSettings",
+    "DiveRoute",
+    "DvlSettings",
+    "Fault",
+    "GnssSettings",
+    "Grade",
+    "HoverRoute",
+    "Loss",
+    "OutlierKind",
+    "Outliers",
+    "Route",
+    "Scenario",
+    "SimulatedMission",
+    "SimulationConfig",
+    "SpiralRoute",
+    "StartSigmas",
+    "SurveyRoute",
+    "Trajectory",
+    "TransitRoute",
+    "Waves",
+    "default_mount",
+    "janus_beams",
+    "scenario_config",
+    "simulate",
+]

@@ -1,0 +1,168 @@
+"""Speed along one DVL beam: residual, Jacobians, and the factor for anyone's own graph."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class BeamResidual(NamedTuple):
+    """Residuals of DVL beams and their Jacobian blocks; leading axes broadcast (pings, beams)."""
+
+    error: Array
+    """(...) m/s, predicted minus measured."""
+    error_D_rotation: Array
+    """(..., 3) with respect to ``phi`` in ``R_nb @ Exp(phi)``, m/s/rad."""
+    error_D_velocity_n: Array
+    """(..., 3)"""
+    error_D_gyro_bias: Array
+    """(..., 3) m"""
+
+
+def beam_error(
+    R_nb: Array,
+    v_n: Array,
+    gyro_bias: Array,
+    *,
+    speed: Array,
+    gyro_b: Array,
+    beam_b: Array,
+    lever_arm_b: Array,
+    omega_ie_n: Array,
+) -> Array:
+    """Return predicted minus measured speed along DVL beams, m/s; see :func:`beam_residual`."""
+    v_b, omega_ie_b = _to_body(R_nb, v_n), _to_body(R_nb, omega_ie_n)
+    omega_eb_b = gyro_b - gyro_bias - omega_ie_b
+    v_instrument_b = v_b + np.cross(omega_eb_b, lever_arm_b)
+    return np.asarray(np.sum(beam_b * v_instrument_b, axis=-1) - speed)
+
+
+def beam_residual(
+    R_nb: Array,
+    v_n: Array,
+    gyro_bias: Array,
+    *,
+    speed: Array,
+    gyro_b: Array,
+    beam_b: Array,
+    lever_arm_b: Array,
+    omega_ie_n: Array,
+) -> BeamResidual:
+    """Return residuals of DVL beams with their Jacobians.
+
+    With the rate of the body relative to the Earth, ``omega_eb_b = gyro_b - gyro_bias -
+    R_nb' omega_ie_n``, and the unit beam direction ``beam_b``::
+
+        error = beam_b . (R_nb' v_n + omega_eb_b x lever_arm_b) - speed
+
+    A speed is positive when the instrument moves along the beam, away from its transducer.
+
+    Parameters
+    ----------
+    R_nb : (..., 3, 3) rotation, body to navigation.
+    v_n : (..., 3) velocity of the body origin over ground, m/s.
+    gyro_bias, gyro_b : (..., 3) gyro bias and gyro reading at the ping, rad/s.
+    speed : (...) measured beam speed, m/s.
+    beam_b : (..., 3) unit vector, body axes.
+    lever_arm_b : (3,) body origin to DVL, body axes, m.
+    omega_ie_n : (3,) Earth rate, rad/s.
+
+    References
+    ----------
+    .. [1] Xu et al., "Combined navigation robust filtering method based on statistical similarity
+       measurement", 2021, eqs. (19) to (22), there for all four beams at once.
+    """
+    error = beam_error(
+        R_nb,
+        v_n,
+        gyro_bias,
+        speed=speed,
+        gyro_b=gyro_b,
+        beam_b=beam_b,
+        lever_arm_b=lever_arm_b,
+        omega_ie_n=omega_ie_n,
+    )
+    v_b, omega_ie_b = _to_body(R_nb, v_n), _to_body(R_nb, omega_ie_n)
+    # beam . (a x lever) = (lever x beam) . a, for any rate a
+    arm = np.cross(lever_arm_b, beam_b)
+    shape = (*np.shape(error), 3)
+    return BeamResidual(
+        error=error,
+        error_D_rotation=np.asarray(np.cross(beam_b, v_b) - np.cross(arm, omega_ie_b)),
+        error_D_velocity_n=np.broadcast_to((R_nb @ beam_b[..., None])[..., 0], shape),
+        error_D_gyro_bias=np.broadcast_to(-arm, shape),
+    )
+
+
+def _to_body(R_nb: Array, vector_n: Array) -> Array:
+    """Return ``R_nb' vector_n`` with broadcasting."""
+    return np.asarray(np.einsum("...ij,...i->...j", R_nb, vector_n))
+
+
+def dvl_beam_factor(
+    pose: int,
+    velocity: int,
+    bias: int,
+    *,
+    sigma: float,
+    speed: float,
+    gyro_b: Array,
+    beam_b: Array,
+    lever_arm_b: Array,
+    omega_ie_n: Array,
+    weight: float = 1.0,
+) -> gtsam.CustomFactor:
+    """Wrap :func:`beam_residual` as a factor on ``(Pose3, velocity, ConstantBias)``.
+
+    Parameters
+    ----------
+    pose, velocity, bias : keys.
+    sigma : nominal standard deviation of the speed, m/s.
+    speed, gyro_b, beam_b, lever_arm_b, omega_ie_n : as in :func:`beam_residual`, for one beam.
+    weight : similarity weight; the effective variance is ``sigma^2 / weight``.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite, or ``sigma`` or ``weight`` is not above zero.
+    """
+    vectors = {
+        "gyro_b": gyro_b,
+        "beam_b": beam_b,
+        "lever_arm_b": lever_arm_b,
+        "omega_ie_n": omega_ie_n,
+    }
+    frozen = {name: np.array(value, dtype=float) for name, value in vectors.items()}
+    for name, value in frozen.items():
+        if value.shape != (3,) or not np.all(np.isfinite(value)):
+            raise ValueError(f"dvl_beam_factor: {name}: expected 3 finite numbers, got {value}")
+    if not (np.isfinite(speed) and 0.0 < sigma < np.inf and 0.0 < weight < np.inf):
+        raise ValueError(
+            "dvl_beam_factor: expected a finite speed and sigma and weight above zero, got "
+            f"speed {speed}, sigma {sigma}, weight {weight}"
+        )
+    measured: dict[str, Any] = {"speed": np.float64(speed), **frozen}
+
+    def evaluate(
+        this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
+    ) -> Array:
+        keys = this.keys()
+        R_nb = values.atPose3(keys[0]).rotation().matrix()
+        v_n = values.atVector(keys[1])
+        gyro_bias = values.atConstantBias(keys[2]).gyroscope()
+        if jacobians is None:
+            return np.atleast_1d(beam_error(R_nb, v_n, gyro_bias, **measured))
+        residual = beam_residual(R_nb, v_n, gyro_bias, **measured)
+        # Pose3 tangent: [rotation, translation]; ConstantBias tangent: [accelerometer, gyroscope].
+        jacobians[0] = np.hstack([residual.error_D_rotation, np.zeros(3)])[None, :]
+        jacobians[1] = residual.error_D_velocity_n[None, :].copy()
+        jacobians[2] = np.hstack([np.zeros(3), residual.error_D_gyro_bias])[None, :]
+        return np.atleast_1d(residual.error)
+
+    noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma / np.sqrt(weight))
+    return gtsam.CustomFactor(noise, [pose, velocity, bias], evaluate)

@@ -1,0 +1,144 @@
+"""Similarity kernels: how much a measurement counts, given how well it agrees.
+
+The statistical similarity of two random vectors is ``E[f(|a - b|^2)]`` with ``f`` continuous,
+decreasing and convex. Its lower bound under a Gaussian posterior depends on the squared
+Mahalanobis length with the posterior variance in it::
+
+    t = (innovation^2 + H P H') / sigma^2,    weight = -2 f'(t)
+
+Every kernel has ``weight(dim) = 1``: a residual of expected size keeps its nominal noise.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+WEIGHT_FLOOR = 1e-8
+"""Smallest weight; keeps the information of a rejected measurement regular."""
+
+
+def expected_mahalanobis_sq(
+    innovation: Array, predicted_variance: Array, *, sigma: ArrayLike
+) -> Array:
+    """Return ``t = (innovation^2 + predicted_variance) / sigma^2``, all (...).
+
+    ``predicted_variance`` is ``H P H'`` at the posterior; zero gives the plain M-estimator.
+    """
+    return np.asarray((innovation**2 + predicted_variance) / np.square(sigma))
+
+
+class Kernel(ABC):
+    """A similarity function ``f`` and the weight ``-2 f'``."""
+
+    @abstractmethod
+    def similarity(self, t: Array, *, dim: int = 1) -> Array:
+        """Return ``f(t)`` for measurements of dimension ``dim``."""
+
+    @abstractmethod
+    def _weight(self, t: Array, dim: int) -> Array:
+        """Return ``-2 f'(t)``, not floored."""
+
+    def weight(self, t: ArrayLike, *, dim: int = 1) -> Array:
+        """Return the weight of measurements of dimension ``dim``, at least the floor.
+
+        Parameters
+        ----------
+        t : (...) squared Mahalanobis lengths, 0 or more.
+        dim : dimension of one measurement.
+        """
+        return np.maximum(self._weight(np.asarray(t, dtype=np.float64), dim), WEIGHT_FLOOR)
+
+
+def _require_positive(name: str, value: float) -> None:
+    if not (math.isfinite(value) and value > 0.0):
+        raise ValueError(f"{name}: expected a number above zero, got {value}")
+
+
+@final
+@dataclass(frozen=True)
+class GaussianKernel(Kernel):
+    """``f = -t/2``: least squares, every weight 1."""
+
+    def similarity(self, t: Array, *, dim: int = 1) -> Array:  # noqa: ARG002
+        """Return ``-t / 2``."""
+        return -0.5 * t
+
+    def _weight(self, t: Array, dim: int) -> Array:  # noqa: ARG002
+        return np.ones_like(t)
+
+    def __str__(self) -> str:
+        return "gaussian"
+
+
+@final
+@dataclass(frozen=True)
+class LogKernel(Kernel):
+    """``f = -(dof + dim)/2 ln(1 + t/dof)``: Student's t."""
+
+    dof: float = 5.0
+    """Degrees of freedom; large is Gaussian."""
+
+    def __post_init__(self) -> None:
+        _require_positive("dof", self.dof)
+
+    def similarity(self, t: Array, *, dim: int = 1) -> Array:
+        """Return ``f(t)``."""
+        return np.asarray(-0.5 * (self.dof + dim) * np.log1p(t / self.dof))
+
+    def _weight(self, t: Array, dim: int) -> Array:
+        return np.asarray((self.dof + dim) / (self.dof + t))
+
+    def __str__(self) -> str:
+        return f"log(dof={self.dof:g})"
+
+
+@final
+@dataclass(frozen=True)
+class SqrtKernel(Kernel):
+    """``f = -sqrt((dof + dim)(dof + t))``."""
+
+    dof: float = 5.0
+    """Degrees of freedom; large is Gaussian."""
+
+    def __post_init__(self) -> None:
+        _require_positive("dof", self.dof)
+
+    def similarity(self, t: Array, *, dim: int = 1) -> Array:
+        """Return ``f(t)``."""
+        return -np.sqrt((self.dof + dim) * (self.dof + t))
+
+    def _weight(self, t: Array, dim: int) -> Array:
+        return np.sqrt((self.dof + dim) / (self.dof + t))
+
+    def __str__(self) -> str:
+        return f"sqrt(dof={self.dof:g})"
+
+
+@final
+@dataclass(frozen=True)
+class ExpKernel(Kernel):
+    """``f = width^2 exp((dim - t) / (2 width^2))``: correntropy."""
+
+    width: float = 5.0
+    """Kernel width in sigmas; large is Gaussian."""
+
+    def __post_init__(self) -> None:
+        _require_positive("width", self.width)
+
+    def similarity(self, t: Array, *, dim: int = 1) -> Array:
+        """Return ``f(t)``."""
+        return np.asarray(self.width**2 * np.exp((dim - t) / (2.0 * self.width**2)))
+
+    def _weight(self, t: Array, dim: int) -> Array:
+        return np.asarray(np.exp((dim - t) / (2.0 * self.width**2)))
+
+    def __str__(self) -> str:
+        return f"exp(width={self.width:g})"

@@ -1,0 +1,125 @@
+"""Errors of a trajectory against a reference, epoch by epoch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ssm_graph.data import Array, FrozenArrays, Reference, shaped
+from ssm_graph.earth import LocalFrame
+from ssm_graph.errors import DataError
+from ssm_graph.estimate import Trajectory
+from ssm_graph.evaluation.alignment import interpolate_within
+from ssm_graph.frames import wrap_to_pi
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ErrorSeries(FrozenArrays):
+    """Estimate minus reference at every keyframe where the reference has a position.
+
+    Axes are local east, north, up at the reference; NaN where the reference is silent.
+    """
+
+    time_s: Array = shaped("N")
+    """(N,) keyframe times, s."""
+    position_enu: Array = shaped("N", 3)
+    """(N, 3) m"""
+    velocity_enu: Array = shaped("N", 3)
+    """(N, 3) m/s"""
+    roll_pitch_heading: Array = shaped("N", 3)
+    """(N, 3) rad, in [-pi, pi)"""
+    position_sigma_enu: Array = shaped("N", 3)
+    """(N, 3) m, posterior"""
+    velocity_sigma_enu: Array = shaped("N", 3)
+    """(N, 3) m/s, posterior"""
+    attitude_sigma: Array = shaped("N", 3)
+    """(N, 3) rad, posterior, of roll, pitch and heading"""
+    nees_position: Array = shaped("N")
+    """(N,) e^T P^-1 e of position with its full covariance; 3 is expected; NaN without one."""
+
+    @property
+    def horizontal(self) -> Array:
+        """(N,) length of the horizontal position error, m."""
+        return np.asarray(np.hypot(self.position_enu[:, 0], self.position_enu[:, 1]))
+
+
+def error_series(trajectory: Trajectory, reference: Reference) -> ErrorSeries:
+    """Return the errors of ``trajectory`` at its keyframes within the reference.
+
+    The reference is interpolated (positions in a local Cartesian frame, angles unwrapped), never
+    extrapolated, and not across its gaps: see `ssm_graph.evaluation.alignment`.
+
+    Raises
+    ------
+    DataError
+        The two have no time in common.
+    """
+    time_s = trajectory.time_s
+    known = np.isfinite(np.stack([reference.lat, reference.lon, reference.height])).all(axis=0)
+    if not np.any(known):
+        raise DataError("reference: it holds no position at all")
+    first = int(np.argmax(known))
+    frame = LocalFrame(*(float(x[first]) for x in (reference.lat, reference.lon, reference.height)))
+    p_reference_n = interpolate_within(
+        time_s,
+        known_s=reference.time_s[known],
+        values=frame.p_n_from_geodetic(reference.lat, reference.lon, reference.height)[known],
+    )
+    p_n = frame.p_n_from_geodetic(trajectory.lat, trajectory.lon, trajectory.height)
+    kept = np.isfinite(p_reference_n).all(axis=1) & np.isfinite(p_n).all(axis=1)
+    if not np.any(kept):
+        raise DataError(_no_overlap(time_s, reference.time_s[known]))
+    difference_n = p_n[kept] - p_reference_n[kept]
+    position_enu = np.einsum("nij,ni->nj", frame.R_nl_at(p_reference_n[kept]), difference_n)
+    velocity, angles = _at(time_s, reference)
+    cov = trajectory.position_cov_enu[kept]
+    return ErrorSeries(
+        time_s=time_s[kept],
+        position_enu=position_enu,
+        velocity_enu=(trajectory.velocity_enu - velocity)[kept],
+        roll_pitch_heading=wrap_to_pi(trajectory.roll_pitch_heading - angles)[kept],
+        position_sigma_enu=np.sqrt(np.diagonal(cov, axis1=1, axis2=2)),
+        velocity_sigma_enu=trajectory.velocity_sigma_enu[kept],
+        attitude_sigma=trajectory.attitude_sigma[kept],
+        nees_position=normalized_error_squared(position_enu, cov),
+    )
+
+
+def normalized_error_squared(error: Array, cov: Array) -> Array:
+    """Return ``e^T P^-1 e`` (N,) of errors (N, K) with covariances (N, K, K).
+
+    NaN where the covariance is not positive definite or anything is not finite.
+    """
+    result = np.full(len(error), np.nan)
+    finite = np.isfinite(cov).all(axis=(1, 2)) & np.isfinite(error).all(axis=1)
+    index = np.flatnonzero(finite)
+    index = index[np.linalg.eigvalsh(cov[index])[:, 0] > 0.0]
+    weighted = np.linalg.solve(cov[index], error[index][..., None])[..., 0]
+    result[index] = np.sum(error[index] * weighted, axis=1)
+    return result
+
+
+def _at(time_s: Array, reference: Reference) -> tuple[Array, Array]:
+    """Return velocities (M, 3) and unwrapped angles (M, 3) of the reference at ``time_s``."""
+    angles = np.array(reference.roll_pitch_heading)
+    for column in angles.T:
+        good = np.isfinite(column)
+        column[good] = np.unwrap(column[good])
+    known_s = reference.time_s
+    velocity = interpolate_within(time_s, known_s=known_s, values=reference.velocity_enu)
+    return velocity, interpolate_within(time_s, known_s=known_s, values=angles)
+
+
+def _no_overlap(time_s: Array, reference_s: Array) -> str:
+    return (
+        "reference: it has no time in common with the trajectory: "
+        f"trajectory {_span(time_s)}, reference {_span(reference_s)}; "
+        "are both on the same clock, and does a gap of the reference hide the overlap?"
+    )
+
+
+def _span(time_s: Array) -> str:
+    if len(time_s) == 0:
+        return "empty"
+    return f"{time_s[0]:.3f} to {time_s[-1]:.3f} s ({len(time_s)} epochs)"

@@ -1,0 +1,113 @@
+"""The numbers by which a trajectory is judged against a reference."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ssm_graph.data import Array, Reference
+from ssm_graph.earth import LocalFrame
+from ssm_graph.estimate import Trajectory
+from ssm_graph.evaluation.errors import ErrorSeries, error_series
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Metrics:
+    """Summary of an :class:`ErrorSeries`; NaN where the reference lacks the quantity."""
+
+    n_epochs: int
+    """Keyframes that were compared."""
+    first_s: float
+    """Time of the first of them, s."""
+    last_s: float
+    """Time of the last of them, s."""
+    rmse_horizontal_m: float
+    """Root mean square of the length of the horizontal error."""
+    rmse_vertical_m: float
+    max_horizontal_m: float
+    end_error_m: float
+    """Horizontal error at the last compared epoch."""
+    path_length_m: float
+    """Horizontal path of the estimate from the first to the last compared epoch."""
+    drift_percent: float
+    """100 ``end_error_m`` / ``path_length_m``; NaN for a vehicle that did not move."""
+    rmse_velocity_m_per_s: float
+    """Root mean square of the length of the velocity error."""
+    rmse_attitude: tuple[float, float, float]
+    """Roll, pitch, heading, rad."""
+    nees_position: float
+    """Mean over epochs of the three-dimensional NEES, divided by 3: 1 is expected."""
+    inside_3_sigma: tuple[float, float, float]
+    """Share of epochs with the east, north, up error within three posterior sigmas; 0.997."""
+    errors: ErrorSeries = field(repr=False)
+    """The errors themselves, for figures and tests."""
+
+
+def evaluate(trajectory: Trajectory, reference: Reference) -> Metrics:
+    """Compare an estimated trajectory with a reference.
+
+    Every keyframe within the reference counts once. The path is horizontal, as the error that
+    ``drift_percent`` relates to it, and the estimate's own, as a reference may be noisy or have
+    gaps; without a gap of the reference it is the distance travelled.
+
+    Raises
+    ------
+    DataError
+        The two have no time in common.
+    """
+    errors = error_series(trajectory, reference)
+    first_s, last_s = float(errors.time_s[0]), float(errors.time_s[-1])
+    length = path_length_m(trajectory, first_s=first_s, last_s=last_s)
+    end_error = float(errors.horizontal[-1])
+    inside = np.abs(errors.position_enu) <= 3.0 * errors.position_sigma_enu
+    inside_share = np.where(np.isfinite(errors.position_sigma_enu), inside, np.nan)
+    return Metrics(
+        n_epochs=len(errors.time_s),
+        first_s=first_s,
+        last_s=last_s,
+        rmse_horizontal_m=_rms(errors.horizontal),
+        rmse_vertical_m=_rms(errors.position_enu[:, 2]),
+        max_horizontal_m=float(errors.horizontal.max()),
+        end_error_m=end_error,
+        path_length_m=length,
+        drift_percent=100.0 * end_error / length if length > 0.0 else np.nan,
+        rmse_velocity_m_per_s=_rms(np.linalg.norm(errors.velocity_enu, axis=1)),
+        rmse_attitude=_per_axis(np.sqrt([_mean(x**2) for x in errors.roll_pitch_heading.T])),
+        nees_position=_mean(errors.nees_position) / 3.0,
+        inside_3_sigma=_per_axis(np.array([_mean(x) for x in inside_share.T])),
+        errors=errors,
+    )
+
+
+def path_length_m(
+    trajectory: Trajectory, *, first_s: float = -np.inf, last_s: float = np.inf
+) -> float:
+    """Return the horizontal length of a trajectory from keyframe to keyframe, m.
+
+    Only keyframes from ``first_s`` to ``last_s`` count. Ships' motion in heave does not: the path is
+    measured along the surface of the local frame, Earth's curvature included.
+    """
+    kept = (trajectory.time_s >= first_s) & (trajectory.time_s <= last_s)
+    lat, lon, height = (x[kept] for x in (trajectory.lat, trajectory.lon, trajectory.height))
+    if len(lat) < 2:
+        return 0.0
+    frame = LocalFrame(float(lat[0]), float(lon[0]), float(height[0]))
+    p_n = frame.p_n_from_geodetic(lat, lon, height)
+    step_l = np.einsum("nij,ni->nj", frame.R_nl_at(p_n[:-1]), np.diff(p_n, axis=0))
+    return float(np.hypot(step_l[:, 0], step_l[:, 1]).sum())
+
+
+def _mean(values: Array) -> float:
+    """Return the mean of the finite values, NaN if there are none."""
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if len(finite) else np.nan
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(_mean(values**2)))
+
+
+def _per_axis(values: Array) -> tuple[float, float, float]:
+    first, second, third = (float(x) for x in values)
+    return first, second, third

@@ -1,0 +1,46 @@
+"""A reference made of GNSS fixes that an estimator was not allowed to see."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ssm_graph.data import GnssLog, Reference
+from ssm_graph.earth import LocalFrame
+from ssm_graph.estimate import Trajectory
+from ssm_graph.evaluation.alignment import interpolate_within
+from ssm_graph.frames import R_lb_from_roll_pitch_heading
+
+
+def reference_from_gnss(gnss: GnssLog, trajectory: Trajectory) -> Reference:
+    """Return positions of the body origin from fixes of the antenna.
+
+    The lever arm is turned with the estimate's own attitude, at the fix (``l`` local level)::
+
+        p_origin = p_antenna - R_lb lever_arm_b
+
+    An error of the heading moves that by no more than the lever arm's length times the error.
+    Fixes outside of the trajectory, or in its gaps, are left out; velocity and attitude are NaN.
+    Compared with fixes, errors contain the noise of the fixes, and NEES shows it.
+    """
+    angles = interpolate_within(
+        gnss.time_s,
+        known_s=trajectory.time_s,
+        values=np.unwrap(trajectory.roll_pitch_heading, axis=0),
+    )
+    kept = np.isfinite(angles).all(axis=1)
+    lat, lon, height = gnss.lat[kept], gnss.lon[kept], gnss.height[kept]
+    if np.any(kept) and np.any(gnss.lever_arm_b != 0.0):
+        frame = LocalFrame(float(lat[0]), float(lon[0]), float(height[0]))
+        antenna_n = frame.p_n_from_geodetic(lat, lon, height)
+        lever_l = R_lb_from_roll_pitch_heading(*angles[kept].T) @ gnss.lever_arm_b
+        lever_n = np.einsum("nij,nj->ni", frame.R_nl_at(antenna_n), lever_l)
+        lat, lon, height = frame.geodetic_from_p_n(antenna_n - lever_n)
+    unknown = np.full((int(kept.sum()), 3), np.nan)
+    return Reference(
+        time_s=gnss.time_s[kept],
+        lat=lat,
+        lon=lon,
+        height=height,
+        velocity_enu=unknown,
+        roll_pitch_heading=unknown,
+    )

@@ -1,0 +1,231 @@
+"""First values and weights for the smoother: one robust pass forwards in time.
+
+Robust weights must not start from a contaminated least-squares solution, which hides the culprit.
+Here every beam meets the inertial prediction first, which no fault of a beam can have touched, and
+the weights of one ping settle before the next.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, V, X
+
+from factors.similarity import WEIGHT_FLOOR, Kernel, expected_mahalanobis_sq
+from ssm_graph.data import Array
+from ssm_graph.earth import SEMI_MAJOR_AXIS
+from ssm_graph.graph.linearize import inertial_graph, linearize_beams
+from ssm_graph.graph.problem import Problem
+from ssm_graph.graph.states import (
+    POSITION,
+    ROTATION,
+    STATE_DIM,
+    VELOCITY,
+    InitialMoments,
+    States,
+    initial_moments,
+    states_from_arrays,
+)
+from ssm_graph.imu.preintegration import gtsam_gravity
+
+GATE = 5.0
+"""Beams further than this many innovation sigmas from the prediction start without weight."""
+LOCKED_OUT_PINGS = 5
+"""After so many pings in a row without one good beam, the prediction is doubted instead."""
+DOUBT_VELOCITY = 1.0
+"""m/s, how far a doubted prediction may be off."""
+WEIGHT_ROUNDS = 10
+GRAVITY_REACH = 20.0
+"""m, how far gravity is carried linearly before it is evaluated anew."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FirstValues:
+    """Where the smoother starts."""
+
+    states: States
+    weights: Array
+    """(M,) one for each beam row"""
+    n_doubts: int
+    """How often the prediction was doubted."""
+
+
+def first_values(problem: Problem, *, kernel: Kernel) -> FirstValues:
+    """Run once through the mission, predicting and updating keyframe by keyframe."""
+    return _ForwardPass(problem, kernel).run()
+
+
+class _ForwardPass:
+    """A filter on the same inertial factors as the graph, in covariance form."""
+
+    def __init__(self, problem: Problem, kernel: Kernel) -> None:
+        self.problem = problem
+        self.kernel = kernel
+        start = initial_moments(
+            problem.start, problem.frame, bias_sigma=problem.imu_noise_bias_sigma
+        )
+        self.R_nb, self.p_n, self.v_n, self.bias = start[:4]
+        self.P = start.covariance
+        self.factors = inertial_graph(problem)
+        self.weights = np.ones(len(problem.beams.speed))
+        self.without_beam = 0
+        self.n_doubts = 0
+        self.gravity_at = np.full(3, np.inf)
+        self.gravity, self.gravity_D_p = np.zeros(3), np.zeros((3, 3))
+
+    def run(self) -> FirstValues:
+        problem = self.problem
+        rows = _RowsByKeyframe(problem)
+        history: list[InitialMoments] = []
+        for k in range(problem.n_keyframes):
+            if k > 0:
+                self._predict(k - 1)
+            self._update_fix(rows.fix[k])
+            self._update_depth(rows.depth[k], k)
+            self._update_beams(rows.beam[k])
+            history.append(InitialMoments(self.R_nb, self.p_n, self.v_n, self.bias, self.P))
+        arrays = (np.array([getattr(h, name) for h in history]) for name in history[0]._fields[:4])
+        return FirstValues(states_from_arrays(*arrays), self.weights, self.n_doubts)
+
+    def _predict(self, k: int) -> None:
+        chain = self.problem.chain
+        span = self.problem.keyframe_s[k + 1] - self.problem.keyframe_s[k]
+        chain.params[k].n_gravity = self._gravity(self.p_n + 0.5 * span * self.v_n)
+        pose = gtsam.Pose3(gtsam.Rot3(self.R_nb), self.p_n)
+        bias = gtsam.imuBias.ConstantBias(self.bias[:3], self.bias[3:])
+        predicted = chain.measurements[k].predict(gtsam.NavState(pose, self.v_n), bias)
+        values = gtsam.Values()
+        for i, state_pose, velocity in (
+            (k, pose, self.v_n),
+            (k + 1, predicted.pose(), predicted.velocity()),
+        ):
+            values.insert(X(i), state_pose)
+            values.insert(V(i), velocity)
+            values.insert(B(i), bias)
+        # Whitened, columns x_i v_i x_j v_j b_i b_j: A_i d_i + A_j d_j is noise of unit variance.
+        whitened, _ = self.factors.at(k).linearize(values).jacobian()
+        solved = np.linalg.solve(whitened[:, _J], np.hstack([-whitened[:, _I], np.eye(STATE_DIM)]))
+        F, root_Q = solved[:, :STATE_DIM], solved[:, STATE_DIM:]
+        self.P = F @ self.P @ F.T + root_Q @ root_Q.T
+        self.R_nb = predicted.pose().rotation().matrix()
+        self.p_n, self.v_n = predicted.position(), predicted.velocity()
+
+    def _gravity(self, p_n: Array) -> Array:
+        """Return gravity, linear about its last exact evaluation: good to 1e-10 m/s^2."""
+        moved = p_n - self.gravity_at
+        if not np.dot(moved, moved) < GRAVITY_REACH**2:
+            self.gravity_at, moved = p_n, np.zeros(3)
+            around = GRAVITY_REACH * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
+            at = gtsam_gravity(self.problem.frame, p_n + around)
+            self.gravity, self.gravity_D_p = at[0], (at[1:4] - at[4:]).T / (2.0 * GRAVITY_REACH)
+        return np.asarray(self.gravity + self.gravity_D_p @ moved)
+
+    def _update_fix(self, rows: range) -> None:
+        fixes = self.problem.fixes
+        for i in rows:
+            assert fixes is not None
+            H = np.zeros((3, STATE_DIM))
+            H[:, ROTATION] = np.cross(fixes.lever_arm_b, self.R_nb)
+            H[:, POSITION] = self.R_nb
+            innovation = fixes.position_n[i] - self.p_n - self.R_nb @ fixes.lever_arm_b
+            self._correct(H, innovation, H @ self.P @ H.T + fixes.covariance_n[i])
+
+    def _update_depth(self, rows: range, k: int) -> None:
+        depths = self.problem.depths
+        if depths is None or len(rows) == 0:
+            return
+        i = rows[len(rows) // 2]
+        late = self.problem.keyframe_s[k] - depths.time_s[i]
+        sensor_n = self.p_n + self.R_nb @ depths.lever_arm_b
+        height = (
+            sensor_n[2]
+            + self.problem.frame.height
+            + (sensor_n[0] ** 2 + sensor_n[1] ** 2) / (2.0 * SEMI_MAJOR_AXIS)
+        )
+        H = np.zeros((1, STATE_DIM))
+        H[0, ROTATION] = np.cross(depths.lever_arm_b, self.R_nb[2])
+        H[0, POSITION] = self.R_nb[2]
+        innovation = -depths.depth[i] + late * self.v_n[2] - height
+        variance = depths.sigma**2 + late**2 * (self.P[8, 8] + 1e-2)
+        self._correct(H, np.atleast_1d(innovation), H @ self.P @ H.T + variance)
+
+    def _update_beams(self, rows: slice) -> None:
+        if rows.start == rows.stop:
+            return
+        error, H = linearize_beams(
+            self.problem.beams,
+            rows=rows,
+            R_nb=self.R_nb,
+            v_n=self.v_n,
+            bias=self.bias,
+            omega_ie_n=self.problem.frame.omega_ie_n,
+        )
+        innovation = -error
+        variance = self.problem.beams.sigma[rows] ** 2
+        predicted = H @ self.P @ H.T
+        weights = _settle_weights(innovation, predicted, variance, self.kernel)
+        self.without_beam = self.without_beam + 1 if np.all(weights < 0.01) else 0
+        if self.without_beam >= LOCKED_OUT_PINGS:
+            self.n_doubts += 1
+            self.without_beam = 0
+            self.P[VELOCITY, VELOCITY] += DOUBT_VELOCITY**2 * np.eye(3)
+            predicted = H @ self.P @ H.T
+            weights = _settle_weights(innovation, predicted, variance, self.kernel)
+        self.weights[rows] = weights
+        self._correct(H, innovation, predicted + np.diag(variance / weights))
+
+    def _correct(self, H: Array, innovation: Array, innovation_cov: Array) -> None:
+        PHt = self.P @ H.T
+        gain = np.linalg.solve(innovation_cov, PHt.T).T
+        step = gain @ innovation
+        P = self.P - gain @ PHt.T
+        self.P = 0.5 * (P + P.T)
+        pose = gtsam.Pose3(gtsam.Rot3(self.R_nb), self.p_n).retract(step[:6])
+        self.R_nb, self.p_n = pose.rotation().matrix(), pose.translation()
+        self.v_n = self.v_n + step[VELOCITY]
+        self.bias = self.bias + step[9:]
+
+
+# Columns of a linearised inertial factor that belong to its first and its second keyframe.
+_I = np.r_[0:9, 18:24]
+_J = np.r_[9:18, 24:30]
+
+
+def _settle_weights(innovation: Array, predicted: Array, variance: Array, kernel: Kernel) -> Array:
+    """Return the beams' weights at one ping, from those that pass the gate.
+
+    The posterior of the innovation needs no state: with ``S = H P H' + R / weight`` it has mean
+    ``R / weight S^-1 innovation`` and covariance ``H P H' - H P H' S^-1 H P H'``.
+    """
+    distance_sq = innovation**2 / (np.diag(predicted) + variance)
+    weights = np.where(distance_sq < GATE**2, 1.0, WEIGHT_FLOOR)
+    for _ in range(WEIGHT_ROUNDS):
+        S_inv = np.linalg.inv(predicted + np.diag(variance / weights))
+        left = innovation - predicted @ S_inv @ innovation
+        spread = np.diag(predicted - predicted @ S_inv @ predicted)
+        t = expected_mahalanobis_sq(left, np.maximum(spread, 0.0), sigma=np.sqrt(variance))
+        settled = kernel.weight(t)
+        if np.max(np.abs(settled - weights)) < 1e-2:
+            return settled
+        weights = settled
+    return weights
+
+
+class _RowsByKeyframe:
+    """Which rows of each measurement table belong to each keyframe."""
+
+    def __init__(self, problem: Problem) -> None:
+        n = problem.n_keyframes
+        self.beam = [slice(a, b) for a, b in _bounds(problem.beams.keyframe, n)]
+        fixes = problem.fixes.keyframe if problem.fixes else np.zeros(0, np.intp)
+        depths = problem.depths.keyframe if problem.depths else np.zeros(0, np.intp)
+        self.fix = [range(a, b) for a, b in _bounds(fixes, n)]
+        self.depth = [range(a, b) for a, b in _bounds(depths, n)]
+
+
+def _bounds(keyframe: np.ndarray[tuple[int], np.dtype[np.intp]], n: int) -> list[tuple[int, int]]:
+    edges = np.searchsorted(keyframe, np.arange(n + 1)).tolist()
+    return list(itertools.pairwise(edges))

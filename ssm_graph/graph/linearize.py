@@ -1,0 +1,202 @@
+"""The nonlinear factors of a mission and their linearisation, beams in bulk."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, V, X
+from scipy.interpolate import CubicHermiteSpline
+
+from factors.dvl_beam import beam_residual
+from ssm_graph.data import N_BEAMS, Array
+from ssm_graph.earth import LocalFrame
+from ssm_graph.graph.problem import Beams, Depths, Fixes, Problem
+from ssm_graph.graph.states import (
+    GYRO_BIAS,
+    ROTATION,
+    STATE_DIM,
+    VELOCITY,
+    States,
+    initial_moments,
+)
+
+
+class BeamRows(NamedTuple):
+    """Linearised beams, one row each, not whitened."""
+
+    error: Array
+    """(M,) m/s, predicted minus measured."""
+    jacobian: Array
+    """(M, 15) with respect to the keyframe's error state."""
+
+
+def linearize_beams(
+    beams: Beams, *, rows: slice, R_nb: Array, v_n: Array, bias: Array, omega_ie_n: Array
+) -> BeamRows:
+    """Linearise the beams of ``rows`` at states given for each row, or one for all."""
+    residual = beam_residual(
+        R_nb,
+        v_n,
+        bias[..., 3:],
+        speed=beams.speed[rows],
+        gyro_b=beams.gyro_b[rows],
+        beam_b=beams.beam_b[rows],
+        lever_arm_b=beams.lever_arm_b,
+        omega_ie_n=omega_ie_n,
+    )
+    jacobian = np.zeros((len(residual.error), STATE_DIM))
+    jacobian[:, ROTATION] = residual.error_D_rotation
+    jacobian[:, VELOCITY] = residual.error_D_velocity_n
+    jacobian[:, GYRO_BIAS] = residual.error_D_gyro_bias
+    return BeamRows(residual.error, jacobian)
+
+
+class GraphLinearizer:
+    """Linearises the whole graph of a problem at any states and beam weights.
+
+    Inertial factors, prior and GNSS are GTSAM's own and stay; gravity and depth targets follow the
+    states; beams become one Jacobian factor a keyframe.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self.inertial = inertial_graph(problem)
+        self.prior = prior_graph(problem)
+        self.gnss = gnss_graph(problem.fixes)
+        k = problem.beams.keyframe
+        self._first_beam = np.flatnonzero(np.diff(k, prepend=-1))
+        self._n_rows = np.diff(np.append(self._first_beam, len(k)))
+        self._unit = [gtsam.noiseModel.Unit.Create(m + 1) for m in range(4 * N_BEAMS)]
+
+    def beam_rows(self, states: States) -> BeamRows:
+        """Linearise all beams at ``states``."""
+        k = self.problem.beams.keyframe
+        return linearize_beams(
+            self.problem.beams,
+            rows=slice(None),
+            R_nb=states.R_nb[k],
+            v_n=states.v_n[k],
+            bias=states.bias[k],
+            omega_ie_n=self.problem.frame.omega_ie_n,
+        )
+
+    def linearize(
+        self, states: States, beam_rows: BeamRows, weights: Array
+    ) -> gtsam.GaussianFactorGraph:
+        """Return the linear graph at ``states``, with their beam rows and weights (M,)."""
+        self.problem.chain.set_gravity(states.p_n)
+        linear = self.inertial.linearize(states.values)
+        for graph in (self.prior, self.gnss, self.depth_graph(states)):
+            linear.push_back(graph.linearize(states.values))
+        self._push_beams(linear, beam_rows, weights)
+        return linear
+
+    def depth_graph(self, states: States) -> gtsam.NonlinearFactorGraph:
+        """Return the depth factors with targets at ``states``."""
+        depths = self.problem.depths
+        if depths is None:
+            return gtsam.NonlinearFactorGraph()
+        return depth_graph(depths, states, self.problem.frame, self.problem.keyframe_s)
+
+    def _push_beams(
+        self, linear: gtsam.GaussianFactorGraph, beam_rows: BeamRows, weights: Array
+    ) -> None:
+        scale = np.sqrt(weights) / self.problem.beams.sigma
+        rows = beam_rows.jacobian * scale[:, None]
+        b = -beam_rows.error * scale
+        pose, velocity, bias = (np.ascontiguousarray(rows[:, s]) for s in _BLOCKS)
+        keyframes = self.problem.beams.keyframe[self._first_beam].tolist()
+        firsts, sizes = self._first_beam.tolist(), self._n_rows.tolist()
+        for k, first, size in zip(keyframes, firsts, sizes, strict=True):
+            end = first + size
+            linear.push_back(
+                gtsam.JacobianFactor(
+                    X(k),
+                    pose[first:end],
+                    V(k),
+                    velocity[first:end],
+                    B(k),
+                    bias[first:end],
+                    b[first:end],
+                    self._unit[size - 1],
+                )
+            )
+
+
+_BLOCKS = (slice(0, 6), slice(6, 9), slice(9, 15))
+
+
+def inertial_graph(problem: Problem) -> gtsam.NonlinearFactorGraph:
+    """Return the inertial factors between successive keyframes."""
+    graph = gtsam.NonlinearFactorGraph()
+    for k, measured in enumerate(problem.chain.measurements):
+        graph.add(
+            gtsam.GalileanCombinedImuFactor(
+                X(k), V(k), X(k + 1), V(k + 1), B(k), B(k + 1), measured
+            )
+        )
+    return graph
+
+
+def prior_graph(problem: Problem) -> gtsam.NonlinearFactorGraph:
+    """Return the prior factors on pose, velocity and bias of the first keyframe."""
+    start = initial_moments(problem.start, problem.frame, bias_sigma=problem.imu_noise_bias_sigma)
+    covariance = gtsam.noiseModel.Gaussian.Covariance
+    graph = gtsam.NonlinearFactorGraph()
+    graph.addPriorPose3(
+        X(0),
+        gtsam.Pose3(gtsam.Rot3(start.R_nb), start.p_n),
+        covariance(start.covariance[:6, :6]),
+    )
+    graph.addPriorVector(V(0), start.v_n, covariance(start.covariance[VELOCITY, VELOCITY]))
+    graph.addPriorConstantBias(
+        B(0), gtsam.imuBias.ConstantBias(), covariance(start.covariance[9:, 9:])
+    )
+    return graph
+
+
+def gnss_graph(fixes: Fixes | None) -> gtsam.NonlinearFactorGraph:
+    """Return GNSS position factors with lever arm."""
+    graph = gtsam.NonlinearFactorGraph()
+    if fixes is None:
+        return graph
+    for k, position_n, covariance_n in zip(
+        fixes.keyframe.tolist(), fixes.position_n, fixes.covariance_n, strict=True
+    ):
+        noise = gtsam.noiseModel.Gaussian.Covariance(covariance_n)
+        graph.add(gtsam.GPSFactorArm(X(k), position_n, fixes.lever_arm_b, noise))
+    return graph
+
+
+def depth_graph(
+    depths: Depths, states: States, frame: LocalFrame, keyframe_s: Array
+) -> gtsam.NonlinearFactorGraph:
+    """Return depth as GTSAM position factors that count along the vertical only.
+
+    Two things make the target depend on the states, and both change little between iterations:
+    the ellipsoid curves away from the frame's horizontal plane, and a reading between keyframes is
+    carried to its keyframe along the estimated track. Readings of one keyframe are averaged.
+    """
+    sensor_n = states.p_n + states.R_nb @ depths.lever_arm_b
+    height = frame.geodetic_from_p_n(sensor_n)[2]
+    track = CubicHermiteSpline(keyframe_s, height, states.v_n[:, 2])
+    too_low = -depths.depth - track(depths.time_s)
+    count = np.bincount(depths.keyframe, minlength=len(keyframe_s))
+    total = np.bincount(depths.keyframe, weights=too_low, minlength=len(keyframe_s))
+    mean = total / np.maximum(count, 1)
+    target_n = sensor_n + np.array([0.0, 0.0, 1.0]) * mean[:, None]
+    noise = {
+        n: gtsam.noiseModel.Diagonal.Precisions(np.array([0.0, 0.0, n / depths.sigma**2]))
+        for n in np.unique(count).tolist()
+        if n > 0
+    }
+    graph = gtsam.NonlinearFactorGraph()
+    for k_used in np.flatnonzero(count).tolist():
+        graph.add(
+            gtsam.GPSFactorArm(
+                X(k_used), target_n[k_used], depths.lever_arm_b, noise[int(count[k_used])]
+            )
+        )
+    return graph

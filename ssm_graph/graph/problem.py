@@ -1,0 +1,218 @@
+"""A mission as an estimation problem: keyframes, inertial chain, measurements, initial state."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ssm_graph.data import N_BEAMS, Array, GnssLog, ImuLog, InitialState, Mission
+from ssm_graph.earth import LocalFrame
+from ssm_graph.errors import ConfigError
+from ssm_graph.graph.timeline import Timeline, build_timeline, nearest
+from ssm_graph.imu.preintegration import InertialChain, imu_gaps, preintegrate
+
+PING_WINDOW_S = 0.1
+"""The gyro reading at a ping is the mean over this window: a ping takes time, and so does noise
+to average out."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProblemConfig:
+    """How a mission becomes a graph."""
+
+    merge_rate_hz: float = 20.0
+    """Raw inertial samples are merged to this rate before preintegration."""
+    keyframe_interval_s: float = 1.0
+    """Longest time between keyframes while DVL and GNSS are silent."""
+
+    def __post_init__(self) -> None:
+        for name in ("merge_rate_hz", "keyframe_interval_s"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0.0):
+                raise ConfigError(f"{name}: expected a number above zero, got {value}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Beams:
+    """Every valid beam speed as one row, in the order of its keyframe."""
+
+    keyframe: NDArray[np.intp]
+    """(M,)"""
+    beam: NDArray[np.intp]
+    """(M,) 0 to 3"""
+    speed: Array
+    """(M,) m/s"""
+    sigma: Array
+    """(M,) m/s"""
+    gyro_b: Array
+    """(M, 3) rad/s, mean over the ping"""
+    beam_b: Array
+    """(M, 3) unit vectors"""
+    lever_arm_b: Array
+    """(3,) m"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Depths:
+    """Depth readings, each assigned to its nearest keyframe."""
+
+    keyframe: NDArray[np.intp]
+    """(M,)"""
+    time_s: Array
+    """(M,) s"""
+    depth: Array
+    """(M,) m, positive down"""
+    sigma: float
+    """m"""
+    lever_arm_b: Array
+    """(3,) m"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fixes:
+    """GNSS fixes at their keyframes, in the navigation frame."""
+
+    keyframe: NDArray[np.intp]
+    """(M,)"""
+    position_n: Array
+    """(M, 3) m"""
+    covariance_n: Array
+    """(M, 3, 3) m^2"""
+    lever_arm_b: Array
+    """(3,) m"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """Everything an estimator needs of one mission."""
+
+    frame: LocalFrame
+    start: InitialState
+    keyframe_s: Array
+    chain: InertialChain
+    beams: Beams
+    depths: Depths | None
+    fixes: Fixes | None
+    imu_noise_bias_sigma: Array
+    """(6,) turn-on bias sigmas, accelerometer (m/s^2) then gyro (rad/s)."""
+    notes: tuple[str, ...] = ()
+
+    @property
+    def n_keyframes(self) -> int:
+        """Number of keyframes."""
+        return len(self.keyframe_s)
+
+
+def build_problem(
+    mission: Mission, config: ProblemConfig | None = None, *, start: InitialState | None = None
+) -> Problem:
+    """Turn a mission into an estimation problem.
+
+    Parameters
+    ----------
+    mission : the recorded run.
+    config : rates and intervals.
+    start : initial state with sigmas; the mission's own when left out. A mission without one
+        needs :func:`ssm_graph.graph.alignment.align` first.
+    """
+    config = config or ProblemConfig()
+    start = start or mission.initial
+    if start is None:
+        raise ConfigError(
+            "mission.toml: no [initial], and no start was given; expected one of them; "
+            "let align(mission) find the start"
+        )
+    timeline = build_timeline(mission, start_s=start.time_s, interval_s=config.keyframe_interval_s)
+    chain = preintegrate(
+        mission.imu, timeline.keyframe_s, frame=mission.frame, rate_hz=config.merge_rate_hz
+    )
+    noise = mission.imu.noise
+    return Problem(
+        frame=mission.frame,
+        start=start,
+        keyframe_s=timeline.keyframe_s,
+        chain=chain,
+        beams=_beams(mission, timeline),
+        depths=_depths(mission, timeline),
+        fixes=None if mission.gnss is None else _fixes(mission.gnss, mission.frame, timeline),
+        imu_noise_bias_sigma=np.repeat([noise.accel_bias_sigma, noise.gyro_bias_sigma], 3),
+        notes=timeline.notes + _gap_note(mission.imu),
+    )
+
+
+def _gap_note(imu: ImuLog) -> tuple[str, ...]:
+    begin, end = imu_gaps(imu)
+    if len(begin) == 0:
+        return ()
+    longest = int(np.argmax(end - begin))
+    return (
+        f"inertial data have {len(begin)} gaps, the longest of "
+        f"{end[longest] - begin[longest]:.2f} s at {begin[longest]:.3f} s: bridged with larger "
+        "process noise",
+    )
+
+
+def mean_gyro(imu: ImuLog, time_s: Array) -> Array:
+    """Return the mean gyro reading (M, 3) over the ping window about each time, rad/s.
+
+    The window slides inwards at the ends of the data.
+    """
+    edges = np.concatenate([[imu.start_s], imu.time_s])
+    angle = np.concatenate(
+        [np.zeros((1, 3)), np.cumsum(imu.gyro_b * np.diff(edges)[:, None], axis=0)]
+    )
+    half = 0.5 * min(PING_WINDOW_S, edges[-1] - edges[0])
+    centre = np.clip(time_s, edges[0] + half, edges[-1] - half)
+    turned = [
+        np.interp(centre + half, edges, axis) - np.interp(centre - half, edges, axis)
+        for axis in angle.T
+    ]
+    return np.asarray(np.stack(turned, axis=-1) / (2.0 * half))
+
+
+def _beams(mission: Mission, timeline: Timeline) -> Beams:
+    dvl = mission.dvl
+    speed = dvl.speed[timeline.ping]
+    row, beam = np.nonzero(np.isfinite(speed))
+    keyframe = timeline.ping_keyframe[row]
+    ping_s = dvl.time_s[timeline.ping] - dvl.mount.time_offset_s
+    gyro_b = mean_gyro(mission.imu, ping_s) if len(ping_s) else np.zeros((0, 3))
+    return Beams(
+        keyframe=keyframe,
+        beam=beam,
+        speed=speed[row, beam],
+        sigma=dvl.sigma[timeline.ping][row, beam],
+        gyro_b=gyro_b[row],
+        beam_b=dvl.mount.beams_b.reshape(N_BEAMS, 3)[beam],
+        lever_arm_b=dvl.mount.lever_arm_b,
+    )
+
+
+def _depths(mission: Mission, timeline: Timeline) -> Depths | None:
+    log = mission.depth
+    if log is None:
+        return None
+    keyframe_s = timeline.keyframe_s
+    used = (log.time_s >= keyframe_s[0]) & (log.time_s <= keyframe_s[-1])
+    return Depths(
+        keyframe=nearest(keyframe_s, log.time_s[used]),
+        time_s=log.time_s[used],
+        depth=log.depth[used],
+        sigma=log.sigma,
+        lever_arm_b=log.lever_arm_b,
+    )
+
+
+def _fixes(log: GnssLog, frame: LocalFrame, timeline: Timeline) -> Fixes:
+    fix = timeline.fix
+    position_n = frame.p_n_from_geodetic(log.lat[fix], log.lon[fix], log.height[fix])
+    R_nl = frame.R_nl_at(position_n)
+    covariance_l = log.sigma_enu[fix][:, :, None] ** 2 * np.eye(3)
+    return Fixes(
+        keyframe=timeline.fix_keyframe,
+        position_n=position_n,
+        covariance_n=R_nl @ covariance_l @ np.swapaxes(R_nl, 1, 2),
+        lever_arm_b=log.lever_arm_b,
+    )

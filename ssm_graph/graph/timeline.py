@@ -1,0 +1,102 @@
+"""Keyframe times of a mission: one for each ping and each fix, and a few where both are silent."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ssm_graph.data import Array, Mission
+from ssm_graph.errors import DataError
+
+MIN_SPACING_S = 1e-3
+"""Times closer than this share a keyframe."""
+
+Indices = NDArray[np.intp]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Timeline:
+    """Keyframe times and what was measured at them."""
+
+    keyframe_s: Array
+    """(K,) s, strictly increasing."""
+    ping: Indices
+    """(P,) pings used, as rows of the DVL table."""
+    ping_keyframe: Indices
+    """(P,) their keyframes."""
+    fix: Indices
+    """(F,) GNSS fixes used, as rows of the GNSS table."""
+    fix_keyframe: Indices
+    """(F,) their keyframes."""
+    notes: tuple[str, ...]
+
+
+def build_timeline(mission: Mission, *, start_s: float, interval_s: float) -> Timeline:
+    """Choose keyframes from ``start_s`` to the end of the inertial data.
+
+    Parameters
+    ----------
+    mission : the recorded run.
+    start_s : time of the initial state, the first keyframe.
+    interval_s : longest time between keyframes where DVL and GNSS are silent, s.
+    """
+    end_s = float(mission.imu.time_s[-1])
+    if end_s - start_s < MIN_SPACING_S:
+        raise DataError(
+            f"the start at {start_s:.3f} s leaves no inertial data, which end at {end_s:.3f} s"
+        )
+    ping_s = mission.dvl.time_s - mission.dvl.mount.time_offset_s
+    has_beam = np.isfinite(mission.dvl.speed).any(axis=1)
+    fix_s = mission.gnss.time_s if mission.gnss is not None else np.zeros(0)
+    ping = np.flatnonzero(has_beam & (ping_s >= start_s) & (ping_s <= end_s))
+    fix = np.flatnonzero((fix_s >= start_s) & (fix_s <= end_s))
+    notes = _left_out("ping", int(has_beam.sum()) - len(ping), start_s, end_s)
+    notes += _left_out("GNSS fix", len(fix_s) - len(fix), start_s, end_s)
+
+    measured = np.concatenate([[start_s], ping_s[ping], fix_s[fix], [end_s]])
+    keyframe_s = _fill(_thin(measured), interval_s)
+    return Timeline(
+        keyframe_s=keyframe_s,
+        ping=ping,
+        ping_keyframe=nearest(keyframe_s, ping_s[ping]),
+        fix=fix,
+        fix_keyframe=nearest(keyframe_s, fix_s[fix]),
+        notes=notes,
+    )
+
+
+def nearest(keyframe_s: Array, time_s: Array) -> Indices:
+    """Return the index of the keyframe nearest to each time."""
+    middle = 0.5 * (keyframe_s[:-1] + keyframe_s[1:])
+    return np.searchsorted(middle, time_s)
+
+
+def _left_out(what: str, count: int, start_s: float, end_s: float) -> tuple[str, ...]:
+    if count == 0:
+        return ()
+    plural = "s" if count > 1 and what == "ping" else "es" if count > 1 else ""
+    return (
+        f"{count} {what}{plural} outside the smoothed span {start_s:.3f}..{end_s:.3f} s left out",
+    )
+
+
+def _thin(times: Array) -> Array:
+    """Return the distinct times, later ones dropped where closer than :data:`MIN_SPACING_S`."""
+    ordered = np.unique(times)
+    kept = [ordered[0]]
+    for time in ordered[1:]:
+        if time - kept[-1] >= MIN_SPACING_S:
+            kept.append(time)
+    return np.array(kept)
+
+
+def _fill(times: Array, interval_s: float) -> Array:
+    """Return the times with equally spaced ones added wherever they are further apart."""
+    n_pieces = np.maximum(np.ceil(np.diff(times) / interval_s - 1e-6).astype(int), 1)
+    pieces = [
+        np.linspace(begin, end, count, endpoint=False)
+        for begin, end, count in zip(times[:-1], times[1:], n_pieces, strict=True)
+    ]
+    return np.concatenate([*pieces, times[-1:]])

@@ -1,0 +1,43 @@
+"""From keyframe states in the navigation frame to a trajectory in geodetic terms."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ssm_graph.data import Array
+from ssm_graph.estimate import Trajectory
+from ssm_graph.frames import phi_D_roll_pitch_heading, roll_pitch_heading_from_R_lb
+from ssm_graph.graph.problem import Problem
+from ssm_graph.graph.states import POSITION, ROTATION, VELOCITY, States
+
+
+def trajectory_from_states(problem: Problem, states: States, covariance: Array) -> Trajectory:
+    """Express states and their covariances (K, 15, 15) along east, north, up at the vehicle."""
+    frame = problem.frame
+    lat, lon, height = frame.geodetic_from_p_n(states.p_n)
+    R_ln = np.swapaxes(frame.R_nl_at(states.p_n), 1, 2)
+    R_lb = R_ln @ states.R_nb
+    roll, pitch, heading = roll_pitch_heading_from_R_lb(R_lb)
+    rph_D_phi = np.asarray(np.linalg.inv(phi_D_roll_pitch_heading(roll, pitch)), float)
+    return Trajectory(
+        time_s=problem.keyframe_s,
+        lat=lat,
+        lon=lon,
+        height=height,
+        velocity_enu=np.einsum("kij,kj->ki", R_ln, states.v_n),
+        roll_pitch_heading=np.stack([roll, pitch, heading], axis=-1),
+        gyro_bias=states.bias[:, 3:],
+        accel_bias=states.bias[:, :3],
+        position_cov_enu=_turned(R_lb, covariance[:, POSITION, POSITION]),
+        velocity_sigma_enu=_sigmas(_turned(R_ln, covariance[:, VELOCITY, VELOCITY])),
+        attitude_sigma=_sigmas(_turned(rph_D_phi, covariance[:, ROTATION, ROTATION])),
+        n_beams=np.bincount(problem.beams.keyframe, minlength=problem.n_keyframes).astype(float),
+    )
+
+
+def _turned(J: Array, covariance: Array) -> Array:
+    return np.asarray(J @ covariance @ np.swapaxes(J, 1, 2))
+
+
+def _sigmas(covariance: Array) -> Array:
+    return np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))

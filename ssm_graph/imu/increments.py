@@ -1,0 +1,163 @@
+"""Merge raw inertial samples into coning- and sculling-compensated ones that end at the keyframes.
+
+A raw sample is the mean rate and the mean specific force over its interval. Preintegration treats
+both as constant within a sample, so what is lost is their change: coning and sculling. The change
+is recovered here from the neighbouring samples, whose spacing may be irregular.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ssm_graph.data import Array, ImuLog
+from ssm_graph.errors import ConfigError, DataError
+
+
+class MergedSamples(NamedTuple):
+    """Merged samples of all intervals between keyframes, in time order."""
+
+    dt: Array
+    """(M,) s"""
+    gyro_b: Array
+    """(M, 3) equivalent constant body rate, rad/s."""
+    accel_b: Array
+    """(M, 3) equivalent constant specific force, m/s^2."""
+    first: NDArray[np.intp]
+    """(K,) index of the first merged sample of each of the K - 1 intervals, and M."""
+
+
+def merge_samples(imu: ImuLog, keyframe_s: Array, *, rate_hz: float) -> MergedSamples:
+    """Cut the raw samples at the keyframe times and merge them to about ``rate_hz``.
+
+    Each piece of a raw sample, of length ``h``, is first made equivalent to one of constant rate
+    and force, with the slopes ``omega', f'`` taken from the neighbours (coning and sculling)::
+
+        theta = omega h + h^3/12 omega x omega'
+        v     = f h     + h^3/12 (omega x f' + f x omega')
+
+    The pieces of a merged sample are then composed without approximation. The turn of the specific
+    force by the sample's own rotation stays out: the Galilean preintegration does it.
+
+    Parameters
+    ----------
+    imu : raw samples, body axes.
+    keyframe_s : (K,) strictly increasing times inside the span of ``imu``, s.
+    rate_hz : highest rate of merged samples; every interval gets at least one. A rate above that
+        of the raw samples merges nothing.
+
+    Raises
+    ------
+    DataError
+        If the keyframes reach outside the inertial data.
+    ConfigError
+        If ``rate_hz`` is not a positive number.
+
+    References
+    ----------
+    .. [1] P. G. Savage, "Strapdown Inertial Navigation Integration Algorithm Design", parts 1 and
+       2, Journal of Guidance, Control, and Dynamics 21, 1998.
+    """
+    if not (np.isfinite(rate_hz) and rate_hz > 0.0):
+        raise ConfigError(f"merge rate: expected a positive rate in Hz, got {rate_hz}")
+    edges = np.concatenate([[imu.start_s], imu.time_s])
+    if keyframe_s[0] < edges[0] or keyframe_s[-1] > edges[-1]:
+        raise DataError(
+            f"keyframes {keyframe_s[0]:.3f}..{keyframe_s[-1]:.3f} s reach outside the inertial "
+            f"data {edges[0]:.3f}..{edges[-1]:.3f} s"
+        )
+    piece_edges, sample = _cut(edges, keyframe_s)
+    h = np.diff(piece_edges)[:, None]
+    omega, force = imu.gyro_b[sample], imu.accel_b[sample]
+    omega_slope, force_slope = (_slopes(edges, rate)[sample] for rate in (imu.gyro_b, imu.accel_b))
+    # The mean over a piece differs from that over its whole sample by the slope.
+    mid = 0.5 * (edges[sample] + edges[sample + 1])
+    shift = (piece_edges[:-1] + 0.5 * h[:, 0] - mid)[:, None]
+    omega, force = omega + omega_slope * shift, force + force_slope * shift
+
+    first = _group_starts(piece_edges, keyframe_s, rate_hz)
+    scale = h**3 / 12.0
+    theta = omega * h + scale * np.cross(omega, omega_slope)
+    v = force * h + scale * (np.cross(omega, force_slope) + np.cross(force, omega_slope))
+    theta, v = _merge(theta, v, first)
+    dt = np.add.reduceat(h[:, 0], first)
+    intervals = np.searchsorted(piece_edges[first], keyframe_s[:-1])
+    return MergedSamples(
+        dt, theta / dt[:, None], v / dt[:, None], np.concatenate([intervals, [len(dt)]])
+    )
+
+
+def _cut(edges: Array, cuts: Array) -> tuple[Array, NDArray[np.intp]]:
+    """Return the edges of the pieces between the first and last cut, and each piece's sample."""
+    inner = edges[(edges > cuts[0]) & (edges < cuts[-1])]
+    piece_edges = np.union1d(inner, cuts)
+    mid = 0.5 * (piece_edges[:-1] + piece_edges[1:])
+    return piece_edges, np.searchsorted(edges, mid) - 1
+
+
+def _slopes(edges: Array, rate: Array) -> Array:
+    """Return the time derivative of a rate at the middle of each sample, from its neighbours."""
+    if len(rate) < 2:
+        return np.zeros_like(rate)
+    return np.asarray(np.gradient(rate, 0.5 * (edges[:-1] + edges[1:]), axis=0))
+
+
+def _group_starts(piece_edges: Array, keyframe_s: Array, rate_hz: float) -> NDArray[np.intp]:
+    """Return the first piece of every merged sample; no group crosses a keyframe."""
+    interval = np.searchsorted(keyframe_s, piece_edges[:-1], side="right") - 1
+    span = np.diff(keyframe_s)
+    n_groups = np.maximum(np.ceil(span * rate_hz - 1e-6), 1.0)
+    # A piece belongs to the group in which it ends.
+    elapsed = piece_edges[1:] - keyframe_s[interval]
+    group = np.ceil(elapsed / span[interval] * n_groups[interval] - 1e-6).astype(np.intp)
+    is_first = np.ones(len(interval), bool)
+    is_first[1:] = (interval[1:] != interval[:-1]) | (group[1:] != group[:-1])
+    return np.flatnonzero(is_first)
+
+
+def _merge(theta: Array, v: Array, first: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Compose the pieces of each group that begins at ``first``.
+
+    Returns the rotation vector (M, 3) of the whole, and the velocity increment (M, 3) that a
+    constant specific force along with a constant rate would need to give the same velocity change.
+    """
+    size = np.diff(np.append(first, len(theta)))
+    turned = Rotation.identity(len(first))
+    gained = np.zeros((len(first), 3))
+    for step in range(int(size.max())):
+        has_piece = (step < size)[:, None]
+        piece = np.minimum(first + step, len(theta) - 1)
+        theta_k, v_k = theta[piece] * has_piece, v[piece] * has_piece
+        gained += turned.apply(_velocity_gain(theta_k, v_k))
+        turned = turned * Rotation.from_rotvec(theta_k)
+    theta_all = turned.as_rotvec()
+    return theta_all, _velocity_gain_inverse(theta_all, gained)
+
+
+def _velocity_gain(theta: Array, v: Array) -> Array:
+    """Return ``int_0^1 Exp(s theta) v ds``: the left Jacobian of SO(3) applied to ``v``."""
+    angle = np.linalg.norm(theta, axis=-1, keepdims=True)
+    first = np.cross(theta, v)
+    # (1 - cos a) / a^2 and (a - sin a) / a^3, without cancellation.
+    half_sinc_sq = 0.5 * np.sinc(0.5 * angle / np.pi) ** 2
+    cubic = np.where(
+        angle < 1e-2,
+        (1.0 - angle**2 / 20.0) / 6.0,
+        (angle - np.sin(angle)) / np.maximum(angle, 1e-9) ** 3,
+    )
+    return np.asarray(v + half_sinc_sq * first + cubic * np.cross(theta, first))
+
+
+def _velocity_gain_inverse(theta: Array, gained: Array) -> Array:
+    """Return ``v`` such that ``_velocity_gain(theta, v) = gained``."""
+    angle = np.linalg.norm(theta, axis=-1, keepdims=True)
+    half = np.maximum(0.5 * angle, 1e-9)
+    # (1 - a/2 cot(a/2)) / a^2
+    factor = np.where(
+        angle < 1e-2, (1.0 + angle**2 / 60.0) / 12.0, (1.0 - half / np.tan(half)) / (4.0 * half**2)
+    )
+    first = np.cross(theta, gained)
+    return np.asarray(gained - 0.5 * first + factor * np.cross(theta, first))

@@ -1,0 +1,144 @@
+"""Reading ``mission.toml``: the sections with every key checked, and where the tables are."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass
+from difflib import get_close_matches
+from enum import Enum
+from pathlib import Path
+from typing import Any, TypeVar
+
+from ssm_graph.errors import ConfigError, nearest_hint
+from ssm_graph.io.mission_keys import (
+    FORMAT,
+    OPTIONAL_TABLES,
+    REQUIRED_SECTIONS,
+    SECTIONS,
+    TABLES,
+    TOML_NAME,
+    BodyAxes,
+    Settings,
+    Stamp,
+    read_settings,
+)
+
+_Choice = TypeVar("_Choice", bound=Enum)
+
+
+@dataclass(frozen=True, slots=True)
+class MissionToml:
+    """The content of one ``mission.toml``, checked."""
+
+    folder: Path
+    name: str
+    body: BodyAxes
+    stamp: Stamp
+    sections: dict[str, Settings]
+
+    def __getitem__(self, section: str) -> Settings:
+        return self.sections[section]
+
+    def __contains__(self, section: str) -> bool:
+        return section in self.sections
+
+
+def read_mission_toml(folder: Path) -> MissionToml:
+    """Read and check ``mission.toml``; raise :class:`ConfigError` naming section and key."""
+    raw = _parse(folder)
+    _check_format(raw)
+    for name in raw:
+        if name not in (*SECTIONS, "format", "name"):
+            hint = nearest_hint(name, [*SECTIONS, "format", "name"])
+            raise ConfigError(f"{TOML_NAME} {name}: unknown key or section; {hint}")
+    for name in REQUIRED_SECTIONS:
+        if name not in raw:
+            raise ConfigError(f"{TOML_NAME} [{name}]: the section is missing")
+    sections = {name: read_settings(name, raw[name]) for name in raw if name in SECTIONS}
+    _check_beam_keys(sections["dvl"])
+    return MissionToml(
+        folder=folder,
+        name=_mission_name(raw),
+        body=_choice(sections["frames"], "body", BodyAxes),
+        stamp=_choice(sections["imu"], "stamp", Stamp),
+        sections=sections,
+    )
+
+
+def table_path(toml: MissionToml, section: str) -> Path | None:
+    """Return the path of a section's table; None where an optional table's file is missing.
+
+    A name that is close to that of a file in the folder is a slip, and an error even then.
+    """
+    label = toml[section].text("file")
+    path = toml.folder / label
+    if path.is_file():
+        return path
+    others = {toml[name].text("file") for name in TABLES if name in toml}
+    found = sorted(p.name for p in toml.folder.iterdir() if p.name not in {*others, TOML_NAME})
+    stems = {Path(name).stem: name for name in reversed(found)}
+    close = get_close_matches(Path(label).stem, stems, n=1, cutoff=0.75)
+    if section in OPTIONAL_TABLES and not close:
+        return None
+    hint = f"did you mean {stems[close[0]]!r}?" if close else "paths start at the mission folder"
+    raise toml[section].fault("file", f"there is no file {label!r}; {hint}")
+
+
+def _parse(folder: Path) -> dict[str, Any]:
+    path = folder / TOML_NAME
+    try:
+        return tomllib.loads(path.read_bytes().decode("utf-8-sig"))
+    except (FileNotFoundError, NotADirectoryError):
+        raise ConfigError(
+            f"{TOML_NAME}: there is none in {str(folder)!r}; expected a mission folder with "
+            f"{TOML_NAME} and its tables"
+        ) from None
+    except OSError as error:
+        raise ConfigError(f"{TOML_NAME}: cannot be read: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{TOML_NAME}: expected UTF-8 text, got bytes that are none") from error
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"{TOML_NAME}: expected valid TOML, got: {error}") from error
+
+
+def _check_format(raw: dict[str, Any]) -> None:
+    if "format" not in raw:
+        raise ConfigError(f"{TOML_NAME} format: the key is missing; expected format = {FORMAT}")
+    if isinstance(raw["format"], bool) or raw["format"] != FORMAT:
+        raise ConfigError(
+            f"{TOML_NAME} format: expected {FORMAT}, got {raw['format']!r}; a newer format needs a "
+            "newer program"
+        )
+
+
+def _mission_name(raw: dict[str, Any]) -> str:
+    name = raw.get("name")
+    if not isinstance(name, str) or not name.strip():
+        got = "nothing" if name is None else repr(name)
+        raise ConfigError(f"{TOML_NAME} name: expected a text in quotes, got {got}")
+    return name
+
+
+def _choice(settings: Settings, key: str, choices: type[_Choice]) -> _Choice:
+    try:
+        return choices(settings.text(key))
+    except ValueError:
+        known = [str(choice.value) for choice in choices]
+        raise settings.fault(
+            key,
+            f"expected one of {', '.join(known)}, got {settings.text(key)!r}; "
+            + nearest_hint(settings.text(key), known),
+        ) from None
+
+
+def _check_beam_keys(dvl: Settings) -> None:
+    angles = ("beam_azimuth_deg", "beam_janus_deg")
+    given = [key for key in angles if key in dvl]
+    if "beam_vectors" in dvl and given:
+        raise dvl.fault("beam_vectors", f"given together with {given[0]}; keep one of the two")
+    if "beam_vectors" not in dvl and len(given) < len(angles):
+        missing = next(key for key in angles if key not in dvl)
+        raise dvl.fault(
+            missing,
+            "the key is missing; expected beam_azimuth_deg with beam_janus_deg, or beam_vectors",
+        )

@@ -1,0 +1,207 @@
+"""Writing a mission folder: the inverse of :func:`ssm_graph.io.mission.read_mission`."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+
+from ssm_graph.data import Array, DvlLog, InitialState, Mission, Reference
+from ssm_graph.errors import DataError
+from ssm_graph.io.mission_keys import (
+    ACCEL,
+    ATTITUDE,
+    FORMAT,
+    GYRO,
+    POSITION_SIGMA,
+    RANGE,
+    SPEED,
+    SPEED_SIGMA,
+    TIME,
+    TOML_NAME,
+    VELOCITY,
+    BodyAxes,
+    Stamp,
+)
+from ssm_graph.io.mission_units import R_bd_from_rpy, from_si, rpy_from_R_bd
+from ssm_graph.io.tables import TableFormat, write_table
+
+_NOISE_OF_EMPTY_LOG = 0.01
+
+
+def write_mission(
+    folder: Path | str, mission: Mission, *, table_format: TableFormat = TableFormat.CSV
+) -> None:
+    """Write ``mission`` as a folder that :func:`read_mission` turns into the same values.
+
+    Body axes are FRD and IMU stamps name the interval's end. Every number is written with all its
+    digits; angles may differ by rounding. ``mission.toml`` is taken away first and written last:
+    an interrupted write leaves a folder without one, never a mixture.
+
+    Parameters
+    ----------
+    folder : made if it does not exist; files of the same names are replaced.
+    mission : what to write; its notes are not.
+    table_format : CSV or Parquet.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    settings = mission_settings(mission, table_format)
+    (folder / TOML_NAME).unlink(missing_ok=True)
+    for section, columns in mission_tables(mission).items():
+        path = folder / settings[section]["file"]
+        part = path.with_name(f"{path.stem}.part{path.suffix}")
+        write_table(part, columns)
+        part.replace(path)
+    part = folder / f"{TOML_NAME}.part"
+    with part.open("wb") as stream:
+        tomli_w.dump(settings, stream)
+        stream.flush()
+        os.fsync(stream.fileno())
+    part.replace(folder / TOML_NAME)
+
+
+def mission_settings(mission: Mission, table_format: TableFormat) -> dict[str, Any]:
+    """Return the content of ``mission.toml``."""
+    frame, suffix = mission.frame, table_format.value
+    settings: dict[str, Any] = {
+        "format": FORMAT,
+        "name": mission.name,
+        "frames": {"body": BodyAxes.FRD.value},
+        "origin": {
+            **_scaled(lat_deg=frame.lat, lon_deg=frame.lon),
+            "height_m": float(frame.height),
+        },
+        "imu": _imu_settings(mission, suffix),
+        "dvl": _dvl_settings(mission.dvl, suffix),
+    }
+    if mission.depth is not None:
+        settings["depth"] = {
+            "file": f"depth{suffix}",
+            "noise_m": float(mission.depth.sigma),
+            "lever_arm_m": mission.depth.lever_arm_b.tolist(),
+        }
+    if mission.gnss is not None:
+        settings["gnss"] = {
+            "file": f"gnss{suffix}",
+            "lever_arm_m": mission.gnss.lever_arm_b.tolist(),
+        }
+    if mission.initial is not None:
+        settings["initial"] = _initial_settings(mission.initial)
+    if mission.reference is not None:
+        settings["reference"] = {"file": f"reference{suffix}"}
+    return settings
+
+
+def mission_tables(mission: Mission) -> dict[str, dict[str, Array]]:
+    """Return the columns of every table."""
+    imu, depth, gnss = mission.imu, mission.depth, mission.gnss
+    tables = {
+        "imu": {TIME: imu.time_s, **_split(GYRO, imu.gyro_b), **_split(ACCEL, imu.accel_b)},
+        "dvl": _dvl_table(mission.dvl),
+    }
+    if depth is not None:
+        tables["depth"] = {TIME: depth.time_s, "depth_m": depth.depth}
+    if gnss is not None:
+        tables["gnss"] = {
+            TIME: gnss.time_s,
+            "lat_deg": np.degrees(gnss.lat),
+            "lon_deg": np.degrees(gnss.lon),
+            "height_m": gnss.height,
+            **_split(POSITION_SIGMA, gnss.sigma_enu),
+        }
+    if mission.reference is not None:
+        tables["reference"] = _reference_table(mission.reference)
+    return tables
+
+
+def _imu_settings(mission: Mission, suffix: str) -> dict[str, Any]:
+    noise = mission.imu.noise
+    return {
+        "file": f"imu{suffix}",
+        "stamp": Stamp.END.value,
+        **_scaled(
+            gyro_random_walk_deg_per_sqrt_h=noise.gyro_density,
+            accel_random_walk_ug_per_sqrt_hz=noise.accel_density,
+            gyro_bias_deg_per_h=noise.gyro_bias_sigma,
+            accel_bias_ug=noise.accel_bias_sigma,
+            gyro_bias_walk_deg_per_h_per_sqrt_h=noise.gyro_bias_density,
+            accel_bias_walk_ug_per_sqrt_h=noise.accel_bias_density,
+        ),
+    }
+
+
+def _dvl_settings(dvl: DvlLog, suffix: str) -> dict[str, Any]:
+    mount = dvl.mount
+    rpy = rpy_from_R_bd(mount.R_bd)
+    if not np.allclose(R_bd_from_rpy(rpy), mount.R_bd, rtol=0.0, atol=1e-9):
+        raise DataError(f"DvlMount.R_bd: expected a rotation matrix, got {mount.R_bd.tolist()}")
+    optional = {
+        "misalignment_sigma_deg": from_si("misalignment_sigma_deg", mount.misalignment_sigma),
+        "scale_sigma": float(mount.scale_sigma),
+        "time_offset_s": float(mount.time_offset_s),
+        "time_offset_sigma_s": float(mount.time_offset_sigma_s),
+    }
+    return {
+        "file": f"dvl{suffix}",
+        "beam_vectors": mount.beams_d.tolist(),
+        "beam_noise_m_per_s": _common_noise(dvl),
+        "lever_arm_m": mount.lever_arm_b.tolist(),
+        "mounting_rpy_deg": _degrees(rpy),
+        **{key: value for key, value in optional.items() if value},
+    }
+
+
+def _common_noise(dvl: DvlLog) -> float:
+    return float(np.median(dvl.sigma)) if dvl.sigma.size else _NOISE_OF_EMPTY_LOG
+
+
+def _dvl_table(dvl: DvlLog) -> dict[str, Array]:
+    columns = {TIME: dvl.time_s, **_split(SPEED, dvl.speed)}
+    if np.any(dvl.sigma != _common_noise(dvl)):
+        columns |= _split(SPEED_SIGMA, dvl.sigma)
+    if dvl.range_m is not None:
+        columns |= _split(RANGE, dvl.range_m)
+    return columns
+
+
+def _initial_settings(initial: InitialState) -> dict[str, Any]:
+    return {
+        "time_s": float(initial.time_s),
+        **_scaled(lat_deg=initial.lat, lon_deg=initial.lon),
+        "height_m": float(initial.height),
+        "vel_enu_m_per_s": initial.velocity_enu.tolist(),
+        **_scaled(roll_deg=initial.roll, pitch_deg=initial.pitch, heading_deg=initial.heading),
+        "position_sigma_m": initial.position_sigma_enu.tolist(),
+        "velocity_sigma_m_per_s": initial.velocity_sigma_enu.tolist(),
+        "attitude_sigma_deg": _degrees(initial.attitude_sigma),
+    }
+
+
+def _reference_table(reference: Reference) -> dict[str, Array]:
+    columns = {
+        TIME: reference.time_s,
+        "lat_deg": np.degrees(reference.lat),
+        "lon_deg": np.degrees(reference.lon),
+        "height_m": reference.height,
+    }
+    if np.isfinite(reference.velocity_enu).any():
+        columns |= _split(VELOCITY, reference.velocity_enu)
+    if np.isfinite(reference.roll_pitch_heading).any():
+        columns |= _split(ATTITUDE, np.degrees(reference.roll_pitch_heading))
+    return columns
+
+
+def _scaled(**values: float) -> dict[str, float]:
+    return {key: from_si(key, float(value)) for key, value in values.items()}
+
+
+def _degrees(angles: Array) -> list[float]:
+    return [from_si("roll_deg", float(angle)) for angle in angles]
+
+
+def _split(names: tuple[str, ...], values: Array) -> dict[str, Array]:
+    return {name: values[:, index] for index, name in enumerate(names)}

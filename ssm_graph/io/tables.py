@@ -1,0 +1,244 @@
+"""Sensor tables of a mission folder, CSV or Parquet, with every defect named by file and line."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ssm_graph.data import Array
+from ssm_graph.errors import ConfigError, DataError, MissingExtraError, nearest_hint
+from ssm_graph.io.csv_tables import (
+    CsvFile,
+    check_is_text,
+    check_last_line,
+    read_csv_header,
+    read_csv_values,
+    write_csv,
+)
+
+_LARGEST_TIME_S = 1e20
+
+
+class TableFormat(Enum):
+    """File format of a table; the value is the ending of its name."""
+
+    CSV = ".csv"
+    PARQUET = ".parquet"
+
+
+@dataclass(frozen=True, slots=True)
+class TableSpec:
+    """The columns of one kind of table."""
+
+    required: tuple[str, ...]
+    optional: tuple[str, ...] = ()
+    blank: frozenset[str] = frozenset()
+    """Required columns whose cells may be empty or NaN; the optional ones always may."""
+
+    @property
+    def may_be_blank(self) -> frozenset[str]:
+        """All columns that may hold NaN."""
+        return self.blank | frozenset(self.optional)
+
+
+@dataclass(frozen=True, slots=True)
+class ParquetFile:
+    """One Parquet file: where it is, and how messages call it."""
+
+    path: Path
+    label: str
+
+    def place(self, row: int) -> str:
+        """Return file and row, counted from 1."""
+        return f"{self.label}: row {row + 1}"
+
+    def cell(self, row: int, column: str) -> str:
+        """Return the value of one cell as text."""
+        value = _pyarrow("pyarrow.parquet").read_table(self.path, columns=[column])[0][row].as_py()
+        return "null" if value is None else str(value)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Table:
+    """The columns of one sensor table, in the units of the file."""
+
+    file: CsvFile | ParquetFile
+    columns: dict[str, Array]
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    def __getitem__(self, name: str) -> Array:
+        return self.columns[name]
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.columns
+
+    @property
+    def label(self) -> str:
+        """The file's name as ``mission.toml`` gives it."""
+        return self.file.label
+
+    @property
+    def time_s(self) -> Array:
+        """(N,) the column ``time_s``."""
+        return self.columns["time_s"]
+
+    def stack(self, names: Sequence[str]) -> Array:
+        """Return columns side by side, (N, len(names)); NaN where the table has no such column."""
+        missing = np.full(len(self), np.nan)
+        return np.column_stack([self.columns.get(name, missing) for name in names])
+
+    def fault(self, row: int, text: str) -> DataError:
+        """Return an error that names the line of ``row``."""
+        return DataError(f"{self.file.place(row)}: {text}")
+
+    def cell_fault(self, row: int, column: str, text: str) -> DataError:
+        """Return an error that names line, column and content of a cell."""
+        return self.fault(row, f"column {column!r} holds {self.file.cell(row, column)}; {text}")
+
+
+def read_table(path: Path, label: str, spec: TableSpec) -> Table:
+    """Read one table and check what needs no knowledge of the sensor.
+
+    Parameters
+    ----------
+    path : the file; its ending decides the format.
+    label : its name in messages.
+    spec : the columns it must and may have.
+
+    Raises
+    ------
+    DataError
+        For a file that is no table, a missing, unknown or repeated column, a cell that is no
+        finite number, and times that do not increase; the message names the line.
+    """
+    try:
+        form = TableFormat(path.suffix.lower())
+    except ValueError:
+        raise ConfigError(
+            f"{label}: expected a name that ends in .csv or .parquet, got {path.suffix!r}; "
+            "convert the table"
+        ) from None
+    try:
+        table = (_read_csv if form is TableFormat.CSV else _read_parquet)(path, label, spec)
+    except OSError as error:
+        raise DataError(f"{label}: cannot be read: {error.strerror or error}") from error
+    _check_finite(table, spec)
+    _check_increasing(table)
+    return table
+
+
+def write_table(path: Path, columns: dict[str, Array]) -> None:
+    """Write columns to CSV or Parquet, by the ending of ``path``, without loss of a bit."""
+    if TableFormat(path.suffix) is TableFormat.CSV:
+        write_csv(path, columns)
+    else:
+        table = _pyarrow("pyarrow").table({name: np.array(v) for name, v in columns.items()})
+        _pyarrow("pyarrow.parquet").write_table(table, path)
+
+
+def _read_csv(path: Path, label: str, spec: TableSpec) -> Table:
+    file = CsvFile(path, label)
+    check_is_text(file)
+    names = read_csv_header(file)
+    _check_names(f"{label}:1", names, spec)
+    values = read_csv_values(file, names, blank=spec.may_be_blank)
+    note = check_last_line(file) if len(values) else None
+    columns = {name: values[:, index] for index, name in enumerate(names)}
+    return Table(file, columns, (note,) if note else ())
+
+
+def _read_parquet(path: Path, label: str, spec: TableSpec) -> Table:
+    arrow, parquet = _pyarrow("pyarrow"), _pyarrow("pyarrow.parquet")
+    try:
+        schema = parquet.read_schema(path)
+        _check_names(label, schema.names, spec)
+        for field in schema:
+            kind = arrow.types
+            if not (kind.is_integer(field.type) or kind.is_floating(field.type)):
+                raise DataError(
+                    f"{label}: column {field.name!r} holds values of type {field.type}; "
+                    "expected numbers; write it as double"
+                )
+        data = parquet.read_table(path)
+        columns = {
+            name: np.asarray(data[name].cast(arrow.float64(), safe=False).to_numpy())
+            for name in schema.names
+        }
+    except arrow.ArrowException as error:
+        raise DataError(
+            f"{label}: expected a Parquet table, got {str(error).splitlines()[0]!r}; "
+            "was the file cut off, or is it another format?"
+        ) from error
+    return Table(ParquetFile(path, label), columns)
+
+
+def _pyarrow(module: str) -> Any:
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise MissingExtraError(
+            "pyarrow", extra="parquet", purpose="reading or writing Parquet tables"
+        ) from error
+
+
+def _check_names(place: str, names: Iterable[str], spec: TableSpec) -> None:
+    counts = Counter(names)
+    known = (*spec.required, *spec.optional)
+    repeated = [name for name, count in counts.items() if count > 1]
+    if repeated:
+        raise DataError(
+            f"{place}: column {repeated[0]!r} appears {counts[repeated[0]]} times; expected once; "
+            "delete or rename the others"
+        )
+    for name in counts:
+        if name not in known:
+            missing = [column for column in known if column not in counts]
+            hint = nearest_hint(name, missing or known)
+            raise DataError(f"{place}: unknown column {name!r}; {hint}")
+    for name in spec.required:
+        if name not in counts:
+            raise DataError(
+                f"{place}: column {name!r} is missing; expected {', '.join(spec.required)}"
+            )
+
+
+def _check_finite(table: Table, spec: TableSpec) -> None:
+    for name, values in table.columns.items():
+        bad = np.isinf(values) if name in spec.may_be_blank else ~np.isfinite(values)
+        if bad.any():
+            row = int(np.argmax(bad))
+            hint = "leave the cell empty" if name in spec.may_be_blank else "delete this row"
+            raise table.cell_fault(row, name, f"expected a finite number; {hint}")
+    if len(table) and np.abs(table.time_s).max() > _LARGEST_TIME_S:
+        row = int(np.argmax(np.abs(table.time_s)))
+        raise table.cell_fault(row, "time_s", "expected seconds; correct or delete this row")
+
+
+def _check_increasing(table: Table) -> None:
+    step = np.diff(table.time_s)
+    if np.all(step > 0.0):
+        return
+    row = int(np.argmax(step <= 0.0)) + 1
+    count = int(np.sum(step <= 0.0))
+    also = f" ({count} such rows in all)" if count > 1 else ""
+    now, before = table.time_s[row], table.time_s[row - 1]
+    if now < before:
+        raise table.fault(
+            row,
+            f"time_s goes back from {before:.6f} to {now:.6f}{also}; expected increasing times; "
+            "sort the rows by time, and split the mission where the clock was set back",
+        )
+    same = all(v[row] == v[row - 1] or np.isnan(v[row]) for v in table.columns.values())
+    what = "the row before is repeated" if same else f"time_s repeats {now:.6f}"
+    hint = "delete the copies" if same else "write the times with more digits, or delete one"
+    raise table.fault(row, f"{what}{also}; expected increasing times; {hint}")

@@ -1,0 +1,136 @@
+"""What a Doppler velocity log reads: the motion of the instrument itself along its beams."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ssm_graph.data import N_BEAMS, Array, DvlMount
+from ssm_graph.earth import geodetic_from_ecef
+from ssm_graph.simulation._checks import require, require_not_negative, require_positive
+from ssm_graph.simulation.taylor import Series
+from ssm_graph.simulation.trajectory import Motion, Trajectory, Vector, stacked
+
+_AZIMUTHS = tuple(math.radians(degrees) for degrees in (45.0, 135.0, 225.0, 315.0))
+
+
+def janus_beams(
+    *,
+    azimuth: Sequence[float] = _AZIMUTHS,
+    janus: float = math.radians(30.0),
+) -> Array:
+    """Return unit beam directions (4, 3) in instrument axes, x forward mark, y starboard, z down.
+
+    Each beam is the z axis, tilted by ``janus`` towards x and then turned by its azimuth from x
+    towards y, rad.
+    """
+    angles = np.column_stack([azimuth, np.full(len(azimuth), janus)])
+    return np.asarray(Rotation.from_euler("ZY", angles).apply([0.0, 0.0, 1.0]))
+
+
+def default_mount() -> DvlMount:
+    """Return a 30-degree Janus array, 0.5 m ahead of the IMU and 0.3 m below, slightly askew."""
+    askew = Rotation.from_euler("ZYX", np.radians([2.0, -1.0, 0.5]))
+    return DvlMount(
+        beams_d=janus_beams(), R_bd=askew.as_matrix(), lever_arm_b=np.array([0.5, 0.0, 0.3])
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class DvlSettings:
+    """The instrument, and in which ways it differs from what is written about it."""
+
+    mount: DvlMount = field(default_factory=default_mount)
+    """The geometry as written into the mission."""
+    rate_hz: float = 1.0
+    """Pings per second."""
+    first_s: float | None = None
+    """Time of the first ping, s; None for one interval after the start."""
+    jitter_s: float = 0.0
+    """Each ping is early or late by up to this much, uniformly; its stamp is true."""
+    noise: float = 0.005
+    """Standard deviation of a beam speed, m/s."""
+    scale_error: float = 0.0
+    """Speeds are read ``1 + scale_error`` too large."""
+    misalignment: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Rotation vector, rad, by which the true mounting differs: ``R_bd_true = R_bd Exp(m)``."""
+    late_s: float = 0.0
+    """Stamps are later than the pings by this much, s."""
+    seabed_depth_m: float | None = None
+    """Depth of a level sea floor; given, ranges are written as well."""
+
+    def __post_init__(self) -> None:
+        require_positive("DvlSettings.rate_hz", self.rate_hz, hint="try 1 Hz")
+        require_positive("DvlSettings.noise", self.noise, hint="try 0.005 m/s")
+        require_not_negative("DvlSettings.jitter_s", self.jitter_s, hint="try 0.02 s")
+        require(
+            self.jitter_s < 0.5 / self.rate_hz,
+            "DvlSettings.jitter_s",
+            expected=f"less than half an interval, {0.5 / self.rate_hz} s",
+            got=self.jitter_s,
+            hint="pings must stay in order",
+        )
+        require(
+            abs(self.scale_error) < 1.0,
+            "DvlSettings.scale_error",
+            expected="a relative error below 1",
+            got=self.scale_error,
+            hint="write 2 % as 0.02",
+        )
+
+
+def ping_times(settings: DvlSettings, *, end_s: float, rng: np.random.Generator | None) -> Array:
+    """Return when the pings happen, s, within ``(0, end_s]``; None draws no jitter."""
+    interval = 1.0 / settings.rate_hz
+    first = interval if settings.first_s is None else settings.first_s
+    count = max(math.floor((end_s - first) * settings.rate_hz + 1e-9) + 1, 0)
+    # A quotient, not a multiple of a rounded interval: whole seconds stay whole.
+    time_s = first + np.arange(count) / settings.rate_hz
+    if rng is not None and settings.jitter_s > 0.0:
+        time_s = time_s + rng.uniform(-settings.jitter_s, settings.jitter_s, size=count)
+    return time_s[(time_s > 0.0) & (time_s <= end_s)]
+
+
+def true_beam_speeds(trajectory: Trajectory, settings: DvlSettings, time_s: Array) -> Array:
+    """Return how fast the instrument moves along each of its beams (N, 4), m/s, over ground.
+
+    The instrument's path over the Earth is differentiated as it is; ``v + omega x l`` is nowhere
+    used.
+    """
+    motion = trajectory.at(time_s)
+    x, y, z = motion.point_e(settings.mount.lever_arm_b)
+    v_e: Vector = (Series([x.rate]), Series([y.rate]), Series([z.rate]))
+    v_b = stacked(motion.body_from_earth(v_e))
+    return np.asarray(v_b @ _true_beams_b(settings).T * (1.0 + settings.scale_error))
+
+
+def beam_ranges(trajectory: Trajectory, settings: DvlSettings, time_s: Array) -> Array:
+    """Return the range (N, 4) along each beam to a level sea floor, m; NaN if it never meets it."""
+    seabed = math.nan if settings.seabed_depth_m is None else settings.seabed_depth_m
+    motion = trajectory.at(time_s)
+    _, _, height = geodetic_from_ecef(stacked(motion.point_e(settings.mount.lever_arm_b)))
+    down = np.empty((len(time_s), N_BEAMS))
+    for beam, direction in enumerate(_true_beams_b(settings)):
+        down[:, beam] = _down_part(motion, direction)
+    altitude = seabed + height[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = altitude / down
+    return np.where((down > 0.0) & (altitude > 0.0), distance, np.nan)
+
+
+def _true_beams_b(settings: DvlSettings) -> Array:
+    """Return the beams (4, 3) in body axes as they really point."""
+    R_dd = Rotation.from_rotvec(settings.misalignment).as_matrix()
+    return np.asarray(settings.mount.beams_d @ (settings.mount.R_bd @ R_dd).T)
+
+
+def _down_part(motion: Motion, direction_b: Array) -> Array:
+    """Return the downward component of a direction fixed to the body."""
+    v: Vector = tuple(Series([np.array(c)]) for c in direction_b)  # type: ignore[assignment]
+    for turn in reversed(motion.to_body):
+        v = turn.forward(v)
+    return v[2].value

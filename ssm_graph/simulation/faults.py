@@ -1,0 +1,233 @@
+"""What goes wrong with DVL beams: outliers of six kinds, programmed faults, dropouts, losses.
+
+An outlier is an offset added to a beam's speed; a dropout or a loss takes the beam away. Events
+are placed at random from the generator handed in, programmed faults exactly where they are asked
+for.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from types import MappingProxyType
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ssm_graph.data import N_BEAMS, Array
+from ssm_graph.simulation._checks import (
+    require,
+    require_beams,
+    require_fraction,
+    require_window,
+)
+
+Mask = NDArray[np.bool_]
+
+_SILT_RISE_S = 60.0
+
+
+class OutlierKind(Enum):
+    """How random outliers come; ``rate`` is always the fraction of pings that they touch."""
+
+    NONE = "no outliers"
+    SPARSE = "one random beam of random pings"
+    BURST = "one random beam for 5 to 20 s at a constant offset"
+    ONE_BEAM = "the same beam in random pings"
+    TWO_BEAMS = "two random beams of random pings, independent offsets"
+    SILT = "one random beam drifts off within a minute, stays for tens of seconds, snaps back"
+    BLOCKED = "one random beam reads zero for 5 to 20 s"
+
+
+DEFAULT_SIZE: Final[Mapping[OutlierKind, tuple[float, float]]] = MappingProxyType(
+    {kind: (0.15, 0.3) if kind is OutlierKind.SILT else (0.5, 3.0) for kind in OutlierKind}
+)
+"""Smallest and largest absolute offset, m/s, drawn uniformly; the sign is drawn as well."""
+
+_EVENT_S: Final[Mapping[OutlierKind, tuple[float, float]]] = MappingProxyType(
+    {
+        OutlierKind.BURST: (5.0, 20.0),
+        OutlierKind.BLOCKED: (5.0, 20.0),
+        OutlierKind.SILT: (80.0, 140.0),
+    }
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Outliers:
+    """Random outliers of one kind."""
+
+    kind: OutlierKind = OutlierKind.NONE
+    rate: float = 0.1
+    """Fraction of pings with an outlier; of the time, for kinds that come as events."""
+    size: tuple[float, float] | None = None
+    """Smallest and largest absolute offset, m/s; None for that of the kind."""
+    beam: int | None = None
+    """The beam that suffers, from 0; None draws it. Not for TWO_BEAMS."""
+
+    def __post_init__(self) -> None:
+        require_fraction("Outliers.rate", self.rate)
+        low, high = self.low_high
+        require(
+            0.0 <= low <= high < math.inf,
+            "Outliers.size",
+            expected="0 <= low <= high, m/s",
+            got=self.size,
+            hint="sizes are absolute values, the sign is drawn",
+        )
+        if self.beam is not None:
+            require_beams("Outliers.beam", (self.beam,), N_BEAMS)
+
+    @property
+    def low_high(self) -> tuple[float, float]:
+        """The size, m/s, by default that of the kind."""
+        return DEFAULT_SIZE[self.kind] if self.size is None else self.size
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """A constant offset of some beams in ``[start_s, end_s)``."""
+
+    beams: tuple[int, ...]
+    """Beams from 0."""
+    start_s: float
+    end_s: float
+    offset_m_per_s: float | tuple[float, ...]
+    """m/s, one for all or one for each of ``beams``."""
+
+    def __post_init__(self) -> None:
+        require_beams("Fault.beams", self.beams, N_BEAMS)
+        require_window("Fault", self.start_s, self.end_s)
+        size = np.size(self.offset_m_per_s)
+        require(
+            size in (1, len(self.beams)),
+            "Fault.offset_m_per_s",
+            expected=f"1 or {len(self.beams)} offsets",
+            got=self.offset_m_per_s,
+            hint="give one offset for all beams or one for each",
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Loss:
+    """No bottom lock of some beams in ``[start_s, end_s)``."""
+
+    start_s: float
+    end_s: float
+    beams: tuple[int, ...] = (0, 1, 2, 3)
+    """Beams from 0; all by default."""
+
+    def __post_init__(self) -> None:
+        require_window("Loss", self.start_s, self.end_s)
+        require_beams("Loss.beams", self.beams, N_BEAMS)
+
+
+class BeamFaults(NamedTuple):
+    """What was done to the beams of every ping."""
+
+    offset: Array
+    """(N, 4) m/s added to the speed."""
+    is_outlier: Mask
+    """(N, 4) True where an outlier or fault acts, even where its offset happens to be tiny."""
+
+
+def draw_outliers(
+    outliers: Outliers, time_s: Array, speed: Array, *, rng: np.random.Generator
+) -> BeamFaults:
+    """Draw random outliers for pings at ``time_s`` (N,) whose clean speeds are ``speed`` (N, 4)."""
+    offset, mask = np.zeros(speed.shape), np.zeros(speed.shape, dtype=bool)
+    if outliers.kind is OutlierKind.NONE or len(time_s) == 0:
+        return BeamFaults(offset, mask)
+    if outliers.kind in _EVENT_S:
+        _add_events(outliers, time_s, offset, mask, rng=rng)
+        if outliers.kind is OutlierKind.BLOCKED:
+            offset[mask] = -speed[mask]
+        return BeamFaults(offset, mask)
+    chosen = rng.choice(len(time_s), size=round(outliers.rate * len(time_s)), replace=False)
+    beams = _pick_beams(outliers.kind, len(chosen), rng=rng)
+    if outliers.beam is not None and outliers.kind is not OutlierKind.TWO_BEAMS:
+        beams = np.full_like(beams, outliers.beam)
+    mask[chosen[:, None], beams] = True
+    offset[chosen[:, None], beams] = _draw_offsets(outliers, beams.shape, rng=rng)
+    return BeamFaults(offset, mask)
+
+
+def _pick_beams(kind: OutlierKind, n_pings: int, *, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Return the beams (n_pings, 1 or 2) that suffer in pings chosen before."""
+    if kind is OutlierKind.SPARSE:
+        return rng.integers(N_BEAMS, size=(n_pings, 1))
+    if kind is OutlierKind.ONE_BEAM:
+        return np.full((n_pings, 1), rng.integers(N_BEAMS))
+    return rng.permuted(np.tile(np.arange(N_BEAMS), (n_pings, 1)), axis=1)[:, :2]
+
+
+def _draw_offsets(outliers: Outliers, shape: tuple[int, ...], *, rng: np.random.Generator) -> Array:
+    """Return offsets of either sign, m/s, uniform in absolute value."""
+    low, high = outliers.low_high
+    return rng.choice([-1.0, 1.0], size=shape) * rng.uniform(low, high, size=shape)
+
+
+def _add_events(
+    outliers: Outliers, time_s: Array, offset: Array, mask: Mask, *, rng: np.random.Generator
+) -> None:
+    """Fill offsets and mask, both our own, with events of one beam each."""
+    for start_s, end_s in _place_events(outliers, time_s, rng=rng):
+        beam = int(rng.integers(N_BEAMS)) if outliers.beam is None else outliers.beam
+        size = float(_draw_offsets(outliers, (1,), rng=rng)[0])
+        inside = (start_s <= time_s) & (time_s < end_s)
+        mask[inside, beam] = True
+        if outliers.kind is OutlierKind.SILT:
+            age = np.clip((time_s[inside] - start_s) / _SILT_RISE_S, 0.0, 1.0)
+            offset[inside, beam] = size * age
+        else:
+            offset[inside, beam] = size
+
+
+def _place_events(
+    outliers: Outliers, time_s: Array, *, rng: np.random.Generator
+) -> list[tuple[float, float]]:
+    """Return disjoint windows that fill the fraction ``rate`` of the time between the pings.
+
+    Lengths are drawn until they suffice, the last one is cut; what is left of the time is shared
+    out at random between them.
+    """
+    step = (time_s[-1] - time_s[0]) / max(len(time_s) - 1, 1)
+    total = len(time_s) * step
+    wanted = outliers.rate * total
+    lengths: list[float] = []
+    while sum(lengths) < wanted:
+        length = rng.uniform(*_EVENT_S[outliers.kind])
+        lengths.append(min(length, wanted - sum(lengths)))
+        if lengths[-1] < step:  # a rest too short for a ping
+            lengths.pop()
+            break
+    gaps = np.sort(rng.uniform(0.0, max(total - sum(lengths), 0.0), size=len(lengths)))
+    starts = time_s[0] + gaps + np.concatenate([[0.0], np.cumsum(lengths)[:-1]])[: len(lengths)]
+    return [(start, start + length) for start, length in zip(starts, lengths, strict=True)]
+
+
+def add_faults(drawn: BeamFaults, faults: Sequence[Fault], time_s: Array) -> BeamFaults:
+    """Return ``drawn`` with the programmed faults added."""
+    offset, mask = drawn.offset.copy(), drawn.is_outlier.copy()
+    for fault in faults:
+        inside = (fault.start_s <= time_s) & (time_s < fault.end_s)
+        added = np.broadcast_to(fault.offset_m_per_s, len(fault.beams))
+        for beam, beam_offset in zip(fault.beams, added, strict=True):
+            offset[inside, beam] += beam_offset
+            mask[inside, beam] = True
+    return BeamFaults(offset, mask)
+
+
+def draw_missing(
+    time_s: Array, losses: Sequence[Loss], *, dropout_rate: float, rng: np.random.Generator
+) -> Mask:
+    """Return which beams (N, 4) have no bottom lock: each at ``dropout_rate``, and the losses."""
+    missing = rng.random((len(time_s), N_BEAMS)) < dropout_rate
+    for loss in losses:
+        inside = (loss.start_s <= time_s) & (time_s < loss.end_s)
+        for beam in loss.beams:
+            missing[inside, beam] = True
+    return missing

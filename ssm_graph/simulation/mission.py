@@ -1,0 +1,163 @@
+"""Put trajectory, sensors and faults together: a mission as recorded, and the truth behind it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ssm_graph.data import Array, DvlLog, ImuLog, Mission, Reference
+from ssm_graph.earth import LocalFrame
+from ssm_graph.simulation.aids import depth_log, gnss_log
+from ssm_graph.simulation.config import SimulationConfig
+from ssm_graph.simulation.dvl_model import beam_ranges, ping_times, true_beam_speeds
+from ssm_graph.simulation.faults import add_faults, draw_missing, draw_outliers
+from ssm_graph.simulation.grades import initial_state
+from ssm_graph.simulation.imu_model import averaged_imu, imu_errors
+from ssm_graph.simulation.streams import Streams, spawn_streams
+from ssm_graph.simulation.trajectory import Trajectory
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class SimulatedMission:
+    """A mission as an estimator may see it, and everything that it may not."""
+
+    config: SimulationConfig
+    mission: Mission
+    """The recorded run; its reference is the truth at ``config.reference_rate_hz``."""
+    is_outlier: NDArray[np.bool_]
+    """(N, 4) beams that an outlier or fault acts on; False where the beam is missing."""
+    beam_offset: Array
+    """(N, 4) what outliers and faults added to the speeds, m/s."""
+    true_speed: Array
+    """(N, 4) beam speeds without noise, outliers, faults or losses, m/s."""
+    ping_time_s: Array
+    """(N,) when the pings really happened, s."""
+    gyro_bias: Array
+    """(M, 3) true gyro bias of each IMU sample, rad/s."""
+    accel_bias: Array
+    """(M, 3) true accelerometer bias of each IMU sample, m/s^2."""
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The closed-form motion."""
+        return self.config.trajectory
+
+    def truth_at(self, time_s: ArrayLike) -> Reference:
+        """Return the true position, velocity and attitude at any times, s."""
+        return self.trajectory.truth(time_s)
+
+    def without_outliers(self) -> Mission:
+        """Return the mission of the oracle, who is told the bad beams: they are missing."""
+        dvl = self.mission.dvl
+        speed = np.where(self.is_outlier, np.nan, dvl.speed)
+        return dataclasses.replace(self.mission, dvl=dataclasses.replace(dvl, speed=speed))
+
+
+def simulate(config: SimulationConfig) -> SimulatedMission:
+    """Simulate a mission; the same settings give the same mission, bit by bit."""
+    streams = spawn_streams(config.seed)
+    n_samples = math.floor(config.duration_s * config.imu_rate_hz + 1e-9)
+    end_s = n_samples / config.imu_rate_hz
+    imu, gyro_bias, accel_bias = _imu(config, streams, n_samples)
+    dvl = _dvl(config, streams, end_s)
+    truth = config.trajectory.truth(_reference_times(config, end_s))
+    noisy = not config.perfect_sensors
+    mission = Mission(
+        name=config.name,
+        frame=LocalFrame(lat=config.lat, lon=config.lon, height=0.0),
+        imu=imu,
+        dvl=dvl.log,
+        depth=None
+        if config.depth is None
+        else depth_log(
+            config.trajectory, config.depth, end_s=end_s, rng=streams.depth if noisy else None
+        ),
+        gnss=None
+        if config.gnss is None
+        else gnss_log(
+            config.trajectory, config.gnss, end_s=end_s, rng=streams.gnss if noisy else None
+        ),
+        initial=initial_state(
+            truth,
+            config.initial_sigmas,
+            rng=streams.initial if config.draw_initial_errors else None,
+        ),
+        reference=truth,
+    )
+    return SimulatedMission(
+        config=config,
+        mission=mission,
+        is_outlier=dvl.is_outlier,
+        beam_offset=dvl.offset,
+        true_speed=dvl.true_speed,
+        ping_time_s=dvl.time_s,
+        gyro_bias=gyro_bias,
+        accel_bias=accel_bias,
+    )
+
+
+def _reference_times(config: SimulationConfig, end_s: float) -> Array:
+    """Return regular times from 0, and the end itself."""
+    count = math.floor(end_s * config.reference_rate_hz + 1e-9)
+    time_s = np.arange(count + 1) / config.reference_rate_hz
+    return time_s if end_s - time_s[-1] < 1e-9 else np.append(time_s, end_s)
+
+
+def _imu(config: SimulationConfig, streams: Streams, n_samples: int) -> tuple[ImuLog, Array, Array]:
+    """Return the readings and the true biases in them."""
+    rate_hz = config.imu_rate_hz
+    gyro_b, accel_b = averaged_imu(config.trajectory, rate_hz=rate_hz, n_samples=n_samples)
+    gyro_bias, accel_bias = np.zeros_like(gyro_b), np.zeros_like(accel_b)
+    if not config.perfect_sensors:
+        gyro, accel = imu_errors(
+            config.noise, rate_hz=rate_hz, n_samples=n_samples, streams=streams
+        )
+        gyro_bias, accel_bias = gyro.bias, accel.bias
+        gyro_b += gyro.bias + gyro.noise
+        accel_b += accel.bias + accel.noise
+    log = ImuLog(
+        start_s=0.0,
+        noise=config.noise,
+        time_s=np.arange(1, n_samples + 1) / rate_hz,
+        gyro_b=gyro_b,
+        accel_b=accel_b,
+    )
+    return log, gyro_bias, accel_bias
+
+
+class _Dvl(NamedTuple):
+    log: DvlLog
+    time_s: Array
+    true_speed: Array
+    offset: Array
+    is_outlier: NDArray[np.bool_]
+
+
+def _dvl(config: SimulationConfig, streams: Streams, end_s: float) -> _Dvl:
+    """Return the pings as read, and what was done to them."""
+    settings = config.dvl
+    time_s = ping_times(settings, end_s=end_s, rng=streams.ping_time)
+    true_speed = true_beam_speeds(config.trajectory, settings, time_s)
+    drawn = draw_outliers(config.outliers, time_s, true_speed, rng=streams.outliers)
+    offset, is_outlier = add_faults(drawn, config.faults, time_s)
+    missing = draw_missing(
+        time_s, config.losses, dropout_rate=config.dropout_rate, rng=streams.dropouts
+    )
+    speed = true_speed + offset
+    if not config.perfect_sensors:
+        speed = speed + settings.noise * streams.beam_noise.standard_normal(speed.shape)
+    ranges = None
+    if settings.seabed_depth_m is not None:
+        ranges = np.where(missing, np.nan, beam_ranges(config.trajectory, settings, time_s))
+    log = DvlLog(
+        mount=settings.mount,
+        time_s=time_s + settings.late_s,
+        speed=np.where(missing, np.nan, speed),
+        sigma=np.full(speed.shape, settings.noise),
+        range_m=ranges,
+    )
+    return _Dvl(log, time_s, true_speed, offset, is_outlier & ~missing)

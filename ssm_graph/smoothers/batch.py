@@ -1,0 +1,184 @@
+"""The batch smoother: similarity weights for every beam by iteratively reweighted least squares."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import NamedTuple
+
+import numpy as np
+
+from factors.similarity import GaussianKernel, Kernel, LogKernel, expected_mahalanobis_sq
+from ssm_graph.data import Array
+from ssm_graph.errors import ConfigError, SolverError
+from ssm_graph.estimate import BeamTable, Estimate, Iteration, Status
+from ssm_graph.graph.first_values import first_values
+from ssm_graph.graph.linearize import BeamRows, GraphLinearizer
+from ssm_graph.graph.problem import Problem
+from ssm_graph.graph.solve import chain_ordering, marginal_covariances, solve_linear
+from ssm_graph.graph.states import States, retract
+from ssm_graph.graph.trajectory import trajectory_from_states
+from ssm_graph.smoothers.verdict import judge
+
+OnIteration = Callable[[int, int, Iteration], None]
+"""Called after each iteration with its number, the limit, and what happened."""
+
+WARM_KERNEL = LogKernel()
+"""Kernel of the first pass and of the first iterations, whichever is asked for in the end."""
+WARM_UPDATE_SIGMAS = 1.0
+"""The kernel asked for takes over once the updates are below this."""
+RUNAWAY_SPEED = 100.0
+"""m/s; no underwater vehicle does that."""
+
+
+class Similarity(Enum):
+    """What the weight of a beam is judged by."""
+
+    EXPECTED = "residual and posterior variance"
+    PLAIN = "residual alone: the plain M-estimator"
+
+
+@dataclass(frozen=True, slots=True)
+class SmootherConfig:
+    """Settings of the similarity loop."""
+
+    kernel: Kernel = field(default_factory=LogKernel)
+    similarity: Similarity = Similarity.EXPECTED
+    max_iterations: int = 50
+    tolerance: float = 1e-3
+    """Updates in their own posterior sigmas, and changes of weights, below which it has settled."""
+
+    def __post_init__(self) -> None:
+        if self.max_iterations < 1:
+            raise ConfigError(f"max_iterations: expected 1 or more, got {self.max_iterations}")
+        if not 0.0 < self.tolerance < 1.0:
+            raise ConfigError(f"tolerance: expected a number in (0, 1), got {self.tolerance}")
+
+
+class _Pass(NamedTuple):
+    """State of the loop after one iteration."""
+
+    states: States
+    covariance: Array
+    beam_rows: BeamRows
+    mahalanobis_sq: Array
+    weights: Array
+    update_sigmas: float
+    weight_change: float
+
+
+class SsmSmoother:
+    """Smooth a whole mission; see :func:`ssm_graph.build_problem` for its input."""
+
+    def __init__(self, config: SmootherConfig | None = None) -> None:
+        self.config = config or SmootherConfig()
+
+    def solve(self, problem: Problem, *, on_iteration: OnIteration | None = None) -> Estimate:
+        """Return the smoothed trajectory with the weight of every beam.
+
+        Raises
+        ------
+        SolverError
+            If no finite solution was found.
+        """
+        begin = time.perf_counter()
+        first = first_values(problem, kernel=WARM_KERNEL)
+        linearizer = GraphLinearizer(problem)
+        is_gaussian = isinstance(self.config.kernel, GaussianKernel)
+        kernel = self.config.kernel if is_gaussian else WARM_KERNEL
+        weights = np.ones_like(first.weights) if is_gaussian else first.weights
+        states, rows = first.states, linearizer.beam_rows(first.states)
+        iterations: list[Iteration] = []
+        status = Status.MAX_ITERATIONS
+        for number in range(self.config.max_iterations):
+            this = self._iterate(linearizer, states, rows, weights, kernel)
+            states, rows, weights = this.states, this.beam_rows, this.weights
+            iterations.append(Iteration(this.update_sigmas, this.weight_change, str(kernel)))
+            if on_iteration is not None:
+                on_iteration(number + 1, self.config.max_iterations, iterations[-1])
+            if kernel != self.config.kernel:
+                if this.update_sigmas < WARM_UPDATE_SIGMAS:
+                    kernel = self.config.kernel
+            elif max(this.update_sigmas, this.weight_change) < self.config.tolerance:
+                status = Status.CONVERGED
+                break
+        return self._estimate(problem, linearizer, this, iterations, status, first.n_doubts, begin)
+
+    def _iterate(
+        self,
+        linearizer: GraphLinearizer,
+        states: States,
+        rows: BeamRows,
+        weights: Array,
+        kernel: Kernel,
+    ) -> _Pass:
+        problem = linearizer.problem
+        linear = linearizer.linearize(states, rows, weights)
+        ordering = chain_ordering(problem.n_keyframes)
+        solution = solve_linear(linear, ordering, n_keyframes=problem.n_keyframes)
+        covariance = marginal_covariances(solution)
+        states, update = retract(states, solution.delta)
+        sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+        speed = float(np.max(np.abs(states.v_n)))
+        if not (np.all(np.isfinite(sigma)) and speed < RUNAWAY_SPEED):
+            raise SolverError(
+                f"{Status.DIVERGED.value}: largest velocity {speed:.3g} m/s; check time stamps and "
+                "noise of [imu], and the initial heading"
+            )
+        rows = linearizer.beam_rows(states)
+        t = self._mahalanobis_sq(problem, rows, covariance)
+        settled = kernel.weight(t)
+        change = float(np.max(np.abs(settled - weights), initial=0.0))
+        return _Pass(
+            states, covariance, rows, t, settled, float(np.max(np.abs(update) / sigma)), change
+        )
+
+    def _mahalanobis_sq(self, problem: Problem, rows: BeamRows, covariance: Array) -> Array:
+        H, beams = rows.jacobian, problem.beams
+        if self.config.similarity is Similarity.PLAIN:
+            spread = np.zeros(len(H))
+        else:
+            spread = np.einsum("mi,mij,mj->m", H, covariance[beams.keyframe], H, optimize=True)
+        return expected_mahalanobis_sq(rows.error, spread, sigma=beams.sigma)
+
+    def _estimate(
+        self,
+        problem: Problem,
+        linearizer: GraphLinearizer,
+        last: _Pass,
+        iterations: list[Iteration],
+        status: Status,
+        n_doubts: int,
+        begin: float,
+    ) -> Estimate:
+        reason = f"{status.value}: {self.config.max_iterations} iterations"
+        if status is Status.CONVERGED:
+            verdict = judge(linearizer, last.states, last.weights)
+            status, reason = verdict.status, verdict.reason
+        notes = problem.notes
+        if n_doubts:
+            notes += (
+                f"the first pass doubted its prediction {n_doubts} times: the beams contradicted "
+                "it together",
+            )
+        beams = problem.beams
+        return Estimate(
+            method="smoother",
+            kernel=str(self.config.kernel),
+            status=status,
+            reason=reason,
+            trajectory=trajectory_from_states(problem, last.states, last.covariance),
+            beams=BeamTable(
+                time_s=problem.keyframe_s[beams.keyframe],
+                beam=(beams.beam + 1).astype(np.float64),
+                innovation=-last.beam_rows.error,
+                mahalanobis_sq=last.mahalanobis_sq,
+                weight=last.weights,
+            ),
+            iterations=tuple(iterations),
+            wall_s=time.perf_counter() - begin,
+            start=problem.start,
+            notes=notes,
+        )
