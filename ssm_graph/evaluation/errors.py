@@ -79,7 +79,7 @@ def error_series(trajectory: Trajectory, reference: Reference) -> ErrorSeries:
         position_enu=position_enu,
         velocity_enu=(trajectory.velocity_enu - velocity)[kept],
         roll_pitch_heading=wrap_to_pi(trajectory.roll_pitch_heading - angles)[kept],
-        position_sigma_enu=np.sqrt(np.diagonal(cov, axis1=1, axis2=2)),
+        position_sigma_enu=np.sqrt(np.maximum(np.diagonal(cov, axis1=1, axis2=2), 0.0)),
         velocity_sigma_enu=trajectory.velocity_sigma_enu[kept],
         attitude_sigma=trajectory.attitude_sigma[kept],
         nees_position=normalized_error_squared(position_enu, cov),

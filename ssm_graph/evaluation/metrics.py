@@ -85,8 +85,8 @@ def path_length_m(
 ) -> float:
     """Return the horizontal length of a trajectory from keyframe to keyframe, m.
 
-    Only keyframes from ``first_s`` to ``last_s`` count. Ships' motion in heave does not: the path is
-    measured along the surface of the local frame, Earth's curvature included.
+    Only keyframes from ``first_s`` to ``last_s`` count; up and down do not. Every step is taken
+    along the local level at its own begin.
     """
     kept = (trajectory.time_s >= first_s) & (trajectory.time_s <= last_s)
     lat, lon, height = (x[kept] for x in (trajectory.lat, trajectory.lon, trajectory.height))

@@ -27,7 +27,7 @@ class Interval:
 def chi2_interval(dof: int, runs: int, confidence: float = 0.95) -> Interval:
     """Return where the mean of ``nees / dof`` over independent runs lies if all is consistent.
 
-    The sum of ``runs`` NEES of dimension ``dof`` is chi-square with ``runs dof`` degrees of freedom::
+    The sum of ``runs`` NEES of dimension ``dof`` is chi-square distributed with ``runs dof``::
 
         low, high = chi2.ppf([tail, 1 - tail], runs dof) / (runs dof),  tail = (1 - confidence) / 2
 

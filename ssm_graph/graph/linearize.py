@@ -65,10 +65,18 @@ class GraphLinearizer:
         self.inertial = inertial_graph(problem)
         self.prior = prior_graph(problem)
         self.gnss = gnss_graph(problem.fixes)
+        self.depth = gtsam.NonlinearFactorGraph()
         k = problem.beams.keyframe
         self._first_beam = np.flatnonzero(np.diff(k, prepend=-1))
         self._n_rows = np.diff(np.append(self._first_beam, len(k)))
         self._unit = [gtsam.noiseModel.Unit.Create(m + 1) for m in range(4 * N_BEAMS)]
+
+    def follow(self, states: States) -> None:
+        """Let gravity and the depth targets follow the states; to be called before the others."""
+        problem = self.problem
+        problem.chain.set_gravity(states.p_n)
+        if problem.depths is not None:
+            self.depth = depth_graph(problem.depths, states, problem.frame, problem.keyframe_s)
 
     def beam_rows(self, states: States) -> BeamRows:
         """Linearise all beams at ``states``."""
@@ -86,19 +94,17 @@ class GraphLinearizer:
         self, states: States, beam_rows: BeamRows, weights: Array
     ) -> gtsam.GaussianFactorGraph:
         """Return the linear graph at ``states``, with their beam rows and weights (M,)."""
-        self.problem.chain.set_gravity(states.p_n)
         linear = self.inertial.linearize(states.values)
-        for graph in (self.prior, self.gnss, self.depth_graph(states)):
+        for graph in (self.prior, self.gnss, self.depth):
             linear.push_back(graph.linearize(states.values))
         self._push_beams(linear, beam_rows, weights)
         return linear
 
-    def depth_graph(self, states: States) -> gtsam.NonlinearFactorGraph:
-        """Return the depth factors with targets at ``states``."""
-        depths = self.problem.depths
-        if depths is None:
-            return gtsam.NonlinearFactorGraph()
-        return depth_graph(depths, states, self.problem.frame, self.problem.keyframe_s)
+    def cost(self, states: States, beam_rows: BeamRows, weights: Array) -> float:
+        """Return half the weighted sum of squares that :meth:`linearize` makes linear."""
+        graphs = (self.inertial, self.prior, self.gnss, self.depth)
+        beams = np.sum(weights * (beam_rows.error / self.problem.beams.sigma) ** 2)
+        return float(sum(graph.error(states.values) for graph in graphs) + 0.5 * beams)
 
     def _push_beams(
         self, linear: gtsam.GaussianFactorGraph, beam_rows: BeamRows, weights: Array

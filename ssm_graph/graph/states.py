@@ -10,7 +10,10 @@ from gtsam.symbol_shorthand import B, V, X
 
 from ssm_graph.data import Array, InitialState
 from ssm_graph.earth import LocalFrame
-from ssm_graph.frames import R_lb_from_roll_pitch_heading, phi_D_roll_pitch_heading
+from ssm_graph.frames import (
+    R_lb_from_roll_pitch_heading,
+    phi_D_roll_pitch_heading,
+)
 
 STATE_DIM = 15
 """Error state of a keyframe: rotation 3, position 3 (both body axes), velocity 3 (navigation
@@ -36,15 +39,23 @@ class States(NamedTuple):
 def states_from_arrays(R_nb: Array, p_n: Array, v_n: Array, bias: Array) -> States:
     """Return the states of K keyframes as both."""
     values = gtsam.Values()
-    for k in range(len(p_n)):
-        values.insert(X(k), gtsam.Pose3(gtsam.Rot3(R_nb[k]), p_n[k]))
-        values.insert(V(k), v_n[k])
-        values.insert(B(k), gtsam.imuBias.ConstantBias(bias[k, :3], bias[k, 3:]))
+    poses = np.tile(np.eye(4), (len(p_n), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = R_nb, p_n
+    for k, (pose, velocity, accel, gyro) in enumerate(
+        zip(poses, v_n, bias[:, :3], bias[:, 3:], strict=True)
+    ):
+        values.insert(X(k), gtsam.Pose3(pose))
+        values.insert(V(k), velocity)
+        values.insert(B(k), gtsam.imuBias.ConstantBias(accel, gyro))
     return States(values, R_nb, p_n, v_n, bias)
 
 
-def retract(states: States, delta: gtsam.VectorValues) -> tuple[States, Array]:
-    """Return the updated states, and the update as (K, 15)."""
+def retract(
+    states: States, delta: gtsam.VectorValues, *, scale: float = 1.0
+) -> tuple[States, Array]:
+    """Return the states moved by ``scale * delta``, and that step as (K, 15)."""
+    if scale != 1.0:
+        delta = delta.scale(scale)
     values = states.values.retract(delta)
     n_keyframes = len(states.p_n)
     # VectorValues come in key order, and symbols sort as b, v, x.
@@ -54,14 +65,14 @@ def retract(states: States, delta: gtsam.VectorValues) -> tuple[States, Array]:
     d_velocity = flat[bias_end:velocity_end].reshape(-1, 3)
     d_pose = flat[velocity_end:].reshape(-1, 6)
     poses = gtsam.utilities.extractPose3(values)
-    updated = States(
+    moved = States(
         values,
         poses[:, :9].reshape(-1, 3, 3),
         poses[:, 9:],
         states.v_n + d_velocity,
         states.bias + d_bias,
     )
-    return updated, np.hstack([d_pose, d_velocity, d_bias])
+    return moved, np.hstack([d_pose, d_velocity, d_bias])
 
 
 class InitialMoments(NamedTuple):

@@ -131,16 +131,16 @@ def _merge(theta: Array, v: Array, first: NDArray[np.intp]) -> tuple[Array, Arra
         has_piece = (step < size)[:, None]
         piece = np.minimum(first + step, len(theta) - 1)
         theta_k, v_k = theta[piece] * has_piece, v[piece] * has_piece
-        gained += turned.apply(_velocity_gain(theta_k, v_k))
+        gained += turned.apply(_left_jacobian_times(theta_k, v_k))
         turned = turned * Rotation.from_rotvec(theta_k)
     theta_all = turned.as_rotvec()
-    return theta_all, _velocity_gain_inverse(theta_all, gained)
+    return theta_all, _left_jacobian_solve(theta_all, gained)
 
 
-def _velocity_gain(theta: Array, v: Array) -> Array:
-    """Return ``int_0^1 Exp(s theta) v ds``: the left Jacobian of SO(3) applied to ``v``."""
-    angle = np.linalg.norm(theta, axis=-1, keepdims=True)
-    first = np.cross(theta, v)
+def _left_jacobian_times(phi: Array, vector: Array) -> Array:
+    """Return ``int_0^1 Exp(s phi) ds vector``: the left Jacobian of SO(3) times (..., 3)."""
+    angle = np.linalg.norm(phi, axis=-1, keepdims=True)
+    first = np.cross(phi, vector)
     # (1 - cos a) / a^2 and (a - sin a) / a^3, without cancellation.
     half_sinc_sq = 0.5 * np.sinc(0.5 * angle / np.pi) ** 2
     cubic = np.where(
@@ -148,16 +148,16 @@ def _velocity_gain(theta: Array, v: Array) -> Array:
         (1.0 - angle**2 / 20.0) / 6.0,
         (angle - np.sin(angle)) / np.maximum(angle, 1e-9) ** 3,
     )
-    return np.asarray(v + half_sinc_sq * first + cubic * np.cross(theta, first))
+    return np.asarray(vector + half_sinc_sq * first + cubic * np.cross(phi, first))
 
 
-def _velocity_gain_inverse(theta: Array, gained: Array) -> Array:
-    """Return ``v`` such that ``_velocity_gain(theta, v) = gained``."""
-    angle = np.linalg.norm(theta, axis=-1, keepdims=True)
+def _left_jacobian_solve(phi: Array, vector: Array) -> Array:
+    """Return ``x`` such that ``_left_jacobian_times(phi, x) = vector``, (..., 3)."""
+    angle = np.linalg.norm(phi, axis=-1, keepdims=True)
     half = np.maximum(0.5 * angle, 1e-9)
     # (1 - a/2 cot(a/2)) / a^2
     factor = np.where(
         angle < 1e-2, (1.0 + angle**2 / 60.0) / 12.0, (1.0 - half / np.tan(half)) / (4.0 * half**2)
     )
-    first = np.cross(theta, gained)
-    return np.asarray(gained - 0.5 * first + factor * np.cross(theta, first))
+    first = np.cross(phi, vector)
+    return np.asarray(vector - 0.5 * first + factor * np.cross(phi, first))

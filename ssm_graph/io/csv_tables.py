@@ -174,7 +174,7 @@ def _read_carefully(file: CsvFile, names: Sequence[str], *, blank: frozenset[str
                 raise _wrong_count(file, number, line, len(names))
             rows.append(
                 [
-                    _number(file, number, name, cell.strip(), blank=blank)
+                    _number(cell.strip(), f"{file.label}:{number}", name, blank=blank)
                     for name, cell in zip(names, cells, strict=True)
                 ]
             )
@@ -183,20 +183,16 @@ def _read_carefully(file: CsvFile, names: Sequence[str], *, blank: frozenset[str
     return np.array(rows, dtype=np.float64).reshape(len(rows), len(names))
 
 
-def _number(file: CsvFile, number: int, name: str, cell: str, *, blank: frozenset[str]) -> float:
+def _number(cell: str, place: str, name: str, *, blank: frozenset[str]) -> float:
     if _NUMBER.fullmatch(cell):
         return float(cell)
     if not cell and name in blank:
         return float("nan")
-    place = f"{file.label}:{number}: column {name!r}"
-    if not cell:
-        raise DataError(
-            f"{place} holds an empty cell; expected a number; fill it in, or delete this row"
-        )
+    got = f"holds {_shown(cell)}" if cell else "is empty"
     hint = "correct the number, or delete this row"
     if cell.startswith(("'", '"')):
         hint = "write numbers without quotes"
-    raise DataError(f"{place} holds {_shown(cell)}; expected a number; {hint}")
+    raise DataError(f"{place}: column {name!r} {got}; expected a number; {hint}")
 
 
 def _wrong_count(file: CsvFile, number: int, line: str, expected: int) -> DataError:

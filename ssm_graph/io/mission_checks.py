@@ -115,23 +115,24 @@ def _imu_times(table: Table) -> list[str]:
     median = float(np.median(steps))
     if not SHORTEST_STEP_S <= median <= LONGEST_STEP_S:
         units = [unit for size, unit in _STEP_UNITS if 5.0 <= size / median <= 5000.0]
-        hint = f"are the times in {units[0]}?" if units else "are the times in seconds?"
+        hint = f"are the times in {units[0]}" if units else "are the times not in seconds"
+        hint += ", or was the log thinned out?" if median > LONGEST_STEP_S else "?"
         raise DataError(
-            f"{table.label}: the rows are {median:.6g} s apart, {1.0 / median:.6g} Hz; expected at "
-            f"least {1.0 / LONGEST_STEP_S:g} Hz and at most {1.0 / SHORTEST_STEP_S:g} Hz; {hint}"
+            f"{table.label}: the rows are {median:.6g} s apart, {1.0 / median:.6g} Hz; expected "
+            f"{1.0 / LONGEST_STEP_S:g} to {1.0 / SHORTEST_STEP_S:g} Hz; {hint}"
         )
     row = int(np.argmax(steps))
     if steps[row] > LONGEST_GAP_S:
         raise table.fault(
             row + 1,
-            f"no samples for {steps[row]:.3f} s after {table.time_s[row]:.3f} s; expected no gap "
+            f"no samples for {steps[row]:z.3f} s after {table.time_s[row]:z.3f} s; expected no gap "
             f"longer than {LONGEST_GAP_S:g} s; split the mission there",
         )
     gaps = steps > max(NOTED_GAP_S, 5.0 * median)
     if gaps.any():
         return [
-            f"{table.label}: {gaps.sum()} gaps in time, the longest {steps[row]:.3f} s after "
-            f"{table.time_s[row]:.3f} s; the reading after a gap is held over all of it"
+            f"{table.label}: {gaps.sum()} gaps in time, the longest {steps[row]:z.3f} s after "
+            f"{table.time_s[row]:z.3f} s; the reading after a gap is held over all of it"
         ]
     return []
 

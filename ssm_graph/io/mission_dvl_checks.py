@@ -1,4 +1,4 @@
-"""Are the beam speeds those of a DVL: units, codes for "no bottom lock", repeated reports?"""
+"""Check that beam speeds are those of a DVL: units, codes for no bottom lock, repeats."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ FASTEST: Final = 20.0
 LARGEST_SPEED: Final = 30.0
 """m/s, of any single beam speed: a number beyond it is a code."""
 SHORTEST_STEP_S: Final = 1e-3
+_CODE_SIZE: Final = 2.0**14
 _CODES: Final = (-1.0, -9.999, 9.999)
 _CODE_SHARE: Final = 0.01
 _REPEATED_SHARE: Final = 0.2
@@ -70,7 +71,8 @@ def _units(table: Table, speed: Array) -> None:
     if large.size:
         values, counts = np.unique(large, return_counts=True)
         common = values[np.argmax(counts)]
-        if counts.max() == large.size or counts.max() > max(2, 0.5 * large.size):
+        is_rare = large.size < 0.5 * finite.size
+        if counts.max() > max(1.0, 0.5 * large.size) and (is_rare or abs(common) > _CODE_SIZE):
             row, beam = np.argwhere(speed == common)[0]
             raise table.cell_fault(
                 int(row),
@@ -79,7 +81,11 @@ def _units(table: Table, speed: Array) -> None:
             )
     fast = float(np.percentile(finite, 99.0))
     if fast > FASTEST:
-        unit = "mm/s: divide them by 1000" if fast > 200.0 else "cm/s or mm/s: divide them"
+        unit = (
+            "mm/s: divide them by 1000"
+            if fast > 200.0
+            else "cm/s or mm/s: divide them by 100 or 1000"
+        )
         raise DataError(
             f"{table.label}: 1 % of the beam speeds exceed {fast:.4g}; expected m/s, up to "
             f"{FASTEST:g}; the speeds seem to be in {unit}"

@@ -19,6 +19,7 @@ from ssm_graph.io.tables import TableSpec
 
 FORMAT: Final = 1
 TOML_NAME: Final = "mission.toml"
+_SHOWN: Final = 60
 
 
 class BodyAxes(Enum):
@@ -183,7 +184,7 @@ class Settings:
 def read_settings(section: str, raw: object) -> Settings:
     """Check every key of a section against :data:`SECTIONS`."""
     if not isinstance(raw, dict):
-        raise ConfigError(f"{TOML_NAME} [{section}]: expected a section, got {raw!r}")
+        raise ConfigError(f"{TOML_NAME} [{section}]: expected a section, got {shown(raw)}")
     known = SECTIONS[section]
     for key in raw:
         if key not in known:
@@ -200,8 +201,19 @@ def read_settings(section: str, raw: object) -> Settings:
         problem = _problem(known[name], value)
         if problem:
             tail = f"; {known[name].hint}" if known[name].hint and problem == "range" else ""
-            raise settings.fault(name, f"expected {known[name].wanted}, got {raw[name]!r}{tail}")
+            raise settings.fault(
+                name, f"expected {known[name].wanted}, got {shown(raw[name])}{tail}"
+            )
     return settings
+
+
+def shown(value: object) -> str:
+    """Return a value as it is shown in a message, cut where it is long."""
+    try:
+        text = repr(value)
+    except ValueError:  # an integer of more than 4300 digits
+        text = "a number of very many digits"
+    return text if len(text) <= _SHOWN else text[:_SHOWN] + "..."
 
 
 def _plain(value: Any) -> Any:

@@ -21,6 +21,7 @@ from ssm_graph.io.mission_keys import (
     Settings,
     Stamp,
     read_settings,
+    shown,
 )
 
 _Choice = TypeVar("_Choice", bound=Enum)
@@ -49,7 +50,7 @@ def read_mission_toml(folder: Path) -> MissionToml:
     _check_format(raw)
     for name in raw:
         if name not in (*SECTIONS, "format", "name"):
-            hint = nearest_hint(name, [*SECTIONS, "format", "name"])
+            hint = nearest_hint(name, [known for known in SECTIONS if known not in raw] or SECTIONS)
             raise ConfigError(f"{TOML_NAME} {name}: unknown key or section; {hint}")
     for name in REQUIRED_SECTIONS:
         if name not in raw:
@@ -72,8 +73,11 @@ def table_path(toml: MissionToml, section: str) -> Path | None:
     """
     label = toml[section].text("file")
     path = toml.folder / label
-    if path.is_file():
-        return path
+    try:
+        if path.is_file():
+            return path
+    except OSError as error:
+        raise toml[section].fault("file", f"cannot be read: {error.strerror}") from error
     others = {toml[name].text("file") for name in TABLES if name in toml}
     found = sorted(p.name for p in toml.folder.iterdir() if p.name not in {*others, TOML_NAME})
     stems = {Path(name).stem: name for name in reversed(found)}
@@ -104,17 +108,17 @@ def _parse(folder: Path) -> dict[str, Any]:
 def _check_format(raw: dict[str, Any]) -> None:
     if "format" not in raw:
         raise ConfigError(f"{TOML_NAME} format: the key is missing; expected format = {FORMAT}")
-    if isinstance(raw["format"], bool) or raw["format"] != FORMAT:
+    if type(raw["format"]) is not int or raw["format"] != FORMAT:
         raise ConfigError(
-            f"{TOML_NAME} format: expected {FORMAT}, got {raw['format']!r}; a newer format needs a "
-            "newer program"
+            f"{TOML_NAME} format: expected {FORMAT}, got {shown(raw['format'])}; a newer format "
+            "needs a newer program"
         )
 
 
 def _mission_name(raw: dict[str, Any]) -> str:
     name = raw.get("name")
     if not isinstance(name, str) or not name.strip():
-        got = "nothing" if name is None else repr(name)
+        got = "nothing" if name is None else shown(name)
         raise ConfigError(f"{TOML_NAME} name: expected a text in quotes, got {got}")
     return name
 
@@ -126,8 +130,7 @@ def _choice(settings: Settings, key: str, choices: type[_Choice]) -> _Choice:
         known = [str(choice.value) for choice in choices]
         raise settings.fault(
             key,
-            f"expected one of {', '.join(known)}, got {settings.text(key)!r}; "
-            + nearest_hint(settings.text(key), known),
+            f"expected one of {', '.join(known)}, got {shown(settings.text(key))}",
         ) from None
 
 

@@ -46,7 +46,7 @@ def to_si(key: str, value: float) -> float:
 
 def from_si(key: str, value: float) -> float:
     """Return the shortest decimal that :func:`to_si` turns into ``value``, or the nearest one."""
-    exact = value / SI.get(key, 1.0)
+    exact = value / SI.get(key, 1.0) + 0.0  # no minus zero in a file for people
     for digits in range(1, 17):
         short = float(f"{exact:.{digits}g}")
         if to_si(key, short) == value:

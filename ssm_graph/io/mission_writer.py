@@ -38,8 +38,8 @@ def write_mission(
     """Write ``mission`` as a folder that :func:`read_mission` turns into the same values.
 
     Body axes are FRD and IMU stamps name the interval's end. Every number is written with all its
-    digits; angles may differ by rounding. ``mission.toml`` is taken away first and written last:
-    an interrupted write leaves a folder without one, never a mixture.
+    digits; angles may differ by rounding. An interrupted write leaves the old mission, or a folder
+    without ``mission.toml``, never a mixture.
 
     Parameters
     ----------
@@ -50,18 +50,20 @@ def write_mission(
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     settings = mission_settings(mission, table_format)
-    (folder / TOML_NAME).unlink(missing_ok=True)
+    parts = {}
     for section, columns in mission_tables(mission).items():
         path = folder / settings[section]["file"]
-        part = path.with_name(f"{path.stem}.part{path.suffix}")
-        write_table(part, columns)
-        part.replace(path)
-    part = folder / f"{TOML_NAME}.part"
-    with part.open("wb") as stream:
+        parts[path] = path.with_name(f"{path.stem}.part{path.suffix}")
+        write_table(parts[path], columns)
+    toml_part = folder / f"{TOML_NAME}.part"
+    with toml_part.open("wb") as stream:
         tomli_w.dump(settings, stream)
         stream.flush()
         os.fsync(stream.fileno())
-    part.replace(folder / TOML_NAME)
+    (folder / TOML_NAME).unlink(missing_ok=True)
+    for path, part in parts.items():
+        part.replace(path)
+    toml_part.replace(folder / TOML_NAME)
 
 
 def mission_settings(mission: Mission, table_format: TableFormat) -> dict[str, Any]:

@@ -176,8 +176,8 @@ def _read_parquet(path: Path, label: str, spec: TableSpec) -> Table:
         }
     except arrow.ArrowException as error:
         raise DataError(
-            f"{label}: expected a Parquet table, got {str(error).splitlines()[0]!r}; "
-            "was the file cut off, or is it another format?"
+            f"{label}: expected a Parquet table, got a file that cannot be read as one; "
+            "was it cut off, or is it another format?"
         ) from error
     return Table(ParquetFile(path, label), columns)
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from ssm_graph.data import ImuNoise
 from ssm_graph.simulation._checks import require, require_fraction, require_positive
 from ssm_graph.simulation.aids import DepthSettings, GnssSettings
@@ -75,7 +77,7 @@ class SimulationConfig:
             hint="make the mission longer",
         )
         require(
-            isinstance(self.seed, int) and self.seed >= 0,
+            isinstance(self.seed, (int, np.integer)) and self.seed >= 0,
             "seed",
             expected="a whole number from 0",
             got=self.seed,

@@ -92,7 +92,7 @@ def ping_times(settings: DvlSettings, *, end_s: float, rng: np.random.Generator 
     time_s = first + np.arange(count) / settings.rate_hz
     if rng is not None and settings.jitter_s > 0.0:
         time_s = time_s + rng.uniform(-settings.jitter_s, settings.jitter_s, size=count)
-    return time_s[(time_s > 0.0) & (time_s <= end_s)]
+    return np.minimum(time_s[(time_s > 0.0) & (time_s <= end_s + 1e-9)], end_s)
 
 
 def true_beam_speeds(trajectory: Trajectory, settings: DvlSettings, time_s: Array) -> Array:

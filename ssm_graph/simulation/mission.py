@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ssm_graph.data import Array, DvlLog, ImuLog, Mission, Reference
+from ssm_graph.data import Array, DepthLog, DvlLog, GnssLog, ImuLog, Mission, Reference
 from ssm_graph.earth import LocalFrame
 from ssm_graph.simulation.aids import depth_log, gnss_log
 from ssm_graph.simulation.config import SimulationConfig
@@ -64,28 +64,17 @@ def simulate(config: SimulationConfig) -> SimulatedMission:
     end_s = n_samples / config.imu_rate_hz
     imu, gyro_bias, accel_bias = _imu(config, streams, n_samples)
     dvl = _dvl(config, streams, end_s)
+    depth, gnss = _aids(config, streams, end_s)
     truth = config.trajectory.truth(_reference_times(config, end_s))
-    noisy = not config.perfect_sensors
+    initial_rng = streams.initial if config.draw_initial_errors else None
     mission = Mission(
         name=config.name,
         frame=LocalFrame(lat=config.lat, lon=config.lon, height=0.0),
         imu=imu,
         dvl=dvl.log,
-        depth=None
-        if config.depth is None
-        else depth_log(
-            config.trajectory, config.depth, end_s=end_s, rng=streams.depth if noisy else None
-        ),
-        gnss=None
-        if config.gnss is None
-        else gnss_log(
-            config.trajectory, config.gnss, end_s=end_s, rng=streams.gnss if noisy else None
-        ),
-        initial=initial_state(
-            truth,
-            config.initial_sigmas,
-            rng=streams.initial if config.draw_initial_errors else None,
-        ),
+        depth=depth,
+        gnss=gnss,
+        initial=initial_state(truth, config.initial_sigmas, rng=initial_rng),
         reference=truth,
     )
     return SimulatedMission(
@@ -161,3 +150,19 @@ def _dvl(config: SimulationConfig, streams: Streams, end_s: float) -> _Dvl:
         range_m=ranges,
     )
     return _Dvl(log, time_s, true_speed, offset, is_outlier & ~missing)
+
+
+def _aids(
+    config: SimulationConfig, streams: Streams, end_s: float
+) -> tuple[DepthLog | None, GnssLog | None]:
+    """Return the readings of depth sensor and GNSS receiver, where there are any."""
+    noisy = not config.perfect_sensors
+    depth: DepthLog | None = None
+    gnss: GnssLog | None = None
+    if config.depth is not None:
+        rng = streams.depth if noisy else None
+        depth = depth_log(config.trajectory, config.depth, end_s=end_s, rng=rng)
+    if config.gnss is not None:
+        rng = streams.gnss if noisy else None
+        gnss = gnss_log(config.trajectory, config.gnss, end_s=end_s, rng=rng)
+    return depth, gnss

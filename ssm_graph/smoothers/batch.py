@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import NamedTuple
 
+import gtsam
 import numpy as np
 
-from factors.similarity import GaussianKernel, Kernel, LogKernel, expected_mahalanobis_sq
+from factors.similarity import Kernel, LogKernel, expected_mahalanobis_sq
 from ssm_graph.data import Array
 from ssm_graph.errors import ConfigError, SolverError
 from ssm_graph.estimate import BeamTable, Estimate, Iteration, Status
@@ -29,6 +30,9 @@ WARM_KERNEL = LogKernel()
 """Kernel of the first pass and of the first iterations, whichever is asked for in the end."""
 WARM_UPDATE_SIGMAS = 1.0
 """The kernel asked for takes over once the updates are below this."""
+MAX_HALVINGS = 10
+COST_SLACK = 1e-2
+"""A rise of the cost by less is rounding: one residual at its sigma costs 0.5."""
 RUNAWAY_SPEED = 100.0
 """m/s; no underwater vehicle does that."""
 
@@ -69,6 +73,24 @@ class _Pass(NamedTuple):
     weight_change: float
 
 
+def _descend(
+    linearizer: GraphLinearizer,
+    states: States,
+    delta: gtsam.VectorValues,
+    weights: Array,
+    cost: float,
+) -> tuple[States, BeamRows, Array]:
+    """Take the Gauss-Newton step, halved while it raises the cost at these weights."""
+    scale = 1.0
+    for _ in range(MAX_HALVINGS):
+        moved, update = retract(states, delta, scale=scale)
+        rows = linearizer.beam_rows(moved)
+        if linearizer.cost(moved, rows, weights) <= cost + COST_SLACK:
+            break
+        scale *= 0.5
+    return moved, rows, update
+
+
 class SsmSmoother:
     """Smooth a whole mission; see :func:`ssm_graph.build_problem` for its input."""
 
@@ -86,10 +108,9 @@ class SsmSmoother:
         begin = time.perf_counter()
         first = first_values(problem, kernel=WARM_KERNEL)
         linearizer = GraphLinearizer(problem)
-        is_gaussian = isinstance(self.config.kernel, GaussianKernel)
-        kernel = self.config.kernel if is_gaussian else WARM_KERNEL
-        weights = np.ones_like(first.weights) if is_gaussian else first.weights
         states, rows = first.states, linearizer.beam_rows(first.states)
+        weights = first.weights
+        kernel: Kernel = WARM_KERNEL
         iterations: list[Iteration] = []
         status = Status.MAX_ITERATIONS
         for number in range(self.config.max_iterations):
@@ -115,11 +136,13 @@ class SsmSmoother:
         kernel: Kernel,
     ) -> _Pass:
         problem = linearizer.problem
+        linearizer.follow(states)
         linear = linearizer.linearize(states, rows, weights)
         ordering = chain_ordering(problem.n_keyframes)
         solution = solve_linear(linear, ordering, n_keyframes=problem.n_keyframes)
         covariance = marginal_covariances(solution)
-        states, update = retract(states, solution.delta)
+        cost = linearizer.cost(states, rows, weights)
+        states, rows, update = _descend(linearizer, states, solution.delta, weights, cost)
         sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
         speed = float(np.max(np.abs(states.v_n)))
         if not (np.all(np.isfinite(sigma)) and speed < RUNAWAY_SPEED):
@@ -127,7 +150,6 @@ class SsmSmoother:
                 f"{Status.DIVERGED.value}: largest velocity {speed:.3g} m/s; check time stamps and "
                 "noise of [imu], and the initial heading"
             )
-        rows = linearizer.beam_rows(states)
         t = self._mahalanobis_sq(problem, rows, covariance)
         settled = kernel.weight(t)
         change = float(np.max(np.abs(settled - weights), initial=0.0))

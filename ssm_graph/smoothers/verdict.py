@@ -36,9 +36,7 @@ def judge(linearizer: GraphLinearizer, states: States, weights: Array) -> Verdic
         _doubt_beams(weights),
         _doubt_prior(linearizer.prior, states),
         _doubt_sensor("GNSS", linearizer.gnss, states, "look for a wrong datum or lever arm"),
-        _doubt_sensor(
-            "depth", linearizer.depth_graph(states), states, "look at its zero, sign and unit"
-        ),
+        _doubt_sensor("depth", linearizer.depth, states, "look at its zero, sign and unit"),
         _doubt_sensor(
             "inertial",
             linearizer.inertial,

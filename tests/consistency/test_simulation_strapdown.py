@@ -78,41 +78,115 @@ def gravitation_i(p_i: Array, time_s: float) -> Array:
     return np.asarray(-normal_gravity(lat, height) * up_i - centrifugal)
 
 
-def navigate(imu: ImuLog, trajectory: Trajectory, *, every: int) -> tuple[Array, float]:
-    """Return the error of position (east, north, up; m) and attitude (rad) at the end.
+def gains_per_stretch(push_i: Array, *, dt: float, every: int) -> tuple[Array, Array]:
+    """Return what velocity and position gain within each stretch of ``every`` samples.
 
-    Gravitation is evaluated once for ``every`` samples, at the midpoint of that stretch.
+    Each push acts from the middle of its own sample on; the slope of the specific force within a
+    sample shifts the position by a twelfth of its change.
+    """
+    blocks = push_i.reshape(-1, every, 3)
+    slopes = np.gradient(push_i, axis=0).reshape(-1, every, 3)
+    lever = (every - 0.5 - np.arange(every))[:, None] * dt
+    return blocks.sum(axis=1), (blocks * lever - slopes * dt / 12.0).sum(axis=1)
+
+
+def navigate(imu: ImuLog, trajectory: Trajectory, *, every: int) -> tuple[Array, Rotation]:
+    """Return the Earth-fixed position and the attitude (b to i) at the end.
+
+    Gravitation is evaluated once for ``every`` samples, at the middle of that stretch, and taken
+    as linear in time within it.
     """
     start = trajectory.truth(0.0)
     R_el = R_el_from_lat_lon(start.lat[0], start.lon[0])
     p_i = ecef_from_geodetic(start.lat, start.lon, start.height)[0]
     v_i = R_el @ start.velocity_enu[0] + np.cross(EARTH_AXIS, p_i)
     push_i, R_ib = inertial_steps(imu, trajectory.R_eb(0.0)[0])
-    dt = float(imu.time_s[1] - imu.time_s[0])
+    dt = float(imu.time_s[0] - imu.start_s)
     span = every * dt
-    # Within a stretch each push acts from the middle of its own sample on; the slope of the
-    # specific force within a sample moves that point by dt^2 / 12.
-    slope = np.gradient(push_i, axis=0)
-    lever = (every - 0.5 - np.arange(every))[:, None] * dt
-    blocks, slopes = (x.reshape(-1, every, 3) for x in (push_i, slope))
-    gained_v = blocks.sum(axis=1)
-    gained_p = (blocks * lever).sum(axis=1) - slopes.sum(axis=1) * dt / 12.0
     gravity = gravitation_i(p_i - 0.5 * span * v_i, -0.5 * span)
-    for k, (push, shift) in enumerate(zip(gained_v, gained_p, strict=True)):
+    gains = zip(*gains_per_stretch(push_i, dt=dt, every=every), strict=True)
+    for k, (push, shift) in enumerate(gains):
         middle_i = p_i + 0.5 * span * v_i + 0.25 * shift + 0.125 * gravity * span**2
         before, gravity = gravity, gravitation_i(middle_i, (k + 0.5) * span)
         p_i = p_i + v_i * span + shift + (0.5 * gravity - (gravity - before) / 12.0) * span**2
         v_i = v_i + push + gravity * span
+    R_ie = Rotation.from_rotvec(EARTH_AXIS * float(imu.time_s[-1]))
+    return np.asarray(R_ie.inv().apply(p_i)), R_ib[-1]
+
+
+def closing_error(config: SimulationConfig, *, every: int) -> tuple[float, float, float]:
+    """Return horizontal and vertical error, m, and that of attitude, rad, at the end."""
+    trajectory, imu = config.trajectory, simulate(config).mission.imu
+    p_e, R_ib = navigate(imu, trajectory, every=every)
     end_s = float(imu.time_s[-1])
     truth = trajectory.truth(end_s)
+    error_e = p_e - ecef_from_geodetic(truth.lat, truth.lon, truth.height)[0]
+    east, north, up = R_el_from_lat_lon(truth.lat[0], truth.lon[0]).T @ error_e
     R_ie = Rotation.from_rotvec(EARTH_AXIS * end_s)
-    error_e = R_ie.inv().apply(p_i) - ecef_from_geodetic(truth.lat, truth.lon, truth.height)[0]
-    R_el = R_el_from_lat_lon(truth.lat[0], truth.lon[0])
-    tilt = (R_ie * trajectory.R_eb(end_s)[0]).inv() * R_ib[-1]
-    return np.asarray(R_el.T @ error_e), float(tilt.magnitude())
+    tilt = (R_ie * trajectory.R_eb(end_s)[0]).inv() * R_ib
+    return math.hypot(east, north), abs(float(up)), float(tilt.magnitude())
 
 
-def close_the_loop(config: SimulationConfig, *, every: int) -> tuple[float, float, float]:
-    """Return horizontal and vertical error, m, and that of attitude, rad, at the end."""
-    error_enu, tilt = navigate(simulate(config).mission.imu, config.trajectory, every=every)
-    return math.hypot(error_enu[0], error_enu[1]), abs(error_enu[2]), tilt
+CALM_ROUTES = {
+    "rest": HoverRoute(sway_m=0.0, yaw=0.0),
+    "hover": HoverRoute(),
+    "transit": TransitRoute(depth=DepthProfile(0.3, 40.0, mid_s=100.0)),
+}
+WAVY_ROUTES = {
+    "hover": HoverRoute(),
+    "survey": SurveyRoute(),
+    "spiral": SpiralRoute(),
+    "dive": DiveRoute(),
+    "transit": TransitRoute(),
+}
+
+
+@pytest.mark.parametrize("name", ["hover", "survey", "transit"])
+def test_half_a_minute_closes(name: str) -> None:
+    """In waves, with turns: micrometres and nanoradians."""
+    config = SimulationConfig(route=WAVY_ROUTES[name], duration_s=30.0, perfect_sensors=True)
+    horizontal, vertical, tilt = closing_error(config, every=10)
+    assert horizontal < 5e-6
+    assert vertical < 5e-6
+    assert tilt < 1e-9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CALM_ROUTES)
+def test_ten_calm_minutes_close(name: str) -> None:
+    """Without coning or sculling only the simulator's own error is left."""
+    config = SimulationConfig(
+        route=CALM_ROUTES[name], waves=CALM, duration_s=600.0, perfect_sensors=True
+    )
+    horizontal, vertical, tilt = closing_error(config, every=10)
+    assert horizontal < 1e-5
+    assert vertical < 1e-5
+    assert tilt < 1e-12
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lat_deg", [-79.0, 0.0, 45.7])
+@pytest.mark.parametrize("name", WAVY_ROUTES)
+def test_ten_wavy_minutes_close(name: str, lat_deg: float) -> None:
+    """Everywhere on Earth, on every route."""
+    config = SimulationConfig(
+        route=WAVY_ROUTES[name],
+        lat=math.radians(lat_deg),
+        duration_s=600.0,
+        imu_rate_hz=100.0,
+        perfect_sensors=True,
+    )
+    horizontal, vertical, tilt = closing_error(config, every=10)
+    assert horizontal < 5e-4
+    assert vertical < 5e-5
+    assert tilt < 1e-9
+
+
+@pytest.mark.slow
+def test_one_hour_closes() -> None:
+    """The free vertical channel has amplified its error 270 times by then."""
+    config = SimulationConfig(duration_s=3600.0, imu_rate_hz=200.0, perfect_sensors=True)
+    horizontal, vertical, tilt = closing_error(config, every=20)
+    assert horizontal < 1e-3
+    assert vertical < 5e-3
+    assert tilt < 1e-9

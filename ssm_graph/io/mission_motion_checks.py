@@ -1,0 +1,208 @@
+"""Check that the sensors tell of one motion: the sign of depth, of beam speeds, of turn rates."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import permutations
+from typing import Final
+
+import numpy as np
+
+from ssm_graph.data import N_BEAMS, Array, DepthLog, Mission
+from ssm_graph.errors import DataError
+
+_UPWARD_M: Final = 2.0
+_WINDOW_S: Final = 2.0
+_SLOWEST: Final = 0.05
+"""m/s rms: slower vertical motion says nothing."""
+_FEWEST_FIXES: Final = 10
+_FEWEST_PINGS: Final = 30
+_OPPOSITE: Final = -0.8
+_CONTRADICTION: Final = 0.3
+_OPPOSITE_TILT: Final = -0.85
+_TINY_GAIN: Final = 0.04
+_SMALLEST_TILT: Final = 0.02
+"""rad rms in one window."""
+_TILT_STEP_S: Final = 1.0
+
+
+def check_motion(mission: Mission, labels: dict[str, str]) -> list[str]:
+    """Compare the sensors' signs; ``labels`` name the tables.  Return the notes."""
+    notes = []
+    if mission.depth is not None:
+        notes += _depth_sign(mission, mission.depth, labels["depth"])
+        notes += _depth_surface(mission, mission.depth, labels["depth"])
+        notes += _vertical_speed(mission, mission.depth, labels)
+    notes += _turn_signs(mission, labels["imu"])
+    notes += _beams_agree(mission, labels["dvl"])
+    return notes
+
+
+def _depth_sign(mission: Mission, depth: DepthLog, label: str) -> list[str]:
+    """Refuse heights given as depths."""
+    expected = "expected depth, positive down; change its sign"
+    median = float(np.median(depth.depth))
+    if median < -_UPWARD_M and max(_known_heights(mission)) < -0.5 * median:
+        raise DataError(
+            f"{label}: column 'depth_m' has a median of {median:.2f} m, and no known height is "
+            f"near {-median:.2f} m; {expected}"
+        )
+    for name, log in (("reference", mission.reference), ("gnss", mission.gnss)):
+        if log is None:
+            continue
+        both = (log.time_s >= depth.time_s[0]) & (log.time_s <= depth.time_s[-1])
+        height, down = log.height[both], np.interp(log.time_s[both], depth.time_s, depth.depth)
+        if both.sum() < _FEWEST_FIXES or min(np.std(height), np.std(down)) < 1.0:
+            continue
+        correlation = float(np.corrcoef(height, down)[0, 1])
+        if correlation > -_OPPOSITE:
+            raise DataError(
+                f"{label}: column 'depth_m' rises with the height of [{name}] (correlation "
+                f"{correlation:.2f}); {expected}"
+            )
+    return []
+
+
+def _known_heights(mission: Mission) -> Iterator[float]:
+    if mission.gnss is not None:
+        yield from mission.gnss.height
+    if mission.reference is not None:
+        yield from mission.reference.height
+    if mission.initial is not None:
+        yield mission.initial.height
+    yield mission.frame.height
+
+
+def _depth_surface(mission: Mission, depth: DepthLog, label: str) -> list[str]:
+    """Note a depth that counts from another surface than the GNSS heights."""
+    gnss = mission.gnss
+    if gnss is None:
+        return []
+    both = (gnss.time_s >= depth.time_s[0]) & (gnss.time_s <= depth.time_s[-1])
+    if not both.any():
+        return []
+    total = gnss.height[both] + np.interp(gnss.time_s[both], depth.time_s, depth.depth)
+    offset, sigma = float(np.median(total)), float(np.median(gnss.sigma_enu[both, 2]))
+    if abs(offset) < max(5.0, 3.0 * sigma):
+        return []
+    return [
+        f"{label}: depth and GNSS height do not cancel: their sum is {offset:.1f} m; depth is "
+        "minus the height above the ellipsoid, not the distance to the surface"
+    ]
+
+
+def _vertical_speed(mission: Mission, depth: DepthLog, labels: dict[str, str]) -> list[str]:
+    """Compare the DVL's downward speed with the change of depth, down being against the force."""
+    dvl, imu = mission.dvl, mission.imu
+    half = 0.5 * max(_WINDOW_S, 2.0 * float(np.median(np.diff(depth.time_s, prepend=-np.inf))))
+    begin = max(imu.time_s[0], depth.time_s[0]) + half
+    end = min(imu.time_s[-1], depth.time_s[-1]) - half
+    used = np.isfinite(dvl.speed).all(axis=1) & (dvl.time_s > begin) & (dvl.time_s < end)
+    if used.sum() < _FEWEST_PINGS:
+        return []
+    left_over = _left_over(mission, dvl.speed)
+    used &= left_over <= 3.0 * np.median(left_over[used])  # without most of the outliers
+    time_s = dvl.time_s[used]
+    v_b = dvl.speed[used] @ np.linalg.pinv(dvl.mount.beams_b).T
+    speed = -np.sum(_force_direction(mission, time_s, half) * v_b, axis=1)
+    rate = _difference(time_s, half, depth.time_s, depth.depth) / (2.0 * half)
+    if min(np.std(speed), np.std(rate)) < _SLOWEST:
+        return []
+    correlation = float(np.corrcoef(speed, rate)[0, 1])
+    if correlation < _OPPOSITE:
+        raise DataError(
+            f"{labels['dvl']}: the DVL's downward speed is opposite to the change of "
+            f"{labels['depth']} (correlation {correlation:.2f}); expected beam speeds that are "
+            "positive when the instrument moves along the beam, and depth positive down; change "
+            "the sign of one of them, or correct mounting_rpy_deg"
+        )
+    ratio = float(np.std(rate) / np.std(speed))
+    if correlation > 0.9 and not 0.7 < ratio < 1.5:
+        return [
+            f"{labels['depth']}: the depth changes {ratio:.2f} times as fast as the DVL goes down; "
+            "check the unit of the beam speeds and beam_janus_deg"
+        ]
+    return []
+
+
+def _turn_signs(mission: Mission, label: str) -> list[str]:
+    """Compare turn rates with the accelerometer: tilting the vehicle tilts the specific force."""
+    imu = mission.imu
+    half = 0.5 * _TILT_STEP_S
+    time_s = np.arange(imu.time_s[0] + 2.0 * half, imu.time_s[-1] - 2.0 * half, 2.0 * half)
+    if len(time_s) < _FEWEST_PINGS:
+        return []
+    before, after = (_force_direction(mission, time_s + at, half) for at in (-half, half))
+    turned = np.column_stack(
+        [_difference(time_s, half, imu.time_s, s) for s in _integral(mission, imu.gyro_b).T]
+    )
+    predicted, seen = -np.cross(turned, 0.5 * (before + after)), after - before
+    notes = []
+    for axis, motion in enumerate(("pitches", "rolls")):
+        notes += _tilt_agrees(seen[:, axis], predicted[:, axis], f"{label}: the vehicle {motion}")
+    return notes
+
+
+def _tilt_agrees(seen: Array, predicted: Array, subject: str) -> list[str]:
+    """Refuse or note a tilt that the accelerometer sees otherwise than the gyros."""
+    seen_sq, predicted_sq = float(np.mean(seen**2)), float(np.mean(predicted**2))
+    if min(seen_sq, predicted_sq) < _SMALLEST_TILT**2:
+        return []
+    product = float(np.mean(seen * predicted))
+    correlation = product / np.sqrt(seen_sq * predicted_sq)
+    text = (
+        f"{subject} by the gyros and the other way by the accelerometer (correlation "
+        f"{correlation:.2f}); expected one motion; check the signs of the gyros and [frames] body"
+    )
+    if correlation < _OPPOSITE_TILT:
+        raise DataError(text)
+    if correlation > -_OPPOSITE_TILT and product / predicted_sq < _TINY_GAIN:
+        raise DataError(
+            f"{subject} {predicted_sq / product:.0f} times as far by the gyros as by the "
+            "accelerometer; expected rad/s; are the turn rates in deg/s?"
+        )
+    return [text] if correlation < -0.5 else []
+
+
+def _integral(mission: Mission, values: Array) -> Array:
+    """Return the running integral of an IMU quantity at the interval ends."""
+    steps = np.diff(mission.imu.time_s, prepend=mission.imu.start_s)
+    return np.asarray(np.cumsum(values * steps[:, None], axis=0))
+
+
+def _force_direction(mission: Mission, time_s: Array, half: float) -> Array:
+    """Return the unit vector (N, 3) of the mean specific force around each time."""
+    sums = _integral(mission, mission.imu.accel_b)
+    force = np.column_stack([_difference(time_s, half, mission.imu.time_s, s) for s in sums.T])
+    return np.asarray(force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-9))
+
+
+def _difference(time_s: Array, half: float, known_s: Array, values: Array) -> Array:
+    """Return ``values(time_s + half) - values(time_s - half)``."""
+    later = np.interp(time_s + half, known_s, values)
+    return np.asarray(later - np.interp(time_s - half, known_s, values))
+
+
+def _left_over(mission: Mission, speed: Array) -> Array:
+    """Return what four beams (..., 4) measure beyond three components of velocity, m/s."""
+    return np.asarray(np.abs(speed @ np.linalg.svd(mission.dvl.mount.beams_d)[0][:, 3]))
+
+
+def _beams_agree(mission: Mission, label: str) -> list[str]:
+    """Note beams that contradict each other, and the order in which they would not."""
+    speed = mission.dvl.speed[np.isfinite(mission.dvl.speed).all(axis=1)]
+    if len(speed) < _FEWEST_PINGS:
+        return []
+    orders = [list(order) for order in permutations(range(N_BEAMS))]
+    errors = [float(np.median(_left_over(mission, speed[:, order]))) for order in orders]
+    best, sigma = int(np.argmin(errors)), float(np.median(mission.dvl.sigma))
+    typical = float(np.median(np.linalg.norm(speed, axis=1)))
+    is_better = 3.0 * max(errors[best], sigma) < errors[0]
+    if not is_better and errors[0] < max(_CONTRADICTION * typical, 10.0 * sigma):
+        return []
+    order = ", ".join(str(beam + 1) for beam in orders[best])
+    hint = f"the order {order} of the beams would fit" if is_better else "check the beam directions"
+    return [
+        f"{label}: the four beams contradict each other by {errors[0]:.3f} m/s in half of the "
+        f"pings at typical speeds of {typical:.2f} m/s; {hint}"
+    ]

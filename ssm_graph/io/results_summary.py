@@ -1,0 +1,204 @@
+"""The content of ``summary.json``: how an estimate came about and how good it is."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping, Sequence
+from enum import Enum
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any, Final, Protocol
+
+import numpy as np
+
+from ssm_graph.data import InitialState, Mission
+from ssm_graph.earth import LocalFrame
+from ssm_graph.estimate import Estimate, Trajectory
+
+OUTLIER_WEIGHT: Final = 0.05
+"""A beam speed with less weight than this is counted as an outlier."""
+PACKAGES: Final = {
+    "ssm_graph": "ssm-graph",
+    "gtsam": "gtsam",
+    "numpy": "numpy",
+    "scipy": "scipy",
+}
+"""Names in the summary and of the distributions."""
+
+
+class MetricsLike(Protocol):
+    """What a summary needs of `ssm_graph.evaluation.Metrics`; angles in rad."""
+
+    @property
+    def n_epochs(self) -> int: ...  # noqa: D102
+    @property
+    def first_s(self) -> float: ...  # noqa: D102
+    @property
+    def last_s(self) -> float: ...  # noqa: D102
+    @property
+    def rmse_horizontal_m(self) -> float: ...  # noqa: D102
+    @property
+    def rmse_vertical_m(self) -> float: ...  # noqa: D102
+    @property
+    def max_horizontal_m(self) -> float: ...  # noqa: D102
+    @property
+    def end_error_m(self) -> float: ...  # noqa: D102
+    @property
+    def path_length_m(self) -> float: ...  # noqa: D102
+    @property
+    def drift_percent(self) -> float: ...  # noqa: D102
+    @property
+    def rmse_velocity_m_per_s(self) -> float: ...  # noqa: D102
+    @property
+    def rmse_attitude(self) -> tuple[float, float, float]: ...  # noqa: D102
+    @property
+    def nees_position(self) -> float: ...  # noqa: D102
+    @property
+    def inside_3_sigma(self) -> tuple[float, float, float]: ...  # noqa: D102
+
+
+def build_summary(
+    estimate: Estimate,
+    *,
+    mission: Mission,
+    metrics: MetricsLike | None,
+    settings: Mapping[str, Any],
+    calibration: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Return the summary of an estimate, ready for strict JSON: what is not finite is None.
+
+    With a reference, ``path_length_m`` is the part that was compared, on which ``drift_percent``
+    rests; ``total_path_length_m`` is always that of the whole trajectory.
+    """
+    trajectory, beams = estimate.trajectory, estimate.beams
+    total_path = horizontal_path_m(trajectory)
+    summary = {
+        "mission": mission.name,
+        "method": estimate.method,
+        "kernel": estimate.kernel,
+        "status": estimate.status.name,
+        "status_text": estimate.status.value,
+        "is_good": estimate.status.is_good,
+        "reason": estimate.reason,
+        "iterations": len(estimate.iterations),
+        "wall_seconds": estimate.wall_s,
+        "n_keyframes": len(trajectory.time_s),
+        "n_beams": len(beams.time_s),
+        "n_outliers": int(np.sum(beams.weight < OUTLIER_WEIGHT)),
+        "outlier_weight": OUTLIER_WEIGHT,
+        "duration_s": float(np.ptp(trajectory.time_s)) if len(trajectory.time_s) else 0.0,
+        "path_length_m": total_path,
+        "total_path_length_m": total_path,
+        "final": _final(trajectory),
+        "start": {
+            **_start(estimate.start),
+            "origin": "mission" if mission.initial is not None else "alignment",
+        },
+        "calibration": calibration,
+        **(_comparison(metrics) if metrics is not None else {}),
+        "settings": settings,
+        "history": [
+            {
+                "update_sigmas": step.update_sigmas,
+                "weight_change": step.weight_change,
+                "kernel": step.kernel,
+            }
+            for step in estimate.iterations
+        ],
+        "notes": estimate.notes,
+        "mission_notes": mission.notes,
+        "versions": versions(),
+    }
+    return {key: as_json(value) for key, value in summary.items()}
+
+
+def horizontal_path_m(trajectory: Trajectory) -> float:
+    """Return the horizontal length of a trajectory from keyframe to keyframe, m."""
+    lat, lon, height = trajectory.lat, trajectory.lon, trajectory.height
+    if len(lat) < 2:
+        return 0.0
+    frame = LocalFrame(float(lat[0]), float(lon[0]), float(height[0]))
+    p_n = frame.p_n_from_geodetic(lat, lon, height)
+    step_l = np.einsum("nij,ni->nj", frame.R_nl_at(p_n[:-1]), np.diff(p_n, axis=0))
+    return float(np.hypot(step_l[:, 0], step_l[:, 1]).sum())
+
+
+def versions() -> dict[str, str | None]:
+    """Return the versions of everything that makes the numbers; None for what is not installed."""
+    found: dict[str, str | None] = {"python": platform.python_version()}
+    for name, distribution in PACKAGES.items():
+        try:
+            found[name] = version(distribution)
+        except PackageNotFoundError:
+            found[name] = None
+    return found
+
+
+def as_json(value: Any) -> Any:
+    """Return ``value`` made of strict JSON's types; infinite and NaN become None."""
+    if isinstance(value, Mapping):
+        return {str(key): as_json(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return as_json(value.tolist())
+    if isinstance(value, Enum):
+        return value.name
+    if isinstance(value, bool | int | str) or value is None:
+        return value
+    if isinstance(value, float):
+        return value if np.isfinite(value) else None
+    if isinstance(value, Sequence | set | frozenset):
+        return [as_json(item) for item in value]
+    return str(value)
+
+
+def _comparison(metrics: MetricsLike) -> dict[str, Any]:
+    roll, pitch, heading = np.rad2deg(metrics.rmse_attitude).tolist()
+    return {
+        "rmse_horizontal_m": metrics.rmse_horizontal_m,
+        "rmse_vertical_m": metrics.rmse_vertical_m,
+        "max_horizontal_m": metrics.max_horizontal_m,
+        "end_error_m": metrics.end_error_m,
+        "path_length_m": metrics.path_length_m,
+        "drift_percent": metrics.drift_percent,
+        "rmse_velocity_m_per_s": metrics.rmse_velocity_m_per_s,
+        "rmse_roll_deg": roll,
+        "rmse_pitch_deg": pitch,
+        "rmse_heading_deg": heading,
+        "nees_position": metrics.nees_position,
+        "inside_3_sigma": dict(zip(("east", "north", "up"), metrics.inside_3_sigma, strict=True)),
+        "compared_epochs": metrics.n_epochs,
+        "compared_from_s": metrics.first_s,
+        "compared_to_s": metrics.last_s,
+    }
+
+
+def _start(start: InitialState) -> dict[str, Any]:
+    """Return the initial state with the keys of the mission format's ``[initial]``."""
+    return {
+        "time_s": start.time_s,
+        "lat_deg": np.rad2deg(start.lat),
+        "lon_deg": np.rad2deg(start.lon),
+        "height_m": start.height,
+        "vel_enu_m_per_s": start.velocity_enu,
+        "roll_deg": np.rad2deg(start.roll),
+        "pitch_deg": np.rad2deg(start.pitch),
+        "heading_deg": np.rad2deg(start.heading) % 360.0,
+        "position_sigma_m": start.position_sigma_enu,
+        "velocity_sigma_m_per_s": start.velocity_sigma_enu,
+        "attitude_sigma_deg": np.rad2deg(start.attitude_sigma),
+    }
+
+
+def _final(trajectory: Trajectory) -> dict[str, Any]:
+    """Return the last keyframe's uncertainty and its place."""
+    if len(trajectory.time_s) == 0:
+        return {}
+    variance = np.maximum(np.diagonal(trajectory.position_cov_enu[-1]), 0.0)
+    return {
+        "time_s": trajectory.time_s[-1],
+        "lat_deg": np.rad2deg(trajectory.lat[-1]),
+        "lon_deg": np.rad2deg(trajectory.lon[-1]),
+        "height_m": trajectory.height[-1],
+        "position_sigma_m": np.sqrt(variance),
+        "velocity_sigma_m_per_s": trajectory.velocity_sigma_enu[-1],
+        "attitude_sigma_deg": np.rad2deg(trajectory.attitude_sigma[-1]),
+    }

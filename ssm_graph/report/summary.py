@@ -1,0 +1,142 @@
+"""The outcome of a run on one screen of a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Final
+
+import numpy as np
+from rich import box
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from ssm_graph.data import N_BEAMS, Array
+from ssm_graph.estimate import Estimate, Status, Trajectory
+from ssm_graph.evaluation import Metrics, path_length_m
+from ssm_graph.report.style import OUTLIER_WEIGHT
+
+STATUS_STYLE: Final = {
+    Status.CONVERGED: "bold green",
+    Status.MAX_ITERATIONS: "bold yellow",
+    Status.SUSPECT: "bold red",
+    Status.DIVERGED: "bold white on red",
+}
+DEG_PER_HOUR: Final = float(np.rad2deg(1.0)) * 3600.0
+"""deg/h in one rad/s."""
+MICRO_G: Final = 9.80665e-6
+"""m/s^2"""
+
+
+def summary_table(estimate: Estimate, metrics: Metrics | None = None) -> RenderableType:
+    """Return what a user wants to know of a run, ready for ``Console.print``.
+
+    Every row is headed by its unit. Without a reference the comparison is left out; the last
+    rows give three numbers each, whose order the heading names.
+    """
+    parts: list[RenderableType] = [_overview(estimate), _axes(estimate.trajectory)]
+    if metrics is not None:
+        parts.append(_comparison(metrics))
+    parts.extend(Text(f"note: {note}", style="yellow") for note in estimate.notes)
+    return Group(*parts)
+
+
+def _overview(estimate: Estimate) -> Table:
+    trajectory, beams = estimate.trajectory, estimate.beams
+    time_s = trajectory.time_s
+    outlier = beams.weight < OUTLIER_WEIGHT
+    n_beams = len(beams.weight)
+    share = f" ({100.0 * np.mean(outlier):.1f} %)" if n_beams else ""
+    counts = [int(np.sum(outlier & (beams.beam == beam + 1))) for beam in range(N_BEAMS)]
+    status = Text(estimate.status.name, style=STATUS_STYLE[estimate.status])
+    status.append(f"  {estimate.status.value}", style="not bold default on default")
+    table = _table("Estimate", ["", ""])
+    table.columns[1].justify = "left"
+    for heading, value in (
+        ("status", status),
+        ("why it stopped", Text(estimate.reason)),
+        ("method, kernel", Text(f"{estimate.method}, {estimate.kernel}")),
+        ("iterations", Text(str(len(estimate.iterations)))),
+        ("wall time, s", Text(f"{estimate.wall_s:.2f}")),
+        ("keyframes", Text(f"{len(time_s)}")),
+        ("duration, s", Text(f"{np.ptp(time_s) if len(time_s) else 0.0:.1f}")),
+        ("path length, m", Text(f"{path_length_m(trajectory):.1f}")),
+        ("beam speeds used", Text(f"{n_beams}")),
+        (f"outliers, weight < {OUTLIER_WEIGHT:g}", Text(f"{int(outlier.sum())}{share}")),
+        (
+            f"outliers of beams 1 to {N_BEAMS}",
+            Text(", ".join(str(count) for count in counts)),
+        ),
+    ):
+        table.add_row(heading, value)
+    return table
+
+
+def _axes(trajectory: Trajectory) -> RenderableType:
+    """Return three numbers per row: final sigmas and biases."""
+    if len(trajectory.time_s) == 0:
+        return Text("no keyframes", style="red")
+    variance = np.maximum(np.diagonal(trajectory.position_cov_enu[-1]), 0.0)
+    table = _table("At the last keyframe", ["", "", "", ""])
+    for heading, values in (
+        ("sigma of position east, north, up, m", np.sqrt(variance)),
+        ("sigma of velocity east, north, up, m/s", trajectory.velocity_sigma_enu[-1]),
+        ("sigma of roll, pitch, heading, deg", np.rad2deg(trajectory.attitude_sigma[-1])),
+        ("roll, pitch, heading, deg", _degrees(trajectory.roll_pitch_heading[-1])),
+        ("gyro bias x, y, z, deg/h", trajectory.gyro_bias[-1] * DEG_PER_HOUR),
+        ("accelerometer bias x, y, z, ug", trajectory.accel_bias[-1] / MICRO_G),
+    ):
+        table.add_row(heading, *_numbers(values))
+    return table
+
+
+def _comparison(metrics: Metrics) -> Table:
+    table = _table(f"Against the reference, {metrics.n_epochs} epochs", ["", ""])
+    for heading, value in (
+        ("horizontal error, rms, m", metrics.rmse_horizontal_m),
+        ("horizontal error, largest, m", metrics.max_horizontal_m),
+        ("horizontal error at the end, m", metrics.end_error_m),
+        ("vertical error, rms, m", metrics.rmse_vertical_m),
+        ("path length compared, m", metrics.path_length_m),
+        ("drift, % of path length", metrics.drift_percent),
+        ("velocity error, rms, m/s", metrics.rmse_velocity_m_per_s),
+        ("heading error, rms, deg", float(np.rad2deg(metrics.rmse_attitude[2]))),
+        ("NEES of position / 3, expected 1", metrics.nees_position),
+    ):
+        table.add_row(heading, *_numbers([value]))
+    inside = ", ".join(f"{100.0 * share:.1f}" for share in metrics.inside_3_sigma)
+    table.add_row("within 3 sigma east, north, up, %", inside)
+    return table
+
+
+def _table(title: str, columns: list[str]) -> Table:
+    table = Table(
+        title=title,
+        title_justify="left",
+        title_style="bold",
+        box=box.SIMPLE_HEAD,
+        show_header=False,
+        pad_edge=False,
+    )
+    for index, name in enumerate(columns):
+        table.add_column(
+            name,
+            justify="left" if index == 0 else "right",
+            style="cyan" if index == 0 else "",
+            min_width=38 if index == 0 else 9,
+            overflow="fold",
+        )
+    return table
+
+
+def _degrees(roll_pitch_heading: Array) -> Array:
+    angles = np.rad2deg(roll_pitch_heading)
+    angles[2] %= 360.0
+    return np.asarray(angles)
+
+
+def _numbers(values: Iterable[float]) -> list[Text]:
+    """Return four digits each; what is unknown is a dash."""
+    return [
+        Text(f"{value:.4g}" if np.isfinite(value) else "–", justify="right") for value in values
+    ]
