@@ -94,6 +94,8 @@ class Estimate:
     beams: BeamTable
     iterations: tuple[Iteration, ...]
     wall_s: float
+    cost: float
+    """Half the sum of squares of all factors, a beam's replaced by its robust loss ``-f(t)``."""
     start: InitialState
     """The initial state that was used, from the mission or from alignment."""
     notes: tuple[str, ...] = ()

@@ -5,22 +5,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from ssm_graph.data import Array
 from ssm_graph.errors import ConfigError, DataError, SsmGraphError
-from tests.mission_fixture import write_example
-
-Damage = Callable[[Path], None]
-
-GYRO = [f"gyro_{axis}_rad_per_s" for axis in "xyz"]
-ACCEL = [f"accel_{axis}_m_per_s2" for axis in "xyz"]
-BEAMS = [f"beam{beam}_m_per_s" for beam in (1, 2, 3, 4)]
-POSITION = ["lat_deg", "lon_deg"]
+from tests.mission_damage import (
+    ACCEL,
+    BEAMS,
+    GYRO,
+    POSITION,
+    Damage,
+    beams_against_depth,
+    both,
+    cell,
+    columns,
+    drop_section,
+    every_second_code,
+    lines,
+    parquet,
+    raw,
+    remove,
+    rename,
+    republish,
+    rolling,
+    toml,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,129 +44,6 @@ class Malformed:
     error: type[SsmGraphError]
     words: tuple[str, ...]
     """What the message must contain: where, and the point of the hint."""
-
-
-def toml(old: str, new: str) -> Damage:
-    """Replace text in ``mission.toml``."""
-
-    def damage(folder: Path) -> None:
-        path = folder / "mission.toml"
-        text = path.read_text(encoding="utf-8")
-        assert old in text, old
-        path.write_text(text.replace(old, new, 1), encoding="utf-8")
-
-    return damage
-
-
-def drop_section(name: str) -> Damage:
-    """Remove a whole section from ``mission.toml``."""
-
-    def damage(folder: Path) -> None:
-        path = folder / "mission.toml"
-        blocks = path.read_text(encoding="utf-8").split("\n\n")
-        kept = [block for block in blocks if not block.startswith(f"[{name}]")]
-        assert len(kept) == len(blocks) - 1, name
-        path.write_text("\n\n".join(kept), encoding="utf-8")
-
-    return damage
-
-
-def raw(file: str, change: Callable[[bytes], bytes]) -> Damage:
-    """Change the bytes of a file."""
-
-    def damage(folder: Path) -> None:
-        (folder / file).write_bytes(change((folder / file).read_bytes()))
-
-    return damage
-
-
-def lines(file: str, change: Callable[[list[str]], list[str]]) -> Damage:
-    """Change the list of a table's lines; index 0 is the header."""
-
-    def change_bytes(content: bytes) -> bytes:
-        return ("\n".join(change(content.decode().splitlines())) + "\n").encode()
-
-    return raw(file, change_bytes)
-
-
-def cell(file: str, line: int, column: str, text: str) -> Damage:
-    """Replace one cell; ``line`` is the physical line, counted from 1."""
-
-    def change(rows: list[str]) -> list[str]:
-        cells = rows[line - 1].split(",")
-        cells[rows[0].split(",").index(column)] = text
-        return [*rows[: line - 1], ",".join(cells), *rows[line:]]
-
-    return lines(file, change)
-
-
-def columns(file: str, names: list[str], change: Callable[[Array], Array]) -> Damage:
-    """Change columns of a table as one array (rows, columns)."""
-
-    def change_lines(rows: list[str]) -> list[str]:
-        header = rows[0].split(",")
-        where = [header.index(name) for name in names]
-        values = np.array([[float(text or "nan") for text in row.split(",")] for row in rows[1:]])
-        values[:, where] = change(values[:, where])
-        return [rows[0], *(",".join(map(repr, row)) for row in values.tolist())]
-
-    return lines(file, change_lines)
-
-
-def both(*damages: Damage) -> Damage:
-    """Apply several damages."""
-
-    def damage(folder: Path) -> None:
-        for one in damages:
-            one(folder)
-
-    return damage
-
-
-def remove(file: str) -> Damage:
-    """Delete a file."""
-
-    def damage(folder: Path) -> None:
-        (folder / file).unlink()
-
-    return damage
-
-
-def parquet(change: Damage) -> Damage:
-    """Write the mission with Parquet tables, then damage it."""
-
-    def damage(folder: Path) -> None:
-        write_example(folder, suffix=".parquet")
-        change(folder)
-
-    return damage
-
-
-def every_second_code(speed: Array, code: float) -> Array:
-    """Write a driver's code into every seventh cell."""
-    speed = speed.copy()
-    speed.ravel()[::7] = code
-    return speed
-
-
-def republish(speed: Array) -> Array:
-    """Repeat every other ping."""
-    return speed[(np.arange(len(speed)) // 2) * 2]
-
-
-def beams_against_depth(folder: Path) -> None:
-    """Let depth rise and fall, and the beams see the opposite."""
-    rate = 2.0 * np.pi / 30.0
-
-    def depth(values: Array) -> Array:
-        return np.column_stack([values[:, 0], 20.0 + 2.0 * np.sin(rate * values[:, 0])])
-
-    def beams(values: Array) -> Array:
-        down = 2.0 * rate * np.cos(rate * values[:, :1])
-        return np.column_stack([values[:, 0], values[:, 1:] - 0.866 * down])
-
-    columns("depth.csv", ["time_s", "depth_m"], depth)(folder)
-    columns("dvl.csv", ["time_s", *BEAMS], beams)(folder)
 
 
 TOML_CASES = (
@@ -318,7 +205,7 @@ TOML_CASES = (
         "A table of another format",
         both(
             toml('file = "depth.csv"', 'file = "depth.txt"'),
-            lambda folder: (folder / "depth.csv").rename(folder / "depth.txt") and None,
+            rename("depth.csv", "depth.txt"),
         ),
         ConfigError,
         ("depth.txt", ".csv or .parquet", "'.txt'"),
@@ -361,7 +248,7 @@ TABLE_CASES = (
         "Zero bytes, as after a power failure",
         raw("depth.csv", lambda content: content[:300] + bytes(40) + content[300:]),
         DataError,
-        ("depth.csv:1", "binary data"),
+        ("depth.csv:21", "zero bytes"),
     ),
     Malformed(
         "Semicolons and decimal commas",
@@ -527,6 +414,18 @@ PHYSICS_CASES = (
         columns("imu.csv", GYRO, lambda w: np.degrees(w + 0.3)),
         DataError,
         ("imu.csv", "expected rad/s", "deg/s: multiply them by pi/180"),
+    ),
+    Malformed(
+        "Gyros in deg/s, vehicle rolling gently",
+        rolling(57.2958),
+        DataError,
+        ("imu.csv", "times as far by the gyros", "deg/s"),
+    ),
+    Malformed(
+        "Gyros with reversed signs",
+        rolling(-1.0),
+        DataError,
+        ("imu.csv", "rolls by the gyros and the other way", "signs of the gyros"),
     ),
     Malformed(
         "One impossible turn rate",

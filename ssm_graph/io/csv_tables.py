@@ -79,11 +79,12 @@ def check_is_text(file: CsvFile) -> None:
             "was the recording or the copy interrupted?"
         )
     found = next((text for mark, text in _SIGNATURES.items() if head.startswith(mark)), None)
+    line = 1
     if found is None and b"\0" in head:
-        found = "binary data or UTF-16 text"
+        found, line = "zero bytes", head[: head.index(b"\0")].count(b"\n") + 1
     if found:
         raise DataError(
-            f"{file.label}:1: expected a CSV table in UTF-8, got {found}; save it as plain CSV"
+            f"{file.label}:{line}: expected a CSV table in UTF-8, got {found}; save it as plain CSV"
         )
 
 
@@ -132,7 +133,8 @@ def check_last_line(file: CsvFile) -> str | None:
         return None
     *before, last = tail.splitlines()[-_TAIL_LINES - 1 :]
     body = [len(line) for line in (before[1:] if len(before) < _TAIL_LINES else before)]
-    if last.endswith((b".", b"-", b"+", b"e")) or (body and len(last) < min(body) - 1):
+    is_short = body and not last.endswith(b",") and len(last) < min(body) - 1
+    if is_short or last.endswith((b".", b"-", b"+", b"e")):
         with file.open() as stream:
             number = sum(1 for _ in stream)
         raise DataError(

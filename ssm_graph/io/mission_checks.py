@@ -19,9 +19,8 @@ from ssm_graph.io.mission_toml import MissionToml
 from ssm_graph.io.mission_units import to_frd
 from ssm_graph.io.tables import Table
 
-LONGEST_STEP_S: Final = 0.2
-"""Below 5 Hz an IMU cannot carry a vehicle's motion between pings."""
-SHORTEST_STEP_S: Final = 5e-5
+RATE_RANGE_HZ: Final = (5.0, 20000.0)
+"""A slower IMU cannot carry a vehicle's motion between pings; a faster one has other units."""
 LONGEST_GAP_S: Final = 10.0
 NOTED_GAP_S: Final = 0.1
 FORCE_RANGE: Final = (9.3, 10.3)
@@ -113,13 +112,14 @@ def check_reference(table: Table) -> list[str]:
 def _imu_times(table: Table) -> list[str]:
     steps = np.diff(table.time_s)
     median = float(np.median(steps))
-    if not SHORTEST_STEP_S <= median <= LONGEST_STEP_S:
+    lowest, highest = RATE_RANGE_HZ
+    if not 0.99 * lowest <= 1.0 / median <= highest:
         units = [unit for size, unit in _STEP_UNITS if 5.0 <= size / median <= 5000.0]
         hint = f"are the times in {units[0]}" if units else "are the times not in seconds"
-        hint += ", or was the log thinned out?" if median > LONGEST_STEP_S else "?"
+        hint += ", or was the log thinned out?" if 1.0 / median < lowest else "?"
         raise DataError(
             f"{table.label}: the rows are {median:.6g} s apart, {1.0 / median:.6g} Hz; expected "
-            f"{1.0 / LONGEST_STEP_S:g} to {1.0 / SHORTEST_STEP_S:g} Hz; {hint}"
+            f"{lowest:g} to {highest:g} Hz; {hint}"
         )
     row = int(np.argmax(steps))
     if steps[row] > LONGEST_GAP_S:

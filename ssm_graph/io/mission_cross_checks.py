@@ -72,7 +72,7 @@ def _initial_time(mission: Mission, label: str) -> None:
     imu, initial = mission.imu, mission.initial
     step = float(np.median(np.diff(imu.time_s)))
     start, end = imu.start_s, float(imu.time_s[-1])
-    if initial is not None and not start - step <= initial.time_s <= end:
+    if initial is not None and not start - 2.0 * step <= initial.time_s <= end:
         raise ConfigError(
             f"{TOML_NAME} [initial] time_s: expected a time between {start:z.3f} and {end:z.3f} s, "
             f"the span of {label}, got {initial.time_s:z.3f} s; give the time of the stated "

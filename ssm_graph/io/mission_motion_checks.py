@@ -200,8 +200,11 @@ def _beams_agree(mission: Mission, label: str) -> list[str]:
     is_better = 3.0 * max(errors[best], sigma) < errors[0]
     if not is_better and errors[0] < max(_CONTRADICTION * typical, 10.0 * sigma):
         return []
-    order = ", ".join(str(beam + 1) for beam in orders[best])
-    hint = f"the order {order} of the beams would fit" if is_better else "check the beam directions"
+    hint = "check the beam directions"
+    if is_better:  # several orders fit alike: name the one that moves the fewest beams
+        fits = [o for o, error in zip(orders, errors, strict=True) if error < 1.5 * errors[best]]
+        order = max(fits, key=lambda o: sum(o[beam] == beam for beam in range(N_BEAMS)))
+        hint = f"they would fit in the order {', '.join(str(beam + 1) for beam in order)}, for one"
     return [
         f"{label}: the four beams contradict each other by {errors[0]:.3f} m/s in half of the "
         f"pings at typical speeds of {typical:.2f} m/s; {hint}"

@@ -54,7 +54,9 @@ def read_mission_toml(folder: Path) -> MissionToml:
             raise ConfigError(f"{TOML_NAME} {name}: unknown key or section; {hint}")
     for name in REQUIRED_SECTIONS:
         if name not in raw:
-            raise ConfigError(f"{TOML_NAME} [{name}]: the section is missing")
+            raise ConfigError(
+                f"{TOML_NAME} [{name}]: the section is missing; every mission needs it"
+            )
     sections = {name: read_settings(name, raw[name]) for name in raw if name in SECTIONS}
     _check_beam_keys(sections["dvl"])
     return MissionToml(

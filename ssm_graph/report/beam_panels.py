@@ -17,12 +17,13 @@ from ssm_graph.report.style import (
     OUTLIER,
     OUTLIER_WEIGHT,
     REDUCED,
+    REDUCED_WEIGHT,
+    SMALL,
     dress,
     thinned_outliers_first,
     time_axis,
 )
 
-REDUCED_WEIGHT: Final = 0.5
 CLASSES: Final = (
     (REDUCED_WEIGHT, np.inf, NOMINAL, f"weight ≥ {REDUCED_WEIGHT:g}", 1.6),
     (OUTLIER_WEIGHT, REDUCED_WEIGHT, REDUCED, "reduced", 3.0),
@@ -33,42 +34,37 @@ CLASSES: Final = (
 
 def draw_beams(
     figure: Figure,
-    rows: tuple[SubplotSpec, SubplotSpec],
+    place: SubplotSpec,
     beams: BeamTable,
     *,
     trajectory_s: Array,
 ) -> None:
     """Draw innovations above weights, a column per beam, all on the same scales."""
     divisor, label = time_axis(trajectory_s)
-    span = (0.0, float(np.ptp(trajectory_s)) / divisor)
-    shared: list[Axes | None] = [None, None]
-    grids = [row.subgridspec(1, N_BEAMS) for row in rows]
+    span = float(np.ptp(trajectory_s)) / divisor or 1.0
+    grid = place.subgridspec(2, N_BEAMS, height_ratios=[1.35, 1.0])
+    upper: list[Axes] = []
+    left: list[Axes] = []
     for beam in range(N_BEAMS):
         mine = np.flatnonzero(beams.beam == beam + 1)
         mine = mine[thinned_outliers_first(beams.weight[mine])]
         since = (beams.time_s[mine] - trajectory_s[0]) / divisor
-        weight = beams.weight[mine]
-        panels = []
-        for row, values in enumerate((beams.innovation[mine], weight)):
-            axes = figure.add_subplot(grids[row][beam], sharey=shared[row])
-            shared[row] = shared[row] or axes
-            _scatter(axes, since, values, weight)
-            axes.set_xlim(span[0] - 0.02 * span[1], span[1] * 1.02 or 1.0)
-            panels.append(axes)
-        is_first = beam == 0
-        dress(
-            panels[0],
-            title=f"Beam {beam + 1}",
-            y="innovation, m/s" if is_first else "",
-        )
-        dress(panels[1], x=label, y="weight, –" if is_first else "")
-        panels[0].tick_params(labelbottom=False)
-        for axes in panels:
-            axes.tick_params(labelleft=is_first)
-        if is_first:
-            _symlog(panels[0], beams.innovation)
-            panels[1].set_ylim(-0.06, max(1.06, 1.06 * float(np.max(weight, initial=1.0))))
-    _class_legend(figure, shared[0])
+        first = upper[0] if upper else None
+        innovation = figure.add_subplot(grid[0, beam], sharey=first)
+        weight = figure.add_subplot(grid[1, beam], sharex=innovation)
+        _scatter(innovation, since, beams.innovation[mine], beams.weight[mine])
+        _scatter(weight, since, beams.weight[mine], beams.weight[mine])
+        innovation.set_xlim(-0.03 * span, 1.03 * span)
+        weight.set_ylim(-0.06, max(1.06, 1.06 * float(np.max(beams.weight, initial=1.0))))
+        dress(innovation, title=f"Beam {beam + 1}", y="" if upper else "innovation, m/s")
+        dress(weight, x=label, y="" if upper else "weight, –")
+        innovation.tick_params(labelbottom=False, labelleft=not upper)
+        weight.tick_params(labelleft=not upper)
+        upper.append(innovation)
+        left = left or [innovation, weight]
+    figure.align_ylabels(left)
+    _symlog(upper[0], beams.innovation)
+    _class_legend(figure, upper[0])
 
 
 def _scatter(axes: Axes, since: Array, values: Array, weight: Array) -> None:
@@ -114,16 +110,14 @@ def _plain(value: float, _position: Any) -> str:
     return f"{value:g}".replace("-", "−")
 
 
-def _class_legend(figure: Figure, axes: Axes | None) -> None:
-    if axes is None:
-        return
+def _class_legend(figure: Figure, axes: Axes) -> None:
     handles, names = axes.get_legend_handles_labels()
     figure.legend(
         handles,
         names,
         loc="outside lower center",
         ncols=len(names),
-        fontsize=7.0,
+        fontsize=SMALL,
         frameon=False,
         markerscale=1.6,
     )

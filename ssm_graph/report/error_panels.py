@@ -52,7 +52,7 @@ def draw_velocity(axes: Axes, trajectory: Trajectory, errors: ErrorSeries | None
     widest = trajectory.velocity_sigma_enu.max(axis=1)
     has_error = errors is not None and bool(np.isfinite(errors.velocity_enu).any())
     if errors is not None and has_error:
-        _draw_bounds(axes, trajectory, widest, label="±3σ, widest axis")
+        _draw_bounds(axes, trajectory, widest, label="±3σ")
         for i in range(3):
             _draw_line(
                 axes,

@@ -6,11 +6,12 @@ import os
 from pathlib import Path
 
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from ssm_graph.data import Reference
 from ssm_graph.errors import DataError
 from ssm_graph.estimate import Estimate, Trajectory
-from ssm_graph.evaluation import ErrorSeries, error_series
+from ssm_graph.evaluation import Metrics, evaluate
 from ssm_graph.report.beam_panels import draw_beams
 from ssm_graph.report.error_panels import draw_heading, draw_position, draw_velocity
 from ssm_graph.report.style import INK, SMALL
@@ -42,13 +43,20 @@ def save_figure(
     path = Path(path)
     if len(estimate.trajectory.time_s) == 0:
         raise DataError(f"{path}: cannot draw an estimate without keyframes")
+    if not path.parent.is_dir():
+        raise DataError(f"{path}: cannot write the figure: no folder {str(path.parent)!r}")
     figure = draw_figure(estimate, reference, title=title)
+    known = figure.canvas.get_supported_filetypes()
+    if path.suffix.removeprefix(".").lower() not in known:
+        raise DataError(
+            f"{path}: cannot write a figure of type {path.suffix!r}; known are {', '.join(known)}"
+        )
     part = path.with_name(f".{path.stem}.part-{os.getpid()}{path.suffix}")
     try:
         figure.savefig(part, dpi=DPI)
         part.replace(path)
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path}: cannot write the figure: {error}") from error
+    except OSError as error:
+        raise DataError(f"{path}: cannot write the figure: {error.strerror or error}") from error
     finally:
         part.unlink(missing_ok=True)
 
@@ -58,35 +66,38 @@ def draw_figure(
 ) -> Figure:
     """Return the page as a figure that belongs to no window and no global state."""
     trajectory = estimate.trajectory
-    errors = _errors(trajectory, reference)
-    figure = Figure(figsize=PAGE_INCHES, layout="constrained")
-    figure.set_constrained_layout_pads(h_pad=0.05, w_pad=0.05)
-    figure.suptitle(
-        title or "Estimate", x=0.012, ha="left", fontsize=13.0, fontweight="bold", color=INK
-    )
-    figure.text(
-        0.988, 0.988, _caption(estimate), ha="right", va="top", fontsize=SMALL + 0.5, color=INK
-    )
-    grid = figure.add_gridspec(4, 1, height_ratios=[4.0, 1.8, 1.9, 1.5])
-    top = grid[0].subgridspec(3, 2, width_ratios=[1.2, 1.0])
-    draw_track(figure.add_subplot(top[:, 0]), estimate, reference if errors else None)
-    draw_position([figure.add_subplot(top[i, 1]) for i in range(3)], trajectory, errors)
-    middle = grid[1].subgridspec(1, 2, width_ratios=[1.2, 1.0])
-    draw_velocity(figure.add_subplot(middle[0]), trajectory, errors)
-    draw_heading(figure.add_subplot(middle[1]), trajectory, errors)
-    draw_beams(figure, (grid[2], grid[3]), estimate.beams, trajectory_s=trajectory.time_s)
-    figure.align_ylabels()
+    metrics = _metrics(trajectory, reference)
+    errors = metrics.errors if metrics else None
+    layout = ConstrainedLayoutEngine(h_pad=0.05, w_pad=0.05)
+    figure = Figure(figsize=PAGE_INCHES, layout=layout)
+    heading = figure.suptitle(f"{title or 'Estimate'}\n", x=0.012, ha="left", color=INK)
+    heading.set(fontsize=12.0, fontweight="bold", linespacing=1.4)
+    caption = _caption(estimate, metrics)
+    figure.text(0.012, 0.973, caption, va="top", fontsize=SMALL + 0.5, color=INK)
+    grid = figure.add_gridspec(2, 1, height_ratios=[5.9, 3.5])
+    upper = grid[0].subgridspec(4, 2, width_ratios=[1.2, 1.0], height_ratios=[1.0, 1.0, 1.0, 1.25])
+    draw_track(figure.add_subplot(upper[:3, 0]), estimate, reference if errors else None)
+    draw_position([figure.add_subplot(upper[i, 1]) for i in range(3)], trajectory, errors)
+    draw_velocity(figure.add_subplot(upper[3, 0]), trajectory, errors)
+    draw_heading(figure.add_subplot(upper[3, 1]), trajectory, errors)
+    draw_beams(figure, grid[1], estimate.beams, trajectory_s=trajectory.time_s)
     return figure
 
 
-def _errors(trajectory: Trajectory, reference: Reference | None) -> ErrorSeries | None:
+def _metrics(trajectory: Trajectory, reference: Reference | None) -> Metrics | None:
     if reference is None:
         return None
     try:
-        return error_series(trajectory, reference)
-    except DataError:  # no overlap: `evaluate` says so, the page is drawn without
+        return evaluate(trajectory, reference)
+    except DataError:  # no overlap: `evaluate` says so elsewhere, the page is drawn without
         return None
 
 
-def _caption(estimate: Estimate) -> str:
-    return f"{estimate.method} · {estimate.kernel}\n{estimate.status.name}"
+def _caption(estimate: Estimate, metrics: Metrics | None) -> str:
+    parts = [estimate.method, estimate.kernel, estimate.status.name]
+    if metrics is not None:
+        parts.append(f"horizontal error {metrics.rmse_horizontal_m:.3g} m rms")
+        parts.append(f"{metrics.end_error_m:.3g} m at the end")
+        if metrics.path_length_m > 0.0:
+            parts.append(f"{metrics.drift_percent:.2g} % of {metrics.path_length_m:.0f} m")
+    return "  ·  ".join(parts)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,6 +12,8 @@ from ssm_graph.data import Array
 
 OUTLIER_WEIGHT: Final = 0.05
 """A beam speed with less weight than this is shown and counted as an outlier."""
+REDUCED_WEIGHT: Final = 0.5
+"""A beam speed with less weight than this is shown as one that lost influence."""
 MAX_POINTS: Final = 5000
 """Points of a curve that are drawn; no page shows more."""
 
@@ -44,9 +46,9 @@ def dress(axes: Axes, *, title: str = "", x: str = "", y: str = "") -> None:
         spine.set_linewidth(0.6)
 
 
-def legend(axes: Axes, **options: object) -> None:
+def legend(axes: Axes, **options: Any) -> None:
     """Add a plain legend."""
-    axes.legend(fontsize=SMALL, frameon=False, handlelength=1.6, **options)  # type: ignore[arg-type]
+    axes.legend(fontsize=SMALL, frameon=False, handlelength=1.4, **options)
 
 
 def thinned(n: int, limit: int = MAX_POINTS) -> NDArray[np.intp]:
@@ -57,12 +59,16 @@ def thinned(n: int, limit: int = MAX_POINTS) -> NDArray[np.intp]:
 
 
 def thinned_outliers_first(weight: Array, limit: int = MAX_POINTS) -> NDArray[np.intp]:
-    """Return at most ``limit`` indices, in order: a half of the least weights, the rest evenly."""
+    """Return at most ``limit`` indices in order: of those below `REDUCED_WEIGHT` up to a half.
+
+    Each of the two kinds is spread evenly, so that no density is made up.
+    """
     if len(weight) <= limit:
         return np.arange(len(weight))
-    least = np.argsort(weight, kind="stable")[: limit // 2]
-    others = np.setdiff1d(np.arange(len(weight)), least, assume_unique=True)
-    return np.sort(np.r_[least, others[thinned(len(others), limit - len(least))]])
+    is_reduced = weight < REDUCED_WEIGHT
+    reduced, nominal = np.flatnonzero(is_reduced), np.flatnonzero(~is_reduced)
+    kept = reduced[thinned(len(reduced), max(limit // 2, limit - len(nominal)))]
+    return np.sort(np.r_[kept, nominal[thinned(len(nominal), limit - len(kept))]])
 
 
 def broken_at_gaps(time_s: Array, values: Array) -> tuple[Array, Array]:

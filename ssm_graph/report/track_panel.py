@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from matplotlib.axes import Axes
 
@@ -20,6 +22,9 @@ from ssm_graph.report.style import (
     thinned,
 )
 
+MAX_MARKS: Final = 200
+"""Rejected pings that are marked; more would hide the track."""
+
 
 def draw_track(axes: Axes, estimate: Estimate, reference: Reference | None) -> None:
     """Draw east and north of the estimate's first keyframe, m or km."""
@@ -28,7 +33,8 @@ def draw_track(axes: Axes, estimate: Estimate, reference: Reference | None) -> N
         float(trajectory.lat[0]), float(trajectory.lon[0]), float(trajectory.height[0])
     )
     p_n = frame.p_n_from_geodetic(trajectory.lat, trajectory.lon, trajectory.height)
-    unit, scale = ("km", 1e-3) if np.nanmax(np.abs(p_n[:, :2])) > 5000.0 else ("m", 1.0)
+    largest = np.nanmax(np.abs(p_n[:, :2]), initial=0.0)
+    unit, scale = ("km", 1e-3) if largest > 5000.0 else ("m", 1.0)
     if reference is not None:
         _draw_reference(axes, reference, frame, trajectory.time_s, scale=scale)
     shown = thinned(len(p_n))
@@ -38,7 +44,7 @@ def draw_track(axes: Axes, estimate: Estimate, reference: Reference | None) -> N
         at = scale * np.column_stack(
             [np.interp(rejected, trajectory.time_s, p_n[:, i]) for i in range(2)]
         )
-        label = f"ping with a beam below weight {OUTLIER_WEIGHT:g}"
+        label = f"beam weight < {OUTLIER_WEIGHT:g}"
         axes.plot(*at.T, "x", color=OUTLIER, markersize=3.2, markeredgewidth=0.8, label=label)
     axes.plot(*(scale * p_n[0, :2]), "o", color=INK, markersize=5.5, label="start")
     axes.plot(
@@ -47,7 +53,14 @@ def draw_track(axes: Axes, estimate: Estimate, reference: Reference | None) -> N
     dress(axes, title="Track", x=f"east, {unit}", y=f"north, {unit}")
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.06)
-    legend(axes, loc="upper left", bbox_to_anchor=(0.0, -0.1), ncols=2, columnspacing=1.2)
+    legend(
+        axes,
+        loc="upper left",
+        bbox_to_anchor=(-0.04, -0.09),
+        ncols=5,
+        columnspacing=0.8,
+        handletextpad=0.4,
+    )
 
 
 def _draw_reference(
@@ -64,4 +77,4 @@ def _draw_reference(
 
 def _rejected_times(estimate: Estimate) -> Array:
     times = np.unique(estimate.beams.time_s[estimate.beams.weight < OUTLIER_WEIGHT])
-    return np.asarray(times[thinned(len(times), 1500)])
+    return np.asarray(times[thinned(len(times), MAX_MARKS)])

@@ -165,6 +165,14 @@ class SsmSmoother:
             spread = np.einsum("mi,mij,mj->m", H, covariance[beams.keyframe], H, optimize=True)
         return expected_mahalanobis_sq(rows.error, spread, sigma=beams.sigma)
 
+    def _cost(self, linearizer: GraphLinearizer, last: _Pass) -> float:
+        """Return the cost with each beam's robust loss in place of its weighted square."""
+        kernel, rows = self.config.kernel, last.beam_rows
+        t = (rows.error / linearizer.problem.beams.sigma) ** 2
+        loss = kernel.similarity(np.zeros_like(t)) - kernel.similarity(t)
+        others = linearizer.cost(last.states, rows, np.zeros_like(t))
+        return others + float(np.sum(loss))
+
     def _estimate(
         self,
         problem: Problem,
@@ -201,6 +209,7 @@ class SsmSmoother:
             ),
             iterations=tuple(iterations),
             wall_s=time.perf_counter() - begin,
+            cost=self._cost(linearizer, last),
             start=problem.start,
             notes=notes,
         )

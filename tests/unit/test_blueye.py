@@ -24,6 +24,7 @@ needs_logs = pytest.mark.skipif(not LOGS.is_dir(), reason=f"no Blueye logs in {L
 
 @pytest.fixture(scope="module")
 def missions() -> dict[str, Mission]:
+    """Return all three runs, converted once."""
     pytest.importorskip("mcap_protobuf", reason="needs the extra 'blueye'")
     return {name: convert_blueye(LOGS / f"{name}.mcap") for name in (SQUARE, DIVE, GRID)}
 

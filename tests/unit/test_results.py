@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.estimate_fixture import EPOCH, NOTES, make_mission, make_run
 
 from ssm_graph.errors import DataError
 from ssm_graph.estimate import BeamTable, Status
@@ -17,6 +16,7 @@ from ssm_graph.evaluation import evaluate, path_length_m
 from ssm_graph.io import results as results_module
 from ssm_graph.io.results import read_results, write_results
 from ssm_graph.io.results_summary import as_json
+from tests.estimate_fixture import EPOCH, NOTES, make_mission, make_run
 
 TRAJECTORY_HEADER = (
     "time_s,lat_deg,lon_deg,height_m,vel_east_m_per_s,vel_north_m_per_s,vel_up_m_per_s,"

@@ -1,0 +1,235 @@
+"""Finding the initial state from the data: levelling, gyrocompassing, heading from GNSS and DVL.
+
+Levelling and gyrocompassing are one fit. In axes that do not turn, the specific force that the
+vehicle's own velocity does not explain integrates to gravity, and gravity turns with the Earth::
+
+    C(t) v_b(t) - v_b(0) - int C f_b dt = R_bn int Exp(omega_ie t) g_n dt
+
+with ``C`` the gyros' rotation since the start. The direction of both sides gives roll and pitch,
+its turning gives heading, if the gyros sense the Earth.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ssm_graph.data import Array, GnssLog, ImuNoise, InitialState, Mission
+from ssm_graph.earth import EARTH_RATE, normal_gravity
+from ssm_graph.errors import ConfigError, DataError
+from ssm_graph.frames import (
+    R_lb_from_roll_pitch_heading,
+    roll_pitch_heading_from_R_lb,
+    wrap_to_pi,
+)
+from ssm_graph.graph.body_velocity import BodyVelocities, body_velocities
+from ssm_graph.graph.track_heading import HeadingFit, heading_from_track
+from ssm_graph.imu.increments import merge_samples
+
+SAFE_HEADING_SIGMA = math.radians(10.0)
+"""Above this, one heading is not safe and several are tried."""
+N_HYPOTHESES = 8
+CAUTION = 3.0
+"""The data that align are used again by the smoother: their sigmas enter its prior this much
+larger, so that counting them twice adds little."""
+MAX_WINDOW_S = 300.0
+MIN_WINDOW_S = 10.0
+TURN_BUDGET = math.radians(0.5)
+"""The window is as long as the gyros' turn-on bias keeps the accumulated turn below this."""
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """Initial states to start from; more than one where the heading is not safe."""
+
+    candidates: tuple[InitialState, ...]
+    method: str
+    """One sentence: how roll, pitch and heading were found, with sigmas."""
+
+
+def align(mission: Mission) -> Alignment:
+    """Find the initial state of a mission from its first minutes.
+
+    Raises
+    ------
+    ConfigError
+        If there is no GNSS fix to give a position.
+    DataError
+        If no inertial data follow the first fix.
+    """
+    gnss, fix = _first_fix(mission)
+    start_s = float(gnss.time_s[fix])
+    velocities = body_velocities(mission)
+    window_s = _window(mission, start_s)
+    turned = _integrate_gyros(mission, start_s, window_s, velocities)
+    R_lb = _level_and_compass(mission, turned)
+    compass = _compass_sigma(mission.imu.noise, turned, mission.frame.lat)
+    track = heading_from_track(mission, start_s, R_lb, velocities)
+    heading, method = _choose_heading(R_lb, compass, track)
+    level = _level_sigma(mission.imu.noise, turned)
+    roll, pitch, _ = roll_pitch_heading_from_R_lb(R_lb)
+    starts = [
+        _initial_state(mission, fix, (float(roll), float(pitch), h), level, sigma, velocities)
+        for h, sigma in _hypotheses(heading)
+    ]
+    method += (
+        f"; roll and pitch levelled over {turned.time_s[-1]:.0f} s, sigma "
+        f"{math.degrees(level):.2f} deg"
+    )
+    return Alignment(tuple(starts), method)
+
+
+def _first_fix(mission: Mission) -> tuple[GnssLog, int]:
+    gnss = mission.gnss
+    if gnss is None or len(gnss.time_s) == 0:
+        raise ConfigError(
+            "mission.toml: expected [initial] or [gnss], got neither; without one of them the "
+            "start is unknown: add [initial] with position, attitude and their sigmas"
+        )
+    usable = np.flatnonzero(gnss.time_s >= mission.imu.start_s)
+    if len(usable) == 0 or gnss.time_s[usable[0]] > mission.imu.time_s[-1] - MIN_WINDOW_S:
+        raise DataError(
+            f"alignment: expected a GNSS fix at least {MIN_WINDOW_S:.0f} s before the end of the "
+            f"inertial data at {mission.imu.time_s[-1]:.3f} s, got fixes "
+            f"{gnss.time_s[0]:.3f}..{gnss.time_s[-1]:.3f} s; check the clocks or add [initial]"
+        )
+    return gnss, int(usable[0])
+
+
+def _window(mission: Mission, start_s: float) -> float:
+    """Return how long to align for, s: as long as the gyros keep their attitude."""
+    budget = TURN_BUDGET / mission.imu.noise.gyro_bias_sigma
+    longest = float(mission.imu.time_s[-1]) - start_s
+    return float(min(max(budget, MIN_WINDOW_S), MAX_WINDOW_S, longest))
+
+
+class _Turned(NamedTuple):
+    """Inertial data of the window in the body axes of its start, at times with a velocity."""
+
+    time_s: Array
+    """(N,) s since the start, the first 0"""
+    velocity_gain: Array
+    """(N, 3) ``C v_b(t) - v_b(0) - int C f_b dt``, m/s"""
+
+
+def _integrate_gyros(
+    mission: Mission, start_s: float, window_s: float, velocities: BodyVelocities
+) -> _Turned:
+    times = start_s + np.linspace(0.0, window_s, max(int(window_s), 2) + 1)
+    merged = merge_samples(mission.imu, times, rate_hz=20.0)
+    v_b = velocities.at(times)
+    C, integral = np.eye(3), np.zeros(3)
+    gains = [np.zeros(3)]
+    for k in range(1, len(times)):
+        for i in range(merged.first[k - 1], merged.first[k]):
+            half = Rotation.from_rotvec(0.5 * merged.gyro_b[i] * merged.dt[i]).as_matrix()
+            integral = integral + C @ half @ merged.accel_b[i] * merged.dt[i]
+            C = C @ half @ half
+        gains.append(C @ v_b[k] - v_b[0] - integral)
+    return _Turned(times - start_s, np.array(gains))
+
+
+def _level_and_compass(mission: Mission, turned: _Turned) -> Array:
+    """Return the rotation body to local level at the start that maps the velocity gain best."""
+    omega = mission.frame.omega_ie_n
+    gravity = float(normal_gravity(mission.frame.lat, mission.frame.height))
+    t = turned.time_s[1:, None]
+    g_n = np.array([0.0, 0.0, -gravity])
+    # int Exp(omega t) g dt to second order in the Earth's turn, 1e-7 of it over the window
+    first, second = np.cross(omega, g_n), np.cross(omega, np.cross(omega, g_n))
+    expected = g_n * t + first * t**2 / 2.0 + second * t**3 / 6.0
+    # Every row counts alike once divided by its length of time.
+    R_lb, _ = Rotation.align_vectors(expected / t, turned.velocity_gain[1:] / t, weights=t[:, 0])
+    return np.asarray(R_lb.as_matrix())
+
+
+def _compass_sigma(noise: ImuNoise, turned: _Turned, lat: float) -> float:
+    """Return the standard deviation of a gyrocompass heading, rad."""
+    window_s = turned.time_s[-1]
+    rate = math.hypot(noise.gyro_bias_sigma, noise.gyro_density / math.sqrt(window_s))
+    # A velocity error of a few mm/s against the sideways gain g omega cos(lat) T^2 / 2.
+    gain = 0.5 * 9.8 * window_s**2
+    return math.hypot(rate, 2.0 * _VELOCITY_SIGMA / gain) / (EARTH_RATE * math.cos(lat))
+
+
+_VELOCITY_SIGMA = 0.02
+
+
+def _level_sigma(noise: ImuNoise, turned: _Turned) -> float:
+    window_s = turned.time_s[-1]
+    parts = (
+        noise.accel_bias_sigma / 9.8,
+        0.5 * noise.gyro_bias_sigma * window_s,
+        2.0 * _VELOCITY_SIGMA / (9.8 * window_s),
+        noise.gyro_density * math.sqrt(window_s),
+    )
+    return math.hypot(*parts)
+
+
+def _choose_heading(R_lb: Array, compass: float, track: HeadingFit) -> tuple[HeadingFit, str]:
+    if compass <= track.sigma:
+        fit = HeadingFit(float(roll_pitch_heading_from_R_lb(R_lb)[2]), compass)
+        source = "gyrocompassing"
+    else:
+        fit, source = track, "GNSS against DVL displacement"
+    if fit.sigma > SAFE_HEADING_SIGMA:
+        sigma = f"{math.degrees(fit.sigma):.0f} deg" if fit.sigma < math.pi else "unbounded"
+        return fit, (
+            f"heading hardly observable from {source} (sigma {sigma}): {N_HYPOTHESES} hypotheses "
+            "tried"
+        )
+    return fit, (
+        f"heading {math.degrees(fit.heading) % 360.0:.2f} deg from {source}, sigma "
+        f"{math.degrees(fit.sigma):.2f} deg"
+    )
+
+
+def _hypotheses(fit: HeadingFit) -> list[tuple[float, float]]:
+    """Return headings to start from with the sigma of each."""
+    if fit.sigma <= SAFE_HEADING_SIGMA:
+        return [(fit.heading, CAUTION * fit.sigma)]
+    step = 2.0 * math.pi / N_HYPOTHESES
+    return [
+        (float(wrap_to_pi(fit.heading + i * step)), CAUTION * SAFE_HEADING_SIGMA)
+        for i in range(N_HYPOTHESES)
+    ]
+
+
+def _initial_state(
+    mission: Mission,
+    fix: int,
+    roll_pitch_heading: tuple[float, float, float],
+    level_sigma: float,
+    heading_sigma: float,
+    velocities: BodyVelocities,
+) -> InitialState:
+    gnss, frame = mission.gnss, mission.frame
+    assert gnss is not None
+    start_s = float(gnss.time_s[fix])
+    R_lb = R_lb_from_roll_pitch_heading(*roll_pitch_heading)
+    antenna_n = frame.p_n_from_geodetic(gnss.lat[fix], gnss.lon[fix], gnss.height[fix])
+    lat, lon, height = frame.geodetic_from_p_n(
+        antenna_n - frame.R_nl_at(antenna_n) @ R_lb @ gnss.lever_arm_b
+    )
+    speed = float(np.linalg.norm(velocities.at(np.array([start_s]))))
+    across = speed * min(heading_sigma, 2.0)
+    velocity_sigma = max(0.1, across) if velocities.covers(start_s) else 1.0
+    level = max(CAUTION * level_sigma, math.radians(0.05))
+    roll, pitch, heading = roll_pitch_heading
+    return InitialState(
+        time_s=start_s,
+        lat=float(lat),
+        lon=float(lon),
+        height=float(height),
+        roll=roll,
+        pitch=pitch,
+        heading=heading % (2.0 * math.pi),
+        velocity_enu=R_lb @ velocities.at(np.array([start_s]))[0],
+        position_sigma_enu=CAUTION * gnss.sigma_enu[fix],
+        velocity_sigma_enu=np.full(3, velocity_sigma),
+        attitude_sigma=np.array([level, level, heading_sigma]),
+    )

@@ -1,0 +1,125 @@
+"""From a mission to its estimate: alignment where it is needed, then the smoother."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from ssm_graph.data import Mission
+from ssm_graph.errors import SolverError
+from ssm_graph.estimate import Estimate, Status
+from ssm_graph.frames import wrap_to_pi
+from ssm_graph.graph.alignment import Alignment, align
+from ssm_graph.graph.problem import Problem, ProblemConfig, build_problem
+from ssm_graph.smoothers.batch import OnIteration, SmootherConfig, SsmSmoother
+
+AMBIGUOUS_COST = 6.0
+"""Another heading whose cost is higher by less than this is as good an explanation (a likelihood
+ratio of about 400)."""
+SAME_HEADING = np.radians(5.0)
+POOR_HEADING = np.radians(10.0)
+"""A heading with a larger posterior sigma at the start is said to be hardly observable."""
+
+OnStage = Callable[[str], None]
+
+
+def smooth(
+    mission: Mission,
+    config: SmootherConfig | None = None,
+    *,
+    problem_config: ProblemConfig | None = None,
+    on_iteration: OnIteration | None = None,
+    on_stage: OnStage | None = None,
+) -> Estimate:
+    """Smooth a mission; without an initial state, align first.
+
+    Where alignment finds no safe heading, several are smoothed and the one that explains the data
+    best is returned; the notes say so, and an ambiguous choice makes the status suspect.
+
+    Parameters
+    ----------
+    mission : from :func:`ssm_graph.read_mission` or a simulation.
+    config : settings of the similarity loop.
+    problem_config : rates and intervals of the graph.
+    on_iteration : called with number, limit and :class:`ssm_graph.Iteration` after each iteration.
+    on_stage : called with a line of text when a new stage begins.
+
+    Raises
+    ------
+    SsmGraphError
+        With a sentence that says what is wrong, if the mission cannot be smoothed.
+    """
+    say = on_stage or (lambda _: None)
+    smoother = SsmSmoother(config)
+    if mission.initial is not None:
+        say("preintegrating")
+        problem = build_problem(mission, problem_config)
+        say(f"smoothing {problem.n_keyframes} keyframes")
+        return _with_notes(smoother.solve(problem, on_iteration=on_iteration), mission.notes)
+    say("aligning")
+    alignment = align(mission)
+    problem = build_problem(mission, problem_config, start=alignment.candidates[0])
+    estimates = []
+    for i, start in enumerate(alignment.candidates):
+        say(
+            f"smoothing {problem.n_keyframes} keyframes, start {i + 1} of "
+            f"{len(alignment.candidates)}: heading {np.degrees(start.heading):.0f} deg"
+        )
+        estimates.append(_try(smoother, replace(problem, start=start), on_iteration))
+    chosen = _choose([estimate for estimate in estimates if estimate is not None], alignment)
+    return _with_notes(chosen, (*mission.notes, f"aligned: {alignment.method}"))
+
+
+def _try(
+    smoother: SsmSmoother, problem: Problem, on_iteration: OnIteration | None
+) -> Estimate | None:
+    try:
+        return smoother.solve(problem, on_iteration=on_iteration)
+    except SolverError:
+        return None
+
+
+def _choose(estimates: list[Estimate], alignment: Alignment) -> Estimate:
+    """Return the estimate of lowest cost, marked where another heading does as well."""
+    if not estimates:
+        raise SolverError(
+            f"none of {len(alignment.candidates)} start headings led to a finite solution; "
+            "check signs, units and axes of [imu] and [dvl], or give [initial]"
+        )
+    best = min(estimates, key=lambda estimate: estimate.cost)
+    heading = best.trajectory.roll_pitch_heading[0, 2]
+    sigma = float(best.trajectory.attitude_sigma[0, 2])
+    rivals = [
+        float(np.degrees(other.trajectory.roll_pitch_heading[0, 2]))
+        for other in estimates
+        if other.cost - best.cost < AMBIGUOUS_COST
+        and abs(wrap_to_pi(other.trajectory.roll_pitch_heading[0, 2] - heading)) > SAME_HEADING
+    ]
+    found = (
+        f"start heading {np.degrees(heading):.2f} deg, posterior sigma {np.degrees(sigma):.2f} deg"
+    )
+    if rivals:
+        return replace(
+            best,
+            status=Status.SUSPECT,
+            reason=(
+                f"heading ambiguous: {found}, but {', '.join(f'{r:.0f}' for r in rivals)} deg "
+                "explain the data as well; move more while GNSS is there, or give [initial]"
+            ),
+        )
+    if sigma > POOR_HEADING:
+        return replace(
+            best,
+            status=Status.SUSPECT,
+            reason=(
+                f"heading hardly observable: {found}; move more while GNSS is there, or give "
+                "[initial]"
+            ),
+        )
+    return _with_notes(best, (found,))
+
+
+def _with_notes(estimate: Estimate, notes: tuple[str, ...]) -> Estimate:
+    return replace(estimate, notes=notes + estimate.notes)

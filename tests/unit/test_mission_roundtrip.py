@@ -1,0 +1,145 @@
+"""What is written is read back, to rounding, and an interrupted write leaves no mixture."""
+
+from __future__ import annotations
+
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tomli_w
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ssm_graph.data import DvlLog, Mission
+from ssm_graph.errors import ConfigError, DataError, MissingExtraError
+from ssm_graph.io import tables as tables_module
+from ssm_graph.io.mission import read_mission
+from ssm_graph.io.mission_units import SI, R_bd_from_rpy, from_si, rpy_from_R_bd, to_si
+from ssm_graph.io.mission_writer import write_mission
+from ssm_graph.io.tables import TableFormat
+from tests.mission_fixture import make_mission
+
+
+def assert_same(got: Any, want: Any, where: str = "mission") -> None:
+    """Compare two frozen values field by field, to a few units in the last place."""
+    if is_dataclass(want):
+        for spec in fields(want):
+            if spec.name != "notes":
+                name = spec.name
+                assert_same(getattr(got, name), getattr(want, name), f"{where}.{name}")
+    elif isinstance(want, float | np.ndarray):
+        np.testing.assert_allclose(got, want, rtol=1e-15, atol=1e-15, err_msg=where)
+    else:
+        assert got == want, where
+
+
+def without_optional_parts(mission: Mission) -> Mission:
+    """Return the smallest mission: IMU, DVL and an origin."""
+    return replace(mission, depth=None, gnss=None, initial=None, reference=None)
+
+
+@pytest.mark.parametrize("table_format", TableFormat)
+def test_round_trip(tmp_path: Path, table_format: TableFormat) -> None:
+    """Every value of a full mission comes back."""
+    if table_format is TableFormat.PARQUET:
+        pytest.importorskip("pyarrow")
+    mission = make_mission()
+    write_mission(tmp_path, mission, table_format=table_format)
+    got = read_mission(tmp_path)
+    assert_same(got, mission)
+    np.testing.assert_array_equal(got.imu.accel_b, mission.imu.accel_b)
+    np.testing.assert_array_equal(got.dvl.speed, mission.dvl.speed)
+    assert got.notes == ()
+
+
+def test_round_trip_of_the_smallest_mission(tmp_path: Path) -> None:
+    """Optional parts may be missing; constant noise needs no columns of its own."""
+    mission = without_optional_parts(make_mission())
+    dvl = replace(mission.dvl, sigma=np.full_like(mission.dvl.sigma, 0.0123), range_m=None)
+    mission = replace(mission, dvl=dvl)
+    write_mission(tmp_path, mission)
+    assert_same(read_mission(tmp_path), mission)
+    assert "sigma" not in (tmp_path / "dvl.csv").read_text().splitlines()[0]
+
+
+def test_round_trip_of_a_silent_dvl(tmp_path: Path) -> None:
+    """A DVL without a single ping is a mission all the same."""
+    mission = make_mission()
+    empty = np.empty((0, 4))
+    dvl = DvlLog(mount=mission.dvl.mount, time_s=np.empty(0), speed=empty, sigma=empty)
+    write_mission(tmp_path, replace(mission, dvl=dvl))
+    got = read_mission(tmp_path)
+    assert got.dvl.speed.shape == (0, 4)
+    assert "no rows" in got.notes[0]
+
+
+@given(st.tuples(*[st.floats(-np.pi, np.pi)] * 3))
+def test_mounting_angles_give_the_same_matrix(rpy: tuple[float, float, float]) -> None:
+    """Angles are not unique; the matrix they stand for is."""
+    R_bd = R_bd_from_rpy(np.array(rpy))
+    np.testing.assert_allclose(R_bd_from_rpy(rpy_from_R_bd(R_bd)), R_bd, rtol=0.0, atol=2e-8)
+
+
+@pytest.mark.parametrize("pitch", [-0.5 * np.pi, 0.5 * np.pi])
+def test_mounting_with_vertical_pitch(pitch: float) -> None:
+    """At the singularity only a combination of roll and yaw is defined."""
+    R_bd = R_bd_from_rpy(np.array([0.3, pitch, -1.1]))
+    np.testing.assert_allclose(R_bd_from_rpy(rpy_from_R_bd(R_bd)), R_bd, atol=1e-15)
+
+
+@given(st.sampled_from([*SI, "lever_arm_m"]), st.floats(-1e6, 1e6))
+def test_units_come_back(key: str, value: float) -> None:
+    """Conversions are inverse to rounding."""
+    np.testing.assert_allclose(to_si(key, from_si(key, value)), value, rtol=4e-16, atol=1e-320)
+
+
+def test_data_sheet_numbers_stay_short() -> None:
+    """A number that a person typed is written as it was typed."""
+    for key in SI:
+        for typed in (0.05, 45.7, 126.6, 0.003, 1e-5):
+            assert from_si(key, to_si(key, typed)) == typed
+
+
+def test_interrupted_write_keeps_the_old_mission(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the new one cannot be completed, the old one is still whole."""
+    write_mission(tmp_path, make_mission())
+
+    def fail(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(tomli_w, "dump", fail)
+    shorter = without_optional_parts(make_mission())
+    with pytest.raises(KeyboardInterrupt):
+        write_mission(tmp_path, shorter)
+    assert_same(read_mission(tmp_path), make_mission())
+    with pytest.raises(KeyboardInterrupt):
+        write_mission(tmp_path / "new", shorter)
+    with pytest.raises(ConfigError, match="there is none in"):
+        read_mission(tmp_path / "new")
+
+
+def test_mount_that_is_no_rotation_is_not_written(tmp_path: Path) -> None:
+    """Angles could not express it."""
+    mission = make_mission()
+    dvl = replace(mission.dvl, mount=replace(mission.dvl.mount, R_bd=2.0 * np.eye(3)))
+    with pytest.raises(DataError, match="expected a rotation matrix"):
+        write_mission(tmp_path, replace(mission, dvl=dvl))
+
+
+def test_parquet_without_pyarrow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The missing extra is named, with the command that installs it."""
+    pytest.importorskip("pyarrow")
+    write_mission(tmp_path, make_mission(), table_format=TableFormat.PARQUET)
+
+    def fail(name: str) -> None:
+        raise ImportError(name)
+
+    monkeypatch.setattr(tables_module, "import_module", fail)
+    with pytest.raises(MissingExtraError, match=r"pip install 'ssm-graph\[parquet\]'"):
+        read_mission(tmp_path)
+    with pytest.raises(MissingExtraError, match="pyarrow"):
+        write_mission(tmp_path, make_mission(), table_format=TableFormat.PARQUET)
