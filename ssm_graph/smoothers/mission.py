@@ -19,7 +19,8 @@ AMBIGUOUS_COST = 6.0
 """Another heading whose cost is higher by less than this is as good an explanation (a likelihood
 ratio of about 400)."""
 SAME_HEADING = np.radians(5.0)
-POOR_HEADING = np.radians(10.0)
+"""Headings closer than this, or than three of their sigmas, are one and the same."""
+POOR_HEADING = np.radians(5.0)
 """A heading with a larger posterior sigma at the start is said to be hardly observable."""
 
 OnStage = Callable[[str], None]
@@ -95,7 +96,8 @@ def _choose(estimates: list[Estimate], alignment: Alignment) -> Estimate:
         float(np.degrees(other.trajectory.roll_pitch_heading[0, 2]))
         for other in estimates
         if other.cost - best.cost < AMBIGUOUS_COST
-        and abs(wrap_to_pi(other.trajectory.roll_pitch_heading[0, 2] - heading)) > SAME_HEADING
+        and abs(wrap_to_pi(other.trajectory.roll_pitch_heading[0, 2] - heading))
+        > max(SAME_HEADING, 3.0 * sigma)
     ]
     found = (
         f"start heading {np.degrees(heading):.2f} deg, posterior sigma {np.degrees(sigma):.2f} deg"
@@ -110,13 +112,8 @@ def _choose(estimates: list[Estimate], alignment: Alignment) -> Estimate:
             ),
         )
     if sigma > POOR_HEADING:
-        return replace(
-            best,
-            status=Status.SUSPECT,
-            reason=(
-                f"heading hardly observable: {found}; move more while GNSS is there, or give "
-                "[initial]"
-            ),
+        found = (
+            f"heading hardly observable: {found}; move more while GNSS is there, or give [initial]"
         )
     return _with_notes(best, (found,))
 
