@@ -118,9 +118,7 @@ def case_config(name: str, grade: Grade, *, seed: int, duration_s: float) -> Sim
     case = CASES.get(name)
     if case is None:
         raise ConfigError(f"there is no case {name!r}; {nearest_hint(name, CASES)}")
-    clean = scenario_config(
-        "survey", name=name, grade=grade, seed=seed, duration_s=case.longer * duration_s
-    )
+    clean = scenario_config("survey", grade=grade, seed=seed, duration_s=case.longer * duration_s)
     return case.change(clean)
 
 

@@ -93,7 +93,10 @@ class Run:
     @staticmethod
     def from_dict(values: dict[str, Any]) -> Run:
         """Invert :meth:`to_dict`."""
-        return Run(**{name: math.nan if v is None else v for name, v in values.items()})
+        full: dict[str, Any] = {
+            name: math.nan if value is None else value for name, value in values.items()
+        }
+        return Run(**full)
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,9 +123,7 @@ def do_job(job: Job) -> list[Run]:
                 problems[method.is_oracle] = _timed_problem(sim, method)
             problem, build_s = problems[method.is_oracle]
             settings = SmootherConfig(kernel=method.kernel, similarity=method.similarity)
-            runs.append(
-                compare(key, sim, SsmSmoother(settings).solve(problem), build_s=build_s)
-            )
+            runs.append(compare(key, sim, SsmSmoother(settings).solve(problem), build_s=build_s))
         except SolverError as error:
             runs.append(Run(*key, status="FAILED", reason=str(error)))
         except Exception as error:  # a defect of ours must not end a study of hours, nor be lost

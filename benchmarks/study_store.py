@@ -55,9 +55,7 @@ class ResultsFile:
         self.path = path
         self.settings = settings
         self._runs: dict[RunKey, Run] = {}
-        if path.exists() and not fresh:
-            self._load()
-        else:
+        if fresh or not path.exists() or not self._load():
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(_line({"settings": settings}), encoding="utf-8")
 
@@ -77,18 +75,21 @@ class ResultsFile:
             file.flush()
         self._runs |= new
 
-    def _load(self) -> None:
+    def _load(self) -> bool:
+        """Read what is there; False if not even the first line is whole."""
         text = self.path.read_text(encoding="utf-8")
         # What follows the last line break was being written when the study was stopped.
         whole, _, torn = text.rpartition("\n")
-        lines = whole.split("\n") if whole else []
-        parsed = [self._parse(number, line) for number, line in enumerate(lines, start=1)]
-        self._check(parsed[0].get("settings") if parsed else None)
-        for values in parsed[1:]:
+        if not whole:
+            return False
+        header, *lines = [self._parse(i, line) for i, line in enumerate(whole.split("\n"), 1)]
+        self._check(header.get("settings"))
+        for values in lines:
             run = Run.from_dict(values)
             self._runs[run.key] = run
         if torn:
             self.path.write_text(whole + "\n", encoding="utf-8")
+        return True
 
     def _parse(self, number: int, line: str) -> dict[str, Any]:
         try:

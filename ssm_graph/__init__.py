@@ -1,1 +1,69 @@
-"""Factor-graph smoothing of inertial and DVL navigation with a weight for every beam."""
+"""Factor-graph smoothing of inertial and DVL navigation with a weight for every beam.
+
+::
+
+    import ssm_graph as sg
+
+    mission = sg.read_mission("lake-trial-3")
+    estimate = sg.smooth(mission, sg.SmootherConfig(kernel=sg.LogKernel(dof=5)))
+    print(estimate.status.name, estimate.reason)
+    metrics = sg.evaluate(estimate.trajectory, mission.reference) if mission.reference else None
+    sg.write_results("out", estimate, mission=mission, metrics=metrics, settings={})
+    sg.save_figure("out/figure.png", estimate, mission.reference)
+"""
+
+from factors.similarity import ExpKernel, GaussianKernel, Kernel, LogKernel, SqrtKernel
+from ssm_graph.data import InitialState, Mission, Reference
+from ssm_graph.errors import (
+    ConfigError,
+    DataError,
+    MissingExtraError,
+    SolverError,
+    SsmGraphError,
+)
+from ssm_graph.estimate import Estimate, Iteration, Status, Trajectory
+from ssm_graph.evaluation import Metrics, evaluate, reference_from_gnss
+from ssm_graph.graph.alignment import Alignment, align
+from ssm_graph.graph.problem import Problem, ProblemConfig, build_problem
+from ssm_graph.io.mission import read_mission, write_mission
+from ssm_graph.io.results import read_results, write_results
+from ssm_graph.report.figure import save_figure
+from ssm_graph.smoothers.batch import Similarity, SmootherConfig, SsmSmoother
+from ssm_graph.smoothers.mission import smooth
+
+__all__ = [
+    "Alignment",
+    "ConfigError",
+    "DataError",
+    "Estimate",
+    "ExpKernel",
+    "GaussianKernel",
+    "InitialState",
+    "Iteration",
+    "Kernel",
+    "LogKernel",
+    "Metrics",
+    "MissingExtraError",
+    "Mission",
+    "Problem",
+    "ProblemConfig",
+    "Reference",
+    "Similarity",
+    "SmootherConfig",
+    "SolverError",
+    "SqrtKernel",
+    "SsmGraphError",
+    "SsmSmoother",
+    "Status",
+    "Trajectory",
+    "align",
+    "build_problem",
+    "evaluate",
+    "read_mission",
+    "read_results",
+    "reference_from_gnss",
+    "save_figure",
+    "smooth",
+    "write_mission",
+    "write_results",
+]

@@ -5,15 +5,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
+import numpy as np
+
 from ssm_graph.data import Array, FrozenArrays, InitialState, shaped
+from ssm_graph.earth import LocalFrame
+
+OUTLIER_WEIGHT = 0.05
+"""Beams that end below this weight are called outliers."""
 
 
 class Status(Enum):
     """Why an estimator stopped; the text is shown to the user."""
 
-    CONVERGED = "updates below their share of the posterior sigma, weights settled"
+    CONVERGED = "updates and weights settled"
     MAX_ITERATIONS = "iteration limit reached before updates and weights settled"
-    SUSPECT = "settled, but on an answer that the data contradict"
+    SUSPECT = "settled, but the data contradict the answer or leave it ambiguous"
     DIVERGED = "the solution became non-finite or ran away"
 
     @property
@@ -100,3 +106,21 @@ class Estimate:
     """The initial state that was used, from the mission or from alignment."""
     notes: tuple[str, ...] = ()
     """What a user should know about the run, one sentence each."""
+
+
+def path_length_m(
+    trajectory: Trajectory, *, first_s: float = -np.inf, last_s: float = np.inf
+) -> float:
+    """Return the horizontal length of a trajectory from keyframe to keyframe, m.
+
+    Only keyframes from ``first_s`` to ``last_s`` count; up and down do not. Every step is taken
+    along the local level at its own begin.
+    """
+    kept = (trajectory.time_s >= first_s) & (trajectory.time_s <= last_s)
+    lat, lon, height = (x[kept] for x in (trajectory.lat, trajectory.lon, trajectory.height))
+    if len(lat) < 2:
+        return 0.0
+    frame = LocalFrame(float(lat[0]), float(lon[0]), float(height[0]))
+    p_n = frame.p_n_from_geodetic(lat, lon, height)
+    step_l = np.einsum("nij,ni->nj", frame.R_nl_at(p_n[:-1]), np.diff(p_n, axis=0))
+    return float(np.hypot(step_l[:, 0], step_l[:, 1]).sum())

@@ -2,7 +2,7 @@
 
 from ssm_graph.evaluation.alignment import gap_limit_s, interpolate_within
 from ssm_graph.evaluation.errors import ErrorSeries, error_series
-from ssm_graph.evaluation.metrics import Metrics, evaluate, path_length_m
+from ssm_graph.evaluation.metrics import Metrics, evaluate
 from ssm_graph.evaluation.statistics import (
     Interval,
     chi2_interval,
@@ -22,6 +22,5 @@ __all__ = [
     "interpolate_within",
     "mean_with_interval",
     "paired_ratio",
-    "path_length_m",
     "reference_from_gnss",
 ]

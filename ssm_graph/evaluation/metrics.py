@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ssm_graph.data import Array, Reference
-from ssm_graph.earth import LocalFrame
-from ssm_graph.estimate import Trajectory
+from ssm_graph.estimate import Trajectory, path_length_m
 from ssm_graph.evaluation.errors import ErrorSeries, error_series
 
 
@@ -78,24 +77,6 @@ def evaluate(trajectory: Trajectory, reference: Reference) -> Metrics:
         inside_3_sigma=_per_axis(np.array([_mean(x) for x in inside_share.T])),
         errors=errors,
     )
-
-
-def path_length_m(
-    trajectory: Trajectory, *, first_s: float = -np.inf, last_s: float = np.inf
-) -> float:
-    """Return the horizontal length of a trajectory from keyframe to keyframe, m.
-
-    Only keyframes from ``first_s`` to ``last_s`` count; up and down do not. Every step is taken
-    along the local level at its own begin.
-    """
-    kept = (trajectory.time_s >= first_s) & (trajectory.time_s <= last_s)
-    lat, lon, height = (x[kept] for x in (trajectory.lat, trajectory.lon, trajectory.height))
-    if len(lat) < 2:
-        return 0.0
-    frame = LocalFrame(float(lat[0]), float(lon[0]), float(height[0]))
-    p_n = frame.p_n_from_geodetic(lat, lon, height)
-    step_l = np.einsum("nij,ni->nj", frame.R_nl_at(p_n[:-1]), np.diff(p_n, axis=0))
-    return float(np.hypot(step_l[:, 0], step_l[:, 1]).sum())
 
 
 def _mean(values: Array) -> float:

@@ -42,7 +42,13 @@ def build_timeline(mission: Mission, *, start_s: float, interval_s: float) -> Ti
     start_s : time of the initial state, the first keyframe.
     interval_s : longest time between keyframes where DVL and GNSS are silent, s.
     """
-    end_s = float(mission.imu.time_s[-1])
+    begin_s, end_s = mission.imu.start_s, float(mission.imu.time_s[-1])
+    if start_s < begin_s - MIN_SPACING_S:
+        raise DataError(
+            f"the start at {start_s:.3f} s lies before the inertial data, which begin at "
+            f"{begin_s:.3f} s: expected it inside; move [initial] time_s"
+        )
+    start_s = max(start_s, begin_s)
     if end_s - start_s < MIN_SPACING_S:
         raise DataError(
             f"the start at {start_s:.3f} s leaves no inertial data, which end at {end_s:.3f} s"

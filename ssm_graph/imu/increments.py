@@ -46,8 +46,8 @@ def merge_samples(imu: ImuLog, keyframe_s: Array, *, rate_hz: float) -> MergedSa
     ----------
     imu : raw samples, body axes.
     keyframe_s : (K,) strictly increasing times inside the span of ``imu``, s.
-    rate_hz : highest rate of merged samples; every interval gets at least one. A rate above that
-        of the raw samples merges nothing.
+    rate_hz : an interval of length T becomes at most ``max(1, ceil(T * rate_hz))`` samples. A rate
+        above that of the raw samples merges nothing.
 
     Raises
     ------
@@ -112,7 +112,9 @@ def _group_starts(piece_edges: Array, keyframe_s: Array, rate_hz: float) -> NDAr
     n_groups = np.maximum(np.ceil(span * rate_hz - 1e-6), 1.0)
     # A piece belongs to the group in which it ends.
     elapsed = piece_edges[1:] - keyframe_s[interval]
-    group = np.ceil(elapsed / span[interval] * n_groups[interval] - 1e-6).astype(np.intp)
+    group = np.ceil(elapsed / span[interval] * n_groups[interval] - 1e-6)
+    # A piece of mere rounding at the begin belongs to the first group.
+    group = np.maximum(group, 1.0)
     is_first = np.ones(len(interval), bool)
     is_first[1:] = (interval[1:] != interval[:-1]) | (group[1:] != group[:-1])
     return np.flatnonzero(is_first)

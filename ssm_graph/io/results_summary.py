@@ -11,11 +11,8 @@ from typing import Any, Final, Protocol
 import numpy as np
 
 from ssm_graph.data import InitialState, Mission
-from ssm_graph.earth import LocalFrame
-from ssm_graph.estimate import Estimate, Trajectory
+from ssm_graph.estimate import OUTLIER_WEIGHT, Estimate, Trajectory, path_length_m
 
-OUTLIER_WEIGHT: Final = 0.05
-"""A beam speed with less weight than this is counted as an outlier."""
 PACKAGES: Final = {
     "ssm_graph": "ssm-graph",
     "gtsam": "gtsam",
@@ -70,7 +67,7 @@ def build_summary(
     rests; ``total_path_length_m`` is always that of the whole trajectory.
     """
     trajectory, beams = estimate.trajectory, estimate.beams
-    total_path = horizontal_path_m(trajectory)
+    total_path = path_length_m(trajectory)
     summary = {
         "mission": mission.name,
         "method": estimate.method,
@@ -109,17 +106,6 @@ def build_summary(
         "versions": versions(),
     }
     return {key: as_json(value) for key, value in summary.items()}
-
-
-def horizontal_path_m(trajectory: Trajectory) -> float:
-    """Return the horizontal length of a trajectory from keyframe to keyframe, m."""
-    lat, lon, height = trajectory.lat, trajectory.lon, trajectory.height
-    if len(lat) < 2:
-        return 0.0
-    frame = LocalFrame(float(lat[0]), float(lon[0]), float(height[0]))
-    p_n = frame.p_n_from_geodetic(lat, lon, height)
-    step_l = np.einsum("nij,ni->nj", frame.R_nl_at(p_n[:-1]), np.diff(p_n, axis=0))
-    return float(np.hypot(step_l[:, 0], step_l[:, 1]).sum())
 
 
 def versions() -> dict[str, str | None]:

@@ -11,11 +11,10 @@ from matplotlib.gridspec import SubplotSpec
 from matplotlib.ticker import FuncFormatter, NullLocator
 
 from ssm_graph.data import N_BEAMS, Array
-from ssm_graph.estimate import BeamTable
+from ssm_graph.estimate import OUTLIER_WEIGHT, BeamTable
 from ssm_graph.report.style import (
     NOMINAL,
     OUTLIER,
-    OUTLIER_WEIGHT,
     REDUCED,
     REDUCED_WEIGHT,
     SMALL,

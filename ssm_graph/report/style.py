@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from ssm_graph.data import Array
 
-OUTLIER_WEIGHT: Final = 0.05
-"""A beam speed with less weight than this is shown and counted as an outlier."""
 REDUCED_WEIGHT: Final = 0.5
 """A beam speed with less weight than this is shown as one that lost influence."""
 MAX_POINTS: Final = 5000

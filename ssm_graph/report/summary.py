@@ -12,9 +12,8 @@ from rich.table import Table
 from rich.text import Text
 
 from ssm_graph.data import N_BEAMS, Array
-from ssm_graph.estimate import Estimate, Status, Trajectory
-from ssm_graph.evaluation import Metrics, path_length_m
-from ssm_graph.report.style import OUTLIER_WEIGHT
+from ssm_graph.estimate import OUTLIER_WEIGHT, Estimate, Status, Trajectory, path_length_m
+from ssm_graph.evaluation import Metrics
 
 STATUS_STYLE: Final = {
     Status.CONVERGED: "bold green",
@@ -49,7 +48,6 @@ def _overview(estimate: Estimate) -> Table:
     share = f" ({100.0 * np.mean(outlier):.1f} %)" if n_beams else ""
     counts = [int(np.sum(outlier & (beams.beam == beam + 1))) for beam in range(N_BEAMS)]
     status = Text(estimate.status.name, style=STATUS_STYLE[estimate.status])
-    status.append(f"  {estimate.status.value}", style="not bold default on default")
     table = _table("Estimate", ["", ""])
     table.columns[1].justify = "left"
     for heading, value in (

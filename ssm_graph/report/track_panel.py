@@ -9,12 +9,11 @@ from matplotlib.axes import Axes
 
 from ssm_graph.data import Array, Reference
 from ssm_graph.earth import LocalFrame
-from ssm_graph.estimate import Estimate
+from ssm_graph.estimate import OUTLIER_WEIGHT, Estimate
 from ssm_graph.report.style import (
     ESTIMATE,
     INK,
     OUTLIER,
-    OUTLIER_WEIGHT,
     REFERENCE,
     broken_at_gaps,
     dress,

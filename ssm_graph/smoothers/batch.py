@@ -21,7 +21,7 @@ from ssm_graph.graph.problem import Problem
 from ssm_graph.graph.solve import chain_ordering, marginal_covariances, solve_linear
 from ssm_graph.graph.states import States, retract
 from ssm_graph.graph.trajectory import trajectory_from_states
-from ssm_graph.smoothers.verdict import judge
+from ssm_graph.smoothers.verdict import contradictions
 
 OnIteration = Callable[[int, int, Iteration], None]
 """Called after each iteration with its number, the limit, and what happened."""
@@ -183,10 +183,14 @@ class SsmSmoother:
         n_doubts: int,
         begin: float,
     ) -> Estimate:
-        reason = f"{status.value}: {self.config.max_iterations} iterations"
+        reason = (
+            f"{status.value}: last update {last.update_sigmas:.1e} sigma, largest weight change "
+            f"{last.weight_change:.1e}"
+        )
         if status is Status.CONVERGED:
-            verdict = judge(linearizer, last.states, last.weights)
-            status, reason = verdict.status, verdict.reason
+            doubts = contradictions(linearizer, last.states, last.weights)
+            if doubts:
+                status, reason = Status.SUSPECT, "; ".join(doubts)
         notes = problem.notes
         if n_doubts:
             notes += (

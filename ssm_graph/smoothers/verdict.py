@@ -2,38 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import gtsam
 import numpy as np
 from scipy.stats import chi2
 
 from ssm_graph.data import Array
-from ssm_graph.estimate import Status
 from ssm_graph.graph.linearize import GraphLinearizer
+from ssm_graph.graph.problem import Problem
 from ssm_graph.graph.states import States
 
 LOW_WEIGHT = 0.1
 SUSPECT_SHARE = 0.5
 """More than this share of the beams below the low weight is no outlier problem any more."""
+SUSPECT_STRETCH_S = 60.0
+"""So long may that last within a mission."""
 PRIOR_TAIL = 1e-9
 """Probability below which the initial state is contradicted by the data."""
 MISFIT = 9.0
 """Mean squared whitened residual above which a sensor is contradicted: three times its sigma."""
 
 
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """Status of a settled run, and why."""
-
-    status: Status
-    reason: str
-
-
-def judge(linearizer: GraphLinearizer, states: States, weights: Array) -> Verdict:
-    """Compare every kind of measurement with the answer; the first contradiction is named."""
+def contradictions(linearizer: GraphLinearizer, states: States, weights: Array) -> list[str]:
+    """Compare every kind of measurement with the answer; say in a sentence each what disagrees."""
     doubts = [
         _doubt_beams(weights),
+        _doubt_stretches(linearizer.problem, weights),
         _doubt_prior(linearizer.prior, states),
         _doubt_sensor("GNSS", linearizer.gnss, states, "look for a wrong datum or lever arm"),
         _doubt_sensor("depth", linearizer.depth, states, "look at its zero, sign and unit"),
@@ -44,22 +37,37 @@ def judge(linearizer: GraphLinearizer, states: States, weights: Array) -> Verdic
             "look at the noise of [imu], its units, axes and time stamps",
         ),
     ]
-    found = [doubt for doubt in doubts if doubt]
-    if found:
-        return Verdict(Status.SUSPECT, "; ".join(found))
-    return Verdict(Status.CONVERGED, Status.CONVERGED.value)
+    return [doubt for doubt in doubts if doubt]
 
 
 def _doubt_beams(weights: Array) -> str:
-    if len(weights) == 0:
-        return ""
-    share = float(np.mean(weights < LOW_WEIGHT))
+    share = float(np.mean(weights < LOW_WEIGHT)) if len(weights) else 0.0
     if share <= SUSPECT_SHARE:
         return ""
     return (
         f"{100.0 * share:.0f} % of the {len(weights)} beam speeds contradict the answer (weight "
         f"below {LOW_WEIGHT}): check the start heading, beam order, mounting and signs of the DVL, "
-        f"and its noise"
+        "and its noise"
+    )
+
+
+def _doubt_stretches(problem: Problem, weights: Array) -> str:
+    """Look for a long stretch in which most beams of every ping are rejected."""
+    pings, row = np.unique(problem.beams.keyframe, return_inverse=True)
+    if len(pings) == 0:
+        return ""
+    is_bad = np.bincount(row, weights=weights < LOW_WEIGHT) > SUSPECT_SHARE * np.bincount(row)
+    edges = np.diff(np.concatenate([[0], is_bad.astype(int), [0]]))
+    begin_s = problem.keyframe_s[pings[np.flatnonzero(edges == 1)]]
+    end_s = problem.keyframe_s[pings[np.flatnonzero(edges == -1) - 1]]
+    if len(begin_s) == 0:
+        return ""
+    longest = int(np.argmax(end_s - begin_s))
+    if end_s[longest] - begin_s[longest] < SUSPECT_STRETCH_S:
+        return ""
+    return (
+        f"most beams of every ping contradict the answer from {begin_s[longest]:.1f} s to "
+        f"{end_s[longest]:.1f} s: look at the DVL's bottom lock and the inertial data there"
     )
 
 

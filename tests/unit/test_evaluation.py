@@ -10,7 +10,7 @@ import pytest
 from ssm_graph.data import Array, GnssLog, Reference
 from ssm_graph.earth import LocalFrame
 from ssm_graph.errors import DataError
-from ssm_graph.estimate import Trajectory
+from ssm_graph.estimate import Trajectory, path_length_m
 from ssm_graph.evaluation import (
     chi2_interval,
     error_series,
@@ -19,7 +19,6 @@ from ssm_graph.evaluation import (
     interpolate_within,
     mean_with_interval,
     paired_ratio,
-    path_length_m,
     reference_from_gnss,
 )
 

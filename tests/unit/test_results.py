@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from ssm_graph.errors import DataError
-from ssm_graph.estimate import BeamTable, Status
-from ssm_graph.evaluation import evaluate, path_length_m
+from ssm_graph.estimate import BeamTable, Status, path_length_m
+from ssm_graph.evaluation import evaluate
 from ssm_graph.io import results as results_module
 from ssm_graph.io.results import read_results, write_results
 from ssm_graph.io.results_summary import as_json

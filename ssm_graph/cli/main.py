@@ -1,0 +1,88 @@
+"""Entry point: parses the words, runs the command, turns errors into exit codes."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from enum import IntEnum
+from importlib.metadata import version
+
+from rich.console import Console
+from rich.markup import escape
+
+from ssm_graph.cli import convert, simulate, smooth
+from ssm_graph.errors import (
+    ConfigError,
+    DataError,
+    MissingExtraError,
+    SolverError,
+    SsmGraphError,
+)
+
+
+class ExitCode(IntEnum):
+    """What a command ends with."""
+
+    GOOD = 0
+    CRASH = 1
+    USAGE = 2
+    DATA = 3
+    NOT_GOOD = 4
+    NO_RESULT = 5
+    INTERRUPTED = 130
+
+
+EPILOG = """\
+exit codes:
+  0    done; for smooth: converged
+  1    a defect of this program
+  2    a wrong option or setting, a missing extra
+  3    the data of a mission cannot be used; the message says where and why
+  4    smooth ended with a result that must not be trusted blindly (iteration limit, or the data
+       contradict it); it is written all the same, and its status says so
+  5    smooth found no finite result; nothing is written
+  130  interrupted
+"""
+
+_CODES: tuple[tuple[type[SsmGraphError], ExitCode], ...] = (
+    (ConfigError, ExitCode.USAGE),
+    (MissingExtraError, ExitCode.USAGE),
+    (DataError, ExitCode.DATA),
+    (SolverError, ExitCode.NO_RESULT),
+    (SsmGraphError, ExitCode.CRASH),
+)
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of all commands."""
+    parser = argparse.ArgumentParser(
+        prog="ssm-graph",
+        description="Inertial and DVL navigation with a similarity weight for every beam.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=version("ssm-graph"))
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for module in (simulate, smooth, convert):
+        module.add_parser(commands, epilog=EPILOG)
+    return parser
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code."""
+    arguments = build_parser().parse_args(words)
+    console, errors = Console(), Console(stderr=True)
+    try:
+        is_good = arguments.run(arguments, console, errors)
+    except SsmGraphError as error:
+        errors.print(f"[bold red]error:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
+        return next(code for kind, code in _CODES if isinstance(error, kind))
+    except KeyboardInterrupt:
+        errors.print("interrupted")
+        return ExitCode.INTERRUPTED
+    return ExitCode.GOOD if is_good else ExitCode.NOT_GOOD
+
+
+if __name__ == "__main__":
+    sys.exit(main())

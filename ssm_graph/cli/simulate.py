@@ -1,0 +1,88 @@
+"""``ssm-graph simulate``: write a simulated mission with its truth as reference."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from ssm_graph.io.mission import TableFormat, write_mission
+from ssm_graph.simulation import (
+    SCENARIOS,
+    Grade,
+    OutlierKind,
+    Outliers,
+    scenario_config,
+    simulate,
+)
+
+
+def add_parser(commands: Any, *, epilog: str) -> None:
+    """Declare the command and its options."""
+    scenarios = "\n".join(f"  {name:9}{s.description}" for name, s in SCENARIOS.items())
+    parser: argparse.ArgumentParser = commands.add_parser(
+        "simulate",
+        help="write a simulated mission folder with truth as reference",
+        description=f"Simulate a mission.\n\nscenarios:\n{scenarios}",
+        epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("scenario", metavar="SCENARIO", choices=list(SCENARIOS))
+    parser.add_argument(
+        "--grade",
+        type=str.lower,
+        choices=[grade.name.lower() for grade in Grade],
+        help="grade of the inertial sensors (default: that of the scenario)",
+    )
+    parser.add_argument(
+        "--outliers",
+        type=str.lower,
+        choices=[kind.name.lower() for kind in OutlierKind],
+        help="kind of DVL outliers (default: that of the scenario)",
+    )
+    parser.add_argument(
+        "--rate", type=float, help="share of pings with an outlier, 0 to 1 (default: 0.1)"
+    )
+    parser.add_argument("--duration", type=float, metavar="SECONDS", help="length of the mission")
+    parser.add_argument("--imu-rate", type=float, metavar="HZ", help="inertial samples per second")
+    parser.add_argument("--seed", type=int, default=0, help="same seed, same mission (default: 0)")
+    parser.add_argument(
+        "--format",
+        type=str.lower,
+        choices=[table.name.lower() for table in TableFormat],
+        default=TableFormat.CSV.name.lower(),
+        help="format of the tables (default: csv)",
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="mission folder")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
+    """Simulate and write."""
+    changes: dict[str, Any] = {"seed": arguments.seed}
+    if arguments.grade is not None:
+        changes["grade"] = Grade[arguments.grade.upper()]
+    if arguments.duration is not None:
+        changes["duration_s"] = arguments.duration
+    if arguments.imu_rate is not None:
+        changes["imu_rate_hz"] = arguments.imu_rate
+    if arguments.outliers is not None or arguments.rate is not None:
+        default = scenario_config(arguments.scenario).outliers
+        kind = OutlierKind[arguments.outliers.upper()] if arguments.outliers else default.kind
+        rate = arguments.rate if arguments.rate is not None else default.rate
+        changes["outliers"] = Outliers(kind, rate)
+    simulated = simulate(scenario_config(arguments.scenario, **changes))
+    write_mission(
+        arguments.out, simulated.mission, table_format=TableFormat[arguments.format.upper()]
+    )
+    mission = simulated.mission
+    console.print(
+        f"{arguments.out}: {len(mission.imu.time_s)} inertial samples, "
+        f"{len(mission.dvl.time_s)} pings, {int(simulated.is_outlier.sum())} beam outliers, "
+        f"seed {arguments.seed}",
+        highlight=False,
+        soft_wrap=True,
+    )
+    return True

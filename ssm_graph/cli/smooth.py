@@ -1,0 +1,204 @@
+"""``ssm-graph smooth``: a mission folder in, a result folder out."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from factors.similarity import ExpKernel, GaussianKernel, Kernel, LogKernel, SqrtKernel
+from ssm_graph.data import GnssLog, Mission, Reference
+from ssm_graph.errors import ConfigError, DataError
+from ssm_graph.estimate import Estimate
+from ssm_graph.evaluation import Metrics, evaluate, reference_from_gnss
+from ssm_graph.graph.problem import ProblemConfig
+from ssm_graph.io.mission import read_mission
+from ssm_graph.io.results import write_results
+from ssm_graph.report.figure import save_figure
+from ssm_graph.report.progress import ProgressDisplay
+from ssm_graph.report.summary import summary_table
+from ssm_graph.smoothers.batch import Similarity, SmootherConfig
+from ssm_graph.smoothers.mission import smooth
+
+KERNELS = ("log", "sqrt", "exp", "gaussian")
+
+
+def add_parser(commands: Any, *, epilog: str) -> None:
+    """Declare the command and its options."""
+    loop, graph = SmootherConfig(), ProblemConfig()
+    parser: argparse.ArgumentParser = commands.add_parser(
+        "smooth",
+        help="smooth a mission folder",
+        description="Smooth a recorded mission; writes trajectory.csv, beams.csv, summary.json and "
+        "figure.png.",
+        epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("mission", type=Path, metavar="MISSION", help="mission folder")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="result folder")
+    parser.add_argument(
+        "--kernel", choices=KERNELS, default="log", help="similarity kernel (default: log)"
+    )
+    parser.add_argument(
+        "--dof",
+        type=float,
+        default=None,
+        help=f"degrees of freedom of log and sqrt (default: {LogKernel().dof:g})",
+    )
+    parser.add_argument(
+        "--width",
+        type=float,
+        default=None,
+        metavar="SIGMAS",
+        help=f"width of exp (default: {ExpKernel().width:g})",
+    )
+    parser.add_argument(
+        "--similarity",
+        choices=[kind.name.lower() for kind in Similarity],
+        default=loop.similarity.name.lower(),
+        help="judge a beam by residual and posterior variance, or by the residual alone "
+        "(default: expected)",
+    )
+    parser.add_argument(
+        "--max-iterations",
+        type=int,
+        default=loop.max_iterations,
+        metavar="N",
+        help=f"limit of the similarity loop (default: {loop.max_iterations})",
+    )
+    parser.add_argument(
+        "--merge-rate",
+        type=float,
+        default=graph.merge_rate_hz,
+        metavar="HZ",
+        help=f"rate to which inertial samples are merged (default: {graph.merge_rate_hz:g})",
+    )
+    parser.add_argument(
+        "--keyframe-interval",
+        type=float,
+        default=graph.keyframe_interval_s,
+        metavar="SECONDS",
+        help="keyframes this far apart while DVL and GNSS are silent "
+        f"(default: {graph.keyframe_interval_s:g})",
+    )
+    parser.add_argument(
+        "--gnss-until",
+        type=float,
+        metavar="SECONDS",
+        help="use GNSS only so long from the begin of the inertial data; the rest becomes the "
+        "reference",
+    )
+    parser.add_argument("--no-figure", action="store_true", help="write no figure.png")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace, console: Console, errors: Console) -> bool:
+    """Read, smooth, compare, write and show."""
+    loop = SmootherConfig(
+        kernel=kernel_from(arguments.kernel, dof=arguments.dof, width=arguments.width),
+        similarity=Similarity[arguments.similarity.upper()],
+        max_iterations=arguments.max_iterations,
+    )
+    graph = ProblemConfig(arguments.merge_rate, arguments.keyframe_interval)
+    with ProgressDisplay(errors) as show:
+        show.stage("reading the mission")
+        mission = read_mission(arguments.mission)
+        withheld: GnssLog | None = None
+        if arguments.gnss_until is not None:
+            mission, withheld = withhold_gnss(mission, arguments.gnss_until)
+        estimate = smooth(
+            mission, loop, problem_config=graph, on_iteration=show, on_stage=show.stage
+        )
+        show.stage("writing results")
+        estimate, reference, metrics = _compare(estimate, mission, withheld)
+        write_results(
+            arguments.out,
+            estimate,
+            mission=mission,
+            metrics=metrics,
+            settings=_settings(arguments, loop, graph),
+        )
+        if not arguments.no_figure:
+            save_figure(arguments.out / "figure.png", estimate, reference, title=mission.name)
+    console.print(summary_table(estimate, metrics))
+    console.print(f"results in {arguments.out}", highlight=False, soft_wrap=True)
+    return estimate.status.is_good
+
+
+def kernel_from(name: str, *, dof: float | None, width: float | None) -> Kernel:
+    """Return a kernel by name; a parameter that it does not have is refused."""
+    if dof is not None and name not in ("log", "sqrt"):
+        raise ConfigError(f"--dof: expected with --kernel log or sqrt, got {name}; leave it out")
+    if width is not None and name != "exp":
+        raise ConfigError(f"--width: expected with --kernel exp, got {name}; leave it out")
+    given = {"dof": dof} if dof is not None else {"width": width} if width is not None else {}
+    makers: dict[str, type[Kernel]] = {
+        "log": LogKernel,
+        "sqrt": SqrtKernel,
+        "exp": ExpKernel,
+        "gaussian": GaussianKernel,
+    }
+    try:
+        return makers[name](**given)
+    except ValueError as error:
+        raise ConfigError(f"--kernel {name}: {error}") from error
+
+
+def withhold_gnss(mission: Mission, until_s: float) -> tuple[Mission, GnssLog]:
+    """Return the mission with GNSS up to ``until_s`` after its begin, and the other fixes."""
+    gnss = mission.gnss
+    if gnss is None:
+        raise ConfigError("--gnss-until: expected a mission with GNSS, got one without")
+    used = gnss.time_s < mission.imu.start_s + until_s
+    if not used.any() or used.all():
+        first, last = gnss.time_s[[0, -1]] - mission.imu.start_s
+        raise ConfigError(
+            f"--gnss-until: expected a time between the first fix at {first:.1f} s and the last "
+            f"at {last:.1f} s, got {until_s:g} s"
+        )
+    return replace(mission, gnss=_fixes(gnss, used)), _fixes(gnss, ~used)
+
+
+def _fixes(gnss: GnssLog, kept: np.ndarray[Any, np.dtype[np.bool_]]) -> GnssLog:
+    return replace(
+        gnss,
+        time_s=gnss.time_s[kept],
+        lat=gnss.lat[kept],
+        lon=gnss.lon[kept],
+        height=gnss.height[kept],
+        sigma_enu=gnss.sigma_enu[kept],
+    )
+
+
+def _compare(
+    estimate: Estimate, mission: Mission, withheld: GnssLog | None
+) -> tuple[Estimate, Reference | None, Metrics | None]:
+    """Compare with the mission's reference or the withheld fixes; a note where that fails."""
+    reference = mission.reference
+    if withheld is not None:
+        reference = reference_from_gnss(withheld, estimate.trajectory)
+    if reference is None:
+        return estimate, None, None
+    try:
+        return estimate, reference, evaluate(estimate.trajectory, reference)
+    except DataError as error:
+        notes = (*estimate.notes, f"not compared with the reference: {error}")
+        return replace(estimate, notes=notes), None, None
+
+
+def _settings(
+    arguments: argparse.Namespace, loop: SmootherConfig, graph: ProblemConfig
+) -> dict[str, Any]:
+    return {
+        "kernel": str(loop.kernel),
+        "similarity": loop.similarity.name.lower(),
+        "max_iterations": loop.max_iterations,
+        "tolerance_sigmas": loop.tolerance,
+        "merge_rate_hz": graph.merge_rate_hz,
+        "keyframe_interval_s": graph.keyframe_interval_s,
+        "gnss_until_s": arguments.gnss_until,
+    }
