@@ -8,6 +8,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.so3 import cross
+
 Array = NDArray[np.float64]
 
 
@@ -38,7 +40,7 @@ def beam_error(
     """Return predicted minus measured speed along DVL beams, m/s; see :func:`beam_residual`."""
     v_b, omega_ie_b = _to_body(R_nb, v_n), _to_body(R_nb, omega_ie_n)
     omega_eb_b = gyro_b - gyro_bias - omega_ie_b
-    v_instrument_b = v_b + np.cross(omega_eb_b, lever_arm_b)
+    v_instrument_b = v_b + cross(omega_eb_b, lever_arm_b)
     return np.asarray(np.sum(beam_b * v_instrument_b, axis=-1) - speed)
 
 
@@ -89,11 +91,11 @@ def beam_residual(
     )
     v_b, omega_ie_b = _to_body(R_nb, v_n), _to_body(R_nb, omega_ie_n)
     # beam . (a x lever) = (lever x beam) . a, for any rate a
-    arm = np.cross(lever_arm_b, beam_b)
+    arm = cross(lever_arm_b, beam_b)
     shape = (*np.shape(error), 3)
     return BeamResidual(
         error=error,
-        error_D_rotation=np.asarray(np.cross(beam_b, v_b) - np.cross(arm, omega_ie_b)),
+        error_D_rotation=np.asarray(cross(beam_b, v_b) - cross(arm, omega_ie_b)),
         error_D_velocity_n=np.broadcast_to((R_nb @ beam_b[..., None])[..., 0], shape),
         error_D_gyro_bias=np.broadcast_to(-arm, shape),
     )

@@ -33,7 +33,7 @@ def assert_jacobians_match(
     linear = factor.linearize(values)
     analytic, _ = linear.jacobian()
     column = 0
-    for key in linear.keys():
+    for key in list(linear.keys()):
         size = values.zeroVectors().at(key).size
         block = analytic[:, column : column + size]
         column += size

@@ -15,6 +15,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from factors.similarity import WEIGHT_FLOOR, Kernel, expected_mahalanobis_sq
+from factors.so3 import cross
 from ssm_graph.data import Array
 from ssm_graph.earth import SEMI_MAJOR_AXIS
 from ssm_graph.graph.linearize import inertial_graph, linearize_beams
@@ -53,15 +54,22 @@ class FirstValues:
     """How often the prediction was doubted."""
 
 
-def first_values(problem: Problem, *, kernel: Kernel) -> FirstValues:
-    """Run once through the mission, predicting and updating keyframe by keyframe."""
-    return _ForwardPass(problem, kernel).run()
+def first_values(
+    problem: Problem, *, kernel: Kernel, inertial: gtsam.NonlinearFactorGraph | None = None
+) -> FirstValues:
+    """Run once through the mission, predicting and updating keyframe by keyframe.
+
+    ``inertial`` is the graph of :func:`inertial_graph`, where it is at hand already.
+    """
+    return _ForwardPass(problem, kernel, inertial or inertial_graph(problem)).run()
 
 
 class _ForwardPass:
     """A filter on the same inertial factors as the graph, in covariance form."""
 
-    def __init__(self, problem: Problem, kernel: Kernel) -> None:
+    def __init__(
+        self, problem: Problem, kernel: Kernel, inertial: gtsam.NonlinearFactorGraph
+    ) -> None:
         self.problem = problem
         self.kernel = kernel
         start = initial_moments(
@@ -69,7 +77,7 @@ class _ForwardPass:
         )
         self.R_nb, self.p_n, self.v_n, self.bias = start[:4]
         self.P = start.covariance
-        self.factors = inertial_graph(problem)
+        self.factors = inertial
         self.weights = np.ones(len(problem.beams.speed))
         self.without_beam = 0
         self.n_doubts = 0
@@ -128,7 +136,7 @@ class _ForwardPass:
         for i in rows:
             assert fixes is not None
             H = np.zeros((3, STATE_DIM))
-            H[:, ROTATION] = np.cross(fixes.lever_arm_b, self.R_nb)
+            H[:, ROTATION] = cross(fixes.lever_arm_b, self.R_nb)
             H[:, POSITION] = self.R_nb
             innovation = fixes.position_n[i] - self.p_n - self.R_nb @ fixes.lever_arm_b
             self._correct(H, innovation, H @ self.P @ H.T + fixes.covariance_n[i])
@@ -146,7 +154,7 @@ class _ForwardPass:
             + (sensor_n[0] ** 2 + sensor_n[1] ** 2) / (2.0 * SEMI_MAJOR_AXIS)
         )
         H = np.zeros((1, STATE_DIM))
-        H[0, ROTATION] = np.cross(depths.lever_arm_b, self.R_nb[2])
+        H[0, ROTATION] = cross(depths.lever_arm_b, self.R_nb[2])
         H[0, POSITION] = self.R_nb[2]
         innovation = -depths.depth[i] + late * self.v_n[2] - height
         variance = depths.sigma**2 + late**2 * (self.P[8, 8] + 1e-2)

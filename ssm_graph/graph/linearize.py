@@ -12,6 +12,7 @@ from scipy.interpolate import CubicHermiteSpline
 from factors.dvl_beam import beam_residual
 from ssm_graph.data import N_BEAMS, Array
 from ssm_graph.earth import LocalFrame
+from ssm_graph.graph.keys import chain_ordering
 from ssm_graph.graph.problem import Beams, Depths, Fixes, Problem
 from ssm_graph.graph.states import (
     GYRO_BIAS,
@@ -62,6 +63,7 @@ class GraphLinearizer:
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
+        self.ordering = chain_ordering(problem.n_keyframes)
         self.inertial = inertial_graph(problem)
         self.prior = prior_graph(problem)
         self.gnss = gnss_graph(problem.fixes)

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, V, X
 
 from ssm_graph.data import Array
 from ssm_graph.errors import SolverError
@@ -28,15 +27,6 @@ class LinearSolution(NamedTuple):
     """(K, 15, 15) upper triangular; ``R_k d_k + S_k d_{k+1} = rhs_k``."""
     S: Array
     """(K, 15, 15) coupling to the next keyframe; zero for the last."""
-
-
-def chain_ordering(n_keyframes: int) -> gtsam.Ordering:
-    """Return the elimination order: keyframe by keyframe in time."""
-    ordering = gtsam.Ordering()
-    for k in range(n_keyframes):
-        for symbol in (X, V, B):
-            ordering.push_back(symbol(k))
-    return ordering
 
 
 def solve_linear(

@@ -18,7 +18,7 @@ from ssm_graph.estimate import BeamTable, Estimate, Iteration, Status
 from ssm_graph.graph.first_values import first_values
 from ssm_graph.graph.linearize import BeamRows, GraphLinearizer
 from ssm_graph.graph.problem import Problem
-from ssm_graph.graph.solve import chain_ordering, marginal_covariances, solve_linear
+from ssm_graph.graph.solve import marginal_covariances, solve_linear
 from ssm_graph.graph.states import States, retract
 from ssm_graph.graph.trajectory import trajectory_from_states
 from ssm_graph.smoothers.verdict import contradictions
@@ -106,8 +106,8 @@ class SsmSmoother:
             If no finite solution was found.
         """
         begin = time.perf_counter()
-        first = first_values(problem, kernel=WARM_KERNEL)
         linearizer = GraphLinearizer(problem)
+        first = first_values(problem, kernel=WARM_KERNEL, inertial=linearizer.inertial)
         states, rows = first.states, linearizer.beam_rows(first.states)
         weights = first.weights
         kernel: Kernel = WARM_KERNEL
@@ -138,8 +138,7 @@ class SsmSmoother:
         problem = linearizer.problem
         linearizer.follow(states)
         linear = linearizer.linearize(states, rows, weights)
-        ordering = chain_ordering(problem.n_keyframes)
-        solution = solve_linear(linear, ordering, n_keyframes=problem.n_keyframes)
+        solution = solve_linear(linear, linearizer.ordering, n_keyframes=problem.n_keyframes)
         covariance = marginal_covariances(solution)
         cost = linearizer.cost(states, rows, weights)
         states, rows, update = _descend(linearizer, states, solution.delta, weights, cost)
@@ -187,10 +186,11 @@ class SsmSmoother:
             f"{status.value}: last update {last.update_sigmas:.1e} sigma, largest weight change "
             f"{last.weight_change:.1e}"
         )
-        if status is Status.CONVERGED:
-            doubts = contradictions(linearizer, last.states, last.weights)
-            if doubts:
-                status, reason = Status.SUSPECT, "; ".join(doubts)
+        doubts = "; ".join(contradictions(linearizer, last.states, last.weights))
+        if doubts and status is Status.CONVERGED:
+            status, reason = Status.SUSPECT, doubts
+        elif doubts:
+            reason += f"; {doubts}"
         notes = problem.notes
         if n_doubts:
             notes += (

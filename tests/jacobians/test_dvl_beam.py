@@ -282,8 +282,8 @@ def test_bulk_and_one_by_one_agree() -> None:
 def test_agrees_with_the_simulators_own_beam_speeds(route: Route) -> None:
     """The simulator differentiates the instrument's path and knows no ``v + omega x l``.
 
-    True states and the true rate: what is left is the rounding of Earth-fixed coordinates, 1e-9 m
-    in 6e6 m, times the turning rates.
+    True states and the true rate at the ping, and series in place of differences on the
+    simulator's side: what is left is rounding.
     """
     sim = simulated(route=route, duration_s=200.0, perfect_sensors=True, imu_rate_hz=10.0)
     problem = build_problem(sim.mission)

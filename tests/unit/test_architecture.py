@@ -1,0 +1,173 @@
+"""Imports point one way, files and functions stay small, only the border prints."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+MODULES = sorted(path for top in ("factors", "ssm_graph") for path in (ROOT / top).rglob("*.py"))
+IDS = [str(path.relative_to(ROOT)) for path in MODULES]
+
+FOUNDATION = {"errors", "earth", "frames", "data", "estimate"}
+MAY_IMPORT = {
+    "factors": set[str](),
+    "io": FOUNDATION,
+    "imu": FOUNDATION,
+    "simulation": FOUNDATION - {"frames"},
+    "evaluation": FOUNDATION,
+    "graph": FOUNDATION | {"imu", "factors"},
+    "smoothers": FOUNDATION | {"graph", "imu", "factors"},
+    "filters": FOUNDATION | {"imu", "factors"},
+    "report": FOUNDATION | {"evaluation"},
+} | {name: FOUNDATION for name in FOUNDATION}
+"""Parts of the project that each part may import, itself apart; the rest may import anything."""
+TOP = {"", "cli", "__main__"}
+"""The package's own namespace and its command line stand above everything."""
+MAY_PRINT = {"cli", "report"}
+WITHOUT_GTSAM = FOUNDATION | {"io", "simulation", "evaluation", "report"}
+MAX_FILE_LINES = 320
+MAX_FUNCTION_LINES = 50
+
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+
+
+def parse(path: Path) -> ast.Module:
+    """Return the syntax tree of a module."""
+    return ast.parse(path.read_text(encoding="utf-8"), str(path))
+
+
+def dotted_name(path: Path) -> str:
+    """Return a module's dotted name; a package goes by the name of its folder."""
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def part_of(module: str) -> str:
+    """Return the part of the project that a dotted name belongs to, ``""`` for the top."""
+    top, *rest = module.split(".")
+    if top == "factors":
+        return "factors"
+    return rest[0] if rest else ""
+
+
+def imported_modules(tree: ast.Module, *, module: str, is_package: bool) -> Iterator[str]:
+    """Yield the dotted names that a module imports, wherever in it."""
+    package = module.split(".") if is_package else module.split(".")[:-1]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            prefix = ".".join([*base, *([node.module] if node.module else [])])
+            # ``from ssm_graph import io`` names a part, ``from ssm_graph.io import x`` its content.
+            yield from (f"{prefix}.{alias.name}" for alias in node.names)
+
+
+def imports_of(path: Path) -> set[str]:
+    """Return the dotted names that a file imports."""
+    name = dotted_name(path)
+    return set(imported_modules(parse(path), module=name, is_package=path.stem == "__init__"))
+
+
+def own_parts(path: Path) -> set[str]:
+    """Return the parts of this project that a file imports."""
+    own = [name for name in imports_of(path) if name.split(".")[0] in {"ssm_graph", "factors"}]
+    return {part_of(name) for name in own}
+
+
+def test_every_part_is_known() -> None:
+    """A new part has to be given its place in the table."""
+    assert len(MODULES) > 40
+    assert {part_of(dotted_name(path)) for path in MODULES} <= set(MAY_IMPORT) | TOP
+
+
+@pytest.mark.parametrize("path", MODULES, ids=IDS)
+def test_imports_point_one_way(path: Path) -> None:
+    """Data flows one way, imports point the other."""
+    part = part_of(dotted_name(path))
+    if part in TOP:
+        return
+    forbidden = own_parts(path) - MAY_IMPORT[part] - {part}
+    assert not forbidden, f"{part} must not import {sorted(forbidden)}"
+
+
+@pytest.mark.parametrize("path", MODULES, ids=IDS)
+def test_gtsam_stays_in_its_place(path: Path) -> None:
+    """Data, files, simulation and evaluation work without GTSAM; factors with it and NumPy only."""
+    part = part_of(dotted_name(path))
+    outside = {name.split(".")[0] for name in imports_of(path)} - {"ssm_graph", "factors"}
+    if part in WITHOUT_GTSAM:
+        assert "gtsam" not in outside
+    if part == "factors":
+        known = {"gtsam", "numpy", "__future__", "abc", "collections", "dataclasses", "math"}
+        assert outside <= known | {"typing", "enum", "functools"}
+
+
+def test_import_rules_see_every_form_of_import() -> None:
+    """The parser behind the rules: absolute, relative, aliased and local imports."""
+    source = """
+import ssm_graph.io.mission as m
+from ssm_graph import graph
+from . import sibling
+from ..smoothers.batch import SsmSmoother
+def f():
+    from factors import dvl_beam
+"""
+    found = set(
+        imported_modules(ast.parse(source), module="ssm_graph.evaluation.x", is_package=False)
+    )
+    assert found == {
+        "ssm_graph.io.mission",
+        "ssm_graph.graph",
+        "ssm_graph.evaluation.sibling",
+        "ssm_graph.smoothers.batch.SsmSmoother",
+        "factors.dvl_beam",
+    }
+    assert {part_of(name) for name in found} == {
+        "io",
+        "graph",
+        "evaluation",
+        "smoothers",
+        "factors",
+    }
+
+
+@pytest.mark.parametrize("path", MODULES, ids=IDS)
+def test_modules_are_documented_and_small(path: Path) -> None:
+    """Every module says what it is for, on at most 320 lines."""
+    assert ast.get_docstring(parse(path)), "no module docstring"
+    n_lines = len(path.read_text(encoding="utf-8").splitlines())
+    assert n_lines <= MAX_FILE_LINES, f"{n_lines} lines"
+
+
+def code_lines(function: Function) -> int:
+    """Return a function's length without its docstring."""
+    assert function.end_lineno is not None
+    length = function.end_lineno - function.lineno + 1
+    if ast.get_docstring(function) is not None:
+        docstring = function.body[0]
+        assert docstring.end_lineno is not None
+        length -= docstring.end_lineno - docstring.lineno + 1
+    return length
+
+
+@pytest.mark.parametrize("path", MODULES, ids=IDS)
+def test_functions_are_small(path: Path) -> None:
+    """One idea, one function."""
+    functions = [node for node in ast.walk(parse(path)) if isinstance(node, Function)]
+    long = {f.name: code_lines(f) for f in functions if code_lines(f) > MAX_FUNCTION_LINES}
+    assert not long
+
+
+@pytest.mark.parametrize("path", MODULES, ids=IDS)
+def test_only_the_border_prints(path: Path) -> None:
+    """The library returns values; command line and reports talk."""
+    if part_of(dotted_name(path)) in MAY_PRINT:
+        return
+    calls = [node for node in ast.walk(parse(path)) if isinstance(node, ast.Call)]
+    printing = [c.lineno for c in calls if isinstance(c.func, ast.Name) and c.func.id == "print"]
+    assert not printing, f"print on lines {printing}"
