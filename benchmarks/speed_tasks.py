@@ -26,7 +26,6 @@ from ssm_graph.data import Array, Mission
 from ssm_graph.graph.first_values import first_values
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.problem import Problem, build_problem
-from ssm_graph.graph.solve import chain_ordering
 from ssm_graph.simulation import Grade, OutlierKind, Outliers, scenario_config, simulate
 
 
@@ -169,12 +168,11 @@ def time_floor(path: Path, n_passes: int) -> Timing:
     for k, sigma in zip(beams.keyframe.tolist(), beams.sigma.tolist(), strict=True):
         noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
         graph.add(gtsam.RangeFactor3D(X(k), V(k), float(distance[k]), noise))
-    ordering = chain_ordering(problem.n_keyframes)
     for _ in range(n_passes):
         with timing.part("linearise"):
             linear = graph.linearize(states.values)
         with timing.part("eliminate by QR and solve"):
-            delta = linear.eliminateMultifrontal(ordering, gtsam.EliminateQR).optimize()
+            delta = linear.eliminateMultifrontal(linearizer.ordering, gtsam.EliminateQR).optimize()
     timing.n_iterations = n_passes
     timing.status = "finite" if np.all(np.isfinite(delta.vector())) else "not finite"
     return _end(timing, problem, mission, None)

@@ -45,7 +45,7 @@ exit codes:
   130  interrupted
 """
 
-_CODES: tuple[tuple[type[SsmGraphError], ExitCode], ...] = (
+EXIT_CODES: tuple[tuple[type[SsmGraphError], ExitCode], ...] = (
     (ConfigError, ExitCode.USAGE),
     (MissingExtraError, ExitCode.USAGE),
     (DataError, ExitCode.DATA),
@@ -77,7 +77,7 @@ def main(words: Sequence[str] | None = None) -> int:
         is_good = arguments.run(arguments, console, errors)
     except SsmGraphError as error:
         errors.print(f"[bold red]error:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
-        return next(code for kind, code in _CODES if isinstance(error, kind))
+        return next(code for kind, code in EXIT_CODES if isinstance(error, kind))
     except KeyboardInterrupt:
         errors.print("interrupted")
         return ExitCode.INTERRUPTED

@@ -189,7 +189,8 @@ def depth_graph(
     """
     sensor_n = states.p_n + states.R_nb @ depths.lever_arm_b
     height = frame.geodetic_from_p_n(sensor_n)[2]
-    track = CubicHermiteSpline(keyframe_s, height, states.v_n[:, 2])
+    up_n = frame.R_nl_at(sensor_n)[:, :, 2]
+    track = CubicHermiteSpline(keyframe_s, height, np.einsum("ki,ki->k", states.v_n, up_n))
     too_low = -depths.depth - track(depths.time_s)
     count = np.bincount(depths.keyframe, minlength=len(keyframe_s))
     total = np.bincount(depths.keyframe, weights=too_low, minlength=len(keyframe_s))

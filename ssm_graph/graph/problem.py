@@ -157,19 +157,21 @@ def _gap_note(imu: ImuLog) -> tuple[str, ...]:
 def mean_gyro(imu: ImuLog, time_s: Array) -> Array:
     """Return the mean gyro reading (M, 3) over the ping window about each time, rad/s.
 
-    The window slides inwards at the ends of the data.
+    Near the ends of the data the window shrinks, to no less than one sample.
     """
     edges = np.concatenate([[imu.start_s], imu.time_s])
     angle = np.concatenate(
         [np.zeros((1, 3)), np.cumsum(imu.gyro_b * np.diff(edges)[:, None], axis=0)]
     )
-    half = 0.5 * min(PING_WINDOW_S, edges[-1] - edges[0])
+    sample = float(np.median(np.diff(edges)))
+    room = np.minimum(time_s - edges[0], edges[-1] - time_s)
+    half = np.clip(room, 0.5 * sample, 0.5 * max(PING_WINDOW_S, sample))
     centre = np.clip(time_s, edges[0] + half, edges[-1] - half)
     turned = [
         np.interp(centre + half, edges, axis) - np.interp(centre - half, edges, axis)
         for axis in angle.T
     ]
-    return np.asarray(np.stack(turned, axis=-1) / (2.0 * half))
+    return np.asarray(np.stack(turned, axis=-1) / (2.0 * half[:, None]))
 
 
 def _beams(mission: Mission, timeline: Timeline) -> Beams:

@@ -12,8 +12,10 @@ from ssm_graph.data import Array, ImuLog, ImuNoise
 from ssm_graph.earth import LocalFrame
 from ssm_graph.imu.increments import MergedSamples, merge_samples
 
-INTEGRATION_DENSITY = 1e-5
-"""m/sqrt(s): what the integration itself may lose; keeps one-sample intervals well-conditioned."""
+INTEGRATION_DENSITY = 1e-4
+"""m/sqrt(s): what the integration itself loses. At 20 Hz a constant force within each sample costs
+0.15 mm of position a wave; this density costs 6 mm in an hour. It also keeps intervals of one
+sample well-conditioned."""
 GAP_GYRO_RATE = 0.2
 """rad/s, 1 sigma of the unseen body rate inside a gap of the inertial data."""
 GAP_ACCEL = 1.0

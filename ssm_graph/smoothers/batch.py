@@ -186,7 +186,7 @@ class SsmSmoother:
             f"{status.value}: last update {last.update_sigmas:.1e} sigma, largest weight change "
             f"{last.weight_change:.1e}"
         )
-        doubts = "; ".join(contradictions(linearizer, last.states, last.weights))
+        doubts = "; ".join(contradictions(linearizer, last.states, last.beam_rows, last.weights))
         if doubts and status is Status.CONVERGED:
             status, reason = Status.SUSPECT, doubts
         elif doubts:

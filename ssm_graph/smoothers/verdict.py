@@ -7,7 +7,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from ssm_graph.data import Array
-from ssm_graph.graph.linearize import GraphLinearizer
+from ssm_graph.graph.linearize import BeamRows, GraphLinearizer
 from ssm_graph.graph.problem import Problem
 from ssm_graph.graph.states import States
 
@@ -22,10 +22,13 @@ MISFIT = 9.0
 """Mean squared whitened residual above which a sensor is contradicted: three times its sigma."""
 
 
-def contradictions(linearizer: GraphLinearizer, states: States, weights: Array) -> list[str]:
+def contradictions(
+    linearizer: GraphLinearizer, states: States, beam_rows: BeamRows, weights: Array
+) -> list[str]:
     """Compare every kind of measurement with the answer; say in a sentence each what disagrees."""
     doubts = [
         _doubt_beams(weights),
+        _doubt_residuals(weights * (beam_rows.error / linearizer.problem.beams.sigma) ** 2),
         _doubt_stretches(linearizer.problem, weights),
         _doubt_prior(linearizer.prior, states),
         _doubt_sensor("GNSS", linearizer.gnss, states, "look for a wrong datum or lever arm"),
@@ -48,6 +51,18 @@ def _doubt_beams(weights: Array) -> str:
         f"{100.0 * share:.0f} % of the {len(weights)} beam speeds contradict the answer (weight "
         f"below {LOW_WEIGHT}): check the start heading, beam order, mounting and signs of the DVL, "
         "and its noise"
+    )
+
+
+def _doubt_residuals(weighted_sq: Array) -> str:
+    """Look at what the beams still miss after weighting; robust kernels keep that bounded."""
+    misfit = float(np.mean(weighted_sq)) if len(weighted_sq) else 0.0
+    if misfit <= MISFIT:
+        return ""
+    return (
+        f"beam speeds miss the answer by {np.sqrt(misfit):.1f} of their own sigmas after weighting "
+        "(rms): outliers went in with full weight, try --kernel log; or the DVL's noise is stated "
+        "too small"
     )
 
 

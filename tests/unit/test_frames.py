@@ -55,7 +55,7 @@ def test_angles_round_trip(roll: float, pitch: float, heading: float) -> None:
     assert abs(float(wrap_to_pi(got[0] - roll))) < tolerance
     assert abs(float(got[1]) - pitch) < tolerance
     assert abs(float(wrap_to_pi(got[2] - heading))) < tolerance
-    assert 0.0 <= float(got[2]) < 2.0 * math.pi
+    assert 0.0 <= float(got[2]) <= 2.0 * math.pi
 
 
 @pytest.mark.parametrize(
@@ -101,7 +101,7 @@ def test_many_attitudes_at_once() -> None:
 
 @pytest.mark.parametrize(
     ("angle", "wrapped"),
-    [(0.0, 0.0), (3.0, 3.0), (4.0, 4.0 - 2.0 * math.pi), (-math.pi, -math.pi), (9.0, 9 - 2 * math.pi)],
+    [(0.0, 0.0), (3.0, 3.0), (4.0, 4 - 2 * math.pi), (-math.pi, -math.pi), (9.0, 9 - 2 * math.pi)],
 )
 def test_wrapping(angle: float, wrapped: float) -> None:
     """Angles end in [-pi, pi)."""
