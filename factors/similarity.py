@@ -105,7 +105,7 @@ class LogKernel(Kernel):
 class SqrtKernel(Kernel):
     """``f = -sqrt((dof + dim)(dof + t))``."""
 
-    dof: float = 5.0
+    dof: float = 2.0
     """Degrees of freedom; large is Gaussian."""
 
     def __post_init__(self) -> None:

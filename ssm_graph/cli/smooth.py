@@ -47,7 +47,8 @@ def add_parser(commands: Any, *, epilog: str) -> None:
         "--dof",
         type=float,
         default=None,
-        help=f"degrees of freedom of log and sqrt (default: {LogKernel().dof:g})",
+        help=f"degrees of freedom (default: {LogKernel().dof:g} for log, {SqrtKernel().dof:g} for "
+        "sqrt)",
     )
     parser.add_argument(
         "--width",

@@ -3,7 +3,7 @@
 Levelling and gyrocompassing are one fit. In axes that do not turn, the specific force that the
 vehicle's own velocity does not explain integrates to gravity, and gravity turns with the Earth::
 
-    C(t) v_b(t) - v_b(0) - int C f_b dt = R_bn int Exp(omega_ie t) g_n dt
+    [C v_b] - int C f_b dt = R_bn int Exp(omega_ie t) g_n dt
 
 with ``C`` the gyros' rotation since the start. The direction of both sides gives roll and pitch,
 its turning gives heading, if the gyros sense the Earth.
@@ -38,6 +38,8 @@ CAUTION = 3.0
 larger, so that counting them twice adds little."""
 MAX_WINDOW_S = 300.0
 MIN_WINDOW_S = 10.0
+COMPASS_FLOOR = math.radians(0.5)
+"""No gyrocompass heading is trusted further: a bad ping in the window costs that much."""
 TURN_BUDGET = math.radians(0.5)
 """The window is as long as the gyros' turn-on bias keeps the accumulated turn below this."""
 
@@ -108,43 +110,61 @@ def _window(mission: Mission, start_s: float) -> float:
 
 
 class _Turned(NamedTuple):
-    """Inertial data of the window in the body axes of its start, at times with a velocity."""
+    """Inertial data of the window in the body axes of its start (``C`` turns into these)."""
 
     time_s: Array
-    """(N,) s since the start, the first 0"""
-    velocity_gain: Array
-    """(N, 3) ``C v_b(t) - v_b(0) - int C f_b dt``, m/s"""
+    """(N,) s since the start, at pings"""
+    velocity: Array
+    """(N, 3) ``C v_b``, m/s"""
+    force: Array
+    """(N, 3) ``int C f_b dt`` since the start, m/s"""
 
 
 def _integrate_gyros(
     mission: Mission, start_s: float, window_s: float, velocities: BodyVelocities
 ) -> _Turned:
-    times = start_s + np.linspace(0.0, window_s, max(int(window_s), 2) + 1)
-    merged = merge_samples(mission.imu, times, rate_hz=20.0)
-    v_b = velocities.at(times)
-    C, integral = np.eye(3), np.zeros(3)
-    gains = [np.zeros(3)]
-    for k in range(1, len(times)):
-        for i in range(merged.first[k - 1], merged.first[k]):
+    pings = velocities.time_s[
+        (velocities.time_s > start_s) & (velocities.time_s < start_s + window_s)
+    ]
+    if len(pings) < 3:
+        pings = start_s + np.linspace(0.0, window_s, max(int(window_s), 3) + 1)[1:]
+    merged = merge_samples(mission.imu, np.concatenate([[start_s], pings]), rate_hz=20.0)
+    v_b = velocities.at(pings)
+    C, force = np.eye(3), np.zeros(3)
+    rows = []
+    for k in range(len(pings)):
+        for i in range(merged.first[k], merged.first[k + 1]):
             half = Rotation.from_rotvec(0.5 * merged.gyro_b[i] * merged.dt[i]).as_matrix()
-            integral = integral + C @ half @ merged.accel_b[i] * merged.dt[i]
+            force = force + C @ half @ merged.accel_b[i] * merged.dt[i]
             C = C @ half @ half
-        gains.append(C @ v_b[k] - v_b[0] - integral)
-    return _Turned(times - start_s, np.array(gains))
+        rows.append((C @ v_b[k], force))
+    velocity, integral = (np.array(column) for column in zip(*rows, strict=True))
+    return _Turned(pings - start_s, velocity, integral)
 
 
 def _level_and_compass(mission: Mission, turned: _Turned) -> Array:
-    """Return the rotation body to local level at the start that maps the velocity gain best."""
-    omega = mission.frame.omega_ie_n
-    gravity = float(normal_gravity(mission.frame.lat, mission.frame.height))
-    t = turned.time_s[1:, None]
-    g_n = np.array([0.0, 0.0, -gravity])
+    """Return the rotation body to local level at the start that explains the velocities best."""
+    frame = mission.frame
+    omega, t = frame.omega_ie_n, turned.time_s[:, None]
+    g_n = np.array([0.0, 0.0, -float(normal_gravity(frame.lat, frame.height))])
     # int Exp(omega t) g dt to second order in the Earth's turn, 1e-7 of it over the window
     first, second = np.cross(omega, g_n), np.cross(omega, np.cross(omega, g_n))
     expected = g_n * t + first * t**2 / 2.0 + second * t**3 / 6.0
-    # Every row counts alike once divided by its length of time.
-    R_lb, _ = Rotation.align_vectors(expected / t, turned.velocity_gain[1:] / t, weights=t[:, 0])
-    return np.asarray(R_lb.as_matrix())
+    gain = turned.velocity - turned.force
+    elapsed = t[1:] - t[0]
+    R_lb = np.eye(3)
+    # Seen from axes that do not turn, a velocity over ground gains -omega x v besides; that needs
+    # the attitude, roughly.
+    for _ in range(2):
+        coriolis = np.cross(R_lb.T @ omega, turned.velocity)
+        step = 0.5 * (coriolis[1:] + coriolis[:-1]) * np.diff(t, axis=0)
+        seen = gain[1:] - gain[0] + np.cumsum(step, axis=0)
+        # Every row counts alike once divided by its length of time.
+        fitted, _ = Rotation.align_vectors(
+            (expected[1:] - expected[0]) / elapsed, seen / elapsed, weights=elapsed[:, 0]
+        )
+        R_lb = np.asarray(fitted.as_matrix())
+    return R_lb
 
 
 def _compass_sigma(noise: ImuNoise, turned: _Turned, lat: float) -> float:
@@ -153,7 +173,8 @@ def _compass_sigma(noise: ImuNoise, turned: _Turned, lat: float) -> float:
     rate = math.hypot(noise.gyro_bias_sigma, noise.gyro_density / math.sqrt(window_s))
     # A velocity error of a few mm/s against the sideways gain g omega cos(lat) T^2 / 2.
     gain = 0.5 * 9.8 * window_s**2
-    return math.hypot(rate, 2.0 * _VELOCITY_SIGMA / gain) / (EARTH_RATE * math.cos(lat))
+    sigma = math.hypot(rate, 2.0 * _VELOCITY_SIGMA / gain) / (EARTH_RATE * math.cos(lat))
+    return max(sigma, COMPASS_FLOOR)
 
 
 _VELOCITY_SIGMA = 0.02

@@ -48,7 +48,10 @@ def body_velocities(mission: Mission) -> BodyVelocities:
     valid = np.isfinite(dvl.speed)
     parity = np.where(valid.all(axis=1), dvl.speed @ null, 0.0)
     sigma = np.sqrt(np.sum((null * dvl.sigma) ** 2, axis=1))
-    usable = np.flatnonzero((valid.sum(axis=1) >= 3) & (np.abs(parity) < PARITY_GATE * sigma))
+    # Three beams agree with anything: they count only where four are rare.
+    n_needed = 4 if np.mean(valid.all(axis=1)) > 0.5 else 3
+    is_good = (valid.sum(axis=1) >= n_needed) & (np.abs(parity) < PARITY_GATE * sigma)
+    usable = np.flatnonzero(is_good)
     time_s = dvl.time_s[usable] - dvl.mount.time_offset_s
     if len(usable) == 0:
         return BodyVelocities(time_s, np.zeros((0, 3)))

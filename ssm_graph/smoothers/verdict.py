@@ -12,6 +12,8 @@ from ssm_graph.graph.problem import Problem
 from ssm_graph.graph.states import States
 
 LOW_WEIGHT = 0.1
+TRUSTED = 0.5
+"""Beams of at least this weight are believed."""
 SUSPECT_SHARE = 0.5
 """More than this share of the beams below the low weight is no outlier problem any more."""
 SUSPECT_STRETCH_S = 60.0
@@ -28,7 +30,7 @@ def contradictions(
     """Compare every kind of measurement with the answer; say in a sentence each what disagrees."""
     doubts = [
         _doubt_beams(weights),
-        _doubt_residuals(weights * (beam_rows.error / linearizer.problem.beams.sigma) ** 2),
+        _doubt_residuals((beam_rows.error / linearizer.problem.beams.sigma)[weights >= TRUSTED]),
         _doubt_stretches(linearizer.problem, weights),
         _doubt_prior(linearizer.prior, states),
         _doubt_sensor("GNSS", linearizer.gnss, states, "look for a wrong datum or lever arm"),
@@ -54,13 +56,13 @@ def _doubt_beams(weights: Array) -> str:
     )
 
 
-def _doubt_residuals(weighted_sq: Array) -> str:
-    """Look at what the beams still miss after weighting; robust kernels keep that bounded."""
-    misfit = float(np.mean(weighted_sq)) if len(weighted_sq) else 0.0
+def _doubt_residuals(whitened: Array) -> str:
+    """Look at what the trusted beams still miss; a robust kernel trusts none that misses much."""
+    misfit = float(np.mean(whitened**2)) if len(whitened) else 0.0
     if misfit <= MISFIT:
         return ""
     return (
-        f"beam speeds miss the answer by {np.sqrt(misfit):.1f} of their own sigmas after weighting "
+        f"the beam speeds that count miss the answer by {np.sqrt(misfit):.1f} of their own sigmas "
         "(rms): outliers went in with full weight, try --kernel log; or the DVL's noise is stated "
         "too small"
     )

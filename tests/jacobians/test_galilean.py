@@ -1,0 +1,77 @@
+"""Guard for the GTSAM version: the inertial and position factors that the graph is built from."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+
+from ssm_graph.data import Array
+from ssm_graph.graph.linearize import depth_graph, gnss_graph, inertial_graph, prior_graph
+from ssm_graph.graph.problem import build_problem
+from ssm_graph.graph.states import States, states_from_arrays
+from ssm_graph.simulation import GnssSettings, Grade
+from tests.helpers import assert_jacobians_match, rotation, simulated, true_states
+
+TURNS = {
+    "as simulated": np.zeros(3),
+    "upside down": np.array([np.pi - 1e-7, 0.0, 0.0]),
+    "any": np.array([0.7, -1.2, 2.0]),
+}
+
+
+def disturbed(states: States, turn: Array, *, seed: int) -> States:
+    """Return states some sigmas off, all turned the same way, with biases."""
+    rng = np.random.default_rng(seed)
+    n = len(states.p_n)
+    R_nb = states.R_nb @ rotation(turn) @ rotation(0.05 * rng.normal(size=(n, 3)))
+    return states_from_arrays(
+        R_nb,
+        states.p_n + rng.normal(size=(n, 3)),
+        states.v_n + 0.3 * rng.normal(size=(n, 3)),
+        rng.normal(size=(n, 6)) * np.repeat([0.05, 5e-4], 3),
+    )
+
+
+@pytest.mark.parametrize("turn", TURNS.values(), ids=TURNS)
+def test_inertial_factor_jacobians(turn: Array) -> None:
+    """GTSAM's Galilean factor, Earth rate and gravity set, against central differences."""
+    sim = simulated(duration_s=4.0, grade=Grade.MEMS)
+    problem = build_problem(sim.mission)
+    states = disturbed(true_states(problem, sim), turn, seed=1)
+    graph = inertial_graph(problem)
+    for k in range(graph.size()):
+        assert_jacobians_match(graph.at(k), states.values, rtol=2e-6)
+
+
+@pytest.mark.parametrize("turn", TURNS.values(), ids=TURNS)
+def test_prior_gnss_and_depth_jacobians(turn: Array) -> None:
+    """GTSAM's own unary factors, lever arms included."""
+    sim = simulated(duration_s=4.0, gnss=GnssSettings(windows=((0.0, 1e9),)))
+    problem = build_problem(sim.mission)
+    states = disturbed(true_states(problem, sim), turn, seed=2)
+    assert problem.depths is not None
+    depth = depth_graph(problem.depths, states, problem.frame, problem.keyframe_s)
+    for graph in (gnss_graph(problem.fixes), depth):
+        assert graph.size() >= 4
+        for k in range(graph.size()):
+            assert_jacobians_match(graph.at(k), states.values)
+    # The prior on the pose is logarithmic: near its mean, where it is used.
+    near = disturbed(true_states(problem, sim), np.zeros(3), seed=3)
+    prior = prior_graph(problem)
+    assert prior.size() == 3
+    for k in range(3):
+        assert_jacobians_match(prior.at(k), near.values, rtol=1e-5)
+
+
+def test_prior_error_is_in_body_axes_at_the_prior() -> None:
+    """The covariance handed over is that of GTSAM's pose tangent: rotation, then body axes."""
+    problem = build_problem(simulated(duration_s=2.0).mission)
+    prior = prior_graph(problem).at(0)
+    assert isinstance(prior, gtsam.PriorFactorPose3)
+    pose = prior.prior()
+    offset = np.array([0.0, 0.0, 0.0, 0.3, -0.1, 0.2])
+    values = gtsam.Values()
+    moved = gtsam.Pose3(pose.rotation(), pose.translation() + pose.rotation().matrix() @ offset[3:])
+    values.insert(prior.keys()[0], moved)
+    np.testing.assert_allclose(prior.unwhitenedError(values), offset, atol=1e-12)

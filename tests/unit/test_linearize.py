@@ -1,0 +1,238 @@
+"""The factors of a mission: zero at the truth over the curved Earth, linear graph equals cost."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import gtsam
+import numpy as np
+import pytest
+
+from ssm_graph.data import Array
+from ssm_graph.graph.linearize import GraphLinearizer, depth_graph, gnss_graph, prior_graph
+from ssm_graph.graph.problem import Problem, build_problem
+from ssm_graph.graph.states import STATE_DIM, States, retract, states_from_arrays
+from ssm_graph.simulation import (
+    CALM,
+    DepthProfile,
+    DepthSettings,
+    GnssSettings,
+    SimulatedMission,
+    TransitRoute,
+    Waves,
+)
+from tests.helpers import rotation, simulated, state_errors, true_states, with_initial
+
+ARM = (3.0, -2.0, 1.5)
+
+
+@cache
+def far_transit(
+    *, depth_hz: float, waves: Waves = CALM, arm: tuple[float, float, float] = ARM
+) -> tuple[SimulatedMission, Problem, States]:
+    """Return 10 km in 1000 s with long lever arms, perfect sensors; down by 30 m half way."""
+    sim = simulated(
+        duration_s=1000.0,
+        imu_rate_hz=10.0,
+        route=TransitRoute(speed=10.0, depth=DepthProfile(10.0, 40.0, mid_s=500.0, tau_s=100.0)),
+        waves=waves,
+        perfect_sensors=True,
+        draw_initial_errors=False,
+        depth=DepthSettings(rate_hz=depth_hz, lever_arm_b=arm),
+        gnss=GnssSettings(rate_hz=0.2, lever_arm_b=arm, windows=((0.0, 1e9),)),
+    )
+    problem = build_problem(sim.mission)
+    return sim, problem, true_states(problem, sim)
+
+
+def errors_of(graph: gtsam.NonlinearFactorGraph, states: States) -> Array:
+    """Return unwhitened errors, one row a factor."""
+    rows = []
+    for k in range(graph.size()):
+        factor = graph.at(k)
+        assert isinstance(factor, gtsam.NoiseModelFactor)
+        rows.append(factor.unwhitenedError(states.values))
+    return np.array(rows)
+
+
+def depth_errors(problem: Problem, states: States) -> Array:
+    """Return what depth misses at the states, m."""
+    assert problem.depths is not None
+    graph = depth_graph(problem.depths, states, problem.frame, problem.keyframe_s)
+    return errors_of(graph, states)[:, 2]
+
+
+def test_gnss_is_zero_at_the_truth_10_km_away() -> None:
+    """Antenna off by its lever arm, positions by the ellipsoid: rounding of 6e6 m is left."""
+    _, problem, states = far_transit(depth_hz=1.0, waves=Waves())
+    assert np.linalg.norm(states.p_n[-1]) > 9900.0
+    errors = errors_of(gnss_graph(problem.fixes), states)
+    assert len(errors) == 200
+    assert np.abs(errors).max() < 2e-8
+
+
+def test_depth_is_zero_at_the_truth_10_km_away() -> None:
+    """Readings at the keyframes: the ellipsoid falls away by 7.8 m over these 10 km."""
+    _, problem, states = far_transit(depth_hz=1.0, waves=Waves())
+    assert states.p_n[-1, 2] < -40.0 - 7.5
+    assert np.abs(depth_errors(problem, states)).max() < 2e-8
+
+
+@pytest.mark.parametrize(
+    ("waves", "arm", "tolerance"),
+    # A cubic over 1 s misses 0.3 m of heave at 6.5 s by 0.7 mm, and the slope of the lever arm's
+    # part (0.22 m, 0.06 rad/s) by a tenth of it; in calm water the dive alone is left.
+    [(CALM, ARM, 1e-6), (Waves(), DepthSettings().lever_arm_b, 2e-3)],
+    ids=["calm", "waves"],
+)
+def test_depth_between_keyframes_is_carried_along_the_track(
+    waves: Waves, arm: tuple[float, float, float], tolerance: float
+) -> None:
+    """Three readings a second: each is compared with the height at its own time."""
+    _, problem, states = far_transit(depth_hz=3.0, waves=waves, arm=arm)
+    assert np.abs(depth_errors(problem, states)).max() < tolerance
+
+
+def test_depth_counts_the_height_error_and_its_readings() -> None:
+    """A state 0.2 m too high misses by 0.2 m; n readings weigh n times one."""
+    _, problem, truth = far_transit(depth_hz=3.0)
+    raised = truth.p_n + [0.0, 0.0, 0.2]
+    states = states_from_arrays(truth.R_nb, raised, truth.v_n, truth.bias)
+    np.testing.assert_allclose(depth_errors(problem, states), 0.2, atol=1e-5)
+    assert problem.depths is not None
+    graph = depth_graph(problem.depths, states, problem.frame, problem.keyframe_s)
+    counts = np.bincount(problem.depths.keyframe, minlength=problem.n_keyframes)
+    costs = [graph.at(k).error(states.values) for k in range(graph.size())]
+    expected = 0.5 * counts[counts > 0] * (0.2 / problem.depths.sigma) ** 2
+    np.testing.assert_allclose(costs, expected, rtol=2e-4)
+
+
+def test_depth_says_nothing_of_east_and_north() -> None:
+    """GTSAM's position factor is used for its third row alone."""
+    _, problem, truth = far_transit(depth_hz=1.0)
+    assert problem.depths is not None
+    graph = depth_graph(problem.depths, truth, problem.frame, problem.keyframe_s)
+    aside = states_from_arrays(truth.R_nb, truth.p_n + [5.0, -9.0, 0.0], truth.v_n, truth.bias)
+    assert graph.error(aside.values) < 1e-9
+
+
+def test_prior_is_zero_at_the_initial_state_and_has_its_sigmas() -> None:
+    """Far off the frame's origin: one sigma of heading, of north, of up each costs one half."""
+    sim = simulated(duration_s=2.0, route=TransitRoute(speed=10.0))
+    truth = sim.truth_at([1000.0])
+    start = {"lat": float(truth.lat[0]), "lon": float(truth.lon[0]), "height": -40.0}
+    mission = with_initial(sim.mission, **start)
+    assert mission.initial is not None
+    problem = build_problem(mission)
+    sigma = mission.initial.position_sigma_enu[0]
+    meridian = 6.36e6
+    for change, half in (
+        ({}, 0.0),
+        ({"heading": mission.initial.heading + mission.initial.attitude_sigma[2]}, 0.5),
+        ({"roll": mission.initial.roll - mission.initial.attitude_sigma[0]}, 0.5),
+        ({"height": -40.0 + 2.0 * sigma}, 2.0),
+        ({"lat": start["lat"] + sigma / meridian}, 0.5),
+        ({"velocity_enu": mission.initial.velocity_enu + [0.05, 0.0, 0.0]}, 0.5),
+    ):
+        at = GraphLinearizer(build_problem(with_initial(mission, **change)))
+        values = gtsam.Values()
+        for k in range(3):
+            factor = at.prior.at(k)
+            assert isinstance(
+                factor,
+                gtsam.PriorFactorPose3 | gtsam.PriorFactorVector | gtsam.PriorFactorConstantBias,
+            )
+            values.insert(factor.keys()[0], factor.prior())
+        assert prior_graph(problem).error(values) == pytest.approx(half, rel=0.02, abs=1e-9)
+
+
+def small_problem() -> tuple[Problem, States, Array]:
+    """Return 8 s with everything, states a few sigmas off, and beam weights."""
+    sim = simulated(duration_s=8.0, gnss=GnssSettings(windows=((0.0, 9.0),)), dropout_rate=0.2)
+    problem = build_problem(sim.mission)
+    truth = true_states(problem, sim)
+    rng = np.random.default_rng(3)
+    n = problem.n_keyframes
+    states = states_from_arrays(
+        truth.R_nb @ rotation(1e-5 * rng.normal(size=(n, 3))),
+        truth.p_n + 1e-3 * rng.normal(size=(n, 3)),
+        truth.v_n + 1e-3 * rng.normal(size=(n, 3)),
+        truth.bias + np.repeat([1e-5, 1e-8], 3) * rng.normal(size=(n, 6)),
+    )
+    return problem, states, rng.uniform(0.01, 1.1, len(problem.beams.speed))
+
+
+def test_linear_graph_has_the_cost_of_the_nonlinear_one() -> None:
+    """At the linearisation point both say the same, weights included."""
+    problem, states, weights = small_problem()
+    linearizer = GraphLinearizer(problem)
+    linearizer.follow(states)
+    rows = linearizer.beam_rows(states)
+    linear = linearizer.linearize(states, rows, weights)
+    zero = states.values.zeroVectors()
+    cost = linearizer.cost(states, rows, weights)
+    assert linear.error(zero) == pytest.approx(cost, rel=1e-12)
+    # Each row of the beams counts by its weight.
+    gained = linearizer.cost(states, rows, 2.0 * weights) - cost
+    expected = 0.5 * np.sum(weights * (rows.error / problem.beams.sigma) ** 2)
+    assert gained == pytest.approx(expected, rel=1e-6)
+
+
+def test_gradient_of_the_linear_graph_is_that_of_the_cost() -> None:
+    """Central differences of the cost along random directions, everything in it."""
+    problem, states, weights = small_problem()
+    linearizer = GraphLinearizer(problem)
+    linearizer.follow(states)
+    linear = linearizer.linearize(states, linearizer.beam_rows(states), weights)
+    gradient = linear.gradientAtZero()
+    rng = np.random.default_rng(4)
+    scale = {3: np.full(3, 1.0), 6: np.r_[np.full(3, 1e-2), np.full(3, 1.0)]}
+    for _ in range(5):
+        delta = states.values.zeroVectors()
+        for key in states.values.keys():  # noqa: SIM118
+            size = delta.at(key).size
+            delta.update(_vector(key, rng.normal(size=size) * scale[size]))
+        ends = []
+        for step in (1e-4, -1e-4):
+            moved, _ = retract(states, delta, scale=step)
+            ends.append(linearizer.cost(moved, linearizer.beam_rows(moved), weights))
+        slope = (ends[0] - ends[1]) / 2e-4
+        assert slope == pytest.approx(gradient.dot(delta), rel=1e-5)
+
+
+def _vector(key: int, value: Array) -> gtsam.VectorValues:
+    vector = gtsam.VectorValues()
+    vector.insert(key, value)
+    return vector
+
+
+def test_arrays_and_values_move_together() -> None:
+    """A step taken on both sides leaves them saying the same, and is returned as it was."""
+    problem, states, _ = small_problem()
+    n = problem.n_keyframes
+    rng = np.random.default_rng(5)
+    step = 0.1 * rng.normal(size=(n, STATE_DIM))
+    delta = gtsam.VectorValues()
+    for k in range(n):
+        delta.insert(gtsam.symbol("x", k), step[k, :6])
+        delta.insert(gtsam.symbol("v", k), step[k, 6:9])
+        delta.insert(gtsam.symbol("b", k), step[k, 9:])
+    for scale in (1.0, 0.25):
+        moved, taken = retract(states, delta, scale=scale)
+        np.testing.assert_allclose(taken, scale * step, rtol=1e-14)
+        again = states_from_arrays(moved.R_nb, moved.p_n, moved.v_n, moved.bias)
+        assert again.values.equals(moved.values, 1e-12)
+        errors = state_errors(states, moved)
+        np.testing.assert_allclose(errors[:, 6:], scale * step[:, 6:], atol=1e-13)
+        np.testing.assert_allclose(errors[:, :3], scale * step[:, :3], atol=1e-12)
+
+
+@pytest.mark.parametrize("n_keyframes", [9, 11, 101])
+def test_states_keep_their_order(n_keyframes: int) -> None:
+    """Keys sort as numbers, not as text: keyframe 10 comes after 9."""
+    p_n = np.arange(3.0 * n_keyframes).reshape(-1, 3)
+    identity = np.tile(np.eye(3), (n_keyframes, 1, 1))
+    states = states_from_arrays(identity, p_n, -p_n, np.hstack([p_n, p_n]))
+    moved, _ = retract(states, states.values.zeroVectors())
+    np.testing.assert_array_equal(moved.p_n, p_n)
+    np.testing.assert_array_equal(moved.R_nb, identity)
