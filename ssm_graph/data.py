@@ -56,6 +56,18 @@ class FrozenArrays:
             object.__setattr__(self, spec.name, array)
 
 
+class ReadOnlyArrays:
+    """Clear the write flag of every array field, without copy: for arrays made on the spot."""
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None:
+        for spec in fields(cast(Any, self)):
+            value = getattr(self, spec.name)
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+
+
 def shaped(*shape: int | str) -> Array:
     """Declare an array field of :class:`FrozenArrays` with its shape."""
     declared: Array = field(metadata={"shape": shape})

