@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ssm_graph.data import N_BEAMS, Array, GnssLog, ImuLog, InitialState, Mission, ReadOnlyArrays
+from ssm_graph.data import N_BEAMS, Array, DvlMount, GnssLog, ImuLog, InitialState, Mission, ReadOnlyArrays
 from ssm_graph.earth import LocalFrame
 from ssm_graph.errors import ConfigError
 from ssm_graph.graph.timeline import Timeline, build_timeline, nearest
@@ -138,7 +138,7 @@ def build_problem(
         depths=_depths(mission, timeline),
         fixes=None if mission.gnss is None else _fixes(mission.gnss, mission.frame, timeline),
         imu_noise_bias_sigma=np.repeat([noise.accel_bias_sigma, noise.gyro_bias_sigma], 3),
-        notes=timeline.notes + _gap_note(mission.imu),
+        notes=timeline.notes + _gap_note(mission.imu) + _calibration_note(mission.dvl.mount),
     )
 
 
@@ -151,6 +151,20 @@ def _gap_note(imu: ImuLog) -> tuple[str, ...]:
         f"gaps in the inertial data: {len(begin)}, the longest of "
         f"{end[longest] - begin[longest]:.2f} s at {begin[longest]:.3f} s; bridged with larger "
         "process noise",
+    )
+
+
+def _calibration_note(mount: DvlMount) -> tuple[str, ...]:
+    asked = [
+        name
+        for name in ("misalignment_sigma", "scale_sigma", "time_offset_sigma_s")
+        if getattr(mount, name) > 0.0
+    ]
+    if not asked:
+        return ()
+    return (
+        f"[dvl] asks to calibrate ({', '.join(asked)}): not part of this version, taken as exact; "
+        "sigmas leave it out",
     )
 
 

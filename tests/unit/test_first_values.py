@@ -1,0 +1,183 @@
+"""The first pass: weights of outliers, doubt after a lock-out, dead reckoning, aids."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from factors.similarity import LogKernel
+from ssm_graph.data import Array
+from ssm_graph.graph.first_values import (
+    DOUBT_VELOCITY,
+    GATE,
+    LOCKED_OUT_PINGS,
+    _settle_weights,
+    first_values,
+)
+from ssm_graph.graph.linearize import inertial_graph
+from ssm_graph.graph.problem import build_problem
+from ssm_graph.simulation import (
+    Fault,
+    GnssSettings,
+    Grade,
+    OutlierKind,
+    Outliers,
+    SimulatedMission,
+)
+from tests.helpers import simulated, state_errors, true_states, with_initial, without_beams
+
+KERNEL = LogKernel()
+each_grade = pytest.mark.parametrize("grade", Grade, ids=lambda grade: grade.name)
+
+
+def errors_after(sim: SimulatedMission, **initial: object) -> tuple[Array, Array, int]:
+    """Return state errors (K, 15), weights (M,) and doubts of the first pass."""
+    mission = with_initial(sim.mission, **initial) if initial else sim.mission
+    problem = build_problem(mission)
+    first = first_values(problem, kernel=KERNEL)
+    errors = state_errors(first.states, true_states(problem, sim))
+    return errors, first.weights, first.n_doubts
+
+
+@each_grade
+@pytest.mark.parametrize("kind", [OutlierKind.SPARSE, OutlierKind.TWO_BEAMS, OutlierKind.ONE_BEAM])
+def test_outliers_end_with_hardly_any_weight(grade: Grade, kind: OutlierKind) -> None:
+    """100 sigma and more off: below 0.01 at once; good beams keep theirs."""
+    sim = simulated(duration_s=60.0, grade=grade, outliers=Outliers(kind, rate=0.2), seed=3)
+    _, weights, n_doubts = errors_after(sim)
+    bad = sim.is_outlier[np.isfinite(sim.mission.dvl.speed)]
+    assert bad.sum() >= 12
+    assert weights[bad].max() < 0.01
+    assert 0.9 < weights[~bad].mean() < 1.1
+    assert n_doubts == 0
+
+
+def test_a_long_fault_of_one_beam_does_not_fool_it() -> None:
+    """1 m/s off for 25 s: the culprit has no weight, the three others keep theirs."""
+    fault = Fault(beams=(2,), start_s=3.0, end_s=28.0, offset_m_per_s=1.0)
+    sim = simulated(faults=(fault,), grade=Grade.MEMS)
+    errors, weights, _ = errors_after(sim)
+    assert weights[sim.is_outlier.ravel()].max() < 0.01
+    assert weights[~sim.is_outlier.ravel()].mean() > 0.9
+    assert np.abs(errors[:, 6:9]).max() < 0.5
+
+
+@each_grade
+def test_a_wrong_start_velocity_is_doubted_and_recovered(grade: Grade) -> None:
+    """20 sigma off at the start: all beams are locked out until the prediction is doubted.
+
+    From then on the velocity is that of the beams again.
+    """
+    sim = simulated(grade=grade)
+    assert sim.mission.initial is not None
+    sigma = float(sim.mission.initial.velocity_sigma_enu[0])
+    velocity = sim.mission.initial.velocity_enu + 20.0 * sigma * np.array([1.0, 0.0, 0.0])
+    errors, weights, _ = errors_after(sim, velocity_enu=velocity)
+    assert np.linalg.norm(errors[-1, 6:9]) < 0.25
+    assert weights[-20:].mean() > 0.6
+
+
+def test_lock_out_is_counted() -> None:
+    """Beams wrong together are first without weight; the fifth such ping is believed."""
+    sim = simulated()
+    assert sim.mission.initial is not None
+    offset = np.array([1.0, -0.8, 0.0])
+    assert np.linalg.norm(offset) < 2.0 * DOUBT_VELOCITY
+    velocity = sim.mission.initial.velocity_enu + offset
+    _, weights, n_doubts = errors_after(sim, velocity_enu=velocity)
+    by_ping = weights.reshape(-1, 4)
+    assert n_doubts == 1
+    assert by_ping[: LOCKED_OUT_PINGS - 1].max() < 0.01
+    assert by_ping[LOCKED_OUT_PINGS - 1].min() > 0.5
+
+
+def test_a_clean_mission_is_never_doubted() -> None:
+    """Over all grades and ten seeds."""
+    for grade in Grade:
+        for seed in range(10):
+            sim = simulated(duration_s=15.0, grade=grade, seed=seed)
+            assert first_values(build_problem(sim.mission), kernel=KERNEL).n_doubts == 0
+
+
+def test_without_beams_it_is_dead_reckoning() -> None:
+    """Perfect sensors and no aid at all: 30 s end where they should."""
+    sim = simulated(perfect_sensors=True, draw_initial_errors=False, depth=None)
+    problem = build_problem(without_beams(sim.mission))
+    first = first_values(problem, kernel=KERNEL)
+    errors = state_errors(first.states, true_states(problem, sim))
+    assert len(first.weights) == 0
+    assert np.abs(errors[:, 3:6]).max() < 1e-3
+    assert np.abs(errors[:, 6:9]).max() < 1e-4
+
+
+def test_depth_and_gnss_pull_a_wrong_start_in() -> None:
+    """5 m off at the start: fixes and depth at the keyframes, none of them gated."""
+    sim = simulated(gnss=GnssSettings(windows=((0.0, 30.0),), sigma_horizontal=0.1), seed=2)
+    assert sim.mission.initial is not None
+    mission = with_initial(
+        sim.mission,
+        height=sim.mission.initial.height + 5.0,
+        lat=sim.mission.initial.lat + 5.0 / 6.4e6,
+        position_sigma_enu=np.full(3, 5.0),
+    )
+    problem = build_problem(mission)
+    first = first_values(problem, kernel=KERNEL)
+    errors = state_errors(first.states, true_states(problem, sim))
+    assert np.linalg.norm(errors[0, 3:6]) > 5.0
+    assert np.linalg.norm(errors[-1, 3:6]) < 0.3
+
+
+def test_states_follow_the_beams_more_closely_than_dead_reckoning() -> None:
+    """MEMS for a minute: beams hold the velocity to centimetres per second."""
+    sim = simulated(duration_s=60.0, grade=Grade.MEMS, seed=1)
+    errors, _, _ = errors_after(sim)
+    problem = build_problem(without_beams(sim.mission))
+    alone = first_values(problem, kernel=KERNEL)
+    free = state_errors(alone.states, true_states(problem, sim))
+    assert np.linalg.norm(errors[-1, 6:9]) < 0.1 * np.linalg.norm(free[-1, 6:9])
+
+
+def test_gravity_is_left_as_that_of_the_predicted_path() -> None:
+    """Linear between its exact evaluations: good to 1e-9 m/s^2."""
+    sim = simulated(duration_s=60.0, perfect_sensors=True, draw_initial_errors=False)
+    problem = build_problem(sim.mission)
+    first = first_values(problem, kernel=KERNEL)
+    left = [params.n_gravity.copy() for params in problem.chain.params]
+    problem.chain.set_gravity(first.states.p_n)
+    exact = [params.n_gravity for params in problem.chain.params]
+    # Half a wave of heave between predicted midpoint and chord: 0.3 m x 3e-6 per second squared.
+    np.testing.assert_allclose(left, exact, rtol=0.0, atol=1e-6)
+
+
+def test_given_inertial_factors_are_used() -> None:
+    """The smoother hands over those it has; the answer is the same."""
+    problem = build_problem(simulated().mission)
+    own = first_values(problem, kernel=KERNEL)
+    given = first_values(problem, kernel=KERNEL, inertial=inertial_graph(problem))
+    np.testing.assert_array_equal(own.weights, given.weights)
+    np.testing.assert_array_equal(own.states.p_n, given.states.p_n)
+
+
+def test_settled_weights_are_a_fixed_point() -> None:
+    """At the returned weights the posterior gives those weights again."""
+    rng = np.random.default_rng(0)
+    H = rng.normal(size=(4, 3))
+    predicted, variance = H @ H.T * 0.02**2, np.full(4, 0.005**2)
+    innovation = np.array([0.01, -0.02, 0.015, 1.5])
+    weights = _settle_weights(innovation, predicted, variance, KERNEL)
+    S_inv = np.linalg.inv(predicted + np.diag(variance / weights))
+    left = variance / weights * (S_inv @ innovation)
+    spread = np.diagonal(predicted - predicted @ S_inv @ predicted)
+    np.testing.assert_allclose(weights, KERNEL.weight((left**2 + spread) / variance), atol=2e-2)
+    assert weights[3] < 1e-3
+    assert weights[:3].min() > 0.2
+
+
+def test_gate_keeps_an_outlier_out_of_the_first_round() -> None:
+    """Without it a single huge beam would drag the least-squares solution to itself."""
+    predicted, variance = np.full((4, 4), 0.02**2) + 1e-8 * np.eye(4), np.full(4, 0.005**2)
+    innovation = np.array([0.0, 0.0, 0.0, 30.0])
+    assert innovation[3] ** 2 > GATE**2 * (predicted[3, 3] + variance[3])
+    weights = _settle_weights(innovation, predicted, variance, KERNEL)
+    assert weights[3] < 1e-5
+    np.testing.assert_allclose(weights[:3], 1.08, atol=0.1)
