@@ -4,6 +4,8 @@ PYTHON ?= $(firstword $(foreach p,python3.11 python3.12 python3.13 python3.14 py
 VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= out
+# Small matrices: BLAS threads only get in each other's way.
+export OPENBLAS_NUM_THREADS ?= 1
 
 .PHONY: demo test test-slow format check clean
 

@@ -85,10 +85,14 @@ def run_jobs(jobs: Sequence[Job], results: ResultsFile, *, n_processes: int) -> 
     ):
         task = progress.add_task("missions", total=len(jobs))
         waiting: set[Future[list[Run]]] = {pool.submit(do_job, job) for job in jobs}
-        for future in as_completed(waiting):
-            runs = future.result()
-            results.append(runs)
-            progress.update(task, advance=1, description=_label(runs))
+        try:
+            for future in as_completed(waiting):
+                runs = future.result()
+                results.append(runs)
+                progress.update(task, advance=1, description=_label(runs))
+        except BaseException:  # an interrupt above all: leave without the jobs not yet begun
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
 def _label(runs: Sequence[Run]) -> str:
@@ -129,14 +133,18 @@ def report(args: argparse.Namespace, results: ResultsFile, wanted: Sequence[Job]
         title=f"Monte-Carlo study: {', '.join(args.cases)}",
         command=shlex.join(["python", "benchmarks/monte_carlo.py", *args.command]),
         code=str(results.settings["code"]),
-        seeds=f"seeds {args.first_seed} to {args.first_seed + args.seeds - 1}, "
-        f"{args.duration:g} s (few_beams: twice that)",
+        seeds=f"seeds {args.first_seed} to {args.first_seed + args.seeds - 1}, {_lengths(args)}",
     )
     (args.out / "summary.md").write_text(text, encoding="utf-8")
     if args.keep:
         RESULTS.mkdir(exist_ok=True)
         (RESULTS / f"{args.keep}.md").write_text(text, encoding="utf-8")
     return text
+
+
+def _lengths(args: argparse.Namespace) -> str:
+    lengths = {args.duration * CASES[name].longer for name in args.cases}
+    return " and ".join(f"{length:g} s" for length in sorted(lengths))
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -136,14 +136,23 @@ class Method:
 _KERNELS: Final[Mapping[str, Callable[[float], Kernel]]] = MappingProxyType(
     {"log": LogKernel, "log-plain": LogKernel, "sqrt": SqrtKernel, "exp": ExpKernel}
 )
-_PARAMETER: Final = 5.0
-"""Degrees of freedom or width where a method is named without a number."""
+_PARAMETERS: Final[Mapping[str, float]] = MappingProxyType(
+    {
+        "log": LogKernel().dof,
+        "log-plain": LogKernel().dof,
+        "sqrt": SqrtKernel().dof,
+        "exp": ExpKernel().width,
+    }
+)
+"""Degrees of freedom or width where a method is named without a number: the package's own."""
 
-DEFAULT_METHODS: Final = ("oracle", "gaussian", "log:5", "sqrt:5", "exp:5", "log-plain:5")
+DEFAULT_METHODS: Final = ("oracle", "gaussian", "log", "sqrt", "exp", "log-plain")
 
 
 def parse_method(text: str) -> Method:
-    """Return the method named, for example, ``oracle``, ``log`` (the same as ``log:5``), ``exp:3``.
+    """Return the method named, for example, ``oracle``, ``log``, ``exp:3``.
+
+    The number is part of the name of what is returned, also where a default stands in for it.
 
     Raises
     ------
@@ -157,7 +166,7 @@ def parse_method(text: str) -> Method:
         known = ("oracle", "gaussian", *_KERNELS)
         raise ConfigError(f"there is no method {text!r}; {nearest_hint(name, known)}")
     try:
-        parameter = float(number) if colon else _PARAMETER
+        parameter = float(number) if colon else _PARAMETERS[name]
         kernel = _KERNELS[name](parameter)
     except ValueError as error:
         raise ConfigError(

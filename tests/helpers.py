@@ -7,15 +7,21 @@ from typing import Any
 
 import gtsam
 import numpy as np
+from hypothesis import settings
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from ssm_graph.data import Array, ImuLog, InitialState, Mission
-from ssm_graph.estimate import Trajectory
+from ssm_graph.errors import SolverError
+from ssm_graph.estimate import Status, Trajectory
 from ssm_graph.frames import R_lb_from_roll_pitch_heading
 from ssm_graph.graph.problem import Problem
 from ssm_graph.graph.states import States, states_from_arrays
 from ssm_graph.simulation import SimulatedMission, SimulationConfig, simulate
+from ssm_graph.smoothers.batch import SsmSmoother
+
+STEADY = settings(deadline=None, derandomize=True, max_examples=50)
+"""For property tests: the same examples every time, however busy the machine is."""
 
 
 def assert_jacobians_match(
@@ -90,6 +96,15 @@ def with_imu(mission: Mission, **changes: Any) -> Mission:
     """Return the mission with fields of its inertial data changed."""
     imu: ImuLog = dataclasses.replace(mission.imu, **changes)
     return dataclasses.replace(mission, imu=imu)
+
+
+def outcome(problem: Problem) -> tuple[Status, str]:
+    """Return how smoothing ended, and why; an error counts as divergence."""
+    try:
+        estimate = SsmSmoother().solve(problem)
+    except SolverError as error:
+        return Status.DIVERGED, str(error)
+    return estimate.status, estimate.reason
 
 
 def states_from_geodetic(

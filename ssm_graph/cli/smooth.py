@@ -29,7 +29,6 @@ KERNELS = ("log", "sqrt", "exp", "gaussian")
 
 def add_parser(commands: Any, *, epilog: str) -> None:
     """Declare the command and its options."""
-    loop, graph = SmootherConfig(), ProblemConfig()
     parser: argparse.ArgumentParser = commands.add_parser(
         "smooth",
         help="smooth a mission folder",
@@ -40,6 +39,12 @@ def add_parser(commands: Any, *, epilog: str) -> None:
     )
     parser.add_argument("mission", type=Path, metavar="MISSION", help="mission folder")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="result folder")
+    _add_kernel_options(parser)
+    _add_other_options(parser)
+    parser.set_defaults(run=run)
+
+
+def _add_kernel_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--kernel", choices=KERNELS, default="log", help="similarity kernel (default: log)"
     )
@@ -60,10 +65,14 @@ def add_parser(commands: Any, *, epilog: str) -> None:
     parser.add_argument(
         "--similarity",
         choices=[kind.name.lower() for kind in Similarity],
-        default=loop.similarity.name.lower(),
+        default=SmootherConfig().similarity.name.lower(),
         help="judge a beam by residual and posterior variance, or by the residual alone "
         "(default: expected)",
     )
+
+
+def _add_other_options(parser: argparse.ArgumentParser) -> None:
+    loop, graph = SmootherConfig(), ProblemConfig()
     parser.add_argument(
         "--max-iterations",
         type=int,
@@ -94,7 +103,6 @@ def add_parser(commands: Any, *, epilog: str) -> None:
         "reference",
     )
     parser.add_argument("--no-figure", action="store_true", help="write no figure.png")
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace, console: Console, errors: Console) -> bool:

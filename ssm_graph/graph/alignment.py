@@ -28,6 +28,7 @@ from ssm_graph.frames import (
 )
 from ssm_graph.graph.body_velocity import BodyVelocities, body_velocities
 from ssm_graph.graph.track_heading import HeadingFit, heading_from_track
+from ssm_graph.graph.usable import require_usable
 from ssm_graph.imu.increments import merge_samples
 
 SAFE_HEADING_SIGMA = math.radians(10.0)
@@ -63,6 +64,7 @@ def align(mission: Mission) -> Alignment:
     DataError
         If no inertial data follow the first fix.
     """
+    require_usable(mission)
     gnss, fix = _first_fix(mission)
     start_s = float(gnss.time_s[fix])
     velocities = body_velocities(mission)

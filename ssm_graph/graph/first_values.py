@@ -18,6 +18,7 @@ from factors.similarity import WEIGHT_FLOOR, Kernel, expected_mahalanobis_sq
 from factors.so3 import cross
 from ssm_graph.data import Array
 from ssm_graph.earth import SEMI_MAJOR_AXIS
+from ssm_graph.errors import SolverError
 from ssm_graph.graph.linearize import inertial_graph, linearize_beams
 from ssm_graph.graph.problem import Problem
 from ssm_graph.graph.states import (
@@ -61,7 +62,16 @@ def first_values(
 
     ``inertial`` is the graph of :func:`inertial_graph`, where it is at hand already.
     """
-    return _ForwardPass(problem, kernel, inertial or inertial_graph(problem)).run()
+    try:
+        first = _ForwardPass(problem, kernel, inertial or inertial_graph(problem)).run()
+    except np.linalg.LinAlgError as error:
+        raise SolverError(f"the first pass ran away ({error}): {_HINT}") from error
+    if not (np.all(np.isfinite(first.states.p_n)) and np.all(np.isfinite(first.states.v_n))):
+        raise SolverError(f"the first pass became non-finite: {_HINT}")
+    return first
+
+
+_HINT = "check units, axes and noise of [imu], and the initial state with its sigmas"
 
 
 class _ForwardPass:

@@ -7,10 +7,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ssm_graph.data import N_BEAMS, Array, DvlMount, GnssLog, ImuLog, InitialState, Mission, ReadOnlyArrays
+from ssm_graph.data import (
+    N_BEAMS,
+    Array,
+    DvlMount,
+    GnssLog,
+    ImuLog,
+    InitialState,
+    Mission,
+    ReadOnlyArrays,
+)
 from ssm_graph.earth import LocalFrame
 from ssm_graph.errors import ConfigError
 from ssm_graph.graph.timeline import Timeline, build_timeline, nearest
+from ssm_graph.graph.usable import require_usable
 from ssm_graph.imu.preintegration import InertialChain, imu_gaps, preintegrate
 
 PING_WINDOW_S = 0.1
@@ -117,6 +127,7 @@ def build_problem(
     start : initial state with sigmas; the mission's own when left out. A mission without one
         needs :func:`ssm_graph.graph.alignment.align` first.
     """
+    require_usable(mission)
     config = config or ProblemConfig()
     start = start or mission.initial
     if start is None:

@@ -50,7 +50,7 @@ class SmootherConfig:
 
     kernel: Kernel = field(default_factory=LogKernel)
     similarity: Similarity = Similarity.EXPECTED
-    max_iterations: int = 50
+    max_iterations: int = 100
     tolerance: float = 1e-3
     """Updates in their own posterior sigmas, and changes of weights, below which it has settled."""
 

@@ -49,9 +49,15 @@ def test_lists_become_float_arrays() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"gyro_b": np.zeros((3, 3))}, "ImuLog.gyro_b: expected an array of shape (2, 3), got (3, 3)"),
+        (
+            {"gyro_b": np.zeros((3, 3))},
+            "ImuLog.gyro_b: expected an array of shape (2, 3), got (3, 3)",
+        ),
         ({"accel_b": np.zeros(3)}, "ImuLog.accel_b: expected an array of shape (2, 3), got (3,)"),
-        ({"time_s": np.zeros((2, 1))}, "ImuLog.time_s: expected an array of shape ('N',), got (2, 1)"),
+        (
+            {"time_s": np.zeros((2, 1))},
+            "ImuLog.time_s: expected an array of shape ('N',), got (2, 1)",
+        ),
     ],
 )
 def test_wrong_shapes_are_named(changes: dict[str, Any], message: str) -> None:
@@ -72,7 +78,7 @@ def test_fixed_shapes_do_not_follow_the_time() -> None:
 def test_missing_ranges_are_allowed_and_present_ones_checked() -> None:
     """An optional array is None or of the right shape."""
     log = DvlLog(
-        mount=default_mount(), time_s=[1.0], speed=np.zeros((1, 4)), sigma=np.ones((1, 4))
+        mount=default_mount(), time_s=np.array([1.0]), speed=np.zeros((1, 4)), sigma=np.ones((1, 4))
     )
     assert log.range_m is None
     with pytest.raises(DataError, match=r"DvlLog\.range_m"):
@@ -98,8 +104,8 @@ def test_beams_turn_with_the_mounting() -> None:
 def test_every_array_of_a_mission_is_read_only() -> None:
     """Both from the fixture and from the simulator."""
     for mission in (make_mission(), simulated().mission):
-        parts = [mission.imu, mission.dvl, mission.dvl.mount, mission.depth, mission.gnss]
-        parts += [mission.initial, mission.reference]
+        parts: list[object] = [mission.imu, mission.dvl, mission.dvl.mount, mission.depth]
+        parts += [mission.gnss, mission.initial, mission.reference]
         for part in parts:
             if part is None:
                 continue

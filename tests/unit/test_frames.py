@@ -18,7 +18,7 @@ from ssm_graph.frames import (
     rotation_zyx,
     wrap_to_pi,
 )
-from tests.helpers import rotation
+from tests.helpers import STEADY, rotation
 
 rolls = st.floats(-math.pi, math.pi)
 pitches = st.floats(-1.55, 1.55)
@@ -34,6 +34,7 @@ def elementary(axis: int, angle: float) -> Array:
     return R
 
 
+@STEADY
 @given(roll=rolls, pitch=pitches, heading=headings)
 def test_attitude_is_the_chain_of_elementary_turns(
     roll: float, pitch: float, heading: float
@@ -46,6 +47,7 @@ def test_attitude_is_the_chain_of_elementary_turns(
     assert float(np.linalg.det(R_lb)) == pytest.approx(1.0)
 
 
+@STEADY
 @given(roll=rolls, pitch=pitches, heading=headings)
 def test_angles_round_trip(roll: float, pitch: float, heading: float) -> None:
     """Angles come back, heading in 0..2 pi, as long as the pitch is not vertical."""
@@ -75,6 +77,7 @@ def test_signs_of_roll_and_pitch() -> None:
     assert R_lb_from_roll_pitch_heading(0.1, 0.0, 1.0)[2, 1] < 0.0
 
 
+@STEADY
 @given(roll=rolls, pitch=st.floats(-1.4, 1.4), heading=headings)
 def test_jacobian_of_the_angles(roll: float, pitch: float, heading: float) -> None:
     """``R(rph + d) = R(rph) Exp(J d)``: what is left is of second order."""
@@ -92,9 +95,7 @@ def test_many_attitudes_at_once() -> None:
     roll, heading = np.array([[0.1], [0.2]]), np.array([0.3, 1.4, 2.5])
     R_lb = R_lb_from_roll_pitch_heading(roll, 0.05, heading)
     assert R_lb.shape == (2, 3, 3, 3)
-    np.testing.assert_allclose(
-        R_lb[1, 2], R_lb_from_roll_pitch_heading(0.2, 0.05, 2.5), atol=1e-15
-    )
+    np.testing.assert_allclose(R_lb[1, 2], R_lb_from_roll_pitch_heading(0.2, 0.05, 2.5), atol=1e-15)
     assert phi_D_roll_pitch_heading(roll, np.zeros(3)).shape == (2, 3, 3, 3)
     assert roll_pitch_heading_from_R_lb(R_lb)[2].shape == (2, 3)
 

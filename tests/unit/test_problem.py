@@ -109,11 +109,8 @@ def test_inertial_gaps_are_noted() -> None:
     log = ImuLog(0.0, imu.noise, imu.time_s[kept], imu.gyro_b[kept], imu.accel_b[kept])
     problem = build_problem(dataclasses.replace(sim.mission, imu=log))
     (note,) = [note for note in problem.notes if "gap" in note]
-    assert re.fullmatch(
-        r"inertial data have 1 gaps?, the longest of 0\.50 s at 9\.950 s: bridged with larger "
-        r"process noise",
-        note,
-    )
+    assert re.search(r"\b1\b.*longest of 0\.50 s at 9\.950 s", note)
+    assert "larger process noise" in note
 
 
 def test_fixes_become_positions_with_covariances_along_the_local_level() -> None:

@@ -19,6 +19,7 @@ from factors.similarity import (
     SqrtKernel,
     expected_mahalanobis_sq,
 )
+from tests.helpers import STEADY
 
 parameters = st.floats(0.5, 1e4)
 kernels = st.one_of(
@@ -35,12 +36,14 @@ lengths = st.floats(0.0, 1e3)
 with_parameter = pytest.mark.parametrize("make", [LogKernel, SqrtKernel, ExpKernel])
 
 
+@STEADY
 @given(kernel=kernels, dim=dims)
 def test_a_residual_of_expected_size_keeps_its_noise(kernel: Kernel, dim: int) -> None:
     """``weight(dim) = 1`` whatever the parameter."""
     assert kernel.weight(float(dim), dim=dim) == pytest.approx(1.0, rel=1e-12)
 
 
+@STEADY
 @given(kernel=robust_kernels, dim=dims, t=st.lists(lengths, min_size=2, unique=True))
 def test_larger_residuals_weigh_less(kernel: Kernel, dim: int, t: list[float]) -> None:
     """Weights are positive, never rise, and fall where they are not at the floor."""
@@ -51,6 +54,7 @@ def test_larger_residuals_weigh_less(kernel: Kernel, dim: int, t: list[float]) -
     assert np.all(np.diff(weight)[apart] < 0.0)
 
 
+@STEADY
 @given(kernel=kernels, dim=dims, t=st.floats(0.0, 300.0))
 def test_weight_is_minus_twice_the_slope_of_the_similarity(
     kernel: Kernel, dim: int, t: float
@@ -67,6 +71,7 @@ def test_weight_is_minus_twice_the_slope_of_the_similarity(
     )
 
 
+@STEADY
 @given(kernel=kernels, dim=dims, a=lengths, b=lengths)
 def test_similarity_is_convex(kernel: Kernel, dim: int, a: float, b: float) -> None:
     """The bound of the method rests on Jensen's inequality, for which ``f`` must be convex."""
@@ -76,6 +81,7 @@ def test_similarity_is_convex(kernel: Kernel, dim: int, a: float, b: float) -> N
 
 
 @with_parameter
+@STEADY
 @given(t=lengths, dim=dims)
 def test_an_infinite_parameter_is_least_squares(
     make: Callable[[float], Kernel], t: float, dim: int
@@ -92,12 +98,14 @@ def test_rejected_measurements_keep_the_floor(make: Callable[[float], Kernel]) -
 
 
 def test_weights_of_a_hundred_sigma_outlier() -> None:
-    """Hand-computed values for the defaults: log and exp let go, sqrt keeps pulling."""
+    """Hand-computed values: log and exp let go, sqrt keeps pulling."""
     t = 1e4
-    assert float(LogKernel().weight(t)) == pytest.approx(6.0 / 10005.0, rel=1e-12)
-    assert float(SqrtKernel().weight(t)) == pytest.approx(math.sqrt(6.0 / 10005.0), rel=1e-12)
-    assert float(ExpKernel().weight(t)) == WEIGHT_FLOOR
-    assert float(ExpKernel().weight(26.0)) == pytest.approx(math.exp(-0.5), rel=1e-12)
+    assert float(LogKernel(dof=5.0).weight(t)) == pytest.approx(6.0 / 10005.0, rel=1e-12)
+    assert float(SqrtKernel(dof=5.0).weight(t)) == pytest.approx(
+        math.sqrt(6.0 / 10005.0), rel=1e-12
+    )
+    assert float(ExpKernel(width=5.0).weight(t)) == WEIGHT_FLOOR
+    assert float(ExpKernel(width=5.0).weight(26.0)) == pytest.approx(math.exp(-0.5), rel=1e-12)
     assert float(GaussianKernel().weight(t)) == 1.0
 
 
@@ -119,18 +127,18 @@ def test_bad_parameters_are_refused(make: Callable[[float], Kernel], value: floa
 
 def test_kernels_are_equal_by_value_and_say_what_they_are() -> None:
     """The smoother compares kernels, the result files print them."""
-    assert LogKernel() == LogKernel(5.0) != LogKernel(4.0)
-    assert LogKernel(5.0) != SqrtKernel(5.0)
-    texts = [str(kernel) for kernel in (GaussianKernel(), LogKernel(), SqrtKernel(), ExpKernel())]
-    assert texts == ["gaussian", "log(dof=5)", "sqrt(dof=5)", "exp(width=5)"]
+    log: Kernel = LogKernel(5.0)
+    sqrt: Kernel = SqrtKernel(5.0)
+    assert log == LogKernel(dof=5.0) != LogKernel(4.0)
+    assert log != sqrt
+    kernels_ = (GaussianKernel(), LogKernel(5.0), SqrtKernel(2.5), ExpKernel(4.0))
+    texts = [str(kernel) for kernel in kernels_]
+    assert texts == ["gaussian", "log(dof=5)", "sqrt(dof=2.5)", "exp(width=4)"]
 
 
-@given(
-    innovation=st.floats(-10.0, 10.0), spread=st.floats(0.0, 10.0), sigma=st.floats(1e-3, 10.0)
-)
-def test_expected_length_is_that_of_samples(
-    innovation: float, spread: float, sigma: float
-) -> None:
+@STEADY
+@given(innovation=st.floats(-10.0, 10.0), spread=st.floats(0.0, 10.0), sigma=st.floats(1e-3, 10.0))
+def test_expected_length_is_that_of_samples(innovation: float, spread: float, sigma: float) -> None:
     """Two points one spread either side have exactly the expected mean square."""
     ends = innovation + np.sqrt(spread) * np.array([-1.0, 1.0])
     t = expected_mahalanobis_sq(np.array(innovation), np.array(spread), sigma=sigma)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, V, X
 
+from factors.similarity import LogKernel
 from ssm_graph.data import Array
 from ssm_graph.errors import SolverError
 from ssm_graph.graph.first_values import first_values
@@ -18,7 +19,6 @@ from ssm_graph.graph.problem import Problem, build_problem
 from ssm_graph.graph.solve import marginal_covariances, solve_linear
 from ssm_graph.graph.states import STATE_DIM
 from ssm_graph.simulation import GnssSettings, Grade
-from factors.similarity import LogKernel
 from tests.helpers import simulated, without_beams
 
 GNSS = GnssSettings(windows=((0.0, 1e9),))
@@ -62,7 +62,7 @@ def problem_of(n_keyframes: int, *, case: str, grade: Grade = Grade.TACTICAL) ->
 
 
 @pytest.mark.parametrize("case", ["all", "few beams", "no beams", "no depth"])
-@pytest.mark.parametrize("n_keyframes", [2, 3, 6, 10])
+@pytest.mark.parametrize("n_keyframes", [2, 3, 6])
 def test_equals_dense_algebra(n_keyframes: int, case: str) -> None:
     """Solution and every keyframe's covariance, whatever is measured where."""
     problem = problem_of(n_keyframes, case=case)

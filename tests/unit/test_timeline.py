@@ -15,7 +15,7 @@ from ssm_graph.data import DvlLog, GnssLog, Mission
 from ssm_graph.errors import DataError
 from ssm_graph.graph.timeline import MIN_SPACING_S, Timeline, build_timeline, nearest
 from ssm_graph.simulation import default_mount
-from tests.helpers import simulated
+from tests.helpers import STEADY, simulated
 
 MISSION = simulated(duration_s=20.0).mission
 
@@ -152,6 +152,7 @@ def test_a_start_at_the_first_sample_may_be_off_by_rounding() -> None:
     assert timeline.keyframe_s[0] == 0.0
 
 
+@STEADY
 @given(
     st.lists(st.floats(0.0, 20.0), max_size=30, unique=True),
     st.lists(st.floats(0.0, 20.0), max_size=10, unique=True),
@@ -174,6 +175,7 @@ def test_laws_of_any_timeline(ping_s: list[float], fix_s: list[float], interval_
     assert np.all(np.diff(timeline.ping_keyframe) >= 0)
 
 
+@STEADY
 @given(st.lists(st.floats(-5.0, 25.0), min_size=1, max_size=20))
 def test_nearest_is_nearest(times: list[float]) -> None:
     """No other keyframe is closer, also beyond the ends."""

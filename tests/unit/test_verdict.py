@@ -1,0 +1,189 @@
+"""The verdict: silent on good answers, and each contradiction named for what it is."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ssm_graph.data import Array
+from ssm_graph.estimate import Status
+from ssm_graph.graph.linearize import GraphLinearizer
+from ssm_graph.graph.problem import Problem, build_problem
+from ssm_graph.graph.states import States, states_from_arrays
+from ssm_graph.simulation import (
+    DiveRoute,
+    GnssSettings,
+    Grade,
+    SimulatedMission,
+    TransitRoute,
+)
+from ssm_graph.smoothers.verdict import SUSPECT_STRETCH_S, contradictions
+from tests.helpers import outcome, simulated, true_states, with_imu, with_initial
+
+
+@cache
+def long_mission() -> tuple[SimulatedMission, Problem, States]:
+    """Return 200 s with all aids, and the truth."""
+    sim = simulated(duration_s=200.0, gnss=GnssSettings(windows=((0.0, 100.0),)), seed=1)
+    problem = build_problem(sim.mission)
+    return sim, problem, true_states(problem, sim)
+
+
+def doubts_at(problem: Problem, states: States, *, weights: Array | None = None) -> list[str]:
+    """Return what the data say against these states and weights."""
+    linearizer = GraphLinearizer(problem)
+    linearizer.follow(states)
+    rows = linearizer.beam_rows(states)
+    weights = np.ones(len(rows.error)) if weights is None else weights
+    return contradictions(linearizer, states, rows, weights)
+
+
+def moved(states: States, **changes: Array) -> States:
+    """Return states with some arrays changed."""
+    arrays: dict[str, Any] = {name: getattr(states, name) for name in states._fields[1:]}
+    return states_from_arrays(**(arrays | changes))
+
+
+@pytest.mark.parametrize("grade", Grade, ids=lambda grade: grade.name)
+def test_the_truth_is_not_doubted(grade: Grade) -> None:
+    """At every grade, everything measured."""
+    sim = simulated(grade=grade, gnss=GnssSettings(windows=((0.0, 99.0),)), imu_rate_hz=100.0)
+    problem = build_problem(sim.mission)
+    assert doubts_at(problem, true_states(problem, sim)) == []
+
+
+def test_more_than_half_of_the_beams_rejected() -> None:
+    """Half is still outliers, one more is not."""
+    _, problem, states = long_mission()
+    weights = np.ones(len(problem.beams.speed))
+    weights[::2] = 0.05
+    assert doubts_at(problem, states, weights=weights) == []
+    weights[1] = 0.05
+    (doubt,) = doubts_at(problem, states, weights=weights)
+    assert doubt.startswith("50 % of the 800 beam speeds contradict the answer")
+
+
+def test_a_long_stretch_of_rejected_beams() -> None:
+    """Three of four beams of each ping for more than a minute; a minute less a ping is silent."""
+    _, problem, states = long_mission()
+    for n_pings, expected in ((round(SUSPECT_STRETCH_S) + 1, 1), (round(SUSPECT_STRETCH_S), 0)):
+        weights = np.ones((200, 4))
+        weights[50 : 50 + n_pings, :3] = 0.05
+        doubts = doubts_at(problem, states, weights=weights.ravel())
+        assert len(doubts) == expected
+    weights = np.ones((200, 4))
+    weights[50:120, :3] = 0.05
+    (doubt,) = doubts_at(problem, states, weights=weights.ravel())
+    assert "from 51.0 s to 120.0 s" in doubt
+
+
+def test_one_good_ping_ends_a_stretch() -> None:
+    """Two stretches of 50 s are not one of 100."""
+    _, problem, states = long_mission()
+    weights = np.ones((200, 4))
+    weights[50:150, :3] = 0.05
+    weights[100] = 1.0
+    assert doubts_at(problem, states, weights=weights.ravel()) == []
+
+
+def test_trusted_beams_that_miss() -> None:
+    """20 sigma off with full weight is named; the same beams without weight are not."""
+    _, problem, states = long_mission()
+    speed = problem.beams.speed.copy()
+    bad = np.zeros(len(speed), bool)
+    bad[::10] = True
+    speed[bad] += 0.2
+    wrong = dataclasses.replace(problem, beams=dataclasses.replace(problem.beams, speed=speed))
+    (doubt,) = doubts_at(wrong, states)
+    assert "miss the answer by 12." in doubt
+    assert doubts_at(wrong, states, weights=np.where(bad, 1e-4, 1.0)) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("position or attitude", {"heading": 0.2}),
+        ("position or attitude", {"lat": 1e-6}),
+        ("velocity", {"velocity_enu": np.array([0.6, 0.0, 0.0])}),
+    ],
+)
+def test_a_contradicted_start_is_named(name: str, change: dict[str, Any]) -> None:
+    """Tens of sigmas between the answer and the initial state."""
+    sim, _, states = long_mission()
+    initial = sim.mission.initial
+    assert initial is not None
+    changes = {key: getattr(initial, key) + value for key, value in change.items()}
+    problem = build_problem(with_initial(sim.mission, **changes))
+    (doubt,) = doubts_at(problem, states)
+    assert doubt.startswith(f"the initial {name} is contradicted by the data (chi-square")
+
+
+def test_a_contradicted_bias_is_named() -> None:
+    """A turn-on bias of tens of its sigmas."""
+    _, problem, states = long_mission()
+    bias = states.bias + np.repeat([30.0, 0.0], 3) * problem.imu_noise_bias_sigma
+    doubts = doubts_at(problem, moved(states, bias=bias))
+    assert any(doubt.startswith("the initial bias is contradicted") for doubt in doubts)
+
+
+def test_gnss_and_depth_that_miss_are_named() -> None:
+    """Each with its own hint."""
+    sim, _, states = long_mission()
+    gnss, depth = sim.mission.gnss, sim.mission.depth
+    assert gnss is not None
+    assert depth is not None
+    far = dataclasses.replace(
+        sim.mission, gnss=dataclasses.replace(gnss, lat=gnss.lat + 20.0 / 6.4e6)
+    )
+    (doubt,) = doubts_at(build_problem(far), states)
+    assert doubt.startswith("GNSS data miss the answer by")
+    assert "datum or lever arm" in doubt
+    deep = dataclasses.replace(
+        sim.mission, depth=dataclasses.replace(depth, depth=depth.depth + 0.5)
+    )
+    (doubt,) = doubts_at(build_problem(deep), states)
+    assert doubt.startswith("depth data miss the answer by 1")
+    assert "zero, sign and unit" in doubt
+
+
+def test_inertial_data_that_miss_are_named() -> None:
+    """A missing quarter of a degree per second over 200 s is no bias of any stated size."""
+    sim, _, states = long_mission()
+    gyro_b = sim.mission.imu.gyro_b + np.array([0.0, 0.0, 4e-3])
+    problem = build_problem(with_imu(sim.mission, gyro_b=gyro_b))
+    doubts = doubts_at(problem, states)
+    assert any(doubt.startswith("inertial data miss the answer by") for doubt in doubts)
+
+
+def test_no_beams_no_doubt() -> None:
+    """Nothing measured, nothing contradicted."""
+    sim = simulated(depth=None)
+    dvl = sim.mission.dvl
+    lost = dataclasses.replace(dvl, speed=np.full_like(dvl.speed, np.nan))
+    problem = build_problem(dataclasses.replace(sim.mission, dvl=lost))
+    assert doubts_at(problem, true_states(problem, sim)) == []
+
+
+@pytest.mark.parametrize("grade", Grade, ids=lambda grade: grade.name)
+@pytest.mark.parametrize(
+    "route", [TransitRoute(), DiveRoute()], ids=lambda route: type(route).__name__
+)
+@pytest.mark.parametrize("turn_deg", [180.0, 90.0])
+def test_a_hopeless_heading_never_ends_well(grade: Grade, route: Any, turn_deg: float) -> None:
+    """A moving vehicle without GNSS, its heading wrong by far: the outcome says so.
+
+    Either the status is not good and the reason names the contradiction, or there is no answer at
+    all but an error that points to the heading.
+    """
+    sim = simulated(grade=grade, route=route, seed=1)
+    assert sim.mission.initial is not None
+    heading = sim.mission.initial.heading + np.radians(turn_deg)
+    status, reason = outcome(build_problem(with_initial(sim.mission, heading=heading)))
+    assert status in (Status.SUSPECT, Status.MAX_ITERATIONS, Status.DIVERGED)
+    assert not status.is_good
+    assert "heading" in reason
+    assert "contradict" in reason or status is Status.DIVERGED
