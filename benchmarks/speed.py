@@ -148,7 +148,8 @@ def verdict(timings: dict[str, Timing]) -> str:
     ours = timings[OURS].total
     text = f"{ours / timings[FLOOR].total:.2f} times the floor (b)"
     if PLAIN in timings:
-        text = f"{timings[PLAIN].total / ours:.0f} times faster than (a); {text}"
+        gain = timings[PLAIN].total / ours
+        text = f"{gain:.{0 if gain >= 10.0 else 1}f} times faster than (a); {text}"
     return text
 
 

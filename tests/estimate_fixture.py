@@ -86,6 +86,7 @@ def _estimate(
             for k in range(6)
         ),
         wall_s=1.25,
+        cost=100.0,
         start=make_start(trajectory),
         notes=NOTES,
     )
