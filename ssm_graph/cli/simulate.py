@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from ssm_graph.io.mission import TableFormat, write_mission
+from ssm_graph.cli.options import add_command, add_mission_output
+from ssm_graph.io.mission import write_mission
 from ssm_graph.simulation import (
     SCENARIOS,
     Grade,
@@ -22,12 +22,12 @@ from ssm_graph.simulation import (
 def add_parser(commands: Any, *, epilog: str) -> None:
     """Declare the command and its options."""
     scenarios = "\n".join(f"  {name:9}{s.description}" for name, s in SCENARIOS.items())
-    parser: argparse.ArgumentParser = commands.add_parser(
+    parser = add_command(
+        commands,
         "simulate",
-        help="write a simulated mission folder with truth as reference",
+        summary="write a simulated mission folder with truth as reference",
         description=f"Simulate a mission.\n\nscenarios:\n{scenarios}",
         epilog=epilog,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("scenario", metavar="SCENARIO", choices=list(SCENARIOS))
     parser.add_argument(
@@ -48,14 +48,7 @@ def add_parser(commands: Any, *, epilog: str) -> None:
     parser.add_argument("--duration", type=float, metavar="SECONDS", help="length of the mission")
     parser.add_argument("--imu-rate", type=float, metavar="HZ", help="inertial samples per second")
     parser.add_argument("--seed", type=int, default=0, help="same seed, same mission (default: 0)")
-    parser.add_argument(
-        "--format",
-        type=str.lower,
-        choices=[table.name.lower() for table in TableFormat],
-        default=TableFormat.CSV.name.lower(),
-        help="format of the tables (default: csv)",
-    )
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="mission folder")
+    add_mission_output(parser)
     parser.set_defaults(run=run)
 
 
@@ -74,9 +67,7 @@ def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
         rate = arguments.rate if arguments.rate is not None else default.rate
         changes["outliers"] = Outliers(kind, rate)
     simulated = simulate(scenario_config(arguments.scenario, **changes))
-    write_mission(
-        arguments.out, simulated.mission, table_format=TableFormat[arguments.format.upper()]
-    )
+    write_mission(arguments.out, simulated.mission, table_format=arguments.format)
     mission = simulated.mission
     console.print(
         f"{arguments.out}: {len(mission.imu.time_s)} inertial samples, "

@@ -11,6 +11,7 @@ import numpy as np
 from rich.console import Console
 
 from factors.similarity import ExpKernel, GaussianKernel, Kernel, LogKernel, SqrtKernel
+from ssm_graph.cli.options import add_command
 from ssm_graph.data import GnssLog, Mission, Reference
 from ssm_graph.errors import ConfigError, DataError
 from ssm_graph.estimate import Estimate
@@ -29,13 +30,13 @@ KERNELS = ("log", "sqrt", "exp", "gaussian")
 
 def add_parser(commands: Any, *, epilog: str) -> None:
     """Declare the command and its options."""
-    parser: argparse.ArgumentParser = commands.add_parser(
+    parser = add_command(
+        commands,
         "smooth",
-        help="smooth a mission folder",
+        summary="smooth a mission folder",
         description="Smooth a recorded mission; writes trajectory.csv, beams.csv, summary.json and "
         "figure.png.",
         epilog=epilog,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("mission", type=Path, metavar="MISSION", help="mission folder")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="result folder")

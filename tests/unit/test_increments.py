@@ -129,7 +129,8 @@ def test_a_cut_sample_keeps_its_own_total() -> None:
     merged = merge_samples(imu_log(edges, ramp, ramp), np.array([0.0, 0.53, 1.0]), rate_hz=1.0)
     np.testing.assert_allclose(merged.dt @ merged.gyro_b, [0.0, 0.0, 1.0 / 3.0], atol=1e-15)
     # And the first part is that of the signal: t^3/3 to second order in the sample.
-    assert merged.gyro_b[0, 2] * 0.53 == pytest.approx(0.53**3 / 3.0, abs=1e-4)
+    for rates in (merged.gyro_b, merged.accel_b):
+        assert rates[0, 2] * 0.53 == pytest.approx(0.53**3 / 3.0, abs=1e-4)
 
 
 @pytest.mark.parametrize("nudge", [-1e-15, 0.0, 1e-15])

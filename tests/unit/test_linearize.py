@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from ssm_graph.data import Array
+from ssm_graph.earth import radii_of_curvature
 from ssm_graph.graph.linearize import GraphLinearizer, depth_graph, gnss_graph, prior_graph
 from ssm_graph.graph.problem import Problem, build_problem
 from ssm_graph.graph.states import STATE_DIM, States, retract, states_from_arrays
@@ -120,33 +121,48 @@ def test_depth_says_nothing_of_east_and_north() -> None:
 
 
 def test_prior_is_zero_at_the_initial_state_and_has_its_sigmas() -> None:
-    """Far off the frame's origin: one sigma of heading, of north, of up each costs one half."""
+    """Far off the frame's origin: one sigma of each axis costs one half, two sigmas two."""
     sim = simulated(duration_s=2.0, route=TransitRoute(speed=10.0))
     truth = sim.truth_at([1000.0])
-    start = {"lat": float(truth.lat[0]), "lon": float(truth.lon[0]), "height": -40.0}
-    mission = with_initial(sim.mission, **start)
-    assert mission.initial is not None
-    problem = build_problem(mission)
-    sigma = mission.initial.position_sigma_enu[0]
-    meridian = 6.36e6
-    for change, half in (
+    lat, lon = float(truth.lat[0]), float(truth.lon[0])
+    mission = with_initial(
+        sim.mission,
+        lat=lat,
+        lon=lon,
+        height=-40.0,
+        roll=0.2,
+        pitch=-0.1,
+        heading=1.0,
+        position_sigma_enu=np.array([0.1, 0.2, 0.4]),
+        velocity_sigma_enu=np.array([0.01, 0.02, 0.04]),
+        attitude_sigma=np.array([0.001, 0.002, 0.004]),
+    )
+    start = mission.initial
+    assert start is not None
+    prior = prior_graph(build_problem(mission))
+    meridian, prime_vertical = radii_of_curvature(lat)
+    parallel = float(prime_vertical) * np.cos(lat)
+    for change, half_chi_sq in (
         ({}, 0.0),
-        ({"heading": mission.initial.heading + mission.initial.attitude_sigma[2]}, 0.5),
-        ({"roll": mission.initial.roll - mission.initial.attitude_sigma[0]}, 0.5),
-        ({"height": -40.0 + 2.0 * sigma}, 2.0),
-        ({"lat": start["lat"] + sigma / meridian}, 0.5),
-        ({"velocity_enu": mission.initial.velocity_enu + np.array([0.05, 0, 0])}, 0.5),
+        ({"roll": 0.201}, 0.5),
+        ({"pitch": -0.102}, 0.5),
+        ({"heading": 1.004}, 0.5),
+        ({"lon": lon + 0.1 / parallel}, 0.5),
+        ({"lat": lat - 0.2 / float(meridian)}, 0.5),
+        ({"height": -40.8}, 2.0),
+        ({"velocity_enu": start.velocity_enu + np.array([0.01, 0.0, 0.0])}, 0.5),
+        ({"velocity_enu": start.velocity_enu - np.array([0.0, 0.04, 0.0])}, 2.0),
     ):
-        at = GraphLinearizer(build_problem(with_initial(mission, **change)))
+        other = prior_graph(build_problem(with_initial(mission, **change)))
         values = gtsam.Values()
         for k in range(3):
-            factor = at.prior.at(k)
+            factor = other.at(k)
             assert isinstance(
                 factor,
                 gtsam.PriorFactorPose3 | gtsam.PriorFactorVector | gtsam.PriorFactorConstantBias,
             )
             values.insert(factor.keys()[0], factor.prior())
-        assert prior_graph(problem).error(values) == pytest.approx(half, rel=0.02, abs=1e-9)
+        assert prior.error(values) == pytest.approx(half_chi_sq, rel=0.01, abs=1e-9)
 
 
 def small_problem() -> tuple[Problem, States, Array]:

@@ -1,0 +1,40 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from ssm_graph.io.mission import TableFormat
+
+
+def add_command(commands: Any, name: str, *, summary: str, description: str, epilog: str) -> Any:
+    """Return the parser of a new command, its text kept line by line."""
+    return commands.add_parser(
+        name,
+        help=summary,
+        description=description,
+        epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
+def add_mission_output(parser: argparse.ArgumentParser) -> None:
+    """Add where and in which format a mission folder is written."""
+    parser.add_argument(
+        "--format",
+        type=_table_format,
+        choices=list(TableFormat),
+        default=TableFormat.CSV,
+        metavar="{" + ",".join(table.name.lower() for table in TableFormat) + "}",
+        help="format of the tables (default: csv)",
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="mission folder")
+
+
+def _table_format(word: str) -> TableFormat:
+    try:
+        return TableFormat[word.upper()]
+    except KeyError:
+        raise argparse.ArgumentTypeError(f"expected csv or parquet, got {word!r}") from None
