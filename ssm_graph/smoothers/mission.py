@@ -20,7 +20,7 @@ AMBIGUOUS_COST = 6.0
 ratio of about 400)."""
 SAME_HEADING = np.radians(5.0)
 """Headings closer than this, or than three of their sigmas, are one and the same."""
-POOR_HEADING = np.radians(5.0)
+POOR_HEADING = np.radians(3.0)
 """A heading with a larger posterior sigma at the start is said to be hardly observable."""
 
 OnStage = Callable[[str], None]
