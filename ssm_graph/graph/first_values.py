@@ -26,7 +26,6 @@ from ssm_graph.graph.states import (
     ROTATION,
     STATE_DIM,
     VELOCITY,
-    InitialMoments,
     States,
     initial_moments,
     states_from_arrays,
@@ -97,16 +96,16 @@ class _ForwardPass:
     def run(self) -> FirstValues:
         problem = self.problem
         rows = _RowsByKeyframe(problem)
-        history: list[InitialMoments] = []
+        history: list[tuple[Array, Array, Array, Array]] = []
         for k in range(problem.n_keyframes):
             if k > 0:
                 self._predict(k - 1)
             self._update_fix(rows.fix[k])
             self._update_depth(rows.depth[k], k)
             self._update_beams(rows.beam[k])
-            history.append(InitialMoments(self.R_nb, self.p_n, self.v_n, self.bias, self.P))
-        arrays = (np.array([getattr(h, name) for h in history]) for name in history[0]._fields[:4])
-        return FirstValues(states_from_arrays(*arrays), self.weights, self.n_doubts)
+            history.append((self.R_nb, self.p_n, self.v_n, self.bias))
+        R_nb, p_n, v_n, bias = (np.array(column) for column in zip(*history, strict=True))
+        return FirstValues(states_from_arrays(R_nb, p_n, v_n, bias), self.weights, self.n_doubts)
 
     def _predict(self, k: int) -> None:
         chain = self.problem.chain

@@ -10,7 +10,7 @@ from gtsam.symbol_shorthand import B, V, X
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from factors.dvl_beam import beam_residual
-from ssm_graph.data import N_BEAMS, Array
+from ssm_graph.data import Array
 from ssm_graph.earth import LocalFrame
 from ssm_graph.graph.keys import chain_ordering
 from ssm_graph.graph.problem import Beams, Depths, Fixes, Problem
@@ -71,7 +71,8 @@ class GraphLinearizer:
         k = problem.beams.keyframe
         self._first_beam = np.flatnonzero(np.diff(k, prepend=-1))
         self._n_rows = np.diff(np.append(self._first_beam, len(k)))
-        self._unit = [gtsam.noiseModel.Unit.Create(m + 1) for m in range(4 * N_BEAMS)]
+        largest = int(self._n_rows.max(initial=1))
+        self._unit = [gtsam.noiseModel.Unit.Create(m + 1) for m in range(largest)]
 
     def follow(self, states: States) -> None:
         """Let gravity and the depth targets follow the states; to be called before the others."""

@@ -128,7 +128,14 @@ class SsmSmoother:
             elif max(this.update_sigmas, this.weight_change) < self.config.tolerance:
                 status = Status.CONVERGED
                 break
-        return self._estimate(problem, linearizer, this, iterations, status, first.n_doubts, begin)
+        notes = problem.notes
+        if first.n_doubts:
+            notes += (
+                f"the first pass doubted its prediction {first.n_doubts} times: the beams "
+                "contradicted it together",
+            )
+        wall_s = time.perf_counter() - begin
+        return self._estimate(linearizer, this, tuple(iterations), status, notes, wall_s)
 
     def _iterate(
         self,
@@ -177,13 +184,12 @@ class SsmSmoother:
 
     def _estimate(
         self,
-        problem: Problem,
         linearizer: GraphLinearizer,
         last: _Pass,
-        iterations: list[Iteration],
+        iterations: tuple[Iteration, ...],
         status: Status,
-        n_doubts: int,
-        begin: float,
+        notes: tuple[str, ...],
+        wall_s: float,
     ) -> Estimate:
         reason = (
             f"{status.value}: last update {last.update_sigmas:.1e} sigma, largest weight change "
@@ -194,13 +200,7 @@ class SsmSmoother:
             status, reason = Status.SUSPECT, doubts
         elif doubts:
             reason += f"; {doubts}"
-        notes = problem.notes
-        if n_doubts:
-            notes += (
-                f"the first pass doubted its prediction {n_doubts} times: the beams contradicted "
-                "it together",
-            )
-        beams = problem.beams
+        problem, beams = linearizer.problem, linearizer.problem.beams
         return Estimate(
             method="smoother",
             kernel=str(self.config.kernel),
@@ -214,8 +214,8 @@ class SsmSmoother:
                 mahalanobis_sq=last.mahalanobis_sq,
                 weight=last.weights,
             ),
-            iterations=tuple(iterations),
-            wall_s=time.perf_counter() - begin,
+            iterations=iterations,
+            wall_s=wall_s,
             cost=self._cost(linearizer, last),
             start=problem.start,
             notes=notes,
