@@ -39,10 +39,11 @@ exit codes:
   1    a defect of this program
   2    a wrong option or setting, a missing extra
   3    the data of a mission cannot be used; the message says where and why
-  4    smooth ended with a result that must not be trusted blindly (iteration limit, or the data
-       contradict it); it is written all the same, and its status says so
+  4    smooth ended with a result that must not be trusted blindly (iteration limit, interrupted
+       after the first iteration, or the data contradict it); it is written all the same, and its
+       status says so
   5    smooth found no finite result; nothing is written
-  130  interrupted
+  130  interrupted, nothing written
 """
 
 EXIT_CODES: tuple[tuple[type[SsmGraphError], ExitCode], ...] = (

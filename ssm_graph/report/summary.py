@@ -18,6 +18,7 @@ from ssm_graph.evaluation import Metrics
 STATUS_STYLE: Final = {
     Status.CONVERGED: "bold green",
     Status.MAX_ITERATIONS: "bold yellow",
+    Status.INTERRUPTED: "bold yellow",
     Status.SUSPECT: "bold red",
     Status.DIVERGED: "bold white on red",
 }

@@ -103,6 +103,8 @@ class SsmSmoother:
     def solve(self, problem: Problem, *, on_iteration: OnIteration | None = None) -> Estimate:
         """Return the smoothed trajectory with the weight of every beam.
 
+        An interrupt from the keyboard ends the loop with what the last iteration found.
+
         Raises
         ------
         SolverError
@@ -117,7 +119,13 @@ class SsmSmoother:
         iterations: list[Iteration] = []
         status = Status.MAX_ITERATIONS
         for number in range(self.config.max_iterations):
-            this = self._iterate(linearizer, states, rows, weights, kernel)
+            try:
+                this = self._iterate(linearizer, states, rows, weights, kernel)
+            except KeyboardInterrupt:
+                if not iterations:
+                    raise
+                status = Status.INTERRUPTED
+                break
             states, rows, weights = this.states, this.beam_rows, this.weights
             iterations.append(Iteration(this.update_sigmas, this.weight_change, str(kernel)))
             if on_iteration is not None:

@@ -69,6 +69,8 @@ def smooth(
             f"{len(alignment.candidates)}: heading {np.degrees(start.heading):.0f} deg"
         )
         estimates.append(_try(smoother, replace(problem, start=start), on_iteration))
+        if estimates[-1] is not None and estimates[-1].status is Status.INTERRUPTED:
+            break
     chosen = _choose([estimate for estimate in estimates if estimate is not None], alignment)
     return _with_notes(chosen, (*mission.notes, f"aligned: {alignment.method}"))
 
