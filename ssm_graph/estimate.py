@@ -20,7 +20,7 @@ class Status(Enum):
     CONVERGED = "updates and weights settled"
     MAX_ITERATIONS = "iteration limit reached before updates and weights settled"
     INTERRUPTED = "interrupted before updates and weights settled"
-    SUSPECT = "settled, but the data contradict the answer or leave it ambiguous"
+    SUSPECT = "the data contradict the answer or leave it ambiguous"
     DIVERGED = "the solution became non-finite or ran away"
 
     @property

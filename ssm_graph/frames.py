@@ -39,7 +39,8 @@ def roll_pitch_heading_from_R_lb(R_lb: Array) -> tuple[Array, Array, Array]:
     roll = np.arctan2(R_ned_b[..., 2, 1], R_ned_b[..., 2, 2])
     pitch = np.arcsin(np.clip(-R_ned_b[..., 2, 0], -1.0, 1.0))
     heading = np.arctan2(R_ned_b[..., 1, 0], R_ned_b[..., 0, 0]) % (2.0 * np.pi)
-    return roll, pitch, heading
+    # A hair below north rounds to a full turn.
+    return roll, pitch, np.where(heading < 2.0 * np.pi, heading, 0.0)
 
 
 def phi_D_roll_pitch_heading(roll: Array | float, pitch: Array | float) -> Array:

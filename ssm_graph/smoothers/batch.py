@@ -203,11 +203,10 @@ class SsmSmoother:
             f"{status.value}: last update {last.update_sigmas:.1e} sigma, largest weight change "
             f"{last.weight_change:.1e}"
         )
-        doubts = "; ".join(contradictions(linearizer, last.states, last.beam_rows, last.weights))
-        if doubts and status is Status.CONVERGED:
-            status, reason = Status.SUSPECT, doubts
-        elif doubts:
-            reason += f"; {doubts}"
+        doubts = contradictions(linearizer, last.states, last.beam_rows, last.weights)
+        if doubts:
+            unsettled = [] if status is Status.CONVERGED else [reason]
+            status, reason = Status.SUSPECT, "; ".join(doubts + unsettled)
         problem, beams = linearizer.problem, linearizer.problem.beams
         return Estimate(
             method="smoother",
