@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
-from factors.dvl_beam import beam_error, beam_residual
+from factors.dvl_beam import dvl_beam_factor
 from ssm_graph.data import Array, ImuNoise, Mission
 from ssm_graph.earth import LocalFrame
 from ssm_graph.graph.linearize import prior_graph
@@ -58,40 +58,19 @@ def _add_inertial(graph: gtsam.NonlinearFactorGraph, mission: Mission, keyframe_
 def _add_beams(graph: gtsam.NonlinearFactorGraph, beams: Beams, omega_ie_n: Array) -> None:
     cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY_K)
     for i, k in enumerate(beams.keyframe.tolist()):
-        noise = gtsam.noiseModel.Robust.Create(
-            cauchy, gtsam.noiseModel.Isotropic.Sigma(1, beams.sigma[i])
+        factor = dvl_beam_factor(
+            X(k),
+            V(k),
+            B(k),
+            sigma=beams.sigma[i],
+            speed=beams.speed[i],
+            gyro_b=beams.gyro_b[i],
+            beam_b=beams.beam_b[i],
+            lever_arm_b=beams.lever_arm_b,
+            omega_ie_n=omega_ie_n,
+            loss=cauchy,
         )
-        graph.add(_beam_factor(k, beams, i, noise=noise, omega_ie_n=omega_ie_n))
-
-
-def _beam_factor(
-    k: int, beams: Beams, i: int, *, noise: gtsam.noiseModel.Base, omega_ie_n: Array
-) -> gtsam.CustomFactor:
-    """As ``factors.dvl_beam.dvl_beam_factor``, which takes no robust noise model."""
-    measured = {
-        "speed": beams.speed[i],
-        "gyro_b": beams.gyro_b[i],
-        "beam_b": beams.beam_b[i],
-        "lever_arm_b": beams.lever_arm_b,
-        "omega_ie_n": omega_ie_n,
-    }
-
-    def evaluate(
-        this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
-    ) -> Array:
-        keys = this.keys()
-        R_nb = values.atPose3(keys[0]).rotation().matrix()
-        v_n = values.atVector(keys[1])
-        gyro_bias = values.atConstantBias(keys[2]).gyroscope()
-        if jacobians is None:
-            return np.atleast_1d(beam_error(R_nb, v_n, gyro_bias, **measured))
-        residual = beam_residual(R_nb, v_n, gyro_bias, **measured)
-        jacobians[0] = np.hstack([residual.error_D_rotation, np.zeros(3)])[None, :]
-        jacobians[1] = residual.error_D_velocity_n[None, :].copy()
-        jacobians[2] = np.hstack([np.zeros(3), residual.error_D_gyro_bias])[None, :]
-        return np.atleast_1d(residual.error)
-
-    return gtsam.CustomFactor(noise, [X(k), V(k), B(k)], evaluate)
+        graph.add(factor)
 
 
 def _add_depth(graph: gtsam.NonlinearFactorGraph, mission: Mission, keyframe_s: Array) -> None:

@@ -3,6 +3,8 @@
 The factor stands for itself: no mission, no smoother, any graph of poses, velocities and biases.
 """
 
+from typing import Any
+
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
@@ -16,7 +18,11 @@ R_nb = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # heading
 true_v_n = np.array([0.0, 1.5, 0.0])
 measured = beams_b @ (R_nb.T @ true_v_n)
 measured[2] += 0.8  # a fish in beam 3
-setting = {"gyro_b": np.zeros(3), "lever_arm_b": np.zeros(3), "omega_ie_n": np.zeros(3)}
+setting: dict[str, Any] = {
+    "gyro_b": np.zeros(3),
+    "lever_arm_b": np.zeros(3),
+    "omega_ie_n": np.zeros(3),
+}
 sigma, kernel, weights = 0.005, LogKernel(dof=5), np.ones(4)
 
 for _ in range(20):

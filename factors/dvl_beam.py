@@ -118,6 +118,7 @@ def dvl_beam_factor(
     lever_arm_b: Array,
     omega_ie_n: Array,
     weight: float = 1.0,
+    loss: gtsam.noiseModel.mEstimator.Base | None = None,
 ) -> gtsam.CustomFactor:
     """Wrap :func:`beam_residual` as a factor on ``(Pose3, velocity, ConstantBias)``.
 
@@ -127,6 +128,7 @@ def dvl_beam_factor(
     sigma : nominal standard deviation of the speed, m/s.
     speed, gyro_b, beam_b, lever_arm_b, omega_ie_n : as in :func:`beam_residual`, for one beam.
     weight : similarity weight; the effective variance is ``sigma^2 / weight``.
+    loss : an M-estimator of GTSAM, for graphs whose optimiser shall do the reweighting.
 
     Raises
     ------
@@ -166,5 +168,7 @@ def dvl_beam_factor(
         jacobians[2] = np.hstack([np.zeros(3), residual.error_D_gyro_bias])[None, :]
         return np.atleast_1d(residual.error)
 
-    noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma / np.sqrt(weight))
+    noise: gtsam.noiseModel.Base = gtsam.noiseModel.Isotropic.Sigma(1, sigma / np.sqrt(weight))
+    if loss is not None:
+        noise = gtsam.noiseModel.Robust.Create(loss, noise)
     return gtsam.CustomFactor(noise, [pose, velocity, bias], evaluate)

@@ -29,7 +29,7 @@ pytestmark = pytest.mark.skipif(not RUNS.is_dir(), reason=f"no real logs in {RUN
 def test_surface_runs(name: str, until_s: float, largest_rms: float) -> None:
     """Converged, heading found, error below the draft's.
 
-    The 3-sigma bounds hold less than they should (73 to 99 % of the epochs): the DVL of these runs
+    The 3-sigma bounds hold in 73 to 100 % of the epochs of an axis only: the DVL of these runs
     reads 2 to 7 % high, and its scale is taken as exact.
     """
     mission, withheld = withhold_gnss(convert_blueye(RUNS / f"{name}.mcap"), until_s)

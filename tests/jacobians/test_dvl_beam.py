@@ -300,3 +300,22 @@ def test_agrees_with_the_simulators_own_beam_speeds(route: Route) -> None:
         omega_ie_n=problem.frame.omega_ie_n,
     )
     assert np.abs(error).max() < 1e-12
+
+
+def test_a_loss_of_gtsam_goes_around_the_noise() -> None:
+    """With Cauchy the cost of a residual of r sigmas is ``k^2/2 ln(1 + r^2/k^2)``."""
+    setting: dict[str, Any] = {
+        "gyro_b": np.zeros(3),
+        "beam_b": np.array([0.0, 0.0, 1.0]),
+        "lever_arm_b": np.zeros(3),
+        "omega_ie_n": np.zeros(3),
+    }
+    k, sigma = 2.0, 0.1
+    loss = gtsam.noiseModel.mEstimator.Cauchy.Create(k)
+    factor = dvl_beam_factor(X(0), V(0), B(0), sigma=sigma, speed=0.5, loss=loss, **setting)
+    values = gtsam.Values()
+    values.insert(X(0), gtsam.Pose3())
+    values.insert(V(0), np.zeros(3))
+    values.insert(B(0), gtsam.imuBias.ConstantBias())
+    expected = 0.5 * k**2 * np.log1p((0.5 / sigma) ** 2 / k**2)
+    assert factor.error(values) == pytest.approx(expected)
