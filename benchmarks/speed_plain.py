@@ -13,6 +13,7 @@ from ssm_graph.data import Array, ImuNoise, Mission
 from ssm_graph.earth import LocalFrame
 from ssm_graph.graph.linearize import prior_graph
 from ssm_graph.graph.problem import Beams, Problem
+from ssm_graph.graph.states import initial_moments
 
 CAUCHY_K = 2.3849
 """The usual constant: 95 % efficiency without outliers."""
@@ -28,6 +29,24 @@ def plain_graph(mission: Mission, problem: Problem) -> gtsam.NonlinearFactorGrap
     _add_beams(graph, problem.beams, problem.frame.omega_ie_n)
     _add_depth(graph, mission, problem.keyframe_s)
     return graph
+
+
+def dead_reckoned(graph: gtsam.NonlinearFactorGraph, problem: Problem) -> gtsam.Values:
+    """Return first values by the inertial prediction alone, from the initial state."""
+    start = initial_moments(problem.start, problem.frame, bias_sigma=problem.imu_noise_bias_sigma)
+    state = gtsam.NavState(gtsam.Pose3(gtsam.Rot3(start.R_nb), start.p_n), start.v_n)
+    bias = gtsam.imuBias.ConstantBias()
+    states = [state]
+    for i in range(graph.size()):
+        factor = graph.at(i)
+        if isinstance(factor, gtsam.CombinedImuFactor):
+            states.append(factor.preintegratedMeasurements().predict(states[-1], bias))
+    values = gtsam.Values()
+    for k, state in enumerate(states):
+        values.insert(X(k), state.pose())
+        values.insert(V(k), state.velocity())
+        values.insert(B(k), bias)
+    return values
 
 
 def _params(noise: ImuNoise, frame: LocalFrame) -> gtsam.PreintegrationCombinedParams:

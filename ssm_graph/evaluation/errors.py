@@ -72,6 +72,9 @@ def error_series(trajectory: Trajectory, reference: Reference) -> ErrorSeries:
         raise DataError(_no_overlap(time_s, reference.time_s[known]))
     difference_n = p_n[kept] - p_reference_n[kept]
     position_enu = np.einsum("nij,ni->nj", frame.R_nl_at(p_reference_n[kept]), difference_n)
+    # Up is a difference of heights: the Earth curves away from a chord by 8 cm in a kilometre.
+    height = frame.geodetic_from_p_n(p_reference_n[kept])[2]
+    position_enu[:, 2] = trajectory.height[kept] - height
     velocity, angles = _at(time_s, reference)
     cov = trajectory.position_cov_enu[kept]
     return ErrorSeries(

@@ -34,10 +34,10 @@ from ssm_graph.imu.preintegration import gtsam_gravity
 
 GATE = 5.0
 """Beams further than this many innovation sigmas from the prediction start without weight."""
-LOCKED_OUT_PINGS = 5
-"""After so many pings in a row without one good beam, the prediction is doubted instead."""
-DOUBT_VELOCITY = 1.0
-"""m/s, how far a doubted prediction may be off."""
+LOCKED_OUT_PINGS = 3
+"""After so many pings in a row without one good beam the prediction is doubted instead."""
+ANCHOR_SIGMA = 1.0
+"""m/s; after a silence that leaves the beams this uncertain they set the velocity anew."""
 WEIGHT_ROUNDS = 10
 GRAVITY_REACH = 20.0
 """m, how far gravity is carried linearly before it is evaluated anew."""
@@ -183,16 +183,29 @@ class _ForwardPass:
         innovation = -error
         variance = self.problem.beams.sigma[rows] ** 2
         predicted = H @ self.P @ H.T
+        if np.max(np.diag(predicted)) > ANCHOR_SIGMA**2:
+            predicted = self._forget_velocity(H, innovation, predicted)
         weights = _settle_weights(innovation, predicted, variance, self.kernel)
         self.without_beam = self.without_beam + 1 if np.all(weights < 0.01) else 0
         if self.without_beam >= LOCKED_OUT_PINGS:
             self.n_doubts += 1
             self.without_beam = 0
-            self.P[VELOCITY, VELOCITY] += DOUBT_VELOCITY**2 * np.eye(3)
-            predicted = H @ self.P @ H.T
+            predicted = self._forget_velocity(H, innovation, predicted)
             weights = _settle_weights(innovation, predicted, variance, self.kernel)
         self.weights[rows] = weights
         self._correct(H, innovation, predicted + np.diag(variance / weights))
+
+    def _forget_velocity(self, H: Array, innovation: Array, predicted: Array) -> Array:
+        """Let the beams alone set the velocity; return the predicted covariance of the beams.
+
+        A prediction this poor is not linear any more: a filter that corrected the attitude by it
+        would ruin the attitude.
+        """
+        self.P[VELOCITY, :] = 0.0
+        self.P[:, VELOCITY] = 0.0
+        variance = max(np.max(innovation**2), np.max(np.diag(predicted)))
+        self.P[VELOCITY, VELOCITY] = variance * np.eye(3)
+        return np.asarray(H @ self.P @ H.T)
 
     def _correct(self, H: Array, innovation: Array, innovation_cov: Array) -> None:
         PHt = self.P @ H.T

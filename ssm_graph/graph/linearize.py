@@ -182,7 +182,7 @@ def gnss_graph(fixes: Fixes | None) -> gtsam.NonlinearFactorGraph:
 def depth_graph(
     depths: Depths, states: States, frame: LocalFrame, keyframe_s: Array
 ) -> gtsam.NonlinearFactorGraph:
-    """Return depth as GTSAM position factors that count along the vertical only.
+    """Return depth as GTSAM position factors that count along the local vertical only.
 
     Two things make the target depend on the states, and both change little between iterations:
     the ellipsoid curves away from the frame's horizontal plane, and a reading between keyframes is
@@ -197,17 +197,11 @@ def depth_graph(
     count = np.bincount(depths.keyframe, minlength=len(keyframe_s))
     total = np.bincount(depths.keyframe, weights=too_low, minlength=len(keyframe_s))
     mean = total / np.maximum(count, 1)
-    target_n = sensor_n + np.array([0.0, 0.0, 1.0]) * mean[:, None]
-    noise = {
-        n: gtsam.noiseModel.Diagonal.Precisions(np.array([0.0, 0.0, n / depths.sigma**2]))
-        for n in np.unique(count).tolist()
-        if n > 0
-    }
+    target_n = sensor_n + up_n * mean[:, None]
+    root_information = np.zeros((len(count), 3, 3))
+    root_information[:, 0] = up_n * (np.sqrt(count) / depths.sigma)[:, None]
     graph = gtsam.NonlinearFactorGraph()
-    for k_used in np.flatnonzero(count).tolist():
-        graph.add(
-            gtsam.GPSFactorArm(
-                X(k_used), target_n[k_used], depths.lever_arm_b, noise[int(count[k_used])]
-            )
-        )
+    for k in np.flatnonzero(count).tolist():
+        noise = gtsam.noiseModel.Gaussian.SqrtInformation(root_information[k], False)
+        graph.add(gtsam.GPSFactorArm(X(k), target_n[k], depths.lever_arm_b, noise))
     return graph

@@ -11,6 +11,8 @@ from ssm_graph.graph.linearize import BeamRows, GraphLinearizer
 from ssm_graph.graph.problem import Problem
 from ssm_graph.graph.states import States
 
+LARGEST_SPEED = 50.0
+"""m/s"""
 LOW_WEIGHT = 0.1
 TRUSTED = 0.5
 """Beams of at least this weight are believed."""
@@ -29,6 +31,7 @@ def contradictions(
 ) -> list[str]:
     """Compare every kind of measurement with the answer; say in a sentence each what disagrees."""
     doubts = [
+        _doubt_speed(states),
         _doubt_beams(weights),
         _doubt_residuals((beam_rows.error / linearizer.problem.beams.sigma)[weights >= TRUSTED]),
         _doubt_stretches(linearizer.problem, weights),
@@ -43,6 +46,16 @@ def contradictions(
         ),
     ]
     return [doubt for doubt in doubts if doubt]
+
+
+def _doubt_speed(states: States) -> str:
+    largest = float(np.max(np.linalg.norm(states.v_n, axis=1)))
+    if largest <= LARGEST_SPEED:
+        return ""
+    return (
+        f"a speed of {largest:.0f} m/s, more than any underwater vehicle's: look for a long silence "
+        "of the DVL, and at the inertial data there"
+    )
 
 
 def _doubt_beams(weights: Array) -> str:

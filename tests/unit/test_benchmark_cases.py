@@ -9,7 +9,14 @@ import pytest
 
 import benchmarks.monte_carlo as monte_carlo
 from benchmarks.speed import FLOOR, OURS, PLAIN, comparison_lines, lengths_lines, verdict
-from benchmarks.speed_tasks import Timing, time_floor, time_ours, time_plain, write_mission
+from benchmarks.speed_tasks import (
+    PlainStart,
+    Timing,
+    time_floor,
+    time_ours,
+    time_plain,
+    write_mission,
+)
 from benchmarks.study_cases import CASES, DEFAULT_METHODS, case_config, parse_method
 from benchmarks.study_runs import Job, beam_truth, do_job
 from factors.similarity import ExpKernel, LogKernel, SqrtKernel
@@ -117,6 +124,8 @@ def test_speed_times_all_three(tmp_path: Path) -> None:
     assert SsmSmoother.solve is solve
     assert ours.n_keyframes == plain.n_keyframes == 13
     assert floor.n_iterations == 3
+    settled = time_plain(path, PlainStart.DEAD_RECKONING, 1e-9)
+    assert settled.rms_horizontal_m == pytest.approx(plain.rms_horizontal_m, abs=0.01)
     assert all(seconds >= 0.0 for seconds in ours.parts.values())
     assert abs(ours.rms_horizontal_m - plain.rms_horizontal_m) < 0.5
     lines = "\n".join(comparison_lines(0.2, {OURS: ours, FLOOR: floor, PLAIN: plain}))
