@@ -38,10 +38,27 @@ def beam_error(
     omega_ie_n: Array,
 ) -> Array:
     """Return predicted minus measured speed along DVL beams, m/s; see :func:`beam_residual`."""
+    return _predict(
+        R_nb, v_n, gyro_b - gyro_bias, speed, beam_b, cross(lever_arm_b, beam_b), omega_ie_n
+    )[0]
+
+
+def _predict(
+    R_nb: Array,
+    v_n: Array,
+    omega_ib_b: Array,
+    speed: Array,
+    beam_b: Array,
+    arm_b: Array,
+    omega_ie_n: Array,
+) -> tuple[Array, Array, Array]:
+    """Return the error, and velocity and Earth rate in body axes.
+
+    ``beam . (rate x lever) = (lever x beam) . rate``, and ``arm_b`` is that ``lever x beam``.
+    """
     v_b, omega_ie_b = _to_body(R_nb, v_n), _to_body(R_nb, omega_ie_n)
-    omega_eb_b = gyro_b - gyro_bias - omega_ie_b
-    v_instrument_b = v_b + cross(omega_eb_b, lever_arm_b)
-    return np.asarray(np.sum(beam_b * v_instrument_b, axis=-1) - speed)
+    error = (beam_b * v_b + arm_b * (omega_ib_b - omega_ie_b)).sum(axis=-1) - speed
+    return np.asarray(error), v_b, omega_ie_b
 
 
 def beam_residual(
@@ -79,31 +96,22 @@ def beam_residual(
     .. [1] Xu et al., "Combined navigation robust filtering method based on statistical similarity
        measurement", 2021, eqs. (19) to (22), there for all four beams at once.
     """
-    error = beam_error(
-        R_nb,
-        v_n,
-        gyro_bias,
-        speed=speed,
-        gyro_b=gyro_b,
-        beam_b=beam_b,
-        lever_arm_b=lever_arm_b,
-        omega_ie_n=omega_ie_n,
+    arm_b = cross(lever_arm_b, beam_b)
+    error, v_b, omega_ie_b = _predict(
+        R_nb, v_n, gyro_b - gyro_bias, speed, beam_b, arm_b, omega_ie_n
     )
-    v_b, omega_ie_b = _to_body(R_nb, v_n), _to_body(R_nb, omega_ie_n)
-    # beam . (a x lever) = (lever x beam) . a, for any rate a
-    arm = cross(lever_arm_b, beam_b)
     shape = (*np.shape(error), 3)
     return BeamResidual(
         error=error,
-        error_D_rotation=np.asarray(cross(beam_b, v_b) - cross(arm, omega_ie_b)),
+        error_D_rotation=cross(beam_b, v_b) - cross(arm_b, omega_ie_b),
         error_D_velocity_n=np.broadcast_to((R_nb @ beam_b[..., None])[..., 0], shape),
-        error_D_gyro_bias=np.broadcast_to(-arm, shape),
+        error_D_gyro_bias=np.broadcast_to(-arm_b, shape),
     )
 
 
 def _to_body(R_nb: Array, vector_n: Array) -> Array:
     """Return ``R_nb' vector_n`` with broadcasting."""
-    return np.asarray(np.einsum("...ij,...i->...j", R_nb, vector_n))
+    return np.asarray((vector_n[..., None, :] @ R_nb)[..., 0, :])
 
 
 def dvl_beam_factor(
@@ -135,22 +143,12 @@ def dvl_beam_factor(
     ValueError
         If a number is not finite, or ``sigma`` or ``weight`` is not above zero.
     """
-    vectors = {
-        "gyro_b": gyro_b,
-        "beam_b": beam_b,
-        "lever_arm_b": lever_arm_b,
-        "omega_ie_n": omega_ie_n,
-    }
-    frozen = {name: np.array(value, dtype=float) for name, value in vectors.items()}
-    for name, value in frozen.items():
-        if value.shape != (3,) or not np.all(np.isfinite(value)):
-            raise ValueError(f"dvl_beam_factor: {name}: expected 3 finite numbers, got {value}")
-    if not (np.isfinite(speed) and 0.0 < sigma < np.inf and 0.0 < weight < np.inf):
-        raise ValueError(
-            "dvl_beam_factor: expected a finite speed and sigma and weight above zero, got "
-            f"speed {speed}, sigma {sigma}, weight {weight}"
-        )
-    measured: dict[str, Any] = {"speed": np.float64(speed), **frozen}
+    measured = _checked(
+        {"gyro_b": gyro_b, "beam_b": beam_b, "lever_arm_b": lever_arm_b, "omega_ie_n": omega_ie_n},
+        speed=speed,
+        sigma=sigma,
+        weight=weight,
+    )
 
     def evaluate(
         this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
@@ -172,3 +170,19 @@ def dvl_beam_factor(
     if loss is not None:
         noise = gtsam.noiseModel.Robust.Create(loss, noise)
     return gtsam.CustomFactor(noise, [pose, velocity, bias], evaluate)
+
+
+def _checked(
+    vectors: dict[str, Array], *, speed: float, sigma: float, weight: float
+) -> dict[str, Any]:
+    """Return copies of what a factor measures, or raise: a wrong shape would crash the process."""
+    frozen = {name: np.array(value, dtype=float) for name, value in vectors.items()}
+    for name, value in frozen.items():
+        if value.shape != (3,) or not np.all(np.isfinite(value)):
+            raise ValueError(f"dvl_beam_factor: {name}: expected 3 finite numbers, got {value}")
+    if not (np.isfinite(speed) and 0.0 < sigma < np.inf and 0.0 < weight < np.inf):
+        raise ValueError(
+            "dvl_beam_factor: expected a finite speed and sigma and weight above zero, got "
+            f"speed {speed}, sigma {sigma}, weight {weight}"
+        )
+    return {"speed": np.float64(speed), **frozen}

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -73,6 +74,20 @@ def first_values(
 _HINT = "check units, axes and noise of [imu], and the initial state with its sigmas"
 
 
+class _Rows(NamedTuple):
+    """Measurements of one keyframe, linearised."""
+
+    H: Array
+    """(m, 15)"""
+    innovation: Array
+    """(m,) measured minus predicted"""
+    variance: Array
+    """(m,)"""
+
+
+_NO_ROWS = _Rows(np.zeros((0, STATE_DIM)), np.zeros(0), np.zeros(0))
+
+
 class _ForwardPass:
     """A filter on the same inertial factors as the graph, in covariance form."""
 
@@ -101,8 +116,7 @@ class _ForwardPass:
             if k > 0:
                 self._predict(k - 1)
             self._update_fix(rows.fix[k])
-            self._update_depth(rows.depth[k], k)
-            self._update_beams(rows.beam[k])
+            self._update_water(rows.beam[k], self._depth_row(rows.depth[k], k))
             history.append((self.R_nb, self.p_n, self.v_n, self.bias))
         R_nb, p_n, v_n, bias = (np.array(column) for column in zip(*history, strict=True))
         return FirstValues(states_from_arrays(R_nb, p_n, v_n, bias), self.weights, self.n_doubts)
@@ -150,28 +164,32 @@ class _ForwardPass:
             innovation = fixes.position_n[i] - self.p_n - self.R_nb @ fixes.lever_arm_b
             self._correct(H, innovation, H @ self.P @ H.T + fixes.covariance_n[i])
 
-    def _update_depth(self, rows: range, k: int) -> None:
+    def _depth_row(self, rows: range, k: int) -> _Rows:
         depths = self.problem.depths
         if depths is None or len(rows) == 0:
-            return
+            return _NO_ROWS
         i = rows[len(rows) // 2]
         late = self.problem.keyframe_s[k] - depths.time_s[i]
-        sensor_n = self.p_n + self.R_nb @ depths.lever_arm_b
-        height = (
-            sensor_n[2]
-            + self.problem.frame.height
-            + (sensor_n[0] ** 2 + sensor_n[1] ** 2) / (2.0 * SEMI_MAJOR_AXIS)
-        )
+        x, y, z = self.p_n + self.R_nb @ depths.lever_arm_b
+        height = z + self.problem.frame.height + (x * x + y * y) / (2.0 * SEMI_MAJOR_AXIS)
         H = np.zeros((1, STATE_DIM))
         H[0, ROTATION] = cross(depths.lever_arm_b, self.R_nb[2])
         H[0, POSITION] = self.R_nb[2]
         innovation = -depths.depth[i] + late * self.v_n[2] - height
         variance = depths.sigma**2 + late**2 * (self.P[8, 8] + 1e-2)
-        self._correct(H, np.atleast_1d(innovation), H @ self.P @ H.T + variance)
+        return _Rows(H, np.array([innovation]), np.array([variance]))
 
-    def _update_beams(self, rows: slice) -> None:
-        if rows.start == rows.stop:
-            return
+    def _update_water(self, rows: slice, depth: _Rows) -> None:
+        """Correct by the beams of one ping and a depth, together."""
+        beams = self._beam_rows(rows) if rows.start < rows.stop else _NO_ROWS
+        H, innovation, variance = (np.concatenate(pair) for pair in zip(beams, depth, strict=True))
+        if len(H):
+            S = H @ self.P @ H.T
+            S.flat[:: len(S) + 1] += variance
+            self._correct(H, innovation, S)
+
+    def _beam_rows(self, rows: slice) -> _Rows:
+        """Return the beams of one ping with the variances that their weights give them."""
         error, H = linearize_beams(
             self.problem.beams,
             rows=rows,
@@ -183,7 +201,7 @@ class _ForwardPass:
         innovation = -error
         variance = self.problem.beams.sigma[rows] ** 2
         predicted = H @ self.P @ H.T
-        if np.max(np.diag(predicted)) > ANCHOR_SIGMA**2:
+        if predicted.diagonal().max() > ANCHOR_SIGMA**2:
             predicted = self._forget_velocity(H, innovation, predicted)
         weights = _settle_weights(innovation, predicted, variance, self.kernel)
         self.without_beam = self.without_beam + 1 if np.all(weights < 0.01) else 0
@@ -193,7 +211,7 @@ class _ForwardPass:
             predicted = self._forget_velocity(H, innovation, predicted)
             weights = _settle_weights(innovation, predicted, variance, self.kernel)
         self.weights[rows] = weights
-        self._correct(H, innovation, predicted + np.diag(variance / weights))
+        return _Rows(H, innovation, variance / weights)
 
     def _forget_velocity(self, H: Array, innovation: Array, predicted: Array) -> Array:
         """Let the beams alone set the velocity; return the predicted covariance of the beams.
@@ -230,15 +248,17 @@ def _settle_weights(innovation: Array, predicted: Array, variance: Array, kernel
     The posterior of the innovation needs no state: with ``S = H P H' + R / weight`` it has mean
     ``R / weight S^-1 innovation`` and covariance ``H P H' - H P H' S^-1 H P H'``.
     """
-    distance_sq = innovation**2 / (np.diag(predicted) + variance)
-    weights = np.where(distance_sq < GATE**2, 1.0, WEIGHT_FLOOR)
+    sigma, spread = np.sqrt(variance), predicted.diagonal()
+    weights = np.where(innovation**2 < GATE**2 * (spread + variance), 1.0, WEIGHT_FLOOR)
     for _ in range(WEIGHT_ROUNDS):
-        S_inv = np.linalg.inv(predicted + np.diag(variance / weights))
-        left = innovation - predicted @ S_inv @ innovation
-        spread = np.diag(predicted - predicted @ S_inv @ predicted)
-        t = expected_mahalanobis_sq(left, np.maximum(spread, 0.0), sigma=np.sqrt(variance))
+        S = predicted.copy()
+        S.flat[:: len(S) + 1] += variance / weights
+        gain = predicted @ np.linalg.inv(S)
+        left = innovation - gain @ innovation
+        left_variance = spread - (gain * predicted).sum(axis=1)
+        t = expected_mahalanobis_sq(left, np.maximum(left_variance, 0.0), sigma=sigma)
         settled = kernel.weight(t)
-        if np.max(np.abs(settled - weights)) < 1e-2:
+        if np.abs(settled - weights).max() < 1e-2:
             return settled
         weights = settled
     return weights

@@ -53,8 +53,8 @@ def _doubt_speed(states: States) -> str:
     if largest <= LARGEST_SPEED:
         return ""
     return (
-        f"a speed of {largest:.0f} m/s, more than any underwater vehicle's: look for a long silence "
-        "of the DVL, and at the inertial data there"
+        f"a speed of {largest:.0f} m/s, more than any underwater vehicle's: look for a long "
+        "silence of the DVL, and at the inertial data there"
     )
 
 

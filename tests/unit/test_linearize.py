@@ -110,12 +110,13 @@ def test_depth_counts_the_height_error_and_its_readings() -> None:
     np.testing.assert_allclose(costs, expected, rtol=2e-4)
 
 
-def test_depth_says_nothing_of_east_and_north() -> None:
-    """GTSAM's position factor is used for its third row alone."""
+def test_depth_says_nothing_of_the_local_level() -> None:
+    """GTSAM's position factor is used along the vertical at the vehicle alone."""
     _, problem, truth = far_transit(depth_hz=1.0)
     assert problem.depths is not None
     graph = depth_graph(problem.depths, truth, problem.frame, problem.keyframe_s)
-    shifted = truth.p_n + np.array([5.0, -9.0, 0.0])
+    level = np.array([5.0, -9.0, 0.0])
+    shifted = truth.p_n + problem.frame.R_nl_at(truth.p_n) @ level
     aside = states_from_arrays(truth.R_nb, shifted, truth.v_n, truth.bias)
     assert graph.error(aside.values) < 1e-9
 
