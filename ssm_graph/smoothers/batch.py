@@ -11,7 +11,7 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
-from factors.similarity import Kernel, LogKernel, expected_mahalanobis_sq
+from factors.similarity import WEIGHT_FLOOR, Kernel, LogKernel, expected_mahalanobis_sq
 from ssm_graph.data import Array
 from ssm_graph.errors import ConfigError, SolverError
 from ssm_graph.estimate import BeamTable, Estimate, Iteration, Status
@@ -94,6 +94,35 @@ def _descend(
     return states, linearizer.beam_rows(states), update / scale
 
 
+class _Mixing:
+    """Anderson acceleration of depth one for the fixed point of the weights.
+
+    Plain reweighting closes in by a constant factor a pass; two passes tell the factor, and the
+    rest of the way is taken at once. The fixed point stays what it is.
+
+    References
+    ----------
+    .. [1] H. F. Walker, P. Ni, "Anderson Acceleration for Fixed-Point Iterations", SIAM Journal on
+       Numerical Analysis 49, 2011.
+    """
+
+    def __init__(self) -> None:
+        self._last: tuple[Array, Array] | None = None
+
+    def next_weights(self, used: Array, settled: Array) -> Array:
+        """Return the weights to try next, from those used and those they led to."""
+        change = settled - used
+        last, self._last = self._last, (change, settled)
+        if last is None:
+            return settled
+        turn = change - last[0]
+        length_sq = float(turn @ turn)
+        if length_sq < 1e-16:
+            return settled
+        mixed = settled - float(change @ turn) / length_sq * (settled - last[1])
+        return np.asarray(np.clip(mixed, WEIGHT_FLOOR, max(1.0, 2.0 * float(settled.max()))))
+
+
 class SsmSmoother:
     """Smooth a whole mission; see :func:`ssm_graph.build_problem` for its input."""
 
@@ -118,6 +147,7 @@ class SsmSmoother:
         kernel: Kernel = WARM_KERNEL
         iterations: list[Iteration] = []
         status = Status.MAX_ITERATIONS
+        mixing = _Mixing()
         for number in range(self.config.max_iterations):
             try:
                 this = self._iterate(linearizer, states, rows, weights, kernel)
@@ -126,13 +156,15 @@ class SsmSmoother:
                     raise
                 status = Status.INTERRUPTED
                 break
-            states, rows, weights = this.states, this.beam_rows, this.weights
+            is_near = this.update_sigmas < WARM_UPDATE_SIGMAS
+            weights = mixing.next_weights(weights, this.weights) if is_near else this.weights
+            states, rows = this.states, this.beam_rows
             iterations.append(Iteration(this.update_sigmas, this.weight_change, str(kernel)))
             if on_iteration is not None:
                 on_iteration(number + 1, self.config.max_iterations, iterations[-1])
             if kernel != self.config.kernel:
-                if this.update_sigmas < WARM_UPDATE_SIGMAS:
-                    kernel = self.config.kernel
+                if is_near:
+                    kernel, mixing = self.config.kernel, _Mixing()
             elif max(this.update_sigmas, this.weight_change) < self.config.tolerance:
                 status = Status.CONVERGED
                 break
