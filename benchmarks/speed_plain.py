@@ -12,8 +12,8 @@ from factors.dvl_beam import dvl_beam_factor
 from ssm_graph.data import Array, ImuNoise, Mission
 from ssm_graph.earth import LocalFrame
 from ssm_graph.graph.linearize import prior_graph
-from ssm_graph.graph.problem import Beams, Problem
-from ssm_graph.graph.states import initial_moments
+from ssm_graph.problem.error_state import initial_moments
+from ssm_graph.problem.problem import Beams, Problem
 
 CAUCHY_K = 2.3849
 """The usual constant: 95 % efficiency without outliers."""

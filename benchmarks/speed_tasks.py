@@ -26,7 +26,7 @@ from factors.similarity import LogKernel
 from ssm_graph.data import Array, Mission
 from ssm_graph.graph.first_values import first_values
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.graph.problem import Problem, build_problem
+from ssm_graph.problem.problem import Problem, build_problem
 from ssm_graph.simulation import Grade, OutlierKind, Outliers, scenario_config, simulate
 
 

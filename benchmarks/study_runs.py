@@ -15,7 +15,7 @@ from ssm_graph.data import Array
 from ssm_graph.errors import SolverError
 from ssm_graph.estimate import Estimate
 from ssm_graph.evaluation import evaluate
-from ssm_graph.graph.problem import Problem, build_problem
+from ssm_graph.problem.problem import Problem, build_problem
 from ssm_graph.simulation import Grade, SimulatedMission, simulate
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
 

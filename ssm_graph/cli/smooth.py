@@ -16,9 +16,9 @@ from ssm_graph.data import GnssLog, Mission, Reference
 from ssm_graph.errors import ConfigError, DataError
 from ssm_graph.estimate import Estimate
 from ssm_graph.evaluation import Metrics, evaluate, reference_from_gnss
-from ssm_graph.graph.problem import ProblemConfig
 from ssm_graph.io.mission import read_mission
 from ssm_graph.io.results import write_results
+from ssm_graph.problem.problem import ProblemConfig
 from ssm_graph.report.figure import save_figure
 from ssm_graph.report.progress import ProgressDisplay
 from ssm_graph.report.summary import summary_table

@@ -1,1 +1,1 @@
-"""The factor graph of a mission: alignment, first values, linearisation, marginals."""
+"""The factor graph of a mission: first values, linearisation, elimination, marginals."""

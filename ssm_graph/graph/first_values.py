@@ -21,17 +21,10 @@ from ssm_graph.data import Array
 from ssm_graph.earth import SEMI_MAJOR_AXIS
 from ssm_graph.errors import SolverError
 from ssm_graph.graph.linearize import inertial_graph, linearize_beams
-from ssm_graph.graph.problem import Problem
-from ssm_graph.graph.states import (
-    POSITION,
-    ROTATION,
-    STATE_DIM,
-    VELOCITY,
-    States,
-    initial_moments,
-    states_from_arrays,
-)
+from ssm_graph.graph.states import States, states_from_arrays
 from ssm_graph.imu.preintegration import gtsam_gravity
+from ssm_graph.problem.error_state import POSITION, ROTATION, STATE_DIM, VELOCITY, initial_moments
+from ssm_graph.problem.problem import Problem
 
 GATE = 5.0
 """Beams further than this many innovation sigmas from the prediction start without weight."""

@@ -13,15 +13,9 @@ from factors.dvl_beam import beam_residual
 from ssm_graph.data import Array
 from ssm_graph.earth import LocalFrame
 from ssm_graph.graph.keys import chain_ordering
-from ssm_graph.graph.problem import Beams, Depths, Fixes, Problem
-from ssm_graph.graph.states import (
-    GYRO_BIAS,
-    ROTATION,
-    STATE_DIM,
-    VELOCITY,
-    States,
-    initial_moments,
-)
+from ssm_graph.graph.states import States
+from ssm_graph.problem.error_state import GYRO_BIAS, ROTATION, STATE_DIM, VELOCITY, initial_moments
+from ssm_graph.problem.problem import Beams, Depths, Fixes, Problem
 
 
 class BeamRows(NamedTuple):

@@ -13,7 +13,7 @@ import numpy as np
 
 from ssm_graph.data import Array
 from ssm_graph.errors import SolverError
-from ssm_graph.graph.states import STATE_DIM
+from ssm_graph.problem.error_state import STATE_DIM
 
 # Separators come in key order (b, v, x); the error state is (x, v, b).
 _SEPARATOR_ORDER = np.r_[9:15, 6:9, 0:6]

@@ -17,10 +17,10 @@ from ssm_graph.errors import ConfigError, SolverError
 from ssm_graph.estimate import BeamTable, Estimate, Iteration, Status
 from ssm_graph.graph.first_values import first_values
 from ssm_graph.graph.linearize import BeamRows, GraphLinearizer
-from ssm_graph.graph.problem import Problem
 from ssm_graph.graph.solve import marginal_covariances, solve_linear
 from ssm_graph.graph.states import States, retract
-from ssm_graph.graph.trajectory import trajectory_from_states
+from ssm_graph.problem.problem import Problem
+from ssm_graph.problem.trajectory import trajectory_from_states
 from ssm_graph.smoothers.verdict import contradictions
 
 OnIteration = Callable[[int, int, Iteration], None]

@@ -11,8 +11,8 @@ from ssm_graph.data import Mission
 from ssm_graph.errors import SolverError
 from ssm_graph.estimate import Estimate, Status
 from ssm_graph.frames import wrap_to_pi
-from ssm_graph.graph.alignment import Alignment, align
-from ssm_graph.graph.problem import Problem, ProblemConfig, build_problem
+from ssm_graph.problem.alignment import Alignment, align
+from ssm_graph.problem.problem import Problem, ProblemConfig, build_problem
 from ssm_graph.smoothers.batch import OnIteration, SmootherConfig, SsmSmoother
 
 AMBIGUOUS_COST = 6.0

@@ -8,8 +8,8 @@ from scipy.stats import chi2
 
 from ssm_graph.data import Array
 from ssm_graph.graph.linearize import BeamRows, GraphLinearizer
-from ssm_graph.graph.problem import Problem
 from ssm_graph.graph.states import States
+from ssm_graph.problem.problem import Problem
 
 LARGEST_SPEED = 50.0
 """m/s"""

@@ -11,9 +11,10 @@ from factors.similarity import ExpKernel, GaussianKernel, Kernel, LogKernel, Sqr
 from ssm_graph.data import Array
 from ssm_graph.estimate import Estimate, Status
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.graph.problem import Problem, build_problem
 from ssm_graph.graph.solve import marginal_covariances, solve_linear
-from ssm_graph.graph.states import STATE_DIM, States
+from ssm_graph.graph.states import States
+from ssm_graph.problem.error_state import STATE_DIM
+from ssm_graph.problem.problem import Problem, build_problem
 from ssm_graph.simulation import Fault, Grade, Loss, OutlierKind, Outliers, SimulatedMission
 from ssm_graph.smoothers.batch import Similarity, SmootherConfig, SsmSmoother
 from tests.helpers import (

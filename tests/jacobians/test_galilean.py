@@ -8,8 +8,8 @@ import pytest
 
 from ssm_graph.data import Array
 from ssm_graph.graph.linearize import depth_graph, gnss_graph, inertial_graph, prior_graph
-from ssm_graph.graph.problem import build_problem
 from ssm_graph.graph.states import States, states_from_arrays
+from ssm_graph.problem.problem import build_problem
 from ssm_graph.simulation import GnssSettings, Grade
 from tests.helpers import assert_jacobians_match, rotation, simulated, true_states
 

@@ -12,8 +12,8 @@ from ssm_graph.data import Mission
 from ssm_graph.errors import ConfigError, DataError
 from ssm_graph.estimate import Status
 from ssm_graph.frames import wrap_to_pi
-from ssm_graph.graph.alignment import N_HYPOTHESES, SAFE_HEADING_SIGMA, align
-from ssm_graph.graph.body_velocity import body_velocities
+from ssm_graph.problem.alignment import N_HYPOTHESES, SAFE_HEADING_SIGMA, align
+from ssm_graph.problem.body_velocity import body_velocities
 from ssm_graph.simulation import (
     GnssSettings,
     Grade,

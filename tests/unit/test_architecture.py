@@ -19,9 +19,13 @@ MAY_IMPORT = {
     "imu": FOUNDATION,
     "simulation": FOUNDATION - {"frames"},
     "evaluation": FOUNDATION,
-    "graph": FOUNDATION | {"imu", "factors"},
-    "smoothers": FOUNDATION | {"graph", "imu", "factors"},
-    "filters": FOUNDATION | {"imu", "factors"},
+    "problem": FOUNDATION | {"imu"},
+    "graph": FOUNDATION | {"problem", "imu", "factors"},
+    "smoothers": FOUNDATION | {"graph", "problem", "imu", "factors"},
+    "filters": FOUNDATION | {"problem", "imu", "factors"},
+    "study": FOUNDATION
+    | {"smoothers", "filters", "graph", "problem", "simulation", "evaluation"}
+    | {"factors", "io"},
     "report": FOUNDATION | {"evaluation"},
 } | {name: FOUNDATION for name in FOUNDATION}
 """Parts of the project that each part may import, itself apart; the rest may import anything."""

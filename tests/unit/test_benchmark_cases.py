@@ -21,7 +21,7 @@ from benchmarks.study_cases import CASES, DEFAULT_METHODS, case_config, parse_me
 from benchmarks.study_runs import Job, beam_truth, do_job
 from factors.similarity import ExpKernel, LogKernel, SqrtKernel
 from ssm_graph.errors import ConfigError
-from ssm_graph.graph.problem import build_problem
+from ssm_graph.problem.problem import build_problem
 from ssm_graph.simulation import Grade, simulate
 from ssm_graph.smoothers.batch import Similarity, SsmSmoother
 

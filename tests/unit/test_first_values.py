@@ -15,8 +15,8 @@ from ssm_graph.graph.first_values import (
     first_values,
 )
 from ssm_graph.graph.linearize import inertial_graph
-from ssm_graph.graph.problem import build_problem
-from ssm_graph.graph.states import POSITION, ROTATION
+from ssm_graph.problem.error_state import POSITION, ROTATION
+from ssm_graph.problem.problem import build_problem
 from ssm_graph.simulation import (
     CALM,
     DepthProfile,

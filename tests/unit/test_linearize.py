@@ -11,8 +11,9 @@ import pytest
 from ssm_graph.data import Array
 from ssm_graph.earth import radii_of_curvature
 from ssm_graph.graph.linearize import GraphLinearizer, depth_graph, gnss_graph, prior_graph
-from ssm_graph.graph.problem import Problem, build_problem
-from ssm_graph.graph.states import STATE_DIM, States, retract, states_from_arrays
+from ssm_graph.graph.states import States, retract, states_from_arrays
+from ssm_graph.problem.error_state import STATE_DIM
+from ssm_graph.problem.problem import Problem, build_problem
 from ssm_graph.simulation import (
     CALM,
     DepthProfile,

@@ -18,8 +18,8 @@ from ssm_graph.errors import ConfigError
 from ssm_graph.estimate import Estimate, Iteration, Status
 from ssm_graph.graph.first_values import first_values
 from ssm_graph.graph.linearize import depth_graph, gnss_graph, inertial_graph, prior_graph
-from ssm_graph.graph.problem import Problem, build_problem
 from ssm_graph.graph.states import States, states_from_arrays
+from ssm_graph.problem.problem import Problem, build_problem
 from ssm_graph.simulation import GnssSettings, Grade, Loss, OutlierKind, Outliers
 from ssm_graph.smoothers.batch import Similarity, SmootherConfig, SsmSmoother
 from tests.helpers import (

@@ -11,7 +11,7 @@ import pytest
 
 from ssm_graph.data import Array, ImuNoise, Mission
 from ssm_graph.errors import DataError
-from ssm_graph.graph.problem import build_problem
+from ssm_graph.problem.problem import build_problem
 from ssm_graph.simulation import GnssSettings
 from ssm_graph.smoothers.batch import SsmSmoother
 from tests.helpers import outcome, simulated, with_imu, with_initial

@@ -10,9 +10,9 @@ import pytest
 
 from ssm_graph.data import Array
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.graph.problem import build_problem
 from ssm_graph.graph.solve import solve_linear
 from ssm_graph.graph.states import States, retract, states_from_arrays
+from ssm_graph.problem.problem import build_problem
 from ssm_graph.smoothers.batch import _descend
 from tests.helpers import simulated, state_errors, true_states
 

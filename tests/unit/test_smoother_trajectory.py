@@ -8,9 +8,10 @@ from gtsam.symbol_shorthand import B, V, X
 
 from ssm_graph.data import Array
 from ssm_graph.frames import wrap_to_pi
-from ssm_graph.graph.problem import Problem, build_problem
-from ssm_graph.graph.states import STATE_DIM, States, retract, states_from_arrays
-from ssm_graph.graph.trajectory import trajectory_from_states
+from ssm_graph.graph.states import States, retract, states_from_arrays
+from ssm_graph.problem.error_state import STATE_DIM
+from ssm_graph.problem.problem import Problem, build_problem
+from ssm_graph.problem.trajectory import trajectory_from_states
 from ssm_graph.simulation import DiveRoute, Waves
 from tests.helpers import simulated, true_states
 

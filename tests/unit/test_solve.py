@@ -15,9 +15,9 @@ from ssm_graph.errors import SolverError
 from ssm_graph.graph.first_values import first_values
 from ssm_graph.graph.keys import chain_ordering
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.graph.problem import Problem, build_problem
 from ssm_graph.graph.solve import marginal_covariances, solve_linear
-from ssm_graph.graph.states import STATE_DIM
+from ssm_graph.problem.error_state import STATE_DIM
+from ssm_graph.problem.problem import Problem, build_problem
 from ssm_graph.simulation import GnssSettings, Grade
 from tests.helpers import simulated, without_beams
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from ssm_graph.data import DvlLog, GnssLog, Mission
 from ssm_graph.errors import DataError
-from ssm_graph.graph.timeline import MIN_SPACING_S, Timeline, build_timeline, nearest
+from ssm_graph.problem.timeline import MIN_SPACING_S, Timeline, build_timeline, nearest
 from ssm_graph.simulation import default_mount
 from tests.helpers import STEADY, simulated
 

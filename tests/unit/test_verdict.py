@@ -12,8 +12,8 @@ import pytest
 from ssm_graph.data import Array
 from ssm_graph.estimate import Status
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.graph.problem import Problem, build_problem
 from ssm_graph.graph.states import States, states_from_arrays
+from ssm_graph.problem.problem import Problem, build_problem
 from ssm_graph.simulation import (
     DiveRoute,
     GnssSettings,

@@ -2,16 +2,40 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 
 from ssm_graph.data import Array
 from ssm_graph.estimate import Trajectory
 from ssm_graph.frames import phi_D_roll_pitch_heading, roll_pitch_heading_from_R_lb
-from ssm_graph.graph.problem import Problem
-from ssm_graph.graph.states import POSITION, ROTATION, VELOCITY, States
+from ssm_graph.problem.error_state import POSITION, ROTATION, VELOCITY
+from ssm_graph.problem.problem import Problem
 
 
-def trajectory_from_states(problem: Problem, states: States, covariance: Array) -> Trajectory:
+class KeyframeStates(Protocol):
+    """Arrays of K keyframes, whoever estimated them."""
+
+    @property
+    def R_nb(self) -> Array:
+        """(K, 3, 3)."""
+
+    @property
+    def p_n(self) -> Array:
+        """(K, 3) m."""
+
+    @property
+    def v_n(self) -> Array:
+        """(K, 3) m/s."""
+
+    @property
+    def bias(self) -> Array:
+        """(K, 6) accelerometer m/s^2, gyro rad/s."""
+
+
+def trajectory_from_states(
+    problem: Problem, states: KeyframeStates, covariance: Array
+) -> Trajectory:
     """Express states and their covariances (K, 15, 15) along east, north, up at the vehicle."""
     frame = problem.frame
     lat, lon, height = frame.geodetic_from_p_n(states.p_n)

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ssm_graph.data import Array, Mission
-from ssm_graph.graph.body_velocity import BodyVelocities
 from ssm_graph.imu.increments import merge_samples
+from ssm_graph.problem.body_velocity import BodyVelocities
 
 SILENCE_S = 5.0
 """A gap between pings that ends the dead reckoning."""

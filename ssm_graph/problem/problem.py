@@ -19,9 +19,9 @@ from ssm_graph.data import (
 )
 from ssm_graph.earth import LocalFrame
 from ssm_graph.errors import ConfigError
-from ssm_graph.graph.timeline import Timeline, build_timeline, nearest
-from ssm_graph.graph.usable import require_usable
 from ssm_graph.imu.preintegration import InertialChain, imu_gaps, preintegrate
+from ssm_graph.problem.timeline import Timeline, build_timeline, nearest
+from ssm_graph.problem.usable import require_usable
 
 PING_WINDOW_S = 0.1
 """The gyro reading at a ping is the mean over this window: a ping takes time, and so does noise
@@ -125,7 +125,7 @@ def build_problem(
     mission : the recorded run.
     config : rates and intervals.
     start : initial state with sigmas; the mission's own when left out. A mission without one
-        needs :func:`ssm_graph.graph.alignment.align` first.
+        needs :func:`ssm_graph.problem.alignment.align` first.
     """
     require_usable(mission)
     config = config or ProblemConfig()

@@ -26,10 +26,10 @@ from ssm_graph.frames import (
     roll_pitch_heading_from_R_lb,
     wrap_to_pi,
 )
-from ssm_graph.graph.body_velocity import BodyVelocities, body_velocities
-from ssm_graph.graph.track_heading import HeadingFit, heading_from_track
-from ssm_graph.graph.usable import require_usable
 from ssm_graph.imu.increments import merge_samples
+from ssm_graph.problem.body_velocity import BodyVelocities, body_velocities
+from ssm_graph.problem.track_heading import HeadingFit, heading_from_track
+from ssm_graph.problem.usable import require_usable
 
 SAFE_HEADING_SIGMA = math.radians(10.0)
 """Above this, one heading is not safe and several are tried."""
