@@ -25,7 +25,7 @@ from benchmarks.speed_plain import dead_reckoned, plain_graph
 from factors.similarity import LogKernel
 from ssm_graph.data import Array, Mission
 from ssm_graph.graph.first_values import first_values
-from ssm_graph.graph.linearize import GraphLinearizer
+from ssm_graph.graph.linearize import GraphLinearizer, prior_graph
 from ssm_graph.problem.problem import Problem, build_problem
 from ssm_graph.simulation import Grade, OutlierKind, Outliers, scenario_config, simulate
 
@@ -184,7 +184,7 @@ def time_floor(path: Path, n_passes: int) -> Timing:
     linearizer = GraphLinearizer(problem)
     linearizer.follow(states)
     graph = gtsam.NonlinearFactorGraph()
-    for part in (linearizer.inertial, linearizer.prior, linearizer.gnss, linearizer.depth):
+    for part in (linearizer.inertial, prior_graph(problem), linearizer.gnss, linearizer.depth):
         graph.push_back(part)
     beams = problem.beams
     distance = np.linalg.norm(states.v_n - states.p_n, axis=1)

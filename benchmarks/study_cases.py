@@ -18,7 +18,7 @@ from ssm_graph.simulation import (
     SimulationConfig,
     scenario_config,
 )
-from ssm_graph.smoothers.batch import Similarity
+from factors.similarity import Similarity
 
 DEFAULT_DURATION_S: Final = 1200.0
 

@@ -6,7 +6,9 @@ Mahalanobis length with the posterior variance in it::
 
     t = (innovation^2 + H P H') / sigma^2,    weight = -2 f'(t)
 
-Every kernel has ``weight(dim) = 1``: a residual of expected size keeps its nominal noise.
+Every similarity kernel has ``weight(dim) = 1``: a residual of expected size keeps its nominal
+noise.
+The classical M-estimators of :mod:`factors.m_estimators` are kernels as well, of another norm.
 """
 
 from __future__ import annotations
@@ -14,7 +16,8 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import final
+from enum import Enum
+from typing import ClassVar, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -35,29 +38,48 @@ def expected_mahalanobis_sq(
     return np.asarray((innovation**2 + predicted_variance) / np.square(sigma))
 
 
+class Similarity(Enum):
+    """What the weight of a beam is judged by."""
+
+    EXPECTED = "residual and posterior variance"
+    PLAIN = "residual alone: the plain M-estimator"
+
+
 class Kernel(ABC):
-    """A similarity function ``f`` and the weight ``-2 f'``."""
+    """A decreasing, convex function ``f`` of ``t`` and the weight ``-2 f'``, which never rises.
+
+    Where the weight is 1 is a matter of the family: at ``t = dim`` for the similarity kernels, at
+    ``t = 0`` for M-estimators.
+    """
+
+    published_with: ClassVar[Similarity] = Similarity.EXPECTED
+    """The ``t`` that the kernel was published for; the other one may be asked for."""
 
     @abstractmethod
     def similarity(self, t: Array, *, dim: int = 1) -> Array:
         """Return ``f(t)`` for measurements of dimension ``dim``."""
 
     @abstractmethod
-    def _weight(self, t: Array, dim: int) -> Array:
+    def _weight(self, t: Array, dim: int | Array) -> Array:
         """Return ``-2 f'(t)``, not floored."""
 
-    def weight(self, t: ArrayLike, *, dim: int = 1) -> Array:
+    def weight(self, t: ArrayLike, *, dim: int | Array = 1) -> Array:
         """Return the weight of measurements of dimension ``dim``, at least the floor.
 
         Parameters
         ----------
         t : (...) squared Mahalanobis lengths, 0 or more.
-        dim : dimension of one measurement.
+        dim : dimension of the measurements, of all or (...) of each.
         """
-        return np.maximum(self._weight(np.asarray(t, dtype=np.float64), dim), WEIGHT_FLOOR)
+        return np.maximum(self.raw_weight(t, dim=dim), WEIGHT_FLOOR)
+
+    def raw_weight(self, t: ArrayLike, *, dim: int | Array = 1) -> Array:
+        """Return the weight as published, which may underflow to zero."""
+        return self._weight(np.asarray(t, dtype=np.float64), dim)
 
 
-def _require_positive(name: str, value: float) -> None:
+def require_positive(name: str, value: float) -> None:
+    """Raise ValueError for a parameter that is no finite number above zero."""
     if not (math.isfinite(value) and value > 0.0):
         raise ValueError(f"{name}: expected a number above zero, got {value}")
 
@@ -71,7 +93,7 @@ class GaussianKernel(Kernel):
         """Return ``-t / 2``."""
         return -0.5 * t
 
-    def _weight(self, t: Array, dim: int) -> Array:  # noqa: ARG002
+    def _weight(self, t: Array, dim: int | Array) -> Array:  # noqa: ARG002
         return np.ones_like(t)
 
     def __str__(self) -> str:
@@ -87,13 +109,13 @@ class LogKernel(Kernel):
     """Degrees of freedom; large is Gaussian."""
 
     def __post_init__(self) -> None:
-        _require_positive("dof", self.dof)
+        require_positive("dof", self.dof)
 
     def similarity(self, t: Array, *, dim: int = 1) -> Array:
         """Return ``f(t)``."""
         return np.asarray(-0.5 * (self.dof + dim) * np.log1p(t / self.dof))
 
-    def _weight(self, t: Array, dim: int) -> Array:
+    def _weight(self, t: Array, dim: int | Array) -> Array:
         return np.asarray((self.dof + dim) / (self.dof + t))
 
     def __str__(self) -> str:
@@ -109,13 +131,13 @@ class SqrtKernel(Kernel):
     """Degrees of freedom; large is Gaussian."""
 
     def __post_init__(self) -> None:
-        _require_positive("dof", self.dof)
+        require_positive("dof", self.dof)
 
     def similarity(self, t: Array, *, dim: int = 1) -> Array:
         """Return ``f(t)``."""
         return -np.sqrt((self.dof + dim) * (self.dof + t))
 
-    def _weight(self, t: Array, dim: int) -> Array:
+    def _weight(self, t: Array, dim: int | Array) -> Array:
         return np.sqrt((self.dof + dim) / (self.dof + t))
 
     def __str__(self) -> str:
@@ -131,13 +153,13 @@ class ExpKernel(Kernel):
     """Kernel width in sigmas; large is Gaussian."""
 
     def __post_init__(self) -> None:
-        _require_positive("width", self.width)
+        require_positive("width", self.width)
 
     def similarity(self, t: Array, *, dim: int = 1) -> Array:
         """Return ``f(t)``."""
         return np.asarray(self.width**2 * np.exp((dim - t) / (2.0 * self.width**2)))
 
-    def _weight(self, t: Array, dim: int) -> Array:
+    def _weight(self, t: Array, dim: int | Array) -> Array:
         return np.asarray(np.exp((dim - t) / (2.0 * self.width**2)))
 
     def __str__(self) -> str:

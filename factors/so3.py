@@ -1,6 +1,8 @@
-"""Small vector algebra that NumPy has only in a slower form."""
+"""Small vector and rotation algebra that NumPy and SciPy have only in a slower form."""
 
 from __future__ import annotations
+
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,6 +10,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 _NEXT, _AFTER = [1, 2, 0], [2, 0, 1]
+SMALL_SQUARE: Final = 1e-2
+"""rad^2; up to it series are used, where closed forms lose digits."""
 
 
 def cross(a: Array, b: Array) -> Array:
@@ -17,3 +21,96 @@ def cross(a: Array, b: Array) -> Array:
     filters call this for every ping.
     """
     return np.asarray(a[..., _NEXT] * b[..., _AFTER] - a[..., _AFTER] * b[..., _NEXT])
+
+
+_SKEW = np.zeros((3, 9))
+for _axis, (_plus, _minus) in enumerate(((7, 5), (2, 6), (3, 1))):
+    _SKEW[_axis, _plus], _SKEW[_axis, _minus] = 1.0, -1.0
+
+
+def skew(a: Array) -> Array:
+    """Return ``[a x]`` (..., 3, 3)."""
+    return np.asarray((a @ _SKEW).reshape(*a.shape, 3))
+
+
+def exp(phi: Array) -> Array:
+    """Return the rotation matrix (..., 3, 3) of a rotation vector (..., 3), rad."""
+    first, second, _ = coefficients(phi)
+    return _polynomial(phi, first, second)
+
+
+def left_jacobian(phi: Array) -> Array:
+    """Return ``int_0^1 Exp(s phi) ds`` (..., 3, 3)."""
+    _, second, third = coefficients(phi)
+    return _polynomial(phi, second, third)
+
+
+def left_jacobian_times(phi: Array, vector: Array) -> Array:
+    """Return :func:`left_jacobian` times vectors (..., 3)."""
+    _, second, third = coefficients(phi)
+    once = cross(phi, vector)
+    return np.asarray(vector + second * once + third * cross(phi, once))
+
+
+def left_jacobian_solve(phi: Array, vector: Array) -> Array:
+    """Return the inverse of :func:`left_jacobian` times vectors (..., 3), angles below 2 pi."""
+    square = (phi * phi).sum(axis=-1, keepdims=True)
+    factor = 1.0 / 12.0 + square / 720.0 + square**2 / 30240.0 + square**3 / 1209600.0
+    if square.max(initial=0.0) > SMALL_SQUARE:
+        first, second, _ = coefficients(phi)
+        large = square > SMALL_SQUARE
+        closed = (1.0 - 0.5 * first / second) / np.where(large, square, 1.0)
+        factor = np.where(large, closed, factor)
+    once = cross(phi, vector)
+    return np.asarray(vector - 0.5 * once + factor * cross(phi, once))
+
+
+def log(R: Array) -> Array:
+    """Return the rotation vector (..., 3) of a rotation matrix, rad; angles well below pi."""
+    sine_axis = 0.5 * (R[..., [2, 0, 1], [1, 2, 0]] - R[..., [1, 2, 0], [2, 0, 1]])
+    sine = np.linalg.norm(sine_axis, axis=-1, keepdims=True)
+    cosine = 0.5 * (np.trace(R, axis1=-2, axis2=-1)[..., None] - 1.0)
+    angle = np.arctan2(sine, cosine)
+    scale = np.divide(angle, sine, out=np.ones_like(sine), where=sine > 0.0)
+    return np.asarray(scale * sine_axis)
+
+
+def _polynomial(phi: Array, linear: Array, quadratic: Array) -> Array:
+    """Return ``I + linear [phi x] + quadratic [phi x]^2`` (..., 3, 3)."""
+    S = skew(phi)
+    return np.asarray(np.eye(3) + linear[..., None] * S + quadratic[..., None] * (S @ S))
+
+
+def coefficients(phi: Array) -> tuple[Array, Array, Array]:
+    """Return ``sin a/a``, ``(1 - cos a)/a^2`` and ``(a - sin a)/a^3`` of the angle, (..., 1)."""
+    square = (phi * phi).sum(axis=-1, keepdims=True)
+    first = 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0 * (1.0 - square / 72.0)))
+    second = 0.5 - square / 24.0 * (1.0 - square / 30.0 * (1.0 - square / 56.0 * (1.0 - square / 90.0)))
+    third = 1.0 - square / 20.0 * (1.0 - square / 42.0 * (1.0 - square / 72.0))
+    third = third / 6.0
+    if square.max(initial=0.0) > SMALL_SQUARE:
+        large = square > SMALL_SQUARE
+        square = np.where(large, square, 1.0)
+        angle = np.sqrt(square)
+        sinc = np.sin(angle) / angle
+        first = np.where(large, sinc, first)
+        second = np.where(large, 2.0 * (np.sin(0.5 * angle) / angle) ** 2, second)
+        third = np.where(large, (1.0 - sinc) / square, third)
+    return first, second, third
+
+
+def right_jacobian_series(adjoint: Array, *, angle: float) -> Array:
+    """Return ``sum_n (-ad)^n / (n + 1)!`` (..., m, m): the right Jacobian of poses.
+
+    ``adjoint`` is the small adjoint of the tangent vector, ``angle`` the largest rotation in it:
+    powers grow by the rotation alone, so it tells how many terms rounding needs.
+    """
+    identity = np.eye(adjoint.shape[-1])
+    n_terms, term = 2, max(angle, 1e-12) / 6.0
+    while term > 1e-18 and n_terms < 60:
+        n_terms += 1
+        term *= angle / (n_terms + 1)
+    total = np.broadcast_to(identity, adjoint.shape)
+    for n in range(n_terms, 0, -1):
+        total = identity - adjoint @ total / (n + 1)
+    return np.asarray(total)

@@ -155,6 +155,11 @@ class DvlLog(FrozenArrays):
     range_m: Array | None = optional_shaped("N", N_BEAMS)
     """(N, 4) range along each beam, m; NaN where unknown."""
 
+    @property
+    def ping_s(self) -> Array:
+        """(N,) when the pings were taken: stamps less the mount's time offset, s."""
+        return np.asarray(self.time_s - self.mount.time_offset_s)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthLog(FrozenArrays):

@@ -22,6 +22,12 @@ def add_command(commands: Any, name: str, *, summary: str, description: str, epi
 
 def add_mission_output(parser: argparse.ArgumentParser) -> None:
     """Add where and in which format a mission folder is written."""
+    table_format_option(parser)
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="mission folder")
+
+
+def table_format_option(parser: argparse.ArgumentParser) -> None:
+    """Add in which format tables are written."""
     parser.add_argument(
         "--format",
         type=_table_format,
@@ -30,7 +36,6 @@ def add_mission_output(parser: argparse.ArgumentParser) -> None:
         metavar="{" + ",".join(table.name.lower() for table in TableFormat) + "}",
         help="format of the tables (default: csv)",
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="mission folder")
 
 
 def _table_format(word: str) -> TableFormat:

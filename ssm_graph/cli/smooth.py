@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from factors.similarity import ExpKernel, GaussianKernel, Kernel, LogKernel, SqrtKernel
+from factors.kernels import KERNELS, KernelChoice
+from factors.m_estimators import TruncatedKernel
+from factors.similarity import Kernel, Similarity
 from ssm_graph.cli.options import add_command
 from ssm_graph.data import GnssLog, Mission, Reference
 from ssm_graph.errors import ConfigError, DataError
@@ -22,10 +24,19 @@ from ssm_graph.problem.problem import ProblemConfig
 from ssm_graph.report.figure import save_figure
 from ssm_graph.report.progress import ProgressDisplay
 from ssm_graph.report.summary import summary_table
-from ssm_graph.smoothers.batch import Similarity, SmootherConfig
+from ssm_graph.smoothers.batch import SmootherConfig
+from ssm_graph.smoothers.gnc import GncStart, Graduation
 from ssm_graph.smoothers.mission import smooth
 
-KERNELS = ("log", "sqrt", "exp", "gaussian")
+GNC = "gnc-tls"
+CHOICES = {**KERNELS, GNC: KernelChoice(TruncatedKernel, "width")}
+"""Kernels by name; that of graduated non-convexity comes with a schedule of its own."""
+PARAMETERS = {
+    "dof": ("NUMBER", "degrees of freedom"),
+    "width": ("SIGMAS", "residual at which a beam begins to be or is an outlier"),
+    "phi": ("SIGMAS2", "squared residual up to which a beam counts in full"),
+}
+"""Metavariable and meaning of the kernels' parameters."""
 
 
 def add_parser(commands: Any, *, epilog: str) -> None:
@@ -47,28 +58,39 @@ def add_parser(commands: Any, *, epilog: str) -> None:
 
 def _add_kernel_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--kernel", choices=KERNELS, default="log", help="similarity kernel (default: log)"
+        "--kernel",
+        choices=CHOICES,
+        default="log",
+        help="log, sqrt, exp: similarity kernels; gaussian: least squares; huber, cauchy, dcs, "
+        "geman-mcclure: classical M-estimators; gnc-tls: truncated least squares by graduated "
+        "non-convexity (default: log)",
     )
+    for name, (metavar, meaning) in PARAMETERS.items():
+        defaults = (
+            f"{choice.default:.5g} for {kernel}"
+            for kernel, choice in CHOICES.items()
+            if choice.parameter == name
+        )
+        parser.add_argument(
+            f"--{name}",
+            type=float,
+            default=None,
+            metavar=metavar,
+            help=f"{meaning} (default: {', '.join(defaults)})",
+        )
     parser.add_argument(
-        "--dof",
-        type=float,
+        "--gnc-start",
+        choices=[start.name.lower() for start in GncStart],
         default=None,
-        help=f"degrees of freedom (default: {LogKernel().dof:g} for log, {SqrtKernel().dof:g} for "
-        "sqrt)",
-    )
-    parser.add_argument(
-        "--width",
-        type=float,
-        default=None,
-        metavar="SIGMAS",
-        help=f"width of exp (default: {ExpKernel().width:g})",
+        help="start gnc-tls from least squares with every weight 1, as published, or from the "
+        "gated forward pass (default: ones)",
     )
     parser.add_argument(
         "--similarity",
         choices=[kind.name.lower() for kind in Similarity],
-        default=SmootherConfig().similarity.name.lower(),
+        default=None,
         help="judge a beam by residual and posterior variance, or by the residual alone "
-        "(default: expected)",
+        "(default: expected for similarity kernels, plain for M-estimators and gnc-tls)",
     )
 
 
@@ -108,11 +130,7 @@ def _add_other_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace, console: Console, errors: Console) -> bool:
     """Read, smooth, compare, write and show."""
-    loop = SmootherConfig(
-        kernel=kernel_from(arguments.kernel, dof=arguments.dof, width=arguments.width),
-        similarity=Similarity[arguments.similarity.upper()],
-        max_iterations=arguments.max_iterations,
-    )
+    loop = loop_from(arguments)
     graph = ProblemConfig(arguments.merge_rate, arguments.keyframe_interval)
     with ProgressDisplay(errors) as show:
         show.stage("reading the mission")
@@ -139,21 +157,37 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     return estimate.status.is_good
 
 
-def kernel_from(name: str, *, dof: float | None, width: float | None) -> Kernel:
+def loop_from(arguments: argparse.Namespace) -> SmootherConfig:
+    """Return the settings of the loop; what does not belong to the kernel is refused."""
+    given = {name: getattr(arguments, name) for name in PARAMETERS}
+    graduation = None
+    if arguments.kernel == GNC:
+        graduation = Graduation(GncStart[(arguments.gnc_start or GncStart.ONES.name).upper()])
+    elif arguments.gnc_start is not None:
+        raise ConfigError(
+            f"--gnc-start: expected with --kernel {GNC}, got {arguments.kernel}; leave it out"
+        )
+    similarity = arguments.similarity
+    return SmootherConfig(
+        kernel=kernel_from(arguments.kernel, **given),
+        similarity=None if similarity is None else Similarity[similarity.upper()],
+        graduation=graduation,
+        max_iterations=arguments.max_iterations,
+    )
+
+
+def kernel_from(name: str, **given: float | None) -> Kernel:
     """Return a kernel by name; a parameter that it does not have is refused."""
-    if dof is not None and name not in ("log", "sqrt"):
-        raise ConfigError(f"--dof: expected with --kernel log or sqrt, got {name}; leave it out")
-    if width is not None and name != "exp":
-        raise ConfigError(f"--width: expected with --kernel exp, got {name}; leave it out")
-    given = {"dof": dof} if dof is not None else {"width": width} if width is not None else {}
-    makers: dict[str, type[Kernel]] = {
-        "log": LogKernel,
-        "sqrt": SqrtKernel,
-        "exp": ExpKernel,
-        "gaussian": GaussianKernel,
-    }
+    choice = CHOICES[name]
+    for parameter, value in given.items():
+        if value is not None and parameter != choice.parameter:
+            owners = [kernel for kernel, c in CHOICES.items() if c.parameter == parameter]
+            raise ConfigError(
+                f"--{parameter}: expected with --kernel {' or '.join(owners)}, got {name}; "
+                "leave it out"
+            )
     try:
-        return makers[name](**given)
+        return choice.kernel(given.get(choice.parameter))
     except ValueError as error:
         raise ConfigError(f"--kernel {name}: {error}") from error
 
@@ -204,8 +238,8 @@ def _settings(
     arguments: argparse.Namespace, loop: SmootherConfig, graph: ProblemConfig
 ) -> dict[str, Any]:
     return {
-        "kernel": str(loop.kernel),
-        "similarity": loop.similarity.name.lower(),
+        "kernel": loop.weighting,
+        "similarity": loop.judged_by.name.lower(),
         "max_iterations": loop.max_iterations,
         "tolerance_sigmas": loop.tolerance,
         "merge_rate_hz": graph.merge_rate_hz,

@@ -23,8 +23,8 @@ from ssm_graph.errors import SolverError
 from ssm_graph.graph.linearize import inertial_graph, linearize_beams
 from ssm_graph.graph.states import States, states_from_arrays
 from ssm_graph.imu.preintegration import gtsam_gravity
-from ssm_graph.problem.error_state import POSITION, ROTATION, STATE_DIM, VELOCITY, initial_moments
-from ssm_graph.problem.problem import Problem
+from ssm_graph.problem.error_state import POSITION, ROTATION, STATE_DIM, VELOCITY
+from ssm_graph.problem.problem import Problem, start_of
 
 GATE = 5.0
 """Beams further than this many innovation sigmas from the prediction start without weight."""
@@ -89,9 +89,7 @@ class _ForwardPass:
     ) -> None:
         self.problem = problem
         self.kernel = kernel
-        start = initial_moments(
-            problem.start, problem.frame, bias_sigma=problem.imu_noise_bias_sigma
-        )
+        start = start_of(problem)
         self.R_nb, self.p_n, self.v_n, self.bias = start[:4]
         self.P = start.covariance
         self.factors = inertial
@@ -161,7 +159,7 @@ class _ForwardPass:
         depths = self.problem.depths
         if depths is None or len(rows) == 0:
             return _NO_ROWS
-        i = rows[len(rows) // 2]
+        i = rows[-1]
         late = self.problem.keyframe_s[k] - depths.time_s[i]
         x, y, z = self.p_n + self.R_nb @ depths.lever_arm_b
         height = z + self.problem.frame.height + (x * x + y * y) / (2.0 * SEMI_MAJOR_AXIS)

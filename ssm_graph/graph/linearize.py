@@ -7,15 +7,21 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
-from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from factors.dvl_beam import beam_residual
 from ssm_graph.data import Array
-from ssm_graph.earth import LocalFrame
+from ssm_graph.graph.depth import depth_graph
 from ssm_graph.graph.keys import chain_ordering
+from ssm_graph.graph.marginal_prior import MarginalPrior, prior_at_start
 from ssm_graph.graph.states import States
-from ssm_graph.problem.error_state import GYRO_BIAS, ROTATION, STATE_DIM, VELOCITY, initial_moments
-from ssm_graph.problem.problem import Beams, Depths, Fixes, Problem
+from ssm_graph.problem.error_state import (
+    GYRO_BIAS,
+    POSITION,
+    ROTATION,
+    STATE_DIM,
+    VELOCITY,
+)
+from ssm_graph.problem.problem import Beams, Fixes, Problem, start_of
 
 
 class BeamRows(NamedTuple):
@@ -51,17 +57,29 @@ def linearize_beams(
 class GraphLinearizer:
     """Linearises the whole graph of a problem at any states and beam weights.
 
-    Inertial factors, prior and GNSS are GTSAM's own and stay; gravity and depth targets follow the
+    Inertial factors and GNSS are GTSAM's own and stay; gravity and depth targets follow the
     states; beams become one Jacobian factor a keyframe.
     """
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(
+        self, problem: Problem, *, prior: MarginalPrior | None = None, first_rise: float = 0.0
+    ) -> None:
+        """Take a mission, or a window of one with what came before it.
+
+        Parameters
+        ----------
+        problem : the mission or window.
+        prior : on the first keyframe, in place of the initial state.
+        first_rise : how much higher the depth sensor is at the first keyframe than it was on
+            average when its readings were taken, m.
+        """
         self.problem = problem
         self.ordering = chain_ordering(problem.n_keyframes)
         self.inertial = inertial_graph(problem)
-        self.prior = prior_graph(problem)
+        self.prior = prior_at_start(start_of(problem)) if prior is None else prior
         self.gnss = gnss_graph(problem.fixes)
         self.depth = gtsam.NonlinearFactorGraph()
+        self._first_rise = first_rise
         k = problem.beams.keyframe
         self._first_beam = np.flatnonzero(np.diff(k, prepend=-1))
         self._n_rows = np.diff(np.append(self._first_beam, len(k)))
@@ -70,10 +88,20 @@ class GraphLinearizer:
 
     def follow(self, states: States) -> None:
         """Let gravity and the depth targets follow the states; to be called before the others."""
+        self.problem.chain.set_gravity(states.p_n)
+        self.follow_depth(states)
+
+    def follow_depth(self, states: States) -> None:
+        """Let the depth targets follow the states."""
         problem = self.problem
-        problem.chain.set_gravity(states.p_n)
         if problem.depths is not None:
-            self.depth = depth_graph(problem.depths, states, problem.frame, problem.keyframe_s)
+            self.depth = depth_graph(
+                problem.depths,
+                states,
+                problem.frame,
+                problem.keyframe_s,
+                first_rise=self._first_rise,
+            )
 
     def beam_rows(self, states: States) -> BeamRows:
         """Linearise all beams at ``states``."""
@@ -92,16 +120,18 @@ class GraphLinearizer:
     ) -> gtsam.GaussianFactorGraph:
         """Return the linear graph at ``states``, with their beam rows and weights (M,)."""
         linear = self.inertial.linearize(states.values)
-        for graph in (self.prior, self.gnss, self.depth):
+        for graph in (self.gnss, self.depth):
             linear.push_back(graph.linearize(states.values))
+        linear.push_back(self.prior.linear_factor(states))
         self._push_beams(linear, beam_rows, weights)
         return linear
 
     def cost(self, states: States, beam_rows: BeamRows, weights: Array) -> float:
         """Return half the weighted sum of squares that :meth:`linearize` makes linear."""
-        graphs = (self.inertial, self.prior, self.gnss, self.depth)
-        beams = np.sum(weights * (beam_rows.error / self.problem.beams.sigma) ** 2)
-        return float(sum(graph.error(states.values) for graph in graphs) + 0.5 * beams)
+        graphs = (self.inertial, self.gnss, self.depth)
+        squares = np.sum(weights * (beam_rows.error / self.problem.beams.sigma) ** 2)
+        squares += np.sum(self.prior.whitened(states) ** 2)
+        return float(sum(graph.error(states.values) for graph in graphs) + 0.5 * squares)
 
     def _push_beams(
         self, linear: gtsam.GaussianFactorGraph, beam_rows: BeamRows, weights: Array
@@ -144,19 +174,16 @@ def inertial_graph(problem: Problem) -> gtsam.NonlinearFactorGraph:
 
 
 def prior_graph(problem: Problem) -> gtsam.NonlinearFactorGraph:
-    """Return the prior factors on pose, velocity and bias of the first keyframe."""
-    start = initial_moments(problem.start, problem.frame, bias_sigma=problem.imu_noise_bias_sigma)
-    covariance = gtsam.noiseModel.Gaussian.Covariance
+    """Return the initial state as GTSAM's factors, for a graph that GTSAM is to optimise."""
+    start = start_of(problem)
+    cov, R_nb = start.covariance, start.R_nb
+    gaussian = gtsam.noiseModel.Gaussian.Covariance
+    position_cov_n = R_nb @ cov[POSITION, POSITION] @ R_nb.T
     graph = gtsam.NonlinearFactorGraph()
-    graph.addPriorPose3(
-        X(0),
-        gtsam.Pose3(gtsam.Rot3(start.R_nb), start.p_n),
-        covariance(start.covariance[:6, :6]),
-    )
-    graph.addPriorVector(V(0), start.v_n, covariance(start.covariance[VELOCITY, VELOCITY]))
-    graph.addPriorConstantBias(
-        B(0), gtsam.imuBias.ConstantBias(), covariance(start.covariance[9:, 9:])
-    )
+    graph.add(gtsam.PoseRotationPrior3D(X(0), gtsam.Rot3(R_nb), gaussian(cov[ROTATION, ROTATION])))
+    graph.add(gtsam.PoseTranslationPrior3D(X(0), start.p_n, gaussian(position_cov_n)))
+    graph.addPriorVector(V(0), start.v_n, gaussian(cov[VELOCITY, VELOCITY]))
+    graph.addPriorConstantBias(B(0), gtsam.imuBias.ConstantBias(), gaussian(cov[9:, 9:]))
     return graph
 
 
@@ -170,32 +197,4 @@ def gnss_graph(fixes: Fixes | None) -> gtsam.NonlinearFactorGraph:
     ):
         noise = gtsam.noiseModel.Gaussian.Covariance(covariance_n)
         graph.add(gtsam.GPSFactorArm(X(k), position_n, fixes.lever_arm_b, noise))
-    return graph
-
-
-def depth_graph(
-    depths: Depths, states: States, frame: LocalFrame, keyframe_s: Array
-) -> gtsam.NonlinearFactorGraph:
-    """Return depth as GTSAM position factors that count along the local vertical only.
-
-    Two things make the target depend on the states, and both change little between iterations:
-    the ellipsoid curves away from the frame's horizontal plane, and a reading between keyframes is
-    carried to its keyframe along the estimated track. Readings of one keyframe are averaged.
-    """
-    sensor_n = states.p_n + states.R_nb @ depths.lever_arm_b
-    height = frame.geodetic_from_p_n(states.p_n)[2]
-    up_n = frame.R_nl_at(states.p_n)[:, :, 2]
-    origin = CubicHermiteSpline(keyframe_s, height, np.einsum("ki,ki->k", states.v_n, up_n))
-    arm = CubicSpline(keyframe_s, frame.geodetic_from_p_n(sensor_n)[2] - height)
-    too_low = -depths.depth - origin(depths.time_s) - arm(depths.time_s)
-    count = np.bincount(depths.keyframe, minlength=len(keyframe_s))
-    total = np.bincount(depths.keyframe, weights=too_low, minlength=len(keyframe_s))
-    mean = total / np.maximum(count, 1)
-    target_n = sensor_n + up_n * mean[:, None]
-    root_information = np.zeros((len(count), 3, 3))
-    root_information[:, 0] = up_n * (np.sqrt(count) / depths.sigma)[:, None]
-    graph = gtsam.NonlinearFactorGraph()
-    for k in np.flatnonzero(count).tolist():
-        noise = gtsam.noiseModel.Gaussian.SqrtInformation(root_information[k], False)
-        graph.add(gtsam.GPSFactorArm(X(k), target_n[k], depths.lever_arm_b, noise))
     return graph

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import gtsam
 import numpy as np
+from gtsam.symbol_shorthand import B, V, X
 
 from ssm_graph.data import Array
 from ssm_graph.errors import SolverError
@@ -27,6 +28,11 @@ class LinearSolution(NamedTuple):
     """(K, 15, 15) upper triangular; ``R_k d_k + S_k d_{k+1} = rhs_k``."""
     S: Array
     """(K, 15, 15) coupling to the next keyframe; zero for the last."""
+
+    def last_step(self) -> Array:
+        """Return the step (15,) of the last keyframe."""
+        k = len(self.R) - 1
+        return np.concatenate([self.delta.at(symbol(k)) for symbol in (X, V, B)])
 
 
 def solve_linear(
@@ -59,6 +65,8 @@ def solve_linear(
     # The root holds the last two keyframes; then one clique a keyframe, backwards in time.
     root = _conditional(cliques, 0).R()
     R[-1] = root[-STATE_DIM:, -STATE_DIM:]
+    if n_keyframes == 1:
+        return LinearSolution(delta, R, S)
     R[-2] = root[:STATE_DIM, :STATE_DIM]
     S[-2] = root[:STATE_DIM, STATE_DIM:]
     separated = np.empty((n_keyframes - 2, STATE_DIM, STATE_DIM))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,13 @@ STATE_DIM = 15
 axes), accelerometer bias 3, gyro bias 3."""
 ROTATION, POSITION, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
 ACCEL_BIAS, GYRO_BIAS = slice(9, 12), slice(12, 15)
+
+
+class Linearised(Enum):
+    """Where the measurements of a keyframe are linearised."""
+
+    EACH_PASS = "at each pass anew: Gauss-Newton"
+    ONCE = "at the prediction: a linear error state, as in closed-loop inertial filters"
 
 
 class InitialMoments(NamedTuple):

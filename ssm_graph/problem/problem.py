@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +18,17 @@ from ssm_graph.data import (
     ReadOnlyArrays,
 )
 from ssm_graph.earth import LocalFrame
-from ssm_graph.errors import ConfigError
+from ssm_graph.errors import ConfigError, DataError
 from ssm_graph.imu.preintegration import InertialChain, imu_gaps, preintegrate
-from ssm_graph.problem.timeline import Timeline, build_timeline, nearest
+from ssm_graph.problem.error_state import InitialMoments, initial_moments
+from ssm_graph.problem.timeline import (
+    MIN_SPACING_S,
+    Indices,
+    Timeline,
+    build_timeline,
+    is_inside,
+    nearest,
+)
 from ssm_graph.problem.usable import require_usable
 
 PING_WINDOW_S = 0.1
@@ -66,7 +74,7 @@ class Beams(ReadOnlyArrays):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Depths(ReadOnlyArrays):
-    """Depth readings, each assigned to its nearest keyframe."""
+    """Depth readings, each assigned to the first keyframe at or after it, as on the vehicle."""
 
     keyframe: NDArray[np.intp]
     """(M,)"""
@@ -74,6 +82,8 @@ class Depths(ReadOnlyArrays):
     """(M,) s"""
     depth: Array
     """(M,) m, positive down"""
+    gyro_b: Array
+    """(K, 3) rad/s, at the keyframes: it moves the lever arm"""
     sigma: float
     """m"""
     lever_arm_b: Array
@@ -145,12 +155,36 @@ def build_problem(
         start=start,
         keyframe_s=timeline.keyframe_s,
         chain=chain,
-        beams=_beams(mission, timeline),
+        beams=_beams(mission, timeline.ping, timeline.ping_keyframe),
         depths=_depths(mission, timeline),
         fixes=None if mission.gnss is None else _fixes(mission.gnss, mission.frame, timeline),
         imu_noise_bias_sigma=np.repeat([noise.accel_bias_sigma, noise.gyro_bias_sigma], 3),
         notes=timeline.notes + _gap_note(mission.imu) + _calibration_note(mission.dvl.mount),
     )
+
+
+def start_of(problem: Problem) -> InitialMoments:
+    """Return mean and covariance of the first keyframe."""
+    return initial_moments(problem.start, problem.frame, bias_sigma=problem.imu_noise_bias_sigma)
+
+
+def with_dvl(problem: Problem, mission: Mission) -> Problem:
+    """Return the problem with the beams of another DVL log of the same run.
+
+    The inertial chain, most of the work, is kept; so the pings have to be at keyframes.
+    """
+    keyframe_s, ping_s = problem.keyframe_s, mission.dvl.ping_s
+    is_used = np.isfinite(mission.dvl.speed).any(axis=1)
+    is_used &= is_inside(ping_s, keyframe_s[0], keyframe_s[-1])
+    ping = np.flatnonzero(is_used)
+    keyframe = nearest(keyframe_s, ping_s[ping])
+    off = np.abs(keyframe_s[keyframe] - ping_s[ping])
+    if np.any(off > MIN_SPACING_S):
+        raise DataError(
+            f"with_dvl: expected pings at the keyframes, got one {off.max():.3f} s away at "
+            f"{ping_s[ping][np.argmax(off)]:.3f} s; build a problem of its own"
+        )
+    return replace(problem, beams=_beams(mission, ping, keyframe))
 
 
 def _gap_note(imu: ImuLog) -> tuple[str, ...]:
@@ -199,18 +233,16 @@ def mean_gyro(imu: ImuLog, time_s: Array) -> Array:
     return np.asarray(np.stack(turned, axis=-1) / (2.0 * half[:, None]))
 
 
-def _beams(mission: Mission, timeline: Timeline) -> Beams:
+def _beams(mission: Mission, ping: Indices, ping_keyframe: Indices) -> Beams:
     dvl = mission.dvl
-    speed = dvl.speed[timeline.ping]
+    speed = dvl.speed[ping]
     row, beam = np.nonzero(np.isfinite(speed))
-    keyframe = timeline.ping_keyframe[row]
-    ping_s = dvl.time_s[timeline.ping] - dvl.mount.time_offset_s
-    gyro_b = mean_gyro(mission.imu, ping_s) if len(ping_s) else np.zeros((0, 3))
+    gyro_b = mean_gyro(mission.imu, dvl.ping_s[ping]) if len(ping) else np.zeros((0, 3))
     return Beams(
-        keyframe=keyframe,
+        keyframe=ping_keyframe[row],
         beam=beam,
         speed=speed[row, beam],
-        sigma=dvl.sigma[timeline.ping][row, beam],
+        sigma=dvl.sigma[ping][row, beam],
         gyro_b=gyro_b[row],
         beam_b=dvl.mount.beams_b.reshape(N_BEAMS, 3)[beam],
         lever_arm_b=dvl.mount.lever_arm_b,
@@ -224,9 +256,10 @@ def _depths(mission: Mission, timeline: Timeline) -> Depths | None:
     keyframe_s = timeline.keyframe_s
     used = (log.time_s >= keyframe_s[0]) & (log.time_s <= keyframe_s[-1])
     return Depths(
-        keyframe=nearest(keyframe_s, log.time_s[used]),
+        keyframe=np.searchsorted(keyframe_s, log.time_s[used]),
         time_s=log.time_s[used],
         depth=log.depth[used],
+        gyro_b=mean_gyro(mission.imu, keyframe_s),
         sigma=log.sigma,
         lever_arm_b=log.lever_arm_b,
     )

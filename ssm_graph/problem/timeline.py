@@ -53,11 +53,11 @@ def build_timeline(mission: Mission, *, start_s: float, interval_s: float) -> Ti
         raise DataError(
             f"the start at {start_s:.3f} s leaves no inertial data, which end at {end_s:.3f} s"
         )
-    ping_s = mission.dvl.time_s - mission.dvl.mount.time_offset_s
+    ping_s = mission.dvl.ping_s
     has_beam = np.isfinite(mission.dvl.speed).any(axis=1)
     fix_s = mission.gnss.time_s if mission.gnss is not None else np.zeros(0)
-    ping = np.flatnonzero(has_beam & _inside(ping_s, start_s, end_s))
-    fix = np.flatnonzero(_inside(fix_s, start_s, end_s))
+    ping = np.flatnonzero(has_beam & is_inside(ping_s, start_s, end_s))
+    fix = np.flatnonzero(is_inside(fix_s, start_s, end_s))
     notes = _left_out("ping", int(has_beam.sum()) - len(ping), start_s, end_s)
     notes += _left_out("GNSS fix", len(fix_s) - len(fix), start_s, end_s)
 
@@ -73,7 +73,7 @@ def build_timeline(mission: Mission, *, start_s: float, interval_s: float) -> Ti
     )
 
 
-def _inside(time_s: Array, start_s: float, end_s: float) -> NDArray[np.bool_]:
+def is_inside(time_s: Array, start_s: float, end_s: float) -> NDArray[np.bool_]:
     """Return which times lie in the span, but for rounding."""
     return (time_s > start_s - MIN_SPACING_S) & (time_s < end_s + MIN_SPACING_S)
 

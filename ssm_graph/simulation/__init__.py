@@ -8,7 +8,7 @@ from ssm_graph.simulation.config import SimulationConfig
 from ssm_graph.simulation.dvl_model import DvlSettings, default_mount, janus_beams
 from ssm_graph.simulation.faults import Fault, Loss, OutlierKind, Outliers
 from ssm_graph.simulation.grades import IMU_NOISE, START_SIGMAS, Grade, StartSigmas
-from ssm_graph.simulation.mission import SimulatedMission, simulate
+from ssm_graph.simulation.mission import SimulatedMission, simulate, with_dvl_errors
 from ssm_graph.simulation.routes import (
     DepthProfile,
     DiveRoute,
@@ -51,4 +51,5 @@ __all__ = [
     "janus_beams",
     "scenario_config",
     "simulate",
+    "with_dvl_errors",
 ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +15,14 @@ from ssm_graph.earth import LocalFrame
 from ssm_graph.simulation.aids import depth_log, gnss_log
 from ssm_graph.simulation.config import SimulationConfig
 from ssm_graph.simulation.dvl_model import beam_ranges, ping_times, true_beam_speeds
-from ssm_graph.simulation.faults import add_faults, draw_missing, draw_outliers
+from ssm_graph.simulation.faults import (
+    Fault,
+    Loss,
+    Outliers,
+    add_faults,
+    draw_missing,
+    draw_outliers,
+)
 from ssm_graph.simulation.grades import initial_state
 from ssm_graph.simulation.imu_model import averaged_imu, imu_errors
 from ssm_graph.simulation.streams import Streams, spawn_streams
@@ -63,7 +71,8 @@ def simulate(config: SimulationConfig) -> SimulatedMission:
     n_samples = math.floor(config.duration_s * config.imu_rate_hz + 1e-9)
     end_s = n_samples / config.imu_rate_hz
     imu, gyro_bias, accel_bias = _imu(config, streams, n_samples)
-    dvl = _dvl(config, streams, end_s)
+    ping_s = ping_times(config.dvl, end_s=end_s, rng=streams.ping_time)
+    dvl = _dvl(config, streams, ping_s, true_beam_speeds(config.trajectory, config.dvl, ping_s))
     depth, gnss = _aids(config, streams, end_s)
     truth = config.trajectory.truth(_reference_times(config, end_s))
     initial_rng = streams.initial if config.draw_initial_errors else None
@@ -86,6 +95,38 @@ def simulate(config: SimulationConfig) -> SimulatedMission:
         ping_time_s=dvl.time_s,
         gyro_bias=gyro_bias,
         accel_bias=accel_bias,
+    )
+
+
+def with_dvl_errors(
+    simulated: SimulatedMission,
+    *,
+    outliers: Outliers | None = None,
+    faults: Sequence[Fault] = (),
+    losses: Sequence[Loss] = (),
+    dropout_rate: float = 0.0,
+) -> SimulatedMission:
+    """Return the same run with other DVL errors; those that it had are replaced.
+
+    Every source of error has a random stream of its own, so that this is, bit by bit, what
+    :func:`simulate` makes of the settings with these errors, at a hundredth of the work: all but
+    the DVL log is shared with ``simulated``.
+    """
+    config = dataclasses.replace(
+        simulated.config,
+        outliers=outliers or Outliers(),
+        faults=tuple(faults),
+        losses=tuple(losses),
+        dropout_rate=dropout_rate,
+    )
+    streams = spawn_streams(config.seed)
+    dvl = _dvl(config, streams, simulated.ping_time_s, simulated.true_speed)
+    return dataclasses.replace(
+        simulated,
+        config=config,
+        mission=dataclasses.replace(simulated.mission, dvl=dvl.log),
+        is_outlier=dvl.is_outlier,
+        beam_offset=dvl.offset,
     )
 
 
@@ -126,11 +167,9 @@ class _Dvl(NamedTuple):
     is_outlier: NDArray[np.bool_]
 
 
-def _dvl(config: SimulationConfig, streams: Streams, end_s: float) -> _Dvl:
+def _dvl(config: SimulationConfig, streams: Streams, time_s: Array, true_speed: Array) -> _Dvl:
     """Return the pings as read, and what was done to them."""
     settings = config.dvl
-    time_s = ping_times(settings, end_s=end_s, rng=streams.ping_time)
-    true_speed = true_beam_speeds(config.trajectory, settings, time_s)
     drawn = draw_outliers(config.outliers, time_s, true_speed, rng=streams.outliers)
     offset, is_outlier = add_faults(drawn, config.faults, time_s)
     missing = draw_missing(

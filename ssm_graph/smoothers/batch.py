@@ -1,17 +1,17 @@
-"""The batch smoother: similarity weights for every beam by iteratively reweighted least squares."""
+"""The batch smoother: a weight for every beam by iteratively reweighted least squares."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from enum import Enum
 from typing import NamedTuple
 
 import gtsam
 import numpy as np
 
-from factors.similarity import WEIGHT_FLOOR, Kernel, LogKernel, expected_mahalanobis_sq
+from factors.m_estimators import TruncatedKernel
+from factors.similarity import Kernel, LogKernel, Similarity, expected_mahalanobis_sq
 from ssm_graph.data import Array
 from ssm_graph.errors import ConfigError, SolverError
 from ssm_graph.estimate import BeamTable, Estimate, Iteration, Status
@@ -21,15 +21,16 @@ from ssm_graph.graph.solve import marginal_covariances, solve_linear
 from ssm_graph.graph.states import States, retract
 from ssm_graph.problem.problem import Problem
 from ssm_graph.problem.trajectory import trajectory_from_states
+from ssm_graph.smoothers.gnc import GncSchedule, Graduation, Schedule, WarmSchedule
 from ssm_graph.smoothers.verdict import contradictions
+
+__all__ = ["OnIteration", "Similarity", "SmootherConfig", "SsmSmoother"]
 
 OnIteration = Callable[[int, int, Iteration], None]
 """Called after each iteration with its number, the limit, and what happened."""
 
 WARM_KERNEL = LogKernel()
 """Kernel of the first pass and of the first iterations, whichever is asked for in the end."""
-WARM_UPDATE_SIGMAS = 1.0
-"""The kernel asked for takes over once the updates are below this."""
 MAX_HALVINGS = 10
 COST_SLACK = 1e-2
 """A rise of the cost by less is rounding: one residual at its sigma costs 0.5."""
@@ -37,19 +38,15 @@ RUNAWAY_SPEED = 1e4
 """m/s; ten silent minutes of a MEMS unit may begin with 100 m/s and still come back."""
 
 
-class Similarity(Enum):
-    """What the weight of a beam is judged by."""
-
-    EXPECTED = "residual and posterior variance"
-    PLAIN = "residual alone: the plain M-estimator"
-
-
 @dataclass(frozen=True, slots=True)
 class SmootherConfig:
     """Settings of the similarity loop."""
 
     kernel: Kernel = field(default_factory=LogKernel)
-    similarity: Similarity = Similarity.EXPECTED
+    similarity: Similarity | None = None
+    """What a beam is judged by; None for what the kernel was published with."""
+    graduation: Graduation | None = None
+    """Come to a truncated kernel by graduated non-convexity; None goes straight to the kernel."""
     max_iterations: int = 100
     tolerance: float = 1e-3
     """Updates in their own posterior sigmas, and changes of weights, below which it has settled."""
@@ -59,6 +56,28 @@ class SmootherConfig:
             raise ConfigError(f"max_iterations: expected 1 or more, got {self.max_iterations}")
         if not 0.0 < self.tolerance < 1.0:
             raise ConfigError(f"tolerance: expected a number in (0, 1), got {self.tolerance}")
+        if self.graduation is not None and not isinstance(self.kernel, TruncatedKernel):
+            raise ConfigError(f"graduation: expected with a TruncatedKernel, got {self.kernel}")
+
+    @property
+    def judged_by(self) -> Similarity:
+        """What a beam is judged by, whether asked for or the kernel's own."""
+        return self.similarity or self.kernel.published_with
+
+    @property
+    def weighting(self) -> str:
+        """Kernel and schedule as text, for example ``log(dof=5)``."""
+        if self.graduation is None:
+            return str(self.kernel)
+        assert isinstance(self.kernel, TruncatedKernel)
+        return f"gnc-tls(width={self.kernel.width:g}, {self.graduation})"
+
+    def schedule(self) -> Schedule:
+        """Return which kernel weighs the beams, pass by pass, from the begin."""
+        if self.graduation is None:
+            return WarmSchedule(self.kernel, WARM_KERNEL)
+        assert isinstance(self.kernel, TruncatedKernel)
+        return GncSchedule(self.kernel, self.graduation, WARM_KERNEL)
 
 
 class _Pass(NamedTuple):
@@ -94,35 +113,6 @@ def _descend(
     return states, linearizer.beam_rows(states), update / scale
 
 
-class _Mixing:
-    """Anderson acceleration of depth one for the fixed point of the weights.
-
-    Plain reweighting closes in by a constant factor a pass; two passes tell the factor, and the
-    rest of the way is taken at once. The fixed point stays what it is.
-
-    References
-    ----------
-    .. [1] H. F. Walker, P. Ni, "Anderson Acceleration for Fixed-Point Iterations", SIAM Journal on
-       Numerical Analysis 49, 2011.
-    """
-
-    def __init__(self) -> None:
-        self._last: tuple[Array, Array] | None = None
-
-    def next_weights(self, used: Array, settled: Array) -> Array:
-        """Return the weights to try next, from those used and those they led to."""
-        change = settled - used
-        last, self._last = self._last, (change, settled)
-        if last is None:
-            return settled
-        turn = change - last[0]
-        length_sq = float(turn @ turn)
-        if length_sq < 1e-16:
-            return settled
-        mixed = settled - float(change @ turn) / length_sq * (settled - last[1])
-        return np.asarray(np.clip(mixed, WEIGHT_FLOOR, max(1.0, 2.0 * float(settled.max()))))
-
-
 class SsmSmoother:
     """Smooth a whole mission; see :func:`ssm_graph.build_problem` for its input."""
 
@@ -143,31 +133,31 @@ class SsmSmoother:
         linearizer = GraphLinearizer(problem)
         first = first_values(problem, kernel=WARM_KERNEL, inertial=linearizer.inertial)
         states, rows = first.states, linearizer.beam_rows(first.states)
-        weights = first.weights
-        kernel: Kernel = WARM_KERNEL
+        schedule = self.config.schedule()
+        weights = schedule.first_weights(first.weights)
         iterations: list[Iteration] = []
         status = Status.MAX_ITERATIONS
-        mixing = _Mixing()
         for number in range(self.config.max_iterations):
             try:
-                this = self._iterate(linearizer, states, rows, weights, kernel)
+                this = self._iterate(linearizer, states, rows, weights, schedule.kernel)
             except KeyboardInterrupt:
                 if not iterations:
                     raise
                 status = Status.INTERRUPTED
                 break
-            is_near = this.update_sigmas < WARM_UPDATE_SIGMAS
-            weights = mixing.next_weights(weights, this.weights) if is_near else this.weights
             states, rows = this.states, this.beam_rows
-            iterations.append(Iteration(this.update_sigmas, this.weight_change, str(kernel)))
+            iterations.append(
+                Iteration(this.update_sigmas, this.weight_change, str(schedule.kernel))
+            )
             if on_iteration is not None:
                 on_iteration(number + 1, self.config.max_iterations, iterations[-1])
-            if kernel != self.config.kernel:
-                if is_near:
-                    kernel, mixing = self.config.kernel, _Mixing()
-            elif max(this.update_sigmas, this.weight_change) < self.config.tolerance:
+            is_settled = max(this.update_sigmas, this.weight_change) < self.config.tolerance
+            if is_settled and schedule.may_end(this.weights):
                 status = Status.CONVERGED
                 break
+            weights = schedule.next_weights(
+                weights, this.weights, t=this.mahalanobis_sq, update_sigmas=this.update_sigmas
+            )
         notes = problem.notes
         if first.n_doubts:
             notes += (
@@ -208,7 +198,7 @@ class SsmSmoother:
 
     def _mahalanobis_sq(self, problem: Problem, rows: BeamRows, covariance: Array) -> Array:
         H, beams = rows.jacobian, problem.beams
-        if self.config.similarity is Similarity.PLAIN:
+        if self.config.judged_by is Similarity.PLAIN:
             spread = np.zeros(len(H))
         else:
             spread = np.einsum("mi,mij,mj->m", H, covariance[beams.keyframe], H, optimize=True)
@@ -242,7 +232,7 @@ class SsmSmoother:
         problem, beams = linearizer.problem, linearizer.problem.beams
         return Estimate(
             method="smoother",
-            kernel=str(self.config.kernel),
+            kernel=self.config.weighting,
             status=status,
             reason=reason,
             trajectory=trajectory_from_states(problem, last.states, last.covariance),

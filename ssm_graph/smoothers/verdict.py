@@ -8,6 +8,7 @@ from scipy.stats import chi2
 
 from ssm_graph.data import Array
 from ssm_graph.graph.linearize import BeamRows, GraphLinearizer
+from ssm_graph.graph.marginal_prior import MarginalPrior
 from ssm_graph.graph.states import States
 from ssm_graph.problem.problem import Problem
 
@@ -101,17 +102,18 @@ def _doubt_stretches(problem: Problem, weights: Array) -> str:
     )
 
 
-def _doubt_prior(prior: gtsam.NonlinearFactorGraph, states: States) -> str:
-    names = ("position or attitude", "velocity", "bias")
-    for i, name in enumerate(names):
-        factor = prior.at(i)
-        assert isinstance(factor, gtsam.NoiseModelFactor)
-        whitened = factor.whitenedError(states.values)
-        chi_sq = float(whitened @ whitened)
-        if chi2.sf(chi_sq, df=len(whitened)) < PRIOR_TAIL:
+def _doubt_prior(prior: MarginalPrior, states: States) -> str:
+    whitened = prior.whitened(states)
+    for name, part in (
+        ("position or attitude", whitened[:6]),
+        ("velocity", whitened[6:9]),
+        ("bias", whitened[9:]),
+    ):
+        chi_sq = float(part @ part)
+        if chi2.sf(chi_sq, df=len(part)) < PRIOR_TAIL:
             return (
                 f"the initial {name} is contradicted by the data (chi-square {chi_sq:.0f} for "
-                f"{len(whitened)} degrees of freedom, largest {np.max(np.abs(whitened)):.0f} "
+                f"{len(part)} degrees of freedom, largest {np.max(np.abs(part)):.0f} "
                 "sigma): check the start, above all its heading, or drop [initial] to align"
             )
     return ""

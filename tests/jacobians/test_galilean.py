@@ -5,11 +5,14 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 import pytest
+from gtsam.symbol_shorthand import B, V, X
 
 from ssm_graph.data import Array
-from ssm_graph.graph.linearize import depth_graph, gnss_graph, inertial_graph, prior_graph
+from ssm_graph.graph.depth import depth_graph
+from ssm_graph.graph.linearize import gnss_graph, inertial_graph, prior_graph
+from ssm_graph.graph.marginal_prior import prior_at_start
 from ssm_graph.graph.states import States, states_from_arrays
-from ssm_graph.problem.problem import build_problem
+from ssm_graph.problem.problem import build_problem, start_of
 from ssm_graph.simulation import GnssSettings, Grade
 from tests.helpers import assert_jacobians_match, rotation, simulated, true_states
 
@@ -56,22 +59,32 @@ def test_prior_gnss_and_depth_jacobians(turn: Array) -> None:
         assert graph.size() >= 4
         for k in range(graph.size()):
             assert_jacobians_match(graph.at(k), states.values)
-    # The prior on the pose is logarithmic: near its mean, where it is used.
+    # The prior on the rotation is logarithmic: near its mean, where it is used.
     near = disturbed(true_states(problem, sim), np.zeros(3), seed=3)
     prior = prior_graph(problem)
-    assert prior.size() == 3
-    for k in range(3):
+    assert prior.size() == 4
+    for k in range(4):
         assert_jacobians_match(prior.at(k), near.values, rtol=1e-5)
 
 
-def test_prior_error_is_in_body_axes_at_the_prior() -> None:
-    """The covariance handed over is that of GTSAM's pose tangent: rotation, then body axes."""
-    problem = build_problem(simulated(duration_s=2.0).mission)
-    prior = prior_graph(problem).at(0)
-    assert isinstance(prior, gtsam.PriorFactorPose3)
-    pose = prior.prior()
-    offset = np.array([0.0, 0.0, 0.0, 0.3, -0.1, 0.2])
-    values = gtsam.Values()
-    moved = gtsam.Pose3(pose.rotation(), pose.translation() + pose.rotation().matrix() @ offset[3:])
-    values.insert(prior.keys()[0], moved)
-    np.testing.assert_allclose(prior.unwhitenedError(values), offset, atol=1e-12)
+def test_marginal_prior_is_the_prior_graph_and_its_derivative_is_exact() -> None:
+    """Half its squared length is the cost of GTSAM's four factors, and falls as it says."""
+    sim = simulated(duration_s=2.0)
+    problem = build_problem(sim.mission)
+    prior, graph = prior_at_start(start_of(problem)), prior_graph(problem)
+    states = disturbed(true_states(problem, sim), np.array([0.1, -0.2, 0.3]), seed=3)
+    cost = 0.5 * float(np.sum(prior.whitened(states) ** 2))
+    assert cost == pytest.approx(graph.error(states.values), rel=1e-9)
+    _, b = prior.linear_factor(states).jacobian()
+    assert 0.5 * float(b @ b) == pytest.approx(cost, rel=1e-12)
+    gradient = gradient_of(prior.linear_factor(states))
+    linear = graph.linearize(states.values).gradientAtZero()
+    for key in (X(0), V(0), B(0)):
+        np.testing.assert_allclose(gradient.at(key), linear.at(key), rtol=1e-6, atol=1e-6)
+
+
+def gradient_of(factor: gtsam.JacobianFactor) -> gtsam.VectorValues:
+    """Return the gradient of one linear factor."""
+    graph = gtsam.GaussianFactorGraph()
+    graph.push_back(factor)
+    return graph.gradientAtZero()

@@ -16,8 +16,9 @@ from factors.similarity import ExpKernel, GaussianKernel, Kernel, LogKernel, Sqr
 from ssm_graph.data import Array
 from ssm_graph.errors import ConfigError
 from ssm_graph.estimate import Estimate, Iteration, Status
+from ssm_graph.graph.depth import depth_graph
 from ssm_graph.graph.first_values import first_values
-from ssm_graph.graph.linearize import depth_graph, gnss_graph, inertial_graph, prior_graph
+from ssm_graph.graph.linearize import gnss_graph, inertial_graph, prior_graph
 from ssm_graph.graph.states import States, states_from_arrays
 from ssm_graph.problem.problem import Problem, build_problem
 from ssm_graph.simulation import GnssSettings, Grade, Loss, OutlierKind, Outliers
@@ -110,7 +111,8 @@ def test_gaussian_kernel_is_the_plain_smoother(grade: Grade) -> None:
     """Without robust weights the loop ends where GTSAM's own optimiser ends, from elsewhere."""
     sim = simulated(duration_s=15.0, grade=grade, gnss=GNSS, dropout_rate=0.1, seed=2)
     problem = build_problem(sim.mission)
-    estimate = smoothed(problem, kernel=GaussianKernel(), tolerance=1e-8)
+    # Heights are good to 1e-9 m, the rounding of the radius of the Earth: 3e-8 of their sigma.
+    estimate = smoothed(problem, kernel=GaussianKernel(), tolerance=1e-7)
     assert estimate.status is Status.CONVERGED
     states = estimated_states(problem, estimate.trajectory)
     truth = true_states(problem, sim)

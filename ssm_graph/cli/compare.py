@@ -1,0 +1,252 @@
+"""``ssm-graph compare``: many missions by many methods, and what came of it."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shlex
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as Bar
+
+from ssm_graph.cli.options import add_command, table_format_option
+from ssm_graph.errors import ConfigError
+from ssm_graph.evaluation.comparison import compare_methods
+from ssm_graph.io.mission import TableFormat
+from ssm_graph.report.compare_tables import latex, markdown
+from ssm_graph.study.cluster import DaskCluster
+from ssm_graph.study.jobs import Execute
+from ssm_graph.study.methods import FAMILIES
+from ssm_graph.study.processes import JobProcesses
+from ssm_graph.study.runner import (
+    Progress,
+    StudyResult,
+    example_estimates,
+    open_store,
+    run_study,
+)
+from ssm_graph.study.scenario import Study, read_study, study_of_folders
+from ssm_graph.study.table import parquet_module, write_rows
+
+FOLDER_METHODS: Final = ("smoother-log", "smoother-gaussian")
+PLAIN_EVERY_S: Final = 30.0
+"""From one plain line to the next, where there is no terminal."""
+
+DESCRIPTION = """\
+Run methods on the missions of a study file, or on recorded missions, and compare them.
+
+Finished runs are kept: interrupted and started again, only what is missing is run. A trial is
+drawn from its number alone, so that neither --jobs nor --scheduler change any result.
+
+files in DIR:
+  runs.jsonl      finished runs, one a line, as they come; from here an interrupted study goes on
+  series/*.npz    errors every 10 s of every run, for the figures
+  table.csv       one row for every mission and method (or table.parquet): errors, consistency,
+                  weights, time
+  summary.md      means with intervals, differences between methods, for reading
+  summary.tex     the same as LaTeX tables
+  figures/*.png   errors over time, consistency, and one example mission
+
+study file (TOML):
+  name = "headline"                  # also baseline = "METHOD": others are compared with it
+  scenario = "survey"                # as in ssm-graph simulate
+  duration_s = 600.0
+  grades = ["navigation", "tactical"]
+  first_seed = 0
+  [[methods]]                        # any number of them
+  names = ["smoother-log", "oracle"]
+  seeds = 30
+  [[cases]]                          # every kind with every rate and every size
+  kinds = ["sparse", "burst"]
+  rates = [0.05, 0.10]
+  sizes_m_per_s = [[0.5, 3.0]]       # if left out: that of the kind
+  [[cases]]                          # programmed faults; duration_s may differ
+  name = "fault40"
+  duration_s = 1200.0
+  dropout_rate = 0.0
+  faults = [{beams = [0], turn_by_seed = true, start_s = 600.0, length_s = 40.0,
+             offset_m_per_s = 1.0}]  # on one line; beams from 0, turned: plus seed, modulo 4
+  losses = [{beams = [3], start_s = 300.0, length_s = 180.0}]
+"""
+
+
+def add_parser(commands: Any, *, epilog: str) -> None:
+    """Declare the command and its options."""
+    methods = "\n".join(f"  {_shown(name):26} {f.description}" for name, f in FAMILIES.items())
+    parser = add_command(
+        commands,
+        "compare",
+        summary="compare methods on many simulated or recorded missions",
+        description=f"{DESCRIPTION}\nmethods:\n{methods}",
+        epilog=epilog,
+    )
+    parser.add_argument(
+        "inputs", type=Path, nargs="+", metavar="INPUT", help="a study file, or mission folders"
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="result folder")
+    parser.add_argument(
+        "--methods",
+        metavar="A,B,C",
+        help="methods instead of those of the study file (default for mission folders: "
+        f"{','.join(FOLDER_METHODS)})",
+    )
+    parser.add_argument(
+        "--seeds", type=int, metavar="N", help="this many trials instead of the study file's"
+    )
+    parser.add_argument(
+        "--jobs",
+        type=int,
+        default=os.cpu_count() or 1,
+        metavar="N",
+        help="processes (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="do the work on the Dask cluster of this scheduler, for example tcp://HOST:8786; its "
+        "workers need this very version, one thread each (dask worker --nthreads 1)",
+    )
+    parser.add_argument("--fresh", action="store_true", help="throw earlier runs in DIR away")
+    parser.add_argument("--no-figures", action="store_true", help="draw no figures")
+    table_format_option(parser)
+    parser.set_defaults(run=run)
+
+
+def _shown(name: str) -> str:
+    default = FAMILIES[name].default
+    return name if default is None else f"{name}[:{default:g}]"
+
+
+def run(arguments: argparse.Namespace, console: Console, errors: Console) -> bool:
+    """Run what is missing, then write table, summaries and figures."""
+    if arguments.format is TableFormat.PARQUET:
+        parquet_module("pyarrow")
+    study, execute = study_from(arguments), execute_from(arguments)
+    store = open_store(study, arguments.out, fresh=arguments.fresh)
+    if len(store) > 0:
+        errors.print(f"going on: {len(store)} runs are done already", highlight=False)
+    try:
+        with StudyDisplay(errors) as show:
+            result = run_study(study, store, execute=execute, on_progress=show)
+    except KeyboardInterrupt:
+        errors.print(
+            f"{len(store)} finished runs are kept in {store.path}; the same command goes on there",
+            highlight=False,
+            soft_wrap=True,
+        )
+        raise
+    command = shlex.join(["ssm-graph", *sys.argv[1:]])
+    text = write_study(arguments.out, study, result, arguments.format, command=command)
+    if not arguments.no_figures:
+        _write_figures(arguments.out / "figures", study, result, errors)
+    console.print(text, markup=False, highlight=False, soft_wrap=True)
+    console.print(
+        f"{len(result.rows)} runs, {result.n_failed} without a result; results in {arguments.out}",
+        highlight=False,
+        soft_wrap=True,
+    )
+    return result.n_failed == 0
+
+
+def study_from(arguments: argparse.Namespace) -> Study:
+    """Return what is to be compared."""
+    paths: Sequence[Path] = arguments.inputs
+    files = [path for path in paths if path.suffix == ".toml" and not path.is_dir()]
+    methods = None
+    if arguments.methods is not None:
+        methods = [name for name in arguments.methods.split(",") if name.strip()]
+    if not files:
+        study = study_of_folders(paths, FOLDER_METHODS if methods is None else methods)
+        return study.changed(n_seeds=arguments.seeds)
+    if len(paths) > 1:
+        raise ConfigError(
+            f"INPUT: expected one study file or mission folders, got {files[0]} among "
+            f"{len(paths)}; run them one by one"
+        )
+    return read_study(files[0]).changed(methods=methods, n_seeds=arguments.seeds)
+
+
+def execute_from(arguments: argparse.Namespace) -> Execute:
+    """Return who does the work."""
+    if arguments.scheduler is not None:
+        return DaskCluster(arguments.scheduler)
+    return JobProcesses(arguments.jobs)
+
+
+def write_study(
+    folder: Path, study: Study, result: StudyResult, form: TableFormat, *, command: str
+) -> str:
+    """Write the table and both summaries; return the summary for the terminal."""
+    write_rows(folder / f"table{form.value}", result.rows)
+    comparison = compare_methods(result.rows, baseline=study.baseline)
+    text = markdown(comparison, title=f"Study: {study.name}", command=command, code=result.code)
+    (folder / "summary.md").write_text(text, encoding="utf-8")
+    caption = f"Study {study.name}: {command}; ssm-graph {result.code}"
+    table = latex(comparison, caption=caption, label=f"tab:{study.name}")
+    (folder / "summary.tex").write_text(table, encoding="utf-8")
+    return text
+
+
+def _write_figures(folder: Path, study: Study, result: StudyResult, errors: Console) -> None:
+    from ssm_graph.report.compare_figures import save_figures
+
+    errors.print("drawing figures; the example mission is run once more")
+    save_figures(folder, result.rows, result.series, example_estimates(study))
+
+
+class StudyDisplay:
+    """A bar with the time left on a terminal, a plain line now and then elsewhere."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._begin = self._said = time.monotonic()
+        self._bar = Bar(
+            TextColumn("{task.description}", markup=False),
+            BarColumn(bar_width=24),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        self._task = self._bar.add_task("runs", total=None)
+
+    def __enter__(self) -> StudyDisplay:
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._bar.stop()
+
+    def __call__(self, progress: Progress) -> None:
+        """Show what was done last, and how long the rest will take."""
+        self._bar.update(
+            self._task,
+            description=progress.label,
+            completed=progress.n_done,
+            total=progress.n_wanted,
+        )
+        now, is_last = time.monotonic(), progress.n_done == progress.n_wanted
+        if self._console.is_terminal or not (is_last or now - self._said >= PLAIN_EVERY_S):
+            return
+        self._said = now
+        left_s = (now - self._begin) * (progress.n_wanted / progress.n_done - 1.0)
+        self._console.print(
+            f"{progress.n_done} of {progress.n_wanted} runs, {progress.label}, "
+            f"{left_s / 60.0:.1f} min left",
+            markup=False,
+            highlight=False,
+            soft_wrap=True,
+        )

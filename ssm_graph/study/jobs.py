@@ -1,0 +1,140 @@
+"""What a process is handed: some trials of one cell, and the methods to try on them."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from ssm_graph.data import Array
+from ssm_graph.simulation import Grade
+from ssm_graph.study.cells import Recording, Source
+from ssm_graph.study.code import code_version
+from ssm_graph.study.methods import parse_method, shown
+from ssm_graph.study.scoring import LOST, Row, failed_row, score
+from ssm_graph.study.trials import Trial, recorded_trial, simulated_trials
+
+_ONE_AT_A_TIME: Final = threading.Lock()
+"""Jobs of one process share missions, whose gravity follows the estimate: no two at once."""
+
+
+class RunKey(NamedTuple):
+    """What tells one run from another."""
+
+    source: str
+    """``id`` of the cell or recording."""
+    grade: str
+    seed: int
+    method: str
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """Some trials and the methods that have not been run on them yet."""
+
+    study: str
+    source: Source
+    grade: Grade | None
+    """None for a recorded mission."""
+    seeds: tuple[int, ...]
+    methods: tuple[str, ...]
+
+    @property
+    def n_runs(self) -> int:
+        """Number of missions times methods."""
+        return len(self.seeds) * len(self.methods)
+
+    @property
+    def grade_name(self) -> str:
+        """Name of the grade as in the table; empty for a recorded mission."""
+        return "" if self.grade is None else self.grade.name.lower()
+
+    @property
+    def missions(self) -> frozenset[tuple[object, ...]]:
+        """What has to be simulated or read: jobs that share it are best done by one process."""
+        if isinstance(self.source, Recording):
+            return frozenset({(self.source.id,)})
+        common = (self.source.scenario, self.source.duration_s, self.grade_name)
+        return frozenset((*common, seed) for seed in self.seeds)
+
+    def run_keys(self) -> Iterator[RunKey]:
+        """Yield the keys of all runs."""
+        for method in self.methods:
+            for seed in self.seeds:
+                yield RunKey(self.source.id, self.grade_name, seed, method)
+
+    def labels(self, seed: int, method: str) -> Row:
+        """Return what a row says of a run before it is done."""
+        own = {"study": self.study, "grade": self.grade_name, "method": method}
+        return {**self.source.labels(), **own, "seed": seed}
+
+    def halves(self) -> tuple[Job, ...]:
+        """Return two smaller jobs; the job alone if there is nothing to share out."""
+        for name in ("seeds", "methods"):
+            whole = getattr(self, name)
+            if len(whole) > 1:
+                half = len(whole) // 2
+                first, second = {name: whole[:half]}, {name: whole[half:]}
+                return replace(self, **first), replace(self, **second)
+        return (self,)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JobResult:
+    """What came of a job."""
+
+    job: Job
+    rows: dict[RunKey, Row]
+    series: dict[str, Array]
+    """Errors over time (seeds, T, 3) by method, for figures."""
+    code: str
+    """Version of the code that did it."""
+
+
+Execute = Callable[[Sequence[Job]], Iterator[JobResult]]
+"""Does jobs somewhere, and yields what comes of them as it comes."""
+
+
+def do_job(job: Job) -> JobResult:
+    """Do a job here and now; whatever goes wrong with a run becomes its row."""
+    with _ONE_AT_A_TIME:
+        try:
+            trials = _trials(job)
+        except Exception as error:
+            return failed_job(job, shown(error))
+        rows: dict[RunKey, Row] = {}
+        series: dict[str, Array] = {}
+        for name in job.methods:
+            outcomes = parse_method(name).run(trials)
+            scored = [
+                score(job.labels(trial.seed, name), trial, outcome)
+                for trial, outcome in zip(trials, outcomes, strict=True)
+            ]
+            keys = (RunKey(job.source.id, job.grade_name, seed, name) for seed in job.seeds)
+            rows |= zip(keys, (row for row, _ in scored), strict=True)
+            series[name] = np.stack([samples for _, samples in scored])
+        return JobResult(job, rows, series, code_version())
+
+
+def _trials(job: Job) -> list[Trial]:
+    if isinstance(job.source, Recording):
+        return [recorded_trial(job.source)]
+    assert job.grade is not None
+    return simulated_trials(job.source, job.grade, job.seeds)
+
+
+def failed_job(job: Job, message: str, **status: str) -> JobResult:
+    """Return the result of a job of which nothing came."""
+    rows: dict[RunKey, Row] = {
+        key: failed_row(job.labels(key.seed, key.method), message, **status)
+        for key in job.run_keys()
+    }
+    return JobResult(job, rows, {}, code_version())
+
+
+def lost_job(job: Job, message: str) -> JobResult:
+    """Return the result of a job that took its process with it."""
+    return failed_job(job, message, status=LOST)

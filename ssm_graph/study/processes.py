@@ -1,0 +1,165 @@
+"""Jobs in processes of this machine; one that dies takes no other's work with it."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from typing import Final
+
+from ssm_graph.errors import ConfigError
+from ssm_graph.study.jobs import Job, JobResult, do_job, lost_job
+
+MAX_DEATHS: Final = 2
+"""A single run that ends its process as often is given up."""
+_THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+class JobProcesses:
+    """An :data:`~ssm_graph.study.jobs.Execute` for a number of processes.
+
+    Every process has a pipe of its own, so that it is known which job a dead one was at: that job
+    is halved and tried again, down to the single run that is to blame. A process prefers jobs
+    whose missions it has simulated already.
+    """
+
+    def __init__(self, n_processes: int) -> None:
+        if n_processes < 1:
+            raise ConfigError(f"--jobs: expected 1 or more processes, got {n_processes}; try 2")
+        self.n_processes = n_processes
+
+    def __call__(self, jobs: Sequence[Job]) -> Iterator[JobResult]:
+        """Yield what comes of the jobs as it comes; closed early, the processes are ended."""
+        waiting = list(jobs)
+        deaths: dict[Job, int] = {}
+        with _one_blas_thread():
+            workers = [_Worker.start() for _ in range(min(self.n_processes, len(waiting)))]
+            try:
+                while waiting or any(worker.job for worker in workers):
+                    self._hand_out(waiting, workers)
+                    yield from self._collect(waiting, workers, deaths)
+            finally:
+                for worker in workers:
+                    worker.process.terminate()
+                for worker in workers:
+                    worker.process.join()
+                    worker.pipe.close()
+
+    def _hand_out(self, waiting: list[Job], workers: list[_Worker]) -> None:
+        for i, worker in enumerate(workers):
+            if worker.job is None and waiting:
+                others = [other.seen for other in workers if other is not worker]
+                job = waiting.pop(best_job(waiting, worker.seen, others))
+                if not worker.give(job):  # died while idle
+                    waiting.insert(0, job)
+                    workers[i] = worker.replaced()
+
+    def _collect(
+        self, waiting: list[Job], workers: list[_Worker], deaths: dict[Job, int]
+    ) -> Iterator[JobResult]:
+        ready = wait([worker.pipe for worker in workers if worker.job])
+        for i, worker in enumerate(workers):
+            if worker.job is None or worker.pipe not in ready:
+                continue
+            job, worker.job = worker.job, None
+            try:
+                result: JobResult = worker.pipe.recv()
+            except (EOFError, OSError):
+                workers[i] = worker.replaced()
+                deaths[job] = deaths.get(job, 0) + 1
+                parts = job.halves()
+                if len(parts) == 1 and deaths[job] >= MAX_DEATHS:
+                    yield lost_job(job, f"its process ended {worker.ending()}")
+                else:
+                    waiting[:0] = parts
+            else:
+                yield result
+
+
+def best_job(
+    waiting: Sequence[Job],
+    seen: set[tuple[object, ...]],
+    others: Sequence[set[tuple[object, ...]]],
+) -> int:
+    """Return the place of the job that shares most missions with those seen, fewest with others'.
+
+    Among equals the first; so no two processes simulate the same mission while others wait.
+    """
+    elsewhere = set().union(*others)
+
+    def merit(place: int) -> tuple[int, int, int]:
+        missions = waiting[place].missions
+        return len(missions & seen), -len(missions & elsewhere), -place
+
+    return max(range(len(waiting)), key=merit)
+
+
+@dataclass(eq=False)
+class _Worker:
+    process: BaseProcess
+    pipe: Connection
+    job: Job | None = None
+    """What it is at."""
+    seen: set[tuple[object, ...]] = field(default_factory=set)
+    """Missions that it has simulated."""
+
+    @staticmethod
+    def start() -> _Worker:
+        context = multiprocessing.get_context("spawn")
+        ours, theirs = context.Pipe()
+        process = context.Process(target=_serve, args=(theirs,), daemon=True)
+        process.start()
+        theirs.close()  # so that its end is seen here
+        return _Worker(process, ours)
+
+    def give(self, job: Job) -> bool:
+        """Hand a job over; False if there is nobody any more."""
+        try:
+            self.pipe.send(job)
+        except OSError:
+            return False
+        self.job = job
+        self.seen |= job.missions
+        return True
+
+    def replaced(self) -> _Worker:
+        """Return a new one for one that died."""
+        self.process.join()
+        self.pipe.close()
+        return _Worker.start()
+
+    def ending(self) -> str:
+        code = self.process.exitcode or 0
+        how = f"by signal {-code}" if code < 0 else f"with exit code {code}"
+        return f"{how}, {MAX_DEATHS} times; short of memory? try fewer --jobs"
+
+
+def _serve(pipe: Connection) -> None:
+    """Do jobs until the other end is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the one who started this decides
+    while True:
+        try:
+            job = pipe.recv()
+        except (EOFError, OSError):
+            return
+        pipe.send(do_job(job))
+
+
+@contextmanager
+def _one_blas_thread() -> Iterator[None]:
+    """Give new processes one thread each: they share the cores already, and results stay equal."""
+    before = {name: os.environ.get(name) for name in _THREADS}
+    os.environ.update(dict.fromkeys(_THREADS, "1"))  # read when a process imports NumPy
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

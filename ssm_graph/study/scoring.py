@@ -1,0 +1,186 @@
+"""One run of a study as a row of numbers: errors against the truth, weights against the faults."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ssm_graph.data import Array
+from ssm_graph.errors import DataError
+from ssm_graph.estimate import OUTLIER_WEIGHT, Estimate, Status, path_length_m
+from ssm_graph.evaluation import Metrics, evaluate
+from ssm_graph.simulation import SimulatedMission
+from ssm_graph.study.methods import Failure, Outcome
+from ssm_graph.study.trials import Trial
+
+LARGE_OFFSET: Final = 0.5
+"""m/s, 100 sigma: outliers from here on must be rejected."""
+SERIES_STEP_S: Final = 10.0
+"""Time between the samples that are kept for figures, s."""
+
+LABEL_COLUMNS: Final = (
+    "study",
+    "case",
+    "grade",
+    "kind",
+    "rate",
+    "size_low_m_per_s",
+    "size_high_m_per_s",
+    "duration_s",
+    "seed",
+    "method",
+)
+NUMBER_COLUMNS: Final = (
+    "horizontal_rms_m",
+    "vertical_rms_m",
+    "velocity_rms_m_per_s",
+    "heading_rms_deg",
+    "end_error_m",
+    "path_length_m",
+    "end_error_percent",
+    "n_epochs",
+    "nees_position",
+    "nees_position_final",
+    "inside_3sigma_east",
+    "inside_3sigma_north",
+    "inside_3sigma_up",
+    "n_outliers",
+    "outliers_rejected",
+    "good_weight",
+    "good_rejected",
+    "iterations",
+    "wall_s",
+)
+COLUMNS: Final = (*LABEL_COLUMNS, "status", "failed", "error", *NUMBER_COLUMNS)
+"""Columns of the table, in their order."""
+TEXT_COLUMNS: Final = frozenset({"study", "case", "grade", "kind", "method", "status", "error"})
+COUNT_COLUMNS: Final = frozenset({"seed", "failed"})
+TIMING_COLUMNS: Final = frozenset({"wall_s"})
+"""Columns that differ from one repetition to the next; all others are the same to the bit."""
+
+FAILED: Final = "FAILED"
+"""Status of a run without an estimate."""
+LOST: Final = "LOST"
+"""Status of a run whose process died; it is tried again when the study is resumed."""
+
+Row = Mapping[str, str | float | int]
+
+
+def failed_row(labels: Row, message: str, *, status: str = FAILED) -> dict[str, str | float | int]:
+    """Return the row of a run without an estimate: no numbers but the reason."""
+    numbers = dict.fromkeys(NUMBER_COLUMNS, math.nan)
+    return {**labels, "status": status, "failed": 1, "error": message, **numbers}
+
+
+def score(labels: Row, trial: Trial, outcome: Outcome) -> tuple[Row, Array]:
+    """Return the row of one run and its series (T, 3): see :func:`series_of`."""
+    if isinstance(outcome, Failure):
+        return failed_row(labels, outcome.message), _no_series(trial)
+    if outcome.status is Status.INTERRUPTED:  # never a result: the study itself was interrupted
+        raise KeyboardInterrupt
+    metrics = _metrics(trial, outcome)
+    numbers = dict.fromkeys(NUMBER_COLUMNS, math.nan)
+    numbers |= _length(outcome) if metrics is None else _errors(metrics)
+    numbers |= _weights(trial, outcome)
+    numbers |= {"iterations": len(outcome.iterations), "wall_s": outcome.wall_s}
+    is_bad = outcome.status is Status.DIVERGED
+    row = {
+        **labels,
+        "status": outcome.status.name,
+        "failed": int(is_bad),
+        "error": "" if outcome.status.is_good else outcome.reason,
+        **numbers,
+    }
+    return row, _no_series(trial) if metrics is None else series_of(trial, metrics)
+
+
+def _metrics(trial: Trial, estimate: Estimate) -> Metrics | None:
+    """Return the errors; None without a reference, or with one of another time."""
+    reference = trial.reference_at(estimate.trajectory.time_s)
+    if reference is None:
+        return None
+    try:
+        return evaluate(estimate.trajectory, reference)
+    except DataError:
+        if trial.simulated is not None:
+            raise
+        return None
+
+
+def _length(estimate: Estimate) -> dict[str, float]:
+    return {"path_length_m": path_length_m(estimate.trajectory)}
+
+
+def _errors(metrics: Metrics) -> dict[str, float]:
+    east, north, up = metrics.inside_3_sigma
+    return {
+        "horizontal_rms_m": metrics.rmse_horizontal_m,
+        "vertical_rms_m": metrics.rmse_vertical_m,
+        "velocity_rms_m_per_s": metrics.rmse_velocity_m_per_s,
+        "heading_rms_deg": math.degrees(metrics.rmse_attitude[2]),
+        "end_error_m": metrics.end_error_m,
+        "path_length_m": metrics.path_length_m,
+        "end_error_percent": metrics.drift_percent,
+        "n_epochs": metrics.n_epochs,
+        "nees_position": metrics.nees_position,
+        "nees_position_final": float(metrics.errors.nees_position[-1]) / 3.0,
+        "inside_3sigma_east": east,
+        "inside_3sigma_north": north,
+        "inside_3sigma_up": up,
+    }
+
+
+def _weights(trial: Trial, estimate: Estimate) -> dict[str, float]:
+    if trial.simulated is None or len(estimate.beams.weight) == 0:
+        return {}
+    offset, is_outlier = beam_truth(trial.simulated, estimate)
+    weight = estimate.beams.weight
+    is_large, good = is_outlier & (np.abs(offset) >= LARGE_OFFSET), ~is_outlier
+    rejected = weight < OUTLIER_WEIGHT
+    return {
+        "n_outliers": int(is_large.sum()),
+        "outliers_rejected": _mean(rejected[is_large]),
+        "good_weight": _mean(weight[good]),
+        "good_rejected": _mean(rejected[good]),
+    }
+
+
+def _mean(values: NDArray[np.float64] | NDArray[np.bool_]) -> float:
+    return float(values.mean()) if len(values) else math.nan
+
+
+def beam_truth(sim: SimulatedMission, estimate: Estimate) -> tuple[Array, NDArray[np.bool_]]:
+    """Return offset (m/s) and outlier flag (M,) of every row of the estimate's beam table."""
+    middle = 0.5 * (sim.ping_time_s[:-1] + sim.ping_time_s[1:])
+    ping = np.searchsorted(middle, estimate.beams.time_s)
+    beam = estimate.beams.beam.astype(np.intp) - 1
+    return sim.beam_offset[ping, beam], sim.is_outlier[ping, beam]
+
+
+def series_times(duration_s: float) -> Array:
+    """Return the times (T,) of a series, seconds since the begin of the mission."""
+    return np.arange(0.0, duration_s + 1e-6, SERIES_STEP_S)
+
+
+def series_of(trial: Trial, metrics: Metrics) -> Array:
+    """Return horizontal error (m), velocity error (m/s) and position NEES/3 (T, 3).
+
+    Each is that of the epoch nearest in time; NaN where there is none within half a step.
+    """
+    errors = metrics.errors
+    time_s = series_times(trial.duration_s)
+    wanted = time_s + trial.mission.imu.start_s
+    middle = 0.5 * (errors.time_s[:-1] + errors.time_s[1:])
+    nearest = np.searchsorted(middle, wanted)
+    is_near = np.abs(errors.time_s[nearest] - wanted) <= 0.5 * SERIES_STEP_S
+    velocity = np.linalg.norm(errors.velocity_enu, axis=1)
+    columns = np.column_stack([errors.horizontal, velocity, errors.nees_position / 3.0])
+    return np.asarray(np.where(is_near[:, None], columns[nearest], np.nan))
+
+
+def _no_series(trial: Trial) -> Array:
+    return np.full((len(series_times(trial.duration_s)), 3), np.nan)
