@@ -30,8 +30,7 @@ from benchmarks.speed_tasks import (
     time_plain,
     write_mission,
 )
-from benchmarks.study_report import table
-from benchmarks.study_store import code_version
+from ssm_graph.study.code import code_version
 
 RESULTS = Path(__file__).resolve().parent / "results"
 OURS, PLAIN, FLOOR = "ours", "(a) plain GTSAM script", "(b) native floor"
@@ -171,6 +170,12 @@ def verdict(timings: dict[str, Timing]) -> str:
         gain = timings[PLAIN].total / ours
         text = f"{gain:.{0 if gain >= 10.0 else 1}f} times faster than (a); {text}"
     return text
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return the lines of a Markdown table."""
+    lines = [header, ["---"] * len(header), *rows]
+    return ["| " + " | ".join(cells) + " |" for cells in lines]
 
 
 def parts_table(timing: Timing) -> list[str]:

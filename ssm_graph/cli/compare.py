@@ -146,7 +146,8 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     text = write_study(arguments.out, study, result, arguments.format, command=command)
     if not arguments.no_figures:
         _write_figures(arguments.out / "figures", study, result, errors)
-    console.print(text, markup=False, highlight=False, soft_wrap=True)
+    headline = text.partition("\n## Every cell")[0]
+    console.print(headline, markup=False, highlight=False, soft_wrap=True)
     console.print(
         f"{len(result.rows)} runs, {result.n_failed} without a result; results in {arguments.out}",
         highlight=False,

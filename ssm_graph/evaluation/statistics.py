@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import chi2, rankdata, wilcoxon
+from scipy.stats import chi2, wilcoxon
 from scipy.stats import t as student_t
 
 from ssm_graph.errors import DataError
@@ -141,7 +141,8 @@ def signed_rank(differences: ArrayLike) -> SignedRank:
     values = values[values != 0.0]
     if len(values) == 0:
         return SignedRank(p=1.0, effect=0.0)
-    ranks = rankdata(np.abs(values))
+    _, place, counts = np.unique(np.abs(values), return_inverse=True, return_counts=True)
+    ranks = (np.cumsum(counts) - 0.5 * (counts - 1))[place]  # equal ones share their mean rank
     effect = float(ranks @ np.sign(values) / ranks.sum())
     return SignedRank(p=float(wilcoxon(values).pvalue), effect=effect)
 

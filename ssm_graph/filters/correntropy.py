@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from factors.similarity import WEIGHT_FLOOR
 from ssm_graph.data import Array
 from ssm_graph.errors import ConfigError
-from ssm_graph.filters.linear_update import Corrected, Groups, Result, correct
+from ssm_graph.filters.linear_update import Corrected, Groups, Result, correct, prepare
 from ssm_graph.filters.model import MeasurementModel, Runs, Update, UpdateRule
 
 
@@ -51,15 +51,16 @@ class CorrentropyUpdate(UpdateRule):
         sigma = np.sqrt(np.einsum("bii->bi", covariance))
         unit = sigma[:, :, None] * sigma[:, None, :]
         root = sigma[:, :, None] * np.linalg.cholesky(covariance / unit)
-        iterate = model.begin()
+        iterate = model.at(np.zeros(sigma.shape))
         for number in range(1, self.max_iterations + 1):
             own = root[runs]
             g_state = self._kernel(np.linalg.solve(own, iterate.xi[..., None])[..., 0])
             g_rows = np.where(is_robust, self._kernel(iterate.innovation), 1.0)
             scaled = (own / g_state[:, None, :]) @ np.swapaxes(own, 1, 2)
-            done = correct(iterate, predicted_cov=scaled, weights=g_rows)
-            before, iterate = iterate.xi, model.move(iterate, done.step, runs)
+            done = correct(prepare(iterate, scaled), weights=g_rows)
+            before, iterate = iterate.xi, iterate.linear_move(done.step)
             has_stopped = self._has_settled(iterate.xi, before, mean, runs, sigma)
+            has_stopped |= ~np.isfinite(done.step).all(axis=1)  # run away: its caller will see
             if number == self.max_iterations:
                 has_stopped[:] = True
             if not np.any(has_stopped):
@@ -67,8 +68,8 @@ class CorrentropyUpdate(UpdateRule):
             result.keep(
                 runs,
                 has_stopped,
-                iterate,
-                covariance=iterate.both_to_local(_joseph(covariance[runs], done)),
+                iterate.xi,
+                covariance=_joseph(covariance[runs], done),
                 weights=g_rows,
                 state_weight=g_state.min(axis=1),
                 mahalanobis_sq=iterate.innovation**2,
@@ -95,7 +96,7 @@ class CorrentropyUpdate(UpdateRule):
 
 def _joseph(covariance: Array, done: Corrected) -> Array:
     """Return the posterior covariance of any gain, with the nominal noise, as published."""
-    H = done.iterate.in_chart(done.iterate.jacobian)
-    left = np.eye(covariance.shape[1]) - done.gain @ H
+    gain = done.gain
+    left = np.eye(covariance.shape[1]) - gain @ done.prepared.H
     joseph = left @ covariance @ np.swapaxes(left, 1, 2)
-    return np.asarray(joseph + done.gain @ np.swapaxes(done.gain, 1, 2))
+    return np.asarray(joseph + gain @ np.swapaxes(gain, 1, 2))

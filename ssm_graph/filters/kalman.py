@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from ssm_graph.data import Array
 from ssm_graph.errors import ConfigError
-from ssm_graph.filters.linear_update import Groups, Result, correct
+from ssm_graph.filters.linear_update import Groups, Prepared, Result, correct, prepare
 from ssm_graph.filters.model import MeasurementModel, Update, UpdateRule
 
 LEFT_OUT = 1e-12
@@ -43,7 +43,8 @@ class KalmanUpdate(UpdateRule):
         mean: Array | None = None,  # noqa: ARG002
     ) -> Update:
         """Correct the predictions of B runs."""
-        return _once(covariance, model, np.ones(model.present.shape))
+        prepared = prepare(model.at(np.zeros(covariance.shape[:2])), covariance)
+        return _once(prepared, model, np.ones(model.present.shape))
 
 
 @final
@@ -72,10 +73,9 @@ class GatedUpdate(UpdateRule):
         mean: Array | None = None,  # noqa: ARG002
     ) -> Update:
         """Correct the predictions of B runs."""
-        rows, groups = model.begin(), Groups(model)
-        H = rows.in_chart(rows.jacobian)
-        robust = groups.is_robust
-        S = H @ covariance @ np.swapaxes(H, 1, 2) + np.eye(H.shape[1])
+        prepared = prepare(model.at(np.zeros(covariance.shape[:2])), covariance)
+        rows, robust = prepared.iterate, Groups(model).is_robust
+        S = prepared.HPHt + np.eye(model.present.shape[1])
         if self.by is Gate.BEAM:
             is_bad = rows.innovation**2 > chi2.ppf(self.confidence, 1) * np.einsum("bii->bi", S)
         else:
@@ -85,21 +85,21 @@ class GatedUpdate(UpdateRule):
             nis = (nu * np.linalg.solve(inner, nu[..., None])[..., 0]).sum(axis=1)
             n_rows = np.maximum(model.present[:, robust].sum(axis=1), 1)
             is_bad = (nis > chi2.ppf(self.confidence, n_rows))[:, None] & np.ones_like(robust)
-        update = _once(covariance, model, np.where(is_bad & robust, LEFT_OUT, 1.0))
+        update = _once(prepared, model, np.where(is_bad & robust, LEFT_OUT, 1.0))
         return update._replace(weights=np.where(update.weights < 1.0, 0.0, 1.0))
 
 
-def _once(covariance: Array, model: MeasurementModel, weights: Array) -> Update:
-    groups, result = Groups(model), Result(covariance, model)
-    runs = np.arange(len(covariance))
-    done = correct(model.begin(), predicted_cov=covariance, weights=weights)
-    after = model.move(done.iterate, done.step, runs)
+def _once(prepared: Prepared, model: MeasurementModel, weights: Array) -> Update:
+    groups, result = Groups(model), Result(prepared.predicted_cov, model)
+    runs = np.arange(len(prepared.H))
+    done = correct(prepared, weights=weights)
+    after = prepared.iterate.linear_move(done.step)
     t = groups.total(done.expected_squares(after))
     result.keep(
         runs,
         np.ones(len(runs), bool),
-        after,
-        covariance=done.local_covariance(after),
+        after.xi,
+        covariance=done.covariance(),
         weights=weights,
         mahalanobis_sq=groups.spread(t, nominal=0.0),
         n_iterations=1,

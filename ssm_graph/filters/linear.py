@@ -36,15 +36,13 @@ class LinearModel:
         whitened, self._H = _whitened(system, z, self.present)
         self._missed = whitened - (self._H @ mean[..., None])[..., 0]
 
-    def begin(self) -> Iterate:
-        """Return all runs at their predicted means."""
-        return Iterate(np.zeros((len(self._H), self._H.shape[2])), self._missed, self._H)
+    def at(self, xi: Array) -> Iterate:
+        """Return all runs at their predicted means plus ``xi``."""
+        return Iterate(xi, self._missed - (self._H @ xi[..., None])[..., 0], self._H)
 
-    def move(self, iterate: Iterate, step: Array, runs: Runs) -> Iterate:
+    def move(self, iterate: Iterate, step: Array, runs: Runs) -> Iterate:  # noqa: ARG002
         """Return the sums."""
-        xi = iterate.xi + step
-        H = self._H[runs]
-        return Iterate(xi, self._missed[runs] - (H @ xi[..., None])[..., 0], H)
+        return iterate.linear_move(step)
 
 
 def _whitened(system: LinearSystem, z: Array, present: NDArray[np.bool_]) -> tuple[Array, Array]:

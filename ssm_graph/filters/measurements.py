@@ -14,7 +14,7 @@ from ssm_graph.data import N_BEAMS, Array
 from ssm_graph.filters.model import NOMINAL, Iterate, Runs
 from ssm_graph.filters.stack import Stack
 from ssm_graph.filters.states import NavigationStates, local_D_deviation
-from ssm_graph.problem.error_state import GYRO_BIAS, POSITION, ROTATION, STATE_DIM, VELOCITY
+from ssm_graph.problem.error_state import GYRO_BIAS, POSITION, ROTATION, VELOCITY
 from ssm_graph.problem.heights import HeightTrack, height_on_the_way, height_track
 
 
@@ -68,10 +68,12 @@ class KeyframeModel:
         self.present = np.concatenate(present, axis=1)
         self.group = np.concatenate(groups)
 
-    def begin(self) -> NavigationIterate:
-        """Return all runs at their predictions."""
-        n_runs = len(self._predicted.p_n)
-        return self._at(self._predicted, np.zeros((n_runs, STATE_DIM)), np.arange(n_runs), None)
+    def at(self, xi: Array) -> NavigationIterate:
+        """Return all runs at deviations from their predictions."""
+        runs = np.arange(len(xi))
+        if not np.any(xi):
+            return self._at(self._predicted, xi, runs, None)
+        return self._at(self._predicted.displaced(xi), xi, runs, local_D_deviation(xi))
 
     def move(self, iterate: Iterate, step: Array, runs: Runs) -> NavigationIterate:
         """Return where local steps lead."""

@@ -80,8 +80,8 @@ class MeasurementModel(Protocol):
     group: NDArray[np.intp]
     """(m,) rows of one group share an auxiliary parameter; :data:`NOMINAL` rows have none"""
 
-    def begin(self) -> Iterate:
-        """Return all runs at their predictions."""
+    def at(self, xi: Array) -> Iterate:
+        """Return all B runs at deviations (B, n) from their predictions."""
 
     def move(self, iterate: Iterate, step: Array, runs: Runs) -> Iterate:
         """Return where local steps (R, n) lead; ``runs`` (R,) says which runs these are."""

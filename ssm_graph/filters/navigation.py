@@ -22,10 +22,15 @@ from ssm_graph.filters.measurements import KeyframeModel
 from ssm_graph.filters.model import Update, UpdateRule
 from ssm_graph.filters.stack import Stack, stack_problems
 from ssm_graph.filters.states import NavigationStates
+from ssm_graph.problem.error_state import VELOCITY
 from ssm_graph.problem.problem import Problem
 
 OnKeyframe = Callable[[int, int], None]
 """Called after each keyframe with its number and how many there are."""
+
+
+RUNAWAY_SIGMA = 1e4
+"""m/s; a filter this uncertain of its velocity has run away."""
 
 
 class Grouping(Enum):
@@ -57,18 +62,20 @@ def run_filter(
     grouping : which beams the rule takes as one measurement.
     on_keyframe : called after each keyframe.
     """
-    return _Filter(stack_problems(problems), rule, grouping).run(on_keyframe)
+    # A run that overflows is found by what comes of it, and is no reason to warn.
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        return _Filter(stack_problems(problems), rule, grouping).run(on_keyframe)
 
 
 class _Filter:
     def __init__(self, stack: Stack, rule: UpdateRule, grouping: Grouping) -> None:
         self._stack, self._rule, self._groups = stack, rule, grouping.groups
-        self._runs = np.arange(len(stack.problems))
+        self._lost = np.zeros(len(stack.problems), dtype=bool)
 
     def run(self, on_keyframe: OnKeyframe | None) -> FilterHistory:
         stack = self._stack
         n_keyframes = stack.n_keyframes
-        history = FilterHistory.empty(n_keyframes, len(self._runs))
+        history = FilterHistory.empty(n_keyframes, len(self._lost))
         predicted, covariance = stack.start, stack.start_cov
         states = None
         for k in range(n_keyframes):
@@ -79,10 +86,30 @@ class _Filter:
                 history.transition[k - 1] = F
             history.predicted.put(k, predicted, covariance)
             states, covariance = self._correct(k, predicted, covariance, states, history)
-            history.posterior.put(k, states, covariance)
+            states, covariance = self._without_lost(states, covariance)
+            history.posterior.put(
+                k, states, np.where(self._lost[:, None, None], np.nan, covariance)
+            )
             if on_keyframe is not None:
                 on_keyframe(k + 1, n_keyframes)
         return history
+
+    def _without_lost(
+        self, states: NavigationStates, covariance: Array
+    ) -> tuple[NavigationStates, Array]:
+        """Put runs that have run away back to their start: the others go on beside them."""
+        variance = np.einsum("bii->bi", covariance)
+        self._lost |= ~np.all(variance > 0.0, axis=1)
+        self._lost |= ~np.all(variance[:, VELOCITY] < RUNAWAY_SIGMA**2, axis=1)
+        self._lost |= ~np.all(np.isfinite(states.p_n + states.v_n), axis=1)
+        if not np.any(self._lost):
+            return states, covariance
+        columns = (
+            np.where(self._lost.reshape(-1, *(1,) * (own.ndim - 1)), start, own)
+            for own, start in zip(states, self._stack.start, strict=True)
+        )
+        kept = np.where(self._lost[:, None, None], self._stack.start_cov, covariance)
+        return NavigationStates(*columns), kept
 
     def _correct(
         self,

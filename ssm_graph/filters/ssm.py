@@ -18,9 +18,10 @@ from ssm_graph.data import Array
 from ssm_graph.filters.linear_update import (
     Corrected,
     Groups,
+    Prepared,
     Result,
     correct,
-    expected_state_square,
+    prepare,
 )
 from ssm_graph.filters.model import Iterate, MeasurementModel, Runs, Update, UpdateRule
 from ssm_graph.problem.error_state import Linearised
@@ -83,41 +84,46 @@ class SsmUpdate(UpdateRule):
         groups, result = Groups(model), Result(covariance, model)
         runs: Runs = np.arange(len(covariance))
         weights, state_weight = np.ones(model.present.shape), np.ones(len(runs))
-        start = iterate = model.begin()
         is_once = self.linearised is Linearised.ONCE
+        prepared = prepare(model.at(np.zeros(covariance.shape[:2])), covariance)
         for number in range(1, self.max_iterations + 1):
-            P = covariance[runs]
-            scaled = P if self.state_kernel is None else P / state_weight[:, None, None]
-            done = correct(iterate, predicted_cov=scaled, weights=weights)
-            iterate = (
-                iterate.linear_move(done.step) if is_once else model.move(iterate, done.step, runs)
-            )
+            done = correct(prepared, weights=weights, state_weight=state_weight)
+            at = prepared.iterate
+            iterate = at.linear_move(done.step) if is_once else model.move(at, done.step, runs)
             t = groups.total(self._squares(iterate, done))
             has_stopped = self._has_settled(done, iterate, mean, runs)
+            has_stopped |= ~np.isfinite(done.step).all(axis=1)  # run away: its caller will see
             if number == self.max_iterations:
                 has_stopped[:] = True
             if np.any(has_stopped):
-                end = model.move(start, iterate.xi, runs) if is_once else iterate
                 result.keep(
                     runs,
                     has_stopped,
-                    end,
-                    covariance=done.local_covariance(end),
+                    iterate.xi,
+                    covariance=done.covariance(),
                     weights=weights,
                     state_weight=state_weight,
                     mahalanobis_sq=groups.spread(t, nominal=0.0),
                     n_iterations=number,
                 )
+            left = ~has_stopped
+            if not np.any(left):
+                break
             settled = self.floor.applied_to(self.kernel, t, groups.size(runs))
-            weights = groups.spread(settled, nominal=1.0)
-            state_weight = self._state_weight(done, iterate, P)
-            if np.any(has_stopped):
-                left = ~has_stopped
-                if not np.any(left):
-                    break
-                runs, weights, state_weight = runs[left], weights[left], state_weight[left]
-                start, iterate = start.take(left), iterate.take(left)
+            weights = groups.spread(settled, nominal=1.0)[left]
+            state_weight = self._state_weight(done, state_weight)[left]
+            prepared, runs = self._next(prepared, iterate, left), runs[left]
         return result.finish()
+
+    def _next(self, prepared: Prepared, iterate: Iterate, left: NDArray[np.bool_]) -> Prepared:
+        """Return what the next pass begins with, of the runs that are left."""
+        all_left = bool(np.all(left))
+        if self.linearised is Linearised.ONCE:
+            same = prepared if all_left else prepared.take(left)
+            xi, innovation = iterate.xi[left], iterate.innovation[left]
+            return same._replace(iterate=Iterate(xi, innovation, same.iterate.jacobian))
+        P = prepared.predicted_cov
+        return prepare(iterate, P) if all_left else prepare(iterate.take(left), P[left])
 
     def _squares(self, iterate: Iterate, done: Corrected) -> Array:
         if self.similarity is Similarity.PLAIN:
@@ -134,8 +140,10 @@ class SsmUpdate(UpdateRule):
         length = np.linalg.norm(done.step, axis=1)
         return np.asarray(length <= self.tolerance * np.linalg.norm(state, axis=1))
 
-    def _state_weight(self, done: Corrected, iterate: Iterate, predicted: Array) -> Array:
+    def _state_weight(self, done: Corrected, used: Array) -> Array:
+        """Return the weights of the prediction, judged by its nominal covariance."""
         if self.state_kernel is None:
-            return np.ones(len(predicted))
-        t = expected_state_square(predicted, iterate.xi, done.covariance())
-        return self.floor.applied_to(self.state_kernel, t, np.full_like(t, predicted.shape[1]))
+            return used
+        t = done.expected_state_square()
+        n_states = done.step.shape[1]
+        return self.floor.applied_to(self.state_kernel, t, np.full_like(t, n_states))

@@ -10,13 +10,7 @@ import numpy as np
 
 from ssm_graph.data import Array
 from ssm_graph.errors import ConfigError
-from ssm_graph.filters.linear_update import (
-    Groups,
-    Result,
-    correct,
-    expected_state_square,
-    predicted_squares,
-)
+from ssm_graph.filters.linear_update import Groups, Result, correct, prepare
 from ssm_graph.filters.model import MeasurementModel, Update, UpdateRule
 
 
@@ -63,34 +57,41 @@ class StudentUpdate(UpdateRule):
         groups, result = Groups(model), Result(covariance, model)
         runs = np.arange(len(covariance))
         n_states, size = covariance.shape[1], groups.size(runs)
-        iterate = model.begin()
+        iterate = model.at(np.zeros(covariance.shape[:2]))
         posterior = scale_cov = covariance
-        squares = predicted_squares(iterate, covariance)
+        squares = prepare(iterate, covariance).squares()
         for _ in range(self.n_iterations):
             xi = iterate.xi
-            t_state = expected_state_square(scale_cov, xi, posterior)
+            moment = posterior + xi[:, :, None] * xi[:, None, :]
+            t_state = _trace_of_ratio(moment, scale_cov)
             state_weight = (self.state_dof + n_states) / (self.state_dof + t_state)
             t = groups.total(squares)
             weights = (self.measurement_dof + size) / (self.measurement_dof + t)
             if self.scale is Scale.ESTIMATED:
-                moment = posterior + xi[:, :, None] * xi[:, None, :]
                 scale_cov = self.tau * covariance + state_weight[:, None, None] * moment
                 scale_cov = scale_cov / (self.tau + 1.0)
             done = correct(
-                iterate,
-                predicted_cov=scale_cov / state_weight[:, None, None],
+                prepare(iterate, scale_cov),
                 weights=groups.spread(weights, nominal=1.0),
+                state_weight=state_weight,
             )
-            iterate = model.move(iterate, done.step, runs)
+            iterate = iterate.linear_move(done.step)
             posterior, squares = done.covariance(), done.expected_squares(iterate)
         result.keep(
             runs,
             np.ones(len(runs), bool),
-            iterate,
-            covariance=done.local_covariance(iterate),
+            iterate.xi,
+            covariance=posterior,
             weights=groups.spread(weights, nominal=1.0),
             state_weight=state_weight,
             mahalanobis_sq=groups.spread(t, nominal=0.0),
             n_iterations=self.n_iterations,
         )
         return result.finish()
+
+
+def _trace_of_ratio(moment: Array, scale_cov: Array) -> Array:
+    """Return ``tr(moment scale_cov^-1)`` (B,), solved in correlation form."""
+    sigma = np.sqrt(np.einsum("bii->bi", scale_cov))
+    unit = sigma[:, :, None] * sigma[:, None, :]
+    return np.asarray(np.einsum("bii->b", np.linalg.solve(scale_cov / unit, moment / unit)))

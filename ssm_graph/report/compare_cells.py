@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from ssm_graph.data import Array
@@ -84,14 +84,14 @@ def clean_case(rows: Sequence[Row], grade: str) -> str | None:
 
 def rate_sweeps(rows: Sequence[Row]) -> list[Sweep]:
     """Return the kinds and grades with two or more rates, each begun by the clean cell."""
-    sweeps = _sweeps(rows, varied=rate_of, fixed=sizes_of)
-    for sweep in sweeps:
+    sweeps = []
+    for sweep in _sweeps(rows, varied=rate_of, fixed=sizes_of):
         case = clean_case(rows, sweep.grade)
         clean = [r for r in rows if (text(r, "grade"), text(r, "case")) == (sweep.grade, case)]
         first = next(iter(sweep.points.values()))[0]
         same = [r for r in clean if _duration(r) == _duration(first)]
-        if same or clean:
-            sweep.points.update({0.0: same or clean, **sweep.points})
+        begin = {0.0: same or clean} if clean else {}
+        sweeps.append(replace(sweep, points={**begin, **sweep.points}))
     return sweeps
 
 

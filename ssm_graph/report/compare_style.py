@@ -8,9 +8,9 @@ import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from matplotlib.axis import Axis
+from matplotlib.axis import Axis, XAxis
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
@@ -41,6 +41,14 @@ DEFAULT_METHODS: Final = (
 GRAPH_PREFIXES: Final = ("smoother", "gnc", "fixed-lag", "graph")
 """Names of methods that solve a factor graph begin like this; so does the `oracle`."""
 
+TICKS_OF_DECADES: Final[tuple[tuple[float, tuple[float, ...]], ...]] = (
+    (0.7, (1.0, 2.0, 3.0, 5.0, 7.0)),
+    (1.6, (1.0, 2.0, 5.0)),
+    (2.8, (1.0, 3.0)),
+    (math.inf, (1.0,)),
+)
+"""Which multiples of powers of ten are labelled on an axis of less than so many decades."""
+
 Dash = str | tuple[float, tuple[float, ...]]
 
 DASHED: Final[Dash] = (0.0, (4.0, 1.6))
@@ -68,19 +76,17 @@ LOOKS: Final[Mapping[str, Look]] = {
     "ekf-gate-beam": Look("#E69F00", DASH_DOT, "^"),
     "ssmkf-log": Look("#CC79A7", LONG, "D"),
     "rstkf": Look("#56B4E9", DASHED, "P"),
-    "mckf": Look("#8C564B", SHORT, "X"),
+    "mckf": Look("#999933", SHORT, "X"),
     "ssm-log": Look("#D55E00", DASHED, "<"),
-    "ssm-log+rts": Look("#D55E00", DASH_DOT_DOT, ">"),
+    "ssm-log+rts": Look("#882255", DASH_DOT_DOT, ">"),
     "smoother-log": Look("#0072B2", "-", "o", 1.7),
     "gnc-tls": Look("#009E73", "-", "s"),
     "smoother-gnc-tls": Look("#009E73", "-", "s"),
 }
-"""Colours by Okabe and Ito and two more that colour-blind readers tell from them by lightness."""
+"""Colours by Okabe and Ito, and by Tol; lines and markers differ where colours are close."""
 OTHER_COLORS: Final = (
-    "#882255",
     "#44AA99",
     "#332288",
-    "#999933",
     "#AA4499",
     "#117733",
     "#6699CC",
@@ -118,7 +124,7 @@ def shown_methods(methods: Iterable[str]) -> tuple[list[str], list[str]]:
     first `MAX_METHODS`.
     """
     present = list(dict.fromkeys(methods))
-    default = [method for method in DEFAULT_METHODS if method in present]
+    default: list[str] = [method for method in DEFAULT_METHODS if method in present]
     if len(present) <= MAX_METHODS:
         shown = default + [method for method in present if method not in default]
     else:
@@ -159,7 +165,7 @@ def add_legend(
     )
 
 
-def line(look: Look) -> dict[str, object]:
+def line(look: Look) -> dict[str, Any]:
     """Return the options of a method's line, but for its marker."""
     return {
         "color": look.color,
@@ -172,7 +178,7 @@ def line(look: Look) -> dict[str, object]:
 
 def add_footnote(figure: Figure, note: str, left_out: Sequence[str] = ()) -> None:
     """Put a note, and which methods the figure does not show, below everything."""
-    columns = int(15.5 * figure.get_figwidth())
+    columns = int(17.0 * figure.get_figwidth())
     lines = textwrap.wrap(note, columns)
     if left_out:
         names = f"Not shown ({len(left_out)}): {', '.join(left_out)}"
@@ -186,14 +192,13 @@ def log_ticks(axis: Axis, low: float, high: float) -> None:
     """Scale an axis by decades from ``low`` to ``high`` with plain numbers that do not crowd."""
     decades = math.log10(high / low)
     axes = axis.axes
-    if axis.axis_name == "x":
+    if isinstance(axis, XAxis):
         axes.set_xscale("log")
         axes.set_xlim(low, high)
     else:
         axes.set_yscale("log")
         axes.set_ylim(low, high)
-    subs = (1.0, 2.0, 3.0, 5.0, 7.0) if decades < 0.7 else (1.0, 2.0, 5.0)
-    subs = (1.0,) if decades > 2.2 else (1.0, 3.0) if decades > 1.6 else subs
+    subs = next(subs for limit, subs in TICKS_OF_DECADES if decades < limit)
     axis.set_major_locator(LogLocator(10.0, subs=subs, numticks=9))
     axis.set_major_formatter(FuncFormatter(_plain))
     axis.set_minor_formatter(NullFormatter())

@@ -15,7 +15,7 @@ from factors.similarity import Kernel, LogKernel, Similarity, expected_mahalanob
 from ssm_graph.data import Array
 from ssm_graph.errors import ConfigError, SolverError
 from ssm_graph.estimate import BeamTable, Estimate, Iteration, Status
-from ssm_graph.graph.first_values import first_values
+from ssm_graph.graph.first_values import FirstValues, first_values
 from ssm_graph.graph.linearize import BeamRows, GraphLinearizer
 from ssm_graph.graph.solve import marginal_covariances, solve_linear
 from ssm_graph.graph.states import States, retract
@@ -113,16 +113,34 @@ def _descend(
     return states, linearizer.beam_rows(states), update / scale
 
 
+def warm_start(problem: Problem) -> FirstValues:
+    """Return the states and weights that every smoother of this problem starts from."""
+    return first_values(problem, kernel=WARM_KERNEL)
+
+
 class SsmSmoother:
     """Smooth a whole mission; see :func:`ssm_graph.build_problem` for its input."""
 
     def __init__(self, config: SmootherConfig | None = None) -> None:
         self.config = config or SmootherConfig()
 
-    def solve(self, problem: Problem, *, on_iteration: OnIteration | None = None) -> Estimate:
+    def solve(
+        self,
+        problem: Problem,
+        *,
+        first: FirstValues | None = None,
+        on_iteration: OnIteration | None = None,
+    ) -> Estimate:
         """Return the smoothed trajectory with the weight of every beam.
 
         An interrupt from the keyboard ends the loop with what the last iteration found.
+
+        Parameters
+        ----------
+        problem : the mission.
+        first : where to start, from :func:`warm_start`; made here when left out. Several methods
+            on one problem can share it.
+        on_iteration : called after each iteration.
 
         Raises
         ------
@@ -131,7 +149,8 @@ class SsmSmoother:
         """
         begin = time.perf_counter()
         linearizer = GraphLinearizer(problem)
-        first = first_values(problem, kernel=WARM_KERNEL, inertial=linearizer.inertial)
+        if first is None:
+            first = first_values(problem, kernel=WARM_KERNEL, inertial=linearizer.inertial)
         states, rows = first.states, linearizer.beam_rows(first.states)
         schedule = self.config.schedule()
         weights = schedule.first_weights(first.weights)

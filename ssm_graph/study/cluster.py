@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import groupby
 from typing import Any, Final
 
 from ssm_graph.errors import ConfigError, MissingExtraError, SsmGraphError
@@ -11,6 +13,18 @@ from ssm_graph.study.methods import shown
 
 RETRIES: Final = 2
 CONNECT_S: Final = 20.0
+
+
+def merged(jobs: Sequence[Job]) -> list[Job]:
+    """Return jobs with those on the same missions, one after the other, made one.
+
+    Nobody says which worker of a cluster gets which job: each may have to simulate its missions.
+    """
+    return [
+        replace(first, methods=(*first.methods, *(name for job in group for name in job.methods)))
+        for _, group in groupby(jobs, key=lambda job: (job.source, job.grade, job.seeds))
+        for first in [next(group)]
+    ]
 
 
 class DaskCluster:
@@ -33,9 +47,9 @@ class DaskCluster:
         client = self._connect()
         futures: dict[Any, Job] = {}
         try:
-            for job in jobs:
+            for job in merged(jobs):
                 futures[client.submit(do_job, job, pure=False, retries=RETRIES)] = job
-            for future in self._dask.as_completed(list(futures)):
+            for future in self._dask.as_completed(list(futures), loop=client.loop):
                 yield self._result(client, future, futures.pop(future))
                 future.release()
         finally:

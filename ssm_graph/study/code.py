@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Final
 
 import factors.similarity
-import ssm_graph
 
 _LEFT_OUT: Final = ("report", "cli")
 """Parts of the package that no number of a study depends on."""
@@ -22,7 +21,7 @@ def code_version() -> str:
     The version alone does not do: between releases the source changes. The versions of GTSAM,
     NumPy and SciPy are part of the digest.
     """
-    package, others = Path(ssm_graph.__file__).parent, Path(factors.similarity.__file__).parent
+    package, others = Path(__file__).parents[1], Path(factors.similarity.__file__).parent
     sources = {p.relative_to(package).as_posix(): p for p in package.rglob("*.py")}
     digest = hashlib.sha256()
     for name in sorted(name for name in sources if name.split("/")[0] not in _LEFT_OUT):

@@ -99,8 +99,11 @@ Execute = Callable[[Sequence[Job]], Iterator[JobResult]]
 
 
 def do_job(job: Job) -> JobResult:
-    """Do a job here and now; whatever goes wrong with a run becomes its row."""
-    with _ONE_AT_A_TIME:
+    """Do a job here and now; whatever goes wrong with a run becomes its row.
+
+    A method that overflows says so by its status; NumPy need not.
+    """
+    with _ONE_AT_A_TIME, np.errstate(all="ignore"):
         try:
             trials = _trials(job)
         except Exception as error:

@@ -11,6 +11,7 @@ from factors.m_estimators import TruncatedKernel
 from factors.similarity import GaussianKernel, Similarity
 from ssm_graph.errors import ConfigError, SsmGraphError, nearest_hint
 from ssm_graph.estimate import Estimate
+from ssm_graph.filters.named import FILTERS, FilterChoice, filter_problems
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
 from ssm_graph.smoothers.gnc import Graduation
 from ssm_graph.study.trials import Trial
@@ -86,7 +87,12 @@ def shown(error: Exception) -> str:
 def _smoother(config: SmootherConfig, *, is_oracle: bool = False) -> Solver:
     def solve(trials: Sequence[Trial]) -> list[Estimate]:
         smoother = SsmSmoother(config)
-        return [smoother.solve(t.oracle_problem if is_oracle else t.problem) for t in trials]
+        return [
+            smoother.solve(trial.oracle_problem)
+            if is_oracle
+            else smoother.solve(trial.problem, first=trial.warm_start)
+            for trial in trials
+        ]
 
     return solve
 
@@ -98,6 +104,23 @@ def _kernel_family(name: str, choice: KernelChoice, similarity: Similarity | Non
         lambda value: _smoother(SmootherConfig(choice.kernel(value), similarity)),
         choice.default,
     )
+
+
+def _filter_family(name: str, choice: FilterChoice, **how: bool) -> Family:
+    is_oracle, smoothed = how.get("is_oracle", False), how.get("smoothed", False)
+
+    def make(value: float | None) -> Solver:
+        choice.make(choice.default if value is None else value)  # refuses a wrong parameter now
+
+        def solve(trials: Sequence[Trial]) -> list[Estimate]:
+            problems = [t.oracle_problem if is_oracle else t.problem for t in trials]
+            return filter_problems(problems, name, value=value, smoothed=smoothed)
+
+        return solve
+
+    told = ", without the bad beams" if is_oracle else ""
+    back = ", and a Rauch-Tung-Striebel pass backwards" if smoothed else ""
+    return Family(choice.description + told + back, make, choice.default, True, is_oracle)
 
 
 def _make_gnc(value: float | None) -> Solver:
@@ -116,6 +139,12 @@ FAMILIES: Final[Mapping[str, Family]] = {
         f"smoother-plain-{name}": _kernel_family(name, KERNELS[name], Similarity.PLAIN)
         for name in ("log", "sqrt", "exp")
     },
+    **{name: _filter_family(name, choice) for name, choice in FILTERS.items()},
+    **{
+        f"{name}+rts": _filter_family(name, choice, smoothed=True)
+        for name, choice in FILTERS.items()
+    },
+    "ekf-oracle": _filter_family("ekf", FILTERS["ekf"], is_oracle=True),
     "smoother-gnc-tls": Family(
         "batch smoother, truncated least squares by graduated non-convexity",
         _make_gnc,

@@ -13,8 +13,8 @@ from ssm_graph.study.methods import parse_method
 from ssm_graph.study.scenario import Study
 from ssm_graph.study.trials import block_size
 
-SMALL_BLOCK: Final = 10
-"""Seeds of a job whose methods take missions one by one: an interruption costs no more."""
+MAX_RUNS: Final = 20
+"""Runs of a job whose methods take missions one by one; an interruption costs the jobs at work."""
 
 
 def wanted_keys(study: Study) -> list[RunKey]:
@@ -57,13 +57,15 @@ def _jobs_of(
     batched = [name for name in study.method_names if parse_method(name).is_batched]
     single = [name for name in study.method_names if name not in batched]
     n_seeds = max(len(_seeds(study, sources[0], name)) for name in study.method_names)
+    small_size = max(1, MAX_RUNS // max(1, len(single)))
     first = study.first_seed if isinstance(sources[0], Cell) else 0
     for begin in range(first, first + n_seeds, size):
         end = min(begin + size, first + n_seeds)
         for source in sources:
-            yield from _jobs(study, source, grade, range(begin, end), batched, done)
-        for small in range(begin, end, SMALL_BLOCK):
-            seeds = range(small, min(small + SMALL_BLOCK, end))
+            for name in batched:
+                yield from _jobs(study, source, grade, range(begin, end), [name], done)
+        for small in range(begin, end, small_size):
+            seeds = range(small, min(small + small_size, end))
             for source in sources:
                 yield from _jobs(study, source, grade, seeds, single, done)
 

@@ -12,11 +12,13 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Final
 
-from ssm_graph.errors import ConfigError
+from ssm_graph.errors import ConfigError, SsmGraphError
 from ssm_graph.study.jobs import Job, JobResult, do_job, lost_job
 
 MAX_DEATHS: Final = 2
 """A single run that ends its process as often is given up."""
+MAX_DEATHS_IN_A_ROW: Final = 40
+"""Without any result between them; no job is to blame for so many."""
 _THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -36,7 +38,7 @@ class JobProcesses:
     def __call__(self, jobs: Sequence[Job]) -> Iterator[JobResult]:
         """Yield what comes of the jobs as it comes; closed early, the processes are ended."""
         waiting = list(jobs)
-        deaths: dict[Job, int] = {}
+        deaths = _Deaths()
         with _one_blas_thread():
             workers = [_Worker.start() for _ in range(min(self.n_processes, len(waiting)))]
             try:
@@ -60,7 +62,7 @@ class JobProcesses:
                     workers[i] = worker.replaced()
 
     def _collect(
-        self, waiting: list[Job], workers: list[_Worker], deaths: dict[Job, int]
+        self, waiting: list[Job], workers: list[_Worker], deaths: _Deaths
     ) -> Iterator[JobResult]:
         ready = wait([worker.pipe for worker in workers if worker.job])
         for i, worker in enumerate(workers):
@@ -71,13 +73,12 @@ class JobProcesses:
                 result: JobResult = worker.pipe.recv()
             except (EOFError, OSError):
                 workers[i] = worker.replaced()
-                deaths[job] = deaths.get(job, 0) + 1
-                parts = job.halves()
-                if len(parts) == 1 and deaths[job] >= MAX_DEATHS:
-                    yield lost_job(job, f"its process ended {worker.ending()}")
+                if deaths.is_last(job, how=worker.ending()):
+                    yield lost_job(job, f"its process ended {worker.ending()}, twice")
                 else:
-                    waiting[:0] = parts
+                    waiting[:0] = job.halves()
             else:
+                deaths.in_a_row = 0
                 yield result
 
 
@@ -97,6 +98,25 @@ def best_job(
         return len(missions & seen), -len(missions & elsewhere), -place
 
     return max(range(len(waiting)), key=merit)
+
+
+@dataclass(eq=False)
+class _Deaths:
+    """Processes that ended unasked."""
+
+    of_job: dict[Job, int] = field(default_factory=dict)
+    in_a_row: int = 0
+
+    def is_last(self, job: Job, *, how: str) -> bool:
+        """Count one, and return whether a job of a single run is to be given up."""
+        self.in_a_row += 1
+        if self.in_a_row >= MAX_DEATHS_IN_A_ROW:
+            raise SsmGraphError(
+                f"--jobs: {self.in_a_row} processes in a row ended {how} without a result; is "
+                "there memory for so many? try --jobs 1; what is done is kept"
+            )
+        self.of_job[job] = self.of_job.get(job, 0) + 1
+        return job.n_runs == 1 and self.of_job[job] >= MAX_DEATHS
 
 
 @dataclass(eq=False)
@@ -134,9 +154,9 @@ class _Worker:
         return _Worker.start()
 
     def ending(self) -> str:
+        """Return how its process ended."""
         code = self.process.exitcode or 0
-        how = f"by signal {-code}" if code < 0 else f"with exit code {code}"
-        return f"{how}, {MAX_DEATHS} times; short of memory? try fewer --jobs"
+        return f"by signal {-code}" if code < 0 else f"with exit code {code}"
 
 
 def _serve(pipe: Connection) -> None:

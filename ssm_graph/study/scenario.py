@@ -158,8 +158,8 @@ def _cells(table: TomlTable, scenario: str, duration_s: float) -> list[Cell]:
     name = table.text("name") if table.has("name") else None
     outliers = _outliers(table)
     duration_s = _positive(table, "duration_s", duration_s)
-    faults = tuple(_fault(entry) for entry in table.tables("faults"))
-    losses = tuple(_loss(entry) for entry in table.tables("losses"))
+    faults = tuple(_fault(entry, duration_s) for entry in table.tables("faults"))
+    losses = tuple(_loss(entry, duration_s) for entry in table.tables("losses"))
     dropout_rate = _fraction(table, "dropout_rate", table.number("dropout_rate", 0.0))
     table.end()
     if name is not None and len(outliers) > 1:
@@ -206,11 +206,12 @@ def _case_name(outliers: Outliers) -> str:
     return f"{name}_{outliers.size[0]:g}to{outliers.size[1]:g}"
 
 
-def _fault(table: TomlTable) -> StudyFault:
+def _fault(table: TomlTable, duration_s: float) -> StudyFault:
+    start_s, length_s = _window(table, duration_s)
     fault = StudyFault(
         beams=_beams(table, table.counts("beams")),
-        start_s=table.number("start_s"),
-        length_s=_positive(table, "length_s"),
+        start_s=start_s,
+        length_s=length_s,
         offset_m_per_s=table.numbers("offset_m_per_s"),
         is_turned_by_seed=table.flag("turn_by_seed", False),
     )
@@ -219,11 +220,23 @@ def _fault(table: TomlTable) -> StudyFault:
     return fault
 
 
-def _loss(table: TomlTable) -> Loss:
+def _loss(table: TomlTable, duration_s: float) -> Loss:
     beams = _beams(table, table.counts("beams", ALL_BEAMS))
-    start_s, length_s = table.number("start_s"), _positive(table, "length_s")
+    start_s, length_s = _window(table, duration_s)
     table.end()
     return _checked(table, lambda: Loss(start_s, start_s + length_s, beams))
+
+
+def _window(table: TomlTable, duration_s: float) -> tuple[float, float]:
+    start_s, length_s = table.number("start_s"), _positive(table, "length_s")
+    if not 0.0 <= start_s < start_s + length_s <= duration_s:
+        raise table.fault(
+            "start_s",
+            expected=f"a window within the {duration_s:g} s of the mission",
+            got=f"{start_s:g} to {start_s + length_s:g} s",
+            hint="make duration_s longer, or begin earlier",
+        )
+    return start_s, length_s
 
 
 def _beams(table: TomlTable, beams: tuple[int, ...]) -> tuple[int, ...]:

@@ -14,7 +14,7 @@ from ssm_graph.errors import DataError
 from ssm_graph.estimate import OUTLIER_WEIGHT, Estimate, Status, path_length_m
 from ssm_graph.evaluation import Metrics, evaluate
 from ssm_graph.simulation import SimulatedMission
-from ssm_graph.study.methods import Failure, Outcome
+from ssm_graph.study.methods import Failure, Outcome, shown
 from ssm_graph.study.trials import Trial
 
 LARGE_OFFSET: Final = 0.5
@@ -77,21 +77,31 @@ def failed_row(labels: Row, message: str, *, status: str = FAILED) -> dict[str, 
 
 
 def score(labels: Row, trial: Trial, outcome: Outcome) -> tuple[Row, Array]:
-    """Return the row of one run and its series (T, 3): see :func:`series_of`."""
-    if isinstance(outcome, Failure):
-        return failed_row(labels, outcome.message), _no_series(trial)
-    if outcome.status is Status.INTERRUPTED:  # never a result: the study itself was interrupted
-        raise KeyboardInterrupt
+    """Return the row of one run and its series (T, 3): see :func:`series_of`.
+
+    An estimate that cannot be judged, for whatever reason, is a failure of its method.
+    """
+    if isinstance(outcome, Estimate):
+        if outcome.status is Status.INTERRUPTED:  # never a result: the study was interrupted
+            raise KeyboardInterrupt
+        try:
+            return _score(labels, trial, outcome)
+        except Exception as error:
+            outcome = Failure(shown(error))
+    return failed_row(labels, outcome.message), _no_series(trial)
+
+
+def _score(labels: Row, trial: Trial, outcome: Estimate) -> tuple[Row, Array]:
     metrics = _metrics(trial, outcome)
     numbers = dict.fromkeys(NUMBER_COLUMNS, math.nan)
     numbers |= _length(outcome) if metrics is None else _errors(metrics)
     numbers |= _weights(trial, outcome)
     numbers |= {"iterations": len(outcome.iterations), "wall_s": outcome.wall_s}
-    is_bad = outcome.status is Status.DIVERGED
+    is_known = math.isfinite(numbers["horizontal_rms_m"]) or trial.simulated is None
     row = {
         **labels,
         "status": outcome.status.name,
-        "failed": int(is_bad),
+        "failed": int(outcome.status is Status.DIVERGED or not is_known),
         "error": "" if outcome.status.is_good else outcome.reason,
         **numbers,
     }
@@ -99,15 +109,13 @@ def score(labels: Row, trial: Trial, outcome: Outcome) -> tuple[Row, Array]:
 
 
 def _metrics(trial: Trial, estimate: Estimate) -> Metrics | None:
-    """Return the errors; None without a reference, or with one of another time."""
+    """Return the errors; None without a common time with a reference: nothing may be finite."""
     reference = trial.reference_at(estimate.trajectory.time_s)
     if reference is None:
         return None
     try:
         return evaluate(estimate.trajectory, reference)
     except DataError:
-        if trial.simulated is not None:
-            raise
         return None
 
 

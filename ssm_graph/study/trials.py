@@ -12,16 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssm_graph.data import Array, Mission, Reference
+from ssm_graph.graph.first_values import FirstValues
 from ssm_graph.io.mission import read_mission
 from ssm_graph.problem.alignment import align
 from ssm_graph.problem.problem import Problem, build_problem, with_dvl
 from ssm_graph.simulation import Grade, SimulatedMission, simulate, with_dvl_errors
+from ssm_graph.smoothers.batch import warm_start
 from ssm_graph.smoothers.mission import smooth
 from ssm_graph.study.cells import Cell, Recording
 
 CACHE_LIMIT_S: Final = 60_000.0
 """Mission time that a process keeps, s: at 20 kB a second with 100 Hz inertial data, 1.2 GB."""
-MAX_BLOCK: Final = 50
+MAX_BLOCK: Final = 100
 """Seeds that a job has at most."""
 
 
@@ -51,6 +53,11 @@ class Trial:
     def oracle_problem(self) -> Problem:
         """The problem of a method that is told the bad beams."""
         return with_dvl(self.problem, self.oracle_mission)
+
+    @cached_property
+    def warm_start(self) -> FirstValues:
+        """Where all smoothers of the problem start."""
+        return warm_start(self.problem)
 
     @property
     def is_outlier(self) -> NDArray[np.bool_] | None:

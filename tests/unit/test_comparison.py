@@ -240,3 +240,8 @@ def test_refusals() -> None:
         compare_methods(rows, baseline="y")
     with pytest.raises(DataError, match="seed 0 of z twice"):
         compare_methods(rows + rows)
+
+
+def test_equal_differences_share_their_rank() -> None:
+    """Ranks 1, 2.5, 2.5, 4 of which the second is negative."""
+    assert signed_rank([1.0, -2.0, 2.0, 3.0]).effect == pytest.approx(0.5)

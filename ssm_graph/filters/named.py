@@ -1,0 +1,139 @@
+"""Every filter that can be asked for by name, with its parameter and the default of that.
+
+All take the same process and the same measurements, and linearise once at the prediction.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from factors.kernels import KERNELS
+from factors.similarity import Similarity
+from ssm_graph.estimate import Estimate
+from ssm_graph.filters.correntropy import CorrentropyUpdate
+from ssm_graph.filters.history import estimates_from_history
+from ssm_graph.filters.kalman import Gate, GatedUpdate, KalmanUpdate
+from ssm_graph.filters.model import UpdateRule
+from ssm_graph.filters.navigation import Grouping, OnKeyframe, run_filter
+from ssm_graph.filters.rts import smooth_history
+from ssm_graph.filters.ssm import SsmUpdate
+from ssm_graph.filters.student import StudentUpdate
+from ssm_graph.problem.error_state import Linearised
+from ssm_graph.problem.problem import Problem
+
+
+@dataclass(frozen=True, slots=True)
+class FilterChoice:
+    """A filter with at most one parameter."""
+
+    description: str
+    make: Callable[[float | None], UpdateRule]
+    """Takes the parameter, None where none is given."""
+    grouping: Grouping
+    default: float | None = None
+    """The parameter where none is given; None for a filter without one."""
+
+
+def _ssm(name: str, grouping: Grouping = Grouping.PER_BEAM) -> FilterChoice:
+    choice = KERNELS[name]
+    return FilterChoice(
+        f"similarity weights, {grouping.value}, the prediction trusted, {name} kernel",
+        lambda value: SsmUpdate(choice.kernel(value), linearised=Linearised.ONCE),
+        grouping,
+        choice.default,
+    )
+
+
+def _ssmkf(name: str) -> FilterChoice:
+    choice = KERNELS[name]
+
+    def make(value: float | None) -> UpdateRule:
+        kernel = choice.kernel(value)
+        return SsmUpdate(kernel, state_kernel=kernel, linearised=Linearised.ONCE)
+
+    return FilterChoice(
+        f"SSMKF: one similarity weight for the ping, one for the prediction, {name} kernel",
+        make,
+        Grouping.PER_PING,
+        choice.default,
+    )
+
+
+def _plain_log(value: float | None) -> UpdateRule:
+    kernel = KERNELS["log"].kernel(value)
+    return SsmUpdate(kernel, similarity=Similarity.PLAIN, linearised=Linearised.ONCE)
+
+
+FILTERS: Final[Mapping[str, FilterChoice]] = {
+    "ekf": FilterChoice("Kalman filter", lambda _: KalmanUpdate(), Grouping.PER_PING),
+    "ekf-gate-ping": FilterChoice(
+        "Kalman filter, chi-square gate on the whole ping",
+        lambda value: GatedUpdate(Gate.PING, value or 0.9973),
+        Grouping.PER_PING,
+        0.9973,
+    ),
+    "ekf-gate-beam": FilterChoice(
+        "Kalman filter, chi-square gate on every beam",
+        lambda value: GatedUpdate(Gate.BEAM, value or 0.9973),
+        Grouping.PER_BEAM,
+        0.9973,
+    ),
+    "rstkf": FilterChoice(
+        "Student's t filter, inverse-Wishart prediction covariance",
+        lambda _: StudentUpdate(),
+        Grouping.PER_PING,
+    ),
+    "mckf": FilterChoice(
+        "maximum correntropy filter",
+        lambda value: CorrentropyUpdate(value or CorrentropyUpdate().width),
+        Grouping.PER_BEAM,
+        CorrentropyUpdate().width,
+    ),
+    **{f"ssmkf-{name}": _ssmkf(name) for name in ("log", "sqrt", "exp")},
+    **{f"ssm-{name}": _ssm(name) for name in ("log", "sqrt", "exp")},
+    "ssm-ping-log": _ssm("log", Grouping.PER_PING),
+    "ssm-plain-log": FilterChoice(
+        "as ssm-log, a beam judged by its residual alone",
+        _plain_log,
+        Grouping.PER_BEAM,
+        KERNELS["log"].default,
+    ),
+}
+"""Names as on the command line."""
+
+
+def filter_problems(
+    problems: Sequence[Problem],
+    name: str,
+    *,
+    value: float | None = None,
+    smoothed: bool = False,
+    on_keyframe: OnKeyframe | None = None,
+) -> list[Estimate]:
+    """Filter problems side by side by the filter of a name.
+
+    Parameters
+    ----------
+    problems : with equal numbers of keyframes, one navigation frame, and the same kinds of aids.
+    name : of :data:`FILTERS`.
+    value : its parameter.
+    smoothed : whether a Rauch-Tung-Striebel pass goes back over the result.
+    on_keyframe : called after each keyframe.
+    """
+    begin = time.perf_counter()
+    choice = FILTERS[name]
+    rule = choice.make(choice.default if value is None else value)
+    history = run_filter(problems, rule, grouping=choice.grouping, on_keyframe=on_keyframe)
+    states = smooth_history(history) if smoothed else history.posterior
+    wall_s = (time.perf_counter() - begin) / len(problems)
+    return estimates_from_history(
+        problems,
+        history,
+        states,
+        method=f"filter {name}{' + rts' if smoothed else ''}",
+        kernel=str(rule),
+        wall_s=wall_s,
+    )

@@ -1,0 +1,223 @@
+"""Study files: what they say, and what is refused before anything runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ssm_graph.errors import ConfigError, DataError
+from ssm_graph.simulation import Grade, Loss, OutlierKind
+from ssm_graph.study.cells import Cell
+from ssm_graph.study.plan import wanted_keys
+from ssm_graph.study.scenario import Study, read_study, study_from, study_of_folders
+from tests.study_fixture import TINY, tiny_study
+
+STUDIES = sorted((Path(__file__).parents[2] / "benchmarks" / "studies").glob("*.toml"))
+
+
+def cells_of(*cases: dict[str, Any], **changes: Any) -> list[Cell]:
+    """Return the cells of a study of some cases."""
+    study = tiny_study(cases=list(cases), **changes)
+    return [source for source in study.sources if isinstance(source, Cell)]
+
+
+@pytest.mark.parametrize("path", STUDIES, ids=[path.stem for path in STUDIES])
+def test_studies_of_the_project_can_be_read(path: Path) -> None:
+    """Their name is that of the file."""
+    study = read_study(path)
+    assert study.name == path.stem
+    assert len(set(wanted_keys(study))) == len(wanted_keys(study)) > 0
+
+
+def test_every_combination_is_a_cell() -> None:
+    """Kinds times rates times sizes; nothing to vary gives one, equal ones count once."""
+    cells = cells_of(
+        {"kinds": ["none", "sparse"], "rates": [0.05, 0.4], "sizes_m_per_s": [[0.5, 3.0], [1, 2]]},
+        {"kinds": ["blocked", "none"], "rates": [0.1], "sizes_m_per_s": [[0.5, 3], [1, 2]]},
+    )
+    assert [cell.case for cell in cells] == [
+        "clean",
+        "sparse5",
+        "sparse5_1to2",
+        "sparse40",
+        "sparse40_1to2",
+        "blocked10",
+    ]
+    assert cells[2].labels()["size_low_m_per_s"] == 1.0
+    assert {**cells[3].labels(), "duration_s": 0} == {
+        "case": "sparse40",
+        "kind": "sparse",
+        "rate": 0.4,
+        "size_low_m_per_s": 0.5,
+        "size_high_m_per_s": 3.0,
+        "duration_s": 0,
+    }
+
+
+def test_other_definitions_have_other_ids() -> None:
+    """A run is never taken for one of another cell, even of the same name."""
+    ids = [
+        cells_of({"name": "x", "kinds": ["sparse"], **change}, **study)[0].id
+        for change, study in (
+            ({}, {}),
+            ({"rates": [0.2]}, {}),
+            ({"dropout_rate": 0.1}, {}),
+            ({"duration_s": 30.0}, {}),
+            ({}, {"scenario": "hover"}),
+        )
+    ]
+    assert len(set(ids)) == len(ids)
+    assert cells_of({"name": "x", "kinds": ["sparse"]})[0].id == ids[0]
+
+
+def test_faults_follow_the_seed() -> None:
+    """The old benchmark's faults: neighbouring beams, the first drawn by the seed."""
+    fault = {"beams": [0, 1], "turn_by_seed": True, "start_s": 5, "length_s": 4}
+    (cell,) = cells_of({"name": "f", "faults": [{**fault, "offset_m_per_s": [1.0, 0.6]}]})
+    (third,) = cell.faults_of(3)
+    assert third.beams == (3, 0)
+    assert (third.start_s, third.end_s) == (5.0, 9.0)
+    assert third.offset_m_per_s == (1.0, 0.6)
+    (fixed,) = cells_of(
+        {"name": "f", "faults": [{**fault, "turn_by_seed": False, "offset_m_per_s": 1.0}]}
+    )
+    assert fixed.faults_of(3)[0].beams == (0, 1)
+    assert fixed.faults_of(3)[0].offset_m_per_s == 1.0
+
+
+def test_few_beams_are_lost_for_minutes() -> None:
+    """Three minutes each with three, two and one beam, ten minutes with none."""
+    study = read_study(next(path for path in STUDIES if path.stem == "few_beams"))
+    (cell,) = study.sources
+    assert isinstance(cell, Cell)
+    lengths = {4 - len(loss.beams): loss.end_s - loss.start_s for loss in cell.losses}
+    assert lengths == {3: 180.0, 2: 180.0, 1: 180.0, 0: 600.0}
+    assert cell.losses[0] == Loss(300.0, 480.0, (3,))
+
+
+def test_methods_have_seeds_of_their_own() -> None:
+    """The larger number counts for a method that is named twice."""
+    groups = [{"names": ["oracle", "smoother-log"], "seeds": 3}, {"names": ["oracle"], "seeds": 5}]
+    study = tiny_study(methods=groups, first_seed=7, baseline="smoother-log:5")
+    assert study.method_names == ("oracle", "smoother-log")
+    assert study.seeds_of("oracle") == range(7, 12)
+    assert study.seeds_of("smoother-log") == range(7, 10)
+    assert study.baseline == "smoother-log"
+
+
+def test_command_line_overrides() -> None:
+    """Other methods get as many seeds as any had; a baseline that is gone is forgotten."""
+    study = tiny_study(baseline="oracle")
+    other = study.changed(methods=["smoother-sqrt", "smoother-log:7"])
+    assert other.method_names == ("smoother-sqrt", "smoother-log:7")
+    assert other.seeds_of("smoother-sqrt") == range(2)
+    assert other.baseline is None
+    quick = study.changed(n_seeds=1)
+    assert [len(quick.seeds_of(name)) for name in quick.method_names] == [1, 1, 1]
+    with pytest.raises(ConfigError, match="--seeds: expected 1 or more, got 0"):
+        study.changed(n_seeds=0)
+    with pytest.raises(ConfigError, match="--methods: expected at least one method"):
+        study.changed(methods=[])
+
+
+def test_grades_and_kinds_are_named_in_lower_case() -> None:
+    """As on the command line."""
+    study = tiny_study(grades=["mems", "tactical"], cases=[{"kinds": ["silt"]}])
+    assert study.grades == (Grade.MEMS, Grade.TACTICAL)
+    (cell,) = study.sources
+    assert isinstance(cell, Cell)
+    assert cell.outliers.kind is OutlierKind.SILT
+    assert cell.labels()["size_low_m_per_s"] == 0.15
+
+
+LOSS = {"start_s": 1.0, "length_s": 2.0}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"grade": ["mems"]}, "tiny.toml: unknown key 'grade'; did you mean 'grades'"),
+        ({"grades": ["MEMS"]}, "tiny.toml grades: expected some of .*, got 'MEMS'"),
+        ({"scenario": "surve"}, "tiny.toml scenario: .* did you mean 'survey'"),
+        ({"name": 3}, "tiny.toml name: expected a text in quotes, got 3"),
+        ({"duration_s": 0}, "duration_s: expected seconds above 0, got 0"),
+        ({"duration_s": True}, "duration_s: expected a finite number, got True"),
+        ({"first_seed": -1}, "first_seed: expected a whole number from 0, got -1"),
+        ({"methods": []}, "methods: expected tables"),
+        ({"methods": [{"names": ["orakel"]}]}, r"\[\[methods\]\] 1 names: .*mean 'oracle'"),
+        ({"methods": [{"names": ["oracle"], "seeds": 0}]}, "seeds: expected a whole number from 1"),
+        ({"methods": [{"names": ["oracle"], "seed": 1}]}, "unknown key 'seed'; .*'seeds'"),
+        ({"baseline": "smoother-exp"}, "baseline: expected a method of the study"),
+        ({"cases": [{"kinds": ["sparce"]}]}, r"\[\[cases\]\] 1 kinds: .*did you mean 'sparse'"),
+        ({"cases": [{"rates": [10]}]}, "rates: expected a fraction between 0 and 1"),
+        ({"cases": [{"sizes_m_per_s": [1, 2]}]}, "sizes_m_per_s: expected a list of pairs"),
+        (
+            {"cases": [{"kinds": ["sparse"], "sizes_m_per_s": [[2, 1]]}]},
+            "sizes_m_per_s: Outliers.size: expected 0 <= low <= high",
+        ),
+        ({"cases": [{"dropout_rate": 0.1}]}, "name: expected a name for a case with faults"),
+        (
+            {"cases": [{"name": "x", "kinds": ["sparse"], "rates": [0.1, 0.2]}]},
+            "name: expected a name for a single kind, rate and size",
+        ),
+        (
+            {"cases": [{"name": "x"}, {"name": "x", "dropout_rate": 0.1}]},
+            "expected different names, got 'x'",
+        ),
+        (
+            {"cases": [{"name": "x", "losses": [{**LOSS, "beams": [4]}]}]},
+            r"\[\[losses\]\] 1 beams: expected different numbers from 0 to 3",
+        ),
+        (
+            {"cases": [{"name": "x", "losses": [{"start_s": 15.0, "length_s": 6.0}]}]},
+            "expected a window within the 20 s of the mission, got '15 to 21 s'",
+        ),
+        (
+            {
+                "cases": [
+                    {"name": "x", "faults": [{**LOSS, "beams": [1], "offset_m_per_s": [1, 2]}]}
+                ]
+            },
+            r"\[\[faults\]\] 1: Fault.offset_m_per_s: expected 1 or 1 offsets",
+        ),
+        ({"cases": [{"name": "x", "faults": [LOSS]}]}, "beams: expected a list of whole numbers"),
+    ],
+)
+def test_bad_studies_are_refused(changes: dict[str, Any], message: str) -> None:
+    """The message says which table and key, and what would do."""
+    with pytest.raises(ConfigError, match=message):
+        study_from(TINY | changes, where="tiny.toml")
+
+
+def test_a_study_needs_cases_and_methods() -> None:
+    """Nothing is assumed."""
+    for key in ("cases", "methods"):
+        raw = {name: value for name, value in TINY.items() if name != key}
+        with pytest.raises(ConfigError, match=rf"expected at least one \[\[{key}\]\]"):
+            study_from(raw, where="tiny.toml")
+
+
+def test_unreadable_files_are_refused(tmp_path: Path) -> None:
+    """File and reason are said."""
+    with pytest.raises(ConfigError, match=r"none\.toml: cannot be read \(No such file"):
+        read_study(tmp_path / "none.toml")
+    (tmp_path / "bad.toml").write_text("name = [")
+    with pytest.raises(ConfigError, match=r"bad\.toml: expected valid TOML"):
+        read_study(tmp_path / "bad.toml")
+
+
+def test_folders_need_missions_and_fair_methods(tmp_path: Path) -> None:
+    """Nobody can tell an oracle what is bad in a recorded mission."""
+    with pytest.raises(ConfigError, match="got 'oracle', which has to be told"):
+        study_of_folders([tmp_path], ["smoother-log", "oracle"])
+    with pytest.raises((ConfigError, DataError), match=rf"{tmp_path.name}: mission.toml"):
+        study_of_folders([tmp_path], ["smoother-log"])
+
+
+def test_studies_are_values() -> None:
+    """Equal files make equal studies: what is told from them is told for good."""
+    first, second = tiny_study(), tiny_study()
+    assert isinstance(first, Study)
+    assert first == second
