@@ -21,8 +21,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import numpy as np
 
 from factors.similarity import LogKernel, Similarity
-from ssm_graph.data import Array
-from ssm_graph.filters.geodetic import Feedback, GeodeticConfig, run_geodetic, to_navigation
+from ssm_graph.filters.geodetic import GeodeticConfig, run_geodetic, to_navigation
+from ssm_graph.filters.geodetic_error_model import Feedback
 from ssm_graph.filters.navigation import Grouping, run_filter
 from ssm_graph.filters.ssm import SsmUpdate
 from ssm_graph.filters.states import NavigationStates
@@ -103,7 +103,7 @@ def states_of(run: FixedLagRun) -> NavigationStates:
 
 def against_geodetic(
     problem: Problem, sim: SimulatedMission, linearised: Linearised, feedback: Feedback
-) -> tuple[Array, Array]:
+) -> tuple[float, float]:
     """Return the largest differences in velocity and horizontal position, sigmas."""
     graph = FixedLagSmoother(FixedLagConfig(0.0, linearised=linearised)).run(problem)
     config = GeodeticConfig(feedback=feedback)
@@ -116,7 +116,7 @@ def against_geodetic(
     position_sigma = np.sqrt(np.diagonal(position_cov_n, axis1=1, axis2=2))[:, :2]
     velocity = np.abs(other.v_n - graph.newest.v_n) / velocity_sigma
     position = np.abs(other.p_n - graph.newest.p_n)[:, :2] / position_sigma
-    return np.max(velocity), np.max(position)
+    return float(np.max(velocity)), float(np.max(position))
 
 
 def report(count: int, duration_s: float) -> str:

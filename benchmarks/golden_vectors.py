@@ -1,4 +1,6 @@
-"""Compare the update rules with published vectors: ``python benchmarks/golden_vectors.py FILE.npz``.
+"""Compare the update rules with published vectors.
+
+``python benchmarks/golden_vectors.py FILE.npz``.
 
 The file holds a linear system (F, H, Q, R, P0) and, for every sequence ``S`` and filter ``f``,
 ``S_z``, ``S_x0`` and ``S_f_x``, ``S_f_P``, ``S_f_xprior``, ``S_f_Pprior``, ``S_f_iters``. Every

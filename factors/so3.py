@@ -84,8 +84,12 @@ def _polynomial(phi: Array, linear: Array, quadratic: Array) -> Array:
 def coefficients(phi: Array) -> tuple[Array, Array, Array]:
     """Return ``sin a/a``, ``(1 - cos a)/a^2`` and ``(a - sin a)/a^3`` of the angle, (..., 1)."""
     square = (phi * phi).sum(axis=-1, keepdims=True)
-    first = 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0 * (1.0 - square / 72.0)))
-    second = 0.5 - square / 24.0 * (1.0 - square / 30.0 * (1.0 - square / 56.0 * (1.0 - square / 90.0)))
+    first = 1.0 - square / 6.0 * (
+        1.0 - square / 20.0 * (1.0 - square / 42.0 * (1.0 - square / 72.0))
+    )
+    second = 0.5 - square / 24.0 * (
+        1.0 - square / 30.0 * (1.0 - square / 56.0 * (1.0 - square / 90.0))
+    )
     third = 1.0 - square / 20.0 * (1.0 - square / 42.0 * (1.0 - square / 72.0))
     third = third / 6.0
     if square.max(initial=0.0) > SMALL_SQUARE:

@@ -57,7 +57,7 @@ class Corrected(NamedTuple):
 
     @property
     def gain(self) -> Array:
-        """(R, n, m)"""
+        """Kalman gain (R, n, m)."""
         return np.asarray((self.scale * self.prepared.PHt) @ self.S_inv)
 
     def covariance(self) -> Array:
@@ -128,7 +128,7 @@ def correct(prepared: Prepared, *, weights: Array, state_weight: Array | None = 
 def _inverse(S: Array) -> Array:
     """Return inverses (R, m, m); NaN for a run that has run away, which ends nobody else's."""
     try:
-        return np.linalg.inv(S)
+        return np.asarray(np.linalg.inv(S))
     except np.linalg.LinAlgError:
         inverse = np.full_like(S, np.nan)
         for run, single in enumerate(S):

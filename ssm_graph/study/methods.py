@@ -69,7 +69,10 @@ class Method:
 
     def _attempt(self, trials: Sequence[Trial]) -> list[Outcome]:
         try:
-            estimates = list(self.solver(trials))
+            # NumPy rounds a stack of one otherwise: a trial must not depend on its company.
+            is_alone = self.is_batched and len(trials) == 1
+            estimates = list(self.solver([*trials, *trials] if is_alone else trials))
+            estimates = estimates[: len(trials)] if is_alone else estimates
         except Exception as error:
             if len(trials) > 1:
                 half = len(trials) // 2

@@ -6,7 +6,6 @@ import gtsam
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, V, X
-from tests.helpers import simulated
 
 from ssm_graph.data import Array
 from ssm_graph.filters.process import Process
@@ -15,6 +14,7 @@ from ssm_graph.imu.arrays import interval_arrays
 from ssm_graph.imu.preintegration import gtsam_gravity
 from ssm_graph.problem.problem import Problem, build_problem
 from ssm_graph.simulation import Grade
+from tests.helpers import simulated
 
 POSE = gtsam.Pose3(gtsam.Rot3.Expmap(np.array([0.3, 0.2, 1.0])), np.array([900.0, 50.0, -20.0]))
 VELOCITY_N = np.array([1.0, 2.0, 0.1])

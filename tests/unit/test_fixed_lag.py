@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tests.helpers import simulated
 
 from factors.similarity import GaussianKernel, LogKernel
 from ssm_graph.errors import ConfigError
@@ -17,6 +16,7 @@ from ssm_graph.problem.window import window_of
 from ssm_graph.simulation import Grade, OutlierKind, Outliers
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
 from ssm_graph.smoothers.fixed_lag import FixedLagConfig, FixedLagSmoother
+from tests.helpers import simulated
 
 
 def problem_of(duration_s: float = 12.0, **changes: object) -> Problem:

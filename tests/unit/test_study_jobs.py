@@ -128,6 +128,15 @@ def test_order_and_company_do_not_matter() -> None:
     np.testing.assert_array_equal(alone.series["smoother-log"][0], larger.series["smoother-log"][1])
 
 
+@pytest.mark.parametrize("method", ["ekf", "ekf-gate-beam", "ssm-log", "rstkf"])
+def test_company_in_a_batch_does_not_matter(method: str) -> None:
+    """A resumed study may need only one of many seeds."""
+    many = do_job(a_job(method, seeds=(0, 1, 2, 3, 4)))
+    alone = do_job(a_job(method, seeds=(3,)))
+    ((key, row),) = alone.rows.items()
+    assert untimed(row) == untimed(many.rows[key])
+
+
 def test_rows_tell_errors_and_weights() -> None:
     """The oracle sees none of the bad beams, the smoother rejects them."""
     result = do_job(a_job("oracle", "smoother-log"))

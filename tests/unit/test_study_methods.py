@@ -76,7 +76,7 @@ def test_one_bad_trial_of_a_batch_is_found() -> None:
     outcomes = run_fake(method, 8)
     assert outcomes[5] == Failure("cannot")
     assert [o for o in outcomes if not isinstance(o, Failure)] == [0, 1, 2, 3, 4, 6, 7]
-    assert calls == [8, 4, 4, 2, 1, 1, 2]
+    assert calls == [8, 4, 4, 2, 2, 2, 2]  # one alone is doubled
 
 
 def test_single_trials_fail_alone() -> None:
