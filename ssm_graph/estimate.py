@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
@@ -12,6 +13,10 @@ from ssm_graph.earth import LocalFrame
 
 OUTLIER_WEIGHT = 0.05
 """Beams that end below this weight are called outliers."""
+
+
+OnKeyframe = Callable[[int, int], None]
+"""Called by what goes keyframe by keyframe: how many are done, and how many there are."""
 
 
 class Status(Enum):

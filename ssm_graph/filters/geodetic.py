@@ -23,7 +23,8 @@ from factors.similarity import Kernel, LogKernel
 from factors.so3 import skew
 from ssm_graph.data import N_BEAMS, Array, ImuLog, ReadOnlyArrays
 from ssm_graph.earth import R_el_from_lat_lon
-from ssm_graph.errors import ConfigError, SolverError
+from ssm_graph.errors import ConfigError
+from ssm_graph.estimate import OnKeyframe
 from ssm_graph.filters.geodetic_error_model import (
     DP,
     DV,
@@ -103,14 +104,6 @@ class GeodeticHistory(ReadOnlyArrays):
     iterations: NDArray[np.intp]
     """(B, K) 0 where there is no beam"""
 
-    @property
-    def is_finite(self) -> NDArray[np.bool_]:
-        """(B,) False for a run that ran away."""
-        place = np.stack([self.lat, self.lon, self.height], axis=-1)
-        parts = np.concatenate([place, self.velocity_enu, self.R_lb[..., 0]], axis=-1)
-        finite: NDArray[np.bool_] = np.isfinite(parts).all(axis=(1, 2))
-        return finite
-
 
 class Posteriors(NamedTuple):
     """One run in the package's own terms: see :mod:`ssm_graph.problem.error_state`."""
@@ -128,7 +121,11 @@ class Posteriors(NamedTuple):
 
 
 def run_geodetic(
-    problems: Sequence[Problem], imu: Sequence[ImuLog], config: GeodeticConfig | None = None
+    problems: Sequence[Problem],
+    imu: Sequence[ImuLog],
+    config: GeodeticConfig | None = None,
+    *,
+    on_keyframe: OnKeyframe | None = None,
 ) -> GeodeticHistory:
     """Filter runs side by side: mechanise, propagate, update, feed back, keyframe by keyframe.
 
@@ -140,6 +137,7 @@ def run_geodetic(
     problems : runs with equally many keyframes.
     imu : their inertial data, merging into equally many samples between keyframes.
     config : kernel and stopping rule.
+    on_keyframe : called after each keyframe.
 
     Raises
     ------
@@ -166,6 +164,8 @@ def run_geodetic(
             X, P = _update(X, P, state, measurements, k, track, config, recorder)
             state, X, P = feed_back(state, X, P, config.feedback)
             recorder.keep(k, state, X, P)
+            if on_keyframe is not None:
+                on_keyframe(k + 1, problems[0].n_keyframes)
     return recorder.history()
 
 
@@ -260,11 +260,6 @@ def to_navigation(problem: Problem, history: GeodeticHistory, run: int) -> Poste
 
         phi_b = R_lb' (phi + theta),  dp_b = -R_lb' D dp,  dv_n = R_nl (theta x v - dv)
     """
-    if not history.is_finite[run]:
-        raise SolverError(
-            f"run {run} of the geodetic filter became non-finite: check units, axes and noise of "
-            "[imu], and the initial state with its sigmas"
-        )
     lat, lon, height = history.lat[run], history.lon[run], history.height[run]
     v_l, R_lb = history.velocity_enu[run], history.R_lb[run]
     R_nl = problem.frame.R_en.T @ R_el_from_lat_lon(lat, lon)

@@ -8,17 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ssm_graph.data import N_BEAMS, Array
-from ssm_graph.estimate import BeamTable, Estimate, Status
+from ssm_graph.estimate import Estimate
 from ssm_graph.filters.states import NavigationStates
 from ssm_graph.problem.error_state import STATE_DIM
 from ssm_graph.problem.problem import Problem
-from ssm_graph.problem.trajectory import trajectory_from_states
-
-LARGEST_SPEED = 50.0
-"""m/s, above which no underwater vehicle goes."""
-LOW_WEIGHT = 0.1
-SUSPECT_SHARE = 0.5
-"""More than this share of the beams below the low weight is no outlier problem any more."""
+from ssm_graph.problem.recursive import RecursiveBeams, recursive_estimate
 
 
 @dataclass(slots=True, eq=False)
@@ -96,62 +90,23 @@ def estimates_from_history(
     wall_s: float,
 ) -> list[Estimate]:
     """Return the estimate of every run; ``states`` are the posterior or smoothed ones."""
-    return [
-        _estimate(problem, run, history, states, method=method, kernel=kernel, wall_s=wall_s)
-        for run, problem in enumerate(problems)
-    ]
-
-
-def _estimate(
-    problem: Problem,
-    run: int,
-    history: FilterHistory,
-    states: StateHistory,
-    *,
-    method: str,
-    kernel: str,
-    wall_s: float,
-) -> Estimate:
-    own = NavigationStates(*(getattr(states, name)[:, run] for name in NavigationStates._fields))
-    keyframe, beam = problem.beams.keyframe, problem.beams.beam
-    weight = history.weight[keyframe, run, beam]
-    status, reason = _verdict(own, states.covariance[:, run], weight, history.n_iterations[:, run])
-    return Estimate(
-        method=method,
-        kernel=kernel,
-        status=status,
-        reason=reason,
-        trajectory=trajectory_from_states(problem, own, states.covariance[:, run]),
-        beams=BeamTable(
-            time_s=problem.keyframe_s[keyframe],
-            beam=(beam + 1).astype(np.float64),
-            innovation=history.innovation[keyframe, run, beam],
-            mahalanobis_sq=history.mahalanobis_sq[keyframe, run, beam],
-            weight=weight,
-        ),
-        iterations=(),
-        wall_s=wall_s,
-        cost=np.nan,
-        start=problem.start,
-        notes=problem.notes,
-    )
-
-
-def _verdict(
-    states: NavigationStates, covariance: Array, weight: Array, n_iterations: Array
-) -> tuple[Status, str]:
-    if not all(np.all(np.isfinite(x)) for x in (*states, covariance)):
-        return Status.DIVERGED, Status.DIVERGED.value
-    largest = float(np.linalg.norm(states.v_n, axis=1).max())
-    if largest > LARGEST_SPEED:
-        return Status.SUSPECT, f"a speed of {largest:.0f} m/s, more than any underwater vehicle's"
-    share = float(np.mean(weight < LOW_WEIGHT)) if len(weight) else 0.0
-    if share > SUSPECT_SHARE:
-        return Status.SUSPECT, (
-            f"{100.0 * share:.0f} % of the {len(weight)} beam speeds contradict the filter (weight "
-            f"below {LOW_WEIGHT}): check the start, beam order, mounting and signs of the DVL"
+    estimates = []
+    for run, problem in enumerate(problems):
+        at = problem.beams.keyframe, run, problem.beams.beam
+        estimates.append(
+            recursive_estimate(
+                problem,
+                NavigationStates(
+                    *(getattr(states, name)[:, run] for name in NavigationStates._fields)
+                ),
+                states.covariance[:, run],
+                RecursiveBeams(
+                    history.innovation[at], history.mahalanobis_sq[at], history.weight[at]
+                ),
+                history.n_iterations[:, run],
+                method=method,
+                kernel=kernel,
+                wall_s=wall_s,
+            )
         )
-    return Status.CONVERGED, (
-        f"filtered {len(n_iterations)} keyframes, {np.mean(n_iterations):.1f} iterations each, "
-        f"{np.max(n_iterations):.0f} at most"
-    )
+    return estimates

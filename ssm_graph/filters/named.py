@@ -12,17 +12,20 @@ from typing import Final
 
 from factors.kernels import KERNELS
 from factors.similarity import Similarity
-from ssm_graph.estimate import Estimate
+from ssm_graph.data import ImuLog
+from ssm_graph.estimate import Estimate, OnKeyframe
 from ssm_graph.filters.correntropy import CorrentropyUpdate
+from ssm_graph.filters.geodetic import GeodeticConfig, run_geodetic, to_navigation
 from ssm_graph.filters.history import estimates_from_history
 from ssm_graph.filters.kalman import Gate, GatedUpdate, KalmanUpdate
 from ssm_graph.filters.model import UpdateRule
-from ssm_graph.filters.navigation import Grouping, OnKeyframe, run_filter
+from ssm_graph.filters.navigation import Grouping, run_filter
 from ssm_graph.filters.rts import smooth_history
 from ssm_graph.filters.ssm import SsmUpdate
 from ssm_graph.filters.student import StudentUpdate
 from ssm_graph.problem.error_state import Linearised
 from ssm_graph.problem.problem import Problem
+from ssm_graph.problem.recursive import RecursiveBeams, recursive_estimate
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,3 +140,44 @@ def filter_problems(
         kernel=str(rule),
         wall_s=wall_s,
     )
+
+
+def filter_geodetic(
+    problems: Sequence[Problem],
+    imu: Sequence[ImuLog],
+    config: GeodeticConfig | None = None,
+    *,
+    on_keyframe: OnKeyframe | None = None,
+) -> list[Estimate]:
+    """Filter problems side by side by the paper's own filter, in geodetic coordinates.
+
+    Parameters
+    ----------
+    problems, imu : as :func:`ssm_graph.filters.geodetic.run_geodetic` takes them.
+    config : kernel, feedback and stopping rule.
+    on_keyframe : called after each keyframe.
+    """
+    begin = time.perf_counter()
+    config = config or GeodeticConfig()
+    history = run_geodetic(problems, imu, config, on_keyframe=on_keyframe)
+    wall_s = (time.perf_counter() - begin) / len(problems)
+    estimates = []
+    for run, problem in enumerate(problems):
+        states = to_navigation(problem, history, run)
+        at = run, problem.beams.keyframe, problem.beams.beam
+        estimates.append(
+            recursive_estimate(
+                problem,
+                states,
+                states.covariance,
+                RecursiveBeams(
+                    history.innovation[at], history.mahalanobis_sq[at], history.weight[at]
+                ),
+                history.iterations[run],
+                max_iterations=config.max_iterations,
+                method=f"filter geodetic, {config.feedback.name.lower()} feedback",
+                kernel=str(config.kernel),
+                wall_s=wall_s,
+            )
+        )
+    return estimates

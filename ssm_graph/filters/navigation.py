@@ -11,12 +11,13 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from enum import Enum
 
 import numpy as np
 
 from ssm_graph.data import N_BEAMS, Array
+from ssm_graph.estimate import OnKeyframe
 from ssm_graph.filters.history import FilterHistory
 from ssm_graph.filters.measurements import KeyframeModel
 from ssm_graph.filters.model import Update, UpdateRule
@@ -24,10 +25,6 @@ from ssm_graph.filters.stack import Stack, stack_problems
 from ssm_graph.filters.states import NavigationStates
 from ssm_graph.problem.error_state import VELOCITY
 from ssm_graph.problem.problem import Problem
-
-OnKeyframe = Callable[[int, int], None]
-"""Called after each keyframe with its number and how many there are."""
-
 
 RUNAWAY_SIGMA = 1e4
 """m/s; a filter this uncertain of its velocity has run away."""

@@ -8,21 +8,17 @@ the filter: predict, marginalise the old keyframe, iterate the beams of the new 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from ssm_graph.data import Array
-from ssm_graph.estimate import BeamTable, Estimate, Status
+from ssm_graph.estimate import Estimate, OnKeyframe
 from ssm_graph.problem.problem import Problem
-from ssm_graph.problem.trajectory import trajectory_from_states
+from ssm_graph.problem.recursive import RecursiveBeams, recursive_estimate
 from ssm_graph.smoothers.window import FixedLagConfig, Track, Window
 
 __all__ = ["FixedLagConfig", "FixedLagRun", "FixedLagSmoother", "Track"]
-
-OnKeyframe = Callable[[int, int], None]
-"""Called after each keyframe with its number and how many there are."""
 
 
 class FixedLagRun(NamedTuple):
@@ -36,6 +32,13 @@ class FixedLagRun(NamedTuple):
     """(K,)"""
 
 
+class FixedLagEstimates(NamedTuple):
+    """Both tracks of :class:`FixedLagRun`, as estimates."""
+
+    newest: Estimate
+    delayed: Estimate
+
+
 class FixedLagSmoother:
     """Estimate a mission keyframe by keyframe."""
 
@@ -44,7 +47,7 @@ class FixedLagSmoother:
 
     def solve(
         self, problem: Problem, *, on_keyframe: OnKeyframe | None = None
-    ) -> tuple[Estimate, Estimate]:
+    ) -> FixedLagEstimates:
         """Return the newest states and those that left the window, as estimates.
 
         Raises
@@ -55,11 +58,12 @@ class FixedLagSmoother:
         begin = time.perf_counter()
         run = self.run(problem, on_keyframe=on_keyframe)
         wall_s = time.perf_counter() - begin
-        newest, delayed = (
-            self._estimate(problem, track, run.n_iterations, wall_s, name)
-            for track, name in ((run.newest, "newest"), (run.delayed, "delayed"))
+        return FixedLagEstimates(
+            *(
+                self._estimate(problem, track, run.n_iterations, wall_s, name)
+                for track, name in ((run.newest, "newest"), (run.delayed, "delayed"))
+            )
         )
-        return newest, delayed
 
     def run(self, problem: Problem, *, on_keyframe: OnKeyframe | None = None) -> FixedLagRun:
         """Go through the keyframes one by one."""
@@ -78,25 +82,14 @@ class FixedLagSmoother:
     def _estimate(
         self, problem: Problem, track: Track, n_iterations: Array, wall_s: float, name: str
     ) -> Estimate:
-        beams = problem.beams
-        at_limit = int(np.sum(n_iterations >= self.config.max_iterations))
-        return Estimate(
+        return recursive_estimate(
+            problem,
+            track,
+            track.covariance,
+            RecursiveBeams(track.innovation, track.mahalanobis_sq, track.weight),
+            n_iterations,
+            max_iterations=self.config.max_iterations,
             method=f"fixed lag {self.config.lag_s:g} s, {name} states",
             kernel=str(self.config.kernel),
-            status=Status.CONVERGED,
-            reason=f"{np.mean(n_iterations):.1f} iterations a keyframe, {at_limit} of "
-            f"{len(n_iterations)} keyframes at the limit of {self.config.max_iterations}",
-            trajectory=trajectory_from_states(problem, track, track.covariance),
-            beams=BeamTable(
-                time_s=problem.keyframe_s[beams.keyframe],
-                beam=(beams.beam + 1).astype(np.float64),
-                innovation=track.innovation,
-                mahalanobis_sq=track.mahalanobis_sq,
-                weight=track.weight,
-            ),
-            iterations=(),
             wall_s=wall_s,
-            cost=np.nan,
-            start=problem.start,
-            notes=problem.notes,
         )

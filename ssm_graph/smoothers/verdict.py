@@ -11,14 +11,10 @@ from ssm_graph.graph.linearize import BeamRows, GraphLinearizer
 from ssm_graph.graph.marginal_prior import MarginalPrior
 from ssm_graph.graph.states import States
 from ssm_graph.problem.problem import Problem
+from ssm_graph.problem.recursive import LARGEST_SPEED, LOW_WEIGHT, SUSPECT_SHARE
 
-LARGEST_SPEED = 50.0
-"""m/s"""
-LOW_WEIGHT = 0.1
 TRUSTED = 0.5
 """Beams of at least this weight are believed."""
-SUSPECT_SHARE = 0.5
-"""More than this share of the beams below the low weight is no outlier problem any more."""
 SUSPECT_STRETCH_S = 60.0
 """So long may that last within a mission."""
 PRIOR_TAIL = 1e-9

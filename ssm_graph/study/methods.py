@@ -4,22 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Protocol
 
 from factors.kernels import KERNELS, KernelChoice
 from factors.m_estimators import TruncatedKernel
 from factors.similarity import GaussianKernel, Similarity
 from ssm_graph.errors import ConfigError, SsmGraphError, nearest_hint
-from ssm_graph.estimate import Estimate
-from ssm_graph.filters.named import FILTERS, FilterChoice, filter_problems
+from ssm_graph.estimate import Estimate, OnKeyframe
+from ssm_graph.filters.geodetic import GeodeticConfig
+from ssm_graph.filters.named import FILTERS, FilterChoice, filter_geodetic, filter_problems
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
+from ssm_graph.smoothers.fixed_lag import FixedLagConfig, FixedLagSmoother
 from ssm_graph.smoothers.gnc import Graduation
 from ssm_graph.study.trials import Trial
 
 ORACLE: Final = "oracle"
 
-Solver = Callable[[Sequence[Trial]], Sequence[Estimate]]
-"""Estimates every trial; a batched one all of them at once, any other is handed one at a time."""
+
+class Solver(Protocol):
+    """Estimates every trial; a batched one all of them at once, any other one at a time.
+
+    One that goes keyframe by keyframe calls ``on_keyframe`` after each.
+    """
+
+    def __call__(  # noqa: D102
+        self, trials: Sequence[Trial], *, on_keyframe: OnKeyframe | None = None
+    ) -> Sequence[Estimate]: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +55,8 @@ class Family:
     """Whether many missions at once are faster than one by one."""
     is_oracle: bool = False
     """Whether it is told which beams are bad."""
+    is_recursive: bool = False
+    """Whether it goes keyframe by keyframe."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,6 +68,7 @@ class Method:
     solver: Solver
     is_batched: bool = False
     is_oracle: bool = False
+    is_recursive: bool = False
 
     def run(self, trials: Sequence[Trial]) -> list[Outcome]:
         """Return an estimate for every trial; one that fails leaves the others as they are.
@@ -88,7 +101,8 @@ def shown(error: Exception) -> str:
 
 
 def _smoother(config: SmootherConfig, *, is_oracle: bool = False) -> Solver:
-    def solve(trials: Sequence[Trial]) -> list[Estimate]:
+    def solve(trials: Sequence[Trial], *, on_keyframe: OnKeyframe | None = None) -> list[Estimate]:
+        del on_keyframe  # there is none to tell of: all keyframes are solved for at once
         smoother = SsmSmoother(config)
         return [
             smoother.solve(trial.oracle_problem)
@@ -115,15 +129,45 @@ def _filter_family(name: str, choice: FilterChoice, **how: bool) -> Family:
     def make(value: float | None) -> Solver:
         choice.make(choice.default if value is None else value)  # refuses a wrong parameter now
 
-        def solve(trials: Sequence[Trial]) -> list[Estimate]:
+        def solve(
+            trials: Sequence[Trial], *, on_keyframe: OnKeyframe | None = None
+        ) -> list[Estimate]:
             problems = [t.oracle_problem if is_oracle else t.problem for t in trials]
-            return filter_problems(problems, name, value=value, smoothed=smoothed)
+            return filter_problems(
+                problems, name, value=value, smoothed=smoothed, on_keyframe=on_keyframe
+            )
 
         return solve
 
     told = ", without the bad beams" if is_oracle else ""
     back = ", and a Rauch-Tung-Striebel pass backwards" if smoothed else ""
-    return Family(choice.description + told + back, make, choice.default, True, is_oracle)
+    description = choice.description + told + back
+    return Family(description, make, choice.default, True, is_oracle, is_recursive=True)
+
+
+def _make_geodetic(value: float | None) -> Solver:
+    config = GeodeticConfig(KERNELS["log"].kernel(value))
+
+    def solve(trials: Sequence[Trial], *, on_keyframe: OnKeyframe | None = None) -> list[Estimate]:
+        problems, imu = [t.problem for t in trials], [t.mission.imu for t in trials]
+        return filter_geodetic(problems, imu, config, on_keyframe=on_keyframe)
+
+    return solve
+
+
+def _fixed_lag_family(states: str, description: str) -> Family:
+    def make(value: float | None) -> Solver:
+        smoother = FixedLagSmoother(FixedLagConfig() if value is None else FixedLagConfig(value))
+
+        def solve(
+            trials: Sequence[Trial], *, on_keyframe: OnKeyframe | None = None
+        ) -> list[Estimate]:
+            results = (smoother.solve(trial.problem, on_keyframe=on_keyframe) for trial in trials)
+            return [getattr(result, states) for result in results]
+
+        return solve
+
+    return Family(description, make, FixedLagConfig().lag_s, is_recursive=True)
 
 
 def _make_gnc(value: float | None) -> Solver:
@@ -148,6 +192,19 @@ FAMILIES: Final[Mapping[str, Family]] = {
         for name, choice in FILTERS.items()
     },
     "ekf-oracle": _filter_family("ekf", FILTERS["ekf"], is_oracle=True),
+    "geodetic-log": Family(
+        "the filter of the paper in geodetic coordinates, similarity weights for every beam",
+        _make_geodetic,
+        KERNELS["log"].default,
+        is_batched=True,
+        is_recursive=True,
+    ),
+    "fixed-lag": _fixed_lag_family(
+        "newest", "fixed-lag smoother with this lag in seconds, its newest states; 0: single step"
+    ),
+    "fixed-lag-delayed": _fixed_lag_family(
+        "delayed", "the same, its states when they leave the window"
+    ),
     "smoother-gnc-tls": Family(
         "batch smoother, truncated least squares by graduated non-convexity",
         _make_gnc,
@@ -181,7 +238,11 @@ def parse_method(text: str) -> Method:
         ) from error
     is_default = value is None or value == family.default
     return Method(
-        name if is_default else f"{name}:{value:g}", solver, family.is_batched, family.is_oracle
+        name if is_default else f"{name}:{value:g}",
+        solver,
+        family.is_batched,
+        family.is_oracle,
+        family.is_recursive,
     )
 
 

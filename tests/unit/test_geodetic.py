@@ -12,7 +12,8 @@ from factors import so3
 from factors.similarity import GaussianKernel
 from ssm_graph.data import Array, Mission
 from ssm_graph.earth import EARTH_RATE
-from ssm_graph.errors import ConfigError, DataError, SolverError
+from ssm_graph.errors import ConfigError, DataError
+from ssm_graph.estimate import Status
 from ssm_graph.filters.geodetic import GeodeticConfig, GeodeticHistory, run_geodetic, to_navigation
 from ssm_graph.filters.geodetic_error_model import (
     DP,
@@ -26,6 +27,7 @@ from ssm_graph.filters.geodetic_error_model import (
 )
 from ssm_graph.filters.geodetic_measurements import beam_rows, gather, nominal_rows
 from ssm_graph.filters.geodetic_mechanisation import GeodeticState, Samples, Track, advance
+from ssm_graph.filters.named import filter_geodetic
 from ssm_graph.graph.states import states_from_arrays
 from ssm_graph.imu.preintegration import INTEGRATION_DENSITY, imu_params
 from ssm_graph.problem import error_state
@@ -303,7 +305,7 @@ def test_absent_beams_are_absent() -> None:
     np.testing.assert_array_equal(np.isfinite(history.weight[0]), present)
     assert np.isnan(history.weight[1]).all()
     assert not history.iterations[1].any()
-    assert history.is_finite.all()
+    assert np.isfinite(history.lat).all()
 
 
 def test_gaussian_kernel_is_the_kalman_filter() -> None:
@@ -382,14 +384,18 @@ def test_two_pings_at_one_keyframe_are_refused() -> None:
         gather([dataclasses.replace(problem, beams=same)])
 
 
-def test_a_run_that_ran_away_is_not_handed_out() -> None:
-    """NaN stays inside; the states are refused."""
+def test_a_run_that_ran_away_says_so() -> None:
+    """A beam speed beyond all reason: the status says it, and the run beside is as it was."""
+    mission = survey().mission
     problem = survey_problem()
-    history = filtered(survey().mission)
-    lat = history.lat.copy()
-    lat[0, -1] = np.nan
-    with pytest.raises(SolverError, match="became non-finite"):
-        to_navigation(problem, dataclasses.replace(history, lat=lat), 0)
+    speed = problem.beams.speed.copy()
+    speed[:] = 1e200
+    lost = dataclasses.replace(problem, beams=dataclasses.replace(problem.beams, speed=speed))
+    alone, _ = filter_geodetic([problem, problem], [mission.imu] * 2)
+    beside, away = filter_geodetic([problem, lost], [mission.imu] * 2)
+    assert away.status in {Status.DIVERGED, Status.SUSPECT}
+    assert beside.status is Status.CONVERGED, beside.reason
+    np.testing.assert_array_equal(beside.trajectory.lat, alone.trajectory.lat)
 
 
 @pytest.mark.parametrize("wrong", [{"tolerance": 0.0}, {"max_iterations": 0}])
