@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import ssm_graph as sg
-from ssm_graph.cli.smooth import withhold_gnss
+from ssm_graph.cli.run_mission import withhold_gnss
 from ssm_graph.io.blueye import convert_blueye
 
 folder = Path(os.environ.get("SSM_GRAPH_DATA", "../shared/data"))

@@ -105,6 +105,7 @@ class Estimate:
     trajectory: Trajectory
     beams: BeamTable
     iterations: tuple[Iteration, ...]
+    """Passes over all keyframes; empty where each keyframe has its own."""
     wall_s: float
     cost: float
     """Half the sum of squares of all factors, a beam's replaced by its robust loss ``-f(t)``."""
@@ -112,6 +113,13 @@ class Estimate:
     """The initial state that was used, from the mission or from alignment."""
     notes: tuple[str, ...] = ()
     """What a user should know about the run, one sentence each."""
+    keyframe_iterations: float = np.nan
+    """Mean passes over a keyframe of what goes keyframe by keyframe."""
+
+    @property
+    def n_iterations(self) -> float:
+        """How often the data were gone through: in all, or on average over the keyframes."""
+        return len(self.iterations) if self.iterations else self.keyframe_iterations
 
 
 def path_length_m(

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 
-from ssm_graph.cli.options import add_command, table_format_option
+from ssm_graph.cli.options import add_command, method_lines, table_format_option
 from ssm_graph.errors import ConfigError
 from ssm_graph.evaluation.comparison import compare_methods
 from ssm_graph.io.mission import TableFormat
@@ -79,12 +79,11 @@ study file (TOML):
 
 def add_parser(commands: Any, *, epilog: str) -> None:
     """Declare the command and its options."""
-    methods = "\n".join(f"  {_shown(name):26} {f.description}" for name, f in FAMILIES.items())
     parser = add_command(
         commands,
         "compare",
         summary="compare methods on many simulated or recorded missions",
-        description=f"{DESCRIPTION}\nmethods:\n{methods}",
+        description=f"{DESCRIPTION}\nmethods:\n{method_lines(FAMILIES)}",
         epilog=epilog,
     )
     parser.add_argument(
@@ -117,11 +116,6 @@ def add_parser(commands: Any, *, epilog: str) -> None:
     parser.add_argument("--no-figures", action="store_true", help="draw no figures")
     table_format_option(parser)
     parser.set_defaults(run=run)
-
-
-def _shown(name: str) -> str:
-    default = FAMILIES[name].default
-    return name if default is None else f"{name}[:{default:g}]"
 
 
 def run(arguments: argparse.Namespace, console: Console, errors: Console) -> bool:

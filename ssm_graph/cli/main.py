@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from ssm_graph.cli import compare, convert, simulate, smooth
+from ssm_graph.cli import filter as filter_command
 from ssm_graph.errors import (
     ConfigError,
     DataError,
@@ -35,13 +36,13 @@ class ExitCode(IntEnum):
 
 EPILOG = """\
 exit codes:
-  0    done; for smooth: converged; for compare: every run has a result
+  0    done; for smooth and filter: converged; for compare: every run has a result
   1    a defect of this program
   2    a wrong option or setting, a missing extra
   3    the data of a mission cannot be used; the message says where and why
-  4    smooth ended with a result that must not be trusted blindly (iteration limit, interrupted
-       after the first iteration, or the data contradict it); it is written all the same, and its
-       status says so; compare: some runs have no result, the table says why
+  4    smooth or filter ended with a result that must not be trusted blindly (iteration limit,
+       interrupted after the first iteration, run away, or the data contradict it); it is written
+       all the same, and its status says so; compare: some runs have no result, the table says why
   5    smooth found no finite result; nothing is written
   130  interrupted, nothing written; compare keeps finished runs and goes on when started again
 """
@@ -65,7 +66,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=version("ssm-graph"))
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for module in (simulate, smooth, compare, convert):
+    for module in (simulate, smooth, filter_command, compare, convert):
         module.add_parser(commands, epilog=EPILOG)
     return parser
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from ssm_graph.io.mission import TableFormat
+from ssm_graph.study.methods import Family
 
 
 def add_command(commands: Any, name: str, *, summary: str, description: str, epilog: str) -> Any:
@@ -17,6 +19,15 @@ def add_command(commands: Any, name: str, *, summary: str, description: str, epi
         description=description,
         epilog=epilog,
         formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
+def method_lines(families: Mapping[str, Family]) -> str:
+    """Return what methods there are, one a line, each with its parameter's default."""
+    return "\n".join(
+        f"  {name if family.default is None else f'{name}[:{family.default:g}]':26} "
+        f"{family.description}"
+        for name, family in families.items()
     )
 
 

@@ -42,6 +42,9 @@ class CorrentropyUpdate(UpdateRule):
         if not (np.isfinite(self.width) and self.width > 0.0):
             raise ConfigError(f"width: expected above zero, got {self.width}")
 
+    def __str__(self) -> str:
+        return f"correntropy(width={self.width:g})"
+
     def __call__(
         self, covariance: Array, model: MeasurementModel, mean: Array | None = None
     ) -> Update:

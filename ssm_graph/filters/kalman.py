@@ -36,6 +36,9 @@ class KalmanUpdate(UpdateRule):
        Basic Engineering 82, 1960.
     """
 
+    def __str__(self) -> str:
+        return "gaussian"
+
     def __call__(
         self,
         covariance: Array,
@@ -65,6 +68,9 @@ class GatedUpdate(UpdateRule):
     def __post_init__(self) -> None:
         if not 0.0 < self.confidence < 1.0:
             raise ConfigError(f"confidence: expected a number in (0, 1), got {self.confidence}")
+
+    def __str__(self) -> str:
+        return f"gate({self.confidence:g})"
 
     def __call__(
         self,

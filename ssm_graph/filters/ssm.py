@@ -77,6 +77,11 @@ class SsmUpdate(UpdateRule):
     floor: Floor = Floor.CLIPPED
     linearised: Linearised = Linearised.EACH_PASS
 
+    def __str__(self) -> str:
+        state = "" if self.state_kernel is None else f", prediction {self.state_kernel}"
+        plain = ", plain" if self.similarity is Similarity.PLAIN else ""
+        return f"{self.kernel}{state}{plain}"
+
     def __call__(
         self, covariance: Array, model: MeasurementModel, mean: Array | None = None
     ) -> Update:

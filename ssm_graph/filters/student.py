@@ -47,6 +47,9 @@ class StudentUpdate(UpdateRule):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise ConfigError(f"{name}: expected above zero, got {getattr(self, name)}")
 
+    def __str__(self) -> str:
+        return f"student(dof={self.measurement_dof:g})"
+
     def __call__(
         self,
         covariance: Array,

@@ -76,7 +76,7 @@ def build_summary(
         "status_text": estimate.status.value,
         "is_good": estimate.status.is_good,
         "reason": estimate.reason,
-        "iterations": len(estimate.iterations),
+        "iterations": estimate.n_iterations,
         "wall_seconds": estimate.wall_s,
         "n_keyframes": len(trajectory.time_s),
         "n_beams": len(beams.time_s),

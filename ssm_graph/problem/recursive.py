@@ -5,17 +5,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ssm_graph.data import Array
 from ssm_graph.estimate import BeamTable, Estimate, Status
+from ssm_graph.problem.doubts import doubts_of_beams
 from ssm_graph.problem.problem import Problem
 from ssm_graph.problem.trajectory import KeyframeStates, trajectory_from_states
 
-LARGEST_SPEED = 50.0
-"""m/s, above which no underwater vehicle goes."""
-LOW_WEIGHT = 0.1
-SUSPECT_SHARE = 0.5
-"""More than this share of the beams below the low weight is no outlier problem any more."""
 UNSETTLED_SHARE = 0.01
 """More than this share of the keyframes at their iteration limit is said by the status."""
 
@@ -55,9 +52,14 @@ def recursive_estimate(
     method, kernel, wall_s : as in :class:`ssm_graph.estimate.Estimate`.
     """
     rows = problem.beams
-    status, reason = _verdict(states, covariance, beams.weight)
-    if status is Status.CONVERGED:
-        status, reason = _settled(n_iterations, max_iterations)
+    status, reason = _settled(n_iterations, max_iterations)
+    doubts = doubts_of_beams(problem, states.v_n, beams.innovation, beams.weight)
+    lost = np.flatnonzero(~_is_finite(states.R_nb, states.p_n, states.v_n, covariance))
+    if len(lost):
+        begin_s = problem.keyframe_s[lost[0]]
+        status, reason = Status.DIVERGED, f"{Status.DIVERGED.value} at {begin_s:.1f} s"
+    elif any(doubts):
+        status, reason = Status.SUSPECT, "; ".join(filter(None, doubts))
     return Estimate(
         method=method,
         kernel=kernel,
@@ -74,23 +76,14 @@ def recursive_estimate(
         cost=np.nan,
         start=problem.start,
         notes=problem.notes,
+        keyframe_iterations=float(np.mean(n_iterations)),
     )
 
 
-def _verdict(states: KeyframeStates, covariance: Array, weight: Array) -> tuple[Status, str]:
-    if not all(np.all(np.isfinite(x)) for x in (states.R_nb, states.p_n, states.v_n, covariance)):
-        return Status.DIVERGED, Status.DIVERGED.value
-    largest = float(np.linalg.norm(states.v_n, axis=1).max())
-    if largest > LARGEST_SPEED:
-        return Status.SUSPECT, f"a speed of {largest:.0f} m/s, more than any underwater vehicle's"
-    share = float(np.mean(weight < LOW_WEIGHT)) if len(weight) else 0.0
-    if share > SUSPECT_SHARE:
-        return Status.SUSPECT, (
-            f"{100.0 * share:.0f} % of the {len(weight)} beam speeds contradict the estimate "
-            f"(weight below {LOW_WEIGHT}): check the start, beam order, mounting and signs of the "
-            "DVL"
-        )
-    return Status.CONVERGED, ""
+def _is_finite(*arrays: Array) -> NDArray[np.bool_]:
+    """Return (K,) whether all that is known of a keyframe is finite."""
+    finite = [np.isfinite(a).reshape(len(a), -1).all(axis=1) for a in arrays]
+    return np.asarray(np.all(finite, axis=0))
 
 
 def _settled(n_iterations: Array, limit: int | None) -> tuple[Status, str]:

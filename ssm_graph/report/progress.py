@@ -12,6 +12,8 @@ from ssm_graph.estimate import Iteration
 
 PLAIN_EVERY: Final = 10
 """Iterations from one plain line to the next."""
+N_PLAIN: Final = 5
+"""Plain lines on the way through the keyframes."""
 
 
 class ProgressDisplay:
@@ -89,6 +91,13 @@ class ProgressDisplay:
             self.stage("smoothing")
         assert self._task is not None
         self._progress.update(self._task, total=limit, completed=index, state=state)
+
+    def keyframe(self, index: int, total: int) -> None:
+        """Show that this many keyframes are done."""
+        if self._is_live and self._task is not None:
+            self._progress.update(self._task, total=total, completed=index, state=f"{index}")
+        elif not self._is_live and index * N_PLAIN // total > (index - 1) * N_PLAIN // total:
+            self._print(f"keyframe {index} of {total}")
 
     def _flush(self) -> None:
         if self._unprinted is not None:

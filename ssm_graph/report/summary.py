@@ -55,7 +55,7 @@ def _overview(estimate: Estimate) -> Table:
         ("status", status),
         ("why it stopped", Text(estimate.reason)),
         ("method, kernel", Text(f"{estimate.method}, {estimate.kernel}")),
-        ("iterations", Text(str(len(estimate.iterations)))),
+        ("iterations", Text(_count(estimate))),
         ("wall time, s", Text(f"{estimate.wall_s:.2f}")),
         ("keyframes", Text(f"{len(time_s)}")),
         ("duration, s", Text(f"{np.ptp(time_s) if len(time_s) else 0.0:.1f}")),
@@ -69,6 +69,12 @@ def _overview(estimate: Estimate) -> Table:
     ):
         table.add_row(heading, value)
     return table
+
+
+def _count(estimate: Estimate) -> str:
+    if estimate.iterations:
+        return str(len(estimate.iterations))
+    return f"{estimate.keyframe_iterations:.1f} a keyframe"
 
 
 def _axes(trajectory: Trajectory) -> RenderableType:

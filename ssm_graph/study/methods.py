@@ -155,9 +155,12 @@ def _make_geodetic(value: float | None) -> Solver:
     return solve
 
 
-def _fixed_lag_family(states: str, description: str) -> Family:
+def _fixed_lag_family(states: str, description: str, lag_s: float | None = None) -> Family:
     def make(value: float | None) -> Solver:
-        smoother = FixedLagSmoother(FixedLagConfig() if value is None else FixedLagConfig(value))
+        chosen_s = value if lag_s is None else lag_s
+        smoother = FixedLagSmoother(
+            FixedLagConfig() if chosen_s is None else FixedLagConfig(chosen_s)
+        )
 
         def solve(
             trials: Sequence[Trial], *, on_keyframe: OnKeyframe | None = None
@@ -167,7 +170,8 @@ def _fixed_lag_family(states: str, description: str) -> Family:
 
         return solve
 
-    return Family(description, make, FixedLagConfig().lag_s, is_recursive=True)
+    default = FixedLagConfig().lag_s if lag_s is None else None
+    return Family(description, make, default, is_recursive=True)
 
 
 def _make_gnc(value: float | None) -> Solver:
@@ -199,8 +203,11 @@ FAMILIES: Final[Mapping[str, Family]] = {
         is_batched=True,
         is_recursive=True,
     ),
+    "single-step": _fixed_lag_family(
+        "newest", "fixed-lag smoother without lag: the filter ssm-log by way of the graph", 0.0
+    ),
     "fixed-lag": _fixed_lag_family(
-        "newest", "fixed-lag smoother with this lag in seconds, its newest states; 0: single step"
+        "newest", "fixed-lag smoother with this lag in seconds, its newest states"
     ),
     "fixed-lag-delayed": _fixed_lag_family(
         "delayed", "the same, its states when they leave the window"

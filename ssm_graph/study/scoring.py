@@ -96,7 +96,7 @@ def _score(labels: Row, trial: Trial, outcome: Estimate) -> tuple[Row, Array]:
     numbers = dict.fromkeys(NUMBER_COLUMNS, math.nan)
     numbers |= _length(outcome) if metrics is None else _errors(metrics)
     numbers |= _weights(trial, outcome)
-    numbers |= {"iterations": len(outcome.iterations), "wall_s": outcome.wall_s}
+    numbers |= {"iterations": outcome.n_iterations, "wall_s": outcome.wall_s}
     is_known = math.isfinite(numbers["horizontal_rms_m"]) or trial.simulated is None
     row = {
         **labels,

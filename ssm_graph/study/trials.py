@@ -152,6 +152,13 @@ def with_initial(mission: Mission) -> Mission:
     if mission.initial is not None:
         return mission
     alignment = align(mission)
-    if len(alignment.candidates) == 1:
-        return replace(mission, initial=alignment.candidates[0])
-    return replace(mission, initial=smooth(mission).start)
+    start, *others = alignment.candidates
+    notes = [f"aligned: {alignment.method}"]
+    if others:
+        estimate = smooth(mission)
+        start = estimate.start
+        notes.append(
+            f"heading at the start chosen by the smoother: {estimate.status.name}, "
+            f"{estimate.reason}"
+        )
+    return replace(mission, initial=start, notes=(*mission.notes, *notes))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import ssm_graph as sg
-from ssm_graph.cli.smooth import withhold_gnss
+from ssm_graph.cli.run_mission import withhold_gnss
 from ssm_graph.io.blueye import convert_blueye
 
 DATA = Path(os.environ.get("SSM_GRAPH_DATA", Path(__file__).parents[2].parent / "shared" / "data"))

@@ -13,6 +13,7 @@ from ssm_graph.data import Array
 from ssm_graph.estimate import Status
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.states import States, states_from_arrays
+from ssm_graph.problem.doubts import SUSPECT_STRETCH_S
 from ssm_graph.problem.problem import Problem, build_problem
 from ssm_graph.simulation import (
     DiveRoute,
@@ -21,7 +22,7 @@ from ssm_graph.simulation import (
     SimulatedMission,
     TransitRoute,
 )
-from ssm_graph.smoothers.verdict import SUSPECT_STRETCH_S, contradictions
+from ssm_graph.smoothers.verdict import contradictions
 from tests.helpers import outcome, simulated, true_states, with_imu, with_initial
 
 

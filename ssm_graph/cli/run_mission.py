@@ -1,0 +1,143 @@
+"""What every command does that makes a result folder of one mission folder."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from ssm_graph.data import GnssLog, Mission, Reference
+from ssm_graph.errors import ConfigError, DataError
+from ssm_graph.estimate import Estimate
+from ssm_graph.evaluation import Metrics, evaluate, reference_from_gnss
+from ssm_graph.io.mission import read_mission
+from ssm_graph.io.results import write_results
+from ssm_graph.problem.problem import ProblemConfig
+from ssm_graph.report.figure import save_figure
+from ssm_graph.report.progress import ProgressDisplay
+from ssm_graph.report.summary import summary_table
+
+Solve = Callable[[Mission, ProblemConfig, ProgressDisplay], Estimate]
+"""Estimates a mission and tells the display how far it is."""
+
+
+def add_mission_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the mission folder, the result folder, and what belongs to neither estimator."""
+    graph = ProblemConfig()
+    parser.add_argument("mission", type=Path, metavar="MISSION", help="mission folder")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="result folder")
+    parser.add_argument(
+        "--merge-rate",
+        type=float,
+        default=graph.merge_rate_hz,
+        metavar="HZ",
+        help=f"rate to which inertial samples are merged (default: {graph.merge_rate_hz:g})",
+    )
+    parser.add_argument(
+        "--keyframe-interval",
+        type=float,
+        default=graph.keyframe_interval_s,
+        metavar="SECONDS",
+        help="keyframes this far apart while DVL and GNSS are silent "
+        f"(default: {graph.keyframe_interval_s:g})",
+    )
+    parser.add_argument(
+        "--gnss-until",
+        type=float,
+        metavar="SECONDS",
+        help="use GNSS only so long from the begin of the inertial data; the rest becomes the "
+        "reference",
+    )
+    parser.add_argument("--no-figure", action="store_true", help="write no figure.png")
+
+
+def run_mission(
+    arguments: argparse.Namespace,
+    console: Console,
+    errors: Console,
+    solve: Solve,
+    settings: dict[str, Any],
+) -> bool:
+    """Read, estimate, compare, write and show; return whether the result may be trusted.
+
+    Parameters
+    ----------
+    arguments : those of :func:`add_mission_arguments`.
+    console, errors : where the result and the progress are shown.
+    solve : the estimator.
+    settings : its settings, for ``summary.json``.
+    """
+    graph = ProblemConfig(arguments.merge_rate, arguments.keyframe_interval)
+    with ProgressDisplay(errors) as show:
+        show.stage("reading the mission")
+        mission = read_mission(arguments.mission)
+        withheld: GnssLog | None = None
+        if arguments.gnss_until is not None:
+            mission, withheld = withhold_gnss(mission, arguments.gnss_until)
+        estimate = solve(mission, graph, show)
+        show.stage("writing results")
+        estimate, reference, metrics = _compare(estimate, mission, withheld)
+        write_results(
+            arguments.out,
+            estimate,
+            mission=mission,
+            metrics=metrics,
+            settings={
+                **settings,
+                "merge_rate_hz": graph.merge_rate_hz,
+                "keyframe_interval_s": graph.keyframe_interval_s,
+                "gnss_until_s": arguments.gnss_until,
+            },
+        )
+        if not arguments.no_figure:
+            save_figure(arguments.out / "figure.png", estimate, reference, title=mission.name)
+    console.print(summary_table(estimate, metrics))
+    console.print(f"results in {arguments.out}", highlight=False, soft_wrap=True)
+    return estimate.status.is_good
+
+
+def withhold_gnss(mission: Mission, until_s: float) -> tuple[Mission, GnssLog]:
+    """Return the mission with GNSS up to ``until_s`` after its begin, and the other fixes."""
+    gnss = mission.gnss
+    if gnss is None:
+        raise ConfigError("--gnss-until: expected a mission with GNSS, got one without")
+    used = gnss.time_s < mission.imu.start_s + until_s
+    if not used.any() or used.all():
+        first, last = gnss.time_s[[0, -1]] - mission.imu.start_s
+        raise ConfigError(
+            f"--gnss-until: expected a time between the first fix at {first:.1f} s and the last "
+            f"at {last:.1f} s, got {until_s:g} s"
+        )
+    return replace(mission, gnss=_fixes(gnss, used)), _fixes(gnss, ~used)
+
+
+def _fixes(gnss: GnssLog, kept: np.ndarray[Any, np.dtype[np.bool_]]) -> GnssLog:
+    return replace(
+        gnss,
+        time_s=gnss.time_s[kept],
+        lat=gnss.lat[kept],
+        lon=gnss.lon[kept],
+        height=gnss.height[kept],
+        sigma_enu=gnss.sigma_enu[kept],
+    )
+
+
+def _compare(
+    estimate: Estimate, mission: Mission, withheld: GnssLog | None
+) -> tuple[Estimate, Reference | None, Metrics | None]:
+    """Compare with the mission's reference or the withheld fixes; a note where that fails."""
+    reference = mission.reference
+    if withheld is not None:
+        reference = reference_from_gnss(withheld, estimate.trajectory)
+    if reference is None:
+        return estimate, None, None
+    try:
+        return estimate, reference, evaluate(estimate.trajectory, reference)
+    except DataError as error:
+        notes = (*estimate.notes, f"not compared with the reference: {error}")
+        return replace(estimate, notes=notes), None, None
