@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ssm_graph.data import N_BEAMS, Array
 from ssm_graph.estimate import Estimate
@@ -41,6 +42,11 @@ class StateHistory:
         """Keep the states of keyframe ``k``."""
         self.R_nb[k], self.p_n[k], self.v_n[k], self.bias[k] = states
         self.covariance[k] = covariance
+
+    def lose(self, k: int, is_lost: NDArray[np.bool_]) -> None:
+        """Forget the states of runs that have run away."""
+        for array in (self.R_nb, self.p_n, self.v_n, self.bias, self.covariance):
+            array[k, is_lost] = np.nan
 
     def at(self, k: int) -> NavigationStates:
         """Return the states of keyframe ``k``."""

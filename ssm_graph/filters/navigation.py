@@ -84,9 +84,8 @@ class _Filter:
             history.predicted.put(k, predicted, covariance)
             states, covariance = self._correct(k, predicted, covariance, states, history)
             states, covariance = self._without_lost(states, covariance)
-            history.posterior.put(
-                k, states, np.where(self._lost[:, None, None], np.nan, covariance)
-            )
+            history.posterior.put(k, states, covariance)
+            history.posterior.lose(k, self._lost)
             if on_keyframe is not None:
                 on_keyframe(k + 1, n_keyframes)
         return history

@@ -73,7 +73,7 @@ class WarmSchedule(Schedule):
     def __init__(self, wanted: Kernel, warm: Kernel) -> None:
         self.kernel = warm
         self._wanted = wanted
-        self._mixing = _Mixing()
+        self._mixing = Mixing()
 
     def first_weights(self, gated: Array) -> Array:
         """Return the weights of the forward pass."""
@@ -92,7 +92,7 @@ class WarmSchedule(Schedule):
             return settled
         weights = self._mixing.next_weights(used, settled)
         if self.kernel != self._wanted:
-            self.kernel, self._mixing = self._wanted, _Mixing()
+            self.kernel, self._mixing = self._wanted, Mixing()
         return weights
 
     def may_end(self, settled: Array) -> bool:  # noqa: ARG002
@@ -100,7 +100,7 @@ class WarmSchedule(Schedule):
         return self.kernel == self._wanted
 
 
-class _Mixing:
+class Mixing:
     """Anderson acceleration of depth one for the fixed point of the weights [2]_.
 
     Plain reweighting closes in by a constant factor a pass; two passes tell the factor, and the

@@ -21,6 +21,10 @@ from ssm_graph.problem.error_state import STATE_DIM, Linearised
 from ssm_graph.problem.problem import Problem, start_of
 from ssm_graph.problem.timeline import MIN_SPACING_S
 from ssm_graph.problem.window import rows_in, window_of
+from ssm_graph.smoothers.gnc import Mixing
+
+ROUNDING = 1e-7
+"""Posterior sigmas: updates of a window of several keyframes come down to a few 1e-8 and stay."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +37,8 @@ class FixedLagConfig:
     similarity: Similarity = Similarity.EXPECTED
     max_iterations: int = 50
     tolerance: float = 1e-8
-    """Largest update, in its own posterior sigmas, at which a keyframe's iteration ends."""
+    """Largest update, in its own posterior sigmas, at which a keyframe's iteration ends; not below
+    1e-7 while the window has several."""
     linearised: Linearised = Linearised.EACH_PASS
 
     def __post_init__(self) -> None:
@@ -142,6 +147,8 @@ class Window:
     def _settle(self, linearizer: GraphLinearizer, states: States, weights: Array) -> _Settled:
         """Solve and reweigh, everything linearised anew at each pass."""
         config, n_keyframes = self._config, linearizer.problem.n_keyframes
+        tolerance = max(config.tolerance, ROUNDING) if n_keyframes > 1 else config.tolerance
+        mixing = Mixing()
         beam_rows = linearizer.beam_rows(states)
         for number in range(1, config.max_iterations + 1):
             if n_keyframes > 1:  # a single keyframe keeps what its prediction came with
@@ -150,10 +157,12 @@ class Window:
             states, update = retract(states, solution.delta)
             beam_rows = linearizer.beam_rows(states)
             t = self._mahalanobis_sq(linearizer.problem, beam_rows, covariance)
-            if _largest(update, covariance) < config.tolerance:
+            if _largest(update, covariance) < tolerance:
                 break
             if number < config.max_iterations:
-                weights = config.kernel.weight(t)
+                settled = config.kernel.weight(t)
+                # A single keyframe's weights are those of the filter, pass by pass.
+                weights = mixing.next_weights(weights, settled) if n_keyframes > 1 else settled
         root = solution.R[-1]
         return _Settled(states, covariance, root, weights, t, -beam_rows.error, number)
 

@@ -8,17 +8,14 @@ import numpy as np
 import pytest
 
 from factors.similarity import ExpKernel, GaussianKernel, Kernel, LogKernel, SqrtKernel
-from ssm_graph.data import Array
 from ssm_graph.estimate import Estimate, Status
-from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.graph.solve import marginal_covariances, solve_linear
-from ssm_graph.graph.states import States
 from ssm_graph.problem.error_state import STATE_DIM
 from ssm_graph.problem.problem import Problem, build_problem
 from ssm_graph.simulation import Fault, Grade, Loss, OutlierKind, Outliers, SimulatedMission
 from ssm_graph.smoothers.batch import Similarity, SmootherConfig, SsmSmoother
 from tests.helpers import (
     assert_consistent,
+    covariances,
     estimated_states,
     simulated,
     state_errors,
@@ -40,15 +37,6 @@ def solved(sim: SimulatedMission, kernel: Kernel) -> tuple[Problem, Estimate]:
     """Return problem and estimate of a simulated mission."""
     problem = build_problem(sim.mission)
     return problem, SsmSmoother(SmootherConfig(kernel=kernel)).solve(problem)
-
-
-def covariances(problem: Problem, states: States, weights: Array) -> Array:
-    """Return the covariance (K, 15, 15) of the whole error state at an answer."""
-    linearizer = GraphLinearizer(problem)
-    linearizer.follow(states)
-    linear = linearizer.linearize(states, linearizer.beam_rows(states), weights)
-    solution = solve_linear(linear, linearizer.ordering, n_keyframes=problem.n_keyframes)
-    return marginal_covariances(solution)
 
 
 @pytest.mark.slow

@@ -1,0 +1,202 @@
+"""Filters by name: every one runs, takes its parameter, and is nobody else's business."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+import pytest
+
+from factors.kernels import KERNELS
+from ssm_graph.data import Array
+from ssm_graph.estimate import Estimate, Status, Trajectory
+from ssm_graph.filters.named import FILTERS, filter_problems
+from ssm_graph.filters.navigation import Grouping
+from ssm_graph.problem.problem import Problem, build_problem
+from ssm_graph.simulation import OutlierKind, Outliers, SimulatedMission
+from tests.helpers import simulated
+
+every_filter = pytest.mark.parametrize("name", FILTERS)
+BY_PARAMETER = [name for name, choice in FILTERS.items() if choice.default is not None]
+LOSES_ITSELF = {"ssmkf-sqrt", "ssmkf-exp"}
+"""Those that give an outlier's ping up together with the prediction, and may run away with it."""
+SUM_OF_FOUR = 4
+
+
+@cache
+def surveys(rate: float) -> tuple[SimulatedMission, ...]:
+    """Return two runs of 30 s in waves, with this share of pings with an outlier."""
+    outliers = Outliers(OutlierKind.SPARSE, rate=rate) if rate else Outliers()
+    return tuple(simulated(seed=seed, outliers=outliers) for seed in (0, 1))
+
+
+@cache
+def problems(rate: float = 0.1) -> tuple[Problem, ...]:
+    """Return what is to be estimated of :func:`surveys`."""
+    return tuple(build_problem(sim.mission) for sim in surveys(rate))
+
+
+@cache
+def filtered(name: str, rate: float = 0.1, value: float | None = None) -> tuple[Estimate, ...]:
+    """Return the estimates of both runs."""
+    return tuple(filter_problems(problems(rate), name, value=value))
+
+
+def highest_weight(name: str) -> float:
+    """Return what a beam without any residual or variance would get."""
+    if name == "rstkf":
+        return (5.0 + SUM_OF_FOUR) / 5.0
+    if not name.startswith("ssm"):
+        return 1.0
+    dim = SUM_OF_FOUR if FILTERS[name].grouping is Grouping.PER_PING else 1
+    return float(KERNELS[name.rpartition("-")[2]].make().weight(0.0, dim=dim))
+
+
+def apart(found: Sequence[Estimate], expected: Sequence[Estimate]) -> float:
+    """Return the largest difference of velocities, sigmas."""
+    return max(
+        float(np.abs(own.velocity_enu - other.velocity_enu).max() / other.velocity_sigma_enu.max())
+        for own, other in zip(
+            (estimate.trajectory for estimate in found),
+            (estimate.trajectory for estimate in expected),
+            strict=True,
+        )
+    )
+
+
+@every_filter
+@pytest.mark.parametrize("smoothed", [False, True], ids=["alone", "+ rts"])
+def test_every_filter_converges_on_clean_data(name: str, smoothed: bool) -> None:
+    """A finite track within five of its own sigmas from the truth, and weights in their range."""
+    for sim, estimate in zip(
+        surveys(0.0), filter_problems(problems(0.0), name, smoothed=smoothed), strict=True
+    ):
+        assert estimate.status is Status.CONVERGED, estimate.reason
+        track, weight = estimate.trajectory, estimate.beams.weight
+        for column in Trajectory.__dataclass_fields__:
+            assert np.all(np.isfinite(getattr(track, column))), column
+        error = track.velocity_enu - sim.truth_at(track.time_s).velocity_enu
+        assert np.abs(error / track.velocity_sigma_enu).max() < 5.0
+        assert weight.min() >= 0.0
+        assert weight.max() <= highest_weight(name)
+        assert np.median(weight) > 0.9
+        assert estimate.method == f"filter {name}{' + rts' if smoothed else ''}"
+        assert estimate.n_iterations >= 0.9
+
+
+@every_filter
+def test_outliers_are_survived_or_confessed(name: str) -> None:
+    """A tenth of the pings with a bad beam: all but the plain filter stay with the truth."""
+    if name in LOSES_ITSELF:
+        pytest.skip("known to diverge with outliers")
+    for sim, estimate in zip(surveys(0.1), filtered(name), strict=True):
+        track = estimate.trajectory
+        error = track.velocity_enu - sim.truth_at(track.time_s).velocity_enu
+        worst = np.abs(error / track.velocity_sigma_enu).max()
+        if name == "ekf":
+            assert estimate.status is Status.SUSPECT
+            assert worst > 50.0
+        else:
+            assert estimate.status is Status.CONVERGED, estimate.reason
+            assert worst < 5.0
+
+
+@pytest.mark.parametrize("name", sorted(LOSES_ITSELF))
+def test_what_runs_away_is_not_called_good(name: str) -> None:
+    """Where the track is not one, the status says so; where it is, it is near the truth."""
+    for sim, estimate in zip(surveys(0.1), filtered(name), strict=True):
+        track = estimate.trajectory
+        error = track.velocity_enu - sim.truth_at(track.time_s).velocity_enu
+        is_near = bool(np.all(np.abs(error) < 5.0 * track.velocity_sigma_enu))
+        assert estimate.status.is_good == is_near, estimate.reason
+
+
+@every_filter
+def test_beams_of_a_ping_share_their_weight_as_the_name_says(name: str) -> None:
+    """One weight for the ping, or the good beams beside a bad one keep theirs."""
+    for sim, problem, estimate in zip(surveys(0.1), problems(), filtered(name), strict=True):
+        weight = np.full((problem.n_keyframes, 4), np.nan)
+        weight[problem.beams.keyframe, problem.beams.beam] = estimate.beams.weight
+        bad = np.zeros(weight.shape, bool)
+        bad[1:] = sim.is_outlier  # pings at 1 s, 2 s, ...
+        struck = weight[bad.any(axis=1)]
+        assert len(struck) >= 2
+        if FILTERS[name].grouping is Grouping.PER_PING:
+            np.testing.assert_allclose(np.ptp(struck, axis=1), 0.0, atol=1e-15)
+        else:
+            assert np.all(struck.max(axis=1) > 0.5)
+            assert np.all(weight[bad] < 0.01)
+
+
+@pytest.mark.parametrize("name", BY_PARAMETER)
+def test_parameter_arrives(name: str) -> None:
+    """One without tails gives the Kalman filter on clean data; the default does not.
+
+    Degrees of freedom of 1e13 leave 1e-6 of a sigma to rounding of the weights, measured.
+    """
+    default = FILTERS[name].default
+    assert default is not None
+    is_gate = name.startswith("ekf-gate")
+    is_width = name == "mckf" or name.endswith("-exp")
+    large = 1.0 - 1e-15 if is_gate else 1e7 if is_width else 1e13
+    kalman = filtered("ekf", 0.0)
+    assert apart(filtered(name, 0.0, large), kalman) < 1e-5
+    assert apart(filtered(name, 0.0), kalman) > 1e-3
+    assert apart(filtered(name, 0.0, default), filtered(name, 0.0)) == 0.0
+    assert f"{0.75:g}" in filtered(name, 0.0, 0.75)[0].kernel
+    assert f"{default:g}" in filtered(name, 0.0)[0].kernel
+
+
+def test_each_keyframe_is_announced() -> None:
+    """With how many there are."""
+    seen: list[tuple[int, int]] = []
+    filter_problems(problems(), "ekf", on_keyframe=lambda *at: seen.append(at))
+    n = problems()[0].n_keyframes
+    assert seen == [(k + 1, n) for k in range(n)]
+
+
+def with_speeds(problem: Problem, speed: float, *, first: int) -> Problem:
+    """Return the problem with the same reading of all beams from a keyframe on."""
+    beams = problem.beams
+    damaged = np.where(beams.keyframe >= first, speed, beams.speed)
+    return dataclasses.replace(problem, beams=dataclasses.replace(beams, speed=damaged))
+
+
+def columns(estimate: Estimate) -> dict[str, Array]:
+    """Return everything that an estimate says of its run."""
+    names = Trajectory.__dataclass_fields__
+    track = {name: getattr(estimate.trajectory, name) for name in names}
+    return track | {name: getattr(estimate.beams, name) for name in ("innovation", "weight")}
+
+
+@pytest.mark.parametrize("name", sorted(FILTERS.keys() - LOSES_ITSELF))
+@pytest.mark.parametrize("speed", [np.nan, 1e200], ids=["not a number", "overflow"])
+@pytest.mark.parametrize("smoothed", [False, True], ids=["alone", "+ rts"])
+def test_a_lost_run_takes_nobody_along(name: str, speed: float, smoothed: bool) -> None:
+    """One of two runs goes beyond all numbers at 10 s; the other is as beside a good one.
+
+    To rounding, as NumPy rounds a stack of one otherwise: when the other has settled, one is left.
+    """
+    good, other = problems()
+    first = 10
+    lost = with_speeds(other, speed, first=first)
+    in_good_company = filter_problems([good, other], name, smoothed=smoothed)
+    beside, away = filter_problems([good, lost], name, smoothed=smoothed)
+    assert away.status in {Status.DIVERGED, Status.SUSPECT}
+    if np.isnan(speed):
+        assert away.status is Status.DIVERGED
+    assert beside.status is in_good_company[0].status
+    expected = columns(in_good_company[0])
+    for key, column in columns(beside).items():
+        scale = np.abs(expected[key]).max()
+        np.testing.assert_allclose(column, expected[key], rtol=0.0, atol=1e-12 * scale)
+    if not smoothed:  # the pass backwards takes what was lost to the begin
+        np.testing.assert_allclose(
+            away.trajectory.velocity_enu[:first],
+            in_good_company[1].trajectory.velocity_enu[:first],
+            rtol=0.0,
+            atol=1e-12,
+        )
+        assert np.all(np.isfinite(away.trajectory.velocity_sigma_enu[:first]))
