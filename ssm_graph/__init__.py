@@ -23,20 +23,25 @@ from ssm_graph.errors import (
 )
 from ssm_graph.estimate import Estimate, Iteration, Status, Trajectory
 from ssm_graph.evaluation import Metrics, evaluate, reference_from_gnss
+from ssm_graph.filters.named import FILTERS, filter_problems
 from ssm_graph.io.mission import read_mission, write_mission
 from ssm_graph.io.results import read_results, write_results
 from ssm_graph.problem.alignment import Alignment, align
 from ssm_graph.problem.problem import Problem, ProblemConfig, build_problem
 from ssm_graph.report.figure import save_figure
 from ssm_graph.smoothers.batch import Similarity, SmootherConfig, SsmSmoother
+from ssm_graph.smoothers.fixed_lag import FixedLagConfig, FixedLagSmoother
 from ssm_graph.smoothers.mission import smooth
 
 __all__ = [
+    "FILTERS",
     "Alignment",
     "ConfigError",
     "DataError",
     "Estimate",
     "ExpKernel",
+    "FixedLagConfig",
+    "FixedLagSmoother",
     "GaussianKernel",
     "InitialState",
     "Iteration",
@@ -59,6 +64,7 @@ __all__ = [
     "align",
     "build_problem",
     "evaluate",
+    "filter_problems",
     "read_mission",
     "read_results",
     "reference_from_gnss",

@@ -20,8 +20,12 @@ from ssm_graph.filters.model import MeasurementModel, Runs, Update, UpdateRule
 class CorrentropyUpdate(UpdateRule):
     """MCKF: every whitened component of state and measurement weighed by a Gaussian kernel.
 
-    As published, the weights have no floor: an innovation beyond 38 kernel widths makes them
-    underflow, and the filter fails. With one, an outlier of any size loses its weight only.
+    The measurements are linearised once, at the prediction; only the weights are iterated.
+
+    As published, the weights have no floor. A measurement beyond 38 kernel widths then underflows
+    to weight zero and infinite noise, and drops out as if it were absent; a prediction that rows of
+    full weight (depth, GNSS) contradict as much gets an infinite covariance, and the run is lost.
+    With a floor, neither happens.
 
     References
     ----------
@@ -36,7 +40,7 @@ class CorrentropyUpdate(UpdateRule):
     states, which may be zero, largest step of a component in its predicted sigma."""
     max_iterations: int = 10_001
     floor: float = WEIGHT_FLOOR
-    """Smallest weight; zero as published."""
+    """Smallest weight of a row and of a component of the prediction; zero as published."""
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.width) and self.width > 0.0):

@@ -27,7 +27,8 @@ class StudentUpdate(UpdateRule):
     """RSTKF: prediction and measurement both Student's t, by variational Bayes.
 
     A fixed number of passes without a stopping test or a floor, as published; the first pass
-    starts from the prediction, so that its measurement weight comes from the innovation.
+    starts from the prediction, so that its measurement weight comes from the innovation. The
+    measurements are linearised once, at the prediction.
 
     References
     ----------

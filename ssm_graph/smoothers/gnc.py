@@ -24,9 +24,10 @@ from typing import final
 import numpy as np
 
 from factors.m_estimators import TruncatedKernel
-from factors.similarity import WEIGHT_FLOOR, GaussianKernel, Kernel
+from factors.similarity import GaussianKernel, Kernel
 from ssm_graph.data import Array
 from ssm_graph.errors import ConfigError
+from ssm_graph.smoothers.mixing import Mixing
 
 NEAR_SIGMAS = 1.0
 """The next kernel takes over once the updates are below this many of their own sigmas."""
@@ -98,35 +99,6 @@ class WarmSchedule(Schedule):
     def may_end(self, settled: Array) -> bool:  # noqa: ARG002
         """Return whether the kernel in force is the one asked for."""
         return self.kernel == self._wanted
-
-
-class Mixing:
-    """Anderson acceleration of depth one for the fixed point of the weights [2]_.
-
-    Plain reweighting closes in by a constant factor a pass; two passes tell the factor, and the
-    rest of the way is taken at once. The fixed point stays what it is.
-
-    References
-    ----------
-    .. [2] H. F. Walker, P. Ni, "Anderson Acceleration for Fixed-Point Iterations", SIAM Journal on
-       Numerical Analysis 49, 2011.
-    """
-
-    def __init__(self) -> None:
-        self._last: tuple[Array, Array] | None = None
-
-    def next_weights(self, used: Array, settled: Array) -> Array:
-        """Return the weights to try next, from those used and those they led to."""
-        change = settled - used
-        last, self._last = self._last, (change, settled)
-        if last is None:
-            return settled
-        turn = change - last[0]
-        length_sq = float(turn @ turn)
-        if length_sq < 1e-16:
-            return settled
-        mixed = settled - float(change @ turn) / length_sq * (settled - last[1])
-        return np.asarray(np.clip(mixed, WEIGHT_FLOOR, max(1.0, 2.0 * float(settled.max()))))
 
 
 class GncStart(Enum):

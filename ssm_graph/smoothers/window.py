@@ -21,7 +21,7 @@ from ssm_graph.problem.error_state import STATE_DIM, Linearised
 from ssm_graph.problem.problem import Problem, start_of
 from ssm_graph.problem.timeline import MIN_SPACING_S
 from ssm_graph.problem.window import rows_in, window_of
-from ssm_graph.smoothers.gnc import Mixing
+from ssm_graph.smoothers.mixing import Mixing
 
 ROUNDING = 1e-7
 """Posterior sigmas: updates of a window of several keyframes come down to a few 1e-8 and stay."""

@@ -11,9 +11,8 @@ import pytest
 
 from factors.kernels import KERNELS
 from ssm_graph.data import Array
-from ssm_graph.estimate import Estimate, Status, Trajectory
+from ssm_graph.estimate import OUTLIER_WEIGHT, Estimate, Status, Trajectory
 from ssm_graph.filters.named import FILTERS, filter_problems
-from ssm_graph.filters.navigation import Grouping
 from ssm_graph.problem.problem import Problem, build_problem
 from ssm_graph.simulation import OutlierKind, Outliers, SimulatedMission
 from tests.helpers import simulated
@@ -22,7 +21,10 @@ every_filter = pytest.mark.parametrize("name", FILTERS)
 BY_PARAMETER = [name for name, choice in FILTERS.items() if choice.default is not None]
 LOSES_ITSELF = {"ssmkf-sqrt", "ssmkf-exp"}
 """Those that give an outlier's ping up together with the prediction, and may run away with it."""
-SUM_OF_FOUR = 4
+WHOLE_PING = {"ekf", "ekf-gate-ping", "rstkf", "ssmkf-log", "ssm-ping-log"} | LOSES_ITSELF
+"""Those with one weight for all beams of a ping."""
+STEADY = [name for name in FILTERS if name not in LOSES_ITSELF]
+N_BEAMS = 4
 
 
 @cache
@@ -47,10 +49,10 @@ def filtered(name: str, rate: float = 0.1, value: float | None = None) -> tuple[
 def highest_weight(name: str) -> float:
     """Return what a beam without any residual or variance would get."""
     if name == "rstkf":
-        return (5.0 + SUM_OF_FOUR) / 5.0
+        return (5.0 + N_BEAMS) / 5.0
     if not name.startswith("ssm"):
         return 1.0
-    dim = SUM_OF_FOUR if FILTERS[name].grouping is Grouping.PER_PING else 1
+    dim = N_BEAMS if name in WHOLE_PING else 1
     return float(KERNELS[name.rpartition("-")[2]].make().weight(0.0, dim=dim))
 
 
@@ -67,12 +69,9 @@ def apart(found: Sequence[Estimate], expected: Sequence[Estimate]) -> float:
 
 
 @every_filter
-@pytest.mark.parametrize("smoothed", [False, True], ids=["alone", "+ rts"])
-def test_every_filter_converges_on_clean_data(name: str, smoothed: bool) -> None:
+def test_every_filter_converges_on_clean_data(name: str) -> None:
     """A finite track within five of its own sigmas from the truth, and weights in their range."""
-    for sim, estimate in zip(
-        surveys(0.0), filter_problems(problems(0.0), name, smoothed=smoothed), strict=True
-    ):
+    for sim, estimate in zip(surveys(0.0), filtered(name, 0.0), strict=True):
         assert estimate.status is Status.CONVERGED, estimate.reason
         track, weight = estimate.trajectory, estimate.beams.weight
         for column in Trajectory.__dataclass_fields__:
@@ -82,15 +81,12 @@ def test_every_filter_converges_on_clean_data(name: str, smoothed: bool) -> None
         assert weight.min() >= 0.0
         assert weight.max() <= highest_weight(name)
         assert np.median(weight) > 0.9
-        assert estimate.method == f"filter {name}{' + rts' if smoothed else ''}"
-        assert estimate.n_iterations >= 0.9
+        assert estimate.method == f"filter {name}"
 
 
-@every_filter
+@pytest.mark.parametrize("name", STEADY)
 def test_outliers_are_survived_or_confessed(name: str) -> None:
     """A tenth of the pings with a bad beam: all but the plain filter stay with the truth."""
-    if name in LOSES_ITSELF:
-        pytest.skip("known to diverge with outliers")
     for sim, estimate in zip(surveys(0.1), filtered(name), strict=True):
         track = estimate.trajectory
         error = track.velocity_enu - sim.truth_at(track.time_s).velocity_enu
@@ -123,11 +119,11 @@ def test_beams_of_a_ping_share_their_weight_as_the_name_says(name: str) -> None:
         bad[1:] = sim.is_outlier  # pings at 1 s, 2 s, ...
         struck = weight[bad.any(axis=1)]
         assert len(struck) >= 2
-        if FILTERS[name].grouping is Grouping.PER_PING:
+        if name in WHOLE_PING:
             np.testing.assert_allclose(np.ptp(struck, axis=1), 0.0, atol=1e-15)
         else:
             assert np.all(struck.max(axis=1) > 0.5)
-            assert np.all(weight[bad] < 0.01)
+            assert np.all(weight[bad] < OUTLIER_WEIGHT)
 
 
 @pytest.mark.parametrize("name", BY_PARAMETER)
@@ -157,13 +153,6 @@ def test_each_keyframe_is_announced() -> None:
     assert seen == [(k + 1, n) for k in range(n)]
 
 
-def with_speeds(problem: Problem, speed: float, *, first: int) -> Problem:
-    """Return the problem with the same reading of all beams from a keyframe on."""
-    beams = problem.beams
-    damaged = np.where(beams.keyframe >= first, speed, beams.speed)
-    return dataclasses.replace(problem, beams=dataclasses.replace(beams, speed=damaged))
-
-
 def columns(estimate: Estimate) -> dict[str, Array]:
     """Return everything that an estimate says of its run."""
     names = Trajectory.__dataclass_fields__
@@ -171,32 +160,56 @@ def columns(estimate: Estimate) -> dict[str, Array]:
     return track | {name: getattr(estimate.beams, name) for name in ("innovation", "weight")}
 
 
-@pytest.mark.parametrize("name", sorted(FILTERS.keys() - LOSES_ITSELF))
-@pytest.mark.parametrize("speed", [np.nan, 1e200], ids=["not a number", "overflow"])
-@pytest.mark.parametrize("smoothed", [False, True], ids=["alone", "+ rts"])
-def test_a_lost_run_takes_nobody_along(name: str, speed: float, smoothed: bool) -> None:
-    """One of two runs goes beyond all numbers at 10 s; the other is as beside a good one.
+def beside_a_lost_run(name: str, speed: float, *, smoothed: bool) -> tuple[Estimate, Estimate]:
+    """Return the good run and that whose beams all read ``speed`` from 10 s on."""
+    good, other = problems()
+    beams = other.beams
+    damaged = np.where(beams.keyframe >= 10, speed, beams.speed)
+    lost = dataclasses.replace(other, beams=dataclasses.replace(beams, speed=damaged))
+    beside, away = filter_problems([good, lost], name, smoothed=smoothed)
+    return beside, away
+
+
+def assert_same_run(found: Estimate, expected: Estimate, *, atol: float) -> None:
+    """Compare all columns, each in parts of its largest number."""
+    assert found.status is expected.status
+    for key, column in columns(expected).items():
+        scale = np.abs(column).max()
+        np.testing.assert_allclose(
+            columns(found)[key], column, rtol=0.0, atol=atol * scale, err_msg=key
+        )
+
+
+@pytest.mark.parametrize(
+    ("name", "speed"),
+    [(name, np.nan) for name in STEADY] + [(name, 1e200) for name in ("ekf", "ssm-log", "rstkf")],
+)
+def test_a_lost_run_takes_nobody_along(name: str, speed: float) -> None:
+    """One of two runs goes beyond all numbers at 10 s: the other is as beside a good one.
 
     To rounding, as NumPy rounds a stack of one otherwise: when the other has settled, one is left.
     """
-    good, other = problems()
-    first = 10
-    lost = with_speeds(other, speed, first=first)
-    in_good_company = filter_problems([good, other], name, smoothed=smoothed)
-    beside, away = filter_problems([good, lost], name, smoothed=smoothed)
+    in_good_company, unharmed = filtered(name)
+    beside, away = beside_a_lost_run(name, speed, smoothed=False)
     assert away.status in {Status.DIVERGED, Status.SUSPECT}
-    if np.isnan(speed):
+    assert_same_run(beside, in_good_company, atol=1e-12)
+    # What the lost one found before is kept.
+    found, expected = away.trajectory, unharmed.trajectory
+    np.testing.assert_allclose(found.velocity_enu[:10], expected.velocity_enu[:10], atol=1e-12)
+    if np.isnan(speed):  # a robust rule rejects any number, and goes on without the beams
         assert away.status is Status.DIVERGED
-    assert beside.status is in_good_company[0].status
-    expected = columns(in_good_company[0])
-    for key, column in columns(beside).items():
-        scale = np.abs(expected[key]).max()
-        np.testing.assert_allclose(column, expected[key], rtol=0.0, atol=1e-12 * scale)
-    if not smoothed:  # the pass backwards takes what was lost to the begin
-        np.testing.assert_allclose(
-            away.trajectory.velocity_enu[:first],
-            in_good_company[1].trajectory.velocity_enu[:first],
-            rtol=0.0,
-            atol=1e-12,
-        )
-        assert np.all(np.isfinite(away.trajectory.velocity_sigma_enu[:first]))
+        assert "10.0 s" in away.reason
+        for column in (found.height, found.velocity_enu, found.velocity_sigma_enu):
+            assert np.all(np.isnan(column[10:]))
+
+
+@pytest.mark.parametrize("name", ["ekf", "ssm-log"])
+def test_the_pass_backwards_takes_nobody_along_either(name: str) -> None:
+    """As before, and the backward pass goes on beside a run that is not a number any more.
+
+    Solving with predicted covariances makes more of the rounding: 5e-12 was measured.
+    """
+    expected = filter_problems(problems(), name, smoothed=True)[0]
+    beside, away = beside_a_lost_run(name, np.nan, smoothed=True)
+    assert away.status is Status.DIVERGED
+    assert_same_run(beside, expected, atol=1e-9)

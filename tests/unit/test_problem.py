@@ -15,6 +15,7 @@ from ssm_graph.errors import ConfigError, DataError
 from ssm_graph.problem.problem import ProblemConfig, build_problem, mean_gyro
 from ssm_graph.simulation import (
     IMU_NOISE,
+    DepthSettings,
     DvlSettings,
     GnssSettings,
     Grade,
@@ -135,13 +136,18 @@ def test_fixes_become_positions_with_covariances_along_the_local_level() -> None
     assert abs(float(up_n[-1, 2]) - 1.0) > 1e-7
 
 
-def test_depths_go_to_their_nearest_keyframes() -> None:
-    """Twice as many readings as pings: each is with the keyframe next to it in time."""
-    problem = build_problem(simulated().mission)
+def test_depths_go_to_the_next_keyframe() -> None:
+    """Three times as many readings as pings: none is known before it was taken.
+
+    Each is with the first keyframe at its time or after it, though another one be nearer.
+    """
+    problem = build_problem(simulated(depth=DepthSettings(rate_hz=3.0)).mission)
     assert problem.depths is not None
-    late = problem.depths.time_s - problem.keyframe_s[problem.depths.keyframe]
-    assert np.abs(late).max() <= 0.5 + 1e-9
-    assert np.all(np.diff(problem.depths.keyframe) >= 0)
+    time_s, keyframe = problem.depths.time_s, problem.depths.keyframe
+    early_s = problem.keyframe_s[keyframe] - time_s
+    assert early_s.min() == pytest.approx(0.0, abs=1e-9)
+    assert early_s.max() == pytest.approx(2.0 / 3.0)
+    assert np.all(problem.keyframe_s[keyframe - 1] < time_s)
 
 
 def test_depths_outside_the_span_are_not_used() -> None:

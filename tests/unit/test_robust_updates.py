@@ -1,184 +1,37 @@
-"""The update rules of the literature: laws, limits, and a curved measurement."""
+"""The update rules of the literature, each for itself: weights, gates, floors, curvature."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
 from factors import so3
-from factors.similarity import WEIGHT_FLOOR, ExpKernel, LogKernel, Similarity, SqrtKernel
+from factors.similarity import WEIGHT_FLOOR, ExpKernel, LogKernel, Similarity
 from ssm_graph.data import Array
 from ssm_graph.filters.correntropy import CorrentropyUpdate
 from ssm_graph.filters.kalman import Gate, GatedUpdate, KalmanUpdate
 from ssm_graph.filters.linear import LinearModel, LinearSystem
-from ssm_graph.filters.model import NOMINAL, Iterate, Runs, Update, UpdateRule
+from ssm_graph.filters.model import NOMINAL, Iterate, Runs
 from ssm_graph.filters.ssm import Floor, SsmUpdate, StopRule
-from ssm_graph.filters.student import Scale, StudentUpdate
 from ssm_graph.problem.error_state import Linearised
-
-N_STATES, N_ROWS, N_RUNS = 5, 4, 6
-EACH_ROW, ALL_ROWS = np.arange(N_ROWS), np.zeros(N_ROWS, dtype=np.intp)
-SSM = SsmUpdate(LogKernel(5.0))
-RULES: dict[str, UpdateRule] = {
-    "kalman": KalmanUpdate(),
-    "ping gate": GatedUpdate(Gate.PING),
-    "beam gate": GatedUpdate(Gate.BEAM),
-    "log": SSM,
-    "sqrt": SsmUpdate(SqrtKernel(2.0)),
-    "exp": SsmUpdate(ExpKernel(5.0)),
-    "log, state too": SsmUpdate(LogKernel(5.0), LogKernel(5.0)),
-    "linear log": replace(SSM, linearised=Linearised.ONCE),
-    "student": StudentUpdate(),
-    "student, fixed": StudentUpdate(Scale.FIXED),
-    "correntropy": CorrentropyUpdate(5.0),
-}
-every_rule = pytest.mark.parametrize("rule", RULES.values(), ids=RULES)
-MISSING = np.full((N_RUNS, N_ROWS), np.nan)
-
-
-def a_system(rng: np.random.Generator) -> LinearSystem:
-    """Return a system with correlated noise."""
-    H, root = rng.normal(size=(N_ROWS, N_STATES)), rng.normal(size=(N_ROWS, N_ROWS))
-    Q = F = np.eye(N_STATES)
-    return LinearSystem(F, Q, H, np.diag([0.5, 1.0, 2.0, 3.0]) + 0.05 * root @ root.T)
-
-
-def predicted(rng: np.random.Generator) -> Array:
-    """Return covariances (N_RUNS, n, n) of predictions."""
-    root = rng.normal(size=(N_RUNS, N_STATES, N_STATES))
-    P = root @ np.swapaxes(root, 1, 2) + 0.1 * np.eye(N_STATES)
-    P.setflags(write=False)
-    return P
-
-
-def measured(rng: np.random.Generator) -> Array:
-    """Return measurements (N_RUNS, m) of a state that is predicted as zero, one run far off."""
-    z = 2.0 * rng.normal(size=(N_RUNS, N_ROWS))
-    z[0, 1] += 60.0
-    return z
-
-
-def corrected(
-    rule: UpdateRule, P: Array, system: LinearSystem, z: Array, group: Runs = EACH_ROW
-) -> Update:
-    """Correct predictions of zero."""
-    return rule(P, LinearModel(system, np.zeros(P.shape[:2]), z, group=group))
-
-
-def assert_same(found: Update, expected: Iterable[NDArray[Any]], *, atol: float = 1e-9) -> None:
-    """Compare all that two updates have to say, in the order of the runs."""
-    for column, other in zip(found, expected, strict=True):
-        np.testing.assert_allclose(column, other, rtol=1e-9, atol=atol)
-
-
-@every_rule
-@pytest.mark.parametrize("group", [EACH_ROW, ALL_ROWS], ids=["rows", "one group"])
-def test_runs_do_not_know_each_other(rule: UpdateRule, group: Runs) -> None:
-    """One by one, or in any order, or side by side: the same, down to the number of passes."""
-    rng = np.random.default_rng(1)
-    P, system, z = predicted(rng), a_system(rng), measured(rng)
-    together = corrected(rule, P, system, z, group)
-    order = rng.permutation(N_RUNS)
-    shuffled = corrected(rule, P[order], system, z[order], group)
-    assert_same(shuffled, [column[order] for column in together])
-    for run in range(N_RUNS):
-        one = slice(run, run + 1)
-        alone = corrected(rule, P[one], system, z[one], group)
-        assert_same(alone, [column[one] for column in together])
-
-
-@every_rule
-def test_covariance_is_one(rule: UpdateRule) -> None:
-    """Symmetric and positive, whatever was measured."""
-    rng = np.random.default_rng(2)
-    update = corrected(rule, predicted(rng), a_system(rng), measured(rng))
-    P = update.covariance
-    np.testing.assert_allclose(P, np.swapaxes(P, 1, 2), atol=1e-12)
-    assert np.all(np.linalg.eigvalsh(P) > 0.0)
-
-
-@every_rule
-def test_nothing_measured(rule: UpdateRule) -> None:
-    """The prediction stays as it is."""
-    rng = np.random.default_rng(3)
-    P = predicted(rng)
-    update = corrected(rule, P, a_system(rng), MISSING)
-    np.testing.assert_array_equal(update.xi, 0.0)
-    np.testing.assert_allclose(update.covariance, P, atol=1e-12)
-    np.testing.assert_array_equal(update.weights, 1.0)
-    np.testing.assert_allclose(update.state_weight, 1.0, atol=1e-12)
-
-
-@every_rule
-@pytest.mark.parametrize("group", [EACH_ROW, ALL_ROWS], ids=["rows", "one group"])
-def test_missing_rows_are_not_there(rule: UpdateRule, group: Runs) -> None:
-    """Rows without a measurement count neither in the state nor in the size of their group."""
-    rng = np.random.default_rng(4)
-    P, system, z = predicted(rng), a_system(rng), measured(rng)
-    z[:, 2] = np.nan
-    left = np.array([0, 1, 3])
-    shorter = system._replace(H=system.H[left], R=system.R[np.ix_(left, left)])
-    found = corrected(rule, P, system, z, group)
-    expected = corrected(rule, P, shorter, z[:, left], group[left])
-    np.testing.assert_array_equal(found.weights[:, 2], 1.0)
-    rows = {
-        key: getattr(found, key)[:, left] for key in ("weights", "mahalanobis_sq", "innovation")
-    }
-    assert_same(found._replace(**rows), expected)
-
-
-@every_rule
-def test_scalar_measurement(rule: UpdateRule) -> None:
-    """One row: a mild innovation of a known variance gives a gain between none and the full one."""
-    system = LinearSystem(np.eye(2), np.eye(2), np.array([[1.0, 0.0]]), np.array([[4.0]]))
-    P = np.array([[[1.0, 0.5], [0.5, 1.0]]])
-    update = corrected(rule, P, system, np.array([[3.0]]), np.array([0]))
-    full = KalmanUpdate()(
-        P, LinearModel(system, np.zeros((1, 2)), np.array([[3.0]]), group=ALL_ROWS[:1])
-    )
-    np.testing.assert_allclose(full.xi, [[0.6, 0.3]])
-    assert 0.3 < update.xi[0, 0] < 1.2
-    np.testing.assert_allclose(update.xi[0, 1], 0.5 * update.xi[0, 0], rtol=0.2)
-
-
-@every_rule
-def test_nominal_rows_count_in_full(rule: UpdateRule) -> None:
-    """Depth and GNSS have no weight to lose, however far off."""
-    rng = np.random.default_rng(5)
-    z = measured(rng)
-    z[:, 0] = 100.0
-    group = np.array([NOMINAL, 0, 1, 2])
-    update = corrected(rule, predicted(rng), a_system(rng), z, group)
-    np.testing.assert_array_equal(update.weights[:, 0], 1.0)
-
-
-@pytest.mark.parametrize(
-    "rule",
-    [
-        SsmUpdate(LogKernel(1e13), LogKernel(1e13)),
-        SsmUpdate(SqrtKernel(1e13), SqrtKernel(1e13)),
-        SsmUpdate(ExpKernel(1e7), ExpKernel(1e7)),
-        StudentUpdate(Scale.FIXED, state_dof=1e13, measurement_dof=1e13),
-        StudentUpdate(state_dof=1e13, measurement_dof=1e13, tau=1e13),
-        CorrentropyUpdate(1e7),
-        GatedUpdate(Gate.PING, 1.0 - 1e-15),
-    ],
+from tests.update_fixture import (
+    ALL_ROWS,
+    EACH_ROW,
+    N_ROWS,
+    N_RUNS,
+    N_STATES,
+    a_system,
+    assert_same,
+    corrected,
+    measured,
+    predicted,
 )
-def test_without_tails_it_is_the_kalman_filter(rule: UpdateRule) -> None:
-    """Infinite degrees of freedom, kernel width, or confidence."""
-    rng = np.random.default_rng(6)
-    P, system = predicted(rng), a_system(rng)
-    z = rng.normal(size=(N_RUNS, N_ROWS))
-    found, expected = corrected(rule, P, system, z), corrected(KalmanUpdate(), P, system, z)
-    np.testing.assert_allclose(found.xi, expected.xi, atol=1e-8)
-    np.testing.assert_allclose(found.covariance, expected.covariance, atol=1e-8)
+
+SSM = SsmUpdate(LogKernel(5.0))
 
 
 def test_one_bad_row_keeps_the_others() -> None:
@@ -212,19 +65,6 @@ def test_weights_are_those_of_the_result(similarity: Similarity, linearised: Lin
     np.testing.assert_allclose(update.weights, LogKernel(5.0).weight(t), rtol=1e-6)
     information = np.linalg.inv(P) + np.swapaxes(H, 1, 2) @ (update.weights[..., None] * H)
     np.testing.assert_allclose(update.covariance, np.linalg.inv(information), rtol=1e-6, atol=1e-9)
-
-
-def test_kalman_in_closed_form() -> None:
-    """Correlated noise, some of it missing: whitening changes nothing."""
-    rng = np.random.default_rng(16)
-    P, system, z = predicted(rng), a_system(rng), measured(rng)
-    z[0, 2] = np.nan
-    update = corrected(KalmanUpdate(), P, system, z)
-    for run, is_there in enumerate(np.isfinite(z)):
-        H, R = system.H[is_there], system.R[np.ix_(is_there, is_there)]
-        gain = P[run] @ H.T @ np.linalg.inv(H @ P[run] @ H.T + R)
-        np.testing.assert_allclose(update.xi[run], gain @ z[run, is_there], atol=1e-10)
-        np.testing.assert_allclose(update.covariance[run], P[run] - gain @ H @ P[run], atol=1e-10)
 
 
 def test_state_weight_is_that_of_the_result() -> None:
@@ -262,32 +102,6 @@ def test_stop_and_floor_are_details() -> None:
     clipped, added = (floor.applied_to(ExpKernel(5.0), t, dim) for floor in Floor)
     np.testing.assert_allclose(clipped[1:], WEIGHT_FLOOR)
     np.testing.assert_allclose(added, [clipped[0], WEIGHT_FLOOR, WEIGHT_FLOOR], rtol=1e-6)
-
-
-@every_rule
-def test_units_of_the_state_do_not_matter(rule: UpdateRule) -> None:
-    """Variances from 1e-16 to 1e2 in one matrix, as of biases and positions."""
-    rng = np.random.default_rng(10)
-    P, system, z = predicted(rng), a_system(rng), measured(rng)
-    unit = np.array([1e-8, 1e-5, 1e-2, 1.0, 10.0])
-    found = corrected(rule, P * np.outer(unit, unit), system._replace(H=system.H / unit), z)
-    xi, covariance = found.xi / unit, found.covariance / np.outer(unit, unit)
-    expected = corrected(rule, P, system, z)
-    assert_same(found._replace(xi=xi, covariance=covariance), expected, atol=1e-7)
-
-
-@pytest.mark.parametrize(
-    "rule", [RULES["kalman"], RULES["beam gate"], SSM, RULES["log, state too"]]
-)
-def test_a_known_component_stays(rule: UpdateRule) -> None:
-    """A component without variance is no zero to divide by."""
-    rng = np.random.default_rng(11)
-    P = predicted(rng).copy()
-    P[:, 0], P[:, :, 0] = 0.0, 0.0
-    update = corrected(rule, P, a_system(rng), measured(rng))
-    np.testing.assert_array_equal(update.xi[:, 0], 0.0)
-    assert all(np.all(np.isfinite(column)) for column in update)
-    assert np.all(update.n_iterations < 50)
 
 
 @pytest.mark.parametrize("gate", Gate)
@@ -336,6 +150,25 @@ def test_floored_correntropy_outlives_underflow() -> None:
     update = corrected(CorrentropyUpdate(2.0, max_iterations=50), P, a_system(rng), z)
     np.testing.assert_array_equal(update.weights, WEIGHT_FLOOR)
     assert np.all(np.abs(update.xi) < 1e-2 * np.sqrt(np.einsum("bii->bi", P)))
+
+
+def test_without_floor_a_far_row_is_as_good_as_absent() -> None:
+    """As published, its weight underflows to zero and its noise to infinity: nothing breaks.
+
+    What breaks is a prediction so far from rows that always count: its covariance is infinite.
+    """
+    eye = np.eye(2)
+    system = LinearSystem(eye, eye, eye, eye)
+    P, mean, far = eye[None], np.zeros((1, 2)), np.array([[1e3, 0.5]])
+    rule = CorrentropyUpdate(2.0, floor=0.0)
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        robust = rule(P, LinearModel(system, mean, far, group=EACH_ROW[:2]))
+        nominal = rule(P, LinearModel(system, mean, far, group=np.array([NOMINAL, 0])))
+    absent = LinearModel(system, mean, np.array([[np.nan, 0.5]]), group=EACH_ROW[:2])
+    np.testing.assert_array_equal(robust.weights[:, 0], 0.0)
+    np.testing.assert_allclose(robust.xi, rule(P, absent).xi)
+    np.testing.assert_allclose(robust.covariance, rule(P, absent).covariance)
+    assert np.all(np.isnan(nominal.covariance))
 
 
 class Directions:
