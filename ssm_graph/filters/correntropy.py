@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 from factors.similarity import WEIGHT_FLOOR
 from ssm_graph.data import Array
 from ssm_graph.errors import ConfigError
-from ssm_graph.filters.linear_update import Corrected, Groups, Result, correct, prepare
+from ssm_graph.filters.linear_update import (
+    Corrected,
+    Groups,
+    Result,
+    correct,
+    each_or_nan,
+    prepare,
+)
 from ssm_graph.filters.model import MeasurementModel, Runs, Update, UpdateRule
 
 
@@ -57,7 +64,7 @@ class CorrentropyUpdate(UpdateRule):
         runs: Runs = np.arange(len(covariance))
         sigma = np.sqrt(np.einsum("bii->bi", covariance))
         unit = sigma[:, :, None] * sigma[:, None, :]
-        root = sigma[:, :, None] * np.linalg.cholesky(covariance / unit)
+        root = sigma[:, :, None] * each_or_nan(np.linalg.cholesky, covariance / unit)
         iterate = model.at(np.zeros(sigma.shape))
         for number in range(1, self.max_iterations + 1):
             own = root[runs]

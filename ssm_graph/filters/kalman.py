@@ -70,7 +70,7 @@ class GatedUpdate(UpdateRule):
             raise ConfigError(f"confidence: expected a number in (0, 1), got {self.confidence}")
 
     def __str__(self) -> str:
-        return f"gate({self.confidence:g})"
+        return f"gate({self.confidence:g} on each {self.by.name.lower()})"
 
     def __call__(
         self,

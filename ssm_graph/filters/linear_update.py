@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -117,7 +118,7 @@ def correct(prepared: Prepared, *, weights: Array, state_weight: Array | None = 
     scale = np.ones((1, 1, 1)) if state_weight is None else 1.0 / state_weight[:, None, None]
     S = scale * prepared.HPHt
     np.einsum("bii->bi", S)[...] += 1.0 / weights
-    S_inv = _inverse(S)
+    S_inv = each_or_nan(np.linalg.inv, S)
     missed = iterate.innovation + (prepared.H @ iterate.xi[..., None])[..., 0]
     pull = (S_inv @ missed[..., None])[..., 0]
     change = ((scale * prepared.PHt) @ pull[..., None])[..., 0] - iterate.xi
@@ -125,16 +126,19 @@ def correct(prepared: Prepared, *, weights: Array, state_weight: Array | None = 
     return Corrected(prepared, scale, S_inv, pull, step)
 
 
-def _inverse(S: Array) -> Array:
-    """Return inverses (R, m, m); NaN for a run that has run away, which ends nobody else's."""
+def each_or_nan(function: Callable[[Any], Any], stack: Array) -> Array:
+    """Apply a function to square matrices (R, m, m) that refuses some of them.
+
+    NaN comes of a run that has run away, which ends nobody else's.
+    """
     try:
-        return np.asarray(np.linalg.inv(S))
+        return np.asarray(function(stack))
     except np.linalg.LinAlgError:
-        inverse = np.full_like(S, np.nan)
-        for run, single in enumerate(S):
+        results = np.full_like(stack, np.nan)
+        for run, single in enumerate(stack):
             with contextlib.suppress(np.linalg.LinAlgError):
-                inverse[run] = np.linalg.inv(single)
-        return inverse
+                results[run] = function(single)
+        return results
 
 
 class Groups:

@@ -13,6 +13,7 @@ from typing import Final
 from factors.kernels import KERNELS
 from factors.similarity import Similarity
 from ssm_graph.data import ImuLog
+from ssm_graph.errors import ConfigError
 from ssm_graph.estimate import Estimate, OnKeyframe
 from ssm_graph.filters.correntropy import CorrentropyUpdate
 from ssm_graph.filters.geodetic import GeodeticConfig, run_geodetic, to_navigation
@@ -65,6 +66,10 @@ def _ssmkf(name: str) -> FilterChoice:
     )
 
 
+def _gated(gate: Gate, value: float | None) -> UpdateRule:
+    return GatedUpdate(gate) if value is None else GatedUpdate(gate, value)
+
+
 def _plain_log(value: float | None) -> UpdateRule:
     kernel = KERNELS["log"].kernel(value)
     return SsmUpdate(kernel, similarity=Similarity.PLAIN, linearised=Linearised.ONCE)
@@ -74,15 +79,15 @@ FILTERS: Final[Mapping[str, FilterChoice]] = {
     "ekf": FilterChoice("Kalman filter", lambda _: KalmanUpdate(), Grouping.PER_PING),
     "ekf-gate-ping": FilterChoice(
         "Kalman filter, chi-square gate on the whole ping",
-        lambda value: GatedUpdate(Gate.PING, value or 0.9973),
+        lambda value: _gated(Gate.PING, value),
         Grouping.PER_PING,
-        0.9973,
+        GatedUpdate(Gate.PING).confidence,
     ),
     "ekf-gate-beam": FilterChoice(
         "Kalman filter, chi-square gate on every beam",
-        lambda value: GatedUpdate(Gate.BEAM, value or 0.9973),
+        lambda value: _gated(Gate.BEAM, value),
         Grouping.PER_BEAM,
-        0.9973,
+        GatedUpdate(Gate.BEAM).confidence,
     ),
     "rstkf": FilterChoice(
         "Student's t filter, inverse-Wishart prediction covariance",
@@ -91,7 +96,7 @@ FILTERS: Final[Mapping[str, FilterChoice]] = {
     ),
     "mckf": FilterChoice(
         "maximum correntropy filter",
-        lambda value: CorrentropyUpdate(value or CorrentropyUpdate().width),
+        lambda value: CorrentropyUpdate() if value is None else CorrentropyUpdate(value),
         Grouping.PER_BEAM,
         CorrentropyUpdate().width,
     ),
@@ -125,9 +130,16 @@ def filter_problems(
     value : its parameter.
     smoothed : whether a Rauch-Tung-Striebel pass goes back over the result.
     on_keyframe : called after each keyframe.
+
+    Raises
+    ------
+    ConfigError
+        If the filter has no parameter, or not this one, or the problems differ in shape.
     """
     begin = time.perf_counter()
     choice = FILTERS[name]
+    if value is not None and choice.default is None:
+        raise ConfigError(f"filter {name}: expected no parameter, got {value:g}; leave it out")
     rule = choice.make(choice.default if value is None else value)
     history = run_filter(problems, rule, grouping=choice.grouping, on_keyframe=on_keyframe)
     states = smooth_history(history) if smoothed else history.posterior

@@ -93,13 +93,17 @@ class _Filter:
     def _without_lost(
         self, states: NavigationStates, covariance: Array
     ) -> tuple[NavigationStates, Array]:
-        """Put runs that have run away back to their start: the others go on beside them."""
+        """Put runs that have run away back to their start, where they meet no measurement.
+
+        The others go on beside them.
+        """
         variance = np.einsum("bii->bi", covariance)
         self._lost |= ~np.all(variance > 0.0, axis=1)
         self._lost |= ~np.all(variance[:, VELOCITY] < RUNAWAY_SIGMA**2, axis=1)
         self._lost |= ~np.all(np.isfinite(states.p_n + states.v_n), axis=1)
         if not np.any(self._lost):
             return states, covariance
+        self._stack.silence(self._lost)
         columns = (
             np.where(self._lost.reshape(-1, *(1,) * (own.ndim - 1)), start, own)
             for own, start in zip(states, self._stack.start, strict=True)

@@ -90,6 +90,14 @@ class Stack:
         """Navigation frame of all runs."""
         return self.problems[0].frame
 
+    def silence(self, runs: NDArray[np.bool_]) -> None:
+        """Take all measurements of some runs (B,) away."""
+        self.beams.root_information[:, runs] = 0.0
+        if self.depths is not None:
+            self.depths.counts[:, runs] = 0.0
+        if self.fixes is not None:
+            self.fixes.root_information[:, runs] = 0.0
+
 
 def stack_problems(problems: Sequence[Problem]) -> Stack:
     """Put problems side by side.

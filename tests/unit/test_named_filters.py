@@ -11,6 +11,7 @@ import pytest
 
 from factors.kernels import KERNELS
 from ssm_graph.data import Array
+from ssm_graph.errors import ConfigError
 from ssm_graph.estimate import OUTLIER_WEIGHT, Estimate, Status, Trajectory
 from ssm_graph.filters.named import FILTERS, filter_problems
 from ssm_graph.problem.problem import Problem, build_problem
@@ -118,7 +119,8 @@ def test_beams_of_a_ping_share_their_weight_as_the_name_says(name: str) -> None:
         bad = np.zeros(weight.shape, bool)
         bad[1:] = sim.is_outlier  # pings at 1 s, 2 s, ...
         struck = weight[bad.any(axis=1)]
-        assert len(struck) >= 2
+        struck = struck[np.isfinite(struck).all(axis=1)]  # a run that is lost has none any more
+        assert len(struck) >= 1
         if name in WHOLE_PING:
             np.testing.assert_allclose(np.ptp(struck, axis=1), 0.0, atol=1e-15)
         else:
@@ -143,6 +145,15 @@ def test_parameter_arrives(name: str) -> None:
     assert apart(filtered(name, 0.0, default), filtered(name, 0.0)) == 0.0
     assert f"{0.75:g}" in filtered(name, 0.0, 0.75)[0].kernel
     assert f"{default:g}" in filtered(name, 0.0)[0].kernel
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("ekf", 1.0), ("rstkf", 5.0), ("ekf-gate-ping", 0.0), ("mckf", 0.0)]
+)
+def test_a_wrong_parameter_is_refused(name: str, value: float) -> None:
+    """Neither ignored nor replaced by the default."""
+    with pytest.raises(ConfigError, match="expected"):
+        filter_problems(problems(), name, value=value)
 
 
 def test_each_keyframe_is_announced() -> None:
@@ -182,7 +193,9 @@ def assert_same_run(found: Estimate, expected: Estimate, *, atol: float) -> None
 
 @pytest.mark.parametrize(
     ("name", "speed"),
-    [(name, np.nan) for name in STEADY] + [(name, 1e200) for name in ("ekf", "ssm-log", "rstkf")],
+    [(name, np.nan) for name in STEADY]
+    + [(name, 1e200) for name in ("ekf", "ssm-log", "rstkf", "mckf")]
+    + [("mckf", 1e7)],
 )
 def test_a_lost_run_takes_nobody_along(name: str, speed: float) -> None:
     """One of two runs goes beyond all numbers at 10 s: the other is as beside a good one.
