@@ -248,7 +248,7 @@ difference (Student's t, each for itself) lies above zero.
 def parse_args(argv: Sequence[str] | None = None) -> argparse.Namespace:
     """Return the settings given on the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--missions", type=int, default=10, help="of each grade, two or more")
+    parser.add_argument("--missions", type=int, default=6, help="of each grade, two or more")
     parser.add_argument("--duration", type=float, default=300.0, help="of a mission, s")
     parser.add_argument("--lags", default="0,1,3,10,30,100,300", help="s, one or more above 0")
     parser.add_argument("--jobs", type=int, default=2, help="processes")

@@ -1,0 +1,27 @@
+"""Filters, a fixed lag and the batch smoother on one mission with bad beams: what the future tells."""
+
+import ssm_graph as sg
+from ssm_graph.simulation import OutlierKind, Outliers, scenario_config, simulate
+
+config = scenario_config(
+    "survey", duration_s=300.0, seed=4, outliers=Outliers(OutlierKind.SPARSE, 0.2)
+)
+mission = simulate(config).mission
+truth = mission.reference
+assert truth is not None
+problem = sg.build_problem(mission)
+
+estimates: list[sg.Estimate] = []
+for name in ("ekf", "ekf-gate-ping", "ssmkf-log", "ssm-log"):
+    estimates += sg.filter_problems([problem], name)
+estimates += sg.FixedLagSmoother(sg.FixedLagConfig(lag_s=0.0)).solve(problem)[:1]
+estimates += sg.FixedLagSmoother(sg.FixedLagConfig(lag_s=5.0)).solve(problem)
+estimates.append(sg.SsmSmoother().solve(problem))
+
+print(f"{'method':32} {'horizontal rms, m':>18} {'velocity rms, mm/s':>19}  status")
+for estimate in estimates:
+    metrics = sg.evaluate(estimate.trajectory, truth)
+    print(
+        f"{estimate.method:32} {metrics.rmse_horizontal_m:18.3f} "
+        f"{1e3 * metrics.rmse_velocity_m_per_s:19.2f}  {estimate.status.name}"
+    )
