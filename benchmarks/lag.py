@@ -29,7 +29,7 @@ from matplotlib.ticker import NullLocator
 from benchmarks.speed import machine, table
 from factors.similarity import LogKernel
 from ssm_graph.data import Array
-from ssm_graph.estimate import Estimate
+from ssm_graph.estimate import Estimate, since_first_ping
 from ssm_graph.evaluation import evaluate, mean_with_interval, paired_ratio
 from ssm_graph.evaluation.statistics import paired_difference
 from ssm_graph.filters.named import filter_problems
@@ -118,9 +118,8 @@ def run_mission(grade: str, seed: int, duration_s: float, lags: Sequence[str]) -
 
 def _errors(sim: SimulatedMission, estimate: Estimate) -> tuple[float, float, float]:
     """Return the errors from the first ping on: before it there is but the initial state."""
-    trajectory = estimate.trajectory
-    first = int(np.argmax(trajectory.n_beams > 0))
-    metrics = evaluate(trajectory, sim.truth_at(trajectory.time_s[first:]))
+    trajectory = since_first_ping(estimate.trajectory)
+    metrics = evaluate(trajectory, sim.truth_at(trajectory.time_s))
     heading = math.degrees(metrics.rmse_attitude[2])
     return 1e3 * metrics.rmse_velocity_m_per_s, metrics.rmse_horizontal_m, heading
 

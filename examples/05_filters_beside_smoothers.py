@@ -1,4 +1,4 @@
-"""Filters, a fixed lag and the batch smoother on one mission with bad beams: what the future tells."""
+"""Filters, a fixed lag and the batch smoother beside each other, on one mission with bad beams."""
 
 import ssm_graph as sg
 from ssm_graph.simulation import OutlierKind, Outliers, scenario_config, simulate

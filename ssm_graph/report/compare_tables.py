@@ -30,7 +30,7 @@ COLUMNS: Final = (
 """Of the table of a cell."""
 LEGEND: Final = """\
 **Rms and end error**: mean over the runs of a method ± half of its 95 % interval (Student's t);
-in the tables of single cells the interval is in brackets. **Bold** in the headline: the best
+in the tables of single cells the interval is in brackets. Errors count from the first ping on. **Bold** in the headline: the best
 method that is no oracle, and those not significantly worse than it (Wilcoxon's signed-rank test of
 the runs that both finished, p > 0.05 after Holm's correction over the methods of the cell). Best
 is the lowest mean over common seeds. Few runs show few differences: with fewer than six pairs none
@@ -48,7 +48,8 @@ where 95 % of such means lie if the covariance is right; `!` marks one outside. 
 mean over all epochs, which depend on each other: no interval. **Inside 3σ**: share of epochs with
 the position error within three sigmas, east, north, up, expected 99.7 %. **Outliers rejected**:
 share of the outliers that the method left out. **Good weight, good rejected**: mean weight of good
-measurements, and the share of them left out. **Iterations, wall time**: means over runs.
+measurements, and the share of them left out. **Iterations, wall time**: means over runs;
+filters share the work of many runs, smoothers on one mission their first pass, which is not in it.
 **Status**: how many runs ended how. A dash is unknown or not applicable.
 """
 

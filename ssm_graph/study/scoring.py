@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ssm_graph.data import Array
 from ssm_graph.errors import DataError
-from ssm_graph.estimate import OUTLIER_WEIGHT, Estimate, Status, path_length_m
+from ssm_graph.estimate import OUTLIER_WEIGHT, Estimate, Status, path_length_m, since_first_ping
 from ssm_graph.evaluation import Metrics, evaluate
 from ssm_graph.simulation import SimulatedMission
 from ssm_graph.study.methods import Failure, Outcome, shown
@@ -109,12 +109,16 @@ def _score(labels: Row, trial: Trial, outcome: Estimate) -> tuple[Row, Array]:
 
 
 def _metrics(trial: Trial, estimate: Estimate) -> Metrics | None:
-    """Return the errors; None without a common time with a reference: nothing may be finite."""
-    reference = trial.reference_at(estimate.trajectory.time_s)
+    """Return the errors from the first ping on.
+
+    None without a common time with a reference: nothing may be finite.
+    """
+    trajectory = since_first_ping(estimate.trajectory)
+    reference = trial.reference_at(trajectory.time_s)
     if reference is None:
         return None
     try:
-        return evaluate(estimate.trajectory, reference)
+        return evaluate(trajectory, reference)
     except DataError:
         return None
 

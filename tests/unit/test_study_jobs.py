@@ -145,7 +145,7 @@ def test_rows_tell_errors_and_weights() -> None:
     assert (oracle["method"], log["method"]) == ("oracle", "smoother-log")
     assert (oracle["n_outliers"], log["n_outliers"]) == (0, 2)
     assert log["outliers_rejected"] == 1.0
-    assert oracle["n_epochs"] == log["n_epochs"] == 21
+    assert oracle["n_epochs"] == log["n_epochs"] == 20
     assert (log["status"], log["failed"], log["error"]) == ("CONVERGED", 0, "")
     assert log["path_length_m"] == pytest.approx(1.5 * DURATION_S, rel=0.05)
     samples = result.series["smoother-log"]
