@@ -55,7 +55,8 @@ class BeamTable(FrozenArrays):
     beam: Array = shaped("N")
     """(N,) beam number, 1 to 4."""
     innovation: Array = shaped("N")
-    """(N,) measured minus predicted, m/s."""
+    """(N,) measured minus predicted, m/s: before the update in filters, with the final states in
+    smoothers."""
     mahalanobis_sq: Array = shaped("N")
     """(N,) the t of the similarity measure, posterior variance included."""
     weight: Array = shaped("N")

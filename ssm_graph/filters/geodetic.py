@@ -100,7 +100,7 @@ class GeodeticHistory(ReadOnlyArrays):
     mahalanobis_sq: Array
     """(B, K, 4) t at the posterior"""
     innovation: Array
-    """(B, K, 4) measured minus predicted at the posterior, m/s"""
+    """(B, K, 4) measured minus predicted before the update, m/s"""
     iterations: NDArray[np.intp]
     """(B, K) 0 where there is no beam"""
 
@@ -204,23 +204,25 @@ def _update(
     recorder: _Recorder,
 ) -> tuple[Array, Array]:
     """Correct by depth and fix, then by the beams; the order changes nothing but the work."""
+    rows = beam_rows(measurements.beams, k, state)
+    recorder.innovation[:, k] = (rows.H @ X[..., None])[..., 0] - rows.Z
     nominal = nominal_rows(measurements, k, state, track, X)
     if nominal is not None:
         X, P = correct(X, P, nominal)
     has_beam = np.isfinite(measurements.beams.speed[:, k])
+    recorder.innovation[:, k][~has_beam] = np.nan
     if not has_beam.any():
         return X, P
     settled = settle(
         X,
         P,
-        beam_rows(measurements.beams, k, state),
+        rows,
         kernel=config.kernel,
         tolerance=config.tolerance,
         max_iterations=config.max_iterations,
     )
     recorder.weight[:, k] = np.where(has_beam, settled.weight, np.nan)
     recorder.mahalanobis_sq[:, k] = np.where(has_beam, settled.mahalanobis_sq, np.nan)
-    recorder.innovation[:, k] = np.where(has_beam, -settled.error, np.nan)
     recorder.iterations[:, k] = np.where(has_beam.any(axis=1), settled.iterations, 0)
     return settled.X, settled.P
 

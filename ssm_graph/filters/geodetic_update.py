@@ -23,8 +23,6 @@ class Settled(NamedTuple):
     """(B, m) the auxiliary parameters, as in the last gain"""
     mahalanobis_sq: Array
     """(B, m) t at the posterior"""
-    error: Array
-    """(B, m) ``Z - H X`` at the posterior, computed minus measured"""
     iterations: NDArray[np.intp]
     """(B,)"""
 
@@ -92,7 +90,7 @@ def settle(
         going = going[more & (iterations[going] < max_iterations)]
     t = expected_mahalanobis_sq(error, variance_left, sigma=rows.sigma)
     X, P = _gained(X, P, rows, sigma_sq / weight)
-    return Settled(X, P, weight, t, error, iterations)
+    return Settled(X, P, weight, t, iterations)
 
 
 def _with_diagonal(matrix: Array, added: Array) -> Array:

@@ -62,7 +62,7 @@ class FilterHistory:
     transition: Array
     """(K - 1, B, 15, 15) of the error state from keyframe to keyframe."""
     innovation: Array
-    """(K, B, 4) m/s, measured minus predicted with the posterior; NaN without a beam."""
+    """(K, B, 4) m/s, measured minus predicted before the update; NaN without a beam."""
     mahalanobis_sq: Array
     """(K, B, 4)"""
     weight: Array
@@ -95,8 +95,11 @@ def estimates_from_history(
     kernel: str,
     wall_s: float,
 ) -> list[Estimate]:
-    """Return the estimate of every run; ``states`` are the posterior or smoothed ones."""
-    estimates = []
+    """Return the estimate of every run; ``states`` are the posterior or smoothed ones.
+
+    Smoothed states have innovations of their own; squared lengths and weights stay the filter's.
+    """
+    estimates, is_smoothed = [], states is not history.posterior
     for run, problem in enumerate(problems):
         at = problem.beams.keyframe, run, problem.beams.beam
         estimates.append(
@@ -107,7 +110,9 @@ def estimates_from_history(
                 ),
                 states.covariance[:, run],
                 RecursiveBeams(
-                    history.innovation[at], history.mahalanobis_sq[at], history.weight[at]
+                    None if is_smoothed else history.innovation[at],
+                    history.mahalanobis_sq[at],
+                    history.weight[at],
                 ),
                 history.n_iterations[:, run],
                 method=method,

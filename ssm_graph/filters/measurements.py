@@ -14,7 +14,7 @@ from ssm_graph.data import N_BEAMS, Array
 from ssm_graph.filters.model import NOMINAL, Iterate, Runs
 from ssm_graph.filters.stack import Stack
 from ssm_graph.filters.states import NavigationStates, local_D_deviation
-from ssm_graph.problem.error_state import GYRO_BIAS, POSITION, ROTATION, VELOCITY
+from ssm_graph.problem.error_state import GYRO_BIAS, POSITION, ROTATION, STATE_DIM, VELOCITY
 from ssm_graph.problem.heights import HeightTrack, height_on_the_way, height_track
 
 
@@ -67,12 +67,15 @@ class KeyframeModel:
             groups.append(np.full(3, NOMINAL))
         self.present = np.concatenate(present, axis=1)
         self.group = np.concatenate(groups)
+        runs = np.arange(len(self.present))
+        self.predicted = self._at(predicted, np.zeros((len(runs), STATE_DIM)), runs, None)
+        """Before any correction."""
 
     def at(self, xi: Array) -> NavigationIterate:
         """Return all runs at deviations from their predictions."""
-        runs = np.arange(len(xi))
         if not np.any(xi):
-            return self._at(self._predicted, xi, runs, None)
+            return self.predicted
+        runs = np.arange(len(xi))
         return self._at(self._predicted.displaced(xi), xi, runs, local_D_deviation(xi))
 
     def move(self, iterate: Iterate, step: Array, runs: Runs) -> NavigationIterate:

@@ -132,7 +132,7 @@ class _Filter:
         root_information = self._stack.beams.root_information[k]
         present = model.present[:, :N_BEAMS]
         scale = np.where(present, root_information, np.nan)
-        history.innovation[k] = update.innovation[:, :N_BEAMS] / scale
+        history.innovation[k] = model.predicted.innovation[:, :N_BEAMS] / scale
         history.mahalanobis_sq[k] = np.where(present, update.mahalanobis_sq[:, :N_BEAMS], np.nan)
         history.weight[k] = np.where(present, update.weights[:, :N_BEAMS], np.nan)
         history.n_iterations[k] = update.n_iterations

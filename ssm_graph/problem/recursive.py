@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.dvl_beam import beam_residual
 from ssm_graph.data import Array
 from ssm_graph.estimate import BeamTable, Estimate, Status
 from ssm_graph.problem.doubts import doubts_of_beams
@@ -20,8 +21,9 @@ UNSETTLED_SHARE = 0.01
 class RecursiveBeams(NamedTuple):
     """What became of the N beam speeds of a problem."""
 
-    innovation: Array
-    """(N,) m/s, measured minus predicted with the posterior"""
+    innovation: Array | None
+    """(N,) m/s, measured minus predicted before the update; None for a smoother, whose innovations
+    are those of its final states"""
     mahalanobis_sq: Array
     """(N,)"""
     weight: Array
@@ -53,7 +55,8 @@ def recursive_estimate(
     """
     rows = problem.beams
     status, reason = _settled(n_iterations, max_iterations)
-    doubts = doubts_of_beams(problem, states.v_n, beams.innovation, beams.weight)
+    error = _beam_errors(problem, states)
+    doubts = doubts_of_beams(problem, states.v_n, error, beams.weight)
     lost = np.flatnonzero(~_is_finite(states.R_nb, states.p_n, states.v_n, covariance))
     if len(lost):
         begin_s = problem.keyframe_s[lost[0]]
@@ -69,7 +72,9 @@ def recursive_estimate(
         beams=BeamTable(
             time_s=problem.keyframe_s[rows.keyframe],
             beam=(rows.beam + 1).astype(np.float64),
-            **beams._asdict(),
+            innovation=-error if beams.innovation is None else beams.innovation,
+            mahalanobis_sq=beams.mahalanobis_sq,
+            weight=beams.weight,
         ),
         iterations=(),
         wall_s=wall_s,
@@ -78,6 +83,21 @@ def recursive_estimate(
         notes=problem.notes,
         keyframe_iterations=float(np.mean(n_iterations)),
     )
+
+
+def _beam_errors(problem: Problem, states: KeyframeStates) -> Array:
+    """Return predicted minus measured beam speeds (N,), m/s."""
+    beams, k = problem.beams, problem.beams.keyframe
+    return beam_residual(
+        states.R_nb[k],
+        states.v_n[k],
+        states.bias[k, 3:],
+        speed=beams.speed,
+        gyro_b=beams.gyro_b,
+        beam_b=beams.beam_b,
+        lever_arm_b=beams.lever_arm_b,
+        omega_ie_n=problem.frame.omega_ie_n,
+    ).error
 
 
 def _is_finite(*arrays: Array) -> NDArray[np.bool_]:

@@ -82,11 +82,12 @@ class FixedLagSmoother:
     def _estimate(
         self, problem: Problem, track: Track, n_iterations: Array, wall_s: float, name: str
     ) -> Estimate:
+        innovation = track.innovation if name == "newest" else None
         return recursive_estimate(
             problem,
             track,
             track.covariance,
-            RecursiveBeams(track.innovation, track.mahalanobis_sq, track.weight),
+            RecursiveBeams(innovation, track.mahalanobis_sq, track.weight),
             n_iterations,
             max_iterations=self.config.max_iterations,
             method=f"fixed lag {self.config.lag_s:g} s, {name} states",

@@ -67,7 +67,7 @@ class Track:
     covariance: Array
     """(K, 15, 15)"""
     innovation: Array
-    """(M,) m/s, measured minus predicted"""
+    """(M,) m/s, measured minus predicted before the first update"""
     mahalanobis_sq: Array
     """(M,)"""
     weight: Array
@@ -92,7 +92,6 @@ class _Settled(NamedTuple):
     """(15, 15) square-root information of the newest keyframe, the others marginalised"""
     weights: Array
     mahalanobis_sq: Array
-    innovation: Array
     n_passes: int
 
 
@@ -137,19 +136,23 @@ class Window:
         linearizer.follow_depth(states)
         rows = rows_in(self._problem.beams.keyframe, self._keyframes)
         settle = self._settle if self._config.linearised is Linearised.EACH_PASS else self._reweigh
-        settled = settle(linearizer, states, self.track.weight[rows])
+        at = linearizer.beam_rows(states)
+        is_new = window.beams.keyframe == window.n_keyframes - 1
+        self.track.innovation[rows][is_new] = -at.error[is_new]
+        settled = settle(linearizer, states, at, self.track.weight[rows])
         self._keep(settled, rows)
         has_measurement = (
             len(window.beams.speed) or linearizer.depth.size() + linearizer.gnss.size()
         )
         return settled.n_passes if has_measurement or window.n_keyframes > 1 else 0
 
-    def _settle(self, linearizer: GraphLinearizer, states: States, weights: Array) -> _Settled:
+    def _settle(
+        self, linearizer: GraphLinearizer, states: States, beam_rows: BeamRows, weights: Array
+    ) -> _Settled:
         """Solve and reweigh, everything linearised anew at each pass."""
         config, n_keyframes = self._config, linearizer.problem.n_keyframes
         tolerance = max(config.tolerance, ROUNDING) if n_keyframes > 1 else config.tolerance
         mixing = Mixing()
-        beam_rows = linearizer.beam_rows(states)
         for number in range(1, config.max_iterations + 1):
             if n_keyframes > 1:  # a single keyframe keeps what its prediction came with
                 linearizer.follow(states)
@@ -164,11 +167,13 @@ class Window:
                 # A single keyframe's weights are those of the filter, pass by pass.
                 weights = mixing.next_weights(weights, settled) if n_keyframes > 1 else settled
         root = solution.R[-1]
-        return _Settled(states, covariance, root, weights, t, -beam_rows.error, number)
+        return _Settled(states, covariance, root, weights, t, number)
 
-    def _reweigh(self, linearizer: GraphLinearizer, states: States, weights: Array) -> _Settled:
+    def _reweigh(
+        self, linearizer: GraphLinearizer, states: States, at: BeamRows, weights: Array
+    ) -> _Settled:
         """Solve and reweigh a single keyframe, linearised at its prediction only."""
-        config, at = self._config, linearizer.beam_rows(states)
+        config = self._config
         before = np.zeros((1, STATE_DIM))
         for number in range(1, config.max_iterations + 1):
             solution, covariance = self._solve(linearizer, states, at, weights)
@@ -183,8 +188,7 @@ class Window:
         J = moved_chart(step[0])
         covariance = J @ covariance @ J.T
         root = solution.R[-1] @ np.linalg.inv(J)
-        innovation = -linearizer.beam_rows(moved).error
-        return _Settled(moved, covariance, root, weights, t, innovation, number)
+        return _Settled(moved, covariance, root, weights, t, number)
 
     def _solve(
         self, linearizer: GraphLinearizer, states: States, rows: BeamRows, weights: Array
@@ -206,7 +210,6 @@ class Window:
         self._put(at, *settled.states[1:])
         track.covariance[at] = settled.covariance
         track.weight[rows], track.mahalanobis_sq[rows] = settled.weights, settled.mahalanobis_sq
-        track.innovation[rows] = settled.innovation
 
     def copy_newest(self, newest: Track) -> None:
         """Keep the newest keyframe as it is now."""

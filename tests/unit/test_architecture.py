@@ -19,7 +19,7 @@ MAY_IMPORT = {
     "imu": FOUNDATION,
     "simulation": FOUNDATION - {"frames"},
     "evaluation": FOUNDATION,
-    "problem": FOUNDATION | {"imu"},
+    "problem": FOUNDATION | {"imu", "factors"},
     "graph": FOUNDATION | {"problem", "imu", "factors"},
     "smoothers": FOUNDATION | {"graph", "problem", "imu", "factors"},
     "filters": FOUNDATION | {"problem", "imu", "factors"},
