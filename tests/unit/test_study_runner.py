@@ -185,7 +185,9 @@ def test_interrupt_keeps_what_is_done(tmp_path: Path) -> None:
     file = tmp_path / "tiny.toml"
     file.write_text(STUDY.replace("seeds = 2", "seeds = 40").replace("20.0", "60.0"))
     words = ["compare", str(file), "--out", str(tmp_path / "out"), "--jobs", "1", "--no-figures"]
-    code = f"import sys; from ssm_graph.cli.main import main; sys.exit(main({words!r}))"
+    # Whatever starts the tests in the background may have had the signal ignored.
+    code = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    code += f"from ssm_graph.cli.main import main; sys.exit(main({words!r}))"
     process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)
     path = tmp_path / "out" / "runs.jsonl"
     deadline = time.monotonic() + 120.0
