@@ -68,7 +68,6 @@ class Method:
     solver: Solver
     is_batched: bool = False
     is_oracle: bool = False
-    is_recursive: bool = False
 
     def run(self, trials: Sequence[Trial]) -> list[Outcome]:
         """Return an estimate for every trial; one that fails leaves the others as they are.
@@ -245,11 +244,7 @@ def parse_method(text: str) -> Method:
         ) from error
     is_default = value is None or value == family.default
     return Method(
-        name if is_default else f"{name}:{value:g}",
-        solver,
-        family.is_batched,
-        family.is_oracle,
-        family.is_recursive,
+        name if is_default else f"{name}:{value:g}", solver, family.is_batched, family.is_oracle
     )
 
 
