@@ -201,7 +201,7 @@ class StudyDisplay:
 
     def __init__(self, console: Console) -> None:
         self._console = console
-        self._begin = self._said = time.monotonic()
+        self._said, self._n_said = time.monotonic(), 0
         self._bar = Bar(
             TextColumn("{task.description}", markup=False),
             BarColumn(bar_width=24),
@@ -236,8 +236,10 @@ class StudyDisplay:
         now, is_last = time.monotonic(), progress.n_done == progress.n_wanted
         if self._console.is_terminal or not (is_last or now - self._said >= PLAIN_EVERY_S):
             return
-        self._said = now
-        left_s = (now - self._begin) * (progress.n_wanted / progress.n_done - 1.0)
+        # As fast as since the last line: some methods take a hundred times as long as others.
+        s_per_run = (now - self._said) / max(progress.n_done - self._n_said, 1)
+        self._said, self._n_said = now, progress.n_done
+        left_s = s_per_run * (progress.n_wanted - progress.n_done)
         self._console.print(
             f"{progress.n_done} of {progress.n_wanted} runs, {progress.label}, "
             f"{left_s / 60.0:.1f} min left",

@@ -2,7 +2,9 @@
 
 from ssm_graph.evaluation.alignment import gap_limit_s, interpolate_within
 from ssm_graph.evaluation.comparison import (
+    FILTER_ORACLE,
     METRICS,
+    ORACLE,
     Cell,
     Comparison,
     Measure,
@@ -25,7 +27,9 @@ from ssm_graph.evaluation.statistics import (
 from ssm_graph.evaluation.withheld import reference_from_gnss
 
 __all__ = [
+    "FILTER_ORACLE",
     "METRICS",
+    "ORACLE",
     "Cell",
     "Comparison",
     "ErrorSeries",

@@ -8,8 +8,10 @@ from collections.abc import Sequence
 from itertools import groupby
 from typing import Final
 
-from ssm_graph.evaluation import Cell, Comparison, Interval, Measure, MethodResult
+from ssm_graph.evaluation import Cell, Comparison, Measure, MethodResult
 from ssm_graph.report.compare_legend import LEGEND
+from ssm_graph.report.compare_sums import sums
+from ssm_graph.report.compare_text import decimals_of, digits, interval, plain, probability, table
 
 MAX_OPEN_CELLS: Final = 6
 """With more cells than these their tables are folded away."""
@@ -49,7 +51,7 @@ def markdown(
             lines += [f"### {name}, {unit}", ""]
             lines += _headline(comparison, cells, metric, unit, scale)
             lines.append("")
-    lines += ["## Every cell", ""]
+    lines += [*sums(comparison), "## Every cell", ""]
     is_folded = len(comparison.cells) > MAX_OPEN_CELLS
     for cell in comparison.cells:
         lines += _details(cell, comparison.baseline, is_folded=is_folded)
@@ -69,7 +71,7 @@ def _headline(
         results = [_result(cell, method) for cell in cells]
         entries = [_headline_entry(result, metric, scale) for result in results]
         rows.append([method, _runs(results), *entries])
-    return _table(header, rows)
+    return table(header, rows)
 
 
 def _headline_entry(result: MethodResult | None, metric: str, scale: float) -> str:
@@ -86,7 +88,7 @@ def entry(measure: Measure, n_runs: int, scale: float) -> str:
     value, half = scale * measure.mean.value, scale * measure.mean.half_width
     if not math.isfinite(half):
         return digits(value) + mark
-    decimals = max(_decimals(max(abs(value), half)), 0)
+    decimals = max(decimals_of(max(abs(value), half)), 0)
     return f"{value:.{decimals}f} ± {half:.{decimals}f}{mark}"
 
 
@@ -135,16 +137,16 @@ def _details(cell: Cell, baseline: str, *, is_folded: bool) -> list[str]:
     about = (cell.case, cell.grade.lower(), cell.kind, label, _size(cell), _duration(cell))
     name = ", ".join(dict.fromkeys(part for part in about if part))
     header = [name.format(baseline=baseline) for name in COLUMNS.split("; ")]
-    lines = _table(header, [_cells(result) for result in cell.methods])
+    lines = table(header, [_cells(result) for result in cell.methods])
     failures = [
-        f"- {_plain(result.method)}: {n} of {result.n_runs} runs failed: {_plain(said) or '?'}"
+        f"- {plain(result.method)}: {n} of {result.n_runs} runs failed: {plain(said) or '?'}"
         for result in cell.methods
         for said, n in result.failures.items()
     ]
     lines += ["", *failures] if failures else []
     if is_folded:
-        return ["<details>", f"<summary>{_plain(name)}</summary>", "", *lines, "", "</details>", ""]
-    return [f"### {_plain(name)}", "", *lines, ""]
+        return ["<details>", f"<summary>{plain(name)}</summary>", "", *lines, "", "</details>", ""]
+    return [f"### {plain(name)}", "", *lines, ""]
 
 
 def _cells(result: MethodResult) -> list[str]:
@@ -188,50 +190,6 @@ def _cells(result: MethodResult) -> list[str]:
 def _marked(measure: Measure, n_runs: int, scale: float = 1.0) -> str:
     missing = n_runs - measure.n
     return interval(measure.mean, scale) + (f" †{missing}" if missing else "")
-
-
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    ruler = ["---" if column == 0 else "---:" for column in range(len(header))]
-    texts = [[_plain(text) for text in line] for line in (header, *rows)]
-    return ["| " + " | ".join(cells) + " |" for cells in (texts[0], ruler, *texts[1:])]
-
-
-def _plain(text: str) -> str:
-    """Return a text on one line that ends no cell of a table."""
-    return " ".join(text.split()).replace("|", "\\|").replace("<", "&lt;")
-
-
-def interval(shown: Interval, scale: float = 1.0) -> str:
-    """Return a value with its interval in brackets, as far as there are any."""
-    if math.isnan(shown.value) or not math.isfinite(shown.half_width):
-        return digits(scale * shown.value)
-    return (
-        f"{digits(scale * shown.value)} [{digits(scale * shown.low)}, {digits(scale * shown.high)}]"
-    )
-
-
-def probability(p: float) -> str:
-    """Return a p value with two digits, small ones as a bound."""
-    if math.isnan(p):
-        return "–"
-    return "< 0.001" if p < 0.001 else f"{p:.2g}"
-
-
-def digits(value: float) -> str:
-    """Return a number with three digits that count."""
-    if not math.isfinite(value):
-        return "–" if math.isnan(value) else f"{value}"
-    if value != 0.0 and not 1e-4 <= abs(value) < 1e6:
-        return f"{value:.2e}"
-    decimals = _decimals(value)
-    return f"{round(value, decimals):.{max(decimals, 0)}f}"
-
-
-def _decimals(value: float) -> int:
-    """Return how many decimals show three digits; below zero if not all of the integer ones."""
-    if value == 0.0:
-        return 0
-    return 2 - int(f"{abs(value):.2e}".partition("e")[2])
 
 
 def latex(comparison: Comparison, *, caption: str, label: str) -> str:

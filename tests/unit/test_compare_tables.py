@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from ssm_graph.evaluation import Comparison, compare_methods
-from ssm_graph.report.compare_tables import digits, interval, latex, markdown, probability
+from ssm_graph.report.compare_legend import LEGEND
+from ssm_graph.report.compare_tables import latex, markdown
+from ssm_graph.report.compare_text import digits, interval, probability
 
 METHODS = ("oracle", "ekf-oracle", "ssm-log", "t_robust", "bad")
 
@@ -82,7 +84,7 @@ def test_markdown_is_headed_by_how_it_was_made() -> None:
 def test_every_heading_has_its_unit() -> None:
     """All columns but names and counts say what they are in, and no table is ragged."""
     blocks = table_blocks(report(a_comparison()))
-    assert len(blocks) == 2 * 2 + 6
+    assert len(blocks) == 2 * 2 + 2 + 6
     for block in blocks:
         assert {len(line) for line in block} == {len(block[0])}
         for heading in block[0]:
@@ -108,6 +110,43 @@ def test_headline_shows_best_and_missing() -> None:
     assert re.fullmatch(r"\*\*0\.\d{3} ± 0\.\d{3}\*\*", lines["ssm-log"])
     assert lines["t_robust"] == lines["ssm-log"] == f"**{lines['oracle']}**"
     assert re.fullmatch(r"0\.\d{3} ± 0\.\d{3} †1", lines["bad"])
+
+
+def test_cells_together_are_means_of_ratios() -> None:
+    """By hand: geometric mean and highest of three cells, one of them without pairs."""
+    rows = [
+        {
+            "case": f"{rate:g}",
+            "grade": "MEMS",
+            "kind": "one_beam",
+            "rate": rate,
+            "seed": seed,
+            "method": method,
+            "failed": int(method == "bad" and rate == 0.4),
+            "horizontal_rms_m": factor if method == "bad" else 1.0,
+            "velocity_rms_m_per_s": 0.1,
+        }
+        for rate, factor in ((0.1, 2.0), (0.2, 8.0), (0.4, 99.0))
+        for seed in range(3)
+        for method in ("ssm-log", "bad", "oracle")
+    ]
+    text = report(compare_methods(rows))
+    block = table_blocks(text[text.index("## Cells together") :])[0]
+    lines = [[cell.strip() for cell in line] for line in block]
+    assert "### mems, outliers, 3 cells" in text
+    assert lines[0] == [
+        "method",
+        "horizontal to ssm-log, 1",
+        "horizontal to oracle, 1",
+        "velocity to ssm-log, 1",
+        "velocity to oracle, 1",
+    ]
+    assert lines[3] == ["bad", *2 * ["4.00 (≤ 8.00) †1"], *2 * ["1.00 (≤ 1.00) †1"]]
+    assert lines[2] == ["ssm-log", "–", "1.00 (≤ 1.00)", "–", "1.00 (≤ 1.00)"]
+    assert (
+        "Cells together"
+        not in report(compare_methods([r for r in rows if r["rate"] == 0.1]))[: -len(LEGEND)]
+    )
 
 
 def test_failures_and_inconsistency_are_said() -> None:
