@@ -1,16 +1,38 @@
-"""``ssm-graph convert``: turn a maker's log into a mission folder."""
+"""``ssm-graph convert``: turn a maker's log or a ROS 2 bag into a mission folder."""
 
 from __future__ import annotations
 
 import argparse
+import math
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
 from ssm_graph.cli.options import add_command, add_mission_output
+from ssm_graph.data import Mission
+from ssm_graph.errors import ConfigError
 from ssm_graph.io.blueye import convert_blueye
 from ssm_graph.io.mission import write_mission
+from ssm_graph.io.mission_keys import BodyAxes
+from ssm_graph.io.ros_messages import SEA_WATER, STANDARD_ATMOSPHERE, BeamSign, RosOptions
+from ssm_graph.io.rosbag import convert_rosbag
+from ssm_graph.io.rosbag_log import ROLES, is_rosbag
+
+DESCRIPTION = f"""\
+Convert a log. LOG is one of
+
+  a ROS 2 bag      the folder with metadata.yaml, or a single .mcap or .db3 file (extra 'ros')
+  a Blueye X3 log  MCAP of the maker (extra 'blueye')
+
+Of a ROS 2 bag, topics are found by their type:
+
+{chr(10).join(f"  {role:6} {' or '.join(types)}" for role, types in ROLES.items())}
+
+imu and dvl have to be there. What messages do not say, noise, lever arms and mounting, comes from
+--vehicle, or is assumed; every assumption is printed as a note. More in docs/ros2.md.
+"""
 
 
 def add_parser(commands: Any, *, epilog: str) -> None:
@@ -18,18 +40,81 @@ def add_parser(commands: Any, *, epilog: str) -> None:
     parser = add_command(
         commands,
         "convert",
-        summary="turn a maker's log into a mission folder",
-        description="Convert a log. So far: Blueye X3 MCAP (extra 'blueye').",
+        summary="turn a maker's log or a ROS 2 bag into a mission folder",
+        description=DESCRIPTION,
         epilog=epilog,
     )
-    parser.add_argument("log", type=Path, metavar="LOG", help="the maker's file")
+    parser.add_argument("log", type=Path, metavar="LOG", help="file or folder to convert")
     add_mission_output(parser)
+    _add_ros_options(parser)
     parser.set_defaults(run=run)
+
+
+def _add_ros_options(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("of ROS 2 bags only")
+    group.add_argument(
+        "--vehicle",
+        type=Path,
+        metavar="FILE",
+        help="noise, lever arms, DVL mounting and beam directions: a mission.toml (its tables need "
+        "not exist) or a mission folder",
+    )
+    group.add_argument(
+        "--topic",
+        type=_topic,
+        action="append",
+        metavar="SENSOR=NAME",
+        help="the topic to read where several fit, such as imu=/imu/data; may be repeated",
+    )
+    group.add_argument(
+        "--body",
+        choices=[axes.value for axes in BodyAxes],
+        help="axes of the IMU messages: forward-left-up as REP 103 has it, forward-right-down, "
+        "right-forward-up (default: FLU)",
+    )
+    group.add_argument(
+        "--water-density",
+        type=_number,
+        metavar="KG_PER_M3",
+        help=f"of the water (default: {SEA_WATER:g}; fresh water has 1000)",
+    )
+    group.add_argument(
+        "--atmosphere",
+        type=_number,
+        metavar="PA",
+        help="pressure at the surface, 0 for a sensor that reads 0 there "
+        f"(default: {STANDARD_ATMOSPHERE:.0f})",
+    )
+    group.add_argument(
+        "--surface-height",
+        type=_number,
+        metavar="M",
+        help="height of the water's surface above the WGS-84 ellipsoid (default: by the fixes, "
+        "else 0)",
+    )
+    group.add_argument(
+        "--beams-against",
+        action="store_true",
+        default=None,
+        help="the speeds of marine_acoustic_msgs are positive when the vehicle moves against the "
+        "beam (default: found by the velocity in the messages)",
+    )
+
+
+ROS_OPTIONS = (
+    "vehicle",
+    "topic",
+    "body",
+    "water_density",
+    "atmosphere",
+    "surface_height",
+    "beams_against",
+)
 
 
 def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
     """Convert and write."""
-    mission = convert_blueye(arguments.log)
+    mission = _convert(arguments)
     write_mission(arguments.out, mission, table_format=arguments.format)
     n_fixes = len(mission.gnss.time_s) if mission.gnss is not None else 0
     span_s = mission.imu.time_s[-1] - mission.imu.start_s
@@ -42,3 +127,53 @@ def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
     for note in mission.notes:
         console.print(f"note: {note}", style="yellow", highlight=False, markup=False)
     return True
+
+
+def _convert(arguments: argparse.Namespace) -> Mission:
+    if is_rosbag(arguments.log):
+        return _from_rosbag(arguments)
+    given = [name for name in ROS_OPTIONS if getattr(arguments, name) is not None]
+    if given:
+        raise ConfigError(
+            f"--{given[0].replace('_', '-')} is for ROS 2 bags, and {arguments.log} is none: "
+            "expected a folder with metadata.yaml, or MCAP or .db3 recorded by ROS 2"
+        )
+    return convert_blueye(arguments.log)
+
+
+def _from_rosbag(arguments: argparse.Namespace) -> Mission:
+    defaults = RosOptions()
+    density, atmosphere = arguments.water_density, arguments.atmosphere
+    if density is not None and density <= 0.0:
+        raise ConfigError(f"--water-density: expected a number above zero, got {density:g}")
+    against = bool(arguments.beams_against)
+    options = RosOptions(
+        body=BodyAxes(arguments.body) if arguments.body else defaults.body,
+        beam_sign=BeamSign.AGAINST if against else BeamSign.ALONG,
+        water_density=defaults.water_density if density is None else density,
+        atmosphere=defaults.atmosphere if atmosphere is None else atmosphere,
+        surface_height=arguments.surface_height,
+    )
+    topics = arguments.topic or []
+    if len(dict(topics)) < len(topics):
+        raise ConfigError("--topic: expected each sensor once")
+    vehicle = None
+    if arguments.vehicle is not None:
+        vehicle = import_module("ssm_graph.io.vehicle").read_vehicle(arguments.vehicle)
+    return convert_rosbag(arguments.log, vehicle=vehicle, topics=dict(topics), options=options)
+
+
+def _topic(word: str) -> tuple[str, str]:
+    role, separator, name = word.partition("=")
+    if not separator or role not in ROLES or not name:
+        raise argparse.ArgumentTypeError(
+            f"expected SENSOR=NAME with a sensor of {', '.join(ROLES)}, got {word!r}"
+        )
+    return role, name
+
+
+def _number(word: str) -> float:
+    number = float(word)
+    if not math.isfinite(number):
+        raise ValueError
+    return number

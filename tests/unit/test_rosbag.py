@@ -1,0 +1,709 @@
+"""ROS 2 bags become missions: written from a simulated mission, read back, compared with it."""
+
+from __future__ import annotations
+
+import re
+import sqlite3
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from ssm_graph.cli.main import ExitCode, main
+from ssm_graph.data import Array, DvlMount, ImuNoise, Mission
+from ssm_graph.errors import ConfigError, DataError, MissingExtraError
+from ssm_graph.io import rosbag_log
+from ssm_graph.io.mission import read_mission, write_mission
+from ssm_graph.io.mission_keys import BodyAxes
+from ssm_graph.io.mission_units import R_FRD
+from ssm_graph.io.ros_messages import BeamSign, RosOptions
+from ssm_graph.io.rosbag import BEAM_SIGMA, NOISE, convert_rosbag
+from ssm_graph.io.rosbag_beams import WATER_LINKED_BEAMS, proven_beams
+from ssm_graph.io.rosbag_log import LAYOUTS, is_rosbag
+from ssm_graph.messages import Vehicle
+from ssm_graph.simulation import GnssSettings
+from tests.helpers import simulated
+
+pytest.importorskip("rosbags", reason="needs the extra 'ros'")
+
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+IMU, MARINE, WATER_LINKED = (
+    "sensor_msgs/msg/Imu",
+    "marine_acoustic_msgs/msg/Dvl",
+    "dvl_msgs/msg/DVL",
+)
+PRESSURE, FIX = "sensor_msgs/msg/FluidPressure", "sensor_msgs/msg/NavSatFix"
+EPOCH_S = 1_700_000_000
+ON_ELLIPSOID = RosOptions(surface_height=0.0)
+"""Depth as simulated, minus the ellipsoidal height."""
+
+
+class Sent(NamedTuple):
+    """One message before it is written."""
+
+    topic: str
+    type_name: str
+    nanoseconds: int
+    message: Any
+
+
+class Ros:
+    """A maker of messages by the definitions of one layout of ``dvl_msgs``."""
+
+    def __init__(self, layout: int = 0) -> None:
+        self.store = get_typestore(Stores.ROS2_HUMBLE)
+        self.store.register(get_types_from_msg(LAYOUTS[MARINE][0], MARINE))
+        self.store.register(get_types_from_msg(LAYOUTS[WATER_LINKED][layout], WATER_LINKED))
+        self.has_times = "time_of_validity" in LAYOUTS[WATER_LINKED][layout]
+        self.has_cov = " cov\n" in LAYOUTS[WATER_LINKED][layout]
+        self.has_covariance = " covariance\n" in LAYOUTS[WATER_LINKED][layout]
+
+    def new(self, type_name: str, **fields: Any) -> Any:
+        """Return a message of a type."""
+        return self.store.types[type_name](**fields)
+
+    def vector(self, values: Any) -> Any:
+        """Return a ``geometry_msgs/Vector3``."""
+        x, y, z = (float(value) for value in values)
+        return self.new("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+
+    def header(self, nanoseconds: int) -> Any:
+        """Return a header."""
+        sec, nanosec = divmod(nanoseconds, 10**9)
+        stamp = self.new("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+        return self.new("std_msgs/msg/Header", stamp=stamp, frame_id="")
+
+    def sent(self, topic: str, type_name: str, time_s: float, **fields: Any) -> Sent:
+        """Return a message with its header, recorded at the time of its stamp."""
+        at = EPOCH_S * 10**9 + round(time_s * 1e9)
+        return Sent(topic, type_name, at, self.new(type_name, header=self.header(at), **fields))
+
+    def imu(self, time_s: float, gyro: Any, accel: Any, topic: str = "/imu") -> Sent:
+        """Return an IMU message, vectors in the axes of the message."""
+        return self.sent(
+            topic,
+            IMU,
+            time_s,
+            orientation=self.new("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+            orientation_covariance=np.r_[-1.0, np.zeros(8)],
+            angular_velocity=self.vector(gyro),
+            angular_velocity_covariance=np.zeros(9),
+            linear_acceleration=self.vector(accel),
+            linear_acceleration_covariance=np.zeros(9),
+        )
+
+    def marine(
+        self, time_s: float, *, speed: Any, beams_d: Any, velocity: Any, **more: Any
+    ) -> Sent:
+        """Return a ``marine_acoustic_msgs/Dvl``; missing beams are 0 with range -1."""
+        missing = np.isnan(speed)
+        fields = {
+            "velocity_mode": 1,
+            "dvl_type": 0,
+            "velocity": self.vector(velocity),
+            "velocity_covar": np.full(9, -1.0),
+            "altitude": 20.0,
+            "course_gnd": 0.0,
+            "speed_gnd": 0.0,
+            "num_good_beams": int(np.sum(~missing)),
+            "sound_speed": 1500.0,
+            "beam_ranges_valid": True,
+            "beam_velocities_valid": True,
+            "beam_unit_vec": [self.vector(beam) for beam in beams_d],
+            "range": np.where(missing, -1.0, 25.0),
+            "range_covar": np.full(4, -1.0, dtype=np.float32),
+            "beam_quality": np.zeros(4, dtype=np.float32),
+            "beam_velocity": np.where(missing, 0.0, speed).astype(np.float32),
+            "beam_velocity_covar": np.full(4, -1.0, dtype=np.float32),
+        }
+        return self.sent("/dvl", MARINE, time_s, **fields | more)
+
+    def water_linked(self, time_s: float, *, speed: Any, velocity: Any) -> Sent:
+        """Return a ``dvl_msgs/DVL`` of the maker's layout."""
+        beams = [
+            self.new(
+                "dvl_msgs/msg/DVLBeam",
+                id=i,
+                velocity=float(np.nan_to_num(one)),
+                distance=25.0,
+                rssi=-30.0,
+                nsd=-90.0,
+                valid=bool(np.isfinite(one)),
+            )
+            for i, one in enumerate(speed)
+        ]
+        fields: dict[str, Any] = {"covariance": np.zeros(9)} if self.has_covariance else {}
+        fields |= {"cov": [self.vector((0, 0, 0))] * 3} if self.has_cov else {}
+        if self.has_times:
+            fields |= {"time_of_validity": 17 * 10**14, "time_of_transmission": 17 * 10**14}
+        return self.sent(
+            "/dvl/data",
+            WATER_LINKED,
+            time_s,
+            time=100.0,
+            velocity=self.vector(velocity),
+            fom=0.002,
+            altitude=20.0,
+            beams=beams,
+            velocity_valid=True,
+            status=0,
+            form="json_v3.1",
+            **fields,
+        )
+
+    def pressure(self, time_s: float, depth: float) -> Sent:
+        """Return the pressure at a depth below a surface on the ellipsoid."""
+        value = 101_325.0 + 1025.0 * 9.80665 * depth
+        return self.sent("/pressure", PRESSURE, time_s, fluid_pressure=value, variance=0.0)
+
+    def fix(self, time_s: float, lat_lon_height: Any, sigma: Any, *, status: int = 0) -> Sent:
+        """Return a fix of known covariance; angles in radians."""
+        lat, lon, height = lat_lon_height
+        return self.sent(
+            "/gps/fix",
+            FIX,
+            time_s,
+            status=self.new("sensor_msgs/msg/NavSatStatus", status=status, service=1),
+            latitude=float(np.degrees(lat)),
+            longitude=float(np.degrees(lon)),
+            altitude=float(height),
+            position_covariance=np.diag(np.square(sigma)).ravel(),
+            position_covariance_type=2,
+        )
+
+
+@pytest.fixture(scope="module")
+def mission() -> Mission:
+    """Return half a minute at 20 Hz with beams missing here and there."""
+    settings = GnssSettings(lever_arm_b=(0.0, 0.0, 0.0), windows=((0.0, 1e9),))
+    made: Mission = simulated(dropout_rate=0.1, gnss=settings, seed=2).mission
+    return made
+
+
+@pytest.fixture(scope="module")
+def ros() -> Ros:
+    """Return a maker of messages."""
+    return Ros()
+
+
+def vehicle_of(mission: Mission) -> Vehicle:
+    """Return what the mission knows of its vehicle."""
+    assert mission.depth is not None
+    assert mission.gnss is not None
+    return Vehicle(
+        name="test",
+        imu_noise=mission.imu.noise,
+        mount=mission.dvl.mount,
+        beam_sigma=float(mission.dvl.sigma[0, 0]),
+        depth_lever_arm_b=mission.depth.lever_arm_b,
+        gnss_lever_arm_b=mission.gnss.lever_arm_b,
+        depth_sigma=mission.depth.sigma,
+    )
+
+
+def velocities(mission: Mission, beams_d: Array) -> Array:
+    """Return what the instrument makes of its beams, 0 where one is missing."""
+    return np.asarray(np.nan_to_num(mission.dvl.speed @ np.linalg.pinv(beams_d).T))
+
+
+def imu_messages(mission: Mission, ros: Ros, *, axes: BodyAxes = BodyAxes.FLU) -> list[Sent]:
+    """Return the inertial samples in the given axes."""
+    imu, turn = mission.imu, R_FRD[axes]  # each of these is its own inverse
+    rows = zip(imu.time_s, imu.gyro_b @ turn, imu.accel_b @ turn, strict=True)
+    return [ros.imu(*row) for row in rows]
+
+
+def marine_messages(mission: Mission, ros: Ros, **more: Any) -> list[Sent]:
+    """Return the pings as ``marine_acoustic_msgs``; ``more`` may hold ``sign`` and fields."""
+    beams_d = more.pop("beams_d", mission.dvl.mount.beams_d)
+    sign = more.pop("sign", 1.0)
+    rows = zip(
+        mission.dvl.time_s,
+        sign * mission.dvl.speed,
+        velocities(mission, mission.dvl.mount.beams_d),
+        strict=True,
+    )
+    return [ros.marine(t, speed=s, beams_d=beams_d, velocity=v, **more) for t, s, v in rows]
+
+
+def aid_messages(mission: Mission, ros: Ros) -> list[Sent]:
+    """Return pressures and fixes."""
+    depth, gnss = mission.depth, mission.gnss
+    assert depth is not None
+    assert gnss is not None
+    places = np.column_stack([gnss.lat, gnss.lon, gnss.height])
+    return [
+        *(ros.pressure(*row) for row in zip(depth.time_s, depth.depth, strict=True)),
+        *(ros.fix(*row) for row in zip(gnss.time_s, places, gnss.sigma_enu, strict=True)),
+    ]
+
+
+def marine_bag(mission: Mission, ros: Ros) -> list[Sent]:
+    """Return all messages of a mission."""
+    return [
+        *imu_messages(mission, ros),
+        *marine_messages(mission, ros),
+        *aid_messages(mission, ros),
+    ]
+
+
+def write_bag(
+    path: Path, ros: Ros, sent: list[Sent], plugin: StoragePlugin = StoragePlugin.MCAP
+) -> Path:
+    """Write messages in the order of their recording; return the folder."""
+    with Writer(path, version=8, storage_plugin=plugin) as writer:
+        connections = {
+            (topic, kind): writer.add_connection(topic, kind, typestore=ros.store)
+            for topic, kind in dict.fromkeys((item.topic, item.type_name) for item in sent)
+        }
+        for item in sorted(sent, key=lambda item: item.nanoseconds):
+            raw = ros.store.serialize_cdr(item.message, item.type_name)
+            writer.write(connections[item.topic, item.type_name], item.nanoseconds, raw)
+    return path
+
+
+def forget_definitions(bag: Path) -> Path:
+    """Take the message definitions out of a db3 bag, which Humble does not write."""
+    with sqlite3.connect(bag / f"{bag.name}.db3") as database:
+        database.execute("DELETE FROM message_definitions")
+        database.execute("UPDATE topics SET type_description_hash = ''")
+    database.close()
+    text = (bag / "metadata.yaml").read_text()
+    (bag / "metadata.yaml").write_text(re.sub(r"RIHS01_[0-9a-f]{64}", "''", text))
+    return bag
+
+
+def assert_times(got: Array, wanted: Array) -> None:
+    """Compare times up to the nanosecond of a stamp and the float of a Unix time."""
+    np.testing.assert_allclose(got - EPOCH_S, wanted, rtol=0.0, atol=3e-7)
+
+
+def assert_same(got: Mission, wanted: Mission) -> None:
+    """Compare all tables; beam speeds go through 32 bits."""
+    assert_times(got.imu.time_s, wanted.imu.time_s)
+    assert got.imu.start_s - EPOCH_S == pytest.approx(wanted.imu.start_s, abs=1e-6)
+    np.testing.assert_array_equal(got.imu.gyro_b, wanted.imu.gyro_b)
+    np.testing.assert_array_equal(got.imu.accel_b, wanted.imu.accel_b)
+    assert_times(got.dvl.time_s, wanted.dvl.time_s)
+    np.testing.assert_allclose(got.dvl.speed, wanted.dvl.speed, rtol=6e-8)
+    for log, truth in ((got.depth, wanted.depth), (got.gnss, wanted.gnss)):
+        assert log is not None
+        assert truth is not None
+        assert_times(log.time_s, truth.time_s)
+    assert got.depth is not None
+    assert got.gnss is not None
+    assert wanted.depth is not None
+    assert wanted.gnss is not None
+    np.testing.assert_allclose(got.depth.depth, wanted.depth.depth, rtol=0.0, atol=1e-9)
+    for name in ("lat", "lon", "height", "sigma_enu"):
+        np.testing.assert_allclose(
+            getattr(got.gnss, name), getattr(wanted.gnss, name), rtol=1e-15, atol=1e-15
+        )
+
+
+@pytest.mark.parametrize("plugin", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+def test_a_bag_is_the_mission_it_was_made_of(
+    mission: Mission, ros: Ros, tmp_path: Path, plugin: StoragePlugin
+) -> None:
+    """Both storages: every table comes back, with the vehicle's constants, and can be read."""
+    bag = write_bag(tmp_path / "run7", ros, marine_bag(mission, ros), plugin)
+    got = convert_rosbag(bag, vehicle=vehicle_of(mission), options=ON_ELLIPSOID)
+    assert_same(got, mission)
+    assert got.name == "run7"
+    assert got.imu.noise == mission.imu.noise
+    np.testing.assert_array_equal(got.dvl.mount.beams_d, mission.dvl.mount.beams_d)
+    np.testing.assert_array_equal(got.dvl.sigma, mission.dvl.sigma)
+    assert got.dvl.range_m is not None
+    np.testing.assert_array_equal(np.isnan(got.dvl.range_m), np.isnan(mission.dvl.speed))
+    assert got.depth is not None
+    assert mission.depth is not None
+    assert got.depth.sigma == mission.depth.sigma
+    assert not any("--vehicle" in note for note in got.notes)
+    write_mission(tmp_path / "mission", got)
+    np.testing.assert_allclose(read_mission(tmp_path / "mission").dvl.speed, got.dvl.speed)
+
+
+def test_a_single_file_is_a_bag_too(mission: Mission, ros: Ros, tmp_path: Path) -> None:
+    """The folder's metadata are not needed."""
+    bag = write_bag(tmp_path / "run", ros, marine_bag(mission, ros))
+    assert is_rosbag(bag)
+    assert is_rosbag(bag / "run.mcap")
+    assert_same(convert_rosbag(bag / "run.mcap", options=ON_ELLIPSOID), mission)
+
+
+@pytest.mark.parametrize("layout", range(len(LAYOUTS[WATER_LINKED])))
+@pytest.mark.parametrize("embedded", [True, False])
+def test_water_linked_in_every_layout(
+    mission: Mission, tmp_path: Path, layout: int, embedded: bool
+) -> None:
+    """The definition is the bag's own, or the known one that makes sense of the bytes."""
+    ros = Ros(layout)
+    body_v = velocities(mission, mission.dvl.mount.beams_d)
+    speed = body_v @ WATER_LINKED_BEAMS.T
+    speed[::7, 2] = np.nan
+    rows = zip(mission.dvl.time_s, speed, body_v, strict=True)
+    sent = [ros.water_linked(t, speed=s, velocity=v) for t, s, v in rows]
+    sent += imu_messages(mission, ros)[:200] + aid_messages(mission, ros)
+    bag = write_bag(tmp_path / "wl", ros, sent, StoragePlugin.SQLITE3)
+    got = convert_rosbag(bag if embedded else forget_definitions(bag), options=ON_ELLIPSOID)
+    np.testing.assert_array_equal(got.dvl.speed, speed)
+    np.testing.assert_array_equal(got.dvl.mount.beams_d, WATER_LINKED_BEAMS)
+    assert got.imu.noise == NOISE
+    assert np.all(got.dvl.sigma == BEAM_SIGMA)
+    assert any("No --vehicle" in note for note in got.notes)
+
+
+def test_marine_definition_is_known_too(mission: Mission, ros: Ros, tmp_path: Path) -> None:
+    """A db3 bag of Humble carries none."""
+    bag = write_bag(tmp_path / "old", ros, marine_bag(mission, ros), StoragePlugin.SQLITE3)
+    assert_same(convert_rosbag(forget_definitions(bag), options=ON_ELLIPSOID), mission)
+
+
+@pytest.mark.parametrize("axes", list(BodyAxes))
+def test_body_axes(mission: Mission, ros: Ros, tmp_path: Path, axes: BodyAxes) -> None:
+    """Each of the three comes to forward-right-down; the wrong one of two is refused."""
+    sent = imu_messages(mission, ros, axes=axes) + marine_messages(mission, ros)
+    bag = write_bag(tmp_path / "axes", ros, sent + aid_messages(mission, ros))
+    got = convert_rosbag(bag, options=RosOptions(body=axes, surface_height=0.0))
+    assert_same(got, mission)
+    wrong = BodyAxes.FLU if axes is BodyAxes.FRD else BodyAxes.FRD
+    with pytest.raises(DataError, match="--body"):
+        convert_rosbag(bag, options=RosOptions(body=wrong))
+
+
+def test_the_published_velocity_shows_the_sign(mission: Mission, ros: Ros, tmp_path: Path) -> None:
+    """Speeds counted as PD0 does are turned, and it is said; stated so, they are turned anyway."""
+    sent = imu_messages(mission, ros) + marine_messages(mission, ros, sign=-1.0)
+    bag = write_bag(tmp_path / "against", ros, sent + aid_messages(mission, ros))
+    for vehicle in (None, vehicle_of(mission)):
+        got = convert_rosbag(bag, vehicle=vehicle, options=ON_ELLIPSOID)
+        assert_same(got, mission)
+        assert any("their sign is turned" in note for note in got.notes)
+    stated = replace(ON_ELLIPSOID, beam_sign=BeamSign.AGAINST)
+    got = convert_rosbag(bag, options=stated)
+    assert_same(got, mission)
+    assert not any("their sign is turned" in note for note in got.notes)
+
+
+def test_beam_vectors_counted_from_the_horizontal(
+    mission: Mission, ros: Ros, tmp_path: Path
+) -> None:
+    """A known slip of drivers is found by the velocity, mended and said."""
+    beams_d = mission.dvl.mount.beams_d
+    level = np.linalg.norm(beams_d[:, :2], axis=1)[:, None]
+    slip = np.hstack([beams_d[:, :2] / level * beams_d[:, 2:], level])
+    sent = imu_messages(mission, ros) + marine_messages(mission, ros, beams_d=slip)
+    bag = write_bag(tmp_path / "slip", ros, sent + aid_messages(mission, ros))
+    got = convert_rosbag(bag, options=ON_ELLIPSOID)
+    np.testing.assert_allclose(got.dvl.mount.beams_d, beams_d, atol=1e-12)
+    assert any("from the horizontal" in note for note in got.notes)
+
+
+def test_beams_that_cannot_be_known_ask_for_a_vehicle(
+    mission: Mission, ros: Ros, tmp_path: Path
+) -> None:
+    """Zero vectors, and directions that contradict the velocity."""
+    for name, beams_d in (("zero", np.zeros((4, 3))), ("wrong", WATER_LINKED_BEAMS[[1, 0, 2, 3]])):
+        sent = imu_messages(mission, ros) + marine_messages(mission, ros, beams_d=beams_d)
+        bag = write_bag(tmp_path / name, ros, sent + aid_messages(mission, ros))
+        with pytest.raises(DataError, match=r"/dvl: .*--vehicle"):
+            convert_rosbag(bag)
+        assert_same(convert_rosbag(bag, vehicle=vehicle_of(mission), options=ON_ELLIPSOID), mission)
+
+
+def test_water_linked_mounting_rotation() -> None:
+    """The velocity shows the quarter turn; with little motion nothing is claimed."""
+    rng = np.random.default_rng(0)
+    velocity = rng.normal(0.0, [0.5, 0.2, 0.05], (50, 3))
+    turned = np.column_stack([-velocity[:, :2], velocity[:, 2]])
+    speed = velocity @ WATER_LINKED_BEAMS.T + rng.normal(0.0, 0.01, (50, 4))
+    found = proven_beams(None, water_linked=True, may_turn=True, speed=speed, velocity_d=turned)
+    np.testing.assert_allclose(turned @ found.beams_d.T, velocity @ WATER_LINKED_BEAMS.T)
+    assert "180 degrees" in found.notes[0]
+    still = proven_beams(
+        None, water_linked=True, may_turn=True, speed=0.01 * speed, velocity_d=0.01 * turned
+    )
+    np.testing.assert_array_equal(still.beams_d, WATER_LINKED_BEAMS)
+    assert "too little motion" in still.notes[0]
+
+
+def test_disorder_repeats_gaps_and_refusals_are_said(
+    mission: Mission, ros: Ros, tmp_path: Path
+) -> None:
+    """The mission is whole again, and its notes count what was done."""
+    imu = imu_messages(mission, ros)
+    imu[3] = imu[3]._replace(nanoseconds=imu[5].nanoseconds + 1)
+    imu += imu[10:12]
+    nan = ros.imu(1.01, (0, 0, np.nan), (0, 0, 9.8))
+    rival = ros.imu(mission.imu.time_s[20], (9, 9, 9), (0, 0, 9.8))
+    no_fix = ros.fix(2.0, (0.5, 0.5, 0.0), (1, 1, 1), status=-1)
+    water = ros.marine(3.01, speed=np.ones(4), beams_d=np.eye(4, 3), velocity=(1, 0, 0))
+    water.message.velocity_mode = 2
+    sent = [*imu, nan, rival, no_fix, water, *marine_messages(mission, ros)]
+    bag = write_bag(tmp_path / "messy", ros, sent + aid_messages(mission, ros))
+    got = convert_rosbag(bag, options=ON_ELLIPSOID)
+    assert_same(got, mission)
+    notes = " ".join(got.notes)
+    assert "1 refused (Imu: " in notes.replace("sensor_msgs__msg__", "")
+    for said in (
+        "1 out of order",
+        "2 exact repeats",
+        "1 dropped that differ",
+        "/gps/fix: of",
+        "through the water",
+    ):
+        assert said in notes
+    gap = [
+        item for item in imu_messages(mission, ros) if not 5 < item.nanoseconds / 1e9 - EPOCH_S < 7
+    ]
+    bag = write_bag(tmp_path / "gap", ros, gap + sent[len(imu) + 2 :] + aid_messages(mission, ros))
+    assert any("1 gaps, the longest 2.0" in note for note in convert_rosbag(bag).notes)
+
+
+def test_stamp_of_zero_is_receipt(mission: Mission, ros: Ros, tmp_path: Path) -> None:
+    """A driver without a clock."""
+    imu = imu_messages(mission, ros)
+    for item in imu:
+        item.message.header.stamp.sec = item.message.header.stamp.nanosec = 0
+    sent = [*imu, *marine_messages(mission, ros), *aid_messages(mission, ros)]
+    bag = write_bag(tmp_path / "zero", ros, sent)
+    assert_same(convert_rosbag(bag, options=ON_ELLIPSOID), mission)
+
+
+def test_surface_height_by_the_fixes(mission: Mission, ros: Ros, tmp_path: Path) -> None:
+    """Depth becomes minus the ellipsoidal height, for GNSS says where the surface is."""
+    raised = replace(mission, gnss=replace(mission.gnss, height=mission.gnss.height + 30.0))  # type: ignore[union-attr,type-var]
+    sent = imu_messages(mission, ros) + marine_messages(mission, ros)
+    bag = write_bag(tmp_path / "geoid", ros, sent + aid_messages(raised, ros))
+    got = convert_rosbag(bag)
+    assert got.depth is not None
+    assert mission.depth is not None
+    np.testing.assert_allclose(got.depth.depth, mission.depth.depth - 30.0, atol=3.0)
+    assert any("above the ellipsoid, by" in note for note in got.notes)
+
+
+def test_several_topics_are_a_choice(mission: Mission, ros: Ros, tmp_path: Path) -> None:
+    """The message names the candidates; the choice is by sensor."""
+    second = [ros.imu(1.0 + 0.1 * i, (0, 0, 0), (0, 0, 9.8), "/imu2") for i in range(9)]
+    bag = write_bag(tmp_path / "two", ros, second + marine_bag(mission, ros))
+    with pytest.raises(ConfigError, match=r"/imu, /imu2; choose one with  --topic imu=/imu"):
+        convert_rosbag(bag)
+    got = convert_rosbag(bag, topics={"imu": "/imu"}, options=ON_ELLIPSOID)
+    assert_same(got, mission)
+    for topics, said in (
+        ({"imu": "/imu3"}, "there is no topic /imu3; did you mean '/imu"),
+        ({"imu": "/dvl"}, "/dvl holds marine_acoustic_msgs/msg/Dvl; for the imu expected"),
+        ({"sonar": "/dvl"}, "unknown sensor"),
+    ):
+        with pytest.raises(ConfigError, match=said):
+            convert_rosbag(bag, topics=topics)
+
+
+Spoil = Callable[[Mission, Ros, Path], Path]
+
+
+def no_dvl(mission: Mission, ros: Ros, path: Path) -> Path:
+    """Write a bag without DVL."""
+    return write_bag(path, ros, imu_messages(mission, ros) + aid_messages(mission, ros))
+
+
+def no_beam_speeds(mission: Mission, ros: Ros, path: Path) -> Path:
+    """Write what drivers send that know derived velocities only."""
+    dvl = marine_messages(mission, ros, beam_velocities_valid=False)
+    return write_bag(path, ros, imu_messages(mission, ros) + dvl)
+
+
+def all_nan(mission: Mission, ros: Ros, path: Path) -> Path:
+    """Write an IMU that never measured."""
+    imu = [ros.imu(time_s, [np.nan] * 3, (0, 0, 9.8)) for time_s in mission.imu.time_s[:9]]
+    return write_bag(path, ros, imu + marine_messages(mission, ros))
+
+
+def in_g(mission: Mission, ros: Ros, path: Path) -> Path:
+    """Write accelerations in g."""
+    imu = [ros.imu(time_s, (0, 0, 0), (0, 0, 1.0)) for time_s in mission.imu.time_s[:9]]
+    return write_bag(path, ros, imu + marine_messages(mission, ros))
+
+
+def no_place(mission: Mission, ros: Ros, path: Path) -> Path:
+    """Write nothing that tells a place."""
+    return write_bag(path, ros, imu_messages(mission, ros) + marine_messages(mission, ros))
+
+
+def gauge(mission: Mission, ros: Ros, path: Path) -> Path:
+    """Write pressures relative to the atmosphere."""
+    aids = aid_messages(mission, ros)
+    for item in aids:
+        if item.type_name == PRESSURE:
+            item.message.fluid_pressure = 1e4
+    return write_bag(path, ros, no_aids(mission, ros) + aids)
+
+
+def other_clock(mission: Mission, ros: Ros, path: Path) -> Path:
+    """Write a DVL stamped by its own clock."""
+    dvl = marine_messages(mission, ros)
+    for item in dvl:
+        item.message.header.stamp.sec -= EPOCH_S - 100
+    return write_bag(path, ros, imu_messages(mission, ros) + dvl + aid_messages(mission, ros))
+
+
+def truncated(mission: Mission, ros: Ros, path: Path) -> Path:
+    """Write a bag whose recording was cut off."""
+    file = write_bag(path, ros, marine_bag(mission, ros)) / f"{path.name}.mcap"
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    return file
+
+
+def truncated_db3(mission: Mission, ros: Ros, path: Path) -> Path:
+    """Write a database whose recording was cut off."""
+    bag = write_bag(path, ros, marine_bag(mission, ros), StoragePlugin.SQLITE3)
+    file = bag / f"{path.name}.db3"
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    return bag
+
+
+def no_files(mission: Mission, ros: Ros, path: Path) -> Path:
+    """Leave the metadata alone in their folder."""
+    bag = write_bag(path, ros, no_aids(mission, ros)[:9])
+    (bag / f"{path.name}.mcap").unlink()
+    return bag
+
+
+def bad_metadata(_: Mission, ros: Ros, path: Path) -> Path:
+    """Write no metadata at all."""
+    path.mkdir()
+    (path / "metadata.yaml").write_text("rosbag2_bagfile_information: [1, 2")
+    assert ros
+    return path
+
+
+def other_bytes(mission: Mission, ros: Ros, path: Path) -> Path:
+    """Write bytes under the name of a type that they are not."""
+    with Writer(path, version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        imu = writer.add_connection("/imu", IMU, typestore=ros.store)
+        dvl = writer.add_connection("/dvl", WATER_LINKED, typestore=ros.store)
+        for item in imu_messages(mission, ros)[:5]:
+            writer.write(imu, item.nanoseconds, ros.store.serialize_cdr(item.message, IMU))
+        for item in marine_messages(mission, ros)[:5]:
+            writer.write(dvl, item.nanoseconds, ros.store.serialize_cdr(item.message, MARINE))
+    return forget_definitions(path)
+
+
+def no_aids(mission: Mission, ros: Ros) -> list[Sent]:
+    """Return IMU and DVL messages."""
+    return imu_messages(mission, ros) + marine_messages(mission, ros)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "error", "said"),
+    [
+        (no_dvl, DataError, r"no topic for the dvl; expected one of type .*; found .*/imu \("),
+        (no_beam_speeds, DataError, "not one beam speed"),
+        (all_nan, DataError, r"two messages for the imu, got 9, 9 refused: .*not finite"),
+        (in_g, DataError, "are they in g"),
+        (no_place, ConfigError, r"\[origin\]"),
+        (gauge, DataError, "--atmosphere 0"),
+        (other_clock, DataError, "expected one clock"),
+        (truncated, DataError, "mcap recover"),
+        (truncated_db3, DataError, "not a complete ROS 2 recording"),
+        (no_files, DataError, "missing"),
+        (bad_metadata, DataError, "YAML"),
+        (other_bytes, DataError, "fit no known definition"),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_malformed_bags(
+    mission: Mission,
+    ros: Ros,
+    tmp_path: Path,
+    spoil: Spoil,
+    error: type[Exception],
+    said: str,
+) -> None:
+    """Every defect ends in a message that says where, what was expected, and what to try."""
+    bag = spoil(mission, ros, tmp_path / "bag")
+    with pytest.raises(error, match=said) as caught:
+        convert_rosbag(bag)
+    assert str(bag) in str(caught.value)
+
+
+def test_missing_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without rosbags the message says what to install."""
+
+    def absent(name: str) -> Any:
+        raise ImportError(name)
+
+    monkeypatch.setattr(rosbag_log, "import_module", absent)
+    with pytest.raises(MissingExtraError, match=r"ssm-graph\[ros\]"):
+        convert_rosbag(tmp_path)
+
+
+def test_what_is_a_bag(tmp_path: Path) -> None:
+    """A folder needs its metadata, MCAP the profile of ROS 2; a Blueye log has none."""
+    assert not is_rosbag(tmp_path)
+    assert not is_rosbag(tmp_path / "nothing.mcap")
+    assert is_rosbag(tmp_path / "any.db3")
+    for profile, expected in ((b"ros2", True), (b"ros1", False), (b"", False)):
+        file = tmp_path / "file.mcap"
+        file.write_bytes(b"\x89MCAP0\r\n\x01" + bytes(8) + bytes([len(profile), 0, 0, 0]) + profile)
+        assert is_rosbag(file) is expected
+
+
+@pytest.fixture
+def bag(mission: Mission, ros: Ros, tmp_path: Path) -> Path:
+    """Write a bag for the command line."""
+    return write_bag(tmp_path / "dive", ros, marine_bag(mission, ros))
+
+
+def test_command_line(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One command makes a folder that reads; what was assumed is said."""
+    words = ["convert", str(bag), "--out", str(tmp_path / "m"), "--surface-height", "0"]
+    assert main([*words, "--topic", "imu=/imu", "--body", "FLU"]) == ExitCode.GOOD
+    shown = capsys.readouterr().out
+    assert "inertial samples" in shown
+    assert "note: No --vehicle" in shown.replace("\n", " ")
+    assert read_mission(tmp_path / "m").name == "dive"
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (["--topic", "imu=/imu3"], ExitCode.USAGE, "no topic /imu3"),
+        (["--topic", "imu=/imu", "--topic", "imu=/imu"], ExitCode.USAGE, "each sensor once"),
+        (["--water-density", "0"], ExitCode.USAGE, "--water-density"),
+        (["--body", "FRD"], ExitCode.DATA, "--body FRD"),
+    ],
+)
+def test_command_line_refuses(
+    bag: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    words: list[str],
+    code: ExitCode,
+    said: str,
+) -> None:
+    """Wrong choices end before anything is written."""
+    assert main(["convert", str(bag), "--out", str(tmp_path / "m"), *words]) == code
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "m").exists()
+
+
+def test_options_of_bags_are_for_bags(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A Blueye log knows its own axes."""
+    words = ["convert", str(tmp_path / "x.mcap"), "--out", str(tmp_path / "m"), "--body", "FRD"]
+    assert main(words) == ExitCode.USAGE
+    assert "--body is for ROS 2 bags" in capsys.readouterr().err
+
+
+def test_defaults_are_plausible() -> None:
+    """The assumed IMU is the one that the note names."""
+    assert isinstance(NOISE, ImuNoise)
+    assert np.degrees(NOISE.gyro_bias_sigma) * 3600.0 == pytest.approx(100.0, rel=0.02)
+    assert np.degrees(NOISE.gyro_density) * 60.0 == pytest.approx(0.4, rel=0.05)
+    assert NOISE.accel_bias_sigma / 9.80665e-3 == pytest.approx(5.0, rel=0.03)
+    assert DvlMount(WATER_LINKED_BEAMS, np.eye(3), np.zeros(3)).beams_b[0, 2] > 0.9
