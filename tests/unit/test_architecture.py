@@ -16,6 +16,7 @@ FOUNDATION = {"errors", "earth", "frames", "data", "estimate", "messages"}
 MAY_IMPORT = {
     "factors": set[str](),
     "io": FOUNDATION,
+    "live": FOUNDATION,
     "imu": FOUNDATION,
     "simulation": FOUNDATION - {"frames"},
     "evaluation": FOUNDATION,
@@ -32,7 +33,7 @@ MAY_IMPORT = {
 TOP = {"", "cli", "__main__"}
 """The package's own namespace and its command line stand above everything."""
 MAY_PRINT = {"cli", "report"}
-WITHOUT_GTSAM = FOUNDATION | {"io", "simulation", "evaluation", "report"}
+WITHOUT_GTSAM = FOUNDATION | {"io", "live", "simulation", "evaluation", "report"}
 MAX_FILE_LINES = 320
 MAX_FUNCTION_LINES = 50
 
