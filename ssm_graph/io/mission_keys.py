@@ -159,7 +159,9 @@ class Settings:
     """The checked values of one section, in the units of the file."""
 
     section: str
+    """Its name; empty for the keys that stand above all sections."""
     values: Mapping[str, Any]
+    file: str = TOML_NAME
 
     def __contains__(self, key: str) -> bool:
         return key in self.values
@@ -178,25 +180,36 @@ class Settings:
 
     def fault(self, key: str, text: str) -> ConfigError:
         """Return an error that names file, section and key."""
-        return ConfigError(f"{TOML_NAME} [{self.section}] {key}: {text}")
+        section = f"[{self.section}] " if self.section else ""
+        return ConfigError(f"{self.file} {section}{key}: {text}")
 
 
-def read_settings(section: str, raw: object) -> Settings:
-    """Check every key of a section against :data:`SECTIONS`."""
+def read_settings(
+    section: str, raw: object, *, file: str = TOML_NAME, may_miss: frozenset[str] = frozenset()
+) -> Settings:
+    """Check every key of a section against :data:`SECTIONS`.
+
+    Parameters
+    ----------
+    section : its name.
+    raw : what the file holds under that name.
+    file : the file's name in messages.
+    may_miss : required keys that this file can do without.
+    """
     if not isinstance(raw, dict):
-        raise ConfigError(f"{TOML_NAME} [{section}]: expected a section, got {shown(raw)}")
+        raise ConfigError(f"{file} [{section}]: expected a section, got {shown(raw)}")
     known = SECTIONS[section]
     for key in raw:
         if key not in known:
             missing = [name for name in known if name not in raw]
             hint = nearest_hint(key, missing or known)
-            raise ConfigError(f"{TOML_NAME} [{section}] {key}: unknown key; {hint}")
+            raise ConfigError(f"{file} [{section}] {key}: unknown key; {hint}")
     for name, key in known.items():
-        if key.required and name not in raw:
+        if key.required and name not in raw and name not in may_miss:
             raise ConfigError(
-                f"{TOML_NAME} [{section}] {name}: the key is missing; expected {key.wanted}"
+                f"{file} [{section}] {name}: the key is missing; expected {key.wanted}"
             )
-    settings = Settings(section, {name: _plain(value) for name, value in raw.items()})
+    settings = Settings(section, {name: _plain(value) for name, value in raw.items()}, file)
     for name, value in settings.values.items():
         problem = _problem(known[name], value)
         if problem:

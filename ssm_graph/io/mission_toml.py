@@ -23,8 +23,10 @@ from ssm_graph.io.mission_keys import (
     read_settings,
     shown,
 )
+from ssm_graph.io.tables import Order
 
 _Choice = TypeVar("_Choice", bound=Enum)
+_ABOUT_TABLES = frozenset({"file", "stamp"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +34,10 @@ class MissionToml:
     """The content of one ``mission.toml``, checked."""
 
     folder: Path
+    file: str
+    """The file's own name in messages."""
     name: str
+    order: Order
     body: BodyAxes
     stamp: Stamp
     sections: dict[str, Settings]
@@ -43,27 +48,51 @@ class MissionToml:
     def __contains__(self, section: str) -> bool:
         return section in self.sections
 
+    def fault_of_no_place(self) -> ConfigError:
+        """Return the error of a mission that may be anywhere on Earth."""
+        return ConfigError(
+            f"{self.file} [origin]: nothing says where on Earth the mission was; add [origin] with "
+            "lat_deg, lon_deg and height_m, or a [gnss] table, or [initial]"
+        )
+
 
 def read_mission_toml(folder: Path) -> MissionToml:
     """Read and check ``mission.toml``; raise :class:`ConfigError` naming section and key."""
-    raw = _parse(folder)
-    _check_format(raw)
+    wanted = f"a mission folder with {TOML_NAME} and its tables"
+    return _checked(_parse(folder / TOML_NAME, wanted), folder / TOML_NAME, frozenset())
+
+
+def read_vehicle_toml(path: Path) -> MissionToml:
+    """Read and check a file like ``mission.toml`` that need not name tables nor their stamps."""
+    wanted = "a file that describes a vehicle, or a mission folder"
+    return _checked(_parse(path, wanted), path, _ABOUT_TABLES)
+
+
+def _checked(raw: dict[str, Any], path: Path, may_miss: frozenset[str]) -> MissionToml:
+    file = path.name
+    _check_format(raw, file)
     for name in raw:
-        if name not in (*SECTIONS, "format", "name"):
-            hint = nearest_hint(name, [known for known in SECTIONS if known not in raw] or SECTIONS)
-            raise ConfigError(f"{TOML_NAME} {name}: unknown key or section; {hint}")
+        if name not in (*SECTIONS, "format", "name", "order"):
+            missing = [known for known in SECTIONS if known not in raw] or SECTIONS
+            known = ("order",) if get_close_matches(name, ("order",)) else missing
+            raise ConfigError(f"{file} {name}: unknown key or section; {nearest_hint(name, known)}")
     for name in REQUIRED_SECTIONS:
         if name not in raw:
-            raise ConfigError(
-                f"{TOML_NAME} [{name}]: the section is missing; every mission needs it"
-            )
-    sections = {name: read_settings(name, raw[name]) for name in raw if name in SECTIONS}
+            raise ConfigError(f"{file} [{name}]: the section is missing; every mission needs it")
+    sections = {
+        name: read_settings(name, raw[name], file=file, may_miss=may_miss)
+        for name in raw
+        if name in SECTIONS
+    }
     _check_beam_keys(sections["dvl"])
+    top = Settings("", {"order": raw.get("order", Order.TIME.value)}, file)
     return MissionToml(
-        folder=folder,
-        name=_mission_name(raw),
+        folder=path.parent,
+        file=file,
+        name=_mission_name(raw, file),
+        order=_choice(top, "order", Order),
         body=_choice(sections["frames"], "body", BodyAxes),
-        stamp=_choice(sections["imu"], "stamp", Stamp),
+        stamp=_choice(sections["imu"], "stamp", Stamp) if "stamp" in sections["imu"] else Stamp.END,
         sections=sections,
     )
 
@@ -90,49 +119,48 @@ def table_path(toml: MissionToml, section: str) -> Path | None:
     raise toml[section].fault("file", f"there is no file {label!r}; {hint}")
 
 
-def _parse(folder: Path) -> dict[str, Any]:
-    path = folder / TOML_NAME
+def _parse(path: Path, wanted: str) -> dict[str, Any]:
+    file = path.name
     try:
         return tomllib.loads(path.read_bytes().decode("utf-8-sig"))
     except (FileNotFoundError, NotADirectoryError):
         raise ConfigError(
-            f"{TOML_NAME}: there is none in {str(folder)!r}; expected a mission folder with "
-            f"{TOML_NAME} and its tables"
+            f"{file}: there is none in {str(path.parent)!r}; expected {wanted}"
         ) from None
     except OSError as error:
-        raise ConfigError(f"{TOML_NAME}: cannot be read: {error.strerror or error}") from error
+        raise ConfigError(f"{file}: cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
-        raise ConfigError(f"{TOML_NAME}: expected UTF-8 text, got bytes that are none") from error
+        raise ConfigError(f"{file}: expected UTF-8 text, got bytes that are none") from error
     except (ValueError, RecursionError) as error:
-        raise ConfigError(f"{TOML_NAME}: expected valid TOML, got: {error}") from error
+        raise ConfigError(f"{file}: expected valid TOML, got: {error}") from error
 
 
-def _check_format(raw: dict[str, Any]) -> None:
+def _check_format(raw: dict[str, Any], file: str) -> None:
     if "format" not in raw:
-        raise ConfigError(f"{TOML_NAME} format: the key is missing; expected format = {FORMAT}")
+        raise ConfigError(f"{file} format: the key is missing; expected format = {FORMAT}")
     if type(raw["format"]) is not int or raw["format"] != FORMAT:
         raise ConfigError(
-            f"{TOML_NAME} format: expected {FORMAT}, got {shown(raw['format'])}; a newer format "
+            f"{file} format: expected {FORMAT}, got {shown(raw['format'])}; a newer format "
             "needs a newer program"
         )
 
 
-def _mission_name(raw: dict[str, Any]) -> str:
+def _mission_name(raw: dict[str, Any], file: str) -> str:
     name = raw.get("name")
     if not isinstance(name, str) or not name.strip():
         got = "nothing" if name is None else shown(name)
-        raise ConfigError(f"{TOML_NAME} name: expected a text in quotes, got {got}")
+        raise ConfigError(f"{file} name: expected a text in quotes, got {got}")
     return name
 
 
 def _choice(settings: Settings, key: str, choices: type[_Choice]) -> _Choice:
     try:
-        return choices(settings.text(key))
+        return choices(settings.values[key])
     except ValueError:
         known = [str(choice.value) for choice in choices]
         raise settings.fault(
             key,
-            f"expected one of {', '.join(known)}, got {shown(settings.text(key))}",
+            f"expected one of {', '.join(known)}, got {shown(settings.values[key])}",
         ) from None
 
 

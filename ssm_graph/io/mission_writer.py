@@ -9,7 +9,16 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from ssm_graph.data import Array, DvlLog, InitialState, Mission, Reference
+from ssm_graph.data import (
+    Array,
+    DvlLog,
+    DvlMount,
+    ImuNoise,
+    InitialState,
+    Mission,
+    Reference,
+)
+from ssm_graph.earth import LocalFrame
 from ssm_graph.errors import DataError
 from ssm_graph.io.mission_keys import (
     ACCEL,
@@ -68,17 +77,14 @@ def write_mission(
 
 def mission_settings(mission: Mission, table_format: TableFormat) -> dict[str, Any]:
     """Return the content of ``mission.toml``."""
-    frame, suffix = mission.frame, table_format.value
+    suffix = table_format.value
     settings: dict[str, Any] = {
         "format": FORMAT,
         "name": mission.name,
         "frames": {"body": BodyAxes.FRD.value},
-        "origin": {
-            **_scaled(lat_deg=frame.lat, lon_deg=frame.lon),
-            "height_m": float(frame.height),
-        },
-        "imu": _imu_settings(mission, suffix),
-        "dvl": _dvl_settings(mission.dvl, suffix),
+        "origin": origin_settings(mission.frame),
+        "imu": imu_settings(mission.imu.noise, suffix),
+        "dvl": dvl_settings(mission.dvl.mount, nominal_sigma(mission.dvl), suffix),
     }
     if mission.depth is not None:
         settings["depth"] = {
@@ -92,7 +98,7 @@ def mission_settings(mission: Mission, table_format: TableFormat) -> dict[str, A
             "lever_arm_m": mission.gnss.lever_arm_b.tolist(),
         }
     if mission.initial is not None:
-        settings["initial"] = _initial_settings(mission.initial)
+        settings["initial"] = initial_settings(mission.initial)
     if mission.reference is not None:
         settings["reference"] = {"file": f"reference{suffix}"}
     return settings
@@ -120,8 +126,13 @@ def mission_tables(mission: Mission) -> dict[str, dict[str, Array]]:
     return tables
 
 
-def _imu_settings(mission: Mission, suffix: str) -> dict[str, Any]:
-    noise = mission.imu.noise
+def origin_settings(frame: LocalFrame) -> dict[str, Any]:
+    """Return the content of ``[origin]``."""
+    return {**_scaled(lat_deg=frame.lat, lon_deg=frame.lon), "height_m": float(frame.height)}
+
+
+def imu_settings(noise: ImuNoise, suffix: str) -> dict[str, Any]:
+    """Return the content of ``[imu]``; ``suffix`` is the ending of the table's name."""
     return {
         "file": f"imu{suffix}",
         "stamp": Stamp.END.value,
@@ -136,8 +147,8 @@ def _imu_settings(mission: Mission, suffix: str) -> dict[str, Any]:
     }
 
 
-def _dvl_settings(dvl: DvlLog, suffix: str) -> dict[str, Any]:
-    mount = dvl.mount
+def dvl_settings(mount: DvlMount, beam_sigma: float, suffix: str) -> dict[str, Any]:
+    """Return the content of ``[dvl]``; raise where the mounting is no rotation."""
     rpy = rpy_from_R_bd(mount.R_bd)
     if not np.allclose(R_bd_from_rpy(rpy), mount.R_bd, rtol=0.0, atol=1e-9):
         raise DataError(f"DvlMount.R_bd: expected a rotation matrix, got {mount.R_bd.tolist()}")
@@ -150,27 +161,29 @@ def _dvl_settings(dvl: DvlLog, suffix: str) -> dict[str, Any]:
     return {
         "file": f"dvl{suffix}",
         "beam_vectors": mount.beams_d.tolist(),
-        "beam_noise_m_per_s": _common_noise(dvl),
+        "beam_noise_m_per_s": beam_sigma,
         "lever_arm_m": mount.lever_arm_b.tolist(),
         "mounting_rpy_deg": _degrees(rpy),
         **{key: value for key, value in optional.items() if value},
     }
 
 
-def _common_noise(dvl: DvlLog) -> float:
+def nominal_sigma(dvl: DvlLog) -> float:
+    """Return the standard deviation that stands for those of all beams, m/s."""
     return float(np.median(dvl.sigma)) if dvl.sigma.size else _NOISE_OF_EMPTY_LOG
 
 
 def _dvl_table(dvl: DvlLog) -> dict[str, Array]:
     columns = {TIME: dvl.time_s, **_split(SPEED, dvl.speed)}
-    if np.any(dvl.sigma != _common_noise(dvl)):
+    if np.any(dvl.sigma != nominal_sigma(dvl)):
         columns |= _split(SPEED_SIGMA, dvl.sigma)
     if dvl.range_m is not None:
         columns |= _split(RANGE, dvl.range_m)
     return columns
 
 
-def _initial_settings(initial: InitialState) -> dict[str, Any]:
+def initial_settings(initial: InitialState) -> dict[str, Any]:
+    """Return the content of ``[initial]``."""
     return {
         "time_s": float(initial.time_s),
         **_scaled(lat_deg=initial.lat, lon_deg=initial.lon),

@@ -33,6 +33,15 @@ class TableFormat(Enum):
     PARQUET = ".parquet"
 
 
+class Order(Enum):
+    """How the rows of a mission's tables follow each other."""
+
+    TIME = "time"
+    """Times increase strictly."""
+    ARRIVAL = "arrival"
+    """As they came: late, repeated and torn rows are possible."""
+
+
 @dataclass(frozen=True, slots=True)
 class TableSpec:
     """The columns of one kind of table."""

@@ -1,0 +1,130 @@
+"""A vehicle as a live estimator has to know it: from a TOML file, from a mission, into a log."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+
+from ssm_graph.data import Array, Mission
+from ssm_graph.io.mission_instruments import (
+    dvl_mount,
+    imu_noise,
+    initial_state,
+    lever_arm_b,
+    stated_frame,
+)
+from ssm_graph.io.mission_keys import FORMAT, TOML_NAME, BodyAxes
+from ssm_graph.io.mission_toml import read_vehicle_toml
+from ssm_graph.io.mission_writer import (
+    dvl_settings,
+    imu_settings,
+    initial_settings,
+    nominal_sigma,
+    origin_settings,
+)
+from ssm_graph.io.tables import Order, TableFormat
+from ssm_graph.messages import Vehicle
+
+
+def read_vehicle(path: Path | str) -> Vehicle:
+    """Read what is known of a vehicle before its first message.
+
+    The file has the keys of ``mission.toml``; ``file`` and ``stamp``, which are about tables, may
+    be left out and are not looked at. Messages are in body axes FRD whatever ``[frames]`` says,
+    which holds for the lever arms of the file. The navigation frame is at ``[origin]``, else at
+    ``[initial]``, else left to the first fix.
+
+    Parameters
+    ----------
+    path : a TOML file, or a mission folder.
+
+    Raises
+    ------
+    ConfigError
+        For a key that is missing, unknown or out of range, and where neither ``[origin]`` nor
+        ``[initial]`` nor a ``[gnss]`` receiver will ever say where on Earth the vehicle is.
+    """
+    path = Path(path)
+    toml = read_vehicle_toml(path / TOML_NAME if path.is_dir() else path)
+    frame = stated_frame(toml, "origin") or stated_frame(toml, "initial")
+    if frame is None and "gnss" not in toml:
+        raise toml.fault_of_no_place()
+    return Vehicle(
+        name=toml.name,
+        imu_noise=imu_noise(toml["imu"]),
+        mount=dvl_mount(toml),
+        beam_sigma=toml["dvl"].number("beam_noise_m_per_s"),
+        depth_lever_arm_b=lever_arm_b(toml, "depth"),
+        gnss_lever_arm_b=lever_arm_b(toml, "gnss"),
+        depth_sigma=toml["depth"].number("noise_m") if "depth" in toml else None,
+        frame=frame,
+        initial=initial_state(toml["initial"]) if "initial" in toml else None,
+    )
+
+
+def vehicle_of(mission: Mission) -> Vehicle:
+    """Return the vehicle of a recorded mission; its beam sigma is the median of those recorded."""
+    depth, gnss = mission.depth, mission.gnss
+    return Vehicle(
+        name=mission.name,
+        imu_noise=mission.imu.noise,
+        mount=mission.dvl.mount,
+        beam_sigma=nominal_sigma(mission.dvl),
+        depth_lever_arm_b=np.zeros(3) if depth is None else depth.lever_arm_b,
+        gnss_lever_arm_b=np.zeros(3) if gnss is None else gnss.lever_arm_b,
+        depth_sigma=None if depth is None else depth.sigma,
+        frame=mission.frame,
+        initial=mission.initial,
+    )
+
+
+def write_vehicle(folder: Path | str, vehicle: Vehicle, *, order: Order = Order.ARRIVAL) -> None:
+    """Write the ``mission.toml`` of a folder whose tables are written by someone else.
+
+    The tables are ``imu.csv`` (body axes FRD, stamps at the interval's end), ``dvl.csv``,
+    ``gnss.csv`` and, where the vehicle has a depth sensor, ``depth.csv``. The file appears whole
+    or not at all; one that is there is replaced.
+    """
+    path = Path(folder) / TOML_NAME
+    part = path.with_name(f"{TOML_NAME}.part")
+    with part.open("wb") as stream:
+        tomli_w.dump(vehicle_settings(vehicle, order=order), stream)
+        stream.flush()
+        os.fsync(stream.fileno())
+    part.replace(path)
+
+
+def vehicle_settings(vehicle: Vehicle, *, order: Order = Order.ARRIVAL) -> dict[str, Any]:
+    """Return the content of the ``mission.toml`` that :func:`write_vehicle` writes."""
+    suffix = TableFormat.CSV.value
+    settings: dict[str, Any] = {
+        "format": FORMAT,
+        "name": vehicle.name,
+        "order": order.value,
+        "frames": {"body": BodyAxes.FRD.value},
+    }
+    if vehicle.frame is not None:
+        settings["origin"] = origin_settings(vehicle.frame)
+    settings["imu"] = imu_settings(vehicle.imu_noise, suffix)
+    settings["dvl"] = dvl_settings(vehicle.mount, float(vehicle.beam_sigma), suffix)
+    if vehicle.depth_sigma is not None:
+        settings["depth"] = {
+            "file": f"depth{suffix}",
+            "noise_m": float(vehicle.depth_sigma),
+            "lever_arm_m": _listed(vehicle.depth_lever_arm_b),
+        }
+    settings["gnss"] = {
+        "file": f"gnss{suffix}",
+        "lever_arm_m": _listed(vehicle.gnss_lever_arm_b),
+    }
+    if vehicle.initial is not None:
+        settings["initial"] = initial_settings(vehicle.initial)
+    return settings
+
+
+def _listed(lever_arm: Array) -> list[float]:
+    return [float(x) + 0.0 for x in lever_arm]  # no minus zero in a file for people

@@ -1,0 +1,174 @@
+"""A vehicle read before its first message, and a mission played to whoever listens."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ssm_graph.data import Mission
+from ssm_graph.errors import ConfigError, SsmGraphError
+from ssm_graph.io.mission import read_mission
+from ssm_graph.io.replay import messages_of
+from ssm_graph.io.tables import Order
+from ssm_graph.io.vehicle import read_vehicle, vehicle_of, write_vehicle
+from ssm_graph.messages import DepthReading, Fix, ImuSample, Ping, Vehicle
+from tests.malformed_cases import TOML_CASES, Malformed
+from tests.mission_fixture import TOML, make_mission, write_example
+from tests.unit.test_mission_roundtrip import assert_same
+
+ABOUT_TABLES = (
+    "No mission.toml",
+    "A stamp that is not known",
+    "The initial state far from the origin",
+    "The initial state at a time without data",
+    "A table that does not exist",
+    "The name of an optional table misspelt",
+    "A table of another format",
+)
+"""What only someone who looks at the tables can find, and two that have tests of their own."""
+
+
+def write(folder: Path, text: str) -> Path:
+    """Write a vehicle file of its own name."""
+    path = folder / "auv-7.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def without(text: str, *sections: str) -> str:
+    """Return TOML without whole sections."""
+    blocks = text.split("\n\n")
+    return "\n\n".join(b for b in blocks if not b.startswith(tuple(f"[{s}]" for s in sections)))
+
+
+def test_vehicle_of_a_folder_is_that_of_its_mission(tmp_path: Path) -> None:
+    """File and recording tell of the same vehicle, tables or not."""
+    mission = read_mission(write_example(tmp_path))
+    for table in tmp_path.glob("*.csv"):
+        table.unlink()
+    vehicle = read_vehicle(tmp_path)
+    assert vehicle.beam_sigma == 0.005
+    assert_same(replace(vehicle, beam_sigma=vehicle_of(mission).beam_sigma), vehicle_of(mission))
+
+
+def test_a_vehicle_file_needs_no_tables(tmp_path: Path) -> None:
+    """Neither their names nor their stamps; what is given is checked all the same."""
+    bare = [line for line in TOML.splitlines() if not line.startswith(("file", "stamp"))]
+    path = write(tmp_path, "\n".join(bare))
+    assert_same(read_vehicle(path), read_vehicle(write(tmp_path, TOML)))
+    with pytest.raises(ConfigError, match=r"auv-7.toml \[imu\] stamp: expected one of start"):
+        read_vehicle(write(tmp_path, TOML.replace('"end"', '"begin"')))
+
+
+def test_lever_arms_turn_to_forward_right_down(tmp_path: Path) -> None:
+    """In FLU axes y and z have the other sign."""
+    text = TOML.replace('"FRD"', '"FLU"').replace("[0.0, 0.0, 0.0]", "[1.0, 2.0, 3.0]")
+    vehicle = read_vehicle(write(tmp_path, text))
+    np.testing.assert_array_equal(vehicle.mount.lever_arm_b, [0.2, 0.0, -0.1])
+    np.testing.assert_array_equal(vehicle.depth_lever_arm_b, [1.0, -2.0, -3.0])
+    np.testing.assert_array_equal(vehicle.gnss_lever_arm_b, [1.0, -2.0, -3.0])
+
+
+def test_frame_is_that_of_the_origin_then_of_the_initial_state(tmp_path: Path) -> None:
+    """And that of the first fix where neither is stated, which only messages bring."""
+    heights = []
+    for missing in ([], ["origin"], ["origin", "initial"]):
+        frame = read_vehicle(write(tmp_path, without(TOML, *missing))).frame
+        heights.append(None if frame is None else frame.height)
+    assert heights == [0.0, -20.0, None]
+
+
+def test_a_vehicle_that_could_be_anywhere_is_refused(tmp_path: Path) -> None:
+    """No receiver will ever bring a fix."""
+    text = without(TOML, "origin", "initial", "gnss")
+    with pytest.raises(ConfigError, match=r"auv-7.toml \[origin\]: nothing says where"):
+        read_vehicle(write(tmp_path, text))
+
+
+def test_optional_sensors_may_be_missing(tmp_path: Path) -> None:
+    """A vehicle without depth sensor says so."""
+    vehicle = read_vehicle(write(tmp_path, without(TOML, "depth", "gnss", "initial")))
+    assert vehicle.depth_sigma is None
+    assert vehicle.initial is None
+    np.testing.assert_array_equal(vehicle.gnss_lever_arm_b, np.zeros(3))
+
+
+def test_a_file_that_is_not_there(tmp_path: Path) -> None:
+    """The message says what was expected."""
+    with pytest.raises(ConfigError, match=r"none.toml: there is none in .* describes a vehicle"):
+        read_vehicle(tmp_path / "none.toml")
+    with pytest.raises(ConfigError, match=r"mission.toml: there is none in"):
+        read_vehicle(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "case", [c for c in TOML_CASES if c.title not in ABOUT_TABLES], ids=lambda case: case.title
+)
+def test_the_reader_of_missions_checks_it(case: Malformed, tmp_path: Path) -> None:
+    """Every malformed file of the catalogue is refused in the same words."""
+    write_example(tmp_path)
+    case.damage(tmp_path)
+    with pytest.raises(case.error) as from_vehicle:
+        read_vehicle(tmp_path)
+    with pytest.raises(SsmGraphError) as from_mission:
+        read_mission(tmp_path)
+    assert str(from_vehicle.value) == str(from_mission.value)
+
+
+@pytest.mark.parametrize("dropped", [(), ("frame",), ("initial",), ("depth_sigma",)])
+def test_written_and_read_again(tmp_path: Path, dropped: tuple[str, ...]) -> None:
+    """All values come back to rounding, whatever is missing."""
+    changes: dict[str, None] = {name: None for name in dropped}
+    vehicle = replace(vehicle_of(make_mission()), **changes)  # type: ignore[arg-type]
+    write_vehicle(tmp_path, vehicle, order=Order.ARRIVAL)
+    got = read_vehicle(tmp_path)
+    if "frame" in dropped:
+        assert got.frame is not None
+        got = replace(got, frame=None)
+    assert_same(got, vehicle)
+    assert 'order = "arrival"' in (tmp_path / "mission.toml").read_text()
+
+
+def test_every_field_is_written(tmp_path: Path) -> None:
+    """A field that a vehicle is given one day has to find its key."""
+    write_vehicle(tmp_path, vehicle_of(make_mission()))
+    got = read_vehicle(tmp_path)
+    assert len(fields(Vehicle)) == 9
+    assert all(getattr(got, spec.name) is not None for spec in fields(Vehicle))
+
+
+def test_messages_come_in_order_of_time() -> None:
+    """All of them, the IMU first where times are equal."""
+    mission = make_mission()
+    messages = list(messages_of(mission))
+    rank = {ImuSample: 0, Ping: 1, DepthReading: 2, Fix: 3}
+    keys = [(m.time_s, rank[type(m)]) for m in messages]
+    assert all(a < b for a, b in pairwise(keys))
+    counts = [sum(isinstance(m, kind) for m in messages) for kind in rank]
+    assert counts == [1200, 60, 61, 7]
+
+
+def test_messages_hold_the_rows_of_the_mission() -> None:
+    """Bit for bit, missing beams included."""
+    mission = make_mission()
+    samples = [m for m in messages_of(mission) if isinstance(m, ImuSample)]
+    pings = [m for m in messages_of(mission) if isinstance(m, Ping)]
+    fixes = [m for m in messages_of(mission) if isinstance(m, Fix)]
+    np.testing.assert_array_equal([m.accel_b for m in samples], mission.imu.accel_b)
+    np.testing.assert_array_equal([m.gyro_b for m in samples], mission.imu.gyro_b)
+    np.testing.assert_array_equal([m.speed for m in pings], mission.dvl.speed)
+    np.testing.assert_array_equal([m.sigma or () for m in pings], mission.dvl.sigma)
+    assert mission.gnss is not None
+    np.testing.assert_array_equal([m.lat for m in fixes], mission.gnss.lat)
+    np.testing.assert_array_equal([m.sigma_enu for m in fixes], mission.gnss.sigma_enu)
+    assert type(samples[0].time_s) is float
+
+
+def test_messages_of_the_smallest_mission() -> None:
+    """Optional sensors may be missing."""
+    mission: Mission = replace(make_mission(), depth=None, gnss=None)
+    assert {type(m) for m in messages_of(mission)} == {ImuSample, Ping}
