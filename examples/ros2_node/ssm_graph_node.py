@@ -38,6 +38,7 @@ from ssm_graph.io.ros_messages import (
     BeamSign,
     RosOptions,
 )
+from ssm_graph.io.vehicle import read_vehicle
 from ssm_graph.messages import Event, Health, Message, Navigation, Severity
 
 ODOMETRY_TYPE: Final = "nav_msgs/msg/Odometry"
@@ -239,7 +240,7 @@ def main() -> int:
             name: node.declare_parameter(name, default).value
             for name, default in PARAMETERS.items()
         }
-        vehicle = import_module("ssm_graph.io.vehicle").read_vehicle(Path(parameters["vehicle"]))
+        vehicle = read_vehicle(Path(parameters["vehicle"]))
         estimator = import_module("ssm_graph.online").FixedLagSmoother(vehicle)
         quality = qos.QoSProfile(depth=QUEUE, reliability=qos.ReliabilityPolicy.BEST_EFFORT)
         Bridge(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from ssm_graph.io.mission_keys import BodyAxes
 from ssm_graph.io.ros_messages import SEA_WATER, STANDARD_ATMOSPHERE, BeamSign, RosOptions
 from ssm_graph.io.rosbag import convert_rosbag
 from ssm_graph.io.rosbag_log import ROLES, is_rosbag
+from ssm_graph.io.vehicle import read_vehicle
 
 DESCRIPTION = f"""\
 Convert a log. LOG is one of
@@ -157,9 +157,7 @@ def _from_rosbag(arguments: argparse.Namespace) -> Mission:
     topics = arguments.topic or []
     if len(dict(topics)) < len(topics):
         raise ConfigError("--topic: expected each sensor once")
-    vehicle = None
-    if arguments.vehicle is not None:
-        vehicle = import_module("ssm_graph.io.vehicle").read_vehicle(arguments.vehicle)
+    vehicle = None if arguments.vehicle is None else read_vehicle(arguments.vehicle)
     return convert_rosbag(arguments.log, vehicle=vehicle, topics=dict(topics), options=options)
 
 

@@ -23,7 +23,7 @@ from ssm_graph.io.ros_messages import BeamSign, RosOptions
 from ssm_graph.io.rosbag import BEAM_SIGMA, NOISE, convert_rosbag
 from ssm_graph.io.rosbag_beams import WATER_LINKED_BEAMS, proven_beams
 from ssm_graph.io.rosbag_log import LAYOUTS, is_rosbag
-from ssm_graph.messages import Vehicle
+from ssm_graph.io.vehicle import vehicle_of
 from ssm_graph.simulation import GnssSettings
 from tests.helpers import simulated
 
@@ -189,21 +189,6 @@ def mission() -> Mission:
 def ros() -> Ros:
     """Return a maker of messages."""
     return Ros()
-
-
-def vehicle_of(mission: Mission) -> Vehicle:
-    """Return what the mission knows of its vehicle."""
-    assert mission.depth is not None
-    assert mission.gnss is not None
-    return Vehicle(
-        name="test",
-        imu_noise=mission.imu.noise,
-        mount=mission.dvl.mount,
-        beam_sigma=float(mission.dvl.sigma[0, 0]),
-        depth_lever_arm_b=mission.depth.lever_arm_b,
-        gnss_lever_arm_b=mission.gnss.lever_arm_b,
-        depth_sigma=mission.depth.sigma,
-    )
 
 
 def velocities(mission: Mission, beams_d: Array) -> Array:
@@ -670,9 +655,24 @@ def test_command_line(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert read_mission(tmp_path / "m").name == "dive"
 
 
+def test_command_line_with_a_vehicle(mission: Mission, bag: Path, tmp_path: Path) -> None:
+    """The constants come from a mission.toml without tables, and the mission is whole."""
+    write_mission(tmp_path / "whole", mission)
+    text = (tmp_path / "whole" / "mission.toml").read_text()
+    (tmp_path / "vehicle.toml").write_text(text)
+    words = ["convert", str(bag), "--out", str(tmp_path / "m"), "--surface-height", "0"]
+    assert main([*words, "--vehicle", str(tmp_path / "vehicle.toml")]) == ExitCode.GOOD
+    got = read_mission(tmp_path / "m")
+    assert got.imu.noise.gyro_density == pytest.approx(mission.imu.noise.gyro_density)
+    assert got.frame == mission.frame
+    np.testing.assert_allclose(got.dvl.mount.lever_arm_b, mission.dvl.mount.lever_arm_b)
+    np.testing.assert_allclose(got.dvl.mount.beams_d, mission.dvl.mount.beams_d)
+
+
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
+        (["--vehicle", "nowhere.toml"], ExitCode.USAGE, "nowhere.toml"),
         (["--topic", "imu=/imu3"], ExitCode.USAGE, "no topic /imu3"),
         (["--topic", "imu=/imu", "--topic", "imu=/imu"], ExitCode.USAGE, "each sensor once"),
         (["--water-density", "0"], ExitCode.USAGE, "--water-density"),
