@@ -5,6 +5,7 @@ The way out is :mod:`ssm_graph.live.nmea_encoder`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum

@@ -1,0 +1,338 @@
+"""NMEA 0183: fixes, sigmas, UTC of day, depths, damage; answers as sentences."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ssm_graph.errors import ConfigError
+from ssm_graph.live.decoder import Clock
+from ssm_graph.live.nmea import DepthSentence, NmeaDecoder, NmeaOptions
+from ssm_graph.live.nmea_encoder import encode_gga, encode_hdt, encode_nmea, encode_vtg
+from ssm_graph.live.nmea_fields import checksum
+from ssm_graph.messages import DepthReading, Fix, Health, Message, Navigation
+from tests.helpers import STEADY
+
+DAY_S = 86400.0
+MIDNIGHT_S = 19_675 * DAY_S
+NOON_S = MIDNIGHT_S + 43_200.0
+GGA = "GPGGA,120000.00,6326.0000,N,01024.0000,E,4,12,0.8,20.50,M,40.25,M,,"
+GST = "GPGST,120000.00,1.1,0.3,0.2,45.0,0.02,0.01,0.05"
+
+
+def sentence(body: str) -> bytes:
+    """Return a sentence with its checksum."""
+    return f"${body}*{checksum(body)}\r\n".encode()
+
+
+def read(
+    *bodies: str, arrival_s: float = NOON_S, options: NmeaOptions | None = None
+) -> tuple[list[Message], list[str]]:
+    """Return the messages of sentences that come at once, and what was refused."""
+    decoder = NmeaDecoder(options)
+    messages = decoder.feed(b"".join(map(sentence, bodies)), arrival_s=arrival_s)
+    return messages, decoder.take_refusals()
+
+
+def read_fix(*bodies: str, arrival_s: float = NOON_S, options: NmeaOptions | None = None) -> Fix:
+    """Return the only message, a fix."""
+    (fix,), refused = read(*bodies, arrival_s=arrival_s, options=options)
+    assert isinstance(fix, Fix)
+    assert not refused
+    return fix
+
+
+def test_checksums_of_makers() -> None:
+    """Sentences out of manuals: Valeport VA500, miniIPS, miniIPS2 and a Trimble GST."""
+    for text in (
+        "PRVAT,00.115,M,0010.073,dBar*39",
+        "PIPS,0001.00,M*78",
+        "PVIPS2,01,45687,10.996,d,10.988,M*61",
+        "GPGST,172814.0,0.006,0.023,0.020,273.6,0.023,0.020,0.031*6A",
+    ):
+        body, _, given_sum = text.partition("*")
+        assert checksum(body) == given_sum
+
+
+def test_gga_is_a_fix_above_the_ellipsoid() -> None:
+    """Radians, geoid separation added, sigmas from HDOP and the stated range error."""
+    fix = read_fix(GGA, options=NmeaOptions(user_range_error_m=4.0))
+    assert fix.time_s == NOON_S
+    assert fix.lat == pytest.approx(math.radians(63.0 + 26.0 / 60.0), abs=1e-15)
+    assert fix.lon == pytest.approx(math.radians(10.4), abs=1e-15)
+    assert fix.height == 60.75
+    assert fix.sigma_enu == pytest.approx((3.2, 3.2, 6.4))
+    south = read_fix(GGA.replace(",N,", ",S,").replace(",E,", ",W,"))
+    assert (south.lat, south.lon) == (-fix.lat, -fix.lon)
+
+
+def test_gst_before_the_fix() -> None:
+    """Latitude's sigma is north, longitude's east."""
+    assert read_fix(GST, GGA).sigma_enu == (0.01, 0.02, 0.05)
+    assert read_fix(GST.replace("120000", "115959"), GGA).sigma_enu[0] == pytest.approx(4.0)
+    for unusable in (",,,", ",0.00,0.00,0.00"):
+        body = GST.rsplit(",", 3)[0] + unusable
+        assert read_fix(body, GGA).sigma_enu[0] == pytest.approx(4.0)
+
+
+def test_gst_after_the_fix_is_waited_for() -> None:
+    """Once it is known to follow; no longer than said, and no fix is lost when it stops."""
+    decoder = NmeaDecoder()
+    found: list[tuple[float, float]] = []
+
+    def feed(time_s: float, *bodies: str) -> None:
+        for fix in decoder.feed(b"".join(map(sentence, bodies)), arrival_s=time_s):
+            assert isinstance(fix, Fix)
+            found.append((fix.time_s - NOON_S, round(fix.sigma_enu[0], 3)))
+
+    def at(body: str, second: int) -> str:
+        return body.replace("120000", f"1200{second:02d}")
+
+    feed(NOON_S, GGA, GST)
+    feed(NOON_S + 1.0, at(GGA, 1))
+    assert found == [(0.0, 4.0)]
+    feed(NOON_S + 1.1, at(GST, 1))
+    feed(NOON_S + 2.0, at(GGA, 2))
+    assert found == [(0.0, 4.0), (1.0, 0.01)]
+    feed(NOON_S + 2.6)
+    assert found[-1] == (2.0, 4.0)
+    feed(NOON_S + 3.0, at(GGA, 3))
+    assert found[-1] == (3.0, 4.0)
+    assert len(found) == 4
+    assert decoder.n_refused == 0
+
+
+@pytest.mark.parametrize("quality", ["0", "6", "7", "8", ""])
+def test_what_is_no_measured_fix_is_refused(quality: str) -> None:
+    """No fix, estimated, typed in, simulated."""
+    messages, refused = read(GGA.replace(",4,12", f",{quality},12"))
+    assert messages == []
+    assert len(refused) == 1
+
+
+def test_no_fix_is_told_once() -> None:
+    """A receiver under water repeats it every second."""
+    decoder = NmeaDecoder()
+    lost = sentence(GGA.replace(",4,12", ",0,00"))
+    decoder.feed(lost * 5 + sentence(GGA) + lost, arrival_s=NOON_S)
+    assert decoder.n_without_fix == 6
+    assert len(decoder.take_refusals()) == 2
+
+
+@pytest.mark.parametrize(
+    ("utc", "arrival", "expected"),
+    [
+        ("235959.90", MIDNIGHT_S + 0.1, MIDNIGHT_S - 0.1),
+        ("000000.10", MIDNIGHT_S - 0.2, MIDNIGHT_S + 0.1),
+        ("000000", MIDNIGHT_S + 0.3, MIDNIGHT_S),
+        ("235960.00", MIDNIGHT_S + 0.5, MIDNIGHT_S),
+        ("", NOON_S + 0.25, NOON_S + 0.25),
+    ],
+)
+def test_utc_of_day_meets_the_arrival(utc: str, arrival: float, expected: float) -> None:
+    """Midnight between instrument and arrival, either way; a leap second; no time."""
+    fix = read_fix(GGA.replace("120000.00", utc), arrival_s=arrival)
+    assert fix.time_s == pytest.approx(expected, abs=1e-6)
+
+
+@STEADY
+@given(ms=st.integers(0, 86_399_999), late_ms=st.integers(-4000, 4000))
+def test_every_time_of_day_comes_back(ms: int, late_ms: int) -> None:
+    """Whatever the day's hour and the arrival's side of midnight."""
+    seconds, part = divmod(ms, 1000)
+    utc = f"{seconds // 3600:02d}{seconds // 60 % 60:02d}{seconds % 60:02d}.{part:03d}"
+    time_s = MIDNIGHT_S + 1e-3 * ms
+    fix = read_fix(GGA.replace("120000.00", utc), arrival_s=time_s + 1e-3 * late_ms)
+    assert fix.time_s == pytest.approx(time_s, abs=1e-6)
+
+
+def test_a_clock_that_is_off_gives_way_to_the_arrival() -> None:
+    """The vehicle's clock is not UTC, or the receiver's is not set."""
+    (fix,), refused = read(GGA, arrival_s=NOON_S + 900.0)
+    assert fix.time_s == NOON_S + 900.0
+    assert "set both clocks to UTC" in refused[0]
+    options = NmeaOptions(clock=Clock.ARRIVAL)
+    assert read_fix(GGA, arrival_s=NOON_S + 900.0, options=options).time_s == NOON_S + 900.0
+
+
+def depth(body: str, options: NmeaOptions | None = None) -> float:
+    """Return the only message, a depth."""
+    (reading,), refused = read(body, options=options)
+    assert isinstance(reading, DepthReading)
+    assert reading.time_s == NOON_S
+    assert not refused
+    return reading.depth
+
+
+def test_depths_of_pressure_sensors() -> None:
+    """Air is subtracted; an altimeter's range beside the pressure is not a depth."""
+    metre_dbar = 1025.0 * 9.80665 / 1e4
+    reading = f"{10.1325 + 20.0 * metre_dbar:.9f}"
+    for body in (
+        f"PRVAT,00.115,M,{reading},dBar",
+        f"PIPS,{reading},d",
+        f"PVIPS2,01,45687,{reading},d,1,M",
+    ):
+        assert depth(body) == pytest.approx(20.0, abs=1e-7)
+    assert depth("PIPS,0020.00,M") == 20.0
+    tank = NmeaOptions(air_pressure_dbar=0.0, water_density_kg_per_m3=1000.0)
+    assert depth("PIPS,9.80665,d", tank) == pytest.approx(10.0)
+    assert depth("PIPS,0020.00,M", NmeaOptions(surface_height_m=40.25)) == -20.25
+
+
+def test_water_below_a_transducer_is_no_vehicle_depth() -> None:
+    """Unless the vehicle's builder says so."""
+    bodies = ("SDDPT,12.5,0.0", "SDDBT,41.0,f,12.5,M,6.8,F", "GPRMC,120000,V,,,,,,,,,,N")
+    assert read(*bodies) == ([], [])
+    asked = NmeaOptions(depth_sentences=frozenset({DepthSentence.DPT, DepthSentence.DBT}))
+    assert depth(bodies[0], asked) == depth(bodies[1], asked) == 12.5
+    assert read("PIPS,0020.00,M", options=asked) == ([], [])
+
+
+@pytest.mark.parametrize(
+    ("raw", "told"),
+    [
+        (b"$GPGGA,1*00\r\n", "expected checksum"),
+        (b"$GPGGA,1\r\n", "expected a checksum '*hh'"),
+        (b"$GPGGA,1*4G\r\n", "expected a checksum '*hh'"),
+        (b"GPGGA,1*00\r\n", "begins with '$'"),
+        (b"\xff\xfe\r\n", "byte 0xff"),
+        (b"$" + b"A" * 2000 + b"\r\n", "at most 1024 bytes"),
+        (sentence("GPGGA,120000"), "expected 14 fields"),
+        (sentence(GGA.replace("120000.00", "250000")), "UTC as hhmmss"),
+        (sentence(GGA.replace("120000.00", "12:00")), "UTC as hhmmss"),
+        (sentence(GGA.replace("6326.0000", "6360.0000")), "angle"),
+        (sentence(GGA.replace("6326.0000", "9026.0000")), "check the unit"),
+        (sentence(GGA.replace(",N,", ",X,")), "angle"),
+        (sentence(GGA.replace(",N,", ",,")), "angle"),
+        (sentence(GGA.replace("20.50", "")), "altitude"),
+        (sentence(GGA.replace("20.50", "nan")), "altitude"),
+        (sentence(GGA.replace("20.50", "1_0")), "altitude"),
+        (sentence(GGA.replace("40.25", "")), "geoid_separation_m"),
+        (sentence(GGA.replace(",0.8,", ",,")), "HDOP"),
+        (sentence("GPGST,120000.00"), "expected 8 fields"),
+        (sentence("PRVAT,00.115,M"), "depth_sentences"),
+        (sentence("PIPS,1.0,"), "dBar"),
+        (sentence("PIPS,99999,M"), "depth, m"),
+    ],
+)
+def test_damage_is_refused(raw: bytes, told: str) -> None:
+    """One sentence each; the next message is decoded."""
+    decoder = NmeaDecoder()
+    (fix,) = decoder.feed(raw + sentence(GGA), arrival_s=NOON_S)
+    assert isinstance(fix, Fix)
+    (text,) = decoder.take_refusals()
+    assert text.startswith("nmea: ")
+    assert told in text
+
+
+def test_a_sentence_that_was_run_into_is_saved() -> None:
+    """Bytes lost on a serial line join two sentences; the second is whole."""
+    decoder = NmeaDecoder()
+    assert len(decoder.feed(b"$GPGGA,12" + sentence(GGA), arrival_s=NOON_S)) == 1
+    assert decoder.n_refused == 1
+
+
+def test_geoid_where_the_receiver_has_none() -> None:
+    """Its field counts first."""
+    options = NmeaOptions(geoid_separation_m=39.0)
+    assert read_fix(GGA.replace("40.25", ""), options=options).height == 59.5
+    assert read_fix(GGA, options=options).height == 60.75
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"water_density_kg_per_m3": 0.0},
+        {"surface_height_m": math.nan},
+        {"geoid_separation_m": math.inf},
+        {"user_range_error_m": -1.0},
+    ],
+)
+def test_options_are_checked(settings: dict[str, float]) -> None:
+    """Once, at the border."""
+    with pytest.raises(ConfigError, match="NmeaOptions"):
+        NmeaOptions(**settings)  # type: ignore[arg-type]
+
+
+NAVIGATION = Navigation(
+    time_s=NOON_S + 0.9996,
+    lat=math.radians(-63.5),
+    lon=math.radians(10.4),
+    height=-30.25,
+    health=Health.GOOD,
+    reason="all agree",
+    confidence=0.9,
+    bottom_lock=True,
+    since_aid_s=0.2,
+    latency_s=0.01,
+    velocity_enu=np.array([1.0, -1.0, 0.1]),
+    roll_pitch_heading=np.array([0.01, -0.02, math.radians(359.999)]),
+    position_sigma_enu=np.ones(3),
+    velocity_sigma_enu=np.ones(3),
+    attitude_sigma=np.ones(3),
+    gyro_bias=np.zeros(3),
+    accel_bias=np.zeros(3),
+    beam_weights=np.array([1.0, 0.5, math.nan, 1.0]),
+)
+
+
+def fields_of(text: str) -> list[str]:
+    """Return the fields of a sentence whose checksum is right."""
+    body, _, given_sum = text.removeprefix("$").removesuffix("\r\n").partition("*")
+    assert checksum(body) == given_sum
+    return body.split(",")
+
+
+def test_an_answer_as_sentences() -> None:
+    """Estimated (6); rounding carries into the next second and over north."""
+    gga = fields_of(encode_gga(NAVIGATION, geoid_separation_m=40.0))
+    assert gga[:7] == ["INGGA", "120001.000", "6330.000000", "S", "01024.000000", "E", "6"]
+    assert gga[9:13] == ["-70.250", "M", "40.000", "M"]
+    assert len(gga) == 15
+    vtg = fields_of(encode_vtg(NAVIGATION))
+    assert vtg == ["INVTG", "135.00", "T", "", "M", "2.749", "N", "5.091", "K", "E"]
+    assert fields_of(encode_hdt(NAVIGATION)) == ["INHDT", "0.00", "T"]
+    all_of_it = encode_nmea(NAVIGATION)
+    assert all_of_it.count(b"\r\n") == 3
+    assert max(map(len, all_of_it.split(b"\r\n"))) <= 80
+
+
+@pytest.mark.parametrize("health", list(Health))
+def test_only_a_usable_answer_is_written(health: Health) -> None:
+    """Else quality 0, mode N and empty fields: nobody steers by them."""
+    navigation = dataclasses.replace(NAVIGATION, health=health)
+    gga, vtg, hdt = (fields_of(f(navigation)) for f in (encode_gga, encode_vtg, encode_hdt))
+    is_usable = health in (Health.GOOD, Health.DEGRADED)
+    assert (gga[6], vtg[-1], bool(hdt[1])) == (("6", "E", True) if is_usable else ("0", "N", False))
+    assert bool(gga[2]) == bool(vtg[1]) == is_usable
+    nowhere = dataclasses.replace(NAVIGATION, lat=math.nan)
+    assert fields_of(encode_gga(nowhere))[6] == "0"
+
+
+def test_our_own_answer_is_never_a_measurement() -> None:
+    """Fed back it is refused."""
+    decoder = NmeaDecoder()
+    assert decoder.feed(encode_nmea(NAVIGATION), arrival_s=NOON_S) == []
+    assert decoder.n_refused == 1
+
+
+@STEADY
+@given(
+    lat=st.floats(-math.pi / 2, math.pi / 2),
+    lon=st.floats(-math.pi, math.pi),
+    height=st.floats(-11_000, 9_000),
+)
+def test_position_comes_back(lat: float, lon: float, height: float) -> None:
+    """To what the digits of a sentence hold."""
+    navigation = dataclasses.replace(NAVIGATION, lat=lat, lon=lon, height=height)
+    body = ",".join(fields_of(encode_gga(navigation, geoid_separation_m=12.3)))
+    fix = read_fix(body.replace(",6,00,", ",1,10,0.8"), arrival_s=NOON_S)
+    assert fix.lat == pytest.approx(lat, abs=2e-10)
+    assert math.remainder(fix.lon - lon, 2.0 * math.pi) == pytest.approx(0.0, abs=2e-10)
+    assert fix.height == pytest.approx(height, abs=1e-3)
