@@ -9,7 +9,9 @@ neither has to be installed.  Facts that decide signs and axes, and where they c
   sign of ``beam_velocity`` is nowhere written down: drivers differ, so the options say it.  No flag
   per beam exists; a negative range, or fewer ``num_good_beams`` than speeds, tells of missing ones.
 * ``dvl_msgs/DVL`` (Water Linked): a beam's velocity is positive when the instrument moves along the
-  beam; ids are 0 to 3; the message says nothing about directions.
+  beam; ids are 0 to 3; the message says nothing about directions. Beams flagged valid in a report
+  whose velocity is not may be false locks (17 such reports of 303 in a recorded log); an altitude
+  would tell, but the ROS drivers repeat the last one then. None of these beams is used.
 * ``FluidPressure`` is absolute, in pascal; ``NavSatFix.altitude`` is above the WGS-84 ellipsoid.
 """
 
@@ -243,16 +245,17 @@ def _water_linked(message: Any, time_s: float, _: RosOptions) -> DvlReport:
     ids = [int(beam.id) for beam in message.beams]
     if len(set(ids)) != len(ids) or not set(ids) <= set(range(N_BEAMS)):
         raise DataError(f"DVL: expected beams with ids 0 to {N_BEAMS - 1}, got {ids}")
-    for beam in message.beams:
+    for beam in message.beams if message.velocity_valid else ():
         if beam.valid and math.isfinite(beam.velocity):
             speed[int(beam.id)] = float(beam.velocity)
             ranges[int(beam.id)] = _range(beam.distance)
-    has_velocity = bool(message.velocity_valid)
     return DvlReport(
         ping=Ping(time_s, _four(speed)),
         range_m=_four(ranges),
         beams_d=None,
-        velocity_d=_vector(message.velocity) if has_velocity else (math.nan, math.nan, math.nan),
+        velocity_d=_vector(message.velocity)
+        if message.velocity_valid
+        else (math.nan, math.nan, math.nan),
     )
 
 

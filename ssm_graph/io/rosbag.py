@@ -174,7 +174,8 @@ def _dvl(
         raise DataError(
             f"{bag}: topic {topic.name} holds {len(table)} messages and not one beam speed; "
             "expected the speeds of the beams, not only the velocity made of them (for "
-            "marine_acoustic_msgs: beam_velocities_valid, num_good_beams and beam_velocity)"
+            "marine_acoustic_msgs: beam_velocities_valid, num_good_beams and beam_velocity; for "
+            "dvl_msgs: velocity_valid and beams)"
         )
     try:
         beams = _beams(topic, vehicle, options, speed=speed, velocity_d=velocity_d)

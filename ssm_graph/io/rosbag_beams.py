@@ -20,7 +20,8 @@ from ssm_graph.io.mission_units import beams_from_angles
 WATER_LINKED_BEAMS: Final = beams_from_angles(
     np.radians([135.0, -135.0, -45.0, 45.0]), float(np.radians(22.5))
 )
-"""Transducers 0 to 3 of A50 and A125; x forward, y starboard, z down."""
+"""Transducers 0 to 3 of A50 and A125; x forward, y starboard, z down. Against 269 reports of a real
+A50 they leave 1.6 mm/s rms; a Blueye X3 has its A50 mounted backwards, and the turn is found."""
 
 _LARGEST_MISFIT: Final = 0.2
 """Of the typical beam speed; the wrong sign gives 2, swapped angles 0.7 and more."""

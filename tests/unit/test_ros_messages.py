@@ -212,15 +212,15 @@ def test_water_linked_beams_go_by_their_ids() -> None:
 
 
 def test_water_linked_beams_without_bottom() -> None:
-    """Each beam has its own flag, and the velocity another."""
-    message = water_linked(velocity_valid=False)
+    """Each beam has its own flag; without a valid velocity they may be false locks."""
+    message = water_linked()
     message.beams[0].valid = False
     report = dvl_report(message, RECEIVED_S)
     np.testing.assert_allclose(report.ping.speed, [0.1, 0.2, NAN, 0.4])
     np.testing.assert_allclose(report.range_m, [5.0, 6.0, NAN, 8.0])
-    assert np.isnan(report.velocity_d).all()
-    nothing = ping(water_linked(beams=[]), RECEIVED_S)
-    assert np.isnan(nothing.speed).all()
+    for nothing in (water_linked(beams=[]), water_linked(velocity_valid=False)):
+        assert np.isnan(ping(nothing, RECEIVED_S).speed).all()
+    assert np.isnan(dvl_report(nothing, RECEIVED_S).velocity_d).all()
 
 
 def test_water_linked_ids_out_of_range_are_refused() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import os
 import re
 import sqlite3
 from collections.abc import Callable
@@ -39,6 +41,9 @@ IMU, MARINE, WATER_LINKED = (
 )
 PRESSURE, FIX = "sensor_msgs/msg/FluidPressure", "sensor_msgs/msg/NavSatFix"
 EPOCH_S = 1_700_000_000
+ROOT = Path(__file__).parents[2]
+DATA = Path(os.environ.get("SSM_GRAPH_DATA", ROOT / "../shared/data"))
+A50_LOG = DATA / "waterlinked_a50" / "20211217-152655dvl_data_time.csv"
 ON_ELLIPSOID = RosOptions(surface_height=0.0)
 """Depth as simulated, minus the ellipsoidal height."""
 
@@ -415,6 +420,28 @@ def test_water_linked_mounting_rotation() -> None:
     )
     np.testing.assert_array_equal(still.beams_d, WATER_LINKED_BEAMS)
     assert "too little motion" in still.notes[0]
+
+
+@pytest.mark.skipif(not A50_LOG.is_file(), reason=f"there is no {A50_LOG}")
+def test_water_linked_beams_against_a_real_log() -> None:
+    """Order, directions and sign: residuals of millimetres per second."""
+    with A50_LOG.open() as stream:
+        rows = [row for row in csv.DictReader(stream) if row["velocity_valid"] == "True"]
+    velocity = np.array([[float(row[name]) for name in ("vx", "vy", "vz")] for row in rows])
+    names = [f"transducers_{i}" for i in range(4)]
+    speed = np.array(
+        [
+            [
+                float(row[f"{name}_velocity"]) if row[f"{name}_beam_valid"] == "True" else np.nan
+                for name in names
+            ]
+            for row in rows
+        ]
+    )
+    found = proven_beams(None, water_linked=True, may_turn=True, speed=speed, velocity_d=velocity)
+    np.testing.assert_array_equal(found.beams_d, WATER_LINKED_BEAMS)
+    assert found.notes == ()
+    assert np.sqrt(np.nanmean((speed - velocity @ found.beams_d.T) ** 2)) < 2e-3
 
 
 def test_disorder_repeats_gaps_and_refusals_are_said(
