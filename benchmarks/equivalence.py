@@ -25,9 +25,9 @@ from ssm_graph.filters.geodetic import GeodeticConfig, run_geodetic, to_navigati
 from ssm_graph.filters.geodetic_error_model import Feedback
 from ssm_graph.filters.navigation import Grouping, run_filter
 from ssm_graph.filters.ssm import SsmUpdate
-from ssm_graph.filters.states import NavigationStates
 from ssm_graph.problem.error_state import POSITION, VELOCITY, Linearised
 from ssm_graph.problem.problem import Problem, build_problem
+from ssm_graph.problem.states import NavigationStates
 from ssm_graph.simulation import (
     GnssSettings,
     Grade,

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from ssm_graph.data import N_BEAMS, Array
 from ssm_graph.estimate import Estimate
-from ssm_graph.filters.states import NavigationStates
 from ssm_graph.problem.error_state import STATE_DIM
 from ssm_graph.problem.problem import Problem
 from ssm_graph.problem.recursive import RecursiveBeams, recursive_estimate
+from ssm_graph.problem.states import NavigationStates
 
 
 @dataclass(slots=True, eq=False)

@@ -13,9 +13,9 @@ from factors.so3 import cross
 from ssm_graph.data import N_BEAMS, Array
 from ssm_graph.filters.model import NOMINAL, Iterate, Runs
 from ssm_graph.filters.stack import Stack
-from ssm_graph.filters.states import NavigationStates, local_D_deviation
 from ssm_graph.problem.error_state import GYRO_BIAS, POSITION, ROTATION, STATE_DIM, VELOCITY
 from ssm_graph.problem.heights import HeightTrack, height_on_the_way, height_track
+from ssm_graph.problem.states import NavigationStates, local_D_deviation
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,9 +22,9 @@ from ssm_graph.filters.history import FilterHistory
 from ssm_graph.filters.measurements import KeyframeModel
 from ssm_graph.filters.model import Update, UpdateRule
 from ssm_graph.filters.stack import Stack, stack_problems
-from ssm_graph.filters.states import NavigationStates
 from ssm_graph.problem.error_state import VELOCITY
 from ssm_graph.problem.problem import Problem
+from ssm_graph.problem.states import NavigationStates
 
 RUNAWAY_SIGMA = 1e4
 """m/s; a filter this uncertain of its velocity has run away."""

@@ -26,10 +26,10 @@ import numpy as np
 from factors import so3
 from ssm_graph.data import Array
 from ssm_graph.earth import LocalFrame
-from ssm_graph.filters.states import NavigationStates
 from ssm_graph.imu.arrays import Intervals
 from ssm_graph.imu.preintegration import gtsam_gravity
 from ssm_graph.problem.error_state import POSITION, ROTATION, STATE_DIM, VELOCITY
+from ssm_graph.problem.states import NavigationStates
 
 BIASES = slice(9, 15)
 

@@ -12,9 +12,9 @@ from ssm_graph.data import N_BEAMS, Array
 from ssm_graph.earth import LocalFrame
 from ssm_graph.errors import ConfigError, DataError
 from ssm_graph.filters.process import Process
-from ssm_graph.filters.states import NavigationStates
 from ssm_graph.imu.arrays import interval_arrays
 from ssm_graph.problem.problem import Problem, start_of
+from ssm_graph.problem.states import NavigationStates
 
 
 @dataclass(frozen=True, slots=True, eq=False)

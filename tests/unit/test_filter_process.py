@@ -9,10 +9,10 @@ from gtsam.symbol_shorthand import B, V, X
 
 from ssm_graph.data import Array
 from ssm_graph.filters.process import Process
-from ssm_graph.filters.states import NavigationStates, local_D_deviation
 from ssm_graph.imu.arrays import interval_arrays
 from ssm_graph.imu.preintegration import gtsam_gravity
 from ssm_graph.problem.problem import Problem, build_problem
+from ssm_graph.problem.states import NavigationStates, local_D_deviation
 from ssm_graph.simulation import Grade
 from tests.helpers import simulated
 

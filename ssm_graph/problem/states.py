@@ -1,4 +1,4 @@
-"""States of many runs side by side, and their moves on the manifold."""
+"""States side by side, of many runs or of many keyframes, and their moves on the manifold."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ssm_graph.problem.error_state import POSITION, ROTATION, VELOCITY
 
 
 class NavigationStates(NamedTuple):
-    """States of B runs at one time."""
+    """States of B runs at one time, or of B keyframes of one run."""
 
     R_nb: Array
     """(B, 3, 3)"""
