@@ -60,6 +60,12 @@ TOML_CASES = (
     Malformed("No format", toml("format = 1\n", ""), ConfigError, ("format", "missing")),
     Malformed("No name", toml('name = "straight-run"\n', ""), ConfigError, ("name: ", "nothing")),
     Malformed(
+        "An order of the rows that is not known",
+        toml("format = 1", 'format = 1\norder = "random"'),
+        ConfigError,
+        ("order: expected one of time, arrival", "'random'"),
+    ),
+    Malformed(
         "A section misspelt",
         toml("[gnss]", "[gps]"),
         ConfigError,
@@ -351,6 +357,15 @@ TABLE_CASES = (
         columns("imu.csv", ["time_s"], lambda t: np.round(t, 1)),
         DataError,
         ("imu.csv:5", "time_s repeats", "more digits"),
+    ),
+    Malformed(
+        "Most rows partly written, where single ones may be (order of arrival)",
+        both(
+            toml("format = 1", 'format = 1\norder = "arrival"'),
+            lines("depth.csv", lambda rows: [rows[0], *(row[:3] for row in rows[1:])]),
+        ),
+        DataError,
+        ("depth.csv:2", "1 cells", "partly written"),
     ),
     Malformed(
         "A gap in the IMU",

@@ -17,7 +17,7 @@ import numpy as np
 from ssm_graph.data import Array
 from ssm_graph.errors import DataError
 
-_NUMBER = re.compile(
+NUMBER = re.compile(
     r"[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE
 )
 _SIGNATURES = {
@@ -37,6 +37,8 @@ class CsvFile:
 
     path: Path
     label: str
+    errors: str = "strict"
+    """What to do with bytes that are no UTF-8, as in :func:`open`."""
 
     def place(self, row: int) -> str:
         """Return ``label:line`` of data row ``row`` (0 is the first below the header)."""
@@ -53,7 +55,7 @@ class CsvFile:
 
     def open(self) -> TextIO:
         """Open as text; a byte order mark of UTF-8 is skipped."""
-        return self.path.open(encoding="utf-8-sig")
+        return self.path.open(encoding="utf-8-sig", errors=self.errors)
 
     def lines(self) -> Iterator[tuple[int, str]]:
         """Yield number and text of every line below the header that is not blank."""
@@ -69,8 +71,11 @@ class CsvFile:
         raise IndexError(row)
 
 
-def check_is_text(file: CsvFile) -> None:
-    """Raise :class:`DataError` for an empty file and for one that is not UTF-8 text."""
+def check_is_text(file: CsvFile, *, may_hold_zeros: bool = False) -> None:
+    """Raise :class:`DataError` for an empty file and for one that is not UTF-8 text.
+
+    Zero bytes among the rows, which a power failure leaves, may be left to the reader of the rows.
+    """
     with file.path.open("rb") as stream:
         head = stream.read(4096)
     if not head.strip():
@@ -80,7 +85,7 @@ def check_is_text(file: CsvFile) -> None:
         )
     found = next((text for mark, text in _SIGNATURES.items() if head.startswith(mark)), None)
     line = 1
-    if found is None and b"\0" in head:
+    if found is None and b"\0" in (head.split(b"\n")[0] if may_hold_zeros else head):
         found, line = "zero bytes", head[: head.index(b"\0")].count(b"\n") + 1
     if found:
         raise DataError(
@@ -94,7 +99,7 @@ def read_csv_header(file: CsvFile) -> list[str]:
         names = file.header()
     except UnicodeDecodeError as error:
         raise _not_utf8(file) from error
-    if all(_NUMBER.fullmatch(name) for name in names):
+    if all(NUMBER.fullmatch(name) for name in names):
         raise DataError(
             f"{file.label}:1: expected the column names, got numbers; add the header row"
         )
@@ -186,7 +191,7 @@ def _read_carefully(file: CsvFile, names: Sequence[str], *, blank: frozenset[str
 
 
 def _number(cell: str, place: str, name: str, *, blank: frozenset[str]) -> float:
-    if _NUMBER.fullmatch(cell):
+    if NUMBER.fullmatch(cell):
         return float(cell)
     if not cell and name in blank:
         return float("nan")

@@ -16,6 +16,7 @@ from ssm_graph.data import (
     Reference,
 )
 from ssm_graph.earth import LocalFrame
+from ssm_graph.io.arrival_tables import read_arrival_table
 from ssm_graph.io.mission_checks import check_tables
 from ssm_graph.io.mission_cross_checks import check_mission
 from ssm_graph.io.mission_instruments import (
@@ -42,7 +43,7 @@ from ssm_graph.io.mission_keys import (
 from ssm_graph.io.mission_toml import MissionToml, read_mission_toml, table_path
 from ssm_graph.io.mission_units import interval_ends, to_frd
 from ssm_graph.io.mission_writer import write_mission
-from ssm_graph.io.tables import Table, TableFormat, read_table
+from ssm_graph.io.tables import Order, Table, TableFormat, read_table
 
 __all__ = ["TableFormat", "read_mission", "write_mission"]
 
@@ -89,6 +90,7 @@ def read_mission(folder: Path | str) -> Mission:
 def _read_tables(toml: MissionToml) -> tuple[dict[str, Table], list[str]]:
     tables: dict[str, Table] = {}
     notes: list[str] = []
+    read = read_table if toml.order is Order.TIME else read_arrival_table
     for section, spec in TABLES.items():
         if section not in toml:
             continue
@@ -97,7 +99,7 @@ def _read_tables(toml: MissionToml) -> tuple[dict[str, Table], list[str]]:
         if path is None:
             notes.append(f"{label}: there is no such file; going on without [{section}]")
             continue
-        table = read_table(path, label, spec)
+        table = read(path, label, spec)
         notes += table.notes
         if len(table) or section in ("imu", "dvl"):
             tables[section] = table

@@ -14,7 +14,16 @@ import numpy as np
 from ssm_graph.data import Array
 from ssm_graph.errors import DataError
 from ssm_graph.io.mission_dvl_checks import check_dvl
-from ssm_graph.io.mission_keys import ACCEL, ATTITUDE, GYRO, POSITION_SIGMA, VELOCITY, BodyAxes
+from ssm_graph.io.mission_keys import (
+    ACCEL,
+    ATTITUDE,
+    DEEPEST_M,
+    GYRO,
+    LIMITS,
+    POSITION_SIGMA,
+    VELOCITY,
+    BodyAxes,
+)
 from ssm_graph.io.mission_toml import MissionToml
 from ssm_graph.io.mission_units import to_frd
 from ssm_graph.io.tables import Table
@@ -27,7 +36,6 @@ FORCE_RANGE: Final = (9.3, 10.3)
 """m/s^2: no bias or scale error of a usable accelerometer leads out of it."""
 FASTEST_TURN: Final = 6.0
 """rad/s"""
-DEEPEST_M: Final = 12000.0
 _HALF_G: Final = 4.9
 _REPEATED_SHARE: Final = 0.2
 _FORCE_UNITS: Final = (
@@ -82,30 +90,24 @@ def check_depth(table: Table) -> list[str]:
             f"{table.label}: column 'depth_m' has a median of {np.median(depth):.6g}; expected "
             "metres below the ellipsoid; is it a pressure, or in millimetres?"
         )
-    _refuse_beyond(table, ["depth_m"], -DEEPEST_M, DEEPEST_M, "expected metres, positive down")
+    _refuse_beyond(table, ["depth_m"], "expected metres, positive down")
     return []
 
 
 def check_gnss(table: Table) -> list[str]:
     """Check ranges of position and sigma."""
     notes = _positions(table)
-    for name in POSITION_SIGMA:
-        bad = (table[name] <= 0.0) | (table[name] > 1e7)
-        if bad.any():
-            raise table.cell_fault(
-                int(np.argmax(bad)),
-                name,
-                "expected a standard deviation above 0, in metres; delete fixes of unknown quality",
-            )
+    expected = "expected a standard deviation above 0, in metres; delete fixes of unknown quality"
+    _refuse_beyond(table, POSITION_SIGMA, expected)
     return notes
 
 
 def check_reference(table: Table) -> list[str]:
     """Check ranges of position, velocity and attitude."""
     notes = _positions(table)
-    _refuse_beyond(table, VELOCITY, -100.0, 100.0, "expected m/s; is it in mm/s?")
-    for name, limit in zip(ATTITUDE, (360.0, 90.0, 360.0), strict=True):
-        _refuse_beyond(table, [name], -limit, limit, f"expected degrees up to {limit:g}")
+    _refuse_beyond(table, VELOCITY, "expected m/s; is it in mm/s?")
+    for name in ATTITUDE:
+        _refuse_beyond(table, [name], f"expected degrees up to {LIMITS[name][1]:g}")
     return notes
 
 
@@ -153,7 +155,7 @@ def _specific_force(table: Table) -> None:
             f"{table.label}: the accelerometer's readings have a median length of {median:.6g}; "
             f"expected about 9.8 m/s^2; {hint}"
         )
-    _refuse_beyond(table, ACCEL, -1e3, 1e3, "expected m/s^2; delete this row")
+    _refuse_beyond(table, ACCEL, "expected m/s^2; delete this row")
 
 
 def _turn_rates(table: Table) -> None:
@@ -163,7 +165,7 @@ def _turn_rates(table: Table) -> None:
             f"{table.label}: 1 % of the turn rates exceed {rate:.4g}; expected rad/s, up to "
             f"{FASTEST_TURN:g} for a vehicle; the readings are in deg/s: multiply them by pi/180"
         )
-    _refuse_beyond(table, GYRO, -100.0, 100.0, "expected rad/s; delete this row")
+    _refuse_beyond(table, GYRO, "expected rad/s; delete this row")
 
 
 def _gravity_direction(table: Table, body: BodyAxes) -> list[str]:
@@ -200,9 +202,9 @@ def _positions(table: Table) -> list[str]:
         )
     swapped = np.all(np.abs(lon) <= 90.0) and np.all(np.abs(lat) <= 360.0)
     hint = "latitude and longitude seem swapped" if swapped else "is it an integer coding?"
-    _refuse_beyond(table, ["lat_deg"], -90.0, 90.0, f"expected degrees from -90 to 90; {hint}")
-    _refuse_beyond(table, ["lon_deg"], -180.0, 360.0, "expected degrees from -180 to 360")
-    _refuse_beyond(table, ["height_m"], -DEEPEST_M, 20000.0, "expected metres, up; is it in mm?")
+    _refuse_beyond(table, ["lat_deg"], f"expected degrees from -90 to 90; {hint}")
+    _refuse_beyond(table, ["lon_deg"], "expected degrees from -180 to 360")
+    _refuse_beyond(table, ["height_m"], "expected metres, up; is it in mm?")
     if np.all(np.abs(lat) <= 0.5 * np.pi) and np.all(np.abs(lon) <= np.pi):
         return [
             f"{table.label}: all positions lie within 3.2 degrees of 0 N, 0 E; if they are in "
@@ -211,12 +213,11 @@ def _positions(table: Table) -> list[str]:
     return []
 
 
-def _refuse_beyond(
-    table: Table, names: Sequence[str], low: float, high: float, expected: str
-) -> None:
-    """Raise for the first value outside ``low`` to ``high``; NaN and missing columns pass."""
+def _refuse_beyond(table: Table, names: Sequence[str], expected: str) -> None:
+    """Raise for the first value outside its limits; NaN and missing columns pass."""
     for name in names:
         if name in table:
+            low, high = LIMITS[name]
             bad = (table[name] < low) | (table[name] > high)
             if bad.any():
                 raise table.cell_fault(int(np.argmax(bad)), name, expected)

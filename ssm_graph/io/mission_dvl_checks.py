@@ -8,13 +8,11 @@ import numpy as np
 
 from ssm_graph.data import Array
 from ssm_graph.errors import DataError
-from ssm_graph.io.mission_keys import RANGE, SPEED, SPEED_SIGMA
+from ssm_graph.io.mission_keys import LARGEST_SPEED, LIMITS, RANGE, SPEED, SPEED_SIGMA
 from ssm_graph.io.tables import Table
 
 FASTEST: Final = 20.0
 """m/s, of 99 % of the beam speeds."""
-LARGEST_SPEED: Final = 30.0
-"""m/s, of any single beam speed: a number beyond it is a code."""
 SHORTEST_STEP_S: Final = 1e-3
 _CODE_SIZE: Final = 2.0**14
 _CODES: Final = (-1.0, -9.999, 9.999)
@@ -53,7 +51,8 @@ def _sigmas_and_ranges(table: Table) -> None:
         if name not in table:
             continue
         is_sigma = name in SPEED_SIGMA
-        bad = (table[name] <= 0.0) | (table[name] > 1e3) if is_sigma else table[name] < 0.0
+        low, high = LIMITS[name]
+        bad = (table[name] < low) | (table[name] > high)
         if bad.any():
             text = (
                 "expected a standard deviation above 0, in m/s; leave the cell empty to use "

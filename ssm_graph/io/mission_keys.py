@@ -145,6 +145,26 @@ POSITION_SIGMA: Final = ("sigma_east_m", "sigma_north_m", "sigma_up_m")
 VELOCITY: Final = ("vel_east_m_per_s", "vel_north_m_per_s", "vel_up_m_per_s")
 ATTITUDE: Final = ("roll_deg", "pitch_deg", "heading_deg")
 
+LARGEST_SPEED: Final = 30.0
+"""m/s, of any single beam speed: a number beyond it is a code."""
+DEEPEST_M: Final = 12000.0
+_ABOVE_ZERO: Final = math.ulp(0.0)
+LIMITS: Final[Mapping[str, tuple[float, float]]] = {
+    **dict.fromkeys(GYRO, (-100.0, 100.0)),
+    **dict.fromkeys(ACCEL, (-1e3, 1e3)),
+    **dict.fromkeys(SPEED, (-LARGEST_SPEED, LARGEST_SPEED)),
+    **dict.fromkeys(SPEED_SIGMA, (_ABOVE_ZERO, 1e3)),
+    **dict.fromkeys(RANGE, (0.0, math.inf)),
+    "depth_m": (-DEEPEST_M, DEEPEST_M),
+    "lat_deg": (-90.0, 90.0),
+    "lon_deg": (-180.0, 360.0),
+    "height_m": (-DEEPEST_M, 20000.0),
+    **dict.fromkeys(POSITION_SIGMA, (_ABOVE_ZERO, 1e7)),
+    **dict.fromkeys(VELOCITY, (-100.0, 100.0)),
+    **dict(zip(ATTITUDE, ((-360.0, 360.0), (-90.0, 90.0), (-360.0, 360.0)), strict=True)),
+}
+"""The least and the largest number that a column of a table can hold."""
+
 TABLES: Final[Mapping[str, TableSpec]] = {
     "imu": TableSpec((TIME, *GYRO, *ACCEL)),
     "dvl": TableSpec((TIME, *SPEED), (*SPEED_SIGMA, *RANGE), frozenset(SPEED)),

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import Enum
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from ssm_graph.io.csv_tables import (
     write_csv,
 )
 
-_LARGEST_TIME_S = 1e20
+LARGEST_TIME_S = 1e20
 
 
 class TableFormat(Enum):
@@ -74,11 +74,25 @@ class ParquetFile:
         return "null" if value is None else str(value)
 
 
+class TableFile(Protocol):
+    """Where the rows of a table stand."""
+
+    @property
+    def label(self) -> str:
+        """How messages call the file."""
+
+    def place(self, row: int) -> str:
+        """Return file and line of a row."""
+
+    def cell(self, row: int, column: str) -> str:
+        """Return the content of a cell."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Table:
     """The columns of one sensor table, in the units of the file."""
 
-    file: CsvFile | ParquetFile
+    file: TableFile
     columns: dict[str, Array]
     notes: tuple[str, ...] = ()
 
@@ -130,20 +144,25 @@ def read_table(path: Path, label: str, spec: TableSpec) -> Table:
         For a file that is no table, a missing, unknown or repeated column, a cell that is no
         finite number, and times that do not increase; the message names the line.
     """
+    read = _read_csv if table_format(path, label) is TableFormat.CSV else read_parquet
     try:
-        form = TableFormat(path.suffix.lower())
+        table = read(path, label, spec)
+    except OSError as error:
+        raise DataError(f"{label}: cannot be read: {error.strerror or error}") from error
+    check_finite(table, spec)
+    _check_increasing(table)
+    return table
+
+
+def table_format(path: Path, label: str) -> TableFormat:
+    """Return the format of a table by the ending of its name."""
+    try:
+        return TableFormat(path.suffix.lower())
     except ValueError:
         raise ConfigError(
             f"{label}: expected a name that ends in .csv or .parquet, got {path.suffix!r}; "
             "convert the table"
         ) from None
-    try:
-        table = (_read_csv if form is TableFormat.CSV else _read_parquet)(path, label, spec)
-    except OSError as error:
-        raise DataError(f"{label}: cannot be read: {error.strerror or error}") from error
-    _check_finite(table, spec)
-    _check_increasing(table)
-    return table
 
 
 def write_table(path: Path, columns: dict[str, Array]) -> None:
@@ -159,18 +178,19 @@ def _read_csv(path: Path, label: str, spec: TableSpec) -> Table:
     file = CsvFile(path, label)
     check_is_text(file)
     names = read_csv_header(file)
-    _check_names(f"{label}:1", names, spec)
+    check_names(f"{label}:1", names, spec)
     values = read_csv_values(file, names, blank=spec.may_be_blank)
     note = check_last_line(file) if len(values) else None
     columns = {name: values[:, index] for index, name in enumerate(names)}
     return Table(file, columns, (note,) if note else ())
 
 
-def _read_parquet(path: Path, label: str, spec: TableSpec) -> Table:
+def read_parquet(path: Path, label: str, spec: TableSpec) -> Table:
+    """Read a Parquet table, whatever its numbers; raise where it is none of this kind."""
     arrow, parquet = _pyarrow("pyarrow"), _pyarrow("pyarrow.parquet")
     try:
         schema = parquet.read_schema(path)
-        _check_names(label, schema.names, spec)
+        check_names(label, schema.names, spec)
         for field in schema:
             kind = arrow.types
             if not (kind.is_integer(field.type) or kind.is_floating(field.type)):
@@ -200,7 +220,8 @@ def _pyarrow(module: str) -> Any:
         ) from error
 
 
-def _check_names(place: str, names: Iterable[str], spec: TableSpec) -> None:
+def check_names(place: str, names: Iterable[str], spec: TableSpec) -> None:
+    """Raise for a column that is repeated, unknown or missing."""
     counts = Counter(names)
     known = (*spec.required, *spec.optional)
     repeated = [name for name, count in counts.items() if count > 1]
@@ -221,14 +242,15 @@ def _check_names(place: str, names: Iterable[str], spec: TableSpec) -> None:
             )
 
 
-def _check_finite(table: Table, spec: TableSpec) -> None:
+def check_finite(table: Table, spec: TableSpec) -> None:
+    """Raise for the first cell that is not finite where it has to be."""
     for name, values in table.columns.items():
         bad = np.isinf(values) if name in spec.may_be_blank else ~np.isfinite(values)
         if bad.any():
             row = int(np.argmax(bad))
             hint = "leave the cell empty" if name in spec.may_be_blank else "delete this row"
             raise table.cell_fault(row, name, f"expected a finite number; {hint}")
-    if len(table) and np.abs(table.time_s).max() > _LARGEST_TIME_S:
+    if len(table) and np.abs(table.time_s).max() > LARGEST_TIME_S:
         row = int(np.argmax(np.abs(table.time_s)))
         raise table.cell_fault(row, "time_s", "expected seconds; correct or delete this row")
 
