@@ -40,9 +40,9 @@ SOUP = st.lists(
             b'{"b":{"c":2}}',
         ]
     ),
-    max_size=60,
+    max_size=30,
 ).map(b"".join)
-CUTS = st.lists(st.integers(0, 60), max_size=8)
+CUTS = st.lists(st.integers(0, 60), max_size=4)
 
 
 def pieces(data: bytes, cuts: list[int]) -> list[bytes]:
