@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from ssm_graph.data import Array
 from ssm_graph.earth import LocalFrame
-from ssm_graph.errors import DataError, SsmGraphError
+from ssm_graph.errors import ConfigError, DataError, SsmGraphError
 from ssm_graph.frames import R_lb_from_roll_pitch_heading, phi_D_roll_pitch_heading
 from ssm_graph.io.mission_keys import BodyAxes
 from ssm_graph.io.mission_units import R_FRD
@@ -35,6 +35,7 @@ from ssm_graph.io.ros_messages import (
     PRESSURE_TYPE,
     SEA_WATER,
     STANDARD_ATMOSPHERE,
+    WATER_LINKED_TYPE,
     BeamSign,
     RosOptions,
 )
@@ -42,6 +43,7 @@ from ssm_graph.io.vehicle import read_vehicle
 from ssm_graph.messages import Event, Health, Message, Navigation, Severity
 
 ODOMETRY_TYPE: Final = "nav_msgs/msg/Odometry"
+DVL_TYPES: Final = (MARINE_DVL_TYPE, WATER_LINKED_TYPE)
 QUEUE: Final = 500
 """Messages that may wait; a fast IMU must not lose samples while an update runs."""
 UNKNOWN_VARIANCE: Final = 1e6
@@ -64,7 +66,7 @@ PARAMETERS: Final[Mapping[str, str | float | bool]] = {
     "body_frame": "base_link",
     "rate_hz": 10.0,
 }
-"""An empty topic is not subscribed to."""
+"""An empty topic is not subscribed to; numbers are written with a decimal point."""
 
 
 class Estimator(Protocol):
@@ -88,7 +90,11 @@ class Subscription(NamedTuple):
 
 
 def subscriptions(parameters: Mapping[str, Any]) -> tuple[Subscription, ...]:
-    """Return what to subscribe to."""
+    """Return what to subscribe to; a type of DVL message that is not known is a ConfigError."""
+    if parameters["dvl_type"] not in DVL_TYPES:
+        raise ConfigError(
+            f"dvl_type: expected {' or '.join(DVL_TYPES)}, got {parameters['dvl_type']!r}"
+        )
     wanted = (
         Subscription(parameters["imu_topic"], IMU_TYPE),
         Subscription(parameters["dvl_topic"], parameters["dvl_type"]),
@@ -230,6 +236,7 @@ def main() -> int:
     """Run the node until it is stopped; 2 is returned where ROS or a setting is missing."""
     try:
         rclpy, qos = import_module("rclpy"), import_module("rclpy.qos")
+        stopped = (KeyboardInterrupt, import_module("rclpy.executors").ExternalShutdownException)
     except ImportError:
         print("this node needs ROS 2 with rclpy: source its setup.bash first", file=sys.stderr)
         return 2
@@ -255,11 +262,12 @@ def main() -> int:
     except (SsmGraphError, ImportError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
+    except stopped:
         pass
     finally:
         node.destroy_node()
-        rclpy.try_shutdown()
+        if rclpy.ok():
+            rclpy.shutdown()
     return 0
 
 

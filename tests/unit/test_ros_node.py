@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -24,8 +25,11 @@ from examples.ros2_node.ssm_graph_node import (
     subscriptions,
 )
 from ssm_graph.earth import LocalFrame
+from ssm_graph.errors import ConfigError
+from ssm_graph.io.mission import write_mission
 from ssm_graph.io.ros_messages import IMU_TYPE, WATER_LINKED_TYPE
 from ssm_graph.messages import Event, Health, ImuSample, Message, Navigation, Severity
+from tests.helpers import simulated
 
 FRAME = LocalFrame(math.radians(45.7), math.radians(126.6), 10.0)
 
@@ -200,6 +204,7 @@ class FakeNode:
         self.published: dict[str, list[Any]] = {}
         self.timers: list[tuple[float, Callable[[], None]]] = []
         self.log: list[tuple[str, str]] = []
+        self.set_parameters: dict[str, Any] = {}
 
     def create_subscription(
         self, _: Any, topic: str, callback: Callable[[Any], None], __: Any
@@ -215,6 +220,13 @@ class FakeNode:
     def create_timer(self, period_s: float, callback: Callable[[], None]) -> None:
         """Keep the timer."""
         self.timers.append((period_s, callback))
+
+    def declare_parameter(self, name: str, default: Any) -> Any:
+        """Return a parameter as it was set, else its default."""
+        return SimpleNamespace(value=self.set_parameters.get(name, default))
+
+    def destroy_node(self) -> None:
+        """Go."""
 
     def get_clock(self) -> Any:
         """Return a clock that stands still."""
@@ -258,6 +270,8 @@ def test_subscriptions_are_data() -> None:
     fewer = {**PARAMETERS, "fix_topic": "", "dvl_type": WATER_LINKED_TYPE}
     assert [one.type_name for one in subscriptions(fewer)][1] == WATER_LINKED_TYPE
     assert len(subscriptions(fewer)) == 3
+    with pytest.raises(ConfigError, match="dvl_type: expected marine_acoustic_msgs"):
+        subscriptions({**PARAMETERS, "dvl_type": "nav_msgs/msg/Odometry"})
 
 
 def test_messages_reach_the_estimator(setup: tuple[FakeNode, FakeEstimator, Bridge]) -> None:
@@ -342,3 +356,39 @@ def test_without_ros_it_says_so(
     monkeypatch.setattr(node_module, "import_module", absent)
     assert main() == 2
     assert "source its setup.bash" in capsys.readouterr().err
+
+
+def test_main_wires_everything(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Parameters, vehicle, estimator and topics; stopped by hand it ends with 0."""
+    write_mission(tmp_path, simulated(duration_s=2.0).mission)
+    node, spun = FakeNode(), []
+
+    class StoppedError(Exception):
+        """As `rclpy` raises when it is told to stop."""
+
+    def spin(_: Any) -> None:
+        spun.append(sorted(node.callbacks))
+        raise StoppedError
+
+    modules: dict[str, Any] = {
+        "rclpy": SimpleNamespace(
+            init=lambda args: args, create_node=lambda _: node, spin=spin, ok=lambda: False
+        ),
+        "rclpy.qos": SimpleNamespace(
+            QoSProfile=dict, ReliabilityPolicy=SimpleNamespace(BEST_EFFORT=2)
+        ),
+        "rclpy.executors": SimpleNamespace(ExternalShutdownException=StoppedError),
+        "ssm_graph.online": SimpleNamespace(FixedLagSmoother=lambda _: FakeEstimator()),
+    }
+    classes = dict.fromkeys(("Imu", "Dvl", "FluidPressure", "NavSatFix", "Odometry"), blank)
+    monkeypatch.setattr(
+        node_module, "import_module", lambda name: modules.get(name, SimpleNamespace(**classes))
+    )
+    node.set_parameters = {"vehicle": str(tmp_path), "fix_topic": ""}
+    assert main() == 0
+    assert spun == [["/dvl/data", "/imu/data", "/pressure"]]
+    node.set_parameters = {"vehicle": str(tmp_path / "nowhere.toml")}
+    assert main() == 2
+    assert "nowhere.toml" in capsys.readouterr().err
