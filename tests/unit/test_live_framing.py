@@ -7,7 +7,7 @@ import math
 from itertools import pairwise
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ssm_graph.errors import ConfigError
@@ -52,7 +52,7 @@ def pieces(data: bytes, cuts: list[int]) -> list[bytes]:
 
 
 @pytest.mark.parametrize("framer", [LineFramer, ObjectFramer])
-@STEADY
+@settings(STEADY, max_examples=25)
 @given(data=SOUP, cuts=CUTS)
 def test_chunks_do_not_matter(
     framer: type[LineFramer] | type[ObjectFramer], data: bytes, cuts: list[int]
@@ -70,7 +70,7 @@ def test_chunks_do_not_matter(
     assert found[0] == found[1] == found[2]
 
 
-@STEADY
+@settings(STEADY, max_examples=25)
 @given(
     objects=st.lists(
         st.dictionaries(
