@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from ssm_graph.data import N_BEAMS, Array
+from ssm_graph.data import Array
 from ssm_graph.errors import DataError
 from ssm_graph.frames import rotation_zyx
 from ssm_graph.io.mission_units import beams_from_angles
@@ -26,6 +26,7 @@ A50 they leave 1.6 mm/s rms; a Blueye X3 has its A50 mounted backwards, and the 
 _LARGEST_MISFIT: Final = 0.2
 """Of the typical beam speed; the wrong sign gives 2, swapped angles 0.7 and more."""
 _FEWEST_PINGS: Final = 10
+_FEWEST_BEAMS: Final = 3
 _SLOWEST: Final = 0.02
 """m/s of typical beam speed that shows directions."""
 _UNIT_TOLERANCE: Final = 1e-3
@@ -165,11 +166,16 @@ def _quarter_turns(beams_d: Array) -> list[_Candidate]:
 
 
 def _swapped(beams_d: Array) -> Array:
-    """Return directions with the angles from the vertical and the horizontal exchanged."""
+    """Return directions with the angles from the vertical and the horizontal exchanged.
+
+    A vertical beam, as that of an altimeter, has no azimuth and stays.
+    """
     level = np.linalg.norm(beams_d[:, :2], axis=1, keepdims=True)
+    is_tilted = level > _UNIT_TOLERANCE
     down = beams_d[:, 2:]
-    ahead = beams_d[:, :2] / np.where(level > 0.0, level, 1.0)
-    return np.hstack([ahead * np.abs(down), np.copysign(level, down)])
+    ahead = beams_d[:, :2] / np.where(is_tilted, level, 1.0)
+    swapped = np.hstack([ahead * np.abs(down), np.copysign(level, down)])
+    return np.where(is_tilted, swapped, beams_d)
 
 
 def _best(
@@ -180,27 +186,26 @@ def _best(
     Half of the pings are used, the faster ones; the typical residual is set against the typical
     speed, so that outliers do not count.
     """
-    whole = np.isfinite(speed).all(axis=1) & np.isfinite(velocity_d).all(axis=1)
-    whole &= np.any(velocity_d != 0.0, axis=1)
-    if whole.sum() < _FEWEST_PINGS:
+    used = np.isfinite(speed).sum(axis=1) >= _FEWEST_BEAMS
+    used &= np.isfinite(velocity_d).all(axis=1) & np.any(velocity_d != 0.0, axis=1)
+    if used.sum() < _FEWEST_PINGS:
         return None
-    speed, velocity_d = speed[whole], velocity_d[whole]
-    size = np.linalg.norm(speed, axis=1)
+    size = _rms(speed[used])
     fast = size >= np.median(size)
-    typical = float(np.median(size[fast])) / np.sqrt(N_BEAMS)
+    speed, velocity_d = speed[used][fast], velocity_d[used][fast]
+    typical = float(np.median(size[fast]))
     if typical < _SLOWEST:
         return None
     misfits = [
-        float(
-            np.median(
-                np.linalg.norm(choice.sign * speed - velocity_d @ choice.beams_d.T, axis=1)[fast]
-            )
-        )
-        / np.sqrt(N_BEAMS)
-        / typical
+        float(np.median(_rms(choice.sign * speed - velocity_d @ choice.beams_d.T))) / typical
         for choice in choices
     ]
     best = int(np.argmin(misfits))
     if misfits[best] > 0.5 * misfits[0]:  # as good as: what is stated needs no change
         best = 0
     return choices[best], misfits[best]
+
+
+def _rms(values: Array) -> Array:
+    """Return the root mean square (N,) of the beams (N, 4) that are not NaN."""
+    return np.asarray(np.sqrt(np.nanmean(values**2, axis=1)))

@@ -422,6 +422,24 @@ def test_water_linked_mounting_rotation() -> None:
     assert "too little motion" in still.notes[0]
 
 
+def test_three_beams_and_an_altimeter() -> None:
+    """Three are enough to prove directions by; a vertical fourth stays what it is."""
+    azimuth = np.radians([0.0, 120.0, -120.0])
+    slip = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.zeros(3)]) * np.cos(np.radians(20))
+    slip[:, 2] = np.sin(np.radians(20))
+    true = np.column_stack(
+        [slip[:, :2] * np.tan(np.radians(20.0)), np.full(3, np.cos(np.radians(20.0)))]
+    )
+    velocity = np.random.default_rng(1).normal(0.0, [0.5, 0.2, 0.05], (50, 3))
+    speed = np.column_stack([velocity @ true.T, np.full(50, np.nan)])
+    stated = np.vstack([slip, [0.0, 0.0, 1.0]])
+    found = proven_beams(
+        stated, water_linked=False, may_turn=True, speed=speed, velocity_d=velocity
+    )
+    np.testing.assert_allclose(found.beams_d, np.vstack([true, [0.0, 0.0, 1.0]]), atol=1e-12)
+    assert "from the horizontal" in found.notes[0]
+
+
 @pytest.mark.skipif(not A50_LOG.is_file(), reason=f"there is no {A50_LOG}")
 def test_water_linked_beams_against_a_real_log() -> None:
     """Order, directions and sign: residuals of millimetres per second."""
