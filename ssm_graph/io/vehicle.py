@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import tomli_w
 
 from ssm_graph.data import Array, Mission
+from ssm_graph.errors import ConfigError
 from ssm_graph.io.mission_instruments import (
     dvl_mount,
     imu_noise,
@@ -17,7 +19,7 @@ from ssm_graph.io.mission_instruments import (
     lever_arm_b,
     stated_frame,
 )
-from ssm_graph.io.mission_keys import FORMAT, TOML_NAME, BodyAxes
+from ssm_graph.io.mission_keys import FORMAT, SECTIONS, TOML_NAME, BodyAxes
 from ssm_graph.io.mission_toml import read_vehicle_toml
 from ssm_graph.io.mission_writer import (
     dvl_settings,
@@ -124,6 +126,34 @@ def vehicle_settings(vehicle: Vehicle, *, order: Order = Order.ARRIVAL) -> dict[
     if vehicle.initial is not None:
         settings["initial"] = initial_settings(vehicle.initial)
     return settings
+
+
+def check_same_vehicle(folder: Path | str, vehicle: Vehicle) -> None:
+    """Raise :class:`ConfigError` unless the log in ``folder`` was begun for just this vehicle."""
+    path = Path(folder) / TOML_NAME
+    read_vehicle_toml(path)
+    found = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    place = _difference(found, vehicle_settings(vehicle))
+    if place is not None:
+        raise ConfigError(
+            f"{TOML_NAME} {place}: the log in {str(folder)!r} was begun with another value; "
+            f"expected that of the vehicle {vehicle.name!r}; begin a new log in another folder"
+        )
+
+
+def _difference(found: Any, wanted: Any, place: str = "") -> str | None:
+    """Return the name of the first key that differs by more than rounding."""
+    if isinstance(found, dict) and isinstance(wanted, dict):
+        for key in {**wanted, **found}:
+            inner = f"{place} {key}" if place else f"[{key}]" if key in SECTIONS else key
+            if (different := _difference(found.get(key), wanted.get(key), inner)) is not None:
+                return different
+        return None
+    try:
+        is_same = np.allclose(found, wanted, rtol=1e-9, atol=1e-12)
+    except (TypeError, ValueError):  # texts, missing keys, lists of other lengths
+        is_same = found == wanted
+    return None if is_same else place
 
 
 def _listed(lever_arm: Array) -> list[float]:
