@@ -38,7 +38,7 @@ from ssm_graph.simulation import (
     scenario_config,
     simulate,
 )
-from ssm_graph.smoothers.fixed_lag import FixedLagConfig, FixedLagRun, FixedLagSmoother
+from ssm_graph.smoothers.fixed_lag import FixedLagConfig, run_fixed_lag
 
 GRADES = (Grade.NAVIGATION, Grade.TACTICAL, Grade.INDUSTRIAL)
 
@@ -77,7 +77,7 @@ def missions(count: int, duration_s: float) -> list[SimulatedMission]:
 def against_filter(problem: Problem, similarity: Similarity) -> Difference:
     """Compare the graph's single steps with the filter."""
     kernel = LogKernel()
-    graph = FixedLagSmoother(FixedLagConfig(0.0, kernel, similarity)).run(problem)
+    graph = run_fixed_lag(problem, FixedLagConfig(0.0, kernel, similarity))
     rule = SsmUpdate(kernel, similarity=similarity)
     history = run_filter([problem], rule, grouping=Grouping.PER_BEAM)
     own = history.posterior
@@ -88,34 +88,29 @@ def against_filter(problem: Problem, similarity: Similarity) -> Difference:
     beams = problem.beams
     weight = history.weight[beams.keyframe, 0, beams.beam]
     return Difference(
-        float(np.max(np.abs(states_of(graph).deviation_of(states)) / sigma)),
+        float(np.max(np.abs(newest.states.deviation_of(states)) / sigma)),
         float(np.max(np.abs(own.covariance[:, 0] - newest.covariance) / unit)),
         float(np.max(np.abs(weight - newest.weight))),
         int(np.sum(history.n_iterations[:, 0] != graph.n_iterations)),
     )
 
 
-def states_of(run: FixedLagRun) -> NavigationStates:
-    """Return the newest states of all keyframes."""
-    newest = run.newest
-    return NavigationStates(newest.R_nb, newest.p_n, newest.v_n, newest.bias)
-
-
 def against_geodetic(
     problem: Problem, sim: SimulatedMission, linearised: Linearised, feedback: Feedback
 ) -> tuple[float, float]:
     """Return the largest differences in velocity and horizontal position, sigmas."""
-    graph = FixedLagSmoother(FixedLagConfig(0.0, linearised=linearised)).run(problem)
+    graph = run_fixed_lag(problem, FixedLagConfig(0.0, linearised=linearised))
     config = GeodeticConfig(feedback=feedback)
     history = run_geodetic([problem], [sim.mission.imu], config)
     other = to_navigation(problem, history, 0)
     P = graph.newest.covariance
     velocity_sigma = np.sqrt(np.diagonal(P[:, VELOCITY, VELOCITY], axis1=1, axis2=2))
-    R_nb = graph.newest.R_nb
+    states = graph.newest.states
+    R_nb = states.R_nb
     position_cov_n = R_nb @ P[:, POSITION, POSITION] @ np.swapaxes(R_nb, 1, 2)
     position_sigma = np.sqrt(np.diagonal(position_cov_n, axis1=1, axis2=2))[:, :2]
-    velocity = np.abs(other.v_n - graph.newest.v_n) / velocity_sigma
-    position = np.abs(other.p_n - graph.newest.p_n)[:, :2] / position_sigma
+    velocity = np.abs(other.v_n - states.v_n) / velocity_sigma
+    position = np.abs(other.p_n - states.p_n)[:, :2] / position_sigma
     return float(np.max(velocity)), float(np.max(position))
 
 

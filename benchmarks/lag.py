@@ -53,7 +53,7 @@ from ssm_graph.simulation import (
     simulate,
 )
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
-from ssm_graph.smoothers.fixed_lag import FixedLagConfig, FixedLagSmoother
+from ssm_graph.smoothers.fixed_lag import FixedLagConfig, solve_fixed_lag
 
 RESULTS = Path(__file__).resolve().parent / "results"
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -107,7 +107,7 @@ def run_mission(grade: str, seed: int, duration_s: float, lags: Sequence[str]) -
     (filtered,) = filter_problems([problem], "ssm-log")
     found = [(FILTER, DELAYED, filtered), (FILTER, NEWEST, filtered), (BATCH, DELAYED, batch)]
     for lag in lags:
-        newest, delayed = FixedLagSmoother(FixedLagConfig(float(lag))).solve(problem)
+        newest, delayed = solve_fixed_lag(problem, FixedLagConfig(float(lag)))
         found += [(lag, NEWEST, newest), (lag, DELAYED, delayed)]
     rows = []
     for name, track, estimate in found:

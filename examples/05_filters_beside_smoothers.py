@@ -14,8 +14,8 @@ problem = sg.build_problem(mission)
 estimates: list[sg.Estimate] = []
 for name in ("ekf", "ekf-gate-ping", "ssmkf-log", "ssm-log"):
     estimates += sg.filter_problems([problem], name)
-estimates += sg.FixedLagSmoother(sg.FixedLagConfig(lag_s=0.0)).solve(problem)[:1]
-estimates += sg.FixedLagSmoother(sg.FixedLagConfig(lag_s=5.0)).solve(problem)
+estimates += sg.solve_fixed_lag(problem, sg.FixedLagConfig(lag_s=0.0))[:1]
+estimates += sg.solve_fixed_lag(problem, sg.FixedLagConfig(lag_s=5.0))
 estimates.append(sg.SsmSmoother().solve(problem))
 
 print(f"{'method':32} {'horizontal rms, m':>18} {'velocity rms, mm/s':>19}  status")

@@ -30,7 +30,7 @@ from ssm_graph.problem.alignment import Alignment, align
 from ssm_graph.problem.problem import Problem, ProblemConfig, build_problem
 from ssm_graph.report.figure import save_figure
 from ssm_graph.smoothers.batch import Similarity, SmootherConfig, SsmSmoother
-from ssm_graph.smoothers.fixed_lag import FixedLagConfig, FixedLagSmoother
+from ssm_graph.smoothers.fixed_lag import FixedLagConfig, solve_fixed_lag
 from ssm_graph.smoothers.mission import smooth
 
 __all__ = [
@@ -41,7 +41,6 @@ __all__ = [
     "Estimate",
     "ExpKernel",
     "FixedLagConfig",
-    "FixedLagSmoother",
     "GaussianKernel",
     "InitialState",
     "Iteration",
@@ -70,6 +69,7 @@ __all__ = [
     "reference_from_gnss",
     "save_figure",
     "smooth",
+    "solve_fixed_lag",
     "write_mission",
     "write_results",
 ]

@@ -12,7 +12,7 @@ from factors.dvl_beam import beam_residual
 from ssm_graph.data import Array
 from ssm_graph.graph.depth import depth_graph
 from ssm_graph.graph.keys import chain_ordering
-from ssm_graph.graph.marginal_prior import MarginalPrior, prior_at_start
+from ssm_graph.graph.marginal_prior import prior_at_start
 from ssm_graph.graph.states import States
 from ssm_graph.problem.error_state import (
     GYRO_BIAS,
@@ -61,25 +61,13 @@ class GraphLinearizer:
     states; beams become one Jacobian factor a keyframe.
     """
 
-    def __init__(
-        self, problem: Problem, *, prior: MarginalPrior | None = None, first_rise: float = 0.0
-    ) -> None:
-        """Take a mission, or a window of one with what came before it.
-
-        Parameters
-        ----------
-        problem : the mission or window.
-        prior : on the first keyframe, in place of the initial state.
-        first_rise : how much higher the depth sensor is at the first keyframe than it was on
-            average when its readings were taken, m.
-        """
+    def __init__(self, problem: Problem) -> None:
         self.problem = problem
         self.ordering = chain_ordering(problem.n_keyframes)
         self.inertial = inertial_graph(problem)
-        self.prior = prior_at_start(start_of(problem)) if prior is None else prior
+        self.prior = prior_at_start(start_of(problem))
         self.gnss = gnss_graph(problem.fixes)
         self.depth = gtsam.NonlinearFactorGraph()
-        self._first_rise = first_rise
         k = problem.beams.keyframe
         self._first_beam = np.flatnonzero(np.diff(k, prepend=-1))
         self._n_rows = np.diff(np.append(self._first_beam, len(k)))
@@ -95,13 +83,7 @@ class GraphLinearizer:
         """Let the depth targets follow the states."""
         problem = self.problem
         if problem.depths is not None:
-            self.depth = depth_graph(
-                problem.depths,
-                states,
-                problem.frame,
-                problem.keyframe_s,
-                first_rise=self._first_rise,
-            )
+            self.depth = depth_graph(problem.depths, states, problem.frame, problem.keyframe_s)
 
     def beam_rows(self, states: States) -> BeamRows:
         """Linearise all beams at ``states``."""

@@ -9,8 +9,8 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from ssm_graph.data import Array
-from ssm_graph.graph.states import States
 from ssm_graph.problem.error_state import STATE_DIM, InitialMoments
+from ssm_graph.problem.trajectory import KeyframeStates
 
 
 class MarginalPrior(NamedTuple):
@@ -31,22 +31,29 @@ class MarginalPrior(NamedTuple):
     offset: Array
     """(15,)"""
 
-    def whitened(self, states: States) -> Array:
+    def whitened(self, states: KeyframeStates) -> Array:
         """Return the whitened error (15,) of the first keyframe of ``states``."""
         return np.asarray(self.root_information @ self._deviation(states) - self.offset)
 
-    def linear_factor(self, states: States) -> gtsam.JacobianFactor:
-        """Linearise at the first keyframe of ``states``."""
+    def rows(self, states: KeyframeStates) -> Array:
+        """Return whitened rows (15, 16) at the first keyframe of ``states``, ``b`` last."""
         deviation = self._deviation(states)
-        rows = self.root_information.copy()
+        rows = np.empty((STATE_DIM, STATE_DIM + 1))
+        rows[:, :STATE_DIM] = self.root_information
         rows[:, :3] = rows[:, :3] @ gtsam.Rot3.LogmapDerivative(deviation[:3])
         rows[:, 3:6] = rows[:, 3:6] @ self.R_nb.T @ states.R_nb[0]
-        b = self.offset - self.root_information @ deviation
+        rows[:, STATE_DIM] = self.offset - self.root_information @ deviation
+        return rows
+
+    def linear_factor(self, states: KeyframeStates) -> gtsam.JacobianFactor:
+        """Linearise at the first keyframe of ``states``."""
+        rows = self.rows(states)
         unit = gtsam.noiseModel.Unit.Create(STATE_DIM)
         pose, velocity, bias = (np.asfortranarray(rows[:, s]) for s in _BLOCKS)
+        b = np.ascontiguousarray(rows[:, STATE_DIM])
         return gtsam.JacobianFactor(X(0), pose, V(0), velocity, B(0), bias, b, unit)
 
-    def _deviation(self, states: States) -> Array:
+    def _deviation(self, states: KeyframeStates) -> Array:
         return np.concatenate(
             [
                 gtsam.Rot3.Logmap(gtsam.Rot3(self.R_nb.T @ states.R_nb[0])),
@@ -72,7 +79,7 @@ def prior_at_start(start: InitialMoments) -> MarginalPrior:
     )
 
 
-def prior_on_last(states: States, root_information: Array, *, step: Array) -> MarginalPrior:
+def prior_on_last(states: KeyframeStates, root_information: Array, *, step: Array) -> MarginalPrior:
     """Return a prior on the last keyframe: ``step`` (15,) off its state, with that information."""
     return MarginalPrior(
         R_nb=states.R_nb[-1].copy(),

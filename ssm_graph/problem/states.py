@@ -40,9 +40,13 @@ class NavigationStates(NamedTuple):
         rho = (R_bn @ (other.p_n - self.p_n)[..., None])[..., 0]
         return np.concatenate([phi, rho, other.v_n - self.v_n, other.bias - self.bias], axis=1)
 
-    def take(self, runs: NDArray[np.intp] | NDArray[np.bool_]) -> NavigationStates:
+    def take(self, runs: NDArray[np.intp] | NDArray[np.bool_] | slice) -> NavigationStates:
         """Return the states of some runs."""
         return NavigationStates(*(column[runs] for column in self))
+
+    def followed_by(self, other: NavigationStates) -> NavigationStates:
+        """Return these states, then the others."""
+        return NavigationStates(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
 
     def _at(self, step: Array, *, shift_b: Array) -> NavigationStates:
         return NavigationStates(

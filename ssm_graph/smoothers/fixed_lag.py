@@ -1,4 +1,4 @@
-"""The fixed-lag smoother: the newest states of a mission, each keyframe as it comes.
+"""A mission keyframe by keyframe: the newest states as each comes, and those that the lag leaves.
 
 Keyframes older than the lag are marginalised into a square-root prior; the weights of all beams in
 the window keep being recomputed, and freeze when their keyframe leaves. With a lag of zero it is
@@ -14,19 +14,22 @@ import numpy as np
 
 from ssm_graph.data import Array
 from ssm_graph.estimate import Estimate, OnKeyframe
-from ssm_graph.problem.problem import Problem
+from ssm_graph.problem.problem import Problem, start_of
 from ssm_graph.problem.recursive import RecursiveBeams, recursive_estimate
-from ssm_graph.smoothers.window import FixedLagConfig, Track, Window
+from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
+from ssm_graph.smoothers.keyframe import keyframes_of, sensors_of
+from ssm_graph.smoothers.stretch import Stretch, joined
+from ssm_graph.smoothers.window import Window
 
-__all__ = ["FixedLagConfig", "FixedLagRun", "FixedLagSmoother", "Track"]
+__all__ = ["FixedLagConfig", "FixedLagEstimates", "FixedLagRun", "run_fixed_lag", "solve_fixed_lag"]
 
 
 class FixedLagRun(NamedTuple):
     """What a fixed-lag smoother found."""
 
-    newest: Track
+    newest: Stretch
     """Each keyframe as known when it was the newest: what a vehicle navigates by."""
-    delayed: Track
+    delayed: Stretch
     """Each keyframe as known when it left the window."""
     n_iterations: Array
     """(K,)"""
@@ -39,58 +42,66 @@ class FixedLagEstimates(NamedTuple):
     delayed: Estimate
 
 
-class FixedLagSmoother:
-    """Estimate a mission keyframe by keyframe."""
+def solve_fixed_lag(
+    problem: Problem,
+    config: FixedLagConfig | None = None,
+    *,
+    on_keyframe: OnKeyframe | None = None,
+) -> FixedLagEstimates:
+    """Return the newest states of a mission and those that left the window, as estimates.
 
-    def __init__(self, config: FixedLagConfig | None = None) -> None:
-        self.config = config or FixedLagConfig()
-
-    def solve(
-        self, problem: Problem, *, on_keyframe: OnKeyframe | None = None
-    ) -> FixedLagEstimates:
-        """Return the newest states and those that left the window, as estimates.
-
-        Raises
-        ------
-        SolverError
-            If no finite solution was found.
-        """
-        begin = time.perf_counter()
-        run = self.run(problem, on_keyframe=on_keyframe)
-        wall_s = time.perf_counter() - begin
-        return FixedLagEstimates(
-            *(
-                self._estimate(problem, track, run.n_iterations, wall_s, name)
-                for track, name in ((run.newest, "newest"), (run.delayed, "delayed"))
-            )
+    Raises
+    ------
+    SolverError
+        If no finite solution was found.
+    """
+    config = config or FixedLagConfig()
+    begin = time.perf_counter()
+    run = run_fixed_lag(problem, config, on_keyframe=on_keyframe)
+    wall_s = time.perf_counter() - begin
+    return FixedLagEstimates(
+        *(
+            _estimate(problem, config, getattr(run, name), run.n_iterations, wall_s, name)
+            for name in FixedLagEstimates._fields
         )
+    )
 
-    def run(self, problem: Problem, *, on_keyframe: OnKeyframe | None = None) -> FixedLagRun:
-        """Go through the keyframes one by one."""
-        window = Window(problem, self.config)
-        n_keyframes = problem.n_keyframes
-        n_iterations = np.zeros(n_keyframes)
-        newest = Track.empty(n_keyframes, len(problem.beams.speed))
-        for k in range(n_keyframes):
-            window.advance(k)
-            n_iterations[k] = window.iterate()
-            window.copy_newest(newest)
-            if on_keyframe is not None:
-                on_keyframe(k + 1, n_keyframes)
-        return FixedLagRun(newest, window.track, n_iterations)
 
-    def _estimate(
-        self, problem: Problem, track: Track, n_iterations: Array, wall_s: float, name: str
-    ) -> Estimate:
-        innovation = track.innovation if name == "newest" else None
-        return recursive_estimate(
-            problem,
-            track,
-            track.covariance,
-            RecursiveBeams(innovation, track.mahalanobis_sq, track.weight),
-            n_iterations,
-            max_iterations=self.config.max_iterations,
-            method=f"fixed lag {self.config.lag_s:g} s, {name} states",
-            kernel=str(self.config.kernel),
-            wall_s=wall_s,
-        )
+def run_fixed_lag(
+    problem: Problem, config: FixedLagConfig, *, on_keyframe: OnKeyframe | None = None
+) -> FixedLagRun:
+    """Go through the keyframes one by one."""
+    first, *others = keyframes_of(problem)
+    window = Window(sensors_of(problem), config, first, start_of(problem))
+    newest, delayed, n_iterations = [], [], []
+    for number, keyframe in enumerate((first, *others), start=1):
+        if number > 1:
+            delayed.append(window.advance(keyframe))
+        n_iterations.append(window.iterate())
+        newest.append(window.newest)
+        if on_keyframe is not None:
+            on_keyframe(number, problem.n_keyframes)
+    delayed.append(window.all)
+    return FixedLagRun(joined(newest), joined(delayed), np.array(n_iterations, float))
+
+
+def _estimate(
+    problem: Problem,
+    config: FixedLagConfig,
+    track: Stretch,
+    n_iterations: Array,
+    wall_s: float,
+    name: str,
+) -> Estimate:
+    innovation = track.innovation if name == "newest" else None
+    return recursive_estimate(
+        problem,
+        track.states,
+        track.covariance,
+        RecursiveBeams(innovation, track.mahalanobis_sq, track.weight),
+        n_iterations,
+        max_iterations=config.max_iterations,
+        method=f"fixed lag {config.lag_s:g} s, {name} states",
+        kernel=str(config.kernel),
+        wall_s=wall_s,
+    )

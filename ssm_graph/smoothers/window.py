@@ -2,97 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import NamedTuple
+import copy
+from typing import Self
 
-import gtsam
 import numpy as np
 
-from factors.similarity import Kernel, LogKernel, Similarity, expected_mahalanobis_sq
+from factors.similarity import Similarity, expected_mahalanobis_sq
 from ssm_graph.data import Array
-from ssm_graph.errors import ConfigError, SolverError
-from ssm_graph.graph.depth import rises
-from ssm_graph.graph.linearize import BeamRows, GraphLinearizer
-from ssm_graph.graph.marginal_prior import moved_chart, prior_at_start, prior_on_last
-from ssm_graph.graph.solve import LinearSolution, marginal_covariances, solve_linear
-from ssm_graph.graph.states import States, retract, states_from_arrays
-from ssm_graph.imu.preintegration import gtsam_gravity
-from ssm_graph.problem.error_state import STATE_DIM, Linearised
-from ssm_graph.problem.problem import Problem, start_of
+from ssm_graph.graph.marginal_prior import MarginalPrior, moved_chart, prior_at_start, prior_on_last
+from ssm_graph.problem.error_state import STATE_DIM, InitialMoments, Linearised
+from ssm_graph.problem.states import NavigationStates
 from ssm_graph.problem.timeline import MIN_SPACING_S
-from ssm_graph.problem.window import rows_in, window_of
+from ssm_graph.smoothers.chain import Chain
+from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
+from ssm_graph.smoothers.keyframe import BeamSpeeds, Keyframe, Sensors
 from ssm_graph.smoothers.mixing import Mixing
+from ssm_graph.smoothers.stretch import Stretch
+from ssm_graph.smoothers.window_rows import (
+    InertialRows,
+    beam_rows,
+    depth_rows,
+    depth_targets,
+    fix_rows,
+)
 
+_NO_ROWS = np.zeros((0, STATE_DIM + 1))
 ROUNDING = 1e-7
 """Posterior sigmas: updates of a window of several keyframes come down to a few 1e-8 and stay."""
-
-
-@dataclass(frozen=True, slots=True)
-class FixedLagConfig:
-    """Settings of the fixed-lag smoother."""
-
-    lag_s: float = 30.0
-    """Keyframes older than this are marginalised; zero makes it the filter."""
-    kernel: Kernel = field(default_factory=LogKernel)
-    similarity: Similarity = Similarity.EXPECTED
-    max_iterations: int = 50
-    tolerance: float = 1e-8
-    """Largest update, in its own posterior sigmas, at which a keyframe's iteration ends; not below
-    1e-7 while the window has several."""
-    linearised: Linearised = Linearised.EACH_PASS
-
-    def __post_init__(self) -> None:
-        if not (np.isfinite(self.lag_s) and self.lag_s >= 0.0):
-            raise ConfigError(f"lag_s: expected zero or more seconds, got {self.lag_s}")
-        if self.max_iterations < 1:
-            raise ConfigError(f"max_iterations: expected 1 or more, got {self.max_iterations}")
-        if not 0.0 < self.tolerance < 1.0:
-            raise ConfigError(f"tolerance: expected a number in (0, 1), got {self.tolerance}")
-        if self.linearised is Linearised.ONCE and self.lag_s > 0.0:
-            raise ConfigError(f"linearised once: expected with lag_s zero, got {self.lag_s}")
-
-
-@dataclass(slots=True, eq=False)
-class Track:
-    """States, covariances and beams as they were at one moment of their keyframe's life."""
-
-    R_nb: Array
-    """(K, 3, 3)"""
-    p_n: Array
-    """(K, 3) m"""
-    v_n: Array
-    """(K, 3) m/s"""
-    bias: Array
-    """(K, 6) accelerometer m/s^2, gyro rad/s"""
-    covariance: Array
-    """(K, 15, 15)"""
-    innovation: Array
-    """(M,) m/s, measured minus predicted before the first update"""
-    mahalanobis_sq: Array
-    """(M,)"""
-    weight: Array
-    """(M,)"""
-
-    @classmethod
-    def empty(cls, n_keyframes: int, n_beams: int) -> Track:
-        """Return a track to be filled."""
-        shapes = ((3, 3), (3,), (3,), (6,), (STATE_DIM, STATE_DIM))
-        R_nb, p_n, v_n, bias, covariance = (np.zeros((n_keyframes, *s)) for s in shapes)
-        innovation, mahalanobis_sq = np.zeros((2, n_beams))
-        weight = np.ones(n_beams)
-        return cls(R_nb, p_n, v_n, bias, covariance, innovation, mahalanobis_sq, weight)
-
-
-class _Settled(NamedTuple):
-    """Outcome of a window's iteration."""
-
-    states: States
-    covariance: Array
-    root: Array
-    """(15, 15) square-root information of the newest keyframe, the others marginalised"""
-    weights: Array
-    mahalanobis_sq: Array
-    n_passes: int
 
 
 def _largest(step: Array, covariance: Array) -> float:
@@ -102,185 +38,273 @@ def _largest(step: Array, covariance: Array) -> float:
 
 
 class Window:
-    """The keyframes from ``first`` to ``last`` and the prior on the first."""
+    """The keyframes that are not yet settled, and the prior on the first of them.
 
-    def __init__(self, problem: Problem, config: FixedLagConfig) -> None:
-        self._problem, self._config = problem, config
-        self.track = Track.empty(problem.n_keyframes, len(problem.beams.speed))
-        self._first, self._last = 0, -1
-        self._rise = np.zeros(problem.n_keyframes)
-        start = start_of(problem)
-        self._put(slice(0, 1), *(column[None] for column in start[:4]))
-        self._prior = self._posterior = prior_at_start(start)
+    Each keyframe is linearised at a state of its own, ``at``, and lies a ``step`` off it. Arrays
+    are replaced, never written into, so that a copy of the window costs no more than its lists.
+    """
+
+    def __init__(
+        self, sensors: Sensors, config: FixedLagConfig, first: Keyframe, start: InitialMoments
+    ) -> None:
+        self.config, self._sensors = config, sensors
+        self.keyframes: list[Keyframe] = [first]
+        self._at = NavigationStates(*(column[None] for column in start[:4]))
+        self._step = np.zeros((1, STATE_DIM))
+        self._covariance = start.covariance[None]
+        self._prior: MarginalPrior = prior_at_start(start)
+        self._beams = BeamSpeeds.none()
+        self._error, self._jacobian = np.zeros(0), np.zeros((0, STATE_DIM))
+        self._innovation, self._weights, self._t = np.zeros((3, 0))
+        self._depths: list[Array] = []
+        self._fixes: list[Array] = []
+        self._inertial = InertialRows(sensors.frame)
+        self._between: list[Array] = []
+        self._targets = depth_targets(sensors, [first], self._at, first_rise=0.0)
+        self._chain = Chain()
+        self._stale = 0
+        self._measure(first)
+
+    def copy(self) -> Self:
+        """Return a window that goes its own way from here."""
+        twin = copy.copy(self)
+        for name in ("keyframes", "_depths", "_fixes", "_between"):
+            setattr(twin, name, getattr(self, name).copy())
+        twin._chain, twin._stale = Chain(), 0
+        return twin
 
     @property
-    def _keyframes(self) -> range:
-        return range(self._first, self._last + 1)
+    def states(self) -> NavigationStates:
+        """The estimate of all keyframes."""
+        return self._at.moved(self._step)
 
-    def advance(self, k: int) -> None:
-        """Predict keyframe ``k`` and marginalise what the lag leaves behind."""
-        if k > 0:
-            self._predict(k)
-        self._last = k
-        self._note_rise(k)
-        oldest_s = self._problem.keyframe_s[k] - self._config.lag_s - MIN_SPACING_S
-        first = int(np.searchsorted(self._problem.keyframe_s[: k + 1], oldest_s))
-        if first > self._first:
-            self._marginalise(first)
+    @property
+    def newest(self) -> Stretch:
+        """The newest keyframe."""
+        return self._stretch(len(self.keyframes) - 1, len(self.keyframes))
+
+    @property
+    def all(self) -> Stretch:
+        """All keyframes."""
+        return self._stretch(0, len(self.keyframes))
+
+    def _stretch(self, begin: int, end: int) -> Stretch:
+        first = self._first_row
+        b = slice(first[begin], first[end])
+        at = slice(begin, end)
+        return Stretch(
+            np.array([keyframe.time_s for keyframe in self.keyframes[at]]),
+            self._at.take(at).moved(self._step[at]),
+            self._covariance[at],
+            np.diff(first[begin : end + 1]).astype(float),
+            self._innovation[b],
+            self._t[b],
+            self._weights[b],
+        )
+
+    @property
+    def _first_row(self) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+        counts = [len(keyframe.beams.speed) for keyframe in self.keyframes]
+        return np.concatenate([[0], np.cumsum(counts, dtype=np.intp)])
+
+    def advance(self, keyframe: Keyframe) -> Stretch:
+        """Predict a new keyframe, marginalise what the lag leaves behind, and return that."""
+        oldest_s = keyframe.time_s - self.config.lag_s - MIN_SPACING_S
+        leaving = sum(known.time_s < oldest_s for known in self.keyframes)
+        left = self._stretch(0, leaving)
+        if leaving == len(self.keyframes):
+            # Of a window that goes as a whole, the posterior of its end is all that counts.
+            self._keep_posterior()
+            leaving = 1
+        self._append(keyframe)
+        if leaving:
+            self._marginalise(leaving)
+        return left
+
+    def _keep_posterior(self) -> None:
+        last = self.states.take(np.s_[-1:])
+        self._prior = prior_on_last(last, self._chain.root, step=np.zeros(STATE_DIM))
+        self._at, self._step = last, np.zeros((1, STATE_DIM))
+        self._covariance = self._covariance[-1:]
+        self.keyframes = [self.keyframes[-1].without_measurements()]
+        self._drop_rows(len(self._weights))
+        self._depths, self._fixes, self._between = [_NO_ROWS], [_NO_ROWS], []
+        self._targets = self._targets.take(np.s_[-1:])
+        self._stale = 0
+
+    def _append(self, keyframe: Keyframe) -> None:
+        last = self.states.take(np.s_[-1:])
+        predicted = self._inertial.predict(keyframe, last)
+        self._at = self._at.followed_by(predicted)
+        self._step = np.concatenate([self._step, np.zeros((1, STATE_DIM))])
+        self._covariance = np.concatenate([self._covariance, self._covariance[-1:]])
+        pair = self._at.take(np.s_[-2:])
+        self._between += self._inertial.rows([keyframe], pair)
+        self._stale = min(self._stale, len(self.keyframes) - 1)
+        self.keyframes.append(keyframe)
+        targets = depth_targets(
+            self._sensors, self.keyframes[-2:], last.followed_by(predicted), first_rise=0.0
+        )
+        self._targets = self._targets.followed_by(targets.take(np.s_[1:]))
+        self._measure(keyframe)
+
+    def _measure(self, keyframe: Keyframe) -> None:
+        """Linearise what was measured at the newest keyframe."""
+        at = self._at.take(np.s_[-1:])
+        rows = np.zeros(len(keyframe.beams.speed), np.intp)
+        error, jacobian = beam_rows(self._sensors, keyframe.beams, at.take(rows))
+        self._beams = self._beams.followed_by(keyframe.beams)
+        self._error = np.append(self._error, error)
+        self._jacobian = np.concatenate([self._jacobian, jacobian])
+        self._innovation = np.append(self._innovation, -error)
+        self._weights = np.append(self._weights, np.ones(len(error)))
+        self._t = np.append(self._t, np.zeros(len(error)))
+        self._depths += depth_rows(self._sensors, [keyframe], at, self._targets.take(np.s_[-1:]))
+        self._fixes += fix_rows(self._sensors, [keyframe], at)
+
+    def _marginalise(self, count: int) -> None:
+        """Leave a prior on what will be the first keyframe, made at the present states."""
+        self._eliminate()
+        carried = self._chain.carried[count]
+        kept = self._at.take(np.s_[count : count + 1])
+        R_nb, p_n, v_n, bias = (column[0] for column in kept)
+        root, offset = carried[:, :STATE_DIM], carried[:, STATE_DIM]
+        self._prior = MarginalPrior(R_nb, p_n, v_n, bias, root, offset)
+        self._drop_rows(int(self._first_row[count]))
+        self._chain.drop(count)
+        self._stale = len(self.keyframes) - count
+        self._at = self._at.take(np.s_[count:])
+        self._step, self._covariance = self._step[count:], self._covariance[count:]
+        self._targets = self._targets.take(np.s_[count:])
+        for name in ("keyframes", "_depths", "_fixes", "_between"):
+            setattr(self, name, getattr(self, name)[count:])
+
+    def _drop_rows(self, count: int) -> None:
+        self._beams = self._beams.without_first(count)
+        for name in ("_error", "_jacobian", "_innovation", "_weights", "_t"):
+            setattr(self, name, getattr(self, name)[count:])
 
     def iterate(self) -> int:
-        """Reweight and solve the window until it has settled; return the number of passes."""
-        window = window_of(self._problem, self._keyframes)
-        linearizer = self._linearizer(window)
-        states = self._states()
-        linearizer.follow_depth(states)
-        rows = rows_in(self._problem.beams.keyframe, self._keyframes)
-        settle = self._settle if self._config.linearised is Linearised.EACH_PASS else self._reweigh
-        at = linearizer.beam_rows(states)
-        is_new = window.beams.keyframe == window.n_keyframes - 1
-        self.track.innovation[rows][is_new] = -at.error[is_new]
-        settled = settle(linearizer, states, at, self.track.weight[rows])
-        self._keep(settled, rows)
-        has_measurement = (
-            len(window.beams.speed) or linearizer.depth.size() + linearizer.gnss.size()
-        )
-        return settled.n_passes if has_measurement or window.n_keyframes > 1 else 0
+        """Reweight and solve until the window has settled; return the number of passes."""
+        is_linear = self.config.linearised is Linearised.ONCE
+        n_passes = self._reweigh() if is_linear else self._settle()
+        is_idle = len(self.keyframes) == 1 and not self.keyframes[0].is_measured
+        return 0 if is_idle else n_passes
 
-    def _settle(
-        self, linearizer: GraphLinearizer, states: States, beam_rows: BeamRows, weights: Array
-    ) -> _Settled:
-        """Solve and reweigh, everything linearised anew at each pass."""
-        config, n_keyframes = self._config, linearizer.problem.n_keyframes
+    def _settle(self) -> int:
+        """Solve and reweigh; what has moved is linearised anew at each pass."""
+        config, n_keyframes = self.config, len(self.keyframes)
         tolerance = max(config.tolerance, ROUNDING) if n_keyframes > 1 else config.tolerance
         mixing = Mixing()
         for number in range(1, config.max_iterations + 1):
-            if n_keyframes > 1:  # a single keyframe keeps what its prediction came with
-                linearizer.follow(states)
-            solution, covariance = self._solve(linearizer, states, beam_rows, weights)
-            states, update = retract(states, solution.delta)
-            beam_rows = linearizer.beam_rows(states)
-            t = self._mahalanobis_sq(linearizer.problem, beam_rows, covariance)
-            if _largest(update, covariance) < tolerance:
+            self._eliminate()
+            step, self._covariance = self._chain.solve()
+            update, self._step = step - self._step, step
+            self._relinearise()
+            self._t = self._mahalanobis_sq()
+            if _largest(update, self._covariance) < tolerance:
                 break
             if number < config.max_iterations:
-                settled = config.kernel.weight(t)
+                settled = config.kernel.weight(self._t)
                 # A single keyframe's weights are those of the filter, pass by pass.
-                weights = mixing.next_weights(weights, settled) if n_keyframes > 1 else settled
-        root = solution.R[-1]
-        return _Settled(states, covariance, root, weights, t, number)
+                if n_keyframes > 1:
+                    settled = mixing.next_weights(self._weights, settled)
+                self._renew(settled)
+        return number
 
-    def _reweigh(
-        self, linearizer: GraphLinearizer, states: States, at: BeamRows, weights: Array
-    ) -> _Settled:
+    def _reweigh(self) -> int:
         """Solve and reweigh a single keyframe, linearised at its prediction only."""
-        config = self._config
-        before = np.zeros((1, STATE_DIM))
+        config = self.config
         for number in range(1, config.max_iterations + 1):
-            solution, covariance = self._solve(linearizer, states, at, weights)
-            moved, step = retract(states, solution.delta)
-            left = BeamRows(at.error + at.jacobian @ step[0], at.jacobian)
-            t = self._mahalanobis_sq(linearizer.problem, left, covariance)
-            if _largest(step - before, covariance) < config.tolerance:
+            self._eliminate()
+            step, self._covariance = self._chain.solve()
+            update, self._step = step - self._step, step
+            self._t = self._mahalanobis_sq()
+            if _largest(update, self._covariance) < config.tolerance:
                 break
-            before = step
             if number < config.max_iterations:
-                weights = config.kernel.weight(t)
-        J = moved_chart(step[0])
-        covariance = J @ covariance @ J.T
-        root = solution.R[-1] @ np.linalg.inv(J)
-        return _Settled(moved, covariance, root, weights, t, number)
+                self._renew(config.kernel.weight(self._t))
+        J = moved_chart(self._step[0])
+        self._covariance = J @ self._covariance @ J.T
+        self._chain.root = self._chain.root @ np.linalg.inv(J)
+        return number
 
-    def _solve(
-        self, linearizer: GraphLinearizer, states: States, rows: BeamRows, weights: Array
-    ) -> tuple[LinearSolution, Array]:
-        problem = linearizer.problem
-        linear = linearizer.linearize(states, rows, weights)
-        solution = solve_linear(linear, linearizer.ordering, n_keyframes=problem.n_keyframes)
-        covariance = marginal_covariances(solution)
-        if not np.all(np.isfinite(covariance)):
-            raise SolverError(
-                f"the window ending at {problem.keyframe_s[-1]:.3f} s has no finite solution; "
-                "check noise and time stamps of [imu] there"
-            )
-        return solution, covariance
-
-    def _keep(self, settled: _Settled, rows: slice) -> None:
-        track, at = self.track, slice(self._first, self._last + 1)
-        self._posterior = prior_on_last(settled.states, settled.root, step=np.zeros(STATE_DIM))
-        self._put(at, *settled.states[1:])
-        track.covariance[at] = settled.covariance
-        track.weight[rows], track.mahalanobis_sq[rows] = settled.weights, settled.mahalanobis_sq
-
-    def copy_newest(self, newest: Track) -> None:
-        """Keep the newest keyframe as it is now."""
-        k = self._last
-        rows = rows_in(self._problem.beams.keyframe, range(k, k + 1))
-        for name in ("R_nb", "p_n", "v_n", "bias", "covariance"):
-            getattr(newest, name)[k] = getattr(self.track, name)[k]
-        for name in ("innovation", "mahalanobis_sq", "weight"):
-            getattr(newest, name)[rows] = getattr(self.track, name)[rows]
-
-    def _predict(self, k: int) -> None:
-        track, chain = self.track, self._problem.chain
-        i = k - 1
-        span = self._problem.keyframe_s[k] - self._problem.keyframe_s[i]
-        middle = track.p_n[i] + 0.5 * span * track.v_n[i]
-        chain.params[i].n_gravity = gtsam_gravity(chain.frame, middle)
-        state = gtsam.NavState(gtsam.Rot3(track.R_nb[i]), track.p_n[i], track.v_n[i])
-        bias = track.bias[i]
-        predicted = chain.measurements[i].predict(
-            state, gtsam.imuBias.ConstantBias(bias[:3], bias[3:])
-        )
-        self._put(
-            slice(k, k + 1),
-            predicted.attitude().matrix()[None],
-            predicted.position()[None],
-            predicted.velocity()[None],
-            bias[None],
-        )
-
-    def _marginalise(self, first: int) -> None:
-        """Leave a prior on keyframe ``first``, made at the present states and weights."""
-        problem, left = self._problem, range(self._first, first)
-        if first == self._last:
-            # Of a window that goes as a whole, the posterior of its end is all that counts.
-            self._prior, self._first, left = self._posterior, first - 1, range(first, first)
-        keyframes = range(self._first, first + 1)
-        window = window_of(problem, keyframes, measured=left)
-        linearizer = self._linearizer(window)
-        states = self._states(keyframes)
-        linearizer.follow_depth(states)
-        weights = self.track.weight[rows_in(problem.beams.keyframe, left)]
-        linear = linearizer.linearize(states, linearizer.beam_rows(states), weights)
-        solution = solve_linear(linear, linearizer.ordering, n_keyframes=len(keyframes))
-        self._prior = prior_on_last(states, solution.R[-1], step=solution.last_step())
-        self._first = first
-
-    def _linearizer(self, window: Problem) -> GraphLinearizer:
-        return GraphLinearizer(window, prior=self._prior, first_rise=float(self._rise[self._first]))
-
-    def _note_rise(self, k: int) -> None:
-        """Keep how the depth sensor rose since its readings: it cannot be known later."""
-        if k == 0 or self._problem.depths is None:
+    def _eliminate(self) -> None:
+        """Bring the chain up to date from the first keyframe that has changed."""
+        begin = self._stale
+        if begin == len(self.keyframes):
             return
-        pair = range(k - 1, k + 1)
-        window = window_of(self._problem, pair)
-        assert window.depths is not None
-        states = self._states(pair)
-        self._rise[k] = rises(window.depths, states, window.frame, window.keyframe_s)[1]
+        first = self._first_row[begin:]
+        b = slice(first[0], None)
+        rows = np.column_stack([self._jacobian[b], -self._error[b]])
+        rows *= (np.sqrt(self._weights[b]) / self._beams.sigma[b])[:, None]
+        first = first - first[0]
+        own = [
+            np.concatenate([rows[first[i] : first[i + 1]], *aids])
+            for i, aids in enumerate(zip(self._depths[begin:], self._fixes[begin:], strict=True))
+        ]
+        carried = self._prior.rows(self._at) if begin == 0 else self._chain.carried[begin]
+        self._chain.eliminate(carried, own, self._between[begin:], begin=begin)
+        self._stale = len(self.keyframes)
 
-    def _states(self, keyframes: range | None = None) -> States:
-        keyframes = self._keyframes if keyframes is None else keyframes
-        at, track = slice(keyframes.start, keyframes.stop), self.track
-        return states_from_arrays(track.R_nb[at], track.p_n[at], track.v_n[at], track.bias[at])
+    def _relinearise(self) -> None:
+        """Linearise anew from the first keyframe that has moved."""
+        sigma = np.sqrt(np.diagonal(self._covariance, axis1=1, axis2=2))
+        is_single = len(self.keyframes) == 1
+        threshold = 0.0 if is_single else self.config.relinearise_sigmas
+        moved = np.max(np.abs(self._step) / sigma, axis=1) > threshold
+        if self.config.first_estimates and not is_single:
+            moved[0] = False
+        if not moved.any():
+            return
+        begin = int(np.argmax(moved))
+        before = max(begin - 1, 0)
+        head, tail = (self._at.take(np.s_[part]) for part in (slice(begin), slice(begin, None)))
+        self._at = head.followed_by(tail.moved(self._step[begin:]))
+        self._step = np.concatenate([self._step[:begin], np.zeros_like(self._step[begin:])])
+        near = self._at.take(np.s_[before:])
+        if not is_single:  # a single keyframe keeps what its prediction came with
+            keyframes = self.keyframes[before:]
+            self._inertial.set_gravity(keyframes[1:], near)
+            rows = self._inertial.rows(keyframes[1:], near)
+            self._between = self._between[:before] + rows
+            targets = depth_targets(
+                self._sensors, keyframes, near, first_rise=float(self._targets.rise[before])
+            )
+            self._targets = self._targets.take(np.s_[:before]).followed_by(targets)
+        self._measure_again(begin)
+        self._stale = min(self._stale, before)
 
-    def _put(self, at: slice, R_nb: Array, p_n: Array, v_n: Array, bias: Array) -> None:
-        track = self.track
-        track.R_nb[at], track.p_n[at], track.v_n[at], track.bias[at] = R_nb, p_n, v_n, bias
+    def _measure_again(self, begin: int) -> None:
+        """Linearise the measurements of the keyframes from ``begin`` on."""
+        first = self._first_row
+        row = first[begin]
+        keyframe = np.repeat(np.arange(begin, len(self.keyframes)), np.diff(first[begin:]))
+        error, jacobian = beam_rows(
+            self._sensors, self._beams.without_first(row), self._at.take(keyframe)
+        )
+        self._error = np.concatenate([self._error[:row], error])
+        self._jacobian = np.concatenate([self._jacobian[:row], jacobian])
+        keyframes, at = self.keyframes[begin:], self._at.take(np.s_[begin:])
+        depths = depth_rows(self._sensors, keyframes, at, self._targets.take(np.s_[begin:]))
+        self._depths = self._depths[:begin] + depths
+        self._fixes = self._fixes[:begin] + fix_rows(self._sensors, keyframes, at)
 
-    def _mahalanobis_sq(self, window: Problem, rows: BeamRows, covariance: Array) -> Array:
-        H, beams = rows.jacobian, window.beams
+    def _renew(self, settled: Array) -> None:
+        """Take the weights that have changed enough."""
+        threshold = 0.0 if len(self.keyframes) == 1 else self.config.reweigh
+        changed = np.abs(settled - self._weights) > threshold
+        if not changed.any():
+            return
+        self._weights = np.where(changed, settled, self._weights)
+        k = int(np.searchsorted(self._first_row, np.argmax(changed), side="right")) - 1
+        self._stale = min(self._stale, k)
+
+    def _mahalanobis_sq(self) -> Array:
+        keyframe = np.repeat(np.arange(len(self.keyframes)), np.diff(self._first_row))
+        H = self._jacobian
+        error = self._error + (H * self._step[keyframe]).sum(axis=1)
         spread = np.zeros(len(H))
-        if self._config.similarity is Similarity.EXPECTED:
-            spread = np.einsum("mi,mij,mj->m", H, covariance[beams.keyframe], H, optimize=True)
-        return expected_mahalanobis_sq(rows.error, spread, sigma=beams.sigma)
+        if self.config.similarity is Similarity.EXPECTED:
+            spread = ((H[:, None, :] @ self._covariance[keyframe])[:, 0] * H).sum(axis=1)
+        return expected_mahalanobis_sq(error, spread, sigma=self._beams.sigma)

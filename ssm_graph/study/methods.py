@@ -14,7 +14,7 @@ from ssm_graph.estimate import Estimate, OnKeyframe
 from ssm_graph.filters.geodetic import GeodeticConfig
 from ssm_graph.filters.named import FILTERS, FilterChoice, filter_geodetic, filter_problems
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
-from ssm_graph.smoothers.fixed_lag import FixedLagConfig, FixedLagSmoother
+from ssm_graph.smoothers.fixed_lag import FixedLagConfig, solve_fixed_lag
 from ssm_graph.smoothers.gnc import Graduation
 from ssm_graph.study.trials import Trial
 
@@ -157,14 +157,14 @@ def _make_geodetic(value: float | None) -> Solver:
 def _fixed_lag_family(states: str, description: str, lag_s: float | None = None) -> Family:
     def make(value: float | None) -> Solver:
         chosen_s = value if lag_s is None else lag_s
-        smoother = FixedLagSmoother(
-            FixedLagConfig() if chosen_s is None else FixedLagConfig(chosen_s)
-        )
+        config = FixedLagConfig() if chosen_s is None else FixedLagConfig(chosen_s)
 
         def solve(
             trials: Sequence[Trial], *, on_keyframe: OnKeyframe | None = None
         ) -> list[Estimate]:
-            results = (smoother.solve(trial.problem, on_keyframe=on_keyframe) for trial in trials)
+            results = (
+                solve_fixed_lag(trial.problem, config, on_keyframe=on_keyframe) for trial in trials
+            )
             return [getattr(result, states) for result in results]
 
         return solve

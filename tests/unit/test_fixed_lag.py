@@ -8,14 +8,15 @@ import pytest
 from factors.similarity import GaussianKernel, LogKernel
 from ssm_graph.errors import ConfigError
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.graph.marginal_prior import prior_on_last
 from ssm_graph.graph.solve import marginal_covariances, solve_linear
 from ssm_graph.graph.states import retract, states_from_arrays
-from ssm_graph.problem.problem import Problem, build_problem, with_dvl
-from ssm_graph.problem.window import window_of
+from ssm_graph.problem.problem import Problem, build_problem, start_of, with_dvl
 from ssm_graph.simulation import Grade, OutlierKind, Outliers
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
-from ssm_graph.smoothers.fixed_lag import FixedLagConfig, FixedLagSmoother
+from ssm_graph.smoothers.chain import Chain
+from ssm_graph.smoothers.fixed_lag import FixedLagConfig, run_fixed_lag, solve_fixed_lag
+from ssm_graph.smoothers.keyframe import keyframes_of, sensors_of
+from ssm_graph.smoothers.window import Window
 from tests.helpers import simulated
 
 
@@ -34,7 +35,7 @@ def test_a_lag_as_long_as_the_mission_is_the_batch_smoother() -> None:
     """Nothing is ever marginalised: same states, covariances and weights."""
     problem = problem_of()
     batch = SsmSmoother(SmootherConfig(tolerance=1e-7)).solve(problem)
-    newest, delayed = FixedLagSmoother(FixedLagConfig(lag_s=12.0, tolerance=1e-7)).solve(problem)
+    newest, delayed = solve_fixed_lag(problem, FixedLagConfig(lag_s=12.0, tolerance=1e-7))
     mine, other = delayed.trajectory, batch.trajectory
     sigma = other.velocity_sigma_enu
     assert np.max(np.abs(mine.velocity_enu - other.velocity_enu) / sigma) < 1e-5
@@ -53,59 +54,96 @@ def test_gaussian_windows_of_any_lag_end_alike() -> None:
     """
     problem = problem_of(outliers=Outliers(), grade=Grade.NAVIGATION, depth=None)
     runs = [
-        FixedLagSmoother(FixedLagConfig(lag_s=lag, kernel=GaussianKernel())).run(problem).newest
+        run_fixed_lag(problem, FixedLagConfig(lag_s=lag, kernel=GaussianKernel())).newest
         for lag in (0.0, 3.0, 12.0)
     ]
     sigma = np.sqrt(np.diagonal(runs[-1].covariance, axis1=1, axis2=2))
     for run in runs[:-1]:
-        assert np.max(np.abs(run.v_n - runs[-1].v_n) / sigma[:, 6:9]) < 0.02
+        assert np.max(np.abs(run.states.v_n - runs[-1].states.v_n) / sigma[:, 6:9]) < 0.02
         np.testing.assert_allclose(
             np.diagonal(run.covariance, axis1=1, axis2=2), sigma**2, rtol=0.01
         )
 
 
-def test_marginal_prior_says_what_the_marginalised_graph_said() -> None:
-    """The last keyframe has the same step and covariance alone as with all before it."""
+def test_the_window_is_the_graph() -> None:
+    """At any states and weights, its rows lead to the step and the covariances of GTSAM's."""
     problem = problem_of(duration_s=6.0)
-    track = FixedLagSmoother(FixedLagConfig(lag_s=6.0)).run(problem).delayed
-    columns = (track.R_nb, track.p_n + 0.3, track.v_n, track.bias)
-    whole = states_from_arrays(*columns)
+    first, *others = keyframes_of(problem)
+    window = Window(sensors_of(problem), FixedLagConfig(lag_s=6.0), first, start_of(problem))
+    for keyframe in others:
+        window.advance(keyframe)
+    window.iterate()
+    states = states_from_arrays(*window.states)
     linearizer = GraphLinearizer(problem)
-    linearizer.follow(whole)
-    weights = np.ones(len(problem.beams.speed))
-    linear = linearizer.linearize(whole, linearizer.beam_rows(whole), weights)
+    linearizer.follow(states)
+    weights = window.all.weight
+    linear = linearizer.linearize(states, linearizer.beam_rows(states), weights)
     solution = solve_linear(linear, linearizer.ordering, n_keyframes=problem.n_keyframes)
-    prior = prior_on_last(whole, solution.R[-1], step=solution.last_step())
-    last = states_from_arrays(*(column[-1:] for column in columns))
-    n = problem.n_keyframes
-    alone = window_of(problem, range(n - 1, n), measured=range(n - 1, n - 1))
-    single = GraphLinearizer(alone, prior=prior)
-    again = single.linearize(last, single.beam_rows(last), np.zeros(0))
-    solved = solve_linear(again, single.ordering, n_keyframes=1)
-    np.testing.assert_allclose(solved.last_step(), solution.last_step(), rtol=1e-9, atol=1e-15)
-    np.testing.assert_allclose(
-        marginal_covariances(solved)[0], marginal_covariances(solution)[-1], rtol=1e-9, atol=1e-20
-    )
-    # The prior is a function of the state, wherever it is linearised: its minimum is found.
-    for _ in range(4):
-        last, _ = retract(last, solved.delta)
-        again = single.linearize(last, single.beam_rows(last), np.zeros(0))
-        solved = solve_linear(again, single.ordering, n_keyframes=1)
-    assert np.linalg.norm(prior.whitened(last)) < 1e-6
+    covariance = marginal_covariances(solution)
+    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    _, step = retract(states, solution.delta)
+    assert np.max(np.abs(step) / sigma) < 1e-6
+    unit = sigma[:, :, None] * sigma[:, None, :]
+    np.testing.assert_allclose((window.all.covariance - covariance) / unit, 0.0, atol=1e-6)
 
 
-def test_a_window_is_a_problem_of_its_own() -> None:
-    """Rows, readings and intervals of the keyframes asked for, counted from zero."""
+def test_what_did_not_change_need_not_be_eliminated_again() -> None:
+    """The chain from any keyframe on, or from the first, is the same; what is dropped is kept."""
+    rng = np.random.default_rng(0)
+    carried = np.column_stack([np.eye(15), rng.normal(size=15)])
+    rows = [rng.normal(size=(n, 16)) for n in (4, 0, 3, 5)]
+    between = [
+        np.column_stack([rng.normal(size=(15, 15)), np.eye(15), rng.normal(size=15)])
+        for _ in range(3)
+    ]
+    whole, parts = Chain(), Chain()
+    whole.eliminate(carried, rows, between, begin=0)
+    parts.eliminate(carried, rows[:2], between[:1], begin=0)
+    parts.eliminate(parts.carried[1], rows[1:], between[1:], begin=1)
+    for mine, other in zip(parts.solve(), whole.solve(), strict=True):
+        np.testing.assert_array_equal(mine, other)
+    dense = np.zeros((15 + 12 + 45, 60))
+    dense[:15, :15], b = carried[:, :15], [carried[:, 15]]
+    at = 15
+    for k, own in enumerate(rows):
+        dense[at : at + len(own), 15 * k : 15 * k + 15] = own[:, :15]
+        b.append(own[:, 15])
+        at += len(own)
+    for k, pair in enumerate(between):
+        dense[at : at + 15, 15 * k : 15 * k + 30] = pair[:, :30]
+        b.append(pair[:, 30])
+        at += 15
+    expected = np.linalg.lstsq(dense, np.concatenate(b))[0]
+    np.testing.assert_allclose(whole.solve()[0].ravel(), expected, rtol=1e-9)
+    covariance = np.linalg.inv(dense.T @ dense)
+    np.testing.assert_allclose(whole.solve()[1][1], covariance[15:30, 15:30], rtol=1e-9)
+    last = [column[-1] for column in whole.solve()]
+    whole.drop(2)
+    for mine, other in zip(whole.solve(), last, strict=True):
+        np.testing.assert_array_equal(mine[-1], other)
+
+
+def test_a_copy_goes_its_own_way() -> None:
+    """Going on with one leaves the other as it was; both end alike, given the same."""
     problem = problem_of()
-    window = window_of(problem, range(3, 8), measured=range(4, 7))
-    assert window.n_keyframes == 5
-    np.testing.assert_array_equal(window.keyframe_s, problem.keyframe_s[3:8])
-    assert len(window.chain.measurements) == 4
-    assert set(window.beams.keyframe.tolist()) == {1, 2, 3}
-    assert window.depths is not None
-    assert window.depths.gyro_b.shape == (5, 3)
-    inside = (problem.beams.keyframe >= 4) & (problem.beams.keyframe < 7)
-    np.testing.assert_array_equal(window.beams.speed, problem.beams.speed[inside])
+    first, *others = keyframes_of(problem)
+    window = Window(sensors_of(problem), FixedLagConfig(lag_s=4.0), first, start_of(problem))
+    for keyframe in others[:8]:
+        window.advance(keyframe)
+        window.iterate()
+    twin = window.copy()
+    before = twin.all
+    ends = []
+    for one in (window, twin):
+        for keyframe in others[8:]:
+            one.advance(keyframe)
+            one.iterate()
+        ends.append(one.newest)
+        if one is window:
+            np.testing.assert_array_equal(twin.all.states.p_n, before.states.p_n)
+            np.testing.assert_array_equal(twin.all.weight, before.weight)
+    sigma = np.sqrt(np.diagonal(ends[0].covariance[0]))
+    assert np.max(np.abs(ends[0].states.deviation_of(ends[1].states)) / sigma) < 1e-6
 
 
 def test_another_dvl_log_of_the_same_run() -> None:
@@ -140,6 +178,6 @@ def test_large_outliers_lose_their_weight_within_the_window() -> None:
     """A beam 3 m/s off ends near zero, the others near one."""
     problem = problem_of(duration_s=20.0, outliers=Outliers(OutlierKind.SPARSE, 0.2, (3.0, 3.0)))
     config = FixedLagConfig(lag_s=5.0, kernel=LogKernel())
-    weight = FixedLagSmoother(config).run(problem).delayed.weight
+    weight = run_fixed_lag(problem, config).delayed.weight
     assert weight.min() < 0.01
     assert np.median(weight) > 0.9

@@ -13,7 +13,7 @@ from ssm_graph.problem.error_state import Linearised
 from ssm_graph.problem.problem import Problem, build_problem
 from ssm_graph.simulation import Grade, OutlierKind, Outliers, SimulatedMission
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
-from ssm_graph.smoothers.fixed_lag import FixedLagConfig, FixedLagSmoother
+from ssm_graph.smoothers.fixed_lag import FixedLagConfig, solve_fixed_lag
 from tests.helpers import simulated
 
 
@@ -57,7 +57,7 @@ def test_three_ways_to_the_same_innovations() -> None:
     sim, problem = survey()
     expected = of_filter("ssm-log")
     config = FixedLagConfig(0.0, linearised=Linearised.ONCE)
-    graph = FixedLagSmoother(config).solve(problem).newest.beams.innovation
+    graph = solve_fixed_lag(problem, config).newest.beams.innovation
     (geodetic,) = filter_geodetic([problem], [sim.mission.imu])
     np.testing.assert_allclose(graph, expected, atol=1e-6)
     np.testing.assert_allclose(geodetic.beams.innovation, expected, atol=2e-5)
@@ -66,7 +66,7 @@ def test_three_ways_to_the_same_innovations() -> None:
 def test_a_smoother_looks_at_its_final_states() -> None:
     """The delayed states of a lag as long as the mission, and a pass backwards, as the batch."""
     problem = survey()[1]
-    lagged = FixedLagSmoother(FixedLagConfig(100.0)).solve(problem)
+    lagged = solve_fixed_lag(problem, FixedLagConfig(100.0))
     batch = SsmSmoother().solve(problem).beams.innovation
     np.testing.assert_allclose(lagged.delayed.beams.innovation, batch, atol=1e-5)
     assert np.abs(lagged.newest.beams.innovation - batch).max() > 1e-3

@@ -1,0 +1,137 @@
+"""What a window is told of one keyframe: its time, the way there, and what was measured."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+
+from ssm_graph.data import Array
+from ssm_graph.earth import LocalFrame
+from ssm_graph.imu.preintegration import Preintegrated
+from ssm_graph.problem.problem import Problem
+from ssm_graph.problem.timeline import Indices
+
+
+class Sensors(NamedTuple):
+    """What is the same at all keyframes of a vehicle."""
+
+    frame: LocalFrame
+    dvl_arm_b: Array
+    """(3,) m, body origin to instrument, as the next two"""
+    depth_arm_b: Array
+    gnss_arm_b: Array
+    depth_sigma: float
+    """m"""
+
+
+class BeamSpeeds(NamedTuple):
+    """Beam speeds of some keyframes, one row each, in order of time."""
+
+    speed: Array
+    """(M,) m/s"""
+    sigma: Array
+    """(M,) m/s"""
+    gyro_b: Array
+    """(M, 3) rad/s, mean over the ping"""
+    beam_b: Array
+    """(M, 3) unit vectors"""
+
+    @classmethod
+    def none(cls) -> BeamSpeeds:
+        """Return no rows."""
+        return cls(np.zeros(0), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
+
+    def followed_by(self, other: BeamSpeeds) -> BeamSpeeds:
+        """Return these rows, then the others."""
+        return BeamSpeeds(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
+
+    def without_first(self, count: int) -> BeamSpeeds:
+        """Return all rows but the first ones."""
+        return BeamSpeeds(*(column[count:] for column in self))
+
+
+class Way(NamedTuple):
+    """What the inertial sensors say of the interval before a keyframe."""
+
+    measured: Preintegrated
+    params: gtsam.PreintegrationCombinedParams
+    """Gravity in them follows the estimate."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Keyframe:
+    """One keyframe; nothing in it ever changes but the gravity of its interval."""
+
+    time_s: float
+    gyro_b: Array
+    """(3,) rad/s at the keyframe: it moves the depth sensor's lever arm"""
+    beams: BeamSpeeds
+    depth_s: Array
+    """(D,) s, readings since the keyframe before"""
+    depth: Array
+    """(D,) m, positive down"""
+    fix_n: Array
+    """(F, 3) m, GNSS antenna"""
+    fix_cov_n: Array
+    """(F, 3, 3) m^2"""
+    way: Way | None = None
+    """From the keyframe before; None for the first of all."""
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether anything but the inertial sensors has seen it."""
+        return len(self.beams.speed) + len(self.depth) + len(self.fix_n) > 0
+
+    def without_measurements(self) -> Keyframe:
+        """Return the keyframe as the inertial sensors alone know it."""
+        none = np.zeros(0)
+        return replace(
+            self,
+            beams=BeamSpeeds.none(),
+            depth_s=none,
+            depth=none,
+            fix_n=np.zeros((0, 3)),
+            fix_cov_n=np.zeros((0, 3, 3)),
+        )
+
+
+def sensors_of(problem: Problem) -> Sensors:
+    """Return what is the same at all keyframes of a mission."""
+    depths, fixes = problem.depths, problem.fixes
+    return Sensors(
+        problem.frame,
+        problem.beams.lever_arm_b,
+        np.zeros(3) if depths is None else depths.lever_arm_b,
+        np.zeros(3) if fixes is None else fixes.lever_arm_b,
+        np.inf if depths is None else depths.sigma,
+    )
+
+
+def keyframes_of(problem: Problem) -> Iterator[Keyframe]:
+    """Yield the keyframes of a mission in order of time."""
+    chain, beams, depths, fixes = problem.chain, problem.beams, problem.depths, problem.fixes
+    none = np.zeros(0)
+    for k, time_s in enumerate(problem.keyframe_s.tolist()):
+        b = _rows_of(k, beams.keyframe)
+        d = slice(0) if depths is None else _rows_of(k, depths.keyframe)
+        f = slice(0) if fixes is None else _rows_of(k, fixes.keyframe)
+        yield Keyframe(
+            time_s=time_s,
+            gyro_b=np.zeros(3) if depths is None else depths.gyro_b[k],
+            beams=BeamSpeeds(beams.speed[b], beams.sigma[b], beams.gyro_b[b], beams.beam_b[b]),
+            depth_s=none if depths is None else depths.time_s[d],
+            depth=none if depths is None else depths.depth[d],
+            fix_n=np.zeros((0, 3)) if fixes is None else fixes.position_n[f],
+            fix_cov_n=np.zeros((0, 3, 3)) if fixes is None else fixes.covariance_n[f],
+            way=Way(chain.measurements[k - 1], chain.params[k - 1]) if k else None,
+        )
+
+
+def _rows_of(k: int, keyframe: Indices) -> slice:
+    """Return which rows of a table, sorted by ``keyframe``, belong to one."""
+    begin, end = np.searchsorted(keyframe, [k, k + 1])
+    return slice(int(begin), int(end))

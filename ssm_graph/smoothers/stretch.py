@@ -1,0 +1,40 @@
+"""Successive keyframes as they were at one moment of their life."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ssm_graph.data import Array
+from ssm_graph.problem.states import NavigationStates
+
+
+class Stretch(NamedTuple):
+    """Successive keyframes as they were at one moment, with the beams of all of them."""
+
+    time_s: Array
+    """(K,) s"""
+    states: NavigationStates
+    """(K, ...)"""
+    covariance: Array
+    """(K, 15, 15)"""
+    n_beams: Array
+    """(K,)"""
+    innovation: Array
+    """(M,) m/s, measured minus predicted before the first update"""
+    mahalanobis_sq: Array
+    """(M,)"""
+    weight: Array
+    """(M,)"""
+
+
+def joined(stretches: Sequence[Stretch]) -> Stretch:
+    """Return successive stretches as one."""
+    time_s, states, *others = zip(*stretches, strict=True)
+    return Stretch(
+        np.concatenate(time_s),
+        NavigationStates(*(np.concatenate(column) for column in zip(*states, strict=True))),
+        *(np.concatenate(column) for column in others),
+    )
