@@ -194,13 +194,13 @@ class _ForwardPass:
         predicted = H @ self.P @ H.T
         if predicted.diagonal().max() > ANCHOR_SIGMA**2:
             predicted = self._forget_velocity(H, innovation, predicted)
-        weights = _settle_weights(innovation, predicted, variance, self.kernel)
+        weights = settle_weights(innovation, predicted, variance, self.kernel)
         self.without_beam = self.without_beam + 1 if np.all(weights < 0.01) else 0
         if self.without_beam >= LOCKED_OUT_PINGS:
             self.n_doubts += 1
             self.without_beam = 0
             predicted = self._forget_velocity(H, innovation, predicted)
-            weights = _settle_weights(innovation, predicted, variance, self.kernel)
+            weights = settle_weights(innovation, predicted, variance, self.kernel)
         self.weights[rows] = weights
         return _Rows(H, innovation, variance / weights)
 
@@ -233,7 +233,7 @@ _I = np.r_[0:9, 18:24]
 _J = np.r_[9:18, 24:30]
 
 
-def _settle_weights(innovation: Array, predicted: Array, variance: Array, kernel: Kernel) -> Array:
+def settle_weights(innovation: Array, predicted: Array, variance: Array, kernel: Kernel) -> Array:
     """Return the beams' weights at one ping, from those that pass the gate.
 
     The posterior of the innovation needs no state: with ``S = H P H' + R / weight`` it has mean

@@ -24,8 +24,9 @@ class FixedLagConfig:
     """Largest update, in its own posterior sigmas, at which a keyframe's iteration ends; not below
     1e-7 while the window has several."""
     linearised: Linearised = Linearised.EACH_PASS
-    relinearise_sigmas: float = 1e-4
-    """A keyframe of several is linearised anew once it has moved by so many posterior sigmas."""
+    relinearise_sigmas: float = 1e-5
+    """A keyframe of several is linearised anew once its attitude has moved by so many posterior
+    sigmas, or anything else, which bends the measurements far less, by ten times as many."""
     reweigh: float = 1e-9
     """A beam's weight, in a window of several keyframes, is renewed once it is off by so much."""
     first_estimates: bool = False

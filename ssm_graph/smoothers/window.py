@@ -6,9 +6,11 @@ import copy
 from typing import Self
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from factors.similarity import Similarity, expected_mahalanobis_sq
 from ssm_graph.data import Array
+from ssm_graph.graph.first_values import settle_weights
 from ssm_graph.graph.marginal_prior import MarginalPrior, moved_chart, prior_at_start, prior_on_last
 from ssm_graph.problem.error_state import STATE_DIM, InitialMoments, Linearised
 from ssm_graph.problem.states import NavigationStates
@@ -27,6 +29,7 @@ from ssm_graph.smoothers.window_rows import (
 )
 
 _NO_ROWS = np.zeros((0, STATE_DIM + 1))
+_BENDING = np.repeat([1.0, 0.1], [3, 12])
 ROUNDING = 1e-7
 """Posterior sigmas: updates of a window of several keyframes come down to a few 1e-8 and stay."""
 
@@ -119,6 +122,8 @@ class Window:
         self._append(keyframe)
         if leaving:
             self._marginalise(leaving)
+        if len(self.keyframes) > 1:
+            self._meet_prediction()
         return left
 
     def _keep_posterior(self) -> None:
@@ -178,6 +183,29 @@ class Window:
         self._targets = self._targets.take(np.s_[count:])
         for name in ("keyframes", "_depths", "_fixes", "_between"):
             setattr(self, name, getattr(self, name)[count:])
+
+    def _meet_prediction(self) -> None:
+        """Let the beams of the newest keyframe meet what all before it predict.
+
+        Beams start as they agree with that and with each other: with full weight one bad beam would
+        throw the whole window off, which then takes many passes to come back.
+        """
+        self._eliminate()
+        row = self._first_row[-2]
+        if row == len(self._weights):
+            return
+        carried = self._chain.carried[-1]
+        solved = solve_triangular(
+            carried[:, :STATE_DIM], np.column_stack([np.eye(STATE_DIM), carried[:, STATE_DIM]])
+        )
+        H = self._jacobian[row:]
+        root = H @ solved[:, :STATE_DIM]
+        innovation = -self._error[row:] - H @ solved[:, STATE_DIM]
+        weights = settle_weights(
+            innovation, root @ root.T, self._beams.sigma[row:] ** 2, self.config.kernel
+        )
+        self._weights = np.concatenate([self._weights[:row], weights])
+        self._stale = min(self._stale, len(self.keyframes) - 1)
 
     def _drop_rows(self, count: int) -> None:
         self._beams = self._beams.without_first(count)
@@ -252,7 +280,7 @@ class Window:
         sigma = np.sqrt(np.diagonal(self._covariance, axis1=1, axis2=2))
         is_single = len(self.keyframes) == 1
         threshold = 0.0 if is_single else self.config.relinearise_sigmas
-        moved = np.max(np.abs(self._step) / sigma, axis=1) > threshold
+        moved = np.max(np.abs(self._step) / sigma * _BENDING, axis=1) > threshold
         if self.config.first_estimates and not is_single:
             moved[0] = False
         if not moved.any():

@@ -11,7 +11,7 @@ from ssm_graph.graph.first_values import (
     GATE,
     LOCKED_OUT_PINGS,
     _ForwardPass,
-    _settle_weights,
+    settle_weights,
     first_values,
 )
 from ssm_graph.graph.linearize import inertial_graph
@@ -254,7 +254,7 @@ def test_settled_weights_are_a_fixed_point() -> None:
     H = rng.normal(size=(4, 3))
     predicted, variance = H @ H.T * 0.02**2, np.full(4, 0.005**2)
     innovation = np.array([0.01, -0.02, 0.015, 1.5])
-    weights = _settle_weights(innovation, predicted, variance, KERNEL)
+    weights = settle_weights(innovation, predicted, variance, KERNEL)
     S_inv = np.linalg.inv(predicted + np.diag(variance / weights))
     left = variance / weights * (S_inv @ innovation)
     spread = np.diagonal(predicted - predicted @ S_inv @ predicted)
@@ -268,6 +268,6 @@ def test_gate_keeps_an_outlier_out_of_the_first_round() -> None:
     predicted, variance = np.full((4, 4), 0.02**2) + 1e-8 * np.eye(4), np.full(4, 0.005**2)
     innovation = np.array([0.0, 0.0, 0.0, 30.0])
     assert innovation[3] ** 2 > GATE**2 * (predicted[3, 3] + variance[3])
-    weights = _settle_weights(innovation, predicted, variance, KERNEL)
+    weights = settle_weights(innovation, predicted, variance, KERNEL)
     assert weights[3] < 1e-5
     np.testing.assert_allclose(weights[:3], 1.08, atol=0.1)
