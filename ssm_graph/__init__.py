@@ -26,6 +26,7 @@ from ssm_graph.evaluation import Metrics, evaluate, reference_from_gnss
 from ssm_graph.filters.named import FILTERS, filter_problems
 from ssm_graph.io.mission import read_mission, write_mission
 from ssm_graph.io.results import read_results, write_results
+from ssm_graph.online import FixedLagSmoother
 from ssm_graph.problem.alignment import Alignment, align
 from ssm_graph.problem.problem import Problem, ProblemConfig, build_problem
 from ssm_graph.report.figure import save_figure
@@ -41,6 +42,7 @@ __all__ = [
     "Estimate",
     "ExpKernel",
     "FixedLagConfig",
+    "FixedLagSmoother",
     "GaussianKernel",
     "InitialState",
     "Iteration",

@@ -265,14 +265,19 @@ def _depths(mission: Mission, timeline: Timeline) -> Depths | None:
     )
 
 
+def fix_covariance_n(frame: LocalFrame, position_n: Array, sigma_enu: Array) -> Array:
+    """Return the covariances (F, 3, 3) of fixes in ``n`` from their sigmas (F, 3), m^2."""
+    R_nl = frame.R_nl_at(position_n)
+    covariance_l = sigma_enu[:, :, None] ** 2 * np.eye(3)
+    return np.asarray(R_nl @ covariance_l @ np.swapaxes(R_nl, 1, 2))
+
+
 def _fixes(log: GnssLog, frame: LocalFrame, timeline: Timeline) -> Fixes:
     fix = timeline.fix
-    position_n = frame.p_n_from_geodetic(log.lat[fix], log.lon[fix], log.height[fix])
-    R_nl = frame.R_nl_at(position_n)
-    covariance_l = log.sigma_enu[fix][:, :, None] ** 2 * np.eye(3)
+    place_n = frame.p_n_from_geodetic(log.lat[fix], log.lon[fix], log.height[fix])
     return Fixes(
         keyframe=timeline.fix_keyframe,
-        position_n=position_n,
-        covariance_n=R_nl @ covariance_l @ np.swapaxes(R_nl, 1, 2),
+        position_n=place_n,
+        covariance_n=fix_covariance_n(frame, place_n, log.sigma_enu[fix]),
         lever_arm_b=log.lever_arm_b,
     )

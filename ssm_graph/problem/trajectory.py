@@ -7,6 +7,7 @@ from typing import Protocol
 import numpy as np
 
 from ssm_graph.data import Array
+from ssm_graph.earth import LocalFrame
 from ssm_graph.estimate import Trajectory
 from ssm_graph.frames import phi_D_roll_pitch_heading, roll_pitch_heading_from_R_lb
 from ssm_graph.problem.error_state import POSITION, ROTATION, VELOCITY
@@ -37,14 +38,26 @@ def trajectory_from_states(
     problem: Problem, states: KeyframeStates, covariance: Array
 ) -> Trajectory:
     """Express states and their covariances (K, 15, 15) along east, north, up at the vehicle."""
-    frame = problem.frame
+    n_beams = np.bincount(problem.beams.keyframe, minlength=problem.n_keyframes).astype(float)
+    return trajectory_at(problem.frame, problem.keyframe_s, states, covariance, n_beams=n_beams)
+
+
+def trajectory_at(
+    frame: LocalFrame,
+    time_s: Array,
+    states: KeyframeStates,
+    covariance: Array,
+    *,
+    n_beams: Array,
+) -> Trajectory:
+    """Express states at any times (K,), with the beam speeds used at each, as a trajectory."""
     lat, lon, height = frame.geodetic_from_p_n(states.p_n)
     R_ln = np.swapaxes(frame.R_nl_at(states.p_n), 1, 2)
     R_lb = R_ln @ states.R_nb
     roll, pitch, heading = roll_pitch_heading_from_R_lb(R_lb)
     rph_D_phi = np.asarray(np.linalg.inv(phi_D_roll_pitch_heading(roll, pitch)), float)
     return Trajectory(
-        time_s=problem.keyframe_s,
+        time_s=time_s,
         lat=lat,
         lon=lon,
         height=height,
@@ -55,7 +68,7 @@ def trajectory_from_states(
         position_cov_enu=_turned(R_lb, covariance[:, POSITION, POSITION]),
         velocity_sigma_enu=_sigmas(_turned(R_ln, covariance[:, VELOCITY, VELOCITY])),
         attitude_sigma=_sigmas(_turned(rph_D_phi, covariance[:, ROTATION, ROTATION])),
-        n_beams=np.bincount(problem.beams.keyframe, minlength=problem.n_keyframes).astype(float),
+        n_beams=n_beams,
     )
 
 

@@ -29,6 +29,8 @@ class FixedLagConfig:
     sigmas, or anything else, which bends the measurements far less, by ten times as many."""
     reweigh: float = 1e-9
     """A beam's weight, in a window of several keyframes, is renewed once it is off by so much."""
+    gate_sigmas: float = np.inf
+    """Depth and GNSS further than this from what is predicted are left out."""
     first_estimates: bool = False
     """Keep the oldest keyframe where its prior was made, with the Jacobians of that point."""
 

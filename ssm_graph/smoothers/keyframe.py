@@ -31,6 +31,8 @@ class Sensors(NamedTuple):
 class BeamSpeeds(NamedTuple):
     """Beam speeds of some keyframes, one row each, in order of time."""
 
+    beam: Array
+    """(M,) 0 to 3"""
     speed: Array
     """(M,) m/s"""
     sigma: Array
@@ -43,7 +45,7 @@ class BeamSpeeds(NamedTuple):
     @classmethod
     def none(cls) -> BeamSpeeds:
         """Return no rows."""
-        return cls(np.zeros(0), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
+        return cls(*np.zeros((3, 0)), *np.zeros((2, 0, 3)))
 
     def followed_by(self, other: BeamSpeeds) -> BeamSpeeds:
         """Return these rows, then the others."""
@@ -86,17 +88,18 @@ class Keyframe:
         """Whether anything but the inertial sensors has seen it."""
         return len(self.beams.speed) + len(self.depth) + len(self.fix_n) > 0
 
-    def without_measurements(self) -> Keyframe:
-        """Return the keyframe as the inertial sensors alone know it."""
-        none = np.zeros(0)
-        return replace(
-            self,
-            beams=BeamSpeeds.none(),
-            depth_s=none,
-            depth=none,
-            fix_n=np.zeros((0, 3)),
-            fix_cov_n=np.zeros((0, 3, 3)),
-        )
+    def without(self, name: str) -> Keyframe:
+        """Return the keyframe without its ``depth`` or its ``fix``."""
+        if name == "depth":
+            return replace(self, depth_s=self.depth_s[:0], depth=self.depth[:0])
+        return replace(self, fix_n=self.fix_n[:0], fix_cov_n=self.fix_cov_n[:0])
+
+    @classmethod
+    def unmeasured(cls, time_s: float, gyro_b: Array, way: Way | None) -> Keyframe:
+        """Return a keyframe as the inertial sensors alone know it."""
+        none, no_fix = np.zeros(0), np.zeros((0, 3))
+        beams = BeamSpeeds.none()
+        return cls(time_s, gyro_b, beams, none, none, no_fix, np.zeros((0, 3, 3)), way)
 
 
 def sensors_of(problem: Problem) -> Sensors:
@@ -122,7 +125,13 @@ def keyframes_of(problem: Problem) -> Iterator[Keyframe]:
         yield Keyframe(
             time_s=time_s,
             gyro_b=np.zeros(3) if depths is None else depths.gyro_b[k],
-            beams=BeamSpeeds(beams.speed[b], beams.sigma[b], beams.gyro_b[b], beams.beam_b[b]),
+            beams=BeamSpeeds(
+                beams.beam[b].astype(float),
+                beams.speed[b],
+                beams.sigma[b],
+                beams.gyro_b[b],
+                beams.beam_b[b],
+            ),
             depth_s=none if depths is None else depths.time_s[d],
             depth=none if depths is None else depths.depth[d],
             fix_n=np.zeros((0, 3)) if fixes is None else fixes.position_n[f],

@@ -22,6 +22,8 @@ class Stretch(NamedTuple):
     """(K, 15, 15)"""
     n_beams: Array
     """(K,)"""
+    beam: Array
+    """(M,) 0 to 3, of each beam speed"""
     innovation: Array
     """(M,) m/s, measured minus predicted before the first update"""
     mahalanobis_sq: Array

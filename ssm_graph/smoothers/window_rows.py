@@ -25,7 +25,8 @@ from ssm_graph.smoothers.keyframe import BeamSpeeds, Keyframe, Sensors, Way
 # Columns of GTSAM's factor, x_i v_i x_j v_j b_i b_j and the right-hand side, as pairs of error
 # states.
 _COLUMNS = np.r_[0:9, 18:24, 9:18, 24:30, 30]
-_NO_ROWS = np.zeros((0, STATE_DIM + 1))
+NO_ROWS = np.zeros((0, STATE_DIM + 1))
+"""Of a keyframe without a measurement."""
 _KEYS = tuple((X(i), V(i), B(i)) for i in (0, 1))
 
 
@@ -59,6 +60,21 @@ class InertialRows:
             predicted.velocity()[None],
             last.bias,
         )
+
+    def carry(
+        self,
+        keyframe: Keyframe,
+        last: NavigationStates,
+        predicted: NavigationStates,
+        covariance: Array,
+    ) -> Array:
+        """Return the covariance (15, 15) at a predicted keyframe from that of the last one."""
+        (rows,) = self.rows([keyframe], last.followed_by(predicted))
+        # Whitened: A_i d_i + A_j d_j is noise of unit variance.
+        A_i, A_j = rows[:, :STATE_DIM], rows[:, STATE_DIM : 2 * STATE_DIM]
+        J = np.linalg.solve(A_j, np.hstack([-A_i, np.eye(STATE_DIM)]))
+        F, root_Q = J[:, :STATE_DIM], J[:, STATE_DIM:]
+        return np.asarray(F @ covariance @ F.T + root_Q @ root_Q.T)
 
     def set_gravity(self, ends: Sequence[Keyframe], states: NavigationStates) -> None:
         """Let gravity of the intervals before ``ends`` follow the states (1 + len(ends), ...)."""
@@ -120,7 +136,7 @@ def fix_rows(
 ) -> list[Array]:
     """Return the whitened rows (m, 16) of GNSS at each keyframe."""
     return [
-        _fix_rows(sensors, keyframe, states, i) if len(keyframe.fix_n) else _NO_ROWS
+        _fix_rows(sensors, keyframe, states, i) if len(keyframe.fix_n) else NO_ROWS
         for i, keyframe in enumerate(keyframes)
     ]
 
@@ -190,7 +206,7 @@ def depth_rows(
     rows[:, POSITION] = up_b
     rows[:, STATE_DIM] = ((targets.sensor_n - states.p_n - arm_n) * targets.up_n).sum(axis=1)
     rows *= (np.sqrt(count) / sensors.depth_sigma)[:, None]
-    return [rows[i : i + 1] if n else _NO_ROWS for i, n in enumerate(count.tolist())]
+    return [rows[i : i + 1] if n else NO_ROWS for i, n in enumerate(count.tolist())]
 
 
 def _fix_rows(sensors: Sensors, keyframe: Keyframe, states: NavigationStates, i: int) -> Array:

@@ -24,6 +24,7 @@ MAY_IMPORT = {
     "graph": FOUNDATION | {"problem", "imu", "factors"},
     "smoothers": FOUNDATION | {"graph", "problem", "imu", "factors"},
     "filters": FOUNDATION | {"problem", "imu", "factors"},
+    "online": FOUNDATION | {"smoothers", "problem", "imu", "factors"},
     "study": FOUNDATION
     | {"smoothers", "filters", "graph", "problem", "simulation", "evaluation"}
     | {"factors", "io"},

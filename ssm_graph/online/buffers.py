@@ -1,0 +1,110 @@
+"""What a live estimator has received and may still need, sensor by sensor."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from ssm_graph.data import N_BEAMS, Array, DepthLog, DvlLog, GnssLog, ImuLog, Mission
+from ssm_graph.earth import LocalFrame
+from ssm_graph.messages import DepthReading, Fix, ImuSample, Message, Ping, Vehicle
+from ssm_graph.online.rows import TimedRows
+
+DEFAULT_PERIOD_S: Final = 0.01
+"""Sampling interval of the inertial data before there are two samples."""
+
+
+class Buffers:
+    """Received rows in order of time; pings at the time they were taken."""
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self.vehicle = vehicle
+        self.imu = TimedRows(6)
+        self.pings = TimedRows(2 * N_BEAMS)
+        self.depths = TimedRows(1)
+        self.fixes = TimedRows(6)
+
+    def time_of(self, message: Message) -> float:
+        """Return when a message's content was true, s."""
+        late = self.vehicle.mount.time_offset_s if isinstance(message, Ping) else 0.0
+        return message.time_s - late
+
+    def add(self, message: Message) -> bool:
+        """Take a message; return False if one of its time is known."""
+        row = [self.time_of(message)]
+        match message:
+            case ImuSample():
+                return self.imu.add(np.array([*row, *message.gyro_b, *message.accel_b]))
+            case Ping():
+                return self.pings.add(np.array([*row, *message.speed, *self._sigma(message)]))
+            case DepthReading():
+                return self.depths.add(np.array([*row, message.depth]))
+            case Fix():
+                place = message.lat, message.lon, message.height
+                return self.fixes.add(np.array([*row, *place, *message.sigma_enu]))
+
+    def _sigma(self, ping: Ping) -> list[float]:
+        given = ping.sigma or (np.nan,) * N_BEAMS
+        return [s if s > 0.0 else self.vehicle.beam_sigma for s in given]
+
+    def drop_before(self, time_s: float) -> None:
+        """Forget what is older than a time."""
+        for rows in (self.imu, self.pings, self.depths, self.fixes):
+            rows.drop_before(time_s)
+
+    @property
+    def period_s(self) -> float:
+        """The usual interval from one inertial sample to the next, s."""
+        times = self.imu.all[-200:, 0]
+        return float(np.median(np.diff(times))) if len(times) > 1 else DEFAULT_PERIOD_S
+
+    def imu_log(self, begin_s: float, end_s: float, *, margin: int = 3) -> ImuLog:
+        """Return the samples that cover a span, and a few on both sides."""
+        rows = self.imu
+        first = max(rows.index(begin_s, after=True) - margin, 0)
+        last = rows.index(end_s) + 1 + margin
+        found = rows.all[first:last]
+        start_s = rows.all[first - 1, 0] if first else found[0, 0] - self.period_s
+        return ImuLog(
+            float(start_s), self.vehicle.imu_noise, found[:, 0], found[:, 1:4], found[:, 4:]
+        )
+
+    def mission(self, frame: LocalFrame) -> Mission:
+        """Return everything as a mission, to align with."""
+        vehicle = self.vehicle
+        pings, depths, fixes = self.pings.all, self.depths.all, self.fixes.all
+        end_s = self.imu.last_s
+        stamps = pings[:, 0] + vehicle.mount.time_offset_s
+        depth = None
+        if vehicle.depth_sigma is not None and len(depths):
+            depth = DepthLog(
+                vehicle.depth_sigma, depths[:, 0], depths[:, 1], vehicle.depth_lever_arm_b
+            )
+        return Mission(
+            vehicle.name,
+            frame,
+            self.imu_log(-np.inf, end_s, margin=0),
+            DvlLog(vehicle.mount, stamps, pings[:, 1:5], pings[:, 5:]),
+            depth,
+            GnssLog(
+                time_s=fixes[:, 0],
+                lat=fixes[:, 1],
+                lon=fixes[:, 2],
+                height=fixes[:, 3],
+                sigma_enu=fixes[:, 4:],
+                lever_arm_b=vehicle.gnss_lever_arm_b,
+            ),
+        )
+
+
+class Measured(NamedTuple):
+    """What belongs to one keyframe."""
+
+    time_s: float
+    pings: Array
+    """(P, 9) time, speeds, sigmas"""
+    fixes: Array
+    """(F, 7) time, latitude, longitude, height, sigmas"""
+    depths: Array
+    """(D, 2) time, depth"""

@@ -1,0 +1,34 @@
+"""Smoothed states that have left the window, as users know them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ssm_graph.earth import LocalFrame
+from ssm_graph.estimate import BeamTable, Trajectory
+from ssm_graph.problem.trajectory import trajectory_at
+from ssm_graph.smoothers.stretch import Stretch
+
+
+class Delayed(NamedTuple):
+    """Some successive keyframes: rows for ``trajectory.csv`` and ``beams.csv``."""
+
+    trajectory: Trajectory
+    beams: BeamTable
+
+
+def delayed_of(stretch: Stretch, frame: LocalFrame, *, shift_s: float) -> Delayed:
+    """Return a stretch on the vehicle's clock, which is ``shift_s`` behind ours."""
+    time_s = stretch.time_s - shift_s
+    return Delayed(
+        trajectory_at(frame, time_s, stretch.states, stretch.covariance, n_beams=stretch.n_beams),
+        BeamTable(
+            time_s=np.repeat(time_s, stretch.n_beams.astype(int)),
+            beam=stretch.beam + 1.0,
+            innovation=stretch.innovation,
+            mahalanobis_sq=stretch.mahalanobis_sq,
+            weight=stretch.weight,
+        ),
+    )

@@ -1,0 +1,117 @@
+"""Which keyframe comes next, and everything a window is told of it.
+
+A keyframe stands at every ping with a beam and at every fix, and at a fixed interval after the last
+one where both are silent. That depends on what was measured and not on when it came, so that late
+messages lead to the same keyframes as punctual ones.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ssm_graph.data import Array
+from ssm_graph.earth import LocalFrame
+from ssm_graph.imu.preintegration import preintegrate
+from ssm_graph.messages import Vehicle
+from ssm_graph.online.buffers import Buffers, Measured
+from ssm_graph.problem.problem import (
+    PING_WINDOW_S,
+    ProblemConfig,
+    fix_covariance_n,
+    mean_gyro,
+)
+from ssm_graph.problem.timeline import MIN_SPACING_S
+from ssm_graph.smoothers.keyframe import BeamSpeeds, Keyframe, Sensors, Way
+
+
+def sensors_of_vehicle(vehicle: Vehicle, frame: LocalFrame) -> Sensors:
+    """Return what is the same at all keyframes."""
+    sigma = vehicle.depth_sigma
+    return Sensors(
+        frame,
+        vehicle.mount.lever_arm_b,
+        vehicle.depth_lever_arm_b,
+        vehicle.gnss_lever_arm_b,
+        np.inf if sigma is None else sigma,
+    )
+
+
+class KeyframeMaker:
+    """Makes keyframes of what has been received."""
+
+    def __init__(self, buffers: Buffers, frame: LocalFrame, config: ProblemConfig) -> None:
+        self._buffers, self._frame, self._config = buffers, frame, config
+
+    def next_after(self, last_s: float) -> Measured | None:
+        """Return what belongs to the keyframe after ``last_s``; None while it is not covered.
+
+        The inertial data have to reach beyond it: a ping's gyro reading is a mean, and the change
+        of the rate within a sample is seen from its neighbours.
+        """
+        buffers = self._buffers
+        begin_s = last_s + MIN_SPACING_S
+        at_s = last_s + self._config.keyframe_interval_s
+        for rows in (self._usable_pings(begin_s, at_s), buffers.fixes.between(begin_s, at_s)):
+            if len(rows):
+                at_s = min(at_s, float(rows[0, 0]))
+        if not self._covers(at_s):
+            return None
+        end_s = at_s + MIN_SPACING_S
+        return Measured(
+            at_s,
+            self._usable_pings(begin_s, end_s),
+            buffers.fixes.between(begin_s, end_s),
+            buffers.depths.between(last_s, at_s),
+        )
+
+    def _usable_pings(self, begin_s: float, end_s: float) -> Array:
+        pings = self._buffers.pings.between(begin_s, end_s)
+        return pings[np.isfinite(pings[:, 1:5]).any(axis=1)]
+
+    def _covers(self, time_s: float) -> bool:
+        """Return whether the inertial data reach far enough beyond a time."""
+        imu = self._buffers.imu
+        return len(imu) - imu.index(time_s) >= 3 and imu.last_s >= time_s + 0.5 * PING_WINDOW_S
+
+    def make(self, measured: Measured, *, last_s: float | None) -> Keyframe:
+        """Return the keyframe; ``last_s`` is the time of the one before, None for the first."""
+        at_s = measured.time_s
+        begin_s = at_s if last_s is None else last_s
+        half = 0.5 * PING_WINDOW_S
+        imu = self._buffers.imu_log(begin_s - half, at_s + half)
+        way = None
+        if last_s is not None:
+            chain = preintegrate(
+                imu,
+                np.array([last_s, at_s]),
+                frame=self._frame,
+                rate_hz=self._config.merge_rate_hz,
+            )
+            way = Way(chain.measurements[0], chain.params[0])
+        gyro_b = mean_gyro(imu, np.array([at_s]))[0]
+        depths, has_depth = measured.depths, self._buffers.vehicle.depth_sigma is not None
+        fix_n, fix_cov_n = self._fixes(measured.fixes)
+        return Keyframe(
+            time_s=at_s,
+            gyro_b=gyro_b,
+            beams=self._beams(measured.pings, gyro_b),
+            depth_s=depths[:, 0] if has_depth else np.zeros(0),
+            depth=depths[:, 1] if has_depth else np.zeros(0),
+            fix_n=fix_n,
+            fix_cov_n=fix_cov_n,
+            way=way,
+        )
+
+    def _beams(self, pings: Array, gyro_b: Array) -> BeamSpeeds:
+        row, beam = np.nonzero(np.isfinite(pings[:, 1:5]))
+        return BeamSpeeds(
+            beam.astype(float),
+            pings[row, 1 + beam],
+            pings[row, 5 + beam],
+            np.broadcast_to(gyro_b, (len(row), 3)),
+            self._buffers.vehicle.mount.beams_b[beam],
+        )
+
+    def _fixes(self, fixes: Array) -> tuple[Array, Array]:
+        position_n = self._frame.p_n_from_geodetic(fixes[:, 1], fixes[:, 2], fixes[:, 3])
+        return position_n, fix_covariance_n(self._frame, position_n, fixes[:, 4:])

@@ -1,0 +1,68 @@
+"""Beginning anew where the answer can no longer be right, with what is still known."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from ssm_graph.online.watch import LOCKED_OUT_DEPTHS, LOCKED_OUT_FIXES, LOCKED_OUT_PINGS, Watch
+from ssm_graph.problem.error_state import POSITION, ROTATION, VELOCITY, InitialMoments
+from ssm_graph.smoothers.keyframe import Keyframe
+from ssm_graph.smoothers.window import Window
+
+SPEED_SIGMA: Final = 3.0
+"""m/s, what a vehicle's velocity can be."""
+POSITION_SIGMA: Final = 50.0
+"""m, how far a position is doubted that GNSS or depth contradict."""
+ATTITUDE_FACTOR: Final = 2.0
+"""Attitude is doubted as well, by so many of its sigmas."""
+
+
+def what_to_forget(watch: Watch) -> str | None:
+    """Say what contradicts the prediction for good; None as long as nothing does."""
+    if watch.pings_refused >= LOCKED_OUT_PINGS:
+        return (
+            f"{watch.pings_refused} pings in a row, whose beams agree with each other, contradict "
+            "the velocity"
+        )
+    if watch.fixes_refused >= LOCKED_OUT_FIXES:
+        return f"{watch.fixes_refused} GNSS fixes in a row contradict the position"
+    if watch.depths_refused >= LOCKED_OUT_DEPTHS:
+        return f"the depth has contradicted the height {watch.depths_refused} times in a row"
+    return None
+
+
+def reanchored(window: Window, keyframe: Keyframe, watch: Watch) -> Window:
+    """Return a window that begins at ``keyframe``, where the inertial data lead from the last one.
+
+    What was contradicted is forgotten: the velocity after a failed solution or pings that agree
+    with each other, the position after fixes or depths. Attitude is kept, with larger sigmas.
+    """
+    predicted, covariance = window.predicted(keyframe)
+    P = covariance.copy()
+    P[ROTATION, ROTATION] *= ATTITUDE_FACTOR**2
+    by_position = watch.fixes_refused >= LOCKED_OUT_FIXES
+    by_depth = watch.depths_refused >= LOCKED_OUT_DEPTHS
+    if by_position or by_depth:
+        P[POSITION, POSITION] += POSITION_SIGMA**2 * np.eye(3)
+    else:
+        P[VELOCITY, :] = P[:, VELOCITY] = 0.0
+        P[VELOCITY, VELOCITY] = SPEED_SIGMA**2 * np.eye(3)
+    R_nb, p_n, v_n, bias = (column[0] for column in predicted)
+    if not by_position and np.linalg.norm(v_n) > SPEED_SIGMA:
+        v_n = v_n * (SPEED_SIGMA / np.linalg.norm(v_n))
+    start = InitialMoments(R_nb, p_n, v_n, bias, _regular(P))
+    begun = Window(window.sensors, window.config, keyframe, start)
+    begun.iterate()
+    return begun
+
+
+def _regular(
+    P: np.ndarray[tuple[int, int], np.dtype[np.float64]],
+) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    """Return a symmetric covariance whose Cholesky factor exists."""
+    P = 0.5 * (P + P.T)
+    scale = np.sqrt(np.diag(P))
+    correlation = P / np.outer(scale, scale) + 1e-12 * np.eye(len(P))
+    return np.asarray(correlation * np.outer(scale, scale))

@@ -1,0 +1,174 @@
+"""Whether a live answer may be used: what is remembered from keyframe to keyframe, and the verdict.
+
+Everything is a function of the data up to a keyframe, so that late messages change the verdict as
+if they had been punctual.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from ssm_graph.data import N_BEAMS, Array
+from ssm_graph.messages import Health
+from ssm_graph.problem.doubts import LARGEST_SPEED, LOW_WEIGHT, MISFIT, TRUSTED
+from ssm_graph.problem.error_state import VELOCITY
+from ssm_graph.smoothers.keyframe import Keyframe
+from ssm_graph.smoothers.window import Window
+
+LOCK_LOST_S: Final = 3.0
+"""Without a beam that counts for so long, bottom lock is lost."""
+PROBATION_S: Final = 5.0
+"""So long after trouble an answer has to agree before it is good again."""
+MEMORY_S: Final = 10.0
+"""Time constant of the running means."""
+FORCES: Final = (8.5, 11.5)
+"""m/s^2, mean specific force of any vehicle that stays under water."""
+LOCKED_OUT_PINGS: Final = 3
+"""Pings in a row whose beams agree with each other but not with the prediction."""
+LOCKED_OUT_FIXES: Final = 5
+LOCKED_OUT_DEPTHS: Final = 25
+SILENT_IMU_S: Final = 1.0
+
+
+class Watch(NamedTuple):
+    """What is remembered from keyframe to keyframe."""
+
+    last_beam_s: float = -math.inf
+    """When a beam counted last, s"""
+    last_fix_s: float = -math.inf
+    pings_refused: int = 0
+    """Pings in a row that agree with themselves and not with the prediction"""
+    fixes_refused: int = 0
+    depths_refused: int = 0
+    good_share: float = 1.0
+    """Running mean of the share of beams that count"""
+    misfit: float = 1.0
+    """Running mean square of what the trusted beams miss, in sigmas"""
+    force: float = 9.8
+    """Running mean of the specific force, m/s^2"""
+    trouble_s: float = -math.inf
+    """When something was last wrong with the answer"""
+    trouble: str = ""
+    beam_weights: tuple[float, ...] = (math.nan,) * N_BEAMS
+
+
+def refused(before: Keyframe, after: Keyframe) -> tuple[bool, bool]:
+    """Return whether fixes, and depths, of a keyframe were left out by the window."""
+    return len(after.fix_n) < len(before.fix_n), len(after.depth) < len(before.depth)
+
+
+def observe(
+    watch: Watch, keyframe: Keyframe, window: Window, *, last_s: float, parity: bool, force: float
+) -> Watch:
+    """Return what is remembered after one more keyframe.
+
+    Parameters
+    ----------
+    watch : what was remembered before.
+    keyframe : as it was handed to the window.
+    window : settled with it.
+    last_s : time of the keyframe before, s.
+    parity : whether its beams agree with each other.
+    force : mean specific force since the keyframe before, m/s^2.
+    """
+    newest, time_s = window.newest, keyframe.time_s
+    kept = window.keyframes[-1]
+    no_fix, no_depth = refused(keyframe, kept)
+    share = 1.0 - math.exp(-(time_s - last_s) / MEMORY_S)
+    watch = watch._replace(force=watch.force + share * (force - watch.force))
+    if len(newest.weight):
+        counted = newest.weight >= TRUSTED
+        trusted = newest.mahalanobis_sq[counted]
+        is_out = bool(np.all(newest.weight < LOW_WEIGHT)) and parity
+        weights = [math.nan] * N_BEAMS
+        for beam, weight in zip(newest.beam.astype(int), newest.weight, strict=True):
+            weights[beam] = float(weight)
+        watch = watch._replace(
+            last_beam_s=time_s if counted.any() else watch.last_beam_s,
+            pings_refused=watch.pings_refused + 1 if is_out else 0,
+            good_share=watch.good_share + share * (float(counted.mean()) - watch.good_share),
+            beam_weights=tuple(weights),
+        )
+        if len(trusted):
+            watch = watch._replace(
+                misfit=watch.misfit + share * (float(trusted.mean()) - watch.misfit)
+            )
+    if len(keyframe.fix_n):
+        watch = watch._replace(
+            fixes_refused=watch.fixes_refused + 1 if no_fix else 0,
+            last_fix_s=watch.last_fix_s if no_fix else time_s,
+        )
+    if len(keyframe.depth):
+        watch = watch._replace(depths_refused=watch.depths_refused + 1 if no_depth else 0)
+    trouble = _trouble(watch, time_s, newest.states.v_n[0])
+    return watch._replace(trouble_s=time_s, trouble=trouble) if trouble else watch
+
+
+def _trouble(watch: Watch, time_s: float, v_n: Array) -> str:
+    """Say what is wrong with the answer now, if anything."""
+    speed = float(np.linalg.norm(v_n))
+    if speed > LARGEST_SPEED:
+        return f"a speed of {speed:.0f} m/s is no underwater vehicle's"
+    if not FORCES[0] < watch.force < FORCES[1]:
+        return (
+            f"the mean specific force is {watch.force:.2f} m/s^2, expected about 9.8: look at unit "
+            "and scale of the accelerometers"
+        )
+    if watch.pings_refused:
+        return f"{watch.pings_refused} pings in a row contradict the prediction"
+    if watch.fixes_refused:
+        return f"{watch.fixes_refused} GNSS fixes in a row contradict the prediction"
+    if watch.depths_refused:
+        return f"{watch.depths_refused} keyframes in a row contradict the depth"
+    if watch.misfit > MISFIT:
+        return f"the beams that count miss the answer by {math.sqrt(watch.misfit):.1f} sigmas"
+    if watch.good_share < 0.5 and time_s - watch.last_beam_s < LOCK_LOST_S:
+        return f"only {100.0 * watch.good_share:.0f} % of the beams agree with the answer"
+    return ""
+
+
+class Verdict(NamedTuple):
+    """What a user is told of the newest answer."""
+
+    health: Health
+    reason: str
+    confidence: float
+    bottom_lock: bool
+    since_aid_s: float
+
+
+def verdict(watch: Watch, *, now_s: float, imu_s: float, covariance: Array) -> Verdict:
+    """Judge the newest answer.
+
+    Parameters
+    ----------
+    watch : what is remembered.
+    now_s : newest time of any message.
+    imu_s : newest time of the inertial data.
+    covariance : (15, 15) of the newest answer.
+    """
+    since_beam_s, since_fix_s = (imu_s - t for t in (watch.last_beam_s, watch.last_fix_s))
+    since_aid_s = min(since_beam_s, since_fix_s)
+    has_lock = since_beam_s < LOCK_LOST_S
+    velocity_sigma = math.sqrt(max(float(np.trace(covariance[VELOCITY, VELOCITY])), 0.0))
+    health, reason = Health.GOOD, Health.GOOD.value
+    if now_s - imu_s > SILENT_IMU_S:
+        health = Health.BAD
+        reason = f"no inertial data for {now_s - imu_s:.1f} s: look at the IMU and its link"
+    elif not (np.all(np.isfinite(covariance)) and velocity_sigma < LARGEST_SPEED):
+        health, reason = Health.BAD, "the answer has run away"
+    elif imu_s - watch.trouble_s < PROBATION_S:
+        health, reason = Health.DEGRADED, watch.trouble
+    elif not has_lock:
+        health = Health.DEGRADED
+        since = f"for {since_beam_s:.0f} s" if math.isfinite(since_beam_s) else "yet"
+        reason = f"no beam has counted {since}: bottom lock is lost, sigmas grow"
+    confidence = 0.0
+    if health is not Health.BAD:
+        fresh = math.exp(-max(since_aid_s, 0.0) / 60.0)
+        confidence = min(1.0, watch.good_share) * fresh / max(1.0, math.sqrt(watch.misfit))
+        confidence = min(confidence, 0.45) if health is Health.DEGRADED else max(confidence, 0.5)
+    return Verdict(health, reason, confidence, has_lock, max(since_aid_s, 0.0))

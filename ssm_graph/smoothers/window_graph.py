@@ -1,0 +1,202 @@
+"""The graph of a window: its keyframes, their rows where they were linearised, and their chain."""
+
+from __future__ import annotations
+
+import copy
+from typing import Self
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from ssm_graph.data import Array
+from ssm_graph.graph.marginal_prior import MarginalPrior, prior_at_start, prior_on_last
+from ssm_graph.problem.error_state import STATE_DIM, InitialMoments
+from ssm_graph.problem.states import NavigationStates
+from ssm_graph.smoothers.chain import Chain
+from ssm_graph.smoothers.keyframe import BeamSpeeds, Keyframe, Sensors
+from ssm_graph.smoothers.window_rows import (
+    NO_ROWS,
+    InertialRows,
+    beam_rows,
+    depth_rows,
+    depth_targets,
+    fix_rows,
+)
+
+
+class WindowGraph:
+    """Successive keyframes, each linearised at a state of its own, and the prior on the first.
+
+    Arrays are replaced, never written into, so that a copy costs no more than its lists.
+    """
+
+    def __init__(self, sensors: Sensors, first: Keyframe, start: InitialMoments) -> None:
+        self.sensors = sensors
+        self.keyframes: list[Keyframe] = []
+        self.at = NavigationStates(*(column[None] for column in start[:4]))
+        """Where each keyframe is linearised"""
+        self.beams = BeamSpeeds.none()
+        self.error, self.jacobian = np.zeros(0), np.zeros((0, STATE_DIM))
+        """Of the beams, (M,) in m/s and (M, 15)"""
+        self.inertial = InertialRows(sensors.frame)
+        self.chain = Chain()
+        self.prior: MarginalPrior = prior_at_start(start)
+        self._depths: list[Array] = []
+        self._fixes: list[Array] = []
+        self._between: list[Array] = []
+        self._targets = depth_targets(sensors, [first], self.at, first_rise=0.0)
+        self._stale = 0
+        self._measure(first)
+
+    def copy(self) -> Self:
+        """Return a graph that goes its own way from here."""
+        twin = copy.copy(self)
+        for name in ("keyframes", "_depths", "_fixes", "_between"):
+            setattr(twin, name, getattr(self, name).copy())
+        twin.chain, twin._stale = Chain(), 0
+        return twin
+
+    def successor(self) -> Self:
+        """Return a copy with the chain; this graph is left without."""
+        twin = self.copy()
+        twin.chain, twin._stale = self.chain, self._stale
+        self.chain, self._stale = Chain(), 0
+        return twin
+
+    @property
+    def first_row(self) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+        """(K + 1,) where the beams of each keyframe begin, and where they end."""
+        counts = [len(keyframe.beams.speed) for keyframe in self.keyframes]
+        return np.concatenate([[0], np.cumsum(counts, dtype=np.intp)])
+
+    def changed_from(self, keyframe: int) -> None:
+        """Have the chain eliminated again from a keyframe on."""
+        self._stale = min(self._stale, keyframe)
+
+    def append(self, keyframe: Keyframe, last: NavigationStates) -> None:
+        """Add a keyframe where the inertial data lead from ``last`` (1, ...), the newest one."""
+        predicted = self.inertial.predict(keyframe, last)
+        self.at = self.at.followed_by(predicted)
+        self._between += self.inertial.rows([keyframe], self.at.take(np.s_[-2:]))
+        self.changed_from(len(self.keyframes) - 1)
+        pair = [self.keyframes[-1], keyframe]
+        both = last.followed_by(predicted)
+        targets = depth_targets(self.sensors, pair, both, first_rise=0.0)
+        self._targets = self._targets.followed_by(targets.take(np.s_[1:]))
+        self._measure(keyframe)
+
+    def _measure(self, keyframe: Keyframe) -> None:
+        """Add a keyframe's measurements, linearised."""
+        self.keyframes.append(keyframe)
+        at = self.at.take(np.s_[-1:])
+        here = np.zeros(len(keyframe.beams.speed), np.intp)
+        error, jacobian = beam_rows(self.sensors, keyframe.beams, at.take(here))
+        self.beams = self.beams.followed_by(keyframe.beams)
+        self.error = np.append(self.error, error)
+        self.jacobian = np.concatenate([self.jacobian, jacobian])
+        self._depths += depth_rows(self.sensors, [keyframe], at, self._targets.take(np.s_[-1:]))
+        self._fixes += fix_rows(self.sensors, [keyframe], at)
+
+    def keep_posterior(self, last: NavigationStates) -> None:
+        """Keep of all keyframes the newest, with what was found there as its prior."""
+        self.prior = prior_on_last(last, self.chain.root, step=np.zeros(STATE_DIM))
+        end = self.keyframes[-1]
+        self.drop(len(self.keyframes) - 1)
+        self._drop_rows(len(self.error))
+        self.at = last
+        self.keyframes = [Keyframe.unmeasured(end.time_s, end.gyro_b, end.way)]
+        self._depths, self._fixes = [NO_ROWS], [NO_ROWS]
+        self._stale = 0
+
+    def marginalise(self, count: int, weights: Array) -> None:
+        """Leave of the first keyframes a prior on the next, made where they are linearised."""
+        self.eliminate(weights)
+        carried = self.chain.carried[count]
+        R_nb, p_n, v_n, bias = (column[count] for column in self.at)
+        root, offset = carried[:, :STATE_DIM], carried[:, STATE_DIM]
+        self.prior = MarginalPrior(R_nb, p_n, v_n, bias, root, offset)
+        self.drop(count)
+
+    def drop(self, count: int) -> None:
+        """Forget the first keyframes."""
+        self._drop_rows(int(self.first_row[count]))
+        self.chain.drop(count)
+        self._stale = max(self._stale - count, 0)
+        self.at, self._targets = self.at.take(np.s_[count:]), self._targets.take(np.s_[count:])
+        for name in ("keyframes", "_depths", "_fixes", "_between"):
+            setattr(self, name, getattr(self, name)[count:])
+
+    def _drop_rows(self, count: int) -> None:
+        self.beams = self.beams.without_first(count)
+        self.error, self.jacobian = self.error[count:], self.jacobian[count:]
+
+    def eliminate(self, weights: Array) -> None:
+        """Bring the chain up to date from the first keyframe that has changed."""
+        begin = self._stale
+        if begin == len(self.keyframes):
+            return
+        first = self.first_row[begin:]
+        b = slice(first[0], None)
+        rows = np.column_stack([self.jacobian[b], -self.error[b]])
+        rows *= (np.sqrt(weights[b]) / self.beams.sigma[b])[:, None]
+        first = first - first[0]
+        own = [
+            np.concatenate([rows[first[i] : first[i + 1]], *aids])
+            for i, aids in enumerate(zip(self._depths[begin:], self._fixes[begin:], strict=True))
+        ]
+        carried = self.prior.rows(self.at) if begin == 0 else self.chain.carried[begin]
+        self.chain.eliminate(carried, own, self._between[begin:], begin=begin)
+        self._stale = len(self.keyframes)
+
+    def prediction(self, weights: Array) -> tuple[Array, Array]:
+        """Return what all before it say of the newest keyframe: step, and root of its covariance.
+
+        The covariance is ``root @ root.T``, both (15, 15); the step (15,) is off ``at``.
+        """
+        self.eliminate(weights)
+        carried = self.chain.carried[-1]
+        identity = np.eye(STATE_DIM)
+        solved = solve_triangular(
+            carried[:, :STATE_DIM], np.column_stack([identity, carried[:, STATE_DIM]])
+        )
+        return solved[:, STATE_DIM], solved[:, :STATE_DIM]
+
+    def leave_out_far(self, step: Array, root_cov: Array, *, sigmas: float) -> None:
+        """Leave out depth and GNSS of the newest keyframe that are far from its prediction."""
+        k = len(self.keyframes) - 1
+        for name, aids in (("depth", self._depths), ("fix", self._fixes)):
+            A, b = aids[k][:, :STATE_DIM], aids[k][:, STATE_DIM]
+            root, left = A @ root_cov, b - A @ step
+            distance_sq = left @ np.linalg.solve(root @ root.T + np.eye(len(b)), left)
+            if distance_sq > sigmas**2 * len(b):
+                self.keyframes[k] = self.keyframes[k].without(name)
+                aids[k] = NO_ROWS
+                self.changed_from(k)
+
+    def linearise(self, begin: int, step: Array) -> None:
+        """Move the keyframes from ``begin`` on by ``step`` (K - begin, 15); linearise there."""
+        before = max(begin - 1, 0)
+        moved = self.at.take(np.s_[begin:]).moved(step)
+        self.at = self.at.take(np.s_[:begin]).followed_by(moved)
+        if len(self.keyframes) > 1:  # a single keyframe keeps what its prediction came with
+            keyframes, near = self.keyframes[before:], self.at.take(np.s_[before:])
+            self.inertial.set_gravity(keyframes[1:], near)
+            self._between = self._between[:before] + self.inertial.rows(keyframes[1:], near)
+            first_rise = float(self._targets.rise[before])
+            targets = depth_targets(self.sensors, keyframes, near, first_rise=first_rise)
+            self._targets = self._targets.take(np.s_[:before]).followed_by(targets)
+        self._measure_again(begin)
+        self.changed_from(before)
+
+    def _measure_again(self, begin: int) -> None:
+        first = self.first_row
+        row = first[begin]
+        keyframe = np.repeat(np.arange(begin, len(self.keyframes)), np.diff(first[begin:]))
+        beams, at = self.beams.without_first(row), self.at.take(keyframe)
+        error, jacobian = beam_rows(self.sensors, beams, at)
+        self.error = np.concatenate([self.error[:row], error])
+        self.jacobian = np.concatenate([self.jacobian[:row], jacobian])
+        keyframes, at = self.keyframes[begin:], self.at.take(np.s_[begin:])
+        depths = depth_rows(self.sensors, keyframes, at, self._targets.take(np.s_[begin:]))
+        self._depths = self._depths[:begin] + depths
+        self._fixes = self._fixes[:begin] + fix_rows(self.sensors, keyframes, at)
