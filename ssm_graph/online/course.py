@@ -24,8 +24,8 @@ from ssm_graph.smoothers.stretch import Stretch
 from ssm_graph.smoothers.window import Window
 
 REACH_S: Final = 0.1
-"""A message changes keyframes that are no more than this older than it: a ping's gyro reading is a
-mean, and samples are seen with their neighbours."""
+"""A late inertial sample changes keyframes that are so much older: a ping's gyro reading is a mean,
+and samples are seen with their neighbours."""
 LEAST_LATE_S: Final = 1.0
 """Messages may be so late whatever the lag."""
 
@@ -72,9 +72,9 @@ class Course:
         return self.oldest.time_s + REACH_S
 
     def rewind(self, time_s: float) -> bool:
-        """Undo the steps that a message of this time would have changed."""
+        """Undo the steps from a time on; return whether there were any."""
         undone = False
-        while len(self._steps) > 1 and self._steps[-1].time_s >= time_s - REACH_S:
+        while len(self._steps) > 1 and self._steps[-1].time_s >= time_s:
             self._steps.pop()
             undone = True
         return undone

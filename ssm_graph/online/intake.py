@@ -123,7 +123,7 @@ class Intake:
     def _accept_sample(self, sample: ImuSample, now_s: float) -> float | None:
         """Take an inertial sample where one may be: next, after a gap, or in one."""
         time_s, period_s = sample.time_s, self.buffers.period_s
-        if time_s == now_s:
+        if self._is_known(sample):
             self.counts["imu repeated"] += 1
             return None
         is_next = now_s < time_s <= now_s + max(1.0, 20.0 * period_s)
@@ -133,6 +133,15 @@ class Intake:
         if self.horizon_s <= time_s < now_s and self._is_missing(time_s, period_s):
             return time_s if self._add(sample) else None
         return self._meet_another_clock(sample, now_s, period_s)
+
+    def _is_known(self, sample: ImuSample) -> bool:
+        """Return whether this very sample has come before."""
+        rows = self.buffers.imu
+        at = rows.index(sample.time_s)
+        if at == len(rows):
+            return False
+        known: list[float] = rows.all[at].tolist()
+        return known == [sample.time_s, *sample.gyro_b, *sample.accel_b]
 
     def _is_missing(self, time_s: float, period_s: float) -> bool:
         """Return whether a late sample has room of its own."""

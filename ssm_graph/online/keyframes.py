@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ssm_graph.data import Array
+from ssm_graph.data import Array, ImuLog
 from ssm_graph.earth import LocalFrame
 from ssm_graph.imu.preintegration import preintegrate
 from ssm_graph.messages import Vehicle
@@ -79,15 +79,7 @@ class KeyframeMaker:
         begin_s = at_s if last_s is None else last_s
         half = 0.5 * PING_WINDOW_S
         imu = self._buffers.imu_log(begin_s - half, at_s + half)
-        way = None
-        if last_s is not None:
-            chain = preintegrate(
-                imu,
-                np.array([last_s, at_s]),
-                frame=self._frame,
-                rate_hz=self._config.merge_rate_hz,
-            )
-            way = Way(chain.measurements[0], chain.params[0])
+        way = None if last_s is None else self._integrate(imu, last_s, at_s)
         gyro_b = mean_gyro(imu, np.array([at_s]))[0]
         depths, has_depth = measured.depths, self._buffers.vehicle.depth_sigma is not None
         fix_n, fix_cov_n = self._fixes(measured.fixes)
@@ -101,6 +93,20 @@ class KeyframeMaker:
             fix_cov_n=fix_cov_n,
             way=way,
         )
+
+    def way(self, begin_s: float, end_s: float) -> Way:
+        """Return what the inertial sensors say from one time to another."""
+        half = 0.5 * PING_WINDOW_S
+        return self._integrate(self._buffers.imu_log(begin_s - half, end_s + half), begin_s, end_s)
+
+    def _integrate(self, imu: ImuLog, begin_s: float, end_s: float) -> Way:
+        chain = preintegrate(
+            imu,
+            np.array([begin_s, end_s]),
+            frame=self._frame,
+            rate_hz=self._config.merge_rate_hz,
+        )
+        return Way(chain.measurements[0], chain.params[0])
 
     def _beams(self, pings: Array, gyro_b: Array) -> BeamSpeeds:
         row, beam = np.nonzero(np.isfinite(pings[:, 1:5]))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
-from typing import Final
+from collections.abc import Mapping
+from dataclasses import astuple, replace
+from typing import Any, Final, Self
 
 import numpy as np
 
 from ssm_graph.data import Array
+from ssm_graph.earth import LocalFrame
 from ssm_graph.messages import (
     Event,
     Health,
@@ -18,16 +20,24 @@ from ssm_graph.messages import (
     Severity,
     Vehicle,
 )
-from ssm_graph.online.course import Course, Step
+from ssm_graph.online.answer import answer
+from ssm_graph.online.course import REACH_S, Course, Step
 from ssm_graph.online.delayed import Delayed, delayed_of
 from ssm_graph.online.events import EventLog
 from ssm_graph.online.intake import Intake
 from ssm_graph.online.keyframes import KeyframeMaker, sensors_of_vehicle
 from ssm_graph.online.start import Beginning, Starter
-from ssm_graph.online.tail import Newest, Tail
-from ssm_graph.online.watch import Watch, verdict
+from ssm_graph.online.store import (
+    pack_buffers,
+    pack_step,
+    unpack_buffers,
+    unpack_left,
+    unpack_watch,
+)
+from ssm_graph.online.tail import Tail
+from ssm_graph.online.watch import Watch
 from ssm_graph.problem.problem import ProblemConfig
-from ssm_graph.problem.trajectory import trajectory_at
+from ssm_graph.problem.timeline import MIN_SPACING_S
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
 from ssm_graph.smoothers.keyframe import Keyframe
 from ssm_graph.smoothers.window import Window
@@ -76,6 +86,7 @@ class FixedLagSmoother:
         self._tail: Tail | None = None
         self._latest_s = -np.inf
         self._cost_s = 0.0
+        self._is_lost = False
         self._finished: list[Delayed] = []
 
     @property
@@ -86,15 +97,17 @@ class FixedLagSmoother:
     def push(self, message: Message) -> None:
         """Take one message; nothing that it may hold raises."""
         begin = time.perf_counter()
+        newest_s = self._intake.buffers.imu.last_s
         time_s = self._intake.accept(message)
         if time_s is None:
             return
+        is_late = time_s < newest_s or not isinstance(message, ImuSample)
         self._latest_s = max(self._latest_s, message.time_s + self._intake.shift_s)
-        is_made = self._update(message, time_s)
+        is_made = self._update(message, time_s, is_late=is_late)
         if is_made:
             self._cost_s = time.perf_counter() - begin
 
-    def _update(self, message: Message, time_s: float) -> bool:
+    def _update(self, message: Message, time_s: float, *, is_late: bool) -> bool:
         """Let the answer follow what has come; return whether a keyframe was made."""
         if self._course is None:
             return self._start()
@@ -102,7 +115,8 @@ class FixedLagSmoother:
         if isinstance(message, ImuSample) and self._is_gap(time_s):
             self._lose(time_s)
             return False
-        undone = time_s <= course.newest.time_s + 0.1 and course.rewind(time_s)
+        reach_s = REACH_S if isinstance(message, ImuSample) else MIN_SPACING_S
+        undone = is_late and course.rewind(time_s - reach_s)
         n_made = course.advance()
         self._intake.horizon_s = course.horizon_s
         if undone or n_made or self._tail is None:
@@ -125,11 +139,69 @@ class FixedLagSmoother:
         sensors = sensors_of_vehicle(self.vehicle, beginning.frame)
         window = Window(sensors, self.config, first, beginning.moments)
         window.iterate()
+        self._follow(Step(window, Watch(), None), maker)
+
+    def _follow(self, step: Step, maker: KeyframeMaker) -> None:
+        """Make all steps from a first one on."""
         null_b = np.linalg.svd(self.vehicle.mount.beams_b.T)[2][-1]
-        step = Step(window, Watch(), None)
-        self._course = Course(step, maker, buffers, self._events, null_b)
+        self._course = Course(step, maker, self._intake.buffers, self._events, null_b)
         self._course.advance()
+        self._intake.horizon_s = self._course.horizon_s
         self._tail = self._tail_of(self._course.newest)
+
+    def checkpoint(self) -> tuple[dict[str, Array], dict[str, Any]]:
+        """Return the state as plain arrays and plain numbers, for :meth:`restore`.
+
+        Delayed states that have not been taken are not in it: take them first.
+        """
+        intake = self._intake
+        arrays = pack_buffers(intake.buffers)
+        meta: dict[str, Any] = {
+            "shift_s": intake.shift_s,
+            "counts": dict(intake.counts),
+            "frame": None if self._frame is None else [*astuple(self._frame)],
+            "is_lost": self._is_lost,
+            "watch": None,
+        }
+        if self._course is not None:
+            packed, meta["watch"] = pack_step(self._course.oldest)
+            arrays |= packed
+        return arrays, meta
+
+    @classmethod
+    def restore(
+        cls,
+        vehicle: Vehicle,
+        config: FixedLagConfig | None,
+        arrays: Mapping[str, Array],
+        meta: Mapping[str, Any],
+        *,
+        problem_config: ProblemConfig | None = None,
+    ) -> Self:
+        """Return the estimator as it was when ``checkpoint`` was called."""
+        smoother = cls(vehicle, config, problem_config=problem_config)
+        intake = smoother._intake
+        intake.shift_s = float(meta["shift_s"])
+        intake.counts.update(meta["counts"])
+        unpack_buffers(arrays, intake.buffers)
+        smoother._latest_s = intake.buffers.imu.last_s
+        if meta["is_lost"]:
+            smoother._start_anew()
+        if meta["frame"] is not None:
+            smoother._frame = LocalFrame(*meta["frame"])
+        if meta["watch"] is not None:
+            assert smoother._frame is not None
+            packed = {
+                name.removeprefix("window_"): array
+                for name, array in arrays.items()
+                if name.startswith("window_")
+            }
+            maker = KeyframeMaker(intake.buffers, smoother._frame, smoother._problem_config)
+            sensors = sensors_of_vehicle(vehicle, smoother._frame)
+            window = Window.unpack(packed, sensors, smoother.config, maker.way)
+            step = Step(window, unpack_watch(meta["watch"]), unpack_left(arrays))
+            smoother._follow(step, maker)
+        return smoother
 
     def _is_gap(self, time_s: float) -> bool:
         assert self._course is not None
@@ -152,9 +224,13 @@ class FixedLagSmoother:
         self._course = self._tail = None
         self._intake.buffers.drop_before(time_s)
         self._intake.horizon_s = time_s
-        self._starter = Starter(
-            replace(self.vehicle, initial=None), self._problem_config, self._events
-        )
+        self._start_anew()
+
+    def _start_anew(self) -> None:
+        """Align without the initial state, which is of another time."""
+        self._is_lost = True
+        vehicle = replace(self.vehicle, initial=None)
+        self._starter = Starter(vehicle, self._problem_config, self._events)
 
     def _tail_of(self, step: Step) -> Tail:
         assert self._frame is not None
@@ -173,39 +249,14 @@ class FixedLagSmoother:
         """Return the state at the last inertial sample, None before there is any."""
         if self._course is None or self._tail is None:
             return None
-        return self._navigation(self._tail.newest(), self._course.newest.watch)
-
-    def _navigation(self, newest: Newest, watch: Watch) -> Navigation:
         assert self._frame is not None
-        told = verdict(
-            watch, now_s=self._latest_s, imu_s=newest.time_s, covariance=newest.covariance
-        )
-        at = trajectory_at(
+        return answer(
+            self._tail.newest(),
+            self._course.newest.watch,
             self._frame,
-            np.array([newest.time_s]),
-            newest.states,
-            newest.covariance[None],
-            n_beams=np.zeros(1),
-        )
-        return Navigation(
-            time_s=newest.time_s - self._intake.shift_s,
-            lat=float(at.lat[0]),
-            lon=float(at.lon[0]),
-            height=float(at.height[0]),
-            health=told.health,
-            reason=told.reason,
-            confidence=told.confidence,
-            bottom_lock=told.bottom_lock,
-            since_aid_s=told.since_aid_s,
+            latest_s=self._latest_s,
+            shift_s=self._intake.shift_s,
             latency_s=self._cost_s,
-            velocity_enu=at.velocity_enu[0],
-            roll_pitch_heading=at.roll_pitch_heading[0],
-            position_sigma_enu=_sigmas(at.position_cov_enu[0]),
-            velocity_sigma_enu=at.velocity_sigma_enu[0],
-            attitude_sigma=at.attitude_sigma[0],
-            gyro_bias=at.gyro_bias[0],
-            accel_bias=at.accel_bias[0],
-            beam_weights=np.array(watch.beam_weights),
         )
 
     def status(self) -> tuple[Health, str]:
@@ -240,7 +291,3 @@ class FixedLagSmoother:
             for stretch in course.take_settled(all_of_them=all_of_them)
             if len(stretch.time_s)
         ]
-
-
-def _sigmas(covariance: Array) -> Array:
-    return np.sqrt(np.diagonal(covariance))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable, Mapping
 from typing import Self
 
 import numpy as np
@@ -16,11 +17,12 @@ from ssm_graph.problem.error_state import STATE_DIM, InitialMoments, Linearised
 from ssm_graph.problem.states import NavigationStates
 from ssm_graph.problem.timeline import MIN_SPACING_S
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
-from ssm_graph.smoothers.keyframe import Keyframe, Sensors
+from ssm_graph.smoothers.keyframe import Keyframe, Sensors, Way
 from ssm_graph.smoothers.mixing import Mixing
 from ssm_graph.smoothers.stretch import Stretch
 from ssm_graph.smoothers.window_graph import WindowGraph
 
+_PACKED = ("step", "covariance", "innovation", "weights", "t")
 _BENDING = np.repeat([1.0, 0.1], [3, 12])
 """How much a component of the error state bends the measurements."""
 RUNAWAY_SPEED = 100.0
@@ -60,6 +62,27 @@ class Window:
         twin = copy.copy(self)
         twin._graph = self._graph.successor()
         return twin
+
+    def pack(self) -> dict[str, Array]:
+        """Return all that :meth:`unpack` needs to go on from here, as plain arrays."""
+        own = {name: getattr(self, f"_{name}") for name in _PACKED}
+        return {**self._graph.pack(), **own}
+
+    @classmethod
+    def unpack(
+        cls,
+        arrays: Mapping[str, Array],
+        sensors: Sensors,
+        config: FixedLagConfig,
+        way: Callable[[float, float], Way],
+    ) -> Self:
+        """Return the window that was packed; ``way`` gives the inertial data between two times."""
+        window = cls.__new__(cls)
+        window.config = config
+        window._graph = WindowGraph.unpack(arrays, sensors, way)
+        for name in _PACKED:
+            setattr(window, f"_{name}", arrays[name])
+        return window
 
     @property
     def keyframes(self) -> list[Keyframe]:

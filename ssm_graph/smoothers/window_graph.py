@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable, Mapping
 from typing import Self
 
 import numpy as np
@@ -13,9 +14,11 @@ from ssm_graph.graph.marginal_prior import MarginalPrior, prior_at_start, prior_
 from ssm_graph.problem.error_state import STATE_DIM, InitialMoments
 from ssm_graph.problem.states import NavigationStates
 from ssm_graph.smoothers.chain import Chain
-from ssm_graph.smoothers.keyframe import BeamSpeeds, Keyframe, Sensors
+from ssm_graph.smoothers.keyframe import BeamSpeeds, Keyframe, Sensors, Way
+from ssm_graph.smoothers.keyframe_arrays import pack_keyframes, unpack_keyframes
 from ssm_graph.smoothers.window_rows import (
     NO_ROWS,
+    DepthTargets,
     InertialRows,
     beam_rows,
     depth_rows,
@@ -62,6 +65,35 @@ class WindowGraph:
         twin.chain, twin._stale = self.chain, self._stale
         self.chain, self._stale = Chain(), 0
         return twin
+
+    def pack(self) -> dict[str, Array]:
+        """Return all that :meth:`unpack` needs to go on from here, as plain arrays."""
+        return {
+            **{f"at_{name}": column for name, column in self.at._asdict().items()},
+            **{f"prior_{name}": column for name, column in self.prior._asdict().items()},
+            **{f"target_{name}": column for name, column in self._targets._asdict().items()},
+            **pack_keyframes(self.keyframes),
+        }
+
+    @classmethod
+    def unpack(
+        cls, arrays: Mapping[str, Array], sensors: Sensors, way: Callable[[float, float], Way]
+    ) -> Self:
+        """Return the graph that was packed; ``way`` gives the inertial data between two times."""
+        keyframes = unpack_keyframes(arrays, way)
+        at = NavigationStates(*(arrays[f"at_{name}"] for name in NavigationStates._fields))
+        R_nb, p_n, v_n, bias = (column[0] for column in at)
+        start = InitialMoments(R_nb, p_n, v_n, bias, np.eye(STATE_DIM))
+        graph = cls(sensors, keyframes[0], start)
+        graph.keyframes, graph.at = keyframes, at
+        graph.prior = MarginalPrior(*(arrays[f"prior_{n}"] for n in MarginalPrior._fields))
+        graph._targets = DepthTargets(*(arrays[f"target_{n}"] for n in DepthTargets._fields))
+        for keyframe in keyframes[1:]:
+            graph.beams = graph.beams.followed_by(keyframe.beams)
+        graph.inertial.set_gravity(keyframes[1:], at)
+        graph._between = graph.inertial.rows(keyframes[1:], at)
+        graph._measure_again(0)
+        return graph
 
     @property
     def first_row(self) -> np.ndarray[tuple[int], np.dtype[np.intp]]:

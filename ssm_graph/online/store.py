@@ -1,0 +1,69 @@
+"""The state of a live estimator as plain arrays and back.
+
+What is stored is the oldest step that messages may still undo, and everything received since: all
+later steps follow from these, and so does the answer to every late message.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+
+from ssm_graph.data import Array
+from ssm_graph.online.buffers import Buffers
+from ssm_graph.online.course import Step
+from ssm_graph.online.watch import Watch
+from ssm_graph.problem.states import NavigationStates
+from ssm_graph.smoothers.stretch import Stretch
+
+TABLES: Final = ("imu", "pings", "depths", "fixes")
+
+
+def pack_buffers(buffers: Buffers) -> dict[str, Array]:
+    """Return all rows that were received and kept."""
+    return {f"rows_{name}": getattr(buffers, name).all.copy() for name in TABLES}
+
+
+def unpack_buffers(arrays: Mapping[str, Array], buffers: Buffers) -> None:
+    """Fill empty buffers."""
+    for name in TABLES:
+        for row in arrays[f"rows_{name}"]:
+            getattr(buffers, name).add(row)
+
+
+def pack_step(step: Step) -> tuple[dict[str, Array], dict[str, Any]]:
+    """Return arrays of the window and of what left it, and the plain numbers of the watch."""
+    arrays = {f"window_{name}": array for name, array in step.window.pack().items()}
+    if step.left is not None:
+        states = {f"states_{k}": v for k, v in step.left.states._asdict().items()}
+        others = {k: v for k, v in step.left._asdict().items() if k != "states"}
+        arrays |= {f"left_{name}": array for name, array in {**states, **others}.items()}
+    return arrays, {name: _plain(value) for name, value in step.watch._asdict().items()}
+
+
+def unpack_watch(plain: Mapping[str, Any]) -> Watch:
+    """Return the watch that was packed."""
+    numbers: dict[str, Any] = {
+        name: float(value) if isinstance(value, str) and name != "trouble" else value
+        for name, value in plain.items()
+    }
+    numbers["beam_weights"] = tuple(float(weight) for weight in plain["beam_weights"])
+    return Watch(**numbers)
+
+
+def unpack_left(arrays: Mapping[str, Array]) -> Stretch | None:
+    """Return what had left the window with the step."""
+    if "left_time_s" not in arrays:
+        return None
+    states = NavigationStates(*(arrays[f"left_states_{n}"] for n in NavigationStates._fields))
+    others = {n: arrays[f"left_{n}"] for n in Stretch._fields if n != "states"}
+    return Stretch(states=states, **others)
+
+
+def _plain(value: Any) -> Any:
+    """Return a number that JSON can hold: infinite ones and NaN as text."""
+    if isinstance(value, tuple):
+        return [_plain(v) for v in value]
+    return str(value) if isinstance(value, float) and not np.isfinite(value) else value
