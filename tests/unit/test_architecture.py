@@ -16,7 +16,7 @@ FOUNDATION = {"errors", "earth", "frames", "data", "estimate", "messages"}
 MAY_IMPORT = {
     "factors": set[str](),
     "io": FOUNDATION,
-    "live": FOUNDATION,
+    "live": FOUNDATION | {"io"},
     "imu": FOUNDATION,
     "simulation": FOUNDATION - {"frames"},
     "evaluation": FOUNDATION,

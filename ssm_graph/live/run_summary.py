@@ -1,0 +1,44 @@
+"""The ``summary.json`` of a live run."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ssm_graph.estimate import Status
+from ssm_graph.io.results_summary import as_json, versions
+from ssm_graph.live.json_messages import navigation_fields
+from ssm_graph.live.run_folder import LOG_NAME, RunFolder
+from ssm_graph.messages import Health, Navigation
+
+_STATUS = {
+    Health.GOOD: Status.CONVERGED,
+    Health.DEGRADED: Status.SUSPECT,
+    Health.BAD: Status.DIVERGED,
+    Health.ALIGNING: Status.SUSPECT,
+}
+
+
+def summary_of(
+    folder: RunFolder, navigation: Navigation | None, ended: str, n_messages: int
+) -> dict[str, Any]:
+    """Return how a run ended, in the terms of the summaries of other estimators."""
+    health = Health.ALIGNING if navigation is None else navigation.health
+    status = _STATUS[health]
+    summary: dict[str, Any] = {
+        "mission": folder.vehicle.name,
+        "method": "live fixed lag, delayed states",
+        "kernel": folder.settings.get("kernel"),
+        "status": status.name,
+        "status_text": status.value,
+        "is_good": status.is_good,
+        "reason": health.value if navigation is None else navigation.reason,
+        "ended": ended,
+        "n_messages": n_messages,
+        "raw_log": LOG_NAME,
+        "newest": None if navigation is None else navigation_fields(navigation),
+        "settings": folder.settings,
+        "calibration": {},
+        "notes": [],
+        "versions": versions(),
+    }
+    return {key: as_json(value) for key, value in summary.items()}
