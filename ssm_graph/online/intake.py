@@ -52,7 +52,6 @@ class Intake:
         """What is older is refused."""
         self._events = events
         self._elsewhere: list[ImuSample] = []
-        self._last_speeds: tuple[float, ...] = ()
 
     def accept(self, message: Message) -> float | None:
         """Take a message; return the time that it adds to, None if it was refused."""
@@ -108,10 +107,9 @@ class Intake:
         if len(valid) == N_BEAMS and len(set(valid)) == 1:
             self._refuse(ping, now_s, "identical_beams", f"four beams of {valid[0]:g} m/s each")
             valid = []
-        elif valid and speeds == self._last_speeds:
+        elif valid and self._is_frozen(ping):
             self._refuse(ping, now_s, "repeated_speeds", f"the speeds {speeds} m/s once more")
             valid = []
-        self._last_speeds = speeds
         if not valid:
             return replace(ping, speed=(np.nan, np.nan, np.nan, np.nan))
         if max(map(abs, valid)) > LARGEST_SPEED:
@@ -119,6 +117,14 @@ class Intake:
             kept = [v if abs(v) <= LARGEST_SPEED else np.nan for v in speeds]
             return replace(ping, speed=(kept[0], kept[1], kept[2], kept[3]))
         return ping
+
+    def _is_frozen(self, ping: Ping) -> bool:
+        """Return whether the ping before or after, at another time, has the very same speeds."""
+        rows, time_s = self.buffers.pings, self.buffers.time_of(ping)
+        at = rows.index(time_s)
+        near = rows.all[max(at - 1, 0) : at + 2]
+        others = near[near[:, 0] != time_s, 1 : 1 + N_BEAMS]
+        return any(np.array_equal(other, ping.speed, equal_nan=True) for other in others)
 
     def _accept_sample(self, sample: ImuSample, now_s: float) -> float | None:
         """Take an inertial sample where one may be: next, after a gap, or in one."""
@@ -147,10 +153,8 @@ class Intake:
         """Return whether a late sample has room of its own."""
         rows = self.buffers.imu
         at = rows.index(time_s)
-        if at == 0:
-            return False
-        before_s, after_s = rows.all[at - 1, 0], rows.all[at, 0]
-        return bool(min(time_s - before_s, after_s - time_s) > 0.5 * period_s)
+        before_s = rows.all[at - 1, 0] if at else time_s - period_s
+        return bool(min(time_s - before_s, rows.all[at, 0] - time_s) > 0.5 * period_s)
 
     def _meet_another_clock(self, sample: ImuSample, now_s: float, period_s: float) -> float | None:
         """Wait for more of a time that is not ours; a whole row of samples makes it so."""

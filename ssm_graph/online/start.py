@@ -20,6 +20,8 @@ from ssm_graph.smoothers.fixed_lag import run_fixed_lag
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
 from ssm_graph.smoothers.mission import smooth
 
+SETTLE_S: Final = 1.0
+"""So much inertial data is waited for, since the first samples may come late as well."""
 TRY_EVERY_S: Final = 5.0
 LONGEST_S: Final = 300.0
 """Data to align with are kept for so long."""
@@ -46,7 +48,8 @@ class Starter:
 
     def find(self, buffers: Buffers) -> Beginning | None:
         """Return the beginning, None while there is none."""
-        if len(buffers.imu) < 10:
+        imu = buffers.imu
+        if len(imu) < 3 or imu.last_s - imu.all[0, 0] < SETTLE_S:
             return None
         if self._initial is not None:
             return self._given(self._initial, buffers)
@@ -62,7 +65,9 @@ class Starter:
             return None
 
     def _given(self, initial: InitialState, buffers: Buffers) -> Beginning | None:
-        first_s, last_s = float(buffers.imu.all[0, 0]), buffers.imu.last_s
+        # A little inside the first sample, whose begin is known to rounding only.
+        first_s = float(buffers.imu.all[0, 0]) - buffers.period_s + 1e-6
+        last_s = buffers.imu.last_s
         if last_s < initial.time_s:
             self.reason = f"waiting for the time of the initial state, {initial.time_s:.1f} s"
             return None

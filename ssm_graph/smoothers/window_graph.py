@@ -73,6 +73,7 @@ class WindowGraph:
             **{f"prior_{name}": column for name, column in self.prior._asdict().items()},
             **{f"target_{name}": column for name, column in self._targets._asdict().items()},
             **pack_keyframes(self.keyframes),
+            "between": np.array(self._between).reshape(-1, STATE_DIM, 2 * STATE_DIM + 1),
         }
 
     @classmethod
@@ -90,8 +91,7 @@ class WindowGraph:
         graph._targets = DepthTargets(*(arrays[f"target_{n}"] for n in DepthTargets._fields))
         for keyframe in keyframes[1:]:
             graph.beams = graph.beams.followed_by(keyframe.beams)
-        graph.inertial.set_gravity(keyframes[1:], at)
-        graph._between = graph.inertial.rows(keyframes[1:], at)
+        graph._between = list(arrays["between"])
         graph._measure_again(0)
         return graph
 

@@ -1,0 +1,75 @@
+"""Missions as messages for tests of the live estimator."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+
+from ssm_graph.data import Array
+from ssm_graph.io.replay import messages_of
+from ssm_graph.io.vehicle import vehicle_of
+from ssm_graph.messages import Message, Navigation, Vehicle
+from ssm_graph.online import ONLINE, FixedLagSmoother
+from ssm_graph.online.delayed import Delayed
+from ssm_graph.simulation import (
+    DvlSettings,
+    GnssSettings,
+    Grade,
+    OutlierKind,
+    Outliers,
+    SimulatedMission,
+)
+from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
+from tests.helpers import simulated
+
+SHORT = FixedLagConfig(
+    lag_s=3.0,
+    max_iterations=ONLINE.max_iterations,
+    tolerance=ONLINE.tolerance,
+    relinearise_sigmas=ONLINE.relinearise_sigmas,
+    reweigh=ONLINE.reweigh,
+    gate_sigmas=ONLINE.gate_sigmas,
+)
+
+
+@cache
+def stream(duration_s: float = 12.0, rate_hz: float = 2.0) -> tuple[SimulatedMission, Vehicle]:
+    """Return a tactical-grade mission with outliers, GNSS in its first half, and its vehicle."""
+    sim = simulated(
+        duration_s=duration_s,
+        grade=Grade.TACTICAL,
+        dvl=DvlSettings(rate_hz=rate_hz),
+        gnss=GnssSettings(windows=((0.0, 0.5 * duration_s),)),
+        outliers=Outliers(OutlierKind.SPARSE, rate=0.2),
+        seed=3,
+    )
+    return sim, vehicle_of(sim.mission)
+
+
+@cache
+def messages(duration_s: float = 12.0, rate_hz: float = 2.0) -> tuple[Message, ...]:
+    """Return the mission's messages in order of time."""
+    return tuple(messages_of(stream(duration_s, rate_hz)[0].mission))
+
+
+def run(
+    given: Sequence[Message], vehicle: Vehicle, config: FixedLagConfig = SHORT
+) -> tuple[Navigation, list[Delayed], FixedLagSmoother]:
+    """Return the newest answer, all delayed states, and the estimator."""
+    smoother = FixedLagSmoother(vehicle, config)
+    for message in given:
+        smoother.push(message)
+    newest = smoother.newest()
+    assert newest is not None
+    return newest, smoother.finish(), smoother
+
+
+def joined(delayed: Sequence[Delayed], name: str) -> Array:
+    """Return a column of the delayed trajectory, or of the beams if it has none of that name."""
+    parts = [
+        getattr(piece.trajectory, name, None) if name != "weight" else piece.beams.weight
+        for piece in delayed
+    ]
+    return np.concatenate([part for part in parts if part is not None])
