@@ -11,7 +11,7 @@ from importlib.metadata import version
 from rich.console import Console
 from rich.markup import escape
 
-from ssm_graph.cli import compare, convert, simulate, smooth
+from ssm_graph.cli import compare, convert, online, simulate, smooth
 from ssm_graph.cli import filter as filter_command
 from ssm_graph.errors import (
     ConfigError,
@@ -36,15 +36,19 @@ class ExitCode(IntEnum):
 
 EPILOG = """\
 exit codes:
-  0    done; for smooth and filter: converged; for compare: every run has a result
+  0    done; for smooth and filter: converged; for online: ended in order, the last answer good;
+       for compare: every run has a result
   1    a defect of this program
   2    a wrong option or setting, a missing extra
   3    the data of a mission cannot be used; the message says where and why
   4    smooth or filter ended with a result that must not be trusted blindly (iteration limit,
        interrupted after the first iteration, run away, or the data contradict it); it is written
-       all the same, and its status says so; compare: some runs have no result, the table says why
-  5    smooth found no finite result; nothing is written
-  130  interrupted, nothing written; compare keeps finished runs and goes on when started again
+       all the same, and its status says so; online: ended in order, the last answer was not good;
+       compare: some runs have no result, the table says why
+  5    smooth found no finite result, nothing is written; online: there never was an answer, what
+       came is logged
+  130  interrupted, nothing written; compare keeps finished runs and goes on when started again, and
+       so does online; it ends in order at the first SIGINT or SIGTERM, like this at the second
 """
 
 EXIT_CODES: tuple[tuple[type[SsmGraphError], ExitCode], ...] = (
@@ -66,7 +70,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=version("ssm-graph"))
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for module in (simulate, smooth, filter_command, compare, convert):
+    for module in (simulate, smooth, filter_command, online, compare, convert):
         module.add_parser(commands, epilog=EPILOG)
     return parser
 

@@ -119,7 +119,7 @@ def test_bad_data_and_missing_folders_have_their_codes(
 
 def test_help_lists_the_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
     """They stand in the help of every command."""
-    for words in ([], ["simulate"], ["smooth"], ["filter"], ["compare"], ["convert"]):
+    for words in ([], ["simulate"], ["smooth"], ["filter"], ["online"], ["compare"], ["convert"]):
         with pytest.raises(SystemExit) as stop:
             main([*words, "--help"])
         assert stop.value.code == 0
