@@ -11,6 +11,7 @@ from ssm_graph.earth import LocalFrame
 from ssm_graph.messages import DepthReading, Fix, ImuSample, Message, Ping, Vehicle
 from ssm_graph.online.rows import TimedRows
 
+PERIOD_EVERY: Final = 100
 DEFAULT_PERIOD_S: Final = 0.01
 """Sampling interval of the inertial data before there are two samples."""
 
@@ -24,6 +25,7 @@ class Buffers:
         self.pings = TimedRows(2 * N_BEAMS)
         self.depths = TimedRows(1)
         self.fixes = TimedRows(6)
+        self._period_s, self._n_imu = DEFAULT_PERIOD_S, 0
 
     def time_of(self, message: Message) -> float:
         """Return when a message's content was true, s."""
@@ -35,6 +37,7 @@ class Buffers:
         row = [self.time_of(message)]
         match message:
             case ImuSample():
+                self._n_imu += 1
                 return self.imu.add(np.array([*row, *message.gyro_b, *message.accel_b]))
             case Ping():
                 return self.pings.add(np.array([*row, *message.speed, *self._sigma(message)]))
@@ -55,9 +58,12 @@ class Buffers:
 
     @property
     def period_s(self) -> float:
-        """The usual interval from one inertial sample to the next, s."""
-        times = self.imu.all[-200:, 0]
-        return float(np.median(np.diff(times))) if len(times) > 1 else DEFAULT_PERIOD_S
+        """The usual interval from one inertial sample to the next, s; looked at now and then."""
+        if self._n_imu % PERIOD_EVERY == 0 or self._n_imu < PERIOD_EVERY:
+            times = self.imu.all[-2 * PERIOD_EVERY :, 0]
+            if len(times) > 1:
+                self._period_s = float(np.median(np.diff(times)))
+        return self._period_s
 
     def imu_log(self, begin_s: float, end_s: float, *, margin: int = 3) -> ImuLog:
         """Return the samples that cover a span, and a few on both sides."""

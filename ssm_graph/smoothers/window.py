@@ -21,6 +21,7 @@ from ssm_graph.smoothers.keyframe import Keyframe, Sensors, Way
 from ssm_graph.smoothers.mixing import Mixing
 from ssm_graph.smoothers.stretch import Stretch
 from ssm_graph.smoothers.window_graph import WindowGraph
+from ssm_graph.smoothers.window_rows import SEEN_BY_BEAMS
 
 _PACKED = ("step", "covariance", "innovation", "weights", "t")
 _BENDING = np.repeat([1.0, 0.1], [3, 12])
@@ -269,9 +270,10 @@ class Window:
     def _mahalanobis_sq(self) -> Array:
         graph = self._graph
         keyframe = np.repeat(np.arange(len(self.keyframes)), np.diff(graph.first_row))
-        H = graph.jacobian
-        error = graph.error + (H * self._step[keyframe]).sum(axis=1)
+        H = graph.jacobian[:, SEEN_BY_BEAMS]
+        error = graph.error + (H * self._step[:, SEEN_BY_BEAMS][keyframe]).sum(axis=1)
         spread = np.zeros(len(H))
         if self.config.similarity is Similarity.EXPECTED:
-            spread = ((H[:, None, :] @ self._covariance[keyframe])[:, 0] * H).sum(axis=1)
+            covariance = self._covariance[:, SEEN_BY_BEAMS[:, None], SEEN_BY_BEAMS]
+            spread = ((H[:, None, :] @ covariance[keyframe])[:, 0] * H).sum(axis=1)
         return expected_mahalanobis_sq(error, spread, sigma=graph.beams.sigma)

@@ -49,6 +49,8 @@ class WindowGraph:
         self._between: list[Array] = []
         self._targets = depth_targets(sensors, [first], self.at, first_rise=0.0)
         self._stale = 0
+        self.first_row = np.zeros(1, np.intp)
+        """(K + 1,) where the beams of each keyframe begin, and where they end"""
         self._measure(first)
 
     def copy(self) -> Self:
@@ -91,15 +93,11 @@ class WindowGraph:
         graph._targets = DepthTargets(*(arrays[f"target_{n}"] for n in DepthTargets._fields))
         for keyframe in keyframes[1:]:
             graph.beams = graph.beams.followed_by(keyframe.beams)
+        counts = [len(keyframe.beams.speed) for keyframe in keyframes]
+        graph.first_row = np.append(0, np.cumsum(counts, dtype=np.intp))
         graph._between = list(arrays["between"])
         graph._measure_again(0)
         return graph
-
-    @property
-    def first_row(self) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-        """(K + 1,) where the beams of each keyframe begin, and where they end."""
-        counts = [len(keyframe.beams.speed) for keyframe in self.keyframes]
-        return np.concatenate([[0], np.cumsum(counts, dtype=np.intp)])
 
     def changed_from(self, keyframe: int) -> None:
         """Have the chain eliminated again from a keyframe on."""
@@ -120,6 +118,8 @@ class WindowGraph:
     def _measure(self, keyframe: Keyframe) -> None:
         """Add a keyframe's measurements, linearised."""
         self.keyframes.append(keyframe)
+        n_rows = self.first_row[-1] + len(keyframe.beams.speed)
+        self.first_row = np.append(self.first_row, n_rows)
         at = self.at.take(np.s_[-1:])
         here = np.zeros(len(keyframe.beams.speed), np.intp)
         error, jacobian = beam_rows(self.sensors, keyframe.beams, at.take(here))
@@ -135,6 +135,7 @@ class WindowGraph:
         end = self.keyframes[-1]
         self.drop(len(self.keyframes) - 1)
         self._drop_rows(len(self.error))
+        self.first_row = np.zeros(2, np.intp)
         self.at = last
         self.keyframes = [Keyframe.unmeasured(end.time_s, end.gyro_b, end.way)]
         self._depths, self._fixes = [NO_ROWS], [NO_ROWS]
@@ -152,6 +153,7 @@ class WindowGraph:
     def drop(self, count: int) -> None:
         """Forget the first keyframes."""
         self._drop_rows(int(self.first_row[count]))
+        self.first_row = self.first_row[count:] - self.first_row[count]
         self.chain.drop(count)
         self._stale = max(self._stale - count, 0)
         self.at, self._targets = self.at.take(np.s_[count:]), self._targets.take(np.s_[count:])

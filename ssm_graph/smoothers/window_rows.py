@@ -25,6 +25,8 @@ from ssm_graph.smoothers.keyframe import BeamSpeeds, Keyframe, Sensors, Way
 # Columns of GTSAM's factor, x_i v_i x_j v_j b_i b_j and the right-hand side, as pairs of error
 # states.
 _COLUMNS = np.r_[0:9, 18:24, 9:18, 24:30, 30]
+SEEN_BY_BEAMS = np.r_[ROTATION, VELOCITY, GYRO_BIAS]
+"""Components of the error state that a beam depends on."""
 NO_ROWS = np.zeros((0, STATE_DIM + 1))
 """Of a keyframe without a measurement."""
 _KEYS = tuple((X(i), V(i), B(i)) for i in (0, 1))
