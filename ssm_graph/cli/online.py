@@ -33,7 +33,8 @@ from ssm_graph.live.interfaces import Connections, Engine
 from ssm_graph.live.publisher import Publisher
 from ssm_graph.live.replay_source import ReplaySource
 from ssm_graph.live.run_folder import RunFolder
-from ssm_graph.live.runner import RunEnd, Runner, RunnerConfig, StopReason
+from ssm_graph.live.run_summary import RunEnd, StopReason
+from ssm_graph.live.runner import Runner, RunnerConfig
 from ssm_graph.live.sockets import InputConfig, OutputConfig, SocketHub
 from ssm_graph.live.status import RunStatus
 from ssm_graph.messages import Health, Vehicle

@@ -147,9 +147,13 @@ def replay_speed(word: str) -> float | None:
 
 def input_configs(arguments: argparse.Namespace) -> list[InputConfig]:
     """Return the sources that were asked for."""
-    rate = arguments.max_rate
-    burst = math.ceil(2.0 * rate) if math.isfinite(rate) else 1
-    limits = Limits(messages_per_s=rate, burst=max(1, burst), stall_s=arguments.stall)
+    rate, usual = arguments.max_rate, Limits()
+    limits = Limits(
+        messages_per_s=rate,
+        burst=max(1, math.ceil(2.0 * rate)) if math.isfinite(rate) else 1,
+        bytes_per_s=max(1.0, rate / usual.messages_per_s) * usual.bytes_per_s,
+        stall_s=arguments.stall,
+    )
     return [
         InputConfig(
             name,

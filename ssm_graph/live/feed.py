@@ -46,8 +46,8 @@ class Limits:
     messages_per_s: float = 2000.0
     burst: int = 4000
     """Messages at once."""
-    bytes_per_s: float = 2e6
-    """In the mean; a source that sends more is read no faster."""
+    bytes_per_s: float = 6e5
+    """In the mean, 300 for every message; a source that sends more is read no faster."""
     stall_s: float = 10.0
     """Silence after which a connection is given up."""
     max_clients: int = 4

@@ -59,6 +59,8 @@ class Resumed:
     """Of the results and events; what is beyond is written once more."""
     n_messages: int = 0
     """That the estimator of the checkpoint had been given."""
+    data_s: float = 0.0
+    """Time of the last inertial one of them."""
     notes: tuple[str, ...] = ()
     """What a person should know, one sentence each."""
 
@@ -122,6 +124,7 @@ class RunFolder:
             offsets=meta["offsets"],
             sizes=meta["sizes"],
             n_messages=meta["n_messages"],
+            data_s=meta["data_s"],
             notes=(*found.notes, *self._missing(meta["sizes"])),
         )
 
@@ -158,7 +161,12 @@ class RunFolder:
             self.event_problem = f"{EVENTS_NAME} cannot be written: {error.strerror or error}"
 
     def write_checkpoint(
-        self, arrays: Mapping[str, Array], meta: Mapping[str, Any], *, n_messages: int
+        self,
+        arrays: Mapping[str, Array],
+        meta: Mapping[str, Any],
+        *,
+        n_messages: int,
+        data_s: float,
     ) -> None:
         """Begin to write the estimator's state of this very moment, with all sizes."""
         assert self.log is not None
@@ -169,6 +177,7 @@ class RunFolder:
             "offsets": self.log.offsets(),
             "sizes": sizes,
             "n_messages": n_messages,
+            "data_s": data_s,
         }
         self.writer.write(arrays, whole)
 

@@ -1,8 +1,9 @@
-"""The ``summary.json`` of a live run."""
+"""How a live run ended, and its ``summary.json``."""
 
 from __future__ import annotations
 
-from typing import Any
+from enum import Enum
+from typing import Any, Final, NamedTuple
 
 from ssm_graph.estimate import Status
 from ssm_graph.io.results_summary import as_json, versions
@@ -10,12 +11,34 @@ from ssm_graph.live.json_messages import navigation_fields
 from ssm_graph.live.run_folder import LOG_NAME, RunFolder
 from ssm_graph.messages import Health, Navigation
 
-_STATUS = {
+MOST_FAILURES: Final = 100
+"""Messages in a row that an estimator may fail at before the run is given up."""
+_STATUS: Final = {
     Health.GOOD: Status.CONVERGED,
     Health.DEGRADED: Status.SUSPECT,
     Health.BAD: Status.DIVERGED,
     Health.ALIGNING: Status.SUSPECT,
 }
+
+
+class StopReason(Enum):
+    """Why a run ended; the text is shown to the user."""
+
+    SOURCE_ENDED = "all messages were given"
+    ASKED = "it was asked to stop"
+    DURATION = "its time was over"
+    FAILED = f"the estimator failed at {MOST_FAILURES} messages in a row: a defect"
+
+
+class RunEnd(NamedTuple):
+    """How a run ended."""
+
+    reason: StopReason
+    navigation: Navigation | None
+    """The last answer."""
+    n_messages: int
+    n_errors: int
+    """Exceptions that nobody expected and the run survived."""
 
 
 def summary_of(

@@ -6,8 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from enum import Enum
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -16,12 +15,10 @@ from ssm_graph.live.interfaces import Connect, Connections, Delayed, Engine, Sou
 from ssm_graph.live.notices import Notices
 from ssm_graph.live.publisher import Every, Outlet, Publisher
 from ssm_graph.live.run_folder import Resumed, RunFolder
-from ssm_graph.live.run_summary import summary_of
+from ssm_graph.live.run_summary import MOST_FAILURES, RunEnd, StopReason, summary_of
 from ssm_graph.live.status import Latency, RunStatus
 from ssm_graph.messages import Event, ImuSample, Message, Navigation, Severity
 
-MOST_FAILURES: Final = 100
-"""Messages in a row that an estimator may fail at before the run is given up."""
 POLL_S: Final = 0.05
 N_EVENTS: Final = 8
 """Shown to a person."""
@@ -44,26 +41,6 @@ class RunnerConfig:
             value = getattr(self, name)
             if value is not None and not 0.0 < value < float("inf"):
                 raise ConfigError(f"{name}: expected a number above 0, got {value}")
-
-
-class StopReason(Enum):
-    """Why a run ended; the text is shown to the user."""
-
-    SOURCE_ENDED = "all messages were given"
-    ASKED = "it was asked to stop"
-    DURATION = "its time was over"
-    FAILED = f"the estimator failed at {MOST_FAILURES} messages in a row: a defect"
-
-
-class RunEnd(NamedTuple):
-    """How a run ended."""
-
-    reason: StopReason
-    navigation: Navigation | None
-    """The last answer."""
-    n_messages: int
-    n_errors: int
-    """Exceptions that nobody expected and the run survived."""
 
 
 class Runner:
@@ -154,7 +131,7 @@ class Runner:
     def _recover(self) -> None:
         """Bring the estimator to where an earlier process was when it ended, however it did."""
         resumed = self._restored(self.folder.resume())
-        self._n_messages = resumed.n_messages
+        self._n_messages, self._data_s = resumed.n_messages, resumed.data_s
         n_before = self._n_messages
         for message in self.folder.logged(resumed):
             self._push(message)
@@ -267,7 +244,9 @@ class Runner:
             return
         try:
             arrays, meta = self._estimator.checkpoint()
-            self.folder.write_checkpoint(arrays, meta, n_messages=self._n_messages)
+            self.folder.write_checkpoint(
+                arrays, meta, n_messages=self._n_messages, data_s=self._data_s
+            )
             self._checkpoint_s = self._data_s
         except Exception as failure:
             self._notices.failure("checkpoint", "checkpoint_failed", failure)
