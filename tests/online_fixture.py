@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -24,14 +25,7 @@ from ssm_graph.simulation import (
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
 from tests.helpers import simulated
 
-SHORT = FixedLagConfig(
-    lag_s=3.0,
-    max_iterations=ONLINE.max_iterations,
-    tolerance=ONLINE.tolerance,
-    relinearise_sigmas=ONLINE.relinearise_sigmas,
-    reweigh=ONLINE.reweigh,
-    gate_sigmas=ONLINE.gate_sigmas,
-)
+SHORT = replace(ONLINE, lag_s=3.0)
 
 
 @cache

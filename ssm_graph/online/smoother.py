@@ -44,9 +44,10 @@ from ssm_graph.smoothers.window import Window
 
 ONLINE: Final = FixedLagConfig(
     max_iterations=3,
-    tolerance=0.05,
-    relinearise_sigmas=0.3,
-    reweigh=0.05,
+    tolerance=0.02,
+    relinearise_sigmas=0.1,
+    relinearise_turn=5e-4,
+    reweigh=0.02,
     gate_sigmas=6.0,
 )
 """What a vehicle can afford; `benchmarks/online.py` compares it with windows solved to the end."""

@@ -27,6 +27,9 @@ class FixedLagConfig:
     relinearise_sigmas: float = 1e-5
     """A keyframe of several is linearised anew once its attitude has moved by so many posterior
     sigmas, or anything else, which bends the measurements far less, by ten times as many."""
+    relinearise_turn: float = 0.0
+    """And only if its attitude has moved by so many rad, or its velocity by a hundred times as many
+    m/s: what is less bends nothing, however certain."""
     reweigh: float = 1e-9
     """A beam's weight, in a window of several keyframes, is renewed once it is off by so much."""
     gate_sigmas: float = np.inf
@@ -41,7 +44,7 @@ class FixedLagConfig:
             raise ConfigError(f"max_iterations: expected 1 or more, got {self.max_iterations}")
         if not 0.0 < self.tolerance < 1.0:
             raise ConfigError(f"tolerance: expected a number in (0, 1), got {self.tolerance}")
-        for name in ("relinearise_sigmas", "reweigh"):
+        for name in ("relinearise_sigmas", "relinearise_turn", "reweigh"):
             if not 0.0 <= getattr(self, name) < 1.0:
                 raise ConfigError(f"{name}: expected a number in [0, 1), got {getattr(self, name)}")
         if self.linearised is Linearised.ONCE and self.lag_s > 0.0:

@@ -51,9 +51,9 @@ class BeamSpeeds(NamedTuple):
         """Return these rows, then the others."""
         return BeamSpeeds(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
 
-    def without_first(self, count: int) -> BeamSpeeds:
-        """Return all rows but the first ones."""
-        return BeamSpeeds(*(column[count:] for column in self))
+    def take(self, rows: slice) -> BeamSpeeds:
+        """Return some rows."""
+        return BeamSpeeds(*(column[rows] for column in self))
 
 
 class Way(NamedTuple):

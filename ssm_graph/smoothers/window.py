@@ -26,6 +26,8 @@ from ssm_graph.smoothers.window_rows import SEEN_BY_BEAMS
 _PACKED = ("step", "covariance", "innovation", "weights", "t")
 _BENDING = np.repeat([1.0, 0.1], [3, 12])
 """How much a component of the error state bends the measurements."""
+_AS_MUCH = np.repeat([1.0, 1e4, 1e2, 1e6], [3, 3, 3, 6])
+"""Metres, metres per second and biases that bend the measurements as much as a turn of 1 rad."""
 RUNAWAY_SPEED = 100.0
 """m/s"""
 ROUNDING = 1e-7
@@ -245,17 +247,21 @@ class Window:
         return update
 
     def _relinearise(self) -> None:
-        """Linearise anew from the first keyframe that has moved."""
+        """Linearise the keyframes anew from the first to the last that has moved too far."""
+        config, is_single = self.config, len(self.keyframes) == 1
         sigma = np.sqrt(np.diagonal(self._covariance, axis1=1, axis2=2))
-        is_single = len(self.keyframes) == 1
-        threshold = 0.0 if is_single else self.config.relinearise_sigmas
-        moved = np.max(np.abs(self._step) / sigma * _BENDING, axis=1) > threshold
-        if self.config.first_estimates and not is_single:
+        step = np.abs(self._step)
+        threshold = 0.0 if is_single else config.relinearise_sigmas
+        least = 0.0 if is_single else config.relinearise_turn
+        moved = ((step * _BENDING > threshold * sigma) & (step > least * _AS_MUCH)).any(axis=1)
+        if config.first_estimates and not is_single:
             moved[0] = False
         if moved.any():
-            begin = int(np.argmax(moved))
-            self._graph.linearise(begin, self._step[begin:])
-            self._step = np.concatenate([self._step[:begin], np.zeros_like(self._step[begin:])])
+            at = np.flatnonzero(moved)
+            begin, end = int(at[0]), int(at[-1]) + 1
+            self._graph.linearise(begin, end, self._step[begin:end])
+            self._step = self._step.copy()
+            self._step[begin:end] = 0.0
 
     def _renew(self, settled: Array) -> None:
         """Take the weights that have changed enough."""

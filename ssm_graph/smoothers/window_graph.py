@@ -96,7 +96,10 @@ class WindowGraph:
         counts = [len(keyframe.beams.speed) for keyframe in keyframes]
         graph.first_row = np.append(0, np.cumsum(counts, dtype=np.intp))
         graph._between = list(arrays["between"])
-        graph._measure_again(0)
+        graph.error = np.zeros(graph.first_row[-1])
+        graph.jacobian = np.zeros((len(graph.error), STATE_DIM))
+        graph._depths, graph._fixes = [], []
+        graph._measure_again(0, len(keyframes))
         return graph
 
     def changed_from(self, keyframe: int) -> None:
@@ -161,7 +164,7 @@ class WindowGraph:
             setattr(self, name, getattr(self, name)[count:])
 
     def _drop_rows(self, count: int) -> None:
-        self.beams = self.beams.without_first(count)
+        self.beams = self.beams.take(np.s_[count:])
         self.error, self.jacobian = self.error[count:], self.jacobian[count:]
 
     def eliminate(self, weights: Array) -> None:
@@ -207,30 +210,36 @@ class WindowGraph:
                 aids[k] = NO_ROWS
                 self.changed_from(k)
 
-    def linearise(self, begin: int, step: Array) -> None:
-        """Move the keyframes from ``begin`` on by ``step`` (K - begin, 15); linearise there."""
-        before = max(begin - 1, 0)
-        moved = self.at.take(np.s_[begin:]).moved(step)
-        self.at = self.at.take(np.s_[:begin]).followed_by(moved)
+    def linearise(self, begin: int, end: int, step: Array) -> None:
+        """Move successive keyframes by ``step`` (end - begin, 15) and linearise there."""
+        moved = self.at.take(np.s_[begin:end]).moved(step)
+        head, tail = self.at.take(np.s_[:begin]), self.at.take(np.s_[end:])
+        self.at = head.followed_by(moved).followed_by(tail)
+        before, behind = max(begin - 1, 0), min(end + 1, len(self.keyframes))
         if len(self.keyframes) > 1:  # a single keyframe keeps what its prediction came with
-            keyframes, near = self.keyframes[before:], self.at.take(np.s_[before:])
-            self.inertial.set_gravity(keyframes[1:], near)
-            self._between = self._between[:before] + self.inertial.rows(keyframes[1:], near)
-            first_rise = float(self._targets.rise[before])
-            targets = depth_targets(self.sensors, keyframes, near, first_rise=first_rise)
-            self._targets = self._targets.take(np.s_[:before]).followed_by(targets)
-        self._measure_again(begin)
+            self._linearise_ways(before, behind)
+        self._measure_again(begin, behind)
         self.changed_from(before)
 
-    def _measure_again(self, begin: int) -> None:
+    def _linearise_ways(self, begin: int, end: int) -> None:
+        """Linearise the ways between successive keyframes, and lead their depths along them."""
+        keyframes, at = self.keyframes[begin:end], self.at.take(np.s_[begin:end])
+        self.inertial.set_gravity(keyframes[1:], at)
+        self._between[begin : end - 1] = self.inertial.rows(keyframes[1:], at)
+        first_rise = float(self._targets.rise[begin])
+        targets = depth_targets(self.sensors, keyframes, at, first_rise=first_rise)
+        head, tail = self._targets.take(np.s_[:begin]), self._targets.take(np.s_[end:])
+        self._targets = head.followed_by(targets).followed_by(tail)
+
+    def _measure_again(self, begin: int, end: int) -> None:
+        """Linearise the measurements of successive keyframes."""
         first = self.first_row
-        row = first[begin]
-        keyframe = np.repeat(np.arange(begin, len(self.keyframes)), np.diff(first[begin:]))
-        beams, at = self.beams.without_first(row), self.at.take(keyframe)
-        error, jacobian = beam_rows(self.sensors, beams, at)
-        self.error = np.concatenate([self.error[:row], error])
-        self.jacobian = np.concatenate([self.jacobian[:row], jacobian])
-        keyframes, at = self.keyframes[begin:], self.at.take(np.s_[begin:])
-        depths = depth_rows(self.sensors, keyframes, at, self._targets.take(np.s_[begin:]))
-        self._depths = self._depths[:begin] + depths
-        self._fixes = self._fixes[:begin] + fix_rows(self.sensors, keyframes, at)
+        rows = slice(first[begin], first[end])
+        keyframe = np.repeat(np.arange(begin, end), np.diff(first[begin : end + 1]))
+        error, jacobian = beam_rows(self.sensors, self.beams.take(rows), self.at.take(keyframe))
+        self.error, self.jacobian = self.error.copy(), self.jacobian.copy()
+        self.error[rows], self.jacobian[rows] = error, jacobian
+        here = np.s_[begin:end]
+        keyframes, at = self.keyframes[here], self.at.take(here)
+        self._depths[here] = depth_rows(self.sensors, keyframes, at, self._targets.take(here))
+        self._fixes[here] = fix_rows(self.sensors, keyframes, at)
