@@ -205,11 +205,9 @@ class FixedLagSmoother:
         return smoother
 
     def _is_gap(self, time_s: float) -> bool:
-        assert self._course is not None
         samples = self._intake.buffers.imu
         at = samples.index(time_s)
-        before_s = samples.all[at - 1, 0] if at else -np.inf
-        return at == len(samples) - 1 and time_s - before_s > LONGEST_GAP_S
+        return bool(at > 0 and time_s - samples.all[at - 1, 0] > LONGEST_GAP_S)
 
     def _lose(self, time_s: float) -> None:
         """Give the answer up, keep what was found, and align anew."""
