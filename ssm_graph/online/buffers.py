@@ -51,6 +51,13 @@ class Buffers:
         given = ping.sigma or (np.nan,) * N_BEAMS
         return [s if s > 0.0 else self.vehicle.beam_sigma for s in given]
 
+    def counting(self, pings: Array) -> Array:
+        """Return pings (P, 9) without the speeds of infinite sigma, which are kept but not used."""
+        counting, unused = pings.copy(), np.isinf(pings[:, 1 + N_BEAMS :])
+        counting[:, 1 : 1 + N_BEAMS][unused] = np.nan
+        counting[:, 1 + N_BEAMS :][unused] = self.vehicle.beam_sigma
+        return counting
+
     def drop_before(self, time_s: float) -> None:
         """Forget what is older than a time."""
         for rows in (self.imu, self.pings, self.depths, self.fixes):
@@ -79,7 +86,8 @@ class Buffers:
     def mission(self, frame: LocalFrame) -> Mission:
         """Return everything as a mission, to align with."""
         vehicle = self.vehicle
-        pings, depths, fixes = self.pings.all, self.depths.all, self.fixes.all
+        pings = self.counting(self.pings.all)
+        depths, fixes = self.depths.all, self.fixes.all
         end_s = self.imu.last_s
         stamps = pings[:, 0] + vehicle.mount.time_offset_s
         depth = None

@@ -109,7 +109,8 @@ class Intake:
             valid = []
         elif valid and self._is_frozen(ping):
             self._refuse(ping, now_s, "repeated_speeds", f"the speeds {speeds} m/s once more")
-            valid = []
+            # Kept without counting: the next copy has to be known as one.
+            return replace(ping, sigma=(np.inf,) * N_BEAMS)
         if not valid:
             return replace(ping, speed=(np.nan, np.nan, np.nan, np.nan))
         if max(map(abs, valid)) > LARGEST_SPEED:
