@@ -110,7 +110,7 @@ class Intake:
         elif valid and self._is_frozen(ping):
             self._refuse(ping, now_s, "repeated_speeds", f"the speeds {speeds} m/s once more")
             # Kept without counting: the next copy has to be known as one.
-            return replace(ping, sigma=(np.inf,) * N_BEAMS)
+            return replace(ping, sigma=(np.inf, np.inf, np.inf, np.inf))
         if not valid:
             return replace(ping, speed=(np.nan, np.nan, np.nan, np.nan))
         if max(map(abs, valid)) > LARGEST_SPEED:
