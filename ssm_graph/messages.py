@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import Enum
-
-import numpy as np
 
 from ssm_graph.data import N_BEAMS, Array, DvlMount, FrozenArrays, ImuNoise, InitialState, shaped
 from ssm_graph.earth import LocalFrame
@@ -161,9 +160,11 @@ def bad_number(message: Message) -> str | None:
     Missing beams and sigmas of a ping are NaN on purpose; infinite ones are not.
     """
     for name in type(message).__slots__:
-        values = np.atleast_1d(np.asarray(getattr(message, name), dtype=float))
-        missing_allowed = isinstance(message, Ping) and name in ("speed", "sigma")
-        is_bad = np.isinf(values) if missing_allowed else ~np.isfinite(values)
-        if getattr(message, name) is not None and is_bad.any():
-            return name
+        value = getattr(message, name)
+        if value is None:
+            continue
+        may_miss = isinstance(message, Ping) and name in ("speed", "sigma")
+        for number in value if isinstance(value, tuple) else (value,):
+            if not math.isfinite(number) and not (may_miss and math.isnan(number)):
+                return name
     return None

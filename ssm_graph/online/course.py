@@ -18,7 +18,7 @@ from ssm_graph.online.buffers import Buffers, Measured
 from ssm_graph.online.events import EventLog
 from ssm_graph.online.keyframes import KeyframeMaker
 from ssm_graph.online.recovery import reanchored, what_to_forget
-from ssm_graph.online.watch import Watch, observe
+from ssm_graph.online.watch import LOCKED_OUT_DEPTHS, Watch, observe
 from ssm_graph.smoothers.keyframe import Keyframe
 from ssm_graph.smoothers.stretch import Stretch
 from ssm_graph.smoothers.window import Window
@@ -79,8 +79,13 @@ class Course:
             undone = True
         return undone
 
-    def advance(self) -> int:
-        """Make all steps that the data allow; return how many."""
+    def advance(self, *, is_sample: bool = False) -> int:
+        """Make all steps that the data allow; return how many.
+
+        ``is_sample`` says that nothing but one more inertial sample has come since the last call.
+        """
+        if is_sample and self._buffers.imu.last_s < self._maker.not_before_s:
+            return 0
         count = 0
         while (measured := self._maker.next_after(self.newest.time_s)) is not None:
             self._steps.append(self._step(measured))
@@ -123,8 +128,15 @@ class Course:
                 keyframe.time_s, Severity.ERROR, "recovered", f"{error}: begun anew from there"
             )
             window = reanchored(last.window, keyframe, last.watch)
-            fresh = Watch(trouble_s=keyframe.time_s, trouble=str(error))
-            fresh = fresh._replace(last_beam_s=last.watch.last_beam_s, force=last.watch.force)
+            refusals = last.watch.depths_refused
+            fresh = Watch(
+                last_beam_s=last.watch.last_beam_s,
+                depths_refused=refusals + (refusals == LOCKED_OUT_DEPTHS),
+                force=last.watch.force,
+                trouble_s=keyframe.time_s,
+                trouble=str(error),
+                begun_anew_s=keyframe.time_s,
+            )
             return Step(window, fresh, last.window.all)
         samples = self._buffers.imu.between(last.time_s, keyframe.time_s)
         force = float(np.linalg.norm(samples[:, 4:], axis=1).mean()) if len(samples) else 9.8

@@ -41,6 +41,8 @@ class KeyframeMaker:
 
     def __init__(self, buffers: Buffers, frame: LocalFrame, config: ProblemConfig) -> None:
         self._buffers, self._frame, self._config = buffers, frame, config
+        self.not_before_s = -np.inf
+        """Where the inertial data have to be before asking again is worth while."""
 
     def next_after(self, last_s: float) -> Measured | None:
         """Return what belongs to the keyframe after ``last_s``; None while it is not covered.
@@ -48,21 +50,24 @@ class KeyframeMaker:
         The inertial data have to reach beyond it: a ping's gyro reading is a mean, and the change
         of the rate within a sample is seen from its neighbours.
         """
-        buffers = self._buffers
-        begin_s = last_s + MIN_SPACING_S
-        at_s = last_s + self._config.keyframe_interval_s
-        for rows in (self._usable_pings(begin_s, at_s), buffers.fixes.between(begin_s, at_s)):
-            if len(rows):
-                at_s = min(at_s, float(rows[0, 0]))
+        buffers, at_s = self._buffers, self._next_time(last_s)
+        self.not_before_s = at_s + 0.5 * PING_WINDOW_S
         if not self._covers(at_s):
             return None
-        end_s = at_s + MIN_SPACING_S
+        begin_s, end_s = last_s + MIN_SPACING_S, at_s + MIN_SPACING_S
         return Measured(
             at_s,
             self._usable_pings(begin_s, end_s),
             buffers.fixes.between(begin_s, end_s),
             buffers.depths.between(last_s, at_s),
         )
+
+    def _next_time(self, last_s: float) -> float:
+        """Return the time of the keyframe after ``last_s``, as far as is known."""
+        begin_s = last_s + MIN_SPACING_S
+        at_s = last_s + self._config.keyframe_interval_s
+        pings, fixes = self._usable_pings(begin_s, at_s), self._buffers.fixes.between(begin_s, at_s)
+        return min([at_s, *pings[:1, 0].tolist(), *fixes[:1, 0].tolist()])
 
     def _usable_pings(self, begin_s: float, end_s: float) -> Array:
         pings = self._buffers.counting(self._buffers.pings.between(begin_s, end_s))

@@ -15,6 +15,7 @@ SPEED_SIGMA: Final = 3.0
 """m/s, what a vehicle's velocity can be."""
 POSITION_SIGMA: Final = 50.0
 """m, how far a position is doubted that GNSS or depth contradict."""
+LONGEST_DOUBT_S: Final = 60.0
 ATTITUDE_FACTOR: Final = 2.0
 """Attitude is doubted as well, by so many of its sigmas."""
 
@@ -28,7 +29,7 @@ def what_to_forget(watch: Watch) -> str | None:
         )
     if watch.fixes_refused >= LOCKED_OUT_FIXES:
         return f"{watch.fixes_refused} GNSS fixes in a row contradict the position"
-    if watch.depths_refused >= LOCKED_OUT_DEPTHS:
+    if watch.depths_refused == LOCKED_OUT_DEPTHS:  # once: if that does not help, it is the sensor
         return f"the depth has contradicted the height {watch.depths_refused} times in a row"
     return None
 
@@ -37,19 +38,25 @@ def reanchored(window: Window, keyframe: Keyframe, watch: Watch) -> Window:
     """Return a window that begins at ``keyframe``, where the inertial data lead from the last one.
 
     What was contradicted is forgotten: the velocity after a failed solution or pings that agree
-    with each other, the position after fixes or depths. Attitude is kept, with larger sigmas.
+    with each other, the position after fixes, the height after depths. Where the velocity was wrong
+    the position is doubted by what that may have done since a beam counted last. Attitude is kept,
+    with larger sigmas.
     """
     predicted, covariance = window.predicted(keyframe)
     P = covariance.copy()
     P[ROTATION, ROTATION] *= ATTITUDE_FACTOR**2
     by_position = watch.fixes_refused >= LOCKED_OUT_FIXES
-    by_depth = watch.depths_refused >= LOCKED_OUT_DEPTHS
-    if by_position or by_depth:
+    by_depth = watch.depths_refused == LOCKED_OUT_DEPTHS
+    R_nb, p_n, v_n, bias = (column[0] for column in predicted)
+    if by_position:
         P[POSITION, POSITION] += POSITION_SIGMA**2 * np.eye(3)
+    elif by_depth:
+        P[POSITION, POSITION] += POSITION_SIGMA**2 * np.outer(R_nb[2], R_nb[2])
     else:
         P[VELOCITY, :] = P[:, VELOCITY] = 0.0
         P[VELOCITY, VELOCITY] = SPEED_SIGMA**2 * np.eye(3)
-    R_nb, p_n, v_n, bias = (column[0] for column in predicted)
+        since_s = min(keyframe.time_s - watch.last_beam_s, LONGEST_DOUBT_S)
+        P[POSITION, POSITION] += (SPEED_SIGMA * since_s) ** 2 * np.eye(3)
     if not by_position and np.linalg.norm(v_n) > SPEED_SIGMA:
         v_n = v_n * (SPEED_SIGMA / np.linalg.norm(v_n))
     start = InitialMoments(R_nb, p_n, v_n, bias, _regular(P))

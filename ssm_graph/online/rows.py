@@ -47,7 +47,9 @@ class TimedRows:
 
     def index(self, time_s: float, *, after: bool = False) -> int:
         """Return how many rows lie before a time, or, with ``after``, not after it."""
-        return int(np.searchsorted(self.all[:, 0], time_s, side="right" if after else "left"))
+        if time_s > self.last_s:
+            return len(self)
+        return int(self.all[:, 0].searchsorted(time_s, side="right" if after else "left"))
 
     def between(self, begin_s: float, end_s: float) -> Array:
         """Return the rows after ``begin_s`` up to and with ``end_s``."""

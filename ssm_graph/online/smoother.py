@@ -118,7 +118,7 @@ class FixedLagSmoother:
             return False
         reach_s = REACH_S if isinstance(message, ImuSample) else MIN_SPACING_S
         undone = is_late and course.rewind(time_s - reach_s)
-        n_made = course.advance()
+        n_made = course.advance(is_sample=not is_late)
         self._intake.horizon_s = course.horizon_s
         if undone or n_made or self._tail is None:
             self._tail = self._tail_of(course.newest)

@@ -52,6 +52,8 @@ class Watch(NamedTuple):
     trouble_s: float = -math.inf
     """When something was last wrong with the answer"""
     trouble: str = ""
+    begun_anew_s: float = -math.inf
+    """When the answer was last given up and begun anew"""
     beam_weights: tuple[float, ...] = (math.nan,) * N_BEAMS
 
 
@@ -160,6 +162,8 @@ def verdict(watch: Watch, *, now_s: float, imu_s: float, covariance: Array) -> V
         reason = f"no inertial data for {now_s - imu_s:.1f} s: look at the IMU and its link"
     elif not (np.all(np.isfinite(covariance)) and velocity_sigma < LARGEST_SPEED):
         health, reason = Health.BAD, "the answer has run away"
+    elif imu_s - watch.begun_anew_s < PROBATION_S:
+        health, reason = Health.BAD, f"being recovered: {watch.trouble}"
     elif imu_s - watch.trouble_s < PROBATION_S:
         health, reason = Health.DEGRADED, watch.trouble
     elif not has_lock:
