@@ -60,7 +60,9 @@ def reanchored(window: Window, keyframe: Keyframe, watch: Watch) -> Window:
     if not by_position and np.linalg.norm(v_n) > SPEED_SIGMA:
         v_n = v_n * (SPEED_SIGMA / np.linalg.norm(v_n))
     start = InitialMoments(R_nb, p_n, v_n, bias, _regular(P))
-    begun = Window(window.sensors, window.config, keyframe, start)
+    # The first keyframe of a window meets no gate: depth and fixes count from the next one on.
+    first = keyframe.without("depth").without("fix")
+    begun = Window(window.sensors, window.config, first, start)
     begun.iterate()
     return begun
 

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from ssm_graph.messages import Health, Message, Ping
+import numpy as np
+import pytest
+
+from ssm_graph.messages import DepthReading, Health, Message, Ping
 from ssm_graph.online import FixedLagSmoother
 from tests.online_fixture import SHORT, messages, stream
 
 
-def pushed(given: list[Message]) -> FixedLagSmoother:
+def pushed(given: list[Message], duration_s: float = 12.0) -> FixedLagSmoother:
     """Return an estimator that was given all messages."""
-    smoother = FixedLagSmoother(stream()[1], SHORT)
+    smoother = FixedLagSmoother(stream(duration_s)[1], SHORT)
     for message in given:
         smoother.push(message)
     return smoother
@@ -42,3 +45,39 @@ def test_a_frozen_report_counts_once() -> None:
     health, reason = smoother.status()
     assert health is Health.DEGRADED
     assert "no beam" in reason
+
+
+def test_an_answer_that_is_being_recovered_is_bad() -> None:
+    """Beams of the wrong sign agree with each other: begun anew, the position doubted, not used."""
+    given = [
+        replace(m, speed=tuple(-x for x in m.speed))
+        if isinstance(m, Ping) and m.time_s > 6.0
+        else m
+        for m in messages()
+    ]
+    smoother = pushed(given)
+    health, reason = smoother.status()
+    assert health is Health.BAD
+    assert "recovered" in reason
+    assert {"doubt", "recovered"} <= kinds(smoother)
+    newest, before = smoother.newest(), pushed(list(messages())).newest()
+    assert newest is not None
+    assert before is not None
+    assert np.min(newest.position_sigma_enu[:2]) > 1.0 > np.max(before.position_sigma_enu)
+
+
+@pytest.mark.slow
+def test_a_depth_sensor_in_another_unit_moves_nothing_else() -> None:
+    """It is tried once whether the height was wrong; then the depth is what is left out."""
+    given = [
+        replace(m, depth=100.0 * m.depth) if isinstance(m, DepthReading) and m.time_s > 10.0 else m
+        for m in messages(40.0)
+    ]
+    smoother, good = pushed(given, 40.0), pushed(list(messages(40.0)), 40.0)
+    assert smoother.status()[0] is Health.DEGRADED
+    assert [e.kind for e in smoother.take_events()].count("recovered") == 1
+    newest, other = smoother.newest(), good.newest()
+    assert newest is not None
+    assert other is not None
+    assert abs(newest.lat - other.lat) * 6.4e6 < 0.5
+    assert abs(newest.height - other.height) < 2.0
