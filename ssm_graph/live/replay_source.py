@@ -13,6 +13,7 @@ from ssm_graph.messages import Event, ImuSample, Message
 
 MOST: Final = 1000
 """Messages of one poll."""
+_ROUNDING_S = 1e-6
 
 
 class ReplaySource:
@@ -72,7 +73,7 @@ class ReplaySource:
         if self._began_s is None:
             self._began_s = self._steady_s()
         due_s = self._begin_s + (self._steady_s() - self._began_s) * self._speed
-        messages = self._take(lambda message: message.time_s <= due_s)
+        messages = self._take(lambda message: message.time_s <= due_s + _ROUNDING_S)
         if messages:
             self._wait(0.0)
         elif self._next is not None:

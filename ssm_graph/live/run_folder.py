@@ -33,6 +33,7 @@ from ssm_graph.io.mission_keys import TOML_NAME
 from ssm_graph.io.raw_log import RawLog, replay
 from ssm_graph.io.results import BEAMS_NAME, SUMMARY_NAME, TRAJECTORY_NAME
 from ssm_graph.io.results_summary import as_json
+from ssm_graph.io.vehicle import check_same_vehicle
 from ssm_graph.live.checkpoint_writer import CheckpointWriter
 from ssm_graph.messages import Event, Message, Vehicle
 
@@ -219,6 +220,8 @@ class RunFolder:
                     f"{path}: this run was begun with {_difference(found, wanted)}; go on with "
                     "the same, or give another folder"
                 )
+            if self._has_log:
+                check_same_vehicle(self.path / LOG_NAME, self.vehicle)
             return
         others = [
             name

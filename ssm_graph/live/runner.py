@@ -20,6 +20,8 @@ from ssm_graph.live.status import Latency, RunStatus
 from ssm_graph.messages import Event, ImuSample, Message, Navigation, Severity
 
 POLL_S: Final = 0.05
+LATE_S: Final = 5.0
+"""A disk that needs longer for a checkpoint is complained of."""
 N_EVENTS: Final = 8
 """Shown to a person."""
 
@@ -74,7 +76,8 @@ class Runner:
         self._notices = Notices(self._now_s, steady_s)
         self._connections: Connections | None = None
         self._data_s, self._n_messages, self._n_failures = 0.0, 0, 0
-        self._checkpoint_s = float("-inf")
+        self._checkpoint_s, self._written_s = float("-inf"), 0.0
+        self._is_checkpoint_due = False
         self._asked = False
         self._note = ""
         self._navigation: Navigation | None = None
@@ -197,8 +200,7 @@ class Runner:
         for event in source.take_events():
             self._note_event(event)
         self._keep_results()
-        if self._checkpoints.is_due(self._data_s):
-            self._write_checkpoint()
+        self._keep_checkpoint()
         problem = self.folder.problems()
         if problem is not None:
             self._notices.tell("disk", "disk", problem, Severity.ERROR)
@@ -230,14 +232,27 @@ class Runner:
         except Exception as error:
             self._notices.failure("results", "results_failed", error)
 
-    def _write_checkpoint(self) -> None:
+    def _keep_checkpoint(self) -> None:
+        """Write one where it is due and the disk is done with the last one."""
+        self._tell_unwritten()
+        if self._checkpoints.is_due(self._data_s):
+            self._is_checkpoint_due = True
+        if not self._is_checkpoint_due:
+            return
+        if not self.folder.writer.is_busy:
+            self._is_checkpoint_due = False
+            self._write_checkpoint()
+        elif self._steady_s() - self._written_s > LATE_S:
+            text = f"the disk has been busy with the last one for more than {LATE_S:g} s"
+            self._notices.tell("checkpoint", "checkpoint_late", text, Severity.WARNING)
+
+    def _tell_unwritten(self) -> None:
         error = self.folder.writer.take_error()
         if error is not None:
             self._notices.failure("checkpoint", "checkpoint_failed", error)
-        if self.folder.writer.is_busy:
-            text = "the disk is still busy with the last one; this one is left out"
-            self._notices.tell("checkpoint", "checkpoint_late", text, Severity.WARNING)
-            return
+
+    def _write_checkpoint(self) -> None:
+        self._written_s = self._steady_s()
         self._write_delayed(self._estimator.take_delayed)
         self._take_events()
         if self.folder.problems() is not None:  # it would count on what is not on the disk
@@ -258,6 +273,7 @@ class Runner:
         if reason is not StopReason.FAILED:
             self._write_checkpoint()  # before the window is emptied: a restart goes on from here
             self.folder.writer.wait()
+        self._tell_unwritten()
         navigation = self._newest()
         self._write_delayed(self._estimator.finish)
         self._notices.tell("run", "ended", reason.value, Severity.INFO)

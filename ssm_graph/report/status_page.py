@@ -203,7 +203,7 @@ def _beams(navigation: Navigation) -> Text:
         shown = f"{weight:.2f}" if math.isfinite(weight) else _NONE
         text.append(f"  {number + 1} ").append(weight_bar(weight), style).append(f" {shown}")
     lock = ("bottom lock", "green") if navigation.bottom_lock else ("no bottom lock", "yellow")
-    since = f"last aid {_age(navigation.since_aid_s)} ago"
+    since = f"last aid {_ago(navigation.since_aid_s)}"
     return text.append("   ").append(*lock).append(f"   {since}")
 
 
@@ -255,7 +255,7 @@ def _disk(view: StatusView) -> Text:
     text = Text(f"{view.folder}   ", "dim")
     if view.log_problem:
         return text.append(view.log_problem, "bold red")
-    return text.append(f"log as it comes; checkpoint {_age(view.checkpoint_age_s)} ago")
+    return text.append(f"log as it comes; checkpoint {_ago(view.checkpoint_age_s)}")
 
 
 def _horizontal(navigation: Navigation) -> float:
@@ -275,3 +275,7 @@ def _age(seconds: float) -> str:
     if not math.isfinite(seconds):
         return "never"
     return f"{seconds:.1f} s" if seconds < 100.0 else f"{seconds / 60.0:.0f} min"
+
+
+def _ago(seconds: float) -> str:
+    return f"{_age(seconds)} ago" if math.isfinite(seconds) else "not yet"

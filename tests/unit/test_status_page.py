@@ -1,0 +1,157 @@
+"""What a person on watch reads, as text."""
+
+from __future__ import annotations
+
+import io
+import math
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from ssm_graph.cli.online import view_of
+from ssm_graph.live.status import Latency, LinkState, OutputStatus, RunStatus, SourceStatus
+from ssm_graph.messages import Event, Health, Severity
+from ssm_graph.report.status_page import StatusPage, StatusView, plain_line, render, weight_bar
+from tests.live_fixture import a_navigation
+
+STATUS = RunStatus(
+    vehicle="otter [2]",
+    folder="runs/1",
+    elapsed_s=3723.4,
+    n_messages=12409,
+    navigation=a_navigation(100.0, 0.7),
+    reason="all is well",
+    latency=Latency(0.001, 0.012, 0.0345),
+    sources=(
+        SourceStatus(
+            "dvl",
+            "tcp://192.168.194.95:16171",
+            LinkState.WAITING,
+            n_bytes=5,
+            n_messages=7,
+            n_refused=2,
+            n_limited=3,
+            n_reconnects=4,
+            rate_hz=7.96,
+            age_s=12.3,
+        ),
+    ),
+    outputs=(OutputStatus("json", "udp://127.0.0.1:9000", 1, 77, 0),),
+    events=(Event(99.0, Severity.ERROR, "bottom_lost", "no beam [counts]"),),
+    log_problem=None,
+    checkpoint_age_s=4.0,
+)
+
+
+def text_of(view: StatusView) -> str:
+    """Return the page as plain text."""
+    stream = io.StringIO()
+    Console(file=stream, width=150).print(render(view))
+    return stream.getvalue()
+
+
+def test_the_page_has_everything() -> None:
+    """Health and reason, all states with sigmas and units, beams, sources, events, disk."""
+    text = text_of(view_of(STATUS))
+    for expected in (
+        "otter [2]",
+        "1:02:03",
+        "GOOD",
+        "all is well",
+        "confidence 0.90",
+        f"lat {math.degrees(0.7):.7f}° ± 0.40 m",
+        f"lon {math.degrees(-0.7):.7f}° ± 0.30 m",
+        "height -20.00 ± 0.05 m",
+        "east +1.000 ± 0.010 m/s",
+        "north -0.500 ± 0.010 m/s",
+        "roll 1.00 ± 0.02°",
+        "heading 350.00 ± 0.50°",
+        "1 █ 1.00",
+        "2 ▅ 0.60",
+        "3 ▁ 0.02",
+        "4 · –",
+        "bottom lock",
+        "last aid 0.2 s ago",
+        "median 1.0 ms, 99 % 12.0 ms, max 34.5 ms",
+        "waits to reconnect",
+        "tcp://192.168.194.95:16171",
+        "8.0",
+        "12.3 s",
+        "→ json",
+        "1 listening",
+        "99.0 s  no beam [counts]",
+        "checkpoint 4.0 s ago",
+        "runs/1",
+    ):
+        assert expected in text, f"{expected!r} is missing in\n{text}"
+    row = next(line for line in text.splitlines() if "16171" in line)
+    assert row.split()[-6:-1] == ["7", "5", "4", "12.3", "s"]
+
+
+def test_the_page_before_the_first_answer() -> None:
+    """What is waited for stands where the answer will be."""
+    view = StatusView(
+        "otter",
+        "runs/1",
+        0.0,
+        0,
+        None,
+        "waiting for a fix",
+        log_problem="raw log: no space left",
+        note="going through the log",
+    )
+    text = text_of(view)
+    assert "ALIGNING  waiting for a fix" in text
+    assert "nothing has come yet" in text
+    assert "raw log: no space left" in text
+    assert "going through the log" in text
+    line = plain_line(view)
+    assert line == (
+        "0:00:00; ALIGNING; waiting for a fix; raw log: no space left; going through the log"
+    )
+
+
+def test_a_plain_line_says_the_most_important() -> None:
+    """One line without markup; the reason where all is not well."""
+    line = plain_line(view_of(STATUS))
+    assert line.startswith("1:02:03; GOOD; lat 40.1070457 lon -40.1070457 deg; height -20.00 m; ")
+    assert "sigma 0.50 m; heading 350.0 deg; bottom lock" in line
+    assert "dvl waits to reconnect 8/s" in line
+    assert "all is well" not in line
+    navigation = a_navigation(1.0, health=Health.BAD, bottom_lock=False, since_aid_s=math.inf)
+    bad = StatusView("otter", "", 0.0, 1, navigation, "it has run away")
+    assert "BAD" in plain_line(bad)
+    assert "no bottom lock" in plain_line(bad)
+    assert "last aid not yet" in text_of(bad)
+
+
+def test_without_a_terminal_a_line_every_ten_seconds() -> None:
+    """As a service's journal wants it."""
+    stream, now = io.StringIO(), [0.0]
+    with StatusPage(Console(file=stream, width=80), steady_s=lambda: now[0]) as show:
+        for _ in range(41):
+            show(view_of(STATUS))
+            now[0] += 0.5
+    lines = stream.getvalue().splitlines()
+    assert len(lines) == 3
+    assert all("GOOD" in line and "\x1b" not in line for line in lines)
+
+
+def test_on_a_terminal_the_page_is_drawn_again() -> None:
+    """Colours say the health."""
+    stream = io.StringIO()
+    console = Console(file=stream, width=120, force_terminal=True, color_system="standard")
+    with StatusPage(console) as show:
+        show(view_of(STATUS))
+        show(view_of(STATUS))
+    assert "\x1b[1;32m GOOD" in stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("weight", "bar"),
+    [(0.0, "▁"), (0.124, "▁"), (0.126, "▂"), (0.99, "█"), (1.0, "█"), (1.4, "█"), (np.nan, "·")],
+)
+def test_weights_as_bars(weight: float, bar: str) -> None:
+    """Eight steps; weights above 1 are full, beams that are missing have none."""
+    assert weight_bar(weight) == bar
