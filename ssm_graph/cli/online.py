@@ -69,6 +69,7 @@ def add_parser(commands: Any, *, epilog: str) -> None:
 def run(arguments: argparse.Namespace, console: Console, errors: Console) -> bool:
     """Navigate until asked to stop; return whether the last answer was good."""
     inputs, outputs = input_configs(arguments), output_configs(arguments)
+    speed = replay_speed(arguments.speed)
     publisher = Publisher(
         rate_hz=arguments.output_rate,
         nmea_rate_hz=arguments.nmea_rate,
@@ -86,7 +87,7 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
         runner = Runner(
             RunFolder(arguments.out, vehicle, _settings(lag)),
             engine_of(vehicle, lag),
-            _connector(stack, inputs, outputs, mission, replay_speed(arguments.speed)),
+            _connector(stack, inputs, outputs, mission, speed),
             publisher=publisher,
             config=config,
             on_status=lambda status: show(view_of(status)),

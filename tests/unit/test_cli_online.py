@@ -1,0 +1,139 @@
+"""``ssm-graph online`` as a person types it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import pytest
+
+from ssm_graph.cli.main import ExitCode, build_parser, main
+from ssm_graph.cli.online_arguments import input_configs, output_configs, replay_speed
+from ssm_graph.io.mission import read_mission, write_mission
+from ssm_graph.io.results import read_results
+from ssm_graph.live.endpoints import Transport
+from ssm_graph.live.feed import Limits
+from ssm_graph.live.json_messages import JsonDecoder
+from ssm_graph.live.nmea import NmeaDecoder
+from ssm_graph.live.outputs import OutputFormat
+from ssm_graph.live.waterlinked import WaterLinkedDecoder
+from tests.mission_fixture import make_mission
+
+
+@pytest.fixture(scope="module")
+def mission(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a straight run of a minute."""
+    folder = tmp_path_factory.mktemp("online") / "mission"
+    write_mission(folder, make_mission())
+    return folder
+
+
+def parsed(*words: str) -> argparse.Namespace:
+    """Return what the words mean."""
+    return build_parser().parse_args(["online", "v.toml", "--out", "r", *words])
+
+
+def test_a_replay_is_a_run(
+    mission: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A mission without a word about its vehicle; results, log and settings are there."""
+    run = tmp_path / "run"
+    words = ["online", "--replay", str(mission), "--speed", "full", "--out", str(run)]
+    words += ["--kernel", "sqrt", "--dof", "4", "--lag", "5", "--duration", "20"]
+    assert main(words) == ExitCode.GOOD
+    shown = capsys.readouterr()
+    assert "GOOD" in shown.out
+    assert "its time was over" in shown.out
+    assert f"results in {run}" in shown.out
+    settings = json.loads((run / "run.json").read_text())["settings"]
+    assert settings == {"lag_s": 5.0, "kernel": "sqrt(dof=4)", "similarity": "expected"}
+    results = read_results(run)
+    assert results.summary["kernel"] == "sqrt(dof=4)"
+    assert results.trajectory["time_s"][-1] == pytest.approx(20.0, abs=1.1)
+    assert len(read_mission(run / "log").imu.time_s) == pytest.approx(400, abs=5)
+    assert main([*words[:-4], "--lag", "6"]) == ExitCode.USAGE
+    assert "lag_s = 5.0, not 6.0" in capsys.readouterr().err
+
+
+def test_a_run_without_an_answer_has_its_code(
+    mission: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Too short to align: the log is kept, and where it is is said."""
+    folder = tmp_path / "m"
+    folder.mkdir()
+    for path in mission.iterdir():
+        text = path.read_bytes()
+        if path.name == "mission.toml":
+            begin, end = text.index(b"[initial]"), text.index(b"[reference]")
+            text = text[:begin] + text[end:]
+        (folder / path.name).write_bytes(text)
+    run = tmp_path / "run"
+    words = ["online", "--replay", str(folder), "--speed", "full", "--duration", "0.5"]
+    assert main([*words, "--out", str(run)]) == ExitCode.NO_RESULT
+    assert "no answer" in capsys.readouterr().err
+    assert (run / "log" / "imu.csv").stat().st_size > 500
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([], "no source"),
+        (["--dvl", "tcp://127.0.0.1:9"], "inertial data"),
+        (["--imu", "udp://:9", "--replay", "m"], "--replay: expected alone"),
+        (["--imu", "9000"], "--imu: expected tcp://HOST:PORT"),
+        (["--imu", "udp://:9", "--publish", "tcp://a:1"], "--publish: expected tcp-listen"),
+        (["--imu", "udp://:9", "--nmea", "udp://:0"], "--nmea: expected a port"),
+        (["--imu", "udp://:9", "--kernel", "gaussian", "--dof", "3"], "--dof"),
+        (["--imu", "udp://:9", "--kernel", "log", "--dof", "-3"], "--kernel log"),
+        (["--imu", "udp://:9", "--lag", "-3"], "lag_s"),
+        (["--imu", "udp://:9", "--output-rate", "0"], "output rate"),
+        (["--imu", "udp://:9", "--checkpoint-every", "0"], "checkpoint_every_s"),
+        (["--imu", "udp://:9", "--max-rate", "nan"], "rate limit"),
+        (["--imu", "udp://:9", "--max-rate", "0"], "rate limit"),
+        (["--imu", "udp://:9", "--stall", "-1"], "stall_s"),
+        (["--imu", "udp://:9"], "VEHICLE"),
+        (["--replay", "m", "--speed", "fast"], "--speed"),
+        (["--replay", "m", "--speed", "0"], "--speed"),
+    ],
+)
+def test_wrong_options_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], said: str
+) -> None:
+    """Before anything is opened or written."""
+    run = tmp_path / "run"
+    assert main(["online", "--out", str(run), *words]) == ExitCode.USAGE
+    assert said in capsys.readouterr().err
+    assert not run.exists()
+
+
+def test_sources_and_outputs() -> None:
+    """Every source has its decoder and limits; outputs may be several."""
+    arguments = parsed(
+        *("--dvl", "tcp://192.168.194.95:16171", "--gnss", "udp://:9001", "--depth", "udp://:9002"),
+        *("--imu", "tcp-listen://:9003", "--messages", "udp://[::1]:9004", "--max-rate", "4000"),
+        *("--publish", "udp://:9005", "--publish", "tcp-listen://:9006", "--nmea", "udp://:9007"),
+        *("--clock", "arrival", "--axes", "FLU", "--surface-height", "40", "--stall", "3"),
+    )
+    inputs = {config.name: config for config in input_configs(arguments)}
+    assert list(inputs) == ["dvl", "gnss", "depth", "imu", "messages"]
+    kinds = {name: type(config.make_decoder()) for name, config in inputs.items()}
+    assert kinds["dvl"] is WaterLinkedDecoder
+    assert kinds["gnss"] is kinds["depth"] is NmeaDecoder
+    assert kinds["imu"] is kinds["messages"] is JsonDecoder
+    limits = inputs["dvl"].limits
+    assert limits == Limits(4000.0, 8000, 2.0 * Limits().bytes_per_s, 3.0)
+    assert inputs["imu"].endpoint.transport is Transport.TCP_SERVER
+    outputs = output_configs(arguments)
+    assert [config.form for config in outputs] == [
+        OutputFormat.JSON,
+        OutputFormat.JSON,
+        OutputFormat.NMEA,
+    ]
+    assert all(config.endpoint.host == "127.0.0.1" for config in outputs)
+
+
+def test_speeds() -> None:
+    """A number, or as fast as it goes."""
+    assert replay_speed("full") is None
+    assert replay_speed("2.5") == 2.5
