@@ -132,7 +132,7 @@ def view_of(status: RunStatus) -> StatusView:
         ),
         outputs=tuple(
             SourceRow(
-                o.name,
+                f"→ {o.name}",
                 o.address,
                 f"{o.n_clients} listening",
                 n_messages=o.n_sent,

@@ -137,6 +137,8 @@ class Runner:
         self._n_messages, self._data_s = resumed.n_messages, resumed.data_s
         n_before = self._n_messages
         for message in self.folder.logged(resumed):
+            if self._asked:  # nothing has changed yet: the next process goes through it again
+                raise KeyboardInterrupt
             self._push(message)
             self._keep_results()
             if (self._n_messages - n_before) % 256 == 1:

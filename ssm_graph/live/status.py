@@ -14,7 +14,7 @@ class LinkState(Enum):
 
     CONNECTING = "connecting"
     CONNECTED = "connected"
-    WAITING = "waits to reconnect"
+    WAITING = "waiting"
     LISTENING = "listening"
     SILENT = "silent"
     REPLAYING = "replaying"

@@ -32,7 +32,10 @@ SEVERITY_STYLE: Final = {
     Severity.ERROR: "bold red",
 }
 BAR: Final = "▁▂▃▄▅▆▇█"
+N_EVENTS: Final = 5
 _NONE: Final = "–"
+_FIRST_UNIX_S: Final = 1e9
+"""Later times are Unix time, shown as time of day."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +121,7 @@ def render(view: StatusView) -> RenderableType:
         parts.append(_state(view.navigation))
         parts.append(_beams(view.navigation))
     parts += [_latency(view), _links(view)]
-    parts += [_event(event) for event in view.events]
+    parts += [_event(event) for event in view.events[-N_EVENTS:]]
     parts.append(_disk(view))
     title = f"{view.vehicle}   {_clock(view.elapsed_s)}   {view.n_messages} messages"
     return Panel(Group(*parts), title=Text(title), title_align="left")
@@ -168,16 +171,15 @@ def _headline(view: StatusView) -> Text:
 
 
 def _state(navigation: Navigation) -> Table:
-    """Return position, velocity and attitude, each with its sigma."""
+    """Return position, velocity and attitude, each with its sigma; three columns of 24."""
     table = Table.grid(padding=(0, 2))
-    for _ in range(4):
+    for _ in range(3):
         table.add_column(no_wrap=True)
-    sigma = navigation.position_sigma_enu
+    east, north, up = navigation.position_sigma_enu
     table.add_row(
-        "position",
-        f"lat {math.degrees(navigation.lat):.7f}° ± {sigma[1]:.2f} m",
-        f"lon {math.degrees(navigation.lon):.7f}° ± {sigma[0]:.2f} m",
-        f"height {navigation.height:.2f} ± {sigma[2]:.2f} m",
+        f"lat {math.degrees(navigation.lat):.7f}° ±{north:.2f} m",
+        f"lon {math.degrees(navigation.lon):.7f}° ±{east:.2f} m",
+        f"height {navigation.height:.2f} ±{up:.2f} m",
     )
     velocity = zip(
         ("east", "north", "up"),
@@ -185,26 +187,26 @@ def _state(navigation: Navigation) -> Table:
         navigation.velocity_sigma_enu,
         strict=True,
     )
-    table.add_row("velocity", *(f"{n} {v:+.3f} ± {s:.3f} m/s" for n, v, s in velocity))
+    table.add_row(*(f"{n} {v:+.3f} ±{s:.3f} m/s" for n, v, s in velocity))
     angles = np.degrees(navigation.roll_pitch_heading)
     angles[2] = _heading(navigation)
     attitude = zip(
         ("roll", "pitch", "heading"), angles, np.degrees(navigation.attitude_sigma), strict=True
     )
-    table.add_row("attitude", *(f"{n} {a:.2f} ± {s:.2f}°" for n, a, s in attitude))
+    table.add_row(*(f"{n} {a:.2f} ±{s:.2g}°" for n, a, s in attitude))
     return table
 
 
 def _beams(navigation: Navigation) -> Text:
-    text = Text("beams  ")
+    text = Text("beams")
     for number in range(N_BEAMS):
         weight = float(navigation.beam_weights[number])
         style = "green" if weight > 0.5 else "yellow" if weight > 0.05 else "red"
         shown = f"{weight:.2f}" if math.isfinite(weight) else _NONE
-        text.append(f"  {number + 1} ").append(weight_bar(weight), style).append(f" {shown}")
+        text.append(f"  {number + 1}").append(weight_bar(weight), style).append(f" {shown}")
     lock = ("bottom lock", "green") if navigation.bottom_lock else ("no bottom lock", "yellow")
     since = f"last aid {_ago(navigation.since_aid_s)}"
-    return text.append("   ").append(*lock).append(f"   {since}")
+    return text.append("  ").append(*lock).append(f"  {since}")
 
 
 def _latency(view: StatusView) -> Text:
@@ -215,40 +217,32 @@ def _latency(view: StatusView) -> Text:
 
 
 def _links(view: StatusView) -> Table:
-    table = Table(box=None, padding=(0, 2), pad_edge=False, header_style="dim")
-    for name in ("source", "state", "address"):
-        table.add_column(name)
-    for name in ("messages/s", "messages", "refused", "reconnects", "last"):
-        table.add_column(name, justify="right")
+    table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False, header_style="dim")
+    for name, width in (("source", 8), ("state", 11)):
+        table.add_column(name, no_wrap=True, min_width=width)
+    for name, width in (("per s", 6), ("messages", 8), ("refused", 7), ("again", 5), ("last", 6)):
+        table.add_column(name, justify="right", no_wrap=True, min_width=width)
+    table.add_column("address", no_wrap=True, overflow="ellipsis")
     for row in view.sources:
-        table.add_row(
-            Text(row.name),
-            Text(row.state),
-            Text(row.address),
-            f"{row.rate_hz:.1f}" if math.isfinite(row.rate_hz) else _NONE,
-            f"{row.n_messages}",
-            Text(f"{row.n_refused}", "yellow" if row.n_refused else ""),
-            f"{row.n_reconnects}",
-            _age(row.age_s),
-        )
+        rate = f"{row.rate_hz:.1f}" if math.isfinite(row.rate_hz) else _NONE
+        _add_link(table, row, rate, f"{row.n_reconnects}", _age(row.age_s))
     for row in view.outputs:
-        refused = Text(f"{row.n_refused}", "yellow" if row.n_refused else "")
-        table.add_row(
-            Text(f"→ {row.name}"),
-            Text(row.state),
-            Text(row.address),
-            "",
-            f"{row.n_messages}",
-            refused,
-            "",
-            "",
-        )
+        _add_link(table, row, "", "", "")
     return table
 
 
+def _add_link(table: Table, row: SourceRow, rate: str, again: str, last: str) -> None:
+    refused = Text(f"{row.n_refused}", "yellow" if row.n_refused else "")
+    texts = [Text(row.name), Text(row.state)]
+    table.add_row(*texts, rate, f"{row.n_messages}", refused, again, last, Text(row.address))
+
+
 def _event(event: Event) -> Text:
+    when = f"{event.time_s:.1f} s"
+    if event.time_s > _FIRST_UNIX_S:
+        when = time.strftime("%H:%M:%S", time.gmtime(event.time_s))
     style = SEVERITY_STYLE[event.severity]
-    return Text(f"{event.time_s:.1f} s  {event.text}", style, no_wrap=True, overflow="ellipsis")
+    return Text(f"{when}  {event.text}", style, no_wrap=True, overflow="ellipsis")
 
 
 def _disk(view: StatusView) -> Text:

@@ -409,6 +409,19 @@ def test_stop_ends_in_order(tmp_path: Path) -> None:
     assert read_results(tmp_path).summary["n_messages"] == end.n_messages
 
 
+def test_stop_while_catching_up_leaves_all_as_it_was(whole: Path, tmp_path: Path) -> None:
+    """Half a log gone through is no end; the next process does it again."""
+    messages = some_messages()
+    with pytest.raises(Crash):
+        run(tmp_path, ListSource(messages, crash_after=251))
+    runner = Runner(run_folder(tmp_path), FAKE, connect(ListSource(messages)))
+    runner.stop()
+    with pytest.raises(KeyboardInterrupt):
+        runner.run()
+    run(tmp_path, ListSource(messages))
+    assert_same(whole, tmp_path)
+
+
 def test_status_tells_everything(tmp_path: Path) -> None:
     """Twice a second of the steady clock, at the begin and before the end."""
     shown: list[RunStatus] = []

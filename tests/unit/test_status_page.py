@@ -44,37 +44,37 @@ STATUS = RunStatus(
 )
 
 
-def text_of(view: StatusView) -> str:
+def text_of(view: StatusView, *, width: int = 80) -> str:
     """Return the page as plain text."""
     stream = io.StringIO()
-    Console(file=stream, width=150).print(render(view))
+    Console(file=stream, width=width).print(render(view))
     return stream.getvalue()
 
 
 def test_the_page_has_everything() -> None:
     """Health and reason, all states with sigmas and units, beams, sources, events, disk."""
-    text = text_of(view_of(STATUS))
+    text = text_of(view_of(STATUS), width=100)
     for expected in (
         "otter [2]",
         "1:02:03",
         "GOOD",
         "all is well",
         "confidence 0.90",
-        f"lat {math.degrees(0.7):.7f}° ± 0.40 m",
-        f"lon {math.degrees(-0.7):.7f}° ± 0.30 m",
-        "height -20.00 ± 0.05 m",
-        "east +1.000 ± 0.010 m/s",
-        "north -0.500 ± 0.010 m/s",
-        "roll 1.00 ± 0.02°",
-        "heading 350.00 ± 0.50°",
-        "1 █ 1.00",
-        "2 ▅ 0.60",
-        "3 ▁ 0.02",
-        "4 · –",
+        f"lat {math.degrees(0.7):.7f}° ±0.40 m",
+        f"lon {math.degrees(-0.7):.7f}° ±0.30 m",
+        "height -20.00 ±0.05 m",
+        "east +1.000 ±0.010 m/s",
+        "north -0.500 ±0.010 m/s",
+        "roll 1.00 ±0.02°",
+        "heading 350.00 ±0.5°",
+        "1█ 1.00",
+        "2▅ 0.60",
+        "3▁ 0.02",
+        "4· –",
         "bottom lock",
         "last aid 0.2 s ago",
         "median 1.0 ms, 99 % 12.0 ms, max 34.5 ms",
-        "waits to reconnect",
+        "waiting",
         "tcp://192.168.194.95:16171",
         "8.0",
         "12.3 s",
@@ -85,8 +85,11 @@ def test_the_page_has_everything() -> None:
         "runs/1",
     ):
         assert expected in text, f"{expected!r} is missing in\n{text}"
+    narrow = text_of(view_of(STATUS))
+    assert "heading 350.00 ±0.5°" in narrow
+    assert "last aid 0.2 s ago" in narrow
     row = next(line for line in text.splitlines() if "16171" in line)
-    assert row.split()[-6:-1] == ["7", "5", "4", "12.3", "s"]
+    assert row.split()[1:-2] == ["dvl", "waiting", "8.0", "7", "5", "4", "12.3", "s"]
 
 
 def test_the_page_before_the_first_answer() -> None:
@@ -117,7 +120,7 @@ def test_a_plain_line_says_the_most_important() -> None:
     line = plain_line(view_of(STATUS))
     assert line.startswith("1:02:03; GOOD; lat 40.1070457 lon -40.1070457 deg; height -20.00 m; ")
     assert "sigma 0.50 m; heading 350.0 deg; bottom lock" in line
-    assert "dvl waits to reconnect 8/s" in line
+    assert "dvl waiting 8/s" in line
     assert "all is well" not in line
     navigation = a_navigation(1.0, health=Health.BAD, bottom_lock=False, since_aid_s=math.inf)
     bad = StatusView("otter", "", 0.0, 1, navigation, "it has run away")
