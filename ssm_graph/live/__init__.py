@@ -1,1 +1,1 @@
-"""Live traffic: bytes of instruments to messages, answers to bytes; no sockets, no threads."""
+"""Live traffic: bytes of instruments to messages, answers to bytes, and the loop between them."""
