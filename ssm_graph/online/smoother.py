@@ -49,6 +49,7 @@ ONLINE: Final = FixedLagConfig(
     relinearise_turn=5e-4,
     reweigh=0.02,
     gate_sigmas=6.0,
+    first_estimates=True,
 )
 """What a vehicle can afford; `benchmarks/online.py` compares it with windows solved to the end."""
 LONGEST_GAP_S: Final = 10.0

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ssm_graph.messages import DepthReading, Health, Message, Ping
-from ssm_graph.online import FixedLagSmoother
+from ssm_graph.messages import DepthReading, Health, ImuSample, Message, Ping
+from ssm_graph.online import ONLINE, FixedLagSmoother
 from tests.online_fixture import SHORT, messages, stream
 
 
@@ -81,3 +81,23 @@ def test_a_depth_sensor_in_another_unit_moves_nothing_else() -> None:
     assert other is not None
     assert abs(newest.lat - other.lat) * 6.4e6 < 0.5
     assert abs(newest.height - other.height) < 2.0
+
+
+@pytest.mark.slow
+def test_after_a_gap_no_heading_comes_out_of_nothing() -> None:
+    """As the gap leaves the window nothing has shown the heading: its sigma stays as it was.
+
+    Linearised anew where the prior was not, the window took its own corrections for measurements.
+    """
+    duration_s, begin_s, end_s, lag_s = 40.0, 25.0, 29.0, 5.0
+    smoother = FixedLagSmoother(stream(duration_s)[1], replace(ONLINE, lag_s=lag_s))
+    before = None
+    for message in messages(duration_s):
+        if not (isinstance(message, ImuSample) and begin_s < message.time_s <= end_s):
+            smoother.push(message)
+        if before is None and message.time_s > end_s + 0.5 * lag_s:
+            before = smoother.newest()
+    after = smoother.newest()
+    assert before is not None
+    assert after is not None
+    assert after.attitude_sigma[2] > 0.8 * before.attitude_sigma[2]
