@@ -1,0 +1,240 @@
+"""What `online.py` runs, each in a process of its own: streams, lags, settings, real logs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from benchmarks.online_stream import (
+    HEALTHS,
+    NOT_SCORED,
+    Accuracy,
+    accuracy,
+    rss_mb,
+    run_stream,
+)
+from benchmarks.online_theirs import TheirConfig, run_theirs
+from ssm_graph.cli.run_mission import withhold_gnss
+from ssm_graph.data import Array, Mission, Reference
+from ssm_graph.estimate import Trajectory, since_first_ping
+from ssm_graph.evaluation import error_series, reference_from_gnss
+from ssm_graph.filters.named import filter_problems
+from ssm_graph.io.blueye import convert_blueye
+from ssm_graph.io.replay import messages_of
+from ssm_graph.io.vehicle import vehicle_of
+from ssm_graph.messages import Health
+from ssm_graph.online import ONLINE, FixedLagSmoother
+from ssm_graph.problem.problem import build_problem
+from ssm_graph.simulation import (
+    DvlSettings,
+    Grade,
+    OutlierKind,
+    Outliers,
+    SimulatedMission,
+    scenario_config,
+    simulate,
+)
+from ssm_graph.smoothers.batch import SsmSmoother
+from ssm_graph.smoothers.fixed_lag import FixedLagConfig, solve_fixed_lag
+from ssm_graph.smoothers.mission import smooth
+from ssm_graph.study.trials import with_initial
+
+OUTLIERS = Outliers(OutlierKind.SPARSE, rate=0.2)
+ASK_HZ = 20.0
+"""How often control asks for the newest state"""
+GNSS_UNTIL_S = 70.0
+CONFIGS = {
+    "online": ONLINE,
+    "online, first estimates": replace(ONLINE, first_estimates=True),
+    "settled": FixedLagConfig(lag_s=30.0),
+    "settled, first estimates": FixedLagConfig(lag_s=30.0, first_estimates=True),
+}
+
+
+class StreamRun(NamedTuple):
+    """One estimator on a stream; NaN or empty for what it does not tell."""
+
+    name: str
+    keyframe_s: Array
+    """(K,) s, when an answer came"""
+    latency_s: Array
+    """(K,) s, what a new keyframe cost, all in all"""
+    parts_s: dict[str, Array]
+    """What else was timed, (K,) or as many as there were"""
+    newest: Accuracy
+    delayed: Accuracy
+    rss_mb: tuple[float, float]
+    """With the window just filled, and at the end"""
+    wall_s: float
+    remark: str
+
+
+def survey(
+    duration_s: float, *, dvl_hz: float, seed: int, grade: Grade = Grade.NAVIGATION
+) -> SimulatedMission:
+    """Return the stream of this benchmark."""
+    settings = {"duration_s": duration_s, "seed": seed, "grade": grade}
+    dvl = DvlSettings(rate_hz=dvl_hz)
+    return simulate(
+        scenario_config("survey", dvl=dvl, outliers=OUTLIERS, reference_rate_hz=1.0, **settings)
+    )
+
+
+def stream_ours(duration_s: float, seed: int, dvl_hz: float, config: FixedLagConfig) -> StreamRun:
+    """Push a stream through the live estimator."""
+    sim = survey(duration_s, dvl_hz=dvl_hz, seed=seed)
+    smoother = FixedLagSmoother(vehicle_of(sim.mission), config)
+    run = run_stream(
+        smoother, messages_of(sim.mission), every_s=1.0 / ASK_HZ, duration_s=duration_s
+    )
+    first_s = float(sim.mission.dvl.ping_s[0])
+    rows = run.answers.first_after_keyframe(begin_s=first_s)
+    assert run.delayed is not None
+    delayed = since_first_ping(run.delayed)
+    is_full = run.rss_s > config.lag_s + 60.0
+    sizes = run.rss_mb[is_full] if is_full.any() else run.rss_mb
+    return StreamRun(
+        f"ours, lag {config.lag_s:g} s",
+        run.answers.column("time_s")[rows],
+        run.answers.column("latency_s")[rows],
+        {"asking for the newest state": run.answers.column("newest_s")},
+        accuracy(run.answers.trajectory(rows), sim.truth_at),
+        accuracy(delayed, sim.truth_at),
+        (float(sizes[0]), float(run.rss_mb[-1])),
+        run.wall_s,
+        f"events: {run.told}",
+    )
+
+
+def stream_theirs(
+    duration_s: float, seed: int, dvl_hz: float, config: TheirConfig, most_wall_s: float
+) -> StreamRun:
+    """Feed the keyframes of a stream to one of GTSAM's smoothers."""
+    sim = survey(duration_s, dvl_hz=dvl_hz, seed=seed)
+    begin_mb = rss_mb()
+    run = run_theirs(sim.mission, config, most_wall_s=most_wall_s)
+    covariance_s = np.where(np.isfinite(run.covariance_s), run.covariance_s, 0.0)
+    parts = {"keyframe made (ours)": run.front_s, "update": run.update_s}
+    parts["reading the covariance"] = run.covariance_s
+    scored = accuracy(run.trajectory, sim.truth_at) if len(run.update_s) else NOT_SCORED
+    return StreamRun(
+        str(config),
+        run.trajectory.time_s,
+        run.front_s + run.update_s + covariance_s,
+        parts,
+        scored,
+        NOT_SCORED,
+        (begin_mb, rss_mb()),
+        run.wall_s,
+        run.failure,
+    )
+
+
+def offline(duration_s: float, seed: int, dvl_hz: float) -> list[tuple[str, Accuracy]]:
+    """Return the filters and the batch smoother on the same stream."""
+    sim = survey(duration_s, dvl_hz=dvl_hz, seed=seed)
+    problem = build_problem(sim.mission)
+    found = {name: filter_problems([problem], name)[0] for name in ("ekf", "ssm-log")}
+    found["batch"] = SsmSmoother().solve(problem)
+    return [
+        (name, accuracy(since_first_ping(estimate.trajectory), sim.truth_at))
+        for name, estimate in found.items()
+    ]
+
+
+class SettingRow(NamedTuple):
+    """Newest states of one mission with one of `CONFIGS`."""
+
+    grade: str
+    seed: int
+    name: str
+    accuracy: Accuracy
+    ms_per_keyframe: float
+
+
+def settings_rows(grade: str, seed: int, duration_s: float) -> list[SettingRow]:
+    """Go through one mission with each of `CONFIGS`."""
+    sim = survey(duration_s, dvl_hz=1.0, seed=seed, grade=Grade[grade])
+    problem = build_problem(sim.mission)
+    rows = []
+    for name, config in CONFIGS.items():
+        newest = solve_fixed_lag(problem, config).newest
+        scored = accuracy(since_first_ping(newest.trajectory), sim.truth_at)
+        ms = 1e3 * newest.wall_s / problem.n_keyframes
+        rows.append(SettingRow(grade, seed, name, scored, ms))
+    return rows
+
+
+class LogRow(NamedTuple):
+    """One estimator on one real log, scored against withheld fixes."""
+
+    log: str
+    name: str
+    horizontal: float
+    """m, root mean square, as the next"""
+    median: float
+    """m"""
+    n_fixes: int
+    latency_ms: tuple[float, float, float]
+    """Median, 99th percentile and largest; NaN offline"""
+    remark: str
+
+
+def log_rows(path: Path, config: FixedLagConfig) -> list[LogRow]:
+    """Run a real log live and offline, GNSS withheld after `GNSS_UNTIL_S`."""
+    mission, withheld = withhold_gnss(convert_blueye(path), GNSS_UNTIL_S)
+
+    def reference(trajectory: Trajectory) -> Reference:
+        return reference_from_gnss(withheld, trajectory)
+
+    rows = _live_rows(path.stem, mission, reference, config)
+    aligned = with_initial(mission)
+    problem = build_problem(aligned)
+    for name in ("ekf", "ssm-log"):
+        trajectory = filter_problems([problem], name)[0].trajectory
+        rows.append(_log_row(path.stem, name, trajectory, reference))
+    batch = smooth(mission)
+    rows.append(_log_row(path.stem, "batch", batch.trajectory, reference, batch.status.name))
+    return rows
+
+
+def _live_rows(
+    log: str,
+    mission: Mission,
+    reference: Callable[[Trajectory], Reference],
+    config: FixedLagConfig,
+) -> list[LogRow]:
+    duration_s = float(mission.imu.time_s[-1] - mission.imu.start_s)
+    smoother = FixedLagSmoother(vehicle_of(mission), config)
+    run = run_stream(smoother, messages_of(mission), every_s=1.0 / ASK_HZ, duration_s=duration_s)
+    rows = run.answers.first_after_keyframe(begin_s=-np.inf)
+    if len(rows) == 0 or run.delayed is None:
+        return [LogRow(log, "live", np.nan, np.nan, 0, (np.nan,) * 3, smoother.status()[1])]
+    newest, latency_s = run.answers.trajectory(rows), run.answers.column("latency_s")[rows][1:]
+    median, p99, largest = (1e3 * np.percentile(latency_s, [50.0, 99.0, 100.0])).tolist()
+    good = np.mean(run.answers.column("health") == HEALTHS.index(Health.GOOD))
+    remark = f"begins at {newest.time_s[0] - mission.imu.start_s:.1f} s; good {100 * good:.0f} % "
+    remark += f"of the time; events: {run.told}; refused: {run.refused or 'none'}"
+    first = _log_row(log, f"live, lag {config.lag_s:g} s, newest", newest, reference, remark)
+    return [
+        first._replace(latency_ms=(median, p99, largest)),
+        _log_row(log, f"live, lag {config.lag_s:g} s, delayed", run.delayed, reference),
+    ]
+
+
+def _log_row(
+    log: str,
+    name: str,
+    trajectory: Trajectory,
+    reference: Callable[[Trajectory], Reference],
+    remark: str = "",
+) -> LogRow:
+    """Compare at the fixes: each is a row of the reference, the estimate is near enough."""
+    series = error_series(trajectory, reference(trajectory))
+    error = series.horizontal
+    rms = float(np.sqrt(np.mean(error**2)))
+    return LogRow(log, name, rms, float(np.median(error)), len(error), (np.nan,) * 3, remark)
