@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -20,6 +22,16 @@ GAP_GYRO_RATE = 0.2
 """rad/s, 1 sigma of the unseen body rate inside a gap of the inertial data."""
 GAP_ACCEL = 1.0
 """m/s^2, 1 sigma of the unseen specific force inside a gap of the inertial data."""
+GRAVITY = 9.8
+"""m/s^2"""
+LIVELY_S = 5.0
+"""Before and after a gap, what is seen tells how lively the unseen may have been."""
+LIVELIER = 1.5
+LIVELY_GAP_S = 1.0
+"""By so much more than what is seen, by less in gaps shorter than that, and by a tenth of the above
+besides."""
+LEAST_SEEN = 50
+"""Samples that have to be seen, or the above is taken."""
 
 Preintegrated = gtsam.PreintegratedCombinedMeasurementsG
 
@@ -71,14 +83,14 @@ def preintegrate(
     InertialChain
         Of K - 1 measurements, gravity set for the origin of ``frame``.
     """
-    merged = merge_samples(imu, keyframe_s, rate_hz=rate_hz)
-    gaps = _gap_lengths(imu, keyframe_s)
+    unseen = _unseen(imu, keyframe_s)
+    merged = merge_samples(bridged(imu), keyframe_s, rate_hz=rate_hz)
     g_n = gtsam_gravity(frame, np.zeros(3))
     bias = np.zeros(6) if bias is None else bias
     bias_hat = gtsam.imuBias.ConstantBias(bias[:3], bias[3:])
     params = tuple(
-        imu_params(imu.noise, g_n=g_n, frame=frame, gap_s=gap, span_s=span)
-        for gap, span in zip(gaps, np.diff(keyframe_s), strict=True)
+        imu_params(imu.noise, g_n=g_n, frame=frame, unseen=motion, span_s=span)
+        for motion, span in zip(unseen, np.diff(keyframe_s), strict=True)
     )
     return InertialChain(_integrate(merged, params, bias_hat), params, frame)
 
@@ -98,19 +110,36 @@ def _integrate(
     return tuple(measurements)
 
 
+class Unseen(NamedTuple):
+    """Motion inside a gap of the inertial data, 1 sigma off what bridges it."""
+
+    gap_s: float = 0.0
+    rate: float = GAP_GYRO_RATE
+    """rad/s"""
+    force: float = GAP_ACCEL
+    """m/s^2"""
+
+
 def imu_params(
-    noise: ImuNoise, *, g_n: Array, frame: LocalFrame, gap_s: float = 0.0, span_s: float = 1.0
+    noise: ImuNoise,
+    *,
+    g_n: Array,
+    frame: LocalFrame,
+    unseen: Unseen | None = None,
+    span_s: float = 1.0,
 ) -> gtsam.PreintegrationCombinedParams:
     """Return GTSAM's parameters of one interval.
 
-    Over a gap of ``gap_s`` within an interval of ``span_s`` the motion is bridged by the mean of
-    the sample that ends it; the noise grows so that the interval's covariance covers an unseen
-    rate of :data:`GAP_GYRO_RATE` and force of :data:`GAP_ACCEL` over the gap.
+    Over a gap within an interval of ``span_s`` the motion is bridged by the mean of the samples on
+    both sides; the noise grows so that the interval's covariance covers what is unseen.
     """
+    gap_s, rate, force = unseen or Unseen()
     # GTSAM takes continuous-time densities squared and divides by dt itself: do not pre-scale.
     # Every covariance defaults to identity, so each one is set.
-    gyro_sq = noise.gyro_density**2 + (GAP_GYRO_RATE * gap_s) ** 2 / span_s
-    accel_sq = noise.accel_density**2 + (GAP_ACCEL * gap_s) ** 2 / span_s
+    gyro_sq = noise.gyro_density**2 + (rate * gap_s) ** 2 / span_s
+    # What the attitude is off, gravity pulls into the force.
+    force = math.hypot(force, 0.5 * GRAVITY * rate * gap_s)
+    accel_sq = noise.accel_density**2 + (force * gap_s) ** 2 / span_s
     eye = np.eye(3)
     params = gtsam.PreintegrationCombinedParams(g_n)
     params.setOmegaCoriolis(frame.omega_ie_n)
@@ -137,10 +166,45 @@ def imu_gaps(imu: ImuLog) -> tuple[Array, Array]:
     return edges[:-1][is_gap], edges[1:][is_gap]
 
 
-def _gap_lengths(imu: ImuLog, keyframe_s: Array) -> Array:
-    """Return the longest stretch of a gap in each interval between keyframes, s."""
-    longest = np.zeros(len(keyframe_s) - 1)
+def _unseen(imu: ImuLog, keyframe_s: Array) -> list[Unseen]:
+    """Return what is not seen of each interval between keyframes: its longest stretch of a gap."""
+    unseen = [Unseen()] * (len(keyframe_s) - 1)
     for begin, end in zip(*imu_gaps(imu), strict=True):
+        rate, force = _liveliness(imu, begin, end)
         overlap = np.minimum(end, keyframe_s[1:]) - np.maximum(begin, keyframe_s[:-1])
-        longest = np.maximum(longest, overlap)
-    return longest
+        for k in np.flatnonzero(overlap > 0.0).tolist():
+            if overlap[k] > unseen[k].gap_s:
+                unseen[k] = Unseen(float(overlap[k]), rate, force)
+    return unseen
+
+
+def _liveliness(imu: ImuLog, begin: float, end: float) -> tuple[float, float]:
+    """Return how far rate and force may be off what bridges a gap, by what is seen around it."""
+    near = (imu.time_s > begin - LIVELY_S) & (imu.time_s <= end + LIVELY_S)
+    # The sample that ends the gap claims to be the mean over it; it is no more than a bridge.
+    near &= imu.time_s != end
+    if near.sum() < LEAST_SEEN:
+        return GAP_GYRO_RATE, GAP_ACCEL
+    more = min(LIVELIER, (end - begin) / LIVELY_GAP_S)
+    rate, force = (more * float(seen[near].std(axis=0).max()) for seen in (imu.gyro_b, imu.accel_b))
+    return (
+        min(rate + 0.1 * GAP_GYRO_RATE, GAP_GYRO_RATE),
+        min(force + 0.1 * GAP_ACCEL, GAP_ACCEL),
+    )
+
+
+def bridged(imu: ImuLog) -> ImuLog:
+    """Return the log with the sample that ends a gap as the mean of what is seen on both sides.
+
+    As it stands it would claim its own reading for the whole of the gap, also that of gravity in
+    axes that have turned meanwhile.
+    """
+    _, end = imu_gaps(imu)
+    k = np.searchsorted(imu.time_s, end)
+    k = k[k > 0]
+    if len(k) == 0:
+        return imu
+    columns = {name: getattr(imu, name).copy() for name in ("gyro_b", "accel_b")}
+    for name, column in columns.items():
+        column[k] = 0.5 * (getattr(imu, name)[k - 1] + getattr(imu, name)[k])
+    return replace(imu, **columns)

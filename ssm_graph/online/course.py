@@ -7,6 +7,7 @@ message and forth again leads to what punctual messages would have led to.
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -19,6 +20,8 @@ from ssm_graph.online.events import EventLog
 from ssm_graph.online.keyframes import KeyframeMaker
 from ssm_graph.online.recovery import reanchored, what_to_forget
 from ssm_graph.online.watch import LOCKED_OUT_DEPTHS, Watch, observe
+from ssm_graph.problem.doubts import TRUSTED
+from ssm_graph.problem.error_state import VELOCITY
 from ssm_graph.smoothers.keyframe import Keyframe
 from ssm_graph.smoothers.stretch import Stretch
 from ssm_graph.smoothers.window import Window
@@ -26,6 +29,8 @@ from ssm_graph.smoothers.window import Window
 REACH_S: Final = 0.1
 """A late inertial sample changes keyframes that are so much older: a ping's gyro reading is a mean,
 and samples are seen with their neighbours."""
+ANY_SPEED: Final = 5.0
+"""m/s: once its velocity is less certain than this, a vehicle's being no faster is what is left."""
 LEAST_LATE_S: Final = 1.0
 """Messages may be so late whatever the lag."""
 
@@ -115,8 +120,11 @@ class Course:
     def _step(self, measured: Measured) -> Step:
         last = self.newest
         keyframe = self._maker.make(measured, last_s=last.time_s)
+        sigma = last.window.newest_sigma
+        if len(keyframe.beams.speed) == 0 and np.linalg.norm(sigma[VELOCITY]) > ANY_SPEED:
+            keyframe = replace(keyframe, speed_sigma=ANY_SPEED)
         window = last.window.successor()
-        doubt = what_to_forget(last.watch)
+        doubt = what_to_forget(last.watch, sigma, keyframe)
         try:
             if doubt is not None:
                 raise SolverError(doubt)
@@ -130,9 +138,11 @@ class Course:
             window = reanchored(last.window, keyframe, last.watch)
             refusals = last.watch.depths_refused
             fresh = Watch(
-                last_beam_s=last.watch.last_beam_s,
+                last_beam_s=_last_beam_s(window, last.watch),
                 depths_refused=refusals + (refusals == LOCKED_OUT_DEPTHS),
                 force=last.watch.force,
+                good_share=0.0,  # it has to prove itself
+                sound_s=min(last.watch.sound_s, last.time_s),
                 trouble_s=keyframe.time_s,
                 trouble=str(error),
                 begun_anew_s=keyframe.time_s,
@@ -162,3 +172,9 @@ class Course:
     def _tell(self, before: Watch, after: Watch, keyframe: Keyframe) -> None:
         if after.trouble_s == keyframe.time_s and after.trouble != before.trouble:
             self._events.tell(keyframe.time_s, Severity.WARNING, "doubt", after.trouble)
+
+
+def _last_beam_s(begun: Window, watch: Watch) -> float:
+    """Return when a beam counted last, after a window has begun anew."""
+    newest = begun.newest
+    return float(newest.time_s[-1]) if np.any(newest.weight >= TRUSTED) else watch.last_beam_s

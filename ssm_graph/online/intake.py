@@ -35,6 +35,8 @@ DEPTHS: Final = (-100.0, 12_000.0)
 """m"""
 AHEAD_S: Final = 5.0
 """Messages further ahead of the inertial data than this belong to another clock."""
+NEXT_S: Final = 2.5
+"""A gap of the inertial data so long is taken at once, a longer one when the samples go on."""
 CLOCK_SAMPLES: Final = 20
 """So many inertial samples in a row on another time make it the new one."""
 
@@ -133,7 +135,7 @@ class Intake:
         if self._is_known(sample):
             self.counts["imu repeated"] += 1
             return None
-        is_next = now_s < time_s <= now_s + max(1.0, 20.0 * period_s)
+        is_next = now_s < time_s <= now_s + max(NEXT_S, 20.0 * period_s)
         if is_next or now_s == -np.inf:
             self._elsewhere.clear()
             return time_s if self._add(sample) else None

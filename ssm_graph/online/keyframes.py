@@ -11,7 +11,7 @@ import numpy as np
 
 from ssm_graph.data import Array, ImuLog
 from ssm_graph.earth import LocalFrame
-from ssm_graph.imu.preintegration import preintegrate
+from ssm_graph.imu.preintegration import LIVELY_S, imu_gaps, preintegrate
 from ssm_graph.messages import Vehicle
 from ssm_graph.online.buffers import Buffers, Measured
 from ssm_graph.problem.problem import (
@@ -67,7 +67,8 @@ class KeyframeMaker:
         begin_s = last_s + MIN_SPACING_S
         at_s = last_s + self._config.keyframe_interval_s
         pings, fixes = self._usable_pings(begin_s, at_s), self._buffers.fixes.between(begin_s, at_s)
-        return min([at_s, *pings[:1, 0].tolist(), *fixes[:1, 0].tolist()])
+        times: list[float] = [at_s, *pings[:1, 0].tolist(), *fixes[:1, 0].tolist()]
+        return min(times)
 
     def _usable_pings(self, begin_s: float, end_s: float) -> Array:
         pings = self._buffers.counting(self._buffers.pings.between(begin_s, end_s))
@@ -82,8 +83,7 @@ class KeyframeMaker:
         """Return the keyframe; ``last_s`` is the time of the one before, None for the first."""
         at_s = measured.time_s
         begin_s = at_s if last_s is None else last_s
-        half = 0.5 * PING_WINDOW_S
-        imu = self._buffers.imu_log(begin_s - half, at_s + half)
+        imu = self._imu(begin_s, at_s)
         way = None if last_s is None else self._integrate(imu, last_s, at_s)
         gyro_b = mean_gyro(imu, np.array([at_s]))[0]
         depths, has_depth = measured.depths, self._buffers.vehicle.depth_sigma is not None
@@ -101,8 +101,18 @@ class KeyframeMaker:
 
     def way(self, begin_s: float, end_s: float) -> Way:
         """Return what the inertial sensors say from one time to another."""
+        return self._integrate(self._imu(begin_s, end_s), begin_s, end_s)
+
+    def _imu(self, begin_s: float, end_s: float) -> ImuLog:
+        """Return the samples that two keyframes and the way between them need.
+
+        Around a gap these are more: they tell how lively the vehicle was.
+        """
         half = 0.5 * PING_WINDOW_S
-        return self._integrate(self._buffers.imu_log(begin_s - half, end_s + half), begin_s, end_s)
+        imu = self._buffers.imu_log(begin_s - half, end_s + half)
+        if len(imu_gaps(imu)[0]) == 0:
+            return imu
+        return self._buffers.imu_log(begin_s - LIVELY_S, end_s + half)
 
     def _integrate(self, imu: ImuLog, begin_s: float, end_s: float) -> Way:
         chain = preintegrate(

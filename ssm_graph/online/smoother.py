@@ -242,7 +242,8 @@ class FixedLagSmoother:
             noise=self.vehicle.imu_noise,
             frame=self._frame,
         )
-        tail.add(self._intake.buffers.imu.between(step.time_s, np.inf))
+        imu = self._intake.buffers.imu
+        tail.add(imu.all[max(imu.index(step.time_s, after=True) - 1, 0) :])
         return tail
 
     def newest(self) -> Navigation | None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ssm_graph.data import Array, ImuNoise
 from ssm_graph.earth import LocalFrame
-from ssm_graph.imu.preintegration import gtsam_gravity, imu_params
+from ssm_graph.imu.preintegration import Unseen, gtsam_gravity, imu_params
 from ssm_graph.problem.error_state import STATE_DIM
 from ssm_graph.problem.states import NavigationStates
 from ssm_graph.smoothers.keyframe import Keyframe, Way
@@ -46,6 +46,7 @@ class Tail:
         self._states, self._covariance = states, covariance
         self._noise, self._frame = noise, frame
         self._gap_s = 0.0
+        self._last: Array | None = None
         bias = gtsam.imuBias.ConstantBias(states.bias[0, :3], states.bias[0, 3:])
         params = imu_params(noise, g_n=gtsam_gravity(frame, states.p_n[0]), frame=frame)
         self._way = Way(gtsam.PreintegratedCombinedMeasurementsG(params, bias), params)
@@ -56,9 +57,14 @@ class Tail:
         for time_s, *row in samples.tolist():
             dt = time_s - self._end_s
             if dt <= 0.0:
+                self._last = np.array(row)
                 continue
             self._gap_s = max(self._gap_s, dt if dt > LONGEST_S else 0.0)
-            gyro_b, accel_b = np.array(row[:3]), np.array(row[3:])
+            reading = np.array(row)
+            here = (
+                reading if self._last is None or dt <= LONGEST_S else 0.5 * (self._last + reading)
+            )
+            gyro_b, accel_b, self._last = here[:3], here[3:], reading
             self._way.measured.integrateMeasurement(accel_b, gyro_b, dt)
             self._end_s = time_s
 
@@ -86,7 +92,7 @@ class Tail:
         """
         span = self._end_s - self._begin_s
         noisy = imu_params(
-            self._noise, g_n=np.zeros(3), frame=self._frame, gap_s=self._gap_s, span_s=span
+            self._noise, g_n=np.zeros(3), frame=self._frame, unseen=Unseen(self._gap_s), span_s=span
         )
         extra = np.zeros((STATE_DIM, STATE_DIM))
         gyro = noisy.getGyroscopeCovariance() * span

@@ -30,6 +30,8 @@ LOCKED_OUT_PINGS: Final = 3
 """Pings in a row whose beams agree with each other but not with the prediction."""
 LOCKED_OUT_FIXES: Final = 5
 LOCKED_OUT_DEPTHS: Final = 25
+FEW: Final = 0.5
+"""Fewer of the beams that agree are too few."""
 SILENT_IMU_S: Final = 1.0
 
 
@@ -45,10 +47,14 @@ class Watch(NamedTuple):
     depths_refused: int = 0
     good_share: float = 1.0
     """Running mean of the share of beams that count"""
+    few_since_s: float = math.inf
+    """Since when that has been less than half, s"""
     misfit: float = 1.0
     """Running mean square of what the trusted beams miss, in sigmas"""
     force: float = 9.8
     """Running mean of the specific force, m/s^2"""
+    sound_s: float = math.inf
+    """When nothing was wrong last, s; infinite while it is not"""
     trouble_s: float = -math.inf
     """When something was last wrong with the answer"""
     trouble: str = ""
@@ -98,6 +104,8 @@ def observe(
             watch = watch._replace(
                 misfit=watch.misfit + share * (float(trusted.mean()) - watch.misfit)
             )
+    few_since_s = min(watch.few_since_s, time_s) if watch.good_share < FEW else math.inf
+    watch = watch._replace(few_since_s=few_since_s)
     if len(keyframe.fix_n):
         watch = watch._replace(
             fixes_refused=watch.fixes_refused + 1 if no_fix else 0,
@@ -106,7 +114,10 @@ def observe(
     if len(keyframe.depth):
         watch = watch._replace(depths_refused=watch.depths_refused + 1 if no_depth else 0)
     trouble = _trouble(watch, time_s, newest.states.v_n[0])
-    return watch._replace(trouble_s=time_s, trouble=trouble) if trouble else watch
+    if trouble:
+        return watch._replace(trouble_s=time_s, trouble=trouble, sound_s=min(watch.sound_s, last_s))
+    is_sound = time_s - watch.trouble_s > PROBATION_S
+    return watch._replace(sound_s=math.inf) if is_sound else watch
 
 
 def _trouble(watch: Watch, time_s: float, v_n: Array) -> str:
@@ -127,7 +138,7 @@ def _trouble(watch: Watch, time_s: float, v_n: Array) -> str:
         return f"{watch.depths_refused} keyframes in a row contradict the depth"
     if watch.misfit > MISFIT:
         return f"the beams that count miss the answer by {math.sqrt(watch.misfit):.1f} sigmas"
-    if watch.good_share < 0.5 and time_s - watch.last_beam_s < LOCK_LOST_S:
+    if watch.good_share < FEW and time_s - watch.last_beam_s < LOCK_LOST_S:
         return f"only {100.0 * watch.good_share:.0f} % of the beams agree with the answer"
     return ""
 

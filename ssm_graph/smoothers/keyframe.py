@@ -80,13 +80,16 @@ class Keyframe:
     """(F, 3) m, GNSS antenna"""
     fix_cov_n: Array
     """(F, 3, 3) m^2"""
+    speed_sigma: float = np.inf
+    """m/s, of any vehicle's velocity: all that is known where beams have been silent for long"""
     way: Way | None = None
     """From the keyframe before; None for the first of all."""
 
     @property
     def is_measured(self) -> bool:
         """Whether anything but the inertial sensors has seen it."""
-        return len(self.beams.speed) + len(self.depth) + len(self.fix_n) > 0
+        n_measured = len(self.beams.speed) + len(self.depth) + len(self.fix_n)
+        return n_measured > 0 or np.isfinite(self.speed_sigma)
 
     def without(self, name: str) -> Keyframe:
         """Return the keyframe without its ``depth`` or its ``fix``."""
@@ -99,7 +102,7 @@ class Keyframe:
         """Return a keyframe as the inertial sensors alone know it."""
         none, no_fix = np.zeros(0), np.zeros((0, 3))
         beams = BeamSpeeds.none()
-        return cls(time_s, gyro_b, beams, none, none, no_fix, np.zeros((0, 3, 3)), way)
+        return cls(time_s, gyro_b, beams, none, none, no_fix, np.zeros((0, 3, 3)), way=way)
 
 
 def sensors_of(problem: Problem) -> Sensors:

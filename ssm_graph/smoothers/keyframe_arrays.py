@@ -22,6 +22,7 @@ def pack_keyframes(keyframes: Sequence[Keyframe]) -> dict[str, Array]:
     arrays = {
         "time_s": np.array([keyframe.time_s for keyframe in keyframes]),
         "gyro_b": np.array([keyframe.gyro_b for keyframe in keyframes]),
+        "speed_sigma": np.array([keyframe.speed_sigma for keyframe in keyframes]),
     }
     for group, names in _GROUPS.items():
         for name in names:
@@ -62,6 +63,7 @@ def unpack_keyframes(
                 depth=depth,
                 fix_n=fix_n,
                 fix_cov_n=fix_cov_n,
+                speed_sigma=float(arrays["speed_sigma"][k]),
                 way=ways[k],
             )
         )

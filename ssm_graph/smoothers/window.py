@@ -108,6 +108,11 @@ class Window:
         return self._stretch(len(self.keyframes) - 1, len(self.keyframes))
 
     @property
+    def newest_sigma(self) -> Array:
+        """Standard deviations (15,) of the newest keyframe."""
+        return np.asarray(np.sqrt(np.diagonal(self._covariance[-1])))
+
+    @property
     def all(self) -> Stretch:
         """All keyframes."""
         return self._stretch(0, len(self.keyframes))

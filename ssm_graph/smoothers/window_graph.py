@@ -24,6 +24,7 @@ from ssm_graph.smoothers.window_rows import (
     depth_rows,
     depth_targets,
     fix_rows,
+    speed_rows,
 )
 
 
@@ -46,6 +47,7 @@ class WindowGraph:
         self.prior: MarginalPrior = prior_at_start(start)
         self._depths: list[Array] = []
         self._fixes: list[Array] = []
+        self._speeds: list[Array] = []
         self._between: list[Array] = []
         self._targets = depth_targets(sensors, [first], self.at, first_rise=0.0)
         self._stale = 0
@@ -56,7 +58,7 @@ class WindowGraph:
     def copy(self) -> Self:
         """Return a graph that goes its own way from here."""
         twin = copy.copy(self)
-        for name in ("keyframes", "_depths", "_fixes", "_between"):
+        for name in ("keyframes", "_depths", "_fixes", "_speeds", "_between"):
             setattr(twin, name, getattr(self, name).copy())
         twin.chain, twin._stale = Chain(), 0
         return twin
@@ -98,7 +100,7 @@ class WindowGraph:
         graph._between = list(arrays["between"])
         graph.error = np.zeros(graph.first_row[-1])
         graph.jacobian = np.zeros((len(graph.error), STATE_DIM))
-        graph._depths, graph._fixes = [], []
+        graph._depths, graph._fixes, graph._speeds = [], [], []
         graph._measure_again(0, len(keyframes))
         return graph
 
@@ -131,6 +133,7 @@ class WindowGraph:
         self.jacobian = np.concatenate([self.jacobian, jacobian])
         self._depths += depth_rows(self.sensors, [keyframe], at, self._targets.take(np.s_[-1:]))
         self._fixes += fix_rows(self.sensors, [keyframe], at)
+        self._speeds += speed_rows([keyframe], at)
 
     def keep_posterior(self, last: NavigationStates) -> None:
         """Keep of all keyframes the newest, with what was found there as its prior."""
@@ -141,7 +144,7 @@ class WindowGraph:
         self.first_row = np.zeros(2, np.intp)
         self.at = last
         self.keyframes = [Keyframe.unmeasured(end.time_s, end.gyro_b, end.way)]
-        self._depths, self._fixes = [NO_ROWS], [NO_ROWS]
+        self._depths, self._fixes, self._speeds = [NO_ROWS], [NO_ROWS], [NO_ROWS]
         self._stale = 0
 
     def marginalise(self, count: int, weights: Array) -> None:
@@ -160,7 +163,7 @@ class WindowGraph:
         self.chain.drop(count)
         self._stale = max(self._stale - count, 0)
         self.at, self._targets = self.at.take(np.s_[count:]), self._targets.take(np.s_[count:])
-        for name in ("keyframes", "_depths", "_fixes", "_between"):
+        for name in ("keyframes", "_depths", "_fixes", "_speeds", "_between"):
             setattr(self, name, getattr(self, name)[count:])
 
     def _drop_rows(self, count: int) -> None:
@@ -179,7 +182,9 @@ class WindowGraph:
         first = first - first[0]
         own = [
             np.concatenate([rows[first[i] : first[i + 1]], *aids])
-            for i, aids in enumerate(zip(self._depths[begin:], self._fixes[begin:], strict=True))
+            for i, aids in enumerate(
+                zip(self._depths[begin:], self._fixes[begin:], self._speeds[begin:], strict=True)
+            )
         ]
         carried = self.prior.rows(self.at) if begin == 0 else self.chain.carried[begin]
         self.chain.eliminate(carried, own, self._between[begin:], begin=begin)
@@ -243,3 +248,4 @@ class WindowGraph:
         keyframes, at = self.keyframes[here], self.at.take(here)
         self._depths[here] = depth_rows(self.sensors, keyframes, at, self._targets.take(here))
         self._fixes[here] = fix_rows(self.sensors, keyframes, at)
+        self._speeds[here] = speed_rows(keyframes, at)

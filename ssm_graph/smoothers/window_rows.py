@@ -211,6 +211,23 @@ def depth_rows(
     return [rows[i : i + 1] if n else NO_ROWS for i, n in enumerate(count.tolist())]
 
 
+def speed_rows(keyframes: Sequence[Keyframe], states: NavigationStates) -> list[Array]:
+    """Return three whitened rows (3, 16) for any vehicle's velocity where it is asked for."""
+    return [
+        _speed_rows(keyframe.speed_sigma, states.v_n[i])
+        if np.isfinite(keyframe.speed_sigma)
+        else NO_ROWS
+        for i, keyframe in enumerate(keyframes)
+    ]
+
+
+def _speed_rows(sigma: float, v_n: Array) -> Array:
+    rows = np.zeros((3, STATE_DIM + 1))
+    rows[:, VELOCITY] = np.eye(3)
+    rows[:, STATE_DIM] = -v_n
+    return rows / sigma
+
+
 def _fix_rows(sensors: Sensors, keyframe: Keyframe, states: NavigationStates, i: int) -> Array:
     R_nb, arm_b = states.R_nb[i], sensors.gnss_arm_b
     rows = np.zeros((len(keyframe.fix_n), 3, STATE_DIM + 1))
