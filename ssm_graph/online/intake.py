@@ -67,8 +67,6 @@ class Intake:
             message = replace(message, time_s=message.time_s + self.shift_s)
         if isinstance(message, ImuSample):
             return self._accept_sample(message, now_s)
-        if isinstance(message, Ping):
-            message = self._checked_ping(message, now_s)
         time_s = self.buffers.time_of(message)
         if time_s < self.horizon_s:
             late_s = now_s - time_s
@@ -80,6 +78,8 @@ class Intake:
                 message, now_s, "clock", f"{ahead_s:.1f} s ahead of the inertial data: wrong clock?"
             )
             return None
+        if isinstance(message, Ping):
+            message = self._checked_ping(message, now_s)
         return time_s if self._add(message) else None
 
     def _problem(self, message: Message) -> tuple[str, str] | None:

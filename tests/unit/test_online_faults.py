@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 
-from ssm_graph.messages import DepthReading, Health, ImuSample, Message, Ping
+from ssm_graph.messages import DepthReading, Fix, Health, ImuSample, Message, Navigation, Ping
 from ssm_graph.online import ONLINE, FixedLagSmoother
 from tests.online_fixture import SHORT, messages, stream
 
@@ -18,6 +20,14 @@ def pushed(given: list[Message], duration_s: float = 12.0) -> FixedLagSmoother:
     for message in given:
         smoother.push(message)
     return smoother
+
+
+@cache
+def undisturbed() -> Navigation:
+    """Return the last answer to the messages as they are."""
+    newest = pushed(list(messages())).newest()
+    assert newest is not None
+    return newest
 
 
 def kinds(smoother: FixedLagSmoother) -> set[str]:
@@ -50,7 +60,7 @@ def test_a_frozen_report_counts_once() -> None:
 def test_an_answer_that_is_being_recovered_is_bad() -> None:
     """Beams of the wrong sign agree with each other: begun anew, the position doubted, not used."""
     given = [
-        replace(m, speed=tuple(-x for x in m.speed))
+        replace(m, speed=(-m.speed[0], -m.speed[1], -m.speed[2], -m.speed[3]))
         if isinstance(m, Ping) and m.time_s > 6.0
         else m
         for m in messages()
@@ -60,10 +70,55 @@ def test_an_answer_that_is_being_recovered_is_bad() -> None:
     assert health is Health.BAD
     assert "recovered" in reason
     assert {"doubt", "recovered"} <= kinds(smoother)
-    newest, before = smoother.newest(), pushed(list(messages())).newest()
+    newest = smoother.newest()
     assert newest is not None
-    assert before is not None
-    assert np.min(newest.position_sigma_enu[:2]) > 1.0 > np.max(before.position_sigma_enu)
+    assert np.min(newest.position_sigma_enu[:2]) > 1.0 > np.max(undisturbed().position_sigma_enu)
+
+
+@pytest.mark.parametrize("off_s", [365 * 86400.0, -50 * 365 * 86400.0])
+def test_a_single_wrong_stamp_is_counted_once_and_harms_nothing(off_s: float) -> None:
+    """Messages of another year are refused; the answer is what it is without them."""
+    given: list[Message] = []
+    for k, message in enumerate(messages()):
+        given.append(message)
+        if k % 101 == 100:
+            given.append(replace(message, time_s=message.time_s + off_s))
+    smoother = pushed(given)
+    assert sum(smoother.counts.values()) == len(given) - len(messages())
+    mine, theirs = smoother.newest(), undisturbed()
+    assert mine is not None
+    assert (mine.health, mine.lat, mine.lon) == (theirs.health, theirs.lat, theirs.lon)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_bad_numbers_are_refused_and_told(bad: float) -> None:
+    """Wherever they stand; every answer stays finite."""
+    given: list[Message] = []
+    for k, m in enumerate(messages()):
+        given.append(m)
+        if k % 97 == 50:
+            given += [
+                ImuSample(m.time_s, (bad, 0.0, 0.0), (0.0, 0.0, -9.8)),
+                Ping(bad, (0.1, 0.2, 0.3, 0.4)),
+                DepthReading(m.time_s, bad),
+                Fix(m.time_s, 0.7, 2.2, bad, (1.0, 1.0, 1.0)),
+            ]
+    smoother = pushed(given)
+    assert sum(smoother.counts.values()) == len(given) - len(messages())
+    assert {f"{x}_not_finite" for x in ("imu", "dvl", "depth", "gnss")} <= kinds(smoother)
+    newest = smoother.newest()
+    assert newest is not None
+    assert newest.health is Health.GOOD
+    assert np.isfinite([newest.lat, newest.lon, newest.height, *newest.velocity_enu]).all()
+
+
+def test_inertial_data_that_end_are_bad_at_once() -> None:
+    """The other sensors go on, the answer must not be used."""
+    given = [m for m in messages() if not (isinstance(m, ImuSample) and m.time_s > 8.0)]
+    smoother = pushed(given)
+    health, reason = smoother.status()
+    assert health is Health.BAD
+    assert "no inertial data" in reason
 
 
 @pytest.mark.slow
