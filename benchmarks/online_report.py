@@ -65,6 +65,7 @@ def verdict_lines(short: Sequence[StreamRun], long: StreamRun, *, lag_s: float) 
     """Return what became of the goals, and how latency and memory went over the long run."""
     ours, theirs = short[0], [run for run in short[1:] if len(run.latency_s)]
     median, p99, largest = percentiles_ms(long.latency_s)
+    cpu = percentiles_ms(long.cpu_s)
     hours = (long.keyframe_s[-1] - long.keyframe_s[0]) / 3600.0
     grown = growth(long.keyframe_s, long.latency_s, begin_s=2.0 * lag_s)
     told = "too short to tell"
@@ -73,7 +74,8 @@ def verdict_lines(short: Sequence[StreamRun], long: StreamRun, *, lag_s: float) 
     begin_mb, end_mb = long.rss_mb
     lines = [
         f"**Over {hours:.2g} h: latency median {median:.1f} ms, 99th percentile {p99:.1f} ms, "
-        f"largest {largest:.1f} ms ({_met(p99 < P99_MS)}: 99th percentile below {P99_MS:g} ms). "
+        f"largest {largest:.1f} ms ({_met(p99 < P99_MS)}: 99th percentile below {P99_MS:g} ms); of "
+        f"processor time {cpu[0]:.1f}, {cpu[1]:.1f} and {cpu[2]:.1f} ms. "
         f"Median of the last tenth over that of the first: {told}. Resident size {begin_mb:.0f} MB "
         f"with the window full, {end_mb:.0f} MB at the end.**",
         "",
@@ -112,12 +114,21 @@ def stream_lines(runs: Sequence[StreamRun]) -> list[str]:
     ours = runs[0]
     base = percentiles_ms(ours.latency_s)
     header = ["", "keyframes", "median, ms", "99 %, ms", "largest, ms", "median / ours"]
-    header += ["99 % / ours", "MB begin", "MB end", "wall, s", "remark"]
+    header += [
+        "99 % / ours",
+        "processor: median, ms",
+        "99 %, ms",
+        "MB begin",
+        "MB end",
+        "wall, s",
+        "remark",
+    ]
     rows = []
     for run in runs:
         ms = percentiles_ms(run.latency_s)
         cells = [run.name, str(len(run.latency_s)), *(f"{x:.1f}" for x in ms)]
         cells += [f"{ms[0] / base[0]:.2f}", f"{ms[1] / base[1]:.2f}"]
+        cells += [f"{x:.1f}" for x in percentiles_ms(run.cpu_s)[:2]]
         cells += [f"{x:.0f}" for x in (*run.rss_mb, run.wall_s)]
         rows.append([*cells, run.remark or "–"])
     lines = [*table(header, rows), ""]

@@ -33,6 +33,7 @@ _COLUMNS = {
     "attitude_sigma": 3,
     "health": 1,
     "latency_s": 1,
+    "cpu_s": 1,
     "newest_s": 1,
 }
 _ENDS = np.cumsum(list(_COLUMNS.values())).tolist()
@@ -57,14 +58,14 @@ class Answers:
     def __len__(self) -> int:
         return self._count
 
-    def add(self, navigation: Navigation, newest_s: float) -> None:
-        """Keep an answer, and what it took to ask for it."""
+    def add(self, navigation: Navigation, *, cpu_s: float, newest_s: float) -> None:
+        """Keep an answer, the dearest push before it, and what it took to ask for it, s."""
         n = navigation
         row = self._rows[self._count]
         row[:] = (
             *(n.time_s, n.lat, n.lon, n.height, *n.velocity_enu, *n.roll_pitch_heading),
             *(*n.position_sigma_enu, *n.velocity_sigma_enu, *n.attitude_sigma),
-            *(HEALTHS.index(n.health), n.latency_s, newest_s),
+            *(HEALTHS.index(n.health), n.latency_s, cpu_s, newest_s),
         )
         self._count += 1
 
@@ -135,15 +136,20 @@ def run_stream(
     sizes: list[tuple[float, float]] = []
     next_s, take_s = -np.inf, -np.inf
     begin = time.perf_counter()
+    cpu_s = 0.0
     for message in messages:
+        pushed = time.process_time()
         smoother.push(message)
+        cpu_s = max(cpu_s, time.process_time() - pushed)
         if not isinstance(message, ImuSample) or message.time_s < next_s - 1e-6:
             continue
         next_s = every_s * np.floor(message.time_s / every_s + 1.0 + 1e-6)
         asked = time.perf_counter()
         navigation = smoother.newest()
+        dearest_s, cpu_s = cpu_s, 0.0
         if navigation is not None:
-            answers.add(navigation, time.perf_counter() - asked)
+            asking_s = time.perf_counter() - asked
+            answers.add(navigation, cpu_s=dearest_s, newest_s=asking_s)
         if message.time_s >= take_s:
             take_s = message.time_s + TAKE_S
             taken = smoother.take_delayed()

@@ -63,6 +63,8 @@ class StreamRun(NamedTuple):
     """(K,) s, when an answer came"""
     latency_s: Array
     """(K,) s, what a new keyframe cost, all in all"""
+    cpu_s: Array
+    """(K,) s, processor time of the same: others on the machine do not stretch it"""
     parts_s: dict[str, Array]
     """What else was timed, (K,) or as many as there were"""
     newest: Accuracy
@@ -101,6 +103,7 @@ def stream_ours(duration_s: float, seed: int, dvl_hz: float, config: FixedLagCon
         f"ours, lag {config.lag_s:g} s",
         run.answers.column("time_s")[rows],
         run.answers.column("latency_s")[rows],
+        run.answers.column("cpu_s")[rows],
         {"asking for the newest state": run.answers.column("newest_s")},
         accuracy(run.answers.trajectory(rows), sim.truth_at),
         accuracy(delayed, sim.truth_at),
@@ -125,6 +128,7 @@ def stream_theirs(
         str(config),
         run.trajectory.time_s,
         run.front_s + run.update_s + covariance_s,
+        run.cpu_s,
         parts,
         scored,
         NOT_SCORED,

@@ -75,6 +75,8 @@ class TheirRun(NamedTuple):
     """(K,) s, factors, update, newest state"""
     covariance_s: Array
     """(K,) s, to read the newest state's covariance, NaN where it was not read"""
+    cpu_s: Array
+    """(K,) s, processor time of all three"""
     failure: str
     """Empty for a stream that ended as it should"""
     wall_s: float
@@ -85,6 +87,7 @@ class Timed(NamedTuple):
 
     keyframe: Keyframe
     seconds: float
+    cpu_s: float
 
 
 def keyframes_live(mission: Mission) -> Iterator[Timed]:
@@ -97,12 +100,12 @@ def keyframes_live(mission: Mission) -> Iterator[Timed]:
     for message in messages_of(mission):
         buffers.add(message)
         while len(buffers.imu) > 10:
-            begin = time.perf_counter()
+            begin, cpu = time.perf_counter(), time.process_time()
             measured = maker.next_after(last_s)
             if measured is None:
                 break
             keyframe = maker.make(measured, last_s=last_s)
-            yield Timed(keyframe, time.perf_counter() - begin)
+            yield Timed(keyframe, time.perf_counter() - begin, time.process_time() - cpu)
             last_s = measured.time_s
             buffers.drop_before(last_s - 5.0)
 
@@ -229,7 +232,7 @@ class _Columns:
         self.time_s: list[float] = []
         self.states: list[NavigationStates] = []
         self.covariance: list[Array] = []
-        self.seconds: list[tuple[float, float, float]] = []
+        self.seconds: list[tuple[float, float, float, float]] = []
 
     def trajectory(self, frame: LocalFrame) -> Trajectory:
         states = NavigationStates(*(np.concatenate(c) for c in zip(*self.states, strict=True)))
@@ -248,7 +251,7 @@ def run_theirs(mission: Mission, config: TheirConfig, *, most_wall_s: float = np
     reads = config.reads_covariance and config.kind is Kind.INCREMENTAL
     covariance, begun = np.full((15, 15), np.nan), time.perf_counter()
     for timed in keyframes_live(mission):
-        begin = time.perf_counter()
+        begin, cpu = time.perf_counter(), time.process_time()
         try:
             theirs.add(timed.keyframe)
             updated = time.perf_counter()
@@ -259,18 +262,19 @@ def run_theirs(mission: Mission, config: TheirConfig, *, most_wall_s: float = np
             failure = f"{type(error).__name__} at {timed.keyframe.time_s:.1f} s: {text}"
             break
         read_s = time.perf_counter() - updated if reads else np.nan
+        spent_s = timed.cpu_s + time.process_time() - cpu
         if not all(np.all(np.isfinite(column)) for column in theirs.states):
             failure = f"not finite from {timed.keyframe.time_s:.1f} s on"
             break
         columns.time_s.append(timed.keyframe.time_s)
         columns.states.append(theirs.states)
         columns.covariance.append(covariance)
-        columns.seconds.append((timed.seconds, updated - begin, read_s))
+        columns.seconds.append((timed.seconds, updated - begin, read_s, spent_s))
         if time.perf_counter() - begun > most_wall_s:
             failure = f"stopped at {timed.keyframe.time_s:.1f} s: out of time"
             break
-    seconds = np.array(columns.seconds).reshape(-1, 3)
+    seconds = np.array(columns.seconds).reshape(-1, 4)
     wall_s = time.perf_counter() - begun
-    front_s, update_s, covariance_s = seconds.T
+    front_s, update_s, covariance_s, cpu_s = seconds.T
     trajectory = columns.trajectory(mission.frame)
-    return TheirRun(trajectory, front_s, update_s, covariance_s, failure, wall_s)
+    return TheirRun(trajectory, front_s, update_s, covariance_s, cpu_s, failure, wall_s)

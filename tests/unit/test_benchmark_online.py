@@ -35,8 +35,9 @@ def made_up(name: str, scale: float, *, hours: float = 1.0) -> StreamRun:
     time_s = np.arange(0.0, 3600.0 * hours, 1.0)
     latency_s = np.asarray(scale * 1e-3 * (1.0 + time_s % 10.0))
     accuracy = Accuracy(*[scale] * len(ACCURACY))
+    parts = {"part": latency_s}
     return StreamRun(
-        name, time_s, latency_s, {"part": latency_s}, accuracy, accuracy, (1.0, 2.0), 1.0, ""
+        name, time_s, latency_s, latency_s, parts, accuracy, accuracy, (1.0, 2.0), 1.0, ""
     )
 
 
@@ -47,6 +48,7 @@ def test_ours_answers_after_every_ping() -> None:
     np.testing.assert_allclose(late, 1.65 + 0.2 * np.arange(len(late)), atol=1e-9)
     assert late[-1] == pytest.approx(5.85)
     assert np.all(run.latency_s > 0.0)
+    assert np.all(run.cpu_s > 1e-4)
     assert 0.0 < run.newest.velocity < 100.0
     assert 0.0 < run.delayed.horizontal < 2.0
     assert run.rss_mb[0] > 10.0
