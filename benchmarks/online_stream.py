@@ -199,13 +199,14 @@ def accuracy(trajectory: Trajectory, truth: Callable[[Array], Reference]) -> Acc
 def accuracy_of(e: ErrorSeries) -> Accuracy:
     """Return the summary of errors."""
     with np.errstate(invalid="ignore", divide="ignore"):
+        position = (e.position_enu / e.position_sigma_enu) ** 2
         velocity = (e.velocity_enu / e.velocity_sigma_enu) ** 2
         heading = (e.roll_pitch_heading[:, 2] / e.attitude_sigma[:, 2]) ** 2
     return Accuracy(
         velocity=1e3 * _rms(np.linalg.norm(e.velocity_enu, axis=1)),
         horizontal=_rms(e.horizontal),
         heading=float(np.degrees(_rms(e.roll_pitch_heading[:, 2]))),
-        nees_position=float(np.mean(e.nees_position)) / 3.0,
+        nees_position=float(np.mean(position)),
         nees_velocity=float(np.mean(velocity)),
         nees_heading=float(np.mean(heading)),
     )
