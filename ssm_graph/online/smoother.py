@@ -121,9 +121,10 @@ class FixedLagSmoother:
         undone = is_late and course.rewind(time_s - reach_s)
         n_made = course.advance(is_sample=not is_late)
         self._intake.horizon_s = course.horizon_s
-        if undone or n_made or self._tail is None:
+        is_sample = isinstance(message, ImuSample)
+        if undone or n_made or self._tail is None or (is_late and is_sample):
             self._tail = self._tail_of(course.newest)
-        elif isinstance(message, ImuSample):
+        elif is_sample:
             self._tail.add(buffers.imu.between(self._tail.end_s, np.inf))
         return n_made > 0
 

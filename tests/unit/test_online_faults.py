@@ -121,6 +121,23 @@ def test_inertial_data_that_end_are_bad_at_once() -> None:
     assert "no inertial data" in reason
 
 
+def test_a_late_sample_counts_at_once() -> None:
+    """One that comes after its successors, with no keyframe between: the newest answer has it."""
+    given = list(messages())
+    samples = [k for k, m in enumerate(given) if isinstance(m, ImuSample)]
+    late = given.pop(samples[-3])
+    without = pushed(given).newest()
+    newest = pushed([*given, late]).newest()
+    assert without is not None
+    assert newest is not None
+    np.testing.assert_allclose(
+        newest.roll_pitch_heading, undisturbed().roll_pitch_heading, rtol=0.0, atol=1e-12
+    )
+    assert not np.allclose(
+        without.roll_pitch_heading, newest.roll_pitch_heading, rtol=0.0, atol=1e-6
+    )
+
+
 @pytest.mark.slow
 def test_a_depth_sensor_in_another_unit_moves_nothing_else() -> None:
     """It is tried once whether the height was wrong; then the depth is what is left out."""
