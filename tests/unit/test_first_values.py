@@ -11,8 +11,8 @@ from ssm_graph.graph.first_values import (
     GATE,
     LOCKED_OUT_PINGS,
     _ForwardPass,
-    settle_weights,
     first_values,
+    settle_weights,
 )
 from ssm_graph.graph.linearize import inertial_graph
 from ssm_graph.problem.error_state import POSITION, ROTATION
