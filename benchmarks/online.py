@@ -79,7 +79,7 @@ def parse_args(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--hours", type=float, default=2.0, help="of ours on the long stream")
     parser.add_argument("--their-minutes", type=float, default=10.0, help="of the comparison")
-    parser.add_argument("--their-wall", type=float, default=900.0, help="s, at most for each")
+    parser.add_argument("--their-wall", type=float, default=600.0, help="s, at most for each")
     parser.add_argument("--dvl-hz", type=float, default=5.0)
     parser.add_argument("--lags", default="0,5,30,120", help="s")
     parser.add_argument("--lag-minutes", type=float, default=10.0)

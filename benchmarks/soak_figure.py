@@ -13,7 +13,7 @@ from benchmarks.online_stream import HEALTHS
 from benchmarks.soak_stream import HOUR_S, Soaked
 from ssm_graph.data import Array
 from ssm_graph.messages import Health
-from ssm_graph.report.compare_style import add_footnote, new_figure
+from ssm_graph.report.compare_style import add_footnote, log_ticks, new_figure
 from ssm_graph.report.style import BOUND, ESTIMATE, OUTLIER, SMALL, dress
 
 COLORS = {
@@ -83,8 +83,9 @@ def draw_latency(axes: Axes, run: Soaked) -> None:
     at = np.arange(len(rows)) + 0.5
     for label, column in zip(("median", "99 %", "largest"), np.array(rows).T, strict=True):
         axes.plot(at, column, marker=".", linewidth=1.0, markersize=4.0, label=label)
-    axes.legend(fontsize=SMALL, frameon=False, handlelength=1.2)
-    axes.set_yscale("log")
+    axes.legend(fontsize=SMALL, frameon=False, handlelength=1.2, ncols=3, columnspacing=0.8)
+    log_ticks(axes.yaxis, 1.0, 1000.0)
+    axes.set_xlim(0.0, len(rows))
 
 
 def hourly(run: Soaked) -> list[list[float]]:
