@@ -23,7 +23,7 @@ from ssm_graph.online.watch import LOCKED_OUT_DEPTHS, Watch, observe
 from ssm_graph.problem.doubts import TRUSTED
 from ssm_graph.problem.error_state import VELOCITY
 from ssm_graph.smoothers.keyframe import Keyframe
-from ssm_graph.smoothers.stretch import Stretch
+from ssm_graph.smoothers.stretch import Stretch, joined
 from ssm_graph.smoothers.window import Window
 
 REACH_S: Final = 0.1
@@ -115,7 +115,7 @@ class Course:
 
     def _settle(self, step: Step) -> None:
         if step.left is not None:
-            self._settled.append(step.left)
+            self._settled.append(joined([step.left]))  # a copy: a view keeps the whole window
 
     def _step(self, measured: Measured) -> Step:
         last = self.newest
