@@ -157,6 +157,7 @@ class Course:
             last_s=last.time_s,
             parity=self._agree(measured),
             force=force,
+            gap_s=float(np.max(np.diff(samples[:, 0], prepend=last.time_s), initial=0.0)),
         )
         self._tell(last.watch, watch, keyframe)
         return Step(window, watch, left)

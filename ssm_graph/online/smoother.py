@@ -67,7 +67,8 @@ class FixedLagSmoother:
             navigation = smoother.newest()
 
     Messages may come late and out of order within the lag, repeated, damaged or not at all: nothing
-    raises. Out of order they lead to the same answer as in order.
+    raises. Out of order they lead to the same answer as in order. Smoothed states are kept until
+    ``take_delayed`` takes them: in a long run call it now and then.
     """
 
     def __init__(

@@ -32,6 +32,8 @@ LOCKED_OUT_FIXES: Final = 5
 LOCKED_OUT_DEPTHS: Final = 25
 FEW: Final = 0.5
 """Fewer of the beams that agree are too few."""
+GAP_S: Final = 0.3
+"""So long without an inertial sample leaves an attitude that the next pings have to confirm."""
 SILENT_IMU_S: Final = 1.0
 
 
@@ -69,7 +71,14 @@ def refused(before: Keyframe, after: Keyframe) -> tuple[bool, bool]:
 
 
 def observe(
-    watch: Watch, keyframe: Keyframe, window: Window, *, last_s: float, parity: bool, force: float
+    watch: Watch,
+    keyframe: Keyframe,
+    window: Window,
+    *,
+    last_s: float,
+    parity: bool,
+    force: float,
+    gap_s: float,
 ) -> Watch:
     """Return what is remembered after one more keyframe.
 
@@ -81,6 +90,7 @@ def observe(
     last_s : time of the keyframe before, s.
     parity : whether its beams agree with each other.
     force : mean specific force since the keyframe before, m/s^2.
+    gap_s : longest time without an inertial sample since then.
     """
     newest, time_s = window.newest, keyframe.time_s
     kept = window.keyframes[-1]
@@ -114,6 +124,8 @@ def observe(
     if len(keyframe.depth):
         watch = watch._replace(depths_refused=watch.depths_refused + 1 if no_depth else 0)
     trouble = _trouble(watch, time_s, newest.states.v_n[0])
+    if gap_s > GAP_S and not trouble:
+        trouble = f"{gap_s:.1f} s of inertial data are missing: what was guessed has to prove right"
     if trouble:
         return watch._replace(trouble_s=time_s, trouble=trouble, sound_s=min(watch.sound_s, last_s))
     is_sound = time_s - watch.trouble_s > PROBATION_S
