@@ -13,7 +13,6 @@ from typing import Any
 from rich.console import Console
 
 from factors.kernels import KERNELS
-from factors.similarity import Kernel
 from ssm_graph.cli.online_arguments import (
     DESCRIPTION,
     add_connections,
@@ -23,7 +22,7 @@ from ssm_graph.cli.online_arguments import (
     output_configs,
     replay_speed,
 )
-from ssm_graph.cli.options import add_command
+from ssm_graph.cli.options import add_command, kernel_from
 from ssm_graph.data import Array, Mission
 from ssm_graph.errors import ConfigError, SolverError
 from ssm_graph.io.mission import read_mission
@@ -170,24 +169,9 @@ def _vehicle(path: Path | None, mission: Mission | None) -> Vehicle:
 
 
 def _lag_config(arguments: argparse.Namespace) -> FixedLagConfig:
-    kernel = _kernel(arguments)
+    given = {name: getattr(arguments, name) for name in ("dof", "width", "phi")}
+    kernel = kernel_from(KERNELS, arguments.kernel, **given)
     return replace(ONLINE, lag_s=arguments.lag, kernel=kernel, similarity=kernel.published_with)
-
-
-def _kernel(arguments: argparse.Namespace) -> Kernel:
-    choice = KERNELS[arguments.kernel]
-    given = {n: getattr(arguments, n) for n in ("dof", "width", "phi")}
-    for name, value in given.items():
-        if value is not None and name != choice.parameter:
-            owners = [k for k, c in KERNELS.items() if c.parameter == name]
-            raise ConfigError(
-                f"--{name}: expected with --kernel {' or '.join(owners)}, got {arguments.kernel}; "
-                "leave it out"
-            )
-    try:
-        return choice.kernel(given.get(choice.parameter))
-    except ValueError as error:
-        raise ConfigError(f"--kernel {arguments.kernel}: {error}") from error
 
 
 def _settings(config: FixedLagConfig) -> dict[str, Any]:

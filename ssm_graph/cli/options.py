@@ -7,6 +7,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from factors.kernels import KernelChoice
+from factors.similarity import Kernel
+from ssm_graph.errors import ConfigError
 from ssm_graph.io.mission import TableFormat
 from ssm_graph.study.methods import Family
 
@@ -54,3 +57,19 @@ def _table_format(word: str) -> TableFormat:
         return TableFormat[word.upper()]
     except KeyError:
         raise argparse.ArgumentTypeError(f"expected csv or parquet, got {word!r}") from None
+
+
+def kernel_from(choices: Mapping[str, KernelChoice], name: str, **given: float | None) -> Kernel:
+    """Return a kernel by name; a parameter that it does not have is refused."""
+    choice = choices[name]
+    for parameter, value in given.items():
+        if value is not None and parameter != choice.parameter:
+            owners = [kernel for kernel, c in choices.items() if c.parameter == parameter]
+            raise ConfigError(
+                f"--{parameter}: expected with --kernel {' or '.join(owners)}, got {name}; "
+                "leave it out"
+            )
+    try:
+        return choice.kernel(given.get(choice.parameter))
+    except ValueError as error:
+        raise ConfigError(f"--kernel {name}: {error}") from error

@@ -9,8 +9,8 @@ from rich.console import Console
 
 from factors.kernels import KERNELS, KernelChoice
 from factors.m_estimators import TruncatedKernel
-from factors.similarity import Kernel, Similarity
-from ssm_graph.cli.options import add_command
+from factors.similarity import Similarity
+from ssm_graph.cli.options import add_command, kernel_from
 from ssm_graph.cli.run_mission import add_mission_arguments, run_mission
 from ssm_graph.data import Mission
 from ssm_graph.errors import ConfigError
@@ -119,27 +119,11 @@ def loop_from(arguments: argparse.Namespace) -> SmootherConfig:
         )
     similarity = arguments.similarity
     return SmootherConfig(
-        kernel=kernel_from(arguments.kernel, **given),
+        kernel=kernel_from(CHOICES, arguments.kernel, **given),
         similarity=None if similarity is None else Similarity[similarity.upper()],
         graduation=graduation,
         max_iterations=arguments.max_iterations,
     )
-
-
-def kernel_from(name: str, **given: float | None) -> Kernel:
-    """Return a kernel by name; a parameter that it does not have is refused."""
-    choice = CHOICES[name]
-    for parameter, value in given.items():
-        if value is not None and parameter != choice.parameter:
-            owners = [kernel for kernel, c in CHOICES.items() if c.parameter == parameter]
-            raise ConfigError(
-                f"--{parameter}: expected with --kernel {' or '.join(owners)}, got {name}; "
-                "leave it out"
-            )
-    try:
-        return choice.kernel(given.get(choice.parameter))
-    except ValueError as error:
-        raise ConfigError(f"--kernel {name}: {error}") from error
 
 
 def _settings(loop: SmootherConfig) -> dict[str, Any]:

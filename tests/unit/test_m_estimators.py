@@ -25,7 +25,8 @@ from factors.m_estimators import (
     TruncatedKernel,
 )
 from factors.similarity import WEIGHT_FLOOR, GaussianKernel, Kernel, LogKernel, Similarity
-from ssm_graph.cli.smooth import kernel_from
+from ssm_graph.cli.options import kernel_from
+from ssm_graph.cli.smooth import CHOICES
 from ssm_graph.errors import ConfigError
 from ssm_graph.smoothers import batch
 from ssm_graph.smoothers.batch import SmootherConfig
@@ -224,15 +225,15 @@ def test_bad_names_are_refused(text: str, message: str) -> None:
 
 def test_command_line_refuses_what_a_kernel_does_not_have() -> None:
     """And says which kernels do."""
-    assert kernel_from("huber", dof=None, width=2.0, phi=None) == HuberKernel(2.0)
-    assert kernel_from("dcs", phi=2.0) == DcsKernel(2.0)
-    assert kernel_from("gnc-tls", width=3.0) == TruncatedKernel(3.0)
+    assert kernel_from(CHOICES, "huber", dof=None, width=2.0, phi=None) == HuberKernel(2.0)
+    assert kernel_from(CHOICES, "dcs", phi=2.0) == DcsKernel(2.0)
+    assert kernel_from(CHOICES, "gnc-tls", width=3.0) == TruncatedKernel(3.0)
     with pytest.raises(ConfigError, match=r"--dof: expected with --kernel log or sqrt, got huber"):
-        kernel_from("huber", dof=5.0)
+        kernel_from(CHOICES, "huber", dof=5.0)
     with pytest.raises(ConfigError, match=r"--phi: expected with --kernel dcs, got cauchy"):
-        kernel_from("cauchy", phi=5.0)
+        kernel_from(CHOICES, "cauchy", phi=5.0)
     with pytest.raises(ConfigError, match=r"--kernel huber: width: expected a number above zero"):
-        kernel_from("huber", width=0.0)
+        kernel_from(CHOICES, "huber", width=0.0)
 
 
 def test_each_family_is_judged_as_it_was_published() -> None:
