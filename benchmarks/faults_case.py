@@ -76,9 +76,6 @@ class Rule:
     """Begin of the kind of an event that has to be told."""
     is_harmless: bool = False
     """The last answer has to be that of the undisturbed mission, to 1e-6 sigmas."""
-    is_believed: bool = False
-    """An absolute sensor that stays off is followed in the end, for nothing else sees what it does;
-    the truth and the undisturbed answer are then no measure."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -43,7 +43,7 @@ SURFACING: Final = Stage(duration_s=200.0, gnss=((0.0, 60.0), (110.0, 200.0)))
 GNSS_ALL: Final = Stage(gnss=((0.0, 1e9),))
 HARMLESS: Final = Rule(is_harmless=True, good_after_s=2.0)
 TOLD: Final = Health.DEGRADED
-BELIEVED: Final = Rule(Health.BAD, 15.0, None, told="recovered", is_believed=True)
+FOLLOWED: Final = Rule(Health.BAD, 15.0, None, told="recovered")
 
 
 def water_track(current_enu: tuple[float, float, float]) -> Edit:
@@ -284,7 +284,7 @@ def _aids() -> list[Case]:
         ),
         Case(
             "depth 20 m off", f"from {begin_s:.0f} s on", edited(DepthReading, jump, begin_s),
-            BELIEVED,
+            FOLLOWED,
         ),
         Case(
             "one GNSS outlier", "100 m to the north, at 40 s",
@@ -296,7 +296,7 @@ def _aids() -> list[Case]:
         ),
         Case(
             "GNSS offset that stays", "100 m to the north, from 65 s on, GNSS all the time",
-            edited(Fix, moved_fix(100.0), 65.0), Rule(TOLD, 5.0, None), stage=GNSS_ALL,
+            edited(Fix, moved_fix(100.0), 65.0), FOLLOWED, stage=GNSS_ALL,
         ),
         Case(
             "heading wrong at the start", "180 degrees, stated sigma 0.5 degrees", untouched,

@@ -47,9 +47,9 @@ can be lived with, the health is GOOD in time and stays so; (6) where it is GOOD
 answer is within three of its sigmas of that of the undisturbed mission in every component, and
 where the fault takes nothing away it is the same answer to {SAME:g} sigmas.
 
-An absolute sensor that goes off for good, depth or GNSS, is followed in the end, for nothing else
-sees what it measures: (2) and (6) do not hold for these two rows, but the answer has to be BAD
-before, and `recovered` told.
+Two rows cannot pass as things are: an absolute sensor that goes off for good, depth or GNSS, is
+followed in the end, for nothing else sees what it measures. The answer is BAD before, `recovered` is
+told, and then it is GOOD at the wrong place.
 """
 
 
@@ -76,7 +76,7 @@ def judge(case: Case, run: Run) -> Row:
     faults = [] if run.failure is None else [f"raised: {run.failure.splitlines()[-1]}"]
     shares = shares_inside(run.looks, case, Health.GOOD)
     for name, share in zip(GROUPS, shares, strict=True):
-        if share < LEAST_SHARE and not case.rule.is_believed:
+        if share < LEAST_SHARE:
             faults.append(f"{name} inside in {100 * share:.0f} % while GOOD")
     if run.n_silent:
         faults.append(f"{run.n_silent} messages lost in silence")
@@ -122,7 +122,7 @@ def _off(case: Case, run: Run) -> tuple[str, str]:
     text = f"{np.linalg.norm(difference.error[0, :3]):.2f} m, {sigmas:.2g} σ"
     if case.rule.is_harmless and not sigmas < SAME:
         return text, f"another answer, by {sigmas:.1g} sigmas"
-    if last.health is Health.GOOD and not (sigmas < INSIDE or case.rule.is_believed):
+    if last.health is Health.GOOD and not sigmas < INSIDE:
         return text, f"GOOD at {sigmas:.1f} sigmas"
     return text, ""
 
