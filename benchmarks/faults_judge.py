@@ -48,8 +48,8 @@ answer is within three of its sigmas of that of the undisturbed mission in every
 where the fault takes nothing away it is the same answer to {SAME:g} sigmas.
 
 Two rows cannot pass as things are: an absolute sensor that goes off for good, depth or GNSS, is
-followed in the end, for nothing else sees what it measures. The answer is BAD before, `recovered` is
-told, and then it is GOOD at the wrong place.
+followed in the end, for nothing else sees what it measures. The answer is BAD before, `recovered`
+is told, and then it is GOOD at the wrong place.
 """
 
 
