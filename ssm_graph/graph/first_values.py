@@ -20,7 +20,11 @@ from factors.so3 import cross
 from ssm_graph.data import Array
 from ssm_graph.earth import SEMI_MAJOR_AXIS
 from ssm_graph.errors import SolverError
-from ssm_graph.graph.linearize import inertial_graph, linearize_beams
+from ssm_graph.graph.linearize import (
+    carried_covariance,
+    inertial_graph,
+    linearize_beams,
+)
 from ssm_graph.graph.states import States, states_from_arrays
 from ssm_graph.imu.preintegration import gtsam_gravity
 from ssm_graph.problem.error_state import POSITION, ROTATION, STATE_DIM, VELOCITY
@@ -127,11 +131,9 @@ class _ForwardPass:
             values.insert(X(i), pose3=state_pose)
             values.insert(V(i), velocity)
             values.insert(B(i), constant_bias=bias)
-        # Whitened, columns x_i v_i x_j v_j b_i b_j: A_i d_i + A_j d_j is noise of unit variance.
+        # Columns x_i v_i x_j v_j b_i b_j.
         whitened, _ = self.factors.at(k).linearize(values).jacobian()
-        solved = np.linalg.solve(whitened[:, _J], np.hstack([-whitened[:, _I], np.eye(STATE_DIM)]))
-        F, root_Q = solved[:, :STATE_DIM], solved[:, STATE_DIM:]
-        self.P = F @ self.P @ F.T + root_Q @ root_Q.T
+        self.P = carried_covariance(whitened[:, _I], whitened[:, _J], self.P)
         self.R_nb = predicted.pose().rotation().matrix()
         self.p_n, self.v_n = predicted.position(), predicted.velocity()
 

@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
-from factors.dvl_beam import beam_residual
+from factors.dvl_beam import BeamResidual, beam_residual
 from ssm_graph.data import Array
 from ssm_graph.graph.depth import depth_graph
 from ssm_graph.graph.keys import chain_ordering
@@ -47,11 +47,26 @@ def linearize_beams(
         lever_arm_b=beams.lever_arm_b,
         omega_ie_n=omega_ie_n,
     )
+    return rows_of_beams(residual)
+
+
+def rows_of_beams(residual: BeamResidual) -> BeamRows:
+    """Return the residuals of M beams with Jacobians of the whole error state."""
     jacobian = np.zeros((len(residual.error), STATE_DIM))
     jacobian[:, ROTATION] = residual.error_D_rotation
     jacobian[:, VELOCITY] = residual.error_D_velocity_n
     jacobian[:, GYRO_BIAS] = residual.error_D_gyro_bias
     return BeamRows(residual.error, jacobian)
+
+
+def carried_covariance(A_i: Array, A_j: Array, covariance: Array) -> Array:
+    """Return the covariance (15, 15) at the end of an inertial factor from that at its begin.
+
+    Whitened, ``A_i d_i + A_j d_j`` is noise of unit variance, both (15, 15).
+    """
+    solved = np.linalg.solve(A_j, np.hstack([-A_i, np.eye(STATE_DIM)]))
+    F, root_Q = solved[:, :STATE_DIM], solved[:, STATE_DIM:]
+    return np.asarray(F @ covariance @ F.T + root_Q @ root_Q.T)
 
 
 class GraphLinearizer:

@@ -83,8 +83,9 @@ def preintegrate(
     InertialChain
         Of K - 1 measurements, gravity set for the origin of ``frame``.
     """
-    unseen = _unseen(imu, keyframe_s)
-    merged = merge_samples(bridged(imu), keyframe_s, rate_hz=rate_hz)
+    gaps = imu_gaps(imu)
+    unseen = _unseen(imu, keyframe_s, gaps)
+    merged = merge_samples(bridged(imu, gaps), keyframe_s, rate_hz=rate_hz)
     g_n = gtsam_gravity(frame, np.zeros(3))
     bias = np.zeros(6) if bias is None else bias
     bias_hat = gtsam.imuBias.ConstantBias(bias[:3], bias[3:])
@@ -166,10 +167,10 @@ def imu_gaps(imu: ImuLog) -> tuple[Array, Array]:
     return edges[:-1][is_gap], edges[1:][is_gap]
 
 
-def _unseen(imu: ImuLog, keyframe_s: Array) -> list[Unseen]:
+def _unseen(imu: ImuLog, keyframe_s: Array, gaps: tuple[Array, Array]) -> list[Unseen]:
     """Return what is not seen of each interval between keyframes: its longest stretch of a gap."""
     unseen = [Unseen()] * (len(keyframe_s) - 1)
-    for begin, end in zip(*imu_gaps(imu), strict=True):
+    for begin, end in zip(*gaps, strict=True):
         rate, force = _liveliness(imu, begin, end)
         overlap = np.minimum(end, keyframe_s[1:]) - np.maximum(begin, keyframe_s[:-1])
         for k in np.flatnonzero(overlap > 0.0).tolist():
@@ -193,13 +194,13 @@ def _liveliness(imu: ImuLog, begin: float, end: float) -> tuple[float, float]:
     )
 
 
-def bridged(imu: ImuLog) -> ImuLog:
+def bridged(imu: ImuLog, gaps: tuple[Array, Array]) -> ImuLog:
     """Return the log with the sample that ends a gap as the mean of what is seen on both sides.
 
     As it stands it would claim its own reading for the whole of the gap, also that of gravity in
     axes that have turned meanwhile.
     """
-    _, end = imu_gaps(imu)
+    _, end = gaps
     k = np.searchsorted(imu.time_s, end)
     k = k[k > 0]
     if len(k) == 0:

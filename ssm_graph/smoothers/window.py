@@ -54,14 +54,11 @@ class Window:
         self._innovation = -self._graph.error
         self._weights, self._t = np.ones(len(self._innovation)), np.zeros(len(self._innovation))
 
-    def copy(self) -> Self:
-        """Return a window that goes its own way from here."""
-        twin = copy.copy(self)
-        twin._graph = self._graph.copy()
-        return twin
-
     def successor(self) -> Self:
-        """Return a copy that goes on at full speed; this one rests, small, until it is copied."""
+        """Return a window that goes its own way from here, at full speed; this one rests, small.
+
+        It still has all that is needed for another successor, if this way has to be left.
+        """
         twin = copy.copy(self)
         twin._graph = self._graph.successor()
         return twin

@@ -55,18 +55,11 @@ class WindowGraph:
         """(K + 1,) where the beams of each keyframe begin, and where they end"""
         self._measure(first)
 
-    def copy(self) -> Self:
-        """Return a graph that goes its own way from here."""
+    def successor(self) -> Self:
+        """Return a graph that goes its own way from here, and takes the chain along."""
         twin = copy.copy(self)
         for name in ("keyframes", "_depths", "_fixes", "_speeds", "_between"):
             setattr(twin, name, getattr(self, name).copy())
-        twin.chain, twin._stale = Chain(), 0
-        return twin
-
-    def successor(self) -> Self:
-        """Return a copy with the chain; this graph is left without."""
-        twin = self.copy()
-        twin.chain, twin._stale = self.chain, self._stale
         self.chain, self._stale = Chain(), 0
         return twin
 

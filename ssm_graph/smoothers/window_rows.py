@@ -16,6 +16,7 @@ from factors.dvl_beam import beam_residual
 from factors.so3 import cross
 from ssm_graph.data import Array
 from ssm_graph.earth import LocalFrame
+from ssm_graph.graph.linearize import BeamRows, carried_covariance, rows_of_beams
 from ssm_graph.imu.preintegration import gtsam_gravity
 from ssm_graph.problem.error_state import GYRO_BIAS, POSITION, ROTATION, STATE_DIM, VELOCITY
 from ssm_graph.problem.heights import height_track, mean_rises
@@ -72,11 +73,8 @@ class InertialRows:
     ) -> Array:
         """Return the covariance (15, 15) at a predicted keyframe from that of the last one."""
         (rows,) = self.rows([keyframe], last.followed_by(predicted))
-        # Whitened: A_i d_i + A_j d_j is noise of unit variance.
         A_i, A_j = rows[:, :STATE_DIM], rows[:, STATE_DIM : 2 * STATE_DIM]
-        J = np.linalg.solve(A_j, np.hstack([-A_i, np.eye(STATE_DIM)]))
-        F, root_Q = J[:, :STATE_DIM], J[:, STATE_DIM:]
-        return np.asarray(F @ covariance @ F.T + root_Q @ root_Q.T)
+        return carried_covariance(A_i, A_j, covariance)
 
     def set_gravity(self, ends: Sequence[Keyframe], states: NavigationStates) -> None:
         """Let gravity of the intervals before ``ends`` follow the states (1 + len(ends), ...)."""
@@ -114,7 +112,7 @@ def _way(keyframe: Keyframe) -> Way:
     return keyframe.way
 
 
-def beam_rows(sensors: Sensors, beams: BeamSpeeds, states: NavigationStates) -> tuple[Array, Array]:
+def beam_rows(sensors: Sensors, beams: BeamSpeeds, states: NavigationStates) -> BeamRows:
     """Return errors (M,) in m/s and Jacobians (M, 15) of beams, each with its own state."""
     residual = beam_residual(
         states.R_nb,
@@ -126,11 +124,7 @@ def beam_rows(sensors: Sensors, beams: BeamSpeeds, states: NavigationStates) -> 
         lever_arm_b=sensors.dvl_arm_b,
         omega_ie_n=sensors.frame.omega_ie_n,
     )
-    jacobian = np.zeros((len(residual.error), STATE_DIM))
-    jacobian[:, ROTATION] = residual.error_D_rotation
-    jacobian[:, VELOCITY] = residual.error_D_velocity_n
-    jacobian[:, GYRO_BIAS] = residual.error_D_gyro_bias
-    return residual.error, jacobian
+    return rows_of_beams(residual)
 
 
 def fix_rows(
