@@ -29,7 +29,10 @@ class Chain:
     for two successive ones.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, root: Array | None = None) -> None:
+        """``root``: as below, of a chain that this one has to make anew."""
+        self.root = np.zeros((_N, _N)) if root is None else root
+        """(15, 15) square-root information of the last keyframe, from all before it and its own"""
         self.carried: list[Array] = []
         """(15, 16) on each keyframe, from all before it"""
         self._tail = np.zeros((0, _N))

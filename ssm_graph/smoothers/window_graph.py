@@ -60,7 +60,7 @@ class WindowGraph:
         twin = copy.copy(self)
         for name in ("keyframes", "_depths", "_fixes", "_speeds", "_between"):
             setattr(twin, name, getattr(self, name).copy())
-        self.chain, self._stale = Chain(), 0
+        self.chain, self._stale = Chain(self.chain.root), 0
         return twin
 
     def pack(self) -> dict[str, Array]:
@@ -70,6 +70,7 @@ class WindowGraph:
             **{f"prior_{name}": column for name, column in self.prior._asdict().items()},
             **{f"target_{name}": column for name, column in self._targets._asdict().items()},
             **pack_keyframes(self.keyframes),
+            "root": self.chain.root,
             "between": np.array(self._between).reshape(-1, STATE_DIM, 2 * STATE_DIM + 1),
         }
 
@@ -91,6 +92,7 @@ class WindowGraph:
         counts = [len(keyframe.beams.speed) for keyframe in keyframes]
         graph.first_row = np.append(0, np.cumsum(counts, dtype=np.intp))
         graph._between = list(arrays["between"])
+        graph.chain = Chain(arrays["root"])
         graph.error = np.zeros(graph.first_row[-1])
         graph.jacobian = np.zeros((len(graph.error), STATE_DIM))
         graph._depths, graph._fixes, graph._speeds = [], [], []

@@ -81,6 +81,27 @@ def test_out_of_order_is_in_order(seed: int) -> None:
         np.testing.assert_allclose(joined(other, name), joined(delayed, name), rtol=0, atol=1e-9)
 
 
+def test_a_filter_takes_late_messages_and_restarts_as_well() -> None:
+    """With a lag of zero, messages may be late by a second."""
+    _, vehicle = stream()
+    config = replace(SHORT, lag_s=0.0)
+    expected, _, _ = run(messages(), vehicle, config)
+    late = {id(m): 0.7 if isinstance(m, Ping) else 0.0 for m in messages()}
+    ordered = sorted(messages(), key=lambda m: m.time_s + late[id(m)])
+    newest, _, _ = run(ordered, vehicle, config)
+    assert_same(newest, expected, sigmas=1e-8)
+    before = FixedLagSmoother(vehicle, config)
+    for message in messages()[:150]:
+        before.push(message)
+    arrays, meta = before.checkpoint()
+    after = FixedLagSmoother.restore(vehicle, config, arrays, meta)
+    for message in messages()[150:]:
+        after.push(message)
+    restarted = after.newest()
+    assert restarted is not None
+    assert_same(restarted, expected, sigmas=1e-8)
+
+
 @pytest.mark.parametrize("share", [0.02, 0.3, 0.8])
 def test_a_restart_gives_the_same_answer(share: float) -> None:
     """From the plain arrays and the messages since; delayed states are there once."""
