@@ -14,7 +14,6 @@ import numpy as np
 from ssm_graph.data import N_BEAMS
 from ssm_graph.errors import nearest_hint
 from ssm_graph.live.decoder import (
-    Refusals,
     RefusedError,
     number,
     parse_object,
@@ -22,6 +21,7 @@ from ssm_graph.live.decoder import (
     require,
     shown,
 )
+from ssm_graph.live.framed_decoder import FramedDecoder
 from ssm_graph.live.framing import MAX_LENGTH, LineFramer
 from ssm_graph.messages import (
     DepthReading,
@@ -61,7 +61,7 @@ KEYS: Final[dict[str, tuple[str, ...]]] = {
 """Type of a message to its keys; of them only ``sigma_m_per_s`` may be left out."""
 
 
-class JsonDecoder:
+class JsonDecoder(FramedDecoder):
     """JSON lines to messages.
 
     Parameters
@@ -71,36 +71,13 @@ class JsonDecoder:
     """
 
     def __init__(self, *, axes: BodyAxes = BodyAxes.FRD, max_length: int = MAX_LENGTH) -> None:
+        super().__init__(PLACE)
         self._axes = axes
-        self._refusals = Refusals()
         self._framer = LineFramer(self._refuse, max_length=max_length)
 
-    @property
-    def n_held(self) -> int:
-        """Bytes held of an unfinished line."""
-        return self._framer.n_held
-
-    @property
-    def n_refused(self) -> int:
-        """How much was refused so far."""
-        return self._refusals.n_total
-
-    def feed(self, data: bytes, *, arrival_s: float) -> list[Message]:  # noqa: ARG002
-        """Return the messages that these bytes complete; they carry their own time."""
-        messages: list[Message] = []
-        for line in self._framer.feed(data):
-            try:
-                messages.append(decode_message(line, axes=self._axes))
-            except RefusedError as error:
-                self._refuse(str(error))
-        return messages
-
-    def take_refusals(self) -> list[str]:
-        """Return what was refused since the last call; see :class:`Decoder`."""
-        return self._refusals.take()
-
-    def _refuse(self, text: str) -> None:
-        self._refusals.add(f"{PLACE}: {text}")
+    def _decode(self, text: str, arrival_s: float) -> list[Message]:  # noqa: ARG002
+        """Messages carry their own time."""
+        return [decode_message(text, axes=self._axes)]
 
 
 def decode_message(line: str, *, axes: BodyAxes = BodyAxes.FRD) -> Message:

@@ -12,7 +12,8 @@ from enum import Enum
 from typing import Final, NamedTuple
 
 from ssm_graph.errors import ConfigError
-from ssm_graph.live.decoder import Clock, Refusals, RefusedError, Stamper, number, shown
+from ssm_graph.live.decoder import Clock, RefusedError, Stamper, number, shown
+from ssm_graph.live.framed_decoder import FramedDecoder
 from ssm_graph.live.framing import LineFramer
 from ssm_graph.live.nmea_fields import (
     angle,
@@ -98,7 +99,7 @@ class _Gga(NamedTuple):
     hdop: float | None
 
 
-class NmeaDecoder:
+class NmeaDecoder(FramedDecoder):
     """GGA (with GST) to fixes, pressures to depths; all other sentences are ignored.
 
     ``height`` is that of GGA above the geoid plus its separation: above the ellipsoid. Sigmas are
@@ -108,10 +109,10 @@ class NmeaDecoder:
     """
 
     def __init__(self, options: NmeaOptions | None = None) -> None:
+        super().__init__(PLACE)
         self.n_without_fix = 0
         """How many GGA said that there is no fix; the first of a row is told as a refusal."""
         self._options = options or NmeaOptions()
-        self._refusals = Refusals()
         self._framer = LineFramer(self._refuse, max_length=MAX_SENTENCE)
         self._stamper = Stamper(
             self._options.clock,
@@ -125,42 +126,19 @@ class NmeaDecoder:
         self._gst: tuple[str, Vector] | None = None
         self._gst_follows = False
 
-    @property
-    def n_held(self) -> int:
-        """Bytes held of an unfinished sentence."""
-        return self._framer.n_held
-
-    @property
-    def n_refused(self) -> int:
-        """How much was refused so far."""
-        return self._refusals.n_total
-
-    def feed(self, data: bytes, *, arrival_s: float) -> list[Message]:
-        """Return the messages that these bytes complete; see :class:`Decoder`."""
-        messages: list[Message] = []
-        for line in self._framer.feed(data):
-            try:
-                messages += self._decode(line, arrival_s)
-            except RefusedError as error:
-                self._refuse(str(error))
+    def _overdue(self, arrival_s: float) -> list[Message]:
+        """Return the fix that has waited for its GST long enough."""
         waited = self._pending and not (
             0.0 <= arrival_s - self._pending.arrival_s < self._options.gst_wait_s
         )
-        return messages + (self._release(None) if waited else [])
+        return self._release(None) if waited else []
 
-    def take_refusals(self) -> list[str]:
-        """Return what was refused since the last call; see :class:`Decoder`."""
-        return self._refusals.take()
-
-    def _refuse(self, text: str) -> None:
-        self._refusals.add(f"{PLACE}: {text}")
-
-    def _decode(self, line: str, arrival_s: float) -> list[Message]:
-        lead, _, body = line.rpartition("$")
-        if lead or not line.startswith("$"):
-            if line.startswith("!"):
+    def _decode(self, text: str, arrival_s: float) -> list[Message]:
+        lead, _, body = text.rpartition("$")
+        if lead or not text.startswith("$"):
+            if text.startswith("!"):
                 return []
-            self._refuse(f"expected a sentence that begins with '$', got {shown(line)}")
+            self._refuse(f"expected a sentence that begins with '$', got {shown(text)}")
             if not lead:
                 return []
         name, *fields = split_sentence(body)

@@ -35,7 +35,6 @@ from typing import Any, Final
 from ssm_graph.data import N_BEAMS
 from ssm_graph.live.decoder import (
     Clock,
-    Refusals,
     RefusedError,
     Stamper,
     number,
@@ -43,6 +42,7 @@ from ssm_graph.live.decoder import (
     require,
     shown,
 )
+from ssm_graph.live.framed_decoder import FramedDecoder
 from ssm_graph.live.framing import MAX_LENGTH, ObjectFramer
 from ssm_graph.messages import Message, Ping
 
@@ -61,7 +61,7 @@ class BeamRule(Enum):
     VELOCITY = "beams flagged valid, where the report has a valid velocity"
 
 
-class WaterLinkedDecoder:
+class WaterLinkedDecoder(FramedDecoder):
     """Velocity reports to pings, in any layout: one a line, spread over lines, back to back.
 
     A report without a beam that counts is a ping of four missing beams. The same report again (by
@@ -84,9 +84,9 @@ class WaterLinkedDecoder:
         beam_rule: BeamRule = BeamRule.BOTTOM,
         max_length: int = MAX_LENGTH,
     ) -> None:
+        super().__init__(PLACE)
         self.n_repeats = 0
         """How many reports came again and were dropped."""
-        self._refusals = Refusals()
         self._framer = ObjectFramer(self._refuse, max_length=max_length)
         self._stamper = Stamper(
             clock, max_clock_error_s=max_clock_error_s, refusals=self._refusals, place=PLACE
@@ -94,34 +94,9 @@ class WaterLinkedDecoder:
         self._beam_rule = beam_rule
         self._last: dict[str, Any] = {}
 
-    @property
-    def n_held(self) -> int:
-        """Bytes held of an unfinished report."""
-        return self._framer.n_held
-
-    @property
-    def n_refused(self) -> int:
-        """How much was refused so far."""
-        return self._refusals.n_total
-
-    def feed(self, data: bytes, *, arrival_s: float) -> list[Message]:
-        """Return the pings that these bytes complete; see :class:`Decoder`."""
-        pings: list[Message] = []
-        for text in self._framer.feed(data):
-            try:
-                ping = self._ping(parse_object(text), arrival_s)
-            except RefusedError as error:
-                self._refuse(str(error))
-            else:
-                pings += [] if ping is None else [ping]
-        return pings
-
-    def take_refusals(self) -> list[str]:
-        """Return what was refused since the last call; see :class:`Decoder`."""
-        return self._refusals.take()
-
-    def _refuse(self, text: str) -> None:
-        self._refusals.add(f"{PLACE}: {text}")
+    def _decode(self, text: str, arrival_s: float) -> list[Message]:
+        ping = self._ping(parse_object(text), arrival_s)
+        return [] if ping is None else [ping]
 
     def _ping(self, report: dict[str, Any], arrival_s: float) -> Ping | None:
         kind = require(report, "type")
