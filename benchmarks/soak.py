@@ -9,11 +9,13 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import os
+import re
 import shlex
 import sys
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -26,6 +28,7 @@ from benchmarks.speed import machine, table
 from ssm_graph.data import Array
 from ssm_graph.report.compare_style import save
 from ssm_graph.simulation import Grade
+from ssm_graph.study.code import code_version
 
 RESULTS = Path(__file__).resolve().parent / "results"
 WANTED = 0.99
@@ -62,13 +65,18 @@ def parse_args(argv: Sequence[str] | None = None) -> argparse.Namespace:
 
 
 def run_all(args: argparse.Namespace) -> list[Soaked]:
-    """Run all cases, each in a process of its own: resident sizes are counted by process."""
+    """Run all cases, each in a process of its own: resident sizes are counted by process.
+
+    A case that was finished before, by the same code with the same settings, is taken from ``out``.
+    """
     context = multiprocessing.get_context("spawn")
     found: dict[str, Soaked] = {}
+    args.out.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(args.jobs, mp_context=context, max_tasks_per_child=1) as pool:
         futures = [
             pool.submit(
-                soak,
+                soaked_once,
+                args.out,
                 case,
                 hours=args.hours,
                 seed=args.seed + list(CASES).index(case),
@@ -82,6 +90,21 @@ def run_all(args: argparse.Namespace) -> list[Soaked]:
             found[run.name] = run
             print(f"{run.name}: done in {run.wall_s / 60.0:.0f} min", file=sys.stderr, flush=True)
     return [found[case] for case in args.cases]
+
+
+def soaked_once(out: Path, case: str, **settings: Any) -> Soaked:
+    """Return the run of a case, kept in a folder as soon as it is done."""
+    told = [code_version(), case, *(f"{name}={value}" for name, value in settings.items())]
+    file = out / (re.sub(r"[^\w.=+-]+", "_", "_".join(told)) + ".npz")
+    if file.exists():
+        with np.load(file) as kept:
+            return Soaked.unpack(kept)
+    run = soak(case, **settings)
+    unfinished = file.with_suffix(".part.npz")
+    arrays: dict[str, Any] = run.pack()
+    np.savez(unfinished, **arrays)
+    unfinished.replace(file)
+    return run
 
 
 def goals(run: Soaked) -> list[str]:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,6 +90,20 @@ class Soaked(NamedTuple):
     rss_s: Array
     rss_mb: Array
     wall_s: float
+
+    def pack(self) -> dict[str, Array]:
+        """Return everything as arrays."""
+        return {
+            name: np.array(json.dumps(value) if isinstance(value, dict) else value)
+            for name, value in self._asdict().items()
+        }
+
+    @classmethod
+    def unpack(cls, arrays: Mapping[str, Array]) -> Soaked:
+        """Return the run that was packed."""
+        fields: dict[str, Any] = {name: arrays[name] for name in cls._fields}
+        fields |= {name: json.loads(str(fields[name])) for name in ("events", "refused")}
+        return cls(**fields | {"name": str(fields["name"]), "wall_s": float(fields["wall_s"])})
 
     @property
     def is_outside(self) -> NDArray[np.bool_]:

@@ -15,11 +15,12 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
-from factors.similarity import WEIGHT_FLOOR, Kernel, expected_mahalanobis_sq
+from factors.similarity import Kernel
 from factors.so3 import cross
-from ssm_graph.data import Array
+from ssm_graph.data import N_BEAMS, Array
 from ssm_graph.earth import SEMI_MAJOR_AXIS
 from ssm_graph.errors import SolverError
+from ssm_graph.graph.beam_weights import first_trust, settle_weights, updated_trust
 from ssm_graph.graph.linearize import (
     carried_covariance,
     inertial_graph,
@@ -30,13 +31,10 @@ from ssm_graph.imu.preintegration import gtsam_gravity
 from ssm_graph.problem.error_state import POSITION, ROTATION, STATE_DIM, VELOCITY
 from ssm_graph.problem.problem import Problem, start_of
 
-GATE = 5.0
-"""Beams further than this many innovation sigmas from the prediction start without weight."""
 LOCKED_OUT_PINGS = 3
 """After so many pings in a row without one good beam the prediction is doubted instead."""
 ANCHOR_SIGMA = 1.0
 """m/s; after a silence that leaves the beams this uncertain they set the velocity anew."""
-WEIGHT_ROUNDS = 10
 GRAVITY_REACH = 20.0
 """m, how far gravity is carried linearly before it is evaluated anew."""
 
@@ -98,6 +96,7 @@ class _ForwardPass:
         self.P = start.covariance
         self.factors = inertial
         self.weights = np.ones(len(problem.beams.speed))
+        self.trust = np.ones(N_BEAMS)
         self.without_beam = 0
         self.n_doubts = 0
         self.gravity_at = np.full(3, np.inf)
@@ -196,13 +195,16 @@ class _ForwardPass:
         predicted = H @ self.P @ H.T
         if predicted.diagonal().max() > ANCHOR_SIGMA**2:
             predicted = self._forget_velocity(H, innovation, predicted)
-        weights = settle_weights(innovation, predicted, variance, self.kernel)
+        beam = self.problem.beams.beam[rows]
+        first = first_trust(self.trust[beam], predicted, variance)
+        weights = settle_weights(innovation, predicted, variance, self.kernel, first=first)
         self.without_beam = self.without_beam + 1 if np.all(weights < 0.01) else 0
         if self.without_beam >= LOCKED_OUT_PINGS:
             self.n_doubts += 1
             self.without_beam = 0
             predicted = self._forget_velocity(H, innovation, predicted)
             weights = settle_weights(innovation, predicted, variance, self.kernel)
+        self.trust = updated_trust(self.trust, beam, weights)
         self.weights[rows] = weights
         return _Rows(H, innovation, variance / weights)
 
@@ -233,28 +235,6 @@ class _ForwardPass:
 # Columns of a linearised inertial factor that belong to its first and its second keyframe.
 _I = np.r_[0:9, 18:24]
 _J = np.r_[9:18, 24:30]
-
-
-def settle_weights(innovation: Array, predicted: Array, variance: Array, kernel: Kernel) -> Array:
-    """Return the beams' weights at one ping, from those that pass the gate.
-
-    The posterior of the innovation needs no state: with ``S = H P H' + R / weight`` it has mean
-    ``R / weight S^-1 innovation`` and covariance ``H P H' - H P H' S^-1 H P H'``.
-    """
-    sigma, spread = np.sqrt(variance), predicted.diagonal()
-    weights = np.where(innovation**2 < GATE**2 * (spread + variance), 1.0, WEIGHT_FLOOR)
-    for _ in range(WEIGHT_ROUNDS):
-        S = predicted.copy()
-        S.flat[:: len(S) + 1] += variance / weights
-        gain = predicted @ np.linalg.inv(S)
-        left = innovation - gain @ innovation
-        left_variance = spread - (gain * predicted).sum(axis=1)
-        t = expected_mahalanobis_sq(left, np.maximum(left_variance, 0.0), sigma=sigma)
-        settled = kernel.weight(t)
-        if np.abs(settled - weights).max() < 1e-2:
-            return settled
-        weights = settled
-    return weights
 
 
 class _RowsByKeyframe:

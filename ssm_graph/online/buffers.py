@@ -10,6 +10,7 @@ from ssm_graph.data import N_BEAMS, Array, DepthLog, DvlLog, GnssLog, ImuLog, Mi
 from ssm_graph.earth import LocalFrame
 from ssm_graph.messages import DepthReading, Fix, ImuSample, Message, Ping, Vehicle
 from ssm_graph.online.rows import TimedRows
+from ssm_graph.stuck_beams import STUCK_PINGS, stuck_beams
 
 PERIOD_EVERY: Final = 100
 DEFAULT_PERIOD_S: Final = 0.01
@@ -26,6 +27,8 @@ class Buffers:
         self.depths = TimedRows(1)
         self.fixes = TimedRows(6)
         self._period_s, self._n_imu = DEFAULT_PERIOD_S, 0
+        self.shortest_period_s = np.inf
+        """Sampling interval of the inertial data when most of them came, s"""
 
     def time_of(self, message: Message) -> float:
         """Return when a message's content was true, s."""
@@ -51,17 +54,29 @@ class Buffers:
         given = ping.sigma or (np.nan,) * N_BEAMS
         return [s if s > 0.0 else self.vehicle.beam_sigma for s in given]
 
-    def counting(self, pings: Array) -> Array:
-        """Return pings (P, 9) without the speeds of infinite sigma, which are kept but not used."""
-        counting, unused = pings.copy(), np.isinf(pings[:, 1 + N_BEAMS :])
+    def pings_between(self, begin_s: float, end_s: float) -> Array:
+        """Return the pings (P, 9) after ``begin_s`` up to and with ``end_s``, as they count.
+
+        Speeds of stuck beams and those of infinite sigma are kept but not used.
+        """
+        rows = self.pings
+        begin, end = (rows.index(t, after=True) for t in (begin_s, end_s))
+        first = max(begin - STUCK_PINGS, 0)
+        near = rows.all[first : end + STUCK_PINGS]
+        is_stuck = stuck_beams(near[:, 1 : 1 + N_BEAMS])
+        here = slice(begin - first, end - first)
+        counting = near[here].copy()
+        unused = np.isinf(counting[:, 1 + N_BEAMS :]) | is_stuck[here]
         counting[:, 1 : 1 + N_BEAMS][unused] = np.nan
         counting[:, 1 + N_BEAMS :][unused] = self.vehicle.beam_sigma
         return counting
 
     def drop_before(self, time_s: float) -> None:
         """Forget what is older than a time."""
-        for rows in (self.imu, self.pings, self.depths, self.fixes):
+        for rows in (self.imu, self.depths, self.fixes):
             rows.drop_before(time_s)
+        kept = self.pings.all[: max(self.pings.index(time_s) - STUCK_PINGS, 0)]
+        self.pings.drop_before(kept[-1, 0] if len(kept) else -np.inf)
 
     @property
     def period_s(self) -> float:
@@ -70,6 +85,8 @@ class Buffers:
             times = self.imu.all[-2 * PERIOD_EVERY :, 0]
             if len(times) > 1:
                 self._period_s = float(np.median(np.diff(times)))
+                if len(times) > PERIOD_EVERY:
+                    self.shortest_period_s = min(self.shortest_period_s, self._period_s)
         return self._period_s
 
     def imu_log(self, begin_s: float, end_s: float, *, margin: int = 3) -> ImuLog:
@@ -86,7 +103,7 @@ class Buffers:
     def mission(self, frame: LocalFrame) -> Mission:
         """Return everything as a mission, to align with."""
         vehicle = self.vehicle
-        pings = self.counting(self.pings.all)
+        pings = self.pings_between(-np.inf, np.inf)
         depths, fixes = self.depths.all, self.fixes.all
         end_s = self.imu.last_s
         stamps = pings[:, 0] + vehicle.mount.time_offset_s

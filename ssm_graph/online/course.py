@@ -18,13 +18,14 @@ from ssm_graph.messages import Severity
 from ssm_graph.online.buffers import Buffers, Measured
 from ssm_graph.online.events import EventLog
 from ssm_graph.online.keyframes import KeyframeMaker
-from ssm_graph.online.recovery import reanchored, what_to_forget
-from ssm_graph.online.watch import LOCKED_OUT_DEPTHS, Watch, observe
-from ssm_graph.problem.doubts import TRUSTED
+from ssm_graph.online.recovery import Doubt, Doubted, doubt_of, reanchored, watch_after
+from ssm_graph.online.reserve import Reserve
+from ssm_graph.online.watch import Watch, is_sound, observe
 from ssm_graph.problem.error_state import VELOCITY
 from ssm_graph.smoothers.keyframe import Keyframe
 from ssm_graph.smoothers.stretch import Stretch, joined
 from ssm_graph.smoothers.window import Window
+from ssm_graph.smoothers.window_rows import InertialRows
 
 REACH_S: Final = 0.1
 """A late inertial sample changes keyframes that are so much older: a ping's gyro reading is a mean,
@@ -42,6 +43,7 @@ class Step(NamedTuple):
     watch: Watch
     left: Stretch | None
     """What left the window with it."""
+    reserve: Reserve
 
     @property
     def time_s(self) -> float:
@@ -58,7 +60,7 @@ class Course:
         """``null_b`` (4,) is the array's parity: orthogonal to the speeds of any velocity."""
         self._steps = deque([first])
         self._maker, self._buffers, self._events = maker, buffers, events
-        self._null = null_b
+        self._null, self._inertial = null_b, InertialRows(first.window.sensors.frame)
         self._settled: list[Stretch] = []
 
     @property
@@ -123,44 +125,49 @@ class Course:
         sigma = last.window.newest_sigma
         if len(keyframe.beams.speed) == 0 and np.linalg.norm(sigma[VELOCITY]) > ANY_SPEED:
             keyframe = replace(keyframe, speed_sigma=ANY_SPEED)
-        window = last.window.successor()
-        doubt = what_to_forget(last.watch, sigma, keyframe)
+        window, reserve = last.window.successor(), last.reserve.led_on(keyframe, self._inertial)
+        doubt = doubt_of(last.watch, sigma, keyframe)
+        if doubt is not None:
+            return self._anew(keyframe, doubt, reserve)
         try:
-            if doubt is not None:
-                raise SolverError(doubt)
             left = window.advance(keyframe)
             window.iterate()
             window.require_sane()
         except (SolverError, np.linalg.LinAlgError, FloatingPointError) as error:
-            self._events.tell(
-                keyframe.time_s, Severity.ERROR, "recovered", f"{error}: begun anew from there"
-            )
-            window = reanchored(last.window, keyframe, last.watch)
-            refusals = last.watch.depths_refused
-            fresh = Watch(
-                last_beam_s=_last_beam_s(window, last.watch),
-                depths_refused=refusals + (refusals == LOCKED_OUT_DEPTHS),
-                force=last.watch.force,
-                good_share=0.0,  # it has to prove itself
-                sound_s=min(last.watch.sound_s, last.time_s),
-                trouble_s=keyframe.time_s,
-                trouble=str(error),
-                begun_anew_s=keyframe.time_s,
-            )
-            return Step(window, fresh, last.window.all)
+            return self._anew(keyframe, Doubt(Doubted.ANSWER, str(error)), reserve)
+        watch = self._observed(keyframe, window, parity=self._agree(measured))
+        if is_sound(watch, keyframe.time_s):
+            reserve = reserve.renewed(window)
+        self._tell(last.watch, watch, keyframe)
+        return Step(window, watch, left, reserve)
+
+    def _anew(self, keyframe: Keyframe, doubt: Doubt, reserve: Reserve) -> Step:
+        """Begin a new window at the next keyframe."""
+        last = self.newest
+        self._events.tell(
+            keyframe.time_s, Severity.ERROR, "recovered", f"{doubt.reason}: begun anew from there"
+        )
+        window = reanchored(last.window, keyframe, reserve.older, doubt.what)
+        if doubt.what not in (Doubted.ANSWER, Doubted.VELOCITY):
+            reserve = Reserve.of(window)
+        watch = watch_after(last.watch, window, last.window.newest, doubt)
+        return Step(window, watch, last.window.all, reserve)
+
+    def _observed(self, keyframe: Keyframe, window: Window, *, parity: bool) -> Watch:
+        last, period_s = self.newest, self._buffers.shortest_period_s
         samples = self._buffers.imu.between(last.time_s, keyframe.time_s)
         force = float(np.linalg.norm(samples[:, 4:], axis=1).mean()) if len(samples) else 9.8
-        watch = observe(
+        n_due = np.floor((keyframe.time_s - last.time_s) / period_s - 1.0)
+        return observe(
             last.watch,
             keyframe,
             window,
             last_s=last.time_s,
-            parity=self._agree(measured),
+            parity=parity,
             force=force,
             gap_s=float(np.max(np.diff(samples[:, 0], prepend=last.time_s), initial=0.0)),
+            missing=1.0 - len(samples) / n_due if n_due > 0 else 0.0,
         )
-        self._tell(last.watch, watch, keyframe)
-        return Step(window, watch, left)
 
     def _agree(self, measured: Measured) -> bool:
         """Return whether all four beams of the ping are there and agree with each other."""
@@ -173,9 +180,3 @@ class Course:
     def _tell(self, before: Watch, after: Watch, keyframe: Keyframe) -> None:
         if after.trouble_s == keyframe.time_s and after.trouble != before.trouble:
             self._events.tell(keyframe.time_s, Severity.WARNING, "doubt", after.trouble)
-
-
-def _last_beam_s(begun: Window, watch: Watch) -> float:
-    """Return when a beam counted last, after a window has begun anew."""
-    newest = begun.newest
-    return float(newest.time_s[-1]) if np.any(newest.weight >= TRUSTED) else watch.last_beam_s

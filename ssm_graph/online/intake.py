@@ -24,6 +24,7 @@ from ssm_graph.messages import (
 )
 from ssm_graph.online.buffers import Buffers
 from ssm_graph.online.events import EventLog
+from ssm_graph.stuck_beams import STUCK_PINGS, stuck_beams
 
 LARGEST_RATE: Final = 35.0
 """rad/s"""
@@ -80,7 +81,31 @@ class Intake:
             return None
         if isinstance(message, Ping):
             message = self._checked_ping(message, now_s)
-        return time_s if self._add(message) else None
+        if not self._add(message):
+            return None
+        return self._since_stuck(message, time_s) if isinstance(message, Ping) else time_s
+
+    def _since_stuck(self, ping: Ping, time_s: float) -> float:
+        """Return the time of the first ping that this one shows to be of a stuck beam, or its own.
+
+        A ping that ends a row of equal readings, or comes late into one, changes what that was.
+        """
+        rows = self.buffers.pings.all
+        at = self.buffers.pings.index(time_s)
+        first = max(at - STUCK_PINGS, 0)
+        near = rows[first : at + STUCK_PINGS, 1 : 1 + N_BEAMS]
+        known = np.delete(near, at - first, axis=0)
+        was = np.insert(stuck_beams(known), at - first, False, axis=0)
+        now = stuck_beams(near)
+        changed = (was != now).any(axis=1)
+        for beam in np.flatnonzero(now[at - first]).tolist():
+            self._events.tell(
+                ping.time_s,
+                Severity.WARNING,
+                f"beam_{beam + 1}_stuck",
+                f"beam {beam + 1} repeats {ping.speed[beam]:g} m/s in every ping: left out",
+            )
+        return float(rows[first + np.argmax(changed), 0]) if changed.any() else time_s
 
     def _problem(self, message: Message) -> tuple[str, str] | None:
         name = bad_number(message)

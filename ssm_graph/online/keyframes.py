@@ -71,7 +71,7 @@ class KeyframeMaker:
         return min(times)
 
     def _usable_pings(self, begin_s: float, end_s: float) -> Array:
-        pings = self._buffers.counting(self._buffers.pings.between(begin_s, end_s))
+        pings = self._buffers.pings_between(begin_s, end_s)
         return pings[np.isfinite(pings[:, 1:5]).any(axis=1)]
 
     def _covers(self, time_s: float) -> bool:

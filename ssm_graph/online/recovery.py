@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Final
+from enum import Enum
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from ssm_graph.data import Array
-from ssm_graph.online.watch import LOCKED_OUT_DEPTHS, LOCKED_OUT_FIXES, LOCKED_OUT_PINGS, Watch
+from ssm_graph.online.reserve import Kept
+from ssm_graph.online.watch import Contradicted, Watch
+from ssm_graph.problem.doubts import TRUSTED
 from ssm_graph.problem.error_state import POSITION, ROTATION, VELOCITY, InitialMoments
 from ssm_graph.smoothers.keyframe import Keyframe
+from ssm_graph.smoothers.stretch import Stretch
 from ssm_graph.smoothers.window import Window
 
 SPEED_SIGMA: Final = 3.0
 """m/s, what a vehicle's velocity can be."""
 POSITION_SIGMA: Final = 50.0
 """m, how far a position is doubted that GNSS or depth contradict."""
-LONGEST_DOUBT_S: Final = 60.0
 BENT_SPEED: Final = 1.0
 """m/s, with the next: so uncertain a velocity is not corrected along with so uncertain an attitude;
 that would take the one for the other."""
@@ -24,38 +27,77 @@ BENT_TURN: Final = 0.05
 """rad"""
 SILENCE_S: Final = 10.0
 LONGEST_FEW_S: Final = 25.0
-ATTITUDE_FACTOR: Final = 2.0
-"""Attitude is doubted as well, by so many of its sigmas."""
+LOCKED_OUT_PINGS: Final = 3
+"""Pings in a row whose beams agree with each other but not with the prediction."""
+OUT_PINGS: Final = 6
+"""Pings in a row without a beam that agrees with the prediction."""
+LONGEST_LOCK_OUT_S: Final = 30.0
+"""So long the inertial data are believed rather than beams that agree with each other."""
+LOCKED_OUT_FIXES: Final = 5
+LOCKED_OUT_DEPTHS: Final = 25
+DOUBT_FACTOR: Final = 2.0
+"""What an answer in reserve says is doubted by so many of its sigmas, and attitude with a position
+that is contradicted."""
 
 
-def what_to_forget(watch: Watch, sigma: Array, keyframe: Keyframe) -> str | None:
+ASTRAY_TIMES: Final = 3
+ASTRAY_S: Final = 120.0
+"""A position that fixes contradict so often within so long is not mended by moving it."""
+
+
+class Doubted(Enum):
+    """What cannot be gone on from."""
+
+    VELOCITY_AFTER_SILENCE = "velocity, after a silence of the beams"
+    ANSWER = "everything since it was sound"
+    VELOCITY = "everything since it was sound, and what the inertial data made of the velocity"
+    POSITION = "position"
+    HEIGHT = "height"
+
+
+class Doubt(NamedTuple):
+    """Why a window has to begin anew."""
+
+    what: Doubted
+    reason: str
+
+
+def doubt_of(watch: Watch, sigma: Array, keyframe: Keyframe) -> Doubt | None:
     """Say why the prediction of a keyframe cannot be gone on from; None if it can.
 
     ``sigma`` (15,) are those of the keyframe before.
     """
-    if is_adrift(watch, sigma, keyframe):
-        return (
+    if _is_adrift(watch, sigma, keyframe):
+        return Doubt(
+            Doubted.VELOCITY_AFTER_SILENCE,
             "after a silence of the beams the prediction is too uncertain to be corrected: the "
-            "beams set the velocity anew"
+            "beams set the velocity anew",
         )
-    if watch.pings_refused >= LOCKED_OUT_PINGS:
-        return (
-            f"{watch.pings_refused} pings in a row, whose beams agree with each other, contradict "
-            "the velocity"
-        )
-    if len(keyframe.beams.speed) > 2 and keyframe.time_s - watch.few_since_s > LONGEST_FEW_S:
-        return (
-            f"most beams have contradicted the answer for {keyframe.time_s - watch.few_since_s:.0f}"
-            " s: perhaps it follows the wrong ones"
+    if watch.pings_refused >= LOCKED_OUT_PINGS or watch.pings_out >= OUT_PINGS:
+        out_s = keyframe.time_s - watch.out_since_s
+        if out_s > LONGEST_LOCK_OUT_S:
+            reason = f"for {out_s:.0f} s no beam has agreed with the velocity: they set it anew"
+            return Doubt(Doubted.VELOCITY, reason)
+        if watch.begun_anew_s < watch.out_since_s:
+            reason = f"no beam of {watch.pings_out} pings in a row agrees with the velocity"
+            return Doubt(Doubted.ANSWER, reason)
+    few_s = keyframe.time_s - watch.few_since_s
+    if len(keyframe.beams.speed) > 2 and few_s > LONGEST_FEW_S:
+        return Doubt(
+            Doubted.ANSWER,
+            f"most beams have contradicted the answer for {few_s:.0f} s: perhaps it follows the "
+            "wrong ones",
         )
     if watch.fixes_refused >= LOCKED_OUT_FIXES:
-        return f"{watch.fixes_refused} GNSS fixes in a row contradict the position"
+        reason = f"{watch.fixes_refused} GNSS fixes in a row contradict the position"
+        return Doubt(Doubted.POSITION, reason)
     if watch.depths_refused == LOCKED_OUT_DEPTHS:  # once: if that does not help, it is the sensor
-        return f"the depth has contradicted the height {watch.depths_refused} times in a row"
+        reason = f"the depth has contradicted the height {watch.depths_refused} times in a row"
+        return Doubt(Doubted.HEIGHT, reason)
     return None
 
 
-def is_adrift(watch: Watch, sigma: Array, keyframe: Keyframe) -> bool:
+def _is_adrift(watch: Watch, sigma: Array, keyframe: Keyframe) -> bool:
     """Return whether beams are back after a silence that left the prediction beyond correction."""
     return bool(
         len(keyframe.beams.speed) > 2
@@ -65,41 +107,116 @@ def is_adrift(watch: Watch, sigma: Array, keyframe: Keyframe) -> bool:
     )
 
 
-def reanchored(window: Window, keyframe: Keyframe, watch: Watch) -> Window:
-    """Return a window that begins at ``keyframe``, where the inertial data lead from the last one.
+def watch_after(was: Watch, begun: Window, last: Stretch, doubt: Doubt) -> Watch:
+    """Return what is remembered of an answer that was begun anew; it has to prove itself.
 
-    What was contradicted is forgotten: the velocity after a failed solution or pings that agree
-    with each other, the position after fixes, the height after depths. Where the velocity was wrong
-    the position is doubted by what that may have done since all was sound. Attitude is kept,
-    with larger sigmas.
+    Parameters
+    ----------
+    was : what was remembered before.
+    begun : the window of the new answer.
+    last : the newest keyframe before.
+    doubt : why it was begun anew.
     """
-    predicted, covariance = window.predicted(keyframe)
-    P = covariance.copy()
-    is_silent = is_adrift(watch, window.newest_sigma, keyframe)
-    if not is_silent:
-        P[ROTATION, ROTATION] *= ATTITUDE_FACTOR**2
-    by_position = watch.fixes_refused >= LOCKED_OUT_FIXES
-    by_depth = watch.depths_refused == LOCKED_OUT_DEPTHS
-    R_nb, p_n, v_n, bias = (column[0] for column in predicted)
-    if by_position:
-        P[POSITION, POSITION] += POSITION_SIGMA**2 * np.eye(3)
-    elif by_depth:
-        P[POSITION, POSITION] += POSITION_SIGMA**2 * np.outer(R_nb[2], R_nb[2])
+    newest, refusals = begun.newest, was.depths_refused
+    time_s = float(newest.time_s[0])
+    is_aided = bool(np.any(newest.weight >= TRUSTED))
+    contradicted, moved = was.contradicted, was.moved
+    if doubt.what in (Doubted.POSITION, Doubted.HEIGHT):
+        contradicted = Contradicted(
+            time_s,
+            f"since {time_s:.0f} s: {doubt.reason} of dead reckoning, and it follows them; one of "
+            "the two is wrong",
+            tuple(last.states.p_n[0].tolist()),
+            float(np.sqrt(np.trace(last.covariance[0, POSITION, POSITION]))),
+        )
+    if doubt.what is Doubted.POSITION:
+        moved = (*(t for t in moved if time_s - t < ASTRAY_S), time_s)
+    return Watch(
+        last_beam_s=time_s if is_aided else was.last_beam_s,
+        depths_refused=refusals + (refusals == LOCKED_OUT_DEPTHS),
+        out_since_s=np.inf if is_aided else was.out_since_s,
+        force=was.force,
+        good_share=0.0,
+        trouble_s=time_s,
+        trouble=doubt.reason,
+        begun_anew_s=time_s,
+        moved=moved,
+        contradicted=contradicted,
+    )
+
+
+def is_astray(watch: Watch) -> bool:
+    """Return whether fixes have contradicted one answer after the other: the heading is wrong."""
+    return len(watch.moved) >= ASTRAY_TIMES
+
+
+def reanchored(window: Window, keyframe: Keyframe, kept: Kept, what: Doubted) -> Window:
+    """Return a window that begins at ``keyframe`` without what is doubted.
+
+    Parameters
+    ----------
+    window : up to the keyframe before.
+    keyframe : the next one.
+    kept : an older answer, led on to ``keyframe`` by the inertial data.
+    what : of position, height, or velocity after a silence, the rest of the prediction is gone on
+        from; otherwise ``kept`` is.
+    """
+    if what in (Doubted.ANSWER, Doubted.VELOCITY):
+        trust = kept.trust
+        start = _from_reserve(kept, keyframe.time_s, has_velocity=what is Doubted.ANSWER)
     else:
-        P[VELOCITY, :] = P[:, VELOCITY] = 0.0
-        P[VELOCITY, VELOCITY] = SPEED_SIGMA**2 * np.eye(3)
-        since_s = keyframe.time_s - min(watch.sound_s, keyframe.time_s)
-        since_s = max(since_s, min(keyframe.time_s - watch.last_beam_s, LONGEST_DOUBT_S))
-        if not is_silent:
-            P[POSITION, POSITION] += (SPEED_SIGMA * since_s) ** 2 * np.eye(3)
-    if not by_position and np.linalg.norm(v_n) > SPEED_SIGMA:
-        v_n = v_n * (SPEED_SIGMA / np.linalg.norm(v_n))
-    start = InitialMoments(R_nb, p_n, v_n, bias, _regular(P))
+        trust, start = window.trust, _from_prediction(window, keyframe, what)
     # The first keyframe of a window meets no gate: depth and fixes count from the next one on.
     first = keyframe.without("depth").without("fix")
-    begun = Window(window.sensors, window.config, first, start)
+    begun = Window(window.sensors, window.config, first, start, trust=trust)
+    begun.meet_prediction()
     begun.iterate()
     return begun
+
+
+def _from_reserve(kept: Kept, time_s: float, *, has_velocity: bool) -> InitialMoments:
+    """Return the older answer; where its velocity says little, the place with what may have come.
+
+    Its errors are correlated as the inertial data correlate them: a velocity that is measured
+    corrects attitude and position as well.
+    """
+    P = kept.covariance * DOUBT_FACTOR**2
+    R_nb, p_n, v_n, bias = (column[0] for column in kept.states)
+    if not has_velocity or np.sqrt(np.trace(P[VELOCITY, VELOCITY])) > SPEED_SIGMA:
+        v_n = _slowed(v_n)
+        _forget(P, VELOCITY, SPEED_SIGMA)
+        p_n = kept.place_n
+        _forget(
+            P, POSITION, float(np.hypot(kept.place_sigma, SPEED_SIGMA * (time_s - kept.since_s)))
+        )
+    return InitialMoments(R_nb, p_n, v_n, bias, _regular(P))
+
+
+def _from_prediction(window: Window, keyframe: Keyframe, what: Doubted) -> InitialMoments:
+    predicted, covariance = window.predicted(keyframe)
+    P = covariance.copy()
+    R_nb, p_n, v_n, bias = (column[0] for column in predicted)
+    if what is Doubted.VELOCITY_AFTER_SILENCE:
+        v_n = _slowed(v_n)
+        _forget(P, VELOCITY, SPEED_SIGMA)
+    else:
+        P[ROTATION, ROTATION] *= DOUBT_FACTOR**2
+        up_b = R_nb[2]
+        unsure = np.eye(3) if what is Doubted.POSITION else np.outer(up_b, up_b)
+        P[POSITION, POSITION] += POSITION_SIGMA**2 * unsure
+    return InitialMoments(R_nb, p_n, v_n, bias, _regular(P))
+
+
+def _slowed(v_n: Array) -> Array:
+    """Return a velocity that a vehicle can have."""
+    speed = float(np.linalg.norm(v_n))
+    return v_n * (SPEED_SIGMA / speed) if speed > SPEED_SIGMA else v_n
+
+
+def _forget(P: Array, part: slice, sigma: float) -> None:
+    """Leave a standard deviation of a part of the error state, and nothing else of it."""
+    P[part, :] = P[:, part] = 0.0
+    P[part, part] = sigma**2 * np.eye(3)
 
 
 def _regular(P: Array) -> Array:

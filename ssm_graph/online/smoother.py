@@ -26,12 +26,15 @@ from ssm_graph.online.delayed import Delayed, delayed_of
 from ssm_graph.online.events import EventLog
 from ssm_graph.online.intake import Intake
 from ssm_graph.online.keyframes import KeyframeMaker, sensors_of_vehicle
+from ssm_graph.online.recovery import ASTRAY_TIMES, is_astray
+from ssm_graph.online.reserve import Reserve
 from ssm_graph.online.start import Beginning, Starter
 from ssm_graph.online.store import (
     pack_buffers,
     pack_step,
     unpack_buffers,
     unpack_left,
+    unpack_reserve,
     unpack_watch,
 )
 from ssm_graph.online.tail import Tail
@@ -116,12 +119,19 @@ class FixedLagSmoother:
             return self._start()
         course, buffers = self._course, self._intake.buffers
         if isinstance(message, ImuSample) and self._is_gap(time_s):
-            self._lose(time_s)
+            reason = f"no inertial data for more than {LONGEST_GAP_S:.0f} s"
+            self._intake.buffers.drop_before(time_s)
+            self._lose(time_s, reason)
             return False
         reach_s = REACH_S if isinstance(message, ImuSample) else MIN_SPACING_S
         undone = is_late and course.rewind(time_s - reach_s)
         n_made = course.advance(is_sample=not is_late)
         self._intake.horizon_s = course.horizon_s
+        if is_astray(course.newest.watch):
+            self._lose(
+                time_s, f"fixes contradicted the position {ASTRAY_TIMES} times: wrong heading?"
+            )
+            return True
         is_sample = isinstance(message, ImuSample)
         if undone or n_made or self._tail is None or (is_late and is_sample):
             self._tail = self._tail_of(course.newest)
@@ -143,7 +153,7 @@ class FixedLagSmoother:
         sensors = sensors_of_vehicle(self.vehicle, beginning.frame)
         window = Window(sensors, self.config, first, beginning.moments)
         window.iterate()
-        self._follow(Step(window, Watch(), None), maker)
+        self._follow(Step(window, Watch(), None, Reserve.of(window)), maker)
 
     def _follow(self, step: Step, maker: KeyframeMaker) -> None:
         """Make all steps from a first one on."""
@@ -203,7 +213,8 @@ class FixedLagSmoother:
             maker = KeyframeMaker(intake.buffers, smoother._frame, smoother._problem_config)
             sensors = sensors_of_vehicle(vehicle, smoother._frame)
             window = Window.unpack(packed, sensors, smoother.config, maker.way)
-            step = Step(window, unpack_watch(meta["watch"]), unpack_left(arrays))
+            watch, left = unpack_watch(meta["watch"]), unpack_left(arrays)
+            step = Step(window, watch, left, unpack_reserve(arrays))
             smoother._follow(step, maker)
         return smoother
 
@@ -212,19 +223,17 @@ class FixedLagSmoother:
         at = samples.index(time_s)
         return bool(at > 0 and time_s - samples.all[at - 1, 0] > LONGEST_GAP_S)
 
-    def _lose(self, time_s: float) -> None:
+    def _lose(self, time_s: float, reason: str) -> None:
         """Give the answer up, keep what was found, and align anew."""
         assert self._course is not None
         self._events.tell(
             time_s,
             Severity.ERROR,
             "lost",
-            f"no inertial data for more than {LONGEST_GAP_S:.0f} s: position and attitude have to "
-            "be found anew",
+            f"{reason}; position and attitude have to be found anew",
         )
         self._finished += self._take(self._course, all_of_them=True)
         self._course = self._tail = None
-        self._intake.buffers.drop_before(time_s)
         self._intake.horizon_s = time_s
         self._start_anew()
 

@@ -14,7 +14,8 @@ import numpy as np
 from ssm_graph.data import Array
 from ssm_graph.online.buffers import Buffers
 from ssm_graph.online.course import Step
-from ssm_graph.online.watch import Watch
+from ssm_graph.online.reserve import Reserve
+from ssm_graph.online.watch import Contradicted, Watch
 from ssm_graph.problem.states import NavigationStates
 from ssm_graph.smoothers.stretch import Stretch
 
@@ -40,6 +41,7 @@ def pack_step(step: Step) -> tuple[dict[str, Array], dict[str, Any]]:
         states = {f"states_{k}": v for k, v in step.left.states._asdict().items()}
         others = {k: v for k, v in step.left._asdict().items() if k != "states"}
         arrays |= {f"left_{name}": array for name, array in {**states, **others}.items()}
+    arrays |= {f"reserve_{name}": array for name, array in step.reserve.pack()}
     return arrays, {name: _plain(value) for name, value in step.watch._asdict().items()}
 
 
@@ -50,7 +52,17 @@ def unpack_watch(plain: Mapping[str, Any]) -> Watch:
         for name, value in plain.items()
     }
     numbers["beam_weights"] = tuple(float(weight) for weight in plain["beam_weights"])
+    numbers["moved"] = tuple(plain["moved"])
+    if plain["contradicted"] is not None:
+        since_s, text, reckoned_n, sigma = plain["contradicted"]
+        numbers["contradicted"] = Contradicted(since_s, text, tuple(reckoned_n), sigma)
     return Watch(**numbers)
+
+
+def unpack_reserve(arrays: Mapping[str, Array]) -> Reserve:
+    """Return the reserve of the step."""
+    prefix = "reserve_"
+    return Reserve.unpack({k.removeprefix(prefix): v for k, v in arrays.items() if prefix in k})
 
 
 def unpack_left(arrays: Mapping[str, Array]) -> Stretch | None:

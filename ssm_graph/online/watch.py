@@ -14,8 +14,9 @@ import numpy as np
 from ssm_graph.data import N_BEAMS, Array
 from ssm_graph.messages import Health
 from ssm_graph.problem.doubts import LARGEST_SPEED, LOW_WEIGHT, MISFIT, TRUSTED
-from ssm_graph.problem.error_state import VELOCITY
+from ssm_graph.problem.error_state import POSITION, VELOCITY
 from ssm_graph.smoothers.keyframe import Keyframe
+from ssm_graph.smoothers.stretch import Stretch
 from ssm_graph.smoothers.window import Window
 
 LOCK_LOST_S: Final = 3.0
@@ -26,15 +27,29 @@ MEMORY_S: Final = 10.0
 """Time constant of the running means."""
 FORCES: Final = (8.5, 11.5)
 """m/s^2, mean specific force of any vehicle that stays under water."""
-LOCKED_OUT_PINGS: Final = 3
-"""Pings in a row whose beams agree with each other but not with the prediction."""
-LOCKED_OUT_FIXES: Final = 5
-LOCKED_OUT_DEPTHS: Final = 25
+CONTRADICTED_S: Final = 600.0
+"""So long after position or height had to follow a sensor against dead reckoning nothing is good,
+unless they come back: one of the two was wrong, and nothing says which."""
+TORN_PINGS: Final = 3
+"""Pings in a row whose beams agree with each other and of which two or more are left out."""
 FEW: Final = 0.5
 """Fewer of the beams that agree are too few."""
 GAP_S: Final = 0.3
 """So long without an inertial sample leaves an attitude that the next pings have to confirm."""
 SILENT_IMU_S: Final = 1.0
+MOST_MISSING: Final = 0.3
+"""A larger share of the inertial samples missing leaves turns and shocks unseen."""
+
+
+class Contradicted(NamedTuple):
+    """A position that was given up against dead reckoning."""
+
+    since_s: float
+    text: str
+    reckoned_n: tuple[float, ...]
+    """m, where dead reckoning goes on from there"""
+    sigma: float
+    """m, of where it began"""
 
 
 class Watch(NamedTuple):
@@ -45,6 +60,12 @@ class Watch(NamedTuple):
     last_fix_s: float = -math.inf
     pings_refused: int = 0
     """Pings in a row that agree with themselves and not with the prediction"""
+    pings_out: int = 0
+    """Pings in a row of which no beam agrees with the prediction"""
+    pings_torn: int = 0
+    """Pings in a row that agree with themselves and of which two beams or more are left out"""
+    out_since_s: float = math.inf
+    """Since when no beam has agreed, s, also if the answer was begun anew meanwhile"""
     fixes_refused: int = 0
     depths_refused: int = 0
     good_share: float = 1.0
@@ -55,13 +76,14 @@ class Watch(NamedTuple):
     """Running mean square of what the trusted beams miss, in sigmas"""
     force: float = 9.8
     """Running mean of the specific force, m/s^2"""
-    sound_s: float = math.inf
-    """When nothing was wrong last, s; infinite while it is not"""
     trouble_s: float = -math.inf
     """When something was last wrong with the answer"""
     trouble: str = ""
     begun_anew_s: float = -math.inf
     """When the answer was last given up and begun anew"""
+    moved: tuple[float, ...] = ()
+    """When it was begun anew at another position because fixes contradicted it, the last times"""
+    contradicted: Contradicted | None = None
     beam_weights: tuple[float, ...] = (math.nan,) * N_BEAMS
 
 
@@ -79,6 +101,7 @@ def observe(
     parity: bool,
     force: float,
     gap_s: float,
+    missing: float,
 ) -> Watch:
     """Return what is remembered after one more keyframe.
 
@@ -91,6 +114,7 @@ def observe(
     parity : whether its beams agree with each other.
     force : mean specific force since the keyframe before, m/s^2.
     gap_s : longest time without an inertial sample since then.
+    missing : share of the inertial samples that have not come since then.
     """
     newest, time_s = window.newest, keyframe.time_s
     kept = window.keyframes[-1]
@@ -98,22 +122,7 @@ def observe(
     share = 1.0 - math.exp(-(time_s - last_s) / MEMORY_S)
     watch = watch._replace(force=watch.force + share * (force - watch.force))
     if len(newest.weight):
-        counted = newest.weight >= TRUSTED
-        trusted = newest.mahalanobis_sq[counted]
-        is_out = bool(np.all(newest.weight < LOW_WEIGHT)) and parity
-        weights = [math.nan] * N_BEAMS
-        for beam, weight in zip(newest.beam.astype(int), newest.weight, strict=True):
-            weights[beam] = float(weight)
-        watch = watch._replace(
-            last_beam_s=time_s if counted.any() else watch.last_beam_s,
-            pings_refused=watch.pings_refused + 1 if is_out else 0,
-            good_share=watch.good_share + share * (float(counted.mean()) - watch.good_share),
-            beam_weights=tuple(weights),
-        )
-        if len(trusted):
-            watch = watch._replace(
-                misfit=watch.misfit + share * (float(trusted.mean()) - watch.misfit)
-            )
+        watch = _with_beams(watch, newest, share, parity=parity)
     few_since_s = min(watch.few_since_s, time_s) if watch.good_share < FEW else math.inf
     watch = watch._replace(few_since_s=few_since_s)
     if len(keyframe.fix_n):
@@ -123,13 +132,56 @@ def observe(
         )
     if len(keyframe.depth):
         watch = watch._replace(depths_refused=watch.depths_refused + 1 if no_depth else 0)
+    if watch.contradicted is not None:
+        watch = watch._replace(contradicted=_still(watch.contradicted, newest, time_s - last_s))
     trouble = _trouble(watch, time_s, newest.states.v_n[0])
     if gap_s > GAP_S and not trouble:
         trouble = f"{gap_s:.1f} s of inertial data are missing: what was guessed has to prove right"
-    if trouble:
-        return watch._replace(trouble_s=time_s, trouble=trouble, sound_s=min(watch.sound_s, last_s))
-    is_sound = time_s - watch.trouble_s > PROBATION_S
-    return watch._replace(sound_s=math.inf) if is_sound else watch
+    elif missing > MOST_MISSING and not trouble:
+        trouble = f"{100.0 * missing:.0f} % of the inertial samples are missing"
+    return watch._replace(trouble_s=time_s, trouble=trouble) if trouble else watch
+
+
+def _with_beams(watch: Watch, newest: Stretch, share: float, *, parity: bool) -> Watch:
+    """Return what is remembered after the beams of one more keyframe; means move by ``share``."""
+    time_s = float(newest.time_s[0])
+    counted = newest.weight >= TRUSTED
+    trusted = newest.mahalanobis_sq[counted]
+    n_out = int(np.sum(newest.weight < LOW_WEIGHT))
+    is_out = n_out == len(newest.weight) > 2
+    weights = [math.nan] * N_BEAMS
+    for beam, weight in zip(newest.beam.astype(int), newest.weight, strict=True):
+        weights[beam] = float(weight)
+    watch = watch._replace(
+        last_beam_s=time_s if counted.any() else watch.last_beam_s,
+        pings_refused=watch.pings_refused + 1 if is_out and parity else 0,
+        pings_out=watch.pings_out + 1 if is_out else 0,
+        pings_torn=watch.pings_torn + 1 if n_out > 1 and parity else 0,
+        out_since_s=min(watch.out_since_s, time_s) if is_out else math.inf,
+        good_share=watch.good_share + share * (float(counted.mean()) - watch.good_share),
+        beam_weights=tuple(weights),
+    )
+    if len(trusted):
+        watch = watch._replace(misfit=watch.misfit + share * (float(trusted.mean()) - watch.misfit))
+    return watch
+
+
+def is_sound(watch: Watch, time_s: float) -> bool:
+    """Return whether nothing has been wrong with the answer for a while."""
+    return time_s - max(watch.trouble_s, watch.begun_anew_s) > PROBATION_S
+
+
+def _still(was: Contradicted, newest: Stretch, span_s: float) -> Contradicted | None:
+    """Return the contradiction after one more keyframe, None once the position has come back."""
+    reckoned_n = np.add(was.reckoned_n, newest.states.v_n[0] * span_s)
+    since_s = float(newest.time_s[0]) - was.since_s
+    if since_s > CONTRADICTED_S:
+        return None
+    sigma = math.hypot(was.sigma, math.sqrt(np.trace(newest.covariance[0, POSITION, POSITION])))
+    off = float(np.linalg.norm(newest.states.p_n[0] - reckoned_n))
+    if since_s > 2.0 * PROBATION_S and off < 3.0 * sigma:
+        return None
+    return was._replace(reckoned_n=tuple(reckoned_n.tolist()))
 
 
 def _trouble(watch: Watch, time_s: float, v_n: Array) -> str:
@@ -144,6 +196,13 @@ def _trouble(watch: Watch, time_s: float, v_n: Array) -> str:
         )
     if watch.pings_refused:
         return f"{watch.pings_refused} pings in a row contradict the prediction"
+    if watch.pings_out >= TORN_PINGS:
+        return f"in {watch.pings_out} pings in a row no beam agrees with the prediction"
+    if watch.pings_torn >= TORN_PINGS:
+        return (
+            f"in {watch.pings_torn} pings in a row the beams agree with each other, but not with "
+            "the prediction: some are left out"
+        )
     if watch.fixes_refused:
         return f"{watch.fixes_refused} GNSS fixes in a row contradict the prediction"
     if watch.depths_refused:
@@ -189,6 +248,8 @@ def verdict(watch: Watch, *, now_s: float, imu_s: float, covariance: Array) -> V
         health, reason = Health.BAD, f"being recovered: {watch.trouble}"
     elif imu_s - watch.trouble_s < PROBATION_S:
         health, reason = Health.DEGRADED, watch.trouble
+    elif watch.contradicted is not None:
+        health, reason = Health.DEGRADED, watch.contradicted.text
     elif not has_lock:
         health = Health.DEGRADED
         since = f"for {since_beam_s:.0f} s" if math.isfinite(since_beam_s) else "yet"

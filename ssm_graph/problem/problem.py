@@ -30,6 +30,7 @@ from ssm_graph.problem.timeline import (
     nearest,
 )
 from ssm_graph.problem.usable import require_usable
+from ssm_graph.stuck_beams import stuck_beams
 
 PING_WINDOW_S = 0.1
 """The gyro reading at a ping is the mean over this window: a ping takes time, and so does noise
@@ -138,6 +139,7 @@ def build_problem(
         needs :func:`ssm_graph.problem.alignment.align` first.
     """
     require_usable(mission)
+    mission, stuck_note = _without_stuck_beams(mission)
     config = config or ProblemConfig()
     start = start or mission.initial
     if start is None:
@@ -159,7 +161,12 @@ def build_problem(
         depths=_depths(mission, timeline),
         fixes=None if mission.gnss is None else _fixes(mission.gnss, mission.frame, timeline),
         imu_noise_bias_sigma=np.repeat([noise.accel_bias_sigma, noise.gyro_bias_sigma], 3),
-        notes=timeline.notes + _gap_note(mission.imu) + _calibration_note(mission.dvl.mount),
+        notes=(
+            *timeline.notes,
+            *_gap_note(mission.imu),
+            *stuck_note,
+            *_calibration_note(mission.dvl.mount),
+        ),
     )
 
 
@@ -173,6 +180,7 @@ def with_dvl(problem: Problem, mission: Mission) -> Problem:
 
     The inertial chain, most of the work, is kept; so the pings have to be at keyframes.
     """
+    mission, _ = _without_stuck_beams(mission)
     keyframe_s, ping_s = problem.keyframe_s, mission.dvl.ping_s
     is_used = np.isfinite(mission.dvl.speed).any(axis=1)
     is_used &= is_inside(ping_s, keyframe_s[0], keyframe_s[-1])
@@ -185,6 +193,23 @@ def with_dvl(problem: Problem, mission: Mission) -> Problem:
             f"{ping_s[ping][np.argmax(off)]:.3f} s; build a problem of its own"
         )
     return replace(problem, beams=_beams(mission, ping, keyframe))
+
+
+def _without_stuck_beams(mission: Mission) -> tuple[Mission, tuple[str, ...]]:
+    """Return the mission without the speeds of beams that repeat themselves, and a note."""
+    dvl = mission.dvl
+    is_stuck = stuck_beams(dvl.speed)
+    count = is_stuck.sum(axis=0)
+    if not count.any():
+        return mission, ()
+    beams = ", ".join(f"beam {b + 1}: {count[b]}" for b in np.flatnonzero(count))
+    first_s = float(dvl.ping_s[is_stuck.any(axis=1)][0])
+    note = (
+        f"speeds of a beam that repeats one reading while the others change are left out: {beams}; "
+        f"the first at {first_s:.3f} s"
+    )
+    speed = np.where(is_stuck, np.nan, dvl.speed)
+    return replace(mission, dvl=replace(dvl, speed=speed)), (note,)
 
 
 def _gap_note(imu: ImuLog) -> tuple[str, ...]:

@@ -9,9 +9,9 @@ from typing import Self
 import numpy as np
 
 from factors.similarity import Similarity, expected_mahalanobis_sq
-from ssm_graph.data import Array
+from ssm_graph.data import N_BEAMS, Array
 from ssm_graph.errors import SolverError
-from ssm_graph.graph.first_values import settle_weights
+from ssm_graph.graph.beam_weights import first_trust, settle_weights, updated_trust
 from ssm_graph.graph.marginal_prior import moved_chart
 from ssm_graph.problem.error_state import STATE_DIM, InitialMoments, Linearised
 from ssm_graph.problem.states import NavigationStates
@@ -23,7 +23,7 @@ from ssm_graph.smoothers.stretch import Stretch
 from ssm_graph.smoothers.window_graph import WindowGraph
 from ssm_graph.smoothers.window_rows import SEEN_BY_BEAMS
 
-_PACKED = ("step", "covariance", "innovation", "weights", "t")
+_PACKED = ("step", "covariance", "innovation", "weights", "t", "trust")
 _BENDING = np.repeat([1.0, 0.1], [3, 12])
 """How much a component of the error state bends the measurements."""
 _AS_MUCH = np.repeat([1.0, 1e4, 1e2, 1e6], [3, 3, 3, 6])
@@ -44,9 +44,17 @@ class Window:
     """The keyframes that are not yet settled, and the weights of their beams."""
 
     def __init__(
-        self, sensors: Sensors, config: FixedLagConfig, first: Keyframe, start: InitialMoments
+        self,
+        sensors: Sensors,
+        config: FixedLagConfig,
+        first: Keyframe,
+        start: InitialMoments,
+        *,
+        trust: Array | None = None,
     ) -> None:
+        """``trust`` (4,) is what each beam was worth before, 0 to 1; all of them when left out."""
         self.config = config
+        self._trust = np.ones(N_BEAMS) if trust is None else trust
         self._graph = WindowGraph(sensors, first, start)
         self._step = np.zeros((1, STATE_DIM))
         """(K, 15) off where each keyframe is linearised"""
@@ -95,6 +103,11 @@ class Window:
         return self._graph.sensors
 
     @property
+    def trust(self) -> Array:
+        """What each beam (4,) was worth in the last pings, the newest left out."""
+        return self._trust
+
+    @property
     def states(self) -> NavigationStates:
         """The estimate of all keyframes."""
         return self._graph.at.moved(self._step)
@@ -133,6 +146,8 @@ class Window:
         oldest_s = keyframe.time_s - self.config.lag_s - MIN_SPACING_S
         leaving = sum(known.time_s < oldest_s for known in self.keyframes)
         left, last = self._stretch(0, leaving), self.states.take(np.s_[-1:])
+        newest = self.newest
+        self._trust = updated_trust(self._trust, newest.beam.astype(np.intp), newest.weight)
         if leaving == len(self.keyframes):
             # Of a window that goes as a whole, the posterior of its end is all that counts.
             self._graph.keep_posterior(last)
@@ -143,7 +158,7 @@ class Window:
             self._graph.marginalise(leaving, self._weights)
             self._keep_newest(keyframes=len(self.keyframes), rows=len(self._graph.error))
         if len(self.keyframes) > 1 and keyframe.is_measured:
-            self._meet_prediction()
+            self.meet_prediction()
         return left
 
     def _append(self, keyframe: Keyframe, last: NavigationStates) -> None:
@@ -163,7 +178,7 @@ class Window:
             column[first:] for column in (self._innovation, self._weights, self._t)
         )
 
-    def _meet_prediction(self) -> None:
+    def meet_prediction(self) -> None:
         """Let what was measured at the newest keyframe meet what all before it predict.
 
         Beams start as they agree with that and with each other: with full weight one bad beam would
@@ -178,11 +193,14 @@ class Window:
         if len(H) == 0:
             return
         root = H @ root_cov
+        predicted, variance = root @ root.T, graph.beams.sigma[row:] ** 2
+        trust = self._trust[graph.beams.beam[row:].astype(np.intp)]
         weights = settle_weights(
             -graph.error[row:] - H @ step,
-            root @ root.T,
-            graph.beams.sigma[row:] ** 2,
+            predicted,
+            variance,
             self.config.kernel,
+            first=first_trust(trust, predicted, variance),
         )
         self._weights = np.concatenate([self._weights[:row], weights])
         graph.changed_from(len(self.keyframes) - 1)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.online_stream import HEALTHS
-from benchmarks.soak import by_health, goals, report, shares_inside
+from benchmarks.soak import by_health, goals, report, shares_inside, soaked_once
 from benchmarks.soak_figure import draw, hourly
 from benchmarks.soak_stream import (
     CASES,
@@ -89,3 +89,19 @@ def test_longest_run_and_untold_events() -> None:
     assert longest_run(np.zeros(3, dtype=bool), 0.5) == (0.0, 0)
     assert more_untold("no beam (and 12 more since)") == 12
     assert more_untold("no beam") == 0
+
+
+def test_a_finished_case_is_kept(tmp_path: Path) -> None:
+    """A second run of the same code with the same settings reads what the first one found."""
+    settings = {"hours": 0.01, "seed": 3, "dvl_hz": 1.0, "grade": "NAVIGATION", "says": False}
+    first = soaked_once(tmp_path, "depth", **settings)
+    (file,) = tmp_path.iterdir()
+    again = soaked_once(tmp_path, "depth", **settings)
+    assert again.wall_s == first.wall_s
+    assert (again.name, again.events, again.refused) == (first.name, first.events, first.refused)
+    np.testing.assert_array_equal(again.error, first.error)
+    assert goals(again) == goals(first)
+    other = soaked_once(tmp_path, "depth", **settings | {"seed": 4})
+    assert other.wall_s != first.wall_s
+    assert len(list(tmp_path.iterdir())) == 2
+    assert file.exists()

@@ -7,13 +7,8 @@ import pytest
 
 from factors.similarity import LogKernel
 from ssm_graph.data import Array
-from ssm_graph.graph.first_values import (
-    GATE,
-    LOCKED_OUT_PINGS,
-    _ForwardPass,
-    first_values,
-    settle_weights,
-)
+from ssm_graph.graph.beam_weights import GATE, settle_weights
+from ssm_graph.graph.first_values import LOCKED_OUT_PINGS, _ForwardPass, first_values
 from ssm_graph.graph.linearize import inertial_graph
 from ssm_graph.problem.error_state import POSITION, ROTATION
 from ssm_graph.problem.problem import build_problem

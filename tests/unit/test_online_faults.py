@@ -72,7 +72,7 @@ def test_an_answer_that_is_being_recovered_is_bad() -> None:
     assert {"doubt", "recovered"} <= kinds(smoother)
     newest = smoother.newest()
     assert newest is not None
-    assert np.min(newest.position_sigma_enu[:2]) > 1.0 > np.max(undisturbed().position_sigma_enu)
+    assert np.min(newest.position_sigma_enu[:2]) > np.max(undisturbed().position_sigma_enu)
 
 
 @pytest.mark.parametrize("off_s", [365 * 86400.0, -50 * 365 * 86400.0])

@@ -1,0 +1,72 @@
+"""The weights that the beams of one ping get from what was predicted before them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from factors.similarity import WEIGHT_FLOOR, Kernel, expected_mahalanobis_sq
+from ssm_graph.data import Array
+from ssm_graph.problem.timeline import Indices
+
+GATE = 5.0
+"""Beams further than this many innovation sigmas from the prediction start without weight."""
+POOR = 10.0
+"""Beam sigmas; a prediction less certain than this does not tell good beams from bad ones."""
+MEMORY_PINGS = 3.0
+"""What a beam was worth is remembered for about so many pings."""
+WEIGHT_ROUNDS = 10
+
+
+def first_trust(trust: Array, predicted: Array, variance: Array) -> Array:
+    """Return the weights that the beams of one ping are met with, before the gate.
+
+    A prediction that is much less certain than the beams cannot tell which of them is wrong, for
+    any three agree with it and with each other. Then those that were wrong before are taken to be
+    wrong still, as long as three others are left; any of them may prove right.
+
+    Parameters
+    ----------
+    trust : (m,) what each beam was worth in the pings before, 0 to 1.
+    predicted : (m, m) covariance of the predicted speeds, (m/s)^2.
+    variance : (m,) of the measured ones.
+    """
+    is_poor = bool(np.any(predicted.diagonal() > POOR**2 * variance))
+    if is_poor and np.sum(trust >= 0.5) >= 3:
+        return np.where(trust >= 0.5, 1.0, WEIGHT_FLOOR)
+    return np.ones(len(trust))
+
+
+def updated_trust(trust: Array, beam: Indices, weights: Array) -> Array:
+    """Return what each beam (4,) is worth after one more ping with weights (m,) of its beams."""
+    updated = trust.copy()
+    updated[beam] += (weights - trust[beam]) / MEMORY_PINGS
+    return updated
+
+
+def settle_weights(
+    innovation: Array,
+    predicted: Array,
+    variance: Array,
+    kernel: Kernel,
+    *,
+    first: Array | float = 1.0,
+) -> Array:
+    """Return the beams' weights at one ping, beginning with ``first`` of those that pass the gate.
+
+    The posterior of the innovation needs no state: with ``S = H P H' + R / weight`` it has mean
+    ``R / weight S^-1 innovation`` and covariance ``H P H' - H P H' S^-1 H P H'``.
+    """
+    sigma, spread = np.sqrt(variance), predicted.diagonal()
+    weights = np.where(innovation**2 < GATE**2 * (spread + variance), first, WEIGHT_FLOOR)
+    for _ in range(WEIGHT_ROUNDS):
+        S = predicted.copy()
+        S.flat[:: len(S) + 1] += variance / weights
+        gain = predicted @ np.linalg.inv(S)
+        left = innovation - gain @ innovation
+        left_variance = spread - (gain * predicted).sum(axis=1)
+        t = expected_mahalanobis_sq(left, np.maximum(left_variance, 0.0), sigma=sigma)
+        settled = kernel.weight(t)
+        if np.abs(settled - weights).max() < 1e-2:
+            return settled
+        weights = settled
+    return weights

@@ -1,0 +1,102 @@
+"""Answers of a while ago, led on by the inertial data alone: no later beam can have bent them.
+
+What is wrong with an answer shows some seconds after it began to be wrong. So two answers are kept
+in reserve, the older one at least `RENEW_S` old whenever trouble shows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from ssm_graph.data import Array
+from ssm_graph.problem.error_state import POSITION
+from ssm_graph.problem.states import NavigationStates
+from ssm_graph.smoothers.keyframe import Keyframe
+from ssm_graph.smoothers.window import Window
+from ssm_graph.smoothers.window_rows import InertialRows
+
+RENEW_S: Final = 15.0
+"""While all is sound a new answer goes into reserve so often."""
+
+
+class Kept(NamedTuple):
+    """One answer, led on to the newest keyframe."""
+
+    since_s: float
+    """s, when it was the answer"""
+    place_n: Array
+    """(3,) m, where the vehicle was then"""
+    place_sigma: float
+    """m, in the most uncertain direction"""
+    R_nb: Array
+    """(1, 3, 3) now, as the next four"""
+    p_n: Array
+    """(1, 3) m"""
+    v_n: Array
+    """(1, 3) m/s"""
+    bias: Array
+    """(1, 6) accelerometer m/s^2, gyro rad/s"""
+    covariance: Array
+    """(15, 15)"""
+    trust: Array
+    """(4,) what each beam was worth then, 0 to 1"""
+
+    @property
+    def states(self) -> NavigationStates:
+        """The state (1, ...) now."""
+        return NavigationStates(self.R_nb, self.p_n, self.v_n, self.bias)
+
+    def led_on(self, keyframe: Keyframe, inertial: InertialRows) -> Kept:
+        """Return the answer at the next keyframe."""
+        there = inertial.predict(keyframe, self.states)
+        covariance = inertial.carry(keyframe, self.states, there, self.covariance)
+        return self._replace(**there._asdict(), covariance=covariance)
+
+
+class Reserve(NamedTuple):
+    """Two answers of different age."""
+
+    older: Kept
+    younger: Kept
+
+    @classmethod
+    def of(cls, window: Window) -> Reserve:
+        """Return a reserve that begins with the newest answer of a window."""
+        kept = _kept(window)
+        return cls(kept, kept)
+
+    def led_on(self, keyframe: Keyframe, inertial: InertialRows) -> Reserve:
+        """Return both answers at the next keyframe."""
+        return Reserve(*(kept.led_on(keyframe, inertial) for kept in self))
+
+    def renewed(self, window: Window) -> Reserve:
+        """Return the reserve with the newest, sound answer of a window taken in, if it is time."""
+        if window.keyframes[-1].time_s - self.younger.since_s < RENEW_S:
+            return self
+        return Reserve(self.younger, _kept(window))
+
+    def pack(self) -> Iterator[tuple[str, Array]]:
+        """Yield name and array of everything."""
+        for name, kept in self._asdict().items():
+            for field, value in kept._asdict().items():
+                yield f"{name}_{field}", np.asarray(value)
+
+    @classmethod
+    def unpack(cls, arrays: Mapping[str, Array]) -> Reserve:
+        """Return the reserve that was packed."""
+
+        def kept(name: str) -> Kept:
+            fields: dict[str, Any] = {f: arrays[f"{name}_{f}"] for f in Kept._fields}
+            return Kept(**fields)
+
+        return cls(kept("older"), kept("younger"))
+
+
+def _kept(window: Window) -> Kept:
+    newest = window.newest
+    states, covariance = newest.states, newest.covariance[0]
+    place_sigma = np.sqrt(np.linalg.eigvalsh(covariance[POSITION, POSITION])[-1])
+    return Kept(newest.time_s[0], states.p_n[0], place_sigma, *states, covariance, window.trust)
