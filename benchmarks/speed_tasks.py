@@ -20,6 +20,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import V, X
 
+import ssm_graph.graph.linearize as linearize
 import ssm_graph.smoothers.batch as batch
 from benchmarks.speed_plain import dead_reckoned, plain_graph
 from factors.similarity import LogKernel
@@ -110,10 +111,10 @@ def _timed_calls(parts: dict[str, float]) -> Iterator[None]:
         (GraphLinearizer, "follow", "linearise: gravity and depth targets"),
         (GraphLinearizer, "beam_rows", "linearise: beams"),
         (GraphLinearizer, "linearize", "linearise: GTSAM factors and assembly"),
-        (batch, "solve_linear", "eliminate by QR and solve"),
-        (batch, "marginal_covariances", "marginals"),
+        (linearize, "solve_linear", "eliminate by QR and solve"),
+        (linearize, "marginal_covariances", "marginals"),
         (GraphLinearizer, "cost", "cost"),
-        (batch, "retract", "retract"),
+        (GraphLinearizer, "retract", "retract"),
         (batch, "trajectory_from_states", "result"),
     )
     originals = [(owner, name, getattr(owner, name)) for owner, name, _ in steps]

@@ -7,7 +7,7 @@ clock; velocities and sigmas labelled ``enu`` are along east, north, up at the v
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, cast
 
 import numpy as np
@@ -134,11 +134,39 @@ class DvlMount(FrozenArrays):
     """How late the DVL's stamps are, s: a ping was taken at ``stamp - time_offset_s``."""
     time_offset_sigma_s: float = 0.0
     """Prior sigma of the time offset, s; above zero asks for its calibration."""
+    scale_error: float = 0.0
+    """Speeds are read ``1 + scale_error`` too large."""
+    scale_walk_density: float = 0.0
+    """Random walk of the scale error along the mission, 1/sqrt(s); it needs a ``scale_sigma``."""
+    beam_scale_error: Array = field(
+        default_factory=lambda: np.zeros(N_BEAMS), metadata={"shape": (N_BEAMS,)}
+    )
+    """(4,) the same of each beam, on top of that of all."""
+    beam_scale_sigma: float = 0.0
+    """Prior sigma of each beam's own scale error, 1; above zero asks for its calibration."""
+    lever_arm_sigma: float = 0.0
+    """Prior sigma of each component of the lever arm, m; above zero asks for its calibration."""
 
     @property
     def beams_b(self) -> Array:
-        """(4, 3) beam directions as rows, body axes."""
-        return np.asarray(self.beams_d @ self.R_bd.T)
+        """(4, 3) what each beam reads of a velocity in body axes.
+
+        Beam directions as rows, longer than one by the known scale errors.
+        """
+        scale = (1.0 + self.scale_error) * (1.0 + self.beam_scale_error)
+        return np.asarray((self.beams_d * scale[:, None]) @ self.R_bd.T)
+
+    def as_stated(self) -> DvlMount:
+        """Return the mount as one that is exact."""
+        return replace(
+            self,
+            misalignment_sigma=0.0,
+            scale_sigma=0.0,
+            scale_walk_density=0.0,
+            beam_scale_sigma=0.0,
+            lever_arm_sigma=0.0,
+            time_offset_sigma_s=0.0,
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,6 +189,28 @@ class DvlLog(FrozenArrays):
         return np.asarray(self.time_s - self.mount.time_offset_s)
 
 
+@dataclass(frozen=True, slots=True)
+class DepthCalibration:
+    """What is known of the errors of a depth sensor, and what is asked for."""
+
+    offset: float = 0.0
+    """Depths are read too large by so much, m."""
+    offset_sigma: float = 0.0
+    """Prior sigma of what is left of that, m; above zero asks for its calibration."""
+
+
+@dataclass(frozen=True, slots=True)
+class GnssCalibration:
+    """What is known of the errors of a GNSS receiver, and what is asked for."""
+
+    time_offset_s: float = 0.0
+    """How late its stamps are, s."""
+    time_offset_sigma_s: float = 0.0
+    """Prior sigma of what is left of that, s; above zero asks for its calibration."""
+    lever_arm_sigma: float = 0.0
+    """Prior sigma of each component of the lever arm, m; above zero asks for its calibration."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthLog(FrozenArrays):
     """Depth: minus the ellipsoidal height of the sensor."""
@@ -173,6 +223,8 @@ class DepthLog(FrozenArrays):
     """(N,) m, positive down."""
     lever_arm_b: Array = shaped(3)
     """(3,) body origin to sensor, m."""
+    calibration: DepthCalibration = DepthCalibration()
+    """Its offset is taken off ``depth`` already."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -191,6 +243,8 @@ class GnssLog(FrozenArrays):
     """(N, 3) m, east, north, up, above zero."""
     lever_arm_b: Array = shaped(3)
     """(3,) body origin to antenna, m."""
+    calibration: GnssCalibration = GnssCalibration()
+    """Its time offset is taken off ``time_s`` already."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

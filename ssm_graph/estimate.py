@@ -92,6 +92,61 @@ class Trajectory(FrozenArrays):
     """(N,) beam speeds used at the keyframe"""
 
 
+class Determined(Enum):
+    """How well the data determined a calibration; the text is shown to the user."""
+
+    GREEN = "by the data"
+    AMBER = "in part"
+    RED = "not by this mission: it stays at its prior"
+
+
+GREEN_RATIO = 0.3
+"""Posterior sigma over prior sigma below which the data hold nine tenths of what is known."""
+AMBER_RATIO = 0.8
+"""Above it, hardly more is known than before."""
+
+
+@dataclass(frozen=True, slots=True)
+class CalibratedValue:
+    """One number of a calibration: how far an instrument is off what the mission states."""
+
+    variable: str
+    """For example ``dvl_mounting``."""
+    label: str
+    """For people and files, with the unit: ``dvl_mounting_x_deg``."""
+    unit: float
+    """SI units in one of the label's."""
+    value: float
+    """SI; of what walks along the mission, at its end."""
+    sigma: float
+    """SI, posterior."""
+    prior_sigma: float
+    """SI; of what walks, at the end of the mission if nothing had been measured."""
+
+    @property
+    def determined(self) -> Determined:
+        """How well the data determined it."""
+        ratio = self.sigma / self.prior_sigma
+        if ratio < GREEN_RATIO:
+            return Determined.GREEN
+        return Determined.AMBER if ratio < AMBER_RATIO else Determined.RED
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """What was found of the instruments."""
+
+    values: tuple[CalibratedValue, ...]
+    covariance: Array
+    """(E, E) of the values, SI."""
+    walks: Array
+    """(K, s) at every keyframe, SI: those of the values that walk, which come first."""
+
+    def of(self, variable: str) -> Array:
+        """Return the components of a variable, SI; empty where it was not asked for."""
+        return np.array([v.value for v in self.values if v.variable == variable])
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
     """The answer of one estimator on one mission."""
@@ -116,6 +171,8 @@ class Estimate:
     """What a user should know about the run, one sentence each."""
     keyframe_iterations: float = np.nan
     """Mean passes over a keyframe of what goes keyframe by keyframe."""
+    calibration: Calibration | None = None
+    """What was found of the instruments, if that was asked for."""
 
     @property
     def n_iterations(self) -> float:

@@ -6,7 +6,17 @@ import math
 from dataclasses import dataclass
 from enum import Enum
 
-from ssm_graph.data import N_BEAMS, Array, DvlMount, FrozenArrays, ImuNoise, InitialState, shaped
+from ssm_graph.data import (
+    N_BEAMS,
+    Array,
+    DepthCalibration,
+    DvlMount,
+    FrozenArrays,
+    GnssCalibration,
+    ImuNoise,
+    InitialState,
+    shaped,
+)
 from ssm_graph.earth import LocalFrame
 
 Vector = tuple[float, float, float]
@@ -42,7 +52,7 @@ class DepthReading:
 
     time_s: float
     depth: float
-    """m, positive down: minus the ellipsoidal height of the sensor."""
+    """m, positive down: minus the height of the sensor; its offset is not yet taken off."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +88,10 @@ class Vehicle(FrozenArrays):
     """(3,) body origin to antenna, m."""
     depth_sigma: float | None = None
     """m; None where there is no depth sensor."""
+    depth_calibration: DepthCalibration = DepthCalibration()
+    """What is known of the depth sensor's errors."""
+    gnss_calibration: GnssCalibration = GnssCalibration()
+    """What is known of the receiver's errors."""
     frame: LocalFrame | None = None
     """Navigation frame; None takes the first fix."""
     initial: InitialState | None = None

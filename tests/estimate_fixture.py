@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ssm_graph.data import (
@@ -14,7 +16,15 @@ from ssm_graph.data import (
     Reference,
 )
 from ssm_graph.earth import LocalFrame
-from ssm_graph.estimate import BeamTable, Estimate, Iteration, Status, Trajectory
+from ssm_graph.estimate import (
+    BeamTable,
+    CalibratedValue,
+    Calibration,
+    Estimate,
+    Iteration,
+    Status,
+    Trajectory,
+)
 
 FRAME = LocalFrame(lat=np.deg2rad(63.44), lon=np.deg2rad(10.41), height=-20.0)
 EPOCH = 1746622514.25
@@ -127,3 +137,22 @@ def make_mission(estimate: Estimate, reference: Reference | None = None) -> Miss
         reference=reference,
         notes=("made up",),
     )
+
+
+def calibrated(estimate: Estimate, *, gnss_sigma: float) -> Estimate:
+    """Return the estimate with a mounting, a scale and a lever arm that it found."""
+    degree = np.radians(1.0)
+    values = (
+        CalibratedValue("dvl_scale", "dvl_scale_error", 1.0, -0.02, 0.001, 0.03),
+        *(
+            CalibratedValue("dvl_mounting", f"dvl_mounting_{axis}_deg", degree, x, 0.1 * degree, s)
+            for axis, x, s in zip("xyz", (0.0, 0.0, 2.0 * degree), (2 * degree,) * 3, strict=True)
+        ),
+        *(
+            CalibratedValue("gnss_lever_arm", f"gnss_lever_arm_{axis}_m", 1.0, 0.1, sigma, 0.4)
+            for axis, sigma in zip("xyz", (gnss_sigma, gnss_sigma, 0.39), strict=True)
+        ),
+        CalibratedValue("gnss_time_offset", "gnss_time_offset_s", 1.0, 0.0, 0.29, 0.3),
+    )
+    calibration = Calibration(values, np.eye(len(values)), np.zeros((1, 0)))
+    return replace(estimate, calibration=calibration)

@@ -15,7 +15,9 @@ from ssm_graph.data import GnssLog, Mission, Reference
 from ssm_graph.errors import ConfigError, DataError
 from ssm_graph.estimate import Estimate
 from ssm_graph.evaluation import Metrics, evaluate, reference_from_gnss
+from ssm_graph.io.calibration_toml import CALIBRATION_NAME
 from ssm_graph.io.mission import read_mission
+from ssm_graph.io.mission_toml import read_mission_toml
 from ssm_graph.io.results import write_results
 from ssm_graph.problem.problem import ProblemConfig
 from ssm_graph.report.figure import save_figure
@@ -93,11 +95,15 @@ def run_mission(
                 "keyframe_interval_s": graph.keyframe_interval_s,
                 "gnss_until_s": arguments.gnss_until,
             },
+            axes=read_mission_toml(arguments.mission).body,
         )
         if not arguments.no_figure:
             save_figure(arguments.out / "figure.png", estimate, reference, title=mission.name)
     console.print(summary_table(estimate, metrics))
     console.print(f"results in {arguments.out}", highlight=False, soft_wrap=True)
+    if estimate.calibration is not None:
+        path = arguments.out / CALIBRATION_NAME
+        console.print(f"lines for mission.toml in {path}", highlight=False, soft_wrap=True)
     return estimate.status.is_good
 
 

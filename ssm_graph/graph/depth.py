@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import X
+from numpy.typing import NDArray
 
 from ssm_graph.data import Array
 from ssm_graph.earth import LocalFrame
@@ -13,17 +16,27 @@ from ssm_graph.problem.heights import height_track, mean_rises
 from ssm_graph.problem.problem import Depths
 
 
-def depth_graph(
-    depths: Depths,
-    states: States,
-    frame: LocalFrame,
-    keyframe_s: Array,
-) -> gtsam.NonlinearFactorGraph:
-    """Return depth as GTSAM position factors that count along the local vertical only.
+class DepthTargets(NamedTuple):
+    """Where the depth readings of D keyframes put the sensor."""
+
+    keyframe: NDArray[np.intp]
+    """(D,)"""
+    target_n: Array
+    """(D, 3) m; only its component along the vertical counts"""
+    up_n: Array
+    """(D, 3) local vertical"""
+    root_information: Array
+    """(D,) 1/m, of the mean of the readings"""
+
+
+def depth_targets(
+    depths: Depths, states: States, frame: LocalFrame, keyframe_s: Array
+) -> DepthTargets:
+    """Return the mean of each keyframe's readings, carried to it along the track of ``states``.
 
     Two things make the target depend on the states, and both change little between iterations:
     the ellipsoid curves away from the frame's horizontal plane, and a reading between keyframes is
-    carried to the next one along the estimated track. Readings of one keyframe are averaged.
+    carried to the next one along the estimated track.
     """
     track = height_track(
         frame,
@@ -38,10 +51,22 @@ def depth_graph(
     total = np.bincount(depths.keyframe, weights=-depths.depth, minlength=len(rise))
     too_low = total / np.maximum(count, 1) + rise - track.height
     target_n = track.sensor_n + track.up_n * too_low[:, None]
-    root_information = np.zeros((len(count), 3, 3))
-    root_information[:, 0] = track.up_n * (np.sqrt(count) / depths.sigma)[:, None]
+    read = np.flatnonzero(count)
+    root_information = np.sqrt(count[read]) / depths.sigma
+    return DepthTargets(read, target_n[read], track.up_n[read], root_information)
+
+
+def depth_graph(
+    depths: Depths, states: States, frame: LocalFrame, keyframe_s: Array
+) -> gtsam.NonlinearFactorGraph:
+    """Return depth as GTSAM position factors that count along the local vertical only."""
+    targets = depth_targets(depths, states, frame, keyframe_s)
+    root_information = np.zeros((len(targets.keyframe), 3, 3))
+    root_information[:, 0] = targets.up_n * targets.root_information[:, None]
     graph = gtsam.NonlinearFactorGraph()
-    for k in np.flatnonzero(count).tolist():
-        noise = gtsam.noiseModel.Gaussian.SqrtInformation(root_information[k], False)
-        graph.add(gtsam.GPSFactorArm(X(k), target_n[k], depths.lever_arm_b, noise))
+    for k, target_n, root in zip(
+        targets.keyframe.tolist(), targets.target_n, root_information, strict=True
+    ):
+        noise = gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
+        graph.add(gtsam.GPSFactorArm(X(k), target_n, depths.lever_arm_b, noise))
     return graph

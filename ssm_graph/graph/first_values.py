@@ -21,11 +21,9 @@ from ssm_graph.data import N_BEAMS, Array
 from ssm_graph.earth import SEMI_MAJOR_AXIS
 from ssm_graph.errors import SolverError
 from ssm_graph.graph.beam_weights import first_trust, settle_weights, updated_trust
-from ssm_graph.graph.linearize import (
-    carried_covariance,
-    inertial_graph,
-    linearize_beams,
-)
+from ssm_graph.graph.forward_extras import ForwardExtras
+from ssm_graph.graph.interfaces import BeamRows
+from ssm_graph.graph.linearize import carried_covariance, inertial_graph, linearize_beams
 from ssm_graph.graph.states import States, states_from_arrays
 from ssm_graph.imu.preintegration import gtsam_gravity
 from ssm_graph.problem.error_state import POSITION, ROTATION, STATE_DIM, VELOCITY
@@ -80,9 +78,6 @@ class _Rows(NamedTuple):
     """(m,)"""
 
 
-_NO_ROWS = _Rows(np.zeros((0, STATE_DIM)), np.zeros(0), np.zeros(0))
-
-
 class _ForwardPass:
     """A filter on the same inertial factors as the graph, in covariance form."""
 
@@ -93,7 +88,9 @@ class _ForwardPass:
         self.kernel = kernel
         start = start_of(problem)
         self.R_nb, self.p_n, self.v_n, self.bias = start[:4]
-        self.P = start.covariance
+        self.extras = ForwardExtras(problem) if problem.extras else None
+        self.P = self.extras.begin(start.covariance) if self.extras else start.covariance
+        self.no_rows = _Rows(np.zeros((0, len(self.P))), np.zeros(0), np.zeros(0))
         self.factors = inertial
         self.weights = np.ones(len(problem.beams.speed))
         self.trust = np.ones(N_BEAMS)
@@ -101,24 +98,29 @@ class _ForwardPass:
         self.n_doubts = 0
         self.gravity_at = np.full(3, np.inf)
         self.gravity, self.gravity_D_p = np.zeros(3), np.zeros((3, 3))
+        self._g_n = gtsam_gravity(problem.frame, self.p_n)
 
     def run(self) -> FirstValues:
         problem = self.problem
         rows = _RowsByKeyframe(problem)
-        history: list[tuple[Array, Array, Array, Array]] = []
+        history: list[tuple[Array, ...]] = []
         for k in range(problem.n_keyframes):
             if k > 0:
                 self._predict(k - 1)
             self._update_fix(rows.fix[k])
             self._update_water(rows.beam[k], self._depth_row(rows.depth[k], k))
-            history.append((self.R_nb, self.p_n, self.v_n, self.bias))
-        R_nb, p_n, v_n, bias = (np.array(column) for column in zip(*history, strict=True))
-        return FirstValues(states_from_arrays(R_nb, p_n, v_n, bias), self.weights, self.n_doubts)
+            walks = (self.extras.walks,) if self.extras else ()
+            history.append((self.R_nb, self.p_n, self.v_n, self.bias, *walks))
+        states = states_from_arrays(*(np.array(column) for column in zip(*history, strict=True)))
+        if self.extras:
+            states = states._replace(constants=self.extras.constants)
+        return FirstValues(states, self.weights, self.n_doubts)
 
     def _predict(self, k: int) -> None:
         chain = self.problem.chain
         span = self.problem.keyframe_s[k + 1] - self.problem.keyframe_s[k]
-        chain.params[k].n_gravity = self._gravity(self.p_n + 0.5 * span * self.v_n)
+        self._g_n = self._gravity(self.p_n + 0.5 * span * self.v_n)
+        chain.params[k].n_gravity = self._g_n
         pose = gtsam.Pose3(gtsam.Rot3(self.R_nb), self.p_n)
         bias = gtsam.imuBias.ConstantBias(self.bias[:3], self.bias[3:])
         predicted = chain.measurements[k].predict(gtsam.NavState(pose, self.v_n), bias)
@@ -133,6 +135,8 @@ class _ForwardPass:
         # Columns x_i v_i x_j v_j b_i b_j.
         whitened, _ = self.factors.at(k).linearize(values).jacobian()
         self.P = carried_covariance(whitened[:, _I], whitened[:, _J], self.P)
+        if self.extras:
+            self.extras.predict(k, self.P)
         self.R_nb = predicted.pose().rotation().matrix()
         self.p_n, self.v_n = predicted.position(), predicted.velocity()
 
@@ -150,6 +154,10 @@ class _ForwardPass:
         fixes = self.problem.fixes
         for i in rows:
             assert fixes is not None
+            if self.extras:
+                innovation, H = self.extras.fix_rows(i, self._state, self._g_n)
+                self._correct(H, innovation, H @ self.P @ H.T + fixes.covariance_n[i])
+                continue
             H = np.zeros((3, STATE_DIM))
             H[:, ROTATION] = cross(fixes.lever_arm_b, self.R_nb)
             H[:, POSITION] = self.R_nb
@@ -159,7 +167,7 @@ class _ForwardPass:
     def _depth_row(self, rows: range, k: int) -> _Rows:
         depths = self.problem.depths
         if depths is None or len(rows) == 0:
-            return _NO_ROWS
+            return self.no_rows
         i = rows[-1]
         late = self.problem.keyframe_s[k] - depths.time_s[i]
         x, y, z = self.p_n + self.R_nb @ depths.lever_arm_b
@@ -167,13 +175,15 @@ class _ForwardPass:
         H = np.zeros((1, STATE_DIM))
         H[0, ROTATION] = cross(depths.lever_arm_b, self.R_nb[2])
         H[0, POSITION] = self.R_nb[2]
-        innovation = -depths.depth[i] + late * self.v_n[2] - height
+        innovation = float(-depths.depth[i] + late * self.v_n[2] - height)
         variance = depths.sigma**2 + late**2 * (self.P[8, 8] + 1e-2)
+        if self.extras:
+            H, innovation = self.extras.depth_row(H, innovation)
         return _Rows(H, np.array([innovation]), np.array([variance]))
 
     def _update_water(self, rows: slice, depth: _Rows) -> None:
         """Correct by the beams of one ping and a depth, together."""
-        beams = self._beam_rows(rows) if rows.start < rows.stop else _NO_ROWS
+        beams = self._beam_rows(rows) if rows.start < rows.stop else self.no_rows
         H, innovation, variance = (np.concatenate(pair) for pair in zip(beams, depth, strict=True))
         if len(H):
             S = H @ self.P @ H.T
@@ -182,14 +192,7 @@ class _ForwardPass:
 
     def _beam_rows(self, rows: slice) -> _Rows:
         """Return the beams of one ping with the variances that their weights give them."""
-        error, H = linearize_beams(
-            self.problem.beams,
-            rows=rows,
-            R_nb=self.R_nb,
-            v_n=self.v_n,
-            bias=self.bias,
-            omega_ie_n=self.problem.frame.omega_ie_n,
-        )
+        error, H = self._linearized(rows)
         innovation = -error
         variance = self.problem.beams.sigma[rows] ** 2
         predicted = H @ self.P @ H.T
@@ -207,6 +210,22 @@ class _ForwardPass:
         self.trust = updated_trust(self.trust, beam, weights)
         self.weights[rows] = weights
         return _Rows(H, innovation, variance / weights)
+
+    @property
+    def _state(self) -> tuple[Array, Array, Array, Array]:
+        return self.R_nb, self.p_n, self.v_n, self.bias
+
+    def _linearized(self, rows: slice) -> BeamRows:
+        if self.extras:
+            return self.extras.beam_rows(rows, self._state, self._g_n)
+        return linearize_beams(
+            self.problem.beams,
+            rows=rows,
+            R_nb=self.R_nb,
+            v_n=self.v_n,
+            bias=self.bias,
+            omega_ie_n=self.problem.frame.omega_ie_n,
+        )
 
     def _forget_velocity(self, H: Array, innovation: Array, predicted: Array) -> Array:
         """Let the beams alone set the velocity; return the predicted covariance of the beams.
@@ -229,7 +248,9 @@ class _ForwardPass:
         pose = gtsam.Pose3(gtsam.Rot3(self.R_nb), self.p_n).retract(step[:6])
         self.R_nb, self.p_n = pose.rotation().matrix(), pose.translation()
         self.v_n = self.v_n + step[VELOCITY]
-        self.bias = self.bias + step[9:]
+        self.bias = self.bias + step[9:STATE_DIM]
+        if self.extras:
+            self.extras.correct(step[STATE_DIM:])
 
 
 # Columns of a linearised inertial factor that belong to its first and its second keyframe.

@@ -7,13 +7,16 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
+from numpy.typing import NDArray
 
 from factors.dvl_beam import BeamResidual, beam_residual
 from ssm_graph.data import Array
 from ssm_graph.graph.depth import depth_graph
+from ssm_graph.graph.interfaces import BeamRows, Misfit
 from ssm_graph.graph.keys import chain_ordering
 from ssm_graph.graph.marginal_prior import prior_at_start
-from ssm_graph.graph.states import States
+from ssm_graph.graph.solve import marginal_covariances, solve_linear
+from ssm_graph.graph.states import States, retract
 from ssm_graph.problem.error_state import (
     GYRO_BIAS,
     POSITION,
@@ -22,15 +25,6 @@ from ssm_graph.problem.error_state import (
     VELOCITY,
 )
 from ssm_graph.problem.problem import Beams, Fixes, Problem, start_of
-
-
-class BeamRows(NamedTuple):
-    """Linearised beams, one row each, not whitened."""
-
-    error: Array
-    """(M,) m/s, predicted minus measured."""
-    jacobian: Array
-    """(M, 15) with respect to the keyframe's error state."""
 
 
 def linearize_beams(
@@ -62,11 +56,40 @@ def rows_of_beams(residual: BeamResidual) -> BeamRows:
 def carried_covariance(A_i: Array, A_j: Array, covariance: Array) -> Array:
     """Return the covariance (15, 15) at the end of an inertial factor from that at its begin.
 
-    Whitened, ``A_i d_i + A_j d_j`` is noise of unit variance, both (15, 15).
+    Whitened, ``A_i d_i + A_j d_j`` is noise of unit variance, both (15, 15). Extra variables
+    behind the error state make it larger; they are carried as they are.
     """
     solved = np.linalg.solve(A_j, np.hstack([-A_i, np.eye(STATE_DIM)]))
     F, root_Q = solved[:, :STATE_DIM], solved[:, STATE_DIM:]
-    return np.asarray(F @ covariance @ F.T + root_Q @ root_Q.T)
+    if len(covariance) == STATE_DIM:
+        return np.asarray(F @ covariance @ F.T + root_Q @ root_Q.T)
+    carried = covariance.copy()
+    carried[:STATE_DIM] = F @ covariance[:STATE_DIM]
+    carried[:, :STATE_DIM] = carried[:, :STATE_DIM] @ F.T
+    carried[:STATE_DIM, :STATE_DIM] += root_Q @ root_Q.T
+    return carried
+
+
+class ChainStep(NamedTuple):
+    """A step of the keyframes alone."""
+
+    delta: gtsam.VectorValues
+    covariance: Array
+
+    @property
+    def sigma(self) -> Array:
+        """Of the error state of every keyframe, (K, 15)."""
+        return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)))
+
+    @property
+    def extras_covariance(self) -> Array:
+        """Of no variable beside the keyframes, (0, 0)."""
+        return np.zeros((0, 0))
+
+    def variance(self, keyframe: NDArray[np.intp], rows: Array) -> Array:
+        """Return ``H P H'`` (M,) of rows (M, 15)."""
+        P = self.covariance[keyframe]
+        return np.asarray(np.einsum("mi,mij,mj->m", rows, P, rows, optimize=True))
 
 
 class GraphLinearizer:
@@ -123,6 +146,27 @@ class GraphLinearizer:
         self._push_beams(linear, beam_rows, weights)
         return linear
 
+    def solve(self, states: States, beam_rows: BeamRows, weights: Array) -> ChainStep:
+        """Return the step at ``states``, with their beam rows and weights (M,)."""
+        linear = self.linearize(states, beam_rows, weights)
+        solution = solve_linear(linear, self.ordering, n_keyframes=self.problem.n_keyframes)
+        return ChainStep(solution.delta, marginal_covariances(solution))
+
+    def retract(
+        self, states: States, delta: gtsam.VectorValues, *, scale: float = 1.0
+    ) -> tuple[States, Array]:
+        """Return the states moved by ``scale * delta``, and that step as (K, 15)."""
+        return retract(states, delta, scale=scale)
+
+    def misfits(self, states: States) -> dict[str, Misfit]:
+        """Return the misfit of GNSS, depth and inertial data, by name, where there are any."""
+        graphs = {"GNSS": self.gnss, "depth": self.depth, "inertial": self.inertial}
+        return {
+            name: misfit_of(graph, states, rows_per_factor=1 if name == "depth" else None)
+            for name, graph in graphs.items()
+            if graph.size()
+        }
+
     def cost(self, states: States, beam_rows: BeamRows, weights: Array) -> float:
         """Return half the weighted sum of squares that :meth:`linearize` makes linear."""
         graphs = (self.inertial, self.gnss, self.depth)
@@ -156,6 +200,15 @@ class GraphLinearizer:
 
 
 _BLOCKS = (slice(0, 6), slice(6, 9), slice(9, 15))
+
+
+def misfit_of(
+    graph: gtsam.NonlinearFactorGraph, states: States, *, rows_per_factor: int | None = None
+) -> Misfit:
+    """Return the misfit of GTSAM's factors of one kind."""
+    n_factors = graph.size()
+    n_rows = n_factors * (rows_per_factor or graph.at(0).dim())
+    return Misfit(2.0 * graph.error(states.values), n_rows, n_factors)
 
 
 def inertial_graph(problem: Problem) -> gtsam.NonlinearFactorGraph:

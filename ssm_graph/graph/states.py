@@ -10,6 +10,9 @@ from gtsam.symbol_shorthand import B, V, X
 
 from ssm_graph.data import Array
 
+_NONE = np.zeros((1, 0))
+_NONE.setflags(write=False)
+
 
 class States(NamedTuple):
     """States of all keyframes; the arrays and the GTSAM values say the same."""
@@ -23,9 +26,20 @@ class States(NamedTuple):
     """(K, 3) m/s"""
     bias: Array
     """(K, 6) accelerometer m/s^2, gyro rad/s"""
+    walks: Array = _NONE
+    """(K, s) extra variables that walk, zero where they are as stated"""
+    constants: Array = _NONE[0]
+    """(C,) extra variables that do not"""
 
 
-def states_from_arrays(R_nb: Array, p_n: Array, v_n: Array, bias: Array) -> States:
+def states_from_arrays(
+    R_nb: Array,
+    p_n: Array,
+    v_n: Array,
+    bias: Array,
+    walks: Array = _NONE,
+    constants: Array = _NONE[0],
+) -> States:
     """Return the states of K keyframes as both."""
     values = gtsam.Values()
     poses = np.tile(np.eye(4), (len(p_n), 1, 1))
@@ -37,7 +51,7 @@ def states_from_arrays(R_nb: Array, p_n: Array, v_n: Array, bias: Array) -> Stat
         values.insert(X(k), pose3=gtsam.Pose3(pose))
         values.insert(V(k), velocity)
         values.insert(B(k), constant_bias=gtsam.imuBias.ConstantBias(accel, gyro))
-    return States(values, R_nb, p_n, v_n, bias)
+    return States(values, R_nb, p_n, v_n, bias, walks, constants)
 
 
 def retract(

@@ -20,8 +20,10 @@ from ssm_graph.io.arrival_tables import read_arrival_table
 from ssm_graph.io.mission_checks import check_tables
 from ssm_graph.io.mission_cross_checks import check_mission
 from ssm_graph.io.mission_instruments import (
+    depth_calibration,
     dvl_mount,
     frame_at,
+    gnss_calibration,
     imu_noise,
     initial_state,
     lever_arm_b,
@@ -142,22 +144,26 @@ def _dvl(table: Table, toml: MissionToml) -> DvlLog:
 
 
 def _depth(table: Table, toml: MissionToml) -> DepthLog:
+    calibration = depth_calibration(toml)
     return DepthLog(
         sigma=toml["depth"].number("noise_m"),
         time_s=table.time_s,
-        depth=table["depth_m"],
+        depth=table["depth_m"] - calibration.offset,
         lever_arm_b=lever_arm_b(toml, "depth"),
+        calibration=calibration,
     )
 
 
 def _gnss(table: Table, toml: MissionToml) -> GnssLog:
+    calibration = gnss_calibration(toml)
     return GnssLog(
-        time_s=table.time_s,
+        time_s=table.time_s - calibration.time_offset_s,
         lat=np.radians(table["lat_deg"]),
         lon=radians_wrapped(table["lon_deg"]),
         height=table["height_m"],
         sigma_enu=table.stack(POSITION_SIGMA),
         lever_arm_b=lever_arm_b(toml, "gnss"),
+        calibration=calibration,
     )
 
 

@@ -4,7 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from ssm_graph.data import Array, DvlMount, ImuNoise, InitialState
+from ssm_graph.data import (
+    N_BEAMS,
+    Array,
+    DepthCalibration,
+    DvlMount,
+    GnssCalibration,
+    ImuNoise,
+    InitialState,
+)
 from ssm_graph.earth import LocalFrame
 from ssm_graph.frames import wrap_to_pi
 from ssm_graph.io.mission_keys import POSITION, Settings
@@ -30,6 +38,12 @@ def imu_noise(settings: Settings) -> ImuNoise:
 def dvl_mount(toml: MissionToml) -> DvlMount:
     """Return the geometry of section ``[dvl]``; raise where the beams lie in one plane."""
     settings = toml["dvl"]
+    if settings.number("scale_walk_per_sqrt_h") > 0.0 and settings.number("scale_sigma") == 0.0:
+        raise settings.fault(
+            "scale_walk_per_sqrt_h",
+            "expected with a scale_sigma above 0, the sigma at the start, got none; "
+            "0.01 is 1 percent",
+        )
     return DvlMount(
         beams_d=_beams(settings),
         R_bd=R_bd_from_rpy(np.radians(settings.array("mounting_rpy_deg"))),
@@ -38,6 +52,35 @@ def dvl_mount(toml: MissionToml) -> DvlMount:
         scale_sigma=settings.number("scale_sigma"),
         time_offset_s=settings.number("time_offset_s"),
         time_offset_sigma_s=settings.number("time_offset_sigma_s"),
+        scale_error=settings.number("scale_error"),
+        scale_walk_density=_si(settings, "scale_walk_per_sqrt_h"),
+        beam_scale_error=(
+            settings.array("beam_scale_error")
+            if "beam_scale_error" in settings
+            else np.zeros(N_BEAMS)
+        ),
+        beam_scale_sigma=settings.number("beam_scale_sigma"),
+        lever_arm_sigma=settings.number("lever_arm_sigma_m"),
+    )
+
+
+def depth_calibration(toml: MissionToml) -> DepthCalibration:
+    """Return what section ``[depth]`` says of its errors; nothing without the section."""
+    if "depth" not in toml:
+        return DepthCalibration()
+    settings = toml["depth"]
+    return DepthCalibration(settings.number("offset_m"), settings.number("offset_sigma_m"))
+
+
+def gnss_calibration(toml: MissionToml) -> GnssCalibration:
+    """Return what section ``[gnss]`` says of its errors; nothing without the section."""
+    if "gnss" not in toml:
+        return GnssCalibration()
+    settings = toml["gnss"]
+    return GnssCalibration(
+        time_offset_s=settings.number("time_offset_s"),
+        time_offset_sigma_s=settings.number("time_offset_sigma_s"),
+        lever_arm_sigma=settings.number("lever_arm_sigma_m"),
     )
 
 

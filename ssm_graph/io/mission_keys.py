@@ -81,6 +81,9 @@ _LEVER_ARM = Key(shape=(3,), low=-100.0, high=100.0, hint="lever arms are in met
 _LAT = Key(low=-90.0, high=90.0, hint="are latitude and longitude swapped?")
 _LON = Key(low=-180.0, high=360.0, hint="longitude is in degrees")
 _HEIGHT = Key(low=-12000.0, high=20000.0, hint="height is in metres above the ellipsoid, up")
+_LATE = _optional(-10.0, 10.0, "the unit is seconds, not milliseconds")
+_LATE_SIGMA = _optional(0.0, 10.0, "the unit is seconds, not milliseconds")
+_ARM_SIGMA = _optional(0.0, 100.0, "the unit is metres")
 _WALK = "the unit is that of the data sheet"
 
 SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
@@ -111,11 +114,30 @@ SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
         "mounting_rpy_deg": Key(shape=(3,), low=-360.0, high=360.0),
         "misalignment_sigma_deg": _optional(0.0, 45.0, "the unit is degrees"),
         "scale_sigma": _optional(0.0, 1.0, "1 percent is 0.01"),
-        "time_offset_s": _optional(-10.0, 10.0, "the unit is seconds, not milliseconds"),
-        "time_offset_sigma_s": _optional(0.0, 10.0, "the unit is seconds, not milliseconds"),
+        "time_offset_s": _LATE,
+        "time_offset_sigma_s": _LATE_SIGMA,
+        "scale_error": _optional(-0.5, 0.5, "1 percent is 0.01"),
+        "scale_walk_per_sqrt_h": _optional(0.0, 1.0, "1 percent in an hour is 0.01"),
+        "beam_scale_error": Key(
+            shape=(N_BEAMS,), low=-0.5, high=0.5, required=False, hint="1 percent is 0.01"
+        ),
+        "beam_scale_sigma": _optional(0.0, 1.0, "1 percent is 0.01"),
+        "lever_arm_sigma_m": _ARM_SIGMA,
     },
-    "depth": {"file": _FILE, "noise_m": _sigma(1000.0), "lever_arm_m": _LEVER_ARM},
-    "gnss": {"file": _FILE, "lever_arm_m": _LEVER_ARM},
+    "depth": {
+        "file": _FILE,
+        "noise_m": _sigma(1000.0),
+        "lever_arm_m": _LEVER_ARM,
+        "offset_m": _optional(-1000.0, 1000.0, "the unit is metres"),
+        "offset_sigma_m": _optional(0.0, 1000.0, "the unit is metres"),
+    },
+    "gnss": {
+        "file": _FILE,
+        "lever_arm_m": _LEVER_ARM,
+        "lever_arm_sigma_m": _ARM_SIGMA,
+        "time_offset_s": _LATE,
+        "time_offset_sigma_s": _LATE_SIGMA,
+    },
     "initial": {
         "time_s": Key(),
         "lat_deg": _LAT,

@@ -11,8 +11,10 @@ import tomli_w
 
 from ssm_graph.data import (
     Array,
+    DepthCalibration,
     DvlLog,
     DvlMount,
+    GnssCalibration,
     ImuNoise,
     InitialState,
     Mission,
@@ -91,11 +93,13 @@ def mission_settings(mission: Mission, table_format: TableFormat) -> dict[str, A
             "file": f"depth{suffix}",
             "noise_m": float(mission.depth.sigma),
             "lever_arm_m": mission.depth.lever_arm_b.tolist(),
+            **depth_calibration_settings(mission.depth.calibration),
         }
     if mission.gnss is not None:
         settings["gnss"] = {
             "file": f"gnss{suffix}",
             "lever_arm_m": mission.gnss.lever_arm_b.tolist(),
+            **gnss_calibration_settings(mission.gnss.calibration),
         }
     if mission.initial is not None:
         settings["initial"] = initial_settings(mission.initial)
@@ -112,10 +116,11 @@ def mission_tables(mission: Mission) -> dict[str, dict[str, Array]]:
         "dvl": _dvl_table(mission.dvl),
     }
     if depth is not None:
-        tables["depth"] = {TIME: depth.time_s, "depth_m": depth.depth}
+        read = depth.depth + depth.calibration.offset
+        tables["depth"] = {TIME: depth.time_s, "depth_m": read}
     if gnss is not None:
         tables["gnss"] = {
-            TIME: gnss.time_s,
+            TIME: gnss.time_s + gnss.calibration.time_offset_s,
             "lat_deg": np.degrees(gnss.lat),
             "lon_deg": np.degrees(gnss.lon),
             "height_m": gnss.height,
@@ -157,6 +162,11 @@ def dvl_settings(mount: DvlMount, beam_sigma: float, suffix: str) -> dict[str, A
         "scale_sigma": float(mount.scale_sigma),
         "time_offset_s": float(mount.time_offset_s),
         "time_offset_sigma_s": float(mount.time_offset_sigma_s),
+        "scale_error": float(mount.scale_error),
+        "scale_walk_per_sqrt_h": from_si("scale_walk_per_sqrt_h", mount.scale_walk_density),
+        "beam_scale_error": mount.beam_scale_error.tolist() if mount.beam_scale_error.any() else 0,
+        "beam_scale_sigma": float(mount.beam_scale_sigma),
+        "lever_arm_sigma_m": float(mount.lever_arm_sigma),
     }
     return {
         "file": f"dvl{suffix}",
@@ -166,6 +176,24 @@ def dvl_settings(mount: DvlMount, beam_sigma: float, suffix: str) -> dict[str, A
         "mounting_rpy_deg": _degrees(rpy),
         **{key: value for key, value in optional.items() if value},
     }
+
+
+def depth_calibration_settings(calibration: DepthCalibration) -> dict[str, float]:
+    """Return the keys of ``[depth]`` that tell of its errors; none for an exact sensor."""
+    return _given(offset_m=calibration.offset, offset_sigma_m=calibration.offset_sigma)
+
+
+def gnss_calibration_settings(calibration: GnssCalibration) -> dict[str, float]:
+    """Return the keys of ``[gnss]`` that tell of its errors; none for an exact receiver."""
+    return _given(
+        lever_arm_sigma_m=calibration.lever_arm_sigma,
+        time_offset_s=calibration.time_offset_s,
+        time_offset_sigma_s=calibration.time_offset_sigma_s,
+    )
+
+
+def _given(**values: float) -> dict[str, float]:
+    return {key: float(value) for key, value in values.items() if value}
 
 
 def nominal_sigma(dvl: DvlLog) -> float:

@@ -1,5 +1,7 @@
 """Result folders: ``trajectory.csv``, ``beams.csv`` and ``summary.json``, written and read again.
 
+A run that calibrated leaves ``calibration.toml`` too.
+
 Units are those of the mission format: degrees, degrees per hour, micro-g. Column and key names are
 a contract: they only grow.
 """
@@ -18,6 +20,7 @@ import numpy as np
 from ssm_graph.data import Array, Mission
 from ssm_graph.errors import DataError
 from ssm_graph.estimate import BeamTable, Estimate, Trajectory
+from ssm_graph.io.calibration_toml import CALIBRATION_NAME, calibration_toml
 from ssm_graph.io.csv_tables import (
     CsvFile,
     check_is_text,
@@ -25,6 +28,7 @@ from ssm_graph.io.csv_tables import (
     read_csv_header,
     read_csv_values,
 )
+from ssm_graph.io.mission_keys import BodyAxes
 from ssm_graph.io.mission_units import SI
 from ssm_graph.io.results_summary import MetricsLike, build_summary
 
@@ -55,7 +59,7 @@ def write_results(
     mission: Mission,
     metrics: MetricsLike | None,
     settings: Mapping[str, Any],
-    calibration: Mapping[str, Any] | None = None,
+    axes: BodyAxes = BodyAxes.FRD,
 ) -> None:
     """Write one estimate as a result folder.
 
@@ -69,8 +73,7 @@ def write_results(
     mission : what it was found from; its name, notes and the origin of the start are noted.
     metrics : comparison with the reference, if there is one.
     settings : of the estimator, noted as they are; units belong into the keys.
-    calibration : name to value and sigma, for example
-        ``{"scale": {"value": 0.01, "sigma": 0.002}}``; None or empty if nothing was calibrated.
+    axes : body axes of the mission's file, for the lever arms of ``calibration.toml``.
 
     Raises
     ------
@@ -78,20 +81,22 @@ def write_results(
         The folder cannot be made or written.
     """
     folder = Path(folder)
-    summary = build_summary(
-        estimate, mission=mission, metrics=metrics, settings=settings, calibration=calibration or {}
-    )
+    summary = build_summary(estimate, mission=mission, metrics=metrics, settings=settings)
     content = {
         TRAJECTORY_NAME: format_table(trajectory_columns(estimate.trajectory)),
         BEAMS_NAME: format_table(beam_columns(estimate.beams)),
-        SUMMARY_NAME: json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n",
     }
+    if estimate.calibration is not None:
+        content[CALIBRATION_NAME] = calibration_toml(mission, estimate.calibration, axes=axes)
+    text = json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False)
+    content[SUMMARY_NAME] = text + "\n"
     parts = {name: folder / f".{name}.part-{os.getpid()}" for name in content}
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, text in content.items():
             _write_through(parts[name], text)
-        (folder / SUMMARY_NAME).unlink(missing_ok=True)
+        for name in (SUMMARY_NAME, CALIBRATION_NAME):
+            (folder / name).unlink(missing_ok=True)
         for name, part in parts.items():
             part.replace(folder / name)
     except OSError as error:

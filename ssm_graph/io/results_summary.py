@@ -59,7 +59,6 @@ def build_summary(
     mission: Mission,
     metrics: MetricsLike | None,
     settings: Mapping[str, Any],
-    calibration: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Return the summary of an estimate, ready for strict JSON: what is not finite is None.
 
@@ -90,7 +89,7 @@ def build_summary(
             **_start(estimate.start),
             "origin": "mission" if mission.initial is not None else "alignment",
         },
-        "calibration": calibration,
+        "calibration": _calibration(estimate),
         **(_comparison(metrics) if metrics is not None else {}),
         "settings": settings,
         "history": [
@@ -154,6 +153,21 @@ def _comparison(metrics: MetricsLike) -> dict[str, Any]:
         "compared_epochs": metrics.n_epochs,
         "compared_from_s": metrics.first_s,
         "compared_to_s": metrics.last_s,
+    }
+
+
+def _calibration(estimate: Estimate) -> dict[str, Any]:
+    """Return what was found of the instruments, by label, in the label's unit."""
+    if estimate.calibration is None:
+        return {}
+    return {
+        value.label: {
+            "value": value.value / value.unit,
+            "sigma": value.sigma / value.unit,
+            "prior_sigma": value.prior_sigma / value.unit,
+            "determined": value.determined.name.lower(),
+        }
+        for value in estimate.calibration.values
     }
 
 

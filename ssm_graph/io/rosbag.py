@@ -15,9 +15,11 @@ import numpy as np
 
 from ssm_graph.data import (
     Array,
+    DepthCalibration,
     DepthLog,
     DvlLog,
     DvlMount,
+    GnssCalibration,
     GnssLog,
     ImuLog,
     ImuNoise,
@@ -26,12 +28,7 @@ from ssm_graph.data import (
 )
 from ssm_graph.earth import LocalFrame
 from ssm_graph.errors import ConfigError, DataError
-from ssm_graph.io.ros_messages import (
-    STANDARD_GRAVITY,
-    WATER_LINKED_TYPE,
-    BeamSign,
-    RosOptions,
-)
+from ssm_graph.io.ros_messages import STANDARD_GRAVITY, WATER_LINKED_TYPE, BeamSign, RosOptions
 from ssm_graph.io.rosbag_beams import Beams, known_beams, proven_beams
 from ssm_graph.io.rosbag_rows import BagTopic, in_order, read_topics
 from ssm_graph.messages import Vehicle
@@ -232,13 +229,15 @@ def _gnss(
             f"{topic.name}: {topic.n_unstated} fixes do not say how good they are and are given "
             f"{sigma[0]:g}, {sigma[1]:g}, {sigma[2]:g} m east, north, up."
         )
+    known = GnssCalibration() if vehicle is None else vehicle.gnss_calibration
     log = GnssLog(
-        time_s=table[:, 0],
+        time_s=table[:, 0] - known.time_offset_s,
         lat=table[:, 1],
         lon=table[:, 2],
         height=table[:, 3],
         sigma_enu=table[:, 4:7],
         lever_arm_b=np.zeros(3) if vehicle is None else vehicle.gnss_lever_arm_b,
+        calibration=known,
     )
     return log, notes
 
@@ -260,11 +259,13 @@ def _depth(
         )
     stated = table[np.isfinite(table[:, 2]), 2]
     sigma = float(np.median(stated)) if len(stated) else DEPTH_SIGMA
+    known = DepthCalibration() if vehicle is None else vehicle.depth_calibration
     log = DepthLog(
         sigma=sigma if vehicle is None or vehicle.depth_sigma is None else vehicle.depth_sigma,
         time_s=table[:, 0],
-        depth=table[:, 1],
+        depth=table[:, 1] - known.offset,
         lever_arm_b=np.zeros(3) if vehicle is None else vehicle.depth_lever_arm_b,
+        calibration=known,
     )
     notes = [
         f"Depth is pressure above {options.atmosphere:.0f} Pa in water of "

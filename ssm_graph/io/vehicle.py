@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import os
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import tomli_w
 
-from ssm_graph.data import Array, Mission
+from ssm_graph.data import Array, DepthCalibration, GnssCalibration, Mission
 from ssm_graph.errors import ConfigError
 from ssm_graph.io.mission_instruments import (
+    depth_calibration,
     dvl_mount,
+    gnss_calibration,
     imu_noise,
     initial_state,
     lever_arm_b,
@@ -22,7 +25,9 @@ from ssm_graph.io.mission_instruments import (
 from ssm_graph.io.mission_keys import FORMAT, SECTIONS, TOML_NAME, BodyAxes
 from ssm_graph.io.mission_toml import read_vehicle_toml
 from ssm_graph.io.mission_writer import (
+    depth_calibration_settings,
     dvl_settings,
+    gnss_calibration_settings,
     imu_settings,
     initial_settings,
     nominal_sigma,
@@ -63,13 +68,18 @@ def read_vehicle(path: Path | str) -> Vehicle:
         depth_lever_arm_b=lever_arm_b(toml, "depth"),
         gnss_lever_arm_b=lever_arm_b(toml, "gnss"),
         depth_sigma=toml["depth"].number("noise_m") if "depth" in toml else None,
+        depth_calibration=depth_calibration(toml),
+        gnss_calibration=gnss_calibration(toml),
         frame=frame,
         initial=initial_state(toml["initial"]) if "initial" in toml else None,
     )
 
 
 def vehicle_of(mission: Mission) -> Vehicle:
-    """Return the vehicle of a recorded mission; its beam sigma is the median of those recorded."""
+    """Return the vehicle of a recorded mission; its beam sigma is the median of those recorded.
+
+    The offsets of depth and GNSS are those that are left in the mission's values: none.
+    """
     depth, gnss = mission.depth, mission.gnss
     return Vehicle(
         name=mission.name,
@@ -79,6 +89,12 @@ def vehicle_of(mission: Mission) -> Vehicle:
         depth_lever_arm_b=np.zeros(3) if depth is None else depth.lever_arm_b,
         gnss_lever_arm_b=np.zeros(3) if gnss is None else gnss.lever_arm_b,
         depth_sigma=None if depth is None else depth.sigma,
+        depth_calibration=(
+            DepthCalibration() if depth is None else replace(depth.calibration, offset=0.0)
+        ),
+        gnss_calibration=(
+            GnssCalibration() if gnss is None else replace(gnss.calibration, time_offset_s=0.0)
+        ),
         frame=mission.frame,
         initial=mission.initial,
     )
@@ -118,10 +134,12 @@ def vehicle_settings(vehicle: Vehicle, *, order: Order = Order.ARRIVAL) -> dict[
             "file": f"depth{suffix}",
             "noise_m": float(vehicle.depth_sigma),
             "lever_arm_m": _listed(vehicle.depth_lever_arm_b),
+            **depth_calibration_settings(vehicle.depth_calibration),
         }
     settings["gnss"] = {
         "file": f"gnss{suffix}",
         "lever_arm_m": _listed(vehicle.gnss_lever_arm_b),
+        **gnss_calibration_settings(vehicle.gnss_calibration),
     }
     if vehicle.initial is not None:
         settings["initial"] = initial_settings(vehicle.initial)

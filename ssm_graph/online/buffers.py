@@ -32,8 +32,12 @@ class Buffers:
 
     def time_of(self, message: Message) -> float:
         """Return when a message's content was true, s."""
-        late = self.vehicle.mount.time_offset_s if isinstance(message, Ping) else 0.0
-        return message.time_s - late
+        match message:
+            case Ping():
+                return message.time_s - self.vehicle.mount.time_offset_s
+            case Fix():
+                return message.time_s - self.vehicle.gnss_calibration.time_offset_s
+        return message.time_s
 
     def add(self, message: Message) -> bool:
         """Take a message; return False if one of its time is known."""
@@ -45,7 +49,8 @@ class Buffers:
             case Ping():
                 return self.pings.add(np.array([*row, *message.speed, *self._sigma(message)]))
             case DepthReading():
-                return self.depths.add(np.array([*row, message.depth]))
+                depth = message.depth - self.vehicle.depth_calibration.offset
+                return self.depths.add(np.array([*row, depth]))
             case Fix():
                 place = message.lat, message.lon, message.height
                 return self.fixes.add(np.array([*row, *place, *message.sigma_enu]))
@@ -101,7 +106,7 @@ class Buffers:
         )
 
     def mission(self, frame: LocalFrame) -> Mission:
-        """Return everything as a mission, to align with."""
+        """Return everything as a mission, to align with; instruments are taken as stated."""
         vehicle = self.vehicle
         pings = self.pings_between(-np.inf, np.inf)
         depths, fixes = self.depths.all, self.fixes.all
@@ -116,7 +121,7 @@ class Buffers:
             vehicle.name,
             frame,
             self.imu_log(-np.inf, end_s, margin=0),
-            DvlLog(vehicle.mount, stamps, pings[:, 1:5], pings[:, 5:]),
+            DvlLog(vehicle.mount.as_stated(), stamps, pings[:, 1:5], pings[:, 5:]),
             depth,
             GnssLog(
                 time_s=fixes[:, 0],

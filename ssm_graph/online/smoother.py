@@ -39,6 +39,8 @@ from ssm_graph.online.store import (
 )
 from ssm_graph.online.tail import Tail
 from ssm_graph.online.watch import Watch
+from ssm_graph.problem.calibration import calibration_extras, taken_as_exact
+from ssm_graph.problem.extras import Extras
 from ssm_graph.problem.problem import ProblemConfig
 from ssm_graph.problem.timeline import MIN_SPACING_S
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
@@ -88,6 +90,13 @@ class FixedLagSmoother:
         self._intake = Intake(vehicle, self._events)
         self._starter = Starter(vehicle, self._problem_config, self._events)
         self._course: Course | None = None
+        self._exact = taken_as_exact(
+            Extras(
+                calibration_extras(
+                    vehicle.mount, vehicle.depth_calibration, vehicle.gnss_calibration
+                )
+            )
+        )
         self._frame = vehicle.frame
         self._tail: Tail | None = None
         self._latest_s = -np.inf
@@ -148,6 +157,8 @@ class FixedLagSmoother:
 
     def _begin(self, beginning: Beginning) -> None:
         self._frame, buffers = beginning.frame, self._intake.buffers
+        for note in self._exact:
+            self._events.tell(beginning.time_s, Severity.INFO, "not_calibrated", note)
         maker = KeyframeMaker(buffers, beginning.frame, self._problem_config)
         first = Keyframe.unmeasured(beginning.time_s, np.zeros(3), None)
         sensors = sensors_of_vehicle(self.vehicle, beginning.frame)

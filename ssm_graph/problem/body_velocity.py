@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ssm_graph.data import Array, Mission
-from ssm_graph.problem.problem import mean_gyro
+from ssm_graph.problem.ping_motion import mean_gyro
 
 PARITY_GATE = 5.0
 """Sigmas of the array's parity above which a ping is not used."""

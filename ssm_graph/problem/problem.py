@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from ssm_graph.data import (
     N_BEAMS,
     Array,
-    DvlMount,
     GnssLog,
     ImuLog,
     InitialState,
@@ -20,7 +19,10 @@ from ssm_graph.data import (
 from ssm_graph.earth import LocalFrame
 from ssm_graph.errors import ConfigError, DataError
 from ssm_graph.imu.preintegration import InertialChain, imu_gaps, preintegrate
+from ssm_graph.problem.calibration import DVL_TIME_OFFSET, extras_of
 from ssm_graph.problem.error_state import InitialMoments, initial_moments
+from ssm_graph.problem.extras import Extras
+from ssm_graph.problem.ping_motion import MotionBefore, mean_gyro
 from ssm_graph.problem.timeline import (
     MIN_SPACING_S,
     Indices,
@@ -32,9 +34,7 @@ from ssm_graph.problem.timeline import (
 from ssm_graph.problem.usable import require_usable
 from ssm_graph.stuck_beams import stuck_beams
 
-PING_WINDOW_S = 0.1
-"""The gyro reading at a ping is the mean over this window: a ping takes time, and so does noise
-to average out."""
+NO_EXTRAS = Extras()
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,9 +68,15 @@ class Beams(ReadOnlyArrays):
     gyro_b: Array
     """(M, 3) rad/s, mean over the ping"""
     beam_b: Array
-    """(M, 3) unit vectors"""
+    """(M, 3) beam directions, longer than one by the known scale errors"""
     lever_arm_b: Array
     """(3,) m"""
+    R_bd: Array
+    """(3, 3) mounting, instrument to body"""
+    ping: NDArray[np.intp]
+    """(M,) the ping of each, counted from 0"""
+    motion: MotionBefore | None = None
+    """Inertial readings before the pings, where the DVL's clock is in doubt."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,6 +107,8 @@ class Fixes(ReadOnlyArrays):
     """(M, 3) m"""
     covariance_n: Array
     """(M, 3, 3) m^2"""
+    gyro_b: Array
+    """(M, 3) rad/s, at the fixes: with a clock in doubt it moves the antenna"""
     lever_arm_b: Array
     """(3,) m"""
 
@@ -118,6 +126,8 @@ class Problem(ReadOnlyArrays):
     fixes: Fixes | None
     imu_noise_bias_sigma: Array
     """(6,) turn-on bias sigmas, accelerometer (m/s^2) then gyro (rad/s)."""
+    extras: Extras = NO_EXTRAS
+    """What else is to be estimated; an estimator that takes it as exact says so."""
     notes: tuple[str, ...] = ()
 
     @property
@@ -152,21 +162,18 @@ def build_problem(
         mission.imu, timeline.keyframe_s, frame=mission.frame, rate_hz=config.merge_rate_hz
     )
     noise = mission.imu.noise
+    extras = extras_of(mission)
     return Problem(
         frame=mission.frame,
         start=start,
         keyframe_s=timeline.keyframe_s,
         chain=chain,
-        beams=_beams(mission, timeline.ping, timeline.ping_keyframe),
+        beams=_beams(mission, timeline.ping, timeline.ping_keyframe, extras),
         depths=_depths(mission, timeline),
-        fixes=None if mission.gnss is None else _fixes(mission.gnss, mission.frame, timeline),
+        fixes=None if mission.gnss is None else _fixes(mission, mission.gnss, timeline),
         imu_noise_bias_sigma=np.repeat([noise.accel_bias_sigma, noise.gyro_bias_sigma], 3),
-        notes=(
-            *timeline.notes,
-            *_gap_note(mission.imu),
-            *stuck_note,
-            *_calibration_note(mission.dvl.mount),
-        ),
+        extras=extras,
+        notes=(*timeline.notes, *_gap_note(mission.imu), *stuck_note),
     )
 
 
@@ -192,7 +199,7 @@ def with_dvl(problem: Problem, mission: Mission) -> Problem:
             f"with_dvl: expected pings at the keyframes, got one {off.max():.3f} s away at "
             f"{ping_s[ping][np.argmax(off)]:.3f} s; build a problem of its own"
         )
-    return replace(problem, beams=_beams(mission, ping, keyframe))
+    return replace(problem, beams=_beams(mission, ping, keyframe, problem.extras))
 
 
 def _without_stuck_beams(mission: Mission) -> tuple[Mission, tuple[str, ...]]:
@@ -224,41 +231,7 @@ def _gap_note(imu: ImuLog) -> tuple[str, ...]:
     )
 
 
-def _calibration_note(mount: DvlMount) -> tuple[str, ...]:
-    asked = [
-        name
-        for name in ("misalignment_sigma", "scale_sigma", "time_offset_sigma_s")
-        if getattr(mount, name) > 0.0
-    ]
-    if not asked:
-        return ()
-    return (
-        f"[dvl] asks to calibrate ({', '.join(asked)}): not part of this version, taken as exact; "
-        "sigmas leave it out",
-    )
-
-
-def mean_gyro(imu: ImuLog, time_s: Array) -> Array:
-    """Return the mean gyro reading (M, 3) over the ping window about each time, rad/s.
-
-    Near the ends of the data the window shrinks, to no less than one sample.
-    """
-    edges = np.concatenate([[imu.start_s], imu.time_s])
-    angle = np.concatenate(
-        [np.zeros((1, 3)), np.cumsum(imu.gyro_b * np.diff(edges)[:, None], axis=0)]
-    )
-    sample = float(np.median(np.diff(edges)))
-    room = np.minimum(time_s - edges[0], edges[-1] - time_s)
-    half = np.clip(room, 0.5 * sample, 0.5 * max(PING_WINDOW_S, sample))
-    centre = np.clip(time_s, edges[0] + half, edges[-1] - half)
-    turned = [
-        np.interp(centre + half, edges, axis) - np.interp(centre - half, edges, axis)
-        for axis in angle.T
-    ]
-    return np.asarray(np.stack(turned, axis=-1) / (2.0 * half[:, None]))
-
-
-def _beams(mission: Mission, ping: Indices, ping_keyframe: Indices) -> Beams:
+def _beams(mission: Mission, ping: Indices, ping_keyframe: Indices, extras: Extras) -> Beams:
     dvl = mission.dvl
     speed = dvl.speed[ping]
     row, beam = np.nonzero(np.isfinite(speed))
@@ -271,6 +244,9 @@ def _beams(mission: Mission, ping: Indices, ping_keyframe: Indices) -> Beams:
         gyro_b=gyro_b[row],
         beam_b=dvl.mount.beams_b.reshape(N_BEAMS, 3)[beam],
         lever_arm_b=dvl.mount.lever_arm_b,
+        R_bd=dvl.mount.R_bd,
+        ping=row,
+        motion=MotionBefore(mission.imu, dvl.ping_s[ping]) if DVL_TIME_OFFSET in extras else None,
     )
 
 
@@ -297,12 +273,13 @@ def fix_covariance_n(frame: LocalFrame, position_n: Array, sigma_enu: Array) -> 
     return np.asarray(R_nl @ covariance_l @ np.swapaxes(R_nl, 1, 2))
 
 
-def _fixes(log: GnssLog, frame: LocalFrame, timeline: Timeline) -> Fixes:
-    fix = timeline.fix
+def _fixes(mission: Mission, log: GnssLog, timeline: Timeline) -> Fixes:
+    fix, frame = timeline.fix, mission.frame
     place_n = frame.p_n_from_geodetic(log.lat[fix], log.lon[fix], log.height[fix])
     return Fixes(
         keyframe=timeline.fix_keyframe,
         position_n=place_n,
         covariance_n=fix_covariance_n(frame, place_n, log.sigma_enu[fix]),
+        gyro_b=mean_gyro(mission.imu, log.time_s[fix]),
         lever_arm_b=log.lever_arm_b,
     )

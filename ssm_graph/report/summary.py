@@ -12,7 +12,15 @@ from rich.table import Table
 from rich.text import Text
 
 from ssm_graph.data import N_BEAMS, Array
-from ssm_graph.estimate import OUTLIER_WEIGHT, Estimate, Status, Trajectory, path_length_m
+from ssm_graph.estimate import (
+    OUTLIER_WEIGHT,
+    Calibration,
+    Determined,
+    Estimate,
+    Status,
+    Trajectory,
+    path_length_m,
+)
 from ssm_graph.evaluation import Metrics
 
 STATUS_STYLE: Final = {
@@ -21,6 +29,11 @@ STATUS_STYLE: Final = {
     Status.INTERRUPTED: "bold yellow",
     Status.SUSPECT: "bold red",
     Status.DIVERGED: "bold white on red",
+}
+DETERMINED_STYLE: Final = {
+    Determined.GREEN: "green",
+    Determined.AMBER: "yellow",
+    Determined.RED: "red",
 }
 DEG_PER_HOUR: Final = float(np.rad2deg(1.0)) * 3600.0
 """deg/h in one rad/s."""
@@ -37,6 +50,8 @@ def summary_table(estimate: Estimate, metrics: Metrics | None = None) -> Rendera
     parts: list[RenderableType] = [_overview(estimate), _axes(estimate.trajectory)]
     if metrics is not None:
         parts.append(_comparison(metrics))
+    if estimate.calibration is not None:
+        parts.append(_calibration(estimate.calibration))
     parts.extend(Text(f"note: {note}", style="yellow") for note in estimate.notes)
     return Group(*parts)
 
@@ -111,6 +126,26 @@ def _comparison(metrics: Metrics) -> Table:
         table.add_row(heading, *_numbers([value]))
     inside = ", ".join(f"{100.0 * share:.1f}" for share in metrics.inside_3_sigma)
     table.add_row("within 3 sigma east, north, up, %", inside)
+    return table
+
+
+def _calibration(calibration: Calibration) -> Table:
+    """Return what was found of the instruments, each value in the colour of its certainty."""
+    table = _table("Calibration, off what the mission states", ["", "", "", "", ""])
+    table.show_header = True
+    for column, name in zip(
+        table.columns, ("", "value", "sigma", "sigma before", "determined"), strict=True
+    ):
+        column.header = name
+    table.columns[4].justify = "left"
+    for value in calibration.values:
+        numbers = (value.value, value.sigma, value.prior_sigma)
+        style = DETERMINED_STYLE[value.determined]
+        table.add_row(
+            value.label,
+            *_numbers(number / value.unit for number in numbers),
+            Text(f"{value.determined.name.lower()}: {value.determined.value}", style=style),
+        )
     return table
 
 

@@ -24,6 +24,8 @@ class DepthSettings:
     """m"""
     lever_arm_b: Point = (0.2, 0.1, 0.0)
     """Body origin to sensor, body axes, m."""
+    offset: float = 0.0
+    """Depths are read too large by this much, m."""
 
     def __post_init__(self) -> None:
         require_positive("DepthSettings.rate_hz", self.rate_hz, hint="try 2 Hz")
@@ -42,6 +44,10 @@ class GnssSettings:
     """m"""
     lever_arm_b: Point = (-0.3, 0.0, -0.6)
     """Body origin to antenna, body axes, m."""
+    lever_arm_error_b: Point = (0.0, 0.0, 0.0)
+    """The antenna truly sits this much further on, m."""
+    late_s: float = 0.0
+    """Stamps are later than the fixes by this much, s."""
     windows: tuple[tuple[float, float], ...] | None = None
     """Times with fixes, s, each ``[start, end)``; None for whenever the route is at the surface."""
     surface_depth_m: float = 0.5
@@ -52,6 +58,7 @@ class GnssSettings:
         require_positive("GnssSettings.sigma_horizontal", self.sigma_horizontal, hint="try 0.5 m")
         require_positive("GnssSettings.sigma_vertical", self.sigma_vertical, hint="try 1 m")
         _require_point("GnssSettings.lever_arm_b", self.lever_arm_b)
+        _require_point("GnssSettings.lever_arm_error_b", self.lever_arm_error_b)
         for window in self.windows or ():
             require_window("GnssSettings.windows", *window)
 
@@ -76,7 +83,7 @@ def depth_log(
     """Return the depth of the sensor over ``(0, end_s]``; None draws no noise."""
     time_s = _regular_times(settings.rate_hz, end_s)
     point_e = trajectory.at(time_s).point_e(np.array(settings.lever_arm_b))
-    depth = -geodetic_from_ecef(stacked(point_e))[2]
+    depth = settings.offset - geodetic_from_ecef(stacked(point_e))[2]
     if rng is not None:
         depth = depth + settings.sigma * rng.standard_normal(len(time_s))
     return DepthLog(
@@ -107,11 +114,12 @@ def gnss_log(
     time_s, unit = time_s[has_fix], unit[has_fix]
     motion = trajectory.at(time_s)
     R_el = R_el_from_lat_lon(motion.lat.value, motion.lon.value)
-    antenna_e = stacked(motion.point_e(np.array(settings.lever_arm_b)))
+    true_arm_b = np.array(settings.lever_arm_b) + np.array(settings.lever_arm_error_b)
+    antenna_e = stacked(motion.point_e(true_arm_b))
     noise_e = np.einsum("kij,kj->ki", R_el, unit * sigma_enu)
     lat, lon, height = geodetic_from_ecef(antenna_e + noise_e)
     return GnssLog(
-        time_s=time_s,
+        time_s=time_s + settings.late_s,
         lat=lat,
         lon=lon,
         height=height,

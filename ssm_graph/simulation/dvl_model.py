@@ -60,6 +60,12 @@ class DvlSettings:
     """Rotation vector, rad, by which the true mounting differs: ``R_bd_true = R_bd Exp(m)``."""
     late_s: float = 0.0
     """Stamps are later than the pings by this much, s."""
+    lever_arm_error_b: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """The instrument truly sits this much further on, body axes, m."""
+    beam_scale_errors: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    """On top of ``scale_error``, each beam's own."""
+    scale_drift_per_h: float = 0.0
+    """By so much the scale error grows in an hour."""
     seabed_depth_m: float | None = None
     """Depth of a level sea floor; given, ranges are written as well."""
 
@@ -102,17 +108,19 @@ def true_beam_speeds(trajectory: Trajectory, settings: DvlSettings, time_s: Arra
     used.
     """
     motion = trajectory.at(time_s)
-    x, y, z = motion.point_e(settings.mount.lever_arm_b)
+    x, y, z = motion.point_e(_true_lever_arm_b(settings))
     v_e: Vector = (Series([x.rate]), Series([y.rate]), Series([z.rate]))
     v_b = stacked(motion.body_from_earth(v_e))
-    return np.asarray(v_b @ _true_beams_b(settings).T * (1.0 + settings.scale_error))
+    read = (1.0 + settings.scale_error + settings.scale_drift_per_h * time_s / 3600.0)[:, None]
+    read = read * (1.0 + np.array(settings.beam_scale_errors))
+    return np.asarray(v_b @ _true_beams_b(settings).T * read)
 
 
 def beam_ranges(trajectory: Trajectory, settings: DvlSettings, time_s: Array) -> Array:
     """Return the range (N, 4) along each beam to a level sea floor, m; NaN if it never meets it."""
     seabed = math.nan if settings.seabed_depth_m is None else settings.seabed_depth_m
     motion = trajectory.at(time_s)
-    _, _, height = geodetic_from_ecef(stacked(motion.point_e(settings.mount.lever_arm_b)))
+    _, _, height = geodetic_from_ecef(stacked(motion.point_e(_true_lever_arm_b(settings))))
     down = np.empty((len(time_s), N_BEAMS))
     for beam, direction in enumerate(_true_beams_b(settings)):
         down[:, beam] = _down_part(motion, direction)
@@ -120,6 +128,10 @@ def beam_ranges(trajectory: Trajectory, settings: DvlSettings, time_s: Array) ->
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = altitude / down
     return np.where((down > 0.0) & (altitude > 0.0), distance, np.nan)
+
+
+def _true_lever_arm_b(settings: DvlSettings) -> Array:
+    return np.asarray(settings.mount.lever_arm_b + np.array(settings.lever_arm_error_b))
 
 
 def _true_beams_b(settings: DvlSettings) -> Array:

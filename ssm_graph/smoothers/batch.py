@@ -5,9 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import gtsam
 import numpy as np
 
 from factors.m_estimators import TruncatedKernel
@@ -15,12 +14,14 @@ from factors.similarity import Kernel, LogKernel, Similarity, expected_mahalanob
 from ssm_graph.data import Array
 from ssm_graph.errors import ConfigError, SolverError
 from ssm_graph.estimate import BeamTable, Estimate, Iteration, Status
+from ssm_graph.graph.extended import ExtendedLinearizer
 from ssm_graph.graph.first_values import FirstValues, first_values
-from ssm_graph.graph.linearize import BeamRows, GraphLinearizer
-from ssm_graph.graph.solve import marginal_covariances, solve_linear
-from ssm_graph.graph.states import States, retract
+from ssm_graph.graph.interfaces import BeamRows, Linearizer, Step
+from ssm_graph.graph.linearize import GraphLinearizer
+from ssm_graph.graph.states import States
 from ssm_graph.problem.problem import Problem
 from ssm_graph.problem.trajectory import trajectory_from_states
+from ssm_graph.smoothers.calibrated import calibration_of
 from ssm_graph.smoothers.gnc import GncSchedule, Graduation, Schedule, WarmSchedule
 from ssm_graph.smoothers.verdict import contradictions
 
@@ -84,7 +85,7 @@ class _Pass(NamedTuple):
     """State of the loop after one iteration."""
 
     states: States
-    covariance: Array
+    step: Step
     beam_rows: BeamRows
     mahalanobis_sq: Array
     weights: Array
@@ -93,24 +94,30 @@ class _Pass(NamedTuple):
 
 
 def _descend(
-    linearizer: GraphLinearizer,
+    linearizer: Linearizer,
     states: States,
-    delta: gtsam.VectorValues,
+    delta: Any,
     weights: Array,
     cost: float,
 ) -> tuple[States, BeamRows, Array]:
     """Take the Gauss-Newton step, halved while it raises the cost at these weights.
 
-    Returns the states moved to, their beams, and the whole step (K, 15), however little of it was
-    taken: what is judged as settled is the step that was wanted.
+    Returns the states moved to, their beams, and the whole step, (K, 15) or with all extra
+    variables, however little of it was taken: what is judged as settled is the step that was
+    wanted.
     """
     for halvings in range(MAX_HALVINGS):
         scale = 0.5**halvings
-        moved, update = retract(states, delta, scale=scale)
+        moved, update = linearizer.retract(states, delta, scale=scale)
         rows = linearizer.beam_rows(moved)
         if linearizer.cost(moved, rows, weights) <= cost + COST_SLACK:
             return moved, rows, update / scale
     return states, linearizer.beam_rows(states), update / scale
+
+
+def linearizer_of(problem: Problem) -> Linearizer:
+    """Return what linearises a problem: with extra variables, or the keyframes alone."""
+    return ExtendedLinearizer(problem) if problem.extras else GraphLinearizer(problem)
 
 
 def warm_start(problem: Problem) -> FirstValues:
@@ -148,7 +155,7 @@ class SsmSmoother:
             If no finite solution was found.
         """
         begin = time.perf_counter()
-        linearizer = GraphLinearizer(problem)
+        linearizer = linearizer_of(problem)
         if first is None:
             first = first_values(problem, kernel=WARM_KERNEL, inertial=linearizer.inertial)
         states, rows = first.states, linearizer.beam_rows(first.states)
@@ -188,7 +195,7 @@ class SsmSmoother:
 
     def _iterate(
         self,
-        linearizer: GraphLinearizer,
+        linearizer: Linearizer,
         states: States,
         rows: BeamRows,
         weights: Array,
@@ -196,34 +203,30 @@ class SsmSmoother:
     ) -> _Pass:
         problem = linearizer.problem
         linearizer.follow(states)
-        linear = linearizer.linearize(states, rows, weights)
-        solution = solve_linear(linear, linearizer.ordering, n_keyframes=problem.n_keyframes)
-        covariance = marginal_covariances(solution)
+        step = linearizer.solve(states, rows, weights)
         cost = linearizer.cost(states, rows, weights)
-        states, rows, update = _descend(linearizer, states, solution.delta, weights, cost)
-        sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+        states, rows, update = _descend(linearizer, states, step.delta, weights, cost)
+        sigma = step.sigma
         speed = float(np.max(np.abs(states.v_n)))
         if not (np.all(np.isfinite(sigma)) and speed < RUNAWAY_SPEED):
             raise SolverError(
                 f"{Status.DIVERGED.value}: largest velocity {speed:.3g} m/s; check time stamps and "
                 "noise of [imu], and the initial heading"
             )
-        t = self._mahalanobis_sq(problem, rows, covariance)
+        t = self._mahalanobis_sq(problem, rows, step)
         settled = kernel.weight(t)
         change = float(np.max(np.abs(settled - weights), initial=0.0))
-        return _Pass(
-            states, covariance, rows, t, settled, float(np.max(np.abs(update) / sigma)), change
-        )
+        return _Pass(states, step, rows, t, settled, float(np.max(np.abs(update) / sigma)), change)
 
-    def _mahalanobis_sq(self, problem: Problem, rows: BeamRows, covariance: Array) -> Array:
+    def _mahalanobis_sq(self, problem: Problem, rows: BeamRows, step: Step) -> Array:
         H, beams = rows.jacobian, problem.beams
         if self.config.judged_by is Similarity.PLAIN:
             spread = np.zeros(len(H))
         else:
-            spread = np.einsum("mi,mij,mj->m", H, covariance[beams.keyframe], H, optimize=True)
+            spread = step.variance(beams.keyframe, H)
         return expected_mahalanobis_sq(rows.error, spread, sigma=beams.sigma)
 
-    def _cost(self, linearizer: GraphLinearizer, last: _Pass) -> float:
+    def _cost(self, linearizer: Linearizer, last: _Pass) -> float:
         """Return the cost with each beam's robust loss in place of its weighted square."""
         kernel, rows = self.config.kernel, last.beam_rows
         t = (rows.error / linearizer.problem.beams.sigma) ** 2
@@ -233,7 +236,7 @@ class SsmSmoother:
 
     def _estimate(
         self,
-        linearizer: GraphLinearizer,
+        linearizer: Linearizer,
         last: _Pass,
         iterations: tuple[Iteration, ...],
         status: Status,
@@ -254,7 +257,7 @@ class SsmSmoother:
             kernel=self.config.weighting,
             status=status,
             reason=reason,
-            trajectory=trajectory_from_states(problem, last.states, last.covariance),
+            trajectory=trajectory_from_states(problem, last.states, last.step.covariance),
             beams=BeamTable(
                 time_s=problem.keyframe_s[beams.keyframe],
                 beam=(beams.beam + 1).astype(np.float64),
@@ -267,4 +270,5 @@ class SsmSmoother:
             cost=self._cost(linearizer, last),
             start=problem.start,
             notes=notes,
+            calibration=calibration_of(problem, last.states, last.step.extras_covariance),
         )

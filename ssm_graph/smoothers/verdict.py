@@ -2,35 +2,42 @@
 
 from __future__ import annotations
 
-import gtsam
 import numpy as np
 from scipy.stats import chi2
 
 from ssm_graph.data import Array
-from ssm_graph.graph.linearize import BeamRows, GraphLinearizer
+from ssm_graph.graph.interfaces import BeamRows, Linearizer, Misfit
 from ssm_graph.graph.marginal_prior import MarginalPrior
 from ssm_graph.graph.states import States
 from ssm_graph.problem.doubts import MISFIT, doubts_of_beams
+from ssm_graph.problem.extras import Extras
 
 PRIOR_TAIL = 1e-9
 """Probability below which the initial state is contradicted by the data."""
 
 
+HINTS = {
+    "GNSS": "look for a wrong datum or lever arm",
+    "depth": "look at its zero, sign and unit",
+    "inertial": "look at the noise of [imu], its units, axes and time stamps",
+}
+"""What to look at when a kind of measurement contradicts the answer."""
+
+
 def contradictions(
-    linearizer: GraphLinearizer, states: States, beam_rows: BeamRows, weights: Array
+    linearizer: Linearizer, states: States, beam_rows: BeamRows, weights: Array
 ) -> list[str]:
     """Compare every kind of measurement with the answer; say in a sentence each what disagrees."""
+    misfits = linearizer.misfits(states)
     doubts = [
         *doubts_of_beams(linearizer.problem, states.v_n, beam_rows.error, weights),
         _doubt_prior(linearizer.prior, states),
-        _doubt_sensor("GNSS", linearizer.gnss, states, "look for a wrong datum or lever arm"),
-        _doubt_sensor("depth", linearizer.depth, states, "look at its zero, sign and unit"),
-        _doubt_sensor(
-            "inertial",
-            linearizer.inertial,
-            states,
-            "look at the noise of [imu], its units, axes and time stamps",
+        *(
+            _doubt_sensor(name, misfits[name], hint)
+            for name, hint in HINTS.items()
+            if name in misfits
         ),
+        *_doubt_extras(linearizer.problem.extras, states),
     ]
     return [doubt for doubt in doubts if doubt]
 
@@ -52,15 +59,26 @@ def _doubt_prior(prior: MarginalPrior, states: States) -> str:
     return ""
 
 
-def _doubt_sensor(name: str, graph: gtsam.NonlinearFactorGraph, states: States, hint: str) -> str:
-    n_factors = graph.size()
-    if n_factors == 0:
-        return ""
-    n_rows = n_factors * (1 if name == "depth" else graph.at(0).dim())
-    misfit = 2.0 * graph.error(states.values) / n_rows
-    if misfit <= MISFIT:
+def _doubt_sensor(name: str, misfit: Misfit, hint: str) -> str:
+    mean_sq = misfit.sum_sq / misfit.n_rows
+    if mean_sq <= MISFIT:
         return ""
     return (
-        f"{name} data miss the answer by {np.sqrt(misfit):.1f} of their own sigmas (rms over "
-        f"{n_factors} factors): {hint}"
+        f"{name} data miss the answer by {np.sqrt(mean_sq):.1f} of their own sigmas (rms over "
+        f"{misfit.n_factors} factors): {hint}"
     )
+
+
+def _doubt_extras(extras: Extras, states: States) -> list[str]:
+    """Look for a calibration that lies further off than its prior can mean."""
+    doubts = []
+    for block in extras.blocks:
+        first = states.walks[0] if extras.n_walks else states.walks
+        value = extras.value(block.name, first, states.constants, default=np.zeros(0))
+        whitened = value / block.sigma
+        if chi2.sf(float(whitened @ whitened), df=len(whitened)) < PRIOR_TAIL:
+            doubts.append(
+                f"the calibration of {block.name} lies {np.max(np.abs(whitened)):.0f} of its prior "
+                "sigmas off: state it nearer, or a larger sigma; or another instrument is wrong"
+            )
+    return doubts

@@ -16,7 +16,8 @@ from factors.dvl_beam import beam_residual
 from factors.so3 import cross
 from ssm_graph.data import Array
 from ssm_graph.earth import LocalFrame
-from ssm_graph.graph.linearize import BeamRows, carried_covariance, rows_of_beams
+from ssm_graph.graph.interfaces import BeamRows
+from ssm_graph.graph.linearize import carried_covariance, rows_of_beams
 from ssm_graph.imu.preintegration import gtsam_gravity
 from ssm_graph.problem.error_state import GYRO_BIAS, POSITION, ROTATION, STATE_DIM, VELOCITY
 from ssm_graph.problem.heights import height_track, mean_rises

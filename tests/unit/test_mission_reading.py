@@ -79,6 +79,45 @@ def test_optional_dvl_keys_are_read(tmp_path: Path) -> None:
     assert (mount.scale_sigma, mount.time_offset_s, mount.time_offset_sigma_s) == (0.03, 0.12, 0.05)
 
 
+def test_calibration_keys_are_read(tmp_path: Path) -> None:
+    """Each key reaches its field; known offsets are taken off the readings."""
+    for name in ("plain", "changed"):
+        (tmp_path / name).mkdir()
+    plain = read_after(tmp_path / "plain")
+    dvl = (
+        "scale_error = -0.03\nscale_sigma = 0.02\nscale_walk_per_sqrt_h = 0.06\n"
+        "beam_scale_error = [0, 0.01, 0, 0]\nbeam_scale_sigma = 0.005\nlever_arm_sigma_m = 0.3\n"
+    )
+    changes = (
+        toml("\n[depth]", f"{dvl}\n[depth]\noffset_m = 0.5\noffset_sigma_m = 0.2"),
+        toml(
+            "\n[gnss]",
+            "\n[gnss]\ntime_offset_s = 0.3\ntime_offset_sigma_s = 0.1\nlever_arm_sigma_m = 0.4",
+        ),
+    )
+    mission = read_after(tmp_path / "changed", *changes)
+    mount, depth, gnss = mission.dvl.mount, mission.depth, mission.gnss
+    assert depth is not None
+    assert gnss is not None
+    assert plain.depth is not None
+    assert plain.gnss is not None
+    assert (mount.scale_error, mount.scale_sigma) == (-0.03, 0.02)
+    assert mount.scale_walk_density == pytest.approx(0.001)
+    assert (mount.beam_scale_sigma, mount.lever_arm_sigma) == (0.005, 0.3)
+    longer = np.linalg.norm(mount.beams_b, axis=1)
+    np.testing.assert_allclose(longer, [0.97, 0.97 * 1.01, 0.97, 0.97])
+    assert (depth.calibration.offset, depth.calibration.offset_sigma) == (0.5, 0.2)
+    np.testing.assert_allclose(depth.depth, plain.depth.depth - 0.5)
+    assert (gnss.calibration.time_offset_sigma_s, gnss.calibration.lever_arm_sigma) == (0.1, 0.4)
+    np.testing.assert_allclose(gnss.time_s, plain.gnss.time_s - 0.3)
+
+
+def test_a_scale_that_walks_needs_a_sigma_to_start_from(tmp_path: Path) -> None:
+    """Without one the walk would never be looked at."""
+    with pytest.raises(ConfigError, match=r"scale_walk_per_sqrt_h: expected with a scale_sigma"):
+        read_after(tmp_path, toml("\n[depth]", "scale_walk_per_sqrt_h = 0.01\n\n[depth]"))
+
+
 def test_beams_and_mounting(tmp_path: Path) -> None:
     """Beam 1 looks 45 degrees to starboard; a mounting yaw of 90 degrees turns x to starboard."""
     mission = read_after(

@@ -12,13 +12,14 @@ import tomli_w
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ssm_graph.data import DvlLog, Mission
+from ssm_graph.data import DepthCalibration, DvlLog, GnssCalibration, Mission
 from ssm_graph.errors import ConfigError, DataError, MissingExtraError
 from ssm_graph.io import tables as tables_module
 from ssm_graph.io.mission import read_mission
 from ssm_graph.io.mission_units import SI, R_bd_from_rpy, from_si, rpy_from_R_bd, to_si
 from ssm_graph.io.mission_writer import write_mission
 from ssm_graph.io.tables import TableFormat
+from ssm_graph.io.vehicle import read_vehicle, vehicle_of
 from tests.mission_fixture import make_mission
 
 
@@ -62,6 +63,39 @@ def test_round_trip_of_the_smallest_mission(tmp_path: Path) -> None:
     write_mission(tmp_path, mission)
     assert_same(read_mission(tmp_path), mission)
     assert "sigma" not in (tmp_path / "dvl.csv").read_text().splitlines()[0]
+
+
+def test_round_trip_of_known_and_doubted_errors(tmp_path: Path) -> None:
+    """All that can be said of instruments' errors; offsets of quarters leave no rounding."""
+    mission = make_mission()
+    assert mission.depth is not None
+    assert mission.gnss is not None
+    mount = replace(
+        mission.dvl.mount,
+        scale_error=-0.03,
+        scale_walk_density=1e-4 / 60.0,
+        beam_scale_error=np.array([0.01, 0.0, -0.02, 0.005]),
+        beam_scale_sigma=0.01,
+        lever_arm_sigma=0.3,
+    )
+    true_depth = np.round(mission.depth.depth, 6)
+    depth = DepthCalibration(offset=0.25, offset_sigma=0.1)
+    gnss = GnssCalibration(time_offset_s=0.25, time_offset_sigma_s=0.2, lever_arm_sigma=0.4)
+    mission = replace(
+        mission,
+        dvl=replace(mission.dvl, mount=mount),
+        depth=replace(mission.depth, calibration=depth, depth=true_depth),
+        gnss=replace(mission.gnss, calibration=gnss),
+    )
+    write_mission(tmp_path, mission)
+    got = read_mission(tmp_path)
+    assert got.depth is not None
+    np.testing.assert_allclose(got.depth.depth, true_depth, atol=1e-13)
+    assert_same(replace(got, depth=replace(got.depth, depth=true_depth)), mission)
+    assert_same(read_vehicle(tmp_path).gnss_calibration, gnss)
+    assert_same(read_vehicle(tmp_path).depth_calibration, depth)
+    vehicle = vehicle_of(got)
+    assert vehicle.depth_calibration.offset == vehicle.gnss_calibration.time_offset_s == 0.0
 
 
 def test_round_trip_of_a_silent_dvl(tmp_path: Path) -> None:

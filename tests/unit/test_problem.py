@@ -12,7 +12,8 @@ import pytest
 
 from ssm_graph.data import DepthLog, ImuLog
 from ssm_graph.errors import ConfigError, DataError
-from ssm_graph.problem.problem import ProblemConfig, build_problem, mean_gyro
+from ssm_graph.problem.ping_motion import mean_gyro
+from ssm_graph.problem.problem import ProblemConfig, build_problem
 from ssm_graph.simulation import (
     IMU_NOISE,
     DepthSettings,

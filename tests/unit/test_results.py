@@ -78,7 +78,6 @@ def test_summary_tells_the_run(tmp_path: Path) -> None:
         mission=make_mission(estimate, reference),
         metrics=metrics,
         settings={"dof": np.float64(5.0), "limit": np.inf, "where": tmp_path},
-        calibration={"scale": {"value": 0.01, "sigma": 0.002}},
     )
     text = (tmp_path / "new" / "folder" / "summary.json").read_text()
     summary = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} in JSON"))
@@ -90,7 +89,6 @@ def test_summary_tells_the_run(tmp_path: Path) -> None:
     assert summary["wall_seconds"] == 1.25
     assert summary["mission"] == "lawn-mower"
     assert set(summary["versions"]) == {"ssm_graph", "gtsam", "numpy", "scipy", "python"}
-    assert summary["calibration"] == {"scale": {"value": 0.01, "sigma": 0.002}}
     assert summary["start"]["origin"] == "alignment"
     assert summary["start"]["heading_deg"] == pytest.approx(350.0)
     assert summary["start"]["attitude_sigma_deg"] == pytest.approx([0.1, 0.1, 3.0])

@@ -137,7 +137,7 @@ def test_every_field_is_written(tmp_path: Path) -> None:
     """A field that a vehicle is given one day has to find its key."""
     write_vehicle(tmp_path, vehicle_of(make_mission()))
     got = read_vehicle(tmp_path)
-    assert len(fields(Vehicle)) == 9
+    assert len(fields(Vehicle)) == 11
     assert all(getattr(got, spec.name) is not None for spec in fields(Vehicle))
 
 

@@ -1,0 +1,200 @@
+"""A problem with extra variables: linearised in NumPy, solved as a chain with a border.
+
+The inertial factors stay GTSAM's. Beams, depth and GNSS are rows over the error state, the walks of
+their keyframe and the constants; GTSAM's own Jacobian factor takes three keys from Python, and its
+elimination of the chain alone takes longer than that of chain and border here.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, V, X
+from numpy.typing import NDArray
+
+from ssm_graph.data import Array
+from ssm_graph.graph.bordered import BorderedSolution, ChainRows, solve_bordered
+from ssm_graph.graph.extended_rows import Aid, DepthAid, ExtendedBeams, GnssAid, states_of
+from ssm_graph.graph.interfaces import BeamRows, Misfit
+from ssm_graph.graph.linearize import inertial_graph, misfit_of
+from ssm_graph.graph.marginal_prior import prior_at_start
+from ssm_graph.graph.states import States
+from ssm_graph.problem.calibration import DVL_TIME_OFFSET
+from ssm_graph.problem.error_state import STATE_DIM
+from ssm_graph.problem.problem import Problem, start_of
+
+# Columns of GTSAM's inertial factor, x_i v_i x_j v_j b_i b_j, as pairs of error states.
+_BEGIN, _END = np.r_[0:9, 18:24], np.r_[9:18, 24:30]
+
+
+class ExtendedStep(NamedTuple):
+    """A step of keyframes, walks and constants."""
+
+    solution: BorderedSolution
+
+    @property
+    def delta(self) -> tuple[Array, Array]:
+        """Steps of keyframes and walks (K, 15 + s), and of the constants (C,)."""
+        return self.solution.step, self.solution.constants_step
+
+    @property
+    def covariance(self) -> Array:
+        """Of the error state of every keyframe, (K, 15, 15)."""
+        return self.solution.covariance(STATE_DIM)
+
+    @property
+    def sigma(self) -> Array:
+        """Of all components of the step, (K (15 + s) + C,)."""
+        own = np.diagonal(self.solution.constants_cov)
+        return np.asarray(np.sqrt(np.concatenate([self.solution.variances().ravel(), own])))
+
+    @property
+    def extras_covariance(self) -> Array:
+        """Of the walks at the last keyframe and of the constants, (E, E)."""
+        return self.solution.end_covariance(STATE_DIM)
+
+    def variance(self, keyframe: NDArray[np.intp], rows: Array) -> Array:
+        """Return ``H P H'`` (M,) of rows (M, 15 + s + C)."""
+        return self.solution.variance(keyframe, rows)
+
+
+class ExtendedLinearizer:
+    """Linearises and solves the whole graph of a problem with extra variables."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self.inertial = inertial_graph(problem)
+        self.prior = prior_at_start(start_of(problem))
+        self.aids: list[Aid] = []
+        if problem.depths is not None:
+            self.aids.append(DepthAid(problem, problem.depths))
+        if problem.fixes is not None:
+            self.aids.append(GnssAid(problem, problem.fixes))
+        self._beams = ExtendedBeams(problem.beams, problem.extras, problem.frame.omega_ie_n)
+        self._keys = [(X(k), V(k), B(k)) for k in range(problem.n_keyframes)]
+        factor, sigma = problem.extras.transitions(np.diff(problem.keyframe_s))
+        self._walk_factor, self._walk_sigma = factor, sigma
+
+    def follow(self, states: States) -> None:
+        """Let gravity and the aids follow the states; to be called before the others."""
+        self.problem.chain.set_gravity(states.p_n)
+        for aid in self.aids:
+            aid.follow(states)
+
+    def beam_rows(self, states: States) -> BeamRows:
+        """Linearise all beams at ``states``."""
+        extras, motion, late_s = self.problem.extras, None, 0.0
+        if DVL_TIME_OFFSET in extras:
+            offset = extras.value(
+                DVL_TIME_OFFSET, states.walks, states.constants, default=np.zeros(1)
+            )
+            late_s = float(offset[0])
+            motion = self._beams.motion(late_s)
+        g_n = self.problem.frame.g_n_at(states.p_n)
+        at = states_of(states, self.problem.beams.keyframe, g_n=g_n)
+        return self._beams.rows(at, motion=motion, motion_late_s=late_s)
+
+    def solve(self, states: States, beam_rows: BeamRows, weights: Array) -> ExtendedStep:
+        """Return the step at ``states``, with their beam rows and weights (M,)."""
+        extras = self.problem.extras
+        own, first = self._own_rows(states, beam_rows, weights)
+        sigma = extras.sigma
+        start = np.zeros((extras.state_dim, extras.width + 1))
+        prior = self.prior.rows(states)
+        start[:STATE_DIM, :STATE_DIM], start[:STATE_DIM, -1] = prior[:, :-1], prior[:, -1]
+        walk, constant = np.arange(STATE_DIM, extras.state_dim), slice(extras.n_walks, None)
+        start[walk, walk] = 1.0 / sigma[: extras.n_walks]
+        start[STATE_DIM:, -1] = -states.walks[0] / sigma[: extras.n_walks]
+        border = np.diag(1.0 / sigma[constant])
+        rows = ChainRows(
+            start=start,
+            between=self._between(states),
+            own=own,
+            first=first,
+            border=np.column_stack([border, -states.constants / sigma[constant]]),
+        )
+        return ExtendedStep(solve_bordered(rows))
+
+    def retract(
+        self, states: States, delta: tuple[Array, Array], *, scale: float = 1.0
+    ) -> tuple[States, Array]:
+        """Return the states moved by ``scale * delta``, and that step, flat."""
+        step, constants_step = scale * delta[0], scale * delta[1]
+        move = gtsam.VectorValues()
+        for keys, own in zip(self._keys, step, strict=True):
+            move.insert(keys[0], own[:6])
+            move.insert(keys[1], own[6:9])
+            move.insert(keys[2], own[9:STATE_DIM])
+        values = states.values.retract(move)
+        poses = gtsam.utilities.extractPose3(values)
+        moved = States(
+            values,
+            poses[:, :9].reshape(-1, 3, 3),
+            poses[:, 9:],
+            states.v_n + step[:, 6:9],
+            states.bias + step[:, 9:STATE_DIM],
+            states.walks + step[:, STATE_DIM:],
+            states.constants + constants_step,
+        )
+        return moved, np.concatenate([step.ravel(), constants_step])
+
+    def cost(self, states: States, beam_rows: BeamRows, weights: Array) -> float:
+        """Return half the weighted sum of squares that :meth:`solve` makes least."""
+        extras = self.problem.extras
+        squares = np.sum(weights * (beam_rows.error / self.problem.beams.sigma) ** 2)
+        squares += np.sum(self.prior.whitened(states) ** 2)
+        squares += sum(float(np.sum(aid.rows(states).error ** 2)) for aid in self.aids)
+        at_start = np.concatenate([states.walks[0], states.constants])
+        squares += np.sum((at_start / extras.sigma) ** 2) + np.sum(self._walked(states) ** 2)
+        return float(self.inertial.error(states.values) + 0.5 * squares)
+
+    def misfits(self, states: States) -> dict[str, Misfit]:
+        """Return the misfit of the aids and the inertial data, by name."""
+        found = {}
+        for aid in self.aids:
+            error = aid.rows(states).error
+            found[aid.name] = Misfit(float(error @ error), len(error), len(error) // aid.dim)
+        return found | {"inertial": misfit_of(self.inertial, states)}
+
+    def _walked(self, states: States) -> Array:
+        """Return the whitened errors (K - 1, s) of the walks."""
+        went = states.walks[1:] - self._walk_factor * states.walks[:-1]
+        return np.asarray(went / self._walk_sigma)
+
+    def _between(self, states: States) -> Array:
+        """Return the rows (K - 1, n, 2 n + C + 1) from each keyframe to the next."""
+        extras = self.problem.extras
+        n, n_intervals = extras.state_dim, self.problem.n_keyframes - 1
+        linear = self.inertial.linearize(states.values)
+        inertial = np.empty((n_intervals, STATE_DIM, 2 * STATE_DIM + 1))
+        for k in range(n_intervals):
+            inertial[k] = linear.at(k).augmentedJacobian()
+        between = np.zeros((n_intervals, n, n + extras.width + 1))
+        between[:, :STATE_DIM, :STATE_DIM] = inertial[:, :, _BEGIN]
+        between[:, :STATE_DIM, n : n + STATE_DIM] = inertial[:, :, _END]
+        between[:, :STATE_DIM, -1] = inertial[:, :, -1]
+        for i in range(extras.n_walks):
+            sigma, row = self._walk_sigma[:, i], STATE_DIM + i
+            between[:, row, row] = -self._walk_factor[:, i] / sigma
+            between[:, row, n + row] = 1.0 / sigma
+            between[:, row, -1] = -self._walked(states)[:, i]
+        return between
+
+    def _own_rows(
+        self, states: States, beam_rows: BeamRows, weights: Array
+    ) -> tuple[Array, NDArray[np.intp]]:
+        """Return all rows of one keyframe each (M, width + 1) in order, and where each begins."""
+        beams = self.problem.beams
+        scale = np.sqrt(weights) / beams.sigma
+        whitened = np.column_stack([beam_rows.jacobian, -beam_rows.error]) * scale[:, None]
+        keyframes, blocks = [beams.keyframe], [whitened]
+        for aid in self.aids:
+            keyframe, error, jacobian = aid.rows(states)
+            keyframes.append(keyframe)
+            blocks.append(np.column_stack([jacobian, -error]))
+        keyframe = np.concatenate(keyframes)
+        order = np.argsort(keyframe, kind="stable")
+        first = np.searchsorted(keyframe[order], np.arange(self.problem.n_keyframes + 1))
+        return np.concatenate(blocks)[order], first

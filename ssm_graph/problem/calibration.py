@@ -1,0 +1,96 @@
+"""Which instruments a mission asks to calibrate, as extra variables of the problem."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from ssm_graph.data import N_BEAMS, DepthCalibration, DvlMount, GnssCalibration, Mission
+from ssm_graph.problem.extras import Extra, Extras
+
+DVL_MOUNTING: Final = "dvl_mounting"
+DVL_SCALE: Final = "dvl_scale"
+DVL_BEAM_SCALE: Final = "dvl_beam_scale"
+DVL_LEVER_ARM: Final = "dvl_lever_arm"
+DVL_TIME_OFFSET: Final = "dvl_time_offset"
+DEPTH_OFFSET: Final = "depth_offset"
+GNSS_LEVER_ARM: Final = "gnss_lever_arm"
+GNSS_TIME_OFFSET: Final = "gnss_time_offset"
+CALIBRATIONS: Final = frozenset(
+    {
+        DVL_MOUNTING,
+        DVL_SCALE,
+        DVL_BEAM_SCALE,
+        DVL_LEVER_ARM,
+        DVL_TIME_OFFSET,
+        DEPTH_OFFSET,
+        GNSS_LEVER_ARM,
+        GNSS_TIME_OFFSET,
+    }
+)
+"""Those of the extra variables that tell of instruments."""
+
+
+def calibration_extras(
+    mount: DvlMount, depth: DepthCalibration | None, gnss: GnssCalibration | None
+) -> tuple[Extra, ...]:
+    """Return what the prior sigmas of instruments switch on; None for one that there is not."""
+    extras = [
+        Extra(
+            DVL_SCALE,
+            ("dvl_scale_error",),
+            np.array([mount.scale_sigma]),
+            walk_density=mount.scale_walk_density,
+        ),
+        Extra(
+            DVL_MOUNTING,
+            _axes("dvl_mounting_{}_deg"),
+            np.full(3, mount.misalignment_sigma),
+            unit=math.radians(1.0),
+        ),
+        Extra(
+            DVL_BEAM_SCALE,
+            tuple(f"dvl_beam{beam}_scale_error" for beam in range(1, N_BEAMS + 1)),
+            np.full(N_BEAMS, mount.beam_scale_sigma),
+        ),
+        Extra(DVL_LEVER_ARM, _axes("dvl_lever_arm_{}_m"), np.full(3, mount.lever_arm_sigma)),
+        Extra(DVL_TIME_OFFSET, ("dvl_time_offset_s",), np.array([mount.time_offset_sigma_s])),
+    ]
+    if depth is not None:
+        sigma = np.array([depth.offset_sigma])
+        extras.append(Extra(DEPTH_OFFSET, ("depth_offset_m",), sigma))
+    if gnss is not None:
+        arm_sigma = np.full(3, gnss.lever_arm_sigma)
+        late_sigma = np.array([gnss.time_offset_sigma_s])
+        extras.append(Extra(GNSS_LEVER_ARM, _axes("gnss_lever_arm_{}_m"), arm_sigma))
+        extras.append(Extra(GNSS_TIME_OFFSET, ("gnss_time_offset_s",), late_sigma))
+    return tuple(extra for extra in extras if extra.sigma[0] > 0.0)
+
+
+def extras_of(mission: Mission) -> Extras:
+    """Return what a mission asks to calibrate."""
+    depth, gnss = mission.depth, mission.gnss
+    return Extras(
+        calibration_extras(
+            mission.dvl.mount,
+            None if depth is None else depth.calibration,
+            None if gnss is None else gnss.calibration,
+        )
+    )
+
+
+def taken_as_exact(extras: Extras) -> tuple[str, ...]:
+    """Return the note of an estimator that does not calibrate, if it is asked to."""
+    asked = [block.name for block in extras.blocks if block.name in CALIBRATIONS]
+    if not asked:
+        return ()
+    return (
+        f"mission.toml asks to calibrate {', '.join(asked)}: this estimator takes them as stated, "
+        "and its sigmas leave their errors out; ssm-graph smooth calibrates",
+    )
+
+
+def _axes(pattern: str) -> tuple[str, ...]:
+    return tuple(pattern.format(axis) for axis in "xyz")

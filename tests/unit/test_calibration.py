@@ -1,0 +1,129 @@
+"""Instruments calibrated by the smoother: found, said how well, and left alone where unseen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from ssm_graph.estimate import Calibration, Determined, Estimate, Status
+from ssm_graph.evaluation import evaluate
+from ssm_graph.filters.named import filter_problems
+from ssm_graph.io.replay import messages_of
+from ssm_graph.io.vehicle import vehicle_of
+from ssm_graph.messages import DepthReading, Fix
+from ssm_graph.online.buffers import Buffers
+from ssm_graph.online.smoother import FixedLagSmoother
+from ssm_graph.problem.problem import build_problem
+from ssm_graph.simulation import DepthSettings, DvlSettings, GnssSettings, Grade
+from ssm_graph.smoothers.batch import SsmSmoother
+from ssm_graph.smoothers.fixed_lag import FixedLagConfig, solve_fixed_lag
+from tests.calibration_fixture import TRUTH, asking, exact, miscalibrated
+
+
+@cache
+def two_minutes() -> Estimate:
+    """Return two minutes of turns with everything miscalibrated, calibrated."""
+    return SsmSmoother().solve(build_problem(asking(miscalibrated().mission)))
+
+
+def found(estimate: Estimate) -> Calibration:
+    """Return the calibration of an estimate that has one."""
+    assert estimate.calibration is not None
+    return estimate.calibration
+
+
+def test_all_errors_are_found_together() -> None:
+    """Within four of their own sigmas, most of them determined by the data."""
+    estimate = two_minutes()
+    assert estimate.status is Status.CONVERGED
+    calibration = found(estimate)
+    assert {value.variable for value in calibration.values} == set(TRUTH)
+    for variable, truth in TRUTH.items():
+        own = [value for value in calibration.values if value.variable == variable]
+        sigma = np.array([value.sigma for value in own])
+        assert np.all(np.abs(calibration.of(variable) - truth) < 4.0 * sigma), variable
+    colours = {value.label: value.determined for value in calibration.values}
+    for label in ("dvl_scale_error", "dvl_mounting_z_deg", "dvl_time_offset_s", "depth_offset_m"):
+        assert colours[label] in (Determined.GREEN, Determined.AMBER), label
+    sigmas = np.sqrt(np.diag(calibration.covariance))
+    np.testing.assert_allclose(sigmas, [value.sigma for value in calibration.values])
+
+
+def test_it_saves_the_track() -> None:
+    """Left alone, errors that large are no outliers: the track is lost; calibrated it is not."""
+    sim = miscalibrated()
+    reference = sim.mission.reference
+    assert reference is not None
+    calibrated = evaluate(two_minutes().trajectory, reference)
+    stated = SsmSmoother().solve(build_problem(exact(sim.mission)))
+    assert calibrated.rmse_horizontal_m < 0.1
+    assert evaluate(stated.trajectory, reference).rmse_horizontal_m > 0.2
+    assert stated.calibration is None
+
+
+def test_a_scale_that_drifts_is_followed() -> None:
+    """A random walk of the scale follows what a constant cannot."""
+    sim = miscalibrated(
+        duration_s=300.0,
+        dvl=DvlSettings(scale_error=-0.02, scale_drift_per_h=0.6),
+        depth=DepthSettings(),
+        gnss=GnssSettings(sigma_horizontal=0.05, sigma_vertical=0.1),
+    )
+    mission = exact(sim.mission)
+    mount = replace(mission.dvl.mount, scale_sigma=0.03, scale_walk_density=0.1 / 60.0)
+    problem = build_problem(replace(mission, dvl=replace(mission.dvl, mount=mount)))
+    calibration = found(SsmSmoother().solve(problem))
+    true_scale = -0.02 + 0.6 * problem.keyframe_s / 3600.0
+    assert calibration.walks.shape == (problem.n_keyframes, 1)
+    assert np.abs(calibration.walks[:, 0] - true_scale).max() < 0.015
+    (value,) = calibration.values
+    assert abs(value.value - 0.03) < 4.0 * value.sigma
+    assert value.prior_sigma == pytest.approx(np.hypot(0.03, 0.1 * np.sqrt(300.0 / 3600.0)))
+
+
+def test_a_prior_that_is_contradicted_is_said() -> None:
+    """A scale 3 % off with a prior of 0.1 % is no calibration any more."""
+    mission = asking(miscalibrated().mission, scale_sigma=1e-3)
+    estimate = SsmSmoother().solve(build_problem(mission))
+    assert estimate.status is Status.SUSPECT
+    assert "dvl_scale" in estimate.reason
+
+
+def test_filters_and_fixed_lag_say_that_they_do_not_calibrate() -> None:
+    """They take everything as stated; the note names what is asked for."""
+    sim = miscalibrated(duration_s=6.0, grade=Grade.NAVIGATION)
+    asked, stated = (build_problem(change(sim.mission)) for change in (asking, exact))
+    for problem, n_notes in ((asked, 1), (stated, 0)):
+        (filtered,) = filter_problems([problem], "ekf")
+        lagged = solve_fixed_lag(problem, FixedLagConfig(lag_s=5.0)).delayed
+        for estimate in (filtered, lagged):
+            notes = [note for note in estimate.notes if "calibrate" in note]
+            assert len(notes) == n_notes
+            assert all("dvl_mounting" in note and "gnss_time_offset" in note for note in notes)
+            assert estimate.calibration is None
+
+
+def test_the_live_estimator_says_so_too_and_takes_known_offsets_off() -> None:
+    """One event when it begins; fixes and depths go in without what is known of their errors."""
+    sim = miscalibrated(duration_s=8.0)
+    vehicle = vehicle_of(asking(sim.mission))
+    vehicle = replace(
+        vehicle,
+        depth_calibration=replace(vehicle.depth_calibration, offset=0.4),
+        gnss_calibration=replace(vehicle.gnss_calibration, time_offset_s=0.2),
+    )
+    smoother = FixedLagSmoother(vehicle)
+    for message in messages_of(sim.mission):
+        smoother.push(message)
+    (event,) = [e for e in smoother.take_events() if e.kind == "not_calibrated"]
+    assert "dvl_scale" in event.text
+    assert "depth_offset" in event.text
+    buffers = Buffers(vehicle)
+    fix, depth = Fix(1.2, 0.5, 0.5, 0.0, (1.0, 1.0, 1.0)), DepthReading(1.0, 2.4)
+    assert buffers.time_of(fix) == pytest.approx(1.0)
+    assert buffers.time_of(depth) == 1.0
+    assert buffers.add(depth)
+    assert buffers.depths.all[0, 1] == pytest.approx(2.0)

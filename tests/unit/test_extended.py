@@ -1,0 +1,161 @@
+"""A problem with extra variables: rows against GTSAM's, linear graph against cost, walks."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ssm_graph.data import Array
+from ssm_graph.graph.extended import ExtendedLinearizer
+from ssm_graph.graph.linearize import GraphLinearizer
+from ssm_graph.graph.states import States, states_from_arrays
+from ssm_graph.problem.extras import Extra, Extras
+from ssm_graph.problem.problem import Problem, build_problem
+from tests.calibration_fixture import asking, exact, miscalibrated
+from tests.helpers import true_states
+
+
+@cache
+def problems() -> tuple[Problem, Problem, States]:
+    """Return a problem with all calibrations, the same with none, and states a little off."""
+    sim = miscalibrated(duration_s=30.0)
+    wide = asking(sim.mission, beam_scale_sigma=0.01, scale_walk_density=1e-4)
+    problem, plain = build_problem(wide), build_problem(exact(sim.mission))
+    truth = true_states(problem, sim)
+    rng = np.random.default_rng(0)
+    off = 0.02 * rng.normal(size=truth.v_n.shape)
+    states = states_from_arrays(
+        truth.R_nb,
+        truth.p_n + off,
+        truth.v_n - off,
+        truth.bias,
+        1e-3 * rng.normal(size=(problem.n_keyframes, problem.extras.n_walks)),
+        0.01 * rng.normal(size=problem.extras.n_constants),
+    )
+    return problem, plain, states
+
+
+def with_small_priors(problem: Problem, sigma: float) -> Problem:
+    """Return the problem with all extra variables as good as known."""
+    blocks = tuple(
+        Extra(block.name, block.labels, np.full_like(block.sigma, sigma), unit=block.unit)
+        for block in problem.extras.blocks
+    )
+    changed = {name: getattr(problem, name) for name in problem.__slots__ if name != "extras"}
+    return Problem(**changed, extras=Extras(blocks))
+
+
+def test_with_everything_known_it_is_gtsams_graph() -> None:
+    """Step, covariance, cost and misfits are those of the chain that GTSAM eliminates."""
+    problem, plain, states = problems()
+    known = with_small_priors(problem, 1e-7)
+    states = states._replace(
+        walks=np.zeros((known.n_keyframes, 0)), constants=np.zeros(known.extras.n_constants)
+    )
+    ours, theirs = ExtendedLinearizer(known), GraphLinearizer(plain)
+    weights = np.random.default_rng(1).uniform(0.1, 1.0, size=len(plain.beams.speed))
+    found: list[tuple[Any, ...]] = []
+    linearizer: Any
+    for linearizer in (ours, theirs):
+        linearizer.follow(states)
+        rows = linearizer.beam_rows(states)
+        step = linearizer.solve(states, rows, weights)
+        _, update = linearizer.retract(states, step.delta)
+        cost = linearizer.cost(states, rows, weights)
+        variance = step.variance(plain.beams.keyframe, rows.jacobian)
+        found.append((step.covariance, cost, variance, linearizer.misfits(states), update))
+    (P, cost, variance, misfits, update), (P_2, cost_2, variance_2, misfits_2, update_2) = found
+    sigma = np.sqrt(np.diagonal(P_2, axis1=1, axis2=2))
+    scale = sigma[:, :, None] * sigma[:, None, :]
+    np.testing.assert_allclose(P / scale, P_2 / scale, atol=1e-6)
+    states_step = update[: update_2.size].reshape(update_2.shape)
+    np.testing.assert_allclose(states_step / sigma, update_2 / sigma, atol=1e-4)
+    np.testing.assert_allclose(variance, variance_2, rtol=1e-6)
+    assert cost == pytest.approx(cost_2, rel=1e-9)
+    assert misfits.keys() == misfits_2.keys() == {"GNSS", "depth", "inertial"}
+    for name, misfit in misfits.items():
+        assert misfit.sum_sq == pytest.approx(misfits_2[name].sum_sq, rel=1e-9)
+        assert misfit[1:] == misfits_2[name][1:]
+
+
+def along(linearizer: ExtendedLinearizer, states: States, direction: Array) -> tuple[float, float]:
+    """Return slope and curvature of the cost along a direction of all variables."""
+    problem = linearizer.problem
+    n = problem.extras.state_dim
+    end = n * problem.n_keyframes
+    delta = (direction[:end].reshape(-1, n), direction[end:])
+    weights = np.ones(len(problem.beams.speed))
+
+    def cost(scale: float) -> float:
+        moved, _ = linearizer.retract(states, delta, scale=scale)
+        return linearizer.cost(moved, linearizer.beam_rows(moved), weights)
+
+    ends = cost(1.0), cost(0.0), cost(-1.0)
+    return 0.5 * (ends[0] - ends[2]), ends[0] - 2.0 * ends[1] + ends[2]
+
+
+def test_the_linear_graph_is_the_derivative_of_the_cost() -> None:
+    """Where its step comes to nothing the cost has no slope, along any kind of variable.
+
+    A wrong Jacobian would settle elsewhere. That of the DVL's clock takes the acceleration as the
+    mean over the ping window, and settles within a hundredth of a sigma.
+    """
+    problem, _, states = problems()
+    linearizer = ExtendedLinearizer(problem)
+    linearizer.follow(states)
+    moved, weights = states, np.ones(len(problem.beams.speed))
+    for _ in range(6):
+        step = linearizer.solve(moved, linearizer.beam_rows(moved), weights)
+        moved, _ = linearizer.retract(moved, step.delta)
+    P = step.solution.constants_cov
+    labels = [label for block in problem.extras.blocks for label in block.labels]
+    for i, label in enumerate(labels[problem.extras.n_walks :]):
+        direction = np.zeros(len(step.sigma))
+        direction[len(direction) - len(P) + i] = 0.1 * np.sqrt(P[i, i])
+        slope, curvature = along(linearizer, moved, direction)
+        allowed = 1e-2 if label == "dvl_time_offset_s" else 1e-4
+        assert abs(slope) < allowed * np.sqrt(curvature), label
+    n = problem.extras.state_dim
+    for k, j in [(3, 0), (10, 7), (20, 12), (5, n - 1), (29, n - 1), (0, n - 1)]:
+        direction = np.zeros(len(step.sigma))
+        direction[n * k + j] = 0.1 * step.sigma[n * k + j]
+        slope, curvature = along(linearizer, moved, direction)
+        assert abs(slope) < 1e-3 * np.sqrt(curvature)
+
+
+def test_walks_forget_and_grow() -> None:
+    """A Gauss-Markov walk comes to its stationary sigma, a random walk grows with the root."""
+    sigma = np.ones(2)
+    extras = Extras(
+        (
+            Extra("fix", ("fix",), np.ones(1)),
+            Extra("slow", ("a", "b"), sigma, walk_density=0.1),
+            Extra("current", ("e", "n"), sigma, walk_density=0.2, correlation_s=50.0),
+        )
+    )
+    assert (extras.n_walks, extras.n_constants, extras.width) == (4, 1, 20)
+    assert extras.columns("slow") == slice(15, 17)
+    assert extras.columns("fix") == slice(19, 20)
+    factor, grown = extras.transitions(np.array([1.0, 100.0, 1e6]))
+    np.testing.assert_allclose(factor[:, :2], 1.0)
+    np.testing.assert_allclose(grown[:, 0], 0.1 * np.sqrt([1.0, 100.0, 1e6]))
+    np.testing.assert_allclose(factor[:, 2], np.exp(-np.array([1.0, 100.0, 1e6]) / 50.0))
+    np.testing.assert_allclose(grown[-1, 2], 0.2 * np.sqrt(25.0))
+    np.testing.assert_allclose(grown[0, 2], 0.2, rtol=0.02)
+
+
+def test_values_are_found_by_name() -> None:
+    """Walks for every row, constants for all, a default for what there is not."""
+    extras = Extras(
+        (Extra("arm", ("x", "y"), np.ones(2)), Extra("w", ("w",), np.ones(1), walk_density=1.0))
+    )
+    walks, constants = np.array([[1.0], [2.0]]), np.array([3.0, 4.0])
+    zero = np.zeros(1)
+    np.testing.assert_array_equal(extras.value("w", walks, constants, default=zero), walks)
+    np.testing.assert_array_equal(extras.value("arm", walks, constants, default=zero), [3, 4])
+    assert extras.value("other", walks, constants, default=zero) is zero
+    assert "other" not in extras
+    assert not Extras()
