@@ -9,7 +9,7 @@ import numpy as np
 
 from ssm_graph.data import Array
 from ssm_graph.online.reserve import Kept
-from ssm_graph.online.watch import Contradicted, Watch
+from ssm_graph.online.watch import FEW, TORN_PINGS, Contradicted, Watch
 from ssm_graph.problem.doubts import TRUSTED
 from ssm_graph.problem.error_state import POSITION, ROTATION, VELOCITY, InitialMoments
 from ssm_graph.smoothers.keyframe import Keyframe
@@ -81,6 +81,12 @@ def doubt_of(watch: Watch, sigma: Array, keyframe: Keyframe) -> Doubt | None:
         if watch.begun_anew_s < watch.out_since_s:
             reason = f"no beam of {watch.pings_out} pings in a row agrees with the velocity"
             return Doubt(Doubted.ANSWER, reason)
+    if watch.pings_torn >= TORN_PINGS and watch.begun_anew_s < watch.torn_since_s:
+        return Doubt(
+            Doubted.ANSWER,
+            f"{watch.pings_torn} pings in a row, whose beams agree with each other, contradict the "
+            "answer in part",
+        )
     few_s = keyframe.time_s - watch.few_since_s
     if len(keyframe.beams.speed) > 2 and few_s > LONGEST_FEW_S:
         return Doubt(
@@ -122,11 +128,12 @@ def watch_after(was: Watch, begun: Window, last: Stretch, doubt: Doubt) -> Watch
     is_aided = bool(np.any(newest.weight >= TRUSTED))
     contradicted, moved = was.contradicted, was.moved
     if doubt.what in (Doubted.POSITION, Doubted.HEIGHT):
+        reckoned_n = last.states.p_n[0] + last.states.v_n[0] * (time_s - last.time_s[0])
         contradicted = Contradicted(
             time_s,
             f"since {time_s:.0f} s: {doubt.reason} of dead reckoning, and it follows them; one of "
             "the two is wrong",
-            tuple(last.states.p_n[0].tolist()),
+            tuple(reckoned_n.tolist()),
             float(np.sqrt(np.trace(last.covariance[0, POSITION, POSITION]))),
         )
     if doubt.what is Doubted.POSITION:
@@ -135,8 +142,9 @@ def watch_after(was: Watch, begun: Window, last: Stretch, doubt: Doubt) -> Watch
         last_beam_s=time_s if is_aided else was.last_beam_s,
         depths_refused=refusals + (refusals == LOCKED_OUT_DEPTHS),
         out_since_s=np.inf if is_aided else was.out_since_s,
+        torn_since_s=was.torn_since_s,
         force=was.force,
-        good_share=0.0,
+        good_share=0.8 * FEW,  # it has to prove itself
         trouble_s=time_s,
         trouble=doubt.reason,
         begun_anew_s=time_s,

@@ -64,6 +64,8 @@ class Watch(NamedTuple):
     """Pings in a row of which no beam agrees with the prediction"""
     pings_torn: int = 0
     """Pings in a row that agree with themselves and of which two beams or more are left out"""
+    torn_since_s: float = math.inf
+    """Since when such pings have come, s, also if the answer was begun anew meanwhile"""
     out_since_s: float = math.inf
     """Since when no beam has agreed, s, also if the answer was begun anew meanwhile"""
     fixes_refused: int = 0
@@ -133,7 +135,7 @@ def observe(
     if len(keyframe.depth):
         watch = watch._replace(depths_refused=watch.depths_refused + 1 if no_depth else 0)
     if watch.contradicted is not None:
-        watch = watch._replace(contradicted=_still(watch.contradicted, newest, time_s - last_s))
+        watch = watch._replace(contradicted=_still(watch.contradicted, window))
     trouble = _trouble(watch, time_s, newest.states.v_n[0])
     if gap_s > GAP_S and not trouble:
         trouble = f"{gap_s:.1f} s of inertial data are missing: what was guessed has to prove right"
@@ -148,7 +150,7 @@ def _with_beams(watch: Watch, newest: Stretch, share: float, *, parity: bool) ->
     counted = newest.weight >= TRUSTED
     trusted = newest.mahalanobis_sq[counted]
     n_out = int(np.sum(newest.weight < LOW_WEIGHT))
-    is_out = n_out == len(newest.weight) > 2
+    is_out, is_torn = n_out == len(newest.weight) > 2, n_out > 1 and parity
     weights = [math.nan] * N_BEAMS
     for beam, weight in zip(newest.beam.astype(int), newest.weight, strict=True):
         weights[beam] = float(weight)
@@ -156,7 +158,8 @@ def _with_beams(watch: Watch, newest: Stretch, share: float, *, parity: bool) ->
         last_beam_s=time_s if counted.any() else watch.last_beam_s,
         pings_refused=watch.pings_refused + 1 if is_out and parity else 0,
         pings_out=watch.pings_out + 1 if is_out else 0,
-        pings_torn=watch.pings_torn + 1 if n_out > 1 and parity else 0,
+        pings_torn=watch.pings_torn + 1 if is_torn else 0,
+        torn_since_s=min(watch.torn_since_s, time_s) if is_torn else math.inf,
         out_since_s=min(watch.out_since_s, time_s) if is_out else math.inf,
         good_share=watch.good_share + share * (float(counted.mean()) - watch.good_share),
         beam_weights=tuple(weights),
@@ -171,9 +174,10 @@ def is_sound(watch: Watch, time_s: float) -> bool:
     return time_s - max(watch.trouble_s, watch.begun_anew_s) > PROBATION_S
 
 
-def _still(was: Contradicted, newest: Stretch, span_s: float) -> Contradicted | None:
+def _still(was: Contradicted, window: Window) -> Contradicted | None:
     """Return the contradiction after one more keyframe, None once the position has come back."""
-    reckoned_n = np.add(was.reckoned_n, newest.states.v_n[0] * span_s)
+    newest, path_n = window.newest, window.states.p_n
+    reckoned_n = np.add(was.reckoned_n, path_n[-1] - path_n[max(len(path_n) - 2, 0)])
     since_s = float(newest.time_s[0]) - was.since_s
     if since_s > CONTRADICTED_S:
         return None
