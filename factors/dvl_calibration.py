@@ -15,27 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import so3
-from factors.dvl_beam import beam_error, beam_residual
+from factors.dvl_beam import beam_error
 from factors.so3 import cross
 
 Array = NDArray[np.float64]
 
 
-class Miscalibration(NamedTuple):
-    """How an instrument differs from what is stated; leading axes broadcast with the beams."""
-
-    mounting: Array
-    """(..., 3) rotation vector, instrument axes, rad: truly ``R_bd Exp(mounting)``."""
-    scale: Array
-    """(...) speeds are read ``1 + scale`` too large."""
-    lever_arm_b: Array
-    """(..., 3) m, to be added to the stated lever arm."""
-    time_offset: Array
-    """(...) s; positive when stamps are late: the speed belongs to so much before the keyframe."""
-
-
 class Motion(NamedTuple):
-    """What the inertial sensors read before and at the ping; zeros where no clock is in doubt."""
+    """What the inertial sensors read before and at a ping."""
 
     turn_b: Array
     """(..., 3) rad, rotation from the ping to the keyframe, by the gyros."""
@@ -48,6 +35,76 @@ class Motion(NamedTuple):
     """(..., 3) m/s^2, at the ping."""
     gyro_rate_b: Array
     """(..., 3) rad/s^2, at the ping."""
+
+
+class Back(NamedTuple):
+    """How the state at a ping follows from that at its keyframe; leading axes broadcast."""
+
+    time_offset: Array
+    """(...) s; positive when stamps are late: the ping is so much before the keyframe."""
+    R_back: Array
+    """(..., 3, 3) body at the ping to body at the keyframe."""
+    J_back: Array
+    """(..., 3, 3) its turn with respect to that of the gyro bias."""
+    gain_b: Array
+    """(..., 3) m/s, by specific force, along the body axes at the keyframe."""
+    motion: Motion
+
+
+class Instrument(NamedTuple):
+    """A DVL as it is mounted, its error taken in."""
+
+    beam_b: Array
+    """(..., 3) beam direction, body axes; longer than one by a known scale error."""
+    turn_D_mounting: Array
+    """(3, 3) how it turns in the body with the mounting error."""
+    lever_arm_b: Array
+    """(3,) m, body origin to DVL."""
+
+
+def led_back(motion: Motion, bias: Array, time_offset: Array) -> Back:
+    """Return the way back from keyframe to ping for a time offset and the biases at hand.
+
+    ::
+
+        R_nb(t - tau) = R_nb Exp(-(turn_b - tau gyro_bias))
+        v_n(t - tau)  = v_n - R_nb (gain_b - tau accel_bias) - tau g_n
+
+    The turn of the Earth within ``tau`` is left out: 1e-5 m/s at 0.1 s and 1.5 m/s.
+
+    Parameters
+    ----------
+    motion : inertial readings of the pings (...) for this offset.
+    bias : (..., 6) accelerometer bias, m/s^2, and gyro bias, rad/s.
+    time_offset : tau, s.
+    """
+    tau = np.asarray(time_offset)[..., None]
+    turn = motion.turn_b - tau * bias[..., 3:]
+    gain = motion.gain_b - tau * bias[..., :3]
+    return Back(time_offset, so3.exp(-turn), so3.left_jacobian(-turn), gain, motion)
+
+
+def no_way_back(gyro_b: Array) -> Back:
+    """Return that of a ping at its keyframe, with the gyro reading (..., 3) there."""
+    still, same = np.zeros(3), np.eye(3)
+    return Back(np.zeros(()), same, same, still, Motion(still, still, gyro_b, still, still))
+
+
+def turned_instrument(
+    mounting: Array, beam_b: Array, *, R_bd: Array, lever_arm_b: Array
+) -> Instrument:
+    """Return the instrument with its mounting error: ``beam_b' = R_bd Exp(mounting) R_bd' beam_b``.
+
+    Parameters
+    ----------
+    mounting : (3,) rotation vector, instrument axes, rad: truly ``R_bd Exp(mounting)``.
+    beam_b : (..., 3) beam directions as stated, body axes.
+    R_bd : (3, 3) mounting as stated, instrument to body.
+    lever_arm_b : (3,) m, with its error.
+    """
+    mounting_b = R_bd @ mounting
+    beam = beam_b @ so3.exp(mounting_b).T
+    return Instrument(beam, so3.left_jacobian(mounting_b) @ R_bd, lever_arm_b)
 
 
 class CalibratedResidual(NamedTuple):
@@ -78,76 +135,58 @@ def calibrated_beam_residual(
     v_n: Array,
     bias: Array,
     *,
-    off: Miscalibration,
-    motion: Motion,
+    instrument: Instrument,
+    scale: Array,
+    back: Back,
     speed: Array,
-    beam_b: Array,
-    R_bd: Array,
-    lever_arm_b: Array,
     omega_ie_n: Array,
     g_n: Array,
 ) -> CalibratedResidual:
     """Return residuals of DVL beams with Jacobians of state and calibration.
 
-    With the time offset ``tau``, the state at the ping follows from that at the keyframe by what
-    the inertial sensors read in between::
+    With all states at the ping, see :func:`led_back`, and the instrument as it is mounted::
 
-        R_nb(t - tau) = R_nb Exp(-(turn_b - tau gyro_bias))
-        v_n(t - tau)  = v_n - R_nb (gain_b - tau accel_bias) - tau g_n
-
-    and with ``beam_b' = R_bd Exp(mounting) R_bd' beam_b`` and the lever arm with its error::
-
-        error = (1 + scale) beam_b' . (R_nb' v_n + omega_eb_b x lever') - speed,  all at t - tau
-
-    The turn of the Earth within ``tau`` is left out: 1e-5 m/s at 0.1 s and 1.5 m/s.
+        error = (1 + scale) beam_b . (R_nb' v_n + omega_eb_b x lever_arm_b) - speed
 
     Parameters
     ----------
     R_nb : (..., 3, 3) rotation, body to navigation, at the keyframe.
     v_n : (..., 3) velocity of the body origin over ground, m/s, at the keyframe.
     bias : (..., 6) accelerometer bias, m/s^2, and gyro bias, rad/s.
-    off : the calibration.
-    motion : inertial readings before and at the ping, for the ``tau`` of ``off``.
+    instrument : from :func:`turned_instrument`.
+    scale : (...) speeds are read ``1 + scale`` too large.
+    back : from :func:`led_back` for these biases.
     speed : (...) measured beam speed, m/s, positive when the instrument moves along the beam.
-    beam_b : (..., 3) beam direction as stated, body axes; longer than one by a known scale error.
-    R_bd : (3, 3) mounting as stated, instrument to body.
-    lever_arm_b : (3,) body origin to DVL as stated, m.
     omega_ie_n : (3,) Earth rate, rad/s.
     g_n : (..., 3) gravity, m/s^2; it counts only with a time offset.
     """
-    then = _state_then(R_nb, v_n, bias, off.time_offset, motion, g_n)
-    lever = lever_arm_b + off.lever_arm_b
-    mounting_b = off.mounting @ R_bd.T
-    beam = _times(so3.exp(mounting_b), beam_b)
-    at_ping = beam_residual(
-        then.R_nb,
-        then.v_n,
-        bias[..., 3:],
-        speed=np.zeros_like(speed),
-        gyro_b=motion.gyro_b,
-        beam_b=beam,
-        lever_arm_b=lever,
-        omega_ie_n=omega_ie_n,
-    )
-    D_phi, D_v = at_ping.error_D_rotation, at_ping.error_D_velocity_n
-    D_gyro_bias = at_ping.error_D_gyro_bias
-    omega_eb = then.omega_b - _times(_T(then.R_nb), omega_ie_n)
-    at_instrument = _times(_T(then.R_nb), then.v_n) + cross(omega_eb, lever)
-    D_gain = _times(_T(R_nb), D_v)
-    D_late = (D_gyro_bias * motion.gyro_rate_b - D_phi * then.omega_b - D_v * then.a_n).sum(axis=-1)
-    turned_back = so3.left_jacobian_times(-then.turn, D_phi)
-    tau = np.asarray(off.time_offset)[..., None]
-    gain_1 = np.asarray(1.0 + off.scale)
+    beam, turn_D_mounting, lever = instrument
+    tau, R_back, J_back, gain, motion = back
+    tau = np.asarray(tau)[..., None]
+    R_then = R_nb @ R_back
+    v_then = v_n - _times(R_nb, gain) - tau * g_n
+    R_then_T = _T(R_then)
+    omega_ib = motion.gyro_b - bias[..., 3:]
+    omega_eb = omega_ib - _times(R_then_T, omega_ie_n)
+    at_instrument = _times(R_then_T, v_then) + cross(omega_eb, lever)
+    predicted = (beam * at_instrument).sum(axis=-1)
+    arm = cross(lever, beam)
+    # With respect to the attitude then: of the velocity, and of the Earth rate in omega_eb.
+    D_phi = cross(beam, at_instrument - cross(omega_eb, lever)) - cross(arm, omega_ib - omega_eb)
+    D_v_b = _times(R_back, beam)
+    D_phi_now = _times(R_back, D_phi)
+    a_then_b = motion.accel_b + _times(R_then_T, g_n - _times(R_nb, bias[..., :3]))
+    D_late = -(D_phi * omega_ib + beam * a_then_b + arm * motion.gyro_rate_b).sum(axis=-1)
+    gain_1 = np.asarray(1.0 + scale)
     gain_3 = gain_1[..., None]
-    D_mounting_b = _times(_T(so3.left_jacobian(mounting_b)), cross(beam, at_instrument))
     return CalibratedResidual(
-        error=gain_1 * at_ping.error - speed,
-        error_D_rotation=gain_3 * (_times(then.R_back, D_phi) + cross(D_gain, then.gain)),
-        error_D_velocity_n=gain_3 * D_v,
-        error_D_accel_bias=gain_3 * tau * D_gain,
-        error_D_gyro_bias=gain_3 * (D_gyro_bias + tau * turned_back),
-        error_D_mounting=gain_3 * (D_mounting_b @ R_bd),
-        error_D_scale=at_ping.error,
+        error=gain_1 * predicted - speed,
+        error_D_rotation=gain_3 * (D_phi_now + cross(D_v_b, gain)),
+        error_D_velocity_n=gain_3 * _times(R_nb, D_v_b),
+        error_D_accel_bias=gain_3 * tau * D_v_b,
+        error_D_gyro_bias=gain_3 * (tau * _times(J_back, D_phi) - arm),
+        error_D_mounting=gain_3 * (cross(beam, at_instrument) @ turn_D_mounting),
+        error_D_scale=predicted,
         error_D_lever_arm_b=gain_3 * cross(beam, omega_eb),
         error_D_time_offset=gain_1 * D_late,
     )
@@ -158,64 +197,26 @@ def calibrated_beam_error(
     v_n: Array,
     bias: Array,
     *,
-    off: Miscalibration,
-    motion: Motion,
+    instrument: Instrument,
+    scale: Array,
+    back: Back,
     speed: Array,
-    beam_b: Array,
-    R_bd: Array,
-    lever_arm_b: Array,
     omega_ie_n: Array,
     g_n: Array,
 ) -> Array:
     """Return predicted minus measured speed, m/s; see :func:`calibrated_beam_residual`."""
-    then = _state_then(R_nb, v_n, bias, off.time_offset, motion, g_n)
+    R_then = R_nb @ back.R_back
     predicted = beam_error(
-        then.R_nb,
-        then.v_n,
+        R_then,
+        v_n - _times(R_nb, back.gain_b) - np.asarray(back.time_offset)[..., None] * g_n,
         bias[..., 3:],
         speed=np.zeros_like(speed),
-        gyro_b=motion.gyro_b,
-        beam_b=_times(so3.exp(off.mounting @ R_bd.T), beam_b),
-        lever_arm_b=lever_arm_b + off.lever_arm_b,
+        gyro_b=back.motion.gyro_b,
+        beam_b=instrument.beam_b,
+        lever_arm_b=instrument.lever_arm_b,
         omega_ie_n=omega_ie_n,
     )
-    return np.asarray((1.0 + off.scale) * predicted - speed)
-
-
-class _Then(NamedTuple):
-    """The state when a ping was taken, and what leads there from its keyframe."""
-
-    R_nb: Array
-    v_n: Array
-    a_n: Array
-    """(..., 3) m/s^2"""
-    omega_b: Array
-    """(..., 3) rad/s, relative to inertial space"""
-    R_back: Array
-    """(..., 3, 3) body at the ping to body at the keyframe"""
-    turn: Array
-    """(..., 3) rad, and m/s below, less what the biases make of them"""
-    gain: Array
-
-
-def _state_then(
-    R_nb: Array, v_n: Array, bias: Array, time_offset: Array, motion: Motion, g_n: Array
-) -> _Then:
-    tau = np.asarray(time_offset)[..., None]
-    accel_bias, gyro_bias = bias[..., :3], bias[..., 3:]
-    turn = motion.turn_b - tau * gyro_bias
-    gain = motion.gain_b - tau * accel_bias
-    R_back = so3.exp(-turn)
-    R_then = R_nb @ R_back
-    return _Then(
-        R_nb=R_then,
-        v_n=v_n - _times(R_nb, gain) - tau * g_n,
-        a_n=_times(R_then, motion.accel_b) - _times(R_nb, accel_bias) + g_n,
-        omega_b=motion.gyro_b - gyro_bias,
-        R_back=R_back,
-        turn=turn,
-        gain=gain,
-    )
+    return np.asarray((1.0 + scale) * predicted - speed)
 
 
 def calibrated_beam_factor(
@@ -228,7 +229,11 @@ def calibrated_beam_factor(
     motion: Callable[[float], Motion],
     sigma: float,
     speed: float,
-    **stated: Array,
+    beam_b: Array,
+    R_bd: Array,
+    lever_arm_b: Array,
+    omega_ie_n: Array,
+    g_n: Array,
 ) -> gtsam.CustomFactor:
     """Wrap :func:`calibrated_beam_residual` as a factor for anyone's own graph.
 
@@ -238,8 +243,8 @@ def calibrated_beam_factor(
     mounting, scale, lever_arm, time_offset : keys of vectors of 3, 1, 3 and 1.
     motion : the inertial readings of the ping for a time offset.
     sigma : standard deviation of the speed, m/s.
-    speed : measured, m/s.
-    stated : the other arguments of :func:`calibrated_beam_residual`, for one beam.
+    speed, omega_ie_n, g_n : as in :func:`calibrated_beam_residual`, for one beam.
+    beam_b, R_bd, lever_arm_b : as stated.
     """
 
     def evaluate(
@@ -253,25 +258,35 @@ def calibrated_beam_factor(
             values.atConstantBias(bias).vector(),
         )
         how: dict[str, Any] = {
-            "off": Miscalibration(mounting_at, scale_at[0], arm_at, late[0]),
-            "motion": motion(float(late[0])),
+            "instrument": turned_instrument(
+                mounting_at, beam_b, R_bd=R_bd, lever_arm_b=lever_arm_b + arm_at
+            ),
+            "scale": scale_at[0],
+            "back": led_back(motion(float(late[0])), at[2], late[0]),
             "speed": np.float64(speed),
-            **stated,
+            "omega_ie_n": omega_ie_n,
+            "g_n": g_n,
         }
         if jacobians is None:
             return np.atleast_1d(calibrated_beam_error(*at, **how))
         residual = calibrated_beam_residual(*at, **how)
-        # Pose3 tangent: [rotation, translation]; ConstantBias: [accelerometer, gyroscope].
-        jacobians[0] = np.hstack([residual.error_D_rotation, np.zeros(3)])[None, :]
-        jacobians[1] = residual.error_D_velocity_n[None, :].copy()
-        biases = [residual.error_D_accel_bias, residual.error_D_gyro_bias]
-        jacobians[2] = np.hstack(biases)[None, :]
-        for i, block in enumerate(residual[5:], start=3):
-            jacobians[i] = np.reshape(block, (1, -1)).copy()
+        for i, block in enumerate(_blocks(residual)):
+            jacobians[i] = block
         return np.atleast_1d(residual.error)
 
     keys = [*state, mounting, scale, lever_arm, time_offset]
     return gtsam.CustomFactor(gtsam.noiseModel.Isotropic.Sigma(1, sigma), keys, evaluate)
+
+
+def _blocks(residual: CalibratedResidual) -> list[Array]:
+    """Return the Jacobians of one beam in GTSAM's tangent spaces, in the order of the keys.
+
+    ``Pose3``: [rotation, translation]; ``ConstantBias``: [accelerometer, gyroscope].
+    """
+    biases = np.hstack([residual.error_D_accel_bias, residual.error_D_gyro_bias])
+    pose = np.hstack([residual.error_D_rotation, np.zeros(3)])
+    blocks = [pose, residual.error_D_velocity_n, biases, *residual[5:]]
+    return [np.reshape(block, (1, -1)).copy() for block in blocks]
 
 
 def _times(matrix: Array, vector: Array) -> Array:

@@ -21,7 +21,6 @@ from ssm_graph.graph.interfaces import BeamRows, Misfit
 from ssm_graph.graph.linearize import inertial_graph, misfit_of
 from ssm_graph.graph.marginal_prior import prior_at_start
 from ssm_graph.graph.states import States
-from ssm_graph.problem.calibration import DVL_TIME_OFFSET
 from ssm_graph.problem.error_state import STATE_DIM
 from ssm_graph.problem.problem import Problem, start_of
 
@@ -85,16 +84,9 @@ class ExtendedLinearizer:
 
     def beam_rows(self, states: States) -> BeamRows:
         """Linearise all beams at ``states``."""
-        extras, motion, late_s = self.problem.extras, None, 0.0
-        if DVL_TIME_OFFSET in extras:
-            offset = extras.value(
-                DVL_TIME_OFFSET, states.walks, states.constants, default=np.zeros(1)
-            )
-            late_s = float(offset[0])
-            motion = self._beams.motion(late_s)
+        prepared = self._beams.prepare(states.walks, states.constants, states.bias)
         g_n = self.problem.frame.g_n_at(states.p_n)
-        at = states_of(states, self.problem.beams.keyframe, g_n=g_n)
-        return self._beams.rows(at, motion=motion, motion_late_s=late_s)
+        return self._beams.rows(states_of(states, self.problem.beams.keyframe, g_n=g_n), prepared)
 
     def solve(self, states: States, beam_rows: BeamRows, weights: Array) -> ExtendedStep:
         """Return the step at ``states``, with their beam rows and weights (M,)."""

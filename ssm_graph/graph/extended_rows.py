@@ -12,9 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.depth_height import height_residual
-from factors.dvl_calibration import Miscalibration, Motion, calibrated_beam_residual
+from factors.dvl_calibration import (
+    Back,
+    Instrument,
+    Motion,
+    calibrated_beam_residual,
+    led_back,
+    no_way_back,
+    turned_instrument,
+)
 from factors.gnss_position import fix_residual
-from ssm_graph.data import Array
+from ssm_graph.data import N_BEAMS, Array
 from ssm_graph.graph.depth import DepthTargets, depth_targets
 from ssm_graph.graph.interfaces import BeamRows
 from ssm_graph.graph.states import States
@@ -33,6 +41,7 @@ from ssm_graph.problem.error_state import (
     GYRO_BIAS,
     POSITION,
     ROTATION,
+    STATE_DIM,
     VELOCITY,
 )
 from ssm_graph.problem.extras import Extras
@@ -62,48 +71,66 @@ def states_of(states: States, keyframe: NDArray[np.intp], *, g_n: Array) -> RowS
     return RowStates(R_nb, p_n, v_n, bias, walks, states.constants, gravity)
 
 
+class PreparedBeams(NamedTuple):
+    """What all beams of a problem share, made for one set of calibrations and biases."""
+
+    instrument: Instrument
+    """(M, ...)"""
+    back: Back | None
+    """(P, ...) of the pings; None where the clock is not in doubt"""
+    mounting: Array
+    time_offset: Array
+    bias: Array | None
+    """(6,) of all pings; None where each has that of its keyframe"""
+
+
 class ExtendedBeams:
     """Beam speeds of a problem whose DVL is to be calibrated."""
 
     def __init__(self, beams: Beams, extras: Extras, omega_ie_n: Array) -> None:
         self._beams, self._extras, self._omega_ie_n = beams, extras, omega_ie_n
+        self._ping_keyframe = beams.keyframe[np.flatnonzero(np.diff(beams.ping, prepend=-1))]
 
-    def motion(self, late_s: float) -> Motion:
-        """Return the inertial readings at the pings (P, ...) if they were so much earlier."""
-        assert self._beams.motion is not None
-        return self._beams.motion.at(late_s)
+    def prepare(self, walks: Array, constants: Array, bias: Array) -> PreparedBeams:
+        """Return what beams share; ``bias`` is (K, 6) of the keyframes, or (6,) of all."""
+        beams, extras = self._beams, self._extras
+        mounting, late_s = self.instrument_of(walks, constants)
+        back, motion = None, beams.motion
+        if DVL_TIME_OFFSET in extras and motion is not None:
+            of_ping = bias if bias.ndim == 1 else bias[self._ping_keyframe]
+            back = led_back(motion.at(float(late_s)), of_ping, late_s)
+        instrument = turned_instrument(
+            mounting, beams.beam_b, R_bd=beams.R_bd, lever_arm_b=beams.lever_arm_b
+        )
+        return PreparedBeams(instrument, back, mounting, late_s, bias if bias.ndim == 1 else None)
 
-    def rows(
-        self, at: RowStates, rows: Rows = np.s_[:], *, motion: Motion | None, motion_late_s: float
-    ) -> BeamRows:
-        """Linearise beams.
+    def instrument_of(self, walks: Array, constants: Array) -> tuple[Array, Array]:
+        """Return mounting (3,) and time offset (): what it takes long to prepare for."""
+        mounting = self._value(DVL_MOUNTING, walks, constants, 3)
+        return mounting, self._value(DVL_TIME_OFFSET, walks, constants, 1)[0]
 
-        Parameters
-        ----------
-        at : their states.
-        rows : which beams.
-        motion : of :meth:`motion`, None where the clock is not in doubt.
-        motion_late_s : the time offset it was made for; what the estimate differs from it counts
-            to first order.
+    def rows(self, at: RowStates, prepared: PreparedBeams, rows: Rows = np.s_[:]) -> BeamRows:
+        """Linearise beams at their states.
+
+        Where they are prepared for other values of mounting, clock and biases, what these differ
+        counts to first order.
         """
         beams, extras = self._beams, self._extras
-        off = self._miscalibration(at, beams.beam[rows])
-        late_s = float(off.time_offset)
-        if motion is None:
-            still = np.zeros(3)
-            motion = Motion(still, still, beams.gyro_b[rows], still, still)
-        else:
-            motion = Motion(*(column[beams.ping[rows]] for column in motion))
+        back = no_way_back(beams.gyro_b[rows])
+        if prepared.back is not None:
+            back = _of_pings(prepared.back, beams.ping[rows])
+        lever = self._value(DVL_LEVER_ARM, at.walks, at.constants, 3)
+        instrument = prepared.instrument
         residual = calibrated_beam_residual(
             at.R_nb,
             at.v_n,
-            at.bias,
-            off=off._replace(time_offset=np.asarray(motion_late_s)),
-            motion=motion,
+            at.bias if prepared.bias is None else prepared.bias,
+            instrument=instrument._replace(
+                beam_b=instrument.beam_b[rows], lever_arm_b=instrument.lever_arm_b + lever
+            ),
+            scale=self._scale(at, beams.beam[rows]),
+            back=back,
             speed=beams.speed[rows],
-            beam_b=beams.beam_b[rows],
-            R_bd=beams.R_bd,
-            lever_arm_b=beams.lever_arm_b,
             omega_ie_n=self._omega_ie_n,
             g_n=at.g_n,
         )
@@ -121,23 +148,41 @@ class ExtendedBeams:
             if name in extras:
                 jacobian[:, extras.columns(name)] = block
         if DVL_BEAM_SCALE in extras:
-            own = np.arange(len(jacobian))
             first = extras.columns(DVL_BEAM_SCALE).start
-            jacobian[own, first + beams.beam[rows]] = residual.error_D_scale
-        error = residual.error + residual.error_D_time_offset * (late_s - motion_late_s)
-        return BeamRows(error, jacobian)
+            jacobian[np.arange(len(jacobian)), first + beams.beam[rows]] = residual.error_D_scale
+        if prepared.bias is None:
+            return BeamRows(residual.error, jacobian)
+        return BeamRows(residual.error + jacobian @ self._since(at, prepared), jacobian)
 
-    def _miscalibration(self, at: RowStates, beam: NDArray[np.intp]) -> Miscalibration:
-        def value(name: str, size: int) -> Array:
-            return self._extras.value(name, at.walks, at.constants, default=np.zeros(size))
+    def _since(self, at: RowStates, prepared: PreparedBeams) -> Array:
+        """Return how far the variables (E,) are from what the beams are prepared for."""
+        extras, since = self._extras, np.zeros(self._extras.width)
+        assert prepared.bias is not None
+        since[STATE_DIM - 6 : STATE_DIM] = at.bias - prepared.bias
+        mounting, late_s = self.instrument_of(at.walks, at.constants)
+        if DVL_MOUNTING in extras:
+            since[extras.columns(DVL_MOUNTING)] = mounting - prepared.mounting
+        if DVL_TIME_OFFSET in extras:
+            since[extras.columns(DVL_TIME_OFFSET)] = late_s - prepared.time_offset
+        return since
 
-        beam_scale = value(DVL_BEAM_SCALE, 4)[beam]
-        return Miscalibration(
-            mounting=value(DVL_MOUNTING, 3),
-            scale=value(DVL_SCALE, 1)[..., 0] + beam_scale,
-            lever_arm_b=value(DVL_LEVER_ARM, 3),
-            time_offset=value(DVL_TIME_OFFSET, 1)[..., 0],
-        )
+    def _scale(self, at: RowStates, beam: NDArray[np.intp]) -> Array:
+        scale = self._value(DVL_SCALE, at.walks, at.constants, 1)[..., 0]
+        return scale + self._value(DVL_BEAM_SCALE, at.walks, at.constants, N_BEAMS)[beam]
+
+    def _value(self, name: str, walks: Array, constants: Array, size: int) -> Array:
+        return self._extras.value(name, walks, constants, default=np.zeros(size))
+
+
+def _of_pings(back: Back, ping: NDArray[np.intp]) -> Back:
+    """Return the way back of each row from that of all pings."""
+    return Back(
+        time_offset=back.time_offset,
+        R_back=back.R_back[ping],
+        J_back=back.J_back[ping],
+        gain_b=back.gain_b[ping],
+        motion=Motion(*(column[ping] for column in back.motion)),
+    )
 
 
 class AidRows(NamedTuple):

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from factors.dvl_calibration import Motion
 from ssm_graph.data import Array
-from ssm_graph.graph.extended_rows import ExtendedBeams, RowStates, fix_rows
+from ssm_graph.graph.extended_rows import ExtendedBeams, PreparedBeams, RowStates, fix_rows
 from ssm_graph.graph.interfaces import BeamRows
-from ssm_graph.problem.calibration import DEPTH_OFFSET, DVL_TIME_OFFSET
+from ssm_graph.problem.calibration import DEPTH_OFFSET
 from ssm_graph.problem.error_state import STATE_DIM
 from ssm_graph.problem.problem import Problem
 
-REACH_S = 2e-3
-"""How far a clock may move before the inertial readings at the pings are looked up anew."""
+REACH_S = 4e-3
+REACH_TURN = 4e-3
+"""How far clock and mounting, rad, may move before the beams are prepared anew; the rest counts to
+first order."""
 
 
 class ForwardExtras:
@@ -25,8 +26,7 @@ class ForwardExtras:
         self.walks, self.constants = np.zeros(extras.n_walks), np.zeros(extras.n_constants)
         self._beams = ExtendedBeams(problem.beams, extras, problem.frame.omega_ie_n)
         self._walk_factor, self._walk_sigma = extras.transitions(np.diff(problem.keyframe_s))
-        self._motion: Motion | None = None
-        self._motion_late_s = 0.0
+        self._last: PreparedBeams | None = None
 
     def begin(self, covariance: Array) -> Array:
         """Return the covariance (E, E) at the start from that of the error state."""
@@ -56,9 +56,7 @@ class ForwardExtras:
     ) -> BeamRows:
         """Linearise the beams of one ping, with the columns of all variables."""
         at = RowStates(*state, self.walks, self.constants, g_n)
-        if DVL_TIME_OFFSET in self._problem.extras:
-            self._look_up()
-        return self._beams.rows(at, rows, motion=self._motion, motion_late_s=self._motion_late_s)
+        return self._beams.rows(at, self._prepared(at.bias), rows)
 
     def fix_rows(
         self, i: int, state: tuple[Array, Array, Array, Array], g_n: Array
@@ -81,10 +79,14 @@ class ForwardExtras:
             innovation += float(value[0])
         return wide, innovation
 
-    def _look_up(self) -> None:
-        offset = self._problem.extras.value(
-            DVL_TIME_OFFSET, self.walks, self.constants, default=np.zeros(1)
-        )
-        late_s = float(offset[0])
-        if self._motion is None or abs(late_s - self._motion_late_s) > REACH_S:
-            self._motion, self._motion_late_s = self._beams.motion(late_s), late_s
+    def _prepared(self, bias: Array) -> PreparedBeams:
+        """Return what beams share, made anew where the instrument has moved too far."""
+        mounting, late_s = self._beams.instrument_of(self.walks, self.constants)
+        last = self._last
+        if (
+            last is None
+            or abs(float(late_s - last.time_offset)) > REACH_S
+            or float(np.abs(mounting - last.mounting).max()) > REACH_TURN
+        ):
+            last = self._last = self._beams.prepare(self.walks, self.constants, bias)
+        return last

@@ -15,11 +15,13 @@ from scipy.spatial.transform import Rotation
 import factors.dvl_calibration
 from factors.dvl_beam import beam_residual
 from factors.dvl_calibration import (
-    Miscalibration,
     Motion,
     calibrated_beam_error,
     calibrated_beam_factor,
     calibrated_beam_residual,
+    led_back,
+    no_way_back,
+    turned_instrument,
 )
 from ssm_graph.data import Array
 from tests.helpers import assert_jacobians_match, rotation
@@ -104,11 +106,18 @@ def test_as_stated_it_is_the_beam_factor() -> None:
     how = stated(rng)
     R_nb, v_n, bias, gyro_b = rotation([0.3, 1.0, 2.0]), *rng.normal(size=(2, 3)), np.ones(3)
     bias = np.concatenate([bias, 0.1 * bias])
-    still = np.zeros(3)
-    off = Miscalibration(np.zeros(3), np.zeros(()), np.zeros(3), np.zeros(()))
-    motion = Motion(still, still, gyro_b, still, still)
     got = calibrated_beam_residual(
-        R_nb, v_n, bias, off=off, motion=motion, speed=np.asarray(0.4), **how
+        R_nb,
+        v_n,
+        bias,
+        instrument=turned_instrument(
+            np.zeros(3), how["beam_b"], R_bd=how["R_bd"], lever_arm_b=how["lever_arm_b"]
+        ),
+        scale=np.zeros(()),
+        back=no_way_back(gyro_b),
+        speed=np.asarray(0.4),
+        omega_ie_n=OMEGA_IE_N,
+        g_n=G_N,
     )
     plain = {name: how[name] for name in ("beam_b", "lever_arm_b", "omega_ie_n")}
     want = beam_residual(R_nb, v_n, bias[3:], speed=np.asarray(0.4), gyro_b=gyro_b, **plain)
@@ -122,43 +131,57 @@ def test_many_beams_at_once_are_the_same_as_one_by_one() -> None:
     rng = np.random.default_rng(2)
     n = 7
     R_nb = Rotation.from_rotvec(rng.normal(size=(n, 3))).as_matrix()
-    v_n, bias, speed = rng.normal(size=(n, 3)), 0.01 * rng.normal(size=(n, 6)), rng.normal(size=n)
-    how = stated(rng) | {"beam_b": rng.normal(size=(n, 3)), "g_n": G_N + rng.normal(size=(n, 3))}
+    v_n, bias = rng.normal(size=(n, 3)), 0.01 * rng.normal(size=(n, 6))
     motion = Motion(*(0.05 * rng.normal(size=(n, 3)) for _ in range(5)))
-    off = Miscalibration(rng.normal(size=3), rng.normal(size=n), np.ones(3), np.asarray(0.1))
-    bulk = calibrated_beam_residual(R_nb, v_n, bias, off=off, motion=motion, speed=speed, **how)
-    for i in range(n):
-        one = calibrated_beam_residual(
+    speed, scale, g_n = rng.normal(size=n), rng.normal(size=n), G_N + rng.normal(size=(n, 3))
+    beam_b, late_s = rng.normal(size=(n, 3)), np.asarray(0.1)
+    R_bd, mounting, lever = stated(rng)["R_bd"], rng.normal(size=3), np.ones(3)
+
+    def residual(i: Any, function: Any) -> Any:
+        return function(
             R_nb[i],
             v_n[i],
             bias[i],
-            off=off._replace(scale=off.scale[i]),
-            motion=Motion(*(column[i] for column in motion)),
+            instrument=turned_instrument(mounting, beam_b[i], R_bd=R_bd, lever_arm_b=lever),
+            scale=scale[i],
+            back=led_back(Motion(*(column[i] for column in motion)), bias[i], late_s),
             speed=speed[i],
-            **(how | {"beam_b": how["beam_b"][i], "g_n": how["g_n"][i]}),
+            omega_ie_n=OMEGA_IE_N,
+            g_n=g_n[i],
         )
-        for got, want in zip(bulk, one, strict=True):
+
+    bulk = residual(np.s_[:], calibrated_beam_residual)
+    for i in range(n):
+        for got, want in zip(bulk, residual(i, calibrated_beam_residual), strict=True):
             np.testing.assert_allclose(got[i], want, rtol=1e-13, atol=1e-13)
-    error = calibrated_beam_error(R_nb, v_n, bias, off=off, motion=motion, speed=speed, **how)
-    np.testing.assert_array_equal(error, bulk.error)
+    error = residual(np.s_[:], calibrated_beam_error)
+    np.testing.assert_allclose(error, bulk.error, rtol=1e-13, atol=1e-13)
 
 
 @pytest.mark.parametrize("late_s", [0.08, -0.3])
 def test_the_state_at_the_ping_is_that_of_the_motion(late_s: float) -> None:
     """Attitude and velocity before a keyframe, integrated here, give the speed without error."""
     rng = np.random.default_rng(3)
-    how = stated(rng) | {"omega_ie_n": np.zeros(3)}
+    how = stated(rng)
     R_nb, v_n = rotation([0.3, -1.1, 0.8]), rng.normal(size=3)
-    motion = motion_before(late_s)
     R_then = R_nb @ rotation(angle(0.0) - angle(-late_s)).T
     change, _ = quad_vec(
         lambda s: R_nb @ rotation(angle(s) - angle(0.0)) @ force(s) + G_N, -late_s, 0.0
     )
     v_then = v_n - change
     speed = how["beam_b"] @ (R_then.T @ v_then + np.cross(rate(-late_s), how["lever_arm_b"]))
-    off = Miscalibration(np.zeros(3), np.zeros(()), np.zeros(3), np.asarray(late_s))
     error = calibrated_beam_error(
-        R_nb, v_n, np.zeros(6), off=off, motion=motion, speed=np.asarray(speed), **how
+        R_nb,
+        v_n,
+        np.zeros(6),
+        instrument=turned_instrument(
+            np.zeros(3), how["beam_b"], R_bd=how["R_bd"], lever_arm_b=how["lever_arm_b"]
+        ),
+        scale=np.zeros(()),
+        back=led_back(motion_before(late_s), np.zeros(6), np.asarray(late_s)),
+        speed=np.asarray(speed),
+        omega_ie_n=np.zeros(3),
+        g_n=G_N,
     )
     assert abs(float(error)) < 1e-9
 
