@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from benchmarks.calibration_cases import AIDS, DVL, as_stated, asking
 from ssm_graph.estimate import Calibration, Determined, Estimate, Status
 from ssm_graph.evaluation import evaluate
 from ssm_graph.filters.named import filter_problems
@@ -20,7 +21,7 @@ from ssm_graph.problem.problem import build_problem
 from ssm_graph.simulation import DepthSettings, DvlSettings, GnssSettings, Grade
 from ssm_graph.smoothers.batch import SsmSmoother
 from ssm_graph.smoothers.fixed_lag import FixedLagConfig, solve_fixed_lag
-from tests.calibration_fixture import TRUTH, asking, exact, miscalibrated
+from tests.calibration_fixture import miscalibrated
 
 
 @cache
@@ -40,8 +41,8 @@ def test_all_errors_are_found_together() -> None:
     estimate = two_minutes()
     assert estimate.status is Status.CONVERGED
     calibration = found(estimate)
-    assert {value.variable for value in calibration.values} == set(TRUTH)
-    for variable, truth in TRUTH.items():
+    assert {value.variable for value in calibration.values} == {*DVL, *AIDS}
+    for variable, truth in (DVL | AIDS).items():
         own = [value for value in calibration.values if value.variable == variable]
         sigma = np.array([value.sigma for value in own])
         assert np.all(np.abs(calibration.of(variable) - truth) < 4.0 * sigma), variable
@@ -58,7 +59,7 @@ def test_it_saves_the_track() -> None:
     reference = sim.mission.reference
     assert reference is not None
     calibrated = evaluate(two_minutes().trajectory, reference)
-    stated = SsmSmoother().solve(build_problem(exact(sim.mission)))
+    stated = SsmSmoother().solve(build_problem(as_stated(sim.mission)))
     assert calibrated.rmse_horizontal_m < 0.1
     assert evaluate(stated.trajectory, reference).rmse_horizontal_m > 0.2
     assert stated.calibration is None
@@ -72,7 +73,7 @@ def test_a_scale_that_drifts_is_followed() -> None:
         depth=DepthSettings(),
         gnss=GnssSettings(sigma_horizontal=0.05, sigma_vertical=0.1),
     )
-    mission = exact(sim.mission)
+    mission = as_stated(sim.mission)
     mount = replace(mission.dvl.mount, scale_sigma=0.03, scale_walk_density=0.1 / 60.0)
     problem = build_problem(replace(mission, dvl=replace(mission.dvl, mount=mount)))
     calibration = found(SsmSmoother().solve(problem))
@@ -95,7 +96,7 @@ def test_a_prior_that_is_contradicted_is_said() -> None:
 def test_filters_and_fixed_lag_say_that_they_do_not_calibrate() -> None:
     """They take everything as stated; the note names what is asked for."""
     sim = miscalibrated(duration_s=6.0, grade=Grade.NAVIGATION)
-    asked, stated = (build_problem(change(sim.mission)) for change in (asking, exact))
+    asked, stated = (build_problem(change(sim.mission)) for change in (asking, as_stated))
     for problem, n_notes in ((asked, 1), (stated, 0)):
         (filtered,) = filter_problems([problem], "ekf")
         lagged = solve_fixed_lag(problem, FixedLagConfig(lag_s=5.0)).delayed

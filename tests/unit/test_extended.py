@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.calibration_cases import as_stated, asking
 from ssm_graph.data import Array
 from ssm_graph.graph.extended import ExtendedLinearizer
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.states import States, states_from_arrays
 from ssm_graph.problem.extras import Extra, Extras
 from ssm_graph.problem.problem import Problem, build_problem
-from tests.calibration_fixture import asking, exact, miscalibrated
+from tests.calibration_fixture import miscalibrated
 from tests.helpers import true_states
 
 
@@ -23,7 +24,7 @@ def problems() -> tuple[Problem, Problem, States]:
     """Return a problem with all calibrations, the same with none, and states a little off."""
     sim = miscalibrated(duration_s=30.0)
     wide = asking(sim.mission, beam_scale_sigma=0.01, scale_walk_density=1e-4)
-    problem, plain = build_problem(wide), build_problem(exact(sim.mission))
+    problem, plain = build_problem(wide), build_problem(as_stated(sim.mission))
     truth = true_states(problem, sim)
     rng = np.random.default_rng(0)
     off = 0.02 * rng.normal(size=truth.v_n.shape)
