@@ -15,14 +15,19 @@ from gtsam.symbol_shorthand import B, V, X
 from numpy.typing import NDArray
 
 from ssm_graph.data import Array
+from ssm_graph.graph.aid_rows import Aid, DepthAid, GnssAid
 from ssm_graph.graph.bordered import BorderedSolution, ChainRows, solve_bordered
-from ssm_graph.graph.extended_rows import Aid, DepthAid, ExtendedBeams, GnssAid, states_of
+from ssm_graph.graph.extended_rows import ExtendedBeams, RowStates, states_of
 from ssm_graph.graph.interfaces import BeamRows, Misfit
 from ssm_graph.graph.linearize import inertial_graph, misfit_of
 from ssm_graph.graph.marginal_prior import prior_at_start
 from ssm_graph.graph.states import States
+from ssm_graph.problem.calibration import needs_motion
 from ssm_graph.problem.error_state import STATE_DIM
 from ssm_graph.problem.problem import Problem, start_of
+
+JUDGED_PASSES = 3
+"""The first pass is at the states of the forward pass, the next ones at smoothed states."""
 
 # Columns of GTSAM's inertial factor, x_i v_i x_j v_j b_i b_j, as pairs of error states.
 _BEGIN, _END = np.r_[0:9, 18:24], np.r_[9:18, 24:30]
@@ -72,21 +77,30 @@ class ExtendedLinearizer:
         if problem.fixes is not None:
             self.aids.append(GnssAid(problem, problem.fixes))
         self._beams = ExtendedBeams(problem.beams, problem.extras, problem.frame.omega_ie_n)
+        self._n_judged = 0
         self._keys = [(X(k), V(k), B(k)) for k in range(problem.n_keyframes)]
         factor, sigma = problem.extras.transitions(np.diff(problem.keyframe_s))
         self._walk_factor, self._walk_sigma = factor, sigma
 
-    def follow(self, states: States) -> None:
-        """Let gravity and the aids follow the states; to be called before the others."""
+    def follow(self, states: States) -> bool:
+        """Let gravity and the aids follow the states; to be called before the others.
+
+        In the first passes, how much motion there is to calibrate by is judged anew: only smoothed
+        states tell acceleration from a bias. Then the beams are to be linearised anew.
+        """
         self.problem.chain.set_gravity(states.p_n)
         for aid in self.aids:
             aid.follow(states)
+        if self._n_judged == JUDGED_PASSES or not needs_motion(self.problem.extras):
+            return False
+        self._n_judged += 1
+        self._beams.judge(self._at_beams(states), states.bias)
+        return True
 
     def beam_rows(self, states: States) -> BeamRows:
         """Linearise all beams at ``states``."""
         prepared = self._beams.prepare(states.walks, states.constants, states.bias)
-        g_n = self.problem.frame.g_n_at(states.p_n)
-        return self._beams.rows(states_of(states, self.problem.beams.keyframe, g_n=g_n), prepared)
+        return self._beams.rows(self._at_beams(states), prepared)
 
     def solve(self, states: States, beam_rows: BeamRows, weights: Array) -> ExtendedStep:
         """Return the step at ``states``, with their beam rows and weights (M,)."""
@@ -149,6 +163,10 @@ class ExtendedLinearizer:
             error = aid.rows(states).error
             found[aid.name] = Misfit(float(error @ error), len(error), len(error) // aid.dim)
         return found | {"inertial": misfit_of(self.inertial, states)}
+
+    def _at_beams(self, states: States) -> RowStates:
+        g_n = self.problem.frame.g_n_at(states.p_n)
+        return states_of(states, self.problem.beams.keyframe, g_n=g_n)
 
     def _walked(self, states: States) -> Array:
         """Return the whitened errors (K - 1, s) of the walks."""

@@ -62,8 +62,11 @@ class Linearizer(Protocol):
     inertial: gtsam.NonlinearFactorGraph
     prior: MarginalPrior
 
-    def follow(self, states: States) -> None:
-        """Let gravity and the depth targets follow the states; to be called before the others."""
+    def follow(self, states: States) -> bool:
+        """Let gravity and the depth targets follow the states; to be called before the others.
+
+        Returns whether beams linearised before are to be linearised anew.
+        """
 
     def beam_rows(self, states: States) -> BeamRows:
         """Linearise all beams at ``states``."""

@@ -112,10 +112,14 @@ class GraphLinearizer:
         largest = int(self._n_rows.max(initial=1))
         self._unit = [gtsam.noiseModel.Unit.Create(m + 1) for m in range(largest)]
 
-    def follow(self, states: States) -> None:
-        """Let gravity and the depth targets follow the states; to be called before the others."""
+    def follow(self, states: States) -> bool:
+        """Let gravity and the depth targets follow the states; to be called before the others.
+
+        Returns False: beams stay as they are linearised.
+        """
         self.problem.chain.set_gravity(states.p_n)
         self.follow_depth(states)
+        return False
 
     def follow_depth(self, states: States) -> None:
         """Let the depth targets follow the states."""

@@ -81,6 +81,11 @@ def extras_of(mission: Mission) -> Extras:
     )
 
 
+def needs_motion(extras: Extras) -> bool:
+    """Return whether something is to be estimated that only motion shows, as the IMU reads it."""
+    return DVL_TIME_OFFSET in extras or DVL_LEVER_ARM in extras
+
+
 def taken_as_exact(extras: Extras) -> tuple[str, ...]:
     """Return the note of an estimator that does not calibrate, if it is asked to."""
     asked = [block.name for block in extras.blocks if block.name in CALIBRATIONS]

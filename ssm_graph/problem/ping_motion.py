@@ -47,7 +47,8 @@ class MotionBefore:
         spans = np.diff(self._edges)[:, None]
         readings = np.hstack([imu.gyro_b, imu.accel_b])
         self._integral = np.concatenate([np.zeros((1, 6)), np.cumsum(readings * spans, axis=0)])
-        self._half = 0.5 * max(PING_WINDOW_S, float(np.median(spans)))
+        self._sample_s = float(np.median(spans))
+        self._half_s = 0.5 * max(PING_WINDOW_S, self._sample_s)
 
     def at(self, late_s: float, pings: slice | NDArray[np.intp] = np.s_[:]) -> Motion:
         """Return the motion (P, ...) of pings taken ``late_s`` before their keyframes."""
@@ -55,8 +56,9 @@ class MotionBefore:
         ping_s = time_s - late_s
         between = self._at(time_s) - self._at(ping_s)
         turn_b, gain_b = between[:, :3], between[:, 3:]
+        window_s = 2.0 * self._half_s
         mean, before, behind = (
-            self._mean(ping_s + shift) for shift in (0.0, -self._half, self._half)
+            self._mean(ping_s + shift, self._half_s) for shift in (0.0, -window_s, window_s)
         )
         return Motion(
             turn_b=turn_b,
@@ -64,14 +66,28 @@ class MotionBefore:
             gain_b=gain_b - 0.5 * cross(turn_b, gain_b),
             gyro_b=mean[:, :3],
             accel_b=mean[:, 3:],
-            gyro_rate_b=(behind - before)[:, :3] / (2.0 * self._half),
+            gyro_rate_b=(behind - before)[:, :3] / (2.0 * window_s),
         )
 
-    def _mean(self, time_s: Array) -> Array:
-        """Return the mean readings (P, 6) over the ping window about each time."""
-        centre = np.clip(time_s, self._edges[0] + self._half, self._edges[-1] - self._half)
-        passed = self._at(centre + self._half) - self._at(centre - self._half)
-        return np.asarray(passed / (2.0 * self._half))
+    def in_thirds(self, late_s: float) -> tuple[tuple[Motion, Motion, Motion], float]:
+        """Return the readings in three parts about each ping, one after the other.
+
+        What is white in them is so much larger, in variance, than in their mean over the ping
+        window: the second number. Each part is two samples long or more.
+        """
+        whole, half_s = self.at(late_s), max(self._half_s / 3.0, self._sample_s)
+        ping_s = self.time_s - late_s
+        parts = []
+        for shift in (-2.0 * half_s, 0.0, 2.0 * half_s):
+            mean = self._mean(ping_s + shift, half_s)
+            parts.append(whole._replace(gyro_b=mean[:, :3], accel_b=mean[:, 3:]))
+        return (parts[0], parts[1], parts[2]), self._half_s / half_s
+
+    def _mean(self, time_s: Array, half_s: float) -> Array:
+        """Return the mean readings (P, 6) from ``half_s`` before to ``half_s`` after each time."""
+        centre = np.clip(time_s, self._edges[0] + half_s, self._edges[-1] - half_s)
+        passed = self._at(centre + half_s) - self._at(centre - half_s)
+        return np.asarray(passed / (2.0 * half_s))
 
     def _at(self, time_s: Array) -> Array:
         """Return the integrals (P, 6) of the readings up to each time."""

@@ -19,7 +19,7 @@ from ssm_graph.data import (
 from ssm_graph.earth import LocalFrame
 from ssm_graph.errors import ConfigError, DataError
 from ssm_graph.imu.preintegration import InertialChain, imu_gaps, preintegrate
-from ssm_graph.problem.calibration import DVL_TIME_OFFSET, extras_of
+from ssm_graph.problem.calibration import extras_of, needs_motion
 from ssm_graph.problem.error_state import InitialMoments, initial_moments
 from ssm_graph.problem.extras import Extras
 from ssm_graph.problem.ping_motion import MotionBefore, mean_gyro
@@ -76,7 +76,7 @@ class Beams(ReadOnlyArrays):
     ping: NDArray[np.intp]
     """(M,) the ping of each, counted from 0"""
     motion: MotionBefore | None = None
-    """Inertial readings before the pings, where the DVL's clock is in doubt."""
+    """Inertial readings about the pings, where the DVL's clock or lever arm is in doubt."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -246,7 +246,7 @@ def _beams(mission: Mission, ping: Indices, ping_keyframe: Indices, extras: Extr
         lever_arm_b=dvl.mount.lever_arm_b,
         R_bd=dvl.mount.R_bd,
         ping=row,
-        motion=MotionBefore(mission.imu, dvl.ping_s[ping]) if DVL_TIME_OFFSET in extras else None,
+        motion=MotionBefore(mission.imu, dvl.ping_s[ping]) if needs_motion(extras) else None,
     )
 
 

@@ -202,7 +202,8 @@ class SsmSmoother:
         kernel: Kernel,
     ) -> _Pass:
         problem = linearizer.problem
-        linearizer.follow(states)
+        if linearizer.follow(states):
+            rows = linearizer.beam_rows(states)
         step = linearizer.solve(states, rows, weights)
         cost = linearizer.cost(states, rows, weights)
         states, rows, update = _descend(linearizer, states, step.delta, weights, cost)

@@ -18,7 +18,16 @@ from ssm_graph.messages import DepthReading, Fix
 from ssm_graph.online.buffers import Buffers
 from ssm_graph.online.smoother import FixedLagSmoother
 from ssm_graph.problem.problem import build_problem
-from ssm_graph.simulation import DepthSettings, DvlSettings, GnssSettings, Grade
+from ssm_graph.simulation import (
+    CALM,
+    DepthProfile,
+    DepthSettings,
+    DvlSettings,
+    GnssSettings,
+    Grade,
+    StartSigmas,
+    TransitRoute,
+)
 from ssm_graph.smoothers.batch import SsmSmoother
 from ssm_graph.smoothers.fixed_lag import FixedLagConfig, solve_fixed_lag
 from tests.calibration_fixture import miscalibrated
@@ -128,3 +137,30 @@ def test_the_live_estimator_says_so_too_and_takes_known_offsets_off() -> None:
     assert buffers.time_of(depth) == 1.0
     assert buffers.add(depth)
     assert buffers.depths.all[0, 1] == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("with_gnss", [True, False])
+def test_a_straight_run_in_a_calm_invents_nothing(with_gnss: bool) -> None:
+    """Without motion clock and lever arm stay at their priors, however noisy the sensors are."""
+    start = StartSigmas(position=0.3, velocity=0.5, roll_pitch=2e-3, heading=0.01)
+    sim = miscalibrated(
+        duration_s=240.0,
+        grade=Grade.MEMS,
+        start_sigmas=start,
+        route=TransitRoute(speed=1.5, depth=DepthProfile(0.3, 0.3)),
+        waves=CALM,
+        gnss=GnssSettings(windows=((0.0, 1e9),)) if with_gnss else None,
+        depth=DepthSettings(),
+    )
+    calibration = found(SsmSmoother().solve(build_problem(asking(sim.mission, DVL))))
+    unseen = ["dvl_time_offset_s", *(f"dvl_lever_arm_{axis}_m" for axis in "xyz")]
+    if not with_gnss:
+        unseen.append("dvl_scale_error")
+    values = {value.label: value for value in calibration.values}
+    for label in unseen:
+        assert values[label].determined is Determined.RED, label
+    scale = values["dvl_scale_error"]
+    assert (scale.determined is Determined.GREEN) == with_gnss
+    for variable, truth in DVL.items():
+        sigma = np.array([v.sigma for v in calibration.values if v.variable == variable])
+        assert np.all(np.abs(calibration.of(variable) - truth) < 3.0 * sigma), variable

@@ -1,0 +1,132 @@
+"""Rows of depth and GNSS beside the beams, whichever variables they depend on."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.depth_height import height_residual
+from factors.gnss_position import fix_residual
+from ssm_graph.data import Array
+from ssm_graph.graph.depth import DepthTargets, depth_targets
+from ssm_graph.graph.extended_rows import Rows, RowStates, states_of
+from ssm_graph.graph.states import States
+from ssm_graph.problem.calibration import DEPTH_OFFSET, GNSS_LEVER_ARM, GNSS_TIME_OFFSET
+from ssm_graph.problem.error_state import POSITION, ROTATION, VELOCITY
+from ssm_graph.problem.extras import Extras
+from ssm_graph.problem.problem import Depths, Fixes, Problem
+
+
+class AidRows(NamedTuple):
+    """Whitened rows of an aid, ``A d = b`` with ``b`` minus the error."""
+
+    keyframe: NDArray[np.intp]
+    """(M,)"""
+    error: Array
+    """(M,)"""
+    jacobian: Array
+    """(M, width)"""
+
+
+class Aid(Protocol):
+    """A kind of measurement beside the beams: it counts in full, without a weight."""
+
+    name: str
+    dim: int
+    """Rows of one measurement"""
+
+    def follow(self, states: States) -> None:
+        """Let what is only slowly a function of the states follow them."""
+
+    def rows(self, states: States) -> AidRows:
+        """Linearise at ``states``."""
+
+
+class DepthAid:
+    """Depth, with an offset where one is asked for."""
+
+    name = "depth"
+    dim = 1
+
+    def __init__(self, problem: Problem, depths: Depths) -> None:
+        self._problem, self._depths = problem, depths
+        self._targets: DepthTargets | None = None
+
+    def follow(self, states: States) -> None:
+        """Lead the readings along the track of ``states``."""
+        problem = self._problem
+        self._targets = depth_targets(self._depths, states, problem.frame, problem.keyframe_s)
+
+    def rows(self, states: States) -> AidRows:
+        """Return one row for each keyframe with a reading; to be called after :meth:`follow`."""
+        assert self._targets is not None
+        extras, (k, target_n, up_n, root) = self._problem.extras, self._targets
+        offset = extras.value(DEPTH_OFFSET, states.walks[k], states.constants, default=np.zeros(1))[
+            ..., 0
+        ]
+        residual = height_residual(
+            states.R_nb[k],
+            states.p_n[k],
+            lever_arm_b=self._depths.lever_arm_b,
+            offset=offset,
+            up_n=up_n,
+            target_n=target_n,
+        )
+        jacobian = np.zeros((len(k), extras.width))
+        jacobian[:, ROTATION] = residual.error_D_rotation
+        jacobian[:, POSITION] = residual.error_D_position
+        if DEPTH_OFFSET in extras:
+            jacobian[:, extras.columns(DEPTH_OFFSET)] = residual.error_D_offset[:, None]
+        return AidRows(k, residual.error * root, jacobian * root[:, None])
+
+
+class GnssAid:
+    """Position fixes, with lever arm and clock in doubt where that is asked for."""
+
+    name = "GNSS"
+    dim = 3
+
+    def __init__(self, problem: Problem, fixes: Fixes) -> None:
+        self._extras, self._fixes = problem.extras, fixes
+        self._whiten = np.linalg.inv(np.linalg.cholesky(fixes.covariance_n))
+
+    def follow(self, states: States) -> None:
+        """Do nothing: a fix is where it is."""
+
+    def rows(self, states: States) -> AidRows:
+        """Return three rows for each fix."""
+        keyframe = self._fixes.keyframe
+        at = states_of(states, keyframe, g_n=states.p_n)
+        error, jacobian = fix_rows(self._fixes, self._extras, at, np.s_[:])
+        return AidRows(
+            np.repeat(keyframe, 3),
+            (self._whiten @ error[..., None])[..., 0].ravel(),
+            (self._whiten @ jacobian).reshape(-1, self._extras.width),
+        )
+
+
+def fix_rows(fixes: Fixes, extras: Extras, at: RowStates, rows: Rows | int) -> tuple[Array, Array]:
+    """Return errors (F, 3), m, and Jacobians (F, 3, width) of fixes, not whitened."""
+    nothing = np.zeros(3)
+    late_s = extras.value(GNSS_TIME_OFFSET, at.walks, at.constants, default=nothing)[..., 0]
+    lever = extras.value(GNSS_LEVER_ARM, at.walks, at.constants, default=nothing)
+    residual = fix_residual(
+        at.R_nb,
+        at.p_n,
+        at.v_n,
+        lever_arm_b=fixes.lever_arm_b + lever,
+        time_offset=late_s,
+        omega_b=fixes.gyro_b[rows] - at.bias[..., 3:],
+        position_n=fixes.position_n[rows],
+    )
+    jacobian = np.zeros((*residual.error.shape, extras.width))
+    jacobian[..., ROTATION] = residual.error_D_rotation
+    jacobian[..., POSITION] = residual.error_D_position
+    jacobian[..., VELOCITY] = residual.error_D_velocity_n
+    if GNSS_LEVER_ARM in extras:
+        jacobian[..., extras.columns(GNSS_LEVER_ARM)] = residual.error_D_lever_arm_b
+    if GNSS_TIME_OFFSET in extras:
+        jacobian[..., extras.columns(GNSS_TIME_OFFSET)] = residual.error_D_time_offset[..., None]
+    return residual.error, jacobian
