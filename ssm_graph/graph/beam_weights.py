@@ -6,6 +6,7 @@ import numpy as np
 
 from factors.similarity import WEIGHT_FLOOR, Kernel, expected_mahalanobis_sq
 from ssm_graph.data import Array
+from ssm_graph.problem.doubts import LOW_WEIGHT, TRUSTED
 from ssm_graph.problem.timeline import Indices
 
 GATE = 5.0
@@ -17,27 +18,41 @@ MEMORY_PINGS = 3.0
 WEIGHT_ROUNDS = 10
 
 
-def first_trust(trust: Array, predicted: Array, variance: Array) -> Array:
-    """Return the weights that the beams of one ping are met with, before the gate.
+def met_weights(
+    innovation: Array, predicted: Array, variance: Array, kernel: Kernel, *, trust: Array
+) -> Array:
+    """Return the weights of the beams of one ping that meets its prediction.
 
-    A prediction that is much less certain than the beams cannot tell which of them is wrong, for
-    any three agree with it and with each other. Then those that were wrong before are taken to be
-    wrong still, as long as three others are left; any of them may prove right.
+    A prediction that is much less certain than the beams cannot tell which of them is wrong: any
+    three of four agree with it, and with each other. Then those that were wrong before are taken to
+    be wrong still, as long as three others are left; any of them may prove right. Where that does
+    not help, and no beam agrees with the others, the ping is left out until its neighbours in time
+    decide: least squares would lay the fault of one beam upon the velocity.
 
     Parameters
     ----------
-    trust : (m,) what each beam was worth in the pings before, 0 to 1.
+    innovation : (m,) m/s, measured minus predicted.
     predicted : (m, m) covariance of the predicted speeds, (m/s)^2.
     variance : (m,) of the measured ones.
+    kernel : turns Mahalanobis distances into weights.
+    trust : (m,) what each beam was worth in the pings before, 0 to 1.
     """
     is_poor = bool(np.any(predicted.diagonal() > POOR**2 * variance))
-    if is_poor and np.sum(trust >= 0.5) >= 3:
-        return np.where(trust >= 0.5, 1.0, WEIGHT_FLOOR)
-    return np.ones(len(trust))
+    first: Array | float = 1.0
+    if is_poor and np.sum(trust >= TRUSTED) >= 3:
+        first = np.where(trust >= TRUSTED, 1.0, WEIGHT_FLOOR)
+    weights = settle_weights(innovation, predicted, variance, kernel, first=first)
+    is_undecided = is_poor and bool(np.all(weights < LOW_WEIGHT))
+    return np.full(len(weights), WEIGHT_FLOOR) if is_undecided else weights
 
 
 def updated_trust(trust: Array, beam: Indices, weights: Array) -> Array:
-    """Return what each beam (4,) is worth after one more ping with weights (m,) of its beams."""
+    """Return what each beam (4,) is worth after one more ping with weights (m,) of its beams.
+
+    A ping without a beam that agrees says nothing of any of them.
+    """
+    if np.all(weights < LOW_WEIGHT):
+        return trust
     updated = trust.copy()
     updated[beam] += (weights - trust[beam]) / MEMORY_PINGS
     return updated

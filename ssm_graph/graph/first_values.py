@@ -20,7 +20,7 @@ from factors.so3 import cross
 from ssm_graph.data import N_BEAMS, Array
 from ssm_graph.earth import SEMI_MAJOR_AXIS
 from ssm_graph.errors import SolverError
-from ssm_graph.graph.beam_weights import first_trust, settle_weights, updated_trust
+from ssm_graph.graph.beam_weights import met_weights, settle_weights, updated_trust
 from ssm_graph.graph.forward_extras import ForwardExtras
 from ssm_graph.graph.interfaces import BeamRows
 from ssm_graph.graph.linearize import carried_covariance, inertial_graph, linearize_beams
@@ -199,8 +199,8 @@ class _ForwardPass:
         if predicted.diagonal().max() > ANCHOR_SIGMA**2:
             predicted = self._forget_velocity(H, innovation, predicted)
         beam = self.problem.beams.beam[rows]
-        first = first_trust(self.trust[beam], predicted, variance)
-        weights = settle_weights(innovation, predicted, variance, self.kernel, first=first)
+        trust = self.trust[beam]
+        weights = met_weights(innovation, predicted, variance, self.kernel, trust=trust)
         self.without_beam = self.without_beam + 1 if np.all(weights < 0.01) else 0
         if self.without_beam >= LOCKED_OUT_PINGS:
             self.n_doubts += 1

@@ -11,7 +11,7 @@ import numpy as np
 from factors.similarity import Similarity, expected_mahalanobis_sq
 from ssm_graph.data import N_BEAMS, Array
 from ssm_graph.errors import SolverError
-from ssm_graph.graph.beam_weights import first_trust, settle_weights, updated_trust
+from ssm_graph.graph.beam_weights import met_weights, updated_trust
 from ssm_graph.graph.marginal_prior import moved_chart
 from ssm_graph.problem.error_state import STATE_DIM, InitialMoments, Linearised
 from ssm_graph.problem.states import NavigationStates
@@ -193,14 +193,12 @@ class Window:
         if len(H) == 0:
             return
         root = H @ root_cov
-        predicted, variance = root @ root.T, graph.beams.sigma[row:] ** 2
-        trust = self._trust[graph.beams.beam[row:].astype(np.intp)]
-        weights = settle_weights(
+        weights = met_weights(
             -graph.error[row:] - H @ step,
-            predicted,
-            variance,
+            root @ root.T,
+            graph.beams.sigma[row:] ** 2,
             self.config.kernel,
-            first=first_trust(trust, predicted, variance),
+            trust=self._trust[graph.beams.beam[row:].astype(np.intp)],
         )
         self._weights = np.concatenate([self._weights[:row], weights])
         graph.changed_from(len(self.keyframes) - 1)
