@@ -22,7 +22,7 @@ import numpy as np
 from benchmarks.calibration_cases import DVL, asking, knowing_dvl, wrong_dvl
 from benchmarks.speed import machine, table
 from factors.similarity import GaussianKernel, Kernel, LogKernel
-from ssm_graph.data import Array, Mission
+from ssm_graph.data import Array, Mission, Reference
 from ssm_graph.estimate import Estimate
 from ssm_graph.evaluation import chi2_interval, evaluate, mean_with_interval, paired_ratio
 from ssm_graph.problem.problem import build_problem
@@ -75,6 +75,14 @@ def smoothed(mission: Mission, kernel: Kernel) -> Estimate:
     return SsmSmoother(SmootherConfig(kernel=kernel)).solve(build_problem(mission))
 
 
+def rms_each_second(estimate: Estimate, reference: Reference) -> float:
+    """Return the horizontal rms error, m; each second counts the same wherever keyframes are."""
+    errors = evaluate(estimate.trajectory, reference).errors
+    at_s = np.arange(np.ceil(errors.time_s[0]), errors.time_s[-1])
+    east, north = (np.interp(at_s, errors.time_s, axis) for axis in errors.position_enu.T[:2])
+    return float(np.sqrt(np.mean(east**2 + north**2)))
+
+
 def judged(estimate: Estimate, mission: Mission, *, known: Estimate | None) -> Run:
     """Compare a calibrated estimate with what is true."""
     calibration, reference = estimate.calibration, mission.reference
@@ -90,10 +98,8 @@ def judged(estimate: Estimate, mission: Mission, *, known: Estimate | None) -> R
         error=error / sigma,
         ratio=sigma / [value.prior_sigma for value in values],
         nees=float(error @ np.linalg.solve(covariance, error)),
-        rms_m=evaluate(estimate.trajectory, reference).rmse_horizontal_m,
-        rms_known_m=(
-            np.nan if known is None else evaluate(known.trajectory, reference).rmse_horizontal_m
-        ),
+        rms_m=rms_each_second(estimate, reference),
+        rms_known_m=np.nan if known is None else rms_each_second(known, reference),
         status=estimate.status.name,
     )
 

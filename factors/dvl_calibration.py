@@ -167,12 +167,16 @@ def calibrated_beam_residual(
     v_then = v_n - _times(R_nb, gain) - tau * g_n
     R_then_T = _T(R_then)
     omega_ib = motion.gyro_b - bias[..., 3:]
-    omega_eb = omega_ib - _times(R_then_T, omega_ie_n)
-    at_instrument = _times(R_then_T, v_then) + cross(omega_eb, lever)
-    predicted = (beam * at_instrument).sum(axis=-1)
-    arm = cross(lever, beam)
+    omega_ie_b = _times(R_then_T, omega_ie_n)
+    v_b, omega_eb = _times(R_then_T, v_then), omega_ib - omega_ie_b
+    swing_b = cross(omega_eb, lever)
+    predicted = (beam * (v_b + swing_b)).sum(axis=-1)
+    # All products of the beam at once: a single one costs as much as four.
+    factors = np.empty((4, *predicted.shape, 3))
+    factors[0], factors[1], factors[2], factors[3] = v_b, swing_b, omega_eb, -lever
+    beam_x_v, beam_x_swing, beam_x_omega, arm = cross(beam, factors)
     # With respect to the attitude then: of the velocity, and of the Earth rate in omega_eb.
-    D_phi = cross(beam, at_instrument - cross(omega_eb, lever)) - cross(arm, omega_ib - omega_eb)
+    D_phi = beam_x_v - cross(arm, omega_ie_b)
     D_v_b = _times(R_back, beam)
     D_phi_now = _times(R_back, D_phi)
     a_then_b = motion.accel_b + _times(R_then_T, g_n - _times(R_nb, bias[..., :3]))
@@ -185,9 +189,9 @@ def calibrated_beam_residual(
         error_D_velocity_n=gain_3 * _times(R_nb, D_v_b),
         error_D_accel_bias=gain_3 * tau * D_v_b,
         error_D_gyro_bias=gain_3 * (tau * _times(J_back, D_phi) - arm),
-        error_D_mounting=gain_3 * (cross(beam, at_instrument) @ turn_D_mounting),
+        error_D_mounting=gain_3 * ((beam_x_v + beam_x_swing) @ turn_D_mounting),
         error_D_scale=predicted,
-        error_D_lever_arm_b=gain_3 * cross(beam, omega_eb),
+        error_D_lever_arm_b=gain_3 * beam_x_omega,
         error_D_time_offset=gain_1 * D_late,
     )
 

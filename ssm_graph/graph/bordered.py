@@ -104,10 +104,12 @@ def solve_bordered(rows: ChainRows) -> BorderedSolution:
     conditional = R_inv @ np.swapaxes(R_inv, 1, 2)
     # Columns of the border, and the solution without it, go back through the chain together.
     answers[:, :, :-1] *= -1.0
+    dot, gain = np.dot, np.ascontiguousarray(gain)
+    answers = np.ascontiguousarray(answers)
     for k in range(n_keyframes - 2, -1, -1):
         M = gain[k]
-        answers[k] -= M @ answers[k + 1]
-        conditional[k] += M @ conditional[k + 1] @ M.T
+        answers[k] -= dot(M, answers[k + 1])
+        conditional[k] += dot(dot(M, conditional[k + 1]), M.T)
     sensitivity = answers[:, :, :-1]
     step = answers[:, :, -1] + sensitivity @ constants_step
     if not (np.all(np.isfinite(step)) and np.all(np.isfinite(constants_cov))):

@@ -26,8 +26,8 @@ from ssm_graph.problem.calibration import needs_motion
 from ssm_graph.problem.error_state import STATE_DIM
 from ssm_graph.problem.problem import Problem, start_of
 
-JUDGED_PASSES = 3
-"""The first pass is at the states of the forward pass, the next ones at smoothed states."""
+JUDGED_PASSES = 2
+"""The first pass is at the states of the forward pass, the second at smoothed ones."""
 
 # Columns of GTSAM's inertial factor, x_i v_i x_j v_j b_i b_j, as pairs of error states.
 _BEGIN, _END = np.r_[0:9, 18:24], np.r_[9:18, 24:30]
