@@ -39,7 +39,8 @@ def add_parser(commands: Any, *, epilog: str) -> None:
         "smooth",
         summary="smooth a mission folder",
         description="Smooth a recorded mission; writes trajectory.csv, beams.csv, summary.json and "
-        "figure.png.",
+        "figure.png. Where mission.toml gives prior sigmas of mounting, scale, lever arms, clocks "
+        "or depth offset, these are calibrated: calibration.toml has the lines to put in place.",
         epilog=epilog,
     )
     add_mission_arguments(parser)

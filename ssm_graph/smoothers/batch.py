@@ -21,7 +21,7 @@ from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.states import States
 from ssm_graph.problem.problem import Problem
 from ssm_graph.problem.trajectory import trajectory_from_states
-from ssm_graph.smoothers.calibrated import calibration_of
+from ssm_graph.smoothers.calibrated import calibration_of, undetermined
 from ssm_graph.smoothers.gnc import GncSchedule, Graduation, Schedule, WarmSchedule
 from ssm_graph.smoothers.verdict import contradictions
 
@@ -253,6 +253,7 @@ class SsmSmoother:
             unsettled = [] if status is Status.CONVERGED else [reason]
             status, reason = Status.SUSPECT, "; ".join(doubts + unsettled)
         problem, beams = linearizer.problem, linearizer.problem.beams
+        calibration = calibration_of(problem, last.states, last.step.extras_covariance)
         return Estimate(
             method="smoother",
             kernel=self.config.weighting,
@@ -270,6 +271,6 @@ class SsmSmoother:
             wall_s=wall_s,
             cost=self._cost(linearizer, last),
             start=problem.start,
-            notes=notes,
-            calibration=calibration_of(problem, last.states, last.step.extras_covariance),
+            notes=notes + undetermined(calibration),
+            calibration=calibration,
         )

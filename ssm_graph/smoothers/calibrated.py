@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ssm_graph.data import Array
-from ssm_graph.estimate import CalibratedValue, Calibration
+from ssm_graph.estimate import CalibratedValue, Calibration, Determined
 from ssm_graph.graph.states import States
 from ssm_graph.problem.calibration import CALIBRATIONS
 from ssm_graph.problem.error_state import STATE_DIM
@@ -42,6 +42,18 @@ def calibration_of(problem: Problem, states: States, covariance: Array) -> Calib
         return None
     walks = states.walks[:, [own for own in kept if own < extras.n_walks]]
     return Calibration(tuple(values), covariance[np.ix_(kept, kept)], walks)
+
+
+def undetermined(calibration: Calibration | None) -> tuple[str, ...]:
+    """Return a note that names what the mission did not determine."""
+    values = calibration.values if calibration else ()
+    red = [value.label for value in values if value.determined is Determined.RED]
+    if not red:
+        return ()
+    return (
+        f"not determined by this mission: {', '.join(red)}; they stay at their priors: turn, and "
+        "change speed and depth, while GNSS is there",
+    )
 
 
 def _prior_sigma_at_end(problem: Problem) -> Array:

@@ -152,13 +152,15 @@ def test_a_straight_run_in_a_calm_invents_nothing(with_gnss: bool) -> None:
         gnss=GnssSettings(windows=((0.0, 1e9),)) if with_gnss else None,
         depth=DepthSettings(),
     )
-    calibration = found(SsmSmoother().solve(build_problem(asking(sim.mission, DVL))))
+    estimate = SsmSmoother().solve(build_problem(asking(sim.mission, DVL)))
+    calibration = found(estimate)
     unseen = ["dvl_time_offset_s", *(f"dvl_lever_arm_{axis}_m" for axis in "xyz")]
     if not with_gnss:
         unseen.append("dvl_scale_error")
     values = {value.label: value for value in calibration.values}
     for label in unseen:
         assert values[label].determined is Determined.RED, label
+        assert any("not determined" in note and label in note for note in estimate.notes)
     scale = values["dvl_scale_error"]
     assert (scale.determined is Determined.GREEN) == with_gnss
     for variable, truth in DVL.items():

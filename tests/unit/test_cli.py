@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +66,25 @@ def test_smooth_aligns_where_the_start_is_missing(mission: Path, tmp_path: Path)
     assert any(note.startswith("aligned: heading") for note in summary["notes"])
     assert summary["rmse_horizontal_m"] < 1.5
     assert not (tmp_path / "out" / "figure.png").exists()
+
+
+def test_smooth_calibrates_where_the_mission_asks_for_it(
+    mission: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A prior sigma is all it takes; the lines to put in place are in the file's own axes."""
+    folder, out = tmp_path / "m", tmp_path / "out"
+    shutil.copytree(mission, folder)
+    text = (folder / "mission.toml").read_text()
+    text = text.replace("[dvl]\n", "[dvl]\nscale_sigma = 0.03\nlever_arm_sigma_m = 0.2\n")
+    (folder / "mission.toml").write_text(text)
+    assert main(["smooth", str(folder), "--out", str(out), "--no-figure"]) == ExitCode.GOOD
+    shown = capsys.readouterr().out
+    assert "dvl_scale_error" in shown
+    assert "calibration.toml" in shown
+    found = read_results(out).summary["calibration"]
+    assert abs(found["dvl_scale_error"]["value"]) < 4.0 * found["dvl_scale_error"]["sigma"]
+    lines = tomllib.loads((out / "calibration.toml").read_text())
+    assert lines["dvl"]["scale_error"] == pytest.approx(found["dvl_scale_error"]["value"], abs=1e-6)
 
 
 def test_an_unconverged_run_is_marked_and_written(mission: Path, tmp_path: Path) -> None:
