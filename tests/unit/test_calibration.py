@@ -166,3 +166,21 @@ def test_a_straight_run_in_a_calm_invents_nothing(with_gnss: bool) -> None:
     for variable, truth in DVL.items():
         sigma = np.array([v.sigma for v in calibration.values if v.variable == variable])
         assert np.all(np.abs(calibration.of(variable) - truth) < 3.0 * sigma), variable
+
+
+def test_each_beam_has_a_scale_of_its_own() -> None:
+    """Within four sigmas, far better than the prior."""
+    errors = (0.02, -0.01, 0.0, 0.015)
+    sim = miscalibrated(
+        dvl=DvlSettings(beam_scale_errors=errors),
+        depth=DepthSettings(),
+        gnss=GnssSettings(sigma_horizontal=0.05, sigma_vertical=0.1),
+    )
+    mission = asking(sim.mission, (), beam_scale_sigma=0.03)
+    calibration = found(SsmSmoother().solve(build_problem(mission)))
+    assert [value.label for value in calibration.values] == [
+        f"dvl_beam{beam}_scale_error" for beam in (1, 2, 3, 4)
+    ]
+    sigma = np.array([value.sigma for value in calibration.values])
+    assert np.all(np.abs(calibration.of("dvl_beam_scale") - errors) < 4.0 * sigma)
+    assert sigma.max() < 0.01
