@@ -31,6 +31,7 @@ from ssm_graph.problem.alignment import Alignment, align
 from ssm_graph.problem.problem import Problem, ProblemConfig, build_problem
 from ssm_graph.report.figure import save_figure
 from ssm_graph.smoothers.batch import Similarity, SmootherConfig, SsmSmoother
+from ssm_graph.smoothers.beam_faults import FaultSearch
 from ssm_graph.smoothers.fixed_lag import FixedLagConfig, solve_fixed_lag
 from ssm_graph.smoothers.mission import smooth
 
@@ -41,6 +42,7 @@ __all__ = [
     "DataError",
     "Estimate",
     "ExpKernel",
+    "FaultSearch",
     "FixedLagConfig",
     "FixedLagSmoother",
     "GaussianKernel",

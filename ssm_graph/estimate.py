@@ -148,6 +148,22 @@ class Calibration:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class NoiseFound:
+    """How noisy the data are by what the answer misses of them."""
+
+    beam_factor: Array
+    """(4,) estimated over stated sigma of each beam; NaN with too few speeds."""
+    beam_dof: Array
+    """(4,) degrees of freedom behind it."""
+    beam_used: Array
+    """(4,) sigma that the answer was made with over the stated one: 1 unless adapted."""
+    inertial_chi_sq: float
+    """Sum of the squared whitened errors of the inertial data,"""
+    inertial_dof: float
+    """and what it is expected to be."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
     """The answer of one estimator on one mission."""
 
@@ -173,6 +189,8 @@ class Estimate:
     """Mean passes over a keyframe of what goes keyframe by keyframe."""
     calibration: Calibration | None = None
     """What was found of the instruments, if that was asked for."""
+    noise: NoiseFound | None = None
+    """What was found of their noise; None of what goes keyframe by keyframe."""
 
     @property
     def n_iterations(self) -> float:

@@ -72,7 +72,9 @@ study file (TOML):
   duration_s = 1200.0
   dropout_rate = 0.0
   faults = [{beams = [0], turn_by_seed = true, start_s = 600.0, length_s = 40.0,
-             offset_m_per_s = 1.0}]  # on one line; beams from 0, turned: plus seed, modulo 4
+             offset_m_per_s = 1.0}]  # on one line; beams from 0, turned: plus seed, modulo 4;
+                                     # shape = "drift" grows to the offset, "covered" reads low
+                                     # by a share that grows to share, "stuck" keeps its speed
   losses = [{beams = [3], start_s = 300.0, length_s = 180.0}]
 """
 

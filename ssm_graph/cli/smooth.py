@@ -18,6 +18,7 @@ from ssm_graph.estimate import Estimate
 from ssm_graph.problem.problem import ProblemConfig
 from ssm_graph.report.progress import ProgressDisplay
 from ssm_graph.smoothers.batch import SmootherConfig
+from ssm_graph.smoothers.beam_faults import FaultSearch
 from ssm_graph.smoothers.gnc import GncStart, Graduation
 from ssm_graph.smoothers.mission import smooth
 
@@ -97,6 +98,19 @@ def _add_loop_options(parser: argparse.ArgumentParser) -> None:
         help=f"limit of the similarity loop (default: {loop.max_iterations})",
     )
 
+    parser.add_argument(
+        "--adapt-noise",
+        action="store_true",
+        help="repeat the solution with the sigma of each beam that its errors ask for; without it "
+        "a note says where it differs from the stated one",
+    )
+    parser.add_argument(
+        "--find-faults",
+        action="store_true",
+        help="look for stretches in which one beam is off for long (biased, drifting, covered, "
+        "stuck) and leave them out; single bad pings are the kernel's business",
+    )
+
 
 def run(arguments: argparse.Namespace, console: Console, errors: Console) -> bool:
     """Smooth, with the loop that was asked for."""
@@ -123,6 +137,8 @@ def loop_from(arguments: argparse.Namespace) -> SmootherConfig:
         kernel=kernel_from(CHOICES, arguments.kernel, **given),
         similarity=None if similarity is None else Similarity[similarity.upper()],
         graduation=graduation,
+        fault_search=FaultSearch() if arguments.find_faults else None,
+        adapt_noise=arguments.adapt_noise,
         max_iterations=arguments.max_iterations,
     )
 
@@ -131,6 +147,8 @@ def _settings(loop: SmootherConfig) -> dict[str, Any]:
     return {
         "kernel": loop.weighting,
         "similarity": loop.judged_by.name.lower(),
+        "adapt_noise": loop.adapt_noise,
+        "find_faults": loop.fault_search is not None,
         "max_iterations": loop.max_iterations,
         "tolerance_sigmas": loop.tolerance,
     }

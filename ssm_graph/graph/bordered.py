@@ -50,12 +50,20 @@ class BorderedSolution(NamedTuple):
     """(K, n, C) how each keyframe follows the constants"""
     constants_cov: Array
     """(C, C)"""
+    gain: Array
+    """(K, n, n) how each keyframe follows the next, negative"""
 
     def covariance(self, size: int) -> Array:
         """Return the covariance (K, size, size) of the first states of every keyframe."""
         part = self.sensitivity[:, :size]
         shared = part @ self.constants_cov @ np.swapaxes(part, 1, 2)
         return np.asarray(self.conditional[:, :size, :size] + shared)
+
+    def neighbour_covariance(self, size: int) -> Array:
+        """Return the covariance (K - 1, size, size) of every keyframe with the next."""
+        part = self.sensitivity[:, :size]
+        shared = part[:-1] @ self.constants_cov @ np.swapaxes(part[1:], 1, 2)
+        return np.asarray(shared - self.gain[:-1, :size] @ self.conditional[1:, :, :size])
 
     def end_covariance(self, begin: int) -> Array:
         """Return that of the last keyframe's states from ``begin`` on, and of the constants."""
@@ -117,7 +125,7 @@ def solve_bordered(rows: ChainRows) -> BorderedSolution:
             "the linear solution is not finite: look for time stamps far apart, or sigmas that "
             "differ by more than 12 orders of magnitude"
         )
-    return BorderedSolution(step, constants_step, conditional, sensitivity, constants_cov)
+    return BorderedSolution(step, constants_step, conditional, sensitivity, constants_cov, gain)
 
 
 def _eliminate(rows: ChainRows) -> tuple[Array, Array]:

@@ -18,6 +18,7 @@ from ssm_graph.data import Array
 from ssm_graph.graph.aid_rows import Aid, DepthAid, GnssAid
 from ssm_graph.graph.bordered import BorderedSolution, ChainRows, solve_bordered
 from ssm_graph.graph.extended_rows import ExtendedBeams, RowStates, states_of
+from ssm_graph.graph.inertial_fit import BEGIN, END, inertial_rows
 from ssm_graph.graph.interfaces import BeamRows, Misfit
 from ssm_graph.graph.linearize import inertial_graph, misfit_of
 from ssm_graph.graph.marginal_prior import prior_at_start
@@ -28,9 +29,6 @@ from ssm_graph.problem.problem import Problem, start_of
 
 JUDGED_PASSES = 2
 """The first pass is at the states of the forward pass, the second at smoothed ones."""
-
-# Columns of GTSAM's inertial factor, x_i v_i x_j v_j b_i b_j, as pairs of error states.
-_BEGIN, _END = np.r_[0:9, 18:24], np.r_[9:18, 24:30]
 
 
 class ExtendedStep(NamedTuple):
@@ -47,6 +45,11 @@ class ExtendedStep(NamedTuple):
     def covariance(self) -> Array:
         """Of the error state of every keyframe, (K, 15, 15)."""
         return self.solution.covariance(STATE_DIM)
+
+    @property
+    def neighbour_covariance(self) -> Array:
+        """Between every keyframe and the next, (K - 1, 15, 15)."""
+        return self.solution.neighbour_covariance(STATE_DIM)
 
     @property
     def sigma(self) -> Array:
@@ -177,13 +180,10 @@ class ExtendedLinearizer:
         """Return the rows (K - 1, n, 2 n + C + 1) from each keyframe to the next."""
         extras = self.problem.extras
         n, n_intervals = extras.state_dim, self.problem.n_keyframes - 1
-        linear = self.inertial.linearize(states.values)
-        inertial = np.empty((n_intervals, STATE_DIM, 2 * STATE_DIM + 1))
-        for k in range(n_intervals):
-            inertial[k] = linear.at(k).augmentedJacobian()
+        inertial = inertial_rows(self.inertial, states.values)
         between = np.zeros((n_intervals, n, n + extras.width + 1))
-        between[:, :STATE_DIM, :STATE_DIM] = inertial[:, :, _BEGIN]
-        between[:, :STATE_DIM, n : n + STATE_DIM] = inertial[:, :, _END]
+        between[:, :STATE_DIM, :STATE_DIM] = inertial[:, :, BEGIN]
+        between[:, :STATE_DIM, n : n + STATE_DIM] = inertial[:, :, END]
         between[:, :STATE_DIM, -1] = inertial[:, :, -1]
         for i in range(extras.n_walks):
             sigma, row = self._walk_sigma[:, i], STATE_DIM + i

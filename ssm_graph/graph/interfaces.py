@@ -44,6 +44,10 @@ class Step(Protocol):
         """(K, 15, 15) of the error state of every keyframe."""
 
     @property
+    def neighbour_covariance(self) -> Array:
+        """(K - 1, 15, 15) of the error states of every keyframe and the next."""
+
+    @property
     def sigma(self) -> Array:
         """Posterior sigmas in the shape of what ``retract`` moves by."""
 

@@ -15,7 +15,7 @@ from ssm_graph.graph.depth import depth_graph
 from ssm_graph.graph.interfaces import BeamRows, Misfit
 from ssm_graph.graph.keys import chain_ordering
 from ssm_graph.graph.marginal_prior import prior_at_start
-from ssm_graph.graph.solve import marginal_covariances, solve_linear
+from ssm_graph.graph.solve import LinearSolution, marginal_covariances, solve_linear
 from ssm_graph.graph.states import States, retract
 from ssm_graph.problem.error_state import (
     GYRO_BIAS,
@@ -73,8 +73,19 @@ def carried_covariance(A_i: Array, A_j: Array, covariance: Array) -> Array:
 class ChainStep(NamedTuple):
     """A step of the keyframes alone."""
 
-    delta: gtsam.VectorValues
+    solution: LinearSolution
     covariance: Array
+
+    @property
+    def delta(self) -> gtsam.VectorValues:
+        """Steps of the keyframes."""
+        return self.solution.delta
+
+    @property
+    def neighbour_covariance(self) -> Array:
+        """Between every keyframe and the next, (K - 1, 15, 15)."""
+        gain = np.linalg.solve(self.solution.R[:-1], self.solution.S[:-1])
+        return np.asarray(-gain @ self.covariance[1:])
 
     @property
     def sigma(self) -> Array:
@@ -154,7 +165,7 @@ class GraphLinearizer:
         """Return the step at ``states``, with their beam rows and weights (M,)."""
         linear = self.linearize(states, beam_rows, weights)
         solution = solve_linear(linear, self.ordering, n_keyframes=self.problem.n_keyframes)
-        return ChainStep(solution.delta, marginal_covariances(solution))
+        return ChainStep(solution, marginal_covariances(solution))
 
     def retract(
         self, states: States, delta: gtsam.VectorValues, *, scale: float = 1.0

@@ -90,6 +90,7 @@ def build_summary(
             "origin": "mission" if mission.initial is not None else "alignment",
         },
         "calibration": _calibration(estimate),
+        "noise": _noise(estimate),
         **(_comparison(metrics) if metrics is not None else {}),
         "settings": settings,
         "history": [
@@ -168,6 +169,20 @@ def _calibration(estimate: Estimate) -> dict[str, Any]:
             "determined": value.determined.name.lower(),
         }
         for value in estimate.calibration.values
+    }
+
+
+def _noise(estimate: Estimate) -> dict[str, Any]:
+    """Return the noise found, by beam, over the stated one; of the inertial data the test."""
+    noise = estimate.noise
+    if noise is None:
+        return {}
+    return {
+        "beam_sigma_estimated_over_stated": noise.beam_factor,
+        "beam_sigma_used_over_stated": noise.beam_used,
+        "beam_degrees_of_freedom": noise.beam_dof,
+        "inertial_chi_square": noise.inertial_chi_sq,
+        "inertial_degrees_of_freedom": noise.inertial_dof,
     }
 
 

@@ -6,9 +6,10 @@
 from ssm_graph.simulation.aids import DepthSettings, GnssSettings
 from ssm_graph.simulation.config import SimulationConfig
 from ssm_graph.simulation.dvl_model import DvlSettings, default_mount, janus_beams
-from ssm_graph.simulation.faults import Fault, Loss, OutlierKind, Outliers
+from ssm_graph.simulation.faults import Loss, OutlierKind, Outliers
 from ssm_graph.simulation.grades import IMU_NOISE, START_SIGMAS, Grade, StartSigmas
 from ssm_graph.simulation.mission import SimulatedMission, simulate, with_dvl_errors
+from ssm_graph.simulation.programmed import Fault, FaultShape
 from ssm_graph.simulation.routes import (
     DepthProfile,
     DiveRoute,
@@ -31,6 +32,7 @@ __all__ = [
     "DiveRoute",
     "DvlSettings",
     "Fault",
+    "FaultShape",
     "GnssSettings",
     "Grade",
     "HoverRoute",

@@ -11,8 +11,9 @@ from ssm_graph.data import ImuNoise
 from ssm_graph.simulation._checks import require, require_fraction, require_positive
 from ssm_graph.simulation.aids import DepthSettings, GnssSettings
 from ssm_graph.simulation.dvl_model import DvlSettings
-from ssm_graph.simulation.faults import Fault, Loss, Outliers
+from ssm_graph.simulation.faults import Loss, Outliers
 from ssm_graph.simulation.grades import IMU_NOISE, START_SIGMAS, Grade, StartSigmas
+from ssm_graph.simulation.programmed import Fault
 from ssm_graph.simulation.routes import Route, SurveyRoute
 from ssm_graph.simulation.trajectory import Trajectory, Waves
 

@@ -1,8 +1,7 @@
-"""What goes wrong with DVL beams: outliers of six kinds, programmed faults, dropouts, losses.
+"""What goes wrong with DVL beams at random: outliers of six kinds, dropouts; and losses.
 
 An outlier is an offset added to a beam's speed; a dropout or a loss takes the beam away. Events
-are placed at random from the generator handed in, programmed faults exactly where they are asked
-for.
+are placed at random from the generator handed in.
 """
 
 from __future__ import annotations
@@ -85,30 +84,6 @@ class Outliers:
     def low_high(self) -> tuple[float, float]:
         """The size, m/s, by default that of the kind."""
         return DEFAULT_SIZE[self.kind] if self.size is None else self.size
-
-
-@dataclass(frozen=True, slots=True)
-class Fault:
-    """A constant offset of some beams in ``[start_s, end_s)``."""
-
-    beams: tuple[int, ...]
-    """Beams from 0."""
-    start_s: float
-    end_s: float
-    offset_m_per_s: float | tuple[float, ...]
-    """m/s, one for all or one for each of ``beams``."""
-
-    def __post_init__(self) -> None:
-        require_beams("Fault.beams", self.beams, N_BEAMS)
-        require_window("Fault", self.start_s, self.end_s)
-        size = np.size(self.offset_m_per_s)
-        require(
-            size in (1, len(self.beams)),
-            "Fault.offset_m_per_s",
-            expected=f"1 or {len(self.beams)} offsets",
-            got=self.offset_m_per_s,
-            hint="give one offset for all beams or one for each",
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,18 +182,6 @@ def _place_events(
     gaps = np.sort(rng.uniform(0.0, max(total - sum(lengths), 0.0), size=len(lengths)))
     starts = time_s[0] + gaps + np.concatenate([[0.0], np.cumsum(lengths)[:-1]])[: len(lengths)]
     return [(start, start + length) for start, length in zip(starts, lengths, strict=True)]
-
-
-def add_faults(drawn: BeamFaults, faults: Sequence[Fault], time_s: Array) -> BeamFaults:
-    """Return ``drawn`` with the programmed faults added."""
-    offset, mask = drawn.offset.copy(), drawn.is_outlier.copy()
-    for fault in faults:
-        inside = (fault.start_s <= time_s) & (time_s < fault.end_s)
-        added = np.broadcast_to(fault.offset_m_per_s, len(fault.beams))
-        for beam, beam_offset in zip(fault.beams, added, strict=True):
-            offset[inside, beam] += beam_offset
-            mask[inside, beam] = True
-    return BeamFaults(offset, mask)
 
 
 def draw_missing(

@@ -15,16 +15,10 @@ from ssm_graph.earth import LocalFrame
 from ssm_graph.simulation.aids import depth_log, gnss_log
 from ssm_graph.simulation.config import SimulationConfig
 from ssm_graph.simulation.dvl_model import beam_ranges, ping_times, true_beam_speeds
-from ssm_graph.simulation.faults import (
-    Fault,
-    Loss,
-    Outliers,
-    add_faults,
-    draw_missing,
-    draw_outliers,
-)
+from ssm_graph.simulation.faults import Loss, Outliers, draw_missing, draw_outliers
 from ssm_graph.simulation.grades import initial_state
 from ssm_graph.simulation.imu_model import averaged_imu, imu_errors
+from ssm_graph.simulation.programmed import Fault, add_faults
 from ssm_graph.simulation.streams import Streams, spawn_streams
 from ssm_graph.simulation.trajectory import Trajectory
 
@@ -171,7 +165,7 @@ def _dvl(config: SimulationConfig, streams: Streams, time_s: Array, true_speed: 
     """Return the pings as read, and what was done to them."""
     settings = config.dvl
     drawn = draw_outliers(config.outliers, time_s, true_speed, rng=streams.outliers)
-    offset, is_outlier = add_faults(drawn, config.faults, time_s)
+    offset, is_outlier = add_faults(drawn, config.faults, time_s, true_speed)
     missing = draw_missing(
         time_s, config.losses, dropout_rate=config.dropout_rate, rng=streams.dropouts
     )

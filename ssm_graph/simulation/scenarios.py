@@ -11,7 +11,8 @@ from ssm_graph.errors import ConfigError, nearest_hint
 from ssm_graph.simulation.aids import GnssSettings
 from ssm_graph.simulation.config import SimulationConfig
 from ssm_graph.simulation.dvl_model import DvlSettings
-from ssm_graph.simulation.faults import Fault, Loss, OutlierKind, Outliers
+from ssm_graph.simulation.faults import Loss, OutlierKind, Outliers
+from ssm_graph.simulation.programmed import Fault
 from ssm_graph.simulation.routes import (
     DepthProfile,
     DiveRoute,

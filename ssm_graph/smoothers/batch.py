@@ -5,15 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
 
 import numpy as np
 
 from factors.m_estimators import TruncatedKernel
 from factors.similarity import Kernel, LogKernel, Similarity, expected_mahalanobis_sq
-from ssm_graph.data import Array
+from ssm_graph.data import N_BEAMS, Array
 from ssm_graph.errors import ConfigError, SolverError
-from ssm_graph.estimate import BeamTable, Estimate, Iteration, Status
+from ssm_graph.estimate import BeamTable, Estimate, Iteration, NoiseFound, Status
 from ssm_graph.graph.extended import ExtendedLinearizer
 from ssm_graph.graph.first_values import FirstValues, first_values
 from ssm_graph.graph.interfaces import BeamRows, Linearizer, Step
@@ -21,8 +20,11 @@ from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.states import States
 from ssm_graph.problem.problem import Problem
 from ssm_graph.problem.trajectory import trajectory_from_states
+from ssm_graph.smoothers.beam_faults import FaultSearch, FaultWatch
 from ssm_graph.smoothers.calibrated import calibration_of, undetermined
 from ssm_graph.smoothers.gnc import GncSchedule, Graduation, Schedule, WarmSchedule
+from ssm_graph.smoothers.noise import MAX_ADAPTATIONS, adaptation, noise_notes, with_sigmas
+from ssm_graph.smoothers.passes import Pass, Solved, descend, noise_of
 from ssm_graph.smoothers.verdict import contradictions
 
 __all__ = ["OnIteration", "Similarity", "SmootherConfig", "SsmSmoother"]
@@ -32,9 +34,6 @@ OnIteration = Callable[[int, int, Iteration], None]
 
 WARM_KERNEL = LogKernel()
 """Kernel of the first pass and of the first iterations, whichever is asked for in the end."""
-MAX_HALVINGS = 10
-COST_SLACK = 1e-2
-"""A rise of the cost by less is rounding: one residual at its sigma costs 0.5."""
 RUNAWAY_SPEED = 1e4
 """m/s; ten silent minutes of a MEMS unit may begin with 100 m/s and still come back."""
 
@@ -48,6 +47,10 @@ class SmootherConfig:
     """What a beam is judged by; None for what the kernel was published with."""
     graduation: Graduation | None = None
     """Come to a truncated kernel by graduated non-convexity; None goes straight to the kernel."""
+    fault_search: FaultSearch | None = None
+    """Look for stretches in which one beam is off for long, and leave them out; None does not."""
+    adapt_noise: bool = False
+    """Repeat the solution with the sigma of each beam that its errors ask for."""
     max_iterations: int = 100
     tolerance: float = 1e-3
     """Updates in their own posterior sigmas, and changes of weights, below which it has settled."""
@@ -81,43 +84,18 @@ class SmootherConfig:
         return GncSchedule(self.kernel, self.graduation, WARM_KERNEL)
 
 
-class _Pass(NamedTuple):
-    """State of the loop after one iteration."""
-
-    states: States
-    step: Step
-    beam_rows: BeamRows
-    mahalanobis_sq: Array
-    weights: Array
-    update_sigmas: float
-    weight_change: float
-
-
-def _descend(
-    linearizer: Linearizer,
-    states: States,
-    delta: Any,
-    weights: Array,
-    cost: float,
-) -> tuple[States, BeamRows, Array]:
-    """Take the Gauss-Newton step, halved while it raises the cost at these weights.
-
-    Returns the states moved to, their beams, and the whole step, (K, 15) or with all extra
-    variables, however little of it was taken: what is judged as settled is the step that was
-    wanted.
-    """
-    for halvings in range(MAX_HALVINGS):
-        scale = 0.5**halvings
-        moved, update = linearizer.retract(states, delta, scale=scale)
-        rows = linearizer.beam_rows(moved)
-        if linearizer.cost(moved, rows, weights) <= cost + COST_SLACK:
-            return moved, rows, update / scale
-    return states, linearizer.beam_rows(states), update / scale
-
-
 def linearizer_of(problem: Problem) -> Linearizer:
     """Return what linearises a problem: with extra variables, or the keyframes alone."""
     return ExtendedLinearizer(problem) if problem.extras else GraphLinearizer(problem)
+
+
+def _notes_of(first: FirstValues) -> tuple[str, ...]:
+    if first.n_doubts == 0:
+        return ()
+    return (
+        f"the first pass doubted its prediction {first.n_doubts} times: the beams contradicted it "
+        "together",
+    )
 
 
 def warm_start(problem: Problem) -> FirstValues:
@@ -154,18 +132,36 @@ class SsmSmoother:
         SolverError
             If no finite solution was found.
         """
-        begin = time.perf_counter()
+        begin, used = time.perf_counter(), np.ones(N_BEAMS)
+        iterations: tuple[Iteration, ...] = ()
+        for adaptations in range(MAX_ADAPTATIONS + 1):
+            solved = self._solve(problem, first, on_iteration)
+            iterations += solved.iterations
+            noise = noise_of(solved, used)
+            is_wanted = self.config.adapt_noise and solved.status is not Status.INTERRUPTED
+            change = adaptation(noise) if is_wanted and adaptations < MAX_ADAPTATIONS else None
+            if change is None:
+                break
+            used, problem, first = used * change, with_sigmas(problem, change), solved.again()
+        solved = solved._replace(iterations=iterations)
+        return self._estimate(solved, noise, wall_s=time.perf_counter() - begin)
+
+    def _solve(
+        self, problem: Problem, first: FirstValues | None, on_iteration: OnIteration | None
+    ) -> Solved:
+        """Iterate states and weights until both have settled."""
         linearizer = linearizer_of(problem)
         if first is None:
             first = first_values(problem, kernel=WARM_KERNEL, inertial=linearizer.inertial)
         states, rows = first.states, linearizer.beam_rows(first.states)
         schedule = self.config.schedule()
         weights = schedule.first_weights(first.weights)
+        faults = FaultWatch(problem, self.config.fault_search)
         iterations: list[Iteration] = []
         status = Status.MAX_ITERATIONS
         for number in range(self.config.max_iterations):
             try:
-                this = self._iterate(linearizer, states, rows, weights, schedule.kernel)
+                this = self._iterate(linearizer, states, rows, weights, schedule.kernel, faults)
             except KeyboardInterrupt:
                 if not iterations:
                     raise
@@ -178,20 +174,20 @@ class SsmSmoother:
             if on_iteration is not None:
                 on_iteration(number + 1, self.config.max_iterations, iterations[-1])
             is_settled = max(this.update_sigmas, this.weight_change) < self.config.tolerance
-            if is_settled and schedule.may_end(this.weights):
+            is_settled = is_settled and schedule.may_end(this.weights)
+            has_news = faults.look(
+                states, rows, update_sigmas=this.update_sigmas, is_settled=is_settled
+            )
+            if is_settled and not has_news:
                 status = Status.CONVERGED
                 break
-            weights = schedule.next_weights(
-                weights, this.weights, t=this.mahalanobis_sq, update_sigmas=this.update_sigmas
+            weights = faults.leave_out(
+                schedule.next_weights(
+                    weights, this.weights, t=this.mahalanobis_sq, update_sigmas=this.update_sigmas
+                )
             )
-        notes = problem.notes
-        if first.n_doubts:
-            notes += (
-                f"the first pass doubted its prediction {first.n_doubts} times: the beams "
-                "contradicted it together",
-            )
-        wall_s = time.perf_counter() - begin
-        return self._estimate(linearizer, this, tuple(iterations), status, notes, wall_s)
+        notes = problem.notes + faults.notes(rows.error) + _notes_of(first)
+        return Solved(linearizer, this, tuple(iterations), status, notes, first.n_doubts)
 
     def _iterate(
         self,
@@ -200,13 +196,14 @@ class SsmSmoother:
         rows: BeamRows,
         weights: Array,
         kernel: Kernel,
-    ) -> _Pass:
+        faults: FaultWatch,
+    ) -> Pass:
         problem = linearizer.problem
         if linearizer.follow(states):
             rows = linearizer.beam_rows(states)
         step = linearizer.solve(states, rows, weights)
         cost = linearizer.cost(states, rows, weights)
-        states, rows, update = _descend(linearizer, states, step.delta, weights, cost)
+        states, rows, update = descend(linearizer, states, step.delta, weights, cost)
         sigma = step.sigma
         speed = float(np.max(np.abs(states.v_n)))
         if not (np.all(np.isfinite(sigma)) and speed < RUNAWAY_SPEED):
@@ -215,9 +212,9 @@ class SsmSmoother:
                 "noise of [imu], and the initial heading"
             )
         t = self._mahalanobis_sq(problem, rows, step)
-        settled = kernel.weight(t)
+        settled = faults.leave_out(kernel.weight(t))
         change = float(np.max(np.abs(settled - weights), initial=0.0))
-        return _Pass(states, step, rows, t, settled, float(np.max(np.abs(update) / sigma)), change)
+        return Pass(states, step, rows, t, settled, float(np.max(np.abs(update) / sigma)), change)
 
     def _mahalanobis_sq(self, problem: Problem, rows: BeamRows, step: Step) -> Array:
         H, beams = rows.jacobian, problem.beams
@@ -227,7 +224,7 @@ class SsmSmoother:
             spread = step.variance(beams.keyframe, H)
         return expected_mahalanobis_sq(rows.error, spread, sigma=beams.sigma)
 
-    def _cost(self, linearizer: Linearizer, last: _Pass) -> float:
+    def _cost(self, linearizer: Linearizer, last: Pass) -> float:
         """Return the cost with each beam's robust loss in place of its weighted square."""
         kernel, rows = self.config.kernel, last.beam_rows
         t = (rows.error / linearizer.problem.beams.sigma) ** 2
@@ -235,15 +232,8 @@ class SsmSmoother:
         others = linearizer.cost(last.states, rows, np.zeros_like(t))
         return others + float(np.sum(loss))
 
-    def _estimate(
-        self,
-        linearizer: Linearizer,
-        last: _Pass,
-        iterations: tuple[Iteration, ...],
-        status: Status,
-        notes: tuple[str, ...],
-        wall_s: float,
-    ) -> Estimate:
+    def _estimate(self, solved: Solved, noise: NoiseFound, *, wall_s: float) -> Estimate:
+        linearizer, last, status = solved.linearizer, solved.last, solved.status
         reason = (
             f"{status.value}: last update {last.update_sigmas:.1e} sigma, largest weight change "
             f"{last.weight_change:.1e}"
@@ -267,10 +257,11 @@ class SsmSmoother:
                 mahalanobis_sq=last.mahalanobis_sq,
                 weight=last.weights,
             ),
-            iterations=iterations,
+            iterations=solved.iterations,
             wall_s=wall_s,
             cost=self._cost(linearizer, last),
             start=problem.start,
-            notes=notes + undetermined(calibration),
+            notes=solved.notes + noise_notes(noise) + undetermined(calibration),
             calibration=calibration,
+            noise=noise,
         )

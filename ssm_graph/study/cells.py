@@ -11,6 +11,7 @@ from typing import Final
 
 from ssm_graph.simulation import (
     Fault,
+    FaultShape,
     Grade,
     Loss,
     OutlierKind,
@@ -28,16 +29,19 @@ Label = str | float
 
 @dataclass(frozen=True, slots=True)
 class StudyFault:
-    """A constant offset of some beams, the same in every trial or on the next beams in each."""
+    """A programmed fault, the same in every trial or on the next beams in each."""
 
     beams: tuple[int, ...]
     """Beams from 0."""
     start_s: float
     length_s: float
-    offset_m_per_s: tuple[float, ...]
+    offset_m_per_s: tuple[float, ...] = (0.0,)
     """m/s, one for all or one for each of ``beams``."""
     is_turned_by_seed: bool = False
     """Whether the seed is added to the beams, modulo their number."""
+    shape: FaultShape = FaultShape.CONSTANT
+    share: float = 0.0
+    """By how much a covered beam reads low in the end."""
 
     def of_trial(self, seed: int) -> Fault:
         """Return the fault of one trial."""
@@ -48,6 +52,8 @@ class StudyFault:
             start_s=self.start_s,
             end_s=self.start_s + self.length_s,
             offset_m_per_s=offsets[0] if len(offsets) == 1 else offsets,
+            shape=self.shape,
+            share=self.share,
         )
 
 

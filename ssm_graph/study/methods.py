@@ -14,6 +14,7 @@ from ssm_graph.estimate import Estimate, OnKeyframe
 from ssm_graph.filters.geodetic import GeodeticConfig
 from ssm_graph.filters.named import FILTERS, FilterChoice, filter_geodetic, filter_problems
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
+from ssm_graph.smoothers.beam_faults import FaultSearch
 from ssm_graph.smoothers.fixed_lag import FixedLagConfig, solve_fixed_lag
 from ssm_graph.smoothers.gnc import Graduation
 from ssm_graph.study.trials import Trial
@@ -178,6 +179,11 @@ def _make_gnc(value: float | None) -> Solver:
     return _smoother(SmootherConfig(kernel, graduation=Graduation()))
 
 
+def _make_fault_search(value: float | None) -> Solver:
+    search = FaultSearch() if value is None else FaultSearch(significance=value)
+    return _smoother(SmootherConfig(fault_search=search))
+
+
 def _make_oracle(_: float | None) -> Solver:
     return _smoother(SmootherConfig(GaussianKernel()), is_oracle=True)
 
@@ -189,6 +195,11 @@ FAMILIES: Final[Mapping[str, Family]] = {
         f"smoother-plain-{name}": _kernel_family(name, KERNELS[name], Similarity.PLAIN)
         for name in ("log", "sqrt", "exp")
     },
+    "smoother-log-faults": Family(
+        "batch smoother, log kernel, without stretches of a beam off by so many sigmas of its mean",
+        _make_fault_search,
+        FaultSearch().significance,
+    ),
     **{name: _filter_family(name, choice) for name, choice in FILTERS.items()},
     **{
         f"{name}+rts": _filter_family(name, choice, smoothed=True)

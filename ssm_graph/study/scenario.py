@@ -13,6 +13,7 @@ from ssm_graph.errors import ConfigError, DataError, nearest_hint
 from ssm_graph.io.mission import read_mission
 from ssm_graph.simulation import (
     SCENARIOS,
+    FaultShape,
     Grade,
     Loss,
     OutlierKind,
@@ -208,12 +209,16 @@ def _case_name(outliers: Outliers) -> str:
 
 def _fault(table: TomlTable, duration_s: float) -> StudyFault:
     start_s, length_s = _window(table, duration_s)
+    shape = table.choice("shape", FaultShape, FaultShape.CONSTANT)
+    has_offset = shape in (FaultShape.CONSTANT, FaultShape.DRIFT)
     fault = StudyFault(
         beams=_beams(table, table.counts("beams")),
         start_s=start_s,
         length_s=length_s,
-        offset_m_per_s=table.numbers("offset_m_per_s"),
+        offset_m_per_s=table.numbers("offset_m_per_s") if has_offset else (0.0,),
         is_turned_by_seed=table.flag("turn_by_seed", False),
+        shape=shape,
+        share=table.number("share") if shape is FaultShape.COVERED else 0.0,
     )
     table.end()
     _checked(table, lambda: fault.of_trial(0))

@@ -112,6 +112,10 @@ class TomlTable:
             return default
         return tuple(self._choice(key, name, kinds) for name in self.texts(key))
 
+    def choice(self, key: str, kinds: type[_Choice], default: _Choice) -> _Choice:
+        """Return a member of an enumeration, named in lower case."""
+        return self._choice(key, self.text(key), kinds) if self.has(key) else default
+
     def _choice(self, key: str, name: str, kinds: type[_Choice]) -> _Choice:
         known = {member.name.lower(): member for member in kinds}
         if name not in known:

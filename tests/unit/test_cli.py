@@ -87,6 +87,13 @@ def test_smooth_calibrates_where_the_mission_asks_for_it(
     assert lines["dvl"]["scale_error"] == pytest.approx(found["dvl_scale_error"]["value"], abs=1e-6)
 
 
+def test_faults_are_searched_for_on_request(mission: Path, tmp_path: Path) -> None:
+    """The summary says that the search was on."""
+    words = ["smooth", str(mission), "--out", str(tmp_path), "--find-faults", "--no-figure"]
+    assert main(words) == ExitCode.GOOD
+    assert json.loads((tmp_path / "summary.json").read_text())["settings"]["find_faults"] is True
+
+
 def test_an_unconverged_run_is_marked_and_written(mission: Path, tmp_path: Path) -> None:
     """One iteration is not enough: exit code 4, results there, status plain."""
     words = ["smooth", str(mission), "--out", str(tmp_path), "--max-iterations", "1"]

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from ssm_graph.errors import ConfigError
-from ssm_graph.simulation import Fault, Loss, OutlierKind, Outliers
-from ssm_graph.simulation.faults import BeamFaults, add_faults, draw_missing, draw_outliers
+from ssm_graph.simulation import Fault, FaultShape, Loss, OutlierKind, Outliers
+from ssm_graph.simulation.faults import BeamFaults, draw_missing, draw_outliers
+from ssm_graph.simulation.programmed import add_faults
 
 N = 4000
 TIMES = np.arange(1.0, N + 1.0)
@@ -106,11 +107,27 @@ def test_programmed_faults_do_exactly_what_they_say() -> None:
         Fault(beams=(1, 3), start_s=200.0, end_s=215.0, offset_m_per_s=(0.5, -0.7)),
         Fault(beams=(1, 2), start_s=300.0, end_s=315.0, offset_m_per_s=0.4),
     )
-    done = add_faults(draw(OutlierKind.NONE), faults, TIMES)
+    done = add_faults(draw(OutlierKind.NONE), faults, TIMES, SPEED)
     assert done.is_outlier.sum(axis=0).tolist() == [40, 30, 15, 15]
     np.testing.assert_array_equal(done.offset[99:139, 0], 1.0)
     np.testing.assert_array_equal(done.offset[205], [0.0, 0.5, 0.0, -0.7])
     np.testing.assert_array_equal(done.offset[305], [0.0, 0.4, 0.4, 0.0])
+
+
+def test_slow_faults_begin_at_nothing() -> None:
+    """A drift comes to its offset evenly, a covered beam loses its share, a stuck one stays."""
+    faults = (
+        Fault((0,), 100.0, 200.0, 0.5, shape=FaultShape.DRIFT),
+        Fault((1,), 100.0, 200.0, shape=FaultShape.COVERED, share=0.4),
+        Fault((2, 3), 100.0, 200.0, shape=FaultShape.STUCK),
+    )
+    done = add_faults(draw(OutlierKind.NONE), faults, TIMES, SPEED)
+    assert done.is_outlier.sum(axis=0).tolist() == [100] * 4
+    np.testing.assert_allclose(done.offset[99:199, 0], 0.005 * np.arange(100.0))
+    np.testing.assert_allclose(done.offset[149, 1], -0.2 * SPEED[149, 1])
+    stuck = (SPEED + done.offset)[99:199, 2:]
+    np.testing.assert_allclose(stuck, np.broadcast_to(SPEED[99, 2:], stuck.shape))
+    assert not done.offset[199:].any()
 
 
 def test_losses_and_dropouts() -> None:
@@ -141,6 +158,10 @@ def test_impossible_faults_are_refused() -> None:
         Fault(beams=(4,), start_s=0.0, end_s=1.0, offset_m_per_s=1.0)
     with pytest.raises(ConfigError, match=r"Fault\.offset_m_per_s: expected 1 or 2 offsets"):
         Fault(beams=(0, 1), start_s=0.0, end_s=1.0, offset_m_per_s=(1.0, 2.0, 3.0))
+    with pytest.raises(ConfigError, match=r"Fault\.offset_m_per_s: expected none with STUCK"):
+        Fault((0,), 0.0, 1.0, 1.0, shape=FaultShape.STUCK)
+    with pytest.raises(ConfigError, match=r"Fault\.share: .*30 % as 0\.3"):
+        Fault((0,), 0.0, 1.0, shape=FaultShape.COVERED, share=30.0)
     with pytest.raises(ConfigError, match="Loss: expected start_s < end_s"):
         Loss(10.0, 10.0)
     with pytest.raises(ConfigError, match="Fault: expected"):

@@ -13,7 +13,7 @@ from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.solve import solve_linear
 from ssm_graph.graph.states import States, retract, states_from_arrays
 from ssm_graph.problem.problem import build_problem
-from ssm_graph.smoothers.batch import _descend
+from ssm_graph.smoothers.passes import descend
 from tests.helpers import simulated, state_errors, true_states
 
 
@@ -42,7 +42,7 @@ def same(a: States, b: States) -> bool:
 def test_a_good_step_is_taken_whole() -> None:
     """And is what the linear solution says."""
     linearizer, states, delta, weights, cost = off_the_minimum()
-    moved, rows, update = _descend(linearizer, states, delta, weights, cost)
+    moved, rows, update = descend(linearizer, states, delta, weights, cost)
     expected, step = retract(states, delta)
     assert same(moved, expected)
     np.testing.assert_array_equal(update, step)
@@ -54,7 +54,7 @@ def test_a_good_step_is_taken_whole() -> None:
 def test_a_step_too_long_is_halved(overshoot: float, taken: float) -> None:
     """Beyond twice the way to the minimum the cost rises; what is judged is the step wanted."""
     linearizer, states, delta, weights, cost = off_the_minimum()
-    moved, _, update = _descend(linearizer, states, delta.scale(overshoot), weights, cost)
+    moved, _, update = descend(linearizer, states, delta.scale(overshoot), weights, cost)
     assert same(moved, retract(states, delta, scale=taken)[0])
     np.testing.assert_allclose(update, retract(states, delta, scale=overshoot)[1], rtol=1e-12)
 
@@ -62,7 +62,7 @@ def test_a_step_too_long_is_halved(overshoot: float, taken: float) -> None:
 def test_a_step_uphill_is_not_taken_nor_taken_for_settled() -> None:
     """The states stay, and the update remains as large as it was."""
     linearizer, states, delta, weights, cost = off_the_minimum()
-    moved, rows, update = _descend(linearizer, states, delta.scale(-100.0), weights, cost)
+    moved, rows, update = descend(linearizer, states, delta.scale(-100.0), weights, cost)
     assert same(moved, states)
     np.testing.assert_array_equal(rows.error, linearizer.beam_rows(states).error)
     expected = retract(states, delta, scale=-100.0)[1]

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from ssm_graph.errors import ConfigError, DataError
-from ssm_graph.simulation import Grade, Loss, OutlierKind
+from ssm_graph.simulation import FaultShape, Grade, Loss, OutlierKind
 from ssm_graph.study.cells import Cell
 from ssm_graph.study.plan import wanted_keys
 from ssm_graph.study.scenario import Study, read_study, study_from, study_of_folders
@@ -85,6 +85,29 @@ def test_faults_follow_the_seed() -> None:
     )
     assert fixed.faults_of(3)[0].beams == (0, 1)
     assert fixed.faults_of(3)[0].offset_m_per_s == 1.0
+
+
+def test_slow_faults_have_a_shape() -> None:
+    """Each with the size that belongs to it."""
+    window = {"beams": [1], "start_s": 5, "length_s": 4}
+    (cell,) = cells_of(
+        {
+            "name": "f",
+            "faults": [
+                {**window, "shape": "drift", "offset_m_per_s": 0.1},
+                {**window, "shape": "covered", "share": 0.3},
+                {**window, "shape": "stuck"},
+            ],
+        }
+    )
+    drift, covered, stuck = cell.faults_of(0)
+    assert (drift.shape, drift.offset_m_per_s) == (FaultShape.DRIFT, 0.1)
+    assert (covered.shape, covered.share) == (FaultShape.COVERED, 0.3)
+    assert stuck.shape is FaultShape.STUCK
+    with pytest.raises(ConfigError, match="share: expected a finite number, got nothing"):
+        cells_of({"name": "f", "faults": [{**window, "shape": "covered"}]})
+    with pytest.raises(ConfigError, match="shape: expected some of constant, drift"):
+        cells_of({"name": "f", "faults": [{**window, "shape": "silt"}]})
 
 
 def test_few_beams_are_lost_for_minutes() -> None:

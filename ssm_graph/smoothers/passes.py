@@ -1,0 +1,79 @@
+"""One pass of the similarity loop, and what a loop ended with."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from ssm_graph.data import Array
+from ssm_graph.estimate import Iteration, NoiseFound, Status
+from ssm_graph.graph.first_values import FirstValues
+from ssm_graph.graph.inertial_fit import inertial_fit
+from ssm_graph.graph.interfaces import BeamRows, Linearizer, Step
+from ssm_graph.graph.states import States
+from ssm_graph.smoothers.noise import noise_found
+
+MAX_HALVINGS = 10
+COST_SLACK = 1e-2
+"""A rise of the cost by less is rounding: one residual at its sigma costs 0.5."""
+
+
+class Pass(NamedTuple):
+    """State of the loop after one iteration."""
+
+    states: States
+    step: Step
+    beam_rows: BeamRows
+    mahalanobis_sq: Array
+    weights: Array
+    update_sigmas: float
+    weight_change: float
+
+
+class Solved(NamedTuple):
+    """How a solution ended."""
+
+    linearizer: Linearizer
+    last: Pass
+    iterations: tuple[Iteration, ...]
+    status: Status
+    notes: tuple[str, ...]
+    n_doubts: int
+
+    def again(self) -> FirstValues:
+        """Return where another solution may start."""
+        return FirstValues(self.last.states, self.last.weights, self.n_doubts)
+
+
+def noise_of(solved: Solved, used: Array) -> NoiseFound:
+    """Return what a solution says of the noise; ``used`` (4,) are its sigmas over the stated."""
+    linearizer, last = solved.linearizer, solved.last
+    return noise_found(
+        linearizer.problem,
+        error=last.beam_rows.error,
+        variance=last.step.variance(linearizer.problem.beams.keyframe, last.beam_rows.jacobian),
+        weights=last.weights,
+        inertial=inertial_fit(linearizer.inertial, last.states.values, last.step),
+        used=used,
+    )
+
+
+def descend(
+    linearizer: Linearizer,
+    states: States,
+    delta: Any,
+    weights: Array,
+    cost: float,
+) -> tuple[States, BeamRows, Array]:
+    """Take the Gauss-Newton step, halved while it raises the cost at these weights.
+
+    Returns the states moved to, their beams, and the whole step, (K, 15) or with all extra
+    variables, however little of it was taken: what is judged as settled is the step that was
+    wanted.
+    """
+    for halvings in range(MAX_HALVINGS):
+        scale = 0.5**halvings
+        moved, update = linearizer.retract(states, delta, scale=scale)
+        rows = linearizer.beam_rows(moved)
+        if linearizer.cost(moved, rows, weights) <= cost + COST_SLACK:
+            return moved, rows, update / scale
+    return states, linearizer.beam_rows(states), update / scale
