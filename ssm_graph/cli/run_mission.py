@@ -119,10 +119,11 @@ def withhold_gnss(mission: Mission, until_s: float) -> tuple[Mission, GnssLog]:
             f"--gnss-until: expected a time between the first fix at {first:.1f} s and the last "
             f"at {last:.1f} s, got {until_s:g} s"
         )
-    return replace(mission, gnss=_fixes(gnss, used)), _fixes(gnss, ~used)
+    return replace(mission, gnss=fixes_where(gnss, used)), fixes_where(gnss, ~used)
 
 
-def _fixes(gnss: GnssLog, kept: np.ndarray[Any, np.dtype[np.bool_]]) -> GnssLog:
+def fixes_where(gnss: GnssLog, kept: np.ndarray[Any, np.dtype[np.bool_]]) -> GnssLog:
+    """Return the fixes that a mask (N,) keeps."""
     return replace(
         gnss,
         time_s=gnss.time_s[kept],

@@ -37,6 +37,7 @@ from ssm_graph.data import (
 from ssm_graph.earth import LocalFrame, normal_gravity
 from ssm_graph.errors import DataError
 from ssm_graph.io.blueye_log import GNSS_SENSOR_ID, BlueyeTables, read_blueye_tables
+from ssm_graph.io.blueye_witness import compare_imus
 
 STANDARD_GRAVITY: Final = 9.80665
 """m/s^2, of an accelerometer that counts in g."""
@@ -103,7 +104,14 @@ def convert_blueye(log: Path) -> Mission:
         dvl=dvl,
         depth=depth,
         gnss=gnss,
-        notes=(*imu_notes, *_gravity_notes(imu, frame), *dvl_notes, *gnss_notes, assumed),
+        notes=(
+            *imu_notes,
+            *compare_imus(imu, tables.witness),
+            *_gravity_notes(imu, frame),
+            *dvl_notes,
+            *gnss_notes,
+            assumed,
+        ),
     )
 
 
@@ -223,7 +231,9 @@ def _dvl(tables: BlueyeTables, imu: ImuLog) -> tuple[DvlLog, tuple[str, ...]]:
         raise DataError("DvlVelocityTel: fewer than two new reports while the IMU ran")
     speed, valid, ranges = np.split(table[:, 4 : 4 + 3 * N_BEAMS], 3, axis=1)
     water_track = table[:, 2:3] > 0.0
-    speed = np.where((valid > 0.0) & ~water_track, speed, np.nan)
+    is_one_number = np.ptp(speed, axis=1, keepdims=True) == 0.0
+    speed = np.where((valid > 0.0) & ~water_track & ~is_one_number, speed, np.nan)
+    _check_lock(speed, is_one_number, valid)
     log = DvlLog(
         mount=_dvl_mount(),
         time_s=time_s,
@@ -235,10 +245,27 @@ def _dvl(tables: BlueyeTables, imu: ImuLog) -> tuple[DvlLog, tuple[str, ...]]:
         f"DvlVelocityTel: {len(table)} new reports among {len(tables.dvl)} messages, stamped by "
         f"the sum of delta_time (arrivals scatter by {jitter_ms:.1f} ms rms), {DVL_DELAY_S} s "
         f"late; {int(np.isnan(speed).sum())} beams without bottom lock, {int(water_track.sum())} "
-        f"reports of water track dropped, {int(np.sum(table[:, 3] != 0.0))} with a fault status "
+        f"reports of water track dropped, {int(is_one_number.sum())} with one number in all four "
+        f"beams left out, {int(np.sum(table[:, 3] != 0.0))} with a fault status "
         "kept for their beams."
     )
     return log, (note,)
+
+
+def _check_lock(speed: Array, is_one_number: Array, valid: Array) -> None:
+    """Refuse a log whose beams (N, 4) say nothing, and say why."""
+    if np.isfinite(speed).any():
+        return
+    why = "no beam is flagged valid: was there bottom lock at all?"
+    if is_one_number.mean() > 0.5:
+        why = (
+            "four beams hold the same number: the driver writes one value into all of them; "
+            "export the transducers' velocities"
+        )
+    raise DataError(
+        f"DvlVelocityTel: expected beam speeds, got none in {len(speed)} reports "
+        f"({int(np.sum(valid > 0.0))} beams flagged valid); {why}"
+    )
 
 
 def _depth(tables: BlueyeTables) -> DepthLog:

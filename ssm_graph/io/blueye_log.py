@@ -15,6 +15,8 @@ PREFIX: Final = "blueye.protocol."
 TOPICS: Final = tuple(
     PREFIX + name for name in ("Imu2Tel", "DvlVelocityTel", "DepthTel", "PositionEstimateTel")
 )
+WITNESS: Final = PREFIX + "Imu1Tel"
+"""The vehicle's other IMU, which a log need not have."""
 GNSS_SENSOR_ID: Final = 4
 
 
@@ -22,7 +24,9 @@ class BlueyeTables(NamedTuple):
     """The topics as they were logged, repeats included; first columns are arrival times, Unix s."""
 
     imu: Array
-    """(N, 7) time, gyro x, y, z and accelerometer x, y, z in the log's units."""
+    """(N, 7) time, gyro x, y, z and accelerometer x, y, z in the log's units, of Imu2Tel."""
+    witness: Array
+    """(N, 7) the same of Imu1Tel; no rows where the log has none."""
     dvl: Array
     """(N, 19) time, delta_time in ms, water track, status, then of beams 1 to 4 the speeds in m/s,
     validity and ranges in m, then the velocity in m/s, forward-right-down."""
@@ -37,7 +41,7 @@ class BlueyeTables(NamedTuple):
 def read_blueye_tables(log: Path) -> BlueyeTables:
     """Return the messages of a log as arrays, in order of arrival; raises as `convert_blueye`."""
     rows: dict[str, list[tuple[float, ...]]] = {
-        name: [] for name in ("imu", "dvl", "depth", "yaw_rate", "gnss")
+        name: [] for name in ("imu", "witness", "dvl", "depth", "yaw_rate", "gnss")
     }
     for topic, time_s, message in _messages(log):
         try:
@@ -51,6 +55,7 @@ def read_blueye_tables(log: Path) -> BlueyeTables:
         raise DataError(f"{log}: IMU, depth or GNSS hold values that are not finite")
     return BlueyeTables(
         imu=np.array(rows["imu"]),
+        witness=np.array(rows["witness"]).reshape(-1, 7),
         dvl=np.array(rows["dvl"]),
         depth=np.array(rows["depth"]),
         yaw_rate=np.array(rows["yaw_rate"]).reshape(-1, 2),
@@ -77,7 +82,7 @@ def _messages(log: Path) -> Iterator[tuple[str, float, Any]]:
                     f"{log}: expected the topics of a Blueye X3 log, {', '.join(missing)} missing; "
                     f"found: {', '.join(sorted(found)) or 'none'}"
                 )
-            for _, channel, raw, message in reader.iter_decoded_messages(topics=TOPICS):
+            for _, channel, raw, message in reader.iter_decoded_messages(topics=(*TOPICS, WITNESS)):
                 yield channel.topic, raw.log_time * 1e-9, message
     except OSError as error:
         raise DataError(f"{log}: cannot be read: {error.strerror or error}") from error
@@ -91,9 +96,11 @@ def _messages(log: Path) -> Iterator[tuple[str, float, Any]]:
 
 
 def _append(rows: dict[str, list[tuple[float, ...]]], topic: str, time: float, msg: Any) -> None:
-    if topic == "Imu2Tel":
+    if topic in ("Imu1Tel", "Imu2Tel"):
         gyro, accel = msg.imu.gyroscope, msg.imu.accelerometer
-        rows["imu"].append((time, gyro.x, gyro.y, gyro.z, accel.x, accel.y, accel.z))
+        rows["imu" if topic == "Imu2Tel" else "witness"].append(
+            (time, gyro.x, gyro.y, gyro.z, accel.x, accel.y, accel.z)
+        )
     elif topic == "DvlVelocityTel":
         dvl = msg.dvl_velocity
         beams = sorted(dvl.transducers, key=lambda beam: int(beam.id))

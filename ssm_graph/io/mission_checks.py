@@ -32,6 +32,8 @@ RATE_RANGE_HZ: Final = (5.0, 20000.0)
 """A slower IMU cannot carry a vehicle's motion between pings; a faster one has other units."""
 LONGEST_GAP_S: Final = 10.0
 NOTED_GAP_S: Final = 0.1
+NOTED_JITTER: Final = 0.1
+"""Scatter of the steps between samples, of their median; an instrument's own clock has no more."""
 FORCE_RANGE: Final = (9.3, 10.3)
 """m/s^2: no bias or scale error of a usable accelerometer leads out of it."""
 FASTEST_TURN: Final = 6.0
@@ -131,12 +133,20 @@ def _imu_times(table: Table) -> list[str]:
             f"longer than {LONGEST_GAP_S:g} s; split the mission there",
         )
     gaps = steps > max(NOTED_GAP_S, 5.0 * median)
+    notes = []
+    jitter = float(np.std(steps[~gaps])) / median
+    if jitter > NOTED_JITTER:
+        notes.append(
+            f"{table.label}: the steps in time scatter by {100.0 * jitter:.0f} % of their median, "
+            f"{median:z.4f} s: times of arrival, not the sensor's own; each reading counts for the "
+            "step before it"
+        )
     if gaps.any():
-        return [
+        notes.append(
             f"{table.label}: {gaps.sum()} gaps in time, the longest {steps[row]:z.3f} s after "
             f"{table.time_s[row]:z.3f} s; the reading after a gap is held over all of it"
-        ]
-    return []
+        )
+    return notes
 
 
 def _specific_force(table: Table) -> None:

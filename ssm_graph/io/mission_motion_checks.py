@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 
 from ssm_graph.data import N_BEAMS, Array, DepthLog, Mission
+from ssm_graph.earth import EARTH_RATE
 from ssm_graph.errors import DataError
 
 _UPWARD_M: Final = 2.0
@@ -24,6 +25,18 @@ _TINY_GAIN: Final = 0.04
 _SMALLEST_TILT: Final = 0.02
 """rad rms in one window."""
 _TILT_STEP_S: Final = 1.0
+_TILT_NOISE: Final = 0.1
+"""rad, of the tilt by the accelerometer at either end of a mission, waves included."""
+_BIAS_SIGMAS: Final = 4.0
+_REST_S: Final = 10.0
+_REST_FORCE: Final = 0.05
+"""m/s^2, scatter of the specific force of a vehicle at rest."""
+_REST_RATE: Final = 0.01
+"""rad/s, scatter of its turn rates."""
+_REST_SPEED: Final = 0.03
+"""m/s along the beams"""
+_LAGS_S: Final = np.arange(-0.5, 0.51, 0.02)
+_NOTED_LAG_S: Final = 0.05
 
 
 def check_motion(mission: Mission, labels: dict[str, str]) -> list[str]:
@@ -34,6 +47,7 @@ def check_motion(mission: Mission, labels: dict[str, str]) -> list[str]:
         notes += _depth_surface(mission, mission.depth, labels["depth"])
         notes += _vertical_speed(mission, mission.depth, labels)
     notes += _turn_signs(mission, labels["imu"])
+    notes += _rates_at_rest(mission, labels["imu"])
     notes += _beams_agree(mission, labels["dvl"])
     return notes
 
@@ -97,12 +111,13 @@ def _vertical_speed(mission: Mission, depth: DepthLog, labels: dict[str, str]) -
     half = 0.5 * max(_WINDOW_S, 2.0 * float(np.median(np.diff(depth.time_s, prepend=-np.inf))))
     begin = max(imu.time_s[0], depth.time_s[0]) + half
     end = min(imu.time_s[-1], depth.time_s[-1]) - half
-    used = np.isfinite(dvl.speed).all(axis=1) & (dvl.time_s > begin) & (dvl.time_s < end)
+    begin, end = begin + _LAGS_S[-1], end + _LAGS_S[0]
+    used = np.isfinite(dvl.speed).all(axis=1) & (dvl.ping_s > begin) & (dvl.ping_s < end)
     if used.sum() < _FEWEST_PINGS:
         return []
     left_over = _left_over(mission, dvl.speed)
     used &= left_over <= 3.0 * np.median(left_over[used])  # without most of the outliers
-    time_s = dvl.time_s[used]
+    time_s = dvl.ping_s[used]
     v_b = dvl.speed[used] @ np.linalg.pinv(dvl.mount.beams_b).T
     speed = -np.sum(_force_direction(mission, time_s, half) * v_b, axis=1)
     rate = _difference(time_s, half, depth.time_s, depth.depth) / (2.0 * half)
@@ -122,7 +137,25 @@ def _vertical_speed(mission: Mission, depth: DepthLog, labels: dict[str, str]) -
             f"{labels['depth']}: the depth changes {ratio:.2f} times as fast as the DVL goes down; "
             "check the unit of the beam speeds and beam_janus_deg"
         ]
-    return []
+    return _vertical_lag(time_s, speed, half, depth, labels) if correlation > 0.5 else []
+
+
+def _vertical_lag(
+    time_s: Array, speed: Array, half: float, depth: DepthLog, labels: dict[str, str]
+) -> list[str]:
+    """Note a downward speed that fits the change of depth at another time far better."""
+    rates = [_difference(time_s - lag, half, depth.time_s, depth.depth) for lag in _LAGS_S]
+    misfit = 1.0 - np.array([np.corrcoef(speed, rate)[0, 1] for rate in rates]) ** 2
+    best = int(np.argmin(misfit))
+    lag = float(_LAGS_S[best])
+    now = misfit[np.argmin(np.abs(_LAGS_S))]
+    if abs(lag) < _NOTED_LAG_S or not misfit[best] < min(0.5 * now, 0.2):
+        return []
+    return [
+        f"{labels['dvl']}: the DVL's downward speed fits the change of {labels['depth']} best "
+        f"{abs(lag):.2f} s {'earlier' if lag > 0.0 else 'later'} than it is stamped; one of the "
+        "two is late: time_offset_s of [dvl] can say so"
+    ]
 
 
 def _turn_signs(mission: Mission, label: str) -> list[str]:
@@ -140,7 +173,60 @@ def _turn_signs(mission: Mission, label: str) -> list[str]:
     notes = []
     for axis, motion in enumerate(("pitches", "rolls")):
         notes += _tilt_agrees(seen[:, axis], predicted[:, axis], f"{label}: the vehicle {motion}")
-    return notes
+    return notes + _level_bias(mission, (seen - predicted).mean(axis=0) / (2.0 * half), label)
+
+
+def _level_bias(mission: Mission, drift: Array, label: str) -> list[str]:
+    """Note gyros about the level axes that read far more than the vehicle tilts.
+
+    Parameters
+    ----------
+    mission : the recorded run.
+    drift : (3,) how fast the direction of the specific force leaves the one by the gyros, 1/s;
+        that is ``bias x force``.
+    label : the table.
+    """
+    force = np.median(mission.imu.accel_b, axis=0)
+    bias = np.cross(force / np.linalg.norm(force), drift)
+    noise, span = mission.imu.noise, float(mission.imu.time_s[-1] - mission.imu.start_s)
+    spread = (noise.gyro_density / np.sqrt(span), _TILT_NOISE / span)
+    size, limit = float(np.linalg.norm(bias)), float(np.hypot(*spread))
+    if size < EARTH_RATE + _BIAS_SIGMAS * np.hypot(noise.gyro_bias_sigma, limit):
+        return []
+    return [
+        f"{label}: over the mission the gyros turn by {_deg_per_h(bias)} deg/h about x, y, z more "
+        "than the vehicle tilts, far beyond gyro_bias_deg_per_h = "
+        f"{_deg_per_h(noise.gyro_bias_sigma)}: that is a bias, and the axis along gravity, which "
+        "this does not see, may have one too; take it off or state it"
+    ]
+
+
+def _rates_at_rest(mission: Mission, label: str) -> list[str]:
+    """Note gyros that turn while the accelerometer and the DVL are still."""
+    imu, noise = mission.imu, mission.imu.noise
+    spread = np.hypot(noise.gyro_bias_sigma, noise.gyro_density / _REST_S**0.5)
+    limit = EARTH_RATE + _BIAS_SIGMAS * float(spread)
+    for begin in np.arange(imu.start_s, imu.time_s[-1] - _REST_S, _REST_S):
+        now = (imu.time_s > begin) & (imu.time_s <= begin + _REST_S)
+        ping = (mission.dvl.ping_s > begin) & (mission.dvl.ping_s <= begin + _REST_S)
+        speed = mission.dvl.speed[ping]
+        if now.sum() < _FEWEST_PINGS or not np.isfinite(speed).any():
+            continue
+        is_still = np.max(np.std(imu.accel_b[now], axis=0)) < _REST_FORCE
+        is_still &= np.max(np.std(imu.gyro_b[now], axis=0)) < _REST_RATE
+        mean = imu.gyro_b[now].mean(axis=0)
+        if is_still and np.nanmedian(np.abs(speed)) < _REST_SPEED and np.abs(mean).max() > limit:
+            return [
+                f"{label}: from {begin:z.1f} s on the vehicle lies still for {_REST_S:g} s by "
+                f"accelerometer and DVL, and the gyros read {_deg_per_h(mean)} deg/h about x, y, "
+                f"z; gyro_bias_deg_per_h = {_deg_per_h(noise.gyro_bias_sigma)}: a bias, or a "
+                "steady turn on the spot"
+            ]
+    return []
+
+
+def _deg_per_h(rate: Array | float) -> str:
+    return ", ".join(f"{x + 0.0:.0f}" for x in np.atleast_1d(np.degrees(rate) * 3600.0))
 
 
 def _tilt_agrees(seen: Array, predicted: Array, subject: str) -> list[str]:

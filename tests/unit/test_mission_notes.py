@@ -71,6 +71,16 @@ ODD: dict[str, tuple[Damage, tuple[str, ...]]] = {
         columns("imu.csv", [*GYRO, *ACCEL], lambda v: v[(np.arange(len(v)) // 2) * 2]),
         ("imu.csv", "50 % of the rows repeat"),
     ),
+    "gyro bias": (
+        columns("imu.csv", GYRO, lambda w: w + np.array([0.03, -0.02, 0.0])),
+        ("imu.csv", "6192, -4135, -0 deg/h about x, y, z more than the vehicle tilts"),
+    ),
+    "stamped at arrival": (
+        columns(
+            "imu.csv", ["time_s"], lambda t: t + 0.03 * np.random.default_rng(0).random(t.shape)
+        ),
+        ("imu.csv", "scatter by", "times of arrival"),
+    ),
     "no newline at the end": (
         raw("dvl.csv", lambda content: content.rstrip()),
         ("dvl.csv", "no newline"),

@@ -1,0 +1,239 @@
+"""Real runs of a Blueye X3 against GNSS that was withheld: ``python benchmarks/field.py --keep``.
+
+Some twenty minutes on one core; a quick look is ``--runs square,grid --seeds 1 --methods log``. The
+logs are looked for in ``$SSM_GRAPH_DATA/blueye_x3``, else in ``../shared/data/blueye_x3``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import shlex
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from benchmarks.field_runs import (
+    FILTER,
+    LOGS,
+    MODES,
+    RUNS,
+    SMOOTHERS,
+    SURFACE,
+    Case,
+    Faults,
+    Protocol,
+    Score,
+    evaluate_case,
+    load,
+    track_of,
+    used_fixes,
+)
+from benchmarks.speed import machine, table
+from ssm_graph.data import Mission
+from ssm_graph.report.compare_style import add_footnote, new_figure, save
+from ssm_graph.report.style import ESTIMATE, INK, OUTLIER, REFERENCE, dress
+
+RESULTS = Path(__file__).resolve().parent / "results"
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+CUTS = (45.0, 55.0, 62.0, 70.0, 80.0, 90.0, 100.0, 110.0, 120.0)
+"""s, other ends of GNSS for protocol A: 70 s alone is one draw of its noise."""
+TO_BEAT = {
+    Protocol.A: {"square": (1.8, 1.2), "grid": (0.39, 2.0)},
+    Protocol.B: {"square": (0.93,), "grid": (0.32,)},
+    Protocol.C: {"square": (0.15,), "grid": (0.15,)},
+}
+"""m: a draft graph tuned on these very runs, and the better of the log author's two filters."""
+
+Scores = dict[Case, Score]
+Missions = Mapping[tuple[str, bool], Mission]
+"""By run, and whether the calibration is estimated."""
+
+
+def cases(runs: Sequence[str], methods: Sequence[str], seeds: int) -> Iterator[Case]:
+    """Yield every cell: the filter for protocol A alone, one seed for the dive."""
+    for run, protocol, method, is_calibrated in product(runs, Protocol, methods, MODES):
+        if method == FILTER and (protocol is not Protocol.A or is_calibrated):
+            continue
+        if run not in SURFACE and protocol is not Protocol.A and method != methods[0]:
+            continue  # eight headings are tried there, twenty seconds each time
+        for faults in Faults:
+            n = 1 if faults is Faults.CLEAN or run not in SURFACE else seeds
+            yield from (
+                Case(run, protocol, method, is_calibrated, faults, seed) for seed in range(n)
+            )
+
+
+def report(scores: Scores) -> list[str]:
+    """Return the tables of all protocols."""
+    lines: list[str] = []
+    for protocol in Protocol:
+        lines += [f"## {protocol.name}: {protocol.value}", ""]
+        lines += ["### Clean beams", "", *_clean_table(scores, protocol), ""]
+        lines += ["### Faults injected, mean and largest over the seeds", ""]
+        lines += [*_fault_table(scores, protocol), ""]
+    return lines
+
+
+def _clean_table(scores: Scores, protocol: Protocol) -> list[str]:
+    header = ["run", "method", "calibration", "rms, m", "of the path", "end, m", "of the path"]
+    header += ["path, m", "heading sigma, deg", "error / sigma", "verdict"]
+    rows = []
+    for case, score in scores.items():
+        if case.protocol is protocol and case.faults is Faults.CLEAN:
+            rows.append([case.run, case.method, _word(case.is_calibrated), *_cells(score)])
+    beat = [
+        f"{run}: {' and '.join(f'{x:g} m' for x in values)}"
+        for run, values in TO_BEAT[protocol].items()
+    ]
+    return [*table(header, rows), "", f"To beat: {'; '.join(beat)} rms."]
+
+
+def _cells(score: Score) -> list[str]:
+    if not math.isfinite(score.rms_m):
+        return ["–", "–", "–", "–", "–", "–", "–", score.status]
+    return [
+        f"{score.rms_m:.2f}",
+        f"{score.percent:.2f} %",
+        f"{score.end_m:.2f}",
+        f"{100.0 * score.end_m / score.path_m:.2f} %",
+        f"{score.path_m:.0f}",
+        f"{math.degrees(score.heading_sigma):.1f}",
+        f"{score.ratio:.2f}",
+        score.status,
+    ]
+
+
+def _fault_table(scores: Scores, protocol: Protocol) -> list[str]:
+    header = ["run", "method", "calibration", "clean, m"]
+    header += [f"{faults.name.lower()}, m" for faults in Faults if faults is not Faults.CLEAN]
+    rows = []
+    keys = dict.fromkeys(
+        (c.run, c.method, c.is_calibrated) for c in scores if c.protocol is protocol
+    )
+    for run, method, is_calibrated in keys:
+        cells = [_spread(scores, run, protocol, method, is_calibrated, faults) for faults in Faults]
+        rows.append([run, method, _word(is_calibrated), *cells])
+    return table(header, rows)
+
+
+def _spread(
+    scores: Scores, run: str, protocol: Protocol, method: str, is_calibrated: bool, faults: Faults
+) -> str:
+    some = [s for c, s in scores.items() if c[:5] == (run, protocol, method, is_calibrated, faults)]
+    rms = np.array([score.rms_m for score in some])
+    if not np.isfinite(rms).any():
+        return "–"
+    doubted = [s.status for s in some if s.status != "CONVERGED"]
+    verdict = f", {len(doubted)} of {len(some)} not CONVERGED" if doubted else ""
+    if len(rms) == 1:
+        return f"{rms[0]:.2f}{verdict}"
+    return f"{np.nanmean(rms):.2f}, {np.nanmax(rms):.2f}{verdict}"
+
+
+def _word(is_calibrated: bool) -> str:
+    return "estimated" if is_calibrated else "exact"
+
+
+def cuts_lines(missions: Missions) -> list[str]:
+    """Return the error of protocol A against when GNSS ends, kernel log, in % of the path."""
+    rows, every = [], []
+    for (run, is_calibrated), mission in missions.items():
+        if run not in SURFACE:
+            continue
+        case = Case(run, Protocol.A, "log", is_calibrated, Faults.CLEAN, 0)
+        scores = [evaluate_case(mission, case, until_s) for until_s in CUTS]
+        percent = np.array([score.percent for score in scores])
+        ratio = math.sqrt(float(np.mean(np.square([score.ratio for score in scores]))))
+        cells = [f"{x:.2f}" for x in (*percent, percent.mean(), ratio)]
+        rows.append([run, _word(is_calibrated), *cells])
+        every.append(percent)
+    header = ["run", "calibration", *(f"{cut:.0f} s" for cut in CUTS), "mean", "error / sigma"]
+    return ["## When GNSS ends earlier or later: rms in % of the path", "", *table(header, rows)]
+
+
+def draw(scores: Scores, missions: Missions, runs: Sequence[str]) -> Figure:
+    """Return the tracks of the clean runs, kernel log, a row for each run."""
+    figure = new_figure(9.6, 3.3 * len(runs), "Blueye X3: smoother-log against GNSS")
+    panels = figure.subplots(len(runs), len(Protocol), squeeze=False)
+    for (i, run), (j, protocol) in product(enumerate(runs), enumerate(Protocol)):
+        axes = panels[i, j]
+        some = [s for c, s in scores.items() if c[:3] == (run, protocol, "log")]
+        drawn = [s for s in some if s.estimate is not None]
+        if not drawn:
+            axes.set_visible(False)
+            continue
+        mission, score = missions[run, False], drawn[0]
+        assert mission.gnss is not None
+        assert score.estimate is not None
+        gnss, used = mission.gnss, used_fixes(mission, protocol)
+        fixes = mission.frame.p_n_from_geodetic(gnss.lat, gnss.lon, gnss.height)[:, :2]
+        axes.plot(*fixes[~used].T, ".", color=REFERENCE, markersize=2.5, label="GNSS withheld")
+        axes.plot(*fixes[used].T, ".", color=OUTLIER, markersize=2.5, label="GNSS used")
+        track = track_of(score.estimate, mission)
+        axes.plot(*track.T, color=ESTIMATE, linewidth=1.2, label="estimate")
+        axes.plot(*track[0], "o", color=INK, markersize=4.5)
+        title = f"{run}, {protocol.name}: {score.rms_m:.2f} m rms"
+        dress(axes, title=title, x="east, m", y="north, m")
+        axes.set_aspect("equal", adjustable="datalim")
+    handles = panels[0, 0].get_legend_handles_labels()
+    figure.legend(*handles, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+    add_footnote(figure, "The antenna's fixes, 0.35 m behind the body origin that is estimated.")
+    return figure
+
+
+LEGEND = """\
+Missions as `ssm-graph convert` makes them: one set of settings for the vehicle, nothing tuned per
+log ([where each comes from](../../docs/field.md)). `exact`: what can be calibrated is taken as
+stated; `estimated`: with the prior sigmas that the importer states. Path: horizontal way from the
+last fix used to the last one scored, by positions a second apart. Heading sigma: posterior, when
+GNSS ends. Error / sigma: rms of the horizontal error over the rms of its own sigma. The fixes
+themselves are good to 0.15 to 0.35 m. Faults are drawn from the seed; bursts begin after GNSS has
+ended.
+"""
+
+
+def parse_args(argv: Sequence[str] | None = None) -> argparse.Namespace:
+    """Return the settings given on the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--runs", default=",".join(RUNS), help="of square, grid, dive")
+    parser.add_argument("--methods", default=",".join((*SMOOTHERS, FILTER)), help="see the tables")
+    parser.add_argument("--seeds", type=int, default=3, help="of the faults, on surface runs")
+    parser.add_argument("--out", type=Path, default=Path("out/field"))
+    parser.add_argument("--keep", action="store_true", help="write to benchmarks/results and docs")
+    return parser.parse_args(argv)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run all cases; write tables and figure."""
+    args = parse_args(argv)
+    if not LOGS.is_dir():
+        print(f"{LOGS}: no real logs; set SSM_GRAPH_DATA to the folder that holds blueye_x3")
+        return 1
+    runs, methods = args.runs.split(","), args.methods.split(",")
+    about = f"{machine()}; load average before {os.getloadavg()[0]:.1f}."
+    command = shlex.join(["python", "benchmarks/field.py", *(argv or sys.argv[1:])])
+    missions = {(run, is_on): make(load(run)) for run in runs for is_on, make in MODES.items()}
+    scores: Scores = {}
+    for case in cases(runs, methods, args.seeds):
+        scores[case] = evaluate_case(missions[case.run, case.is_calibrated], case)
+        print(f"{case}: {scores[case].rms_m:.2f} m, {scores[case].status}", file=sys.stderr)
+    lines = ["# Real runs", "", f"    {command}", "", about, "", LEGEND]
+    text = "\n".join([*lines, *report(scores), *cuts_lines(missions), ""])
+    print(text)
+    for reports, figures in ((args.out, args.out), (RESULTS, DOCS))[: 1 + args.keep]:
+        reports.mkdir(parents=True, exist_ok=True)
+        (reports / "field.md").write_text(text, encoding="utf-8")
+        save(draw(scores, missions, runs), figures / "field.png")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
