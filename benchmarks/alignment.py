@@ -25,7 +25,7 @@ import numpy as np
 from benchmarks.speed import machine, table
 from ssm_graph.estimate import Estimate, Status
 from ssm_graph.frames import wrap_to_pi
-from ssm_graph.io.blueye import NOISE
+from ssm_graph.io.blueye_vehicle import NOISE
 from ssm_graph.simulation import (
     DepthProfile,
     GnssSettings,

@@ -43,9 +43,10 @@ from ssm_graph.report.style import ESTIMATE, INK, OUTLIER, REFERENCE, dress
 
 RESULTS = Path(__file__).resolve().parent / "results"
 DOCS = Path(__file__).resolve().parents[1] / "docs"
+ESTIMATED = "estimated"
 CUTS = (45.0, 55.0, 62.0, 70.0, 80.0, 90.0, 100.0, 110.0, 120.0)
 """s, other ends of GNSS for protocol A: 70 s alone is one draw of its noise."""
-TO_BEAT = {
+TO_BEAT: dict[Protocol, dict[str, tuple[float, ...]]] = {
     Protocol.A: {"square": (1.8, 1.2), "grid": (0.39, 2.0)},
     Protocol.B: {"square": (0.93,), "grid": (0.32,)},
     Protocol.C: {"square": (0.15,), "grid": (0.15,)},
@@ -53,22 +54,23 @@ TO_BEAT = {
 """m: a draft graph tuned on these very runs, and the better of the log author's two filters."""
 
 Scores = dict[Case, Score]
-Missions = Mapping[tuple[str, bool], Mission]
-"""By run, and whether the calibration is estimated."""
+Missions = Mapping[tuple[str, str], Mission]
+"""By run and mode of calibration."""
 
 
 def cases(runs: Sequence[str], methods: Sequence[str], seeds: int) -> Iterator[Case]:
     """Yield every cell: the filter for protocol A alone, one seed for the dive."""
-    for run, protocol, method, is_calibrated in product(runs, Protocol, methods, MODES):
-        if method == FILTER and (protocol is not Protocol.A or is_calibrated):
+    for run, protocol, method, calibration in product(runs, Protocol, methods, MODES):
+        if method == FILTER and (protocol is not Protocol.A or calibration == ESTIMATED):
             continue
-        if run not in SURFACE and protocol is not Protocol.A and method != methods[0]:
-            continue  # eight headings are tried there, twenty seconds each time
+        is_dive = run not in SURFACE
+        if is_dive and (method not in (methods[0], FILTER) or calibration == "none"):
+            continue  # eight headings are tried there, half a minute each time
         for faults in Faults:
-            n = 1 if faults is Faults.CLEAN or run not in SURFACE else seeds
-            yield from (
-                Case(run, protocol, method, is_calibrated, faults, seed) for seed in range(n)
-            )
+            if is_dive and faults is not Faults.CLEAN and protocol is not Protocol.A:
+                continue
+            n = 1 if faults is Faults.CLEAN or is_dive else seeds
+            yield from (Case(run, protocol, method, calibration, faults, seed) for seed in range(n))
 
 
 def report(scores: Scores) -> list[str]:
@@ -88,7 +90,7 @@ def _clean_table(scores: Scores, protocol: Protocol) -> list[str]:
     rows = []
     for case, score in scores.items():
         if case.protocol is protocol and case.faults is Faults.CLEAN:
-            rows.append([case.run, case.method, _word(case.is_calibrated), *_cells(score)])
+            rows.append([case.run, case.method, case.calibration, *_cells(score)])
     beat = [
         f"{run}: {' and '.join(f'{x:g} m' for x in values)}"
         for run, values in TO_BEAT[protocol].items()
@@ -115,19 +117,17 @@ def _fault_table(scores: Scores, protocol: Protocol) -> list[str]:
     header = ["run", "method", "calibration", "clean, m"]
     header += [f"{faults.name.lower()}, m" for faults in Faults if faults is not Faults.CLEAN]
     rows = []
-    keys = dict.fromkeys(
-        (c.run, c.method, c.is_calibrated) for c in scores if c.protocol is protocol
-    )
-    for run, method, is_calibrated in keys:
-        cells = [_spread(scores, run, protocol, method, is_calibrated, faults) for faults in Faults]
-        rows.append([run, method, _word(is_calibrated), *cells])
+    keys = dict.fromkeys((c.run, c.method, c.calibration) for c in scores if c.protocol is protocol)
+    for run, method, calibration in keys:
+        cells = [_spread(scores, run, protocol, method, calibration, faults) for faults in Faults]
+        rows.append([run, method, calibration, *cells])
     return table(header, rows)
 
 
 def _spread(
-    scores: Scores, run: str, protocol: Protocol, method: str, is_calibrated: bool, faults: Faults
+    scores: Scores, run: str, protocol: Protocol, method: str, calibration: str, faults: Faults
 ) -> str:
-    some = [s for c, s in scores.items() if c[:5] == (run, protocol, method, is_calibrated, faults)]
+    some = [s for c, s in scores.items() if c[:5] == (run, protocol, method, calibration, faults)]
     rms = np.array([score.rms_m for score in some])
     if not np.isfinite(rms).any():
         return "–"
@@ -138,22 +138,32 @@ def _spread(
     return f"{np.nanmean(rms):.2f}, {np.nanmax(rms):.2f}{verdict}"
 
 
-def _word(is_calibrated: bool) -> str:
-    return "estimated" if is_calibrated else "exact"
+def calibration_lines(scores: Scores) -> list[str]:
+    """Return what the smoother with kernel log found of the instruments, beams clean."""
+    rows = []
+    for case, score in scores.items():
+        found = score.estimate.calibration if score.estimate is not None else None
+        if case.method != "log" or case.faults is not Faults.CLEAN or found is None:
+            continue
+        for v in found.values:
+            numbers = [f"{x / v.unit:+.4f}" for x in (v.value, v.sigma, v.prior_sigma)]
+            rows.append([case.run, case.protocol.name, v.label, *numbers, v.determined.name])
+    header = ["run", "protocol", "what", "found beyond the stated", "sigma", "prior", "determined"]
+    return ["## What the calibration found", "", *table(header, rows), ""]
 
 
 def cuts_lines(missions: Missions) -> list[str]:
     """Return the error of protocol A against when GNSS ends, kernel log, in % of the path."""
     rows, every = [], []
-    for (run, is_calibrated), mission in missions.items():
+    for (run, calibration), mission in missions.items():
         if run not in SURFACE:
             continue
-        case = Case(run, Protocol.A, "log", is_calibrated, Faults.CLEAN, 0)
+        case = Case(run, Protocol.A, "log", calibration, Faults.CLEAN, 0)
         scores = [evaluate_case(mission, case, until_s) for until_s in CUTS]
         percent = np.array([score.percent for score in scores])
         ratio = math.sqrt(float(np.mean(np.square([score.ratio for score in scores]))))
         cells = [f"{x:.2f}" for x in (*percent, percent.mean(), ratio)]
-        rows.append([run, _word(is_calibrated), *cells])
+        rows.append([run, calibration, *cells])
         every.append(percent)
     header = ["run", "calibration", *(f"{cut:.0f} s" for cut in CUTS), "mean", "error / sigma"]
     return ["## When GNSS ends earlier or later: rms in % of the path", "", *table(header, rows)]
@@ -170,7 +180,7 @@ def draw(scores: Scores, missions: Missions, runs: Sequence[str]) -> Figure:
         if not drawn:
             axes.set_visible(False)
             continue
-        mission, score = missions[run, False], drawn[0]
+        mission, score = missions[run, ESTIMATED], drawn[-1]
         assert mission.gnss is not None
         assert score.estimate is not None
         gnss, used = mission.gnss, used_fixes(mission, protocol)
@@ -191,12 +201,13 @@ def draw(scores: Scores, missions: Missions, runs: Sequence[str]) -> Figure:
 
 LEGEND = """\
 Missions as `ssm-graph convert` makes them: one set of settings for the vehicle, nothing tuned per
-log ([where each comes from](../../docs/field.md)). `exact`: what can be calibrated is taken as
-stated; `estimated`: with the prior sigmas that the importer states. Path: horizontal way from the
-last fix used to the last one scored, by positions a second apart. Heading sigma: posterior, when
-GNSS ends. Error / sigma: rms of the horizontal error over the rms of its own sigma. The fixes
-themselves are good to 0.15 to 0.35 m. Faults are drawn from the seed; bursts begin after GNSS has
-ended.
+log ([where each comes from](../../docs/field.md)). Calibration `estimated`: DVL scale and both
+delays about the vehicle's known values, as the importer asks; `vehicle`: those values taken as
+exact; `none`: the speeds as read, gyro biases left in with a prior of 0.001 rad/s. Path: horizontal
+way from the last fix used to the last one scored, by positions a second apart. Heading sigma:
+posterior, when GNSS ends. Error / sigma: rms of the horizontal error over the rms of its own sigma.
+The fixes themselves are good to 0.15 to 0.35 m. Faults are drawn from the seed; bursts begin after
+GNSS has ended.
 """
 
 
@@ -220,13 +231,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     runs, methods = args.runs.split(","), args.methods.split(",")
     about = f"{machine()}; load average before {os.getloadavg()[0]:.1f}."
     command = shlex.join(["python", "benchmarks/field.py", *(argv or sys.argv[1:])])
-    missions = {(run, is_on): make(load(run)) for run in runs for is_on, make in MODES.items()}
+    missions = {(run, mode): make(load(run)) for run in runs for mode, make in MODES.items()}
     scores: Scores = {}
     for case in cases(runs, methods, args.seeds):
-        scores[case] = evaluate_case(missions[case.run, case.is_calibrated], case)
+        scores[case] = evaluate_case(missions[case.run, case.calibration], case)
         print(f"{case}: {scores[case].rms_m:.2f} m, {scores[case].status}", file=sys.stderr)
     lines = ["# Real runs", "", f"    {command}", "", about, "", LEGEND]
-    text = "\n".join([*lines, *report(scores), *cuts_lines(missions), ""])
+    text = "\n".join(
+        [*lines, *report(scores), *calibration_lines(scores), *cuts_lines(missions), ""]
+    )
     print(text)
     for reports, figures in ((args.out, args.out), (RESULTS, DOCS))[: 1 + args.keep]:
         reports.mkdir(parents=True, exist_ok=True)

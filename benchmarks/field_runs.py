@@ -21,6 +21,7 @@ from ssm_graph.evaluation import reference_from_gnss
 from ssm_graph.evaluation.errors import ErrorSeries, error_series
 from ssm_graph.filters.named import filter_problems
 from ssm_graph.io.blueye import convert_blueye
+from ssm_graph.io.blueye_vehicle import GYRO_BIAS
 from ssm_graph.problem.alignment import align
 from ssm_graph.problem.problem import build_problem
 from ssm_graph.smoothers.batch import SmootherConfig
@@ -45,9 +46,6 @@ SHARE = 0.1
 BURST_S = 10.0
 FAULT_SPEEDS = (0.5, 3.0)
 """m/s"""
-
-MODES: Mapping[bool, Callable[[Mission], Mission]] = {False: lambda mission: mission}
-"""What is done to an imported mission, by whether its calibration is estimated."""
 
 Mask = NDArray[np.bool_]
 
@@ -99,7 +97,8 @@ class Case(NamedTuple):
     run: str
     protocol: Protocol
     method: str
-    is_calibrated: bool
+    calibration: str
+    """a key of `MODES`"""
     faults: Faults
     seed: int
 
@@ -107,6 +106,38 @@ class Case(NamedTuple):
 def load(run: str) -> Mission:
     """Convert a log."""
     return convert_blueye(LOGS / f"{RUNS[run]}.mcap")
+
+
+def exact(mission: Mission) -> Mission:
+    """Return the mission with nothing to calibrate: what is known of instruments is exact."""
+    gnss = _gnss(mission)
+    mount = replace(mission.dvl.mount, scale_sigma=0.0, time_offset_sigma_s=0.0)
+    known = replace(gnss.calibration, time_offset_sigma_s=0.0)
+    return replace(
+        mission,
+        dvl=replace(mission.dvl, mount=mount),
+        gnss=replace(gnss, calibration=known),
+    )
+
+
+def unknown(mission: Mission) -> Mission:
+    """Return the mission of a user who knows neither scale nor gyro biases, and asks for nothing.
+
+    Gyro biases come back, with a prior that covers them; speeds are taken as they are read.
+    """
+    plain = exact(mission)
+    noise = replace(plain.imu.noise, gyro_bias_sigma=1e-3)
+    imu = replace(plain.imu, gyro_b=plain.imu.gyro_b + GYRO_BIAS, noise=noise)
+    mount = replace(plain.dvl.mount, scale_error=0.0)
+    return replace(plain, imu=imu, dvl=replace(plain.dvl, mount=mount))
+
+
+MODES: Mapping[str, Callable[[Mission], Mission]] = {
+    "none": unknown,
+    "vehicle": exact,
+    "estimated": lambda mission: mission,
+}
+"""What is done to an imported mission, by the name of what is calibrated."""
 
 
 def used_fixes(mission: Mission, protocol: Protocol, until_s: float = GNSS_END_S) -> Mask:
@@ -154,7 +185,7 @@ def solve(mission: Mission, method: str) -> Estimate:
 
 
 def evaluate_case(mission: Mission, case: Case, until_s: float = GNSS_END_S) -> Score:
-    """Withhold, spoil, estimate and score; ``mission`` is calibrated or not already."""
+    """Withhold, spoil, estimate and score; ``mission`` is of the case's mode."""
     gnss = _gnss(mission)
     used = used_fixes(mission, case.protocol, until_s)
     scored = used if case.protocol is Protocol.C else ~used

@@ -28,39 +28,33 @@ from ssm_graph.data import (
     Array,
     DepthLog,
     DvlLog,
-    DvlMount,
     GnssLog,
     ImuLog,
-    ImuNoise,
     Mission,
 )
 from ssm_graph.earth import LocalFrame, normal_gravity
 from ssm_graph.errors import DataError
 from ssm_graph.io.blueye_log import GNSS_SENSOR_ID, BlueyeTables, read_blueye_tables
+from ssm_graph.io.blueye_vehicle import (
+    BEAM_SIGMA,
+    DEPTH_SIGMA,
+    DVL_DELAY_S,
+    DVL_SCALE_ERROR,
+    DVL_SCALE_SIGMA,
+    GNSS_DELAY_S,
+    GNSS_LEVER_ARM,
+    GNSS_SIGMA_LIMIT,
+    GNSS_UP_SIGMA,
+    GYRO_BIAS,
+    NOISE,
+    dvl_mount,
+    gnss_calibration,
+)
 from ssm_graph.io.blueye_witness import compare_imus
 
 STANDARD_GRAVITY: Final = 9.80665
 """m/s^2, of an accelerometer that counts in g."""
 
-JANUS_ANGLE: Final = np.deg2rad(22.5)
-BEAM_AZIMUTH: Final = np.deg2rad([-45.0, 45.0, 135.0, -135.0])
-"""rad, from instrument x (forward) towards y (starboard), transducers 0 to 3."""
-DVL_LEVER_ARM: Final = (-0.17, 0.0, 0.26)
-"""m, forward-right-down from the IMU, as is the antenna's."""
-GNSS_LEVER_ARM: Final = (-0.35, 0.0, -0.05)
-DVL_DELAY_S: Final = 0.12
-GNSS_DELAY_S: Final = 0.3
-BEAM_SIGMA: Final = 0.02
-"""m/s"""
-DEPTH_SIGMA: Final = 0.03
-"""m; the sensor resolves 1 mm, waves at the surface do not"""
-GNSS_SIGMA_LIMIT: Final = 1.0
-"""m; fixes that report more are taken while the antenna surfaces or sinks."""
-GNSS_UP_SIGMA: Final = 10.0
-"""m; their height is made from depth, so it must not count as a measurement."""
-NOISE: Final = ImuNoise(
-    gyro_density=2e-3, accel_density=0.05, gyro_bias_sigma=1e-3, accel_bias_sigma=0.05
-)
 CLOCK_WINDOW: Final = 5
 """IMU values; odd."""
 DVL_CLOCK_WINDOW: Final = 101
@@ -94,8 +88,9 @@ def convert_blueye(log: Path) -> Mission:
     gnss, gnss_notes = _gnss(tables, imu, depth)
     frame = LocalFrame(float(gnss.lat[0]), float(gnss.lon[0]), float(gnss.height[0]))
     assumed = (
-        "Noise, delays and lever arms are those known of the Blueye X3, not of this very vehicle; "
-        "the speeds of its DVL are 1 to 7 % high against GNSS: consider scale_sigma."
+        "Noise, biases, delays, scale and lever arms are those measured on one Blueye X3; DVL "
+        f"speeds are taken to be {100.0 * DVL_SCALE_ERROR:.1f} % high, give or take "
+        f"{100.0 * DVL_SCALE_SIGMA:g} %; this and both delays are estimated about these values."
     )
     return Mission(
         name=log.stem,
@@ -157,14 +152,15 @@ def _imu(tables: BlueyeTables) -> tuple[ImuLog, tuple[str, ...]]:
         start_s=float(time_s[0] - np.median(steps)),
         noise=NOISE,
         time_s=time_s,
-        gyro_b=table[:, 1:4],
+        gyro_b=table[:, 1:4] - GYRO_BIAS,
         accel_b=table[:, 4:7] * accel_unit,
     )
     rate = (len(time_s) - 1) / np.sum(steps[steps < GAP_S])
     notes = [
         f"Imu2Tel: {len(table)} new values among {len(tables.imu)} messages, {rate:.1f} per "
         f"second, accelerometer in {unit_name}; stamps are smoothed arrival times, "
-        f"{jitter_ms:.1f} ms rms of jitter removed."
+        f"{jitter_ms:.1f} ms rms of jitter removed; "
+        f"the gyro biases known of the X3, {GYRO_BIAS} rad/s, are taken off."
     ]
     if n_gaps := int(np.sum(steps >= GAP_S)):
         notes.append(f"The IMU has {n_gaps} gaps, the longest {steps.max():.2f} s.")
@@ -207,17 +203,6 @@ def _gravity_notes(imu: ImuLog, frame: LocalFrame) -> tuple[str, ...]:
     )
 
 
-def _dvl_mount() -> DvlMount:
-    sin_janus, cos_janus = np.sin(JANUS_ANGLE), np.cos(JANUS_ANGLE)
-    forward, starboard = sin_janus * np.cos(BEAM_AZIMUTH), sin_janus * np.sin(BEAM_AZIMUTH)
-    return DvlMount(
-        beams_d=np.column_stack([forward, starboard, np.full(N_BEAMS, cos_janus)]),
-        R_bd=np.eye(3),
-        lever_arm_b=np.array(DVL_LEVER_ARM),
-        time_offset_s=DVL_DELAY_S,
-    )
-
-
 def _dvl(tables: BlueyeTables, imu: ImuLog) -> tuple[DvlLog, tuple[str, ...]]:
     """Return new reports with beam speeds on the instrument's own clock."""
     table = tables.dvl[_is_new(tables.dvl[:, 1:])]
@@ -235,7 +220,7 @@ def _dvl(tables: BlueyeTables, imu: ImuLog) -> tuple[DvlLog, tuple[str, ...]]:
     speed = np.where((valid > 0.0) & ~water_track & ~is_one_number, speed, np.nan)
     _check_lock(speed, is_one_number, valid)
     log = DvlLog(
-        mount=_dvl_mount(),
+        mount=dvl_mount(),
         time_s=time_s,
         speed=speed,
         sigma=np.full(speed.shape, BEAM_SIGMA),
@@ -301,6 +286,7 @@ def _gnss(tables: BlueyeTables, imu: ImuLog, depth: DepthLog) -> tuple[GnssLog, 
         height=height,
         sigma_enu=np.column_stack([sigma, sigma, np.full_like(sigma, GNSS_UP_SIGMA)]),
         lever_arm_b=np.array(GNSS_LEVER_ARM),
+        calibration=gnss_calibration(),
     )
     silent = np.flatnonzero(np.diff(time_s) > 5.0)
     gaps = [
