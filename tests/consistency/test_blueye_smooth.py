@@ -11,6 +11,7 @@ import pytest
 
 import ssm_graph as sg
 from ssm_graph.cli.run_mission import withhold_gnss
+from ssm_graph.evaluation.errors import error_series
 from ssm_graph.io.blueye import convert_blueye
 
 DATA = Path(os.environ.get("SSM_GRAPH_DATA", Path(__file__).parents[2].parent / "shared" / "data"))
@@ -21,23 +22,24 @@ pytestmark = pytest.mark.skipif(not RUNS.is_dir(), reason=f"no real logs in {RUN
 @pytest.mark.parametrize(
     ("name", "until_s", "largest_rms"),
     [
-        # An untuned draft without calibration: 2.8 m. Seen here: 1.31 m and 1.04 m.
-        ("log_auto_square_2025-05-07_14_55_13", 70.0, 2.8),
-        ("log_grid_01_05_scaled", 70.0, 2.8),
+        # Drafts and filters of others: 1.2 to 2.8 m. Seen here: 1.18 m and 0.55 m.
+        ("log_auto_square_2025-05-07_14_55_13", 70.0, 1.5),
+        ("log_grid_01_05_scaled", 70.0, 0.8),
     ],
 )
 def test_surface_runs(name: str, until_s: float, largest_rms: float) -> None:
-    """Converged, heading found, error below the draft's.
-
-    The 3-sigma bounds hold in 73 to 100 % of the epochs of an axis only: the DVL of these runs
-    reads 2 to 7 % high, and its scale is taken as exact.
-    """
+    """Converged, heading found, scale and delays estimated, error small and within its sigmas."""
     mission, withheld = withhold_gnss(convert_blueye(RUNS / f"{name}.mcap"), until_s)
     estimate = sg.smooth(mission)
     assert estimate.status is sg.Status.CONVERGED, estimate.reason
     reference = sg.reference_from_gnss(withheld, estimate.trajectory)
     metrics = sg.evaluate(estimate.trajectory, reference)
     assert metrics.rmse_horizontal_m < largest_rms
+    errors = error_series(estimate.trajectory, reference)
+    assert np.all(np.abs(errors.position_enu[:, :2]) < 3.0 * errors.position_sigma_enu[:, :2])
+    assert estimate.calibration is not None
+    found = {value.variable for value in estimate.calibration.values}
+    assert found == {"dvl_scale", "dvl_time_offset", "gnss_time_offset"}
 
 
 @pytest.mark.slow
@@ -51,7 +53,11 @@ def test_the_dive_says_that_its_heading_is_hardly_observable() -> None:
 
 
 def test_a_long_fault_of_one_beam_does_not_fool_the_start() -> None:
-    """40 s of 1 m/s in one beam: within a decimetre or two of the run without fault."""
+    """40 s of 1 m/s in one beam: within half a metre of the run without fault, not tens of metres.
+
+    The log kernel leaves a beam of residual r a pull of 6 sigma^2 / r: with sigma 0.06 m/s, 7 mm/s
+    on the velocity for as long as the fault lasts.
+    """
     log = RUNS / "log_auto_square_2025-05-07_14_55_13.mcap"
     mission, withheld = withhold_gnss(convert_blueye(log), 70.0)
     elapsed = mission.dvl.time_s - mission.dvl.time_s[0]
@@ -63,4 +69,4 @@ def test_a_long_fault_of_one_beam_does_not_fool_the_start() -> None:
         estimate = sg.smooth(run)
         reference = sg.reference_from_gnss(withheld, estimate.trajectory)
         rms.append(sg.evaluate(estimate.trajectory, reference).rmse_horizontal_m)
-    assert rms[1] < rms[0] + 0.2
+    assert rms[1] < rms[0] + 0.5
