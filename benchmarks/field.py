@@ -175,14 +175,12 @@ def draw(scores: Scores, missions: Missions, runs: Sequence[str]) -> Figure:
     panels = figure.subplots(len(runs), len(Protocol), squeeze=False)
     for (i, run), (j, protocol) in product(enumerate(runs), enumerate(Protocol)):
         axes = panels[i, j]
-        some = [s for c, s in scores.items() if c[:3] == (run, protocol, "log")]
-        drawn = [s for s in some if s.estimate is not None]
-        if not drawn:
+        score = scores.get(Case(run, protocol, "log", ESTIMATED, Faults.CLEAN, 0))
+        if score is None or score.estimate is None:
             axes.set_visible(False)
             continue
-        mission, score = missions[run, ESTIMATED], drawn[-1]
+        mission = missions[run, ESTIMATED]
         assert mission.gnss is not None
-        assert score.estimate is not None
         gnss, used = mission.gnss, used_fixes(mission, protocol)
         fixes = mission.frame.p_n_from_geodetic(gnss.lat, gnss.lon, gnss.height)[:, :2]
         axes.plot(*fixes[~used].T, ".", color=REFERENCE, markersize=2.5, label="GNSS withheld")
@@ -194,7 +192,7 @@ def draw(scores: Scores, missions: Missions, runs: Sequence[str]) -> Figure:
         dress(axes, title=title, x="east, m", y="north, m")
         axes.set_aspect("equal", adjustable="datalim")
     handles = panels[0, 0].get_legend_handles_labels()
-    figure.legend(*handles, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+    figure.legend(*handles, loc="outside lower right", ncols=3, fontsize=8, frameon=False)
     add_footnote(figure, "The antenna's fixes, 0.35 m behind the body origin that is estimated.")
     return figure
 
