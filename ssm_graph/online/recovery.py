@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from ssm_graph.data import Array
-from ssm_graph.online.reserve import Kept
+from ssm_graph.online.reserve import SPEED_SIGMA, Kept, forget, slowed
 from ssm_graph.online.watch import FEW, TORN_PINGS, Contradicted, Watch
 from ssm_graph.problem.doubts import TRUSTED
 from ssm_graph.problem.error_state import POSITION, ROTATION, VELOCITY, InitialMoments
@@ -16,8 +16,6 @@ from ssm_graph.smoothers.keyframe import Keyframe
 from ssm_graph.smoothers.stretch import Stretch
 from ssm_graph.smoothers.window import Window
 
-SPEED_SIGMA: Final = 3.0
-"""m/s, what a vehicle's velocity can be."""
 POSITION_SIGMA: Final = 50.0
 """m, how far a position is doubted that GNSS or depth contradict."""
 BENT_SPEED: Final = 1.0
@@ -188,16 +186,12 @@ def _from_reserve(kept: Kept, time_s: float, *, has_velocity: bool) -> InitialMo
     Its errors are correlated as the inertial data correlate them: a velocity that is measured
     corrects attitude and position as well.
     """
-    P = kept.covariance * DOUBT_FACTOR**2
-    R_nb, p_n, v_n, bias = (column[0] for column in kept.states)
-    if not has_velocity or np.sqrt(np.trace(P[VELOCITY, VELOCITY])) > SPEED_SIGMA:
-        v_n = _slowed(v_n)
-        _forget(P, VELOCITY, SPEED_SIGMA)
-        p_n = kept.place_n
-        _forget(
-            P, POSITION, float(np.hypot(kept.place_sigma, SPEED_SIGMA * (time_s - kept.since_s)))
-        )
-    return InitialMoments(R_nb, p_n, v_n, bias, _regular(P))
+    doubted = kept._replace(covariance=kept.covariance * DOUBT_FACTOR**2)
+    variance = np.trace(doubted.covariance[VELOCITY, VELOCITY])
+    if not has_velocity or variance > SPEED_SIGMA**2:
+        doubted = doubted.without_velocity(time_s)
+    R_nb, p_n, v_n, bias = (column[0] for column in doubted.states)
+    return InitialMoments(R_nb, p_n, v_n, bias, _regular(doubted.covariance))
 
 
 def _from_prediction(window: Window, keyframe: Keyframe, what: Doubted) -> InitialMoments:
@@ -205,26 +199,14 @@ def _from_prediction(window: Window, keyframe: Keyframe, what: Doubted) -> Initi
     P = covariance.copy()
     R_nb, p_n, v_n, bias = (column[0] for column in predicted)
     if what is Doubted.VELOCITY_AFTER_SILENCE:
-        v_n = _slowed(v_n)
-        _forget(P, VELOCITY, SPEED_SIGMA)
+        v_n = slowed(v_n)
+        forget(P, VELOCITY, SPEED_SIGMA)
     else:
         P[ROTATION, ROTATION] *= DOUBT_FACTOR**2
         up_b = R_nb[2]
         unsure = np.eye(3) if what is Doubted.POSITION else np.outer(up_b, up_b)
         P[POSITION, POSITION] += POSITION_SIGMA**2 * unsure
     return InitialMoments(R_nb, p_n, v_n, bias, _regular(P))
-
-
-def _slowed(v_n: Array) -> Array:
-    """Return a velocity that a vehicle can have."""
-    speed = float(np.linalg.norm(v_n))
-    return v_n * (SPEED_SIGMA / speed) if speed > SPEED_SIGMA else v_n
-
-
-def _forget(P: Array, part: slice, sigma: float) -> None:
-    """Leave a standard deviation of a part of the error state, and nothing else of it."""
-    P[part, :] = P[:, part] = 0.0
-    P[part, part] = sigma**2 * np.eye(3)
 
 
 def _regular(P: Array) -> Array:

@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from ssm_graph.data import Array
-from ssm_graph.problem.error_state import POSITION
+from ssm_graph.problem.error_state import POSITION, VELOCITY
 from ssm_graph.problem.states import NavigationStates
 from ssm_graph.smoothers.keyframe import Keyframe
 from ssm_graph.smoothers.window import Window
@@ -20,6 +20,10 @@ from ssm_graph.smoothers.window_rows import InertialRows
 
 RENEW_S: Final = 15.0
 """While all is sound a new answer goes into reserve so often."""
+SPEED_SIGMA: Final = 3.0
+"""m/s, what a vehicle's velocity can be."""
+LOST_FACTOR: Final = 2.0
+"""So many times less certain, the velocity that the inertial data lead to says nothing."""
 
 
 class Kept(NamedTuple):
@@ -53,7 +57,17 @@ class Kept(NamedTuple):
         """Return the answer at the next keyframe."""
         there = inertial.predict(keyframe, self.states)
         covariance = inertial.carry(keyframe, self.states, there, self.covariance)
-        return self._replace(**there._asdict(), covariance=covariance)
+        led = self._replace(**there._asdict(), covariance=covariance)
+        is_lost = np.trace(covariance[VELOCITY, VELOCITY]) > (LOST_FACTOR * SPEED_SIGMA) ** 2
+        return led.without_velocity(keyframe.time_s) if is_lost else led
+
+    def without_velocity(self, time_s: float) -> Kept:
+        """Return the answer with the velocity, and the place, that any vehicle can have by now."""
+        P = self.covariance.copy()
+        forget(P, VELOCITY, SPEED_SIGMA)
+        way = SPEED_SIGMA * (time_s - self.since_s)
+        forget(P, POSITION, float(np.hypot(self.place_sigma, way)))
+        return self._replace(p_n=self.place_n[None], v_n=slowed(self.v_n), covariance=P)
 
 
 class Reserve(NamedTuple):
@@ -93,6 +107,18 @@ class Reserve(NamedTuple):
             return Kept(**fields)
 
         return cls(kept("older"), kept("younger"))
+
+
+def slowed(v_n: Array) -> Array:
+    """Return a velocity (..., 3), m/s, that a vehicle can have."""
+    speed = float(np.linalg.norm(v_n))
+    return v_n * (SPEED_SIGMA / speed) if speed > SPEED_SIGMA else v_n
+
+
+def forget(P: Array, part: slice, sigma: float) -> None:
+    """Leave a standard deviation of a part of the error state, and nothing else of it."""
+    P[part, :] = P[:, part] = 0.0
+    P[part, part] = sigma**2 * np.eye(3)
 
 
 def _kept(window: Window) -> Kept:
