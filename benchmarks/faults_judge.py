@@ -47,9 +47,9 @@ can be lived with, the health is GOOD in time and stays so; (6) where it is GOOD
 answer is within three of its sigmas of that of the undisturbed mission in every component, and
 where the fault takes nothing away it is the same answer to {SAME:g} sigmas.
 
-Two rows cannot pass as things are: an absolute sensor that goes off for good, depth or GNSS, is
-followed in the end, for nothing else sees what it measures. The answer is BAD before, `recovered`
-is told, and then it is GOOD at the wrong place.
+An absolute sensor that goes off for good, depth or GNSS, is followed in the end, for nothing else
+sees what it measures. The answer is BAD before, `recovered` is told, and it is not GOOD for ten
+minutes; the runs here end before, and after that it would be GOOD at the wrong place.
 """
 
 
