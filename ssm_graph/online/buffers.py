@@ -77,11 +77,11 @@ class Buffers:
         return counting
 
     def drop_before(self, time_s: float) -> None:
-        """Forget what is older than a time."""
+        """Forget what is older than a time, but for the pings that tell whether a beam is stuck."""
         for rows in (self.imu, self.depths, self.fixes):
             rows.drop_before(time_s)
-        kept = self.pings.all[: max(self.pings.index(time_s) - STUCK_PINGS, 0)]
-        self.pings.drop_before(kept[-1, 0] if len(kept) else -np.inf)
+        first = max(self.pings.index(time_s) - STUCK_PINGS, 0)
+        self.pings.drop_before(self.pings.all[first, 0] if first else -np.inf)
 
     @property
     def period_s(self) -> float:
