@@ -16,7 +16,7 @@ from factors.dvl_beam import dvl_beam_factor
 from ssm_graph.data import Array, Mission
 from ssm_graph.earth import LocalFrame
 from ssm_graph.estimate import Trajectory
-from ssm_graph.graph.linearize import prior_graph
+from ssm_graph.graph.gtsam_graph import prior_graph
 from ssm_graph.io.replay import messages_of
 from ssm_graph.io.vehicle import vehicle_of
 from ssm_graph.online.buffers import Buffers

@@ -11,7 +11,7 @@ from gtsam.symbol_shorthand import B, V, X
 from factors.dvl_beam import dvl_beam_factor
 from ssm_graph.data import Array, ImuNoise, Mission
 from ssm_graph.earth import LocalFrame
-from ssm_graph.graph.linearize import prior_graph
+from ssm_graph.graph.gtsam_graph import prior_graph
 from ssm_graph.problem.error_state import initial_moments
 from ssm_graph.problem.problem import Beams, Problem
 

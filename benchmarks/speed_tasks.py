@@ -18,15 +18,17 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import V, X
+from gtsam.symbol_shorthand import B, V, X
 
-import ssm_graph.graph.linearize as linearize
+import ssm_graph.graph.extended as extended
 import ssm_graph.smoothers.batch as batch
 from benchmarks.speed_plain import dead_reckoned, plain_graph
 from factors.similarity import LogKernel
 from ssm_graph.data import Array, Mission
+from ssm_graph.graph.extended import GraphLinearizer
 from ssm_graph.graph.first_values import first_values
-from ssm_graph.graph.linearize import GraphLinearizer, prior_graph
+from ssm_graph.graph.gtsam_graph import depth_graph, gnss_graph, prior_graph
+from ssm_graph.graph.inertial_rows import inertial_graph
 from ssm_graph.problem.problem import Problem, build_problem
 from ssm_graph.simulation import Grade, OutlierKind, Outliers, scenario_config, simulate
 
@@ -110,9 +112,8 @@ def _timed_calls(parts: dict[str, float]) -> Iterator[None]:
         (batch, "first_values", "first pass"),
         (GraphLinearizer, "follow", "linearise: gravity and depth targets"),
         (GraphLinearizer, "beam_rows", "linearise: beams"),
-        (GraphLinearizer, "linearize", "linearise: GTSAM factors and assembly"),
-        (linearize, "solve_linear", "eliminate by QR and solve"),
-        (linearize, "marginal_covariances", "marginals"),
+        (GraphLinearizer, "inertial_rows", "linearise: GTSAM's inertial factors"),
+        (extended, "solve_bordered", "eliminate by QR, solve, marginals"),
         (GraphLinearizer, "cost", "cost"),
         (GraphLinearizer, "retract", "retract"),
         (batch, "trajectory_from_states", "result"),
@@ -182,11 +183,16 @@ def time_floor(path: Path, n_passes: int) -> Timing:
     with timing.part("build: merge and preintegrate"):
         problem = build_problem(mission)
     states = first_values(problem, kernel=LogKernel()).states
-    linearizer = GraphLinearizer(problem)
-    linearizer.follow(states)
-    graph = gtsam.NonlinearFactorGraph()
-    for part in (linearizer.inertial, prior_graph(problem), linearizer.gnss, linearizer.depth):
+    problem.chain.set_gravity(states.p_n)
+    graph = inertial_graph(problem)
+    for part in (prior_graph(problem), gnss_graph(problem.fixes)):
         graph.push_back(part)
+    if problem.depths is not None:
+        graph.push_back(depth_graph(problem, problem.depths, states))
+    ordering = gtsam.Ordering()
+    for k in range(problem.n_keyframes):
+        for key in (X(k), V(k), B(k)):
+            ordering.push_back(key)
     beams = problem.beams
     distance = np.linalg.norm(states.v_n - states.p_n, axis=1)
     for k, sigma in zip(beams.keyframe.tolist(), beams.sigma.tolist(), strict=True):
@@ -196,7 +202,7 @@ def time_floor(path: Path, n_passes: int) -> Timing:
         with timing.part("linearise"):
             linear = graph.linearize(states.values)
         with timing.part("eliminate by QR and solve"):
-            delta = linear.eliminateMultifrontal(linearizer.ordering, gtsam.EliminateQR).optimize()
+            delta = linear.eliminateMultifrontal(ordering, gtsam.EliminateQR).optimize()
     timing.n_iterations = n_passes
     timing.status = "finite" if np.all(np.isfinite(delta.vector())) else "not finite"
     return _end(timing, problem, mission, None)

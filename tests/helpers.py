@@ -15,8 +15,7 @@ from ssm_graph.data import Array, ImuLog, InitialState, Mission
 from ssm_graph.errors import SolverError
 from ssm_graph.estimate import Status, Trajectory
 from ssm_graph.frames import R_lb_from_roll_pitch_heading
-from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.graph.solve import marginal_covariances, solve_linear
+from ssm_graph.graph.extended import GraphLinearizer
 from ssm_graph.graph.states import States, states_from_arrays
 from ssm_graph.problem.problem import Problem
 from ssm_graph.simulation import SimulatedMission, SimulationConfig, simulate
@@ -159,6 +158,4 @@ def covariances(problem: Problem, states: States, weights: Array) -> Array:
     """Return the covariance (K, 15, 15) of the whole error state at an answer."""
     linearizer = GraphLinearizer(problem)
     linearizer.follow(states)
-    linear = linearizer.linearize(states, linearizer.beam_rows(states), weights)
-    solution = solve_linear(linear, linearizer.ordering, n_keyframes=problem.n_keyframes)
-    return marginal_covariances(solution)
+    return linearizer.solve(states, linearizer.beam_rows(states), weights).covariance

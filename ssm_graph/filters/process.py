@@ -27,7 +27,7 @@ from factors import so3
 from ssm_graph.data import Array
 from ssm_graph.earth import LocalFrame
 from ssm_graph.imu.arrays import Intervals
-from ssm_graph.imu.preintegration import gtsam_gravity
+from ssm_graph.imu.preintegration import gravity_gradient, gtsam_gravity
 from ssm_graph.problem.error_state import POSITION, ROTATION, STATE_DIM, VELOCITY
 from ssm_graph.problem.states import NavigationStates
 
@@ -51,6 +51,7 @@ class Process:
         columns = zip(*intervals, strict=True)
         self._intervals = Intervals(*(np.stack(column, axis=1) for column in columns))
         self._frame = frame
+        self._gravity_gradient = gravity_gradient(frame)
         turn = self._intervals.dt[..., None] * frame.omega_ie_n
         self._Omega = so3.skew(frame.omega_ie_n)
         self._E = so3.exp(-turn)
@@ -79,7 +80,22 @@ class Process:
         process_cov = m.covariance.copy()
         process_cov[:, VELOCITY, :] = moved.R_nb @ process_cov[:, VELOCITY, :]
         process_cov[:, :, VELOCITY] = process_cov[:, :, VELOCITY] @ _T(moved.R_nb)
-        return Prediction(moved, F, process_cov)
+        change = np.eye(STATE_DIM) + self._gravity_along(k, dt[..., None], moved, moved.R_nb)
+        F = change @ (F + self._gravity_along(k, dt[..., None], moved, states.R_nb))
+        return Prediction(moved, F, change @ process_cov @ _T(change))
+
+    def _gravity_along(self, k: int, dt: Array, moved: NavigationStates, R_nb: Array) -> Array:
+        """Return what the error at an end of attitude ``R_nb`` does by the change of gravity there.
+
+        Gravity is that of the middle; (B, 15, 15), on the error state at the end.
+        """
+        E = self._E[k]
+        gravity_D = 0.5 * self._gravity_gradient @ R_nb
+        p_D = dt**2 * (E @ self._J2[k] @ gravity_D)
+        along = np.zeros((len(R_nb), STATE_DIM, STATE_DIM))
+        along[:, POSITION, POSITION] = _T(moved.R_nb) @ p_D
+        along[:, VELOCITY, POSITION] = dt * (E @ self._J1[k] @ gravity_D) - self._Omega @ p_D
+        return along
 
     def _transition(
         self,

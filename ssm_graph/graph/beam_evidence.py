@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssm_graph.data import Array
-from ssm_graph.graph.solve import LinearSolution
+from ssm_graph.graph.bordered import BorderedSolution
 from ssm_graph.problem.error_state import STATE_DIM
 
 
@@ -58,13 +58,14 @@ class _Carried(NamedTuple):
 class ChainEvidence:
     """One solution of the chain, ready for columns anywhere along it."""
 
-    def __init__(self, solution: LinearSolution, beams: WhitenedBeams) -> None:
+    def __init__(self, solution: BorderedSolution, beams: WhitenedBeams) -> None:
         self._beams = beams
         self._first_row = np.searchsorted(beams.keyframe, np.arange(len(solution.R) + 1)).tolist()
         R_invT = np.swapaxes(np.linalg.inv(solution.R), 1, 2)
         self._load = np.einsum("mij,mj->mi", R_invT[beams.keyframe], beams.jacobian, optimize=True)
         self._step = np.zeros_like(solution.R)
-        self._step[1:] = -R_invT[1:] @ np.swapaxes(solution.S[:-1], 1, 2)
+        S = solution.R[:-1] @ solution.gain[:-1]
+        self._step[1:] = -R_invT[1:] @ np.swapaxes(S, 1, 2)
         self._ahead = np.zeros_like(solution.R)
         identity = np.eye(STATE_DIM)
         for k in range(len(solution.R) - 2, -1, -1):

@@ -52,6 +52,8 @@ class BorderedSolution(NamedTuple):
     """(C, C)"""
     gain: Array
     """(K, n, n) how each keyframe follows the next, negative"""
+    R: Array
+    """(K, n, n) upper triangular; without the border ``R_k (d_k + gain_k d_{k+1}) = rhs_k``"""
 
     def covariance(self, size: int) -> Array:
         """Return the covariance (K, size, size) of the first states of every keyframe."""
@@ -125,7 +127,7 @@ def solve_bordered(rows: ChainRows) -> BorderedSolution:
             "the linear solution is not finite: look for time stamps far apart, or sigmas that "
             "differ by more than 12 orders of magnitude"
         )
-    return BorderedSolution(step, constants_step, conditional, sensitivity, constants_cov, gain)
+    return BorderedSolution(step, constants_step, conditional, sensitivity, constants_cov, gain, R)
 
 
 def _eliminate(rows: ChainRows) -> tuple[Array, Array]:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import X
 from numpy.typing import NDArray
 
 from ssm_graph.data import Array
@@ -54,19 +52,3 @@ def depth_targets(
     read = np.flatnonzero(count)
     root_information = np.sqrt(count[read]) / depths.sigma
     return DepthTargets(read, target_n[read], track.up_n[read], root_information)
-
-
-def depth_graph(
-    depths: Depths, states: States, frame: LocalFrame, keyframe_s: Array
-) -> gtsam.NonlinearFactorGraph:
-    """Return depth as GTSAM position factors that count along the local vertical only."""
-    targets = depth_targets(depths, states, frame, keyframe_s)
-    root_information = np.zeros((len(targets.keyframe), 3, 3))
-    root_information[:, 0] = targets.up_n * targets.root_information[:, None]
-    graph = gtsam.NonlinearFactorGraph()
-    for k, target_n, root in zip(
-        targets.keyframe.tolist(), targets.target_n, root_information, strict=True
-    ):
-        noise = gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
-        graph.add(gtsam.GPSFactorArm(X(k), target_n, depths.lever_arm_b, noise))
-    return graph

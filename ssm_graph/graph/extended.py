@@ -1,28 +1,26 @@
-"""A problem with extra variables: linearised in NumPy, solved as a chain with a border.
+"""The graph of a problem, linearised at any states and beam weights and solved.
 
-The inertial factors stay GTSAM's. Beams, depth and GNSS are rows over the error state, the walks of
-their keyframe and the constants; GTSAM's own Jacobian factor takes three keys from Python, and its
-elimination of the chain alone takes longer than that of chain and border here.
+The inertial factors are GTSAM's. Beams, depth and GNSS are rows over the error state, the walks of
+their keyframe and the constants, in bulk. They are eliminated as a chain with a border: GTSAM's own
+Jacobian factor takes three keys from Python, and its elimination of the chain alone takes longer.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, V, X
 from numpy.typing import NDArray
 
 from ssm_graph.data import Array
 from ssm_graph.graph.aid_rows import Aid, DepthAid, GnssAid
 from ssm_graph.graph.bordered import BorderedSolution, ChainRows, solve_bordered
 from ssm_graph.graph.extended_rows import ExtendedBeams, RowStates, states_of
-from ssm_graph.graph.inertial_fit import BEGIN, END, inertial_rows
+from ssm_graph.graph.inertial_rows import InertialRows, inertial_graph
 from ssm_graph.graph.interfaces import BeamRows, Misfit
-from ssm_graph.graph.linearize import inertial_graph, misfit_of
+from ssm_graph.graph.linearize import misfit_of
 from ssm_graph.graph.marginal_prior import prior_at_start
-from ssm_graph.graph.states import States
+from ssm_graph.graph.states import States, retract
 from ssm_graph.problem.calibration import needs_motion
 from ssm_graph.problem.error_state import STATE_DIM
 from ssm_graph.problem.problem import Problem, start_of
@@ -31,7 +29,7 @@ JUDGED_PASSES = 2
 """The first pass is at the states of the forward pass, the second at smoothed ones."""
 
 
-class ExtendedStep(NamedTuple):
+class Step(NamedTuple):
     """A step of keyframes, walks and constants."""
 
     solution: BorderedSolution
@@ -67,12 +65,13 @@ class ExtendedStep(NamedTuple):
         return self.solution.variance(keyframe, rows)
 
 
-class ExtendedLinearizer:
-    """Linearises and solves the whole graph of a problem with extra variables."""
+class GraphLinearizer:
+    """Linearises and solves the whole graph of a problem at any states and beam weights."""
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
         self.inertial = inertial_graph(problem)
+        self._inertial_rows = InertialRows(problem, self.inertial)
         self.prior = prior_at_start(start_of(problem))
         self.aids: list[Aid] = []
         if problem.depths is not None:
@@ -81,7 +80,6 @@ class ExtendedLinearizer:
             self.aids.append(GnssAid(problem, problem.fixes))
         self._beams = ExtendedBeams(problem.beams, problem.extras, problem.frame.omega_ie_n)
         self._n_judged = 0
-        self._keys = [(X(k), V(k), B(k)) for k in range(problem.n_keyframes)]
         factor, sigma = problem.extras.transitions(np.diff(problem.keyframe_s))
         self._walk_factor, self._walk_sigma = factor, sigma
 
@@ -105,7 +103,7 @@ class ExtendedLinearizer:
         prepared = self._beams.prepare(states.walks, states.constants, states.bias)
         return self._beams.rows(self._at_beams(states), prepared)
 
-    def solve(self, states: States, beam_rows: BeamRows, weights: Array) -> ExtendedStep:
+    def solve(self, states: States, beam_rows: BeamRows, weights: Array) -> Step:
         """Return the step at ``states``, with their beam rows and weights (M,)."""
         extras = self.problem.extras
         own, first = self._own_rows(states, beam_rows, weights)
@@ -124,33 +122,23 @@ class ExtendedLinearizer:
             first=first,
             border=np.column_stack([border, -states.constants / sigma[constant]]),
         )
-        return ExtendedStep(solve_bordered(rows))
+        return Step(solve_bordered(rows))
+
+    def inertial_rows(self, states: States) -> Array:
+        """Return the whitened rows (K - 1, 15, 31) of the inertial data at ``states``."""
+        return self._inertial_rows.at(states.values, states.R_nb)
 
     def retract(
         self, states: States, delta: tuple[Array, Array], *, scale: float = 1.0
     ) -> tuple[States, Array]:
         """Return the states moved by ``scale * delta``, and that step, flat."""
         step, constants_step = scale * delta[0], scale * delta[1]
-        move = gtsam.VectorValues()
-        for keys, own in zip(self._keys, step, strict=True):
-            move.insert(keys[0], own[:6])
-            move.insert(keys[1], own[6:9])
-            move.insert(keys[2], own[9:STATE_DIM])
-        values = states.values.retract(move)
-        poses = gtsam.utilities.extractPose3(values)
-        moved = States(
-            values,
-            poses[:, :9].reshape(-1, 3, 3),
-            poses[:, 9:],
-            states.v_n + step[:, 6:9],
-            states.bias + step[:, 9:STATE_DIM],
-            states.walks + step[:, STATE_DIM:],
-            states.constants + constants_step,
-        )
+        moved = retract(states, step, constants_step)
         return moved, np.concatenate([step.ravel(), constants_step])
 
     def cost(self, states: States, beam_rows: BeamRows, weights: Array) -> float:
         """Return half the weighted sum of squares that :meth:`solve` makes least."""
+        self.problem.chain.set_gravity(states.p_n)
         extras = self.problem.extras
         squares = np.sum(weights * (beam_rows.error / self.problem.beams.sigma) ** 2)
         squares += np.sum(self.prior.whitened(states) ** 2)
@@ -180,11 +168,11 @@ class ExtendedLinearizer:
         """Return the rows (K - 1, n, 2 n + C + 1) from each keyframe to the next."""
         extras = self.problem.extras
         n, n_intervals = extras.state_dim, self.problem.n_keyframes - 1
-        inertial = inertial_rows(self.inertial, states.values)
+        begin, end, b = np.split(self.inertial_rows(states), [STATE_DIM, 2 * STATE_DIM], axis=2)
         between = np.zeros((n_intervals, n, n + extras.width + 1))
-        between[:, :STATE_DIM, :STATE_DIM] = inertial[:, :, BEGIN]
-        between[:, :STATE_DIM, n : n + STATE_DIM] = inertial[:, :, END]
-        between[:, :STATE_DIM, -1] = inertial[:, :, -1]
+        between[:, :STATE_DIM, :STATE_DIM] = begin
+        between[:, :STATE_DIM, n : n + STATE_DIM] = end
+        between[:, :STATE_DIM, -1] = b[..., 0]
         for i in range(extras.n_walks):
             sigma, row = self._walk_sigma[:, i], STATE_DIM + i
             between[:, row, row] = -self._walk_factor[:, i] / sigma

@@ -22,10 +22,16 @@ from ssm_graph.earth import SEMI_MAJOR_AXIS
 from ssm_graph.errors import SolverError
 from ssm_graph.graph.beam_weights import met_weights, settle_weights, updated_trust
 from ssm_graph.graph.forward_extras import ForwardExtras
+from ssm_graph.graph.inertial_rows import (
+    PAIR_COLUMNS,
+    add_gravity_gradient,
+    carried_covariance,
+    inertial_graph,
+)
 from ssm_graph.graph.interfaces import BeamRows
-from ssm_graph.graph.linearize import carried_covariance, inertial_graph, linearize_beams
+from ssm_graph.graph.linearize import linearize_beams
 from ssm_graph.graph.states import States, states_from_arrays
-from ssm_graph.imu.preintegration import gtsam_gravity
+from ssm_graph.imu.preintegration import gravity_gradient, gtsam_gravity
 from ssm_graph.problem.error_state import POSITION, ROTATION, STATE_DIM, VELOCITY
 from ssm_graph.problem.problem import Problem, start_of
 
@@ -99,6 +105,7 @@ class _ForwardPass:
         self.gravity_at = np.full(3, np.inf)
         self.gravity, self.gravity_D_p = np.zeros(3), np.zeros((3, 3))
         self._g_n = gtsam_gravity(problem.frame, self.p_n)
+        self._gradient = gravity_gradient(problem.frame)
 
     def run(self) -> FirstValues:
         problem = self.problem
@@ -132,13 +139,13 @@ class _ForwardPass:
             values.insert(X(i), pose3=state_pose)
             values.insert(V(i), velocity)
             values.insert(B(i), constant_bias=bias)
-        # Columns x_i v_i x_j v_j b_i b_j.
-        whitened, _ = self.factors.at(k).linearize(values).jacobian()
-        self.P = carried_covariance(whitened[:, _I], whitened[:, _J], self.P)
+        pair = self.factors.at(k).linearize(values).augmentedJacobian()[:, PAIR_COLUMNS]
+        R_end = predicted.pose().rotation().matrix()
+        add_gravity_gradient(pair, self._gradient, R_begin=self.R_nb, R_end=R_end, span_s=span)
+        self.P = carried_covariance(pair, self.P)
         if self.extras:
             self.extras.predict(k, self.P)
-        self.R_nb = predicted.pose().rotation().matrix()
-        self.p_n, self.v_n = predicted.position(), predicted.velocity()
+        self.R_nb, self.p_n, self.v_n = R_end, predicted.position(), predicted.velocity()
 
     def _gravity(self, p_n: Array) -> Array:
         """Return gravity, linear about its last exact evaluation: good to 1e-10 m/s^2."""
@@ -251,11 +258,6 @@ class _ForwardPass:
         self.bias = self.bias + step[9:STATE_DIM]
         if self.extras:
             self.extras.correct(step[STATE_DIM:])
-
-
-# Columns of a linearised inertial factor that belong to its first and its second keyframe.
-_I = np.r_[0:9, 18:24]
-_J = np.r_[9:18, 24:30]
 
 
 class _RowsByKeyframe:

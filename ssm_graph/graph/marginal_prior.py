@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, V, X
 
 from ssm_graph.data import Array
 from ssm_graph.problem.error_state import STATE_DIM, InitialMoments
@@ -45,14 +44,6 @@ class MarginalPrior(NamedTuple):
         rows[:, STATE_DIM] = self.offset - self.root_information @ deviation
         return rows
 
-    def linear_factor(self, states: KeyframeStates) -> gtsam.JacobianFactor:
-        """Linearise at the first keyframe of ``states``."""
-        rows = self.rows(states)
-        unit = gtsam.noiseModel.Unit.Create(STATE_DIM)
-        pose, velocity, bias = (np.asfortranarray(rows[:, s]) for s in _BLOCKS)
-        b = np.ascontiguousarray(rows[:, STATE_DIM])
-        return gtsam.JacobianFactor(X(0), pose, V(0), velocity, B(0), bias, b, unit)
-
     def _deviation(self, states: KeyframeStates) -> Array:
         return np.concatenate(
             [
@@ -62,9 +53,6 @@ class MarginalPrior(NamedTuple):
                 states.bias[0] - self.bias,
             ]
         )
-
-
-_BLOCKS = (slice(0, 6), slice(6, 9), slice(9, 15))
 
 
 def prior_at_start(start: InitialMoments) -> MarginalPrior:

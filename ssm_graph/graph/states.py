@@ -9,9 +9,10 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from ssm_graph.data import Array
+from ssm_graph.problem.error_state import STATE_DIM
 
-_NONE = np.zeros((1, 0))
-_NONE.setflags(write=False)
+_NO_CONSTANTS = np.zeros(0)
+_NO_CONSTANTS.setflags(write=False)
 
 
 class States(NamedTuple):
@@ -26,9 +27,9 @@ class States(NamedTuple):
     """(K, 3) m/s"""
     bias: Array
     """(K, 6) accelerometer m/s^2, gyro rad/s"""
-    walks: Array = _NONE
+    walks: Array
     """(K, s) extra variables that walk, zero where they are as stated"""
-    constants: Array = _NONE[0]
+    constants: Array
     """(C,) extra variables that do not"""
 
 
@@ -37,10 +38,10 @@ def states_from_arrays(
     p_n: Array,
     v_n: Array,
     bias: Array,
-    walks: Array = _NONE,
-    constants: Array = _NONE[0],
+    walks: Array | None = None,
+    constants: Array = _NO_CONSTANTS,
 ) -> States:
-    """Return the states of K keyframes as both."""
+    """Return the states of K keyframes as both, without extra variables that are left out."""
     values = gtsam.Values()
     poses = np.tile(np.eye(4), (len(p_n), 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = R_nb, p_n
@@ -51,29 +52,29 @@ def states_from_arrays(
         values.insert(X(k), pose3=gtsam.Pose3(pose))
         values.insert(V(k), velocity)
         values.insert(B(k), constant_bias=gtsam.imuBias.ConstantBias(accel, gyro))
+    if walks is None:
+        walks = np.zeros((len(p_n), 0))
     return States(values, R_nb, p_n, v_n, bias, walks, constants)
 
 
-def retract(
-    states: States, delta: gtsam.VectorValues, *, scale: float = 1.0
-) -> tuple[States, Array]:
-    """Return the states moved by ``scale * delta``, and that step as (K, 15)."""
-    if scale != 1.0:
-        delta = delta.scale(scale)
-    values = states.values.retract(delta)
-    n_keyframes = len(states.p_n)
-    # VectorValues come in key order, and symbols sort as b, v, x.
-    flat = delta.vector()
-    bias_end, velocity_end = 6 * n_keyframes, 9 * n_keyframes
-    d_bias = flat[:bias_end].reshape(-1, 6)
-    d_velocity = flat[bias_end:velocity_end].reshape(-1, 3)
-    d_pose = flat[velocity_end:].reshape(-1, 6)
+def retract(states: States, step: Array, constants_step: Array = _NO_CONSTANTS) -> States:
+    """Return the states moved by a step of keyframes and walks (K, 15 + s), and of constants (C,).
+
+    The pose moves as GTSAM retracts it.
+    """
+    move = gtsam.VectorValues()
+    for k, own in enumerate(step):
+        move.insert(X(k), own[:6])
+        move.insert(V(k), own[6:9])
+        move.insert(B(k), own[9:STATE_DIM])
+    values = states.values.retract(move)
     poses = gtsam.utilities.extractPose3(values)
-    moved = States(
+    return States(
         values,
         poses[:, :9].reshape(-1, 3, 3),
         poses[:, 9:],
-        states.v_n + d_velocity,
-        states.bias + d_bias,
+        states.v_n + step[:, 6:9],
+        states.bias + step[:, 9:STATE_DIM],
+        states.walks + step[:, STATE_DIM:],
+        states.constants + constants_step,
     )
-    return moved, np.hstack([d_pose, d_velocity, d_bias])

@@ -24,6 +24,8 @@ GAP_ACCEL = 1.0
 """m/s^2, 1 sigma of the unseen specific force inside a gap of the inertial data."""
 GRAVITY = 9.8
 """m/s^2"""
+GRADIENT_REACH = 1000.0
+"""m, over which the gradient of gravity is taken."""
 LIVELY_S = 5.0
 """Before and after a gap, what is seen tells how lively the unseen may have been."""
 LIVELIER = 1.5
@@ -63,6 +65,13 @@ def gtsam_gravity(frame: LocalFrame, p_n: Array) -> Array:
     """Return the gravity (..., 3) to hand to GTSAM at positions ``p_n``, m/s^2."""
     omega = frame.omega_ie_n
     return np.asarray(frame.g_n_at(p_n) + np.cross(omega, np.cross(omega, p_n)))
+
+
+def gravity_gradient(frame: LocalFrame) -> Array:
+    """Return how that gravity changes with position (3, 3), 1/s^2, about the origin of ``n``."""
+    around = GRADIENT_REACH * np.vstack([np.eye(3), -np.eye(3)])
+    at = gtsam_gravity(frame, around)
+    return np.asarray((at[:3] - at[3:]).T / (2.0 * GRADIENT_REACH))
 
 
 def preintegrate(

@@ -77,4 +77,6 @@ def _turned(J: Array, covariance: Array) -> Array:
 
 
 def _sigmas(covariance: Array) -> Array:
-    return np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    """Return standard deviations; a variance that a lost filter let become negative is no limit."""
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    return np.sqrt(np.where(variance < 0.0, np.inf, variance))

@@ -13,10 +13,9 @@ from factors.similarity import Kernel, LogKernel, Similarity, expected_mahalanob
 from ssm_graph.data import N_BEAMS, Array
 from ssm_graph.errors import ConfigError, SolverError
 from ssm_graph.estimate import BeamTable, Estimate, Iteration, NoiseFound, Status
-from ssm_graph.graph.extended import ExtendedLinearizer
+from ssm_graph.graph.extended import GraphLinearizer, Step
 from ssm_graph.graph.first_values import FirstValues, first_values
-from ssm_graph.graph.interfaces import BeamRows, Linearizer, Step
-from ssm_graph.graph.linearize import GraphLinearizer
+from ssm_graph.graph.interfaces import BeamRows
 from ssm_graph.graph.states import States
 from ssm_graph.problem.problem import Problem
 from ssm_graph.problem.trajectory import trajectory_from_states
@@ -84,11 +83,6 @@ class SmootherConfig:
         return GncSchedule(self.kernel, self.graduation, WARM_KERNEL)
 
 
-def linearizer_of(problem: Problem) -> Linearizer:
-    """Return what linearises a problem: with extra variables, or the keyframes alone."""
-    return ExtendedLinearizer(problem) if problem.extras else GraphLinearizer(problem)
-
-
 def _notes_of(first: FirstValues) -> tuple[str, ...]:
     if first.n_doubts == 0:
         return ()
@@ -150,7 +144,7 @@ class SsmSmoother:
         self, problem: Problem, first: FirstValues | None, on_iteration: OnIteration | None
     ) -> Solved:
         """Iterate states and weights until both have settled."""
-        linearizer = linearizer_of(problem)
+        linearizer = GraphLinearizer(problem)
         if first is None:
             first = first_values(problem, kernel=WARM_KERNEL, inertial=linearizer.inertial)
         states, rows = first.states, linearizer.beam_rows(first.states)
@@ -191,7 +185,7 @@ class SsmSmoother:
 
     def _iterate(
         self,
-        linearizer: Linearizer,
+        linearizer: GraphLinearizer,
         states: States,
         rows: BeamRows,
         weights: Array,
@@ -224,7 +218,7 @@ class SsmSmoother:
             spread = step.variance(beams.keyframe, H)
         return expected_mahalanobis_sq(rows.error, spread, sigma=beams.sigma)
 
-    def _cost(self, linearizer: Linearizer, last: Pass) -> float:
+    def _cost(self, linearizer: GraphLinearizer, last: Pass) -> float:
         """Return the cost with each beam's robust loss in place of its weighted square."""
         kernel, rows = self.config.kernel, last.beam_rows
         t = (rows.error / linearizer.problem.beams.sigma) ** 2

@@ -12,7 +12,7 @@ calibration error of the whole array would explain, scale or mounting, is nobody
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -22,12 +22,11 @@ from factors.similarity import WEIGHT_FLOOR, LogKernel
 from ssm_graph.data import N_BEAMS, Array
 from ssm_graph.errors import ConfigError
 from ssm_graph.graph.beam_evidence import ChainEvidence, Evidence, WhitenedBeams
+from ssm_graph.graph.extended import GraphLinearizer
 from ssm_graph.graph.interfaces import BeamRows
-from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.graph.solve import solve_linear
-from ssm_graph.graph.states import States, retract
+from ssm_graph.graph.states import States
 from ssm_graph.problem.error_state import STATE_DIM
-from ssm_graph.problem.problem import Problem
+from ssm_graph.problem.problem import NO_EXTRAS, Problem
 from ssm_graph.smoothers.gnc import NEAR_SIGMAS
 
 Mask = NDArray[np.bool_]
@@ -92,13 +91,12 @@ def find_beam_faults(
 ) -> Found:
     """Search the whole mission, linearised at ``states`` near the answer."""
     problem, beams = linearizer.problem, linearizer.problem.beams
+    states = states._replace(walks=states.walks[:, :0], constants=states.constants[:0])
     jacobian = rows.jacobian[:, :STATE_DIM]
     weights = KERNEL.weight((rows.error / beams.sigma) ** 2)
     linearizer.follow(states)
-    linear = linearizer.linearize(states, BeamRows(rows.error, jacobian), weights)
-    solution = solve_linear(linear, linearizer.ordering, n_keyframes=problem.n_keyframes)
-    _, step = retract(states, solution.delta)
-    missed = -rows.error - np.einsum("mi,mi->m", jacobian, step[beams.keyframe])
+    solution = linearizer.solve(states, BeamRows(rows.error, jacobian), weights).solution
+    missed = -rows.error - np.einsum("mi,mi->m", jacobian, solution.step[beams.keyframe])
     scale = np.sqrt(weights) / beams.sigma
     whitened = WhitenedBeams(
         beams.keyframe,
@@ -252,7 +250,8 @@ class FaultWatch:
 
     def __init__(self, problem: Problem, search: FaultSearch | None) -> None:
         self._search = search
-        self._linearizer = None if search is None else GraphLinearizer(problem)
+        alone = replace(problem, extras=NO_EXTRAS)
+        self._linearizer = None if search is None else GraphLinearizer(alone)
         self._beams, self._time_s = problem.beams, problem.keyframe_s[problem.beams.keyframe]
         self._found = Found(np.zeros(len(self._time_s), dtype=bool), ())
         self._n_looks = 0

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from ssm_graph.data import Array
 from ssm_graph.estimate import Iteration, NoiseFound, Status
+from ssm_graph.graph.extended import GraphLinearizer, Step
 from ssm_graph.graph.first_values import FirstValues
 from ssm_graph.graph.inertial_fit import inertial_fit
-from ssm_graph.graph.interfaces import BeamRows, Linearizer, Step
+from ssm_graph.graph.interfaces import BeamRows
 from ssm_graph.graph.states import States
 from ssm_graph.smoothers.noise import noise_found
 
@@ -32,7 +33,7 @@ class Pass(NamedTuple):
 class Solved(NamedTuple):
     """How a solution ended."""
 
-    linearizer: Linearizer
+    linearizer: GraphLinearizer
     last: Pass
     iterations: tuple[Iteration, ...]
     status: Status
@@ -52,15 +53,15 @@ def noise_of(solved: Solved, used: Array) -> NoiseFound:
         error=last.beam_rows.error,
         variance=last.step.variance(linearizer.problem.beams.keyframe, last.beam_rows.jacobian),
         weights=last.weights,
-        inertial=inertial_fit(linearizer.inertial, last.states.values, last.step),
+        inertial=inertial_fit(linearizer.inertial_rows(last.states), last.step),
         used=used,
     )
 
 
 def descend(
-    linearizer: Linearizer,
+    linearizer: GraphLinearizer,
     states: States,
-    delta: Any,
+    delta: tuple[Array, Array],
     weights: Array,
     cost: float,
 ) -> tuple[States, BeamRows, Array]:

@@ -6,7 +6,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from ssm_graph.data import Array
-from ssm_graph.graph.interfaces import BeamRows, Linearizer, Misfit
+from ssm_graph.graph.extended import GraphLinearizer
+from ssm_graph.graph.interfaces import BeamRows, Misfit
 from ssm_graph.graph.marginal_prior import MarginalPrior
 from ssm_graph.graph.states import States
 from ssm_graph.problem.doubts import MISFIT, doubts_of_beams
@@ -25,7 +26,7 @@ HINTS = {
 
 
 def contradictions(
-    linearizer: Linearizer, states: States, beam_rows: BeamRows, weights: Array
+    linearizer: GraphLinearizer, states: States, beam_rows: BeamRows, weights: Array
 ) -> list[str]:
     """Compare every kind of measurement with the answer; say in a sentence each what disagrees."""
     misfits = linearizer.misfits(states)
@@ -73,8 +74,7 @@ def _doubt_extras(extras: Extras, states: States) -> list[str]:
     """Look for a calibration that lies further off than its prior can mean."""
     doubts = []
     for block in extras.blocks:
-        first = states.walks[0] if extras.n_walks else states.walks
-        value = extras.value(block.name, first, states.constants, default=np.zeros(0))
+        value = extras.value(block.name, states.walks[0], states.constants, default=np.zeros(0))
         whitened = value / block.sigma
         if chi2.sf(float(whitened @ whitened), df=len(whitened)) < PRIOR_TAIL:
             doubts.append(

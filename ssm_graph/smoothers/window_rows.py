@@ -16,17 +16,19 @@ from factors.dvl_beam import beam_residual
 from factors.so3 import cross
 from ssm_graph.data import Array
 from ssm_graph.earth import LocalFrame
+from ssm_graph.graph.inertial_rows import (
+    PAIR_COLUMNS,
+    add_gravity_gradient,
+    carried_covariance,
+)
 from ssm_graph.graph.interfaces import BeamRows
-from ssm_graph.graph.linearize import carried_covariance, rows_of_beams
-from ssm_graph.imu.preintegration import gtsam_gravity
+from ssm_graph.graph.linearize import rows_of_beams
+from ssm_graph.imu.preintegration import gravity_gradient, gtsam_gravity
 from ssm_graph.problem.error_state import GYRO_BIAS, POSITION, ROTATION, STATE_DIM, VELOCITY
 from ssm_graph.problem.heights import height_track, mean_rises
 from ssm_graph.problem.states import NavigationStates
 from ssm_graph.smoothers.keyframe import BeamSpeeds, Keyframe, Sensors, Way
 
-# Columns of GTSAM's factor, x_i v_i x_j v_j b_i b_j and the right-hand side, as pairs of error
-# states.
-_COLUMNS = np.r_[0:9, 18:24, 9:18, 24:30, 30]
 SEEN_BY_BEAMS = np.r_[ROTATION, VELOCITY, GYRO_BIAS]
 """Components of the error state that a beam depends on."""
 NO_ROWS = np.zeros((0, STATE_DIM + 1))
@@ -42,6 +44,7 @@ class InertialRows:
 
     def __init__(self, frame: LocalFrame) -> None:
         self._frame = frame
+        self._gradient = gravity_gradient(frame)
         self._values = gtsam.Values()
         for pose, velocity, bias in _KEYS:
             self._values.insert(pose, pose3=gtsam.Pose3())
@@ -73,9 +76,8 @@ class InertialRows:
         covariance: Array,
     ) -> Array:
         """Return the covariance (15, 15) at a predicted keyframe from that of the last one."""
-        (rows,) = self.rows([keyframe], last.followed_by(predicted))
-        A_i, A_j = rows[:, :STATE_DIM], rows[:, STATE_DIM : 2 * STATE_DIM]
-        return carried_covariance(A_i, A_j, covariance)
+        (pair,) = self.rows([keyframe], last.followed_by(predicted))
+        return carried_covariance(pair, covariance)
 
     def set_gravity(self, ends: Sequence[Keyframe], states: NavigationStates) -> None:
         """Let gravity of the intervals before ``ends`` follow the states (1 + len(ends), ...)."""
@@ -98,7 +100,15 @@ class InertialRows:
             factor = gtsam.GalileanCombinedImuFactor(
                 x_i, v_i, x_j, v_j, b_i, b_j, _way(keyframe).measured
             )
-            rows.append(factor.linearize(self._values).augmentedJacobian()[:, _COLUMNS])
+            pair = factor.linearize(self._values).augmentedJacobian()[:, PAIR_COLUMNS]
+            add_gravity_gradient(
+                pair,
+                self._gradient,
+                R_begin=states.R_nb[i - 1],
+                R_end=states.R_nb[i],
+                span_s=float(_way(keyframe).measured.deltaTij()),
+            )
+            rows.append(pair)
         return rows
 
     def _put(self, which: int, pose: Array, v_n: Array, bias: Array) -> None:

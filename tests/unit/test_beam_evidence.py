@@ -2,33 +2,33 @@
 
 from __future__ import annotations
 
-import gtsam
 import numpy as np
 import pytest
 
 from ssm_graph.data import Array
 from ssm_graph.graph.beam_evidence import ChainEvidence, WhitenedBeams
-from ssm_graph.graph.solve import LinearSolution
+from ssm_graph.graph.bordered import BorderedSolution
 
 K, N, M = 30, 15, 90
 
 
-def chain(rng: np.random.Generator) -> LinearSolution:
+def chain(rng: np.random.Generator) -> BorderedSolution:
     """Return conditionals of a chain that forgets."""
     R = np.triu(rng.normal(size=(K, N, N))) + 3.0 * np.eye(N)
     S = 0.2 * rng.normal(size=(K, N, N))
     S[-1] = 0.0
-    return LinearSolution(gtsam.VectorValues(), R, S)
+    none = np.zeros(0)
+    return BorderedSolution(none, none, none, none, none, np.asarray(np.linalg.solve(R, S)), R)
 
 
-def dense_information(solution: LinearSolution, beams: WhitenedBeams, columns: Array) -> Array:
+def dense_information(solution: BorderedSolution, beams: WhitenedBeams, columns: Array) -> Array:
     """Return ``c' (I - A (A'A)^-1 A') c`` by one triangular matrix of the whole chain."""
     root = np.zeros((K * N, K * N))
     A = np.zeros((M, K * N))
     for k in range(K):
         root[k * N : (k + 1) * N, k * N : (k + 1) * N] = solution.R[k]
         if k + 1 < K:
-            root[k * N : (k + 1) * N, (k + 1) * N : (k + 2) * N] = solution.S[k]
+            root[k * N : (k + 1) * N, (k + 1) * N : (k + 2) * N] = solution.R[k] @ solution.gain[k]
     for row, k in enumerate(beams.keyframe):
         A[row, k * N : (k + 1) * N] = beams.jacobian[row]
     y = np.linalg.solve(root.T, A.T @ columns)

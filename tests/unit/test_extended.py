@@ -1,22 +1,27 @@
-"""A problem with extra variables: rows against GTSAM's, linear graph against cost, walks."""
+"""The linearised graph against GTSAM's and against its cost, with extra variables and without."""
 
 from __future__ import annotations
 
 from functools import cache
 from typing import Any
 
+import gtsam
 import numpy as np
 import pytest
+from gtsam.symbol_shorthand import B, V, X
 
 from benchmarks.calibration_cases import as_stated, asking
 from ssm_graph.data import Array
-from ssm_graph.graph.extended import ExtendedLinearizer
-from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.graph.states import States, states_from_arrays
+from ssm_graph.errors import ConfigError
+from ssm_graph.graph.extended import GraphLinearizer
+from ssm_graph.graph.gtsam_graph import gtsam_graph
+from ssm_graph.graph.states import States, retract, states_from_arrays
+from ssm_graph.problem.error_state import STATE_DIM
 from ssm_graph.problem.extras import Extra, Extras
 from ssm_graph.problem.problem import Problem, build_problem
+from ssm_graph.simulation import GnssSettings, Grade
 from tests.calibration_fixture import miscalibrated
-from tests.helpers import true_states
+from tests.helpers import simulated, true_states
 
 
 @cache
@@ -49,31 +54,84 @@ def with_small_priors(problem: Problem, sigma: float) -> Problem:
     return Problem(**changed, extras=Extras(blocks))
 
 
-def test_with_everything_known_it_is_gtsams_graph() -> None:
-    """Step, covariance, cost and misfits are those of the chain that GTSAM eliminates."""
+def dense(graph: gtsam.NonlinearFactorGraph, states: States) -> tuple[Array, Array]:
+    """Return step (K, 15) and covariance (K, 15, 15) of a graph of GTSAM's, by NumPy.
+
+    Columns are scaled to unit length, and ``J'J`` is inverted through the QR of ``J``: the normal
+    equations themselves would lose half of the digits.
+    """
+    n = len(states.p_n)
+    ordering = gtsam.Ordering()
+    for k in range(n):
+        for key in (X(k), V(k), B(k)):
+            ordering.push_back(key)
+    J, b = graph.linearize(states.values).jacobian(ordering)
+    scale = 1.0 / np.linalg.norm(J, axis=0)
+    Q, R = np.linalg.qr(J * scale)
+    R_inv = np.linalg.inv(R) * scale[:, None]
+    blocks = R_inv.reshape(n, STATE_DIM, -1)
+    return (R_inv @ (Q.T @ b)).reshape(n, STATE_DIM), blocks @ np.swapaxes(blocks, 1, 2)
+
+
+@pytest.mark.parametrize("grade", Grade, ids=lambda grade: grade.name)
+def test_it_is_gtsams_graph(grade: Grade, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Step, covariance and cost are those of GTSAM's factors and one in Python for each beam.
+
+    Up to the gradient of gravity, which those do not know.
+    """
+    monkeypatch.setattr(
+        "ssm_graph.graph.inertial_rows.gravity_gradient", lambda _: np.zeros((3, 3))
+    )
+    gnss = GnssSettings(windows=((0.0, 9.0),))
+    sim = simulated(duration_s=8.0, gnss=gnss, dropout_rate=0.2, grade=grade)
+    problem = build_problem(sim.mission)
+    truth, rng = true_states(problem, sim), np.random.default_rng(3)
+    size = np.repeat([1e-5, 1e-3, 1e-3, 1e-5, 1e-8], 3)
+    states = retract(truth, size * rng.normal(size=(problem.n_keyframes, STATE_DIM)))
+    weights = rng.uniform(0.01, 1.1, len(problem.beams.speed))
+    linearizer = GraphLinearizer(problem)
+    linearizer.follow(states)
+    rows = linearizer.beam_rows(states)
+    found = linearizer.solve(states, rows, weights)
+    graph = gtsam_graph(problem, states, weights)
+    step, P = dense(graph, states)
+    sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+    scale = sigma[:, :, None] * sigma[:, None, :]
+    np.testing.assert_allclose(found.covariance / scale, P / scale, rtol=0.0, atol=1e-8)
+    np.testing.assert_allclose(found.delta[0] / sigma, step / sigma, rtol=0.0, atol=1e-7)
+    cost = linearizer.cost(states, rows, weights)
+    assert cost == pytest.approx(graph.error(states.values), rel=1e-9)
+
+
+def test_gtsams_graph_has_no_calibration() -> None:
+    """It says which variables are in the way."""
+    problem, _, states = problems()
+    with pytest.raises(ConfigError, match="calibrates dvl_scale"):
+        gtsam_graph(problem, states)
+
+
+def test_with_everything_known_it_is_the_graph_without() -> None:
+    """Step, covariance, cost and misfits are those of the keyframes alone."""
     problem, plain, states = problems()
     known = with_small_priors(problem, 1e-7)
     states = states._replace(
         walks=np.zeros((known.n_keyframes, 0)), constants=np.zeros(known.extras.n_constants)
     )
-    ours, theirs = ExtendedLinearizer(known), GraphLinearizer(plain)
     weights = np.random.default_rng(1).uniform(0.1, 1.0, size=len(plain.beams.speed))
     found: list[tuple[Any, ...]] = []
-    linearizer: Any
-    for linearizer in (ours, theirs):
-        linearizer.follow(states)
-        rows = linearizer.beam_rows(states)
-        step = linearizer.solve(states, rows, weights)
-        _, update = linearizer.retract(states, step.delta)
-        cost = linearizer.cost(states, rows, weights)
+    for of, at in ((known, states), (plain, states._replace(constants=np.zeros(0)))):
+        linearizer = GraphLinearizer(of)
+        linearizer.follow(at)
+        rows = linearizer.beam_rows(at)
+        step = linearizer.solve(at, rows, weights)
+        cost = linearizer.cost(at, rows, weights)
         variance = step.variance(plain.beams.keyframe, rows.jacobian)
-        found.append((step.covariance, cost, variance, linearizer.misfits(states), update))
+        found.append((step.covariance, cost, variance, linearizer.misfits(at), step.delta[0]))
     (P, cost, variance, misfits, update), (P_2, cost_2, variance_2, misfits_2, update_2) = found
     sigma = np.sqrt(np.diagonal(P_2, axis1=1, axis2=2))
     scale = sigma[:, :, None] * sigma[:, None, :]
     np.testing.assert_allclose(P / scale, P_2 / scale, atol=1e-6)
-    states_step = update[: update_2.size].reshape(update_2.shape)
-    np.testing.assert_allclose(states_step / sigma, update_2 / sigma, atol=1e-4)
+    np.testing.assert_allclose(update / sigma, update_2 / sigma, atol=1e-4)
     np.testing.assert_allclose(variance, variance_2, rtol=1e-6)
     assert cost == pytest.approx(cost_2, rel=1e-9)
     assert misfits.keys() == misfits_2.keys() == {"GNSS", "depth", "inertial"}
@@ -82,7 +140,7 @@ def test_with_everything_known_it_is_gtsams_graph() -> None:
         assert misfit[1:] == misfits_2[name][1:]
 
 
-def along(linearizer: ExtendedLinearizer, states: States, direction: Array) -> tuple[float, float]:
+def along(linearizer: GraphLinearizer, states: States, direction: Array) -> tuple[float, float]:
     """Return slope and curvature of the cost along a direction of all variables."""
     problem = linearizer.problem
     n = problem.extras.state_dim
@@ -105,7 +163,7 @@ def test_the_linear_graph_is_the_derivative_of_the_cost() -> None:
     mean over the ping window, and settles within a hundredth of a sigma.
     """
     problem, _, states = problems()
-    linearizer = ExtendedLinearizer(problem)
+    linearizer = GraphLinearizer(problem)
     linearizer.follow(states)
     moved, weights = states, np.ones(len(problem.beams.speed))
     for _ in range(6):

@@ -7,9 +7,8 @@ import pytest
 
 from factors.similarity import GaussianKernel, LogKernel
 from ssm_graph.errors import ConfigError
-from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.graph.solve import marginal_covariances, solve_linear
-from ssm_graph.graph.states import retract, states_from_arrays
+from ssm_graph.graph.extended import GraphLinearizer
+from ssm_graph.graph.states import states_from_arrays
 from ssm_graph.problem.problem import Problem, build_problem, start_of, with_dvl
 from ssm_graph.simulation import Grade, OutlierKind, Outliers
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
@@ -66,7 +65,7 @@ def test_gaussian_windows_of_any_lag_end_alike() -> None:
 
 
 def test_the_window_is_the_graph() -> None:
-    """At any states and weights, its rows lead to the step and the covariances of GTSAM's."""
+    """At any states and weights, its rows lead to the step and the covariances of the graph."""
     problem = problem_of(duration_s=6.0)
     first, *others = keyframes_of(problem)
     window = Window(sensors_of(problem), FixedLagConfig(lag_s=6.0), first, start_of(problem))
@@ -77,12 +76,10 @@ def test_the_window_is_the_graph() -> None:
     linearizer = GraphLinearizer(problem)
     linearizer.follow(states)
     weights = window.all.weight
-    linear = linearizer.linearize(states, linearizer.beam_rows(states), weights)
-    solution = solve_linear(linear, linearizer.ordering, n_keyframes=problem.n_keyframes)
-    covariance = marginal_covariances(solution)
+    step = linearizer.solve(states, linearizer.beam_rows(states), weights)
+    covariance = step.covariance
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    _, step = retract(states, solution.delta)
-    assert np.max(np.abs(step) / sigma) < 1e-6
+    assert np.max(np.abs(step.delta[0]) / sigma) < 1e-6
     unit = sigma[:, :, None] * sigma[:, None, :]
     np.testing.assert_allclose((window.all.covariance - covariance) / unit, 0.0, atol=1e-6)
 

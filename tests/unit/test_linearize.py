@@ -1,4 +1,4 @@
-"""The factors of a mission: zero at the truth over the curved Earth, linear graph equals cost."""
+"""The factors of a mission: zero at the truth over the curved Earth."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import pytest
 
 from ssm_graph.data import Array
 from ssm_graph.earth import radii_of_curvature
-from ssm_graph.graph.depth import depth_graph
-from ssm_graph.graph.linearize import GraphLinearizer, gnss_graph, prior_graph
+from ssm_graph.graph.gtsam_graph import depth_graph, gnss_graph, prior_graph
 from ssm_graph.graph.states import States, retract, states_from_arrays
 from ssm_graph.problem.error_state import STATE_DIM
 from ssm_graph.problem.problem import Problem, build_problem, start_of
@@ -61,7 +60,7 @@ def errors_of(graph: gtsam.NonlinearFactorGraph, states: States) -> Array:
 def depth_errors(problem: Problem, states: States) -> Array:
     """Return what depth misses at the states, m."""
     assert problem.depths is not None
-    graph = depth_graph(problem.depths, states, problem.frame, problem.keyframe_s)
+    graph = depth_graph(problem, problem.depths, states)
     return errors_of(graph, states)[:, 2]
 
 
@@ -106,7 +105,7 @@ def test_depth_counts_the_height_error_and_its_readings() -> None:
     states = states_from_arrays(truth.R_nb, raised, truth.v_n, truth.bias)
     np.testing.assert_allclose(depth_errors(problem, states), 0.2, atol=1e-5)
     assert problem.depths is not None
-    graph = depth_graph(problem.depths, states, problem.frame, problem.keyframe_s)
+    graph = depth_graph(problem, problem.depths, states)
     counts = np.bincount(problem.depths.keyframe, minlength=problem.n_keyframes)
     costs = [graph.at(k).error(states.values) for k in range(graph.size())]
     expected = 0.5 * counts[counts > 0] * (0.2 / problem.depths.sigma) ** 2
@@ -117,7 +116,7 @@ def test_depth_says_nothing_of_the_local_level() -> None:
     """GTSAM's position factor is used along the vertical at the vehicle alone."""
     _, problem, truth = far_transit(depth_hz=1.0)
     assert problem.depths is not None
-    graph = depth_graph(problem.depths, truth, problem.frame, problem.keyframe_s)
+    graph = depth_graph(problem, problem.depths, truth)
     level = np.array([5.0, -9.0, 0.0])
     shifted = truth.p_n + problem.frame.R_nl_at(truth.p_n) @ level
     aside = states_from_arrays(truth.R_nb, shifted, truth.v_n, truth.bias)
@@ -179,69 +178,19 @@ def small_problem() -> tuple[Problem, States, Array]:
     return problem, states, rng.uniform(0.01, 1.1, len(problem.beams.speed))
 
 
-def test_linear_graph_has_the_cost_of_the_nonlinear_one() -> None:
-    """At the linearisation point both say the same, weights included."""
-    problem, states, weights = small_problem()
-    linearizer = GraphLinearizer(problem)
-    linearizer.follow(states)
-    rows = linearizer.beam_rows(states)
-    linear = linearizer.linearize(states, rows, weights)
-    zero = states.values.zeroVectors()
-    cost = linearizer.cost(states, rows, weights)
-    assert linear.error(zero) == pytest.approx(cost, rel=1e-12)
-    # Each row of the beams counts by its weight.
-    gained = linearizer.cost(states, rows, 2.0 * weights) - cost
-    expected = 0.5 * np.sum(weights * (rows.error / problem.beams.sigma) ** 2)
-    assert gained == pytest.approx(expected, rel=1e-6)
-
-
-def test_gradient_of_the_linear_graph_is_that_of_the_cost() -> None:
-    """Central differences of the cost along random directions, everything in it."""
-    problem, states, weights = small_problem()
-    linearizer = GraphLinearizer(problem)
-    linearizer.follow(states)
-    linear = linearizer.linearize(states, linearizer.beam_rows(states), weights)
-    gradient = linear.gradientAtZero()
-    rng = np.random.default_rng(4)
-    scale = {3: np.full(3, 1.0), 6: np.r_[np.full(3, 1e-2), np.full(3, 1.0)]}
-    for _ in range(5):
-        delta = states.values.zeroVectors()
-        for key in states.values.keys():  # noqa: SIM118
-            size = delta.at(key).size
-            delta.update(_vector(key, rng.normal(size=size) * scale[size]))
-        ends = []
-        for step in (1e-4, -1e-4):
-            moved, _ = retract(states, delta, scale=step)
-            ends.append(linearizer.cost(moved, linearizer.beam_rows(moved), weights))
-        slope = (ends[0] - ends[1]) / 2e-4
-        assert slope == pytest.approx(gradient.dot(delta), rel=1e-5)
-
-
-def _vector(key: int, value: Array) -> gtsam.VectorValues:
-    vector = gtsam.VectorValues()
-    vector.insert(key, value)
-    return vector
-
-
 def test_arrays_and_values_move_together() -> None:
-    """A step taken on both sides leaves them saying the same, and is returned as it was."""
-    problem, states, _ = small_problem()
-    n = problem.n_keyframes
+    """A step taken on both sides leaves them saying the same."""
+    sim = simulated(duration_s=8.0)
+    states = true_states(build_problem(sim.mission), sim)
+    n = len(states.p_n)
     rng = np.random.default_rng(5)
     step = 0.1 * rng.normal(size=(n, STATE_DIM))
-    delta = gtsam.VectorValues()
-    for k in range(n):
-        delta.insert(gtsam.symbol("x", k), step[k, :6])
-        delta.insert(gtsam.symbol("v", k), step[k, 6:9])
-        delta.insert(gtsam.symbol("b", k), step[k, 9:])
-    for scale in (1.0, 0.25):
-        moved, taken = retract(states, delta, scale=scale)
-        np.testing.assert_allclose(taken, scale * step, rtol=1e-14)
-        again = states_from_arrays(moved.R_nb, moved.p_n, moved.v_n, moved.bias)
-        assert again.values.equals(moved.values, 1e-12)
-        errors = state_errors(states, moved)
-        np.testing.assert_allclose(errors[:, 6:], scale * step[:, 6:], atol=1e-13)
-        np.testing.assert_allclose(errors[:, :3], scale * step[:, :3], atol=1e-12)
+    moved = retract(states, step)
+    again = states_from_arrays(moved.R_nb, moved.p_n, moved.v_n, moved.bias)
+    assert again.values.equals(moved.values, 1e-12)
+    errors = state_errors(states, moved)
+    np.testing.assert_allclose(errors[:, 6:], step[:, 6:], atol=1e-13)
+    np.testing.assert_allclose(errors[:, :3], step[:, :3], atol=1e-12)
 
 
 @pytest.mark.parametrize("n_keyframes", [9, 11, 101])
@@ -250,6 +199,6 @@ def test_states_keep_their_order(n_keyframes: int) -> None:
     p_n = np.arange(3.0 * n_keyframes).reshape(-1, 3)
     identity = np.tile(np.eye(3), (n_keyframes, 1, 1))
     states = states_from_arrays(identity, p_n, -p_n, np.hstack([p_n, p_n]))
-    moved, _ = retract(states, states.values.zeroVectors())
+    moved = retract(states, np.zeros((n_keyframes, STATE_DIM)))
     np.testing.assert_array_equal(moved.p_n, p_n)
     np.testing.assert_array_equal(moved.R_nb, identity)

@@ -10,7 +10,7 @@ import pytest
 
 from ssm_graph.data import Array, ImuLog, ImuNoise
 from ssm_graph.earth import EARTH_RATE, LocalFrame
-from ssm_graph.graph.linearize import inertial_graph
+from ssm_graph.graph.inertial_rows import inertial_graph
 from ssm_graph.imu.preintegration import (
     GAP_ACCEL,
     GAP_GYRO_RATE,

@@ -1,0 +1,112 @@
+"""A problem as a graph of GTSAM's own, for its optimisers and for factors that a user adds.
+
+Inertial factors, GNSS and depth are GTSAM's; every beam is a factor of its own, in Python. What
+solves missions here takes the same residuals in bulk, see :mod:`ssm_graph.graph.extended`.
+"""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, V, X
+
+from factors.dvl_beam import dvl_beam_factor
+from ssm_graph.data import Array
+from ssm_graph.errors import ConfigError
+from ssm_graph.graph.depth import depth_targets
+from ssm_graph.graph.inertial_rows import inertial_graph
+from ssm_graph.graph.states import States
+from ssm_graph.problem.error_state import POSITION, ROTATION, VELOCITY
+from ssm_graph.problem.problem import Depths, Fixes, Problem, start_of
+
+
+def gtsam_graph(
+    problem: Problem, states: States, weights: Array | None = None
+) -> gtsam.NonlinearFactorGraph:
+    """Return the whole graph with the keys ``x``, ``v`` and ``b`` of every keyframe.
+
+    Gravity of the inertial factors and the targets of depth are those of ``states``, near the
+    answer; the factors share gravity with the problem.
+
+    Parameters
+    ----------
+    problem : the mission, with no calibration asked for.
+    states : of all keyframes, for example those of :func:`warm_start`.
+    weights : (M,) of the beams; all one when left out.
+
+    Raises
+    ------
+    ConfigError
+        If the problem has variables beside those of the keyframes.
+    """
+    if problem.extras:
+        names = ", ".join(block.name for block in problem.extras.blocks)
+        raise ConfigError(
+            f"gtsam_graph: expected a problem of keyframes alone, got one that calibrates {names}: "
+            "take their prior sigmas out of mission.toml"
+        )
+    problem.chain.set_gravity(states.p_n)
+    graph = inertial_graph(problem)
+    for part in (prior_graph(problem), gnss_graph(problem.fixes)):
+        graph.push_back(part)
+    if problem.depths is not None:
+        graph.push_back(depth_graph(problem, problem.depths, states))
+    beams = problem.beams
+    weights = np.ones(len(beams.speed)) if weights is None else weights
+    for row, k in enumerate(beams.keyframe.tolist()):
+        graph.add(
+            dvl_beam_factor(
+                X(k),
+                V(k),
+                B(k),
+                sigma=float(beams.sigma[row]),
+                weight=float(weights[row]),
+                speed=float(beams.speed[row]),
+                gyro_b=beams.gyro_b[row],
+                beam_b=beams.beam_b[row],
+                lever_arm_b=beams.lever_arm_b,
+                omega_ie_n=problem.frame.omega_ie_n,
+            )
+        )
+    return graph
+
+
+def prior_graph(problem: Problem) -> gtsam.NonlinearFactorGraph:
+    """Return the initial state."""
+    start = start_of(problem)
+    cov, R_nb = start.covariance, start.R_nb
+    gaussian = gtsam.noiseModel.Gaussian.Covariance
+    position_cov_n = R_nb @ cov[POSITION, POSITION] @ R_nb.T
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(gtsam.PoseRotationPrior3D(X(0), gtsam.Rot3(R_nb), gaussian(cov[ROTATION, ROTATION])))
+    graph.add(gtsam.PoseTranslationPrior3D(X(0), start.p_n, gaussian(position_cov_n)))
+    graph.addPriorVector(V(0), start.v_n, gaussian(cov[VELOCITY, VELOCITY]))
+    graph.addPriorConstantBias(B(0), gtsam.imuBias.ConstantBias(), gaussian(cov[9:, 9:]))
+    return graph
+
+
+def gnss_graph(fixes: Fixes | None) -> gtsam.NonlinearFactorGraph:
+    """Return GNSS position factors with lever arm."""
+    graph = gtsam.NonlinearFactorGraph()
+    if fixes is None:
+        return graph
+    for k, position_n, covariance_n in zip(
+        fixes.keyframe.tolist(), fixes.position_n, fixes.covariance_n, strict=True
+    ):
+        noise = gtsam.noiseModel.Gaussian.Covariance(covariance_n)
+        graph.add(gtsam.GPSFactorArm(X(k), position_n, fixes.lever_arm_b, noise))
+    return graph
+
+
+def depth_graph(problem: Problem, depths: Depths, states: States) -> gtsam.NonlinearFactorGraph:
+    """Return depth as GTSAM position factors that count along the local vertical only."""
+    targets = depth_targets(depths, states, problem.frame, problem.keyframe_s)
+    root_information = np.zeros((len(targets.keyframe), 3, 3))
+    root_information[:, 0] = targets.up_n * targets.root_information[:, None]
+    graph = gtsam.NonlinearFactorGraph()
+    for k, target_n, root in zip(
+        targets.keyframe.tolist(), targets.target_n, root_information, strict=True
+    ):
+        noise = gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
+        graph.add(gtsam.GPSFactorArm(X(k), target_n, depths.lever_arm_b, noise))
+    return graph

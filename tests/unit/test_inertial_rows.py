@@ -1,0 +1,69 @@
+"""Inertial rows: gravity changes with position, and Gauss-Newton has to know."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ssm_graph.data import Array
+from ssm_graph.estimate import Status
+from ssm_graph.graph.inertial_rows import InertialRows, inertial_graph
+from ssm_graph.graph.states import States, retract
+from ssm_graph.problem.error_state import POSITION, STATE_DIM
+from ssm_graph.problem.problem import Problem, build_problem
+from ssm_graph.simulation import Grade
+from ssm_graph.smoothers.batch import SsmSmoother
+from tests.helpers import (
+    estimated_states,
+    rotation,
+    simulated,
+    state_errors,
+    true_states,
+    with_initial,
+)
+
+
+def turned() -> tuple[Problem, States]:
+    """Return a short mission and its states, all axes of the body askew."""
+    sim = simulated(duration_s=3.0, grade=Grade.NAVIGATION)
+    problem = build_problem(sim.mission)
+    truth = true_states(problem, sim)
+    return problem, truth._replace(R_nb=truth.R_nb @ rotation(np.array([0.4, -0.7, 1.1])))
+
+
+@pytest.mark.parametrize("end", [0, 1], ids=["begin", "end"])
+def test_rows_follow_gravity(end: int) -> None:
+    """Differences over a kilometre, gravity led after the states, against the columns."""
+    problem, states = turned()
+    states = retract(states, np.zeros((problem.n_keyframes, STATE_DIM)))
+    inertial = InertialRows(problem, inertial_graph(problem))
+
+    def error_at(step: Array) -> Array:
+        moved = retract(states, step)
+        problem.chain.set_gravity(moved.p_n)
+        return -inertial.at(moved.values, moved.R_nb)[1, :, -1]
+
+    problem.chain.set_gravity(states.p_n)
+    columns = inertial.at(states.values, states.R_nb)[1]
+    for axis in range(3):
+        step = np.zeros((problem.n_keyframes, STATE_DIM))
+        step[1 + end, POSITION.start + axis] = 1000.0
+        slope = (error_at(step) - error_at(-step)) / 2000.0
+        expected = columns[:, STATE_DIM * end + POSITION.start + axis]
+        scale = np.abs(expected).max()
+        np.testing.assert_allclose(slope / scale, expected / scale, rtol=0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("grade", [Grade.NAVIGATION, Grade.MEMS], ids=lambda grade: grade.name)
+def test_a_start_known_to_ten_kilometres_settles(grade: Grade) -> None:
+    """Beams alone: the answer comes in a few passes and is within its sigmas of the truth."""
+    sim = simulated(duration_s=120.0, grade=grade, depth=None)
+    mission = with_initial(sim.mission, position_sigma_enu=np.full(3, 1e4))
+    problem = build_problem(mission)
+    estimate = SsmSmoother().solve(problem)
+    assert estimate.status is Status.CONVERGED
+    assert len(estimate.iterations) < 15
+    truth = true_states(problem, sim)
+    errors = state_errors(estimated_states(problem, estimate.trajectory), truth)
+    assert np.abs(errors[:, 6:9]).max() < 0.05
+    assert np.linalg.norm(errors[:, 3:6], axis=1).max() < 3e4
