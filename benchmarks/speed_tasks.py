@@ -20,15 +20,15 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
-import ssm_graph.graph.extended as extended
+import ssm_graph.graph.linearize as linearize
 import ssm_graph.smoothers.batch as batch
 from benchmarks.speed_plain import dead_reckoned, plain_graph
 from factors.similarity import LogKernel
 from ssm_graph.data import Array, Mission
-from ssm_graph.graph.extended import GraphLinearizer
 from ssm_graph.graph.first_values import first_values
 from ssm_graph.graph.gtsam_graph import depth_graph, gnss_graph, prior_graph
 from ssm_graph.graph.inertial_rows import inertial_graph
+from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.problem.problem import Problem, build_problem
 from ssm_graph.simulation import Grade, OutlierKind, Outliers, scenario_config, simulate
 
@@ -113,7 +113,7 @@ def _timed_calls(parts: dict[str, float]) -> Iterator[None]:
         (GraphLinearizer, "follow", "linearise: gravity and depth targets"),
         (GraphLinearizer, "beam_rows", "linearise: beams"),
         (GraphLinearizer, "inertial_rows", "linearise: GTSAM's inertial factors"),
-        (extended, "solve_bordered", "eliminate by QR, solve, marginals"),
+        (linearize, "solve_bordered", "eliminate by QR, solve, marginals"),
         (GraphLinearizer, "cost", "cost"),
         (GraphLinearizer, "retract", "retract"),
         (batch, "trajectory_from_states", "result"),

@@ -15,7 +15,7 @@ from ssm_graph.data import Array, ImuLog, InitialState, Mission
 from ssm_graph.errors import SolverError
 from ssm_graph.estimate import Status, Trajectory
 from ssm_graph.frames import R_lb_from_roll_pitch_heading
-from ssm_graph.graph.extended import GraphLinearizer
+from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.states import States, states_from_arrays
 from ssm_graph.problem.problem import Problem
 from ssm_graph.simulation import SimulatedMission, SimulationConfig, simulate

@@ -22,7 +22,7 @@ from factors.dvl_calibration import (
     turned_instrument,
 )
 from ssm_graph.data import N_BEAMS, Array
-from ssm_graph.graph.interfaces import BeamRows
+from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.states import States
 from ssm_graph.problem.calibration import (
     DVL_BEAM_SCALE,

@@ -20,6 +20,7 @@ from factors.so3 import cross
 from ssm_graph.data import N_BEAMS, Array
 from ssm_graph.earth import SEMI_MAJOR_AXIS
 from ssm_graph.errors import SolverError
+from ssm_graph.graph.beam_rows import BeamRows, linearize_beams
 from ssm_graph.graph.beam_weights import met_weights, settle_weights, updated_trust
 from ssm_graph.graph.forward_extras import ForwardExtras
 from ssm_graph.graph.inertial_rows import (
@@ -28,8 +29,6 @@ from ssm_graph.graph.inertial_rows import (
     carried_covariance,
     inertial_graph,
 )
-from ssm_graph.graph.interfaces import BeamRows
-from ssm_graph.graph.linearize import linearize_beams
 from ssm_graph.graph.states import States, states_from_arrays
 from ssm_graph.imu.preintegration import gravity_gradient, gtsam_gravity
 from ssm_graph.problem.error_state import POSITION, ROTATION, STATE_DIM, VELOCITY

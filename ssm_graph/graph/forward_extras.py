@@ -6,8 +6,8 @@ import numpy as np
 
 from ssm_graph.data import Array
 from ssm_graph.graph.aid_rows import fix_rows
+from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.extended_rows import ExtendedBeams, PreparedBeams, RowStates
-from ssm_graph.graph.interfaces import BeamRows
 from ssm_graph.problem.calibration import DEPTH_OFFSET
 from ssm_graph.problem.error_state import STATE_DIM
 from ssm_graph.problem.problem import Problem

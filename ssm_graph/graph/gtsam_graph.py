@@ -1,7 +1,7 @@
 """A problem as a graph of GTSAM's own, for its optimisers and for factors that a user adds.
 
 Inertial factors, GNSS and depth are GTSAM's; every beam is a factor of its own, in Python. What
-solves missions here takes the same residuals in bulk, see :mod:`ssm_graph.graph.extended`.
+solves missions here takes the same residuals in bulk, see :mod:`ssm_graph.graph.linearize`.
 """
 
 from __future__ import annotations

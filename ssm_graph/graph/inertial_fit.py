@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ssm_graph.data import Array
-from ssm_graph.graph.extended import Step
+from ssm_graph.graph.linearize import Step
 from ssm_graph.problem.error_state import STATE_DIM
 
 

@@ -13,9 +13,9 @@ from factors.similarity import Kernel, LogKernel, Similarity, expected_mahalanob
 from ssm_graph.data import N_BEAMS, Array
 from ssm_graph.errors import ConfigError, SolverError
 from ssm_graph.estimate import BeamTable, Estimate, Iteration, NoiseFound, Status
-from ssm_graph.graph.extended import GraphLinearizer, Step
+from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.first_values import FirstValues, first_values
-from ssm_graph.graph.interfaces import BeamRows
+from ssm_graph.graph.linearize import GraphLinearizer, Step
 from ssm_graph.graph.states import States
 from ssm_graph.problem.problem import Problem
 from ssm_graph.problem.trajectory import trajectory_from_states

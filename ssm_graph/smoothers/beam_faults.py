@@ -22,8 +22,8 @@ from factors.similarity import WEIGHT_FLOOR, LogKernel
 from ssm_graph.data import N_BEAMS, Array
 from ssm_graph.errors import ConfigError
 from ssm_graph.graph.beam_evidence import ChainEvidence, Evidence, WhitenedBeams
-from ssm_graph.graph.extended import GraphLinearizer
-from ssm_graph.graph.interfaces import BeamRows
+from ssm_graph.graph.beam_rows import BeamRows
+from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.states import States
 from ssm_graph.problem.error_state import STATE_DIM
 from ssm_graph.problem.problem import NO_EXTRAS, Problem

@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 from ssm_graph.data import Array
 from ssm_graph.estimate import Iteration, NoiseFound, Status
-from ssm_graph.graph.extended import GraphLinearizer, Step
+from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.first_values import FirstValues
 from ssm_graph.graph.inertial_fit import inertial_fit
-from ssm_graph.graph.interfaces import BeamRows
+from ssm_graph.graph.linearize import GraphLinearizer, Step
 from ssm_graph.graph.states import States
 from ssm_graph.smoothers.noise import noise_found
 

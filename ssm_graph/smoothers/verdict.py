@@ -6,8 +6,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from ssm_graph.data import Array
-from ssm_graph.graph.extended import GraphLinearizer
-from ssm_graph.graph.interfaces import BeamRows, Misfit
+from ssm_graph.graph.beam_rows import BeamRows
+from ssm_graph.graph.linearize import GraphLinearizer, Misfit
 from ssm_graph.graph.marginal_prior import MarginalPrior
 from ssm_graph.graph.states import States
 from ssm_graph.problem.doubts import MISFIT, doubts_of_beams

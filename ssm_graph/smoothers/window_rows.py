@@ -16,13 +16,12 @@ from factors.dvl_beam import beam_residual
 from factors.so3 import cross
 from ssm_graph.data import Array
 from ssm_graph.earth import LocalFrame
+from ssm_graph.graph.beam_rows import BeamRows, rows_of_beams
 from ssm_graph.graph.inertial_rows import (
     PAIR_COLUMNS,
     add_gravity_gradient,
     carried_covariance,
 )
-from ssm_graph.graph.interfaces import BeamRows
-from ssm_graph.graph.linearize import rows_of_beams
 from ssm_graph.imu.preintegration import gravity_gradient, gtsam_gravity
 from ssm_graph.problem.error_state import GYRO_BIAS, POSITION, ROTATION, STATE_DIM, VELOCITY
 from ssm_graph.problem.heights import height_track, mean_rises

@@ -11,8 +11,8 @@ from ssm_graph.data import Array, DvlLog
 from ssm_graph.errors import ConfigError
 from ssm_graph.estimate import OUTLIER_WEIGHT, Estimate, Status
 from ssm_graph.graph.beam_evidence import Evidence
-from ssm_graph.graph.extended import GraphLinearizer
 from ssm_graph.graph.first_values import first_values
+from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.problem.problem import build_problem
 from ssm_graph.simulation import Fault, FaultShape, Grade, OutlierKind, Outliers, SimulatedMission
 from ssm_graph.smoothers import beam_faults

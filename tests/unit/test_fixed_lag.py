@@ -7,7 +7,7 @@ import pytest
 
 from factors.similarity import GaussianKernel, LogKernel
 from ssm_graph.errors import ConfigError
-from ssm_graph.graph.extended import GraphLinearizer
+from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.states import states_from_arrays
 from ssm_graph.problem.problem import Problem, build_problem, start_of, with_dvl
 from ssm_graph.simulation import Grade, OutlierKind, Outliers

@@ -1,204 +1,220 @@
-"""The factors of a mission: zero at the truth over the curved Earth."""
+"""The linearised graph against GTSAM's and against its cost, with extra variables and without."""
 
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import gtsam
 import numpy as np
 import pytest
+from gtsam.symbol_shorthand import B, V, X
 
+from benchmarks.calibration_cases import as_stated, asking
 from ssm_graph.data import Array
-from ssm_graph.earth import radii_of_curvature
-from ssm_graph.graph.gtsam_graph import depth_graph, gnss_graph, prior_graph
+from ssm_graph.errors import ConfigError
+from ssm_graph.graph.gtsam_graph import gtsam_graph
+from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.states import States, retract, states_from_arrays
 from ssm_graph.problem.error_state import STATE_DIM
-from ssm_graph.problem.problem import Problem, build_problem, start_of
-from ssm_graph.simulation import (
-    CALM,
-    DepthProfile,
-    DepthSettings,
-    GnssSettings,
-    SimulatedMission,
-    TransitRoute,
-    Waves,
-)
-from tests.helpers import rotation, simulated, state_errors, true_states, with_initial
-
-ARM = (3.0, -2.0, 1.5)
+from ssm_graph.problem.extras import Extra, Extras
+from ssm_graph.problem.problem import Problem, build_problem
+from ssm_graph.simulation import GnssSettings, Grade
+from tests.calibration_fixture import miscalibrated
+from tests.helpers import simulated, true_states
 
 
 @cache
-def far_transit(
-    *, depth_hz: float, waves: Waves = CALM
-) -> tuple[SimulatedMission, Problem, States]:
-    """Return 10 km in 1000 s with long lever arms, perfect sensors; down by 30 m half way."""
-    sim = simulated(
-        duration_s=1000.0,
-        imu_rate_hz=10.0,
-        route=TransitRoute(speed=10.0, depth=DepthProfile(10.0, 40.0, mid_s=500.0, tau_s=100.0)),
-        waves=waves,
-        perfect_sensors=True,
-        draw_initial_errors=False,
-        depth=DepthSettings(rate_hz=depth_hz, lever_arm_b=ARM),
-        gnss=GnssSettings(rate_hz=0.2, lever_arm_b=ARM, windows=((0.0, 1e9),)),
-    )
-    problem = build_problem(sim.mission)
-    return sim, problem, true_states(problem, sim)
-
-
-def errors_of(graph: gtsam.NonlinearFactorGraph, states: States) -> Array:
-    """Return unwhitened errors, one row a factor."""
-    rows = []
-    for k in range(graph.size()):
-        factor = graph.at(k)
-        assert isinstance(factor, gtsam.NoiseModelFactor)
-        rows.append(factor.unwhitenedError(states.values))
-    return np.array(rows)
-
-
-def depth_errors(problem: Problem, states: States) -> Array:
-    """Return what depth misses at the states, m."""
-    assert problem.depths is not None
-    graph = depth_graph(problem, problem.depths, states)
-    return errors_of(graph, states)[:, 2]
-
-
-def test_gnss_is_zero_at_the_truth_10_km_away() -> None:
-    """Antenna off by its lever arm, positions by the ellipsoid: rounding of 6e6 m is left."""
-    _, problem, states = far_transit(depth_hz=1.0, waves=Waves())
-    assert np.linalg.norm(states.p_n[-1]) > 9900.0
-    errors = errors_of(gnss_graph(problem.fixes), states)
-    assert len(errors) == 200
-    assert np.abs(errors).max() < 2e-8
-
-
-def test_depth_is_zero_at_the_truth_10_km_away() -> None:
-    """Readings at the keyframes: the ellipsoid falls away by 7.8 m over these 10 km."""
-    _, problem, states = far_transit(depth_hz=1.0, waves=Waves())
-    assert states.p_n[-1, 2] < -40.0 - 7.5
-    assert np.abs(depth_errors(problem, states)).max() < 2e-8
-
-
-def test_depth_between_keyframes_is_carried_along_the_track() -> None:
-    """Three readings a second: each is compared with the height at its own time."""
-    _, problem, states = far_transit(depth_hz=3.0)
-    assert np.abs(depth_errors(problem, states)).max() < 1e-6
-
-
-def test_depth_carried_to_the_next_keyframe_in_waves() -> None:
-    """A cubic over 1 s misses 0.3 m of heave at 6.5 s by 0.4 mm; 3 m of arm make it 0.8 mm.
-
-    The first interval begins where the inertial data do: the arm's rate there is of half a sample
-    later, which makes it 1.3 mm.
-    """
-    _, problem, states = far_transit(depth_hz=3.0, waves=Waves())
-    errors = np.abs(depth_errors(problem, states))
-    assert errors[1:].max() < 1e-3
-    assert errors[0] < 2e-3
-
-
-def test_depth_counts_the_height_error_and_its_readings() -> None:
-    """A state 0.2 m too high misses by 0.2 m; n readings weigh n times one."""
-    _, problem, truth = far_transit(depth_hz=3.0)
-    raised = truth.p_n + np.array([0.0, 0.0, 0.2])
-    states = states_from_arrays(truth.R_nb, raised, truth.v_n, truth.bias)
-    np.testing.assert_allclose(depth_errors(problem, states), 0.2, atol=1e-5)
-    assert problem.depths is not None
-    graph = depth_graph(problem, problem.depths, states)
-    counts = np.bincount(problem.depths.keyframe, minlength=problem.n_keyframes)
-    costs = [graph.at(k).error(states.values) for k in range(graph.size())]
-    expected = 0.5 * counts[counts > 0] * (0.2 / problem.depths.sigma) ** 2
-    np.testing.assert_allclose(costs, expected, rtol=2e-4)
-
-
-def test_depth_says_nothing_of_the_local_level() -> None:
-    """GTSAM's position factor is used along the vertical at the vehicle alone."""
-    _, problem, truth = far_transit(depth_hz=1.0)
-    assert problem.depths is not None
-    graph = depth_graph(problem, problem.depths, truth)
-    level = np.array([5.0, -9.0, 0.0])
-    shifted = truth.p_n + problem.frame.R_nl_at(truth.p_n) @ level
-    aside = states_from_arrays(truth.R_nb, shifted, truth.v_n, truth.bias)
-    assert graph.error(aside.values) < 1e-9
-
-
-def test_prior_is_zero_at_the_initial_state_and_has_its_sigmas() -> None:
-    """Far off the frame's origin: one sigma of each axis costs one half, two sigmas two."""
-    sim = simulated(duration_s=2.0, route=TransitRoute(speed=10.0))
-    truth = sim.truth_at([1000.0])
-    lat, lon = float(truth.lat[0]), float(truth.lon[0])
-    mission = with_initial(
-        sim.mission,
-        lat=lat,
-        lon=lon,
-        height=-40.0,
-        roll=0.2,
-        pitch=-0.1,
-        heading=1.0,
-        position_sigma_enu=np.array([0.1, 0.2, 0.4]),
-        velocity_sigma_enu=np.array([0.01, 0.02, 0.04]),
-        attitude_sigma=np.array([0.001, 0.002, 0.004]),
-    )
-    start = mission.initial
-    assert start is not None
-    prior = prior_graph(build_problem(mission))
-    meridian, prime_vertical = radii_of_curvature(lat)
-    parallel = float(prime_vertical) * np.cos(lat)
-    for change, half_chi_sq in (
-        ({}, 0.0),
-        ({"roll": 0.201}, 0.5),
-        ({"pitch": -0.102}, 0.5),
-        ({"heading": 1.004}, 0.5),
-        ({"lon": lon + 0.1 / parallel}, 0.5),
-        ({"lat": lat - 0.2 / float(meridian)}, 0.5),
-        ({"height": -40.8}, 2.0),
-        ({"velocity_enu": start.velocity_enu + np.array([0.01, 0.0, 0.0])}, 0.5),
-        ({"velocity_enu": start.velocity_enu - np.array([0.0, 0.04, 0.0])}, 2.0),
-    ):
-        other = start_of(build_problem(with_initial(mission, **change)))
-        columns = (other.R_nb, other.p_n, other.v_n, other.bias)
-        values = states_from_arrays(*(column[None] for column in columns)).values
-        assert prior.error(values) == pytest.approx(half_chi_sq, rel=0.01, abs=1e-9)
-
-
-def small_problem() -> tuple[Problem, States, Array]:
-    """Return 8 s with everything, states a few sigmas off, and beam weights."""
-    sim = simulated(duration_s=8.0, gnss=GnssSettings(windows=((0.0, 9.0),)), dropout_rate=0.2)
-    problem = build_problem(sim.mission)
+def problems() -> tuple[Problem, Problem, States]:
+    """Return a problem with all calibrations, the same with none, and states a little off."""
+    sim = miscalibrated(duration_s=30.0)
+    wide = asking(sim.mission, beam_scale_sigma=0.01, scale_walk_density=1e-4)
+    problem, plain = build_problem(wide), build_problem(as_stated(sim.mission))
     truth = true_states(problem, sim)
-    rng = np.random.default_rng(3)
-    n = problem.n_keyframes
+    rng = np.random.default_rng(0)
+    off = 0.02 * rng.normal(size=truth.v_n.shape)
     states = states_from_arrays(
-        truth.R_nb @ rotation(1e-5 * rng.normal(size=(n, 3))),
-        truth.p_n + 1e-3 * rng.normal(size=(n, 3)),
-        truth.v_n + 1e-3 * rng.normal(size=(n, 3)),
-        truth.bias + np.repeat([1e-5, 1e-8], 3) * rng.normal(size=(n, 6)),
+        truth.R_nb,
+        truth.p_n + off,
+        truth.v_n - off,
+        truth.bias,
+        1e-3 * rng.normal(size=(problem.n_keyframes, problem.extras.n_walks)),
+        0.01 * rng.normal(size=problem.extras.n_constants),
     )
-    return problem, states, rng.uniform(0.01, 1.1, len(problem.beams.speed))
+    return problem, plain, states
 
 
-def test_arrays_and_values_move_together() -> None:
-    """A step taken on both sides leaves them saying the same."""
-    sim = simulated(duration_s=8.0)
-    states = true_states(build_problem(sim.mission), sim)
+def with_small_priors(problem: Problem, sigma: float) -> Problem:
+    """Return the problem with all extra variables as good as known."""
+    blocks = tuple(
+        Extra(block.name, block.labels, np.full_like(block.sigma, sigma), unit=block.unit)
+        for block in problem.extras.blocks
+    )
+    changed = {name: getattr(problem, name) for name in problem.__slots__ if name != "extras"}
+    return Problem(**changed, extras=Extras(blocks))
+
+
+def dense(graph: gtsam.NonlinearFactorGraph, states: States) -> tuple[Array, Array]:
+    """Return step (K, 15) and covariance (K, 15, 15) of a graph of GTSAM's, by NumPy.
+
+    Columns are scaled to unit length, and ``J'J`` is inverted through the QR of ``J``: the normal
+    equations themselves would lose half of the digits.
+    """
     n = len(states.p_n)
-    rng = np.random.default_rng(5)
-    step = 0.1 * rng.normal(size=(n, STATE_DIM))
-    moved = retract(states, step)
-    again = states_from_arrays(moved.R_nb, moved.p_n, moved.v_n, moved.bias)
-    assert again.values.equals(moved.values, 1e-12)
-    errors = state_errors(states, moved)
-    np.testing.assert_allclose(errors[:, 6:], step[:, 6:], atol=1e-13)
-    np.testing.assert_allclose(errors[:, :3], step[:, :3], atol=1e-12)
+    ordering = gtsam.Ordering()
+    for k in range(n):
+        for key in (X(k), V(k), B(k)):
+            ordering.push_back(key)
+    J, b = graph.linearize(states.values).jacobian(ordering)
+    scale = 1.0 / np.linalg.norm(J, axis=0)
+    Q, R = np.linalg.qr(J * scale)
+    R_inv = np.linalg.inv(R) * scale[:, None]
+    blocks = R_inv.reshape(n, STATE_DIM, -1)
+    return (R_inv @ (Q.T @ b)).reshape(n, STATE_DIM), blocks @ np.swapaxes(blocks, 1, 2)
 
 
-@pytest.mark.parametrize("n_keyframes", [9, 11, 101])
-def test_states_keep_their_order(n_keyframes: int) -> None:
-    """Keys sort as numbers, not as text: keyframe 10 comes after 9."""
-    p_n = np.arange(3.0 * n_keyframes).reshape(-1, 3)
-    identity = np.tile(np.eye(3), (n_keyframes, 1, 1))
-    states = states_from_arrays(identity, p_n, -p_n, np.hstack([p_n, p_n]))
-    moved = retract(states, np.zeros((n_keyframes, STATE_DIM)))
-    np.testing.assert_array_equal(moved.p_n, p_n)
-    np.testing.assert_array_equal(moved.R_nb, identity)
+@pytest.mark.parametrize("grade", Grade, ids=lambda grade: grade.name)
+def test_it_is_gtsams_graph(grade: Grade, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Step, covariance and cost are those of GTSAM's factors and one in Python for each beam.
+
+    Up to the gradient of gravity, which those do not know.
+    """
+    monkeypatch.setattr(
+        "ssm_graph.graph.inertial_rows.gravity_gradient", lambda _: np.zeros((3, 3))
+    )
+    gnss = GnssSettings(windows=((0.0, 9.0),))
+    sim = simulated(duration_s=8.0, gnss=gnss, dropout_rate=0.2, grade=grade)
+    problem = build_problem(sim.mission)
+    truth, rng = true_states(problem, sim), np.random.default_rng(3)
+    size = np.repeat([1e-5, 1e-3, 1e-3, 1e-5, 1e-8], 3)
+    states = retract(truth, size * rng.normal(size=(problem.n_keyframes, STATE_DIM)))
+    weights = rng.uniform(0.01, 1.1, len(problem.beams.speed))
+    linearizer = GraphLinearizer(problem)
+    linearizer.follow(states)
+    rows = linearizer.beam_rows(states)
+    found = linearizer.solve(states, rows, weights)
+    graph = gtsam_graph(problem, states, weights)
+    step, P = dense(graph, states)
+    sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+    scale = sigma[:, :, None] * sigma[:, None, :]
+    np.testing.assert_allclose(found.covariance / scale, P / scale, rtol=0.0, atol=1e-8)
+    np.testing.assert_allclose(found.delta[0] / sigma, step / sigma, rtol=0.0, atol=1e-7)
+    cost = linearizer.cost(states, rows, weights)
+    assert cost == pytest.approx(graph.error(states.values), rel=1e-9)
+
+
+def test_gtsams_graph_has_no_calibration() -> None:
+    """It says which variables are in the way."""
+    problem, _, states = problems()
+    with pytest.raises(ConfigError, match="calibrates dvl_scale"):
+        gtsam_graph(problem, states)
+
+
+def test_with_everything_known_it_is_the_graph_without() -> None:
+    """Step, covariance, cost and misfits are those of the keyframes alone."""
+    problem, plain, states = problems()
+    known = with_small_priors(problem, 1e-7)
+    states = states._replace(
+        walks=np.zeros((known.n_keyframes, 0)), constants=np.zeros(known.extras.n_constants)
+    )
+    weights = np.random.default_rng(1).uniform(0.1, 1.0, size=len(plain.beams.speed))
+    found: list[tuple[Any, ...]] = []
+    for of, at in ((known, states), (plain, states._replace(constants=np.zeros(0)))):
+        linearizer = GraphLinearizer(of)
+        linearizer.follow(at)
+        rows = linearizer.beam_rows(at)
+        step = linearizer.solve(at, rows, weights)
+        cost = linearizer.cost(at, rows, weights)
+        variance = step.variance(plain.beams.keyframe, rows.jacobian)
+        found.append((step.covariance, cost, variance, linearizer.misfits(at), step.delta[0]))
+    (P, cost, variance, misfits, update), (P_2, cost_2, variance_2, misfits_2, update_2) = found
+    sigma = np.sqrt(np.diagonal(P_2, axis1=1, axis2=2))
+    scale = sigma[:, :, None] * sigma[:, None, :]
+    np.testing.assert_allclose(P / scale, P_2 / scale, atol=1e-6)
+    np.testing.assert_allclose(update / sigma, update_2 / sigma, atol=1e-4)
+    np.testing.assert_allclose(variance, variance_2, rtol=1e-6)
+    assert cost == pytest.approx(cost_2, rel=1e-9)
+    assert misfits.keys() == misfits_2.keys() == {"GNSS", "depth", "inertial"}
+    for name, misfit in misfits.items():
+        assert misfit.sum_sq == pytest.approx(misfits_2[name].sum_sq, rel=1e-9)
+        assert misfit[1:] == misfits_2[name][1:]
+
+
+def along(linearizer: GraphLinearizer, states: States, direction: Array) -> tuple[float, float]:
+    """Return slope and curvature of the cost along a direction of all variables."""
+    problem = linearizer.problem
+    n = problem.extras.state_dim
+    end = n * problem.n_keyframes
+    delta = (direction[:end].reshape(-1, n), direction[end:])
+    weights = np.ones(len(problem.beams.speed))
+
+    def cost(scale: float) -> float:
+        moved, _ = linearizer.retract(states, delta, scale=scale)
+        return linearizer.cost(moved, linearizer.beam_rows(moved), weights)
+
+    ends = cost(1.0), cost(0.0), cost(-1.0)
+    return 0.5 * (ends[0] - ends[2]), ends[0] - 2.0 * ends[1] + ends[2]
+
+
+def test_the_linear_graph_is_the_derivative_of_the_cost() -> None:
+    """Where its step comes to nothing the cost has no slope, along any kind of variable.
+
+    A wrong Jacobian would settle elsewhere. That of the DVL's clock takes the acceleration as the
+    mean over the ping window, and settles within a hundredth of a sigma.
+    """
+    problem, _, states = problems()
+    linearizer = GraphLinearizer(problem)
+    linearizer.follow(states)
+    moved, weights = states, np.ones(len(problem.beams.speed))
+    for _ in range(6):
+        step = linearizer.solve(moved, linearizer.beam_rows(moved), weights)
+        moved, _ = linearizer.retract(moved, step.delta)
+    P = step.solution.constants_cov
+    labels = [label for block in problem.extras.blocks for label in block.labels]
+    for i, label in enumerate(labels[problem.extras.n_walks :]):
+        direction = np.zeros(len(step.sigma))
+        direction[len(direction) - len(P) + i] = 0.1 * np.sqrt(P[i, i])
+        slope, curvature = along(linearizer, moved, direction)
+        allowed = 1e-2 if label == "dvl_time_offset_s" else 1e-4
+        assert abs(slope) < allowed * np.sqrt(curvature), label
+    n = problem.extras.state_dim
+    for k, j in [(3, 0), (10, 7), (20, 12), (5, n - 1), (29, n - 1), (0, n - 1)]:
+        direction = np.zeros(len(step.sigma))
+        direction[n * k + j] = 0.1 * step.sigma[n * k + j]
+        slope, curvature = along(linearizer, moved, direction)
+        assert abs(slope) < 1e-3 * np.sqrt(curvature)
+
+
+def test_walks_forget_and_grow() -> None:
+    """A Gauss-Markov walk comes to its stationary sigma, a random walk grows with the root."""
+    sigma = np.ones(2)
+    extras = Extras(
+        (
+            Extra("fix", ("fix",), np.ones(1)),
+            Extra("slow", ("a", "b"), sigma, walk_density=0.1),
+            Extra("current", ("e", "n"), sigma, walk_density=0.2, correlation_s=50.0),
+        )
+    )
+    assert (extras.n_walks, extras.n_constants, extras.width) == (4, 1, 20)
+    assert extras.columns("slow") == slice(15, 17)
+    assert extras.columns("fix") == slice(19, 20)
+    factor, grown = extras.transitions(np.array([1.0, 100.0, 1e6]))
+    np.testing.assert_allclose(factor[:, :2], 1.0)
+    np.testing.assert_allclose(grown[:, 0], 0.1 * np.sqrt([1.0, 100.0, 1e6]))
+    np.testing.assert_allclose(factor[:, 2], np.exp(-np.array([1.0, 100.0, 1e6]) / 50.0))
+    np.testing.assert_allclose(grown[-1, 2], 0.2 * np.sqrt(25.0))
+    np.testing.assert_allclose(grown[0, 2], 0.2, rtol=0.02)
+
+
+def test_values_are_found_by_name() -> None:
+    """Walks for every row, constants for all, a default for what there is not."""
+    extras = Extras(
+        (Extra("arm", ("x", "y"), np.ones(2)), Extra("w", ("w",), np.ones(1), walk_density=1.0))
+    )
+    walks, constants = np.array([[1.0], [2.0]]), np.array([3.0, 4.0])
+    zero = np.zeros(1)
+    np.testing.assert_array_equal(extras.value("w", walks, constants, default=zero), walks)
+    np.testing.assert_array_equal(extras.value("arm", walks, constants, default=zero), [3, 4])
+    assert extras.value("other", walks, constants, default=zero) is zero
+    assert "other" not in extras
+    assert not Extras()

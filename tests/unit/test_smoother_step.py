@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ssm_graph.data import Array
-from ssm_graph.graph.extended import GraphLinearizer
+from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.states import States, states_from_arrays
 from ssm_graph.problem.problem import build_problem
 from ssm_graph.smoothers.passes import descend

@@ -11,7 +11,7 @@ import pytest
 
 from ssm_graph.data import Array
 from ssm_graph.estimate import Status
-from ssm_graph.graph.extended import GraphLinearizer
+from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.states import States, states_from_arrays
 from ssm_graph.problem.doubts import SUSPECT_STRETCH_S
 from ssm_graph.problem.problem import Problem, build_problem
