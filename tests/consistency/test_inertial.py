@@ -108,7 +108,11 @@ def test_one_hour_over_7_km(
 @pytest.mark.slow
 @pytest.mark.parametrize("lat_deg", [45.7, 80.0])
 def test_the_smoother_agrees_over_an_hour(lat_deg: float) -> None:
-    """With nothing measured the batch solution is the dead reckoning itself."""
+    """With nothing measured the batch solution is the dead reckoning itself, and better.
+
+    Its gravity is that of the path it ends with. The forward pass has that of the predicted path,
+    and what heave makes of the difference grows with the height's own instability.
+    """
     sim = unaided(duration_s=3600.0, lat_deg=lat_deg, rate_hz=100.0)
     problem = problem_of(sim, merge_hz=20.0)
     first = first_values(problem, kernel=LogKernel())
@@ -117,8 +121,9 @@ def test_the_smoother_agrees_over_an_hour(lat_deg: float) -> None:
     states = estimated_states(problem, estimate.trajectory)
     horizontal, vertical = final_error(problem, states, sim)
     assert horizontal < 0.01
-    assert vertical < 0.05
-    assert np.abs(states.p_n - first.states.p_n).max() < 0.01
+    assert vertical < 0.005
+    assert np.abs(states.p_n - first.states.p_n)[:, :2].max() < 0.01
+    assert np.abs(states.p_n - first.states.p_n).max() < 0.05
 
 
 @pytest.mark.parametrize("term", ["gravity", "rate", "merging"])
