@@ -18,7 +18,7 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, V, X
+from gtsam.symbol_shorthand import V, X
 
 import ssm_graph.graph.linearize as linearize
 import ssm_graph.smoothers.batch as batch
@@ -26,8 +26,7 @@ from benchmarks.speed_plain import dead_reckoned, plain_graph
 from factors.similarity import LogKernel
 from ssm_graph.data import Array, Mission
 from ssm_graph.graph.first_values import first_values
-from ssm_graph.graph.gtsam_graph import depth_graph, gnss_graph, prior_graph
-from ssm_graph.graph.inertial_rows import inertial_graph
+from ssm_graph.graph.gtsam_graph import chain_ordering, graph_without_beams
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.problem.problem import Problem, build_problem
 from ssm_graph.simulation import Grade, OutlierKind, Outliers, scenario_config, simulate
@@ -183,16 +182,7 @@ def time_floor(path: Path, n_passes: int) -> Timing:
     with timing.part("build: merge and preintegrate"):
         problem = build_problem(mission)
     states = first_values(problem, kernel=LogKernel()).states
-    problem.chain.set_gravity(states.p_n)
-    graph = inertial_graph(problem)
-    for part in (prior_graph(problem), gnss_graph(problem.fixes)):
-        graph.push_back(part)
-    if problem.depths is not None:
-        graph.push_back(depth_graph(problem, problem.depths, states))
-    ordering = gtsam.Ordering()
-    for k in range(problem.n_keyframes):
-        for key in (X(k), V(k), B(k)):
-            ordering.push_back(key)
+    graph, ordering = graph_without_beams(problem, states), chain_ordering(problem.n_keyframes)
     beams = problem.beams
     distance = np.linalg.norm(states.v_n - states.p_n, axis=1)
     for k, sigma in zip(beams.keyframe.tolist(), beams.sigma.tolist(), strict=True):

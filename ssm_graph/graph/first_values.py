@@ -23,12 +23,7 @@ from ssm_graph.errors import SolverError
 from ssm_graph.graph.beam_rows import BeamRows, linearize_beams
 from ssm_graph.graph.beam_weights import met_weights, settle_weights, updated_trust
 from ssm_graph.graph.forward_extras import ForwardExtras
-from ssm_graph.graph.inertial_rows import (
-    PAIR_COLUMNS,
-    add_gravity_gradient,
-    carried_covariance,
-    inertial_graph,
-)
+from ssm_graph.graph.inertial_rows import carried_covariance, inertial_graph, pair_rows
 from ssm_graph.graph.states import States, states_from_arrays
 from ssm_graph.imu.preintegration import gravity_gradient, gtsam_gravity
 from ssm_graph.problem.error_state import POSITION, ROTATION, STATE_DIM, VELOCITY
@@ -138,9 +133,8 @@ class _ForwardPass:
             values.insert(X(i), pose3=state_pose)
             values.insert(V(i), velocity)
             values.insert(B(i), constant_bias=bias)
-        pair = self.factors.at(k).linearize(values).augmentedJacobian()[:, PAIR_COLUMNS]
-        R_end = predicted.pose().rotation().matrix()
-        add_gravity_gradient(pair, self._gradient, R_begin=self.R_nb, R_end=R_end, span_s=span)
+        R_end, at = predicted.pose().rotation().matrix(), self.factors.at(k)
+        pair = pair_rows(at, values, self._gradient, R_begin=self.R_nb, R_end=R_end, span_s=span)
         self.P = carried_covariance(pair, self.P)
         if self.extras:
             self.extras.predict(k, self.P)
@@ -151,9 +145,8 @@ class _ForwardPass:
         moved = p_n - self.gravity_at
         if not np.dot(moved, moved) < GRAVITY_REACH**2:
             self.gravity_at, moved = p_n, np.zeros(3)
-            around = GRAVITY_REACH * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
-            at = gtsam_gravity(self.problem.frame, p_n + around)
-            self.gravity, self.gravity_D_p = at[0], (at[1:4] - at[4:]).T / (2.0 * GRAVITY_REACH)
+            frame = self.problem.frame
+            self.gravity, self.gravity_D_p = gtsam_gravity(frame, p_n), gravity_gradient(frame, p_n)
         return np.asarray(self.gravity + self.gravity_D_p @ moved)
 
     def _update_fix(self, rows: range) -> None:

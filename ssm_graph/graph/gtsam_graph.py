@@ -45,12 +45,7 @@ def gtsam_graph(
             f"gtsam_graph: expected a problem of keyframes alone, got one that calibrates {names}: "
             "take their prior sigmas out of mission.toml"
         )
-    problem.chain.set_gravity(states.p_n)
-    graph = inertial_graph(problem)
-    for part in (prior_graph(problem), gnss_graph(problem.fixes)):
-        graph.push_back(part)
-    if problem.depths is not None:
-        graph.push_back(depth_graph(problem, problem.depths, states))
+    graph = graph_without_beams(problem, states)
     beams = problem.beams
     weights = np.ones(len(beams.speed)) if weights is None else weights
     for row, k in enumerate(beams.keyframe.tolist()):
@@ -69,6 +64,26 @@ def gtsam_graph(
             )
         )
     return graph
+
+
+def graph_without_beams(problem: Problem, states: States) -> gtsam.NonlinearFactorGraph:
+    """Return the inertial factors, the initial state, GNSS and depth, led after ``states``."""
+    problem.chain.set_gravity(states.p_n)
+    graph = inertial_graph(problem)
+    for part in (prior_graph(problem), gnss_graph(problem.fixes)):
+        graph.push_back(part)
+    if problem.depths is not None:
+        graph.push_back(depth_graph(problem, problem.depths, states))
+    return graph
+
+
+def chain_ordering(n_keyframes: int) -> gtsam.Ordering:
+    """Return the order to eliminate in: keyframe by keyframe in time, pose, velocity, bias."""
+    ordering = gtsam.Ordering()
+    for k in range(n_keyframes):
+        for key in (X(k), V(k), B(k)):
+            ordering.push_back(key)
+    return ordering
 
 
 def prior_graph(problem: Problem) -> gtsam.NonlinearFactorGraph:

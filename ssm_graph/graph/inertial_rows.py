@@ -12,7 +12,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from ssm_graph.data import Array
-from ssm_graph.imu.preintegration import gravity_gradient
+from ssm_graph.graph.states import States
 from ssm_graph.problem.error_state import POSITION, STATE_DIM, VELOCITY
 from ssm_graph.problem.problem import Problem
 
@@ -43,7 +43,7 @@ def add_gravity_gradient(
     Parameters
     ----------
     rows : (..., 15, 31) begin, end and right-hand side, see :data:`PAIR_COLUMNS`.
-    gradient : (3, 3) of :func:`gravity_gradient`.
+    gradient : (3, 3) 1/s^2, of gravity; see :func:`ssm_graph.imu.preintegration.gravity_gradient`.
     R_begin, R_end : (..., 3, 3) attitudes at both ends, body to ``n``.
     span_s : (...) from begin to end.
     """
@@ -56,28 +56,33 @@ def add_gravity_gradient(
     end[..., POSITION] += D_middle @ R_end
 
 
-class InertialRows:
-    """Whitened rows of the inertial factors of a problem."""
+def inertial_rows(
+    graph: gtsam.NonlinearFactorGraph, states: States, gradient: Array, *, span_s: Array
+) -> Array:
+    """Return the whitened rows (K - 1, 15, 31) of a chain of inertial factors at ``states``."""
+    linear = graph.linearize(states.values)
+    rows = np.empty((len(span_s), STATE_DIM, 2 * STATE_DIM + 1))
+    for k in range(len(rows)):
+        rows[k] = linear.at(k).augmentedJacobian()
+    rows = rows[:, :, PAIR_COLUMNS]
+    R_nb = states.R_nb
+    add_gravity_gradient(rows, gradient, R_begin=R_nb[:-1], R_end=R_nb[1:], span_s=span_s)
+    return rows
 
-    def __init__(self, problem: Problem, graph: gtsam.NonlinearFactorGraph) -> None:
-        self._graph = graph
-        self._span_s = np.diff(problem.keyframe_s)
-        self._gradient = gravity_gradient(problem.frame)
 
-    def at(self, values: gtsam.Values, R_nb: Array) -> Array:
-        """Return the rows (K - 1, 15, 31), each of begin, end and ``b``.
-
-        ``R_nb`` (K, 3, 3) are the attitudes in ``values``.
-        """
-        linear = self._graph.linearize(values)
-        rows = np.empty((len(self._span_s), STATE_DIM, 2 * STATE_DIM + 1))
-        for k in range(len(rows)):
-            rows[k] = linear.at(k).augmentedJacobian()
-        rows = rows[:, :, PAIR_COLUMNS]
-        add_gravity_gradient(
-            rows, self._gradient, R_begin=R_nb[:-1], R_end=R_nb[1:], span_s=self._span_s
-        )
-        return rows
+def pair_rows(
+    factor: gtsam.NonlinearFactor,
+    values: gtsam.Values,
+    gradient: Array,
+    *,
+    R_begin: Array,
+    R_end: Array,
+    span_s: float,
+) -> Array:
+    """Return the whitened rows (15, 31) of one inertial factor; see :func:`inertial_rows`."""
+    pair = factor.linearize(values).augmentedJacobian()[:, PAIR_COLUMNS]
+    add_gravity_gradient(pair, gradient, R_begin=R_begin, R_end=R_end, span_s=span_s)
+    return np.asarray(pair)
 
 
 def carried_covariance(pair: Array, covariance: Array) -> Array:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,9 +17,10 @@ from ssm_graph.graph.aid_rows import Aid, DepthAid, GnssAid
 from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.bordered import BorderedSolution, ChainRows, solve_bordered
 from ssm_graph.graph.extended_rows import ExtendedBeams, RowStates, states_of
-from ssm_graph.graph.inertial_rows import InertialRows, inertial_graph
+from ssm_graph.graph.inertial_rows import inertial_graph, inertial_rows
 from ssm_graph.graph.marginal_prior import prior_at_start
 from ssm_graph.graph.states import States, retract
+from ssm_graph.imu.preintegration import gravity_gradient
 from ssm_graph.problem.calibration import needs_motion
 from ssm_graph.problem.error_state import STATE_DIM
 from ssm_graph.problem.problem import Problem, start_of
@@ -80,7 +80,7 @@ class GraphLinearizer:
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
         self.inertial = inertial_graph(problem)
-        self._inertial_rows = InertialRows(problem, self.inertial)
+        self._gradient, self._span_s = gravity_gradient(problem.frame), np.diff(problem.keyframe_s)
         self.prior = prior_at_start(start_of(problem))
         self.aids: list[Aid] = []
         if problem.depths is not None:
@@ -89,7 +89,7 @@ class GraphLinearizer:
             self.aids.append(GnssAid(problem, problem.fixes))
         self._beams = ExtendedBeams(problem.beams, problem.extras, problem.frame.omega_ie_n)
         self._n_judged = 0
-        factor, sigma = problem.extras.transitions(np.diff(problem.keyframe_s))
+        factor, sigma = problem.extras.transitions(self._span_s)
         self._walk_factor, self._walk_sigma = factor, sigma
 
     def follow(self, states: States) -> bool:
@@ -135,7 +135,7 @@ class GraphLinearizer:
 
     def inertial_rows(self, states: States) -> Array:
         """Return the whitened rows (K - 1, 15, 31) of the inertial data at ``states``."""
-        return self._inertial_rows.at(states.values, states.R_nb)
+        return inertial_rows(self.inertial, states, self._gradient, span_s=self._span_s)
 
     def retract(
         self, states: States, delta: tuple[Array, Array], *, scale: float = 1.0
@@ -157,12 +157,13 @@ class GraphLinearizer:
         return float(self.inertial.error(states.values) + 0.5 * squares)
 
     def misfits(self, states: States) -> dict[str, Misfit]:
-        """Return the misfit of the aids and the inertial data, by name."""
-        found = {}
+        """Return the misfit of the aids and the inertial data, by name, where there are any."""
+        n = self.inertial.size()
+        found = {"inertial": Misfit(2.0 * self.inertial.error(states.values), n * STATE_DIM, n)}
         for aid in self.aids:
             error = aid.rows(states).error
             found[aid.name] = Misfit(float(error @ error), len(error), len(error) // aid.dim)
-        return found | {"inertial": _misfit_of(self.inertial, states)}
+        return {name: misfit for name, misfit in found.items() if misfit.n_factors}
 
     def _at_beams(self, states: States) -> RowStates:
         g_n = self.problem.frame.g_n_at(states.p_n)
@@ -205,9 +206,3 @@ class GraphLinearizer:
         order = np.argsort(keyframe, kind="stable")
         first = np.searchsorted(keyframe[order], np.arange(self.problem.n_keyframes + 1))
         return np.concatenate(blocks)[order], first
-
-
-def _misfit_of(graph: gtsam.NonlinearFactorGraph, states: States) -> Misfit:
-    """Return the misfit of GTSAM's factors of one kind."""
-    n_factors = graph.size()
-    return Misfit(2.0 * graph.error(states.values), n_factors * graph.at(0).dim(), n_factors)

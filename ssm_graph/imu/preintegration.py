@@ -26,6 +26,9 @@ GRAVITY = 9.8
 """m/s^2"""
 GRADIENT_REACH = 1000.0
 """m, over which the gradient of gravity is taken."""
+ORIGIN = np.zeros(3)
+"""Of the navigation frame."""
+ORIGIN.setflags(write=False)
 LIVELY_S = 5.0
 """Before and after a gap, what is seen tells how lively the unseen may have been."""
 LIVELIER = 1.5
@@ -67,9 +70,9 @@ def gtsam_gravity(frame: LocalFrame, p_n: Array) -> Array:
     return np.asarray(frame.g_n_at(p_n) + np.cross(omega, np.cross(omega, p_n)))
 
 
-def gravity_gradient(frame: LocalFrame) -> Array:
-    """Return how that gravity changes with position (3, 3), 1/s^2, about the origin of ``n``."""
-    around = GRADIENT_REACH * np.vstack([np.eye(3), -np.eye(3)])
+def gravity_gradient(frame: LocalFrame, p_n: Array = ORIGIN) -> Array:
+    """Return how that gravity changes with position (3, 3), 1/s^2, about ``p_n`` (3,)."""
+    around = p_n + GRADIENT_REACH * np.vstack([np.eye(3), -np.eye(3)])
     at = gtsam_gravity(frame, around)
     return np.asarray((at[:3] - at[3:]).T / (2.0 * GRADIENT_REACH))
 
@@ -95,7 +98,7 @@ def preintegrate(
     gaps = imu_gaps(imu)
     unseen = _unseen(imu, keyframe_s, gaps)
     merged = merge_samples(bridged(imu, gaps), keyframe_s, rate_hz=rate_hz)
-    g_n = gtsam_gravity(frame, np.zeros(3))
+    g_n = gtsam_gravity(frame, ORIGIN)
     bias = np.zeros(6) if bias is None else bias
     bias_hat = gtsam.imuBias.ConstantBias(bias[:3], bias[3:])
     params = tuple(

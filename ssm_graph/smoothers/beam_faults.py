@@ -250,8 +250,9 @@ class FaultWatch:
 
     def __init__(self, problem: Problem, search: FaultSearch | None) -> None:
         self._search = search
-        alone = replace(problem, extras=NO_EXTRAS)
-        self._linearizer = None if search is None else GraphLinearizer(alone)
+        self._linearizer = None
+        if search is not None:
+            self._linearizer = GraphLinearizer(replace(problem, extras=NO_EXTRAS))
         self._beams, self._time_s = problem.beams, problem.keyframe_s[problem.beams.keyframe]
         self._found = Found(np.zeros(len(self._time_s), dtype=bool), ())
         self._n_looks = 0

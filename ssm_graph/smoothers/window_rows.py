@@ -17,11 +17,7 @@ from factors.so3 import cross
 from ssm_graph.data import Array
 from ssm_graph.earth import LocalFrame
 from ssm_graph.graph.beam_rows import BeamRows, rows_of_beams
-from ssm_graph.graph.inertial_rows import (
-    PAIR_COLUMNS,
-    add_gravity_gradient,
-    carried_covariance,
-)
+from ssm_graph.graph.inertial_rows import carried_covariance, pair_rows
 from ssm_graph.imu.preintegration import gravity_gradient, gtsam_gravity
 from ssm_graph.problem.error_state import GYRO_BIAS, POSITION, ROTATION, STATE_DIM, VELOCITY
 from ssm_graph.problem.heights import height_track, mean_rises
@@ -99,15 +95,16 @@ class InertialRows:
             factor = gtsam.GalileanCombinedImuFactor(
                 x_i, v_i, x_j, v_j, b_i, b_j, _way(keyframe).measured
             )
-            pair = factor.linearize(self._values).augmentedJacobian()[:, PAIR_COLUMNS]
-            add_gravity_gradient(
-                pair,
-                self._gradient,
-                R_begin=states.R_nb[i - 1],
-                R_end=states.R_nb[i],
-                span_s=float(_way(keyframe).measured.deltaTij()),
+            rows.append(
+                pair_rows(
+                    factor,
+                    self._values,
+                    self._gradient,
+                    R_begin=states.R_nb[i - 1],
+                    R_end=states.R_nb[i],
+                    span_s=float(_way(keyframe).measured.deltaTij()),
+                )
             )
-            rows.append(pair)
         return rows
 
     def _put(self, which: int, pose: Array, v_n: Array, bias: Array) -> None:

@@ -138,6 +138,9 @@ def test_the_claim_rests_on_each_term(term: str, monkeypatch: pytest.MonkeyPatch
             "ssm_graph.graph.first_values.gtsam_gravity",
             lambda frame, p_n: gtsam_gravity(frame, np.zeros_like(p_n)),
         )
+        monkeypatch.setattr(
+            "ssm_graph.graph.first_values.gravity_gradient", lambda *_: np.zeros((3, 3))
+        )
     elif term == "rate":
         monkeypatch.setattr(
             "ssm_graph.graph.first_values.gtsam_gravity", lambda frame, p_n: frame.g_n_at(p_n)

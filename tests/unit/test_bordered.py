@@ -94,6 +94,24 @@ def test_variance_of_rows_takes_the_border_along() -> None:
         np.testing.assert_allclose(got.variance(keyframe, H)[i], wide @ covariance @ wide)
 
 
+@pytest.mark.parametrize("keyframes", [2, 3, 10, 30])
+def test_triangles_rebuild_the_information(keyframes: int) -> None:
+    """``R`` and ``R gain`` of every keyframe, in their places, have the ``A'A`` of all rows."""
+    rows = random_rows(np.random.default_rng(keyframes), keyframes=keyframes, n=4, constants=0)
+    got, (_, covariance) = solve_bordered(rows), dense(rows)
+    whole = np.zeros_like(covariance)
+    for k in range(keyframes):
+        own = slice(4 * k, 4 * k + 4)
+        whole[own, own] = got.R[k]
+        assert np.all(np.tril(got.R[k], -1) == 0.0)
+        if k + 1 < keyframes:
+            whole[own, 4 * k + 4 : 4 * k + 8] = got.R[k] @ got.gain[k]
+    information = np.linalg.inv(covariance)
+    np.testing.assert_allclose(
+        whole.T @ whole, information, rtol=0.0, atol=1e-8 * np.abs(information).max()
+    )
+
+
 def test_what_is_not_determined_is_refused() -> None:
     """A constant without a prior that no row sees."""
     rng = np.random.default_rng(4)

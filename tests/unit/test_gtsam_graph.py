@@ -7,10 +7,11 @@ from functools import cache
 import gtsam
 import numpy as np
 import pytest
+from gtsam.symbol_shorthand import B, V, X
 
 from ssm_graph.data import Array
 from ssm_graph.earth import radii_of_curvature
-from ssm_graph.graph.gtsam_graph import depth_graph, gnss_graph, prior_graph
+from ssm_graph.graph.gtsam_graph import chain_ordering, depth_graph, gnss_graph, prior_graph
 from ssm_graph.graph.states import States, retract, states_from_arrays
 from ssm_graph.problem.error_state import STATE_DIM
 from ssm_graph.problem.problem import Problem, build_problem, start_of
@@ -23,7 +24,7 @@ from ssm_graph.simulation import (
     TransitRoute,
     Waves,
 )
-from tests.helpers import rotation, simulated, state_errors, true_states, with_initial
+from tests.helpers import simulated, state_errors, true_states, with_initial
 
 ARM = (3.0, -2.0, 1.5)
 
@@ -162,20 +163,11 @@ def test_prior_is_zero_at_the_initial_state_and_has_its_sigmas() -> None:
         assert prior.error(values) == pytest.approx(half_chi_sq, rel=0.01, abs=1e-9)
 
 
-def small_problem() -> tuple[Problem, States, Array]:
-    """Return 8 s with everything, states a few sigmas off, and beam weights."""
-    sim = simulated(duration_s=8.0, gnss=GnssSettings(windows=((0.0, 9.0),)), dropout_rate=0.2)
-    problem = build_problem(sim.mission)
-    truth = true_states(problem, sim)
-    rng = np.random.default_rng(3)
-    n = problem.n_keyframes
-    states = states_from_arrays(
-        truth.R_nb @ rotation(1e-5 * rng.normal(size=(n, 3))),
-        truth.p_n + 1e-3 * rng.normal(size=(n, 3)),
-        truth.v_n + 1e-3 * rng.normal(size=(n, 3)),
-        truth.bias + np.repeat([1e-5, 1e-8], 3) * rng.normal(size=(n, 6)),
-    )
-    return problem, states, rng.uniform(0.01, 1.1, len(problem.beams.speed))
+def test_ordering_goes_keyframe_by_keyframe() -> None:
+    """Pose, velocity, bias, in time."""
+    ordering = chain_ordering(2)
+    keys = [ordering.at(i) for i in range(ordering.size())]
+    assert keys == [X(0), V(0), B(0), X(1), V(1), B(1)]
 
 
 def test_arrays_and_values_move_together() -> None:

@@ -7,8 +7,9 @@ import pytest
 
 from ssm_graph.data import Array
 from ssm_graph.estimate import Status
-from ssm_graph.graph.inertial_rows import InertialRows, inertial_graph
+from ssm_graph.graph.inertial_rows import inertial_graph, inertial_rows
 from ssm_graph.graph.states import States, retract
+from ssm_graph.imu.preintegration import gravity_gradient
 from ssm_graph.problem.error_state import POSITION, STATE_DIM
 from ssm_graph.problem.problem import Problem, build_problem
 from ssm_graph.simulation import Grade
@@ -36,15 +37,16 @@ def test_rows_follow_gravity(end: int) -> None:
     """Differences over a kilometre, gravity led after the states, against the columns."""
     problem, states = turned()
     states = retract(states, np.zeros((problem.n_keyframes, STATE_DIM)))
-    inertial = InertialRows(problem, inertial_graph(problem))
+    graph, gradient = inertial_graph(problem), gravity_gradient(problem.frame)
+    span_s = np.diff(problem.keyframe_s)
 
     def error_at(step: Array) -> Array:
         moved = retract(states, step)
         problem.chain.set_gravity(moved.p_n)
-        return -inertial.at(moved.values, moved.R_nb)[1, :, -1]
+        return -inertial_rows(graph, moved, gradient, span_s=span_s)[1, :, -1]
 
     problem.chain.set_gravity(states.p_n)
-    columns = inertial.at(states.values, states.R_nb)[1]
+    columns = inertial_rows(graph, states, gradient, span_s=span_s)[1]
     for axis in range(3):
         step = np.zeros((problem.n_keyframes, STATE_DIM))
         step[1 + end, POSITION.start + axis] = 1000.0

@@ -8,12 +8,11 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
-from gtsam.symbol_shorthand import B, V, X
 
 from benchmarks.calibration_cases import as_stated, asking
 from ssm_graph.data import Array
 from ssm_graph.errors import ConfigError
-from ssm_graph.graph.gtsam_graph import gtsam_graph
+from ssm_graph.graph.gtsam_graph import chain_ordering, gtsam_graph
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.states import States, retract, states_from_arrays
 from ssm_graph.problem.error_state import STATE_DIM
@@ -61,11 +60,7 @@ def dense(graph: gtsam.NonlinearFactorGraph, states: States) -> tuple[Array, Arr
     equations themselves would lose half of the digits.
     """
     n = len(states.p_n)
-    ordering = gtsam.Ordering()
-    for k in range(n):
-        for key in (X(k), V(k), B(k)):
-            ordering.push_back(key)
-    J, b = graph.linearize(states.values).jacobian(ordering)
+    J, b = graph.linearize(states.values).jacobian(chain_ordering(n))
     scale = 1.0 / np.linalg.norm(J, axis=0)
     Q, R = np.linalg.qr(J * scale)
     R_inv = np.linalg.inv(R) * scale[:, None]
@@ -79,9 +74,7 @@ def test_it_is_gtsams_graph(grade: Grade, monkeypatch: pytest.MonkeyPatch) -> No
 
     Up to the gradient of gravity, which those do not know.
     """
-    monkeypatch.setattr(
-        "ssm_graph.graph.inertial_rows.gravity_gradient", lambda _: np.zeros((3, 3))
-    )
+    monkeypatch.setattr("ssm_graph.graph.linearize.gravity_gradient", lambda _: np.zeros((3, 3)))
     gnss = GnssSettings(windows=((0.0, 9.0),))
     sim = simulated(duration_s=8.0, gnss=gnss, dropout_rate=0.2, grade=grade)
     problem = build_problem(sim.mission)

@@ -86,9 +86,7 @@ def test_gaussian_kernel_is_the_plain_smoother(
 
     Up to the gradient of gravity, which GTSAM's factor does not know.
     """
-    monkeypatch.setattr(
-        "ssm_graph.graph.inertial_rows.gravity_gradient", lambda _: np.zeros((3, 3))
-    )
+    monkeypatch.setattr("ssm_graph.graph.linearize.gravity_gradient", lambda _: np.zeros((3, 3)))
     sim = simulated(duration_s=15.0, grade=grade, gnss=GNSS, dropout_rate=0.1, seed=2)
     problem = build_problem(sim.mission)
     # Heights are good to 1e-9 m, the rounding of the radius of the Earth: 3e-8 of their sigma.
@@ -345,3 +343,15 @@ def test_first_values_are_no_worse_than_the_answer_needs() -> None:
     answer = estimated_states(problem, estimate.trajectory)
     assert np.abs(state_errors(first.states, answer)[1:, 6:9]).max() < 0.05
     assert len(estimate.iterations) <= 8
+
+
+def test_a_depth_log_that_is_over_before_the_first_ping() -> None:
+    """It says nothing, and does not spoil the answer."""
+    mission = simulated(duration_s=10.0).mission
+    depth = mission.depth
+    assert depth is not None
+    early = dataclasses.replace(depth, time_s=depth.time_s - 1e3)
+    estimate = smoothed(build_problem(dataclasses.replace(mission, depth=early)))
+    without = smoothed(build_problem(dataclasses.replace(mission, depth=None)))
+    assert estimate.status is Status.CONVERGED
+    np.testing.assert_array_equal(estimate.trajectory.lat, without.trajectory.lat)
