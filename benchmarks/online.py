@@ -90,7 +90,9 @@ def parse_args(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--parts", nargs="+", default=list(PARTS), choices=PARTS)
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the real logs")
     parser.add_argument("--out", type=Path, default=Path("out/online"))
-    parser.add_argument("--keep", action="store_true", help="write benchmarks/results/online.md")
+    parser.add_argument(
+        "--keep", action="store_true", help="write benchmarks/results/online_PART.md"
+    )
     return parser.parse_args(argv)
 
 
@@ -150,6 +152,12 @@ def run_logs(args: argparse.Namespace) -> list[str]:
     return ["## Real logs, GNSS withheld after 70 s", "", *log_lines(rows)]
 
 
+TITLES = {
+    "stream": "latency, beside GTSAM's own fixed-lag smoothers",
+    "lags": "lags",
+    "settings": "settings",
+    "logs": "real logs",
+}
 SECTIONS: dict[str, Callable[[argparse.Namespace], list[str]]] = {
     "stream": run_streams,
     "lags": run_lags,
@@ -159,20 +167,21 @@ SECTIONS: dict[str, Callable[[argparse.Namespace], list[str]]] = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the benchmark and write its report."""
+    """Run the benchmark and write a report of each part."""
     args = parse_args(argv)
     os.environ["OPENBLAS_NUM_THREADS"] = "1"  # for the processes that are begun from here
-    load = os.getloadavg()[0]
-    body = [line for part in PARTS if part in args.parts for line in SECTIONS[part](args)]
     command = shlex.join(["python", "benchmarks/online.py", *(argv or sys.argv[1:])])
-    about = f"{machine()}; load average before {load:.1f}, after {os.getloadavg()[0]:.1f}."
-    text = "\n".join(["# The live estimator", "", f"    {command}", "", about, "", *body])
-    args.out.mkdir(parents=True, exist_ok=True)
-    (args.out / "online.md").write_text(text, encoding="utf-8")
-    if args.keep:
-        RESULTS.mkdir(exist_ok=True)
-        (RESULTS / "online.md").write_text(text, encoding="utf-8")
-    print(text)
+    folders = [args.out, *([RESULTS] if args.keep else [])]
+    for part in (part for part in PARTS if part in args.parts):
+        load = os.getloadavg()[0]
+        body = SECTIONS[part](args)
+        about = f"{machine()}; load average before {load:.1f}, after {os.getloadavg()[0]:.1f}."
+        title = f"# The live estimator: {TITLES[part]}"
+        text = "\n".join([title, "", f"    {command}", "", about, "", *body])
+        for folder in folders:
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / f"online_{part}.md").write_text(text, encoding="utf-8")
+        print(text)
     return 0
 
 

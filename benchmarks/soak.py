@@ -40,13 +40,13 @@ WARM_H = 0.25
 LEGEND = f"""\
 Scenario `survey`, 100 Hz inertial, depth 2 Hz, no GNSS; initial state given. Every case has its own
 seed. `bottom losses`: no beam for ten minutes of every hour. `stuck beam`: one beam repeats its
-reading for 15 minutes of every hour. `IMU gaps`: a second of samples missing every ten minutes.
-`all of these`: also without depth. The newest state is asked for twice a ping interval and compared
-with the truth at its own time. Inside: share of the time of good health at which the error is
-within three of its sigmas, of the worst axis, and mean of the nine; wanted {WANTED:.0%} or more.
-Outside: longest unbroken stretch of good health with any axis outside three sigmas. Beyond: how
-long the health was good with any axis beyond five. Memory: growth of the resident size from
-{WARM_H:g} h on, by least squares.
+reading for 15 minutes of every hour. `IMU gaps`: a second of samples missing of every ten minutes,
+at a time drawn from them. `all of these`: also without depth. The newest state is asked for twice a
+ping interval and compared with the truth at its own time. Inside: share of the time of good health
+at which the error is within three of its sigmas, of the worst axis, and mean of the nine; wanted
+{WANTED:.0%} or more. Outside: longest unbroken stretch of good health with any axis outside three
+sigmas. Beyond: how long the health was good with any axis beyond five. Memory: growth of the
+resident size from {WARM_H:g} h on, by least squares.
 """
 
 

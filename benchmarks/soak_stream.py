@@ -35,7 +35,7 @@ LOSS_S = (1800.0, 2400.0)
 """Begin and end within the hour"""
 STUCK_S = (600.0, 1500.0)
 STUCK_BEAM = 1
-GAP_EVERY_S, GAP_BEGIN_S, GAP_S = 600.0, 300.0, 1.0
+GAP_EVERY_S, GAP_S = 600.0, 1.0
 GOOD = HEALTHS.index(Health.GOOD)
 AXES = tuple(
     f"{name} {axis}"
@@ -57,7 +57,7 @@ class Case:
     stuck: bool = False
     """One beam repeats its reading for a quarter of every hour, also while the others are gone"""
     gaps: bool = False
-    """A second of the inertial data is missing every ten minutes"""
+    """A second of the inertial data is missing of every ten minutes, at a time drawn from them"""
 
 
 CASES = {
@@ -136,7 +136,7 @@ def broken_mission(
     mission = simulate(config).mission
     if case.stuck:
         mission = _with_stuck_beam(mission, starts)
-    return (_with_gaps(mission) if case.gaps else mission), config.trajectory.truth
+    return (_with_gaps(mission, seed) if case.gaps else mission), config.trajectory.truth
 
 
 def _with_stuck_beam(mission: Mission, starts: Array) -> Mission:
@@ -148,10 +148,14 @@ def _with_stuck_beam(mission: Mission, starts: Array) -> Mission:
     return replace(mission, dvl=replace(dvl, speed=speed))
 
 
-def _with_gaps(mission: Mission) -> Mission:
+def _with_gaps(mission: Mission, seed: int) -> Mission:
+    """Return the mission with gaps at random: at one place of the pattern all would err alike."""
     imu = mission.imu
-    since_s = imu.time_s % GAP_EVERY_S - GAP_BEGIN_S
-    kept = (since_s <= 1e-6) | (since_s > GAP_S + 1e-6)
+    within_s, number = imu.time_s % GAP_EVERY_S, (imu.time_s // GAP_EVERY_S).astype(np.intp)
+    random = np.random.default_rng([seed, len(imu.time_s)])
+    begin_s = random.uniform(GAP_S, GAP_EVERY_S - 2.0 * GAP_S, size=number[-1] + 1)
+    since_s = within_s - begin_s[number]
+    kept = (since_s <= 0.0) | (since_s > GAP_S)
     columns = {name: getattr(imu, name)[kept] for name in ("time_s", "gyro_b", "accel_b")}
     return replace(mission, imu=replace(imu, **columns))
 
