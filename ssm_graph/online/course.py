@@ -6,6 +6,7 @@ message and forth again leads to what punctual messages would have led to.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import deque
 from dataclasses import replace
 from typing import Final, NamedTuple
@@ -34,6 +35,10 @@ ANY_SPEED: Final = 5.0
 """m/s: once its velocity is less certain than this, a vehicle's being no faster is what is left."""
 LEAST_LATE_S: Final = 1.0
 """Messages may be so late whatever the lag."""
+FRESH_S: Final = 5.0
+"""Every step as old as this is kept, for what comes late comes late by little."""
+SPARSE_S: Final = 2.0
+"""Of older ones, each with a window of its own, one in so long; the others are made anew."""
 
 
 class Step(NamedTuple):
@@ -42,7 +47,7 @@ class Step(NamedTuple):
     window: Window
     watch: Watch
     left: Stretch | None
-    """What left the window with it."""
+    """What left the window since the step that is kept before it."""
     reserve: Reserve
 
     @property
@@ -52,7 +57,7 @@ class Step(NamedTuple):
 
 
 class Course:
-    """Makes one step after the other, and keeps those that late messages may undo."""
+    """Makes one step after the other, and keeps those that late messages may go back to."""
 
     def __init__(
         self, first: Step, maker: KeyframeMaker, buffers: Buffers, events: EventLog, null_b: Array
@@ -98,6 +103,7 @@ class Course:
             self._steps.append(self._step(measured))
             count += 1
             self._let_go()
+            self._thin_out()
         return count
 
     def take_settled(self, *, all_of_them: bool = False) -> list[Stretch]:
@@ -114,6 +120,17 @@ class Course:
         while len(self._steps) > 1 and self._steps[1].time_s <= kept_s:
             self._settle(self._steps.popleft())
         self._buffers.drop_before(self.oldest.window.keyframes[0].time_s - 1.0)
+
+    def _thin_out(self) -> None:
+        """Forget the step that is no longer fresh, if those beside it are close enough."""
+        steps, fresh_s = self._steps, self.newest.time_s - FRESH_S
+        at = bisect_left(steps, fresh_s, key=lambda step: step.time_s) - 1
+        if at < 1 or steps[at + 1].time_s - steps[at - 1].time_s > SPARSE_S:
+            return
+        behind = steps[at + 1]
+        left = [stretch for stretch in (steps[at].left, behind.left) if stretch is not None]
+        steps[at + 1] = behind._replace(left=joined(left) if left else None)
+        del steps[at]
 
     def _settle(self, step: Step) -> None:
         if step.left is not None:

@@ -11,6 +11,7 @@ import pytest
 
 from ssm_graph.messages import Fix, Health, ImuSample, Message, Navigation, Ping
 from ssm_graph.online import ONLINE, FixedLagSmoother
+from ssm_graph.online.course import FRESH_S, SPARSE_S
 from ssm_graph.problem.problem import build_problem
 from ssm_graph.smoothers.fixed_lag import solve_fixed_lag
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
@@ -75,6 +76,28 @@ def test_out_of_order_is_in_order(seed: int) -> None:
     _, vehicle = stream()
     ordered, delayed, _ = run(messages(), vehicle)
     newest, other, smoother = run(shuffled(seed), vehicle)
+    assert not any("too_late" in kind for kind in smoother.counts)
+    assert_same(newest, ordered, sigmas=1e-8)
+    for name in ("time_s", "lat", "velocity_enu", "velocity_sigma_enu", "weight"):
+        np.testing.assert_allclose(joined(other, name), joined(delayed, name), rtol=0, atol=1e-9)
+
+
+def test_what_comes_late_by_more_than_is_kept_in_full_changes_nothing() -> None:
+    """Of steps that are no longer fresh one in two seconds is kept: the rest is made anew."""
+    _, vehicle = stream(24.0, 4.0)
+    config, given = replace(ONLINE, lag_s=15.0), messages(24.0, 4.0)
+    running = FixedLagSmoother(vehicle, config)
+    for message in given:
+        running.push(message)
+    assert running._course is not None
+    kept_s = [step.time_s for step in running._course._steps]
+    assert len(kept_s) < 4.0 * FRESH_S + (config.lag_s - FRESH_S) / (0.5 * SPARSE_S) + 3
+    assert np.all(np.diff(kept_s) <= SPARSE_S)
+    pings = [m for m in given if isinstance(m, Ping)]
+    late = {id(pings[i]): 5.3 + 2.0 * n for n, i in enumerate((20, 31, 41, 50))}
+    ordered, delayed, _ = run(given, vehicle, config)
+    given = tuple(sorted(given, key=lambda m: m.time_s + late.get(id(m), 0.0)))
+    newest, other, smoother = run(given, vehicle, config)
     assert not any("too_late" in kind for kind in smoother.counts)
     assert_same(newest, ordered, sigmas=1e-8)
     for name in ("time_s", "lat", "velocity_enu", "velocity_sigma_enu", "weight"):
