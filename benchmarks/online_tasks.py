@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -188,14 +188,14 @@ class LogRow(NamedTuple):
     remark: str
 
 
-def log_rows(path: Path, config: FixedLagConfig) -> list[LogRow]:
-    """Run a real log live and offline, GNSS withheld after `GNSS_UNTIL_S`."""
+def log_rows(path: Path, configs: Sequence[FixedLagConfig]) -> list[LogRow]:
+    """Run a real log live, with each of the settings, and offline; GNSS ends at `GNSS_UNTIL_S`."""
     mission, withheld = withhold_gnss(convert_blueye(path), GNSS_UNTIL_S)
 
     def reference(trajectory: Trajectory) -> Reference:
         return reference_from_gnss(withheld, trajectory)
 
-    rows = _live_rows(path.stem, mission, reference, config)
+    rows = [r for config in configs for r in _live_rows(path.stem, mission, reference, config)]
     aligned = with_initial(mission)
     problem = build_problem(aligned)
     for name in ("ekf", "ssm-log"):
