@@ -6,78 +6,20 @@ clock; velocities and sigmas labelled ``enu`` are along east, north, up at the v
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
-from typing import Any, cast
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
+from ssm_graph.aid_logs import NO_AIDS, AidLogs
 from ssm_graph.earth import LocalFrame
-from ssm_graph.errors import DataError
-
-Array = NDArray[np.float64]
+from ssm_graph.frozen import Array as Array
+from ssm_graph.frozen import FrozenArrays as FrozenArrays
+from ssm_graph.frozen import ReadOnlyArrays as ReadOnlyArrays
+from ssm_graph.frozen import optional_shaped as optional_shaped
+from ssm_graph.frozen import read_only as read_only
+from ssm_graph.frozen import shaped as shaped
 
 N_BEAMS = 4
-
-
-def read_only(name: str, value: ArrayLike, shape: Sequence[int | None]) -> Array:
-    """Return a read-only float copy of ``value`` after checking its shape (None matches any)."""
-    array = np.array(value, dtype=np.float64)
-    expected = tuple(shape)
-    if array.ndim != len(expected) or any(
-        want is not None and got != want for got, want in zip(array.shape, expected, strict=False)
-    ):
-        wanted = tuple("N" if size is None else size for size in expected)
-        raise DataError(f"{name}: expected an array of shape {wanted}, got {array.shape}")
-    array.setflags(write=False)
-    return array
-
-
-class FrozenArrays:
-    """Apply :func:`read_only` to every array field, by the shape kept in the field's metadata.
-
-    The letter ``N`` in a shape stands for the length of ``time_s``.
-    """
-
-    __slots__ = ()
-
-    def __post_init__(self) -> None:
-        length: int | None = None
-        for spec in fields(cast(Any, self)):
-            shape = spec.metadata.get("shape")
-            value = getattr(self, spec.name)
-            if shape is None or value is None:
-                continue
-            wanted = [length if size == "N" else size for size in shape]
-            array = read_only(f"{type(self).__name__}.{spec.name}", value, wanted)
-            if length is None and shape[0] == "N":
-                length = len(array)
-            object.__setattr__(self, spec.name, array)
-
-
-class ReadOnlyArrays:
-    """Clear the write flag of every array field, without copy: for arrays made on the spot."""
-
-    __slots__ = ()
-
-    def __post_init__(self) -> None:
-        for spec in fields(cast(Any, self)):
-            value = getattr(self, spec.name)
-            if isinstance(value, np.ndarray):
-                value.setflags(write=False)
-
-
-def shaped(*shape: int | str) -> Array:
-    """Declare an array field of :class:`FrozenArrays` with its shape."""
-    declared: Array = field(metadata={"shape": shape})
-    return declared
-
-
-def optional_shaped(*shape: int | str) -> Array | None:
-    """Declare an array field that may be None."""
-    declared: Array | None = field(default=None, metadata={"shape": shape})
-    return declared
 
 
 @dataclass(frozen=True, slots=True)
@@ -302,6 +244,8 @@ class Mission:
     dvl: DvlLog
     depth: DepthLog | None = None
     gnss: GnssLog | None = None
+    aids: AidLogs = NO_AIDS
+    """What else the batch smoother is aided by."""
     initial: InitialState | None = None
     reference: Reference | None = None
     notes: tuple[str, ...] = ()

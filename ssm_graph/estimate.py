@@ -64,6 +64,26 @@ class BeamTable(FrozenArrays):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class AidTable(FrozenArrays):
+    """One row for every component of a measurement that was weighted beside the beams."""
+
+    aid: tuple[str, ...]
+    """(N,) USBL, range, heading or standstill"""
+    component: tuple[str, ...]
+    """(N,) east, north, up, heading, or the beacon of a range"""
+    unit: tuple[str, ...]
+    """(N,) of the innovation: m, rad or m/s"""
+    time_s: Array = shaped("N")
+    """(N,) s, when it was valid, or of the keyframe that it was led to."""
+    innovation: Array = shaped("N")
+    """(N,) measured minus predicted, with the final states."""
+    mahalanobis_sq: Array = shaped("N")
+    """(N,) the t of the whole measurement, posterior variance included."""
+    weight: Array = shaped("N")
+    """(N,) of the whole measurement, 1 = nominal."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Trajectory(FrozenArrays):
     """States at the keyframes with their posterior uncertainty."""
 
@@ -189,6 +209,8 @@ class Estimate:
     """Mean passes over a keyframe of what goes keyframe by keyframe."""
     calibration: Calibration | None = None
     """What was found of the instruments, if that was asked for."""
+    aids: AidTable | None = None
+    """What became of the further aids; None where there are none."""
     noise: NoiseFound | None = None
     """What was found of their noise; None of what goes keyframe by keyframe."""
 

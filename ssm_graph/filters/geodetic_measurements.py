@@ -27,7 +27,8 @@ from ssm_graph.filters.geodetic_error_model import (
     enu_D_place,
 )
 from ssm_graph.filters.geodetic_mechanisation import GeodeticState, Track, earth_terms
-from ssm_graph.problem.problem import Beams, Depths, Fixes, Problem
+from ssm_graph.problem.aids import Depths, Fixes
+from ssm_graph.problem.problem import Beams, Problem
 
 
 class Rows(NamedTuple):

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from ssm_graph.data import Array
 from ssm_graph.earth import LocalFrame
 from ssm_graph.graph.states import States
+from ssm_graph.problem.aids import Depths
 from ssm_graph.problem.heights import height_track, mean_rises
-from ssm_graph.problem.problem import Depths
 
 
 class DepthTargets(NamedTuple):

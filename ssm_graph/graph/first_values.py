@@ -15,13 +15,17 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
-from factors.similarity import Kernel
+from factors.similarity import WEIGHT_FLOOR, Kernel
 from factors.so3 import cross
 from ssm_graph.data import N_BEAMS, Array
 from ssm_graph.earth import SEMI_MAJOR_AXIS
 from ssm_graph.errors import SolverError
+from ssm_graph.graph.aids.of_problem import weighted_aids
+from ssm_graph.graph.beacon_start import find_beacons
 from ssm_graph.graph.beam_rows import BeamRows, linearize_beams
 from ssm_graph.graph.beam_weights import met_weights, settle_weights, updated_trust
+from ssm_graph.graph.extended_rows import RowStates
+from ssm_graph.graph.forward_aids import ForwardAids
 from ssm_graph.graph.forward_extras import ForwardExtras
 from ssm_graph.graph.inertial_rows import carried_covariance, inertial_graph, pair_rows
 from ssm_graph.graph.states import States, states_from_arrays
@@ -33,6 +37,7 @@ LOCKED_OUT_PINGS = 3
 """After so many pings in a row without one good beam the prediction is doubted instead."""
 ANCHOR_SIGMA = 1.0
 """m/s; after a silence that leaves the beams this uncertain they set the velocity anew."""
+_NONE = np.zeros(0)
 GRAVITY_REACH = 20.0
 """m, how far gravity is carried linearly before it is evaluated anew."""
 
@@ -46,6 +51,9 @@ class FirstValues:
     """(M,) one for each beam row"""
     n_doubts: int
     """How often the prediction was doubted."""
+    aid_weights: Array
+    """One for each measurement of the weighted aids"""
+    notes: tuple[str, ...] = ()
 
 
 def first_values(
@@ -92,6 +100,8 @@ class _ForwardPass:
         self.P = self.extras.begin(start.covariance) if self.extras else start.covariance
         self.no_rows = _Rows(np.zeros((0, len(self.P))), np.zeros(0), np.zeros(0))
         self.factors = inertial
+        self.aids = weighted_aids(problem)
+        self.met = ForwardAids(self.aids)
         self.weights = np.ones(len(problem.beams.speed))
         self.trust = np.ones(N_BEAMS)
         self.without_beam = 0
@@ -109,13 +119,15 @@ class _ForwardPass:
             if k > 0:
                 self._predict(k - 1)
             self._update_fix(rows.fix[k])
+            self._update_aids(k)
             self._update_water(rows.beam[k], self._depth_row(rows.depth[k], k))
             walks = (self.extras.walks,) if self.extras else ()
             history.append((self.R_nb, self.p_n, self.v_n, self.bias, *walks))
         states = states_from_arrays(*(np.array(column) for column in zip(*history, strict=True)))
         if self.extras:
             states = states._replace(constants=self.extras.constants)
-        return FirstValues(states, self.weights, self.n_doubts)
+        states, met, notes = find_beacons(states, self.aids, problem.extras, self.met.weights)
+        return FirstValues(states, self.weights, self.n_doubts, met, notes)
 
     def _predict(self, k: int) -> None:
         chain = self.problem.chain
@@ -162,6 +174,17 @@ class _ForwardPass:
             H[:, POSITION] = self.R_nb
             innovation = fixes.position_n[i] - self.p_n - self.R_nb @ fixes.lever_arm_b
             self._correct(H, innovation, H @ self.P @ H.T + fixes.covariance_n[i])
+
+    def _update_aids(self, k: int) -> None:
+        """Correct by the weighted aids of one keyframe, each by itself."""
+        extras = self.extras
+        walks, constants = (extras.walks, extras.constants) if extras else (_NONE, _NONE)
+        for met in self.met.at(k, RowStates(*self._state, walks, constants, self._g_n)):
+            predicted = met.H @ self.P @ met.H.T
+            weight = self.met.weigh(met, predicted, self.kernel)
+            if weight > WEIGHT_FLOOR:
+                S = predicted + np.eye(len(met.innovation)) / weight
+                self._correct(met.H, met.innovation, S)
 
     def _depth_row(self, rows: range, k: int) -> _Rows:
         depths = self.problem.depths

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ssm_graph.data import Array
-from ssm_graph.graph.aid_rows import fix_rows
+from ssm_graph.graph.aids.positions import fix_rows
 from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.extended_rows import ExtendedBeams, PreparedBeams, RowStates
 from ssm_graph.problem.calibration import DEPTH_OFFSET

@@ -16,8 +16,9 @@ from ssm_graph.errors import ConfigError
 from ssm_graph.graph.depth import depth_targets
 from ssm_graph.graph.inertial_rows import inertial_graph
 from ssm_graph.graph.states import States
+from ssm_graph.problem.aids import Depths, Fixes
 from ssm_graph.problem.error_state import POSITION, ROTATION, VELOCITY
-from ssm_graph.problem.problem import Depths, Fixes, Problem, start_of
+from ssm_graph.problem.problem import Problem, start_of
 
 
 def gtsam_graph(

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssm_graph.data import Array
-from ssm_graph.graph.aid_rows import Aid, DepthAid, GnssAid
+from ssm_graph.graph.aids.of_problem import full_aids, weighted_aids
 from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.bordered import BorderedSolution, ChainRows, solve_bordered
 from ssm_graph.graph.extended_rows import ExtendedBeams, RowStates, states_of
@@ -82,11 +82,7 @@ class GraphLinearizer:
         self.inertial = inertial_graph(problem)
         self._gradient, self._span_s = gravity_gradient(problem.frame), np.diff(problem.keyframe_s)
         self.prior = prior_at_start(start_of(problem))
-        self.aids: list[Aid] = []
-        if problem.depths is not None:
-            self.aids.append(DepthAid(problem, problem.depths))
-        if problem.fixes is not None:
-            self.aids.append(GnssAid(problem, problem.fixes))
+        self.aids, self.weighted = full_aids(problem), weighted_aids(problem)
         self._beams = ExtendedBeams(problem.beams, problem.extras, problem.frame.omega_ie_n)
         self._n_judged = 0
         factor, sigma = problem.extras.transitions(self._span_s)
@@ -112,10 +108,19 @@ class GraphLinearizer:
         prepared = self._beams.prepare(states.walks, states.constants, states.bias)
         return self._beams.rows(self._at_beams(states), prepared)
 
-    def solve(self, states: States, beam_rows: BeamRows, weights: Array) -> Step:
-        """Return the step at ``states``, with their beam rows and weights (M,)."""
+    def solve(
+        self,
+        states: States,
+        beam_rows: BeamRows,
+        weights: Array,
+        aid_weights: Array | None = None,
+    ) -> Step:
+        """Return the step at ``states``, with their beam rows and weights (M,).
+
+        ``aid_weights`` are those of the weighted aids' measurements; all one when left out.
+        """
         extras = self.problem.extras
-        own, first = self._own_rows(states, beam_rows, weights)
+        own, first = self._own_rows(states, beam_rows, weights, aid_weights)
         sigma = extras.sigma
         start = np.zeros((extras.state_dim, extras.width + 1))
         prior = self.prior.rows(states)
@@ -145,13 +150,20 @@ class GraphLinearizer:
         moved = retract(states, step, constants_step)
         return moved, np.concatenate([step.ravel(), constants_step])
 
-    def cost(self, states: States, beam_rows: BeamRows, weights: Array) -> float:
+    def cost(
+        self,
+        states: States,
+        beam_rows: BeamRows,
+        weights: Array,
+        aid_weights: Array | None = None,
+    ) -> float:
         """Return half the weighted sum of squares that :meth:`solve` makes least."""
         self.problem.chain.set_gravity(states.p_n)
         extras = self.problem.extras
         squares = np.sum(weights * (beam_rows.error / self.problem.beams.sigma) ** 2)
         squares += np.sum(self.prior.whitened(states) ** 2)
         squares += sum(float(np.sum(aid.rows(states).error ** 2)) for aid in self.aids)
+        squares += np.sum(self._aid_weights(aid_weights) * self.weighted.squares(states))
         at_start = np.concatenate([states.walks[0], states.constants])
         squares += np.sum((at_start / extras.sigma) ** 2) + np.sum(self._walked(states) ** 2)
         return float(self.inertial.error(states.values) + 0.5 * squares)
@@ -164,6 +176,9 @@ class GraphLinearizer:
             error = aid.rows(states).error
             found[aid.name] = Misfit(float(error @ error), len(error), len(error) // aid.dim)
         return {name: misfit for name, misfit in found.items() if misfit.n_factors}
+
+    def _aid_weights(self, weights: Array | None) -> Array:
+        return np.ones(len(self.weighted)) if weights is None else weights
 
     def _at_beams(self, states: States) -> RowStates:
         g_n = self.problem.frame.g_n_at(states.p_n)
@@ -191,15 +206,21 @@ class GraphLinearizer:
         return between
 
     def _own_rows(
-        self, states: States, beam_rows: BeamRows, weights: Array
+        self,
+        states: States,
+        beam_rows: BeamRows,
+        weights: Array,
+        aid_weights: Array | None,
     ) -> tuple[Array, NDArray[np.intp]]:
         """Return all rows of one keyframe each (M, width + 1) in order, and where each begins."""
         beams = self.problem.beams
         scale = np.sqrt(weights) / beams.sigma
         whitened = np.column_stack([beam_rows.jacobian, -beam_rows.error]) * scale[:, None]
         keyframes, blocks = [beams.keyframe], [whitened]
-        for aid in self.aids:
-            keyframe, error, jacobian = aid.rows(states)
+        aid_rows = [aid.rows(states) for aid in self.aids]
+        if len(self.weighted):
+            aid_rows.append(self.weighted.weighted_rows(states, self._aid_weights(aid_weights)))
+        for keyframe, error, jacobian in aid_rows:
             keyframes.append(keyframe)
             blocks.append(np.column_stack([jacobian, -error]))
         keyframe = np.concatenate(keyframes)

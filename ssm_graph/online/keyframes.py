@@ -14,8 +14,9 @@ from ssm_graph.earth import LocalFrame
 from ssm_graph.imu.preintegration import LIVELY_S, imu_gaps, preintegrate
 from ssm_graph.messages import Vehicle
 from ssm_graph.online.buffers import Buffers, Measured
+from ssm_graph.problem.aids import fix_covariance_n
 from ssm_graph.problem.ping_motion import PING_WINDOW_S, mean_gyro
-from ssm_graph.problem.problem import ProblemConfig, fix_covariance_n
+from ssm_graph.problem.problem import ProblemConfig
 from ssm_graph.problem.timeline import MIN_SPACING_S
 from ssm_graph.smoothers.keyframe import BeamSpeeds, Keyframe, Sensors, Way
 

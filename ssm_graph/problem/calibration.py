@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 
 from ssm_graph.data import N_BEAMS, DepthCalibration, DvlMount, GnssCalibration, Mission
+from ssm_graph.problem.aid_errors import aid_extras, is_of_aid
 from ssm_graph.problem.extras import Extra, Extras
 
 DVL_MOUNTING: Final = "dvl_mounting"
@@ -30,7 +31,7 @@ CALIBRATIONS: Final = frozenset(
         GNSS_TIME_OFFSET,
     }
 )
-"""Those of the extra variables that tell of instruments."""
+"""Those of the extra variables that tell of the instruments of every estimator."""
 
 
 def calibration_extras(
@@ -70,20 +71,24 @@ def calibration_extras(
 
 
 def extras_of(mission: Mission) -> Extras:
-    """Return what a mission asks to calibrate."""
+    """Return what a mission asks to calibrate, that of its further aids as well."""
     depth, gnss = mission.depth, mission.gnss
-    return Extras(
-        calibration_extras(
-            mission.dvl.mount,
-            None if depth is None else depth.calibration,
-            None if gnss is None else gnss.calibration,
-        )
+    of_instruments = calibration_extras(
+        mission.dvl.mount,
+        None if depth is None else depth.calibration,
+        None if gnss is None else gnss.calibration,
     )
+    return Extras((*of_instruments, *aid_extras(mission.aids)))
 
 
 def needs_motion(extras: Extras) -> bool:
     """Return whether something is to be estimated that only motion shows, as the IMU reads it."""
     return DVL_TIME_OFFSET in extras or DVL_LEVER_ARM in extras
+
+
+def is_calibration(name: str) -> bool:
+    """Return whether an extra variable tells of an instrument or a beacon."""
+    return name in CALIBRATIONS or is_of_aid(name)
 
 
 def taken_as_exact(extras: Extras) -> tuple[str, ...]:

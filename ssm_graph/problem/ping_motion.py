@@ -19,10 +19,7 @@ def mean_gyro(imu: ImuLog, time_s: Array) -> Array:
 
     Near the ends of the data the window shrinks, to no less than one sample.
     """
-    edges = np.concatenate([[imu.start_s], imu.time_s])
-    angle = np.concatenate(
-        [np.zeros((1, 3)), np.cumsum(imu.gyro_b * np.diff(edges)[:, None], axis=0)]
-    )
+    edges, angle = _angles(imu)
     sample = float(np.median(np.diff(edges)))
     room = np.minimum(time_s - edges[0], edges[-1] - time_s)
     half = np.clip(room, 0.5 * sample, 0.5 * max(PING_WINDOW_S, sample))
@@ -32,6 +29,23 @@ def mean_gyro(imu: ImuLog, time_s: Array) -> Array:
         for axis in angle.T
     ]
     return np.asarray(np.stack(turned, axis=-1) / (2.0 * half[:, None]))
+
+
+def turn_between(imu: ImuLog, begin_s: Array, end_s: Array) -> Array:
+    """Return how far the gyros say the body turned from one time to another (M, 3), rad.
+
+    Rates are summed as they are, along the body's own axes: for a second or less.
+    """
+    edges, angle = _angles(imu)
+    turned = [np.interp(end_s, edges, axis) - np.interp(begin_s, edges, axis) for axis in angle.T]
+    return np.asarray(np.stack(turned, axis=-1))
+
+
+def _angles(imu: ImuLog) -> tuple[Array, Array]:
+    """Return the ends (N + 1,) of the inertial samples, and the gyros summed up to each."""
+    edges = np.concatenate([[imu.start_s], imu.time_s])
+    steps = imu.gyro_b * np.diff(edges)[:, None]
+    return edges, np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
 
 
 class MotionBefore:

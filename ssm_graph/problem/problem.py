@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from ssm_graph.data import (
     N_BEAMS,
     Array,
-    GnssLog,
     ImuLog,
     InitialState,
     Mission,
@@ -19,14 +18,15 @@ from ssm_graph.data import (
 from ssm_graph.earth import LocalFrame
 from ssm_graph.errors import ConfigError, DataError
 from ssm_graph.imu.preintegration import InertialChain, imu_gaps, preintegrate
+from ssm_graph.problem.aids import Depths, Fixes, depths_of, fixes_of
 from ssm_graph.problem.calibration import extras_of, needs_motion
 from ssm_graph.problem.error_state import InitialMoments, initial_moments
 from ssm_graph.problem.extras import Extras
+from ssm_graph.problem.further_aids import NO_FURTHER, FurtherAids, further_aids
 from ssm_graph.problem.ping_motion import MotionBefore, mean_gyro
 from ssm_graph.problem.timeline import (
     MIN_SPACING_S,
     Indices,
-    Timeline,
     build_timeline,
     is_inside,
     nearest,
@@ -80,40 +80,6 @@ class Beams(ReadOnlyArrays):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Depths(ReadOnlyArrays):
-    """Depth readings, each assigned to the first keyframe at or after it, as on the vehicle."""
-
-    keyframe: NDArray[np.intp]
-    """(M,)"""
-    time_s: Array
-    """(M,) s"""
-    depth: Array
-    """(M,) m, positive down"""
-    gyro_b: Array
-    """(K, 3) rad/s, at the keyframes: it moves the lever arm"""
-    sigma: float
-    """m"""
-    lever_arm_b: Array
-    """(3,) m"""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Fixes(ReadOnlyArrays):
-    """GNSS fixes at their keyframes, in the navigation frame."""
-
-    keyframe: NDArray[np.intp]
-    """(M,)"""
-    position_n: Array
-    """(M, 3) m"""
-    covariance_n: Array
-    """(M, 3, 3) m^2"""
-    gyro_b: Array
-    """(M, 3) rad/s, at the fixes: with a clock in doubt it moves the antenna"""
-    lever_arm_b: Array
-    """(3,) m"""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Problem(ReadOnlyArrays):
     """Everything an estimator needs of one mission."""
 
@@ -128,6 +94,8 @@ class Problem(ReadOnlyArrays):
     """(6,) turn-on bias sigmas, accelerometer (m/s^2) then gyro (rad/s)."""
     extras: Extras = NO_EXTRAS
     """What else is to be estimated; an estimator that takes it as exact says so."""
+    further: FurtherAids = NO_FURTHER
+    """What only the batch smoother is aided by; another estimator says so."""
     notes: tuple[str, ...] = ()
 
     @property
@@ -163,17 +131,19 @@ def build_problem(
     )
     noise = mission.imu.noise
     extras = extras_of(mission)
+    further, left_out = further_aids(mission, timeline.keyframe_s)
     return Problem(
         frame=mission.frame,
         start=start,
         keyframe_s=timeline.keyframe_s,
         chain=chain,
         beams=_beams(mission, timeline.ping, timeline.ping_keyframe, extras),
-        depths=_depths(mission, timeline),
-        fixes=None if mission.gnss is None else _fixes(mission, mission.gnss, timeline),
+        depths=depths_of(mission, timeline),
+        fixes=None if mission.gnss is None else fixes_of(mission, mission.gnss, timeline),
         imu_noise_bias_sigma=np.repeat([noise.accel_bias_sigma, noise.gyro_bias_sigma], 3),
         extras=extras,
-        notes=(*timeline.notes, *_gap_note(mission.imu), *stuck_note),
+        further=further,
+        notes=(*timeline.notes, *left_out, *_gap_note(mission.imu), *stuck_note),
     )
 
 
@@ -247,39 +217,4 @@ def _beams(mission: Mission, ping: Indices, ping_keyframe: Indices, extras: Extr
         R_bd=dvl.mount.R_bd,
         ping=row,
         motion=MotionBefore(mission.imu, dvl.ping_s[ping]) if needs_motion(extras) else None,
-    )
-
-
-def _depths(mission: Mission, timeline: Timeline) -> Depths | None:
-    log = mission.depth
-    if log is None:
-        return None
-    keyframe_s = timeline.keyframe_s
-    used = (log.time_s >= keyframe_s[0]) & (log.time_s <= keyframe_s[-1])
-    return Depths(
-        keyframe=np.searchsorted(keyframe_s, log.time_s[used]),
-        time_s=log.time_s[used],
-        depth=log.depth[used],
-        gyro_b=mean_gyro(mission.imu, keyframe_s),
-        sigma=log.sigma,
-        lever_arm_b=log.lever_arm_b,
-    )
-
-
-def fix_covariance_n(frame: LocalFrame, position_n: Array, sigma_enu: Array) -> Array:
-    """Return the covariances (F, 3, 3) of fixes in ``n`` from their sigmas (F, 3), m^2."""
-    R_nl = frame.R_nl_at(position_n)
-    covariance_l = sigma_enu[:, :, None] ** 2 * np.eye(3)
-    return np.asarray(R_nl @ covariance_l @ np.swapaxes(R_nl, 1, 2))
-
-
-def _fixes(mission: Mission, log: GnssLog, timeline: Timeline) -> Fixes:
-    fix, frame = timeline.fix, mission.frame
-    place_n = frame.p_n_from_geodetic(log.lat[fix], log.lon[fix], log.height[fix])
-    return Fixes(
-        keyframe=timeline.fix_keyframe,
-        position_n=place_n,
-        covariance_n=fix_covariance_n(frame, place_n, log.sigma_enu[fix]),
-        gyro_b=mean_gyro(mission.imu, log.time_s[fix]),
-        lever_arm_b=log.lever_arm_b,
     )

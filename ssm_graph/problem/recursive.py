@@ -12,6 +12,7 @@ from ssm_graph.data import Array
 from ssm_graph.estimate import BeamTable, Estimate, Status
 from ssm_graph.problem.calibration import taken_as_exact
 from ssm_graph.problem.doubts import doubts_of_beams
+from ssm_graph.problem.further_aids import not_used
 from ssm_graph.problem.problem import Problem
 from ssm_graph.problem.trajectory import KeyframeStates, trajectory_from_states
 
@@ -81,7 +82,7 @@ def recursive_estimate(
         wall_s=wall_s,
         cost=np.nan,
         start=problem.start,
-        notes=problem.notes + taken_as_exact(problem.extras),
+        notes=problem.notes + taken_as_exact(problem.extras) + not_used(problem.further),
         keyframe_iterations=float(np.mean(n_iterations)),
     )
 

@@ -1,4 +1,4 @@
-"""Keyframe times of a mission: one for each ping and each fix, and a few where both are silent."""
+"""Keyframe times of a mission: one for each ping, fix and range, a few where all are silent."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ssm_graph.aid_logs import AidLogs
 from ssm_graph.data import Array, Mission, ReadOnlyArrays
 from ssm_graph.errors import DataError
 
@@ -58,10 +59,11 @@ def build_timeline(mission: Mission, *, start_s: float, interval_s: float) -> Ti
     fix_s = mission.gnss.time_s if mission.gnss is not None else np.zeros(0)
     ping = np.flatnonzero(has_beam & is_inside(ping_s, start_s, end_s))
     fix = np.flatnonzero(is_inside(fix_s, start_s, end_s))
-    notes = _left_out("ping", int(has_beam.sum()) - len(ping), start_s, end_s)
-    notes += _left_out("GNSS fix", len(fix_s) - len(fix), start_s, end_s)
+    notes = left_out("ping", int(has_beam.sum()) - len(ping), start_s, end_s)
+    notes += left_out("GNSS fix", len(fix_s) - len(fix), start_s, end_s)
 
-    measured = np.clip(np.concatenate([ping_s[ping], fix_s[fix]]), start_s, end_s)
+    acoustic_s = _acoustic_s(mission.aids, start_s, end_s)
+    measured = np.clip(np.concatenate([ping_s[ping], fix_s[fix], *acoustic_s]), start_s, end_s)
     keyframe_s = _fill(_thin(np.concatenate([[start_s], measured, [end_s]])), interval_s)
     return Timeline(
         keyframe_s=keyframe_s,
@@ -71,6 +73,13 @@ def build_timeline(mission: Mission, *, start_s: float, interval_s: float) -> Ti
         fix_keyframe=nearest(keyframe_s, fix_s[fix]),
         notes=notes,
     )
+
+
+def _acoustic_s(aids: AidLogs, start_s: float, end_s: float) -> list[Array]:
+    """Return the times of acoustic fixes and ranges within the span."""
+    times = [aids.usbl.valid_s] if aids.usbl else []
+    times += [aids.ranges.time_s] if aids.ranges else []
+    return [time_s[is_inside(time_s, start_s, end_s)] for time_s in times]
 
 
 def is_inside(time_s: Array, start_s: float, end_s: float) -> NDArray[np.bool_]:
@@ -84,10 +93,11 @@ def nearest(keyframe_s: Array, time_s: Array) -> Indices:
     return np.searchsorted(middle, time_s)
 
 
-def _left_out(what: str, count: int, start_s: float, end_s: float) -> tuple[str, ...]:
+def left_out(what: str, count: int, start_s: float, end_s: float) -> tuple[str, ...]:
+    """Return the note on measurements outside the keyframes, if there are any."""
     if count == 0:
         return ()
-    plural = "s" if count > 1 and what == "ping" else "es" if count > 1 else ""
+    plural = "" if count == 1 else "es" if what.endswith("fix") else "s"
     return (
         f"{count} {what}{plural} outside the smoothed span {start_s:.3f}..{end_s:.3f} s left out",
     )

@@ -30,7 +30,7 @@ class DepthSettings:
     def __post_init__(self) -> None:
         require_positive("DepthSettings.rate_hz", self.rate_hz, hint="try 2 Hz")
         require_positive("DepthSettings.sigma", self.sigma, hint="try 0.05 m")
-        _require_point("DepthSettings.lever_arm_b", self.lever_arm_b)
+        require_point("DepthSettings.lever_arm_b", self.lever_arm_b)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,13 +57,14 @@ class GnssSettings:
         require_positive("GnssSettings.rate_hz", self.rate_hz, hint="try 1 Hz")
         require_positive("GnssSettings.sigma_horizontal", self.sigma_horizontal, hint="try 0.5 m")
         require_positive("GnssSettings.sigma_vertical", self.sigma_vertical, hint="try 1 m")
-        _require_point("GnssSettings.lever_arm_b", self.lever_arm_b)
-        _require_point("GnssSettings.lever_arm_error_b", self.lever_arm_error_b)
+        require_point("GnssSettings.lever_arm_b", self.lever_arm_b)
+        require_point("GnssSettings.lever_arm_error_b", self.lever_arm_error_b)
         for window in self.windows or ():
             require_window("GnssSettings.windows", *window)
 
 
-def _require_point(where: str, point: Point) -> None:
+def require_point(where: str, point: Point) -> None:
+    """Raise :class:`ConfigError` for a point that is not three finite numbers."""
     require(
         len(point) == 3 and all(math.isfinite(c) for c in point),
         where,
@@ -81,7 +82,7 @@ def depth_log(
     rng: np.random.Generator | None,
 ) -> DepthLog:
     """Return the depth of the sensor over ``(0, end_s]``; None draws no noise."""
-    time_s = _regular_times(settings.rate_hz, end_s)
+    time_s = regular_times(settings.rate_hz, end_s)
     point_e = trajectory.at(time_s).point_e(np.array(settings.lever_arm_b))
     depth = settings.offset - geodetic_from_ecef(stacked(point_e))[2]
     if rng is not None:
@@ -102,7 +103,7 @@ def gnss_log(
     rng: np.random.Generator | None,
 ) -> GnssLog | None:
     """Return the fixes over ``(0, end_s]``; None if there is not one. No ``rng``, no noise."""
-    time_s = _regular_times(settings.rate_hz, end_s)
+    time_s = regular_times(settings.rate_hz, end_s)
     sigma_enu = np.array(
         [settings.sigma_horizontal, settings.sigma_horizontal, settings.sigma_vertical]
     )
@@ -137,5 +138,6 @@ def _has_fix(trajectory: Trajectory, settings: GnssSettings, time_s: Array) -> n
     return inside
 
 
-def _regular_times(rate_hz: float, end_s: float) -> Array:
+def regular_times(rate_hz: float, end_s: float) -> Array:
+    """Return the times in ``(0, end_s]`` of what happens at a rate."""
     return np.arange(1, math.floor(end_s * rate_hz + 1e-9) + 1) / rate_hz

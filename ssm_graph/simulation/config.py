@@ -12,6 +12,7 @@ from ssm_graph.simulation._checks import require, require_fraction, require_posi
 from ssm_graph.simulation.aids import DepthSettings, GnssSettings
 from ssm_graph.simulation.dvl_model import DvlSettings
 from ssm_graph.simulation.faults import Loss, Outliers
+from ssm_graph.simulation.further_aids import AidSettings
 from ssm_graph.simulation.grades import IMU_NOISE, START_SIGMAS, Grade, StartSigmas
 from ssm_graph.simulation.programmed import Fault
 from ssm_graph.simulation.routes import Route, SurveyRoute
@@ -53,6 +54,8 @@ class SimulationConfig:
     """None for no depth sensor."""
     gnss: GnssSettings | None = None
     """None for no GNSS receiver."""
+    aids: AidSettings = AidSettings()
+    """Acoustics, compass, times at rest: none of them by default."""
 
     perfect_sensors: bool = False
     """Draw no sensor error at all; noise stays as stated, outliers and losses as asked for."""

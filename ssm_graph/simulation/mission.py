@@ -16,6 +16,7 @@ from ssm_graph.simulation.aids import depth_log, gnss_log
 from ssm_graph.simulation.config import SimulationConfig
 from ssm_graph.simulation.dvl_model import beam_ranges, ping_times, true_beam_speeds
 from ssm_graph.simulation.faults import Loss, Outliers, draw_missing, draw_outliers
+from ssm_graph.simulation.further_aids import SimulatedAids, aid_logs
 from ssm_graph.simulation.grades import initial_state
 from ssm_graph.simulation.imu_model import averaged_imu, imu_errors
 from ssm_graph.simulation.programmed import Fault, add_faults
@@ -40,6 +41,8 @@ class SimulatedMission:
     """(N,) when the pings really happened, s."""
     gyro_bias: Array
     """(M, 3) true gyro bias of each IMU sample, rad/s."""
+    aids: SimulatedAids
+    """The further aids, with what is wrong with them"""
     accel_bias: Array
     """(M, 3) true accelerometer bias of each IMU sample, m/s^2."""
 
@@ -68,6 +71,8 @@ def simulate(config: SimulationConfig) -> SimulatedMission:
     ping_s = ping_times(config.dvl, end_s=end_s, rng=streams.ping_time)
     dvl = _dvl(config, streams, ping_s, true_beam_speeds(config.trajectory, config.dvl, ping_s))
     depth, gnss = _aids(config, streams, end_s)
+    noisy = not config.perfect_sensors
+    aids = aid_logs(config.trajectory, config.aids, end_s=end_s, streams=streams, noisy=noisy)
     truth = config.trajectory.truth(_reference_times(config, end_s))
     initial_rng = streams.initial if config.draw_initial_errors else None
     mission = Mission(
@@ -77,6 +82,7 @@ def simulate(config: SimulationConfig) -> SimulatedMission:
         dvl=dvl.log,
         depth=depth,
         gnss=gnss,
+        aids=aids.logs,
         initial=initial_state(truth, config.initial_sigmas, rng=initial_rng),
         reference=truth,
     )
@@ -88,6 +94,7 @@ def simulate(config: SimulationConfig) -> SimulatedMission:
         true_speed=dvl.true_speed,
         ping_time_s=dvl.time_s,
         gyro_bias=gyro_bias,
+        aids=aids,
         accel_bias=accel_bias,
     )
 

@@ -28,6 +28,9 @@ class Streams:
     dropouts: np.random.Generator
     depth: np.random.Generator
     gnss: np.random.Generator
+    usbl: np.random.Generator
+    ranges: np.random.Generator
+    heading: np.random.Generator
 
 
 def spawn_streams(seed: int) -> Streams:

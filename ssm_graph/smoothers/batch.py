@@ -19,6 +19,7 @@ from ssm_graph.graph.linearize import GraphLinearizer, Step
 from ssm_graph.graph.states import States
 from ssm_graph.problem.problem import Problem
 from ssm_graph.problem.trajectory import trajectory_from_states
+from ssm_graph.smoothers.aid_weights import AidKernel, AidWeighing
 from ssm_graph.smoothers.beam_faults import FaultSearch, FaultWatch
 from ssm_graph.smoothers.calibrated import calibration_of, undetermined
 from ssm_graph.smoothers.gnc import GncSchedule, Graduation, Schedule, WarmSchedule
@@ -85,8 +86,9 @@ class SmootherConfig:
 
 def _notes_of(first: FirstValues) -> tuple[str, ...]:
     if first.n_doubts == 0:
-        return ()
+        return first.notes
     return (
+        *first.notes,
         f"the first pass doubted its prediction {first.n_doubts} times: the beams contradicted it "
         "together",
     )
@@ -151,11 +153,14 @@ class SsmSmoother:
         schedule = self.config.schedule()
         weights = schedule.first_weights(first.weights)
         faults = FaultWatch(problem, self.config.fault_search)
+        aids = self._aids(linearizer, first)
         iterations: list[Iteration] = []
         status = Status.MAX_ITERATIONS
         for number in range(self.config.max_iterations):
             try:
-                this = self._iterate(linearizer, states, rows, weights, schedule.kernel, faults)
+                this = self._iterate(
+                    linearizer, states, rows, weights, schedule.kernel, faults, aids
+                )
             except KeyboardInterrupt:
                 if not iterations:
                     raise
@@ -168,20 +173,21 @@ class SsmSmoother:
             if on_iteration is not None:
                 on_iteration(number + 1, self.config.max_iterations, iterations[-1])
             is_settled = max(this.update_sigmas, this.weight_change) < self.config.tolerance
-            is_settled = is_settled and schedule.may_end(this.weights)
+            is_settled = is_settled and schedule.may_end(this.weights) and aids.may_end
             has_news = faults.look(
                 states, rows, update_sigmas=this.update_sigmas, is_settled=is_settled
             )
             if is_settled and not has_news:
                 status = Status.CONVERGED
                 break
+            aids.go_on(this.update_sigmas)
             weights = faults.leave_out(
                 schedule.next_weights(
                     weights, this.weights, t=this.mahalanobis_sq, update_sigmas=this.update_sigmas
                 )
             )
         notes = problem.notes + faults.notes(rows.error) + _notes_of(first)
-        return Solved(linearizer, this, tuple(iterations), status, notes, first.n_doubts)
+        return Solved(linearizer, this, tuple(iterations), status, notes, first, aids)
 
     def _iterate(
         self,
@@ -191,13 +197,16 @@ class SsmSmoother:
         weights: Array,
         kernel: Kernel,
         faults: FaultWatch,
+        aids: AidWeighing,
     ) -> Pass:
         problem = linearizer.problem
         if linearizer.follow(states):
             rows = linearizer.beam_rows(states)
-        step = linearizer.solve(states, rows, weights)
-        cost = linearizer.cost(states, rows, weights)
-        states, rows, update = descend(linearizer, states, step.delta, weights, cost)
+        step = linearizer.solve(states, rows, weights, aids.used)
+        cost = linearizer.cost(states, rows, weights, aids.used)
+        states, rows, update = descend(
+            linearizer, states, step.delta, weights, cost, aid_weights=aids.used
+        )
         sigma = step.sigma
         speed = float(np.max(np.abs(states.v_n)))
         if not (np.all(np.isfinite(sigma)) and speed < RUNAWAY_SPEED):
@@ -208,7 +217,12 @@ class SsmSmoother:
         t = self._mahalanobis_sq(problem, rows, step)
         settled = faults.leave_out(kernel.weight(t))
         change = float(np.max(np.abs(settled - weights), initial=0.0))
+        change = max(change, aids.judge(states, step))
         return Pass(states, step, rows, t, settled, float(np.max(np.abs(update) / sigma)), change)
+
+    def _aids(self, linearizer: GraphLinearizer, first: FirstValues) -> AidWeighing:
+        kernel = AidKernel(self.config.kernel, WARM_KERNEL, self.config.judged_by)
+        return AidWeighing(linearizer.weighted, kernel, first.aid_weights)
 
     def _mahalanobis_sq(self, problem: Problem, rows: BeamRows, step: Step) -> Array:
         H, beams = rows.jacobian, problem.beams
@@ -218,13 +232,14 @@ class SsmSmoother:
             spread = step.variance(beams.keyframe, H)
         return expected_mahalanobis_sq(rows.error, spread, sigma=beams.sigma)
 
-    def _cost(self, linearizer: GraphLinearizer, last: Pass) -> float:
+    def _cost(self, linearizer: GraphLinearizer, last: Pass, aids: AidWeighing) -> float:
         """Return the cost with each beam's robust loss in place of its weighted square."""
         kernel, rows = self.config.kernel, last.beam_rows
         t = (rows.error / linearizer.problem.beams.sigma) ** 2
         loss = kernel.similarity(np.zeros_like(t)) - kernel.similarity(t)
-        others = linearizer.cost(last.states, rows, np.zeros_like(t))
-        return others + float(np.sum(loss))
+        no_aids = np.zeros(len(linearizer.weighted))
+        others = linearizer.cost(last.states, rows, np.zeros_like(t), no_aids)
+        return others + float(np.sum(loss)) + aids.cost(last.states)
 
     def _estimate(self, solved: Solved, noise: NoiseFound, *, wall_s: float) -> Estimate:
         linearizer, last, status = solved.linearizer, solved.last, solved.status
@@ -233,6 +248,7 @@ class SsmSmoother:
             f"{last.weight_change:.1e}"
         )
         doubts = contradictions(linearizer, last.states, last.beam_rows, last.weights)
+        doubts += solved.aids.doubts(last.states)
         if doubts:
             unsettled = [] if status is Status.CONVERGED else [reason]
             status, reason = Status.SUSPECT, "; ".join(doubts + unsettled)
@@ -253,9 +269,10 @@ class SsmSmoother:
             ),
             iterations=solved.iterations,
             wall_s=wall_s,
-            cost=self._cost(linearizer, last),
+            cost=self._cost(linearizer, last, solved.aids),
             start=problem.start,
             notes=solved.notes + noise_notes(noise) + undetermined(calibration),
             calibration=calibration,
+            aids=solved.aids.table(last.states, problem.keyframe_s),
             noise=noise,
         )

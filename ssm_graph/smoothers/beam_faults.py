@@ -26,6 +26,7 @@ from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.states import States
 from ssm_graph.problem.error_state import STATE_DIM
+from ssm_graph.problem.further_aids import NO_FURTHER
 from ssm_graph.problem.problem import NO_EXTRAS, Problem
 from ssm_graph.smoothers.gnc import NEAR_SIGMAS
 
@@ -252,7 +253,9 @@ class FaultWatch:
         self._search = search
         self._linearizer = None
         if search is not None:
-            self._linearizer = GraphLinearizer(replace(problem, extras=NO_EXTRAS))
+            self._linearizer = GraphLinearizer(
+                replace(problem, extras=NO_EXTRAS, further=NO_FURTHER)
+            )
         self._beams, self._time_s = problem.beams, problem.keyframe_s[problem.beams.keyframe]
         self._found = Found(np.zeros(len(self._time_s), dtype=bool), ())
         self._n_looks = 0

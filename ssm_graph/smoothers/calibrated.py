@@ -7,7 +7,7 @@ import numpy as np
 from ssm_graph.data import Array
 from ssm_graph.estimate import CalibratedValue, Calibration, Determined
 from ssm_graph.graph.states import States
-from ssm_graph.problem.calibration import CALIBRATIONS
+from ssm_graph.problem.calibration import is_calibration
 from ssm_graph.problem.error_state import STATE_DIM
 from ssm_graph.problem.problem import Problem
 
@@ -22,7 +22,7 @@ def calibration_of(problem: Problem, states: States, covariance: Array) -> Calib
     prior = _prior_sigma_at_end(problem)
     values, kept = [], []
     for block in extras.blocks:
-        if block.name not in CALIBRATIONS:
+        if not is_calibration(block.name):
             continue
         columns = extras.columns(block.name)
         for label, i in zip(block.labels, range(columns.start, columns.stop), strict=True):

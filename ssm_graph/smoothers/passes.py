@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 from ssm_graph.data import Array
@@ -11,6 +12,7 @@ from ssm_graph.graph.first_values import FirstValues
 from ssm_graph.graph.inertial_fit import inertial_fit
 from ssm_graph.graph.linearize import GraphLinearizer, Step
 from ssm_graph.graph.states import States
+from ssm_graph.smoothers.aid_weights import AidWeighing
 from ssm_graph.smoothers.noise import noise_found
 
 MAX_HALVINGS = 10
@@ -38,11 +40,17 @@ class Solved(NamedTuple):
     iterations: tuple[Iteration, ...]
     status: Status
     notes: tuple[str, ...]
-    n_doubts: int
+    first: FirstValues
+    aids: AidWeighing
 
     def again(self) -> FirstValues:
         """Return where another solution may start."""
-        return FirstValues(self.last.states, self.last.weights, self.n_doubts)
+        return replace(
+            self.first,
+            states=self.last.states,
+            weights=self.last.weights,
+            aid_weights=self.aids.settled,
+        )
 
 
 def noise_of(solved: Solved, used: Array) -> NoiseFound:
@@ -64,6 +72,8 @@ def descend(
     delta: tuple[Array, Array],
     weights: Array,
     cost: float,
+    *,
+    aid_weights: Array | None = None,
 ) -> tuple[States, BeamRows, Array]:
     """Take the Gauss-Newton step, halved while it raises the cost at these weights.
 
@@ -75,6 +85,6 @@ def descend(
         scale = 0.5**halvings
         moved, update = linearizer.retract(states, delta, scale=scale)
         rows = linearizer.beam_rows(moved)
-        if linearizer.cost(moved, rows, weights) <= cost + COST_SLACK:
+        if linearizer.cost(moved, rows, weights, aid_weights) <= cost + COST_SLACK:
             return moved, rows, update / scale
     return states, linearizer.beam_rows(states), update / scale

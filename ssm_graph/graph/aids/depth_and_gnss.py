@@ -1,47 +1,19 @@
-"""Rows of depth and GNSS beside the beams, whichever variables they depend on."""
+"""Rows of depth and GNSS, which count in full."""
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
-
 import numpy as np
-from numpy.typing import NDArray
 
 from factors.depth_height import height_residual
-from factors.gnss_position import fix_residual
-from ssm_graph.data import Array
+from ssm_graph.graph.aids.positions import fix_rows
+from ssm_graph.graph.aids.rows import AidRows
 from ssm_graph.graph.depth import DepthTargets, depth_targets
-from ssm_graph.graph.extended_rows import Rows, RowStates, states_of
+from ssm_graph.graph.extended_rows import states_of
 from ssm_graph.graph.states import States
-from ssm_graph.problem.calibration import DEPTH_OFFSET, GNSS_LEVER_ARM, GNSS_TIME_OFFSET
-from ssm_graph.problem.error_state import POSITION, ROTATION, VELOCITY
-from ssm_graph.problem.extras import Extras
-from ssm_graph.problem.problem import Depths, Fixes, Problem
-
-
-class AidRows(NamedTuple):
-    """Whitened rows of an aid, ``A d = b`` with ``b`` minus the error."""
-
-    keyframe: NDArray[np.intp]
-    """(M,)"""
-    error: Array
-    """(M,)"""
-    jacobian: Array
-    """(M, width)"""
-
-
-class Aid(Protocol):
-    """A kind of measurement beside the beams: it counts in full, without a weight."""
-
-    name: str
-    dim: int
-    """Rows of one measurement"""
-
-    def follow(self, states: States) -> None:
-        """Let what is only slowly a function of the states follow them."""
-
-    def rows(self, states: States) -> AidRows:
-        """Linearise at ``states``."""
+from ssm_graph.problem.aids import Depths, Fixes
+from ssm_graph.problem.calibration import DEPTH_OFFSET
+from ssm_graph.problem.error_state import POSITION, ROTATION
+from ssm_graph.problem.problem import Problem
 
 
 class DepthAid:
@@ -105,28 +77,3 @@ class GnssAid:
             (self._whiten @ error[..., None])[..., 0].ravel(),
             (self._whiten @ jacobian).reshape(-1, self._extras.width),
         )
-
-
-def fix_rows(fixes: Fixes, extras: Extras, at: RowStates, rows: Rows | int) -> tuple[Array, Array]:
-    """Return errors (F, 3), m, and Jacobians (F, 3, width) of fixes, not whitened."""
-    nothing = np.zeros(3)
-    late_s = extras.value(GNSS_TIME_OFFSET, at.walks, at.constants, default=nothing)[..., 0]
-    lever = extras.value(GNSS_LEVER_ARM, at.walks, at.constants, default=nothing)
-    residual = fix_residual(
-        at.R_nb,
-        at.p_n,
-        at.v_n,
-        lever_arm_b=fixes.lever_arm_b + lever,
-        time_offset=late_s,
-        omega_b=fixes.gyro_b[rows] - at.bias[..., 3:],
-        position_n=fixes.position_n[rows],
-    )
-    jacobian = np.zeros((*residual.error.shape, extras.width))
-    jacobian[..., ROTATION] = residual.error_D_rotation
-    jacobian[..., POSITION] = residual.error_D_position
-    jacobian[..., VELOCITY] = residual.error_D_velocity_n
-    if GNSS_LEVER_ARM in extras:
-        jacobian[..., extras.columns(GNSS_LEVER_ARM)] = residual.error_D_lever_arm_b
-    if GNSS_TIME_OFFSET in extras:
-        jacobian[..., extras.columns(GNSS_TIME_OFFSET)] = residual.error_D_time_offset[..., None]
-    return residual.error, jacobian

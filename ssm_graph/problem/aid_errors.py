@@ -1,0 +1,73 @@
+"""What is unknown of the further aids: places of beacons and errors of a compass, as extras."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from ssm_graph.aid_logs import AidLogs, HeadingErrors
+from ssm_graph.problem.extras import Extra
+
+BEACON: Final = "beacon_"
+"""Followed by the beacon's number."""
+HEADING_OFFSET: Final = "heading_offset"
+HEADING_WALK: Final = "heading_walk"
+HEADING_ONE_CYCLE: Final = "heading_one_cycle"
+HEADING_TWO_CYCLE: Final = "heading_two_cycle"
+_OF_HEADING: Final = (HEADING_OFFSET, HEADING_WALK, HEADING_ONE_CYCLE, HEADING_TWO_CYCLE)
+
+
+def is_of_aid(name: str) -> bool:
+    """Return whether an extra variable belongs to one of the further aids."""
+    return name.startswith(BEACON) or name in _OF_HEADING
+
+
+def beacon_name(number: int) -> str:
+    """Return what the place of a beacon is called, as an extra variable."""
+    return f"{BEACON}{number}"
+
+
+def aid_extras(aids: AidLogs) -> tuple[Extra, ...]:
+    """Return what the further aids ask to estimate."""
+    extras: list[Extra] = []
+    if aids.ranges is not None:
+        heard = np.unique(aids.ranges.beacon)
+        extras += [
+            Extra(
+                beacon_name(beacon.number),
+                tuple(f"{beacon_name(beacon.number)}_{axis}_m" for axis in ("east", "north", "up")),
+                beacon.position_sigma_enu,
+            )
+            for beacon in aids.ranges.beacons
+            if not beacon.is_known and beacon.number in heard
+        ]
+    if aids.heading is not None:
+        extras += _of_heading(aids.heading.errors)
+    return tuple(extras)
+
+
+def _of_heading(errors: HeadingErrors) -> list[Extra]:
+    degree = math.radians(1.0)
+    found = []
+    for name, sigma, waves in (
+        (HEADING_OFFSET, errors.offset_sigma, ("",)),
+        (HEADING_ONE_CYCLE, errors.one_cycle_sigma, ("_sine", "_cosine")),
+        (HEADING_TWO_CYCLE, errors.two_cycle_sigma, ("_sine", "_cosine")),
+    ):
+        if sigma > 0.0:
+            labels = tuple(f"{name}{wave}_deg" for wave in waves)
+            found.append(Extra(name, labels, np.full(len(waves), sigma), unit=degree))
+    if errors.walk_sigma > 0.0:
+        found.append(
+            Extra(
+                HEADING_WALK,
+                (f"{HEADING_WALK}_deg",),
+                np.array([errors.walk_sigma]),
+                unit=degree,
+                walk_density=errors.walk_sigma * math.sqrt(2.0 / errors.correlation_s),
+                correlation_s=errors.correlation_s,
+            )
+        )
+    return found
