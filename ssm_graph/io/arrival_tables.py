@@ -33,6 +33,7 @@ from ssm_graph.io.tables import (
     TableSpec,
     check_finite,
     check_names,
+    is_repeated,
     read_parquet,
     table_format,
 )
@@ -141,7 +142,7 @@ def read_arrival_table(path: Path, label: str, spec: TableSpec) -> Table:
     except OSError as error:
         raise DataError(f"{label}: cannot be read: {error.strerror or error}") from error
     table = _without_impossible(table, spec, counts)
-    table = _in_order_of_time(table, counts)
+    table = _in_order_of_time(table, spec, counts)
     note = counts.note(label)
     return replace(table, notes=(note,) if note else ())
 
@@ -221,13 +222,14 @@ def _without_impossible(table: Table, spec: TableSpec, counts: Counts) -> Table:
     return _picked(table, np.flatnonzero(~bad)) if n_bad else table
 
 
-def _in_order_of_time(table: Table, counts: Counts) -> Table:
+def _in_order_of_time(table: Table, spec: TableSpec, counts: Counts) -> Table:
     time_s = table.time_s
     if len(time_s) == 0 or np.all(np.diff(time_s) > 0.0):
         return table
     counts.late = int(np.sum(time_s < np.maximum.accumulate(time_s)))
-    table = _picked(table, np.argsort(time_s, kind="stable"))
-    is_first = np.diff(table.time_s, prepend=-np.inf) > 0.0
+    keys = [table[name] for name in reversed(spec.key)]
+    table = _picked(table, np.lexsort((*keys, time_s)))
+    is_first = ~is_repeated(table, spec)
     first_of = np.flatnonzero(is_first)[np.cumsum(is_first) - 1]
     is_same = np.ones(len(table), dtype=bool)
     for values in table.columns.values():

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from ssm_graph.data import Array, Mission
 from ssm_graph.estimate import CalibratedValue, Calibration, Determined
+from ssm_graph.io.beacon_toml import beacon_lines
 from ssm_graph.io.mission_keys import BodyAxes
 from ssm_graph.io.mission_units import R_FRD, rpy_from_R_bd
 
@@ -62,6 +63,11 @@ def _gnss_late(mission: Mission) -> float:
     return 0.0 if mission.gnss is None else mission.gnss.calibration.time_offset_s
 
 
+def _declination_deg(mission: Mission, off: Array, axes: BodyAxes) -> Array:  # noqa: ARG001
+    assert mission.aids.heading is not None
+    return np.degrees(mission.aids.heading.declination - off)
+
+
 _KEYS: Final[Mapping[str, _Key]] = {
     "dvl_mounting": _Key("dvl", "mounting_rpy_deg", "misalignment_sigma_deg", _mounting),
     "dvl_scale": _Key(
@@ -79,6 +85,7 @@ _KEYS: Final[Mapping[str, _Key]] = {
     ),
     "depth_offset": _Key("depth", "offset_m", "offset_sigma_m", _added(_depth_offset)),
     "gnss_lever_arm": _Key("gnss", "lever_arm_m", "lever_arm_sigma_m", _gnss_arm),
+    "heading_offset": _Key("heading", "declination_deg", "offset_sigma_deg", _declination_deg),
     "gnss_time_offset": _Key("gnss", "time_offset_s", "time_offset_sigma_s", _added(_gnss_late)),
 }
 
@@ -104,7 +111,7 @@ def calibration_toml(
     found: dict[str, list[CalibratedValue]] = {}
     for value in calibration.values:
         found.setdefault(value.variable, []).append(value)
-    for section in ("dvl", "depth", "gnss"):
+    for section in ("dvl", "depth", "gnss", "heading"):
         keys = {name: key for name, key in _KEYS.items() if key.section == section}
         if not keys.keys() & found.keys():
             continue
@@ -112,6 +119,7 @@ def calibration_toml(
         for name, key in keys.items():
             if name in found:
                 lines += _lines(key, found[name], mission, axes)
+    lines += beacon_lines(mission, calibration)
     return "\n".join(lines) + "\n"
 
 

@@ -16,6 +16,7 @@ from ssm_graph.data import (
     Reference,
 )
 from ssm_graph.earth import LocalFrame
+from ssm_graph.io.aid_reading import read_aids
 from ssm_graph.io.arrival_tables import read_arrival_table
 from ssm_graph.io.mission_checks import check_tables
 from ssm_graph.io.mission_cross_checks import check_mission
@@ -75,6 +76,8 @@ def read_mission(folder: Path | str) -> Mission:
     toml = read_mission_toml(Path(folder))
     tables, notes = _read_tables(toml)
     notes += check_tables(tables, toml)
+    aids, notes_of_aids = read_aids(tables, toml)
+    notes += notes_of_aids
     mission = Mission(
         name=toml.name,
         frame=_frame(toml, tables),
@@ -82,6 +85,7 @@ def read_mission(folder: Path | str) -> Mission:
         dvl=_dvl(tables["dvl"], toml),
         depth=_depth(tables["depth"], toml) if "depth" in tables else None,
         gnss=_gnss(tables["gnss"], toml) if "gnss" in tables else None,
+        aids=aids,
         initial=initial_state(toml["initial"]) if "initial" in toml else None,
         reference=_reference(tables["reference"]) if "reference" in tables else None,
     )

@@ -92,24 +92,24 @@ def check_depth(table: Table) -> list[str]:
             f"{table.label}: column 'depth_m' has a median of {np.median(depth):.6g}; expected "
             "metres below the ellipsoid; is it a pressure, or in millimetres?"
         )
-    _refuse_beyond(table, ["depth_m"], "expected metres, positive down")
+    refuse_beyond(table, ["depth_m"], "expected metres, positive down")
     return []
 
 
 def check_gnss(table: Table) -> list[str]:
     """Check ranges of position and sigma."""
-    notes = _positions(table)
+    notes = check_positions(table)
     expected = "expected a standard deviation above 0, in metres; delete fixes of unknown quality"
-    _refuse_beyond(table, POSITION_SIGMA, expected)
+    refuse_beyond(table, POSITION_SIGMA, expected)
     return notes
 
 
 def check_reference(table: Table) -> list[str]:
     """Check ranges of position, velocity and attitude."""
-    notes = _positions(table)
-    _refuse_beyond(table, VELOCITY, "expected m/s; is it in mm/s?")
+    notes = check_positions(table)
+    refuse_beyond(table, VELOCITY, "expected m/s; is it in mm/s?")
     for name in ATTITUDE:
-        _refuse_beyond(table, [name], f"expected degrees up to {LIMITS[name][1]:g}")
+        refuse_beyond(table, [name], f"expected degrees up to {LIMITS[name][1]:g}")
     return notes
 
 
@@ -165,7 +165,7 @@ def _specific_force(table: Table) -> None:
             f"{table.label}: the accelerometer's readings have a median length of {median:.6g}; "
             f"expected about 9.8 m/s^2; {hint}"
         )
-    _refuse_beyond(table, ACCEL, "expected m/s^2; delete this row")
+    refuse_beyond(table, ACCEL, "expected m/s^2; delete this row")
 
 
 def _turn_rates(table: Table) -> None:
@@ -175,7 +175,7 @@ def _turn_rates(table: Table) -> None:
             f"{table.label}: 1 % of the turn rates exceed {rate:.4g}; expected rad/s, up to "
             f"{FASTEST_TURN:g} for a vehicle; the readings are in deg/s: multiply them by pi/180"
         )
-    _refuse_beyond(table, GYRO, "expected rad/s; delete this row")
+    refuse_beyond(table, GYRO, "expected rad/s; delete this row")
 
 
 def _gravity_direction(table: Table, body: BodyAxes) -> list[str]:
@@ -201,7 +201,8 @@ def _gravity_direction(table: Table, body: BodyAxes) -> list[str]:
     return []
 
 
-def _positions(table: Table) -> list[str]:
+def check_positions(table: Table) -> list[str]:
+    """Check the ranges of positions, and whether they are codes or radians."""
     lat, lon = table["lat_deg"], table["lon_deg"]
     nowhere = (lat == 0.0) & (lon == 0.0)
     if nowhere.any():
@@ -212,9 +213,9 @@ def _positions(table: Table) -> list[str]:
         )
     swapped = np.all(np.abs(lon) <= 90.0) and np.all(np.abs(lat) <= 360.0)
     hint = "latitude and longitude seem swapped" if swapped else "is it an integer coding?"
-    _refuse_beyond(table, ["lat_deg"], f"expected degrees from -90 to 90; {hint}")
-    _refuse_beyond(table, ["lon_deg"], "expected degrees from -180 to 360")
-    _refuse_beyond(table, ["height_m"], "expected metres, up; is it in mm?")
+    refuse_beyond(table, ["lat_deg"], f"expected degrees from -90 to 90; {hint}")
+    refuse_beyond(table, ["lon_deg"], "expected degrees from -180 to 360")
+    refuse_beyond(table, ["height_m"], "expected metres, up; is it in mm?")
     if np.all(np.abs(lat) <= 0.5 * np.pi) and np.all(np.abs(lon) <= np.pi):
         return [
             f"{table.label}: all positions lie within 3.2 degrees of 0 N, 0 E; if they are in "
@@ -223,7 +224,7 @@ def _positions(table: Table) -> list[str]:
     return []
 
 
-def _refuse_beyond(table: Table, names: Sequence[str], expected: str) -> None:
+def refuse_beyond(table: Table, names: Sequence[str], expected: str) -> None:
     """Raise for the first value outside its limits; NaN and missing columns pass."""
     for name in names:
         if name in table:

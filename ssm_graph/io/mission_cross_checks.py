@@ -9,9 +9,9 @@ import numpy as np
 from ssm_graph.data import Array, Mission
 from ssm_graph.earth import normal_gravity
 from ssm_graph.errors import ConfigError, DataError
-from ssm_graph.io.mission_keys import TOML_NAME
 from ssm_graph.io.mission_motion_checks import check_motion
 from ssm_graph.io.mission_toml import MissionToml
+from ssm_graph.io.settings import TOML_NAME
 from ssm_graph.io.tables import Table
 
 FARTHEST_M: Final = 100e3
@@ -27,7 +27,7 @@ def check_mission(mission: Mission, tables: dict[str, Table], toml: MissionToml)
     notes = _times(mission, tables)
     _initial_time(mission, tables["imu"].label)
     _initial_position(mission, toml)
-    for name in ("gnss", "reference"):
+    for name in ("gnss", "usbl", "reference"):
         if name in tables:
             _table_position(mission, tables[name], has_origin="origin" in toml)
     notes += _gravity(mission, tables["imu"].label)

@@ -1,4 +1,4 @@
-"""What a mission folder may contain: sections, keys, limits and columns; how a section is read.
+"""What a mission folder may contain: sections, keys, limits and columns.
 
 The limits do not judge an instrument: they are so wide that only a wrong unit leaves them.
 """
@@ -7,19 +7,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from enum import Enum
-from typing import Any, Final
+from typing import Final
 
-import numpy as np
-
-from ssm_graph.data import N_BEAMS, Array
-from ssm_graph.errors import ConfigError, nearest_hint
+from ssm_graph.data import N_BEAMS
+from ssm_graph.io.aid_keys import AID_LIMITS, AID_SECTIONS, AID_TABLES
+from ssm_graph.io.settings import Key, optional_key, sigma_key
 from ssm_graph.io.tables import TableSpec
 
 FORMAT: Final = 1
-TOML_NAME: Final = "mission.toml"
-_SHOWN: Final = 60
 
 
 class BodyAxes(Enum):
@@ -38,52 +34,14 @@ class Stamp(Enum):
     END = "end"
 
 
-@dataclass(frozen=True, slots=True)
-class Key:
-    """One key of a section: what it holds and the range in which a value can be right."""
-
-    shape: tuple[int, ...] | None = ()
-    """() for a number, (3,) for three numbers, None for text."""
-    low: float = -math.inf
-    high: float = math.inf
-    positive: bool = False
-    """The value must be above zero."""
-    required: bool = True
-    hint: str = ""
-    """What to try when the value is out of range."""
-
-    @property
-    def wanted(self) -> str:
-        """The expected value in words."""
-        if self.shape is None:
-            return "a text in quotes"
-        words = {(): "a number", (3,): "a list of 3 numbers"}
-        text = words.get(self.shape, " lists of ".join(str(n) for n in self.shape) + " numbers")
-        if self.positive:
-            text += f" above 0 and up to {self.high:g}" if self.high < math.inf else " above 0"
-        elif math.isfinite(self.low) and math.isfinite(self.high):
-            text += f" from {self.low:g} to {self.high:g}"
-        elif math.isfinite(self.low):
-            text += f" not below {self.low:g}"
-        return text
-
-
-def _sigma(high: float, hint: str = "", *, required: bool = True) -> Key:
-    return Key(positive=True, high=high, required=required, hint=hint)
-
-
-def _optional(low: float, high: float, hint: str) -> Key:
-    return Key(low=low, high=high, required=False, hint=hint)
-
-
 _FILE = Key(shape=None)
 _LEVER_ARM = Key(shape=(3,), low=-100.0, high=100.0, hint="lever arms are in metres")
 _LAT = Key(low=-90.0, high=90.0, hint="are latitude and longitude swapped?")
 _LON = Key(low=-180.0, high=360.0, hint="longitude is in degrees")
 _HEIGHT = Key(low=-12000.0, high=20000.0, hint="height is in metres above the ellipsoid, up")
-_LATE = _optional(-10.0, 10.0, "the unit is seconds, not milliseconds")
-_LATE_SIGMA = _optional(0.0, 10.0, "the unit is seconds, not milliseconds")
-_ARM_SIGMA = _optional(0.0, 100.0, "the unit is metres")
+_LATE = optional_key(-10.0, 10.0, "the unit is seconds, not milliseconds")
+_LATE_SIGMA = optional_key(0.0, 10.0, "the unit is seconds, not milliseconds")
+_ARM_SIGMA = optional_key(0.0, 100.0, "the unit is metres")
 _WALK = "the unit is that of the data sheet"
 
 SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
@@ -92,12 +50,12 @@ SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
     "imu": {
         "file": _FILE,
         "stamp": Key(shape=None),
-        "gyro_random_walk_deg_per_sqrt_h": _sigma(1e4, _WALK),
-        "accel_random_walk_ug_per_sqrt_hz": _sigma(1e7, _WALK),
-        "gyro_bias_deg_per_h": _sigma(1e6, _WALK),
-        "accel_bias_ug": _sigma(1e7, _WALK),
-        "gyro_bias_walk_deg_per_h_per_sqrt_h": _optional(0.0, 1e6, _WALK),
-        "accel_bias_walk_ug_per_sqrt_h": _optional(0.0, 1e7, _WALK),
+        "gyro_random_walk_deg_per_sqrt_h": sigma_key(1e4, _WALK),
+        "accel_random_walk_ug_per_sqrt_hz": sigma_key(1e7, _WALK),
+        "gyro_bias_deg_per_h": sigma_key(1e6, _WALK),
+        "accel_bias_ug": sigma_key(1e7, _WALK),
+        "gyro_bias_walk_deg_per_h_per_sqrt_h": optional_key(0.0, 1e6, _WALK),
+        "accel_bias_walk_ug_per_sqrt_h": optional_key(0.0, 1e7, _WALK),
     },
     "dvl": {
         "file": _FILE,
@@ -109,27 +67,27 @@ SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
             hint="it is counted from the vertical; the horizontal angle is 90 minus this",
         ),
         "beam_vectors": Key(shape=(N_BEAMS, 3), required=False),
-        "beam_noise_m_per_s": _sigma(5.0, "the unit is m/s, not mm/s"),
+        "beam_noise_m_per_s": sigma_key(5.0, "the unit is m/s, not mm/s"),
         "lever_arm_m": _LEVER_ARM,
         "mounting_rpy_deg": Key(shape=(3,), low=-360.0, high=360.0),
-        "misalignment_sigma_deg": _optional(0.0, 45.0, "the unit is degrees"),
-        "scale_sigma": _optional(0.0, 1.0, "1 percent is 0.01"),
+        "misalignment_sigma_deg": optional_key(0.0, 45.0, "the unit is degrees"),
+        "scale_sigma": optional_key(0.0, 1.0, "1 percent is 0.01"),
         "time_offset_s": _LATE,
         "time_offset_sigma_s": _LATE_SIGMA,
-        "scale_error": _optional(-0.5, 0.5, "1 percent is 0.01"),
-        "scale_walk_per_sqrt_h": _optional(0.0, 1.0, "1 percent in an hour is 0.01"),
+        "scale_error": optional_key(-0.5, 0.5, "1 percent is 0.01"),
+        "scale_walk_per_sqrt_h": optional_key(0.0, 1.0, "1 percent in an hour is 0.01"),
         "beam_scale_error": Key(
             shape=(N_BEAMS,), low=-0.5, high=0.5, required=False, hint="1 percent is 0.01"
         ),
-        "beam_scale_sigma": _optional(0.0, 1.0, "1 percent is 0.01"),
+        "beam_scale_sigma": optional_key(0.0, 1.0, "1 percent is 0.01"),
         "lever_arm_sigma_m": _ARM_SIGMA,
     },
     "depth": {
         "file": _FILE,
-        "noise_m": _sigma(1000.0),
+        "noise_m": sigma_key(1000.0),
         "lever_arm_m": _LEVER_ARM,
-        "offset_m": _optional(-1000.0, 1000.0, "the unit is metres"),
-        "offset_sigma_m": _optional(0.0, 1000.0, "the unit is metres"),
+        "offset_m": optional_key(-1000.0, 1000.0, "the unit is metres"),
+        "offset_sigma_m": optional_key(0.0, 1000.0, "the unit is metres"),
     },
     "gnss": {
         "file": _FILE,
@@ -138,6 +96,7 @@ SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
         "time_offset_s": _LATE,
         "time_offset_sigma_s": _LATE_SIGMA,
     },
+    **AID_SECTIONS,
     "initial": {
         "time_s": Key(),
         "lat_deg": _LAT,
@@ -154,7 +113,7 @@ SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
     "reference": {"file": _FILE},
 }
 REQUIRED_SECTIONS: Final = ("frames", "imu", "dvl")
-OPTIONAL_TABLES: Final = ("depth", "gnss", "reference")
+OPTIONAL_TABLES: Final = ("depth", "gnss", *AID_TABLES, "reference")
 
 TIME: Final = "time_s"
 GYRO: Final = tuple(f"gyro_{axis}_rad_per_s" for axis in "xyz")
@@ -184,6 +143,7 @@ LIMITS: Final[Mapping[str, tuple[float, float]]] = {
     **dict.fromkeys(POSITION_SIGMA, (_ABOVE_ZERO, 1e7)),
     **dict.fromkeys(VELOCITY, (-100.0, 100.0)),
     **dict(zip(ATTITUDE, ((-360.0, 360.0), (-90.0, 90.0), (-360.0, 360.0)), strict=True)),
+    **AID_LIMITS,
 }
 """The least and the largest number that a column of a table can hold."""
 
@@ -192,112 +152,6 @@ TABLES: Final[Mapping[str, TableSpec]] = {
     "dvl": TableSpec((TIME, *SPEED), (*SPEED_SIGMA, *RANGE), frozenset(SPEED)),
     "depth": TableSpec((TIME, "depth_m")),
     "gnss": TableSpec((TIME, *POSITION, *POSITION_SIGMA)),
+    **AID_TABLES,
     "reference": TableSpec((TIME, *POSITION), (*VELOCITY, *ATTITUDE)),
 }
-
-
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """The checked values of one section, in the units of the file."""
-
-    section: str
-    """Its name; empty for the keys that stand above all sections."""
-    values: Mapping[str, Any]
-    file: str = TOML_NAME
-
-    def __contains__(self, key: str) -> bool:
-        return key in self.values
-
-    def text(self, key: str) -> str:
-        """Return a text."""
-        return str(self.values[key])
-
-    def number(self, key: str) -> float:
-        """Return a number; an optional one that is not given is zero."""
-        return float(self.values.get(key, 0.0))
-
-    def array(self, key: str) -> Array:
-        """Return a list as an array."""
-        return np.array(self.values[key], dtype=np.float64)
-
-    def fault(self, key: str, text: str) -> ConfigError:
-        """Return an error that names file, section and key."""
-        section = f"[{self.section}] " if self.section else ""
-        return ConfigError(f"{self.file} {section}{key}: {text}")
-
-
-def read_settings(
-    section: str, raw: object, *, file: str = TOML_NAME, may_miss: frozenset[str] = frozenset()
-) -> Settings:
-    """Check every key of a section against :data:`SECTIONS`.
-
-    Parameters
-    ----------
-    section : its name.
-    raw : what the file holds under that name.
-    file : the file's name in messages.
-    may_miss : required keys that this file can do without.
-    """
-    if not isinstance(raw, dict):
-        raise ConfigError(f"{file} [{section}]: expected a section, got {shown(raw)}")
-    known = SECTIONS[section]
-    for key in raw:
-        if key not in known:
-            missing = [name for name in known if name not in raw]
-            hint = nearest_hint(key, missing or known)
-            raise ConfigError(f"{file} [{section}] {key}: unknown key; {hint}")
-    for name, key in known.items():
-        if key.required and name not in raw and name not in may_miss:
-            raise ConfigError(
-                f"{file} [{section}] {name}: the key is missing; expected {key.wanted}"
-            )
-    settings = Settings(section, {name: _plain(value) for name, value in raw.items()}, file)
-    for name, value in settings.values.items():
-        problem = _problem(known[name], value)
-        if problem:
-            tail = f"; {known[name].hint}" if known[name].hint and problem == "range" else ""
-            raise settings.fault(
-                name, f"expected {known[name].wanted}, got {shown(raw[name])}{tail}"
-            )
-    return settings
-
-
-def shown(value: object) -> str:
-    """Return a value as it is shown in a message, cut where it is long."""
-    try:
-        text = repr(value)
-    except ValueError:  # an integer of more than 4300 digits
-        text = "a number of very many digits"
-    return text if len(text) <= _SHOWN else text[:_SHOWN] + "..."
-
-
-def _plain(value: Any) -> Any:
-    """Return ints, also those in lists, as floats; an int too large for a float becomes inf."""
-    if isinstance(value, list):
-        return [_plain(item) for item in value]
-    if isinstance(value, int) and not isinstance(value, bool):
-        return float(value) if abs(value) < 10**300 else math.inf
-    return value
-
-
-def _problem(key: Key, value: Any) -> str:
-    """Return "" for a good value, "type" or "range" for a bad one."""
-    if key.shape is None:
-        return "" if isinstance(value, str) and value.strip() else "type"
-    numbers = _numbers(value, key.shape)
-    if numbers is None or not all(math.isfinite(number) for number in numbers):
-        return "type"
-    low_ok = all(x > 0.0 for x in numbers) if key.positive else min(numbers) >= key.low
-    return "" if low_ok and max(numbers) <= key.high else "range"
-
-
-def _numbers(value: Any, shape: tuple[int, ...]) -> list[float] | None:
-    """Return the numbers in nested lists of just this shape, else None."""
-    if not shape:
-        return [value] if isinstance(value, float) else None
-    if not isinstance(value, list) or len(value) != shape[0]:
-        return None
-    parts = [_numbers(item, shape[1:]) for item in value]
-    if any(part is None for part in parts):
-        return None
-    return [number for part in parts if part is not None for number in part]

@@ -10,19 +10,17 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ssm_graph.errors import ConfigError, nearest_hint
+from ssm_graph.io.aid_keys import LISTS
 from ssm_graph.io.mission_keys import (
     FORMAT,
     OPTIONAL_TABLES,
     REQUIRED_SECTIONS,
     SECTIONS,
     TABLES,
-    TOML_NAME,
     BodyAxes,
-    Settings,
     Stamp,
-    read_settings,
-    shown,
 )
+from ssm_graph.io.settings import TOML_NAME, Settings, read_settings, shown
 from ssm_graph.io.tables import Order
 
 _Choice = TypeVar("_Choice", bound=Enum)
@@ -41,6 +39,8 @@ class MissionToml:
     body: BodyAxes
     stamp: Stamp
     sections: dict[str, Settings]
+    lists: dict[str, tuple[Settings, ...]]
+    """The sections that may come several times."""
 
     def __getitem__(self, section: str) -> Settings:
         return self.sections[section]
@@ -72,15 +72,16 @@ def _checked(raw: dict[str, Any], path: Path, may_miss: frozenset[str]) -> Missi
     file = path.name
     _check_format(raw, file)
     for name in raw:
-        if name not in (*SECTIONS, "format", "name", "order"):
-            missing = [known for known in SECTIONS if known not in raw] or SECTIONS
+        if name not in (*SECTIONS, *LISTS, "format", "name", "order"):
+            names = (*SECTIONS, *LISTS)
+            missing = [known for known in names if known not in raw] or names
             known = ("order",) if get_close_matches(name, ("order",)) else missing
             raise ConfigError(f"{file} {name}: unknown key or section; {nearest_hint(name, known)}")
     for name in REQUIRED_SECTIONS:
         if name not in raw:
             raise ConfigError(f"{file} [{name}]: the section is missing; every mission needs it")
     sections = {
-        name: read_settings(name, raw[name], file=file, may_miss=may_miss)
+        name: read_settings(name, raw[name], known=SECTIONS[name], file=file, may_miss=may_miss)
         for name in raw
         if name in SECTIONS
     }
@@ -94,6 +95,20 @@ def _checked(raw: dict[str, Any], path: Path, may_miss: frozenset[str]) -> Missi
         body=_choice(sections["frames"], "body", BodyAxes),
         stamp=_choice(sections["imu"], "stamp", Stamp) if "stamp" in sections["imu"] else Stamp.END,
         sections=sections,
+        lists={name: _read_list(name, raw.get(name, []), file) for name in LISTS},
+    )
+
+
+def _read_list(name: str, raw: object, file: str) -> tuple[Settings, ...]:
+    """Read the sections ``[[name]]`` of a file."""
+    if not isinstance(raw, list):
+        raise ConfigError(
+            f"{file} [{name}]: expected a list of sections, each under [[{name}]], got "
+            f"{shown(raw)}; write double brackets"
+        )
+    return tuple(
+        read_settings(f"[[{name}]] {number}", item, known=LISTS[name], file=file)
+        for number, item in enumerate(raw, start=1)
     )
 
 

@@ -28,6 +28,12 @@ SI: Final[Mapping[str, float]] = {
     "pitch_deg": math.radians(1.0),
     "heading_deg": math.radians(1.0),
     "misalignment_sigma_deg": math.radians(1.0),
+    "noise_deg": math.radians(1.0),
+    "declination_deg": math.radians(1.0),
+    "offset_sigma_deg": math.radians(1.0),
+    "walk_sigma_deg": math.radians(1.0),
+    "one_cycle_sigma_deg": math.radians(1.0),
+    "two_cycle_sigma_deg": math.radians(1.0),
     "scale_walk_per_sqrt_h": 1.0 / 60.0,
 }
 """One unit of a key in SI units; keys that are not listed are in SI units already."""

@@ -22,6 +22,7 @@ from ssm_graph.data import (
 )
 from ssm_graph.earth import LocalFrame
 from ssm_graph.errors import DataError
+from ssm_graph.io.aid_writer import aid_settings, aid_tables
 from ssm_graph.io.mission_keys import (
     ACCEL,
     ATTITUDE,
@@ -32,12 +33,12 @@ from ssm_graph.io.mission_keys import (
     SPEED,
     SPEED_SIGMA,
     TIME,
-    TOML_NAME,
     VELOCITY,
     BodyAxes,
     Stamp,
 )
 from ssm_graph.io.mission_units import R_bd_from_rpy, from_si, rpy_from_R_bd
+from ssm_graph.io.settings import TOML_NAME
 from ssm_graph.io.tables import TableFormat, write_table
 
 _NOISE_OF_EMPTY_LOG = 0.01
@@ -101,6 +102,7 @@ def mission_settings(mission: Mission, table_format: TableFormat) -> dict[str, A
             "lever_arm_m": mission.gnss.lever_arm_b.tolist(),
             **gnss_calibration_settings(mission.gnss.calibration),
         }
+    settings |= aid_settings(mission.aids, suffix)
     if mission.initial is not None:
         settings["initial"] = initial_settings(mission.initial)
     if mission.reference is not None:
@@ -126,6 +128,7 @@ def mission_tables(mission: Mission) -> dict[str, dict[str, Array]]:
             "height_m": gnss.height,
             **_split(POSITION_SIGMA, gnss.sigma_enu),
         }
+    tables |= aid_tables(mission.aids)
     if mission.reference is not None:
         tables["reference"] = _reference_table(mission.reference)
     return tables

@@ -17,9 +17,9 @@ from typing import Final, Self
 
 from ssm_graph.errors import ConfigError
 from ssm_graph.io.append_file import AppendFile, sync_folder
-from ssm_graph.io.mission_keys import TOML_NAME
 from ssm_graph.io.raw_replay import replay
 from ssm_graph.io.raw_rows import ARRIVALS, ROW_KINDS, RowKind
+from ssm_graph.io.settings import TOML_NAME
 from ssm_graph.io.vehicle import check_same_vehicle, write_vehicle
 from ssm_graph.messages import Message, Vehicle
 

@@ -1,6 +1,6 @@
 """Result folders: ``trajectory.csv``, ``beams.csv`` and ``summary.json``, written and read again.
 
-A run that calibrated leaves ``calibration.toml`` too.
+A run that calibrated leaves ``calibration.toml`` too, one with further aids ``aids.csv``.
 
 Units are those of the mission format: degrees, degrees per hour, micro-g. Column and key names are
 a contract: they only grow.
@@ -19,7 +19,7 @@ import numpy as np
 
 from ssm_graph.data import Array, Mission
 from ssm_graph.errors import DataError
-from ssm_graph.estimate import BeamTable, Estimate, Trajectory
+from ssm_graph.estimate import AidTable, BeamTable, Estimate, Trajectory
 from ssm_graph.io.calibration_toml import CALIBRATION_NAME, calibration_toml
 from ssm_graph.io.csv_tables import (
     CsvFile,
@@ -34,6 +34,7 @@ from ssm_graph.io.results_summary import MetricsLike, build_summary
 
 TRAJECTORY_NAME: Final = "trajectory.csv"
 BEAMS_NAME: Final = "beams.csv"
+AIDS_NAME: Final = "aids.csv"
 SUMMARY_NAME: Final = "summary.json"
 Columns = dict[str, tuple[Array, str]]
 """Values of every column and the format of a cell."""
@@ -86,6 +87,8 @@ def write_results(
         TRAJECTORY_NAME: format_table(trajectory_columns(estimate.trajectory)),
         BEAMS_NAME: format_table(beam_columns(estimate.beams)),
     }
+    if estimate.aids is not None:
+        content[AIDS_NAME] = format_aids(estimate.aids)
     if estimate.calibration is not None:
         content[CALIBRATION_NAME] = calibration_toml(mission, estimate.calibration, axes=axes)
     text = json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False)
@@ -95,7 +98,7 @@ def write_results(
         folder.mkdir(parents=True, exist_ok=True)
         for name, text in content.items():
             _write_through(parts[name], text)
-        for name in (SUMMARY_NAME, CALIBRATION_NAME):
+        for name in (SUMMARY_NAME, CALIBRATION_NAME, AIDS_NAME):
             (folder / name).unlink(missing_ok=True)
         for name, part in parts.items():
             part.replace(folder / name)
@@ -171,6 +174,18 @@ def beam_columns(beams: BeamTable) -> Columns:
         "mahalanobis_sq": (beams.mahalanobis_sq, "%.9g"),
         "weight": (beams.weight, "%.9g"),
     }
+
+
+def format_aids(aids: AidTable) -> str:
+    """Return the content of ``aids.csv``, angles in degrees."""
+    in_degrees = np.array([unit == "rad" for unit in aids.unit], dtype=bool)
+    innovation = np.where(in_degrees, np.degrees(aids.innovation), aids.innovation)
+    units = np.where(in_degrees, "deg", np.array(aids.unit))
+    columns = (aids.time_s, aids.aid, aids.component, innovation, units)
+    rows = zip(*columns, aids.mahalanobis_sq, aids.weight, strict=True)
+    row_format = "%.7f,%s,%s,%.9g,%s,%.9g,%.9g\n"
+    header = "time_s,aid,component,innovation,unit,mahalanobis_sq,weight\n"
+    return header + "".join([row_format % row for row in rows])
 
 
 def format_table(columns: Columns) -> str:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ssm_graph.data import Array
 from ssm_graph.errors import ConfigError, DataError, MissingExtraError, nearest_hint
@@ -50,6 +51,8 @@ class TableSpec:
     optional: tuple[str, ...] = ()
     blank: frozenset[str] = frozenset()
     """Required columns whose cells may be empty or NaN; the optional ones always may."""
+    key: tuple[str, ...] = ()
+    """Columns that tell rows of one time apart; without them every time is there once."""
 
     @property
     def may_be_blank(self) -> frozenset[str]:
@@ -150,7 +153,7 @@ def read_table(path: Path, label: str, spec: TableSpec) -> Table:
     except OSError as error:
         raise DataError(f"{label}: cannot be read: {error.strerror or error}") from error
     check_finite(table, spec)
-    _check_increasing(table)
+    _check_increasing(table, spec)
     return table
 
 
@@ -255,12 +258,25 @@ def check_finite(table: Table, spec: TableSpec) -> None:
         raise table.cell_fault(row, "time_s", "expected seconds; correct or delete this row")
 
 
-def _check_increasing(table: Table) -> None:
+def is_repeated(table: Table, spec: TableSpec) -> NDArray[np.bool_]:
+    """Return which rows (N,) have the time, and the key, of an earlier one."""
+    rows = table.stack(("time_s", *spec.key))
+    repeated = np.ones(len(rows), dtype=bool)
+    repeated[np.unique(rows, axis=0, return_index=True)[1]] = False
+    return repeated
+
+
+def _check_increasing(table: Table, spec: TableSpec) -> None:
     step = np.diff(table.time_s)
     if np.all(step > 0.0):
         return
-    row = int(np.argmax(step <= 0.0)) + 1
-    count = int(np.sum(step <= 0.0))
+    is_wrong = step <= 0.0
+    if spec.key:
+        is_wrong = (step < 0.0) | is_repeated(table, spec)[1:]
+        if not is_wrong.any():
+            return
+    row = int(np.argmax(is_wrong)) + 1
+    count = int(np.sum(is_wrong))
     also = f" ({count} such rows in all)" if count > 1 else ""
     now, before = table.time_s[row], table.time_s[row - 1]
     if now < before:

@@ -22,7 +22,7 @@ from ssm_graph.io.mission_instruments import (
     lever_arm_b,
     stated_frame,
 )
-from ssm_graph.io.mission_keys import FORMAT, SECTIONS, TOML_NAME, BodyAxes
+from ssm_graph.io.mission_keys import FORMAT, SECTIONS, BodyAxes
 from ssm_graph.io.mission_toml import read_vehicle_toml
 from ssm_graph.io.mission_writer import (
     depth_calibration_settings,
@@ -33,6 +33,7 @@ from ssm_graph.io.mission_writer import (
     nominal_sigma,
     origin_settings,
 )
+from ssm_graph.io.settings import TOML_NAME
 from ssm_graph.io.tables import Order, TableFormat
 from ssm_graph.messages import Vehicle
 

@@ -29,10 +29,10 @@ from ssm_graph.errors import ConfigError, DataError
 from ssm_graph.io.append_file import AppendFile
 from ssm_graph.io.checkpoint import newest_checkpoint
 from ssm_graph.io.growing_results import GrowingResults
-from ssm_graph.io.mission_keys import TOML_NAME
 from ssm_graph.io.raw_log import RawLog, replay
 from ssm_graph.io.results import BEAMS_NAME, SUMMARY_NAME, TRAJECTORY_NAME
 from ssm_graph.io.results_summary import as_json
+from ssm_graph.io.settings import TOML_NAME
 from ssm_graph.io.vehicle import check_same_vehicle
 from ssm_graph.live.checkpoint_writer import CheckpointWriter
 from ssm_graph.messages import Event, Message, Vehicle
