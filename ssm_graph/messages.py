@@ -96,6 +96,8 @@ class Vehicle(FrozenArrays):
     """Navigation frame; None takes the first fix."""
     initial: InitialState | None = None
     """None lets the estimator align itself."""
+    further_aids: tuple[str, ...] = ()
+    """Sections of its file that only the batch smoother uses."""
 
 
 class Health(Enum):

@@ -5,17 +5,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from ssm_graph.errors import ConfigError, DataError, SsmGraphError
+from ssm_graph.errors import ConfigError, DataError
+from tests.malformed_aids import AID_CASES
+from tests.malformed_case import Malformed
 from tests.mission_damage import (
     ACCEL,
     BEAMS,
     GYRO,
     POSITION,
-    Damage,
     beams_against_depth,
     both,
     cell,
@@ -31,20 +30,6 @@ from tests.mission_damage import (
     rolling,
     toml,
 )
-
-
-@dataclass(frozen=True, slots=True)
-class Malformed:
-    """One way in which a mission folder can be wrong."""
-
-    title: str
-    """What is wrong with it, for people."""
-    damage: Damage
-    """Turn a valid folder into a wrong one."""
-    error: type[SsmGraphError]
-    words: tuple[str, ...]
-    """What the message must contain: where, and the point of the hint."""
-
 
 TOML_CASES = (
     Malformed("No mission.toml", remove("mission.toml"), ConfigError, ("there is none in",)),
@@ -570,4 +555,4 @@ PHYSICS_CASES = (
     ),
 )
 
-CASES = (*TOML_CASES, *TABLE_CASES, *PHYSICS_CASES)
+CASES = (*TOML_CASES, *TABLE_CASES, *PHYSICS_CASES, *AID_CASES)

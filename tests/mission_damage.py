@@ -113,6 +113,61 @@ def rename(old: str, new: str) -> Damage:
     return damage
 
 
+AIDS_TOML = """
+[usbl]
+file = "usbl.csv"
+lever_arm_m = [0.0, 0.0, 0.0]
+
+[ranges]
+file = "ranges.csv"
+noise_m = 0.3
+lever_arm_m = [0.0, 0.0, 0.0]
+
+[[beacon]]
+number = 4
+lat_deg = 45.701
+lon_deg = 126.601
+height_m = -40.0
+
+[[beacon]]
+number = 5
+lat_deg = 45.699
+lon_deg = 126.602
+height_m = -40.0
+position_sigma_m = [50.0, 50.0, 5.0]
+
+[heading]
+file = "heading.csv"
+noise_deg = 1.0
+
+[[standstill]]
+begin_s = 0.0
+end_s = 5.0
+"""
+AIDS_TABLES = {
+    "usbl.csv": """\
+time_s,lat_deg,lon_deg,height_m,sigma_east_m,sigma_north_m,sigma_up_m,delay_s
+10.0,45.70006,126.60018,-20.0,2.0,2.0,2.0,1.5
+20.0,45.70012,126.60035,-20.0,2.0,2.0,2.0,1.5
+""",
+    "ranges.csv": "time_s,beacon,range_m\n8.0,4,130.0\n8.0,5,170.0\n16.0,4,120.0\n",
+    "heading.csv": "time_s,heading_deg\n1.0,63.4\n2.0,63.6\n3.0,63.2\n",
+}
+
+
+def aided(change: Damage) -> Damage:
+    """Give the mission further aids, then damage it."""
+
+    def damage(folder: Path) -> None:
+        for name, text in AIDS_TABLES.items():
+            (folder / name).write_text(text, encoding="utf-8")
+        with (folder / "mission.toml").open("a", encoding="utf-8") as stream:
+            stream.write(AIDS_TOML)
+        change(folder)
+
+    return damage
+
+
 def parquet(change: Damage) -> Damage:
     """Write the mission with Parquet tables, then damage it."""
 

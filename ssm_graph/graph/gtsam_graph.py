@@ -46,6 +46,11 @@ def gtsam_graph(
             f"gtsam_graph: expected a problem of keyframes alone, got one that calibrates {names}: "
             "take their prior sigmas out of mission.toml"
         )
+    if problem.further.sections:
+        raise ConfigError(
+            f"gtsam_graph: expected a problem of beams, depth and GNSS, got "
+            f"{', '.join(problem.further.sections)} besides: take them out of mission.toml"
+        )
     graph = graph_without_beams(problem, states)
     beams = problem.beams
     weights = np.ones(len(beams.speed)) if weights is None else weights

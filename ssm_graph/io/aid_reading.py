@@ -13,6 +13,7 @@ from ssm_graph.aid_logs import (
     Standstill,
     UsblLog,
 )
+from ssm_graph.io.aid_keys import AID_TABLES
 from ssm_graph.io.mission_checks import check_positions, refuse_beyond
 from ssm_graph.io.mission_instruments import lever_arm_b, radians_wrapped
 from ssm_graph.io.mission_keys import LIMITS, POSITION_SIGMA
@@ -42,6 +43,12 @@ def read_aids(tables: dict[str, Table], toml: MissionToml) -> tuple[AidLogs, lis
         heading = _heading(tables["heading"], toml["heading"])
     standstills = tuple(_standstill(settings, tables) for settings in toml.lists["standstill"])
     return AidLogs(usbl, ranges, heading, standstills), notes
+
+
+def sections_of_aids(toml: MissionToml) -> tuple[str, ...]:
+    """Return the sections of a file that tell of further aids."""
+    sections = [f"[{name}]" for name in AID_TABLES if name in toml]
+    return (*sections, *(["[[standstill]]"] if toml.lists["standstill"] else []))
 
 
 def check_usbl(table: Table) -> list[str]:

@@ -13,6 +13,7 @@ import tomli_w
 
 from ssm_graph.data import Array, DepthCalibration, GnssCalibration, Mission
 from ssm_graph.errors import ConfigError
+from ssm_graph.io.aid_reading import sections_of_aids
 from ssm_graph.io.mission_instruments import (
     depth_calibration,
     dvl_mount,
@@ -73,6 +74,7 @@ def read_vehicle(path: Path | str) -> Vehicle:
         gnss_calibration=gnss_calibration(toml),
         frame=frame,
         initial=initial_state(toml["initial"]) if "initial" in toml else None,
+        further_aids=sections_of_aids(toml),
     )
 
 
@@ -98,6 +100,7 @@ def vehicle_of(mission: Mission) -> Vehicle:
         ),
         frame=mission.frame,
         initial=mission.initial,
+        further_aids=mission.aids.sections,
     )
 
 

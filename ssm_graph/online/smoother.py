@@ -39,6 +39,7 @@ from ssm_graph.online.store import (
 )
 from ssm_graph.online.tail import Tail
 from ssm_graph.online.watch import Watch
+from ssm_graph.problem.aid_errors import not_used
 from ssm_graph.problem.calibration import calibration_extras, taken_as_exact
 from ssm_graph.problem.extras import Extras
 from ssm_graph.problem.problem import ProblemConfig
@@ -159,6 +160,8 @@ class FixedLagSmoother:
         self._frame, buffers = beginning.frame, self._intake.buffers
         for note in self._exact:
             self._events.tell(beginning.time_s, Severity.INFO, "not_calibrated", note)
+        for note in not_used(self.vehicle.further_aids):
+            self._events.tell(beginning.time_s, Severity.INFO, "not_aided", note)
         maker = KeyframeMaker(buffers, beginning.frame, self._problem_config)
         first = Keyframe.unmeasured(beginning.time_s, np.zeros(3), None)
         sensors = sensors_of_vehicle(self.vehicle, beginning.frame)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -22,6 +23,16 @@ _OF_HEADING: Final = (HEADING_OFFSET, HEADING_WALK, HEADING_ONE_CYCLE, HEADING_T
 def is_of_aid(name: str) -> bool:
     """Return whether an extra variable belongs to one of the further aids."""
     return name.startswith(BEACON) or name in _OF_HEADING
+
+
+def not_used(sections: Sequence[str]) -> tuple[str, ...]:
+    """Return the note of an estimator without further aids, if the mission has some."""
+    if not sections:
+        return ()
+    return (
+        f"{', '.join(sections)} of mission.toml left out: this estimator is not aided by them; "
+        "ssm-graph smooth is",
+    )
 
 
 def beacon_name(number: int) -> str:

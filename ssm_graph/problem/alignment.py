@@ -1,4 +1,4 @@
-"""Finding the initial state from the data: levelling, gyrocompassing, heading from GNSS and DVL.
+"""Finding the initial state from the data: levelling, gyrocompassing, GNSS and DVL, compass.
 
 Levelling and gyrocompassing are one fit. In axes that do not turn, the specific force that the
 vehicle's own velocity does not explain integrates to gravity, and gravity turns with the Earth::
@@ -28,6 +28,7 @@ from ssm_graph.frames import (
 )
 from ssm_graph.imu.increments import merge_samples
 from ssm_graph.problem.body_velocity import BodyVelocities, body_velocities
+from ssm_graph.problem.compass_start import heading_from_compass
 from ssm_graph.problem.track_heading import HeadingFit, heading_from_track
 from ssm_graph.problem.usable import require_usable
 
@@ -73,7 +74,8 @@ def align(mission: Mission) -> Alignment:
     R_lb = _level_and_compass(mission, turned)
     compass = _compass_sigma(mission.imu.noise, turned, mission.frame.lat)
     track = heading_from_track(mission, start_s, R_lb, velocities)
-    heading, method = _choose_heading(R_lb, compass, track)
+    magnetic = heading_from_compass(mission, start_s, R_lb, window_s=window_s)
+    heading, method = _choose_heading(R_lb, compass, track, magnetic)
     level = _level_sigma(mission.imu.noise, turned)
     roll, pitch, _ = roll_pitch_heading_from_R_lb(R_lb)
     starts = [
@@ -193,12 +195,17 @@ def _level_sigma(noise: ImuNoise, turned: _Turned) -> float:
     return math.hypot(*parts)
 
 
-def _choose_heading(R_lb: Array, compass: float, track: HeadingFit) -> tuple[HeadingFit, str]:
-    if compass <= track.sigma:
+def _choose_heading(
+    R_lb: Array, compass: float, track: HeadingFit, magnetic: HeadingFit
+) -> tuple[HeadingFit, str]:
+    """Return the heading of smallest sigma and a sentence that says where it is from."""
+    if compass <= min(track.sigma, magnetic.sigma):
         fit = HeadingFit(float(roll_pitch_heading_from_R_lb(R_lb)[2]), compass)
         source = "gyrocompassing"
-    else:
+    elif track.sigma <= magnetic.sigma:
         fit, source = track, "GNSS against DVL displacement"
+    else:
+        fit, source = magnetic, "the compass"
     if fit.sigma > SAFE_HEADING_SIGMA:
         sigma = f"{math.degrees(fit.sigma):.0f} deg" if fit.sigma < math.pi else "unbounded"
         return fit, (

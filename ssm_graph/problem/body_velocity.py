@@ -6,11 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ssm_graph.aid_logs import Standstill
 from ssm_graph.data import Array, Mission
 from ssm_graph.problem.ping_motion import mean_gyro
 
 PARITY_GATE = 5.0
 """Sigmas of the array's parity above which a ping is not used."""
+REST_STEP_S = 1.0
+"""Between the velocities of a standstill."""
 REACH_S = 3.0
 """How far from a ping its velocity is believed."""
 
@@ -36,6 +39,26 @@ class BodyVelocities:
 
 
 def body_velocities(mission: Mission) -> BodyVelocities:
+    """Return the velocities of the pings, and zero while the mission stands still."""
+    velocities = _of_pings(mission)
+    for still in mission.aids.standstills:
+        velocities = _at_rest(velocities, still)
+    return velocities
+
+
+def _at_rest(velocities: BodyVelocities, still: Standstill) -> BodyVelocities:
+    """Return velocities with those of a standstill in the place of its pings."""
+    count = int((still.end_s - still.begin_s) / REST_STEP_S) + 2
+    rest_s = np.linspace(still.begin_s, still.end_s, count)
+    before = velocities.time_s < still.begin_s
+    after = velocities.time_s > still.end_s
+    return BodyVelocities(
+        np.concatenate([velocities.time_s[before], rest_s, velocities.time_s[after]]),
+        np.concatenate([velocities.v_b[before], np.zeros((count, 3)), velocities.v_b[after]]),
+    )
+
+
+def _of_pings(mission: Mission) -> BodyVelocities:
     """Solve pings of four agreeing beams, or of three, for the velocity of the body origin.
 
     Four beams measure three components, and the fourth number is the array's parity: ``n . b``

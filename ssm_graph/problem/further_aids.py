@@ -104,16 +104,6 @@ def further_aids(mission: Mission, keyframe_s: Array) -> tuple[FurtherAids, tupl
     return found, notes
 
 
-def not_used(further: FurtherAids) -> tuple[str, ...]:
-    """Return the note of an estimator that has no further aids, if the problem has."""
-    if not further.sections:
-        return ()
-    return (
-        f"{', '.join(further.sections)} of mission.toml left out: this estimator is not aided by "
-        "them; ssm-graph smooth is",
-    )
-
-
 def _usbl(mission: Mission, log: UsblLog, keyframe_s: Array) -> Fixes:
     fix = np.flatnonzero(is_inside(log.valid_s, keyframe_s[0], keyframe_s[-1]))
     fix = fix[np.argsort(log.valid_s[fix], kind="stable")]

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from factors.dvl_beam import beam_residual
 from ssm_graph.data import Array
 from ssm_graph.estimate import BeamTable, Estimate, Status
+from ssm_graph.problem.aid_errors import not_used
 from ssm_graph.problem.calibration import taken_as_exact
 from ssm_graph.problem.doubts import doubts_of_beams
-from ssm_graph.problem.further_aids import not_used
 from ssm_graph.problem.problem import Problem
 from ssm_graph.problem.trajectory import KeyframeStates, trajectory_from_states
 
@@ -82,7 +82,7 @@ def recursive_estimate(
         wall_s=wall_s,
         cost=np.nan,
         start=problem.start,
-        notes=problem.notes + taken_as_exact(problem.extras) + not_used(problem.further),
+        notes=problem.notes + taken_as_exact(problem.extras) + not_used(problem.further.sections),
         keyframe_iterations=float(np.mean(n_iterations)),
     )
 

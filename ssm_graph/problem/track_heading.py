@@ -85,14 +85,14 @@ def _dead_reckon(
     time_s = np.concatenate([[start_s], pings])
     if len(time_s) < 2:
         return time_s, np.zeros((1, 3)), (R_lb @ gnss.lever_arm_b)[None, :]
-    R = _attitudes(mission, time_s, R_lb)
+    R = gyro_attitudes(mission, time_s, R_lb)
     v_l = np.einsum("kij,kj->ki", R, velocities.at(time_s))
     step = 0.5 * (v_l[1:] + v_l[:-1]) * np.diff(time_s)[:, None]
     track = np.concatenate([np.zeros((1, 3)), np.cumsum(step, axis=0)])
     return time_s, track, R @ gnss.lever_arm_b
 
 
-def _attitudes(mission: Mission, time_s: Array, R_lb: Array) -> Array:
+def gyro_attitudes(mission: Mission, time_s: Array, R_lb: Array) -> Array:
     """Return attitudes (N, 3, 3) at the times, by the gyros alone."""
     merged = merge_samples(mission.imu, time_s, rate_hz=20.0)
     # Against the turn of the Earth, which a MEMS gyro does not notice but a better one does.

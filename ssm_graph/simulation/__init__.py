@@ -7,6 +7,14 @@ from ssm_graph.simulation.aids import DepthSettings, GnssSettings
 from ssm_graph.simulation.config import SimulationConfig
 from ssm_graph.simulation.dvl_model import DvlSettings, default_mount, janus_beams
 from ssm_graph.simulation.faults import Loss, OutlierKind, Outliers
+from ssm_graph.simulation.further_aids import (
+    AidSettings,
+    BeaconSettings,
+    CompassSettings,
+    GrossErrors,
+    RangingSettings,
+    UsblSettings,
+)
 from ssm_graph.simulation.grades import IMU_NOISE, START_SIGMAS, Grade, StartSigmas
 from ssm_graph.simulation.mission import SimulatedMission, simulate, with_dvl_errors
 from ssm_graph.simulation.programmed import Fault, FaultShape
@@ -27,6 +35,9 @@ __all__ = [
     "IMU_NOISE",
     "SCENARIOS",
     "START_SIGMAS",
+    "AidSettings",
+    "BeaconSettings",
+    "CompassSettings",
     "DepthProfile",
     "DepthSettings",
     "DiveRoute",
@@ -35,10 +46,12 @@ __all__ = [
     "FaultShape",
     "GnssSettings",
     "Grade",
+    "GrossErrors",
     "HoverRoute",
     "Loss",
     "OutlierKind",
     "Outliers",
+    "RangingSettings",
     "Route",
     "Scenario",
     "SimulatedMission",
@@ -48,6 +61,7 @@ __all__ = [
     "SurveyRoute",
     "Trajectory",
     "TransitRoute",
+    "UsblSettings",
     "Waves",
     "default_mount",
     "janus_beams",

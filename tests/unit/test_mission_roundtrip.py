@@ -30,6 +30,9 @@ def assert_same(got: Any, want: Any, where: str = "mission") -> None:
             if spec.name != "notes":
                 name = spec.name
                 assert_same(getattr(got, name), getattr(want, name), f"{where}.{name}")
+    elif isinstance(want, tuple):
+        for i, (one, other) in enumerate(zip(got, want, strict=True)):
+            assert_same(one, other, f"{where}[{i}]")
     elif isinstance(want, float | np.ndarray):
         np.testing.assert_allclose(got, want, rtol=1e-15, atol=1e-15, err_msg=where)
     else:

@@ -1,0 +1,56 @@
+"""Simulated missions with further aids of every kind."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from ssm_graph.aid_logs import HeadingErrors, Standstill
+from ssm_graph.simulation import (
+    AidSettings,
+    BeaconSettings,
+    CompassSettings,
+    GrossErrors,
+    RangingSettings,
+    SimulatedMission,
+    UsblSettings,
+)
+from tests.helpers import simulated
+
+KNOWN = BeaconSettings(3, (200.0, 60.0, -50.0))
+UNKNOWN = BeaconSettings(7, (90.0, -80.0, -55.0), (30.0, -25.0, 4.0), (40.0, 40.0, 6.0))
+COMPASS_ERRORS = HeadingErrors(
+    offset_sigma=math.radians(4.0),
+    walk_sigma=math.radians(0.5),
+    correlation_s=200.0,
+    one_cycle_sigma=math.radians(2.0),
+    two_cycle_sigma=math.radians(1.0),
+)
+
+
+def usbl(rate: float = 0.0, **changes: Any) -> AidSettings:
+    """Return acoustic fixes, some of them far off."""
+    return AidSettings(usbl=UsblSettings(gross=GrossErrors(rate, (20.0, 100.0)), **changes))
+
+
+def ranging(*beacons: BeaconSettings, rate: float = 0.0, **changes: Any) -> AidSettings:
+    """Return ranges to beacons, some of them far off."""
+    gross = GrossErrors(rate, (5.0, 50.0))
+    return AidSettings(ranging=RangingSettings(beacons, gross=gross, **changes))
+
+
+def compass(rate: float = 0.0, **changes: Any) -> AidSettings:
+    """Return a compass, disturbed now and then."""
+    config: dict[str, Any] = {"errors": COMPASS_ERRORS, "gross": GrossErrors(rate, (0.2, 1.0))}
+    return AidSettings(compass=CompassSettings(**(config | changes)))
+
+
+def with_every_aid(**changes: Any) -> SimulatedMission:
+    """Return a short mission with all of them, a beacon whose place is not known among them."""
+    aids = AidSettings(
+        usbl=UsblSettings(interval_s=3.1),
+        ranging=RangingSettings((KNOWN, UNKNOWN), interval_s=1.3),
+        compass=CompassSettings(errors=COMPASS_ERRORS, declination=0.1),
+        standstills=(Standstill(4.0, 6.5),),
+    )
+    return simulated(**({"duration_s": 30.0, "aids": aids} | changes))

@@ -1,0 +1,326 @@
+"""Further aids from a mission to its answer: keyframes, weights, beacons, doubts, and no trace."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from factors.similarity import WEIGHT_FLOOR, LogKernel, Similarity
+from ssm_graph.aid_logs import AidLogs, HeadingLog, RangeLog, Standstill
+from ssm_graph.errors import ConfigError, DataError
+from ssm_graph.estimate import Determined, Status
+from ssm_graph.filters.named import filter_problems
+from ssm_graph.graph.beacon_start import beacon_start
+from ssm_graph.graph.first_values import first_values
+from ssm_graph.graph.forward_aids import settled_weight
+from ssm_graph.graph.gtsam_graph import gtsam_graph
+from ssm_graph.problem.problem import NO_EXTRAS, build_problem
+from ssm_graph.simulation import (
+    CALM,
+    AidSettings,
+    BeaconSettings,
+    GrossErrors,
+    HoverRoute,
+    SimulatedMission,
+)
+from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother, warm_start
+from ssm_graph.smoothers.fixed_lag import solve_fixed_lag
+from tests.aids_fixture import UNKNOWN, compass, ranging, usbl, with_every_aid
+from tests.helpers import simulated
+
+KERNEL = LogKernel()
+
+
+def test_fixes_and_ranges_have_keyframes_of_when_they_were_valid() -> None:
+    """Between the pings; a fix that came late goes back to its time."""
+    sim = with_every_aid()
+    problem, aids = build_problem(sim.mission), sim.mission.aids
+    assert aids.usbl is not None
+    assert aids.ranges is not None
+    further = problem.further
+    assert further.usbl is not None
+    assert further.ranges is not None
+    np.testing.assert_allclose(problem.keyframe_s[further.usbl.keyframe], aids.usbl.valid_s)
+    np.testing.assert_allclose(problem.keyframe_s[further.ranges.keyframe], aids.ranges.time_s)
+    assert aids.usbl.valid_s[0] == pytest.approx(aids.usbl.time_s[0] - 1.5)
+    numbers = further.ranges.number[further.ranges.beacon]
+    np.testing.assert_array_equal(numbers, aids.ranges.beacon)
+
+
+def test_what_lies_outside_is_left_out_and_said() -> None:
+    """Fixes that were valid before the start."""
+    sim = simulated(aids=usbl(delay_s=0.0, interval_s=2.0))
+    log = sim.mission.aids.usbl
+    assert log is not None
+    late = replace(log, delay_s=np.where(np.arange(len(log.time_s)) < 3, 100.0, 0.0))
+    problem = build_problem(replace(sim.mission, aids=AidLogs(usbl=late)))
+    assert problem.further.usbl is not None
+    assert len(problem.further.usbl.keyframe) == len(log.time_s) - 3
+    assert any("3 USBL fixes outside" in note for note in problem.notes)
+
+
+def test_a_keyframe_has_one_heading_led_to_it_by_the_gyros() -> None:
+    """At a quarter of a second from its reading, in a turn, and without noise, to 1e-4 rad."""
+    sim = simulated(perfect_sensors=True, aids=compass(rate_hz=2.0), route=HoverRoute())
+    shifted = sim.mission.aids.heading
+    assert shifted is not None
+    shifted = replace(shifted, time_s=shifted.time_s + 0.25)  # its readings are of 0.25 s before
+    headings = build_problem(replace(sim.mission, aids=AidLogs(heading=shifted))).further.headings
+    assert headings is not None
+    assert len(np.unique(headings.keyframe)) == len(headings.keyframe)
+    problem = build_problem(sim.mission)
+    led = problem.further.headings
+    assert led is not None
+    assert len(led.keyframe) >= problem.n_keyframes - 1
+    turn = np.arccos(0.5 * (np.trace(headings.R_back, axis1=1, axis2=2) - 1.0))
+    assert 1e-4 < np.median(turn) < 0.05
+
+
+def test_the_vehicle_stands_still_at_every_keyframe_of_a_standstill() -> None:
+    """Where two overlap the stricter one counts."""
+    sim = simulated()
+    stills = (Standstill(3.0, 8.0), Standstill(6.0, 9.5, sigma=0.01))
+    problem = build_problem(replace(sim.mission, aids=AidLogs(standstills=stills)))
+    further = problem.further.standstills
+    assert further is not None
+    time_s = problem.keyframe_s[further.keyframe]
+    assert (time_s >= 3.0).all()
+    assert (time_s <= 9.5).all()
+    np.testing.assert_array_equal(further.sigma, np.where(time_s >= 6.0, 0.01, 0.05))
+
+
+@pytest.mark.parametrize("dim", [1, 3])
+def test_weights_of_the_first_pass(dim: int) -> None:
+    """What agrees counts in full, what is beyond the gate not at all, and between less and less."""
+    predicted = 2.0 * np.eye(dim)
+    agrees = settled_weight(np.zeros(dim), predicted, KERNEL)
+    odd = settled_weight(np.full(dim, 6.0), predicted, KERNEL)
+    gross = settled_weight(np.full(dim, 60.0), predicted, KERNEL)
+    assert agrees > 1.0
+    assert gross == WEIGHT_FLOOR
+    assert gross < odd < agrees
+
+
+def circle(n: int = 200) -> np.ndarray:
+    """Return a track once around, 60 m wide, at one depth."""
+    angle = np.linspace(0.0, 2.0 * np.pi, n)
+    return np.stack([30.0 * np.cos(angle), 30.0 * np.sin(angle), np.full(n, 5.0)], axis=1)
+
+
+def test_a_beacon_is_found_from_ranges_along_a_turning_track() -> None:
+    """Thrice its prior sigma off, with every fifth range an echo."""
+    rng, track, place = np.random.default_rng(2), circle(), np.array([120.0, -80.0, -12.0])
+    ranges = np.linalg.norm(track - place, axis=1) + 0.2 * rng.standard_normal(len(track))
+    ranges[::5] += rng.uniform(5.0, 60.0, len(ranges[::5]))
+    start = beacon_start(
+        track, ranges, sigma=np.full(len(track), 0.2), prior_sigma=np.array([60.0, 60.0, 6.0])
+    )
+    np.testing.assert_allclose(start.offset[:2], place[:2], atol=2.0)
+    assert start.rival is None
+    assert start.weights[::5].max() < 0.2
+    assert np.median(np.delete(start.weights, np.s_[::5])) > 0.8
+
+
+def test_a_straight_track_leaves_two_places() -> None:
+    """Ranges along a line cannot tell one side of it from the other, and this is said."""
+    track = np.stack([np.linspace(-100.0, 100.0, 100), *np.zeros((2, 100))], axis=1)
+    ranges = np.linalg.norm(track - np.array([10.0, 50.0, 0.0]), axis=1)
+    start = beacon_start(
+        track, ranges, sigma=np.full(100, 0.3), prior_sigma=np.array([60.0, 60.0, 2.0])
+    )
+    assert start.rival is not None
+    np.testing.assert_allclose(np.abs([start.offset[1], start.rival[1]]), 50.0, atol=3.0)
+    assert start.offset[1] * start.rival[1] < 0.0
+
+
+def test_the_smoother_starts_an_unknown_beacon_near_its_place() -> None:
+    """Within some metres, before the first iteration."""
+    sim = simulated(duration_s=300.0, aids=ranging(UNKNOWN, rate=0.1))
+    problem = build_problem(sim.mission)
+    first = first_values(problem, kernel=KERNEL)
+    np.testing.assert_allclose(first.states.constants, -np.array(UNKNOWN.stated_off), atol=8.0)
+    gross = sim.aids.gross["ranges"]
+    assert first.aid_weights[gross].max() < 0.3
+
+
+def outliers(sim: SimulatedMission, section: str, name: str) -> tuple[Status, np.ndarray]:
+    """Return how the smoother ended, and the weights of gross errors and of good readings."""
+    estimate = SsmSmoother().solve(build_problem(sim.mission))
+    assert estimate.aids is not None
+    table = estimate.aids
+    assert set(table.aid) == {name}
+    first = np.array([c not in ("north", "up") for c in table.component])
+    weight, gross = table.weight[first], sim.aids.gross[section]
+    assert len(weight) == len(gross)
+    assert weight[gross].max() < 0.15
+    assert np.median(weight[~gross]) > 0.8
+    return estimate.status, weight
+
+
+def test_gross_fixes_and_ranges_lose_their_weight() -> None:
+    """One in five, and the good ones keep theirs."""
+    for settings, section, name in (
+        (usbl(0.2, interval_s=2.0), "usbl", "USBL"),
+        (ranging(BeaconSettings(1, (80.0, 90.0, -40.0)), rate=0.2), "ranges", "range"),
+    ):
+        sim = simulated(duration_s=200.0, aids=settings)
+        status, _ = outliers(sim, section, name)
+        assert status is Status.CONVERGED
+
+
+def test_a_disturbed_compass_loses_its_weight() -> None:
+    """While it is near iron, and no longer."""
+    sim = simulated(duration_s=200.0, aids=compass(rate_hz=1.0, gross=GrossErrors(0.2, (0.3, 1.0))))
+    estimate = SsmSmoother().solve(build_problem(sim.mission))
+    assert estimate.status is Status.CONVERGED
+    table, log = estimate.aids, sim.mission.aids.heading
+    assert table is not None
+    assert log is not None
+    reading = np.argmin(np.abs(log.time_s - table.time_s[:, None]), axis=1)
+    gross = sim.aids.gross["heading"][reading]
+    assert table.weight[gross].max() < 0.15
+    assert np.median(table.weight[~gross]) > 0.8
+
+
+def test_what_a_compass_errs_by_is_found_within_its_sigma() -> None:
+    """Offset and iron, with the heading known from the start; a label and a colour for each."""
+    sim = simulated(duration_s=300.0, aids=compass())
+    found = SsmSmoother().solve(build_problem(sim.mission)).calibration
+    assert found is not None
+    truth = dict(
+        zip(
+            (
+                "heading_offset_deg",
+                "heading_one_cycle_sine_deg",
+                "heading_one_cycle_cosine_deg",
+                "heading_two_cycle_sine_deg",
+                "heading_two_cycle_cosine_deg",
+            ),
+            sim.aids.heading_errors,
+            strict=True,
+        )
+    )
+    values = {value.label: value for value in found.values}
+    assert set(values) == {"heading_walk_deg", *truth}
+    for label, true in truth.items():
+        assert abs(values[label].value - true) < 3.0 * values[label].sigma, label
+    assert values["heading_one_cycle_cosine_deg"].determined is not Determined.RED
+
+
+def test_an_aid_that_contradicts_the_answer_is_named() -> None:
+    """A datum that is 40 m off, and a compass mounted backwards."""
+    sim = simulated(duration_s=120.0, aids=usbl(interval_s=2.0), gnss=None)
+    log = sim.mission.aids.usbl
+    assert log is not None
+    wrong = replace(log, height=log.height + 200.0)
+    estimate = SsmSmoother().solve(build_problem(replace(sim.mission, aids=AidLogs(usbl=wrong))))
+    assert estimate.status is Status.SUSPECT
+    assert "USBL measurements contradict" in estimate.reason
+    assert "datum" in estimate.reason
+    sim = simulated(duration_s=60.0, aids=compass())
+    heading = sim.mission.aids.heading
+    assert heading is not None
+    backwards = replace(heading, heading=heading.heading + np.pi)
+    estimate = SsmSmoother().solve(
+        build_problem(replace(sim.mission, aids=AidLogs(heading=backwards)))
+    )
+    assert estimate.status is Status.SUSPECT
+    assert "heading" in estimate.reason
+
+
+def test_without_aids_nothing_changes() -> None:
+    """The same mission, whether or not its aids are taken away: bit by bit that without them."""
+    plain, aided = simulated(), with_every_aid()
+    taken = replace(aided.mission, aids=AidLogs())
+    for log in ("imu", "dvl", "depth"):
+        for name in ("time_s", "speed", "gyro_b", "depth"):
+            if hasattr(getattr(plain.mission, log), name):
+                np.testing.assert_array_equal(
+                    getattr(getattr(taken, log), name), getattr(getattr(plain.mission, log), name)
+                )
+    first, second = (SsmSmoother().solve(build_problem(m)) for m in (plain.mission, taken))
+    np.testing.assert_array_equal(first.trajectory.lat, second.trajectory.lat)
+    np.testing.assert_array_equal(first.beams.weight, second.beams.weight)
+    assert first.aids is None
+    assert first.calibration is None
+    assert first.notes == second.notes
+
+
+def test_every_aid_at_once() -> None:
+    """They settle together, and a table tells of each."""
+    at_rest = with_every_aid(route=HoverRoute(sway_m=0.0), waves=CALM)
+    estimate = SsmSmoother().solve(build_problem(at_rest.mission))
+    assert estimate.status is Status.CONVERGED, estimate.reason
+    assert estimate.aids is not None
+    assert set(estimate.aids.aid) == {"USBL", "range", "heading", "standstill"}
+    assert set(estimate.aids.component) == {
+        "east",
+        "north",
+        "up",
+        "heading",
+        "beacon_3",
+        "beacon_7",
+    }
+
+
+def test_estimators_without_them_say_so() -> None:
+    """Filters and fixed lag; GTSAM's own graph refuses them."""
+    problem = build_problem(with_every_aid().mission)
+    for estimate in (*filter_problems([problem], "ekf"), *solve_fixed_lag(problem)):
+        (note,) = (note for note in estimate.notes if "left out" in note)
+        assert "[usbl], [ranges], [heading], [[standstill]]" in note
+    with pytest.raises(ConfigError, match="usbl"):
+        gtsam_graph(replace(problem, extras=NO_EXTRAS), warm_start(problem).states)
+
+
+def test_at_rest_nothing_drifts() -> None:
+    """A silent DVL, on deck: the end is ten times nearer than inertial data alone bring it."""
+    sim = simulated(
+        duration_s=120.0,
+        dropout_rate=1.0,
+        depth=None,
+        route=HoverRoute(sway_m=0.0, yaw=0.0),
+        waves=CALM,
+        aids=AidSettings(standstills=(Standstill(0.0, 120.0),)),
+    )
+    apart = []
+    for mission in (sim.mission, replace(sim.mission, aids=AidLogs())):
+        estimate = SsmSmoother().solve(build_problem(mission))
+        end = estimate.trajectory
+        truth = sim.truth_at(end.time_s[-1:])
+        apart.append(float(np.hypot(end.lat[-1] - truth.lat[0], end.lon[-1] - truth.lon[0])))
+    assert apart[0] < 0.1 * apart[1]
+
+
+def test_logs_refuse_what_cannot_be() -> None:
+    """Ranges to a beacon that nobody stated, and a standstill that ends before it begins."""
+    sim = simulated(aids=ranging(UNKNOWN))
+    log = sim.mission.aids.ranges
+    assert log is not None
+    with pytest.raises(DataError, match="numbers of the beacons"):
+        RangeLog(
+            beacons=log.beacons,
+            time_s=log.time_s,
+            beacon=log.beacon + 1.0,
+            range_m=log.range_m,
+            sigma=log.sigma,
+            lever_arm_b=log.lever_arm_b,
+        )
+    with pytest.raises(DataError, match="before its end"):
+        Standstill(2.0, 1.0)
+    with pytest.raises(DataError, match="shape"):
+        HeadingLog(sigma=0.1, time_s=np.zeros(3), heading=np.zeros(2))
+
+
+def test_plain_weights_ignore_the_posterior() -> None:
+    """A method that judges by the residual alone judges the aids so as well."""
+    problem = build_problem(with_every_aid().mission)
+    with_, without = (
+        SsmSmoother(SmootherConfig(similarity=similarity)).solve(problem).aids
+        for similarity in (Similarity.EXPECTED, Similarity.PLAIN)
+    )
+    assert with_ is not None
+    assert without is not None
+    assert without.mahalanobis_sq.mean() < with_.mahalanobis_sq.mean()
