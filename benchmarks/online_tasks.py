@@ -18,6 +18,7 @@ from benchmarks.online_stream import (
     run_stream,
 )
 from benchmarks.online_theirs import TheirConfig, run_theirs
+from ssm_graph.cli.online import pass_over_imports
 from ssm_graph.cli.run_mission import withhold_gnss
 from ssm_graph.data import Array, Mission, Reference
 from ssm_graph.estimate import Trajectory, since_first_ping
@@ -90,6 +91,7 @@ def stream_ours(duration_s: float, seed: int, dvl_hz: float, config: FixedLagCon
     """Push a stream through the live estimator."""
     sim = survey(duration_s, dvl_hz=dvl_hz, seed=seed)
     smoother = FixedLagSmoother(vehicle_of(sim.mission), config)
+    pass_over_imports()
     run = run_stream(
         smoother, messages_of(sim.mission), every_s=1.0 / ASK_HZ, duration_s=duration_s
     )
@@ -119,6 +121,7 @@ def stream_theirs(
     """Feed the keyframes of a stream to one of GTSAM's smoothers."""
     sim = survey(duration_s, dvl_hz=dvl_hz, seed=seed)
     begin_mb = rss_mb()
+    pass_over_imports()
     run = run_theirs(sim.mission, config, most_wall_s=most_wall_s)
     covariance_s = np.where(np.isfinite(run.covariance_s), run.covariance_s, 0.0)
     parts = {"keyframe made (ours)": run.front_s, "update": run.update_s}

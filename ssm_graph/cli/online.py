@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import gc
 import signal
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
@@ -92,8 +93,15 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
             on_status=lambda status: show(view_of(status)),
         )
         stack.enter_context(_stopped_by_signals(runner.stop))
+        pass_over_imports()
         end = runner.run()
     return _report(end, arguments.out, console)
+
+
+def pass_over_imports() -> None:
+    """Have the garbage collector pass over all that there is: to look through it takes 60 ms."""
+    gc.collect()
+    gc.freeze()
 
 
 def engine_of(vehicle: Vehicle, config: FixedLagConfig) -> Engine:
