@@ -1,0 +1,314 @@
+"""What further aids are worth, with and without gross errors in them, and whether sigmas hold.
+
+``python benchmarks/aids.py --keep`` (some ten minutes on one core; a quick look is ``--runs 3``).
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import math
+import os
+import shlex
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import numpy as np
+
+from benchmarks.speed import machine, table
+from factors.similarity import GaussianKernel, Kernel, LogKernel
+from ssm_graph.aid_logs import AidLogs, HeadingErrors, Standstill
+from ssm_graph.estimate import Calibration
+from ssm_graph.evaluation import chi2_interval, evaluate, mean_with_interval
+from ssm_graph.problem.problem import build_problem
+from ssm_graph.simulation import (
+    CALM,
+    AidSettings,
+    BeaconSettings,
+    CompassSettings,
+    Grade,
+    GrossErrors,
+    HoverRoute,
+    RangingSettings,
+    SimulationConfig,
+    UsblSettings,
+    simulate,
+)
+from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
+
+RESULTS = Path(__file__).resolve().parent / "results"
+RATE = 0.1
+"""Of gross errors, where there are any."""
+KNOWN = tuple(
+    BeaconSettings(number, enu)
+    for number, enu in enumerate(
+        [(300.0, 100.0, -60.0), (-100.0, 400.0, -60.0), (100.0, -300.0, -50.0)], start=1
+    )
+)
+PRIOR_M = (80.0, 80.0, 10.0)
+"""Of the unknown beacon; where it is stated is drawn from it."""
+IRON = HeadingErrors(
+    offset_sigma=math.radians(3.0),
+    walk_sigma=math.radians(1.0),
+    correlation_s=300.0,
+    one_cycle_sigma=math.radians(2.0),
+    two_cycle_sigma=math.radians(1.0),
+)
+
+
+class Case(NamedTuple):
+    """One kind of aid and a mission for it."""
+
+    name: str
+    text: str
+    aids: Callable[[int, float], AidSettings]
+    """Of a seed and a rate of gross errors"""
+    config: SimulationConfig
+    has_gross: bool = True
+
+
+def _usbl(seed: int, rate: float) -> AidSettings:  # noqa: ARG001
+    return AidSettings(usbl=UsblSettings(gross=GrossErrors(rate, (20.0, 100.0))))
+
+
+def _ranges(seed: int, rate: float) -> AidSettings:  # noqa: ARG001
+    return AidSettings(ranging=RangingSettings(KNOWN, gross=GrossErrors(rate, (5.0, 50.0))))
+
+
+def unknown_beacon(seed: int) -> BeaconSettings:
+    """Return a beacon whose stated place is off by a draw from its prior."""
+    off = np.random.default_rng([seed, 1]).standard_normal(3) * PRIOR_M
+    east, north, up = off.tolist()
+    return BeaconSettings(7, (250.0, -100.0, -55.0), (east, north, up), PRIOR_M)
+
+
+def _unknown(seed: int, rate: float) -> AidSettings:
+    ranging = RangingSettings((unknown_beacon(seed),), gross=GrossErrors(rate, (5.0, 50.0)))
+    return AidSettings(ranging=ranging)
+
+
+def _compass(seed: int, rate: float) -> AidSettings:  # noqa: ARG001
+    return AidSettings(compass=CompassSettings(errors=IRON, gross=GrossErrors(rate, (0.2, 1.0))))
+
+
+def _rest(seed: int, rate: float) -> AidSettings:  # noqa: ARG001
+    return AidSettings(standstills=(Standstill(0.0, 300.0, sigma=0.02),))
+
+
+_SURVEY = SimulationConfig(duration_s=600.0, imu_rate_hz=50.0, grade=Grade.TACTICAL)
+CASES = (
+    Case(
+        "Acoustic fixes",
+        "Survey, tactical grade, 10 min. A fix every 5 s with 2 m of noise an axis, 1.5 s late; "
+        "gross errors of 20 to 100 m.",
+        _usbl,
+        _SURVEY,
+    ),
+    Case(
+        "Ranges to three known beacons",
+        "The same survey. A range every 4 s with 0.3 m of noise, to each beacon in turn; gross "
+        "errors of 5 to 50 m.",
+        _ranges,
+        _SURVEY,
+    ),
+    Case(
+        "Ranges to one beacon whose place is not known",
+        "The same survey. The place is stated within 80 m east and north and 10 m up (1 sigma); "
+        "ranges as before.",
+        _unknown,
+        _SURVEY,
+    ),
+    Case(
+        "Compass",
+        "Survey, MEMS grade, 10 min. 4 Hz with 1 degree of noise, offset 3 degrees, walk 1 degree "
+        "within 300 s, hard iron 2 degrees, soft iron 1 degree, all estimated; disturbances of "
+        "11 to 57 degrees for 3 s.",
+        _compass,
+        dataclasses.replace(_SURVEY, grade=Grade.MEMS),
+    ),
+    Case(
+        "Standstill",
+        "At rest for 5 min without bottom lock and without depth, tactical grade; sigma 0.02 m/s.",
+        _rest,
+        dataclasses.replace(
+            _SURVEY,
+            duration_s=300.0,
+            route=HoverRoute(sway_m=0.0, yaw=0.0),
+            waves=CALM,
+            dropout_rate=1.0,
+            depth=None,
+        ),
+        has_gross=False,
+    ),
+)
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Run:
+    """One mission, smoothed."""
+
+    horizontal_m: float
+    """rms"""
+    heading_deg: float
+    """rms"""
+    nees: float
+    """Of the position, over 3"""
+    status: str
+    error: tuple[float, ...]
+    """Of what was estimated of the aid, in posterior sigmas; empty for nothing"""
+
+
+def run(case: Case, seed: int, *, rate: float, kernel: Kernel, is_aided: bool = True) -> Run:
+    """Simulate and smooth one mission."""
+    config = dataclasses.replace(case.config, seed=seed, aids=case.aids(seed, rate))
+    sim = simulate(config)
+    mission = sim.mission
+    if not is_aided:
+        mission = dataclasses.replace(mission, aids=AidLogs())
+    estimate = SsmSmoother(SmootherConfig(kernel=kernel)).solve(build_problem(mission))
+    assert mission.reference is not None
+    metrics = evaluate(estimate.trajectory, mission.reference)
+    truth = beacon_truth(config.aids) | dict(
+        zip(
+            ("heading_offset", "heading_one_cycle", "heading_two_cycle"),
+            np.split(sim.aids.heading_errors, [1, 3]),
+            strict=True,
+        )
+    )
+    return Run(
+        horizontal_m=metrics.rmse_horizontal_m,
+        heading_deg=math.degrees(metrics.rmse_attitude[2]),
+        nees=metrics.nees_position,
+        status=estimate.status.name,
+        error=errors_of(estimate.calibration, truth),
+    )
+
+
+def beacon_truth(aids: AidSettings) -> dict[str, np.ndarray]:
+    """Return how far the beacons truly are from where they are stated, by name."""
+    beacons = aids.ranging.beacons if aids.ranging is not None else ()
+    return {f"beacon_{beacon.number}": -np.array(beacon.stated_off) for beacon in beacons}
+
+
+def errors_of(calibration: Calibration | None, truth: dict[str, np.ndarray]) -> tuple[float, ...]:
+    """Return the errors of estimated constants, in their posterior sigmas."""
+    errors: list[float] = []
+    for variable, true in truth.items():
+        values = [v for v in calibration.values if v.variable == variable] if calibration else []
+        errors += [(v.value - t) / v.sigma for v, t in zip(values, true, strict=False)]
+    return tuple(errors)
+
+
+def variants(case: Case) -> list[tuple[str, dict[str, object]]]:
+    """Return what is compared, by its name in the table."""
+    kernels: tuple[tuple[str, Kernel], ...] = (
+        ("gaussian", GaussianKernel()),
+        ("log", LogKernel()),
+    )
+    found: list[tuple[str, dict[str, object]]] = [
+        ("without the aid", {"rate": 0.0, "kernel": LogKernel(), "is_aided": False})
+    ]
+    for rate in (0.0, RATE) if case.has_gross else (0.0,):
+        about = f"{100.0 * rate:.0f} % gross errors, " if case.has_gross else ""
+        found += [(f"{about}{name}", {"rate": rate, "kernel": kernel}) for name, kernel in kernels]
+    return found
+
+
+def case_lines(case: Case, results: Mapping[str, Sequence[Run]]) -> list[str]:
+    """Return the section of one aid."""
+    n_runs = len(next(iter(results.values())))
+    rows, found = [], []
+    for name, runs in results.items():
+        settled = sum(r.status == "CONVERGED" for r in runs)
+        suspect = sum(r.status == "SUSPECT" for r in runs)
+        rows.append(
+            [
+                name,
+                _mean([r.horizontal_m for r in runs]),
+                _mean([r.heading_deg for r in runs]),
+                _mean([r.nees for r in runs]),
+                f"{settled} / {suspect}",
+            ]
+        )
+        found += _estimated(name, runs)
+    expected = chi2_interval(3, n_runs)
+    header = ["", "horizontal rms, m", "heading rms, deg", "NEES / 3", "CONVERGED / SUSPECT"]
+    return [
+        f"## {case.name}",
+        "",
+        case.text,
+        "",
+        *table(header, rows),
+        "",
+        f"Seeds 0 to {n_runs - 1}. The epochs of one run depend on each other; did they all say "
+        f"the same, NEES / 3 of consistent runs would be {expected.low:.2f} to {expected.high:.2f}.",
+        "",
+        *([*found, ""] if found else []),
+    ]
+
+
+def _estimated(name: str, runs: Sequence[Run]) -> list[str]:
+    """Return how well the sigmas of what was estimated hold."""
+    errors = np.array([r.error for r in runs])
+    if errors.size == 0:
+        return []
+    inside = np.abs(errors) < 3.0
+    all_inside = int(inside.all(axis=1).sum())
+    return [
+        f"- {name}: all {errors.shape[1]} estimated constants within 3 sigma in {all_inside} of "
+        f"{len(runs)} runs, {100.0 * inside.mean():.2f} % of {inside.size} values; mean square of "
+        f"the errors over their variances {np.mean(errors**2):.2f}, largest error "
+        f"{np.abs(errors).max():.1f} sigma"
+    ]
+
+
+def _mean(samples: Sequence[float]) -> str:
+    interval = mean_with_interval(samples)
+    return f"{interval.value:.3g} ({interval.low:.3g} to {interval.high:.3g})"
+
+
+LEGEND = """\
+Inertial data of 50 Hz, DVL of 1 Hz with clean beams, depth, no GNSS, the start known to the sigmas
+of the grade. "gaussian" is least squares, weight 1 for every beam and every measurement of the aid;
+"log" weighs both by the default kernel. Intervals are of 95 %.
+"""
+
+
+def parse_args(argv: Sequence[str] | None = None) -> argparse.Namespace:
+    """Return the settings given on the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--runs", type=int, default=40, help="missions of each kind")
+    parser.add_argument("--out", type=Path, default=Path("out/aids"))
+    parser.add_argument("--keep", action="store_true", help="write benchmarks/results too")
+    return parser.parse_args(argv)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run everything and write the report."""
+    args = parse_args(argv)
+    load = os.getloadavg()[0]
+    lines: list[str] = []
+    for case in CASES:
+        print(f"{case.name} ...", file=sys.stderr, flush=True)
+        results = {
+            name: [run(case, seed, **settings) for seed in range(args.runs)]  # type: ignore[arg-type]
+            for name, settings in variants(case)
+        }
+        lines += case_lines(case, results)
+    command = shlex.join(["python", "benchmarks/aids.py", *(argv or sys.argv[1:])])
+    about = f"{machine()}; load average before {load:.1f}."
+    text = "\n".join(["# Further aids", "", f"    {command}", "", about, "", LEGEND, *lines])
+    args.out.mkdir(parents=True, exist_ok=True)
+    (args.out / "aids.md").write_text(text, encoding="utf-8")
+    if args.keep:
+        (RESULTS / "aids.md").write_text(text, encoding="utf-8")
+    print(text)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
