@@ -245,7 +245,8 @@ def case_lines(case: Case, results: Mapping[str, Sequence[Run]]) -> list[str]:
         *table(header, rows),
         "",
         f"Seeds 0 to {n_runs - 1}. The epochs of one run depend on each other; did they all say "
-        f"the same, NEES / 3 of consistent runs would be {expected.low:.2f} to {expected.high:.2f}.",
+        "the same, NEES / 3 of consistent runs would be "
+        f"{expected.low:.2f} to {expected.high:.2f}.",
         "",
         *([*found, ""] if found else []),
     ]

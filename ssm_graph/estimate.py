@@ -82,6 +82,17 @@ class AidTable(FrozenArrays):
     weight: Array = shaped("N")
     """(N,) of the whole measurement, 1 = nominal."""
 
+    def counts(self) -> dict[str, tuple[int, int]]:
+        """Return how many measurements each aid had, and how many ended as outliers."""
+        names = np.array(self.aid)
+        # The first component stands for the measurement: east of positions and velocities.
+        is_first = ~np.isin(self.component, ("north", "up"))
+        found = {}
+        for name in dict.fromkeys(self.aid):
+            weights = self.weight[is_first & (names == name)]
+            found[name] = (len(weights), int(np.sum(weights < OUTLIER_WEIGHT)))
+        return found
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory(FrozenArrays):

@@ -53,7 +53,6 @@ class FirstValues:
     """How often the prediction was doubted."""
     aid_weights: Array
     """One for each measurement of the weighted aids"""
-    notes: tuple[str, ...] = ()
 
 
 def first_values(
@@ -126,8 +125,8 @@ class _ForwardPass:
         states = states_from_arrays(*(np.array(column) for column in zip(*history, strict=True)))
         if self.extras:
             states = states._replace(constants=self.extras.constants)
-        states, met, notes = find_beacons(states, self.aids, problem.extras, self.met.weights)
-        return FirstValues(states, self.weights, self.n_doubts, met, notes)
+        states, met = find_beacons(states, self.aids, problem.extras, self.met.weights)
+        return FirstValues(states, self.weights, self.n_doubts, met)
 
     def _predict(self, k: int) -> None:
         chain = self.problem.chain

@@ -9,7 +9,6 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Any, Final, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ssm_graph.data import InitialState, Mission
 from ssm_graph.estimate import OUTLIER_WEIGHT, AidTable, Estimate, Trajectory, path_length_m
@@ -176,21 +175,10 @@ def _calibration(estimate: Estimate) -> dict[str, Any]:
 
 def _aids(aids: AidTable) -> dict[str, Any]:
     """Return how many measurements each further aid had, and how many had hardly any weight."""
-    names = np.array(aids.aid)
-    found = {}
-    for name in dict.fromkeys(aids.aid):
-        of_one = (names == name) & _is_first_component(aids)
-        weights = aids.weight[of_one]
-        found[name] = {
-            "n_measurements": len(weights),
-            "n_outliers": int(np.sum(weights < OUTLIER_WEIGHT)),
-        }
-    return found
-
-
-def _is_first_component(aids: AidTable) -> NDArray[np.bool_]:
-    """Return which rows (N,) begin a measurement; of positions and velocities that is the east."""
-    return ~np.isin(aids.component, ("north", "up"))
+    return {
+        name: {"n_measurements": count, "n_outliers": outliers}
+        for name, (count, outliers) in aids.counts().items()
+    }
 
 
 def _noise(estimate: Estimate) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from rich.text import Text
 from ssm_graph.data import N_BEAMS, Array
 from ssm_graph.estimate import (
     OUTLIER_WEIGHT,
+    AidTable,
     Calibration,
     Determined,
     Estimate,
@@ -52,6 +53,8 @@ def summary_table(estimate: Estimate, metrics: Metrics | None = None) -> Rendera
         parts.append(_comparison(metrics))
     if estimate.calibration is not None:
         parts.append(_calibration(estimate.calibration))
+    if estimate.aids is not None:
+        parts.append(_aids(estimate.aids))
     parts.extend(Text(f"note: {note}", style="yellow") for note in estimate.notes)
     return Group(*parts)
 
@@ -83,6 +86,14 @@ def _overview(estimate: Estimate) -> Table:
         ),
     ):
         table.add_row(heading, value)
+    return table
+
+
+def _aids(aids: AidTable) -> Table:
+    """Return how many measurements of each further aid there were, and how many have no weight."""
+    table = _table("Further aids", ["", "measurements", f"weight < {OUTLIER_WEIGHT:g}"])
+    for name, (count, outliers) in aids.counts().items():
+        table.add_row(name, str(count), str(outliers))
     return table
 
 

@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, Final
 
+from ssm_graph.aid_logs import HeadingErrors
 from ssm_graph.errors import ConfigError, nearest_hint
 from ssm_graph.simulation.aids import GnssSettings
 from ssm_graph.simulation.config import SimulationConfig
 from ssm_graph.simulation.dvl_model import DvlSettings
 from ssm_graph.simulation.faults import Loss, OutlierKind, Outliers
+from ssm_graph.simulation.further_aids import (
+    AidSettings,
+    BeaconSettings,
+    CompassSettings,
+    GrossErrors,
+    RangingSettings,
+    UsblSettings,
+)
 from ssm_graph.simulation.programmed import Fault
 from ssm_graph.simulation.routes import (
     DepthProfile,
@@ -46,6 +56,30 @@ _DEMO = SimulationConfig(
     gnss=GnssSettings(),
 )
 
+_AIDED = AidSettings(
+    usbl=UsblSettings(interval_s=10.0, gross=GrossErrors(0.05, (20.0, 100.0))),
+    ranging=RangingSettings(
+        (
+            BeaconSettings(1, (300.0, 100.0, -60.0)),
+            BeaconSettings(
+                2,
+                enu=(-100.0, 400.0, -60.0),
+                stated_off=(50.0, -30.0, 5.0),
+                position_sigma=(60.0, 60.0, 8.0),
+            ),
+        ),
+        gross=GrossErrors(0.05, (5.0, 50.0)),
+    ),
+    compass=CompassSettings(
+        errors=HeadingErrors(
+            offset_sigma=math.radians(3.0),
+            walk_sigma=math.radians(1.0),
+            one_cycle_sigma=math.radians(2.0),
+        ),
+        gross=GrossErrors(0.05, (0.2, 1.0)),
+    ),
+)
+
 SCENARIOS: Final[Mapping[str, Scenario]] = MappingProxyType(
     {
         "survey": Scenario(
@@ -67,6 +101,11 @@ SCENARIOS: Final[Mapping[str, Scenario]] = MappingProxyType(
         "transit": Scenario(
             "straight run of 14.4 km at 40 m depth, 2 h, in waves",
             SimulationConfig(name="transit", route=TransitRoute(), duration_s=7200.0),
+        ),
+        "aided": Scenario(
+            "survey with late acoustic fixes, ranges to a known and an unknown beacon, a compass; "
+            "5 % of them grossly wrong",
+            SimulationConfig(name="aided", aids=_AIDED),
         ),
         "demo": Scenario(
             "GNSS start, dive, 20 min of survey lines: outliers, a burst, dropouts, a bottom loss",

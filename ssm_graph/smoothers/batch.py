@@ -13,6 +13,7 @@ from factors.similarity import Kernel, LogKernel, Similarity, expected_mahalanob
 from ssm_graph.data import N_BEAMS, Array
 from ssm_graph.errors import ConfigError, SolverError
 from ssm_graph.estimate import BeamTable, Estimate, Iteration, NoiseFound, Status
+from ssm_graph.graph.beacon_start import ambiguous_beacons
 from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.first_values import FirstValues, first_values
 from ssm_graph.graph.linearize import GraphLinearizer, Step
@@ -86,9 +87,8 @@ class SmootherConfig:
 
 def _notes_of(first: FirstValues) -> tuple[str, ...]:
     if first.n_doubts == 0:
-        return first.notes
+        return ()
     return (
-        *first.notes,
         f"the first pass doubted its prediction {first.n_doubts} times: the beams contradicted it "
         "together",
     )
@@ -249,6 +249,12 @@ class SsmSmoother:
         )
         doubts = contradictions(linearizer, last.states, last.beam_rows, last.weights)
         doubts += solved.aids.doubts(last.states)
+        doubts += ambiguous_beacons(
+            last.states,
+            linearizer.weighted,
+            linearizer.problem.extras,
+            last.step.extras_covariance,
+        )
         if doubts:
             unsettled = [] if status is Status.CONVERGED else [reason]
             status, reason = Status.SUSPECT, "; ".join(doubts + unsettled)

@@ -12,7 +12,7 @@ from ssm_graph.aid_logs import AidLogs, HeadingLog, RangeLog, Standstill
 from ssm_graph.errors import ConfigError, DataError
 from ssm_graph.estimate import Determined, Status
 from ssm_graph.filters.named import filter_problems
-from ssm_graph.graph.beacon_start import beacon_start
+from ssm_graph.graph.beacon_start import BeaconRanges, beacon_start, rival_place
 from ssm_graph.graph.first_values import first_values
 from ssm_graph.graph.forward_aids import settled_weight
 from ssm_graph.graph.gtsam_graph import gtsam_graph
@@ -24,6 +24,7 @@ from ssm_graph.simulation import (
     GrossErrors,
     HoverRoute,
     SimulatedMission,
+    TransitRoute,
 )
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother, warm_start
 from ssm_graph.smoothers.fixed_lag import solve_fixed_lag
@@ -114,25 +115,36 @@ def test_a_beacon_is_found_from_ranges_along_a_turning_track() -> None:
     rng, track, place = np.random.default_rng(2), circle(), np.array([120.0, -80.0, -12.0])
     ranges = np.linalg.norm(track - place, axis=1) + 0.2 * rng.standard_normal(len(track))
     ranges[::5] += rng.uniform(5.0, 60.0, len(ranges[::5]))
-    start = beacon_start(
-        track, ranges, sigma=np.full(len(track), 0.2), prior_sigma=np.array([60.0, 60.0, 6.0])
+    heard = BeaconRanges(
+        "beacon_1", track, ranges, np.full(len(track), 0.2), np.array([60.0, 60.0, 6.0])
     )
-    np.testing.assert_allclose(start.offset[:2], place[:2], atol=2.0)
-    assert start.rival is None
-    assert start.weights[::5].max() < 0.2
-    assert np.median(np.delete(start.weights, np.s_[::5])) > 0.8
+    found, weights = beacon_start(heard)
+    np.testing.assert_allclose(found[:2], place[:2], atol=2.0)
+    assert weights[::5].max() < 0.2
+    assert np.median(np.delete(weights, np.s_[::5])) > 0.8
+    assert rival_place(heard, found, apart_m=0.0) is None
 
 
 def test_a_straight_track_leaves_two_places() -> None:
     """Ranges along a line cannot tell one side of it from the other, and this is said."""
     track = np.stack([np.linspace(-100.0, 100.0, 100), *np.zeros((2, 100))], axis=1)
     ranges = np.linalg.norm(track - np.array([10.0, 50.0, 0.0]), axis=1)
-    start = beacon_start(
-        track, ranges, sigma=np.full(100, 0.3), prior_sigma=np.array([60.0, 60.0, 2.0])
-    )
-    assert start.rival is not None
-    np.testing.assert_allclose(np.abs([start.offset[1], start.rival[1]]), 50.0, atol=3.0)
-    assert start.offset[1] * start.rival[1] < 0.0
+    heard = BeaconRanges("beacon_1", track, ranges, np.full(100, 0.3), np.array([60.0, 60.0, 2.0]))
+    found, _ = beacon_start(heard)
+    rival = rival_place(heard, found, apart_m=5.0)
+    assert rival is not None
+    np.testing.assert_allclose(np.abs([found[1], rival[1]]), 50.0, atol=3.0)
+    assert found[1] * rival[1] < 0.0
+    assert rival_place(heard, found, apart_m=200.0) is None
+
+
+def test_an_answer_with_a_beacon_on_either_side_is_suspect() -> None:
+    """After a straight run past it."""
+    beacon = BeaconSettings(5, (150.0, 200.0, -45.0), (20.0, -20.0, 1.0), (80.0, 80.0, 3.0))
+    sim = simulated(duration_s=200.0, route=TransitRoute(), aids=ranging(beacon, interval_s=2.0))
+    estimate = SsmSmoother().solve(build_problem(sim.mission))
+    assert estimate.status is Status.SUSPECT
+    assert "beacon_5 may as well be" in estimate.reason
 
 
 def test_the_smoother_starts_an_unknown_beacon_near_its_place() -> None:
