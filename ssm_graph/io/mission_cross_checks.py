@@ -40,8 +40,11 @@ def _times(mission: Mission, tables: dict[str, Table]) -> list[str]:
     for name, table in tables.items():
         if name == "imu" or len(table) == 0:
             continue
-        first, last = float(table.time_s[0]), float(table.time_s[-1])
-        inside = (table.time_s >= start - _EDGE_S) & (table.time_s <= end + _EDGE_S)
+        time_s = table.time_s
+        if "delay_s" in table:
+            time_s = time_s - np.nan_to_num(table["delay_s"])
+        first, last = float(time_s[0]), float(time_s[-1])
+        inside = (time_s >= start - _EDGE_S) & (time_s <= end + _EDGE_S)
         ratio = (last - first) / (end - start)
         if not inside.any() or (ratio > 20.0 and inside.mean() < 0.5):
             raise DataError(
