@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factors.similarity import WEIGHT_FLOOR, LogKernel, Similarity
+from factors.m_estimators import HuberKernel, TruncatedKernel
+from factors.similarity import WEIGHT_FLOOR, ExpKernel, LogKernel, Similarity
 from ssm_graph.aid_logs import AidLogs, HeadingLog, RangeLog, Standstill
 from ssm_graph.errors import ConfigError, DataError
 from ssm_graph.estimate import Determined, Status
@@ -27,7 +28,9 @@ from ssm_graph.simulation import (
     TransitRoute,
 )
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother, warm_start
+from ssm_graph.smoothers.beam_faults import FaultSearch
 from ssm_graph.smoothers.fixed_lag import solve_fixed_lag
+from ssm_graph.smoothers.gnc import Graduation
 from tests.aids_fixture import UNKNOWN, compass, ranging, usbl, with_every_aid
 from tests.helpers import simulated
 
@@ -180,6 +183,27 @@ def test_gross_fixes_and_ranges_lose_their_weight() -> None:
         sim = simulated(duration_s=200.0, aids=settings)
         status, _ = outliers(sim, section, name)
         assert status is Status.CONVERGED
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        SmootherConfig(kernel=ExpKernel()),
+        SmootherConfig(kernel=HuberKernel()),
+        SmootherConfig(kernel=TruncatedKernel(), graduation=Graduation()),
+        SmootherConfig(adapt_noise=True, fault_search=FaultSearch()),
+    ],
+    ids=lambda config: config.weighting,
+)
+def test_whatever_weighs_the_beams_the_aids_are_robust(config: SmootherConfig) -> None:
+    """Kernels that know but one component leave them to the log kernel; all of them settle."""
+    sim = simulated(duration_s=100.0, aids=usbl(0.2, interval_s=2.0))
+    estimate = SsmSmoother(config).solve(build_problem(sim.mission))
+    assert estimate.status is Status.CONVERGED
+    assert estimate.aids is not None
+    weight = estimate.aids.weight[::3]
+    assert weight[sim.aids.gross["usbl"]].max() < 0.15
+    assert np.isfinite(estimate.cost)
 
 
 def test_a_disturbed_compass_loses_its_weight() -> None:

@@ -1,0 +1,57 @@
+"""What the smoother finds of beacons and compasses lies within what it claims, over many runs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ssm_graph.data import Array
+from ssm_graph.estimate import Estimate
+from ssm_graph.problem.problem import build_problem
+from ssm_graph.simulation import BeaconSettings, SurveyRoute
+from ssm_graph.smoothers.batch import SsmSmoother
+from tests.aids_fixture import compass, ranging
+from tests.helpers import assert_consistent, simulated
+
+pytestmark = pytest.mark.slow
+RUNS = 25
+PRIOR_M = (40.0, 40.0, 6.0)
+ROUTE = SurveyRoute(line_m=60.0)
+
+
+def nees(estimate: Estimate, truth: dict[str, Array]) -> float:
+    """Return the NEES of some variables of a calibration together."""
+    calibration = estimate.calibration
+    assert calibration is not None
+    kept = [i for i, value in enumerate(calibration.values) if value.variable in truth]
+    found = np.array([calibration.values[i].value for i in kept])
+    order = dict.fromkeys(calibration.values[i].variable for i in kept)
+    error = found - np.concatenate([truth[variable] for variable in order])
+    return float(error @ np.linalg.solve(calibration.covariance[np.ix_(kept, kept)], error))
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.1])
+def test_unknown_beacons_lie_where_their_sigmas_say(rate: float) -> None:
+    """Stated with errors drawn from the prior, with and without echoes."""
+    found = []
+    for seed in range(RUNS):
+        off = np.random.default_rng([seed, 7]).standard_normal(3) * PRIOR_M
+        beacon = BeaconSettings(7, (90.0, -60.0, -50.0), (off[0], off[1], off[2]), PRIOR_M)
+        aids = ranging(beacon, rate=rate, interval_s=2.0)
+        sim = simulated(duration_s=200.0, route=ROUTE, aids=aids, seed=seed)
+        estimate = SsmSmoother().solve(build_problem(sim.mission))
+        found.append(nees(estimate, {"beacon_7": -off}))
+    # On clean data the log kernel's errors have 1.1 times the variance that it claims.
+    assert_consistent(np.array(found) / 1.1, dof=3)
+
+
+def test_errors_of_a_compass_lie_where_their_sigmas_say() -> None:
+    """Offset and iron, drawn anew in every run."""
+    names = ("heading_offset", "heading_one_cycle", "heading_two_cycle")
+    found = []
+    for seed in range(RUNS):
+        sim = simulated(duration_s=200.0, route=ROUTE, aids=compass(), seed=seed)
+        estimate = SsmSmoother().solve(build_problem(sim.mission))
+        truth = np.split(sim.aids.heading_errors, [1, 3])
+        found.append(nees(estimate, dict(zip(names, truth, strict=True))))
+    assert_consistent(np.array(found), dof=5)
