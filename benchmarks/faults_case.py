@@ -129,19 +129,22 @@ class Errors(NamedTuple):
         return np.abs(self.error) / self.sigma
 
 
+def stage_config(stage: Stage) -> SimulationConfig:
+    """Return what is simulated."""
+    return SimulationConfig(
+        route=SurveyRoute(line_m=60.0),
+        duration_s=stage.duration_s,
+        grade=Grade.TACTICAL,
+        dvl=DvlSettings(rate_hz=2.0),
+        gnss=GnssSettings(windows=stage.gnss),
+        seed=stage.seed,
+    )
+
+
 @cache
 def simulated_stage(stage: Stage) -> tuple[SimulatedMission, Vehicle, tuple[Message, ...]]:
     """Return the mission, its vehicle and its messages."""
-    sim = simulate(
-        SimulationConfig(
-            route=SurveyRoute(line_m=60.0),
-            duration_s=stage.duration_s,
-            grade=Grade.TACTICAL,
-            dvl=DvlSettings(rate_hz=2.0),
-            gnss=GnssSettings(windows=stage.gnss),
-            seed=stage.seed,
-        )
-    )
+    sim = simulate(stage_config(stage))
     vehicle = vehicle_of(sim.mission)
     if not stage.is_aligned:
         vehicle = replace(vehicle, initial=None)

@@ -11,6 +11,7 @@ import math
 import socket
 import tempfile
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -23,6 +24,7 @@ from benchmarks.faults_case import (
     Sent,
     Stage,
     simulated_stage,
+    stage_config,
     undisturbed_stream,
 )
 from benchmarks.faults_transforms import untouched
@@ -45,6 +47,7 @@ from benchmarks.faults_vessel import (
     vanishing,
 )
 from ssm_graph.cli.online import engine_of
+from ssm_graph.data import DepthLog
 from ssm_graph.io.raw_log import replay
 from ssm_graph.live.endpoints import LOOPBACK, Endpoint, Transport
 from ssm_graph.live.interfaces import Connections
@@ -66,8 +69,18 @@ from ssm_graph.messages import (
     Vehicle,
 )
 from ssm_graph.online import ONLINE
+from ssm_graph.simulation import DepthSettings, simulate
 
 STAGE: Final = Stage(duration_s=60.0, gnss=((0.0, 20.0),))
+
+
+@cache
+def eager_depths() -> DepthLog:
+    """Return what the mission's depth sensor would read 10 000 times a second."""
+    config = replace(stage_config(STAGE), depth=DepthSettings(rate_hz=1e4))
+    depths = simulate(config).mission.depth
+    assert depths is not None
+    return depths
 
 
 class SocketFault(NamedTuple):
@@ -99,7 +112,7 @@ FAULTS: Final = {
     ),
     "messages at 100 times the rate": SocketFault(
         f"10 000 depths/s more on the socket of the inertial data, {_SPAN}",
-        during(messages_flood),
+        lambda vessel, sent: during(messages_flood(eager_depths()))(vessel, sent),
         Rule(told="rate_limited", good_after_s=25.0),
     ),
     "a client that never reads": SocketFault(

@@ -10,7 +10,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Final
 
+import numpy as np
+
 from benchmarks.faults_case import Sent
+from ssm_graph.data import DepthLog
 from ssm_graph.live.endpoints import LOOPBACK
 from ssm_graph.live.json_messages import encode_message
 from ssm_graph.live.outputs import TcpServerOutput
@@ -155,17 +158,22 @@ def reports_flood(vessel: Vessel, sent: Sent) -> bool:
     return True
 
 
-def messages_flood(vessel: Vessel, sent: Sent) -> bool:
-    """Send 100 depths more with each inertial sample, 10 000/s."""
-    if isinstance(sent.message, ImuSample):
-        depth = 30.0 + vessel.rng.gauss(0.0, 0.01)
-        lines = [
-            encode_message(DepthReading(EPOCH_S + sent.true_s + 1e-5 * k, depth))
-            for k in range(100)
-        ]
-        vessel.others.sendall(b"".join(lines))
-        vessel.n_extra += len(lines)
-    return True
+def messages_flood(depths: DepthLog) -> Disturb:
+    """Send the readings of a far too eager depth sensor with the inertial samples."""
+
+    def flood(vessel: Vessel, sent: Sent) -> bool:
+        if isinstance(sent.message, ImuSample):
+            end = int(np.searchsorted(depths.time_s, sent.true_s))
+            begin = int(np.searchsorted(depths.time_s, sent.true_s - 0.01))
+            lines = [
+                encode_message(DepthReading(EPOCH_S + depths.time_s[k], depths.depth[k]))
+                for k in range(begin, end)
+            ]
+            vessel.others.sendall(b"".join(lines))
+            vessel.n_extra += len(lines)
+        return True
+
+    return flood
 
 
 def deaf_client(vessel: Vessel, sent: Sent) -> bool:

@@ -110,6 +110,9 @@ def add_estimator_options(parser: argparse.ArgumentParser) -> None:
         )
 
 
+MAX_RATE: Final = "inertial samples/s of one source, of other kinds a tenth; more are left out"
+
+
 def add_rates(parser: argparse.ArgumentParser) -> None:
     """Add how often what is done, and what one source may send."""
     limits = Limits()
@@ -117,7 +120,7 @@ def add_rates(parser: argparse.ArgumentParser) -> None:
         ("output-rate", 50.0, "HZ", "JSON answers at most so often"),
         ("nmea-rate", 1.0, "HZ", "NMEA answers at most so often"),
         ("checkpoint-every", 10.0, "SECONDS", "of data, from one checkpoint to the next"),
-        ("max-rate", limits.messages_per_s, "N", "messages/s of one source; more are left out"),
+        ("max-rate", limits.messages_per_s, "N", MAX_RATE),
         ("stall", limits.stall_s, "SECONDS", "a connection silent for so long is given up"),
     ):
         parser.add_argument(

@@ -12,12 +12,14 @@ from ssm_graph.live.decoder import Decoder
 from ssm_graph.live.framing import TokenBucket
 from ssm_graph.live.notices import BURST, Notices
 from ssm_graph.live.status import LinkState, SourceStatus
-from ssm_graph.messages import Message, Severity
+from ssm_graph.messages import ImuSample, Message, Severity
 
 CHUNK: Final = 65536
 """Bytes that are read of one source before the others have their turn."""
 IDLE_S: Final = 1.0
 """A source that is silent so long gets to feed nothing, which lets a decoder release what waits."""
+OTHERS_SHARE: Final = 0.1
+"""Of the rate of inertial samples, what each other kind of message may come at."""
 _AHEAD_S: Final = 0.1
 
 
@@ -44,8 +46,9 @@ class Limits:
     """What one source may do."""
 
     messages_per_s: float = 2000.0
+    """Inertial samples; of every other kind a tenth, so that none crowds out another."""
     burst: int = 4000
-    """Messages at once."""
+    """Inertial samples at once; of every other kind a tenth."""
     bytes_per_s: float = 6e5
     """In the mean, 300 for every message; a source that sends more is read no faster."""
     stall_s: float = 10.0
@@ -97,7 +100,7 @@ class Feed:
         self.name, self.address, self.limits = name, address, limits
         self.n_reconnects = 0
         self._make_decoder, self._notices = make_decoder, notices
-        self._bucket = TokenBucket(rate_per_s=limits.messages_per_s, burst=limits.burst)
+        self._buckets: dict[type[Message], TokenBucket] = {}
         self._n_bytes = self._n_messages = self._n_refused = 0
         self._free_s = self._last_s = -math.inf
         self._rate_hz, self._marked_s, self._n_marked = 0.0, -math.inf, 0
@@ -156,19 +159,31 @@ class Feed:
             n_bytes=self._n_bytes,
             n_messages=self._n_messages,
             n_refused=self._n_refused,
-            n_limited=self._bucket.n_refused,
+            n_limited=self._n_limited,
             n_reconnects=self.n_reconnects,
             rate_hz=self._rate_hz,
             age_s=now.steady_s - self._last_s,
         )
 
+    @property
+    def _n_limited(self) -> int:
+        return sum(bucket.n_refused for bucket in self._buckets.values())
+
+    def _bucket(self, kind: type[Message]) -> TokenBucket:
+        if kind not in self._buckets:
+            share = 1.0 if kind is ImuSample else OTHERS_SHARE
+            rate, burst = share * self.limits.messages_per_s, share * self.limits.burst
+            self._buckets[kind] = TokenBucket(rate_per_s=rate, burst=max(1, round(burst)))
+        return self._buckets[kind]
+
     def _limited(self, messages: list[Message], now: Now) -> list[Message]:
-        kept = [message for message in messages if self._bucket.admit(now.steady_s)]
+        kept = [m for m in messages if self._bucket(type(m)).admit(now.steady_s)]
         if len(kept) < len(messages):
             self.tell(
                 "rate_limited",
-                f"expected at most {self.limits.messages_per_s:g} messages/s, got more; "
-                f"{self._bucket.n_refused} were left out so far",
+                f"expected at most {self.limits.messages_per_s:g} inertial samples/s and "
+                f"{OTHERS_SHARE * self.limits.messages_per_s:g} messages/s of any other kind, got "
+                f"more; {self._n_limited} were left out so far",
                 Severity.WARNING,
             )
         if kept:

@@ -6,6 +6,7 @@ import math
 import socket
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -353,7 +354,7 @@ def test_a_flood_harms_nobody_else_and_is_said() -> None:
     limits = Limits(messages_per_s=200.0, burst=400)
     configs = [
         listening(Transport.TCP_SERVER, "imu", limits),
-        listening(Transport.UDP, "messages", limits),
+        listening(Transport.UDP, "messages"),
     ]
     flood = encode_message(IMU) * 500
     n_sent, duration_s, step_s = 0, 3.0, 0.01
@@ -572,3 +573,26 @@ def test_ipv6_works_where_there_is_any() -> None:
             client.sendall(encode_message(IMU))
             receiver.until(lambda: receiver.messages)
         assert receiver.messages == [IMU]
+
+
+def test_a_flood_of_one_kind_leaves_the_others_of_its_socket_alone() -> None:
+    """Of a hundred depths with each inertial sample the most are left out, of those none."""
+    clock = FakeTime()
+    with SocketHub([listening(Transport.UDP, "messages")], steady_s=clock.steady_s) as hub:
+        hub.poll(0.0)
+        sender = UdpSender(port_of(hub))
+        messages: list[Message] = []
+        for k in range(200):
+            depths = [encode_message(DepthReading(k + 1e-3 * n, 5.0)) for n in range(100)]
+            sender.send(encode_message(replace(IMU, time_s=float(k))))
+            for begin in range(0, 100, 20):
+                sender.send(b"".join(depths[begin : begin + 20]))
+            messages += hub.poll(0.0)
+            clock.now_s += 0.01
+        for _ in range(10):
+            messages += hub.poll(0.005)
+        sender.close()
+    samples = [m.time_s for m in messages if isinstance(m, ImuSample)]
+    assert samples == [float(k) for k in range(200)]
+    n_depths = len(messages) - len(samples)
+    assert 200.0 * 2.0 <= n_depths <= 200.0 * 2.0 + 400 + 1
