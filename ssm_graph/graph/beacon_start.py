@@ -165,7 +165,7 @@ def _unknown(
         ranges = aid.ranges
         for i in np.flatnonzero(~ranges.is_known):
             heard, name = ranges.beacon == i, beacon_name(int(ranges.number[i]))
-            if name not in extras:
+            if not heard.any():
                 continue
             k, whole = ranges.keyframe[heard], extras.columns(name)
             track_n = states.p_n[k] + states.R_nb[k] @ ranges.lever_arm_b

@@ -139,7 +139,7 @@ def _ranges(frame: LocalFrame, log: RangeLog, keyframe_s: Array) -> Ranges:
 
 
 def _headings(mission: Mission, log: HeadingLog, keyframe_s: Array) -> Headings:
-    reading = nearest(log.time_s, keyframe_s) if len(log.time_s) > 1 else 0 * keyframe_s.astype(int)
+    reading = nearest(log.time_s, keyframe_s)
     # A reading belongs to the keyframe nearest to it, and a keyframe has but its nearest reading.
     is_own = nearest(keyframe_s, log.time_s[reading]) == np.arange(len(keyframe_s))
     is_own &= is_inside(log.time_s[reading], keyframe_s[0], keyframe_s[-1])

@@ -95,7 +95,7 @@ class AidWeighing:
         return [
             doubt
             for aid in self.aids.all
-            if (doubt := self._doubt(aid, self.aids.of(aid, squares) / len(aid.components)))
+            if (doubt := self._doubt(aid, self.aids.of(aid, squares) / aid.dim))
         ]
 
     def _doubt(self, aid: WeightedAid, mean_sq: Array) -> str:

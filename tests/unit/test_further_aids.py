@@ -65,6 +65,29 @@ def test_what_lies_outside_is_left_out_and_said() -> None:
     assert any("3 USBL fixes outside" in note for note in problem.notes)
 
 
+def test_an_aid_without_a_measurement_in_the_mission_is_none() -> None:
+    """Each kind beside another one, and all of them together."""
+    sim = with_every_aid()
+    aids = sim.mission.aids
+    assert aids.usbl is not None
+    assert aids.ranges is not None
+    assert aids.heading is not None
+    late = AidLogs(
+        usbl=replace(aids.usbl, time_s=aids.usbl.time_s + 1e3),
+        ranges=replace(aids.ranges, time_s=aids.ranges.time_s + 1e3),
+        heading=replace(aids.heading, time_s=aids.heading.time_s + 1e3),
+        standstills=(Standstill(1e3, 2e3),),
+    )
+    for logs in (
+        replace(aids, standstills=late.standstills, usbl=late.usbl),
+        replace(aids, standstills=late.standstills, ranges=late.ranges, heading=late.heading),
+        late,
+    ):
+        estimate = SsmSmoother().solve(build_problem(replace(sim.mission, aids=logs)))
+        assert estimate.status is Status.CONVERGED
+        assert (estimate.aids is None) == (logs is late)
+
+
 def test_a_keyframe_has_one_heading_led_to_it_by_the_gyros() -> None:
     """At a quarter of a second from its reading, in a turn, and without noise, to 1e-4 rad."""
     sim = simulated(perfect_sensors=True, aids=compass(rate_hz=2.0), route=HoverRoute())

@@ -24,11 +24,11 @@ class UsblAid(WeightedAid):
 
     name = "USBL"
     unit = "m"
-    components = ("east", "north", "up")
     hint = "look at its delay, datum, lever arm and the ship's heading"
 
     def __init__(self, fixes: Fixes, extras: Extras) -> None:
-        super().__init__(fixes.keyframe, np.linalg.inv(np.linalg.cholesky(fixes.covariance_n)))
+        roots = np.linalg.inv(np.linalg.cholesky(fixes.covariance_n))
+        super().__init__(fixes.keyframe, roots, ("east", "north", "up") * len(roots))
         self._fixes, self._extras = fixes, extras
 
     def measured(self, at: RowStates, rows: Rows | int) -> Measured:
@@ -42,16 +42,12 @@ class RangeAid(WeightedAid):
 
     name = "range"
     unit = "m"
-    components = ("range",)
     hint = "look at places and numbers of the beacons, and the speed of sound"
 
     def __init__(self, ranges: Ranges, extras: Extras) -> None:
-        super().__init__(ranges.keyframe, 1.0 / ranges.sigma[:, None, None])
+        labels = [beacon_name(int(ranges.number[i])) for i in ranges.beacon]
+        super().__init__(ranges.keyframe, 1.0 / ranges.sigma[:, None, None], labels)
         self.ranges, self._extras = ranges, extras
-
-    def labels(self) -> list[str]:
-        """Return the names of the beacons."""
-        return [beacon_name(int(self.ranges.number[i])) for i in self.ranges.beacon]
 
     def is_to_known(self, i: int) -> bool:
         """Return whether one of the ranges is to a beacon at a known place."""

@@ -29,12 +29,11 @@ class HeadingAid(WeightedAid):
 
     name = "heading"
     unit = "rad"
-    components = ("heading",)
     hint = "look at its sign, declination and mounting, and at what iron is near it"
 
     def __init__(self, headings: Headings, extras: Extras, frame: LocalFrame) -> None:
         roots = np.full((len(headings.keyframe), 1, 1), 1.0 / headings.sigma)
-        super().__init__(headings.keyframe, roots)
+        super().__init__(headings.keyframe, roots, ["heading"] * len(roots))
         self._headings, self._extras, self._frame = headings, extras, frame
 
     def measured(self, at: RowStates, rows: Rows | int) -> Measured:
@@ -77,11 +76,11 @@ class StandstillAid(WeightedAid):
 
     name = "standstill"
     unit = "m/s"
-    components = ("east", "north", "up")
     hint = "look at its begin and end"
 
     def __init__(self, standstills: Standstills, extras: Extras) -> None:
-        super().__init__(standstills.keyframe, np.eye(3) / standstills.sigma[:, None, None])
+        roots = np.eye(3) / standstills.sigma[:, None, None]
+        super().__init__(standstills.keyframe, roots, ("east", "north", "up") * len(roots))
         self._width = extras.width
 
     def measured(self, at: RowStates, rows: Rows | int) -> Measured:  # noqa: ARG002

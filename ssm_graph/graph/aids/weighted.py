@@ -37,21 +37,27 @@ class WeightedAid(ABC):
     name: str
     unit: str
     """Of its errors: m, rad or m/s"""
-    components: tuple[str, ...]
     hint: str
     """What to look at when it contradicts the answer."""
 
-    def __init__(self, keyframe: NDArray[np.intp], root_information: Array) -> None:
-        """Take the keyframes (N,) of the measurements and what whitens them (N, d, d)."""
+    def __init__(
+        self, keyframe: NDArray[np.intp], root_information: Array, labels: Sequence[str]
+    ) -> None:
+        """Take the keyframes (N,) of the measurements and what whitens them (N, d, d).
+
+        ``labels`` are what the components of all of them are called, (N d,).
+        """
         self.keyframe, self.root_information = keyframe, root_information
+        self.labels = tuple(labels)
+
+    @property
+    def dim(self) -> int:
+        """Components of each measurement."""
+        return int(self.root_information.shape[-1])
 
     @abstractmethod
     def measured(self, at: RowStates, rows: Rows | int) -> Measured:
         """Linearise some of the measurements at their states."""
-
-    def labels(self) -> list[str]:
-        """Return what the components of all measurements are called, (N d,)."""
-        return list(self.components) * len(self.keyframe)
 
     @final
     def whitened(self, at: RowStates, rows: Rows | int) -> Measured:
@@ -76,7 +82,7 @@ class WeightedAids:
 
     def __init__(self, aids: Sequence[WeightedAid]) -> None:
         self.all = tuple(aids)
-        sizes = [np.full(len(aid.keyframe), len(aid.components)) for aid in self.all]
+        sizes = [np.full(len(aid.keyframe), aid.dim) for aid in self.all]
         self.dim = np.concatenate([np.zeros(0, dtype=np.intp), *sizes])
         """(M,) components of each measurement"""
         self.measurement = np.repeat(np.arange(len(self.dim)), self.dim)
@@ -90,9 +96,9 @@ class WeightedAids:
         keyframes, errors, jacobians = [], [], []
         for aid in self.all:
             error, jacobian = aid.whitened(aid.at_keyframes(states), np.s_[:])
-            keyframes.append(np.repeat(aid.keyframe, len(aid.components)))
+            keyframes.append(np.repeat(aid.keyframe, aid.dim))
             errors.append(error.ravel())
-            jacobians.append(jacobian.reshape(len(error) * len(aid.components), -1))
+            jacobians.append(jacobian.reshape(-1, jacobian.shape[-1]))
         return AidRows(np.concatenate(keyframes), np.concatenate(errors), np.concatenate(jacobians))
 
     def weighted_rows(self, states: States, weights: Array) -> AidRows:
@@ -126,13 +132,13 @@ class WeightedAids:
         innovations = [
             -aid.measured(aid.at_keyframes(states), np.s_[:]).error.ravel() for aid in self.all
         ]
-        repeated = [len(aid.components) * len(aid.keyframe) for aid in self.all]
+        repeated = [aid.dim * len(aid.keyframe) for aid in self.all]
         keyframe = np.concatenate([aid.keyframe for aid in self.all])
         kinds = zip(self.all, repeated, strict=True)
         names = [(aid.name, aid.unit) for aid, count in kinds for _ in range(count)]
         return AidTable(
             aid=tuple(name for name, _ in names),
-            component=tuple(label for aid in self.all for label in aid.labels()),
+            component=tuple(label for aid in self.all for label in aid.labels),
             unit=tuple(unit for _, unit in names),
             time_s=keyframe_s[keyframe][self.measurement],
             innovation=np.concatenate(innovations),
