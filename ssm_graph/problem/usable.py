@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ssm_graph.aid_logs import AidLogs
 from ssm_graph.data import Array, Mission
 from ssm_graph.errors import DataError
 
@@ -29,6 +30,7 @@ def require_usable(mission: Mission) -> None:
     _finite("dvl.speed", np.where(has_speed, dvl.speed, 0.0))
     _positive("dvl.sigma", np.where(has_speed, dvl.sigma, 1.0))
     _require_aids(mission)
+    _require_further(mission.aids)
 
 
 def _require_aids(mission: Mission) -> None:
@@ -49,6 +51,29 @@ def _require_aids(mission: Mission) -> None:
         _finite("initial.velocity_enu", initial.velocity_enu)
         for name in ("position_sigma_enu", "velocity_sigma_enu", "attitude_sigma"):
             _positive(f"initial.{name}", getattr(initial, name))
+
+
+def _require_further(aids: AidLogs) -> None:
+    usbl, ranges, heading = aids.usbl, aids.ranges, aids.heading
+    if usbl is not None:
+        _positive("aids.usbl.sigma_enu", usbl.sigma_enu)
+        for name in ("time_s", "delay_s", "lat", "lon", "height", "lever_arm_b"):
+            _finite(f"aids.usbl.{name}", getattr(usbl, name))
+    if ranges is not None:
+        _positive("aids.ranges.sigma", ranges.sigma)
+        for name in ("time_s", "range_m", "lever_arm_b"):
+            _finite(f"aids.ranges.{name}", getattr(ranges, name))
+        for beacon in ranges.beacons:
+            place = np.array([beacon.lat, beacon.lon, beacon.height])
+            _finite(f"aids.ranges.beacons, number {beacon.number}", place)
+            if not beacon.is_known:
+                name = f"aids.ranges.beacons, number {beacon.number}, position_sigma_enu"
+                _positive(name, beacon.position_sigma_enu)
+    if heading is not None:
+        _increasing("aids.heading.time_s", heading.time_s)
+        _finite("aids.heading.heading", heading.heading)
+        _positive("aids.heading.sigma", np.array([heading.sigma]))
+        _positive("aids.heading.errors.correlation_s", np.array([heading.errors.correlation_s]))
 
 
 def _finite(name: str, values: Array) -> None:

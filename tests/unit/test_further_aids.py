@@ -383,3 +383,35 @@ def test_plain_weights_ignore_the_posterior() -> None:
     assert with_ is not None
     assert without is not None
     assert without.mahalanobis_sq.mean() < with_.mahalanobis_sq.mean()
+
+
+@pytest.mark.parametrize(
+    ("log", "field", "value"),
+    [
+        ("usbl", "sigma_enu", 0.0),
+        ("usbl", "height", np.nan),
+        ("usbl", "delay_s", np.inf),
+        ("ranges", "range_m", np.nan),
+        ("ranges", "sigma", -1.0),
+        ("heading", "heading", np.nan),
+        ("heading", "time_s", -1.0),
+    ],
+)
+def test_a_value_that_no_smoother_can_use_is_named(log: str, field: str, value: float) -> None:
+    """In missions made in Python, which no reader has checked."""
+    mission = with_every_aid(duration_s=10.0).mission
+    changed = getattr(getattr(mission.aids, log), field).copy()
+    changed.flat[-1] = value
+    spoilt = replace(getattr(mission.aids, log), **{field: changed})
+    with pytest.raises(DataError, match=f"aids.{log}.{field}"):
+        build_problem(replace(mission, aids=replace(mission.aids, **{log: spoilt})))
+
+
+def test_a_beacon_known_along_one_axis_alone_is_named() -> None:
+    """Its prior would be infinitely strong there."""
+    mission = simulated(duration_s=10.0, aids=ranging(UNKNOWN)).mission
+    log = mission.aids.ranges
+    assert log is not None
+    flat = replace(log.beacons[0], position_sigma_enu=np.array([40.0, 40.0, 0.0]))
+    with pytest.raises(DataError, match="number 7, position_sigma_enu"):
+        build_problem(replace(mission, aids=AidLogs(ranges=replace(log, beacons=(flat,)))))

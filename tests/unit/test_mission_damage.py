@@ -14,12 +14,13 @@ from hypothesis import strategies as st
 from ssm_graph.data import Mission
 from ssm_graph.errors import SsmGraphError
 from ssm_graph.io.mission import read_mission
+from tests.mission_damage import AIDS_TABLES, aided
 from tests.mission_fixture import write_example
 
 Files = dict[str, bytes]
 Damage = Callable[[Files], None]
 
-TABLES = ("imu.csv", "dvl.csv", "depth.csv", "gnss.csv", "reference.csv")
+TABLES = ("imu.csv", "dvl.csv", "depth.csv", "gnss.csv", "reference.csv", *AIDS_TABLES)
 CELLS = st.one_of(
     st.sampled_from(
         ["", " ", "nan", "inf", "-inf", "1e999", "1e300", "-1e300", "1e-320", "0", "-1"]
@@ -45,6 +46,7 @@ def sound_files() -> Files:
     """Return a valid folder as bytes, with a shorter IMU table than usual."""
     with tempfile.TemporaryDirectory() as name:
         folder = write_example(Path(name))
+        aided(lambda _: None)(folder)
         return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 
@@ -133,7 +135,7 @@ def scale_damage(draw: st.DrawFn) -> Damage:
 @st.composite
 def toml_damage(draw: st.DrawFn) -> Damage:
     """Replace the value of a key, or delete or repeat its line."""
-    line, value = draw(st.integers(0, 80)), draw(TOML_VALUES)
+    line, value = draw(st.integers(0, 110)), draw(TOML_VALUES)
     kind = draw(st.sampled_from(["value", "value", "value", "delete", "repeat"]))
 
     def damage(files: Files) -> None:
@@ -162,6 +164,16 @@ def assert_sound(mission: Mission) -> None:
         gnss = mission.gnss
         needed += [gnss.time_s, gnss.lat, gnss.lon, gnss.height, gnss.lever_arm_b]
         sigmas.append(gnss.sigma_enu)
+    aids = mission.aids
+    if aids.usbl is not None:
+        needed += [aids.usbl.valid_s, aids.usbl.lat, aids.usbl.lon, aids.usbl.height]
+        sigmas.append(aids.usbl.sigma_enu)
+    if aids.ranges is not None:
+        needed += [aids.ranges.time_s, aids.ranges.range_m, aids.ranges.lever_arm_b]
+        sigmas.append(aids.ranges.sigma)
+    if aids.heading is not None:
+        needed += [aids.heading.time_s, aids.heading.heading]
+        sigmas.append(np.array([aids.heading.sigma, aids.heading.errors.correlation_s]))
     if mission.initial is not None:
         needed.append(mission.initial.velocity_enu)
         sigmas.append(mission.initial.attitude_sigma)
