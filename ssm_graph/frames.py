@@ -6,6 +6,8 @@ Letters: ``n`` navigation frame, ``l`` local east-north-up axes at the vehicle, 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from enum import Enum
 from typing import Final
 
 import numpy as np
@@ -17,6 +19,35 @@ Array = NDArray[np.float64]
 R_ENU_NED: Final[Array] = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 """North-east-down to east-north-up; its own inverse."""
 R_ENU_NED.setflags(write=False)
+
+
+class BodyAxes(Enum):
+    """Body axes of the world outside; inside they are forward-right-down."""
+
+    FRD = "FRD"
+    FLU = "FLU"
+    RFU = "RFU"
+
+
+R_FRD: Final[Mapping[BodyAxes, Array]] = {
+    BodyAxes.FRD: np.diag([1.0, 1.0, 1.0]),
+    BodyAxes.FLU: np.diag([1.0, -1.0, -1.0]),
+    BodyAxes.RFU: np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
+}
+"""Rotations to forward-right-down; each is its own inverse."""
+
+
+def to_frd(vectors: Array, axes: BodyAxes) -> Array:
+    """Return body vectors (..., 3) in forward-right-down."""
+    return np.asarray(vectors @ R_FRD[axes].T)
+
+
+def turned(vector: tuple[float, float, float], axes: BodyAxes) -> tuple[float, float, float]:
+    """Return one body vector in forward-right-down, or from there, digit by digit."""
+    x, y, z = vector
+    if axes is BodyAxes.FLU:
+        return x, -y, -z
+    return (y, x, -z) if axes is BodyAxes.RFU else vector
 
 
 def rotation_zyx(yaw: Array | float, pitch: Array | float, roll: Array | float) -> Array:

@@ -24,9 +24,7 @@ from scipy.spatial.transform import Rotation
 from ssm_graph.data import Array
 from ssm_graph.earth import LocalFrame
 from ssm_graph.errors import ConfigError, DataError, SsmGraphError
-from ssm_graph.frames import R_lb_from_roll_pitch_heading, phi_D_roll_pitch_heading
-from ssm_graph.io.mission_keys import BodyAxes
-from ssm_graph.io.mission_units import R_FRD
+from ssm_graph.frames import R_FRD, BodyAxes, R_lb_from_roll_pitch_heading, phi_D_roll_pitch_heading
 from ssm_graph.io.ros_messages import (
     CONVERTERS,
     FIX_TYPE,

@@ -10,10 +10,11 @@ from typing import Final
 
 from factors.kernels import KERNELS
 from ssm_graph.errors import ConfigError
+from ssm_graph.frames import BodyAxes
 from ssm_graph.live.decoder import Clock
 from ssm_graph.live.endpoints import OUTPUTS, parse_endpoint
 from ssm_graph.live.feed import CountingDecoder, Limits
-from ssm_graph.live.json_messages import BodyAxes, JsonDecoder
+from ssm_graph.live.json_messages import JsonDecoder
 from ssm_graph.live.nmea import NmeaDecoder, NmeaOptions
 from ssm_graph.live.outputs import OutputFormat
 from ssm_graph.live.sockets import InputConfig, OutputConfig

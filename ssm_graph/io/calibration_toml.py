@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from ssm_graph.data import Array, Mission
 from ssm_graph.estimate import CalibratedValue, Calibration, Determined
+from ssm_graph.frames import R_FRD, BodyAxes
 from ssm_graph.io.beacon_toml import beacon_lines
-from ssm_graph.io.mission_keys import BodyAxes
-from ssm_graph.io.mission_units import R_FRD, rpy_from_R_bd
+from ssm_graph.io.mission_units import rpy_from_R_bd
 
 CALIBRATION_NAME: Final = "calibration.toml"
 

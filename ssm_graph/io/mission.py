@@ -16,6 +16,7 @@ from ssm_graph.data import (
     Reference,
 )
 from ssm_graph.earth import LocalFrame
+from ssm_graph.frames import to_frd
 from ssm_graph.io.aid_reading import read_aids
 from ssm_graph.io.arrival_tables import read_arrival_table
 from ssm_graph.io.mission_checks import check_tables
@@ -44,7 +45,7 @@ from ssm_graph.io.mission_keys import (
     VELOCITY,
 )
 from ssm_graph.io.mission_toml import MissionToml, read_mission_toml, table_path
-from ssm_graph.io.mission_units import interval_ends, to_frd
+from ssm_graph.io.mission_units import interval_ends
 from ssm_graph.io.mission_writer import write_mission
 from ssm_graph.io.tables import Order, Table, TableFormat, read_table
 

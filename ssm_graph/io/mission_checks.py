@@ -13,20 +13,19 @@ import numpy as np
 
 from ssm_graph.data import Array
 from ssm_graph.errors import DataError
+from ssm_graph.frames import BodyAxes, to_frd
 from ssm_graph.io.mission_dvl_checks import check_dvl
 from ssm_graph.io.mission_keys import (
     ACCEL,
     ATTITUDE,
-    DEEPEST_M,
     GYRO,
     LIMITS,
     POSITION_SIGMA,
     VELOCITY,
-    BodyAxes,
 )
 from ssm_graph.io.mission_toml import MissionToml
-from ssm_graph.io.mission_units import to_frd
 from ssm_graph.io.tables import Table
+from ssm_graph.plausible import DEEPEST_M
 
 RATE_RANGE_HZ: Final = (5.0, 20000.0)
 """A slower IMU cannot carry a vehicle's motion between pings; a faster one has other units."""

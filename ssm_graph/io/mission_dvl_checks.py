@@ -8,8 +8,9 @@ import numpy as np
 
 from ssm_graph.data import Array
 from ssm_graph.errors import DataError
-from ssm_graph.io.mission_keys import LARGEST_SPEED, LIMITS, RANGE, SPEED, SPEED_SIGMA
+from ssm_graph.io.mission_keys import LIMITS, RANGE, SPEED, SPEED_SIGMA
 from ssm_graph.io.tables import Table
+from ssm_graph.plausible import LARGEST_SPEED
 
 FASTEST: Final = 20.0
 """m/s, of 99 % of the beam speeds."""

@@ -14,16 +14,9 @@ from ssm_graph.data import N_BEAMS
 from ssm_graph.io.aid_keys import AID_LIMITS, AID_SECTIONS, AID_TABLES
 from ssm_graph.io.settings import Key, optional_key, sigma_key
 from ssm_graph.io.tables import TableSpec
+from ssm_graph.plausible import DEEPEST_M, LARGEST_SPEED
 
 FORMAT: Final = 1
-
-
-class BodyAxes(Enum):
-    """Axes of the body quantities in the tables and of the lever arms."""
-
-    FRD = "FRD"
-    FLU = "FLU"
-    RFU = "RFU"
 
 
 class Stamp(Enum):
@@ -126,9 +119,6 @@ POSITION_SIGMA: Final = ("sigma_east_m", "sigma_north_m", "sigma_up_m")
 VELOCITY: Final = ("vel_east_m_per_s", "vel_north_m_per_s", "vel_up_m_per_s")
 ATTITUDE: Final = ("roll_deg", "pitch_deg", "heading_deg")
 
-LARGEST_SPEED: Final = 30.0
-"""m/s, of any single beam speed: a number beyond it is a code."""
-DEEPEST_M: Final = 12000.0
 _ABOVE_ZERO: Final = math.ulp(0.0)
 LIMITS: Final[Mapping[str, tuple[float, float]]] = {
     **dict.fromkeys(GYRO, (-100.0, 100.0)),

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ssm_graph.errors import ConfigError, nearest_hint
+from ssm_graph.frames import BodyAxes
 from ssm_graph.io.aid_keys import LISTS
 from ssm_graph.io.mission_keys import (
     FORMAT,
@@ -17,7 +18,6 @@ from ssm_graph.io.mission_keys import (
     REQUIRED_SECTIONS,
     SECTIONS,
     TABLES,
-    BodyAxes,
     Stamp,
 )
 from ssm_graph.io.settings import TOML_NAME, Settings, read_settings, shown

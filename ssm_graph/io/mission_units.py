@@ -10,7 +10,7 @@ import numpy as np
 
 from ssm_graph.data import Array
 from ssm_graph.frames import rotation_zyx
-from ssm_graph.io.mission_keys import BodyAxes, Stamp
+from ssm_graph.io.mission_keys import Stamp
 
 MICRO_G: Final = 9.80665e-6
 """m/s^2"""
@@ -38,13 +38,6 @@ SI: Final[Mapping[str, float]] = {
 }
 """One unit of a key in SI units; keys that are not listed are in SI units already."""
 
-R_FRD: Final[Mapping[BodyAxes, Array]] = {
-    BodyAxes.FRD: np.diag([1.0, 1.0, 1.0]),
-    BodyAxes.FLU: np.diag([1.0, -1.0, -1.0]),
-    BodyAxes.RFU: np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
-}
-"""Rotations from the body axes of the file to forward-right-down."""
-
 
 def to_si(key: str, value: float) -> float:
     """Return ``value`` of the TOML key ``key`` in SI units and radians."""
@@ -59,11 +52,6 @@ def from_si(key: str, value: float) -> float:
         if to_si(key, short) == value:
             return short
     return exact
-
-
-def to_frd(vectors: Array, axes: BodyAxes) -> Array:
-    """Return body vectors (..., 3) in forward-right-down."""
-    return np.asarray(vectors @ R_FRD[axes].T)
 
 
 def interval_ends(time_s: Array, stamp: Stamp) -> tuple[float, Array]:

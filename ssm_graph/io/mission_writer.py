@@ -22,6 +22,7 @@ from ssm_graph.data import (
 )
 from ssm_graph.earth import LocalFrame
 from ssm_graph.errors import DataError
+from ssm_graph.frames import BodyAxes
 from ssm_graph.io.aid_writer import aid_settings, aid_tables
 from ssm_graph.io.mission_keys import (
     ACCEL,
@@ -34,7 +35,6 @@ from ssm_graph.io.mission_keys import (
     SPEED_SIGMA,
     TIME,
     VELOCITY,
-    BodyAxes,
     Stamp,
 )
 from ssm_graph.io.mission_units import R_bd_from_rpy, from_si, rpy_from_R_bd

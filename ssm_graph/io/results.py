@@ -20,6 +20,7 @@ import numpy as np
 from ssm_graph.data import Array, Mission
 from ssm_graph.errors import DataError
 from ssm_graph.estimate import AidTable, BeamTable, Estimate, Trajectory
+from ssm_graph.frames import BodyAxes
 from ssm_graph.io.calibration_toml import CALIBRATION_NAME, calibration_toml
 from ssm_graph.io.csv_tables import (
     CsvFile,
@@ -28,7 +29,6 @@ from ssm_graph.io.csv_tables import (
     read_csv_header,
     read_csv_values,
 )
-from ssm_graph.io.mission_keys import BodyAxes
 from ssm_graph.io.mission_units import SI
 from ssm_graph.io.results_summary import MetricsLike, build_summary
 

@@ -25,7 +25,7 @@ from typing import Any, Final, NamedTuple
 
 from ssm_graph.data import N_BEAMS
 from ssm_graph.errors import DataError
-from ssm_graph.io.mission_keys import BodyAxes
+from ssm_graph.frames import BodyAxes, turned
 from ssm_graph.messages import DepthReading, Fix, ImuSample, Message, Ping, Vector
 
 IMU_TYPE: Final = "sensor_msgs/msg/Imu"
@@ -271,12 +271,10 @@ def _fix_sigma(message: Any, instead: Vector) -> Vector:
 
 
 def _in_frd(message: Any, field: str, axes: BodyAxes) -> Vector:
-    x, y, z = vector = _vector(getattr(message, field))
+    vector = _vector(getattr(message, field))
     if not all(math.isfinite(value) for value in vector):
         raise DataError(f"{type(message).__name__}: {field} is not finite: {vector}")
-    if axes is BodyAxes.FLU:
-        return (x, -y, -z)
-    return (y, x, -z) if axes is BodyAxes.RFU else vector
+    return turned(vector, axes)
 
 
 def _finite(message: Any, field: str) -> float:

@@ -32,6 +32,7 @@ from ssm_graph.io.ros_messages import STANDARD_GRAVITY, WATER_LINKED_TYPE, BeamS
 from ssm_graph.io.rosbag_beams import Beams, known_beams, proven_beams
 from ssm_graph.io.rosbag_rows import BagTopic, in_order, read_topics
 from ssm_graph.messages import Vehicle
+from ssm_graph.plausible import DEEPEST_M
 
 NOISE: Final = ImuNoise(
     gyro_density=1.2e-4,
@@ -50,7 +51,6 @@ DEPTH_SIGMA: Final = 0.1
 _GAP_STEPS: Final = 5.0
 _GRAVITY_SHARE: Final = 0.1
 _ABOVE_WATER_M: Final = 2.0
-_DEEPEST_M: Final = 12_000.0
 
 
 def convert_rosbag(
@@ -252,7 +252,7 @@ def _depth(
     if table is None or len(table) == 0:
         return None, []
     typical = float(np.median(table[:, 1])) + (options.surface_height or 0.0)
-    if not -_ABOVE_WATER_M < typical < _DEEPEST_M:
+    if not -_ABOVE_WATER_M < typical < DEEPEST_M:
         raise DataError(
             f"{bag}: the pressures are those of {typical:.1f} m depth; expected absolute pressure "
             f"in pascal; for a sensor that reads 0 at the surface try  --atmosphere 0"

@@ -13,6 +13,7 @@ import tomli_w
 
 from ssm_graph.data import Array, DepthCalibration, GnssCalibration, Mission
 from ssm_graph.errors import ConfigError
+from ssm_graph.frames import BodyAxes
 from ssm_graph.io.aid_reading import sections_of_aids
 from ssm_graph.io.mission_instruments import (
     depth_calibration,
@@ -23,7 +24,7 @@ from ssm_graph.io.mission_instruments import (
     lever_arm_b,
     stated_frame,
 )
-from ssm_graph.io.mission_keys import FORMAT, SECTIONS, BodyAxes
+from ssm_graph.io.mission_keys import FORMAT, SECTIONS
 from ssm_graph.io.mission_toml import read_vehicle_toml
 from ssm_graph.io.mission_writer import (
     depth_calibration_settings,

@@ -6,13 +6,13 @@ import json
 import math
 from collections.abc import Callable
 from decimal import Context, Decimal
-from enum import Enum
 from typing import Any, Final
 
 import numpy as np
 
 from ssm_graph.data import N_BEAMS
 from ssm_graph.errors import nearest_hint
+from ssm_graph.frames import BodyAxes, turned
 from ssm_graph.live.decoder import (
     RefusedError,
     number,
@@ -42,14 +42,6 @@ _DIGITS = Context(prec=24)
 _DEG_PER_H = math.radians(1.0) / 3600.0
 _MICRO_G = 9.80665e-6
 _Beams = tuple[float, float, float, float]
-
-
-class BodyAxes(Enum):
-    """Axes of the inertial vectors outside; inside they are forward-right-down."""
-
-    FRD = "FRD"
-    FLU = "FLU"
-    RFU = "RFU"
 
 
 KEYS: Final[dict[str, tuple[str, ...]]] = {
@@ -106,7 +98,7 @@ def encode_message(message: Message, *, axes: BodyAxes = BodyAxes.FRD) -> bytes:
     digits, angles with 24.
     """
     if isinstance(message, ImuSample):
-        gyro, accel = (_turn(x, axes) for x in (message.gyro_b, message.accel_b))
+        gyro, accel = (turned(x, axes) for x in (message.gyro_b, message.accel_b))
         return _line(type="imu", time_s=message.time_s, gyro_rad_per_s=gyro, accel_m_per_s2=accel)
     if isinstance(message, Ping):
         sigma = {} if message.sigma is None else {"sigma_m_per_s": message.sigma}
@@ -194,14 +186,6 @@ def _radians(value: Any, *, key: str, limit_deg: float) -> float:
     return float(_EXACT.multiply(exact, _RAD_PER_DEG))
 
 
-def _turn(vector: Vector, axes: BodyAxes) -> Vector:
-    """Return a vector in FRD from ``axes`` or the other way: all turns are their own inverse."""
-    x, y, z = vector
-    if axes is BodyAxes.FLU:
-        return x, -y, -z
-    return (y, x, -z) if axes is BodyAxes.RFU else vector
-
-
 def _list(value: Any, count: int, *, key: str) -> list[Any]:
     if not isinstance(value, list) or len(value) != count:
         raise RefusedError(f"{key}: expected a list of {count} numbers, got {shown(str(value))}")
@@ -227,7 +211,7 @@ def _time(fields: dict[str, Any]) -> float:
 
 def _imu(fields: dict[str, Any], axes: BodyAxes) -> Message:
     gyro, accel = _vector(fields, "gyro_rad_per_s"), _vector(fields, "accel_m_per_s2")
-    return ImuSample(_time(fields), _turn(gyro, axes), _turn(accel, axes))
+    return ImuSample(_time(fields), turned(gyro, axes), turned(accel, axes))
 
 
 def _dvl(fields: dict[str, Any], _: BodyAxes) -> Message:

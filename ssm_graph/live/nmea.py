@@ -23,6 +23,7 @@ from ssm_graph.live.nmea_fields import (
     utc_seconds,
 )
 from ssm_graph.messages import DepthReading, Fix, Message, Vector
+from ssm_graph.plausible import DEEPEST_M, HIGHEST_M
 
 PLACE: Final = "nmea"
 MAX_SENTENCE: Final = 1024
@@ -30,7 +31,6 @@ MAX_SENTENCE: Final = 1024
 PASCAL_PER_DBAR: Final = 1e4
 STANDARD_GRAVITY: Final = 9.80665
 """m/s^2"""
-_HIGHEST_M, _DEEPEST_M = -100.0, 12000.0
 _FIXES = {"1", "2", "3", "4", "5", "9"}
 _NO_FIX = {"", "0"}
 
@@ -149,7 +149,7 @@ class NmeaDecoder(FramedDecoder):
         kind = name if name.startswith("P") else name[-3:]
         if kind in _DEPTHS and DepthSentence[kind] in self._options.depth_sentences:
             below_surface = _DEPTHS[kind](fields, self._options)
-            depth = number(below_surface, key="depth, m", low=_HIGHEST_M, high=_DEEPEST_M)
+            depth = number(below_surface, key="depth, m", low=-HIGHEST_M, high=DEEPEST_M)
             depth -= self._options.surface_height_m
             return [DepthReading(self._stamper.stamp(None, arrival_s), depth)]
         return []

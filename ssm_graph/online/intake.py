@@ -24,16 +24,13 @@ from ssm_graph.messages import (
 )
 from ssm_graph.online.buffers import Buffers
 from ssm_graph.online.events import EventLog
+from ssm_graph.plausible import DEEPEST_M, HIGHEST_M, LARGEST_SPEED
 from ssm_graph.stuck_beams import STUCK_PINGS, stuck_beams
 
 LARGEST_RATE: Final = 35.0
 """rad/s"""
 LARGEST_FORCE: Final = 200.0
 """m/s^2"""
-LARGEST_SPEED: Final = 30.0
-"""m/s along a beam"""
-DEPTHS: Final = (-100.0, 12_000.0)
-"""m"""
 AHEAD_S: Final = 5.0
 """Messages further ahead of the inertial data than this belong to another clock."""
 NEXT_S: Final = 2.5
@@ -118,7 +115,7 @@ class Intake:
                 if max(map(abs, message.accel_b)) > LARGEST_FORCE:
                     return "implausible", f"specific force {message.accel_b} m/s^2: a wrong unit?"
             case DepthReading():
-                if not DEPTHS[0] <= message.depth <= DEPTHS[1]:
+                if not -HIGHEST_M <= message.depth <= DEEPEST_M:
                     return "implausible", f"depth {message.depth:g} m: a wrong unit?"
             case Fix():
                 if abs(message.lat) > np.pi / 2 or abs(message.lon) > 2 * np.pi:

@@ -12,9 +12,17 @@ ROOT = Path(__file__).parents[2]
 MODULES = sorted(path for top in ("factors", "ssm_graph") for path in (ROOT / top).rglob("*.py"))
 IDS = [str(path.relative_to(ROOT)) for path in MODULES]
 
-FOUNDATION = {"errors", "earth", "frames", "data", "estimate", "messages", "stuck_beams"} | {
-    "frozen",
+FOUNDATION = {
     "aid_logs",
+    "data",
+    "earth",
+    "errors",
+    "estimate",
+    "frames",
+    "frozen",
+    "messages",
+    "plausible",
+    "stuck_beams",
 }
 MAY_IMPORT = {
     "factors": set[str](),

@@ -13,8 +13,8 @@ import tomli_w
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
+from ssm_graph.frames import BodyAxes
 from ssm_graph.io.mission import read_mission, write_mission
-from ssm_graph.io.mission_keys import BodyAxes
 from ssm_graph.io.results import read_results, write_results
 from ssm_graph.report import summary_table
 from tests import mission_fixture

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from ssm_graph.errors import DataError
-from ssm_graph.io.mission_keys import BodyAxes
-from ssm_graph.io.mission_units import R_FRD
+from ssm_graph.frames import R_FRD, BodyAxes
 from ssm_graph.io.ros_messages import (
     CONVERTERS,
     FIX_SIGMA,

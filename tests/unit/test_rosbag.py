@@ -17,10 +17,9 @@ import pytest
 from ssm_graph.cli.main import ExitCode, main
 from ssm_graph.data import Array, DvlMount, ImuNoise, Mission
 from ssm_graph.errors import ConfigError, DataError, MissingExtraError
+from ssm_graph.frames import R_FRD, BodyAxes
 from ssm_graph.io import rosbag_log
 from ssm_graph.io.mission import read_mission, write_mission
-from ssm_graph.io.mission_keys import BodyAxes
-from ssm_graph.io.mission_units import R_FRD
 from ssm_graph.io.ros_messages import BeamSign, RosOptions
 from ssm_graph.io.rosbag import BEAM_SIGMA, NOISE, convert_rosbag
 from ssm_graph.io.rosbag_beams import WATER_LINKED_BEAMS, proven_beams

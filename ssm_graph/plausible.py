@@ -1,0 +1,15 @@
+"""Numbers that no instrument on an underwater vehicle means: beyond them is a code or another unit.
+
+They do not judge an instrument; they are so wide that nothing real leaves them.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+LARGEST_SPEED: Final = 30.0
+"""m/s along a beam"""
+DEEPEST_M: Final = 12_000.0
+"""Depth, positive down"""
+HIGHEST_M: Final = 100.0
+"""Above the surface: a pressure sensor in air, and tides"""
