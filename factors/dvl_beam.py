@@ -143,7 +143,8 @@ def dvl_beam_factor(
     ValueError
         If a number is not finite, or ``sigma`` or ``weight`` is not above zero.
     """
-    measured = _checked(
+    measured = checked_beam(
+        "dvl_beam_factor",
         {"gyro_b": gyro_b, "beam_b": beam_b, "lever_arm_b": lever_arm_b, "omega_ie_n": omega_ie_n},
         speed=speed,
         sigma=sigma,
@@ -172,17 +173,17 @@ def dvl_beam_factor(
     return gtsam.CustomFactor(noise, [pose, velocity, bias], evaluate)
 
 
-def _checked(
-    vectors: dict[str, Array], *, speed: float, sigma: float, weight: float
+def checked_beam(
+    factor: str, vectors: dict[str, Array], *, speed: float, sigma: float, weight: float
 ) -> dict[str, Any]:
     """Return copies of what a factor measures, or raise: a wrong shape would crash the process."""
     frozen = {name: np.array(value, dtype=float) for name, value in vectors.items()}
     for name, value in frozen.items():
         if value.shape != (3,) or not np.all(np.isfinite(value)):
-            raise ValueError(f"dvl_beam_factor: {name}: expected 3 finite numbers, got {value}")
+            raise ValueError(f"{factor}: {name}: expected 3 finite numbers, got {value}")
     if not (np.isfinite(speed) and 0.0 < sigma < np.inf and 0.0 < weight < np.inf):
         raise ValueError(
-            "dvl_beam_factor: expected a finite speed and sigma and weight above zero, got "
+            f"{factor}: expected a finite speed and sigma and weight above zero, got "
             f"speed {speed}, sigma {sigma}, weight {weight}"
         )
     return {"speed": np.float64(speed), **frozen}

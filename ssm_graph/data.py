@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ssm_graph.aid_logs import NO_AIDS, AidLogs
 from ssm_graph.earth import LocalFrame
@@ -18,6 +19,7 @@ from ssm_graph.frozen import ReadOnlyArrays as ReadOnlyArrays
 from ssm_graph.frozen import optional_shaped as optional_shaped
 from ssm_graph.frozen import read_only as read_only
 from ssm_graph.frozen import shaped as shaped
+from ssm_graph.water_current import CurrentModel
 
 N_BEAMS = 4
 
@@ -113,7 +115,7 @@ class DvlMount(FrozenArrays):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DvlLog(FrozenArrays):
-    """Bottom-track pings; a beam speed is positive when the instrument moves along the beam."""
+    """Pings off the ground or off the water; a speed is positive when moving along the beam."""
 
     mount: DvlMount
     time_s: Array = shaped("N")
@@ -124,6 +126,29 @@ class DvlLog(FrozenArrays):
     """(N, 4) standard deviation of each speed, m/s, above zero."""
     range_m: Array | None = optional_shaped("N", N_BEAMS)
     """(N, 4) range along each beam, m; NaN where unknown."""
+    water_track: Array | None = optional_shaped("N")
+    """(N,) 1 where a ping is off the water, 0 where it is off the ground; None for all ground."""
+
+    @property
+    def is_water(self) -> NDArray[np.bool_]:
+        """(N,) which pings are off the water: their speeds are relative to its current."""
+        if self.water_track is None:
+            return np.zeros(len(self.time_s), bool)
+        return self.water_track > 0.0
+
+    def of_ground(self) -> DvlLog:
+        """Return the pings off the ground alone."""
+        if self.water_track is None:
+            return self
+        kept = ~self.is_water
+        return replace(
+            self,
+            time_s=self.time_s[kept],
+            speed=self.speed[kept],
+            sigma=self.sigma[kept],
+            range_m=None if self.range_m is None else self.range_m[kept],
+            water_track=None,
+        )
 
     @property
     def ping_s(self) -> Array:
@@ -248,5 +273,7 @@ class Mission:
     """What else the batch smoother is aided by."""
     initial: InitialState | None = None
     reference: Reference | None = None
+    current: CurrentModel | None = None
+    """Of the water, where pings are off it; None for one that is not stated."""
     notes: tuple[str, ...] = ()
     """What the reader noticed and a user should know, one sentence each."""

@@ -123,6 +123,23 @@ class Trajectory(FrozenArrays):
     """(N,) beam speeds used at the keyframe"""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class CurrentTrack(FrozenArrays):
+    """The current of the water along the vehicle's way, at the keyframes."""
+
+    time_s: Array = shaped("N")
+    velocity_enu: Array = shaped("N", 3)
+    """(N, 3) of the water over ground along east, north, up, m/s; up is zero where it is not
+    estimated."""
+    covariance_enu: Array = shaped("N", 3, 3)
+    """(N, 3, 3) (m/s)^2"""
+
+    @property
+    def sigma_enu(self) -> Array:
+        """(N, 3) m/s."""
+        return np.sqrt(np.diagonal(self.covariance_enu, axis1=1, axis2=2))
+
+
 class Determined(Enum):
     """How well the data determined a calibration; the text is shown to the user."""
 
@@ -224,6 +241,8 @@ class Estimate:
     """What became of the further aids; None where there are none."""
     noise: NoiseFound | None = None
     """What was found of their noise; None of what goes keyframe by keyframe."""
+    current: CurrentTrack | None = None
+    """What was found of the water's current; None without pings off the water."""
 
     @property
     def n_iterations(self) -> float:

@@ -20,6 +20,7 @@ from ssm_graph.estimate import (
     BeamTable,
     CalibratedValue,
     Calibration,
+    CurrentTrack,
     Estimate,
     Iteration,
     Status,
@@ -156,3 +157,12 @@ def calibrated(estimate: Estimate, *, gnss_sigma: float) -> Estimate:
     )
     calibration = Calibration(values, np.eye(len(values)), np.zeros((1, 0)))
     return replace(estimate, calibration=calibration)
+
+
+def with_current(estimate: Estimate) -> Estimate:
+    """Return the estimate with a current that turns slowly, known to 2 cm/s, level."""
+    time_s = estimate.trajectory.time_s
+    turned = 1e-3 * (time_s - time_s[0])
+    velocity = 0.5 * np.column_stack([np.sin(turned), np.cos(turned), np.zeros(len(time_s))])
+    covariance = np.tile(np.diag([4e-4, 4e-4, 0.0]), (len(time_s), 1, 1))
+    return replace(estimate, current=CurrentTrack(time_s, velocity, covariance))

@@ -22,6 +22,7 @@ from tests.mission_damage import (
     drop_section,
     every_second_code,
     lines,
+    new_column,
     parquet,
     raw,
     remove,
@@ -155,6 +156,18 @@ TOML_CASES = (
         toml("[depth]", "time_offset_s = 120\n\n[depth]"),
         ConfigError,
         ("[dvl] time_offset_s", "got 120", "not milliseconds"),
+    ),
+    Malformed(
+        "A current of zero",
+        toml("[depth]", "[current]\nsigma_m_per_s = 0.0\n\n[depth]"),
+        ConfigError,
+        ("[current] sigma_m_per_s", "above 0", "got 0.0", "m/s"),
+    ),
+    Malformed(
+        "Noise of water track in millimetres per second",
+        toml("beam_noise_m_per_s = 0.005", "beam_noise_m_per_s = 0.005\nwater_noise_m_per_s = 10"),
+        ConfigError,
+        ("[dvl] water_noise_m_per_s", "got 10", "not mm/s"),
     ),
     Malformed(
         "Nothing says where the mission was",
@@ -486,6 +499,12 @@ PHYSICS_CASES = (
         cell("dvl.csv", 20, "beam1_sigma_m_per_s", "0.0"),
         DataError,
         ("dvl.csv:20", "'beam1_sigma_m_per_s' holds 0.0", "beam_noise_m_per_s"),
+    ),
+    Malformed(
+        "A mark for water track that is neither 0 nor 1",
+        new_column("dvl.csv", "water_track", lambda k: "2" if k == 20 else "0"),
+        DataError,
+        ("dvl.csv:22", "'water_track' holds 2", "1 for a ping off the water"),
     ),
     Malformed(
         "Beam speeds with the opposite sign (PD0)",

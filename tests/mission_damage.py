@@ -85,6 +85,16 @@ def columns(file: str, names: list[str], change: Callable[[Array], Array]) -> Da
     return lines(file, change_lines)
 
 
+def new_column(file: str, name: str, text: Callable[[int], str]) -> Damage:
+    """Add a column; ``text`` is asked for the cell of each row, counted from 0."""
+
+    def change(rows: list[str]) -> list[str]:
+        body = [f"{row},{text(k)}" for k, row in enumerate(rows[1:])]
+        return [f"{rows[0]},{name}", *body]
+
+    return lines(file, change)
+
+
 def both(*damages: Damage) -> Damage:
     """Apply several damages."""
 

@@ -28,6 +28,7 @@ from ssm_graph.filters.geodetic_error_model import (
 )
 from ssm_graph.filters.geodetic_mechanisation import GeodeticState, Track, earth_terms
 from ssm_graph.problem.aids import Depths, Fixes
+from ssm_graph.problem.bottom_track import require_bottom_track
 from ssm_graph.problem.problem import Beams, Problem
 
 
@@ -91,6 +92,8 @@ class Measurements(NamedTuple):
 
 def gather(problems: Sequence[Problem]) -> Measurements:
     """Lay the measurements of runs with equally many keyframes side by side."""
+    for problem in problems:
+        require_bottom_track(problem)
     n = problems[0].n_keyframes
     widest = max((_most_per_keyframe(p.depths) for p in problems), default=0)
     return Measurements(

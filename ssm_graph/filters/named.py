@@ -24,6 +24,7 @@ from ssm_graph.filters.navigation import Grouping, run_filter
 from ssm_graph.filters.rts import smooth_history
 from ssm_graph.filters.ssm import SsmUpdate
 from ssm_graph.filters.student import StudentUpdate
+from ssm_graph.problem.bottom_track import without_water_track
 from ssm_graph.problem.error_state import Linearised
 from ssm_graph.problem.problem import Problem
 from ssm_graph.problem.recursive import RecursiveBeams, recursive_estimate
@@ -140,6 +141,7 @@ def filter_problems(
     choice = FILTERS[name]
     if value is not None and choice.default is None:
         raise ConfigError(f"filter {name}: expected no parameter, got {value:g}; leave it out")
+    problems = [without_water_track(problem) for problem in problems]
     rule = choice.make(choice.default if value is None else value)
     history = run_filter(problems, rule, grouping=choice.grouping, on_keyframe=on_keyframe)
     states = smooth_history(history) if smoothed else history.posterior
@@ -171,6 +173,7 @@ def filter_geodetic(
     """
     begin = time.perf_counter()
     config = config or GeodeticConfig()
+    problems = [without_water_track(problem) for problem in problems]
     history = run_geodetic(problems, imu, config, on_keyframe=on_keyframe)
     wall_s = (time.perf_counter() - begin) / len(problems)
     estimates = []

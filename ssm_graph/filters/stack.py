@@ -13,6 +13,7 @@ from ssm_graph.earth import LocalFrame
 from ssm_graph.errors import ConfigError, DataError
 from ssm_graph.filters.process import Process
 from ssm_graph.imu.arrays import interval_arrays
+from ssm_graph.problem.bottom_track import require_bottom_track
 from ssm_graph.problem.problem import Problem, start_of
 from ssm_graph.problem.states import NavigationStates
 
@@ -138,6 +139,7 @@ def _stack_beams(problems: Sequence[Problem]) -> BeamStack:
     gyro_b = np.zeros((*shape[:2], 1, 3))
     beam_b = np.zeros((len(problems), N_BEAMS, 3))
     for run, problem in enumerate(problems):
+        require_bottom_track(problem)
         beams = problem.beams
         _require_single(beams.keyframe * N_BEAMS + beams.beam, problem)
         speed[beams.keyframe, run, beams.beam] = beams.speed

@@ -7,7 +7,7 @@ off by for long, and the beams that are right get the rest.
 
 One elimination of the chain serves any number of columns. With its conditionals ``R_k d_k + S_k
 d_{k+1} = rhs_k`` what the trajectory explains is ``sum y_k'y_k``, ``y_k = R_k^-T (A_k'c_k -
-S_{k-1}' y_{k-1})``. Of a column that has ended 15 numbers go on, and all that they will explain to
+S_{k-1}' y_{k-1})``. Of a column that has ended n numbers go on, and all that they will explain to
 the end of the mission is one quadratic form, known from a pass backwards.
 """
 
@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from ssm_graph.data import Array
 from ssm_graph.graph.bordered import BorderedSolution
-from ssm_graph.problem.error_state import STATE_DIM
 
 
 class Evidence(NamedTuple):
@@ -39,7 +38,7 @@ class WhitenedBeams(NamedTuple):
     keyframe: NDArray[np.intp]
     """(M,)"""
     jacobian: Array
-    """(M, 15)"""
+    """(M, n)"""
     missed: Array
     """(M,) measured minus predicted, at the solution"""
 
@@ -48,18 +47,18 @@ class _Carried(NamedTuple):
     """How the columns that act in one block go through its keyframes."""
 
     transition: Array
-    """(15, 15) what is left at its end of what columns before it had left"""
+    """(n, n) what is left at its end of what columns before it had left"""
     explained: Array
-    """(B + C, 15 + B + C) by its keyframes: against what was left before, and among themselves"""
+    """(B + C, n + B + C) by its keyframes: against what was left before, and among themselves"""
     left: Array
-    """(15, B + C) at its end"""
+    """(n, B + C) at its end"""
 
 
 class ChainEvidence:
     """One solution of the chain, ready for columns anywhere along it."""
 
     def __init__(self, solution: BorderedSolution, beams: WhitenedBeams) -> None:
-        self._beams = beams
+        self._beams, self._n = beams, solution.R.shape[1]
         self._first_row = np.searchsorted(beams.keyframe, np.arange(len(solution.R) + 1)).tolist()
         R_invT = np.swapaxes(np.linalg.inv(solution.R), 1, 2)
         self._load = np.einsum("mij,mj->mi", R_invT[beams.keyframe], beams.jacobian, optimize=True)
@@ -67,7 +66,7 @@ class ChainEvidence:
         S = solution.R[:-1] @ solution.gain[:-1]
         self._step[1:] = -R_invT[1:] @ np.swapaxes(S, 1, 2)
         self._ahead = np.zeros_like(solution.R)
-        identity = np.eye(STATE_DIM)
+        identity = np.eye(self._n)
         for k in range(len(solution.R) - 2, -1, -1):
             step = self._step[k + 1]
             self._ahead[k] = step.T @ (identity + self._ahead[k + 1]) @ step
@@ -86,16 +85,16 @@ class ChainEvidence:
         common = np.arange(n, n + shared.shape[1])
         score, information = np.zeros(n + len(common)), np.zeros((n + len(common),) * 2)
         dense = np.hstack([own, shared])
-        left, left_shared = np.zeros((STATE_DIM, n)), np.zeros((STATE_DIM, len(common)))
+        left, left_shared = np.zeros((self._n, n)), np.zeros((self._n, len(common)))
         for i, (begin, end) in enumerate(itertools.pairwise(blocks)):
             now = np.arange(i * n_own, (i + 1) * n_own)
             active, before = np.concatenate([now, common]), slice(0, i * n_own)
             rows = slice(self._first_row[begin], self._first_row[end])
             score[active] += dense[rows].T @ self._beams.missed[rows]
             carried = self._carry(begin, end, dense, left_shared)
-            among = dense[rows].T @ dense[rows] - carried.explained[:, STATE_DIM:]
+            among = dense[rows].T @ dense[rows] - carried.explained[:, self._n :]
             information[np.ix_(active, active)] += among
-            crossed = carried.explained[:, :STATE_DIM] @ left[:, before]
+            crossed = carried.explained[:, : self._n] @ left[:, before]
             information[active, before] -= crossed
             left[:, before] = carried.transition @ left[:, before]
             left[:, now], left_shared = np.split(carried.left, [n_own], axis=1)
@@ -110,16 +109,16 @@ class ChainEvidence:
 
     def _carry(self, begin: int, end: int, dense: Array, left_shared: Array) -> _Carried:
         """Take the columns (M, B + C) of a block through its keyframes."""
-        width = dense.shape[1]
-        at = np.zeros((STATE_DIM, STATE_DIM + width))
-        at[:, :STATE_DIM] = np.eye(STATE_DIM)
-        at[:, STATE_DIM + width - left_shared.shape[1] :] = left_shared
+        width, n = dense.shape[1], self._n
+        at = np.zeros((n, n + width))
+        at[:, :n] = np.eye(n)
+        at[:, n + width - left_shared.shape[1] :] = left_shared
         history = np.empty((end - begin, *at.shape))
         for k in range(begin, end):
             at = self._step[k] @ at
             rows = slice(self._first_row[k], self._first_row[k + 1])
-            at[:, STATE_DIM:] += self._load[rows].T @ dense[rows]
+            at[:, n:] += self._load[rows].T @ dense[rows]
             history[k - begin] = at
-        flat = history.reshape(-1, STATE_DIM + width)
-        explained = flat[:, STATE_DIM:].T @ flat
-        return _Carried(at[:, :STATE_DIM], explained, at[:, STATE_DIM:])
+        flat = history.reshape(-1, n + width)
+        explained = flat[:, n:].T @ flat
+        return _Carried(at[:, :n], explained, at[:, n:])

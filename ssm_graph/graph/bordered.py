@@ -57,9 +57,13 @@ class BorderedSolution(NamedTuple):
 
     def covariance(self, size: int) -> Array:
         """Return the covariance (K, size, size) of the first states of every keyframe."""
-        part = self.sensitivity[:, :size]
+        return self.covariance_of(slice(0, size))
+
+    def covariance_of(self, states: slice) -> Array:
+        """Return the covariance (K, m, m) of some states of every keyframe."""
+        part = self.sensitivity[:, states]
         shared = part @ self.constants_cov @ np.swapaxes(part, 1, 2)
-        return np.asarray(self.conditional[:, :size, :size] + shared)
+        return np.asarray(self.conditional[:, states, states] + shared)
 
     def neighbour_covariance(self, size: int) -> Array:
         """Return the covariance (K - 1, size, size) of every keyframe with the next."""

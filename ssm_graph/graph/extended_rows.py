@@ -21,9 +21,12 @@ from factors.dvl_calibration import (
     no_way_back,
     turned_instrument,
 )
+from factors.water_track import ThroughWater
 from ssm_graph.data import N_BEAMS, Array
+from ssm_graph.earth import LocalFrame
 from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.states import States
+from ssm_graph.graph.water_rows import WaterRows
 from ssm_graph.problem.calibration import (
     DVL_BEAM_SCALE,
     DVL_LEVER_ARM,
@@ -82,10 +85,11 @@ class PreparedBeams(NamedTuple):
 
 
 class ExtendedBeams:
-    """Beam speeds of a problem whose DVL is to be calibrated."""
+    """Beam speeds of a problem whose DVL is to be calibrated, or tracks the water at times."""
 
-    def __init__(self, beams: Beams, extras: Extras, omega_ie_n: Array) -> None:
-        self._beams, self._extras, self._omega_ie_n = beams, extras, omega_ie_n
+    def __init__(self, beams: Beams, extras: Extras, frame: LocalFrame) -> None:
+        self._beams, self._extras, self._omega_ie_n = beams, extras, frame.omega_ie_n
+        self._water = WaterRows(beams, extras, frame)
         self._ping_keyframe = beams.keyframe[np.flatnonzero(np.diff(beams.ping, prepend=-1))]
         self._share = {DVL_TIME_OFFSET: 1.0, DVL_LEVER_ARM: 1.0}
 
@@ -109,6 +113,7 @@ class ExtendedBeams:
         parts, ratio = self._beams.motion.in_thirds(float(late_s))
         whole = self._beams.motion.at(float(late_s))
         of_ping = bias[self._ping_keyframe]
+        at, _ = self._relative(at, np.s_[:])
         found = [
             self._residual(at, prepared._replace(back=led_back(motion, of_ping, late_s)))
             for motion in (whole, *parts)
@@ -145,6 +150,7 @@ class ExtendedBeams:
         counts to first order.
         """
         beams, extras = self._beams, self._extras
+        at, through = self._relative(at, rows)
         residual = self._residual(at, prepared, rows)
         jacobian = np.zeros((len(residual.error), extras.width))
         jacobian[:, ROTATION] = residual.error_D_rotation
@@ -162,9 +168,16 @@ class ExtendedBeams:
         if DVL_BEAM_SCALE in extras:
             first = extras.columns(DVL_BEAM_SCALE).start
             jacobian[np.arange(len(jacobian)), first + beams.beam[rows]] = residual.error_D_scale
+        if through is not None:
+            self._water.fill(jacobian, residual.error_D_velocity_n, through)
         if prepared.bias is None:
             return BeamRows(residual.error, jacobian)
         return BeamRows(residual.error + jacobian @ self._since(at, prepared), jacobian)
+
+    def _relative(self, at: RowStates, rows: Rows) -> tuple[RowStates, ThroughWater | None]:
+        """Return the states with velocities relative to what reflects each beam."""
+        through = self._water.relative(at.v_n, p_n=at.p_n, walks=at.walks, rows=rows)
+        return at if through is None else at._replace(v_n=through.v_n), through
 
     def _residual(
         self, at: RowStates, prepared: PreparedBeams, rows: Rows = np.s_[:]

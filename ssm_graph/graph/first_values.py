@@ -119,7 +119,7 @@ class _ForwardPass:
                 self._predict(k - 1)
             self._update_fix(rows.fix[k])
             self._update_aids(k)
-            self._update_water(rows.beam[k], self._depth_row(rows.depth[k], k))
+            self._update_dvl(rows.beam[k], self._depth_row(rows.depth[k], k))
             walks = (self.extras.walks,) if self.extras else ()
             history.append((self.R_nb, self.p_n, self.v_n, self.bias, *walks))
         states = states_from_arrays(*(np.array(column) for column in zip(*history, strict=True)))
@@ -202,7 +202,7 @@ class _ForwardPass:
             H, innovation = self.extras.depth_row(H, innovation)
         return _Rows(H, np.array([innovation]), np.array([variance]))
 
-    def _update_water(self, rows: slice, depth: _Rows) -> None:
+    def _update_dvl(self, rows: slice, depth: _Rows) -> None:
         """Correct by the beams of one ping and a depth, together."""
         beams = self._beam_rows(rows) if rows.start < rows.stop else self.no_rows
         H, innovation, variance = (np.concatenate(pair) for pair in zip(beams, depth, strict=True))
@@ -226,7 +226,8 @@ class _ForwardPass:
         if self.without_beam >= LOCKED_OUT_PINGS:
             self.n_doubts += 1
             self.without_beam = 0
-            predicted = self._forget_velocity(H, innovation, predicted)
+            forget = self._forget_current if self._is_water(rows) else self._forget_velocity
+            predicted = forget(H, innovation, predicted)
             weights = settle_weights(innovation, predicted, variance, self.kernel)
         self.trust = updated_trust(self.trust, beam, weights)
         self.weights[rows] = weights
@@ -258,6 +259,16 @@ class _ForwardPass:
         self.P[:, VELOCITY] = 0.0
         variance = max(np.max(innovation**2), np.max(np.diag(predicted)))
         self.P[VELOCITY, VELOCITY] = variance * np.eye(3)
+        return np.asarray(H @ self.P @ H.T)
+
+    def _is_water(self, rows: slice) -> bool:
+        return bool(self.problem.beams.is_water[rows].all())
+
+    def _forget_current(self, H: Array, innovation: Array, predicted: Array) -> Array:
+        """Let the beams off the water set the current: it has changed, not the velocity."""
+        variance = max(np.max(innovation**2), np.max(np.diag(predicted)))
+        assert self.extras is not None
+        self.extras.forget_current(self.P, variance)
         return np.asarray(H @ self.P @ H.T)
 
     def _correct(self, H: Array, innovation: Array, innovation_cov: Array) -> None:

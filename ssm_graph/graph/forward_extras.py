@@ -9,6 +9,7 @@ from ssm_graph.graph.aids.positions import fix_rows
 from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.extended_rows import ExtendedBeams, PreparedBeams, RowStates
 from ssm_graph.problem.calibration import DEPTH_OFFSET
+from ssm_graph.problem.current import CURRENTS
 from ssm_graph.problem.error_state import STATE_DIM
 from ssm_graph.problem.problem import Problem
 
@@ -25,7 +26,7 @@ class ForwardExtras:
         self._problem = problem
         extras = problem.extras
         self.walks, self.constants = np.zeros(extras.n_walks), np.zeros(extras.n_constants)
-        self._beams = ExtendedBeams(problem.beams, extras, problem.frame.omega_ie_n)
+        self._beams = ExtendedBeams(problem.beams, extras, problem.frame)
         self._walk_factor, self._walk_sigma = extras.transitions(np.diff(problem.keyframe_s))
         self._last: PreparedBeams | None = None
 
@@ -46,6 +47,16 @@ class ForwardExtras:
         covariance[:, STATE_DIM:end] *= factor
         own = np.arange(STATE_DIM, end)
         covariance[own, own] += self._walk_sigma[k] ** 2
+
+    def forget_current(self, covariance: Array, variance: float) -> None:
+        """Let the current be anything of this variance, (m/s)^2, in place."""
+        extras = self._problem.extras
+        for name in sorted(CURRENTS):
+            if name in extras:
+                own = extras.columns(name)
+                covariance[own] = 0.0
+                covariance[:, own] = 0.0
+                covariance[own, own] = variance * np.eye(own.stop - own.start)
 
     def correct(self, step: Array) -> None:
         """Take the part of a step that is behind the error state."""

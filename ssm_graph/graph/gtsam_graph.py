@@ -43,8 +43,8 @@ def gtsam_graph(
     if problem.extras:
         names = ", ".join(block.name for block in problem.extras.blocks)
         raise ConfigError(
-            f"gtsam_graph: expected a problem of keyframes alone, got one that calibrates {names}: "
-            "take their prior sigmas out of mission.toml"
+            f"gtsam_graph: expected a problem of keyframes alone, got one that estimates {names}: "
+            "take their prior sigmas, or the pings off the water, out of the mission"
         )
     if problem.further.sections:
         raise ConfigError(

@@ -83,7 +83,7 @@ class GraphLinearizer:
         self._gradient, self._span_s = gravity_gradient(problem.frame), np.diff(problem.keyframe_s)
         self.prior = prior_at_start(start_of(problem))
         self.aids, self.weighted = full_aids(problem), weighted_aids(problem)
-        self._beams = ExtendedBeams(problem.beams, problem.extras, problem.frame.omega_ie_n)
+        self._beams = ExtendedBeams(problem.beams, problem.extras, problem.frame)
         self._n_judged = 0
         factor, sigma = problem.extras.transitions(self._span_s)
         self._walk_factor, self._walk_sigma = factor, sigma

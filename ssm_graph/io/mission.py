@@ -22,6 +22,7 @@ from ssm_graph.io.arrival_tables import read_arrival_table
 from ssm_graph.io.mission_checks import check_tables
 from ssm_graph.io.mission_cross_checks import check_mission
 from ssm_graph.io.mission_instruments import (
+    current_model,
     depth_calibration,
     dvl_mount,
     frame_at,
@@ -43,6 +44,7 @@ from ssm_graph.io.mission_keys import (
     SPEED_SIGMA,
     TABLES,
     VELOCITY,
+    WATER_TRACK,
 )
 from ssm_graph.io.mission_toml import MissionToml, read_mission_toml, table_path
 from ssm_graph.io.mission_units import interval_ends
@@ -89,6 +91,7 @@ def read_mission(folder: Path | str) -> Mission:
         aids=aids,
         initial=initial_state(toml["initial"]) if "initial" in toml else None,
         reference=_reference(tables["reference"]) if "reference" in tables else None,
+        current=current_model(toml["current"]) if "current" in toml else None,
     )
     notes += check_mission(mission, tables, toml)
     return replace(mission, notes=tuple(notes))
@@ -139,12 +142,17 @@ def _imu(table: Table, toml: MissionToml) -> ImuLog:
 def _dvl(table: Table, toml: MissionToml) -> DvlLog:
     settings = toml["dvl"]
     sigma = table.stack(SPEED_SIGMA)
+    water = np.nan_to_num(table.stack([WATER_TRACK])[:, 0])
+    noise = settings.number("beam_noise_m_per_s")
+    water_noise = settings.number("water_noise_m_per_s") or noise
+    nominal = np.where(water > 0.0, water_noise, noise)[:, None]
     return DvlLog(
         mount=dvl_mount(toml),
         time_s=table.time_s,
         speed=table.stack(SPEED),
-        sigma=np.where(np.isnan(sigma), settings.number("beam_noise_m_per_s"), sigma),
+        sigma=np.where(np.isnan(sigma), nominal, sigma),
         range_m=table.stack(RANGE) if any(name in table for name in RANGE) else None,
+        water_track=water if water.any() else None,
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from ssm_graph.data import Array, Mission
 from ssm_graph.earth import normal_gravity
 from ssm_graph.errors import ConfigError, DataError
+from ssm_graph.io.mission_keys import WATER_TRACK
 from ssm_graph.io.mission_motion_checks import check_motion
 from ssm_graph.io.mission_toml import MissionToml
 from ssm_graph.io.settings import TOML_NAME
@@ -30,6 +31,7 @@ def check_mission(mission: Mission, tables: dict[str, Table], toml: MissionToml)
     for name in ("gnss", "usbl", "reference"):
         if name in tables:
             _table_position(mission, tables[name], has_origin="origin" in toml)
+    notes += _current(mission)
     notes += _gravity(mission, tables["imu"].label)
     return notes + check_motion(mission, {name: table.label for name, table in tables.items()})
 
@@ -139,6 +141,16 @@ def _distance(mission: Mission, lat: Array, lon: Array) -> Array:
 
 def _limit(mission: Mission) -> float:
     return max(FARTHEST_M, _FASTEST * float(mission.imu.time_s[-1] - mission.imu.start_s))
+
+
+def _current(mission: Mission) -> list[str]:
+    """Note a current that nothing measures."""
+    if mission.current is None or mission.dvl.water_track is not None:
+        return []
+    return [
+        f"{TOML_NAME} [current]: no ping is off the water, so the section changes nothing; a 1 in "
+        f"column {WATER_TRACK!r} of the DVL's table marks such a ping"
+    ]
 
 
 def _gravity(mission: Mission, label: str) -> list[str]:

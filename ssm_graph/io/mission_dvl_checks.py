@@ -8,7 +8,7 @@ import numpy as np
 
 from ssm_graph.data import Array
 from ssm_graph.errors import DataError
-from ssm_graph.io.mission_keys import LIMITS, RANGE, SPEED, SPEED_SIGMA
+from ssm_graph.io.mission_keys import LIMITS, RANGE, SPEED, SPEED_SIGMA, WATER_TRACK
 from ssm_graph.io.tables import Table
 from ssm_graph.plausible import LARGEST_SPEED
 
@@ -30,6 +30,7 @@ def check_dvl(table: Table) -> list[str]:
     if len(table) == 0:
         return [f"{table.label}: the table has no rows; nothing will aid the inertial sensors"]
     _sigmas_and_ranges(table)
+    _water_flags(table)
     speed = table.stack(SPEED)
     if np.isnan(speed).all():
         return [f"{table.label}: no beam ever had bottom lock; every speed is empty or NaN"]
@@ -62,6 +63,20 @@ def _sigmas_and_ranges(table: Table) -> None:
                 else "expected metres, not below 0; leave the cell empty where it is unknown"
             )
             raise table.cell_fault(int(np.argmax(bad)), name, text)
+
+
+def _water_flags(table: Table) -> None:
+    """Refuse a flag that is neither yes nor no."""
+    if WATER_TRACK not in table:
+        return
+    flag = table[WATER_TRACK]
+    bad = np.isfinite(flag) & (flag != 0.0) & (flag != 1.0)
+    if bad.any():
+        raise table.cell_fault(
+            int(np.argmax(bad)),
+            WATER_TRACK,
+            "expected 1 for a ping off the water, 0 or nothing for one off the ground",
+        )
 
 
 def _units(table: Table, speed: Array) -> None:

@@ -19,6 +19,7 @@ from ssm_graph.io.mission_keys import POSITION
 from ssm_graph.io.mission_toml import MissionToml
 from ssm_graph.io.mission_units import R_bd_from_rpy, beams_from_angles, to_si
 from ssm_graph.io.settings import Settings
+from ssm_graph.water_current import CurrentModel
 
 _UNIT_TOLERANCE = 1e-3
 _FLATTEST_GEOMETRY = 0.01
@@ -62,6 +63,20 @@ def dvl_mount(toml: MissionToml) -> DvlMount:
         ),
         beam_scale_sigma=settings.number("beam_scale_sigma"),
         lever_arm_sigma=settings.number("lever_arm_sigma_m"),
+    )
+
+
+def current_model(settings: Settings) -> CurrentModel:
+    """Return what section ``[current]`` says of the water; what it does not say is the default."""
+    default = CurrentModel()
+    return CurrentModel(
+        sigma=settings.number("sigma_m_per_s") or default.sigma,
+        correlation_s=settings.number("correlation_s") or default.correlation_s,
+        vertical_sigma=(
+            settings.number("vertical_sigma_m_per_s")
+            if "vertical_sigma_m_per_s" in settings
+            else default.vertical_sigma
+        ),
     )
 
 

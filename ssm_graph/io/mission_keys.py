@@ -74,6 +74,12 @@ SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
         ),
         "beam_scale_sigma": optional_key(0.0, 1.0, "1 percent is 0.01"),
         "lever_arm_sigma_m": _ARM_SIGMA,
+        "water_noise_m_per_s": sigma_key(5.0, "the unit is m/s, not mm/s", required=False),
+    },
+    "current": {
+        "sigma_m_per_s": sigma_key(20.0, "the unit is m/s", required=False),
+        "correlation_s": sigma_key(1e8, "the unit is seconds", required=False),
+        "vertical_sigma_m_per_s": optional_key(0.0, 20.0, "the unit is m/s"),
     },
     "depth": {
         "file": _FILE,
@@ -114,6 +120,7 @@ ACCEL: Final = tuple(f"accel_{axis}_m_per_s2" for axis in "xyz")
 SPEED: Final = tuple(f"beam{beam}_m_per_s" for beam in range(1, N_BEAMS + 1))
 SPEED_SIGMA: Final = tuple(f"beam{beam}_sigma_m_per_s" for beam in range(1, N_BEAMS + 1))
 RANGE: Final = tuple(f"range{beam}_m" for beam in range(1, N_BEAMS + 1))
+WATER_TRACK: Final = "water_track"
 POSITION: Final = ("lat_deg", "lon_deg", "height_m")
 POSITION_SIGMA: Final = ("sigma_east_m", "sigma_north_m", "sigma_up_m")
 VELOCITY: Final = ("vel_east_m_per_s", "vel_north_m_per_s", "vel_up_m_per_s")
@@ -126,6 +133,7 @@ LIMITS: Final[Mapping[str, tuple[float, float]]] = {
     **dict.fromkeys(SPEED, (-LARGEST_SPEED, LARGEST_SPEED)),
     **dict.fromkeys(SPEED_SIGMA, (_ABOVE_ZERO, 1e3)),
     **dict.fromkeys(RANGE, (0.0, math.inf)),
+    WATER_TRACK: (0.0, 1.0),
     "depth_m": (-DEEPEST_M, DEEPEST_M),
     "lat_deg": (-90.0, 90.0),
     "lon_deg": (-180.0, 360.0),
@@ -139,7 +147,7 @@ LIMITS: Final[Mapping[str, tuple[float, float]]] = {
 
 TABLES: Final[Mapping[str, TableSpec]] = {
     "imu": TableSpec((TIME, *GYRO, *ACCEL)),
-    "dvl": TableSpec((TIME, *SPEED), (*SPEED_SIGMA, *RANGE), frozenset(SPEED)),
+    "dvl": TableSpec((TIME, *SPEED), (*SPEED_SIGMA, *RANGE, WATER_TRACK), frozenset(SPEED)),
     "depth": TableSpec((TIME, "depth_m")),
     "gnss": TableSpec((TIME, *POSITION, *POSITION_SIGMA)),
     **AID_TABLES,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import permutations
 from typing import Final
 
@@ -40,8 +41,11 @@ _NOTED_LAG_S: Final = 0.05
 
 
 def check_motion(mission: Mission, labels: dict[str, str]) -> list[str]:
-    """Compare the sensors' signs; ``labels`` name the tables.  Return the notes."""
-    notes = []
+    """Compare the sensors' signs; ``labels`` name the tables.  Return the notes.
+
+    Pings off the water are left out.
+    """
+    mission, notes = replace(mission, dvl=mission.dvl.of_ground()), []
     if mission.depth is not None:
         notes += _depth_sign(mission, mission.depth, labels["depth"])
         notes += _depth_surface(mission, mission.depth, labels["depth"])

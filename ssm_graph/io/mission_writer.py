@@ -35,6 +35,7 @@ from ssm_graph.io.mission_keys import (
     SPEED_SIGMA,
     TIME,
     VELOCITY,
+    WATER_TRACK,
     Stamp,
 )
 from ssm_graph.io.mission_units import R_bd_from_rpy, from_si, rpy_from_R_bd
@@ -89,6 +90,14 @@ def mission_settings(mission: Mission, table_format: TableFormat) -> dict[str, A
         "imu": imu_settings(mission.imu.noise, suffix),
         "dvl": dvl_settings(mission.dvl.mount, nominal_sigma(mission.dvl), suffix),
     }
+    if mission.dvl.is_water.any():
+        settings["dvl"]["water_noise_m_per_s"] = _sigma_off_water(mission.dvl)
+    if mission.current is not None:
+        settings["current"] = {
+            "sigma_m_per_s": float(mission.current.sigma),
+            "correlation_s": float(mission.current.correlation_s),
+            "vertical_sigma_m_per_s": float(mission.current.vertical_sigma),
+        }
     if mission.depth is not None:
         settings["depth"] = {
             "file": f"depth{suffix}",
@@ -200,16 +209,26 @@ def _given(**values: float) -> dict[str, float]:
 
 
 def nominal_sigma(dvl: DvlLog) -> float:
-    """Return the standard deviation that stands for those of all beams, m/s."""
-    return float(np.median(dvl.sigma)) if dvl.sigma.size else _NOISE_OF_EMPTY_LOG
+    """Return the standard deviation that stands for those of all beams off the ground, m/s."""
+    sigma = dvl.sigma[~dvl.is_water] if (~dvl.is_water).any() else dvl.sigma
+    return float(np.median(sigma)) if sigma.size else _NOISE_OF_EMPTY_LOG
+
+
+def _sigma_off_water(dvl: DvlLog) -> float:
+    return float(np.median(dvl.sigma[dvl.is_water]))
 
 
 def _dvl_table(dvl: DvlLog) -> dict[str, Array]:
     columns = {TIME: dvl.time_s, **_split(SPEED, dvl.speed)}
-    if np.any(dvl.sigma != nominal_sigma(dvl)):
+    nominal = np.full(dvl.sigma.shape, nominal_sigma(dvl))
+    if dvl.is_water.any():
+        nominal[dvl.is_water] = _sigma_off_water(dvl)
+    if np.any(dvl.sigma != nominal):
         columns |= _split(SPEED_SIGMA, dvl.sigma)
     if dvl.range_m is not None:
         columns |= _split(RANGE, dvl.range_m)
+    if dvl.water_track is not None:
+        columns[WATER_TRACK] = dvl.water_track
     return columns
 
 

@@ -18,15 +18,27 @@ def messages_of(mission: Mission) -> Iterator[Message]:
     """Yield all messages of a mission in order of time.
 
     An IMU sample stands at the end of its interval, a ping at its stamp. Of equal times the IMU
-    comes first, then DVL, depth, GNSS. Rows are turned into messages as they are asked for, so that
-    a day of data needs no more memory than the mission itself.
+    comes first, then DVL, depth, GNSS. Pings off the water are left out: a live estimator has no
+    current, see :func:`left_out_of_replay`. Rows are turned into messages as they are asked for, so
+    that a day of data needs no more memory than the mission itself.
     """
-    streams: list[Iterator[Message]] = [_samples(mission.imu), _pings(mission.dvl)]
+    streams: list[Iterator[Message]] = [_samples(mission.imu), _pings(mission.dvl.of_ground())]
     if mission.depth is not None:
         streams.append(_depths(mission.depth))
     if mission.gnss is not None:
         streams.append(_fixes(mission.gnss))
     return heapq.merge(*streams, key=lambda message: message.time_s)
+
+
+def left_out_of_replay(mission: Mission) -> tuple[str, ...]:
+    """Return the note of what a mission has and a live estimator is not sent."""
+    count = int(mission.dvl.is_water.sum())
+    if count == 0:
+        return ()
+    return (
+        f"{count} pings off the water are left out: the live estimator has no current; "
+        "ssm-graph smooth uses them",
+    )
 
 
 def _samples(imu: ImuLog) -> Iterator[ImuSample]:

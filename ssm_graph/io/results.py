@@ -19,7 +19,7 @@ import numpy as np
 
 from ssm_graph.data import Array, Mission
 from ssm_graph.errors import DataError
-from ssm_graph.estimate import AidTable, BeamTable, Estimate, Trajectory
+from ssm_graph.estimate import AidTable, BeamTable, CurrentTrack, Estimate, Trajectory
 from ssm_graph.frames import BodyAxes
 from ssm_graph.io.calibration_toml import CALIBRATION_NAME, calibration_toml
 from ssm_graph.io.csv_tables import (
@@ -84,7 +84,9 @@ def write_results(
     folder = Path(folder)
     summary = build_summary(estimate, mission=mission, metrics=metrics, settings=settings)
     content = {
-        TRAJECTORY_NAME: format_table(trajectory_columns(estimate.trajectory)),
+        TRAJECTORY_NAME: format_table(
+            trajectory_columns(estimate.trajectory) | current_columns(estimate.current)
+        ),
         BEAMS_NAME: format_table(beam_columns(estimate.beams)),
     }
     if estimate.aids is not None:
@@ -162,6 +164,17 @@ def trajectory_columns(trajectory: Trajectory) -> Columns:
         ),
         **_spread("accel_bias_{}_ug", xyz, trajectory.accel_bias / SI["accel_bias_ug"], "%.9g"),
         "n_beams": (trajectory.n_beams, "%.0f"),
+    }
+
+
+def current_columns(current: CurrentTrack | None) -> Columns:
+    """Return the columns that ``trajectory.csv`` has besides where a current was estimated."""
+    if current is None:
+        return {}
+    enu = ("east", "north", "up")
+    return {
+        **_spread("current_{}_m_per_s", enu, current.velocity_enu, "%.7f"),
+        **_spread("sigma_current_{}_m_per_s", enu, current.sigma_enu, "%.7g"),
     }
 
 

@@ -92,6 +92,7 @@ def build_summary(
         "calibration": _calibration(estimate),
         "noise": _noise(estimate),
         **({"aids": _aids(estimate.aids)} if estimate.aids is not None else {}),
+        "current": _current(estimate),
         **(_comparison(metrics) if metrics is not None else {}),
         "settings": settings,
         "history": [
@@ -192,6 +193,20 @@ def _noise(estimate: Estimate) -> dict[str, Any]:
         "beam_degrees_of_freedom": noise.beam_dof,
         "inertial_chi_square": noise.inertial_chi_sq,
         "inertial_degrees_of_freedom": noise.inertial_dof,
+    }
+
+
+def _current(estimate: Estimate) -> dict[str, Any]:
+    """Return what was found of the current: means, the largest, and how well it is known."""
+    current = estimate.current
+    if current is None:
+        return {}
+    return {
+        "mean_enu_m_per_s": current.velocity_enu.mean(axis=0),
+        "largest_m_per_s": np.linalg.norm(current.velocity_enu[:, :2], axis=1).max(),
+        "mean_sigma_enu_m_per_s": current.sigma_enu.mean(axis=0),
+        "final_enu_m_per_s": current.velocity_enu[-1],
+        "final_sigma_enu_m_per_s": current.sigma_enu[-1],
     }
 
 

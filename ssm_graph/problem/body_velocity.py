@@ -63,9 +63,9 @@ def _of_pings(mission: Mission) -> BodyVelocities:
 
     Four beams measure three components, and the fourth number is the array's parity: ``n . b``
     with ``n`` the unit null vector of the beam directions. It is blind to faults that ``n`` is
-    orthogonal to, so what passes here is no more than a start.
+    orthogonal to, so what passes here is no more than a start. Pings off the water are left out.
     """
-    dvl = mission.dvl
+    dvl = mission.dvl.of_ground()
     beams_b = dvl.mount.beams_b
     null = np.linalg.svd(beams_b.T)[2][-1]
     valid = np.isfinite(dvl.speed)

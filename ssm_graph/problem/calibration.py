@@ -9,6 +9,7 @@ import numpy as np
 
 from ssm_graph.data import N_BEAMS, DepthCalibration, DvlMount, GnssCalibration, Mission
 from ssm_graph.problem.aid_errors import aid_extras, is_of_aid
+from ssm_graph.problem.current import current_extras
 from ssm_graph.problem.extras import Extra, Extras
 
 DVL_MOUNTING: Final = "dvl_mounting"
@@ -71,14 +72,14 @@ def calibration_extras(
 
 
 def extras_of(mission: Mission) -> Extras:
-    """Return what a mission asks to calibrate, that of its further aids as well."""
+    """Return what a mission asks to calibrate, its further aids as well, and its current."""
     depth, gnss = mission.depth, mission.gnss
     of_instruments = calibration_extras(
         mission.dvl.mount,
         None if depth is None else depth.calibration,
         None if gnss is None else gnss.calibration,
     )
-    return Extras((*of_instruments, *aid_extras(mission.aids)))
+    return Extras((*of_instruments, *aid_extras(mission.aids), *current_extras(mission)))
 
 
 def needs_motion(extras: Extras) -> bool:

@@ -10,9 +10,11 @@ the columns of that name beside those of its keyframe's error state::
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ssm_graph.data import Array, ReadOnlyArrays
 from ssm_graph.problem.error_state import STATE_DIM
@@ -76,6 +78,19 @@ class Extras:
     def columns(self, name: str) -> slice:
         """Return the columns of a variable in a row."""
         return self._columns[name]
+
+    def only(self, names: Collection[str]) -> Extras:
+        """Return those of these names."""
+        return Extras(tuple(block for block in self.blocks if block.name in names))
+
+    def without(self, names: Collection[str]) -> Extras:
+        """Return those of other names."""
+        return Extras(tuple(block for block in self.blocks if block.name not in names))
+
+    def columns_of(self, others: Extras) -> NDArray[np.intp]:
+        """Return the columns that a row of some of these variables has here."""
+        blocks = [np.r_[self.columns(block.name)] for block in others.blocks]
+        return np.concatenate([np.arange(STATE_DIM), *blocks])
 
     def value(self, name: str, walks: Array, constants: Array, *, default: Array) -> Array:
         """Return a variable's value, (d,) or (..., d) with the walks at (...) rows.

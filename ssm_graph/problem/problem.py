@@ -20,6 +20,7 @@ from ssm_graph.errors import ConfigError, DataError
 from ssm_graph.imu.preintegration import InertialChain, imu_gaps, preintegrate
 from ssm_graph.problem.aids import Depths, Fixes, depths_of, fixes_of
 from ssm_graph.problem.calibration import extras_of, needs_motion
+from ssm_graph.problem.current import CURRENT, current_note
 from ssm_graph.problem.error_state import InitialMoments, initial_moments
 from ssm_graph.problem.extras import Extras
 from ssm_graph.problem.further_aids import NO_FURTHER, FurtherAids, further_aids
@@ -75,6 +76,8 @@ class Beams(ReadOnlyArrays):
     """(3, 3) mounting, instrument to body"""
     ping: NDArray[np.intp]
     """(M,) the ping of each, counted from 0"""
+    is_water: NDArray[np.bool_]
+    """(M,) off the water instead of the ground: relative to its current"""
     motion: MotionBefore | None = None
     """Inertial readings about the pings, where the DVL's clock or lever arm is in doubt."""
 
@@ -143,7 +146,13 @@ def build_problem(
         imu_noise_bias_sigma=np.repeat([noise.accel_bias_sigma, noise.gyro_bias_sigma], 3),
         extras=extras,
         further=further,
-        notes=(*timeline.notes, *left_out, *_gap_note(mission.imu), *stuck_note),
+        notes=(
+            *timeline.notes,
+            *left_out,
+            *_gap_note(mission.imu),
+            *stuck_note,
+            *current_note(mission),
+        ),
     )
 
 
@@ -169,7 +178,13 @@ def with_dvl(problem: Problem, mission: Mission) -> Problem:
             f"with_dvl: expected pings at the keyframes, got one {off.max():.3f} s away at "
             f"{ping_s[ping][np.argmax(off)]:.3f} s; build a problem of its own"
         )
-    return replace(problem, beams=_beams(mission, ping, keyframe, problem.extras))
+    beams = _beams(mission, ping, keyframe, problem.extras)
+    if beams.is_water.any() and CURRENT not in problem.extras:
+        raise DataError(
+            "with_dvl: expected pings off the ground, as those of the problem, got some off the "
+            "water, whose current it does not have; build a problem of its own"
+        )
+    return replace(problem, beams=beams)
 
 
 def _without_stuck_beams(mission: Mission) -> tuple[Mission, tuple[str, ...]]:
@@ -202,7 +217,7 @@ def _gap_note(imu: ImuLog) -> tuple[str, ...]:
 
 
 def _beams(mission: Mission, ping: Indices, ping_keyframe: Indices, extras: Extras) -> Beams:
-    dvl = mission.dvl
+    dvl, is_water = mission.dvl, mission.dvl.is_water[ping]
     speed = dvl.speed[ping]
     row, beam = np.nonzero(np.isfinite(speed))
     gyro_b = mean_gyro(mission.imu, dvl.ping_s[ping]) if len(ping) else np.zeros((0, 3))
@@ -216,5 +231,6 @@ def _beams(mission: Mission, ping: Indices, ping_keyframe: Indices, extras: Extr
         lever_arm_b=dvl.mount.lever_arm_b,
         R_bd=dvl.mount.R_bd,
         ping=row,
+        is_water=is_water[row],
         motion=MotionBefore(mission.imu, dvl.ping_s[ping]) if needs_motion(extras) else None,
     )

@@ -29,6 +29,9 @@ def require_usable(mission: Mission) -> None:
     has_speed = ~np.isnan(dvl.speed)
     _finite("dvl.speed", np.where(has_speed, dvl.speed, 0.0))
     _positive("dvl.sigma", np.where(has_speed, dvl.sigma, 1.0))
+    if mission.current is not None:
+        _positive("current.sigma", np.array([mission.current.sigma]))
+        _positive("current.correlation_s", np.array([mission.current.correlation_s]))
     _require_aids(mission)
     _require_further(mission.aids)
 

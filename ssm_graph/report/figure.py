@@ -13,6 +13,7 @@ from ssm_graph.errors import DataError
 from ssm_graph.estimate import Estimate, Trajectory
 from ssm_graph.evaluation import Metrics, evaluate
 from ssm_graph.report.beam_panels import draw_beams
+from ssm_graph.report.current_panel import draw_current
 from ssm_graph.report.error_panels import draw_heading, draw_position, draw_velocity
 from ssm_graph.report.style import INK, SMALL
 from ssm_graph.report.track_panel import draw_track
@@ -74,13 +75,16 @@ def draw_figure(
     heading.set(fontsize=12.0, fontweight="bold", linespacing=1.4)
     caption = _caption(estimate, metrics)
     figure.text(0.012, 0.973, caption, va="top", fontsize=SMALL + 0.5, color=INK)
-    grid = figure.add_gridspec(2, 1, height_ratios=[5.9, 3.5])
+    heights = [5.9, 3.5] if estimate.current is None else [5.3, 3.0, 1.1]
+    grid = figure.add_gridspec(len(heights), 1, height_ratios=heights)
     upper = grid[0].subgridspec(4, 2, width_ratios=[1.2, 1.0], height_ratios=[1.0, 1.0, 1.0, 1.25])
     draw_track(figure.add_subplot(upper[:3, 0]), estimate, reference if errors else None)
     draw_position([figure.add_subplot(upper[i, 1]) for i in range(3)], trajectory, errors)
     draw_velocity(figure.add_subplot(upper[3, 0]), trajectory, errors)
     draw_heading(figure.add_subplot(upper[3, 1]), trajectory, errors)
     draw_beams(figure, grid[1], estimate.beams, trajectory_s=trajectory.time_s)
+    if estimate.current is not None:
+        draw_current(figure.add_subplot(grid[2]), estimate.current)
     return figure
 
 

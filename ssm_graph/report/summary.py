@@ -16,6 +16,7 @@ from ssm_graph.estimate import (
     OUTLIER_WEIGHT,
     AidTable,
     Calibration,
+    CurrentTrack,
     Determined,
     Estimate,
     Status,
@@ -51,6 +52,8 @@ def summary_table(estimate: Estimate, metrics: Metrics | None = None) -> Rendera
     parts: list[RenderableType] = [_overview(estimate), _axes(estimate.trajectory)]
     if metrics is not None:
         parts.append(_comparison(metrics))
+    if estimate.current is not None:
+        parts.append(_current(estimate.current))
     if estimate.calibration is not None:
         parts.append(_calibration(estimate.calibration))
     if estimate.aids is not None:
@@ -116,6 +119,17 @@ def _axes(trajectory: Trajectory) -> RenderableType:
         ("roll, pitch, heading, deg", _degrees(trajectory.roll_pitch_heading[-1])),
         ("gyro bias x, y, z, deg/h", trajectory.gyro_bias[-1] * DEG_PER_HOUR),
         ("accelerometer bias x, y, z, ug", trajectory.accel_bias[-1] / MICRO_G),
+    ):
+        table.add_row(heading, *_numbers(values))
+    return table
+
+
+def _current(current: CurrentTrack) -> Table:
+    table = _table("Current of the water", ["", "", "", ""])
+    for heading, values in (
+        ("mean east, north, up, m/s", current.velocity_enu.mean(axis=0)),
+        ("mean sigma east, north, up, m/s", current.sigma_enu.mean(axis=0)),
+        ("at the last keyframe, m/s", current.velocity_enu[-1]),
     ):
         table.add_row(heading, *_numbers(values))
     return table

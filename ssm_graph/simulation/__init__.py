@@ -5,6 +5,7 @@
 
 from ssm_graph.simulation.aids import DepthSettings, GnssSettings
 from ssm_graph.simulation.config import SimulationConfig
+from ssm_graph.simulation.currents import Current, CurrentSettings, WaterTrack
 from ssm_graph.simulation.dvl_model import DvlSettings, default_mount, janus_beams
 from ssm_graph.simulation.faults import Loss, OutlierKind, Outliers
 from ssm_graph.simulation.further_aids import (
@@ -38,6 +39,8 @@ __all__ = [
     "AidSettings",
     "BeaconSettings",
     "CompassSettings",
+    "Current",
+    "CurrentSettings",
     "DepthProfile",
     "DepthSettings",
     "DiveRoute",
@@ -62,6 +65,7 @@ __all__ = [
     "Trajectory",
     "TransitRoute",
     "UsblSettings",
+    "WaterTrack",
     "Waves",
     "default_mount",
     "janus_beams",

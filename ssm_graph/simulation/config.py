@@ -10,6 +10,7 @@ import numpy as np
 from ssm_graph.data import ImuNoise
 from ssm_graph.simulation._checks import require, require_fraction, require_positive
 from ssm_graph.simulation.aids import DepthSettings, GnssSettings
+from ssm_graph.simulation.currents import CurrentSettings, WaterTrack
 from ssm_graph.simulation.dvl_model import DvlSettings
 from ssm_graph.simulation.faults import Loss, Outliers
 from ssm_graph.simulation.further_aids import AidSettings
@@ -50,6 +51,10 @@ class SimulationConfig:
     losses: tuple[Loss, ...] = ()
     dropout_rate: float = 0.0
     """Fraction of beam readings that are missing, each beam for itself."""
+    current: CurrentSettings | None = None
+    """None for water at rest."""
+    water_track: WaterTrack | None = None
+    """None for a DVL that tracks the ground alone."""
     depth: DepthSettings | None = DepthSettings()
     """None for no depth sensor."""
     gnss: GnssSettings | None = None

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ssm_graph.data import N_BEAMS, Array, DvlMount
-from ssm_graph.earth import geodetic_from_ecef
+from ssm_graph.earth import R_el_from_lat_lon, geodetic_from_ecef
 from ssm_graph.simulation._checks import require, require_not_negative, require_positive
 from ssm_graph.simulation.taylor import Series
 from ssm_graph.simulation.trajectory import Motion, Trajectory, Vector, stacked
@@ -101,15 +101,25 @@ def ping_times(settings: DvlSettings, *, end_s: float, rng: np.random.Generator 
     return np.minimum(time_s[(time_s > 0.0) & (time_s <= end_s + 1e-9)], end_s)
 
 
-def true_beam_speeds(trajectory: Trajectory, settings: DvlSettings, time_s: Array) -> Array:
+def true_beam_speeds(
+    trajectory: Trajectory,
+    settings: DvlSettings,
+    time_s: Array,
+    *,
+    current_enu: Array | None = None,
+) -> Array:
     """Return how fast the instrument moves along each of its beams (N, 4), m/s, over ground.
 
     The instrument's path over the Earth is differentiated as it is; ``v + omega x l`` is nowhere
-    used.
+    used. With a current (N, 3), m/s along east, north, up, it is the motion through the water.
     """
     motion = trajectory.at(time_s)
-    x, y, z = motion.point_e(_true_lever_arm_b(settings))
-    v_e: Vector = (Series([x.rate]), Series([y.rate]), Series([z.rate]))
+    x, y, z = (axis.rate for axis in motion.point_e(_true_lever_arm_b(settings)))
+    if current_enu is not None:
+        R_el = R_el_from_lat_lon(motion.lat.value, motion.lon.value)
+        east, north, up = np.moveaxis(R_el * current_enu[:, None, :], -1, 0)
+        x, y, z = (v - c for v, c in zip((x, y, z), (east + north + up).T, strict=True))
+    v_e: Vector = (Series([x]), Series([y]), Series([z]))
     v_b = stacked(motion.body_from_earth(v_e))
     read = (1.0 + settings.scale_error + settings.scale_drift_per_h * time_s / 3600.0)[:, None]
     read = read * (1.0 + np.array(settings.beam_scale_errors))

@@ -187,10 +187,19 @@ def _place_events(
 def draw_missing(
     time_s: Array, losses: Sequence[Loss], *, dropout_rate: float, rng: np.random.Generator
 ) -> Mask:
-    """Return which beams (N, 4) have no bottom lock: each at ``dropout_rate``, and the losses."""
-    missing = rng.random((len(time_s), N_BEAMS)) < dropout_rate
+    """Return which beams (N, 4) are missing: each at ``dropout_rate``, and the losses."""
+    return draw_dropouts(time_s, dropout_rate=dropout_rate, rng=rng) | lost_beams(time_s, losses)
+
+
+def draw_dropouts(time_s: Array, *, dropout_rate: float, rng: np.random.Generator) -> Mask:
+    """Return which beams (N, 4) are missing, each at ``dropout_rate``."""
+    return np.asarray(rng.random((len(time_s), N_BEAMS)) < dropout_rate)
+
+
+def lost_beams(time_s: Array, losses: Sequence[Loss]) -> Mask:
+    """Return which beams (N, 4) have no bottom lock."""
+    lost = np.zeros((len(time_s), N_BEAMS), dtype=bool)
     for loss in losses:
         inside = (loss.start_s <= time_s) & (time_s < loss.end_s)
-        for beam in loss.beams:
-            missing[inside, beam] = True
-    return missing
+        lost[np.ix_(inside, np.array(loss.beams, dtype=np.intp))] = True
+    return lost

@@ -10,12 +10,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ssm_graph.data import Array, DepthLog, DvlLog, GnssLog, ImuLog, Mission, Reference
+from ssm_graph.data import N_BEAMS, Array, DepthLog, DvlLog, GnssLog, ImuLog, Mission, Reference
 from ssm_graph.earth import LocalFrame
 from ssm_graph.simulation.aids import depth_log, gnss_log
 from ssm_graph.simulation.config import SimulationConfig
+from ssm_graph.simulation.currents import Current
 from ssm_graph.simulation.dvl_model import beam_ranges, ping_times, true_beam_speeds
-from ssm_graph.simulation.faults import Loss, Outliers, draw_missing, draw_outliers
+from ssm_graph.simulation.faults import Loss, Outliers, draw_dropouts, draw_outliers, lost_beams
 from ssm_graph.simulation.further_aids import SimulatedAids, aid_logs
 from ssm_graph.simulation.grades import initial_state
 from ssm_graph.simulation.imu_model import averaged_imu, imu_errors
@@ -36,7 +37,9 @@ class SimulatedMission:
     beam_offset: Array
     """(N, 4) what outliers and faults added to the speeds, m/s."""
     true_speed: Array
-    """(N, 4) beam speeds without noise, outliers, faults or losses, m/s."""
+    """(N, 4) beam speeds over ground without noise, outliers, faults or losses, m/s."""
+    water_speed: Array
+    """(N, 4) the same through the water, m/s."""
     ping_time_s: Array
     """(N,) when the pings really happened, s."""
     gyro_bias: Array
@@ -45,6 +48,7 @@ class SimulatedMission:
     """The further aids, with what is wrong with them"""
     accel_bias: Array
     """(M, 3) true accelerometer bias of each IMU sample, m/s^2."""
+    current: Current
 
     @property
     def trajectory(self) -> Trajectory:
@@ -54,6 +58,18 @@ class SimulatedMission:
     def truth_at(self, time_s: ArrayLike) -> Reference:
         """Return the true position, velocity and attitude at any times, s."""
         return self.trajectory.truth(time_s)
+
+    def with_known_current(self) -> Mission:
+        """Return the mission of the oracle who is told the current: every ping is off the ground.
+
+        Pings off the water keep their noise.
+        """
+        dvl = self.mission.dvl
+        over_ground = dvl.speed + (self.true_speed - self.water_speed)
+        known = dataclasses.replace(
+            dvl, speed=np.where(dvl.is_water[:, None], over_ground, dvl.speed), water_track=None
+        )
+        return dataclasses.replace(self.mission, dvl=known)
 
     def without_outliers(self) -> Mission:
         """Return the mission of the oracle, who is told the bad beams: they are missing."""
@@ -69,7 +85,9 @@ def simulate(config: SimulationConfig) -> SimulatedMission:
     end_s = n_samples / config.imu_rate_hz
     imu, gyro_bias, accel_bias = _imu(config, streams, n_samples)
     ping_s = ping_times(config.dvl, end_s=end_s, rng=streams.ping_time)
-    dvl = _dvl(config, streams, ping_s, true_beam_speeds(config.trajectory, config.dvl, ping_s))
+    current = Current(config.current, end_s=end_s, rng=streams.current)
+    speeds = _true_speeds(config, ping_s, current)
+    dvl = _dvl(config, streams, ping_s, speeds)
     depth, gnss = _aids(config, streams, end_s)
     noisy = not config.perfect_sensors
     aids = aid_logs(config.trajectory, config.aids, end_s=end_s, streams=streams, noisy=noisy)
@@ -85,17 +103,20 @@ def simulate(config: SimulationConfig) -> SimulatedMission:
         aids=aids.logs,
         initial=initial_state(truth, config.initial_sigmas, rng=initial_rng),
         reference=truth,
+        current=None if config.current is None else config.current.model,
     )
     return SimulatedMission(
         config=config,
         mission=mission,
         is_outlier=dvl.is_outlier,
         beam_offset=dvl.offset,
-        true_speed=dvl.true_speed,
-        ping_time_s=dvl.time_s,
+        true_speed=speeds.over_ground,
+        water_speed=speeds.through_water,
+        ping_time_s=ping_s,
         gyro_bias=gyro_bias,
         aids=aids,
         accel_bias=accel_bias,
+        current=current,
     )
 
 
@@ -121,7 +142,8 @@ def with_dvl_errors(
         dropout_rate=dropout_rate,
     )
     streams = spawn_streams(config.seed)
-    dvl = _dvl(config, streams, simulated.ping_time_s, simulated.true_speed)
+    speeds = _TrueSpeeds(simulated.true_speed, simulated.water_speed)
+    dvl = _dvl(config, streams, simulated.ping_time_s, speeds)
     return dataclasses.replace(
         simulated,
         config=config,
@@ -160,36 +182,57 @@ def _imu(config: SimulationConfig, streams: Streams, n_samples: int) -> tuple[Im
     return log, gyro_bias, accel_bias
 
 
+class _TrueSpeeds(NamedTuple):
+    """Of the instrument along its beams, both (N, 4), m/s."""
+
+    over_ground: Array
+    through_water: Array
+
+
+def _true_speeds(config: SimulationConfig, time_s: Array, current: Current) -> _TrueSpeeds:
+    over_ground = true_beam_speeds(config.trajectory, config.dvl, time_s)
+    if config.current is None:
+        return _TrueSpeeds(over_ground, over_ground)
+    return _TrueSpeeds(
+        over_ground,
+        true_beam_speeds(config.trajectory, config.dvl, time_s, current_enu=current.at(time_s)),
+    )
+
+
 class _Dvl(NamedTuple):
     log: DvlLog
-    time_s: Array
-    true_speed: Array
     offset: Array
     is_outlier: NDArray[np.bool_]
 
 
-def _dvl(config: SimulationConfig, streams: Streams, time_s: Array, true_speed: Array) -> _Dvl:
+def _dvl(config: SimulationConfig, streams: Streams, time_s: Array, speeds: _TrueSpeeds) -> _Dvl:
     """Return the pings as read, and what was done to them."""
-    settings = config.dvl
-    drawn = draw_outliers(config.outliers, time_s, true_speed, rng=streams.outliers)
-    offset, is_outlier = add_faults(drawn, config.faults, time_s, true_speed)
-    missing = draw_missing(
-        time_s, config.losses, dropout_rate=config.dropout_rate, rng=streams.dropouts
-    )
-    speed = true_speed + offset
+    settings, water = config.dvl, config.water_track
+    lost = lost_beams(time_s, config.losses)
+    is_water = np.zeros(len(time_s), bool) if water is None else water.pings(lost)
+    noise = np.where(is_water, settings.noise if water is None else water.noise, settings.noise)
+    returns = np.isin(np.arange(N_BEAMS), () if water is None else water.beams)
+    missing = draw_dropouts(time_s, dropout_rate=config.dropout_rate, rng=streams.dropouts)
+    missing |= np.where(is_water[:, None], ~returns, lost)
+    speed = np.where(is_water[:, None], speeds.through_water, speeds.over_ground)
+    drawn = draw_outliers(config.outliers, time_s, speed, rng=streams.outliers)
+    offset, is_outlier = add_faults(drawn, config.faults, time_s, speed)
+    speed = speed + offset
     if not config.perfect_sensors:
-        speed = speed + settings.noise * streams.beam_noise.standard_normal(speed.shape)
+        speed = speed + noise[:, None] * streams.beam_noise.standard_normal(speed.shape)
     ranges = None
     if settings.seabed_depth_m is not None:
-        ranges = np.where(missing, np.nan, beam_ranges(config.trajectory, settings, time_s))
+        off_ground = beam_ranges(config.trajectory, settings, time_s)
+        ranges = np.where(missing | is_water[:, None], np.nan, off_ground)
     log = DvlLog(
         mount=settings.mount,
         time_s=time_s + settings.late_s,
         speed=np.where(missing, np.nan, speed),
-        sigma=np.full(speed.shape, settings.noise),
+        sigma=np.broadcast_to(noise[:, None], speed.shape),
         range_m=ranges,
+        water_track=is_water.astype(float) if is_water.any() else None,
     )
-    return _Dvl(log, time_s, true_speed, offset, is_outlier & ~missing)
+    return _Dvl(log, offset, is_outlier & ~missing)
 
 
 def _aids(

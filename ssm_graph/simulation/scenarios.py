@@ -12,6 +12,7 @@ from ssm_graph.aid_logs import HeadingErrors
 from ssm_graph.errors import ConfigError, nearest_hint
 from ssm_graph.simulation.aids import GnssSettings
 from ssm_graph.simulation.config import SimulationConfig
+from ssm_graph.simulation.currents import CurrentSettings, WaterTrack
 from ssm_graph.simulation.dvl_model import DvlSettings
 from ssm_graph.simulation.faults import Loss, OutlierKind, Outliers
 from ssm_graph.simulation.further_aids import (
@@ -106,6 +107,16 @@ SCENARIOS: Final[Mapping[str, Scenario]] = MappingProxyType(
             "survey with late acoustic fixes, ranges to a known and an unknown beacon, a compass; "
             "5 % of them grossly wrong",
             SimulationConfig(name="aided", aids=_AIDED),
+        ),
+        "midwater": Scenario(
+            "survey lines at 30 m depth, 40 min, a tide of 0.5 m/s: half without bottom lock",
+            SimulationConfig(
+                name="midwater",
+                duration_s=2400.0,
+                losses=(Loss(start_s=600.0, end_s=1800.0),),
+                current=CurrentSettings(tide=0.5, vertical_sigma=0.01),
+                water_track=WaterTrack(every=10),
+            ),
         ),
         "demo": Scenario(
             "GNSS start, dive, 20 min of survey lines: outliers, a burst, dropouts, a bottom loss",

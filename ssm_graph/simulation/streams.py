@@ -31,6 +31,7 @@ class Streams:
     usbl: np.random.Generator
     ranges: np.random.Generator
     heading: np.random.Generator
+    current: np.random.Generator
 
 
 def spawn_streams(seed: int) -> Streams:

@@ -23,6 +23,7 @@ from ssm_graph.problem.trajectory import trajectory_from_states
 from ssm_graph.smoothers.aid_weights import AidKernel, AidWeighing
 from ssm_graph.smoothers.beam_faults import FaultSearch, FaultWatch
 from ssm_graph.smoothers.calibrated import calibration_of, undetermined
+from ssm_graph.smoothers.current import current_of
 from ssm_graph.smoothers.gnc import GncSchedule, Graduation, Schedule, WarmSchedule
 from ssm_graph.smoothers.noise import MAX_ADAPTATIONS, adaptation, noise_notes, with_sigmas
 from ssm_graph.smoothers.passes import Pass, Solved, descend, noise_of
@@ -281,4 +282,5 @@ class SsmSmoother:
             calibration=calibration,
             aids=solved.aids.table(last.states, problem.keyframe_s),
             noise=noise,
+            current=current_of(problem, last.states, last.step),
         )

@@ -25,9 +25,11 @@ from ssm_graph.graph.beam_evidence import ChainEvidence, Evidence, WhitenedBeams
 from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.states import States
+from ssm_graph.graph.water_rows import WaterRows
+from ssm_graph.problem.current import CURRENTS
 from ssm_graph.problem.error_state import STATE_DIM
 from ssm_graph.problem.further_aids import NO_FURTHER
-from ssm_graph.problem.problem import NO_EXTRAS, Problem
+from ssm_graph.problem.problem import Problem
 from ssm_graph.smoothers.gnc import NEAR_SIGMAS
 
 Mask = NDArray[np.bool_]
@@ -92,11 +94,10 @@ def find_beam_faults(
 ) -> Found:
     """Search the whole mission, linearised at ``states`` near the answer."""
     problem, beams = linearizer.problem, linearizer.problem.beams
-    states = states._replace(walks=states.walks[:, :0], constants=states.constants[:0])
-    jacobian = rows.jacobian[:, :STATE_DIM]
+    jacobian = rows.jacobian
     weights = KERNEL.weight((rows.error / beams.sigma) ** 2)
     linearizer.follow(states)
-    solution = linearizer.solve(states, BeamRows(rows.error, jacobian), weights).solution
+    solution = linearizer.solve(states, rows, weights).solution
     missed = -rows.error - np.einsum("mi,mi->m", jacobian, solution.step[beams.keyframe])
     scale = np.sqrt(weights) / beams.sigma
     whitened = WhitenedBeams(
@@ -147,8 +148,11 @@ def _excess(beam: NDArray[np.intp], weights: Array, missed: Array) -> float:
 
 def calibration_columns(problem: Problem, states: States) -> Array:
     """Return what scale (1) and mounting angles (3, rad) do to the beam speeds (M, 4), m/s."""
-    beams = problem.beams
-    R_nb, v_n = states.R_nb[beams.keyframe], states.v_n[beams.keyframe]
+    beams, k = problem.beams, problem.beams.keyframe
+    R_nb, v_n = states.R_nb[k], states.v_n[k]
+    water = WaterRows(beams, problem.extras, problem.frame)
+    through = water.relative(v_n, p_n=states.p_n[k], walks=states.walks[k], rows=np.s_[:])
+    v_n = v_n if through is None else through.v_n
     v_b = np.einsum("mij,mi->mj", R_nb, v_n)
     along = np.einsum("mi,mi->m", beams.beam_b, v_b)
     return np.column_stack([along, np.cross(v_b, beams.beam_b)])
@@ -251,10 +255,11 @@ class FaultWatch:
 
     def __init__(self, problem: Problem, search: FaultSearch | None) -> None:
         self._search = search
+        self._extras, self._current = problem.extras, problem.extras.only(CURRENTS)
         self._linearizer = None
         if search is not None:
             self._linearizer = GraphLinearizer(
-                replace(problem, extras=NO_EXTRAS, further=NO_FURTHER)
+                replace(problem, extras=self._current, further=NO_FURTHER)
             )
         self._beams, self._time_s = problem.beams, problem.keyframe_s[problem.beams.keyframe]
         self._found = Found(np.zeros(len(self._time_s), dtype=bool), ())
@@ -277,11 +282,19 @@ class FaultWatch:
         if self._search is None or self._linearizer is None or not is_due:
             return False
         self._n_looks += 1
-        found, before = find_beam_faults(self._linearizer, states, rows, self._search), self._found
+        alone, before = self._without_calibration(states, rows), self._found
+        found = find_beam_faults(self._linearizer, *alone, self._search)
         if self._n_looks > FREE_LOOKS:
             found = found._replace(is_off=found.is_off | before.is_off)
         self._found = found
         return not np.array_equal(found.is_off, before.is_off)
+
+    def _without_calibration(self, states: States, rows: BeamRows) -> tuple[States, BeamRows]:
+        """Return both with the current as the only extra variable."""
+        kept = self._extras.columns_of(self._current)
+        walks = states.walks[:, kept[STATE_DIM:] - STATE_DIM]
+        alone = states._replace(walks=walks, constants=states.constants[:0])
+        return alone, BeamRows(rows.error, rows.jacobian[:, kept])
 
     def notes(self, error: Array) -> tuple[str, ...]:
         """Say what was left out; ``error`` (M,) is what the answer misses, predicted - measured."""

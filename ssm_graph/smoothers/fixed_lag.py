@@ -14,6 +14,7 @@ import numpy as np
 
 from ssm_graph.data import Array
 from ssm_graph.estimate import Estimate, OnKeyframe
+from ssm_graph.problem.bottom_track import without_water_track
 from ssm_graph.problem.problem import Problem, start_of
 from ssm_graph.problem.recursive import RecursiveBeams, recursive_estimate
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
@@ -55,7 +56,7 @@ def solve_fixed_lag(
     SolverError
         If no finite solution was found.
     """
-    config = config or FixedLagConfig()
+    config, problem = config or FixedLagConfig(), without_water_track(problem)
     begin = time.perf_counter()
     run = run_fixed_lag(problem, config, on_keyframe=on_keyframe)
     wall_s = time.perf_counter() - begin
@@ -70,7 +71,8 @@ def solve_fixed_lag(
 def run_fixed_lag(
     problem: Problem, config: FixedLagConfig, *, on_keyframe: OnKeyframe | None = None
 ) -> FixedLagRun:
-    """Go through the keyframes one by one."""
+    """Go through the keyframes one by one, with pings off the ground alone."""
+    problem = without_water_track(problem)
     first, *others = keyframes_of(problem)
     window = Window(sensors_of(problem), config, first, start_of(problem))
     newest, delayed, n_iterations = [], [], []

@@ -10,6 +10,7 @@ from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.linearize import GraphLinearizer, Misfit
 from ssm_graph.graph.marginal_prior import MarginalPrior
 from ssm_graph.graph.states import States
+from ssm_graph.problem.current import CURRENTS
 from ssm_graph.problem.doubts import MISFIT, doubts_of_beams
 from ssm_graph.problem.extras import Extras
 
@@ -39,6 +40,7 @@ def contradictions(
             if name in misfits
         ),
         *_doubt_extras(linearizer.problem.extras, states),
+        *_doubt_current(linearizer.problem.extras, states),
     ]
     return [doubt for doubt in doubts if doubt]
 
@@ -74,11 +76,31 @@ def _doubt_extras(extras: Extras, states: States) -> list[str]:
     """Look for a calibration that lies further off than its prior can mean."""
     doubts = []
     for block in extras.blocks:
+        if block.name in CURRENTS:
+            continue
         value = extras.value(block.name, states.walks[0], states.constants, default=np.zeros(0))
         whitened = value / block.sigma
         if chi2.sf(float(whitened @ whitened), df=len(whitened)) < PRIOR_TAIL:
             doubts.append(
                 f"the calibration of {block.name} lies {np.max(np.abs(whitened)):.0f} of its prior "
                 "sigmas off: state it nearer, or a larger sigma; or another instrument is wrong"
+            )
+    return doubts
+
+
+def _doubt_current(extras: Extras, states: States) -> list[str]:
+    """Look for a current that is larger than what is known beforehand can mean."""
+    doubts = []
+    for block in extras.blocks:
+        if block.name not in CURRENTS:
+            continue
+        value = extras.value(block.name, states.walks, states.constants, default=np.zeros(0))
+        chi_sq = np.sum((value / block.sigma) ** 2, axis=-1)
+        worst = int(np.argmax(chi_sq))
+        if chi2.sf(float(chi_sq[worst]), df=len(block.sigma)) < PRIOR_TAIL:
+            doubts.append(
+                f"a current of {np.linalg.norm(value[worst]):.2f} m/s "
+                f"({' and '.join(block.labels)}) with a sigma of {block.sigma[0]:g} m/s each: "
+                "state a larger one in [current]; or are pings off the ground marked as water_track"
             )
     return doubts

@@ -23,6 +23,7 @@ FOUNDATION = {
     "messages",
     "plausible",
     "stuck_beams",
+    "water_current",
 }
 MAY_IMPORT = {
     "factors": set[str](),

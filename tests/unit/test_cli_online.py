@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from ssm_graph.cli.main import ExitCode, build_parser, main
@@ -54,6 +56,20 @@ def test_a_replay_is_a_run(
     assert len(read_mission(run / "log").imu.time_s) == pytest.approx(400, abs=5)
     assert main([*words[:-4], "--lag", "6"]) == ExitCode.USAGE
     assert "lag_s = 5.0, not 6.0" in capsys.readouterr().err
+
+
+def test_a_replay_leaves_pings_off_the_water_out(tmp_path: Path) -> None:
+    """They are not sent to an estimator that has no current, and an event says so."""
+    mission = make_mission()
+    water = (np.arange(len(mission.dvl.time_s)) % 4 == 3).astype(float)
+    write_mission(tmp_path / "m", replace(mission, dvl=replace(mission.dvl, water_track=water)))
+    words = ["online", "--replay", str(tmp_path / "m"), "--speed", "full", "--duration", "20"]
+    assert main([*words, "--out", str(tmp_path / "run")]) == ExitCode.GOOD
+    text = (tmp_path / "run" / "events.jsonl").read_text()
+    events = [json.loads(line) for line in text.splitlines()]
+    (event,) = [event for event in events if event["kind"] == "left_out"]
+    assert event["text"].startswith("15 pings off the water are left out")
+    assert len(read_mission(tmp_path / "run" / "log").dvl.time_s) == 15
 
 
 def test_a_run_without_an_answer_has_its_code(

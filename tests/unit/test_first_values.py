@@ -193,7 +193,7 @@ def test_one_exact_depth_moves_what_is_free_until_the_sensor_meets_it(free: slic
 
     before = too_high()
     assert abs(before) > 0.1
-    state._update_water(slice(0, 0), state._depth_row(range(row, row + 1), k))
+    state._update_dvl(slice(0, 0), state._depth_row(range(row, row + 1), k))
     # The Earth as a sphere: the ellipsoid's radii differ by 0.3 % of a fall of 5 m.
     assert abs(too_high()) < 0.02 * abs(before) + 0.02
 

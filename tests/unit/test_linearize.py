@@ -99,7 +99,7 @@ def test_it_is_gtsams_graph(grade: Grade, monkeypatch: pytest.MonkeyPatch) -> No
 def test_gtsams_graph_has_no_calibration() -> None:
     """It says which variables are in the way."""
     problem, _, states = problems()
-    with pytest.raises(ConfigError, match="calibrates dvl_scale"):
+    with pytest.raises(ConfigError, match="estimates dvl_scale"):
         gtsam_graph(problem, states)
 
 

@@ -19,6 +19,7 @@ from tests.mission_damage import (
     columns,
     drop_section,
     lines,
+    new_column,
     raw,
     remove,
     rolling,
@@ -101,6 +102,10 @@ ODD: dict[str, tuple[Damage, tuple[str, ...]]] = {
         ),
         ("dvl.csv", "contradict each other", "they would fit in the order"),
     ),
+    "current without water track": (
+        toml("[depth]", "[current]\nsigma_m_per_s = 0.3\n\n[depth]"),
+        ("mission.toml [current]", "no ping is off the water", "'water_track'"),
+    ),
     "depth from the surface": (
         columns("depth.csv", ["depth_m"], lambda d: d - 15.0),
         ("depth.csv", "do not cancel: their sum is -15.0 m", "above the ellipsoid"),
@@ -137,6 +142,10 @@ def test_odd_mission_loads_with_a_note(tmp_path: Path, case: str) -> None:
 
 
 SOUND: dict[str, Damage] = {
+    "all of it off the water": both(
+        new_column("dvl.csv", "water_track", lambda _: "1"),
+        columns("dvl.csv", BEAMS, lambda v: -v),
+    ),
     "as it is": toml("format = 1", "format = 1"),
     "rolling vehicle": rolling(1.0),
     "short outliers": cell("dvl.csv", 20, "beam2_m_per_s", "-4.2"),

@@ -20,7 +20,11 @@ from ssm_graph.io.mission_units import SI, R_bd_from_rpy, from_si, rpy_from_R_bd
 from ssm_graph.io.mission_writer import write_mission
 from ssm_graph.io.tables import TableFormat
 from ssm_graph.io.vehicle import read_vehicle, vehicle_of
-from tests.mission_fixture import make_mission
+from ssm_graph.water_current import CurrentModel
+from tests.mission_damage import both, columns, new_column, toml
+from tests.mission_fixture import make_mission, write_example
+
+SIGMAS = [f"beam{beam}_sigma_m_per_s" for beam in range(1, 5)]
 
 
 def assert_same(got: Any, want: Any, where: str = "mission") -> None:
@@ -99,6 +103,48 @@ def test_round_trip_of_known_and_doubted_errors(tmp_path: Path) -> None:
     assert_same(read_vehicle(tmp_path).depth_calibration, depth)
     vehicle = vehicle_of(got)
     assert vehicle.depth_calibration.offset == vehicle.gnss_calibration.time_offset_s == 0.0
+
+
+@pytest.mark.parametrize("table_format", TableFormat, ids=lambda f: f.name)
+def test_round_trip_of_water_track(tmp_path: Path, table_format: TableFormat) -> None:
+    """The mark of each ping, both noises without columns of sigmas, and the current."""
+    if table_format is TableFormat.PARQUET:
+        pytest.importorskip("pyarrow")
+    mission = make_mission()
+    water = (np.arange(len(mission.dvl.time_s)) % 3 == 0).astype(float)
+    sigma = np.where(water[:, None] > 0.0, 0.02, 0.005) * np.ones(4)
+    dvl = replace(mission.dvl, water_track=water, sigma=sigma)
+    current = CurrentModel(sigma=0.3, correlation_s=7200.0, vertical_sigma=0.0)
+    mission = replace(mission, dvl=dvl, current=current)
+    write_mission(tmp_path, mission, table_format=table_format)
+    got = read_mission(tmp_path)
+    assert_same(got, mission)
+    assert got.current == current
+    assert "water_noise_m_per_s = 0.02" in (tmp_path / "mission.toml").read_text()
+    if table_format is TableFormat.CSV:
+        assert "sigma" not in (tmp_path / "dvl.csv").read_text().splitlines()[0]
+    odd = np.array(sigma)
+    odd[3, 1] = 0.7
+    write_mission(tmp_path, replace(mission, dvl=replace(dvl, sigma=odd)))
+    assert_same(read_mission(tmp_path).dvl, replace(dvl, sigma=odd))
+
+
+def test_water_track_without_its_keys(tmp_path: Path) -> None:
+    """Empty cells are ground; the noise is that of the beams; keys left out take the defaults."""
+    write_example(tmp_path)
+    both(
+        new_column("dvl.csv", "water_track", lambda k: "1" if k < 5 else ""),
+        columns("dvl.csv", SIGMAS, lambda s: np.full_like(s, np.nan)),
+        toml("[depth]", "[current]\nsigma_m_per_s = 0.25\n\n[depth]"),
+    )(tmp_path)
+    got = read_mission(tmp_path)
+    assert got.dvl.is_water.sum() == 5
+    assert np.all(got.dvl.sigma == 0.005)
+    assert got.current == CurrentModel(sigma=0.25)
+    ground = got.dvl.of_ground()
+    assert len(ground.time_s) == len(got.dvl.time_s) - 5
+    assert not ground.is_water.any()
+    assert ground.of_ground() is ground
 
 
 def test_round_trip_of_a_silent_dvl(tmp_path: Path) -> None:

@@ -37,6 +37,7 @@ def beams_of(sigma: Array) -> Beams:
         lever_arm_b=np.zeros(3),
         R_bd=np.eye(3),
         ping=rows // 4,
+        is_water=np.zeros(len(rows), bool),
     )
 
 

@@ -19,7 +19,7 @@ from ssm_graph.evaluation import evaluate
 from ssm_graph.report import ProgressDisplay, save_figure, summary_table
 from ssm_graph.report.figure import draw_figure
 from ssm_graph.report.style import broken_at_gaps, thinned, thinned_outliers_first, time_axis
-from tests.estimate_fixture import NOTES, make_run
+from tests.estimate_fixture import NOTES, make_run, with_current
 
 NO_BEAMS = BeamTable(*[np.empty(0)] * 5)
 
@@ -43,6 +43,20 @@ def shorten(estimate: Estimate, n: int) -> Estimate:
     trajectory = estimate.trajectory
     cut = {name: getattr(trajectory, name)[:n] for name in trajectory.__dataclass_fields__}
     return replace(estimate, trajectory=replace(trajectory, **cut), beams=NO_BEAMS)
+
+
+def test_a_current_is_told_and_drawn(tmp_path: Path) -> None:
+    """Three numbers a row; a panel of its own below the beams, without what is not estimated."""
+    estimate, reference = make_run()
+    estimate = with_current(estimate)
+    text = text_of(summary_table(estimate))
+    assert row(text, "mean sigma east, north, up, m/s") == ["0.02", "0.02", "0"]
+    assert "Current of the water" not in text_of(summary_table(make_run()[0]))
+    figure = draw_figure(estimate, reference)
+    (panel,) = [axes for axes in figure.axes if axes.get_title(loc="left").startswith("Current")]
+    assert [line.get_label() for line in panel.get_lines()] == ["east", "north"]
+    assert len(figure.axes) == len(draw_figure(make_run()[0], reference).axes) + 1
+    save_figure(tmp_path / "figure.png", estimate, reference)
 
 
 def test_table_tells_the_run() -> None:

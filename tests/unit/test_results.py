@@ -16,7 +16,7 @@ from ssm_graph.evaluation import evaluate
 from ssm_graph.io import results as results_module
 from ssm_graph.io.results import read_results, write_results
 from ssm_graph.io.results_summary import as_json
-from tests.estimate_fixture import EPOCH, NOTES, make_mission, make_run
+from tests.estimate_fixture import EPOCH, NOTES, make_mission, make_run, with_current
 
 TRAJECTORY_HEADER = (
     "time_s,lat_deg,lon_deg,height_m,vel_east_m_per_s,vel_north_m_per_s,vel_up_m_per_s,"
@@ -43,6 +43,30 @@ def test_names_are_the_contract(tmp_path: Path) -> None:
         "summary.json",
         "trajectory.csv",
     ]
+
+
+def test_a_current_has_columns_of_its_own(tmp_path: Path) -> None:
+    """Behind those of the contract, and in the summary; read again with the others."""
+    estimate = with_current(make_run(n=20)[0])
+    write_results(tmp_path, estimate, mission=make_mission(estimate), metrics=None, settings={})
+    header = (tmp_path / "trajectory.csv").read_text().splitlines()[0]
+    columns = [f"{name}_{axis}_m_per_s" for name in NAMES for axis in ("east", "north", "up")]
+    assert header == ",".join([TRAJECTORY_HEADER, *columns])
+    assert estimate.current is not None
+    got = read_results(tmp_path)
+    np.testing.assert_allclose(
+        got.trajectory["current_east_m_per_s"], estimate.current.velocity_enu[:, 0], atol=1e-7
+    )
+    np.testing.assert_allclose(got.trajectory["sigma_current_north_m_per_s"], 0.02)
+    current = got.summary["current"]
+    assert current["largest_m_per_s"] == pytest.approx(0.5)
+    assert current["mean_sigma_enu_m_per_s"] == pytest.approx([0.02, 0.02, 0.0])
+    plain = replace(estimate, current=None)
+    write_results(tmp_path, plain, mission=make_mission(plain), metrics=None, settings={})
+    assert read_results(tmp_path).summary["current"] == {}
+
+
+NAMES = ("current", "sigma_current")
 
 
 def test_numbers_survive(tmp_path: Path) -> None:
