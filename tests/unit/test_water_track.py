@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ssm_graph.aid_logs import HeadingErrors
 from ssm_graph.data import Array, DvlMount, Mission
 from ssm_graph.errors import ConfigError, DataError
 from ssm_graph.estimate import Estimate, Status
@@ -26,6 +27,8 @@ from ssm_graph.problem.bottom_track import without_water_track
 from ssm_graph.problem.current import CURRENT, CURRENT_UP
 from ssm_graph.problem.problem import build_problem, with_dvl
 from ssm_graph.simulation import (
+    AidSettings,
+    CompassSettings,
     CurrentSettings,
     DvlSettings,
     Fault,
@@ -34,6 +37,7 @@ from ssm_graph.simulation import (
     OutlierKind,
     Outliers,
     SimulatedMission,
+    UsblSettings,
     WaterTrack,
     default_mount,
 )
@@ -280,6 +284,23 @@ def test_the_fault_search_tells_a_beam_from_the_current() -> None:
         found = [note for note in estimate.notes if "is off from" in note]
         assert len(found) == n_found, found
     assert "beam 3 is off from 90" in found[0]
+
+
+def test_current_and_further_aids_go_together() -> None:
+    """Walks and constants of both kinds in one problem, with the search for faults over it."""
+    compass = CompassSettings(
+        errors=HeadingErrors(offset_sigma=0.05, walk_sigma=0.02, correlation_s=100.0)
+    )
+    aids = AidSettings(usbl=UsblSettings(interval_s=5.0), compass=compass)
+    sim = in_current(seed=6, aids=aids)
+    problem = build_problem(sim.mission)
+    assert problem.extras.n_walks > 3
+    assert problem.extras.n_constants > 0
+    estimate = SsmSmoother(SmootherConfig(fault_search=FaultSearch())).solve(problem)
+    assert estimate.status is Status.CONVERGED, estimate.reason
+    assert estimate.current is not None
+    assert np.abs(current_errors(estimate, sim) / estimate.current.sigma_enu).max() < 4.5
+    assert not any("is off from" in note for note in estimate.notes)
 
 
 def test_a_current_beyond_its_sigma_is_said() -> None:
