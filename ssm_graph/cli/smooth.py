@@ -41,7 +41,8 @@ def add_parser(commands: Any, *, epilog: str) -> None:
         summary="smooth a mission folder",
         description="Smooth a recorded mission; writes trajectory.csv, beams.csv, summary.json and "
         "figure.png. Where mission.toml gives prior sigmas of mounting, scale, lever arms, clocks "
-        "or depth offset, these are calibrated: calibration.toml has the lines to put in place.",
+        "or depth offset, these are calibrated: calibration.toml has the lines to put in place. "
+        "Where pings are off the water (column water_track), its current is estimated.",
         epilog=epilog,
     )
     add_mission_arguments(parser)
