@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
@@ -13,6 +15,7 @@ from ssm_graph.errors import DataError
 from ssm_graph.estimate import Estimate, Trajectory
 from ssm_graph.evaluation import Metrics, evaluate
 from ssm_graph.report.beam_panels import draw_beams
+from ssm_graph.report.calibration_panel import draw_calibration
 from ssm_graph.report.current_panel import draw_current
 from ssm_graph.report.error_panels import draw_heading, draw_position, draw_velocity
 from ssm_graph.report.style import INK, SMALL
@@ -75,7 +78,8 @@ def draw_figure(
     heading.set(fontsize=12.0, fontweight="bold", linespacing=1.4)
     caption = _caption(estimate, metrics)
     figure.text(0.012, 0.973, caption, va="top", fontsize=SMALL + 0.5, color=INK)
-    heights = [5.9, 3.5] if estimate.current is None else [5.3, 3.0, 1.1]
+    further = _further_panels(estimate)
+    heights = [5.9 - 0.6 * len(further), 3.5 - 0.5 * len(further), *(1.1 for _ in further)]
     grid = figure.add_gridspec(len(heights), 1, height_ratios=heights)
     upper = grid[0].subgridspec(4, 2, width_ratios=[1.2, 1.0], height_ratios=[1.0, 1.0, 1.0, 1.25])
     draw_track(figure.add_subplot(upper[:3, 0]), estimate, reference if errors else None)
@@ -83,9 +87,20 @@ def draw_figure(
     draw_velocity(figure.add_subplot(upper[3, 0]), trajectory, errors)
     draw_heading(figure.add_subplot(upper[3, 1]), trajectory, errors)
     draw_beams(figure, grid[1], estimate.beams, trajectory_s=trajectory.time_s)
-    if estimate.current is not None:
-        draw_current(figure.add_subplot(grid[2]), estimate.current)
+    for row, draw in enumerate(further, start=2):
+        draw(figure.add_subplot(grid[row]))
     return figure
+
+
+def _further_panels(estimate: Estimate) -> list[Callable[[Axes], None]]:
+    """Return what draws the panels that not every run has."""
+    current, calibration = estimate.current, estimate.calibration
+    panels: list[Callable[[Axes], None]] = []
+    if current is not None:
+        panels.append(lambda axes: draw_current(axes, current))
+    if calibration is not None:
+        panels.append(lambda axes: draw_calibration(axes, calibration))
+    return panels
 
 
 def _metrics(trajectory: Trajectory, reference: Reference | None) -> Metrics | None:

@@ -19,7 +19,7 @@ from ssm_graph.evaluation import evaluate
 from ssm_graph.report import ProgressDisplay, save_figure, summary_table
 from ssm_graph.report.figure import draw_figure
 from ssm_graph.report.style import broken_at_gaps, thinned, thinned_outliers_first, time_axis
-from tests.estimate_fixture import NOTES, make_run, with_current
+from tests.estimate_fixture import NOTES, calibrated, make_run, with_current
 
 NO_BEAMS = BeamTable(*[np.empty(0)] * 5)
 
@@ -56,6 +56,23 @@ def test_a_current_is_told_and_drawn(tmp_path: Path) -> None:
     (panel,) = [axes for axes in figure.axes if axes.get_title(loc="left").startswith("Current")]
     assert [line.get_label() for line in panel.get_lines()] == ["east", "north"]
     assert len(figure.axes) == len(draw_figure(make_run()[0], reference).axes) + 1
+    save_figure(tmp_path / "figure.png", estimate, reference)
+
+
+def test_a_calibration_is_drawn_in_sigmas_before(tmp_path: Path) -> None:
+    """A panel of its own, beside that of a current; each value has a place and the sign it has."""
+    estimate, reference = make_run()
+    estimate = calibrated(with_current(estimate), gnss_sigma=0.1)
+    assert estimate.calibration is not None
+    figure = draw_figure(estimate, reference)
+    (panel,) = [a for a in figure.axes if a.get_title(loc="left").startswith("Calibration")]
+    labels = [label.get_text().split("\n") for label in panel.get_xticklabels()]
+    assert [name for name, _ in labels] == [v.label for v in estimate.calibration.values]
+    assert labels[0] == ["dvl_scale_error", "-0.02"]
+    assert labels[3] == ["dvl_mounting_z_deg", "2"]
+    centres = [c.lines[0].get_ydata()[0] for c in panel.containers]  # type: ignore[attr-defined]
+    np.testing.assert_allclose(centres[0], -0.02 / 0.03)
+    assert len(figure.axes) == len(draw_figure(make_run()[0], reference).axes) + 2
     save_figure(tmp_path / "figure.png", estimate, reference)
 
 
