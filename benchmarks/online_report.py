@@ -204,9 +204,9 @@ def _ratio(rows: list[SettingRow], base: list[SettingRow], field: str) -> str:
 
 def log_lines(rows: Sequence[LogRow]) -> list[str]:
     """Return the table of the real logs."""
-    header = ["log", "", "horizontal rms, m", "median, m", "compared", "median, ms", "99 %, ms"]
+    header = ["log", "", "horizontal rms, m", "median, m", "compared"]
     cells = []
     for row in rows:
-        numbers = [row.horizontal, row.median, row.n_fixes, *row.latency_ms[:2]]
+        numbers = [row.horizontal, row.median, row.n_fixes]
         cells.append([row.log[:16], row.name, *map(_number, numbers), row.remark or "–"])
     return [*table([*header, "remark"], cells), ""]

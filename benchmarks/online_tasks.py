@@ -186,8 +186,6 @@ class LogRow(NamedTuple):
     median: float
     """m"""
     n_fixes: int
-    latency_ms: tuple[float, float, float]
-    """Median, 99th percentile and largest; NaN offline"""
     remark: str
 
 
@@ -220,15 +218,13 @@ def _live_rows(
     run = run_stream(smoother, messages_of(mission), every_s=1.0 / ASK_HZ, duration_s=duration_s)
     rows = run.answers.first_after_keyframe(begin_s=-np.inf)
     if len(rows) == 0 or run.delayed is None:
-        return [LogRow(log, "live", np.nan, np.nan, 0, (np.nan,) * 3, smoother.status()[1])]
-    newest, latency_s = run.answers.trajectory(rows), run.answers.column("latency_s")[rows][1:]
-    median, p99, largest = (1e3 * np.percentile(latency_s, [50.0, 99.0, 100.0])).tolist()
+        return [LogRow(log, "live", np.nan, np.nan, 0, smoother.status()[1])]
+    newest = run.answers.trajectory(rows)
     good = np.mean(run.answers.column("health") == HEALTHS.index(Health.GOOD))
     remark = f"begins at {newest.time_s[0] - mission.imu.start_s:.1f} s; good {100 * good:.0f} % "
     remark += f"of the time; events: {run.told}; refused: {run.refused or 'none'}"
-    first = _log_row(log, f"live, lag {config.lag_s:g} s, newest", newest, reference, remark)
     return [
-        first._replace(latency_ms=(median, p99, largest)),
+        _log_row(log, f"live, lag {config.lag_s:g} s, newest", newest, reference, remark),
         _log_row(log, f"live, lag {config.lag_s:g} s, delayed", run.delayed, reference),
     ]
 
@@ -244,4 +240,4 @@ def _log_row(
     series = error_series(trajectory, reference(trajectory))
     error = series.horizontal
     rms = float(np.sqrt(np.mean(error**2)))
-    return LogRow(log, name, rms, float(np.median(error)), len(error), (np.nan,) * 3, remark)
+    return LogRow(log, name, rms, float(np.median(error)), len(error), remark)
