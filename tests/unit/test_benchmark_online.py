@@ -116,5 +116,5 @@ def test_tables_of_settings_and_logs() -> None:
     ]
     lines = setting_lines(rows, ["TACTICAL"], ["a", "b"])
     assert any(line.startswith("| b | 4 ± ") and "2.000 (2.000 to 2.000)" in line for line in lines)
-    log = LogRow("log_auto_square_x", "live", 1.5, 1.0, 7, (np.nan,) * 3, "")
-    assert log_lines([log])[-2] == "| log_auto_square_ | live | 1.5 | 1 | 7 | – | – | – |"
+    log = LogRow("log_auto_square_x", "live", np.nan, 1.0, 7, "")
+    assert log_lines([log])[-2] == "| log_auto_square_ | live | – | 1 | 7 | – |"
