@@ -201,11 +201,12 @@ LEGEND = """\
 Missions as `ssm-graph convert` makes them: one set of settings for the vehicle, nothing tuned per
 log ([where each comes from](../../docs/field.md)). Calibration `estimated`: DVL scale and both
 delays about the vehicle's known values, as the importer asks; `vehicle`: those values taken as
-exact; `none`: the speeds as read, gyro biases left in with a prior of 0.001 rad/s. Path: horizontal
-way from the last fix used to the last one scored, by positions a second apart. Heading sigma:
-posterior, when GNSS ends. Error / sigma: rms of the horizontal error over the rms of its own sigma.
-The fixes themselves are good to 0.15 to 0.35 m. Faults are drawn from the seed; bursts begin after
-GNSS has ended.
+exact, both with the slow errors of DVL and GNSS as variables; `none`: the speeds as read, gyro
+biases left in with a prior of 0.001 rad/s, all errors as white noise. Path: horizontal way from the
+last fix used to the last one scored, by positions a second apart. Heading sigma: posterior, when
+GNSS ends. Error / sigma: rms of the horizontal error over the rms of its own sigma. The fixes
+themselves are good to 0.15 to 0.35 m, by other estimates; the receiver says 0.5 m. Faults are drawn
+from the seed; bursts begin after GNSS has ended.
 """
 
 

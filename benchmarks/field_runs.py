@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from factors.kernels import KERNELS
 from ssm_graph.cli.run_mission import fixes_where
-from ssm_graph.data import Array, GnssLog, Mission
+from ssm_graph.data import Array, Drift, GnssLog, Mission
 from ssm_graph.errors import SsmGraphError
 from ssm_graph.estimate import Estimate
 from ssm_graph.evaluation import reference_from_gnss
@@ -123,13 +123,21 @@ def exact(mission: Mission) -> Mission:
 def unknown(mission: Mission) -> Mission:
     """Return the mission of a user who knows neither scale nor gyro biases, and asks for nothing.
 
-    Gyro biases come back, with a prior that covers them; speeds are taken as they are read.
+    Gyro biases come back, with a prior that covers them; speeds are taken as they are read, and
+    slow errors of DVL and GNSS are left to the noise stated.
     """
     plain = exact(mission)
     noise = replace(plain.imu.noise, gyro_bias_sigma=1e-3)
     imu = replace(plain.imu, gyro_b=plain.imu.gyro_b + GYRO_BIAS, noise=noise)
-    mount = replace(plain.dvl.mount, scale_error=0.0)
-    return replace(plain, imu=imu, dvl=replace(plain.dvl, mount=mount))
+    mount = replace(plain.dvl.mount, scale_error=0.0, drift=Drift())
+    gnss = _gnss(plain)
+    known = replace(gnss.calibration, drift=Drift())
+    return replace(
+        plain,
+        imu=imu,
+        dvl=replace(plain.dvl, mount=mount),
+        gnss=replace(gnss, calibration=known),
+    )
 
 
 MODES: Mapping[str, Callable[[Mission], Mission]] = {

@@ -60,6 +60,22 @@ class ImuLog(FrozenArrays):
     """(N, 3) specific force, m/s^2; at rest (0, 0, -9.8)."""
 
 
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """Errors that change slowly, as a Gauss-Markov process; none by default.
+
+    An estimator that models it takes the rest of the stated noise as white; one that does not
+    counts the stated noise, which has to stand for both.
+    """
+
+    sigma: float = 0.0
+    """Of each component, SI; above zero makes it a variable of the graph."""
+    correlation_s: float = 0.0
+    """It forgets within so much, s; above zero where there is a drift."""
+    fast_share: float = 1.0
+    """Of the stated sigmas, what is left as white noise where the drift is modelled, in (0, 1]."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class DvlMount(FrozenArrays):
     """Geometry of the DVL: beams in the instrument, instrument in the body."""
@@ -90,6 +106,8 @@ class DvlMount(FrozenArrays):
     """Prior sigma of each beam's own scale error, 1; above zero asks for its calibration."""
     lever_arm_sigma: float = 0.0
     """Prior sigma of each component of the lever arm, m; above zero asks for its calibration."""
+    drift: Drift = Drift()
+    """What the velocity is off by slowly, each of three components in instrument axes, m/s."""
 
     @property
     def beams_b(self) -> Array:
@@ -110,6 +128,7 @@ class DvlMount(FrozenArrays):
             beam_scale_sigma=0.0,
             lever_arm_sigma=0.0,
             time_offset_sigma_s=0.0,
+            drift=Drift(),
         )
 
 
@@ -176,6 +195,8 @@ class GnssCalibration:
     """Prior sigma of what is left of that, s; above zero asks for its calibration."""
     lever_arm_sigma: float = 0.0
     """Prior sigma of each component of the lever arm, m; above zero asks for its calibration."""
+    drift: Drift = Drift()
+    """What fixes are off by slowly, each of east, north and up, m."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,7 +11,7 @@ from hypothesis import settings
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from ssm_graph.data import Array, ImuLog, InitialState, Mission
+from ssm_graph.data import Array, Drift, ImuLog, InitialState, Mission
 from ssm_graph.errors import SolverError
 from ssm_graph.estimate import Status, Trajectory
 from ssm_graph.frames import R_lb_from_roll_pitch_heading
@@ -85,6 +85,18 @@ def without_beams(mission: Mission) -> Mission:
     """Return the mission with every beam speed missing."""
     speed = np.full_like(mission.dvl.speed, np.nan)
     return dataclasses.replace(mission, dvl=dataclasses.replace(mission.dvl, speed=speed))
+
+
+def drifting(mission: Mission, of_dvl: Drift, of_gnss: Drift) -> Mission:
+    """Return the mission with slow errors stated for DVL and GNSS."""
+    mount = dataclasses.replace(mission.dvl.mount, drift=of_dvl)
+    gnss = mission.gnss
+    if gnss is not None:
+        calibration = dataclasses.replace(gnss.calibration, drift=of_gnss)
+        gnss = dataclasses.replace(gnss, calibration=calibration)
+    return dataclasses.replace(
+        mission, dvl=dataclasses.replace(mission.dvl, mount=mount), gnss=gnss
+    )
 
 
 def with_initial(mission: Mission, **changes: Any) -> Mission:

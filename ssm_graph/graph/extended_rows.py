@@ -29,6 +29,7 @@ from ssm_graph.graph.states import States
 from ssm_graph.graph.water_rows import WaterRows
 from ssm_graph.problem.calibration import (
     DVL_BEAM_SCALE,
+    DVL_DRIFT,
     DVL_LEVER_ARM,
     DVL_MOUNTING,
     DVL_SCALE,
@@ -170,9 +171,16 @@ class ExtendedBeams:
             jacobian[np.arange(len(jacobian)), first + beams.beam[rows]] = residual.error_D_scale
         if through is not None:
             self._water.fill(jacobian, residual.error_D_velocity_n, through)
+        error = residual.error
+        if DVL_DRIFT in extras:
+            # In instrument axes, and on top of what is read: no scale, no lever arm.
+            beam_d = beams.beam_b[rows] @ beams.R_bd
+            jacobian[:, extras.columns(DVL_DRIFT)] = beam_d
+            drift_d = self._value(DVL_DRIFT, at.walks, at.constants, 3)
+            error = error + np.sum(beam_d * drift_d, axis=-1)
         if prepared.bias is None:
-            return BeamRows(residual.error, jacobian)
-        return BeamRows(residual.error + jacobian @ self._since(at, prepared), jacobian)
+            return BeamRows(error, jacobian)
+        return BeamRows(error + jacobian @ self._since(at, prepared), jacobian)
 
     def _relative(self, at: RowStates, rows: Rows) -> tuple[RowStates, ThroughWater | None]:
         """Return the states with velocities relative to what reflects each beam."""

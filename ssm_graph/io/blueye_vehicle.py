@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from ssm_graph.data import N_BEAMS, DvlMount, GnssCalibration, ImuNoise
+from ssm_graph.data import N_BEAMS, Drift, DvlMount, GnssCalibration, ImuNoise
 
 DVL_LEVER_ARM: Final = (-0.17, 0.0, 0.26)
 """m, forward-right-down from the IMU, as is the antenna's: positions on the vehicle."""
@@ -26,15 +26,21 @@ NOISE: Final = ImuNoise(
     # Two IMUs on one vehicle part by 0.3 to 0.6 deg rms within four minutes, and readings of 25 to
     # 37 Hz stamped at arrival miss part of every turn.
     gyro_density=2e-3,
-    accel_density=0.05,
+    # With 0.05 the inertial data err three to five times less than that on two logs; with 0.02 both
+    # agree about DVL scale and delays, beside them.
+    accel_density=0.02,
     # 0.5 % of gravity; a log in m/s^2 is 1 % low.
     accel_bias_sigma=0.05,
 )
 
 BEAM_SIGMA: Final = 0.06
-"""m/s. Single reports scatter by 3 to 6 mm/s; what leads a track astray is slow: the maker states
-1 % for the standard edition, and waves turn the mean. At 5 reports a second this leaves 9 mm/s
-after half a minute, 1.5 % of the speed under way, and the sigmas of withheld epochs hold."""
+"""m/s, what a report counts as where its slow errors are not modelled. At 5 reports a second this
+leaves 9 mm/s after half a minute, 1.5 % of the speed under way."""
+DVL_DRIFT: Final = Drift(sigma=0.006, correlation_s=20.0, fast_share=1.0 / 3.0)
+"""m/s. The maker states 1 % for the standard edition, 6 mm/s under way; with GNSS throughout, means
+over 2 s miss by 5 mm/s that stay alike for 10 to 20 s. It is common to the beams: what they have
+not in common, their parity, is white, 5 mm/s a report. That leaves 0.02 m/s of white noise, four
+times as much, for waves within a report."""
 DVL_SCALE_ERROR: Final = 0.046
 """Speeds are so much too high: 0.047 and 0.046 against GNSS on two days. The standard edition
 counts on 1500 m/s of sound, and brackish water of 6 degrees has 1435 m/s."""
@@ -50,7 +56,11 @@ DEPTH_SIGMA: Final = 0.03
 """m; the sensor resolves 1 mm, waves at the surface do not"""
 GNSS_SIGMA_LIMIT: Final = 1.0
 """m; fixes that report more are taken while the antenna surfaces or sinks."""
-GNSS_UP_SIGMA: Final = 10.0
+GNSS_DRIFT: Final = Drift(sigma=0.5, correlation_s=120.0, fast_share=0.2)
+"""m. Nearly all of the 0.5 m that the receiver reports: successive fixes differ by centimetres.
+Beside the DVL and the gyros, two logs with GNSS throughout are likeliest with 0.3 to 0.5 m that
+stay alike for 120 to 300 s, and 0.01 m of white noise; 0.1 m is left for waves."""
+GNSS_UP_SIGMA: Final = 50.0
 """m; their height is made from depth, so it must not count as a measurement."""
 
 JANUS_ANGLE: Final = np.deg2rad(22.5)
@@ -70,9 +80,12 @@ def dvl_mount() -> DvlMount:
         scale_sigma=DVL_SCALE_SIGMA,
         time_offset_s=DVL_DELAY_S,
         time_offset_sigma_s=DVL_DELAY_SIGMA_S,
+        drift=DVL_DRIFT,
     )
 
 
 def gnss_calibration() -> GnssCalibration:
     """Return the receiver's delay, to be estimated about what is known."""
-    return GnssCalibration(time_offset_s=GNSS_DELAY_S, time_offset_sigma_s=GNSS_DELAY_SIGMA_S)
+    return GnssCalibration(
+        time_offset_s=GNSS_DELAY_S, time_offset_sigma_s=GNSS_DELAY_SIGMA_S, drift=GNSS_DRIFT
+    )

@@ -38,7 +38,7 @@ def compare_imus(imu: ImuLog, witness: Array) -> tuple[str, ...]:
     other = np.diff(_turn(witness[:, 0], witness[:, 1:4], edges), axis=0) / STEP_S
     offset = np.median(other - used, axis=0)
     is_up = float(np.median(witness[:, 6])) < 0.0
-    text = ", ".join(f"{x + 0.0:.3f}" for x in offset)
+    text = ", ".join(f"{x + 0.0:.4f}" for x in offset)
     first = (
         "Imu1Tel is not used, only compared: its gyros read "
         f"({text}) rad/s more than those of Imu2Tel"

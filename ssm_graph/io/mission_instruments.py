@@ -8,6 +8,7 @@ from ssm_graph.data import (
     N_BEAMS,
     Array,
     DepthCalibration,
+    Drift,
     DvlMount,
     GnssCalibration,
     ImuNoise,
@@ -63,6 +64,7 @@ def dvl_mount(toml: MissionToml) -> DvlMount:
         ),
         beam_scale_sigma=settings.number("beam_scale_sigma"),
         lever_arm_sigma=settings.number("lever_arm_sigma_m"),
+        drift=_drift(settings, "drift_sigma_m_per_s"),
     )
 
 
@@ -97,6 +99,7 @@ def gnss_calibration(toml: MissionToml) -> GnssCalibration:
         time_offset_s=settings.number("time_offset_s"),
         time_offset_sigma_s=settings.number("time_offset_sigma_s"),
         lever_arm_sigma=settings.number("lever_arm_sigma_m"),
+        drift=_drift(settings, "drift_sigma_m"),
     )
 
 
@@ -140,6 +143,20 @@ def radians_wrapped(lon_deg: Array | float) -> Array:
     """Return a longitude in [-pi, pi], unchanged in all its digits where it lies there already."""
     lon = np.radians(lon_deg)
     return np.asarray(np.where(np.abs(lon) > np.pi, wrap_to_pi(lon), lon))
+
+
+def _drift(settings: Settings, sigma_key: str) -> Drift:
+    """Return the drift of a section; raise where one of its keys stands without the other."""
+    sigma, correlation_s = settings.number(sigma_key), settings.number("drift_correlation_s")
+    if sigma > 0.0 and correlation_s == 0.0:
+        raise settings.fault(
+            sigma_key, "expected with a drift_correlation_s, got none; 20 is a third of a minute"
+        )
+    for key in ("drift_correlation_s", "drift_fast_share"):
+        if key in settings and sigma == 0.0:
+            raise settings.fault(key, f"expected with a {sigma_key} above 0, got none")
+    share = settings.number("drift_fast_share") if "drift_fast_share" in settings else 1.0
+    return Drift(sigma, correlation_s, share)
 
 
 def _beams(settings: Settings) -> Array:

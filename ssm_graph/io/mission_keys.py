@@ -35,6 +35,10 @@ _HEIGHT = Key(low=-12000.0, high=20000.0, hint="height is in metres above the el
 _LATE = optional_key(-10.0, 10.0, "the unit is seconds, not milliseconds")
 _LATE_SIGMA = optional_key(0.0, 10.0, "the unit is seconds, not milliseconds")
 _ARM_SIGMA = optional_key(0.0, 100.0, "the unit is metres")
+_DRIFT: Final[Mapping[str, Key]] = {
+    "drift_correlation_s": sigma_key(1e8, "the unit is seconds", required=False),
+    "drift_fast_share": sigma_key(1.0, "all of the noise is 1", required=False),
+}
 _WALK = "the unit is that of the data sheet"
 
 SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
@@ -75,6 +79,8 @@ SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
         "beam_scale_sigma": optional_key(0.0, 1.0, "1 percent is 0.01"),
         "lever_arm_sigma_m": _ARM_SIGMA,
         "water_noise_m_per_s": sigma_key(5.0, "the unit is m/s, not mm/s", required=False),
+        "drift_sigma_m_per_s": optional_key(0.0, 5.0, "the unit is m/s, not mm/s"),
+        **_DRIFT,
     },
     "current": {
         "sigma_m_per_s": sigma_key(20.0, "the unit is m/s", required=False),
@@ -94,6 +100,8 @@ SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
         "lever_arm_sigma_m": _ARM_SIGMA,
         "time_offset_s": _LATE,
         "time_offset_sigma_s": _LATE_SIGMA,
+        "drift_sigma_m": optional_key(0.0, 1000.0, "the unit is metres"),
+        **_DRIFT,
     },
     **AID_SECTIONS,
     "initial": {

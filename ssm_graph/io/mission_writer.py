@@ -12,6 +12,7 @@ import tomli_w
 from ssm_graph.data import (
     Array,
     DepthCalibration,
+    Drift,
     DvlLog,
     DvlMount,
     GnssCalibration,
@@ -179,6 +180,7 @@ def dvl_settings(mount: DvlMount, beam_sigma: float, suffix: str) -> dict[str, A
         "beam_scale_error": mount.beam_scale_error.tolist() if mount.beam_scale_error.any() else 0,
         "beam_scale_sigma": float(mount.beam_scale_sigma),
         "lever_arm_sigma_m": float(mount.lever_arm_sigma),
+        **_drift_settings("drift_sigma_m_per_s", mount.drift),
     }
     return {
         "file": f"dvl{suffix}",
@@ -201,7 +203,18 @@ def gnss_calibration_settings(calibration: GnssCalibration) -> dict[str, float]:
         lever_arm_sigma_m=calibration.lever_arm_sigma,
         time_offset_s=calibration.time_offset_s,
         time_offset_sigma_s=calibration.time_offset_sigma_s,
+        **_drift_settings("drift_sigma_m", calibration.drift),
     )
+
+
+def _drift_settings(sigma_key: str, drift: Drift) -> dict[str, float]:
+    if drift.sigma == 0.0:
+        return {}
+    return {
+        sigma_key: float(drift.sigma),
+        "drift_correlation_s": float(drift.correlation_s),
+        "drift_fast_share": float(drift.fast_share),
+    }
 
 
 def _given(**values: float) -> dict[str, float]:

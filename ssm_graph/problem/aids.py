@@ -45,6 +45,8 @@ class Fixes(ReadOnlyArrays):
     """(M, 3) rad/s, at the fixes: with a clock in doubt it moves the antenna"""
     lever_arm_b: Array
     """(3,) m"""
+    fast_share: float = 1.0
+    """Of the sigmas, what is white where their drift is a variable"""
 
 
 def depths_of(mission: Mission, timeline: Timeline) -> Depths | None:
@@ -81,4 +83,5 @@ def fixes_of(mission: Mission, log: GnssLog, timeline: Timeline) -> Fixes:
         covariance_n=fix_covariance_n(frame, place_n, log.sigma_enu[fix]),
         gyro_b=mean_gyro(mission.imu, log.time_s[fix]),
         lever_arm_b=log.lever_arm_b,
+        fast_share=log.calibration.drift.fast_share,
     )

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from ssm_graph.data import N_BEAMS, DepthCalibration, DvlMount, GnssCalibration, Mission
+from ssm_graph.data import N_BEAMS, DepthCalibration, Drift, DvlMount, GnssCalibration, Mission
 from ssm_graph.problem.aid_errors import aid_extras, is_of_aid
 from ssm_graph.problem.current import current_extras
 from ssm_graph.problem.extras import Extra, Extras
@@ -20,6 +20,8 @@ DVL_TIME_OFFSET: Final = "dvl_time_offset"
 DEPTH_OFFSET: Final = "depth_offset"
 GNSS_LEVER_ARM: Final = "gnss_lever_arm"
 GNSS_TIME_OFFSET: Final = "gnss_time_offset"
+DVL_DRIFT: Final = "dvl_drift"
+GNSS_DRIFT: Final = "gnss_drift"
 CALIBRATIONS: Final = frozenset(
     {
         DVL_MOUNTING,
@@ -38,7 +40,7 @@ CALIBRATIONS: Final = frozenset(
 def calibration_extras(
     mount: DvlMount, depth: DepthCalibration | None, gnss: GnssCalibration | None
 ) -> tuple[Extra, ...]:
-    """Return what the prior sigmas of instruments switch on; None for one that there is not."""
+    """Return what the sigmas of instruments switch on, drifts too; None for one not there."""
     extras = [
         Extra(
             DVL_SCALE,
@@ -59,6 +61,7 @@ def calibration_extras(
         ),
         Extra(DVL_LEVER_ARM, _axes("dvl_lever_arm_{}_m"), np.full(3, mount.lever_arm_sigma)),
         Extra(DVL_TIME_OFFSET, ("dvl_time_offset_s",), np.array([mount.time_offset_sigma_s])),
+        _drift(DVL_DRIFT, "dvl_drift_{}_m_per_s", mount.drift),
     ]
     if depth is not None:
         sigma = np.array([depth.offset_sigma])
@@ -68,6 +71,7 @@ def calibration_extras(
         late_sigma = np.array([gnss.time_offset_sigma_s])
         extras.append(Extra(GNSS_LEVER_ARM, _axes("gnss_lever_arm_{}_m"), arm_sigma))
         extras.append(Extra(GNSS_TIME_OFFSET, ("gnss_time_offset_s",), late_sigma))
+        extras.append(_drift(GNSS_DRIFT, "gnss_drift_{}_m", gnss.drift))
     return tuple(extra for extra in extras if extra.sigma[0] > 0.0)
 
 
@@ -100,6 +104,20 @@ def taken_as_exact(extras: Extras) -> tuple[str, ...]:
     return (
         f"mission.toml asks to calibrate {', '.join(asked)}: this estimator takes them as stated, "
         "and its sigmas leave their errors out; ssm-graph smooth calibrates",
+    )
+
+
+def _drift(name: str, pattern: str, drift: Drift) -> Extra:
+    """Return a drift of three components; one of sigma zero is none."""
+    sigma, density = np.full(3, drift.sigma), 0.0
+    if drift.sigma > 0.0:
+        density = drift.sigma * math.sqrt(2.0 / drift.correlation_s)
+    return Extra(
+        name,
+        _axes(pattern),
+        sigma,
+        walk_density=density,
+        correlation_s=drift.correlation_s,
     )
 
 

@@ -19,7 +19,7 @@ from ssm_graph.earth import LocalFrame
 from ssm_graph.errors import ConfigError, DataError
 from ssm_graph.imu.preintegration import InertialChain, imu_gaps, preintegrate
 from ssm_graph.problem.aids import Depths, Fixes, depths_of, fixes_of
-from ssm_graph.problem.calibration import extras_of, needs_motion
+from ssm_graph.problem.calibration import DVL_DRIFT, GNSS_DRIFT, extras_of, needs_motion
 from ssm_graph.problem.current import CURRENT, current_note
 from ssm_graph.problem.error_state import InitialMoments, initial_moments
 from ssm_graph.problem.extras import Extras
@@ -80,6 +80,8 @@ class Beams(ReadOnlyArrays):
     """(M,) off the water instead of the ground: relative to its current"""
     motion: MotionBefore | None = None
     """Inertial readings about the pings, where the DVL's clock or lever arm is in doubt."""
+    fast_share: float = 1.0
+    """Of the sigmas off the ground, what is white where the drift of the DVL is a variable"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,6 +102,8 @@ class Problem(ReadOnlyArrays):
     further: FurtherAids = NO_FURTHER
     """What only the batch smoother is aided by; another estimator says so."""
     notes: tuple[str, ...] = ()
+    is_noise_fast: bool = False
+    """Whether sigmas of beams and fixes leave out what drifts stand for: :func:`with_fast_noise`"""
 
     @property
     def n_keyframes(self) -> int:
@@ -184,7 +188,33 @@ def with_dvl(problem: Problem, mission: Mission) -> Problem:
             "with_dvl: expected pings off the ground, as those of the problem, got some off the "
             "water, whose current it does not have; build a problem of its own"
         )
-    return replace(problem, beams=beams)
+    return replace(with_stated_noise(problem), beams=beams)
+
+
+def with_fast_noise(problem: Problem) -> Problem:
+    """Return the problem for an estimator whose variables are its drifts, too.
+
+    The sigmas of beams and fixes are then those of white noise alone; as they are stated, they
+    stand for what changes slowly as well.
+    """
+    return problem if problem.is_noise_fast else _scaled_noise(problem, is_noise_fast=True)
+
+
+def with_stated_noise(problem: Problem) -> Problem:
+    """Return the problem for an estimator without drifts."""
+    return _scaled_noise(problem, is_noise_fast=False) if problem.is_noise_fast else problem
+
+
+def _scaled_noise(problem: Problem, *, is_noise_fast: bool) -> Problem:
+    power = 1.0 if is_noise_fast else -1.0
+    beams, fixes = problem.beams, problem.fixes
+    if DVL_DRIFT in problem.extras:
+        share = np.where(beams.is_water, 1.0, beams.fast_share**power)
+        beams = replace(beams, sigma=beams.sigma * share)
+    if fixes is not None and GNSS_DRIFT in problem.extras:
+        covariance_n = fixes.covariance_n * fixes.fast_share ** (2.0 * power)
+        fixes = replace(fixes, covariance_n=covariance_n)
+    return replace(problem, beams=beams, fixes=fixes, is_noise_fast=is_noise_fast)
 
 
 def _without_stuck_beams(mission: Mission) -> tuple[Mission, tuple[str, ...]]:
@@ -233,4 +263,5 @@ def _beams(mission: Mission, ping: Indices, ping_keyframe: Indices, extras: Extr
         ping=row,
         is_water=is_water[row],
         motion=MotionBefore(mission.imu, dvl.ping_s[ping]) if needs_motion(extras) else None,
+        fast_share=dvl.mount.drift.fast_share,
     )

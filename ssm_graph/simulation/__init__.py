@@ -6,6 +6,7 @@
 from ssm_graph.simulation.aids import DepthSettings, GnssSettings
 from ssm_graph.simulation.config import SimulationConfig
 from ssm_graph.simulation.currents import Current, CurrentSettings, WaterTrack
+from ssm_graph.simulation.drifts import DriftSettings
 from ssm_graph.simulation.dvl_model import DvlSettings, default_mount, janus_beams
 from ssm_graph.simulation.faults import Loss, OutlierKind, Outliers
 from ssm_graph.simulation.further_aids import (
@@ -44,6 +45,7 @@ __all__ = [
     "DepthProfile",
     "DepthSettings",
     "DiveRoute",
+    "DriftSettings",
     "DvlSettings",
     "Fault",
     "FaultShape",

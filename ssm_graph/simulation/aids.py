@@ -10,6 +10,7 @@ import numpy as np
 from ssm_graph.data import Array, DepthLog, GnssLog
 from ssm_graph.earth import R_el_from_lat_lon, geodetic_from_ecef
 from ssm_graph.simulation._checks import require, require_positive, require_window
+from ssm_graph.simulation.drifts import DriftSettings, draw_drift
 from ssm_graph.simulation.trajectory import Trajectory, stacked
 
 Point = tuple[float, float, float]
@@ -48,6 +49,8 @@ class GnssSettings:
     """The antenna truly sits this much further on, m."""
     late_s: float = 0.0
     """Stamps are later than the fixes by this much, s."""
+    drift: DriftSettings | None = None
+    """Of the fixes on top of their noise, each of east, north and up, m."""
     windows: tuple[tuple[float, float], ...] | None = None
     """Times with fixes, s, each ``[start, end)``; None for whenever the route is at the surface."""
     surface_depth_m: float = 0.5
@@ -101,6 +104,7 @@ def gnss_log(
     *,
     end_s: float,
     rng: np.random.Generator | None,
+    drift_rng: np.random.Generator | None = None,
 ) -> GnssLog | None:
     """Return the fixes over ``(0, end_s]``; None if there is not one. No ``rng``, no noise."""
     time_s = regular_times(settings.rate_hz, end_s)
@@ -109,15 +113,18 @@ def gnss_log(
     )
     # Drawn before fixes are chosen: a fix keeps its noise when the windows change.
     unit = np.zeros((len(time_s), 3)) if rng is None else rng.standard_normal((len(time_s), 3))
+    noise_l = unit * sigma_enu
+    if drift_rng is not None and settings.drift is not None:
+        noise_l = noise_l + draw_drift(settings.drift, time_s, drift_rng)
     has_fix = _has_fix(trajectory, settings, time_s)
     if not has_fix.any():
         return None
-    time_s, unit = time_s[has_fix], unit[has_fix]
+    time_s, noise_l = time_s[has_fix], noise_l[has_fix]
     motion = trajectory.at(time_s)
     R_el = R_el_from_lat_lon(motion.lat.value, motion.lon.value)
     true_arm_b = np.array(settings.lever_arm_b) + np.array(settings.lever_arm_error_b)
     antenna_e = stacked(motion.point_e(true_arm_b))
-    noise_e = np.einsum("kij,kj->ki", R_el, unit * sigma_enu)
+    noise_e = np.einsum("kij,kj->ki", R_el, noise_l)
     lat, lon, height = geodetic_from_ecef(antenna_e + noise_e)
     return GnssLog(
         time_s=time_s + settings.late_s,

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from ssm_graph.data import N_BEAMS, Array, DvlMount
 from ssm_graph.earth import R_el_from_lat_lon, geodetic_from_ecef
 from ssm_graph.simulation._checks import require, require_not_negative, require_positive
+from ssm_graph.simulation.drifts import DriftSettings
 from ssm_graph.simulation.taylor import Series
 from ssm_graph.simulation.trajectory import Motion, Trajectory, Vector, stacked
 
@@ -66,6 +67,8 @@ class DvlSettings:
     """On top of ``scale_error``, each beam's own."""
     scale_drift_per_h: float = 0.0
     """By so much the scale error grows in an hour."""
+    drift: DriftSettings | None = None
+    """Of the velocity that is read, each component in instrument axes, m/s."""
     seabed_depth_m: float | None = None
     """Depth of a level sea floor; given, ranges are written as well."""
 

@@ -15,6 +15,7 @@ from ssm_graph.earth import LocalFrame
 from ssm_graph.simulation.aids import depth_log, gnss_log
 from ssm_graph.simulation.config import SimulationConfig
 from ssm_graph.simulation.currents import Current
+from ssm_graph.simulation.drifts import draw_drift
 from ssm_graph.simulation.dvl_model import beam_ranges, ping_times, true_beam_speeds
 from ssm_graph.simulation.faults import Loss, Outliers, draw_dropouts, draw_outliers, lost_beams
 from ssm_graph.simulation.further_aids import SimulatedAids, aid_logs
@@ -220,6 +221,9 @@ def _dvl(config: SimulationConfig, streams: Streams, time_s: Array, speeds: _Tru
     speed = speed + offset
     if not config.perfect_sensors:
         speed = speed + noise[:, None] * streams.beam_noise.standard_normal(speed.shape)
+        if settings.drift is not None:
+            drift_d = draw_drift(settings.drift, time_s, streams.dvl_drift)
+            speed = speed + drift_d @ settings.mount.beams_d.T
     ranges = None
     if settings.seabed_depth_m is not None:
         off_ground = beam_ranges(config.trajectory, settings, time_s)
@@ -247,5 +251,6 @@ def _aids(
         depth = depth_log(config.trajectory, config.depth, end_s=end_s, rng=rng)
     if config.gnss is not None:
         rng = streams.gnss if noisy else None
-        gnss = gnss_log(config.trajectory, config.gnss, end_s=end_s, rng=rng)
+        drift_rng = streams.gnss_drift if noisy else None
+        gnss = gnss_log(config.trajectory, config.gnss, end_s=end_s, rng=rng, drift_rng=drift_rng)
     return depth, gnss

@@ -32,6 +32,8 @@ class Streams:
     ranges: np.random.Generator
     heading: np.random.Generator
     current: np.random.Generator
+    dvl_drift: np.random.Generator
+    gnss_drift: np.random.Generator
 
 
 def spawn_streams(seed: int) -> Streams:

@@ -29,7 +29,7 @@ from ssm_graph.graph.water_rows import WaterRows
 from ssm_graph.problem.current import CURRENTS
 from ssm_graph.problem.error_state import STATE_DIM
 from ssm_graph.problem.further_aids import NO_FURTHER
-from ssm_graph.problem.problem import Problem
+from ssm_graph.problem.problem import Problem, with_stated_noise
 from ssm_graph.smoothers.gnc import NEAR_SIGMAS
 
 Mask = NDArray[np.bool_]
@@ -259,7 +259,7 @@ class FaultWatch:
         self._linearizer = None
         if search is not None:
             self._linearizer = GraphLinearizer(
-                replace(problem, extras=self._current, further=NO_FURTHER)
+                replace(with_stated_noise(problem), extras=self._current, further=NO_FURTHER)
             )
         self._beams, self._time_s = problem.beams, problem.keyframe_s[problem.beams.keyframe]
         self._found = Found(np.zeros(len(self._time_s), dtype=bool), ())

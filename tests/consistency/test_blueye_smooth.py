@@ -22,9 +22,9 @@ pytestmark = pytest.mark.skipif(not RUNS.is_dir(), reason=f"no real logs in {RUN
 @pytest.mark.parametrize(
     ("name", "until_s", "largest_rms"),
     [
-        # Drafts and filters of others: 1.2 to 2.8 m. Seen here: 1.18 m and 0.55 m.
+        # Drafts and filters of others: 1.2 to 2.8 m. Seen here: 1.2 m and 0.27 m.
         ("log_auto_square_2025-05-07_14_55_13", 70.0, 1.5),
-        ("log_grid_01_05_scaled", 70.0, 0.8),
+        ("log_grid_01_05_scaled", 70.0, 0.5),
     ],
 )
 def test_surface_runs(name: str, until_s: float, largest_rms: float) -> None:
@@ -53,10 +53,10 @@ def test_the_dive_says_that_its_heading_is_hardly_observable() -> None:
 
 
 def test_a_long_fault_of_one_beam_does_not_fool_the_start() -> None:
-    """40 s of 1 m/s in one beam: within half a metre of the run without fault, not tens of metres.
+    """40 s of 1 m/s in one beam: within 0.2 m of the run without fault, not tens of metres.
 
-    The log kernel leaves a beam of residual r a pull of 6 sigma^2 / r: with sigma 0.06 m/s, 7 mm/s
-    on the velocity for as long as the fault lasts.
+    The log kernel leaves a beam of residual r a pull of 6 sigma^2 / r: with 0.02 m/s of white noise
+    1 mm/s on the velocity, with 0.06 m/s, where the drift is not modelled, 7 mm/s.
     """
     log = RUNS / "log_auto_square_2025-05-07_14_55_13.mcap"
     mission, withheld = withhold_gnss(convert_blueye(log), 70.0)
@@ -69,4 +69,4 @@ def test_a_long_fault_of_one_beam_does_not_fool_the_start() -> None:
         estimate = sg.smooth(run)
         reference = sg.reference_from_gnss(withheld, estimate.trajectory)
         rms.append(sg.evaluate(estimate.trajectory, reference).rmse_horizontal_m)
-    assert rms[1] < rms[0] + 0.5
+    assert rms[1] < rms[0] + 0.2

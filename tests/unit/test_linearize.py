@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks.calibration_cases import as_stated, asking
-from ssm_graph.data import Array
+from ssm_graph.data import Array, Drift
 from ssm_graph.errors import ConfigError
 from ssm_graph.graph.gtsam_graph import chain_ordering, gtsam_graph
 from ssm_graph.graph.linearize import GraphLinearizer
@@ -20,7 +20,7 @@ from ssm_graph.problem.extras import Extra, Extras
 from ssm_graph.problem.problem import Problem, build_problem
 from ssm_graph.simulation import GnssSettings, Grade
 from tests.calibration_fixture import miscalibrated
-from tests.helpers import simulated, true_states
+from tests.helpers import drifting, simulated, true_states
 
 
 @cache
@@ -28,6 +28,7 @@ def problems() -> tuple[Problem, Problem, States]:
     """Return a problem with all calibrations, the same with none, and states a little off."""
     sim = miscalibrated(duration_s=30.0)
     wide = asking(sim.mission, beam_scale_sigma=0.01, scale_walk_density=1e-4)
+    wide = drifting(wide, Drift(0.01, 20.0, 0.5), Drift(0.5, 60.0, 0.5))
     problem, plain = build_problem(wide), build_problem(as_stated(sim.mission))
     truth = true_states(problem, sim)
     rng = np.random.default_rng(0)
@@ -171,7 +172,8 @@ def test_the_linear_graph_is_the_derivative_of_the_cost() -> None:
         allowed = 1e-2 if label == "dvl_time_offset_s" else 1e-4
         assert abs(slope) < allowed * np.sqrt(curvature), label
     n = problem.extras.state_dim
-    for k, j in [(3, 0), (10, 7), (20, 12), (5, n - 1), (29, n - 1), (0, n - 1)]:
+    walks = [(5, n - 1), (29, n - 1), (0, n - 1), (7, n - 2), (8, n - 4), (9, n - 6), (4, n - 7)]
+    for k, j in [(3, 0), (10, 7), (20, 12), *walks]:
         direction = np.zeros(len(step.sigma))
         direction[n * k + j] = 0.1 * step.sigma[n * k + j]
         slope, curvature = along(linearizer, moved, direction)

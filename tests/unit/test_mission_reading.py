@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ssm_graph.data import Array, Mission
+from ssm_graph.data import Array, Drift, Mission
 from ssm_graph.errors import ConfigError, DataError
 from ssm_graph.io.mission import read_mission
 from tests.mission_damage import (
@@ -337,3 +337,30 @@ def test_no_folder(tmp_path: Path) -> None:
     """A folder that does not exist is named."""
     with pytest.raises(ConfigError, match="nowhere"):
         read_mission(str(tmp_path / "nowhere"))
+
+
+def test_drifts_are_read(tmp_path: Path) -> None:
+    """Of DVL and GNSS; all of the noise stays white unless a share is given."""
+    dvl = "drift_sigma_m_per_s = 0.006\ndrift_correlation_s = 20\ndrift_fast_share = 0.25"
+    gnss = "drift_sigma_m = 0.5\ndrift_correlation_s = 120"
+    mission = read_after(
+        tmp_path, toml("\n[depth]", f"{dvl}\n\n[depth]"), toml("\n[gnss]", f"\n[gnss]\n{gnss}")
+    )
+    assert mission.gnss is not None
+    assert mission.dvl.mount.drift == Drift(0.006, 20.0, 0.25)
+    assert mission.gnss.calibration.drift == Drift(0.5, 120.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ("drift_sigma_m_per_s = 0.006", "expected with a drift_correlation_s"),
+        ("drift_correlation_s = 20.0", "expected with a drift_sigma_m_per_s above 0"),
+        ("drift_fast_share = 0.5", "expected with a drift_sigma_m_per_s above 0"),
+        ("drift_correlation_s = 20.0\ndrift_fast_share = 1.5", "above 0 and up to 1"),
+    ],
+)
+def test_a_drift_is_given_whole(tmp_path: Path, keys: str, message: str) -> None:
+    """One key without the other would never be looked at."""
+    with pytest.raises(ConfigError, match=rf"\[dvl\] drift_\w+: .*{message}"):
+        read_after(tmp_path, toml("\n[depth]", f"{keys}\n\n[depth]"))

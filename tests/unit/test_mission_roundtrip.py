@@ -12,7 +12,7 @@ import tomli_w
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ssm_graph.data import DepthCalibration, DvlLog, GnssCalibration, Mission
+from ssm_graph.data import DepthCalibration, Drift, DvlLog, GnssCalibration, Mission
 from ssm_graph.errors import ConfigError, DataError, MissingExtraError
 from ssm_graph.io import tables as tables_module
 from ssm_graph.io.mission import read_mission
@@ -84,10 +84,13 @@ def test_round_trip_of_known_and_doubted_errors(tmp_path: Path) -> None:
         beam_scale_error=np.array([0.01, 0.0, -0.02, 0.005]),
         beam_scale_sigma=0.01,
         lever_arm_sigma=0.3,
+        drift=Drift(0.006, 20.0, 0.25),
     )
     true_depth = np.round(mission.depth.depth, 6)
     depth = DepthCalibration(offset=0.25, offset_sigma=0.1)
-    gnss = GnssCalibration(time_offset_s=0.25, time_offset_sigma_s=0.2, lever_arm_sigma=0.4)
+    gnss = GnssCalibration(
+        time_offset_s=0.25, time_offset_sigma_s=0.2, lever_arm_sigma=0.4, drift=Drift(0.5, 120.0)
+    )
     mission = replace(
         mission,
         dvl=replace(mission.dvl, mount=mount),

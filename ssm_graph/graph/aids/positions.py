@@ -8,7 +8,7 @@ from factors.gnss_position import fix_residual
 from ssm_graph.data import Array
 from ssm_graph.graph.extended_rows import Rows, RowStates
 from ssm_graph.problem.aids import Fixes
-from ssm_graph.problem.calibration import GNSS_LEVER_ARM, GNSS_TIME_OFFSET
+from ssm_graph.problem.calibration import GNSS_DRIFT, GNSS_LEVER_ARM, GNSS_TIME_OFFSET
 from ssm_graph.problem.error_state import POSITION, ROTATION, VELOCITY
 from ssm_graph.problem.extras import Extras
 
@@ -18,7 +18,7 @@ def fix_rows(
 ) -> tuple[Array, Array]:
     """Return errors (F, 3), m, and Jacobians (F, 3, width) of fixes, not whitened.
 
-    Only those of GNSS depend on what is unknown of its antenna and clock.
+    Only those of GNSS depend on what is unknown of its antenna and clock, and drift.
     """
     extras_of_gnss = extras if of_gnss else Extras()
     nothing = np.zeros(3)
@@ -41,4 +41,8 @@ def fix_rows(
         jacobian[..., extras.columns(GNSS_LEVER_ARM)] = residual.error_D_lever_arm_b
     if GNSS_TIME_OFFSET in extras_of_gnss:
         jacobian[..., extras.columns(GNSS_TIME_OFFSET)] = residual.error_D_time_offset[..., None]
-    return residual.error, jacobian
+    error = residual.error
+    if GNSS_DRIFT in extras_of_gnss:
+        jacobian[..., extras.columns(GNSS_DRIFT)] = np.eye(3)
+        error = error + extras.value(GNSS_DRIFT, at.walks, at.constants, default=nothing)
+    return error, jacobian
