@@ -205,8 +205,8 @@ exact, both with the slow errors of DVL and GNSS as variables; `none`: the speed
 biases left in with a prior of 0.001 rad/s, all errors as white noise. Path: horizontal way from the
 last fix used to the last one scored, by positions a second apart. Heading sigma: posterior, when
 GNSS ends. Error / sigma: rms of the horizontal error over the rms of its own sigma. The fixes
-themselves are good to 0.15 to 0.35 m, by other estimates; the receiver says 0.5 m. Faults are drawn
-from the seed; bursts begin after GNSS has ended.
+themselves are good to 0.15 to 0.5 m. Faults are drawn from the seed; bursts begin after GNSS has
+ended.
 """
 
 

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.skipif(not RUNS.is_dir(), reason=f"no real logs in {RUN
 @pytest.mark.parametrize(
     ("name", "until_s", "largest_rms"),
     [
-        # Drafts and filters of others: 1.2 to 2.8 m. Seen here: 1.2 m and 0.27 m.
+        # Drafts and filters of others: 1.2 to 2.8 m. Seen here: 1.10 m and 0.27 m.
         ("log_auto_square_2025-05-07_14_55_13", 70.0, 1.5),
         ("log_grid_01_05_scaled", 70.0, 0.5),
     ],
