@@ -34,6 +34,7 @@ from ssm_graph.simulation import (
     GrossErrors,
     HoverRoute,
     RangingSettings,
+    SimulatedMission,
     SimulationConfig,
     UsblSettings,
     simulate,
@@ -49,6 +50,7 @@ KNOWN = tuple(
         [(300.0, 100.0, -60.0), (-100.0, 400.0, -60.0), (100.0, -300.0, -50.0)], start=1
     )
 )
+KERNELS: dict[str, Kernel] = {"gaussian": GaussianKernel(), "log": LogKernel()}
 PRIOR_M = (80.0, 80.0, 10.0)
 """Of the unknown beacon; where it is stated is drawn from it."""
 IRON = HeadingErrors(
@@ -162,29 +164,27 @@ class Run:
     """Of what was estimated of the aid, in posterior sigmas; empty for nothing"""
 
 
-def run(case: Case, seed: int, *, rate: float, kernel: Kernel, is_aided: bool = True) -> Run:
-    """Simulate and smooth one mission."""
-    config = dataclasses.replace(case.config, seed=seed, aids=case.aids(seed, rate))
-    sim = simulate(config)
+def simulated(case: Case, seed: int, rate: float) -> SimulatedMission:
+    """Return one mission, a fraction ``rate`` of its aid grossly wrong."""
+    return simulate(dataclasses.replace(case.config, seed=seed, aids=case.aids(seed, rate)))
+
+
+def run(sim: SimulatedMission, kernel: Kernel, *, is_aided: bool = True) -> Run:
+    """Smooth one mission, with or without its aid."""
     mission = sim.mission
     if not is_aided:
         mission = dataclasses.replace(mission, aids=AidLogs())
     estimate = SsmSmoother(SmootherConfig(kernel=kernel)).solve(build_problem(mission))
     assert mission.reference is not None
     metrics = evaluate(estimate.trajectory, mission.reference)
-    truth = beacon_truth(config.aids) | dict(
-        zip(
-            ("heading_offset", "heading_one_cycle", "heading_two_cycle"),
-            np.split(sim.aids.heading_errors, [1, 3]),
-            strict=True,
-        )
-    )
+    names = ("heading_offset", "heading_one_cycle", "heading_two_cycle")
+    of_compass = zip(names, np.split(sim.aids.heading_errors, [1, 3]), strict=True)
     return Run(
         horizontal_m=metrics.rmse_horizontal_m,
         heading_deg=math.degrees(metrics.rmse_attitude[2]),
         nees=metrics.nees_position,
         status=estimate.status.name,
-        error=errors_of(estimate.calibration, truth),
+        error=errors_of(estimate.calibration, beacon_truth(sim.config.aids) | dict(of_compass)),
     )
 
 
@@ -203,19 +203,19 @@ def errors_of(calibration: Calibration | None, truth: dict[str, np.ndarray]) -> 
     return tuple(errors)
 
 
-def variants(case: Case) -> list[tuple[str, dict[str, object]]]:
-    """Return what is compared, by its name in the table."""
-    kernels: tuple[tuple[str, Kernel], ...] = (
-        ("gaussian", GaussianKernel()),
-        ("log", LogKernel()),
-    )
-    found: list[tuple[str, dict[str, object]]] = [
-        ("without the aid", {"rate": 0.0, "kernel": LogKernel(), "is_aided": False})
-    ]
-    for rate in (0.0, RATE) if case.has_gross else (0.0,):
-        about = f"{100.0 * rate:.0f} % gross errors, " if case.has_gross else ""
-        found += [(f"{about}{name}", {"rate": rate, "kernel": kernel}) for name, kernel in kernels]
-    return found
+def results_of(case: Case, n_runs: int) -> dict[str, list[Run]]:
+    """Smooth missions of one case in every way that is compared, by its name in the table."""
+    results: dict[str, list[Run]] = {}
+    for seed in range(n_runs):
+        for rate in (0.0, RATE) if case.has_gross else (0.0,):
+            sim = simulated(case, seed, rate)
+            if rate == 0.0:
+                plain = run(sim, LogKernel(), is_aided=False)
+                results.setdefault("without the aid", []).append(plain)
+            about = f"{100.0 * rate:.0f} % gross errors, " if case.has_gross else ""
+            for name, kernel in KERNELS.items():
+                results.setdefault(about + name, []).append(run(sim, kernel))
+    return results
 
 
 def case_lines(case: Case, results: Mapping[str, Sequence[Run]]) -> list[str]:
@@ -282,7 +282,7 @@ of the grade. "gaussian" is least squares, weight 1 for every beam and every mea
 def parse_args(argv: Sequence[str] | None = None) -> argparse.Namespace:
     """Return the settings given on the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--runs", type=int, default=40, help="missions of each kind")
+    parser.add_argument("--runs", type=int, default=30, help="missions of each kind")
     parser.add_argument("--out", type=Path, default=Path("out/aids"))
     parser.add_argument("--keep", action="store_true", help="write benchmarks/results too")
     return parser.parse_args(argv)
@@ -295,11 +295,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     lines: list[str] = []
     for case in CASES:
         print(f"{case.name} ...", file=sys.stderr, flush=True)
-        results = {
-            name: [run(case, seed, **settings) for seed in range(args.runs)]  # type: ignore[arg-type]
-            for name, settings in variants(case)
-        }
-        lines += case_lines(case, results)
+        lines += case_lines(case, results_of(case, args.runs))
     command = shlex.join(["python", "benchmarks/aids.py", *(argv or sys.argv[1:])])
     about = f"{machine()}; load average before {load:.1f}."
     text = "\n".join(["# Further aids", "", f"    {command}", "", about, "", LEGEND, *lines])
