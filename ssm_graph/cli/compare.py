@@ -132,6 +132,8 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
         with StudyDisplay(errors) as show:
             result = run_study(study, store, execute=execute, on_progress=show)
     except KeyboardInterrupt:
+        # As many as the file has: the signal may have come between writing and counting.
+        store = open_store(study, arguments.out, fresh=False)
         errors.print(
             f"{len(store)} finished runs are kept in {store.path}; the same command goes on there",
             highlight=False,
