@@ -112,7 +112,7 @@ FAULTS: Final = {
     ),
     "messages at 100 times the rate": SocketFault(
         f"10 000 depths/s more on the socket of the inertial data, {_SPAN}",
-        lambda vessel, sent: during(messages_flood(eager_depths()))(vessel, sent),
+        during(messages_flood(eager_depths)),
         Rule(told="rate_limited", good_after_s=25.0),
     ),
     "a client that never reads": SocketFault(

@@ -158,11 +158,12 @@ def reports_flood(vessel: Vessel, sent: Sent) -> bool:
     return True
 
 
-def messages_flood(depths: DepthLog) -> Disturb:
+def messages_flood(eager: Callable[[], DepthLog]) -> Disturb:
     """Send the readings of a far too eager depth sensor with the inertial samples."""
 
     def flood(vessel: Vessel, sent: Sent) -> bool:
         if isinstance(sent.message, ImuSample):
+            depths = eager()
             end = int(np.searchsorted(depths.time_s, sent.true_s))
             begin = int(np.searchsorted(depths.time_s, sent.true_s - 0.01))
             lines = [

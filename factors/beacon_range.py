@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.so3 import cross
+from factors.so3 import cross, times
 
 Array = NDArray[np.float64]
 
@@ -47,17 +47,13 @@ def range_residual(
     beacon_n : (..., 3) m
     range_m : (...) measured, m.
     """
-    sight_n = p_n + _times(R_nb, lever_arm_b) - beacon_n
+    sight_n = p_n + times(R_nb, lever_arm_b) - beacon_n
     distance = np.linalg.norm(sight_n, axis=-1)
     along_n = sight_n / np.maximum(distance, CLOSEST_M)[..., None]
-    along_b = _times(np.swapaxes(R_nb, -1, -2), along_n)
+    along_b = times(np.swapaxes(R_nb, -1, -2), along_n)
     return RangeResidual(
         error=distance - range_m,
         error_D_rotation=cross(lever_arm_b, along_b),
         error_D_position=along_b,
         error_D_beacon_n=-along_n,
     )
-
-
-def _times(matrix: Array, vector: Array) -> Array:
-    return np.asarray((matrix @ vector[..., None])[..., 0])

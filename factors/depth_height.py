@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.so3 import cross
+from factors.so3 import cross, times
 
 Array = NDArray[np.float64]
 
@@ -44,7 +44,7 @@ def height_residual(
     up_n : (..., 3) local vertical.
     target_n : (..., 3) m; only its component along ``up_n`` counts.
     """
-    arm_n = (R_nb @ lever_arm_b[..., None])[..., 0]
+    arm_n = times(R_nb, lever_arm_b)
     up_b = np.asarray((up_n[..., None, :] @ R_nb)[..., 0, :])
     error = (up_n * (p_n + arm_n - target_n)).sum(axis=-1) - offset
     return HeightResidual(

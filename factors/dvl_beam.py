@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.so3 import cross
+from factors.so3 import cross, times
 
 Array = NDArray[np.float64]
 
@@ -104,7 +104,7 @@ def beam_residual(
     return BeamResidual(
         error=error,
         error_D_rotation=cross(beam_b, v_b) - cross(arm_b, omega_ie_b),
-        error_D_velocity_n=np.broadcast_to((R_nb @ beam_b[..., None])[..., 0], shape),
+        error_D_velocity_n=np.broadcast_to(times(R_nb, beam_b), shape),
         error_D_gyro_bias=np.broadcast_to(-arm_b, shape),
     )
 
@@ -161,16 +161,26 @@ def dvl_beam_factor(
         if jacobians is None:
             return np.atleast_1d(beam_error(R_nb, v_n, gyro_bias, **measured))
         residual = beam_residual(R_nb, v_n, gyro_bias, **measured)
-        # Pose3 tangent: [rotation, translation]; ConstantBias tangent: [accelerometer, gyroscope].
-        jacobians[0] = np.hstack([residual.error_D_rotation, np.zeros(3)])[None, :]
-        jacobians[1] = residual.error_D_velocity_n[None, :].copy()
-        jacobians[2] = np.hstack([np.zeros(3), residual.error_D_gyro_bias])[None, :]
+        jacobians[:] = beam_blocks(residual)
         return np.atleast_1d(residual.error)
 
     noise: gtsam.noiseModel.Base = gtsam.noiseModel.Isotropic.Sigma(1, sigma / np.sqrt(weight))
     if loss is not None:
         noise = gtsam.noiseModel.Robust.Create(loss, noise)
     return gtsam.CustomFactor(noise, [pose, velocity, bias], evaluate)
+
+
+def beam_blocks(residual: BeamResidual) -> list[Array]:
+    """Return the Jacobians of one beam in GTSAM's tangent spaces: pose, velocity, bias.
+
+    ``Pose3``: [rotation, translation]; ``ConstantBias``: [accelerometer, gyroscope].
+    """
+    nothing = np.zeros(3)
+    return [
+        np.hstack([residual.error_D_rotation, nothing])[None, :],
+        residual.error_D_velocity_n[None, :].copy(),
+        np.hstack([nothing, residual.error_D_gyro_bias])[None, :],
+    ]
 
 
 def checked_beam(

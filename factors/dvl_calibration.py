@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from factors import so3
 from factors.dvl_beam import beam_error
-from factors.so3 import cross
+from factors.so3 import cross, times
 
 Array = NDArray[np.float64]
 
@@ -164,11 +164,11 @@ def calibrated_beam_residual(
     tau, R_back, J_back, gain, motion = back
     tau = np.asarray(tau)[..., None]
     R_then = R_nb @ R_back
-    v_then = v_n - _times(R_nb, gain) - tau * g_n
+    v_then = v_n - times(R_nb, gain) - tau * g_n
     R_then_T = _T(R_then)
     omega_ib = motion.gyro_b - bias[..., 3:]
-    omega_ie_b = _times(R_then_T, omega_ie_n)
-    v_b, omega_eb = _times(R_then_T, v_then), omega_ib - omega_ie_b
+    omega_ie_b = times(R_then_T, omega_ie_n)
+    v_b, omega_eb = times(R_then_T, v_then), omega_ib - omega_ie_b
     swing_b = cross(omega_eb, lever)
     predicted = (beam * (v_b + swing_b)).sum(axis=-1)
     # All products of the beam at once: a single one costs as much as four.
@@ -177,18 +177,18 @@ def calibrated_beam_residual(
     beam_x_v, beam_x_swing, beam_x_omega, arm = cross(beam, factors)
     # With respect to the attitude then: of the velocity, and of the Earth rate in omega_eb.
     D_phi = beam_x_v - cross(arm, omega_ie_b)
-    D_v_b = _times(R_back, beam)
-    D_phi_now = _times(R_back, D_phi)
-    a_then_b = motion.accel_b + _times(R_then_T, g_n - _times(R_nb, bias[..., :3]))
+    D_v_b = times(R_back, beam)
+    D_phi_now = times(R_back, D_phi)
+    a_then_b = motion.accel_b + times(R_then_T, g_n - times(R_nb, bias[..., :3]))
     D_late = -(D_phi * omega_ib + beam * a_then_b + arm * motion.gyro_rate_b).sum(axis=-1)
     gain_1 = np.asarray(1.0 + scale)
     gain_3 = gain_1[..., None]
     return CalibratedResidual(
         error=gain_1 * predicted - speed,
         error_D_rotation=gain_3 * (D_phi_now + cross(D_v_b, gain)),
-        error_D_velocity_n=gain_3 * _times(R_nb, D_v_b),
+        error_D_velocity_n=gain_3 * times(R_nb, D_v_b),
         error_D_accel_bias=gain_3 * tau * D_v_b,
-        error_D_gyro_bias=gain_3 * (tau * _times(J_back, D_phi) - arm),
+        error_D_gyro_bias=gain_3 * (tau * times(J_back, D_phi) - arm),
         error_D_mounting=gain_3 * ((beam_x_v + beam_x_swing) @ turn_D_mounting),
         error_D_scale=predicted,
         error_D_lever_arm_b=gain_3 * beam_x_omega,
@@ -212,7 +212,7 @@ def calibrated_beam_error(
     R_then = R_nb @ back.R_back
     predicted = beam_error(
         R_then,
-        v_n - _times(R_nb, back.gain_b) - np.asarray(back.time_offset)[..., None] * g_n,
+        v_n - times(R_nb, back.gain_b) - np.asarray(back.time_offset)[..., None] * g_n,
         bias[..., 3:],
         speed=np.zeros_like(speed),
         gyro_b=back.motion.gyro_b,
@@ -291,10 +291,6 @@ def _blocks(residual: CalibratedResidual) -> list[Array]:
     pose = np.hstack([residual.error_D_rotation, np.zeros(3)])
     blocks = [pose, residual.error_D_velocity_n, biases, *residual[5:]]
     return [np.reshape(block, (1, -1)).copy() for block in blocks]
-
-
-def _times(matrix: Array, vector: Array) -> Array:
-    return np.asarray((matrix @ vector[..., None])[..., 0])
 
 
 def _T(matrix: Array) -> Array:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.so3 import cross
+from factors.so3 import cross, times
 
 Array = NDArray[np.float64]
 
@@ -58,20 +58,16 @@ def fix_residual(
     """
     late = time_offset * cross(omega_b, lever_arm_b)
     arm = lever_arm_b - late
-    swing_n = _times(R_nb, cross(omega_b, lever_arm_b))
+    swing_n = times(R_nb, cross(omega_b, lever_arm_b))
     n_fixes = np.shape(p_n)[:-1]
     identity = np.broadcast_to(np.eye(3), (*n_fixes, 3, 3))
     # Column i of [omega x] is omega x e_i.
     turned = np.swapaxes(cross(omega_b[..., None, :], identity), -1, -2)
     return FixResidual(
-        error=p_n + _times(R_nb, arm) - time_offset * v_n - position_n,
+        error=p_n + times(R_nb, arm) - time_offset * v_n - position_n,
         error_D_rotation=cross(arm[..., None, :], R_nb),
         error_D_position=R_nb,
         error_D_velocity_n=-time_offset * identity,
         error_D_lever_arm_b=R_nb @ (identity - time_offset * turned),
         error_D_time_offset=-(v_n + swing_n),
     )
-
-
-def _times(matrix: Array, vector: Array) -> Array:
-    return np.asarray((matrix @ vector[..., None])[..., 0])

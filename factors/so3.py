@@ -23,6 +23,11 @@ def cross(a: Array, b: Array) -> Array:
     return np.asarray(a[..., _NEXT] * b[..., _AFTER] - a[..., _AFTER] * b[..., _NEXT])
 
 
+def times(matrix: Array, vector: Array) -> Array:
+    """Return ``matrix @ vector`` for matrices (..., n, m) and vectors (..., m) that broadcast."""
+    return np.asarray((matrix @ vector[..., None])[..., 0])
+
+
 _SKEW = np.zeros((3, 9))
 for _axis, (_plus, _minus) in enumerate(((7, 5), (2, 6), (3, 1))):
     _SKEW[_axis, _plus], _SKEW[_axis, _minus] = 1.0, -1.0

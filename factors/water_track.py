@@ -13,7 +13,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.dvl_beam import beam_error, beam_residual, checked_beam
+from factors.dvl_beam import beam_blocks, beam_error, beam_residual, checked_beam
+from factors.so3 import times
 
 Array = NDArray[np.float64]
 
@@ -42,7 +43,7 @@ def through_water(
     is_water : (...) whether the water reflects.
     """
     v_D_current = np.where(is_water[..., None, None], -R_nl, 0.0)
-    return ThroughWater(v_n + (v_D_current @ current_l[..., None])[..., 0], v_D_current)
+    return ThroughWater(v_n + times(v_D_current, current_l), v_D_current)
 
 
 def water_beam_factor(
@@ -100,10 +101,7 @@ def water_beam_factor(
         if jacobians is None:
             return np.atleast_1d(beam_error(R_nb, v_n, gyro_bias, **measured))
         residual = beam_residual(R_nb, v_n, gyro_bias, **measured)
-        nothing = np.zeros(3)
-        jacobians[0] = np.hstack([residual.error_D_rotation, nothing])[None]
-        jacobians[1] = residual.error_D_velocity_n[None].copy()
-        jacobians[2] = np.hstack([nothing, residual.error_D_gyro_bias])[None]
+        jacobians[:3] = beam_blocks(residual)
         jacobians[3] = (residual.error_D_velocity_n @ v_D_current)[None]
         return np.atleast_1d(residual.error)
 

@@ -9,18 +9,16 @@ import math
 from collections.abc import Mapping
 from typing import Final
 
-from ssm_graph.io.settings import Key, optional_key, sigma_key
-from ssm_graph.io.tables import TableSpec
+from ssm_graph.io.settings import FILE_KEY, LEVER_ARM_KEY, PLACE_KEYS, Key, optional_key, sigma_key
+from ssm_graph.io.tables import POSITION, POSITION_SIGMA, TIME, TableSpec
 
-_FILE: Final = Key(shape=None)
-_LEVER_ARM: Final = Key(shape=(3,), low=-100.0, high=100.0, hint="lever arms are in metres")
 _DEGREES: Final = "the unit is degrees"
 
 AID_SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
-    "usbl": {"file": _FILE, "lever_arm_m": _LEVER_ARM},
-    "ranges": {"file": _FILE, "noise_m": sigma_key(1000.0), "lever_arm_m": _LEVER_ARM},
+    "usbl": {"file": FILE_KEY, "lever_arm_m": LEVER_ARM_KEY},
+    "ranges": {"file": FILE_KEY, "noise_m": sigma_key(1000.0), "lever_arm_m": LEVER_ARM_KEY},
     "heading": {
-        "file": _FILE,
+        "file": FILE_KEY,
         "noise_deg": sigma_key(90.0, _DEGREES),
         "declination_deg": optional_key(-180.0, 180.0, _DEGREES),
         "offset_sigma_deg": optional_key(0.0, 180.0, _DEGREES),
@@ -33,11 +31,7 @@ AID_SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
 LISTS: Final[Mapping[str, Mapping[str, Key]]] = {
     "beacon": {
         "number": Key(low=0.0, high=1e6, hint="it is what column 'beacon' of [ranges] calls it"),
-        "lat_deg": Key(low=-90.0, high=90.0, hint="are latitude and longitude swapped?"),
-        "lon_deg": Key(low=-180.0, high=360.0, hint="longitude is in degrees"),
-        "height_m": Key(
-            low=-12000.0, high=20000.0, hint="height is in metres above the ellipsoid, up"
-        ),
+        **PLACE_KEYS,
         "position_sigma_m": Key(
             shape=(3,),
             positive=True,
@@ -54,12 +48,10 @@ LISTS: Final[Mapping[str, Mapping[str, Key]]] = {
 }
 """Sections that may come several times, ``[[beacon]]``."""
 
-_POSITION: Final = ("lat_deg", "lon_deg", "height_m")
-_POSITION_SIGMA: Final = ("sigma_east_m", "sigma_north_m", "sigma_up_m")
 AID_TABLES: Final[Mapping[str, TableSpec]] = {
-    "usbl": TableSpec(("time_s", *_POSITION, *_POSITION_SIGMA), ("delay_s",)),
-    "ranges": TableSpec(("time_s", "beacon", "range_m"), ("sigma_m",), key=("beacon",)),
-    "heading": TableSpec(("time_s", "heading_deg")),
+    "usbl": TableSpec((TIME, *POSITION, *POSITION_SIGMA), ("delay_s",)),
+    "ranges": TableSpec((TIME, "beacon", "range_m"), ("sigma_m",), key=("beacon",)),
+    "heading": TableSpec((TIME, "heading_deg")),
 }
 AID_LIMITS: Final[Mapping[str, tuple[float, float]]] = {
     "delay_s": (0.0, 3600.0),

@@ -16,11 +16,11 @@ from ssm_graph.aid_logs import (
 from ssm_graph.io.aid_keys import AID_TABLES
 from ssm_graph.io.mission_checks import check_positions, refuse_beyond
 from ssm_graph.io.mission_instruments import lever_arm_b, radians_wrapped
-from ssm_graph.io.mission_keys import LIMITS, POSITION_SIGMA
+from ssm_graph.io.mission_keys import LIMITS
 from ssm_graph.io.mission_toml import MissionToml
 from ssm_graph.io.mission_units import to_si
 from ssm_graph.io.settings import Settings
-from ssm_graph.io.tables import Table
+from ssm_graph.io.tables import POSITION_SIGMA, Table
 
 _DEFAULT_STANDSTILL = Standstill(0.0, 1.0)
 

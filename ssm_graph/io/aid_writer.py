@@ -8,8 +8,8 @@ import numpy as np
 
 from ssm_graph.aid_logs import AidLogs, Beacon, HeadingLog, RangeLog
 from ssm_graph.data import Array
-from ssm_graph.io.mission_keys import POSITION_SIGMA, TIME
 from ssm_graph.io.mission_units import from_si
+from ssm_graph.io.tables import POSITION_SIGMA, TIME
 
 
 def aid_settings(aids: AidLogs, suffix: str) -> dict[str, Any]:

@@ -37,8 +37,6 @@ from ssm_graph.io.mission_keys import (
     ACCEL,
     ATTITUDE,
     GYRO,
-    POSITION,
-    POSITION_SIGMA,
     RANGE,
     SPEED,
     SPEED_SIGMA,
@@ -49,7 +47,7 @@ from ssm_graph.io.mission_keys import (
 from ssm_graph.io.mission_toml import MissionToml, read_mission_toml, table_path
 from ssm_graph.io.mission_units import interval_ends
 from ssm_graph.io.mission_writer import write_mission
-from ssm_graph.io.tables import Order, Table, TableFormat, read_table
+from ssm_graph.io.tables import POSITION, POSITION_SIGMA, Order, Table, TableFormat, read_table
 
 __all__ = ["TableFormat", "read_mission", "write_mission"]
 

@@ -15,16 +15,9 @@ from ssm_graph.data import Array
 from ssm_graph.errors import DataError
 from ssm_graph.frames import BodyAxes, to_frd
 from ssm_graph.io.mission_dvl_checks import check_dvl
-from ssm_graph.io.mission_keys import (
-    ACCEL,
-    ATTITUDE,
-    GYRO,
-    LIMITS,
-    POSITION_SIGMA,
-    VELOCITY,
-)
+from ssm_graph.io.mission_keys import ACCEL, ATTITUDE, GYRO, LIMITS, VELOCITY
 from ssm_graph.io.mission_toml import MissionToml
-from ssm_graph.io.tables import Table
+from ssm_graph.io.tables import POSITION_SIGMA, Table
 from ssm_graph.plausible import DEEPEST_M
 
 RATE_RANGE_HZ: Final = (5.0, 20000.0)

@@ -16,10 +16,10 @@ from ssm_graph.data import (
 )
 from ssm_graph.earth import LocalFrame
 from ssm_graph.frames import to_frd, wrap_to_pi
-from ssm_graph.io.mission_keys import POSITION
 from ssm_graph.io.mission_toml import MissionToml
 from ssm_graph.io.mission_units import R_bd_from_rpy, beams_from_angles, to_si
 from ssm_graph.io.settings import Settings
+from ssm_graph.io.tables import POSITION
 from ssm_graph.water_current import CurrentModel
 
 _UNIT_TOLERANCE = 1e-3

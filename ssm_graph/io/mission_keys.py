@@ -12,8 +12,8 @@ from typing import Final
 
 from ssm_graph.data import N_BEAMS
 from ssm_graph.io.aid_keys import AID_LIMITS, AID_SECTIONS, AID_TABLES
-from ssm_graph.io.settings import Key, optional_key, sigma_key
-from ssm_graph.io.tables import TableSpec
+from ssm_graph.io.settings import FILE_KEY, LEVER_ARM_KEY, PLACE_KEYS, Key, optional_key, sigma_key
+from ssm_graph.io.tables import POSITION, POSITION_SIGMA, TIME, TableSpec
 from ssm_graph.plausible import DEEPEST_M, LARGEST_SPEED
 
 FORMAT: Final = 1
@@ -27,11 +27,6 @@ class Stamp(Enum):
     END = "end"
 
 
-_FILE = Key(shape=None)
-_LEVER_ARM = Key(shape=(3,), low=-100.0, high=100.0, hint="lever arms are in metres")
-_LAT = Key(low=-90.0, high=90.0, hint="are latitude and longitude swapped?")
-_LON = Key(low=-180.0, high=360.0, hint="longitude is in degrees")
-_HEIGHT = Key(low=-12000.0, high=20000.0, hint="height is in metres above the ellipsoid, up")
 _LATE = optional_key(-10.0, 10.0, "the unit is seconds, not milliseconds")
 _LATE_SIGMA = optional_key(0.0, 10.0, "the unit is seconds, not milliseconds")
 _ARM_SIGMA = optional_key(0.0, 100.0, "the unit is metres")
@@ -43,9 +38,9 @@ _WALK = "the unit is that of the data sheet"
 
 SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
     "frames": {"body": Key(shape=None)},
-    "origin": {"lat_deg": _LAT, "lon_deg": _LON, "height_m": _HEIGHT},
+    "origin": PLACE_KEYS,
     "imu": {
-        "file": _FILE,
+        "file": FILE_KEY,
         "stamp": Key(shape=None),
         "gyro_random_walk_deg_per_sqrt_h": sigma_key(1e4, _WALK),
         "accel_random_walk_ug_per_sqrt_hz": sigma_key(1e7, _WALK),
@@ -55,7 +50,7 @@ SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
         "accel_bias_walk_ug_per_sqrt_h": optional_key(0.0, 1e7, _WALK),
     },
     "dvl": {
-        "file": _FILE,
+        "file": FILE_KEY,
         "beam_azimuth_deg": Key(shape=(N_BEAMS,), low=-360.0, high=360.0, required=False),
         "beam_janus_deg": Key(
             positive=True,
@@ -65,7 +60,7 @@ SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
         ),
         "beam_vectors": Key(shape=(N_BEAMS, 3), required=False),
         "beam_noise_m_per_s": sigma_key(5.0, "the unit is m/s, not mm/s"),
-        "lever_arm_m": _LEVER_ARM,
+        "lever_arm_m": LEVER_ARM_KEY,
         "mounting_rpy_deg": Key(shape=(3,), low=-360.0, high=360.0),
         "misalignment_sigma_deg": optional_key(0.0, 45.0, "the unit is degrees"),
         "scale_sigma": optional_key(0.0, 1.0, "1 percent is 0.01"),
@@ -88,15 +83,15 @@ SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
         "vertical_sigma_m_per_s": optional_key(0.0, 20.0, "the unit is m/s"),
     },
     "depth": {
-        "file": _FILE,
+        "file": FILE_KEY,
         "noise_m": sigma_key(1000.0),
-        "lever_arm_m": _LEVER_ARM,
+        "lever_arm_m": LEVER_ARM_KEY,
         "offset_m": optional_key(-1000.0, 1000.0, "the unit is metres"),
         "offset_sigma_m": optional_key(0.0, 1000.0, "the unit is metres"),
     },
     "gnss": {
-        "file": _FILE,
-        "lever_arm_m": _LEVER_ARM,
+        "file": FILE_KEY,
+        "lever_arm_m": LEVER_ARM_KEY,
         "lever_arm_sigma_m": _ARM_SIGMA,
         "time_offset_s": _LATE,
         "time_offset_sigma_s": _LATE_SIGMA,
@@ -106,9 +101,7 @@ SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
     **AID_SECTIONS,
     "initial": {
         "time_s": Key(),
-        "lat_deg": _LAT,
-        "lon_deg": _LON,
-        "height_m": _HEIGHT,
+        **PLACE_KEYS,
         "vel_enu_m_per_s": Key(shape=(3,), low=-50.0, high=50.0, hint="the unit is m/s"),
         "roll_deg": Key(low=-180.0, high=180.0),
         "pitch_deg": Key(low=-90.0, high=90.0),
@@ -117,20 +110,17 @@ SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
         "velocity_sigma_m_per_s": Key(shape=(3,), positive=True, high=1e3),
         "attitude_sigma_deg": Key(shape=(3,), positive=True, high=360.0),
     },
-    "reference": {"file": _FILE},
+    "reference": {"file": FILE_KEY},
 }
 REQUIRED_SECTIONS: Final = ("frames", "imu", "dvl")
 OPTIONAL_TABLES: Final = ("depth", "gnss", *AID_TABLES, "reference")
 
-TIME: Final = "time_s"
 GYRO: Final = tuple(f"gyro_{axis}_rad_per_s" for axis in "xyz")
 ACCEL: Final = tuple(f"accel_{axis}_m_per_s2" for axis in "xyz")
 SPEED: Final = tuple(f"beam{beam}_m_per_s" for beam in range(1, N_BEAMS + 1))
 SPEED_SIGMA: Final = tuple(f"beam{beam}_sigma_m_per_s" for beam in range(1, N_BEAMS + 1))
 RANGE: Final = tuple(f"range{beam}_m" for beam in range(1, N_BEAMS + 1))
 WATER_TRACK: Final = "water_track"
-POSITION: Final = ("lat_deg", "lon_deg", "height_m")
-POSITION_SIGMA: Final = ("sigma_east_m", "sigma_north_m", "sigma_up_m")
 VELOCITY: Final = ("vel_east_m_per_s", "vel_north_m_per_s", "vel_up_m_per_s")
 ATTITUDE: Final = ("roll_deg", "pitch_deg", "heading_deg")
 

@@ -30,18 +30,16 @@ from ssm_graph.io.mission_keys import (
     ATTITUDE,
     FORMAT,
     GYRO,
-    POSITION_SIGMA,
     RANGE,
     SPEED,
     SPEED_SIGMA,
-    TIME,
     VELOCITY,
     WATER_TRACK,
     Stamp,
 )
 from ssm_graph.io.mission_units import R_bd_from_rpy, from_si, rpy_from_R_bd
 from ssm_graph.io.settings import TOML_NAME
-from ssm_graph.io.tables import TableFormat, write_table
+from ssm_graph.io.tables import POSITION_SIGMA, TIME, TableFormat, write_table
 
 _NOISE_OF_EMPTY_LOG = 0.01
 

@@ -7,15 +7,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from ssm_graph.io.mission_keys import (
-    ACCEL,
-    GYRO,
-    POSITION,
-    POSITION_SIGMA,
-    SPEED,
-    SPEED_SIGMA,
-    TIME,
-)
+from ssm_graph.io.mission_keys import ACCEL, GYRO, SPEED, SPEED_SIGMA
+from ssm_graph.io.tables import POSITION, POSITION_SIGMA, TIME
 from ssm_graph.messages import DepthReading, Fix, ImuSample, Message, Ping
 
 ARRIVALS: Final = "arrivals"

@@ -11,6 +11,7 @@ import numpy as np
 
 from ssm_graph.data import Array
 from ssm_graph.errors import ConfigError, nearest_hint
+from ssm_graph.plausible import DEEPEST_M
 
 TOML_NAME: Final = "mission.toml"
 _SHOWN: Final = 60
@@ -54,6 +55,17 @@ def sigma_key(high: float, hint: str = "", *, required: bool = True) -> Key:
 def optional_key(low: float, high: float, hint: str) -> Key:
     """Return a key of a number that may be left out; it is zero then."""
     return Key(low=low, high=high, required=False, hint=hint)
+
+
+FILE_KEY: Final = Key(shape=None)
+LEVER_ARM_KEY: Final = Key(shape=(3,), low=-100.0, high=100.0, hint="lever arms are in metres")
+PLACE_KEYS: Final[Mapping[str, Key]] = {
+    "lat_deg": Key(low=-90.0, high=90.0, hint="are latitude and longitude swapped?"),
+    "lon_deg": Key(low=-180.0, high=360.0, hint="longitude is in degrees"),
+    "height_m": Key(
+        low=-DEEPEST_M, high=20000.0, hint="height is in metres above the ellipsoid, up"
+    ),
+}
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import Enum
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +41,12 @@ class Order(Enum):
     """Times increase strictly."""
     ARRIVAL = "arrival"
     """As they came: late, repeated and torn rows are possible."""
+
+
+TIME: Final = "time_s"
+POSITION: Final = ("lat_deg", "lon_deg", "height_m")
+POSITION_SIGMA: Final = ("sigma_east_m", "sigma_north_m", "sigma_up_m")
+"""Columns that several tables have."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +122,7 @@ class Table:
     @property
     def time_s(self) -> Array:
         """(N,) the column ``time_s``."""
-        return self.columns["time_s"]
+        return self.columns[TIME]
 
     def stack(self, names: Sequence[str]) -> Array:
         """Return columns side by side, (N, len(names)); NaN where the table has no such column."""
@@ -255,12 +261,12 @@ def check_finite(table: Table, spec: TableSpec) -> None:
             raise table.cell_fault(row, name, f"expected a finite number; {hint}")
     if len(table) and np.abs(table.time_s).max() > LARGEST_TIME_S:
         row = int(np.argmax(np.abs(table.time_s)))
-        raise table.cell_fault(row, "time_s", "expected seconds; correct or delete this row")
+        raise table.cell_fault(row, TIME, "expected seconds; correct or delete this row")
 
 
 def is_repeated(table: Table, spec: TableSpec) -> NDArray[np.bool_]:
     """Return which rows (N,) have the time, and the key, of an earlier one."""
-    rows = table.stack(("time_s", *spec.key))
+    rows = table.stack((TIME, *spec.key))
     repeated = np.ones(len(rows), dtype=bool)
     repeated[np.unique(rows, axis=0, return_index=True)[1]] = False
     return repeated

@@ -72,13 +72,12 @@ def _of_heading(errors: HeadingErrors) -> list[Extra]:
             found.append(Extra(name, labels, np.full(len(waves), sigma), unit=degree))
     if errors.walk_sigma > 0.0:
         found.append(
-            Extra(
+            Extra.gauss_markov(
                 HEADING_WALK,
                 (f"{HEADING_WALK}_deg",),
-                np.array([errors.walk_sigma]),
-                unit=degree,
-                walk_density=errors.walk_sigma * math.sqrt(2.0 / errors.correlation_s),
+                errors.walk_sigma,
                 correlation_s=errors.correlation_s,
+                unit=degree,
             )
         )
     return found

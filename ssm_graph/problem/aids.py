@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ssm_graph.aid_logs import UsblLog
 from ssm_graph.data import Array, GnssLog, Mission, ReadOnlyArrays
 from ssm_graph.earth import LocalFrame
 from ssm_graph.problem.ping_motion import mean_gyro
-from ssm_graph.problem.timeline import Timeline
+from ssm_graph.problem.timeline import Indices, Timeline
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,13 +76,23 @@ def fix_covariance_n(frame: LocalFrame, position_n: Array, sigma_enu: Array) -> 
 
 def fixes_of(mission: Mission, log: GnssLog, timeline: Timeline) -> Fixes:
     """Return the GNSS fixes that a timeline uses."""
-    fix, frame = timeline.fix, mission.frame
-    place_n = frame.p_n_from_geodetic(log.lat[fix], log.lon[fix], log.height[fix])
+    fixes = fixes_at(
+        mission, log, timeline.fix, time_s=log.time_s[timeline.fix], keyframe=timeline.fix_keyframe
+    )
+    return replace(fixes, fast_share=log.calibration.drift.fast_share)
+
+
+def fixes_at(
+    mission: Mission, log: GnssLog | UsblLog, rows: Indices, *, time_s: Array, keyframe: Indices
+) -> Fixes:
+    """Return some rows (F,) of a log of positions, valid at times (F,), at keyframes (F,)."""
+    frame = mission.frame
+    place_n = frame.p_n_from_geodetic(log.lat[rows], log.lon[rows], log.height[rows])
+    place_n = place_n.reshape(len(rows), 3)
     return Fixes(
-        keyframe=timeline.fix_keyframe,
+        keyframe=keyframe,
         position_n=place_n,
-        covariance_n=fix_covariance_n(frame, place_n, log.sigma_enu[fix]),
-        gyro_b=mean_gyro(mission.imu, log.time_s[fix]),
+        covariance_n=fix_covariance_n(frame, place_n, log.sigma_enu[rows]),
+        gyro_b=mean_gyro(mission.imu, time_s),
         lever_arm_b=log.lever_arm_b,
-        fast_share=log.calibration.drift.fast_share,
     )

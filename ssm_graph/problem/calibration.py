@@ -61,7 +61,7 @@ def calibration_extras(
         ),
         Extra(DVL_LEVER_ARM, _axes("dvl_lever_arm_{}_m"), np.full(3, mount.lever_arm_sigma)),
         Extra(DVL_TIME_OFFSET, ("dvl_time_offset_s",), np.array([mount.time_offset_sigma_s])),
-        _drift(DVL_DRIFT, "dvl_drift_{}_m_per_s", mount.drift),
+        *_drift(DVL_DRIFT, "dvl_drift_{}_m_per_s", mount.drift),
     ]
     if depth is not None:
         sigma = np.array([depth.offset_sigma])
@@ -71,7 +71,7 @@ def calibration_extras(
         late_sigma = np.array([gnss.time_offset_sigma_s])
         extras.append(Extra(GNSS_LEVER_ARM, _axes("gnss_lever_arm_{}_m"), arm_sigma))
         extras.append(Extra(GNSS_TIME_OFFSET, ("gnss_time_offset_s",), late_sigma))
-        extras.append(_drift(GNSS_DRIFT, "gnss_drift_{}_m", gnss.drift))
+        extras += _drift(GNSS_DRIFT, "gnss_drift_{}_m", gnss.drift)
     return tuple(extra for extra in extras if extra.sigma[0] > 0.0)
 
 
@@ -107,17 +107,12 @@ def taken_as_exact(extras: Extras) -> tuple[str, ...]:
     )
 
 
-def _drift(name: str, pattern: str, drift: Drift) -> Extra:
-    """Return a drift of three components; one of sigma zero is none."""
-    sigma, density = np.full(3, drift.sigma), 0.0
-    if drift.sigma > 0.0:
-        density = drift.sigma * math.sqrt(2.0 / drift.correlation_s)
-    return Extra(
-        name,
-        _axes(pattern),
-        sigma,
-        walk_density=density,
-        correlation_s=drift.correlation_s,
+def _drift(name: str, pattern: str, drift: Drift) -> tuple[Extra, ...]:
+    """Return a drift of three components, or nothing."""
+    if drift.sigma == 0.0:
+        return ()
+    return (
+        Extra.gauss_markov(name, _axes(pattern), drift.sigma, correlation_s=drift.correlation_s),
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Final
 
 import numpy as np
@@ -34,13 +33,7 @@ def current_extras(mission: Mission) -> tuple[Extra, ...]:
         (CURRENT_UP, ("current_up_m_per_s",), model.vertical_sigma),
     )
     return tuple(
-        Extra(
-            name,
-            labels,
-            np.full(len(labels), sigma),
-            walk_density=sigma * math.sqrt(2.0 / model.correlation_s),
-            correlation_s=model.correlation_s,
-        )
+        Extra.gauss_markov(name, labels, sigma, correlation_s=model.correlation_s)
         for name, labels, sigma in parts
         if sigma > 0.0
     )

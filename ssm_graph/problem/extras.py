@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,20 @@ class Extra(ReadOnlyArrays):
     """Per square root of a second; zero for a constant."""
     correlation_s: float = math.inf
     """A walk forgets within so much; infinite for a random walk, which does not."""
+
+    @classmethod
+    def gauss_markov(
+        cls,
+        name: str,
+        labels: tuple[str, ...],
+        sigma: float,
+        *,
+        correlation_s: float,
+        unit: float = 1.0,
+    ) -> Self:
+        """Return a walk that keeps its variance; each component has the same ``sigma``."""
+        density = sigma * math.sqrt(2.0 / correlation_s)
+        return cls(name, labels, np.full(len(labels), sigma), unit, density, correlation_s)
 
     @property
     def is_walk(self) -> bool:

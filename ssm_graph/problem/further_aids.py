@@ -16,8 +16,8 @@ from factors import so3
 from ssm_graph.aid_logs import HeadingLog, RangeLog, Standstill, UsblLog
 from ssm_graph.data import Array, Mission, ReadOnlyArrays
 from ssm_graph.earth import LocalFrame
-from ssm_graph.problem.aids import Fixes, fix_covariance_n
-from ssm_graph.problem.ping_motion import mean_gyro, turn_between
+from ssm_graph.problem.aids import Fixes, fixes_at
+from ssm_graph.problem.ping_motion import turn_between
 from ssm_graph.problem.timeline import Indices, is_inside, left_out, nearest
 
 
@@ -107,16 +107,8 @@ def further_aids(mission: Mission, keyframe_s: Array) -> tuple[FurtherAids, tupl
 def _usbl(mission: Mission, log: UsblLog, keyframe_s: Array) -> Fixes:
     fix = np.flatnonzero(is_inside(log.valid_s, keyframe_s[0], keyframe_s[-1]))
     fix = fix[np.argsort(log.valid_s[fix], kind="stable")]
-    frame, valid_s = mission.frame, log.valid_s[fix]
-    place_n = frame.p_n_from_geodetic(log.lat[fix], log.lon[fix], log.height[fix])
-    place_n = place_n.reshape(len(fix), 3)
-    return Fixes(
-        keyframe=nearest(keyframe_s, valid_s),
-        position_n=place_n,
-        covariance_n=fix_covariance_n(frame, place_n, log.sigma_enu[fix]),
-        gyro_b=mean_gyro(mission.imu, valid_s),
-        lever_arm_b=log.lever_arm_b,
-    )
+    valid_s = log.valid_s[fix]
+    return fixes_at(mission, log, fix, time_s=valid_s, keyframe=nearest(keyframe_s, valid_s))
 
 
 def _ranges(frame: LocalFrame, log: RangeLog, keyframe_s: Array) -> Ranges:
