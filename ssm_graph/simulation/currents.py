@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from ssm_graph.data import N_BEAMS, Array
 from ssm_graph.simulation._checks import (
@@ -16,6 +15,7 @@ from ssm_graph.simulation._checks import (
     require_not_negative,
     require_positive,
 )
+from ssm_graph.simulation.drifts import gauss_markov
 from ssm_graph.water_current import CurrentModel
 
 _STEP_S = 1.0
@@ -123,7 +123,5 @@ class Current:
     def _gauss_markov(self, rng: np.random.Generator) -> Array:
         settings = self._settings
         sigma = np.array([settings.sigma, settings.sigma, settings.vertical_sigma])
-        kept = math.exp(-_STEP_S / settings.correlation_s)
         fresh = rng.standard_normal((len(self._time_s), 3))
-        fresh[1:] *= math.sqrt(1.0 - kept**2)
-        return np.asarray(sigma * lfilter([1.0], [1.0, -kept], fresh, axis=0))
+        return np.asarray(sigma * gauss_markov(fresh, self._time_s, settings.correlation_s))

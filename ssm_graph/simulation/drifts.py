@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,8 +27,17 @@ class DriftSettings:
 def draw_drift(settings: DriftSettings, time_s: Array, rng: np.random.Generator) -> Array:
     """Return three independent components (N, 3) at increasing times (N,)."""
     unit = rng.standard_normal((len(time_s), 3))
-    drift = settings.sigma * unit
-    for k in range(1, len(time_s)):
-        kept = math.exp(-(time_s[k] - time_s[k - 1]) / settings.correlation_s)
-        drift[k] = kept * drift[k - 1] + math.sqrt(1.0 - kept**2) * drift[k]
-    return np.asarray(drift)
+    return settings.sigma * gauss_markov(unit, time_s, settings.correlation_s)
+
+
+def gauss_markov(unit: Array, time_s: Array, correlation_s: float) -> Array:
+    """Return processes of variance 1, (N, d), at increasing times (N,).
+
+    ``unit`` (N, d) are the standard normal numbers that drive them.
+    """
+    kept = np.exp(-np.diff(time_s) / correlation_s)
+    fresh = np.sqrt(1.0 - kept**2)[:, None] * unit[1:]
+    process = unit.copy()
+    for k in range(len(kept)):
+        process[k + 1] = kept[k] * process[k] + fresh[k]
+    return process

@@ -31,6 +31,7 @@ from ssm_graph.earth import (
 )
 from ssm_graph.simulation._checks import require, require_fraction, require_positive
 from ssm_graph.simulation.aids import Point, regular_times, require_point
+from ssm_graph.simulation.drifts import gauss_markov
 from ssm_graph.simulation.streams import Streams
 from ssm_graph.simulation.trajectory import Trajectory, stacked
 
@@ -264,7 +265,8 @@ def _heading(
         *(f(n * psi) for n in (1, 2) for f in (np.sin, np.cos)),
     ]
     if noisy:
-        read = read + settings.sigma * noise + _walk(errors, steps, 1.0 / settings.rate_hz)
+        walk = gauss_markov(steps[:, None], time_s, errors.correlation_s)[:, 0]
+        read = read + settings.sigma * noise + errors.walk_sigma * walk
     n_events = math.ceil(len(time_s) / (settings.gross_s * settings.rate_hz))
     event = (time_s / settings.gross_s).astype(int) % n_events
     size, is_gross = _gross(settings.gross, n_events, rng=rng)
@@ -278,16 +280,6 @@ def _heading(
         errors=errors,
     )
     return log, is_gross[event], drawn
-
-
-def _walk(errors: HeadingErrors, steps: Array, span_s: float) -> Array:
-    """Return a Gauss-Markov process, rad, driven by standard normal steps."""
-    kept = math.exp(-span_s / errors.correlation_s)
-    value, values = errors.walk_sigma * steps[0], np.zeros(len(steps))
-    for i, step in enumerate(steps):
-        values[i] = value
-        value = kept * value + errors.walk_sigma * math.sqrt(1.0 - kept**2) * step
-    return values
 
 
 def _gross(settings: GrossErrors, count: int, *, rng: np.random.Generator) -> tuple[Array, Mask]:
