@@ -161,7 +161,8 @@ def dvl_beam_factor(
         if jacobians is None:
             return np.atleast_1d(beam_error(R_nb, v_n, gyro_bias, **measured))
         residual = beam_residual(R_nb, v_n, gyro_bias, **measured)
-        jacobians[:] = beam_blocks(residual)
+        for i, block in enumerate(beam_blocks(residual)):  # GTSAM's list takes no slices
+            jacobians[i] = block
         return np.atleast_1d(residual.error)
 
     noise: gtsam.noiseModel.Base = gtsam.noiseModel.Isotropic.Sigma(1, sigma / np.sqrt(weight))

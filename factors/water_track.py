@@ -101,7 +101,8 @@ def water_beam_factor(
         if jacobians is None:
             return np.atleast_1d(beam_error(R_nb, v_n, gyro_bias, **measured))
         residual = beam_residual(R_nb, v_n, gyro_bias, **measured)
-        jacobians[:3] = beam_blocks(residual)
+        for i, block in enumerate(beam_blocks(residual)):  # GTSAM's list takes no slices
+            jacobians[i] = block
         jacobians[3] = (residual.error_D_velocity_n @ v_D_current)[None]
         return np.atleast_1d(residual.error)
 
