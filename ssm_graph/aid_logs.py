@@ -93,10 +93,15 @@ class RangeLog(FrozenArrays):
 
 @dataclass(frozen=True, slots=True)
 class HeadingErrors:
-    """Errors of a compass beside its noise, as prior sigmas in rad; zero is none."""
+    """Errors of a compass beside its noise, as prior sigmas in rad; zero is none.
+
+    A heading gyro that seeks no north, a directional gyro, has an offset of pi and a rate.
+    """
 
     offset_sigma: float = 0.0
     """Of what is constant: mounting, declination."""
+    rate_sigma: float = 0.0
+    """Of a constant drift since the first reading, rad/s."""
     walk_sigma: float = 0.0
     """Of what comes and goes, a Gauss-Markov process."""
     correlation_s: float = 600.0
@@ -109,7 +114,7 @@ class HeadingErrors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadingLog(FrozenArrays):
-    """Readings of a magnetic or any other compass."""
+    """Readings of a magnetic or any other compass, or of a directional gyro."""
 
     sigma: float
     """Standard deviation of a reading, rad."""

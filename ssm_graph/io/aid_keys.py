@@ -22,6 +22,7 @@ AID_SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
         "noise_deg": sigma_key(90.0, _DEGREES),
         "declination_deg": optional_key(-180.0, 180.0, _DEGREES),
         "offset_sigma_deg": optional_key(0.0, 180.0, _DEGREES),
+        "rate_sigma_deg_per_h": optional_key(0.0, 1e4, "the unit is degrees per hour"),
         "walk_sigma_deg": optional_key(0.0, 90.0, _DEGREES),
         "correlation_s": Key(positive=True, high=1e6, required=False, hint="the unit is seconds"),
         "one_cycle_sigma_deg": optional_key(0.0, 90.0, _DEGREES),

@@ -142,6 +142,7 @@ def _heading(table: Table, settings: Settings) -> HeadingLog:
         field: to_si(key, settings.number(key))
         for field, key in (
             ("offset_sigma", "offset_sigma_deg"),
+            ("rate_sigma", "rate_sigma_deg_per_h"),
             ("walk_sigma", "walk_sigma_deg"),
             ("correlation_s", "correlation_s"),
             ("one_cycle_sigma", "one_cycle_sigma_deg"),

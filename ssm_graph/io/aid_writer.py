@@ -91,6 +91,7 @@ def _heading(log: HeadingLog) -> dict[str, float]:
     optional = {
         "declination_deg": log.declination,
         "offset_sigma_deg": errors.offset_sigma,
+        "rate_sigma_deg_per_h": errors.rate_sigma,
         "walk_sigma_deg": errors.walk_sigma,
         "correlation_s": errors.correlation_s if errors.walk_sigma else 0.0,
         "one_cycle_sigma_deg": errors.one_cycle_sigma,

@@ -12,6 +12,8 @@ What these logs need before they can be used, all of it measured on logs of 2025
   at its stamp, it is late by no more than about 15 ms.
 * The DVL's own clock, the running sum of ``delta_time``, is good; its offset to the arrivals is a
   running median. They scatter by +-22 ms about it, the publishing period of that topic.
+* The DVL dead-reckons with a gyro of its own, and its heading is among the sensors of the vehicle's
+  position estimate: another gyro, see :mod:`ssm_graph.io.blueye_heading`.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from typing import Any, Final
 import numpy as np
 from scipy.ndimage import median_filter, uniform_filter1d
 
+from ssm_graph.aid_logs import AidLogs
 from ssm_graph.data import (
     N_BEAMS,
     Array,
@@ -34,6 +37,7 @@ from ssm_graph.data import (
 )
 from ssm_graph.earth import LocalFrame, normal_gravity
 from ssm_graph.errors import DataError
+from ssm_graph.io.blueye_heading import dvl_heading
 from ssm_graph.io.blueye_log import GNSS_SENSOR_ID, BlueyeTables, read_blueye_tables
 from ssm_graph.io.blueye_vehicle import (
     BEAM_SIGMA,
@@ -84,6 +88,7 @@ def convert_blueye(log: Path) -> Mission:
     tables = read_blueye_tables(log)
     imu, imu_notes = _imu(tables)
     dvl, dvl_notes = _dvl(tables, imu)
+    heading, heading_notes = dvl_heading(tables.dvl_heading, imu)
     depth = _depth(tables)
     gnss, gnss_notes = _gnss(tables, imu, depth)
     frame = LocalFrame(float(gnss.lat[0]), float(gnss.lon[0]), float(gnss.height[0]))
@@ -99,11 +104,13 @@ def convert_blueye(log: Path) -> Mission:
         dvl=dvl,
         depth=depth,
         gnss=gnss,
+        aids=AidLogs(heading=heading),
         notes=(
             *imu_notes,
             *compare_imus(imu, tables.witness),
             *_gravity_notes(imu, frame),
             *dvl_notes,
+            *heading_notes,
             *gnss_notes,
             assumed,
         ),

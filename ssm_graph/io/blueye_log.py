@@ -18,6 +18,8 @@ TOPICS: Final = tuple(
 WITNESS: Final = PREFIX + "Imu1Tel"
 """The vehicle's other IMU, which a log need not have."""
 GNSS_SENSOR_ID: Final = 4
+DVL_SENSOR_ID: Final = 1
+"""The dead reckoning that the DVL does by itself."""
 
 
 class BlueyeTables(NamedTuple):
@@ -36,12 +38,15 @@ class BlueyeTables(NamedTuple):
     """(N, 2) time, yaw rate of the vehicle's own estimator in rad/s."""
     gnss: Array
     """(N, 4) time, latitude and longitude in deg, sigma in m; valid fixes only."""
+    dvl_heading: Array
+    """(N, 2) time, heading in rad of the DVL's own dead reckoning, from no known origin; no rows
+    where the log has none."""
 
 
 def read_blueye_tables(log: Path) -> BlueyeTables:
     """Return the messages of a log as arrays, in order of arrival; raises as `convert_blueye`."""
     rows: dict[str, list[tuple[float, ...]]] = {
-        name: [] for name in ("imu", "witness", "dvl", "depth", "yaw_rate", "gnss")
+        name: [] for name in ("imu", "witness", "dvl", "depth", "yaw_rate", "gnss", "dvl_heading")
     }
     for topic, time_s, message in _messages(log):
         try:
@@ -60,6 +65,7 @@ def read_blueye_tables(log: Path) -> BlueyeTables:
         depth=np.array(rows["depth"]),
         yaw_rate=np.array(rows["yaw_rate"]).reshape(-1, 2),
         gnss=np.array(rows["gnss"]).reshape(-1, 4),
+        dvl_heading=np.array(rows["dvl_heading"]).reshape(-1, 2),
     )
 
 
@@ -122,3 +128,5 @@ def _append(rows: dict[str, list[tuple[float, ...]]], topic: str, time: float, m
             if sensor.sensor_id == GNSS_SENSOR_ID and sensor.is_valid:
                 point = sensor.global_position
                 rows["gnss"].append((time, point.latitude, point.longitude, sensor.std))
+            elif sensor.sensor_id == DVL_SENSOR_ID and sensor.is_valid:
+                rows["dvl_heading"].append((time, sensor.heading))

@@ -6,10 +6,12 @@ by itself, or three logs of 2025, two of which have GNSS throughout. Nothing dep
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
 
+from ssm_graph.aid_logs import HeadingErrors
 from ssm_graph.data import N_BEAMS, Drift, DvlMount, GnssCalibration, ImuNoise
 
 DVL_LEVER_ARM: Final = (-0.17, 0.0, 0.26)
@@ -60,6 +62,21 @@ GNSS_DRIFT: Final = Drift(sigma=0.5, correlation_s=120.0, fast_share=0.2)
 """m. Nearly all of the 0.5 m that the receiver reports: successive fixes differ by centimetres.
 Beside the DVL and the gyros, two logs with GNSS throughout are likeliest with 0.3 to 0.5 m that
 stay alike for 120 to 300 s, and 0.01 m of white noise; 0.1 m is left for waves."""
+DVL_HEADING_SCALE: Final = 0.989
+"""The DVL's own gyro turns so much of what Imu2Tel turns, 0.989 in three logs; with opposite legs
+of a lawn-mower over ground it is Imu2Tel that agrees."""
+DVL_HEADING_DELAY_S: Final = 0.25
+"""0.25 s against the gyros in three logs."""
+DVL_HEADING_SIGMA: Final = math.radians(0.5)
+"""Stamped at arrival: 0.1 to 0.2 degrees on straight legs, 0.7 in turns."""
+DVL_HEADING_ERRORS: Final = HeadingErrors(
+    offset_sigma=math.pi,
+    # 12, 72 and 0 deg/h against the smoother with GNSS throughout, or the gyros under water.
+    rate_sigma=math.radians(50.0) / 3600.0,
+    # What is left over 10 s once offset and rate are taken off: 0.2 to 0.3 degrees.
+    walk_sigma=math.radians(0.5),
+    correlation_s=60.0,
+)
 GNSS_UP_SIGMA: Final = 50.0
 """m; their height is made from depth, so it must not count as a measurement."""
 

@@ -34,8 +34,8 @@ def compare_imus(imu: ImuLog, witness: Array) -> tuple[str, ...]:
     edges = np.arange(begin, min(float(imu.time_s[-1]), float(witness[-1, 0])) - STEP_S, STEP_S)
     if len(edges) <= FEWEST_STEPS:
         return ()
-    used = np.diff(_turn(imu.time_s, imu.gyro_b, edges), axis=0) / STEP_S
-    other = np.diff(_turn(witness[:, 0], witness[:, 1:4], edges), axis=0) / STEP_S
+    used = np.diff(turned(imu.time_s, imu.gyro_b, edges), axis=0) / STEP_S
+    other = np.diff(turned(witness[:, 0], witness[:, 1:4], edges), axis=0) / STEP_S
     offset = np.median(other - used, axis=0)
     is_up = float(np.median(witness[:, 6])) < 0.0
     text = ", ".join(f"{x + 0.0:.4f}" for x in offset)
@@ -48,7 +48,7 @@ def compare_imus(imu: ImuLog, witness: Array) -> tuple[str, ...]:
     return (first, *_doubts(used - np.median(used, axis=0), other - np.median(other, axis=0)))
 
 
-def _turn(time_s: Array, rate: Array, at_s: Array) -> Array:
+def turned(time_s: Array, rate: Array, at_s: Array) -> Array:
     """Return the integral (M, 3) of rates (N, 3) that hold since the time before, rad."""
     angle = np.cumsum(rate[1:] * np.diff(time_s)[:, None], axis=0)
     return np.column_stack([np.interp(at_s, time_s[1:], column) for column in angle.T])

@@ -31,6 +31,7 @@ SI: Final[Mapping[str, float]] = {
     "noise_deg": math.radians(1.0),
     "declination_deg": math.radians(1.0),
     "offset_sigma_deg": math.radians(1.0),
+    "rate_sigma_deg_per_h": math.radians(1.0) / 3600.0,
     "walk_sigma_deg": math.radians(1.0),
     "one_cycle_sigma_deg": math.radians(1.0),
     "two_cycle_sigma_deg": math.radians(1.0),

@@ -14,10 +14,17 @@ from ssm_graph.problem.extras import Extra
 BEACON: Final = "beacon_"
 """Followed by the beacon's number."""
 HEADING_OFFSET: Final = "heading_offset"
+HEADING_RATE: Final = "heading_rate"
 HEADING_WALK: Final = "heading_walk"
 HEADING_ONE_CYCLE: Final = "heading_one_cycle"
 HEADING_TWO_CYCLE: Final = "heading_two_cycle"
-_OF_HEADING: Final = (HEADING_OFFSET, HEADING_WALK, HEADING_ONE_CYCLE, HEADING_TWO_CYCLE)
+_OF_HEADING: Final = (
+    HEADING_OFFSET,
+    HEADING_RATE,
+    HEADING_WALK,
+    HEADING_ONE_CYCLE,
+    HEADING_TWO_CYCLE,
+)
 
 
 def is_of_aid(name: str) -> bool:
@@ -70,6 +77,9 @@ def _of_heading(errors: HeadingErrors) -> list[Extra]:
         if sigma > 0.0:
             labels = tuple(f"{name}{wave}_deg" for wave in waves)
             found.append(Extra(name, labels, np.full(len(waves), sigma), unit=degree))
+    if errors.rate_sigma > 0.0:
+        sigma = np.full(1, errors.rate_sigma)
+        found.append(Extra(HEADING_RATE, (f"{HEADING_RATE}_deg_per_h",), sigma, degree / 3600.0))
     if errors.walk_sigma > 0.0:
         found.append(
             Extra.gauss_markov(

@@ -53,6 +53,8 @@ class Headings(ReadOnlyArrays):
     """(M,)"""
     heading: Array
     """(M,) rad, clockwise from true north but for the compass's errors"""
+    since_s: Array
+    """(M,) from the first reading of all to each, s"""
     sigma: float
     """rad"""
     R_back: Array
@@ -140,6 +142,7 @@ def _headings(mission: Mission, log: HeadingLog, keyframe_s: Array) -> Headings:
     return Headings(
         keyframe=keyframe,
         heading=log.heading[reading] + log.declination,
+        since_s=log.time_s[reading] - log.time_s[0],
         sigma=log.sigma,
         R_back=so3.exp(-turn_b),
     )

@@ -15,6 +15,7 @@ from ssm_graph.graph.extended_rows import Rows, RowStates
 from ssm_graph.problem.aid_errors import (
     HEADING_OFFSET,
     HEADING_ONE_CYCLE,
+    HEADING_RATE,
     HEADING_TWO_CYCLE,
     HEADING_WALK,
 )
@@ -40,7 +41,9 @@ class HeadingAid(WeightedAid):
         """Linearise headings: one component each."""
         extras, headings = self._extras, self._headings
         R_nl, R_back = self._frame.R_nl_at(at.p_n), headings.R_back[rows]
+        since_s = headings.since_s[rows, None]
         offset = self._value(at, HEADING_OFFSET, 1) + self._value(at, HEADING_WALK, 1)
+        offset = offset + since_s * self._value(at, HEADING_RATE, 1)
         residual = heading_residual(
             at.R_nb @ R_back,
             east_n=R_nl[..., 0],
@@ -58,6 +61,7 @@ class HeadingAid(WeightedAid):
         one = np.ones((*residual.error.shape, 1))
         for name, block in (
             (HEADING_OFFSET, one),
+            (HEADING_RATE, since_s),
             (HEADING_WALK, one),
             (HEADING_ONE_CYCLE, residual.error_D_one_cycle),
             (HEADING_TWO_CYCLE, residual.error_D_two_cycle),

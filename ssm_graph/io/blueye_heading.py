@@ -1,0 +1,67 @@
+"""The heading of a Blueye's DVL as a directional gyro: no known origin, but a gyro of its own.
+
+The A50 dead-reckons with inertial sensors that are not the vehicle's, and without compass or GNSS.
+A reset of its dead reckoning makes the heading jump; pieces are joined by the vehicle's gyros.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from ssm_graph.aid_logs import HeadingLog
+from ssm_graph.data import Array, ImuLog
+from ssm_graph.frames import wrap_to_pi
+from ssm_graph.io.blueye_vehicle import (
+    DVL_HEADING_DELAY_S,
+    DVL_HEADING_ERRORS,
+    DVL_HEADING_SCALE,
+    DVL_HEADING_SIGMA,
+)
+from ssm_graph.io.blueye_witness import turned
+
+JUMP: Final = np.deg2rad(10.0)
+"""Between two readings, beyond what the vehicle's gyros turn."""
+MOST_JUMPS: Final = 0.02
+"""Share of the readings: with more of them it is no gyro."""
+FEWEST: Final = 20
+
+
+def dvl_heading(readings: Array, imu: ImuLog) -> tuple[HeadingLog | None, tuple[str, ...]]:
+    """Return the DVL's heading, if the log has one that turns as the vehicle does, and notes.
+
+    Parameters
+    ----------
+    readings : (N, 2) arrival time, s, and heading, rad, repeats included.
+    imu : forward-right-down; its turns about z say where the readings jump.
+    """
+    new = readings[1:][np.diff(readings[:, 1]) != 0.0]  # the first is of unknown age
+    time_s = new[:, 0] - DVL_HEADING_DELAY_S
+    inside = (time_s >= imu.time_s[0]) & (time_s <= imu.time_s[-1])
+    inside &= np.r_[True, np.diff(time_s) > 0.0][: len(time_s)]
+    new, time_s = new[inside], time_s[inside]
+    if len(new) < FEWEST:
+        return None, ()
+    turn = np.diff(turned(imu.time_s, imu.gyro_b, time_s)[:, 2])
+    beyond = wrap_to_pi(np.diff(new[:, 1]) - DVL_HEADING_SCALE * turn)
+    jumps = np.abs(beyond) > JUMP
+    if np.mean(jumps) > MOST_JUMPS:
+        return None, (
+            f"The DVL's heading is left out: {int(jumps.sum())} of {len(new)} readings jump by "
+            f"more than {np.rad2deg(JUMP):.0f} degrees from what the gyros turn.",
+        )
+    steps = turn + np.where(jumps, 0.0, beyond) / DVL_HEADING_SCALE
+    heading = new[0, 1] + np.concatenate([[0.0], np.cumsum(steps)])
+    log = HeadingLog(
+        sigma=DVL_HEADING_SIGMA,
+        time_s=time_s,
+        heading=np.remainder(heading, 2.0 * np.pi),
+        errors=DVL_HEADING_ERRORS,
+    )
+    note = (
+        f"The DVL's own heading, {len(new)} readings {DVL_HEADING_DELAY_S} s late, is used as a "
+        f"directional gyro: it turns {DVL_HEADING_SCALE} of what the vehicle turns, from an origin "
+        f"of its own; {int(jumps.sum())} jumps of its dead reckoning bridged by the gyros."
+    )
+    return log, (note,)
