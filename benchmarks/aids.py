@@ -178,7 +178,7 @@ def run(sim: SimulatedMission, kernel: Kernel, *, is_aided: bool = True) -> Run:
     assert mission.reference is not None
     metrics = evaluate(estimate.trajectory, mission.reference)
     names = ("heading_offset", "heading_one_cycle", "heading_two_cycle")
-    of_compass = zip(names, np.split(sim.aids.heading_errors, [1, 3]), strict=True)
+    of_compass = zip(names, np.split(sim.aids.heading_errors[:5], [1, 3]), strict=True)
     return Run(
         horizontal_m=metrics.rmse_horizontal_m,
         heading_deg=math.degrees(metrics.rmse_attitude[2]),

@@ -21,7 +21,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.field_runs import (
+    ESTIMATED,
     FILTER,
+    IMU_ALONE,
     LOGS,
     MODES,
     RUNS,
@@ -43,7 +45,6 @@ from ssm_graph.report.style import ESTIMATE, INK, OUTLIER, REFERENCE, dress
 
 RESULTS = Path(__file__).resolve().parent / "results"
 DOCS = Path(__file__).resolve().parents[1] / "docs"
-ESTIMATED = "estimated"
 CUTS = (45.0, 55.0, 62.0, 70.0, 80.0, 90.0, 100.0, 110.0, 120.0)
 """s, other ends of GNSS for protocol A: 70 s alone is one draw of its noise."""
 TO_BEAT: dict[Protocol, dict[str, tuple[float, ...]]] = {
@@ -62,6 +63,8 @@ def cases(runs: Sequence[str], methods: Sequence[str], seeds: int) -> Iterator[C
     """Yield every cell: the filter for protocol A alone, one seed for the dive."""
     for run, protocol, method, calibration in product(runs, Protocol, methods, MODES):
         if method == FILTER and (protocol is not Protocol.A or calibration == ESTIMATED):
+            continue
+        if calibration == IMU_ALONE and method != "log":
             continue
         is_dive = run not in SURFACE
         if is_dive and (method not in (methods[0], FILTER) or calibration == "none"):
@@ -200,13 +203,14 @@ def draw(scores: Scores, missions: Missions, runs: Sequence[str]) -> Figure:
 LEGEND = """\
 Missions as `ssm-graph convert` makes them: one set of settings for the vehicle, nothing tuned per
 log ([where each comes from](../../docs/field.md)). Calibration `estimated`: DVL scale and both
-delays about the vehicle's known values, as the importer asks; `vehicle`: those values taken as
-exact, both with the slow errors of DVL and GNSS as variables; `none`: the speeds as read, gyro
-biases left in with a prior of 0.001 rad/s, all errors as white noise. Path: horizontal way from the
-last fix used to the last one scored, by positions a second apart. Heading sigma: posterior, when
-GNSS ends. Error / sigma: rms of the horizontal error over the rms of its own sigma. The fixes
-themselves are good to 0.15 to 0.5 m. Faults are drawn from the seed; bursts begin after GNSS has
-ended.
+delays about the vehicle's known values, and the DVL's own heading with origin and rate to be
+estimated, as the importer asks; `IMU alone`: without that heading; `vehicle`: scale and delays
+taken as exact, all three with the slow errors of DVL and GNSS as variables; `none`: the speeds as
+read, gyro biases left in with a prior of 0.001 rad/s, all errors as white noise, no DVL heading.
+The filter has neither such variables nor that heading. Path: horizontal way from the last fix used
+to the last one scored, by positions a second apart. Heading sigma: posterior, when GNSS ends.
+Error / sigma: rms of the horizontal error over the rms of its own sigma. The fixes themselves are
+good to 0.15 to 0.5 m. Faults are drawn from the seed; bursts begin after GNSS has ended.
 """
 
 

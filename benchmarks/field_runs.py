@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.kernels import KERNELS
+from ssm_graph.aid_logs import NO_AIDS
 from ssm_graph.cli.run_mission import fixes_where
 from ssm_graph.data import Array, Drift, GnssLog, Mission
 from ssm_graph.errors import SsmGraphError
@@ -37,6 +38,8 @@ RUNS = {
 SURFACE = ("square", "grid")
 SMOOTHERS = ("log", "sqrt", "exp", "gaussian")
 FILTER = "ssm-log filter"
+ESTIMATED = "estimated"
+IMU_ALONE = "estimated, IMU alone"
 GNSS_END_S = 70.0
 SILENCE_S = 10.0
 """A longer silence of GNSS is a dive: protocol A ends there if it comes before `GNSS_END_S`."""
@@ -120,13 +123,18 @@ def exact(mission: Mission) -> Mission:
     )
 
 
+def imu_alone(mission: Mission) -> Mission:
+    """Return the mission without the heading of the DVL."""
+    return replace(mission, aids=NO_AIDS)
+
+
 def unknown(mission: Mission) -> Mission:
     """Return the mission of a user who knows neither scale nor gyro biases, and asks for nothing.
 
-    Gyro biases come back, with a prior that covers them; speeds are taken as they are read, and
-    slow errors of DVL and GNSS are left to the noise stated.
+    Gyro biases come back, with a prior that covers them; speeds are taken as they are read, slow
+    errors of DVL and GNSS are left to the noise stated, and the DVL's heading is not used.
     """
-    plain = exact(mission)
+    plain = imu_alone(exact(mission))
     noise = replace(plain.imu.noise, gyro_bias_sigma=1e-3)
     imu = replace(plain.imu, gyro_b=plain.imu.gyro_b + GYRO_BIAS, noise=noise)
     mount = replace(plain.dvl.mount, scale_error=0.0, drift=Drift())
@@ -143,7 +151,8 @@ def unknown(mission: Mission) -> Mission:
 MODES: Mapping[str, Callable[[Mission], Mission]] = {
     "none": unknown,
     "vehicle": exact,
-    "estimated": lambda mission: mission,
+    IMU_ALONE: imu_alone,
+    ESTIMATED: lambda mission: mission,
 }
 """What is done to an imported mission, by the name of what is calibrated."""
 

@@ -21,6 +21,7 @@ KNOWN = BeaconSettings(3, (200.0, 60.0, -50.0))
 UNKNOWN = BeaconSettings(7, (90.0, -80.0, -55.0), (30.0, -25.0, 4.0), (40.0, 40.0, 6.0))
 COMPASS_ERRORS = HeadingErrors(
     offset_sigma=math.radians(4.0),
+    rate_sigma=math.radians(20.0) / 3600.0,
     walk_sigma=math.radians(0.5),
     correlation_s=200.0,
     one_cycle_sigma=math.radians(2.0),

@@ -63,10 +63,10 @@ GNSS_DRIFT: Final = Drift(sigma=0.5, correlation_s=120.0, fast_share=0.2)
 Beside the DVL and the gyros, two logs with GNSS throughout are likeliest with 0.3 to 0.5 m that
 stay alike for 120 to 300 s, and 0.01 m of white noise; 0.1 m is left for waves."""
 DVL_HEADING_SCALE: Final = 0.989
-"""The DVL's own gyro turns so much of what Imu2Tel turns, 0.989 in three logs; with opposite legs
-of a lawn-mower over ground it is Imu2Tel that agrees."""
+"""The DVL's own gyro turns so much of what Imu2Tel turns, 0.989 in two logs; both with GNSS
+throughout are likelier with the scale of Imu2Tel, by a ratio of 20 together."""
 DVL_HEADING_DELAY_S: Final = 0.25
-"""0.25 s against the gyros in three logs."""
+"""0.25 s against the gyros in two logs."""
 DVL_HEADING_SIGMA: Final = math.radians(0.5)
 """Stamped at arrival: 0.1 to 0.2 degrees on straight legs, 0.7 in turns."""
 DVL_HEADING_ERRORS: Final = HeadingErrors(

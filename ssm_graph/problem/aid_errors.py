@@ -78,8 +78,8 @@ def _of_heading(errors: HeadingErrors) -> list[Extra]:
             labels = tuple(f"{name}{wave}_deg" for wave in waves)
             found.append(Extra(name, labels, np.full(len(waves), sigma), unit=degree))
     if errors.rate_sigma > 0.0:
-        sigma = np.full(1, errors.rate_sigma)
-        found.append(Extra(HEADING_RATE, (f"{HEADING_RATE}_deg_per_h",), sigma, degree / 3600.0))
+        labels, rate = (f"{HEADING_RATE}_deg_per_h",), np.full(1, errors.rate_sigma)
+        found.append(Extra(HEADING_RATE, labels, rate, unit=degree / 3600.0))
     if errors.walk_sigma > 0.0:
         found.append(
             Extra.gauss_markov(

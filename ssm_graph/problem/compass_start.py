@@ -11,6 +11,8 @@ from ssm_graph.frames import wrap_to_pi
 from ssm_graph.problem.track_heading import HeadingFit, gyro_attitudes
 
 NONE = HeadingFit(0.0, math.inf)
+UNKNOWN_OFFSET = math.radians(90.0)
+"""A compass that may be off by so much, a directional gyro, says nothing of the start."""
 
 
 def heading_from_compass(
@@ -29,7 +31,7 @@ def heading_from_compass(
     window_s : as long as the gyros keep the heading.
     """
     log = mission.aids.heading
-    if log is None:
+    if log is None or log.errors.offset_sigma >= UNKNOWN_OFFSET:
         return NONE
     used = (log.time_s > start_s) & (log.time_s <= start_s + window_s)
     if not used.any():

@@ -151,7 +151,7 @@ class SimulatedAids(NamedTuple):
     gross: dict[str, Mask]
     """By section: usbl, ranges, heading"""
     heading_errors: Array
-    """(5,) of the compass: offset, sine and cosine once, sine and cosine twice, rad"""
+    """(6,) of the compass: offset, sine and cosine once, sine and cosine twice, rad; rate, rad/s"""
 
 
 def aid_logs(
@@ -159,7 +159,7 @@ def aid_logs(
 ) -> SimulatedAids:
     """Return the readings over ``(0, end_s]``; without noise, with gross errors as asked for."""
     gross: dict[str, Mask] = {}
-    usbl, ranges, heading, errors = None, None, None, np.zeros(5)
+    usbl, ranges, heading, errors = None, None, None, np.zeros(6)
     if settings.usbl is not None:
         usbl, gross["usbl"] = _usbl(
             trajectory, settings.usbl, end_s=end_s, rng=streams.usbl, noisy=noisy
@@ -271,7 +271,8 @@ def _heading(
     event = (time_s / settings.gross_s).astype(int) % n_events
     size, is_gross = _gross(settings.gross, n_events, rng=rng)
     sign = rng.choice([-1.0, 1.0], size=n_events)
-    read = read + (sign * size)[event] - settings.declination
+    rate = float(noisy) * errors.rate_sigma * rng.standard_normal()
+    read = read + (sign * size)[event] + rate * (time_s - time_s[0]) - settings.declination
     log = HeadingLog(
         sigma=settings.sigma,
         time_s=time_s,
@@ -279,7 +280,7 @@ def _heading(
         declination=settings.declination,
         errors=errors,
     )
-    return log, is_gross[event], drawn
+    return log, is_gross[event], np.append(drawn, rate)
 
 
 def _gross(settings: GrossErrors, count: int, *, rng: np.random.Generator) -> tuple[Array, Mask]:

@@ -46,12 +46,12 @@ def test_unknown_beacons_lie_where_their_sigmas_say(rate: float) -> None:
 
 
 def test_errors_of_a_compass_lie_where_their_sigmas_say() -> None:
-    """Offset and iron, drawn anew in every run."""
-    names = ("heading_offset", "heading_one_cycle", "heading_two_cycle")
+    """Offset, iron and rate, drawn anew in every run."""
+    names = ("heading_offset", "heading_one_cycle", "heading_two_cycle", "heading_rate")
     found = []
     for seed in range(RUNS):
         sim = simulated(duration_s=200.0, route=ROUTE, aids=compass(), seed=seed)
         estimate = SsmSmoother().solve(build_problem(sim.mission))
-        truth = np.split(sim.aids.heading_errors, [1, 3])
+        truth = np.split(sim.aids.heading_errors, [1, 3, 5])
         found.append(nees(estimate, dict(zip(names, truth, strict=True))))
-    assert_consistent(np.array(found), dof=5)
+    assert_consistent(np.array(found), dof=6)

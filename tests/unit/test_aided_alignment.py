@@ -68,6 +68,14 @@ def test_a_compass_gives_the_heading_that_nothing_else_does() -> None:
     assert np.all(np.abs(error) < 3.0 * end.attitude_sigma[:, 2])
 
 
+def test_a_directional_gyro_says_nothing_of_the_start() -> None:
+    """Its origin is its own: the heading stays open, and is estimated all the same."""
+    errors = HeadingErrors(offset_sigma=math.pi, rate_sigma=math.radians(10.0) / 3600.0)
+    sim = hovering(Grade.MEMS, compass=CompassSettings(errors=errors))
+    assert "hypotheses" in align(sim.mission).method
+    assert "compass" not in align(sim.mission).method
+
+
 def test_good_gyros_need_no_compass() -> None:
     """Theirs is the smaller sigma."""
     sim = hovering(Grade.NAVIGATION, compass=COMPASS)

@@ -244,7 +244,7 @@ def test_a_disturbed_compass_loses_its_weight() -> None:
 
 
 def test_what_a_compass_errs_by_is_found_within_its_sigma() -> None:
-    """Offset and iron, with the heading known from the start; a label and a colour for each."""
+    """Offset, iron and rate, the heading known from the start; a label and a colour for each."""
     sim = simulated(duration_s=300.0, aids=compass())
     found = SsmSmoother().solve(build_problem(sim.mission)).calibration
     assert found is not None
@@ -256,6 +256,7 @@ def test_what_a_compass_errs_by_is_found_within_its_sigma() -> None:
                 "heading_one_cycle_cosine_deg",
                 "heading_two_cycle_sine_deg",
                 "heading_two_cycle_cosine_deg",
+                "heading_rate_deg_per_h",
             ),
             sim.aids.heading_errors,
             strict=True,
