@@ -25,6 +25,8 @@ def cross(a: Array, b: Array) -> Array:
 
 def times(matrix: Array, vector: Array) -> Array:
     """Return ``matrix @ vector`` for matrices (..., n, m) and vectors (..., m) that broadcast."""
+    if matrix.ndim == 2:
+        return np.asarray(vector @ matrix.T)  # one product of two matrices, not one for each vector
     return np.asarray((matrix @ vector[..., None])[..., 0])
 
 

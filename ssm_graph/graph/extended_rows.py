@@ -191,8 +191,9 @@ class ExtendedBeams:
         self, at: RowStates, prepared: PreparedBeams, rows: Rows = np.s_[:]
     ) -> CalibratedResidual:
         beams = self._beams
-        back = no_way_back(beams.gyro_b[rows])
-        if prepared.back is not None:
+        if prepared.back is None:
+            back = no_way_back(beams.gyro_b[rows])
+        else:
             back = _of_pings(prepared.back, beams.ping[rows])
         lever = self._share[DVL_LEVER_ARM] * self._value(DVL_LEVER_ARM, at.walks, at.constants, 3)
         instrument = prepared.instrument
@@ -246,7 +247,9 @@ def _share_of_motion(
 
 
 def _of_pings(back: Back, ping: NDArray[np.intp]) -> Back:
-    """Return the way back of each row from that of all pings."""
+    """Return the way back of each row, or once for all rows of one ping, from that of all pings."""
+    if len(ping) and ping[0] == ping[-1]:
+        ping = ping[0]
     return Back(
         time_offset=back.time_offset,
         R_back=back.R_back[ping],
