@@ -6,6 +6,7 @@ A reset of its dead reckoning makes the heading jump; pieces are joined by the v
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
@@ -18,6 +19,7 @@ from ssm_graph.io.blueye_vehicle import (
     DVL_HEADING_ERRORS,
     DVL_HEADING_SCALE,
     DVL_HEADING_SIGMA,
+    NOISE,
 )
 from ssm_graph.io.blueye_witness import turned
 
@@ -26,6 +28,8 @@ JUMP: Final = np.deg2rad(10.0)
 MOST_JUMPS: Final = 0.02
 """Share of the readings: with more of them it is no gyro."""
 FEWEST: Final = 20
+MOST_RATE: Final = 4.0 * math.hypot(DVL_HEADING_ERRORS.rate_sigma, NOISE.gyro_bias_sigma)
+"""rad/s, between both gyros: one that drifts further is not the one that its sigma is of."""
 
 
 def dvl_heading(readings: Array, imu: ImuLog) -> tuple[HeadingLog | None, tuple[str, ...]]:
@@ -51,8 +55,14 @@ def dvl_heading(readings: Array, imu: ImuLog) -> tuple[HeadingLog | None, tuple[
             f"The DVL's heading is left out: {int(jumps.sum())} of {len(new)} readings jump by "
             f"more than {np.rad2deg(JUMP):.0f} degrees from what the gyros turn.",
         )
-    steps = turn + np.where(jumps, 0.0, beyond) / DVL_HEADING_SCALE
-    heading = new[0, 1] + np.concatenate([[0.0], np.cumsum(steps)])
+    away = np.cumsum(np.where(jumps, 0.0, beyond) / DVL_HEADING_SCALE)
+    rate = float(np.polyfit(time_s[1:] - time_s[0], away, 1)[0])
+    if abs(rate) > MOST_RATE:
+        return None, (
+            f"The DVL's heading is left out: it drifts by {_deg_per_h(rate):.0f} deg/h against the "
+            f"gyros, and {_deg_per_h(MOST_RATE):.0f} were expected at most.",
+        )
+    heading = new[0, 1] + np.concatenate([[0.0], np.cumsum(turn) + away])
     log = HeadingLog(
         sigma=DVL_HEADING_SIGMA,
         time_s=time_s,
@@ -65,3 +75,7 @@ def dvl_heading(readings: Array, imu: ImuLog) -> tuple[HeadingLog | None, tuple[
         f"of its own; {int(jumps.sum())} jumps of its dead reckoning bridged by the gyros."
     )
     return log, (note,)
+
+
+def _deg_per_h(rate: float) -> float:
+    return 3600.0 * math.degrees(rate)

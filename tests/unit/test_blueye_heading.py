@@ -79,6 +79,15 @@ def test_what_does_not_turn_as_the_vehicle_is_left_out(turning: ImuLog, factor: 
     assert "left out" in note
 
 
+def test_a_gyro_that_drifts_far_is_left_out(turning: ImuLog) -> None:
+    """Beyond what its sigma, and that of the vehicle's gyros, could be."""
+    drifting = readings()
+    drifting[:, 1] = wrap_to_pi(drifting[:, 1] + np.deg2rad(0.2) * drifting[:, 0])
+    log, (note,) = dvl_heading(drifting, turning)
+    assert log is None
+    assert 700.0 < float(note.split("drifts by ")[1].split()[0]) < 760.0
+
+
 def test_logs_without_it_say_nothing(turning: ImuLog) -> None:
     """No reading, or one that never changes."""
     assert dvl_heading(np.zeros((0, 2)), turning) == (None, ())
