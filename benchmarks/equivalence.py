@@ -88,7 +88,7 @@ def against_filter(problem: Problem, similarity: Similarity) -> Difference:
     beams = problem.beams
     weight = history.weight[beams.keyframe, 0, beams.beam]
     return Difference(
-        float(np.max(np.abs(newest.states.deviation_of(states)) / sigma)),
+        float(np.max(np.abs(newest.states.navigation.deviation_of(states)) / sigma)),
         float(np.max(np.abs(own.covariance[:, 0] - newest.covariance) / unit)),
         float(np.max(np.abs(weight - newest.weight))),
         int(np.sum(history.n_iterations[:, 0] != graph.n_iterations)),

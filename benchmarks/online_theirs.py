@@ -21,8 +21,8 @@ from ssm_graph.io.replay import messages_of
 from ssm_graph.io.vehicle import vehicle_of
 from ssm_graph.online.buffers import Buffers
 from ssm_graph.online.keyframes import KeyframeMaker, sensors_of_vehicle
-from ssm_graph.problem.problem import ProblemConfig, build_problem, start_of
-from ssm_graph.problem.states import NavigationStates
+from ssm_graph.problem.problem import NO_EXTRAS, ProblemConfig, build_problem, start_of
+from ssm_graph.problem.states import AugmentedStates
 from ssm_graph.problem.trajectory import trajectory_at
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors
 from ssm_graph.smoothers.window_rows import InertialRows, depth_targets
@@ -115,12 +115,12 @@ class Theirs:
 
     def __init__(self, mission: Mission, config: TheirConfig) -> None:
         self.config, self._frame = config, mission.frame
-        self._sensors: Sensors = sensors_of_vehicle(vehicle_of(mission), mission.frame)
+        self._sensors: Sensors = sensors_of_vehicle(vehicle_of(mission), mission.frame, NO_EXTRAS)
         self._inertial = InertialRows(mission.frame)
         self._loss = gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY_K)
         problem = build_problem(mission)
         start = start_of(problem)
-        self.states = NavigationStates(*(column[None] for column in start[:4]))
+        self.states = AugmentedStates.of(start)
         self.covariance = start.covariance
         self._last = Keyframe.unmeasured(problem.start.time_s, np.zeros(3), None)
         self._k = 0
@@ -164,7 +164,7 @@ class Theirs:
         self.states = self._newest()
 
     def _update(
-        self, graph: gtsam.NonlinearFactorGraph, at: NavigationStates, time_s: float
+        self, graph: gtsam.NonlinearFactorGraph, at: AugmentedStates, time_s: float
     ) -> None:
         k, values = self._k, gtsam.Values()
         values.insert(X(k), gtsam.Pose3(gtsam.Rot3(at.R_nb[0]), at.p_n[0]))
@@ -193,7 +193,7 @@ class Theirs:
         self,
         graph: gtsam.NonlinearFactorGraph,
         keyframe: Keyframe,
-        predicted: NavigationStates,
+        predicted: AugmentedStates,
         k: int,
     ) -> None:
         """Add the mean of the readings, carried along the track as ours are, once."""
@@ -205,15 +205,16 @@ class Theirs:
         noise = gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
         graph.add(gtsam.GPSFactorArm(X(k), targets.sensor_n[0], self._sensors.depth_arm_b, noise))
 
-    def _newest(self) -> NavigationStates:
+    def _newest(self) -> AugmentedStates:
         k, smoother = self._k, self.smoother
         pose, v_n = smoother.calculateEstimatePose3(X(k)), smoother.calculateEstimateVector(V(k))
         bias = smoother.calculateEstimateConstantBias(B(k))
-        return NavigationStates(
+        return AugmentedStates(
             pose.rotation().matrix()[None],
             pose.translation()[None],
             v_n[None],
             np.concatenate([bias.accelerometer(), bias.gyroscope()])[None],
+            np.zeros((1, 0)),
         )
 
     def read_covariance(self) -> Array:
@@ -230,12 +231,12 @@ class _Columns:
 
     def __init__(self) -> None:
         self.time_s: list[float] = []
-        self.states: list[NavigationStates] = []
+        self.states: list[AugmentedStates] = []
         self.covariance: list[Array] = []
         self.seconds: list[tuple[float, float, float, float]] = []
 
     def trajectory(self, frame: LocalFrame) -> Trajectory:
-        states = NavigationStates(*(np.concatenate(c) for c in zip(*self.states, strict=True)))
+        states = AugmentedStates(*(np.concatenate(c) for c in zip(*self.states, strict=True)))
         return trajectory_at(
             frame,
             np.array(self.time_s),

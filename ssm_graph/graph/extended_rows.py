@@ -139,9 +139,12 @@ class ExtendedBeams:
         return PreparedBeams(instrument, back, mounting, late_s, bias if bias.ndim == 1 else None)
 
     def instrument_of(self, walks: Array, constants: Array) -> tuple[Array, Array]:
-        """Return mounting (3,) and time offset (): what it takes long to prepare for."""
+        """Return mounting (3,) and time offset (): what it takes long to prepare for.
+
+        Of walks (M, s) that each row has of its own, both have as many rows.
+        """
         mounting = self._value(DVL_MOUNTING, walks, constants, 3)
-        late_s = self._value(DVL_TIME_OFFSET, walks, constants, 1)[0]
+        late_s = self._value(DVL_TIME_OFFSET, walks, constants, 1)[..., 0]
         return mounting, self._share[DVL_TIME_OFFSET] * late_s
 
     def rows(self, at: RowStates, prepared: PreparedBeams, rows: Rows = np.s_[:]) -> BeamRows:
@@ -226,7 +229,9 @@ class ExtendedBeams:
 
     def _scale(self, at: RowStates, beam: NDArray[np.intp]) -> Array:
         scale = self._value(DVL_SCALE, at.walks, at.constants, 1)[..., 0]
-        return scale + self._value(DVL_BEAM_SCALE, at.walks, at.constants, N_BEAMS)[beam]
+        of_beams = self._value(DVL_BEAM_SCALE, at.walks, at.constants, N_BEAMS)
+        own = of_beams[beam] if of_beams.ndim == 1 else of_beams[np.arange(len(beam)), beam]
+        return np.asarray(scale + own)
 
     def _value(self, name: str, walks: Array, constants: Array, size: int) -> Array:
         return self._extras.value(name, walks, constants, default=np.zeros(size))

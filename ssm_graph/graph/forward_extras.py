@@ -32,10 +32,7 @@ class ForwardExtras:
 
     def begin(self, covariance: Array) -> Array:
         """Return the covariance (E, E) at the start from that of the error state."""
-        extras = self._problem.extras
-        whole = np.diag(np.concatenate([np.zeros(STATE_DIM), extras.sigma**2]))
-        whole[:STATE_DIM, :STATE_DIM] = covariance
-        return whole
+        return self._problem.extras.behind(covariance)
 
     def predict(self, k: int, covariance: Array) -> None:
         """Let the walks go on from keyframe ``k``, in place."""

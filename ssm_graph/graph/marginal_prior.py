@@ -8,7 +8,8 @@ import gtsam
 import numpy as np
 
 from ssm_graph.data import Array
-from ssm_graph.problem.error_state import STATE_DIM, InitialMoments
+from ssm_graph.problem.error_state import NO_EXTRA, InitialMoments
+from ssm_graph.problem.states import AugmentedStates
 from ssm_graph.problem.trajectory import KeyframeStates
 
 
@@ -25,32 +26,36 @@ class MarginalPrior(NamedTuple):
     p_n: Array
     v_n: Array
     bias: Array
+    extra: Array
+    """(E,) of extra variables that are carried in the state"""
     root_information: Array
-    """(15, 15)"""
+    """(n, n) with n = 15 + E"""
     offset: Array
-    """(15,)"""
+    """(n,)"""
 
-    def whitened(self, states: KeyframeStates) -> Array:
-        """Return the whitened error (15,) of the first keyframe of ``states``."""
-        return np.asarray(self.root_information @ self._deviation(states) - self.offset)
+    def whitened(self, states: KeyframeStates, extra: Array = NO_EXTRA) -> Array:
+        """Return the whitened error (n,) of the first keyframe of ``states``, ``extra`` (E,)."""
+        return np.asarray(self.root_information @ self._deviation(states, extra) - self.offset)
 
-    def rows(self, states: KeyframeStates) -> Array:
-        """Return whitened rows (15, 16) at the first keyframe of ``states``, ``b`` last."""
-        deviation = self._deviation(states)
-        rows = np.empty((STATE_DIM, STATE_DIM + 1))
-        rows[:, :STATE_DIM] = self.root_information
+    def rows(self, states: KeyframeStates, extra: Array = NO_EXTRA) -> Array:
+        """Return whitened rows (n, n + 1) at the first keyframe of ``states``, ``b`` last."""
+        deviation = self._deviation(states, extra)
+        n = len(deviation)
+        rows = np.empty((n, n + 1))
+        rows[:, :n] = self.root_information
         rows[:, :3] = rows[:, :3] @ gtsam.Rot3.LogmapDerivative(deviation[:3])
         rows[:, 3:6] = rows[:, 3:6] @ self.R_nb.T @ states.R_nb[0]
-        rows[:, STATE_DIM] = self.offset - self.root_information @ deviation
+        rows[:, n] = self.offset - self.root_information @ deviation
         return rows
 
-    def _deviation(self, states: KeyframeStates) -> Array:
+    def _deviation(self, states: KeyframeStates, extra: Array) -> Array:
         return np.concatenate(
             [
                 gtsam.Rot3.Logmap(gtsam.Rot3(self.R_nb.T @ states.R_nb[0])),
                 self.R_nb.T @ (states.p_n[0] - self.p_n),
                 states.v_n[0] - self.v_n,
                 states.bias[0] - self.bias,
+                extra - self.extra,
             ]
         )
 
@@ -62,26 +67,21 @@ def prior_at_start(start: InitialMoments) -> MarginalPrior:
         p_n=start.p_n,
         v_n=start.v_n,
         bias=start.bias,
+        extra=start.extra,
         root_information=np.linalg.inv(np.linalg.cholesky(start.covariance)),
-        offset=np.zeros(STATE_DIM),
+        offset=np.zeros(len(start.covariance)),
     )
 
 
-def prior_on_last(states: KeyframeStates, root_information: Array, *, step: Array) -> MarginalPrior:
-    """Return a prior on the last keyframe: ``step`` (15,) off its state, with that information."""
-    return MarginalPrior(
-        R_nb=states.R_nb[-1].copy(),
-        p_n=states.p_n[-1].copy(),
-        v_n=states.v_n[-1].copy(),
-        bias=states.bias[-1].copy(),
-        root_information=root_information,
-        offset=root_information @ step,
-    )
+def prior_on(state: AugmentedStates, root_information: Array, *, offset: Array) -> MarginalPrior:
+    """Return a prior on a keyframe at its state (1, ...) that is linearised there."""
+    R_nb, p_n, v_n, bias, extra = (column[0].copy() for column in state)
+    return MarginalPrior(R_nb, p_n, v_n, bias, extra, root_information, offset)
 
 
 def moved_chart(step: Array) -> Array:
-    """Return how the local error (15,) after a step follows that before it, (15, 15)."""
-    jacobian = np.eye(STATE_DIM)
+    """Return how the local error (n,) after a step follows that before it, (n, n)."""
+    jacobian = np.eye(len(step))
     jacobian[:3, :3] = gtsam.Rot3.ExpmapDerivative(step[:3])
     jacobian[3:6, 3:6] = gtsam.Rot3.Expmap(step[:3]).matrix().T
     return jacobian

@@ -65,7 +65,8 @@ class Course:
         """``null_b`` (4,) is the array's parity: orthogonal to the speeds of any velocity."""
         self._steps = deque([first])
         self._maker, self._buffers, self._events = maker, buffers, events
-        self._null, self._inertial = null_b, InertialRows(first.window.sensors.frame)
+        sensors = first.window.sensors
+        self._null, self._inertial = null_b, InertialRows(sensors.frame, sensors.extras)
         self._settled: list[Stretch] = []
 
     @property

@@ -15,14 +15,15 @@ from ssm_graph.imu.preintegration import LIVELY_S, imu_gaps, preintegrate
 from ssm_graph.messages import Vehicle
 from ssm_graph.online.buffers import Buffers, Measured
 from ssm_graph.problem.aids import fix_covariance_n
+from ssm_graph.problem.extras import Extras
 from ssm_graph.problem.ping_motion import PING_WINDOW_S, mean_gyro
 from ssm_graph.problem.problem import ProblemConfig
 from ssm_graph.problem.timeline import MIN_SPACING_S
 from ssm_graph.smoothers.keyframe import BeamSpeeds, Keyframe, Sensors, Way
 
 
-def sensors_of_vehicle(vehicle: Vehicle, frame: LocalFrame) -> Sensors:
-    """Return what is the same at all keyframes."""
+def sensors_of_vehicle(vehicle: Vehicle, frame: LocalFrame, extras: Extras) -> Sensors:
+    """Return what is the same at all keyframes; ``extras`` are those that each one carries."""
     sigma = vehicle.depth_sigma
     return Sensors(
         frame,
@@ -30,6 +31,8 @@ def sensors_of_vehicle(vehicle: Vehicle, frame: LocalFrame) -> Sensors:
         vehicle.depth_lever_arm_b,
         vehicle.gnss_lever_arm_b,
         np.inf if sigma is None else sigma,
+        vehicle.mount.R_bd,
+        extras,
     )
 
 

@@ -190,14 +190,13 @@ def _from_reserve(kept: Kept, time_s: float, *, has_velocity: bool) -> InitialMo
     variance = np.trace(doubted.covariance[VELOCITY, VELOCITY])
     if not has_velocity or variance > SPEED_SIGMA**2:
         doubted = doubted.without_velocity(time_s)
-    R_nb, p_n, v_n, bias = (column[0] for column in doubted.states)
-    return InitialMoments(R_nb, p_n, v_n, bias, _regular(doubted.covariance))
+    return doubted.states.moments(_regular(doubted.covariance))
 
 
 def _from_prediction(window: Window, keyframe: Keyframe, what: Doubted) -> InitialMoments:
     predicted, covariance = window.predicted(keyframe)
     P = covariance.copy()
-    R_nb, p_n, v_n, bias = (column[0] for column in predicted)
+    R_nb, p_n, v_n, bias, extra = (column[0] for column in predicted)
     if what is Doubted.VELOCITY_AFTER_SILENCE:
         v_n = slowed(v_n)
         forget(P, VELOCITY, SPEED_SIGMA)
@@ -206,7 +205,7 @@ def _from_prediction(window: Window, keyframe: Keyframe, what: Doubted) -> Initi
         up_b = R_nb[2]
         unsure = np.eye(3) if what is Doubted.POSITION else np.outer(up_b, up_b)
         P[POSITION, POSITION] += POSITION_SIGMA**2 * unsure
-    return InitialMoments(R_nb, p_n, v_n, bias, _regular(P))
+    return InitialMoments(R_nb, p_n, v_n, bias, _regular(P), extra)
 
 
 def _regular(P: Array) -> Array:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ssm_graph.data import Array
 from ssm_graph.problem.error_state import POSITION, VELOCITY
-from ssm_graph.problem.states import NavigationStates
+from ssm_graph.problem.states import AugmentedStates
 from ssm_graph.smoothers.keyframe import Keyframe
 from ssm_graph.smoothers.window import Window
 from ssm_graph.smoothers.window_rows import InertialRows
@@ -36,22 +36,24 @@ class Kept(NamedTuple):
     place_sigma: float
     """m, in the most uncertain direction"""
     R_nb: Array
-    """(1, 3, 3) now, as the next four"""
+    """(1, 3, 3) now, as the next five"""
     p_n: Array
     """(1, 3) m"""
     v_n: Array
     """(1, 3) m/s"""
     bias: Array
     """(1, 6) accelerometer m/s^2, gyro rad/s"""
+    extra: Array
+    """(1, E) extra variables"""
     covariance: Array
-    """(15, 15)"""
+    """(n, n)"""
     trust: Array
     """(4,) what each beam was worth then, 0 to 1"""
 
     @property
-    def states(self) -> NavigationStates:
+    def states(self) -> AugmentedStates:
         """The state (1, ...) now."""
-        return NavigationStates(self.R_nb, self.p_n, self.v_n, self.bias)
+        return AugmentedStates(self.R_nb, self.p_n, self.v_n, self.bias, self.extra)
 
     def led_on(self, keyframe: Keyframe, inertial: InertialRows) -> Kept:
         """Return the answer at the next keyframe."""

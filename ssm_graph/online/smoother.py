@@ -42,7 +42,7 @@ from ssm_graph.online.watch import Watch
 from ssm_graph.problem.aid_errors import not_used
 from ssm_graph.problem.calibration import calibration_extras, taken_as_exact
 from ssm_graph.problem.extras import Extras
-from ssm_graph.problem.problem import ProblemConfig
+from ssm_graph.problem.problem import NO_EXTRAS, ProblemConfig
 from ssm_graph.problem.timeline import MIN_SPACING_S
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
 from ssm_graph.smoothers.keyframe import Keyframe
@@ -164,7 +164,7 @@ class FixedLagSmoother:
             self._events.tell(beginning.time_s, Severity.INFO, "not_aided", note)
         maker = KeyframeMaker(buffers, beginning.frame, self._problem_config)
         first = Keyframe.unmeasured(beginning.time_s, np.zeros(3), None)
-        sensors = sensors_of_vehicle(self.vehicle, beginning.frame)
+        sensors = sensors_of_vehicle(self.vehicle, beginning.frame, NO_EXTRAS)
         window = Window(sensors, self.config, first, beginning.moments)
         window.iterate()
         self._follow(Step(window, Watch(), None, Reserve.of(window)), maker)
@@ -225,7 +225,7 @@ class FixedLagSmoother:
                 if name.startswith("window_")
             }
             maker = KeyframeMaker(intake.buffers, smoother._frame, smoother._problem_config)
-            sensors = sensors_of_vehicle(vehicle, smoother._frame)
+            sensors = sensors_of_vehicle(vehicle, smoother._frame, NO_EXTRAS)
             window = Window.unpack(packed, sensors, smoother.config, maker.way)
             watch, left = unpack_watch(meta["watch"]), unpack_left(arrays)
             step = Step(window, watch, left, unpack_reserve(arrays))
@@ -265,7 +265,7 @@ class FixedLagSmoother:
             newest.states,
             newest.covariance[0],
             noise=self.vehicle.imu_noise,
-            frame=self._frame,
+            sensors=step.window.sensors,
         )
         imu = self._intake.buffers.imu
         tail.add(imu.all[max(imu.index(step.time_s, after=True) - 1, 0) :])

@@ -15,7 +15,7 @@ from ssm_graph.online.buffers import Buffers
 from ssm_graph.online.events import EventLog
 from ssm_graph.problem.alignment import SAFE_HEADING_SIGMA
 from ssm_graph.problem.error_state import InitialMoments, initial_moments
-from ssm_graph.problem.problem import ProblemConfig, build_problem
+from ssm_graph.problem.problem import NO_EXTRAS, ProblemConfig, build_problem
 from ssm_graph.smoothers.fixed_lag import run_fixed_lag
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
 from ssm_graph.smoothers.mission import smooth
@@ -106,9 +106,9 @@ class Starter:
             )
             return None
         problem = build_problem(mission, self._config, start=estimate.start)
+        problem = replace(problem, extras=NO_EXTRAS)
         newest = run_fixed_lag(problem, FixedLagConfig(0.0, tolerance=1e-3)).newest
-        R_nb, p_n, v_n, bias = (column[-1] for column in newest.states)
-        moments = InitialMoments(R_nb, p_n, v_n, bias, newest.covariance[-1])
+        moments = newest.states.take(np.s_[-1:]).moments(newest.covariance[-1])
         self._events.tell(
             now_s, Severity.INFO, "aligned", "; ".join(estimate.notes) or "heading found"
         )

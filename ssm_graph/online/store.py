@@ -16,7 +16,7 @@ from ssm_graph.online.buffers import Buffers
 from ssm_graph.online.course import Step
 from ssm_graph.online.reserve import Reserve
 from ssm_graph.online.watch import Contradicted, Watch
-from ssm_graph.problem.states import NavigationStates
+from ssm_graph.problem.states import AugmentedStates
 from ssm_graph.smoothers.stretch import Stretch
 
 TABLES: Final = ("imu", "pings", "depths", "fixes")
@@ -69,7 +69,7 @@ def unpack_left(arrays: Mapping[str, Array]) -> Stretch | None:
     """Return what had left the window with the step."""
     if "left_time_s" not in arrays:
         return None
-    states = NavigationStates(*(arrays[f"left_states_{n}"] for n in NavigationStates._fields))
+    states = AugmentedStates(*(arrays[f"left_states_{n}"] for n in AugmentedStates._fields))
     others = {n: arrays[f"left_{n}"] for n in Stretch._fields if n != "states"}
     return Stretch(states=states, **others)
 

@@ -8,11 +8,9 @@ import gtsam
 import numpy as np
 
 from ssm_graph.data import Array, ImuNoise
-from ssm_graph.earth import LocalFrame
 from ssm_graph.imu.preintegration import Unseen, gtsam_gravity, imu_params
-from ssm_graph.problem.error_state import STATE_DIM
-from ssm_graph.problem.states import NavigationStates
-from ssm_graph.smoothers.keyframe import Keyframe, Way
+from ssm_graph.problem.states import AugmentedStates
+from ssm_graph.smoothers.keyframe import Keyframe, Sensors, Way
 from ssm_graph.smoothers.window_rows import InertialRows
 
 LONGEST_S = 0.1
@@ -23,10 +21,10 @@ class Newest(NamedTuple):
     """State and covariance at the last inertial sample."""
 
     time_s: float
-    states: NavigationStates
+    states: AugmentedStates
     """(1, ...)"""
     covariance: Array
-    """(15, 15)"""
+    """(n, n)"""
 
 
 class Tail:
@@ -35,13 +33,14 @@ class Tail:
     def __init__(
         self,
         keyframe: Keyframe,
-        states: NavigationStates,
+        states: AugmentedStates,
         covariance: Array,
         *,
         noise: ImuNoise,
-        frame: LocalFrame,
+        sensors: Sensors,
     ) -> None:
-        """Begin at a keyframe with its states (1, ...) and covariance (15, 15)."""
+        """Begin at a keyframe with its states (1, ...) and covariance (n, n)."""
+        frame = sensors.frame
         self._begin_s = self._end_s = keyframe.time_s
         self._states, self._covariance = states, covariance
         self._noise, self._frame = noise, frame
@@ -50,7 +49,7 @@ class Tail:
         bias = gtsam.imuBias.ConstantBias(states.bias[0, :3], states.bias[0, 3:])
         params = imu_params(noise, g_n=gtsam_gravity(frame, states.p_n[0]), frame=frame)
         self._way = Way(gtsam.PreintegratedCombinedMeasurementsG(params, bias), params)
-        self._rows = InertialRows(frame)
+        self._rows = InertialRows(frame, sensors.extras)
 
     def add(self, samples: Array) -> None:
         """Integrate samples (N, 7): end of the interval s, gyro rad/s, specific force m/s^2."""
@@ -94,7 +93,7 @@ class Tail:
         noisy = imu_params(
             self._noise, g_n=np.zeros(3), frame=self._frame, unseen=Unseen(self._gap_s), span_s=span
         )
-        extra = np.zeros((STATE_DIM, STATE_DIM))
+        extra = np.zeros_like(self._covariance)
         gyro = noisy.getGyroscopeCovariance() * span
         accel = noisy.getAccelerometerCovariance() * span
         extra[:3, :3], extra[6:9, 6:9] = gyro, accel

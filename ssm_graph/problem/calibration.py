@@ -35,6 +35,11 @@ CALIBRATIONS: Final = frozenset(
     }
 )
 """Those of the extra variables that tell of the instruments of every estimator."""
+DRIFTS: Final = frozenset({DVL_DRIFT, GNSS_DRIFT})
+"""Those that tell of slow errors."""
+
+SEEN_BY_READINGS: Final = frozenset({DVL_TIME_OFFSET, DVL_LEVER_ARM})
+"""Those that only motion shows, as the IMU reads it about each ping."""
 
 
 def calibration_extras(
@@ -88,7 +93,17 @@ def extras_of(mission: Mission) -> Extras:
 
 def needs_motion(extras: Extras) -> bool:
     """Return whether something is to be estimated that only motion shows, as the IMU reads it."""
-    return DVL_TIME_OFFSET in extras or DVL_LEVER_ARM in extras
+    return any(name in extras for name in SEEN_BY_READINGS)
+
+
+def windowed(extras: Extras) -> Extras:
+    """Return those that a fixed-lag window estimates, as it carries them: in each state.
+
+    Left out are those of the further aids, which it is not aided by, and those that only motion
+    shows: how much of what the IMU reads is motion can only be judged over a whole mission.
+    """
+    kept = (CALIBRATIONS | DRIFTS) - SEEN_BY_READINGS
+    return extras.only(kept).in_the_state()
 
 
 def is_calibration(name: str) -> bool:

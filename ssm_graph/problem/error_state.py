@@ -17,6 +17,9 @@ axes), accelerometer bias 3, gyro bias 3."""
 ROTATION, POSITION, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
 ACCEL_BIAS, GYRO_BIAS = slice(9, 12), slice(12, 15)
 
+NO_EXTRA = np.zeros(0)
+NO_EXTRA.setflags(write=False)
+
 
 class Linearised(Enum):
     """Where the measurements of a keyframe are linearised."""
@@ -33,7 +36,9 @@ class InitialMoments(NamedTuple):
     v_n: Array
     bias: Array
     covariance: Array
-    """(15, 15) in the order of the error state."""
+    """(15 + E, 15 + E) in the order of the error state, then of the extra variables."""
+    extra: Array = NO_EXTRA
+    """(E,) extra variables that are carried in the state."""
 
 
 def initial_moments(start: InitialState, frame: LocalFrame, *, bias_sigma: Array) -> InitialMoments:

@@ -11,14 +11,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from dataclasses import dataclass
-from typing import Self
+from dataclasses import dataclass, replace
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ssm_graph.data import Array, ReadOnlyArrays
-from ssm_graph.problem.error_state import STATE_DIM
+from ssm_graph.problem.error_state import STATE_DIM, InitialMoments
+
+WANDER: Final = 1e-3
+"""Share of its prior sigma that a constant may wander in an hour where it is carried in the state:
+without any, what a window keeps of it would be infinitely stiff."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,6 +106,26 @@ class Extras:
         """Return those of other names."""
         return Extras(tuple(block for block in self.blocks if block.name not in names))
 
+    def in_the_state(self) -> Extras:
+        """Return the same, in the same order, with constants that wander a little: all are walks.
+
+        So can a keyframe carry all of them, and no other one has to be asked.
+        """
+        return Extras(
+            tuple(
+                block
+                if block.is_walk
+                else replace(block, walk_density=WANDER * float(block.sigma[0]) / math.sqrt(3600.0))
+                for block in self.blocks
+            )
+        )
+
+    def behind(self, covariance: Array) -> Array:
+        """Return the covariance (width, width) at the start from that of the error state."""
+        whole = np.diag(np.concatenate([np.zeros(STATE_DIM), self.sigma**2]))
+        whole[:STATE_DIM, :STATE_DIM] = covariance
+        return whole
+
     def columns_of(self, others: Extras) -> NDArray[np.intp]:
         """Return the columns that a row of some of these variables has here."""
         blocks = [np.r_[self.columns(block.name)] for block in others.blocks]
@@ -138,3 +162,11 @@ class Extras:
             factors.append(np.repeat(kept[:, None], len(block.sigma), axis=1))
             sigmas.append(np.repeat(sigma[:, None], len(block.sigma), axis=1))
         return np.hstack(factors), np.hstack(sigmas)
+
+
+def with_extras(start: InitialMoments, extras: Extras) -> InitialMoments:
+    """Return the moments of a keyframe that carries extra variables, each at its prior."""
+    if not extras:
+        return start
+    covariance = extras.behind(start.covariance)
+    return start._replace(covariance=covariance, extra=np.zeros(len(extras.sigma)))

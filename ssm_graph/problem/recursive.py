@@ -30,6 +30,8 @@ class RecursiveBeams(NamedTuple):
     """(N,)"""
     weight: Array
     """(N,) 1 = nominal"""
+    error: Array | None = None
+    """(N,) m/s, predicted minus measured at the final states; None for instruments as stated"""
 
 
 def recursive_estimate(
@@ -48,7 +50,7 @@ def recursive_estimate(
 
     Parameters
     ----------
-    problem : what was estimated.
+    problem : what was estimated; its extra variables are those that were not.
     states, covariance : of its K keyframes; (K, 15, 15).
     beams : of its N beam speeds.
     n_iterations : (K,) of each keyframe.
@@ -57,7 +59,7 @@ def recursive_estimate(
     """
     rows = problem.beams
     status, reason = _settled(n_iterations, max_iterations)
-    error = _beam_errors(problem, states)
+    error = _beam_errors(problem, states) if beams.error is None else beams.error
     doubts = doubts_of_beams(problem, states.v_n, error, beams.weight)
     lost = np.flatnonzero(~_is_finite(states.R_nb, states.p_n, states.v_n, covariance))
     if len(lost):

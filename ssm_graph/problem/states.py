@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from factors import so3
 from ssm_graph.data import Array
-from ssm_graph.problem.error_state import POSITION, ROTATION, VELOCITY
+from ssm_graph.problem.error_state import POSITION, ROTATION, STATE_DIM, VELOCITY, InitialMoments
 
 
 class NavigationStates(NamedTuple):
@@ -55,6 +55,50 @@ class NavigationStates(NamedTuple):
             v_n=self.v_n + step[:, VELOCITY],
             bias=self.bias + step[:, 9:],
         )
+
+
+class AugmentedStates(NamedTuple):
+    """States of K keyframes of one run, each with its own values of the extra variables."""
+
+    R_nb: Array
+    """(K, 3, 3)"""
+    p_n: Array
+    """(K, 3) m"""
+    v_n: Array
+    """(K, 3) m/s"""
+    bias: Array
+    """(K, 6) accelerometer m/s^2, gyro rad/s"""
+    extra: Array
+    """(K, E) zero where they are as stated"""
+
+    @classmethod
+    def of(cls, moments: InitialMoments) -> AugmentedStates:
+        """Return the mean (1, ...) of a keyframe."""
+        mean = (moments.R_nb, moments.p_n, moments.v_n, moments.bias, moments.extra)
+        return cls(*(column[None] for column in mean))
+
+    @property
+    def navigation(self) -> NavigationStates:
+        """The states without the extra variables."""
+        return NavigationStates(self.R_nb, self.p_n, self.v_n, self.bias)
+
+    def moments(self, covariance: Array) -> InitialMoments:
+        """Return the first of these keyframes as mean with its covariance (15 + E, 15 + E)."""
+        R_nb, p_n, v_n, bias, extra = (column[0] for column in self)
+        return InitialMoments(R_nb, p_n, v_n, bias, covariance, extra)
+
+    def moved(self, step: Array) -> AugmentedStates:
+        """Return the states moved by local errors (K, 15 + E), the pose as GTSAM retracts it."""
+        own = self.navigation.moved(step[:, :STATE_DIM])
+        return AugmentedStates(*own, self.extra + step[:, STATE_DIM:])
+
+    def take(self, keyframes: NDArray[np.intp] | slice) -> AugmentedStates:
+        """Return the states of some keyframes."""
+        return AugmentedStates(*(column[keyframes] for column in self))
+
+    def followed_by(self, other: AugmentedStates) -> AugmentedStates:
+        """Return these states, then the others."""
+        return AugmentedStates(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
 
 
 def local_D_deviation(xi: Array) -> Array:

@@ -261,7 +261,13 @@ class SsmSmoother:
             unsettled = [] if status is Status.CONVERGED else [reason]
             status, reason = Status.SUSPECT, "; ".join(doubts + unsettled)
         problem, beams = linearizer.problem, linearizer.problem.beams
-        calibration = calibration_of(problem, last.states, last.step.extras_covariance)
+        calibration = calibration_of(
+            problem.extras,
+            last.states.walks,
+            last.states.constants,
+            last.step.extras_covariance,
+            span_s=float(problem.keyframe_s[-1] - problem.keyframe_s[0]),
+        )
         return Estimate(
             method="smoother",
             kernel=self.config.weighting,

@@ -6,20 +6,26 @@ import numpy as np
 
 from ssm_graph.data import Array
 from ssm_graph.estimate import CalibratedValue, Calibration, Determined
-from ssm_graph.graph.states import States
 from ssm_graph.problem.calibration import is_calibration
 from ssm_graph.problem.error_state import STATE_DIM
-from ssm_graph.problem.problem import Problem
+from ssm_graph.problem.extras import Extras
 
 
-def calibration_of(problem: Problem, states: States, covariance: Array) -> Calibration | None:
-    """Return the calibration of an answer, None if the problem has none.
+def calibration_of(
+    extras: Extras, walks: Array, constants: Array, covariance: Array, *, span_s: float
+) -> Calibration | None:
+    """Return the calibration of an answer, None if it has none.
 
-    ``covariance`` (E, E) is that of the walks at the last keyframe and of the constants.
+    Parameters
+    ----------
+    extras : what was estimated.
+    walks : (K, s) at every keyframe.
+    constants : (C,)
+    covariance : (E, E) of the walks at the last keyframe and of the constants.
+    span_s : from the first keyframe to the last, s.
     """
-    extras = problem.extras
-    found = np.concatenate([states.walks[-1], states.constants])
-    prior = _prior_sigma_at_end(problem)
+    found = np.concatenate([walks[-1], constants])
+    prior = _prior_sigma_at_end(extras, span_s)
     values, kept = [], []
     for block in extras.blocks:
         if not is_calibration(block.name):
@@ -40,8 +46,8 @@ def calibration_of(problem: Problem, states: States, covariance: Array) -> Calib
             )
     if not values:
         return None
-    walks = states.walks[:, [own for own in kept if own < extras.n_walks]]
-    return Calibration(tuple(values), covariance[np.ix_(kept, kept)], walks)
+    kept_walks = walks[:, [own for own in kept if own < extras.n_walks]]
+    return Calibration(tuple(values), covariance[np.ix_(kept, kept)], kept_walks)
 
 
 def undetermined(calibration: Calibration | None) -> tuple[str, ...]:
@@ -56,12 +62,10 @@ def undetermined(calibration: Calibration | None) -> tuple[str, ...]:
     )
 
 
-def _prior_sigma_at_end(problem: Problem) -> Array:
+def _prior_sigma_at_end(extras: Extras, span_s: float) -> Array:
     """Return the prior sigmas (E,); of a walk, what the whole mission makes of it."""
-    extras = problem.extras
     variance = extras.sigma**2
-    span_s = np.atleast_1d(problem.keyframe_s[-1] - problem.keyframe_s[0])
-    factor, sigma = extras.transitions(span_s)
+    factor, sigma = extras.transitions(np.atleast_1d(span_s))
     walks = slice(0, extras.n_walks)
     variance[walks] = factor[0] ** 2 * variance[walks] + sigma[0] ** 2
     return np.asarray(np.sqrt(variance))

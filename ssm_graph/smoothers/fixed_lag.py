@@ -8,6 +8,7 @@ the filter: predict, marginalise the old keyframe, iterate the beams of the new 
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,12 +16,16 @@ import numpy as np
 from ssm_graph.data import Array
 from ssm_graph.estimate import Estimate, OnKeyframe
 from ssm_graph.problem.bottom_track import without_water_track
-from ssm_graph.problem.problem import Problem, start_of
+from ssm_graph.problem.error_state import STATE_DIM
+from ssm_graph.problem.extras import with_extras
+from ssm_graph.problem.problem import Problem, start_of, with_fast_noise
 from ssm_graph.problem.recursive import RecursiveBeams, recursive_estimate
+from ssm_graph.smoothers.calibrated import calibration_of, undetermined
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
-from ssm_graph.smoothers.keyframe import keyframes_of, sensors_of
+from ssm_graph.smoothers.keyframe import beam_speeds, keyframes_of, sensors_of
 from ssm_graph.smoothers.stretch import Stretch, joined
 from ssm_graph.smoothers.window import Window
+from ssm_graph.smoothers.window_rows import beam_rows
 
 __all__ = ["FixedLagConfig", "FixedLagEstimates", "FixedLagRun", "run_fixed_lag", "solve_fixed_lag"]
 
@@ -72,9 +77,10 @@ def run_fixed_lag(
     problem: Problem, config: FixedLagConfig, *, on_keyframe: OnKeyframe | None = None
 ) -> FixedLagRun:
     """Go through the keyframes one by one, with pings off the ground alone."""
-    problem = without_water_track(problem)
+    problem = with_fast_noise(without_water_track(problem))
     first, *others = keyframes_of(problem)
-    window = Window(sensors_of(problem), config, first, start_of(problem))
+    sensors = sensors_of(problem)
+    window = Window(sensors, config, first, with_extras(start_of(problem), sensors.extras))
     newest, delayed, n_iterations = [], [], []
     for number, keyframe in enumerate((first, *others), start=1):
         if number > 1:
@@ -95,15 +101,33 @@ def _estimate(
     wall_s: float,
     name: str,
 ) -> Estimate:
-    innovation = track.innovation if name == "newest" else None
-    return recursive_estimate(
-        problem,
+    sensors, extras = sensors_of(problem), problem.extras
+    error = beam_rows(
+        sensors, beam_speeds(problem.beams), track.states.take(problem.beams.keyframe)
+    ).error
+    calibration = calibration_of(
+        sensors.extras,
+        track.states.extra,
+        np.zeros(0),
+        track.covariance[-1, STATE_DIM:, STATE_DIM:],
+        span_s=float(problem.keyframe_s[-1] - problem.keyframe_s[0]),
+    )
+    estimate = recursive_estimate(
+        replace(problem, extras=extras.without([block.name for block in sensors.extras.blocks])),
         track.states,
-        track.covariance,
-        RecursiveBeams(innovation, track.mahalanobis_sq, track.weight),
+        track.covariance[:, :STATE_DIM, :STATE_DIM],
+        RecursiveBeams(
+            track.innovation if name == "newest" else None,
+            track.mahalanobis_sq,
+            track.weight,
+            error,
+        ),
         n_iterations,
         max_iterations=config.max_iterations,
         method=f"fixed lag {config.lag_s:g} s, {name} states",
         kernel=str(config.kernel),
         wall_s=wall_s,
+    )
+    return replace(
+        estimate, calibration=calibration, notes=estimate.notes + undetermined(calibration)
     )

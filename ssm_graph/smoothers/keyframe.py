@@ -12,7 +12,9 @@ import numpy as np
 from ssm_graph.data import Array
 from ssm_graph.earth import LocalFrame
 from ssm_graph.imu.preintegration import Preintegrated
-from ssm_graph.problem.problem import Problem
+from ssm_graph.problem.calibration import windowed
+from ssm_graph.problem.extras import Extras
+from ssm_graph.problem.problem import Beams, Problem
 from ssm_graph.problem.timeline import Indices
 
 
@@ -26,6 +28,15 @@ class Sensors(NamedTuple):
     gnss_arm_b: Array
     depth_sigma: float
     """m"""
+    R_bd: Array
+    """(3, 3) mounting, instrument to body"""
+    extras: Extras
+    """What each keyframe carries beside the error state; all of them walk"""
+
+    @property
+    def state_dim(self) -> int:
+        """Components of a keyframe's state, n."""
+        return self.extras.width
 
 
 class BeamSpeeds(NamedTuple):
@@ -70,7 +81,7 @@ class Keyframe:
 
     time_s: float
     gyro_b: Array
-    """(3,) rad/s at the keyframe: it moves the depth sensor's lever arm"""
+    """(3,) rad/s at the keyframe: it moves the lever arms of depth sensor and antenna"""
     beams: BeamSpeeds
     depth_s: Array
     """(D,) s, readings since the keyframe before"""
@@ -114,6 +125,8 @@ def sensors_of(problem: Problem) -> Sensors:
         np.zeros(3) if depths is None else depths.lever_arm_b,
         np.zeros(3) if fixes is None else fixes.lever_arm_b,
         np.inf if depths is None else depths.sigma,
+        problem.beams.R_bd,
+        windowed(problem.extras),
     )
 
 
@@ -123,24 +136,34 @@ def keyframes_of(problem: Problem) -> Iterator[Keyframe]:
     none = np.zeros(0)
     for k, time_s in enumerate(problem.keyframe_s.tolist()):
         b = _rows_of(k, beams.keyframe)
-        d = slice(0) if depths is None else _rows_of(k, depths.keyframe)
-        f = slice(0) if fixes is None else _rows_of(k, fixes.keyframe)
+        d = slice(0, 0) if depths is None else _rows_of(k, depths.keyframe)
+        f = slice(0, 0) if fixes is None else _rows_of(k, fixes.keyframe)
+        gyro_b = np.zeros(3)
+        if depths is not None:
+            gyro_b = depths.gyro_b[k]
+        elif fixes is not None and f.stop > f.start:
+            gyro_b = fixes.gyro_b[f.start]
         yield Keyframe(
             time_s=time_s,
-            gyro_b=np.zeros(3) if depths is None else depths.gyro_b[k],
-            beams=BeamSpeeds(
-                beams.beam[b].astype(float),
-                beams.speed[b],
-                beams.sigma[b],
-                beams.gyro_b[b],
-                beams.beam_b[b],
-            ),
+            gyro_b=gyro_b,
+            beams=beam_speeds(beams, b),
             depth_s=none if depths is None else depths.time_s[d],
             depth=none if depths is None else depths.depth[d],
             fix_n=np.zeros((0, 3)) if fixes is None else fixes.position_n[f],
             fix_cov_n=np.zeros((0, 3, 3)) if fixes is None else fixes.covariance_n[f],
             way=Way(chain.measurements[k - 1], chain.params[k - 1]) if k else None,
         )
+
+
+def beam_speeds(beams: Beams, rows: slice = np.s_[:]) -> BeamSpeeds:
+    """Return some of a problem's beam speeds."""
+    return BeamSpeeds(
+        beams.beam[rows].astype(float),
+        beams.speed[rows],
+        beams.sigma[rows],
+        beams.gyro_b[rows],
+        beams.beam_b[rows],
+    )
 
 
 def _rows_of(k: int, keyframe: Indices) -> slice:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ssm_graph.data import Array
-from ssm_graph.problem.states import NavigationStates
+from ssm_graph.problem.states import AugmentedStates
 
 
 class Stretch(NamedTuple):
@@ -16,10 +16,10 @@ class Stretch(NamedTuple):
 
     time_s: Array
     """(K,) s"""
-    states: NavigationStates
+    states: AugmentedStates
     """(K, ...)"""
     covariance: Array
-    """(K, 15, 15)"""
+    """(K, n, n)"""
     n_beams: Array
     """(K,)"""
     beam: Array
@@ -37,6 +37,6 @@ def joined(stretches: Sequence[Stretch]) -> Stretch:
     time_s, states, *others = zip(*stretches, strict=True)
     return Stretch(
         np.concatenate(time_s),
-        NavigationStates(*(np.concatenate(column) for column in zip(*states, strict=True))),
+        AugmentedStates(*(np.concatenate(column) for column in zip(*states, strict=True))),
         *(np.concatenate(column) for column in others),
     )

@@ -13,21 +13,16 @@ from ssm_graph.data import N_BEAMS, Array
 from ssm_graph.errors import SolverError
 from ssm_graph.graph.beam_weights import met_weights, updated_trust
 from ssm_graph.graph.marginal_prior import moved_chart
-from ssm_graph.problem.error_state import STATE_DIM, InitialMoments, Linearised
-from ssm_graph.problem.states import NavigationStates
+from ssm_graph.problem.error_state import InitialMoments, Linearised
+from ssm_graph.problem.states import AugmentedStates
 from ssm_graph.problem.timeline import MIN_SPACING_S
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors, Way
 from ssm_graph.smoothers.mixing import Mixing
 from ssm_graph.smoothers.stretch import Stretch
 from ssm_graph.smoothers.window_graph import WindowGraph
-from ssm_graph.smoothers.window_rows import SEEN_BY_BEAMS
 
 _PACKED = ("step", "covariance", "innovation", "weights", "t", "trust")
-_BENDING = np.repeat([1.0, 0.1], [3, 12])
-"""How much a component of the error state bends the measurements."""
-_AS_MUCH = np.repeat([1.0, 1e4, 1e2, 1e6], [3, 3, 3, 6])
-"""Metres, metres per second and biases that bend the measurements as much as a turn of 1 rad."""
 RUNAWAY_SPEED = 100.0
 """m/s"""
 ROUNDING = 1e-7
@@ -35,7 +30,7 @@ ROUNDING = 1e-7
 
 
 def _largest(step: Array, covariance: Array) -> float:
-    """Return the largest component of a step (K, 15) in its posterior sigmas."""
+    """Return the largest component of a step (K, n) in its posterior sigmas."""
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     return float(np.max(np.abs(step) / sigma))
 
@@ -56,8 +51,8 @@ class Window:
         self.config = config
         self._trust = np.ones(N_BEAMS) if trust is None else trust
         self._graph = WindowGraph(sensors, first, start)
-        self._step = np.zeros((1, STATE_DIM))
-        """(K, 15) off where each keyframe is linearised"""
+        self._step = np.zeros((1, sensors.state_dim))
+        """(K, n) off where each keyframe is linearised"""
         self._covariance = start.covariance[None]
         self._innovation = -self._graph.error
         self._weights, self._t = np.ones(len(self._innovation)), np.zeros(len(self._innovation))
@@ -108,7 +103,7 @@ class Window:
         return self._trust
 
     @property
-    def states(self) -> NavigationStates:
+    def states(self) -> AugmentedStates:
         """The estimate of all keyframes."""
         return self._graph.at.moved(self._step)
 
@@ -119,7 +114,7 @@ class Window:
 
     @property
     def newest_sigma(self) -> Array:
-        """Standard deviations (15,) of the newest keyframe."""
+        """Standard deviations (n,) of the newest keyframe."""
         return np.asarray(np.sqrt(np.diagonal(self._covariance[-1])))
 
     @property
@@ -161,11 +156,11 @@ class Window:
             self.meet_prediction()
         return left
 
-    def _append(self, keyframe: Keyframe, last: NavigationStates) -> None:
+    def _append(self, keyframe: Keyframe, last: AugmentedStates) -> None:
         graph, n_rows = self._graph, len(self._weights)
         graph.append(keyframe, last)
         n_new = len(graph.error) - n_rows
-        self._step = np.concatenate([self._step, np.zeros((1, STATE_DIM))])
+        self._step = np.concatenate([self._step, np.zeros((1, graph.state_dim))])
         self._covariance = np.concatenate([self._covariance, self._covariance[-1:]])
         self._innovation = np.append(self._innovation, -graph.error[n_rows:])
         self._weights = np.append(self._weights, np.ones(n_new))
@@ -203,7 +198,7 @@ class Window:
         self._weights = np.concatenate([self._weights[:row], weights])
         graph.changed_from(len(self.keyframes) - 1)
 
-    def predicted(self, keyframe: Keyframe) -> tuple[NavigationStates, Array]:
+    def predicted(self, keyframe: Keyframe) -> tuple[AugmentedStates, Array]:
         """Return where the inertial data lead from the newest keyframe, with the covariance."""
         last, inertial = self.states.take(np.s_[-1:]), self._graph.inertial
         there = inertial.predict(keyframe, last)
@@ -258,7 +253,7 @@ class Window:
         return number
 
     def _solve(self) -> Array:
-        """Solve with the present weights and return by how much that moves (K, 15)."""
+        """Solve with the present weights and return by how much that moves (K, n)."""
         self._graph.eliminate(self._weights)
         step, self._covariance = self._graph.chain.solve()
         update, self._step = step - self._step, step
@@ -271,7 +266,9 @@ class Window:
         step = np.abs(self._step)
         threshold = 0.0 if is_single else config.relinearise_sigmas
         least = 0.0 if is_single else config.relinearise_turn
-        moved = ((step * _BENDING > threshold * sigma) & (step > least * _AS_MUCH)).any(axis=1)
+        bends = self._graph.bends
+        is_far = (step * bends.share > threshold * sigma) & (step > least * bends.as_a_turn)
+        moved = np.asarray(is_far.any(axis=1))
         if config.first_estimates and not is_single:
             moved[0] = False
         if moved.any():
@@ -294,10 +291,11 @@ class Window:
     def _mahalanobis_sq(self) -> Array:
         graph = self._graph
         keyframe = np.repeat(np.arange(len(self.keyframes)), np.diff(graph.first_row))
-        H = graph.jacobian[:, SEEN_BY_BEAMS]
-        error = graph.error + (H * self._step[:, SEEN_BY_BEAMS][keyframe]).sum(axis=1)
+        seen = graph.seen_by_beams
+        H = graph.jacobian[:, seen]
+        error = graph.error + (H * self._step[:, seen][keyframe]).sum(axis=1)
         spread = np.zeros(len(H))
         if self.config.similarity is Similarity.EXPECTED:
-            covariance = self._covariance[:, SEEN_BY_BEAMS[:, None], SEEN_BY_BEAMS]
+            covariance = self._covariance[:, seen[:, None], seen]
             spread = ((H[:, None, :] @ covariance[keyframe])[:, 0] * H).sum(axis=1)
         return expected_mahalanobis_sq(error, spread, sigma=graph.beams.sigma)

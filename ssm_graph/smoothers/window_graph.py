@@ -10,20 +10,22 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from ssm_graph.data import Array
-from ssm_graph.graph.marginal_prior import MarginalPrior, prior_at_start, prior_on_last
-from ssm_graph.problem.error_state import STATE_DIM, InitialMoments
-from ssm_graph.problem.states import NavigationStates
+from ssm_graph.graph.marginal_prior import MarginalPrior, prior_at_start, prior_on
+from ssm_graph.problem.error_state import InitialMoments
+from ssm_graph.problem.states import AugmentedStates
+from ssm_graph.smoothers.bends import bends_of
 from ssm_graph.smoothers.chain import Chain
 from ssm_graph.smoothers.keyframe import BeamSpeeds, Keyframe, Sensors, Way
 from ssm_graph.smoothers.keyframe_arrays import pack_keyframes, unpack_keyframes
 from ssm_graph.smoothers.window_rows import (
-    NO_ROWS,
     DepthTargets,
     InertialRows,
     beam_rows,
     depth_rows,
     depth_targets,
     fix_rows,
+    no_rows,
+    seen_by_beams,
     speed_rows,
 )
 
@@ -37,13 +39,14 @@ class WindowGraph:
     def __init__(self, sensors: Sensors, first: Keyframe, start: InitialMoments) -> None:
         self.sensors = sensors
         self.keyframes: list[Keyframe] = []
-        self.at = NavigationStates(*(column[None] for column in start[:4]))
+        self.at = AugmentedStates.of(start)
         """Where each keyframe is linearised"""
         self.beams = BeamSpeeds.none()
-        self.error, self.jacobian = np.zeros(0), np.zeros((0, STATE_DIM))
-        """Of the beams, (M,) in m/s and (M, 15)"""
-        self.inertial = InertialRows(sensors.frame)
-        self.chain = Chain()
+        self.state_dim = n = sensors.state_dim
+        self.error, self.jacobian = np.zeros(0), np.zeros((0, n))
+        """Of the beams, (M,) in m/s and (M, n)"""
+        self.inertial = InertialRows(sensors.frame, sensors.extras)
+        self.chain = Chain(dim=n)
         self.prior: MarginalPrior = prior_at_start(start)
         self._depths: list[Array] = []
         self._fixes: list[Array] = []
@@ -53,6 +56,7 @@ class WindowGraph:
         self._stale = 0
         self.first_row = np.zeros(1, np.intp)
         """(K + 1,) where the beams of each keyframe begin, and where they end"""
+        self.bends, self.seen_by_beams = bends_of(sensors.extras), seen_by_beams(sensors)
         self._measure(first)
 
     def successor(self) -> Self:
@@ -60,18 +64,19 @@ class WindowGraph:
         twin = copy.copy(self)
         for name in ("keyframes", "_depths", "_fixes", "_speeds", "_between"):
             setattr(twin, name, getattr(self, name).copy())
-        self.chain, self._stale = Chain(self.chain.root), 0
+        self.chain, self._stale = self.chain.successor(), 0
         return twin
 
     def pack(self) -> dict[str, Array]:
         """Return all that :meth:`unpack` needs to go on from here, as plain arrays."""
+        n = self.state_dim
         return {
             **{f"at_{name}": column for name, column in self.at._asdict().items()},
             **{f"prior_{name}": column for name, column in self.prior._asdict().items()},
             **{f"target_{name}": column for name, column in self._targets._asdict().items()},
             **pack_keyframes(self.keyframes),
             "root": self.chain.root,
-            "between": np.array(self._between).reshape(-1, STATE_DIM, 2 * STATE_DIM + 1),
+            "between": np.array(self._between).reshape(-1, n, 2 * n + 1),
         }
 
     @classmethod
@@ -80,10 +85,8 @@ class WindowGraph:
     ) -> Self:
         """Return the graph that was packed; ``way`` gives the inertial data between two times."""
         keyframes = unpack_keyframes(arrays, way)
-        at = NavigationStates(*(arrays[f"at_{name}"] for name in NavigationStates._fields))
-        R_nb, p_n, v_n, bias = (column[0] for column in at)
-        start = InitialMoments(R_nb, p_n, v_n, bias, np.eye(STATE_DIM))
-        graph = cls(sensors, keyframes[0], start)
+        at = AugmentedStates(*(arrays[f"at_{name}"] for name in AugmentedStates._fields))
+        graph = cls(sensors, keyframes[0], at.moments(np.eye(sensors.state_dim)))
         graph.keyframes, graph.at = keyframes, at
         graph.prior = MarginalPrior(*(arrays[f"prior_{n}"] for n in MarginalPrior._fields))
         graph._targets = DepthTargets(*(arrays[f"target_{n}"] for n in DepthTargets._fields))
@@ -92,9 +95,9 @@ class WindowGraph:
         counts = [len(keyframe.beams.speed) for keyframe in keyframes]
         graph.first_row = np.append(0, np.cumsum(counts, dtype=np.intp))
         graph._between = list(arrays["between"])
-        graph.chain = Chain(arrays["root"])
+        graph.chain = Chain(arrays["root"], dim=sensors.state_dim)
         graph.error = np.zeros(graph.first_row[-1])
-        graph.jacobian = np.zeros((len(graph.error), STATE_DIM))
+        graph.jacobian = np.zeros((len(graph.error), sensors.state_dim))
         graph._depths, graph._fixes, graph._speeds = [], [], []
         graph._measure_again(0, len(keyframes))
         return graph
@@ -103,7 +106,7 @@ class WindowGraph:
         """Have the chain eliminated again from a keyframe on."""
         self._stale = min(self._stale, keyframe)
 
-    def append(self, keyframe: Keyframe, last: NavigationStates) -> None:
+    def append(self, keyframe: Keyframe, last: AugmentedStates) -> None:
         """Add a keyframe where the inertial data lead from ``last`` (1, ...), the newest one."""
         predicted = self.inertial.predict(keyframe, last)
         self.at = self.at.followed_by(predicted)
@@ -128,27 +131,27 @@ class WindowGraph:
         self.jacobian = np.concatenate([self.jacobian, jacobian])
         self._depths += depth_rows(self.sensors, [keyframe], at, self._targets.take(np.s_[-1:]))
         self._fixes += fix_rows(self.sensors, [keyframe], at)
-        self._speeds += speed_rows([keyframe], at)
+        self._speeds += speed_rows(self.sensors, [keyframe], at)
 
-    def keep_posterior(self, last: NavigationStates) -> None:
+    def keep_posterior(self, last: AugmentedStates) -> None:
         """Keep of all keyframes the newest, with what was found there as its prior."""
-        self.prior = prior_on_last(last, self.chain.root, step=np.zeros(STATE_DIM))
+        self.prior = prior_on(last, self.chain.root, offset=np.zeros(self.state_dim))
         end = self.keyframes[-1]
         self.drop(len(self.keyframes) - 1)
         self._drop_rows(len(self.error))
         self.first_row = np.zeros(2, np.intp)
         self.at = last
         self.keyframes = [Keyframe.unmeasured(end.time_s, end.gyro_b, end.way)]
-        self._depths, self._fixes, self._speeds = [NO_ROWS], [NO_ROWS], [NO_ROWS]
+        none = no_rows(self.sensors)
+        self._depths, self._fixes, self._speeds = [none], [none], [none]
         self._stale = 0
 
     def marginalise(self, count: int, weights: Array) -> None:
         """Leave of the first keyframes a prior on the next, made where they are linearised."""
         self.eliminate(weights)
         carried = self.chain.carried[count]
-        R_nb, p_n, v_n, bias = (column[count] for column in self.at)
-        root, offset = carried[:, :STATE_DIM], carried[:, STATE_DIM]
-        self.prior = MarginalPrior(R_nb, p_n, v_n, bias, root, offset)
+        at = self.at.take(np.s_[count : count + 1])
+        self.prior = prior_on(at, carried[:, :-1], offset=carried[:, -1])
         self.drop(count)
 
     def drop(self, count: int) -> None:
@@ -181,37 +184,38 @@ class WindowGraph:
                 zip(self._depths[begin:], self._fixes[begin:], self._speeds[begin:], strict=True)
             )
         ]
-        carried = self.prior.rows(self.at) if begin == 0 else self.chain.carried[begin]
+        if begin == 0:
+            carried = self.prior.rows(self.at, self.at.extra[0])
+        else:
+            carried = self.chain.carried[begin]
         self.chain.eliminate(carried, own, self._between[begin:], begin=begin)
         self._stale = len(self.keyframes)
 
     def prediction(self, weights: Array) -> tuple[Array, Array]:
         """Return what all before it say of the newest keyframe: step, and root of its covariance.
 
-        The covariance is ``root @ root.T``, both (15, 15); the step (15,) is off ``at``.
+        The covariance is ``root @ root.T``, both (n, n); the step (n,) is off ``at``.
         """
         self.eliminate(weights)
         carried = self.chain.carried[-1]
-        identity = np.eye(STATE_DIM)
-        solved = solve_triangular(
-            carried[:, :STATE_DIM], np.column_stack([identity, carried[:, STATE_DIM]])
-        )
-        return solved[:, STATE_DIM], solved[:, :STATE_DIM]
+        identity = np.eye(self.state_dim)
+        solved = solve_triangular(carried[:, :-1], np.column_stack([identity, carried[:, -1]]))
+        return solved[:, -1], solved[:, :-1]
 
     def leave_out_far(self, step: Array, root_cov: Array, *, sigmas: float) -> None:
         """Leave out depth and GNSS of the newest keyframe that are far from its prediction."""
         k = len(self.keyframes) - 1
         for name, aids in (("depth", self._depths), ("fix", self._fixes)):
-            A, b = aids[k][:, :STATE_DIM], aids[k][:, STATE_DIM]
+            A, b = aids[k][:, :-1], aids[k][:, -1]
             root, left = A @ root_cov, b - A @ step
             distance_sq = left @ np.linalg.solve(root @ root.T + np.eye(len(b)), left)
             if distance_sq > sigmas**2 * len(b):
                 self.keyframes[k] = self.keyframes[k].without(name)
-                aids[k] = NO_ROWS
+                aids[k] = no_rows(self.sensors)
                 self.changed_from(k)
 
     def linearise(self, begin: int, end: int, step: Array) -> None:
-        """Move successive keyframes by ``step`` (end - begin, 15) and linearise there."""
+        """Move successive keyframes by ``step`` (end - begin, n) and linearise there."""
         moved = self.at.take(np.s_[begin:end]).moved(step)
         head, tail = self.at.take(np.s_[:begin]), self.at.take(np.s_[end:])
         self.at = head.followed_by(moved).followed_by(tail)
@@ -243,4 +247,4 @@ class WindowGraph:
         keyframes, at = self.keyframes[here], self.at.take(here)
         self._depths[here] = depth_rows(self.sensors, keyframes, at, self._targets.take(here))
         self._fixes[here] = fix_rows(self.sensors, keyframes, at)
-        self._speeds[here] = speed_rows(keyframes, at)
+        self._speeds[here] = speed_rows(self.sensors, keyframes, at)

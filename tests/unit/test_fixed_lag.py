@@ -139,7 +139,10 @@ def test_a_successor_goes_its_own_way() -> None:
             np.testing.assert_array_equal(window.all.states.p_n, before.states.p_n)
             np.testing.assert_array_equal(window.all.weight, before.weight)
     sigma = np.sqrt(np.diagonal(ends[0].covariance[0]))
-    assert np.max(np.abs(ends[0].states.deviation_of(ends[1].states)) / sigma) < 1e-6
+    assert (
+        np.max(np.abs(ends[0].states.navigation.deviation_of(ends[1].states.navigation)) / sigma)
+        < 1e-6
+    )
 
 
 def test_another_dvl_log_of_the_same_run() -> None:

@@ -39,7 +39,7 @@ def test_the_older_answer_is_old_enough_to_be_sound() -> None:
     assert smoother._course is not None
     newest = smoother._course.newest.window.newest
     assert newest.time_s[-1] - older.since_s >= RENEW_S
-    off = newest.states.deviation_of(older.states)[0]
+    off = newest.states.navigation.deviation_of(older.states.navigation)[0]
     sigma = np.sqrt(np.diag(older.covariance))
     assert np.all(np.abs(off[:9]) < 5.0 * sigma[:9])
     assert np.all(sigma[VELOCITY] > np.sqrt(np.diag(newest.covariance[-1]))[VELOCITY])
