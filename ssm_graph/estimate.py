@@ -188,7 +188,8 @@ class Calibration:
     covariance: Array
     """(E, E) of the values, SI."""
     walks: Array
-    """(K, s) at every keyframe, SI: those of the values that walk, which come first."""
+    """(K, s) at every keyframe, SI: those of the values that walk, which come first; in a window
+    each of them does."""
 
     def of(self, variable: str) -> Array:
         """Return the components of a variable, SI; empty where it was not asked for."""

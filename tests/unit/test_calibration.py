@@ -102,8 +102,8 @@ def test_a_prior_that_is_contradicted_is_said() -> None:
     assert "dvl_scale" in estimate.reason
 
 
-def test_filters_and_fixed_lag_say_that_they_do_not_calibrate() -> None:
-    """They take everything as stated; the note names what is asked for."""
+def test_filters_and_fixed_lag_say_what_they_do_not_calibrate() -> None:
+    """Filters take everything as stated, fixed lag what only motion shows; a note names it."""
     sim = miscalibrated(duration_s=6.0, grade=Grade.NAVIGATION)
     asked, stated = (build_problem(change(sim.mission)) for change in (asking, as_stated))
     for problem, n_notes in ((asked, 1), (stated, 0)):
@@ -112,8 +112,11 @@ def test_filters_and_fixed_lag_say_that_they_do_not_calibrate() -> None:
         for estimate in (filtered, lagged):
             notes = [note for note in estimate.notes if "calibrate" in note]
             assert len(notes) == n_notes
-            assert all("dvl_mounting" in note and "gnss_time_offset" in note for note in notes)
-            assert estimate.calibration is None
+            assert all("dvl_time_offset" in note for note in notes)
+        assert all("dvl_mounting" in note for note in filtered.notes if "calibrate" in note)
+        assert not any("dvl_mounting" in note for note in lagged.notes if "calibrate" in note)
+        assert filtered.calibration is None
+        assert (lagged.calibration is None) == (problem is stated)
 
 
 def test_the_live_estimator_says_so_too_and_takes_known_offsets_off() -> None:
