@@ -25,7 +25,8 @@ from ssm_graph.problem.problem import NO_EXTRAS, ProblemConfig, build_problem, s
 from ssm_graph.problem.states import AugmentedStates
 from ssm_graph.problem.trajectory import trajectory_at
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors
-from ssm_graph.smoothers.window_rows import InertialRows, depth_targets
+from ssm_graph.smoothers.window_inertial import InertialRows
+from ssm_graph.smoothers.window_rows import depth_targets
 
 CAUCHY_K = 2.3849
 """The usual constant: 95 % efficiency without outliers."""

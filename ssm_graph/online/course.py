@@ -26,7 +26,7 @@ from ssm_graph.problem.error_state import VELOCITY
 from ssm_graph.smoothers.keyframe import Keyframe
 from ssm_graph.smoothers.stretch import Stretch, joined
 from ssm_graph.smoothers.window import Window
-from ssm_graph.smoothers.window_rows import InertialRows
+from ssm_graph.smoothers.window_inertial import InertialRows
 
 REACH_S: Final = 0.1
 """A late inertial sample changes keyframes that are so much older: a ping's gyro reading is a mean,

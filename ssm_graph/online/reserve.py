@@ -16,7 +16,7 @@ from ssm_graph.problem.error_state import POSITION, VELOCITY
 from ssm_graph.problem.states import AugmentedStates
 from ssm_graph.smoothers.keyframe import Keyframe
 from ssm_graph.smoothers.window import Window
-from ssm_graph.smoothers.window_rows import InertialRows
+from ssm_graph.smoothers.window_inertial import InertialRows
 
 RENEW_S: Final = 15.0
 """While all is sound a new answer goes into reserve so often."""

@@ -11,7 +11,7 @@ from ssm_graph.data import Array, ImuNoise
 from ssm_graph.imu.preintegration import Unseen, gtsam_gravity, imu_params
 from ssm_graph.problem.states import AugmentedStates
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors, Way
-from ssm_graph.smoothers.window_rows import InertialRows
+from ssm_graph.smoothers.window_inertial import InertialRows
 
 LONGEST_S = 0.1
 """A longer step from sample to sample is a gap of the inertial data."""

@@ -17,9 +17,9 @@ from ssm_graph.smoothers.bends import bends_of
 from ssm_graph.smoothers.chain import Chain
 from ssm_graph.smoothers.keyframe import BeamSpeeds, Keyframe, Sensors, Way
 from ssm_graph.smoothers.keyframe_arrays import pack_keyframes, unpack_keyframes
+from ssm_graph.smoothers.window_inertial import InertialRows
 from ssm_graph.smoothers.window_rows import (
     DepthTargets,
-    InertialRows,
     beam_rows,
     depth_rows,
     depth_targets,
