@@ -277,6 +277,8 @@ class Reference(FrozenArrays):
     """(N, 3) m/s, or NaN"""
     roll_pitch_heading: Array = shaped("N", 3)
     """(N, 3) rad, or NaN"""
+    position_sigma_enu: Array | None = optional_shaped("N", 3)
+    """(N, 3) m, of the reference itself; None where it counts as exact."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

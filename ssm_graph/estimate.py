@@ -141,7 +141,7 @@ class CurrentTrack(FrozenArrays):
 
 
 class Determined(Enum):
-    """How well the data determined a calibration; the text is shown to the user."""
+    """How well the data determined a calibration; the text says what that means."""
 
     GREEN = "by the data"
     AMBER = "in part"

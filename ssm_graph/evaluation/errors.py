@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ssm_graph.data import Array, FrozenArrays, Reference, shaped
 from ssm_graph.earth import LocalFrame
@@ -35,13 +36,23 @@ class ErrorSeries(FrozenArrays):
     """(N, 3) m/s, posterior"""
     attitude_sigma: Array = shaped("N", 3)
     """(N, 3) rad, posterior, of roll, pitch and heading"""
+    reference_sigma_enu: Array = shaped("N", 3)
+    """(N, 3) m, of the reference's positions; zero where it counts as exact"""
     nees_position: Array = shaped("N")
-    """(N,) e^T P^-1 e of position with its full covariance; 3 is expected; NaN without one."""
+    """(N,) e^T P^-1 e of position with its full covariance and that of the reference; 3 is
+    expected; NaN without one."""
 
     @property
     def horizontal(self) -> Array:
         """(N,) length of the horizontal position error, m."""
         return np.asarray(np.hypot(self.position_enu[:, 0], self.position_enu[:, 1]))
+
+    @property
+    def inside_3_sigma(self) -> Array:
+        """(N, 3) 1 where a position is within 3 sigma of both, else 0; NaN without a sigma."""
+        sigma = np.hypot(self.position_sigma_enu, self.reference_sigma_enu)
+        inside = np.abs(self.position_enu) <= 3.0 * sigma
+        return np.where(np.isfinite(sigma), inside, np.nan)
 
 
 def error_series(trajectory: Trajectory, reference: Reference) -> ErrorSeries:
@@ -56,7 +67,8 @@ def error_series(trajectory: Trajectory, reference: Reference) -> ErrorSeries:
         The two have no time in common.
     """
     time_s = trajectory.time_s
-    known = np.isfinite(np.stack([reference.lat, reference.lon, reference.height])).all(axis=0)
+    places = np.stack([reference.lat, reference.lon, reference.height])
+    known = np.asarray(np.isfinite(places).all(axis=0))
     if not np.any(known):
         raise DataError("reference: it holds no position at all")
     first = int(np.argmax(known))
@@ -77,6 +89,7 @@ def error_series(trajectory: Trajectory, reference: Reference) -> ErrorSeries:
     position_enu[:, 2] = trajectory.height[kept] - height
     velocity, angles = _at(time_s, reference)
     cov = trajectory.position_cov_enu[kept]
+    reference_sigma = _sigma_at(time_s[kept], reference, known)
     return ErrorSeries(
         time_s=time_s[kept],
         position_enu=position_enu,
@@ -85,7 +98,10 @@ def error_series(trajectory: Trajectory, reference: Reference) -> ErrorSeries:
         position_sigma_enu=np.sqrt(np.maximum(np.diagonal(cov, axis1=1, axis2=2), 0.0)),
         velocity_sigma_enu=trajectory.velocity_sigma_enu[kept],
         attitude_sigma=trajectory.attitude_sigma[kept],
-        nees_position=normalized_error_squared(position_enu, cov),
+        reference_sigma_enu=reference_sigma,
+        nees_position=normalized_error_squared(
+            position_enu, cov + reference_sigma[:, :, None] ** 2 * np.eye(3)
+        ),
     )
 
 
@@ -101,6 +117,14 @@ def normalized_error_squared(error: Array, cov: Array) -> Array:
     weighted = np.linalg.solve(cov[index], error[index][..., None])[..., 0]
     result[index] = np.sum(error[index] * weighted, axis=1)
     return result
+
+
+def _sigma_at(time_s: Array, reference: Reference, known: NDArray[np.bool_]) -> Array:
+    """Return sigmas (M, 3) of a reference's positions, between those that are ``known``."""
+    if reference.position_sigma_enu is None:
+        return np.zeros((len(time_s), 3))
+    columns = reference.position_sigma_enu[known].T
+    return np.column_stack([np.interp(time_s, reference.time_s[known], x) for x in columns])
 
 
 def _at(time_s: Array, reference: Reference) -> tuple[Array, Array]:

@@ -59,8 +59,6 @@ def evaluate(trajectory: Trajectory, reference: Reference) -> Metrics:
     first_s, last_s = float(errors.time_s[0]), float(errors.time_s[-1])
     length = path_length_m(trajectory, first_s=first_s, last_s=last_s)
     end_error = float(errors.horizontal[-1])
-    inside = np.abs(errors.position_enu) <= 3.0 * errors.position_sigma_enu
-    inside_share = np.where(np.isfinite(errors.position_sigma_enu), inside, np.nan)
     return Metrics(
         n_epochs=len(errors.time_s),
         first_s=first_s,
@@ -74,7 +72,7 @@ def evaluate(trajectory: Trajectory, reference: Reference) -> Metrics:
         rmse_velocity_m_per_s=_rms(np.linalg.norm(errors.velocity_enu, axis=1)),
         rmse_attitude=_per_axis(np.sqrt([_mean(x**2) for x in errors.roll_pitch_heading.T])),
         nees_position=_mean(errors.nees_position) / 3.0,
-        inside_3_sigma=_per_axis(np.array([_mean(x) for x in inside_share.T])),
+        inside_3_sigma=_per_axis(np.array([_mean(x) for x in errors.inside_3_sigma.T])),
         errors=errors,
     )
 

@@ -20,7 +20,7 @@ def reference_from_gnss(gnss: GnssLog, trajectory: Trajectory) -> Reference:
 
     An error of the heading moves that by no more than the lever arm's length times the error.
     Fixes outside of the trajectory, or in its gaps, are left out; velocity and attitude are NaN.
-    Compared with fixes, errors contain the noise of the fixes, and NEES shows it.
+    Errors contain the noise of the fixes; their sigmas count beside those of the estimate.
     """
     angles = interpolate_within(
         gnss.time_s,
@@ -43,4 +43,5 @@ def reference_from_gnss(gnss: GnssLog, trajectory: Trajectory) -> Reference:
         height=height,
         velocity_enu=unknown,
         roll_pitch_heading=unknown,
+        position_sigma_enu=gnss.sigma_enu[kept],
     )

@@ -94,7 +94,8 @@ def _overview(estimate: Estimate) -> Table:
 
 def _aids(aids: AidTable) -> Table:
     """Return how many measurements of each further aid there were, and how many have no weight."""
-    table = _table("Further aids", ["", "measurements", f"weight < {OUTLIER_WEIGHT:g}"])
+    names = ["", "measurements", f"weight < {OUTLIER_WEIGHT:g}"]
+    table = _table("Further aids", names, show_header=True)
     for name, (count, outliers) in aids.counts().items():
         table.add_row(name, str(count), str(outliers))
     return table
@@ -156,12 +157,10 @@ def _comparison(metrics: Metrics) -> Table:
 
 def _calibration(calibration: Calibration) -> Table:
     """Return what was found of the instruments, each value in the colour of its certainty."""
-    table = _table("Calibration, off what the mission states", ["", "", "", "", ""])
-    table.show_header = True
-    for column, name in zip(
-        table.columns, ("", "value", "sigma", "sigma before", "determined"), strict=True
-    ):
-        column.header = name
+    names = ["", "value", "sigma", "before", "determined"]
+    title = "Calibration, off what the mission states; red is not seen and stays at its prior"
+    table = _table(title, names, show_header=True)
+    table.columns[0].min_width = 30  # so that all of them fit into 80 columns
     table.columns[4].justify = "left"
     for value in calibration.values:
         numbers = (value.value, value.sigma, value.prior_sigma)
@@ -169,18 +168,18 @@ def _calibration(calibration: Calibration) -> Table:
         table.add_row(
             value.label,
             *_numbers(number / value.unit for number in numbers),
-            Text(f"{value.determined.name.lower()}: {value.determined.value}", style=style),
+            Text(value.determined.name.lower(), style=style),
         )
     return table
 
 
-def _table(title: str, columns: list[str]) -> Table:
+def _table(title: str, columns: list[str], *, show_header: bool = False) -> Table:
     table = Table(
         title=title,
         title_justify="left",
         title_style="bold",
         box=box.SIMPLE_HEAD,
-        show_header=False,
+        show_header=show_header,
         pad_edge=False,
     )
     for index, name in enumerate(columns):

@@ -123,6 +123,18 @@ def test_nees_uses_the_full_covariance() -> None:
     np.testing.assert_allclose(errors.nees_position, expected, rtol=1e-5)
 
 
+def test_what_a_reference_errs_by_counts_beside_the_estimate() -> None:
+    """Off by 5 sigmas of the estimate alone, by one of both; on the way between fixes too."""
+    time_s = np.arange(5.0)
+    trajectory = make_trajectory(time_s, np.tile([0.0, 0.0, 2.5], (5, 1)))
+    exact = make_reference(time_s[::2], np.zeros((3, 3)))
+    doubted = replace(exact, position_sigma_enu=np.tile([0.0, 0.0, np.sqrt(6.0)], (3, 1)))
+    alone, both = (evaluate(trajectory, reference) for reference in (exact, doubted))
+    assert (alone.inside_3_sigma[2], both.inside_3_sigma[2]) == (0.0, 1.0)
+    assert alone.nees_position == pytest.approx(25.0 / 3.0, rel=1e-6)
+    assert both.nees_position == pytest.approx(1.0 / 3.0, rel=1e-6)
+
+
 def test_angles_cross_north() -> None:
     """Interpolated between 359 and 1 degrees the reference points north, not south."""
     known_s = np.arange(0.0, 10.0)
