@@ -18,18 +18,17 @@ HEADING_RATE: Final = "heading_rate"
 HEADING_WALK: Final = "heading_walk"
 HEADING_ONE_CYCLE: Final = "heading_one_cycle"
 HEADING_TWO_CYCLE: Final = "heading_two_cycle"
-_OF_HEADING: Final = (
+_CONSTANTS_OF_HEADING: Final = (
     HEADING_OFFSET,
     HEADING_RATE,
-    HEADING_WALK,
     HEADING_ONE_CYCLE,
     HEADING_TWO_CYCLE,
 )
 
 
-def is_of_aid(name: str) -> bool:
-    """Return whether an extra variable belongs to one of the further aids."""
-    return name.startswith(BEACON) or name in _OF_HEADING
+def is_constant_of_aid(name: str) -> bool:
+    """Return whether an extra variable is the place of a beacon or a lasting error of a compass."""
+    return name.startswith(BEACON) or name in _CONSTANTS_OF_HEADING
 
 
 def not_used(sections: Sequence[str]) -> tuple[str, ...]:

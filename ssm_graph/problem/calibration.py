@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from ssm_graph.data import N_BEAMS, DepthCalibration, Drift, DvlMount, GnssCalibration, Mission
-from ssm_graph.problem.aid_errors import aid_extras, is_of_aid
+from ssm_graph.problem.aid_errors import aid_extras, is_constant_of_aid
 from ssm_graph.problem.current import current_extras
 from ssm_graph.problem.extras import Extra, Extras
 
@@ -107,8 +107,8 @@ def windowed(extras: Extras) -> Extras:
 
 
 def is_calibration(name: str) -> bool:
-    """Return whether an extra variable tells of an instrument or a beacon."""
-    return name in CALIBRATIONS or is_of_aid(name)
+    """Return whether an extra variable tells what lasts of an instrument or a beacon."""
+    return name in CALIBRATIONS or is_constant_of_aid(name)
 
 
 def taken_as_exact(extras: Extras) -> tuple[str, ...]:

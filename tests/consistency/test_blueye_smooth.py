@@ -39,7 +39,7 @@ def test_surface_runs(name: str, until_s: float, largest_rms: float) -> None:
     assert np.all(np.abs(errors.position_enu[:, :2]) < 3.0 * errors.position_sigma_enu[:, :2])
     assert estimate.calibration is not None
     found = {value.variable for value in estimate.calibration.values}
-    heading = {"heading_offset", "heading_rate", "heading_walk"}
+    heading = {"heading_offset", "heading_rate"}
     assert found == {"dvl_scale", "dvl_time_offset", "gnss_time_offset"} | heading
 
 
