@@ -107,9 +107,10 @@ def _add_loop_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--find-faults",
-        action="store_true",
+        action=argparse.BooleanOptionalAction,
+        default=True,
         help="look for stretches in which one beam is off for long (biased, drifting, covered, "
-        "stuck) and leave them out; single bad pings are the kernel's business",
+        "stuck) and leave them out; single bad pings are the kernel's business (default: yes)",
     )
 
 

@@ -14,6 +14,7 @@ from ssm_graph.frames import wrap_to_pi
 from ssm_graph.problem.alignment import Alignment, align
 from ssm_graph.problem.problem import Problem, ProblemConfig, build_problem
 from ssm_graph.smoothers.batch import OnIteration, SmootherConfig, SsmSmoother
+from ssm_graph.smoothers.beam_faults import FaultSearch
 
 AMBIGUOUS_COST = 6.0
 """Another heading whose cost is higher by less than this is as good an explanation (a likelihood
@@ -42,7 +43,8 @@ def smooth(
     Parameters
     ----------
     mission : from :func:`ssm_graph.read_mission` or a simulation.
-    config : settings of the similarity loop.
+    config : settings of the similarity loop; without, its defaults and the search for faults of
+        one beam that last.
     problem_config : rates and intervals of the graph.
     on_iteration : called with number, limit and :class:`ssm_graph.Iteration` after each iteration.
     on_stage : called with a line of text when a new stage begins.
@@ -53,7 +55,7 @@ def smooth(
         With a sentence that says what is wrong, if the mission cannot be smoothed.
     """
     say = on_stage or (lambda _: None)
-    smoother = SsmSmoother(config)
+    smoother = SsmSmoother(config or SmootherConfig(fault_search=FaultSearch()))
     if mission.initial is not None:
         say("preintegrating")
         problem = build_problem(mission, problem_config)

@@ -43,6 +43,29 @@ def test_surface_runs(name: str, until_s: float, largest_rms: float) -> None:
     assert found == {"dvl_scale", "dvl_time_offset", "gnss_time_offset"} | heading
 
 
+@pytest.mark.parametrize(
+    ("name", "largest_rms"),
+    [("log_auto_square_2025-05-07_14_55_13", 0.88), ("log_grid_01_05_scaled", 0.91)],
+)
+def test_a_small_bias_of_one_beam_for_long_is_found(name: str, largest_rms: float) -> None:
+    """0.15 m/s for 40 s after GNSS has ended: the beam is left out, the others are kept."""
+    mission, withheld = withhold_gnss(convert_blueye(RUNS / f"{name}.mcap"), 70.0)
+    elapsed = mission.dvl.time_s - mission.dvl.time_s[0]
+    is_off = (elapsed > 100.0) & (elapsed < 140.0)
+    speed = mission.dvl.speed.copy()
+    speed[is_off, 1] += 0.15
+    estimate = sg.smooth(replace(mission, dvl=replace(mission.dvl, speed=speed)))
+    assert any(note.startswith("beam 2 is off") for note in estimate.notes)
+    beams = estimate.beams
+    then = (beams.time_s > mission.dvl.time_s[is_off][0]) & (
+        beams.time_s < mission.dvl.time_s[is_off][-1] - 1.0
+    )
+    assert beams.weight[then & (beams.beam == 2.0)].max() < 0.05
+    assert beams.weight[then & (beams.beam != 2.0)].mean() > 0.8
+    reference = sg.reference_from_gnss(withheld, estimate.trajectory)
+    assert sg.evaluate(estimate.trajectory, reference).rmse_horizontal_m < largest_rms
+
+
 @pytest.mark.slow
 def test_the_dive_says_that_its_heading_is_hardly_observable() -> None:
     """It moves by 1.6 m before GNSS is lost."""

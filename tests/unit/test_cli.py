@@ -87,11 +87,13 @@ def test_smooth_calibrates_where_the_mission_asks_for_it(
     assert lines["dvl"]["scale_error"] == pytest.approx(found["dvl_scale_error"]["value"], abs=1e-6)
 
 
-def test_faults_are_searched_for_on_request(mission: Path, tmp_path: Path) -> None:
-    """The summary says that the search was on."""
-    words = ["smooth", str(mission), "--out", str(tmp_path), "--find-faults", "--no-figure"]
-    assert main(words) == ExitCode.GOOD
-    assert json.loads((tmp_path / "summary.json").read_text())["settings"]["find_faults"] is True
+def test_faults_are_searched_for_unless_refused(mission: Path, tmp_path: Path) -> None:
+    """The summary says whether the search was on."""
+    for words, is_on in (([], True), (["--no-find-faults"], False)):
+        out = tmp_path / str(is_on)
+        assert main(["smooth", str(mission), "--out", str(out), "--no-figure", *words]) == 0
+        settings = json.loads((out / "summary.json").read_text())["settings"]
+        assert settings["find_faults"] is is_on
 
 
 def test_an_unconverged_run_is_marked_and_written(mission: Path, tmp_path: Path) -> None:
