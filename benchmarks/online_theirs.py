@@ -19,9 +19,10 @@ from ssm_graph.estimate import Trajectory
 from ssm_graph.graph.gtsam_graph import prior_graph
 from ssm_graph.io.replay import messages_of
 from ssm_graph.io.vehicle import vehicle_of
+from ssm_graph.online.asked import sensors_of_vehicle
 from ssm_graph.online.buffers import Buffers
-from ssm_graph.online.keyframes import KeyframeMaker, sensors_of_vehicle
-from ssm_graph.problem.problem import NO_EXTRAS, ProblemConfig, build_problem, start_of
+from ssm_graph.online.keyframes import KeyframeMaker
+from ssm_graph.problem.problem import ProblemConfig, build_problem, start_of
 from ssm_graph.problem.states import AugmentedStates
 from ssm_graph.problem.trajectory import trajectory_at
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors
@@ -116,7 +117,7 @@ class Theirs:
 
     def __init__(self, mission: Mission, config: TheirConfig) -> None:
         self.config, self._frame = config, mission.frame
-        self._sensors: Sensors = sensors_of_vehicle(vehicle_of(mission), mission.frame, NO_EXTRAS)
+        self._sensors: Sensors = sensors_of_vehicle(vehicle_of(mission), mission.frame)
         self._inertial = InertialRows(mission.frame)
         self._loss = gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY_K)
         problem = build_problem(mission)

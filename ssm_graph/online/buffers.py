@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -106,7 +107,10 @@ class Buffers:
         )
 
     def mission(self, frame: LocalFrame) -> Mission:
-        """Return everything as a mission, to align with; instruments are taken as stated."""
+        """Return everything as a mission, to align with.
+
+        What is known to be off in stamps, fixes and depths has been taken off.
+        """
         vehicle = self.vehicle
         pings = self.pings_between(-np.inf, np.inf)
         depths, fixes = self.depths.all, self.fixes.all
@@ -115,13 +119,17 @@ class Buffers:
         depth = None
         if vehicle.depth_sigma is not None and len(depths):
             depth = DepthLog(
-                vehicle.depth_sigma, depths[:, 0], depths[:, 1], vehicle.depth_lever_arm_b
+                vehicle.depth_sigma,
+                depths[:, 0],
+                depths[:, 1],
+                vehicle.depth_lever_arm_b,
+                replace(vehicle.depth_calibration, offset=0.0),
             )
         return Mission(
             vehicle.name,
             frame,
             self.imu_log(-np.inf, end_s, margin=0),
-            DvlLog(vehicle.mount.as_stated(), stamps, pings[:, 1:5], pings[:, 5:]),
+            DvlLog(vehicle.mount, stamps, pings[:, 1:5], pings[:, 5:]),
             depth,
             GnssLog(
                 time_s=fixes[:, 0],
@@ -130,6 +138,7 @@ class Buffers:
                 height=fixes[:, 3],
                 sigma_enu=fixes[:, 4:],
                 lever_arm_b=vehicle.gnss_lever_arm_b,
+                calibration=replace(vehicle.gnss_calibration, time_offset_s=0.0),
             ),
         )
 

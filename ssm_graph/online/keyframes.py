@@ -9,31 +9,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from ssm_graph.data import Array, ImuLog
+from ssm_graph.data import Array, Drift, ImuLog
 from ssm_graph.earth import LocalFrame
 from ssm_graph.imu.preintegration import LIVELY_S, imu_gaps, preintegrate
-from ssm_graph.messages import Vehicle
 from ssm_graph.online.buffers import Buffers, Measured
 from ssm_graph.problem.aids import fix_covariance_n
-from ssm_graph.problem.extras import Extras
 from ssm_graph.problem.ping_motion import PING_WINDOW_S, mean_gyro
 from ssm_graph.problem.problem import ProblemConfig
 from ssm_graph.problem.timeline import MIN_SPACING_S
-from ssm_graph.smoothers.keyframe import BeamSpeeds, Keyframe, Sensors, Way
-
-
-def sensors_of_vehicle(vehicle: Vehicle, frame: LocalFrame, extras: Extras) -> Sensors:
-    """Return what is the same at all keyframes; ``extras`` are those that each one carries."""
-    sigma = vehicle.depth_sigma
-    return Sensors(
-        frame,
-        vehicle.mount.lever_arm_b,
-        vehicle.depth_lever_arm_b,
-        vehicle.gnss_lever_arm_b,
-        np.inf if sigma is None else sigma,
-        vehicle.mount.R_bd,
-        extras,
-    )
+from ssm_graph.smoothers.keyframe import BeamSpeeds, Keyframe, Way
 
 
 class KeyframeMaker:
@@ -41,6 +25,9 @@ class KeyframeMaker:
 
     def __init__(self, buffers: Buffers, frame: LocalFrame, config: ProblemConfig) -> None:
         self._buffers, self._frame, self._config = buffers, frame, config
+        vehicle = buffers.vehicle
+        self._fast_beams = _fast_share(vehicle.mount.drift)
+        self._fast_fixes = _fast_share(vehicle.gnss_calibration.drift)
         self.not_before_s = -np.inf
         """Where the inertial data have to be before asking again is worth while."""
 
@@ -128,11 +115,17 @@ class KeyframeMaker:
         return BeamSpeeds(
             beam.astype(float),
             pings[row, 1 + beam],
-            pings[row, 5 + beam],
+            pings[row, 5 + beam] * self._fast_beams,
             np.broadcast_to(gyro_b, (len(row), 3)),
             self._buffers.vehicle.mount.beams_b[beam],
         )
 
     def _fixes(self, fixes: Array) -> tuple[Array, Array]:
         position_n = self._frame.p_n_from_geodetic(fixes[:, 1], fixes[:, 2], fixes[:, 3])
-        return position_n, fix_covariance_n(self._frame, position_n, fixes[:, 4:])
+        sigma_enu = fixes[:, 4:] * self._fast_fixes
+        return position_n, fix_covariance_n(self._frame, position_n, sigma_enu)
+
+
+def _fast_share(drift: Drift) -> float:
+    """Return how much of the stated sigmas is white noise, where a drift is carried beside it."""
+    return drift.fast_share if drift.sigma > 0.0 else 1.0

@@ -11,6 +11,7 @@ import numpy as np
 
 from ssm_graph.data import Array
 from ssm_graph.earth import LocalFrame
+from ssm_graph.estimate import Calibration
 from ssm_graph.messages import (
     Event,
     Health,
@@ -21,11 +22,12 @@ from ssm_graph.messages import (
     Vehicle,
 )
 from ssm_graph.online.answer import answer
+from ssm_graph.online.asked import not_calibrated, sensors_of_vehicle
 from ssm_graph.online.course import REACH_S, Course, Step
 from ssm_graph.online.delayed import Delayed, delayed_of
 from ssm_graph.online.events import EventLog
 from ssm_graph.online.intake import Intake
-from ssm_graph.online.keyframes import KeyframeMaker, sensors_of_vehicle
+from ssm_graph.online.keyframes import KeyframeMaker
 from ssm_graph.online.recovery import ASTRAY_TIMES, is_astray
 from ssm_graph.online.reserve import Reserve
 from ssm_graph.online.start import Beginning, Starter
@@ -36,14 +38,14 @@ from ssm_graph.online.store import (
     unpack_left,
     unpack_reserve,
     unpack_watch,
+    window_arrays,
 )
 from ssm_graph.online.tail import Tail
 from ssm_graph.online.watch import Watch
 from ssm_graph.problem.aid_errors import not_used
-from ssm_graph.problem.calibration import calibration_extras, taken_as_exact
-from ssm_graph.problem.extras import Extras
-from ssm_graph.problem.problem import NO_EXTRAS, ProblemConfig
+from ssm_graph.problem.problem import ProblemConfig
 from ssm_graph.problem.timeline import MIN_SPACING_S
+from ssm_graph.smoothers.calibrated import calibration_of_last
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
 from ssm_graph.smoothers.keyframe import Keyframe
 from ssm_graph.smoothers.window import Window
@@ -91,18 +93,11 @@ class FixedLagSmoother:
         self._intake = Intake(vehicle, self._events)
         self._starter = Starter(vehicle, self._problem_config, self._events)
         self._course: Course | None = None
-        self._exact = taken_as_exact(
-            Extras(
-                calibration_extras(
-                    vehicle.mount, vehicle.depth_calibration, vehicle.gnss_calibration
-                )
-            )
-        )
         self._frame = vehicle.frame
         self._tail: Tail | None = None
         self._latest_s = -np.inf
         self._cost_s = 0.0
-        self._is_lost = False
+        self._begun_s, self._is_lost = 0.0, False
         self._finished: list[Delayed] = []
 
     @property
@@ -158,13 +153,14 @@ class FixedLagSmoother:
 
     def _begin(self, beginning: Beginning) -> None:
         self._frame, buffers = beginning.frame, self._intake.buffers
-        for note in self._exact:
+        self._begun_s = beginning.time_s
+        for note in not_calibrated(self.vehicle):
             self._events.tell(beginning.time_s, Severity.INFO, "not_calibrated", note)
         for note in not_used(self.vehicle.further_aids):
             self._events.tell(beginning.time_s, Severity.INFO, "not_aided", note)
         maker = KeyframeMaker(buffers, beginning.frame, self._problem_config)
         first = Keyframe.unmeasured(beginning.time_s, np.zeros(3), None)
-        sensors = sensors_of_vehicle(self.vehicle, beginning.frame, NO_EXTRAS)
+        sensors = sensors_of_vehicle(self.vehicle, beginning.frame)
         window = Window(sensors, self.config, first, beginning.moments)
         window.iterate()
         self._follow(Step(window, Watch(), None, Reserve.of(window)), maker)
@@ -189,6 +185,7 @@ class FixedLagSmoother:
             "counts": dict(intake.counts),
             "frame": None if self._frame is None else [*astuple(self._frame)],
             "is_lost": self._is_lost,
+            "begun_s": self._begun_s,
             "watch": None,
         }
         if self._course is not None:
@@ -213,20 +210,16 @@ class FixedLagSmoother:
         intake.counts.update(meta["counts"])
         unpack_buffers(arrays, intake.buffers)
         smoother._latest_s = intake.buffers.imu.last_s
+        smoother._begun_s = meta["begun_s"]
         if meta["is_lost"]:
             smoother._start_anew()
         if meta["frame"] is not None:
             smoother._frame = LocalFrame(*meta["frame"])
         if meta["watch"] is not None:
             assert smoother._frame is not None
-            packed = {
-                name.removeprefix("window_"): array
-                for name, array in arrays.items()
-                if name.startswith("window_")
-            }
             maker = KeyframeMaker(intake.buffers, smoother._frame, smoother._problem_config)
-            sensors = sensors_of_vehicle(vehicle, smoother._frame, NO_EXTRAS)
-            window = Window.unpack(packed, sensors, smoother.config, maker.way)
+            sensors = sensors_of_vehicle(vehicle, smoother._frame)
+            window = Window.unpack(window_arrays(arrays), sensors, smoother.config, maker.way)
             watch, left = unpack_watch(meta["watch"]), unpack_left(arrays)
             step = Step(window, watch, left, unpack_reserve(arrays))
             smoother._follow(step, maker)
@@ -284,6 +277,14 @@ class FixedLagSmoother:
             shift_s=self._intake.shift_s,
             latency_s=self._cost_s,
         )
+
+    def calibration(self) -> Calibration | None:
+        """Return what is known of the instruments by now; None where nothing is asked for."""
+        if self._course is None:
+            return None
+        step = self._course.newest
+        extras, span_s = step.window.sensors.extras, step.time_s - self._begun_s
+        return calibration_of_last(extras, step.window.newest, span_s=span_s)
 
     def status(self) -> tuple[Health, str]:
         """Return the health of the newest answer and one sentence, also before there is one."""

@@ -11,11 +11,14 @@ from ssm_graph.data import InitialState
 from ssm_graph.earth import LocalFrame
 from ssm_graph.errors import SsmGraphError
 from ssm_graph.messages import Severity, Vehicle
+from ssm_graph.online.asked import extras_of_vehicle
 from ssm_graph.online.buffers import Buffers
 from ssm_graph.online.events import EventLog
 from ssm_graph.problem.alignment import SAFE_HEADING_SIGMA
+from ssm_graph.problem.calibration import windowed
 from ssm_graph.problem.error_state import InitialMoments, initial_moments
-from ssm_graph.problem.problem import NO_EXTRAS, ProblemConfig, build_problem
+from ssm_graph.problem.extras import with_extras
+from ssm_graph.problem.problem import ProblemConfig, build_problem
 from ssm_graph.smoothers.fixed_lag import run_fixed_lag
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
 from ssm_graph.smoothers.mission import smooth
@@ -87,7 +90,8 @@ class Starter:
     def _moments(self, start: InitialState, frame: LocalFrame) -> InitialMoments:
         noise = self._vehicle.imu_noise
         bias_sigma = np.repeat([noise.accel_bias_sigma, noise.gyro_bias_sigma], 3)
-        return initial_moments(start, frame, bias_sigma=bias_sigma)
+        moments = initial_moments(start, frame, bias_sigma=bias_sigma)
+        return with_extras(moments, extras_of_vehicle(self._vehicle))
 
     def _aligned(self, buffers: Buffers) -> Beginning | None:
         """Smooth what there is; begin at its end if that may be believed."""
@@ -106,9 +110,9 @@ class Starter:
             )
             return None
         problem = build_problem(mission, self._config, start=estimate.start)
-        problem = replace(problem, extras=NO_EXTRAS)
         newest = run_fixed_lag(problem, FixedLagConfig(0.0, tolerance=1e-3)).newest
-        moments = newest.states.take(np.s_[-1:]).moments(newest.covariance[-1])
+        found = newest.states.take(np.s_[-1:]).moments(newest.covariance[-1])
+        moments = with_extras(found, extras_of_vehicle(self._vehicle), windowed(problem.extras))
         self._events.tell(
             now_s, Severity.INFO, "aligned", "; ".join(estimate.notes) or "heading found"
         )

@@ -45,6 +45,12 @@ def pack_step(step: Step) -> tuple[dict[str, Array], dict[str, Any]]:
     return arrays, {name: _plain(value) for name, value in step.watch._asdict().items()}
 
 
+def window_arrays(arrays: Mapping[str, Array]) -> dict[str, Array]:
+    """Return what :meth:`ssm_graph.smoothers.window.Window.pack` gave of the step."""
+    prefix = "window_"
+    return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+
+
 def unpack_watch(plain: Mapping[str, Any]) -> Watch:
     """Return the watch that was packed."""
     numbers: dict[str, Any] = {

@@ -164,9 +164,17 @@ class Extras:
         return np.hstack(factors), np.hstack(sigmas)
 
 
-def with_extras(start: InitialMoments, extras: Extras) -> InitialMoments:
-    """Return the moments of a keyframe that carries extra variables, each at its prior."""
+def with_extras(
+    start: InitialMoments, extras: Extras, known: Extras | None = None
+) -> InitialMoments:
+    """Return the moments of a keyframe that carries these extra variables.
+
+    What ``start`` carries are ``known``, some of them; the others begin at their priors.
+    """
     if not extras:
         return start
-    covariance = extras.behind(start.covariance)
-    return start._replace(covariance=covariance, extra=np.zeros(len(extras.sigma)))
+    covariance, extra = extras.behind(np.zeros((STATE_DIM, STATE_DIM))), np.zeros(extras.width)
+    columns = extras.columns_of(known or Extras())
+    covariance[np.ix_(columns, columns)] = start.covariance
+    extra[columns[STATE_DIM:]] = start.extra
+    return start._replace(covariance=covariance, extra=extra[STATE_DIM:])

@@ -9,6 +9,7 @@ from ssm_graph.estimate import CalibratedValue, Calibration, Determined
 from ssm_graph.problem.calibration import is_calibration
 from ssm_graph.problem.error_state import STATE_DIM
 from ssm_graph.problem.extras import Extras
+from ssm_graph.smoothers.stretch import Stretch
 
 
 def calibration_of(
@@ -48,6 +49,13 @@ def calibration_of(
         return None
     kept_walks = walks[:, [own for own in kept if own < extras.n_walks]]
     return Calibration(tuple(values), covariance[np.ix_(kept, kept)], kept_walks)
+
+
+def calibration_of_last(extras: Extras, track: Stretch, *, span_s: float) -> Calibration | None:
+    """Return the calibration that the last keyframe of a window's track carries in its state."""
+    own = slice(STATE_DIM, None)
+    covariance = track.covariance[-1, own, own]
+    return calibration_of(extras, track.states.extra, np.zeros(0), covariance, span_s=span_s)
 
 
 def undetermined(calibration: Calibration | None) -> tuple[str, ...]:

@@ -20,7 +20,7 @@ from ssm_graph.problem.error_state import STATE_DIM
 from ssm_graph.problem.extras import with_extras
 from ssm_graph.problem.problem import Problem, start_of, with_fast_noise
 from ssm_graph.problem.recursive import RecursiveBeams, recursive_estimate
-from ssm_graph.smoothers.calibrated import calibration_of, undetermined
+from ssm_graph.smoothers.calibrated import calibration_of_last, undetermined
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
 from ssm_graph.smoothers.keyframe import beam_speeds, keyframes_of, sensors_of
 from ssm_graph.smoothers.stretch import Stretch, joined
@@ -105,13 +105,8 @@ def _estimate(
     error = beam_rows(
         sensors, beam_speeds(problem.beams), track.states.take(problem.beams.keyframe)
     ).error
-    calibration = calibration_of(
-        sensors.extras,
-        track.states.extra,
-        np.zeros(0),
-        track.covariance[-1, STATE_DIM:, STATE_DIM:],
-        span_s=float(problem.keyframe_s[-1] - problem.keyframe_s[0]),
-    )
+    span_s = float(problem.keyframe_s[-1] - problem.keyframe_s[0])
+    calibration = calibration_of_last(sensors.extras, track, span_s=span_s)
     estimate = recursive_estimate(
         replace(problem, extras=extras.without([block.name for block in sensors.extras.blocks])),
         track.states,

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from ssm_graph.data import Array
+from ssm_graph.errors import DataError
 from ssm_graph.graph.marginal_prior import MarginalPrior, prior_at_start, prior_on
 from ssm_graph.problem.error_state import InitialMoments
 from ssm_graph.problem.states import AugmentedStates
@@ -86,7 +87,13 @@ class WindowGraph:
         """Return the graph that was packed; ``way`` gives the inertial data between two times."""
         keyframes = unpack_keyframes(arrays, way)
         at = AugmentedStates(*(arrays[f"at_{name}"] for name in AugmentedStates._fields))
-        graph = cls(sensors, keyframes[0], at.moments(np.eye(sensors.state_dim)))
+        n, packed = sensors.state_dim, len(arrays["root"])
+        if packed != n:
+            raise DataError(
+                f"checkpoint: expected keyframes of {n} states, what the vehicle asks to estimate, "
+                f"got {packed}; it needs the vehicle that it was written with"
+            )
+        graph = cls(sensors, keyframes[0], at.moments(np.eye(n)))
         graph.keyframes, graph.at = keyframes, at
         graph.prior = MarginalPrior(*(arrays[f"prior_{n}"] for n in MarginalPrior._fields))
         graph._targets = DepthTargets(*(arrays[f"target_{n}"] for n in DepthTargets._fields))
@@ -95,9 +102,9 @@ class WindowGraph:
         counts = [len(keyframe.beams.speed) for keyframe in keyframes]
         graph.first_row = np.append(0, np.cumsum(counts, dtype=np.intp))
         graph._between = list(arrays["between"])
-        graph.chain = Chain(arrays["root"], dim=sensors.state_dim)
+        graph.chain = Chain(arrays["root"], dim=n)
         graph.error = np.zeros(graph.first_row[-1])
-        graph.jacobian = np.zeros((len(graph.error), sensors.state_dim))
+        graph.jacobian = np.zeros((len(graph.error), n))
         graph._depths, graph._fixes, graph._speeds = [], [], []
         graph._measure_again(0, len(keyframes))
         return graph
