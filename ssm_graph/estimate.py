@@ -197,6 +197,16 @@ class Calibration:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """What a live estimator knows by now, beside the state of the vehicle."""
+
+    calibration: Calibration | None = None
+    """None where nothing is asked for."""
+    current: CurrentTrack | None = None
+    """One row, the newest; None without pings off the water."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class NoiseFound:
     """How noisy the data are by what the answer misses of them."""
 

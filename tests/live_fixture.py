@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ssm_graph.data import Array
-from ssm_graph.estimate import BeamTable, Trajectory
+from ssm_graph.estimate import BeamTable, Found, Trajectory
 from ssm_graph.io.vehicle import vehicle_of
 from ssm_graph.live.interfaces import Connections, Engine
 from ssm_graph.live.outputs import OutputFormat
@@ -75,6 +75,10 @@ class FakeEstimator:
         """Return what happened since the last call."""
         taken, self._events = self._events, []
         return taken
+
+    def found(self) -> Found:
+        """Return nothing: it knows the state alone."""
+        return Found()
 
     def take_delayed(self) -> Sequence[Delayed]:
         """Return what is settled."""

@@ -40,6 +40,7 @@ from ssm_graph.live.status import RunStatus
 from ssm_graph.messages import Health, Vehicle
 from ssm_graph.online import ONLINE, FixedLagSmoother
 from ssm_graph.report.status_page import SourceRow, StatusPage, StatusView
+from ssm_graph.report.summary import calibration_table
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
 
 
@@ -150,6 +151,7 @@ def view_of(status: RunStatus) -> StatusView:
         events=status.events,
         log_problem=status.log_problem,
         checkpoint_age_s=status.checkpoint_age_s,
+        found=status.found,
         note=status.note,
     )
 
@@ -249,5 +251,7 @@ def _report(end: RunEnd, folder: Path, console: Console) -> bool:
     if end.n_errors:
         text += f"; {end.n_errors} errors survived, see {folder / 'events.jsonl'}"
     console.print(text, markup=False, highlight=False, soft_wrap=True)
+    if end.found.calibration is not None:
+        console.print(calibration_table(end.found.calibration))
     console.print(f"results in {folder}", markup=False, highlight=False, soft_wrap=True)
     return end.navigation.health is Health.GOOD and end.reason is not StopReason.FAILED

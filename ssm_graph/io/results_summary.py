@@ -11,7 +11,15 @@ from typing import Any, Final, Protocol
 import numpy as np
 
 from ssm_graph.data import InitialState, Mission
-from ssm_graph.estimate import OUTLIER_WEIGHT, AidTable, Estimate, Trajectory, path_length_m
+from ssm_graph.estimate import (
+    OUTLIER_WEIGHT,
+    AidTable,
+    Calibration,
+    CurrentTrack,
+    Estimate,
+    Trajectory,
+    path_length_m,
+)
 
 PACKAGES: Final = {
     "ssm_graph": "ssm-graph",
@@ -89,10 +97,10 @@ def build_summary(
             **_start(estimate.start),
             "origin": "mission" if mission.initial is not None else "alignment",
         },
-        "calibration": _calibration(estimate),
+        "calibration": calibration_fields(estimate.calibration),
         "noise": _noise(estimate),
         **({"aids": _aids(estimate.aids)} if estimate.aids is not None else {}),
-        "current": _current(estimate),
+        "current": current_fields(estimate.current),
         **(_comparison(metrics) if metrics is not None else {}),
         "settings": settings,
         "history": [
@@ -159,9 +167,9 @@ def _comparison(metrics: MetricsLike) -> dict[str, Any]:
     }
 
 
-def _calibration(estimate: Estimate) -> dict[str, Any]:
+def calibration_fields(calibration: Calibration | None) -> dict[str, Any]:
     """Return what was found of the instruments, by label, in the label's unit."""
-    if estimate.calibration is None:
+    if calibration is None:
         return {}
     return {
         value.label: {
@@ -170,7 +178,7 @@ def _calibration(estimate: Estimate) -> dict[str, Any]:
             "prior_sigma": value.prior_sigma / value.unit,
             "determined": value.determined.name.lower(),
         }
-        for value in estimate.calibration.values
+        for value in calibration.values
     }
 
 
@@ -196,9 +204,8 @@ def _noise(estimate: Estimate) -> dict[str, Any]:
     }
 
 
-def _current(estimate: Estimate) -> dict[str, Any]:
+def current_fields(current: CurrentTrack | None) -> dict[str, Any]:
     """Return what was found of the current: means, the largest, and how well it is known."""
-    current = estimate.current
     if current is None:
         return {}
     return {

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 from ssm_graph.data import Array
-from ssm_graph.estimate import BeamTable, Trajectory
+from ssm_graph.estimate import BeamTable, Found, Trajectory
 from ssm_graph.live.publisher import Outlet
 from ssm_graph.live.status import SourceStatus
 from ssm_graph.messages import Event, Health, Message, Navigation
@@ -26,6 +26,7 @@ class Estimator(Protocol):
 
     def push(self, message: Message) -> None: ...  # noqa: D102
     def newest(self) -> Navigation | None: ...  # noqa: D102
+    def found(self) -> Found: ...  # noqa: D102
     def status(self) -> tuple[Health, str]: ...  # noqa: D102
     def take_events(self) -> Sequence[Event]: ...  # noqa: D102
     def take_delayed(self) -> Sequence[Delayed]: ...  # noqa: D102

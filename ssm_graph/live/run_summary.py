@@ -5,8 +5,8 @@ from __future__ import annotations
 from enum import Enum
 from typing import Any, Final, NamedTuple
 
-from ssm_graph.estimate import Status
-from ssm_graph.io.results_summary import as_json, versions
+from ssm_graph.estimate import Found, Status
+from ssm_graph.io.results_summary import as_json, calibration_fields, current_fields, versions
 from ssm_graph.live.json_messages import navigation_fields
 from ssm_graph.live.run_folder import LOG_NAME, RunFolder
 from ssm_graph.messages import Health, Navigation
@@ -36,15 +36,16 @@ class RunEnd(NamedTuple):
     reason: StopReason
     navigation: Navigation | None
     """The last answer."""
+    found: Found
+    """What was known then beside it."""
     n_messages: int
     n_errors: int
     """Exceptions that nobody expected and the run survived."""
 
 
-def summary_of(
-    folder: RunFolder, navigation: Navigation | None, ended: str, n_messages: int
-) -> dict[str, Any]:
+def summary_of(folder: RunFolder, end: RunEnd) -> dict[str, Any]:
     """Return how a run ended, in the terms of the summaries of other estimators."""
+    navigation = end.navigation
     health = Health.ALIGNING if navigation is None else navigation.health
     status = _STATUS[health]
     summary: dict[str, Any] = {
@@ -55,12 +56,13 @@ def summary_of(
         "status_text": status.value,
         "is_good": status.is_good,
         "reason": health.value if navigation is None else navigation.reason,
-        "ended": ended,
-        "n_messages": n_messages,
+        "ended": end.reason.value,
+        "n_messages": end.n_messages,
         "raw_log": LOG_NAME,
         "newest": None if navigation is None else navigation_fields(navigation),
         "settings": folder.settings,
-        "calibration": {},
+        "calibration": calibration_fields(end.found.calibration),
+        "current": current_fields(end.found.current),
         "notes": [],
         "versions": versions(),
     }

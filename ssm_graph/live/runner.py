@@ -8,9 +8,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
-
 from ssm_graph.errors import ConfigError
+from ssm_graph.estimate import Found
 from ssm_graph.live.interfaces import Connect, Connections, Delayed, Engine, Source
 from ssm_graph.live.notices import Notices
 from ssm_graph.live.publisher import Every, Outlet, Publisher
@@ -197,6 +196,13 @@ class Runner:
             self._notices.failure("estimator", "estimator_failed", error)
         return self._navigation
 
+    def _found(self) -> Found:
+        try:
+            return self._estimator.found()
+        except Exception as error:
+            self._notices.failure("estimator", "estimator_failed", error)
+            return Found()
+
     def _keep(self, source: Source) -> None:
         """Write what has come about, and show it."""
         for event in source.take_events():
@@ -276,14 +282,13 @@ class Runner:
             self._write_checkpoint()  # before the window is emptied: a restart goes on from here
             self.folder.writer.wait()
         self._tell_unwritten()
-        navigation = self._newest()
+        navigation, found = self._newest(), self._found()
         self._write_delayed(self._estimator.finish)
         self._notices.tell("run", "ended", reason.value, Severity.INFO)
         self._take_events()
-        end = RunEnd(reason, navigation, self._n_messages, self._notices.n_errors)
+        end = RunEnd(reason, navigation, found, self._n_messages, self._notices.n_errors)
         assert self.folder.results is not None
-        summary = summary_of(self.folder, navigation, reason.value, self._n_messages)
-        self.folder.results.finish(summary)
+        self.folder.results.finish(summary_of(self.folder, end))
         return end
 
     def _show(self, *, at_once: bool = False) -> None:
@@ -295,9 +300,6 @@ class Runner:
             self._notices.failure("status", "status_failed", error)
 
     def _run_status(self) -> RunStatus:
-        latency = None
-        if self._latencies:
-            latency = Latency(*np.percentile(np.array(self._latencies), [50, 99, 100]).tolist())
         connections, navigation = self._connections, self._newest()
         return RunStatus(
             vehicle=self.folder.vehicle.name,
@@ -306,11 +308,12 @@ class Runner:
             n_messages=self._n_messages,
             navigation=navigation,
             reason=self._estimator.status()[1] if navigation is None else navigation.reason,
-            latency=latency,
+            latency=Latency.of(self._latencies),
             sources=() if connections is None else connections.source.source_status(),
             outputs=() if connections is None else connections.outlet.output_status(),
             events=tuple(self._events),
             log_problem=self.folder.problems(),
             checkpoint_age_s=self._data_s - self._checkpoint_s,
+            found=self._found(),
             note=self._note,
         )

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 from enum import Enum
+from typing import Self
 
+import numpy as np
+
+from ssm_graph.estimate import Found
 from ssm_graph.messages import Event, Navigation
 
 
@@ -63,6 +68,13 @@ class Latency:
     p99_s: float
     max_s: float
 
+    @classmethod
+    def of(cls, latencies_s: Collection[float]) -> Self | None:
+        """Return that of single ones, None for none."""
+        if not latencies_s:
+            return None
+        return cls(*np.percentile(np.array(list(latencies_s)), [50, 99, 100]).tolist())
+
 
 @dataclass(frozen=True, slots=True)
 class RunStatus:
@@ -84,5 +96,7 @@ class RunStatus:
     log_problem: str | None
     checkpoint_age_s: float
     """Data time since the last one; infinite before the first."""
+    found: Found = Found()
+    """What is known beside the state of the vehicle."""
     note: str = ""
     """What is going on besides: recovering, stopping."""

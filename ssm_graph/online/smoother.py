@@ -11,7 +11,7 @@ import numpy as np
 
 from ssm_graph.data import Array
 from ssm_graph.earth import LocalFrame
-from ssm_graph.estimate import Calibration
+from ssm_graph.estimate import Found
 from ssm_graph.messages import (
     Event,
     Health,
@@ -278,13 +278,13 @@ class FixedLagSmoother:
             latency_s=self._cost_s,
         )
 
-    def calibration(self) -> Calibration | None:
-        """Return what is known of the instruments by now; None where nothing is asked for."""
+    def found(self) -> Found:
+        """Return what is known by now beside the state of the vehicle."""
         if self._course is None:
-            return None
+            return Found()
         step = self._course.newest
         extras, span_s = step.window.sensors.extras, step.time_s - self._begun_s
-        return calibration_of_last(extras, step.window.newest, span_s=span_s)
+        return Found(calibration_of_last(extras, step.window.newest, span_s=span_s))
 
     def status(self) -> tuple[Health, str]:
         """Return the health of the newest answer and one sentence, also before there is one."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Final, Self
@@ -17,7 +17,9 @@ from rich.table import Table
 from rich.text import Text
 
 from ssm_graph.data import N_BEAMS
+from ssm_graph.estimate import Found
 from ssm_graph.messages import Event, Health, Navigation, Severity
+from ssm_graph.report.summary import DETERMINED_STYLE
 
 PLAIN_EVERY_S: Final = 10.0
 HEALTH_STYLE: Final = {
@@ -73,6 +75,8 @@ class StatusView:
     """Newest last."""
     log_problem: str | None = None
     checkpoint_age_s: float = math.inf
+    found: Found = Found()
+    """What is known beside the state of the vehicle."""
     note: str = ""
 
 
@@ -120,7 +124,7 @@ def render(view: StatusView) -> RenderableType:
     if view.navigation is not None:
         parts.append(_state(view.navigation))
         parts.append(_beams(view.navigation))
-    parts += [_latency(view), _links(view)]
+    parts += [*_found(view.found), _latency(view), _links(view)]
     parts += [_event(event) for event in view.events[-N_EVENTS:]]
     parts.append(_disk(view))
     title = f"{view.vehicle}   {_clock(view.elapsed_s)}   {view.n_messages} messages"
@@ -207,6 +211,20 @@ def _beams(navigation: Navigation) -> Text:
     lock = ("bottom lock", "green") if navigation.bottom_lock else ("no bottom lock", "yellow")
     since = f"last aid {_ago(navigation.since_aid_s)}"
     return text.append("  ").append(*lock).append(f"  {since}")
+
+
+def _found(found: Found) -> Iterator[Text]:
+    """Yield what was found of the current and of the instruments, each with its sigma."""
+    if found.current is not None:
+        velocity, sigma = found.current.velocity_enu[-1], found.current.sigma_enu[-1]
+        parts = zip(("east", "north", "up"), velocity, sigma, strict=True)
+        yield Text("  ".join(["current", *(f"{n} {v:+.2f} ±{s:.2f}" for n, v, s in parts), "m/s"]))
+    if found.calibration is not None:
+        text = Text("off what is stated")
+        for value in found.calibration.values:
+            shown = f"{value.value / value.unit:+.3g} ±{value.sigma / value.unit:.2g}"
+            text.append(f"  {value.label} ").append(shown, DETERMINED_STYLE[value.determined])
+        yield text
 
 
 def _latency(view: StatusView) -> Text:

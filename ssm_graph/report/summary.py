@@ -55,7 +55,7 @@ def summary_table(estimate: Estimate, metrics: Metrics | None = None) -> Rendera
     if estimate.current is not None:
         parts.append(_current(estimate.current))
     if estimate.calibration is not None:
-        parts.append(_calibration(estimate.calibration))
+        parts.append(calibration_table(estimate.calibration))
     if estimate.aids is not None:
         parts.append(_aids(estimate.aids))
     parts.extend(Text(f"note: {note}", style="yellow") for note in estimate.notes)
@@ -155,7 +155,7 @@ def _comparison(metrics: Metrics) -> Table:
     return table
 
 
-def _calibration(calibration: Calibration) -> Table:
+def calibration_table(calibration: Calibration) -> Table:
     """Return what was found of the instruments, each value in the colour of its certainty."""
     names = ["", "value", "sigma", "before", "determined"]
     title = "Calibration, off what the mission states; red is not seen and stays at its prior"

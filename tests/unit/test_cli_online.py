@@ -58,6 +58,22 @@ def test_a_replay_is_a_run(
     assert "lag_s = 5.0, not 6.0" in capsys.readouterr().err
 
 
+def test_a_replay_says_what_it_found_of_the_instruments(
+    mission: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """At its end on the terminal and in the summary, with sigma and unit."""
+    asking = read_mission(mission)
+    mount = replace(asking.dvl.mount, scale_sigma=0.02)
+    write_mission(tmp_path / "m", replace(asking, dvl=replace(asking.dvl, mount=mount)))
+    run = tmp_path / "run"
+    words = ["online", "--replay", str(tmp_path / "m"), "--speed", "full", "--out", str(run)]
+    assert main([*words, "--duration", "20"]) == ExitCode.GOOD
+    assert "dvl_scale_error" in capsys.readouterr().out
+    found = json.loads((run / "summary.json").read_text())["calibration"]["dvl_scale_error"]
+    assert abs(found["value"]) < 3.0 * found["sigma"]
+    assert 0.0 < found["sigma"] <= found["prior_sigma"] == pytest.approx(0.02)
+
+
 def test_a_replay_leaves_pings_off_the_water_out(tmp_path: Path) -> None:
     """They are not sent to an estimator that has no current, and an event says so."""
     mission = make_mission()

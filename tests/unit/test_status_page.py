@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import io
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from rich.console import Console
 
 from ssm_graph.cli.online import view_of
+from ssm_graph.estimate import CalibratedValue, Calibration, CurrentTrack, Found
 from ssm_graph.live.status import Latency, LinkState, OutputStatus, RunStatus, SourceStatus
 from ssm_graph.messages import Event, Health, Severity
 from ssm_graph.report.status_page import StatusPage, StatusView, plain_line, render, weight_bar
@@ -158,3 +160,21 @@ def test_on_a_terminal_the_page_is_drawn_again() -> None:
 def test_weights_as_bars(weight: float, bar: str) -> None:
     """Eight steps; weights above 1 are full, beams that are missing have none."""
     assert weight_bar(weight) == bar
+
+
+def test_the_page_has_what_was_found_besides() -> None:
+    """Current and calibration, each with its sigma and its unit; neither where there is none."""
+    found = Found(
+        Calibration(
+            (CalibratedValue("dvl_mounting", "dvl_mounting_z_deg", 0.5, 1.0, 0.1, 2.0),),
+            np.eye(1),
+            np.zeros((1, 0)),
+        ),
+        CurrentTrack(np.zeros(1), np.array([[0.3, -0.4, 0.0]]), np.diag([0.01, 0.04, 0.0])[None]),
+    )
+    text = text_of(view_of(replace(STATUS, found=found)), width=100)
+    assert "dvl_mounting_z_deg +2 ±0.2" in text
+    assert "current  east +0.30 ±0.10  north -0.40 ±0.20" in text
+    plain = text_of(view_of(STATUS))
+    assert "off what is stated" not in plain
+    assert "current" not in plain

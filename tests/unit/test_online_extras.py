@@ -1,0 +1,132 @@
+"""Drifts and calibrations of the live estimator: as offline, however messages come."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from benchmarks.calibration_cases import MOUNTING, SCALE
+from ssm_graph.data import Array
+from ssm_graph.errors import DataError
+from ssm_graph.estimate import Calibration
+from ssm_graph.io.replay import messages_of
+from ssm_graph.io.vehicle import vehicle_of
+from ssm_graph.messages import Health, Message, Ping, Vehicle
+from ssm_graph.online import ONLINE, FixedLagSmoother
+from ssm_graph.online.recovery import Doubted, reanchored
+from ssm_graph.problem.calibration import DVL_MOUNTING, DVL_SCALE
+from ssm_graph.problem.error_state import STATE_DIM
+from ssm_graph.problem.problem import build_problem
+from ssm_graph.smoothers.fixed_lag import run_fixed_lag
+from tests.window_fixture import asked, off
+
+LAG = replace(ONLINE, lag_s=8.0)
+TRUTH = {DVL_SCALE: np.array([SCALE]), DVL_MOUNTING: MOUNTING}
+
+
+@cache
+def stream() -> tuple[Vehicle, tuple[Message, ...]]:
+    """Return a vehicle that is off and asks for it, and what it sends."""
+    mission = asked(off(duration_s=40.0).mission)
+    return vehicle_of(mission), tuple(messages_of(mission))
+
+
+def after(given: Sequence[Message], vehicle: Vehicle | None = None) -> FixedLagSmoother:
+    """Return the estimator after some messages."""
+    smoother = FixedLagSmoother(vehicle or stream()[0], LAG)
+    for message in given:
+        smoother.push(message)
+    return smoother
+
+
+def found(smoother: FixedLagSmoother) -> Calibration:
+    """Return the calibration, which is asked for."""
+    calibration = smoother.found().calibration
+    assert calibration is not None
+    return calibration
+
+
+def values(smoother: FixedLagSmoother) -> Array:
+    """Return all values that were found."""
+    return np.array([value.value for value in found(smoother).values])
+
+
+def test_it_finds_the_truth_and_what_fixed_lag_finds() -> None:
+    """Within three sigmas of the truth, and a hundredth of what it is offline."""
+    smoother = after(stream()[1])
+    assert smoother.status()[0] is Health.GOOD
+    calibration = found(smoother)
+    for name, truth in TRUTH.items():
+        sigma = np.array([value.sigma for value in calibration.values if value.variable == name])
+        assert np.all(np.abs(calibration.of(name) - truth) < 3.0 * sigma), name
+    assert smoother._course is not None
+    newest = smoother._course.newest.window.newest
+    offline = run_fixed_lag(build_problem(asked(off(duration_s=40.0).mission)), LAG).newest
+    (k,) = np.flatnonzero(np.abs(offline.time_s - newest.time_s[0]) < 1e-3)
+    sigma = np.sqrt(np.diag(newest.covariance[0]))
+    off_extra = (offline.states.extra[k] - newest.states.extra[0]) / sigma[STATE_DIM:]
+    off_state = offline.states.take(np.array([k])).navigation.deviation_of(newest.states.navigation)
+    assert np.abs(off_extra).max() < 0.01
+    assert np.abs(off_state[0] / sigma[:STATE_DIM]).max() < 0.01
+
+
+def test_late_pings_change_nothing() -> None:
+    """Half a second late, they lead to the same calibration."""
+    messages = stream()[1]
+    due = [(m.time_s + (0.5 if isinstance(m, Ping) else 0.0), i) for i, m in enumerate(messages)]
+    late = after([messages[i] for _, i in sorted(due)])
+    np.testing.assert_allclose(values(late), values(after(messages)), rtol=0.0, atol=1e-9)
+
+
+def test_a_restored_estimator_goes_on_as_the_one_that_was_kept() -> None:
+    """Arrays and plain numbers hold all of it, and another vehicle is refused."""
+    vehicle, messages = stream()
+    half = len(messages) // 2
+    smoother = after(messages[:half])
+    arrays, meta = smoother.checkpoint()
+    restored = FixedLagSmoother.restore(vehicle, LAG, arrays, meta)
+    for message in messages[half:]:
+        smoother.push(message)
+        restored.push(message)
+    np.testing.assert_allclose(values(restored), values(smoother), rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(
+        found(restored).covariance, found(smoother).covariance, rtol=1e-6, atol=1e-12
+    )
+    plain = replace(vehicle, mount=vehicle.mount.as_stated())
+    with pytest.raises(DataError, match=r"expected keyframes of 23 states, .* got 34"):
+        FixedLagSmoother.restore(plain, LAG, arrays, meta)
+
+
+@pytest.mark.parametrize("what", list(Doubted))
+def test_a_new_begin_keeps_what_was_found(what: Doubted) -> None:
+    """Of the instruments, whatever of the vehicle's state is doubted."""
+    smoother = after(stream()[1])
+    course = smoother._course
+    assert course is not None
+    measured = course._maker.next_after(course.newest.time_s - 1.5)
+    assert measured is not None
+    step = next(s for s in reversed(course._steps) if s.time_s < measured.time_s - 0.1)
+    keyframe = course._maker.make(measured, last_s=step.time_s)
+    kept = step.reserve.older.led_on(keyframe, course._inertial)
+    begun = reanchored(step.window, keyframe, kept, what).newest
+    at = step.window.sensors.extras.columns(DVL_SCALE).start
+    sigma = float(np.sqrt(begun.covariance[0, at, at]))
+    assert abs(begun.states.extra[0, at - STATE_DIM] - SCALE) < 3.0 * sigma
+    assert sigma < 0.5 * stream()[0].mount.scale_sigma
+
+
+def test_it_aligns_with_instruments_that_are_off() -> None:
+    """Without an initial state, what alignment found of the instruments is gone on from."""
+    vehicle, messages = stream()
+    smoother = after(messages, replace(vehicle, initial=None))
+    kinds = {event.kind for event in smoother.take_events()}
+    navigation = smoother.newest()
+    assert navigation is not None, smoother.status()
+    assert "aligned" in kinds
+    sigma = np.array([v.sigma for v in found(smoother).values if v.variable == DVL_SCALE])
+    assert abs(found(smoother).of(DVL_SCALE) - SCALE) < 3.0 * sigma
+    assert sigma < 0.5 * vehicle.mount.scale_sigma
