@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.calibration_cases import SCALE
 from ssm_graph.cli.main import ExitCode, build_parser, main
 from ssm_graph.cli.online_arguments import input_configs, output_configs, replay_speed
 from ssm_graph.io.mission import read_mission, write_mission
@@ -21,6 +22,7 @@ from ssm_graph.live.nmea import NmeaDecoder
 from ssm_graph.live.outputs import OutputFormat
 from ssm_graph.live.waterlinked import WaterLinkedDecoder
 from tests.mission_fixture import make_mission
+from tests.window_fixture import asked, off
 
 
 @pytest.fixture(scope="module")
@@ -59,19 +61,17 @@ def test_a_replay_is_a_run(
 
 
 def test_a_replay_says_what_it_found_of_the_instruments(
-    mission: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """At its end on the terminal and in the summary, with sigma and unit."""
-    asking = read_mission(mission)
-    mount = replace(asking.dvl.mount, scale_sigma=0.02)
-    write_mission(tmp_path / "m", replace(asking, dvl=replace(asking.dvl, mount=mount)))
+    write_mission(tmp_path / "m", asked(off(duration_s=20.0).mission))
     run = tmp_path / "run"
     words = ["online", "--replay", str(tmp_path / "m"), "--speed", "full", "--out", str(run)]
-    assert main([*words, "--duration", "20"]) == ExitCode.GOOD
+    assert main(words) == ExitCode.GOOD
     assert "dvl_scale_error" in capsys.readouterr().out
     found = json.loads((run / "summary.json").read_text())["calibration"]["dvl_scale_error"]
-    assert abs(found["value"]) < 3.0 * found["sigma"]
-    assert 0.0 < found["sigma"] <= found["prior_sigma"] == pytest.approx(0.02)
+    assert abs(found["value"] - SCALE) < 3.0 * found["sigma"]
+    assert 0.0 < found["sigma"] < found["prior_sigma"] == pytest.approx(0.03)
 
 
 def test_a_replay_leaves_pings_off_the_water_out(tmp_path: Path) -> None:
