@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,10 @@ from ssm_graph.errors import DataError
 from ssm_graph.estimate import Trajectory
 from ssm_graph.evaluation.alignment import interpolate_within
 from ssm_graph.frames import wrap_to_pi
+
+NO_REFERENCE: Final = 10.0
+"""m; along an axis where its own sigma is larger a reference tells nothing, as the height of fixes
+that were given one for the sake of the format."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,7 +30,7 @@ class ErrorSeries(FrozenArrays):
     time_s: Array = shaped("N")
     """(N,) keyframe times, s."""
     position_enu: Array = shaped("N", 3)
-    """(N, 3) m"""
+    """(N, 3) m; NaN along axes of which the reference tells nothing"""
     velocity_enu: Array = shaped("N", 3)
     """(N, 3) m/s"""
     roll_pitch_heading: Array = shaped("N", 3)
@@ -52,7 +57,7 @@ class ErrorSeries(FrozenArrays):
         """(N, 3) 1 where a position is within 3 sigma of both, else 0; NaN without a sigma."""
         sigma = np.hypot(self.position_sigma_enu, self.reference_sigma_enu)
         inside = np.abs(self.position_enu) <= 3.0 * sigma
-        return np.where(np.isfinite(sigma), inside, np.nan)
+        return np.where(np.isfinite(sigma + self.position_enu), inside, np.nan)
 
 
 def error_series(trajectory: Trajectory, reference: Reference) -> ErrorSeries:
@@ -92,7 +97,7 @@ def error_series(trajectory: Trajectory, reference: Reference) -> ErrorSeries:
     reference_sigma = _sigma_at(time_s[kept], reference, known)
     return ErrorSeries(
         time_s=time_s[kept],
-        position_enu=position_enu,
+        position_enu=np.where(reference_sigma > NO_REFERENCE, np.nan, position_enu),
         velocity_enu=(trajectory.velocity_enu - velocity)[kept],
         roll_pitch_heading=wrap_to_pi(trajectory.roll_pitch_heading - angles)[kept],
         position_sigma_enu=np.sqrt(np.maximum(np.diagonal(cov, axis1=1, axis2=2), 0.0)),

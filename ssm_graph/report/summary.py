@@ -150,7 +150,8 @@ def _comparison(metrics: Metrics) -> Table:
         ("NEES of position / 3, expected 1", metrics.nees_position),
     ):
         table.add_row(heading, *_numbers([value]))
-    inside = ", ".join(f"{100.0 * share:.1f}" for share in metrics.inside_3_sigma)
+    shares = 100.0 * np.array(metrics.inside_3_sigma)
+    inside = ", ".join(f"{share:.1f}" if np.isfinite(share) else "–" for share in shares)
     table.add_row("within 3 sigma east, north, up, %", inside)
     return table
 

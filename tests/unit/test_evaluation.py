@@ -133,6 +133,12 @@ def test_what_a_reference_errs_by_counts_beside_the_estimate() -> None:
     assert (alone.inside_3_sigma[2], both.inside_3_sigma[2]) == (0.0, 1.0)
     assert alone.nees_position == pytest.approx(25.0 / 3.0, rel=1e-6)
     assert both.nees_position == pytest.approx(1.0 / 3.0, rel=1e-6)
+    blind = replace(exact, position_sigma_enu=np.tile([0.5, 0.5, 50.0], (3, 1)))
+    level = evaluate(trajectory, blind)
+    assert np.isnan(level.rmse_vertical_m)
+    assert np.isnan(level.inside_3_sigma[2])
+    assert level.inside_3_sigma[0] == 1.0
+    assert level.rmse_horizontal_m == pytest.approx(0.0, abs=1e-6)
 
 
 def test_angles_cross_north() -> None:
