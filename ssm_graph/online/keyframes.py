@@ -118,6 +118,7 @@ class KeyframeMaker:
             pings[row, 5 + beam] * self._fast_beams,
             np.broadcast_to(gyro_b, (len(row), 3)),
             self._buffers.vehicle.mount.beams_b[beam],
+            np.zeros(len(row)),
         )
 
     def _fixes(self, fixes: Array) -> tuple[Array, Array]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ssm_graph.data import N_BEAMS, DepthCalibration, Drift, DvlMount, GnssCalibration, Mission
 from ssm_graph.problem.aid_errors import aid_extras, is_constant_of_aid
-from ssm_graph.problem.current import current_extras
+from ssm_graph.problem.current import CURRENTS, current_extras
 from ssm_graph.problem.extras import Extra, Extras
 
 DVL_MOUNTING: Final = "dvl_mounting"
@@ -102,7 +102,7 @@ def windowed(extras: Extras) -> Extras:
     Left out are those of the further aids, which it is not aided by, and those that only motion
     shows: how much of what the IMU reads is motion can only be judged over a whole mission.
     """
-    kept = (CALIBRATIONS | DRIFTS) - SEEN_BY_READINGS
+    kept = (CALIBRATIONS | DRIFTS | CURRENTS) - SEEN_BY_READINGS
     return extras.only(kept).in_the_state()
 
 

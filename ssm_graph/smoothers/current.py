@@ -4,32 +4,46 @@ from __future__ import annotations
 
 import numpy as np
 
+from ssm_graph.data import Array
 from ssm_graph.estimate import CurrentTrack
-from ssm_graph.graph.linearize import Step
-from ssm_graph.graph.states import States
 from ssm_graph.problem.current import CURRENT, CURRENT_UP
 from ssm_graph.problem.error_state import STATE_DIM
-from ssm_graph.problem.problem import Problem
+from ssm_graph.problem.extras import Extras
+from ssm_graph.smoothers.stretch import Stretch
 
 
-def current_of(problem: Problem, states: States, step: Step) -> CurrentTrack | None:
-    """Return the current of an answer with its covariance, None if the problem has none."""
-    extras, n = problem.extras, problem.n_keyframes
+def current_of(
+    extras: Extras, time_s: Array, walks: Array, covariance: Array
+) -> CurrentTrack | None:
+    """Return the current of an answer with its covariance, None if it has none.
+
+    Parameters
+    ----------
+    extras : what was estimated.
+    time_s : (K,) s, of the keyframes.
+    walks : (K, s)
+    covariance : (K, s, s) of the walks of each keyframe.
+    """
     if CURRENT not in extras:
         return None
-    velocity, covariance = np.zeros((n, 3)), np.zeros((n, 3, 3))
-    known = [*_columns(problem, CURRENT), *_columns(problem, CURRENT_UP)]
-    within = step.solution.covariance_of(slice(STATE_DIM, extras.state_dim))
+    n, known = len(time_s), [*_columns(extras, CURRENT), *_columns(extras, CURRENT_UP)]
+    velocity, own = np.zeros((n, 3)), np.zeros((n, 3, 3))
     for i, a in enumerate(known):
-        velocity[:, i] = states.walks[:, a]
+        velocity[:, i] = walks[:, a]
         for j, b in enumerate(known):
-            covariance[:, i, j] = within[:, a, b]
-    return CurrentTrack(problem.keyframe_s, velocity, covariance)
+            own[:, i, j] = covariance[:, a, b]
+    return CurrentTrack(time_s, velocity, own)
 
 
-def _columns(problem: Problem, name: str) -> range:
+def current_along(extras: Extras, track: Stretch) -> CurrentTrack | None:
+    """Return the current that the keyframes of a window's track carry in their states."""
+    covariance = track.covariance[:, STATE_DIM:, STATE_DIM:]
+    return current_of(extras, track.time_s, track.states.extra, covariance)
+
+
+def _columns(extras: Extras, name: str) -> range:
     """Return the walks of a variable, none for one that there is not."""
-    if name not in problem.extras:
+    if name not in extras:
         return range(0)
-    columns = problem.extras.columns(name)
+    columns = extras.columns(name)
     return range(columns.start - STATE_DIM, columns.stop - STATE_DIM)

@@ -15,12 +15,12 @@ import numpy as np
 
 from ssm_graph.data import Array
 from ssm_graph.estimate import Estimate, OnKeyframe
-from ssm_graph.problem.bottom_track import without_water_track
 from ssm_graph.problem.error_state import STATE_DIM
 from ssm_graph.problem.extras import with_extras
 from ssm_graph.problem.problem import Problem, start_of, with_fast_noise
 from ssm_graph.problem.recursive import RecursiveBeams, recursive_estimate
 from ssm_graph.smoothers.calibrated import calibration_of_last, undetermined
+from ssm_graph.smoothers.current import current_along
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
 from ssm_graph.smoothers.keyframe import beam_speeds, keyframes_of, sensors_of
 from ssm_graph.smoothers.stretch import Stretch, joined
@@ -61,7 +61,7 @@ def solve_fixed_lag(
     SolverError
         If no finite solution was found.
     """
-    config, problem = config or FixedLagConfig(), without_water_track(problem)
+    config = config or FixedLagConfig()
     begin = time.perf_counter()
     run = run_fixed_lag(problem, config, on_keyframe=on_keyframe)
     wall_s = time.perf_counter() - begin
@@ -76,8 +76,8 @@ def solve_fixed_lag(
 def run_fixed_lag(
     problem: Problem, config: FixedLagConfig, *, on_keyframe: OnKeyframe | None = None
 ) -> FixedLagRun:
-    """Go through the keyframes one by one, with pings off the ground alone."""
-    problem = with_fast_noise(without_water_track(problem))
+    """Go through the keyframes one by one."""
+    problem = with_fast_noise(problem)
     first, *others = keyframes_of(problem)
     sensors = sensors_of(problem)
     window = Window(sensors, config, first, with_extras(start_of(problem), sensors.extras))
@@ -124,5 +124,8 @@ def _estimate(
         wall_s=wall_s,
     )
     return replace(
-        estimate, calibration=calibration, notes=estimate.notes + undetermined(calibration)
+        estimate,
+        calibration=calibration,
+        notes=estimate.notes + undetermined(calibration),
+        current=current_along(sensors.extras, track),
     )

@@ -52,11 +52,14 @@ class BeamSpeeds(NamedTuple):
     """(M, 3) rad/s, mean over the ping"""
     beam_b: Array
     """(M, 3) unit vectors"""
+    is_water: Array
+    """(M,) 1 off the water, relative to its current, 0 off the ground"""
 
     @classmethod
     def none(cls) -> BeamSpeeds:
         """Return no rows."""
-        return cls(*np.zeros((3, 0)), *np.zeros((2, 0, 3)))
+        none, none_b = np.zeros(0), np.zeros((0, 3))
+        return cls(none, none, none, none_b, none_b, none)
 
     def followed_by(self, other: BeamSpeeds) -> BeamSpeeds:
         """Return these rows, then the others."""
@@ -163,6 +166,7 @@ def beam_speeds(beams: Beams, rows: slice = np.s_[:]) -> BeamSpeeds:
         beams.sigma[rows],
         beams.gyro_b[rows],
         beams.beam_b[rows],
+        beams.is_water[rows].astype(float),
     )
 
 

@@ -59,7 +59,7 @@ def _extended_rows(sensors: Sensors, beams: BeamSpeeds, states: AugmentedStates)
         lever_arm_b=sensors.dvl_arm_b,
         R_bd=sensors.R_bd,
         ping=np.zeros(count, np.intp),
-        is_water=np.zeros(count, np.bool_),
+        is_water=beams.is_water > 0.0,
     )
     extended = ExtendedBeams(table, sensors.extras, sensors.frame)
     at = _row_states(states)

@@ -43,7 +43,7 @@ from ssm_graph.simulation import (
 )
 from ssm_graph.smoothers.batch import WARM_KERNEL, SmootherConfig, SsmSmoother
 from ssm_graph.smoothers.beam_faults import FaultSearch
-from ssm_graph.smoothers.fixed_lag import solve_fixed_lag
+from ssm_graph.smoothers.fixed_lag import FixedLagConfig, solve_fixed_lag
 from ssm_graph.water_current import CurrentModel
 from tests.helpers import simulated, true_states, without_beams
 from tests.water_fixture import current_errors, in_current, without_water
@@ -203,7 +203,29 @@ def test_a_current_that_nobody_stated_is_assumed_and_said() -> None:
     assert not build_problem(without_beams(sim.mission)).extras
 
 
-def test_filters_and_fixed_lag_leave_the_water_out() -> None:
+def test_a_window_bridges_a_loss_like_the_batch() -> None:
+    """As long as the mission, it is the batch; a shorter one is as far off as its sigmas say."""
+    sim = in_current(duration_s=100.0, losses=(Loss(30.0, 80.0),))
+    problem = build_problem(sim.mission)
+    config = FixedLagConfig(
+        1e3, max_iterations=15, tolerance=1e-3, relinearise_sigmas=1e-3, reweigh=1e-3
+    )
+    batch, whole = SsmSmoother().solve(problem), solve_fixed_lag(problem, config).delayed
+    assert batch.current is not None
+    assert whole.current is not None
+    off = np.abs(whole.current.velocity_enu - batch.current.velocity_enu)
+    assert np.all(off < 0.02 * batch.current.sigma_enu)
+    np.testing.assert_allclose(whole.current.sigma_enu, batch.current.sigma_enu, rtol=0.01)
+    off = np.abs(whole.trajectory.velocity_enu - batch.trajectory.velocity_enu)
+    assert np.all(off < 0.02 * batch.trajectory.velocity_sigma_enu)
+    for lagged in solve_fixed_lag(problem, replace(config, lag_s=20.0)):
+        assert lagged.current is not None
+        assert np.all(np.abs(current_errors(lagged, sim)) < 4.0 * lagged.current.sigma_enu)
+        assert lagged.current.sigma_enu[-1, 0] < 0.1
+        assert not any("off the water" in note for note in lagged.notes)
+
+
+def test_filters_leave_the_water_out() -> None:
     """Their answers are those without such pings, and a note says so."""
     sim = in_current(duration_s=120.0)
     problem, dry = build_problem(sim.mission), build_problem(without_water(sim).mission)
@@ -211,7 +233,6 @@ def test_filters_and_fixed_lag_leave_the_water_out() -> None:
     for wet_answer, dry_answer in (
         (filter_problems([problem], "ssm-log")[0], filter_problems([dry], "ssm-log")[0]),
         (filter_geodetic([problem], imu)[0], filter_geodetic([dry], imu)[0]),
-        (solve_fixed_lag(problem).newest, solve_fixed_lag(dry).newest),
     ):
         np.testing.assert_allclose(
             wet_answer.trajectory.lat, dry_answer.trajectory.lat, rtol=0.0, atol=1e-12
