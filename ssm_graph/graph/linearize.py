@@ -69,6 +69,12 @@ class Step(NamedTuple):
         """Of the walks at the last keyframe and of the constants, (E, E)."""
         return self.solution.end_covariance(STATE_DIM)
 
+    @property
+    def walks_covariance(self) -> Array:
+        """Of the walks of every keyframe, (K, s, s)."""
+        n_states = self.solution.step.shape[1]
+        return self.solution.covariance_of(slice(STATE_DIM, n_states))
+
     def variance(self, keyframe: NDArray[np.intp], rows: Array) -> Array:
         """Return ``H P H'`` (M,) of rows (M, 15 + s + C)."""
         return self.solution.variance(keyframe, rows)

@@ -18,7 +18,6 @@ from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.first_values import FirstValues, first_values
 from ssm_graph.graph.linearize import GraphLinearizer, Step
 from ssm_graph.graph.states import States
-from ssm_graph.problem.error_state import STATE_DIM
 from ssm_graph.problem.problem import Problem, with_fast_noise
 from ssm_graph.problem.trajectory import trajectory_from_states
 from ssm_graph.smoothers.aid_weights import AidKernel, AidWeighing
@@ -291,9 +290,6 @@ class SsmSmoother:
             aids=solved.aids.table(last.states, problem.keyframe_s),
             noise=noise,
             current=current_of(
-                problem.extras,
-                problem.keyframe_s,
-                last.states.walks,
-                last.step.solution.covariance_of(slice(STATE_DIM, problem.extras.state_dim)),
+                problem.extras, problem.keyframe_s, last.states.walks, last.step.walks_covariance
             ),
         )
