@@ -53,7 +53,7 @@ def json_traffic(rng: random.Random, time_s: float) -> bytes:
         message = ImuSample(time_s, (a, b, c), (d, a, -9.8))
     elif kind < 0.85:
         sigma = None if kind < 0.8 else (0.01, 0.02, math.nan, 0.01)
-        message = Ping(time_s, (a, math.nan if b > 1.0 else b, c, d), sigma)
+        message = Ping(time_s, (a, math.nan if b > 1.0 else b, c, d), sigma, is_water=a > 1.0)
     elif kind < 0.95:
         message = DepthReading(time_s, 30.0 + a)
     else:

@@ -36,14 +36,16 @@ class ImuSample:
 
 @dataclass(frozen=True, slots=True)
 class Ping:
-    """One bottom-track ping; a speed is positive when the instrument moves along the beam."""
+    """One ping; a speed is positive when the instrument moves along the beam."""
 
     time_s: float
     """As stamped, s; the mount's time offset is not yet applied."""
     speed: tuple[float, float, float, float]
-    """m/s; NaN marks a beam without bottom lock."""
+    """m/s; NaN marks a beam without lock."""
     sigma: tuple[float, float, float, float] | None = None
     """Standard deviations, m/s; None or NaN is the vehicle's nominal one."""
+    is_water: bool = False
+    """Whether it is off the water: its speeds are relative to the current, not to the ground."""
 
 
 @dataclass(frozen=True, slots=True)

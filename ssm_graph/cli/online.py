@@ -27,7 +27,7 @@ from ssm_graph.cli.options import add_command, kernel_from
 from ssm_graph.data import Array, Mission
 from ssm_graph.errors import ConfigError, SolverError
 from ssm_graph.io.mission import read_mission
-from ssm_graph.io.replay import left_out_of_replay, messages_of
+from ssm_graph.io.replay import messages_of
 from ssm_graph.io.vehicle import read_vehicle, vehicle_of
 from ssm_graph.live.interfaces import Connections, Engine
 from ssm_graph.live.publisher import Publisher
@@ -207,7 +207,6 @@ def _connector(
             messages_of(mission),
             speed=speed,
             skip=n_messages,
-            notes=left_out_of_replay(mission),
             name=mission.name,
             end_s=float(mission.imu.time_s[-1]),
             wait=hub.wait,

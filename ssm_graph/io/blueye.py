@@ -222,9 +222,9 @@ def _dvl(tables: BlueyeTables, imu: ImuLog) -> tuple[DvlLog, tuple[str, ...]]:
     if len(table) < 2:
         raise DataError("DvlVelocityTel: fewer than two new reports while the IMU ran")
     speed, valid, ranges = np.split(table[:, 4 : 4 + 3 * N_BEAMS], 3, axis=1)
-    water_track = table[:, 2:3] > 0.0
+    water_track = table[:, 2] > 0.0
     is_one_number = np.ptp(speed, axis=1, keepdims=True) == 0.0
-    speed = np.where((valid > 0.0) & ~water_track & ~is_one_number, speed, np.nan)
+    speed = np.where((valid > 0.0) & ~is_one_number, speed, np.nan)
     _check_lock(speed, is_one_number, valid)
     log = DvlLog(
         mount=dvl_mount(),
@@ -232,12 +232,13 @@ def _dvl(tables: BlueyeTables, imu: ImuLog) -> tuple[DvlLog, tuple[str, ...]]:
         speed=speed,
         sigma=np.full(speed.shape, BEAM_SIGMA),
         range_m=np.where(ranges > 0.0, ranges, np.nan),
+        water_track=water_track.astype(float) if water_track.any() else None,
     )
     note = (
         f"DvlVelocityTel: {len(table)} new reports among {len(tables.dvl)} messages, stamped by "
         f"the sum of delta_time (arrivals scatter by {jitter_ms:.1f} ms rms), {DVL_DELAY_S} s "
-        f"late; {int(np.isnan(speed).sum())} beams without bottom lock, {int(water_track.sum())} "
-        f"reports of water track dropped, {int(is_one_number.sum())} with one number in all four "
+        f"late; {int(np.isnan(speed).sum())} beams without lock, {int(water_track.sum())} "
+        f"reports off the water, {int(is_one_number.sum())} with one number in all four "
         f"beams left out, {int(np.sum(table[:, 3] != 0.0))} with a fault status "
         "kept for their beams."
     )

@@ -17,7 +17,7 @@ from typing import Final, Self
 
 from ssm_graph.errors import ConfigError
 from ssm_graph.io.append_file import AppendFile, sync_folder
-from ssm_graph.io.raw_replay import replay
+from ssm_graph.io.raw_replay import check_columns, replay
 from ssm_graph.io.raw_rows import ARRIVALS, ROW_KINDS, RowKind
 from ssm_graph.io.settings import TOML_NAME
 from ssm_graph.io.vehicle import check_same_vehicle, write_vehicle
@@ -105,11 +105,12 @@ class RawLog:
         Raises
         ------
         ConfigError
-            For a folder without a log, and for the log of another vehicle.
+            For a folder without a log, and for the log of another vehicle or of another version.
         OSError
             Where the files cannot be opened.
         """
         check_same_vehicle(folder, vehicle)
+        check_columns(folder)
         log = cls.__new__(cls)
         log._open(Path(folder), max_waiting=max_waiting, retry_every=retry_every)
         sizes = ",".join(str(table.size) for table in log._tables.values())

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO
 
+from ssm_graph.errors import ConfigError
 from ssm_graph.io.raw_rows import ARRIVALS, ROW_KINDS, RowKind
 from ssm_graph.io.vehicle import check_same_vehicle
 from ssm_graph.messages import Message, Vehicle
@@ -57,9 +58,10 @@ def replay(
     Raises
     ------
     ConfigError
-        For a folder without a log, and for the log of another vehicle.
+        For a folder without a log, and for the log of another vehicle or of another version.
     """
     check_same_vehicle(folder, vehicle)
+    check_columns(folder)
     starts = offsets or {}
     arrivals = _read_from(Path(folder) / ARRIVALS, starts.get(ARRIVALS, 0))
     tables = {
@@ -67,6 +69,22 @@ def replay(
         for kind in ROW_KINDS.values()
     }
     return _in_order_of_arrival(arrivals, tables)
+
+
+def check_columns(folder: Path | str) -> None:
+    """Raise :class:`ConfigError` for a log whose tables have other columns than ours."""
+    for kind in ROW_KINDS.values():
+        path = Path(folder) / kind.file
+        if not path.exists():
+            continue
+        with path.open("rb") as stream:
+            head = stream.readline()
+        if head.endswith(b"\n") and head != kind.header:
+            raise ConfigError(
+                f"{path}: expected the columns {kind.header.decode().strip()}, got "
+                f"{head.decode(errors='replace').strip()[:200]}; it is the log of another version: "
+                "begin a new one in another folder; ssm-graph smooth and --replay read the old one"
+            )
 
 
 def _in_order_of_arrival(arrivals: bytes, tables: dict[int, _Rows]) -> Iterator[Message]:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from ssm_graph.io.mission_keys import ACCEL, GYRO, SPEED, SPEED_SIGMA
+from ssm_graph.io.mission_keys import ACCEL, GYRO, SPEED, SPEED_SIGMA, WATER_TRACK
 from ssm_graph.io.tables import POSITION, POSITION_SIGMA, TIME
 from ssm_graph.messages import DepthReading, Fix, ImuSample, Message, Ping
 
@@ -68,13 +68,14 @@ def degrees_of(angle: float) -> float:
 
 def _ping_numbers(ping: Ping) -> tuple[float, ...]:
     sigma = (math.nan,) * len(SPEED_SIGMA) if ping.sigma is None else ping.sigma
-    return (ping.time_s, *ping.speed, *sigma)
+    return (ping.time_s, *ping.speed, *sigma, float(ping.is_water))
 
 
 def _ping(cells: list[float]) -> Ping:
-    time_s, v1, v2, v3, v4, s1, s2, s3, s4 = cells
+    time_s, v1, v2, v3, v4, s1, s2, s3, s4, water = cells
     has_sigma = not all(math.isnan(sigma) for sigma in (s1, s2, s3, s4))
-    return Ping(time_s, (v1, v2, v3, v4), (s1, s2, s3, s4) if has_sigma else None)
+    sigma = (s1, s2, s3, s4) if has_sigma else None
+    return Ping(time_s, (v1, v2, v3, v4), sigma, is_water=water > 0.0)
 
 
 def _fix_numbers(fix: Fix) -> tuple[float, ...]:
@@ -101,7 +102,7 @@ ROW_KINDS: Final[Mapping[type, RowKind]] = {
     Ping: RowKind(
         file="dvl.csv",
         letter=b"d",
-        columns=(TIME, *SPEED, *SPEED_SIGMA),
+        columns=(TIME, *SPEED, *SPEED_SIGMA, WATER_TRACK),
         numbers=_ping_numbers,
         message=_ping,
         has_blanks=True,

@@ -18,27 +18,15 @@ def messages_of(mission: Mission) -> Iterator[Message]:
     """Yield all messages of a mission in order of time.
 
     An IMU sample stands at the end of its interval, a ping at its stamp. Of equal times the IMU
-    comes first, then DVL, depth, GNSS. Pings off the water are left out: a live estimator has no
-    current, see :func:`left_out_of_replay`. Rows are turned into messages as they are asked for, so
-    that a day of data needs no more memory than the mission itself.
+    comes first, then DVL, depth, GNSS. Rows are turned into messages as they are asked for, so that
+    a day of data needs no more memory than the mission itself.
     """
-    streams: list[Iterator[Message]] = [_samples(mission.imu), _pings(mission.dvl.of_ground())]
+    streams: list[Iterator[Message]] = [_samples(mission.imu), _pings(mission.dvl)]
     if mission.depth is not None:
         streams.append(_depths(mission.depth))
     if mission.gnss is not None:
         streams.append(_fixes(mission.gnss))
     return heapq.merge(*streams, key=lambda message: message.time_s)
-
-
-def left_out_of_replay(mission: Mission) -> tuple[str, ...]:
-    """Return the note of what a mission has and a live estimator is not sent."""
-    count = int(mission.dvl.is_water.sum())
-    if count == 0:
-        return ()
-    return (
-        f"{count} pings off the water are left out: the live estimator has no current; "
-        "ssm-graph smooth uses them",
-    )
 
 
 def _samples(imu: ImuLog) -> Iterator[ImuSample]:
@@ -47,8 +35,9 @@ def _samples(imu: ImuLog) -> Iterator[ImuSample]:
 
 
 def _pings(dvl: DvlLog) -> Iterator[Ping]:
-    for time_s, v1, v2, v3, v4, s1, s2, s3, s4 in _rows(dvl.time_s, dvl.speed, dvl.sigma):
-        yield Ping(time_s, (v1, v2, v3, v4), (s1, s2, s3, s4))
+    columns = (dvl.time_s, dvl.speed, dvl.sigma, dvl.is_water.astype(float))
+    for time_s, v1, v2, v3, v4, s1, s2, s3, s4, water in _rows(*columns):
+        yield Ping(time_s, (v1, v2, v3, v4), (s1, s2, s3, s4), is_water=water > 0.0)
 
 
 def _depths(depth: DepthLog) -> Iterator[DepthReading]:

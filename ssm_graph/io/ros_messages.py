@@ -8,10 +8,13 @@ neither has to be installed.  Facts that decide signs and axes, and where they c
 * ``marine_acoustic_msgs/Dvl``: instrument axes are x forward, y starboard, z the way it looks.  The
   sign of ``beam_velocity`` is nowhere written down: drivers differ, so the options say it.  No flag
   per beam exists; a negative range, or fewer ``num_good_beams`` than speeds, tells of missing ones.
+  ``velocity_mode`` is 1 for speeds off the bottom and 2 for those off the water; drivers that leave
+  it 0 know the bottom alone.
 * ``dvl_msgs/DVL`` (Water Linked): a beam's velocity is positive when the instrument moves along the
   beam; ids are 0 to 3; the message says nothing about directions. Beams flagged valid in a report
   whose velocity is not may be false locks (17 such reports of 303 in a recorded log); an altitude
-  would tell, but the ROS drivers repeat the last one then. None of these beams is used.
+  would tell, but the ROS drivers repeat the last one then. None of these beams is used. It tracks
+  the bottom alone.
 * ``FluidPressure`` is absolute, in pascal; ``NavSatFix.altitude`` is above the WGS-84 ellipsoid.
 """
 
@@ -45,6 +48,7 @@ FIX_SIGMA: Final = (5.0, 5.0, 10.0)
 
 _NANOSECONDS: Final = 1_000_000_000
 _WATER_TRACK: Final = 2
+"""``DVL_MODE_WATER`` of ``marine_acoustic_msgs``."""
 _COVARIANCE_UNKNOWN: Final = 0
 
 Four = tuple[float, float, float, float]
@@ -134,7 +138,7 @@ def dvl_report(message: Any, received_s: float, options: RosOptions = DEFAULTS) 
     Raises
     ------
     DataError
-        The message is a water track, or its beams are not numbered 0 to 3.
+        The beams of the message are not numbered 0 to 3.
     """
     report = _water_linked if hasattr(message, "beams") else _marine
     return report(message, stamp_s(message, received_s), options)
@@ -200,8 +204,6 @@ CONVERTERS: Final[Mapping[str, Callable[..., Message]]] = {
 
 
 def _marine(message: Any, time_s: float, options: RosOptions) -> DvlReport:
-    if int(message.velocity_mode) == _WATER_TRACK:
-        raise DataError("Dvl: the velocity is through the water, not over ground")
     sign = 1.0 if options.beam_sign is BeamSign.ALONG else -1.0
     sigma = _four(_sigma(value) for value in message.beam_velocity_covar)
     ranges = [float(value) for value in message.range]
@@ -213,6 +215,7 @@ def _marine(message: Any, time_s: float, options: RosOptions) -> DvlReport:
                 for speed, good in zip(message.beam_velocity, _good_beams(message), strict=True)
             ),
             sigma=None if all(math.isnan(value) for value in sigma) else sigma,
+            is_water=int(message.velocity_mode) == _WATER_TRACK,
         ),
         range_m=_four(_range(value) if message.beam_ranges_valid else math.nan for value in ranges),
         beams_d=tuple(_vector(beam) for beam in message.beam_unit_vec),

@@ -166,7 +166,7 @@ def _imu_notes(imu: ImuLog, topic: BagTopic, vehicle: Vehicle | None) -> list[st
 def _dvl(
     bag: Path, table: Array, topic: BagTopic, vehicle: Vehicle | None, options: RosOptions
 ) -> tuple[DvlLog, list[str]]:
-    _, speed, sigma, ranges, velocity_d = np.split(table, [1, 5, 9, 13], axis=1)
+    _, speed, sigma, ranges, velocity_d, water = np.split(table, [1, 5, 9, 13, 16], axis=1)
     if not np.isfinite(speed).any():
         raise DataError(
             f"{bag}: topic {topic.name} holds {len(table)} messages and not one beam speed; "
@@ -193,6 +193,7 @@ def _dvl(
         speed=beams.sign * speed,
         sigma=np.where(np.isnan(sigma), nominal, sigma),
         range_m=ranges if np.isfinite(ranges).any() else None,
+        water_track=water[:, 0] if water.any() else None,
     )
     return log, notes
 

@@ -24,7 +24,9 @@ from ssm_graph.io.ros_messages import (
 from ssm_graph.io.rosbag_beams import stated_beams
 from ssm_graph.io.rosbag_log import REQUIRED_ROLES, BagMessage, read_rosbag
 
-_WIDTHS: Final = {"imu": 7, "dvl": 1 + 3 * N_BEAMS + 3, "depth": 3, "gnss": 7}
+WATER_LATER_S: Final = 1e-3
+"""A ping off the water that has the time of one off the ground is put so much later."""
+_WIDTHS: Final = {"imu": 7, "dvl": 1 + 3 * N_BEAMS + 4, "depth": 3, "gnss": 7}
 
 
 @dataclass(slots=True)
@@ -35,8 +37,9 @@ class BagTopic:
     name: str = ""
     type_name: str = ""
     rows: array[float] = field(default_factory=lambda: array("d"))
-    """IMU: time, gyro, accelerometer; DVL: time, speeds, sigmas, ranges, velocity; depth: time,
-    depth, sigma; GNSS: time, latitude, longitude, height, sigmas. SI units, FRD, NaN if unknown."""
+    """IMU: time, gyro, accelerometer; DVL: time, speeds, sigmas, ranges, velocity, 1 off the water;
+    depth: time, depth, sigma; GNSS: time, latitude, longitude, height, sigmas. SI units, FRD, NaN
+    if unknown."""
     n_messages: int = 0
     refused: list[str] = field(default_factory=list)
     beams_d: Array | None = None
@@ -77,7 +80,7 @@ def _row(item: BagMessage, topic: BagTopic, options: RosOptions) -> Sequence[flo
             topic.beams_d = stated_beams(np.array(report.beams_d))
         sigma = report.ping.sigma or (np.nan,) * N_BEAMS
         beams = (*report.ping.speed, *sigma, *report.range_m)
-        return (report.ping.time_s, *beams, *report.velocity_d)
+        return (report.ping.time_s, *beams, *report.velocity_d, float(report.ping.is_water))
     if item.role == "depth":
         reading = depth_reading(item.message, item.received_s, options)
         return (reading.time_s, reading.depth, depth_sigma(item.message, options))
@@ -86,16 +89,25 @@ def _row(item: BagMessage, topic: BagTopic, options: RosOptions) -> Sequence[flo
     return (position.time_s, position.lat, position.lon, position.height, *position.sigma_enu)
 
 
+def _part_tracks(table: Array) -> list[str]:
+    """Put pings off the water apart from those off the ground, where both have one time."""
+    is_water = table[:, -1] > 0.0
+    together = is_water & np.isin(table[:, 0], table[~is_water, 0])
+    table[together, 0] += WATER_LATER_S
+    n_together = int(together.sum())
+    return [f"{n_together} off the water put 1 ms behind those off the ground"] * (n_together > 0)
+
+
 def in_order(topic: BagTopic) -> tuple[Array, list[str]]:
     """Return the rows with strictly increasing times, and what that took."""
     table = np.array(topic.rows, dtype=float).reshape(-1, _WIDTHS[topic.role])
+    said = _part_tracks(table) if topic.role == "dvl" else []
     n_late = int(np.sum(np.diff(table[:, 0], prepend=-np.inf) < 0.0))
     table = table[np.argsort(table[:, 0], kind="stable")]
     again = np.diff(table[:, 0], prepend=-np.inf) == 0.0
     before = np.roll(table, 1, axis=0)
     alike = np.all((table == before) | (np.isnan(table) & np.isnan(before)), axis=1)
     n_repeats, n_rivals = int(np.sum(again & alike)), int(np.sum(again & ~alike))
-    said = []
     if topic.refused:
         said.append(f"{len(topic.refused)} refused ({topic.refused[0]})")
     if n_late:

@@ -188,6 +188,14 @@ def number(value: object, *, key: str, low: float = -math.inf, high: float = mat
     return result
 
 
+def flag(fields: dict[str, Any], key: str) -> bool:
+    """Return the truth value of a key that must be there."""
+    value = require(fields, key)
+    if not isinstance(value, bool):
+        raise RefusedError(f"{key}: expected true or false, got {shown(value)}")
+    return value
+
+
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     result = dict(pairs)
     if len(result) < len(pairs):

@@ -15,6 +15,7 @@ from ssm_graph.errors import nearest_hint
 from ssm_graph.frames import BodyAxes, turned
 from ssm_graph.live.decoder import (
     RefusedError,
+    flag,
     number,
     parse_object,
     reject_unknown,
@@ -46,11 +47,12 @@ _Beams = tuple[float, float, float, float]
 
 KEYS: Final[dict[str, tuple[str, ...]]] = {
     "imu": ("type", "time_s", "gyro_rad_per_s", "accel_m_per_s2"),
-    "dvl": ("type", "time_s", "beam_m_per_s", "sigma_m_per_s"),
+    "dvl": ("type", "time_s", "beam_m_per_s", "sigma_m_per_s", "water_track"),
     "depth": ("type", "time_s", "depth_m"),
     "gnss": ("type", "time_s", "lat_deg", "lon_deg", "height_m", "sigma_m"),
 }
-"""Type of a message to its keys; of them only ``sigma_m_per_s`` may be left out."""
+"""Type of a message to its keys."""
+_OPTIONAL: Final = frozenset({"sigma_m_per_s", "water_track"})
 
 
 class JsonDecoder(FramedDecoder):
@@ -81,7 +83,7 @@ def decode_message(line: str, *, axes: BodyAxes = BodyAxes.FRD) -> Message:
         raise RefusedError(f"unknown type {shown(kind)}; {hint}")
     reject_unknown(fields, KEYS[kind])
     for key in KEYS[kind]:
-        if key != "sigma_m_per_s":
+        if key not in _OPTIONAL:
             require(fields, key)
     if kind == "gnss":  # all digits of the angles count
         fields = parse_object(line, parse_float=Decimal)
@@ -102,7 +104,10 @@ def encode_message(message: Message, *, axes: BodyAxes = BodyAxes.FRD) -> bytes:
         return _line(type="imu", time_s=message.time_s, gyro_rad_per_s=gyro, accel_m_per_s2=accel)
     if isinstance(message, Ping):
         sigma = {} if message.sigma is None else {"sigma_m_per_s": message.sigma}
-        return _line(type="dvl", time_s=message.time_s, beam_m_per_s=message.speed, **sigma)
+        water = {"water_track": True} if message.is_water else {}
+        return _line(
+            type="dvl", time_s=message.time_s, beam_m_per_s=message.speed, **sigma, **water
+        )
     if isinstance(message, DepthReading):
         return _line(type="depth", time_s=message.time_s, depth_m=message.depth)
     return _line(
@@ -217,7 +222,8 @@ def _imu(fields: dict[str, Any], axes: BodyAxes) -> Message:
 def _dvl(fields: dict[str, Any], _: BodyAxes) -> Message:
     has_sigma = "sigma_m_per_s" in fields
     sigma = _beams(fields, "sigma_m_per_s", low=_SMALLEST_SIGMA) if has_sigma else None
-    return Ping(_time(fields), _beams(fields, "beam_m_per_s"), sigma)
+    is_water = "water_track" in fields and flag(fields, "water_track")
+    return Ping(_time(fields), _beams(fields, "beam_m_per_s"), sigma, is_water=is_water)
 
 
 def _depth(fields: dict[str, Any], _: BodyAxes) -> Message:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
 from typing import Final
 
 from ssm_graph.errors import ConfigError
 from ssm_graph.live.status import LinkState, SourceStatus
-from ssm_graph.messages import Event, ImuSample, Message, Severity
+from ssm_graph.messages import Event, ImuSample, Message
 
 MOST: Final = 1000
 """Messages of one poll."""
@@ -24,7 +24,6 @@ class ReplaySource:
     messages : in order of time.
     speed : 1 is as they were recorded, None as fast as they are taken.
     skip : how many were given to an earlier process of the same run.
-    notes : what of the mission is not among them and a user should know, one sentence each.
     name : for people.
     end_s : time of the last message, for the progress.
     wait : waits so many seconds, and looks after what else there is.
@@ -37,7 +36,6 @@ class ReplaySource:
         *,
         speed: float | None = None,
         skip: int = 0,
-        notes: Sequence[str] = (),
         name: str = "mission",
         end_s: float = float("nan"),
         wait: Callable[[float], None] = time.sleep,
@@ -52,10 +50,6 @@ class ReplaySource:
         self._n_messages = 0
         self._begin_s = self.time_s = 0.0 if self._next is None else self._next.time_s
         self._began_s: float | None = None
-        self._events = [
-            Event(self._begin_s, Severity.WARNING, "left_out", note)
-            for note in (notes if skip == 0 else ())
-        ]
 
     @property
     def is_finished(self) -> bool:
@@ -87,9 +81,8 @@ class ReplaySource:
         return messages
 
     def take_events(self) -> list[Event]:
-        """Return, once, what is left out of the mission; all else goes well here."""
-        events, self._events = self._events, []
-        return events
+        """Return none: all goes well here."""
+        return []
 
     def source_status(self) -> tuple[SourceStatus, ...]:
         """Return how far it is."""

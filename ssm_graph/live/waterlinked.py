@@ -37,6 +37,7 @@ from ssm_graph.live.decoder import (
     Clock,
     RefusedError,
     Stamper,
+    flag,
     number,
     parse_object,
     require,
@@ -121,7 +122,7 @@ class WaterLinkedDecoder(FramedDecoder):
 
     def _counts(self, report: dict[str, Any], beams: list[dict[str, Any]]) -> bool:
         """Return whether the valid beams of a report are to be believed."""
-        is_valid = _flag(report, "velocity_valid")
+        is_valid = flag(report, "velocity_valid")
         has_altitude = number(report.get("altitude", -1.0), key="altitude") > 0.0
         if is_valid:
             return True
@@ -142,7 +143,7 @@ def _transducers(report: dict[str, Any]) -> list[dict[str, Any]]:
         raise RefusedError(f"transducers: expected the numbers 0 to 3, got {shown(str(numbers))}")
     beams = sorted(found, key=lambda beam: int(beam["id"]))
     for beam in beams:
-        _flag(beam, "beam_valid")
+        flag(beam, "beam_valid")
         number(require(beam, "velocity"), key="velocity", low=-_LARGEST_SPEED, high=_LARGEST_SPEED)
     return beams
 
@@ -150,13 +151,6 @@ def _transducers(report: dict[str, Any]) -> list[dict[str, Any]]:
 def _speeds(beams: list[dict[str, Any]]) -> tuple[float, float, float, float]:
     a, b, c, d = (float(x["velocity"]) if x["beam_valid"] else math.nan for x in beams)
     return a, b, c, d
-
-
-def _flag(fields: dict[str, Any], key: str) -> bool:
-    value = require(fields, key)
-    if not isinstance(value, bool):
-        raise RefusedError(f"{key}: expected true or false, got {shown(value)}")
-    return value
 
 
 def _time_of_validity(report: dict[str, Any]) -> float | None:

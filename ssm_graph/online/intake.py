@@ -114,6 +114,9 @@ class Intake:
                     return "implausible", f"body rate {message.gyro_b} rad/s: degrees?"
                 if max(map(abs, message.accel_b)) > LARGEST_FORCE:
                     return "implausible", f"specific force {message.accel_b} m/s^2: a wrong unit?"
+            case Ping():
+                if message.is_water:
+                    return "water_track", "off the water, and the live estimator has no current"
             case DepthReading():
                 if not -HIGHEST_M <= message.depth <= DEEPEST_M:
                     return "implausible", f"depth {message.depth:g} m: a wrong unit?"

@@ -155,6 +155,25 @@ def test_turning_and_moving_agree_with_gnss(missions: dict[str, Mission]) -> Non
     assert 0.97 < abs(scale) < 1.03
 
 
+@needs_logs
+def test_reports_off_the_water_are_marked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No log at hand has any: some reports of one are given the flag."""
+    pytest.importorskip("mcap_protobuf", reason="needs the extra 'blueye'")
+    log = LOGS / f"{DIVE}.mcap"
+    tables, ground = read_blueye_tables(log), convert_blueye(log).dvl
+    flagged = tables.dvl.copy()
+    flagged[len(flagged) // 2 :, 2] = 1.0
+    monkeypatch.setattr(
+        "ssm_graph.io.blueye.read_blueye_tables", lambda _: tables._replace(dvl=flagged)
+    )
+    mission = convert_blueye(log)
+    assert ground.water_track is None
+    n_water = int(mission.dvl.is_water.sum())
+    assert n_water == pytest.approx(len(ground.time_s) / 2, rel=0.1)
+    assert any(f"{n_water} reports off the water" in note for note in mission.notes)
+    np.testing.assert_array_equal(mission.dvl.speed, ground.speed)
+
+
 def test_smoothing_keeps_order_and_gaps() -> None:
     """An even clock with arrival jitter comes back nearly even; a gap stays as long as it was."""
     rng = np.random.default_rng(0)

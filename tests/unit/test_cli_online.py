@@ -74,8 +74,8 @@ def test_a_replay_says_what_it_found_of_the_instruments(
     assert 0.0 < found["sigma"] < found["prior_sigma"] == pytest.approx(0.03)
 
 
-def test_a_replay_leaves_pings_off_the_water_out(tmp_path: Path) -> None:
-    """They are not sent to an estimator that has no current, and an event says so."""
+def test_pings_off_the_water_are_logged_and_left_out(tmp_path: Path) -> None:
+    """An estimator that has no current says so in an event."""
     mission = make_mission()
     water = (np.arange(len(mission.dvl.time_s)) % 4 == 3).astype(float)
     write_mission(tmp_path / "m", replace(mission, dvl=replace(mission.dvl, water_track=water)))
@@ -83,9 +83,10 @@ def test_a_replay_leaves_pings_off_the_water_out(tmp_path: Path) -> None:
     assert main([*words, "--out", str(tmp_path / "run")]) == ExitCode.GOOD
     text = (tmp_path / "run" / "events.jsonl").read_text()
     events = [json.loads(line) for line in text.splitlines()]
-    (event,) = [event for event in events if event["kind"] == "left_out"]
-    assert event["text"].startswith("15 pings off the water are left out")
-    assert len(read_mission(tmp_path / "run" / "log").dvl.time_s) == 15
+    assert "dvl_water_track" in {event["kind"] for event in events}
+    logged = read_mission(tmp_path / "run" / "log").dvl
+    np.testing.assert_array_equal(logged.is_water, water[: len(logged.time_s)] > 0.0)
+    assert logged.is_water.sum() == 5
 
 
 def test_a_run_without_an_answer_has_its_code(

@@ -47,6 +47,7 @@ MESSAGES = st.one_of(
         NUMBER,
         st.tuples(BEAM, BEAM, BEAM, BEAM),
         st.none() | st.tuples(BEAM_SIGMA, BEAM_SIGMA, BEAM_SIGMA, BEAM_SIGMA),
+        st.booleans(),
     ),
     st.builds(DepthReading, NUMBER, NUMBER),
     st.builds(
@@ -126,6 +127,8 @@ def changed(kind: str, **changes: Any) -> str:
     [
         (changed("imu", gyro_rad_per_sec=[1, 2, 3]), "did you mean 'gyro_rad_per_s'"),
         (changed("imu", type="imuu"), "did you mean 'imu'"),
+        (changed("dvl", water_track=1), "water_track: expected true or false, got 1"),
+        (changed("dvl", water_trak=True), "did you mean 'water_track'"),
         (changed("imu", type=None), "'type' is missing"),
         (changed("imu", type=["imu"]), "unknown type"),
         (changed("imu", time_s=None), "'time_s' is missing"),

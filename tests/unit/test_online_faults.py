@@ -43,6 +43,22 @@ def test_a_clock_far_ahead_begins_anew() -> None:
     assert {"clock_gap", "lost"} <= kinds(smoother)
 
 
+def test_pings_off_the_water_do_not_count() -> None:
+    """An estimator without a current answers as if they had not come, and says so."""
+    water = [
+        replace(m, time_s=m.time_s + 0.3, speed=(2.0, 2.1, 2.2, 2.3), is_water=True)
+        for m in messages()
+        if isinstance(m, Ping)
+    ]
+    smoother = pushed(sorted([*messages(), *water], key=lambda m: m.time_s))
+    newest, expected = smoother.newest(), undisturbed()
+    assert newest is not None
+    assert newest.lat == expected.lat
+    np.testing.assert_array_equal(newest.velocity_enu, expected.velocity_enu)
+    assert smoother.counts["dvl water_track"] == len(water)
+    assert "dvl_water_track" in kinds(smoother)
+
+
 def test_a_frozen_report_counts_once() -> None:
     """Every copy with a new stamp is refused, not every other one."""
     pings = [m for m in messages() if isinstance(m, Ping) and m.time_s > 6.0]

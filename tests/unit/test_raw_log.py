@@ -41,7 +41,7 @@ TRIPLES = st.tuples(FLOATS, FLOATS, FLOATS)
 BEAMS = st.tuples(*[st.floats(allow_infinity=False)] * 4)
 MESSAGES = st.one_of(
     st.builds(ImuSample, FLOATS, TRIPLES, TRIPLES),
-    st.builds(Ping, FLOATS, BEAMS, st.none() | BEAMS),
+    st.builds(Ping, FLOATS, BEAMS, st.none() | BEAMS, st.booleans()),
     st.builds(DepthReading, FLOATS, FLOATS),
     st.builds(Fix, FLOATS, st.just(0.8), st.just(2.2), FLOATS, TRIPLES),
 )
@@ -56,7 +56,7 @@ def mixed(n: int) -> list[Message]:
     """Return messages of all kinds whose times are all different, in order of time."""
     kinds: list[Callable[[float], Message]] = [
         lambda t: ImuSample(t, (t, 0.1, 1 / 3), (0.0, -0.0, -9.8)),
-        lambda t: Ping(t, (t, NAN, 0.1, 1e-300)),
+        lambda t: Ping(t, (t, NAN, 0.1, 1e-300), is_water=t > 5.0),
         lambda t: DepthReading(t, 20.0 + t / 3.0),
         lambda t: Fix(t, 0.8, 2.2, -t, (0.5, 0.5, 1.0)),
     ]
@@ -187,6 +187,18 @@ def test_what_is_not_finite_is_logged_as_it_came(tmp_path: Path) -> None:
     assert shown(replayed(tmp_path)[-2:])[0] == repr(bad[0])
     notes = read_mission(tmp_path).notes
     assert sum("1 row of impossible numbers" in note for note in notes) == 2
+
+
+def test_the_log_of_another_version_is_refused(tmp_path: Path) -> None:
+    """Rows of other columns would shift; as a mission it can be read still."""
+    log_of(tmp_path, list(messages_of(make_mission()))).close()
+    path = tmp_path / "dvl.csv"
+    lines = path.read_text().splitlines()
+    path.write_text("".join(f"{line.rpartition(',')[0]}\n" for line in lines))
+    for begin in (RawLog.reopen, replay):
+        with pytest.raises(ConfigError, match=r"dvl\.csv: expected the columns .*water_track"):
+            begin(tmp_path, VEHICLE)
+    assert len(read_mission(tmp_path).dvl.time_s) == len(make_mission().dvl.time_s)
 
 
 def test_a_folder_with_a_mission_is_refused(tmp_path: Path) -> None:

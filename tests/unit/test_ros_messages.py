@@ -194,11 +194,12 @@ def test_marine_beams_without_bottom(changes: dict[str, Any], good: list[int]) -
     assert bad_number(ping(marine(**changes), RECEIVED_S)) is None
 
 
-def test_water_track_is_refused() -> None:
+@pytest.mark.parametrize(("mode", "is_water"), [(0, False), (1, False), (2, True)])
+def test_water_track_is_marked(mode: int, is_water: bool) -> None:
     """Speed through water is no speed over ground; a mode that was not set is bottom track."""
-    with pytest.raises(DataError, match="through the water"):
-        ping(marine(velocity_mode=2), RECEIVED_S)
-    assert ping(marine(velocity_mode=0), RECEIVED_S).speed[0] == 1.0
+    found = ping(marine(velocity_mode=mode), RECEIVED_S)
+    assert found.is_water is is_water
+    assert found.speed[0] == 1.0
 
 
 def test_water_linked_beams_go_by_their_ids() -> None:
