@@ -76,6 +76,10 @@ study file (TOML):
                                      # shape = "drift" grows to the offset, "covered" reads low
                                      # by a share that grows to share, "stuck" keeps its speed
   losses = [{beams = [3], start_s = 300.0, length_s = 180.0}]
+  current = {steady_enu_m_per_s = [0.3, 0.0, 0.0], tide_m_per_s = 0.2, tide_period_s = 44714.0,
+             sigma_m_per_s = 0.1, vertical_sigma_m_per_s = 0.01, correlation_s = 21600.0}
+  water_track = {noise_m_per_s = 0.01, beams = [0, 1, 2, 3], every = 10}  # pings off the water:
+                                     # without bottom lock, and every 10th (0: none) with it
 """
 
 

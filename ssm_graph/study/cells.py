@@ -5,11 +5,12 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
 from ssm_graph.simulation import (
+    CurrentSettings,
     Fault,
     FaultShape,
     Grade,
@@ -17,6 +18,7 @@ from ssm_graph.simulation import (
     OutlierKind,
     Outliers,
     SimulationConfig,
+    WaterTrack,
     scenario_config,
 )
 
@@ -70,15 +72,23 @@ class Cell:
     faults: tuple[StudyFault, ...] = ()
     losses: tuple[Loss, ...] = ()
     dropout_rate: float = 0.0
+    current: CurrentSettings | None = field(default=None, repr=False)
+    """None for that of the scenario."""
+    water_track: WaterTrack | None = field(default=None, repr=False)
+    """None for that of the scenario."""
 
     @property
     def id(self) -> str:
         """Name and digest of the whole definition: runs of another one are never taken for it."""
-        return f"{self.case}#{digest(repr(self))}"
+        water = repr((self.current, self.water_track)) if self.current or self.water_track else ""
+        return f"{self.case}#{digest(repr(self) + water)}"
 
     def clean_config(self, grade: Grade, seed: int) -> SimulationConfig:
-        """Return the settings of the run without DVL errors, which all cells have in common."""
-        return scenario_config(
+        """Return the settings of the run without DVL errors, which all cells have in common.
+
+        A DVL that tracks the water keeps its losses: they decide which pings are off the water.
+        """
+        config = scenario_config(
             self.scenario,
             grade=grade,
             seed=seed,
@@ -87,6 +97,13 @@ class Cell:
             faults=(),
             losses=(),
             dropout_rate=0.0,
+        )
+        water_track = self.water_track or config.water_track
+        return replace(
+            config,
+            current=self.current or config.current,
+            water_track=water_track,
+            losses=self.losses if water_track else (),
         )
 
     def faults_of(self, seed: int) -> tuple[Fault, ...]:

@@ -29,6 +29,7 @@ from ssm_graph.study.cells import (
 )
 from ssm_graph.study.methods import parse_method, parse_methods
 from ssm_graph.study.toml_table import TomlTable
+from ssm_graph.study.water_keys import read_current, read_water_track
 
 _Made = TypeVar("_Made")
 
@@ -162,6 +163,7 @@ def _cells(table: TomlTable, scenario: str, duration_s: float) -> list[Cell]:
     faults = tuple(_fault(entry, duration_s) for entry in table.tables("faults"))
     losses = tuple(_loss(entry, duration_s) for entry in table.tables("losses"))
     dropout_rate = _fraction(table, "dropout_rate", table.number("dropout_rate", 0.0))
+    current, water_track = read_current(table), read_water_track(table)
     table.end()
     if name is not None and len(outliers) > 1:
         raise table.fault(
@@ -170,15 +172,20 @@ def _cells(table: TomlTable, scenario: str, duration_s: float) -> list[Cell]:
             got=name,
             hint="leave it out, the cases name themselves",
         )
-    if name is None and (faults or losses or dropout_rate):
+    if name is None and (faults or losses or dropout_rate or current or water_track):
         raise ConfigError(
-            f"{table.where} name: expected a name for a case with faults, losses or dropouts, "
-            'got nothing; try name = "fault"'
+            f"{table.where} name: expected a name for a case with faults, losses, dropouts or "
+            'currents, got nothing; try name = "fault"'
         )
-    return [
-        Cell(name or _case_name(each), scenario, duration_s, each, faults, losses, dropout_rate)
-        for each in outliers
-    ]
+    case = replace(
+        Cell("", scenario, duration_s),
+        faults=faults,
+        losses=losses,
+        dropout_rate=dropout_rate,
+        current=current,
+        water_track=water_track,
+    )
+    return [replace(case, case=name or _case_name(each), outliers=each) for each in outliers]
 
 
 def _outliers(table: TomlTable) -> list[Outliers]:

@@ -104,6 +104,12 @@ class TomlTable:
         path = f"{self.where} [[{key}]]"
         return tuple(TomlTable(f"{path} {i}", values) for i, values in enumerate(listed, 1))
 
+    def table(self, key: str) -> TomlTable | None:
+        """Return a table within this one; None where the key is missing."""
+        if not self.has(key):
+            return None
+        return TomlTable(f"{self.where} {key}", self._values[key])
+
     def choices(
         self, key: str, kinds: type[_Choice], default: tuple[_Choice, ...] = MISSING
     ) -> tuple[_Choice, ...]:

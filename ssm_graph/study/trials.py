@@ -117,11 +117,14 @@ def simulated_trials(
 
 
 def _simulated_trial(cell: Cell, grade: Grade, seed: int, cache: MissionCache) -> Trial:
+    config = cell.clean_config(grade, seed)
+
     def make() -> tuple[SimulatedMission, Problem]:
-        simulated = simulate(cell.clean_config(grade, seed))
+        simulated = simulate(config)
         return simulated, build_problem(simulated.mission)
 
-    key = (cell.scenario, grade.name, cell.duration_s, seed)
+    water = (config.current, config.water_track, config.losses)
+    key = (cell.scenario, grade.name, cell.duration_s, seed, water)
     clean, problem = cache.get(key, make, length_s=cell.duration_s)
     simulated = with_dvl_errors(
         clean,

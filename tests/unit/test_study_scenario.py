@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from ssm_graph.errors import ConfigError, DataError
-from ssm_graph.simulation import FaultShape, Grade, Loss, OutlierKind
+from ssm_graph.problem.current import CURRENT
+from ssm_graph.simulation import (
+    CurrentSettings,
+    FaultShape,
+    Grade,
+    Loss,
+    OutlierKind,
+    WaterTrack,
+)
 from ssm_graph.study.cells import Cell
 from ssm_graph.study.plan import wanted_keys
 from ssm_graph.study.scenario import Study, read_study, study_from, study_of_folders
-from tests.study_fixture import TINY, tiny_study
+from ssm_graph.study.trials import MissionCache, simulated_trials
+from tests.study_fixture import SPARSE, TINY, tiny_study
 
 STUDIES = sorted((Path(__file__).parents[2] / "benchmarks" / "studies").glob("*.toml"))
 
@@ -158,6 +169,39 @@ def test_grades_and_kinds_are_named_in_lower_case() -> None:
 LOSS = {"start_s": 1.0, "length_s": 2.0}
 
 
+def test_a_case_may_have_a_current() -> None:
+    """The DVL then pings off the water where it has lost the ground; the smoother uses that."""
+    water = {"current": {"steady_enu_m_per_s": [0.3, 0.1, 0.0]}, "water_track": {"every": 4}}
+    loss = {"start_s": 5.0, "length_s": 10.0}
+    (cell,) = cells_of({"name": "w", "losses": [loss], **water})
+    assert cell.current == CurrentSettings(steady_enu=(0.3, 0.1, 0.0))
+    assert cell.water_track == WaterTrack(every=4)
+    (trial,) = simulated_trials(cell, Grade.NAVIGATION, [1], cache=MissionCache())
+    assert trial.simulated is not None
+    dvl, ping_s = trial.mission.dvl, trial.simulated.ping_time_s
+    assert dvl.is_water[(ping_s >= 5.0) & (ping_s < 15.0)].all()
+    assert 0 < dvl.is_water[ping_s < 5.0].sum() < 5
+    assert CURRENT in trial.problem.extras
+    np.testing.assert_allclose(trial.simulated.current.at(ping_s)[:, 0], 0.3)
+
+
+def test_cells_in_other_waters_share_no_mission() -> None:
+    """Nor an id; one that says nothing of the water has the id that it always had."""
+    loss = {"name": "x", "losses": [{"start_s": 5.0, "length_s": 10.0}]}
+    dry, wet, tidal = cells_of(
+        loss | {"name": "d"},
+        loss | {"name": "w", "water_track": {}},
+        {"name": "t", "current": {"tide_m_per_s": 0.2}},
+    )
+    assert len({replace(cell, case="x").id for cell in (dry, wet, tidal)}) == 3
+    cache = MissionCache()
+    for cell in (dry, wet, tidal):
+        (trial,) = simulated_trials(cell, Grade.NAVIGATION, [1], cache=cache)
+        assert trial.mission.dvl.is_water.any() == (cell is wet)
+    assert len(cache) == 3
+    assert SPARSE.id == "sparse10#da995acc4e"
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -205,6 +249,24 @@ LOSS = {"start_s": 1.0, "length_s": 2.0}
             },
             r"\[\[faults\]\] 1: Fault.offset_m_per_s: expected 1 or 1 offsets",
         ),
+        ({"cases": [{"current": {"tide_m_per_s": 0.2}}]}, "name: expected a name for a case with"),
+        (
+            {"cases": [{"name": "x", "current": {"tide": 0.2}}]},
+            r"\[\[cases\]\] 1 current: unknown key 'tide'; .*tide_m_per_s",
+        ),
+        (
+            {"cases": [{"name": "x", "current": {"steady_enu_m_per_s": [1, 2]}}]},
+            "steady_enu_m_per_s: expected three numbers",
+        ),
+        (
+            {"cases": [{"name": "x", "current": {"sigma_m_per_s": -1}}]},
+            "1 current: CurrentSettings.sigma: expected a finite number of at least 0",
+        ),
+        (
+            {"cases": [{"name": "x", "water_track": {"every": 1}}]},
+            "1 water_track: WaterTrack.every: expected 0, or 2 and more, got 1",
+        ),
+        ({"cases": [{"name": "x", "water_track": 3}]}, "water_track: expected a table of keys"),
         ({"cases": [{"name": "x", "faults": [LOSS]}]}, "beams: expected a list of whole numbers"),
     ],
 )
