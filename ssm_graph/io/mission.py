@@ -117,13 +117,23 @@ def _read_tables(toml: MissionToml) -> tuple[dict[str, Table], list[str]]:
 
 
 def _frame(toml: MissionToml, tables: dict[str, Table]) -> LocalFrame:
-    frame = stated_frame(toml, "origin")
-    if frame is None and "gnss" in tables:
-        frame = frame_at(*(float(tables["gnss"][key][0]) for key in POSITION))
-    frame = frame or stated_frame(toml, "initial")
-    if frame is None:
+    frames = (
+        stated_frame(toml, "origin"),
+        _frame_of_first(tables, "gnss"),
+        stated_frame(toml, "initial"),
+        _frame_of_first(tables, "usbl"),
+    )
+    found = next((frame for frame in frames if frame is not None), None)
+    if found is None:
         raise toml.fault_of_no_place()
-    return frame
+    return found
+
+
+def _frame_of_first(tables: dict[str, Table], section: str) -> LocalFrame | None:
+    """Return the frame at the first position of a table."""
+    if section not in tables:
+        return None
+    return frame_at(*(float(tables[section][key][0]) for key in POSITION))
 
 
 def _imu(table: Table, toml: MissionToml) -> ImuLog:

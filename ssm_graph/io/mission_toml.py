@@ -52,7 +52,7 @@ class MissionToml:
         """Return the error of a mission that may be anywhere on Earth."""
         return ConfigError(
             f"{self.file} [origin]: nothing says where on Earth the mission was; add [origin] with "
-            "lat_deg, lon_deg and height_m, or a [gnss] table, or [initial]"
+            "lat_deg, lon_deg and height_m, or a [gnss] or [usbl] table, or [initial]"
         )
 
 

@@ -1,4 +1,4 @@
-"""Finding the initial state from the data: levelling, gyrocompassing, GNSS and DVL, compass.
+"""Finding the initial state from the data: levelling, gyrocompassing, fixes and DVL, compass.
 
 Levelling and gyrocompassing are one fit. In axes that do not turn, the specific force that the
 vehicle's own velocity does not explain integrates to gravity, and gravity turns with the Earth::
@@ -18,9 +18,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ssm_graph.data import Array, GnssLog, ImuNoise, InitialState, Mission
+from ssm_graph.data import Array, ImuNoise, InitialState, Mission
 from ssm_graph.earth import EARTH_RATE, normal_gravity
-from ssm_graph.errors import ConfigError, DataError
 from ssm_graph.frames import (
     R_lb_from_roll_pitch_heading,
     roll_pitch_heading_from_R_lb,
@@ -29,6 +28,7 @@ from ssm_graph.frames import (
 from ssm_graph.imu.increments import merge_samples
 from ssm_graph.problem.body_velocity import BodyVelocities, body_velocities
 from ssm_graph.problem.compass_start import heading_from_compass
+from ssm_graph.problem.start_fixes import MIN_WINDOW_S, StartFixes, start_fixes
 from ssm_graph.problem.track_heading import HeadingFit, heading_from_track
 from ssm_graph.problem.usable import require_usable
 
@@ -39,7 +39,6 @@ CAUTION = 3.0
 """The data that align are used again by the smoother: their sigmas enter its prior this much
 larger, so that counting them twice adds little."""
 MAX_WINDOW_S = 300.0
-MIN_WINDOW_S = 10.0
 COMPASS_FLOOR = math.radians(0.5)
 """No gyrocompass heading is trusted further: a bad ping in the window costs that much."""
 TURN_BUDGET = math.radians(0.5)
@@ -61,49 +60,32 @@ def align(mission: Mission) -> Alignment:
     Raises
     ------
     ConfigError
-        If there is no GNSS fix to give a position.
+        If there is no GNSS or USBL fix to give a position.
     DataError
         If no inertial data follow the first fix.
     """
     require_usable(mission)
-    gnss, fix = _first_fix(mission)
-    start_s = float(gnss.time_s[fix])
     velocities = body_velocities(mission)
+    fixes = start_fixes(mission, velocities)
+    start_s = float(fixes.time_s[0])
     window_s = _window(mission, start_s)
     turned = _integrate_gyros(mission, start_s, window_s, velocities)
     R_lb = _level_and_compass(mission, turned)
     compass = _compass_sigma(mission.imu.noise, turned, mission.frame.lat)
-    track = heading_from_track(mission, start_s, R_lb, velocities)
+    track = heading_from_track(mission, fixes, R_lb, velocities)
     magnetic = heading_from_compass(mission, start_s, R_lb, window_s=window_s)
-    heading, method = _choose_heading(R_lb, compass, track, magnetic)
+    heading, method = _choose_heading(R_lb, compass, track, magnetic, fixes.source)
     level = _level_sigma(mission.imu.noise, turned)
     roll, pitch, _ = roll_pitch_heading_from_R_lb(R_lb)
     starts = [
-        _initial_state(mission, fix, (float(roll), float(pitch), h), level, sigma, velocities)
+        _initial_state(mission, fixes, (float(roll), float(pitch), h), level, sigma, velocities)
         for h, sigma in _hypotheses(heading)
     ]
     method += (
         f"; roll and pitch levelled over {turned.time_s[-1]:.0f} s, sigma "
-        f"{math.degrees(level):.2f} deg"
+        f"{math.degrees(level):.2f} deg; position from {fixes.source}"
     )
     return Alignment(tuple(starts), method)
-
-
-def _first_fix(mission: Mission) -> tuple[GnssLog, int]:
-    gnss = mission.gnss
-    if gnss is None or len(gnss.time_s) == 0:
-        raise ConfigError(
-            "mission.toml: expected [initial] or [gnss], got neither; without one of them the "
-            "start is unknown: add [initial] with position, attitude and their sigmas"
-        )
-    usable = np.flatnonzero(gnss.time_s >= mission.imu.start_s)
-    if len(usable) == 0 or gnss.time_s[usable[0]] > mission.imu.time_s[-1] - MIN_WINDOW_S:
-        raise DataError(
-            f"alignment: expected a GNSS fix at least {MIN_WINDOW_S:.0f} s before the end of the "
-            f"inertial data at {mission.imu.time_s[-1]:.3f} s, got fixes "
-            f"{gnss.time_s[0]:.3f}..{gnss.time_s[-1]:.3f} s; check the clocks or add [initial]"
-        )
-    return gnss, int(usable[0])
 
 
 def _window(mission: Mission, start_s: float) -> float:
@@ -196,14 +178,14 @@ def _level_sigma(noise: ImuNoise, turned: _Turned) -> float:
 
 
 def _choose_heading(
-    R_lb: Array, compass: float, track: HeadingFit, magnetic: HeadingFit
+    R_lb: Array, compass: float, track: HeadingFit, magnetic: HeadingFit, fixes: str
 ) -> tuple[HeadingFit, str]:
     """Return the heading of smallest sigma and a sentence that says where it is from."""
     if compass <= min(track.sigma, magnetic.sigma):
         fit = HeadingFit(float(roll_pitch_heading_from_R_lb(R_lb)[2]), compass)
         source = "gyrocompassing"
     elif track.sigma <= magnetic.sigma:
-        fit, source = track, "GNSS against DVL displacement"
+        fit, source = track, f"{fixes} against DVL displacement"
     else:
         fit, source = magnetic, "the compass"
     if fit.sigma > SAFE_HEADING_SIGMA:
@@ -231,19 +213,17 @@ def _hypotheses(fit: HeadingFit) -> list[tuple[float, float]]:
 
 def _initial_state(
     mission: Mission,
-    fix: int,
+    fixes: StartFixes,
     roll_pitch_heading: tuple[float, float, float],
     level_sigma: float,
     heading_sigma: float,
     velocities: BodyVelocities,
 ) -> InitialState:
-    gnss, frame = mission.gnss, mission.frame
-    assert gnss is not None
-    start_s = float(gnss.time_s[fix])
+    frame, antenna_n = mission.frame, fixes.position_n[0]
+    start_s = float(fixes.time_s[0])
     R_lb = R_lb_from_roll_pitch_heading(*roll_pitch_heading)
-    antenna_n = frame.p_n_from_geodetic(gnss.lat[fix], gnss.lon[fix], gnss.height[fix])
     lat, lon, height = frame.geodetic_from_p_n(
-        antenna_n - frame.R_nl_at(antenna_n) @ R_lb @ gnss.lever_arm_b
+        antenna_n - frame.R_nl_at(antenna_n) @ R_lb @ fixes.lever_arm_b
     )
     speed = float(np.linalg.norm(velocities.at(np.array([start_s]))))
     across = speed * min(heading_sigma, 2.0)
@@ -259,7 +239,7 @@ def _initial_state(
         pitch=pitch,
         heading=heading % (2.0 * math.pi),
         velocity_enu=R_lb @ velocities.at(np.array([start_s]))[0],
-        position_sigma_enu=CAUTION * gnss.sigma_enu[fix],
+        position_sigma_enu=CAUTION * fixes.sigma_enu[0],
         velocity_sigma_enu=np.full(3, velocity_sigma),
         attitude_sigma=np.array([level, level, heading_sigma]),
     )

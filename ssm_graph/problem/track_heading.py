@@ -1,4 +1,4 @@
-"""Heading from the displacement that GNSS sees against the one that DVL and gyros see."""
+"""Heading from the displacement that fixes see against the one that DVL and gyros see."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from scipy.spatial.transform import Rotation
 from ssm_graph.data import Array, Mission
 from ssm_graph.imu.increments import merge_samples
 from ssm_graph.problem.body_velocity import BodyVelocities
+from ssm_graph.problem.start_fixes import StartFixes
 
 SILENCE_S = 5.0
 """A gap between pings that ends the dead reckoning."""
 INDEPENDENT_FIXES = 4
-"""GNSS errors change slowly: never count on more independent fixes than this."""
+"""Errors of GNSS change slowly: never count on more independent fixes than this."""
 
 
 class HeadingFit(NamedTuple):
@@ -26,32 +27,30 @@ class HeadingFit(NamedTuple):
 
 
 def heading_from_track(
-    mission: Mission, start_s: float, R_lb: Array, velocities: BodyVelocities
+    mission: Mission, fixes: StartFixes, R_lb: Array, velocities: BodyVelocities
 ) -> HeadingFit:
-    """Turn the dead-reckoned track onto the GNSS track, over the stretch that fixes it best.
+    """Turn the dead-reckoned track onto that of the fixes, over the stretch that fixes it best.
 
     Parameters
     ----------
-    mission : with GNSS.
-    start_s : begin of the track, s.
+    mission : whose inertial data and pings are used.
+    fixes : from the first of which the track begins.
     R_lb : (3, 3) body to local level at the start; its heading is what is sought, so any will do.
     velocities : of the body at the pings.
     """
-    gnss = mission.gnss
-    assert gnss is not None
-    time_s, track_l, antenna_l = _dead_reckon(mission, start_s, R_lb, velocities)
-    used = (gnss.time_s >= start_s) & (gnss.time_s <= time_s[-1])
-    fix_n = mission.frame.p_n_from_geodetic(gnss.lat[used], gnss.lon[used], gnss.height[used])
+    time_s, track_l, antenna_l = _dead_reckon(mission, fixes, R_lb, velocities)
+    used = fixes.where(fixes.time_s <= time_s[-1])
+    fix_n = used.position_n
     if len(fix_n) < 3:
         return HeadingFit(0.0, math.inf)
     fix_l = (fix_n @ mission.frame.R_nl_at(fix_n[0]))[:, :2]
     seen_l = np.stack(
-        [np.interp(gnss.time_s[used], time_s, axis) for axis in (track_l + antenna_l)[:, :2].T],
+        [np.interp(used.time_s, time_s, axis) for axis in (track_l + antenna_l)[:, :2].T],
         axis=-1,
     )
-    noise = float(np.sqrt(np.mean(gnss.sigma_enu[used, :2] ** 2)))
+    noise = float(np.sqrt(np.mean(used.sigma_enu[:, :2] ** 2)))
     drift = mission.imu.noise.gyro_bias_sigma
-    elapsed = gnss.time_s[used] - start_s
+    elapsed = used.time_s - time_s[0]
     fits = [
         _fit(seen_l[:n], fix_l[:n], noise=noise, drift=0.5 * drift * elapsed[n - 1])
         for n in np.unique(np.geomspace(3, len(fix_l), 20).astype(int))
@@ -73,23 +72,22 @@ def _fit(seen: Array, fixed: Array, *, noise: float, drift: float) -> HeadingFit
 
 
 def _dead_reckon(
-    mission: Mission, start_s: float, R_lb: Array, velocities: BodyVelocities
+    mission: Mission, fixes: StartFixes, R_lb: Array, velocities: BodyVelocities
 ) -> tuple[Array, Array, Array]:
     """Return times (N,), track (N, 3) and antenna offset (N, 3) in the level axes assumed, m."""
-    gnss = mission.gnss
-    assert gnss is not None
-    end_s = min(float(gnss.time_s[-1]), float(mission.imu.time_s[-1]))
+    start_s = float(fixes.time_s[0])
+    end_s = min(float(fixes.time_s[-1]), float(mission.imu.time_s[-1]))
     pings = velocities.time_s[(velocities.time_s > start_s) & (velocities.time_s < end_s)]
     silent = np.flatnonzero(np.diff(pings, prepend=start_s) > SILENCE_S)
     pings = pings[: silent[0]] if len(silent) else pings
     time_s = np.concatenate([[start_s], pings])
     if len(time_s) < 2:
-        return time_s, np.zeros((1, 3)), (R_lb @ gnss.lever_arm_b)[None, :]
+        return time_s, np.zeros((1, 3)), (R_lb @ fixes.lever_arm_b)[None, :]
     R = gyro_attitudes(mission, time_s, R_lb)
     v_l = np.einsum("kij,kj->ki", R, velocities.at(time_s))
     step = 0.5 * (v_l[1:] + v_l[:-1]) * np.diff(time_s)[:, None]
     track = np.concatenate([np.zeros((1, 3)), np.cumsum(step, axis=0)])
-    return time_s, track, R @ gnss.lever_arm_b
+    return time_s, track, R @ fixes.lever_arm_b
 
 
 def gyro_attitudes(mission: Mission, time_s: Array, R_lb: Array) -> Array:

@@ -112,12 +112,13 @@ def _choose(estimates: list[Estimate], alignment: Alignment) -> Estimate:
             status=Status.SUSPECT,
             reason=(
                 f"heading ambiguous: {found}, but {', '.join(f'{r:.0f}' for r in rivals)} deg "
-                "explain the data as well; move more while GNSS is there, or give [initial]"
+                "explain the data as well; move more while there are fixes, or give [initial]"
             ),
         )
     if sigma > POOR_HEADING:
         found = (
-            f"heading hardly observable: {found}; move more while GNSS is there, or give [initial]"
+            f"heading hardly observable: {found}; move more while there are fixes, or give "
+            "[initial]"
         )
     return _with_notes(best, (found,))
 
