@@ -31,6 +31,11 @@ def is_constant_of_aid(name: str) -> bool:
     return name.startswith(BEACON) or name in _CONSTANTS_OF_HEADING
 
 
+def is_of_aid(name: str) -> bool:
+    """Return whether an extra variable is of a further aid, lasting or not."""
+    return is_constant_of_aid(name) or name == HEADING_WALK
+
+
 def not_used(sections: Sequence[str]) -> tuple[str, ...]:
     """Return the note of an estimator without further aids, if the mission has some."""
     if not sections:

@@ -21,9 +21,10 @@ from ssm_graph.graph.states import States
 from ssm_graph.problem.problem import Problem, with_fast_noise
 from ssm_graph.problem.trajectory import trajectory_from_states
 from ssm_graph.smoothers.aid_weights import AidKernel, AidWeighing
-from ssm_graph.smoothers.beam_faults import FaultSearch, FaultWatch
+from ssm_graph.smoothers.beam_faults import FaultSearch
 from ssm_graph.smoothers.calibrated import calibration_of, undetermined
 from ssm_graph.smoothers.current import current_of
+from ssm_graph.smoothers.fault_watch import FaultWatch
 from ssm_graph.smoothers.gnc import GncSchedule, Graduation, Schedule, WarmSchedule
 from ssm_graph.smoothers.noise import MAX_ADAPTATIONS, adaptation, noise_notes, with_sigmas
 from ssm_graph.smoothers.passes import Pass, Solved, descend, noise_of
@@ -177,7 +178,11 @@ class SsmSmoother:
             is_settled = max(this.update_sigmas, this.weight_change) < self.config.tolerance
             is_settled = is_settled and schedule.may_end(this.weights) and aids.may_end
             has_news = faults.look(
-                states, rows, update_sigmas=this.update_sigmas, is_settled=is_settled
+                states,
+                rows,
+                update_sigmas=this.update_sigmas,
+                is_settled=is_settled,
+                aid_weights=aids.settled,
             )
             if is_settled and not has_news:
                 status = Status.CONVERGED

@@ -12,13 +12,13 @@ calibration error of the whole array would explain, scale or mounting, is nobody
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.similarity import WEIGHT_FLOOR, LogKernel
+from factors.similarity import LogKernel
 from ssm_graph.data import N_BEAMS, Array
 from ssm_graph.errors import ConfigError
 from ssm_graph.graph.beam_evidence import ChainEvidence, Evidence, WhitenedBeams
@@ -26,11 +26,7 @@ from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.states import States
 from ssm_graph.graph.water_rows import WaterRows
-from ssm_graph.problem.current import CURRENTS
-from ssm_graph.problem.error_state import STATE_DIM
-from ssm_graph.problem.further_aids import NO_FURTHER
-from ssm_graph.problem.problem import Problem, with_stated_noise
-from ssm_graph.smoothers.gnc import NEAR_SIGMAS
+from ssm_graph.problem.problem import Problem
 
 Mask = NDArray[np.bool_]
 
@@ -45,8 +41,6 @@ FREE_INFORMATION = 1e-6
 """Of the offset of a stretch that is let free, and the least to judge one by: 1000 sigmas."""
 MAX_FOUND = 100
 """Stretches that are taken out of one piece."""
-FREE_LOOKS = 2
-"""So often a search may take back what the one before it found."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,14 +84,21 @@ class Found(NamedTuple):
 
 
 def find_beam_faults(
-    linearizer: GraphLinearizer, states: States, rows: BeamRows, search: FaultSearch
+    linearizer: GraphLinearizer,
+    states: States,
+    rows: BeamRows,
+    search: FaultSearch,
+    aid_weights: Array | None = None,
 ) -> Found:
-    """Search the whole mission, linearised at ``states`` near the answer."""
+    """Search the whole mission, linearised at ``states`` near the answer.
+
+    ``aid_weights`` are those of the further aids' measurements; all one when left out.
+    """
     problem, beams = linearizer.problem, linearizer.problem.beams
     jacobian = rows.jacobian
     weights = KERNEL.weight((rows.error / beams.sigma) ** 2)
     linearizer.follow(states)
-    solution = linearizer.solve(states, rows, weights).solution
+    solution = linearizer.solve(states, rows, weights, aid_weights).solution
     missed = -rows.error - np.einsum("mi,mi->m", jacobian, solution.step[beams.keyframe])
     scale = np.sqrt(weights) / beams.sigma
     whitened = WhitenedBeams(
@@ -248,72 +249,3 @@ def stretch_chi_sq(evidence: Evidence, beam: int, n_blocks: int) -> Array:
     usable = np.triu(information > FREE_INFORMATION, 1)
     chi_sq: Array = np.divide(square, information, out=np.zeros_like(square), where=usable)
     return chi_sq
-
-
-class FaultWatch:
-    """Keeps the beams out of a solution that the search finds, while it is iterated."""
-
-    def __init__(self, problem: Problem, search: FaultSearch | None) -> None:
-        self._search = search
-        self._extras, self._current = problem.extras, problem.extras.only(CURRENTS)
-        self._linearizer = None
-        if search is not None:
-            self._linearizer = GraphLinearizer(
-                replace(with_stated_noise(problem), extras=self._current, further=NO_FURTHER)
-            )
-        self._beams, self._time_s = problem.beams, problem.keyframe_s[problem.beams.keyframe]
-        self._found = Found(np.zeros(len(self._time_s), dtype=bool), ())
-        self._n_looks = 0
-
-    def leave_out(self, weights: Array) -> Array:
-        """Return the weights (M,) with the floor for what was found."""
-        return np.where(self._found.is_off, WEIGHT_FLOOR, weights)
-
-    def look(
-        self, states: States, rows: BeamRows, *, update_sigmas: float, is_settled: bool
-    ) -> bool:
-        """Search once the solution is near, and whenever it has settled; return what has changed.
-
-        The first solution may be far off where a fault has not been left out yet: its findings are
-        given up again where a later one disagrees. After ``FREE_LOOKS`` they only become more, so
-        that there is an end to it.
-        """
-        is_due = is_settled or (self._n_looks == 0 and update_sigmas < NEAR_SIGMAS)
-        if self._search is None or self._linearizer is None or not is_due:
-            return False
-        self._n_looks += 1
-        alone, before = self._without_calibration(states, rows), self._found
-        found = find_beam_faults(self._linearizer, *alone, self._search)
-        if self._n_looks > FREE_LOOKS:
-            found = found._replace(is_off=found.is_off | before.is_off)
-        self._found = found
-        return not np.array_equal(found.is_off, before.is_off)
-
-    def _without_calibration(self, states: States, rows: BeamRows) -> tuple[States, BeamRows]:
-        """Return both with the current as the only extra variable."""
-        kept = self._extras.columns_of(self._current)
-        walks = states.walks[:, kept[STATE_DIM:] - STATE_DIM]
-        alone = states._replace(walks=walks, constants=states.constants[:0])
-        return alone, BeamRows(rows.error, rows.jacobian[:, kept])
-
-    def notes(self, error: Array) -> tuple[str, ...]:
-        """Say what was left out; ``error`` (M,) is what the answer misses, predicted - measured."""
-        said = []
-        for beam in range(N_BEAMS):
-            rows = np.flatnonzero(self._beams.beam == beam)
-            edges = np.diff(self._found.is_off[rows].astype(int), prepend=0, append=0)
-            for begin, end in zip(
-                np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True
-            ):
-                left_out = rows[begin:end]
-                said.append(
-                    f"beam {beam + 1} is off from {self._time_s[left_out[0]]:.1f} s to "
-                    f"{self._time_s[left_out[-1]]:.1f} s, by {-np.mean(error[left_out]):+.3f} m/s "
-                    "on average, and left out there"
-                )
-        said.extend(
-            f"one of the beams is off between {begin_s:.0f} s and {end_s:.0f} s, and the data do "
-            "not say which: nothing is left out there"
-            for begin_s, end_s in self._found.doubtful_s
-        )
-        return tuple(said)

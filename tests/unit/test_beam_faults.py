@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from ssm_graph.aid_logs import NO_AIDS
 from ssm_graph.data import Array, DvlLog
 from ssm_graph.errors import ConfigError
 from ssm_graph.estimate import OUTLIER_WEIGHT, Estimate, Status
@@ -14,19 +16,32 @@ from ssm_graph.graph.beam_evidence import Evidence
 from ssm_graph.graph.first_values import first_values
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.problem.problem import build_problem
-from ssm_graph.simulation import Fault, FaultShape, Grade, OutlierKind, Outliers, SimulatedMission
-from ssm_graph.smoothers import beam_faults
+from ssm_graph.simulation import (
+    AidSettings,
+    CompassSettings,
+    Fault,
+    FaultShape,
+    Grade,
+    HoverRoute,
+    Loss,
+    OutlierKind,
+    Outliers,
+    SimulatedMission,
+    UsblSettings,
+)
+from ssm_graph.smoothers import beam_faults, fault_watch
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
 from ssm_graph.smoothers.beam_faults import (
     KERNEL,
     FaultSearch,
-    FaultWatch,
     calibration_columns,
     stretch_chi_sq,
     who_is_off,
     without_shared,
 )
-from tests.helpers import simulated
+from ssm_graph.smoothers.fault_watch import FaultWatch
+from tests.aids_fixture import with_every_aid
+from tests.helpers import simulated, with_initial
 
 SEARCH = SmootherConfig(fault_search=FaultSearch())
 
@@ -63,6 +78,34 @@ def test_the_search_goes_with_calibration() -> None:
     assert estimate.calibration
     (note,) = (note for note in estimate.notes if "left out" in note)
     assert note.startswith("beam 3 is off from ")
+
+
+def test_the_search_goes_by_further_aids() -> None:
+    """Three beams have no parity, and a poor IMU that starts at any velocity believes them all."""
+    aids = AidSettings(
+        usbl=UsblSettings(interval_s=2.0, sigma_horizontal=0.3, sigma_vertical=0.3),
+        compass=CompassSettings(sigma=math.radians(0.3)),
+    )
+    sim = simulated(
+        duration_s=200.0,
+        route=HoverRoute(),
+        grade=Grade.MEMS,
+        losses=(Loss(0.0, 200.0, (0,)),),
+        faults=(Fault((2,), 0.0, 200.0, 0.02),),
+        aids=aids,
+        seed=1,
+    )
+    start = with_initial(sim.mission, velocity_sigma_enu=np.full(3, 1.0))
+    unaided = smoothed(replace(sim, mission=replace(start, aids=NO_AIDS)))
+    assert not any("left out" in note for note in unaided.notes)
+    (note,) = (n for n in smoothed(replace(sim, mission=start)).notes if "left out" in n)
+    assert note.startswith("beam 3 is off from 1.0 s to 200.0 s, by +0.0")
+
+
+def test_errors_of_aids_are_carried_along() -> None:
+    """Those of a compass and the place of a beacon too, and nothing is found."""
+    sim = with_every_aid(duration_s=60.0)
+    assert not any("left out" in note for note in smoothed(sim).notes)
 
 
 @pytest.mark.parametrize(
@@ -173,7 +216,7 @@ def test_findings_stop_changing(monkeypatch: pytest.MonkeyPatch) -> None:
         begin, end = next(answers)
         return beam_faults.Found((np.arange(n_rows) >= begin) & (np.arange(n_rows) < end), ())
 
-    monkeypatch.setattr(beam_faults, "find_beam_faults", undecided)
+    monkeypatch.setattr(fault_watch, "find_beam_faults", undecided)
     states = first_values(problem, kernel=KERNEL).states
     assert not watch.look(states, rows, update_sigmas=3.0, is_settled=False)
     assert watch.look(states, rows, update_sigmas=0.5, is_settled=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factors.beacon_range import range_residual
 from ssm_graph.data import Array
@@ -53,13 +54,15 @@ class RangeAid(WeightedAid):
         """Return whether one of the ranges is to a beacon at a known place."""
         return bool(self.ranges.is_known[self.ranges.beacon[i]])
 
-    def beacons_n(self, constants: Array) -> Array:
-        """Return the places (B, 3) of the beacons at constants (C,), m."""
-        ranges, found = self.ranges, self.ranges.beacon_n.copy()
+    def _places_n(self, at: RowStates, beacon: NDArray[np.intp]) -> Array:
+        """Return the places (..., 3) of the beacons of some ranges, m."""
+        ranges = self.ranges
+        found: Array = ranges.beacon_n[beacon]
         for i in np.flatnonzero(~ranges.is_known):
             name = beacon_name(int(ranges.number[i]))
-            off = self._extras.value(name, np.zeros(0), constants, default=np.zeros(3))
-            found[i] += ranges.R_nl[i] @ off
+            off = self._extras.value(name, at.walks, at.constants, default=np.zeros(3))
+            place_n = ranges.beacon_n[i] + (ranges.R_nl[i] @ off[..., None])[..., 0]
+            found = np.where(np.asarray(beacon == i)[..., None], place_n, found)
         return found
 
     def measured(self, at: RowStates, rows: Rows | int) -> Measured:
@@ -69,7 +72,7 @@ class RangeAid(WeightedAid):
             at.R_nb,
             at.p_n,
             lever_arm_b=ranges.lever_arm_b,
-            beacon_n=self.beacons_n(at.constants)[beacon],
+            beacon_n=self._places_n(at, beacon),
             range_m=ranges.range_m[rows],
         )
         jacobian = np.zeros((*residual.error.shape, 1, self._extras.width))
