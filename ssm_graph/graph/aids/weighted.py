@@ -87,12 +87,21 @@ class WeightedAids:
         """(M,) components of each measurement"""
         self.measurement = np.repeat(np.arange(len(self.dim)), self.dim)
         """(R,) of each component"""
+        self._last: tuple[States, AidRows] | None = None
 
     def __len__(self) -> int:
         return len(self.dim)
 
     def rows(self, states: States) -> AidRows:
-        """Linearise all of them, not weighted; only where there are any."""
+        """Linearise all of them, not weighted; only where there are any.
+
+        A pass asks for the same states up to four times: the last rows are kept.
+        """
+        if self._last is None or self._last[0] is not states:
+            self._last = states, self._linearised(states)
+        return self._last[1]
+
+    def _linearised(self, states: States) -> AidRows:
         keyframes, errors, jacobians = [], [], []
         for aid in self.all:
             error, jacobian = aid.whitened(aid.at_keyframes(states), np.s_[:])
