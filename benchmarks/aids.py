@@ -8,8 +8,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import math
-import os
-import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -19,7 +17,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
 
-from benchmarks.speed import machine, table
+from benchmarks.report import Report
+from benchmarks.speed import table
 from factors.similarity import GaussianKernel, Kernel, LogKernel
 from ssm_graph.aid_logs import AidLogs, HeadingErrors, Standstill
 from ssm_graph.estimate import Calibration
@@ -291,19 +290,12 @@ def parse_args(argv: Sequence[str] | None = None) -> argparse.Namespace:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run everything and write the report."""
     args = parse_args(argv)
-    load = os.getloadavg()[0]
-    lines: list[str] = []
+    page = Report("aids", "Further aids", argv)
+    lines = [*page.head(), LEGEND]
     for case in CASES:
         print(f"{case.name} ...", file=sys.stderr, flush=True)
         lines += case_lines(case, results_of(case, args.runs))
-    command = shlex.join(["python", "benchmarks/aids.py", *(argv or sys.argv[1:])])
-    about = f"{machine()}; load average before {load:.1f}."
-    text = "\n".join(["# Further aids", "", f"    {command}", "", about, "", LEGEND, *lines])
-    args.out.mkdir(parents=True, exist_ok=True)
-    (args.out / "aids.md").write_text(text, encoding="utf-8")
-    if args.keep:
-        (RESULTS / "aids.md").write_text(text, encoding="utf-8")
-    print(text)
+    page.write("\n".join(lines), (args.out, RESULTS)[: 1 + args.keep])
     return 0
 
 

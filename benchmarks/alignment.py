@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
-import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -22,7 +20,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
 
-from benchmarks.speed import machine, table
+from benchmarks.report import Report
+from benchmarks.speed import table
 from ssm_graph.estimate import Estimate, Status
 from ssm_graph.frames import wrap_to_pi
 from ssm_graph.io.blueye_vehicle import NOISE
@@ -217,18 +216,13 @@ def parse_args(argv: Sequence[str] | None = None) -> argparse.Namespace:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run all missions and print the tables."""
     args = parse_args(argv)
-    about = f"{machine()}; load average before {os.getloadavg()[0]:.1f}."
-    command = shlex.join(["python", "benchmarks/alignment.py", *(argv or sys.argv[1:])])
+    page = Report("alignment", "Alignment in the field", argv)
     rows = []
     for grade, start, seed in product(GRADES, STARTS, range(args.missions)):
         rows.append(run(grade, start, seed))
         print(f"{len(rows)}: {rows[-1]}", file=sys.stderr)
-    lines = ["# Alignment in the field", "", f"    {command}", "", about, "", LEGEND]
-    text = "\n".join([*lines, *report(rows), "", *doubtful(rows), ""])
-    print(text)
-    if args.keep:
-        RESULTS.mkdir(parents=True, exist_ok=True)
-        (RESULTS / "alignment.md").write_text(text, encoding="utf-8")
+    text = "\n".join([*page.head(), LEGEND, *report(rows), "", *doubtful(rows), ""])
+    page.write(text, (RESULTS,)[: int(args.keep)])
     return 0
 
 

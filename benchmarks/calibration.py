@@ -7,8 +7,6 @@
 from __future__ import annotations
 
 import argparse
-import os
-import shlex
 import sys
 import time
 from collections.abc import Sequence
@@ -20,7 +18,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import numpy as np
 
 from benchmarks.calibration_cases import DVL, asking, knowing_dvl, wrong_dvl
-from benchmarks.speed import machine, table
+from benchmarks.report import Report
+from benchmarks.speed import table
 from factors.similarity import GaussianKernel, Kernel, LogKernel
 from ssm_graph.data import Array, Mission, Reference
 from ssm_graph.estimate import Estimate
@@ -275,8 +274,8 @@ def parse_args(argv: Sequence[str] | None = None) -> argparse.Namespace:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run everything and write the report."""
     args = parse_args(argv)
-    load = os.getloadavg()[0]
-    lines = []
+    page = Report("calibration", "Calibration", argv)
+    lines = [*page.head(), LEGEND]
     for name, kernel, rate in (
         ("clean beams, gaussian kernel", GaussianKernel(), 0.0),
         ("10 % of the pings with an outlier, log kernel", LogKernel(), 0.1),
@@ -289,14 +288,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         lines += transit_lines(f"{name}, 10 min, calm", runs)
     _note("time")
     lines += time_lines(args.minutes, *times(args.minutes, args.repeats))
-    command = shlex.join(["python", "benchmarks/calibration.py", *(argv or sys.argv[1:])])
-    about = f"{machine()}; load average before {load:.1f}."
-    text = "\n".join(["# Calibration", "", f"    {command}", "", about, "", LEGEND, *lines])
-    args.out.mkdir(parents=True, exist_ok=True)
-    (args.out / "calibration.md").write_text(text, encoding="utf-8")
-    if args.keep:
-        (RESULTS / "calibration.md").write_text(text, encoding="utf-8")
-    print(text)
+    page.write("\n".join(lines), (args.out, RESULTS)[: 1 + args.keep])
     return 0
 
 

@@ -7,8 +7,6 @@
 from __future__ import annotations
 
 import argparse
-import os
-import shlex
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -20,7 +18,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
 
-from benchmarks.speed import machine, table
+from benchmarks.report import Report
+from benchmarks.speed import table
 from ssm_graph.data import Array, Mission
 from ssm_graph.estimate import Estimate, Status
 from ssm_graph.evaluation import evaluate
@@ -268,18 +267,13 @@ def parse_args(argv: Sequence[str] | None = None) -> argparse.Namespace:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run all missions and print the tables."""
     args = parse_args(argv)
-    about = f"{machine()}; load average before {os.getloadavg()[0]:.1f}."
-    command = shlex.join(["python", "benchmarks/currents.py", *(argv or sys.argv[1:])])
+    page = Report("currents", "Water track in a current", argv)
     rows, begin_s = [], time.monotonic()
     for row in runs([Grade[name.upper()] for name in args.grades], range(args.missions)):
         rows.append(row)
         print(f"{time.monotonic() - begin_s:.0f} s: {row}", file=sys.stderr, flush=True)
-    lines = ["# Water track in a current", "", f"    {command}", "", about, "", LEGEND]
-    text = "\n".join([*lines, *report(rows)])
-    print(text)
-    if args.keep:
-        RESULTS.mkdir(parents=True, exist_ok=True)
-        (RESULTS / "currents.md").write_text(text, encoding="utf-8")
+    text = "\n".join([*page.head(), LEGEND, *report(rows)])
+    page.write(text, (RESULTS,)[: int(args.keep)])
     return 0
 
 

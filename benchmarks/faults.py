@@ -33,7 +33,8 @@ from benchmarks.faults_data import data_cases
 from benchmarks.faults_judge import HEADER, RULES, Row, judge, share_text
 from benchmarks.faults_process import PROCESS_ROWS, run_process_row
 from benchmarks.faults_transforms import untouched
-from benchmarks.speed import machine, table
+from benchmarks.report import machine
+from benchmarks.speed import table
 from ssm_graph.messages import Health
 
 PROCESS = """\

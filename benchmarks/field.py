@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
-import shlex
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
@@ -38,7 +36,8 @@ from benchmarks.field_runs import (
     track_of,
     used_fixes,
 )
-from benchmarks.speed import machine, table
+from benchmarks.report import Report
+from benchmarks.speed import table
 from ssm_graph.data import Mission
 from ssm_graph.report.compare_style import add_footnote, new_figure, save
 from ssm_graph.report.style import ESTIMATE, INK, OUTLIER, REFERENCE, dress
@@ -232,21 +231,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"{LOGS}: no real logs; set SSM_GRAPH_DATA to the folder that holds blueye_x3")
         return 1
     runs, methods = args.runs.split(","), args.methods.split(",")
-    about = f"{machine()}; load average before {os.getloadavg()[0]:.1f}."
-    command = shlex.join(["python", "benchmarks/field.py", *(argv or sys.argv[1:])])
+    page = Report("field", "Real runs", argv)
     missions = {(run, mode): make(load(run)) for run in runs for mode, make in MODES.items()}
     scores: Scores = {}
     for case in cases(runs, methods, args.seeds):
         scores[case] = evaluate_case(missions[case.run, case.calibration], case)
         print(f"{case}: {scores[case].rms_m:.2f} m, {scores[case].status}", file=sys.stderr)
-    lines = ["# Real runs", "", f"    {command}", "", about, "", LEGEND]
-    text = "\n".join(
-        [*lines, *report(scores), *calibration_lines(scores), *cuts_lines(missions), ""]
-    )
-    print(text)
-    for reports, figures in ((args.out, args.out), (RESULTS, DOCS))[: 1 + args.keep]:
-        reports.mkdir(parents=True, exist_ok=True)
-        (reports / "field.md").write_text(text, encoding="utf-8")
+    lines = [*page.head(), LEGEND, *report(scores)]
+    lines += [*calibration_lines(scores), *cuts_lines(missions), ""]
+    page.write("\n".join(lines), (args.out, RESULTS)[: 1 + args.keep])
+    for figures in (args.out, DOCS)[: 1 + args.keep]:
         save(draw(scores, missions, runs), figures / "field.png")
     return 0
 

@@ -9,10 +9,8 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import os
 import random
 import resource
-import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -21,7 +19,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.speed import machine, table
+from benchmarks.report import Report
+from benchmarks.speed import table
 from ssm_graph.live.decoder import MAX_REFUSALS, Decoder
 from ssm_graph.live.framing import MAX_LENGTH
 from ssm_graph.live.json_messages import JsonDecoder, encode_message
@@ -316,7 +315,7 @@ def parse_args(argv: Sequence[str] | None = None) -> argparse.Namespace:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run all decoders; return 1 if anything failed."""
     args = parse_args(argv)
-    load = os.getloadavg()[0]
+    page = Report("fuzz", "Damaged traffic", argv)
     warm = targets()
     for target in warm:
         run(target, warm, args.bytes // 20, random.Random(-1 - args.seed))
@@ -326,13 +325,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"{target.name} ...", file=sys.stderr, flush=True)
         run(target, found, args.bytes, random.Random(1000 * args.seed + k))
     growth_mb = peak_mb() - before_mb
-    command = shlex.join(["python", "benchmarks/fuzz.py", *(argv or sys.argv[1:])])
-    lines = ["# Damaged traffic", "", f"    {command}", ""]
-    lines += [f"{machine()}; load average before {load:.1f}.", "", LEGEND]
-    text = "\n".join([*lines, *report_lines(found, growth_mb)]).rstrip() + "\n"
-    print(text)
-    if args.keep:
-        (RESULTS / "fuzz.md").write_text(text, encoding="utf-8")
+    lines = [*page.head(), LEGEND, *report_lines(found, growth_mb)]
+    page.write("\n".join(lines).rstrip() + "\n", (RESULTS,)[: int(args.keep)])
     failed = growth_mb > MAX_GROWTH_MB or any(t.failures for t in (*warm, *found))
     return int(failed)
 

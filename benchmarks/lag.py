@@ -10,8 +10,6 @@ import argparse
 import csv
 import math
 import multiprocessing
-import os
-import shlex
 import sys
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -26,7 +24,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from benchmarks.speed import machine, table
+from benchmarks.report import Report
+from benchmarks.speed import table
 from factors.similarity import LogKernel
 from ssm_graph.data import Array
 from ssm_graph.estimate import Estimate, since_first_ping
@@ -259,20 +258,15 @@ def parse_args(argv: Sequence[str] | None = None) -> argparse.Namespace:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the benchmark; write report, figure and the numbers of every mission."""
     args = parse_args(argv)
-    about = f"{machine()}; load average before {os.getloadavg()[0]:.1f}."
-    command = shlex.join(["python", "benchmarks/lag.py", *(argv or sys.argv[1:])])
+    page = Report("lag", "Error against lag", argv)
     lags = [f"{lag:g}" for lag in sorted(map(float, args.lags.split(",")))]
     rows = run_all(args.missions, args.duration, lags, args.jobs)
     size = f"{args.missions} missions of {args.duration:g} s of each grade"
-    lines = ["# Error against lag", "", f"    {command}", "", about, "", f"{size}.\n{LEGEND}"]
-    lines += findings(rows, lags, args.duration)
+    lines = [*page.head(), f"{size}.\n{LEGEND}", *findings(rows, lags, args.duration)]
     for grade in GRADES:
         lines += grade_lines(rows, grade, [FILTER, *lags, BATCH])
-    text = "\n".join(lines)
-    print(text)
-    for reports, figures in ((args.out, args.out), (RESULTS, DOCS))[: 1 + args.keep]:
-        reports.mkdir(parents=True, exist_ok=True)
-        (reports / "lag.md").write_text(text, encoding="utf-8")
+    page.write("\n".join(lines), (args.out, RESULTS)[: 1 + args.keep])
+    for figures in (args.out, DOCS)[: 1 + args.keep]:
         save(draw(rows, lags, f"Error against lag: {size}"), figures / "lag.png")
     with (args.out / "lag.csv").open("w", encoding="utf-8", newline="") as file:
         csv.writer(file).writerows([Row._fields, *sorted(rows)])

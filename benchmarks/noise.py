@@ -18,7 +18,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
 
-from benchmarks.speed import machine, table
+from benchmarks.report import machine
+from benchmarks.speed import table
 from factors.kernels import KERNELS
 from ssm_graph.data import Array, ImuNoise, Mission
 from ssm_graph.estimate import since_first_ping

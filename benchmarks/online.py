@@ -37,7 +37,8 @@ from benchmarks.online_tasks import (
     stream_theirs,
 )
 from benchmarks.online_theirs import Kind, TheirConfig
-from benchmarks.speed import in_fresh_process, machine
+from benchmarks.report import machine
+from benchmarks.speed import in_fresh_process
 from ssm_graph.online import ONLINE
 
 RESULTS = Path(__file__).resolve().parent / "results"

@@ -22,9 +22,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import numpy as np
 
 from benchmarks.online_stream import HEALTHS
+from benchmarks.report import machine
 from benchmarks.soak_figure import draw, hourly
 from benchmarks.soak_stream import AXES, CASES, HOUR_S, Soaked, longest_run, soak
-from benchmarks.speed import machine, table
+from benchmarks.speed import table
 from ssm_graph.data import Array
 from ssm_graph.report.compare_style import save
 from ssm_graph.simulation import Grade

@@ -9,19 +9,16 @@ from __future__ import annotations
 import argparse
 import math
 import multiprocessing
-import os
-import platform
-import shlex
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from importlib.metadata import version
 from pathlib import Path
 from typing import TypeVar
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from benchmarks.report import Report
 from benchmarks.speed_tasks import (
     PlainStart,
     Timing,
@@ -30,7 +27,6 @@ from benchmarks.speed_tasks import (
     time_plain,
     write_mission,
 )
-from ssm_graph.study.code import code_version
 
 RESULTS = Path(__file__).resolve().parent / "results"
 OURS, PLAIN, FLOOR = "ours", "(a) plain GTSAM script", "(b) native floor"
@@ -125,19 +121,6 @@ def _note(text: str) -> None:
     print(f"{text} ...", file=sys.stderr, flush=True)
 
 
-def machine() -> str:
-    """Return processor, cores and versions."""
-    model = platform.processor() or platform.machine()
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        names = [x for x in cpuinfo.read_text(encoding="utf-8").splitlines() if "model name" in x]
-        model = names[0].partition(":")[2].strip() if names else model
-    return (
-        f"{model}, {os.cpu_count()} cores; ssm-graph {code_version()}, gtsam {version('gtsam')}, "
-        f"numpy {version('numpy')}, Python {platform.python_version()}"
-    )
-
-
 def comparison_lines(minutes: float, timings: dict[str, Timing]) -> list[str]:
     """Return the section that compares ours with (a) and (b)."""
     ours = timings[OURS]
@@ -221,7 +204,7 @@ size of the process, GTSAM and SciPy included.
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the benchmark and write its report."""
     args = parse_args(argv)
-    load = os.getloadavg()[0]
+    page = Report("speed", "Speed", argv)
     with tempfile.TemporaryDirectory() as folder:
         bench = Bench(Path(folder), seed=args.seed, repeats=args.repeats)
         timings = bench.compare(
@@ -231,26 +214,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             plain_tolerance=args.plain_tolerance,
         )
         by_length = bench.lengths(args.lengths)
-    command = shlex.join(["python", "benchmarks/speed.py", *(argv or sys.argv[1:])])
-    lines = [
-        "# Speed",
-        "",
-        f"    {command}",
-        "",
-        f"{machine()}; load average before {load:.1f}.",
-        "",
-        LEGEND,
-    ]
+    lines = [*page.head(), LEGEND]
     lines += comparison_lines(args.minutes, timings)
     if by_length:
         lines += lengths_lines(by_length)
-    text = "\n".join(lines)
-    args.out.mkdir(parents=True, exist_ok=True)
-    (args.out / "speed.md").write_text(text, encoding="utf-8")
-    if args.keep:
-        RESULTS.mkdir(exist_ok=True)
-        (RESULTS / "speed.md").write_text(text, encoding="utf-8")
-    print(text)
+    page.write("\n".join(lines), (args.out, RESULTS)[: 1 + args.keep])
     return 0
 
 
