@@ -27,6 +27,7 @@ def test_the_same_states_are_linearised_once(monkeypatch: pytest.MonkeyPatch) ->
         return whitened(aid, *at)
 
     monkeypatch.setattr(WeightedAid, "whitened", counted)
+    linearizer.follow(states)
     beams = linearizer.beam_rows(states)
     ones = np.ones(len(beams.error))
     step = linearizer.solve(states, beams, ones)
