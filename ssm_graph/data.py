@@ -72,7 +72,7 @@ class Drift:
     """Of each component, SI; above zero makes it a variable of the graph."""
     correlation_s: float = 0.0
     """It forgets within so much, s; above zero where there is a drift."""
-    fast_share: float = 1.0
+    white_share: float = 1.0
     """Of the stated sigmas, what is left as white noise where the drift is modelled, in (0, 1]."""
 
 

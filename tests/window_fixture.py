@@ -54,10 +54,10 @@ def asked(mission: Mission) -> Mission:
         scale_sigma=0.03,
         misalignment_sigma=np.radians(2.0),
         beam_scale_sigma=0.002,
-        drift=Drift(0.01, 40.0, fast_share=0.8),
+        drift=Drift(0.01, 40.0, white_share=0.8),
     )
     gnss = GnssCalibration(
-        lever_arm_sigma=0.1, time_offset_sigma_s=0.1, drift=Drift(0.3, 40.0, fast_share=0.8)
+        lever_arm_sigma=0.1, time_offset_sigma_s=0.1, drift=Drift(0.3, 40.0, white_share=0.8)
     )
     return replace(
         mission,

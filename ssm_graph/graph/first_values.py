@@ -21,10 +21,10 @@ from ssm_graph.data import N_BEAMS, Array
 from ssm_graph.earth import SEMI_MAJOR_AXIS
 from ssm_graph.errors import SolverError
 from ssm_graph.graph.aids.of_problem import weighted_aids
+from ssm_graph.graph.augmented_rows import RowStates
 from ssm_graph.graph.beacon_start import find_beacons
 from ssm_graph.graph.beam_rows import BeamRows, linearize_beams
 from ssm_graph.graph.beam_weights import met_weights, settle_weights, updated_trust
-from ssm_graph.graph.extended_rows import RowStates
 from ssm_graph.graph.forward_aids import ForwardAids
 from ssm_graph.graph.forward_extras import ForwardExtras
 from ssm_graph.graph.inertial_rows import carried_covariance, inertial_graph, pair_rows

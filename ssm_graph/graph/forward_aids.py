@@ -16,8 +16,8 @@ from factors.similarity import WEIGHT_FLOOR, Kernel
 from ssm_graph.data import Array
 from ssm_graph.graph.aids.acoustic import RangeAid
 from ssm_graph.graph.aids.weighted import WeightedAid, WeightedAids
+from ssm_graph.graph.augmented_rows import RowStates
 from ssm_graph.graph.beam_weights import GATE, WEIGHT_ROUNDS
-from ssm_graph.graph.extended_rows import RowStates
 
 
 class Met(NamedTuple):

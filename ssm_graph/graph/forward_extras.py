@@ -6,8 +6,8 @@ import numpy as np
 
 from ssm_graph.data import Array
 from ssm_graph.graph.aids.positions import fix_rows
+from ssm_graph.graph.augmented_rows import AugmentedBeams, PreparedBeams, RowStates
 from ssm_graph.graph.beam_rows import BeamRows
-from ssm_graph.graph.extended_rows import ExtendedBeams, PreparedBeams, RowStates
 from ssm_graph.problem.calibration import DEPTH_OFFSET
 from ssm_graph.problem.current import CURRENTS
 from ssm_graph.problem.error_state import STATE_DIM
@@ -26,7 +26,7 @@ class ForwardExtras:
         self._problem = problem
         extras = problem.extras
         self.walks, self.constants = np.zeros(extras.n_walks), np.zeros(extras.n_constants)
-        self._beams = ExtendedBeams(problem.beams, extras, problem.frame)
+        self._beams = AugmentedBeams(problem.beams, extras, problem.frame)
         self._walk_factor, self._walk_sigma = extras.transitions(np.diff(problem.keyframe_s))
         self._last: PreparedBeams | None = None
 

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from ssm_graph.data import Array
 from ssm_graph.graph.aids.of_problem import full_aids, weighted_aids
+from ssm_graph.graph.augmented_rows import AugmentedBeams, RowStates, states_of
 from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.bordered import BorderedSolution, ChainRows, solve_bordered
-from ssm_graph.graph.extended_rows import ExtendedBeams, RowStates, states_of
 from ssm_graph.graph.inertial_rows import inertial_graph, inertial_rows
 from ssm_graph.graph.marginal_prior import prior_at_start
 from ssm_graph.graph.states import States, retract
@@ -89,7 +89,7 @@ class GraphLinearizer:
         self._gradient, self._span_s = gravity_gradient(problem.frame), np.diff(problem.keyframe_s)
         self.prior = prior_at_start(start_of(problem))
         self.aids, self.weighted = full_aids(problem), weighted_aids(problem)
-        self._beams = ExtendedBeams(problem.beams, problem.extras, problem.frame)
+        self._beams = AugmentedBeams(problem.beams, problem.extras, problem.frame)
         self._n_judged = 0
         factor, sigma = problem.extras.transitions(self._span_s)
         self._walk_factor, self._walk_sigma = factor, sigma

@@ -38,7 +38,7 @@ NOISE: Final = ImuNoise(
 BEAM_SIGMA: Final = 0.06
 """m/s, what a report counts as where its slow errors are not modelled. At 5 reports a second this
 leaves 9 mm/s after half a minute, 1.5 % of the speed under way."""
-DVL_DRIFT: Final = Drift(sigma=0.006, correlation_s=20.0, fast_share=1.0 / 3.0)
+DVL_DRIFT: Final = Drift(sigma=0.006, correlation_s=20.0, white_share=1.0 / 3.0)
 """m/s. The maker states 1 % for the standard edition, 6 mm/s under way; with GNSS throughout, means
 over 2 s miss by 5 mm/s that stay alike for 10 to 20 s. It is common to the beams: what they have
 not in common, their parity, is white, 5 mm/s a report. That leaves 0.02 m/s of white noise, four
@@ -58,7 +58,7 @@ DEPTH_SIGMA: Final = 0.03
 """m; the sensor resolves 1 mm, waves at the surface do not"""
 GNSS_SIGMA_LIMIT: Final = 1.0
 """m; fixes that report more are taken while the antenna surfaces or sinks."""
-GNSS_DRIFT: Final = Drift(sigma=0.5, correlation_s=120.0, fast_share=0.2)
+GNSS_DRIFT: Final = Drift(sigma=0.5, correlation_s=120.0, white_share=0.2)
 """m. Nearly all of the 0.5 m that the receiver reports: successive fixes differ by centimetres.
 Beside the DVL and the gyros, two logs with GNSS throughout are likeliest with 0.3 to 0.5 m that
 stay alike for 120 to 300 s, and 0.01 m of white noise; 0.1 m is left for waves."""

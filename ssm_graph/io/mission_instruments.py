@@ -152,10 +152,10 @@ def _drift(settings: Settings, sigma_key: str) -> Drift:
         raise settings.fault(
             sigma_key, "expected with a drift_correlation_s, got none; 20 is a third of a minute"
         )
-    for key in ("drift_correlation_s", "drift_fast_share"):
+    for key in ("drift_correlation_s", "drift_white_share"):
         if key in settings and sigma == 0.0:
             raise settings.fault(key, f"expected with a {sigma_key} above 0, got none")
-    share = settings.number("drift_fast_share") if "drift_fast_share" in settings else 1.0
+    share = settings.number("drift_white_share") if "drift_white_share" in settings else 1.0
     return Drift(sigma, correlation_s, share)
 
 

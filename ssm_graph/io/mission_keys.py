@@ -32,7 +32,7 @@ _LATE_SIGMA = optional_key(0.0, 10.0, "the unit is seconds, not milliseconds")
 _ARM_SIGMA = optional_key(0.0, 100.0, "the unit is metres")
 _DRIFT: Final[Mapping[str, Key]] = {
     "drift_correlation_s": sigma_key(1e8, "the unit is seconds", required=False),
-    "drift_fast_share": sigma_key(1.0, "all of the noise is 1", required=False),
+    "drift_white_share": sigma_key(1.0, "all of the noise is 1", required=False),
 }
 _WALK = "the unit is that of the data sheet"
 

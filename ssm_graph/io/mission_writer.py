@@ -211,7 +211,7 @@ def _drift_settings(sigma_key: str, drift: Drift) -> dict[str, float]:
     return {
         sigma_key: float(drift.sigma),
         "drift_correlation_s": float(drift.correlation_s),
-        "drift_fast_share": float(drift.fast_share),
+        "drift_white_share": float(drift.white_share),
     }
 
 

@@ -26,8 +26,8 @@ class KeyframeMaker:
     def __init__(self, buffers: Buffers, frame: LocalFrame, config: ProblemConfig) -> None:
         self._buffers, self._frame, self._config = buffers, frame, config
         vehicle = buffers.vehicle
-        self._fast_beams = _fast_share(vehicle.mount.drift)
-        self._fast_fixes = _fast_share(vehicle.gnss_calibration.drift)
+        self._fast_beams = _white_share(vehicle.mount.drift)
+        self._fast_fixes = _white_share(vehicle.gnss_calibration.drift)
         self.not_before_s = -np.inf
         """Where the inertial data have to be before asking again is worth while."""
 
@@ -127,6 +127,6 @@ class KeyframeMaker:
         return position_n, fix_covariance_n(self._frame, position_n, sigma_enu)
 
 
-def _fast_share(drift: Drift) -> float:
+def _white_share(drift: Drift) -> float:
     """Return how much of the stated sigmas is white noise, where a drift is carried beside it."""
-    return drift.fast_share if drift.sigma > 0.0 else 1.0
+    return drift.white_share if drift.sigma > 0.0 else 1.0

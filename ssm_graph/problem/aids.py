@@ -46,7 +46,7 @@ class Fixes(ReadOnlyArrays):
     """(M, 3) rad/s, at the fixes: with a clock in doubt it moves the antenna"""
     lever_arm_b: Array
     """(3,) m"""
-    fast_share: float = 1.0
+    white_share: float = 1.0
     """Of the sigmas, what is white where their drift is a variable"""
 
 
@@ -79,7 +79,7 @@ def fixes_of(mission: Mission, log: GnssLog, timeline: Timeline) -> Fixes:
     fixes = fixes_at(
         mission, log, timeline.fix, time_s=log.time_s[timeline.fix], keyframe=timeline.fix_keyframe
     )
-    return replace(fixes, fast_share=log.calibration.drift.fast_share)
+    return replace(fixes, white_share=log.calibration.drift.white_share)
 
 
 def fixes_at(

@@ -80,7 +80,7 @@ class Beams(ReadOnlyArrays):
     """(M,) off the water instead of the ground: relative to its current"""
     motion: MotionBefore | None = None
     """Inertial readings about the pings, where the DVL's clock or lever arm is in doubt."""
-    fast_share: float = 1.0
+    white_share: float = 1.0
     """Of the sigmas off the ground, what is white where the drift of the DVL is a variable"""
 
 
@@ -102,8 +102,8 @@ class Problem(ReadOnlyArrays):
     further: FurtherAids = NO_FURTHER
     """What only the batch smoother is aided by; another estimator says so."""
     notes: tuple[str, ...] = ()
-    is_noise_fast: bool = False
-    """Whether sigmas of beams and fixes leave out what drifts stand for: :func:`with_fast_noise`"""
+    is_noise_white: bool = False
+    """Whether sigmas of beams and fixes leave out what drifts stand for: `with_white_noise`"""
 
     @property
     def n_keyframes(self) -> int:
@@ -191,30 +191,30 @@ def with_dvl(problem: Problem, mission: Mission) -> Problem:
     return replace(with_stated_noise(problem), beams=beams)
 
 
-def with_fast_noise(problem: Problem) -> Problem:
+def with_white_noise(problem: Problem) -> Problem:
     """Return the problem for an estimator whose variables are its drifts, too.
 
     The sigmas of beams and fixes are then those of white noise alone; as they are stated, they
     stand for what changes slowly as well.
     """
-    return problem if problem.is_noise_fast else _scaled_noise(problem, is_noise_fast=True)
+    return problem if problem.is_noise_white else _scaled_noise(problem, is_noise_white=True)
 
 
 def with_stated_noise(problem: Problem) -> Problem:
     """Return the problem for an estimator without drifts."""
-    return _scaled_noise(problem, is_noise_fast=False) if problem.is_noise_fast else problem
+    return _scaled_noise(problem, is_noise_white=False) if problem.is_noise_white else problem
 
 
-def _scaled_noise(problem: Problem, *, is_noise_fast: bool) -> Problem:
-    power = 1.0 if is_noise_fast else -1.0
+def _scaled_noise(problem: Problem, *, is_noise_white: bool) -> Problem:
+    power = 1.0 if is_noise_white else -1.0
     beams, fixes = problem.beams, problem.fixes
     if DVL_DRIFT in problem.extras:
-        share = np.where(beams.is_water, 1.0, beams.fast_share**power)
+        share = np.where(beams.is_water, 1.0, beams.white_share**power)
         beams = replace(beams, sigma=beams.sigma * share)
     if fixes is not None and GNSS_DRIFT in problem.extras:
-        covariance_n = fixes.covariance_n * fixes.fast_share ** (2.0 * power)
+        covariance_n = fixes.covariance_n * fixes.white_share ** (2.0 * power)
         fixes = replace(fixes, covariance_n=covariance_n)
-    return replace(problem, beams=beams, fixes=fixes, is_noise_fast=is_noise_fast)
+    return replace(problem, beams=beams, fixes=fixes, is_noise_white=is_noise_white)
 
 
 def _without_stuck_beams(mission: Mission) -> tuple[Mission, tuple[str, ...]]:
@@ -263,5 +263,5 @@ def _beams(mission: Mission, ping: Indices, ping_keyframe: Indices, extras: Extr
         ping=row,
         is_water=is_water[row],
         motion=MotionBefore(mission.imu, dvl.ping_s[ping]) if needs_motion(extras) else None,
-        fast_share=dvl.mount.drift.fast_share,
+        white_share=dvl.mount.drift.white_share,
     )

@@ -18,7 +18,7 @@ from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.first_values import FirstValues, first_values
 from ssm_graph.graph.linearize import GraphLinearizer, Step
 from ssm_graph.graph.states import States
-from ssm_graph.problem.problem import Problem, with_fast_noise
+from ssm_graph.problem.problem import Problem, with_white_noise
 from ssm_graph.problem.trajectory import trajectory_from_states
 from ssm_graph.smoothers.aid_weights import AidKernel, AidWeighing
 from ssm_graph.smoothers.beam_faults import FaultSearch
@@ -98,7 +98,7 @@ def _notes_of(first: FirstValues) -> tuple[str, ...]:
 
 def warm_start(problem: Problem) -> FirstValues:
     """Return the states and weights that every smoother of this problem starts from."""
-    return first_values(with_fast_noise(problem), kernel=WARM_KERNEL)
+    return first_values(with_white_noise(problem), kernel=WARM_KERNEL)
 
 
 class SsmSmoother:
@@ -131,7 +131,7 @@ class SsmSmoother:
             If no finite solution was found.
         """
         begin, used = time.perf_counter(), np.ones(N_BEAMS)
-        problem = with_fast_noise(problem)
+        problem = with_white_noise(problem)
         iterations: tuple[Iteration, ...] = ()
         for adaptations in range(MAX_ADAPTATIONS + 1):
             solved = self._solve(problem, first, on_iteration)

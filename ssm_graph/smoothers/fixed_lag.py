@@ -17,7 +17,7 @@ from ssm_graph.data import Array
 from ssm_graph.estimate import Estimate, OnKeyframe
 from ssm_graph.problem.error_state import STATE_DIM
 from ssm_graph.problem.extras import with_extras
-from ssm_graph.problem.problem import Problem, start_of, with_fast_noise
+from ssm_graph.problem.problem import Problem, start_of, with_white_noise
 from ssm_graph.problem.recursive import RecursiveBeams, recursive_estimate
 from ssm_graph.smoothers.calibrated import calibration_of_last, undetermined
 from ssm_graph.smoothers.current import current_along
@@ -77,7 +77,7 @@ def run_fixed_lag(
     problem: Problem, config: FixedLagConfig, *, on_keyframe: OnKeyframe | None = None
 ) -> FixedLagRun:
     """Go through the keyframes one by one."""
-    problem = with_fast_noise(problem)
+    problem = with_white_noise(problem)
     first, *others = keyframes_of(problem)
     sensors = sensors_of(problem)
     window = Window(sensors, config, first, with_extras(start_of(problem), sensors.extras))

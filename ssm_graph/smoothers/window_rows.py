@@ -12,8 +12,8 @@ from factors.depth_height import height_residual
 from factors.dvl_beam import beam_residual
 from ssm_graph.data import Array
 from ssm_graph.graph.aids import positions
+from ssm_graph.graph.augmented_rows import AugmentedBeams, RowStates
 from ssm_graph.graph.beam_rows import BeamRows, rows_of_beams
-from ssm_graph.graph.extended_rows import ExtendedBeams, RowStates
 from ssm_graph.problem.aids import Fixes
 from ssm_graph.problem.calibration import DEPTH_OFFSET
 from ssm_graph.problem.error_state import GYRO_BIAS, POSITION, ROTATION, STATE_DIM, VELOCITY
@@ -33,7 +33,7 @@ def seen_by_beams(sensors: Sensors) -> NDArray[np.intp]:
 def beam_rows(sensors: Sensors, beams: BeamSpeeds, states: AugmentedStates) -> BeamRows:
     """Return errors (M,) in m/s and Jacobians (M, n) of beams, each with its own state."""
     if sensors.extras:
-        return _extended_rows(sensors, beams, states)
+        return _augmented_rows(sensors, beams, states)
     residual = beam_residual(
         states.R_nb,
         states.v_n,
@@ -47,7 +47,7 @@ def beam_rows(sensors: Sensors, beams: BeamSpeeds, states: AugmentedStates) -> B
     return rows_of_beams(residual)
 
 
-def _extended_rows(sensors: Sensors, beams: BeamSpeeds, states: AugmentedStates) -> BeamRows:
+def _augmented_rows(sensors: Sensors, beams: BeamSpeeds, states: AugmentedStates) -> BeamRows:
     count = len(beams.speed)
     table = Beams(
         keyframe=np.arange(count),
@@ -61,7 +61,7 @@ def _extended_rows(sensors: Sensors, beams: BeamSpeeds, states: AugmentedStates)
         ping=np.zeros(count, np.intp),
         is_water=beams.is_water > 0.0,
     )
-    extended = ExtendedBeams(table, sensors.extras, sensors.frame)
+    extended = AugmentedBeams(table, sensors.extras, sensors.frame)
     at = _row_states(states)
     return extended.rows(at, extended.prepare(at.walks, at.constants, at.bias))
 

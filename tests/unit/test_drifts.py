@@ -14,8 +14,8 @@ from ssm_graph.filters.named import filter_problems
 from ssm_graph.problem.problem import (
     build_problem,
     with_dvl,
-    with_fast_noise,
     with_stated_noise,
+    with_white_noise,
 )
 from ssm_graph.simulation import DriftSettings, DvlSettings, GnssSettings
 from ssm_graph.simulation.drifts import draw_drift
@@ -31,16 +31,16 @@ def test_only_what_models_a_drift_leaves_it_out_of_the_noise() -> None:
     mission = simulated(gnss=GNSS).mission
     plain = build_problem(mission)
     stated = build_problem(drifting(mission, OF_DVL, OF_GNSS))
-    fast = with_fast_noise(stated)
+    white = with_white_noise(stated)
     assert plain.fixes is not None
     assert stated.fixes is not None
-    assert fast.fixes is not None
+    assert white.fixes is not None
     np.testing.assert_array_equal(stated.beams.sigma, plain.beams.sigma)
     np.testing.assert_array_equal(stated.fixes.covariance_n, plain.fixes.covariance_n)
-    np.testing.assert_allclose(fast.beams.sigma, 0.25 * plain.beams.sigma)
-    np.testing.assert_allclose(fast.fixes.covariance_n, 0.04 * plain.fixes.covariance_n)
-    assert with_fast_noise(fast) is fast
-    for back in (with_stated_noise(fast), with_dvl(fast, mission)):
+    np.testing.assert_allclose(white.beams.sigma, 0.25 * plain.beams.sigma)
+    np.testing.assert_allclose(white.fixes.covariance_n, 0.04 * plain.fixes.covariance_n)
+    assert with_white_noise(white) is white
+    for back in (with_stated_noise(white), with_dvl(white, mission)):
         np.testing.assert_allclose(back.beams.sigma, plain.beams.sigma)
         assert back.fixes is not None
         np.testing.assert_allclose(back.fixes.covariance_n, plain.fixes.covariance_n)
@@ -49,10 +49,10 @@ def test_only_what_models_a_drift_leaves_it_out_of_the_noise() -> None:
 def test_without_a_drift_all_noise_is_white() -> None:
     """A share alone changes nothing."""
     mission = simulated(gnss=GNSS).mission
-    problem = build_problem(drifting(mission, Drift(fast_share=0.2), Drift(fast_share=0.2)))
-    fast = with_fast_noise(problem)
-    np.testing.assert_array_equal(fast.beams.sigma, problem.beams.sigma)
-    assert not fast.extras
+    problem = build_problem(drifting(mission, Drift(white_share=0.2), Drift(white_share=0.2)))
+    white = with_white_noise(problem)
+    np.testing.assert_array_equal(white.beams.sigma, problem.beams.sigma)
+    assert not white.extras
 
 
 def test_filters_answer_as_without_a_drift() -> None:

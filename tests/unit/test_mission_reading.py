@@ -341,7 +341,7 @@ def test_no_folder(tmp_path: Path) -> None:
 
 def test_drifts_are_read(tmp_path: Path) -> None:
     """Of DVL and GNSS; all of the noise stays white unless a share is given."""
-    dvl = "drift_sigma_m_per_s = 0.006\ndrift_correlation_s = 20\ndrift_fast_share = 0.25"
+    dvl = "drift_sigma_m_per_s = 0.006\ndrift_correlation_s = 20\ndrift_white_share = 0.25"
     gnss = "drift_sigma_m = 0.5\ndrift_correlation_s = 120"
     mission = read_after(
         tmp_path, toml("\n[depth]", f"{dvl}\n\n[depth]"), toml("\n[gnss]", f"\n[gnss]\n{gnss}")
@@ -356,8 +356,8 @@ def test_drifts_are_read(tmp_path: Path) -> None:
     [
         ("drift_sigma_m_per_s = 0.006", "expected with a drift_correlation_s"),
         ("drift_correlation_s = 20.0", "expected with a drift_sigma_m_per_s above 0"),
-        ("drift_fast_share = 0.5", "expected with a drift_sigma_m_per_s above 0"),
-        ("drift_correlation_s = 20.0\ndrift_fast_share = 1.5", "above 0 and up to 1"),
+        ("drift_white_share = 0.5", "expected with a drift_sigma_m_per_s above 0"),
+        ("drift_correlation_s = 20.0\ndrift_white_share = 1.5", "above 0 and up to 1"),
     ],
 )
 def test_a_drift_is_given_whole(tmp_path: Path, keys: str, message: str) -> None:

@@ -11,7 +11,7 @@ from factors.beacon_range import range_residual
 from ssm_graph.data import Array
 from ssm_graph.graph.aids.positions import fix_rows
 from ssm_graph.graph.aids.weighted import Measured, WeightedAid
-from ssm_graph.graph.extended_rows import Rows, RowStates
+from ssm_graph.graph.augmented_rows import Rows, RowStates
 from ssm_graph.problem.aid_errors import beacon_name
 from ssm_graph.problem.aids import Fixes
 from ssm_graph.problem.error_state import POSITION, ROTATION

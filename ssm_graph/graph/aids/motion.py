@@ -11,7 +11,7 @@ from factors.standstill import standstill_residual
 from ssm_graph.data import Array
 from ssm_graph.earth import LocalFrame
 from ssm_graph.graph.aids.weighted import Measured, WeightedAid
-from ssm_graph.graph.extended_rows import Rows, RowStates
+from ssm_graph.graph.augmented_rows import Rows, RowStates
 from ssm_graph.problem.aid_errors import (
     HEADING_OFFSET,
     HEADING_ONE_CYCLE,

@@ -6,7 +6,7 @@ import numpy as np
 
 from factors.gnss_position import fix_residual
 from ssm_graph.data import Array
-from ssm_graph.graph.extended_rows import Rows, RowStates
+from ssm_graph.graph.augmented_rows import Rows, RowStates
 from ssm_graph.problem.aids import Fixes
 from ssm_graph.problem.calibration import GNSS_DRIFT, GNSS_LEVER_ARM, GNSS_TIME_OFFSET
 from ssm_graph.problem.error_state import POSITION, ROTATION, VELOCITY

@@ -18,7 +18,7 @@ from factors.similarity import Similarity
 from ssm_graph.data import Array
 from ssm_graph.estimate import AidTable
 from ssm_graph.graph.aids.rows import AidRows
-from ssm_graph.graph.extended_rows import Rows, RowStates, states_of
+from ssm_graph.graph.augmented_rows import Rows, RowStates, states_of
 from ssm_graph.graph.states import States
 
 

@@ -85,7 +85,7 @@ class PreparedBeams(NamedTuple):
     """(6,) of all pings; None where each has that of its keyframe"""
 
 
-class ExtendedBeams:
+class AugmentedBeams:
     """Beam speeds of a problem whose DVL is to be calibrated, or tracks the water at times."""
 
     def __init__(self, beams: Beams, extras: Extras, frame: LocalFrame) -> None:
