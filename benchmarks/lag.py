@@ -40,9 +40,8 @@ from ssm_graph.report.compare_style import (
     add_legend,
     line,
     new_figure,
-    save,
 )
-from ssm_graph.report.style import EAST_NORTH_UP, dress
+from ssm_graph.report.style import EAST_NORTH_UP, dress, save
 from ssm_graph.simulation import (
     Grade,
     OutlierKind,

@@ -16,7 +16,8 @@ from ssm_graph.report.compare_runs import (
     draw_error_against_size,
     draw_nees,
 )
-from ssm_graph.report.compare_style import looks_of, save
+from ssm_graph.report.compare_style import looks_of
+from ssm_graph.report.style import save
 
 NAMES = (
     "errors_over_time.png",

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-import os
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final
 
 from matplotlib.axis import Axis, XAxis
@@ -16,11 +14,9 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 
-from ssm_graph.errors import DataError
 from ssm_graph.evaluation.comparison import is_oracle
 from ssm_graph.report.style import INK, NORMAL, SMALL
 
-DPI: Final = 150
 MAX_METHODS: Final = 8
 """As many methods or fewer are all shown; of more, those of `DEFAULT_METHODS`."""
 DEFAULT_METHODS: Final = (
@@ -212,16 +208,3 @@ def _plain(value: float, _position: object) -> str:
     mantissa, exponent = f"{value:.0e}".split("e")
     factor = "" if mantissa == "1" else f"{mantissa}\\cdot"
     return f"${factor}10^{{{int(exponent)}}}$"
-
-
-def save(figure: Figure, path: Path) -> Path:
-    """Write a figure, whole or not at all, and return its path."""
-    part = path.with_name(f".{path.stem}.part-{os.getpid()}{path.suffix}")
-    try:
-        figure.savefig(part, dpi=DPI)
-        part.replace(path)
-    except OSError as error:
-        raise DataError(f"{path}: cannot write the figure: {error.strerror or error}") from error
-    finally:
-        part.unlink(missing_ok=True)
-    return path

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,11 +17,11 @@ from ssm_graph.report.beam_panels import draw_beams
 from ssm_graph.report.calibration_panel import draw_calibration
 from ssm_graph.report.current_panel import draw_current
 from ssm_graph.report.error_panels import draw_heading, draw_position, draw_velocity
-from ssm_graph.report.style import INK, SMALL
+from ssm_graph.report.style import INK, SMALL, save
 from ssm_graph.report.track_panel import draw_track
 
 PAGE_INCHES = (8.27, 10.8)
-DPI = 170
+PAGE_DPI = 170
 
 
 def save_figure(
@@ -55,14 +54,7 @@ def save_figure(
         raise DataError(
             f"{path}: cannot write a figure of type {path.suffix!r}; known are {', '.join(known)}"
         )
-    part = path.with_name(f".{path.stem}.part-{os.getpid()}{path.suffix}")
-    try:
-        figure.savefig(part, dpi=DPI)
-        part.replace(path)
-    except OSError as error:
-        raise DataError(f"{path}: cannot write the figure: {error.strerror or error}") from error
-    finally:
-        part.unlink(missing_ok=True)
+    save(figure, path, dpi=PAGE_DPI)
 
 
 def draw_figure(

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ssm_graph.data import Array
+from ssm_graph.errors import DataError
 
 REDUCED_WEIGHT: Final = 0.5
 """A beam speed with less weight than this is shown as one that lost influence."""
@@ -28,6 +32,7 @@ GRID: Final = "#E3E3E3"
 SMALL: Final = 7.0
 """pt"""
 NORMAL: Final = 8.5
+DPI: Final = 150
 
 
 def dress(axes: Axes, *, title: str = "", x: str = "", y: str = "") -> None:
@@ -85,3 +90,16 @@ def time_axis(time_s: Array) -> tuple[float, str]:
         if span <= limit:
             return divisor, f"time since start, {unit}"
     return 3600.0, "time since start, h"
+
+
+def save(figure: Figure, path: Path, *, dpi: int | None = None) -> Path:
+    """Write a figure, whole or not at all, and return its path."""
+    part = path.with_name(f".{path.stem}.part-{os.getpid()}{path.suffix}")
+    try:
+        figure.savefig(part, dpi=dpi or DPI)
+        part.replace(path)
+    except OSError as error:
+        raise DataError(f"{path}: cannot write the figure: {error.strerror or error}") from error
+    finally:
+        part.unlink(missing_ok=True)
+    return path

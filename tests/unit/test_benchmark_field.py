@@ -23,7 +23,7 @@ from benchmarks.field_runs import (
 )
 from ssm_graph.data import Mission
 from ssm_graph.io.blueye_vehicle import GYRO_BIAS
-from ssm_graph.report.compare_style import save
+from ssm_graph.report.style import save
 from ssm_graph.simulation import GnssSettings, Grade, scenario_config, simulate
 
 

@@ -20,7 +20,7 @@ from benchmarks.soak_stream import (
     soak,
 )
 from ssm_graph.messages import Health
-from ssm_graph.report.compare_style import save
+from ssm_graph.report.style import save
 from ssm_graph.simulation import Grade
 
 GOOD, DEGRADED = HEALTHS.index(Health.GOOD), HEALTHS.index(Health.DEGRADED)

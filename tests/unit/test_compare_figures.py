@@ -13,7 +13,7 @@ from matplotlib.image import imread
 
 from ssm_graph.errors import DataError
 from ssm_graph.estimate import BeamTable
-from ssm_graph.report import compare_style
+from ssm_graph.report import style
 from ssm_graph.report.compare_cells import Series, clean_case, end_error_cells, rate_sweeps
 from ssm_graph.report.compare_figures import NAMES, save_figures
 from ssm_graph.report.compare_missions import Example, draw_beam_weights, draw_errors_over_time
@@ -55,7 +55,7 @@ def make_row(case: str, method: str, seed: int, rate: float = NAN, size: float =
 @pytest.fixture(autouse=True)
 def _coarse(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw few pixels, for speed."""
-    monkeypatch.setattr(compare_style, "DPI", 60)
+    monkeypatch.setattr(style, "DPI", 60)
 
 
 def make_rows(methods: tuple[str, ...] = FEW) -> list[Row]:
