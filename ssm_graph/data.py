@@ -155,6 +155,11 @@ class DvlLog(FrozenArrays):
             return np.zeros(len(self.time_s), bool)
         return self.water_track > 0.0
 
+    @property
+    def hears_water(self) -> bool:
+        """Whether a ping off the water has a speed."""
+        return bool(np.isfinite(self.speed[self.is_water]).any())
+
     def of_ground(self) -> DvlLog:
         """Return the pings off the ground alone."""
         if self.water_track is None:

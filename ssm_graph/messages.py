@@ -18,6 +18,7 @@ from ssm_graph.data import (
     shaped,
 )
 from ssm_graph.earth import LocalFrame
+from ssm_graph.water_current import CurrentModel
 
 Vector = tuple[float, float, float]
 
@@ -88,6 +89,10 @@ class Vehicle(FrozenArrays):
     """(3,) body origin to depth sensor, m."""
     gnss_lever_arm_b: Array = shaped(3)
     """(3,) body origin to antenna, m."""
+    water_sigma: float | None = None
+    """Nominal standard deviation of a beam speed off the water, m/s; None for as off the ground."""
+    current: CurrentModel | None = None
+    """What is known of the water's current; None leaves pings off the water out."""
     depth_sigma: float | None = None
     """m; None where there is no depth sensor."""
     depth_calibration: DepthCalibration = DepthCalibration()

@@ -40,6 +40,7 @@ from ssm_graph.io.mission_keys import (
 from ssm_graph.io.mission_units import R_bd_from_rpy, from_si, rpy_from_R_bd
 from ssm_graph.io.settings import TOML_NAME
 from ssm_graph.io.tables import POSITION_SIGMA, TIME, TableFormat, write_table
+from ssm_graph.water_current import CurrentModel
 
 _NOISE_OF_EMPTY_LOG = 0.01
 
@@ -90,13 +91,9 @@ def mission_settings(mission: Mission, table_format: TableFormat) -> dict[str, A
         "dvl": dvl_settings(mission.dvl.mount, nominal_sigma(mission.dvl), suffix),
     }
     if mission.dvl.is_water.any():
-        settings["dvl"]["water_noise_m_per_s"] = _sigma_off_water(mission.dvl)
+        settings["dvl"]["water_noise_m_per_s"] = sigma_off_water(mission.dvl)
     if mission.current is not None:
-        settings["current"] = {
-            "sigma_m_per_s": float(mission.current.sigma),
-            "correlation_s": float(mission.current.correlation_s),
-            "vertical_sigma_m_per_s": float(mission.current.vertical_sigma),
-        }
+        settings["current"] = current_settings(mission.current)
     if mission.depth is not None:
         settings["depth"] = {
             "file": f"depth{suffix}",
@@ -219,13 +216,23 @@ def _given(**values: float) -> dict[str, float]:
     return {key: float(value) for key, value in values.items() if value}
 
 
+def current_settings(model: CurrentModel) -> dict[str, float]:
+    """Return the section ``[current]``."""
+    return {
+        "sigma_m_per_s": float(model.sigma),
+        "correlation_s": float(model.correlation_s),
+        "vertical_sigma_m_per_s": float(model.vertical_sigma),
+    }
+
+
 def nominal_sigma(dvl: DvlLog) -> float:
     """Return the standard deviation that stands for those of all beams off the ground, m/s."""
     sigma = dvl.sigma[~dvl.is_water] if (~dvl.is_water).any() else dvl.sigma
     return float(np.median(sigma)) if sigma.size else _NOISE_OF_EMPTY_LOG
 
 
-def _sigma_off_water(dvl: DvlLog) -> float:
+def sigma_off_water(dvl: DvlLog) -> float:
+    """Return the standard deviation that stands for those of all beams off the water, m/s."""
     return float(np.median(dvl.sigma[dvl.is_water]))
 
 
@@ -233,7 +240,7 @@ def _dvl_table(dvl: DvlLog) -> dict[str, Array]:
     columns = {TIME: dvl.time_s, **_split(SPEED, dvl.speed)}
     nominal = np.full(dvl.sigma.shape, nominal_sigma(dvl))
     if dvl.is_water.any():
-        nominal[dvl.is_water] = _sigma_off_water(dvl)
+        nominal[dvl.is_water] = sigma_off_water(dvl)
     if np.any(dvl.sigma != nominal):
         columns |= _split(SPEED_SIGMA, dvl.sigma)
     if dvl.range_m is not None:

@@ -16,6 +16,7 @@ from ssm_graph.errors import ConfigError
 from ssm_graph.frames import BodyAxes
 from ssm_graph.io.aid_reading import sections_of_aids
 from ssm_graph.io.mission_instruments import (
+    current_model,
     depth_calibration,
     dvl_mount,
     gnss_calibration,
@@ -27,6 +28,7 @@ from ssm_graph.io.mission_instruments import (
 from ssm_graph.io.mission_keys import FORMAT, SECTIONS
 from ssm_graph.io.mission_toml import read_vehicle_toml
 from ssm_graph.io.mission_writer import (
+    current_settings,
     depth_calibration_settings,
     dvl_settings,
     gnss_calibration_settings,
@@ -34,10 +36,12 @@ from ssm_graph.io.mission_writer import (
     initial_settings,
     nominal_sigma,
     origin_settings,
+    sigma_off_water,
 )
 from ssm_graph.io.settings import TOML_NAME
 from ssm_graph.io.tables import Order, TableFormat
 from ssm_graph.messages import Vehicle
+from ssm_graph.water_current import CurrentModel
 
 
 def read_vehicle(path: Path | str) -> Vehicle:
@@ -68,6 +72,8 @@ def read_vehicle(path: Path | str) -> Vehicle:
         imu_noise=imu_noise(toml["imu"]),
         mount=dvl_mount(toml),
         beam_sigma=toml["dvl"].number("beam_noise_m_per_s"),
+        water_sigma=toml["dvl"].number("water_noise_m_per_s") or None,
+        current=current_model(toml["current"]) if "current" in toml else None,
         depth_lever_arm_b=lever_arm_b(toml, "depth"),
         gnss_lever_arm_b=lever_arm_b(toml, "gnss"),
         depth_sigma=toml["depth"].number("noise_m") if "depth" in toml else None,
@@ -82,14 +88,18 @@ def read_vehicle(path: Path | str) -> Vehicle:
 def vehicle_of(mission: Mission) -> Vehicle:
     """Return the vehicle of a recorded mission; its beam sigma is the median of those recorded.
 
-    The offsets of depth and GNSS are those that are left in the mission's values: none.
+    The offsets of depth and GNSS are those that are left in the mission's values: none. It has a
+    current where there are pings off the water: the default one if the mission states none.
     """
     depth, gnss = mission.depth, mission.gnss
+    hears_water = mission.dvl.hears_water
     return Vehicle(
         name=mission.name,
         imu_noise=mission.imu.noise,
         mount=mission.dvl.mount,
         beam_sigma=nominal_sigma(mission.dvl),
+        water_sigma=sigma_off_water(mission.dvl) if hears_water else None,
+        current=(mission.current or CurrentModel()) if hears_water else None,
         depth_lever_arm_b=np.zeros(3) if depth is None else depth.lever_arm_b,
         gnss_lever_arm_b=np.zeros(3) if gnss is None else gnss.lever_arm_b,
         depth_sigma=None if depth is None else depth.sigma,
@@ -134,6 +144,10 @@ def vehicle_settings(vehicle: Vehicle, *, order: Order = Order.ARRIVAL) -> dict[
         settings["origin"] = origin_settings(vehicle.frame)
     settings["imu"] = imu_settings(vehicle.imu_noise, suffix)
     settings["dvl"] = dvl_settings(vehicle.mount, float(vehicle.beam_sigma), suffix)
+    if vehicle.water_sigma is not None:
+        settings["dvl"]["water_noise_m_per_s"] = float(vehicle.water_sigma)
+    if vehicle.current is not None:
+        settings["current"] = current_settings(vehicle.current)
     if vehicle.depth_sigma is not None:
         settings["depth"] = {
             "file": f"depth{suffix}",

@@ -1,4 +1,4 @@
-"""What a vehicle asks the estimator to find of its instruments, and what it cannot have."""
+"""What a vehicle asks the estimator to find beside its states, and what it cannot have."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import numpy as np
 from ssm_graph.earth import LocalFrame
 from ssm_graph.messages import Vehicle
 from ssm_graph.problem.calibration import calibration_extras, taken_as_exact, windowed
+from ssm_graph.problem.current import current_extras
 from ssm_graph.problem.extras import Extras
 from ssm_graph.smoothers.keyframe import Sensors
 
@@ -38,4 +39,6 @@ def sensors_of_vehicle(vehicle: Vehicle, frame: LocalFrame) -> Sensors:
 
 def _asked(vehicle: Vehicle) -> Extras:
     depth = None if vehicle.depth_sigma is None else vehicle.depth_calibration
-    return Extras(calibration_extras(vehicle.mount, depth, vehicle.gnss_calibration))
+    of_water = () if vehicle.current is None else current_extras(vehicle.current)
+    of_instruments = calibration_extras(vehicle.mount, depth, vehicle.gnss_calibration)
+    return Extras((*of_instruments, *of_water))

@@ -13,6 +13,10 @@ from ssm_graph.messages import DepthReading, Fix, ImuSample, Message, Ping, Vehi
 from ssm_graph.online.rows import TimedRows
 from ssm_graph.stuck_beams import STUCK_PINGS, stuck_beams
 
+SPEEDS: Final = slice(1, 1 + N_BEAMS)
+SIGMAS: Final = slice(1 + N_BEAMS, 1 + 2 * N_BEAMS)
+OFF_WATER: Final = 1 + 2 * N_BEAMS
+"""Columns of a ping's row, its time first."""
 PERIOD_EVERY: Final = 100
 DEFAULT_PERIOD_S: Final = 0.01
 """Sampling interval of the inertial data before there are two samples."""
@@ -24,7 +28,7 @@ class Buffers:
     def __init__(self, vehicle: Vehicle) -> None:
         self.vehicle = vehicle
         self.imu = TimedRows(6)
-        self.pings = TimedRows(2 * N_BEAMS)
+        self.pings = TimedRows(2 * N_BEAMS + 1)
         self.depths = TimedRows(1)
         self.fixes = TimedRows(6)
         self._period_s, self._n_imu = DEFAULT_PERIOD_S, 0
@@ -48,7 +52,8 @@ class Buffers:
                 self._n_imu += 1
                 return self.imu.add(np.array([*row, *message.gyro_b, *message.accel_b]))
             case Ping():
-                return self.pings.add(np.array([*row, *message.speed, *self._sigma(message)]))
+                columns = (*row, *message.speed, *self._sigma(message), float(message.is_water))
+                return self.pings.add(np.array(columns))
             case DepthReading():
                 depth = message.depth - self.vehicle.depth_calibration.offset
                 return self.depths.add(np.array([*row, depth]))
@@ -57,11 +62,13 @@ class Buffers:
                 return self.fixes.add(np.array([*row, *place, *message.sigma_enu]))
 
     def _sigma(self, ping: Ping) -> list[float]:
-        given = ping.sigma or (np.nan,) * N_BEAMS
-        return [s if s > 0.0 else self.vehicle.beam_sigma for s in given]
+        given, nominal = ping.sigma or (np.nan,) * N_BEAMS, self.vehicle.beam_sigma
+        if ping.is_water:
+            nominal = self.vehicle.water_sigma or nominal
+        return [s if s > 0.0 else nominal for s in given]
 
     def pings_between(self, begin_s: float, end_s: float) -> Array:
-        """Return the pings (P, 9) after ``begin_s`` up to and with ``end_s``, as they count.
+        """Return the pings (P, 10) after ``begin_s`` up to and with ``end_s``, as they count.
 
         Speeds of stuck beams and those of infinite sigma are kept but not used.
         """
@@ -72,9 +79,9 @@ class Buffers:
         is_stuck = stuck_beams(near[:, 1 : 1 + N_BEAMS])
         here = slice(begin - first, end - first)
         counting = near[here].copy()
-        unused = np.isinf(counting[:, 1 + N_BEAMS :]) | is_stuck[here]
-        counting[:, 1 : 1 + N_BEAMS][unused] = np.nan
-        counting[:, 1 + N_BEAMS :][unused] = self.vehicle.beam_sigma
+        speed, sigma = counting[:, SPEEDS], counting[:, SIGMAS]
+        unused = np.isinf(sigma) | is_stuck[here]
+        speed[unused], sigma[unused] = np.nan, self.vehicle.beam_sigma
         return counting
 
     def drop_before(self, time_s: float) -> None:
@@ -129,7 +136,7 @@ class Buffers:
             vehicle.name,
             frame,
             self.imu_log(-np.inf, end_s, margin=0),
-            DvlLog(vehicle.mount, stamps, pings[:, 1:5], pings[:, 5:]),
+            DvlLog(vehicle.mount, stamps, pings[:, SPEEDS], pings[:, SIGMAS], pings[:, OFF_WATER]),
             depth,
             GnssLog(
                 time_s=fixes[:, 0],
@@ -140,6 +147,7 @@ class Buffers:
                 lever_arm_b=vehicle.gnss_lever_arm_b,
                 calibration=replace(vehicle.gnss_calibration, time_offset_s=0.0),
             ),
+            current=vehicle.current,
         )
 
 
@@ -148,7 +156,7 @@ class Measured(NamedTuple):
 
     time_s: float
     pings: Array
-    """(P, 9) time, speeds, sigmas"""
+    """(P, 10) time, speeds, sigmas, 1 for off the water"""
     fixes: Array
     """(F, 7) time, latitude, longitude, height, sigmas"""
     depths: Array

@@ -115,8 +115,8 @@ class Intake:
                 if max(map(abs, message.accel_b)) > LARGEST_FORCE:
                     return "implausible", f"specific force {message.accel_b} m/s^2: a wrong unit?"
             case Ping():
-                if message.is_water:
-                    return "water_track", "off the water, and the live estimator has no current"
+                if message.is_water and self.buffers.vehicle.current is None:
+                    return "water_track", "off the water, and the vehicle file has no [current]"
             case DepthReading():
                 if not -HIGHEST_M <= message.depth <= DEEPEST_M:
                     return "implausible", f"depth {message.depth:g} m: a wrong unit?"

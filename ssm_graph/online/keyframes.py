@@ -12,7 +12,7 @@ import numpy as np
 from ssm_graph.data import Array, Drift, ImuLog
 from ssm_graph.earth import LocalFrame
 from ssm_graph.imu.preintegration import LIVELY_S, imu_gaps, preintegrate
-from ssm_graph.online.buffers import Buffers, Measured
+from ssm_graph.online.buffers import OFF_WATER, SIGMAS, SPEEDS, Buffers, Measured
 from ssm_graph.problem.aids import fix_covariance_n
 from ssm_graph.problem.ping_motion import PING_WINDOW_S, mean_gyro
 from ssm_graph.problem.problem import ProblemConfig
@@ -59,7 +59,7 @@ class KeyframeMaker:
 
     def _usable_pings(self, begin_s: float, end_s: float) -> Array:
         pings = self._buffers.pings_between(begin_s, end_s)
-        return pings[np.isfinite(pings[:, 1:5]).any(axis=1)]
+        return pings[np.isfinite(pings[:, SPEEDS]).any(axis=1)]
 
     def _covers(self, time_s: float) -> bool:
         """Return whether the inertial data reach far enough beyond a time."""
@@ -111,14 +111,15 @@ class KeyframeMaker:
         return Way(chain.measurements[0], chain.params[0])
 
     def _beams(self, pings: Array, gyro_b: Array) -> BeamSpeeds:
-        row, beam = np.nonzero(np.isfinite(pings[:, 1:5]))
+        row, beam = np.nonzero(np.isfinite(pings[:, SPEEDS]))
+        is_water = pings[row, OFF_WATER]
         return BeamSpeeds(
             beam.astype(float),
-            pings[row, 1 + beam],
-            pings[row, 5 + beam] * self._fast_beams,
+            pings[:, SPEEDS][row, beam],
+            pings[:, SIGMAS][row, beam] * np.where(is_water > 0.0, 1.0, self._fast_beams),
             np.broadcast_to(gyro_b, (len(row), 3)),
             self._buffers.vehicle.mount.beams_b[beam],
-            np.zeros(len(row)),
+            is_water,
         )
 
     def _fixes(self, fixes: Array) -> tuple[Array, Array]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ssm_graph.data import Array
 from ssm_graph.online.reserve import SPEED_SIGMA, Kept, forget, slowed
-from ssm_graph.online.watch import FEW, TORN_PINGS, Contradicted, Watch
+from ssm_graph.online.watch import FEW, TORN_PINGS, Contradicted, Watch, counts_off_the_ground
 from ssm_graph.problem.doubts import TRUSTED
 from ssm_graph.problem.error_state import POSITION, ROTATION, VELOCITY, InitialMoments
 from ssm_graph.smoothers.keyframe import Keyframe
@@ -138,6 +138,7 @@ def watch_after(was: Watch, begun: Window, last: Stretch, doubt: Doubt) -> Watch
         moved = (*(t for t in moved if time_s - t < ASTRAY_S), time_s)
     return Watch(
         last_beam_s=time_s if is_aided else was.last_beam_s,
+        last_ground_s=time_s if counts_off_the_ground(begun) else was.last_ground_s,
         depths_refused=refusals + (refusals == LOCKED_OUT_DEPTHS),
         out_since_s=np.inf if is_aided else was.out_since_s,
         torn_since_s=was.torn_since_s,

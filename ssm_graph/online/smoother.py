@@ -26,6 +26,7 @@ from ssm_graph.online.asked import not_calibrated, sensors_of_vehicle
 from ssm_graph.online.course import REACH_S, Course, Step
 from ssm_graph.online.delayed import Delayed, delayed_of
 from ssm_graph.online.events import EventLog
+from ssm_graph.online.found import found_by
 from ssm_graph.online.intake import Intake
 from ssm_graph.online.keyframes import KeyframeMaker
 from ssm_graph.online.recovery import ASTRAY_TIMES, is_astray
@@ -45,7 +46,6 @@ from ssm_graph.online.watch import Watch
 from ssm_graph.problem.aid_errors import not_used
 from ssm_graph.problem.problem import ProblemConfig
 from ssm_graph.problem.timeline import MIN_SPACING_S
-from ssm_graph.smoothers.calibrated import calibration_of_last
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
 from ssm_graph.smoothers.keyframe import Keyframe
 from ssm_graph.smoothers.window import Window
@@ -282,9 +282,7 @@ class FixedLagSmoother:
         """Return what is known by now beside the state of the vehicle."""
         if self._course is None:
             return Found()
-        step = self._course.newest
-        extras, span_s = step.window.sensors.extras, step.time_s - self._begun_s
-        return Found(calibration_of_last(extras, step.window.newest, span_s=span_s))
+        return found_by(self._course.newest.window, begun_s=self._begun_s)
 
     def status(self) -> tuple[Health, str]:
         """Return the health of the newest answer and one sentence, also before there is one."""

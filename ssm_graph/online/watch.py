@@ -56,7 +56,9 @@ class Watch(NamedTuple):
     """What is remembered from keyframe to keyframe."""
 
     last_beam_s: float = -math.inf
-    """When a beam counted last, s"""
+    """When a beam counted last, off the ground or off the water, s"""
+    last_ground_s: float = -math.inf
+    """When one off the ground did, s"""
     last_fix_s: float = -math.inf
     pings_refused: int = 0
     """Pings in a row that agree with themselves and not with the prediction"""
@@ -125,6 +127,8 @@ def observe(
     watch = watch._replace(force=watch.force + share * (force - watch.force))
     if len(newest.weight):
         watch = _with_beams(watch, newest, share, parity=parity)
+        if counts_off_the_ground(window):
+            watch = watch._replace(last_ground_s=time_s)
     few_since_s = min(watch.few_since_s, time_s) if watch.good_share < FEW else math.inf
     watch = watch._replace(few_since_s=few_since_s)
     if len(keyframe.fix_n):
@@ -167,6 +171,12 @@ def _with_beams(watch: Watch, newest: Stretch, share: float, *, parity: bool) ->
     if len(trusted):
         watch = watch._replace(misfit=watch.misfit + share * (float(trusted.mean()) - watch.misfit))
     return watch
+
+
+def counts_off_the_ground(window: Window) -> bool:
+    """Return whether a beam off the ground counts at the newest keyframe."""
+    is_water = window.keyframes[-1].beams.is_water > 0.0
+    return bool(np.any(window.newest.weight[~is_water] >= TRUSTED))
 
 
 def is_sound(watch: Watch, time_s: float) -> bool:
@@ -240,7 +250,8 @@ def verdict(watch: Watch, *, now_s: float, imu_s: float, covariance: Array) -> V
     """
     since_beam_s, since_fix_s = (imu_s - t for t in (watch.last_beam_s, watch.last_fix_s))
     since_aid_s = min(since_beam_s, since_fix_s)
-    has_lock = since_beam_s < LOCK_LOST_S
+    since_ground_s = imu_s - watch.last_ground_s
+    has_lock = since_ground_s < LOCK_LOST_S
     velocity_sigma = math.sqrt(max(float(np.trace(covariance[VELOCITY, VELOCITY])), 0.0))
     health, reason = Health.GOOD, Health.GOOD.value
     if now_s - imu_s > SILENT_IMU_S:
@@ -256,8 +267,11 @@ def verdict(watch: Watch, *, now_s: float, imu_s: float, covariance: Array) -> V
         health, reason = Health.DEGRADED, watch.contradicted.text
     elif not has_lock:
         health = Health.DEGRADED
-        since = f"for {since_beam_s:.0f} s" if math.isfinite(since_beam_s) else "yet"
-        reason = f"no beam has counted {since}: bottom lock is lost, sigmas grow"
+        beam = "beam" if since_beam_s >= LOCK_LOST_S else "beam off the ground"
+        since = f"for {since_ground_s:.0f} s" if math.isfinite(since_ground_s) else "yet"
+        reason = f"no {beam} has counted {since}: bottom lock is lost, sigmas grow"
+        if since_beam_s < LOCK_LOST_S:
+            reason += ", though less while the water is heard"
     confidence = 0.0
     if health is not Health.BAD:
         fresh = math.exp(-max(since_aid_s, 0.0) / 60.0)

@@ -9,8 +9,9 @@ import numpy as np
 
 from ssm_graph.data import N_BEAMS, DepthCalibration, Drift, DvlMount, GnssCalibration, Mission
 from ssm_graph.problem.aid_errors import aid_extras, is_constant_of_aid
-from ssm_graph.problem.current import CURRENTS, current_extras
+from ssm_graph.problem.current import CURRENTS, current_extras, has_water_pings
 from ssm_graph.problem.extras import Extra, Extras
+from ssm_graph.water_current import CurrentModel
 
 DVL_MOUNTING: Final = "dvl_mounting"
 DVL_SCALE: Final = "dvl_scale"
@@ -88,7 +89,8 @@ def extras_of(mission: Mission) -> Extras:
         None if depth is None else depth.calibration,
         None if gnss is None else gnss.calibration,
     )
-    return Extras((*of_instruments, *aid_extras(mission.aids), *current_extras(mission)))
+    of_water = current_extras(mission.current or CurrentModel()) if has_water_pings(mission) else ()
+    return Extras((*of_instruments, *aid_extras(mission.aids), *of_water))
 
 
 def needs_motion(extras: Extras) -> bool:

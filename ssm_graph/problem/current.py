@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Final
 
-import numpy as np
-
 from ssm_graph.data import Mission
 from ssm_graph.problem.extras import Extra
 from ssm_graph.water_current import CurrentModel
@@ -19,15 +17,11 @@ CURRENTS: Final = frozenset({CURRENT, CURRENT_UP})
 
 def has_water_pings(mission: Mission) -> bool:
     """Return whether a ping off the water has a speed."""
-    dvl = mission.dvl
-    return bool(np.isfinite(dvl.speed[dvl.is_water]).any())
+    return mission.dvl.hears_water
 
 
-def current_extras(mission: Mission) -> tuple[Extra, ...]:
-    """Return the current as walks that keep their variance; none without pings off the water."""
-    if not has_water_pings(mission):
-        return ()
-    model = mission.current or CurrentModel()
+def current_extras(model: CurrentModel) -> tuple[Extra, ...]:
+    """Return the current as walks that keep their variance."""
     parts = (
         (CURRENT, ("current_east_m_per_s", "current_north_m_per_s"), model.sigma),
         (CURRENT_UP, ("current_up_m_per_s",), model.vertical_sigma),
