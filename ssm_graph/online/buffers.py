@@ -136,7 +136,13 @@ class Buffers:
             vehicle.name,
             frame,
             self.imu_log(-np.inf, end_s, margin=0),
-            DvlLog(vehicle.mount, stamps, pings[:, SPEEDS], pings[:, SIGMAS], pings[:, OFF_WATER]),
+            DvlLog(
+                vehicle.mount,
+                stamps,
+                pings[:, SPEEDS],
+                pings[:, SIGMAS],
+                water_track=pings[:, OFF_WATER],
+            ),
             depth,
             GnssLog(
                 time_s=fixes[:, 0],

@@ -74,17 +74,20 @@ def test_a_replay_says_what_it_found_of_the_instruments(
     assert 0.0 < found["sigma"] < found["prior_sigma"] == pytest.approx(0.03)
 
 
-def test_pings_off_the_water_are_logged_and_left_out(tmp_path: Path) -> None:
-    """An estimator that has no current says so in an event."""
+def test_pings_off_the_water_are_logged_and_count(tmp_path: Path) -> None:
+    """A mission that has them has a current, in the log and in the summary too."""
     mission = make_mission()
     water = (np.arange(len(mission.dvl.time_s)) % 4 == 3).astype(float)
     write_mission(tmp_path / "m", replace(mission, dvl=replace(mission.dvl, water_track=water)))
     words = ["online", "--replay", str(tmp_path / "m"), "--speed", "full", "--duration", "20"]
     assert main([*words, "--out", str(tmp_path / "run")]) == ExitCode.GOOD
-    text = (tmp_path / "run" / "events.jsonl").read_text()
-    events = [json.loads(line) for line in text.splitlines()]
-    assert "dvl_water_track" in {event["kind"] for event in events}
-    logged = read_mission(tmp_path / "run" / "log").dvl
+    assert "water_track" not in (tmp_path / "run" / "events.jsonl").read_text()
+    found = json.loads((tmp_path / "run" / "summary.json").read_text())["current"]
+    assert 0.0 < found["final_sigma_enu_m_per_s"][0] < 0.1
+    assert abs(found["final_enu_m_per_s"][0]) < 4.0 * found["final_sigma_enu_m_per_s"][0]
+    log = read_mission(tmp_path / "run" / "log")
+    assert log.current is not None
+    logged = log.dvl
     np.testing.assert_array_equal(logged.is_water, water[: len(logged.time_s)] > 0.0)
     assert logged.is_water.sum() == 5
 

@@ -21,7 +21,9 @@ from ssm_graph.online.recovery import Doubted, reanchored
 from ssm_graph.problem.calibration import DVL_MOUNTING, DVL_SCALE
 from ssm_graph.problem.error_state import STATE_DIM
 from ssm_graph.problem.problem import build_problem
+from ssm_graph.simulation import GnssSettings, Loss
 from ssm_graph.smoothers.fixed_lag import run_fixed_lag
+from tests.water_fixture import in_current
 from tests.window_fixture import asked, off
 
 LAG = replace(ONLINE, lag_s=8.0)
@@ -130,3 +132,43 @@ def test_it_aligns_with_instruments_that_are_off() -> None:
     sigma = np.array([v.sigma for v in found(smoother).values if v.variable == DVL_SCALE])
     assert abs(found(smoother).of(DVL_SCALE) - SCALE) < 3.0 * sigma
     assert sigma < 0.5 * vehicle.mount.scale_sigma
+
+
+def test_the_water_carries_the_velocity_where_the_ground_is_lost() -> None:
+    """Bottom lock is lost and said to be, an aid counts, the current is found, as offline."""
+    sim = in_current(duration_s=80.0, losses=(Loss(30.0, 120.0),))
+    vehicle = vehicle_of(sim.mission)
+    smoother = after(tuple(messages_of(sim.mission)), vehicle)
+    navigation = smoother.newest()
+    assert navigation is not None
+    assert not navigation.bottom_lock
+    assert navigation.health is Health.DEGRADED
+    assert "off the ground" in navigation.reason
+    assert navigation.since_aid_s < 2.0
+    assert navigation.velocity_sigma_enu[:2].max() < 0.1
+    current = smoother.found().current
+    assert current is not None
+    truth = sim.current.at(np.array([navigation.time_s]))[0]
+    assert np.all(np.abs(current.velocity_enu[0] - truth) < 4.0 * current.sigma_enu[0])
+    assert smoother._course is not None
+    newest = smoother._course.newest.window.newest
+    offline = run_fixed_lag(build_problem(sim.mission), LAG).newest
+    (k,) = np.flatnonzero(np.abs(offline.time_s - newest.time_s[0]) < 1e-3)
+    sigma = np.sqrt(np.diag(newest.covariance[0]))[STATE_DIM:]
+    assert np.all(np.abs(offline.states.extra[k] - newest.states.extra[0]) < 0.01 * sigma)
+
+
+def test_a_current_is_aligned_and_restored_with() -> None:
+    """Whether pings off the water have come yet or not."""
+    sim = in_current(duration_s=60.0, losses=(Loss(40.0, 60.0),), gnss=GnssSettings())
+    vehicle = replace(vehicle_of(sim.mission), initial=None)
+    given = tuple(messages_of(sim.mission))
+    smoother = after(given, vehicle)
+    assert smoother.newest() is not None, smoother.status()
+    current = smoother.found().current
+    assert current is not None
+    assert current.sigma_enu[0, 0] < 0.1
+    arrays, meta = smoother.checkpoint()
+    again = FixedLagSmoother.restore(vehicle, LAG, arrays, meta).found().current
+    assert again is not None
+    np.testing.assert_allclose(again.velocity_enu, current.velocity_enu, rtol=0.0, atol=1e-9)
