@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ssm_graph.data import Array
-from ssm_graph.estimate import BeamTable, Found, Trajectory
+from ssm_graph.estimate import BeamTable, CurrentTrack, Found, Trajectory
 from ssm_graph.io.vehicle import vehicle_of
 from ssm_graph.live.interfaces import Connections, Engine
 from ssm_graph.live.outputs import OutputFormat
@@ -37,6 +37,7 @@ class Delayed(NamedTuple):
 
     trajectory: Trajectory
     beams: BeamTable
+    current: CurrentTrack | None = None
 
 
 class FakeEstimator:

@@ -10,15 +10,17 @@ from pathlib import Path
 from typing import Any, Final
 
 from ssm_graph.errors import DataError
-from ssm_graph.estimate import BeamTable, Trajectory
+from ssm_graph.estimate import BeamTable, CurrentTrack, Trajectory
 from ssm_graph.io.results import (
     BEAM_COLUMNS,
     BEAMS_NAME,
+    CURRENT_COLUMNS,
     SUMMARY_NAME,
     TRAJECTORY_COLUMNS,
     TRAJECTORY_NAME,
     Columns,
     beam_columns,
+    current_columns,
     format_table,
     trajectory_columns,
 )
@@ -29,8 +31,12 @@ HEADERS: Final = {TRAJECTORY_NAME: TRAJECTORY_COLUMNS, BEAMS_NAME: BEAM_COLUMNS}
 class GrowingResults:
     """Appends to ``trajectory.csv`` and ``beams.csv``; a restart continues where it was kept."""
 
-    def __init__(self, folder: Path, *, sizes: Mapping[str, int] | None = None) -> None:
+    def __init__(
+        self, folder: Path, *, sizes: Mapping[str, int] | None = None, has_current: bool = False
+    ) -> None:
         """Begin in a folder, or go on at the sizes (bytes) that a checkpoint knew.
+
+        With a current ``trajectory.csv`` has its columns, and all rows have one.
 
         Raises
         ------
@@ -44,7 +50,8 @@ class GrowingResults:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             (folder / SUMMARY_NAME).unlink(missing_ok=True)
-            for name, columns in HEADERS.items():
+            beside = CURRENT_COLUMNS if has_current else ()
+            for name, columns in (HEADERS | {TRAJECTORY_NAME: TRAJECTORY_COLUMNS + beside}).items():
                 size = (sizes or {}).get(name, 0)
                 with (folder / name).open("ab") as stream:
                     stream.truncate(min(size, stream.tell()))
@@ -57,9 +64,13 @@ class GrowingResults:
         """Return how large the files are, for a checkpoint."""
         return {name: (self._folder / name).stat().st_size for name in HEADERS}
 
-    def append(self, trajectory: Trajectory, beams: BeamTable) -> None:
+    def append(
+        self, trajectory: Trajectory, beams: BeamTable, current: CurrentTrack | None = None
+    ) -> None:
         """Add rows; what the disk does not take waits for the next time."""
-        self._waiting[TRAJECTORY_NAME] += _rows(trajectory_columns(trajectory))
+        self._waiting[TRAJECTORY_NAME] += _rows(
+            trajectory_columns(trajectory) | current_columns(current)
+        )
         self._waiting[BEAMS_NAME] += _rows(beam_columns(beams))
         self.problem = None
         for name, text in self._waiting.items():

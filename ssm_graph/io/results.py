@@ -235,6 +235,9 @@ def _trajectory_names() -> tuple[str, ...]:
 
 
 TRAJECTORY_COLUMNS: Final = _trajectory_names()
+CURRENT_COLUMNS: Final = tuple(
+    current_columns(CurrentTrack(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3))))
+)
 BEAM_COLUMNS: Final = tuple(beam_columns(BeamTable(*[np.empty(0)] * 5)))
 
 

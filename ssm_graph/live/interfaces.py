@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 from ssm_graph.data import Array
-from ssm_graph.estimate import BeamTable, Found, Trajectory
+from ssm_graph.estimate import BeamTable, CurrentTrack, Found, Trajectory
 from ssm_graph.live.publisher import Outlet
 from ssm_graph.live.status import SourceStatus
 from ssm_graph.messages import Event, Health, Message, Navigation
@@ -19,6 +19,8 @@ class Delayed(Protocol):
     def trajectory(self) -> Trajectory: ...  # noqa: D102
     @property
     def beams(self) -> BeamTable: ...  # noqa: D102
+    @property
+    def current(self) -> CurrentTrack | None: ...  # noqa: D102
 
 
 class Estimator(Protocol):

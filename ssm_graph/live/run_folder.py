@@ -131,7 +131,8 @@ class RunFolder:
 
     def logged(self, resumed: Resumed) -> Iterator[Message]:
         """Return what was logged since, and get ready to write results and events once more."""
-        self.results = GrowingResults(self.path, sizes=resumed.sizes)
+        has_current = self.vehicle.current is not None
+        self.results = GrowingResults(self.path, sizes=resumed.sizes, has_current=has_current)
         self._known = _lines_from(self.path / EVENTS_NAME, resumed.sizes.get(EVENTS_NAME, 0))
         if not self._has_log:
             return iter(())

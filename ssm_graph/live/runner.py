@@ -236,7 +236,7 @@ class Runner:
         assert self.folder.results is not None
         try:
             for delayed in take():
-                self.folder.results.append(delayed.trajectory, delayed.beams)
+                self.folder.results.append(delayed.trajectory, delayed.beams, delayed.current)
         except Exception as error:
             self._notices.failure("results", "results_failed", error)
 

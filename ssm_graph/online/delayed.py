@@ -7,8 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ssm_graph.earth import LocalFrame
-from ssm_graph.estimate import BeamTable, Trajectory
+from ssm_graph.estimate import BeamTable, CurrentTrack, Trajectory
+from ssm_graph.problem.extras import Extras
 from ssm_graph.problem.trajectory import trajectory_at
+from ssm_graph.smoothers.current import current_along
 from ssm_graph.smoothers.stretch import Stretch
 
 
@@ -17,10 +19,15 @@ class Delayed(NamedTuple):
 
     trajectory: Trajectory
     beams: BeamTable
+    current: CurrentTrack | None
+    """Beside the trajectory; None of a vehicle without one."""
 
 
-def delayed_of(stretch: Stretch, frame: LocalFrame, *, shift_s: float) -> Delayed:
-    """Return a stretch on the vehicle's clock, which is ``shift_s`` behind ours."""
+def delayed_of(stretch: Stretch, frame: LocalFrame, extras: Extras, *, shift_s: float) -> Delayed:
+    """Return a stretch on the vehicle's clock, which is ``shift_s`` behind ours.
+
+    ``extras`` are what each keyframe of it carries beside the error state.
+    """
     time_s = stretch.time_s - shift_s
     return Delayed(
         trajectory_at(frame, time_s, stretch.states, stretch.covariance, n_beams=stretch.n_beams),
@@ -31,4 +38,5 @@ def delayed_of(stretch: Stretch, frame: LocalFrame, *, shift_s: float) -> Delaye
             mahalanobis_sq=stretch.mahalanobis_sq,
             weight=stretch.weight,
         ),
+        current_along(extras, stretch._replace(time_s=time_s)),
     )

@@ -310,9 +310,9 @@ class FixedLagSmoother:
 
     def _take(self, course: Course, *, all_of_them: bool = False) -> list[Delayed]:
         assert self._frame is not None
-        shift_s = self._intake.shift_s
+        shift_s, extras = self._intake.shift_s, course.newest.window.sensors.extras
         return [
-            delayed_of(stretch, self._frame, shift_s=shift_s)
+            delayed_of(stretch, self._frame, extras, shift_s=shift_s)
             for stretch in course.take_settled(all_of_them=all_of_them)
             if len(stretch.time_s)
         ]
