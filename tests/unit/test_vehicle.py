@@ -16,6 +16,7 @@ from ssm_graph.io.replay import messages_of
 from ssm_graph.io.tables import Order
 from ssm_graph.io.vehicle import read_vehicle, vehicle_of, write_vehicle
 from ssm_graph.messages import DepthReading, Fix, ImuSample, Ping, Vehicle
+from ssm_graph.water_current import CurrentModel
 from tests.malformed_case import Malformed
 from tests.malformed_cases import TOML_CASES
 from tests.mission_fixture import TOML, make_mission, write_example
@@ -136,10 +137,14 @@ def test_written_and_read_again(tmp_path: Path, dropped: tuple[str, ...]) -> Non
 
 def test_every_field_is_written(tmp_path: Path) -> None:
     """A field that a vehicle is given one day has to find its key."""
-    write_vehicle(tmp_path, vehicle_of(make_mission()))
+    vehicle = replace(
+        vehicle_of(make_mission()), water_sigma=0.02, current=CurrentModel(0.3, 7200.0, 0.01)
+    )
+    write_vehicle(tmp_path, vehicle)
     got = read_vehicle(tmp_path)
-    assert len(fields(Vehicle)) == 12  # further_aids is of tables that are not there
+    assert len(fields(Vehicle)) == 14  # further_aids is of tables that are not there
     assert all(getattr(got, spec.name) is not None for spec in fields(Vehicle))
+    assert (got.water_sigma, got.current) == (vehicle.water_sigma, vehicle.current)
 
 
 def test_messages_come_in_order_of_time() -> None:
