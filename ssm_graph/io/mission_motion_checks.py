@@ -10,8 +10,9 @@ from typing import Final
 import numpy as np
 
 from ssm_graph.data import N_BEAMS, Array, DepthLog, Mission
-from ssm_graph.earth import EARTH_RATE
 from ssm_graph.errors import DataError
+from ssm_graph.io.mission_turn_checks import rates_at_rest, turn_signs
+from ssm_graph.io.motion_series import difference, force_direction, left_over, velocities
 
 _UPWARD_M: Final = 2.0
 _WINDOW_S: Final = 2.0
@@ -21,21 +22,6 @@ _FEWEST_FIXES: Final = 10
 _FEWEST_PINGS: Final = 30
 _OPPOSITE: Final = -0.8
 _CONTRADICTION: Final = 0.3
-_OPPOSITE_TILT: Final = -0.85
-_TINY_GAIN: Final = 0.04
-_SMALLEST_TILT: Final = 0.02
-"""rad rms in one window."""
-_TILT_STEP_S: Final = 1.0
-_TILT_NOISE: Final = 0.1
-"""rad, of the tilt by the accelerometer at either end of a mission, waves included."""
-_BIAS_SIGMAS: Final = 4.0
-_REST_S: Final = 10.0
-_REST_FORCE: Final = 0.05
-"""m/s^2, scatter of the specific force of a vehicle at rest."""
-_REST_RATE: Final = 0.01
-"""rad/s, scatter of its turn rates."""
-_REST_SPEED: Final = 0.03
-"""m/s along the beams"""
 _LAGS_S: Final = np.arange(-0.5, 0.51, 0.02)
 _NOTED_LAG_S: Final = 0.05
 
@@ -50,8 +36,8 @@ def check_motion(mission: Mission, labels: dict[str, str]) -> list[str]:
         notes += _depth_sign(mission, mission.depth, labels["depth"])
         notes += _depth_surface(mission, mission.depth, labels["depth"])
         notes += _vertical_speed(mission, mission.depth, labels)
-    notes += _turn_signs(mission, labels["imu"])
-    notes += _rates_at_rest(mission, labels["imu"])
+    notes += turn_signs(mission, labels["imu"])
+    notes += rates_at_rest(mission, labels["imu"])
     notes += _beams_agree(mission, labels["dvl"])
     return notes
 
@@ -111,20 +97,18 @@ def _depth_surface(mission: Mission, depth: DepthLog, label: str) -> list[str]:
 
 def _vertical_speed(mission: Mission, depth: DepthLog, labels: dict[str, str]) -> list[str]:
     """Compare the DVL's downward speed with the change of depth, down being against the force."""
-    dvl, imu = mission.dvl, mission.imu
+    imu = mission.imu
     half = 0.5 * max(_WINDOW_S, 2.0 * float(np.median(np.diff(depth.time_s, prepend=-np.inf))))
     begin = max(imu.time_s[0], depth.time_s[0]) + half
     end = min(imu.time_s[-1], depth.time_s[-1]) - half
     begin, end = begin + _LAGS_S[-1], end + _LAGS_S[0]
-    used = np.isfinite(dvl.speed).all(axis=1) & (dvl.ping_s > begin) & (dvl.ping_s < end)
-    if used.sum() < _FEWEST_PINGS:
+    time_s, v_b = velocities(mission)
+    inside = (time_s > begin) & (time_s < end)
+    if inside.sum() < _FEWEST_PINGS:
         return []
-    left_over = _left_over(mission, dvl.speed)
-    used &= left_over <= 3.0 * np.median(left_over[used])  # without most of the outliers
-    time_s = dvl.ping_s[used]
-    v_b = dvl.speed[used] @ np.linalg.pinv(dvl.mount.beams_b).T
-    speed = -np.sum(_force_direction(mission, time_s, half) * v_b, axis=1)
-    rate = _difference(time_s, half, depth.time_s, depth.depth) / (2.0 * half)
+    time_s, v_b = time_s[inside], v_b[inside]
+    speed = -np.sum(force_direction(mission, time_s, half) * v_b, axis=1)
+    rate = difference(time_s, half, depth.time_s, depth.depth) / (2.0 * half)
     if min(np.std(speed), np.std(rate)) < _SLOWEST:
         return []
     correlation = float(np.corrcoef(speed, rate)[0, 1])
@@ -148,7 +132,7 @@ def _vertical_lag(
     time_s: Array, speed: Array, half: float, depth: DepthLog, labels: dict[str, str]
 ) -> list[str]:
     """Note a downward speed that fits the change of depth at another time far better."""
-    rates = [_difference(time_s - lag, half, depth.time_s, depth.depth) for lag in _LAGS_S]
+    rates = [difference(time_s - lag, half, depth.time_s, depth.depth) for lag in _LAGS_S]
     misfit = 1.0 - np.array([np.corrcoef(speed, rate)[0, 1] for rate in rates]) ** 2
     best = int(np.argmin(misfit))
     lag = float(_LAGS_S[best])
@@ -162,129 +146,13 @@ def _vertical_lag(
     ]
 
 
-def _turn_signs(mission: Mission, label: str) -> list[str]:
-    """Compare turn rates with the accelerometer: tilting the vehicle tilts the specific force."""
-    imu = mission.imu
-    half = 0.5 * _TILT_STEP_S
-    time_s = np.arange(imu.time_s[0] + 2.0 * half, imu.time_s[-1] - 2.0 * half, 2.0 * half)
-    if len(time_s) < _FEWEST_PINGS:
-        return []
-    before, after = (_force_direction(mission, time_s + at, half) for at in (-half, half))
-    turned = np.column_stack(
-        [_difference(time_s, half, imu.time_s, s) for s in _integral(mission, imu.gyro_b).T]
-    )
-    predicted, seen = -np.cross(turned, 0.5 * (before + after)), after - before
-    notes = []
-    for axis, motion in enumerate(("pitches", "rolls")):
-        notes += _tilt_agrees(seen[:, axis], predicted[:, axis], f"{label}: the vehicle {motion}")
-    return notes + _level_bias(mission, (seen - predicted).mean(axis=0) / (2.0 * half), label)
-
-
-def _level_bias(mission: Mission, drift: Array, label: str) -> list[str]:
-    """Note gyros about the level axes that read far more than the vehicle tilts.
-
-    Parameters
-    ----------
-    mission : the recorded run.
-    drift : (3,) how fast the direction of the specific force leaves the one by the gyros, 1/s;
-        that is ``bias x force``.
-    label : the table.
-    """
-    force = np.median(mission.imu.accel_b, axis=0)
-    bias = np.cross(force / np.linalg.norm(force), drift)
-    noise, span = mission.imu.noise, float(mission.imu.time_s[-1] - mission.imu.start_s)
-    spread = (noise.gyro_density / np.sqrt(span), _TILT_NOISE / span)
-    size, limit = float(np.linalg.norm(bias)), float(np.hypot(*spread))
-    if size < EARTH_RATE + _BIAS_SIGMAS * np.hypot(noise.gyro_bias_sigma, limit):
-        return []
-    return [
-        f"{label}: over the mission the gyros turn by {_deg_per_h(bias)} deg/h about x, y, z more "
-        "than the vehicle tilts, far beyond gyro_bias_deg_per_h = "
-        f"{_deg_per_h(noise.gyro_bias_sigma)}: that is a bias, and the axis along gravity, which "
-        "this does not see, may have one too; take it off or state it"
-    ]
-
-
-def _rates_at_rest(mission: Mission, label: str) -> list[str]:
-    """Note gyros that turn while the accelerometer and the DVL are still."""
-    imu, noise = mission.imu, mission.imu.noise
-    spread = np.hypot(noise.gyro_bias_sigma, noise.gyro_density / _REST_S**0.5)
-    limit = EARTH_RATE + _BIAS_SIGMAS * float(spread)
-    for begin in np.arange(imu.start_s, imu.time_s[-1] - _REST_S, _REST_S):
-        now = (imu.time_s > begin) & (imu.time_s <= begin + _REST_S)
-        ping = (mission.dvl.ping_s > begin) & (mission.dvl.ping_s <= begin + _REST_S)
-        speed = mission.dvl.speed[ping]
-        if now.sum() < _FEWEST_PINGS or not np.isfinite(speed).any():
-            continue
-        is_still = np.max(np.std(imu.accel_b[now], axis=0)) < _REST_FORCE
-        is_still &= np.max(np.std(imu.gyro_b[now], axis=0)) < _REST_RATE
-        mean = imu.gyro_b[now].mean(axis=0)
-        if is_still and np.nanmedian(np.abs(speed)) < _REST_SPEED and np.abs(mean).max() > limit:
-            return [
-                f"{label}: from {begin:z.1f} s on the vehicle lies still for {_REST_S:g} s by "
-                f"accelerometer and DVL, and the gyros read {_deg_per_h(mean)} deg/h about x, y, "
-                f"z; gyro_bias_deg_per_h = {_deg_per_h(noise.gyro_bias_sigma)}: a bias, or a "
-                "steady turn on the spot"
-            ]
-    return []
-
-
-def _deg_per_h(rate: Array | float) -> str:
-    return ", ".join(f"{x + 0.0:.0f}" for x in np.atleast_1d(np.degrees(rate) * 3600.0))
-
-
-def _tilt_agrees(seen: Array, predicted: Array, subject: str) -> list[str]:
-    """Refuse or note a tilt that the accelerometer sees otherwise than the gyros."""
-    seen_sq, predicted_sq = float(np.mean(seen**2)), float(np.mean(predicted**2))
-    if min(seen_sq, predicted_sq) < _SMALLEST_TILT**2:
-        return []
-    product = float(np.mean(seen * predicted))
-    correlation = product / np.sqrt(seen_sq * predicted_sq)
-    text = (
-        f"{subject} by the gyros and the other way by the accelerometer (correlation "
-        f"{correlation:.2f}); expected one motion; check the signs of the gyros and [frames] body"
-    )
-    if correlation < _OPPOSITE_TILT:
-        raise DataError(text)
-    if correlation > -_OPPOSITE_TILT and product / predicted_sq < _TINY_GAIN:
-        raise DataError(
-            f"{subject} {predicted_sq / product:.0f} times as far by the gyros as by the "
-            "accelerometer; expected rad/s; are the turn rates in deg/s?"
-        )
-    return [text] if correlation < -0.5 else []
-
-
-def _integral(mission: Mission, values: Array) -> Array:
-    """Return the running integral of an IMU quantity at the interval ends."""
-    steps = np.diff(mission.imu.time_s, prepend=mission.imu.start_s)
-    return np.asarray(np.cumsum(values * steps[:, None], axis=0))
-
-
-def _force_direction(mission: Mission, time_s: Array, half: float) -> Array:
-    """Return the unit vector (N, 3) of the mean specific force around each time."""
-    sums = _integral(mission, mission.imu.accel_b)
-    force = np.column_stack([_difference(time_s, half, mission.imu.time_s, s) for s in sums.T])
-    return np.asarray(force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-9))
-
-
-def _difference(time_s: Array, half: float, known_s: Array, values: Array) -> Array:
-    """Return ``values(time_s + half) - values(time_s - half)``."""
-    later = np.interp(time_s + half, known_s, values)
-    return np.asarray(later - np.interp(time_s - half, known_s, values))
-
-
-def _left_over(mission: Mission, speed: Array) -> Array:
-    """Return what four beams (..., 4) measure beyond three components of velocity, m/s."""
-    return np.asarray(np.abs(speed @ np.linalg.svd(mission.dvl.mount.beams_d)[0][:, 3]))
-
-
 def _beams_agree(mission: Mission, label: str) -> list[str]:
     """Note beams that contradict each other, and the order in which they would not."""
     speed = mission.dvl.speed[np.isfinite(mission.dvl.speed).all(axis=1)]
     if len(speed) < _FEWEST_PINGS:
         return []
     orders = [list(order) for order in permutations(range(N_BEAMS))]
-    errors = [float(np.median(_left_over(mission, speed[:, order]))) for order in orders]
+    errors = [float(np.median(left_over(mission, speed[:, order]))) for order in orders]
     best, sigma = int(np.argmin(errors)), float(np.median(mission.dvl.sigma))
     typical = float(np.median(np.linalg.norm(speed, axis=1)))
     is_better = 3.0 * max(errors[best], sigma) < errors[0]

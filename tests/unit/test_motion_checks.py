@@ -62,3 +62,14 @@ def test_a_level_bias_is_seen_under_way(waves: Mission) -> None:
     x, y, z = (float(word) for word in note.split(" deg/h")[0].split("turn by ")[1].split(", "))
     np.testing.assert_allclose(np.radians([x, y]) / 3600.0, [0.01, -0.02], atol=1e-3)
     assert abs(np.radians(z) / 3600.0) < 1e-3
+
+
+def test_turns_under_way_are_no_bias_of_good_gyros() -> None:
+    """What draws a vehicle inwards turns with it: as much as 40 to 70 deg/h, and none is said."""
+    config = scenario_config("demo", duration_s=1800.0, grade=Grade.NAVIGATION, imu_rate_hz=50.0)
+    mission = simulate(config).mission
+    assert check_motion(mission, LABELS) == []
+    gyro_b = mission.imu.gyro_b + np.radians([0.0, 120.0, 0.0]) / 3600.0
+    (note,) = check_motion(replace(mission, imu=replace(mission.imu, gyro_b=gyro_b)), LABELS)
+    _, y, _ = (float(word) for word in note.split(" deg/h")[0].split("turn by ")[1].split(", "))
+    assert y == pytest.approx(120.0, abs=8.0)
