@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.checks import check_numbers, checked_array
 from factors.so3 import cross, times
 
 Array = NDArray[np.float64]
@@ -57,3 +59,49 @@ def range_residual(
         error_D_position=along_b,
         error_D_beacon_n=-along_n,
     )
+
+
+def beacon_range_factor(
+    pose: int,
+    *,
+    sigma: float,
+    range_m: float,
+    lever_arm_b: Array,
+    beacon_n: Array,
+    weight: float = 1.0,
+) -> gtsam.CustomFactor:
+    """Wrap :func:`range_residual` as a factor on a ``Pose3``, of a beacon whose place is known.
+
+    For one whose place is a variable take GTSAM's ``RangeFactorWithTransform3D``.
+
+    Parameters
+    ----------
+    pose : key.
+    sigma : nominal standard deviation of the range, m.
+    range_m, lever_arm_b, beacon_n : as in :func:`range_residual`, for one range.
+    weight : similarity weight; the effective variance is ``sigma^2 / weight``.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite, or ``sigma`` or ``weight`` is not above zero.
+    """
+    name = "beacon_range_factor"
+    check_numbers(name, sigma=sigma, weight=weight, range_m=range_m)
+    lever = checked_array(name, "lever_arm_b", lever_arm_b, (3,))
+    place = checked_array(name, "beacon_n", beacon_n, (3,))
+    measured = np.array(range_m, dtype=float)
+
+    def evaluate(
+        this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
+    ) -> Array:
+        at = values.atPose3(this.keys()[0])
+        R_nb, p_n = at.rotation().matrix(), at.translation()
+        if jacobians is None:
+            return np.atleast_1d(np.linalg.norm(p_n + R_nb @ lever - place) - measured)
+        found = range_residual(R_nb, p_n, lever_arm_b=lever, beacon_n=place, range_m=measured)
+        jacobians[0] = np.hstack([found.error_D_rotation, found.error_D_position])[None, :]
+        return np.atleast_1d(found.error)
+
+    noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma / np.sqrt(weight))
+    return gtsam.CustomFactor(noise, [pose], evaluate)

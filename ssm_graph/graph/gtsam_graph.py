@@ -14,6 +14,7 @@ from factors.dvl_beam import dvl_beam_factor
 from ssm_graph.data import Array
 from ssm_graph.errors import ConfigError
 from ssm_graph.graph.depth import depth_targets
+from ssm_graph.graph.gtsam_aids import aid_graph
 from ssm_graph.graph.inertial_rows import inertial_graph
 from ssm_graph.graph.states import States
 from ssm_graph.problem.aids import Depths, Fixes
@@ -22,18 +23,22 @@ from ssm_graph.problem.problem import Problem, start_of
 
 
 def gtsam_graph(
-    problem: Problem, states: States, weights: Array | None = None
+    problem: Problem,
+    states: States,
+    weights: Array | None = None,
+    aid_weights: Array | None = None,
 ) -> gtsam.NonlinearFactorGraph:
     """Return the whole graph with the keys ``x``, ``v`` and ``b`` of every keyframe.
 
-    Gravity of the inertial factors and the targets of depth are those of ``states``, near the
-    answer; the factors share gravity with the problem.
+    Gravity of the inertial factors, the targets of depth and the north of compasses are those of
+    ``states``, near the answer; the factors share gravity with the problem.
 
     Parameters
     ----------
     problem : the mission, with no calibration asked for.
     states : of all keyframes, for example those of :func:`warm_start`.
     weights : (M,) of the beams; all one when left out.
+    aid_weights : of the further aids' measurements, in their order; all one when left out.
 
     Raises
     ------
@@ -45,11 +50,6 @@ def gtsam_graph(
         raise ConfigError(
             f"gtsam_graph: expected a problem of keyframes alone, got one that estimates {names}: "
             "take their prior sigmas, or the pings off the water, out of the mission"
-        )
-    if problem.further.sections:
-        raise ConfigError(
-            f"gtsam_graph: expected a problem of beams, depth and GNSS, got "
-            f"{', '.join(problem.further.sections)} besides: take them out of mission.toml"
         )
     graph = graph_without_beams(problem, states)
     beams = problem.beams
@@ -69,6 +69,7 @@ def gtsam_graph(
                 omega_ie_n=problem.frame.omega_ie_n,
             )
         )
+    graph.push_back(aid_graph(problem, states, aid_weights))
     return graph
 
 

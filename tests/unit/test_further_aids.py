@@ -17,7 +17,7 @@ from ssm_graph.graph.beacon_start import BeaconRanges, beacon_start, rival_place
 from ssm_graph.graph.first_values import first_values
 from ssm_graph.graph.forward_aids import settled_weight
 from ssm_graph.graph.gtsam_graph import gtsam_graph
-from ssm_graph.problem.problem import NO_EXTRAS, build_problem
+from ssm_graph.problem.problem import build_problem
 from ssm_graph.simulation import (
     CALM,
     AidSettings,
@@ -326,13 +326,13 @@ def test_every_aid_at_once() -> None:
 
 
 def test_estimators_without_them_say_so() -> None:
-    """Filters and fixed lag; GTSAM's own graph refuses them."""
+    """Filters and fixed lag; GTSAM's own graph refuses what is unknown of them."""
     problem = build_problem(with_every_aid().mission)
     for estimate in (*filter_problems([problem], "ekf"), *solve_fixed_lag(problem)):
         (note,) = (note for note in estimate.notes if "left out" in note)
         assert "[usbl], [ranges], [heading], [[standstill]]" in note
-    with pytest.raises(ConfigError, match="usbl"):
-        gtsam_graph(replace(problem, extras=NO_EXTRAS), warm_start(problem).states)
+    with pytest.raises(ConfigError, match="estimates heading_walk"):
+        gtsam_graph(problem, warm_start(problem).states)
 
 
 def test_at_rest_nothing_drifts() -> None:

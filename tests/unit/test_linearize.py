@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks.calibration_cases import as_stated, asking
+from ssm_graph.aid_logs import Standstill
 from ssm_graph.data import Array, Drift
 from ssm_graph.errors import ConfigError
 from ssm_graph.graph.gtsam_graph import chain_ordering, gtsam_graph
@@ -18,7 +19,15 @@ from ssm_graph.graph.states import States, retract, states_from_arrays
 from ssm_graph.problem.error_state import STATE_DIM
 from ssm_graph.problem.extras import Extra, Extras
 from ssm_graph.problem.problem import Problem, build_problem
-from ssm_graph.simulation import GnssSettings, Grade
+from ssm_graph.simulation import (
+    AidSettings,
+    CompassSettings,
+    GnssSettings,
+    Grade,
+    RangingSettings,
+    UsblSettings,
+)
+from tests.aids_fixture import KNOWN
 from tests.calibration_fixture import miscalibrated
 from tests.helpers import drifting, simulated, true_states
 
@@ -94,6 +103,37 @@ def test_it_is_gtsams_graph(grade: Grade, monkeypatch: pytest.MonkeyPatch) -> No
     np.testing.assert_allclose(found.covariance / scale, P / scale, rtol=0.0, atol=1e-8)
     np.testing.assert_allclose(found.delta[0] / sigma, step / sigma, rtol=0.0, atol=1e-7)
     cost = linearizer.cost(states, rows, weights)
+    assert cost == pytest.approx(graph.error(states.values), rel=1e-9)
+
+
+def test_it_is_gtsams_graph_with_further_aids(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every kind of them, each measurement with a weight of its own."""
+    monkeypatch.setattr("ssm_graph.graph.linearize.gravity_gradient", lambda _: np.zeros((3, 3)))
+    aids = AidSettings(
+        usbl=UsblSettings(interval_s=2.1),
+        ranging=RangingSettings((KNOWN,), interval_s=1.3),
+        compass=CompassSettings(declination=0.1),
+        standstills=(Standstill(4.0, 6.5),),
+    )
+    sim = simulated(duration_s=8.0, grade=Grade.TACTICAL, aids=aids)
+    problem = build_problem(sim.mission)
+    truth, rng = true_states(problem, sim), np.random.default_rng(4)
+    size = np.repeat([1e-3, 1e-2, 0.3, 1e-5, 1e-8], 3)
+    states = retract(truth, size * rng.normal(size=(problem.n_keyframes, STATE_DIM)))
+    linearizer = GraphLinearizer(problem)
+    weights = rng.uniform(0.01, 1.1, len(problem.beams.speed))
+    aid_weights = rng.uniform(0.01, 1.1, len(linearizer.weighted))
+    assert len(linearizer.weighted.all) == 4
+    linearizer.follow(states)
+    rows = linearizer.beam_rows(states)
+    found = linearizer.solve(states, rows, weights, aid_weights)
+    graph = gtsam_graph(problem, states, weights, aid_weights)
+    step, P = dense(graph, states)
+    sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+    scale = sigma[:, :, None] * sigma[:, None, :]
+    np.testing.assert_allclose(found.covariance / scale, P / scale, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(found.delta[0] / sigma, step / sigma, rtol=0.0, atol=1e-9)
+    cost = linearizer.cost(states, rows, weights, aid_weights)
     assert cost == pytest.approx(graph.error(states.values), rel=1e-9)
 
 
