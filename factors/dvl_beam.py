@@ -8,6 +8,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.checks import check_numbers, checked_array
 from factors.so3 import cross, times
 
 Array = NDArray[np.float64]
@@ -188,13 +189,6 @@ def checked_beam(
     factor: str, vectors: dict[str, Array], *, speed: float, sigma: float, weight: float
 ) -> dict[str, Any]:
     """Return copies of what a factor measures, or raise: a wrong shape would crash the process."""
-    frozen = {name: np.array(value, dtype=float) for name, value in vectors.items()}
-    for name, value in frozen.items():
-        if value.shape != (3,) or not np.all(np.isfinite(value)):
-            raise ValueError(f"{factor}: {name}: expected 3 finite numbers, got {value}")
-    if not (np.isfinite(speed) and 0.0 < sigma < np.inf and 0.0 < weight < np.inf):
-        raise ValueError(
-            f"{factor}: expected a finite speed and sigma and weight above zero, got "
-            f"speed {speed}, sigma {sigma}, weight {weight}"
-        )
+    check_numbers(factor, sigma=sigma, weight=weight, speed=speed)
+    frozen = {name: checked_array(factor, name, value, (3,)) for name, value in vectors.items()}
     return {"speed": np.float64(speed), **frozen}

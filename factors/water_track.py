@@ -13,6 +13,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.checks import checked_array
 from factors.dvl_beam import beam_blocks, beam_error, beam_residual, checked_beam
 from factors.so3 import times
 
@@ -78,9 +79,7 @@ def water_beam_factor(
     ValueError
         If a number is not finite, or ``sigma`` or ``weight`` is not above zero.
     """
-    axes = np.array(R_nl, float)
-    if axes.shape != (3, 3) or not np.all(np.isfinite(axes)):
-        raise ValueError(f"water_beam_factor: R_nl: expected a rotation matrix, got {R_nl}")
+    axes = checked_array("water_beam_factor", "R_nl", R_nl, (3, 3))
     measured = checked_beam(
         "water_beam_factor",
         {"gyro_b": gyro_b, "beam_b": beam_b, "lever_arm_b": lever_arm_b, "omega_ie_n": omega_ie_n},

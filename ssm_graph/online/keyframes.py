@@ -26,8 +26,8 @@ class KeyframeMaker:
     def __init__(self, buffers: Buffers, frame: LocalFrame, config: ProblemConfig) -> None:
         self._buffers, self._frame, self._config = buffers, frame, config
         vehicle = buffers.vehicle
-        self._fast_beams = _white_share(vehicle.mount.drift)
-        self._fast_fixes = _white_share(vehicle.gnss_calibration.drift)
+        self._white_beams = _white_share(vehicle.mount.drift)
+        self._white_fixes = _white_share(vehicle.gnss_calibration.drift)
         self.not_before_s = -np.inf
         """Where the inertial data have to be before asking again is worth while."""
 
@@ -116,7 +116,7 @@ class KeyframeMaker:
         return BeamSpeeds(
             beam.astype(float),
             pings[:, SPEEDS][row, beam],
-            pings[:, SIGMAS][row, beam] * np.where(is_water > 0.0, 1.0, self._fast_beams),
+            pings[:, SIGMAS][row, beam] * np.where(is_water > 0.0, 1.0, self._white_beams),
             np.broadcast_to(gyro_b, (len(row), 3)),
             self._buffers.vehicle.mount.beams_b[beam],
             is_water,
@@ -124,7 +124,7 @@ class KeyframeMaker:
 
     def _fixes(self, fixes: Array) -> tuple[Array, Array]:
         position_n = self._frame.p_n_from_geodetic(fixes[:, 1], fixes[:, 2], fixes[:, 3])
-        sigma_enu = fixes[:, 4:] * self._fast_fixes
+        sigma_enu = fixes[:, 4:] * self._white_fixes
         return position_n, fix_covariance_n(self._frame, position_n, sigma_enu)
 
 
