@@ -26,6 +26,9 @@ Navigate live: messages of the instruments in, position, velocity and attitude w
 out. Everything that comes is logged before it is used; started again with the same RUN after a
 crash or a power cut it goes on where it was. SIGINT or SIGTERM ends it in order.
 
+What VEHICLE gives prior sigmas for, a drift, and the current of its [current] are estimated along:
+values with sigmas on the page and in RUN/summary.json.
+
 addresses:
   tcp://HOST:PORT           a server that is called, again and again if need be
   tcp-listen://[HOST]:PORT  a server that others call

@@ -138,7 +138,9 @@ def watch_after(was: Watch, begun: Window, last: Stretch, doubt: Doubt) -> Watch
         moved = (*(t for t in moved if time_s - t < ASTRAY_S), time_s)
     return Watch(
         last_beam_s=time_s if is_aided else was.last_beam_s,
-        last_ground_s=time_s if counts_off_the_ground(begun) else was.last_ground_s,
+        last_ground_s=time_s
+        if counts_off_the_ground(newest, begun.keyframes[-1])
+        else was.last_ground_s,
         depths_refused=refusals + (refusals == LOCKED_OUT_DEPTHS),
         out_since_s=np.inf if is_aided else was.out_since_s,
         torn_since_s=was.torn_since_s,

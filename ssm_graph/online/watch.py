@@ -127,7 +127,7 @@ def observe(
     watch = watch._replace(force=watch.force + share * (force - watch.force))
     if len(newest.weight):
         watch = _with_beams(watch, newest, share, parity=parity)
-        if counts_off_the_ground(window):
+        if counts_off_the_ground(newest, kept):
             watch = watch._replace(last_ground_s=time_s)
     few_since_s = min(watch.few_since_s, time_s) if watch.good_share < FEW else math.inf
     watch = watch._replace(few_since_s=few_since_s)
@@ -173,10 +173,10 @@ def _with_beams(watch: Watch, newest: Stretch, share: float, *, parity: bool) ->
     return watch
 
 
-def counts_off_the_ground(window: Window) -> bool:
-    """Return whether a beam off the ground counts at the newest keyframe."""
-    is_water = window.keyframes[-1].beams.is_water > 0.0
-    return bool(np.any(window.newest.weight[~is_water] >= TRUSTED))
+def counts_off_the_ground(newest: Stretch, keyframe: Keyframe) -> bool:
+    """Return whether a beam off the ground counts at the newest keyframe, as the window has it."""
+    is_ground = keyframe.beams.is_water == 0.0
+    return bool(np.any(newest.weight[is_ground] >= TRUSTED))
 
 
 def is_sound(watch: Watch, time_s: float) -> bool:
