@@ -265,7 +265,7 @@ def parse_args(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--runs", type=int, default=100, help="missions with turns, of each kind")
     parser.add_argument("--transits", type=int, default=20, help="straight runs, of each kind")
     parser.add_argument("--minutes", type=float, default=60.0, help="length of the timed mission")
-    parser.add_argument("--repeats", type=int, default=3, help="of the timed mission")
+    parser.add_argument("--repeats", type=int, default=7, help="of the timed mission")
     parser.add_argument("--out", type=Path, default=Path("out/calibration"))
     parser.add_argument("--keep", action="store_true", help="write benchmarks/results too")
     return parser.parse_args(argv)
