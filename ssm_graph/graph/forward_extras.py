@@ -13,10 +13,10 @@ from ssm_graph.problem.current import CURRENTS
 from ssm_graph.problem.error_state import STATE_DIM
 from ssm_graph.problem.problem import Problem
 
-REACH_S = 1e-2
-REACH_TURN = 1e-2
+REACH_S = 2e-2
+REACH_TURN = 2e-2
 """How far clock and mounting, rad, may move before the beams are prepared anew; the rest counts to
-first order, within 0.1 mm/s at 1.5 m/s."""
+first order, within 0.3 mm/s at 1.5 m/s."""
 
 
 class ForwardExtras:
