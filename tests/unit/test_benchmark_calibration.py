@@ -45,4 +45,5 @@ def test_report() -> None:
     assert "| dvl_scale_error | 0.900 | red | 2.50 |" in text
     seconds, passes = np.array([[4.0, 5.0], [5.0, 5.0]]), np.array([[6.0, 7.0], [6.0, 7.0]])
     text = "\n".join(time_lines(60.0, seconds, passes))
-    assert "**1.250 times** (pairs one after the other: 1.250, 1.000)" in text
+    assert "**1.125 times**, the median of pairs one after the other (1.250, 1.000)" in text
+    assert "fastest to fastest 1.250" in text
