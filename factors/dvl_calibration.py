@@ -104,12 +104,8 @@ def turned_instrument(
     R_bd : (3, 3) mounting as stated, instrument to body.
     lever_arm_b : (3,) m, with its error.
     """
-    if mounting.ndim > 1:
-        mounting_b = times(R_bd, mounting)
-        beam = times(so3.exp(mounting_b), beam_b)
-        return Instrument(beam, so3.left_jacobian(mounting_b) @ R_bd, lever_arm_b)
-    mounting_b = R_bd @ mounting
-    beam = beam_b @ so3.exp(mounting_b).T
+    mounting_b = times(R_bd, mounting)
+    beam = times(so3.exp(mounting_b), beam_b)
     return Instrument(beam, so3.left_jacobian(mounting_b) @ R_bd, lever_arm_b)
 
 
@@ -195,7 +191,7 @@ def calibrated_beam_residual(
         error_D_velocity_n=gain_3 * times(R_nb, D_v_b),
         error_D_accel_bias=gain_3 * tau * D_v_b,
         error_D_gyro_bias=gain_3 * (tau * times(J_back, D_phi) - arm),
-        error_D_mounting=gain_3 * _rows_times(beam_x_v + beam_x_swing, turn_D_mounting),
+        error_D_mounting=gain_3 * times(_T(turn_D_mounting), beam_x_v + beam_x_swing),
         error_D_scale=predicted,
         error_D_lever_arm_b=gain_3 * beam_x_omega,
         error_D_time_offset=gain_1 * D_late,
@@ -297,13 +293,6 @@ def _blocks(residual: CalibratedResidual) -> list[Array]:
     pose = np.hstack([residual.error_D_rotation, np.zeros(3)])
     blocks = [pose, residual.error_D_velocity_n, biases, *residual[5:]]
     return [np.reshape(block, (1, -1)).copy() for block in blocks]
-
-
-def _rows_times(rows: Array, matrix: Array) -> Array:
-    """Return ``rows[i] @ matrix``, or ``rows[i] @ matrix[i]`` where each row has its own."""
-    if matrix.ndim == 2:
-        return np.asarray(rows @ matrix)
-    return np.asarray((rows[..., None, :] @ matrix)[..., 0, :])
 
 
 def _T(matrix: Array) -> Array:

@@ -36,16 +36,21 @@ def turn_signs(mission: Mission, label: str) -> list[str]:
     time_s = np.arange(imu.time_s[0] + 2.0 * half, imu.time_s[-1] - 2.0 * half, 2.0 * half)
     if len(time_s) < _FEWEST_PINGS:
         return []
-    before, after = (force_direction(mission, time_s + at, half) for at in (-half, half))
+    # Windows touch: the end of one step is the begin of the next.
+    edges = np.append(time_s - half, time_s[-1] + half)
+    force = force_direction(mission, edges, half)
+    before, after = force[:-1], force[1:]
     turn = turned(mission, time_s, half)
     predicted, seen = -np.cross(turn, 0.5 * (before + after)), after - before
     notes = []
     for axis, motion in enumerate(("pitches", "rolls")):
         notes += _tilt_agrees(seen[:, axis], predicted[:, axis], f"{label}: the vehicle {motion}")
     # What moves the vehicle is in the force as well, and turns with it: only gravity stays behind.
-    if len(velocities(mission)[0]) < _FEWEST_PINGS:
+    ping_s, velocity = velocities(mission)
+    if len(ping_s) < _FEWEST_PINGS:
         return notes
-    before, after = (gravity_direction(mission, time_s + at, half) for at in (-half, half))
+    gravity = gravity_direction(mission, edges, half, ping_s=ping_s, velocity=velocity)
+    before, after = gravity[:-1], gravity[1:]
     drift = (after - before + np.cross(turn, 0.5 * (before + after))).mean(axis=0)
     return notes + _level_bias(mission, drift / (2.0 * half), label)
 

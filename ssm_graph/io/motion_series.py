@@ -34,9 +34,13 @@ def force_direction(mission: Mission, time_s: Array, half: float) -> Array:
     return _unit(_gained(mission, mission.imu.accel_b, time_s, half))
 
 
-def gravity_direction(mission: Mission, time_s: Array, half: float) -> Array:
-    """Return the unit vector (N, 3) of the mean specific force less the DVL's acceleration."""
-    ping_s, velocity = velocities(mission)
+def gravity_direction(
+    mission: Mission, time_s: Array, half: float, *, ping_s: Array, velocity: Array
+) -> Array:
+    """Return the unit vector (N, 3) of the mean specific force less the acceleration.
+
+    ``ping_s`` (P,) and ``velocity`` (P, 3) are those of :func:`velocities`.
+    """
     v_b = np.column_stack([np.interp(time_s, ping_s, axis) for axis in velocity.T])
     gained = np.column_stack([difference(time_s, half, ping_s, axis) for axis in velocity.T])
     gravity = _gained(mission, mission.imu.accel_b, time_s, half) - gained

@@ -48,13 +48,20 @@ def test_surface_runs(name: str, until_s: float, largest_rms: float) -> None:
     [("log_auto_square_2025-05-07_14_55_13", 0.88), ("log_grid_01_05_scaled", 0.91)],
 )
 def test_a_small_bias_of_one_beam_for_long_is_found(name: str, largest_rms: float) -> None:
-    """0.15 m/s for 40 s after GNSS has ended: the beam is left out, the others are kept."""
+    """0.15 m/s for 40 s after GNSS has ended: the beam is left out, the others are kept.
+
+    The error stays below 1 % of the path; a kernel alone lets it grow beyond 2 m.
+    """
     mission, withheld = withhold_gnss(convert_blueye(RUNS / f"{name}.mcap"), 70.0)
     elapsed = mission.dvl.time_s - mission.dvl.time_s[0]
     is_off = (elapsed > 100.0) & (elapsed < 140.0)
     speed = mission.dvl.speed.copy()
     speed[is_off, 1] += 0.15
-    estimate = sg.smooth(replace(mission, dvl=replace(mission.dvl, speed=speed)))
+    biased = replace(mission, dvl=replace(mission.dvl, speed=speed))
+    alone = sg.smooth(biased, sg.SmootherConfig())
+    reference = sg.reference_from_gnss(withheld, alone.trajectory)
+    assert sg.evaluate(alone.trajectory, reference).rmse_horizontal_m > 2.0
+    estimate = sg.smooth(biased)
     assert any(note.startswith("beam 2 is off") for note in estimate.notes)
     beams = estimate.beams
     then = (beams.time_s > mission.dvl.time_s[is_off][0]) & (
