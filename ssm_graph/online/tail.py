@@ -76,18 +76,17 @@ class Tail:
         """Return where the vehicle is now; the keyframe itself if nothing came since."""
         if self._end_s <= self._begin_s:
             return Newest(self._begin_s, self._states, self._covariance)
-        if self._gap_s:
-            self._cover_gap()
         end = Keyframe.unmeasured(self._end_s, np.zeros(3), self._way)
         predicted = self._rows.predict(end, self._states)
-        covariance = self._rows.carry(end, self._states, predicted, self._covariance)
+        begun = self._covariance + self._unseen() if self._gap_s else self._covariance
+        covariance = self._rows.carry(end, self._states, predicted, begun)
         return Newest(self._end_s, predicted, covariance)
 
-    def _cover_gap(self) -> None:
-        """Let the uncertainty cover what may have happened where samples are missing.
+    def _unseen(self) -> Array:
+        """Return the covariance (n, n) of what may have happened where samples are missing.
 
         The noise of what is integrated already stands, so the whole is integrated with more of it
-        from the next keyframe on; until then the gap's own share is added here.
+        from the next keyframe on; until then the gap's own share is added to the keyframe's.
         """
         span = self._end_s - self._begin_s
         noisy = imu_params(
@@ -98,5 +97,4 @@ class Tail:
         accel = noisy.getAccelerometerCovariance() * span
         extra[:3, :3], extra[6:9, 6:9] = gyro, accel
         extra[3:6, 3:6] = accel * span**2 / 3.0
-        self._covariance = self._covariance + extra
-        self._gap_s = 0.0
+        return extra
