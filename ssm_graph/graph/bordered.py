@@ -16,6 +16,7 @@ from scipy.linalg.lapack import dgeqrf
 
 from ssm_graph.data import Array
 from ssm_graph.errors import SolverError
+from ssm_graph.stepwise import Steps, finished
 
 
 class ChainRows(NamedTuple):
@@ -101,8 +102,13 @@ def solve_bordered(rows: ChainRows) -> BorderedSolution:
     SolverError
         If the rows do not determine everything, or the solution is not finite.
     """
+    return finished(solve_bordered_steps(rows))
+
+
+def solve_bordered_steps(rows: ChainRows) -> Steps[BorderedSolution]:
+    """Make :func:`solve_bordered` in steps."""
     n_keyframes, n = len(rows.first) - 1, rows.start.shape[0]
-    eliminated, left = _eliminate(rows)
+    eliminated, left = yield from _eliminate_steps(rows)
     R = np.triu(eliminated[:, :, :n])
     try:
         constants_step, constants_cov = _solve_border(np.concatenate([left, rows.border]))
@@ -114,6 +120,7 @@ def solve_bordered(rows: ChainRows) -> BorderedSolution:
             "elimination failed: a keyframe or a calibration is not determined, look for zero or "
             "infinite sigmas"
         ) from error
+    yield 0.011 * n_keyframes
     gain, answers, R_inv = np.split(solved, [n, solved.shape[2] - n], axis=2)
     conditional = R_inv @ np.swapaxes(R_inv, 1, 2)
     # Columns of the border, and the solution without it, go back through the chain together.
@@ -124,6 +131,7 @@ def solve_bordered(rows: ChainRows) -> BorderedSolution:
         M = gain[k]
         answers[k] -= dot(M, answers[k + 1])
         conditional[k] += dot(dot(M, conditional[k + 1]), M.T)
+        yield 0.008
     sensitivity = answers[:, :, :-1]
     step = answers[:, :, -1] + sensitivity @ constants_step
     if not (np.all(np.isfinite(step)) and np.all(np.isfinite(constants_cov))):
@@ -134,7 +142,7 @@ def solve_bordered(rows: ChainRows) -> BorderedSolution:
     return BorderedSolution(step, constants_step, conditional, sensitivity, constants_cov, gain, R)
 
 
-def _eliminate(rows: ChainRows) -> tuple[Array, Array]:
+def _eliminate_steps(rows: ChainRows) -> Steps[tuple[Array, Array]]:
     """Return the rows of every keyframe after elimination, and what is left for the border.
 
     The former are (K, n, 2 n + C + 1), upper triangular but for what LAPACK keeps below.
@@ -159,6 +167,7 @@ def _eliminate(rows: ChainRows) -> tuple[Array, Array]:
         carried = reduced[n : 2 * n, n:] * triangle
         remains = min(end - begin, width - n)
         left[k, :remains] = reduced[2 * n : 2 * n + remains, 2 * n :]
+        yield 0.025
     last = np.concatenate([carried, own[first[-2] :]])
     reduced = dgeqrf(last)[0]
     eliminated[-1, :, :n], eliminated[-1, :, 2 * n :] = reduced[:n, :n], reduced[:n, n:]

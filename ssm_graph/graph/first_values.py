@@ -32,6 +32,7 @@ from ssm_graph.graph.states import States, states_from_arrays
 from ssm_graph.imu.preintegration import gravity_gradient, gtsam_gravity
 from ssm_graph.problem.error_state import POSITION, ROTATION, STATE_DIM, VELOCITY
 from ssm_graph.problem.problem import Problem, start_of
+from ssm_graph.stepwise import Steps, finished
 
 LOCKED_OUT_PINGS = 3
 """After so many pings in a row without one good beam the prediction is doubted instead."""
@@ -62,8 +63,16 @@ def first_values(
 
     ``inertial`` is the graph of :func:`inertial_graph`, where it is at hand already.
     """
+    return finished(first_values_steps(problem, kernel=kernel, inertial=inertial))
+
+
+def first_values_steps(
+    problem: Problem, *, kernel: Kernel, inertial: gtsam.NonlinearFactorGraph | None = None
+) -> Steps[FirstValues]:
+    """Make :func:`first_values` in steps."""
     try:
-        first = _ForwardPass(problem, kernel, inertial or inertial_graph(problem)).run()
+        forward = _ForwardPass(problem, kernel, inertial or inertial_graph(problem))
+        first = yield from forward.run_steps()
     except np.linalg.LinAlgError as error:
         raise SolverError(f"the first pass ran away ({error}): {_HINT}") from error
     if not (np.all(np.isfinite(first.states.p_n)) and np.all(np.isfinite(first.states.v_n))):
@@ -110,7 +119,7 @@ class _ForwardPass:
         self._g_n = gtsam_gravity(problem.frame, self.p_n)
         self._gradient = gravity_gradient(problem.frame)
 
-    def run(self) -> FirstValues:
+    def run_steps(self) -> Steps[FirstValues]:
         problem = self.problem
         rows = _RowsByKeyframe(problem)
         history: list[tuple[Array, ...]] = []
@@ -122,7 +131,9 @@ class _ForwardPass:
             self._update_dvl(rows.beam[k], self._depth_row(rows.depth[k], k))
             walks = (self.extras.walks,) if self.extras else ()
             history.append((self.R_nb, self.p_n, self.v_n, self.bias, *walks))
+            yield 0.6
         states = states_from_arrays(*(np.array(column) for column in zip(*history, strict=True)))
+        yield 0.02 * problem.n_keyframes
         if self.extras:
             states = states._replace(constants=self.extras.constants)
         states, met = find_beacons(states, self.aids, problem.extras, self.met.weights)

@@ -15,6 +15,7 @@ from ssm_graph.data import Array
 from ssm_graph.graph.states import States
 from ssm_graph.problem.error_state import POSITION, STATE_DIM, VELOCITY
 from ssm_graph.problem.problem import Problem
+from ssm_graph.stepwise import Steps
 
 PAIR_COLUMNS = np.r_[0:9, 18:24, 9:18, 24:30, 30]
 """Columns of GTSAM's factor, x_i v_i x_j v_j b_i b_j and b, as two error states and b."""
@@ -56,14 +57,16 @@ def add_gravity_gradient(
     end[..., POSITION] += D_middle @ R_end
 
 
-def inertial_rows(
+def inertial_rows_steps(
     graph: gtsam.NonlinearFactorGraph, states: States, gradient: Array, *, span_s: Array
-) -> Array:
+) -> Steps[Array]:
     """Return the whitened rows (K - 1, 15, 31) of a chain of inertial factors at ``states``."""
     linear = graph.linearize(states.values)
+    yield 0.012 * len(span_s)
     rows = np.empty((len(span_s), STATE_DIM, 2 * STATE_DIM + 1))
     for k in range(len(rows)):
         rows[k] = linear.at(k).augmentedJacobian()
+    yield 0.003 * len(rows)
     rows = rows[:, :, PAIR_COLUMNS]
     R_nb = states.R_nb
     add_gravity_gradient(rows, gradient, R_begin=R_nb[:-1], R_end=R_nb[1:], span_s=span_s)
@@ -79,7 +82,7 @@ def pair_rows(
     R_end: Array,
     span_s: float,
 ) -> Array:
-    """Return the whitened rows (15, 31) of one inertial factor; see :func:`inertial_rows`."""
+    """Return the whitened rows (15, 31) of one inertial factor; see :func:`inertial_rows_steps`."""
     pair = factor.linearize(values).augmentedJacobian()[:, PAIR_COLUMNS]
     add_gravity_gradient(pair, gradient, R_begin=R_begin, R_end=R_end, span_s=span_s)
     return np.asarray(pair)

@@ -16,14 +16,15 @@ from ssm_graph.data import Array
 from ssm_graph.graph.aids.of_problem import full_aids, weighted_aids
 from ssm_graph.graph.augmented_rows import AugmentedBeams, RowStates, states_of
 from ssm_graph.graph.beam_rows import BeamRows
-from ssm_graph.graph.bordered import BorderedSolution, ChainRows, solve_bordered
-from ssm_graph.graph.inertial_rows import inertial_graph, inertial_rows
+from ssm_graph.graph.bordered import BorderedSolution, ChainRows, solve_bordered_steps
+from ssm_graph.graph.inertial_rows import inertial_graph, inertial_rows_steps
 from ssm_graph.graph.marginal_prior import prior_at_start
 from ssm_graph.graph.states import States, retract
 from ssm_graph.imu.preintegration import gravity_gradient
 from ssm_graph.problem.calibration import needs_motion
 from ssm_graph.problem.error_state import STATE_DIM
 from ssm_graph.problem.problem import Problem, start_of
+from ssm_graph.stepwise import Steps, finished
 
 JUDGED_PASSES = 2
 """The first pass is at the states of the forward pass, the second at smoothed ones."""
@@ -125,8 +126,19 @@ class GraphLinearizer:
 
         ``aid_weights`` are those of the weighted aids' measurements; all one when left out.
         """
+        return finished(self.solve_steps(states, beam_rows, weights, aid_weights))
+
+    def solve_steps(
+        self,
+        states: States,
+        beam_rows: BeamRows,
+        weights: Array,
+        aid_weights: Array | None = None,
+    ) -> Steps[Step]:
+        """Make :meth:`solve` in steps."""
         extras = self.problem.extras
         own, first = self._own_rows(states, beam_rows, weights, aid_weights)
+        between = yield from self._between_steps(states)
         sigma = extras.sigma
         start = np.zeros((extras.state_dim, extras.width + 1))
         prior = self.prior.rows(states)
@@ -137,16 +149,17 @@ class GraphLinearizer:
         border = np.diag(1.0 / sigma[constant])
         rows = ChainRows(
             start=start,
-            between=self._between(states),
+            between=between,
             own=own,
             first=first,
             border=np.column_stack([border, -states.constants / sigma[constant]]),
         )
-        return Step(solve_bordered(rows))
+        yield 0.005 * len(between)
+        return Step((yield from solve_bordered_steps(rows)))
 
-    def inertial_rows(self, states: States) -> Array:
+    def inertial_rows_steps(self, states: States) -> Steps[Array]:
         """Return the whitened rows (K - 1, 15, 31) of the inertial data at ``states``."""
-        return inertial_rows(self.inertial, states, self._gradient, span_s=self._span_s)
+        return inertial_rows_steps(self.inertial, states, self._gradient, span_s=self._span_s)
 
     def retract(
         self, states: States, delta: tuple[Array, Array], *, scale: float = 1.0
@@ -195,11 +208,12 @@ class GraphLinearizer:
         went = states.walks[1:] - self._walk_factor * states.walks[:-1]
         return np.asarray(went / self._walk_sigma)
 
-    def _between(self, states: States) -> Array:
+    def _between_steps(self, states: States) -> Steps[Array]:
         """Return the rows (K - 1, n, 2 n + C + 1) from each keyframe to the next."""
         extras = self.problem.extras
         n, n_intervals = extras.state_dim, self.problem.n_keyframes - 1
-        begin, end, b = np.split(self.inertial_rows(states), [STATE_DIM, 2 * STATE_DIM], axis=2)
+        inertial = yield from self.inertial_rows_steps(states)
+        begin, end, b = np.split(inertial, [STATE_DIM, 2 * STATE_DIM], axis=2)
         between = np.zeros((n_intervals, n, n + extras.width + 1))
         between[:, :STATE_DIM, :STATE_DIM] = begin
         between[:, :STATE_DIM, n : n + STATE_DIM] = end

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from ssm_graph.data import Array, ImuLog
 from ssm_graph.errors import ConfigError, DataError
+from ssm_graph.stepwise import Steps, finished
 
 
 class MergedSamples(NamedTuple):
@@ -61,6 +62,11 @@ def merge_samples(imu: ImuLog, keyframe_s: Array, *, rate_hz: float) -> MergedSa
     .. [1] P. G. Savage, "Strapdown Inertial Navigation Integration Algorithm Design", parts 1 and
        2, Journal of Guidance, Control, and Dynamics 21, 1998.
     """
+    return finished(merge_samples_steps(imu, keyframe_s, rate_hz=rate_hz))
+
+
+def merge_samples_steps(imu: ImuLog, keyframe_s: Array, *, rate_hz: float) -> Steps[MergedSamples]:
+    """Make :func:`merge_samples` in steps."""
     if not (np.isfinite(rate_hz) and rate_hz > 0.0):
         raise ConfigError(f"merge rate: expected a positive rate in Hz, got {rate_hz}")
     edges = np.concatenate([[imu.start_s], imu.time_s])
@@ -70,6 +76,7 @@ def merge_samples(imu: ImuLog, keyframe_s: Array, *, rate_hz: float) -> MergedSa
             f"data {edges[0]:.3f}..{edges[-1]:.3f} s"
         )
     piece_edges, sample = _cut(edges, keyframe_s)
+    yield 3e-4 * len(sample)
     h = np.diff(piece_edges)[:, None]
     omega, force = imu.gyro_b[sample], imu.accel_b[sample]
     omega_slope, force_slope = (_slopes(edges, rate)[sample] for rate in (imu.gyro_b, imu.accel_b))
@@ -78,11 +85,13 @@ def merge_samples(imu: ImuLog, keyframe_s: Array, *, rate_hz: float) -> MergedSa
     shift = (piece_edges[:-1] + 0.5 * h[:, 0] - mid)[:, None]
     omega, force = omega + omega_slope * shift, force + force_slope * shift
 
+    yield 3e-4 * len(sample)
     first = _group_starts(piece_edges, keyframe_s, rate_hz)
     scale = h**3 / 12.0
     theta = omega * h + scale * np.cross(omega, omega_slope)
     v = force * h + scale * (np.cross(omega, force_slope) + np.cross(force, omega_slope))
-    theta, v = _merge(theta, v, first)
+    yield 5e-4 * len(sample)
+    theta, v = yield from _merge_steps(theta, v, first)
     dt = np.add.reduceat(h[:, 0], first)
     intervals = np.searchsorted(piece_edges[first], keyframe_s[:-1])
     return MergedSamples(
@@ -120,7 +129,7 @@ def _group_starts(piece_edges: Array, keyframe_s: Array, rate_hz: float) -> NDAr
     return np.flatnonzero(is_first)
 
 
-def _merge(theta: Array, v: Array, first: NDArray[np.intp]) -> tuple[Array, Array]:
+def _merge_steps(theta: Array, v: Array, first: NDArray[np.intp]) -> Steps[tuple[Array, Array]]:
     """Compose the pieces of each group that begins at ``first``.
 
     Returns the rotation vector (M, 3) of the whole, and the velocity increment (M, 3) that a
@@ -135,6 +144,7 @@ def _merge(theta: Array, v: Array, first: NDArray[np.intp]) -> tuple[Array, Arra
         theta_k, v_k = theta[piece] * has_piece, v[piece] * has_piece
         gained += turned.apply(_left_jacobian_times(theta_k, v_k))
         turned = turned * Rotation.from_rotvec(theta_k)
+        yield 5e-4 * len(first)
     theta_all = turned.as_rotvec()
     return theta_all, _left_jacobian_solve(theta_all, gained)
 

@@ -12,7 +12,8 @@ import numpy as np
 
 from ssm_graph.data import Array, ImuLog, ImuNoise
 from ssm_graph.earth import LocalFrame
-from ssm_graph.imu.increments import MergedSamples, merge_samples
+from ssm_graph.imu.increments import MergedSamples, merge_samples_steps
+from ssm_graph.stepwise import Steps, finished
 
 INTEGRATION_DENSITY = 1e-4
 """m/sqrt(s): what the integration itself loses. At 20 Hz a constant force within each sample costs
@@ -95,9 +96,17 @@ def preintegrate(
     InertialChain
         Of K - 1 measurements, gravity set for the origin of ``frame``.
     """
+    return finished(preintegrate_steps(imu, keyframe_s, frame=frame, rate_hz=rate_hz, bias=bias))
+
+
+def preintegrate_steps(
+    imu: ImuLog, keyframe_s: Array, *, frame: LocalFrame, rate_hz: float, bias: Array | None = None
+) -> Steps[InertialChain]:
+    """Make :func:`preintegrate` in steps."""
     gaps = imu_gaps(imu)
     unseen = _unseen(imu, keyframe_s, gaps)
-    merged = merge_samples(bridged(imu, gaps), keyframe_s, rate_hz=rate_hz)
+    yield 3e-4 * len(imu.time_s)
+    merged = yield from merge_samples_steps(bridged(imu, gaps), keyframe_s, rate_hz=rate_hz)
     g_n = gtsam_gravity(frame, ORIGIN)
     bias = np.zeros(6) if bias is None else bias
     bias_hat = gtsam.imuBias.ConstantBias(bias[:3], bias[3:])
@@ -105,14 +114,16 @@ def preintegrate(
         imu_params(imu.noise, g_n=g_n, frame=frame, unseen=motion, span_s=span)
         for motion, span in zip(unseen, np.diff(keyframe_s), strict=True)
     )
-    return InertialChain(_integrate(merged, params, bias_hat), params, frame)
+    yield 0.02 * len(params)
+    measurements = yield from _integrate_steps(merged, params, bias_hat)
+    return InertialChain(measurements, params, frame)
 
 
-def _integrate(
+def _integrate_steps(
     merged: MergedSamples,
     params: Sequence[gtsam.PreintegrationCombinedParams],
     bias: gtsam.imuBias.ConstantBias,
-) -> tuple[Preintegrated, ...]:
+) -> Steps[tuple[Preintegrated, ...]]:
     measurements = []
     dts = merged.dt.tolist()
     for k, interval_params in enumerate(params):
@@ -120,6 +131,7 @@ def _integrate(
         for i in range(merged.first[k], merged.first[k + 1]):
             measured.integrateMeasurement(merged.accel_b[i], merged.gyro_b[i], dts[i])
         measurements.append(measured)
+        yield 0.02
     return tuple(measurements)
 
 

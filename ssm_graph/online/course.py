@@ -92,15 +92,18 @@ class Course:
             undone = True
         return undone
 
-    def advance(self, *, is_sample: bool = False) -> int:
-        """Make all steps that the data allow; return how many.
+    def advance(self, *, is_sample: bool = False, at_most: float = np.inf) -> int:
+        """Make all steps that the data allow, but ``at_most`` so many; return how many.
 
         ``is_sample`` says that nothing but one more inertial sample has come since the last call.
         """
         if is_sample and self._buffers.imu.last_s < self._maker.not_before_s:
             return 0
         count = 0
-        while (measured := self._maker.next_after(self.newest.time_s)) is not None:
+        while count < at_most:
+            measured = self._maker.next_after(self.newest.time_s)
+            if measured is None:
+                break
             self._steps.append(self._step(measured))
             count += 1
             self._let_go()

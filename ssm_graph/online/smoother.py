@@ -62,6 +62,8 @@ ONLINE: Final = FixedLagConfig(
 """What a vehicle can afford; `benchmarks/online.py` compares it with windows solved to the end."""
 LONGEST_GAP_S: Final = 10.0
 """After a longer gap of the inertial data the attitude has to be found anew."""
+CATCH_UP_STEPS: Final = 2
+"""Of the keyframes that came while an alignment was worked on so many are made in one push."""
 
 
 class FixedLagSmoother:
@@ -120,24 +122,30 @@ class FixedLagSmoother:
 
     def _update(self, message: Message, time_s: float, *, is_late: bool) -> bool:
         """Let the answer follow what has come; return whether a keyframe was made."""
-        if self._course is None:
-            return self._start()
         course, buffers = self._course, self._intake.buffers
-        if isinstance(message, ImuSample) and self._is_gap(time_s):
-            reason = f"no inertial data for more than {LONGEST_GAP_S:.0f} s"
-            self._intake.buffers.drop_before(time_s)
-            self._lose(time_s, reason)
+        is_sample = isinstance(message, ImuSample)
+        if is_sample and self._is_gap(time_s):
+            buffers.drop_before(time_s)
+            if course is None:
+                self._starter.begin_anew()
+            else:
+                self._lose(time_s, f"no inertial data for more than {LONGEST_GAP_S:.0f} s")
             return False
-        reach_s = REACH_S if isinstance(message, ImuSample) else MIN_SPACING_S
-        undone = is_late and course.rewind(time_s - reach_s)
-        n_made = course.advance(is_sample=not is_late)
+        if course is None:
+            return self._start()
+        is_behind = self._tail is None
+        undone = is_late and course.rewind(time_s - (REACH_S if is_sample else MIN_SPACING_S))
+        n_made = course.advance(
+            is_sample=not (is_late or is_behind), at_most=CATCH_UP_STEPS if is_behind else np.inf
+        )
         self._intake.horizon_s = course.horizon_s
         if is_astray(course.newest.watch):
             self._lose(
                 time_s, f"fixes contradicted the position {ASTRAY_TIMES} times: wrong heading?"
             )
             return True
-        is_sample = isinstance(message, ImuSample)
+        if is_behind and n_made == CATCH_UP_STEPS:
+            return True
         if undone or n_made or self._tail is None or (is_late and is_sample):
             self._tail = self._tail_of(course.newest)
         elif is_sample:
@@ -163,15 +171,13 @@ class FixedLagSmoother:
         sensors = sensors_of_vehicle(self.vehicle, beginning.frame)
         window = Window(sensors, self.config, first, beginning.moments)
         window.iterate()
-        self._follow(Step(window, Watch(), None, Reserve.of(window)), maker)
+        self._course = self._course_from(Step(window, Watch(), None, Reserve.of(window)), maker)
 
-    def _follow(self, step: Step, maker: KeyframeMaker) -> None:
-        """Make all steps from a first one on."""
+    def _course_from(self, step: Step, maker: KeyframeMaker) -> Course:
         null_b = np.linalg.svd(self.vehicle.mount.beams_b.T)[2][-1]
-        self._course = Course(step, maker, self._intake.buffers, self._events, null_b)
-        self._course.advance()
-        self._intake.horizon_s = self._course.horizon_s
-        self._tail = self._tail_of(self._course.newest)
+        course = Course(step, maker, self._intake.buffers, self._events, null_b)
+        self._intake.horizon_s = course.horizon_s
+        return course
 
     def checkpoint(self) -> tuple[dict[str, Array], dict[str, Any]]:
         """Return the state as plain arrays and plain numbers, for :meth:`restore`.
@@ -222,7 +228,10 @@ class FixedLagSmoother:
             window = Window.unpack(window_arrays(arrays), sensors, smoother.config, maker.way)
             watch, left = unpack_watch(meta["watch"]), unpack_left(arrays)
             step = Step(window, watch, left, unpack_reserve(arrays))
-            smoother._follow(step, maker)
+            smoother._course = course = smoother._course_from(step, maker)
+            course.advance()
+            intake.horizon_s = course.horizon_s
+            smoother._tail = smoother._tail_of(course.newest)
         return smoother
 
     def _is_gap(self, time_s: float) -> bool:

@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from ssm_graph.data import InitialState
+from ssm_graph.data import InitialState, Mission
 from ssm_graph.earth import LocalFrame
 from ssm_graph.errors import SsmGraphError
 from ssm_graph.messages import Severity, Vehicle
@@ -18,16 +18,22 @@ from ssm_graph.problem.alignment import SAFE_HEADING_SIGMA
 from ssm_graph.problem.calibration import windowed
 from ssm_graph.problem.error_state import InitialMoments, initial_moments
 from ssm_graph.problem.extras import with_extras
-from ssm_graph.problem.problem import ProblemConfig, build_problem
-from ssm_graph.smoothers.fixed_lag import run_fixed_lag
+from ssm_graph.problem.problem import ProblemConfig, build_problem_steps
+from ssm_graph.smoothers.fixed_lag import run_fixed_lag_steps
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
-from ssm_graph.smoothers.mission import smooth
+from ssm_graph.smoothers.mission import smooth_steps
+from ssm_graph.stepwise import Steps
 
 SETTLE_S: Final = 1.0
 """So much inertial data is waited for, since the first samples may come late as well."""
 TRY_EVERY_S: Final = 5.0
 LONGEST_S: Final = 300.0
 """Data to align with are kept for so long."""
+SHARE: Final = 0.5
+"""Of a laptop's processor, spent on an alignment. It is counted off by the time of the data and the
+size of the steps, never by a clock: every replay comes to the same start at the same sample."""
+MOST_MS: Final = 10.0
+"""So much is worked on it in one push, and to the end of the step that goes beyond."""
 STALE_S: Final = 60.0
 """A given initial state may be so much older than the data."""
 
@@ -41,13 +47,19 @@ class Beginning(NamedTuple):
 
 
 class Starter:
-    """Finds the beginning as soon as the data allow."""
+    """Finds the beginning as soon as the data allow, by a little work with every sample."""
 
     def __init__(self, vehicle: Vehicle, config: ProblemConfig, events: EventLog) -> None:
         self._vehicle, self._config, self._events = vehicle, config, events
-        self._next_try_s = -np.inf
+        self._now_s = self._next_try_s = -np.inf
         self.reason = "waiting for inertial data"
         self._initial = vehicle.initial
+        self._work: Steps[Beginning | None] | None = None
+        self._credit_ms = 0.0
+
+    def begin_anew(self) -> None:
+        """Leave the alignment that is worked on; there are other data now."""
+        self._work = None
 
     def find(self, buffers: Buffers) -> Beginning | None:
         """Return the beginning, None while there is none."""
@@ -56,16 +68,33 @@ class Starter:
             return None
         if self._initial is not None:
             return self._given(self._initial, buffers)
-        now_s = buffers.imu.last_s
-        buffers.drop_before(now_s - LONGEST_S)
-        if now_s < self._next_try_s:
-            return None
-        self._next_try_s = now_s + TRY_EVERY_S
+        elapsed_s, self._now_s = imu.last_s - self._now_s, imu.last_s
+        if self._work is None:
+            buffers.drop_before(self._now_s - LONGEST_S)
+            if self._now_s < self._next_try_s:
+                return None
+            self._next_try_s = self._now_s + TRY_EVERY_S
+            frame = self._frame(buffers)
+            if frame is None:
+                self._wait("waiting for a GNSS fix, or an initial state")
+                return None
+            self._work, self._credit_ms = self._align_steps(buffers.mission(frame)), 0.0
+        self._credit_ms = min(self._credit_ms + 1e3 * SHARE * elapsed_s, MOST_MS)
+        return self._go_on(self._work)
+
+    def _go_on(self, work: Steps[Beginning | None]) -> Beginning | None:
+        """Work on an alignment for what the time of the data allows; return where it leads."""
         try:
-            return self._aligned(buffers)
+            while self._credit_ms > 0.0:
+                self._credit_ms -= next(work)
+        except StopIteration as end:
+            self._work = None
+            beginning: Beginning | None = end.value
+            return beginning
         except (SsmGraphError, np.linalg.LinAlgError) as error:
-            self._wait(now_s, f"not aligned yet: {error}")
-            return None
+            self._work = None
+            self._wait(f"not aligned yet: {error}")
+        return None
 
     def _given(self, initial: InitialState, buffers: Buffers) -> Beginning | None:
         # A little inside the first sample, whose begin is known to rounding only.
@@ -76,10 +105,9 @@ class Starter:
             return None
         time_s = max(initial.time_s, first_s)
         if time_s - initial.time_s > STALE_S:
-            self._initial = None
+            self._initial, self._now_s = None, last_s
             self._wait(
-                last_s,
-                f"[initial] is {time_s - initial.time_s:.0f} s older than the data: left out",
+                f"[initial] is {time_s - initial.time_s:.0f} s older than the data: left out"
             )
             return None
         frame = self._frame(buffers)
@@ -93,30 +121,26 @@ class Starter:
         moments = initial_moments(start, frame, bias_sigma=bias_sigma)
         return with_extras(moments, extras_of_vehicle(self._vehicle))
 
-    def _aligned(self, buffers: Buffers) -> Beginning | None:
+    def _align_steps(self, mission: Mission) -> Steps[Beginning | None]:
         """Smooth what there is; begin at its end if that may be believed."""
-        frame, now_s = self._frame(buffers), buffers.imu.last_s
-        if frame is None:
-            self._wait(now_s, "waiting for a GNSS fix, or an initial state")
-            return None
-        mission = buffers.mission(frame)
-        estimate = smooth(mission, problem_config=self._config)
+        estimate = yield from smooth_steps(mission, problem_config=self._config)
         sigma = float(estimate.trajectory.attitude_sigma[-1, 2])
         if not estimate.status.is_good or sigma > SAFE_HEADING_SIGMA:
             self._wait(
-                now_s,
                 f"heading sigma {np.degrees(sigma):.0f} deg: {estimate.reason}; move while GNSS "
                 "is there",
             )
             return None
-        problem = build_problem(mission, self._config, start=estimate.start)
-        newest = run_fixed_lag(problem, FixedLagConfig(0.0, tolerance=1e-3)).newest
+        problem = yield from build_problem_steps(mission, self._config, start=estimate.start)
+        run = yield from run_fixed_lag_steps(problem, FixedLagConfig(0.0, tolerance=1e-3))
+        newest = run.newest
         found = newest.states.take(np.s_[-1:]).moments(newest.covariance[-1])
         moments = with_extras(found, extras_of_vehicle(self._vehicle), windowed(problem.extras))
+        self.reason = "aligned: catching up with what has come meanwhile"
         self._events.tell(
-            now_s, Severity.INFO, "aligned", "; ".join(estimate.notes) or "heading found"
+            self._now_s, Severity.INFO, "aligned", "; ".join(estimate.notes) or "heading found"
         )
-        return Beginning(float(newest.time_s[-1]), moments, frame)
+        return Beginning(float(newest.time_s[-1]), moments, mission.frame)
 
     def _frame(self, buffers: Buffers) -> LocalFrame | None:
         if self._vehicle.frame is not None:
@@ -128,6 +152,6 @@ class Starter:
         _, lat, lon, height, *_ = buffers.fixes.all[0].tolist()
         return LocalFrame(lat, lon, height)
 
-    def _wait(self, now_s: float, reason: str) -> None:
+    def _wait(self, reason: str) -> None:
         self.reason = reason
-        self._events.tell(now_s, Severity.INFO, "aligning", reason)
+        self._events.tell(self._now_s, Severity.INFO, "aligning", reason)

@@ -25,12 +25,13 @@ from ssm_graph.frames import (
     roll_pitch_heading_from_R_lb,
     wrap_to_pi,
 )
-from ssm_graph.imu.increments import merge_samples
+from ssm_graph.imu.increments import merge_samples_steps
 from ssm_graph.problem.body_velocity import BodyVelocities, body_velocities
-from ssm_graph.problem.compass_start import heading_from_compass
+from ssm_graph.problem.compass_start import heading_from_compass_steps
 from ssm_graph.problem.start_fixes import MIN_WINDOW_S, StartFixes, start_fixes
-from ssm_graph.problem.track_heading import HeadingFit, heading_from_track
+from ssm_graph.problem.track_heading import HeadingFit, heading_from_track_steps
 from ssm_graph.problem.usable import require_usable
+from ssm_graph.stepwise import Steps, finished
 
 SAFE_HEADING_SIGMA = math.radians(10.0)
 """Above this, one heading is not safe and several are tried."""
@@ -64,16 +65,22 @@ def align(mission: Mission) -> Alignment:
     DataError
         If no inertial data follow the first fix.
     """
+    return finished(align_steps(mission))
+
+
+def align_steps(mission: Mission) -> Steps[Alignment]:
+    """Make :func:`align` in steps."""
     require_usable(mission)
     velocities = body_velocities(mission)
+    yield 0.03 * len(velocities.time_s)
     fixes = start_fixes(mission, velocities)
     start_s = float(fixes.time_s[0])
     window_s = _window(mission, start_s)
-    turned = _integrate_gyros(mission, start_s, window_s, velocities)
+    turned = yield from _integrate_gyros_steps(mission, start_s, window_s, velocities)
     R_lb = _level_and_compass(mission, turned)
     compass = _compass_sigma(mission.imu.noise, turned, mission.frame.lat)
-    track = heading_from_track(mission, fixes, R_lb, velocities)
-    magnetic = heading_from_compass(mission, start_s, R_lb, window_s=window_s)
+    track = yield from heading_from_track_steps(mission, fixes, R_lb, velocities)
+    magnetic = yield from heading_from_compass_steps(mission, start_s, R_lb, window_s=window_s)
     heading, method = _choose_heading(R_lb, compass, track, magnetic, fixes.source)
     level = _level_sigma(mission.imu.noise, turned)
     roll, pitch, _ = roll_pitch_heading_from_R_lb(R_lb)
@@ -106,15 +113,16 @@ class _Turned(NamedTuple):
     """(N, 3) ``int C f_b dt`` since the start, m/s"""
 
 
-def _integrate_gyros(
+def _integrate_gyros_steps(
     mission: Mission, start_s: float, window_s: float, velocities: BodyVelocities
-) -> _Turned:
+) -> Steps[_Turned]:
     pings = velocities.time_s[
         (velocities.time_s > start_s) & (velocities.time_s < start_s + window_s)
     ]
     if len(pings) < 3:
         pings = start_s + np.linspace(0.0, window_s, max(int(window_s), 3) + 1)[1:]
-    merged = merge_samples(mission.imu, np.concatenate([[start_s], pings]), rate_hz=20.0)
+    keyframe_s = np.concatenate([[start_s], pings])
+    merged = yield from merge_samples_steps(mission.imu, keyframe_s, rate_hz=20.0)
     v_b = velocities.at(pings)
     C, force = np.eye(3), np.zeros(3)
     rows = []
@@ -124,6 +132,7 @@ def _integrate_gyros(
             force = force + C @ half @ merged.accel_b[i] * merged.dt[i]
             C = C @ half @ half
         rows.append((C @ v_b[k], force))
+        yield 0.2
     velocity, integral = (np.array(column) for column in zip(*rows, strict=True))
     return _Turned(pings - start_s, velocity, integral)
 

@@ -8,16 +8,17 @@ import numpy as np
 
 from ssm_graph.data import Array, Mission
 from ssm_graph.frames import wrap_to_pi
-from ssm_graph.problem.track_heading import HeadingFit, gyro_attitudes
+from ssm_graph.problem.track_heading import HeadingFit, gyro_attitudes_steps
+from ssm_graph.stepwise import Steps
 
 NONE = HeadingFit(0.0, math.inf)
 UNKNOWN_OFFSET = math.radians(90.0)
 """A compass that may be off by so much, a directional gyro, says nothing of the start."""
 
 
-def heading_from_compass(
+def heading_from_compass_steps(
     mission: Mission, start_s: float, R_lb: Array, *, window_s: float
-) -> HeadingFit:
+) -> Steps[HeadingFit]:
     """Return the median of what the readings of a window say, each led back to its begin.
 
     The median keeps disturbances out that are shorter than half the window. Its sigma is that of
@@ -36,7 +37,8 @@ def heading_from_compass(
     used = (log.time_s > start_s) & (log.time_s <= start_s + window_s)
     if not used.any():
         return NONE
-    attitudes = gyro_attitudes(mission, np.concatenate([[start_s], log.time_s[used]]), R_lb)
+    time_s = np.concatenate([[start_s], log.time_s[used]])
+    attitudes = yield from gyro_attitudes_steps(mission, time_s, R_lb)
     assumed = np.arctan2(attitudes[:, 0, 0], attitudes[:, 1, 0])
     off = log.heading[used] + log.declination - assumed[1:]
     middle = math.atan2(float(np.mean(np.sin(off))), float(np.mean(np.cos(off))))

@@ -17,7 +17,7 @@ from ssm_graph.data import (
 )
 from ssm_graph.earth import LocalFrame
 from ssm_graph.errors import ConfigError, DataError
-from ssm_graph.imu.preintegration import InertialChain, imu_gaps, preintegrate
+from ssm_graph.imu.preintegration import InertialChain, imu_gaps, preintegrate_steps
 from ssm_graph.problem.aids import Depths, Fixes, depths_of, fixes_of
 from ssm_graph.problem.calibration import DVL_DRIFT, GNSS_DRIFT, extras_of, needs_motion
 from ssm_graph.problem.current import CURRENT, current_note
@@ -33,6 +33,7 @@ from ssm_graph.problem.timeline import (
     nearest,
 )
 from ssm_graph.problem.usable import require_usable
+from ssm_graph.stepwise import Steps, finished
 from ssm_graph.stuck_beams import stuck_beams
 
 NO_EXTRAS = Extras()
@@ -123,6 +124,13 @@ def build_problem(
     start : initial state with sigmas; the mission's own when left out. A mission without one
         needs :func:`ssm_graph.problem.alignment.align` first.
     """
+    return finished(build_problem_steps(mission, config, start=start))
+
+
+def build_problem_steps(
+    mission: Mission, config: ProblemConfig | None = None, *, start: InitialState | None = None
+) -> Steps[Problem]:
+    """Make :func:`build_problem` in steps."""
     require_usable(mission)
     mission, stuck_note = _without_stuck_beams(mission)
     config = config or ProblemConfig()
@@ -133,7 +141,7 @@ def build_problem(
             "let align(mission) find the start"
         )
     timeline = build_timeline(mission, start_s=start.time_s, interval_s=config.keyframe_interval_s)
-    chain = preintegrate(
+    chain = yield from preintegrate_steps(
         mission.imu, timeline.keyframe_s, frame=mission.frame, rate_hz=config.merge_rate_hz
     )
     noise = mission.imu.noise

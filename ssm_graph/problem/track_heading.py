@@ -9,9 +9,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ssm_graph.data import Array, Mission
-from ssm_graph.imu.increments import merge_samples
+from ssm_graph.imu.increments import merge_samples_steps
 from ssm_graph.problem.body_velocity import BodyVelocities
 from ssm_graph.problem.start_fixes import StartFixes
+from ssm_graph.stepwise import Steps
 
 SILENCE_S = 5.0
 """A gap between pings that ends the dead reckoning."""
@@ -26,9 +27,9 @@ class HeadingFit(NamedTuple):
     sigma: float
 
 
-def heading_from_track(
+def heading_from_track_steps(
     mission: Mission, fixes: StartFixes, R_lb: Array, velocities: BodyVelocities
-) -> HeadingFit:
+) -> Steps[HeadingFit]:
     """Turn the dead-reckoned track onto that of the fixes, over the stretch that fixes it best.
 
     Parameters
@@ -38,7 +39,7 @@ def heading_from_track(
     R_lb : (3, 3) body to local level at the start; its heading is what is sought, so any will do.
     velocities : of the body at the pings.
     """
-    time_s, track_l, antenna_l = _dead_reckon(mission, fixes, R_lb, velocities)
+    time_s, track_l, antenna_l = yield from _dead_reckon_steps(mission, fixes, R_lb, velocities)
     used = fixes.where(fixes.time_s <= time_s[-1])
     fix_n = used.position_n
     if len(fix_n) < 3:
@@ -71,9 +72,9 @@ def _fit(seen: Array, fixed: Array, *, noise: float, drift: float) -> HeadingFit
     return HeadingFit(turn, math.hypot(sigma, drift))
 
 
-def _dead_reckon(
+def _dead_reckon_steps(
     mission: Mission, fixes: StartFixes, R_lb: Array, velocities: BodyVelocities
-) -> tuple[Array, Array, Array]:
+) -> Steps[tuple[Array, Array, Array]]:
     """Return times (N,), track (N, 3) and antenna offset (N, 3) in the level axes assumed, m."""
     start_s = float(fixes.time_s[0])
     end_s = min(float(fixes.time_s[-1]), float(mission.imu.time_s[-1]))
@@ -83,16 +84,16 @@ def _dead_reckon(
     time_s = np.concatenate([[start_s], pings])
     if len(time_s) < 2:
         return time_s, np.zeros((1, 3)), (R_lb @ fixes.lever_arm_b)[None, :]
-    R = gyro_attitudes(mission, time_s, R_lb)
+    R = yield from gyro_attitudes_steps(mission, time_s, R_lb)
     v_l = np.einsum("kij,kj->ki", R, velocities.at(time_s))
     step = 0.5 * (v_l[1:] + v_l[:-1]) * np.diff(time_s)[:, None]
     track = np.concatenate([np.zeros((1, 3)), np.cumsum(step, axis=0)])
     return time_s, track, R @ fixes.lever_arm_b
 
 
-def gyro_attitudes(mission: Mission, time_s: Array, R_lb: Array) -> Array:
+def gyro_attitudes_steps(mission: Mission, time_s: Array, R_lb: Array) -> Steps[Array]:
     """Return attitudes (N, 3, 3) at the times, by the gyros alone."""
-    merged = merge_samples(mission.imu, time_s, rate_hz=20.0)
+    merged = yield from merge_samples_steps(mission.imu, time_s, rate_hz=20.0)
     # Against the turn of the Earth, which a MEMS gyro does not notice but a better one does.
     earth_l = mission.frame.omega_ie_n
     attitudes = [R_lb]
@@ -102,4 +103,5 @@ def gyro_attitudes(mission: Mission, time_s: Array, R_lb: Array) -> Array:
             rate_b = merged.gyro_b[i] - R.T @ earth_l
             R = R @ Rotation.from_rotvec(rate_b * merged.dt[i]).as_matrix()
         attitudes.append(R)
+        yield 0.15
     return np.array(attitudes)

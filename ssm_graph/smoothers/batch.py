@@ -15,7 +15,7 @@ from ssm_graph.errors import ConfigError, SolverError
 from ssm_graph.estimate import BeamTable, Estimate, Iteration, NoiseFound, Status
 from ssm_graph.graph.beacon_start import ambiguous_beacons
 from ssm_graph.graph.beam_rows import BeamRows
-from ssm_graph.graph.first_values import FirstValues, first_values
+from ssm_graph.graph.first_values import FirstValues, first_values, first_values_steps
 from ssm_graph.graph.linearize import GraphLinearizer, Step
 from ssm_graph.graph.states import States
 from ssm_graph.problem.problem import Problem, with_white_noise
@@ -27,8 +27,9 @@ from ssm_graph.smoothers.current import current_of
 from ssm_graph.smoothers.fault_watch import FaultWatch
 from ssm_graph.smoothers.gnc import GncSchedule, Graduation, Schedule, WarmSchedule
 from ssm_graph.smoothers.noise import MAX_ADAPTATIONS, adaptation, noise_notes, with_sigmas
-from ssm_graph.smoothers.passes import Pass, Solved, descend, noise_of
+from ssm_graph.smoothers.passes import Pass, Solved, descend_steps, noise_of_steps
 from ssm_graph.smoothers.verdict import contradictions
+from ssm_graph.stepwise import Steps, finished
 
 __all__ = ["OnIteration", "Similarity", "SmootherConfig", "SsmSmoother"]
 
@@ -130,38 +131,53 @@ class SsmSmoother:
         SolverError
             If no finite solution was found.
         """
+        return finished(self.solve_steps(problem, first=first, on_iteration=on_iteration))
+
+    def solve_steps(
+        self,
+        problem: Problem,
+        *,
+        first: FirstValues | None = None,
+        on_iteration: OnIteration | None = None,
+    ) -> Steps[Estimate]:
+        """Make :meth:`solve` in steps."""
         begin, used = time.perf_counter(), np.ones(N_BEAMS)
         problem = with_white_noise(problem)
         iterations: tuple[Iteration, ...] = ()
         for adaptations in range(MAX_ADAPTATIONS + 1):
-            solved = self._solve(problem, first, on_iteration)
+            solved = yield from self._solve_steps(problem, first, on_iteration)
             iterations += solved.iterations
-            noise = noise_of(solved, used)
+            noise = yield from noise_of_steps(solved, used)
             is_wanted = self.config.adapt_noise and solved.status is not Status.INTERRUPTED
             change = adaptation(noise) if is_wanted and adaptations < MAX_ADAPTATIONS else None
             if change is None:
                 break
             used, problem, first = used * change, with_sigmas(problem, change), solved.again()
         solved = solved._replace(iterations=iterations)
+        yield 0.01 * problem.n_keyframes
         return self._estimate(solved, noise, wall_s=time.perf_counter() - begin)
 
-    def _solve(
+    def _solve_steps(
         self, problem: Problem, first: FirstValues | None, on_iteration: OnIteration | None
-    ) -> Solved:
+    ) -> Steps[Solved]:
         """Iterate states and weights until both have settled."""
         linearizer = GraphLinearizer(problem)
+        yield 0.03 * problem.n_keyframes
         if first is None:
-            first = first_values(problem, kernel=WARM_KERNEL, inertial=linearizer.inertial)
+            first = yield from first_values_steps(
+                problem, kernel=WARM_KERNEL, inertial=linearizer.inertial
+            )
         states, rows = first.states, linearizer.beam_rows(first.states)
         schedule = self.config.schedule()
         weights = schedule.first_weights(first.weights)
         faults = FaultWatch(problem, self.config.fault_search)
+        yield 0.03 * problem.n_keyframes
         aids = self._aids(linearizer, first)
         iterations: list[Iteration] = []
         status = Status.MAX_ITERATIONS
         for number in range(self.config.max_iterations):
             try:
-                this = self._iterate(
+                this = yield from self._iterate(
                     linearizer, states, rows, weights, schedule.kernel, faults, aids
                 )
             except KeyboardInterrupt:
@@ -177,7 +193,7 @@ class SsmSmoother:
                 on_iteration(number + 1, self.config.max_iterations, iterations[-1])
             is_settled = max(this.update_sigmas, this.weight_change) < self.config.tolerance
             is_settled = is_settled and schedule.may_end(this.weights) and aids.may_end
-            has_news = faults.look(
+            has_news = yield from faults.look_steps(
                 states,
                 rows,
                 update_sigmas=this.update_sigmas,
@@ -187,6 +203,7 @@ class SsmSmoother:
             if is_settled and not has_news:
                 status = Status.CONVERGED
                 break
+            yield 0.007 * problem.n_keyframes
             aids.go_on(this.update_sigmas)
             weights = faults.leave_out(
                 schedule.next_weights(
@@ -205,13 +222,15 @@ class SsmSmoother:
         kernel: Kernel,
         faults: FaultWatch,
         aids: AidWeighing,
-    ) -> Pass:
+    ) -> Steps[Pass]:
         problem = linearizer.problem
         if linearizer.follow(states):
             rows = linearizer.beam_rows(states)
-        step = linearizer.solve(states, rows, weights, aids.used)
+        yield 0.004 * problem.n_keyframes
+        step = yield from linearizer.solve_steps(states, rows, weights, aids.used)
         cost = linearizer.cost(states, rows, weights, aids.used)
-        states, rows, update = descend(
+        yield 0.005 * problem.n_keyframes
+        states, rows, update = yield from descend_steps(
             linearizer, states, step.delta, weights, cost, aid_weights=aids.used
         )
         sigma = step.sigma

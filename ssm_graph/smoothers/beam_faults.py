@@ -27,6 +27,7 @@ from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.states import States
 from ssm_graph.graph.water_rows import WaterRows
 from ssm_graph.problem.problem import Problem
+from ssm_graph.stepwise import Steps
 
 Mask = NDArray[np.bool_]
 
@@ -83,13 +84,13 @@ class Found(NamedTuple):
     """Begin and end of stretches in which some beam is off and it is not clear which."""
 
 
-def find_beam_faults(
+def find_beam_faults_steps(
     linearizer: GraphLinearizer,
     states: States,
     rows: BeamRows,
     search: FaultSearch,
     aid_weights: Array | None = None,
-) -> Found:
+) -> Steps[Found]:
     """Search the whole mission, linearised at ``states`` near the answer.
 
     ``aid_weights`` are those of the further aids' measurements; all one when left out.
@@ -98,7 +99,8 @@ def find_beam_faults(
     jacobian = rows.jacobian
     weights = KERNEL.weight((rows.error / beams.sigma) ** 2)
     linearizer.follow(states)
-    solution = linearizer.solve(states, rows, weights, aid_weights).solution
+    yield 0.01 * problem.n_keyframes
+    solution = (yield from linearizer.solve_steps(states, rows, weights, aid_weights)).solution
     missed = -rows.error - np.einsum("mi,mi->m", jacobian, solution.step[beams.keyframe])
     scale = np.sqrt(weights) / beams.sigma
     whitened = WhitenedBeams(
@@ -107,6 +109,7 @@ def find_beam_faults(
         missed * scale / _excess(beams.beam, weights, missed / beams.sigma),
     )
     evidence = ChainEvidence(solution, whitened)
+    yield 0.015 * problem.n_keyframes
     own = np.zeros((len(scale), N_BEAMS))
     own[np.arange(len(scale)), beams.beam] = np.sqrt(weights)
     shared = calibration_columns(problem, states) * (CALIBRATION_SIGMA * scale[:, None])
@@ -116,6 +119,7 @@ def find_beam_faults(
     found: list[Stretch] = []
     for piece, middle in pieces_of(len(edges) - 1):
         judged = evidence.of(edges[piece.start : piece.stop + 1], own, shared)
+        yield 0.01 * problem.n_keyframes
         for stretch in _search(without_shared(judged, shared.shape[1]), search):
             begin = max(stretch.begin + piece.start, middle.start)
             end = min(stretch.end + piece.start, middle.stop)

@@ -15,8 +15,9 @@ from ssm_graph.problem.aid_errors import is_of_aid
 from ssm_graph.problem.current import CURRENTS
 from ssm_graph.problem.extras import Extras
 from ssm_graph.problem.problem import Problem, with_stated_noise
-from ssm_graph.smoothers.beam_faults import FaultSearch, Found, find_beam_faults
+from ssm_graph.smoothers.beam_faults import FaultSearch, Found, find_beam_faults_steps
 from ssm_graph.smoothers.gnc import NEAR_SIGMAS
+from ssm_graph.stepwise import Steps
 
 FREE_LOOKS = 2
 """So often a search may take back what the one before it found."""
@@ -52,7 +53,7 @@ class FaultWatch:
         """Return the weights (M,) with the floor for what was found."""
         return np.where(self._found.is_off, WEIGHT_FLOOR, weights)
 
-    def look(
+    def look_steps(
         self,
         states: States,
         rows: BeamRows,
@@ -60,7 +61,7 @@ class FaultWatch:
         update_sigmas: float,
         is_settled: bool,
         aid_weights: Array | None = None,
-    ) -> bool:
+    ) -> Steps[bool]:
         """Search once the solution is near, and whenever it has settled; return what has changed.
 
         The first solution may be far off where a fault has not been left out yet: its findings are
@@ -72,7 +73,9 @@ class FaultWatch:
             return False
         self._n_looks += 1
         alone, before = self._without_calibration(states, rows), self._found
-        found = find_beam_faults(self._linearizer, *alone, self._search, aid_weights)
+        found = yield from find_beam_faults_steps(
+            self._linearizer, *alone, self._search, aid_weights
+        )
         if self._n_looks > FREE_LOOKS:
             found = found._replace(is_off=found.is_off | before.is_off)
         self._found = found

@@ -7,6 +7,7 @@ the filter: predict, marginalise the old keyframe, iterate the beams of the new 
 
 from __future__ import annotations
 
+import itertools
 import time
 from dataclasses import replace
 from typing import NamedTuple
@@ -26,6 +27,7 @@ from ssm_graph.smoothers.keyframe import beam_speeds, keyframes_of, sensors_of
 from ssm_graph.smoothers.stretch import Stretch, joined
 from ssm_graph.smoothers.window import Window
 from ssm_graph.smoothers.window_rows import beam_rows
+from ssm_graph.stepwise import Steps, finished
 
 __all__ = ["FixedLagConfig", "FixedLagEstimates", "FixedLagRun", "run_fixed_lag", "solve_fixed_lag"]
 
@@ -77,18 +79,27 @@ def run_fixed_lag(
     problem: Problem, config: FixedLagConfig, *, on_keyframe: OnKeyframe | None = None
 ) -> FixedLagRun:
     """Go through the keyframes one by one."""
+    return finished(run_fixed_lag_steps(problem, config, on_keyframe=on_keyframe))
+
+
+def run_fixed_lag_steps(
+    problem: Problem, config: FixedLagConfig, *, on_keyframe: OnKeyframe | None = None
+) -> Steps[FixedLagRun]:
+    """Make :func:`run_fixed_lag` in steps."""
     problem = with_white_noise(problem)
-    first, *others = keyframes_of(problem)
+    keyframes = keyframes_of(problem)
+    first = next(keyframes)
     sensors = sensors_of(problem)
     window = Window(sensors, config, first, with_extras(start_of(problem), sensors.extras))
     newest, delayed, n_iterations = [], [], []
-    for number, keyframe in enumerate((first, *others), start=1):
+    for number, keyframe in enumerate(itertools.chain([first], keyframes), start=1):
         if number > 1:
             delayed.append(window.advance(keyframe))
         n_iterations.append(window.iterate())
         newest.append(window.newest)
         if on_keyframe is not None:
             on_keyframe(number, problem.n_keyframes)
+        yield 5.0
     delayed.append(window.all)
     return FixedLagRun(joined(newest), joined(delayed), np.array(n_iterations, float))
 

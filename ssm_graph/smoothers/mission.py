@@ -11,10 +11,11 @@ from ssm_graph.data import Mission
 from ssm_graph.errors import SolverError
 from ssm_graph.estimate import Estimate, Status
 from ssm_graph.frames import wrap_to_pi
-from ssm_graph.problem.alignment import Alignment, align
-from ssm_graph.problem.problem import Problem, ProblemConfig, build_problem
+from ssm_graph.problem.alignment import Alignment, align_steps
+from ssm_graph.problem.problem import Problem, ProblemConfig, build_problem_steps
 from ssm_graph.smoothers.batch import OnIteration, SmootherConfig, SsmSmoother
 from ssm_graph.smoothers.beam_faults import FaultSearch
+from ssm_graph.stepwise import Steps, finished
 
 AMBIGUOUS_COST = 6.0
 """Another heading whose cost is higher by less than this is as good an explanation (a likelihood
@@ -54,34 +55,57 @@ def smooth(
     SsmGraphError
         With a sentence that says what is wrong, if the mission cannot be smoothed.
     """
+    return finished(
+        smooth_steps(
+            mission,
+            config,
+            problem_config=problem_config,
+            on_iteration=on_iteration,
+            on_stage=on_stage,
+        )
+    )
+
+
+def smooth_steps(
+    mission: Mission,
+    config: SmootherConfig | None = None,
+    *,
+    problem_config: ProblemConfig | None = None,
+    on_iteration: OnIteration | None = None,
+    on_stage: OnStage | None = None,
+) -> Steps[Estimate]:
+    """Make :func:`smooth` in steps."""
     say = on_stage or (lambda _: None)
     smoother = SsmSmoother(config or SmootherConfig(fault_search=FaultSearch()))
     if mission.initial is not None:
         say("preintegrating")
-        problem = build_problem(mission, problem_config)
+        problem = yield from build_problem_steps(mission, problem_config)
         say(f"smoothing {problem.n_keyframes} keyframes")
-        return _with_notes(smoother.solve(problem, on_iteration=on_iteration), mission.notes)
+        estimate = yield from smoother.solve_steps(problem, on_iteration=on_iteration)
+        return _with_notes(estimate, mission.notes)
     say("aligning")
-    alignment = align(mission)
-    problem = build_problem(mission, problem_config, start=alignment.candidates[0])
+    alignment = yield from align_steps(mission)
+    start = alignment.candidates[0]
+    problem = yield from build_problem_steps(mission, problem_config, start=start)
     estimates = []
     for i, start in enumerate(alignment.candidates):
         say(
             f"smoothing {problem.n_keyframes} keyframes, start {i + 1} of "
             f"{len(alignment.candidates)}: heading {np.degrees(start.heading):.0f} deg"
         )
-        estimates.append(_try(smoother, replace(problem, start=start), on_iteration))
+        of_start = replace(problem, start=start)
+        estimates.append((yield from _try_steps(smoother, of_start, on_iteration)))
         if estimates[-1] is not None and estimates[-1].status is Status.INTERRUPTED:
             break
     chosen = _choose([estimate for estimate in estimates if estimate is not None], alignment)
     return _with_notes(chosen, (*mission.notes, f"aligned: {alignment.method}"))
 
 
-def _try(
+def _try_steps(
     smoother: SsmSmoother, problem: Problem, on_iteration: OnIteration | None
-) -> Estimate | None:
+) -> Steps[Estimate | None]:
     try:
-        return smoother.solve(problem, on_iteration=on_iteration)
+        return (yield from smoother.solve_steps(problem, on_iteration=on_iteration))
     except SolverError:
         return None
 

@@ -14,6 +14,7 @@ from ssm_graph.graph.linearize import GraphLinearizer, Step
 from ssm_graph.graph.states import States
 from ssm_graph.smoothers.aid_weights import AidWeighing
 from ssm_graph.smoothers.noise import noise_found
+from ssm_graph.stepwise import Steps
 
 MAX_HALVINGS = 10
 COST_SLACK = 1e-2
@@ -53,20 +54,23 @@ class Solved(NamedTuple):
         )
 
 
-def noise_of(solved: Solved, used: Array) -> NoiseFound:
+def noise_of_steps(solved: Solved, used: Array) -> Steps[NoiseFound]:
     """Return what a solution says of the noise; ``used`` (4,) are its sigmas over the stated."""
     linearizer, last = solved.linearizer, solved.last
+    inertial = yield from linearizer.inertial_rows_steps(last.states)
+    fit = inertial_fit(inertial, last.step)
+    yield 0.005 * len(inertial)
     return noise_found(
         linearizer.problem,
         error=last.beam_rows.error,
         variance=last.step.variance(linearizer.problem.beams.keyframe, last.beam_rows.jacobian),
         weights=last.weights,
-        inertial=inertial_fit(linearizer.inertial_rows(last.states), last.step),
+        inertial=fit,
         used=used,
     )
 
 
-def descend(
+def descend_steps(
     linearizer: GraphLinearizer,
     states: States,
     delta: tuple[Array, Array],
@@ -74,7 +78,7 @@ def descend(
     cost: float,
     *,
     aid_weights: Array | None = None,
-) -> tuple[States, BeamRows, Array]:
+) -> Steps[tuple[States, BeamRows, Array]]:
     """Take the Gauss-Newton step, halved while it raises the cost at these weights.
 
     Returns the states moved to, their beams, and the whole step, (K, 15) or with all extra
@@ -84,7 +88,10 @@ def descend(
     for halvings in range(MAX_HALVINGS):
         scale = 0.5**halvings
         moved, update = linearizer.retract(states, delta, scale=scale)
+        yield 0.006 * len(moved.p_n)
         rows = linearizer.beam_rows(moved)
+        yield 0.004 * len(moved.p_n)
         if linearizer.cost(moved, rows, weights, aid_weights) <= cost + COST_SLACK:
             return moved, rows, update / scale
+        yield 0.005 * len(moved.p_n)
     return states, linearizer.beam_rows(states), update / scale
