@@ -30,6 +30,7 @@ from ssm_graph.graph.gtsam_graph import chain_ordering, graph_without_beams
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.problem.problem import Problem, build_problem
 from ssm_graph.simulation import Grade, OutlierKind, Outliers, scenario_config, simulate
+from ssm_graph.stepwise import Steps
 
 
 class PlainStart(Enum):
@@ -108,11 +109,11 @@ def time_ours(path: Path) -> Timing:
 def _timed_calls(parts: dict[str, float]) -> Iterator[None]:
     """Put a clock on the steps of the loop while the block runs; they do not call each other."""
     steps: tuple[tuple[Any, str, str], ...] = (
-        (batch, "first_values", "first pass"),
+        (batch, "first_values_steps", "first pass"),
         (GraphLinearizer, "follow", "linearise: gravity and depth targets"),
         (GraphLinearizer, "beam_rows", "linearise: beams"),
-        (GraphLinearizer, "inertial_rows", "linearise: GTSAM's inertial factors"),
-        (linearize, "solve_bordered", "eliminate by QR, solve, marginals"),
+        (GraphLinearizer, "inertial_rows_steps", "linearise: GTSAM's inertial factors"),
+        (linearize, "solve_bordered_steps", "eliminate by QR, solve, marginals"),
         (GraphLinearizer, "cost", "cost"),
         (GraphLinearizer, "retract", "retract"),
         (batch, "trajectory_from_states", "result"),
@@ -136,7 +137,13 @@ def _with_clock(
         parts[label] = parts.get(label, 0.0) + time.perf_counter() - begin
         return result
 
-    return timed
+    def timed_steps(*args: Any, **kwargs: Any) -> Steps[Any]:
+        begin = time.perf_counter()
+        result = yield from function(*args, **kwargs)
+        parts[label] = parts.get(label, 0.0) + time.perf_counter() - begin
+        return result
+
+    return timed_steps if function.__name__.endswith("_steps") else timed
 
 
 def time_plain(

@@ -62,7 +62,7 @@ ONLINE: Final = FixedLagConfig(
 """What a vehicle can afford; `benchmarks/online.py` compares it with windows solved to the end."""
 LONGEST_GAP_S: Final = 10.0
 """After a longer gap of the inertial data the attitude has to be found anew."""
-CATCH_UP_STEPS: Final = 2
+CATCH_UP_STEPS: Final = 1
 """Of the keyframes that came while an alignment was worked on so many are made in one push."""
 
 

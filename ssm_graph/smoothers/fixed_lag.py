@@ -95,11 +95,11 @@ def run_fixed_lag_steps(
     for number, keyframe in enumerate(itertools.chain([first], keyframes), start=1):
         if number > 1:
             delayed.append(window.advance(keyframe))
-        n_iterations.append(window.iterate())
+        n_iterations.append((yield from window.iterate_steps()))
         newest.append(window.newest)
         if on_keyframe is not None:
             on_keyframe(number, problem.n_keyframes)
-        yield 5.0
+        yield 1.0
     delayed.append(window.all)
     return FixedLagRun(joined(newest), joined(delayed), np.array(n_iterations, float))
 

@@ -21,6 +21,7 @@ from ssm_graph.smoothers.keyframe import Keyframe, Sensors, Way
 from ssm_graph.smoothers.mixing import Mixing
 from ssm_graph.smoothers.stretch import Stretch
 from ssm_graph.smoothers.window_graph import WindowGraph
+from ssm_graph.stepwise import Steps, finished
 
 _PACKED = ("step", "covariance", "innovation", "weights", "t", "trust")
 RUNAWAY_SPEED = 100.0
@@ -213,12 +214,16 @@ class Window:
 
     def iterate(self) -> int:
         """Reweight and solve until the window has settled; return the number of passes."""
+        return finished(self.iterate_steps())
+
+    def iterate_steps(self) -> Steps[int]:
+        """Make :meth:`iterate` in steps, pass by pass."""
         is_linear = self.config.linearised is Linearised.ONCE
-        n_passes = self._reweigh() if is_linear else self._settle()
+        n_passes = self._reweigh() if is_linear else (yield from self._settle_steps())
         is_idle = len(self.keyframes) == 1 and not self.keyframes[0].is_measured
         return 0 if is_idle else n_passes
 
-    def _settle(self) -> int:
+    def _settle_steps(self) -> Steps[int]:
         """Solve and reweigh; what has moved is linearised anew at each pass."""
         config, n_keyframes = self.config, len(self.keyframes)
         tolerance = max(config.tolerance, ROUNDING) if n_keyframes > 1 else config.tolerance
@@ -229,6 +234,7 @@ class Window:
             self._t = self._mahalanobis_sq()
             if _largest(update, self._covariance) < tolerance:
                 break
+            yield 0.8 + 0.1 * n_keyframes
             if number < config.max_iterations:
                 settled = config.kernel.weight(self._t)
                 # A single keyframe's weights are those of the filter, pass by pass.

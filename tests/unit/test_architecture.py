@@ -22,6 +22,7 @@ FOUNDATION = {
     "frozen",
     "messages",
     "plausible",
+    "stepwise",
     "stuck_beams",
     "water_current",
 }

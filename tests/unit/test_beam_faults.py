@@ -40,6 +40,7 @@ from ssm_graph.smoothers.beam_faults import (
     without_shared,
 )
 from ssm_graph.smoothers.fault_watch import FaultWatch
+from ssm_graph.stepwise import Steps, finished
 from tests.aids_fixture import with_every_aid
 from tests.helpers import simulated, with_initial
 
@@ -212,16 +213,22 @@ def test_findings_stop_changing(monkeypatch: pytest.MonkeyPatch) -> None:
     n_rows = len(problem.beams.speed)
     answers = iter([(0, 5), (5, 9), (0, 5), (5, 9), (0, 9)])
 
-    def undecided(*_: object) -> beam_faults.Found:
+    def undecided(*_: object) -> Steps[beam_faults.Found]:
+        yield 1.0
         begin, end = next(answers)
         return beam_faults.Found((np.arange(n_rows) >= begin) & (np.arange(n_rows) < end), ())
 
-    monkeypatch.setattr(fault_watch, "find_beam_faults", undecided)
+    monkeypatch.setattr(fault_watch, "find_beam_faults_steps", undecided)
     states = first_values(problem, kernel=KERNEL).states
-    assert not watch.look(states, rows, update_sigmas=3.0, is_settled=False)
-    assert watch.look(states, rows, update_sigmas=0.5, is_settled=False)
-    assert not watch.look(states, rows, update_sigmas=0.5, is_settled=False)
-    looks = [watch.look(states, rows, update_sigmas=0.0, is_settled=True) for _ in range(3)]
+
+    def look(*, update_sigmas: float, is_settled: bool) -> bool:
+        steps = watch.look_steps(states, rows, update_sigmas=update_sigmas, is_settled=is_settled)
+        return finished(steps)
+
+    assert not look(update_sigmas=3.0, is_settled=False)
+    assert look(update_sigmas=0.5, is_settled=False)
+    assert not look(update_sigmas=0.5, is_settled=False)
+    looks = [look(update_sigmas=0.0, is_settled=True) for _ in range(3)]
     assert looks == [True, True, False]
     assert np.count_nonzero(watch.leave_out(np.ones(n_rows)) < 1.0) == 9
 

@@ -18,6 +18,7 @@ from ssm_graph.simulation import Grade, OutlierKind, Outliers
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
 from ssm_graph.smoothers.beam_faults import KERNEL
 from ssm_graph.smoothers.noise import adaptation, beam_noise, noise_notes, with_sigmas
+from ssm_graph.stepwise import finished
 from tests.helpers import simulated
 
 N = 20_000
@@ -120,7 +121,7 @@ def test_inertial_degrees_of_freedom_are_those_of_the_dense_system() -> None:
     rows = linearizer.beam_rows(states)
     weights = np.ones(len(rows.error))
     step = linearizer.solve(states, rows, weights)
-    fit = inertial_fit(linearizer.inertial_rows(states), step)
+    fit = inertial_fit(finished(linearizer.inertial_rows_steps(states)), step)
     A, _ = gtsam_graph(problem, states).linearize(states.values).jacobian()
     own, b = linearizer.inertial.linearize(states.values).jacobian()
     # Both have their columns in the order of the keys.

@@ -11,7 +11,8 @@ from ssm_graph.data import Array
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.states import States, states_from_arrays
 from ssm_graph.problem.problem import build_problem
-from ssm_graph.smoothers.passes import descend
+from ssm_graph.smoothers.passes import descend_steps
+from ssm_graph.stepwise import finished
 from tests.helpers import simulated, state_errors, true_states
 
 
@@ -44,7 +45,7 @@ def same(a: States, b: States) -> bool:
 def test_a_good_step_is_taken_whole() -> None:
     """And is what the linear solution says."""
     linearizer, states, delta, weights, cost = off_the_minimum()
-    moved, rows, update = descend(linearizer, states, delta, weights, cost)
+    moved, rows, update = finished(descend_steps(linearizer, states, delta, weights, cost))
     expected, step = linearizer.retract(states, delta)
     assert same(moved, expected)
     np.testing.assert_array_equal(update, step)
@@ -56,7 +57,9 @@ def test_a_good_step_is_taken_whole() -> None:
 def test_a_step_too_long_is_halved(overshoot: float, taken: float) -> None:
     """Beyond twice the way to the minimum the cost rises; what is judged is the step wanted."""
     linearizer, states, delta, weights, cost = off_the_minimum()
-    moved, _, update = descend(linearizer, states, scaled(delta, overshoot), weights, cost)
+    moved, _, update = finished(
+        descend_steps(linearizer, states, scaled(delta, overshoot), weights, cost)
+    )
     assert same(moved, linearizer.retract(states, delta, scale=taken)[0])
     _, wanted = linearizer.retract(states, delta, scale=overshoot)
     np.testing.assert_allclose(update, wanted, rtol=1e-12)
@@ -65,7 +68,9 @@ def test_a_step_too_long_is_halved(overshoot: float, taken: float) -> None:
 def test_a_step_uphill_is_not_taken_nor_taken_for_settled() -> None:
     """The states stay, and the update remains as large as it was."""
     linearizer, states, delta, weights, cost = off_the_minimum()
-    moved, rows, update = descend(linearizer, states, scaled(delta, -100.0), weights, cost)
+    moved, rows, update = finished(
+        descend_steps(linearizer, states, scaled(delta, -100.0), weights, cost)
+    )
     assert same(moved, states)
     np.testing.assert_array_equal(rows.error, linearizer.beam_rows(states).error)
     expected = linearizer.retract(states, delta, scale=-100.0)[1]
