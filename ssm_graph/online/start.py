@@ -57,6 +57,11 @@ class Starter:
         self._work: Steps[Beginning | None] | None = None
         self._credit_ms = 0.0
 
+    @property
+    def is_working(self) -> bool:
+        """Whether an alignment is worked on."""
+        return self._work is not None
+
     def begin_anew(self) -> None:
         """Leave the alignment that is worked on; there are other data now."""
         self._work = None
