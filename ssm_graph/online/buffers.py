@@ -113,15 +113,15 @@ class Buffers:
             float(start_s), self.vehicle.imu_noise, found[:, 0], found[:, 1:4], found[:, 4:]
         )
 
-    def mission(self, frame: LocalFrame) -> Mission:
-        """Return everything as a mission, to align with.
+    def mission(self, frame: LocalFrame, *, until_s: float = np.inf) -> Mission:
+        """Return everything, or what is of a time ``until_s``, as a mission to align with.
 
         What is known to be off in stamps, fixes and depths has been taken off.
         """
         vehicle = self.vehicle
-        pings = self.pings_between(-np.inf, np.inf)
-        depths, fixes = self.depths.all, self.fixes.all
-        end_s = self.imu.last_s
+        pings = self.pings_between(-np.inf, until_s)
+        depths, fixes = (rows.between(-np.inf, until_s) for rows in (self.depths, self.fixes))
+        end_s = min(self.imu.last_s, until_s)
         stamps = pings[:, 0] + vehicle.mount.time_offset_s
         depth = None
         if vehicle.depth_sigma is not None and len(depths):

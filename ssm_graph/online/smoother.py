@@ -192,6 +192,7 @@ class FixedLagSmoother:
             "frame": None if self._frame is None else [*astuple(self._frame)],
             "is_lost": self._is_lost,
             "begun_s": self._begun_s,
+            "alignment": self._starter.pack(),
             "watch": None,
         }
         if self._course is not None:
@@ -221,6 +222,8 @@ class FixedLagSmoother:
             smoother._start_anew()
         if meta["frame"] is not None:
             smoother._frame = LocalFrame(*meta["frame"])
+        if meta["watch"] is None:
+            smoother._starter.go_on_from(meta["alignment"], intake.buffers)
         if meta["watch"] is not None:
             assert smoother._frame is not None
             maker = KeyframeMaker(intake.buffers, smoother._frame, smoother._problem_config)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -55,7 +56,7 @@ class Starter:
         self.reason = "waiting for inertial data"
         self._initial = vehicle.initial
         self._work: Steps[Beginning | None] | None = None
-        self._credit_ms = 0.0
+        self._begun_s, self._n_steps, self._credit_ms = -np.inf, 0, 0.0
 
     @property
     def is_working(self) -> bool:
@@ -65,6 +66,28 @@ class Starter:
     def begin_anew(self) -> None:
         """Leave the alignment that is worked on; there are other data now."""
         self._work = None
+
+    def pack(self) -> dict[str, Any]:
+        """Return how far it has come as plain values, for :meth:`go_on_from`."""
+        work = self._begun_s, self._n_steps, self._credit_ms
+        return {
+            "reason": self.reason,
+            "next_try_s": self._next_try_s if np.isfinite(self._next_try_s) else None,
+            "work": work if self.is_working else None,
+        }
+
+    def go_on_from(self, packed: Mapping[str, Any], buffers: Buffers) -> None:
+        """Come to where another one was; the steps that it had made are made again, at once."""
+        self.reason, self._now_s = packed["reason"], buffers.imu.last_s
+        if packed["next_try_s"] is not None:
+            self._next_try_s = packed["next_try_s"]
+        frame = self._frame(buffers)
+        if packed["work"] is None or frame is None:
+            return
+        self._begun_s, self._n_steps, self._credit_ms = packed["work"]
+        self._work = self._align_steps(buffers.mission(frame, until_s=self._begun_s))
+        for _ in range(self._n_steps):
+            next(self._work)
 
     def find(self, buffers: Buffers) -> Beginning | None:
         """Return the beginning, None while there is none."""
@@ -83,7 +106,8 @@ class Starter:
             if frame is None:
                 self._wait("waiting for a GNSS fix, or an initial state")
                 return None
-            self._work, self._credit_ms = self._align_steps(buffers.mission(frame)), 0.0
+            self._work = self._align_steps(buffers.mission(frame))
+            self._begun_s, self._n_steps, self._credit_ms = self._now_s, 0, 0.0
         self._credit_ms = min(self._credit_ms + 1e3 * SHARE * elapsed_s, MOST_MS)
         return self._go_on(self._work)
 
@@ -92,6 +116,7 @@ class Starter:
         try:
             while self._credit_ms > 0.0:
                 self._credit_ms -= next(work)
+                self._n_steps += 1
         except StopIteration as end:
             self._work = None
             beginning: Beginning | None = end.value
