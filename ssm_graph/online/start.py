@@ -153,6 +153,7 @@ class Starter:
 
     def _align_steps(self, mission: Mission) -> Steps[Beginning | None]:
         """Smooth what there is; begin at its end if that may be believed."""
+        yield 1e-3 * len(mission.imu.time_s)  # for the mission itself
         estimate = yield from smooth_steps(mission, problem_config=self._config)
         sigma = float(estimate.trajectory.attitude_sigma[-1, 2])
         if not estimate.status.is_good or sigma > SAFE_HEADING_SIGMA:

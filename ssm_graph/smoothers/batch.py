@@ -155,7 +155,9 @@ class SsmSmoother:
             used, problem, first = used * change, with_sigmas(problem, change), solved.again()
         solved = solved._replace(iterations=iterations)
         yield 0.01 * problem.n_keyframes
-        return self._estimate(solved, noise, wall_s=time.perf_counter() - begin)
+        estimate = self._estimate(solved, noise, wall_s=time.perf_counter() - begin)
+        yield 0.015 * problem.n_keyframes
+        return estimate
 
     def _solve_steps(
         self, problem: Problem, first: FirstValues | None, on_iteration: OnIteration | None

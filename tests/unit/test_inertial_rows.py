@@ -7,13 +7,14 @@ import pytest
 
 from ssm_graph.data import Array
 from ssm_graph.estimate import Status
-from ssm_graph.graph.inertial_rows import inertial_graph, inertial_rows
+from ssm_graph.graph.inertial_rows import inertial_graph, inertial_rows_steps
 from ssm_graph.graph.states import States, retract
 from ssm_graph.imu.preintegration import gravity_gradient
 from ssm_graph.problem.error_state import POSITION, STATE_DIM
 from ssm_graph.problem.problem import Problem, build_problem
 from ssm_graph.simulation import Grade
 from ssm_graph.smoothers.batch import SsmSmoother
+from ssm_graph.stepwise import finished
 from tests.helpers import (
     estimated_states,
     rotation,
@@ -43,10 +44,10 @@ def test_rows_follow_gravity(end: int) -> None:
     def error_at(step: Array) -> Array:
         moved = retract(states, step)
         problem.chain.set_gravity(moved.p_n)
-        return -inertial_rows(graph, moved, gradient, span_s=span_s)[1, :, -1]
+        return -finished(inertial_rows_steps(graph, moved, gradient, span_s=span_s))[1, :, -1]
 
     problem.chain.set_gravity(states.p_n)
-    columns = inertial_rows(graph, states, gradient, span_s=span_s)[1]
+    columns = finished(inertial_rows_steps(graph, states, gradient, span_s=span_s))[1]
     for axis in range(3):
         step = np.zeros((problem.n_keyframes, STATE_DIM))
         step[1 + end, POSITION.start + axis] = 1000.0
