@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ssm_graph.aid_logs import NO_AIDS, AidLogs
 from ssm_graph.earth import LocalFrame
@@ -178,6 +178,25 @@ class DvlLog(FrozenArrays):
     def ping_s(self) -> Array:
         """(N,) when the pings were taken: stamps less the mount's time offset, s."""
         return np.asarray(self.time_s - self.mount.time_offset_s)
+
+
+def counted_sigma(
+    stated: ArrayLike, is_water: ArrayLike, *, ground_sigma: float, water_sigma: float | None
+) -> Array:
+    """Return the standard deviations (..., 4) that beam speeds count with, m/s.
+
+    One that the DVL does not state is the nominal one of what its ping is off.
+
+    Parameters
+    ----------
+    stated : (..., 4) m/s; NaN, zero and less for none.
+    is_water : (...) whether a ping is off the water.
+    ground_sigma : nominal one off the ground, m/s.
+    water_sigma : nominal one off the water, m/s; None or 0 for that off the ground.
+    """
+    nominal = np.where(is_water, water_sigma or ground_sigma, ground_sigma)[..., None]
+    stated = np.asarray(stated)
+    return np.where(stated > 0.0, stated, nominal)
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ from ssm_graph.data import (
     ImuLog,
     Mission,
     Reference,
+    counted_sigma,
 )
 from ssm_graph.earth import LocalFrame
 from ssm_graph.frames import to_frd
@@ -149,16 +150,17 @@ def _imu(table: Table, toml: MissionToml) -> ImuLog:
 
 def _dvl(table: Table, toml: MissionToml) -> DvlLog:
     settings = toml["dvl"]
-    sigma = table.stack(SPEED_SIGMA)
     water = np.nan_to_num(table.stack([WATER_TRACK])[:, 0])
-    noise = settings.number("beam_noise_m_per_s")
-    water_noise = settings.number("water_noise_m_per_s") or noise
-    nominal = np.where(water > 0.0, water_noise, noise)[:, None]
     return DvlLog(
         mount=dvl_mount(toml),
         time_s=table.time_s,
         speed=table.stack(SPEED),
-        sigma=np.where(np.isnan(sigma), nominal, sigma),
+        sigma=counted_sigma(
+            table.stack(SPEED_SIGMA),
+            water > 0.0,
+            ground_sigma=settings.number("beam_noise_m_per_s"),
+            water_sigma=settings.number("water_noise_m_per_s"),
+        ),
         range_m=table.stack(RANGE) if any(name in table for name in RANGE) else None,
         water_track=water if water.any() else None,
     )

@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import Final, Self
 
 from ssm_graph.errors import ConfigError
-from ssm_graph.io.append_file import AppendFile, sync_folder
+from ssm_graph.io.append_file import TORN_ROW, AppendFile, sync_folder
 from ssm_graph.io.raw_replay import check_columns, replay
 from ssm_graph.io.raw_rows import ARRIVALS, ROW_KINDS, RowKind
 from ssm_graph.io.settings import TOML_NAME
@@ -25,8 +25,6 @@ from ssm_graph.messages import Message, Vehicle
 
 __all__ = ["RawLog", "replay"]
 
-_TORN: Final = b",torn\n"
-"""Ends a torn row: with a word in it, no number of cells makes it a whole one."""
 _RETRY_S: Final = 1.0
 _BATCH: Final = 1000
 """Rows that one append may write of those that waited, so that it takes no longer than 10 ms."""
@@ -118,7 +116,7 @@ class RawLog:
         for kind in ROW_KINDS.values():
             table = log._tables[kind.file]
             if table.size < len(kind.header):  # a power failure took it
-                table.clear()
+                table.cut(0)
                 log._waiting.append(_Row(table, kind.header, b""))
         log._commit()
         log._write_waiting(len(log._waiting))
@@ -126,7 +124,8 @@ class RawLog:
 
     def _open(self, folder: Path, *, max_waiting: int, retry_every: int) -> None:
         self._tables = {
-            kind.file: AppendFile(folder / kind.file, ending=_TORN) for kind in ROW_KINDS.values()
+            kind.file: AppendFile(folder / kind.file, ending=TORN_ROW)
+            for kind in ROW_KINDS.values()
         }
         self._arrivals = AppendFile(folder / ARRIVALS, ending=b"\n")
         self._targets: Mapping[type, tuple[RowKind, AppendFile]] = {

@@ -25,6 +25,7 @@ from ssm_graph.data import (
     ImuNoise,
     InitialState,
     Mission,
+    counted_sigma,
 )
 from ssm_graph.earth import LocalFrame
 from ssm_graph.errors import ConfigError, DataError
@@ -104,6 +105,7 @@ def convert_rosbag(
         depth=depth,
         gnss=gnss,
         initial=initial,
+        current=None if vehicle is None else vehicle.current,
         notes=(*notes, *some, *initial_notes),
     )
 
@@ -178,7 +180,6 @@ def _dvl(
         beams = _beams(topic, vehicle, options, speed=speed, velocity_d=velocity_d)
     except DataError as error:
         raise DataError(f"{bag}: topic {topic.name}: {error}") from None
-    nominal = BEAM_SIGMA if vehicle is None else vehicle.beam_sigma
     notes = list(beams.notes)
     if vehicle is None and np.isnan(sigma).any():
         notes.append(f"Beam speeds without a stated variance are given {BEAM_SIGMA} m/s.")
@@ -191,7 +192,12 @@ def _dvl(
         mount=mount,
         time_s=table[:, 0],
         speed=beams.sign * speed,
-        sigma=np.where(np.isnan(sigma), nominal, sigma),
+        sigma=counted_sigma(
+            sigma,
+            water[:, 0] > 0.0,
+            ground_sigma=BEAM_SIGMA if vehicle is None else vehicle.beam_sigma,
+            water_sigma=None if vehicle is None else vehicle.water_sigma,
+        ),
         range_m=ranges if np.isfinite(ranges).any() else None,
         water_track=water[:, 0] if water.any() else None,
     )

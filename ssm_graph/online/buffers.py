@@ -7,7 +7,16 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from ssm_graph.data import N_BEAMS, Array, DepthLog, DvlLog, GnssLog, ImuLog, Mission
+from ssm_graph.data import (
+    N_BEAMS,
+    Array,
+    DepthLog,
+    DvlLog,
+    GnssLog,
+    ImuLog,
+    Mission,
+    counted_sigma,
+)
 from ssm_graph.earth import LocalFrame
 from ssm_graph.messages import DepthReading, Fix, ImuSample, Message, Ping, Vehicle
 from ssm_graph.online.rows import TimedRows
@@ -52,7 +61,13 @@ class Buffers:
                 self._n_imu += 1
                 return self.imu.add(np.array([*row, *message.gyro_b, *message.accel_b]))
             case Ping():
-                columns = (*row, *message.speed, *self._sigma(message), float(message.is_water))
+                sigma = counted_sigma(
+                    message.sigma or (np.nan,) * N_BEAMS,
+                    message.is_water,
+                    ground_sigma=self.vehicle.beam_sigma,
+                    water_sigma=self.vehicle.water_sigma,
+                )
+                columns = (*row, *message.speed, *sigma, float(message.is_water))
                 return self.pings.add(np.array(columns))
             case DepthReading():
                 depth = message.depth - self.vehicle.depth_calibration.offset
@@ -60,12 +75,6 @@ class Buffers:
             case Fix():
                 place = message.lat, message.lon, message.height
                 return self.fixes.add(np.array([*row, *place, *message.sigma_enu]))
-
-    def _sigma(self, ping: Ping) -> list[float]:
-        given, nominal = ping.sigma or (np.nan,) * N_BEAMS, self.vehicle.beam_sigma
-        if ping.is_water:
-            nominal = self.vehicle.water_sigma or nominal
-        return [s if s > 0.0 else nominal for s in given]
 
     def pings_between(self, begin_s: float, end_s: float) -> Array:
         """Return the pings (P, 10) after ``begin_s`` up to and with ``end_s``, as they count.
