@@ -11,5 +11,7 @@ LARGEST_SPEED: Final = 30.0
 """m/s along a beam"""
 DEEPEST_M: Final = 12_000.0
 """Depth, positive down"""
+LON_RANGE_DEG: Final = (-180.0, 360.0)
+"""Longitudes as people write them: west of Greenwich below zero, or once around to the east"""
 HIGHEST_M: Final = 100.0
 """Above the surface: a pressure sensor in air, and tides"""

@@ -18,7 +18,7 @@ from ssm_graph.io.mission_dvl_checks import check_dvl
 from ssm_graph.io.mission_keys import ACCEL, ATTITUDE, GYRO, LIMITS, VELOCITY
 from ssm_graph.io.mission_toml import MissionToml
 from ssm_graph.io.tables import POSITION_SIGMA, Table
-from ssm_graph.plausible import DEEPEST_M
+from ssm_graph.plausible import DEEPEST_M, LON_RANGE_DEG
 
 RATE_RANGE_HZ: Final = (5.0, 20000.0)
 """A slower IMU cannot carry a vehicle's motion between pings; a faster one has other units."""
@@ -136,7 +136,8 @@ def _imu_times(table: Table) -> list[str]:
     if gaps.any():
         notes.append(
             f"{table.label}: {gaps.sum()} gaps in time, the longest {steps[row]:z.3f} s after "
-            f"{table.time_s[row]:z.3f} s; the reading after a gap is held over all of it"
+            f"{table.time_s[row]:z.3f} s; each is bridged by the mean of the readings on both "
+            "sides, with larger process noise"
         )
     return notes
 
@@ -206,7 +207,7 @@ def check_positions(table: Table) -> list[str]:
     swapped = np.all(np.abs(lon) <= 90.0) and np.all(np.abs(lat) <= 360.0)
     hint = "latitude and longitude seem swapped" if swapped else "is it an integer coding?"
     refuse_beyond(table, ["lat_deg"], f"expected degrees from -90 to 90; {hint}")
-    refuse_beyond(table, ["lon_deg"], "expected degrees from -180 to 360")
+    refuse_beyond(table, ["lon_deg"], "expected degrees from {:g} to {:g}".format(*LON_RANGE_DEG))
     refuse_beyond(table, ["height_m"], "expected metres, up; is it in mm?")
     if np.all(np.abs(lat) <= 0.5 * np.pi) and np.all(np.abs(lon) <= np.pi):
         return [

@@ -14,7 +14,7 @@ from ssm_graph.data import N_BEAMS
 from ssm_graph.io.aid_keys import AID_LIMITS, AID_SECTIONS, AID_TABLES
 from ssm_graph.io.settings import FILE_KEY, LEVER_ARM_KEY, PLACE_KEYS, Key, optional_key, sigma_key
 from ssm_graph.io.tables import POSITION, POSITION_SIGMA, TIME, TableSpec
-from ssm_graph.plausible import DEEPEST_M, LARGEST_SPEED
+from ssm_graph.plausible import DEEPEST_M, LARGEST_SPEED, LON_RANGE_DEG
 
 FORMAT: Final = 1
 
@@ -134,7 +134,7 @@ LIMITS: Final[Mapping[str, tuple[float, float]]] = {
     WATER_TRACK: (0.0, 1.0),
     "depth_m": (-DEEPEST_M, DEEPEST_M),
     "lat_deg": (-90.0, 90.0),
-    "lon_deg": (-180.0, 360.0),
+    "lon_deg": LON_RANGE_DEG,
     "height_m": (-DEEPEST_M, 20000.0),
     **dict.fromkeys(POSITION_SIGMA, (_ABOVE_ZERO, 1e7)),
     **dict.fromkeys(VELOCITY, (-100.0, 100.0)),

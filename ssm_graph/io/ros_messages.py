@@ -29,7 +29,9 @@ from typing import Any, Final, NamedTuple
 from ssm_graph.data import N_BEAMS
 from ssm_graph.errors import DataError
 from ssm_graph.frames import BodyAxes, turned
+from ssm_graph.io.mission_instruments import radians_wrapped
 from ssm_graph.messages import DepthReading, Fix, ImuSample, Message, Ping, Vector
+from ssm_graph.plausible import LON_RANGE_DEG
 
 IMU_TYPE: Final = "sensor_msgs/msg/Imu"
 MARINE_DVL_TYPE: Final = "marine_acoustic_msgs/msg/Dvl"
@@ -176,12 +178,13 @@ def fix(message: Any, received_s: float, options: RosOptions = DEFAULTS) -> Fix:
     if int(message.status.status) < 0:
         raise DataError("NavSatFix: the receiver says that it has no fix")
     lat, lon = _finite(message, "latitude"), _finite(message, "longitude")
-    if abs(lat) > 90.0 or abs(lon) > 360.0 or lat == lon == 0.0:
+    is_on_earth = abs(lat) <= 90.0 and LON_RANGE_DEG[0] <= lon <= LON_RANGE_DEG[1]
+    if not is_on_earth or lat == lon == 0.0:
         raise DataError(f"NavSatFix: expected degrees of a place on Earth, got {lat:g}, {lon:g}")
     return Fix(
         time_s=stamp_s(message, received_s),
         lat=math.radians(lat),
-        lon=math.radians(lon),
+        lon=float(radians_wrapped(lon)),
         height=_finite(message, "altitude"),
         sigma_enu=_fix_sigma(message, options.fix_sigma_enu),
     )

@@ -11,7 +11,7 @@ import numpy as np
 
 from ssm_graph.data import Array
 from ssm_graph.errors import ConfigError, nearest_hint
-from ssm_graph.plausible import DEEPEST_M
+from ssm_graph.plausible import DEEPEST_M, LON_RANGE_DEG
 
 TOML_NAME: Final = "mission.toml"
 _SHOWN: Final = 60
@@ -61,7 +61,7 @@ FILE_KEY: Final = Key(shape=None)
 LEVER_ARM_KEY: Final = Key(shape=(3,), low=-100.0, high=100.0, hint="lever arms are in metres")
 PLACE_KEYS: Final[Mapping[str, Key]] = {
     "lat_deg": Key(low=-90.0, high=90.0, hint="are latitude and longitude swapped?"),
-    "lon_deg": Key(low=-180.0, high=360.0, hint="longitude is in degrees"),
+    "lon_deg": Key(low=LON_RANGE_DEG[0], high=LON_RANGE_DEG[1], hint="longitude is in degrees"),
     "height_m": Key(
         low=-DEEPEST_M, high=20000.0, hint="height is in metres above the ellipsoid, up"
     ),

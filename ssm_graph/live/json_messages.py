@@ -33,6 +33,7 @@ from ssm_graph.messages import (
     Ping,
     Vector,
 )
+from ssm_graph.plausible import LON_RANGE_DEG
 
 PLACE: Final = "json"
 _EXACT = Context(prec=40)
@@ -185,10 +186,12 @@ def _degrees(angle: float) -> Decimal:
     return _DIGITS.divide(Decimal(float(angle)), _RAD_PER_DEG)
 
 
-def _radians(value: Any, *, key: str, limit_deg: float) -> float:
-    number(value, key=key, low=-limit_deg, high=limit_deg)
+def _radians(value: Any, *, key: str, range_deg: tuple[float, float]) -> float:
+    """Return an angle in [-pi, pi]."""
+    number(value, key=key, low=range_deg[0], high=range_deg[1])
     exact = Decimal(value) if isinstance(value, int) else value
-    return float(_EXACT.multiply(exact, _RAD_PER_DEG))
+    wrapped = _EXACT.subtract(exact, Decimal(360)) if exact > 180 else exact
+    return float(_EXACT.multiply(wrapped, _RAD_PER_DEG))
 
 
 def _list(value: Any, count: int, *, key: str) -> list[Any]:
@@ -233,8 +236,8 @@ def _depth(fields: dict[str, Any], _: BodyAxes) -> Message:
 def _gnss(fields: dict[str, Any], _: BodyAxes) -> Message:
     return Fix(
         _time(fields),
-        lat=_radians(fields["lat_deg"], key="lat_deg", limit_deg=90.0),
-        lon=_radians(fields["lon_deg"], key="lon_deg", limit_deg=180.0),
+        lat=_radians(fields["lat_deg"], key="lat_deg", range_deg=(-90.0, 90.0)),
+        lon=_radians(fields["lon_deg"], key="lon_deg", range_deg=LON_RANGE_DEG),
         height=number(fields["height_m"], key="height_m"),
         sigma_enu=_vector(fields, "sigma_m", low=_SMALLEST_SIGMA),
     )

@@ -24,7 +24,7 @@ from ssm_graph.messages import (
 )
 from ssm_graph.online.buffers import Buffers
 from ssm_graph.online.events import EventLog
-from ssm_graph.plausible import DEEPEST_M, HIGHEST_M, LARGEST_SPEED
+from ssm_graph.plausible import DEEPEST_M, HIGHEST_M, LARGEST_SPEED, LON_RANGE_DEG
 from ssm_graph.stuck_beams import STUCK_PINGS, stuck_beams
 
 LARGEST_RATE: Final = 35.0
@@ -121,7 +121,8 @@ class Intake:
                 if not -HIGHEST_M <= message.depth <= DEEPEST_M:
                     return "implausible", f"depth {message.depth:g} m: a wrong unit?"
             case Fix():
-                if abs(message.lat) > np.pi / 2 or abs(message.lon) > 2 * np.pi:
+                west, east = np.radians(LON_RANGE_DEG)
+                if abs(message.lat) > np.pi / 2 or not west <= message.lon <= east:
                     return "implausible", "latitude or longitude out of range: degrees?"
                 if min(message.sigma_enu) <= 0.0:
                     return "implausible", f"sigmas {message.sigma_enu} m, expected above zero"

@@ -107,6 +107,16 @@ def test_lines_of_the_documentation() -> None:
     assert not refused
 
 
+@pytest.mark.parametrize("lon_deg", [-180, -10, 180, 190.125, 360])
+def test_longitudes_may_go_once_around(lon_deg: float) -> None:
+    """As in all other inputs; what is beyond half a turn is west of Greenwich."""
+    (fix,), refused = decode(f"{changed('gnss', lon_deg=lon_deg)}\n".encode())
+    assert isinstance(fix, Fix)
+    assert not refused
+    west = lon_deg - 360 if lon_deg > 180 else lon_deg
+    assert fix.lon == pytest.approx(math.radians(west), rel=1e-15)
+
+
 @pytest.mark.parametrize("axes", BodyAxes)
 def test_axes_are_those_of_the_mission_folder(axes: BodyAxes) -> None:
     """The same names, the same turns."""
@@ -145,7 +155,8 @@ def changed(kind: str, **changes: Any) -> str:
         (changed("depth", depth_m=[1]), "expected a number"),
         (changed("depth", lat_deg=1), "unknown key 'lat_deg'"),
         (changed("gnss", lat_deg=90.001), "check the unit"),
-        (changed("gnss", lon_deg=-181), "check the unit"),
+        (changed("gnss", lon_deg=-181), "expected -180 to 360, got -181; check the unit"),
+        (changed("gnss", lon_deg=360.5), "expected -180 to 360"),
         (changed("gnss", lat_deg="63"), "expected a number"),
         (changed("gnss", sigma_m=[1, -1, 1]), "sigma_m"),
         (LINES["gnss"].replace("63.5", "NaN"), "finite"),
