@@ -91,7 +91,7 @@ def settled_weights(
     measurement : (R,) which measurement, 0 to m - 1 in order, a component is of.
     kernel : turns Mahalanobis distances into weights.
     """
-    dim, spread = np.bincount(measurement), predicted.diagonal()
+    dim, spread = np.bincount(measurement).astype(float), predicted.diagonal()
     is_odd = np.bincount(measurement, weights=innovation**2 >= GATE**2 * (spread + 1.0)) > 0.0
     weights = np.where(is_odd, WEIGHT_FLOOR, 1.0)
     for _ in range(WEIGHT_ROUNDS):

@@ -130,7 +130,7 @@ def test_first_weights_are_those_of_the_posterior() -> None:
     covariance = np.linalg.inv(np.linalg.inv(predicted) + information)
     left = innovation - covariance @ information @ innovation
     t = np.bincount(measurement, weights=left**2 + covariance.diagonal())
-    np.testing.assert_allclose(weights, KERNEL.weight(t, dim=np.array([3, 1, 1])), atol=0.02)
+    np.testing.assert_allclose(weights, KERNEL.weight(t, dim=np.array([3.0, 1.0, 1.0])), atol=0.02)
 
 
 @pytest.mark.parametrize("dim", [1, 3])
@@ -188,7 +188,8 @@ def test_ranges_of_one_keyframe_find_a_start_that_is_off(
     off = replace(start, lat=lat, lon=lon, height=height, position_sigma_enu=sigma_enu)
     problem = build_problem(replace(mission, aids=AidLogs(ranges=ranges)), start=off)
     first = first_values(problem, kernel=KERNEL)
-    (k,) = np.unique(problem.further.ranges.keyframe) if problem.further.ranges else ()
+    assert problem.further.ranges is not None
+    (k,) = np.unique(problem.further.ranges.keyframe)
     assert np.linalg.norm((first.states.p_n[k] - place_n)[:2]) < 0.5
     assert first.aid_weights[n_gross:].min() > 0.8
     assert np.all(first.aid_weights[:n_gross] < 0.01)
