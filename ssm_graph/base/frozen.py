@@ -31,22 +31,22 @@ def read_only(name: str, value: ArrayLike, shape: Sequence[int | None]) -> Array
 class FrozenArrays:
     """Apply :func:`read_only` to every array field, by the shape kept in the field's metadata.
 
-    The letter ``N`` in a shape stands for the length of ``time_s``.
+    A letter in a shape stands for a length: that of the first field that has it.
     """
 
     __slots__ = ()
 
     def __post_init__(self) -> None:
-        length: int | None = None
+        lengths: dict[str, int] = {}
         for spec in fields(cast(Any, self)):
             shape = spec.metadata.get("shape")
             value = getattr(self, spec.name)
             if shape is None or value is None:
                 continue
-            wanted = [length if size == "N" else size for size in shape]
+            wanted = [lengths.get(size) if isinstance(size, str) else size for size in shape]
             array = read_only(f"{type(self).__name__}.{spec.name}", value, wanted)
-            if length is None and shape[0] == "N":
-                length = len(array)
+            named = zip(shape, array.shape, strict=True)
+            lengths |= {size: got for size, got in named if isinstance(size, str)}
             object.__setattr__(self, spec.name, array)
 
 

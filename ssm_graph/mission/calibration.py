@@ -14,7 +14,7 @@ from ssm_graph.mission.mission import Mission
 from ssm_graph.sensors.current import CurrentModel
 from ssm_graph.sensors.depth import DepthCalibration
 from ssm_graph.sensors.drift import Drift
-from ssm_graph.sensors.dvl import N_BEAMS, DvlMount
+from ssm_graph.sensors.dvl import DvlMount
 from ssm_graph.sensors.gnss import GnssCalibration
 
 DVL_MOUNTING: Final = "dvl_mounting"
@@ -66,8 +66,8 @@ def calibration_extras(
         ),
         Extra(
             DVL_BEAM_SCALE,
-            tuple(f"dvl_beam{beam}_scale_error" for beam in range(1, N_BEAMS + 1)),
-            np.full(N_BEAMS, mount.beam_scale_sigma),
+            tuple(f"dvl_beam{beam}_scale_error" for beam in range(1, mount.n_beams + 1)),
+            np.full(mount.n_beams, mount.beam_scale_sigma),
         ),
         Extra(DVL_LEVER_ARM, _axes("dvl_lever_arm_{}_m"), np.full(3, mount.lever_arm_sigma)),
         Extra(DVL_TIME_OFFSET, ("dvl_time_offset_s",), np.array([mount.time_offset_sigma_s])),

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from enum import Enum
 
 from ssm_graph.base.frozen import Array, FrozenArrays, shaped
-from ssm_graph.sensors.dvl import N_BEAMS
 
 
 class Health(Enum):
@@ -75,5 +74,5 @@ class Navigation(FrozenArrays):
     """(3,) rad/s"""
     accel_bias: Array = shaped(3)
     """(3,) m/s^2"""
-    beam_weights: Array = shaped(N_BEAMS)
-    """(4,) of the last ping, 1 = nominal; NaN for a beam that was missing."""
+    beam_weights: Array = shaped("B")
+    """(B,) of the last ping, 1 = nominal; NaN for a beam that was missing."""

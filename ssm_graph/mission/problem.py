@@ -22,7 +22,7 @@ from ssm_graph.mission.ping_motion import MotionBefore, mean_gyro
 from ssm_graph.mission.start.moments import initial_moments
 from ssm_graph.mission.timeline import MIN_SPACING_S, Indices, build_timeline, is_inside, nearest
 from ssm_graph.mission.usable import require_usable
-from ssm_graph.sensors.dvl import N_BEAMS, stuck_beams
+from ssm_graph.sensors.dvl import stuck_beams
 from ssm_graph.sensors.imu import ImuLog
 
 NO_EXTRAS = Extras()
@@ -247,7 +247,7 @@ def _beams(mission: Mission, ping: Indices, ping_keyframe: Indices, extras: Extr
         speed=speed[row, beam],
         sigma=dvl.sigma[ping][row, beam],
         gyro_b=gyro_b[row],
-        beam_b=dvl.mount.beams_b.reshape(N_BEAMS, 3)[beam],
+        beam_b=dvl.mount.beams_b[beam],
         lever_arm_b=dvl.mount.lever_arm_b,
         R_bd=dvl.mount.R_bd,
         ping=row,

@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array, FrozenArrays, optional_shaped, shaped
 from ssm_graph.sensors.drift import Drift
 
+MOST_BEAMS: Final = 8
+"""An instrument may have 1 to so many beams."""
 N_BEAMS = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DvlMount(FrozenArrays):
-    """Geometry of the DVL: beams in the instrument, instrument in the body."""
+    """Geometry of the DVL: beams in the instrument, instrument in the body.
 
-    beams_d: Array = shaped(N_BEAMS, 3)
-    """(4, 3) beam directions as rows, instrument axes, out of the transducer."""
+    An instrument that gives a velocity alone has three beams along its axes.
+    """
+
+    beams_d: Array = shaped("B", 3)
+    """(B, 3) beam directions as rows, instrument axes, out of the transducer; 1 to 8 of them."""
     R_bd: Array = shaped(3, 3)
     """(3, 3) instrument to body."""
     lever_arm_b: Array = shaped(3)
@@ -36,10 +42,8 @@ class DvlMount(FrozenArrays):
     """Speeds are read ``1 + scale_error`` too large."""
     scale_walk_density: float = 0.0
     """Random walk of the scale error along the mission, 1/sqrt(s); it needs a ``scale_sigma``."""
-    beam_scale_error: Array = field(
-        default_factory=lambda: np.zeros(N_BEAMS), metadata={"shape": (N_BEAMS,)}
-    )
-    """(4,) the same of each beam, on top of that of all."""
+    beam_scale_error: Array | None = optional_shaped("B")
+    """(B,) the same of each beam, on top of that of all; None for none."""
     beam_scale_sigma: float = 0.0
     """Prior sigma of each beam's own scale error, 1; above zero asks for its calibration."""
     lever_arm_sigma: float = 0.0
@@ -47,13 +51,30 @@ class DvlMount(FrozenArrays):
     drift: Drift = Drift()
     """What the velocity is off by slowly, each of three components in instrument axes, m/s."""
 
+    def __post_init__(self) -> None:
+        super(DvlMount, self).__post_init__()
+        if not 1 <= self.n_beams <= MOST_BEAMS:
+            raise DataError(
+                f"DvlMount.beams_d: expected 1 to {MOST_BEAMS} beams, got {self.n_beams}"
+            )
+
+    @property
+    def n_beams(self) -> int:
+        """How many beams the instrument has, B."""
+        return len(self.beams_d)
+
+    @property
+    def beam_scale_errors(self) -> Array:
+        """(B,) scale error of each beam, on top of that of all."""
+        return np.zeros(self.n_beams) if self.beam_scale_error is None else self.beam_scale_error
+
     @property
     def beams_b(self) -> Array:
-        """(4, 3) what each beam reads of a velocity in body axes.
+        """(B, 3) what each beam reads of a velocity in body axes.
 
         Beam directions as rows, longer than one by the known scale errors.
         """
-        scale = (1.0 + self.scale_error) * (1.0 + self.beam_scale_error)
+        scale = (1.0 + self.scale_error) * (1.0 + self.beam_scale_errors)
         return np.asarray((self.beams_d * scale[:, None]) @ self.R_bd.T)
 
     def as_stated(self) -> DvlMount:
@@ -77,14 +98,22 @@ class DvlLog(FrozenArrays):
     mount: DvlMount
     time_s: Array = shaped("N")
     """(N,) s as stamped, strictly increasing; the mount's time offset is not yet applied."""
-    speed: Array = shaped("N", N_BEAMS)
-    """(N, 4) beam speeds, m/s; NaN marks a beam without bottom lock."""
-    sigma: Array = shaped("N", N_BEAMS)
-    """(N, 4) standard deviation of each speed, m/s, above zero."""
-    range_m: Array | None = optional_shaped("N", N_BEAMS)
-    """(N, 4) range along each beam, m; NaN where unknown."""
+    speed: Array = shaped("N", "B")
+    """(N, B) beam speeds, m/s; NaN marks a beam without bottom lock."""
+    sigma: Array = shaped("N", "B")
+    """(N, B) standard deviation of each speed, m/s, above zero."""
+    range_m: Array | None = optional_shaped("N", "B")
+    """(N, B) range along each beam, m; NaN where unknown."""
     water_track: Array | None = optional_shaped("N")
     """(N,) 1 where a ping is off the water, 0 where it is off the ground; None for all ground."""
+
+    def __post_init__(self) -> None:
+        super(DvlLog, self).__post_init__()
+        if self.speed.shape[1] != self.mount.n_beams:
+            raise DataError(
+                f"DvlLog.speed: expected a column for each of the mount's {self.mount.n_beams} "
+                f"beams, got {self.speed.shape[1]}"
+            )
 
     @property
     def is_water(self) -> NDArray[np.bool_]:
@@ -124,9 +153,9 @@ class Ping:
 
     time_s: float
     """As stamped, s; the mount's time offset is not yet applied."""
-    speed: tuple[float, float, float, float]
-    """m/s; NaN marks a beam without lock."""
-    sigma: tuple[float, float, float, float] | None = None
+    speed: tuple[float, ...]
+    """(B,) m/s; NaN marks a beam without lock."""
+    sigma: tuple[float, ...] | None = None
     """Standard deviations, m/s; None or NaN is the vehicle's nominal one."""
     is_water: bool = False
     """Whether it is off the water: its speeds are relative to the current, not to the ground."""
@@ -142,7 +171,7 @@ then leave out what the other beams tell too.
 
 
 def stuck_beams(speed: Array) -> NDArray[np.bool_]:
-    """Return which beam speeds (P, 4), m/s, NaN without bottom lock, belong to a stuck beam."""
+    """Return which beam speeds (P, B), m/s, NaN without bottom lock, belong to a stuck beam."""
     is_stuck = np.zeros(speed.shape, bool)
     if len(speed) < STUCK_PINGS:
         return is_stuck

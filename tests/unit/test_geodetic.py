@@ -13,7 +13,6 @@ from factors.similarity import GaussianKernel
 from ssm_graph.base.earth import EARTH_RATE
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
-from ssm_graph.engine import error_state
 from ssm_graph.filters.geodetic.error_model import (
     DP,
     ERROR_DIM,
@@ -38,6 +37,7 @@ from ssm_graph.imu.preintegration import INTEGRATION_DENSITY, imu_params
 from ssm_graph.mission.estimate import Status
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.problem import Problem, build_problem
+from ssm_graph.mission.start import moments
 from ssm_graph.mission.trajectory import trajectory_from_states
 from ssm_graph.simulation import (
     GnssSettings,
@@ -258,7 +258,7 @@ def test_start_is_that_of_the_graph() -> None:
     problem = build_problem(sim.mission)
     history = run_geodetic([problem], [sim.mission.imu])
     states = to_navigation(problem, history, 0)
-    expected = error_state.initial_moments(
+    expected = moments.initial_moments(
         problem.start, problem.frame, bias_sigma=problem.imu_noise_bias_sigma
     )
     np.testing.assert_allclose(states.R_nb[0], expected.R_nb, atol=1e-14)

@@ -78,7 +78,7 @@ _KEYS: Final[Mapping[str, _Key]] = {
         "dvl",
         "beam_scale_error",
         "beam_scale_sigma",
-        _compounded(lambda m: m.dvl.mount.beam_scale_error),
+        _compounded(lambda m: m.dvl.mount.beam_scale_errors),
     ),
     "dvl_lever_arm": _Key("dvl", "lever_arm_m", "lever_arm_sigma_m", _dvl_arm),
     "dvl_time_offset": _Key(

@@ -15,7 +15,7 @@ from ssm_graph.mission.mission import InitialState
 from ssm_graph.sensors.current import CurrentModel
 from ssm_graph.sensors.depth import DepthCalibration
 from ssm_graph.sensors.drift import Drift
-from ssm_graph.sensors.dvl import N_BEAMS, DvlMount
+from ssm_graph.sensors.dvl import DvlMount
 from ssm_graph.sensors.gnss import GnssCalibration
 from ssm_graph.sensors.imu import ImuNoise
 
@@ -55,9 +55,7 @@ def dvl_mount(toml: MissionToml) -> DvlMount:
         scale_error=settings.number("scale_error"),
         scale_walk_density=_si(settings, "scale_walk_per_sqrt_h"),
         beam_scale_error=(
-            settings.array("beam_scale_error")
-            if "beam_scale_error" in settings
-            else np.zeros(N_BEAMS)
+            settings.array("beam_scale_error") if "beam_scale_error" in settings else None
         ),
         beam_scale_sigma=settings.number("beam_scale_sigma"),
         lever_arm_sigma=settings.number("lever_arm_sigma_m"),

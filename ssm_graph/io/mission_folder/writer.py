@@ -167,7 +167,9 @@ def dvl_settings(mount: DvlMount, beam_sigma: float, suffix: str) -> dict[str, A
         "time_offset_sigma_s": float(mount.time_offset_sigma_s),
         "scale_error": float(mount.scale_error),
         "scale_walk_per_sqrt_h": from_si("scale_walk_per_sqrt_h", mount.scale_walk_density),
-        "beam_scale_error": mount.beam_scale_error.tolist() if mount.beam_scale_error.any() else 0,
+        "beam_scale_error": mount.beam_scale_errors.tolist()
+        if mount.beam_scale_errors.any()
+        else 0,
         "beam_scale_sigma": float(mount.beam_scale_sigma),
         "lever_arm_sigma_m": float(mount.lever_arm_sigma),
         **_drift_settings("drift_sigma_m_per_s", mount.drift),
