@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ssm_graph.errors import ConfigError, DataError
+from ssm_graph.base.errors import ConfigError, DataError
 from tests.malformed_aids import AID_CASES
 from tests.malformed_case import Malformed
 from tests.mission_damage import (

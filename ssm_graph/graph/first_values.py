@@ -17,9 +17,10 @@ from gtsam.symbol_shorthand import B, V, X
 
 from factors.similarity import Kernel
 from factors.so3 import cross
-from ssm_graph.data import N_BEAMS, Array
-from ssm_graph.earth import SEMI_MAJOR_AXIS
-from ssm_graph.errors import SolverError
+from ssm_graph.base.earth import SEMI_MAJOR_AXIS
+from ssm_graph.base.errors import SolverError
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import POSITION, ROTATION, STATE_DIM, VELOCITY
 from ssm_graph.graph.aids.of_problem import weighted_aids
 from ssm_graph.graph.augmented_rows import RowStates
 from ssm_graph.graph.beacon_start import find_beacons
@@ -30,8 +31,8 @@ from ssm_graph.graph.forward_extras import ForwardExtras
 from ssm_graph.graph.inertial_rows import carried_covariance, inertial_graph, pair_rows
 from ssm_graph.graph.states import States, states_from_arrays
 from ssm_graph.imu.preintegration import gravity_gradient, gtsam_gravity
-from ssm_graph.problem.error_state import POSITION, ROTATION, STATE_DIM, VELOCITY
-from ssm_graph.problem.problem import Problem, start_of
+from ssm_graph.mission.problem import Problem, start_of
+from ssm_graph.sensors.dvl import N_BEAMS
 
 LOCKED_OUT_PINGS = 3
 """After so many pings in a row without one good beam the prediction is doubted instead."""

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.similarity import WEIGHT_FLOOR, Kernel
-from ssm_graph.data import Array
+from ssm_graph.base.frozen import Array
 from ssm_graph.graph.aids.acoustic import RangeAid
 from ssm_graph.graph.aids.weighted import WeightedAid, WeightedAids
 from ssm_graph.graph.augmented_rows import RowStates

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from ssm_graph.data import Array
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.graph.aids.positions import fix_rows
 from ssm_graph.graph.augmented_rows import AugmentedBeams, PreparedBeams, RowStates
 from ssm_graph.graph.beam_rows import BeamRows
-from ssm_graph.problem.calibration import DEPTH_OFFSET
-from ssm_graph.problem.current import CURRENTS
-from ssm_graph.problem.error_state import STATE_DIM
-from ssm_graph.problem.problem import Problem
+from ssm_graph.mission.calibration import DEPTH_OFFSET
+from ssm_graph.mission.current import CURRENTS
+from ssm_graph.mission.problem import Problem
 
 REACH_S = 2e-2
 REACH_TURN = 2e-2

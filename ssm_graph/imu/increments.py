@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ssm_graph.data import Array, ImuLog
-from ssm_graph.errors import ConfigError, DataError
+from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.base.frozen import Array
+from ssm_graph.sensors.imu import ImuLog
 
 
 class MergedSamples(NamedTuple):

@@ -13,12 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ssm_graph.data import Array
-from ssm_graph.estimate import Estimate, OnKeyframe
-from ssm_graph.problem.error_state import STATE_DIM
-from ssm_graph.problem.extras import with_extras
-from ssm_graph.problem.problem import Problem, start_of, with_white_noise
-from ssm_graph.problem.recursive import RecursiveBeams, recursive_estimate
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import STATE_DIM
+from ssm_graph.engine.extras import with_extras
+from ssm_graph.mission.estimate import Estimate, OnKeyframe
+from ssm_graph.mission.problem import Problem, start_of, with_white_noise
+from ssm_graph.mission.recursive import RecursiveBeams, recursive_estimate
 from ssm_graph.smoothers.calibrated import calibration_of_last, undetermined
 from ssm_graph.smoothers.current import current_along
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from ssm_graph.data import Mission
-from ssm_graph.errors import SolverError
-from ssm_graph.estimate import Estimate, Status
-from ssm_graph.frames import wrap_to_pi
-from ssm_graph.problem.alignment import Alignment, align
-from ssm_graph.problem.problem import Problem, ProblemConfig, build_problem
+from ssm_graph.base.errors import SolverError
+from ssm_graph.base.frames import wrap_to_pi
+from ssm_graph.mission.estimate import Estimate, Status
+from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.problem import Problem, ProblemConfig, build_problem
+from ssm_graph.mission.start.alignment import Alignment, align
 from ssm_graph.smoothers.batch import OnIteration, SmootherConfig, SsmSmoother
 from ssm_graph.smoothers.beam_faults import FaultSearch
 

@@ -9,16 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ssm_graph.data import (
-    DvlLog,
-    DvlMount,
-    FrozenArrays,
-    ImuLog,
-    Reference,
-    counted_sigma,
-    read_only,
-)
-from ssm_graph.errors import DataError, SsmGraphError, nearest_hint
+from ssm_graph.base.errors import DataError, SsmGraphError, nearest_hint
+from ssm_graph.base.frozen import FrozenArrays, read_only
+from ssm_graph.mission.mission import Reference
+from ssm_graph.sensors.dvl import DvlLog, DvlMount, counted_sigma
+from ssm_graph.sensors.imu import ImuLog
 from ssm_graph.simulation import IMU_NOISE, Grade, default_mount
 from tests.helpers import simulated
 from tests.mission_fixture import make_mission

@@ -10,15 +10,19 @@ import pytest
 
 from factors.m_estimators import HuberKernel, TruncatedKernel
 from factors.similarity import ExpKernel, LogKernel, Similarity
-from ssm_graph.aid_logs import AidLogs, HeadingLog, RangeLog, Standstill
-from ssm_graph.errors import ConfigError, DataError
-from ssm_graph.estimate import Determined, Status
-from ssm_graph.filters.named import filter_problems
+from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.engine.gnc import Graduation
+from ssm_graph.filters.navigation.named import filter_problems
 from ssm_graph.graph.beacon_start import BeaconRanges, beacon_start, rival_place
 from ssm_graph.graph.first_values import first_values
 from ssm_graph.graph.forward_aids import settled_weights
 from ssm_graph.graph.gtsam_graph import gtsam_graph
-from ssm_graph.problem.problem import build_problem
+from ssm_graph.mission.estimate import Determined, Status
+from ssm_graph.mission.mission import AidLogs
+from ssm_graph.mission.problem import build_problem
+from ssm_graph.sensors.acoustic import RangeLog
+from ssm_graph.sensors.compass import HeadingLog
+from ssm_graph.sensors.standstill import Standstill
 from ssm_graph.simulation import (
     CALM,
     AidSettings,
@@ -31,7 +35,6 @@ from ssm_graph.simulation import (
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother, warm_start
 from ssm_graph.smoothers.beam_faults import FaultSearch
 from ssm_graph.smoothers.fixed_lag import solve_fixed_lag
-from ssm_graph.smoothers.gnc import Graduation
 from tests.aids_fixture import UNKNOWN, compass, ranging, usbl, with_every_aid
 from tests.helpers import simulated
 

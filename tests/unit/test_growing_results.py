@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from ssm_graph.errors import DataError
-from ssm_graph.io.growing_results import GrowingResults
-from ssm_graph.io.results import BEAMS_NAME, SUMMARY_NAME, TRAJECTORY_NAME
+from ssm_graph.base.errors import DataError
+from ssm_graph.io.results.growing import GrowingResults
+from ssm_graph.io.results.tables import BEAMS_NAME, SUMMARY_NAME, TRAJECTORY_NAME
 from tests.estimate_fixture import make_run
 
 NAMES = (TRAJECTORY_NAME, BEAMS_NAME)

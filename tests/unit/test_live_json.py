@@ -12,27 +12,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ssm_graph.estimate import Trajectory
-from ssm_graph.frames import BodyAxes, to_frd
-from ssm_graph.io.mission_units import SI
-from ssm_graph.io.results import trajectory_columns
-from ssm_graph.live.json_messages import (
+from ssm_graph.base.frames import BodyAxes, to_frd
+from ssm_graph.io.mission_folder.units import SI
+from ssm_graph.io.results.tables import trajectory_columns
+from ssm_graph.live.protocols.json_messages import (
     KEYS,
     JsonDecoder,
     encode_message,
     encode_navigation,
     navigation_fields,
 )
-from ssm_graph.messages import (
-    DepthReading,
-    Fix,
-    Health,
-    ImuSample,
-    Message,
-    Navigation,
-    Ping,
-    bad_number,
-)
+from ssm_graph.mission.estimate import Trajectory
+from ssm_graph.mission.navigation import Health, Navigation
+from ssm_graph.sensors.depth import DepthReading
+from ssm_graph.sensors.dvl import Ping
+from ssm_graph.sensors.gnss import Fix
+from ssm_graph.sensors.imu import ImuSample
+from ssm_graph.sensors.messages import Message, bad_number
 from tests.helpers import STEADY
 
 NUMBER = st.floats(-1e9, 1e9)

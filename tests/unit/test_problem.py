@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ssm_graph.data import DepthLog, ImuLog
-from ssm_graph.errors import ConfigError, DataError
-from ssm_graph.problem.ping_motion import mean_gyro
-from ssm_graph.problem.problem import ProblemConfig, build_problem
+from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.mission.ping_motion import mean_gyro
+from ssm_graph.mission.problem import ProblemConfig, build_problem
+from ssm_graph.sensors.depth import DepthLog
+from ssm_graph.sensors.imu import ImuLog
 from ssm_graph.simulation import (
     IMU_NOISE,
     DepthSettings,

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ssm_graph.errors import DataError
-from ssm_graph.frames import R_FRD, BodyAxes
-from ssm_graph.io.ros_messages import (
+from ssm_graph.base.errors import DataError
+from ssm_graph.base.frames import R_FRD, BodyAxes
+from ssm_graph.io.ros.messages import (
     CONVERTERS,
     FIX_SIGMA,
     BeamSign,
@@ -25,7 +25,11 @@ from ssm_graph.io.ros_messages import (
     imu_sample,
     ping,
 )
-from ssm_graph.messages import DepthReading, Fix, ImuSample, Ping, bad_number
+from ssm_graph.sensors.depth import DepthReading
+from ssm_graph.sensors.dvl import Ping
+from ssm_graph.sensors.gnss import Fix
+from ssm_graph.sensors.imu import ImuSample
+from ssm_graph.sensors.messages import bad_number
 
 NAN = math.nan
 RECEIVED_S = 99.5

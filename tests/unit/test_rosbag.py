@@ -15,20 +15,23 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+from ssm_graph.base.errors import ConfigError, DataError, MissingExtraError
+from ssm_graph.base.frames import R_FRD, BodyAxes
+from ssm_graph.base.frozen import Array
 from ssm_graph.cli.main import ExitCode, main
-from ssm_graph.data import Array, DvlMount, ImuNoise, Mission
-from ssm_graph.errors import ConfigError, DataError, MissingExtraError
-from ssm_graph.frames import R_FRD, BodyAxes
-from ssm_graph.io import rosbag_log
-from ssm_graph.io.mission import read_mission, write_mission
-from ssm_graph.io.ros_messages import BeamSign, RosOptions
-from ssm_graph.io.rosbag import BEAM_SIGMA, NOISE, convert_rosbag
-from ssm_graph.io.rosbag_beams import WATER_LINKED_BEAMS, proven_beams
-from ssm_graph.io.rosbag_log import LAYOUTS, is_rosbag
-from ssm_graph.io.rosbag_rows import WATER_LATER_S
-from ssm_graph.io.vehicle import vehicle_of
+from ssm_graph.io.mission_folder.reader import read_mission, write_mission
+from ssm_graph.io.mission_folder.vehicle import vehicle_of
+from ssm_graph.io.ros import log as rosbag_log
+from ssm_graph.io.ros.beams import WATER_LINKED_BEAMS, proven_beams
+from ssm_graph.io.ros.convert import BEAM_SIGMA, NOISE, convert_rosbag
+from ssm_graph.io.ros.log import LAYOUTS, is_rosbag
+from ssm_graph.io.ros.messages import BeamSign, RosOptions
+from ssm_graph.io.ros.rows import WATER_LATER_S
+from ssm_graph.mission.mission import Mission
+from ssm_graph.sensors.current import CurrentModel
+from ssm_graph.sensors.dvl import DvlMount
+from ssm_graph.sensors.imu import ImuNoise
 from ssm_graph.simulation import GnssSettings
-from ssm_graph.water_current import CurrentModel
 from tests.helpers import simulated
 
 pytest.importorskip("rosbags", reason="needs the extra 'ros'")

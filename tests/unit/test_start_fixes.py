@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ssm_graph.aid_logs import NO_AIDS
-from ssm_graph.data import Mission
-from ssm_graph.errors import ConfigError, DataError
+from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.evaluation import evaluate
-from ssm_graph.io.mission import read_mission, write_mission
-from ssm_graph.problem.alignment import align
-from ssm_graph.problem.body_velocity import BodyVelocities, body_velocities
-from ssm_graph.problem.start_fixes import NEAR_S, start_fixes
+from ssm_graph.io.mission_folder.reader import read_mission, write_mission
+from ssm_graph.mission.mission import NO_AIDS, Mission
+from ssm_graph.mission.start.alignment import align
+from ssm_graph.mission.start.body_velocity import BodyVelocities, body_velocities
+from ssm_graph.mission.start.start_fixes import NEAR_S, start_fixes
 from ssm_graph.simulation import GnssSettings, Grade, SimulatedMission
 from ssm_graph.smoothers.mission import smooth
 from tests.aids_fixture import KNOWN, ranging, usbl

@@ -9,15 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ssm_graph.data import Mission
-from ssm_graph.errors import ConfigError, SsmGraphError
-from ssm_graph.io.mission import read_mission
-from ssm_graph.io.replay import messages_of
-from ssm_graph.io.tables import Order
-from ssm_graph.io.vehicle import read_vehicle, vehicle_of, write_vehicle
-from ssm_graph.messages import DepthReading, Fix, ImuSample, Ping, Vehicle
-from ssm_graph.online.buffers import SIGMAS, Buffers
-from ssm_graph.water_current import CurrentModel
+from ssm_graph.base.errors import ConfigError, SsmGraphError
+from ssm_graph.io.mission_folder.reader import read_mission
+from ssm_graph.io.mission_folder.vehicle import read_vehicle, vehicle_of, write_vehicle
+from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.io.tables.table import Order
+from ssm_graph.live.estimator.buffers import SIGMAS, Buffers
+from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.vehicle import Vehicle
+from ssm_graph.sensors.current import CurrentModel
+from ssm_graph.sensors.depth import DepthReading
+from ssm_graph.sensors.dvl import Ping
+from ssm_graph.sensors.gnss import Fix
+from ssm_graph.sensors.imu import ImuSample
 from tests.malformed_case import Malformed
 from tests.malformed_cases import TOML_CASES
 from tests.mission_fixture import TOML, make_mission, write_example
