@@ -72,10 +72,26 @@ def test_wrong_shapes_are_named(changes: dict[str, Any], message: str) -> None:
 def test_fixed_shapes_do_not_follow_the_time() -> None:
     """A mount has no time; its shapes are its own."""
     mount = default_mount()
-    with pytest.raises(DataError, match=r"DvlMount\.beams_d: expected an array of shape \(4, 3\)"):
-        dataclasses.replace(mount, beams_d=np.zeros((3, 3)))
+    with pytest.raises(DataError, match=r"DvlMount\.beams_d: expected an array of shape"):
+        dataclasses.replace(mount, beams_d=np.zeros((4, 2)))
     with pytest.raises(DataError, match=r"lever_arm_b"):
         dataclasses.replace(mount, lever_arm_b=np.zeros(2))
+
+
+@pytest.mark.parametrize("n_beams", [0, 9])
+def test_an_instrument_has_one_to_eight_beams(n_beams: int) -> None:
+    """As many as any maker builds."""
+    with pytest.raises(DataError, match=f"expected 1 to 8 beams, got {n_beams}"):
+        dataclasses.replace(default_mount(), beams_d=np.zeros((n_beams, 3)))
+
+
+def test_a_log_has_the_beams_of_its_mount() -> None:
+    """Three beams and four speeds are two instruments."""
+    mount = dataclasses.replace(default_mount(), beams_d=np.eye(3))
+    with pytest.raises(DataError, match="for each of the mount's 3 beams, got 4"):
+        DvlLog(mount=mount, time_s=np.zeros(1), speed=np.zeros((1, 4)), sigma=np.ones((1, 4)))
+    log = DvlLog(mount=mount, time_s=np.zeros(1), speed=np.zeros((1, 3)), sigma=np.ones((1, 3)))
+    assert log.mount.beam_scale_errors.shape == (3,)
 
 
 def test_missing_ranges_are_allowed_and_present_ones_checked() -> None:
