@@ -20,10 +20,12 @@ import numpy as np
 from benchmarks.report import Report
 from benchmarks.speed import table
 from factors.similarity import GaussianKernel, Kernel, LogKernel
-from ssm_graph.aid_logs import AidLogs, HeadingErrors, Standstill
-from ssm_graph.estimate import Calibration
 from ssm_graph.evaluation import chi2_interval, evaluate, mean_with_interval
-from ssm_graph.problem.problem import build_problem
+from ssm_graph.mission.estimate import Calibration
+from ssm_graph.mission.mission import AidLogs
+from ssm_graph.mission.problem import build_problem
+from ssm_graph.sensors.compass import HeadingErrors
+from ssm_graph.sensors.standstill import Standstill
 from ssm_graph.simulation import (
     CALM,
     AidSettings,

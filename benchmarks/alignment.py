@@ -22,9 +22,9 @@ import numpy as np
 
 from benchmarks.report import Report
 from benchmarks.speed import table
-from ssm_graph.estimate import Estimate, Status
-from ssm_graph.frames import wrap_to_pi
-from ssm_graph.io.blueye_vehicle import NOISE
+from ssm_graph.base.frames import wrap_to_pi
+from ssm_graph.io.blueye.vehicle import NOISE
+from ssm_graph.mission.estimate import Estimate, Status
 from ssm_graph.simulation import (
     DepthProfile,
     GnssSettings,

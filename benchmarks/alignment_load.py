@@ -21,14 +21,16 @@ import numpy as np
 
 from benchmarks.report import Report
 from benchmarks.speed import table
-from ssm_graph.io.replay import messages_of
-from ssm_graph.io.vehicle import vehicle_of
-from ssm_graph.messages import Health, Message, Vehicle
-from ssm_graph.online import FixedLagSmoother
-from ssm_graph.online.events import EventLog
-from ssm_graph.online.intake import Intake
-from ssm_graph.online.start import MOST_MS, SHARE
-from ssm_graph.online.store import pack_buffers
+from ssm_graph.io.mission_folder.vehicle import vehicle_of
+from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.live.estimator import FixedLagSmoother
+from ssm_graph.live.estimator.events import EventLog
+from ssm_graph.live.estimator.intake import Intake
+from ssm_graph.live.estimator.start import MOST_MS, SHARE
+from ssm_graph.live.estimator.store import pack_buffers
+from ssm_graph.mission.navigation import Health
+from ssm_graph.mission.vehicle import Vehicle
+from ssm_graph.sensors.messages import Message
 from ssm_graph.simulation import (
     DvlSettings,
     GnssSettings,

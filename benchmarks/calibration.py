@@ -21,10 +21,11 @@ from benchmarks.calibration_cases import DVL, asking, knowing_dvl, wrong_dvl
 from benchmarks.report import Report
 from benchmarks.speed import table
 from factors.similarity import GaussianKernel, Kernel, LogKernel
-from ssm_graph.data import Array, Mission, Reference
-from ssm_graph.estimate import Estimate
+from ssm_graph.base.frozen import Array
 from ssm_graph.evaluation import chi2_interval, evaluate, mean_with_interval, paired_ratio
-from ssm_graph.problem.problem import build_problem
+from ssm_graph.mission.estimate import Estimate
+from ssm_graph.mission.mission import Mission, Reference
+from ssm_graph.mission.problem import build_problem
 from ssm_graph.simulation import (
     CALM,
     DepthProfile,

@@ -9,8 +9,8 @@ from typing import Any, Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ssm_graph.data import Array, DepthCalibration, GnssCalibration, Mission
-from ssm_graph.problem.calibration import (
+from ssm_graph.base.frozen import Array
+from ssm_graph.mission.calibration import (
     DEPTH_OFFSET,
     DVL_LEVER_ARM,
     DVL_MOUNTING,
@@ -19,6 +19,9 @@ from ssm_graph.problem.calibration import (
     GNSS_LEVER_ARM,
     GNSS_TIME_OFFSET,
 )
+from ssm_graph.mission.mission import Mission
+from ssm_graph.sensors.depth import DepthCalibration
+from ssm_graph.sensors.gnss import GnssCalibration
 from ssm_graph.simulation import DepthSettings, DvlSettings, GnssSettings
 
 MOUNTING: Final[Array] = Rotation.from_euler("ZYX", np.radians([2.0, 0.5, 1.0])).as_rotvec()

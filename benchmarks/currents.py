@@ -20,12 +20,13 @@ import numpy as np
 
 from benchmarks.report import Report
 from benchmarks.speed import table
-from ssm_graph.data import Array, Mission
-from ssm_graph.estimate import Estimate, Status
+from ssm_graph.base.frozen import Array
 from ssm_graph.evaluation import evaluate
 from ssm_graph.evaluation.statistics import chi2_interval, mean_with_interval, paired_ratio
-from ssm_graph.problem.current import CURRENTS as CURRENT_VARIABLES
-from ssm_graph.problem.problem import Problem, build_problem, with_dvl
+from ssm_graph.mission.current import CURRENTS as CURRENT_VARIABLES
+from ssm_graph.mission.estimate import Estimate, Status
+from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.problem import Problem, build_problem, with_dvl
 from ssm_graph.simulation import (
     CurrentSettings,
     Grade,

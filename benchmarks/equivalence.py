@@ -21,13 +21,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import numpy as np
 
 from factors.similarity import LogKernel, Similarity
-from ssm_graph.filters.geodetic import GeodeticConfig, run_geodetic, to_navigation
-from ssm_graph.filters.geodetic_error_model import Feedback
-from ssm_graph.filters.navigation import Grouping, run_filter
-from ssm_graph.filters.ssm import SsmUpdate
-from ssm_graph.problem.error_state import POSITION, VELOCITY, Linearised
-from ssm_graph.problem.problem import Problem, build_problem
-from ssm_graph.problem.states import NavigationStates
+from ssm_graph.engine.error_state import POSITION, VELOCITY, Linearised
+from ssm_graph.engine.states import NavigationStates
+from ssm_graph.filters.geodetic.error_model import Feedback
+from ssm_graph.filters.geodetic.filter import GeodeticConfig, run_geodetic, to_navigation
+from ssm_graph.filters.navigation.filter import Grouping, run_filter
+from ssm_graph.filters.rules.ssm import SsmUpdate
+from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.simulation import (
     GnssSettings,
     Grade,

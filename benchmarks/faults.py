@@ -35,7 +35,7 @@ from benchmarks.faults_process import PROCESS_ROWS, run_process_row
 from benchmarks.faults_transforms import untouched
 from benchmarks.report import machine
 from benchmarks.speed import table
-from ssm_graph.messages import Health
+from ssm_graph.mission.navigation import Health
 
 PROCESS = """\
 Kills and disks: `ssm-graph online` replays 40 s as fast as it goes, a checkpoint every 3 s; the

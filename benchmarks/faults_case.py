@@ -12,11 +12,13 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from ssm_graph.data import Array
-from ssm_graph.io.replay import messages_of
-from ssm_graph.io.vehicle import vehicle_of
-from ssm_graph.messages import Event, Health, Message, Navigation, Vehicle
-from ssm_graph.online import ONLINE, FixedLagSmoother
+from ssm_graph.base.frozen import Array
+from ssm_graph.io.mission_folder.vehicle import vehicle_of
+from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.live.estimator import ONLINE, FixedLagSmoother
+from ssm_graph.mission.navigation import Event, Health, Navigation
+from ssm_graph.mission.vehicle import Vehicle
+from ssm_graph.sensors.messages import Message
 from ssm_graph.simulation import (
     DvlSettings,
     GnssSettings,

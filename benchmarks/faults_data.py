@@ -32,8 +32,13 @@ from benchmarks.faults_transforms import (
     untouched,
     with_speeds,
 )
-from ssm_graph.frames import R_lb_from_roll_pitch_heading
-from ssm_graph.messages import DepthReading, Fix, Health, ImuSample, Message, Ping
+from ssm_graph.base.frames import R_lb_from_roll_pitch_heading
+from ssm_graph.mission.navigation import Health
+from ssm_graph.sensors.depth import DepthReading
+from ssm_graph.sensors.dvl import Ping
+from ssm_graph.sensors.gnss import Fix
+from ssm_graph.sensors.imu import ImuSample
+from ssm_graph.sensors.messages import Message
 
 NAN, INF = math.nan, math.inf
 BAD_NUMBERS: Final = [NAN, INF, -INF]

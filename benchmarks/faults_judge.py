@@ -20,7 +20,7 @@ from benchmarks.faults_case import (
     spells,
     undisturbed,
 )
-from ssm_graph.messages import Health
+from ssm_graph.mission.navigation import Health
 
 LEAST_SHARE: Final = 0.95
 SAME: Final = 1e-6

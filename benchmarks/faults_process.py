@@ -22,9 +22,9 @@ import numpy as np
 from benchmarks.faults_case import Stage, simulated_stage
 from benchmarks.faults_judge import Row, judge
 from benchmarks.faults_sockets import SOCKET_CASES, run_socket_case
-from ssm_graph.io.checkpoint import CHECKPOINT_NAME, older_name
-from ssm_graph.io.mission_writer import write_mission
-from ssm_graph.live.run_folder import LOG_NAME
+from ssm_graph.io.mission_folder.writer import write_mission
+from ssm_graph.io.tables.checkpoint import CHECKPOINT_NAME, older_name
+from ssm_graph.live.run.run_folder import LOG_NAME
 
 STAGE: Final = Stage(duration_s=40.0, gnss=((0.0, 20.0),))
 PATIENCE_S: Final = 120.0

@@ -47,28 +47,24 @@ from benchmarks.faults_vessel import (
     vanishing,
 )
 from ssm_graph.cli.online import engine_of
-from ssm_graph.data import DepthLog
-from ssm_graph.io.raw_log import replay
-from ssm_graph.live.endpoints import LOOPBACK, Endpoint, Transport
-from ssm_graph.live.interfaces import Connections
-from ssm_graph.live.json_messages import JsonDecoder, encode_message
-from ssm_graph.live.listeners import TcpServerInput
-from ssm_graph.live.outputs import OutputFormat
-from ssm_graph.live.run_folder import LOG_NAME, RunFolder
-from ssm_graph.live.runner import Runner, RunnerConfig
-from ssm_graph.live.sockets import InputConfig, OutputConfig, SocketHub
-from ssm_graph.live.status import RunStatus, SourceStatus
-from ssm_graph.live.waterlinked import WaterLinkedDecoder
-from ssm_graph.messages import (
-    Event,
-    Health,
-    ImuSample,
-    Message,
-    Ping,
-    Severity,
-    Vehicle,
-)
-from ssm_graph.online import ONLINE
+from ssm_graph.io.raw_log.log import replay
+from ssm_graph.live.estimator import ONLINE
+from ssm_graph.live.protocols.json_messages import JsonDecoder, encode_message
+from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
+from ssm_graph.live.run.interfaces import Connections
+from ssm_graph.live.run.run_folder import LOG_NAME, RunFolder
+from ssm_graph.live.run.runner import Runner, RunnerConfig
+from ssm_graph.live.run.status import RunStatus, SourceStatus
+from ssm_graph.live.sockets.endpoints import LOOPBACK, Endpoint, Transport
+from ssm_graph.live.sockets.listeners import TcpServerInput
+from ssm_graph.live.sockets.outputs import OutputFormat
+from ssm_graph.live.sockets.sockets import InputConfig, OutputConfig, SocketHub
+from ssm_graph.mission.navigation import Event, Health, Severity
+from ssm_graph.mission.vehicle import Vehicle
+from ssm_graph.sensors.depth import DepthLog
+from ssm_graph.sensors.dvl import Ping
+from ssm_graph.sensors.imu import ImuSample
+from ssm_graph.sensors.messages import Message
 from ssm_graph.simulation import DepthSettings, simulate
 
 STAGE: Final = Stage(duration_s=60.0, gnss=((0.0, 20.0),))

@@ -10,8 +10,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks.faults_case import Sent, Stream, Transform
-from ssm_graph.data import N_BEAMS, Array
-from ssm_graph.messages import Fix, Message, Ping, Vehicle
+from ssm_graph.base.frozen import Array
+from ssm_graph.mission.vehicle import Vehicle
+from ssm_graph.sensors.dvl import N_BEAMS, Ping
+from ssm_graph.sensors.gnss import Fix
+from ssm_graph.sensors.messages import Message
 
 Edit = Callable[[Any, np.random.Generator], Message | None]
 

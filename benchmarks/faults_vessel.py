@@ -13,12 +13,13 @@ from typing import Final
 import numpy as np
 
 from benchmarks.faults_case import Sent
-from ssm_graph.data import DepthLog
-from ssm_graph.live.endpoints import LOOPBACK
-from ssm_graph.live.json_messages import encode_message
-from ssm_graph.live.outputs import TcpServerOutput
-from ssm_graph.live.sockets import SocketHub
-from ssm_graph.messages import DepthReading, ImuSample, Ping
+from ssm_graph.live.protocols.json_messages import encode_message
+from ssm_graph.live.sockets.endpoints import LOOPBACK
+from ssm_graph.live.sockets.outputs import TcpServerOutput
+from ssm_graph.live.sockets.sockets import SocketHub
+from ssm_graph.sensors.depth import DepthLog, DepthReading
+from ssm_graph.sensors.dvl import Ping
+from ssm_graph.sensors.imu import ImuSample
 
 BEGIN_S: Final = 25.0
 END_S: Final = 35.0

@@ -13,18 +13,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.kernels import KERNELS
-from ssm_graph.aid_logs import NO_AIDS
+from ssm_graph.base.errors import SsmGraphError
+from ssm_graph.base.frozen import Array
 from ssm_graph.cli.run_mission import fixes_where
-from ssm_graph.data import Array, Drift, GnssLog, Mission
-from ssm_graph.errors import SsmGraphError
-from ssm_graph.estimate import Estimate
 from ssm_graph.evaluation import reference_from_gnss
 from ssm_graph.evaluation.errors import ErrorSeries, error_series
-from ssm_graph.filters.named import filter_problems
-from ssm_graph.io.blueye import convert_blueye
-from ssm_graph.io.blueye_vehicle import GYRO_BIAS
-from ssm_graph.problem.alignment import align
-from ssm_graph.problem.problem import build_problem
+from ssm_graph.filters.navigation.named import filter_problems
+from ssm_graph.io.blueye.convert import convert_blueye
+from ssm_graph.io.blueye.vehicle import GYRO_BIAS
+from ssm_graph.mission.estimate import Estimate
+from ssm_graph.mission.mission import NO_AIDS, Mission
+from ssm_graph.mission.problem import build_problem
+from ssm_graph.mission.start.alignment import align
+from ssm_graph.sensors.drift import Drift
+from ssm_graph.sensors.gnss import GnssLog
 from ssm_graph.smoothers.batch import SmootherConfig
 from ssm_graph.smoothers.mission import smooth
 

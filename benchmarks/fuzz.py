@@ -21,13 +21,17 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.report import Report
 from benchmarks.speed import table
-from ssm_graph.live.decoder import MAX_REFUSALS, Decoder
-from ssm_graph.live.framing import MAX_LENGTH
-from ssm_graph.live.json_messages import JsonDecoder, encode_message
-from ssm_graph.live.nmea import NmeaDecoder
-from ssm_graph.live.nmea_fields import checksum
-from ssm_graph.live.waterlinked import BeamRule, WaterLinkedDecoder
-from ssm_graph.messages import DepthReading, Fix, ImuSample, Message, Ping, bad_number
+from ssm_graph.live.protocols.decoder import MAX_REFUSALS, Decoder
+from ssm_graph.live.protocols.framing import MAX_LENGTH
+from ssm_graph.live.protocols.json_messages import JsonDecoder, encode_message
+from ssm_graph.live.protocols.nmea import NmeaDecoder
+from ssm_graph.live.protocols.nmea_fields import checksum
+from ssm_graph.live.protocols.waterlinked import BeamRule, WaterLinkedDecoder
+from ssm_graph.sensors.depth import DepthReading
+from ssm_graph.sensors.dvl import Ping
+from ssm_graph.sensors.gnss import Fix
+from ssm_graph.sensors.imu import ImuSample
+from ssm_graph.sensors.messages import Message, bad_number
 
 RESULTS = Path(__file__).resolve().parent / "results"
 START_S = 1_700_000_000.0

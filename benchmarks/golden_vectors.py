@@ -22,13 +22,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import numpy as np
 
 from factors.similarity import ExpKernel, Kernel, LogKernel, SqrtKernel
-from ssm_graph.data import Array
-from ssm_graph.filters.correntropy import CorrentropyUpdate
-from ssm_graph.filters.kalman import KalmanUpdate
-from ssm_graph.filters.linear import LinearModel, LinearSystem, run_linear_filter
-from ssm_graph.filters.model import Update, UpdateRule
-from ssm_graph.filters.ssm import Floor, SsmUpdate, StopRule
-from ssm_graph.filters.student import Scale, StudentUpdate
+from ssm_graph.base.frozen import Array
+from ssm_graph.filters.rules.correntropy import CorrentropyUpdate
+from ssm_graph.filters.rules.kalman import KalmanUpdate
+from ssm_graph.filters.rules.linear import LinearModel, LinearSystem, run_linear_filter
+from ssm_graph.filters.rules.model import Update, UpdateRule
+from ssm_graph.filters.rules.ssm import Floor, SsmUpdate, StopRule
+from ssm_graph.filters.rules.student import Scale, StudentUpdate
 
 Vectors = Mapping[str, Array]
 TOLERANCE = 1e-8

@@ -27,13 +27,13 @@ from matplotlib.ticker import NullLocator
 from benchmarks.report import Report
 from benchmarks.speed import table
 from factors.similarity import LogKernel
-from ssm_graph.data import Array
-from ssm_graph.estimate import Estimate, since_first_ping
+from ssm_graph.base.frozen import Array
 from ssm_graph.evaluation import evaluate, mean_with_interval, paired_ratio
 from ssm_graph.evaluation.statistics import paired_difference
-from ssm_graph.filters.named import filter_problems
-from ssm_graph.problem.problem import Problem, build_problem
-from ssm_graph.report.compare_style import (
+from ssm_graph.filters.navigation.named import filter_problems
+from ssm_graph.mission.estimate import Estimate, since_first_ping
+from ssm_graph.mission.problem import Problem, build_problem
+from ssm_graph.report.comparison.style import (
     DASHED,
     Look,
     add_footnote,
@@ -41,7 +41,7 @@ from ssm_graph.report.compare_style import (
     line,
     new_figure,
 )
-from ssm_graph.report.style import EAST_NORTH_UP, dress, save
+from ssm_graph.report.mission.style import EAST_NORTH_UP, dress, save
 from ssm_graph.simulation import (
     Grade,
     OutlierKind,

@@ -21,10 +21,12 @@ import numpy as np
 from benchmarks.report import machine
 from benchmarks.speed import table
 from factors.kernels import KERNELS
-from ssm_graph.data import Array, ImuNoise, Mission
-from ssm_graph.estimate import since_first_ping
+from ssm_graph.base.frozen import Array
 from ssm_graph.evaluation import evaluate, paired_ratio
-from ssm_graph.problem.problem import build_problem
+from ssm_graph.mission.estimate import since_first_ping
+from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.problem import build_problem
+from ssm_graph.sensors.imu import ImuNoise
 from ssm_graph.simulation import Grade, OutlierKind, Outliers, scenario_config, simulate
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
 from ssm_graph.study.code import code_version

@@ -39,7 +39,7 @@ from benchmarks.online_tasks import (
 from benchmarks.online_theirs import Kind, TheirConfig
 from benchmarks.report import machine
 from benchmarks.speed import in_fresh_process
-from ssm_graph.online import ONLINE
+from ssm_graph.live.estimator import ONLINE
 
 RESULTS = Path(__file__).resolve().parent / "results"
 DATA = Path(__file__).resolve().parents[1] / "../shared/data"

@@ -9,7 +9,7 @@ import numpy as np
 from benchmarks.online_stream import Accuracy
 from benchmarks.online_tasks import LogRow, SettingRow, StreamRun
 from benchmarks.speed import table
-from ssm_graph.data import Array
+from ssm_graph.base.frozen import Array
 from ssm_graph.evaluation import Interval, mean_with_interval, paired_ratio
 
 P99_MS = 20.0

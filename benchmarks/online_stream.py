@@ -12,12 +12,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ssm_graph.data import Array, Reference
-from ssm_graph.estimate import Trajectory
+from ssm_graph.base.frozen import Array
 from ssm_graph.evaluation import ErrorSeries, error_series
-from ssm_graph.messages import Event, Health, ImuSample, Message, Navigation
-from ssm_graph.online import FixedLagSmoother
-from ssm_graph.online.delayed import Delayed
+from ssm_graph.live.estimator import FixedLagSmoother
+from ssm_graph.live.estimator.delayed import Delayed
+from ssm_graph.mission.estimate import Trajectory
+from ssm_graph.mission.mission import Reference
+from ssm_graph.mission.navigation import Event, Health, Navigation
+from ssm_graph.sensors.imu import ImuSample
+from ssm_graph.sensors.messages import Message
 
 HEALTHS = tuple(Health)
 TAKE_S = 60.0

@@ -18,18 +18,19 @@ from benchmarks.online_stream import (
     run_stream,
 )
 from benchmarks.online_theirs import TheirConfig, run_theirs
+from ssm_graph.base.frozen import Array
 from ssm_graph.cli.online import pass_over_imports
 from ssm_graph.cli.run_mission import withhold_gnss
-from ssm_graph.data import Array, Mission, Reference
-from ssm_graph.estimate import Trajectory, since_first_ping
 from ssm_graph.evaluation import error_series, reference_from_gnss
-from ssm_graph.filters.named import filter_problems
-from ssm_graph.io.blueye import convert_blueye
-from ssm_graph.io.replay import messages_of
-from ssm_graph.io.vehicle import vehicle_of
-from ssm_graph.messages import Health
-from ssm_graph.online import ONLINE, FixedLagSmoother
-from ssm_graph.problem.problem import build_problem
+from ssm_graph.filters.navigation.named import filter_problems
+from ssm_graph.io.blueye.convert import convert_blueye
+from ssm_graph.io.mission_folder.vehicle import vehicle_of
+from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.live.estimator import ONLINE, FixedLagSmoother
+from ssm_graph.mission.estimate import Trajectory, since_first_ping
+from ssm_graph.mission.mission import Mission, Reference
+from ssm_graph.mission.navigation import Health
+from ssm_graph.mission.problem import build_problem
 from ssm_graph.simulation import (
     DvlSettings,
     Grade,

@@ -13,18 +13,19 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from factors.dvl_beam import dvl_beam_factor
-from ssm_graph.data import Array, Mission
-from ssm_graph.earth import LocalFrame
-from ssm_graph.estimate import Trajectory
+from ssm_graph.base.earth import LocalFrame
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.states import AugmentedStates
 from ssm_graph.graph.gtsam_graph import prior_graph
-from ssm_graph.io.replay import messages_of
-from ssm_graph.io.vehicle import vehicle_of
-from ssm_graph.online.asked import sensors_of_vehicle
-from ssm_graph.online.buffers import Buffers
-from ssm_graph.online.keyframes import KeyframeMaker
-from ssm_graph.problem.problem import ProblemConfig, build_problem, start_of
-from ssm_graph.problem.states import AugmentedStates
-from ssm_graph.problem.trajectory import trajectory_at
+from ssm_graph.io.mission_folder.vehicle import vehicle_of
+from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.live.estimator.asked import sensors_of_vehicle
+from ssm_graph.live.estimator.buffers import Buffers
+from ssm_graph.live.estimator.keyframes import KeyframeMaker
+from ssm_graph.mission.estimate import Trajectory
+from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.problem import ProblemConfig, build_problem, start_of
+from ssm_graph.mission.trajectory import trajectory_at
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors
 from ssm_graph.smoothers.window_inertial import InertialRows
 from ssm_graph.smoothers.window_rows import depth_targets

@@ -11,10 +11,10 @@ from matplotlib.patches import Patch
 
 from benchmarks.online_stream import HEALTHS
 from benchmarks.soak_stream import HOUR_S, Soaked
-from ssm_graph.data import Array
-from ssm_graph.messages import Health
-from ssm_graph.report.compare_style import add_footnote, log_ticks, new_figure
-from ssm_graph.report.style import BOUND, ESTIMATE, OUTLIER, SMALL, dress
+from ssm_graph.base.frozen import Array
+from ssm_graph.mission.navigation import Health
+from ssm_graph.report.comparison.style import add_footnote, log_ticks, new_figure
+from ssm_graph.report.mission.style import BOUND, ESTIMATE, OUTLIER, SMALL, dress
 
 COLORS = {
     Health.ALIGNING: "#BBBBBB",

@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.online_stream import HEALTHS, Answers, run_stream
-from ssm_graph.data import Array, Mission, Reference
+from ssm_graph.base.frozen import Array
 from ssm_graph.evaluation import error_series
-from ssm_graph.io.replay import messages_of
-from ssm_graph.io.vehicle import vehicle_of
-from ssm_graph.messages import Health
-from ssm_graph.online import FixedLagSmoother
+from ssm_graph.io.mission_folder.vehicle import vehicle_of
+from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.live.estimator import FixedLagSmoother
+from ssm_graph.mission.mission import Mission, Reference
+from ssm_graph.mission.navigation import Health
 from ssm_graph.simulation import (
     DepthSettings,
     DvlSettings,

@@ -9,11 +9,13 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from factors.dvl_beam import dvl_beam_factor
-from ssm_graph.data import Array, ImuNoise, Mission
-from ssm_graph.earth import LocalFrame
+from ssm_graph.base.earth import LocalFrame
+from ssm_graph.base.frozen import Array
 from ssm_graph.graph.gtsam_graph import prior_graph
-from ssm_graph.problem.error_state import initial_moments
-from ssm_graph.problem.problem import Beams, Problem
+from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.problem import Beams, Problem
+from ssm_graph.mission.start.moments import initial_moments
+from ssm_graph.sensors.imu import ImuNoise
 
 CAUCHY_K = 2.3849
 """The usual constant: 95 % efficiency without outliers."""

@@ -24,13 +24,14 @@ import ssm_graph.graph.linearize as linearize
 import ssm_graph.smoothers.batch as batch
 from benchmarks.speed_plain import dead_reckoned, plain_graph
 from factors.similarity import LogKernel
-from ssm_graph.data import Array, Mission
+from ssm_graph.base.frozen import Array
+from ssm_graph.base.stepwise import Steps
 from ssm_graph.graph.first_values import first_values
 from ssm_graph.graph.gtsam_graph import chain_ordering, graph_without_beams
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.problem.problem import Problem, build_problem
+from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.simulation import Grade, OutlierKind, Outliers, scenario_config, simulate
-from ssm_graph.stepwise import Steps
 
 
 class PlainStart(Enum):

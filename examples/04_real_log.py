@@ -9,7 +9,7 @@ from pathlib import Path
 
 import ssm_graph as sg
 from ssm_graph.cli.run_mission import withhold_gnss
-from ssm_graph.io.blueye import convert_blueye
+from ssm_graph.io.blueye.convert import convert_blueye
 
 folder = Path(os.environ.get("SSM_GRAPH_DATA", "../shared/data"))
 log = folder / "blueye_x3" / "log_auto_square_2025-05-07_14_55_13.mcap"

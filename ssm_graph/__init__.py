@@ -13,23 +13,23 @@
 """
 
 from factors.similarity import ExpKernel, GaussianKernel, Kernel, LogKernel, SqrtKernel
-from ssm_graph.data import InitialState, Mission, Reference
-from ssm_graph.errors import (
+from ssm_graph.base.errors import (
     ConfigError,
     DataError,
     MissingExtraError,
     SolverError,
     SsmGraphError,
 )
-from ssm_graph.estimate import Estimate, Iteration, Status, Trajectory
 from ssm_graph.evaluation import Metrics, evaluate, reference_from_gnss
-from ssm_graph.filters.named import FILTERS, filter_problems
-from ssm_graph.io.mission import read_mission, write_mission
-from ssm_graph.io.results import read_results, write_results
-from ssm_graph.online import FixedLagSmoother
-from ssm_graph.problem.alignment import Alignment, align
-from ssm_graph.problem.problem import Problem, ProblemConfig, build_problem
-from ssm_graph.report.figure import save_figure
+from ssm_graph.filters.navigation.named import FILTERS, filter_problems
+from ssm_graph.io.mission_folder.reader import read_mission, write_mission
+from ssm_graph.io.results.tables import read_results, write_results
+from ssm_graph.live.estimator import FixedLagSmoother
+from ssm_graph.mission.estimate import Estimate, Iteration, Status, Trajectory
+from ssm_graph.mission.mission import InitialState, Mission, Reference
+from ssm_graph.mission.problem import Problem, ProblemConfig, build_problem
+from ssm_graph.mission.start.alignment import Alignment, align
+from ssm_graph.report.mission.figure import save_figure
 from ssm_graph.smoothers.batch import Similarity, SmootherConfig, SsmSmoother
 from ssm_graph.smoothers.beam_faults import FaultSearch
 from ssm_graph.smoothers.fixed_lag import FixedLagConfig, solve_fixed_lag

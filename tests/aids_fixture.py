@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from ssm_graph.aid_logs import HeadingErrors, Standstill
+from ssm_graph.sensors.compass import HeadingErrors
+from ssm_graph.sensors.standstill import Standstill
 from ssm_graph.simulation import (
     AidSettings,
     BeaconSettings,

@@ -6,17 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ssm_graph.data import (
-    DvlLog,
-    DvlMount,
-    ImuLog,
-    ImuNoise,
-    InitialState,
-    Mission,
-    Reference,
-)
-from ssm_graph.earth import LocalFrame
-from ssm_graph.estimate import (
+from ssm_graph.base.earth import LocalFrame
+from ssm_graph.mission.estimate import (
     BeamTable,
     CalibratedValue,
     Calibration,
@@ -26,6 +17,9 @@ from ssm_graph.estimate import (
     Status,
     Trajectory,
 )
+from ssm_graph.mission.mission import InitialState, Mission, Reference
+from ssm_graph.sensors.dvl import DvlLog, DvlMount
+from ssm_graph.sensors.imu import ImuLog, ImuNoise
 
 FRAME = LocalFrame(lat=np.deg2rad(63.44), lon=np.deg2rad(10.41), height=-20.0)
 EPOCH = 1746622514.25

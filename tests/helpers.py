@@ -11,13 +11,16 @@ from hypothesis import settings
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from ssm_graph.data import Array, Drift, ImuLog, InitialState, Mission
-from ssm_graph.errors import SolverError
-from ssm_graph.estimate import Status, Trajectory
-from ssm_graph.frames import R_lb_from_roll_pitch_heading
+from ssm_graph.base.errors import SolverError
+from ssm_graph.base.frames import R_lb_from_roll_pitch_heading
+from ssm_graph.base.frozen import Array
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.states import States, states_from_arrays
-from ssm_graph.problem.problem import Problem
+from ssm_graph.mission.estimate import Status, Trajectory
+from ssm_graph.mission.mission import InitialState, Mission
+from ssm_graph.mission.problem import Problem
+from ssm_graph.sensors.drift import Drift
+from ssm_graph.sensors.imu import ImuLog
 from ssm_graph.simulation import SimulatedMission, SimulationConfig, simulate
 from ssm_graph.smoothers.batch import SsmSmoother
 

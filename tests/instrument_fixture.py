@@ -9,9 +9,13 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from ssm_graph.live.nmea_fields import checksum
-from ssm_graph.live.sockets import SocketHub
-from ssm_graph.messages import DepthReading, Event, Fix, Message, Ping
+from ssm_graph.live.protocols.nmea_fields import checksum
+from ssm_graph.live.sockets.sockets import SocketHub
+from ssm_graph.mission.navigation import Event
+from ssm_graph.sensors.depth import DepthReading
+from ssm_graph.sensors.dvl import Ping
+from ssm_graph.sensors.gnss import Fix
+from ssm_graph.sensors.messages import Message
 
 DEADLINE_S = 5.0
 """So long a test waits for what should come at once."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ssm_graph.errors import ConfigError, DataError
+from ssm_graph.base.errors import ConfigError, DataError
 from tests.malformed_case import Malformed
 from tests.mission_damage import aided, cell, lines, toml
 

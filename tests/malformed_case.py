@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ssm_graph.errors import SsmGraphError
+from ssm_graph.base.errors import SsmGraphError
 from tests.mission_damage import Damage
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ssm_graph.data import Array
+from ssm_graph.base.frozen import Array
 from tests.mission_fixture import write_example
 
 Damage = Callable[[Path], None]

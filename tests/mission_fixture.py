@@ -7,23 +7,17 @@ from pathlib import Path
 
 import numpy as np
 
-from ssm_graph.data import (
-    Array,
-    DepthLog,
-    DvlLog,
-    DvlMount,
-    GnssLog,
-    ImuLog,
-    ImuNoise,
-    InitialState,
-    Mission,
-    Reference,
-)
-from ssm_graph.earth import EARTH_RATE, LocalFrame, normal_gravity
-from ssm_graph.frames import R_lb_from_roll_pitch_heading
-from ssm_graph.io.mission_units import MICRO_G, beams_from_angles
-from ssm_graph.io.mission_writer import mission_tables
-from ssm_graph.io.tables import write_table
+from ssm_graph.base.earth import EARTH_RATE, LocalFrame, normal_gravity
+from ssm_graph.base.frames import R_lb_from_roll_pitch_heading
+from ssm_graph.base.frozen import Array
+from ssm_graph.io.mission_folder.units import MICRO_G, beams_from_angles
+from ssm_graph.io.mission_folder.writer import mission_tables
+from ssm_graph.io.tables.table import write_table
+from ssm_graph.mission.mission import InitialState, Mission, Reference
+from ssm_graph.sensors.depth import DepthLog
+from ssm_graph.sensors.dvl import DvlLog, DvlMount
+from ssm_graph.sensors.gnss import GnssLog
+from ssm_graph.sensors.imu import ImuLog, ImuNoise
 
 LAT, LON, HEIGHT = np.radians(45.7), np.radians(126.6), -20.0
 HEADING = np.radians(63.4)

@@ -8,12 +8,14 @@ from functools import cache
 
 import numpy as np
 
-from ssm_graph.data import Array
-from ssm_graph.io.replay import messages_of
-from ssm_graph.io.vehicle import vehicle_of
-from ssm_graph.messages import Message, Navigation, Vehicle
-from ssm_graph.online import ONLINE, FixedLagSmoother
-from ssm_graph.online.delayed import Delayed
+from ssm_graph.base.frozen import Array
+from ssm_graph.io.mission_folder.vehicle import vehicle_of
+from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.live.estimator import ONLINE, FixedLagSmoother
+from ssm_graph.live.estimator.delayed import Delayed
+from ssm_graph.mission.navigation import Navigation
+from ssm_graph.mission.vehicle import Vehicle
+from ssm_graph.sensors.messages import Message
 from ssm_graph.simulation import (
     DvlSettings,
     GnssSettings,

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ssm_graph.data import Array
-from ssm_graph.estimate import Estimate
+from ssm_graph.base.frozen import Array
+from ssm_graph.mission.estimate import Estimate
 from ssm_graph.simulation import CurrentSettings, Grade, Loss, SimulatedMission, WaterTrack
 from tests.helpers import simulated
 

@@ -7,8 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.calibration_cases import MOUNTING, SCALE, as_stated
-from ssm_graph.data import DepthCalibration, Drift, GnssCalibration, Mission
-from ssm_graph.estimate import Calibration, Estimate
+from ssm_graph.mission.estimate import Calibration, Estimate
+from ssm_graph.mission.mission import Mission
+from ssm_graph.sensors.depth import DepthCalibration
+from ssm_graph.sensors.drift import Drift
+from ssm_graph.sensors.gnss import GnssCalibration
 from ssm_graph.simulation import (
     DepthProfile,
     DepthSettings,

@@ -21,11 +21,17 @@ from typing import Any, Final, NamedTuple, Protocol
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ssm_graph.data import Array
-from ssm_graph.earth import LocalFrame
-from ssm_graph.errors import ConfigError, DataError, SsmGraphError
-from ssm_graph.frames import R_FRD, BodyAxes, R_lb_from_roll_pitch_heading, phi_D_roll_pitch_heading
-from ssm_graph.io.ros_messages import (
+from ssm_graph.base.earth import LocalFrame
+from ssm_graph.base.errors import ConfigError, DataError, SsmGraphError
+from ssm_graph.base.frames import (
+    R_FRD,
+    BodyAxes,
+    R_lb_from_roll_pitch_heading,
+    phi_D_roll_pitch_heading,
+)
+from ssm_graph.base.frozen import Array
+from ssm_graph.io.mission_folder.vehicle import read_vehicle
+from ssm_graph.io.ros.messages import (
     CONVERTERS,
     FIX_TYPE,
     IMU_TYPE,
@@ -37,8 +43,8 @@ from ssm_graph.io.ros_messages import (
     BeamSign,
     RosOptions,
 )
-from ssm_graph.io.vehicle import read_vehicle
-from ssm_graph.messages import Event, Health, Message, Navigation, Severity
+from ssm_graph.mission.navigation import Event, Health, Navigation, Severity
+from ssm_graph.sensors.messages import Message
 
 ODOMETRY_TYPE: Final = "nav_msgs/msg/Odometry"
 DVL_TYPES: Final = (MARINE_DVL_TYPE, WATER_LINKED_TYPE)
@@ -68,7 +74,7 @@ PARAMETERS: Final[Mapping[str, str | float | bool]] = {
 
 
 class Estimator(Protocol):
-    """What the node needs of ``ssm_graph.online.FixedLagSmoother``."""
+    """What the node needs of ``ssm_graph.live.estimator.FixedLagSmoother``."""
 
     def push(self, message: Message) -> None:
         """Take one message; bad ones become events."""
@@ -246,7 +252,7 @@ def main() -> int:
             for name, default in PARAMETERS.items()
         }
         vehicle = read_vehicle(Path(parameters["vehicle"]))
-        estimator = import_module("ssm_graph.online").FixedLagSmoother(vehicle)
+        estimator = import_module("ssm_graph.live.estimator").FixedLagSmoother(vehicle)
         quality = qos.QoSProfile(depth=QUEUE, reliability=qos.ReliabilityPolicy.BEST_EFFORT)
         Bridge(
             node,

@@ -16,22 +16,16 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 
+from ssm_graph.base.errors import ConfigError
 from ssm_graph.cli.options import add_command, method_lines, table_format_option
-from ssm_graph.errors import ConfigError
 from ssm_graph.evaluation.comparison import compare_methods
-from ssm_graph.io.mission import TableFormat
-from ssm_graph.report.compare_tables import latex, markdown
+from ssm_graph.io.mission_folder.reader import TableFormat
+from ssm_graph.report.comparison.tables import latex, markdown
 from ssm_graph.study.cluster import DaskCluster
 from ssm_graph.study.jobs import Execute
 from ssm_graph.study.methods import FAMILIES
 from ssm_graph.study.processes import JobProcesses
-from ssm_graph.study.runner import (
-    Progress,
-    StudyResult,
-    example_estimates,
-    open_store,
-    run_study,
-)
+from ssm_graph.study.runner import Progress, StudyResult, example_estimates, open_store, run_study
 from ssm_graph.study.scenario import Study, read_study, study_of_folders
 from ssm_graph.study.table import parquet_module, write_rows
 
@@ -198,7 +192,7 @@ def write_study(
 
 
 def _write_figures(folder: Path, study: Study, result: StudyResult, errors: Console) -> None:
-    from ssm_graph.report.compare_figures import save_figures
+    from ssm_graph.report.comparison.figures import save_figures
 
     errors.print("drawing figures; the example mission is run once more")
     save_figures(folder, result.rows, result.series, example_estimates(study))

@@ -9,16 +9,16 @@ from typing import Any
 
 from rich.console import Console
 
+from ssm_graph.base.errors import ConfigError
+from ssm_graph.base.frames import BodyAxes
 from ssm_graph.cli.options import add_command, add_mission_output
-from ssm_graph.data import Mission
-from ssm_graph.errors import ConfigError
-from ssm_graph.frames import BodyAxes
-from ssm_graph.io.blueye import convert_blueye
-from ssm_graph.io.mission import write_mission
-from ssm_graph.io.ros_messages import SEA_WATER, STANDARD_ATMOSPHERE, BeamSign, RosOptions
-from ssm_graph.io.rosbag import convert_rosbag
-from ssm_graph.io.rosbag_log import ROLES, is_rosbag
-from ssm_graph.io.vehicle import read_vehicle
+from ssm_graph.io.blueye.convert import convert_blueye
+from ssm_graph.io.mission_folder.reader import write_mission
+from ssm_graph.io.mission_folder.vehicle import read_vehicle
+from ssm_graph.io.ros.convert import convert_rosbag
+from ssm_graph.io.ros.log import ROLES, is_rosbag
+from ssm_graph.io.ros.messages import SEA_WATER, STANDARD_ATMOSPHERE, BeamSign, RosOptions
+from ssm_graph.mission.mission import Mission
 
 DESCRIPTION = f"""\
 Convert a log. LOG is one of

@@ -8,13 +8,13 @@ from typing import Any, Final
 
 from rich.console import Console
 
+from ssm_graph.base.errors import ConfigError, nearest_hint
 from ssm_graph.cli.options import add_command, method_lines
 from ssm_graph.cli.run_mission import add_mission_arguments, run_mission
-from ssm_graph.data import Mission
-from ssm_graph.errors import ConfigError, nearest_hint
-from ssm_graph.estimate import Estimate
-from ssm_graph.problem.problem import ProblemConfig, build_problem
-from ssm_graph.report.progress import ProgressDisplay
+from ssm_graph.mission.estimate import Estimate
+from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.problem import ProblemConfig, build_problem
+from ssm_graph.report.terminal.progress import ProgressDisplay
 from ssm_graph.study.methods import FAMILIES, Method, parse_method, parse_methods
 from ssm_graph.study.trials import Trial, with_initial
 

@@ -11,15 +11,15 @@ from importlib.metadata import version
 from rich.console import Console
 from rich.markup import escape
 
-from ssm_graph.cli import compare, convert, online, simulate, smooth
-from ssm_graph.cli import filter as filter_command
-from ssm_graph.errors import (
+from ssm_graph.base.errors import (
     ConfigError,
     DataError,
     MissingExtraError,
     SolverError,
     SsmGraphError,
 )
+from ssm_graph.cli import compare, convert, online, simulate, smooth
+from ssm_graph.cli import filter as filter_command
 
 
 class ExitCode(IntEnum):

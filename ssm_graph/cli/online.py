@@ -14,6 +14,8 @@ from typing import Any
 from rich.console import Console
 
 from factors.kernels import KERNELS
+from ssm_graph.base.errors import ConfigError, SolverError
+from ssm_graph.base.frozen import Array
 from ssm_graph.cli.online_arguments import (
     DESCRIPTION,
     add_connections,
@@ -24,23 +26,23 @@ from ssm_graph.cli.online_arguments import (
     replay_speed,
 )
 from ssm_graph.cli.options import add_command, kernel_from
-from ssm_graph.data import Array, Mission
-from ssm_graph.errors import ConfigError, SolverError
-from ssm_graph.io.mission import read_mission
-from ssm_graph.io.replay import messages_of
-from ssm_graph.io.vehicle import read_vehicle, vehicle_of
-from ssm_graph.live.interfaces import Connections, Engine
-from ssm_graph.live.publisher import Publisher
-from ssm_graph.live.replay_source import ReplaySource
-from ssm_graph.live.run_folder import RunFolder
-from ssm_graph.live.run_summary import RunEnd, StopReason
-from ssm_graph.live.runner import Runner, RunnerConfig
-from ssm_graph.live.sockets import InputConfig, OutputConfig, SocketHub
-from ssm_graph.live.status import RunStatus
-from ssm_graph.messages import Health, Vehicle
-from ssm_graph.online import ONLINE, FixedLagSmoother
-from ssm_graph.report.status_page import SourceRow, StatusPage, StatusView
-from ssm_graph.report.summary import calibration_table
+from ssm_graph.io.mission_folder.reader import read_mission
+from ssm_graph.io.mission_folder.vehicle import read_vehicle, vehicle_of
+from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.live.estimator import ONLINE, FixedLagSmoother
+from ssm_graph.live.run.interfaces import Connections, Engine
+from ssm_graph.live.run.replay_source import ReplaySource
+from ssm_graph.live.run.run_folder import RunFolder
+from ssm_graph.live.run.run_summary import RunEnd, StopReason
+from ssm_graph.live.run.runner import Runner, RunnerConfig
+from ssm_graph.live.run.status import RunStatus
+from ssm_graph.live.sockets.publisher import Publisher
+from ssm_graph.live.sockets.sockets import InputConfig, OutputConfig, SocketHub
+from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.navigation import Health
+from ssm_graph.mission.vehicle import Vehicle
+from ssm_graph.report.mission.summary import calibration_table
+from ssm_graph.report.terminal.status_page import SourceRow, StatusPage, StatusView
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
 
 

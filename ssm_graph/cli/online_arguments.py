@@ -9,17 +9,17 @@ from pathlib import Path
 from typing import Final
 
 from factors.kernels import KERNELS
-from ssm_graph.errors import ConfigError
-from ssm_graph.frames import BodyAxes
-from ssm_graph.live.decoder import Clock
-from ssm_graph.live.endpoints import OUTPUTS, parse_endpoint
-from ssm_graph.live.feed import CountingDecoder, Limits
-from ssm_graph.live.json_messages import JsonDecoder
-from ssm_graph.live.nmea import NmeaDecoder, NmeaOptions
-from ssm_graph.live.outputs import OutputFormat
-from ssm_graph.live.sockets import InputConfig, OutputConfig
-from ssm_graph.live.waterlinked import WaterLinkedDecoder
-from ssm_graph.online import ONLINE
+from ssm_graph.base.errors import ConfigError
+from ssm_graph.base.frames import BodyAxes
+from ssm_graph.live.estimator import ONLINE
+from ssm_graph.live.protocols.decoder import Clock
+from ssm_graph.live.protocols.json_messages import JsonDecoder
+from ssm_graph.live.protocols.nmea import NmeaDecoder, NmeaOptions
+from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
+from ssm_graph.live.run.feed import CountingDecoder, Limits
+from ssm_graph.live.sockets.endpoints import OUTPUTS, parse_endpoint
+from ssm_graph.live.sockets.outputs import OutputFormat
+from ssm_graph.live.sockets.sockets import InputConfig, OutputConfig
 
 DESCRIPTION: Final = """\
 Navigate live: messages of the instruments in, position, velocity and attitude with their sigmas

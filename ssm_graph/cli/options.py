@@ -9,8 +9,8 @@ from typing import Any
 
 from factors.kernels import KernelChoice
 from factors.similarity import Kernel
-from ssm_graph.errors import ConfigError
-from ssm_graph.io.mission import TableFormat
+from ssm_graph.base.errors import ConfigError
+from ssm_graph.io.mission_folder.reader import TableFormat
 from ssm_graph.study.methods import Family
 
 

@@ -11,18 +11,19 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from ssm_graph.data import GnssLog, Mission, Reference
-from ssm_graph.errors import ConfigError, DataError
-from ssm_graph.estimate import Estimate
+from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.evaluation import Metrics, evaluate, reference_from_gnss
-from ssm_graph.io.calibration_toml import CALIBRATION_NAME
-from ssm_graph.io.mission import read_mission
-from ssm_graph.io.mission_toml import read_mission_toml
-from ssm_graph.io.results import write_results
-from ssm_graph.problem.problem import ProblemConfig
-from ssm_graph.report.figure import save_figure
-from ssm_graph.report.progress import ProgressDisplay
-from ssm_graph.report.summary import summary_table
+from ssm_graph.io.mission_folder.calibration_toml import CALIBRATION_NAME
+from ssm_graph.io.mission_folder.reader import read_mission
+from ssm_graph.io.mission_folder.toml import read_mission_toml
+from ssm_graph.io.results.tables import write_results
+from ssm_graph.mission.estimate import Estimate
+from ssm_graph.mission.mission import Mission, Reference
+from ssm_graph.mission.problem import ProblemConfig
+from ssm_graph.report.mission.figure import save_figure
+from ssm_graph.report.mission.summary import summary_table
+from ssm_graph.report.terminal.progress import ProgressDisplay
+from ssm_graph.sensors.gnss import GnssLog
 
 Solve = Callable[[Mission, ProblemConfig, ProgressDisplay], Estimate]
 """Estimates a mission and tells the display how far it is."""

@@ -8,15 +8,8 @@ from typing import Any
 from rich.console import Console
 
 from ssm_graph.cli.options import add_command, add_mission_output
-from ssm_graph.io.mission import write_mission
-from ssm_graph.simulation import (
-    SCENARIOS,
-    Grade,
-    OutlierKind,
-    Outliers,
-    scenario_config,
-    simulate,
-)
+from ssm_graph.io.mission_folder.reader import write_mission
+from ssm_graph.simulation import SCENARIOS, Grade, OutlierKind, Outliers, scenario_config, simulate
 
 
 def add_parser(commands: Any, *, epilog: str) -> None:

@@ -10,16 +10,16 @@ from rich.console import Console
 from factors.kernels import KERNELS, KernelChoice
 from factors.m_estimators import TruncatedKernel
 from factors.similarity import Similarity
+from ssm_graph.base.errors import ConfigError
 from ssm_graph.cli.options import add_command, kernel_from
 from ssm_graph.cli.run_mission import add_mission_arguments, run_mission
-from ssm_graph.data import Mission
-from ssm_graph.errors import ConfigError
-from ssm_graph.estimate import Estimate
-from ssm_graph.problem.problem import ProblemConfig
-from ssm_graph.report.progress import ProgressDisplay
+from ssm_graph.engine.gnc import GncStart, Graduation
+from ssm_graph.mission.estimate import Estimate
+from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.problem import ProblemConfig
+from ssm_graph.report.terminal.progress import ProgressDisplay
 from ssm_graph.smoothers.batch import SmootherConfig
 from ssm_graph.smoothers.beam_faults import FaultSearch
-from ssm_graph.smoothers.gnc import GncStart, Graduation
 from ssm_graph.smoothers.mission import smooth
 
 GNC = "gnc-tls"

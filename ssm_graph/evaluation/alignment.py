@@ -8,8 +8,8 @@ from typing import Final
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from ssm_graph.data import Array
-from ssm_graph.errors import DataError
+from ssm_graph.base.errors import DataError
+from ssm_graph.base.frozen import Array
 
 MIN_GAP_S: Final = 2.0
 GAP_STEPS: Final = 5.0

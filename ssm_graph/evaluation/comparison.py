@@ -15,8 +15,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from ssm_graph.data import Array
-from ssm_graph.errors import DataError
+from ssm_graph.base.errors import DataError
+from ssm_graph.base.frozen import Array
 from ssm_graph.evaluation.statistics import (
     NOT_PAIRED,
     NOTHING,

@@ -8,12 +8,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ssm_graph.data import Array, FrozenArrays, Reference, shaped
-from ssm_graph.earth import LocalFrame
-from ssm_graph.errors import DataError
-from ssm_graph.estimate import Trajectory
+from ssm_graph.base.earth import LocalFrame
+from ssm_graph.base.errors import DataError
+from ssm_graph.base.frames import wrap_to_pi
+from ssm_graph.base.frozen import Array, FrozenArrays, shaped
 from ssm_graph.evaluation.alignment import interpolate_within
-from ssm_graph.frames import wrap_to_pi
+from ssm_graph.mission.estimate import Trajectory
+from ssm_graph.mission.mission import Reference
 
 NO_REFERENCE: Final = 10.0
 """m; along an axis where its own sigma is larger a reference tells nothing, as the height of fixes

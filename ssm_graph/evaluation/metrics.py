@@ -6,9 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ssm_graph.data import Array, Reference
-from ssm_graph.estimate import Trajectory, path_length_m
+from ssm_graph.base.frozen import Array
 from ssm_graph.evaluation.errors import ErrorSeries, error_series
+from ssm_graph.mission.estimate import Trajectory, path_length_m
+from ssm_graph.mission.mission import Reference
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from scipy.stats import chi2, wilcoxon
 from scipy.stats import t as student_t
 
-from ssm_graph.errors import DataError
+from ssm_graph.base.errors import DataError
 
 SIGNIFICANT_P: Final = 0.05
 """Chance of a false alarm that is accepted."""

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from ssm_graph.data import GnssLog, Reference
-from ssm_graph.earth import LocalFrame
-from ssm_graph.estimate import Trajectory
+from ssm_graph.base.earth import LocalFrame
+from ssm_graph.base.frames import R_lb_from_roll_pitch_heading
 from ssm_graph.evaluation.alignment import interpolate_within
-from ssm_graph.frames import R_lb_from_roll_pitch_heading
+from ssm_graph.mission.estimate import Trajectory
+from ssm_graph.mission.mission import Reference
+from ssm_graph.sensors.gnss import GnssLog
 
 
 def reference_from_gnss(gnss: GnssLog, trajectory: Trajectory) -> Reference:

@@ -1,6 +1,6 @@
 """Rows of beams that depend on more than their keyframe's error state.
 
-Each row is as wide as the problem's extra variables ask for, see :mod:`ssm_graph.problem.extras`.
+Each row is as wide as the problem's extra variables ask for, see :mod:`ssm_graph.engine.extras`.
 Columns of variables that there are not are left out, and the values of those are zero.
 """
 
@@ -22,12 +22,14 @@ from factors.dvl_calibration import (
     turned_instrument,
 )
 from factors.water_track import ThroughWater
-from ssm_graph.data import N_BEAMS, Array
-from ssm_graph.earth import LocalFrame
+from ssm_graph.base.earth import LocalFrame
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import ACCEL_BIAS, GYRO_BIAS, ROTATION, STATE_DIM, VELOCITY
+from ssm_graph.engine.extras import Extras
 from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.states import States
 from ssm_graph.graph.water_rows import WaterRows
-from ssm_graph.problem.calibration import (
+from ssm_graph.mission.calibration import (
     DVL_BEAM_SCALE,
     DVL_DRIFT,
     DVL_LEVER_ARM,
@@ -35,15 +37,8 @@ from ssm_graph.problem.calibration import (
     DVL_SCALE,
     DVL_TIME_OFFSET,
 )
-from ssm_graph.problem.error_state import (
-    ACCEL_BIAS,
-    GYRO_BIAS,
-    ROTATION,
-    STATE_DIM,
-    VELOCITY,
-)
-from ssm_graph.problem.extras import Extras
-from ssm_graph.problem.problem import Beams
+from ssm_graph.mission.problem import Beams
+from ssm_graph.sensors.dvl import N_BEAMS
 
 LEAST_SHARE = 0.5
 """With less motion than noise in what the IMU reads, clock and lever arm cannot be seen."""

@@ -17,13 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.similarity import LogKernel
-from ssm_graph.data import Array
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import STATE_DIM
+from ssm_graph.engine.extras import Extras
 from ssm_graph.graph.aids.acoustic import RangeAid
 from ssm_graph.graph.aids.weighted import WeightedAids
 from ssm_graph.graph.states import States
-from ssm_graph.problem.aid_errors import beacon_name
-from ssm_graph.problem.error_state import STATE_DIM
-from ssm_graph.problem.extras import Extras
+from ssm_graph.mission.aid_errors import beacon_name
 
 STARTS = (-1.0, 0.0, 1.0)
 """Prior sigmas east, north and up of the stated place at which searches start."""

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from factors.dvl_beam import BeamResidual, beam_residual
-from ssm_graph.data import Array
-from ssm_graph.problem.error_state import GYRO_BIAS, ROTATION, STATE_DIM, VELOCITY
-from ssm_graph.problem.problem import Beams
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import GYRO_BIAS, ROTATION, STATE_DIM, VELOCITY
+from ssm_graph.mission.problem import Beams
 
 
 class BeamRows(NamedTuple):

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from factors.similarity import WEIGHT_FLOOR, Kernel, expected_mahalanobis_sq
-from ssm_graph.data import Array
-from ssm_graph.problem.doubts import LOW_WEIGHT, TRUSTED
-from ssm_graph.problem.timeline import Indices
+from ssm_graph.base.frozen import Array
+from ssm_graph.mission.doubts import LOW_WEIGHT, TRUSTED
+from ssm_graph.mission.timeline import Indices
 
 GATE = 5.0
 """Beams further than this many innovation sigmas from the prediction start without weight."""

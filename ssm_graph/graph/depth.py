@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ssm_graph.data import Array
-from ssm_graph.earth import LocalFrame
+from ssm_graph.base.earth import LocalFrame
+from ssm_graph.base.frozen import Array
 from ssm_graph.graph.states import States
-from ssm_graph.problem.aids import Depths
-from ssm_graph.problem.heights import height_track, mean_rises
+from ssm_graph.mission.aids import Depths
+from ssm_graph.mission.heights import height_track, mean_rises
 
 
 class DepthTargets(NamedTuple):

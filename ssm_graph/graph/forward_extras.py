@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from ssm_graph.data import Array
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.graph.aids.positions import fix_rows
 from ssm_graph.graph.augmented_rows import AugmentedBeams, PreparedBeams, RowStates
 from ssm_graph.graph.beam_rows import BeamRows
-from ssm_graph.problem.calibration import DEPTH_OFFSET
-from ssm_graph.problem.current import CURRENTS
-from ssm_graph.problem.error_state import STATE_DIM
-from ssm_graph.problem.problem import Problem
+from ssm_graph.mission.calibration import DEPTH_OFFSET
+from ssm_graph.mission.current import CURRENTS
+from ssm_graph.mission.problem import Problem
 
 REACH_S = 2e-2
 REACH_TURN = 2e-2
@@ -55,10 +55,10 @@ class ForwardExtras:
                 covariance[:, own] = 0.0
                 covariance[own, own] = variance * np.eye(own.stop - own.start)
 
-    def correct(self, step: Array) -> None:
-        """Take the part of a step that is behind the error state."""
-        self.walks = self.walks + step[: len(self.walks)]
-        self.constants = self.constants + step[len(self.walks) :]
+    def moved(self, step: Array) -> tuple[Array, Array]:
+        """Return walks and constants after the part of a step that is behind the error state."""
+        n_walks = len(self.walks)
+        return self.walks + step[:n_walks], self.constants + step[n_walks:]
 
     def beam_rows(
         self, rows: slice, state: tuple[Array, Array, Array, Array], g_n: Array

@@ -11,15 +11,15 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from factors.dvl_beam import dvl_beam_factor
-from ssm_graph.data import Array
-from ssm_graph.errors import ConfigError
+from ssm_graph.base.errors import ConfigError
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import POSITION, ROTATION, VELOCITY
 from ssm_graph.graph.depth import depth_targets
 from ssm_graph.graph.gtsam_aids import aid_graph
 from ssm_graph.graph.inertial_rows import inertial_graph
 from ssm_graph.graph.states import States
-from ssm_graph.problem.aids import Depths, Fixes
-from ssm_graph.problem.error_state import POSITION, ROTATION, VELOCITY
-from ssm_graph.problem.problem import Problem, start_of
+from ssm_graph.mission.aids import Depths, Fixes
+from ssm_graph.mission.problem import Problem, start_of
 
 
 def gtsam_graph(

@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ssm_graph.data import Array
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.graph.linearize import Step
-from ssm_graph.problem.error_state import STATE_DIM
 
 
 class InertialFit(NamedTuple):

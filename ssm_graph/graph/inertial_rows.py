@@ -11,11 +11,11 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
-from ssm_graph.data import Array
+from ssm_graph.base.frozen import Array
+from ssm_graph.base.stepwise import Steps
+from ssm_graph.engine.error_state import POSITION, STATE_DIM, VELOCITY
 from ssm_graph.graph.states import States
-from ssm_graph.problem.error_state import POSITION, STATE_DIM, VELOCITY
-from ssm_graph.problem.problem import Problem
-from ssm_graph.stepwise import Steps
+from ssm_graph.mission.problem import Problem
 
 PAIR_COLUMNS = np.r_[0:9, 18:24, 9:18, 24:30, 30]
 """Columns of GTSAM's factor, x_i v_i x_j v_j b_i b_j and b, as two error states and b."""

@@ -12,19 +12,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ssm_graph.data import Array
+from ssm_graph.base.frozen import Array
+from ssm_graph.base.stepwise import Steps, finished
+from ssm_graph.engine.bordered import BorderedSolution, ChainRows, solve_bordered_steps
+from ssm_graph.engine.error_state import STATE_DIM
+from ssm_graph.engine.marginal_prior import prior_at_start
 from ssm_graph.graph.aids.of_problem import full_aids, weighted_aids
 from ssm_graph.graph.augmented_rows import AugmentedBeams, RowStates, states_of
 from ssm_graph.graph.beam_rows import BeamRows
-from ssm_graph.graph.bordered import BorderedSolution, ChainRows, solve_bordered_steps
 from ssm_graph.graph.inertial_rows import inertial_graph, inertial_rows_steps
-from ssm_graph.graph.marginal_prior import prior_at_start
 from ssm_graph.graph.states import States, retract
 from ssm_graph.imu.preintegration import gravity_gradient
-from ssm_graph.problem.calibration import needs_motion
-from ssm_graph.problem.error_state import STATE_DIM
-from ssm_graph.problem.problem import Problem, start_of
-from ssm_graph.stepwise import Steps, finished
+from ssm_graph.mission.calibration import needs_motion
+from ssm_graph.mission.problem import Problem, start_of
 
 JUDGED_PASSES = 2
 """The first pass is at the states of the forward pass, the second at smoothed ones."""

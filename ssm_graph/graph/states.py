@@ -8,8 +8,8 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
-from ssm_graph.data import Array
-from ssm_graph.problem.error_state import STATE_DIM
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import STATE_DIM
 
 _NO_CONSTANTS = np.zeros(0)
 _NO_CONSTANTS.setflags(write=False)

@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.water_track import ThroughWater, through_water
-from ssm_graph.data import Array
-from ssm_graph.earth import LocalFrame
-from ssm_graph.problem.current import CURRENT, CURRENT_UP
-from ssm_graph.problem.extras import Extras
-from ssm_graph.problem.problem import Beams
+from ssm_graph.base.earth import LocalFrame
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.extras import Extras
+from ssm_graph.mission.current import CURRENT, CURRENT_UP
+from ssm_graph.mission.problem import Beams
 
 
 class WaterRows:

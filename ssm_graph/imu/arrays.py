@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
-from ssm_graph.data import Array
+from ssm_graph.base.frozen import Array
 from ssm_graph.imu.preintegration import InertialChain, Preintegrated
 
 

@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ssm_graph.data import Array, ImuLog
-from ssm_graph.errors import ConfigError, DataError
-from ssm_graph.stepwise import Steps, finished
+from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.base.frozen import Array
+from ssm_graph.base.stepwise import Steps, finished
+from ssm_graph.sensors.imu import ImuLog
 
 
 class MergedSamples(NamedTuple):

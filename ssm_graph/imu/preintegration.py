@@ -10,10 +10,11 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
-from ssm_graph.data import Array, ImuLog, ImuNoise
-from ssm_graph.earth import LocalFrame
+from ssm_graph.base.earth import LocalFrame
+from ssm_graph.base.frozen import Array
+from ssm_graph.base.stepwise import Steps, finished
 from ssm_graph.imu.increments import MergedSamples, merge_samples_steps
-from ssm_graph.stepwise import Steps, finished
+from ssm_graph.sensors.imu import ImuLog, ImuNoise
 
 INTEGRATION_DENSITY = 1e-4
 """m/sqrt(s): what the integration itself loses. At 20 Hz a constant force within each sample costs

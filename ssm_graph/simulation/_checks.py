@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from ssm_graph.errors import ConfigError
+from ssm_graph.base.errors import ConfigError
 
 
 def require(condition: bool, where: str, *, expected: str, got: object, hint: str) -> None:

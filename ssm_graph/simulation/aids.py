@@ -7,8 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ssm_graph.data import Array, DepthLog, GnssLog
-from ssm_graph.earth import R_el_from_lat_lon, geodetic_from_ecef
+from ssm_graph.base.earth import R_el_from_lat_lon, geodetic_from_ecef
+from ssm_graph.base.frozen import Array
+from ssm_graph.sensors.depth import DepthLog
+from ssm_graph.sensors.gnss import GnssLog
 from ssm_graph.simulation._checks import require, require_positive, require_window
 from ssm_graph.simulation.drifts import DriftSettings, draw_drift
 from ssm_graph.simulation.trajectory import Trajectory, stacked

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ssm_graph.data import ImuNoise
+from ssm_graph.sensors.imu import ImuNoise
 from ssm_graph.simulation._checks import require, require_fraction, require_positive
 from ssm_graph.simulation.aids import DepthSettings, GnssSettings
 from ssm_graph.simulation.currents import CurrentSettings, WaterTrack

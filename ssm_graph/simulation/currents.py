@@ -8,7 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ssm_graph.data import N_BEAMS, Array
+from ssm_graph.base.frozen import Array
+from ssm_graph.sensors.current import CurrentModel
+from ssm_graph.sensors.dvl import N_BEAMS
 from ssm_graph.simulation._checks import (
     require,
     require_beams,
@@ -16,7 +18,6 @@ from ssm_graph.simulation._checks import (
     require_positive,
 )
 from ssm_graph.simulation.drifts import gauss_markov
-from ssm_graph.water_current import CurrentModel
 
 _STEP_S = 1.0
 """The random part is drawn so often, and linear between."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ssm_graph.data import Array
+from ssm_graph.base.frozen import Array
 from ssm_graph.simulation._checks import require_not_negative, require_positive
 
 

@@ -9,8 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ssm_graph.data import N_BEAMS, Array, DvlMount
-from ssm_graph.earth import R_el_from_lat_lon, geodetic_from_ecef
+from ssm_graph.base.earth import R_el_from_lat_lon, geodetic_from_ecef
+from ssm_graph.base.frozen import Array
+from ssm_graph.sensors.dvl import N_BEAMS, DvlMount
 from ssm_graph.simulation._checks import require, require_not_negative, require_positive
 from ssm_graph.simulation.drifts import DriftSettings
 from ssm_graph.simulation.taylor import Series

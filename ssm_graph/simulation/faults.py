@@ -16,13 +16,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ssm_graph.data import N_BEAMS, Array
-from ssm_graph.simulation._checks import (
-    require,
-    require_beams,
-    require_fraction,
-    require_window,
-)
+from ssm_graph.base.frozen import Array
+from ssm_graph.sensors.dvl import N_BEAMS
+from ssm_graph.simulation._checks import require, require_beams, require_fraction, require_window
 
 Mask = NDArray[np.bool_]
 

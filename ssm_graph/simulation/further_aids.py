@@ -13,22 +13,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ssm_graph.aid_logs import (
-    AidLogs,
-    Beacon,
-    HeadingErrors,
-    HeadingLog,
-    RangeLog,
-    Standstill,
-    UsblLog,
-)
-from ssm_graph.data import Array
-from ssm_graph.earth import (
+from ssm_graph.base.earth import (
     LocalFrame,
     R_el_from_lat_lon,
     ecef_from_geodetic,
     geodetic_from_ecef,
 )
+from ssm_graph.base.frozen import Array
+from ssm_graph.mission.mission import AidLogs
+from ssm_graph.sensors.acoustic import Beacon, RangeLog, UsblLog
+from ssm_graph.sensors.compass import HeadingErrors, HeadingLog
+from ssm_graph.sensors.standstill import Standstill
 from ssm_graph.simulation._checks import require, require_fraction, require_positive
 from ssm_graph.simulation.aids import Point, regular_times, require_point
 from ssm_graph.simulation.drifts import gauss_markov

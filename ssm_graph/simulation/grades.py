@@ -11,8 +11,9 @@ from typing import Final
 
 import numpy as np
 
-from ssm_graph.data import ImuNoise, InitialState, Reference
-from ssm_graph.earth import R_el_from_lat_lon, ecef_from_geodetic, geodetic_from_ecef
+from ssm_graph.base.earth import R_el_from_lat_lon, ecef_from_geodetic, geodetic_from_ecef
+from ssm_graph.mission.mission import InitialState, Reference
+from ssm_graph.sensors.imu import ImuNoise
 
 _MICRO_G = 9.80665e-6
 _PER_HOUR = 1.0 / 3600.0

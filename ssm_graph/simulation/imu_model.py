@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.polynomial.legendre import leggauss
 
-from ssm_graph.data import Array, ImuNoise
+from ssm_graph.base.frozen import Array
+from ssm_graph.sensors.imu import ImuNoise
 from ssm_graph.simulation.streams import Streams
 from ssm_graph.simulation.trajectory import Trajectory
 

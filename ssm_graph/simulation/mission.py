@@ -10,8 +10,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ssm_graph.data import N_BEAMS, Array, DepthLog, DvlLog, GnssLog, ImuLog, Mission, Reference
-from ssm_graph.earth import LocalFrame
+from ssm_graph.base.earth import LocalFrame
+from ssm_graph.base.frozen import Array
+from ssm_graph.mission.mission import Mission, Reference
+from ssm_graph.sensors.depth import DepthLog
+from ssm_graph.sensors.dvl import N_BEAMS, DvlLog
+from ssm_graph.sensors.gnss import GnssLog
+from ssm_graph.sensors.imu import ImuLog
 from ssm_graph.simulation.aids import depth_log, gnss_log
 from ssm_graph.simulation.config import SimulationConfig
 from ssm_graph.simulation.currents import Current

@@ -8,7 +8,8 @@ from enum import Enum
 
 import numpy as np
 
-from ssm_graph.data import N_BEAMS, Array
+from ssm_graph.base.frozen import Array
+from ssm_graph.sensors.dvl import N_BEAMS
 from ssm_graph.simulation._checks import require, require_beams, require_window
 from ssm_graph.simulation.faults import BeamFaults
 

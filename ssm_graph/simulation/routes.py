@@ -16,15 +16,7 @@ import numpy as np
 from scipy.special import ellipkinc
 
 from ssm_graph.simulation._checks import require, require_not_negative, require_positive
-from ssm_graph.simulation.taylor import (
-    Series,
-    antiderivative,
-    constant,
-    log,
-    sin_cos,
-    sqrt,
-    tanh,
-)
+from ssm_graph.simulation.taylor import Series, antiderivative, constant, log, sin_cos, sqrt, tanh
 
 Position = tuple[Series, Series, Series]
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, Final
 
-from ssm_graph.aid_logs import HeadingErrors
-from ssm_graph.errors import ConfigError, nearest_hint
+from ssm_graph.base.errors import ConfigError, nearest_hint
+from ssm_graph.sensors.compass import HeadingErrors
 from ssm_graph.simulation.aids import GnssSettings
 from ssm_graph.simulation.config import SimulationConfig
 from ssm_graph.simulation.currents import CurrentSettings, WaterTrack

@@ -16,14 +16,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from ssm_graph.data import Array, Reference
-from ssm_graph.earth import (
+from ssm_graph.base.earth import (
     EARTH_RATE,
     ECCENTRICITY_SQ,
     SEMI_MAJOR_AXIS,
     normal_gravity,
     radii_of_curvature,
 )
+from ssm_graph.base.frozen import Array
+from ssm_graph.mission.mission import Reference
 from ssm_graph.simulation._checks import require, require_positive
 from ssm_graph.simulation.routes import Route
 from ssm_graph.simulation.taylor import Series, atan2, sin_cos, sqrt, time_series

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from factors.similarity import Kernel, Similarity
-from ssm_graph.data import Array
-from ssm_graph.estimate import AidTable
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.gnc import NEAR_SIGMAS
+from ssm_graph.engine.mixing import Mixing
 from ssm_graph.graph.aids.weighted import StepLike, WeightedAid, WeightedAids
 from ssm_graph.graph.states import States
-from ssm_graph.problem.doubts import LOW_WEIGHT, MISFIT, SUSPECT_SHARE, TRUSTED
-from ssm_graph.smoothers.gnc import NEAR_SIGMAS
-from ssm_graph.smoothers.mixing import Mixing
+from ssm_graph.mission.doubts import LOW_WEIGHT, MISFIT, SUSPECT_SHARE, TRUSTED
+from ssm_graph.mission.estimate import AidTable
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,26 +10,27 @@ import numpy as np
 
 from factors.m_estimators import TruncatedKernel
 from factors.similarity import Kernel, LogKernel, Similarity, expected_mahalanobis_sq
-from ssm_graph.data import N_BEAMS, Array
-from ssm_graph.errors import ConfigError, SolverError
-from ssm_graph.estimate import BeamTable, Estimate, Iteration, NoiseFound, Status
+from ssm_graph.base.errors import ConfigError, SolverError
+from ssm_graph.base.frozen import Array
+from ssm_graph.base.stepwise import Steps, finished
+from ssm_graph.engine.gnc import GncSchedule, Graduation, Schedule, WarmSchedule
 from ssm_graph.graph.beacon_start import ambiguous_beacons
 from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.first_values import FirstValues, first_values, first_values_steps
 from ssm_graph.graph.linearize import GraphLinearizer, Step
 from ssm_graph.graph.states import States
-from ssm_graph.problem.problem import Problem, with_white_noise
-from ssm_graph.problem.trajectory import trajectory_from_states
+from ssm_graph.mission.estimate import BeamTable, Estimate, Iteration, NoiseFound, Status
+from ssm_graph.mission.problem import Problem, with_white_noise
+from ssm_graph.mission.trajectory import trajectory_from_states
+from ssm_graph.sensors.dvl import N_BEAMS
 from ssm_graph.smoothers.aid_weights import AidKernel, AidWeighing
 from ssm_graph.smoothers.beam_faults import FaultSearch
 from ssm_graph.smoothers.calibrated import calibration_of, undetermined
 from ssm_graph.smoothers.current import current_of
 from ssm_graph.smoothers.fault_watch import FaultWatch
-from ssm_graph.smoothers.gnc import GncSchedule, Graduation, Schedule, WarmSchedule
 from ssm_graph.smoothers.noise import MAX_ADAPTATIONS, adaptation, noise_notes, with_sigmas
 from ssm_graph.smoothers.passes import Pass, Solved, descend_steps, noise_of_steps
 from ssm_graph.smoothers.verdict import contradictions
-from ssm_graph.stepwise import Steps, finished
 
 __all__ = ["OnIteration", "Similarity", "SmootherConfig", "SsmSmoother"]
 

@@ -3,7 +3,7 @@
 A kernel judges every ping by itself. Against a fault that lasts this is not enough: what is left of
 its pull adds up, and one that begins slowly takes the trajectory with it, so that its residuals
 stay small. Here all pings of a stretch are judged together and with the trajectory eliminated
-(:mod:`ssm_graph.graph.beam_evidence`): for every beam and every stretch of whole blocks, how
+(:mod:`ssm_graph.engine.beam_evidence`): for every beam and every stretch of whole blocks, how
 significant is an offset of its own? The most significant stretch is let free, which shows what the
 others look like without it, and so on, as in a step-wise regression. A stretch counts against a
 beam if no other beam explains the data as well, or no other that is blamed nearby. What one
@@ -19,15 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.similarity import LogKernel
-from ssm_graph.data import N_BEAMS, Array
-from ssm_graph.errors import ConfigError
-from ssm_graph.graph.beam_evidence import ChainEvidence, Evidence, WhitenedBeams
+from ssm_graph.base.errors import ConfigError
+from ssm_graph.base.frozen import Array
+from ssm_graph.base.stepwise import Steps
+from ssm_graph.engine.beam_evidence import ChainEvidence, Evidence, WhitenedBeams
 from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.states import States
 from ssm_graph.graph.water_rows import WaterRows
-from ssm_graph.problem.problem import Problem
-from ssm_graph.stepwise import Steps
+from ssm_graph.mission.problem import Problem
+from ssm_graph.sensors.dvl import N_BEAMS
 
 Mask = NDArray[np.bool_]
 

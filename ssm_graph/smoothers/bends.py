@@ -6,8 +6,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from ssm_graph.data import Array
-from ssm_graph.problem.calibration import (
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.extras import Extras
+from ssm_graph.mission.calibration import (
     DVL_BEAM_SCALE,
     DVL_LEVER_ARM,
     DVL_MOUNTING,
@@ -15,7 +16,6 @@ from ssm_graph.problem.calibration import (
     GNSS_LEVER_ARM,
     GNSS_TIME_OFFSET,
 )
-from ssm_graph.problem.extras import Extras
 
 _STRAIGHT: Final = 1e6
 _AS_A_TURN: Final = {

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ssm_graph.data import Array
-from ssm_graph.estimate import CalibratedValue, Calibration, Determined
-from ssm_graph.problem.calibration import is_calibration
-from ssm_graph.problem.error_state import STATE_DIM
-from ssm_graph.problem.extras import Extras
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import STATE_DIM
+from ssm_graph.engine.extras import Extras
+from ssm_graph.mission.calibration import is_calibration
+from ssm_graph.mission.estimate import CalibratedValue, Calibration, Determined
 from ssm_graph.smoothers.stretch import Stretch
 
 

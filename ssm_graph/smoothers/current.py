@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ssm_graph.data import Array
-from ssm_graph.estimate import CurrentTrack
-from ssm_graph.problem.current import CURRENT, CURRENT_UP
-from ssm_graph.problem.error_state import STATE_DIM
-from ssm_graph.problem.extras import Extras
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import STATE_DIM
+from ssm_graph.engine.extras import Extras
+from ssm_graph.mission.current import CURRENT, CURRENT_UP
+from ssm_graph.mission.estimate import CurrentTrack
 from ssm_graph.smoothers.stretch import Stretch
 
 

@@ -7,17 +7,18 @@ from dataclasses import replace
 import numpy as np
 
 from factors.similarity import WEIGHT_FLOOR
-from ssm_graph.data import N_BEAMS, Array
+from ssm_graph.base.frozen import Array
+from ssm_graph.base.stepwise import Steps
+from ssm_graph.engine.extras import Extras
+from ssm_graph.engine.gnc import NEAR_SIGMAS
 from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.states import States
-from ssm_graph.problem.aid_errors import is_of_aid
-from ssm_graph.problem.current import CURRENTS
-from ssm_graph.problem.extras import Extras
-from ssm_graph.problem.problem import Problem, with_stated_noise
+from ssm_graph.mission.aid_errors import is_of_aid
+from ssm_graph.mission.current import CURRENTS
+from ssm_graph.mission.problem import Problem, with_stated_noise
+from ssm_graph.sensors.dvl import N_BEAMS
 from ssm_graph.smoothers.beam_faults import FaultSearch, Found, find_beam_faults_steps
-from ssm_graph.smoothers.gnc import NEAR_SIGMAS
-from ssm_graph.stepwise import Steps
 
 FREE_LOOKS = 2
 """So often a search may take back what the one before it found."""

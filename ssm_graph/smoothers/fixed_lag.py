@@ -14,12 +14,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ssm_graph.data import Array
-from ssm_graph.estimate import Estimate, OnKeyframe
-from ssm_graph.problem.error_state import STATE_DIM
-from ssm_graph.problem.extras import with_extras
-from ssm_graph.problem.problem import Problem, start_of, with_white_noise
-from ssm_graph.problem.recursive import RecursiveBeams, recursive_estimate
+from ssm_graph.base.frozen import Array
+from ssm_graph.base.stepwise import Steps, finished
+from ssm_graph.engine.error_state import STATE_DIM
+from ssm_graph.engine.extras import with_extras
+from ssm_graph.mission.estimate import Estimate, OnKeyframe
+from ssm_graph.mission.problem import Problem, start_of, with_white_noise
+from ssm_graph.mission.recursive import RecursiveBeams, recursive_estimate
 from ssm_graph.smoothers.calibrated import calibration_of_last, undetermined
 from ssm_graph.smoothers.current import current_along
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
@@ -27,7 +28,6 @@ from ssm_graph.smoothers.keyframe import beam_speeds, keyframes_of, sensors_of
 from ssm_graph.smoothers.stretch import Stretch, joined
 from ssm_graph.smoothers.window import Window
 from ssm_graph.smoothers.window_rows import beam_rows
-from ssm_graph.stepwise import Steps, finished
 
 __all__ = ["FixedLagConfig", "FixedLagEstimates", "FixedLagRun", "run_fixed_lag", "solve_fixed_lag"]
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from factors.similarity import Kernel, LogKernel, Similarity
-from ssm_graph.errors import ConfigError
-from ssm_graph.problem.error_state import Linearised
+from ssm_graph.base.errors import ConfigError
+from ssm_graph.engine.error_state import Linearised
 
 
 @dataclass(frozen=True, slots=True)

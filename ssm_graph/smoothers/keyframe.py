@@ -9,13 +9,13 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
-from ssm_graph.data import Array
-from ssm_graph.earth import LocalFrame
+from ssm_graph.base.earth import LocalFrame
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.extras import Extras
 from ssm_graph.imu.preintegration import Preintegrated
-from ssm_graph.problem.calibration import windowed
-from ssm_graph.problem.extras import Extras
-from ssm_graph.problem.problem import Beams, Problem
-from ssm_graph.problem.timeline import Indices
+from ssm_graph.mission.calibration import windowed
+from ssm_graph.mission.problem import Beams, Problem
+from ssm_graph.mission.timeline import Indices
 
 
 class Sensors(NamedTuple):

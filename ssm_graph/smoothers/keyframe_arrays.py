@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from ssm_graph.data import Array
+from ssm_graph.base.frozen import Array
 from ssm_graph.smoothers.keyframe import BeamSpeeds, Keyframe, Way
 
 _GROUPS = {

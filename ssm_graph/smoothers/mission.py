@@ -7,15 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from ssm_graph.data import Mission
-from ssm_graph.errors import SolverError
-from ssm_graph.estimate import Estimate, Status
-from ssm_graph.frames import wrap_to_pi
-from ssm_graph.problem.alignment import Alignment, align_steps
-from ssm_graph.problem.problem import Problem, ProblemConfig, build_problem_steps
+from ssm_graph.base.errors import SolverError
+from ssm_graph.base.frames import wrap_to_pi
+from ssm_graph.base.stepwise import Steps, finished
+from ssm_graph.mission.estimate import Estimate, Status
+from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.problem import Problem, ProblemConfig, build_problem_steps
+from ssm_graph.mission.start.alignment import Alignment, align_steps
 from ssm_graph.smoothers.batch import OnIteration, SmootherConfig, SsmSmoother
 from ssm_graph.smoothers.beam_faults import FaultSearch
-from ssm_graph.stepwise import Steps, finished
 
 AMBIGUOUS_COST = 6.0
 """Another heading whose cost is higher by less than this is as good an explanation (a likelihood

@@ -17,10 +17,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from ssm_graph.data import N_BEAMS, Array
-from ssm_graph.estimate import OUTLIER_WEIGHT, NoiseFound
+from ssm_graph.base.frozen import Array
 from ssm_graph.graph.inertial_fit import InertialFit
-from ssm_graph.problem.problem import Beams, Problem
+from ssm_graph.mission.estimate import OUTLIER_WEIGHT, NoiseFound
+from ssm_graph.mission.problem import Beams, Problem
+from ssm_graph.sensors.dvl import N_BEAMS
 
 FEWEST = 30.0
 """Degrees of freedom below which nothing is said."""

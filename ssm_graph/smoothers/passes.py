@@ -5,16 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import NamedTuple
 
-from ssm_graph.data import Array
-from ssm_graph.estimate import Iteration, NoiseFound, Status
+from ssm_graph.base.frozen import Array
+from ssm_graph.base.stepwise import Steps
 from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.first_values import FirstValues
 from ssm_graph.graph.inertial_fit import inertial_fit
 from ssm_graph.graph.linearize import GraphLinearizer, Step
 from ssm_graph.graph.states import States
+from ssm_graph.mission.estimate import Iteration, NoiseFound, Status
 from ssm_graph.smoothers.aid_weights import AidWeighing
 from ssm_graph.smoothers.noise import noise_found
-from ssm_graph.stepwise import Steps
 
 MAX_HALVINGS = 10
 COST_SLACK = 1e-2

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ssm_graph.data import Array
-from ssm_graph.problem.states import AugmentedStates
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.states import AugmentedStates
 
 
 class Stretch(NamedTuple):

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import chi2
 
-from ssm_graph.data import Array
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.extras import Extras
+from ssm_graph.engine.marginal_prior import MarginalPrior
 from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.linearize import GraphLinearizer, Misfit
-from ssm_graph.graph.marginal_prior import MarginalPrior
 from ssm_graph.graph.states import States
-from ssm_graph.problem.current import CURRENTS
-from ssm_graph.problem.doubts import MISFIT, doubts_of_beams
-from ssm_graph.problem.extras import Extras
+from ssm_graph.mission.current import CURRENTS
+from ssm_graph.mission.doubts import MISFIT, doubts_of_beams
 
 PRIOR_TAIL = 1e-9
 """Probability below which the initial state is contradicted by the data."""

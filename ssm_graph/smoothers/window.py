@@ -9,19 +9,20 @@ from typing import Self
 import numpy as np
 
 from factors.similarity import Similarity, expected_mahalanobis_sq
-from ssm_graph.data import N_BEAMS, Array
-from ssm_graph.errors import SolverError
+from ssm_graph.base.errors import SolverError
+from ssm_graph.base.frozen import Array
+from ssm_graph.base.stepwise import Steps, finished
+from ssm_graph.engine.error_state import InitialMoments, Linearised
+from ssm_graph.engine.marginal_prior import moved_chart
+from ssm_graph.engine.mixing import Mixing
+from ssm_graph.engine.states import AugmentedStates
 from ssm_graph.graph.beam_weights import met_weights, updated_trust
-from ssm_graph.graph.marginal_prior import moved_chart
-from ssm_graph.problem.error_state import InitialMoments, Linearised
-from ssm_graph.problem.states import AugmentedStates
-from ssm_graph.problem.timeline import MIN_SPACING_S
+from ssm_graph.mission.timeline import MIN_SPACING_S
+from ssm_graph.sensors.dvl import N_BEAMS
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors, Way
-from ssm_graph.smoothers.mixing import Mixing
 from ssm_graph.smoothers.stretch import Stretch
 from ssm_graph.smoothers.window_graph import WindowGraph
-from ssm_graph.stepwise import Steps, finished
 
 _PACKED = ("step", "covariance", "innovation", "weights", "t", "trust")
 RUNAWAY_SPEED = 100.0

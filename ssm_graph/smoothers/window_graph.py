@@ -9,13 +9,13 @@ from typing import Self
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from ssm_graph.data import Array
-from ssm_graph.errors import DataError
-from ssm_graph.graph.marginal_prior import MarginalPrior, prior_at_start, prior_on
-from ssm_graph.problem.error_state import InitialMoments
-from ssm_graph.problem.states import AugmentedStates
+from ssm_graph.base.errors import DataError
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.chain import Chain
+from ssm_graph.engine.error_state import InitialMoments
+from ssm_graph.engine.marginal_prior import MarginalPrior, prior_at_start, prior_on
+from ssm_graph.engine.states import AugmentedStates
 from ssm_graph.smoothers.bends import bends_of
-from ssm_graph.smoothers.chain import Chain
 from ssm_graph.smoothers.keyframe import BeamSpeeds, Keyframe, Sensors, Way
 from ssm_graph.smoothers.keyframe_arrays import pack_keyframes, unpack_keyframes
 from ssm_graph.smoothers.window_inertial import InertialRows

@@ -8,14 +8,14 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
-from ssm_graph.data import Array
-from ssm_graph.earth import LocalFrame
+from ssm_graph.base.earth import LocalFrame
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import STATE_DIM
+from ssm_graph.engine.extras import Extras
+from ssm_graph.engine.states import AugmentedStates
 from ssm_graph.graph.inertial_rows import carried_covariance, pair_rows
 from ssm_graph.imu.preintegration import gravity_gradient, gtsam_gravity
-from ssm_graph.problem.error_state import STATE_DIM
-from ssm_graph.problem.extras import Extras
-from ssm_graph.problem.problem import NO_EXTRAS
-from ssm_graph.problem.states import AugmentedStates
+from ssm_graph.mission.problem import NO_EXTRAS
 from ssm_graph.smoothers.keyframe import Keyframe, Way
 
 _KEYS = tuple((X(i), V(i), B(i)) for i in (0, 1))

@@ -10,16 +10,16 @@ from numpy.typing import NDArray
 
 from factors.depth_height import height_residual
 from factors.dvl_beam import beam_residual
-from ssm_graph.data import Array
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import GYRO_BIAS, POSITION, ROTATION, STATE_DIM, VELOCITY
+from ssm_graph.engine.states import AugmentedStates
 from ssm_graph.graph.aids import positions
 from ssm_graph.graph.augmented_rows import AugmentedBeams, RowStates
 from ssm_graph.graph.beam_rows import BeamRows, rows_of_beams
-from ssm_graph.problem.aids import Fixes
-from ssm_graph.problem.calibration import DEPTH_OFFSET
-from ssm_graph.problem.error_state import GYRO_BIAS, POSITION, ROTATION, STATE_DIM, VELOCITY
-from ssm_graph.problem.heights import height_track, mean_rises
-from ssm_graph.problem.problem import Beams
-from ssm_graph.problem.states import AugmentedStates
+from ssm_graph.mission.aids import Fixes
+from ssm_graph.mission.calibration import DEPTH_OFFSET
+from ssm_graph.mission.heights import height_track, mean_rises
+from ssm_graph.mission.problem import Beams
 from ssm_graph.smoothers.keyframe import BeamSpeeds, Keyframe, Sensors
 
 _SEEN_BY_BEAMS = np.r_[ROTATION, VELOCITY, GYRO_BIAS]

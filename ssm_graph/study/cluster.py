@@ -7,7 +7,7 @@ from dataclasses import replace
 from itertools import groupby
 from typing import Any, Final
 
-from ssm_graph.errors import ConfigError, MissingExtraError, SsmGraphError
+from ssm_graph.base.errors import ConfigError, MissingExtraError, SsmGraphError
 from ssm_graph.study.jobs import Job, JobResult, do_job, lost_job
 from ssm_graph.study.methods import shown
 

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from ssm_graph.data import Array
+from ssm_graph.base.frozen import Array
 from ssm_graph.simulation import Grade
 from ssm_graph.study.cells import Recording, Source
 from ssm_graph.study.code import code_version

@@ -9,14 +9,19 @@ from typing import Final, Protocol
 from factors.kernels import KERNELS, KernelChoice
 from factors.m_estimators import TruncatedKernel
 from factors.similarity import GaussianKernel, Similarity
-from ssm_graph.errors import ConfigError, SsmGraphError, nearest_hint
-from ssm_graph.estimate import Estimate, OnKeyframe
-from ssm_graph.filters.geodetic import GeodeticConfig
-from ssm_graph.filters.named import FILTERS, FilterChoice, filter_geodetic, filter_problems
+from ssm_graph.base.errors import ConfigError, SsmGraphError, nearest_hint
+from ssm_graph.engine.gnc import Graduation
+from ssm_graph.filters.geodetic.filter import GeodeticConfig
+from ssm_graph.filters.navigation.named import (
+    FILTERS,
+    FilterChoice,
+    filter_geodetic,
+    filter_problems,
+)
+from ssm_graph.mission.estimate import Estimate, OnKeyframe
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
 from ssm_graph.smoothers.beam_faults import FaultSearch
 from ssm_graph.smoothers.fixed_lag import FixedLagConfig, solve_fixed_lag
-from ssm_graph.smoothers.gnc import Graduation
 from ssm_graph.study.trials import Trial
 
 ORACLE: Final = "oracle"

@@ -12,7 +12,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Final
 
-from ssm_graph.errors import ConfigError, SsmGraphError
+from ssm_graph.base.errors import ConfigError, SsmGraphError
 from ssm_graph.study.jobs import Job, JobResult, do_job, lost_job
 
 MAX_DEATHS: Final = 2

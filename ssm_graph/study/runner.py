@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
-from ssm_graph.data import Reference
-from ssm_graph.errors import DataError
-from ssm_graph.estimate import Estimate
+from ssm_graph.base.errors import DataError
+from ssm_graph.mission.estimate import Estimate
+from ssm_graph.mission.mission import Reference
 from ssm_graph.simulation import OutlierKind
 from ssm_graph.study.cells import Cell, Recording
 from ssm_graph.study.code import code_version

@@ -9,24 +9,10 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from ssm_graph.errors import ConfigError, DataError, nearest_hint
-from ssm_graph.io.mission import read_mission
-from ssm_graph.simulation import (
-    SCENARIOS,
-    FaultShape,
-    Grade,
-    Loss,
-    OutlierKind,
-    Outliers,
-)
-from ssm_graph.study.cells import (
-    WITHOUT_SIZE,
-    Cell,
-    Recording,
-    Source,
-    StudyFault,
-    digest,
-)
+from ssm_graph.base.errors import ConfigError, DataError, nearest_hint
+from ssm_graph.io.mission_folder.reader import read_mission
+from ssm_graph.simulation import SCENARIOS, FaultShape, Grade, Loss, OutlierKind, Outliers
+from ssm_graph.study.cells import WITHOUT_SIZE, Cell, Recording, Source, StudyFault, digest
 from ssm_graph.study.methods import parse_method, parse_methods
 from ssm_graph.study.toml_table import TomlTable
 from ssm_graph.study.water_keys import read_current, read_water_track

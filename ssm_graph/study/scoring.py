@@ -9,10 +9,16 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ssm_graph.data import Array
-from ssm_graph.errors import DataError
-from ssm_graph.estimate import OUTLIER_WEIGHT, Estimate, Status, path_length_m, since_first_ping
+from ssm_graph.base.errors import DataError
+from ssm_graph.base.frozen import Array
 from ssm_graph.evaluation import Metrics, evaluate
+from ssm_graph.mission.estimate import (
+    OUTLIER_WEIGHT,
+    Estimate,
+    Status,
+    path_length_m,
+    since_first_ping,
+)
 from ssm_graph.simulation import SimulatedMission
 from ssm_graph.study.methods import Failure, Outcome, shown
 from ssm_graph.study.trials import Trial

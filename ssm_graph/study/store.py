@@ -11,8 +11,8 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from ssm_graph.data import Array
-from ssm_graph.errors import ConfigError, DataError
+from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.base.frozen import Array
 from ssm_graph.study.cells import digest
 from ssm_graph.study.jobs import JobResult, RunKey
 from ssm_graph.study.scoring import LOST, SERIES_STEP_S, Row

@@ -9,8 +9,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from ssm_graph.errors import MissingExtraError
-from ssm_graph.io.mission import TableFormat
+from ssm_graph.base.errors import MissingExtraError
+from ssm_graph.io.mission_folder.reader import TableFormat
 from ssm_graph.study.scoring import COLUMNS, COUNT_COLUMNS, TEXT_COLUMNS, Row
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from enum import Enum
 from typing import Any, TypeVar
 
-from ssm_graph.errors import ConfigError, nearest_hint
+from ssm_graph.base.errors import ConfigError, nearest_hint
 
 _Choice = TypeVar("_Choice", bound=Enum)
 _Value = TypeVar("_Value")

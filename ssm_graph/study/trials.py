@@ -11,11 +11,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ssm_graph.data import Array, Mission, Reference
+from ssm_graph.base.frozen import Array
 from ssm_graph.graph.first_values import FirstValues
-from ssm_graph.io.mission import read_mission
-from ssm_graph.problem.alignment import align
-from ssm_graph.problem.problem import Problem, build_problem, with_dvl
+from ssm_graph.io.mission_folder.reader import read_mission
+from ssm_graph.mission.mission import Mission, Reference
+from ssm_graph.mission.problem import Problem, build_problem, with_dvl
+from ssm_graph.mission.start.alignment import align
 from ssm_graph.simulation import Grade, SimulatedMission, simulate, with_dvl_errors
 from ssm_graph.smoothers.batch import warm_start
 from ssm_graph.smoothers.mission import smooth

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ssm_graph.errors import ConfigError
+from ssm_graph.base.errors import ConfigError
 from ssm_graph.simulation import CurrentSettings, WaterTrack
 from ssm_graph.study.toml_table import TomlTable
 

@@ -12,7 +12,7 @@ import pytest
 import ssm_graph as sg
 from ssm_graph.cli.run_mission import withhold_gnss
 from ssm_graph.evaluation.errors import error_series
-from ssm_graph.io.blueye import convert_blueye
+from ssm_graph.io.blueye.convert import convert_blueye
 
 DATA = Path(os.environ.get("SSM_GRAPH_DATA", Path(__file__).parents[2].parent / "shared" / "data"))
 RUNS = DATA / "blueye_x3"

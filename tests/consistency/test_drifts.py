@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from factors.similarity import GaussianKernel
-from ssm_graph.data import Array, Drift, Mission
-from ssm_graph.problem.problem import build_problem
+from ssm_graph.base.frozen import Array
+from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.problem import build_problem
+from ssm_graph.sensors.drift import Drift
 from ssm_graph.simulation import (
     DriftSettings,
     DvlSettings,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ssm_graph.data import Array
-from ssm_graph.estimate import Estimate
-from ssm_graph.problem.problem import build_problem
+from ssm_graph.base.frozen import Array
+from ssm_graph.mission.estimate import Estimate
+from ssm_graph.mission.problem import build_problem
 from ssm_graph.simulation import BeaconSettings, SurveyRoute
 from ssm_graph.smoothers.batch import SsmSmoother
 from tests.aids_fixture import compass, ranging

@@ -8,11 +8,16 @@ import numpy as np
 import pytest
 
 from factors.similarity import GaussianKernel
-from ssm_graph.data import Array
+from ssm_graph.base.frozen import Array
 from ssm_graph.evaluation import chi2_interval
-from ssm_graph.filters.geodetic import GeodeticConfig, GeodeticHistory, run_geodetic, to_navigation
+from ssm_graph.filters.geodetic.filter import (
+    GeodeticConfig,
+    GeodeticHistory,
+    run_geodetic,
+    to_navigation,
+)
 from ssm_graph.graph.states import states_from_arrays
-from ssm_graph.problem.problem import build_problem
+from ssm_graph.mission.problem import build_problem
 from ssm_graph.simulation import (
     Grade,
     OutlierKind,

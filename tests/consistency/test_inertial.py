@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from factors.similarity import LogKernel
-from ssm_graph.data import Array
+from ssm_graph.base.frozen import Array
 from ssm_graph.graph.first_values import first_values
 from ssm_graph.graph.states import States
 from ssm_graph.imu.preintegration import gtsam_gravity
-from ssm_graph.problem.problem import Problem, ProblemConfig, build_problem
+from ssm_graph.mission.problem import Problem, ProblemConfig, build_problem
 from ssm_graph.simulation import SimulatedMission, TransitRoute, Waves
 from ssm_graph.smoothers.batch import SsmSmoother
 from tests.helpers import estimated_states, simulated, true_states, without_beams

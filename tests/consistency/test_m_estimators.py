@@ -10,12 +10,12 @@ import pytest
 from factors.kernels import KERNELS
 from factors.m_estimators import HuberKernel, TruncatedKernel
 from factors.similarity import GaussianKernel
-from ssm_graph.estimate import Estimate, Status
+from ssm_graph.engine.gnc import GncStart, Graduation
 from ssm_graph.evaluation import evaluate
-from ssm_graph.problem.problem import build_problem
+from ssm_graph.mission.estimate import Estimate, Status
+from ssm_graph.mission.problem import build_problem
 from ssm_graph.simulation import Fault, Grade, OutlierKind, Outliers, SimulatedMission
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
-from ssm_graph.smoothers.gnc import GncStart, Graduation
 from tests.helpers import simulated
 
 SEEDS = range(500, 503)

@@ -19,26 +19,30 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ssm_graph.base.frozen import Array
 from ssm_graph.cli.main import ExitCode
 from ssm_graph.cli.online import engine_of
-from ssm_graph.data import Array
-from ssm_graph.io.mission import write_mission
-from ssm_graph.io.replay import messages_of
-from ssm_graph.io.results import read_results
-from ssm_graph.io.vehicle import vehicle_of
-from ssm_graph.live.endpoints import LOOPBACK, Endpoint, Transport
-from ssm_graph.live.feed import Limits
-from ssm_graph.live.interfaces import Connections
-from ssm_graph.live.json_messages import JsonDecoder, encode_message
-from ssm_graph.live.listeners import UdpInput
-from ssm_graph.live.nmea import NmeaDecoder
-from ssm_graph.live.outputs import OutputFormat, TcpServerOutput
-from ssm_graph.live.run_folder import RunFolder
-from ssm_graph.live.runner import Runner
-from ssm_graph.live.sockets import InputConfig, OutputConfig, SocketHub
-from ssm_graph.live.waterlinked import WaterLinkedDecoder
-from ssm_graph.messages import DepthReading, Fix, ImuSample, Message, Ping
-from ssm_graph.online import ONLINE
+from ssm_graph.io.mission_folder.reader import write_mission
+from ssm_graph.io.mission_folder.vehicle import vehicle_of
+from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.io.results.tables import read_results
+from ssm_graph.live.estimator import ONLINE
+from ssm_graph.live.protocols.json_messages import JsonDecoder, encode_message
+from ssm_graph.live.protocols.nmea import NmeaDecoder
+from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
+from ssm_graph.live.run.feed import Limits
+from ssm_graph.live.run.interfaces import Connections
+from ssm_graph.live.run.run_folder import RunFolder
+from ssm_graph.live.run.runner import Runner
+from ssm_graph.live.sockets.endpoints import LOOPBACK, Endpoint, Transport
+from ssm_graph.live.sockets.listeners import UdpInput
+from ssm_graph.live.sockets.outputs import OutputFormat, TcpServerOutput
+from ssm_graph.live.sockets.sockets import InputConfig, OutputConfig, SocketHub
+from ssm_graph.sensors.depth import DepthReading
+from ssm_graph.sensors.dvl import Ping
+from ssm_graph.sensors.gnss import Fix
+from ssm_graph.sensors.imu import ImuSample
+from ssm_graph.sensors.messages import Message
 from tests.instrument_fixture import A50, UdpSender, free_port, gga, pips
 from tests.mission_fixture import LENGTH_S, make_mission
 

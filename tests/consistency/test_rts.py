@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from factors.similarity import GaussianKernel
-from ssm_graph.data import Array, ImuNoise
-from ssm_graph.estimate import Status, Trajectory
-from ssm_graph.filters.named import filter_problems
-from ssm_graph.problem.problem import Problem, build_problem
+from ssm_graph.base.frozen import Array
+from ssm_graph.filters.navigation.named import filter_problems
+from ssm_graph.mission.estimate import Status, Trajectory
+from ssm_graph.mission.problem import Problem, build_problem
+from ssm_graph.sensors.imu import ImuNoise
 from ssm_graph.simulation import DepthSettings, DvlSettings, GnssSettings, Grade, Loss
 from ssm_graph.simulation.grades import IMU_NOISE, START_SIGMAS, StartSigmas
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother

@@ -12,14 +12,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ssm_graph.data import Array, ImuLog
-from ssm_graph.earth import (
+from ssm_graph.base.earth import (
     EARTH_RATE,
     R_el_from_lat_lon,
     ecef_from_geodetic,
     geodetic_from_ecef,
     normal_gravity,
 )
+from ssm_graph.base.frozen import Array
+from ssm_graph.sensors.imu import ImuLog
 from ssm_graph.simulation import (
     CALM,
     DepthProfile,

@@ -14,17 +14,10 @@ import pytest
 
 from benchmarks.equivalence import Difference, against_filter, against_geodetic
 from factors.similarity import Similarity
-from ssm_graph.filters.geodetic_error_model import Feedback
-from ssm_graph.problem.error_state import Linearised
-from ssm_graph.problem.problem import Problem, build_problem
-from ssm_graph.simulation import (
-    GnssSettings,
-    Grade,
-    Loss,
-    OutlierKind,
-    Outliers,
-    SimulatedMission,
-)
+from ssm_graph.engine.error_state import Linearised
+from ssm_graph.filters.geodetic.error_model import Feedback
+from ssm_graph.mission.problem import Problem, build_problem
+from ssm_graph.simulation import GnssSettings, Grade, Loss, OutlierKind, Outliers, SimulatedMission
 from tests.helpers import simulated
 
 GRADES = (Grade.NAVIGATION, Grade.TACTICAL, Grade.INDUSTRIAL)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from factors.similarity import ExpKernel, GaussianKernel, Kernel, LogKernel, SqrtKernel
-from ssm_graph.estimate import Estimate, Status
-from ssm_graph.problem.error_state import STATE_DIM
-from ssm_graph.problem.problem import Problem, build_problem
+from ssm_graph.engine.error_state import STATE_DIM
+from ssm_graph.mission.estimate import Estimate, Status
+from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.simulation import Fault, Grade, Loss, OutlierKind, Outliers, SimulatedMission
 from ssm_graph.smoothers.batch import Similarity, SmootherConfig, SsmSmoother
 from tests.helpers import (

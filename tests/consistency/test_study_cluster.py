@@ -16,8 +16,8 @@ from pathlib import Path
 
 import pytest
 
+from ssm_graph.base.errors import ConfigError, MissingExtraError
 from ssm_graph.cli.main import ExitCode, main
-from ssm_graph.errors import ConfigError, MissingExtraError
 from ssm_graph.study.cluster import DaskCluster
 from ssm_graph.study.scoring import TIMING_COLUMNS
 

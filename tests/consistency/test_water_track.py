@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from factors.similarity import GaussianKernel
-from ssm_graph.estimate import Status
-from ssm_graph.problem.error_state import STATE_DIM
-from ssm_graph.problem.problem import build_problem
+from ssm_graph.engine.error_state import STATE_DIM
+from ssm_graph.mission.estimate import Status
+from ssm_graph.mission.problem import build_problem
 from ssm_graph.simulation import CurrentSettings, Grade, WaterTrack
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
 from tests.helpers import (

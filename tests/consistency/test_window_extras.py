@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from benchmarks.calibration_cases import MOUNTING, SCALE
-from ssm_graph.data import Array
-from ssm_graph.estimate import Estimate
-from ssm_graph.problem.calibration import DVL_MOUNTING, DVL_SCALE
-from ssm_graph.problem.problem import build_problem
+from ssm_graph.base.frozen import Array
+from ssm_graph.mission.calibration import DVL_MOUNTING, DVL_SCALE
+from ssm_graph.mission.estimate import Estimate
+from ssm_graph.mission.problem import build_problem
 from ssm_graph.simulation import SimulatedMission
 from ssm_graph.smoothers.fixed_lag import solve_fixed_lag
 from tests.helpers import assert_consistent

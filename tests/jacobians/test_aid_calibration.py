@@ -11,7 +11,7 @@ from gtsam.symbol_shorthand import X
 
 from factors.depth_height import height_residual
 from factors.gnss_position import fix_residual
-from ssm_graph.data import Array
+from ssm_graph.base.frozen import Array
 from tests.helpers import rotation
 
 R_NB = rotation([0.3, -1.1, 0.8])

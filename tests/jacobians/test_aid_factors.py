@@ -12,7 +12,7 @@ from gtsam.symbol_shorthand import X
 
 from factors.beacon_range import beacon_range_factor
 from factors.compass_heading import heading_factor
-from ssm_graph.data import Array
+from ssm_graph.base.frozen import Array
 from tests.helpers import assert_jacobians_match, rotation
 
 ATTITUDES = {

@@ -12,9 +12,9 @@ from gtsam.symbol_shorthand import B, V, X
 
 import factors.dvl_beam
 from factors.dvl_beam import beam_error, beam_residual, dvl_beam_factor
-from ssm_graph.data import Array
+from ssm_graph.base.frozen import Array
 from ssm_graph.graph.beam_rows import linearize_beams
-from ssm_graph.problem.problem import build_problem
+from ssm_graph.mission.problem import build_problem
 from ssm_graph.simulation import DiveRoute, HoverRoute, Route, SpiralRoute, SurveyRoute
 from tests.helpers import assert_jacobians_match, rotation, simulated, true_states
 

@@ -23,7 +23,7 @@ from factors.dvl_calibration import (
     no_way_back,
     turned_instrument,
 )
-from ssm_graph.data import Array
+from ssm_graph.base.frozen import Array
 from tests.helpers import assert_jacobians_match, rotation
 
 OMEGA_IE_N = 7.292115e-5 * np.array([0.0, math.cos(0.8), math.sin(0.8)])

@@ -12,7 +12,7 @@ from gtsam.symbol_shorthand import B, C, V, X
 
 from factors.dvl_beam import dvl_beam_factor
 from factors.water_track import through_water, water_beam_factor
-from ssm_graph.data import Array
+from ssm_graph.base.frozen import Array
 from tests.helpers import assert_jacobians_match, rotation
 
 OMEGA_IE_N = 7.292115e-5 * np.array([0.0, math.cos(0.8), math.sin(0.8)])

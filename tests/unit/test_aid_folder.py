@@ -10,14 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ssm_graph.aid_logs import AidLogs
-from ssm_graph.data import Mission
-from ssm_graph.estimate import Estimate
 from ssm_graph.evaluation import evaluate
-from ssm_graph.io.mission import read_mission, write_mission
-from ssm_graph.io.results import read_results, write_results
-from ssm_graph.io.vehicle import read_vehicle, vehicle_of
-from ssm_graph.problem.problem import build_problem
+from ssm_graph.io.mission_folder.reader import read_mission, write_mission
+from ssm_graph.io.mission_folder.vehicle import read_vehicle, vehicle_of
+from ssm_graph.io.results.tables import read_results, write_results
+from ssm_graph.mission.estimate import Estimate
+from ssm_graph.mission.mission import AidLogs, Mission
+from ssm_graph.mission.problem import build_problem
 from ssm_graph.simulation import SimulatedMission
 from ssm_graph.smoothers.batch import SsmSmoother
 from tests.aids_fixture import UNKNOWN, ranging, with_every_aid

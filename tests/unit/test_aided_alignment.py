@@ -7,11 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from ssm_graph.aid_logs import AidLogs, HeadingErrors, Standstill
-from ssm_graph.estimate import Status
-from ssm_graph.frames import wrap_to_pi
-from ssm_graph.problem.alignment import align
-from ssm_graph.problem.body_velocity import body_velocities
+from ssm_graph.base.frames import wrap_to_pi
+from ssm_graph.mission.estimate import Status
+from ssm_graph.mission.mission import AidLogs
+from ssm_graph.mission.start.alignment import align
+from ssm_graph.mission.start.body_velocity import body_velocities
+from ssm_graph.sensors.compass import HeadingErrors
+from ssm_graph.sensors.standstill import Standstill
 from ssm_graph.simulation import (
     AidSettings,
     CompassSettings,

@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ssm_graph.data import Mission
-from ssm_graph.errors import ConfigError, DataError
-from ssm_graph.estimate import Status
-from ssm_graph.frames import wrap_to_pi
-from ssm_graph.problem.alignment import N_HYPOTHESES, SAFE_HEADING_SIGMA, align
-from ssm_graph.problem.body_velocity import body_velocities
+from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.base.frames import wrap_to_pi
+from ssm_graph.mission.estimate import Status
+from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.start.alignment import N_HYPOTHESES, SAFE_HEADING_SIGMA, align
+from ssm_graph.mission.start.body_velocity import body_velocities
 from ssm_graph.simulation import (
     GnssSettings,
     Grade,

@@ -12,44 +12,40 @@ ROOT = Path(__file__).parents[2]
 MODULES = sorted(path for top in ("factors", "ssm_graph") for path in (ROOT / top).rglob("*.py"))
 IDS = [str(path.relative_to(ROOT)) for path in MODULES]
 
-FOUNDATION = {
-    "aid_logs",
-    "data",
-    "earth",
-    "errors",
-    "estimate",
-    "frames",
-    "frozen",
-    "messages",
-    "plausible",
-    "stepwise",
-    "stuck_beams",
-    "water_current",
-}
+VALUES = {"base", "sensors", "mission.values"}
+"""What every room may read: the foundation, instruments, missions and answers as frozen values."""
 MAY_IMPORT = {
     "factors": set[str](),
-    "io": FOUNDATION,
-    "live": FOUNDATION | {"io"},
-    "imu": FOUNDATION,
-    "simulation": FOUNDATION - {"frames"},
-    "evaluation": FOUNDATION,
-    "problem": FOUNDATION | {"imu", "factors"},
-    "graph": FOUNDATION | {"problem", "imu", "factors"},
-    "smoothers": FOUNDATION | {"graph", "problem", "imu", "factors"},
-    "filters": FOUNDATION | {"problem", "imu", "factors"},
-    "online": FOUNDATION | {"smoothers", "problem", "imu", "factors"},
-    "study": FOUNDATION
-    | {"smoothers", "filters", "graph", "problem", "simulation", "evaluation"}
+    "base": set[str](),
+    "sensors": {"base"},
+    "imu": {"base", "sensors"},
+    "engine": {"base", "factors"},
+    "mission.values": {"base", "sensors"},
+    "mission": VALUES | {"engine", "imu", "factors"},
+    "graph": VALUES | {"mission", "engine", "imu", "factors"},
+    "smoothers": VALUES | {"graph", "mission", "engine", "imu", "factors"},
+    "filters.rules": {"base", "engine", "factors"},
+    "filters": VALUES | {"filters.rules", "mission", "engine", "imu", "factors"},
+    "io": VALUES,
+    "live": VALUES | {"io"},
+    "live.estimator": VALUES | {"smoothers", "mission", "engine", "imu", "factors"},
+    "simulation": VALUES,
+    "evaluation": VALUES,
+    "study": VALUES
+    | {"smoothers", "filters", "graph", "mission", "engine", "simulation", "evaluation"}
     | {"factors", "io"},
-    "report": FOUNDATION | {"evaluation"},
-} | {name: FOUNDATION for name in FOUNDATION}
-"""Parts of the project that each part may import, itself apart; the rest may import anything."""
+    "report": VALUES | {"evaluation"},
+}
+"""Rooms that each room may import, itself apart; the rest may import anything."""
+MISSION_VALUES = {
+    f"ssm_graph.mission.{name}" for name in ("mission", "vehicle", "estimate", "navigation")
+}
 TOP = {"", "cli", "__main__"}
 """The package's own namespace and its command line stand above everything."""
 MAY_PRINT = {"cli", "report"}
-WITHOUT_GTSAM = FOUNDATION | {"io", "live", "simulation", "evaluation", "report"}
-MAX_FILE_LINES = 320
-MAX_FUNCTION_LINES = 50
+WITHOUT_GTSAM = {*VALUES, "io", "live", "simulation", "evaluation", "report"}
+MAX_FILE_LINES = 450
+MAX_FUNCTION_LINES = 60
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
@@ -66,11 +62,14 @@ def dotted_name(path: Path) -> str:
 
 
 def part_of(module: str) -> str:
-    """Return the part of the project that a dotted name belongs to, ``""`` for the top."""
+    """Return the room that a dotted name belongs to, ``""`` for the top."""
     top, *rest = module.split(".")
     if top == "factors":
         return "factors"
-    return rest[0] if rest else ""
+    if any(module == value or module.startswith(f"{value}.") for value in MISSION_VALUES):
+        return "mission.values"
+    pair = ".".join(rest[:2])
+    return pair if pair in MAY_IMPORT else rest[0] if rest else ""
 
 
 def imported_modules(tree: ast.Module, *, module: str, is_package: bool) -> Iterator[str]:
@@ -129,7 +128,7 @@ def test_gtsam_stays_in_its_place(path: Path) -> None:
 def test_import_rules_see_every_form_of_import() -> None:
     """The parser behind the rules: absolute, relative, aliased and local imports."""
     source = """
-import ssm_graph.io.mission as m
+import ssm_graph.io.results.tables as m
 from ssm_graph import graph
 from . import sibling
 from ..smoothers.batch import SsmSmoother
@@ -140,7 +139,7 @@ def f():
         imported_modules(ast.parse(source), module="ssm_graph.evaluation.x", is_package=False)
     )
     assert found == {
-        "ssm_graph.io.mission",
+        "ssm_graph.io.results.tables",
         "ssm_graph.graph",
         "ssm_graph.evaluation.sibling",
         "ssm_graph.smoothers.batch.SsmSmoother",
@@ -157,7 +156,7 @@ def f():
 
 @pytest.mark.parametrize("path", MODULES, ids=IDS)
 def test_modules_are_documented_and_small(path: Path) -> None:
-    """Every module says what it is for, on at most 320 lines."""
+    """Every module says what it is for, on at most 450 lines."""
     assert ast.get_docstring(parse(path)), "no module docstring"
     n_lines = len(path.read_text(encoding="utf-8").splitlines())
     assert n_lines <= MAX_FILE_LINES, f"{n_lines} lines"

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ssm_graph.data import Array
-from ssm_graph.graph.beam_evidence import ChainEvidence, WhitenedBeams
-from ssm_graph.graph.bordered import BorderedSolution
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.beam_evidence import ChainEvidence, WhitenedBeams
+from ssm_graph.engine.bordered import BorderedSolution
 
 K, N, M = 30, 15, 90
 

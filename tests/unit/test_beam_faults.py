@@ -8,14 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ssm_graph.aid_logs import NO_AIDS
-from ssm_graph.data import Array, DvlLog
-from ssm_graph.errors import ConfigError
-from ssm_graph.estimate import OUTLIER_WEIGHT, Estimate, Status
-from ssm_graph.graph.beam_evidence import Evidence
+from ssm_graph.base.errors import ConfigError
+from ssm_graph.base.frozen import Array
+from ssm_graph.base.stepwise import Steps, finished
+from ssm_graph.engine.beam_evidence import Evidence
 from ssm_graph.graph.first_values import first_values
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.problem.problem import build_problem
+from ssm_graph.mission.estimate import OUTLIER_WEIGHT, Estimate, Status
+from ssm_graph.mission.mission import NO_AIDS
+from ssm_graph.mission.problem import build_problem
+from ssm_graph.sensors.dvl import DvlLog
 from ssm_graph.simulation import (
     AidSettings,
     CompassSettings,
@@ -40,7 +42,6 @@ from ssm_graph.smoothers.beam_faults import (
     without_shared,
 )
 from ssm_graph.smoothers.fault_watch import FaultWatch
-from ssm_graph.stepwise import Steps, finished
 from tests.aids_fixture import with_every_aid
 from tests.helpers import simulated, with_initial
 

@@ -36,7 +36,11 @@ from benchmarks.faults_transforms import (
     spoiled,
     untouched,
 )
-from ssm_graph.messages import DepthReading, Health, ImuSample, Message, Ping
+from ssm_graph.mission.navigation import Health
+from ssm_graph.sensors.depth import DepthReading
+from ssm_graph.sensors.dvl import Ping
+from ssm_graph.sensors.imu import ImuSample
+from ssm_graph.sensors.messages import Message
 
 SHORT = Stage(duration_s=5.0, gnss=((0.0, 3.0),))
 RNG = np.random.default_rng(0)

@@ -25,7 +25,7 @@ from benchmarks.online_tasks import (
     survey,
 )
 from benchmarks.online_theirs import Kind, TheirConfig, run_theirs
-from ssm_graph.online import ONLINE
+from ssm_graph.live.estimator import ONLINE
 
 DURATION_S = 6.0
 

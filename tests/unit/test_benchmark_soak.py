@@ -19,8 +19,8 @@ from benchmarks.soak_stream import (
     more_untold,
     soak,
 )
-from ssm_graph.messages import Health
-from ssm_graph.report.style import save
+from ssm_graph.mission.navigation import Health
+from ssm_graph.report.mission.style import save
 from ssm_graph.simulation import Grade
 
 GOOD, DEGRADED = HEALTHS.index(Health.GOOD), HEALTHS.index(Health.DEGRADED)

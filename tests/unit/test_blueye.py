@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ssm_graph.data import Mission
-from ssm_graph.errors import DataError, MissingExtraError
-from ssm_graph.io.blueye import GAP_S, convert_blueye, smooth_arrivals
-from ssm_graph.io.blueye_log import TOPICS, read_blueye_tables
+from ssm_graph.base.errors import DataError, MissingExtraError
+from ssm_graph.io.blueye.convert import GAP_S, convert_blueye, smooth_arrivals
+from ssm_graph.io.blueye.log import TOPICS, read_blueye_tables
+from ssm_graph.mission.mission import Mission
 
 ROOT = Path(__file__).parents[2]
 LOGS = Path(os.environ.get("SSM_GRAPH_DATA", ROOT / "../shared/data")) / "blueye_x3"
@@ -164,7 +164,7 @@ def test_reports_off_the_water_are_marked(monkeypatch: pytest.MonkeyPatch) -> No
     flagged = tables.dvl.copy()
     flagged[len(flagged) // 2 :, 2] = 1.0
     monkeypatch.setattr(
-        "ssm_graph.io.blueye.read_blueye_tables", lambda _: tables._replace(dvl=flagged)
+        "ssm_graph.io.blueye.convert.read_blueye_tables", lambda _: tables._replace(dvl=flagged)
     )
     mission = convert_blueye(log)
     assert ground.water_track is None

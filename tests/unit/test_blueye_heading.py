@@ -7,10 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from ssm_graph.aid_logs import HeadingLog
-from ssm_graph.data import Array, ImuLog, ImuNoise
-from ssm_graph.frames import wrap_to_pi
-from ssm_graph.io.blueye_heading import dvl_heading
+from ssm_graph.base.frames import wrap_to_pi
+from ssm_graph.base.frozen import Array
+from ssm_graph.io.blueye.heading import dvl_heading
+from ssm_graph.sensors.compass import HeadingLog
+from ssm_graph.sensors.imu import ImuLog, ImuNoise
 
 SCALE, DELAY_S, ORIGIN = 0.989, 0.25, 2.5
 """Of the instrument; the origin is its own."""

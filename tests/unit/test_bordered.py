@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ssm_graph.data import Array
-from ssm_graph.errors import SolverError
-from ssm_graph.graph.bordered import ChainRows, solve_bordered
+from ssm_graph.base.errors import SolverError
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.bordered import ChainRows, solve_bordered
 
 
 def random_rows(

@@ -9,15 +9,16 @@ import numpy as np
 import pytest
 
 from benchmarks.calibration_cases import AIDS, DVL, as_stated, asking
-from ssm_graph.estimate import Calibration, Determined, Estimate, Status
 from ssm_graph.evaluation import evaluate
-from ssm_graph.filters.named import filter_problems
-from ssm_graph.io.replay import messages_of
-from ssm_graph.io.vehicle import vehicle_of
-from ssm_graph.messages import DepthReading, Fix
-from ssm_graph.online.buffers import Buffers
-from ssm_graph.online.smoother import FixedLagSmoother
-from ssm_graph.problem.problem import build_problem
+from ssm_graph.filters.navigation.named import filter_problems
+from ssm_graph.io.mission_folder.vehicle import vehicle_of
+from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.live.estimator.buffers import Buffers
+from ssm_graph.live.estimator.smoother import FixedLagSmoother
+from ssm_graph.mission.estimate import Calibration, Determined, Estimate, Status
+from ssm_graph.mission.problem import build_problem
+from ssm_graph.sensors.depth import DepthReading
+from ssm_graph.sensors.gnss import Fix
 from ssm_graph.simulation import (
     CALM,
     DepthProfile,

@@ -13,9 +13,9 @@ import tomli_w
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
-from ssm_graph.frames import BodyAxes
-from ssm_graph.io.mission import read_mission, write_mission
-from ssm_graph.io.results import read_results, write_results
+from ssm_graph.base.frames import BodyAxes
+from ssm_graph.io.mission_folder.reader import read_mission, write_mission
+from ssm_graph.io.results.tables import read_results, write_results
 from ssm_graph.report import summary_table
 from tests import mission_fixture
 from tests.estimate_fixture import calibrated, make_run

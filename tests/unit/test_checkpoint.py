@@ -16,10 +16,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ssm_graph.data import Array
-from ssm_graph.errors import DataError
-from ssm_graph.io import checkpoint as checkpoint_module
-from ssm_graph.io.checkpoint import (
+from ssm_graph.base.errors import DataError
+from ssm_graph.base.frozen import Array
+from ssm_graph.io.tables import checkpoint as checkpoint_module
+from ssm_graph.io.tables.checkpoint import (
     CHECKPOINT_NAME,
     JSON,
     newest_checkpoint,

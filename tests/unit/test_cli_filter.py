@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ssm_graph.base.errors import ConfigError
 from ssm_graph.cli.filter import METHODS, method_from
 from ssm_graph.cli.main import ExitCode, main
-from ssm_graph.errors import ConfigError
-from ssm_graph.io.results import read_results
+from ssm_graph.io.results.tables import read_results
 
 
 @pytest.fixture(scope="module")

@@ -13,14 +13,14 @@ import pytest
 from benchmarks.calibration_cases import SCALE
 from ssm_graph.cli.main import ExitCode, build_parser, main
 from ssm_graph.cli.online_arguments import input_configs, output_configs, replay_speed
-from ssm_graph.io.mission import read_mission, write_mission
-from ssm_graph.io.results import read_results
-from ssm_graph.live.endpoints import Transport
-from ssm_graph.live.feed import Limits
-from ssm_graph.live.json_messages import JsonDecoder
-from ssm_graph.live.nmea import NmeaDecoder
-from ssm_graph.live.outputs import OutputFormat
-from ssm_graph.live.waterlinked import WaterLinkedDecoder
+from ssm_graph.io.mission_folder.reader import read_mission, write_mission
+from ssm_graph.io.results.tables import read_results
+from ssm_graph.live.protocols.json_messages import JsonDecoder
+from ssm_graph.live.protocols.nmea import NmeaDecoder
+from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
+from ssm_graph.live.run.feed import Limits
+from ssm_graph.live.sockets.endpoints import Transport
+from ssm_graph.live.sockets.outputs import OutputFormat
 from tests.mission_fixture import make_mission
 from tests.window_fixture import asked, off
 

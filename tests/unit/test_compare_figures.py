@@ -11,19 +11,19 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from ssm_graph.errors import DataError
-from ssm_graph.estimate import BeamTable
-from ssm_graph.report import style
-from ssm_graph.report.compare_cells import Series, clean_case, end_error_cells, rate_sweeps
-from ssm_graph.report.compare_figures import NAMES, save_figures
-from ssm_graph.report.compare_missions import Example, draw_beam_weights, draw_errors_over_time
-from ssm_graph.report.compare_runs import (
+from ssm_graph.base.errors import DataError
+from ssm_graph.mission.estimate import BeamTable
+from ssm_graph.report.comparison.cells import Series, clean_case, end_error_cells, rate_sweeps
+from ssm_graph.report.comparison.figures import NAMES, save_figures
+from ssm_graph.report.comparison.missions import Example, draw_beam_weights, draw_errors_over_time
+from ssm_graph.report.comparison.runs import (
     draw_end_error,
     draw_error_against_rate,
     draw_error_against_size,
     draw_nees,
 )
-from ssm_graph.report.compare_style import DEFAULT_METHODS, looks_of, shown_methods
+from ssm_graph.report.comparison.style import DEFAULT_METHODS, looks_of, shown_methods
+from ssm_graph.report.mission import style
 from tests.estimate_fixture import make_run
 
 NAN = math.nan

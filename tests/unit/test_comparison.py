@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import t, wilcoxon
 
-from ssm_graph.errors import DataError
+from ssm_graph.base.errors import DataError
 from ssm_graph.evaluation import (
     chi2_interval,
     compare_methods,

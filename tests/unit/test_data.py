@@ -9,8 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ssm_graph.data import DvlLog, DvlMount, FrozenArrays, ImuLog, Reference, read_only
-from ssm_graph.errors import DataError, SsmGraphError, nearest_hint
+from ssm_graph.base.errors import DataError, SsmGraphError, nearest_hint
+from ssm_graph.base.frozen import FrozenArrays, read_only
+from ssm_graph.mission.mission import Reference
+from ssm_graph.sensors.dvl import DvlLog, DvlMount, counted_sigma
+from ssm_graph.sensors.imu import ImuLog
 from ssm_graph.simulation import IMU_NOISE, Grade, default_mount
 from tests.helpers import simulated
 from tests.mission_fixture import make_mission
@@ -69,10 +72,26 @@ def test_wrong_shapes_are_named(changes: dict[str, Any], message: str) -> None:
 def test_fixed_shapes_do_not_follow_the_time() -> None:
     """A mount has no time; its shapes are its own."""
     mount = default_mount()
-    with pytest.raises(DataError, match=r"DvlMount\.beams_d: expected an array of shape \(4, 3\)"):
-        dataclasses.replace(mount, beams_d=np.zeros((3, 3)))
+    with pytest.raises(DataError, match=r"DvlMount\.beams_d: expected an array of shape"):
+        dataclasses.replace(mount, beams_d=np.zeros((4, 2)))
     with pytest.raises(DataError, match=r"lever_arm_b"):
         dataclasses.replace(mount, lever_arm_b=np.zeros(2))
+
+
+@pytest.mark.parametrize("n_beams", [0, 9])
+def test_an_instrument_has_one_to_eight_beams(n_beams: int) -> None:
+    """As many as any maker builds."""
+    with pytest.raises(DataError, match=f"expected 1 to 8 beams, got {n_beams}"):
+        dataclasses.replace(default_mount(), beams_d=np.zeros((n_beams, 3)))
+
+
+def test_a_log_has_the_beams_of_its_mount() -> None:
+    """Three beams and four speeds are two instruments."""
+    mount = dataclasses.replace(default_mount(), beams_d=np.eye(3))
+    with pytest.raises(DataError, match="for each of the mount's 3 beams, got 4"):
+        DvlLog(mount=mount, time_s=np.zeros(1), speed=np.zeros((1, 4)), sigma=np.ones((1, 4)))
+    log = DvlLog(mount=mount, time_s=np.zeros(1), speed=np.zeros((1, 3)), sigma=np.ones((1, 3)))
+    assert log.mount.beam_scale_errors.shape == (3,)
 
 
 def test_missing_ranges_are_allowed_and_present_ones_checked() -> None:
@@ -122,3 +141,16 @@ def test_errors_have_one_base_and_hints_name_the_nearest() -> None:
     assert nearest_hint("zzz", ["lon", "lat"]) == "known are: lat, lon"
     with pytest.raises(SsmGraphError):
         Reference([0.0], [0.0, 1.0], [0.0], [0.0], np.zeros((1, 3)), np.zeros((1, 3)))  # type: ignore[arg-type]
+
+
+def test_a_sigma_that_is_not_stated_is_that_of_ground_or_water() -> None:
+    """NaN, zero and less state none; one nominal sigma may stand for both."""
+    stated = np.array([[0.5, np.nan, 0.0, -1.0], [np.nan, 0.3, np.inf, np.nan]])
+    water = np.array([False, True])
+    np.testing.assert_array_equal(
+        counted_sigma(stated, water, ground_sigma=0.01, water_sigma=0.08),
+        [[0.5, 0.01, 0.01, 0.01], [0.08, 0.3, np.inf, 0.08]],
+    )
+    for none in (None, 0.0):
+        alike = counted_sigma(np.full(4, np.nan), True, ground_sigma=0.01, water_sigma=none)
+        np.testing.assert_array_equal(alike, np.full(4, 0.01))

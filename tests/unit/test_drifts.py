@@ -7,16 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ssm_graph.data import Drift
-from ssm_graph.errors import ConfigError
-from ssm_graph.estimate import Status
-from ssm_graph.filters.named import filter_problems
-from ssm_graph.problem.problem import (
-    build_problem,
-    with_dvl,
-    with_stated_noise,
-    with_white_noise,
-)
+from ssm_graph.base.errors import ConfigError
+from ssm_graph.filters.navigation.named import filter_problems
+from ssm_graph.mission.estimate import Status
+from ssm_graph.mission.problem import build_problem, with_dvl, with_stated_noise, with_white_noise
+from ssm_graph.sensors.drift import Drift
 from ssm_graph.simulation import DriftSettings, DvlSettings, GnssSettings
 from ssm_graph.simulation.drifts import draw_drift
 from ssm_graph.smoothers.batch import SsmSmoother

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ssm_graph.earth import (
+from ssm_graph.base.earth import (
     EARTH_RATE,
     ECCENTRICITY_SQ,
     FLATTENING,

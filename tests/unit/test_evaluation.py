@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ssm_graph.data import Array, GnssLog, Reference
-from ssm_graph.earth import LocalFrame
-from ssm_graph.errors import DataError
-from ssm_graph.estimate import Trajectory, path_length_m
+from ssm_graph.base.earth import LocalFrame
+from ssm_graph.base.errors import DataError
+from ssm_graph.base.frozen import Array
 from ssm_graph.evaluation import (
     chi2_interval,
     error_series,
@@ -21,6 +20,9 @@ from ssm_graph.evaluation import (
     paired_ratio,
     reference_from_gnss,
 )
+from ssm_graph.mission.estimate import Trajectory, path_length_m
+from ssm_graph.mission.mission import Reference
+from ssm_graph.sensors.gnss import GnssLog
 
 FRAME = LocalFrame(lat=1.107, lon=0.182, height=-20.0)
 EPOCH = 1.7466e9

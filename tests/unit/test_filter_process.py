@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, V, X
 
-import ssm_graph.filters.process as process_module
-from ssm_graph.data import Array
-from ssm_graph.filters.process import Process
+import ssm_graph.filters.navigation.process as process_module
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import POSITION, VELOCITY
+from ssm_graph.engine.states import NavigationStates, local_D_deviation
+from ssm_graph.filters.navigation.process import Process
 from ssm_graph.imu.arrays import interval_arrays
 from ssm_graph.imu.preintegration import gtsam_gravity
-from ssm_graph.problem.error_state import POSITION, VELOCITY
-from ssm_graph.problem.problem import Problem, build_problem
-from ssm_graph.problem.states import NavigationStates, local_D_deviation
+from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.simulation import Grade
 from tests.helpers import simulated
 

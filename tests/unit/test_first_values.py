@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from factors.similarity import LogKernel
-from ssm_graph.data import Array
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import POSITION, ROTATION
 from ssm_graph.graph.beam_weights import GATE, settle_weights
 from ssm_graph.graph.first_values import LOCKED_OUT_PINGS, _ForwardPass, first_values
 from ssm_graph.graph.inertial_rows import inertial_graph
-from ssm_graph.problem.error_state import POSITION, ROTATION
-from ssm_graph.problem.problem import build_problem
+from ssm_graph.mission.problem import build_problem
 from ssm_graph.simulation import (
     CALM,
     DepthProfile,

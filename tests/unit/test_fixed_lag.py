@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from factors.similarity import GaussianKernel, LogKernel
-from ssm_graph.errors import ConfigError
+from ssm_graph.base.errors import ConfigError
+from ssm_graph.engine.chain import Chain
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.states import states_from_arrays
-from ssm_graph.problem.problem import Problem, build_problem, start_of, with_dvl
+from ssm_graph.mission.problem import Problem, build_problem, start_of, with_dvl
 from ssm_graph.simulation import Grade, OutlierKind, Outliers
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
-from ssm_graph.smoothers.chain import Chain
 from ssm_graph.smoothers.fixed_lag import FixedLagConfig, run_fixed_lag, solve_fixed_lag
 from ssm_graph.smoothers.keyframe import keyframes_of, sensors_of
 from ssm_graph.smoothers.window import Window

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ssm_graph.data import Array
-from ssm_graph.frames import (
+from ssm_graph.base.frames import (
     R_ENU_NED,
     R_lb_from_roll_pitch_heading,
     phi_D_roll_pitch_heading,
@@ -18,6 +17,7 @@ from ssm_graph.frames import (
     rotation_zyx,
     wrap_to_pi,
 )
+from ssm_graph.base.frozen import Array
 from tests.helpers import STEADY, rotation
 
 rolls = st.floats(-math.pi, math.pi)

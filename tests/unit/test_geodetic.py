@@ -10,12 +10,10 @@ import pytest
 
 from factors import so3
 from factors.similarity import GaussianKernel
-from ssm_graph.data import Array, Mission
-from ssm_graph.earth import EARTH_RATE
-from ssm_graph.errors import ConfigError, DataError
-from ssm_graph.estimate import Status
-from ssm_graph.filters.geodetic import GeodeticConfig, GeodeticHistory, run_geodetic, to_navigation
-from ssm_graph.filters.geodetic_error_model import (
+from ssm_graph.base.earth import EARTH_RATE
+from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.base.frozen import Array
+from ssm_graph.filters.geodetic.error_model import (
     DP,
     ERROR_DIM,
     NABLA,
@@ -25,14 +23,22 @@ from ssm_graph.filters.geodetic_error_model import (
     noise_densities,
     propagate,
 )
-from ssm_graph.filters.geodetic_measurements import beam_rows, gather, nominal_rows
-from ssm_graph.filters.geodetic_mechanisation import GeodeticState, Samples, Track, advance
-from ssm_graph.filters.named import filter_geodetic
+from ssm_graph.filters.geodetic.filter import (
+    GeodeticConfig,
+    GeodeticHistory,
+    run_geodetic,
+    to_navigation,
+)
+from ssm_graph.filters.geodetic.measurements import beam_rows, gather, nominal_rows
+from ssm_graph.filters.geodetic.mechanisation import GeodeticState, Samples, Track, advance
+from ssm_graph.filters.navigation.named import filter_geodetic
 from ssm_graph.graph.states import states_from_arrays
 from ssm_graph.imu.preintegration import INTEGRATION_DENSITY, imu_params
-from ssm_graph.problem import error_state
-from ssm_graph.problem.problem import Problem, build_problem
-from ssm_graph.problem.trajectory import trajectory_from_states
+from ssm_graph.mission.estimate import Status
+from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.problem import Problem, build_problem
+from ssm_graph.mission.start import moments
+from ssm_graph.mission.trajectory import trajectory_from_states
 from ssm_graph.simulation import (
     GnssSettings,
     Grade,
@@ -252,7 +258,7 @@ def test_start_is_that_of_the_graph() -> None:
     problem = build_problem(sim.mission)
     history = run_geodetic([problem], [sim.mission.imu])
     states = to_navigation(problem, history, 0)
-    expected = error_state.initial_moments(
+    expected = moments.initial_moments(
         problem.start, problem.frame, bias_sigma=problem.imu_noise_bias_sigma
     )
     np.testing.assert_allclose(states.R_nb[0], expected.R_nb, atol=1e-14)

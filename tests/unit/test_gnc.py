@@ -10,12 +10,12 @@ import pytest
 
 from factors.m_estimators import HuberKernel, TruncatedKernel
 from factors.similarity import WEIGHT_FLOOR, GaussianKernel, LogKernel
-from ssm_graph.errors import ConfigError
-from ssm_graph.estimate import Estimate, Status
-from ssm_graph.problem.problem import Problem, build_problem
+from ssm_graph.base.errors import ConfigError
+from ssm_graph.engine.gnc import GncSchedule, GncStart, Graduation, first_mu
+from ssm_graph.mission.estimate import Estimate, Status
+from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.simulation import OutlierKind, Outliers
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
-from ssm_graph.smoothers.gnc import GncSchedule, GncStart, Graduation, first_mu
 from tests.helpers import estimated_states, simulated, state_errors
 
 SPARSE = Outliers(OutlierKind.SPARSE, rate=0.1)

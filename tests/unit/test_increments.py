@@ -13,14 +13,15 @@ from hypothesis import strategies as st
 from scipy.integrate import quad_vec
 from scipy.spatial.transform import Rotation
 
-from ssm_graph.data import Array, ImuLog
-from ssm_graph.errors import ConfigError, DataError
+from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.base.frozen import Array
 from ssm_graph.imu.increments import (
     MergedSamples,
     _left_jacobian_solve,
     _left_jacobian_times,
     merge_samples,
 )
+from ssm_graph.sensors.imu import ImuLog
 from ssm_graph.simulation import IMU_NOISE, Grade
 from tests.helpers import STEADY
 

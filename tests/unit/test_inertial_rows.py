@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ssm_graph.data import Array
-from ssm_graph.estimate import Status
+from ssm_graph.base.frozen import Array
+from ssm_graph.base.stepwise import finished
+from ssm_graph.engine.error_state import POSITION, STATE_DIM
 from ssm_graph.graph.inertial_rows import inertial_graph, inertial_rows_steps
 from ssm_graph.graph.states import States, retract
 from ssm_graph.imu.preintegration import gravity_gradient
-from ssm_graph.problem.error_state import POSITION, STATE_DIM
-from ssm_graph.problem.problem import Problem, build_problem
+from ssm_graph.mission.estimate import Status
+from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.simulation import Grade
 from ssm_graph.smoothers.batch import SsmSmoother
-from ssm_graph.stepwise import finished
 from tests.helpers import (
     estimated_states,
     rotation,

@@ -7,10 +7,10 @@ from functools import cache
 import numpy as np
 
 from factors.similarity import GaussianKernel
-from ssm_graph.data import Array
-from ssm_graph.filters.named import filter_geodetic, filter_problems
-from ssm_graph.problem.error_state import Linearised
-from ssm_graph.problem.problem import Problem, build_problem
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import Linearised
+from ssm_graph.filters.navigation.named import filter_geodetic, filter_problems
+from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.simulation import Grade, OutlierKind, Outliers, SimulatedMission
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
 from ssm_graph.smoothers.fixed_lag import FixedLagConfig, solve_fixed_lag

@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 
 from benchmarks.calibration_cases import as_stated, asking
-from ssm_graph.aid_logs import Standstill
-from ssm_graph.data import Array, Drift
-from ssm_graph.errors import ConfigError
+from ssm_graph.base.errors import ConfigError
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import STATE_DIM
+from ssm_graph.engine.extras import Extra, Extras
 from ssm_graph.graph.gtsam_graph import chain_ordering, gtsam_graph
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.states import States, retract, states_from_arrays
-from ssm_graph.problem.error_state import STATE_DIM
-from ssm_graph.problem.extras import Extra, Extras
-from ssm_graph.problem.problem import Problem, build_problem
+from ssm_graph.mission.problem import Problem, build_problem
+from ssm_graph.sensors.drift import Drift
+from ssm_graph.sensors.standstill import Standstill
 from ssm_graph.simulation import (
     AidSettings,
     CompassSettings,

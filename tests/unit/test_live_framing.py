@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ssm_graph.errors import ConfigError
-from ssm_graph.live.decoder import (
+from ssm_graph.base.errors import ConfigError
+from ssm_graph.live.protocols.decoder import (
     MAX_REFUSALS,
     Clock,
     Refusals,
@@ -20,7 +20,7 @@ from ssm_graph.live.decoder import (
     parse_object,
     shown,
 )
-from ssm_graph.live.framing import LineFramer, ObjectFramer, TokenBucket
+from ssm_graph.live.protocols.framing import LineFramer, ObjectFramer, TokenBucket
 from tests.helpers import STEADY
 
 SOUP = st.lists(

@@ -8,7 +8,8 @@ import random
 import pytest
 
 from benchmarks.fuzz import Target, damaged, json_traffic, report_lines, run, targets
-from ssm_graph.messages import DepthReading, Message
+from ssm_graph.sensors.depth import DepthReading
+from ssm_graph.sensors.messages import Message
 
 
 @pytest.mark.parametrize("k", range(len(targets())))

@@ -12,27 +12,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ssm_graph.estimate import Trajectory
-from ssm_graph.frames import BodyAxes, to_frd
-from ssm_graph.io.mission_units import SI
-from ssm_graph.io.results import trajectory_columns
-from ssm_graph.live.json_messages import (
+from ssm_graph.base.frames import BodyAxes, to_frd
+from ssm_graph.io.mission_folder.units import SI
+from ssm_graph.io.results.tables import trajectory_columns
+from ssm_graph.live.protocols.json_messages import (
     KEYS,
     JsonDecoder,
     encode_message,
     encode_navigation,
     navigation_fields,
 )
-from ssm_graph.messages import (
-    DepthReading,
-    Fix,
-    Health,
-    ImuSample,
-    Message,
-    Navigation,
-    Ping,
-    bad_number,
-)
+from ssm_graph.mission.estimate import Trajectory
+from ssm_graph.mission.navigation import Health, Navigation
+from ssm_graph.sensors.depth import DepthReading
+from ssm_graph.sensors.dvl import Ping
+from ssm_graph.sensors.gnss import Fix
+from ssm_graph.sensors.imu import ImuSample
+from ssm_graph.sensors.messages import Message, bad_number
 from tests.helpers import STEADY
 
 NUMBER = st.floats(-1e9, 1e9)
@@ -107,6 +103,16 @@ def test_lines_of_the_documentation() -> None:
     assert not refused
 
 
+@pytest.mark.parametrize("lon_deg", [-180, -10, 180, 190.125, 360])
+def test_longitudes_may_go_once_around(lon_deg: float) -> None:
+    """As in all other inputs; what is beyond half a turn is west of Greenwich."""
+    (fix,), refused = decode(f"{changed('gnss', lon_deg=lon_deg)}\n".encode())
+    assert isinstance(fix, Fix)
+    assert not refused
+    west = lon_deg - 360 if lon_deg > 180 else lon_deg
+    assert fix.lon == pytest.approx(math.radians(west), rel=1e-15)
+
+
 @pytest.mark.parametrize("axes", BodyAxes)
 def test_axes_are_those_of_the_mission_folder(axes: BodyAxes) -> None:
     """The same names, the same turns."""
@@ -145,7 +151,8 @@ def changed(kind: str, **changes: Any) -> str:
         (changed("depth", depth_m=[1]), "expected a number"),
         (changed("depth", lat_deg=1), "unknown key 'lat_deg'"),
         (changed("gnss", lat_deg=90.001), "check the unit"),
-        (changed("gnss", lon_deg=-181), "check the unit"),
+        (changed("gnss", lon_deg=-181), "expected -180 to 360, got -181; check the unit"),
+        (changed("gnss", lon_deg=360.5), "expected -180 to 360"),
         (changed("gnss", lat_deg="63"), "expected a number"),
         (changed("gnss", sigma_m=[1, -1, 1]), "sigma_m"),
         (LINES["gnss"].replace("63.5", "NaN"), "finite"),

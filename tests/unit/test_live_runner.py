@@ -10,21 +10,24 @@ from typing import Any
 
 import pytest
 
-from ssm_graph.errors import ConfigError, DataError
-from ssm_graph.io.checkpoint import CHECKPOINT_NAME, older_name
-from ssm_graph.io.mission import read_mission
-from ssm_graph.io.raw_log import RawLog
-from ssm_graph.io.results import read_results
-from ssm_graph.live.checkpoint_writer import CheckpointWriter
-from ssm_graph.live.interfaces import Connections, Engine
-from ssm_graph.live.outputs import OutputFormat
-from ssm_graph.live.publisher import Every, Publisher
-from ssm_graph.live.replay_source import ReplaySource
-from ssm_graph.live.run_folder import RunFolder
-from ssm_graph.live.run_summary import MOST_FAILURES, RunEnd, StopReason
-from ssm_graph.live.runner import Runner, RunnerConfig
-from ssm_graph.live.status import LinkState, RunStatus
-from ssm_graph.messages import Event, ImuSample, Message, Navigation, Ping, Severity
+from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.io.mission_folder.reader import read_mission
+from ssm_graph.io.raw_log.log import RawLog
+from ssm_graph.io.results.tables import read_results
+from ssm_graph.io.tables.checkpoint import CHECKPOINT_NAME, older_name
+from ssm_graph.live.run.checkpoint_writer import CheckpointWriter
+from ssm_graph.live.run.interfaces import Connections, Engine
+from ssm_graph.live.run.replay_source import ReplaySource
+from ssm_graph.live.run.run_folder import RunFolder
+from ssm_graph.live.run.run_summary import MOST_FAILURES, RunEnd, StopReason
+from ssm_graph.live.run.runner import Runner, RunnerConfig
+from ssm_graph.live.run.status import LinkState, RunStatus
+from ssm_graph.live.sockets.outputs import OutputFormat
+from ssm_graph.live.sockets.publisher import Every, Publisher
+from ssm_graph.mission.navigation import Event, Navigation, Severity
+from ssm_graph.sensors.dvl import Ping
+from ssm_graph.sensors.imu import ImuSample
+from ssm_graph.sensors.messages import Message
 from tests.live_fixture import (
     FAKE,
     Crash,
@@ -337,7 +340,7 @@ def test_a_slow_disk_does_not_hold_up_the_loop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A checkpoint that is due while the last one is on its way waits, and it is said."""
-    monkeypatch.setattr("ssm_graph.live.checkpoint_writer.CheckpointWriter.is_busy", True)
+    monkeypatch.setattr("ssm_graph.live.run.checkpoint_writer.CheckpointWriter.is_busy", True)
     ticks = iter(range(100_000))
     run(tmp_path, ListSource(some_messages()), steady_s=lambda: float(next(ticks)))
     assert "checkpoint_late" in kinds(tmp_path)
@@ -349,7 +352,7 @@ def test_a_checkpoint_that_fails_is_said(tmp_path: Path, monkeypatch: pytest.Mon
     def fail(*_: object) -> None:
         raise OSError("no space left")
 
-    monkeypatch.setattr("ssm_graph.live.checkpoint_writer.write_checkpoint", fail)
+    monkeypatch.setattr("ssm_graph.live.run.checkpoint_writer.write_checkpoint", fail)
     run(tmp_path, ListSource(some_messages()))
     assert "checkpoint_failed" in kinds(tmp_path)
 

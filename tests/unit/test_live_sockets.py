@@ -11,18 +11,23 @@ from itertools import pairwise
 
 import pytest
 
-from ssm_graph.errors import ConfigError
-from ssm_graph.live.decoder import Clock
-from ssm_graph.live.endpoints import LOOPBACK, OUTPUTS, Endpoint, Transport, parse_endpoint
-from ssm_graph.live.feed import CHUNK, CountingDecoder, Limits
-from ssm_graph.live.json_messages import JsonDecoder, encode_message
-from ssm_graph.live.listeners import TcpServerInput, UdpInput
-from ssm_graph.live.nmea import NmeaDecoder
-from ssm_graph.live.outputs import MAX_CLIENTS, MAX_WAITING, OutputFormat, TcpServerOutput
-from ssm_graph.live.sockets import InputConfig, OutputConfig, SocketHub
-from ssm_graph.live.status import LinkState
-from ssm_graph.live.waterlinked import WaterLinkedDecoder
-from ssm_graph.messages import DepthReading, Fix, ImuSample, Message, Ping, Severity
+from ssm_graph.base.errors import ConfigError
+from ssm_graph.live.protocols.decoder import Clock
+from ssm_graph.live.protocols.json_messages import JsonDecoder, encode_message
+from ssm_graph.live.protocols.nmea import NmeaDecoder
+from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
+from ssm_graph.live.run.feed import CHUNK, CountingDecoder, Limits
+from ssm_graph.live.run.status import LinkState
+from ssm_graph.live.sockets.endpoints import LOOPBACK, OUTPUTS, Endpoint, Transport, parse_endpoint
+from ssm_graph.live.sockets.listeners import TcpServerInput, UdpInput
+from ssm_graph.live.sockets.outputs import MAX_CLIENTS, MAX_WAITING, OutputFormat, TcpServerOutput
+from ssm_graph.live.sockets.sockets import InputConfig, OutputConfig, SocketHub
+from ssm_graph.mission.navigation import Severity
+from ssm_graph.sensors.depth import DepthReading
+from ssm_graph.sensors.dvl import Ping
+from ssm_graph.sensors.gnss import Fix
+from ssm_graph.sensors.imu import ImuSample
+from ssm_graph.sensors.messages import Message
 from tests.instrument_fixture import A50, Receiver, UdpSender, gga, pips, report
 
 WALL_S = 1_700_000_000.0
@@ -269,7 +274,7 @@ def test_a_call_that_nobody_answers_is_given_up(monkeypatch: pytest.MonkeyPatch)
     clock = FakeTime()
     monkeypatch.setattr(socket.socket, "connect_ex", lambda *_: 115)
     monkeypatch.setattr(
-        "ssm_graph.live.inputs.selectors.EVENT_WRITE", 1
+        "ssm_graph.live.sockets.inputs.selectors.EVENT_WRITE", 1
     )  # a new socket can always be written
     with SocketHub([dvl_at(9)], steady_s=clock.steady_s) as hub:
         receiver = Receiver(hub)

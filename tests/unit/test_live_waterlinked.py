@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ssm_graph.live.decoder import Clock
-from ssm_graph.live.waterlinked import BeamRule, WaterLinkedDecoder
-from ssm_graph.messages import Ping
+from ssm_graph.live.protocols.decoder import Clock
+from ssm_graph.live.protocols.waterlinked import BeamRule, WaterLinkedDecoder
+from ssm_graph.sensors.dvl import Ping
 
 DATA = Path(os.environ.get("SSM_GRAPH_DATA", Path(__file__).parents[2] / "../shared/data"))
 LOGS = DATA / "waterlinked_a50"

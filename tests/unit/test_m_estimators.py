@@ -25,9 +25,9 @@ from factors.m_estimators import (
     TruncatedKernel,
 )
 from factors.similarity import WEIGHT_FLOOR, GaussianKernel, Kernel, LogKernel, Similarity
+from ssm_graph.base.errors import ConfigError
 from ssm_graph.cli.options import kernel_from
 from ssm_graph.cli.smooth import CHOICES
-from ssm_graph.errors import ConfigError
 from ssm_graph.smoothers import batch
 from ssm_graph.smoothers.batch import SmootherConfig
 from tests.helpers import STEADY

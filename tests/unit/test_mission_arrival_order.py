@@ -10,11 +10,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ssm_graph.errors import ConfigError, DataError, SsmGraphError
-from ssm_graph.io.arrival_tables import read_arrival_table
-from ssm_graph.io.mission import read_mission
-from ssm_graph.io.mission_keys import TABLES
-from ssm_graph.io.tables import Table, read_table
+from ssm_graph.base.errors import ConfigError, DataError, SsmGraphError
+from ssm_graph.io.mission_folder.arrival_tables import read_arrival_table
+from ssm_graph.io.mission_folder.keys import TABLES
+from ssm_graph.io.mission_folder.reader import read_mission
+from ssm_graph.io.tables.table import Table, read_table
 from tests.mission_damage import Damage as FolderDamage
 from tests.mission_damage import cell, columns, lines, toml
 from tests.mission_fixture import write_example

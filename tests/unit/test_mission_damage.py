@@ -11,9 +11,9 @@ import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ssm_graph.data import Mission
-from ssm_graph.errors import SsmGraphError
-from ssm_graph.io.mission import read_mission
+from ssm_graph.base.errors import SsmGraphError
+from ssm_graph.io.mission_folder.reader import read_mission
+from ssm_graph.mission.mission import Mission
 from tests.mission_damage import AIDS_TABLES, aided
 from tests.mission_fixture import write_example
 

@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ssm_graph.data import Array, Drift, Mission
-from ssm_graph.errors import ConfigError, DataError
-from ssm_graph.io.mission import read_mission
+from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.base.frozen import Array
+from ssm_graph.io.mission_folder.reader import read_mission
+from ssm_graph.mission.mission import Mission
+from ssm_graph.sensors.drift import Drift
 from tests.mission_damage import (
     ACCEL,
     BEAMS,

@@ -12,15 +12,19 @@ import tomli_w
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ssm_graph.data import DepthCalibration, Drift, DvlLog, GnssCalibration, Mission
-from ssm_graph.errors import ConfigError, DataError, MissingExtraError
-from ssm_graph.io import tables as tables_module
-from ssm_graph.io.mission import read_mission
-from ssm_graph.io.mission_units import SI, R_bd_from_rpy, from_si, rpy_from_R_bd, to_si
-from ssm_graph.io.mission_writer import write_mission
-from ssm_graph.io.tables import TableFormat
-from ssm_graph.io.vehicle import read_vehicle, vehicle_of
-from ssm_graph.water_current import CurrentModel
+from ssm_graph.base.errors import ConfigError, DataError, MissingExtraError
+from ssm_graph.io.mission_folder.reader import read_mission
+from ssm_graph.io.mission_folder.units import SI, R_bd_from_rpy, from_si, rpy_from_R_bd, to_si
+from ssm_graph.io.mission_folder.vehicle import read_vehicle, vehicle_of
+from ssm_graph.io.mission_folder.writer import write_mission
+from ssm_graph.io.tables import table as tables_module
+from ssm_graph.io.tables.table import TableFormat
+from ssm_graph.mission.mission import Mission
+from ssm_graph.sensors.current import CurrentModel
+from ssm_graph.sensors.depth import DepthCalibration
+from ssm_graph.sensors.drift import Drift
+from ssm_graph.sensors.dvl import DvlLog
+from ssm_graph.sensors.gnss import GnssCalibration
 from tests.mission_damage import both, columns, new_column, toml
 from tests.mission_fixture import make_mission, write_example
 

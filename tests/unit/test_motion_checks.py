@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ssm_graph.data import Mission
-from ssm_graph.io.mission_motion_checks import check_motion
+from ssm_graph.io.mission_folder.checks.motion import check_motion
+from ssm_graph.mission.mission import Mission
 from ssm_graph.simulation import CALM, Grade, HoverRoute, scenario_config, simulate
 
 LABELS = {name: f"{name}.csv" for name in ("imu", "dvl", "depth", "gnss")}

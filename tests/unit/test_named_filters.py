@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from factors.kernels import KERNELS
-from ssm_graph.data import Array
-from ssm_graph.errors import ConfigError
-from ssm_graph.estimate import OUTLIER_WEIGHT, Estimate, Status, Trajectory
-from ssm_graph.filters.named import FILTERS, filter_problems
-from ssm_graph.problem.problem import Problem, build_problem
+from ssm_graph.base.errors import ConfigError
+from ssm_graph.base.frozen import Array
+from ssm_graph.filters.navigation.named import FILTERS, filter_problems
+from ssm_graph.mission.estimate import OUTLIER_WEIGHT, Estimate, Status, Trajectory
+from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.simulation import OutlierKind, Outliers, SimulatedMission
 from tests.helpers import simulated
 

@@ -7,18 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ssm_graph.data import Array
-from ssm_graph.estimate import Estimate, NoiseFound, Status
+from ssm_graph.base.frozen import Array
+from ssm_graph.base.stepwise import finished
 from ssm_graph.graph.first_values import first_values
 from ssm_graph.graph.gtsam_graph import gtsam_graph
 from ssm_graph.graph.inertial_fit import inertial_fit
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.problem.problem import Beams, Problem, build_problem
+from ssm_graph.mission.estimate import Estimate, NoiseFound, Status
+from ssm_graph.mission.problem import Beams, Problem, build_problem
 from ssm_graph.simulation import Grade, OutlierKind, Outliers
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
 from ssm_graph.smoothers.beam_faults import KERNEL
 from ssm_graph.smoothers.noise import adaptation, beam_noise, noise_notes, with_sigmas
-from ssm_graph.stepwise import finished
 from tests.helpers import simulated
 
 N = 20_000

@@ -9,10 +9,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ssm_graph.messages import Fix, Health, ImuSample, Message, Navigation, Ping
-from ssm_graph.online import ONLINE, FixedLagSmoother
-from ssm_graph.online.course import FRESH_S, SPARSE_S
-from ssm_graph.problem.problem import build_problem
+from ssm_graph.live.estimator import ONLINE, FixedLagSmoother
+from ssm_graph.live.estimator.course import FRESH_S, SPARSE_S
+from ssm_graph.mission.navigation import Health, Navigation
+from ssm_graph.mission.problem import build_problem
+from ssm_graph.sensors.dvl import Ping
+from ssm_graph.sensors.gnss import Fix
+from ssm_graph.sensors.imu import ImuSample
+from ssm_graph.sensors.messages import Message
 from ssm_graph.smoothers.fixed_lag import solve_fixed_lag
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
 from tests.online_fixture import SHORT, joined, messages, run, stream

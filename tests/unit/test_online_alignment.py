@@ -11,16 +11,20 @@ from types import FrameType
 import numpy as np
 import pytest
 
-from ssm_graph.data import Array
-from ssm_graph.io.replay import messages_of
-from ssm_graph.io.vehicle import vehicle_of
-from ssm_graph.messages import Health, ImuSample, Message, Navigation, Vehicle
-from ssm_graph.online import FixedLagSmoother, start
-from ssm_graph.online.events import EventLog
-from ssm_graph.online.intake import Intake
-from ssm_graph.online.start import MOST_MS, Beginning, Starter
-from ssm_graph.problem.alignment import N_HYPOTHESES, align
-from ssm_graph.problem.problem import ProblemConfig, build_problem
+from ssm_graph.base.frozen import Array
+from ssm_graph.base.stepwise import Steps, finished
+from ssm_graph.io.mission_folder.vehicle import vehicle_of
+from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.live.estimator import FixedLagSmoother, start
+from ssm_graph.live.estimator.events import EventLog
+from ssm_graph.live.estimator.intake import Intake
+from ssm_graph.live.estimator.start import MOST_MS, Beginning, Starter
+from ssm_graph.mission.navigation import Health, Navigation
+from ssm_graph.mission.problem import ProblemConfig, build_problem
+from ssm_graph.mission.start.alignment import N_HYPOTHESES, align
+from ssm_graph.mission.vehicle import Vehicle
+from ssm_graph.sensors.imu import ImuSample
+from ssm_graph.sensors.messages import Message
 from ssm_graph.simulation import (
     DepthProfile,
     DvlSettings,
@@ -35,7 +39,6 @@ from ssm_graph.simulation import (
 from ssm_graph.smoothers.fixed_lag import run_fixed_lag
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
 from ssm_graph.smoothers.mission import smooth, smooth_steps
-from ssm_graph.stepwise import Steps, finished
 from tests.online_fixture import SHORT
 
 AT_SURFACE = DepthProfile(0.3, 0.3)

@@ -10,17 +10,20 @@ import numpy as np
 import pytest
 
 from benchmarks.calibration_cases import MOUNTING, SCALE
-from ssm_graph.data import Array
-from ssm_graph.errors import DataError
-from ssm_graph.estimate import Calibration
-from ssm_graph.io.replay import messages_of
-from ssm_graph.io.vehicle import vehicle_of
-from ssm_graph.messages import Health, Message, Ping, Vehicle
-from ssm_graph.online import ONLINE, FixedLagSmoother
-from ssm_graph.online.recovery import Doubted, reanchored
-from ssm_graph.problem.calibration import DVL_MOUNTING, DVL_SCALE
-from ssm_graph.problem.error_state import STATE_DIM
-from ssm_graph.problem.problem import build_problem
+from ssm_graph.base.errors import DataError
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import STATE_DIM
+from ssm_graph.io.mission_folder.vehicle import vehicle_of
+from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.live.estimator import ONLINE, FixedLagSmoother
+from ssm_graph.live.estimator.recovery import Doubted, reanchored
+from ssm_graph.mission.calibration import DVL_MOUNTING, DVL_SCALE
+from ssm_graph.mission.estimate import Calibration
+from ssm_graph.mission.navigation import Health
+from ssm_graph.mission.problem import build_problem
+from ssm_graph.mission.vehicle import Vehicle
+from ssm_graph.sensors.dvl import Ping
+from ssm_graph.sensors.messages import Message
 from ssm_graph.simulation import GnssSettings, Loss
 from ssm_graph.smoothers.fixed_lag import run_fixed_lag
 from tests.water_fixture import in_current

@@ -9,8 +9,13 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ssm_graph.messages import DepthReading, Fix, Health, ImuSample, Message, Navigation, Ping
-from ssm_graph.online import ONLINE, FixedLagSmoother
+from ssm_graph.live.estimator import ONLINE, FixedLagSmoother
+from ssm_graph.mission.navigation import Health, Navigation
+from ssm_graph.sensors.depth import DepthReading
+from ssm_graph.sensors.dvl import Ping
+from ssm_graph.sensors.gnss import Fix
+from ssm_graph.sensors.imu import ImuSample
+from ssm_graph.sensors.messages import Message
 from tests.online_fixture import SHORT, messages, stream
 
 

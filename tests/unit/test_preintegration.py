@@ -8,8 +8,8 @@ import gtsam
 import numpy as np
 import pytest
 
-from ssm_graph.data import Array, ImuLog, ImuNoise
-from ssm_graph.earth import EARTH_RATE, LocalFrame
+from ssm_graph.base.earth import EARTH_RATE, LocalFrame
+from ssm_graph.base.frozen import Array
 from ssm_graph.graph.inertial_rows import inertial_graph
 from ssm_graph.imu.preintegration import (
     GAP_ACCEL,
@@ -23,7 +23,8 @@ from ssm_graph.imu.preintegration import (
     imu_params,
     preintegrate,
 )
-from ssm_graph.problem.problem import ProblemConfig, build_problem
+from ssm_graph.mission.problem import ProblemConfig, build_problem
+from ssm_graph.sensors.imu import ImuLog, ImuNoise
 from ssm_graph.simulation import IMU_NOISE, Grade, SurveyRoute
 from tests.helpers import assert_consistent, simulated, true_states
 

@@ -21,14 +21,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ssm_graph.errors import ConfigError
-from ssm_graph.io import raw_log, raw_replay
-from ssm_graph.io.mission import read_mission
-from ssm_graph.io.raw_log import RawLog, replay
-from ssm_graph.io.raw_rows import ROW_KINDS, degrees_of
-from ssm_graph.io.replay import messages_of
-from ssm_graph.io.vehicle import vehicle_of
-from ssm_graph.messages import DepthReading, Fix, ImuSample, Message, Ping
+from ssm_graph.base.errors import ConfigError
+from ssm_graph.io.mission_folder.reader import read_mission
+from ssm_graph.io.mission_folder.vehicle import vehicle_of
+from ssm_graph.io.raw_log import log as raw_log
+from ssm_graph.io.raw_log import replay as raw_replay
+from ssm_graph.io.raw_log.log import RawLog, replay
+from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.io.raw_log.rows import ROW_KINDS, degrees_of
+from ssm_graph.sensors.depth import DepthReading
+from ssm_graph.sensors.dvl import Ping
+from ssm_graph.sensors.gnss import Fix
+from ssm_graph.sensors.imu import ImuSample
+from ssm_graph.sensors.messages import Message
 from tests.mission_fixture import make_mission
 from tests.unit.test_mission_roundtrip import assert_same
 

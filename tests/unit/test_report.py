@@ -12,13 +12,18 @@ import pytest
 from matplotlib.figure import Figure
 from rich.console import Console, RenderableType
 
-from ssm_graph.data import Array
-from ssm_graph.errors import DataError
-from ssm_graph.estimate import BeamTable, Estimate, Iteration, Status
+from ssm_graph.base.errors import DataError
+from ssm_graph.base.frozen import Array
 from ssm_graph.evaluation import evaluate
+from ssm_graph.mission.estimate import BeamTable, Estimate, Iteration, Status
 from ssm_graph.report import ProgressDisplay, save_figure, summary_table
-from ssm_graph.report.figure import draw_figure
-from ssm_graph.report.style import broken_at_gaps, thinned, thinned_outliers_first, time_axis
+from ssm_graph.report.mission.figure import draw_figure
+from ssm_graph.report.mission.style import (
+    broken_at_gaps,
+    thinned,
+    thinned_outliers_first,
+    time_axis,
+)
 from tests.estimate_fixture import NOTES, calibrated, make_run, with_current
 
 NO_BEAMS = BeamTable(*[np.empty(0)] * 5)

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from ssm_graph.online import FixedLagSmoother
-from ssm_graph.online.recovery import Doubt, Doubted, doubt_of, is_astray, watch_after
-from ssm_graph.online.reserve import RENEW_S, SPEED_SIGMA, Kept, Reserve
-from ssm_graph.online.watch import Contradicted, Watch
-from ssm_graph.problem.error_state import POSITION, ROTATION, VELOCITY
+from ssm_graph.engine.error_state import POSITION, ROTATION, VELOCITY
+from ssm_graph.live.estimator import FixedLagSmoother
+from ssm_graph.live.estimator.recovery import Doubt, Doubted, doubt_of, is_astray, watch_after
+from ssm_graph.live.estimator.reserve import RENEW_S, SPEED_SIGMA, Kept, Reserve
+from ssm_graph.live.estimator.watch import Contradicted, Watch
 from ssm_graph.smoothers.keyframe import Keyframe
 from tests.online_fixture import SHORT, messages, stream
 

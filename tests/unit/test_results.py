@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ssm_graph.errors import DataError
-from ssm_graph.estimate import BeamTable, Status, path_length_m
+from ssm_graph.base.errors import DataError
 from ssm_graph.evaluation import evaluate
-from ssm_graph.io import results as results_module
-from ssm_graph.io.results import read_results, write_results
-from ssm_graph.io.results_summary import as_json
+from ssm_graph.io.results import tables as results_module
+from ssm_graph.io.results.summary import as_json
+from ssm_graph.io.results.tables import read_results, write_results
+from ssm_graph.mission.estimate import BeamTable, Status, path_length_m
 from tests.estimate_fixture import EPOCH, NOTES, make_mission, make_run, with_current
 
 TRAJECTORY_HEADER = (

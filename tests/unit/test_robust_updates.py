@@ -11,13 +11,13 @@ from scipy.stats import chi2
 
 from factors import so3
 from factors.similarity import WEIGHT_FLOOR, ExpKernel, LogKernel, Similarity
-from ssm_graph.data import Array
-from ssm_graph.filters.correntropy import CorrentropyUpdate
-from ssm_graph.filters.kalman import Gate, GatedUpdate, KalmanUpdate
-from ssm_graph.filters.linear import LinearModel, LinearSystem
-from ssm_graph.filters.model import NOMINAL, Iterate, Runs
-from ssm_graph.filters.ssm import Floor, SsmUpdate, StopRule
-from ssm_graph.problem.error_state import Linearised
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import Linearised
+from ssm_graph.filters.rules.correntropy import CorrentropyUpdate
+from ssm_graph.filters.rules.kalman import Gate, GatedUpdate, KalmanUpdate
+from ssm_graph.filters.rules.linear import LinearModel, LinearSystem
+from ssm_graph.filters.rules.model import NOMINAL, Iterate, Runs
+from ssm_graph.filters.rules.ssm import Floor, SsmUpdate, StopRule
 from tests.update_fixture import (
     ALL_ROWS,
     EACH_ROW,

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ssm_graph.errors import DataError
-from ssm_graph.frames import R_FRD, BodyAxes
-from ssm_graph.io.ros_messages import (
+from ssm_graph.base.errors import DataError
+from ssm_graph.base.frames import R_FRD, BodyAxes
+from ssm_graph.io.ros.messages import (
     CONVERTERS,
     FIX_SIGMA,
     BeamSign,
@@ -25,7 +25,11 @@ from ssm_graph.io.ros_messages import (
     imu_sample,
     ping,
 )
-from ssm_graph.messages import DepthReading, Fix, ImuSample, Ping, bad_number
+from ssm_graph.sensors.depth import DepthReading
+from ssm_graph.sensors.dvl import Ping
+from ssm_graph.sensors.gnss import Fix
+from ssm_graph.sensors.imu import ImuSample
+from ssm_graph.sensors.messages import bad_number
 
 NAN = math.nan
 RECEIVED_S = 99.5
@@ -270,12 +274,19 @@ def test_fix_of_unknown_quality_gets_the_stated_one(kind: int) -> None:
     assert has_stated_sigma(nav_sat_fix(position_covariance_type=kind))
 
 
+def test_longitudes_may_go_once_around() -> None:
+    """What is beyond half a turn is west of Greenwich."""
+    assert fix(nav_sat_fix(longitude=240.0), RECEIVED_S).lon == pytest.approx(math.radians(-120.0))
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
         ({"status": SimpleNamespace(status=-1)}, "no fix"),
         ({"latitude": NAN}, "latitude is not finite"),
         ({"latitude": 91.0}, "place on Earth"),
+        ({"longitude": -181.0}, "place on Earth"),
+        ({"longitude": 361.0}, "place on Earth"),
         ({"latitude": 0.0, "longitude": 0.0}, "place on Earth"),
         ({"altitude": NAN}, "altitude is not finite"),
     ],

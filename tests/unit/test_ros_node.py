@@ -24,11 +24,13 @@ from examples.ros2_node.ssm_graph_node import (
     ros_class,
     subscriptions,
 )
-from ssm_graph.earth import LocalFrame
-from ssm_graph.errors import ConfigError
-from ssm_graph.io.mission import write_mission
-from ssm_graph.io.ros_messages import IMU_TYPE, WATER_LINKED_TYPE
-from ssm_graph.messages import Event, Health, ImuSample, Message, Navigation, Severity
+from ssm_graph.base.earth import LocalFrame
+from ssm_graph.base.errors import ConfigError
+from ssm_graph.io.mission_folder.reader import write_mission
+from ssm_graph.io.ros.messages import IMU_TYPE, WATER_LINKED_TYPE
+from ssm_graph.mission.navigation import Event, Health, Navigation, Severity
+from ssm_graph.sensors.imu import ImuSample
+from ssm_graph.sensors.messages import Message
 from tests.helpers import simulated
 
 FRAME = LocalFrame(math.radians(45.7), math.radians(126.6), 10.0)
@@ -380,7 +382,7 @@ def test_main_wires_everything(
             QoSProfile=dict, ReliabilityPolicy=SimpleNamespace(BEST_EFFORT=2)
         ),
         "rclpy.executors": SimpleNamespace(ExternalShutdownException=StoppedError),
-        "ssm_graph.online": SimpleNamespace(FixedLagSmoother=lambda _: FakeEstimator()),
+        "ssm_graph.live.estimator": SimpleNamespace(FixedLagSmoother=lambda _: FakeEstimator()),
     }
     classes = dict.fromkeys(("Imu", "Dvl", "FluidPressure", "NavSatFix", "Odometry"), blank)
     monkeypatch.setattr(

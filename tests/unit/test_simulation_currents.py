@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ssm_graph.errors import ConfigError
+from ssm_graph.base.errors import ConfigError
 from ssm_graph.simulation import (
     CALM,
     Current,

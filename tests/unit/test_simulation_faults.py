@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from ssm_graph.errors import ConfigError
+from ssm_graph.base.errors import ConfigError
 from ssm_graph.simulation import Fault, FaultShape, Loss, OutlierKind, Outliers
 from ssm_graph.simulation.faults import BeamFaults, draw_missing, draw_outliers
 from ssm_graph.simulation.programmed import add_faults

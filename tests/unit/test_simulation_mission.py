@@ -13,9 +13,9 @@ import pytest
 from scipy.interpolate import CubicHermiteSpline
 
 import ssm_graph.simulation
-from ssm_graph.data import Array
-from ssm_graph.earth import LocalFrame
-from ssm_graph.errors import ConfigError
+from ssm_graph.base.earth import LocalFrame
+from ssm_graph.base.errors import ConfigError
+from ssm_graph.base.frozen import Array
 from ssm_graph.simulation import (
     SCENARIOS,
     DvlSettings,

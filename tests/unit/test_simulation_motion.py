@@ -7,16 +7,16 @@ import math
 import numpy as np
 import pytest
 
-from ssm_graph.data import Array
-from ssm_graph.earth import (
+from ssm_graph.base.earth import (
     EARTH_RATE,
     R_el_from_lat_lon,
     ecef_from_geodetic,
     normal_gravity,
     radii_of_curvature,
 )
-from ssm_graph.errors import ConfigError
-from ssm_graph.frames import R_lb_from_roll_pitch_heading
+from ssm_graph.base.errors import ConfigError
+from ssm_graph.base.frames import R_lb_from_roll_pitch_heading
+from ssm_graph.base.frozen import Array
 from ssm_graph.simulation import (
     CALM,
     DepthProfile,

@@ -10,10 +10,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from ssm_graph.data import Array
-from ssm_graph.earth import LocalFrame
-from ssm_graph.errors import ConfigError
-from ssm_graph.frames import R_lb_from_roll_pitch_heading
+from ssm_graph.base.earth import LocalFrame
+from ssm_graph.base.errors import ConfigError
+from ssm_graph.base.frames import R_lb_from_roll_pitch_heading
+from ssm_graph.base.frozen import Array
 from ssm_graph.simulation import (
     CALM,
     IMU_NOISE,

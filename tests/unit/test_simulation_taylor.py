@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from ssm_graph.data import Array
+from ssm_graph.base.frozen import Array
 from ssm_graph.simulation.taylor import (
     Series,
     antiderivative,

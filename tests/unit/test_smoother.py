@@ -12,13 +12,13 @@ import pytest
 from gtsam.symbol_shorthand import B, V, X
 
 from factors.similarity import ExpKernel, GaussianKernel, Kernel, LogKernel, SqrtKernel
-from ssm_graph.data import Array
-from ssm_graph.errors import ConfigError
-from ssm_graph.estimate import Estimate, Iteration, Status
+from ssm_graph.base.errors import ConfigError
+from ssm_graph.base.frozen import Array
 from ssm_graph.graph.first_values import first_values
 from ssm_graph.graph.gtsam_graph import gtsam_graph
 from ssm_graph.graph.states import States, states_from_arrays
-from ssm_graph.problem.problem import Problem, build_problem
+from ssm_graph.mission.estimate import Estimate, Iteration, Status
+from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.simulation import GnssSettings, Grade, Loss, OutlierKind, Outliers
 from ssm_graph.smoothers.batch import Similarity, SmootherConfig, SsmSmoother
 from tests.helpers import (

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ssm_graph.estimate import Status
-from ssm_graph.problem.problem import Problem, build_problem
+from ssm_graph.mission.estimate import Status
+from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.simulation import OutlierKind, Outliers, scenario_config, simulate
 from ssm_graph.smoothers.batch import SsmSmoother
 

@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ssm_graph.data import Array, ImuNoise, Mission
-from ssm_graph.errors import DataError
-from ssm_graph.problem.problem import build_problem
+from ssm_graph.base.errors import DataError
+from ssm_graph.base.frozen import Array
+from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.problem import build_problem
+from ssm_graph.sensors.imu import ImuNoise
 from ssm_graph.simulation import GnssSettings
 from ssm_graph.smoothers.batch import SsmSmoother
 from tests.helpers import outcome, simulated, with_imu, with_initial

@@ -7,12 +7,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ssm_graph.data import Array
+from ssm_graph.base.frozen import Array
+from ssm_graph.base.stepwise import finished
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.states import States, states_from_arrays
-from ssm_graph.problem.problem import build_problem
+from ssm_graph.mission.problem import build_problem
 from ssm_graph.smoothers.passes import descend_steps
-from ssm_graph.stepwise import finished
 from tests.helpers import simulated, state_errors, true_states
 
 

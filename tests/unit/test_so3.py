@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from factors import so3
-from ssm_graph.data import Array
+from ssm_graph.base.frozen import Array
 
 ANGLES = (1e-12, 1e-6, 0.009, 0.011, 0.099, 0.101, 1.0, 3.0)
 

@@ -11,10 +11,16 @@ import pytest
 from rich.console import Console
 
 from ssm_graph.cli.online import view_of
-from ssm_graph.estimate import CalibratedValue, Calibration, CurrentTrack, Found
-from ssm_graph.live.status import Latency, LinkState, OutputStatus, RunStatus, SourceStatus
-from ssm_graph.messages import Event, Health, Severity
-from ssm_graph.report.status_page import StatusPage, StatusView, plain_line, render, weight_bar
+from ssm_graph.live.run.status import Latency, LinkState, OutputStatus, RunStatus, SourceStatus
+from ssm_graph.mission.estimate import CalibratedValue, Calibration, CurrentTrack, Found
+from ssm_graph.mission.navigation import Event, Health, Severity
+from ssm_graph.report.terminal.status_page import (
+    StatusPage,
+    StatusView,
+    plain_line,
+    render,
+    weight_bar,
+)
 from tests.live_fixture import a_navigation
 
 STATUS = RunStatus(

@@ -6,9 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ssm_graph.messages import Ping
-from ssm_graph.problem.problem import build_problem
-from ssm_graph.stuck_beams import STUCK_PINGS, stuck_beams
+from ssm_graph.mission.problem import build_problem
+from ssm_graph.sensors.dvl import STUCK_PINGS, Ping, stuck_beams
 from tests.helpers import simulated
 from tests.online_fixture import SHORT, joined, messages, run, stream
 

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ssm_graph.data import DvlLog, Mission
-from ssm_graph.errors import SolverError
-from ssm_graph.estimate import Estimate, Status
-from ssm_graph.problem.problem import Problem, build_problem
+from ssm_graph.base.errors import SolverError
+from ssm_graph.mission.estimate import Estimate, Status
+from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.problem import Problem, build_problem
+from ssm_graph.sensors.dvl import DvlLog
 from ssm_graph.simulation import (
     Fault,
     Grade,

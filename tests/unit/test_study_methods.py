@@ -7,8 +7,8 @@ from typing import Any, cast
 
 import pytest
 
-from ssm_graph.errors import ConfigError, SolverError
-from ssm_graph.estimate import Estimate
+from ssm_graph.base.errors import ConfigError, SolverError
+from ssm_graph.mission.estimate import Estimate
 from ssm_graph.study.methods import FAMILIES, Failure, Method, parse_method, parse_methods
 from ssm_graph.study.trials import Trial
 

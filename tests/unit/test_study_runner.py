@@ -16,9 +16,9 @@ from typing import Any
 
 import pytest
 
+from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.cli.main import ExitCode, main
-from ssm_graph.errors import ConfigError, DataError
-from ssm_graph.io.mission import write_mission
+from ssm_graph.io.mission_folder.reader import write_mission
 from ssm_graph.simulation import Grade, scenario_config, simulate
 from ssm_graph.study.jobs import Job, JobResult, do_job
 from ssm_graph.study.processes import JobProcesses

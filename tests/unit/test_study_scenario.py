@@ -9,16 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ssm_graph.errors import ConfigError, DataError
-from ssm_graph.problem.current import CURRENT
-from ssm_graph.simulation import (
-    CurrentSettings,
-    FaultShape,
-    Grade,
-    Loss,
-    OutlierKind,
-    WaterTrack,
-)
+from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.mission.current import CURRENT
+from ssm_graph.simulation import CurrentSettings, FaultShape, Grade, Loss, OutlierKind, WaterTrack
 from ssm_graph.study.cells import Cell
 from ssm_graph.study.plan import wanted_keys
 from ssm_graph.study.scenario import Study, read_study, study_from, study_of_folders

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ssm_graph.errors import ConfigError, DataError
+from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.simulation import Grade
 from ssm_graph.study.jobs import Job, JobResult, RunKey, failed_job, lost_job
 from ssm_graph.study.scoring import Row

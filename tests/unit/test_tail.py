@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ssm_graph.data import Array
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.states import AugmentedStates
 from ssm_graph.imu.preintegration import GAP_ACCEL, GAP_GYRO_RATE, GRAVITY
-from ssm_graph.messages import ImuSample
-from ssm_graph.online import FixedLagSmoother
-from ssm_graph.online.asked import sensors_of_vehicle
-from ssm_graph.online.tail import LONGEST_S, Tail
-from ssm_graph.problem.states import AugmentedStates
+from ssm_graph.live.estimator import FixedLagSmoother
+from ssm_graph.live.estimator.asked import sensors_of_vehicle
+from ssm_graph.live.estimator.tail import LONGEST_S, Tail
+from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.smoothers.keyframe import Keyframe
 from tests.online_fixture import SHORT, messages, run, stream
 

@@ -11,9 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ssm_graph.data import DvlLog, GnssLog, Mission
-from ssm_graph.errors import DataError
-from ssm_graph.problem.timeline import MIN_SPACING_S, Timeline, build_timeline, nearest
+from ssm_graph.base.errors import DataError
+from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.timeline import MIN_SPACING_S, Timeline, build_timeline, nearest
+from ssm_graph.sensors.dvl import DvlLog
+from ssm_graph.sensors.gnss import GnssLog
 from ssm_graph.simulation import default_mount
 from tests.helpers import STEADY, simulated
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from factors.similarity import ExpKernel, LogKernel, SqrtKernel
-from ssm_graph.filters.correntropy import CorrentropyUpdate
-from ssm_graph.filters.kalman import Gate, GatedUpdate, KalmanUpdate
-from ssm_graph.filters.linear import LinearModel, LinearSystem
-from ssm_graph.filters.model import NOMINAL, Runs, UpdateRule
-from ssm_graph.filters.ssm import SsmUpdate
-from ssm_graph.filters.student import Scale, StudentUpdate
-from ssm_graph.problem.error_state import Linearised
+from ssm_graph.engine.error_state import Linearised
+from ssm_graph.filters.rules.correntropy import CorrentropyUpdate
+from ssm_graph.filters.rules.kalman import Gate, GatedUpdate, KalmanUpdate
+from ssm_graph.filters.rules.linear import LinearModel, LinearSystem
+from ssm_graph.filters.rules.model import NOMINAL, Runs, UpdateRule
+from ssm_graph.filters.rules.ssm import SsmUpdate
+from ssm_graph.filters.rules.student import Scale, StudentUpdate
 from tests.update_fixture import (
     ALL_ROWS,
     EACH_ROW,

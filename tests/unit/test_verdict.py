@@ -9,19 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ssm_graph.data import Array
-from ssm_graph.estimate import Status
+from ssm_graph.base.frozen import Array
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.states import States, states_from_arrays
-from ssm_graph.problem.doubts import SUSPECT_STRETCH_S
-from ssm_graph.problem.problem import Problem, build_problem
-from ssm_graph.simulation import (
-    DiveRoute,
-    GnssSettings,
-    Grade,
-    SimulatedMission,
-    TransitRoute,
-)
+from ssm_graph.mission.doubts import SUSPECT_STRETCH_S
+from ssm_graph.mission.estimate import Status
+from ssm_graph.mission.problem import Problem, build_problem
+from ssm_graph.simulation import DiveRoute, GnssSettings, Grade, SimulatedMission, TransitRoute
 from ssm_graph.smoothers.verdict import contradictions
 from tests.helpers import outcome, simulated, true_states, with_imu, with_initial
 

@@ -8,24 +8,26 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ssm_graph.aid_logs import HeadingErrors
-from ssm_graph.data import Array, DvlMount, Mission
-from ssm_graph.errors import ConfigError, DataError
-from ssm_graph.estimate import Estimate, Status
+from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.base.frozen import Array
 from ssm_graph.evaluation import evaluate
-from ssm_graph.filters.kalman import KalmanUpdate
-from ssm_graph.filters.named import filter_geodetic, filter_problems
-from ssm_graph.filters.navigation import Grouping, run_filter
+from ssm_graph.filters.navigation.filter import Grouping, run_filter
+from ssm_graph.filters.navigation.named import filter_geodetic, filter_problems
+from ssm_graph.filters.rules.kalman import KalmanUpdate
 from ssm_graph.graph.first_values import first_values
 from ssm_graph.graph.gtsam_graph import gtsam_graph
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.states import States
-from ssm_graph.io.replay import messages_of
-from ssm_graph.messages import Ping
-from ssm_graph.problem.alignment import align
-from ssm_graph.problem.bottom_track import without_water_track
-from ssm_graph.problem.current import CURRENT, CURRENT_UP
-from ssm_graph.problem.problem import build_problem, with_dvl
+from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.mission.bottom_track import without_water_track
+from ssm_graph.mission.current import CURRENT, CURRENT_UP
+from ssm_graph.mission.estimate import Estimate, Status
+from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.problem import build_problem, with_dvl
+from ssm_graph.mission.start.alignment import align
+from ssm_graph.sensors.compass import HeadingErrors
+from ssm_graph.sensors.current import CurrentModel
+from ssm_graph.sensors.dvl import DvlMount, Ping
 from ssm_graph.simulation import (
     AidSettings,
     CompassSettings,
@@ -44,7 +46,6 @@ from ssm_graph.simulation import (
 from ssm_graph.smoothers.batch import WARM_KERNEL, SmootherConfig, SsmSmoother
 from ssm_graph.smoothers.beam_faults import FaultSearch
 from ssm_graph.smoothers.fixed_lag import FixedLagConfig, solve_fixed_lag
-from ssm_graph.water_current import CurrentModel
 from tests.helpers import simulated, true_states, without_beams
 from tests.water_fixture import current_errors, in_current, without_water
 

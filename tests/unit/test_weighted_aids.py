@@ -10,7 +10,7 @@ import pytest
 from factors.similarity import Similarity
 from ssm_graph.graph.aids.weighted import Measured, WeightedAid
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.problem.problem import build_problem
+from ssm_graph.mission.problem import build_problem
 from ssm_graph.smoothers.batch import warm_start
 from tests.aids_fixture import with_every_aid
 

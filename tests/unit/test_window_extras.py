@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ssm_graph.problem.problem import build_problem
+from ssm_graph.mission.problem import build_problem
 from ssm_graph.smoothers.batch import SsmSmoother
 from ssm_graph.smoothers.fixed_lag import FixedLagConfig, solve_fixed_lag
 from tests.window_fixture import asked, found, off

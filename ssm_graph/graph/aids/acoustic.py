@@ -8,15 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.beacon_range import range_residual
-from ssm_graph.data import Array
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import POSITION, ROTATION
+from ssm_graph.engine.extras import Extras
 from ssm_graph.graph.aids.positions import fix_rows
 from ssm_graph.graph.aids.weighted import Measured, WeightedAid
 from ssm_graph.graph.augmented_rows import Rows, RowStates
-from ssm_graph.problem.aid_errors import beacon_name
-from ssm_graph.problem.aids import Fixes
-from ssm_graph.problem.error_state import POSITION, ROTATION
-from ssm_graph.problem.extras import Extras
-from ssm_graph.problem.further_aids import Ranges
+from ssm_graph.mission.aid_errors import beacon_name
+from ssm_graph.mission.aids import Fixes
+from ssm_graph.mission.further_aids import Ranges
 
 
 @final

@@ -8,20 +8,20 @@ import numpy as np
 
 from factors.compass_heading import CompassErrors, heading_residual
 from factors.standstill import standstill_residual
-from ssm_graph.data import Array
-from ssm_graph.earth import LocalFrame
+from ssm_graph.base.earth import LocalFrame
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import ROTATION, VELOCITY
+from ssm_graph.engine.extras import Extras
 from ssm_graph.graph.aids.weighted import Measured, WeightedAid
 from ssm_graph.graph.augmented_rows import Rows, RowStates
-from ssm_graph.problem.aid_errors import (
+from ssm_graph.mission.aid_errors import (
     HEADING_OFFSET,
     HEADING_ONE_CYCLE,
     HEADING_RATE,
     HEADING_TWO_CYCLE,
     HEADING_WALK,
 )
-from ssm_graph.problem.error_state import ROTATION, VELOCITY
-from ssm_graph.problem.extras import Extras
-from ssm_graph.problem.further_aids import Headings, Standstills
+from ssm_graph.mission.further_aids import Headings, Standstills
 
 
 @final

@@ -7,7 +7,7 @@ from ssm_graph.graph.aids.depth_and_gnss import DepthAid, GnssAid
 from ssm_graph.graph.aids.motion import HeadingAid, StandstillAid
 from ssm_graph.graph.aids.rows import Aid
 from ssm_graph.graph.aids.weighted import WeightedAid, WeightedAids
-from ssm_graph.problem.problem import Problem
+from ssm_graph.mission.problem import Problem
 
 
 def full_aids(problem: Problem) -> list[Aid]:

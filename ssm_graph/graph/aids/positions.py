@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from factors.gnss_position import fix_residual
-from ssm_graph.data import Array
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import POSITION, ROTATION, VELOCITY
+from ssm_graph.engine.extras import Extras
 from ssm_graph.graph.augmented_rows import Rows, RowStates
-from ssm_graph.problem.aids import Fixes
-from ssm_graph.problem.calibration import GNSS_DRIFT, GNSS_LEVER_ARM, GNSS_TIME_OFFSET
-from ssm_graph.problem.error_state import POSITION, ROTATION, VELOCITY
-from ssm_graph.problem.extras import Extras
+from ssm_graph.mission.aids import Fixes
+from ssm_graph.mission.calibration import GNSS_DRIFT, GNSS_LEVER_ARM, GNSS_TIME_OFFSET
 
 
 def fix_rows(

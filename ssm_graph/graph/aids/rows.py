@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ssm_graph.data import Array
+from ssm_graph.base.frozen import Array
 from ssm_graph.graph.states import States
 
 

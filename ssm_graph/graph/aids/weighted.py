@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.similarity import Similarity
-from ssm_graph.data import Array
-from ssm_graph.estimate import AidTable
+from ssm_graph.base.frozen import Array
 from ssm_graph.graph.aids.rows import AidRows
 from ssm_graph.graph.augmented_rows import Rows, RowStates, states_of
 from ssm_graph.graph.states import States
+from ssm_graph.mission.estimate import AidTable
 
 
 class Measured(NamedTuple):

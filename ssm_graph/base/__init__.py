@@ -1,0 +1,1 @@
+"""Foundation: errors, frozen arrays, frames, the Earth. It knows nothing of the rest."""

@@ -1,0 +1,1 @@
+"""Elimination of chains, error states, kernels' schedules: it knows no water and no instrument."""

@@ -1,0 +1,178 @@
+"""Which kernel weighs the beams, pass by pass: a warm start, or graduated non-convexity.
+
+The warm schedule lets a benign kernel come near before the one asked for takes over. Graduated
+non-convexity comes to truncated least squares by way of ever less convex surrogates [1]_: with a
+small ``mu`` nearly the absolute value, and ``mu`` grows from solution to solution until every
+weight is 0 or 1. What is published solves every weighted least-squares problem to its end; here
+Gauss-Newton passes go on while their steps exceed one sigma, five at most, and mostly there is one.
+The published end, a cost that hardly changes, is not taken for an answer: updates and weights have
+to settle as for every other kernel.
+
+References
+----------
+.. [1] H. Yang, P. Antonante, V. Tzoumas, L. Carlone, "Graduated Non-Convexity for Robust Spatial
+   Perception: From Non-Minimal Solvers to Global Outlier Rejection", RA-L 5, 2020.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import final
+
+import numpy as np
+
+from factors.m_estimators import TruncatedKernel
+from factors.similarity import GaussianKernel, Kernel
+from ssm_graph.base.errors import ConfigError
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.mixing import Mixing
+
+NEAR_SIGMAS = 1.0
+"""The next kernel takes over once the updates are below this many of their own sigmas."""
+SMALLEST_MU = 1e-6
+"""First ``mu`` for outliers however large; GTSAM's."""
+MAX_PASSES = 5
+"""For the solution at one ``mu``. Least squares on bad outliers need not settle at all: at MEMS
+grade twenty passes of it ran away so far that the graduation did not come back."""
+BINARY = 1e-4
+"""Weights this close to 0 or 1 are taken for it; GTSAM's."""
+
+
+class Schedule(ABC):
+    """The weights of one solution, from its first pass to its last."""
+
+    kernel: Kernel
+    """In force in the pass at hand."""
+
+    @abstractmethod
+    def first_weights(self, gated: Array) -> Array:
+        """Return the weights of the first pass; ``gated`` are those of the forward pass."""
+
+    @abstractmethod
+    def next_weights(self, used: Array, settled: Array, *, t: Array, update_sigmas: float) -> Array:
+        """Return the weights of the next pass, whose kernel may be another.
+
+        Parameters
+        ----------
+        used : (M,) weights of the last pass.
+        settled : (M,) weights that its kernel gives to its residuals.
+        t : (M,) squared Mahalanobis lengths behind ``settled``.
+        update_sigmas : largest update of the last pass, in posterior sigmas.
+        """
+
+    @abstractmethod
+    def may_end(self, settled: Array) -> bool:
+        """Return whether settled weights of the kernel in force are the answer."""
+
+
+@final
+class WarmSchedule(Schedule):
+    """A warm kernel until the updates are near, then the one asked for, with mixed weights."""
+
+    def __init__(self, wanted: Kernel, warm: Kernel) -> None:
+        self.kernel = warm
+        self._wanted = wanted
+        self._mixing = Mixing()
+
+    def first_weights(self, gated: Array) -> Array:
+        """Return the weights of the forward pass."""
+        return gated
+
+    def next_weights(
+        self,
+        used: Array,
+        settled: Array,
+        *,
+        t: Array,  # noqa: ARG002
+        update_sigmas: float,
+    ) -> Array:
+        """Return mixed weights near the end, those of the kernel before."""
+        if update_sigmas >= NEAR_SIGMAS:
+            return settled
+        weights = self._mixing.next_weights(used, settled)
+        if self.kernel != self._wanted:
+            self.kernel, self._mixing = self._wanted, Mixing()
+        return weights
+
+    def may_end(self, settled: Array) -> bool:  # noqa: ARG002
+        """Return whether the kernel in force is the one asked for."""
+        return self.kernel == self._wanted
+
+
+class GncStart(Enum):
+    """The solution from which the graduation starts."""
+
+    ONES = "least squares with every weight 1, as published"
+    GATED = "the gated forward pass, then the warm kernel"
+
+
+@dataclass(frozen=True, slots=True)
+class Graduation:
+    """Settings of the graduation; the defaults are those of the paper and of GTSAM."""
+
+    start: GncStart = GncStart.ONES
+    mu_step: float = 1.4
+    """``mu`` grows by this factor from solution to solution."""
+
+    def __post_init__(self) -> None:
+        if not 1.0 < self.mu_step < np.inf:
+            raise ConfigError(f"mu_step: expected a number above 1, got {self.mu_step}")
+
+    def __str__(self) -> str:
+        return f"start={self.start.name.lower()}, step={self.mu_step:g}"
+
+
+def first_mu(largest_t: float, width: float) -> float:
+    """Return the first ``mu`` by remark 5 of [1]_; infinite where nothing needs to be truncated.
+
+    ``largest_t`` is the largest squared whitened residual of the starting solution.
+    """
+    excess = 2.0 * largest_t - width**2
+    return max(width**2 / excess, SMALLEST_MU) if excess > 0.0 else np.inf
+
+
+@final
+class GncSchedule(Schedule):
+    """A starting solution, then one for each surrogate of growing ``mu``."""
+
+    def __init__(self, wanted: TruncatedKernel, graduation: Graduation, warm: Kernel) -> None:
+        self._wanted = wanted
+        self._graduation = graduation
+        self._mu: float | None = None
+        self._passes = 0
+        self.kernel = GaussianKernel() if self._starts_from_ones else warm
+
+    @property
+    def _starts_from_ones(self) -> bool:
+        return self._graduation.start is GncStart.ONES
+
+    def first_weights(self, gated: Array) -> Array:
+        """Return ones, or the weights of the forward pass."""
+        return np.ones_like(gated) if self._starts_from_ones else gated
+
+    def next_weights(
+        self,
+        used: Array,
+        settled: Array,
+        *,
+        t: Array,
+        update_sigmas: float,
+    ) -> Array:
+        """Return weights of the next surrogate once a solution is near, until then the same."""
+        self._passes += 1
+        if update_sigmas >= NEAR_SIGMAS and self._passes < MAX_PASSES:
+            return settled if self._mu is None else used
+        self._passes = 0
+        if self._mu is None:
+            self._mu = first_mu(float(np.max(t, initial=0.0)), self._wanted.width)
+        else:
+            self._mu *= self._graduation.mu_step
+        self.kernel = replace(self._wanted, mu=self._mu)
+        return self.kernel.weight(t)
+
+    def may_end(self, settled: Array) -> bool:
+        """Return whether every weight is 0 or 1."""
+        is_binary = np.minimum(settled, np.abs(1.0 - settled)) <= BINARY
+        return self._mu is not None and bool(np.all(is_binary))

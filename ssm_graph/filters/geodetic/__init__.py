@@ -1,0 +1,1 @@
+"""The filter to the letter: strapdown mechanisation in geodetic coordinates."""

@@ -1,0 +1,288 @@
+"""The paper to the letter: a SINS/DVL filter in geodetic coordinates with closed-loop feedback.
+
+Written a second time on purpose: strapdown mechanisation, error dynamics and measurement matrix
+share nothing with the preintegrated factors and their error state, so that both can be held
+against each other. Many runs of equal shape are filtered at once.
+
+References
+----------
+.. [1] Xu et al., "Combined navigation robust filtering method based on statistical similarity
+   measurement", 2021.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.similarity import Kernel, LogKernel
+from factors.so3 import skew
+from ssm_graph.base.earth import R_el_from_lat_lon
+from ssm_graph.base.errors import ConfigError
+from ssm_graph.base.frozen import Array, ReadOnlyArrays
+from ssm_graph.engine.error_state import (
+    ACCEL_BIAS,
+    GYRO_BIAS,
+    POSITION,
+    ROTATION,
+    STATE_DIM,
+    VELOCITY,
+)
+from ssm_graph.filters.geodetic.error_model import (
+    DP,
+    DV,
+    EPS,
+    ERROR_DIM,
+    NABLA,
+    PHI,
+    Feedback,
+    enu_D_place,
+    feed_back,
+    initial_moments,
+    noise_densities,
+    propagate,
+)
+from ssm_graph.filters.geodetic.measurements import Measurements, beam_rows, gather, nominal_rows
+from ssm_graph.filters.geodetic.mechanisation import GeodeticState, Samples, Track, advance
+from ssm_graph.filters.geodetic.update import correct, settle
+from ssm_graph.imu.increments import merge_samples
+from ssm_graph.mission.estimate import OnKeyframe
+from ssm_graph.mission.problem import Problem
+from ssm_graph.sensors.dvl import N_BEAMS
+from ssm_graph.sensors.imu import ImuLog
+
+
+@dataclass(frozen=True, slots=True)
+class GeodeticConfig:
+    """How the filter runs."""
+
+    kernel: Kernel = field(default_factory=LogKernel)
+    """Similarity kernel of the beams."""
+    feedback: Feedback = Feedback.COMPLETE
+    """What closes the loop; the paper's own serves up to tactical grade."""
+    merge_rate_hz: float = 20.0
+    """Rate to which raw inertial samples are merged."""
+    tolerance: float = 1e-8
+    """The weights of a ping have settled when the state moves by less, relative to itself."""
+    max_iterations: int = 50
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.tolerance) and self.tolerance > 0.0):
+            raise ConfigError(f"tolerance: expected a number above zero, got {self.tolerance}")
+        if self.max_iterations < 1:
+            raise ConfigError(f"max_iterations: expected 1 or more, got {self.max_iterations}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GeodeticHistory(ReadOnlyArrays):
+    """Posteriors of B runs at K keyframes, after feedback."""
+
+    lat: Array
+    """(B, K) rad"""
+    lon: Array
+    """(B, K) rad"""
+    height: Array
+    """(B, K) m"""
+    velocity_enu: Array
+    """(B, K, 3) m/s"""
+    R_lb: Array
+    """(B, K, 3, 3) body to local east-north-up axes"""
+    gyro_bias: Array
+    """(B, K, 3) rad/s"""
+    accel_bias: Array
+    """(B, K, 3) m/s^2"""
+    covariance: Array
+    """(B, K, 15, 15) of the errors of :mod:`ssm_graph.filters.geodetic.error_model`"""
+    weight: Array
+    """(B, K, 4) NaN where there is no beam, as in the two that follow"""
+    mahalanobis_sq: Array
+    """(B, K, 4) t at the posterior"""
+    innovation: Array
+    """(B, K, 4) measured minus predicted before the update, m/s"""
+    iterations: NDArray[np.intp]
+    """(B, K) 0 where there is no beam"""
+
+
+class Posteriors(NamedTuple):
+    """One run in the package's own terms: see :mod:`ssm_graph.engine.error_state`."""
+
+    R_nb: Array
+    """(K, 3, 3)"""
+    p_n: Array
+    """(K, 3) m"""
+    v_n: Array
+    """(K, 3) m/s"""
+    bias: Array
+    """(K, 6) accelerometer m/s^2, gyro rad/s"""
+    covariance: Array
+    """(K, 15, 15)"""
+
+
+def run_geodetic(
+    problems: Sequence[Problem],
+    imu: Sequence[ImuLog],
+    config: GeodeticConfig | None = None,
+    *,
+    on_keyframe: OnKeyframe | None = None,
+) -> GeodeticHistory:
+    """Filter runs side by side: mechanise, propagate, update, feed back, keyframe by keyframe.
+
+    The loop is closed at every keyframe, with measurements or without. No run looks at another; a
+    run that runs away ends in NaN.
+
+    Parameters
+    ----------
+    problems : runs with equally many keyframes.
+    imu : their inertial data, merging into equally many samples between keyframes.
+    config : kernel and stopping rule.
+    on_keyframe : called after each keyframe.
+
+    Raises
+    ------
+    ConfigError
+        If the runs differ in shape: filter them one by one.
+    """
+    config = config or GeodeticConfig()
+    samples, first = _merged(problems, imu, rate_hz=config.merge_rate_hz)
+    measurements = gather(problems)
+    state, P = initial_moments(
+        [problem.start for problem in problems],
+        [problem.imu_noise_bias_sigma for problem in problems],
+    )
+    density = noise_densities([log.noise for log in imu], state)
+    X = np.zeros((len(problems), ERROR_DIM))
+    recorder = _Recorder(len(problems), problems[0].n_keyframes)
+    track: Track | None = None
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        for k in range(problems[0].n_keyframes):
+            if k > 0:
+                track = advance(state, Samples(*(a[:, first[k - 1] : first[k]] for a in samples)))
+                X, P = propagate(X, P, track, density)
+                state = track.end
+            X, P = _update(X, P, state, measurements, k, track, config, recorder)
+            state, X, P = feed_back(state, X, P, config.feedback)
+            recorder.keep(k, state, X, P)
+            if on_keyframe is not None:
+                on_keyframe(k + 1, problems[0].n_keyframes)
+    return recorder.history()
+
+
+def _merged(
+    problems: Sequence[Problem], imu: Sequence[ImuLog], *, rate_hz: float
+) -> tuple[Samples, NDArray[np.intp]]:
+    if len(problems) == 0 or len(problems) != len(imu):
+        raise ConfigError(
+            f"expected one or more runs with their inertial data, got {len(problems)} problems and "
+            f"{len(imu)} logs"
+        )
+    merged = [
+        merge_samples(log, problem.keyframe_s, rate_hz=rate_hz)
+        for problem, log in zip(problems, imu, strict=True)
+    ]
+    first = merged[0].first
+    for run, other in enumerate(merged):
+        if not np.array_equal(other.first, first):
+            raise ConfigError(
+                f"run {run} has another number of keyframes, or of samples between them, than run "
+                "0: expected equal ones; filter such runs one by one"
+            )
+    return Samples(
+        *(np.stack([getattr(m, name) for m in merged]) for name in Samples._fields)
+    ), first
+
+
+def _update(
+    X: Array,
+    P: Array,
+    state: GeodeticState,
+    measurements: Measurements,
+    k: int,
+    track: Track | None,
+    config: GeodeticConfig,
+    recorder: _Recorder,
+) -> tuple[Array, Array]:
+    """Correct by depth and fix, then by the beams; the order changes nothing but the work."""
+    rows = beam_rows(measurements.beams, k, state)
+    recorder.innovation[:, k] = (rows.H @ X[..., None])[..., 0] - rows.Z
+    nominal = nominal_rows(measurements, k, state, track, X)
+    if nominal is not None:
+        X, P = correct(X, P, nominal)
+    has_beam = np.isfinite(measurements.beams.speed[:, k])
+    recorder.innovation[:, k][~has_beam] = np.nan
+    if not has_beam.any():
+        return X, P
+    settled = settle(
+        X,
+        P,
+        rows,
+        kernel=config.kernel,
+        tolerance=config.tolerance,
+        max_iterations=config.max_iterations,
+    )
+    recorder.weight[:, k] = np.where(has_beam, settled.weight, np.nan)
+    recorder.mahalanobis_sq[:, k] = np.where(has_beam, settled.mahalanobis_sq, np.nan)
+    recorder.iterations[:, k] = np.where(has_beam.any(axis=1), settled.iterations, 0)
+    return settled.X, settled.P
+
+
+class _Recorder:
+    """Room for the history, filled keyframe by keyframe."""
+
+    def __init__(self, n_runs: int, n_keyframes: int) -> None:
+        shape = n_runs, n_keyframes
+        self.place = np.empty((3, *shape))
+        self.velocity_enu = np.empty((*shape, 3))
+        self.R_lb = np.empty((*shape, 3, 3))
+        self.gyro_bias, self.accel_bias = np.empty((2, *shape, 3))
+        self.covariance = np.empty((*shape, ERROR_DIM, ERROR_DIM))
+        self.weight, self.mahalanobis_sq, self.innovation = np.full((3, *shape, N_BEAMS), np.nan)
+        self.iterations = np.zeros(shape, np.intp)
+
+    def keep(self, k: int, state: GeodeticState, X: Array, P: Array) -> None:
+        self.place[..., k] = state.lat, state.lon, state.height
+        self.velocity_enu[:, k], self.R_lb[:, k] = state.velocity_enu, state.R_lb
+        self.gyro_bias[:, k] = state.gyro_bias + X[:, EPS]
+        self.accel_bias[:, k] = state.accel_bias + X[:, NABLA]
+        self.covariance[:, k] = P
+
+    def history(self) -> GeodeticHistory:
+        named = {name: array for name, array in vars(self).items() if name != "place"}
+        lat, lon, height = self.place
+        return GeodeticHistory(lat=lat, lon=lon, height=height, **named)
+
+
+def to_navigation(problem: Problem, history: GeodeticHistory, run: int) -> Posteriors:
+    """Return one run in the navigation frame of its problem, with its covariances.
+
+    Errors there are true relative to estimated, ``R_nb Exp(phi_b)``, ``p_n + R_nb dp_b``,
+    ``v_n + dv_n``. With ``theta = (dlat, -dlon cos(lat), -dlon sin(lat))``, the turn from the
+    estimated place's local axes to the true ones::
+
+        phi_b = R_lb' (phi + theta),  dp_b = -R_lb' D dp,  dv_n = R_nl (theta x v - dv)
+    """
+    lat, lon, height = history.lat[run], history.lon[run], history.height[run]
+    v_l, R_lb = history.velocity_enu[run], history.R_lb[run]
+    R_nl = problem.frame.R_en.T @ R_el_from_lat_lon(lat, lon)
+    R_bl = np.swapaxes(R_lb, 1, 2)
+    theta_D_p = np.zeros((len(lat), 3, 3))
+    theta_D_p[:, 0, 0] = 1.0
+    theta_D_p[:, 1, 1], theta_D_p[:, 2, 1] = -np.cos(lat), -np.sin(lat)
+    J = np.zeros((len(lat), STATE_DIM, ERROR_DIM))
+    J[:, ROTATION, PHI] = R_bl
+    J[:, ROTATION, DP] = R_bl @ theta_D_p
+    J[:, POSITION, DP] = -R_bl @ enu_D_place(lat, height)
+    J[:, VELOCITY, DP] = -R_nl @ skew(v_l) @ theta_D_p
+    J[:, VELOCITY, DV] = -R_nl
+    J[:, ACCEL_BIAS, NABLA] = np.eye(3)
+    J[:, GYRO_BIAS, EPS] = np.eye(3)
+    return Posteriors(
+        R_nb=R_nl @ R_lb,
+        p_n=problem.frame.p_n_from_geodetic(lat, lon, height),
+        v_n=(R_nl @ v_l[..., None])[..., 0],
+        bias=np.concatenate([history.accel_bias[run], history.gyro_bias[run]], axis=-1),
+        covariance=np.asarray(J @ history.covariance[run] @ np.swapaxes(J, 1, 2)),
+    )

@@ -1,0 +1,1 @@
+"""The filters of the literature on the error state of a mission."""

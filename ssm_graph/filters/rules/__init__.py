@@ -1,0 +1,1 @@
+"""Update laws of the literature and ours: linear algebra, no instrument."""

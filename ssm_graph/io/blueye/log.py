@@ -1,0 +1,133 @@
+"""Reading of Blueye X3 logs: MCAP files with protobuf schemas inside, as tables of messages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from ssm_graph.base.errors import DataError, MissingExtraError
+from ssm_graph.base.frozen import Array
+from ssm_graph.sensors.dvl import N_BEAMS
+
+PREFIX: Final = "blueye.protocol."
+TOPICS: Final = tuple(
+    PREFIX + name for name in ("Imu2Tel", "DvlVelocityTel", "DepthTel", "PositionEstimateTel")
+)
+WITNESS: Final = PREFIX + "Imu1Tel"
+"""The vehicle's other IMU, which a log need not have."""
+GNSS_SENSOR_ID: Final = 4
+DVL_SENSOR_ID: Final = 1
+"""The dead reckoning that the DVL does by itself."""
+
+
+class BlueyeTables(NamedTuple):
+    """The topics as they were logged, repeats included; first columns are arrival times, Unix s."""
+
+    imu: Array
+    """(N, 7) time, gyro x, y, z and accelerometer x, y, z in the log's units, of Imu2Tel."""
+    witness: Array
+    """(N, 7) the same of Imu1Tel; no rows where the log has none."""
+    dvl: Array
+    """(N, 19) time, delta_time in ms, water track, status, then of beams 1 to 4 the speeds in m/s,
+    validity and ranges in m, then the velocity in m/s, forward-right-down."""
+    depth: Array
+    """(N, 2) time, depth in m."""
+    yaw_rate: Array
+    """(N, 2) time, yaw rate of the vehicle's own estimator in rad/s."""
+    gnss: Array
+    """(N, 4) time, latitude and longitude in deg, sigma in m; valid fixes only."""
+    dvl_heading: Array
+    """(N, 2) time, heading in rad of the DVL's own dead reckoning, from no known origin; no rows
+    where the log has none."""
+
+
+def read_blueye_tables(log: Path) -> BlueyeTables:
+    """Return the messages of a log as arrays, in order of arrival; raises as `convert_blueye`."""
+    rows: dict[str, list[tuple[float, ...]]] = {
+        name: [] for name in ("imu", "witness", "dvl", "depth", "yaw_rate", "gnss", "dvl_heading")
+    }
+    for topic, time_s, message in _messages(log):
+        try:
+            _append(rows, topic.removeprefix(PREFIX), time_s, message)
+        except (AttributeError, IndexError) as error:
+            raise DataError(f"{log}: topic {topic} has an unknown layout: {error}") from error
+    empty = [name for name in ("imu", "dvl", "depth") if len(rows[name]) < 2]
+    if empty:
+        raise DataError(f"{log}: no data of {', '.join(empty)}: is the log empty?")
+    if not all(np.isfinite(rows[name]).all() for name in ("imu", "depth", "gnss")):
+        raise DataError(f"{log}: IMU, depth or GNSS hold values that are not finite")
+    return BlueyeTables(
+        imu=np.array(rows["imu"]),
+        witness=np.array(rows["witness"]).reshape(-1, 7),
+        dvl=np.array(rows["dvl"]),
+        depth=np.array(rows["depth"]),
+        yaw_rate=np.array(rows["yaw_rate"]).reshape(-1, 2),
+        gnss=np.array(rows["gnss"]).reshape(-1, 4),
+        dvl_heading=np.array(rows["dvl_heading"]).reshape(-1, 2),
+    )
+
+
+def _messages(log: Path) -> Iterator[tuple[str, float, Any]]:
+    """Yield topic, arrival time in s and decoded message; all failures become DataError."""
+    try:
+        from mcap.reader import make_reader
+        from mcap_protobuf.decoder import DecoderFactory
+    except ImportError as error:
+        name = "mcap-protobuf-support"
+        raise MissingExtraError(name, extra="blueye", purpose="reading Blueye logs") from error
+    try:
+        with log.open("rb") as stream:
+            reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+            summary = reader.get_summary()
+            found = {channel.topic for channel in summary.channels.values()} if summary else set()
+            missing = [topic for topic in TOPICS if topic not in found]
+            if missing:
+                raise DataError(
+                    f"{log}: expected the topics of a Blueye X3 log, {', '.join(missing)} missing; "
+                    f"found: {', '.join(sorted(found)) or 'none'}"
+                )
+            for _, channel, raw, message in reader.iter_decoded_messages(topics=(*TOPICS, WITNESS)):
+                yield channel.topic, raw.log_time * 1e-9, message
+    except OSError as error:
+        raise DataError(f"{log}: cannot be read: {error.strerror or error}") from error
+    except DataError:
+        raise
+    except Exception as error:  # of mcap, protobuf, lz4 or zstd: damage raises many kinds
+        raise DataError(
+            f"{log}: not a complete MCAP file of a Blueye X3 ({type(error).__name__}: {error}); "
+            "if the recording was cut off, try  mcap recover"
+        ) from error
+
+
+def _append(rows: dict[str, list[tuple[float, ...]]], topic: str, time: float, msg: Any) -> None:
+    if topic in ("Imu1Tel", "Imu2Tel"):
+        gyro, accel = msg.imu.gyroscope, msg.imu.accelerometer
+        rows["imu" if topic == "Imu2Tel" else "witness"].append(
+            (time, gyro.x, gyro.y, gyro.z, accel.x, accel.y, accel.z)
+        )
+    elif topic == "DvlVelocityTel":
+        dvl = msg.dvl_velocity
+        beams = sorted(dvl.transducers, key=lambda beam: int(beam.id))
+        if [beam.id for beam in beams] != list(range(N_BEAMS)):
+            raise IndexError(f"expected transducers 0 to 3, got {[beam.id for beam in beams]}")
+        columns = zip(
+            *((beam.velocity, beam.beam_valid, beam.distance) for beam in beams), strict=True
+        )
+        values = [value for column in columns for value in column]
+        velocity = (dvl.velocity.x, dvl.velocity.y, dvl.velocity.z)
+        head = (time, dvl.delta_time, dvl.is_water_tracking, dvl.status)
+        rows["dvl"].append((*head, *values, *velocity))
+    elif topic == "DepthTel":
+        rows["depth"].append((time, msg.depth.value))
+    else:
+        position = msg.position_estimate
+        rows["yaw_rate"].append((time, position.yaw_rate))
+        for sensor in position.navigation_sensors:
+            if sensor.sensor_id == GNSS_SENSOR_ID and sensor.is_valid:
+                point = sensor.global_position
+                rows["gnss"].append((time, point.latitude, point.longitude, sensor.std))
+            elif sensor.sensor_id == DVL_SENSOR_ID and sensor.is_valid:
+                rows["dvl_heading"].append((time, sensor.heading))

@@ -1,0 +1,1 @@
+"""The mission folder: keys, tables, checks, reader and writer."""

@@ -1,0 +1,1 @@
+"""Checks whether a mission is physically possible."""

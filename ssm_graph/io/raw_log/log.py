@@ -1,0 +1,258 @@
+"""The log of everything that a live estimator receives, written before it is used.
+
+The folder is a mission folder in order of arrival (``mission.toml`` and four tables) with one file
+more, ``arrivals``: a letter per row, in the order in which the rows of all tables came. Where a
+process went on with the log of another, ``arrivals`` holds a line with the sizes of the tables at
+that moment, so that a row that was written without its letter shifts no other.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Self
+
+from ssm_graph.base.errors import ConfigError
+from ssm_graph.io.mission_folder.vehicle import check_same_vehicle, write_vehicle
+from ssm_graph.io.raw_log.replay import check_columns, replay
+from ssm_graph.io.raw_log.rows import ARRIVALS, ROW_KINDS, RowKind
+from ssm_graph.io.tables.append_file import TORN_ROW, AppendFile, sync_folder
+from ssm_graph.io.tables.settings import TOML_NAME
+from ssm_graph.mission.vehicle import Vehicle
+from ssm_graph.sensors.messages import Message
+
+__all__ = ["RawLog", "replay"]
+
+_RETRY_S: Final = 1.0
+_BATCH: Final = 1000
+"""Rows that one append may write of those that waited, so that it takes no longer than 10 ms."""
+
+
+@dataclass(slots=True)
+class _Row:
+    """A record on its way to a table and its letter on the way to ``arrivals``."""
+
+    table: AppendFile
+    record: bytes
+    letter: bytes
+    is_in_table: bool = False
+
+
+class RawLog:
+    """Append-only writer of a log folder.
+
+    A row is on its way to the disk when :meth:`append` returns: it survives the end of the process,
+    and after :meth:`sync` a power failure. A disk that is full or fails stops nobody: rows then
+    wait in memory, and :meth:`problems` says so.
+
+    Parameters
+    ----------
+    folder : made if it does not exist; one that holds a mission is refused.
+    vehicle : what ``mission.toml`` says.
+    max_waiting : rows that may wait in memory for the disk; those that come then are lost.
+    retry_every : rows after which the disk is tried again; at the latest, that is, for it is tried
+        after a second of message time as well.
+
+    Raises
+    ------
+    ConfigError
+        For a folder that holds a mission already.
+    OSError
+        Where the folder and the heads of its tables cannot be written.
+    """
+
+    def __init__(
+        self,
+        folder: Path | str,
+        vehicle: Vehicle,
+        *,
+        max_waiting: int = 100_000,
+        retry_every: int = 500,
+    ) -> None:
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        _refuse_content(folder)
+        self._open(folder, max_waiting=max_waiting, retry_every=retry_every)
+        for kind in ROW_KINDS.values():
+            self._tables[kind.file].append(kind.header)
+        self._commit()
+        for file in self._files():
+            file.sync()
+        write_vehicle(folder, vehicle)
+        sync_folder(folder)
+
+    @classmethod
+    def reopen(
+        cls,
+        folder: Path | str,
+        vehicle: Vehicle,
+        *,
+        max_waiting: int = 100_000,
+        retry_every: int = 500,
+    ) -> Self:
+        """Go on with a log that another process began, full disk or not.
+
+        Parameters
+        ----------
+        folder : the log's.
+        vehicle : that of the log; another one is refused.
+        max_waiting, retry_every : as for a new log.
+
+        Raises
+        ------
+        ConfigError
+            For a folder without a log, and for the log of another vehicle or of another version.
+        OSError
+            Where the files cannot be opened.
+        """
+        check_same_vehicle(folder, vehicle)
+        check_columns(folder)
+        log = cls.__new__(cls)
+        log._open(Path(folder), max_waiting=max_waiting, retry_every=retry_every)
+        sizes = ",".join(str(table.size) for table in log._tables.values())
+        log._waiting.append(_Row(log._arrivals, f"\n@{sizes};\n".encode(), b""))
+        for kind in ROW_KINDS.values():
+            table = log._tables[kind.file]
+            if table.size < len(kind.header):  # a power failure took it
+                table.cut(0)
+                log._waiting.append(_Row(table, kind.header, b""))
+        log._commit()
+        log._write_waiting(len(log._waiting))
+        return log
+
+    def _open(self, folder: Path, *, max_waiting: int, retry_every: int) -> None:
+        self._tables = {
+            kind.file: AppendFile(folder / kind.file, ending=TORN_ROW)
+            for kind in ROW_KINDS.values()
+        }
+        self._arrivals = AppendFile(folder / ARRIVALS, ending=b"\n")
+        self._targets: Mapping[type, tuple[RowKind, AppendFile]] = {
+            kind: (rows, self._tables[rows.file]) for kind, rows in ROW_KINDS.items()
+        }
+        self._offsets: dict[str, int] = {}
+        self._waiting: deque[_Row] = deque()
+        self._max_waiting, self._retry_every = max_waiting, retry_every
+        self._is_blocked = False
+        self._tried_s, self._since_tried = 0.0, 0
+        self._n_lost, self._reason, self._sync_failure = 0, "", ""
+
+    def append(self, message: Message) -> None:
+        """Write one row and its letter; raise nothing where the disk refuses them.
+
+        Every number comes back bit for bit, latitude and longitude, which the table has in degrees,
+        to 5e-16 rad; a ping whose sigmas are all NaN comes back with None.
+        """
+        kind, table = self._targets[type(message)]
+        row = _Row(table, kind.row(message), kind.letter)
+        if self._waiting:
+            self._wait(row)
+            self._retry(message.time_s)
+        elif not self._write(row):
+            self._wait(row)
+            self._tried_s, self._since_tried = message.time_s, 0
+
+    def offsets(self) -> dict[str, int]:
+        """Return the size of every file up to the last row that is wholly written, bytes.
+
+        A replay from there gives all later rows. Rows that wait for the disk are not counted: a
+        checkpoint that has used them will be given them once more.
+        """
+        return dict(self._offsets)
+
+    def problems(self) -> str | None:
+        """Return one sentence where a row is not on its way to the disk, None if all are."""
+        parts = []
+        if self._waiting:
+            n_rows = sum(bool(row.letter) for row in self._waiting)
+            parts.append(f"rows that wait in memory for the disk: {n_rows} ({self._reason})")
+        if self._n_lost:
+            parts.append(f"rows lost because {self._max_waiting} waited already: {self._n_lost}")
+        if self._sync_failure:
+            parts.append(f"the disk does not confirm what it was given ({self._sync_failure})")
+        return f"raw log: {'; '.join(parts)}" if parts else None
+
+    def sync(self) -> bool:
+        """Write what waits and wait until all is on the disk; return whether it is."""
+        self._write_waiting(len(self._waiting))
+        self._sync_failure = ""
+        try:
+            for file in self._files():
+                file.sync()
+        except OSError as error:
+            self._sync_failure = error.strerror or str(error)
+        return not self._waiting and not self._sync_failure
+
+    def close(self) -> None:
+        """Write what waits, as far as the disk takes it, and close the files."""
+        self._write_waiting(len(self._waiting))
+        for file in self._files():
+            file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _files(self) -> list[AppendFile]:
+        return [*self._tables.values(), self._arrivals]
+
+    def _commit(self) -> None:
+        self._offsets.update({file.name: file.size for file in self._files()})
+
+    def _wait(self, row: _Row) -> None:
+        if len(self._waiting) < self._max_waiting:
+            self._waiting.append(row)
+        else:
+            self._n_lost += 1
+
+    def _retry(self, time_s: float) -> None:
+        self._since_tried += 1
+        is_due = abs(time_s - self._tried_s) >= _RETRY_S or self._since_tried >= self._retry_every
+        if is_due or not self._is_blocked:
+            self._tried_s, self._since_tried = time_s, 0
+            self._write_waiting(_BATCH)
+
+    def _write_waiting(self, limit: int) -> None:
+        for _ in range(min(limit, len(self._waiting))):
+            if not self._write(self._waiting[0]):
+                return
+            self._waiting.popleft()
+
+    def _write(self, row: _Row) -> bool:
+        """Write what is missing of a row; return whether all of it is written."""
+        try:
+            if not row.is_in_table:
+                row.table.append(row.record)
+                row.is_in_table = True
+            if row.letter:
+                self._arrivals.append(row.letter)
+        except OSError as error:
+            self._reason, self._is_blocked = error.strerror or str(error), True
+            return False
+        self._is_blocked = False
+        self._offsets[row.table.name] = row.table.size
+        self._offsets[ARRIVALS] = self._arrivals.size
+        return True
+
+
+def _refuse_content(folder: Path) -> None:
+    """Raise where a folder holds a mission; remove what a start that was cut short left there."""
+    heads = {kind.file: kind.header for kind in ROW_KINDS.values()} | {ARRIVALS: b""}
+    begun = [folder / name for name in heads if (folder / name).exists()]
+    is_used = any(path.stat().st_size > len(heads[path.name]) for path in begun)
+    if is_used or (folder / TOML_NAME).exists():
+        raise ConfigError(
+            f"{str(folder)!r} holds a mission already; expected a folder without one; choose "
+            "another folder, or go on with the log that is there (RawLog.reopen)"
+        )
+    for path in begun:
+        path.unlink()

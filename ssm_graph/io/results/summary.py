@@ -1,0 +1,250 @@
+"""The content of ``summary.json``: how an estimate came about and how good it is."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping, Sequence
+from enum import Enum
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any, Final, Protocol
+
+import numpy as np
+
+from ssm_graph.mission.estimate import (
+    OUTLIER_WEIGHT,
+    AidTable,
+    Calibration,
+    CurrentTrack,
+    Estimate,
+    Trajectory,
+    path_length_m,
+)
+from ssm_graph.mission.mission import InitialState, Mission
+
+PACKAGES: Final = {
+    "ssm_graph": "ssm-graph",
+    "gtsam": "gtsam",
+    "numpy": "numpy",
+    "scipy": "scipy",
+}
+"""Names in the summary and of the distributions."""
+
+
+class MetricsLike(Protocol):
+    """What a summary needs of `ssm_graph.evaluation.Metrics`; angles in rad."""
+
+    @property
+    def n_epochs(self) -> int: ...  # noqa: D102
+    @property
+    def first_s(self) -> float: ...  # noqa: D102
+    @property
+    def last_s(self) -> float: ...  # noqa: D102
+    @property
+    def rmse_horizontal_m(self) -> float: ...  # noqa: D102
+    @property
+    def rmse_vertical_m(self) -> float: ...  # noqa: D102
+    @property
+    def max_horizontal_m(self) -> float: ...  # noqa: D102
+    @property
+    def end_error_m(self) -> float: ...  # noqa: D102
+    @property
+    def path_length_m(self) -> float: ...  # noqa: D102
+    @property
+    def drift_percent(self) -> float: ...  # noqa: D102
+    @property
+    def rmse_velocity_m_per_s(self) -> float: ...  # noqa: D102
+    @property
+    def rmse_attitude(self) -> tuple[float, float, float]: ...  # noqa: D102
+    @property
+    def nees_position(self) -> float: ...  # noqa: D102
+    @property
+    def inside_3_sigma(self) -> tuple[float, float, float]: ...  # noqa: D102
+
+
+def build_summary(
+    estimate: Estimate,
+    *,
+    mission: Mission,
+    metrics: MetricsLike | None,
+    settings: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Return the summary of an estimate, ready for strict JSON: what is not finite is None.
+
+    With a reference, ``path_length_m`` is the part that was compared, on which ``drift_percent``
+    rests; ``total_path_length_m`` is always that of the whole trajectory.
+    """
+    trajectory, beams = estimate.trajectory, estimate.beams
+    total_path = path_length_m(trajectory)
+    summary = {
+        "mission": mission.name,
+        "method": estimate.method,
+        "kernel": estimate.kernel,
+        "status": estimate.status.name,
+        "status_text": estimate.status.value,
+        "is_good": estimate.status.is_good,
+        "reason": estimate.reason,
+        "iterations": estimate.n_iterations,
+        "wall_seconds": estimate.wall_s,
+        "n_keyframes": len(trajectory.time_s),
+        "n_beams": len(beams.time_s),
+        "n_outliers": int(np.sum(beams.weight < OUTLIER_WEIGHT)),
+        "outlier_weight": OUTLIER_WEIGHT,
+        "duration_s": float(np.ptp(trajectory.time_s)) if len(trajectory.time_s) else 0.0,
+        "path_length_m": total_path,
+        "total_path_length_m": total_path,
+        "final": _final(trajectory),
+        "start": {
+            **_start(estimate.start),
+            "origin": "mission" if mission.initial is not None else "alignment",
+        },
+        "calibration": calibration_fields(estimate.calibration),
+        "noise": _noise(estimate),
+        **({"aids": _aids(estimate.aids)} if estimate.aids is not None else {}),
+        "current": current_fields(estimate.current),
+        **(_comparison(metrics) if metrics is not None else {}),
+        "settings": settings,
+        "history": [
+            {
+                "update_sigmas": step.update_sigmas,
+                "weight_change": step.weight_change,
+                "kernel": step.kernel,
+            }
+            for step in estimate.iterations
+        ],
+        "notes": estimate.notes,
+        "mission_notes": mission.notes,
+        "versions": versions(),
+    }
+    return {key: as_json(value) for key, value in summary.items()}
+
+
+def versions() -> dict[str, str | None]:
+    """Return the versions of everything that makes the numbers; None for what is not installed."""
+    found: dict[str, str | None] = {"python": platform.python_version()}
+    for name, distribution in PACKAGES.items():
+        try:
+            found[name] = version(distribution)
+        except PackageNotFoundError:
+            found[name] = None
+    return found
+
+
+def as_json(value: Any) -> Any:
+    """Return ``value`` made of strict JSON's types; infinite and NaN become None."""
+    if isinstance(value, Mapping):
+        return {str(key): as_json(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return as_json(value.tolist())
+    if isinstance(value, Enum):
+        return value.name
+    if isinstance(value, bool | int | str) or value is None:
+        return value
+    if isinstance(value, float):
+        return value if np.isfinite(value) else None
+    if isinstance(value, Sequence | set | frozenset):
+        return [as_json(item) for item in value]
+    return str(value)
+
+
+def _comparison(metrics: MetricsLike) -> dict[str, Any]:
+    roll, pitch, heading = np.rad2deg(metrics.rmse_attitude).tolist()
+    return {
+        "rmse_horizontal_m": metrics.rmse_horizontal_m,
+        "rmse_vertical_m": metrics.rmse_vertical_m,
+        "max_horizontal_m": metrics.max_horizontal_m,
+        "end_error_m": metrics.end_error_m,
+        "path_length_m": metrics.path_length_m,
+        "drift_percent": metrics.drift_percent,
+        "rmse_velocity_m_per_s": metrics.rmse_velocity_m_per_s,
+        "rmse_roll_deg": roll,
+        "rmse_pitch_deg": pitch,
+        "rmse_heading_deg": heading,
+        "nees_position": metrics.nees_position,
+        "inside_3_sigma": dict(zip(("east", "north", "up"), metrics.inside_3_sigma, strict=True)),
+        "compared_epochs": metrics.n_epochs,
+        "compared_from_s": metrics.first_s,
+        "compared_to_s": metrics.last_s,
+    }
+
+
+def calibration_fields(calibration: Calibration | None) -> dict[str, Any]:
+    """Return what was found of the instruments, by label, in the label's unit."""
+    if calibration is None:
+        return {}
+    return {
+        value.label: {
+            "value": value.value / value.unit,
+            "sigma": value.sigma / value.unit,
+            "prior_sigma": value.prior_sigma / value.unit,
+            "determined": value.determined.name.lower(),
+        }
+        for value in calibration.values
+    }
+
+
+def _aids(aids: AidTable) -> dict[str, Any]:
+    """Return how many measurements each further aid had, and how many had hardly any weight."""
+    return {
+        name: {"n_measurements": count, "n_outliers": outliers}
+        for name, (count, outliers) in aids.counts().items()
+    }
+
+
+def _noise(estimate: Estimate) -> dict[str, Any]:
+    """Return the noise found, by beam, over the stated one; of the inertial data the test."""
+    noise = estimate.noise
+    if noise is None:
+        return {}
+    return {
+        "beam_sigma_estimated_over_stated": noise.beam_factor,
+        "beam_sigma_used_over_stated": noise.beam_used,
+        "beam_degrees_of_freedom": noise.beam_dof,
+        "inertial_chi_square": noise.inertial_chi_sq,
+        "inertial_degrees_of_freedom": noise.inertial_dof,
+    }
+
+
+def current_fields(current: CurrentTrack | None) -> dict[str, Any]:
+    """Return what was found of the current: means, the largest, and how well it is known."""
+    if current is None:
+        return {}
+    return {
+        "mean_enu_m_per_s": current.velocity_enu.mean(axis=0),
+        "largest_m_per_s": np.linalg.norm(current.velocity_enu[:, :2], axis=1).max(),
+        "mean_sigma_enu_m_per_s": current.sigma_enu.mean(axis=0),
+        "final_enu_m_per_s": current.velocity_enu[-1],
+        "final_sigma_enu_m_per_s": current.sigma_enu[-1],
+    }
+
+
+def _start(start: InitialState) -> dict[str, Any]:
+    """Return the initial state with the keys of the mission format's ``[initial]``."""
+    return {
+        "time_s": start.time_s,
+        "lat_deg": np.rad2deg(start.lat),
+        "lon_deg": np.rad2deg(start.lon),
+        "height_m": start.height,
+        "vel_enu_m_per_s": start.velocity_enu,
+        "roll_deg": np.rad2deg(start.roll),
+        "pitch_deg": np.rad2deg(start.pitch),
+        "heading_deg": np.rad2deg(start.heading) % 360.0,
+        "position_sigma_m": start.position_sigma_enu,
+        "velocity_sigma_m_per_s": start.velocity_sigma_enu,
+        "attitude_sigma_deg": np.rad2deg(start.attitude_sigma),
+    }
+
+
+def _final(trajectory: Trajectory) -> dict[str, Any]:
+    """Return the last keyframe's uncertainty and its place."""
+    if len(trajectory.time_s) == 0:
+        return {}
+    variance = np.maximum(np.diagonal(trajectory.position_cov_enu[-1]), 0.0)
+    return {
+        "time_s": trajectory.time_s[-1],
+        "lat_deg": np.rad2deg(trajectory.lat[-1]),
+        "lon_deg": np.rad2deg(trajectory.lon[-1]),
+        "height_m": trajectory.height[-1],
+        "position_sigma_m": np.sqrt(variance),
+        "velocity_sigma_m_per_s": trajectory.velocity_sigma_enu[-1],
+        "attitude_sigma_deg": np.rad2deg(trajectory.attitude_sigma[-1]),
+    }

@@ -1,0 +1,265 @@
+"""Result folders: ``trajectory.csv``, ``beams.csv`` and ``summary.json``, written and read again.
+
+A run that calibrated leaves ``calibration.toml`` too, one with further aids ``aids.csv``.
+
+Units are those of the mission format: degrees, degrees per hour, micro-g. Column and key names are
+a contract: they only grow.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from ssm_graph.base.errors import DataError
+from ssm_graph.base.frames import BodyAxes
+from ssm_graph.base.frozen import Array
+from ssm_graph.io.mission_folder.calibration_toml import CALIBRATION_NAME, calibration_toml
+from ssm_graph.io.mission_folder.units import SI
+from ssm_graph.io.results.summary import MetricsLike, build_summary
+from ssm_graph.io.tables.csv_tables import (
+    CsvFile,
+    check_is_text,
+    check_last_line,
+    read_csv_header,
+    read_csv_values,
+)
+from ssm_graph.mission.estimate import AidTable, BeamTable, CurrentTrack, Estimate, Trajectory
+from ssm_graph.mission.mission import Mission
+
+TRAJECTORY_NAME: Final = "trajectory.csv"
+BEAMS_NAME: Final = "beams.csv"
+AIDS_NAME: Final = "aids.csv"
+SUMMARY_NAME: Final = "summary.json"
+Columns = dict[str, tuple[Array, str]]
+"""Values of every column and the format of a cell."""
+
+
+@dataclass(frozen=True, slots=True)
+class Results:
+    """A result folder as it stands on disk, in the units of its columns."""
+
+    folder: Path
+    trajectory: Mapping[str, Array]
+    """Columns of ``trajectory.csv``."""
+    beams: Mapping[str, Array]
+    """Columns of ``beams.csv``."""
+    summary: Mapping[str, Any]
+    """Content of ``summary.json``; what was not finite is None."""
+
+
+def write_results(
+    folder: Path | str,
+    estimate: Estimate,
+    *,
+    mission: Mission,
+    metrics: MetricsLike | None,
+    settings: Mapping[str, Any],
+    axes: BodyAxes = BodyAxes.FRD,
+) -> None:
+    """Write one estimate as a result folder.
+
+    All files are complete before the first takes its place, the old summary goes first and the
+    new one comes last: an interruption leaves a folder without summary, never a mixture.
+
+    Parameters
+    ----------
+    folder : made if it does not exist; files of the same names are replaced.
+    estimate : what was found.
+    mission : what it was found from; its name, notes and the origin of the start are noted.
+    metrics : comparison with the reference, if there is one.
+    settings : of the estimator, noted as they are; units belong into the keys.
+    axes : body axes of the mission's file, for the lever arms of ``calibration.toml``.
+
+    Raises
+    ------
+    DataError
+        The folder cannot be made or written.
+    """
+    folder = Path(folder)
+    summary = build_summary(estimate, mission=mission, metrics=metrics, settings=settings)
+    content = {
+        TRAJECTORY_NAME: format_table(
+            trajectory_columns(estimate.trajectory) | current_columns(estimate.current)
+        ),
+        BEAMS_NAME: format_table(beam_columns(estimate.beams)),
+    }
+    if estimate.aids is not None:
+        content[AIDS_NAME] = format_aids(estimate.aids)
+    if estimate.calibration is not None:
+        content[CALIBRATION_NAME] = calibration_toml(mission, estimate.calibration, axes=axes)
+    text = json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False)
+    content[SUMMARY_NAME] = text + "\n"
+    parts = {name: folder / f".{name}.part-{os.getpid()}" for name in content}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, text in content.items():
+            _write_through(parts[name], text)
+        for name in (SUMMARY_NAME, CALIBRATION_NAME, AIDS_NAME):
+            (folder / name).unlink(missing_ok=True)
+        for name, part in parts.items():
+            part.replace(folder / name)
+    except OSError as error:
+        raise DataError(f"{folder}: cannot write results: {error.strerror or error}") from error
+    finally:
+        for part in parts.values():
+            if folder.is_dir():
+                part.unlink(missing_ok=True)
+
+
+def read_results(folder: Path | str) -> Results:
+    """Read a result folder; columns and keys beyond the known ones are kept.
+
+    Raises
+    ------
+    DataError
+        No result folder, a file missing or damaged, or a column of the contract missing.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise DataError(f"{folder}: expected a result folder, found no such folder")
+    if not (folder / SUMMARY_NAME).is_file():
+        raise DataError(
+            f"{folder}: expected a result folder with {SUMMARY_NAME}, found none; "
+            "was the run interrupted? Run it again"
+        )
+    try:
+        summary = json.loads((folder / SUMMARY_NAME).read_text(encoding="utf-8"))
+    except (ValueError, OSError) as error:
+        raise DataError(f"{folder / SUMMARY_NAME}: expected valid JSON: {error}") from error
+    if not isinstance(summary, dict):
+        raise DataError(f"{folder / SUMMARY_NAME}: expected a JSON object at the top")
+    return Results(
+        folder=folder,
+        trajectory=_read_table(folder / TRAJECTORY_NAME, TRAJECTORY_COLUMNS),
+        beams=_read_table(folder / BEAMS_NAME, BEAM_COLUMNS),
+        summary=summary,
+    )
+
+
+def trajectory_columns(trajectory: Trajectory) -> Columns:
+    """Return the columns of ``trajectory.csv`` in the order of the contract."""
+    position_var = np.diagonal(trajectory.position_cov_enu, axis1=1, axis2=2)
+    position_sigma = np.sqrt(np.maximum(position_var, 0.0))
+    enu, rph, xyz = ("east", "north", "up"), ("roll", "pitch", "heading"), ("x", "y", "z")
+    angles = np.rad2deg(trajectory.roll_pitch_heading)
+    angles[:, 2] %= 360.0
+    return {
+        "time_s": (trajectory.time_s, "%.7f"),
+        "lat_deg": (np.rad2deg(trajectory.lat), "%.11f"),
+        "lon_deg": (np.rad2deg(trajectory.lon), "%.11f"),
+        "height_m": (trajectory.height, "%.6f"),
+        **_spread("vel_{}_m_per_s", enu, trajectory.velocity_enu, "%.7f"),
+        **_spread("{}_deg", rph, angles, "%.8f"),
+        **_spread("sigma_{}_m", enu, position_sigma, "%.7g"),
+        **_spread("sigma_vel_{}_m_per_s", enu, trajectory.velocity_sigma_enu, "%.7g"),
+        **_spread("sigma_{}_deg", rph, np.rad2deg(trajectory.attitude_sigma), "%.7g"),
+        **_spread(
+            "gyro_bias_{}_deg_per_h", xyz, trajectory.gyro_bias / SI["gyro_bias_deg_per_h"], "%.9g"
+        ),
+        **_spread("accel_bias_{}_ug", xyz, trajectory.accel_bias / SI["accel_bias_ug"], "%.9g"),
+        "n_beams": (trajectory.n_beams, "%.0f"),
+    }
+
+
+def current_columns(current: CurrentTrack | None) -> Columns:
+    """Return the columns that ``trajectory.csv`` has besides where a current was estimated."""
+    if current is None:
+        return {}
+    enu = ("east", "north", "up")
+    return {
+        **_spread("current_{}_m_per_s", enu, current.velocity_enu, "%.7f"),
+        **_spread("sigma_current_{}_m_per_s", enu, current.sigma_enu, "%.7g"),
+    }
+
+
+def beam_columns(beams: BeamTable) -> Columns:
+    """Return the columns of ``beams.csv`` in the order of the contract."""
+    return {
+        "time_s": (beams.time_s, "%.7f"),
+        "beam": (beams.beam, "%.0f"),
+        "innovation_m_per_s": (beams.innovation, "%.9g"),
+        "mahalanobis_sq": (beams.mahalanobis_sq, "%.9g"),
+        "weight": (beams.weight, "%.9g"),
+    }
+
+
+def format_aids(aids: AidTable) -> str:
+    """Return the content of ``aids.csv``, angles in degrees."""
+    in_degrees = np.array([unit == "rad" for unit in aids.unit], dtype=bool)
+    innovation = np.where(in_degrees, np.degrees(aids.innovation), aids.innovation)
+    units = np.where(in_degrees, "deg", np.array(aids.unit))
+    columns = (aids.time_s, aids.aid, aids.component, innovation, units)
+    rows = zip(*columns, aids.mahalanobis_sq, aids.weight, strict=True)
+    row_format = "%.7f,%s,%s,%.9g,%s,%.9g,%.9g\n"
+    header = "time_s,aid,component,innovation,unit,mahalanobis_sq,weight\n"
+    return header + "".join([row_format % row for row in rows])
+
+
+def format_table(columns: Columns) -> str:
+    """Return a CSV table with header; NaN stays ``nan``."""
+    row_format = ",".join(cell for _, cell in columns.values()) + "\n"
+    rows = np.column_stack([values for values, _ in columns.values()]).tolist()
+    return ",".join(columns) + "\n" + "".join([row_format % tuple(row) for row in rows])
+
+
+def _spread(pattern: str, names: tuple[str, ...], values: Array, cell: str) -> Columns:
+    return {pattern.format(name): (values[:, i], cell) for i, name in enumerate(names)}
+
+
+def _trajectory_names() -> tuple[str, ...]:
+    empty, vector = np.empty(0), np.empty((0, 3))
+    return tuple(
+        trajectory_columns(
+            Trajectory(
+                time_s=empty,
+                lat=empty,
+                lon=empty,
+                height=empty,
+                velocity_enu=vector,
+                roll_pitch_heading=vector,
+                gyro_bias=vector,
+                accel_bias=vector,
+                position_cov_enu=np.empty((0, 3, 3)),
+                velocity_sigma_enu=vector,
+                attitude_sigma=vector,
+                n_beams=empty,
+            )
+        )
+    )
+
+
+TRAJECTORY_COLUMNS: Final = _trajectory_names()
+CURRENT_COLUMNS: Final = tuple(
+    current_columns(CurrentTrack(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3))))
+)
+BEAM_COLUMNS: Final = tuple(beam_columns(BeamTable(*[np.empty(0)] * 5)))
+
+
+def _write_through(path: Path, text: str) -> None:
+    with path.open("w", encoding="utf-8", newline="\n") as stream:
+        stream.write(text)
+        stream.flush()
+        os.fsync(stream.fileno())
+
+
+def _read_table(path: Path, required: tuple[str, ...]) -> dict[str, Array]:
+    """Return the columns of one table by name."""
+    file = CsvFile(path, str(path))
+    try:
+        check_is_text(file)
+        names = read_csv_header(file)
+        missing = [name for name in required if name not in names]
+        if missing:
+            raise DataError(f"{path}:1: column {missing[0]!r} is missing; is it a result table?")
+        values = read_csv_values(file, names, blank=frozenset(names))
+        check_last_line(file)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {error.strerror or error}") from error
+    return {name: values[:, index] for index, name in enumerate(names)}

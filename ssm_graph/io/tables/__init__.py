@@ -1,0 +1,1 @@
+"""CSV and Parquet tables, TOML settings, files that grow, checkpoints."""

@@ -1,0 +1,5 @@
+"""The vehicle's own estimator: messages in as they come, the newest state out at once."""
+
+from ssm_graph.live.estimator.smoother import ONLINE, FixedLagSmoother
+
+__all__ = ["ONLINE", "FixedLagSmoother"]

@@ -1,0 +1,203 @@
+"""The steps that a live estimator has made, and the way back for messages that come late.
+
+Each step is a function of the one before and of the data, so that going back to before a late
+message and forth again leads to what punctual messages would have led to.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections import deque
+from dataclasses import replace
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from ssm_graph.base.errors import SolverError
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import VELOCITY
+from ssm_graph.live.estimator.buffers import SIGMAS, SPEEDS, Buffers, Measured
+from ssm_graph.live.estimator.events import EventLog
+from ssm_graph.live.estimator.keyframes import KeyframeMaker
+from ssm_graph.live.estimator.recovery import Doubt, Doubted, doubt_of, reanchored, watch_after
+from ssm_graph.live.estimator.reserve import Reserve
+from ssm_graph.live.estimator.watch import Watch, is_sound, observe
+from ssm_graph.mission.navigation import Severity
+from ssm_graph.smoothers.keyframe import Keyframe
+from ssm_graph.smoothers.stretch import Stretch, joined
+from ssm_graph.smoothers.window import Window
+from ssm_graph.smoothers.window_inertial import InertialRows
+
+REACH_S: Final = 0.1
+"""A late inertial sample changes keyframes that are so much older: a ping's gyro reading is a mean,
+and samples are seen with their neighbours."""
+ANY_SPEED: Final = 5.0
+"""m/s: once its velocity is less certain than this, a vehicle's being no faster is what is left."""
+LEAST_LATE_S: Final = 1.0
+"""Messages may be so late whatever the lag."""
+FRESH_S: Final = 5.0
+"""Every step as old as this is kept, for what comes late comes late by little."""
+SPARSE_S: Final = 2.0
+"""Of older ones, each with a window of its own, one in so long; the others are made anew."""
+
+
+class Step(NamedTuple):
+    """One keyframe, done."""
+
+    window: Window
+    watch: Watch
+    left: Stretch | None
+    """What left the window since the step that is kept before it."""
+    reserve: Reserve
+
+    @property
+    def time_s(self) -> float:
+        """Of the newest keyframe."""
+        return self.window.keyframes[-1].time_s
+
+
+class Course:
+    """Makes one step after the other, and keeps those that late messages may go back to."""
+
+    def __init__(
+        self, first: Step, maker: KeyframeMaker, buffers: Buffers, events: EventLog, null_b: Array
+    ) -> None:
+        """``null_b`` (4,) is the array's parity: orthogonal to the speeds of any velocity."""
+        self._steps = deque([first])
+        self._maker, self._buffers, self._events = maker, buffers, events
+        sensors = first.window.sensors
+        self._null, self._inertial = null_b, InertialRows(sensors.frame, sensors.extras)
+        self._settled: list[Stretch] = []
+
+    @property
+    def newest(self) -> Step:
+        """The last step."""
+        return self._steps[-1]
+
+    @property
+    def oldest(self) -> Step:
+        """The oldest step that can be gone back to."""
+        return self._steps[0]
+
+    @property
+    def horizon_s(self) -> float:
+        """Messages older than this come too late."""
+        return self.oldest.time_s + REACH_S
+
+    def rewind(self, time_s: float) -> bool:
+        """Undo the steps from a time on; return whether there were any."""
+        undone = False
+        while len(self._steps) > 1 and self._steps[-1].time_s >= time_s:
+            self._steps.pop()
+            undone = True
+        return undone
+
+    def advance(self, *, is_sample: bool = False, at_most: float = np.inf) -> int:
+        """Make all steps that the data allow, but ``at_most`` so many; return how many.
+
+        ``is_sample`` says that nothing but one more inertial sample has come since the last call.
+        """
+        if is_sample and self._buffers.imu.last_s < self._maker.not_before_s:
+            return 0
+        count = 0
+        while count < at_most:
+            measured = self._maker.next_after(self.newest.time_s)
+            if measured is None:
+                break
+            self._steps.append(self._step(measured))
+            count += 1
+            self._let_go()
+            self._thin_out()
+        return count
+
+    def take_settled(self, *, all_of_them: bool = False) -> list[Stretch]:
+        """Return what has left the window for good since the last call, or all there is."""
+        settled, self._settled = self._settled, []
+        if all_of_them:
+            settled += [step.left for step in self._steps if step.left is not None]
+            settled.append(self.newest.window.all)
+        return settled
+
+    def _let_go(self) -> None:
+        """Forget the steps that nothing can undo any more."""
+        kept_s = self.newest.time_s - max(self.newest.window.config.lag_s, LEAST_LATE_S) - REACH_S
+        while len(self._steps) > 1 and self._steps[1].time_s <= kept_s:
+            self._settle(self._steps.popleft())
+        self._buffers.drop_before(self.oldest.window.keyframes[0].time_s - 1.0)
+
+    def _thin_out(self) -> None:
+        """Forget the step that is no longer fresh, if those beside it are close enough."""
+        steps, fresh_s = self._steps, self.newest.time_s - FRESH_S
+        at = bisect_left(steps, fresh_s, key=lambda step: step.time_s) - 1
+        if at < 1 or steps[at + 1].time_s - steps[at - 1].time_s > SPARSE_S:
+            return
+        behind = steps[at + 1]
+        left = [stretch for stretch in (steps[at].left, behind.left) if stretch is not None]
+        steps[at + 1] = behind._replace(left=joined(left) if left else None)
+        del steps[at]
+
+    def _settle(self, step: Step) -> None:
+        if step.left is not None:
+            self._settled.append(joined([step.left]))  # a copy: a view keeps the whole window
+
+    def _step(self, measured: Measured) -> Step:
+        last = self.newest
+        keyframe = self._maker.make(measured, last_s=last.time_s)
+        sigma = last.window.newest_sigma
+        if len(keyframe.beams.speed) == 0 and np.linalg.norm(sigma[VELOCITY]) > ANY_SPEED:
+            keyframe = replace(keyframe, speed_sigma=ANY_SPEED)
+        window, reserve = last.window.successor(), last.reserve.led_on(keyframe, self._inertial)
+        doubt = doubt_of(last.watch, sigma, keyframe)
+        if doubt is not None:
+            return self._anew(keyframe, doubt, reserve)
+        try:
+            left = window.advance(keyframe)
+            window.iterate()
+            window.require_sane()
+        except (SolverError, np.linalg.LinAlgError, FloatingPointError) as error:
+            return self._anew(keyframe, Doubt(Doubted.ANSWER, str(error)), reserve)
+        watch = self._observed(keyframe, window, parity=self._agree(measured))
+        if is_sound(watch, keyframe.time_s):
+            reserve = reserve.renewed(window)
+        self._tell(last.watch, watch, keyframe)
+        return Step(window, watch, left, reserve)
+
+    def _anew(self, keyframe: Keyframe, doubt: Doubt, reserve: Reserve) -> Step:
+        """Begin a new window at the next keyframe."""
+        last = self.newest
+        self._events.tell(
+            keyframe.time_s, Severity.ERROR, "recovered", f"{doubt.reason}: begun anew from there"
+        )
+        window = reanchored(last.window, keyframe, reserve.older, doubt.what)
+        if doubt.what not in (Doubted.ANSWER, Doubted.VELOCITY):
+            reserve = Reserve.of(window)
+        watch = watch_after(last.watch, window, last.window.newest, doubt)
+        return Step(window, watch, last.window.all, reserve)
+
+    def _observed(self, keyframe: Keyframe, window: Window, *, parity: bool) -> Watch:
+        last, period_s = self.newest, self._buffers.shortest_period_s
+        samples = self._buffers.imu.between(last.time_s, keyframe.time_s)
+        force = float(np.linalg.norm(samples[:, 4:], axis=1).mean()) if len(samples) else 9.8
+        n_due = np.floor((keyframe.time_s - last.time_s) / period_s - 1.0)
+        return observe(
+            last.watch,
+            keyframe,
+            window,
+            last_s=last.time_s,
+            parity=parity,
+            force=force,
+            gap_s=float(np.max(np.diff(samples[:, 0], prepend=last.time_s), initial=0.0)),
+            missing=1.0 - len(samples) / n_due if n_due > 0 else 0.0,
+        )
+
+    def _agree(self, measured: Measured) -> bool:
+        """Return whether all four beams of the ping are there and agree with each other."""
+        pings = measured.pings
+        if len(pings) == 0 or not np.all(np.isfinite(pings[-1, SPEEDS])):
+            return False
+        sigma = float(np.sqrt(np.sum((self._null * pings[-1, SIGMAS]) ** 2)))
+        return bool(abs(pings[-1, SPEEDS] @ self._null) < 5.0 * sigma)
+
+    def _tell(self, before: Watch, after: Watch, keyframe: Keyframe) -> None:
+        if after.trouble_s == keyframe.time_s and after.trouble != before.trouble:
+            self._events.tell(keyframe.time_s, Severity.WARNING, "doubt", after.trouble)

@@ -1,0 +1,225 @@
+"""Beginning anew where the answer can no longer be right, with what is still known."""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import POSITION, ROTATION, VELOCITY, InitialMoments
+from ssm_graph.live.estimator.reserve import SPEED_SIGMA, Kept, forget, slowed
+from ssm_graph.live.estimator.watch import (
+    FEW,
+    TORN_PINGS,
+    Contradicted,
+    Watch,
+    counts_off_the_ground,
+)
+from ssm_graph.mission.doubts import TRUSTED
+from ssm_graph.smoothers.keyframe import Keyframe
+from ssm_graph.smoothers.stretch import Stretch
+from ssm_graph.smoothers.window import Window
+
+POSITION_SIGMA: Final = 50.0
+"""m, how far a position is doubted that GNSS or depth contradict."""
+BENT_SPEED: Final = 1.0
+"""m/s, with the next: so uncertain a velocity is not corrected along with so uncertain an attitude;
+that would take the one for the other."""
+BENT_TURN: Final = 0.05
+"""rad"""
+SILENCE_S: Final = 10.0
+LONGEST_FEW_S: Final = 25.0
+LOCKED_OUT_PINGS: Final = 3
+"""Pings in a row whose beams agree with each other but not with the prediction."""
+OUT_PINGS: Final = 6
+"""Pings in a row without a beam that agrees with the prediction."""
+LONGEST_LOCK_OUT_S: Final = 30.0
+"""So long the inertial data are believed rather than beams that agree with each other."""
+LOCKED_OUT_FIXES: Final = 5
+LOCKED_OUT_DEPTHS: Final = 25
+DOUBT_FACTOR: Final = 2.0
+"""What an answer in reserve says is doubted by so many of its sigmas, and attitude with a position
+that is contradicted."""
+
+
+ASTRAY_TIMES: Final = 3
+ASTRAY_S: Final = 120.0
+"""A position that fixes contradict so often within so long is not mended by moving it."""
+
+
+class Doubted(Enum):
+    """What cannot be gone on from."""
+
+    VELOCITY_AFTER_SILENCE = "velocity, after a silence of the beams"
+    ANSWER = "everything since it was sound"
+    VELOCITY = "everything since it was sound, and what the inertial data made of the velocity"
+    POSITION = "position"
+    HEIGHT = "height"
+
+
+class Doubt(NamedTuple):
+    """Why a window has to begin anew."""
+
+    what: Doubted
+    reason: str
+
+
+def doubt_of(watch: Watch, sigma: Array, keyframe: Keyframe) -> Doubt | None:
+    """Say why the prediction of a keyframe cannot be gone on from; None if it can.
+
+    ``sigma`` (15,) are those of the keyframe before.
+    """
+    if _is_adrift(watch, sigma, keyframe):
+        return Doubt(
+            Doubted.VELOCITY_AFTER_SILENCE,
+            "after a silence of the beams the prediction is too uncertain to be corrected: the "
+            "beams set the velocity anew",
+        )
+    if watch.pings_refused >= LOCKED_OUT_PINGS or watch.pings_out >= OUT_PINGS:
+        out_s = keyframe.time_s - watch.out_since_s
+        if out_s > LONGEST_LOCK_OUT_S:
+            reason = f"for {out_s:.0f} s no beam has agreed with the velocity: they set it anew"
+            return Doubt(Doubted.VELOCITY, reason)
+        if watch.begun_anew_s < watch.out_since_s:
+            reason = f"no beam of {watch.pings_out} pings in a row agrees with the velocity"
+            return Doubt(Doubted.ANSWER, reason)
+    if watch.pings_torn >= TORN_PINGS and watch.begun_anew_s < watch.torn_since_s:
+        return Doubt(
+            Doubted.ANSWER,
+            f"{watch.pings_torn} pings in a row, whose beams agree with each other, contradict the "
+            "answer in part",
+        )
+    few_s = keyframe.time_s - watch.few_since_s
+    if len(keyframe.beams.speed) > 2 and few_s > LONGEST_FEW_S:
+        return Doubt(
+            Doubted.ANSWER,
+            f"most beams have contradicted the answer for {few_s:.0f} s: perhaps it follows the "
+            "wrong ones",
+        )
+    if watch.fixes_refused >= LOCKED_OUT_FIXES:
+        reason = f"{watch.fixes_refused} GNSS fixes in a row contradict the position"
+        return Doubt(Doubted.POSITION, reason)
+    if watch.depths_refused == LOCKED_OUT_DEPTHS:  # once: if that does not help, it is the sensor
+        reason = f"the depth has contradicted the height {watch.depths_refused} times in a row"
+        return Doubt(Doubted.HEIGHT, reason)
+    return None
+
+
+def _is_adrift(watch: Watch, sigma: Array, keyframe: Keyframe) -> bool:
+    """Return whether beams are back after a silence that left the prediction beyond correction."""
+    return bool(
+        len(keyframe.beams.speed) > 2
+        and keyframe.time_s - watch.last_beam_s > SILENCE_S
+        and np.linalg.norm(sigma[ROTATION]) > BENT_TURN
+        and np.linalg.norm(sigma[VELOCITY]) > BENT_SPEED
+    )
+
+
+def watch_after(was: Watch, begun: Window, last: Stretch, doubt: Doubt) -> Watch:
+    """Return what is remembered of an answer that was begun anew; it has to prove itself.
+
+    Parameters
+    ----------
+    was : what was remembered before.
+    begun : the window of the new answer.
+    last : the newest keyframe before.
+    doubt : why it was begun anew.
+    """
+    newest, refusals = begun.newest, was.depths_refused
+    time_s = float(newest.time_s[0])
+    is_aided = bool(np.any(newest.weight >= TRUSTED))
+    contradicted, moved = was.contradicted, was.moved
+    if doubt.what in (Doubted.POSITION, Doubted.HEIGHT):
+        reckoned_n = last.states.p_n[0] + last.states.v_n[0] * (time_s - last.time_s[0])
+        contradicted = Contradicted(
+            time_s,
+            f"since {time_s:.0f} s: {doubt.reason} of dead reckoning, and it follows them; one of "
+            "the two is wrong",
+            tuple(reckoned_n.tolist()),
+            float(np.sqrt(np.trace(last.covariance[0, POSITION, POSITION]))),
+        )
+    if doubt.what is Doubted.POSITION:
+        moved = (*(t for t in moved if time_s - t < ASTRAY_S), time_s)
+    return Watch(
+        last_beam_s=time_s if is_aided else was.last_beam_s,
+        last_ground_s=time_s
+        if counts_off_the_ground(newest, begun.keyframes[-1])
+        else was.last_ground_s,
+        depths_refused=refusals + (refusals == LOCKED_OUT_DEPTHS),
+        out_since_s=np.inf if is_aided else was.out_since_s,
+        torn_since_s=was.torn_since_s,
+        force=was.force,
+        good_share=0.8 * FEW,  # it has to prove itself
+        trouble_s=time_s,
+        trouble=doubt.reason,
+        begun_anew_s=time_s,
+        moved=moved,
+        contradicted=contradicted,
+    )
+
+
+def is_astray(watch: Watch) -> bool:
+    """Return whether fixes have contradicted one answer after the other: the heading is wrong."""
+    return len(watch.moved) >= ASTRAY_TIMES
+
+
+def reanchored(window: Window, keyframe: Keyframe, kept: Kept, what: Doubted) -> Window:
+    """Return a window that begins at ``keyframe`` without what is doubted.
+
+    Parameters
+    ----------
+    window : up to the keyframe before.
+    keyframe : the next one.
+    kept : an older answer, led on to ``keyframe`` by the inertial data.
+    what : of position, height, or velocity after a silence, the rest of the prediction is gone on
+        from; otherwise ``kept`` is.
+    """
+    if what in (Doubted.ANSWER, Doubted.VELOCITY):
+        trust = kept.trust
+        start = _from_reserve(kept, keyframe.time_s, has_velocity=what is Doubted.ANSWER)
+    else:
+        trust, start = window.trust, _from_prediction(window, keyframe, what)
+    # The first keyframe of a window meets no gate: depth and fixes count from the next one on.
+    first = keyframe.without("depth").without("fix")
+    begun = Window(window.sensors, window.config, first, start, trust=trust)
+    begun.meet_prediction()
+    begun.iterate()
+    return begun
+
+
+def _from_reserve(kept: Kept, time_s: float, *, has_velocity: bool) -> InitialMoments:
+    """Return the older answer; where its velocity says little, the place with what may have come.
+
+    Its errors are correlated as the inertial data correlate them: a velocity that is measured
+    corrects attitude and position as well.
+    """
+    doubted = kept._replace(covariance=kept.covariance * DOUBT_FACTOR**2)
+    variance = np.trace(doubted.covariance[VELOCITY, VELOCITY])
+    if not has_velocity or variance > SPEED_SIGMA**2:
+        doubted = doubted.without_velocity(time_s)
+    return doubted.states.moments(_regular(doubted.covariance))
+
+
+def _from_prediction(window: Window, keyframe: Keyframe, what: Doubted) -> InitialMoments:
+    predicted, covariance = window.predicted(keyframe)
+    P = covariance.copy()
+    R_nb, p_n, v_n, bias, extra = (column[0] for column in predicted)
+    if what is Doubted.VELOCITY_AFTER_SILENCE:
+        v_n = slowed(v_n)
+        forget(P, VELOCITY, SPEED_SIGMA)
+    else:
+        P[ROTATION, ROTATION] *= DOUBT_FACTOR**2
+        up_b = R_nb[2]
+        unsure = np.eye(3) if what is Doubted.POSITION else np.outer(up_b, up_b)
+        P[POSITION, POSITION] += POSITION_SIGMA**2 * unsure
+    return InitialMoments(R_nb, p_n, v_n, bias, _regular(P), extra)
+
+
+def _regular(P: Array) -> Array:
+    """Return a symmetric covariance whose Cholesky factor exists."""
+    P = 0.5 * (P + P.T)
+    scale = np.sqrt(np.diag(P))
+    correlation = P / np.outer(scale, scale) + 1e-12 * np.eye(len(P))
+    return np.asarray(correlation * np.outer(scale, scale))

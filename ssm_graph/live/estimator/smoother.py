@@ -1,0 +1,325 @@
+"""The live estimator: messages in, in any order; the newest state out, at once."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import astuple, replace
+from typing import Any, Final, Self
+
+import numpy as np
+
+from ssm_graph.base.earth import LocalFrame
+from ssm_graph.base.frozen import Array
+from ssm_graph.live.estimator.answer import answer
+from ssm_graph.live.estimator.asked import not_calibrated, sensors_of_vehicle
+from ssm_graph.live.estimator.course import REACH_S, Course, Step
+from ssm_graph.live.estimator.delayed import Delayed, delayed_of
+from ssm_graph.live.estimator.events import EventLog
+from ssm_graph.live.estimator.found import found_by
+from ssm_graph.live.estimator.intake import Intake
+from ssm_graph.live.estimator.keyframes import KeyframeMaker
+from ssm_graph.live.estimator.recovery import ASTRAY_TIMES, is_astray
+from ssm_graph.live.estimator.reserve import Reserve
+from ssm_graph.live.estimator.start import Beginning, Starter
+from ssm_graph.live.estimator.store import (
+    pack_buffers,
+    pack_step,
+    unpack_buffers,
+    unpack_left,
+    unpack_reserve,
+    unpack_watch,
+    window_arrays,
+)
+from ssm_graph.live.estimator.tail import Tail
+from ssm_graph.live.estimator.watch import Watch
+from ssm_graph.mission.aid_errors import not_used
+from ssm_graph.mission.estimate import Found
+from ssm_graph.mission.navigation import Event, Health, Navigation, Severity
+from ssm_graph.mission.problem import ProblemConfig
+from ssm_graph.mission.timeline import MIN_SPACING_S
+from ssm_graph.mission.vehicle import Vehicle
+from ssm_graph.sensors.imu import ImuSample
+from ssm_graph.sensors.messages import Message
+from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
+from ssm_graph.smoothers.keyframe import Keyframe
+from ssm_graph.smoothers.window import Window
+
+ONLINE: Final = FixedLagConfig(
+    max_iterations=3,
+    tolerance=0.02,
+    relinearise_sigmas=0.1,
+    relinearise_turn=5e-4,
+    reweigh=0.02,
+    gate_sigmas=6.0,
+    first_estimates=True,
+)
+"""What a vehicle can afford; `benchmarks/online.py` compares it with windows solved to the end."""
+LONGEST_GAP_S: Final = 10.0
+"""After a longer gap of the inertial data the attitude has to be found anew."""
+CATCH_UP_STEPS: Final = 1
+"""Of the keyframes that came while an alignment was worked on so many are made in one push."""
+
+
+class FixedLagSmoother:
+    """Estimates a vehicle's state from messages as they come.
+
+    ::
+
+        smoother = FixedLagSmoother(vehicle)
+        for message in messages:
+            smoother.push(message)
+            navigation = smoother.newest()
+
+    Messages may come late and out of order within the lag, repeated, damaged or not at all: nothing
+    raises. Out of order they lead to the same answer as in order. Smoothed states are kept until
+    ``take_delayed`` takes them: in a long run call it now and then.
+    """
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        config: FixedLagConfig | None = None,
+        *,
+        problem_config: ProblemConfig | None = None,
+    ) -> None:
+        """Take a vehicle; ``config`` is :data:`ONLINE` when left out."""
+        self.vehicle, self.config = vehicle, config or ONLINE
+        self._problem_config = problem_config or ProblemConfig()
+        self._events = EventLog()
+        self._intake = Intake(vehicle, self._events)
+        self._starter = Starter(vehicle, self._problem_config, self._events)
+        self._course: Course | None = None
+        self._frame = vehicle.frame
+        self._tail: Tail | None = None
+        self._latest_s = -np.inf
+        self._cost_s = 0.0
+        self._begun_s, self._is_lost = 0.0, False
+        self._finished: list[Delayed] = []
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many messages were refused, by sensor and reason."""
+        return dict(self._intake.counts)
+
+    def push(self, message: Message) -> None:
+        """Take one message; nothing that it may hold raises."""
+        begin = time.perf_counter()
+        newest_s = self._intake.buffers.imu.last_s
+        time_s = self._intake.accept(message)
+        if time_s is None:
+            return
+        is_late = time_s < newest_s or not isinstance(message, ImuSample)
+        self._latest_s = max(self._latest_s, message.time_s + self._intake.shift_s)
+        is_made = self._update(message, time_s, is_late=is_late)
+        if is_made:
+            self._cost_s = time.perf_counter() - begin
+
+    def _update(self, message: Message, time_s: float, *, is_late: bool) -> bool:
+        """Let the answer follow what has come; return whether a keyframe was made."""
+        course, buffers = self._course, self._intake.buffers
+        is_sample = isinstance(message, ImuSample)
+        if is_sample and self._is_gap(time_s):
+            buffers.drop_before(time_s)
+            if course is None:
+                self._starter.begin_anew()
+            else:
+                self._lose(time_s, f"no inertial data for more than {LONGEST_GAP_S:.0f} s")
+            return False
+        if course is None:
+            return self._start()
+        is_behind = self._tail is None
+        undone = is_late and course.rewind(time_s - (REACH_S if is_sample else MIN_SPACING_S))
+        n_made = course.advance(
+            is_sample=not (is_late or is_behind), at_most=CATCH_UP_STEPS if is_behind else np.inf
+        )
+        self._intake.horizon_s = course.horizon_s
+        if is_astray(course.newest.watch):
+            self._lose(
+                time_s, f"fixes contradicted the position {ASTRAY_TIMES} times: wrong heading?"
+            )
+            return True
+        if is_behind and n_made == CATCH_UP_STEPS:
+            return True
+        if undone or n_made or self._tail is None or (is_late and is_sample):
+            self._tail = self._tail_of(course.newest)
+        elif is_sample:
+            self._tail.add(buffers.imu.between(self._tail.end_s, np.inf))
+        return n_made > 0
+
+    def _start(self) -> bool:
+        beginning = self._starter.find(self._intake.buffers)
+        if beginning is None:
+            return False
+        self._begin(beginning)
+        return True
+
+    def _begin(self, beginning: Beginning) -> None:
+        self._frame, buffers = beginning.frame, self._intake.buffers
+        self._begun_s = beginning.time_s
+        for note in not_calibrated(self.vehicle):
+            self._events.tell(beginning.time_s, Severity.INFO, "not_calibrated", note)
+        for note in not_used(self.vehicle.further_aids):
+            self._events.tell(beginning.time_s, Severity.INFO, "not_aided", note)
+        maker = KeyframeMaker(buffers, beginning.frame, self._problem_config)
+        first = Keyframe.unmeasured(beginning.time_s, np.zeros(3), None)
+        sensors = sensors_of_vehicle(self.vehicle, beginning.frame)
+        window = Window(sensors, self.config, first, beginning.moments)
+        window.iterate()
+        self._course = self._course_from(Step(window, Watch(), None, Reserve.of(window)), maker)
+
+    def _course_from(self, step: Step, maker: KeyframeMaker) -> Course:
+        null_b = np.linalg.svd(self.vehicle.mount.beams_b.T)[2][-1]
+        course = Course(step, maker, self._intake.buffers, self._events, null_b)
+        self._intake.horizon_s = course.horizon_s
+        return course
+
+    def checkpoint(self) -> tuple[dict[str, Array], dict[str, Any]]:
+        """Return the state as plain arrays and plain numbers, for :meth:`restore`.
+
+        Delayed states that have not been taken are not in it: take them first.
+        """
+        intake = self._intake
+        arrays = pack_buffers(intake.buffers)
+        meta: dict[str, Any] = {
+            "shift_s": intake.shift_s,
+            "counts": dict(intake.counts),
+            "frame": None if self._frame is None else [*astuple(self._frame)],
+            "is_lost": self._is_lost,
+            "begun_s": self._begun_s,
+            "alignment": self._starter.pack(),
+            "watch": None,
+        }
+        if self._course is not None:
+            packed, meta["watch"] = pack_step(self._course.oldest)
+            arrays |= packed
+        return arrays, meta
+
+    @classmethod
+    def restore(
+        cls,
+        vehicle: Vehicle,
+        config: FixedLagConfig | None,
+        arrays: Mapping[str, Array],
+        meta: Mapping[str, Any],
+        *,
+        problem_config: ProblemConfig | None = None,
+    ) -> Self:
+        """Return the estimator as it was when ``checkpoint`` was called."""
+        smoother = cls(vehicle, config, problem_config=problem_config)
+        intake = smoother._intake
+        intake.shift_s = float(meta["shift_s"])
+        intake.counts.update(meta["counts"])
+        unpack_buffers(arrays, intake.buffers)
+        smoother._latest_s = intake.buffers.imu.last_s
+        smoother._begun_s = meta["begun_s"]
+        if meta["is_lost"]:
+            smoother._start_anew()
+        if meta["frame"] is not None:
+            smoother._frame = LocalFrame(*meta["frame"])
+        if meta["watch"] is None:
+            smoother._starter.go_on_from(meta["alignment"], intake.buffers)
+        if meta["watch"] is not None:
+            assert smoother._frame is not None
+            maker = KeyframeMaker(intake.buffers, smoother._frame, smoother._problem_config)
+            sensors = sensors_of_vehicle(vehicle, smoother._frame)
+            window = Window.unpack(window_arrays(arrays), sensors, smoother.config, maker.way)
+            watch, left = unpack_watch(meta["watch"]), unpack_left(arrays)
+            step = Step(window, watch, left, unpack_reserve(arrays))
+            smoother._course = course = smoother._course_from(step, maker)
+            course.advance()
+            intake.horizon_s = course.horizon_s
+            smoother._tail = smoother._tail_of(course.newest)
+        return smoother
+
+    def _is_gap(self, time_s: float) -> bool:
+        samples = self._intake.buffers.imu
+        at = samples.index(time_s)
+        return bool(at > 0 and time_s - samples.all[at - 1, 0] > LONGEST_GAP_S)
+
+    def _lose(self, time_s: float, reason: str) -> None:
+        """Give the answer up, keep what was found, and align anew."""
+        assert self._course is not None
+        self._events.tell(
+            time_s,
+            Severity.ERROR,
+            "lost",
+            f"{reason}; position and attitude have to be found anew",
+        )
+        self._finished += self._take(self._course, all_of_them=True)
+        self._course = self._tail = None
+        self._intake.horizon_s = time_s
+        self._start_anew()
+
+    def _start_anew(self) -> None:
+        """Align without the initial state, which is of another time."""
+        self._is_lost = True
+        vehicle = replace(self.vehicle, initial=None)
+        self._starter = Starter(vehicle, self._problem_config, self._events)
+
+    def _tail_of(self, step: Step) -> Tail:
+        assert self._frame is not None
+        newest = step.window.newest
+        tail = Tail(
+            step.window.keyframes[-1],
+            newest.states,
+            newest.covariance[0],
+            noise=self.vehicle.imu_noise,
+            sensors=step.window.sensors,
+        )
+        imu = self._intake.buffers.imu
+        tail.add(imu.all[max(imu.index(step.time_s, after=True) - 1, 0) :])
+        return tail
+
+    def newest(self) -> Navigation | None:
+        """Return the state at the last inertial sample, None before there is any."""
+        if self._course is None or self._tail is None:
+            return None
+        assert self._frame is not None
+        return answer(
+            self._tail.newest(),
+            self._course.newest.watch,
+            self._frame,
+            latest_s=self._latest_s,
+            shift_s=self._intake.shift_s,
+            latency_s=self._cost_s,
+        )
+
+    def found(self) -> Found:
+        """Return what is known by now beside the state of the vehicle."""
+        if self._course is None:
+            return Found()
+        return found_by(self._course.newest.window, begun_s=self._begun_s)
+
+    def status(self) -> tuple[Health, str]:
+        """Return the health of the newest answer and one sentence, also before there is one."""
+        navigation = self.newest()
+        if navigation is None:
+            return Health.ALIGNING, self._starter.reason
+        return navigation.health, navigation.reason
+
+    def take_events(self) -> tuple[Event, ...]:
+        """Return what happened since the last call."""
+        return self._events.take()
+
+    def take_delayed(self) -> list[Delayed]:
+        """Return the smoothed states that nothing will change any more, since the last call."""
+        taken, self._finished = self._finished, []
+        return taken if self._course is None else taken + self._take(self._course)
+
+    def finish(self) -> list[Delayed]:
+        """Return all smoothed states that are left, and end."""
+        taken, self._finished = self._finished, []
+        if self._course is not None:
+            taken += self._take(self._course, all_of_them=True)
+            self._course = self._tail = None
+        return taken
+
+    def _take(self, course: Course, *, all_of_them: bool = False) -> list[Delayed]:
+        assert self._frame is not None
+        shift_s, extras = self._intake.shift_s, course.newest.window.sensors.extras
+        return [
+            delayed_of(stretch, self._frame, extras, shift_s=shift_s)
+            for stretch in course.take_settled(all_of_them=all_of_them)
+            if len(stretch.time_s)
+        ]

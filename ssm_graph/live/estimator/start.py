@@ -1,0 +1,190 @@
+"""Where a live estimator begins: at a given state, or where the first minutes lead."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from ssm_graph.base.earth import LocalFrame
+from ssm_graph.base.errors import SsmGraphError
+from ssm_graph.base.stepwise import Steps
+from ssm_graph.engine.error_state import InitialMoments
+from ssm_graph.engine.extras import with_extras
+from ssm_graph.live.estimator.asked import extras_of_vehicle
+from ssm_graph.live.estimator.buffers import Buffers
+from ssm_graph.live.estimator.events import EventLog
+from ssm_graph.mission.calibration import windowed
+from ssm_graph.mission.mission import InitialState, Mission
+from ssm_graph.mission.navigation import Severity
+from ssm_graph.mission.problem import ProblemConfig, build_problem_steps
+from ssm_graph.mission.start.alignment import SAFE_HEADING_SIGMA
+from ssm_graph.mission.start.moments import initial_moments
+from ssm_graph.mission.vehicle import Vehicle
+from ssm_graph.smoothers.fixed_lag import run_fixed_lag_steps
+from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
+from ssm_graph.smoothers.mission import smooth_steps
+
+SETTLE_S: Final = 1.0
+"""So much inertial data is waited for, since the first samples may come late as well."""
+TRY_EVERY_S: Final = 5.0
+LONGEST_S: Final = 300.0
+"""Data to align with are kept for so long."""
+SHARE: Final = 0.5
+"""Of a laptop's processor, spent on an alignment. It is counted off by the time of the data and the
+size of the steps, never by a clock: every replay comes to the same start at the same sample."""
+MOST_MS: Final = 10.0
+"""So much is worked on it in one push, and to the end of the step that goes beyond."""
+STALE_S: Final = 60.0
+"""A given initial state may be so much older than the data."""
+
+
+class Beginning(NamedTuple):
+    """Time and state to begin with."""
+
+    time_s: float
+    moments: InitialMoments
+    frame: LocalFrame
+
+
+class Starter:
+    """Finds the beginning as soon as the data allow, by a little work with every sample."""
+
+    def __init__(self, vehicle: Vehicle, config: ProblemConfig, events: EventLog) -> None:
+        self._vehicle, self._config, self._events = vehicle, config, events
+        self._now_s = self._next_try_s = -np.inf
+        self.reason = "waiting for inertial data"
+        self._initial = vehicle.initial
+        self._work: Steps[Beginning | None] | None = None
+        self._begun_s, self._n_steps, self._credit_ms = -np.inf, 0, 0.0
+
+    @property
+    def is_working(self) -> bool:
+        """Whether an alignment is worked on."""
+        return self._work is not None
+
+    def begin_anew(self) -> None:
+        """Leave the alignment that is worked on; there are other data now."""
+        self._work = None
+
+    def pack(self) -> dict[str, Any]:
+        """Return how far it has come as plain values, for :meth:`go_on_from`."""
+        work = self._begun_s, self._n_steps, self._credit_ms
+        return {
+            "reason": self.reason,
+            "next_try_s": self._next_try_s if np.isfinite(self._next_try_s) else None,
+            "work": work if self.is_working else None,
+        }
+
+    def go_on_from(self, packed: Mapping[str, Any], buffers: Buffers) -> None:
+        """Come to where another one was; the steps that it had made are made again, at once."""
+        self.reason, self._now_s = packed["reason"], buffers.imu.last_s
+        if packed["next_try_s"] is not None:
+            self._next_try_s = packed["next_try_s"]
+        frame = self._frame(buffers)
+        if packed["work"] is None or frame is None:
+            return
+        self._begun_s, self._n_steps, self._credit_ms = packed["work"]
+        self._work = self._align_steps(buffers.mission(frame, until_s=self._begun_s))
+        for _ in range(self._n_steps):
+            next(self._work)
+
+    def find(self, buffers: Buffers) -> Beginning | None:
+        """Return the beginning, None while there is none."""
+        imu = buffers.imu
+        if len(imu) < 3 or imu.last_s - imu.all[0, 0] < SETTLE_S:
+            return None
+        if self._initial is not None:
+            return self._given(self._initial, buffers)
+        elapsed_s, self._now_s = imu.last_s - self._now_s, imu.last_s
+        if self._work is None:
+            buffers.drop_before(self._now_s - LONGEST_S)
+            if self._now_s < self._next_try_s:
+                return None
+            self._next_try_s = self._now_s + TRY_EVERY_S
+            frame = self._frame(buffers)
+            if frame is None:
+                self._wait("waiting for a GNSS fix, or an initial state")
+                return None
+            self._work = self._align_steps(buffers.mission(frame))
+            self._begun_s, self._n_steps, self._credit_ms = self._now_s, 0, 0.0
+        self._credit_ms = min(self._credit_ms + 1e3 * SHARE * elapsed_s, MOST_MS)
+        return self._go_on(self._work)
+
+    def _go_on(self, work: Steps[Beginning | None]) -> Beginning | None:
+        """Work on an alignment for what the time of the data allows; return where it leads."""
+        try:
+            while self._credit_ms > 0.0:
+                self._credit_ms -= next(work)
+                self._n_steps += 1
+        except StopIteration as end:
+            self._work = None
+            beginning: Beginning | None = end.value
+            return beginning
+        except (SsmGraphError, np.linalg.LinAlgError) as error:
+            self._work = None
+            self._wait(f"not aligned yet: {error}")
+        return None
+
+    def _given(self, initial: InitialState, buffers: Buffers) -> Beginning | None:
+        # A little inside the first sample, whose begin is known to rounding only.
+        first_s = float(buffers.imu.all[0, 0]) - buffers.period_s + 1e-6
+        last_s = buffers.imu.last_s
+        if last_s < initial.time_s:
+            self.reason = f"waiting for the time of the initial state, {initial.time_s:.1f} s"
+            return None
+        time_s = max(initial.time_s, first_s)
+        if time_s - initial.time_s > STALE_S:
+            self._initial, self._now_s = None, last_s
+            self._wait(
+                f"[initial] is {time_s - initial.time_s:.0f} s older than the data: left out"
+            )
+            return None
+        frame = self._frame(buffers)
+        assert frame is not None  # an initial state has a place
+        moved = replace(initial, time_s=time_s)
+        return Beginning(time_s, self._moments(moved, frame), frame)
+
+    def _moments(self, start: InitialState, frame: LocalFrame) -> InitialMoments:
+        noise = self._vehicle.imu_noise
+        bias_sigma = np.repeat([noise.accel_bias_sigma, noise.gyro_bias_sigma], 3)
+        moments = initial_moments(start, frame, bias_sigma=bias_sigma)
+        return with_extras(moments, extras_of_vehicle(self._vehicle))
+
+    def _align_steps(self, mission: Mission) -> Steps[Beginning | None]:
+        """Smooth what there is; begin at its end if that may be believed."""
+        yield 1e-3 * len(mission.imu.time_s)  # for the mission itself
+        estimate = yield from smooth_steps(mission, problem_config=self._config)
+        sigma = float(estimate.trajectory.attitude_sigma[-1, 2])
+        if not estimate.status.is_good or sigma > SAFE_HEADING_SIGMA:
+            self._wait(
+                f"heading sigma {np.degrees(sigma):.0f} deg: {estimate.reason}; move while GNSS "
+                "is there",
+            )
+            return None
+        problem = yield from build_problem_steps(mission, self._config, start=estimate.start)
+        run = yield from run_fixed_lag_steps(problem, FixedLagConfig(0.0, tolerance=1e-3))
+        newest = run.newest
+        found = newest.states.take(np.s_[-1:]).moments(newest.covariance[-1])
+        moments = with_extras(found, extras_of_vehicle(self._vehicle), windowed(problem.extras))
+        self.reason = "aligned: catching up with what has come meanwhile"
+        self._events.tell(
+            self._now_s, Severity.INFO, "aligned", "; ".join(estimate.notes) or "heading found"
+        )
+        return Beginning(float(newest.time_s[-1]), moments, mission.frame)
+
+    def _frame(self, buffers: Buffers) -> LocalFrame | None:
+        if self._vehicle.frame is not None:
+            return self._vehicle.frame
+        if self._initial is not None:
+            return LocalFrame(self._initial.lat, self._initial.lon, self._initial.height)
+        if len(buffers.fixes) == 0:
+            return None
+        _, lat, lon, height, *_ = buffers.fixes.all[0].tolist()
+        return LocalFrame(lat, lon, height)
+
+    def _wait(self, reason: str) -> None:
+        self.reason = reason
+        self._events.tell(self._now_s, Severity.INFO, "aligning", reason)

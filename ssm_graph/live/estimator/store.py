@@ -1,0 +1,87 @@
+"""The state of a live estimator as plain arrays and back.
+
+What is stored is the oldest step that messages may still undo, and everything received since: all
+later steps follow from these, and so does the answer to every late message.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.states import AugmentedStates
+from ssm_graph.live.estimator.buffers import Buffers
+from ssm_graph.live.estimator.course import Step
+from ssm_graph.live.estimator.reserve import Reserve
+from ssm_graph.live.estimator.watch import Contradicted, Watch
+from ssm_graph.smoothers.stretch import Stretch
+
+TABLES: Final = ("imu", "pings", "depths", "fixes")
+
+
+def pack_buffers(buffers: Buffers) -> dict[str, Array]:
+    """Return all rows that were received and kept."""
+    return {f"rows_{name}": getattr(buffers, name).all.copy() for name in TABLES}
+
+
+def unpack_buffers(arrays: Mapping[str, Array], buffers: Buffers) -> None:
+    """Fill empty buffers."""
+    for name in TABLES:
+        for row in arrays[f"rows_{name}"]:
+            getattr(buffers, name).add(row)
+
+
+def pack_step(step: Step) -> tuple[dict[str, Array], dict[str, Any]]:
+    """Return arrays of the window and of what left it, and the plain numbers of the watch."""
+    arrays = {f"window_{name}": array for name, array in step.window.pack().items()}
+    if step.left is not None:
+        states = {f"states_{k}": v for k, v in step.left.states._asdict().items()}
+        others = {k: v for k, v in step.left._asdict().items() if k != "states"}
+        arrays |= {f"left_{name}": array for name, array in {**states, **others}.items()}
+    arrays |= {f"reserve_{name}": array for name, array in step.reserve.pack()}
+    return arrays, {name: _plain(value) for name, value in step.watch._asdict().items()}
+
+
+def window_arrays(arrays: Mapping[str, Array]) -> dict[str, Array]:
+    """Return what :meth:`ssm_graph.smoothers.window.Window.pack` gave of the step."""
+    prefix = "window_"
+    return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+
+
+def unpack_watch(plain: Mapping[str, Any]) -> Watch:
+    """Return the watch that was packed."""
+    numbers: dict[str, Any] = {
+        name: float(value) if isinstance(value, str) and name != "trouble" else value
+        for name, value in plain.items()
+    }
+    numbers["beam_weights"] = tuple(float(weight) for weight in plain["beam_weights"])
+    numbers["moved"] = tuple(plain["moved"])
+    if plain["contradicted"] is not None:
+        since_s, text, reckoned_n, sigma = plain["contradicted"]
+        numbers["contradicted"] = Contradicted(since_s, text, tuple(reckoned_n), sigma)
+    return Watch(**numbers)
+
+
+def unpack_reserve(arrays: Mapping[str, Array]) -> Reserve:
+    """Return the reserve of the step."""
+    prefix = "reserve_"
+    return Reserve.unpack({k.removeprefix(prefix): v for k, v in arrays.items() if prefix in k})
+
+
+def unpack_left(arrays: Mapping[str, Array]) -> Stretch | None:
+    """Return what had left the window with the step."""
+    if "left_time_s" not in arrays:
+        return None
+    states = AugmentedStates(*(arrays[f"left_states_{n}"] for n in AugmentedStates._fields))
+    others = {n: arrays[f"left_{n}"] for n in Stretch._fields if n != "states"}
+    return Stretch(states=states, **others)
+
+
+def _plain(value: Any) -> Any:
+    """Return a number that JSON can hold: infinite ones and NaN as text."""
+    if isinstance(value, tuple):
+        return [_plain(v) for v in value]
+    return str(value) if isinstance(value, float) and not np.isfinite(value) else value

@@ -1,0 +1,101 @@
+"""From the newest keyframe to the last inertial sample: what control asks for at once."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.states import AugmentedStates
+from ssm_graph.imu.preintegration import Unseen, gtsam_gravity, imu_params
+from ssm_graph.sensors.imu import ImuNoise
+from ssm_graph.smoothers.keyframe import Keyframe, Sensors, Way
+from ssm_graph.smoothers.window_inertial import InertialRows
+
+LONGEST_S = 0.1
+"""A longer step from sample to sample is a gap of the inertial data."""
+
+
+class Newest(NamedTuple):
+    """State and covariance at the last inertial sample."""
+
+    time_s: float
+    states: AugmentedStates
+    """(1, ...)"""
+    covariance: Array
+    """(n, n)"""
+
+
+class Tail:
+    """Integrates the samples since the newest keyframe."""
+
+    def __init__(
+        self,
+        keyframe: Keyframe,
+        states: AugmentedStates,
+        covariance: Array,
+        *,
+        noise: ImuNoise,
+        sensors: Sensors,
+    ) -> None:
+        """Begin at a keyframe with its states (1, ...) and covariance (n, n)."""
+        frame = sensors.frame
+        self._begin_s = self._end_s = keyframe.time_s
+        self._states, self._covariance = states, covariance
+        self._noise, self._frame = noise, frame
+        self._gap_s = 0.0
+        self._last: Array | None = None
+        bias = gtsam.imuBias.ConstantBias(states.bias[0, :3], states.bias[0, 3:])
+        params = imu_params(noise, g_n=gtsam_gravity(frame, states.p_n[0]), frame=frame)
+        self._way = Way(gtsam.PreintegratedCombinedMeasurementsG(params, bias), params)
+        self._rows = InertialRows(frame, sensors.extras)
+
+    def add(self, samples: Array) -> None:
+        """Integrate samples (N, 7): end of the interval s, gyro rad/s, specific force m/s^2."""
+        for time_s, *row in samples.tolist():
+            dt = time_s - self._end_s
+            if dt <= 0.0:
+                self._last = np.array(row)
+                continue
+            self._gap_s = max(self._gap_s, dt if dt > LONGEST_S else 0.0)
+            reading = np.array(row)
+            here = (
+                reading if self._last is None or dt <= LONGEST_S else 0.5 * (self._last + reading)
+            )
+            gyro_b, accel_b, self._last = here[:3], here[3:], reading
+            self._way.measured.integrateMeasurement(accel_b, gyro_b, dt)
+            self._end_s = time_s
+
+    @property
+    def end_s(self) -> float:
+        """Time of the last sample integrated, s."""
+        return self._end_s
+
+    def newest(self) -> Newest:
+        """Return where the vehicle is now; the keyframe itself if nothing came since."""
+        if self._end_s <= self._begin_s:
+            return Newest(self._begin_s, self._states, self._covariance)
+        end = Keyframe.unmeasured(self._end_s, np.zeros(3), self._way)
+        predicted = self._rows.predict(end, self._states)
+        begun = self._covariance + self._unseen() if self._gap_s else self._covariance
+        covariance = self._rows.carry(end, self._states, predicted, begun)
+        return Newest(self._end_s, predicted, covariance)
+
+    def _unseen(self) -> Array:
+        """Return the covariance (n, n) of what may have happened where samples are missing.
+
+        The noise of what is integrated already stands, so the whole is integrated with more of it
+        from the next keyframe on; until then the gap's own share is added to the keyframe's.
+        """
+        span = self._end_s - self._begin_s
+        noisy = imu_params(
+            self._noise, g_n=np.zeros(3), frame=self._frame, unseen=Unseen(self._gap_s), span_s=span
+        )
+        extra = np.zeros_like(self._covariance)
+        gyro = noisy.getGyroscopeCovariance() * span
+        accel = noisy.getAccelerometerCovariance() * span
+        extra[:3, :3], extra[6:9, 6:9] = gyro, accel
+        extra[3:6, 3:6] = accel * span**2 / 3.0
+        return extra

@@ -1,0 +1,1 @@
+"""Bytes of instruments to messages and back."""

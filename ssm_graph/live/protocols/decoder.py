@@ -1,0 +1,222 @@
+"""What all decoders share: their protocol, refusals, time stamps, and JSON that cannot hurt."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable
+from decimal import Decimal
+from enum import Enum
+from typing import Any, Final, Protocol
+
+from ssm_graph.base.errors import nearest_hint
+from ssm_graph.sensors.messages import Message
+
+MAX_REFUSALS: Final = 20
+LARGEST_NUMBER: Final = 1e12
+"""Whatever the unit, a larger number is damage."""
+_SHOWN: Final = 60
+_MAX_DIGITS: Final = 20
+_MAX_BRACKETS: Final = 200
+
+
+class Decoder(Protocol):
+    """Bytes of one connection in, messages out."""
+
+    def feed(self, data: bytes, *, arrival_s: float) -> list[Message]:
+        """Return the messages that these bytes complete; never raises, whatever the bytes are.
+
+        Parameters
+        ----------
+        data : the next bytes of the stream, cut anywhere.
+        arrival_s : when they came, s on the vehicle's clock.
+        """
+        ...
+
+    def take_refusals(self) -> list[str]:
+        """Return what was refused since the last call, a sentence each, and forget it."""
+        ...
+
+    @property
+    def n_held(self) -> int:
+        """Bytes held of what is not complete yet."""
+        ...
+
+
+class Clock(Enum):
+    """The clock that stamps a message; the text is shown to the user."""
+
+    INSTRUMENT = "the instrument's own UTC where it agrees with the arrival, else the arrival"
+    ARRIVAL = "the arrival of the bytes"
+
+
+class RefusedError(ValueError):
+    """A message cannot be used; the text says what was expected and what came."""
+
+
+class Refusals:
+    """The first sentences since they were last taken; the rest is counted."""
+
+    def __init__(self) -> None:
+        self.n_total = 0
+        self._texts: list[str] = []
+        self._n_more = 0
+
+    def add(self, text: str) -> None:
+        """Keep or count one sentence."""
+        self.n_total += 1
+        if len(self._texts) < MAX_REFUSALS:
+            self._texts.append(text)
+        else:
+            self._n_more += 1
+
+    def take(self) -> list[str]:
+        """Return the sentences, the last one with the count of those not kept; start anew."""
+        texts = self._texts
+        if self._n_more:
+            texts = [*texts, f"{self._n_more} more were refused"]
+        self._texts, self._n_more = [], 0
+        return texts
+
+
+class Stamper:
+    """Joins the instrument's clock and the arrival.
+
+    A stamp that differs from the arrival by more than ``max_clock_error_s`` is not believed: the
+    instrument's clock or the vehicle's is not set, and stamps of two clocks do not go together. It
+    is said once, when it begins.
+    """
+
+    def __init__(
+        self, clock: Clock, *, max_clock_error_s: float, refusals: Refusals, place: str
+    ) -> None:
+        self._clock = clock
+        self._max_error_s = max_clock_error_s
+        self._refusals = refusals
+        self._place = place
+        self._is_off = False
+
+    def stamp(self, instrument_s: float | None, arrival_s: float) -> float:
+        """Return the time of a message, s; raise :class:`RefusedError` where there is none."""
+        if not math.isfinite(arrival_s):
+            raise RefusedError(
+                "expected a finite time of arrival, got none; check the vehicle's clock"
+            )
+        if self._clock is Clock.ARRIVAL or instrument_s is None:
+            return arrival_s
+        off = instrument_s - arrival_s
+        is_off = not abs(off) <= self._max_error_s
+        if is_off and not self._is_off:
+            self._refusals.add(
+                f"{self._place}: expected stamps within {self._max_error_s:g} s of the arrival, "
+                f"got {off:+.6g} s; the arrival is used: set both clocks to UTC, or choose "
+                f"Clock.ARRIVAL"
+            )
+        self._is_off = is_off
+        return arrival_s if is_off else instrument_s
+
+
+def shown(value: object) -> str:
+    """Return a value as it came, cut to a length for people and free of control characters."""
+    text = repr(value[: _SHOWN + 1]) if isinstance(value, str) else repr(value)
+    return text if len(text) <= _SHOWN else text[:_SHOWN] + "..."
+
+
+def parse_object(
+    text: str, *, parse_float: Callable[[str], float | Decimal] | None = None
+) -> dict[str, Any]:
+    """Return a JSON object; raise :class:`RefusedError` for all that is no sound one.
+
+    Refused beyond the grammar: NaN and Infinity, numbers that overflow, integers of more than 20
+    digits, keys that come twice, more than 200 brackets (and with them deep nesting).
+
+    Parameters
+    ----------
+    text : one object.
+    parse_float : reads a number with a point or exponent; the nearest float unless given.
+    """
+    if text.count("[") + text.count("{") > _MAX_BRACKETS:
+        raise RefusedError(f"expected a flat JSON object, got more than {_MAX_BRACKETS} brackets")
+    try:
+        found = json.loads(
+            text,
+            object_pairs_hook=_unique,
+            parse_constant=_no_constant,
+            parse_int=_short_int,
+            parse_float=parse_float or _finite_float,
+        )
+    except RefusedError:
+        raise
+    except RecursionError:
+        raise RefusedError("expected a flat JSON object, got deep nesting") from None
+    except (ValueError, ArithmeticError) as error:
+        reason = getattr(error, "msg", type(error).__name__)
+        raise RefusedError(f"expected a JSON object, got {shown(text)} ({reason})") from None
+    if not isinstance(found, dict):
+        raise RefusedError(f"expected a JSON object, got {shown(text)}")
+    return found
+
+
+def require(fields: dict[str, Any], key: str) -> Any:
+    """Return the value of a key that must be there."""
+    if key not in fields:
+        near = nearest_hint(key, [name[:_SHOWN] for name in fields]) if len(fields) < 40 else ""
+        raise RefusedError(f"key {key!r} is missing; {near}".rstrip("; "))
+    return fields[key]
+
+
+def reject_unknown(fields: Iterable[str], known: Iterable[str]) -> None:
+    """Refuse a key that nothing reads, with the nearest one that is read."""
+    names = list(known)
+    for key in fields:
+        if key not in names:
+            raise RefusedError(f"unknown key {shown(key)}; {nearest_hint(key[:_SHOWN], names)}")
+
+
+def number(value: object, *, key: str, low: float = -math.inf, high: float = math.inf) -> float:
+    """Return a JSON number as float; refuse other types, damage and what is out of range."""
+    if isinstance(value, bool) or not isinstance(value, (int, float, Decimal)):
+        raise RefusedError(f"{key}: expected a number, got {shown(value)}")
+    result = float(value)
+    if not abs(result) <= LARGEST_NUMBER:
+        raise RefusedError(
+            f"{key}: expected a number below {LARGEST_NUMBER:g}, got {shown(result)}"
+        )
+    if not low <= result <= high:
+        raise RefusedError(f"{key}: expected {low:g} to {high:g}, got {result:g}; check the unit")
+    return result
+
+
+def flag(fields: dict[str, Any], key: str) -> bool:
+    """Return the truth value of a key that must be there."""
+    value = require(fields, key)
+    if not isinstance(value, bool):
+        raise RefusedError(f"{key}: expected true or false, got {shown(value)}")
+    return value
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    result = dict(pairs)
+    if len(result) < len(pairs):
+        counts = Counter(name for name, _ in pairs)
+        twice = counts.most_common(1)[0][0]
+        raise RefusedError(f"key {shown(twice)} comes twice; expected it once")
+    return result
+
+
+def _no_constant(text: str) -> float:
+    raise RefusedError(f"expected finite numbers, got {text}; write null for what is missing")
+
+
+def _short_int(text: str) -> int:
+    if len(text) > _MAX_DIGITS:
+        raise RefusedError(f"expected at most {_MAX_DIGITS} digits, got {len(text)}")
+    return int(text)
+
+
+def _finite_float(text: str) -> float:
+    value = float(text)
+    if math.isinf(value):
+        raise RefusedError(f"expected finite numbers, got {shown(text)}")
+    return value

@@ -1,0 +1,282 @@
+"""NMEA 0183 in: GNSS fixes and depths from sentences with a checksum.
+
+The way out is :mod:`ssm_graph.live.protocols.nmea_encoder`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final, NamedTuple
+
+from ssm_graph.base.errors import ConfigError
+from ssm_graph.base.frozen import Vector
+from ssm_graph.live.protocols.decoder import Clock, RefusedError, Stamper, number, shown
+from ssm_graph.live.protocols.framed_decoder import FramedDecoder
+from ssm_graph.live.protocols.framing import LineFramer
+from ssm_graph.live.protocols.nmea_fields import (
+    angle,
+    optional_number,
+    required_number,
+    split_sentence,
+    utc_seconds,
+)
+from ssm_graph.sensors.depth import DepthReading
+from ssm_graph.sensors.gnss import Fix
+from ssm_graph.sensors.limits import DEEPEST_M, HIGHEST_M
+from ssm_graph.sensors.messages import Message
+
+PLACE: Final = "nmea"
+MAX_SENTENCE: Final = 1024
+"""Bytes; the standard allows 82, makers write longer ones."""
+PASCAL_PER_DBAR: Final = 1e4
+STANDARD_GRAVITY: Final = 9.80665
+"""m/s^2"""
+_FIXES = {"1", "2", "3", "4", "5", "9"}
+_NO_FIX = {"", "0"}
+
+
+class DepthSentence(Enum):
+    """Sentences that may hold the vehicle's depth; the text is shown to the user."""
+
+    PRVAT = "$PRVAT: altimeter range and pressure in dBar (Valeport VA500)"
+    PIPS = "$PIPS: pressure in dBar or depth in m (Valeport miniIPS)"
+    PVIPS2 = "$PVIPS2: pressure in dBar, and a depth that is not read (Valeport miniIPS2)"
+    DPT = "$--DPT: water below a transducer; vehicle depth only if your sensor writes it so"
+    DBT = "$--DBT: water below a transducer; vehicle depth only if your sensor writes it so"
+
+
+PRESSURE_SENTENCES: Final = frozenset(
+    {DepthSentence.PRVAT, DepthSentence.PIPS, DepthSentence.PVIPS2}
+)
+
+
+@dataclass(frozen=True, slots=True)
+class NmeaOptions:
+    """What the sentences themselves do not say."""
+
+    clock: Clock = Clock.INSTRUMENT
+    """INSTRUMENT: UTC of day of GGA, joined to the day of the arrival. Depths have no time."""
+    max_clock_error_s: float = 5.0
+    """A time further from the arrival is not believed."""
+    user_range_error_m: float = 5.0
+    """Times HDOP: sigma of east and of north, where there is no GST; twice that of the height."""
+    geoid_separation_m: float | None = None
+    """Geoid above ellipsoid where GGA leaves its field empty; None refuses such a fix."""
+    depth_sentences: frozenset[DepthSentence] = PRESSURE_SENTENCES
+    """What is taken for vehicle depth; all others are ignored."""
+    air_pressure_dbar: float = 10.1325
+    """Subtracted from every pressure; 0 for a sensor that is tared or sealed at the surface."""
+    water_density_kg_per_m3: float = 1025.0
+    """Mean over the column above the sensor."""
+    surface_height_m: float = 0.0
+    """Ellipsoidal height of the water's surface: depth messages count from the ellipsoid."""
+    gst_wait_s: float = 0.5
+    """How long a fix waits for its GST, where the last one came after its GGA."""
+
+    def __post_init__(self) -> None:
+        positive = ("max_clock_error_s", "user_range_error_m", "water_density_kg_per_m3")
+        for name in (*positive, "air_pressure_dbar", "surface_height_m", "gst_wait_s"):
+            value = getattr(self, name)
+            if not math.isfinite(value) or (name in positive and value <= 0.0):
+                wanted = "a number above 0" if name in positive else "a finite number"
+                raise ConfigError(f"NmeaOptions.{name}: expected {wanted}, got {value}")
+        if self.geoid_separation_m is not None and not math.isfinite(self.geoid_separation_m):
+            raise ConfigError(
+                f"NmeaOptions.geoid_separation_m: expected a finite number or None, "
+                f"got {self.geoid_separation_m}"
+            )
+
+
+class _Gga(NamedTuple):
+    """A fix before its sigmas are known."""
+
+    utc: str
+    time_s: float
+    arrival_s: float
+    lat: float
+    lon: float
+    height: float
+    hdop: float | None
+
+
+class NmeaDecoder(FramedDecoder):
+    """GGA (with GST) to fixes, pressures to depths; all other sentences are ignored.
+
+    ``height`` is that of GGA above the geoid plus its separation: above the ellipsoid. Sigmas are
+    those of a GST of the same time of day, before or after its GGA, else from HDOP. Quality 0 is no
+    fix; 6 (estimated), 7 (typed in) and 8 (simulated) are refused: a dead-reckoned position is not
+    a measurement, it might be our own.
+    """
+
+    def __init__(self, options: NmeaOptions | None = None) -> None:
+        super().__init__(PLACE)
+        self.n_without_fix = 0
+        """How many GGA said that there is no fix; the first of a row is told as a refusal."""
+        self._options = options or NmeaOptions()
+        self._framer = LineFramer(self._refuse, max_length=MAX_SENTENCE)
+        self._stamper = Stamper(
+            self._options.clock,
+            max_clock_error_s=self._options.max_clock_error_s,
+            refusals=self._refusals,
+            place=PLACE,
+        )
+        self._has_fix = True
+        self._pending: _Gga | None = None
+        self._last_utc = ""
+        self._gst: tuple[str, Vector] | None = None
+        self._gst_follows = False
+
+    def _overdue(self, arrival_s: float) -> list[Message]:
+        """Return the fix that has waited for its GST long enough."""
+        waited = self._pending and not (
+            0.0 <= arrival_s - self._pending.arrival_s < self._options.gst_wait_s
+        )
+        return self._release(None) if waited else []
+
+    def _decode(self, text: str, arrival_s: float) -> list[Message]:
+        lead, _, body = text.rpartition("$")
+        if lead or not text.startswith("$"):
+            if text.startswith("!"):
+                return []
+            self._refuse(f"expected a sentence that begins with '$', got {shown(text)}")
+            if not lead:
+                return []
+        name, *fields = split_sentence(body)
+        if name[-3:] == "GGA" and not name.startswith("P"):
+            return self._on_gga(fields, arrival_s)
+        if name[-3:] == "GST" and not name.startswith("P"):
+            return self._on_gst(fields)
+        kind = name if name.startswith("P") else name[-3:]
+        if kind in _DEPTHS and DepthSentence[kind] in self._options.depth_sentences:
+            below_surface = _DEPTHS[kind](fields, self._options)
+            depth = number(below_surface, key="depth, m", low=-HIGHEST_M, high=DEEPEST_M)
+            depth -= self._options.surface_height_m
+            return [DepthReading(self._stamper.stamp(None, arrival_s), depth)]
+        return []
+
+    def _on_gga(self, fields: list[str], arrival_s: float) -> list[Message]:
+        before = self._release(None)
+        try:
+            gga = self._gga(fields, arrival_s)
+        except RefusedError as error:
+            self._refuse(f"GGA: {error}")
+            return before
+        if gga is None:
+            return before
+        self._pending, self._last_utc = gga, gga.utc
+        if self._gst is not None and self._gst[0] == gga.utc and gga.utc:
+            self._gst_follows = False
+            return before + self._release(self._gst[1])
+        return before + ([] if self._gst_follows else self._release(None))
+
+    def _on_gst(self, fields: list[str]) -> list[Message]:
+        if len(fields) < 8:
+            raise RefusedError(f"GST: expected 8 fields, got {len(fields)}")
+        utc = fields[0]
+        north, east, up = (optional_number(field, "GST") for field in fields[5:8])
+        if not utc or not east or not north or not up or min(east, north, up) <= 0.0:
+            return []  # receivers without a fix write empty fields or zeros
+        self._gst = utc, (east, north, up)
+        self._gst_follows = utc == self._last_utc
+        if self._pending is not None and self._pending.utc == utc:
+            return self._release(self._gst[1])
+        return []
+
+    def _release(self, sigma_enu: Vector | None) -> list[Message]:
+        """Return the fix that waits, by HDOP where its sigmas are not known."""
+        gga, self._pending = self._pending, None
+        if gga is None:
+            return []
+        if sigma_enu is None:
+            self._gst_follows = False
+            if not gga.hdop or gga.hdop < 0.0:
+                self._refuse("GGA: expected an HDOP above 0 or a GST of the same time, got neither")
+                return []
+            sigma = gga.hdop * self._options.user_range_error_m
+            sigma_enu = sigma, sigma, 2.0 * sigma
+        return [Fix(gga.time_s, gga.lat, gga.lon, gga.height, sigma_enu)]
+
+    def _gga(self, fields: list[str], arrival_s: float) -> _Gga | None:
+        """Return a fix, None where the receiver has none."""
+        if len(fields) < 11:
+            raise RefusedError(f"expected 14 fields, got {len(fields)}")
+        utc, lat, north, lon, east, quality, _, hdop, altitude, _, separation = fields[:11]
+        if quality in _NO_FIX:
+            self.n_without_fix += 1
+            if self._has_fix:
+                self._refuse("GGA: quality 0, the receiver has no fix; said once until it has one")
+            self._has_fix = False
+            return None
+        if quality not in _FIXES:
+            raise RefusedError(f"expected a measured fix, got quality {shown(quality)}")
+        self._has_fix = True
+        geoid_m = optional_number(separation, "geoid separation")
+        geoid_m = self._options.geoid_separation_m if geoid_m is None else geoid_m
+        if geoid_m is None:
+            raise RefusedError("geoid separation is empty; set NmeaOptions.geoid_separation_m")
+        time_s = self._stamper.stamp(utc_seconds(utc, arrival_s), arrival_s)
+        return _Gga(
+            utc,
+            time_s,
+            arrival_s,
+            lat=angle(lat, north, "NS", limit_deg=90.0),
+            lon=angle(lon, east, "EW", limit_deg=180.0),
+            height=required_number(altitude, "altitude") + geoid_m,
+            hdop=optional_number(hdop, "HDOP"),
+        )
+
+
+def _water_column(pressure: str, unit: str, options: NmeaOptions) -> float:
+    """Return the depth below the surface of a pressure, m, by the mean density above it."""
+    if unit.lower() not in ("d", "dbar"):
+        raise RefusedError(f"expected a pressure in dBar, got unit {shown(unit)}")
+    water_dbar = required_number(pressure, "pressure") - options.air_pressure_dbar
+    return water_dbar * PASCAL_PER_DBAR / (options.water_density_kg_per_m3 * STANDARD_GRAVITY)
+
+
+def _prvat(fields: list[str], options: NmeaOptions) -> float:
+    _, _, pressure, unit = _first(fields, 4)
+    return _water_column(pressure, unit, options)
+
+
+def _pips(fields: list[str], options: NmeaOptions) -> float:
+    value, unit = _first(fields, 2)
+    return required_number(value, "depth") if unit == "M" else _water_column(value, unit, options)
+
+
+def _pvips2(fields: list[str], options: NmeaOptions) -> float:
+    _, _, pressure, unit = _first(fields, 4)
+    return _water_column(pressure, unit, options)
+
+
+def _dpt(fields: list[str], _: NmeaOptions) -> float:
+    return required_number(_first(fields, 1)[0], "depth")
+
+
+def _dbt(fields: list[str], _: NmeaOptions) -> float:
+    *_rest, metres, unit = _first(fields, 4)
+    if unit != "M":
+        raise RefusedError(f"expected metres in the third field, got unit {shown(unit)}")
+    return required_number(metres, "depth")
+
+
+def _first(fields: list[str], count: int) -> list[str]:
+    if len(fields) < count:
+        raise RefusedError(
+            f"expected {count} fields or more, got {len(fields)}; if the sentence holds no depth "
+            "of the vehicle, leave it out of NmeaOptions.depth_sentences"
+        )
+    return fields[:count]
+
+
+_DEPTHS: Final[dict[str, Callable[[list[str], NmeaOptions], float]]] = {
+    "PRVAT": _prvat,
+    "PIPS": _pips,
+    "PVIPS2": _pvips2,
+    "DPT": _dpt,
+    "DBT": _dbt,
+}
+"""Depth below the surface, m, from the fields of each of :class:`DepthSentence`."""

@@ -1,0 +1,194 @@
+"""What all sources share: their decoder, their limits and their counts, whatever the socket."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final, NamedTuple, Protocol
+
+from ssm_graph.base.errors import ConfigError
+from ssm_graph.live.protocols.decoder import Decoder
+from ssm_graph.live.protocols.framing import TokenBucket
+from ssm_graph.live.run.notices import BURST, Notices
+from ssm_graph.live.run.status import LinkState, SourceStatus
+from ssm_graph.mission.navigation import Severity
+from ssm_graph.sensors.imu import ImuSample
+from ssm_graph.sensors.messages import Message
+
+CHUNK: Final = 65536
+"""Bytes that are read of one source before the others have their turn."""
+IDLE_S: Final = 1.0
+"""A source that is silent so long gets to feed nothing, which lets a decoder release what waits."""
+OTHERS_SHARE: Final = 0.1
+"""Of the rate of inertial samples, what each other kind of message may come at."""
+_AHEAD_S: Final = 0.1
+
+
+class Now(NamedTuple):
+    """One moment on both clocks."""
+
+    wall_s: float
+    """The vehicle's clock, which stamps arrivals."""
+    steady_s: float
+    """A clock that is never set, for rates and patience."""
+
+
+class CountingDecoder(Decoder, Protocol):
+    """A decoder that counts what it refuses."""
+
+    @property
+    def n_refused(self) -> int:
+        """How much was refused so far."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What one source may do."""
+
+    messages_per_s: float = 2000.0
+    """Inertial samples; of every other kind a tenth, so that none crowds out another."""
+    burst: int = 4000
+    """Inertial samples at once; of every other kind a tenth."""
+    bytes_per_s: float = 6e5
+    """In the mean, 300 for every message; a source that sends more is read no faster."""
+    stall_s: float = 10.0
+    """Silence after which a connection is given up."""
+    max_clients: int = 4
+    """Connections to one server."""
+    connect_s: float = 5.0
+    """Patience with a connection on its way."""
+    retry_s: tuple[float, float] = (0.5, 10.0)
+    """First and longest wait before the next attempt to connect."""
+
+    def __post_init__(self) -> None:
+        TokenBucket(rate_per_s=self.messages_per_s, burst=self.burst)
+        for name in ("bytes_per_s", "stall_s", "connect_s"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise ConfigError(f"Limits.{name}: expected a number above 0, got {value}")
+
+
+class Channel:
+    """One connection's decoder, and when it last heard something, s on the steady clock."""
+
+    def __init__(self, decoder: CountingDecoder, now: Now) -> None:
+        self.decoder = decoder
+        self.heard_s = now.steady_s
+        self.fed_s = now.steady_s
+
+
+class Feed:
+    """One source: bytes to messages, limited and counted.
+
+    Parameters
+    ----------
+    name : for people, such as ``dvl``.
+    address : where it comes from, for people.
+    make_decoder : of a new connection.
+    limits, notices : what it may do and where it is told.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        address: str,
+        make_decoder: Callable[[], CountingDecoder],
+        *,
+        limits: Limits,
+        notices: Notices,
+    ) -> None:
+        self.name, self.address, self.limits = name, address, limits
+        self.n_reconnects = 0
+        self._make_decoder, self._notices = make_decoder, notices
+        self._buckets: dict[type[Message], TokenBucket] = {}
+        self._n_bytes = self._n_messages = self._n_refused = 0
+        self._free_s = self._last_s = -math.inf
+        self._rate_hz, self._marked_s, self._n_marked = 0.0, -math.inf, 0
+
+    def channel(self, now: Now) -> Channel:
+        """Return the begin of a connection."""
+        return Channel(self._make_decoder(), now)
+
+    def take(self, channel: Channel, data: bytes, now: Now) -> list[Message]:
+        """Return the messages that these bytes complete and that are not too many."""
+        if data:
+            self._n_bytes += len(data)
+            channel.heard_s = now.steady_s
+            self._free_s = max(self._free_s, now.steady_s) + len(data) / self.limits.bytes_per_s
+        channel.fed_s = now.steady_s
+        decoder = channel.decoder
+        n_before = decoder.n_refused
+        try:
+            messages = decoder.feed(data, arrival_s=now.wall_s)
+            refusals = decoder.take_refusals()
+        except Exception as error:  # a decoder never raises; if it does, others go on
+            self._notices.failure(self.name, "decoder_failed", error)
+            channel.decoder = self._make_decoder()
+            return []
+        self._n_refused += decoder.n_refused - n_before
+        for text in refusals:
+            self.tell("message_refused", text, Severity.WARNING, burst=BURST)
+        return self._limited(messages, now)
+
+    def idle(self, channel: Channel, now: Now) -> list[Message]:
+        """Return what the decoder releases where nothing has come for a second."""
+        return self.take(channel, b"", now) if now.steady_s - channel.fed_s >= IDLE_S else []
+
+    def is_over(self, now: Now) -> bool:
+        """Return whether it has sent so many bytes that it has to wait."""
+        return self._free_s - now.steady_s > _AHEAD_S
+
+    def is_silent(self, channel: Channel, now: Now) -> bool:
+        """Return whether a connection has been silent for too long."""
+        return now.steady_s - channel.heard_s > self.limits.stall_s
+
+    def tell(self, kind: str, text: str, severity: Severity, *, burst: int = 1) -> None:
+        """Note an event about this source."""
+        self._notices.tell(self.name, kind, text, severity, burst=burst)
+
+    def status(self, state: LinkState, now: Now) -> SourceStatus:
+        """Return the counts."""
+        if now.steady_s - self._marked_s >= 1.0:
+            elapsed_s = now.steady_s - self._marked_s
+            self._rate_hz = (self._n_messages - self._n_marked) / elapsed_s
+            self._marked_s, self._n_marked = now.steady_s, self._n_messages
+        return SourceStatus(
+            self.name,
+            self.address,
+            state,
+            n_bytes=self._n_bytes,
+            n_messages=self._n_messages,
+            n_refused=self._n_refused,
+            n_limited=self._n_limited,
+            n_reconnects=self.n_reconnects,
+            rate_hz=self._rate_hz,
+            age_s=now.steady_s - self._last_s,
+        )
+
+    @property
+    def _n_limited(self) -> int:
+        return sum(bucket.n_refused for bucket in self._buckets.values())
+
+    def _bucket(self, kind: type[Message]) -> TokenBucket:
+        if kind not in self._buckets:
+            share = 1.0 if kind is ImuSample else OTHERS_SHARE
+            rate, burst = share * self.limits.messages_per_s, share * self.limits.burst
+            self._buckets[kind] = TokenBucket(rate_per_s=rate, burst=max(1, round(burst)))
+        return self._buckets[kind]
+
+    def _limited(self, messages: list[Message], now: Now) -> list[Message]:
+        kept = [m for m in messages if self._bucket(type(m)).admit(now.steady_s)]
+        if len(kept) < len(messages):
+            self.tell(
+                "rate_limited",
+                f"expected at most {self.limits.messages_per_s:g} inertial samples/s and "
+                f"{OTHERS_SHARE * self.limits.messages_per_s:g} messages/s of any other kind, got "
+                f"more; {self._n_limited} were left out so far",
+                Severity.WARNING,
+            )
+        if kept:
+            self._n_messages += len(kept)
+            self._last_s = now.steady_s
+        return kept

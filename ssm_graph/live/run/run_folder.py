@@ -1,0 +1,303 @@
+"""The folder of a live run: what is kept so that it can be gone on with, and what it results in.
+
+=====================  =============================================================================
+``log/``               everything received, a mission folder: ``ssm-graph smooth RUN/log`` reads it
+``trajectory.csv``,    smoothed states and their beams, as they leave the window
+``beams.csv``
+``events.jsonl``       what happened, a line of JSON each
+``checkpoint.npz``     the estimator, and the sizes of the files above at that moment
+``summary.json``       how it ended; not there while it goes on
+``run.json``           settings; a run is gone on with the same ones only
+``lock``               held by the process that writes here
+=====================  =============================================================================
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import sys
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any, Final
+
+from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.base.frozen import Array
+from ssm_graph.io.mission_folder.vehicle import check_same_vehicle
+from ssm_graph.io.raw_log.log import RawLog, replay
+from ssm_graph.io.results.growing import GrowingResults
+from ssm_graph.io.results.summary import as_json
+from ssm_graph.io.results.tables import BEAMS_NAME, SUMMARY_NAME, TRAJECTORY_NAME
+from ssm_graph.io.tables.append_file import AppendFile
+from ssm_graph.io.tables.checkpoint import newest_checkpoint
+from ssm_graph.io.tables.settings import TOML_NAME
+from ssm_graph.live.run.checkpoint_writer import CheckpointWriter
+from ssm_graph.mission.navigation import Event
+from ssm_graph.mission.vehicle import Vehicle
+from ssm_graph.sensors.messages import Message
+
+if sys.platform != "win32":
+    import fcntl
+
+LOG_NAME: Final = "log"
+EVENTS_NAME: Final = "events.jsonl"
+RUN_NAME: Final = "run.json"
+LOCK_NAME: Final = "lock"
+FORMAT: Final = 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Resumed:
+    """Where an earlier process of the same run had got to."""
+
+    arrays: Mapping[str, Array] = field(default_factory=dict)
+    meta: Mapping[str, Any] = field(default_factory=dict)
+    """Of the estimator; empty where there is no checkpoint."""
+    offsets: Mapping[str, int] = field(default_factory=dict)
+    """Of the log."""
+    sizes: Mapping[str, int] = field(default_factory=dict)
+    """Of the results and events; what is beyond is written once more."""
+    n_messages: int = 0
+    """That the estimator of the checkpoint had been given."""
+    data_s: float = 0.0
+    """Time of the last inertial one of them."""
+    notes: tuple[str, ...] = ()
+    """What a person should know, one sentence each."""
+
+    def without_checkpoint(self, why: str) -> Resumed:
+        """Return the begin of the run."""
+        return Resumed(notes=(*self.notes, why))
+
+
+class RunFolder:
+    """One live run on the disk.
+
+    Parameters
+    ----------
+    folder : made if it does not exist; one that holds a run is gone on with.
+    vehicle : whose run it is.
+    settings : of the estimator; plain values with units in the keys.
+
+    Raises
+    ------
+    ConfigError
+        For the run of another vehicle or of other settings, one that another process writes, and
+        for a folder that holds something else.
+    DataError
+        For a folder that cannot be written.
+    """
+
+    def __init__(self, folder: Path, vehicle: Vehicle, settings: Mapping[str, Any]) -> None:
+        self.path, self.vehicle, self.settings = folder, vehicle, dict(as_json(settings))
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._lock = _locked(folder)
+        except OSError as error:
+            raise DataError(f"{folder}: cannot be written: {error.strerror or error}") from error
+        try:
+            self._check()
+            self._events = AppendFile(folder / EVENTS_NAME, ending=b" torn\n")
+        except BaseException:
+            self._lock.close()
+            raise
+        self.event_problem: str | None = None
+        self.results: GrowingResults | None = None
+        self.log: RawLog | None = None
+        names = (*_log_names(folder), folder / TRAJECTORY_NAME, folder / BEAMS_NAME)
+        self.writer = CheckpointWriter(folder, names)
+        self._known: Counter[bytes] = Counter()
+
+    def resume(self) -> Resumed:
+        """Return where the run had got to; the begin where nothing was logged yet."""
+        if not self._has_log:
+            return Resumed()
+        try:
+            found = newest_checkpoint(self.path)
+        except DataError as error:
+            return Resumed(notes=(f"{error}; the whole log is gone through",))
+        if found is None:
+            return Resumed()
+        meta: dict[str, Any] = found.meta
+        return Resumed(
+            arrays=found.arrays,
+            meta=meta["estimator"],
+            offsets=meta["offsets"],
+            sizes=meta["sizes"],
+            n_messages=meta["n_messages"],
+            data_s=meta["data_s"],
+            notes=(*found.notes, *self._missing(meta["sizes"])),
+        )
+
+    def logged(self, resumed: Resumed) -> Iterator[Message]:
+        """Return what was logged since, and get ready to write results and events once more."""
+        has_current = self.vehicle.current is not None
+        self.results = GrowingResults(self.path, sizes=resumed.sizes, has_current=has_current)
+        self._known = _lines_from(self.path / EVENTS_NAME, resumed.sizes.get(EVENTS_NAME, 0))
+        if not self._has_log:
+            return iter(())
+        return replay(self.path / LOG_NAME, self.vehicle, resumed.offsets)
+
+    def open_log(self) -> RawLog:
+        """Begin the log, or go on with it; from here on all events are new."""
+        self._known.clear()
+        make = RawLog.reopen if self._has_log else RawLog
+        try:
+            self.log = make(self.path / LOG_NAME, self.vehicle)
+        except OSError as error:
+            raise DataError(
+                f"{self.path / LOG_NAME}: cannot be written: {error.strerror or error}"
+            ) from error
+        return self.log
+
+    def write_event(self, event: Event) -> None:
+        """Append an event, unless an earlier process has written the very same one already."""
+        line = _line(event)
+        if self._known[line] > 0:
+            self._known[line] -= 1
+            return
+        try:
+            self._events.append(line)
+            self.event_problem = None
+        except OSError as error:
+            self.event_problem = f"{EVENTS_NAME} cannot be written: {error.strerror or error}"
+
+    def write_checkpoint(
+        self,
+        arrays: Mapping[str, Array],
+        meta: Mapping[str, Any],
+        *,
+        n_messages: int,
+        data_s: float,
+    ) -> None:
+        """Begin to write the estimator's state of this very moment, with all sizes."""
+        assert self.log is not None
+        assert self.results is not None
+        sizes = {**self.results.sizes(), EVENTS_NAME: self._events.size}
+        whole = {
+            "estimator": dict(meta),
+            "offsets": self.log.offsets(),
+            "sizes": sizes,
+            "n_messages": n_messages,
+            "data_s": data_s,
+        }
+        self.writer.write(arrays, whole)
+
+    def problems(self) -> str | None:
+        """Return one sentence where something is not on its way to the disk."""
+        found = [
+            self.log.problems() if self.log is not None else None,
+            self.results.problem if self.results is not None else None,
+            self.event_problem,
+        ]
+        return "; ".join(text for text in found if text) or None
+
+    def close(self) -> None:
+        """Wait for the disk, and let others have the folder."""
+        self.writer.wait()
+        if self.log is not None:
+            self.log.sync()
+            self.log.close()
+        if self.results is not None:
+            self.results.close()
+        with contextlib.suppress(OSError):
+            self._events.sync()
+        self._events.close()
+        self._lock.close()
+
+    @property
+    def _has_log(self) -> bool:
+        return (self.path / LOG_NAME / TOML_NAME).exists()
+
+    def _check(self) -> None:
+        """Refuse what is not this run; note the settings of a new one."""
+        path = self.path / RUN_NAME
+        wanted = {"format": FORMAT, "vehicle": self.vehicle.name, "settings": self.settings}
+        if path.exists():
+            try:
+                found = json.loads(path.read_text(encoding="utf-8"))
+            except (OSError, ValueError) as error:
+                raise DataError(f"{path}: expected the settings of a run: {error}") from error
+            if found != wanted:
+                raise ConfigError(
+                    f"{path}: this run was begun with {_difference(found, wanted)}; go on with "
+                    "the same, or give another folder"
+                )
+            if self._has_log:
+                check_same_vehicle(self.path / LOG_NAME, self.vehicle)
+            return
+        others = [
+            name
+            for name in (TOML_NAME, SUMMARY_NAME, TRAJECTORY_NAME)
+            if (self.path / name).exists()
+        ]
+        if others:
+            raise ConfigError(
+                f"{str(self.path)!r}: expected a new folder or that of a live run, found "
+                f"{others[0]} of something else; give another folder"
+            )
+        part = path.with_name(f"{RUN_NAME}.part")
+        part.write_text(json.dumps(wanted, indent=2) + "\n", encoding="utf-8")
+        part.replace(path)
+
+    def _missing(self, sizes: Mapping[str, int]) -> list[str]:
+        """Return a sentence for every file that is shorter than the checkpoint knew it."""
+        found = {name: (self.path / name) for name in sizes}
+        return [
+            f"{name}: {sizes[name]} bytes were written and are not all there; did the power fail?"
+            for name, path in found.items()
+            if not path.exists() or path.stat().st_size < sizes[name]
+        ]
+
+
+def _locked(folder: Path) -> IO[str]:
+    """Return the open lock of a folder, which the system lets go of with the process."""
+    lock = (folder / LOCK_NAME).open("a+", encoding="ascii")
+    try:
+        if sys.platform != "win32":
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        lock.seek(0)
+        owner = lock.read(20).strip() or "?"
+        lock.close()
+        raise ConfigError(
+            f"{str(folder)!r}: another process (number {owner}) writes this run; stop it, or give "
+            "another folder"
+        ) from None
+    lock.truncate(0)
+    lock.write(f"{os.getpid()}\n")
+    lock.flush()
+    return lock
+
+
+def _log_names(folder: Path) -> tuple[Path, ...]:
+    names = ("imu.csv", "dvl.csv", "depth.csv", "gnss.csv", "arrivals")
+    return tuple(folder / LOG_NAME / name for name in names)
+
+
+def _lines_from(path: Path, start: int) -> Counter[bytes]:
+    with path.open("rb") as stream:
+        stream.seek(start)
+        return Counter(stream)
+
+
+def _line(event: Event) -> bytes:
+    fields = {
+        "time_s": event.time_s,
+        "severity": event.severity.value,
+        "kind": event.kind,
+        "text": event.text,
+    }
+    return (json.dumps(as_json(fields), ensure_ascii=False) + "\n").encode()
+
+
+def _difference(found: Any, wanted: dict[str, Any]) -> str:
+    """Return the first value of a run that is another one now."""
+    if isinstance(found, dict):
+        before, now = ({**x, **x.get("settings", {})} for x in (found, wanted))
+        for key in now:
+            if key != "settings" and before.get(key) != now[key]:
+                return f"{key} = {before.get(key)!r}, not {now[key]!r}"
+    return "other settings"

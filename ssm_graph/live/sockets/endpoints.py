@@ -1,0 +1,136 @@
+"""Addresses of sources and listeners: ``tcp://HOST:PORT``, ``tcp-listen://:PORT``, ``udp://:PORT``.
+
+What is bound is bound to this computer only, 127.0.0.1, unless another interface is named.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+import socket
+from collections.abc import Collection
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, Final, NamedTuple
+
+from ssm_graph.base.errors import ConfigError, nearest_hint
+
+LOOPBACK: Final = "127.0.0.1"
+_ADDRESS = re.compile(
+    r"(?P<scheme>[A-Za-z-]+)://(?P<host>\[[^\[\]]*\]|[^:/\[\]@]*):(?P<port>\d{1,5})/?", re.ASCII
+)
+_HOST_NAME = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9_.-]{0,252}[A-Za-z0-9_])?", re.ASCII)
+
+
+class Transport(Enum):
+    """How bytes come and go; the value is the scheme of an address."""
+
+    TCP_CLIENT = "tcp"
+    TCP_SERVER = "tcp-listen"
+    UDP = "udp"
+
+
+INPUTS: Final = frozenset(Transport)
+OUTPUTS: Final = frozenset({Transport.TCP_SERVER, Transport.UDP})
+FORMS: Final = {
+    Transport.TCP_CLIENT: "tcp://HOST:PORT",
+    Transport.TCP_SERVER: "tcp-listen://[HOST]:PORT",
+    Transport.UDP: "udp://[HOST]:PORT",
+}
+"""How an address is written; a host in square brackets may be left out, or is IPv6."""
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """Where bytes come from or go to."""
+
+    transport: Transport
+    host: str
+    port: int
+    """0 lets the system choose one, where something is bound."""
+
+    def __str__(self) -> str:
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"{self.transport.value}://{host}:{self.port}"
+
+
+class Resolved(NamedTuple):
+    """A numeric address that a socket takes."""
+
+    family: socket.AddressFamily
+    address: Any
+
+
+def parse_endpoint(text: str, *, where: str, allowed: Collection[Transport] = INPUTS) -> Endpoint:
+    """Return the endpoint of an address as it is written.
+
+    Parameters
+    ----------
+    text : for example ``tcp://192.168.194.95:16171``, ``udp://:9000``, ``tcp-listen://[::1]:7000``.
+    where : the option it belongs to, for the message.
+    allowed : what may be used there.
+
+    Raises
+    ------
+    ConfigError
+        For anything else.
+    """
+    wanted = " or ".join(FORMS[kind] for kind in Transport if kind in allowed)
+    found = _ADDRESS.fullmatch(text.strip())
+    if not found:
+        raise ConfigError(f"{where}: expected {wanted}, got {text!r}")
+    scheme, port = found["scheme"].lower(), int(found["port"])
+    names = {kind.value: kind for kind in Transport if kind in allowed}
+    if scheme not in names:
+        raise ConfigError(
+            f"{where}: expected {wanted}, got {scheme!r}; {nearest_hint(scheme, names)}"
+        )
+    if not 1 <= port <= 65535:
+        raise ConfigError(f"{where}: expected a port from 1 to 65535, got {port}")
+    return Endpoint(names[scheme], _host(found["host"], names[scheme], where, text), port)
+
+
+def resolve(endpoint: Endpoint) -> list[Resolved]:
+    """Return the numeric addresses of an endpoint; may ask a name server, so not within a loop.
+
+    Raises
+    ------
+    ConfigError
+        For a name that is not known.
+    """
+    kind = socket.SOCK_DGRAM if endpoint.transport is Transport.UDP else socket.SOCK_STREAM
+    try:
+        found = socket.getaddrinfo(endpoint.host, endpoint.port, type=kind)
+    except (OSError, UnicodeError) as error:
+        raise ConfigError(
+            f"{endpoint}: the host is not known ({error}); give its number instead"
+        ) from error
+    return [Resolved(family, address) for family, _, _, _, address in found]
+
+
+def _host(written: str, transport: Transport, where: str, text: str) -> str:
+    if written.startswith("["):
+        host = written[1:-1]
+        try:
+            ipaddress.IPv6Address(host)
+        except ValueError as error:
+            raise ConfigError(
+                f"{where}: expected an IPv6 address in brackets, got {text!r} ({error})"
+            ) from error
+        return host
+    if not written:
+        if transport is Transport.TCP_CLIENT:
+            raise ConfigError(f"{where}: expected {FORMS[transport]} with a host, got {text!r}")
+        return LOOPBACK
+    looks_numeric = re.fullmatch(r"[0-9.]+", written) is not None
+    if not _HOST_NAME.fullmatch(written) or (looks_numeric and not _is_ipv4(written)):
+        raise ConfigError(f"{where}: expected a host name, an IPv4 address or [IPv6], got {text!r}")
+    return written
+
+
+def _is_ipv4(text: str) -> bool:
+    try:
+        ipaddress.IPv4Address(text)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,191 @@
+"""All sockets of a live estimator in one thread; none of them can make another one wait."""
+
+from __future__ import annotations
+
+import selectors
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Self
+
+from ssm_graph.live.run.feed import CountingDecoder, Feed, Limits, Now
+from ssm_graph.live.run.notices import Notices
+from ssm_graph.live.run.status import OutputStatus, SourceStatus
+from ssm_graph.live.sockets.endpoints import Endpoint, Transport
+from ssm_graph.live.sockets.inputs import Input, TcpClientInput
+from ssm_graph.live.sockets.listeners import TcpServerInput, UdpInput
+from ssm_graph.live.sockets.outputs import Output, OutputFormat, TcpServerOutput, UdpOutput
+from ssm_graph.mission.navigation import Event
+from ssm_graph.sensors.messages import Message
+
+
+@dataclass(frozen=True, slots=True)
+class InputConfig:
+    """One source."""
+
+    name: str
+    endpoint: Endpoint
+    make_decoder: Callable[[], CountingDecoder]
+    limits: Limits = Limits()
+
+
+@dataclass(frozen=True, slots=True)
+class OutputConfig:
+    """One place that answers go to."""
+
+    form: OutputFormat
+    endpoint: Endpoint
+
+
+class SocketHub:
+    """Reads all sources and sends to all outputs.
+
+    Parameters
+    ----------
+    inputs, outputs : what there is; connections are made on the way, again and again if need be.
+    wall_s : the vehicle's clock, which stamps arrivals.
+    steady_s : a clock that is never set, for rates and patience.
+
+    Raises
+    ------
+    ConfigError
+        For an unknown host, and for an address where nothing can listen.
+    """
+
+    is_finished = False
+    """Sockets never are."""
+
+    def __init__(
+        self,
+        inputs: Sequence[InputConfig] = (),
+        outputs: Sequence[OutputConfig] = (),
+        *,
+        wall_s: Callable[[], float] = time.time,
+        steady_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._wall_s, self._steady_s = wall_s, steady_s
+        self._begin_s = steady_s()
+        self._notices = Notices(wall_s, steady_s)
+        self._selector = selectors.DefaultSelector()
+        self.inputs: list[Input] = []
+        self.outputs: list[Output] = []
+        try:
+            for wanted in inputs:
+                self.inputs.append(self._input(wanted))
+            for output in outputs:
+                self.outputs.append(self._output(output))
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def _links(self) -> tuple[Input | Output, ...]:
+        return (*self.inputs, *self.outputs)
+
+    @property
+    def time_s(self) -> float:
+        """The vehicle's clock, s."""
+        return self._wall_s()
+
+    @property
+    def elapsed_s(self) -> float:
+        """Since the begin, s."""
+        return self._steady_s() - self._begin_s
+
+    def poll(self, timeout_s: float) -> list[Message]:
+        """Wait until something comes, no longer than this; return what messages it completes."""
+        ready = self._selector.select(max(0.0, timeout_s))
+        now = Now(self._wall_s(), self._steady_s())
+        messages: list[Message] = []
+        for key, mask in ready:
+            try:
+                if isinstance(key.data, Output):
+                    key.data.on_ready(key.fileobj, mask, now)  # type: ignore[arg-type]
+                else:
+                    messages += key.data.on_ready(key.fileobj, now)
+            except Exception as error:  # a defect: others go on
+                self._notices.failure(_name(key.data), "socket_failed", error)
+                key.data.abandon(key.fileobj)
+        for link in self._links:
+            try:
+                messages += link.tick(now) or []  # outputs have none
+            except Exception as error:
+                self._notices.failure(_name(link), "socket_failed", error)
+        return messages
+
+    def wait(self, timeout_s: float) -> None:
+        """Look after the outputs so long; for a run whose messages come from elsewhere."""
+        end_s = self._steady_s() + timeout_s
+        while True:
+            self.poll(end_s - self._steady_s())
+            if self._steady_s() >= end_s:
+                return
+
+    def wants(self, form: OutputFormat) -> bool:
+        """Return whether anybody listens to answers of this form."""
+        return any(output.form is form and output.n_clients for output in self.outputs)
+
+    def send(self, form: OutputFormat, data: bytes) -> None:
+        """Send an answer to everybody who listens to this form; never waits."""
+        for output in self.outputs:
+            if output.form is form:
+                try:
+                    output.send(data)
+                except Exception as error:
+                    self._notices.failure(_name(output), "socket_failed", error)
+
+    def take_events(self) -> list[Event]:
+        """Return what happened since the last call."""
+        return self._notices.take()
+
+    def source_status(self) -> tuple[SourceStatus, ...]:
+        """Return how the sources are doing."""
+        now = Now(self._wall_s(), self._steady_s())
+        return tuple(source.status(now) for source in self.inputs)
+
+    def output_status(self) -> tuple[OutputStatus, ...]:
+        """Return how the outputs are doing."""
+        return tuple(output.status() for output in self.outputs)
+
+    def close(self) -> None:
+        """Close all sockets."""
+        for link in self._links:
+            link.close()
+        self._selector.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _input(self, config: InputConfig) -> Input:
+        feed = Feed(
+            config.name,
+            str(config.endpoint),
+            config.make_decoder,
+            limits=config.limits,
+            notices=self._notices,
+        )
+        match config.endpoint.transport:
+            case Transport.TCP_CLIENT:
+                return TcpClientInput(feed, self._selector, config.endpoint)
+            case Transport.TCP_SERVER:
+                return TcpServerInput(feed, self._selector, config.endpoint)
+            case Transport.UDP:
+                return UdpInput(feed, self._selector, config.endpoint)
+
+    def _output(self, config: OutputConfig) -> Output:
+        if config.endpoint.transport is Transport.UDP:
+            return UdpOutput(config.form, config.endpoint, self._notices)
+        return TcpServerOutput(config.form, config.endpoint, self._notices, self._selector)
+
+
+def _name(link: Input | Output) -> str:
+    return link.feed.name if isinstance(link, Input) else link.address

@@ -1,0 +1,1 @@
+"""Missions, vehicles and answers as values; keyframes, start and the estimation problem."""

@@ -1,0 +1,265 @@
+"""A mission as an estimation problem: keyframes, inertial chain, measurements, initial state."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ssm_graph.base.earth import LocalFrame
+from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.base.frozen import Array, ReadOnlyArrays
+from ssm_graph.base.stepwise import Steps, finished
+from ssm_graph.engine.error_state import InitialMoments
+from ssm_graph.engine.extras import Extras
+from ssm_graph.imu.preintegration import InertialChain, imu_gaps, preintegrate_steps
+from ssm_graph.mission.aids import Depths, Fixes, depths_of, fixes_of
+from ssm_graph.mission.calibration import DVL_DRIFT, GNSS_DRIFT, extras_of, needs_motion
+from ssm_graph.mission.current import CURRENT, current_note
+from ssm_graph.mission.further_aids import NO_FURTHER, FurtherAids, further_aids
+from ssm_graph.mission.mission import InitialState, Mission
+from ssm_graph.mission.ping_motion import MotionBefore, mean_gyro
+from ssm_graph.mission.start.moments import initial_moments
+from ssm_graph.mission.timeline import MIN_SPACING_S, Indices, build_timeline, is_inside, nearest
+from ssm_graph.mission.usable import require_usable
+from ssm_graph.sensors.dvl import stuck_beams
+from ssm_graph.sensors.imu import ImuLog
+
+NO_EXTRAS = Extras()
+
+
+@dataclass(frozen=True, slots=True)
+class ProblemConfig:
+    """How a mission becomes a graph."""
+
+    merge_rate_hz: float = 20.0
+    """Raw inertial samples are merged to this rate before preintegration."""
+    keyframe_interval_s: float = 1.0
+    """Longest time between keyframes while DVL and GNSS are silent."""
+
+    def __post_init__(self) -> None:
+        for name in ("merge_rate_hz", "keyframe_interval_s"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0.0):
+                raise ConfigError(f"{name}: expected a number above zero, got {value}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Beams(ReadOnlyArrays):
+    """Every valid beam speed as one row, in the order of its keyframe."""
+
+    keyframe: NDArray[np.intp]
+    """(M,)"""
+    beam: NDArray[np.intp]
+    """(M,) 0 to 3"""
+    speed: Array
+    """(M,) m/s"""
+    sigma: Array
+    """(M,) m/s"""
+    gyro_b: Array
+    """(M, 3) rad/s, mean over the ping"""
+    beam_b: Array
+    """(M, 3) beam directions, longer than one by the known scale errors"""
+    lever_arm_b: Array
+    """(3,) m"""
+    R_bd: Array
+    """(3, 3) mounting, instrument to body"""
+    ping: NDArray[np.intp]
+    """(M,) the ping of each, counted from 0"""
+    is_water: NDArray[np.bool_]
+    """(M,) off the water instead of the ground: relative to its current"""
+    motion: MotionBefore | None = None
+    """Inertial readings about the pings, where the DVL's clock or lever arm is in doubt."""
+    white_share: float = 1.0
+    """Of the sigmas off the ground, what is white where the drift of the DVL is a variable"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem(ReadOnlyArrays):
+    """Everything an estimator needs of one mission."""
+
+    frame: LocalFrame
+    start: InitialState
+    keyframe_s: Array
+    chain: InertialChain
+    beams: Beams
+    depths: Depths | None
+    fixes: Fixes | None
+    imu_noise_bias_sigma: Array
+    """(6,) turn-on bias sigmas, accelerometer (m/s^2) then gyro (rad/s)."""
+    extras: Extras = NO_EXTRAS
+    """What else is to be estimated; an estimator that takes it as exact says so."""
+    further: FurtherAids = NO_FURTHER
+    """What only the batch smoother is aided by; another estimator says so."""
+    notes: tuple[str, ...] = ()
+    is_noise_white: bool = False
+    """Whether sigmas of beams and fixes leave out what drifts stand for: `with_white_noise`"""
+
+    @property
+    def n_keyframes(self) -> int:
+        """Number of keyframes."""
+        return len(self.keyframe_s)
+
+
+def build_problem(
+    mission: Mission, config: ProblemConfig | None = None, *, start: InitialState | None = None
+) -> Problem:
+    """Turn a mission into an estimation problem.
+
+    Parameters
+    ----------
+    mission : the recorded run.
+    config : rates and intervals.
+    start : initial state with sigmas; the mission's own when left out. A mission without one
+        needs :func:`ssm_graph.mission.start.alignment.align` first.
+    """
+    return finished(build_problem_steps(mission, config, start=start))
+
+
+def build_problem_steps(
+    mission: Mission, config: ProblemConfig | None = None, *, start: InitialState | None = None
+) -> Steps[Problem]:
+    """Make :func:`build_problem` in steps."""
+    require_usable(mission)
+    mission, stuck_note = _without_stuck_beams(mission)
+    config = config or ProblemConfig()
+    start = start or mission.initial
+    if start is None:
+        raise ConfigError(
+            "mission.toml: no [initial], and no start was given; expected one of them; "
+            "let align(mission) find the start"
+        )
+    timeline = build_timeline(mission, start_s=start.time_s, interval_s=config.keyframe_interval_s)
+    chain = yield from preintegrate_steps(
+        mission.imu, timeline.keyframe_s, frame=mission.frame, rate_hz=config.merge_rate_hz
+    )
+    noise = mission.imu.noise
+    extras = extras_of(mission)
+    further, left_out = further_aids(mission, timeline.keyframe_s)
+    return Problem(
+        frame=mission.frame,
+        start=start,
+        keyframe_s=timeline.keyframe_s,
+        chain=chain,
+        beams=_beams(mission, timeline.ping, timeline.ping_keyframe, extras),
+        depths=depths_of(mission, timeline),
+        fixes=None if mission.gnss is None else fixes_of(mission, mission.gnss, timeline),
+        imu_noise_bias_sigma=np.repeat([noise.accel_bias_sigma, noise.gyro_bias_sigma], 3),
+        extras=extras,
+        further=further,
+        notes=(
+            *timeline.notes,
+            *left_out,
+            *_gap_note(mission.imu),
+            *stuck_note,
+            *current_note(mission),
+        ),
+    )
+
+
+def start_of(problem: Problem) -> InitialMoments:
+    """Return mean and covariance of the first keyframe."""
+    return initial_moments(problem.start, problem.frame, bias_sigma=problem.imu_noise_bias_sigma)
+
+
+def with_dvl(problem: Problem, mission: Mission) -> Problem:
+    """Return the problem with the beams of another DVL log of the same run.
+
+    The inertial chain, most of the work, is kept; so the pings have to be at keyframes.
+    """
+    mission, _ = _without_stuck_beams(mission)
+    keyframe_s, ping_s = problem.keyframe_s, mission.dvl.ping_s
+    is_used = np.isfinite(mission.dvl.speed).any(axis=1)
+    is_used &= is_inside(ping_s, keyframe_s[0], keyframe_s[-1])
+    ping = np.flatnonzero(is_used)
+    keyframe = nearest(keyframe_s, ping_s[ping])
+    off = np.abs(keyframe_s[keyframe] - ping_s[ping])
+    if np.any(off > MIN_SPACING_S):
+        raise DataError(
+            f"with_dvl: expected pings at the keyframes, got one {off.max():.3f} s away at "
+            f"{ping_s[ping][np.argmax(off)]:.3f} s; build a problem of its own"
+        )
+    beams = _beams(mission, ping, keyframe, problem.extras)
+    if beams.is_water.any() and CURRENT not in problem.extras:
+        raise DataError(
+            "with_dvl: expected pings off the ground, as those of the problem, got some off the "
+            "water, whose current it does not have; build a problem of its own"
+        )
+    return replace(with_stated_noise(problem), beams=beams)
+
+
+def with_white_noise(problem: Problem) -> Problem:
+    """Return the problem for an estimator whose variables are its drifts, too.
+
+    The sigmas of beams and fixes are then those of white noise alone; as they are stated, they
+    stand for what changes slowly as well.
+    """
+    return problem if problem.is_noise_white else _scaled_noise(problem, is_noise_white=True)
+
+
+def with_stated_noise(problem: Problem) -> Problem:
+    """Return the problem for an estimator without drifts."""
+    return _scaled_noise(problem, is_noise_white=False) if problem.is_noise_white else problem
+
+
+def _scaled_noise(problem: Problem, *, is_noise_white: bool) -> Problem:
+    power = 1.0 if is_noise_white else -1.0
+    beams, fixes = problem.beams, problem.fixes
+    if DVL_DRIFT in problem.extras:
+        share = np.where(beams.is_water, 1.0, beams.white_share**power)
+        beams = replace(beams, sigma=beams.sigma * share)
+    if fixes is not None and GNSS_DRIFT in problem.extras:
+        covariance_n = fixes.covariance_n * fixes.white_share ** (2.0 * power)
+        fixes = replace(fixes, covariance_n=covariance_n)
+    return replace(problem, beams=beams, fixes=fixes, is_noise_white=is_noise_white)
+
+
+def _without_stuck_beams(mission: Mission) -> tuple[Mission, tuple[str, ...]]:
+    """Return the mission without the speeds of beams that repeat themselves, and a note."""
+    dvl = mission.dvl
+    is_stuck = stuck_beams(dvl.speed)
+    count = is_stuck.sum(axis=0)
+    if not count.any():
+        return mission, ()
+    beams = ", ".join(f"beam {b + 1}: {count[b]}" for b in np.flatnonzero(count))
+    first_s = float(dvl.ping_s[is_stuck.any(axis=1)][0])
+    note = (
+        f"speeds of a beam that repeats one reading while the others change are left out: {beams}; "
+        f"the first at {first_s:.3f} s"
+    )
+    speed = np.where(is_stuck, np.nan, dvl.speed)
+    return replace(mission, dvl=replace(dvl, speed=speed)), (note,)
+
+
+def _gap_note(imu: ImuLog) -> tuple[str, ...]:
+    begin, end = imu_gaps(imu)
+    if len(begin) == 0:
+        return ()
+    longest = int(np.argmax(end - begin))
+    return (
+        f"gaps in the inertial data: {len(begin)}, the longest of "
+        f"{end[longest] - begin[longest]:.2f} s at {begin[longest]:.3f} s; bridged with larger "
+        "process noise",
+    )
+
+
+def _beams(mission: Mission, ping: Indices, ping_keyframe: Indices, extras: Extras) -> Beams:
+    dvl, is_water = mission.dvl, mission.dvl.is_water[ping]
+    speed = dvl.speed[ping]
+    row, beam = np.nonzero(np.isfinite(speed))
+    gyro_b = mean_gyro(mission.imu, dvl.ping_s[ping]) if len(ping) else np.zeros((0, 3))
+    return Beams(
+        keyframe=ping_keyframe[row],
+        beam=beam,
+        speed=speed[row, beam],
+        sigma=dvl.sigma[ping][row, beam],
+        gyro_b=gyro_b[row],
+        beam_b=dvl.mount.beams_b[beam],
+        lever_arm_b=dvl.mount.lever_arm_b,
+        R_bd=dvl.mount.R_bd,
+        ping=row,
+        is_water=is_water[row],
+        motion=MotionBefore(mission.imu, dvl.ping_s[ping]) if needs_motion(extras) else None,
+        white_share=dvl.mount.drift.white_share,
+    )

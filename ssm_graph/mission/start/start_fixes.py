@@ -1,0 +1,141 @@
+"""Position fixes to start from: those of GNSS, else acoustic ones."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.base.frozen import Array, FrozenArrays, shaped
+from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.start.body_velocity import BodyVelocities
+from ssm_graph.sensors.acoustic import UsblLog
+from ssm_graph.sensors.gnss import GnssLog
+
+ACOUSTIC: Final = "USBL"
+MIN_WINDOW_S: Final = 10.0
+"""Inertial data that have to follow the first fix, to align with."""
+NEAR_S: Final = 60.0
+"""An acoustic fix is compared with those so long before and after it, and is preferred to one of
+GNSS that is so much later."""
+GATE: Final = 4.0
+"""It disagrees with one that is further off than the way swum and so many sigmas."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StartFixes(FrozenArrays):
+    """Fixes of one instrument from the begin of the inertial data on, the first to start from."""
+
+    source: str
+    """For people."""
+    time_s: Array = shaped("N")
+    """(N,) when they were valid, s."""
+    position_n: Array = shaped("N", 3)
+    """(N, 3) of antenna or transponder, m."""
+    sigma_enu: Array = shaped("N", 3)
+    """(N, 3) m"""
+    lever_arm_b: Array = shaped(3)
+    """(3,) body origin to antenna or transponder, m."""
+
+    def where(self, kept: NDArray[np.bool_]) -> StartFixes:
+        """Return some of them."""
+        return StartFixes(
+            self.source,
+            self.time_s[kept],
+            self.position_n[kept],
+            self.sigma_enu[kept],
+            self.lever_arm_b,
+        )
+
+
+def start_fixes(mission: Mission, velocities: BodyVelocities) -> StartFixes:
+    """Return the fixes of a mission that its start is found from.
+
+    Acoustic fixes err grossly now and then: those that disagree with most of the others near them
+    are left out here; the smoother judges them again.
+
+    Raises
+    ------
+    ConfigError
+        If the mission has no position fixes.
+    DataError
+        If no inertial data follow the first fix.
+    """
+    every = _all_fixes(mission)
+    usable = [used for fixes in every if (used := _usable(mission, fixes, velocities)) is not None]
+    if usable:
+        return min(usable, key=lambda used: used.time_s[0] + NEAR_S * (used.source == ACOUSTIC))
+    said = " and ".join(
+        f"{fixes.source} {fixes.time_s[0]:.3f}..{fixes.time_s[-1]:.3f} s" for fixes in every
+    )
+    raise DataError(
+        f"alignment: expected a position fix at least {MIN_WINDOW_S:.0f} s before the end of the "
+        f"inertial data at {mission.imu.time_s[-1]:.3f} s, got fixes of {said}; check the clocks "
+        "or add [initial]"
+    )
+
+
+def _all_fixes(mission: Mission) -> tuple[StartFixes, ...]:
+    found = tuple(
+        _in_order(mission, source, log)
+        for source, log in (("GNSS", mission.gnss), (ACOUSTIC, mission.aids.usbl))
+        if log is not None and len(log.time_s)
+    )
+    if found:
+        return found
+    alone = "" if mission.aids.ranges is None else ", and ranges to beacons alone give none"
+    raise ConfigError(
+        "mission.toml: expected [initial], [gnss] or [usbl], got none of them; without one the "
+        f"start is unknown{alone}: add [initial] with position, attitude and their sigmas"
+    )
+
+
+def _in_order(mission: Mission, source: str, log: GnssLog | UsblLog) -> StartFixes:
+    time_s = log.time_s if isinstance(log, GnssLog) else log.valid_s
+    order = np.argsort(time_s, kind="stable")
+    position_n = mission.frame.p_n_from_geodetic(log.lat, log.lon, log.height)
+    return StartFixes(
+        source, time_s[order], position_n[order], log.sigma_enu[order], log.lever_arm_b
+    )
+
+
+def _usable(mission: Mission, fixes: StartFixes, velocities: BodyVelocities) -> StartFixes | None:
+    """Return the fixes to start from; None if there are none, or the first is too late."""
+    imu = mission.imu
+    used = fixes.where((fixes.time_s >= imu.start_s) & (fixes.time_s <= imu.time_s[-1]))
+    if fixes.source == ACOUSTIC:
+        used = used.where(_agreeing(used, velocities))
+    is_early = len(used.time_s) > 0 and used.time_s[0] <= imu.time_s[-1] - MIN_WINDOW_S
+    return used if is_early else None
+
+
+def _agreeing(fixes: StartFixes, velocities: BodyVelocities) -> NDArray[np.bool_]:
+    """Return which fixes (N,) agree with at least half of those near them."""
+    if len(velocities.time_s) == 0:
+        return np.ones(len(fixes.time_s), bool)
+    swum = _swum(fixes.time_s, velocities)
+    sigma_sq = np.sum(fixes.sigma_enu**2, axis=1)
+    agrees = np.ones(len(fixes.time_s), bool)
+    for i, time_s in enumerate(fixes.time_s):
+        near = np.abs(fixes.time_s - time_s) <= NEAR_S
+        near[i] = False
+        if not near.any():
+            continue
+        apart = np.linalg.norm(fixes.position_n[near] - fixes.position_n[i], axis=1)
+        turned = 2.0 * float(np.linalg.norm(fixes.lever_arm_b))
+        sigma = np.sqrt(sigma_sq[near] + sigma_sq[i])
+        fits = apart <= np.abs(swum[near] - swum[i]) + turned + GATE * sigma
+        agrees[i] = np.count_nonzero(fits) >= math.ceil(np.count_nonzero(near) / 2)
+    return agrees
+
+
+def _swum(time_s: Array, velocities: BodyVelocities) -> Array:
+    """Return the length of the way up to each time (N,), m."""
+    grid = np.union1d(time_s, velocities.time_s)
+    speed = np.linalg.norm(velocities.at(grid), axis=1)
+    way = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(grid))])
+    return np.asarray(np.interp(time_s, grid, way))

@@ -1,0 +1,108 @@
+"""Heading from the displacement that fixes see against the one that DVL and gyros see."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ssm_graph.base.frozen import Array
+from ssm_graph.base.stepwise import Steps
+from ssm_graph.imu.increments import merge_samples_steps
+from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.start.body_velocity import BodyVelocities
+from ssm_graph.mission.start.start_fixes import StartFixes
+
+SILENCE_S = 5.0
+"""A gap between pings that ends the dead reckoning."""
+INDEPENDENT_FIXES = 4
+"""Errors of GNSS change slowly: never count on more independent fixes than this."""
+
+
+class HeadingFit(NamedTuple):
+    """A heading at the start with its standard deviation, rad."""
+
+    heading: float
+    sigma: float
+
+
+def heading_from_track_steps(
+    mission: Mission, fixes: StartFixes, R_lb: Array, velocities: BodyVelocities
+) -> Steps[HeadingFit]:
+    """Turn the dead-reckoned track onto that of the fixes, over the stretch that fixes it best.
+
+    Parameters
+    ----------
+    mission : whose inertial data and pings are used.
+    fixes : from the first of which the track begins.
+    R_lb : (3, 3) body to local level at the start; its heading is what is sought, so any will do.
+    velocities : of the body at the pings.
+    """
+    time_s, track_l, antenna_l = yield from _dead_reckon_steps(mission, fixes, R_lb, velocities)
+    used = fixes.where(fixes.time_s <= time_s[-1])
+    fix_n = used.position_n
+    if len(fix_n) < 3:
+        return HeadingFit(0.0, math.inf)
+    fix_l = (fix_n @ mission.frame.R_nl_at(fix_n[0]))[:, :2]
+    seen_l = np.stack(
+        [np.interp(used.time_s, time_s, axis) for axis in (track_l + antenna_l)[:, :2].T],
+        axis=-1,
+    )
+    noise = float(np.sqrt(np.mean(used.sigma_enu[:, :2] ** 2)))
+    drift = mission.imu.noise.gyro_bias_sigma
+    elapsed = used.time_s - time_s[0]
+    fits = [
+        _fit(seen_l[:n], fix_l[:n], noise=noise, drift=0.5 * drift * elapsed[n - 1])
+        for n in np.unique(np.geomspace(3, len(fix_l), 20).astype(int))
+    ]
+    turn, sigma = min(fits, key=lambda fit: fit.sigma)
+    # The fit turns from the level axes assumed to the true ones, anticlockwise.
+    assumed = math.atan2(R_lb[0, 0], R_lb[1, 0])
+    return HeadingFit(assumed - turn, sigma)
+
+
+def _fit(seen: Array, fixed: Array, *, noise: float, drift: float) -> HeadingFit:
+    """Return the anticlockwise turn of ``seen`` (N, 2) onto ``fixed`` (N, 2)."""
+    a, b = seen - seen.mean(axis=0), fixed - fixed.mean(axis=0)
+    turn = math.atan2(float(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])), float(np.sum(a * b)))
+    spread = math.sqrt(float(np.mean(np.sum(a**2, axis=1))))
+    independent = min(len(a), INDEPENDENT_FIXES)
+    sigma = noise / max(spread * math.sqrt(independent), 1e-9)
+    return HeadingFit(turn, math.hypot(sigma, drift))
+
+
+def _dead_reckon_steps(
+    mission: Mission, fixes: StartFixes, R_lb: Array, velocities: BodyVelocities
+) -> Steps[tuple[Array, Array, Array]]:
+    """Return times (N,), track (N, 3) and antenna offset (N, 3) in the level axes assumed, m."""
+    start_s = float(fixes.time_s[0])
+    end_s = min(float(fixes.time_s[-1]), float(mission.imu.time_s[-1]))
+    pings = velocities.time_s[(velocities.time_s > start_s) & (velocities.time_s < end_s)]
+    silent = np.flatnonzero(np.diff(pings, prepend=start_s) > SILENCE_S)
+    pings = pings[: silent[0]] if len(silent) else pings
+    time_s = np.concatenate([[start_s], pings])
+    if len(time_s) < 2:
+        return time_s, np.zeros((1, 3)), (R_lb @ fixes.lever_arm_b)[None, :]
+    R = yield from gyro_attitudes_steps(mission, time_s, R_lb)
+    v_l = np.einsum("kij,kj->ki", R, velocities.at(time_s))
+    step = 0.5 * (v_l[1:] + v_l[:-1]) * np.diff(time_s)[:, None]
+    track = np.concatenate([np.zeros((1, 3)), np.cumsum(step, axis=0)])
+    return time_s, track, R @ fixes.lever_arm_b
+
+
+def gyro_attitudes_steps(mission: Mission, time_s: Array, R_lb: Array) -> Steps[Array]:
+    """Return attitudes (N, 3, 3) at the times, by the gyros alone."""
+    merged = yield from merge_samples_steps(mission.imu, time_s, rate_hz=20.0)
+    # Against the turn of the Earth, which a MEMS gyro does not notice but a better one does.
+    earth_l = mission.frame.omega_ie_n
+    attitudes = [R_lb]
+    for k in range(len(time_s) - 1):
+        R = attitudes[-1]
+        for i in range(merged.first[k], merged.first[k + 1]):
+            rate_b = merged.gyro_b[i] - R.T @ earth_l
+            R = R @ Rotation.from_rotvec(rate_b * merged.dt[i]).as_matrix()
+        attitudes.append(R)
+        yield 0.15
+    return np.array(attitudes)

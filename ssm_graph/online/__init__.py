@@ -1,5 +1,0 @@
-"""The vehicle's own estimator: messages in as they come, the newest state out at once."""
-
-from ssm_graph.online.smoother import ONLINE, FixedLagSmoother
-
-__all__ = ["ONLINE", "FixedLagSmoother"]

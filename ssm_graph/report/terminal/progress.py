@@ -1,0 +1,108 @@
+"""What a user sees while an estimator works."""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import Final
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
+
+from ssm_graph.mission.estimate import Iteration
+
+PLAIN_EVERY: Final = 10
+"""Iterations from one plain line to the next."""
+N_PLAIN: Final = 5
+"""Plain lines on the way through the keyframes."""
+
+
+class ProgressDisplay:
+    """A bar on a terminal, a few plain lines elsewhere; gone when the work is done.
+
+    ::
+
+        with ProgressDisplay(Console(stderr=True)) as show:
+            show.stage("reading the mission")
+            estimate = smoother.solve(problem, on_iteration=show)
+    """
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._is_live = console.is_terminal and not console.is_dumb_terminal
+        self._unprinted: str | None = None
+        self._task: TaskID | None = None
+        self._progress = Progress(
+            SpinnerColumn(),
+            TextColumn("{task.description}", markup=False),
+            BarColumn(bar_width=24),
+            TextColumn("{task.fields[state]}", markup=False),
+            TimeElapsedColumn(),
+            console=console,
+            transient=True,
+            disable=not self._is_live,
+        )
+
+    def __enter__(self) -> ProgressDisplay:
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._progress.stop()
+        self._flush()
+
+    def __call__(self, index: int, limit: int, iteration: Iteration) -> None:
+        """Do as :meth:`iteration`: the display itself is a callback."""
+        self.iteration(index, limit, iteration)
+
+    def stage(self, text: str) -> None:
+        """Show that another part of the work begins."""
+        if not self._is_live:
+            self._flush()
+            self._print(text)
+            return
+        if self._task is not None:
+            self._progress.remove_task(self._task)
+        self._task = self._progress.add_task(text, total=None, state="")
+
+    def iteration(self, index: int, limit: int, iteration: Iteration) -> None:
+        """Show one finished pass.
+
+        Parameters
+        ----------
+        index : its number, counted from 1.
+        limit : the number after which the estimator gives up.
+        iteration : how far it moved.
+        """
+        state = (
+            f"{index} of at most {limit}: update {iteration.update_sigmas:.2g} sigma, "
+            f"weights {iteration.weight_change:.2g}, {iteration.kernel}"
+        )
+        if not self._is_live:
+            self._unprinted = f"iteration {state}"
+            if index == 1 or index % PLAIN_EVERY == 0:
+                self._flush()
+            return
+        if self._task is None:
+            self.stage("smoothing")
+        assert self._task is not None
+        self._progress.update(self._task, total=limit, completed=index, state=state)
+
+    def keyframe(self, index: int, total: int) -> None:
+        """Show that this many keyframes are done."""
+        if self._is_live and self._task is not None:
+            self._progress.update(self._task, total=total, completed=index, state=f"{index}")
+        elif not self._is_live and index * N_PLAIN // total > (index - 1) * N_PLAIN // total:
+            self._print(f"keyframe {index} of {total}")
+
+    def _flush(self) -> None:
+        if self._unprinted is not None:
+            self._print(self._unprinted)
+            self._unprinted = None
+
+    def _print(self, text: str) -> None:
+        self._console.print(text, markup=False, highlight=False, soft_wrap=True)

@@ -1,0 +1,1 @@
+"""Instruments, a file each: what they measure, their errors and calibrations, their messages."""
