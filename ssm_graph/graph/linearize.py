@@ -146,7 +146,13 @@ class GraphLinearizer:
 
     def inertial_rows(self, states: States) -> Array:
         """Return the whitened rows (K - 1, 15, 31) of the inertial data at ``states``."""
-        return inertial_rows(self.inertial, states, self._gradient, span_s=self._span_s)
+        return inertial_rows(
+            self.inertial,
+            states,
+            self._gradient,
+            omega_ie_n=self.problem.frame.omega_ie_n,
+            span_s=self._span_s,
+        )
 
     def retract(
         self, states: States, delta: tuple[Array, Array], *, scale: float = 1.0
