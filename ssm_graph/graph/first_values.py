@@ -161,7 +161,15 @@ class _ForwardPass:
             values.insert(V(i), velocity)
             values.insert(B(i), constant_bias=bias)
         R_end, at = predicted.pose().rotation().matrix(), self.factors.at(k)
-        pair = pair_rows(at, values, self._gradient, R_begin=self.R_nb, R_end=R_end, span_s=span)
+        pair = pair_rows(
+            at,
+            values,
+            self._gradient,
+            omega_ie_n=self.problem.frame.omega_ie_n,
+            R_begin=self.R_nb,
+            R_end=R_end,
+            span_s=span,
+        )
         self.P = carried_covariance(pair, self.P)
         if self.extras:
             self.extras.predict(k, self.P)

@@ -11,6 +11,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
+from factors.so3 import skew
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps
 from ssm_graph.engine.error_state import POSITION, STATE_DIM, VELOCITY
@@ -34,31 +35,46 @@ def inertial_graph(problem: Problem) -> gtsam.NonlinearFactorGraph:
 
 
 def add_gravity_gradient(
-    rows: Array, gradient: Array, *, R_begin: Array, R_end: Array, span_s: Array | float
+    rows: Array,
+    gradient: Array,
+    *,
+    omega_ie_n: Array,
+    R_begin: Array,
+    R_end: Array,
+    span_s: Array | float,
 ) -> None:
     """Let whitened inertial rows know that gravity changes along with both positions, in place.
 
-    More gravity by ``g`` is a velocity at the end that differs by ``g t`` and a position that
-    differs by ``g t^2 / 2``.
+    With ``T = skew(omega t)`` more gravity by ``g`` is a velocity at the end that differs by
+    ``t (I - T) g`` and a position that differs by ``t^2 (I/2 - T/3) g``, the turn of the Earth in
+    a time ``t`` taken to first order. Without it a metre of position is 2e-10 m/s off after each
+    second, always the same way: 2e-6 of the velocity's sigma after minutes at navigation grade.
 
     Parameters
     ----------
     rows : (..., 15, 31) begin, end and right-hand side, see :data:`PAIR_COLUMNS`.
     gradient : (3, 3) 1/s^2, of gravity; see :func:`ssm_graph.imu.preintegration.gravity_gradient`.
+    omega_ie_n : (3,) rad/s, of the Earth.
     R_begin, R_end : (..., 3, 3) attitudes at both ends, body to ``n``.
     span_s : (...) from begin to end.
     """
     t = np.asarray(span_s)[..., None, None]
     end = rows[..., STATE_DIM : 2 * STATE_DIM]
     D_position_n = end[..., POSITION] @ np.swapaxes(R_end, -1, -2)
-    D_gravity = -(end[..., VELOCITY] * t + D_position_n * (0.5 * t**2))
+    T, eye = skew(omega_ie_n) * t, np.eye(3)
+    D_gravity = -t * (end[..., VELOCITY] @ (eye - T) + D_position_n @ (t * (eye / 2.0 - T / 3.0)))
     D_middle = 0.5 * D_gravity @ gradient
     rows[..., POSITION] += D_middle @ R_begin
     end[..., POSITION] += D_middle @ R_end
 
 
 def inertial_rows_steps(
-    graph: gtsam.NonlinearFactorGraph, states: States, gradient: Array, *, span_s: Array
+    graph: gtsam.NonlinearFactorGraph,
+    states: States,
+    gradient: Array,
+    *,
+    omega_ie_n: Array,
+    span_s: Array,
 ) -> Steps[Array]:
     """Return the whitened rows (K - 1, 15, 31) of a chain of inertial factors at ``states``."""
     linear = graph.linearize(states.values)
@@ -69,7 +85,14 @@ def inertial_rows_steps(
     yield 0.003 * len(rows)
     rows = rows[:, :, PAIR_COLUMNS]
     R_nb = states.R_nb
-    add_gravity_gradient(rows, gradient, R_begin=R_nb[:-1], R_end=R_nb[1:], span_s=span_s)
+    add_gravity_gradient(
+        rows,
+        gradient,
+        omega_ie_n=omega_ie_n,
+        R_begin=R_nb[:-1],
+        R_end=R_nb[1:],
+        span_s=span_s,
+    )
     return rows
 
 
@@ -78,13 +101,16 @@ def pair_rows(
     values: gtsam.Values,
     gradient: Array,
     *,
+    omega_ie_n: Array,
     R_begin: Array,
     R_end: Array,
     span_s: float,
 ) -> Array:
     """Return the whitened rows (15, 31) of one inertial factor; see :func:`inertial_rows_steps`."""
     pair = factor.linearize(values).augmentedJacobian()[:, PAIR_COLUMNS]
-    add_gravity_gradient(pair, gradient, R_begin=R_begin, R_end=R_end, span_s=span_s)
+    add_gravity_gradient(
+        pair, gradient, omega_ie_n=omega_ie_n, R_begin=R_begin, R_end=R_end, span_s=span_s
+    )
     return np.asarray(pair)
 
 

@@ -159,7 +159,13 @@ class GraphLinearizer:
 
     def inertial_rows_steps(self, states: States) -> Steps[Array]:
         """Return the whitened rows (K - 1, 15, 31) of the inertial data at ``states``."""
-        return inertial_rows_steps(self.inertial, states, self._gradient, span_s=self._span_s)
+        return inertial_rows_steps(
+            self.inertial,
+            states,
+            self._gradient,
+            omega_ie_n=self.problem.frame.omega_ie_n,
+            span_s=self._span_s,
+        )
 
     def retract(
         self, states: States, delta: tuple[Array, Array], *, scale: float = 1.0

@@ -126,6 +126,7 @@ class InertialRows:
                     factor,
                     self._values,
                     self._gradient,
+                    omega_ie_n=self._frame.omega_ie_n,
                     R_begin=states.R_nb[i - 1],
                     R_end=states.R_nb[i],
                     span_s=float(_way(keyframe).measured.deltaTij()),

@@ -219,7 +219,9 @@ FAMILIES: Final[Mapping[str, Family]] = {
         is_recursive=True,
     ),
     "single-step": _fixed_lag_family(
-        "newest", "fixed-lag smoother without lag: the filter ssm-log by way of the graph", 0.0
+        "newest",
+        "fixed-lag smoother without lag: as ssm-log, but linearised at each pass, and calibrating",
+        0.0,
     ),
     "fixed-lag": _fixed_lag_family(
         "newest", "fixed-lag smoother with this lag in seconds, its newest states"

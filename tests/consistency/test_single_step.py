@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from benchmarks.equivalence import Difference, against_filter, against_geodetic
+from benchmarks.equivalence import Difference, against_filter, against_geodetic, missions
 from factors.similarity import Similarity
 from ssm_graph.engine.error_state import Linearised
 from ssm_graph.filters.geodetic.error_model import Feedback
@@ -47,11 +47,12 @@ def assert_the_same(found: Difference) -> None:
     """Compare with the limits of two that stop at steps of 1e-8 sigma.
 
     Each keyframe leaves less than such a step between them, which the later ones forget: up to
-    2e-8 sigma, 7e-10 of a covariance and 9e-10 of a weight were measured.
+    2e-8 sigma, 7e-10 of a covariance and 9e-10 of a weight were measured in a minute. A process
+    that is not quite the same adds up instead, and shows in twenty minutes.
     """
-    assert found.state < 1e-6
-    assert found.covariance < 1e-6
-    assert found.weight < 1e-8
+    assert found.state < 1e-7
+    assert found.covariance < 1e-8
+    assert found.weight < 5e-9
     assert found.n_iterations == 0
 
 
@@ -66,9 +67,27 @@ def test_it_is_the_filter_for_twenty_seconds(similarity: Similarity) -> None:
 @each_similarity
 @each_grade
 def test_it_is_the_filter(grade: Grade, similarity: Similarity) -> None:
-    """States, covariances, weights and numbers of passes, keyframe by keyframe."""
+    """States, covariances, weights and numbers of passes, keyframe by keyframe.
+
+    The filter is the one that linearises anew at each pass, and ``ssm-log`` is told apart.
+    """
     _, problem = survey(grade)
-    assert_the_same(against_filter(problem, similarity))
+    found = against_filter(problem, similarity)
+    assert_the_same(found)
+    assert found.once > 1e-2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(len(GRADES)), ids=[grade.name for grade in GRADES])
+def test_it_stays_the_filter_for_twenty_minutes(seed: int) -> None:
+    """The missions of the benchmark, one a grade, within what its page promises."""
+    sim = missions(len(GRADES), 1200.0)[seed]
+    assert sim.config.grade is GRADES[seed]
+    found = against_filter(build_problem(sim.mission), Similarity.EXPECTED)
+    assert found.state < 1e-6
+    assert found.covariance < 1e-6
+    assert found.weight < 1e-8
+    assert found.n_iterations == 0
 
 
 GEODETIC_LIMITS = (0.05, 0.1)

@@ -80,7 +80,9 @@ class Process:
         process_cov = m.covariance.copy()
         process_cov[:, VELOCITY, :] = moved.R_nb @ process_cov[:, VELOCITY, :]
         process_cov[:, :, VELOCITY] = process_cov[:, :, VELOCITY] @ _T(moved.R_nb)
-        change = np.eye(STATE_DIM) + self._gravity_along(k, dt[..., None], moved, moved.R_nb)
+        # Gravity of the middle follows the end itself: d_j = F d_i + G_i d_i + G_j d_j + noise.
+        at_end = self._gravity_along(k, dt[..., None], moved, moved.R_nb)
+        change = np.asarray(np.linalg.inv(np.eye(STATE_DIM) - at_end), dtype=np.float64)
         F = change @ (F + self._gravity_along(k, dt[..., None], moved, states.R_nb))
         return Prediction(moved, F, change @ process_cov @ _T(change))
 
