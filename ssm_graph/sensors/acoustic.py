@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 
@@ -28,6 +28,8 @@ class UsblLog(FrozenArrays):
 
     A fix travels: it is stamped when it is known, and was valid ``delay_s`` before.
     """
+
+    SECTION: ClassVar[str] = "[usbl]"
 
     time_s: Array = shaped("N")
     """(N,) s as stamped, strictly increasing."""
@@ -90,6 +92,8 @@ class Beacon(FrozenArrays):
 @dataclass(frozen=True, slots=True, eq=False)
 class RangeLog(FrozenArrays):
     """Acoustic ranges from the vehicle's transducer to beacons."""
+
+    SECTION: ClassVar[str] = "[ranges]"
 
     beacons: tuple[Beacon, ...]
     time_s: Array = shaped("N")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 
@@ -40,6 +40,8 @@ class HeadingErrors:
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadingLog(FrozenArrays):
     """Readings of a magnetic or any other compass, or of a directional gyro."""
+
+    SECTION: ClassVar[str] = "[heading]"
 
     sigma: float
     """Standard deviation of a reading, rad."""

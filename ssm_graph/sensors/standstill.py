@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import ClassVar, Final
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.settings import Key, Settings, build
@@ -13,6 +13,8 @@ from ssm_graph.base.settings import Key, Settings, build
 @dataclass(frozen=True, slots=True)
 class Standstill:
     """A time in which the vehicle did not go anywhere: on deck, moored, on the bottom."""
+
+    SECTION: ClassVar[str] = "[[standstill]]"
 
     begin_s: float
     end_s: float
