@@ -18,8 +18,8 @@ from ssm_graph.sensors.messages import Message
 
 DEEPEST_M: Final = 12_000.0
 """Depth, positive down; the deepest trench has 10,935 m."""
-HIGHEST_M: Final = 100.0
-"""Above the surface: a pressure sensor in air, and tides, and the ellipsoid against the geoid."""
+HIGHEST_M: Final = 6_500.0
+"""Above the ellipsoid, where the highest lakes are; depth is minus the height of the sensor."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -72,6 +72,7 @@ _SPEED: Final = Column(
     expected=f"expected m/s, up to {LARGEST_SPEED:g}; {LEAVE_EMPTY}",
     blank=True,
     is_many=True,
+    json="beam_m_per_s",
 )
 _SIGMA: Final = Column(
     "sigma",
@@ -188,31 +189,32 @@ class _Dvl(Instrument):
         return notes + check_speeds(table, speed)
 
     def filled(self, table: Table, bare: DvlLog, settings: Settings, axes: BodyAxes) -> DvlLog:
-        noise = settings.number("beam_noise_m_per_s")
-        off_water = settings.number("water_noise_m_per_s") or noise
-        return self.with_nominal_sigmas(table, bare, axes, noise, off_water)
-
-    def with_nominal_sigmas(
-        self, table: Table, bare: DvlLog, axes: BodyAxes, noise: float, off_water: float
-    ) -> DvlLog:
-        """Return the log of a checked table; sigmas, m/s, of beams that state none."""
         rows = {c.field: c.read(table, axes) for c in self.columns_of(bare) if c.field}
         covariance = _covariance(table, bare)
         if covariance is not None:
             stated = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
             rows["sigma"] = np.where(np.isnan(stated), rows["sigma"], stated)
         water = rows["water_track"]
+        noise = settings.number("beam_noise_m_per_s")
+        off_water = settings.number("water_noise_m_per_s") or noise
         nominal = np.where(water > 0.0, off_water, noise)[:, None]
         has_range = any(name in table for name in _RANGE.sized(bare.mount.n_beams).names)
-        return DvlLog(
+        log = DvlLog(
             mount=bare.mount,
             time_s=table.time_s,
-            speed=without_false_speeds(rows["speed"]),
+            speed=rows["speed"],
             sigma=np.where(np.isnan(rows["sigma"]), nominal, rows["sigma"]),
             range_m=rows["range_m"] if has_range else None,
             water_track=water if water.any() else None,
             covariance=covariance,
         )
+        return self.cleaned(log)
+
+    def cleaned(self, log: DvlLog) -> DvlLog:
+        return replace(log, speed=without_false_speeds(log.speed))
+
+    def without_rows(self, log: DvlLog) -> DvlLog:
+        return empty_dvl(log.mount)
 
     def settings_of(self, log: DvlLog) -> dict[str, Any]:
         found = {
@@ -263,6 +265,8 @@ class _Dvl(Instrument):
         assert isinstance(message, Ping)
         if len(message.speed) != bare.mount.n_beams:
             return f"{len(message.speed)} beams, expected the vehicle's {bare.mount.n_beams}"
+        if message.sigma is not None and len(message.sigma) != bare.mount.n_beams:
+            return f"{len(message.sigma)} sigmas of {bare.mount.n_beams} beams"
         return None
 
     def sifted(

@@ -90,7 +90,7 @@ class Column:
     @property
     def key(self) -> str:
         """Its key in a JSON message."""
-        return self.json or self.pattern.replace("{}_", "").replace("{}", "")
+        return self.json or self.pattern.replace("{}_", "")
 
     def read(self, table: Table, axes: BodyAxes) -> Array:
         """Return its numbers (N,) or (N, len(over)) in SI units, body vectors forward-right-down."""
@@ -207,6 +207,14 @@ class Instrument:
         """Return the log of a checked table."""
         rows = {column.field: column.read(table, axes) for column in self.columns_of(bare)}
         return replace(bare, time_s=table.time_s, **rows)
+
+    def cleaned(self, log: Any) -> Any:
+        """Return a log that :meth:`check` has seen without what cannot have been measured."""
+        return log
+
+    def without_rows(self, log: Any) -> Any:
+        """Return what is known of an instrument beside its readings."""
+        return replace(log, **self.empty())
 
     def settings_of(self, log: Any) -> dict[str, Any]:
         """Return the section that describes an instrument, without the name of its table."""
