@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array, ReadOnlyArrays
-from ssm_graph.mission.mission import AidLogs, Mission
+from ssm_graph.mission.mission import Aids, Mission
+from ssm_graph.sensors.acoustic import RangeLog, UsblLog
 
 MIN_SPACING_S = 1e-3
 """Times closer than this share a keyframe."""
@@ -54,9 +55,9 @@ def build_timeline(mission: Mission, *, start_s: float, interval_s: float) -> Ti
         raise DataError(
             f"the start at {start_s:.3f} s leaves no inertial data, which end at {end_s:.3f} s"
         )
-    ping_s = mission.dvl.ping_s
+    ping_s = mission.dvl.valid_s
     has_beam = np.isfinite(mission.dvl.speed).any(axis=1)
-    fix_s = mission.gnss.time_s if mission.gnss is not None else np.zeros(0)
+    fix_s = mission.gnss.valid_s if mission.gnss is not None else np.zeros(0)
     ping = np.flatnonzero(has_beam & is_inside(ping_s, start_s, end_s))
     fix = np.flatnonzero(is_inside(fix_s, start_s, end_s))
     notes = left_out("ping", int(has_beam.sum()) - len(ping), start_s, end_s)
@@ -75,10 +76,11 @@ def build_timeline(mission: Mission, *, start_s: float, interval_s: float) -> Ti
     )
 
 
-def _acoustic_s(aids: AidLogs, start_s: float, end_s: float) -> list[Array]:
+def _acoustic_s(aids: Aids, start_s: float, end_s: float) -> list[Array]:
     """Return the times of acoustic fixes and ranges within the span."""
-    times = [aids.usbl.valid_s] if aids.usbl else []
-    times += [aids.ranges.time_s] if aids.ranges else []
+    usbl, ranges = aids.get(UsblLog), aids.get(RangeLog)
+    times = [usbl.valid_s] if usbl else []
+    times += [ranges.time_s] if ranges else []
     return [time_s[is_inside(time_s, start_s, end_s)] for time_s in times]
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frames import rotation_zyx
 from ssm_graph.base.frozen import Array
-from ssm_graph.io.mission_folder.units import beams_from_angles
+from ssm_graph.sensors.dvl import beams_from_angles
 
 WATER_LINKED_BEAMS: Final = beams_from_angles(
     np.radians([135.0, -135.0, -45.0, 45.0]), float(np.radians(22.5))

@@ -21,11 +21,10 @@ from ssm_graph.io.ros.messages import STANDARD_GRAVITY, WATER_LINKED_TYPE, BeamS
 from ssm_graph.io.ros.rows import BagTopic, in_order, read_topics
 from ssm_graph.mission.mission import InitialState, Mission
 from ssm_graph.mission.vehicle import Vehicle
-from ssm_graph.sensors.depth import DepthCalibration, DepthLog
+from ssm_graph.sensors.depth import DEEPEST_M, DepthCalibration, DepthLog
 from ssm_graph.sensors.dvl import DvlLog, DvlMount
 from ssm_graph.sensors.gnss import GnssCalibration, GnssLog
 from ssm_graph.sensors.imu import ImuLog, ImuNoise
-from ssm_graph.sensors.limits import DEEPEST_M
 
 NOISE: Final = ImuNoise(
     gyro_density=1.2e-4,
