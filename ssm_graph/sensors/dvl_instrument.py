@@ -415,7 +415,9 @@ def _check_covariance(table: Table, bare: DvlLog) -> None:
     whole = np.isfinite(covariance).all(axis=(1, 2))
     least = np.full(len(table), np.inf)
     least[whole] = np.linalg.eigvalsh(covariance[whole])[:, 0]
-    least = np.minimum(least, np.nan_to_num(np.diagonal(covariance, axis1=1, axis2=2), nan=1.0).min(axis=1))
+    least = np.minimum(
+        least, np.nan_to_num(np.diagonal(covariance, axis1=1, axis2=2), nan=1.0).min(axis=1)
+    )
     if (least <= SMALLEST_SIGMA**2).any():
         row = int(np.argmax(least <= SMALLEST_SIGMA**2))
         raise table.fault(

@@ -12,6 +12,7 @@ from ssm_graph.sensors.dvl_instrument import DVL
 from ssm_graph.sensors.gnss import GNSS
 from ssm_graph.sensors.imu import IMU
 from ssm_graph.sensors.instrument import Instrument
+from ssm_graph.sensors.magnetometer import MAGNETOMETER
 from ssm_graph.sensors.messages import Message
 
 INSTRUMENTS: Final[tuple[Instrument, ...]] = (
@@ -22,6 +23,7 @@ INSTRUMENTS: Final[tuple[Instrument, ...]] = (
     USBL,
     RANGES,
     COMPASS,
+    MAGNETOMETER,
 )
 """In the order in which a folder has their tables, and a log counts them."""
 BY_SECTION: Final[Mapping[str, Instrument]] = {one.section: one for one in INSTRUMENTS}
