@@ -16,6 +16,7 @@ from factors.dvl_beam import dvl_beam_factor
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.states import AugmentedStates
+from ssm_graph.graph.aids.depth import DepthMeans
 from ssm_graph.graph.gtsam_graph import prior_graph
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.io.raw_log.mission_messages import messages_of
@@ -27,8 +28,8 @@ from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.problem import ProblemConfig, build_problem, start_of
 from ssm_graph.mission.trajectory import trajectory_at
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors
+from ssm_graph.smoothers.window_aids import row_states
 from ssm_graph.smoothers.window_inertial import InertialRows
-from ssm_graph.smoothers.window_rows import depth_targets
 
 CAUCHY_K = 2.3849
 """The usual constant: 95 % efficiency without outliers."""
@@ -125,7 +126,6 @@ class Theirs:
         start = start_of(problem)
         self.states = AugmentedStates.of(start)
         self.covariance = start.covariance
-        self._last = Keyframe.unmeasured(problem.start.time_s, np.zeros(3), None)
         self._k = 0
         self.smoother = self._make()
         self._update(prior_graph(problem), self.states, problem.start.time_s)
@@ -157,13 +157,13 @@ class Theirs:
             )
         )
         self._add_beams(graph, keyframe, j)
-        if len(keyframe.depth):
-            self._add_depth(graph, keyframe, predicted, j)
+        depth = keyframe.aids.get(DepthMeans.name)
+        if isinstance(depth, DepthMeans):
+            self._add_depth(graph, depth, predicted, j)
         self._k = j
         self._update(graph, predicted, keyframe.time_s)
         for _ in range(self.config.extra_updates):
             self.smoother.update()
-        self._last = keyframe
         self.states = self._newest()
 
     def _update(
@@ -186,7 +186,7 @@ class Theirs:
                 speed=float(beams.speed[i]),
                 gyro_b=beams.gyro_b[i],
                 beam_b=beams.beam_b[i],
-                lever_arm_b=self._sensors.dvl_arm_b,
+                lever_arm_b=beams.lever_arm_b,
                 omega_ie_n=self._frame.omega_ie_n,
                 loss=self._loss,
             )
@@ -195,18 +195,17 @@ class Theirs:
     def _add_depth(
         self,
         graph: gtsam.NonlinearFactorGraph,
-        keyframe: Keyframe,
+        depth: DepthMeans,
         predicted: AugmentedStates,
         k: int,
     ) -> None:
         """Add the mean of the readings, carried along the track as ours are, once."""
-        both = self.states.followed_by(predicted)
-        pair = [self._last, keyframe]
-        targets = depth_targets(self._sensors, pair, both, first_rise=0.0).take(np.s_[1:])
+        before, at = (row_states(self._sensors, states) for states in (self.states, predicted))
+        target_n, up_n = depth.led_along(before, at).target(at)
         root = np.zeros((3, 3))
-        root[0] = targets.up_n[0] * np.sqrt(len(keyframe.depth)) / self._sensors.depth_sigma
+        root[0] = up_n[0] * depth.root_information[0, 0]
         noise = gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
-        graph.add(gtsam.GPSFactorArm(X(k), targets.sensor_n[0], self._sensors.depth_arm_b, noise))
+        graph.add(gtsam.GPSFactorArm(X(k), target_n[0], depth.lever_arm_b, noise))
 
     def _newest(self) -> AugmentedStates:
         k, smoother = self._k, self.smoother

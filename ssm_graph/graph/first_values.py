@@ -21,14 +21,14 @@ from ssm_graph.base.earth import SEMI_MAJOR_AXIS
 from ssm_graph.base.errors import SolverError
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import POSITION, ROTATION, STATE_DIM, VELOCITY
-from ssm_graph.graph.aids.of_problem import weighted_aids
-from ssm_graph.graph.augmented_rows import RowStates
+from ssm_graph.graph.aids.aid import RowStates
 from ssm_graph.graph.beacon_start import find_beacons
 from ssm_graph.graph.beam_rows import BeamRows, linearize_beams
 from ssm_graph.graph.beam_weights import met_weights, settle_weights, updated_trust
 from ssm_graph.graph.forward_aids import ForwardAids
 from ssm_graph.graph.forward_extras import ForwardExtras
 from ssm_graph.graph.inertial_rows import carried_covariance, inertial_graph, pair_rows
+from ssm_graph.graph.measurements import Measurements
 from ssm_graph.graph.states import States, states_from_arrays
 from ssm_graph.imu.preintegration import gravity_gradient, gtsam_gravity
 from ssm_graph.mission.problem import Problem, start_of
@@ -100,7 +100,7 @@ class _ForwardPass:
         self.P = self.extras.begin(start.covariance) if self.extras else start.covariance
         self.no_rows = _Rows(np.zeros((0, len(self.P))), np.zeros(0), np.zeros(0))
         self.factors = inertial
-        self.aids = weighted_aids(problem)
+        self.aids = Measurements.weighted(problem)
         self.met = ForwardAids(self.aids)
         self.weights = np.ones(len(problem.beams.speed))
         self.trust = np.ones(N_BEAMS)
@@ -179,7 +179,9 @@ class _ForwardPass:
         """Correct by the weighted aids of one keyframe, each by itself."""
         extras = self.extras
         walks, constants = (extras.walks, extras.constants) if extras else (_NONE, _NONE)
-        for met in self.met.at(k, RowStates(*self._state, walks, constants, self._g_n)):
+        for met in self.met.at(
+            k, RowStates(*self._state, walks, constants, self.problem.extras, self._g_n)
+        ):
             predicted = met.H @ self.P @ met.H.T
             weight = self.met.weigh(met, predicted, self.kernel)
             if weight > WEIGHT_FLOOR:

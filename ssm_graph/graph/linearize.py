@@ -16,10 +16,10 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.engine.bordered import BorderedSolution, ChainRows, solve_bordered
 from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.engine.marginal_prior import prior_at_start
-from ssm_graph.graph.aids.of_problem import full_aids, weighted_aids
-from ssm_graph.graph.augmented_rows import AugmentedBeams, RowStates, states_of
-from ssm_graph.graph.beam_rows import BeamRows
+from ssm_graph.graph.aids.aid import RowStates
+from ssm_graph.graph.beam_rows import BeamRows, CalibratedBeams
 from ssm_graph.graph.inertial_rows import inertial_graph, inertial_rows
+from ssm_graph.graph.measurements import Measurements, states_at
 from ssm_graph.graph.states import States, retract
 from ssm_graph.imu.preintegration import gravity_gradient
 from ssm_graph.mission.calibration import needs_motion
@@ -88,8 +88,8 @@ class GraphLinearizer:
         self.inertial = inertial_graph(problem)
         self._gradient, self._span_s = gravity_gradient(problem.frame), np.diff(problem.keyframe_s)
         self.prior = prior_at_start(start_of(problem))
-        self.aids, self.weighted = full_aids(problem), weighted_aids(problem)
-        self._beams = AugmentedBeams(problem.beams, problem.extras, problem.frame)
+        self.aids, self.weighted = Measurements.in_full(problem), Measurements.weighted(problem)
+        self._beams = CalibratedBeams(problem.beams, problem.extras, problem.frame)
         self._n_judged = 0
         factor, sigma = problem.extras.transitions(self._span_s)
         self._walk_factor, self._walk_sigma = factor, sigma
@@ -101,8 +101,8 @@ class GraphLinearizer:
         states tell acceleration from a bias. Then the beams are to be linearised anew.
         """
         self.problem.chain.set_gravity(states.p_n)
-        for aid in self.aids:
-            aid.follow(states)
+        self.aids.follow(states)
+        self.weighted.follow(states)
         if self._n_judged == JUDGED_PASSES or not needs_motion(self.problem.extras):
             return False
         self._n_judged += 1
@@ -168,8 +168,8 @@ class GraphLinearizer:
         extras = self.problem.extras
         squares = np.sum(weights * (beam_rows.error / self.problem.beams.sigma) ** 2)
         squares += np.sum(self.prior.whitened(states) ** 2)
-        squares += sum(float(np.sum(aid.rows(states).error ** 2)) for aid in self.aids)
-        squares += np.sum(self._aid_weights(aid_weights) * self.weighted.squares(states))
+        squares += np.sum(self.aids.rows(states).error ** 2)
+        squares += np.sum(self.weighted.rows(states, aid_weights).error ** 2)
         at_start = np.concatenate([states.walks[0], states.constants])
         squares += np.sum((at_start / extras.sigma) ** 2) + np.sum(self._walked(states) ** 2)
         return float(self.inertial.error(states.values) + 0.5 * squares)
@@ -178,17 +178,14 @@ class GraphLinearizer:
         """Return the misfit of the aids and the inertial data, by name, where there are any."""
         n = self.inertial.size()
         found = {"inertial": Misfit(2.0 * self.inertial.error(states.values), n * STATE_DIM, n)}
-        for aid in self.aids:
-            error = aid.rows(states).error
-            found[aid.name] = Misfit(float(error @ error), len(error), len(error) // aid.dim)
+        for aid in self.aids.all:
+            error = aid.whitened(self.aids.at_keyframes(aid, states)).error
+            found[aid.name] = Misfit(float(np.sum(error**2)), error.size, len(error))
         return {name: misfit for name, misfit in found.items() if misfit.n_factors}
-
-    def _aid_weights(self, weights: Array | None) -> Array:
-        return np.ones(len(self.weighted)) if weights is None else weights
 
     def _at_beams(self, states: States) -> RowStates:
         g_n = self.problem.frame.g_n_at(states.p_n)
-        return states_of(states, self.problem.beams.keyframe, g_n=g_n)
+        return states_at(states, self.problem.beams.keyframe, self.problem.extras, g_n=g_n)
 
     def _walked(self, states: States) -> Array:
         """Return the whitened errors (K - 1, s) of the walks."""
@@ -223,9 +220,7 @@ class GraphLinearizer:
         scale = np.sqrt(weights) / beams.sigma
         whitened = np.column_stack([beam_rows.jacobian, -beam_rows.error]) * scale[:, None]
         keyframes, blocks = [beams.keyframe], [whitened]
-        aid_rows = [aid.rows(states) for aid in self.aids]
-        if len(self.weighted):
-            aid_rows.append(self.weighted.weighted_rows(states, self._aid_weights(aid_weights)))
+        aid_rows = self.aids.rows(states), self.weighted.rows(states, aid_weights)
         for keyframe, error, jacobian in aid_rows:
             keyframes.append(keyframe)
             blocks.append(np.column_stack([jacobian, -error]))

@@ -13,6 +13,10 @@ from factors.similarity import WEIGHT_FLOOR, ExpKernel, LogKernel, Similarity
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.engine.gnc import Graduation
 from ssm_graph.filters.navigation.named import filter_problems
+from ssm_graph.graph.aids.heading import Headings
+from ssm_graph.graph.aids.ranges import Ranges
+from ssm_graph.graph.aids.standstill import Standstills
+from ssm_graph.graph.aids.usbl import UsblFixes
 from ssm_graph.graph.beacon_start import BeaconRanges, beacon_start, rival_place
 from ssm_graph.graph.first_values import first_values
 from ssm_graph.graph.forward_aids import settled_weight
@@ -45,13 +49,13 @@ def test_fixes_and_ranges_have_keyframes_of_when_they_were_valid() -> None:
     """Between the pings; a fix that came late goes back to its time."""
     sim = with_every_aid()
     problem, aids = build_problem(sim.mission), sim.mission.aids
-    further = problem.further
-    assert further.usbl is not None
-    assert further.ranges is not None
-    np.testing.assert_allclose(problem.keyframe_s[further.usbl.keyframe], aids[UsblLog].valid_s)
-    np.testing.assert_allclose(problem.keyframe_s[further.ranges.keyframe], aids[RangeLog].time_s)
+    fixes, ranges = problem.aid(UsblFixes), problem.aid(Ranges)
+    assert fixes is not None
+    assert ranges is not None
+    np.testing.assert_allclose(problem.keyframe_s[fixes.keyframe], aids[UsblLog].valid_s)
+    np.testing.assert_allclose(problem.keyframe_s[ranges.keyframe], aids[RangeLog].time_s)
     assert aids[UsblLog].valid_s[0] == pytest.approx(aids[UsblLog].time_s[0] - 1.5)
-    numbers = further.ranges.number[further.ranges.beacon]
+    numbers = ranges.number[ranges.beacon]
     np.testing.assert_array_equal(numbers, aids[RangeLog].beacon)
 
 
@@ -61,8 +65,9 @@ def test_what_lies_outside_is_left_out_and_said() -> None:
     log = sim.mission.aids[UsblLog]
     late = replace(log, delay_s=np.where(np.arange(len(log.time_s)) < 3, 100.0, 0.0))
     problem = build_problem(replace(sim.mission, aids=Aids(late)))
-    assert problem.further.usbl is not None
-    assert len(problem.further.usbl.keyframe) == len(log.time_s) - 3
+    fixes = problem.aid(UsblFixes)
+    assert fixes is not None
+    assert len(fixes) == len(log.time_s) - 3
     assert any("3 USBL fixes outside" in note for note in problem.notes)
 
 
@@ -92,11 +97,11 @@ def test_a_keyframe_has_one_heading_led_to_it_by_the_gyros() -> None:
     sim = simulated(perfect_sensors=True, aids=compass(rate_hz=2.0), route=HoverRoute())
     shifted = sim.mission.aids[HeadingLog]
     shifted = replace(shifted, time_s=shifted.time_s + 0.25)  # its readings are of 0.25 s before
-    headings = build_problem(replace(sim.mission, aids=Aids(shifted))).further.headings
+    headings = build_problem(replace(sim.mission, aids=Aids(shifted))).aid(Headings)
     assert headings is not None
     assert len(np.unique(headings.keyframe)) == len(headings.keyframe)
     problem = build_problem(sim.mission)
-    led = problem.further.headings
+    led = problem.aid(Headings)
     assert led is not None
     assert len(led.keyframe) >= problem.n_keyframes - 1
     turn = np.arccos(0.5 * (np.trace(headings.R_back, axis1=1, axis2=2) - 1.0))
@@ -108,7 +113,7 @@ def test_the_vehicle_stands_still_at_every_keyframe_of_a_standstill() -> None:
     sim = simulated()
     stills = (Standstill(3.0, 8.0), Standstill(6.0, 9.5, sigma=0.01))
     problem = build_problem(replace(sim.mission, aids=Aids(*stills)))
-    further = problem.further.standstills
+    further = problem.aid(Standstills)
     assert further is not None
     time_s = problem.keyframe_s[further.keyframe]
     assert (time_s >= 3.0).all()
@@ -320,9 +325,9 @@ def test_every_aid_at_once() -> None:
 
 
 def test_estimators_without_them_say_so() -> None:
-    """Filters and fixed lag; GTSAM's own graph refuses what is unknown of them."""
+    """Filters; GTSAM's own graph refuses what is unknown of them."""
     problem = build_problem(with_every_aid().mission)
-    for estimate in (*filter_problems([problem], "ekf"), *solve_fixed_lag(problem)):
+    for estimate in filter_problems([problem], "ekf"):
         (note,) = (note for note in estimate.notes if "left out" in note)
         assert "[usbl], [ranges], [heading], [[standstill]]" in note
     with pytest.raises(ConfigError, match="estimates heading_walk"):

@@ -128,15 +128,6 @@ class Buffers:
         depths, fixes = self.depths.all, self.fixes.all
         end_s = self.imu.last_s
         stamps = pings[:, 0] + vehicle.mount.time_offset_s
-        depth = None
-        if vehicle.depth_sigma is not None and len(depths):
-            depth = DepthLog(
-                vehicle.depth_sigma,
-                depths[:, 0],
-                depths[:, 1],
-                vehicle.depth_lever_arm_b,
-                replace(vehicle.depth_calibration, offset=0.0),
-            )
         return Mission(
             vehicle.name,
             frame,
@@ -148,18 +139,36 @@ class Buffers:
                 pings[:, SIGMAS],
                 water_track=pings[:, OFF_WATER],
             ),
-            depth,
-            GnssLog(
-                time_s=fixes[:, 0],
-                lat=fixes[:, 1],
-                lon=fixes[:, 2],
-                height=fixes[:, 3],
-                sigma_enu=fixes[:, 4:],
-                lever_arm_b=vehicle.gnss_lever_arm_b,
-                calibration=replace(vehicle.gnss_calibration, time_offset_s=0.0),
-            ),
+            depth_of(vehicle, depths) if len(depths) else None,
+            gnss_of(vehicle, fixes),
             current=vehicle.current,
         )
+
+
+def depth_of(vehicle: Vehicle, rows: Array) -> DepthLog | None:
+    """Return rows (D, 2) as a log, None without a sensor; the offset has been taken off them."""
+    if vehicle.depth_sigma is None:
+        return None
+    return DepthLog(
+        vehicle.depth_sigma,
+        rows[:, 0],
+        rows[:, 1],
+        vehicle.depth_lever_arm_b,
+        replace(vehicle.depth_calibration, offset=0.0),
+    )
+
+
+def gnss_of(vehicle: Vehicle, rows: Array) -> GnssLog:
+    """Return rows (F, 7) as a log; what is known to be off in the stamps has been taken off."""
+    return GnssLog(
+        time_s=rows[:, 0],
+        lat=rows[:, 1],
+        lon=rows[:, 2],
+        height=rows[:, 3],
+        sigma_enu=rows[:, 4:],
+        lever_arm_b=vehicle.gnss_lever_arm_b,
+        calibration=replace(vehicle.gnss_calibration, time_offset_s=0.0),
+    )
 
 
 class Measured(NamedTuple):

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections import deque
-from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -141,8 +140,8 @@ class Course:
         last = self.newest
         keyframe = self._maker.make(measured, last_s=last.time_s)
         sigma = last.window.newest_sigma
-        if len(keyframe.beams.speed) == 0 and np.linalg.norm(sigma[VELOCITY]) > ANY_SPEED:
-            keyframe = replace(keyframe, speed_sigma=ANY_SPEED)
+        if len(keyframe.beams) == 0 and np.linalg.norm(sigma[VELOCITY]) > ANY_SPEED:
+            keyframe = keyframe.no_faster_than(ANY_SPEED)
         window, reserve = last.window.successor(), last.reserve.led_on(keyframe, self._inertial)
         doubt = doubt_of(last.watch, sigma, keyframe)
         if doubt is not None:

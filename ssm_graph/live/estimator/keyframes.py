@@ -7,19 +7,32 @@ messages lead to the same keyframes as punctual ones.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import replace
+
 import numpy as np
 
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.times import MIN_SPACING_S
+from ssm_graph.graph.aids.aid import Aid
+from ssm_graph.graph.aids.depth import DepthMeans, Depths
+from ssm_graph.graph.aids.gnss import Fixes
+from ssm_graph.imu.ping_motion import PING_WINDOW_S, mean_gyro
 from ssm_graph.imu.preintegration import LIVELY_S, imu_gaps, preintegrate
-from ssm_graph.live.estimator.buffers import OFF_WATER, SIGMAS, SPEEDS, Buffers, Measured
-from ssm_graph.mission.aids import fix_covariance_n
-from ssm_graph.mission.ping_motion import PING_WINDOW_S, mean_gyro
-from ssm_graph.mission.problem import ProblemConfig
-from ssm_graph.mission.timeline import MIN_SPACING_S
+from ssm_graph.live.estimator.buffers import (
+    OFF_WATER,
+    SIGMAS,
+    SPEEDS,
+    Buffers,
+    Measured,
+    depth_of,
+    gnss_of,
+)
+from ssm_graph.mission.problem import Beams, ProblemConfig
 from ssm_graph.sensors.drift import Drift
 from ssm_graph.sensors.imu import ImuLog
-from ssm_graph.smoothers.keyframe import BeamSpeeds, Keyframe, Way
+from ssm_graph.smoothers.keyframe import Keyframe, Way
 
 
 class KeyframeMaker:
@@ -28,6 +41,7 @@ class KeyframeMaker:
     def __init__(self, buffers: Buffers, frame: LocalFrame, config: ProblemConfig) -> None:
         self._buffers, self._frame, self._config = buffers, frame, config
         vehicle = buffers.vehicle
+        self._no_beams = Beams.of_mount(vehicle.mount)
         self._white_beams = _white_share(vehicle.mount.drift)
         self._white_fixes = _white_share(vehicle.gnss_calibration.drift)
         self.not_before_s = -np.inf
@@ -75,18 +89,31 @@ class KeyframeMaker:
         imu = self._imu(begin_s, at_s)
         way = None if last_s is None else self._integrate(imu, last_s, at_s)
         gyro_b = mean_gyro(imu, np.array([at_s]))[0]
-        depths, has_depth = measured.depths, self._buffers.vehicle.depth_sigma is not None
-        fix_n, fix_cov_n = self._fixes(measured.fixes)
+        keyframe_s = np.array([begin_s, at_s])
+        aids = self._aids(measured, keyframe_s, imu)
         return Keyframe(
-            time_s=at_s,
-            gyro_b=gyro_b,
-            beams=self._beams(measured.pings, gyro_b),
-            depth_s=depths[:, 0] if has_depth else np.zeros(0),
-            depth=depths[:, 1] if has_depth else np.zeros(0),
-            fix_n=fix_n,
-            fix_cov_n=fix_cov_n,
-            way=way,
+            at_s,
+            self._beams(measured.pings, gyro_b),
+            {aid.name: aid for aid in aids if len(aid)},
+            way,
         )
+
+    def _aids(self, measured: Measured, keyframe_s: Array, imu: ImuLog) -> Iterator[Aid]:
+        """Yield what was measured at the second of two keyframes."""
+        vehicle, fix = self._buffers.vehicle, np.arange(len(measured.fixes))
+        fixes = Fixes.of_log(
+            gnss_of(vehicle, measured.fixes),
+            fix,
+            time_s=np.full(len(fix), keyframe_s[1]),
+            keyframe=np.ones(len(fix), np.intp),
+            frame=self._frame,
+            imu=imu,
+        )
+        yield replace(fixes, covariance_n=fixes.covariance_n * self._white_fixes**2)
+        depth = depth_of(vehicle, measured.depths)
+        if depth is not None and len(measured.depths):
+            readings = Depths.of(depth, imu, keyframe_s)
+            yield DepthMeans.of_readings(readings, keyframe_s, self._frame).at(1)
 
     def way(self, begin_s: float, end_s: float) -> Way:
         """Return what the inertial sensors say from one time to another."""
@@ -112,22 +139,20 @@ class KeyframeMaker:
         )
         return Way(chain.measurements[0], chain.params[0])
 
-    def _beams(self, pings: Array, gyro_b: Array) -> BeamSpeeds:
+    def _beams(self, pings: Array, gyro_b: Array) -> Beams:
         row, beam = np.nonzero(np.isfinite(pings[:, SPEEDS]))
-        is_water = pings[row, OFF_WATER]
-        return BeamSpeeds(
-            beam.astype(float),
-            pings[:, SPEEDS][row, beam],
-            pings[:, SIGMAS][row, beam] * np.where(is_water > 0.0, 1.0, self._white_beams),
-            np.broadcast_to(gyro_b, (len(row), 3)),
-            self._buffers.vehicle.mount.beams_b[beam],
-            is_water,
+        is_water = pings[row, OFF_WATER] > 0.0
+        return replace(
+            self._no_beams,
+            keyframe=np.zeros(len(row), np.intp),
+            beam=beam,
+            speed=pings[:, SPEEDS][row, beam],
+            sigma=pings[:, SIGMAS][row, beam] * np.where(is_water, 1.0, self._white_beams),
+            gyro_b=np.broadcast_to(gyro_b, (len(row), 3)),
+            beam_b=self._buffers.vehicle.mount.beams_b[beam],
+            ping=row,
+            is_water=is_water,
         )
-
-    def _fixes(self, fixes: Array) -> tuple[Array, Array]:
-        position_n = self._frame.p_n_from_geodetic(fixes[:, 1], fixes[:, 2], fixes[:, 3])
-        sigma_enu = fixes[:, 4:] * self._white_fixes
-        return position_n, fix_covariance_n(self._frame, position_n, sigma_enu)
 
 
 def _white_share(drift: Drift) -> float:

@@ -41,7 +41,7 @@ class Tail:
         sensors: Sensors,
     ) -> None:
         """Begin at a keyframe with its states (1, ...) and covariance (n, n)."""
-        frame = sensors.frame
+        frame, self._no_beams = sensors.frame, sensors.beams
         self._begin_s = self._end_s = keyframe.time_s
         self._states, self._covariance = states, covariance
         self._noise, self._frame = noise, frame
@@ -79,7 +79,7 @@ class Tail:
             return Newest(self._begin_s, self._states, self._covariance)
         if self._gap_s:
             self._cover_gap()
-        end = Keyframe.unmeasured(self._end_s, np.zeros(3), self._way)
+        end = Keyframe(self._end_s, self._no_beams, way=self._way)
         predicted = self._rows.predict(end, self._states)
         covariance = self._rows.carry(end, self._states, predicted, self._covariance)
         return Newest(self._end_s, predicted, covariance)
