@@ -21,7 +21,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, Self
+from typing import NamedTuple, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,26 @@ _AT_ONCE = 128
 """So many intervals stay in the processor's cache, from the first product to the last."""
 _EYE = np.eye(3)
 _EYE.setflags(write=False)
+
+
+class MovingState(Protocol):
+    """States at one end of I intervals, whoever holds them."""
+
+    @property
+    def R_nb(self) -> Array:
+        """(I, 3, 3)."""
+
+    @property
+    def p_n(self) -> Array:
+        """(I, 3) m."""
+
+    @property
+    def v_n(self) -> Array:
+        """(I, 3) m/s."""
+
+    @property
+    def bias(self) -> Array:
+        """(I, 6) accelerometer m/s^2, gyro rad/s."""
 
 
 class InertialState(NamedTuple):
@@ -111,7 +131,7 @@ class Intervals(NamedTuple):
         sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
         correlation = covariance / (sigma[:, :, None] * sigma[:, None, :])
         root = np.linalg.cholesky(np.linalg.inv(correlation)).mT
-        return cls(
+        made = cls(
             span_s,
             delta_R,
             delta_pv,
@@ -123,6 +143,9 @@ class Intervals(NamedTuple):
             by_force,
             np.concatenate([p_D_g, v_D_g], axis=1),
         )
+        for column in made:
+            column.setflags(write=False)
+        return made
 
     def take(self, which: slice | NDArray[np.intp]) -> Intervals:
         """Return some of them."""
@@ -143,6 +166,33 @@ class Predicted(NamedTuple):
     transition: Array
     """(I, 15, 15) of the error state: rotation and position in body axes, velocity in navigation
     axes, biases"""
+    at_end: Array
+    """(I, 2, 3, 3) position and velocity, navigation axes, by gravity's change along with the end
+    alone, whose position is in body axes"""
+
+    def noise(self, m: Intervals) -> Array:
+        """Return the covariance (I, 15, 15) that the intervals add to that carried here."""
+        R_nb, noise = self.state.R_nb, m.covariance.copy()
+        noise[:, _VELOCITY] = R_nb @ noise[:, _VELOCITY]
+        noise[:, :, _VELOCITY] = noise[:, :, _VELOCITY] @ R_nb.mT
+        back = self.at_end.reshape(-1, 6, 3)
+        back = np.concatenate([R_nb.mT @ back[:, :3], back[:, 3:]], axis=1)
+        # What the noise moves moves gravity.
+        half = np.zeros_like(noise)
+        half[:, 3:9] = back @ noise[:, _POSITION]
+        return noise + half + half.mT
+
+    def rows(self, m: Intervals) -> Array:
+        """Return :func:`whitened_rows` with these states at the end, where the error is zero."""
+        R_bn, root = self.state.R_nb.mT, m.root_information
+        rows = np.zeros((len(root), 15, 31))
+        end = rows[:, :, 15:30]
+        np.negative(root, out=end)
+        end[:, :, _VELOCITY] = end[:, :, _VELOCITY] @ R_bn
+        by_position, by_velocity = root[:, :, _POSITION] @ R_bn, root[:, :, _VELOCITY] @ R_bn
+        end[:, :, _POSITION] += by_position @ self.at_end[:, 0] + by_velocity @ self.at_end[:, 1]
+        np.negative(end @ self.transition, out=rows[:, :, :15])
+        return rows
 
 
 class _Increment(NamedTuple):
@@ -165,7 +215,7 @@ class _Slopes(NamedTuple):
     """(I, 2, 3, 3) the same with respect to half the change of gravity at the end, 1/s^2 taken"""
 
 
-def predict(m: Intervals, begin: InertialState, *, g_n: Array, gradient: Array) -> Predicted:
+def predict(m: Intervals, begin: MovingState, *, g_n: Array, gradient: Array) -> Predicted:
     """Return states and transition at the end of intervals.
 
     Parameters
@@ -180,28 +230,21 @@ def predict(m: Intervals, begin: InertialState, *, g_n: Array, gradient: Array) 
     increment = _corrected(m, begin.bias, derivative=True)
     end = _predicted(m, begin, increment, g_n)
     slopes = _slopes(m, begin, end, increment, gradient)
-    n, R_bn = len(begin.p_n), end.R_nb.mT
-    transition = np.zeros((n, 15, 15))
+    R_bn, at_end = end.R_nb.mT, slopes.gravity
+    transition = np.zeros((len(R_bn), 15, 15))
     transition[:, _ROTATION] = slopes.rotation
-    transition[:, _POSITION] = R_bn @ slopes.pv[:, 0]
-    # Gravity of the middle changes along with the end, too: a millionth of its way.
-    at_end = slopes.gravity @ transition[:, None, _POSITION]
-    transition[:, _POSITION] += R_bn @ at_end[:, 0]
-    transition[:, _VELOCITY] = slopes.pv[:, 1] + at_end[:, 1]
+    # Gravity of the middle changes along with the end, too: a millionth of its way, twice is exact.
+    first = R_bn @ slopes.pv[:, 0]
+    along = R_bn @ at_end[:, 0]
+    position = first + along @ (first + along @ first)
+    transition[:, _POSITION] = position
+    transition[:, _VELOCITY] = slopes.pv[:, 1] + at_end[:, 1] @ position
     bias = range(9, 15)
     transition[:, bias, bias] = 1.0
-    return Predicted(end, transition)
+    return Predicted(end, transition, at_end)
 
 
-def process_covariance(m: Intervals, end: InertialState) -> Array:
-    """Return the noise (I, 15, 15) of the error state at the end of intervals."""
-    noise = m.covariance.copy()
-    noise[:, _VELOCITY] = end.R_nb @ noise[:, _VELOCITY]
-    noise[:, :, _VELOCITY] = noise[:, :, _VELOCITY] @ end.R_nb.mT
-    return noise
-
-
-def whitened_error(m: Intervals, begin: InertialState, end: InertialState, *, g_n: Array) -> Array:
+def whitened_error(m: Intervals, begin: MovingState, end: MovingState, *, g_n: Array) -> Array:
     """Return the whitened errors (I, 15) of states at both ends, ``g_n`` (I, 3) m/s^2."""
     predicted = _predicted(m, begin, _corrected(m, begin.bias, derivative=False), g_n)
     R, pv = _between(end, predicted)
@@ -214,7 +257,7 @@ def whitened_error(m: Intervals, begin: InertialState, end: InertialState, *, g_
 
 
 def whitened_rows(
-    m: Intervals, begin: InertialState, end: InertialState, *, g_n: Array, gradient: Array
+    m: Intervals, begin: MovingState, end: MovingState, *, g_n: Array, gradient: Array
 ) -> Array:
     """Return whitened rows ``A d = b`` (I, 15, 31): error states at begin and end, ``b`` last.
 
@@ -224,16 +267,16 @@ def whitened_rows(
     rows = np.empty((len(g_n), 15, 31))
     for i in range(0, len(g_n), _AT_ONCE):
         at = slice(i, i + _AT_ONCE)
-        ends = (InertialState(*(column[at] for column in end)) for end in (begin, end))
-        _fill_rows(rows[at], m.take(at), *ends, g_n=g_n[at], gradient=gradient)
+        own = (InertialState(x.R_nb[at], x.p_n[at], x.v_n[at], x.bias[at]) for x in (begin, end))
+        _fill_rows(rows[at], m.take(at), *own, g_n=g_n[at], gradient=gradient)
     return rows
 
 
 def _fill_rows(
     rows: Array,
     m: Intervals,
-    begin: InertialState,
-    end: InertialState,
+    begin: MovingState,
+    end: MovingState,
     *,
     g_n: Array,
     gradient: Array,
@@ -287,7 +330,7 @@ def _corrected(m: Intervals, bias: Array, *, derivative: bool) -> _Increment:
 
 
 def _predicted(
-    m: Intervals, begin: InertialState, increment: _Increment, g_n: Array
+    m: Intervals, begin: MovingState, increment: _Increment, g_n: Array
 ) -> InertialState:
     R_nb = begin.R_nb
     force = (increment.pv @ R_nb.mT).reshape(-1, 6)
@@ -297,7 +340,7 @@ def _predicted(
     return InertialState(E @ R_nb @ increment.R, end[:, :3], end[:, 3:], begin.bias)
 
 
-def _between(end: InertialState, predicted: InertialState) -> tuple[Array, Array]:
+def _between(end: MovingState, predicted: InertialState) -> tuple[Array, Array]:
     """Return ``X_j^-1 X'``: rotation (I, 3, 3), position and velocity (I, 2, 3)."""
     apart = np.stack([predicted.p_n - end.p_n, predicted.v_n - end.v_n], axis=1)
     return end.R_nb.mT @ predicted.R_nb, apart @ end.R_nb
@@ -305,8 +348,8 @@ def _between(end: InertialState, predicted: InertialState) -> tuple[Array, Array
 
 def _slopes(
     m: Intervals,
-    begin: InertialState,
-    end: InertialState,
+    begin: MovingState,
+    end: MovingState,
     increment: _Increment,
     gradient: Array,
 ) -> _Slopes:
@@ -325,6 +368,4 @@ def _slopes(
     rotation = np.zeros((n, 3, 15))
     rotation[:, :, _ROTATION] = R.mT
     rotation[:, :, _BIAS] = increment.D_bias[:, 0]
-    return _Slopes(
-        rotation, pv.reshape(n, 2, 3, 15), (by_gravity @ end.R_nb).reshape(n, 2, 3, 3)
-    )
+    return _Slopes(rotation, pv.reshape(n, 2, 3, 15), (by_gravity @ end.R_nb).reshape(n, 2, 3, 3))

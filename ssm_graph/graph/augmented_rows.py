@@ -26,8 +26,8 @@ from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import ACCEL_BIAS, GYRO_BIAS, ROTATION, STATE_DIM, VELOCITY
 from ssm_graph.engine.extras import Extras
+from ssm_graph.engine.states import States
 from ssm_graph.graph.beam_rows import BeamRows
-from ssm_graph.graph.states import States
 from ssm_graph.graph.water_rows import WaterRows
 from ssm_graph.mission.calibration import (
     DVL_BEAM_SCALE,

@@ -20,9 +20,9 @@ from factors.similarity import LogKernel
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.engine.extras import Extras
+from ssm_graph.engine.states import States
 from ssm_graph.graph.aids.acoustic import RangeAid
 from ssm_graph.graph.aids.weighted import WeightedAids
-from ssm_graph.graph.states import States
 from ssm_graph.mission.aid_errors import beacon_name
 
 STARTS = (-1.0, 0.0, 1.0)

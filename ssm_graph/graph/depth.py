@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
-from ssm_graph.graph.states import States
+from ssm_graph.engine.states import States
 from ssm_graph.mission.aids import Depths
 from ssm_graph.mission.heights import height_track, mean_rises
 

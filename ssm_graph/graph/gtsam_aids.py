@@ -15,7 +15,7 @@ from factors.beacon_range import beacon_range_factor
 from factors.compass_heading import heading_factor
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
-from ssm_graph.graph.states import States
+from ssm_graph.engine.states import States
 from ssm_graph.mission.aids import Fixes
 from ssm_graph.mission.further_aids import Headings, Ranges, Standstills
 from ssm_graph.mission.problem import Problem

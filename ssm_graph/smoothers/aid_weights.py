@@ -10,8 +10,8 @@ from factors.similarity import Kernel, Similarity
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.gnc import NEAR_SIGMAS
 from ssm_graph.engine.mixing import Mixing
+from ssm_graph.engine.states import States
 from ssm_graph.graph.aids.weighted import StepLike, WeightedAid, WeightedAids
-from ssm_graph.graph.states import States
 from ssm_graph.mission.doubts import LOW_WEIGHT, MISFIT, SUSPECT_SHARE, TRUSTED
 from ssm_graph.mission.estimate import AidTable
 

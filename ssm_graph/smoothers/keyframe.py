@@ -1,4 +1,4 @@
-"""What a window is told of one keyframe: its time, the way there, and what was measured."""
+"""What a window is told of one keyframe: its time, the inertial data and what was measured."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-import gtsam
 import numpy as np
 
+from factors.inertial import Intervals
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.extras import Extras
-from ssm_graph.imu.preintegration import Preintegrated
 from ssm_graph.mission.calibration import windowed
 from ssm_graph.mission.problem import Beams, Problem
 from ssm_graph.mission.timeline import Indices
@@ -70,17 +69,9 @@ class BeamSpeeds(NamedTuple):
         return BeamSpeeds(*(column[rows] for column in self))
 
 
-class Way(NamedTuple):
-    """What the inertial sensors say of the interval before a keyframe."""
-
-    measured: Preintegrated
-    params: gtsam.PreintegrationCombinedParams
-    """Gravity in them follows the estimate."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Keyframe:
-    """One keyframe; nothing in it ever changes but the gravity of its interval."""
+    """One keyframe."""
 
     time_s: float
     gyro_b: Array
@@ -96,8 +87,8 @@ class Keyframe:
     """(F, 3, 3) m^2"""
     speed_sigma: float = np.inf
     """m/s, of any vehicle's velocity: all that is known where beams have been silent for long"""
-    way: Way | None = None
-    """From the keyframe before; None for the first of all."""
+    inertial: Intervals | None = None
+    """(1, ...) from the keyframe before; None for the first of all"""
 
     @property
     def is_measured(self) -> bool:
@@ -112,11 +103,13 @@ class Keyframe:
         return replace(self, fix_n=self.fix_n[:0], fix_cov_n=self.fix_cov_n[:0])
 
     @classmethod
-    def unmeasured(cls, time_s: float, gyro_b: Array, way: Way | None) -> Keyframe:
+    def unmeasured(cls, time_s: float, gyro_b: Array, inertial: Intervals | None) -> Keyframe:
         """Return a keyframe as the inertial sensors alone know it."""
         none, no_fix = np.zeros(0), np.zeros((0, 3))
         beams = BeamSpeeds.none()
-        return cls(time_s, gyro_b, beams, none, none, no_fix, np.zeros((0, 3, 3)), way=way)
+        return cls(
+            time_s, gyro_b, beams, none, none, no_fix, np.zeros((0, 3, 3)), inertial=inertial
+        )
 
 
 def sensors_of(problem: Problem) -> Sensors:
@@ -154,7 +147,7 @@ def keyframes_of(problem: Problem) -> Iterator[Keyframe]:
             depth=none if depths is None else depths.depth[d],
             fix_n=np.zeros((0, 3)) if fixes is None else fixes.position_n[f],
             fix_cov_n=np.zeros((0, 3, 3)) if fixes is None else fixes.covariance_n[f],
-            way=Way(chain.measurements[k - 1], chain.params[k - 1]) if k else None,
+            inertial=chain.intervals.take(np.s_[k - 1 : k]) if k else None,
         )
 
 

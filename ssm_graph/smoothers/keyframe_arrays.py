@@ -7,8 +7,9 @@ from itertools import pairwise
 
 import numpy as np
 
+from factors.inertial import Intervals
 from ssm_graph.base.frozen import Array
-from ssm_graph.smoothers.keyframe import BeamSpeeds, Keyframe, Way
+from ssm_graph.smoothers.keyframe import BeamSpeeds, Keyframe
 
 _GROUPS = {
     "beams": BeamSpeeds._fields,
@@ -38,11 +39,11 @@ def _column(keyframe: Keyframe, group: str, name: str) -> Array:
 
 
 def unpack_keyframes(
-    arrays: Mapping[str, Array], way: Callable[[float, float], Way]
+    arrays: Mapping[str, Array], inertial: Callable[[float, float], Intervals]
 ) -> list[Keyframe]:
-    """Return the keyframes that were packed; ``way`` gives the inertial data between two times."""
+    """Return the keyframes that were packed; ``inertial`` gives the data between two times."""
     times = arrays["time_s"].tolist()
-    ways = [None, *(way(begin_s, end_s) for begin_s, end_s in pairwise(times))]
+    intervals = [None, *(inertial(begin_s, end_s) for begin_s, end_s in pairwise(times))]
     edges = {
         group: np.concatenate([[0], np.cumsum(arrays[f"{group}_count"])]).astype(int)
         for group in _GROUPS
@@ -64,7 +65,7 @@ def unpack_keyframes(
                 fix_n=fix_n,
                 fix_cov_n=fix_cov_n,
                 speed_sigma=float(arrays["speed_sigma"][k]),
-                way=ways[k],
+                inertial=intervals[k],
             )
         )
     return keyframes

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.engine.states import AugmentedStates
+from ssm_graph.engine.states import States
 
 
 class Stretch(NamedTuple):
@@ -16,7 +16,7 @@ class Stretch(NamedTuple):
 
     time_s: Array
     """(K,) s"""
-    states: AugmentedStates
+    states: States
     """(K, ...)"""
     covariance: Array
     """(K, n, n)"""
@@ -37,6 +37,6 @@ def joined(stretches: Sequence[Stretch]) -> Stretch:
     time_s, states, *others = zip(*stretches, strict=True)
     return Stretch(
         np.concatenate(time_s),
-        AugmentedStates(*(np.concatenate(column) for column in zip(*states, strict=True))),
+        states[0].followed_by(*states[1:]),
         *(np.concatenate(column) for column in others),
     )

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Self
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
+from factors.inertial import Intervals
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.chain import Chain
 from ssm_graph.engine.error_state import InitialMoments
 from ssm_graph.engine.marginal_prior import MarginalPrior, prior_at_start, prior_on
-from ssm_graph.engine.states import AugmentedStates
+from ssm_graph.engine.states import States
+from ssm_graph.graph.inertial_rows import InertialRows
 from ssm_graph.smoothers.bends import bends_of
-from ssm_graph.smoothers.keyframe import BeamSpeeds, Keyframe, Sensors, Way
+from ssm_graph.smoothers.keyframe import BeamSpeeds, Keyframe, Sensors
 from ssm_graph.smoothers.keyframe_arrays import pack_keyframes, unpack_keyframes
-from ssm_graph.smoothers.window_inertial import InertialRows
 from ssm_graph.smoothers.window_rows import (
     DepthTargets,
     beam_rows,
@@ -31,6 +32,11 @@ from ssm_graph.smoothers.window_rows import (
 )
 
 
+def inertial_data(keyframes: Sequence[Keyframe]) -> Intervals:
+    """Return the inertial data before keyframes, none of which is the first of all."""
+    return Intervals.joined([k.inertial for k in keyframes if k.inertial is not None])
+
+
 class WindowGraph:
     """Successive keyframes, each linearised at a state of its own, and the prior on the first.
 
@@ -40,14 +46,14 @@ class WindowGraph:
     def __init__(self, sensors: Sensors, first: Keyframe, start: InitialMoments) -> None:
         self.sensors = sensors
         self.keyframes: list[Keyframe] = []
-        self.at = AugmentedStates.of(start)
+        self.at = States.at_start(start)
         """Where each keyframe is linearised"""
         self.beams = BeamSpeeds.none()
         self.state_dim = n = sensors.state_dim
         self.error, self.jacobian = np.zeros(0), np.zeros((0, n))
         """Of the beams, (M,) in m/s and (M, n)"""
         self.inertial = InertialRows(sensors.frame, sensors.extras)
-        self.chain = Chain(dim=n)
+        self.chain = Chain(n)
         self.prior: MarginalPrior = prior_at_start(start)
         self._depths: list[Array] = []
         self._fixes: list[Array] = []
@@ -82,11 +88,14 @@ class WindowGraph:
 
     @classmethod
     def unpack(
-        cls, arrays: Mapping[str, Array], sensors: Sensors, way: Callable[[float, float], Way]
+        cls,
+        arrays: Mapping[str, Array],
+        sensors: Sensors,
+        inertial: Callable[[float, float], Intervals],
     ) -> Self:
-        """Return the graph that was packed; ``way`` gives the inertial data between two times."""
-        keyframes = unpack_keyframes(arrays, way)
-        at = AugmentedStates(*(arrays[f"at_{name}"] for name in AugmentedStates._fields))
+        """Return the graph that was packed; ``inertial`` gives the data between two times."""
+        keyframes = unpack_keyframes(arrays, inertial)
+        at = States(*(arrays[f"at_{name}"] for name in States._fields))
         n, packed = sensors.state_dim, len(arrays["root"])
         if packed != n:
             raise DataError(
@@ -102,7 +111,7 @@ class WindowGraph:
         counts = [len(keyframe.beams.speed) for keyframe in keyframes]
         graph.first_row = np.append(0, np.cumsum(counts, dtype=np.intp))
         graph._between = list(arrays["between"])
-        graph.chain = Chain(arrays["root"], dim=n)
+        graph.chain = Chain(n, root=arrays["root"])
         graph.error = np.zeros(graph.first_row[-1])
         graph.jacobian = np.zeros((len(graph.error), n))
         graph._depths, graph._fixes, graph._speeds = [], [], []
@@ -113,11 +122,16 @@ class WindowGraph:
         """Have the chain eliminated again from a keyframe on."""
         self._stale = min(self._stale, keyframe)
 
-    def append(self, keyframe: Keyframe, last: AugmentedStates) -> None:
+    def append(self, keyframe: Keyframe, last: States) -> None:
         """Add a keyframe where the inertial data lead from ``last`` (1, ...), the newest one."""
-        predicted = self.inertial.predict(keyframe, last)
+        interval = inertial_data([keyframe])
+        ahead = self.inertial.predict(interval, last)
+        predicted, at = ahead.states, self.at.take(np.s_[-1:])
         self.at = self.at.followed_by(predicted)
-        self._between += self.inertial.rows([keyframe], self.at.take(np.s_[-2:]))
+        if at.is_same(last):
+            self._between += list(ahead.rows(last))
+        else:
+            self._between += list(self.inertial.rows(interval, self.at.take(np.s_[-2:])))
         self.changed_from(len(self.keyframes) - 1)
         pair = [self.keyframes[-1], keyframe]
         both = last.followed_by(predicted)
@@ -140,7 +154,7 @@ class WindowGraph:
         self._fixes += fix_rows(self.sensors, [keyframe], at)
         self._speeds += speed_rows(self.sensors, [keyframe], at)
 
-    def keep_posterior(self, last: AugmentedStates) -> None:
+    def keep_posterior(self, last: States) -> None:
         """Keep of all keyframes the newest, with what was found there as its prior."""
         self.prior = prior_on(last, self.chain.root, offset=np.zeros(self.state_dim))
         end = self.keyframes[-1]
@@ -148,7 +162,7 @@ class WindowGraph:
         self._drop_rows(len(self.error))
         self.first_row = np.zeros(2, np.intp)
         self.at = last
-        self.keyframes = [Keyframe.unmeasured(end.time_s, end.gyro_b, end.way)]
+        self.keyframes = [Keyframe.unmeasured(end.time_s, end.gyro_b, end.inertial)]
         none = no_rows(self.sensors)
         self._depths, self._fixes, self._speeds = [none], [none], [none]
         self._stale = 0
@@ -191,10 +205,7 @@ class WindowGraph:
                 zip(self._depths[begin:], self._fixes[begin:], self._speeds[begin:], strict=True)
             )
         ]
-        if begin == 0:
-            carried = self.prior.rows(self.at, self.at.extra[0])
-        else:
-            carried = self.chain.carried[begin]
+        carried = self.prior.rows(self.at) if begin == 0 else self.chain.carried[begin]
         self.chain.eliminate(carried, own, self._between[begin:], begin=begin)
         self._stale = len(self.keyframes)
 
@@ -228,15 +239,14 @@ class WindowGraph:
         self.at = head.followed_by(moved).followed_by(tail)
         before, behind = max(begin - 1, 0), min(end + 1, len(self.keyframes))
         if len(self.keyframes) > 1:  # a single keyframe keeps what its prediction came with
-            self._linearise_ways(before, behind)
+            self._linearise_between(before, behind)
         self._measure_again(begin, behind)
         self.changed_from(before)
 
-    def _linearise_ways(self, begin: int, end: int) -> None:
-        """Linearise the ways between successive keyframes, and lead their depths along them."""
+    def _linearise_between(self, begin: int, end: int) -> None:
+        """Linearise from keyframe to keyframe, and lead their depths along the way."""
         keyframes, at = self.keyframes[begin:end], self.at.take(np.s_[begin:end])
-        self.inertial.set_gravity(keyframes[1:], at)
-        self._between[begin : end - 1] = self.inertial.rows(keyframes[1:], at)
+        self._between[begin : end - 1] = self.inertial.rows(inertial_data(keyframes[1:]), at)
         first_rise = float(self._targets.rise[begin])
         targets = depth_targets(self.sensors, keyframes, at, first_rise=first_rise)
         head, tail = self._targets.take(np.s_[:begin]), self._targets.take(np.s_[end:])

@@ -12,7 +12,7 @@ from factors.depth_height import height_residual
 from factors.dvl_beam import beam_residual
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import GYRO_BIAS, POSITION, ROTATION, STATE_DIM, VELOCITY
-from ssm_graph.engine.states import AugmentedStates
+from ssm_graph.engine.states import States
 from ssm_graph.graph.aids import positions
 from ssm_graph.graph.augmented_rows import AugmentedBeams, RowStates
 from ssm_graph.graph.beam_rows import BeamRows, rows_of_beams
@@ -30,7 +30,7 @@ def seen_by_beams(sensors: Sensors) -> NDArray[np.intp]:
     return np.concatenate([_SEEN_BY_BEAMS, np.arange(STATE_DIM, sensors.state_dim)])
 
 
-def beam_rows(sensors: Sensors, beams: BeamSpeeds, states: AugmentedStates) -> BeamRows:
+def beam_rows(sensors: Sensors, beams: BeamSpeeds, states: States) -> BeamRows:
     """Return errors (M,) in m/s and Jacobians (M, n) of beams, each with its own state."""
     if sensors.extras:
         return _augmented_rows(sensors, beams, states)
@@ -47,7 +47,7 @@ def beam_rows(sensors: Sensors, beams: BeamSpeeds, states: AugmentedStates) -> B
     return rows_of_beams(residual)
 
 
-def _augmented_rows(sensors: Sensors, beams: BeamSpeeds, states: AugmentedStates) -> BeamRows:
+def _augmented_rows(sensors: Sensors, beams: BeamSpeeds, states: States) -> BeamRows:
     count = len(beams.speed)
     table = Beams(
         keyframe=np.arange(count),
@@ -66,9 +66,9 @@ def _augmented_rows(sensors: Sensors, beams: BeamSpeeds, states: AugmentedStates
     return extended.rows(at, extended.prepare(at.walks, at.constants, at.bias))
 
 
-def _row_states(states: AugmentedStates) -> RowStates:
+def _row_states(states: States) -> RowStates:
     """Return the states as rows take them; gravity, which none here asks for, is left out."""
-    return RowStates(*states, constants=np.zeros(0), g_n=np.zeros(3))
+    return RowStates(*states, g_n=np.zeros(3))
 
 
 def no_rows(sensors: Sensors) -> Array:
@@ -76,9 +76,7 @@ def no_rows(sensors: Sensors) -> Array:
     return np.zeros((0, sensors.state_dim + 1))
 
 
-def fix_rows(
-    sensors: Sensors, keyframes: Sequence[Keyframe], states: AugmentedStates
-) -> list[Array]:
+def fix_rows(sensors: Sensors, keyframes: Sequence[Keyframe], states: States) -> list[Array]:
     """Return the whitened rows (m, n + 1) of GNSS at each keyframe."""
     return [
         _fix_rows(sensors, keyframe, states.take(np.s_[i : i + 1]))
@@ -108,7 +106,7 @@ class DepthTargets(NamedTuple):
 
 
 def depth_targets(
-    sensors: Sensors, keyframes: Sequence[Keyframe], states: AugmentedStates, *, first_rise: float
+    sensors: Sensors, keyframes: Sequence[Keyframe], states: States, *, first_rise: float
 ) -> DepthTargets:
     """Return where the mean of each keyframe's readings, carried to it along the track, leads.
 
@@ -141,12 +139,12 @@ def depth_targets(
 def depth_rows(
     sensors: Sensors,
     keyframes: Sequence[Keyframe],
-    states: AugmentedStates,
+    states: States,
     targets: DepthTargets,
 ) -> list[Array]:
     """Return the whitened rows (m, n + 1) of depth at each keyframe: one, or none."""
     count, extras = np.array([len(keyframe.depth) for keyframe in keyframes]), sensors.extras
-    offset = extras.value(DEPTH_OFFSET, states.extra, np.zeros(0), default=np.zeros(1))
+    offset = extras.value(DEPTH_OFFSET, states.walks, np.zeros(0), default=np.zeros(1))
     residual = height_residual(
         states.R_nb,
         states.p_n,
@@ -166,9 +164,7 @@ def depth_rows(
     return [rows[i : i + 1] if n else none for i, n in enumerate(count.tolist())]
 
 
-def speed_rows(
-    sensors: Sensors, keyframes: Sequence[Keyframe], states: AugmentedStates
-) -> list[Array]:
+def speed_rows(sensors: Sensors, keyframes: Sequence[Keyframe], states: States) -> list[Array]:
     """Return three whitened rows (3, n + 1) for any vehicle's velocity where it is asked for."""
     return [
         _speed_rows(sensors, keyframe.speed_sigma, states.v_n[i])
@@ -185,7 +181,7 @@ def _speed_rows(sensors: Sensors, sigma: float, v_n: Array) -> Array:
     return rows / sigma
 
 
-def _fix_rows(sensors: Sensors, keyframe: Keyframe, state: AugmentedStates) -> Array:
+def _fix_rows(sensors: Sensors, keyframe: Keyframe, state: States) -> Array:
     n_fixes = len(keyframe.fix_n)
     fixes = Fixes(
         keyframe=np.zeros(n_fixes, np.intp),

@@ -6,11 +6,11 @@ import numpy as np
 
 from factors.depth_height import height_residual
 from ssm_graph.engine.error_state import POSITION, ROTATION
+from ssm_graph.engine.states import States
 from ssm_graph.graph.aids.positions import fix_rows
 from ssm_graph.graph.aids.rows import AidRows
 from ssm_graph.graph.augmented_rows import states_of
 from ssm_graph.graph.depth import DepthTargets, depth_targets
-from ssm_graph.graph.states import States
 from ssm_graph.mission.aids import Depths, Fixes
 from ssm_graph.mission.calibration import DEPTH_OFFSET
 from ssm_graph.mission.problem import Problem

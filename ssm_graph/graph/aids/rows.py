@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.graph.states import States
+from ssm_graph.engine.states import States
 
 
 class AidRows(NamedTuple):

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from factors.similarity import Similarity
 from ssm_graph.base.frozen import Array
+from ssm_graph.engine.states import States
 from ssm_graph.graph.aids.rows import AidRows
 from ssm_graph.graph.augmented_rows import Rows, RowStates, states_of
-from ssm_graph.graph.states import States
 from ssm_graph.mission.estimate import AidTable
 
 

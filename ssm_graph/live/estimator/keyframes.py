@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from factors.inertial import Intervals
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
 from ssm_graph.imu.preintegration import LIVELY_S, imu_gaps, preintegrate
@@ -19,7 +20,7 @@ from ssm_graph.mission.problem import ProblemConfig
 from ssm_graph.mission.timeline import MIN_SPACING_S
 from ssm_graph.sensors.drift import Drift
 from ssm_graph.sensors.imu import ImuLog
-from ssm_graph.smoothers.keyframe import BeamSpeeds, Keyframe, Way
+from ssm_graph.smoothers.keyframe import BeamSpeeds, Keyframe
 
 
 class KeyframeMaker:
@@ -73,7 +74,7 @@ class KeyframeMaker:
         at_s = measured.time_s
         begin_s = at_s if last_s is None else last_s
         imu = self._imu(begin_s, at_s)
-        way = None if last_s is None else self._integrate(imu, last_s, at_s)
+        inertial = None if last_s is None else self._integrate(imu, last_s, at_s)
         gyro_b = mean_gyro(imu, np.array([at_s]))[0]
         depths, has_depth = measured.depths, self._buffers.vehicle.depth_sigma is not None
         fix_n, fix_cov_n = self._fixes(measured.fixes)
@@ -85,10 +86,10 @@ class KeyframeMaker:
             depth=depths[:, 1] if has_depth else np.zeros(0),
             fix_n=fix_n,
             fix_cov_n=fix_cov_n,
-            way=way,
+            inertial=inertial,
         )
 
-    def way(self, begin_s: float, end_s: float) -> Way:
+    def inertial(self, begin_s: float, end_s: float) -> Intervals:
         """Return what the inertial sensors say from one time to another."""
         return self._integrate(self._imu(begin_s, end_s), begin_s, end_s)
 
@@ -103,14 +104,14 @@ class KeyframeMaker:
             return imu
         return self._buffers.imu_log(begin_s - LIVELY_S, end_s + half)
 
-    def _integrate(self, imu: ImuLog, begin_s: float, end_s: float) -> Way:
+    def _integrate(self, imu: ImuLog, begin_s: float, end_s: float) -> Intervals:
         chain = preintegrate(
             imu,
             np.array([begin_s, end_s]),
             frame=self._frame,
             rate_hz=self._config.merge_rate_hz,
         )
-        return Way(chain.measurements[0], chain.params[0])
+        return chain.intervals
 
     def _beams(self, pings: Array, gyro_b: Array) -> BeamSpeeds:
         row, beam = np.nonzero(np.isfinite(pings[:, SPEEDS]))

@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.engine.states import AugmentedStates
+from ssm_graph.engine.states import States
 from ssm_graph.live.estimator.buffers import Buffers
 from ssm_graph.live.estimator.course import Step
 from ssm_graph.live.estimator.reserve import Reserve
@@ -75,7 +75,7 @@ def unpack_left(arrays: Mapping[str, Array]) -> Stretch | None:
     """Return what had left the window with the step."""
     if "left_time_s" not in arrays:
         return None
-    states = AugmentedStates(*(arrays[f"left_states_{n}"] for n in AugmentedStates._fields))
+    states = States(*(arrays[f"left_states_{n}"] for n in States._fields))
     others = {n: arrays[f"left_{n}"] for n in Stretch._fields if n != "states"}
     return Stretch(states=states, **others)
 
