@@ -11,11 +11,12 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
+from ssm_graph.smoothers.window_inertial import InertialRows
 
 from factors.dvl_beam import dvl_beam_factor
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
-from ssm_graph.engine.states import AugmentedStates
+from ssm_graph.engine.states import States
 from ssm_graph.graph.aids.depth import DepthMeans
 from ssm_graph.graph.gtsam_graph import prior_graph
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
@@ -29,7 +30,6 @@ from ssm_graph.mission.problem import ProblemConfig, build_problem, start_of
 from ssm_graph.mission.trajectory import trajectory_at
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors
 from ssm_graph.smoothers.window_aids import row_states
-from ssm_graph.smoothers.window_inertial import InertialRows
 
 CAUCHY_K = 2.3849
 """The usual constant: 95 % efficiency without outliers."""
@@ -124,7 +124,7 @@ class Theirs:
         self._loss = gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY_K)
         problem = build_problem(mission)
         start = start_of(problem)
-        self.states = AugmentedStates.of(start)
+        self.states = States.of(start)
         self.covariance = start.covariance
         self._k = 0
         self.smoother = self._make()
@@ -166,9 +166,7 @@ class Theirs:
             self.smoother.update()
         self.states = self._newest()
 
-    def _update(
-        self, graph: gtsam.NonlinearFactorGraph, at: AugmentedStates, time_s: float
-    ) -> None:
+    def _update(self, graph: gtsam.NonlinearFactorGraph, at: States, time_s: float) -> None:
         k, values = self._k, gtsam.Values()
         values.insert(X(k), gtsam.Pose3(gtsam.Rot3(at.R_nb[0]), at.p_n[0]))
         values.insert(V(k), at.v_n[0])
@@ -196,7 +194,7 @@ class Theirs:
         self,
         graph: gtsam.NonlinearFactorGraph,
         depth: DepthMeans,
-        predicted: AugmentedStates,
+        predicted: States,
         k: int,
     ) -> None:
         """Add the mean of the readings, carried along the track as ours are, once."""
@@ -207,11 +205,11 @@ class Theirs:
         noise = gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
         graph.add(gtsam.GPSFactorArm(X(k), target_n[0], depth.lever_arm_b, noise))
 
-    def _newest(self) -> AugmentedStates:
+    def _newest(self) -> States:
         k, smoother = self._k, self.smoother
         pose, v_n = smoother.calculateEstimatePose3(X(k)), smoother.calculateEstimateVector(V(k))
         bias = smoother.calculateEstimateConstantBias(B(k))
-        return AugmentedStates(
+        return States(
             pose.rotation().matrix()[None],
             pose.translation()[None],
             v_n[None],
@@ -233,12 +231,12 @@ class _Columns:
 
     def __init__(self) -> None:
         self.time_s: list[float] = []
-        self.states: list[AugmentedStates] = []
+        self.states: list[States] = []
         self.covariance: list[Array] = []
         self.seconds: list[tuple[float, float, float, float]] = []
 
     def trajectory(self, frame: LocalFrame) -> Trajectory:
-        states = AugmentedStates(*(np.concatenate(c) for c in zip(*self.states, strict=True)))
+        states = States(*(np.concatenate(c) for c in zip(*self.states, strict=True)))
         return trajectory_at(
             frame,
             np.array(self.time_s),

@@ -10,12 +10,12 @@ import numpy as np
 from hypothesis import settings
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
+from ssm_graph.graph.states import States, states_from_arrays
 
 from ssm_graph.base.errors import SolverError
 from ssm_graph.base.frames import R_lb_from_roll_pitch_heading
 from ssm_graph.base.frozen import Array
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.graph.states import States, states_from_arrays
 from ssm_graph.mission.estimate import Status, Trajectory
 from ssm_graph.mission.mission import InitialState, Mission
 from ssm_graph.mission.problem import Problem

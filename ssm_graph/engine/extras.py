@@ -102,6 +102,11 @@ class Extras:
         """(E,) prior sigmas of all, in the order of the columns."""
         return np.concatenate([np.zeros(0), *(block.sigma for block in self.blocks)])
 
+    @property
+    def walks(self) -> Extras:
+        """Those that have a value at every keyframe."""
+        return Extras(tuple(block for block in self.blocks if block.is_walk))
+
     def columns(self, name: str) -> slice:
         """Return the columns of a variable in a row."""
         return self._columns[name]

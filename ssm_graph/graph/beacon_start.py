@@ -20,9 +20,9 @@ from factors.similarity import LogKernel
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.engine.extras import Extras
+from ssm_graph.engine.states import States
 from ssm_graph.graph.aids.ranges import Ranges, beacon_name
 from ssm_graph.graph.measurements import Measurements
-from ssm_graph.graph.states import States
 
 STARTS = (-1.0, 0.0, 1.0)
 """Prior sigmas east, north and up of the stated place at which searches start."""

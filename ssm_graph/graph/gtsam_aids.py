@@ -16,11 +16,11 @@ from factors.compass_heading import heading_factor
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
+from ssm_graph.engine.states import States
 from ssm_graph.graph.aids.gnss import Fixes
 from ssm_graph.graph.aids.heading import Headings
 from ssm_graph.graph.aids.ranges import Ranges
 from ssm_graph.graph.aids.standstill import Standstills
-from ssm_graph.graph.states import States
 from ssm_graph.mission.problem import Problem
 
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.dvl_beam import beam_residual
+from factors.inertial import MovingState
 from ssm_graph.base.frozen import Array
-from ssm_graph.engine.states import KeyframeStates
 from ssm_graph.mission.calibration import taken_as_exact
 from ssm_graph.mission.doubts import doubts_of_beams
 from ssm_graph.mission.estimate import BeamTable, Estimate, Status
@@ -37,7 +37,7 @@ class RecursiveBeams(NamedTuple):
 
 def recursive_estimate(
     problem: Problem,
-    states: KeyframeStates,
+    states: MovingState,
     covariance: Array,
     beams: RecursiveBeams,
     n_iterations: Array,
@@ -106,7 +106,7 @@ def not_used(sections: Sequence[str]) -> tuple[str, ...]:
     )
 
 
-def _beam_errors(problem: Problem, states: KeyframeStates) -> Array:
+def _beam_errors(problem: Problem, states: MovingState) -> Array:
     """Return predicted minus measured beam speeds (N,), m/s."""
     beams, k = problem.beams, problem.beams.keyframe
     return beam_residual(

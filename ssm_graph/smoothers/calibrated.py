@@ -54,7 +54,7 @@ def calibration_of_last(extras: Extras, track: Stretch, *, span_s: float) -> Cal
     """Return the calibration that the last keyframe of a window's track carries in its state."""
     own = slice(STATE_DIM, None)
     covariance = track.covariance[-1, own, own]
-    return calibration_of(extras, track.states.extra, np.zeros(0), covariance, span_s=span_s)
+    return calibration_of(extras, track.states.walks, np.zeros(0), covariance, span_s=span_s)
 
 
 def undetermined(calibration: Calibration | None) -> tuple[str, ...]:

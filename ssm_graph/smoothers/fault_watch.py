@@ -10,9 +10,9 @@ from factors.similarity import WEIGHT_FLOOR
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.extras import Extras
 from ssm_graph.engine.gnc import NEAR_SIGMAS
+from ssm_graph.engine.states import States
 from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.graph.states import States
 from ssm_graph.mission.calibration import CALIBRATIONS, DRIFTS
 from ssm_graph.mission.problem import Problem, with_stated_noise
 from ssm_graph.sensors.dvl import N_BEAMS

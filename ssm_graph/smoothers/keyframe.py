@@ -1,4 +1,4 @@
-"""What a window is told of one keyframe: its time, the way there, and what was measured."""
+"""What a window is told of one keyframe: its time, the inertial data and what was measured."""
 
 from __future__ import annotations
 
@@ -6,15 +6,14 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
-import gtsam
 import numpy as np
 
+from factors.inertial import Intervals
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.engine.extras import Extras
 from ssm_graph.graph.aids.aid import Aid
 from ssm_graph.graph.aids.standstill import AnySpeed
 from ssm_graph.graph.measurements import aids_of
-from ssm_graph.imu.preintegration import Preintegrated
 from ssm_graph.mission.calibration import windowed
 from ssm_graph.mission.problem import Beams, Problem
 
@@ -43,24 +42,16 @@ class Sensors(NamedTuple):
         return self.extras.width
 
 
-class Way(NamedTuple):
-    """What the inertial sensors say of the interval before a keyframe."""
-
-    measured: Preintegrated
-    params: gtsam.PreintegrationCombinedParams
-    """Gravity in them follows the estimate."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Keyframe:
-    """One keyframe; nothing in it ever changes but the gravity of its interval."""
+    """One keyframe."""
 
     time_s: float
     beams: Beams
     aids: Mapping[str, Aid] = field(default_factory=dict)
     """What else was measured at it, by name: depth, GNSS and the further aids"""
-    way: Way | None = None
-    """From the keyframe before; None for the first of all."""
+    inertial: Intervals | None = None
+    """(1, ...) from the keyframe before; None for the first of all"""
 
     @property
     def is_measured(self) -> bool:
@@ -96,5 +87,5 @@ def keyframes_of(problem: Problem) -> Iterator[Keyframe]:
             time_s,
             beams.take(own),
             {aid.name: aid.take(rows) for aid, rows in here if rows.stop > rows.start},
-            Way(chain.measurements[k - 1], chain.params[k - 1]) if k else None,
+            chain.intervals.take(np.s_[k - 1 : k]) if k else None,
         )

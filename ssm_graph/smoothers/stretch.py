@@ -9,7 +9,7 @@ import numpy as np
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.times import Indices
-from ssm_graph.engine.states import AugmentedStates
+from ssm_graph.engine.states import States
 from ssm_graph.graph.aids.aid import Aid
 from ssm_graph.graph.measurements import JudgedAid, joined_aids
 
@@ -19,7 +19,7 @@ class Stretch(NamedTuple):
 
     time_s: Array
     """(K,) s"""
-    states: AugmentedStates
+    states: States
     """(K, ...)"""
     covariance: Array
     """(K, n, n)"""
@@ -47,7 +47,7 @@ def joined(stretches: Sequence[Stretch]) -> Stretch:
         if name not in ("states", "aids")
     }
     return Stretch(
-        states=AugmentedStates(*(np.concatenate(column) for column in zip(*states, strict=True))),
+        states=states[0].followed_by(*states[1:]),
         aids={n: joined_aids([of_one[n] for of_one in aids if n in of_one]) for n in names},
         **columns,
     )

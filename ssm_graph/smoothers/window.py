@@ -8,6 +8,7 @@ from typing import Self
 
 import numpy as np
 
+from factors.inertial import Intervals
 from factors.similarity import Similarity, expected_mahalanobis_sq
 from ssm_graph.base.errors import SolverError
 from ssm_graph.base.frozen import Array
@@ -15,12 +16,12 @@ from ssm_graph.base.times import MIN_SPACING_S
 from ssm_graph.engine.error_state import InitialMoments, Linearised
 from ssm_graph.engine.marginal_prior import moved_chart
 from ssm_graph.engine.mixing import Mixing
-from ssm_graph.engine.states import AugmentedStates
+from ssm_graph.engine.states import States
 from ssm_graph.graph.beam_weights import met_weights, updated_trust
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
-from ssm_graph.smoothers.keyframe import Keyframe, Sensors, Way
+from ssm_graph.smoothers.keyframe import Keyframe, Sensors
 from ssm_graph.smoothers.stretch import Stretch
-from ssm_graph.smoothers.window_graph import WindowGraph
+from ssm_graph.smoothers.window_graph import WindowGraph, inertial_data
 
 _PACKED = ("step", "covariance", "innovation", "weights", "t", "trust")
 RUNAWAY_SPEED = 100.0
@@ -77,12 +78,12 @@ class Window:
         arrays: Mapping[str, Array],
         sensors: Sensors,
         config: FixedLagConfig,
-        way: Callable[[float, float], Way],
+        inertial: Callable[[float, float], Intervals],
     ) -> Self:
-        """Return the window that was packed; ``way`` gives the inertial data between two times."""
+        """Return the window that was packed; ``inertial`` gives the data between two times."""
         window = cls.__new__(cls)
         window.config = config
-        window._graph = WindowGraph.unpack(arrays, sensors, way)
+        window._graph = WindowGraph.unpack(arrays, sensors, inertial)
         for name in _PACKED:
             setattr(window, f"_{name}", arrays[name])
         return window
@@ -103,7 +104,7 @@ class Window:
         return self._trust
 
     @property
-    def states(self) -> AugmentedStates:
+    def states(self) -> States:
         """The estimate of all keyframes."""
         return self._graph.at.moved(self._step)
 
@@ -158,7 +159,7 @@ class Window:
             self.meet_prediction()
         return left
 
-    def _append(self, keyframe: Keyframe, last: AugmentedStates) -> None:
+    def _append(self, keyframe: Keyframe, last: States) -> None:
         graph, n_rows = self._graph, len(self._weights)
         graph.append(keyframe, last)
         n_new = len(graph.error) - n_rows
@@ -202,11 +203,11 @@ class Window:
         self._weights = np.concatenate([self._weights[:row], weights])
         graph.changed_from(k)
 
-    def predicted(self, keyframe: Keyframe) -> tuple[AugmentedStates, Array]:
+    def predicted(self, keyframe: Keyframe) -> tuple[States, Array]:
         """Return where the inertial data lead from the newest keyframe, with the covariance."""
-        last, inertial = self.states.take(np.s_[-1:]), self._graph.inertial
-        there = inertial.predict(keyframe, last)
-        return there, inertial.carry(keyframe, last, there, self._covariance[-1])
+        last = self.states.take(np.s_[-1:])
+        ahead = self._graph.inertial.predict(inertial_data([keyframe]), last)
+        return ahead.states, ahead.covariance(self._covariance[-1])
 
     def require_sane(self) -> None:
         """Raise :class:`SolverError` for a newest state that no vehicle can have."""
@@ -260,7 +261,8 @@ class Window:
     def _solve(self) -> Array:
         """Solve with the present weights and return by how much that moves (K, n)."""
         self._graph.eliminate(self._weights)
-        step, self._covariance = self._graph.chain.solve()
+        solution = self._graph.chain.solve()
+        step, self._covariance = solution.step, solution.conditional
         update, self._step = step - self._step, step
         return update
 

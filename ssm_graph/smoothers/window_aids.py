@@ -10,7 +10,7 @@ import numpy as np
 from factors.similarity import Kernel, Similarity
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.times import Indices
-from ssm_graph.engine.states import AugmentedStates
+from ssm_graph.engine.states import States
 from ssm_graph.graph.aids.aid import Aid, Rows, RowStates
 from ssm_graph.graph.aids.standstill import AnySpeed
 from ssm_graph.graph.forward_aids import settled_weight
@@ -18,9 +18,9 @@ from ssm_graph.graph.measurements import JudgedAid, aid_kernel
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors
 
 
-def row_states(sensors: Sensors, states: AugmentedStates) -> RowStates:
+def row_states(sensors: Sensors, states: States) -> RowStates:
     """Return the states as rows take them; gravity, which none here asks for, is left out."""
-    return RowStates(*states, np.zeros(0), sensors.extras, np.zeros(3))
+    return RowStates(*states, sensors.extras, np.zeros(3))
 
 
 class _Measured(NamedTuple):
@@ -77,9 +77,7 @@ class WindowAids:
         """(M,) of all measurements that have one."""
         return np.concatenate([np.zeros(0), *(self._all[name].weight for name in self._weighted)])
 
-    def append(
-        self, keyframe: Keyframe, k: int, at: AugmentedStates, before: AugmentedStates | None
-    ) -> None:
+    def append(self, keyframe: Keyframe, k: int, at: States, before: States | None) -> None:
         """Add what was measured at keyframe ``k``, the newest, linearised ``at`` (1, ...).
 
         Those that follow the way from the keyframe before are led along it from ``before``.
@@ -97,7 +95,7 @@ class WindowAids:
         error, jacobian = aid.whitened(at)
         return _Measured(aid, error, jacobian, np.ones(len(aid)), np.zeros(len(aid)))
 
-    def linearise(self, begin: int, end: int, at: AugmentedStates) -> None:
+    def linearise(self, begin: int, end: int, at: States) -> None:
         """Linearise those of successive keyframes anew at the states (K, ...) of all.
 
         What follows the way from the keyframe before is led along it, but at the first one.
@@ -233,7 +231,7 @@ class WindowAids:
             yield f"aid_{name}_t_now", one.t
 
     @classmethod
-    def unpack(cls, arrays: Mapping[str, Array], sensors: Sensors, at: AugmentedStates) -> Self:
+    def unpack(cls, arrays: Mapping[str, Array], sensors: Sensors, at: States) -> Self:
         """Return what was packed, linearised at the states (K, ...)."""
         aids = cls(sensors)
         for name, template in sensors.aids.items():

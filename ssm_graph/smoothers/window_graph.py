@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple, Self
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
+from factors.inertial import Intervals
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.chain import Chain
 from ssm_graph.engine.error_state import GYRO_BIAS, ROTATION, STATE_DIM, VELOCITY, InitialMoments
 from ssm_graph.engine.extras import Extras
 from ssm_graph.engine.marginal_prior import MarginalPrior, prior_at_start, prior_on
-from ssm_graph.engine.states import AugmentedStates
+from ssm_graph.engine.states import States
 from ssm_graph.graph.beam_rows import BeamRows, CalibratedBeams, linearize_beams
+from ssm_graph.graph.inertial_rows import InertialRows
 from ssm_graph.mission.problem import Beams
-from ssm_graph.smoothers.keyframe import Keyframe, Sensors, Way
+from ssm_graph.smoothers.keyframe import Keyframe, Sensors
 from ssm_graph.smoothers.window_aids import WindowAids, row_states
-from ssm_graph.smoothers.window_inertial import InertialRows
 
 _LISTS = ("keyframes", "_between")
 
@@ -44,7 +45,7 @@ class Bends(NamedTuple):
         return cls(share, np.concatenate([of_state, *of_extras]))
 
 
-def beam_rows(sensors: Sensors, beams: Beams, states: AugmentedStates) -> BeamRows:
+def beam_rows(sensors: Sensors, beams: Beams, states: States) -> BeamRows:
     """Return errors (M,) in m/s and Jacobians (M, n) of beams, each with its own state."""
     if not sensors.extras:
         return linearize_beams(
@@ -59,6 +60,11 @@ def beam_rows(sensors: Sensors, beams: Beams, states: AugmentedStates) -> BeamRo
     return extended.rows(at, extended.prepare(at.walks, at.constants, at.bias))
 
 
+def inertial_data(keyframes: Sequence[Keyframe]) -> Intervals:
+    """Return the inertial data before keyframes, none of which is the first of all."""
+    return Intervals.joined([k.inertial for k in keyframes if k.inertial is not None])
+
+
 class WindowGraph:
     """Successive keyframes, each linearised at a state of its own, and the prior on the first.
 
@@ -68,7 +74,7 @@ class WindowGraph:
     def __init__(self, sensors: Sensors, first: Keyframe, start: InitialMoments) -> None:
         self.sensors = sensors
         self.keyframes: list[Keyframe] = []
-        self.at = AugmentedStates.of(start)
+        self.at = States.at_start(start)
         """Where each keyframe is linearised"""
         self.beams = sensors.beams
         self.aids = WindowAids(sensors)
@@ -76,7 +82,7 @@ class WindowGraph:
         self.error, self.jacobian = np.zeros(0), np.zeros((0, n))
         """Of the beams, (M,) in m/s and (M, n)"""
         self.inertial = InertialRows(sensors.frame, sensors.extras)
-        self.chain = Chain(dim=n)
+        self.chain = Chain(n)
         self.prior: MarginalPrior = prior_at_start(start)
         self._between: list[Array] = []
         self._stale = 0
@@ -112,10 +118,13 @@ class WindowGraph:
 
     @classmethod
     def unpack(
-        cls, arrays: Mapping[str, Array], sensors: Sensors, way: Callable[[float, float], Way]
+        cls,
+        arrays: Mapping[str, Array],
+        sensors: Sensors,
+        inertial: Callable[[float, float], Intervals],
     ) -> Self:
-        """Return the graph that was packed; ``way`` gives the inertial data between two times."""
-        at = AugmentedStates(*(arrays[f"at_{name}"] for name in AugmentedStates._fields))
+        """Return the graph that was packed; ``inertial`` gives the data between two times."""
+        at = States(*(arrays[f"at_{name}"] for name in States._fields))
         n, packed = sensors.state_dim, len(arrays["root"])
         if packed != n:
             raise DataError(
@@ -125,9 +134,9 @@ class WindowGraph:
         beams = sensors.beams.unpack({name: arrays[f"beams_{name}"] for name in Beams.columns()})
         first_row = arrays["first_row"].astype(np.intp)
         aids, times = WindowAids.unpack(arrays, sensors, at), arrays["time_s"].tolist()
-        ways = [None, *(way(begin_s, end_s) for begin_s, end_s in pairwise(times))]
+        intervals = [None, *(inertial(begin_s, end_s) for begin_s, end_s in pairwise(times))]
         keyframes = [
-            Keyframe(time_s, beams.take(slice(*first_row[k : k + 2])), aids.at(k), ways[k])
+            Keyframe(time_s, beams.take(slice(*first_row[k : k + 2])), aids.at(k), intervals[k])
             for k, time_s in enumerate(times)
         ]
         graph = cls(sensors, keyframes[0], at.moments(np.eye(n)))
@@ -135,7 +144,7 @@ class WindowGraph:
         graph.prior = MarginalPrior(*(arrays[f"prior_{n}"] for n in MarginalPrior._fields))
         graph.first_row = first_row
         graph._between = list(arrays["between"])
-        graph.chain = Chain(arrays["root"], dim=n)
+        graph.chain = Chain(n, root=arrays["root"])
         graph._linearise_beams(0, len(keyframes))
         return graph
 
@@ -143,15 +152,20 @@ class WindowGraph:
         """Have the chain eliminated again from a keyframe on."""
         self._stale = min(self._stale, keyframe)
 
-    def append(self, keyframe: Keyframe, last: AugmentedStates) -> None:
+    def append(self, keyframe: Keyframe, last: States) -> None:
         """Add a keyframe where the inertial data lead from ``last`` (1, ...), the newest one."""
-        predicted = self.inertial.predict(keyframe, last)
+        interval = inertial_data([keyframe])
+        ahead = self.inertial.predict(interval, last)
+        predicted, at = ahead.states, self.at.take(np.s_[-1:])
         self.at = self.at.followed_by(predicted)
-        self._between += self.inertial.rows([keyframe], self.at.take(np.s_[-2:]))
+        if at.is_same(last):
+            self._between += list(ahead.rows(last))
+        else:
+            self._between += list(self.inertial.rows(interval, self.at.take(np.s_[-2:])))
         self.changed_from(len(self.keyframes) - 1)
         self._measure(keyframe, last)
 
-    def _measure(self, keyframe: Keyframe, before: AugmentedStates | None = None) -> None:
+    def _measure(self, keyframe: Keyframe, before: States | None = None) -> None:
         """Add a keyframe's measurements, linearised; ``before`` (1, ...) is the state before."""
         self.keyframes.append(keyframe)
         self.beams = self.beams.followed_by(keyframe.beams)
@@ -163,7 +177,7 @@ class WindowGraph:
         self.jacobian = np.concatenate([self.jacobian, jacobian])
         self.aids.append(keyframe, len(self.keyframes) - 1, at, before)
 
-    def keep_posterior(self, last: AugmentedStates) -> None:
+    def keep_posterior(self, last: States) -> None:
         """Keep of all keyframes the newest, with what was found there as its prior."""
         self.prior = prior_on(last, self.chain.root, offset=np.zeros(self.state_dim))
         end = self.keyframes[-1]
@@ -171,7 +185,7 @@ class WindowGraph:
         self._drop_rows(len(self.error))
         self.first_row = np.zeros(2, np.intp)
         self.at = last
-        self.keyframes = [Keyframe(end.time_s, self.sensors.beams, way=end.way)]
+        self.keyframes = [Keyframe(end.time_s, self.sensors.beams, inertial=end.inertial)]
         self.aids.drop(1)
         self._stale = 0
 
@@ -214,10 +228,7 @@ class WindowGraph:
         rows = np.concatenate([rows, of_aids])[order]
         edges = np.searchsorted(keyframe[order], np.arange(begin, n_keyframes + 1)).tolist()
         own = [rows[first:last] for first, last in pairwise(edges)]
-        if begin == 0:
-            carried = self.prior.rows(self.at, self.at.extra[0])
-        else:
-            carried = self.chain.carried[begin]
+        carried = self.prior.rows(self.at) if begin == 0 else self.chain.carried[begin]
         self.chain.eliminate(carried, own, self._between[begin:], begin=begin)
         self._stale = len(self.keyframes)
 
@@ -248,8 +259,7 @@ class WindowGraph:
         before, behind = max(begin - 1, 0), min(end + 1, len(self.keyframes))
         if len(self.keyframes) > 1:  # a single keyframe keeps what its prediction came with
             keyframes, at = self.keyframes[before + 1 : behind], self.at.take(np.s_[before:behind])
-            self.inertial.set_gravity(keyframes, at)
-            self._between[before : behind - 1] = self.inertial.rows(keyframes, at)
+            self._between[before : behind - 1] = self.inertial.rows(inertial_data(keyframes), at)
         self._linearise_beams(begin, behind)
         self.aids.linearise(begin, behind, self.at)
         self.changed_from(before)

@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from ssm_graph.graph.states import states_from_arrays
 
 from factors.similarity import GaussianKernel
 from ssm_graph.base.frozen import Array
@@ -16,7 +17,6 @@ from ssm_graph.filters.geodetic.filter import (
     run_geodetic,
     to_navigation,
 )
-from ssm_graph.graph.states import states_from_arrays
 from ssm_graph.mission.problem import build_problem
 from ssm_graph.simulation import (
     Grade,

@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import L, X
+from ssm_graph.graph.states import States, retract
 
 from factors.beacon_range import range_residual
 from factors.compass_heading import CompassErrors, heading_residual
@@ -16,7 +17,6 @@ from factors.standstill import standstill_residual
 from ssm_graph.base.frozen import Array
 from ssm_graph.graph.aids.aid import Aid
 from ssm_graph.graph.measurements import Measurements, aids_of
-from ssm_graph.graph.states import States, retract
 from ssm_graph.mission.problem import Problem, build_problem
 from tests.aids_fixture import with_every_aid
 from tests.helpers import rotation, true_states

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, V, X
+from ssm_graph.graph.states import States, states_from_arrays
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.marginal_prior import prior_at_start
 from ssm_graph.graph.gtsam_graph import depth_graph, gnss_graph, prior_graph
 from ssm_graph.graph.inertial_rows import inertial_graph
-from ssm_graph.graph.states import States, states_from_arrays
 from ssm_graph.mission.problem import build_problem, start_of
 from ssm_graph.simulation import GnssSettings, Grade
 from tests.helpers import assert_jacobians_match, rotation, simulated, true_states

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from ssm_graph.engine.bordered import BorderedSolution
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.beam_evidence import ChainEvidence, WhitenedBeams
-from ssm_graph.engine.bordered import BorderedSolution
 
 K, N, M = 30, 15, 90
 

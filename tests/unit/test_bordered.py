@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from ssm_graph.engine.bordered import ChainRows, solve_bordered
 
 from ssm_graph.base.errors import SolverError
 from ssm_graph.base.frozen import Array
-from ssm_graph.engine.bordered import ChainRows, solve_bordered
 
 
 def random_rows(

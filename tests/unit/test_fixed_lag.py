@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from ssm_graph.graph.states import states_from_arrays
 
 from factors.similarity import GaussianKernel, LogKernel
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.engine.chain import Chain
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.graph.states import states_from_arrays
 from ssm_graph.mission.problem import Problem, build_problem, start_of, with_dvl
 from ssm_graph.simulation import Grade, OutlierKind, Outliers
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother

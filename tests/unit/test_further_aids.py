@@ -38,7 +38,6 @@ from ssm_graph.simulation import (
 )
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother, warm_start
 from ssm_graph.smoothers.beam_faults import FaultSearch
-from ssm_graph.smoothers.fixed_lag import solve_fixed_lag
 from tests.aids_fixture import UNKNOWN, compass, ranging, usbl, with_every_aid
 from tests.helpers import simulated
 

@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from ssm_graph.graph.states import states_from_arrays
 
 from factors import so3
 from factors.similarity import GaussianKernel
@@ -32,7 +33,6 @@ from ssm_graph.filters.geodetic.filter import (
 from ssm_graph.filters.geodetic.measurements import beam_rows, gather, nominal_rows
 from ssm_graph.filters.geodetic.mechanisation import GeodeticState, Samples, Track, advance
 from ssm_graph.filters.navigation.named import filter_geodetic
-from ssm_graph.graph.states import states_from_arrays
 from ssm_graph.imu.preintegration import INTEGRATION_DENSITY, imu_params
 from ssm_graph.mission.estimate import Status
 from ssm_graph.mission.mission import Mission

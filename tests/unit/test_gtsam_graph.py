@@ -8,12 +8,12 @@ import gtsam
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, V, X
+from ssm_graph.graph.states import States, retract, states_from_arrays
 
 from ssm_graph.base.earth import radii_of_curvature
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.graph.gtsam_graph import chain_ordering, depth_graph, gnss_graph, prior_graph
-from ssm_graph.graph.states import States, retract, states_from_arrays
 from ssm_graph.mission.problem import Problem, build_problem, start_of
 from ssm_graph.simulation import (
     CALM,

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from ssm_graph.graph.states import States, retract
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import POSITION, STATE_DIM
 from ssm_graph.graph.inertial_rows import inertial_graph, inertial_rows
-from ssm_graph.graph.states import States, retract
 from ssm_graph.imu.preintegration import gravity_gradient
 from ssm_graph.mission.estimate import Status
 from ssm_graph.mission.problem import Problem, build_problem

@@ -8,6 +8,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
+from ssm_graph.graph.states import States, retract, states_from_arrays
 
 from benchmarks.calibration_cases import as_stated, asking
 from ssm_graph.base.errors import ConfigError
@@ -16,7 +17,6 @@ from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.engine.extras import Extra, Extras
 from ssm_graph.graph.gtsam_graph import chain_ordering, gtsam_graph
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.graph.states import States, retract, states_from_arrays
 from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.sensors.drift import Drift
 from ssm_graph.sensors.standstill import Standstill

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from ssm_graph.graph.inertial_fit import inertial_fit
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.graph.first_values import first_values
 from ssm_graph.graph.gtsam_graph import gtsam_graph
-from ssm_graph.graph.inertial_fit import inertial_fit
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.mission.estimate import Estimate, NoiseFound, Status
 from ssm_graph.mission.problem import Beams, Problem, build_problem

@@ -10,13 +10,13 @@ import gtsam
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, V, X
+from ssm_graph.graph.states import States, states_from_arrays
 
 from factors.similarity import ExpKernel, GaussianKernel, Kernel, LogKernel, SqrtKernel
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
 from ssm_graph.graph.first_values import first_values
 from ssm_graph.graph.gtsam_graph import gtsam_graph
-from ssm_graph.graph.states import States, states_from_arrays
 from ssm_graph.mission.estimate import Estimate, Iteration, Status
 from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.simulation import GnssSettings, Grade, Loss, OutlierKind, Outliers

@@ -6,10 +6,10 @@ from functools import cache
 
 import numpy as np
 import pytest
+from ssm_graph.graph.states import States, states_from_arrays
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.graph.states import States, states_from_arrays
 from ssm_graph.mission.problem import build_problem
 from ssm_graph.smoothers.passes import descend
 from tests.helpers import simulated, state_errors, true_states

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+from ssm_graph.graph.states import States, retract, states_from_arrays
 
 from ssm_graph.base.frames import wrap_to_pi
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import STATE_DIM
-from ssm_graph.graph.states import States, retract, states_from_arrays
 from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.mission.trajectory import trajectory_from_states
 from ssm_graph.simulation import DiveRoute, Waves

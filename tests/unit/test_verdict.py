@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ssm_graph.graph.states import States, states_from_arrays
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.graph.states import States, states_from_arrays
 from ssm_graph.mission.doubts import SUSPECT_STRETCH_S
 from ssm_graph.mission.estimate import Status
 from ssm_graph.mission.problem import Problem, build_problem

@@ -15,6 +15,7 @@ import numpy as np
 from ssm_graph.base.errors import SolverError
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import VELOCITY
+from ssm_graph.graph.inertial_rows import InertialRows
 from ssm_graph.live.estimator.buffers import SIGMAS, SPEEDS, Buffers, Measured
 from ssm_graph.live.estimator.events import EventLog
 from ssm_graph.live.estimator.keyframes import KeyframeMaker
@@ -25,7 +26,6 @@ from ssm_graph.mission.navigation import Severity
 from ssm_graph.smoothers.keyframe import Keyframe
 from ssm_graph.smoothers.stretch import Stretch, joined
 from ssm_graph.smoothers.window import Window
-from ssm_graph.smoothers.window_inertial import InertialRows
 
 REACH_S: Final = 0.1
 """A late inertial sample changes keyframes that are so much older: a ping's gyro reading is a mean,

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from factors.inertial import Intervals
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.times import MIN_SPACING_S
@@ -32,7 +33,7 @@ from ssm_graph.live.estimator.buffers import (
 from ssm_graph.mission.problem import Beams, ProblemConfig
 from ssm_graph.sensors.drift import Drift
 from ssm_graph.sensors.imu import ImuLog
-from ssm_graph.smoothers.keyframe import Keyframe, Way
+from ssm_graph.smoothers.keyframe import Keyframe
 
 
 class KeyframeMaker:
@@ -87,7 +88,7 @@ class KeyframeMaker:
         at_s = measured.time_s
         begin_s = at_s if last_s is None else last_s
         imu = self._imu(begin_s, at_s)
-        way = None if last_s is None else self._integrate(imu, last_s, at_s)
+        inertial = None if last_s is None else self._integrate(imu, last_s, at_s)
         gyro_b = mean_gyro(imu, np.array([at_s]))[0]
         keyframe_s = np.array([begin_s, at_s])
         aids = self._aids(measured, keyframe_s, imu)
@@ -95,7 +96,7 @@ class KeyframeMaker:
             at_s,
             self._beams(measured.pings, gyro_b),
             {aid.name: aid for aid in aids if len(aid)},
-            way,
+            inertial,
         )
 
     def _aids(self, measured: Measured, keyframe_s: Array, imu: ImuLog) -> Iterator[Aid]:
@@ -115,7 +116,7 @@ class KeyframeMaker:
             readings = Depths.of(depth, imu, keyframe_s)
             yield DepthMeans.of_readings(readings, keyframe_s, self._frame).at(1)
 
-    def way(self, begin_s: float, end_s: float) -> Way:
+    def inertial(self, begin_s: float, end_s: float) -> Intervals:
         """Return what the inertial sensors say from one time to another."""
         return self._integrate(self._imu(begin_s, end_s), begin_s, end_s)
 
@@ -130,14 +131,14 @@ class KeyframeMaker:
             return imu
         return self._buffers.imu_log(begin_s - LIVELY_S, end_s + half)
 
-    def _integrate(self, imu: ImuLog, begin_s: float, end_s: float) -> Way:
+    def _integrate(self, imu: ImuLog, begin_s: float, end_s: float) -> Intervals:
         chain = preintegrate(
             imu,
             np.array([begin_s, end_s]),
             frame=self._frame,
             rate_hz=self._config.merge_rate_hz,
         )
-        return Way(chain.measurements[0], chain.params[0])
+        return chain.intervals
 
     def _beams(self, pings: Array, gyro_b: Array) -> Beams:
         row, beam = np.nonzero(np.isfinite(pings[:, SPEEDS]))

@@ -214,7 +214,7 @@ class FixedLagSmoother:
             assert smoother._frame is not None
             maker = KeyframeMaker(intake.buffers, smoother._frame, smoother._problem_config)
             sensors = sensors_of_vehicle(vehicle, smoother._frame)
-            window = Window.unpack(window_arrays(arrays), sensors, smoother.config, maker.way)
+            window = Window.unpack(window_arrays(arrays), sensors, smoother.config, maker.inertial)
             watch, left = unpack_watch(meta["watch"]), unpack_left(arrays, sensors)
             step = Step(window, watch, left, unpack_reserve(arrays))
             smoother._follow(step, maker)

@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.engine.states import AugmentedStates
+from ssm_graph.engine.states import States
 from ssm_graph.live.estimator.buffers import Buffers
 from ssm_graph.live.estimator.course import Step
 from ssm_graph.live.estimator.reserve import Reserve
@@ -77,9 +77,11 @@ def unpack_left(arrays: Mapping[str, Array], sensors: Sensors) -> Stretch | None
     """Return what had left the window with the step."""
     if "left_time_s" not in arrays:
         return None
-    states = AugmentedStates(*(arrays[f"left_states_{n}"] for n in AugmentedStates._fields))
+    states = States(*(arrays[f"left_states_{n}"] for n in States._fields))
     aids = unpack_judged(arrays, sensors.aids, prefix="left_")
-    others: dict[str, Any] = {n: arrays[f"left_{n}"] for n in Stretch._fields if n not in ("states", "aids")}
+    others: dict[str, Any] = {
+        n: arrays[f"left_{n}"] for n in Stretch._fields if n not in ("states", "aids")
+    }
     others["beam"] = others["beam"].astype(np.intp)
     return Stretch(states=states, aids=aids, **others)
 
