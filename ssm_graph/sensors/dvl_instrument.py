@@ -186,7 +186,8 @@ class _Dvl(Instrument):
                 column.beyond(table)
             _check_flags(table)
             _check_covariance(table, bare)
-        return notes + check_speeds(table, speed)
+        is_water = table.stack(_WATER.names)[:, 0] > 0.0
+        return notes + check_speeds(table, speed, is_water)
 
     def filled(self, table: Table, bare: DvlLog, settings: Settings, axes: BodyAxes) -> DvlLog:
         rows = {c.field: c.read(table, axes) for c in self.columns_of(bare) if c.field}
@@ -211,7 +212,7 @@ class _Dvl(Instrument):
         return self.cleaned(log)
 
     def cleaned(self, log: DvlLog) -> DvlLog:
-        return replace(log, speed=without_false_speeds(log.speed))
+        return replace(log, speed=without_false_speeds(log.speed, log.is_water))
 
     def without_rows(self, log: DvlLog) -> DvlLog:
         return empty_dvl(log.mount)
@@ -287,7 +288,8 @@ class _Dvl(Instrument):
         if identical_beams(speed[None])[0]:
             text = f"{COUNTS[n_beams]} beams of {speed[0]:g} m/s each"
             return replace(message, speed=none), ("identical_beams", text)
-        if any(np.array_equal(x, speed, equal_nan=True) for x in near[:, 1 : 1 + n_beams]):
+        same_track = near[near[:, -1] == float(message.is_water), 1 : 1 + n_beams]
+        if any(np.array_equal(other, speed, equal_nan=True) for other in same_track):
             text = f"the speeds {message.speed} m/s once more"
             return replace(message, sigma=(math.inf,) * n_beams), ("repeated_speeds", text)
         beyond = np.abs(speed) > LARGEST_SPEED
