@@ -20,7 +20,7 @@ from ssm_graph.engine.states import States
 from ssm_graph.graph.aids.depth import DepthMeans
 from ssm_graph.graph.gtsam_graph import prior_graph
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
-from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator.asked import sensors_of_vehicle
 from ssm_graph.live.estimator.buffers import Buffers
 from ssm_graph.live.estimator.keyframes import KeyframeMaker
@@ -98,7 +98,7 @@ def keyframes_live(mission: Mission) -> Iterator[Timed]:
     """Yield the keyframes that the live estimator makes, after the first one."""
     vehicle = vehicle_of(mission)
     buffers = Buffers(vehicle)
-    maker = KeyframeMaker(buffers, mission.frame, ProblemConfig())
+    maker = KeyframeMaker(buffers, mission.frame, ProblemConfig(), begin_s=0.0)
     assert mission.initial is not None
     last_s = mission.initial.time_s
     for message in messages_of(mission):

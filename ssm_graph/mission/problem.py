@@ -26,7 +26,8 @@ from ssm_graph.mission.mission import InitialState, Mission
 from ssm_graph.mission.start.moments import initial_moments
 from ssm_graph.mission.timeline import Timeline, build_timeline
 from ssm_graph.mission.usable import require_usable
-from ssm_graph.sensors.dvl import DvlMount, stuck_beams
+from ssm_graph.sensors.dvl import DvlMount
+from ssm_graph.sensors.dvl_readings import stuck_beams
 from ssm_graph.sensors.imu import ImuLog
 
 NO_EXTRAS = Extras()
@@ -131,7 +132,11 @@ class Problem(ReadOnlyArrays):
 
 
 def build_problem(
-    mission: Mission, config: ProblemConfig | None = None, *, start: InitialState | None = None
+    mission: Mission,
+    config: ProblemConfig | None = None,
+    *,
+    start: InitialState | None = None,
+    begin_s: float | None = None,
 ) -> Problem:
     """Turn a mission into an estimation problem.
 
@@ -141,6 +146,8 @@ def build_problem(
     config : rates and intervals.
     start : initial state with sigmas; the mission's own when left out. A mission without one
         needs :func:`ssm_graph.mission.start.alignment.align` first.
+    begin_s : when errors of aids that grow are counted from, s; from the first reading of each when
+        left out.
     """
     require_usable(mission)
     mission, stuck_note = _without_stuck_beams(mission)
@@ -158,7 +165,13 @@ def build_problem(
     noise = mission.imu.noise
     extras = extras_of(mission)
     aids = (
-        kind.of(mission.aids, frame=mission.frame, imu=mission.imu, keyframe_s=timeline.keyframe_s)
+        kind.of(
+            mission.aids,
+            frame=mission.frame,
+            imu=mission.imu,
+            keyframe_s=timeline.keyframe_s,
+            begin_s=begin_s,
+        )
         for kind in AIDS
     )
     return Problem(
@@ -192,7 +205,7 @@ def with_dvl(problem: Problem, mission: Mission) -> Problem:
     The inertial chain, most of the work, is kept; so the pings have to be at keyframes.
     """
     mission, _ = _without_stuck_beams(mission)
-    keyframe_s, ping_s = problem.keyframe_s, mission.dvl.ping_s
+    keyframe_s, ping_s = problem.keyframe_s, mission.dvl.valid_s
     is_used = np.isfinite(mission.dvl.speed).any(axis=1)
     is_used &= is_inside(ping_s, keyframe_s[0], keyframe_s[-1])
     ping = np.flatnonzero(is_used)
@@ -246,7 +259,7 @@ def _without_stuck_beams(mission: Mission) -> tuple[Mission, tuple[str, ...]]:
     if not count.any():
         return mission, ()
     beams = ", ".join(f"beam {b + 1}: {count[b]}" for b in np.flatnonzero(count))
-    first_s = float(dvl.ping_s[is_stuck.any(axis=1)][0])
+    first_s = float(dvl.valid_s[is_stuck.any(axis=1)][0])
     note = (
         f"speeds of a beam that repeats one reading while the others change are left out: {beams}; "
         f"the first at {first_s:.3f} s"
@@ -279,7 +292,7 @@ def _fixes(mission: Mission, timeline: Timeline) -> Fixes | None:
     fixes = Fixes.of_log(
         log,
         timeline.fix,
-        time_s=log.time_s[timeline.fix],
+        time_s=log.valid_s[timeline.fix],
         keyframe=timeline.fix_keyframe,
         frame=mission.frame,
         imu=mission.imu,
@@ -289,21 +302,21 @@ def _fixes(mission: Mission, timeline: Timeline) -> Fixes | None:
 
 def _beams(mission: Mission, ping: Indices, ping_keyframe: Indices, extras: Extras) -> Beams:
     dvl, is_water = mission.dvl, mission.dvl.is_water[ping]
-    speed = dvl.speed[ping]
+    speed, sigma, beams_b = (rows[ping] for rows in dvl.independent())
     row, beam = np.nonzero(np.isfinite(speed))
-    gyro_b = mean_gyro(mission.imu, dvl.ping_s[ping]) if len(ping) else np.zeros((0, 3))
+    gyro_b = mean_gyro(mission.imu, dvl.valid_s[ping]) if len(ping) else np.zeros((0, 3))
     return Beams(
         keyframe=ping_keyframe[row],
         beam=beam,
         speed=speed[row, beam],
-        sigma=dvl.sigma[ping][row, beam],
+        sigma=sigma[row, beam],
         gyro_b=gyro_b[row],
-        beam_b=dvl.mount.beams_b[beam],
+        beam_b=beams_b[row, beam],
         lever_arm_b=dvl.mount.lever_arm_b,
         R_bd=dvl.mount.R_bd,
         ping=row,
         is_water=is_water[row],
         n_beams=dvl.mount.n_beams,
-        motion=MotionBefore(mission.imu, dvl.ping_s[ping]) if needs_motion(extras) else None,
+        motion=MotionBefore(mission.imu, dvl.valid_s[ping]) if needs_motion(extras) else None,
         white_share=dvl.mount.drift.white_share,
     )

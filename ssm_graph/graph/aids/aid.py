@@ -129,6 +129,8 @@ class Aid(Table, ABC):
     """Of ``mission.toml``"""
     is_weighted: ClassVar[bool] = True
     """Whether each measurement has a weight, as every beam has; otherwise it counts in full"""
+    asks_for_keyframes: ClassVar[bool] = False
+    """Whether each of them asks for a keyframe of its own; see :meth:`times`"""
 
     @classmethod
     def of(

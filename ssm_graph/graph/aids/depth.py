@@ -46,7 +46,7 @@ class Depths(ReadOnlyArrays):
         return cls(
             keyframe=np.searchsorted(keyframe_s, log.time_s[used]),
             time_s=log.time_s[used],
-            depth=log.depth[used],
+            depth=log.true_depth[used],
             gyro_b=mean_gyro(imu, keyframe_s),
             sigma=log.sigma,
             lever_arm_b=log.lever_arm_b,

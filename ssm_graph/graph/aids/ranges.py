@@ -38,6 +38,7 @@ class Ranges(Aid):
     unit = "m"
     hint = "look at places and numbers of the beacons, and the speed of sound"
     section = RangeLog.SECTION
+    asks_for_keyframes = True
 
     beacon: Indices
     """(M,) which of the beacons, from 0"""

@@ -25,6 +25,7 @@ class UsblFixes(Fixes):
     hint = "look at its delay, datum, lever arm and the ship's heading"
     section = UsblLog.SECTION
     is_weighted = True
+    asks_for_keyframes = True
     LEVER_ARM: ClassVar[str] = ""
     TIME_OFFSET: ClassVar[str] = ""
     DRIFT: ClassVar[str] = ""

@@ -37,7 +37,6 @@ from ssm_graph.live.estimator.watch import Watch
 from ssm_graph.mission.estimate import Found
 from ssm_graph.mission.navigation import Event, Health, Navigation, Severity
 from ssm_graph.mission.problem import ProblemConfig
-from ssm_graph.mission.recursive import not_used
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.sensors.messages import Message
@@ -148,12 +147,10 @@ class FixedLagSmoother:
 
     def _begin(self, beginning: Beginning) -> None:
         self._frame, buffers = beginning.frame, self._intake.buffers
-        self._begun_s = beginning.time_s
+        self._begun_s = beginning.begin_s
         for note in not_calibrated(self.vehicle):
             self._events.tell(beginning.time_s, Severity.INFO, "not_calibrated", note)
-        for note in not_used(self.vehicle.further_aids):
-            self._events.tell(beginning.time_s, Severity.INFO, "not_aided", note)
-        maker = KeyframeMaker(buffers, beginning.frame, self._problem_config)
+        maker = KeyframeMaker(buffers, beginning.frame, self._problem_config, begin_s=self._begun_s)
         sensors = sensors_of_vehicle(self.vehicle, beginning.frame)
         first = Keyframe(beginning.time_s, sensors.beams)
         window = Window(sensors, self.config, first, beginning.moments)
@@ -212,7 +209,12 @@ class FixedLagSmoother:
             smoother._frame = LocalFrame(*meta["frame"])
         if meta["watch"] is not None:
             assert smoother._frame is not None
-            maker = KeyframeMaker(intake.buffers, smoother._frame, smoother._problem_config)
+            maker = KeyframeMaker(
+                intake.buffers,
+                smoother._frame,
+                smoother._problem_config,
+                begin_s=smoother._begun_s,
+            )
             sensors = sensors_of_vehicle(vehicle, smoother._frame)
             window = Window.unpack(window_arrays(arrays), sensors, smoother.config, maker.inertial)
             watch, left = unpack_watch(meta["watch"]), unpack_left(arrays, sensors)
