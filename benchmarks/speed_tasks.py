@@ -26,7 +26,7 @@ from benchmarks.speed_plain import dead_reckoned, plain_graph
 from factors.similarity import LogKernel
 from ssm_graph.base.frozen import Array
 from ssm_graph.graph.first_values import first_values
-from ssm_graph.graph.gtsam_graph import chain_ordering, graph_without_beams
+from ssm_graph.graph.gtsam_graph import chain_ordering, graph_without_beams, gtsam_values
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.problem import Problem, build_problem
@@ -191,7 +191,7 @@ def time_floor(path: Path, n_passes: int) -> Timing:
         graph.add(gtsam.RangeFactor3D(X(k), V(k), float(distance[k]), noise))
     for _ in range(n_passes):
         with timing.part("linearise"):
-            linear = graph.linearize(states.values)
+            linear = graph.linearize(gtsam_values(states))
         with timing.part("eliminate by QR and solve"):
             delta = linear.eliminateMultifrontal(ordering, gtsam.EliminateQR).optimize()
     timing.n_iterations = n_passes

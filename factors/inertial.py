@@ -108,7 +108,7 @@ class Intervals(NamedTuple):
         *,
         omega_ie_n: Array,
     ) -> Self:
-        """Return intervals from what is measured, see there, and from the turn of the Earth (3,)."""
+        """Return intervals from what is measured, see there, and the turn of the Earth (3,)."""
         turn = span_s[:, None] * omega_ie_n
         Omega, t = so3.skew(omega_ie_n), span_s[:, None, None]
         E = so3.exp(-turn)

@@ -91,8 +91,8 @@ def _upper(rows: int, columns: int) -> Array:
 class Chain:
     """Square-root information of K keyframes of n states and C constants, and their solution.
 
-    Rows are whitened, ``A d = b`` with ``b`` as the last column: n + C + 1 columns for one keyframe,
-    2 n + C + 1 for two successive ones.
+    Rows are whitened, ``A d = b`` with ``b`` as the last column: n + C + 1 columns for one
+    keyframe, 2 n + C + 1 for two successive ones.
     """
 
     def __init__(self, dim: int, n_constants: int = 0, *, root: Array | None = None) -> None:

@@ -81,15 +81,29 @@ class States(NamedTuple):
     """(C,) those that hold for all of them"""
 
     @classmethod
-    def of(cls, R_nb: Array, p_n: Array, v_n: Array, bias: Array) -> States:
-        """Return states without other variables."""
-        return cls(R_nb, p_n, v_n, bias, np.zeros((len(p_n), 0)))
+    def of(
+        cls,
+        R_nb: Array,
+        p_n: Array,
+        v_n: Array,
+        bias: Array,
+        walks: Array | None = None,
+        constants: Array = NO_EXTRA,
+    ) -> States:
+        """Return states, without the variables that are left out."""
+        walks = np.zeros((len(p_n), 0)) if walks is None else walks
+        return cls(R_nb, p_n, v_n, bias, walks, constants)
 
     @classmethod
     def at_start(cls, moments: InitialMoments) -> States:
         """Return the mean (1, ...) of a keyframe that carries its other variables in its state."""
         mean = (moments.R_nb, moments.p_n, moments.v_n, moments.bias, moments.extra)
         return cls(*(column[None] for column in mean))
+
+    @property
+    def navigation(self) -> NavigationStates:
+        """The states without the other variables."""
+        return NavigationStates(*self[:4])
 
     def moments(self, covariance: Array) -> InitialMoments:
         """Return the first of these keyframes as mean with its covariance (15 + s, 15 + s)."""
@@ -101,7 +115,7 @@ class States(NamedTuple):
 
         ``constants_step`` is (C,); the constants stay as they are when it is left out.
         """
-        own = NavigationStates(*self[:4]).moved(step[:, :STATE_DIM])
+        own = self.navigation.moved(step[:, :STATE_DIM])
         constants = self.constants if constants_step is None else self.constants + constants_step
         return States(*own, self.walks + step[:, STATE_DIM:], constants)
 

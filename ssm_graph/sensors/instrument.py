@@ -275,7 +275,7 @@ class Instrument:
 
     def sifted(
         self, message: Message, near: Array, bare: Any
-    ) -> tuple[Message, tuple[str, str] | None]:  # noqa: ARG002
+    ) -> tuple[Message, tuple[str, str] | None]:
         """Return a message without what cannot have been measured, and what was and why.
 
         Parameters

@@ -6,10 +6,10 @@ from functools import cache
 
 import numpy as np
 import pytest
-from ssm_graph.graph.states import states_from_arrays
 
 from factors.similarity import GaussianKernel
 from ssm_graph.base.frozen import Array
+from ssm_graph.engine.states import States
 from ssm_graph.evaluation import chi2_interval
 from ssm_graph.filters.geodetic.filter import (
     GeodeticConfig,
@@ -68,7 +68,7 @@ def final_nees(sims: tuple[SimulatedMission, ...], history: GeodeticHistory) -> 
     for run, sim in enumerate(sims):
         problem = build_problem(sim.mission)
         states = to_navigation(problem, history, run)
-        error = state_errors(states_from_arrays(*states[:4]), true_states(problem, sim))[-1]
+        error = state_errors(States.of(*states[:4]), true_states(problem, sim))[-1]
         nees.append(error @ np.linalg.solve(states.covariance[-1], error))
     return np.array(nees)
 

@@ -11,10 +11,10 @@ import math
 
 import numpy as np
 import pytest
-from ssm_graph.graph.states import States
 
 from factors.similarity import LogKernel
 from ssm_graph.base.frozen import Array
+from ssm_graph.engine.states import States
 from ssm_graph.graph.first_values import first_values
 from ssm_graph.imu.preintegration import gtsam_gravity
 from ssm_graph.mission.problem import Problem, ProblemConfig, build_problem

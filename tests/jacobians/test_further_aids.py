@@ -9,12 +9,12 @@ import gtsam
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import L, X
-from ssm_graph.graph.states import States, retract
 
 from factors.beacon_range import range_residual
 from factors.compass_heading import CompassErrors, heading_residual
 from factors.standstill import standstill_residual
 from ssm_graph.base.frozen import Array
+from ssm_graph.engine.states import States
 from ssm_graph.graph.aids.aid import Aid
 from ssm_graph.graph.measurements import Measurements, aids_of
 from ssm_graph.mission.problem import Problem, build_problem
@@ -152,7 +152,7 @@ def off_the_truth() -> tuple[Problem, States]:
     states = states._replace(constants=np.zeros(extras.n_constants))
     scale = np.array([0.02] * 3 + [1.0] * 3 + [0.1] * 3 + [1e-3] * 6 + [0.01] * extras.n_walks)
     step = rng.standard_normal((problem.n_keyframes, len(scale))) * scale
-    return problem, retract(states, step, 0.3 * extras.sigma[extras.n_walks :])
+    return problem, states.moved(step, 0.3 * extras.sigma[extras.n_walks :])
 
 
 @pytest.mark.parametrize("name", ["USBL", "range", "heading", "standstill", "depth"])
@@ -177,5 +177,5 @@ def _moved_error(aids: Measurements, aid: Aid, states: States, column: int, by: 
         step[:, column] = by
     else:
         constants[column - state_dim] = by
-    moved = retract(states, step, constants)
+    moved = states.moved(step, constants)
     return aid.measured(aids.at_keyframes(aid, moved)).error

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ssm_graph.graph.states import States
 
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
+from ssm_graph.engine.states import States
 from ssm_graph.evaluation import evaluate
 from ssm_graph.filters.navigation.filter import Grouping, run_filter
 from ssm_graph.filters.navigation.named import filter_geodetic, filter_problems
@@ -114,7 +114,7 @@ def _difference(linearizer: GraphLinearizer, states: States, column: int) -> Arr
             delta[:, column] = step
         else:
             constants[column - extras.state_dim] = step
-        moved, _ = linearizer.retract(states, (delta, constants))
+        moved = states.moved(delta, constants)
         ends.append(linearizer.beam_rows(moved).error)
     return np.asarray((ends[0] - ends[1]) / 2e-5)
 
