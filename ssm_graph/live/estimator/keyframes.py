@@ -12,7 +12,7 @@ import numpy as np
 from factors.inertial import Intervals
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
-from ssm_graph.imu.preintegration import LIVELY_S, imu_gaps, preintegrate
+from ssm_graph.imu.preintegration import LIVELY_S, InertialChain, imu_gaps, preintegrate
 from ssm_graph.live.estimator.buffers import OFF_WATER, SIGMAS, SPEEDS, Buffers, Measured
 from ssm_graph.mission.aids import fix_covariance_n
 from ssm_graph.mission.ping_motion import PING_WINDOW_S, mean_gyro
@@ -74,7 +74,7 @@ class KeyframeMaker:
         at_s = measured.time_s
         begin_s = at_s if last_s is None else last_s
         imu = self._imu(begin_s, at_s)
-        inertial = None if last_s is None else self._integrate(imu, last_s, at_s)
+        inertial = None if last_s is None else self._integrate(imu, last_s, at_s).intervals
         gyro_b = mean_gyro(imu, np.array([at_s]))[0]
         depths, has_depth = measured.depths, self._buffers.vehicle.depth_sigma is not None
         fix_n, fix_cov_n = self._fixes(measured.fixes)
@@ -91,6 +91,10 @@ class KeyframeMaker:
 
     def inertial(self, begin_s: float, end_s: float) -> Intervals:
         """Return what the inertial sensors say from one time to another."""
+        return self.chain(begin_s, end_s).intervals
+
+    def chain(self, begin_s: float, end_s: float) -> InertialChain:
+        """Return the same with the samples that it was made of."""
         return self._integrate(self._imu(begin_s, end_s), begin_s, end_s)
 
     def _imu(self, begin_s: float, end_s: float) -> ImuLog:
@@ -104,14 +108,13 @@ class KeyframeMaker:
             return imu
         return self._buffers.imu_log(begin_s - LIVELY_S, end_s + half)
 
-    def _integrate(self, imu: ImuLog, begin_s: float, end_s: float) -> Intervals:
-        chain = preintegrate(
+    def _integrate(self, imu: ImuLog, begin_s: float, end_s: float) -> InertialChain:
+        return preintegrate(
             imu,
             np.array([begin_s, end_s]),
             frame=self._frame,
             rate_hz=self._config.merge_rate_hz,
         )
-        return chain.intervals
 
     def _beams(self, pings: Array, gyro_b: Array) -> BeamSpeeds:
         row, beam = np.nonzero(np.isfinite(pings[:, SPEEDS]))
