@@ -16,11 +16,12 @@ from factors.dvl_beam import dvl_beam_factor
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.states import States
+from ssm_graph.graph.aids.depth import DepthMeans
 from ssm_graph.graph.gtsam_graph import prior_graph
 from ssm_graph.graph.inertial_rows import InertialRows
 from ssm_graph.imu.preintegration import InertialChain, Preintegrated, gravity_between
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
-from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator.asked import sensors_of_vehicle
 from ssm_graph.live.estimator.buffers import Buffers
 from ssm_graph.live.estimator.keyframes import KeyframeMaker
@@ -29,7 +30,7 @@ from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.problem import NO_EXTRAS, ProblemConfig, build_problem, start_of
 from ssm_graph.mission.trajectory import trajectory_at
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors
-from ssm_graph.smoothers.window_rows import depth_targets
+from ssm_graph.smoothers.window_aids import row_states
 
 CAUCHY_K = 2.3849
 """The usual constant: 95 % efficiency without outliers."""
@@ -100,7 +101,7 @@ def keyframes_live(mission: Mission) -> Iterator[Timed]:
     """Yield the keyframes that the live estimator makes, after the first one."""
     vehicle = vehicle_of(mission)
     buffers = Buffers(vehicle)
-    maker = KeyframeMaker(buffers, mission.frame, ProblemConfig())
+    maker = KeyframeMaker(buffers, mission.frame, ProblemConfig(), begin_s=0.0)
     assert mission.initial is not None
     last_s = mission.initial.time_s
     for message in messages_of(mission):
@@ -129,7 +130,6 @@ class Theirs:
         start = start_of(problem)
         self.states = States.at_start(start)
         self.covariance = start.covariance
-        self._last = Keyframe.unmeasured(problem.start.time_s, np.zeros(3), None)
         self._k = 0
         self.smoother = self._make()
         self._update(prior_graph(problem), self.states, problem.start.time_s)
@@ -156,13 +156,13 @@ class Theirs:
         graph = gtsam.NonlinearFactorGraph()
         graph.add(gtsam.GalileanCombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), measured))
         self._add_beams(graph, keyframe, j)
-        if len(keyframe.depth):
-            self._add_depth(graph, keyframe, predicted, j)
+        depth = keyframe.aids.get(DepthMeans.name)
+        if isinstance(depth, DepthMeans):
+            self._add_depth(graph, depth, predicted, j)
         self._k = j
         self._update(graph, predicted, keyframe.time_s)
         for _ in range(self.config.extra_updates):
             self.smoother.update()
-        self._last = keyframe
         self.states = self._newest()
 
     def gravity_before(self, keyframe: Keyframe) -> Array:
@@ -192,7 +192,7 @@ class Theirs:
                 speed=float(beams.speed[i]),
                 gyro_b=beams.gyro_b[i],
                 beam_b=beams.beam_b[i],
-                lever_arm_b=self._sensors.dvl_arm_b,
+                lever_arm_b=beams.lever_arm_b,
                 omega_ie_n=self._frame.omega_ie_n,
                 loss=self._loss,
             )
@@ -201,18 +201,17 @@ class Theirs:
     def _add_depth(
         self,
         graph: gtsam.NonlinearFactorGraph,
-        keyframe: Keyframe,
+        depth: DepthMeans,
         predicted: States,
         k: int,
     ) -> None:
         """Add the mean of the readings, carried along the track as ours are, once."""
-        both = self.states.followed_by(predicted)
-        pair = [self._last, keyframe]
-        targets = depth_targets(self._sensors, pair, both, first_rise=0.0).take(np.s_[1:])
+        before, at = (row_states(self._sensors, states) for states in (self.states, predicted))
+        target_n, up_n = depth.led_along(before, at).target(at)
         root = np.zeros((3, 3))
-        root[0] = targets.up_n[0] * np.sqrt(len(keyframe.depth)) / self._sensors.depth_sigma
+        root[0] = up_n[0] * depth.root_information[0, 0]
         noise = gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
-        graph.add(gtsam.GPSFactorArm(X(k), targets.sensor_n[0], self._sensors.depth_arm_b, noise))
+        graph.add(gtsam.GPSFactorArm(X(k), target_n[0], depth.lever_arm_b, noise))
 
     def _newest(self) -> States:
         k, smoother = self._k, self.smoother

@@ -20,14 +20,14 @@ from ssm_graph.base.errors import SolverError
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import POSITION, ROTATION, STATE_DIM, VELOCITY
 from ssm_graph.engine.states import NavigationStates, States
-from ssm_graph.graph.aids.of_problem import weighted_aids
-from ssm_graph.graph.augmented_rows import RowStates
+from ssm_graph.graph.aids.aid import RowStates
 from ssm_graph.graph.beacon_start import find_beacons
 from ssm_graph.graph.beam_rows import BeamRows, linearize_beams
 from ssm_graph.graph.beam_weights import met_weights, settle_weights, updated_trust
 from ssm_graph.graph.forward_aids import ForwardAids
 from ssm_graph.graph.forward_extras import ForwardExtras
 from ssm_graph.graph.inertial_rows import InertialRows
+from ssm_graph.graph.measurements import Measurements
 from ssm_graph.imu.preintegration import gravity_gradient, gtsam_gravity
 from ssm_graph.mission.problem import NO_EXTRAS, Problem, start_of
 from ssm_graph.sensors.dvl import N_BEAMS
@@ -91,7 +91,7 @@ class _ForwardPass:
         self.P = self.extras.begin(start.covariance) if self.extras else start.covariance
         self.no_rows = _Rows(np.zeros((0, len(self.P))), np.zeros(0), np.zeros(0))
         self.inertial = InertialRows(problem.frame, NO_EXTRAS)
-        self.aids = weighted_aids(problem)
+        self.aids = Measurements.weighted(problem)
         self.met = ForwardAids(self.aids)
         self.weights = np.ones(len(problem.beams.speed))
         self.trust = np.ones(N_BEAMS)
@@ -157,7 +157,9 @@ class _ForwardPass:
         """Correct by the weighted aids of one keyframe, each by itself."""
         extras = self.extras
         walks, constants = (extras.walks, extras.constants) if extras else (_NONE, _NONE)
-        for met in self.met.at(k, RowStates(*self._state, walks, constants, self._g_n)):
+        for met in self.met.at(
+            k, RowStates(*self._state, walks, constants, self.problem.extras, self._g_n)
+        ):
             predicted = met.H @ self.P @ met.H.T
             weight = self.met.weigh(met, predicted, self.kernel)
             if weight > WEIGHT_FLOOR:

@@ -14,10 +14,10 @@ import numpy as np
 
 from factors.similarity import WEIGHT_FLOOR, Kernel
 from ssm_graph.base.frozen import Array
-from ssm_graph.graph.aids.acoustic import RangeAid
-from ssm_graph.graph.aids.weighted import WeightedAid, WeightedAids
-from ssm_graph.graph.augmented_rows import RowStates
+from ssm_graph.graph.aids.aid import Aid, RowStates
+from ssm_graph.graph.aids.ranges import Ranges
 from ssm_graph.graph.beam_weights import GATE, WEIGHT_ROUNDS
+from ssm_graph.graph.measurements import Measurements
 
 
 class Met(NamedTuple):
@@ -34,22 +34,23 @@ class Met(NamedTuple):
 class ForwardAids:
     """The weighted aids of a problem, keyframe by keyframe."""
 
-    def __init__(self, aids: WeightedAids) -> None:
+    def __init__(self, aids: Measurements) -> None:
         self.weights = np.ones(len(aids))
         """(M,) of all measurements, as far as they have been met"""
-        self._at: dict[int, list[tuple[WeightedAid, int, int]]] = {}
+        self._at: dict[int, list[tuple[Aid, int]]] = {}
         number = 0
         for aid in aids.all:
+            is_unknown = ~aid.is_known[aid.beacon] if isinstance(aid, Ranges) else None
             for i, k in enumerate(aid.keyframe.tolist()):
-                if not (isinstance(aid, RangeAid) and not aid.is_to_known(i)):
-                    self._at.setdefault(k, []).append((aid, i, number))
+                if is_unknown is None or not is_unknown[i]:
+                    self._at.setdefault(k, []).append((aid.take(slice(i, i + 1)), number))
                 number += 1
 
     def at(self, k: int, state: RowStates) -> Iterator[Met]:
         """Yield the measurements of a keyframe, linearised at its state before all of them."""
-        for aid, i, number in self._at.get(k, ()):
-            error, jacobian = aid.whitened(state, i)
-            yield Met(number, -error, jacobian)
+        for aid, number in self._at.get(k, ()):
+            error, jacobian = aid.whitened(state.rows_of_one())
+            yield Met(number, -error[0], jacobian[0])
 
     def weigh(self, met: Met, predicted: Array, kernel: Kernel) -> float:
         """Return the weight of a measurement, and keep it.

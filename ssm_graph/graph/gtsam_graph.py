@@ -15,10 +15,11 @@ from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import POSITION, ROTATION, VELOCITY
 from ssm_graph.engine.states import States
-from ssm_graph.graph.depth import depth_targets
+from ssm_graph.graph.aids.depth import DepthMeans, Depths
+from ssm_graph.graph.aids.gnss import Fixes
 from ssm_graph.graph.gtsam_aids import aid_graph
+from ssm_graph.graph.measurements import Measurements
 from ssm_graph.imu.preintegration import gravity_between
-from ssm_graph.mission.aids import Depths, Fixes
 from ssm_graph.mission.problem import Problem, start_of
 
 
@@ -148,13 +149,17 @@ def gnss_graph(fixes: Fixes | None) -> gtsam.NonlinearFactorGraph:
 
 def depth_graph(problem: Problem, depths: Depths, states: States) -> gtsam.NonlinearFactorGraph:
     """Return depth as GTSAM position factors that count along the local vertical only."""
-    targets = depth_targets(depths, states, problem.frame, problem.keyframe_s)
-    root_information = np.zeros((len(targets.keyframe), 3, 3))
-    root_information[:, 0] = targets.up_n * targets.root_information[:, None]
+    aids = Measurements(
+        [DepthMeans.of_readings(depths, problem.keyframe_s, problem.frame)], problem.extras
+    )
+    aids.follow(states)
+    (means,) = aids.all
+    assert isinstance(means, DepthMeans)
+    target_n, up_n = means.target(aids.at_keyframes(means, states))
+    root_information = np.zeros((len(means), 3, 3))
+    root_information[:, 0] = up_n * means.root_information[:, 0]
     graph = gtsam.NonlinearFactorGraph()
-    for k, target_n, root in zip(
-        targets.keyframe.tolist(), targets.target_n, root_information, strict=True
-    ):
+    for k, place_n, root in zip(means.keyframe.tolist(), target_n, root_information, strict=True):
         noise = gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
-        graph.add(gtsam.GPSFactorArm(X(k), target_n, depths.lever_arm_b, noise))
+        graph.add(gtsam.GPSFactorArm(X(k), place_n, depths.lever_arm_b, noise))
     return graph

@@ -17,10 +17,10 @@ from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.engine.extras import with_extras
 from ssm_graph.engine.marginal_prior import prior_at_start
 from ssm_graph.engine.states import States
-from ssm_graph.graph.aids.of_problem import full_aids, weighted_aids
-from ssm_graph.graph.augmented_rows import AugmentedBeams, RowStates, states_of
-from ssm_graph.graph.beam_rows import BeamRows
+from ssm_graph.graph.aids.aid import RowStates
+from ssm_graph.graph.beam_rows import BeamRows, CalibratedBeams
 from ssm_graph.graph.inertial_rows import InertialRows
+from ssm_graph.graph.measurements import Measurements, states_at
 from ssm_graph.mission.calibration import needs_motion
 from ssm_graph.mission.problem import Problem, start_of
 
@@ -44,8 +44,8 @@ class GraphLinearizer:
         self.problem = problem
         self._inertial = InertialRows(problem.frame, problem.extras)
         self.prior = prior_at_start(with_extras(start_of(problem), problem.extras.walks))
-        self.aids, self.weighted = full_aids(problem), weighted_aids(problem)
-        self._beams = AugmentedBeams(problem.beams, problem.extras, problem.frame)
+        self.aids, self.weighted = Measurements.in_full(problem), Measurements.weighted(problem)
+        self._beams = CalibratedBeams(problem.beams, problem.extras, problem.frame)
         self._n_judged = 0
 
     def follow(self, states: States) -> bool:
@@ -54,8 +54,8 @@ class GraphLinearizer:
         In the first passes, how much motion there is to calibrate by is judged anew: only smoothed
         states tell acceleration from a bias. Then the beams are to be linearised anew.
         """
-        for aid in self.aids:
-            aid.follow(states)
+        self.aids.follow(states)
+        self.weighted.follow(states)
         if self._n_judged == JUDGED_PASSES or not needs_motion(self.problem.extras):
             return False
         self._n_judged += 1
@@ -104,8 +104,8 @@ class GraphLinearizer:
         """Return half the weighted sum of squares that :meth:`solve` makes least."""
         squares = np.sum(weights * (beam_rows.error / self.problem.beams.sigma) ** 2)
         squares += np.sum(self.prior.whitened(states) ** 2)
-        squares += sum(float(np.sum(aid.rows(states).error ** 2)) for aid in self.aids)
-        squares += np.sum(self._aid_weights(aid_weights) * self.weighted.squares(states))
+        squares += np.sum(self.aids.rows(states).error ** 2)
+        squares += np.sum(self.weighted.rows(states, aid_weights).error ** 2)
         constants_sigma = self.problem.extras.sigma[self.problem.extras.n_walks :]
         squares += np.sum((states.constants / constants_sigma) ** 2)
         squares += np.sum(self._inertial.errors(self.problem.chain.intervals, states) ** 2)
@@ -115,17 +115,14 @@ class GraphLinearizer:
         """Return the misfit of the aids and the inertial data, by name, where there are any."""
         errors = self._inertial.errors(self.problem.chain.intervals, states)[:, :STATE_DIM]
         found = {"inertial": Misfit(float(np.sum(errors**2)), errors.size, len(errors))}
-        for aid in self.aids:
-            error = aid.rows(states).error
-            found[aid.name] = Misfit(float(error @ error), len(error), len(error) // aid.dim)
+        for aid in self.aids.all:
+            error = aid.whitened(self.aids.at_keyframes(aid, states)).error
+            found[aid.name] = Misfit(float(np.sum(error**2)), error.size, len(error))
         return {name: misfit for name, misfit in found.items() if misfit.n_factors}
-
-    def _aid_weights(self, weights: Array | None) -> Array:
-        return np.ones(len(self.weighted)) if weights is None else weights
 
     def _at_beams(self, states: States) -> RowStates:
         g_n = self.problem.frame.g_n_at(states.p_n)
-        return states_of(states, self.problem.beams.keyframe, g_n=g_n)
+        return states_at(states, self.problem.beams.keyframe, self.problem.extras, g_n=g_n)
 
     def _own_rows(
         self,
@@ -139,9 +136,7 @@ class GraphLinearizer:
         scale = np.sqrt(weights) / beams.sigma
         whitened = np.column_stack([beam_rows.jacobian, -beam_rows.error]) * scale[:, None]
         keyframes, blocks = [beams.keyframe], [whitened]
-        aid_rows = [aid.rows(states) for aid in self.aids]
-        if len(self.weighted):
-            aid_rows.append(self.weighted.weighted_rows(states, self._aid_weights(aid_weights)))
+        aid_rows = self.aids.rows(states), self.weighted.rows(states, aid_weights)
         for keyframe, error, jacobian in aid_rows:
             keyframes.append(keyframe)
             blocks.append(np.column_stack([jacobian, -error]))

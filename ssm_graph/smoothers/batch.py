@@ -20,11 +20,12 @@ from ssm_graph.graph.beacon_start import ambiguous_beacons
 from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.first_values import FirstValues, first_values
 from ssm_graph.graph.linearize import GraphLinearizer
+from ssm_graph.graph.measurements import aid_table, doubts_of_aids
 from ssm_graph.mission.estimate import BeamTable, Estimate, Iteration, NoiseFound, Status
 from ssm_graph.mission.problem import Problem, with_white_noise
 from ssm_graph.mission.trajectory import trajectory_from_states
 from ssm_graph.sensors.dvl import N_BEAMS
-from ssm_graph.smoothers.aid_weights import AidKernel, AidWeighing
+from ssm_graph.smoothers.aid_weights import AidWeighing
 from ssm_graph.smoothers.beam_faults import FaultSearch
 from ssm_graph.smoothers.calibrated import calibration_of, undetermined
 from ssm_graph.smoothers.current import current_of
@@ -230,8 +231,13 @@ class SsmSmoother:
         return Pass(states, step, rows, t, settled, float(np.max(np.abs(wanted) / sigma)), change)
 
     def _aids(self, linearizer: GraphLinearizer, first: FirstValues) -> AidWeighing:
-        kernel = AidKernel(self.config.kernel, WARM_KERNEL, self.config.judged_by)
-        return AidWeighing(linearizer.weighted, kernel, first.aid_weights)
+        return AidWeighing(
+            linearizer.weighted,
+            first.aid_weights,
+            wanted=self.config.kernel,
+            warm=WARM_KERNEL,
+            judged_by=self.config.judged_by,
+        )
 
     def _mahalanobis_sq(self, problem: Problem, rows: BeamRows, step: ChainSolution) -> Array:
         H, beams = rows.jacobian, problem.beams
@@ -257,7 +263,8 @@ class SsmSmoother:
             f"{last.weight_change:.1e}"
         )
         doubts = contradictions(linearizer, last.states, last.beam_rows, last.weights)
-        doubts += solved.aids.doubts(last.states)
+        judged = solved.aids.judged(last.states, linearizer.problem.keyframe_s)
+        doubts += doubts_of_aids(judged)
         doubts += ambiguous_beacons(
             last.states,
             linearizer.weighted,
@@ -296,7 +303,7 @@ class SsmSmoother:
             start=problem.start,
             notes=solved.notes + noise_notes(noise) + undetermined(calibration),
             calibration=calibration,
-            aids=solved.aids.table(last.states, problem.keyframe_s),
+            aids=aid_table(judged),
             noise=noise,
             current=current_of(
                 problem.extras,

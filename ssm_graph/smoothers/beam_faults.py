@@ -23,9 +23,8 @@ from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.beam_evidence import ChainEvidence, Evidence, WhitenedBeams
 from ssm_graph.engine.states import States
-from ssm_graph.graph.beam_rows import BeamRows
+from ssm_graph.graph.beam_rows import BeamRows, WaterRows
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.graph.water_rows import WaterRows
 from ssm_graph.mission.problem import Problem
 from ssm_graph.sensors.dvl import N_BEAMS
 

@@ -12,7 +12,7 @@ from benchmarks.calibration_cases import AIDS, DVL, as_stated, asking
 from ssm_graph.evaluation import evaluate
 from ssm_graph.filters.navigation.named import filter_problems
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
-from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator.buffers import Buffers
 from ssm_graph.live.estimator.smoother import FixedLagSmoother
 from ssm_graph.mission.estimate import Calibration, Determined, Estimate, Status

@@ -33,7 +33,7 @@ def delayed_of(stretch: Stretch, frame: LocalFrame, extras: Extras, *, shift_s: 
         trajectory_at(frame, time_s, stretch.states, stretch.covariance, n_beams=stretch.n_beams),
         BeamTable(
             time_s=np.repeat(time_s, stretch.n_beams.astype(int)),
-            beam=stretch.beam + 1.0,
+            beam=(stretch.beam + 1).astype(np.float64),
             innovation=stretch.innovation,
             mahalanobis_sq=stretch.mahalanobis_sq,
             weight=stretch.weight,

@@ -41,7 +41,7 @@ class Tail:
         sensors: Sensors,
     ) -> None:
         """Begin at a keyframe with its states (1, ...) and covariance (n, n)."""
-        frame = sensors.frame
+        frame, self._no_beams = sensors.frame, sensors.beams
         self._begin_s = self._end_s = keyframe.time_s
         self._states, self._covariance = states, covariance
         self._noise, self._frame = noise, frame
