@@ -11,7 +11,6 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
-from ssm_graph.smoothers.window_inertial import InertialRows
 
 from factors.dvl_beam import dvl_beam_factor
 from ssm_graph.base.earth import LocalFrame
@@ -19,6 +18,8 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.engine.states import States
 from ssm_graph.graph.aids.depth import DepthMeans
 from ssm_graph.graph.gtsam_graph import prior_graph
+from ssm_graph.graph.inertial_rows import InertialRows
+from ssm_graph.imu.preintegration import InertialChain, Preintegrated, gravity_between
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator.asked import sensors_of_vehicle
@@ -26,7 +27,7 @@ from ssm_graph.live.estimator.buffers import Buffers
 from ssm_graph.live.estimator.keyframes import KeyframeMaker
 from ssm_graph.mission.estimate import Trajectory
 from ssm_graph.mission.mission import Mission
-from ssm_graph.mission.problem import ProblemConfig, build_problem, start_of
+from ssm_graph.mission.problem import NO_EXTRAS, ProblemConfig, build_problem, start_of
 from ssm_graph.mission.trajectory import trajectory_at
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors
 from ssm_graph.smoothers.window_aids import row_states
@@ -90,6 +91,8 @@ class Timed(NamedTuple):
     """A keyframe, and what it took to make it."""
 
     keyframe: Keyframe
+    chain: InertialChain
+    """The inertial data before it, for GTSAM's factor"""
     seconds: float
     cpu_s: float
 
@@ -109,7 +112,8 @@ def keyframes_live(mission: Mission) -> Iterator[Timed]:
             if measured is None:
                 break
             keyframe = maker.make(measured, last_s=last_s)
-            yield Timed(keyframe, time.perf_counter() - begin, time.process_time() - cpu)
+            took = time.perf_counter() - begin, time.process_time() - cpu
+            yield Timed(keyframe, maker.chain(last_s, measured.time_s), *took)
             last_s = measured.time_s
             buffers.drop_before(last_s - 5.0)
 
@@ -120,11 +124,11 @@ class Theirs:
     def __init__(self, mission: Mission, config: TheirConfig) -> None:
         self.config, self._frame = config, mission.frame
         self._sensors: Sensors = sensors_of_vehicle(vehicle_of(mission), mission.frame)
-        self._inertial = InertialRows(mission.frame)
+        self._inertial = InertialRows(mission.frame, NO_EXTRAS)
         self._loss = gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY_K)
         problem = build_problem(mission)
         start = start_of(problem)
-        self.states = States.of(start)
+        self.states = States.at_start(start)
         self.covariance = start.covariance
         self._k = 0
         self.smoother = self._make()
@@ -145,17 +149,12 @@ class Theirs:
         isam.findUnusedFactorSlots = True
         return gtsam.IncrementalFixedLagSmoother(config.lag_s, isam)
 
-    def add(self, keyframe: Keyframe) -> None:
-        """Take a keyframe; the newest state follows."""
-        predicted = self._inertial.predict(keyframe, self.states)
+    def add(self, keyframe: Keyframe, measured: Preintegrated) -> None:
+        """Take a keyframe and the inertial data before it; the newest state follows."""
+        predicted = self._predicted(keyframe)
         i, j = self._k, self._k + 1
         graph = gtsam.NonlinearFactorGraph()
-        assert keyframe.way is not None
-        graph.add(
-            gtsam.GalileanCombinedImuFactor(
-                X(i), V(i), X(j), V(j), B(i), B(j), keyframe.way.measured
-            )
-        )
+        graph.add(gtsam.GalileanCombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), measured))
         self._add_beams(graph, keyframe, j)
         depth = keyframe.aids.get(DepthMeans.name)
         if isinstance(depth, DepthMeans):
@@ -165,6 +164,15 @@ class Theirs:
         for _ in range(self.config.extra_updates):
             self.smoother.update()
         self.states = self._newest()
+
+    def gravity_before(self, keyframe: Keyframe) -> Array:
+        """Return gravity (1, 3) midway to where a keyframe is predicted."""
+        pair = self.states.followed_by(self._predicted(keyframe))
+        return gravity_between(self._frame, pair.p_n)
+
+    def _predicted(self, keyframe: Keyframe) -> States:
+        assert keyframe.inertial is not None
+        return self._inertial.predict(keyframe.inertial, self.states).states
 
     def _update(self, graph: gtsam.NonlinearFactorGraph, at: States, time_s: float) -> None:
         k, values = self._k, gtsam.Values()
@@ -254,7 +262,8 @@ def run_theirs(mission: Mission, config: TheirConfig, *, most_wall_s: float = np
     for timed in keyframes_live(mission):
         begin, cpu = time.perf_counter(), time.process_time()
         try:
-            theirs.add(timed.keyframe)
+            measured = timed.chain.measured(theirs.gravity_before(timed.keyframe))[0]
+            theirs.add(timed.keyframe, measured)
             updated = time.perf_counter()
             if reads:
                 covariance = theirs.read_covariance()

@@ -14,6 +14,7 @@ from scipy.stats import chi2
 from ssm_graph.base.errors import SolverError
 from ssm_graph.base.frames import R_lb_from_roll_pitch_heading
 from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.engine.states import States
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.mission.estimate import Status, Trajectory
@@ -173,4 +174,4 @@ def covariances(problem: Problem, states: States, weights: Array) -> Array:
     """Return the covariance (K, 15, 15) of the whole error state at an answer."""
     linearizer = GraphLinearizer(problem)
     linearizer.follow(states)
-    return linearizer.solve(states, linearizer.beam_rows(states), weights).covariance
+    return linearizer.solve(states, linearizer.beam_rows(states), weights).covariance(STATE_DIM)

@@ -117,7 +117,7 @@ class States(NamedTuple):
         """
         own = self.navigation.moved(step[:, :STATE_DIM])
         constants = self.constants if constants_step is None else self.constants + constants_step
-        return States(*own, self.walks + step[:, STATE_DIM:], constants)
+        return States(*own, walks=self.walks + step[:, STATE_DIM:], constants=constants)
 
     def is_same(self, other: States) -> bool:
         """Return whether these are the other states, to the last bit."""
@@ -125,12 +125,14 @@ class States(NamedTuple):
 
     def take(self, keyframes: NDArray[np.intp] | slice) -> States:
         """Return the states of some keyframes."""
-        return States(*(column[keyframes] for column in self[:5]), self.constants)
+        R_nb, p_n, v_n, bias, walks = (column[keyframes] for column in self[:5])
+        return States(R_nb, p_n, v_n, bias, walks, self.constants)
 
     def followed_by(self, *others: States) -> States:
         """Return these states, then the others, which have the same constants."""
         parts = zip(*(part[:5] for part in (self, *others)), strict=True)
-        return States(*(np.concatenate(columns) for columns in parts), self.constants)
+        R_nb, p_n, v_n, bias, walks = (np.concatenate(columns) for columns in parts)
+        return States(R_nb, p_n, v_n, bias, walks, self.constants)
 
 
 def local_D_deviation(xi: Array) -> Array:

@@ -117,7 +117,7 @@ def test_jacobians_against_differences(turn: float) -> None:
 
     def error(a: NavigationStates, b: NavigationStates) -> Array:
         g_n = G_N + (0.5 * (a.p_n + b.p_n) - middle) @ gradient.T
-        return whitened_error(intervals, a, b, g_n=g_n)[0]
+        return np.asarray(whitened_error(intervals, a, b, g_n=g_n)[0])
 
     rows = whitened_rows(intervals, begin, end, g_n=G_N[None], gradient=gradient)[0]
     for column in range(30):

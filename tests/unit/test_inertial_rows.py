@@ -38,7 +38,7 @@ def test_rows_follow_gravity(end: int) -> None:
     between, intervals = InertialRows(problem.frame, NO_EXTRAS), problem.chain.intervals
 
     def error_at(step: Array) -> Array:
-        return between.errors(intervals, states.moved(step))[1]
+        return np.asarray(between.errors(intervals, states.moved(step))[1])
 
     columns = between.rows(intervals, states)[1]
     for axis in range(3):

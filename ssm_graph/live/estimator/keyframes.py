@@ -21,7 +21,7 @@ from ssm_graph.graph.aids.aid import Aid
 from ssm_graph.graph.aids.depth import DepthMeans, Depths
 from ssm_graph.graph.aids.gnss import Fixes
 from ssm_graph.imu.ping_motion import PING_WINDOW_S, mean_gyro
-from ssm_graph.imu.preintegration import LIVELY_S, imu_gaps, preintegrate
+from ssm_graph.imu.preintegration import LIVELY_S, InertialChain, imu_gaps, preintegrate
 from ssm_graph.live.estimator.buffers import OFF_WATER, Buffers, Logs, Measured
 from ssm_graph.mission.problem import Beams, ProblemConfig
 from ssm_graph.sensors.drift import Drift
@@ -80,7 +80,7 @@ class KeyframeMaker:
         at_s = measured.time_s
         begin_s = at_s if last_s is None else last_s
         imu = self._imu(begin_s, at_s)
-        inertial = None if last_s is None else self._integrate(imu, last_s, at_s)
+        inertial = None if last_s is None else self._integrate(imu, last_s, at_s).intervals
         gyro_b = mean_gyro(imu, np.array([at_s]))[0]
         keyframe_s = np.array([begin_s, at_s])
         aids = aids_at(measured.logs, self._frame, imu, keyframe_s, begin_s=self._begin_s)
@@ -93,6 +93,10 @@ class KeyframeMaker:
 
     def inertial(self, begin_s: float, end_s: float) -> Intervals:
         """Return what the inertial sensors say from one time to another."""
+        return self.chain(begin_s, end_s).intervals
+
+    def chain(self, begin_s: float, end_s: float) -> InertialChain:
+        """Return the same with the samples that it was made of."""
         return self._integrate(self._imu(begin_s, end_s), begin_s, end_s)
 
     def _imu(self, begin_s: float, end_s: float) -> ImuLog:
@@ -106,14 +110,13 @@ class KeyframeMaker:
             return imu
         return self._buffers.imu_log(begin_s - LIVELY_S, end_s + half)
 
-    def _integrate(self, imu: ImuLog, begin_s: float, end_s: float) -> Intervals:
-        chain = preintegrate(
+    def _integrate(self, imu: ImuLog, begin_s: float, end_s: float) -> InertialChain:
+        return preintegrate(
             imu,
             np.array([begin_s, end_s]),
             frame=self._frame,
             rate_hz=self._config.merge_rate_hz,
         )
-        return chain.intervals
 
     def _beams(self, pings: Array, gyro_b: Array) -> Beams:
         speed, sigma = pings[:, self._buffers.speeds], pings[:, self._buffers.sigmas]
