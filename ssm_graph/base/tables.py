@@ -168,6 +168,7 @@ def is_repeated(table: Table, spec: TableSpec) -> NDArray[np.bool_]:
 
 
 def check_increasing(table: Table, spec: TableSpec) -> None:
+    """Raise for the first time that is not after the one before."""
     step = np.diff(table.time_s)
     if np.all(step > 0.0):
         return

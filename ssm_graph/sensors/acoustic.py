@@ -15,7 +15,15 @@ import numpy as np
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frames import BodyAxes
 from ssm_graph.base.frozen import Array, FrozenArrays, Vector, shaped
-from ssm_graph.base.settings import FILE_KEY, LEVER_ARM_KEY, Key, Settings, build, sigma_key, written
+from ssm_graph.base.settings import (
+    FILE_KEY,
+    LEVER_ARM_KEY,
+    Key,
+    Settings,
+    build,
+    sigma_key,
+    written,
+)
 from ssm_graph.base.tables import Table
 from ssm_graph.sensors.instrument import SMALLEST_SIGMA, Column, Instrument, Lists
 from ssm_graph.sensors.messages import Message
@@ -216,7 +224,9 @@ class _Ranges(Instrument):
         numbers = [beacon.number for beacon in bare.beacons]
         is_known = np.isin(table["beacon"], numbers)
         if not is_known.all():
-            known = f"expected one of {', '.join(map(str, numbers))}" if numbers else "there is none"
+            known = (
+                f"expected one of {', '.join(map(str, numbers))}" if numbers else "there is none"
+            )
             raise table.cell_fault(
                 int(np.argmin(is_known)),
                 "beacon",
@@ -236,7 +246,9 @@ class _Ranges(Instrument):
         return super().settings_of(replace(log, nominal_sigma=_nominal_sigma(log)))
 
     def lists_of(self, log: RangeLog) -> dict[str, list[dict[str, Any]]]:
-        sections = [{**written(beacon, _BEACON_KEYS), "number": beacon.number} for beacon in log.beacons]
+        sections = [
+            {**written(beacon, _BEACON_KEYS), "number": beacon.number} for beacon in log.beacons
+        ]
         return {"beacon": sections}
 
     def table_of(self, log: RangeLog) -> dict[str, Array]:

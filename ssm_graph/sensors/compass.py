@@ -92,12 +92,8 @@ _KEYS: Final = {
             "expected with a walk_sigma_deg above 0, got none; 1 is usual",
         ),
     ),
-    "one_cycle_sigma_deg": optional_key(
-        "errors.one_cycle_sigma", 0.0, 90.0, _DEGREES, unit=DEGREE
-    ),
-    "two_cycle_sigma_deg": optional_key(
-        "errors.two_cycle_sigma", 0.0, 90.0, _DEGREES, unit=DEGREE
-    ),
+    "one_cycle_sigma_deg": optional_key("errors.one_cycle_sigma", 0.0, 90.0, _DEGREES, unit=DEGREE),
+    "two_cycle_sigma_deg": optional_key("errors.two_cycle_sigma", 0.0, 90.0, _DEGREES, unit=DEGREE),
 }
 
 

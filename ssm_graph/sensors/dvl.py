@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -138,7 +138,7 @@ class DvlLog(FrozenArrays):
         if self.water_track is None:
             return self
         kept = ~self.is_water
-        rows = {
+        rows: dict[str, Any] = {
             name: None if getattr(self, name) is None else getattr(self, name)[kept]
             for name in ("time_s", "speed", "sigma", "range_m", "covariance")
         }

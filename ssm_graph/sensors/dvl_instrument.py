@@ -178,7 +178,7 @@ class _Dvl(Instrument):
         covariance = (Column("", name, optional=True, is_live=False) for *_, name in pairs)
         return (*many, _WATER, *covariance)
 
-    def check(self, table: Table, bare: DvlLog, axes: BodyAxes) -> list[str]:
+    def check(self, table: Table, bare: DvlLog, axes: BodyAxes) -> list[str]:  # noqa: ARG002
         notes = _geometry_note(bare.mount, table.label)
         speed, *others = self.columns_of(bare)
         if len(table):
@@ -417,7 +417,9 @@ def _check_covariance(table: Table, bare: DvlLog) -> None:
     whole = np.isfinite(covariance).all(axis=(1, 2))
     least = np.full(len(table), np.inf)
     least[whole] = np.linalg.eigvalsh(covariance[whole])[:, 0]
-    least = np.minimum(least, np.nan_to_num(np.diagonal(covariance, axis1=1, axis2=2), nan=1.0).min(axis=1))
+    least = np.minimum(
+        least, np.nan_to_num(np.diagonal(covariance, axis1=1, axis2=2), nan=1.0).min(axis=1)
+    )
     if (least <= SMALLEST_SIGMA**2).any():
         row = int(np.argmax(least <= SMALLEST_SIGMA**2))
         raise table.fault(

@@ -130,9 +130,7 @@ _KEYS: Final = {
     "gyro_random_walk_deg_per_sqrt_h": sigma_key(
         "noise.gyro_density", 1e4, _WALK, unit=DEGREE * PER_SQRT_H
     ),
-    "accel_random_walk_ug_per_sqrt_hz": sigma_key(
-        "noise.accel_density", 1e7, _WALK, unit=MICRO_G
-    ),
+    "accel_random_walk_ug_per_sqrt_hz": sigma_key("noise.accel_density", 1e7, _WALK, unit=MICRO_G),
     "gyro_bias_deg_per_h": sigma_key("noise.gyro_bias_sigma", 1e6, _WALK, unit=DEG_PER_H),
     "accel_bias_ug": sigma_key("noise.accel_bias_sigma", 1e7, _WALK, unit=MICRO_G),
     "gyro_bias_walk_deg_per_h_per_sqrt_h": optional_key(

@@ -93,7 +93,7 @@ class Column:
         return self.json or self.pattern.replace("{}_", "")
 
     def read(self, table: Table, axes: BodyAxes) -> Array:
-        """Return its numbers (N,) or (N, len(over)) in SI units, body vectors forward-right-down."""
+        """Return its numbers (N,) or (N, len(over)) in SI units, body vectors in axes FRD."""
         values = table.stack(self.names) * self.unit
         if self.wraps:
             values = wrapped(values)
@@ -155,7 +155,7 @@ class Instrument:
         """Return the log without rows that a section describes; raise where it cannot be."""
         return build(self.log, self.empty() | settings.given())
 
-    def empty(self) -> dict[str, Array]:
+    def empty(self) -> dict[str, Any]:
         """Return the fields of a log that has no rows."""
         shapes = {c.field: (0, len(c.over)) if c.over else (0,) for c in self.columns}
         return {name: np.zeros(shape) for name, shape in {"time_s": (0,), **shapes}.items()}
@@ -274,8 +274,11 @@ class Instrument:
         return None
 
     def sifted(
-        self, message: Message, near: Array, bare: Any
-    ) -> tuple[Message, tuple[str, str] | None]:  # noqa: ARG002
+        self,
+        message: Message,
+        near: Array,  # noqa: ARG002
+        bare: Any,  # noqa: ARG002
+    ) -> tuple[Message, tuple[str, str] | None]:
         """Return a message without what cannot have been measured, and what was and why.
 
         Parameters
@@ -318,5 +321,5 @@ class Instrument:
 
 
 @cache
-def _fields(kind: type[Message]) -> tuple[str, ...]:
+def _fields(kind: type[Any]) -> tuple[str, ...]:
     return tuple(spec.name for spec in fields(kind))

@@ -1,4 +1,4 @@
-"""Positions on Earth as columns of a table and keys of a section, whichever instrument says them."""
+"""Positions on Earth as columns of a table and keys of a section, whoever says them."""
 
 from __future__ import annotations
 

@@ -34,9 +34,7 @@ class Standstill:
 STANDSTILL_KEYS: Final = {
     "begin_s": Key("begin_s"),
     "end_s": Key("end_s"),
-    "sigma_m_per_s": Key(
-        "sigma", positive=True, high=10.0, required=False, hint="the unit is m/s"
-    ),
+    "sigma_m_per_s": Key("sigma", positive=True, high=10.0, required=False, hint="the unit is m/s"),
 }
 """Of a section ``[[standstill]]``."""
 

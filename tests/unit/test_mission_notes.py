@@ -169,6 +169,6 @@ SOUND: dict[str, Damage] = {
 
 @pytest.mark.parametrize("case", sorted(SOUND))
 def test_sound_mission_leaves_no_note_of_contradiction(tmp_path: Path, case: str) -> None:
-    """Checks do not cry wolf; a vehicle that reads zero in all beams is told how to say it rests."""
+    """Checks do not cry wolf; one that reads zero in all beams is told how to say it rests."""
     notes = notes_after(tmp_path, SOUND[case])
     assert [note for note in notes if "[[standstill]]" not in note] == []

@@ -169,7 +169,7 @@ class RawLog:
             self._tried_s, self._since_tried = message.time_s, 0
 
     def _begin_table(self, kind: RowKind) -> AppendFile | None:
-        """Return the table of an instrument that is heard for the first time, if there can be one."""
+        """Return the table of an instrument that is heard for the first time; None if refused."""
         try:
             table = AppendFile(self._folder / kind.file, ending=_TORN)
         except OSError as error:

@@ -226,7 +226,7 @@ def _velocities(
     """Return velocities (N, 3) as speeds along the instrument's axes, and how they are counted."""
     turn = vehicle.mount.beams_d
     matrix = turn @ covariance.reshape(-1, 3, 3) @ turn.T
-    is_stated = np.isfinite(matrix).all(axis=(1, 2))
+    is_stated = np.asarray(np.isfinite(matrix).all(axis=(1, 2)))
     is_stated[is_stated] = np.linalg.eigvalsh(matrix[is_stated])[:, 0] > 0.0
     matrix = np.where(is_stated[:, None, None], matrix, np.nan)
     sigma = np.full(velocity_d.shape, vehicle.beam_sigma)

@@ -55,6 +55,7 @@ _WATER_TRACK: Final = 2
 """``DVL_MODE_WATER`` of ``marine_acoustic_msgs``."""
 _COVARIANCE_UNKNOWN: Final = 0
 
+
 class BeamSign(Enum):
     """When a driver's beam speed is positive."""
 
@@ -211,9 +212,7 @@ CONVERTERS: Final[Mapping[str, Callable[..., Message]]] = {
 def _marine(message: Any, time_s: float, options: RosOptions) -> DvlReport:
     sign, n_beams = 1.0 if options.beam_sign is BeamSign.ALONG else -1.0, options.n_beams
     if n_beams > len(message.beam_velocity):
-        raise DataError(
-            f"Dvl: expected {n_beams} beams, got room for {len(message.beam_velocity)}"
-        )
+        raise DataError(f"Dvl: expected {n_beams} beams, got room for {len(message.beam_velocity)}")
     sigma = tuple(_sigma(value) for value in message.beam_velocity_covar)[:n_beams]
     good = _good_beams(message)
     speed = tuple(
