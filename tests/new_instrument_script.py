@@ -7,6 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from ssm_graph.sensors.magnetometer import (  # type: ignore[import-not-found]
+    MAGNETOMETER,
+    MagnetometerLog,
+    MagnetometerReading,
+)
 
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.io.mission_folder.assembly import mission_from
@@ -18,11 +23,6 @@ from ssm_graph.live.estimator.events import EventLog
 from ssm_graph.live.estimator.intake import Intake
 from ssm_graph.live.protocols.json_messages import decode_message, encode_message
 from ssm_graph.mission.mission import Aids
-from ssm_graph.sensors.magnetometer import (  # type: ignore[import-not-found]
-    MAGNETOMETER,
-    MagnetometerLog,
-    MagnetometerReading,
-)
 from tests.mission_fixture import make_mission
 from tests.unit.test_mission_roundtrip import assert_same
 

@@ -66,7 +66,12 @@ ODD: dict[str, tuple[Damage, tuple[str, ...]]] = {
     ),
     "short gap": (
         lines("imu.csv", lambda rows: rows[:400] + rows[420:]),
-        ("imu.csv", "1 gaps", "longest 1.050 s after 19.950 s"),
+        (
+            "imu.csv",
+            "1 gaps",
+            "longest 1.050 s after 19.950 s",
+            "bridged by the mean of the readings on both sides",
+        ),
     ),
     "readings repeated": (
         columns("imu.csv", [*GYRO, *ACCEL], lambda v: v[(np.arange(len(v)) // 2) * 2]),

@@ -206,6 +206,8 @@ def _number(value: Any, column: Column) -> float:
         return number(value, key=column.key, low=column.low if column.low > 0.0 else -math.inf)
     number(value, key=column.key, low=column.low, high=column.high)
     exact = Decimal(value) if isinstance(value, int) else value
+    if column.wraps and exact > 180:
+        exact = _EXACT.subtract(exact, Decimal(360))
     return float(_EXACT.multiply(exact, _exact(column.unit)))
 
 
