@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cache
 from typing import Any, Final
 
 import numpy as np
@@ -320,6 +319,11 @@ class Instrument:
                 yield self.message_of(row, log)
 
 
-@cache
-def _fields(kind: type[Any]) -> tuple[str, ...]:
-    return tuple(spec.name for spec in fields(kind))
+_FIELDS: Final[dict[type, tuple[str, ...]]] = {}
+
+
+def _fields(kind: type[Message]) -> tuple[str, ...]:
+    """Return the names of a message's fields; asked for every message of an IMU."""
+    if kind not in _FIELDS:
+        _FIELDS[kind] = tuple(spec.name for spec in fields(kind))
+    return _FIELDS[kind]

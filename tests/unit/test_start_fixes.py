@@ -74,8 +74,7 @@ def test_gross_fixes_start_nothing() -> None:
 def test_a_fix_disagrees_beyond_four_sigmas(far: float, is_kept: bool) -> None:
     """Of both fixes together, at rest and without a lever arm; the last one comes after the end."""
     mission = adrift().mission
-    log = mission.aids.usbl
-    assert log is not None
+    log = mission.aids[UsblLog]
     n, sigma = len(log.time_s), 0.5
     place_n = np.zeros((n, 3))
     place_n[0, 0] = far * sigma * np.sqrt(6.0)
@@ -90,7 +89,7 @@ def test_a_fix_disagrees_beyond_four_sigmas(far: float, is_kept: bool) -> None:
         lever_arm_b=np.zeros(3),
     )
     at_rest = BodyVelocities(log.time_s, place_n * 0.0)
-    found = start_fixes(replace(mission, aids=replace(mission.aids, usbl=fixes)), at_rest)
+    found = start_fixes(replace(mission, aids=mission.aids.having(fixes)), at_rest)
     np.testing.assert_array_equal(found.time_s, log.time_s[0 if is_kept else 1 : -1])
 
 
