@@ -382,9 +382,7 @@ def test_water_linked_in_every_layout(
     sent += imu_messages(mission, ros)[:200] + aid_messages(mission, ros)
     bag = write_bag(tmp_path / "wl", ros, sent, StoragePlugin.SQLITE3)
     got = convert_rosbag(bag if embedded else forget_definitions(bag), options=ON_ELLIPSOID)
-    is_zero = np.asarray(
-        ~body_v.any(axis=1)
-    )  # a driver's word for no lock
+    is_zero = np.asarray(~body_v.any(axis=1))  # a driver's word for no lock
     np.testing.assert_array_equal(got.dvl.speed, np.where(is_zero[:, None], np.nan, speed))
     np.testing.assert_array_equal(got.dvl.mount.beams_d, WATER_LINKED_BEAMS)
     assert got.imu.noise == NOISE
