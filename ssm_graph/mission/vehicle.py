@@ -41,7 +41,7 @@ class Vehicle:
     """None where there is no depth sensor."""
     gnss: GnssLog = GNSS_AT_ORIGIN
     aids: Aids = NO_AIDS
-    """What else it has, for the batch smoother."""
+    """What else it has."""
     frame: LocalFrame | None = None
     """Navigation frame; None takes the first fix."""
     initial: InitialState | None = None

@@ -15,7 +15,6 @@ from ssm_graph.base.tables import Table
 from ssm_graph.sensors.instrument import Column, Instrument
 from ssm_graph.sensors.messages import Message
 
-
 DEEPEST_M: Final = 12_000.0
 """Depth, positive down; the deepest trench has 10,935 m."""
 HIGHEST_M: Final = 6_500.0

@@ -46,22 +46,23 @@ def identical_beams(speed: Array) -> Mask:
     return np.asarray((speed == speed[:, :1]).all(axis=1) & (speed[:, 0] != 0.0))
 
 
-def repeats_of_ping_before(speed: Array) -> Mask:
+def repeats_of_ping_before(speed: Array, is_water: Mask) -> Mask:
     """Return which pings (P,) repeat every speed of the ping before, missing ones as well.
 
     A driver that publishes faster than the instrument measures sends them under new times. A ping
-    whose speeds are all zero or missing repeats nothing.
+    whose speeds are all zero or missing repeats nothing, nor does one of the other track, off the
+    ground or off the water (P,).
     """
     repeated = np.zeros(len(speed), bool)
     same = (speed[1:] == speed[:-1]) | (np.isnan(speed[1:]) & np.isnan(speed[:-1]))
     moving = np.isfinite(speed[1:]) & (speed[1:] != 0.0)
-    repeated[1:] = same.all(axis=1) & moving.any(axis=1)
+    repeated[1:] = same.all(axis=1) & moving.any(axis=1) & (is_water[1:] == is_water[:-1])
     return repeated
 
 
-def without_false_speeds(speed: Array) -> Array:
+def without_false_speeds(speed: Array, is_water: Mask) -> Array:
     """Return the speeds without those of pings that no beam has measured."""
-    false = no_lock(speed) | identical_beams(speed) | repeats_of_ping_before(speed)
+    false = no_lock(speed) | identical_beams(speed) | repeats_of_ping_before(speed, is_water)
     return np.where(false[:, None], np.nan, speed)
 
 
@@ -101,7 +102,7 @@ _IDENTICAL_SHARE: Final = 0.9
 _FEW: Final = 5
 
 
-def check_speeds(table: Table, column: Column) -> list[str]:
+def check_speeds(table: Table, column: Column, is_water: Mask) -> list[str]:
     """Refuse a table whose speeds have another unit, or are codes or copies; return the notes.
 
     What the notes say to be left out is what :func:`without_false_speeds` leaves out.
@@ -120,8 +121,8 @@ def check_speeds(table: Table, column: Column) -> list[str]:
     _small_codes(table, speed, column)
     notes = _zeros(table, speed)
     notes += _identical(table, speed)
-    notes += _repeats(table, speed)
-    is_stuck = stuck_beams(without_false_speeds(speed))
+    notes += _repeats(table, speed, is_water)
+    is_stuck = stuck_beams(without_false_speeds(speed, is_water))
     for beam in np.flatnonzero(is_stuck.any(axis=0)):
         notes += _stuck(table, speed[:, beam], is_stuck[:, beam], int(beam))
     return notes
@@ -179,8 +180,8 @@ def _zeros(table: Table, speed: Array) -> list[str]:
     if not count:
         return []
     return [
-        f"{table.file.place(int(np.argmax(zero)))}: {count} of {len(speed)} pings hold exactly 0 in "
-        "all beams: taken for no bottom lock; a time at rest may be stated as [[standstill]]"
+        f"{table.file.place(int(np.argmax(zero)))}: {count} of {len(speed)} pings hold exactly 0 "
+        "in all beams: taken for no bottom lock; a time at rest may be stated as [[standstill]]"
     ]
 
 
@@ -203,8 +204,8 @@ def _identical(table: Table, speed: Array) -> list[str]:
     ]
 
 
-def _repeats(table: Table, speed: Array) -> list[str]:
-    repeated = repeats_of_ping_before(speed)
+def _repeats(table: Table, speed: Array, is_water: Mask) -> list[str]:
+    repeated = repeats_of_ping_before(speed, is_water)
     count = int(repeated.sum())
     if not count:
         return []

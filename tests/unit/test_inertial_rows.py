@@ -7,11 +7,10 @@ import pytest
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import POSITION, STATE_DIM
-from ssm_graph.graph.inertial_rows import inertial_graph, inertial_rows
-from ssm_graph.graph.states import States, retract
-from ssm_graph.imu.preintegration import gravity_gradient
+from ssm_graph.engine.states import States
+from ssm_graph.graph.inertial_rows import InertialRows
 from ssm_graph.mission.estimate import Status
-from ssm_graph.mission.problem import Problem, build_problem
+from ssm_graph.mission.problem import NO_EXTRAS, Problem, build_problem
 from ssm_graph.simulation import Grade
 from ssm_graph.smoothers.batch import SsmSmoother
 from tests.helpers import (
@@ -36,17 +35,12 @@ def turned() -> tuple[Problem, States]:
 def test_rows_follow_gravity(end: int) -> None:
     """Differences over a kilometre, gravity led after the states, against the columns."""
     problem, states = turned()
-    states = retract(states, np.zeros((problem.n_keyframes, STATE_DIM)))
-    graph, gradient = inertial_graph(problem), gravity_gradient(problem.frame)
-    span_s = np.diff(problem.keyframe_s)
+    between, intervals = InertialRows(problem.frame, NO_EXTRAS), problem.chain.intervals
 
     def error_at(step: Array) -> Array:
-        moved = retract(states, step)
-        problem.chain.set_gravity(moved.p_n)
-        return -inertial_rows(graph, moved, gradient, span_s=span_s)[1, :, -1]
+        return np.asarray(between.errors(intervals, states.moved(step))[1])
 
-    problem.chain.set_gravity(states.p_n)
-    columns = inertial_rows(graph, states, gradient, span_s=span_s)[1]
+    columns = between.rows(intervals, states)[1]
     for axis in range(3):
         step = np.zeros((problem.n_keyframes, STATE_DIM))
         step[1 + end, POSITION.start + axis] = 1000.0

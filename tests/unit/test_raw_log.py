@@ -22,14 +22,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ssm_graph.base.errors import ConfigError
+from ssm_graph.base.units import DEGREE, exactly_in_unit
 from ssm_graph.io.mission_folder.reader import read_mission
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.io.raw_log import log as raw_log
 from ssm_graph.io.raw_log import replay as raw_replay
 from ssm_graph.io.raw_log.log import RawLog, replay
-from ssm_graph.io.raw_log.rows import messages_of
-from ssm_graph.base.units import DEGREE, exactly_in_unit
-from ssm_graph.io.raw_log.rows import ALWAYS, row_kinds
+from ssm_graph.io.raw_log.rows import ALWAYS, messages_of, row_kinds
 from ssm_graph.sensors.depth import DepthReading
 from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.gnss import Fix
@@ -149,7 +148,7 @@ def test_any_message_becomes_a_row_and_back(message: Message) -> None:
     assert repr(got) == repr(message)
 
 
-@settings(max_examples=15)
+@settings(max_examples=15, deadline=None)
 @given(st.lists(MESSAGES, max_size=8), st.integers(0, 8))
 def test_any_messages_are_replayed(messages: list[Message], n_before: int) -> None:
     """In the order in which they came, from any checkpoint on, whatever the times say."""

@@ -45,9 +45,7 @@ ATTITUDE: Final = Column(
     unit=DEGREE,
     optional=True,
 )
-_PITCH: Final = Column(
-    "", "pitch_deg", low=-90.0, high=90.0, expected="expected degrees up to 90"
-)
+_PITCH: Final = Column("", "pitch_deg", low=-90.0, high=90.0, expected="expected degrees up to 90")
 
 
 class _Reference(Instrument):
@@ -77,9 +75,7 @@ INITIAL_KEYS: Final[Mapping[str, Key]] = {
     ),
     "position_sigma_m": Key("position_sigma_enu", shape=(3,), positive=True, high=1e7),
     "velocity_sigma_m_per_s": Key("velocity_sigma_enu", shape=(3,), positive=True, high=1e3),
-    "attitude_sigma_deg": Key(
-        "attitude_sigma", shape=(3,), positive=True, high=360.0, unit=DEGREE
-    ),
+    "attitude_sigma_deg": Key("attitude_sigma", shape=(3,), positive=True, high=360.0, unit=DEGREE),
 }
 TABLES: Final = (*INSTRUMENTS, REFERENCE)
 """Everything that has a table, in the order in which tables are read."""

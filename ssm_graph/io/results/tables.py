@@ -160,9 +160,7 @@ def trajectory_columns(trajectory: Trajectory) -> Columns:
         **_spread("sigma_{}_m", enu, position_sigma, "%.7g"),
         **_spread("sigma_vel_{}_m_per_s", enu, trajectory.velocity_sigma_enu, "%.7g"),
         **_spread("sigma_{}_deg", rph, np.rad2deg(trajectory.attitude_sigma), "%.7g"),
-        **_spread(
-            "gyro_bias_{}_deg_per_h", xyz, trajectory.gyro_bias / DEG_PER_H, "%.9g"
-        ),
+        **_spread("gyro_bias_{}_deg_per_h", xyz, trajectory.gyro_bias / DEG_PER_H, "%.9g"),
         **_spread("accel_bias_{}_ug", xyz, trajectory.accel_bias / MICRO_G, "%.9g"),
         "n_beams": (trajectory.n_beams, "%.0f"),
     }

@@ -9,11 +9,13 @@ import numpy as np
 
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.times import MIN_SPACING_S
+from ssm_graph.graph.aids import AIDS
 from ssm_graph.live.estimator.rows import TimedRows
-from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.mission import Aids, Mission
 from ssm_graph.mission.vehicle import Vehicle
-from ssm_graph.sensors.depth import DEPTH, DepthLog
-from ssm_graph.sensors.dvl import Ping
+from ssm_graph.sensors.depth import DepthLog
+from ssm_graph.sensors.dvl import Ping, counted_sigma
 from ssm_graph.sensors.dvl_instrument import DVL
 from ssm_graph.sensors.dvl_readings import STUCK_PINGS, stuck_beams
 from ssm_graph.sensors.gnss import GNSS, GnssLog
@@ -44,6 +46,9 @@ class Buffers:
         }
         """By the section of the instrument."""
         self.imu, self.pings, self.fixes = (self.rows[one.section] for one in (IMU, DVL, GNSS))
+        sections = (kind.section.strip("[]") for kind in AIDS if kind.asks_for_keyframes)
+        self.asking = [self.fixes, *(self.rows[name] for name in sections if name in self.rows)]
+        """Those whose readings ask for keyframes of their own, pings apart."""
         n_beams = vehicle.mount.n_beams
         self.speeds, self.sigmas = slice(1, 1 + n_beams), slice(1 + n_beams, 1 + 2 * n_beams)
         """Columns of a ping's row."""
@@ -67,20 +72,30 @@ class Buffers:
         if isinstance(message, ImuSample):
             self._n_imu += 1
         elif isinstance(message, Ping):
-            nominal = self.vehicle.beam_sigma
-            if message.is_water:
-                nominal = self.vehicle.water_sigma or nominal
-            sigma = row[self.sigmas]
-            row[self.sigmas] = np.where(sigma > 0.0, sigma, nominal)
+            row[self.sigmas] = counted_sigma(
+                row[self.sigmas],
+                message.is_water,
+                ground_sigma=self.vehicle.beam_sigma,
+                water_sigma=self.vehicle.water_sigma,
+            )
         return self.rows[one.section].add(row)
 
-    def depths_between(self, begin_s: float, end_s: float) -> Array:
-        """Return the depths (D, 2) after ``begin_s`` up to and with ``end_s``: time, true depth."""
-        if DEPTH.section not in self.rows:
-            return np.zeros((0, 2))
-        rows = self.rows[DEPTH.section].between(begin_s, end_s)
-        log: DepthLog = DEPTH.log_of(rows, self._bare[DEPTH.section])
-        return np.column_stack([log.time_s, log.true_depth])
+    def logs_between(self, begin_s: float, end_s: float) -> Logs:
+        """Return what beside IMU and DVL belongs to a keyframe at ``end_s`` after ``begin_s``.
+
+        Depths are of the way up to it, the others of what stands at one, or is taken for it.
+        """
+
+        def log_of(bare: Any, later_s: float = MIN_SPACING_S) -> Any:
+            if type(bare) not in BY_LOG:  # of times, not of readings
+                return bare
+            one = BY_LOG[type(bare)]
+            rows = self.rows[one.section].between(begin_s + later_s, end_s + later_s)
+            return one.log_of(rows, bare)
+
+        vehicle = self.vehicle
+        depth = None if vehicle.depth is None else log_of(vehicle.depth, 0.0)
+        return Logs(log_of(vehicle.gnss), depth, Aids(*map(log_of, vehicle.aids)))
 
     def pings_between(self, begin_s: float, end_s: float) -> Array:
         """Return the pings (P, 2 B + 2) after ``begin_s`` up to and with ``end_s``, as they count.
@@ -131,18 +146,27 @@ class Buffers:
     def mission(self, frame: LocalFrame) -> Mission:
         """Return everything as a mission, to align with."""
         vehicle = self.vehicle
-        depths = self.rows.get(DEPTH.section, ())
         dvl = DVL.log_of(self.pings_between(-np.inf, np.inf), self._bare[DVL.section])
-        gnss: GnssLog = GNSS.log_of(self.fixes.all, vehicle.gnss)
+        gnss, depth, aids = self.logs_between(-np.inf, np.inf)
         return Mission(
             vehicle.name,
             frame,
             self.imu_log(-np.inf, self.imu.last_s, margin=0),
             dvl,
-            DEPTH.log_of(depths.all, vehicle.depth) if depths else None,
+            depth if depth is not None and len(depth.time_s) else None,
             gnss,
+            aids,
             current=vehicle.current,
         )
+
+
+class Logs(NamedTuple):
+    """Readings of what is beside IMU and DVL."""
+
+    gnss: GnssLog
+    depth: DepthLog | None
+    """None where there is no sensor"""
+    aids: Aids
 
 
 class Measured(NamedTuple):
@@ -151,7 +175,5 @@ class Measured(NamedTuple):
     time_s: float
     pings: Array
     """(P, 2 B + 2) time, speeds, sigmas, 1 for off the water"""
-    fixes: Array
-    """(F, 7) time, latitude, longitude, height, sigmas"""
-    depths: Array
-    """(D, 2) time, depth without the known offset"""
+    logs: Logs
+    """Since the keyframe before"""

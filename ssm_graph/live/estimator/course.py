@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections import deque
-from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -16,6 +15,7 @@ import numpy as np
 from ssm_graph.base.errors import SolverError
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import VELOCITY
+from ssm_graph.graph.inertial_rows import InertialRows
 from ssm_graph.live.estimator.buffers import Buffers, Measured
 from ssm_graph.live.estimator.events import EventLog
 from ssm_graph.live.estimator.keyframes import KeyframeMaker
@@ -26,7 +26,6 @@ from ssm_graph.mission.navigation import Severity
 from ssm_graph.smoothers.keyframe import Keyframe
 from ssm_graph.smoothers.stretch import Stretch, joined
 from ssm_graph.smoothers.window import Window
-from ssm_graph.smoothers.window_inertial import InertialRows
 
 REACH_S: Final = 0.1
 """A late inertial sample changes keyframes that are so much older: a ping's gyro reading is a mean,
@@ -141,8 +140,8 @@ class Course:
         last = self.newest
         keyframe = self._maker.make(measured, last_s=last.time_s)
         sigma = last.window.newest_sigma
-        if len(keyframe.beams.speed) == 0 and np.linalg.norm(sigma[VELOCITY]) > ANY_SPEED:
-            keyframe = replace(keyframe, speed_sigma=ANY_SPEED)
+        if len(keyframe.beams) == 0 and np.linalg.norm(sigma[VELOCITY]) > ANY_SPEED:
+            keyframe = keyframe.no_faster_than(ANY_SPEED)
         window, reserve = last.window.successor(), last.reserve.led_on(keyframe, self._inertial)
         doubt = doubt_of(last.watch, sigma, keyframe)
         if doubt is not None:

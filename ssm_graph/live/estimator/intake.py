@@ -21,8 +21,6 @@ from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.sensors.messages import Message, bad_number
 from ssm_graph.sensors.registry import BY_MESSAGE
 
-AIDED_BY: Final = frozenset({"imu", "dvl", "depth", "gnss"})
-"""Sections of the instruments whose messages change the answer; the others are kept beside."""
 AHEAD_S: Final = 5.0
 """Messages further ahead of the inertial data than this belong to another clock."""
 NEXT_S: Final = 2.5
@@ -69,7 +67,7 @@ class Intake:
             )
             return None
         message = self._sifted(message, time_s, now_s)
-        if not self._add(message) or _name(message) not in AIDED_BY:
+        if not self._add(message):
             return None
         return self._since_stuck(message, time_s) if isinstance(message, Ping) else time_s
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ssm_graph.base.frozen import Array
+from ssm_graph.imu.ping_motion import mean_gyro
 from ssm_graph.mission.mission import Mission
-from ssm_graph.mission.ping_motion import mean_gyro
 from ssm_graph.sensors.standstill import Standstill
 
 PARITY_GATE = 5.0
