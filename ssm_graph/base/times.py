@@ -24,6 +24,18 @@ def nearest(keyframe_s: Array, time_s: Array) -> Indices:
     return np.searchsorted(middle, time_s)
 
 
+def last_readings(keyframe_s: Array, time_s: Array) -> tuple[Indices, Indices]:
+    """Return the keyframes (M,) with a reading since the keyframe before, and the last one of each.
+
+    Of the first keyframe it is a reading at its own time.
+    """
+    late_s = keyframe_s + MIN_SPACING_S
+    reading = np.searchsorted(time_s, late_s, side="right") - 1
+    before = np.searchsorted(time_s, np.append(keyframe_s[0] - MIN_SPACING_S, late_s[:-1]))
+    keyframe = np.flatnonzero(reading >= before)
+    return keyframe, reading[keyframe]
+
+
 def left_out(what: str, count: int, start_s: float, end_s: float) -> tuple[str, ...]:
     """Return the note on measurements outside the keyframes, if there are any."""
     if count == 0:

@@ -16,7 +16,7 @@ from factors import so3
 from factors.compass_heading import CompassErrors, heading_residual
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
-from ssm_graph.base.times import MIN_SPACING_S
+from ssm_graph.base.times import last_readings
 from ssm_graph.base.usable import require_finite, require_increasing, require_positive
 from ssm_graph.engine.error_state import ROTATION
 from ssm_graph.engine.extras import Extra
@@ -68,11 +68,8 @@ class Headings(Aid):
         log = aids.get(HeadingLog)
         if log is None:
             return None
-        time_s, late_s = log.time_s, keyframe_s + MIN_SPACING_S
-        reading = np.searchsorted(time_s, late_s, side="right") - 1
-        before = np.searchsorted(time_s, np.append(keyframe_s[0] - MIN_SPACING_S, late_s[:-1]))
-        keyframe = np.flatnonzero(reading >= before)
-        reading = reading[keyframe]
+        time_s = log.time_s
+        keyframe, reading = last_readings(keyframe_s, time_s)
         turn_b = turn_between(imu, time_s[reading], keyframe_s[keyframe])
         if begin_s is None:
             begin_s = float(time_s[0]) if len(time_s) else 0.0
