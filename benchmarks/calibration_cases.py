@@ -10,14 +10,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ssm_graph.base.frozen import Array
+from ssm_graph.graph.aids.depth import DEPTH_OFFSET
+from ssm_graph.graph.aids.gnss import GNSS_LEVER_ARM, GNSS_TIME_OFFSET
 from ssm_graph.mission.calibration import (
-    DEPTH_OFFSET,
     DVL_LEVER_ARM,
     DVL_MOUNTING,
     DVL_SCALE,
     DVL_TIME_OFFSET,
-    GNSS_LEVER_ARM,
-    GNSS_TIME_OFFSET,
 )
 from ssm_graph.mission.mission import Mission
 from ssm_graph.sensors.depth import DepthCalibration

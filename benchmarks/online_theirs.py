@@ -15,20 +15,22 @@ from gtsam.symbol_shorthand import B, V, X
 from factors.dvl_beam import dvl_beam_factor
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
-from ssm_graph.engine.states import AugmentedStates
+from ssm_graph.engine.states import States
+from ssm_graph.graph.aids.depth import DepthMeans
 from ssm_graph.graph.gtsam_graph import prior_graph
+from ssm_graph.graph.inertial_rows import InertialRows
+from ssm_graph.imu.preintegration import InertialChain, Preintegrated, gravity_between
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
-from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator.asked import sensors_of_vehicle
 from ssm_graph.live.estimator.buffers import Buffers
 from ssm_graph.live.estimator.keyframes import KeyframeMaker
 from ssm_graph.mission.estimate import Trajectory
 from ssm_graph.mission.mission import Mission
-from ssm_graph.mission.problem import ProblemConfig, build_problem, start_of
+from ssm_graph.mission.problem import NO_EXTRAS, ProblemConfig, build_problem, start_of
 from ssm_graph.mission.trajectory import trajectory_at
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors
-from ssm_graph.smoothers.window_inertial import InertialRows
-from ssm_graph.smoothers.window_rows import depth_targets
+from ssm_graph.smoothers.window_aids import row_states
 
 CAUCHY_K = 2.3849
 """The usual constant: 95 % efficiency without outliers."""
@@ -89,6 +91,8 @@ class Timed(NamedTuple):
     """A keyframe, and what it took to make it."""
 
     keyframe: Keyframe
+    chain: InertialChain
+    """The inertial data before it, for GTSAM's factor"""
     seconds: float
     cpu_s: float
 
@@ -97,7 +101,7 @@ def keyframes_live(mission: Mission) -> Iterator[Timed]:
     """Yield the keyframes that the live estimator makes, after the first one."""
     vehicle = vehicle_of(mission)
     buffers = Buffers(vehicle)
-    maker = KeyframeMaker(buffers, mission.frame, ProblemConfig())
+    maker = KeyframeMaker(buffers, mission.frame, ProblemConfig(), begin_s=0.0)
     assert mission.initial is not None
     last_s = mission.initial.time_s
     for message in messages_of(mission):
@@ -108,7 +112,8 @@ def keyframes_live(mission: Mission) -> Iterator[Timed]:
             if measured is None:
                 break
             keyframe = maker.make(measured, last_s=last_s)
-            yield Timed(keyframe, time.perf_counter() - begin, time.process_time() - cpu)
+            took = time.perf_counter() - begin, time.process_time() - cpu
+            yield Timed(keyframe, maker.chain(last_s, measured.time_s), *took)
             last_s = measured.time_s
             buffers.drop_before(last_s - 5.0)
 
@@ -119,13 +124,12 @@ class Theirs:
     def __init__(self, mission: Mission, config: TheirConfig) -> None:
         self.config, self._frame = config, mission.frame
         self._sensors: Sensors = sensors_of_vehicle(vehicle_of(mission), mission.frame)
-        self._inertial = InertialRows(mission.frame)
+        self._inertial = InertialRows(mission.frame, NO_EXTRAS)
         self._loss = gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY_K)
         problem = build_problem(mission)
         start = start_of(problem)
-        self.states = AugmentedStates.of(start)
+        self.states = States.at_start(start)
         self.covariance = start.covariance
-        self._last = Keyframe.unmeasured(problem.start.time_s, np.zeros(3), None)
         self._k = 0
         self.smoother = self._make()
         self._update(prior_graph(problem), self.states, problem.start.time_s)
@@ -145,30 +149,32 @@ class Theirs:
         isam.findUnusedFactorSlots = True
         return gtsam.IncrementalFixedLagSmoother(config.lag_s, isam)
 
-    def add(self, keyframe: Keyframe) -> None:
-        """Take a keyframe; the newest state follows."""
-        predicted = self._inertial.predict(keyframe, self.states)
+    def add(self, keyframe: Keyframe, measured: Preintegrated) -> None:
+        """Take a keyframe and the inertial data before it; the newest state follows."""
+        predicted = self._predicted(keyframe)
         i, j = self._k, self._k + 1
         graph = gtsam.NonlinearFactorGraph()
-        assert keyframe.way is not None
-        graph.add(
-            gtsam.GalileanCombinedImuFactor(
-                X(i), V(i), X(j), V(j), B(i), B(j), keyframe.way.measured
-            )
-        )
+        graph.add(gtsam.GalileanCombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), measured))
         self._add_beams(graph, keyframe, j)
-        if len(keyframe.depth):
-            self._add_depth(graph, keyframe, predicted, j)
+        depth = keyframe.aids.get(DepthMeans.name)
+        if isinstance(depth, DepthMeans):
+            self._add_depth(graph, depth, predicted, j)
         self._k = j
         self._update(graph, predicted, keyframe.time_s)
         for _ in range(self.config.extra_updates):
             self.smoother.update()
-        self._last = keyframe
         self.states = self._newest()
 
-    def _update(
-        self, graph: gtsam.NonlinearFactorGraph, at: AugmentedStates, time_s: float
-    ) -> None:
+    def gravity_before(self, keyframe: Keyframe) -> Array:
+        """Return gravity (1, 3) midway to where a keyframe is predicted."""
+        pair = self.states.followed_by(self._predicted(keyframe))
+        return gravity_between(self._frame, pair.p_n)
+
+    def _predicted(self, keyframe: Keyframe) -> States:
+        assert keyframe.inertial is not None
+        return self._inertial.predict(keyframe.inertial, self.states).states
+
+    def _update(self, graph: gtsam.NonlinearFactorGraph, at: States, time_s: float) -> None:
         k, values = self._k, gtsam.Values()
         values.insert(X(k), gtsam.Pose3(gtsam.Rot3(at.R_nb[0]), at.p_n[0]))
         values.insert(V(k), at.v_n[0])
@@ -186,7 +192,7 @@ class Theirs:
                 speed=float(beams.speed[i]),
                 gyro_b=beams.gyro_b[i],
                 beam_b=beams.beam_b[i],
-                lever_arm_b=self._sensors.dvl_arm_b,
+                lever_arm_b=beams.lever_arm_b,
                 omega_ie_n=self._frame.omega_ie_n,
                 loss=self._loss,
             )
@@ -195,24 +201,23 @@ class Theirs:
     def _add_depth(
         self,
         graph: gtsam.NonlinearFactorGraph,
-        keyframe: Keyframe,
-        predicted: AugmentedStates,
+        depth: DepthMeans,
+        predicted: States,
         k: int,
     ) -> None:
         """Add the mean of the readings, carried along the track as ours are, once."""
-        both = self.states.followed_by(predicted)
-        pair = [self._last, keyframe]
-        targets = depth_targets(self._sensors, pair, both, first_rise=0.0).take(np.s_[1:])
+        before, at = (row_states(self._sensors, states) for states in (self.states, predicted))
+        target_n, up_n = depth.led_along(before, at).target(at)
         root = np.zeros((3, 3))
-        root[0] = targets.up_n[0] * np.sqrt(len(keyframe.depth)) / self._sensors.depth_sigma
+        root[0] = up_n[0] * depth.root_information[0, 0]
         noise = gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
-        graph.add(gtsam.GPSFactorArm(X(k), targets.sensor_n[0], self._sensors.depth_arm_b, noise))
+        graph.add(gtsam.GPSFactorArm(X(k), target_n[0], depth.lever_arm_b, noise))
 
-    def _newest(self) -> AugmentedStates:
+    def _newest(self) -> States:
         k, smoother = self._k, self.smoother
         pose, v_n = smoother.calculateEstimatePose3(X(k)), smoother.calculateEstimateVector(V(k))
         bias = smoother.calculateEstimateConstantBias(B(k))
-        return AugmentedStates(
+        return States(
             pose.rotation().matrix()[None],
             pose.translation()[None],
             v_n[None],
@@ -234,12 +239,12 @@ class _Columns:
 
     def __init__(self) -> None:
         self.time_s: list[float] = []
-        self.states: list[AugmentedStates] = []
+        self.states: list[States] = []
         self.covariance: list[Array] = []
         self.seconds: list[tuple[float, float, float, float]] = []
 
     def trajectory(self, frame: LocalFrame) -> Trajectory:
-        states = AugmentedStates(*(np.concatenate(c) for c in zip(*self.states, strict=True)))
+        states = States(*(np.concatenate(c) for c in zip(*self.states, strict=True)))
         return trajectory_at(
             frame,
             np.array(self.time_s),
@@ -257,7 +262,8 @@ def run_theirs(mission: Mission, config: TheirConfig, *, most_wall_s: float = np
     for timed in keyframes_live(mission):
         begin, cpu = time.perf_counter(), time.process_time()
         try:
-            theirs.add(timed.keyframe)
+            measured = timed.chain.measured(theirs.gravity_before(timed.keyframe))[0]
+            theirs.add(timed.keyframe, measured)
             updated = time.perf_counter()
             if reads:
                 covariance = theirs.read_covariance()

@@ -20,14 +20,15 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import V, X
 
-import ssm_graph.graph.linearize as linearize
 import ssm_graph.smoothers.batch as batch
 from benchmarks.speed_plain import dead_reckoned, plain_graph
 from factors.similarity import LogKernel
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps
+from ssm_graph.engine.chain import Chain
+from ssm_graph.engine.states import States
 from ssm_graph.graph.first_values import first_values
-from ssm_graph.graph.gtsam_graph import chain_ordering, graph_without_beams
+from ssm_graph.graph.gtsam_graph import chain_ordering, graph_without_beams, gtsam_values
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.problem import Problem, build_problem
@@ -111,12 +112,13 @@ def _timed_calls(parts: dict[str, float]) -> Iterator[None]:
     """Put a clock on the steps of the loop while the block runs; they do not call each other."""
     steps: tuple[tuple[Any, str, str], ...] = (
         (batch, "first_values_steps", "first pass"),
-        (GraphLinearizer, "follow", "linearise: gravity and depth targets"),
+        (GraphLinearizer, "follow", "linearise: depth targets"),
         (GraphLinearizer, "beam_rows", "linearise: beams"),
-        (GraphLinearizer, "inertial_rows_steps", "linearise: GTSAM's inertial factors"),
-        (linearize, "solve_bordered_steps", "eliminate by QR, solve, marginals"),
+        (GraphLinearizer, "inertial_rows", "linearise: inertial data"),
+        (Chain, "eliminate_steps", "eliminate by QR"),
+        (Chain, "solve_steps", "solve, marginals"),
         (GraphLinearizer, "cost", "cost"),
-        (GraphLinearizer, "retract", "retract"),
+        (States, "moved", "retract"),
         (batch, "trajectory_from_states", "result"),
     )
     originals = [(owner, name, getattr(owner, name)) for owner, name, _ in steps]
@@ -163,7 +165,7 @@ def time_plain(
     with timing.part("preintegrate and build"):
         graph = plain_graph(mission, problem)
     if start is PlainStart.FIRST_PASS:
-        initial = first_values(problem, kernel=LogKernel()).states.values
+        initial = gtsam_values(first_values(problem, kernel=LogKernel()).states)
     else:
         initial = dead_reckoned(graph, problem)
     params = gtsam.LevenbergMarquardtParams()
@@ -198,7 +200,7 @@ def time_floor(path: Path, n_passes: int) -> Timing:
         graph.add(gtsam.RangeFactor3D(X(k), V(k), float(distance[k]), noise))
     for _ in range(n_passes):
         with timing.part("linearise"):
-            linear = graph.linearize(states.values)
+            linear = graph.linearize(gtsam_values(states))
         with timing.part("eliminate by QR and solve"):
             delta = linear.eliminateMultifrontal(ordering, gtsam.EliminateQR).optimize()
     timing.n_iterations = n_passes

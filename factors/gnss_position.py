@@ -52,11 +52,12 @@ def fix_residual(
     R_nb : (..., 3, 3) rotation, body to navigation.
     p_n, v_n : (..., 3) position and velocity of the body origin, m and m/s.
     lever_arm_b : (3,) body origin to antenna with its error, m.
-    time_offset : () tau, s.
+    time_offset : (...) tau, s, of each fix, or () of all.
     omega_b : (..., 3) body rate, rad/s: it moves the antenna about.
     position_n : (..., 3) the fix, m.
     """
-    late = time_offset * cross(omega_b, lever_arm_b)
+    late_s = np.asarray(time_offset)[..., None]
+    late = late_s * cross(omega_b, lever_arm_b)
     arm = lever_arm_b - late
     swing_n = times(R_nb, cross(omega_b, lever_arm_b))
     n_fixes = np.shape(p_n)[:-1]
@@ -64,10 +65,10 @@ def fix_residual(
     # Column i of [omega x] is omega x e_i.
     turned = np.swapaxes(cross(omega_b[..., None, :], identity), -1, -2)
     return FixResidual(
-        error=p_n + times(R_nb, arm) - time_offset * v_n - position_n,
+        error=p_n + times(R_nb, arm) - late_s * v_n - position_n,
         error_D_rotation=cross(arm[..., None, :], R_nb),
         error_D_position=R_nb,
-        error_D_velocity_n=-time_offset * identity,
-        error_D_lever_arm_b=R_nb @ (identity - time_offset * turned),
+        error_D_velocity_n=-late_s[..., None] * identity,
+        error_D_lever_arm_b=R_nb @ (identity - late_s[..., None] * turned),
         error_D_time_offset=-(v_n + swing_n),
     )

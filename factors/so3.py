@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 _NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
+_EYE = np.eye(3)
 SMALL_SQUARE: Final = 1e-2
 """rad^2; up to it series are used, where closed forms lose digits."""
 
@@ -73,11 +74,17 @@ def left_jacobian_solve(phi: Array, vector: Array) -> Array:
     return np.asarray(vector - 0.5 * once + factor * cross(phi, once))
 
 
+_UNSKEW = np.zeros((9, 4))
+for _axis, (_plus, _minus) in enumerate(((7, 5), (2, 6), (3, 1))):
+    _UNSKEW[_plus, _axis], _UNSKEW[_minus, _axis] = 0.5, -0.5
+    _UNSKEW[4 * _axis, 3] = 0.5
+
+
 def log(R: Array) -> Array:
     """Return the rotation vector (..., 3) of a rotation matrix, rad; angles well below pi."""
-    sine_axis = 0.5 * (R[..., [2, 0, 1], [1, 2, 0]] - R[..., [1, 2, 0], [2, 0, 1]])
-    sine = np.linalg.norm(sine_axis, axis=-1, keepdims=True)
-    cosine = 0.5 * (np.trace(R, axis1=-2, axis2=-1)[..., None] - 1.0)
+    parts = R.reshape(*R.shape[:-2], 9) @ _UNSKEW
+    sine_axis, cosine = parts[..., :3], parts[..., 3:] - 0.5
+    sine = np.sqrt((sine_axis * sine_axis).sum(axis=-1, keepdims=True))
     angle = np.arctan2(sine, cosine)
     scale = np.divide(angle, sine, out=np.ones_like(sine), where=sine > 0.0)
     return np.asarray(scale * sine_axis)
@@ -109,6 +116,71 @@ def coefficients(phi: Array) -> tuple[Array, Array, Array]:
         second = np.where(large, 2.0 * (np.sin(0.5 * angle) / angle) ** 2, second)
         third = np.where(large, (1.0 - sinc) / square, third)
     return first, second, third
+
+
+# Powers of the square of the angle in: (1 - cos a)/a^2, (a - sin a)/a^3, and what, times the
+# vector, is the gradient of each; and in (1 - a/2 cot a/2)/a^2.
+_SERIES = np.array(
+    [
+        [1 / 2, 1 / 6, -1 / 12, -1 / 60, 1 / 12],
+        [-1 / 24, -1 / 120, 1 / 180, 1 / 1260, 1 / 720],
+        [1 / 720, 1 / 5040, -1 / 6720, -1 / 60480, 1 / 30240],
+        [-1 / 40320, -1 / 362880, 1 / 453600, 1 / 4989600, 1 / 1209600],
+        [1 / 3628800, 1 / 39916800, -1 / 47900160, -1 / 622702080, 1 / 47900160],
+    ]
+)
+_POWERS = np.arange(5)
+
+
+class Jacobians(NamedTuple):
+    """Of rotation vectors (..., 3), all that derivatives of extended poses are made of."""
+
+    phi: Array
+    skew: Array
+    """(..., 3, 3)"""
+    coefficients: Array
+    """(..., 5)"""
+
+    @classmethod
+    def of(cls, phi: Array) -> Jacobians:
+        """Return them of rotation vectors, rad, angles below 2 pi."""
+        square = (phi * phi).sum(axis=-1, keepdims=True)
+        found = square**_POWERS @ _SERIES
+        if square.max(initial=0.0) > SMALL_SQUARE:
+            large = square > SMALL_SQUARE
+            square = np.where(large, square, 1.0)
+            first, second, third = coefficients(phi)
+            closed = np.concatenate(
+                [
+                    second,
+                    third,
+                    (first - 2.0 * second) / square,
+                    (second - 3.0 * third) / square,
+                    (1.0 - 0.5 * first / second) / square,
+                ],
+                axis=-1,
+            )
+            found = np.where(large, closed, found)
+        return cls(phi, skew(phi), found)
+
+    def left(self) -> Array:
+        """Return :func:`left_jacobian` (..., 3, 3)."""
+        S, k = self.skew, self.coefficients[..., None]
+        return np.asarray(_EYE + k[..., :1, :] * S + k[..., 1:2, :] * (S @ S))
+
+    def left_inverse(self) -> Array:
+        """Return its inverse (..., 3, 3)."""
+        S = self.skew
+        return np.asarray(_EYE - 0.5 * S + self.coefficients[..., 4:, None] * (S @ S))
+
+    def slope(self, vectors: Array) -> Array:
+        """Return how ``left() a`` follows the rotation vector, (..., m, 3, 3) of m ``a``."""
+        S, k = self.skew, self.coefficients[..., None, :]
+        once = vectors @ S.mT  # phi x a
+        along = k[..., 2:3] * once + k[..., 3:4] * (once @ S.mT)
+        straight = skew(k[..., :1] * vectors + k[..., 1:2] * once)
+        bent = k[..., 1:2, None] * (S[..., None, :, :] @ skew(vectors))
+        return np.asarray(along[..., None] * self.phi[..., None, None, :] - straight - bent)
 
 
 def right_jacobian_series(adjoint: Array, *, angle: float) -> Array:

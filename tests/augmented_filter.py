@@ -13,6 +13,8 @@ from dataclasses import dataclass, field
 from typing import NamedTuple, final
 
 import numpy as np
+from ssm_graph.imu.arrays import interval_arrays
+from ssm_graph.mission.heights import HeightTrack, height_on_the_way, height_track
 
 from factors.depth_height import height_residual
 from factors.dvl_calibration import calibrated_beam_residual, no_way_back, turned_instrument
@@ -32,7 +34,6 @@ from ssm_graph.engine.states import AugmentedStates, NavigationStates, local_D_d
 from ssm_graph.filters.navigation.process import Process
 from ssm_graph.filters.rules.model import NOMINAL, Iterate, Runs
 from ssm_graph.filters.rules.ssm import SsmUpdate
-from ssm_graph.imu.arrays import interval_arrays
 from ssm_graph.mission.calibration import (
     DEPTH_OFFSET,
     DVL_BEAM_SCALE,
@@ -45,7 +46,6 @@ from ssm_graph.mission.calibration import (
     windowed,
 )
 from ssm_graph.mission.current import CURRENT, CURRENT_UP
-from ssm_graph.mission.heights import HeightTrack, height_on_the_way, height_track
 from ssm_graph.mission.problem import Problem, start_of, with_white_noise
 from ssm_graph.sensors.dvl import N_BEAMS
 

@@ -14,8 +14,9 @@ from scipy.stats import chi2
 from ssm_graph.base.errors import SolverError
 from ssm_graph.base.frames import R_lb_from_roll_pitch_heading
 from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import STATE_DIM
+from ssm_graph.engine.states import States
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.graph.states import States, states_from_arrays
 from ssm_graph.mission.estimate import Status, Trajectory
 from ssm_graph.mission.mission import InitialState, Mission
 from ssm_graph.mission.problem import Problem
@@ -136,7 +137,7 @@ def states_from_geodetic(
     R_nl = frame.R_nl_at(p_n)
     R_nb = R_nl @ R_lb_from_roll_pitch_heading(*place.roll_pitch_heading.T)
     v_n = np.einsum("kij,kj->ki", R_nl, place.velocity_enu)
-    return states_from_arrays(R_nb, p_n, v_n, np.hstack([accel_bias, gyro_bias]))
+    return States.of(R_nb, p_n, v_n, np.hstack([accel_bias, gyro_bias]))
 
 
 def true_states(problem: Problem, sim: SimulatedMission) -> States:
@@ -173,4 +174,4 @@ def covariances(problem: Problem, states: States, weights: Array) -> Array:
     """Return the covariance (K, 15, 15) of the whole error state at an answer."""
     linearizer = GraphLinearizer(problem)
     linearizer.follow(states)
-    return linearizer.solve(states, linearizer.beam_rows(states), weights).covariance
+    return linearizer.solve(states, linearizer.beam_rows(states), weights).covariance(STATE_DIM)

@@ -28,7 +28,7 @@ from ssm_graph.cli.online_arguments import (
 from ssm_graph.cli.options import add_command, kernel_from
 from ssm_graph.io.mission_folder.reader import read_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle, vehicle_of
-from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator import ONLINE, FixedLagSmoother
 from ssm_graph.live.run.interfaces import Connections, Engine
 from ssm_graph.live.run.replay_source import ReplaySource

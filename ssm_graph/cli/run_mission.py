@@ -113,9 +113,9 @@ def withhold_gnss(mission: Mission, until_s: float) -> tuple[Mission, GnssLog]:
     gnss = mission.gnss
     if gnss is None:
         raise ConfigError("--gnss-until: expected a mission with GNSS, got one without")
-    used = gnss.time_s < mission.imu.start_s + until_s
+    used = gnss.valid_s < mission.imu.start_s + until_s
     if not used.any() or used.all():
-        first, last = gnss.time_s[[0, -1]] - mission.imu.start_s
+        first, last = gnss.valid_s[[0, -1]] - mission.imu.start_s
         raise ConfigError(
             f"--gnss-until: expected a time between the first fix at {first:.1f} s and the last "
             f"at {last:.1f} s, got {until_s:g} s"

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.engine.bordered import BorderedSolution
+from ssm_graph.engine.chain import ChainSolution
 
 
 class Evidence(NamedTuple):
@@ -57,7 +57,7 @@ class _Carried(NamedTuple):
 class ChainEvidence:
     """One solution of the chain, ready for columns anywhere along it."""
 
-    def __init__(self, solution: BorderedSolution, beams: WhitenedBeams) -> None:
+    def __init__(self, solution: ChainSolution, beams: WhitenedBeams) -> None:
         self._beams, self._n = beams, solution.R.shape[1]
         self._first_row = np.searchsorted(beams.keyframe, np.arange(len(solution.R) + 1)).tolist()
         R_invT = np.swapaxes(np.linalg.inv(solution.R), 1, 2)

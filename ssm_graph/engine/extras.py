@@ -40,6 +40,9 @@ class Extra(ReadOnlyArrays):
     """Per square root of a second; zero for a constant."""
     correlation_s: float = math.inf
     """A walk forgets within so much; infinite for a random walk, which does not."""
+    as_a_turn: float = 1e6
+    """So much of it bends what is measured as much as a turn of 1 rad; of most, measurements are
+    linear functions."""
 
     @classmethod
     def gauss_markov(
@@ -54,6 +57,11 @@ class Extra(ReadOnlyArrays):
         """Return a walk that keeps its variance; each component has the same ``sigma``."""
         density = sigma * math.sqrt(2.0 / correlation_s)
         return cls(name, labels, np.full(len(labels), sigma), unit, density, correlation_s)
+
+    @property
+    def is_lasting(self) -> bool:
+        """Whether it tells what lasts of an instrument: a calibration, or the place of a beacon."""
+        return math.isinf(self.correlation_s)
 
     @property
     def is_walk(self) -> bool:
@@ -93,6 +101,11 @@ class Extras:
     def sigma(self) -> Array:
         """(E,) prior sigmas of all, in the order of the columns."""
         return np.concatenate([np.zeros(0), *(block.sigma for block in self.blocks)])
+
+    @property
+    def walks(self) -> Extras:
+        """Those that have a value at every keyframe."""
+        return Extras(tuple(block for block in self.blocks if block.is_walk))
 
     def columns(self, name: str) -> slice:
         """Return the columns of a variable in a row."""

@@ -8,8 +8,8 @@ import gtsam
 import numpy as np
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.engine.error_state import NO_EXTRA, InitialMoments
-from ssm_graph.engine.states import AugmentedStates, KeyframeStates
+from ssm_graph.engine.error_state import InitialMoments
+from ssm_graph.engine.states import States
 
 
 class MarginalPrior(NamedTuple):
@@ -32,13 +32,13 @@ class MarginalPrior(NamedTuple):
     offset: Array
     """(n,)"""
 
-    def whitened(self, states: KeyframeStates, extra: Array = NO_EXTRA) -> Array:
-        """Return the whitened error (n,) of the first keyframe of ``states``, ``extra`` (E,)."""
-        return np.asarray(self.root_information @ self._deviation(states, extra) - self.offset)
+    def whitened(self, states: States) -> Array:
+        """Return the whitened error (n,) of the first keyframe of ``states``."""
+        return np.asarray(self.root_information @ self._deviation(states) - self.offset)
 
-    def rows(self, states: KeyframeStates, extra: Array = NO_EXTRA) -> Array:
+    def rows(self, states: States) -> Array:
         """Return whitened rows (n, n + 1) at the first keyframe of ``states``, ``b`` last."""
-        deviation = self._deviation(states, extra)
+        deviation = self._deviation(states)
         n = len(deviation)
         rows = np.empty((n, n + 1))
         rows[:, :n] = self.root_information
@@ -47,14 +47,14 @@ class MarginalPrior(NamedTuple):
         rows[:, n] = self.offset - self.root_information @ deviation
         return rows
 
-    def _deviation(self, states: KeyframeStates, extra: Array) -> Array:
+    def _deviation(self, states: States) -> Array:
         return np.concatenate(
             [
                 gtsam.Rot3.Logmap(gtsam.Rot3(self.R_nb.T @ states.R_nb[0])),
                 self.R_nb.T @ (states.p_n[0] - self.p_n),
                 states.v_n[0] - self.v_n,
                 states.bias[0] - self.bias,
-                extra - self.extra,
+                states.walks[0] - self.extra,
             ]
         )
 
@@ -72,9 +72,9 @@ def prior_at_start(start: InitialMoments) -> MarginalPrior:
     )
 
 
-def prior_on(state: AugmentedStates, root_information: Array, *, offset: Array) -> MarginalPrior:
+def prior_on(state: States, root_information: Array, *, offset: Array) -> MarginalPrior:
     """Return a prior on a keyframe at its state (1, ...) that is linearised there."""
-    R_nb, p_n, v_n, bias, extra = (column[0].copy() for column in state)
+    R_nb, p_n, v_n, bias, extra = (column[0].copy() for column in state[:5])
     return MarginalPrior(R_nb, p_n, v_n, bias, extra, root_information, offset)
 
 

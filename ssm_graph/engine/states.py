@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from factors import so3
 from ssm_graph.base.frozen import Array
-from ssm_graph.engine.error_state import POSITION, ROTATION, STATE_DIM, VELOCITY, InitialMoments
+from ssm_graph.engine.error_state import (
+    NO_EXTRA,
+    POSITION,
+    ROTATION,
+    STATE_DIM,
+    VELOCITY,
+    InitialMoments,
+)
 
 
 class NavigationStates(NamedTuple):
@@ -57,8 +64,8 @@ class NavigationStates(NamedTuple):
         )
 
 
-class AugmentedStates(NamedTuple):
-    """States of K keyframes of one run, each with its own values of the extra variables."""
+class States(NamedTuple):
+    """States of K keyframes of one run, with the variables beside them."""
 
     R_nb: Array
     """(K, 3, 3)"""
@@ -68,37 +75,64 @@ class AugmentedStates(NamedTuple):
     """(K, 3) m/s"""
     bias: Array
     """(K, 6) accelerometer m/s^2, gyro rad/s"""
-    extra: Array
-    """(K, E) zero where they are as stated"""
+    walks: Array
+    """(K, s) variables that have a value at every keyframe, zero where they are as stated"""
+    constants: Array = NO_EXTRA
+    """(C,) those that hold for all of them"""
 
     @classmethod
-    def of(cls, moments: InitialMoments) -> AugmentedStates:
-        """Return the mean (1, ...) of a keyframe."""
+    def of(
+        cls,
+        R_nb: Array,
+        p_n: Array,
+        v_n: Array,
+        bias: Array,
+        walks: Array | None = None,
+        constants: Array = NO_EXTRA,
+    ) -> States:
+        """Return states, without the variables that are left out."""
+        walks = np.zeros((len(p_n), 0)) if walks is None else walks
+        return cls(R_nb, p_n, v_n, bias, walks, constants)
+
+    @classmethod
+    def at_start(cls, moments: InitialMoments) -> States:
+        """Return the mean (1, ...) of a keyframe that carries its other variables in its state."""
         mean = (moments.R_nb, moments.p_n, moments.v_n, moments.bias, moments.extra)
         return cls(*(column[None] for column in mean))
 
     @property
     def navigation(self) -> NavigationStates:
-        """The states without the extra variables."""
-        return NavigationStates(self.R_nb, self.p_n, self.v_n, self.bias)
+        """The states without the other variables."""
+        return NavigationStates(*self[:4])
 
     def moments(self, covariance: Array) -> InitialMoments:
-        """Return the first of these keyframes as mean with its covariance (15 + E, 15 + E)."""
-        R_nb, p_n, v_n, bias, extra = (column[0] for column in self)
-        return InitialMoments(R_nb, p_n, v_n, bias, covariance, extra)
+        """Return the first of these keyframes as mean with its covariance (15 + s, 15 + s)."""
+        R_nb, p_n, v_n, bias, walks = (column[0] for column in self[:5])
+        return InitialMoments(R_nb, p_n, v_n, bias, covariance, walks)
 
-    def moved(self, step: Array) -> AugmentedStates:
-        """Return the states moved by local errors (K, 15 + E), the pose as GTSAM retracts it."""
+    def moved(self, step: Array, constants_step: Array | None = None) -> States:
+        """Return the states moved by local errors (K, 15 + s), the pose as GTSAM retracts it.
+
+        ``constants_step`` is (C,); the constants stay as they are when it is left out.
+        """
         own = self.navigation.moved(step[:, :STATE_DIM])
-        return AugmentedStates(*own, self.extra + step[:, STATE_DIM:])
+        constants = self.constants if constants_step is None else self.constants + constants_step
+        return States(*own, walks=self.walks + step[:, STATE_DIM:], constants=constants)
 
-    def take(self, keyframes: NDArray[np.intp] | slice) -> AugmentedStates:
+    def is_same(self, other: States) -> bool:
+        """Return whether these are the other states, to the last bit."""
+        return all(np.array_equal(a, b) for a, b in zip(self, other, strict=True))
+
+    def take(self, keyframes: NDArray[np.intp] | slice) -> States:
         """Return the states of some keyframes."""
-        return AugmentedStates(*(column[keyframes] for column in self))
+        R_nb, p_n, v_n, bias, walks = (column[keyframes] for column in self[:5])
+        return States(R_nb, p_n, v_n, bias, walks, self.constants)
 
-    def followed_by(self, other: AugmentedStates) -> AugmentedStates:
-        """Return these states, then the others."""
-        return AugmentedStates(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
+    def followed_by(self, *others: States) -> States:
+        """Return these states, then the others, which have the same constants."""
+        parts = zip(*(part[:5] for part in (self, *others)), strict=True)
+        R_nb, p_n, v_n, bias, walks = (np.concatenate(columns) for columns in parts)
+        return States(R_nb, p_n, v_n, bias, walks, self.constants)
 
 
 def local_D_deviation(xi: Array) -> Array:
@@ -110,23 +144,3 @@ def local_D_deviation(xi: Array) -> Array:
     jacobian[:, :3, :3] = so3.left_jacobian(-xi[:, ROTATION])
     jacobian[:, 3:, 3:] = so3.exp(-xi[:, ROTATION])
     return jacobian
-
-
-class KeyframeStates(Protocol):
-    """Arrays of K keyframes, whoever estimated them."""
-
-    @property
-    def R_nb(self) -> Array:
-        """(K, 3, 3)."""
-
-    @property
-    def p_n(self) -> Array:
-        """(K, 3) m."""
-
-    @property
-    def v_n(self) -> Array:
-        """(K, 3) m/s."""
-
-    @property
-    def bias(self) -> Array:
-        """(K, 6) accelerometer m/s^2, gyro rad/s."""

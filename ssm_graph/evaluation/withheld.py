@@ -24,7 +24,7 @@ def reference_from_gnss(gnss: GnssLog, trajectory: Trajectory) -> Reference:
     Errors contain the noise of the fixes; their sigmas count beside those of the estimate.
     """
     angles = interpolate_within(
-        gnss.time_s,
+        gnss.valid_s,
         known_s=trajectory.time_s,
         values=np.unwrap(trajectory.roll_pitch_heading, axis=0),
     )
@@ -38,7 +38,7 @@ def reference_from_gnss(gnss: GnssLog, trajectory: Trajectory) -> Reference:
         lat, lon, height = frame.geodetic_from_p_n(antenna_n - lever_n)
     unknown = np.full((int(kept.sum()), 3), np.nan)
     return Reference(
-        time_s=gnss.time_s[kept],
+        time_s=gnss.valid_s[kept],
         lat=lat,
         lon=lon,
         height=height,

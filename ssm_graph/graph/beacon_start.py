@@ -20,10 +20,9 @@ from factors.similarity import LogKernel
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.engine.extras import Extras
-from ssm_graph.graph.aids.acoustic import RangeAid
-from ssm_graph.graph.aids.weighted import WeightedAids
-from ssm_graph.graph.states import States
-from ssm_graph.mission.aid_errors import beacon_name
+from ssm_graph.engine.states import States
+from ssm_graph.graph.aids.ranges import Ranges, beacon_name
+from ssm_graph.graph.measurements import Measurements
 
 STARTS = (-1.0, 0.0, 1.0)
 """Prior sigmas east, north and up of the stated place at which searches start."""
@@ -121,7 +120,7 @@ def _cost(ranges: BeaconRanges, at: Array, scale: Array) -> float:
 
 
 def find_beacons(
-    states: States, aids: WeightedAids, extras: Extras, weights: Array
+    states: States, aids: Measurements, extras: Extras, weights: Array
 ) -> tuple[States, Array]:
     """Return the states with all unknown beacons where the ranges along them put them.
 
@@ -135,7 +134,7 @@ def find_beacons(
 
 
 def ambiguous_beacons(
-    states: States, aids: WeightedAids, extras: Extras, covariance: Array
+    states: States, aids: Measurements, extras: Extras, covariance: Array
 ) -> list[str]:
     """Say in a sentence each which beacons may as well be elsewhere, at final states.
 
@@ -156,13 +155,12 @@ def ambiguous_beacons(
 
 
 def _unknown(
-    states: States, aids: WeightedAids, extras: Extras
-) -> Iterator[tuple[RangeAid, NDArray[np.bool_], slice, BeaconRanges]]:
+    states: States, aids: Measurements, extras: Extras
+) -> Iterator[tuple[Ranges, NDArray[np.bool_], slice, BeaconRanges]]:
     """Yield each unknown beacon: the aid, its ranges, its columns among the constants."""
-    for aid in aids.all:
-        if not isinstance(aid, RangeAid):
+    for ranges in aids.all:
+        if not isinstance(ranges, Ranges):
             continue
-        ranges = aid.ranges
         for i in np.flatnonzero(~ranges.is_known):
             heard, name = ranges.beacon == i, beacon_name(int(ranges.number[i]))
             if not heard.any():
@@ -177,4 +175,4 @@ def _unknown(
                 extras.sigma[whole.start - STATE_DIM : whole.stop - STATE_DIM],
             )
             first = whole.start - extras.state_dim
-            yield aid, heard, slice(first, first + 3), along
+            yield ranges, heard, slice(first, first + 3), along

@@ -6,8 +6,8 @@ import numpy as np
 
 from factors.similarity import WEIGHT_FLOOR, Kernel, expected_mahalanobis_sq
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.times import Indices
 from ssm_graph.mission.doubts import LOW_WEIGHT, TRUSTED
-from ssm_graph.mission.timeline import Indices
 
 GATE = 5.0
 """Beams further than this many innovation sigmas from the prediction start without weight."""

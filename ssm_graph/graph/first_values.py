@@ -11,9 +11,7 @@ import itertools
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, V, X
 
 from factors.similarity import Kernel
 from factors.so3 import cross
@@ -22,17 +20,17 @@ from ssm_graph.base.errors import SolverError
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps, finished
 from ssm_graph.engine.error_state import POSITION, ROTATION, STATE_DIM, VELOCITY
-from ssm_graph.graph.aids.of_problem import weighted_aids
-from ssm_graph.graph.augmented_rows import RowStates
+from ssm_graph.engine.states import NavigationStates, States
+from ssm_graph.graph.aids.aid import RowStates
 from ssm_graph.graph.beacon_start import find_beacons
 from ssm_graph.graph.beam_rows import BeamRows, linearize_beams
 from ssm_graph.graph.beam_weights import met_weights, settle_weights, updated_trust
 from ssm_graph.graph.forward_aids import ForwardAids
 from ssm_graph.graph.forward_extras import ForwardExtras
-from ssm_graph.graph.inertial_rows import carried_covariance, inertial_graph, pair_rows
-from ssm_graph.graph.states import States, states_from_arrays
+from ssm_graph.graph.inertial_rows import InertialRows
+from ssm_graph.graph.measurements import Measurements
 from ssm_graph.imu.preintegration import gravity_gradient, gtsam_gravity
-from ssm_graph.mission.problem import Problem, start_of
+from ssm_graph.mission.problem import NO_EXTRAS, Problem, start_of
 from ssm_graph.sensors.dvl import N_BEAMS
 
 LOCKED_OUT_PINGS = 3
@@ -61,23 +59,15 @@ class FirstValues:
     """One for each measurement of the weighted aids"""
 
 
-def first_values(
-    problem: Problem, *, kernel: Kernel, inertial: gtsam.NonlinearFactorGraph | None = None
-) -> FirstValues:
-    """Run once through the mission, predicting and updating keyframe by keyframe.
-
-    ``inertial`` is the graph of :func:`inertial_graph`, where it is at hand already.
-    """
-    return finished(first_values_steps(problem, kernel=kernel, inertial=inertial))
+def first_values(problem: Problem, *, kernel: Kernel) -> FirstValues:
+    """Run once through the mission, predicting and updating keyframe by keyframe."""
+    return finished(first_values_steps(problem, kernel=kernel))
 
 
-def first_values_steps(
-    problem: Problem, *, kernel: Kernel, inertial: gtsam.NonlinearFactorGraph | None = None
-) -> Steps[FirstValues]:
+def first_values_steps(problem: Problem, *, kernel: Kernel) -> Steps[FirstValues]:
     """Make :func:`first_values` in steps."""
     try:
-        forward = _ForwardPass(problem, kernel, inertial or inertial_graph(problem))
-        first = yield from forward.run_steps()
+        first = yield from _ForwardPass(problem, kernel).run_steps()
     except np.linalg.LinAlgError as error:
         raise SolverError(f"the first pass ran away ({error}): {_HINT}") from error
     if not (np.all(np.isfinite(first.states.p_n)) and np.all(np.isfinite(first.states.v_n))):
@@ -102,9 +92,7 @@ class _Rows(NamedTuple):
 class _ForwardPass:
     """A filter on the same inertial factors as the graph, in covariance form."""
 
-    def __init__(
-        self, problem: Problem, kernel: Kernel, inertial: gtsam.NonlinearFactorGraph
-    ) -> None:
+    def __init__(self, problem: Problem, kernel: Kernel) -> None:
         self.problem = problem
         self.kernel = kernel
         start = start_of(problem)
@@ -112,8 +100,8 @@ class _ForwardPass:
         self.extras = ForwardExtras(problem) if problem.extras else None
         self.P = self.extras.begin(start.covariance) if self.extras else start.covariance
         self.no_rows = _Rows(np.zeros((0, len(self.P))), np.zeros(0), np.zeros(0))
-        self.factors = inertial
-        self.aids = weighted_aids(problem)
+        self.inertial = InertialRows(problem.frame, NO_EXTRAS)
+        self.aids = Measurements.weighted(problem)
         self.met = ForwardAids(self.aids)
         self.weights = np.ones(len(problem.beams.speed))
         self.trust = np.ones(N_BEAMS)
@@ -122,7 +110,6 @@ class _ForwardPass:
         self.gravity_at = np.full(3, np.inf)
         self.gravity, self.gravity_D_p = np.zeros(3), np.zeros((3, 3))
         self._g_n = gtsam_gravity(problem.frame, self.p_n)
-        self._gradient = gravity_gradient(problem.frame)
 
     def run_steps(self) -> Steps[FirstValues]:
         problem = self.problem
@@ -137,43 +124,23 @@ class _ForwardPass:
             walks = (self.extras.walks,) if self.extras else ()
             history.append((self.R_nb, self.p_n, self.v_n, self.bias, *walks))
             yield 0.6
-        states = states_from_arrays(*(np.array(column) for column in zip(*history, strict=True)))
+        columns = [np.array(column) for column in zip(*history, strict=True)]
+        states = States.of(*columns[:4])
         yield 0.02 * problem.n_keyframes
         if self.extras:
-            states = states._replace(constants=self.extras.constants)
+            states = states._replace(walks=columns[4], constants=self.extras.constants)
         states, met = find_beacons(states, self.aids, problem.extras, self.met.weights)
         return FirstValues(states, self.weights, self.n_doubts, met)
 
     def _predict(self, k: int) -> None:
-        chain = self.problem.chain
-        span = self.problem.keyframe_s[k + 1] - self.problem.keyframe_s[k]
-        self._g_n = self._gravity(self.p_n + 0.5 * span * self.v_n)
-        chain.params[k].n_gravity = self._g_n
-        pose = gtsam.Pose3(gtsam.Rot3(self.R_nb), self.p_n)
-        bias = gtsam.imuBias.ConstantBias(self.bias[:3], self.bias[3:])
-        predicted = chain.measurements[k].predict(gtsam.NavState(pose, self.v_n), bias)
-        values = gtsam.Values()
-        for i, state_pose, velocity in (
-            (k, pose, self.v_n),
-            (k + 1, predicted.pose(), predicted.velocity()),
-        ):
-            values.insert(X(i), pose3=state_pose)
-            values.insert(V(i), velocity)
-            values.insert(B(i), constant_bias=bias)
-        R_end, at = predicted.pose().rotation().matrix(), self.factors.at(k)
-        pair = pair_rows(
-            at,
-            values,
-            self._gradient,
-            omega_ie_n=self.problem.frame.omega_ie_n,
-            R_begin=self.R_nb,
-            R_end=R_end,
-            span_s=span,
-        )
-        self.P = carried_covariance(pair, self.P)
+        interval = self.problem.chain.intervals.take(np.s_[k : k + 1])
+        self._g_n = self._gravity(self.p_n + 0.5 * interval.span_s * self.v_n)
+        here = States.of(*(column[None] for column in self._state))
+        ahead = self.inertial.predict(interval, here, g_n=self._g_n)
+        self.P = ahead.covariance(self.P)
         if self.extras:
             self.extras.predict(k, self.P)
-        self.R_nb, self.p_n, self.v_n = R_end, predicted.position(), predicted.velocity()
+        self.R_nb, self.p_n, self.v_n = (column[0] for column in ahead.states[:3])
 
     def _gravity(self, p_n: Array) -> Array:
         """Return gravity, linear about its last exact evaluation: good to 1e-10 m/s^2."""
@@ -315,16 +282,10 @@ class _ForwardPass:
 
     def _moved(self, step: Array) -> RowStates:
         """Return the state after a step (E,) of the error state and what is behind it."""
-        pose = gtsam.Pose3(gtsam.Rot3(self.R_nb), self.p_n).retract(step[:6])
-        beyond = self.extras.moved(step[STATE_DIM:]) if self.extras else (_NONE, _NONE)
-        return RowStates(
-            pose.rotation().matrix(),
-            pose.translation(),
-            self.v_n + step[VELOCITY],
-            self.bias + step[9:STATE_DIM],
-            *beyond,
-            self._g_n,
-        )
+        here = NavigationStates(*(column[None] for column in self._state))
+        R_nb, p_n, v_n, bias = (column[0] for column in here.moved(step[None, :STATE_DIM]))
+        walks, constants = self.extras.moved(step[STATE_DIM:]) if self.extras else (_NONE, _NONE)
+        return RowStates(R_nb, p_n, v_n, bias, walks, constants, self.problem.extras, self._g_n)
 
 
 class _RowsByKeyframe:

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from factors.similarity import WEIGHT_FLOOR, Kernel
 from ssm_graph.base.frozen import Array
-from ssm_graph.graph.aids.acoustic import RangeAid
-from ssm_graph.graph.aids.weighted import WeightedAid, WeightedAids
-from ssm_graph.graph.augmented_rows import RowStates
+from ssm_graph.graph.aids.aid import Aid, RowStates
+from ssm_graph.graph.aids.ranges import Ranges
 from ssm_graph.graph.beam_weights import GATE, WEIGHT_ROUNDS
+from ssm_graph.graph.measurements import Measurements
 
 
 class Met(NamedTuple):
@@ -38,15 +38,16 @@ class Met(NamedTuple):
 class ForwardAids:
     """The weighted aids of a problem, keyframe by keyframe."""
 
-    def __init__(self, aids: WeightedAids) -> None:
+    def __init__(self, aids: Measurements) -> None:
         self.weights = np.ones(len(aids))
         """(M,) of all measurements, as far as they have been met"""
-        self._at: dict[int, list[tuple[WeightedAid, int, int]]] = {}
+        self._at: dict[int, list[tuple[Aid, int]]] = {}
         number = 0
         for aid in aids.all:
+            is_unknown = ~aid.is_known[aid.beacon] if isinstance(aid, Ranges) else None
             for i, k in enumerate(aid.keyframe.tolist()):
-                if not (isinstance(aid, RangeAid) and not aid.is_to_known(i)):
-                    self._at.setdefault(k, []).append((aid, i, number))
+                if is_unknown is None or not is_unknown[i]:
+                    self._at.setdefault(k, []).append((aid.take(slice(i, i + 1)), number))
                 number += 1
 
     def has(self, k: int) -> bool:
@@ -55,13 +56,13 @@ class ForwardAids:
 
     def at(self, k: int, state: RowStates) -> Met:
         """Return the measurements of a keyframe that has some, linearised at a state."""
-        here = self._at[k]
-        errors, jacobians = zip(*(aid.whitened(state, i) for aid, i, _ in here), strict=True)
+        here, own = self._at[k], state.rows_of_one()
+        errors, jacobians = zip(*(aid.whitened(own) for aid, _ in here), strict=True)
         return Met(
-            numbers=[number for *_, number in here],
-            measurement=np.repeat(np.arange(len(here)), [aid.dim for aid, *_ in here]),
-            innovation=-np.concatenate(errors),
-            H=np.concatenate(jacobians),
+            numbers=[number for _, number in here],
+            measurement=np.repeat(np.arange(len(here)), [aid.dim for aid, _ in here]),
+            innovation=-np.concatenate(errors, axis=1)[0],
+            H=np.concatenate(jacobians, axis=1)[0],
         )
 
     def weigh(self, met: Met, innovation: Array, predicted: Array, kernel: Kernel) -> Array:

@@ -6,10 +6,9 @@ import numpy as np
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import STATE_DIM
-from ssm_graph.graph.aids.positions import fix_rows
-from ssm_graph.graph.augmented_rows import AugmentedBeams, PreparedBeams, RowStates
-from ssm_graph.graph.beam_rows import BeamRows
-from ssm_graph.mission.calibration import DEPTH_OFFSET
+from ssm_graph.graph.aids.aid import RowStates
+from ssm_graph.graph.aids.depth import DEPTH_OFFSET
+from ssm_graph.graph.beam_rows import BeamRows, CalibratedBeams, PreparedBeams
 from ssm_graph.mission.current import CURRENTS
 from ssm_graph.mission.problem import Problem
 
@@ -26,7 +25,7 @@ class ForwardExtras:
         self._problem = problem
         extras = problem.extras
         self.walks, self.constants = np.zeros(extras.n_walks), np.zeros(extras.n_constants)
-        self._beams = AugmentedBeams(problem.beams, extras, problem.frame)
+        self._beams = CalibratedBeams(problem.beams, extras, problem.frame)
         self._walk_factor, self._walk_sigma = extras.transitions(np.diff(problem.keyframe_s))
         self._last: PreparedBeams | None = None
 
@@ -64,7 +63,7 @@ class ForwardExtras:
         self, rows: slice, state: tuple[Array, Array, Array, Array], g_n: Array
     ) -> BeamRows:
         """Linearise the beams of one ping, with the columns of all variables."""
-        at = RowStates(*state, self.walks, self.constants, g_n)
+        at = RowStates(*state, self.walks, self.constants, self._problem.extras, g_n)
         return self._beams.rows(at, self._prepared(at.bias), rows)
 
     def fix_rows(
@@ -73,9 +72,9 @@ class ForwardExtras:
         """Return innovation (3,), m, and Jacobian (3, E) of one fix."""
         fixes = self._problem.fixes
         assert fixes is not None
-        at = RowStates(*state, self.walks, self.constants, g_n)
-        error, jacobian = fix_rows(fixes, self._problem.extras, at, i)
-        return -error, jacobian
+        at = RowStates(*state, self.walks, self.constants, self._problem.extras, g_n)
+        error, jacobian = fixes.take(slice(i, i + 1)).measured(at.rows_of_one())
+        return -error[0], jacobian[0]
 
     def depth_row(self, H: Array, innovation: float) -> tuple[Array, float]:
         """Return a depth's row (1, E) and innovation, m, from those of the error state."""

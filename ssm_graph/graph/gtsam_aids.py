@@ -14,10 +14,13 @@ from gtsam.symbol_shorthand import V, X
 from factors.beacon_range import beacon_range_factor
 from factors.compass_heading import heading_factor
 from ssm_graph.base.earth import LocalFrame
+from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
-from ssm_graph.graph.states import States
-from ssm_graph.mission.aids import Fixes
-from ssm_graph.mission.further_aids import Headings, Ranges, Standstills
+from ssm_graph.engine.states import States
+from ssm_graph.graph.aids.gnss import Fixes
+from ssm_graph.graph.aids.heading import Headings
+from ssm_graph.graph.aids.ranges import Ranges
+from ssm_graph.graph.aids.standstill import Standstills
 from ssm_graph.mission.problem import Problem
 
 
@@ -32,9 +35,8 @@ def aid_graph(
     states : of all keyframes; they say where north is for the compass.
     weights : (M,) of the measurements: USBL, ranges, headings, standstills; all one when left out.
     """
-    aids = problem.further
-    kinds = [aid for aid in (aids.usbl, aids.ranges, aids.headings, aids.standstills) if aid]
-    sizes = [len(aid.keyframe) for aid in kinds]
+    kinds = problem.aids
+    sizes = [len(aid) for aid in kinds]
     weights = np.ones(sum(sizes)) if weights is None else weights
     graph = gtsam.NonlinearFactorGraph()
     for aid, size, end in zip(kinds, sizes, np.cumsum(sizes).tolist(), strict=True):
@@ -48,6 +50,10 @@ def aid_graph(
                 factors = _headings(aid, own, states, problem.frame)
             case Standstills():
                 factors = _standstills(aid, own)
+            case _:
+                raise ConfigError(
+                    f"GTSAM's graph: expected aids it has factors for, got {aid.name}"
+                )
         for factor in factors:
             graph.add(factor)
     return graph

@@ -1,133 +1,141 @@
-"""The inertial factors of GTSAM as rows, and what they lack: gravity that changes with position.
+"""From keyframe to keyframe: inertial data and walks as whitened rows, for batch and window.
 
-Gravity of an interval is that of the middle between its ends, and follows the states; GTSAM's
-factor takes it for constant. Within a hundred metres that is the same. Over a kilometre gravity
-turns by 1.5e-4 rad, and Gauss-Newton without that derivative walks away from the answer.
+Gravity of an interval is that of the middle between its ends, and follows the states. Within a
+hundred metres that is a constant. Over a kilometre gravity turns by 1.5e-4 rad, and Gauss-Newton
+without that derivative walks away from the answer.
 """
 
 from __future__ import annotations
 
-import gtsam
+from typing import NamedTuple
+
 import numpy as np
-from gtsam.symbol_shorthand import B, V, X
 
-from factors.so3 import skew
+from factors.inertial import Intervals, Predicted, predict, whitened_error, whitened_rows
+from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
-from ssm_graph.base.stepwise import Steps
-from ssm_graph.engine.error_state import POSITION, STATE_DIM, VELOCITY
-from ssm_graph.graph.states import States
-from ssm_graph.mission.problem import Problem
-
-PAIR_COLUMNS = np.r_[0:9, 18:24, 9:18, 24:30, 30]
-"""Columns of GTSAM's factor, x_i v_i x_j v_j b_i b_j and b, as two error states and b."""
+from ssm_graph.engine.chain import ChainSolution
+from ssm_graph.engine.error_state import STATE_DIM
+from ssm_graph.engine.extras import Extras
+from ssm_graph.engine.states import States
+from ssm_graph.imu.preintegration import gravity_between, gravity_gradient, gtsam_gravity
 
 
-def inertial_graph(problem: Problem) -> gtsam.NonlinearFactorGraph:
-    """Return the inertial factors between successive keyframes."""
-    graph = gtsam.NonlinearFactorGraph()
-    for k, measured in enumerate(problem.chain.measurements):
-        graph.add(
-            gtsam.GalileanCombinedImuFactor(
-                X(k), V(k), X(k + 1), V(k + 1), B(k), B(k + 1), measured
-            )
+class InertialRows:
+    """Rows between successive keyframes that carry these variables beside their error state."""
+
+    def __init__(self, frame: LocalFrame, extras: Extras) -> None:
+        self._frame, self._extras, self._gradient = frame, extras, gravity_gradient(frame)
+
+    def rows(self, intervals: Intervals, states: States) -> Array:
+        """Return the rows (I, n, 2 n + C + 1) of I intervals at their I + 1 states, ``b`` last.
+
+        Columns are those of the keyframe before, of the one after, and of C constants.
+        """
+        pairs = whitened_rows(
+            intervals,
+            states.take(np.s_[:-1]),
+            states.take(np.s_[1:]),
+            g_n=gravity_between(self._frame, states.p_n),
+            gradient=self._gradient,
         )
-    return graph
+        return self._with_walks(pairs, intervals, states.walks)
+
+    def errors(self, intervals: Intervals, states: States) -> Array:
+        """Return the whitened errors (I, n) of inertial data, then of the walks."""
+        inertial = whitened_error(
+            intervals,
+            states.take(np.s_[:-1]),
+            states.take(np.s_[1:]),
+            g_n=gravity_between(self._frame, states.p_n),
+        )
+        if self._extras.n_walks == 0:
+            return inertial
+        factor, sigma = self._extras.transitions(intervals.span_s)
+        walked = (states.walks[1:] - factor * states.walks[:-1]) / sigma
+        return np.concatenate([inertial, walked], axis=1)
+
+    def predict(self, interval: Intervals, last: States, *, g_n: Array | None = None) -> Ahead:
+        """Return the state at the end of an interval (1, ...) from that at its begin (1, ...).
+
+        ``g_n`` (3,) is gravity between them, m/s^2; that of the frame when left out.
+        """
+        if g_n is None:
+            g_n = gtsam_gravity(self._frame, last.p_n[0] + 0.5 * interval.span_s * last.v_n[0])
+        moved = predict(interval, last, g_n=g_n[None], gradient=self._gradient)
+        walks = last.walks
+        if self._extras.n_walks:
+            walks = walks * self._extras.transitions(interval.span_s)[0]
+        return Ahead(States(*moved.state, walks, last.constants), interval, moved, self)
+
+    def _with_walks(self, pairs: Array, intervals: Intervals, walks: Array) -> Array:
+        """Return inertial rows (I, 15, 31) with the columns and the rows of walks (I + 1, s)."""
+        extras = self._extras
+        if not extras:
+            return pairs
+        n = extras.state_dim
+        wide = np.zeros((len(pairs), n, n + extras.width + 1))
+        wide[:, :STATE_DIM, :STATE_DIM] = pairs[:, :, :STATE_DIM]
+        wide[:, :STATE_DIM, n : n + STATE_DIM] = pairs[:, :, STATE_DIM:-1]
+        wide[:, :STATE_DIM, -1] = pairs[:, :, -1]
+        factor, sigma = extras.transitions(intervals.span_s)
+        own = np.arange(STATE_DIM, n)
+        wide[:, own, own], wide[:, own, n + own] = -factor / sigma, 1.0 / sigma
+        wide[:, own, -1] = (factor * walks[:-1] - walks[1:]) / sigma
+        return wide
 
 
-def add_gravity_gradient(
-    rows: Array,
-    gradient: Array,
-    *,
-    omega_ie_n: Array,
-    R_begin: Array,
-    R_end: Array,
-    span_s: Array | float,
-) -> None:
-    """Let whitened inertial rows know that gravity changes along with both positions, in place.
+class Ahead(NamedTuple):
+    """A keyframe as the inertial data alone know it from the one before."""
 
-    With ``T = skew(omega t)`` more gravity by ``g`` is a velocity at the end that differs by
-    ``t (I - T) g`` and a position that differs by ``t^2 (I/2 - T/3) g``, the turn of the Earth in
-    a time ``t`` taken to first order. Without it a metre of position is 2e-10 m/s off after each
-    second, always the same way: 2e-6 of the velocity's sigma after minutes at navigation grade.
+    states: States
+    """(1, ...)"""
+    interval: Intervals
+    moved: Predicted
+    between: InertialRows
 
-    Parameters
-    ----------
-    rows : (..., 15, 31) begin, end and right-hand side, see :data:`PAIR_COLUMNS`.
-    gradient : (3, 3) 1/s^2, of gravity; see :func:`ssm_graph.imu.preintegration.gravity_gradient`.
-    omega_ie_n : (3,) rad/s, of the Earth.
-    R_begin, R_end : (..., 3, 3) attitudes at both ends, body to ``n``.
-    span_s : (...) from begin to end.
+    def rows(self, last: States) -> Array:
+        """Return the rows (1, n, 2 n + C + 1) from the keyframe before, linearised at both."""
+        walks = np.concatenate([last.walks, self.states.walks])
+        return self.between._with_walks(self.moved.rows(self.interval), self.interval, walks)
+
+    def covariance(self, before: Array) -> Array:
+        """Return the covariance (n + C, n + C) here from that at the keyframe before."""
+        F, Q = self.moved.transition[0], self.moved.noise(self.interval)[0]
+        if len(before) == STATE_DIM:
+            return np.asarray(F @ before @ F.T + Q)
+        carried = before.copy()
+        carried[:STATE_DIM] = F @ before[:STATE_DIM]
+        carried[:, :STATE_DIM] = carried[:, :STATE_DIM] @ F.T
+        carried[:STATE_DIM, :STATE_DIM] += Q
+        if self.between._extras.n_walks == 0:
+            return carried
+        (factor,), (sigma,) = self.between._extras.transitions(self.interval.span_s)
+        own = np.arange(STATE_DIM, STATE_DIM + len(factor))
+        carried[own] *= factor[:, None]
+        carried[:, own] *= factor
+        carried[own, own] += sigma**2
+        return carried
+
+
+class InertialFit(NamedTuple):
+    """Sum of squared whitened errors of the inertial data, and what it is if noise is as stated."""
+
+    chi_sq: float
+    dof: float
+
+
+def inertial_fit(rows: Array, solution: ChainSolution) -> InertialFit:
+    """Return how well inertial rows (K - 1, n, ...) fit the answer that ``solution`` led to.
+
+    Of the whitened errors most is taken up by the states: hardly anything else sees a keyframe's
+    biases. With ``A_i d_i + A_j d_j = b + noise`` and the posterior covariance ``P`` of both
+    keyframes the expected square is ``15 - tr(A P A')``; the sum over all intervals is what the
+    chi-square of the inertial data has for degrees of freedom.
     """
-    t = np.asarray(span_s)[..., None, None]
-    end = rows[..., STATE_DIM : 2 * STATE_DIM]
-    D_position_n = end[..., POSITION] @ np.swapaxes(R_end, -1, -2)
-    T, eye = skew(omega_ie_n) * t, np.eye(3)
-    D_gravity = -t * (end[..., VELOCITY] @ (eye - T) + D_position_n @ (t * (eye / 2.0 - T / 3.0)))
-    D_middle = 0.5 * D_gravity @ gradient
-    rows[..., POSITION] += D_middle @ R_begin
-    end[..., POSITION] += D_middle @ R_end
-
-
-def inertial_rows_steps(
-    graph: gtsam.NonlinearFactorGraph,
-    states: States,
-    gradient: Array,
-    *,
-    omega_ie_n: Array,
-    span_s: Array,
-) -> Steps[Array]:
-    """Return the whitened rows (K - 1, 15, 31) of a chain of inertial factors at ``states``."""
-    linear = graph.linearize(states.values)
-    yield 0.012 * len(span_s)
-    rows = np.empty((len(span_s), STATE_DIM, 2 * STATE_DIM + 1))
-    for k in range(len(rows)):
-        rows[k] = linear.at(k).augmentedJacobian()
-    yield 0.003 * len(rows)
-    rows = rows[:, :, PAIR_COLUMNS]
-    R_nb = states.R_nb
-    add_gravity_gradient(
-        rows,
-        gradient,
-        omega_ie_n=omega_ie_n,
-        R_begin=R_nb[:-1],
-        R_end=R_nb[1:],
-        span_s=span_s,
-    )
-    return rows
-
-
-def pair_rows(
-    factor: gtsam.NonlinearFactor,
-    values: gtsam.Values,
-    gradient: Array,
-    *,
-    omega_ie_n: Array,
-    R_begin: Array,
-    R_end: Array,
-    span_s: float,
-) -> Array:
-    """Return the whitened rows (15, 31) of one inertial factor; see :func:`inertial_rows_steps`."""
-    pair = factor.linearize(values).augmentedJacobian()[:, PAIR_COLUMNS]
-    add_gravity_gradient(
-        pair, gradient, omega_ie_n=omega_ie_n, R_begin=R_begin, R_end=R_end, span_s=span_s
-    )
-    return np.asarray(pair)
-
-
-def carried_covariance(pair: Array, covariance: Array) -> Array:
-    """Return the covariance (15, 15) at the end of an inertial factor from that at its begin.
-
-    Whitened, ``A_i d_i + A_j d_j`` is noise of unit variance, ``pair`` (15, 31) being
-    ``[A_i, A_j, b]``. Extra variables behind the error state make the covariance larger; they are
-    carried as they are.
-    """
-    A_i, A_j = pair[:, :STATE_DIM], pair[:, STATE_DIM : 2 * STATE_DIM]
-    solved = np.linalg.solve(A_j, np.hstack([-A_i, np.eye(STATE_DIM)]))
-    F, root_Q = solved[:, :STATE_DIM], solved[:, STATE_DIM:]
-    if len(covariance) == STATE_DIM:
-        return np.asarray(F @ covariance @ F.T + root_Q @ root_Q.T)
-    carried = covariance.copy()
-    carried[:STATE_DIM] = F @ covariance[:STATE_DIM]
-    carried[:, :STATE_DIM] = carried[:, :STATE_DIM] @ F.T
-    carried[:STATE_DIM, :STATE_DIM] += root_Q @ root_Q.T
-    return carried
+    n = rows.shape[1]
+    A_i, A_j = rows[:, :STATE_DIM, :STATE_DIM], rows[:, :STATE_DIM, n : n + STATE_DIM]
+    b, P = rows[:, :STATE_DIM, -1], solution.covariance(STATE_DIM)
+    explained = np.sum((A_i @ P[:-1]) * A_i) + np.sum((A_j @ P[1:]) * A_j)
+    explained += 2.0 * np.sum((A_i @ solution.neighbour_covariance(STATE_DIM)) * A_j)
+    return InertialFit(float(np.sum(b**2)), float(b.size - explained))

@@ -9,13 +9,18 @@ from typing import NamedTuple
 
 import gtsam
 import numpy as np
+from gtsam.symbol_shorthand import B, V, X
 
+from factors import so3
+from factors.inertial import Intervals
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps, finished
 from ssm_graph.imu.increments import MergedSamples, merge_samples_steps
 from ssm_graph.sensors.imu import ImuLog, ImuNoise
 
+AT_ONCE = 64
+"""So many intervals are read from GTSAM at a time: some 6 ms."""
 INTEGRATION_DENSITY = 1e-4
 """m/sqrt(s): what the integration itself loses. At 20 Hz a constant force within each sample costs
 0.15 mm of position a wave; this density costs 6 mm in an hour. It also keeps intervals of one
@@ -43,31 +48,52 @@ LEAST_SEEN = 50
 Preintegrated = gtsam.PreintegratedCombinedMeasurementsG
 
 
-@dataclass(frozen=True, slots=True)
+class Unseen(NamedTuple):
+    """Motion inside a gap of the inertial data, 1 sigma off what bridges it."""
+
+    gap_s: float = 0.0
+    rate: float = GAP_GYRO_RATE
+    """rad/s"""
+    force: float = GAP_ACCEL
+    """m/s^2"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class InertialChain:
-    """Preintegrated measurements between successive keyframes, each with its own parameters.
+    """Preintegrated inertial data between K successive keyframes, and what they were made of."""
 
-    The parameters are held apart because gravity follows the estimate: see :meth:`set_gravity`.
-    """
-
-    measurements: tuple[Preintegrated, ...]
-    params: tuple[gtsam.PreintegrationCombinedParams, ...]
+    intervals: Intervals
+    """Of the K - 1 ways between successive keyframes"""
     frame: LocalFrame
+    samples: MergedSamples
+    noise: ImuNoise
+    unseen: tuple[Unseen, ...]
+    """(K - 1) what is bridged in each interval"""
+    bias: Array
+    """(6,) about which all are preintegrated, accelerometer m/s^2, gyro rad/s"""
 
-    def set_gravity(self, p_n: Array) -> None:
-        """Evaluate gravity of each interval at the middle of its keyframes' positions (K, 3).
+    def measured(self, g_n: Array) -> list[Preintegrated]:
+        """Return GTSAM's measurements, made anew, for gravity (K - 1, 3) that stays theirs."""
+        spans_s = self.intervals.span_s.tolist()
+        params = [
+            imu_params(self.noise, g_n=own, frame=self.frame, unseen=unseen, span_s=span_s)
+            for own, unseen, span_s in zip(g_n, self.unseen, spans_s, strict=True)
+        ]
+        return finished(_integrate_steps(self.samples, params, self.bias))
 
-        GTSAM's Coriolis term holds ``omega x (omega x p)`` with ``p`` from the origin of ``n``,
-        and plumb-line gravity holds the centrifugal acceleration already, so that term is added
-        back: ``n_gravity = g_n(p) + omega x (omega x p)``.
-        """
-        gravity = gtsam_gravity(self.frame, 0.5 * (p_n[:-1] + p_n[1:]))
-        for params, g_n in zip(self.params, gravity, strict=True):
-            params.n_gravity = g_n
+
+def gravity_between(frame: LocalFrame, p_n: Array) -> Array:
+    """Return gravity (K - 1, 3) at the middles between successive keyframes' positions (K, 3)."""
+    return gtsam_gravity(frame, 0.5 * (p_n[:-1] + p_n[1:]))
 
 
 def gtsam_gravity(frame: LocalFrame, p_n: Array) -> Array:
-    """Return the gravity (..., 3) to hand to GTSAM at positions ``p_n``, m/s^2."""
+    """Return gravity (..., 3) without the centrifugal term at positions ``p_n``, m/s^2.
+
+    The inertial factors' Coriolis term holds ``omega x (omega x p)`` with ``p`` from the origin of
+    ``n``, and plumb-line gravity holds the centrifugal acceleration already, so that term is added
+    back: ``g_n(p) + omega x (omega x p)``.
+    """
     omega = frame.omega_ie_n
     return np.asarray(frame.g_n_at(p_n) + np.cross(omega, np.cross(omega, p_n)))
 
@@ -91,11 +117,6 @@ def preintegrate(
     frame : navigation frame; gives the Earth rate.
     rate_hz : rate to which raw samples are merged first.
     bias : (6,) accelerometer and gyro bias about which to linearise, m/s^2 and rad/s.
-
-    Returns
-    -------
-    InertialChain
-        Of K - 1 measurements, gravity set for the origin of ``frame``.
     """
     return finished(preintegrate_steps(imu, keyframe_s, frame=frame, rate_hz=rate_hz, bias=bias))
 
@@ -105,45 +126,80 @@ def preintegrate_steps(
 ) -> Steps[InertialChain]:
     """Make :func:`preintegrate` in steps."""
     gaps = imu_gaps(imu)
-    unseen = _unseen(imu, keyframe_s, gaps)
+    unseen = tuple(_unseen(imu, keyframe_s, gaps))
     yield 3e-4 * len(imu.time_s)
-    merged = yield from merge_samples_steps(bridged(imu, gaps), keyframe_s, rate_hz=rate_hz)
-    g_n = gtsam_gravity(frame, ORIGIN)
+    samples = yield from merge_samples_steps(bridged(imu, gaps), keyframe_s, rate_hz=rate_hz)
     bias = np.zeros(6) if bias is None else bias
-    bias_hat = gtsam.imuBias.ConstantBias(bias[:3], bias[3:])
-    params = tuple(
-        imu_params(imu.noise, g_n=g_n, frame=frame, unseen=motion, span_s=span)
-        for motion, span in zip(unseen, np.diff(keyframe_s), strict=True)
-    )
+    nowhere = np.zeros(3)  # gravity is no part of what is measured
+    params = [
+        imu_params(imu.noise, g_n=nowhere, frame=frame, unseen=motion, span_s=span_s)
+        for motion, span_s in zip(unseen, np.diff(keyframe_s).tolist(), strict=True)
+    ]
     yield 0.02 * len(params)
-    measurements = yield from _integrate_steps(merged, params, bias_hat)
-    return InertialChain(measurements, params, frame)
+    measured = yield from _integrate_steps(samples, params, bias)
+    parts = []
+    for begin in range(0, len(measured), AT_ONCE):
+        parts.append(intervals_of(measured[begin : begin + AT_ONCE], frame))
+        yield 0.1 * len(parts[-1].span_s)
+    intervals = Intervals.joined(parts) if parts else intervals_of([], frame)
+    return InertialChain(intervals, frame, samples, imu.noise, unseen, bias)
 
 
 def _integrate_steps(
-    merged: MergedSamples,
-    params: Sequence[gtsam.PreintegrationCombinedParams],
-    bias: gtsam.imuBias.ConstantBias,
-) -> Steps[tuple[Preintegrated, ...]]:
+    merged: MergedSamples, params: Sequence[gtsam.PreintegrationCombinedParams], bias: Array
+) -> Steps[list[Preintegrated]]:
+    about = gtsam.imuBias.ConstantBias(bias[:3], bias[3:])
     measurements = []
     dts = merged.dt.tolist()
     for k, interval_params in enumerate(params):
-        measured = Preintegrated(interval_params, bias)
+        measured = Preintegrated(interval_params, about)
         for i in range(merged.first[k], merged.first[k + 1]):
             measured.integrateMeasurement(merged.accel_b[i], merged.gyro_b[i], dts[i])
         measurements.append(measured)
         yield 0.02
-    return tuple(measurements)
+    return measurements
 
 
-class Unseen(NamedTuple):
-    """Motion inside a gap of the inertial data, 1 sigma off what bridges it."""
+def intervals_of(measurements: Sequence[Preintegrated], frame: LocalFrame) -> Intervals:
+    """Read what GTSAM has preintegrated; what gravity its parameters hold does not matter."""
+    omega = frame.omega_ie_n
+    return Intervals.of(
+        span_s=np.array([m.deltaTij() for m in measurements]),
+        delta_R=np.array([m.deltaRij().matrix() for m in measurements]).reshape(-1, 3, 3),
+        delta_pv=np.array([(m.deltaPij(), m.deltaVij()) for m in measurements]).reshape(-1, 2, 3),
+        bias=np.array([m.biasHatVector() for m in measurements]).reshape(-1, 6),
+        delta_D_bias=_delta_D_bias(measurements, omega),
+        covariance=np.array([m.residualCovariance() for m in measurements]).reshape(-1, 15, 15),
+        omega_ie_n=omega,
+    )
 
-    gap_s: float = 0.0
-    rate: float = GAP_GYRO_RATE
-    """rad/s"""
-    force: float = GAP_ACCEL
-    """m/s^2"""
+
+# Columns of a linearised factor: x_i 6, v_i 3, x_j 6, v_j 3, b_i 6, b_j 6.
+_BEGIN_BIAS, _END = slice(18, 24), np.r_[9:18, 24:30]
+
+
+def _delta_D_bias(measurements: Sequence[Preintegrated], omega_ie_n: Array) -> Array:
+    """Return the bias Jacobians (N, 9, 6), which GTSAM does not show, from linearised factors."""
+    at_rest = gtsam.NavState()
+    values = gtsam.Values()
+    for k in (0, 1):
+        values.insert(X(k), pose3=at_rest.pose())
+        values.insert(V(k), at_rest.velocity())
+        values.insert(B(k), constant_bias=gtsam.imuBias.ConstantBias())
+    whitened, R_nb = np.empty((len(measurements), 15, 30)), np.empty((len(measurements), 3, 3))
+    for i, measured in enumerate(measurements):
+        about = measured.biasHat()
+        end = measured.predict(at_rest, about)
+        values.update(X(1), pose3=end.pose())
+        values.update(V(1), end.velocity())
+        values.update(B(0), constant_bias=about)
+        factor = gtsam.GalileanCombinedImuFactor(X(0), V(0), X(1), V(1), B(0), B(1), measured)
+        whitened[i] = factor.linearize(values).jacobian()[0]
+        R_nb[i] = end.attitude().matrix()
+    moved = np.linalg.solve(whitened[:, :, _END], -whitened[:, :, _BEGIN_BIAS])[:, :9]
+    # The end's velocity is relative to the Earth and along the navigation axes.
+    velocity_n = moved[:, 6:] + so3.skew(omega_ie_n) @ R_nb @ moved[:, 3:6]
+    return np.concatenate([moved[:, :6], R_nb.mT @ velocity_n], axis=1)
 
 
 def imu_params(

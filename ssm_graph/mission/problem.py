@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,22 +12,27 @@ from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array, ReadOnlyArrays
 from ssm_graph.base.stepwise import Steps, finished
+from ssm_graph.base.times import MIN_SPACING_S, Indices, is_inside, nearest
 from ssm_graph.engine.error_state import InitialMoments
 from ssm_graph.engine.extras import Extras
+from ssm_graph.graph.aids import AIDS
+from ssm_graph.graph.aids.aid import Aid, Table
+from ssm_graph.graph.aids.depth import Depths
+from ssm_graph.graph.aids.gnss import GNSS_DRIFT, Fixes
+from ssm_graph.imu.ping_motion import MotionBefore, mean_gyro
 from ssm_graph.imu.preintegration import InertialChain, imu_gaps, preintegrate_steps
-from ssm_graph.mission.aids import Depths, Fixes, depths_of, fixes_of
-from ssm_graph.mission.calibration import DVL_DRIFT, GNSS_DRIFT, extras_of, needs_motion
+from ssm_graph.mission.calibration import DVL_DRIFT, extras_of, needs_motion
 from ssm_graph.mission.current import CURRENT, current_note
-from ssm_graph.mission.further_aids import NO_FURTHER, FurtherAids, further_aids
 from ssm_graph.mission.mission import InitialState, Mission
-from ssm_graph.mission.ping_motion import MotionBefore, mean_gyro
 from ssm_graph.mission.start.moments import initial_moments
-from ssm_graph.mission.timeline import MIN_SPACING_S, Indices, build_timeline, is_inside, nearest
+from ssm_graph.mission.timeline import Timeline, build_timeline
 from ssm_graph.mission.usable import require_usable
-from ssm_graph.sensors.dvl import stuck_beams
+from ssm_graph.sensors.dvl import DvlMount
+from ssm_graph.sensors.dvl_readings import stuck_beams
 from ssm_graph.sensors.imu import ImuLog
 
 NO_EXTRAS = Extras()
+A = TypeVar("A", bound=Aid)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,13 +52,13 @@ class ProblemConfig:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Beams(ReadOnlyArrays):
+class Beams(Table):
     """Every valid beam speed as one row, in the order of its keyframe."""
 
-    keyframe: NDArray[np.intp]
-    """(M,)"""
+    SHARED = frozenset({"lever_arm_b", "R_bd", "n_beams", "motion", "white_share"})
+
     beam: NDArray[np.intp]
-    """(M,) 0 to 3"""
+    """(M,) from 0"""
     speed: Array
     """(M,) m/s"""
     sigma: Array
@@ -69,10 +75,30 @@ class Beams(ReadOnlyArrays):
     """(M,) the ping of each, counted from 0"""
     is_water: NDArray[np.bool_]
     """(M,) off the water instead of the ground: relative to its current"""
+    n_beams: int
+    """Of the instrument, B"""
     motion: MotionBefore | None = None
     """Inertial readings about the pings, where the DVL's clock or lever arm is in doubt."""
     white_share: float = 1.0
     """Of the sigmas off the ground, what is white where the drift of the DVL is a variable"""
+
+    @classmethod
+    def of_mount(cls, mount: DvlMount) -> Beams:
+        """Return no row of an instrument."""
+        none, none_b, index = np.zeros(0), np.zeros((0, 3)), np.zeros(0, np.intp)
+        return cls(
+            keyframe=index,
+            beam=index,
+            speed=none,
+            sigma=none,
+            gyro_b=none_b,
+            beam_b=none_b,
+            lever_arm_b=mount.lever_arm_b,
+            R_bd=mount.R_bd,
+            ping=index,
+            is_water=np.zeros(0, bool),
+            n_beams=mount.n_beams,
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,11 +116,15 @@ class Problem(ReadOnlyArrays):
     """(6,) turn-on bias sigmas, accelerometer (m/s^2) then gyro (rad/s)."""
     extras: Extras = NO_EXTRAS
     """What else is to be estimated; an estimator that takes it as exact says so."""
-    further: FurtherAids = NO_FURTHER
-    """What only the batch smoother is aided by; another estimator says so."""
+    aids: tuple[Aid, ...] = ()
+    """What the smoothers are aided by besides; another estimator says that it is not."""
     notes: tuple[str, ...] = ()
     is_noise_white: bool = False
     """Whether sigmas of beams and fixes leave out what drifts stand for: `with_white_noise`"""
+
+    def aid(self, kind: type[A]) -> A | None:
+        """Return the aid of a kind, None if there is none."""
+        return next((aid for aid in self.aids if isinstance(aid, kind)), None)
 
     @property
     def n_keyframes(self) -> int:
@@ -103,7 +133,11 @@ class Problem(ReadOnlyArrays):
 
 
 def build_problem(
-    mission: Mission, config: ProblemConfig | None = None, *, start: InitialState | None = None
+    mission: Mission,
+    config: ProblemConfig | None = None,
+    *,
+    start: InitialState | None = None,
+    begin_s: float | None = None,
 ) -> Problem:
     """Turn a mission into an estimation problem.
 
@@ -113,12 +147,18 @@ def build_problem(
     config : rates and intervals.
     start : initial state with sigmas; the mission's own when left out. A mission without one
         needs :func:`ssm_graph.mission.start.alignment.align` first.
+    begin_s : when errors of aids that grow are counted from, s; from the first reading of each when
+        left out.
     """
-    return finished(build_problem_steps(mission, config, start=start))
+    return finished(build_problem_steps(mission, config, start=start, begin_s=begin_s))
 
 
 def build_problem_steps(
-    mission: Mission, config: ProblemConfig | None = None, *, start: InitialState | None = None
+    mission: Mission,
+    config: ProblemConfig | None = None,
+    *,
+    start: InitialState | None = None,
+    begin_s: float | None = None,
 ) -> Steps[Problem]:
     """Make :func:`build_problem` in steps."""
     require_usable(mission)
@@ -136,21 +176,29 @@ def build_problem_steps(
     )
     noise = mission.imu.noise
     extras = extras_of(mission)
-    further, left_out = further_aids(mission, timeline.keyframe_s)
+    aids = (
+        kind.of(
+            mission.aids,
+            frame=mission.frame,
+            imu=mission.imu,
+            keyframe_s=timeline.keyframe_s,
+            begin_s=begin_s,
+        )
+        for kind in AIDS
+    )
     return Problem(
         frame=mission.frame,
         start=start,
         keyframe_s=timeline.keyframe_s,
         chain=chain,
         beams=_beams(mission, timeline.ping, timeline.ping_keyframe, extras),
-        depths=depths_of(mission, timeline),
-        fixes=None if mission.gnss is None else fixes_of(mission, mission.gnss, timeline),
+        depths=_depths(mission, timeline),
+        fixes=_fixes(mission, timeline),
         imu_noise_bias_sigma=np.repeat([noise.accel_bias_sigma, noise.gyro_bias_sigma], 3),
         extras=extras,
-        further=further,
+        aids=tuple(aid for aid in aids if aid is not None),
         notes=(
             *timeline.notes,
-            *left_out,
             *_gap_note(mission.imu),
             *stuck_note,
             *current_note(mission),
@@ -169,7 +217,7 @@ def with_dvl(problem: Problem, mission: Mission) -> Problem:
     The inertial chain, most of the work, is kept; so the pings have to be at keyframes.
     """
     mission, _ = _without_stuck_beams(mission)
-    keyframe_s, ping_s = problem.keyframe_s, mission.dvl.ping_s
+    keyframe_s, ping_s = problem.keyframe_s, mission.dvl.valid_s
     is_used = np.isfinite(mission.dvl.speed).any(axis=1)
     is_used &= is_inside(ping_s, keyframe_s[0], keyframe_s[-1])
     ping = np.flatnonzero(is_used)
@@ -223,7 +271,7 @@ def _without_stuck_beams(mission: Mission) -> tuple[Mission, tuple[str, ...]]:
     if not count.any():
         return mission, ()
     beams = ", ".join(f"beam {b + 1}: {count[b]}" for b in np.flatnonzero(count))
-    first_s = float(dvl.ping_s[is_stuck.any(axis=1)][0])
+    first_s = float(dvl.valid_s[is_stuck.any(axis=1)][0])
     note = (
         f"speeds of a beam that repeats one reading while the others change are left out: {beams}; "
         f"the first at {first_s:.3f} s"
@@ -244,22 +292,43 @@ def _gap_note(imu: ImuLog) -> tuple[str, ...]:
     )
 
 
+def _depths(mission: Mission, timeline: Timeline) -> Depths | None:
+    log = mission.depth
+    return None if log is None else Depths.of(log, mission.imu, timeline.keyframe_s)
+
+
+def _fixes(mission: Mission, timeline: Timeline) -> Fixes | None:
+    log = mission.gnss
+    if log is None:
+        return None
+    fixes = Fixes.of_log(
+        log,
+        timeline.fix,
+        time_s=log.valid_s[timeline.fix],
+        keyframe=timeline.fix_keyframe,
+        frame=mission.frame,
+        imu=mission.imu,
+    )
+    return replace(fixes, white_share=log.calibration.drift.white_share)
+
+
 def _beams(mission: Mission, ping: Indices, ping_keyframe: Indices, extras: Extras) -> Beams:
     dvl, is_water = mission.dvl, mission.dvl.is_water[ping]
-    speed = dvl.speed[ping]
+    speed, sigma, beams_b = (rows[ping] for rows in dvl.independent())
     row, beam = np.nonzero(np.isfinite(speed))
-    gyro_b = mean_gyro(mission.imu, dvl.ping_s[ping]) if len(ping) else np.zeros((0, 3))
+    gyro_b = mean_gyro(mission.imu, dvl.valid_s[ping]) if len(ping) else np.zeros((0, 3))
     return Beams(
         keyframe=ping_keyframe[row],
         beam=beam,
         speed=speed[row, beam],
-        sigma=dvl.sigma[ping][row, beam],
+        sigma=sigma[row, beam],
         gyro_b=gyro_b[row],
-        beam_b=dvl.mount.beams_b[beam],
+        beam_b=beams_b[row, beam],
         lever_arm_b=dvl.mount.lever_arm_b,
         R_bd=dvl.mount.R_bd,
         ping=row,
         is_water=is_water[row],
-        motion=MotionBefore(mission.imu, dvl.ping_s[ping]) if needs_motion(extras) else None,
+        n_beams=dvl.mount.n_beams,
+        motion=MotionBefore(mission.imu, dvl.valid_s[ping]) if needs_motion(extras) else None,
         white_share=dvl.mount.drift.white_share,
     )

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from factors.dvl_beam import beam_residual
+from factors.inertial import MovingState
 from ssm_graph.base.frozen import Array
-from ssm_graph.engine.states import KeyframeStates
-from ssm_graph.mission.aid_errors import not_used
 from ssm_graph.mission.calibration import taken_as_exact
 from ssm_graph.mission.doubts import doubts_of_beams
 from ssm_graph.mission.estimate import BeamTable, Estimate, Status
@@ -37,7 +37,7 @@ class RecursiveBeams(NamedTuple):
 
 def recursive_estimate(
     problem: Problem,
-    states: KeyframeStates,
+    states: MovingState,
     covariance: Array,
     beams: RecursiveBeams,
     n_iterations: Array,
@@ -46,6 +46,7 @@ def recursive_estimate(
     method: str,
     kernel: str,
     wall_s: float,
+    doubts: Sequence[str] = (),
 ) -> Estimate:
     """Return the estimate of one run, judged.
 
@@ -56,18 +57,19 @@ def recursive_estimate(
     beams : of its N beam speeds.
     n_iterations : (K,) of each keyframe.
     max_iterations : the limit of those, where there is one.
+    doubts : what else contradicts the answer, a sentence each.
     method, kernel, wall_s : as in :class:`ssm_graph.mission.estimate.Estimate`.
     """
     rows = problem.beams
     status, reason = _settled(n_iterations, max_iterations)
     error = _beam_errors(problem, states) if beams.error is None else beams.error
-    doubts = doubts_of_beams(problem, states.v_n, error, beams.weight)
+    every = [*doubts_of_beams(problem, states.v_n, error, beams.weight), *doubts]
     lost = np.flatnonzero(~_is_finite(states.R_nb, states.p_n, states.v_n, covariance))
     if len(lost):
         begin_s = problem.keyframe_s[lost[0]]
         status, reason = Status.DIVERGED, f"{Status.DIVERGED.value} at {begin_s:.1f} s"
-    elif any(doubts):
-        status, reason = Status.SUSPECT, "; ".join(filter(None, doubts))
+    elif any(every):
+        status, reason = Status.SUSPECT, "; ".join(filter(None, every))
     return Estimate(
         method=method,
         kernel=kernel,
@@ -85,12 +87,26 @@ def recursive_estimate(
         wall_s=wall_s,
         cost=np.nan,
         start=problem.start,
-        notes=problem.notes + taken_as_exact(problem.extras) + not_used(problem.further.sections),
+        notes=(
+            *problem.notes,
+            *taken_as_exact(problem.extras),
+            *not_used([aid.section for aid in problem.aids]),
+        ),
         keyframe_iterations=float(np.mean(n_iterations)),
     )
 
 
-def _beam_errors(problem: Problem, states: KeyframeStates) -> Array:
+def not_used(sections: Sequence[str]) -> tuple[str, ...]:
+    """Return the note of an estimator without further aids, if the mission has some."""
+    if not sections:
+        return ()
+    return (
+        f"{', '.join(sections)} of mission.toml left out: this estimator is not aided by them; "
+        "ssm-graph smooth is",
+    )
+
+
+def _beam_errors(problem: Problem, states: MovingState) -> Array:
     """Return predicted minus measured beam speeds (N,), m/s."""
     beams, k = problem.beams, problem.beams.keyframe
     return beam_residual(

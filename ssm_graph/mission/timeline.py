@@ -5,16 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array, ReadOnlyArrays
-from ssm_graph.mission.mission import AidLogs, Mission
-
-MIN_SPACING_S = 1e-3
-"""Times closer than this share a keyframe."""
-
-Indices = NDArray[np.intp]
+from ssm_graph.base.times import MIN_SPACING_S, Indices, is_inside, left_out, nearest
+from ssm_graph.graph.aids import AIDS
+from ssm_graph.mission.mission import Mission
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,16 +50,20 @@ def build_timeline(mission: Mission, *, start_s: float, interval_s: float) -> Ti
         raise DataError(
             f"the start at {start_s:.3f} s leaves no inertial data, which end at {end_s:.3f} s"
         )
-    ping_s = mission.dvl.ping_s
+    ping_s = mission.dvl.valid_s
     has_beam = np.isfinite(mission.dvl.speed).any(axis=1)
-    fix_s = mission.gnss.time_s if mission.gnss is not None else np.zeros(0)
+    fix_s = mission.gnss.valid_s if mission.gnss is not None else np.zeros(0)
     ping = np.flatnonzero(has_beam & is_inside(ping_s, start_s, end_s))
     fix = np.flatnonzero(is_inside(fix_s, start_s, end_s))
     notes = left_out("ping", int(has_beam.sum()) - len(ping), start_s, end_s)
     notes += left_out("GNSS fix", len(fix_s) - len(fix), start_s, end_s)
 
-    acoustic_s = _acoustic_s(mission.aids, start_s, end_s)
-    measured = np.clip(np.concatenate([ping_s[ping], fix_s[fix], *acoustic_s]), start_s, end_s)
+    aids_s = [np.zeros(0)]
+    for what, time_s in (kind.times(mission.aids) for kind in AIDS):
+        inside = is_inside(time_s, start_s, end_s)
+        aids_s.append(time_s[inside])
+        notes += left_out(what, int(np.sum(~inside)), start_s, end_s)
+    measured = np.clip(np.concatenate([ping_s[ping], fix_s[fix], *aids_s]), start_s, end_s)
     keyframe_s = _fill(_thin(np.concatenate([[start_s], measured, [end_s]])), interval_s)
     return Timeline(
         keyframe_s=keyframe_s,
@@ -72,34 +72,6 @@ def build_timeline(mission: Mission, *, start_s: float, interval_s: float) -> Ti
         fix=fix,
         fix_keyframe=nearest(keyframe_s, fix_s[fix]),
         notes=notes,
-    )
-
-
-def _acoustic_s(aids: AidLogs, start_s: float, end_s: float) -> list[Array]:
-    """Return the times of acoustic fixes and ranges within the span."""
-    times = [aids.usbl.valid_s] if aids.usbl else []
-    times += [aids.ranges.time_s] if aids.ranges else []
-    return [time_s[is_inside(time_s, start_s, end_s)] for time_s in times]
-
-
-def is_inside(time_s: Array, start_s: float, end_s: float) -> NDArray[np.bool_]:
-    """Return which times lie in the span, but for rounding."""
-    return (time_s > start_s - MIN_SPACING_S) & (time_s < end_s + MIN_SPACING_S)
-
-
-def nearest(keyframe_s: Array, time_s: Array) -> Indices:
-    """Return the index of the keyframe nearest to each time."""
-    middle = 0.5 * (keyframe_s[:-1] + keyframe_s[1:])
-    return np.searchsorted(middle, time_s)
-
-
-def left_out(what: str, count: int, start_s: float, end_s: float) -> tuple[str, ...]:
-    """Return the note on measurements outside the keyframes, if there are any."""
-    if count == 0:
-        return ()
-    plural = "" if count == 1 else "es" if what.endswith("fix") else "s"
-    return (
-        f"{count} {what}{plural} outside the smoothed span {start_s:.3f}..{end_s:.3f} s left out",
     )
 
 

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
+from factors.inertial import MovingState
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frames import phi_D_roll_pitch_heading, roll_pitch_heading_from_R_lb
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import POSITION, ROTATION, VELOCITY
-from ssm_graph.engine.states import KeyframeStates
 from ssm_graph.mission.estimate import Trajectory
 from ssm_graph.mission.problem import Problem
 
 
-def trajectory_from_states(
-    problem: Problem, states: KeyframeStates, covariance: Array
-) -> Trajectory:
+def trajectory_from_states(problem: Problem, states: MovingState, covariance: Array) -> Trajectory:
     """Express states and their covariances (K, 15, 15) along east, north, up at the vehicle."""
     n_beams = np.bincount(problem.beams.keyframe, minlength=problem.n_keyframes).astype(float)
     return trajectory_at(problem.frame, problem.keyframe_s, states, covariance, n_beams=n_beams)
@@ -24,7 +22,7 @@ def trajectory_from_states(
 def trajectory_at(
     frame: LocalFrame,
     time_s: Array,
-    states: KeyframeStates,
+    states: MovingState,
     covariance: Array,
     *,
     n_beams: Array,

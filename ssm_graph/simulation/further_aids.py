@@ -20,7 +20,7 @@ from ssm_graph.base.earth import (
     geodetic_from_ecef,
 )
 from ssm_graph.base.frozen import Array
-from ssm_graph.mission.mission import AidLogs
+from ssm_graph.mission.mission import Aids
 from ssm_graph.sensors.acoustic import Beacon, RangeLog, UsblLog
 from ssm_graph.sensors.compass import HeadingErrors, HeadingLog
 from ssm_graph.sensors.standstill import Standstill
@@ -142,7 +142,7 @@ class AidSettings:
 class SimulatedAids(NamedTuple):
     """The readings, and which of them are grossly wrong."""
 
-    logs: AidLogs
+    logs: Aids
     gross: dict[str, Mask]
     """By section: usbl, ranges, heading"""
     heading_errors: Array
@@ -167,7 +167,7 @@ def aid_logs(
         heading, gross["heading"], errors = _heading(
             trajectory, settings.compass, end_s=end_s, rng=streams.heading, noisy=noisy
         )
-    return SimulatedAids(AidLogs(usbl, ranges, heading, settings.standstills), gross, errors)
+    return SimulatedAids(Aids(usbl, ranges, heading, *settings.standstills), gross, errors)
 
 
 def _usbl(
@@ -229,6 +229,7 @@ def _ranges(
         range_m=range_m,
         sigma=np.full(len(time_s), settings.sigma),
         lever_arm_b=np.array(settings.lever_arm_b),
+        nominal_sigma=settings.sigma,
     )
     return log, is_gross
 

@@ -13,17 +13,20 @@ from factors.similarity import Kernel, LogKernel, Similarity, expected_mahalanob
 from ssm_graph.base.errors import ConfigError, SolverError
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps, finished
+from ssm_graph.engine.chain import ChainSolution
+from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.engine.gnc import GncSchedule, Graduation, Schedule, WarmSchedule
+from ssm_graph.engine.states import States
 from ssm_graph.graph.beacon_start import ambiguous_beacons
 from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.first_values import FirstValues, first_values, first_values_steps
-from ssm_graph.graph.linearize import GraphLinearizer, Step
-from ssm_graph.graph.states import States
+from ssm_graph.graph.linearize import GraphLinearizer
+from ssm_graph.graph.measurements import aid_table, doubts_of_aids
 from ssm_graph.mission.estimate import BeamTable, Estimate, Iteration, NoiseFound, Status
 from ssm_graph.mission.problem import Problem, with_white_noise
 from ssm_graph.mission.trajectory import trajectory_from_states
 from ssm_graph.sensors.dvl import N_BEAMS
-from ssm_graph.smoothers.aid_weights import AidKernel, AidWeighing
+from ssm_graph.smoothers.aid_weights import AidWeighing
 from ssm_graph.smoothers.beam_faults import FaultSearch
 from ssm_graph.smoothers.calibrated import calibration_of, undetermined
 from ssm_graph.smoothers.current import current_of
@@ -167,9 +170,7 @@ class SsmSmoother:
         linearizer = GraphLinearizer(problem)
         yield 0.03 * problem.n_keyframes
         if first is None:
-            first = yield from first_values_steps(
-                problem, kernel=WARM_KERNEL, inertial=linearizer.inertial
-            )
+            first = yield from first_values_steps(problem, kernel=WARM_KERNEL)
         states, rows = first.states, linearizer.beam_rows(first.states)
         schedule = self.config.schedule()
         weights = schedule.first_weights(first.weights)
@@ -233,10 +234,11 @@ class SsmSmoother:
         step = yield from linearizer.solve_steps(states, rows, weights, aids.used)
         cost = linearizer.cost(states, rows, weights, aids.used)
         yield 0.005 * problem.n_keyframes
-        states, rows, update = yield from descend_steps(
-            linearizer, states, step.delta, weights, cost, aid_weights=aids.used
+        states, rows = yield from descend_steps(
+            linearizer, states, step, weights, cost, aid_weights=aids.used
         )
-        sigma = step.sigma
+        # What is judged as settled is the step that was wanted, however little of it was taken.
+        wanted, sigma = np.concatenate([step.step.ravel(), step.constants_step]), step.sigma
         speed = float(np.max(np.abs(states.v_n)))
         if not (np.all(np.isfinite(sigma)) and speed < RUNAWAY_SPEED):
             raise SolverError(
@@ -247,13 +249,18 @@ class SsmSmoother:
         settled = faults.leave_out(kernel.weight(t))
         change = float(np.max(np.abs(settled - weights), initial=0.0))
         change = max(change, aids.judge(states, step))
-        return Pass(states, step, rows, t, settled, float(np.max(np.abs(update) / sigma)), change)
+        return Pass(states, step, rows, t, settled, float(np.max(np.abs(wanted) / sigma)), change)
 
     def _aids(self, linearizer: GraphLinearizer, first: FirstValues) -> AidWeighing:
-        kernel = AidKernel(self.config.kernel, WARM_KERNEL, self.config.judged_by)
-        return AidWeighing(linearizer.weighted, kernel, first.aid_weights)
+        return AidWeighing(
+            linearizer.weighted,
+            first.aid_weights,
+            wanted=self.config.kernel,
+            warm=WARM_KERNEL,
+            judged_by=self.config.judged_by,
+        )
 
-    def _mahalanobis_sq(self, problem: Problem, rows: BeamRows, step: Step) -> Array:
+    def _mahalanobis_sq(self, problem: Problem, rows: BeamRows, step: ChainSolution) -> Array:
         H, beams = rows.jacobian, problem.beams
         if self.config.judged_by is Similarity.PLAIN:
             spread = np.zeros(len(H))
@@ -277,12 +284,13 @@ class SsmSmoother:
             f"{last.weight_change:.1e}"
         )
         doubts = contradictions(linearizer, last.states, last.beam_rows, last.weights)
-        doubts += solved.aids.doubts(last.states)
+        judged = solved.aids.judged(last.states, linearizer.problem.keyframe_s)
+        doubts += doubts_of_aids(judged)
         doubts += ambiguous_beacons(
             last.states,
             linearizer.weighted,
             linearizer.problem.extras,
-            last.step.extras_covariance,
+            last.step.end_covariance(STATE_DIM),
         )
         if doubts:
             unsettled = [] if status is Status.CONVERGED else [reason]
@@ -292,7 +300,7 @@ class SsmSmoother:
             problem.extras,
             last.states.walks,
             last.states.constants,
-            last.step.extras_covariance,
+            last.step.end_covariance(STATE_DIM),
             span_s=float(problem.keyframe_s[-1] - problem.keyframe_s[0]),
         )
         return Estimate(
@@ -300,7 +308,9 @@ class SsmSmoother:
             kernel=self.config.weighting,
             status=status,
             reason=reason,
-            trajectory=trajectory_from_states(problem, last.states, last.step.covariance),
+            trajectory=trajectory_from_states(
+                problem, last.states, last.step.covariance(STATE_DIM)
+            ),
             beams=BeamTable(
                 time_s=problem.keyframe_s[beams.keyframe],
                 beam=(beams.beam + 1).astype(np.float64),
@@ -314,9 +324,12 @@ class SsmSmoother:
             start=problem.start,
             notes=solved.notes + noise_notes(noise) + undetermined(calibration),
             calibration=calibration,
-            aids=solved.aids.table(last.states, problem.keyframe_s),
+            aids=aid_table(judged),
             noise=noise,
             current=current_of(
-                problem.extras, problem.keyframe_s, last.states.walks, last.step.walks_covariance
+                problem.extras,
+                problem.keyframe_s,
+                last.states.walks,
+                last.step.covariance_of(slice(STATE_DIM, None)),
             ),
         )

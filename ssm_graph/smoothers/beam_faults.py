@@ -23,10 +23,9 @@ from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps
 from ssm_graph.engine.beam_evidence import ChainEvidence, Evidence, WhitenedBeams
-from ssm_graph.graph.beam_rows import BeamRows
+from ssm_graph.engine.states import States
+from ssm_graph.graph.beam_rows import BeamRows, WaterRows
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.graph.states import States
-from ssm_graph.graph.water_rows import WaterRows
 from ssm_graph.mission.problem import Problem
 from ssm_graph.sensors.dvl import N_BEAMS
 
@@ -101,7 +100,7 @@ def find_beam_faults_steps(
     weights = KERNEL.weight((rows.error / beams.sigma) ** 2)
     linearizer.follow(states)
     yield 0.01 * problem.n_keyframes
-    solution = (yield from linearizer.solve_steps(states, rows, weights, aid_weights)).solution
+    solution = yield from linearizer.solve_steps(states, rows, weights, aid_weights)
     missed = -rows.error - np.einsum("mi,mi->m", jacobian, solution.step[beams.keyframe])
     scale = np.sqrt(weights) / beams.sigma
     whitened = WhitenedBeams(

@@ -7,7 +7,6 @@ import numpy as np
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.engine.extras import Extras
-from ssm_graph.mission.calibration import is_calibration
 from ssm_graph.mission.estimate import CalibratedValue, Calibration, Determined
 from ssm_graph.smoothers.stretch import Stretch
 
@@ -29,7 +28,7 @@ def calibration_of(
     prior = _prior_sigma_at_end(extras, span_s)
     values, kept = [], []
     for block in extras.blocks:
-        if not is_calibration(block.name):
+        if not block.is_lasting:
             continue
         columns = extras.columns(block.name)
         for label, i in zip(block.labels, range(columns.start, columns.stop), strict=True):
@@ -55,7 +54,7 @@ def calibration_of_last(extras: Extras, track: Stretch, *, span_s: float) -> Cal
     """Return the calibration that the last keyframe of a window's track carries in its state."""
     own = slice(STATE_DIM, None)
     covariance = track.covariance[-1, own, own]
-    return calibration_of(extras, track.states.extra, np.zeros(0), covariance, span_s=span_s)
+    return calibration_of(extras, track.states.walks, np.zeros(0), covariance, span_s=span_s)
 
 
 def undetermined(calibration: Calibration | None) -> tuple[str, ...]:

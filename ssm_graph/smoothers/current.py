@@ -38,7 +38,7 @@ def current_of(
 def current_along(extras: Extras, track: Stretch) -> CurrentTrack | None:
     """Return the current that the keyframes of a window's track carry in their states."""
     covariance = track.covariance[:, STATE_DIM:, STATE_DIM:]
-    return current_of(extras, track.time_s, track.states.extra, covariance)
+    return current_of(extras, track.time_s, track.states.walks, covariance)
 
 
 def _columns(extras: Extras, name: str) -> range:

@@ -11,11 +11,10 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps
 from ssm_graph.engine.extras import Extras
 from ssm_graph.engine.gnc import NEAR_SIGMAS
+from ssm_graph.engine.states import States
 from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.graph.states import States
-from ssm_graph.mission.aid_errors import is_of_aid
-from ssm_graph.mission.current import CURRENTS
+from ssm_graph.mission.calibration import CALIBRATIONS, DRIFTS
 from ssm_graph.mission.problem import Problem, with_stated_noise
 from ssm_graph.sensors.dvl import N_BEAMS
 from ssm_graph.smoothers.beam_faults import FaultSearch, Found, find_beam_faults_steps
@@ -30,9 +29,7 @@ def _kept(extras: Extras) -> Extras:
     Those of the current and of the further aids: they are nothing of the DVL's, and hold what
     would be taken for a fault. Calibrations are held at their estimates.
     """
-    names = {block.name for block in extras.blocks}
-    kept = {name for name in names if name in CURRENTS or is_of_aid(name)}
-    return extras.only(kept).in_the_state()
+    return extras.without(CALIBRATIONS | DRIFTS).in_the_state()
 
 
 class FaultWatch:

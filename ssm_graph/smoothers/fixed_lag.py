@@ -18,16 +18,17 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps, finished
 from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.engine.extras import with_extras
+from ssm_graph.graph.measurements import aid_table, doubts_of_aids
 from ssm_graph.mission.estimate import Estimate, OnKeyframe
 from ssm_graph.mission.problem import Problem, start_of, with_white_noise
 from ssm_graph.mission.recursive import RecursiveBeams, recursive_estimate
 from ssm_graph.smoothers.calibrated import calibration_of_last, undetermined
 from ssm_graph.smoothers.current import current_along
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
-from ssm_graph.smoothers.keyframe import beam_speeds, keyframes_of, sensors_of
+from ssm_graph.smoothers.keyframe import keyframes_of, sensors_of
 from ssm_graph.smoothers.stretch import Stretch, joined
 from ssm_graph.smoothers.window import Window
-from ssm_graph.smoothers.window_rows import beam_rows
+from ssm_graph.smoothers.window_graph import beam_rows
 
 __all__ = ["FixedLagConfig", "FixedLagEstimates", "FixedLagRun", "run_fixed_lag", "solve_fixed_lag"]
 
@@ -113,13 +114,17 @@ def _estimate(
     name: str,
 ) -> Estimate:
     sensors, extras = sensors_of(problem), problem.extras
-    error = beam_rows(
-        sensors, beam_speeds(problem.beams), track.states.take(problem.beams.keyframe)
-    ).error
+    beams = replace(problem.beams, motion=None)
+    error = beam_rows(sensors, beams, track.states.take(beams.keyframe)).error
+    judged = [track.aids[name] for name in sensors.aids if name in track.aids]
     span_s = float(problem.keyframe_s[-1] - problem.keyframe_s[0])
     calibration = calibration_of_last(sensors.extras, track, span_s=span_s)
     estimate = recursive_estimate(
-        replace(problem, extras=extras.without([block.name for block in sensors.extras.blocks])),
+        replace(
+            problem,
+            extras=extras.without([block.name for block in sensors.extras.blocks]),
+            aids=(),
+        ),
         track.states,
         track.covariance[:, :STATE_DIM, :STATE_DIM],
         RecursiveBeams(
@@ -133,10 +138,12 @@ def _estimate(
         method=f"fixed lag {config.lag_s:g} s, {name} states",
         kernel=str(config.kernel),
         wall_s=wall_s,
+        doubts=doubts_of_aids(judged),
     )
     return replace(
         estimate,
         calibration=calibration,
         notes=estimate.notes + undetermined(calibration),
         current=current_along(sensors.extras, track),
+        aids=aid_table(judged),
     )

@@ -1,37 +1,40 @@
-"""What a window is told of one keyframe: its time, the way there, and what was measured."""
+"""What a window is told of one keyframe: its time, the inertial data and what was measured."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
-import gtsam
 import numpy as np
 
+from factors.inertial import Intervals
 from ssm_graph.base.earth import LocalFrame
-from ssm_graph.base.frozen import Array
 from ssm_graph.engine.extras import Extras
-from ssm_graph.imu.preintegration import Preintegrated
+from ssm_graph.graph.aids.aid import Aid
+from ssm_graph.graph.aids.standstill import AnySpeed
+from ssm_graph.graph.measurements import aids_of
 from ssm_graph.mission.calibration import windowed
 from ssm_graph.mission.problem import Beams, Problem
-from ssm_graph.mission.timeline import Indices
 
 
 class Sensors(NamedTuple):
-    """What is the same at all keyframes of a vehicle."""
+    """What is the same at all keyframes of a vehicle: tables without a row, and variables."""
 
     frame: LocalFrame
-    dvl_arm_b: Array
-    """(3,) m, body origin to instrument, as the next two"""
-    depth_arm_b: Array
-    gnss_arm_b: Array
-    depth_sigma: float
-    """m"""
-    R_bd: Array
-    """(3, 3) mounting, instrument to body"""
+    beams: Beams
+    aids: Mapping[str, Aid]
+    """By name"""
     extras: Extras
     """What each keyframe carries beside the error state; all of them walk"""
+
+    @classmethod
+    def of(cls, frame: LocalFrame, beams: Beams, aids: Iterator[Aid], extras: Extras) -> Sensors:
+        """Return the sensors that these tables are of."""
+        none = slice(0, 0)
+        named = {aid.name: aid.take(none) for aid in aids}
+        named[AnySpeed.name] = AnySpeed(np.zeros(0, np.intp), np.zeros(0))
+        return cls(frame, replace(beams.take(none), motion=None), named, extras)
 
     @property
     def state_dim(self) -> int:
@@ -39,138 +42,50 @@ class Sensors(NamedTuple):
         return self.extras.width
 
 
-class BeamSpeeds(NamedTuple):
-    """Beam speeds of some keyframes, one row each, in order of time."""
-
-    beam: Array
-    """(M,) 0 to 3"""
-    speed: Array
-    """(M,) m/s"""
-    sigma: Array
-    """(M,) m/s"""
-    gyro_b: Array
-    """(M, 3) rad/s, mean over the ping"""
-    beam_b: Array
-    """(M, 3) unit vectors"""
-    is_water: Array
-    """(M,) 1 off the water, relative to its current, 0 off the ground"""
-
-    @classmethod
-    def none(cls) -> BeamSpeeds:
-        """Return no rows."""
-        none, none_b = np.zeros(0), np.zeros((0, 3))
-        return cls(none, none, none, none_b, none_b, none)
-
-    def followed_by(self, other: BeamSpeeds) -> BeamSpeeds:
-        """Return these rows, then the others."""
-        return BeamSpeeds(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
-
-    def take(self, rows: slice) -> BeamSpeeds:
-        """Return some rows."""
-        return BeamSpeeds(*(column[rows] for column in self))
-
-
-class Way(NamedTuple):
-    """What the inertial sensors say of the interval before a keyframe."""
-
-    measured: Preintegrated
-    params: gtsam.PreintegrationCombinedParams
-    """Gravity in them follows the estimate."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Keyframe:
-    """One keyframe; nothing in it ever changes but the gravity of its interval."""
+    """One keyframe."""
 
     time_s: float
-    gyro_b: Array
-    """(3,) rad/s at the keyframe: it moves the lever arms of depth sensor and antenna"""
-    beams: BeamSpeeds
-    depth_s: Array
-    """(D,) s, readings since the keyframe before"""
-    depth: Array
-    """(D,) m, positive down"""
-    fix_n: Array
-    """(F, 3) m, GNSS antenna"""
-    fix_cov_n: Array
-    """(F, 3, 3) m^2"""
-    speed_sigma: float = np.inf
-    """m/s, of any vehicle's velocity: all that is known where beams have been silent for long"""
-    way: Way | None = None
-    """From the keyframe before; None for the first of all."""
+    beams: Beams
+    aids: Mapping[str, Aid] = field(default_factory=dict)
+    """What else was measured at it, by name: depth, GNSS and the further aids"""
+    inertial: Intervals | None = None
+    """(1, ...) from the keyframe before; None for the first of all"""
 
     @property
     def is_measured(self) -> bool:
         """Whether anything but the inertial sensors has seen it."""
-        n_measured = len(self.beams.speed) + len(self.depth) + len(self.fix_n)
-        return n_measured > 0 or np.isfinite(self.speed_sigma)
+        return len(self.beams) > 0 or bool(self.aids)
 
-    def without(self, name: str) -> Keyframe:
-        """Return the keyframe without its ``depth`` or its ``fix``."""
-        if name == "depth":
-            return replace(self, depth_s=self.depth_s[:0], depth=self.depth[:0])
-        return replace(self, fix_n=self.fix_n[:0], fix_cov_n=self.fix_cov_n[:0])
+    def without(self, *names: str) -> Keyframe:
+        """Return the keyframe without some of its aids."""
+        return replace(self, aids={n: aid for n, aid in self.aids.items() if n not in names})
 
-    @classmethod
-    def unmeasured(cls, time_s: float, gyro_b: Array, way: Way | None) -> Keyframe:
-        """Return a keyframe as the inertial sensors alone know it."""
-        none, no_fix = np.zeros(0), np.zeros((0, 3))
-        beams = BeamSpeeds.none()
-        return cls(time_s, gyro_b, beams, none, none, no_fix, np.zeros((0, 3, 3)), way=way)
+    def no_faster_than(self, sigma: float) -> Keyframe:
+        """Return the keyframe with a velocity of zero and a sigma, m/s, that any vehicle has."""
+        speed = AnySpeed(np.zeros(1, np.intp), np.array([sigma]))
+        return replace(self, aids={**self.aids, AnySpeed.name: speed})
 
 
 def sensors_of(problem: Problem) -> Sensors:
     """Return what is the same at all keyframes of a mission."""
-    depths, fixes = problem.depths, problem.fixes
-    return Sensors(
-        problem.frame,
-        problem.beams.lever_arm_b,
-        np.zeros(3) if depths is None else depths.lever_arm_b,
-        np.zeros(3) if fixes is None else fixes.lever_arm_b,
-        np.inf if depths is None else depths.sigma,
-        problem.beams.R_bd,
-        windowed(problem.extras),
-    )
+    extras = windowed(problem.extras)
+    return Sensors.of(problem.frame, problem.beams, iter(aids_of(problem)), extras)
 
 
 def keyframes_of(problem: Problem) -> Iterator[Keyframe]:
     """Yield the keyframes of a mission in order of time."""
-    chain, beams, depths, fixes = problem.chain, problem.beams, problem.depths, problem.fixes
-    none = np.zeros(0)
+    chain, beams, aids = problem.chain, replace(problem.beams, motion=None), aids_of(problem)
+    edges = [
+        np.searchsorted(t.keyframe, np.arange(problem.n_keyframes + 1)) for t in (beams, *aids)
+    ]
     for k, time_s in enumerate(problem.keyframe_s.tolist()):
-        b = _rows_of(k, beams.keyframe)
-        d = slice(0, 0) if depths is None else _rows_of(k, depths.keyframe)
-        f = slice(0, 0) if fixes is None else _rows_of(k, fixes.keyframe)
-        gyro_b = np.zeros(3)
-        if depths is not None:
-            gyro_b = depths.gyro_b[k]
-        elif fixes is not None and f.stop > f.start:
-            gyro_b = fixes.gyro_b[f.start]
+        own, *others = (slice(int(edge[k]), int(edge[k + 1])) for edge in edges)
+        here = zip(aids, others, strict=True)
         yield Keyframe(
-            time_s=time_s,
-            gyro_b=gyro_b,
-            beams=beam_speeds(beams, b),
-            depth_s=none if depths is None else depths.time_s[d],
-            depth=none if depths is None else depths.depth[d],
-            fix_n=np.zeros((0, 3)) if fixes is None else fixes.position_n[f],
-            fix_cov_n=np.zeros((0, 3, 3)) if fixes is None else fixes.covariance_n[f],
-            way=Way(chain.measurements[k - 1], chain.params[k - 1]) if k else None,
+            time_s,
+            beams.take(own),
+            {aid.name: aid.take(rows) for aid, rows in here if rows.stop > rows.start},
+            chain.intervals.take(np.s_[k - 1 : k]) if k else None,
         )
-
-
-def beam_speeds(beams: Beams, rows: slice = np.s_[:]) -> BeamSpeeds:
-    """Return some of a problem's beam speeds."""
-    return BeamSpeeds(
-        beams.beam[rows].astype(float),
-        beams.speed[rows],
-        beams.sigma[rows],
-        beams.gyro_b[rows],
-        beams.beam_b[rows],
-        beams.is_water[rows].astype(float),
-    )
-
-
-def _rows_of(k: int, keyframe: Indices) -> slice:
-    """Return which rows of a table, sorted by ``keyframe``, belong to one."""
-    begin, end = np.searchsorted(keyframe, [k, k + 1])
-    return slice(int(begin), int(end))

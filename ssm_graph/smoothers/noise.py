@@ -8,7 +8,7 @@ is a little wrong as well; :attr:`SmootherConfig.adapt_noise` repeats solution a
 they agree.
 
 *Inertial data.* Their chi-square with the degrees of freedom that the states leave them, see
-:mod:`ssm_graph.graph.inertial_fit`.
+:func:`ssm_graph.graph.inertial_rows.inertial_fit`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.graph.inertial_fit import InertialFit
+from ssm_graph.graph.inertial_rows import InertialFit
 from ssm_graph.mission.estimate import OUTLIER_WEIGHT, NoiseFound
 from ssm_graph.mission.problem import Beams, Problem
 from ssm_graph.sensors.dvl import N_BEAMS

@@ -7,11 +7,12 @@ from typing import NamedTuple
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps
+from ssm_graph.engine.chain import ChainSolution
+from ssm_graph.engine.states import States
 from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.first_values import FirstValues
-from ssm_graph.graph.inertial_fit import inertial_fit
-from ssm_graph.graph.linearize import GraphLinearizer, Step
-from ssm_graph.graph.states import States
+from ssm_graph.graph.inertial_rows import inertial_fit
+from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.mission.estimate import Iteration, NoiseFound, Status
 from ssm_graph.smoothers.aid_weights import AidWeighing
 from ssm_graph.smoothers.noise import noise_found
@@ -25,7 +26,7 @@ class Pass(NamedTuple):
     """State of the loop after one iteration."""
 
     states: States
-    step: Step
+    step: ChainSolution
     beam_rows: BeamRows
     mahalanobis_sq: Array
     weights: Array
@@ -57,7 +58,7 @@ class Solved(NamedTuple):
 def noise_of_steps(solved: Solved, used: Array) -> Steps[NoiseFound]:
     """Return what a solution says of the noise; ``used`` (4,) are its sigmas over the stated."""
     linearizer, last = solved.linearizer, solved.last
-    inertial = yield from linearizer.inertial_rows_steps(last.states)
+    inertial = linearizer.inertial_rows(last.states)
     fit = inertial_fit(inertial, last.step)
     yield 0.005 * len(inertial)
     return noise_found(
@@ -73,25 +74,23 @@ def noise_of_steps(solved: Solved, used: Array) -> Steps[NoiseFound]:
 def descend_steps(
     linearizer: GraphLinearizer,
     states: States,
-    delta: tuple[Array, Array],
+    step: ChainSolution,
     weights: Array,
     cost: float,
     *,
     aid_weights: Array | None = None,
-) -> Steps[tuple[States, BeamRows, Array]]:
+) -> Steps[tuple[States, BeamRows]]:
     """Take the Gauss-Newton step, halved while it raises the cost at these weights.
 
-    Returns the states moved to, their beams, and the whole step, (K, 15) or with all extra
-    variables, however little of it was taken: what is judged as settled is the step that was
-    wanted.
+    Returns the states moved to, and their beams.
     """
     for halvings in range(MAX_HALVINGS):
         scale = 0.5**halvings
-        moved, update = linearizer.retract(states, delta, scale=scale)
+        moved = states.moved(scale * step.step, scale * step.constants_step)
         yield 0.006 * len(moved.p_n)
         rows = linearizer.beam_rows(moved)
         yield 0.004 * len(moved.p_n)
         if linearizer.cost(moved, rows, weights, aid_weights) <= cost + COST_SLACK:
-            return moved, rows, update / scale
+            return moved, rows
         yield 0.005 * len(moved.p_n)
-    return states, linearizer.beam_rows(states), update / scale
+    return states, linearizer.beam_rows(states)

@@ -6,11 +6,12 @@ import numpy as np
 from scipy.stats import chi2
 
 from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.engine.extras import Extras
 from ssm_graph.engine.marginal_prior import MarginalPrior
+from ssm_graph.engine.states import States
 from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.linearize import GraphLinearizer, Misfit
-from ssm_graph.graph.states import States
 from ssm_graph.mission.current import CURRENTS
 from ssm_graph.mission.doubts import MISFIT, doubts_of_beams
 
@@ -50,7 +51,7 @@ def _doubt_prior(prior: MarginalPrior, states: States) -> str:
     for name, part in (
         ("position or attitude", whitened[:6]),
         ("velocity", whitened[6:9]),
-        ("bias", whitened[9:]),
+        ("bias", whitened[9:STATE_DIM]),
     ):
         chi_sq = float(part @ part)
         if chi2.sf(chi_sq, df=len(part)) < PRIOR_TAIL:

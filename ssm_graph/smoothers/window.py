@@ -8,21 +8,21 @@ from typing import Self
 
 import numpy as np
 
+from factors.inertial import Intervals
 from factors.similarity import Similarity, expected_mahalanobis_sq
 from ssm_graph.base.errors import SolverError
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps, finished
+from ssm_graph.base.times import MIN_SPACING_S
 from ssm_graph.engine.error_state import InitialMoments, Linearised
 from ssm_graph.engine.marginal_prior import moved_chart
 from ssm_graph.engine.mixing import Mixing
-from ssm_graph.engine.states import AugmentedStates
+from ssm_graph.engine.states import States
 from ssm_graph.graph.beam_weights import met_weights, updated_trust
-from ssm_graph.mission.timeline import MIN_SPACING_S
-from ssm_graph.sensors.dvl import N_BEAMS
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
-from ssm_graph.smoothers.keyframe import Keyframe, Sensors, Way
+from ssm_graph.smoothers.keyframe import Keyframe, Sensors
 from ssm_graph.smoothers.stretch import Stretch
-from ssm_graph.smoothers.window_graph import WindowGraph
+from ssm_graph.smoothers.window_graph import WindowGraph, inertial_data
 
 _PACKED = ("step", "covariance", "innovation", "weights", "t", "trust")
 RUNAWAY_SPEED = 100.0
@@ -49,9 +49,9 @@ class Window:
         *,
         trust: Array | None = None,
     ) -> None:
-        """``trust`` (4,) is what each beam was worth before, 0 to 1; all of them when left out."""
+        """``trust`` (B,) is what each beam was worth before, 0 to 1; all of them when left out."""
         self.config = config
-        self._trust = np.ones(N_BEAMS) if trust is None else trust
+        self._trust = np.ones(sensors.beams.n_beams) if trust is None else trust
         self._graph = WindowGraph(sensors, first, start)
         self._step = np.zeros((1, sensors.state_dim))
         """(K, n) off where each keyframe is linearised"""
@@ -79,12 +79,12 @@ class Window:
         arrays: Mapping[str, Array],
         sensors: Sensors,
         config: FixedLagConfig,
-        way: Callable[[float, float], Way],
+        inertial: Callable[[float, float], Intervals],
     ) -> Self:
-        """Return the window that was packed; ``way`` gives the inertial data between two times."""
+        """Return the window that was packed; ``inertial`` gives the data between two times."""
         window = cls.__new__(cls)
         window.config = config
-        window._graph = WindowGraph.unpack(arrays, sensors, way)
+        window._graph = WindowGraph.unpack(arrays, sensors, inertial)
         for name in _PACKED:
             setattr(window, f"_{name}", arrays[name])
         return window
@@ -101,11 +101,11 @@ class Window:
 
     @property
     def trust(self) -> Array:
-        """What each beam (4,) was worth in the last pings, the newest left out."""
+        """What each beam (B,) was worth in the last pings, the newest left out."""
         return self._trust
 
     @property
-    def states(self) -> AugmentedStates:
+    def states(self) -> States:
         """The estimate of all keyframes."""
         return self._graph.at.moved(self._step)
 
@@ -127,8 +127,9 @@ class Window:
     def _stretch(self, begin: int, end: int) -> Stretch:
         first = self._graph.first_row
         rows, at = slice(first[begin], first[end]), slice(begin, end)
+        time_s = np.array([keyframe.time_s for keyframe in self.keyframes])
         return Stretch(
-            np.array([keyframe.time_s for keyframe in self.keyframes[at]]),
+            time_s[at],
             self._graph.at.take(at).moved(self._step[at]),
             self._covariance[at],
             np.diff(first[begin : end + 1]).astype(float),
@@ -136,6 +137,7 @@ class Window:
             self._innovation[rows],
             self._t[rows],
             self._weights[rows],
+            self._graph.aids.judged(begin, end, time_s, self._step),
         )
 
     def advance(self, keyframe: Keyframe) -> Stretch:
@@ -144,7 +146,7 @@ class Window:
         leaving = sum(known.time_s < oldest_s for known in self.keyframes)
         left, last = self._stretch(0, leaving), self.states.take(np.s_[-1:])
         newest = self.newest
-        self._trust = updated_trust(self._trust, newest.beam.astype(np.intp), newest.weight)
+        self._trust = updated_trust(self._trust, newest.beam, newest.weight)
         if leaving == len(self.keyframes):
             # Of a window that goes as a whole, the posterior of its end is all that counts.
             self._graph.keep_posterior(last)
@@ -158,7 +160,7 @@ class Window:
             self.meet_prediction()
         return left
 
-    def _append(self, keyframe: Keyframe, last: AugmentedStates) -> None:
+    def _append(self, keyframe: Keyframe, last: States) -> None:
         graph, n_rows = self._graph, len(self._weights)
         graph.append(keyframe, last)
         n_new = len(graph.error) - n_rows
@@ -185,7 +187,9 @@ class Window:
         step, root_cov = graph.prediction(self._weights)
         if np.isfinite(self.config.gate_sigmas):
             graph.leave_out_far(step, root_cov, sigmas=self.config.gate_sigmas)
-        row = graph.first_row[-2]
+        k, row = len(self.keyframes) - 1, graph.first_row[-2]
+        if graph.aids.meet_prediction(k, step, root_cov, self.config.kernel):
+            graph.changed_from(k)
         H = graph.jacobian[row:]
         if len(H) == 0:
             return
@@ -195,16 +199,16 @@ class Window:
             root @ root.T,
             graph.beams.sigma[row:] ** 2,
             self.config.kernel,
-            trust=self._trust[graph.beams.beam[row:].astype(np.intp)],
+            trust=self._trust[graph.beams.beam[row:]],
         )
         self._weights = np.concatenate([self._weights[:row], weights])
-        graph.changed_from(len(self.keyframes) - 1)
+        graph.changed_from(k)
 
-    def predicted(self, keyframe: Keyframe) -> tuple[AugmentedStates, Array]:
+    def predicted(self, keyframe: Keyframe) -> tuple[States, Array]:
         """Return where the inertial data lead from the newest keyframe, with the covariance."""
-        last, inertial = self.states.take(np.s_[-1:]), self._graph.inertial
-        there = inertial.predict(keyframe, last)
-        return there, inertial.carry(keyframe, last, there, self._covariance[-1])
+        last = self.states.take(np.s_[-1:])
+        ahead = self._graph.inertial.predict(inertial_data([keyframe]), last)
+        return ahead.states, ahead.covariance(self._covariance[-1])
 
     def require_sane(self) -> None:
         """Raise :class:`SolverError` for a newest state that no vehicle can have."""
@@ -232,15 +236,16 @@ class Window:
         for number in range(1, config.max_iterations + 1):
             update = self._solve()
             self._relinearise()
-            self._t = self._mahalanobis_sq()
+            self._judge()
             if _largest(update, self._covariance) < tolerance:
                 break
             yield 0.8 + 0.1 * n_keyframes
             if number < config.max_iterations:
-                settled = config.kernel.weight(self._t)
+                settled = self._settled()
                 # A single keyframe's weights are those of the filter, pass by pass.
                 if n_keyframes > 1:
-                    settled = mixing.next_weights(self._weights, settled)
+                    used = np.concatenate([self._weights, self._graph.aids.weights])
+                    settled = mixing.next_weights(used, settled)
                 self._renew(settled)
         return number
 
@@ -249,11 +254,11 @@ class Window:
         config, chain = self.config, self._graph.chain
         for number in range(1, config.max_iterations + 1):
             update = self._solve()
-            self._t = self._mahalanobis_sq()
+            self._judge()
             if _largest(update, self._covariance) < config.tolerance:
                 break
             if number < config.max_iterations:
-                self._renew(config.kernel.weight(self._t))
+                self._renew(self._settled())
         J = moved_chart(self._step[0])
         self._covariance = J @ self._covariance @ J.T
         chain.root = chain.root @ np.linalg.inv(J)
@@ -262,7 +267,8 @@ class Window:
     def _solve(self) -> Array:
         """Solve with the present weights and return by how much that moves (K, n)."""
         self._graph.eliminate(self._weights)
-        step, self._covariance = self._graph.chain.solve()
+        solution = self._graph.chain.solve()
+        step, self._covariance = solution.step, solution.conditional
         update, self._step = step - self._step, step
         return update
 
@@ -288,12 +294,26 @@ class Window:
     def _renew(self, settled: Array) -> None:
         """Take the weights that have changed enough."""
         threshold = 0.0 if len(self.keyframes) == 1 else self.config.reweigh
-        changed = np.abs(settled - self._weights) > threshold
+        n_beams = len(self._weights)
+        of_beams, graph = settled[:n_beams], self._graph
+        changed = np.abs(of_beams - self._weights) > threshold
         if changed.any():
-            self._weights = np.where(changed, settled, self._weights)
+            self._weights = np.where(changed, of_beams, self._weights)
             row = np.argmax(changed)
-            k = int(np.searchsorted(self._graph.first_row, row, side="right")) - 1
-            self._graph.changed_from(k)
+            graph.changed_from(int(np.searchsorted(graph.first_row, row, side="right")) - 1)
+        first = graph.aids.renew(settled[n_beams:], threshold=threshold)
+        if first is not None:
+            graph.changed_from(first)
+
+    def _settled(self) -> Array:
+        """Return the weights that all beams, then all aids, are found to have."""
+        kernel = self.config.kernel
+        return np.concatenate([kernel.weight(self._t), self._graph.aids.settled(kernel)])
+
+    def _judge(self) -> None:
+        """Find the ``t`` of all measurements at the present solution."""
+        self._t = self._mahalanobis_sq()
+        self._graph.aids.judge(self._step, self._covariance, self.config.similarity)
 
     def _mahalanobis_sq(self) -> Array:
         graph = self._graph

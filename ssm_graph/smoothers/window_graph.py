@@ -3,32 +3,66 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
-from typing import Self
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
+from typing import NamedTuple, Self
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
+from factors.inertial import Intervals
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.chain import Chain
-from ssm_graph.engine.error_state import InitialMoments
+from ssm_graph.engine.error_state import GYRO_BIAS, ROTATION, STATE_DIM, VELOCITY, InitialMoments
+from ssm_graph.engine.extras import Extras
 from ssm_graph.engine.marginal_prior import MarginalPrior, prior_at_start, prior_on
-from ssm_graph.engine.states import AugmentedStates
-from ssm_graph.smoothers.bends import bends_of
-from ssm_graph.smoothers.keyframe import BeamSpeeds, Keyframe, Sensors, Way
-from ssm_graph.smoothers.keyframe_arrays import pack_keyframes, unpack_keyframes
-from ssm_graph.smoothers.window_inertial import InertialRows
-from ssm_graph.smoothers.window_rows import (
-    DepthTargets,
-    beam_rows,
-    depth_rows,
-    depth_targets,
-    fix_rows,
-    no_rows,
-    seen_by_beams,
-    speed_rows,
-)
+from ssm_graph.engine.states import States
+from ssm_graph.graph.beam_rows import BeamRows, CalibratedBeams, linearize_beams
+from ssm_graph.graph.inertial_rows import InertialRows
+from ssm_graph.mission.problem import Beams
+from ssm_graph.smoothers.keyframe import Keyframe, Sensors
+from ssm_graph.smoothers.window_aids import WindowAids, row_states
+
+_LISTS = ("keyframes", "_between")
+
+
+class Bends(NamedTuple):
+    """How much each of the n components of a keyframe's state bends what is measured there."""
+
+    share: Array
+    """(n,) of what the attitude bends, by the same number of sigmas"""
+    as_a_turn: Array
+    """(n,) what bends as much as a turn of 1 rad: metres, metres per second, biases ..."""
+
+    @classmethod
+    def of(cls, extras: Extras) -> Bends:
+        """Return those of the error state and of the extra variables behind it."""
+        share = np.full(extras.width, 0.1)
+        share[:3] = 1.0
+        of_state = np.repeat([1.0, 1e4, 1e2, 1e6, 1e6], 3)
+        of_extras = (np.full(len(block.sigma), block.as_a_turn) for block in extras.blocks)
+        return cls(share, np.concatenate([of_state, *of_extras]))
+
+
+def beam_rows(sensors: Sensors, beams: Beams, states: States) -> BeamRows:
+    """Return errors (M,) in m/s and Jacobians (M, n) of beams, each with its own state."""
+    if not sensors.extras:
+        return linearize_beams(
+            beams,
+            R_nb=states.R_nb,
+            v_n=states.v_n,
+            bias=states.bias,
+            omega_ie_n=sensors.frame.omega_ie_n,
+        )
+    extended = CalibratedBeams(beams, sensors.extras, sensors.frame)
+    at = row_states(sensors, states)
+    return extended.rows(at, extended.prepare(at.walks, at.constants, at.bias))
+
+
+def inertial_data(keyframes: Sequence[Keyframe]) -> Intervals:
+    """Return the inertial data before keyframes, none of which is the first of all."""
+    return Intervals.joined([k.inertial for k in keyframes if k.inertial is not None])
 
 
 class WindowGraph:
@@ -40,31 +74,31 @@ class WindowGraph:
     def __init__(self, sensors: Sensors, first: Keyframe, start: InitialMoments) -> None:
         self.sensors = sensors
         self.keyframes: list[Keyframe] = []
-        self.at = AugmentedStates.of(start)
+        self.at = States.at_start(start)
         """Where each keyframe is linearised"""
-        self.beams = BeamSpeeds.none()
+        self.beams = sensors.beams
+        self.aids = WindowAids(sensors)
         self.state_dim = n = sensors.state_dim
         self.error, self.jacobian = np.zeros(0), np.zeros((0, n))
         """Of the beams, (M,) in m/s and (M, n)"""
         self.inertial = InertialRows(sensors.frame, sensors.extras)
-        self.chain = Chain(dim=n)
+        self.chain = Chain(n)
         self.prior: MarginalPrior = prior_at_start(start)
-        self._depths: list[Array] = []
-        self._fixes: list[Array] = []
-        self._speeds: list[Array] = []
         self._between: list[Array] = []
-        self._targets = depth_targets(sensors, [first], self.at, first_rise=0.0)
         self._stale = 0
         self.first_row = np.zeros(1, np.intp)
         """(K + 1,) where the beams of each keyframe begin, and where they end"""
-        self.bends, self.seen_by_beams = bends_of(sensors.extras), seen_by_beams(sensors)
+        self.bends = Bends.of(sensors.extras)
+        self.seen_by_beams = np.r_[ROTATION, VELOCITY, GYRO_BIAS, STATE_DIM:n]
+        """Components of the state that a beam may depend on"""
         self._measure(first)
 
     def successor(self) -> Self:
         """Return a graph that goes its own way from here, and takes the chain along."""
         twin = copy.copy(self)
-        for name in ("keyframes", "_depths", "_fixes", "_speeds", "_between"):
+        for name in _LISTS:
             setattr(twin, name, getattr(self, name).copy())
+        twin.aids = self.aids.copy()
         self.chain, self._stale = self.chain.successor(), 0
         return twin
 
@@ -74,73 +108,76 @@ class WindowGraph:
         return {
             **{f"at_{name}": column for name, column in self.at._asdict().items()},
             **{f"prior_{name}": column for name, column in self.prior._asdict().items()},
-            **{f"target_{name}": column for name, column in self._targets._asdict().items()},
-            **pack_keyframes(self.keyframes),
+            **{f"beams_{name}": column for name, column in self.beams.pack()},
+            **dict(self.aids.pack()),
+            "time_s": np.array([keyframe.time_s for keyframe in self.keyframes]),
+            "first_row": self.first_row.astype(np.float64),
             "root": self.chain.root,
             "between": np.array(self._between).reshape(-1, n, 2 * n + 1),
         }
 
     @classmethod
     def unpack(
-        cls, arrays: Mapping[str, Array], sensors: Sensors, way: Callable[[float, float], Way]
+        cls,
+        arrays: Mapping[str, Array],
+        sensors: Sensors,
+        inertial: Callable[[float, float], Intervals],
     ) -> Self:
-        """Return the graph that was packed; ``way`` gives the inertial data between two times."""
-        keyframes = unpack_keyframes(arrays, way)
-        at = AugmentedStates(*(arrays[f"at_{name}"] for name in AugmentedStates._fields))
+        """Return the graph that was packed; ``inertial`` gives the data between two times."""
+        at = States(*(arrays[f"at_{name}"] for name in States._fields))
         n, packed = sensors.state_dim, len(arrays["root"])
         if packed != n:
             raise DataError(
                 f"checkpoint: expected keyframes of {n} states, what the vehicle asks to estimate, "
                 f"got {packed}; it needs the vehicle that it was written with"
             )
+        beams = sensors.beams.unpack({name: arrays[f"beams_{name}"] for name in Beams.columns()})
+        first_row = arrays["first_row"].astype(np.intp)
+        aids, times = WindowAids.unpack(arrays, sensors, at), arrays["time_s"].tolist()
+        intervals = [None, *(inertial(begin_s, end_s) for begin_s, end_s in pairwise(times))]
+        keyframes = [
+            Keyframe(time_s, beams.take(slice(*first_row[k : k + 2])), aids.at(k), intervals[k])
+            for k, time_s in enumerate(times)
+        ]
         graph = cls(sensors, keyframes[0], at.moments(np.eye(n)))
-        graph.keyframes, graph.at = keyframes, at
+        graph.keyframes, graph.at, graph.beams, graph.aids = keyframes, at, beams, aids
         graph.prior = MarginalPrior(*(arrays[f"prior_{n}"] for n in MarginalPrior._fields))
-        graph._targets = DepthTargets(*(arrays[f"target_{n}"] for n in DepthTargets._fields))
-        for keyframe in keyframes[1:]:
-            graph.beams = graph.beams.followed_by(keyframe.beams)
-        counts = [len(keyframe.beams.speed) for keyframe in keyframes]
-        graph.first_row = np.append(0, np.cumsum(counts, dtype=np.intp))
+        graph.first_row = first_row
         graph._between = list(arrays["between"])
-        graph.chain = Chain(arrays["root"], dim=n)
-        graph.error = np.zeros(graph.first_row[-1])
-        graph.jacobian = np.zeros((len(graph.error), n))
-        graph._depths, graph._fixes, graph._speeds = [], [], []
-        graph._measure_again(0, len(keyframes))
+        graph.chain = Chain(n, root=arrays["root"])
+        graph._linearise_beams(0, len(keyframes))
         return graph
 
     def changed_from(self, keyframe: int) -> None:
         """Have the chain eliminated again from a keyframe on."""
         self._stale = min(self._stale, keyframe)
 
-    def append(self, keyframe: Keyframe, last: AugmentedStates) -> None:
+    def append(self, keyframe: Keyframe, last: States) -> None:
         """Add a keyframe where the inertial data lead from ``last`` (1, ...), the newest one."""
-        predicted = self.inertial.predict(keyframe, last)
+        interval = inertial_data([keyframe])
+        ahead = self.inertial.predict(interval, last)
+        predicted, at = ahead.states, self.at.take(np.s_[-1:])
         self.at = self.at.followed_by(predicted)
-        self._between += self.inertial.rows([keyframe], self.at.take(np.s_[-2:]))
+        if at.is_same(last):
+            self._between += list(ahead.rows(last))
+        else:
+            self._between += list(self.inertial.rows(interval, self.at.take(np.s_[-2:])))
         self.changed_from(len(self.keyframes) - 1)
-        pair = [self.keyframes[-1], keyframe]
-        both = last.followed_by(predicted)
-        targets = depth_targets(self.sensors, pair, both, first_rise=0.0)
-        self._targets = self._targets.followed_by(targets.take(np.s_[1:]))
-        self._measure(keyframe)
+        self._measure(keyframe, last)
 
-    def _measure(self, keyframe: Keyframe) -> None:
-        """Add a keyframe's measurements, linearised."""
+    def _measure(self, keyframe: Keyframe, before: States | None = None) -> None:
+        """Add a keyframe's measurements, linearised; ``before`` (1, ...) is the state before."""
         self.keyframes.append(keyframe)
-        n_rows = self.first_row[-1] + len(keyframe.beams.speed)
-        self.first_row = np.append(self.first_row, n_rows)
-        at = self.at.take(np.s_[-1:])
-        here = np.zeros(len(keyframe.beams.speed), np.intp)
-        error, jacobian = beam_rows(self.sensors, keyframe.beams, at.take(here))
         self.beams = self.beams.followed_by(keyframe.beams)
+        self.first_row = np.append(self.first_row, len(self.beams))
+        at = self.at.take(np.s_[-1:])
+        here = np.zeros(len(keyframe.beams), np.intp)
+        error, jacobian = beam_rows(self.sensors, keyframe.beams, at.take(here))
         self.error = np.append(self.error, error)
         self.jacobian = np.concatenate([self.jacobian, jacobian])
-        self._depths += depth_rows(self.sensors, [keyframe], at, self._targets.take(np.s_[-1:]))
-        self._fixes += fix_rows(self.sensors, [keyframe], at)
-        self._speeds += speed_rows(self.sensors, [keyframe], at)
+        self.aids.append(keyframe, len(self.keyframes) - 1, at, before)
 
-    def keep_posterior(self, last: AugmentedStates) -> None:
+    def keep_posterior(self, last: States) -> None:
         """Keep of all keyframes the newest, with what was found there as its prior."""
         self.prior = prior_on(last, self.chain.root, offset=np.zeros(self.state_dim))
         end = self.keyframes[-1]
@@ -148,9 +185,8 @@ class WindowGraph:
         self._drop_rows(len(self.error))
         self.first_row = np.zeros(2, np.intp)
         self.at = last
-        self.keyframes = [Keyframe.unmeasured(end.time_s, end.gyro_b, end.way)]
-        none = no_rows(self.sensors)
-        self._depths, self._fixes, self._speeds = [none], [none], [none]
+        self.keyframes = [Keyframe(end.time_s, self.sensors.beams, inertial=end.inertial)]
+        self.aids.drop(1)
         self._stale = 0
 
     def marginalise(self, count: int, weights: Array) -> None:
@@ -167,8 +203,9 @@ class WindowGraph:
         self.first_row = self.first_row[count:] - self.first_row[count]
         self.chain.drop(count)
         self._stale = max(self._stale - count, 0)
-        self.at, self._targets = self.at.take(np.s_[count:]), self._targets.take(np.s_[count:])
-        for name in ("keyframes", "_depths", "_fixes", "_speeds", "_between"):
+        self.at = self.at.take(np.s_[count:])
+        self.aids.drop(count)
+        for name in _LISTS:
             setattr(self, name, getattr(self, name)[count:])
 
     def _drop_rows(self, count: int) -> None:
@@ -180,21 +217,18 @@ class WindowGraph:
         begin = self._stale
         if begin == len(self.keyframes):
             return
-        first = self.first_row[begin:]
-        b = slice(first[0], None)
-        rows = np.column_stack([self.jacobian[b], -self.error[b]])
-        rows *= (np.sqrt(weights[b]) / self.beams.sigma[b])[:, None]
-        first = first - first[0]
-        own = [
-            np.concatenate([rows[first[i] : first[i + 1]], *aids])
-            for i, aids in enumerate(
-                zip(self._depths[begin:], self._fixes[begin:], self._speeds[begin:], strict=True)
-            )
-        ]
-        if begin == 0:
-            carried = self.prior.rows(self.at, self.at.extra[0])
-        else:
-            carried = self.chain.carried[begin]
+        row = self.first_row[begin]
+        rows = np.column_stack([self.jacobian[row:], -self.error[row:]])
+        rows *= (np.sqrt(weights[row:]) / self.beams.sigma[row:])[:, None]
+        keyframe, of_aids = self.aids.rows(begin)
+        n_keyframes = len(self.keyframes)
+        of_beams = np.repeat(np.arange(begin, n_keyframes), np.diff(self.first_row[begin:]))
+        keyframe = np.concatenate([of_beams, keyframe])
+        order = np.argsort(keyframe, kind="stable")
+        rows = np.concatenate([rows, of_aids])[order]
+        edges = np.searchsorted(keyframe[order], np.arange(begin, n_keyframes + 1)).tolist()
+        own = [rows[first:last] for first, last in pairwise(edges)]
+        carried = self.prior.rows(self.at) if begin == 0 else self.chain.carried[begin]
         self.chain.eliminate(carried, own, self._between[begin:], begin=begin)
         self._stale = len(self.keyframes)
 
@@ -210,16 +244,12 @@ class WindowGraph:
         return solved[:, -1], solved[:, :-1]
 
     def leave_out_far(self, step: Array, root_cov: Array, *, sigmas: float) -> None:
-        """Leave out depth and GNSS of the newest keyframe that are far from its prediction."""
+        """Leave out of the newest keyframe what counts in full and is far from its prediction."""
         k = len(self.keyframes) - 1
-        for name, aids in (("depth", self._depths), ("fix", self._fixes)):
-            A, b = aids[k][:, :-1], aids[k][:, -1]
-            root, left = A @ root_cov, b - A @ step
-            distance_sq = left @ np.linalg.solve(root @ root.T + np.eye(len(b)), left)
-            if distance_sq > sigmas**2 * len(b):
-                self.keyframes[k] = self.keyframes[k].without(name)
-                aids[k] = no_rows(self.sensors)
-                self.changed_from(k)
+        left_out = self.aids.leave_out_far(k, step, root_cov, sigmas=sigmas)
+        if left_out:
+            self.keyframes[k] = self.keyframes[k].without(*left_out)
+            self.changed_from(k)
 
     def linearise(self, begin: int, end: int, step: Array) -> None:
         """Move successive keyframes by ``step`` (end - begin, n) and linearise there."""
@@ -228,30 +258,19 @@ class WindowGraph:
         self.at = head.followed_by(moved).followed_by(tail)
         before, behind = max(begin - 1, 0), min(end + 1, len(self.keyframes))
         if len(self.keyframes) > 1:  # a single keyframe keeps what its prediction came with
-            self._linearise_ways(before, behind)
-        self._measure_again(begin, behind)
+            keyframes, at = self.keyframes[before + 1 : behind], self.at.take(np.s_[before:behind])
+            self._between[before : behind - 1] = self.inertial.rows(inertial_data(keyframes), at)
+        self._linearise_beams(begin, behind)
+        self.aids.linearise(begin, behind, self.at)
         self.changed_from(before)
 
-    def _linearise_ways(self, begin: int, end: int) -> None:
-        """Linearise the ways between successive keyframes, and lead their depths along them."""
-        keyframes, at = self.keyframes[begin:end], self.at.take(np.s_[begin:end])
-        self.inertial.set_gravity(keyframes[1:], at)
-        self._between[begin : end - 1] = self.inertial.rows(keyframes[1:], at)
-        first_rise = float(self._targets.rise[begin])
-        targets = depth_targets(self.sensors, keyframes, at, first_rise=first_rise)
-        head, tail = self._targets.take(np.s_[:begin]), self._targets.take(np.s_[end:])
-        self._targets = head.followed_by(targets).followed_by(tail)
-
-    def _measure_again(self, begin: int, end: int) -> None:
-        """Linearise the measurements of successive keyframes."""
+    def _linearise_beams(self, begin: int, end: int) -> None:
+        """Linearise the beams of successive keyframes."""
         first = self.first_row
         rows = slice(first[begin], first[end])
         keyframe = np.repeat(np.arange(begin, end), np.diff(first[begin : end + 1]))
         error, jacobian = beam_rows(self.sensors, self.beams.take(rows), self.at.take(keyframe))
-        self.error, self.jacobian = self.error.copy(), self.jacobian.copy()
-        self.error[rows], self.jacobian[rows] = error, jacobian
-        here = np.s_[begin:end]
-        keyframes, at = self.keyframes[here], self.at.take(here)
-        self._depths[here] = depth_rows(self.sensors, keyframes, at, self._targets.take(here))
-        self._fixes[here] = fix_rows(self.sensors, keyframes, at)
-        self._speeds[here] = speed_rows(self.sensors, keyframes, at)
+        parts = [(self.error, error), (self.jacobian, jacobian)]
+        self.error, self.jacobian = (
+            np.concatenate([old[: rows.start], new, old[rows.stop :]]) for old, new in parts
+        )

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,9 +15,6 @@ from ssm_graph.study.code import code_version
 from ssm_graph.study.methods import parse_method, shown
 from ssm_graph.study.scoring import LOST, Row, failed_row, score
 from ssm_graph.study.trials import Trial, recorded_trial, simulated_trials
-
-_ONE_AT_A_TIME: Final = threading.Lock()
-"""Jobs of one process share missions, whose gravity follows the estimate: no two at once."""
 
 
 class RunKey(NamedTuple):
@@ -103,7 +99,7 @@ def do_job(job: Job) -> JobResult:
 
     A method that overflows says so by its status; NumPy need not.
     """
-    with _ONE_AT_A_TIME, np.errstate(all="ignore"):
+    with np.errstate(all="ignore"):
         try:
             trials = _trials(job)
         except Exception as error:

@@ -9,6 +9,7 @@ import pytest
 
 from factors.similarity import GaussianKernel
 from ssm_graph.base.frozen import Array
+from ssm_graph.engine.states import States
 from ssm_graph.evaluation import chi2_interval
 from ssm_graph.filters.geodetic.filter import (
     GeodeticConfig,
@@ -16,7 +17,6 @@ from ssm_graph.filters.geodetic.filter import (
     run_geodetic,
     to_navigation,
 )
-from ssm_graph.graph.states import states_from_arrays
 from ssm_graph.mission.problem import build_problem
 from ssm_graph.simulation import (
     Grade,
@@ -68,7 +68,7 @@ def final_nees(sims: tuple[SimulatedMission, ...], history: GeodeticHistory) -> 
     for run, sim in enumerate(sims):
         problem = build_problem(sim.mission)
         states = to_navigation(problem, history, run)
-        error = state_errors(states_from_arrays(*states[:4]), true_states(problem, sim))[-1]
+        error = state_errors(States.of(*states[:4]), true_states(problem, sim))[-1]
         nees.append(error @ np.linalg.solve(states.covariance[-1], error))
     return np.array(nees)
 

@@ -14,8 +14,8 @@ import pytest
 
 from factors.similarity import LogKernel
 from ssm_graph.base.frozen import Array
+from ssm_graph.engine.states import States
 from ssm_graph.graph.first_values import first_values
-from ssm_graph.graph.states import States
 from ssm_graph.imu.preintegration import gtsam_gravity
 from ssm_graph.mission.problem import Problem, ProblemConfig, build_problem
 from ssm_graph.simulation import SimulatedMission, TransitRoute, Waves

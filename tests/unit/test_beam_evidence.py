@@ -7,21 +7,21 @@ import pytest
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.beam_evidence import ChainEvidence, WhitenedBeams
-from ssm_graph.engine.bordered import BorderedSolution
+from ssm_graph.engine.chain import ChainSolution
 
 K, N, M = 30, 15, 90
 
 
-def chain(rng: np.random.Generator) -> BorderedSolution:
+def chain(rng: np.random.Generator) -> ChainSolution:
     """Return conditionals of a chain that forgets."""
     R = np.triu(rng.normal(size=(K, N, N))) + 3.0 * np.eye(N)
     S = 0.2 * rng.normal(size=(K, N, N))
     S[-1] = 0.0
     none = np.zeros(0)
-    return BorderedSolution(none, none, none, none, none, np.asarray(np.linalg.solve(R, S)), R)
+    return ChainSolution(none, none, none, none, none, np.asarray(np.linalg.solve(R, S)), R)
 
 
-def dense_information(solution: BorderedSolution, beams: WhitenedBeams, columns: Array) -> Array:
+def dense_information(solution: ChainSolution, beams: WhitenedBeams, columns: Array) -> Array:
     """Return ``c' (I - A (A'A)^-1 A') c`` by one triangular matrix of the whole chain."""
     root = np.zeros((K * N, K * N))
     A = np.zeros((M, K * N))

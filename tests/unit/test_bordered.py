@@ -2,12 +2,40 @@
 
 from __future__ import annotations
 
+import itertools
+from typing import NamedTuple
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from ssm_graph.base.errors import SolverError
 from ssm_graph.base.frozen import Array
-from ssm_graph.engine.bordered import ChainRows, solve_bordered
+from ssm_graph.engine.chain import Chain, ChainSolution
+
+
+class ChainRows(NamedTuple):
+    """Rows ``A d = b`` of K keyframes of n states with a border of C constants, ``b`` last."""
+
+    start: Array
+    """(n, n + C + 1)"""
+    between: Array
+    """(K - 1, n, 2 n + C + 1)"""
+    own: Array
+    """(M, n + C + 1)"""
+    first: NDArray[np.intp]
+    """(K + 1,) where the own rows of each keyframe begin, and M"""
+    border: Array
+    """(m, C + 1)"""
+
+
+def solve(rows: ChainRows) -> ChainSolution:
+    """Eliminate and solve."""
+    n, width = rows.start.shape
+    chain = Chain(n, width - n - 1)
+    own = [rows.own[a:b] for a, b in itertools.pairwise(rows.first.tolist())]
+    chain.eliminate(rows.start, own, rows.between, begin=0)
+    return chain.solve(rows.border)
 
 
 def random_rows(
@@ -62,13 +90,13 @@ def test_as_a_dense_system(keyframes: int, n: int, constants: int, most: int) ->
     """Steps, marginal covariances, and those between keyframes and constants."""
     rng = np.random.default_rng(keyframes + constants)
     rows = random_rows(rng, keyframes=keyframes, n=n, constants=constants, most=most)
-    got = solve_bordered(rows)
+    got = solve(rows)
     solution, covariance = dense(rows)
     end = n * keyframes
     np.testing.assert_allclose(got.step.ravel(), solution[:end], rtol=1e-8, atol=1e-9)
     np.testing.assert_allclose(got.constants_step, solution[end:], rtol=1e-8, atol=1e-9)
     np.testing.assert_allclose(got.constants_cov, covariance[end:, end:], rtol=1e-8, atol=1e-12)
-    marginals, variances = got.covariance(n), got.variances()
+    marginals, variances = got.covariance(n), got.sigma[:end].reshape(-1, n) ** 2
     for k in range(keyframes):
         own = slice(n * k, n * k + n)
         np.testing.assert_allclose(marginals[k], covariance[own, own], rtol=1e-7, atol=1e-10)
@@ -85,7 +113,7 @@ def test_variance_of_rows_takes_the_border_along() -> None:
     """``H P H'`` holds the correlation of a keyframe with the constants."""
     rng = np.random.default_rng(3)
     rows = random_rows(rng, keyframes=5, n=4, constants=3)
-    got, (_, covariance) = solve_bordered(rows), dense(rows)
+    got, (_, covariance) = solve(rows), dense(rows)
     keyframe = np.array([0, 4, 2, 2])
     H = rng.normal(size=(4, 7))
     for i, k in enumerate(keyframe):
@@ -98,7 +126,7 @@ def test_variance_of_rows_takes_the_border_along() -> None:
 def test_triangles_rebuild_the_information(keyframes: int) -> None:
     """``R`` and ``R gain`` of every keyframe, in their places, have the ``A'A`` of all rows."""
     rows = random_rows(np.random.default_rng(keyframes), keyframes=keyframes, n=4, constants=0)
-    got, (_, covariance) = solve_bordered(rows), dense(rows)
+    got, (_, covariance) = solve(rows), dense(rows)
     whole = np.zeros_like(covariance)
     for k in range(keyframes):
         own = slice(4 * k, 4 * k + 4)
@@ -118,7 +146,7 @@ def test_what_is_not_determined_is_refused() -> None:
     rows = random_rows(rng, keyframes=4, n=3, constants=2)
     rows.own[:, 3], rows.border[0] = 0.0, 0.0
     with pytest.raises(SolverError, match="not determined"):
-        solve_bordered(rows)
+        solve(rows)
 
 
 def test_what_is_not_finite_is_refused() -> None:
@@ -127,4 +155,4 @@ def test_what_is_not_finite_is_refused() -> None:
     rows = random_rows(rng, keyframes=4, n=3, constants=2)
     rows.between[1, 0, 0] = np.nan
     with pytest.raises(SolverError):
-        solve_bordered(rows)
+        solve(rows)

@@ -12,7 +12,6 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import POSITION, VELOCITY
 from ssm_graph.engine.states import NavigationStates, local_D_deviation
 from ssm_graph.filters.navigation.process import Process
-from ssm_graph.imu.arrays import interval_arrays
 from ssm_graph.imu.preintegration import gtsam_gravity
 from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.simulation import Grade
@@ -38,8 +37,8 @@ def gtsam_step(problem: Problem, k: int, bias: Array) -> tuple[gtsam.NavState, A
     """Return prediction, transition and process covariance from GTSAM's factor."""
     span = problem.keyframe_s[k + 1] - problem.keyframe_s[k]
     middle = POSE.translation() + 0.5 * span * VELOCITY_N
-    problem.chain.params[k].n_gravity = gtsam_gravity(problem.frame, middle)
-    measured = problem.chain.measurements[k]
+    g_n = np.tile(gtsam_gravity(problem.frame, middle), (problem.n_keyframes - 1, 1))
+    measured = problem.chain.measured(g_n)[k]
     begin = gtsam.imuBias.ConstantBias(bias[:3], bias[3:])
     end = measured.predict(gtsam.NavState(POSE, VELOCITY_N), begin)
     values = gtsam.Values()
@@ -62,7 +61,7 @@ def test_prediction_is_that_of_gtsam(bias: Array, k: int, monkeypatch: pytest.Mo
     """
     monkeypatch.setattr(process_module, "gravity_gradient", lambda _: np.zeros((3, 3)))
     problem = build_problem(simulated(duration_s=5.0, grade=Grade.INDUSTRIAL).mission)
-    process = Process([interval_arrays(problem.chain)], problem.frame)
+    process = Process([problem.chain.intervals], problem.frame)
     prediction = process.predict(k, states_of(bias))
     end, F, Q = gtsam_step(problem, k, bias)
     states = prediction.states
@@ -79,7 +78,7 @@ def test_prediction_is_that_of_gtsam(bias: Array, k: int, monkeypatch: pytest.Mo
 def test_transition_knows_that_gravity_changes() -> None:
     """A kilometre to each side, by differences of the prediction itself."""
     problem = build_problem(simulated(duration_s=5.0, grade=Grade.INDUSTRIAL).mission)
-    process = Process([interval_arrays(problem.chain)], problem.frame)
+    process = Process([problem.chain.intervals], problem.frame)
     begin = states_of(NO_BIAS)
     at = process.predict(0, begin)
     moves = 1000.0 * np.eye(15)[POSITION]
@@ -96,7 +95,7 @@ def test_transition_knows_that_gravity_changes() -> None:
 def test_runs_side_by_side_are_runs_alone() -> None:
     """Three seeds at once, bit by bit what each gives alone."""
     problems = [build_problem(simulated(duration_s=3.0, seed=seed).mission) for seed in range(3)]
-    intervals = [interval_arrays(problem.chain) for problem in problems]
+    intervals = [problem.chain.intervals for problem in problems]
     alone = states_of(LARGE_BIAS)
     together = NavigationStates(*(np.repeat(column, 3, axis=0) for column in alone))
     many = Process(intervals, problems[0].frame).predict(1, together)

@@ -8,9 +8,7 @@ import pytest
 from factors.similarity import LogKernel
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import POSITION, ROTATION
-from ssm_graph.graph.beam_weights import GATE, settle_weights
 from ssm_graph.graph.first_values import LOCKED_OUT_PINGS, _ForwardPass, first_values
-from ssm_graph.graph.inertial_rows import inertial_graph
 from ssm_graph.mission.problem import build_problem
 from ssm_graph.simulation import (
     CALM,
@@ -142,7 +140,7 @@ def test_one_exact_fix_moves_what_is_free_until_the_antenna_meets_it(free: slice
     )
     sim = simulated(duration_s=3.0, gnss=settings, waves=Waves(roll=0.5, pitch=0.4), seed=4)
     problem = build_problem(sim.mission)
-    state = _ForwardPass(problem, KERNEL, inertial_graph(problem))
+    state = _ForwardPass(problem, KERNEL)
     assert problem.fixes is not None
     lever, k = problem.fixes.lever_arm_b, int(problem.fixes.keyframe[0])
     truth = true_states(problem, sim)
@@ -173,7 +171,7 @@ def test_one_exact_depth_moves_what_is_free_until_the_sensor_meets_it(free: slic
         depth=DepthSettings(rate_hz=1.0, sigma=1e-4, lever_arm_b=(3.0, -2.0, 4.0)),
     )
     problem = build_problem(sim.mission)
-    state = _ForwardPass(problem, KERNEL, inertial_graph(problem))
+    state = _ForwardPass(problem, KERNEL)
     assert problem.depths is not None
     k, row = 800, 799
     truth = true_states(problem, sim)
@@ -220,49 +218,3 @@ def test_states_follow_the_beams_more_closely_than_dead_reckoning() -> None:
     alone = first_values(problem, kernel=KERNEL)
     free = state_errors(alone.states, true_states(problem, sim))
     assert np.linalg.norm(errors[-1, 6:9]) < 0.1 * np.linalg.norm(free[-1, 6:9])
-
-
-def test_gravity_is_left_as_that_of_the_predicted_path() -> None:
-    """Linear between its exact evaluations: good to 1e-9 m/s^2."""
-    sim = simulated(duration_s=60.0, perfect_sensors=True, draw_initial_errors=False)
-    problem = build_problem(sim.mission)
-    first = first_values(problem, kernel=KERNEL)
-    left = [params.n_gravity.copy() for params in problem.chain.params]
-    problem.chain.set_gravity(first.states.p_n)
-    exact = [params.n_gravity for params in problem.chain.params]
-    # Half a wave of heave between predicted midpoint and chord: 0.3 m x 3e-6 per second squared.
-    np.testing.assert_allclose(left, exact, rtol=0.0, atol=1e-6)
-
-
-def test_given_inertial_factors_are_used() -> None:
-    """The smoother hands over those it has; the answer is the same."""
-    problem = build_problem(simulated().mission)
-    own = first_values(problem, kernel=KERNEL)
-    given = first_values(problem, kernel=KERNEL, inertial=inertial_graph(problem))
-    np.testing.assert_array_equal(own.weights, given.weights)
-    np.testing.assert_array_equal(own.states.p_n, given.states.p_n)
-
-
-def test_settled_weights_are_a_fixed_point() -> None:
-    """At the returned weights the posterior gives those weights again."""
-    rng = np.random.default_rng(0)
-    H = rng.normal(size=(4, 3))
-    predicted, variance = H @ H.T * 0.02**2, np.full(4, 0.005**2)
-    innovation = np.array([0.01, -0.02, 0.015, 1.5])
-    weights = settle_weights(innovation, predicted, variance, KERNEL)
-    S_inv = np.linalg.inv(predicted + np.diag(variance / weights))
-    left = variance / weights * (S_inv @ innovation)
-    spread = np.diagonal(predicted - predicted @ S_inv @ predicted)
-    np.testing.assert_allclose(weights, KERNEL.weight((left**2 + spread) / variance), atol=2e-2)
-    assert weights[3] < 1e-3
-    assert weights[:3].min() > 0.2
-
-
-def test_gate_keeps_an_outlier_out_of_the_first_round() -> None:
-    """Without it a single huge beam would drag the least-squares solution to itself."""
-    predicted, variance = np.full((4, 4), 0.02**2) + 1e-8 * np.eye(4), np.full(4, 0.005**2)
-    innovation = np.array([0.0, 0.0, 0.0, 30.0])
-    assert innovation[3] ** 2 > GATE**2 * (predicted[3, 3] + variance[3])
-    weights = settle_weights(innovation, predicted, variance, KERNEL)
-    assert weights[3] < 1e-5
-    np.testing.assert_allclose(weights[:3], 1.08, atol=0.1)

@@ -13,6 +13,7 @@ from factors.similarity import GaussianKernel
 from ssm_graph.base.earth import EARTH_RATE
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
+from ssm_graph.engine.states import States
 from ssm_graph.filters.geodetic.error_model import (
     DP,
     ERROR_DIM,
@@ -32,7 +33,6 @@ from ssm_graph.filters.geodetic.filter import (
 from ssm_graph.filters.geodetic.measurements import beam_rows, gather, nominal_rows
 from ssm_graph.filters.geodetic.mechanisation import GeodeticState, Samples, Track, advance
 from ssm_graph.filters.navigation.named import filter_geodetic
-from ssm_graph.graph.states import states_from_arrays
 from ssm_graph.imu.preintegration import INTEGRATION_DENSITY, imu_params
 from ssm_graph.mission.estimate import Status
 from ssm_graph.mission.mission import Mission
@@ -342,7 +342,7 @@ def test_errors_are_within_their_sigmas() -> None:
     problem = build_problem(sim.mission)
     states = to_navigation(problem, filtered(sim.mission), 0)
     sigma = np.sqrt(np.diagonal(states.covariance, axis1=1, axis2=2))
-    own = states_from_arrays(*states[:4])
+    own = States.of(*states[:4])
     assert np.abs(state_errors(own, true_states(problem, sim)) / sigma).max() < 5.0
 
 

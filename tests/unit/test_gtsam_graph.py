@@ -12,8 +12,14 @@ from gtsam.symbol_shorthand import B, V, X
 from ssm_graph.base.earth import radii_of_curvature
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import STATE_DIM
-from ssm_graph.graph.gtsam_graph import chain_ordering, depth_graph, gnss_graph, prior_graph
-from ssm_graph.graph.states import States, retract, states_from_arrays
+from ssm_graph.engine.states import States
+from ssm_graph.graph.gtsam_graph import (
+    chain_ordering,
+    depth_graph,
+    gnss_graph,
+    gtsam_values,
+    prior_graph,
+)
 from ssm_graph.mission.problem import Problem, build_problem, start_of
 from ssm_graph.simulation import (
     CALM,
@@ -54,7 +60,7 @@ def errors_of(graph: gtsam.NonlinearFactorGraph, states: States) -> Array:
     for k in range(graph.size()):
         factor = graph.at(k)
         assert isinstance(factor, gtsam.NoiseModelFactor)
-        rows.append(factor.unwhitenedError(states.values))
+        rows.append(factor.unwhitenedError(gtsam_values(states)))
     return np.array(rows)
 
 
@@ -103,12 +109,12 @@ def test_depth_counts_the_height_error_and_its_readings() -> None:
     """A state 0.2 m too high misses by 0.2 m; n readings weigh n times one."""
     _, problem, truth = far_transit(depth_hz=3.0)
     raised = truth.p_n + np.array([0.0, 0.0, 0.2])
-    states = states_from_arrays(truth.R_nb, raised, truth.v_n, truth.bias)
+    states = States.of(truth.R_nb, raised, truth.v_n, truth.bias)
     np.testing.assert_allclose(depth_errors(problem, states), 0.2, atol=1e-5)
     assert problem.depths is not None
     graph = depth_graph(problem, problem.depths, states)
     counts = np.bincount(problem.depths.keyframe, minlength=problem.n_keyframes)
-    costs = [graph.at(k).error(states.values) for k in range(graph.size())]
+    costs = [graph.at(k).error(gtsam_values(states)) for k in range(graph.size())]
     expected = 0.5 * counts[counts > 0] * (0.2 / problem.depths.sigma) ** 2
     np.testing.assert_allclose(costs, expected, rtol=2e-4)
 
@@ -120,8 +126,8 @@ def test_depth_says_nothing_of_the_local_level() -> None:
     graph = depth_graph(problem, problem.depths, truth)
     level = np.array([5.0, -9.0, 0.0])
     shifted = truth.p_n + problem.frame.R_nl_at(truth.p_n) @ level
-    aside = states_from_arrays(truth.R_nb, shifted, truth.v_n, truth.bias)
-    assert graph.error(aside.values) < 1e-9
+    aside = States.of(truth.R_nb, shifted, truth.v_n, truth.bias)
+    assert graph.error(gtsam_values(aside)) < 1e-9
 
 
 def test_prior_is_zero_at_the_initial_state_and_has_its_sigmas() -> None:
@@ -159,7 +165,7 @@ def test_prior_is_zero_at_the_initial_state_and_has_its_sigmas() -> None:
     ):
         other = start_of(build_problem(with_initial(mission, **change)))
         columns = (other.R_nb, other.p_n, other.v_n, other.bias)
-        values = states_from_arrays(*(column[None] for column in columns)).values
+        values = gtsam_values(States.of(*(column[None] for column in columns)))
         assert prior.error(values) == pytest.approx(half_chi_sq, rel=0.01, abs=1e-9)
 
 
@@ -177,9 +183,13 @@ def test_arrays_and_values_move_together() -> None:
     n = len(states.p_n)
     rng = np.random.default_rng(5)
     step = 0.1 * rng.normal(size=(n, STATE_DIM))
-    moved = retract(states, step)
-    again = states_from_arrays(moved.R_nb, moved.p_n, moved.v_n, moved.bias)
-    assert again.values.equals(moved.values, 1e-12)
+    moved = states.moved(step)
+    delta = gtsam.VectorValues()
+    for k, own in enumerate(step):
+        delta.insert(X(k), own[:6])
+        delta.insert(V(k), own[6:9])
+        delta.insert(B(k), own[9:])
+    assert gtsam_values(moved).equals(gtsam_values(states).retract(delta), 1e-12)
     errors = state_errors(states, moved)
     np.testing.assert_allclose(errors[:, 6:], step[:, 6:], atol=1e-13)
     np.testing.assert_allclose(errors[:, :3], step[:, :3], atol=1e-12)
@@ -190,7 +200,7 @@ def test_states_keep_their_order(n_keyframes: int) -> None:
     """Keys sort as numbers, not as text: keyframe 10 comes after 9."""
     p_n = np.arange(3.0 * n_keyframes).reshape(-1, 3)
     identity = np.tile(np.eye(3), (n_keyframes, 1, 1))
-    states = states_from_arrays(identity, p_n, -p_n, np.hstack([p_n, p_n]))
-    moved = retract(states, np.zeros((n_keyframes, STATE_DIM)))
+    states = States.of(identity, p_n, -p_n, np.hstack([p_n, p_n]))
+    moved = states.moved(np.zeros((n_keyframes, STATE_DIM)))
     np.testing.assert_array_equal(moved.p_n, p_n)
     np.testing.assert_array_equal(moved.R_nb, identity)

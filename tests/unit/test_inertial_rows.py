@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from factors.inertial import whitened_error, whitened_rows
 from ssm_graph.base.frozen import Array
-from ssm_graph.base.stepwise import finished
 from ssm_graph.engine.error_state import POSITION, STATE_DIM
-from ssm_graph.graph.inertial_rows import inertial_graph, inertial_rows_steps
-from ssm_graph.graph.states import States, retract
-from ssm_graph.imu.preintegration import gravity_gradient
+from ssm_graph.engine.states import States
+from ssm_graph.imu.preintegration import gravity_between, gravity_gradient
 from ssm_graph.mission.estimate import Status
 from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.simulation import Grade
@@ -40,22 +39,23 @@ def test_rows_follow_gravity(end: int) -> None:
     What gravity does alone, so that the turn of the Earth meanwhile, 5e-5 of it, is seen.
     """
     problem, states = turned()
-    states = retract(states, np.zeros((problem.n_keyframes, STATE_DIM)))
-    graph, middle_n = inertial_graph(problem), states.p_n[1:3].mean(axis=0)
-    gradient = gravity_gradient(problem.frame, middle_n)
-    omega_ie_n, span_s = problem.frame.omega_ie_n, np.diff(problem.keyframe_s)
-
-    def rows_at(at: States, gravity_at: States, gradient: Array) -> Array:
-        problem.chain.set_gravity(gravity_at.p_n)
-        steps = inertial_rows_steps(graph, at, gradient, omega_ie_n=omega_ie_n, span_s=span_s)
-        return np.asarray(finished(steps)[1])
+    frame, intervals = problem.frame, problem.chain.intervals
+    here = (states.take(np.s_[:-1]), states.take(np.s_[1:]))
+    g_n, gradient = gravity_between(frame, states.p_n), gravity_gradient(frame)
+    with_it, without = (
+        whitened_rows(intervals, *here, g_n=g_n, gradient=of)[1]
+        for of in (gradient, np.zeros((3, 3)))
+    )
+    columns = with_it - without
 
     def by_gravity(step: Array) -> Array:
-        moved = retract(states, step)
-        led, kept = rows_at(moved, moved, gradient), rows_at(moved, states, gradient)
-        return kept[:, -1] - led[:, -1]
+        moved = states.moved(step)
+        there = (moved.take(np.s_[:-1]), moved.take(np.s_[1:]))
+        middle_n = 0.5 * (moved.p_n - states.p_n)[:-1] + 0.5 * (moved.p_n - states.p_n)[1:]
+        led_n = g_n + middle_n @ gradient.T
+        led, kept = (whitened_error(intervals, *there, g_n=g)[1] for g in (led_n, g_n))
+        return np.asarray(led - kept)
 
-    columns = rows_at(states, states, gradient) - rows_at(states, states, np.zeros((3, 3)))
     for axis in range(3):
         step = np.zeros((problem.n_keyframes, STATE_DIM))
         step[1 + end, POSITION.start + axis] = 1000.0

@@ -14,9 +14,9 @@ from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.engine.extras import Extra, Extras
-from ssm_graph.graph.gtsam_graph import chain_ordering, gtsam_graph
+from ssm_graph.engine.states import States
+from ssm_graph.graph.gtsam_graph import chain_ordering, gtsam_graph, gtsam_values
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.graph.states import States, retract, states_from_arrays
 from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.sensors.drift import Drift
 from ssm_graph.sensors.standstill import Standstill
@@ -43,7 +43,7 @@ def problems() -> tuple[Problem, Problem, States]:
     truth = true_states(problem, sim)
     rng = np.random.default_rng(0)
     off = 0.02 * rng.normal(size=truth.v_n.shape)
-    states = states_from_arrays(
+    states = States.of(
         truth.R_nb,
         truth.p_n + off,
         truth.v_n - off,
@@ -71,7 +71,7 @@ def dense(graph: gtsam.NonlinearFactorGraph, states: States) -> tuple[Array, Arr
     equations themselves would lose half of the digits.
     """
     n = len(states.p_n)
-    J, b = graph.linearize(states.values).jacobian(chain_ordering(n))
+    J, b = graph.linearize(gtsam_values(states)).jacobian(chain_ordering(n))
     scale = 1.0 / np.linalg.norm(J, axis=0)
     Q, R = np.linalg.qr(J * scale)
     R_inv = np.linalg.inv(R) * scale[:, None]
@@ -85,13 +85,15 @@ def test_it_is_gtsams_graph(grade: Grade, monkeypatch: pytest.MonkeyPatch) -> No
 
     Up to the gradient of gravity, which those do not know.
     """
-    monkeypatch.setattr("ssm_graph.graph.linearize.gravity_gradient", lambda _: np.zeros((3, 3)))
+    monkeypatch.setattr(
+        "ssm_graph.graph.inertial_rows.gravity_gradient", lambda _: np.zeros((3, 3))
+    )
     gnss = GnssSettings(windows=((0.0, 9.0),))
     sim = simulated(duration_s=8.0, gnss=gnss, dropout_rate=0.2, grade=grade)
     problem = build_problem(sim.mission)
     truth, rng = true_states(problem, sim), np.random.default_rng(3)
     size = np.repeat([1e-5, 1e-3, 1e-3, 1e-5, 1e-8], 3)
-    states = retract(truth, size * rng.normal(size=(problem.n_keyframes, STATE_DIM)))
+    states = truth.moved(size * rng.normal(size=(problem.n_keyframes, STATE_DIM)))
     weights = rng.uniform(0.01, 1.1, len(problem.beams.speed))
     linearizer = GraphLinearizer(problem)
     linearizer.follow(states)
@@ -101,15 +103,17 @@ def test_it_is_gtsams_graph(grade: Grade, monkeypatch: pytest.MonkeyPatch) -> No
     step, P = dense(graph, states)
     sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
     scale = sigma[:, :, None] * sigma[:, None, :]
-    np.testing.assert_allclose(found.covariance / scale, P / scale, rtol=0.0, atol=1e-8)
-    np.testing.assert_allclose(found.delta[0] / sigma, step / sigma, rtol=0.0, atol=1e-7)
+    np.testing.assert_allclose(found.covariance(STATE_DIM) / scale, P / scale, rtol=0.0, atol=1e-8)
+    np.testing.assert_allclose(found.step / sigma, step / sigma, rtol=0.0, atol=1e-7)
     cost = linearizer.cost(states, rows, weights)
-    assert cost == pytest.approx(graph.error(states.values), rel=1e-9)
+    assert cost == pytest.approx(graph.error(gtsam_values(states)), rel=1e-9)
 
 
 def test_it_is_gtsams_graph_with_further_aids(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every kind of them, each measurement with a weight of its own."""
-    monkeypatch.setattr("ssm_graph.graph.linearize.gravity_gradient", lambda _: np.zeros((3, 3)))
+    monkeypatch.setattr(
+        "ssm_graph.graph.inertial_rows.gravity_gradient", lambda _: np.zeros((3, 3))
+    )
     aids = AidSettings(
         usbl=UsblSettings(interval_s=2.1),
         ranging=RangingSettings((KNOWN,), interval_s=1.3),
@@ -120,7 +124,7 @@ def test_it_is_gtsams_graph_with_further_aids(monkeypatch: pytest.MonkeyPatch) -
     problem = build_problem(sim.mission)
     truth, rng = true_states(problem, sim), np.random.default_rng(4)
     size = np.repeat([1e-3, 1e-2, 0.3, 1e-5, 1e-8], 3)
-    states = retract(truth, size * rng.normal(size=(problem.n_keyframes, STATE_DIM)))
+    states = truth.moved(size * rng.normal(size=(problem.n_keyframes, STATE_DIM)))
     linearizer = GraphLinearizer(problem)
     weights = rng.uniform(0.01, 1.1, len(problem.beams.speed))
     aid_weights = rng.uniform(0.01, 1.1, len(linearizer.weighted))
@@ -132,10 +136,10 @@ def test_it_is_gtsams_graph_with_further_aids(monkeypatch: pytest.MonkeyPatch) -
     step, P = dense(graph, states)
     sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
     scale = sigma[:, :, None] * sigma[:, None, :]
-    np.testing.assert_allclose(found.covariance / scale, P / scale, rtol=0.0, atol=1e-9)
-    np.testing.assert_allclose(found.delta[0] / sigma, step / sigma, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(found.covariance(STATE_DIM) / scale, P / scale, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(found.step / sigma, step / sigma, rtol=0.0, atol=1e-9)
     cost = linearizer.cost(states, rows, weights, aid_weights)
-    assert cost == pytest.approx(graph.error(states.values), rel=1e-9)
+    assert cost == pytest.approx(graph.error(gtsam_values(states)), rel=1e-9)
 
 
 def test_gtsams_graph_has_no_calibration() -> None:
@@ -161,7 +165,9 @@ def test_with_everything_known_it_is_the_graph_without() -> None:
         step = linearizer.solve(at, rows, weights)
         cost = linearizer.cost(at, rows, weights)
         variance = step.variance(plain.beams.keyframe, rows.jacobian)
-        found.append((step.covariance, cost, variance, linearizer.misfits(at), step.delta[0]))
+        found.append(
+            (step.covariance(STATE_DIM), cost, variance, linearizer.misfits(at), step.step)
+        )
     (P, cost, variance, misfits, update), (P_2, cost_2, variance_2, misfits_2, update_2) = found
     sigma = np.sqrt(np.diagonal(P_2, axis1=1, axis2=2))
     scale = sigma[:, :, None] * sigma[:, None, :]
@@ -184,7 +190,7 @@ def along(linearizer: GraphLinearizer, states: States, direction: Array) -> tupl
     weights = np.ones(len(problem.beams.speed))
 
     def cost(scale: float) -> float:
-        moved, _ = linearizer.retract(states, delta, scale=scale)
+        moved = states.moved(scale * delta[0], scale * delta[1])
         return linearizer.cost(moved, linearizer.beam_rows(moved), weights)
 
     ends = cost(1.0), cost(0.0), cost(-1.0)
@@ -203,8 +209,8 @@ def test_the_linear_graph_is_the_derivative_of_the_cost() -> None:
     moved, weights = states, np.ones(len(problem.beams.speed))
     for _ in range(6):
         step = linearizer.solve(moved, linearizer.beam_rows(moved), weights)
-        moved, _ = linearizer.retract(moved, step.delta)
-    P = step.solution.constants_cov
+        moved = moved.moved(step.step, step.constants_step)
+    P = step.constants_cov
     labels = [label for block in problem.extras.blocks for label in block.labels]
     for i, label in enumerate(labels[problem.extras.n_walks :]):
         direction = np.zeros(len(step.sigma))

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.base.stepwise import finished
 from ssm_graph.graph.first_values import first_values
-from ssm_graph.graph.gtsam_graph import gtsam_graph
-from ssm_graph.graph.inertial_fit import inertial_fit
+from ssm_graph.graph.gtsam_graph import gtsam_graph, gtsam_values, inertial_graph
+from ssm_graph.graph.inertial_rows import inertial_fit
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.mission.estimate import Estimate, NoiseFound, Status
 from ssm_graph.mission.problem import Beams, Problem, build_problem
@@ -39,6 +38,7 @@ def beams_of(sigma: Array) -> Beams:
         R_bd=np.eye(3),
         ping=rows // 4,
         is_water=np.zeros(len(rows), bool),
+        n_beams=4,
     )
 
 
@@ -121,9 +121,9 @@ def test_inertial_degrees_of_freedom_are_those_of_the_dense_system() -> None:
     rows = linearizer.beam_rows(states)
     weights = np.ones(len(rows.error))
     step = linearizer.solve(states, rows, weights)
-    fit = inertial_fit(finished(linearizer.inertial_rows_steps(states)), step)
-    A, _ = gtsam_graph(problem, states).linearize(states.values).jacobian()
-    own, b = linearizer.inertial.linearize(states.values).jacobian()
+    fit = inertial_fit(linearizer.inertial_rows(states), step)
+    A, _ = gtsam_graph(problem, states).linearize(gtsam_values(states)).jacobian()
+    own, b = inertial_graph(problem, states).linearize(gtsam_values(states)).jacobian()
     # Both have their columns in the order of the keys.
     explained = np.trace(own @ np.linalg.solve(A.T @ A, own.T))
     assert fit.dof == pytest.approx(len(b) - explained, abs=1e-3)

@@ -14,7 +14,7 @@ from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
-from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator import ONLINE, FixedLagSmoother
 from ssm_graph.live.estimator.recovery import Doubted, reanchored
 from ssm_graph.mission.calibration import DVL_MOUNTING, DVL_SCALE
@@ -73,7 +73,7 @@ def test_it_finds_the_truth_and_what_fixed_lag_finds() -> None:
     offline = run_fixed_lag(build_problem(asked(off(duration_s=40.0).mission)), LAG).newest
     (k,) = np.flatnonzero(np.abs(offline.time_s - newest.time_s[0]) < 1e-3)
     sigma = np.sqrt(np.diag(newest.covariance[0]))
-    off_extra = (offline.states.extra[k] - newest.states.extra[0]) / sigma[STATE_DIM:]
+    off_extra = (offline.states.walks[k] - newest.states.walks[0]) / sigma[STATE_DIM:]
     off_state = offline.states.take(np.array([k])).navigation.deviation_of(newest.states.navigation)
     assert np.abs(off_extra).max() < 0.01
     assert np.abs(off_state[0] / sigma[:STATE_DIM]).max() < 0.01
@@ -120,7 +120,7 @@ def test_a_new_begin_keeps_what_was_found(what: Doubted) -> None:
     begun = reanchored(step.window, keyframe, kept, what).newest
     at = step.window.sensors.extras.columns(DVL_SCALE).start
     sigma = float(np.sqrt(begun.covariance[0, at, at]))
-    assert abs(begun.states.extra[0, at - STATE_DIM] - SCALE) < 3.0 * sigma
+    assert abs(begun.states.walks[0, at - STATE_DIM] - SCALE) < 3.0 * sigma
     assert sigma < 0.5 * stream()[0].mount.scale_sigma
 
 
@@ -158,7 +158,7 @@ def test_the_water_carries_the_velocity_where_the_ground_is_lost() -> None:
     offline = run_fixed_lag(build_problem(sim.mission), LAG).newest
     (k,) = np.flatnonzero(np.abs(offline.time_s - newest.time_s[0]) < 1e-3)
     sigma = np.sqrt(np.diag(newest.covariance[0]))[STATE_DIM:]
-    assert np.all(np.abs(offline.states.extra[k] - newest.states.extra[0]) < 0.01 * sigma)
+    assert np.all(np.abs(offline.states.walks[k] - newest.states.walks[0]) < 0.01 * sigma)
 
 
 def test_a_current_is_aligned_and_restored_with() -> None:

@@ -10,7 +10,8 @@ import pytest
 
 from ssm_graph.base.earth import EARTH_RATE, LocalFrame
 from ssm_graph.base.frozen import Array
-from ssm_graph.graph.inertial_rows import inertial_graph
+from ssm_graph.graph.gtsam_graph import gtsam_values, inertial_graph
+from ssm_graph.graph.inertial_rows import InertialRows
 from ssm_graph.imu.preintegration import (
     GAP_ACCEL,
     GAP_GYRO_RATE,
@@ -18,12 +19,13 @@ from ssm_graph.imu.preintegration import (
     INTEGRATION_DENSITY,
     Unseen,
     bridged,
+    gravity_between,
     gtsam_gravity,
     imu_gaps,
     imu_params,
     preintegrate,
 )
-from ssm_graph.mission.problem import ProblemConfig, build_problem
+from ssm_graph.mission.problem import NO_EXTRAS, ProblemConfig, build_problem
 from ssm_graph.sensors.imu import ImuLog, ImuNoise
 from ssm_graph.simulation import IMU_NOISE, Grade, SurveyRoute
 from tests.helpers import assert_consistent, simulated, true_states
@@ -54,7 +56,7 @@ def test_no_covariance_of_an_interval_comes_near_identity(noise: ImuNoise) -> No
     edges = np.arange(0, 101) / 100.0
     log = ImuLog(0.0, noise, edges[1:], np.zeros((100, 3)), np.tile([0.0, 0.0, -9.8], (100, 1)))
     chain = preintegrate(log, np.array([0.0, 1.0]), frame=FRAME, rate_hz=20.0)
-    covariance = chain.measurements[0].preintMeasCov()
+    covariance = chain.intervals.covariance[0]
     assert covariance.shape == (15, 15)
     assert np.all(np.diagonal(covariance) > 0.0)
     assert np.abs(covariance).max() < 1e-4
@@ -101,7 +103,7 @@ def test_gaps_are_found_and_only_their_intervals_inflated() -> None:
     np.testing.assert_allclose([begin, end], [[4.0], [4.5]])
     keyframe_s = np.array([0.0, 2.0, 4.2, 6.0, 10.0])
     chain = preintegrate(log, keyframe_s, frame=FRAME, rate_hz=20.0)
-    angle_sigma = [math.sqrt(m.preintMeasCov()[0, 0]) for m in chain.measurements]
+    angle_sigma = np.sqrt(chain.intervals.covariance[:, 0, 0]).tolist()
     plain = [NOISE.gyro_density * math.sqrt(span) for span in np.diff(keyframe_s)]
     assert angle_sigma[0] == pytest.approx(plain[0], rel=1e-3)
     assert angle_sigma[1] == pytest.approx(0.02 * GAP_GYRO_RATE, rel=1e-2)
@@ -128,7 +130,7 @@ def test_a_gap_in_waves_is_bridged_within_what_is_covered() -> None:
         as_it_stood = log.gyro_b[k, 0] * (end - begin) - (turned[1] - turned[0])
         assert abs(left) < max(0.2 * abs(as_it_stood), math.radians(0.15))
         chain = preintegrate(log, np.array([begin - 0.1, end + 0.1]), frame=FRAME, rate_hz=20.0)
-        assert abs(left) < 3.0 * math.sqrt(chain.measurements[0].preintMeasCov()[0, 0])
+        assert abs(left) < 3.0 * math.sqrt(chain.intervals.covariance[0, 0, 0])
 
 
 def test_regular_data_have_no_gaps() -> None:
@@ -158,9 +160,8 @@ def test_rest_stays_at_rest(p_n: list[float]) -> None:
     keyframe_s = np.linspace(0.0, 600.0, 11)
     log = resting_log(np.array(p_n), R_nb, duration_s=600.0)
     chain = preintegrate(log, keyframe_s, frame=FRAME, rate_hz=10.0)
-    chain.set_gravity(np.tile(p_n, (11, 1)))
     state = gtsam.NavState(gtsam.Rot3(R_nb), np.array(p_n), np.zeros(3))
-    for measured in chain.measurements:
+    for measured in chain.measured(gravity_between(FRAME, np.tile(p_n, (11, 1)))):
         state = measured.predict(state, gtsam.imuBias.ConstantBias())
     np.testing.assert_allclose(state.position(), p_n, rtol=0.0, atol=1e-4)
     np.testing.assert_allclose(state.velocity(), 0.0, atol=1e-6)
@@ -177,36 +178,30 @@ def test_gravity_is_that_of_the_plumb_line_plus_the_axis_distance() -> None:
     np.testing.assert_allclose(gtsam_gravity(frame, p_n) - frame.g_n_at(p_n), 0.0, atol=1e-14)
 
 
-def test_gravity_follows_the_estimate_in_place() -> None:
-    """Writing gravity moves the error of factors already made, by gravity's change and no more."""
+def test_gravity_moves_the_error_by_its_change_and_no_more() -> None:
+    """10 km up gravity is weaker by 0.031 m/s^2; the error is in body axes."""
     sim = simulated(duration_s=3.0, perfect_sensors=True)
     problem = build_problem(sim.mission)
     states = true_states(problem, sim)
-    factor = inertial_graph(problem).at(0)
-    assert isinstance(factor, gtsam.NoiseModelFactor)
-    problem.chain.set_gravity(states.p_n)
-    before = factor.unwhitenedError(states.values)
-    problem.chain.set_gravity(states.p_n + np.array([0.0, 0.0, 1e4]))
-    change = factor.unwhitenedError(states.values) - before
+    raised = states._replace(p_n=states.p_n + np.array([0.0, 0.0, 1e4]))
+    errors = []
+    for graph in (inertial_graph(problem, states), inertial_graph(problem, raised)):
+        factor = graph.at(0)
+        assert isinstance(factor, gtsam.NoiseModelFactor)
+        errors.append(factor.unwhitenedError(gtsam_values(states)))
     span = problem.keyframe_s[1] - problem.keyframe_s[0]
-    # 10 km up gravity is weaker by 0.031 m/s^2; the error is in body axes.
-    assert np.linalg.norm(change[6:9]) == pytest.approx(0.0308 * span, rel=0.01)
-    problem.chain.set_gravity(states.p_n)
-    np.testing.assert_array_equal(factor.unwhitenedError(states.values), before)
+    change = np.linalg.norm((errors[1] - errors[0])[6:9])
+    assert change == pytest.approx(0.0308 * span, rel=0.01)
 
 
 def test_gravity_is_taken_midway() -> None:
     """Each interval has the gravity of the middle between its keyframes."""
-    edges = np.arange(0, 31) / 10.0
-    log = ImuLog(0.0, NOISE, edges[1:], np.zeros((30, 3)), np.zeros((30, 3)))
-    chain = preintegrate(log, np.array([0.0, 1.0, 3.0]), frame=FRAME, rate_hz=10.0)
-    np.testing.assert_allclose(chain.params[1].n_gravity, gtsam_gravity(FRAME, np.zeros(3)))
     p_n = np.array([[0.0, 0.0, 0.0], [1e3, 0.0, 0.0], [5e3, 2e3, 100.0]])
-    chain.set_gravity(p_n)
+    found = gravity_between(FRAME, p_n)
     for k, middle in enumerate(([500.0, 0.0, 0.0], [3e3, 1e3, 50.0])):
         expected = gtsam_gravity(FRAME, np.array(middle))
         # One component is zero but for rounding: of gravity as a whole, then.
-        np.testing.assert_allclose(chain.params[k].n_gravity, expected, rtol=0.0, atol=1e-13)
+        np.testing.assert_allclose(found[k], expected, rtol=0.0, atol=1e-13)
 
 
 def test_bias_of_linearisation_is_kept() -> None:
@@ -215,10 +210,9 @@ def test_bias_of_linearisation_is_kept() -> None:
     edges = np.arange(0, 11) / 10.0
     log = ImuLog(0.0, NOISE, edges[1:], np.tile(bias[3:], (10, 1)), np.tile(bias[:3], (10, 1)))
     chain = preintegrate(log, edges[[0, -1]], frame=FRAME, rate_hz=10.0, bias=bias)
-    measured = chain.measurements[0]
-    np.testing.assert_allclose(measured.biasHatVector(), bias)
-    np.testing.assert_allclose(measured.deltaVij(), 0.0, atol=1e-15)
-    np.testing.assert_allclose(measured.deltaRij().matrix(), np.eye(3), atol=1e-15)
+    np.testing.assert_allclose(chain.intervals.bias[0], bias)
+    np.testing.assert_allclose(chain.intervals.delta_pv[0, 1], 0.0, atol=1e-15)
+    np.testing.assert_allclose(chain.intervals.delta_R[0], np.eye(3), atol=1e-15)
 
 
 @pytest.mark.parametrize("grade", Grade, ids=lambda grade: grade.name)
@@ -227,14 +221,8 @@ def test_inertial_errors_at_the_truth_are_as_large_as_stated(grade: Grade) -> No
     sim = simulated(duration_s=300.0, imu_rate_hz=100.0, grade=grade, route=SurveyRoute())
     problem = build_problem(sim.mission, ProblemConfig(merge_rate_hz=20.0))
     states = true_states(problem, sim)
-    problem.chain.set_gravity(states.p_n)
-    graph = inertial_graph(problem)
-    whitened = []
-    for k in range(graph.size()):
-        factor = graph.at(k)
-        assert isinstance(factor, gtsam.NoiseModelFactor)
-        whitened.append(factor.whitenedError(states.values))
+    whitened = InertialRows(problem.frame, NO_EXTRAS).errors(problem.chain.intervals, states)
     # INTEGRATION_DENSITY covers a loss that is no noise; position along with it is left out.
-    rest = np.delete(np.array(whitened), [3, 4, 5], axis=1)
+    rest = np.delete(whitened, [3, 4, 5], axis=1)
     assert_consistent(np.sum(rest**2, axis=1), dof=12)
-    assert np.mean(np.array(whitened)[:, 3:6] ** 2) < 1.3
+    assert np.mean(whitened[:, 3:6] ** 2) < 1.3

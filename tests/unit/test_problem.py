@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ssm_graph.base.errors import ConfigError, DataError
-from ssm_graph.mission.ping_motion import mean_gyro
+from ssm_graph.imu.ping_motion import mean_gyro
 from ssm_graph.mission.problem import ProblemConfig, build_problem
 from ssm_graph.sensors.depth import DepthLog
 from ssm_graph.sensors.imu import ImuLog

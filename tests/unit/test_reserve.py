@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from ssm_graph.engine.error_state import POSITION, ROTATION, VELOCITY
@@ -74,7 +72,7 @@ def with_beams(time_s: float) -> Keyframe:
     assert smoother._course is not None
     keyframes = smoother._course.newest.window.keyframes
     full = next(k for k in keyframes if len(k.beams.speed) == 4)
-    return replace(Keyframe.unmeasured(time_s, full.gyro_b, None), beams=full.beams)
+    return Keyframe(time_s, full.beams)
 
 
 def test_what_is_doubted_follows_from_what_was_refused() -> None:

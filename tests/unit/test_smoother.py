@@ -14,9 +14,9 @@ from gtsam.symbol_shorthand import B, V, X
 from factors.similarity import ExpKernel, GaussianKernel, Kernel, LogKernel, SqrtKernel
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
+from ssm_graph.engine.states import States
 from ssm_graph.graph.first_values import first_values
-from ssm_graph.graph.gtsam_graph import gtsam_graph
-from ssm_graph.graph.states import States, states_from_arrays
+from ssm_graph.graph.gtsam_graph import gtsam_graph, gtsam_values
 from ssm_graph.mission.estimate import Estimate, Iteration, Status
 from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.simulation import GnssSettings, Grade, Loss, OutlierKind, Outliers
@@ -70,7 +70,7 @@ def optimised(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, n: int) ->
     params.setMaxIterations(8)
     values = gtsam.GaussNewtonOptimizer(graph, start, params).optimize()
     poses = [values.atPose3(X(k)) for k in range(n)]
-    return states_from_arrays(
+    return States.of(
         np.array([pose.rotation().matrix() for pose in poses]),
         np.array([pose.translation() for pose in poses]),
         np.array([values.atVector(V(k)) for k in range(n)]),
@@ -86,7 +86,9 @@ def test_gaussian_kernel_is_the_plain_smoother(
 
     Up to the gradient of gravity, which GTSAM's factor does not know.
     """
-    monkeypatch.setattr("ssm_graph.graph.linearize.gravity_gradient", lambda _: np.zeros((3, 3)))
+    monkeypatch.setattr(
+        "ssm_graph.graph.inertial_rows.gravity_gradient", lambda _: np.zeros((3, 3))
+    )
     sim = simulated(duration_s=15.0, grade=grade, gnss=GNSS, dropout_rate=0.1, seed=2)
     problem = build_problem(sim.mission)
     # Heights are good to 1e-9 m, the rounding of the radius of the Earth: 3e-8 of their sigma.
@@ -96,13 +98,13 @@ def test_gaussian_kernel_is_the_plain_smoother(
     truth = true_states(problem, sim)
     rng = np.random.default_rng(0)
     n = problem.n_keyframes
-    start = states_from_arrays(
+    start = States.of(
         truth.R_nb @ rotation(1e-3 * rng.normal(size=(n, 3))),
         truth.p_n + 0.1 * rng.normal(size=(n, 3)),
         truth.v_n + 0.01 * rng.normal(size=(n, 3)),
         truth.bias,
     )
-    plain = optimised(gtsam_graph(problem, states), start.values, n)
+    plain = optimised(gtsam_graph(problem, states), gtsam_values(start), n)
     difference = np.abs(state_errors(states, plain))
     trajectory = estimate.trajectory
     assert np.max(difference[:, 3:6] / posterior_sigmas(estimate)) < 1e-6
@@ -141,8 +143,8 @@ def test_plain_m_estimator_is_stationary_for_its_own_cost(kernel: Kernel) -> Non
             delta.insert(X(k), np.r_[np.zeros(3), 1e-3 * sigma[k] * rng.normal(size=3)])
             delta.insert(V(k), 1e-5 * rng.normal(size=3))
             delta.insert(B(k), np.zeros(6))
-        ends = [cost(states.values.retract(delta.scale(s))) for s in (1.0, -1.0)]
-        curvature = ends[0] + ends[1] - 2.0 * cost(states.values)
+        ends = [cost(gtsam_values(states).retract(delta.scale(s))) for s in (1.0, -1.0)]
+        curvature = ends[0] + ends[1] - 2.0 * cost(gtsam_values(states))
         # At a minimum the odd part is far below the even one.
         assert curvature > 0.0
         assert abs(ends[0] - ends[1]) < 1e-3 * curvature

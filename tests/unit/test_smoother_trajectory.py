@@ -7,7 +7,7 @@ import numpy as np
 from ssm_graph.base.frames import wrap_to_pi
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import STATE_DIM
-from ssm_graph.graph.states import States, retract, states_from_arrays
+from ssm_graph.engine.states import States
 from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.mission.trajectory import trajectory_from_states
 from ssm_graph.simulation import DiveRoute, Waves
@@ -20,7 +20,7 @@ def tilted() -> tuple[Problem, States, States]:
     problem = build_problem(sim.mission)
     truth = true_states(problem, sim)
     moved = truth.p_n + np.array([1.5e4, -1.3e4, 0.0])
-    return problem, truth, states_from_arrays(truth.R_nb, moved, truth.v_n, truth.bias)
+    return problem, truth, States.of(truth.R_nb, moved, truth.v_n, truth.bias)
 
 
 def random_covariance(n: int) -> Array:
@@ -73,7 +73,7 @@ def test_covariances_are_those_of_what_they_describe() -> None:
     for axis in range(STATE_DIM):
         ends = []
         for sign in (step, -step):
-            moved = retract(states, np.tile(sign * np.eye(STATE_DIM)[axis], (n, 1)))
+            moved = states.moved(np.tile(sign * np.eye(STATE_DIM)[axis], (n, 1)))
             ends.append((moved, trajectory_from_states(problem, moved, P)))
         (plus, at_plus), (minus, at_minus) = ends
         position_D[:, :, axis] = np.einsum("kji,kj->ki", R_nl, plus.p_n - minus.p_n)

@@ -12,8 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ssm_graph.base.errors import DataError
+from ssm_graph.base.times import MIN_SPACING_S, nearest
 from ssm_graph.mission.mission import Mission
-from ssm_graph.mission.timeline import MIN_SPACING_S, Timeline, build_timeline, nearest
+from ssm_graph.mission.timeline import Timeline, build_timeline
 from ssm_graph.sensors.dvl import DvlLog
 from ssm_graph.sensors.gnss import GnssLog
 from ssm_graph.simulation import default_mount

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from ssm_graph.base.frozen import Array
+from ssm_graph.engine.states import States
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.graph.states import States, states_from_arrays
 from ssm_graph.mission.doubts import SUSPECT_STRETCH_S
 from ssm_graph.mission.estimate import Status
 from ssm_graph.mission.problem import Problem, build_problem
@@ -39,8 +39,8 @@ def doubts_at(problem: Problem, states: States, *, weights: Array | None = None)
 
 def moved(states: States, **changes: Array) -> States:
     """Return states with some arrays changed."""
-    arrays: dict[str, Any] = {name: getattr(states, name) for name in states._fields[1:]}
-    return states_from_arrays(**(arrays | changes))
+    arrays: dict[str, Any] = {name: getattr(states, name) for name in states._fields}
+    return States.of(**(arrays | changes))
 
 
 @pytest.mark.parametrize("grade", Grade, ids=lambda grade: grade.name)

@@ -10,6 +10,7 @@ import pytest
 
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
+from ssm_graph.engine.states import States
 from ssm_graph.evaluation import evaluate
 from ssm_graph.filters.navigation.filter import Grouping, run_filter
 from ssm_graph.filters.navigation.named import filter_geodetic, filter_problems
@@ -17,8 +18,7 @@ from ssm_graph.filters.rules.kalman import KalmanUpdate
 from ssm_graph.graph.first_values import first_values
 from ssm_graph.graph.gtsam_graph import gtsam_graph
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.graph.states import States
-from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.mission.bottom_track import without_water_track
 from ssm_graph.mission.current import CURRENT, CURRENT_UP
 from ssm_graph.mission.estimate import Estimate, Status
@@ -114,7 +114,7 @@ def _difference(linearizer: GraphLinearizer, states: States, column: int) -> Arr
             delta[:, column] = step
         else:
             constants[column - extras.state_dim] = step
-        moved, _ = linearizer.retract(states, (delta, constants))
+        moved = states.moved(delta, constants)
         ends.append(linearizer.beam_rows(moved).error)
     return np.asarray((ends[0] - ends[1]) / 2e-5)
 

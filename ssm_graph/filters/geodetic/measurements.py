@@ -27,7 +27,8 @@ from ssm_graph.filters.geodetic.error_model import (
     enu_D_place,
 )
 from ssm_graph.filters.geodetic.mechanisation import GeodeticState, Track, earth_terms
-from ssm_graph.mission.aids import Depths, Fixes
+from ssm_graph.graph.aids.depth import Depths
+from ssm_graph.graph.aids.gnss import Fixes
 from ssm_graph.mission.bottom_track import require_bottom_track
 from ssm_graph.mission.problem import Beams, Problem
 from ssm_graph.sensors.dvl import N_BEAMS

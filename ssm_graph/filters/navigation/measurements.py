@@ -15,7 +15,7 @@ from ssm_graph.engine.error_state import GYRO_BIAS, POSITION, ROTATION, STATE_DI
 from ssm_graph.engine.states import NavigationStates, local_D_deviation
 from ssm_graph.filters.navigation.stack import Stack
 from ssm_graph.filters.rules.model import NOMINAL, Iterate, Runs
-from ssm_graph.mission.heights import HeightTrack, height_on_the_way, height_track
+from ssm_graph.graph.aids.heights import HeightTrack, height_on_the_way, height_track
 from ssm_graph.sensors.dvl import N_BEAMS
 
 

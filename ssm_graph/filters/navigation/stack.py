@@ -13,7 +13,6 @@ from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.states import NavigationStates
 from ssm_graph.filters.navigation.process import Process
-from ssm_graph.imu.arrays import interval_arrays
 from ssm_graph.mission.bottom_track import require_bottom_track
 from ssm_graph.mission.problem import Problem, start_of
 from ssm_graph.sensors.dvl import N_BEAMS
@@ -124,7 +123,7 @@ def stack_problems(problems: Sequence[Problem]) -> Stack:
     starts = [start_of(p) for p in problems]
     return Stack(
         problems=tuple(problems),
-        process=Process([interval_arrays(p.chain) for p in problems], first.frame),
+        process=Process([p.chain.intervals for p in problems], first.frame),
         start=NavigationStates(*(np.array([s[i] for s in starts]) for i in range(4))),
         start_cov=np.array([s.covariance for s in starts]),
         span_s=np.stack([np.diff(p.keyframe_s) for p in problems], axis=1),

@@ -6,9 +6,14 @@ import numpy as np
 
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.engine.extras import Extras
+from ssm_graph.graph.aids import AIDS
+from ssm_graph.live.estimator.buffers import Logs
+from ssm_graph.live.estimator.keyframes import aids_at
 from ssm_graph.mission.calibration import calibration_extras, taken_as_exact, windowed
 from ssm_graph.mission.current import current_extras
+from ssm_graph.mission.problem import Beams
 from ssm_graph.mission.vehicle import Vehicle
+from ssm_graph.sensors.imu import ImuLog
 from ssm_graph.smoothers.keyframe import Sensors
 
 
@@ -25,20 +30,15 @@ def not_calibrated(vehicle: Vehicle) -> tuple[str, ...]:
 
 def sensors_of_vehicle(vehicle: Vehicle, frame: LocalFrame) -> Sensors:
     """Return what is the same at all keyframes."""
-    sigma = vehicle.depth_sigma
-    return Sensors(
-        frame,
-        vehicle.mount.lever_arm_b,
-        vehicle.depth_lever_arm_b,
-        vehicle.gnss_lever_arm_b,
-        np.inf if sigma is None else sigma,
-        vehicle.mount.R_bd,
-        extras_of_vehicle(vehicle),
-    )
+    at_rest = ImuLog(0.0, vehicle.imu_noise, np.ones(1), np.zeros((1, 3)), np.zeros((1, 3)))
+    logs = Logs(vehicle.gnss, vehicle.depth, vehicle.aids)
+    aids = (aid.take(np.s_[:0]) for aid in aids_at(logs, frame, at_rest, np.array([0.0, 1.0])))
+    return Sensors.of(frame, Beams.of_mount(vehicle.mount), aids, extras_of_vehicle(vehicle))
 
 
 def _asked(vehicle: Vehicle) -> Extras:
-    depth = None if vehicle.depth_sigma is None else vehicle.depth_calibration
+    depth = None if vehicle.depth is None else vehicle.depth.calibration
+    of_instruments = calibration_extras(vehicle.mount, depth, vehicle.gnss.calibration)
+    of_aids = (extra for kind in AIDS for extra in kind.variables(vehicle.aids))
     of_water = () if vehicle.current is None else current_extras(vehicle.current)
-    of_instruments = calibration_extras(vehicle.mount, depth, vehicle.gnss_calibration)
-    return Extras((*of_instruments, *of_water))
+    return Extras((*of_instruments, *of_aids, *of_water))

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections import deque
-from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -16,7 +15,8 @@ import numpy as np
 from ssm_graph.base.errors import SolverError
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import VELOCITY
-from ssm_graph.live.estimator.buffers import SIGMAS, SPEEDS, Buffers, Measured
+from ssm_graph.graph.inertial_rows import InertialRows
+from ssm_graph.live.estimator.buffers import Buffers, Measured
 from ssm_graph.live.estimator.events import EventLog
 from ssm_graph.live.estimator.keyframes import KeyframeMaker
 from ssm_graph.live.estimator.recovery import Doubt, Doubted, doubt_of, reanchored, watch_after
@@ -26,7 +26,6 @@ from ssm_graph.mission.navigation import Severity
 from ssm_graph.smoothers.keyframe import Keyframe
 from ssm_graph.smoothers.stretch import Stretch, joined
 from ssm_graph.smoothers.window import Window
-from ssm_graph.smoothers.window_inertial import InertialRows
 
 REACH_S: Final = 0.1
 """A late inertial sample changes keyframes that are so much older: a ping's gyro reading is a mean,
@@ -144,8 +143,8 @@ class Course:
         last = self.newest
         keyframe = self._maker.make(measured, last_s=last.time_s)
         sigma = last.window.newest_sigma
-        if len(keyframe.beams.speed) == 0 and np.linalg.norm(sigma[VELOCITY]) > ANY_SPEED:
-            keyframe = replace(keyframe, speed_sigma=ANY_SPEED)
+        if len(keyframe.beams) == 0 and np.linalg.norm(sigma[VELOCITY]) > ANY_SPEED:
+            keyframe = keyframe.no_faster_than(ANY_SPEED)
         window, reserve = last.window.successor(), last.reserve.led_on(keyframe, self._inertial)
         doubt = doubt_of(last.watch, sigma, keyframe)
         if doubt is not None:
@@ -193,10 +192,10 @@ class Course:
     def _agree(self, measured: Measured) -> bool:
         """Return whether all four beams of the ping are there and agree with each other."""
         pings = measured.pings
-        if len(pings) == 0 or not np.all(np.isfinite(pings[-1, SPEEDS])):
+        if len(pings) == 0 or not np.all(np.isfinite(pings[-1, self._buffers.speeds])):
             return False
-        sigma = float(np.sqrt(np.sum((self._null * pings[-1, SIGMAS]) ** 2)))
-        return bool(abs(pings[-1, SPEEDS] @ self._null) < 5.0 * sigma)
+        sigma = float(np.sqrt(np.sum((self._null * pings[-1, self._buffers.sigmas]) ** 2)))
+        return bool(abs(pings[-1, self._buffers.speeds] @ self._null) < 5.0 * sigma)
 
     def _tell(self, before: Watch, after: Watch, keyframe: Keyframe) -> None:
         if after.trouble_s == keyframe.time_s and after.trouble != before.trouble:

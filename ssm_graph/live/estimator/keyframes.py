@@ -1,35 +1,46 @@
 """Which keyframe comes next, and everything a window is told of it.
 
-A keyframe stands at every ping with a beam and at every fix, and at a fixed interval after the last
-one where both are silent. That depends on what was measured and not on when it came, so that late
-messages lead to the same keyframes as punctual ones.
+A keyframe stands at every ping with a beam, at every fix and range, and at a fixed interval after
+the last one where all are silent. That depends on what was measured and not on when it came, so
+that late messages lead to the same keyframes as punctual ones.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import replace
+
 import numpy as np
 
+from factors.inertial import Intervals
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
-from ssm_graph.imu.preintegration import LIVELY_S, imu_gaps, preintegrate
-from ssm_graph.live.estimator.buffers import OFF_WATER, SIGMAS, SPEEDS, Buffers, Measured
-from ssm_graph.mission.aids import fix_covariance_n
-from ssm_graph.mission.ping_motion import PING_WINDOW_S, mean_gyro
-from ssm_graph.mission.problem import ProblemConfig
-from ssm_graph.mission.timeline import MIN_SPACING_S
+from ssm_graph.base.times import MIN_SPACING_S
+from ssm_graph.graph.aids import AIDS
+from ssm_graph.graph.aids.aid import Aid
+from ssm_graph.graph.aids.depth import DepthMeans, Depths
+from ssm_graph.graph.aids.gnss import Fixes
+from ssm_graph.imu.ping_motion import PING_WINDOW_S, mean_gyro
+from ssm_graph.imu.preintegration import LIVELY_S, InertialChain, imu_gaps, preintegrate
+from ssm_graph.live.estimator.buffers import OFF_WATER, Buffers, Logs, Measured
+from ssm_graph.mission.problem import Beams, ProblemConfig
 from ssm_graph.sensors.drift import Drift
 from ssm_graph.sensors.imu import ImuLog
-from ssm_graph.smoothers.keyframe import BeamSpeeds, Keyframe, Way
+from ssm_graph.smoothers.keyframe import Keyframe
 
 
 class KeyframeMaker:
     """Makes keyframes of what has been received."""
 
-    def __init__(self, buffers: Buffers, frame: LocalFrame, config: ProblemConfig) -> None:
+    def __init__(
+        self, buffers: Buffers, frame: LocalFrame, config: ProblemConfig, *, begin_s: float
+    ) -> None:
+        """Errors that grow are counted from ``begin_s``, s, on."""
         self._buffers, self._frame, self._config = buffers, frame, config
+        self._begin_s = begin_s
         vehicle = buffers.vehicle
+        self._no_beams = Beams.of_mount(vehicle.mount)
         self._white_beams = _white_share(vehicle.mount.drift)
-        self._white_fixes = _white_share(vehicle.gnss_calibration.drift)
         self.not_before_s = -np.inf
         """Where the inertial data have to be before asking again is worth while."""
 
@@ -43,25 +54,21 @@ class KeyframeMaker:
         self.not_before_s = at_s + 0.5 * PING_WINDOW_S
         if not self._covers(at_s):
             return None
-        begin_s, end_s = last_s + MIN_SPACING_S, at_s + MIN_SPACING_S
-        return Measured(
-            at_s,
-            self._usable_pings(begin_s, end_s),
-            buffers.fixes.between(begin_s, end_s),
-            buffers.depths.between(last_s, at_s),
-        )
+        pings = self._usable_pings(last_s + MIN_SPACING_S, at_s + MIN_SPACING_S)
+        return Measured(at_s, pings, buffers.logs_between(last_s, at_s))
 
     def _next_time(self, last_s: float) -> float:
         """Return the time of the keyframe after ``last_s``, as far as is known."""
         begin_s = last_s + MIN_SPACING_S
         at_s = last_s + self._config.keyframe_interval_s
-        pings, fixes = self._usable_pings(begin_s, at_s), self._buffers.fixes.between(begin_s, at_s)
-        times: list[float] = [at_s, *pings[:1, 0].tolist(), *fixes[:1, 0].tolist()]
+        times: list[float] = [at_s, *self._usable_pings(begin_s, at_s)[:1, 0].tolist()]
+        for rows in self._buffers.asking:
+            times += rows.between(begin_s, at_s)[:1, 0].tolist()
         return min(times)
 
     def _usable_pings(self, begin_s: float, end_s: float) -> Array:
         pings = self._buffers.pings_between(begin_s, end_s)
-        return pings[np.isfinite(pings[:, SPEEDS]).any(axis=1)]
+        return pings[np.isfinite(pings[:, self._buffers.speeds]).any(axis=1)]
 
     def _covers(self, time_s: float) -> bool:
         """Return whether the inertial data reach far enough beyond a time."""
@@ -73,23 +80,23 @@ class KeyframeMaker:
         at_s = measured.time_s
         begin_s = at_s if last_s is None else last_s
         imu = self._imu(begin_s, at_s)
-        way = None if last_s is None else self._integrate(imu, last_s, at_s)
+        inertial = None if last_s is None else self._integrate(imu, last_s, at_s).intervals
         gyro_b = mean_gyro(imu, np.array([at_s]))[0]
-        depths, has_depth = measured.depths, self._buffers.vehicle.depth_sigma is not None
-        fix_n, fix_cov_n = self._fixes(measured.fixes)
+        keyframe_s = np.array([begin_s, at_s])
+        aids = aids_at(measured.logs, self._frame, imu, keyframe_s, begin_s=self._begin_s)
         return Keyframe(
-            time_s=at_s,
-            gyro_b=gyro_b,
-            beams=self._beams(measured.pings, gyro_b),
-            depth_s=depths[:, 0] if has_depth else np.zeros(0),
-            depth=depths[:, 1] if has_depth else np.zeros(0),
-            fix_n=fix_n,
-            fix_cov_n=fix_cov_n,
-            way=way,
+            at_s,
+            self._beams(measured.pings, gyro_b),
+            {aid.name: aid for aid in aids if len(aid)},
+            inertial,
         )
 
-    def way(self, begin_s: float, end_s: float) -> Way:
+    def inertial(self, begin_s: float, end_s: float) -> Intervals:
         """Return what the inertial sensors say from one time to another."""
+        return self.chain(begin_s, end_s).intervals
+
+    def chain(self, begin_s: float, end_s: float) -> InertialChain:
+        """Return the same with the samples that it was made of."""
         return self._integrate(self._imu(begin_s, end_s), begin_s, end_s)
 
     def _imu(self, begin_s: float, end_s: float) -> ImuLog:
@@ -103,31 +110,57 @@ class KeyframeMaker:
             return imu
         return self._buffers.imu_log(begin_s - LIVELY_S, end_s + half)
 
-    def _integrate(self, imu: ImuLog, begin_s: float, end_s: float) -> Way:
-        chain = preintegrate(
+    def _integrate(self, imu: ImuLog, begin_s: float, end_s: float) -> InertialChain:
+        return preintegrate(
             imu,
             np.array([begin_s, end_s]),
             frame=self._frame,
             rate_hz=self._config.merge_rate_hz,
         )
-        return Way(chain.measurements[0], chain.params[0])
 
-    def _beams(self, pings: Array, gyro_b: Array) -> BeamSpeeds:
-        row, beam = np.nonzero(np.isfinite(pings[:, SPEEDS]))
-        is_water = pings[row, OFF_WATER]
-        return BeamSpeeds(
-            beam.astype(float),
-            pings[:, SPEEDS][row, beam],
-            pings[:, SIGMAS][row, beam] * np.where(is_water > 0.0, 1.0, self._white_beams),
-            np.broadcast_to(gyro_b, (len(row), 3)),
-            self._buffers.vehicle.mount.beams_b[beam],
-            is_water,
+    def _beams(self, pings: Array, gyro_b: Array) -> Beams:
+        speed, sigma = pings[:, self._buffers.speeds], pings[:, self._buffers.sigmas]
+        row, beam = np.nonzero(np.isfinite(speed))
+        is_water = pings[row, OFF_WATER] > 0.0
+        return replace(
+            self._no_beams,
+            keyframe=np.zeros(len(row), np.intp),
+            beam=beam,
+            speed=speed[row, beam],
+            sigma=sigma[row, beam] * np.where(is_water, 1.0, self._white_beams),
+            gyro_b=np.broadcast_to(gyro_b, (len(row), 3)),
+            beam_b=self._buffers.vehicle.mount.beams_b[beam],
+            ping=row,
+            is_water=is_water,
         )
 
-    def _fixes(self, fixes: Array) -> tuple[Array, Array]:
-        position_n = self._frame.p_n_from_geodetic(fixes[:, 1], fixes[:, 2], fixes[:, 3])
-        sigma_enu = fixes[:, 4:] * self._white_fixes
-        return position_n, fix_covariance_n(self._frame, position_n, sigma_enu)
+
+def aids_at(
+    logs: Logs, frame: LocalFrame, imu: ImuLog, keyframe_s: Array, *, begin_s: float | None = None
+) -> Iterator[Aid]:
+    """Yield what the logs say at the second of two keyframes (2,), s, also where it is nothing.
+
+    Errors that grow are counted from ``begin_s``, s, on.
+    """
+    gnss, depth, aids = logs
+    fix = np.arange(len(gnss.time_s))
+    fixes = Fixes.of_log(
+        gnss,
+        fix,
+        time_s=np.full(len(fix), keyframe_s[1]),
+        keyframe=np.ones(len(fix), np.intp),
+        frame=frame,
+        imu=imu,
+    )
+    white = _white_share(gnss.calibration.drift)
+    yield replace(fixes, covariance_n=fixes.covariance_n * white**2)
+    if depth is not None:
+        readings = Depths.of(depth, imu, keyframe_s)
+        yield DepthMeans.of_readings(readings, keyframe_s, frame).at(1)
+    for kind in AIDS:
+        aid = kind.of(aids, frame=frame, imu=imu, keyframe_s=keyframe_s, begin_s=begin_s)
+        if aid is not None:
+            yield aid.at(1)
 
 
 def _white_share(drift: Drift) -> float:

@@ -9,6 +9,8 @@ import numpy as np
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import POSITION, ROTATION, VELOCITY, InitialMoments
+from ssm_graph.graph.aids.depth import DepthMeans
+from ssm_graph.graph.aids.gnss import Fixes
 from ssm_graph.live.estimator.reserve import SPEED_SIGMA, Kept, forget, slowed
 from ssm_graph.live.estimator.watch import (
     FEW,
@@ -92,7 +94,7 @@ def doubt_of(watch: Watch, sigma: Array, keyframe: Keyframe) -> Doubt | None:
             "answer in part",
         )
     few_s = keyframe.time_s - watch.few_since_s
-    if len(keyframe.beams.speed) > 2 and few_s > LONGEST_FEW_S:
+    if len(keyframe.beams) > 2 and few_s > LONGEST_FEW_S:
         return Doubt(
             Doubted.ANSWER,
             f"most beams have contradicted the answer for {few_s:.0f} s: perhaps it follows the "
@@ -110,7 +112,7 @@ def doubt_of(watch: Watch, sigma: Array, keyframe: Keyframe) -> Doubt | None:
 def _is_adrift(watch: Watch, sigma: Array, keyframe: Keyframe) -> bool:
     """Return whether beams are back after a silence that left the prediction beyond correction."""
     return bool(
-        len(keyframe.beams.speed) > 2
+        len(keyframe.beams) > 2
         and keyframe.time_s - watch.last_beam_s > SILENCE_S
         and np.linalg.norm(sigma[ROTATION]) > BENT_TURN
         and np.linalg.norm(sigma[VELOCITY]) > BENT_SPEED
@@ -182,7 +184,7 @@ def reanchored(window: Window, keyframe: Keyframe, kept: Kept, what: Doubted) ->
     else:
         trust, start = window.trust, _from_prediction(window, keyframe, what)
     # The first keyframe of a window meets no gate: depth and fixes count from the next one on.
-    first = keyframe.without("depth").without("fix")
+    first = keyframe.without(DepthMeans.name, Fixes.name)
     begun = Window(window.sensors, window.config, first, start, trust=trust)
     begun.meet_prediction()
     begun.iterate()

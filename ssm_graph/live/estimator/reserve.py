@@ -13,10 +13,10 @@ import numpy as np
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import POSITION, VELOCITY
-from ssm_graph.engine.states import AugmentedStates
+from ssm_graph.engine.states import States
+from ssm_graph.graph.inertial_rows import InertialRows
 from ssm_graph.smoothers.keyframe import Keyframe
 from ssm_graph.smoothers.window import Window
-from ssm_graph.smoothers.window_inertial import InertialRows
 
 RENEW_S: Final = 15.0
 """While all is sound a new answer goes into reserve so often."""
@@ -51,15 +51,19 @@ class Kept(NamedTuple):
     """(4,) what each beam was worth then, 0 to 1"""
 
     @property
-    def states(self) -> AugmentedStates:
+    def states(self) -> States:
         """The state (1, ...) now."""
-        return AugmentedStates(self.R_nb, self.p_n, self.v_n, self.bias, self.extra)
+        return States(self.R_nb, self.p_n, self.v_n, self.bias, self.extra)
 
     def led_on(self, keyframe: Keyframe, inertial: InertialRows) -> Kept:
         """Return the answer at the next keyframe."""
-        there = inertial.predict(keyframe, self.states)
-        covariance = inertial.carry(keyframe, self.states, there, self.covariance)
-        led = self._replace(**there._asdict(), covariance=covariance)
+        assert keyframe.inertial is not None
+        ahead = inertial.predict(keyframe.inertial, self.states)
+        covariance = ahead.covariance(self.covariance)
+        R_nb, p_n, v_n, bias, walks, _ = ahead.states
+        led = self._replace(
+            R_nb=R_nb, p_n=p_n, v_n=v_n, bias=bias, extra=walks, covariance=covariance
+        )
         is_lost = np.trace(covariance[VELOCITY, VELOCITY]) > (LOST_FACTOR * SPEED_SIGMA) ** 2
         return led.without_velocity(keyframe.time_s) if is_lost else led
 
@@ -127,4 +131,4 @@ def _kept(window: Window) -> Kept:
     newest = window.newest
     states, covariance = newest.states, newest.covariance[0]
     place_sigma = np.sqrt(np.linalg.eigvalsh(covariance[POSITION, POSITION])[-1])
-    return Kept(newest.time_s[0], states.p_n[0], place_sigma, *states, covariance, window.trust)
+    return Kept(newest.time_s[0], states.p_n[0], place_sigma, *states[:5], covariance, window.trust)

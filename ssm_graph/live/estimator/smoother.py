@@ -11,6 +11,7 @@ import numpy as np
 
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.times import MIN_SPACING_S
 from ssm_graph.live.estimator.answer import answer
 from ssm_graph.live.estimator.asked import not_calibrated, sensors_of_vehicle
 from ssm_graph.live.estimator.course import REACH_S, Course, Step
@@ -33,11 +34,9 @@ from ssm_graph.live.estimator.store import (
 )
 from ssm_graph.live.estimator.tail import Tail
 from ssm_graph.live.estimator.watch import Watch
-from ssm_graph.mission.aid_errors import not_used
 from ssm_graph.mission.estimate import Found
 from ssm_graph.mission.navigation import Event, Health, Navigation, Severity
 from ssm_graph.mission.problem import ProblemConfig
-from ssm_graph.mission.timeline import MIN_SPACING_S
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.sensors.messages import Message
@@ -156,14 +155,12 @@ class FixedLagSmoother:
 
     def _begin(self, beginning: Beginning) -> None:
         self._frame, buffers = beginning.frame, self._intake.buffers
-        self._begun_s = beginning.time_s
+        self._begun_s = beginning.begin_s
         for note in not_calibrated(self.vehicle):
             self._events.tell(beginning.time_s, Severity.INFO, "not_calibrated", note)
-        for note in not_used(self.vehicle.further_aids):
-            self._events.tell(beginning.time_s, Severity.INFO, "not_aided", note)
-        maker = KeyframeMaker(buffers, beginning.frame, self._problem_config)
-        first = Keyframe.unmeasured(beginning.time_s, np.zeros(3), None)
+        maker = KeyframeMaker(buffers, beginning.frame, self._problem_config, begin_s=self._begun_s)
         sensors = sensors_of_vehicle(self.vehicle, beginning.frame)
+        first = Keyframe(beginning.time_s, sensors.beams)
         window = Window(sensors, self.config, first, beginning.moments)
         window.iterate()
         self._course = self._course_from(Step(window, Watch(), None, Reserve.of(window)), maker)
@@ -221,10 +218,15 @@ class FixedLagSmoother:
             smoother._starter.go_on_from(meta["alignment"], intake.buffers)
         if meta["watch"] is not None:
             assert smoother._frame is not None
-            maker = KeyframeMaker(intake.buffers, smoother._frame, smoother._problem_config)
+            maker = KeyframeMaker(
+                intake.buffers,
+                smoother._frame,
+                smoother._problem_config,
+                begin_s=smoother._begun_s,
+            )
             sensors = sensors_of_vehicle(vehicle, smoother._frame)
-            window = Window.unpack(window_arrays(arrays), sensors, smoother.config, maker.way)
-            watch, left = unpack_watch(meta["watch"]), unpack_left(arrays)
+            window = Window.unpack(window_arrays(arrays), sensors, smoother.config, maker.inertial)
+            watch, left = unpack_watch(meta["watch"]), unpack_left(arrays, sensors)
             step = Step(window, watch, left, unpack_reserve(arrays))
             smoother._course = course = smoother._course_from(step, maker)
             course.advance()

@@ -47,6 +47,8 @@ class Beginning(NamedTuple):
     time_s: float
     moments: InitialMoments
     frame: LocalFrame
+    begin_s: float
+    """s; priors hold there, and errors that grow are counted from there"""
 
 
 class Starter:
@@ -145,7 +147,7 @@ class Starter:
         frame = self._frame(buffers)
         assert frame is not None  # an initial state has a place
         moved = replace(initial, time_s=time_s)
-        return Beginning(time_s, self._moments(moved, frame), frame)
+        return Beginning(time_s, self._moments(moved, frame), frame, time_s)
 
     def _moments(self, start: InitialState, frame: LocalFrame) -> InitialMoments:
         noise = self._vehicle.imu_noise
@@ -164,7 +166,10 @@ class Starter:
                 "is there",
             )
             return None
-        problem = yield from build_problem_steps(mission, self._config, start=estimate.start)
+        begin_s = estimate.start.time_s
+        problem = yield from build_problem_steps(
+            mission, self._config, start=estimate.start, begin_s=begin_s
+        )
         run = yield from run_fixed_lag_steps(problem, FixedLagConfig(0.0, tolerance=1e-3))
         newest = run.newest
         found = newest.states.take(np.s_[-1:]).moments(newest.covariance[-1])
@@ -173,7 +178,7 @@ class Starter:
         self._events.tell(
             self._now_s, Severity.INFO, "aligned", "; ".join(estimate.notes) or "heading found"
         )
-        return Beginning(float(newest.time_s[-1]), moments, mission.frame)
+        return Beginning(float(newest.time_s[-1]), moments, mission.frame, begin_s)
 
     def _frame(self, buffers: Buffers) -> LocalFrame | None:
         if self._vehicle.frame is not None:

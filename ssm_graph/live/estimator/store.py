@@ -7,31 +7,30 @@ later steps follow from these, and so does the answer to every late message.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.engine.states import AugmentedStates
+from ssm_graph.engine.states import States
 from ssm_graph.live.estimator.buffers import Buffers
 from ssm_graph.live.estimator.course import Step
 from ssm_graph.live.estimator.reserve import Reserve
 from ssm_graph.live.estimator.watch import Contradicted, Watch
-from ssm_graph.smoothers.stretch import Stretch
-
-TABLES: Final = ("imu", "pings", "depths", "fixes")
+from ssm_graph.smoothers.keyframe import Sensors
+from ssm_graph.smoothers.stretch import Stretch, pack_judged, unpack_judged
 
 
 def pack_buffers(buffers: Buffers) -> dict[str, Array]:
     """Return all rows that were received and kept."""
-    return {f"rows_{name}": getattr(buffers, name).all.copy() for name in TABLES}
+    return {f"rows_{section}": rows.all.copy() for section, rows in buffers.rows.items()}
 
 
 def unpack_buffers(arrays: Mapping[str, Array], buffers: Buffers) -> None:
     """Fill empty buffers."""
-    for name in TABLES:
-        for row in arrays[f"rows_{name}"]:
-            getattr(buffers, name).add(row)
+    for section, rows in buffers.rows.items():
+        for row in arrays[f"rows_{section}"]:
+            rows.add(row)
 
 
 def pack_step(step: Step) -> tuple[dict[str, Array], dict[str, Any]]:
@@ -39,8 +38,9 @@ def pack_step(step: Step) -> tuple[dict[str, Array], dict[str, Any]]:
     arrays = {f"window_{name}": array for name, array in step.window.pack().items()}
     if step.left is not None:
         states = {f"states_{k}": v for k, v in step.left.states._asdict().items()}
-        others = {k: v for k, v in step.left._asdict().items() if k != "states"}
-        arrays |= {f"left_{name}": array for name, array in {**states, **others}.items()}
+        others = {k: v for k, v in step.left._asdict().items() if k not in ("states", "aids")}
+        aids = dict(pack_judged(step.left.aids))
+        arrays |= {f"left_{name}": array for name, array in {**states, **others, **aids}.items()}
     arrays |= {f"reserve_{name}": array for name, array in step.reserve.pack()}
     return arrays, {name: _plain(value) for name, value in step.watch._asdict().items()}
 
@@ -71,13 +71,17 @@ def unpack_reserve(arrays: Mapping[str, Array]) -> Reserve:
     return Reserve.unpack({k.removeprefix(prefix): v for k, v in arrays.items() if prefix in k})
 
 
-def unpack_left(arrays: Mapping[str, Array]) -> Stretch | None:
+def unpack_left(arrays: Mapping[str, Array], sensors: Sensors) -> Stretch | None:
     """Return what had left the window with the step."""
     if "left_time_s" not in arrays:
         return None
-    states = AugmentedStates(*(arrays[f"left_states_{n}"] for n in AugmentedStates._fields))
-    others = {n: arrays[f"left_{n}"] for n in Stretch._fields if n != "states"}
-    return Stretch(states=states, **others)
+    states = States(*(arrays[f"left_states_{n}"] for n in States._fields))
+    aids = unpack_judged(arrays, sensors.aids, prefix="left_")
+    others: dict[str, Any] = {
+        n: arrays[f"left_{n}"] for n in Stretch._fields if n not in ("states", "aids")
+    }
+    others["beam"] = others["beam"].astype(np.intp)
+    return Stretch(states=states, aids=aids, **others)
 
 
 def _plain(value: Any) -> Any:

@@ -8,11 +8,11 @@ import gtsam
 import numpy as np
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.engine.states import AugmentedStates
-from ssm_graph.imu.preintegration import Unseen, gtsam_gravity, imu_params
+from ssm_graph.engine.states import States
+from ssm_graph.graph.inertial_rows import InertialRows
+from ssm_graph.imu.preintegration import Preintegrated, Unseen, imu_params, intervals_of
 from ssm_graph.sensors.imu import ImuNoise
-from ssm_graph.smoothers.keyframe import Keyframe, Sensors, Way
-from ssm_graph.smoothers.window_inertial import InertialRows
+from ssm_graph.smoothers.keyframe import Keyframe, Sensors
 
 LONGEST_S = 0.1
 """A longer step from sample to sample is a gap of the inertial data."""
@@ -22,7 +22,7 @@ class Newest(NamedTuple):
     """State and covariance at the last inertial sample."""
 
     time_s: float
-    states: AugmentedStates
+    states: States
     """(1, ...)"""
     covariance: Array
     """(n, n)"""
@@ -34,22 +34,22 @@ class Tail:
     def __init__(
         self,
         keyframe: Keyframe,
-        states: AugmentedStates,
+        states: States,
         covariance: Array,
         *,
         noise: ImuNoise,
         sensors: Sensors,
     ) -> None:
         """Begin at a keyframe with its states (1, ...) and covariance (n, n)."""
-        frame = sensors.frame
+        frame, self._no_beams = sensors.frame, sensors.beams
         self._begin_s = self._end_s = keyframe.time_s
         self._states, self._covariance = states, covariance
         self._noise, self._frame = noise, frame
         self._gap_s = 0.0
         self._last: Array | None = None
         bias = gtsam.imuBias.ConstantBias(states.bias[0, :3], states.bias[0, 3:])
-        params = imu_params(noise, g_n=gtsam_gravity(frame, states.p_n[0]), frame=frame)
-        self._way = Way(gtsam.PreintegratedCombinedMeasurementsG(params, bias), params)
+        params = imu_params(noise, g_n=np.zeros(3), frame=frame)
+        self._measured = Preintegrated(params, bias)
         self._rows = InertialRows(frame, sensors.extras)
 
     def add(self, samples: Array) -> None:
@@ -65,7 +65,7 @@ class Tail:
                 reading if self._last is None or dt <= LONGEST_S else 0.5 * (self._last + reading)
             )
             gyro_b, accel_b, self._last = here[:3], here[3:], reading
-            self._way.measured.integrateMeasurement(accel_b, gyro_b, dt)
+            self._measured.integrateMeasurement(accel_b, gyro_b, dt)
             self._end_s = time_s
 
     @property
@@ -77,11 +77,9 @@ class Tail:
         """Return where the vehicle is now; the keyframe itself if nothing came since."""
         if self._end_s <= self._begin_s:
             return Newest(self._begin_s, self._states, self._covariance)
-        end = Keyframe.unmeasured(self._end_s, np.zeros(3), self._way)
-        predicted = self._rows.predict(end, self._states)
         begun = self._covariance + self._unseen() if self._gap_s else self._covariance
-        covariance = self._rows.carry(end, self._states, predicted, begun)
-        return Newest(self._end_s, predicted, covariance)
+        ahead = self._rows.predict(intervals_of([self._measured], self._frame), self._states)
+        return Newest(self._end_s, ahead.states, ahead.covariance(begun))
 
     def _unseen(self) -> Array:
         """Return the covariance (n, n) of what may have happened where samples are missing.

@@ -13,9 +13,10 @@ import numpy as np
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import POSITION, VELOCITY
+from ssm_graph.graph.aids.depth import DepthMeans
+from ssm_graph.graph.aids.gnss import Fixes
 from ssm_graph.mission.doubts import LARGEST_SPEED, LOW_WEIGHT, MISFIT, TRUSTED
 from ssm_graph.mission.navigation import Health
-from ssm_graph.sensors.dvl import N_BEAMS
 from ssm_graph.smoothers.keyframe import Keyframe
 from ssm_graph.smoothers.stretch import Stretch
 from ssm_graph.smoothers.window import Window
@@ -61,6 +62,8 @@ class Watch(NamedTuple):
     last_ground_s: float = -math.inf
     """When one off the ground did, s"""
     last_fix_s: float = -math.inf
+    last_aid_s: float = -math.inf
+    """When a measurement of any other aid counted, s"""
     pings_refused: int = 0
     """Pings in a row that agree with themselves and not with the prediction"""
     pings_out: int = 0
@@ -89,12 +92,8 @@ class Watch(NamedTuple):
     moved: tuple[float, ...] = ()
     """When it was begun anew at another position because fixes contradicted it, the last times"""
     contradicted: Contradicted | None = None
-    beam_weights: tuple[float, ...] = (math.nan,) * N_BEAMS
-
-
-def refused(before: Keyframe, after: Keyframe) -> tuple[bool, bool]:
-    """Return whether fixes, and depths, of a keyframe were left out by the window."""
-    return len(after.fix_n) < len(before.fix_n), len(after.depth) < len(before.depth)
+    beam_weights: tuple[float, ...] = ()
+    """Of the last ping"""
 
 
 def observe(
@@ -123,22 +122,24 @@ def observe(
     """
     newest, time_s = window.newest, keyframe.time_s
     kept = window.keyframes[-1]
-    no_fix, no_depth = refused(keyframe, kept)
+    no_fix, no_depth = (name not in kept.aids for name in (Fixes.name, DepthMeans.name))
     share = 1.0 - math.exp(-(time_s - last_s) / MEMORY_S)
     watch = watch._replace(force=watch.force + share * (force - watch.force))
     if len(newest.weight):
-        watch = _with_beams(watch, newest, share, parity=parity)
+        watch = _with_beams(watch, newest, share, parity=parity, n_beams=keyframe.beams.n_beams)
         if counts_off_the_ground(newest, kept):
             watch = watch._replace(last_ground_s=time_s)
     few_since_s = min(watch.few_since_s, time_s) if watch.good_share < FEW else math.inf
     watch = watch._replace(few_since_s=few_since_s)
-    if len(keyframe.fix_n):
+    if Fixes.name in keyframe.aids:
         watch = watch._replace(
             fixes_refused=watch.fixes_refused + 1 if no_fix else 0,
             last_fix_s=watch.last_fix_s if no_fix else time_s,
         )
-    if len(keyframe.depth):
+    if DepthMeans.name in keyframe.aids:
         watch = watch._replace(depths_refused=watch.depths_refused + 1 if no_depth else 0)
+    if any(np.any(judged.weight >= TRUSTED) for judged in newest.aids.values()):
+        watch = watch._replace(last_aid_s=time_s)
     if watch.contradicted is not None:
         watch = watch._replace(contradicted=_still(watch.contradicted, window))
     trouble = _trouble(watch, time_s, newest.states.v_n[0])
@@ -149,15 +150,17 @@ def observe(
     return watch._replace(trouble_s=time_s, trouble=trouble) if trouble else watch
 
 
-def _with_beams(watch: Watch, newest: Stretch, share: float, *, parity: bool) -> Watch:
+def _with_beams(
+    watch: Watch, newest: Stretch, share: float, *, parity: bool, n_beams: int
+) -> Watch:
     """Return what is remembered after the beams of one more keyframe; means move by ``share``."""
     time_s = float(newest.time_s[0])
     counted = newest.weight >= TRUSTED
     trusted = newest.mahalanobis_sq[counted]
     n_out = int(np.sum(newest.weight < LOW_WEIGHT))
     is_out, is_torn = n_out == len(newest.weight) > 2, n_out > 1 and parity
-    weights = [math.nan] * N_BEAMS
-    for beam, weight in zip(newest.beam.astype(int), newest.weight, strict=True):
+    weights = [math.nan] * n_beams
+    for beam, weight in zip(newest.beam.tolist(), newest.weight, strict=True):
         weights[beam] = float(weight)
     watch = watch._replace(
         last_beam_s=time_s if counted.any() else watch.last_beam_s,
@@ -176,7 +179,7 @@ def _with_beams(watch: Watch, newest: Stretch, share: float, *, parity: bool) ->
 
 def counts_off_the_ground(newest: Stretch, keyframe: Keyframe) -> bool:
     """Return whether a beam off the ground counts at the newest keyframe, as the window has it."""
-    is_ground = keyframe.beams.is_water == 0.0
+    is_ground = ~keyframe.beams.is_water
     return bool(np.any(newest.weight[is_ground] >= TRUSTED))
 
 
@@ -249,8 +252,8 @@ def verdict(watch: Watch, *, now_s: float, imu_s: float, covariance: Array) -> V
     imu_s : newest time of the inertial data.
     covariance : (15, 15) of the newest answer.
     """
-    since_beam_s, since_fix_s = (imu_s - t for t in (watch.last_beam_s, watch.last_fix_s))
-    since_aid_s = min(since_beam_s, since_fix_s)
+    since_beam_s = imu_s - watch.last_beam_s
+    since_aid_s = imu_s - max(watch.last_beam_s, watch.last_fix_s, watch.last_aid_s)
     since_ground_s = imu_s - watch.last_ground_s
     has_lock = since_ground_s < LOCK_LOST_S
     velocity_sigma = math.sqrt(max(float(np.trace(covariance[VELOCITY, VELOCITY])), 0.0))

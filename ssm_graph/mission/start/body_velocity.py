@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ssm_graph.base.frozen import Array
+from ssm_graph.imu.ping_motion import mean_gyro
 from ssm_graph.mission.mission import Mission
-from ssm_graph.mission.ping_motion import mean_gyro
 from ssm_graph.sensors.standstill import Standstill
 
 PARITY_GATE = 5.0
@@ -42,7 +42,7 @@ class BodyVelocities:
 def body_velocities(mission: Mission) -> BodyVelocities:
     """Return the velocities of the pings, and zero while the mission stands still."""
     velocities = _of_pings(mission)
-    for still in mission.aids.standstills:
+    for still in mission.aids.all(Standstill):
         velocities = _at_rest(velocities, still)
     return velocities
 
@@ -76,7 +76,7 @@ def _of_pings(mission: Mission) -> BodyVelocities:
     n_needed = 4 if np.mean(valid.all(axis=1)) > 0.5 else 3
     is_good = (valid.sum(axis=1) >= n_needed) & (np.abs(parity) < PARITY_GATE * sigma)
     usable = np.flatnonzero(is_good)
-    time_s = dvl.ping_s[usable]
+    time_s = dvl.valid_s[usable]
     if len(usable) == 0:
         return BodyVelocities(time_s, np.zeros((0, 3)))
     v_b = np.array([np.linalg.lstsq(beams_b[valid[i]], dvl.speed[i, valid[i]])[0] for i in usable])

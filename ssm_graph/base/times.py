@@ -1,0 +1,46 @@
+"""Times and the keyframes that they belong to."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ssm_graph.base.frozen import Array
+
+MIN_SPACING_S = 1e-3
+"""Times closer than this share a keyframe."""
+
+Indices = NDArray[np.intp]
+
+
+def is_inside(time_s: Array, start_s: float, end_s: float) -> NDArray[np.bool_]:
+    """Return which times lie in the span, but for rounding."""
+    return (time_s > start_s - MIN_SPACING_S) & (time_s < end_s + MIN_SPACING_S)
+
+
+def nearest(keyframe_s: Array, time_s: Array) -> Indices:
+    """Return the index of the keyframe nearest to each time."""
+    middle = 0.5 * (keyframe_s[:-1] + keyframe_s[1:])
+    return np.searchsorted(middle, time_s)
+
+
+def last_readings(keyframe_s: Array, time_s: Array) -> tuple[Indices, Indices]:
+    """Return the keyframes (M,) with a reading since the keyframe before, and the last one of each.
+
+    Of the first keyframe it is a reading at its own time.
+    """
+    late_s = keyframe_s + MIN_SPACING_S
+    reading = np.searchsorted(time_s, late_s, side="right") - 1
+    before = np.searchsorted(time_s, np.append(keyframe_s[0] - MIN_SPACING_S, late_s[:-1]))
+    keyframe = np.flatnonzero(reading >= before)
+    return keyframe, reading[keyframe]
+
+
+def left_out(what: str, count: int, start_s: float, end_s: float) -> tuple[str, ...]:
+    """Return the note on measurements outside the keyframes, if there are any."""
+    if count == 0:
+        return ()
+    plural = "" if count == 1 else "es" if what.endswith("fix") else "s"
+    return (
+        f"{count} {what}{plural} outside the smoothed span {start_s:.3f}..{end_s:.3f} s left out",
+    )

@@ -1,0 +1,178 @@
+"""Depth: readings between keyframes, carried to the next one along the track, with an offset."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final, Self
+
+import numpy as np
+
+from factors.depth_height import height_residual
+from ssm_graph.base.earth import LocalFrame
+from ssm_graph.base.frozen import Array, ReadOnlyArrays
+from ssm_graph.base.times import Indices
+from ssm_graph.engine.error_state import POSITION, ROTATION
+from ssm_graph.engine.extras import Extra
+from ssm_graph.graph.aids.aid import Aid, Linearised, RowStates
+from ssm_graph.graph.aids.heights import HeightTrack, height_track
+from ssm_graph.imu.ping_motion import mean_gyro
+from ssm_graph.sensors.depth import DepthCalibration, DepthLog
+from ssm_graph.sensors.imu import ImuLog
+
+DEPTH_OFFSET: Final = "depth_offset"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Depths(ReadOnlyArrays):
+    """Depth readings, each assigned to the first keyframe at or after it, as on the vehicle."""
+
+    keyframe: Indices
+    """(M,)"""
+    time_s: Array
+    """(M,) s"""
+    depth: Array
+    """(M,) m, positive down"""
+    gyro_b: Array
+    """(K, 3) rad/s, at the keyframes: it moves the lever arm"""
+    sigma: float
+    """m"""
+    lever_arm_b: Array
+    """(3,) m"""
+
+    @classmethod
+    def of(cls, log: DepthLog, imu: ImuLog, keyframe_s: Array) -> Depths:
+        """Return the readings of a log within keyframes (K,)."""
+        used = (log.time_s >= keyframe_s[0]) & (log.time_s <= keyframe_s[-1])
+        return cls(
+            keyframe=np.searchsorted(keyframe_s, log.time_s[used]),
+            time_s=log.time_s[used],
+            depth=log.true_depth[used],
+            gyro_b=mean_gyro(imu, keyframe_s),
+            sigma=log.sigma,
+            lever_arm_b=log.lever_arm_b,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthMeans(Aid):
+    """The mean of each keyframe's readings.
+
+    Between keyframes the sensor's height follows the cubic through both heights and climbs, see
+    :func:`ssm_graph.graph.aids.heights.height_on_the_way`: how much it rises from the readings to
+    the keyframe, on average, is a sum of these with the factors ``rise_of_...``. At the first
+    keyframe it is taken as nothing: what came before it is not known.
+    """
+
+    SHARED = frozenset({"sigma", "lever_arm_b", "frame"})
+    name = "depth"
+    unit = "m"
+    hint = "look at its zero, sign and unit"
+    is_weighted = False
+
+    depth: Array
+    """(M,) m, positive down"""
+    count: Array
+    """(M,) readings"""
+    rise_of_way: Array
+    """(M,) of the rise from the keyframe before"""
+    rise_of_begin_s: Array
+    """(M,) of the climb at the keyframe before, negative, s"""
+    rise_of_end_s: Array
+    """(M,) of the climb at the keyframe, s"""
+    gyro_before_b: Array
+    """(M, 3) rad/s, at the keyframe before: it moves the lever arm"""
+    gyro_b: Array
+    """(M, 3) rad/s"""
+    rise: Array
+    """(M,) m, from the readings to the keyframe, along the track last followed"""
+    sigma: float
+    """m, of one reading"""
+    lever_arm_b: Array
+    """(3,) m"""
+    frame: LocalFrame
+
+    @classmethod
+    def of_readings(cls, depths: Depths, keyframe_s: Array, frame: LocalFrame) -> Self:
+        """Return the means of readings at keyframes (K,)."""
+        n, k = len(keyframe_s), depths.keyframe
+        before = np.maximum(k - 1, 0)
+        span_s = np.where(k > 0, keyframe_s[k] - keyframe_s[before], np.inf)
+        s = np.where(k > 0, (depths.time_s - keyframe_s[before]) / span_s, 1.0)
+        span_s = np.where(k > 0, span_s, 0.0)
+        count = np.bincount(k, minlength=n)
+        read = np.flatnonzero(count)
+
+        def mean(values: Array) -> Array:
+            return np.asarray(np.bincount(k, weights=values, minlength=n)[read] / count[read])
+
+        return cls(
+            keyframe=read,
+            depth=mean(depths.depth),
+            count=count[read].astype(np.float64),
+            rise_of_way=mean(1.0 - s**2 * (3.0 - 2.0 * s)),
+            rise_of_begin_s=mean(-span_s * s * (1.0 - s) ** 2),
+            rise_of_end_s=mean(span_s * s**2 * (1.0 - s)),
+            gyro_before_b=depths.gyro_b[np.maximum(read - 1, 0)],
+            gyro_b=depths.gyro_b[read],
+            rise=np.zeros(len(read)),
+            sigma=depths.sigma,
+            lever_arm_b=depths.lever_arm_b,
+            frame=frame,
+        )
+
+    @property
+    def root_information(self) -> Array:
+        """(M, 1, 1) 1/m."""
+        return np.asarray((np.sqrt(self.count) / self.sigma)[:, None, None])
+
+    @property
+    def labels(self) -> list[str]:
+        """(M,) always the same."""
+        return ["depth"] * len(self)
+
+    def _track(self, at: RowStates, gyro_b: Array) -> HeightTrack:
+        return height_track(
+            self.frame,
+            R_nb=at.R_nb,
+            p_n=at.p_n,
+            v_n=at.v_n,
+            gyro_b=gyro_b,
+            lever_arm_b=self.lever_arm_b,
+        )
+
+    def led_along(self, before: RowStates, at: RowStates) -> Self:
+        """Return the same with the rises along another track."""
+        begin, end = self._track(before, self.gyro_before_b), self._track(at, self.gyro_b)
+        rise = self.rise_of_way * (end.height - begin.height)
+        rise = rise + self.rise_of_begin_s * begin.climb + self.rise_of_end_s * end.climb
+        return replace(self, rise=rise)
+
+    def target(self, at: RowStates) -> tuple[Array, Array]:
+        """Return where readings put the sensor, m, and the vertical that counts, both (M, 3)."""
+        track = self._track(at, self.gyro_b)
+        too_low = self.rise - self.depth - track.height
+        return track.sensor_n + track.up_n * too_low[:, None], track.up_n
+
+    def measured(self, at: RowStates) -> Linearised:
+        """Linearise heights: one component each."""
+        target_n, up_n = self.target(at)
+        residual = height_residual(
+            at.R_nb,
+            at.p_n,
+            lever_arm_b=self.lever_arm_b,
+            offset=at.value(DEPTH_OFFSET, 1)[..., 0],
+            up_n=up_n,
+            target_n=target_n,
+        )
+        jacobian = np.zeros((*residual.error.shape, 1, at.extras.width))
+        jacobian[..., 0, ROTATION] = residual.error_D_rotation
+        jacobian[..., 0, POSITION] = residual.error_D_position
+        if DEPTH_OFFSET in at.extras:
+            own = at.extras.columns(DEPTH_OFFSET)
+            jacobian[..., 0, own] = residual.error_D_offset[..., None]
+        return Linearised(residual.error[..., None], jacobian)
+
+
+def depth_variables(calibration: DepthCalibration) -> tuple[Extra, ...]:
+    """Return what the sigmas of a depth sensor switch on."""
+    return (Extra(DEPTH_OFFSET, ("depth_offset_m",), np.array([calibration.offset_sigma])),)

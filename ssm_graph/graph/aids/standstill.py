@@ -1,0 +1,78 @@
+"""Times at rest: every keyframe within one stands still."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from factors.standstill import standstill_residual
+from ssm_graph.base.earth import LocalFrame
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import VELOCITY
+from ssm_graph.graph.aids.aid import Aid, Linearised, RowStates
+from ssm_graph.graph.aids.gnss import EAST_NORTH_UP
+from ssm_graph.mission.mission import Aids
+from ssm_graph.sensors.imu import ImuLog
+from ssm_graph.sensors.standstill import Standstill
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Standstills(Aid):
+    """Keyframes at which the vehicle stands still: velocities of zero."""
+
+    name = "standstill"
+    unit = "m/s"
+    hint = "look at its begin and end"
+    section = Standstill.SECTION
+
+    sigma: Array
+    """(M,) m/s"""
+
+    @classmethod
+    def of(
+        cls,
+        aids: Aids,
+        *,
+        frame: LocalFrame,
+        imu: ImuLog,
+        keyframe_s: Array,
+        begin_s: float | None = None,
+    ) -> Self | None:
+        """Return the keyframes within standstills; where two overlap the stricter one counts."""
+        del frame, imu, begin_s
+        standstills = aids.all(Standstill)
+        if not standstills:
+            return None
+        sigma = np.full(len(keyframe_s), np.inf)
+        for still in standstills:
+            inside = (keyframe_s >= still.begin_s) & (keyframe_s <= still.end_s)
+            sigma[inside] = np.minimum(sigma[inside], still.sigma)
+        keyframe = np.flatnonzero(np.isfinite(sigma))
+        return cls(keyframe, sigma[keyframe])
+
+    @property
+    def root_information(self) -> Array:
+        """(M, 3, 3) s/m."""
+        return np.asarray(np.eye(3) / self.sigma[:, None, None])
+
+    @property
+    def labels(self) -> list[str]:
+        """(3 M,) axes."""
+        return [*EAST_NORTH_UP] * len(self)
+
+    def measured(self, at: RowStates) -> Linearised:
+        """Linearise velocities: three components each."""
+        residual = standstill_residual(at.v_n)
+        jacobian = np.zeros((*residual.error.shape, at.extras.width))
+        jacobian[..., VELOCITY] = residual.error_D_velocity_n
+        return Linearised(residual.error, jacobian)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AnySpeed(Standstills):
+    """Keyframes of which no more is known than how fast any vehicle is; it counts in full."""
+
+    name = "speed"
+    is_weighted = False

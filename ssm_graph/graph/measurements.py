@@ -1,0 +1,227 @@
+"""All aids of a problem as rows of its graph, and what became of each measurement.
+
+With the errors of a measurement whitened, its ``t`` is the sum over its components of the squared
+error and of its posterior variance ``H P H'``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.similarity import Kernel, LogKernel, Similarity
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.extras import Extras
+from ssm_graph.engine.states import States
+from ssm_graph.graph.aids.aid import Aid, RowStates
+from ssm_graph.graph.aids.depth import DepthMeans
+from ssm_graph.mission.doubts import LOW_WEIGHT, MISFIT, SUSPECT_SHARE, TRUSTED
+from ssm_graph.mission.estimate import AidTable
+from ssm_graph.mission.problem import Problem
+
+
+class AidRows(NamedTuple):
+    """Whitened rows of all measurements, ``A d = b`` with ``b`` minus the error."""
+
+    keyframe: NDArray[np.intp]
+    """(R,)"""
+    error: Array
+    """(R,)"""
+    jacobian: Array
+    """(R, width)"""
+
+
+class StepLike(Protocol):
+    """What is asked of a solution."""
+
+    def variance(self, keyframe: NDArray[np.intp], rows: Array) -> Array: ...  # noqa: D102
+
+
+class JudgedAid(NamedTuple):
+    """Measurements of one aid and what became of them."""
+
+    aid: Aid
+    time_s: Array
+    """(M,) of their keyframes, s"""
+    error: Array
+    """(M, d) predicted minus measured, whitened"""
+    mahalanobis_sq: Array
+    """(M,)"""
+    weight: Array
+    """(M,)"""
+
+
+def states_at(
+    states: States, keyframe: NDArray[np.intp], extras: Extras, *, g_n: Array | None = None
+) -> RowStates:
+    """Return the states of rows from those of all keyframes, with gravity ``g_n`` (K, 3) of them.
+
+    Only beams ask for gravity, where the clock of the DVL is in doubt.
+    """
+    own = (states.R_nb, states.p_n, states.v_n, states.bias, states.walks)
+    R_nb, p_n, v_n, bias, walks = (column[keyframe] for column in own)
+    gravity = np.zeros(3) if g_n is None else g_n[keyframe]
+    return RowStates(R_nb, p_n, v_n, bias, walks, states.constants, extras, gravity)
+
+
+def aids_of(problem: Problem) -> tuple[Aid, ...]:
+    """Return all aids of a problem: depth, GNSS and the further ones."""
+    found: list[Aid] = []
+    if problem.depths is not None:
+        found.append(DepthMeans.of_readings(problem.depths, problem.keyframe_s, problem.frame))
+    if problem.fixes is not None:
+        found.append(problem.fixes)
+    return (*found, *problem.aids)
+
+
+class Measurements:
+    """Some aids of a problem, their M measurements of R components one after the other."""
+
+    def __init__(self, aids: Iterable[Aid], extras: Extras) -> None:
+        self.all = tuple(aids)
+        self._extras = extras
+        sizes = [np.full(len(aid), aid.dim) for aid in self.all]
+        self.dim = np.concatenate([np.zeros(0, dtype=np.intp), *sizes])
+        """(M,) components of each measurement"""
+        self.measurement = np.repeat(np.arange(len(self.dim)), self.dim)
+        """(R,) of each component"""
+
+    @classmethod
+    def weighted(cls, problem: Problem) -> Measurements:
+        """Return those of a problem that have weights."""
+        return cls((aid for aid in aids_of(problem) if aid.is_weighted), problem.extras)
+
+    @classmethod
+    def in_full(cls, problem: Problem) -> Measurements:
+        """Return those of a problem that count in full."""
+        return cls((aid for aid in aids_of(problem) if not aid.is_weighted), problem.extras)
+
+    def __len__(self) -> int:
+        return len(self.dim)
+
+    def at_keyframes(self, aid: Aid, states: States) -> RowStates:
+        """Return the states of all measurements of one aid."""
+        return states_at(states, aid.keyframe, self._extras)
+
+    def follow(self, states: States) -> None:
+        """Let what is only slowly a function of the states follow them."""
+        self.all = tuple(
+            aid.led_along(
+                states_at(states, np.maximum(aid.keyframe - 1, 0), self._extras),
+                self.at_keyframes(aid, states),
+            )
+            for aid in self.all
+        )
+
+    def rows(self, states: States, weights: Array | None = None) -> AidRows:
+        """Linearise all of them, with weights (M,)."""
+        keyframes, errors = [np.zeros(0, dtype=np.intp)], [np.zeros(0)]
+        jacobians = [np.zeros((0, self._extras.width))]
+        for aid in self.all:
+            error, jacobian = aid.whitened(self.at_keyframes(aid, states))
+            keyframes.append(np.repeat(aid.keyframe, aid.dim))
+            errors.append(error.ravel())
+            jacobians.append(jacobian.reshape(-1, self._extras.width))
+        scale = 1.0 if weights is None else np.sqrt(weights)[self.measurement]
+        return AidRows(
+            np.concatenate(keyframes),
+            scale * np.concatenate(errors),
+            np.asarray((scale * np.concatenate(jacobians).T).T),
+        )
+
+    def mahalanobis_sq(self, states: States, step: StepLike, similarity: Similarity) -> Array:
+        """Return the ``t`` (M,) of the similarity measure."""
+        keyframe, error, jacobian = self.rows(states)
+        square = error**2
+        if similarity is Similarity.EXPECTED:
+            square = square + step.variance(keyframe, jacobian)
+        return self._summed(square)
+
+    def squares(self, states: States) -> Array:
+        """Return the squared whitened errors (M,)."""
+        return self._summed(self.rows(states).error ** 2)
+
+    def of(self, aid: Aid, values: Array) -> Array:
+        """Return what is one of the aids' of values (M,), as a view."""
+        begin = sum(len(before) for before in self.all[: self.all.index(aid)])
+        return values[begin : begin + len(aid)]
+
+    def judged(
+        self, states: States, keyframe_s: Array, mahalanobis_sq: Array, weights: Array
+    ) -> list[JudgedAid]:
+        """Return what became of them at final states, with ``t`` and weights (M,)."""
+        return [
+            JudgedAid(
+                aid,
+                keyframe_s[aid.keyframe],
+                aid.whitened(self.at_keyframes(aid, states)).error,
+                self.of(aid, mahalanobis_sq),
+                self.of(aid, weights),
+            )
+            for aid in self.all
+        ]
+
+    def _summed(self, values: Array) -> Array:
+        """Return the sums (M,) over the components of each measurement."""
+        summed = np.bincount(self.measurement, weights=values, minlength=len(self))
+        return np.asarray(summed, dtype=np.float64)
+
+
+def joined_aids(judged: Sequence[JudgedAid]) -> JudgedAid:
+    """Return successive measurements of one aid as one."""
+    aids, *columns = zip(*judged, strict=True)
+    return JudgedAid(aids[0].joined(aids), *(np.concatenate(column) for column in columns))
+
+
+def aid_kernel(wanted: Kernel) -> Kernel:
+    """Return what the measurements of aids are weighed by, beside beams weighed by ``wanted``.
+
+    M-estimators and truncation are made for one component and have no place here: beside them it is
+    the logarithm's kernel.
+    """
+    return wanted if wanted.published_with is Similarity.EXPECTED else LogKernel()
+
+
+def aid_table(judged: Sequence[JudgedAid]) -> AidTable | None:
+    """Return what became of all components; None if there are none."""
+    if not any(len(one.aid) for one in judged):
+        return None
+    dims = [one.aid.dim for one in judged]
+    pairs = list(zip(judged, dims, strict=True))
+    names = [(one.aid.name, one.aid.unit) for one in judged for _ in one.aid.labels]
+    errors = [np.linalg.solve(one.aid.root_information, one.error[..., None]) for one in judged]
+    return AidTable(
+        aid=tuple(name for name, _ in names),
+        component=tuple(label for one in judged for label in one.aid.labels),
+        unit=tuple(unit for _, unit in names),
+        time_s=np.concatenate([np.repeat(one.time_s, dim) for one, dim in pairs]),
+        innovation=-np.concatenate([error.ravel() for error in errors]),
+        mahalanobis_sq=np.concatenate([np.repeat(one.mahalanobis_sq, dim) for one, dim in pairs]),
+        weight=np.concatenate([np.repeat(one.weight, dim) for one, dim in pairs]),
+    )
+
+
+def doubts_of_aids(judged: Sequence[JudgedAid]) -> list[str]:
+    """Say in a sentence each which weighted aid disagrees with the answer."""
+    return [doubt for one in judged if len(one.aid) and (doubt := _doubt(one))]
+
+
+def _doubt(one: JudgedAid) -> str:
+    aid, weights = one.aid, one.weight
+    share = float(np.mean(weights < LOW_WEIGHT))
+    if share > SUSPECT_SHARE:
+        return (
+            f"{100.0 * share:.0f} % of the {len(weights)} {aid.name} measurements contradict "
+            f"the answer (weight below {LOW_WEIGHT}): {aid.hint}"
+        )
+    trusted = np.mean(one.error**2, axis=1)[weights >= TRUSTED]
+    misfit = float(np.mean(trusted)) if len(trusted) else 0.0
+    if misfit <= MISFIT:
+        return ""
+    return (
+        f"{aid.name} measurements that count miss the answer by {np.sqrt(misfit):.1f} of their "
+        f"own sigmas (rms): their noise is stated too small, or {aid.hint}"
+    )

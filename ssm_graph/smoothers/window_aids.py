@@ -1,0 +1,258 @@
+"""What aids measured within a window: whitened rows where they were linearised, and weights."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from factors.similarity import Kernel, Similarity
+from ssm_graph.base.frozen import Array
+from ssm_graph.base.times import Indices
+from ssm_graph.engine.states import States
+from ssm_graph.graph.aids.aid import Aid, Rows, RowStates
+from ssm_graph.graph.aids.standstill import AnySpeed
+from ssm_graph.graph.forward_aids import settled_weights
+from ssm_graph.graph.measurements import JudgedAid, aid_kernel
+from ssm_graph.smoothers.keyframe import Keyframe, Sensors
+
+
+def row_states(sensors: Sensors, states: States) -> RowStates:
+    """Return the states as rows take them; gravity, which none here asks for, is left out."""
+    return RowStates(*states, sensors.extras, np.zeros(3))
+
+
+class _Measured(NamedTuple):
+    """All measurements of one aid."""
+
+    aid: Aid
+    """Its keyframes are counted within the window"""
+    error: Array
+    """(M, d) whitened, where it is linearised, as the next"""
+    jacobian: Array
+    """(M, d, n)"""
+    weight: Array
+    """(M,)"""
+    t: Array
+    """(M,)"""
+
+    def take(self, rows: Rows) -> _Measured:
+        """Return some measurements."""
+        return _Measured(self.aid.take(rows), *(column[rows] for column in self[1:]))
+
+    def followed_by(self, other: _Measured) -> _Measured:
+        """Return these, then the others."""
+        columns = (np.concatenate(pair) for pair in zip(self[1:], other[1:], strict=True))
+        return _Measured(self.aid.followed_by(other.aid), *columns)
+
+    def rows_of(self, begin: int, end: int) -> slice:
+        """Return which belong to successive keyframes."""
+        first, last = np.searchsorted(self.aid.keyframe, [begin, end]).tolist()
+        return slice(first, last)
+
+
+class WindowAids:
+    """The measurements of all aids of a window, by name.
+
+    Arrays are replaced, never written into, so that a copy costs no more than its names.
+    """
+
+    def __init__(self, sensors: Sensors) -> None:
+        self._sensors = sensors
+        self._all: dict[str, _Measured] = {}
+
+    def copy(self) -> Self:
+        """Return the same, to go its own way."""
+        twin = type(self)(self._sensors)
+        twin._all = dict(self._all)
+        return twin
+
+    @property
+    def _weighted(self) -> list[str]:
+        return [name for name, one in self._all.items() if one.aid.is_weighted]
+
+    @property
+    def weights(self) -> Array:
+        """(M,) of all measurements that have one."""
+        return np.concatenate([np.zeros(0), *(self._all[name].weight for name in self._weighted)])
+
+    def append(self, keyframe: Keyframe, k: int, at: States, before: States | None) -> None:
+        """Add what was measured at keyframe ``k``, the newest, linearised ``at`` (1, ...).
+
+        Those that follow the way from the keyframe before are led along it from ``before``.
+        """
+        for name, aid in keyframe.aids.items():
+            here = np.zeros(len(aid), np.intp)
+            own = row_states(self._sensors, at.take(here))
+            if before is not None:
+                aid = aid.led_along(row_states(self._sensors, before.take(here)), own)
+            added = self._linearised(aid.moved_to(k), own)
+            known = self._all.get(name)
+            self._all[name] = added if known is None else known.followed_by(added)
+
+    def _linearised(self, aid: Aid, at: RowStates) -> _Measured:
+        error, jacobian = aid.whitened(at)
+        return _Measured(aid, error, jacobian, np.ones(len(aid)), np.zeros(len(aid)))
+
+    def linearise(self, begin: int, end: int, at: States) -> None:
+        """Linearise those of successive keyframes anew at the states (K, ...) of all.
+
+        What follows the way from the keyframe before is led along it, but at the first one.
+        """
+        for name, one in self._all.items():
+            rows = one.rows_of(begin, end)
+            if rows.start == rows.stop:
+                continue
+            head, some, tail = (one.take(r) for r in _parts(rows))
+            aid, k = some.aid, some.aid.keyframe
+            own = row_states(self._sensors, at.take(k))
+            led = aid.led_along(row_states(self._sensors, at.take(np.maximum(k - 1, 0))), own)
+            if k[0] == 0:
+                n_first = int(np.searchsorted(k, 1))
+                led = aid.take(np.s_[:n_first]).followed_by(led.take(np.s_[n_first:]))
+            anew = self._linearised(led, own)._replace(weight=some.weight, t=some.t)
+            self._all[name] = head.followed_by(anew).followed_by(tail)
+
+    def drop(self, count: int) -> None:
+        """Forget the first keyframes."""
+        kept = {name: one.take(one.rows_of(count, 1 << 62)) for name, one in self._all.items()}
+        self._all = {
+            name: one._replace(aid=one.aid.moved_to(one.aid.keyframe - count))
+            for name, one in kept.items()
+            if len(one.aid)
+        }
+
+    def rows(self, begin: int) -> tuple[Indices, Array]:
+        """Return the weighted rows (R, n + 1) from a keyframe on, and the keyframe of each."""
+        n = self._sensors.state_dim
+        keyframes, blocks = [np.zeros(0, np.intp)], [np.zeros((0, n + 1))]
+        for one in self._all.values():
+            some = one.take(one.rows_of(begin, 1 << 62))
+            scale = np.sqrt(some.weight)[:, None, None]
+            rows = scale * np.concatenate([some.jacobian, -some.error[..., None]], axis=-1)
+            keyframes.append(np.repeat(some.aid.keyframe, rows.shape[1]))
+            blocks.append(rows.reshape(-1, n + 1))
+        return np.concatenate(keyframes), np.concatenate(blocks)
+
+    def leave_out_far(
+        self, k: int, step: Array, root_cov: Array, *, sigmas: float
+    ) -> tuple[str, ...]:
+        """Leave out what counts in full at the newest keyframe and is far from its prediction.
+
+        Returns the names of what was left out; step (n,) and root (n, n) as the graph predicts.
+        """
+        left_out = []
+        for name, one in self._all.items():
+            rows = one.rows_of(k, k + 1)
+            if one.aid.is_weighted or isinstance(one.aid, AnySpeed) or rows.start == rows.stop:
+                continue
+            A = one.jacobian[rows].reshape(-1, len(step))
+            root, left = A @ root_cov, -one.error[rows].ravel() - A @ step
+            distance_sq = left @ np.linalg.solve(root @ root.T + np.eye(len(left)), left)
+            if distance_sq > sigmas**2 * len(left):
+                self._all[name] = one.take(np.s_[: rows.start])
+                left_out.append(name)
+        return tuple(left_out)
+
+    def meet_prediction(self, k: int, step: Array, root_cov: Array, kernel: Kernel) -> bool:
+        """Weigh the measurements of the newest keyframe by what all before it predict, together.
+
+        Returns whether there are any.
+        """
+        met = [(name, self._all[name].rows_of(k, k + 1)) for name in self._weighted]
+        met = [(name, rows) for name, rows in met if rows.stop > rows.start]
+        if not met:
+            return False
+        some = [self._all[name].take(rows) for name, rows in met]
+        H = np.concatenate([one.jacobian.reshape(-1, len(step)) for one in some])
+        error, root = np.concatenate([one.error.ravel() for one in some]), H @ root_cov
+        dims = np.concatenate([np.full(len(one.aid), one.aid.dim) for one in some])
+        measurement = np.repeat(np.arange(len(dims)), dims)
+        weights = settled_weights(-error - H @ step, root @ root.T, measurement, aid_kernel(kernel))
+        begin = 0
+        for name, rows in met:
+            one, count = self._all[name], rows.stop - rows.start
+            own = np.concatenate([one.weight[: rows.start], weights[begin : begin + count]])
+            self._all[name] = one._replace(weight=own)
+            begin += count
+        return True
+
+    def judge(self, step: Array, covariance: Array, similarity: Similarity) -> None:
+        """Find the ``t`` of all measurements with weights at a solution (K, n), (K, n, n)."""
+        for name in self._weighted:
+            one = self._all[name]
+            J, k = one.jacobian, one.aid.keyframe
+            square = self._errors(one, step) ** 2
+            if similarity is Similarity.EXPECTED:
+                square = square + ((J @ covariance[k]) * J).sum(axis=-1)
+            self._all[name] = one._replace(t=square.sum(axis=-1))
+
+    @staticmethod
+    def _errors(one: _Measured, step: Array) -> Array:
+        return np.asarray(one.error + (one.jacobian @ step[one.aid.keyframe][..., None])[..., 0])
+
+    def settled(self, kernel: Kernel) -> Array:
+        """Return the weights (M,) that the present ``t`` ask for."""
+        kernel = aid_kernel(kernel)
+        of_each = (self._all[name] for name in self._weighted)
+        return np.concatenate([np.zeros(0), *(kernel.weight(x.t, dim=x.aid.dim) for x in of_each)])
+
+    def renew(self, settled: Array, *, threshold: float) -> int | None:
+        """Take the weights (M,) that differ by more; return the first keyframe that has one."""
+        first, begin = [], 0
+        for name in self._weighted:
+            one = self._all[name]
+            own = settled[begin : begin + len(one.weight)]
+            begin += len(one.weight)
+            changed = np.abs(own - one.weight) > threshold
+            if changed.any():
+                first.append(int(one.aid.keyframe[np.argmax(changed)]))
+                self._all[name] = one._replace(weight=np.where(changed, own, one.weight))
+        return min(first, default=None)
+
+    def judged(self, begin: int, end: int, time_s: Array, step: Array) -> dict[str, JudgedAid]:
+        """Return what became of the weighted measurements of successive keyframes.
+
+        ``time_s`` (K,) and ``step`` (K, n) are those of all.
+        """
+        found = {}
+        for name in self._weighted:
+            one = self._all[name]
+            some = one.take(one.rows_of(begin, end))
+            if len(some.aid):
+                times = time_s[some.aid.keyframe]
+                found[name] = JudgedAid(
+                    some.aid, times, self._errors(some, step), some.t, some.weight
+                )
+        return found
+
+    def pack(self) -> Iterator[tuple[str, Array]]:
+        """Yield name and array of all that :meth:`unpack` needs."""
+        for name, one in self._all.items():
+            for column, array in one.aid.pack():
+                yield f"aid_{name}_{column}", array
+            yield f"aid_{name}_weight_now", one.weight
+            yield f"aid_{name}_t_now", one.t
+
+    @classmethod
+    def unpack(cls, arrays: Mapping[str, Array], sensors: Sensors, at: States) -> Self:
+        """Return what was packed, linearised at the states (K, ...)."""
+        aids = cls(sensors)
+        for name, template in sensors.aids.items():
+            prefix = f"aid_{name}_"
+            own = {n.removeprefix(prefix): a for n, a in arrays.items() if n.startswith(prefix)}
+            if own:
+                aid = template.unpack(own)
+                anew = aids._linearised(aid, row_states(sensors, at.take(aid.keyframe)))
+                aids._all[name] = anew._replace(weight=own["weight_now"], t=own["t_now"])
+        return aids
+
+    def at(self, k: int) -> dict[str, Aid]:
+        """Return what was measured at one keyframe."""
+        found = {name: one.aid.at(k) for name, one in self._all.items()}
+        return {name: aid for name, aid in found.items() if len(aid)}
+
+
+def _parts(rows: slice) -> tuple[slice, slice, slice]:
+    return slice(0, rows.start), rows, slice(rows.stop, None)
