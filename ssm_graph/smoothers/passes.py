@@ -55,7 +55,7 @@ class Solved(NamedTuple):
 
 
 def noise_of(solved: Solved, used: Array) -> NoiseFound:
-    """Return what a solution says of the noise; ``used`` (4,) are its sigmas over the stated."""
+    """Return what a solution says of the noise; ``used`` (B,) are its sigmas over the stated."""
     linearizer, last = solved.linearizer, solved.last
     return noise_found(
         linearizer.problem,
