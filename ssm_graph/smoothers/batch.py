@@ -25,7 +25,6 @@ from ssm_graph.graph.measurements import aid_table, doubts_of_aids
 from ssm_graph.mission.estimate import BeamTable, Estimate, Iteration, NoiseFound, Status
 from ssm_graph.mission.problem import Problem, with_white_noise
 from ssm_graph.mission.trajectory import trajectory_from_states
-from ssm_graph.sensors.dvl import N_BEAMS
 from ssm_graph.smoothers.aid_weights import AidWeighing
 from ssm_graph.smoothers.beam_faults import FaultSearch
 from ssm_graph.smoothers.calibrated import calibration_of, undetermined
@@ -145,7 +144,7 @@ class SsmSmoother:
         on_iteration: OnIteration | None = None,
     ) -> Steps[Estimate]:
         """Make :meth:`solve` in steps."""
-        begin, used = time.perf_counter(), np.ones(N_BEAMS)
+        begin, used = time.perf_counter(), np.ones(problem.beams.n_beams)
         problem = with_white_noise(problem)
         iterations: tuple[Iteration, ...] = ()
         for adaptations in range(MAX_ADAPTATIONS + 1):

@@ -27,7 +27,6 @@ from ssm_graph.engine.states import States
 from ssm_graph.graph.beam_rows import BeamRows, WaterRows
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.mission.problem import Problem
-from ssm_graph.sensors.dvl import N_BEAMS
 
 Mask = NDArray[np.bool_]
 
@@ -110,7 +109,7 @@ def find_beam_faults_steps(
     )
     evidence = ChainEvidence(solution, whitened)
     yield 0.015 * problem.n_keyframes
-    own = np.zeros((len(scale), N_BEAMS))
+    own = np.zeros((len(scale), beams.n_beams))
     own[np.arange(len(scale)), beams.beam] = np.sqrt(weights)
     shared = calibration_columns(problem, states) * (CALIBRATION_SIGMA * scale[:, None])
     edges_s = np.arange(problem.keyframe_s[0], problem.keyframe_s[-1], search.block_s)
@@ -120,7 +119,7 @@ def find_beam_faults_steps(
     for piece, middle in pieces_of(len(edges) - 1):
         judged = evidence.of(edges[piece.start : piece.stop + 1], own, shared)
         yield 0.01 * problem.n_keyframes
-        for stretch in _search(without_shared(judged, shared.shape[1]), search):
+        for stretch in _search(without_shared(judged, shared.shape[1]), search, beams.n_beams):
             begin = max(stretch.begin + piece.start, middle.start)
             end = min(stretch.end + piece.start, middle.stop)
             if begin < end:
@@ -145,8 +144,8 @@ def _excess(beam: NDArray[np.intp], weights: Array, missed: Array) -> float:
     beam, weights : (M,)
     missed : (M,) in stated sigmas.
     """
-    square = np.bincount(beam, (weights * missed) ** 2, minlength=N_BEAMS)
-    expected = np.bincount(beam, weights, minlength=N_BEAMS)
+    square = np.bincount(beam, (weights * missed) ** 2)
+    expected = np.bincount(beam, weights)
     ratio = square[expected > 0.0] / expected[expected > 0.0]
     return float(np.sqrt(max(np.median(ratio), 1.0))) if len(ratio) else 1.0
 
@@ -196,13 +195,13 @@ def _freed(evidence: Evidence, columns: NDArray[np.intp], information: float) ->
     return Evidence(score - crossed @ explained[:, -1], among - crossed @ explained[:, :-1])
 
 
-def _search(evidence: Evidence, search: FaultSearch) -> list[Stretch]:
+def _search(evidence: Evidence, search: FaultSearch, n_beams: int) -> list[Stretch]:
     """Take out the most significant stretch until none is significant any more."""
-    n_blocks = len(evidence.score) // N_BEAMS
-    is_free, is_blamed = np.zeros((2, n_blocks, N_BEAMS), dtype=bool)
+    n_blocks = len(evidence.score) // n_beams
+    is_free, is_blamed = np.zeros((2, n_blocks, n_beams), dtype=bool)
     found: list[Stretch] = []
     while len(found) < MAX_FOUND:
-        chi_sq = np.stack([stretch_chi_sq(evidence, beam, n_blocks) for beam in range(N_BEAMS)])
+        chi_sq = np.stack([stretch_chi_sq(evidence, beam, n_blocks) for beam in range(n_beams)])
         best, begin, end = (int(i) for i in np.unravel_index(np.argmax(chi_sq), chi_sq.shape))
         if chi_sq[best, begin, end] < search.significance**2:
             break
@@ -215,7 +214,7 @@ def _search(evidence: Evidence, search: FaultSearch) -> list[Stretch]:
             break
         is_free[blocks, found[-1].beam] = True
         is_blamed[begin:end, found[-1].beam] |= found[-1].is_blamed
-        evidence = _freed(evidence, blocks * N_BEAMS + found[-1].beam, FREE_INFORMATION)
+        evidence = _freed(evidence, blocks * n_beams + found[-1].beam, FREE_INFORMATION)
     return found
 
 
@@ -243,7 +242,7 @@ def stretch_chi_sq(evidence: Evidence, beam: int, n_blocks: int) -> Array:
     (N + 1, N + 1), one degree of freedom; zero where the end is not after the begin, or where
     nothing can be said.
     """
-    own = slice(beam, n_blocks * N_BEAMS, N_BEAMS)
+    own = slice(beam, None, len(evidence.score) // n_blocks)
     score = np.concatenate([[0.0], np.cumsum(evidence.score[own])])
     summed = np.zeros((n_blocks + 1, n_blocks + 1))
     summed[1:, 1:] = evidence.information[own, own].cumsum(axis=0).cumsum(axis=1)

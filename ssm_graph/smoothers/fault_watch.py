@@ -16,7 +16,6 @@ from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.mission.calibration import CALIBRATIONS, DRIFTS
 from ssm_graph.mission.problem import Problem, with_stated_noise
-from ssm_graph.sensors.dvl import N_BEAMS
 from ssm_graph.smoothers.beam_faults import FaultSearch, Found, find_beam_faults_steps
 
 FREE_LOOKS = 2
@@ -94,7 +93,7 @@ class FaultWatch:
     def notes(self, error: Array) -> tuple[str, ...]:
         """Say what was left out; ``error`` (M,) is what the answer misses, predicted - measured."""
         said = []
-        for beam in range(N_BEAMS):
+        for beam in range(self._beams.n_beams):
             rows = np.flatnonzero(self._beams.beam == beam)
             edges = np.diff(self._found.is_off[rows].astype(int), prepend=0, append=0)
             for begin, end in zip(

@@ -56,7 +56,7 @@ class Solved(NamedTuple):
 
 
 def noise_of_steps(solved: Solved, used: Array) -> Steps[NoiseFound]:
-    """Return what a solution says of the noise; ``used`` (4,) are its sigmas over the stated."""
+    """Return what a solution says of the noise; ``used`` (B,) are its sigmas over the stated."""
     linearizer, last = solved.linearizer, solved.last
     inertial = linearizer.inertial_rows(last.states)
     fit = inertial_fit(inertial, last.step)

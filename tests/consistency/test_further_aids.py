@@ -63,18 +63,16 @@ def test_errors_of_a_compass_lie_where_their_sigmas_say() -> None:
     assert_consistent(np.array(found), dof=6)
 
 
-@pytest.mark.parametrize("lag_s", [0.0, 8.0])
-def test_a_window_finds_them_where_its_sigmas_say(lag_s: float) -> None:
+def test_a_window_finds_them_where_its_sigmas_say() -> None:
     """A beacon and a compass carried in the state of each keyframe, and the last position."""
     names = ("heading_offset", "heading_one_cycle", "heading_two_cycle", "heading_rate")
-    config = replace(SHORT, lag_s=lag_s)
     beacons, compasses, placed = [], [], []
     for seed in range(WINDOW_RUNS):
         off = np.random.default_rng([seed, 7]).standard_normal(3) * NEAR_M
         beacon = BeaconSettings(7, (90.0, -60.0, -50.0), (off[0], off[1], off[2]), NEAR_M)
         aids = replace(compass(rate_hz=1.0), ranging=ranging(beacon, interval_s=2.0).ranging)
         sim = simulated(duration_s=100.0, route=ROUTE, aids=aids, seed=seed)
-        estimate = solve_fixed_lag(build_problem(sim.mission), config).newest
+        estimate = solve_fixed_lag(build_problem(sim.mission), SHORT).newest
         beacons.append(nees(estimate, {"beacon_7": -off}))
         truth = np.split(sim.aids.heading_errors, [1, 3, 5])
         compasses.append(nees(estimate, dict(zip(names, truth, strict=True))))

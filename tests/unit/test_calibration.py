@@ -146,7 +146,9 @@ def test_the_live_estimator_says_so_too_and_takes_known_offsets_off() -> None:
     assert buffers.time_of(fix) == pytest.approx(1.0)
     assert buffers.time_of(reading) == 1.0
     assert buffers.add(reading)
-    np.testing.assert_allclose(buffers.depths_between(0.0, 2.0), [[1.0, 2.0]])
+    depth = buffers.logs_between(0.0, 2.0).depth
+    assert depth is not None
+    np.testing.assert_allclose(depth.true_depth, [2.0])
 
 
 @pytest.mark.parametrize("with_gnss", [True, False])

@@ -189,8 +189,9 @@ def test_ranges_of_one_keyframe_find_a_start_that_is_off(
     off = replace(start, lat=lat, lon=lon, height=height, position_sigma_enu=sigma_enu)
     problem = build_problem(replace(mission, aids=Aids(ranges)), start=off)
     first = first_values(problem, kernel=KERNEL)
-    assert problem.further.ranges is not None
-    (k,) = np.unique(problem.further.ranges.keyframe)
+    met = problem.aid(Ranges)
+    assert met is not None
+    (k,) = np.unique(met.keyframe)
     assert np.linalg.norm((first.states.p_n[k] - place_n)[:2]) < 0.5
     assert first.aid_weights[n_gross:].min() > 0.8
     assert np.all(first.aid_weights[:n_gross] < 0.01)
