@@ -18,11 +18,11 @@ from typing import NamedTuple
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
-from ssm_graph.io.raw_log.mission_messages import messages_of
 
 from benchmarks.report import Report
 from benchmarks.speed import table
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
+from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator import FixedLagSmoother
 from ssm_graph.live.estimator.events import EventLog
 from ssm_graph.live.estimator.intake import Intake

@@ -13,8 +13,6 @@ from dataclasses import dataclass, field
 from typing import NamedTuple, final
 
 import numpy as np
-from ssm_graph.imu.arrays import interval_arrays
-from ssm_graph.mission.heights import HeightTrack, height_on_the_way, height_track
 
 from factors.depth_height import height_residual
 from factors.dvl_calibration import calibrated_beam_residual, no_way_back, turned_instrument
@@ -30,30 +28,28 @@ from ssm_graph.engine.error_state import (
     VELOCITY,
 )
 from ssm_graph.engine.extras import Extra
-from ssm_graph.engine.states import AugmentedStates, NavigationStates, local_D_deviation
+from ssm_graph.engine.states import NavigationStates, States, local_D_deviation
 from ssm_graph.filters.navigation.process import Process
 from ssm_graph.filters.rules.model import NOMINAL, Iterate, Runs
 from ssm_graph.filters.rules.ssm import SsmUpdate
+from ssm_graph.graph.aids.depth import DEPTH_OFFSET
+from ssm_graph.graph.aids.gnss import GNSS_DRIFT, GNSS_LEVER_ARM, GNSS_TIME_OFFSET
+from ssm_graph.graph.aids.heights import HeightTrack, height_on_the_way, height_track
 from ssm_graph.mission.calibration import (
-    DEPTH_OFFSET,
     DVL_BEAM_SCALE,
     DVL_DRIFT,
     DVL_MOUNTING,
     DVL_SCALE,
-    GNSS_DRIFT,
-    GNSS_LEVER_ARM,
-    GNSS_TIME_OFFSET,
     windowed,
 )
 from ssm_graph.mission.current import CURRENT, CURRENT_UP
 from ssm_graph.mission.problem import Problem, start_of, with_white_noise
-from ssm_graph.sensors.dvl import N_BEAMS
 
 
 class AugmentedHistory(NamedTuple):
     """Posteriors of one run at K keyframes, and the weights of its M beam speeds."""
 
-    states: AugmentedStates
+    states: States
     """(K, ...)"""
     covariance: Array
     """(K, 15 + E, 15 + E)"""
@@ -107,17 +103,17 @@ def _walk(block: Extra, span_s: float) -> tuple[float, float]:
 class _Iterate(Iterate):
     """An iterate of one run that knows its states."""
 
-    states: AugmentedStates = field(kw_only=True)
+    states: States = field(kw_only=True)
 
 
 def filter_augmented(problem: Problem, rule: SsmUpdate) -> AugmentedHistory:
     """Filter one run, its calibrations, drifts and current with it."""
     problem = with_white_noise(problem)
     variables, start = Variables(problem), start_of(problem)
-    process = Process([interval_arrays(problem.chain)], problem.frame)
-    states = AugmentedStates.of(start)._replace(extra=np.zeros((1, len(variables.sigma))))
+    process = Process([problem.chain.intervals], problem.frame)
+    states = States.at_start(start)._replace(walks=np.zeros((1, len(variables.sigma))))
     P = _both(start.covariance, np.diag(variables.sigma**2))
-    before: AugmentedStates | None = None
+    before: States | None = None
     found, covariances, n_iterations = [], [], []
     weight = np.ones(len(problem.beams.speed))
     for k in range(problem.n_keyframes):
@@ -125,7 +121,7 @@ def filter_augmented(problem: Problem, rule: SsmUpdate) -> AugmentedHistory:
             before = states
             ahead = process.predict(k - 1, states.navigation)
             factor, variance = variables.walk(float(np.diff(problem.keyframe_s)[k - 1]))
-            states = AugmentedStates(*ahead.states, factor * states.extra)
+            states = States(*ahead.states, factor * states.walks)
             F = _both(ahead.transition[0], np.diag(factor))
             P = F @ P @ F.T + _both(ahead.process_cov[0], np.diag(variance))
         model = _KeyframeModel(problem, variables, k, states, before)
@@ -137,22 +133,20 @@ def filter_augmented(problem: Problem, rule: SsmUpdate) -> AugmentedHistory:
             n_iterations[-1] = int(update.n_iterations[0])
         found.append(states)
         covariances.append(P)
-    columns = (np.concatenate(column) for column in zip(*found, strict=True))
-    return AugmentedHistory(
-        AugmentedStates(*columns), np.array(covariances), weight, np.array(n_iterations)
-    )
+    states = found[0].followed_by(*found[1:])
+    return AugmentedHistory(states, np.array(covariances), weight, np.array(n_iterations))
 
 
-def displaced(states: AugmentedStates, xi: Array) -> AugmentedStates:
+def displaced(states: States, xi: Array) -> States:
     """Return the states at deviations (B, 15 + E)."""
     own = states.navigation.displaced(xi[:, :STATE_DIM])
-    return AugmentedStates(*own, states.extra + xi[:, STATE_DIM:])
+    return States(*own, states.walks + xi[:, STATE_DIM:])
 
 
-def deviation_of(states: AugmentedStates, other: AugmentedStates) -> Array:
+def deviation_of(states: States, other: States) -> Array:
     """Return how far other states are (B, 15 + E)."""
     own = states.navigation.deviation_of(other.navigation)
-    return np.hstack([own, other.extra - states.extra])
+    return np.hstack([own, other.walks - states.walks])
 
 
 def _both(own: Array, extra: Array) -> Array:
@@ -171,8 +165,8 @@ class _KeyframeModel:
         problem: Problem,
         variables: Variables,
         k: int,
-        predicted: AugmentedStates,
-        before: AugmentedStates | None,
+        predicted: States,
+        before: States | None,
     ) -> None:
         self._problem, self._variables, self._predicted = problem, variables, predicted
         self.beams = np.flatnonzero(problem.beams.keyframe == k)
@@ -197,12 +191,12 @@ class _KeyframeModel:
         states = iterate.states.moved(step)
         return self._iterate(states, deviation_of(self._predicted, states))
 
-    def _iterate(self, states: AugmentedStates, xi: Array) -> _Iterate:
+    def _iterate(self, states: States, xi: Array) -> _Iterate:
         at = NavigationStates(*(column[0] for column in states.navigation))
-        parts = [self._beam_rows(at, states.extra[0])]
+        parts = [self._beam_rows(at, states.walks[0])]
         if len(self._depths):
-            parts.append(self._depth_row(at, states.extra[0]))
-        parts += [self._fix_rows(at, states.extra[0], i) for i in self._fixes.tolist()]
+            parts.append(self._depth_row(at, states.walks[0]))
+        parts += [self._fix_rows(at, states.walks[0], i) for i in self._fixes.tolist()]
         errors, rows = zip(*parts, strict=True)
         return _Iterate(
             xi,
@@ -224,7 +218,7 @@ class _KeyframeModel:
             at.v_n, current_l, R_nl=frame.R_nl_at(at.p_n), is_water=beams.is_water[own]
         )
         beam_b = beams.beam_b[own]
-        of_beam = variables.value(DVL_BEAM_SCALE, extra, N_BEAMS)[beams.beam[own]]
+        of_beam = variables.value(DVL_BEAM_SCALE, extra, beams.n_beams)[beams.beam[own]]
         residual = calibrated_beam_residual(
             at.R_nb,
             relative.v_n,
@@ -245,7 +239,7 @@ class _KeyframeModel:
         H[:, ACCEL_BIAS], H[:, GYRO_BIAS] = residual.error_D_accel_bias, residual.error_D_gyro_bias
         variables.fill(H, DVL_MOUNTING, residual.error_D_mounting)
         variables.fill(H, DVL_SCALE, residual.error_D_scale[:, None])
-        one_hot = np.eye(N_BEAMS)[beams.beam[own]]
+        one_hot = np.eye(beams.n_beams)[beams.beam[own]]
         variables.fill(H, DVL_BEAM_SCALE, one_hot * residual.error_D_scale[:, None])
         by_current = np.einsum("mi,mij->mj", residual.error_D_velocity_n, relative.v_D_current)
         variables.fill(H, CURRENT, by_current[:, :2])
@@ -255,7 +249,7 @@ class _KeyframeModel:
         error = residual.error + beam_d @ variables.value(DVL_DRIFT, extra, 3)
         return error / beams.sigma[own], H / beams.sigma[own, None]
 
-    def _lead_depths(self, k: int, before: AugmentedStates | None) -> None:
+    def _lead_depths(self, k: int, before: States | None) -> None:
         """Lead the mean of the readings since the keyframe before to where it puts the sensor."""
         depths = self._problem.depths
         assert depths is not None
@@ -272,7 +266,7 @@ class _KeyframeModel:
         too_low = np.mean(-depths.depth[self._depths] - when_read)
         self._up_n, self._sensor_n = end.up_n, end.sensor_n + too_low * end.up_n
 
-    def _sensor_track(self, k: int, states: AugmentedStates) -> HeightTrack:
+    def _sensor_track(self, k: int, states: States) -> HeightTrack:
         depths = self._problem.depths
         assert depths is not None
         return height_track(

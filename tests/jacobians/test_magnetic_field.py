@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -100,8 +101,8 @@ def test_without_iron_it_is_that_of_gtsam(R_nb: Array) -> None:
         ({"field_n": np.array([0.0, np.nan, 0.0])}, "field_n: expected 3 finite numbers"),
     ],
 )
-def test_bad_input_is_refused(wrong: dict[str, float], message: str) -> None:
+def test_bad_input_is_refused(wrong: dict[str, Any], message: str) -> None:
     """A wrong shape would crash the process."""
-    given = {"sigma": 1e-7, "reading_b": READING_B, "field_n": FIELD_N, **wrong}
+    given: dict[str, Any] = {"sigma": 1e-7, "reading_b": READING_B, "field_n": FIELD_N, **wrong}
     with pytest.raises(ValueError, match=message):
         magnetic_field_factor(X(0), **given)

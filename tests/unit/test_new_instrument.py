@@ -13,20 +13,18 @@ from ssm_graph.sensors.registry import BY_MESSAGE, INSTRUMENTS
 ROOT = Path(__file__).parents[2]
 
 
-def test_a_magnetometer_is_one_file_and_one_line(tmp_path: Path) -> None:
+def test_an_instrument_is_one_file_and_one_line(tmp_path: Path) -> None:
     """It is read, written, converted, decoded, logged, replayed and kept, checked everywhere."""
     code = tmp_path / "code"
     for part in ("ssm_graph", "factors", "tests"):
         shutil.copytree(ROOT / part, code / part, ignore=shutil.ignore_patterns("__pycache__"))
     sensors = code / "ssm_graph" / "sensors"
-    shutil.copy(ROOT / "tests" / "magnetometer_fixture.py", sensors / "magnetometer.py")
+    shutil.copy(ROOT / "tests" / "fluxgate_fixture.py", sensors / "fluxgate.py")
     registry = sensors / "registry.py"
     text = registry.read_text()
-    imported = (
-        "from ssm_graph.sensors.magnetometer import MAGNETOMETER\nfrom ssm_graph.sensors.mess"
-    )
+    imported = "from ssm_graph.sensors.fluxgate import FLUXGATE\nfrom ssm_graph.sensors.mess"
     text = text.replace("from ssm_graph.sensors.mess", imported)
-    registry.write_text(text.replace("    COMPASS,\n", "    COMPASS,\n    MAGNETOMETER,\n"))
+    registry.write_text(text.replace("    COMPASS,\n", "    COMPASS,\n    FLUXGATE,\n"))
     ran = subprocess.run(
         [sys.executable, "-m", "tests.new_instrument_script", str(tmp_path)],
         cwd=code,

@@ -10,11 +10,11 @@ from types import FrameType
 
 import numpy as np
 import pytest
-from ssm_graph.io.raw_log.mission_messages import messages_of
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps, finished
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
+from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator import FixedLagSmoother, start
 from ssm_graph.live.estimator.events import EventLog
 from ssm_graph.live.estimator.intake import Intake

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.engine.states import AugmentedStates
+from ssm_graph.engine.states import States
 from ssm_graph.imu.preintegration import GAP_ACCEL, GAP_GYRO_RATE, GRAVITY
 from ssm_graph.live.estimator import FixedLagSmoother
 from ssm_graph.live.estimator.asked import sensors_of_vehicle
@@ -29,10 +29,8 @@ def a_tail() -> Tail:
     n = sensors.state_dim
     R_nb = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     walks = np.zeros((1, n - 15))
-    states = AugmentedStates(
-        R_nb[None], np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 6)), walks
-    )
-    keyframe = Keyframe.unmeasured(0.0, np.zeros(3), None)
+    states = States(R_nb[None], np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 6)), walks)
+    keyframe = Keyframe(0.0, sensors.beams)
     return Tail(keyframe, states, TILT * np.eye(n), noise=vehicle.imu_noise, sensors=sensors)
 
 
@@ -48,7 +46,7 @@ def samples(*spans: tuple[float, float], yaw_rate: float = 0.0) -> Array:
     return np.array(rows)
 
 
-def after(rows: Array, *, asked: bool = False) -> tuple[AugmentedStates, Array]:
+def after(rows: Array, *, asked: bool = False) -> tuple[States, Array]:
     """Return states and covariance after some samples, asked for at each of them or at the end."""
     tail = a_tail()
     for row in rows:

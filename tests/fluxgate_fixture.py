@@ -1,4 +1,4 @@
-"""A magnetometer: all that the package needs to be told of an instrument that it does not know."""
+"""A fluxgate: all that the package needs to be told of an instrument that it does not know."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ MICROTESLA: Final = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MagnetometerLog(FrozenArrays):
+class FluxgateLog(FrozenArrays):
     """The Earth's field as the vehicle feels it."""
 
-    SECTION: ClassVar[str] = "[magnetometer]"
+    SECTION: ClassVar[str] = "[fluxgate]"
 
     sigma: float
     """T, of each component."""
@@ -31,16 +31,16 @@ class MagnetometerLog(FrozenArrays):
 
 
 @dataclass(frozen=True, slots=True)
-class MagnetometerReading(Message):
+class FluxgateReading(Message):
     """One reading."""
 
     field_b: Vector
     """T"""
 
 
-MAGNETOMETER: Final = Instrument(
-    "magnetometer",
-    MagnetometerLog,
+FLUXGATE: Final = Instrument(
+    "fluxgate",
+    FluxgateLog,
     {
         "file": FILE_KEY,
         "noise_ut": sigma_key("sigma", 100.0, "the unit is microtesla", unit=MICROTESLA),
@@ -59,6 +59,6 @@ MAGNETOMETER: Final = Instrument(
             is_body=True,
         ),
     ),
-    MagnetometerReading,
-    "m",
+    FluxgateReading,
+    "f",
 )
