@@ -79,12 +79,7 @@ def optional_key(field: str, low: float, high: float, hint: str, *, unit: float 
 FILE_KEY: Final = Key(shape=None)
 """Where the table of an instrument is."""
 LEVER_ARM_KEY: Final = Key(
-    "lever_arm_b",
-    shape=(3,),
-    low=-100.0,
-    high=100.0,
-    hint="lever arms are in metres",
-    is_body=True,
+    "lever_arm_b", shape=(3,), low=-100.0, high=100.0, hint="lever arms are in metres", is_body=True
 )
 
 

@@ -66,8 +66,7 @@ _DEGREES: Final = "the unit is degrees"
 _HEADING: Final = Column(
     "heading",
     "heading_deg",
-    low=-360.0,
-    high=360.0,
+    limits=(-360.0, 360.0),
     expected="expected degrees up to 360, clockwise from north",
     told="heading {:g} rad: degrees?",
     unit=DEGREE,
@@ -87,10 +86,7 @@ _KEYS: Final = {
         high=1e6,
         required=False,
         hint="the unit is seconds",
-        beside=(
-            "walk_sigma_deg",
-            "expected with a walk_sigma_deg above 0, got none; 1 is usual",
-        ),
+        beside=("walk_sigma_deg", "expected with a walk_sigma_deg above 0, got none; 1 is usual"),
     ),
     "one_cycle_sigma_deg": optional_key("errors.one_cycle_sigma", 0.0, 90.0, _DEGREES, unit=DEGREE),
     "two_cycle_sigma_deg": optional_key("errors.two_cycle_sigma", 0.0, 90.0, _DEGREES, unit=DEGREE),

@@ -63,8 +63,7 @@ _METRES: Final = "the unit is metres"
 _DEPTH: Final = Column(
     "depth",
     "depth_m",
-    low=-HIGHEST_M,
-    high=DEEPEST_M,
+    limits=(-HIGHEST_M, DEEPEST_M),
     expected="expected metres, positive down",
     told="depth {:g} m: a wrong unit?",
 )

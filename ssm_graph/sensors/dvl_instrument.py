@@ -68,8 +68,7 @@ _SPEED_UNIT: Final = "the unit is m/s, not mm/s"
 _SPEED: Final = Column(
     "speed",
     "beam{}_m_per_s",
-    low=-LARGEST_SPEED,
-    high=LARGEST_SPEED,
+    limits=(-LARGEST_SPEED, LARGEST_SPEED),
     expected=f"expected m/s, up to {LARGEST_SPEED:g}; {LEAVE_EMPTY}",
     blank=True,
     is_many=True,
@@ -78,8 +77,7 @@ _SPEED: Final = Column(
 _SIGMA: Final = Column(
     "sigma",
     "beam{}_sigma_m_per_s",
-    low=SMALLEST_SIGMA,
-    high=1e3,
+    limits=(SMALLEST_SIGMA, 1e3),
     expected="expected a standard deviation above 0, in m/s; leave the cell empty to use "
     "beam_noise_m_per_s",
     told="sigmas {} m/s, expected above zero",
@@ -90,7 +88,7 @@ _SIGMA: Final = Column(
 _RANGE: Final = Column(
     "range_m",
     "range{}_m",
-    low=0.0,
+    limits=(0.0, math.inf),
     expected="expected metres, not below 0; leave the cell empty where it is unknown",
     optional=True,
     is_many=True,
@@ -99,8 +97,7 @@ _RANGE: Final = Column(
 _WATER: Final = Column(
     "water_track",
     "water_track",
-    low=0.0,
-    high=1.0,
+    limits=(0.0, 1.0),
     expected="expected 1 for a ping off the water, 0 or nothing for one off the ground",
     optional=True,
     missing=0.0,
@@ -138,12 +135,7 @@ _KEYS: Final = {
         ),
     ),
     "beam_scale_error": Key(
-        "mount.beam_scale_error",
-        shape=(_BEAMS,),
-        low=-0.5,
-        high=0.5,
-        required=False,
-        hint=_PERCENT,
+        "mount.beam_scale_error", shape=(_BEAMS,), low=-0.5, high=0.5, required=False, hint=_PERCENT
     ),
     "beam_scale_sigma": optional_key("mount.beam_scale_sigma", 0.0, 1.0, _PERCENT),
     "lever_arm_sigma_m": optional_key("mount.lever_arm_sigma", *ARM_SIGMA),

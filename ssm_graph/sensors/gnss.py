@@ -89,11 +89,5 @@ class _Gnss(Instrument):
 
 
 GNSS: Final = _Gnss(
-    "gnss",
-    GnssLog,
-    _KEYS,
-    (*POSITION, SIGMA_ENU),
-    Fix,
-    "g",
-    late="calibration.time_offset_s",
+    "gnss", GnssLog, _KEYS, (*POSITION, SIGMA_ENU), Fix, "g", late="calibration.time_offset_s"
 )

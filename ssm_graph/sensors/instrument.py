@@ -42,8 +42,7 @@ class Column:
     pattern: str
     """Name of its column in the table; braces stand for each of ``over``."""
     over: tuple[str, ...] = ()
-    low: float = -math.inf
-    high: float = math.inf
+    limits: tuple[float, float] = (-math.inf, math.inf)
     """The least and the largest number that the column can hold, in its unit."""
     expected: str = ""
     """What is told of a number beyond."""
@@ -111,13 +110,13 @@ class Column:
         """Raise :class:`DataError` for the first number of a table that is beyond the limits."""
         for name in self.names:
             if name in table:
-                bad = (table[name] < self.low) | (table[name] > self.high)
+                bad = (table[name] < self.limits[0]) | (table[name] > self.limits[1])
                 if bad.any():
                     raise table.cell_fault(int(np.argmax(bad)), name, self.expected)
 
     def is_beyond(self, numbers: Sequence[float]) -> bool:
         """Return whether one of some numbers in SI units is beyond the limits; NaN is not."""
-        low, high = self.low * self.unit, self.high * self.unit
+        low, high = (limit * self.unit for limit in self.limits)
         return any(x < low or x > high for x in numbers)
 
 
@@ -172,7 +171,7 @@ class Instrument:
             tuple(name for c in columns if c.optional for name in c.names),
             frozenset(name for c in columns if c.blank for name in c.names),
             key=self.row_key,
-            limits={name: (c.low, c.high) for c in columns for name in c.names},
+            limits={name: c.limits for c in columns for name in c.names},
             nowhere=place if {*place} <= {c.pattern for c in columns} else (),
         )
 

@@ -202,11 +202,7 @@ def _gives_velocity(mount: DvlMount, velocity_d: Array) -> bool:
 
 
 def _velocities(
-    time_s: Array,
-    velocity_d: Array,
-    covariance: Array,
-    vehicle: Vehicle,
-    water_track: Array | None,
+    time_s: Array, velocity_d: Array, covariance: Array, vehicle: Vehicle, water_track: Array | None
 ) -> tuple[DvlLog, list[str]]:
     """Return velocities (N, 3) as speeds along the instrument's axes, and how they are counted."""
     turn = vehicle.mount.beams_d
