@@ -12,7 +12,7 @@ from ssm_graph.base.frozen import Array, FrozenArrays, shaped
 from ssm_graph.base.settings import FILE_KEY, Key, optional_key, sigma_key
 from ssm_graph.base.tables import Table
 from ssm_graph.base.units import DEG_PER_H, DEGREE
-from ssm_graph.sensors.instrument import Column, Instrument
+from ssm_graph.sensors.instrument import Calibrated, Column, Instrument
 from ssm_graph.sensors.messages import Message
 
 
@@ -93,6 +93,14 @@ _KEYS: Final = {
 }
 
 
+def _less(log: HeadingLog, stated: float | Array, off: Array) -> Array:  # noqa: ARG001
+    """Return the declination of a compass whose headings were found to be too large by so much."""
+    return np.asarray(stated - off)
+
+
+_CALIBRATED: Final = {"heading_offset": Calibrated("declination_deg", "offset_sigma_deg", _less)}
+
+
 class _Compass(Instrument):
     """The way of compasses: some give radians."""
 
@@ -108,4 +116,6 @@ class _Compass(Instrument):
         return []
 
 
-COMPASS: Final = _Compass("heading", HeadingLog, _KEYS, (_HEADING,), HeadingReading, "h")
+COMPASS: Final = _Compass(
+    "heading", HeadingLog, _KEYS, (_HEADING,), HeadingReading, "h", calibrated=_CALIBRATED
+)

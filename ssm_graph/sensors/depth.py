@@ -12,7 +12,7 @@ from ssm_graph.base.frames import BodyAxes
 from ssm_graph.base.frozen import Array, FrozenArrays, shaped
 from ssm_graph.base.settings import FILE_KEY, LEVER_ARM_KEY, optional_key, sigma_key
 from ssm_graph.base.tables import Table
-from ssm_graph.sensors.instrument import Column, Instrument
+from ssm_graph.sensors.instrument import Calibrated, Column, Instrument
 from ssm_graph.sensors.messages import Message
 
 DEEPEST_M: Final = 12_000.0
@@ -76,6 +76,9 @@ _KEYS: Final = {
 }
 
 
+_CALIBRATED: Final = {"depth_offset": Calibrated("offset_m", "offset_sigma_m")}
+
+
 class _Depth(Instrument):
     """The way of depth sensors: some give pressure, or millimetres."""
 
@@ -91,4 +94,6 @@ class _Depth(Instrument):
         return super().check(table, bare, axes)
 
 
-DEPTH: Final = _Depth("depth", DepthLog, _KEYS, (_DEPTH,), DepthReading, "z")
+DEPTH: Final = _Depth(
+    "depth", DepthLog, _KEYS, (_DEPTH,), DepthReading, "z", calibrated=_CALIBRATED
+)

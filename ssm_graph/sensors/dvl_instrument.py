@@ -14,6 +14,7 @@ from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frames import BodyAxes
@@ -53,7 +54,14 @@ from ssm_graph.sensors.dvl_readings import (
     no_lock,
     without_false_speeds,
 )
-from ssm_graph.sensors.instrument import SMALLEST_SIGMA, Column, Instrument, Lists
+from ssm_graph.sensors.instrument import (
+    SMALLEST_SIGMA,
+    Calibrated,
+    Column,
+    Instrument,
+    Lists,
+    compounded,
+)
 from ssm_graph.sensors.messages import Message
 
 MOST_CORRELATED: Final = 3
@@ -295,6 +303,11 @@ class _Dvl(Instrument):
         return message, None
 
 
+def _turned_further(log: DvlLog, _: float | Array, off: Array) -> Array:
+    """Return roll, pitch and yaw of an instrument that is turned about its own axes, radians."""
+    return rpy_from_R_bd(log.mount.R_bd @ Rotation.from_rotvec(off).as_matrix())
+
+
 DVL: Final = _Dvl(
     "dvl",
     DvlLog,
@@ -303,6 +316,13 @@ DVL: Final = _Dvl(
     Ping,
     "d",
     late="mount.time_offset_s",
+    calibrated={
+        "dvl_mounting": Calibrated("mounting_rpy_deg", "misalignment_sigma_deg", _turned_further),
+        "dvl_scale": Calibrated("scale_error", "scale_sigma", compounded),
+        "dvl_beam_scale": Calibrated("beam_scale_error", "beam_scale_sigma", compounded),
+        "dvl_lever_arm": Calibrated("lever_arm_m", "lever_arm_sigma_m"),
+        "dvl_time_offset": Calibrated("time_offset_s", "time_offset_sigma_s"),
+    },
     is_required=True,
 )
 

@@ -9,9 +9,9 @@ an offset, a scale) is taken off by the log's own properties, and nowhere else.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -120,6 +120,27 @@ class Column:
         return any(x < low or x > high for x in numbers)
 
 
+def added(log: Any, stated: float | Array, off: Array) -> Array:  # noqa: ARG001
+    """Return a value that was found to be off by so much."""
+    return np.asarray(stated + off)
+
+
+def compounded(log: Any, stated: float | Array, off: Array) -> Array:  # noqa: ARG001
+    """Return a scale error that was found to be off by another, of what is left."""
+    return np.asarray((1.0 + stated) * (1.0 + off) - 1.0)
+
+
+class Calibrated(NamedTuple):
+    """Where a file states what a calibration finds."""
+
+    key: str
+    """Of its value."""
+    sigma_key: str
+    """Of its prior sigma."""
+    total: Callable[[Any, float | Array, Array], Array] = added
+    """Makes the value of the log, of what it states and of what that was found to be off by, SI."""
+
+
 @dataclass(frozen=True, slots=True)
 class Instrument:
     """The declaration of one kind of instrument; those with ways of their own extend it.
@@ -144,6 +165,8 @@ class Instrument:
     """Columns that tell readings of one time apart."""
     lists: Mapping[str, Mapping[str, Key]] = field(default_factory=dict)
     """Sections that may come several times and belong to it."""
+    calibrated: Mapping[str, Calibrated] = field(default_factory=dict)
+    """What is estimated of it, by the name of the variable."""
     is_required: bool = False
     """Every mission has one."""
 

@@ -112,7 +112,7 @@ def vehicle_settings(vehicle: Vehicle, *, order: Order = Order.ARRIVAL) -> dict[
     }
     if vehicle.frame is not None:
         settings["origin"] = written(vehicle.frame, PLACE_KEYS)
-    settings |= instrument_sections(vehicle.bare_logs.values(), TableFormat.CSV.value)
+    settings |= instrument_sections(vehicle.bare_logs, TableFormat.CSV.value)
     settings["dvl"]["beam_noise_m_per_s"] = float(vehicle.beam_sigma)
     if vehicle.water_sigma is not None:
         settings["dvl"]["water_noise_m_per_s"] = float(vehicle.water_sigma)
