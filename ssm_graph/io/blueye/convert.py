@@ -170,8 +170,6 @@ def _imu(tables: BlueyeTables) -> tuple[ImuLog, tuple[str, ...]]:
         f"{jitter_ms:.1f} ms rms of jitter removed; "
         f"the gyro biases known of the X3, {GYRO_BIAS} rad/s, are taken off."
     ]
-    if n_gaps := int(np.sum(steps >= GAP_S)):
-        notes.append(f"The IMU has {n_gaps} gaps, the longest {steps.max():.2f} s.")
     return imu, tuple(notes)
 
 
