@@ -24,7 +24,7 @@ from ssm_graph.evaluation.statistics import (
     paired_ratio,
     signed_rank,
 )
-from ssm_graph.evaluation.withheld import reference_from_gnss
+from ssm_graph.evaluation.withheld import reference_from_gnss, withhold_gnss
 
 __all__ = [
     "FILTER_ORACLE",
@@ -51,4 +51,5 @@ __all__ = [
     "paired_ratio",
     "reference_from_gnss",
     "signed_rank",
+    "withhold_gnss",
 ]

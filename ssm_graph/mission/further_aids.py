@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from factors import so3
 from ssm_graph.base.earth import LocalFrame
-from ssm_graph.base.frozen import Array, ReadOnlyArrays
+from ssm_graph.base.frozen import Array, ReadOnlyArrays, ShortRepr
 from ssm_graph.mission.aids import Fixes, fixes_at
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.ping_motion import turn_between
@@ -75,7 +75,7 @@ class Standstills(ReadOnlyArrays):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FurtherAids:
+class FurtherAids(ShortRepr):
     """What a problem has beside beams, depth and GNSS; for estimators that weigh it."""
 
     usbl: Fixes | None = None

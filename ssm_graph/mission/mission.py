@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ssm_graph.base.earth import LocalFrame
-from ssm_graph.base.frozen import Array, FrozenArrays, optional_shaped, shaped
+from ssm_graph.base.frozen import Array, FrozenArrays, ShortRepr, optional_shaped, shaped
 from ssm_graph.sensors.acoustic import RangeLog, UsblLog
 from ssm_graph.sensors.compass import HeadingLog
 from ssm_graph.sensors.current import CurrentModel
@@ -21,7 +21,7 @@ from ssm_graph.sensors.standstill import Standstill
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class AidLogs:
+class AidLogs(ShortRepr):
     """All of them; what a mission does not have is None or empty."""
 
     usbl: UsblLog | None = None
@@ -91,7 +91,7 @@ class Reference(FrozenArrays):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Mission:
+class Mission(ShortRepr):
     """One recorded run: everything that an estimator may look at, and the reference."""
 
     name: str

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ssm_graph.base.earth import LocalFrame
-from ssm_graph.base.frozen import Array
+from ssm_graph.base.frozen import Array, ShortRepr
 from ssm_graph.mission.mission import Mission, Reference
 from ssm_graph.sensors.depth import DepthLog
 from ssm_graph.sensors.dvl import N_BEAMS, DvlLog
@@ -32,7 +32,7 @@ from ssm_graph.simulation.trajectory import Trajectory
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class SimulatedMission:
+class SimulatedMission(ShortRepr):
     """A mission as an estimator may see it, and everything that it may not."""
 
     config: SimulationConfig

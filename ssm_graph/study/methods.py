@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Protocol
 
 from factors.kernels import KERNELS, KernelChoice
@@ -19,10 +19,13 @@ from ssm_graph.filters.navigation.named import (
     filter_problems,
 )
 from ssm_graph.mission.estimate import Estimate, OnKeyframe
+from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.problem import ProblemConfig, build_problem
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
 from ssm_graph.smoothers.beam_faults import FaultSearch
 from ssm_graph.smoothers.fixed_lag import FixedLagConfig, solve_fixed_lag
-from ssm_graph.study.trials import Trial
+from ssm_graph.smoothers.mission import OnStage
+from ssm_graph.study.trials import Trial, with_initial
 
 ORACLE: Final = "oracle"
 
@@ -234,6 +237,9 @@ FAMILIES: Final[Mapping[str, Family]] = {
     ),
 }
 """All methods by the name in front of the colon."""
+RECURSIVE: Final = {n: f for n, f in FAMILIES.items() if f.is_recursive and not f.is_oracle}
+"""Those that need nothing but the mission and go keyframe by keyframe."""
+DEFAULT_FILTER: Final = "ssm-log"
 
 
 def parse_method(text: str) -> Method:
@@ -273,3 +279,47 @@ def parse_methods(texts: Sequence[str], *, where: str) -> tuple[str, ...]:
     if not names:
         raise ConfigError(f"{where}: expected at least one method; known: {', '.join(FAMILIES)}")
     return tuple(names)
+
+
+def parse_filter(text: str) -> Method:
+    """Return the method of :data:`RECURSIVE` that is named, as :func:`parse_method` does."""
+    name = text.strip().partition(":")[0]
+    if name not in RECURSIVE:
+        raise ConfigError(f"{text!r} is no filter; {nearest_hint(name, RECURSIVE)}")
+    return parse_method(text)
+
+
+def filter_mission(
+    mission: Mission,
+    method: str = DEFAULT_FILTER,
+    *,
+    problem_config: ProblemConfig | None = None,
+    on_keyframe: OnKeyframe | None = None,
+    on_stage: OnStage | None = None,
+) -> Estimate:
+    """Filter a mission, or smooth it with a fixed lag; without an initial state, align first.
+
+    Parameters
+    ----------
+    mission : from :func:`ssm_graph.read_mission` or a simulation.
+    method : one of ``ssm-graph filter --help``, for example ``ssm-log``, ``ekf-gate-beam:0.99`` or
+        ``fixed-lag:10``.
+    problem_config : rates and intervals of the keyframes.
+    on_keyframe : called with number and total after each keyframe.
+    on_stage : called with a line of text when a new stage begins.
+
+    Raises
+    ------
+    SsmGraphError
+        With a sentence that says what is wrong, if there is no such filter, or it cannot be used.
+    """
+    say = on_stage or (lambda _: None)
+    chosen = parse_filter(method)
+    if mission.initial is None:
+        say("aligning")
+        mission = with_initial(mission)
+    say("preintegrating")
+    problem = build_problem(mission, problem_config)
+    say(f"{chosen.name}: {problem.n_keyframes} keyframes")
+    (estimate,) = chosen.solver([Trial(0, mission, problem)], on_keyframe=on_keyframe)
+    return replace(estimate, notes=mission.notes + estimate.notes)
