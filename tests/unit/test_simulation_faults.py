@@ -9,8 +9,7 @@ import pytest
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.simulation import Fault, FaultShape, Loss, OutlierKind, Outliers
-from ssm_graph.simulation.faults import BeamFaults, draw_missing, draw_outliers
-from ssm_graph.simulation.programmed import add_faults
+from ssm_graph.simulation.beam_faults import BeamFaults, add_faults, draw_missing, draw_outliers
 
 N = 4000
 TIMES = np.arange(1.0, N + 1.0)
