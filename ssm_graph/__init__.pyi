@@ -53,7 +53,7 @@ from ssm_graph.mission.estimate import Estimate as Estimate
 from ssm_graph.mission.estimate import Iteration as Iteration
 from ssm_graph.mission.estimate import Status as Status
 from ssm_graph.mission.estimate import Trajectory as Trajectory
-from ssm_graph.mission.mission import AidLogs as AidLogs
+from ssm_graph.mission.mission import Aids as Aids
 from ssm_graph.mission.mission import InitialState as InitialState
 from ssm_graph.mission.mission import Mission as Mission
 from ssm_graph.mission.mission import Reference as Reference

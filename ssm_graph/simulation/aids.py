@@ -21,7 +21,7 @@ from ssm_graph.base.earth import (
     geodetic_from_ecef,
 )
 from ssm_graph.base.frozen import Array
-from ssm_graph.mission.mission import AidLogs
+from ssm_graph.mission.mission import Aids
 from ssm_graph.sensors.acoustic import Beacon, RangeLog, UsblLog
 from ssm_graph.sensors.compass import HeadingErrors, HeadingLog
 from ssm_graph.sensors.depth import DepthLog
@@ -162,7 +162,7 @@ class AidSettings:
 class SimulatedAids(NamedTuple):
     """The readings, and which of them are grossly wrong."""
 
-    logs: AidLogs
+    logs: Aids
     gross: dict[str, Mask]
     """By section: usbl, ranges, heading"""
     heading_errors: Array
@@ -185,7 +185,7 @@ def aid_logs(
         heading, gross["heading"], errors = _heading(
             trajectory, settings.compass, end_s, streams.heading, noisy
         )
-    return SimulatedAids(AidLogs(usbl, ranges, heading, settings.standstills), gross, errors)
+    return SimulatedAids(Aids(usbl, ranges, heading, *settings.standstills), gross, errors)
 
 
 def regular_times(rate_hz: float, end_s: float) -> Array:

@@ -31,7 +31,7 @@ from ssm_graph.simulation import (
 )
 
 SHORT = SimulationConfig(duration_s=30.0, seed=5, gnss=GnssSettings(windows=((0.0, 10.0),)))
-ALLOWED = {"aid_logs", "data", "earth", "errors", "simulation", "water_current"}
+ALLOWED = {"base", "sensors", "simulation"}
 
 
 def arrays(value: Any, prefix: str = "") -> dict[str, Array]:
