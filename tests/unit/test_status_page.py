@@ -184,3 +184,15 @@ def test_the_page_has_what_was_found_besides() -> None:
     plain = text_of(view_of(STATUS))
     assert "off what is stated" not in plain
     assert "current" not in plain
+
+
+@pytest.mark.parametrize("n_beams", [1, 3, 8])
+def test_the_page_has_every_beam(n_beams: int) -> None:
+    """However many the instrument has; what does not fit goes on in the next line."""
+    weights = np.linspace(1.0, 0.0, n_beams)
+    navigation = a_navigation(100.0, 0.7, beam_weights=weights)
+    page = text_of(view_of(replace(STATUS, navigation=navigation)))
+    shown = " ".join(page.replace("│", "").split())
+    for number, weight in enumerate(weights, start=1):
+        assert f" {number}{weight_bar(weight)} {weight:.2f}" in shown
+    assert f" {n_beams + 1}{weight_bar(0.0)}" not in shown

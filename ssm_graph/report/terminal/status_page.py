@@ -19,7 +19,6 @@ from rich.text import Text
 from ssm_graph.mission.estimate import Found
 from ssm_graph.mission.navigation import Event, Health, Navigation, Severity
 from ssm_graph.report.mission.summary import DETERMINED_STYLE
-from ssm_graph.sensors.dvl import N_BEAMS
 
 PLAIN_EVERY_S: Final = 10.0
 HEALTH_STYLE: Final = {
@@ -203,8 +202,7 @@ def _state(navigation: Navigation) -> Table:
 
 def _beams(navigation: Navigation) -> Text:
     text = Text("beams")
-    for number in range(N_BEAMS):
-        weight = float(navigation.beam_weights[number])
+    for number, weight in enumerate(navigation.beam_weights.tolist()):
         style = "green" if weight > 0.5 else "yellow" if weight > 0.05 else "red"
         shown = f"{weight:.2f}" if math.isfinite(weight) else _NONE
         text.append(f"  {number + 1}").append(weight_bar(weight), style).append(f" {shown}")
