@@ -13,7 +13,7 @@ from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.mission.current import CURRENT
 from ssm_graph.simulation import CurrentSettings, FaultShape, Grade, Loss, OutlierKind, WaterTrack
 from ssm_graph.study.cells import Cell
-from ssm_graph.study.plan import wanted_keys
+from ssm_graph.study.runner import wanted_keys
 from ssm_graph.study.scenario import Study, read_study, study_from, study_of_folders
 from ssm_graph.study.trials import MissionCache, simulated_trials
 from tests.study_fixture import SPARSE, TINY, tiny_study
