@@ -9,7 +9,7 @@ import numpy as np
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frames import R_lb_from_roll_pitch_heading
-from ssm_graph.evaluation.alignment import interpolate_within
+from ssm_graph.evaluation.errors import interpolate_within
 from ssm_graph.mission.estimate import Trajectory
 from ssm_graph.mission.mission import Mission, Reference
 from ssm_graph.sensors.gnss import GnssLog
