@@ -198,10 +198,10 @@ class FaultShape(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Fault(checked.Settings):
+class Fault:
     """A fault of some beams in ``[start_s, end_s)``."""
 
-    beams: tuple[int, ...] = checked.beams()
+    beams: tuple[int, ...]
     """Beams from 0."""
     start_s: float
     end_s: float
@@ -212,7 +212,7 @@ class Fault(checked.Settings):
     """By how much a COVERED beam reads low in the end; 1 reads zero."""
 
     def __post_init__(self) -> None:
-        super(Fault, self).__post_init__()
+        checked.require_rule("Fault.beams", checked.BEAMS, self.beams)
         checked.require_rule("Fault", checked.WINDOW, (self.start_s, self.end_s))
         size = np.size(self.offset_m_per_s)
         checked.require(

@@ -41,7 +41,7 @@ from ssm_graph.simulation.trajectory import Trajectory, Waves
 
 _IMU_RATE = checked.Rule(lambda rate: 10.0 <= rate <= 10_000.0, "10 to 10000 Hz", "try 100 Hz")
 _SEED = checked.Rule(
-    lambda seed: isinstance(seed, (int, np.integer)) and seed >= 0,
+    lambda seed: isinstance(seed, (int, np.integer)) and bool(seed >= 0),
     "a whole number from 0",
     "the number of the trial makes a good seed",
 )

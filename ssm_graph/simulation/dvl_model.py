@@ -35,12 +35,13 @@ def janus_beams(
     towards y, rad. Without azimuths the beams are spread evenly, half a step from x on; of five
     one looks straight down, as makers of such instruments have it.
     """
-    if azimuth is None:
-        n_slanted = 4 if n_beams == 5 else n_beams
-        azimuth = 2.0 * math.pi * (np.arange(n_slanted) + 0.5) / n_slanted
-    angles = np.column_stack([azimuth, np.full(len(azimuth), janus)])
+    has_vertical = azimuth is None and n_beams == 5
+    n_slanted = n_beams - has_vertical
+    even = 2.0 * math.pi * (np.arange(n_slanted) + 0.5) / n_slanted
+    turns = even if azimuth is None else np.asarray(azimuth, float)
+    angles = np.column_stack([turns, np.full(len(turns), janus)])
     beams_d = np.asarray(Rotation.from_euler("ZY", angles).apply([0.0, 0.0, 1.0]))
-    return beams_d if n_beams != 5 or len(azimuth) == 5 else np.vstack([beams_d, _VERTICAL])
+    return np.vstack([beams_d, _VERTICAL]) if has_vertical else beams_d
 
 
 def default_mount(beams_d: Array | None = None) -> DvlMount:

@@ -37,7 +37,7 @@ MEAN_NOTE: Final = (
     "Mean of the horizontal rms error over the missions that a method finished, with its 95 % "
     "confidence band (Student's t)."
 )
-BAND: Final = {"color": "#D9D9D9", "zorder": 0.6}
+BAND_COLOR: Final = "#D9D9D9"
 MAX_COLUMNS: Final = 3
 
 
@@ -62,12 +62,13 @@ def draw_grid(
     width = width or {1: 5.0, 2: 3.7}.get(n_columns, 3.1)
     figure = style.new_figure(n_columns * width + 1.7, n_rows * height + 0.8, title)
     grid = figure.subplots(n_rows, n_columns, squeeze=False)
-    for place in np.ndindex(n_rows, n_columns):
-        panel = panels.get((place[0], place[1]))
-        if panel is not None and panel.curves:
-            style.draw_panel(grid[place], panel)
-        else:
-            figure.delaxes(grid[place])
+    for i, row in enumerate(grid):
+        for j, axes in enumerate(row):
+            panel = panels.get((i, j))
+            if panel is not None and panel.curves:
+                style.draw_panel(axes, panel)
+            else:
+                figure.delaxes(axes)
     style.add_legend(figure, methods, looks, has_markers=has_markers, extra=extra)
     style.add_footnote(figure, note, left_out)
     return figure
@@ -184,7 +185,7 @@ def draw_nees(
         told = {m: mine[case, grade, m] for m in methods if (case, grade, m) in mine}
         panels[place], n_runs = _nees_panel(told, looks, _joined(case, grade))
         counts.add(n_runs)
-    band = Patch(color=BAND["color"], label="95 % if consistent")
+    band = Patch(color=BAND_COLOR, label="95 % if consistent")
     expected = Line2D([], [], color=style.GREY, linewidth=0.8, label="expected, 1")
     runs = " or ".join(f"{n}" for n in sorted(counts - {0}))
     note = f"Grey band: where 95 % of such means over {runs} runs lie (chi-square). "
@@ -216,7 +217,7 @@ def _nees_panel(told: Mapping[str, Series], looks: Looks, title: str) -> tuple[P
     band = chi2_interval(3, n_runs)
     low, high = min(*extremes, band.low), max(*extremes, band.high)
     panel = Panel(
-        bands=[Band(span, band.low, band.high, BAND)],
+        bands=[Band(span, band.low, band.high, {"color": BAND_COLOR, "zorder": 0.6})],
         curves=curves,
         level=1.0,
         x_limits=(float(span[0]), float(span[1])),

@@ -307,9 +307,10 @@ def _draw_track(axes: Axes, estimate: Estimate, reference: Reference | None) -> 
     if reference is not None:
         track = scale * _reference_track(reference, frame, path.time_s)
         look = {"color": style.REFERENCE, "linewidth": 2.6, "alpha": 0.35, "label": "reference"}
-        curves.append(Curve(*track.T, look))
+        curves.append(Curve(track[:, 0], track[:, 1], look))
     look = {"color": style.ESTIMATE, "linewidth": 1.3, "label": "estimate"}
-    curves.append(Curve(*p_n[style.thinned(len(p_n))].T, look))
+    kept = style.thinned(len(p_n))
+    curves.append(Curve(p_n[kept, 0], p_n[kept, 1], look))
     rejected = np.unique(estimate.beams.time_s[estimate.beams.weight < OUTLIER_WEIGHT])
     rejected = rejected[style.thinned(len(rejected), MAX_MARKS)]
     if len(rejected):
@@ -319,7 +320,8 @@ def _draw_track(axes: Axes, estimate: Estimate, reference: Reference | None) -> 
         curves.append(Curve(at[0], at[1], look))
     for place, marker, face, label in ((0, "o", style.INK, "start"), (-1, "s", "white", "end")):
         look = {"marker": marker, "color": style.INK, "markersize": 5.5, "markerfacecolor": face}
-        curves.append(Curve(*p_n[[place]].T, {**look, "linestyle": "", "label": label}))
+        look |= {"linestyle": "", "label": label}
+        curves.append(Curve(p_n[[place], 0], p_n[[place], 1], look))
     below = {"loc": "upper left", "bbox_to_anchor": (-0.04, -0.09), "ncols": 5}
     below |= {"columnspacing": 0.8, "handletextpad": 0.4}
     x, y = f"east, {unit}", f"north, {unit}"
