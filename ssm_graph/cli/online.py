@@ -21,7 +21,7 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.cli.options import add_command, add_kernel_options, kernel_of
 from ssm_graph.io.mission_folder.reader import read_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle, vehicle_of
-from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator import ONLINE, FixedLagSmoother
 from ssm_graph.live.protocols.decoder import Clock
 from ssm_graph.live.protocols.json_messages import JsonDecoder

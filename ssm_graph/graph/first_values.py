@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
-from factors.similarity import WEIGHT_FLOOR, Kernel
+from factors.similarity import Kernel
 from factors.so3 import cross
 from ssm_graph.base.earth import SEMI_MAJOR_AXIS
 from ssm_graph.base.errors import SolverError
@@ -38,6 +38,10 @@ LOCKED_OUT_PINGS = 3
 """After so many pings in a row without one good beam the prediction is doubted instead."""
 ANCHOR_SIGMA = 1.0
 """m/s; after a silence that leaves the beams this uncertain they set the velocity anew."""
+AID_ROUNDS = 5
+"""How often the aids of a keyframe are linearised anew."""
+AID_REACH = 0.1
+"""Sigmas of an aid; where a round moves what is predicted by less, the next one is spared."""
 _NONE = np.zeros(0)
 GRAVITY_REACH = 20.0
 """m, how far gravity is carried linearly before it is evaluated anew."""
@@ -176,15 +180,23 @@ class _ForwardPass:
             self._correct(H, innovation, H @ self.P @ H.T + fixes.covariance_n[i])
 
     def _update_aids(self, k: int) -> None:
-        """Correct by the weighted aids of one keyframe, each by itself."""
-        extras = self.extras
-        walks, constants = (extras.walks, extras.constants) if extras else (_NONE, _NONE)
-        for met in self.met.at(k, RowStates(*self._state, walks, constants, self._g_n)):
+        """Correct by the weighted aids of one keyframe, together, linearised where they lead to.
+
+        An uncertain position bends the distances to it by more than their sigmas.
+        """
+        if not self.met.has(k):
+            return
+        step = np.zeros(len(self.P))
+        for _ in range(AID_ROUNDS):
+            met = self.met.at(k, self._moved(step))
+            innovation = met.innovation + met.H @ step
             predicted = met.H @ self.P @ met.H.T
-            weight = self.met.weigh(met, predicted, self.kernel)
-            if weight > WEIGHT_FLOOR:
-                S = predicted + np.eye(len(met.innovation)) / weight
-                self._correct(met.H, met.innovation, S)
+            weights = self.met.weigh(met, innovation, predicted, self.kernel)
+            S = predicted + np.diag(1.0 / weights)
+            last, step = step, self.P @ met.H.T @ np.linalg.solve(S, innovation)
+            if np.abs(met.H @ (step - last)).max() < AID_REACH:
+                break
+        self._correct(met.H, innovation, S)
 
     def _depth_row(self, rows: range, k: int) -> _Rows:
         depths = self.problem.depths
@@ -275,15 +287,25 @@ class _ForwardPass:
     def _correct(self, H: Array, innovation: Array, innovation_cov: Array) -> None:
         PHt = self.P @ H.T
         gain = np.linalg.solve(innovation_cov, PHt.T).T
-        step = gain @ innovation
+        moved = self._moved(gain @ innovation)
         P = self.P - gain @ PHt.T
         self.P = 0.5 * (P + P.T)
-        pose = gtsam.Pose3(gtsam.Rot3(self.R_nb), self.p_n).retract(step[:6])
-        self.R_nb, self.p_n = pose.rotation().matrix(), pose.translation()
-        self.v_n = self.v_n + step[VELOCITY]
-        self.bias = self.bias + step[9:STATE_DIM]
+        self.R_nb, self.p_n, self.v_n, self.bias = moved[:4]
         if self.extras:
-            self.extras.correct(step[STATE_DIM:])
+            self.extras.walks, self.extras.constants = moved.walks, moved.constants
+
+    def _moved(self, step: Array) -> RowStates:
+        """Return the state after a step (E,) of the error state and what is behind it."""
+        pose = gtsam.Pose3(gtsam.Rot3(self.R_nb), self.p_n).retract(step[:6])
+        beyond = self.extras.moved(step[STATE_DIM:]) if self.extras else (_NONE, _NONE)
+        return RowStates(
+            pose.rotation().matrix(),
+            pose.translation(),
+            self.v_n + step[VELOCITY],
+            self.bias + step[9:STATE_DIM],
+            *beyond,
+            self._g_n,
+        )
 
 
 class _RowsByKeyframe:

@@ -1,16 +1,18 @@
-"""Weighted aids in the forward pass: each measurement meets the prediction first, as beams do.
+"""Weighted aids in the forward pass: those of a keyframe meet the prediction first, as beams do.
 
-What a prediction and its covariance cannot mean starts without weight; the smoother, which knows
-the whole mission, judges it again. Ranges to a beacon whose place is unknown are left to
-:mod:`ssm_graph.graph.beacon_start`: their linearisation there would mean nothing.
+They meet it together, for one of them judges the others: met one after the other, a gross one that
+an uncertain prediction lets pass would have all later ones refused. What a prediction and its
+covariance cannot mean starts without weight; the smoother, which knows the whole mission, judges
+again. Ranges to a beacon whose place is unknown are left to :mod:`ssm_graph.graph.beacon_start`:
+their linearisation there would mean nothing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factors.similarity import WEIGHT_FLOOR, Kernel
 from ssm_graph.base.frozen import Array
@@ -21,14 +23,16 @@ from ssm_graph.graph.beam_weights import GATE, WEIGHT_ROUNDS
 
 
 class Met(NamedTuple):
-    """One measurement at the state of its keyframe."""
+    """The measurements of one keyframe, linearised at one state: R components of m of them."""
 
-    number: int
-    """Among all of them"""
+    numbers: list[int]
+    """(m,) among all measurements"""
+    measurement: NDArray[np.intp]
+    """(R,) which of the m a component is of"""
     innovation: Array
-    """(d,) measured minus predicted, whitened"""
+    """(R,) measured minus predicted, whitened"""
     H: Array
-    """(d, width)"""
+    """(R, width)"""
 
 
 class ForwardAids:
@@ -45,37 +49,58 @@ class ForwardAids:
                     self._at.setdefault(k, []).append((aid, i, number))
                 number += 1
 
-    def at(self, k: int, state: RowStates) -> Iterator[Met]:
-        """Yield the measurements of a keyframe, linearised at its state before all of them."""
-        for aid, i, number in self._at.get(k, ()):
-            error, jacobian = aid.whitened(state, i)
-            yield Met(number, -error, jacobian)
+    def has(self, k: int) -> bool:
+        """Return whether a keyframe has measurements to meet."""
+        return k in self._at
 
-    def weigh(self, met: Met, predicted: Array, kernel: Kernel) -> float:
-        """Return the weight of a measurement, and keep it.
+    def at(self, k: int, state: RowStates) -> Met:
+        """Return the measurements of a keyframe that has some, linearised at a state."""
+        here = self._at[k]
+        errors, jacobians = zip(*(aid.whitened(state, i) for aid, i, _ in here), strict=True)
+        return Met(
+            numbers=[number for *_, number in here],
+            measurement=np.repeat(np.arange(len(here)), [aid.dim for aid, *_ in here]),
+            innovation=-np.concatenate(errors),
+            H=np.concatenate(jacobians),
+        )
 
-        ``predicted`` (d, d) is the covariance of what was predicted, in the measurement's sigmas.
+    def weigh(self, met: Met, innovation: Array, predicted: Array, kernel: Kernel) -> Array:
+        """Return the weights (R,) of the components, and keep those of their measurements.
+
+        ``innovation`` (R,) is that at the prediction, ``predicted`` (R, R) the covariance of what
+        was predicted, both in the measurements' sigmas.
         """
-        weight = settled_weight(met.innovation, predicted, kernel)
-        self.weights[met.number] = weight
-        return weight
+        weights = settled_weights(innovation, predicted, met.measurement, kernel)
+        self.weights[met.numbers] = weights
+        return weights[met.measurement]
 
 
-def settled_weight(innovation: Array, predicted: Array, kernel: Kernel) -> float:
-    """Return the weight of a whitened measurement (d,); none beyond the gate.
+def settled_weights(
+    innovation: Array, predicted: Array, measurement: NDArray[np.intp], kernel: Kernel
+) -> Array:
+    """Return the weights (m,) of whitened measurements that meet one prediction together.
 
-    With ``S = H P H' + 1 / weight`` the posterior of the innovation has mean ``S^-1 innovation /
-    weight`` and covariance ``S^-1 H P H' / weight``.
+    Those beyond the gate begin with none. With ``S = H P H' + 1 / weight`` the posterior of the
+    innovation has mean ``innovation - H P H' S^-1 innovation`` and covariance ``H P H' - H P H'
+    S^-1 H P H'``.
+
+    Parameters
+    ----------
+    innovation : (R,) measured minus predicted, in sigmas.
+    predicted : (R, R) covariance of what was predicted.
+    measurement : (R,) which measurement, 0 to m - 1 in order, a component is of.
+    kernel : turns Mahalanobis distances into weights.
     """
-    dim = len(innovation)
-    if np.any(innovation**2 >= GATE**2 * (predicted.diagonal() + 1.0)):
-        return WEIGHT_FLOOR
-    weight = 1.0
+    dim, spread = np.bincount(measurement).astype(float), predicted.diagonal()
+    is_odd = np.bincount(measurement, weights=innovation**2 >= GATE**2 * (spread + 1.0)) > 0.0
+    weights = np.where(is_odd, WEIGHT_FLOOR, 1.0)
     for _ in range(WEIGHT_ROUNDS):
-        share = np.linalg.inv(np.eye(dim) + weight * predicted)
-        left = share @ innovation
-        t = float(left @ left + np.trace(share @ predicted))
-        last, weight = weight, float(kernel.weight(t, dim=dim))
-        if abs(weight - last) < 1e-2:
+        S = predicted + np.diag(1.0 / weights[measurement])
+        gain = np.linalg.solve(S, predicted).T
+        left = innovation - gain @ innovation
+        left_variance = np.maximum(spread - (gain * predicted).sum(axis=1), 0.0)
+        t = np.bincount(measurement, weights=left**2 + left_variance)
+        last, weights = weights, kernel.weight(t, dim=dim)
+        if np.abs(weights - last).max() < 1e-2:
             break
-    return weight
+    return weights

@@ -55,10 +55,10 @@ class ForwardExtras:
                 covariance[:, own] = 0.0
                 covariance[own, own] = variance * np.eye(own.stop - own.start)
 
-    def correct(self, step: Array) -> None:
-        """Take the part of a step that is behind the error state."""
-        self.walks = self.walks + step[: len(self.walks)]
-        self.constants = self.constants + step[len(self.walks) :]
+    def moved(self, step: Array) -> tuple[Array, Array]:
+        """Return walks and constants after the part of a step that is behind the error state."""
+        n_walks = len(self.walks)
+        return self.walks + step[:n_walks], self.constants + step[n_walks:]
 
     def beam_rows(
         self, rows: slice, state: tuple[Array, Array, Array, Array], g_n: Array

@@ -18,13 +18,13 @@ def require_usable(mission: Mission) -> None:
     come without it.
     """
     imu, dvl = mission.imu, mission.dvl
+    _finite("imu.start_s", np.array([imu.start_s]))
     _finite("imu.time_s", imu.time_s)
     _finite("imu.gyro_b", imu.gyro_b)
     _finite("imu.accel_b", imu.accel_b)
     _increasing("imu.time_s", np.concatenate([[imu.start_s], imu.time_s]))
     for name in ("gyro_density", "accel_density", "gyro_bias_sigma", "accel_bias_sigma"):
         _positive(f"imu.noise.{name}", np.array([getattr(imu.noise, name)]))
-    _finite("dvl.time_s", dvl.time_s)
     _increasing("dvl.time_s", dvl.time_s)
     _finite("dvl.mount.beams_b", dvl.mount.beams_b)
     _finite("dvl.mount.lever_arm_b", dvl.mount.lever_arm_b)
@@ -43,12 +43,12 @@ def _require_aids(mission: Mission) -> None:
     if depth is not None:
         _increasing("depth.time_s", depth.time_s)
         _positive("depth.sigma", np.array([depth.sigma]))
-        for name in ("time_s", "depth", "lever_arm_b"):
+        for name in ("depth", "lever_arm_b"):
             _finite(f"depth.{name}", getattr(depth, name))
     if gnss is not None:
         _increasing("gnss.time_s", gnss.time_s)
         _positive("gnss.sigma_enu", gnss.sigma_enu)
-        for name in ("time_s", "lat", "lon", "height", "lever_arm_b"):
+        for name in ("lat", "lon", "height", "lever_arm_b"):
             _finite(f"gnss.{name}", getattr(gnss, name))
     if initial is not None:
         for name in ("time_s", "lat", "lon", "height", "roll", "pitch", "heading"):
@@ -90,6 +90,7 @@ def _positive(name: str, values: Array) -> None:
 
 
 def _increasing(name: str, times: Array) -> None:
+    _finite(name, times)
     wrong = np.zeros(len(times), bool)
     wrong[1:] = ~(np.diff(times) > 0.0)
     _refuse(name, times, wrong, "times that increase strictly")

@@ -301,6 +301,7 @@ def _ranges(
         range_m=range_m,
         sigma=np.full(len(time_s), settings.sigma),
         lever_arm_b=np.array(settings.lever_arm_b),
+        nominal_sigma=settings.sigma,
     )
     return log, is_gross
 

@@ -26,6 +26,7 @@ from typing import IO, Any, Final
 
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
+from ssm_graph.io.mission_folder.toml import TOML_NAME
 from ssm_graph.io.mission_folder.vehicle import check_same_vehicle
 from ssm_graph.io.raw_log.log import RawLog, replay
 from ssm_graph.io.results.growing import GrowingResults
@@ -33,7 +34,6 @@ from ssm_graph.io.results.summary import as_json
 from ssm_graph.io.results.tables import BEAMS_NAME, SUMMARY_NAME, TRAJECTORY_NAME
 from ssm_graph.io.tables.append_file import AppendFile
 from ssm_graph.io.tables.checkpoint import newest_checkpoint
-from ssm_graph.io.tables.settings import TOML_NAME
 from ssm_graph.live.run.checkpoint_writer import CheckpointWriter
 from ssm_graph.mission.navigation import Event
 from ssm_graph.mission.vehicle import Vehicle
@@ -200,6 +200,8 @@ class RunFolder:
         if self.log is not None:
             self.log.sync()
             self.log.close()
+        if self.results is not None:
+            self.results.close()
         with contextlib.suppress(OSError):
             self._events.sync()
         self._events.close()
