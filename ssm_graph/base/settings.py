@@ -63,6 +63,16 @@ class Key:
             text += f" not below {self.low:g}"
         return text
 
+    def problem(self, value: Any) -> str:
+        """Return "" for a good value, "type" or "range" for a bad one."""
+        if self.shape is None:
+            return "" if isinstance(value, str) and value.strip() else "type"
+        numbers = _numbers(value, self.shape)
+        if numbers is None or not all(math.isfinite(number) for number in numbers):
+            return "type"
+        low_ok = all(x > 0.0 for x in numbers) if self.positive else min(numbers) >= self.low
+        return "" if low_ok and max(numbers) <= self.high else "range"
+
 
 def sigma_key(
     field: str, high: float, hint: str = "", *, required: bool = True, unit: float = 1.0
@@ -166,21 +176,21 @@ def read_settings(
     axes : body axes of its vectors.
     may_miss : required keys that this file can do without.
     """
-    place = place_of(section)
+    place = f"{file} {place_of(section)}".rstrip()
     if not isinstance(raw, dict):
-        raise ConfigError(f"{file} {place}: expected a section, got {shown(raw)}")
+        raise ConfigError(f"{place}: expected a section, got {shown(raw)}")
     for key in raw:
         if key not in known:
             missing = [name for name in known if name not in raw]
             hint = nearest_hint(key, missing or known)
-            raise ConfigError(f"{file} {place} {key}: unknown key; {hint}")
+            raise ConfigError(f"{place} {key}: unknown key; {hint}")
     for name, key in known.items():
         if key.required and name not in raw and name not in may_miss:
-            raise ConfigError(f"{file} {place} {name}: the key is missing; expected {key.wanted}")
+            raise ConfigError(f"{place} {name}: the key is missing; expected {key.wanted}")
     values = {name: _plain(value) for name, value in raw.items()}
     settings = Settings(section, values, file, known, axes)
     for name, value in values.items():
-        problem = _problem(known[name], value)
+        problem = known[name].problem(value)
         if problem:
             tail = f"; {known[name].hint}" if known[name].hint and problem == "range" else ""
             raise settings.fault(
@@ -188,8 +198,10 @@ def read_settings(
             )
     for name in values:
         other, expected = known[name].beside
+        if not other:
+            continue
         is_said = known[name].shape is None or np.any(settings.array(name))
-        if other and is_said and not settings.number(other):
+        if is_said and not settings.number(other):
             raise settings.fault(name, expected)
     return settings
 
@@ -242,7 +254,7 @@ def _default(owner: object, field: str) -> Any:
 
 def place_of(section: str) -> str:
     """Return a section's name as it stands in the file."""
-    return section if section.startswith("[[") else f"[{section}]"
+    return section if section.startswith("[[") or not section else f"[{section}]"
 
 
 def shown(value: object) -> str:
@@ -261,17 +273,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, int) and not isinstance(value, bool):
         return float(value) if abs(value) < 10**300 else math.inf
     return value
-
-
-def _problem(key: Key, value: Any) -> str:
-    """Return "" for a good value, "type" or "range" for a bad one."""
-    if key.shape is None:
-        return "" if isinstance(value, str) and value.strip() else "type"
-    numbers = _numbers(value, key.shape)
-    if numbers is None or not all(math.isfinite(number) for number in numbers):
-        return "type"
-    low_ok = all(x > 0.0 for x in numbers) if key.positive else min(numbers) >= key.low
-    return "" if low_ok and max(numbers) <= key.high else "range"
 
 
 def _numbers(value: Any, shape: tuple[int | tuple[int, int], ...]) -> list[float] | None:

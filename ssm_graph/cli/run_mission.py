@@ -8,11 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 
 from ssm_graph.base.errors import ConfigError, DataError
-from ssm_graph.evaluation import Metrics, evaluate, reference_from_gnss
+from ssm_graph.cli.options import number_option, say
+from ssm_graph.evaluation import Metrics, evaluate, reference_from_gnss, withhold_gnss
 from ssm_graph.io.mission_folder.calibration_toml import CALIBRATION_NAME
 from ssm_graph.io.mission_folder.reader import read_mission
 from ssm_graph.io.mission_folder.toml import read_mission_toml
@@ -34,28 +34,12 @@ def add_mission_arguments(parser: argparse.ArgumentParser) -> None:
     graph = ProblemConfig()
     parser.add_argument("mission", type=Path, metavar="MISSION", help="mission folder")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="result folder")
-    parser.add_argument(
-        "--merge-rate",
-        type=float,
-        default=graph.merge_rate_hz,
-        metavar="HZ",
-        help=f"rate to which inertial samples are merged (default: {graph.merge_rate_hz:g})",
-    )
-    parser.add_argument(
-        "--keyframe-interval",
-        type=float,
-        default=graph.keyframe_interval_s,
-        metavar="SECONDS",
-        help="keyframes this far apart while DVL and GNSS are silent "
-        f"(default: {graph.keyframe_interval_s:g})",
-    )
-    parser.add_argument(
-        "--gnss-until",
-        type=float,
-        metavar="SECONDS",
-        help="use GNSS only so long from the begin of the inertial data; the rest becomes the "
-        "reference",
-    )
+    merged = "rate to which inertial samples are merged"
+    number_option(parser, "--merge-rate", "HZ", merged, graph.merge_rate_hz)
+    apart = "keyframes this far apart while DVL and GNSS are silent"
+    number_option(parser, "--keyframe-interval", "SECONDS", apart, graph.keyframe_interval_s)
+    until = "use GNSS only so long from the begin of the inertial data; the rest becomes the "
+    number_option(parser, "--gnss-until", "SECONDS", until + "reference")
     parser.add_argument("--no-figure", action="store_true", help="write no figure.png")
 
 
@@ -81,7 +65,10 @@ def run_mission(
         mission = read_mission(arguments.mission)
         withheld: GnssLog | None = None
         if arguments.gnss_until is not None:
-            mission, withheld = withhold_gnss(mission, arguments.gnss_until)
+            try:
+                mission, withheld = withhold_gnss(mission, arguments.gnss_until)
+            except ConfigError as error:
+                raise ConfigError(f"--gnss-until: {error}") from error
         estimate = solve(mission, graph, show)
         show.stage("writing results")
         estimate, reference, metrics = _compare(estimate, mission, withheld)
@@ -101,38 +88,11 @@ def run_mission(
         if not arguments.no_figure:
             save_figure(arguments.out / "figure.png", estimate, reference, title=mission.name)
     console.print(summary_table(estimate, metrics))
-    console.print(f"results in {arguments.out}", highlight=False, soft_wrap=True)
+    say(console, f"results in {arguments.out}")
     if estimate.calibration is not None:
         path = arguments.out / CALIBRATION_NAME
-        console.print(f"lines for mission.toml in {path}", highlight=False, soft_wrap=True)
+        say(console, f"lines for mission.toml in {path}")
     return estimate.status.is_good
-
-
-def withhold_gnss(mission: Mission, until_s: float) -> tuple[Mission, GnssLog]:
-    """Return the mission with GNSS up to ``until_s`` after its begin, and the other fixes."""
-    gnss = mission.gnss
-    if gnss is None:
-        raise ConfigError("--gnss-until: expected a mission with GNSS, got one without")
-    used = gnss.valid_s < mission.imu.start_s + until_s
-    if not used.any() or used.all():
-        first, last = gnss.valid_s[[0, -1]] - mission.imu.start_s
-        raise ConfigError(
-            f"--gnss-until: expected a time between the first fix at {first:.1f} s and the last "
-            f"at {last:.1f} s, got {until_s:g} s"
-        )
-    return replace(mission, gnss=fixes_where(gnss, used)), fixes_where(gnss, ~used)
-
-
-def fixes_where(gnss: GnssLog, kept: np.ndarray[Any, np.dtype[np.bool_]]) -> GnssLog:
-    """Return the fixes that a mask (N,) keeps."""
-    return replace(
-        gnss,
-        time_s=gnss.time_s[kept],
-        lat=gnss.lat[kept],
-        lon=gnss.lon[kept],
-        height=gnss.height[kept],
-        sigma_enu=gnss.sigma_enu[kept],
-    )
 
 
 def _compare(

@@ -17,7 +17,7 @@ from factors.similarity import Kernel
 from factors.so3 import cross
 from ssm_graph.base.earth import SEMI_MAJOR_AXIS
 from ssm_graph.base.errors import SolverError
-from ssm_graph.base.frozen import Array
+from ssm_graph.base.frozen import Array, ShortRepr
 from ssm_graph.base.stepwise import Steps, finished
 from ssm_graph.engine.error_state import POSITION, ROTATION, STATE_DIM, VELOCITY
 from ssm_graph.engine.states import NavigationStates, States
@@ -46,7 +46,7 @@ GRAVITY_REACH = 20.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FirstValues:
+class FirstValues(ShortRepr):
     """Where the smoother starts."""
 
     states: States

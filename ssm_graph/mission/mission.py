@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Protocol, TypeVar
 
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import DataError
-from ssm_graph.base.frozen import Array, FrozenArrays, optional_shaped, shaped
+from ssm_graph.base.frozen import Array, FrozenArrays, ShortRepr, optional_shaped, shaped
 from ssm_graph.sensors.current import CurrentModel
 from ssm_graph.sensors.depth import DepthLog
 from ssm_graph.sensors.dvl import DvlLog
@@ -139,7 +139,7 @@ class Reference(FrozenArrays):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Mission:
+class Mission(ShortRepr):
     """One recorded run: everything that an estimator may look at, and the reference."""
 
     name: str
