@@ -22,7 +22,7 @@ from benchmarks.speed import table
 from factors.similarity import GaussianKernel, Kernel, LogKernel
 from ssm_graph.evaluation import chi2_interval, evaluate, mean_with_interval
 from ssm_graph.mission.estimate import Calibration
-from ssm_graph.mission.mission import AidLogs
+from ssm_graph.mission.mission import Aids
 from ssm_graph.mission.problem import build_problem
 from ssm_graph.sensors.compass import HeadingErrors
 from ssm_graph.sensors.standstill import Standstill
@@ -174,7 +174,7 @@ def run(sim: SimulatedMission, kernel: Kernel, *, is_aided: bool = True) -> Run:
     """Smooth one mission, with or without its aid."""
     mission = sim.mission
     if not is_aided:
-        mission = dataclasses.replace(mission, aids=AidLogs())
+        mission = dataclasses.replace(mission, aids=Aids())
     estimate = SsmSmoother(SmootherConfig(kernel=kernel)).solve(build_problem(mission))
     assert mission.reference is not None
     metrics = evaluate(estimate.trajectory, mission.reference)

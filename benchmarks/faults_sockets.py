@@ -54,12 +54,12 @@ from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
 from ssm_graph.live.run.interfaces import Connections
 from ssm_graph.live.run.run_folder import LOG_NAME, RunFolder
 from ssm_graph.live.run.runner import Runner, RunnerConfig
-from ssm_graph.live.run.status import RunStatus, SourceStatus
 from ssm_graph.live.sockets.endpoints import LOOPBACK, Endpoint, Transport
 from ssm_graph.live.sockets.listeners import TcpServerInput
 from ssm_graph.live.sockets.outputs import OutputFormat
 from ssm_graph.live.sockets.sockets import InputConfig, OutputConfig, SocketHub
 from ssm_graph.mission.navigation import Event, Health, Severity
+from ssm_graph.mission.run_status import RunStatus, SourceStatus
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.depth import DepthLog
 from ssm_graph.sensors.dvl import Ping

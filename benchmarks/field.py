@@ -39,8 +39,16 @@ from benchmarks.field_runs import (
 from benchmarks.report import Report
 from benchmarks.speed import table
 from ssm_graph.mission.mission import Mission
-from ssm_graph.report.comparison.style import add_footnote, new_figure
-from ssm_graph.report.mission.style import ESTIMATE, INK, OUTLIER, REFERENCE, dress, save
+from ssm_graph.report.style import (
+    ESTIMATE,
+    INK,
+    OUTLIER,
+    REFERENCE,
+    add_footnote,
+    dress,
+    new_figure,
+    save,
+)
 
 RESULTS = Path(__file__).resolve().parent / "results"
 DOCS = Path(__file__).resolve().parents[1] / "docs"

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from factors.kernels import KERNELS
 from ssm_graph.base.errors import SsmGraphError
 from ssm_graph.base.frozen import Array
-from ssm_graph.cli.run_mission import fixes_where
 from ssm_graph.evaluation import reference_from_gnss
 from ssm_graph.evaluation.errors import ErrorSeries, error_series
 from ssm_graph.filters.navigation.named import filter_problems
@@ -210,7 +209,7 @@ def evaluate_case(mission: Mission, case: Case, until_s: float = GNSS_END_S) -> 
     scored = used if case.protocol is Protocol.C else ~used
     if case.protocol is Protocol.A:
         scored = scored & (gnss.time_s > gnss.time_s[used][-1])
-    seen = replace(mission, gnss=fixes_where(gnss, used))
+    seen = replace(mission, gnss=gnss.rows(used))
     spoilt = with_faults(seen, case.faults, case.seed)
     nothing = Score(np.nan, np.nan, np.nan, np.nan, np.nan, "-", None, None)
     if scored.sum() < 2:
@@ -224,7 +223,7 @@ def evaluate_case(mission: Mission, case: Case, until_s: float = GNSS_END_S) -> 
 
 def _score(estimate: Estimate, mission: Mission, scored: Mask, used: Mask) -> Score:
     gnss = _gnss(mission)
-    reference = reference_from_gnss(fixes_where(gnss, scored), estimate.trajectory)
+    reference = reference_from_gnss(gnss.rows(scored), estimate.trajectory)
     errors = error_series(estimate.trajectory, reference)
     is_open = scored.all()
     before = used & (gnss.time_s < gnss.time_s[scored][0])

@@ -33,15 +33,17 @@ from ssm_graph.evaluation.statistics import paired_difference
 from ssm_graph.filters.navigation.named import filter_problems
 from ssm_graph.mission.estimate import Estimate, since_first_ping
 from ssm_graph.mission.problem import Problem, build_problem
-from ssm_graph.report.comparison.style import (
+from ssm_graph.report.style import (
     DASHED,
+    EAST_NORTH_UP,
     Look,
     add_footnote,
     add_legend,
+    dress,
     line,
     new_figure,
+    save,
 )
-from ssm_graph.report.mission.style import EAST_NORTH_UP, dress, save
 from ssm_graph.simulation import (
     Grade,
     OutlierKind,

@@ -20,8 +20,7 @@ from benchmarks.online_stream import (
 from benchmarks.online_theirs import TheirConfig, run_theirs
 from ssm_graph.base.frozen import Array
 from ssm_graph.cli.online import pass_over_imports
-from ssm_graph.cli.run_mission import withhold_gnss
-from ssm_graph.evaluation import error_series, reference_from_gnss
+from ssm_graph.evaluation import error_series, reference_from_gnss, withhold_gnss
 from ssm_graph.filters.navigation.named import filter_problems
 from ssm_graph.io.blueye.convert import convert_blueye
 from ssm_graph.io.mission_folder.vehicle import vehicle_of

@@ -27,7 +27,7 @@ from benchmarks.soak_figure import draw, hourly
 from benchmarks.soak_stream import AXES, CASES, HOUR_S, Soaked, longest_run, soak
 from benchmarks.speed import table
 from ssm_graph.base.frozen import Array
-from ssm_graph.report.mission.style import save
+from ssm_graph.report.style import save
 from ssm_graph.simulation import Grade
 from ssm_graph.study.code import code_version
 

@@ -13,8 +13,16 @@ from benchmarks.online_stream import HEALTHS
 from benchmarks.soak_stream import HOUR_S, Soaked
 from ssm_graph.base.frozen import Array
 from ssm_graph.mission.navigation import Health
-from ssm_graph.report.comparison.style import add_footnote, log_ticks, new_figure
-from ssm_graph.report.mission.style import BOUND, ESTIMATE, OUTLIER, SMALL, dress
+from ssm_graph.report.style import (
+    BOUND,
+    ESTIMATE,
+    OUTLIER,
+    SMALL,
+    add_footnote,
+    dress,
+    log_ticks,
+    new_figure,
+)
 
 COLORS = {
     Health.ALIGNING: "#BBBBBB",

@@ -1,10 +1,11 @@
 """Simulate a short mission with failing beams, smooth it, compare it with the truth."""
 
 import ssm_graph as sg
-from ssm_graph.simulation import OutlierKind, Outliers, scenario_config, simulate
 
-config = scenario_config("survey", duration_s=300.0, outliers=Outliers(OutlierKind.SPARSE, 0.1))
-sg.write_mission("mission", simulate(config).mission)
+config = sg.scenario_config(
+    "survey", duration_s=300.0, outliers=sg.Outliers(sg.OutlierKind.SPARSE, 0.1)
+)
+sg.write_mission("mission", sg.simulate(config).mission)
 
 mission = sg.read_mission("mission")
 estimate = sg.smooth(mission, sg.SmootherConfig(kernel=sg.LogKernel(dof=5)))

@@ -1,12 +1,11 @@
 """One mission, one beam wrong half of the time, every kernel beside the oracle."""
 
 import ssm_graph as sg
-from ssm_graph.simulation import OutlierKind, Outliers, scenario_config, simulate
 
-config = scenario_config(
-    "survey", duration_s=600.0, seed=4, outliers=Outliers(OutlierKind.ONE_BEAM, 0.5)
+config = sg.scenario_config(
+    "survey", duration_s=600.0, seed=4, outliers=sg.Outliers(sg.OutlierKind.ONE_BEAM, 0.5)
 )
-simulated = simulate(config)
+simulated = sg.simulate(config)
 truth = simulated.mission.reference
 assert truth is not None
 

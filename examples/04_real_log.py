@@ -8,8 +8,6 @@ import sys
 from pathlib import Path
 
 import ssm_graph as sg
-from ssm_graph.cli.run_mission import withhold_gnss
-from ssm_graph.io.blueye.convert import convert_blueye
 
 folder = Path(os.environ.get("SSM_GRAPH_DATA", "../shared/data"))
 log = folder / "blueye_x3" / "log_auto_square_2025-05-07_14_55_13.mcap"
@@ -17,7 +15,7 @@ if not log.exists():
     print(f"{log} is not there: set SSM_GRAPH_DATA to the folder of real logs")
     sys.exit(0)
 
-mission, withheld = withhold_gnss(convert_blueye(log), 70.0)
+mission, withheld = sg.withhold_gnss(sg.convert_blueye(log), 70.0)
 estimate = sg.smooth(mission)
 metrics = sg.evaluate(estimate.trajectory, sg.reference_from_gnss(withheld, estimate.trajectory))
 print(estimate.status.name, estimate.reason)

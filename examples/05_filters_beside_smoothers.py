@@ -1,12 +1,11 @@
 """Filters, a fixed lag and the batch smoother beside each other, on one mission with bad beams."""
 
 import ssm_graph as sg
-from ssm_graph.simulation import OutlierKind, Outliers, scenario_config, simulate
 
-config = scenario_config(
-    "survey", duration_s=300.0, seed=4, outliers=Outliers(OutlierKind.SPARSE, 0.2)
+config = sg.scenario_config(
+    "survey", duration_s=300.0, seed=4, outliers=sg.Outliers(sg.OutlierKind.SPARSE, 0.2)
 )
-mission = simulate(config).mission
+mission = sg.simulate(config).mission
 truth = mission.reference
 assert truth is not None
 problem = sg.build_problem(mission)

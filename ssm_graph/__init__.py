@@ -10,70 +10,43 @@
     metrics = sg.evaluate(estimate.trajectory, mission.reference) if mission.reference else None
     sg.write_results("out", estimate, mission=mission, metrics=metrics, settings={})
     sg.save_figure("out/figure.png", estimate, mission.reference)
+
+The public names stand in ``__init__.pyi``; each is loaded when it is first asked for, so that to
+import this package costs nothing.
 """
 
-from factors.similarity import ExpKernel, GaussianKernel, Kernel, LogKernel, SqrtKernel
-from ssm_graph.base.errors import (
-    ConfigError,
-    DataError,
-    MissingExtraError,
-    SolverError,
-    SsmGraphError,
-)
-from ssm_graph.evaluation import Metrics, evaluate, reference_from_gnss
-from ssm_graph.filters.navigation.named import FILTERS, filter_problems
-from ssm_graph.io.mission_folder.reader import read_mission, write_mission
-from ssm_graph.io.results.tables import read_results, write_results
-from ssm_graph.live.estimator import FixedLagSmoother
-from ssm_graph.mission.estimate import Estimate, Iteration, Status, Trajectory
-from ssm_graph.mission.mission import InitialState, Mission, Reference
-from ssm_graph.mission.problem import Problem, ProblemConfig, build_problem
-from ssm_graph.mission.start.alignment import Alignment, align
-from ssm_graph.report.mission.figure import save_figure
-from ssm_graph.smoothers.batch import Similarity, SmootherConfig, SsmSmoother
-from ssm_graph.smoothers.beam_faults import FaultSearch
-from ssm_graph.smoothers.fixed_lag import FixedLagConfig, solve_fixed_lag
-from ssm_graph.smoothers.mission import smooth
+from __future__ import annotations
 
-__all__ = [
-    "FILTERS",
-    "Alignment",
-    "ConfigError",
-    "DataError",
-    "Estimate",
-    "ExpKernel",
-    "FaultSearch",
-    "FixedLagConfig",
-    "FixedLagSmoother",
-    "GaussianKernel",
-    "InitialState",
-    "Iteration",
-    "Kernel",
-    "LogKernel",
-    "Metrics",
-    "MissingExtraError",
-    "Mission",
-    "Problem",
-    "ProblemConfig",
-    "Reference",
-    "Similarity",
-    "SmootherConfig",
-    "SolverError",
-    "SqrtKernel",
-    "SsmGraphError",
-    "SsmSmoother",
-    "Status",
-    "Trajectory",
-    "align",
-    "build_problem",
-    "evaluate",
-    "filter_problems",
-    "read_mission",
-    "read_results",
-    "reference_from_gnss",
-    "save_figure",
-    "smooth",
-    "solve_fixed_lag",
-    "write_mission",
-    "write_results",
-]
+import ast
+from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+_STUB = ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
+_HOMES = {
+    alias.asname: (node.module, alias.name)
+    for node in _STUB.body
+    if isinstance(node, ast.ImportFrom)
+    for alias in node.names
+}
+"""Module and name there of every public name."""
+
+__all__ = sorted(_HOMES)  # type: ignore[arg-type]
+
+
+def __getattr__(name: str) -> Any:
+    """Load a public name."""
+    if name == "__version__":
+        value = version("ssm-graph")
+    elif name in _HOMES:
+        module, there = _HOMES[name]
+        value = getattr(import_module(str(module)), there)
+    else:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *__all__, "__version__"]

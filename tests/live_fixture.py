@@ -13,10 +13,10 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.live.run.interfaces import Connections, Engine
 from ssm_graph.live.run.run_folder import RunFolder
-from ssm_graph.live.run.status import LinkState, OutputStatus, SourceStatus
 from ssm_graph.live.sockets.outputs import OutputFormat
 from ssm_graph.mission.estimate import BeamTable, CurrentTrack, Found, Trajectory
 from ssm_graph.mission.navigation import Event, Health, Navigation, Severity
+from ssm_graph.mission.run_status import LinkState, OutputStatus, SourceStatus
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.imu import ImuSample

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import field, fields
-from typing import Any, cast
+from collections.abc import Iterator, Sequence
+from dataclasses import field, fields, replace
+from enum import Enum
+from typing import Any, Final, Self, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +14,64 @@ from ssm_graph.base.errors import DataError
 
 Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
+
+_SHOWN_NUMBERS: Final = 4
+_SHOWN_ITEMS: Final = 3
+_SHOWN_CHARACTERS: Final = 60
+
+
+def shown(value: object) -> str:
+    """Return a value as :class:`ShortRepr` shows it: short, however much it holds."""
+    if isinstance(value, np.ndarray):
+        return _shown_array(value)
+    if isinstance(value, ShortRepr):
+        return f"{type(value).__name__}({', '.join(f'{n}={size}' for n, size in _lengths(value))})"
+    if isinstance(value, Enum):
+        return value.name
+    if isinstance(value, tuple) and len(value) > _SHOWN_ITEMS:
+        return f"{len(value)} of {type(value[0]).__name__}"
+    if isinstance(value, tuple):
+        return f"({', '.join(shown(item) for item in value)})"
+    text = repr(value)
+    return text if len(text) <= _SHOWN_CHARACTERS else text[:_SHOWN_CHARACTERS] + "..."
+
+
+def _lengths(value: object) -> Iterator[tuple[str, int]]:
+    """Yield the named lengths of a value's declared shapes, each once."""
+    named: dict[str, int] = {}
+    for spec in fields(cast(Any, value)):
+        shape = spec.metadata.get("shape", ())
+        named |= dict(zip(shape, np.shape(getattr(value, spec.name)), strict=False))
+    yield from ((name, size) for name, size in named.items() if isinstance(name, str))
+
+
+def _shown_array(array: NDArray[Any]) -> str:
+    """Return few numbers as they are, of many the shape, the range and how many are missing."""
+    if array.size <= _SHOWN_NUMBERS:
+        return np.array2string(array, precision=6, separator=", ").replace("\n", "")
+    shape = " x ".join(str(size) for size in array.shape)
+    if array.dtype == bool:
+        return f"<{shape} bool, {int(array.sum())} true>"
+    finite = array[np.isfinite(array)]
+    text = f"{shape}, {finite.min():.6g} to {finite.max():.6g}" if finite.size else shape
+    missing = array.size - finite.size
+    return f"<{text}, {missing} not finite>" if missing else f"<{text}>"
+
+
+class ShortRepr:
+    """Give a dataclass a ``repr`` of one short line: arrays by shape and range, values by name."""
+
+    __slots__ = ()
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        if "__repr__" not in cls.__dict__:  # or else `dataclass` would write one of its own
+            cls.__repr__ = ShortRepr._short  # type: ignore[method-assign]
+
+    def _short(self) -> str:
+        specs = (spec for spec in fields(cast(Any, self)) if spec.repr)
+        shown_fields = ", ".join(f"{s.name}={shown(getattr(self, s.name))}" for s in specs)
+        return f"{type(self).__name__}({shown_fields})"
 
 
 def read_only(name: str, value: ArrayLike, shape: Sequence[int | None]) -> Array:
@@ -28,7 +87,7 @@ def read_only(name: str, value: ArrayLike, shape: Sequence[int | None]) -> Array
     return array
 
 
-class FrozenArrays:
+class FrozenArrays(ShortRepr):
     """Apply :func:`read_only` to every array field, by the shape kept in the field's metadata.
 
     A letter in a shape stands for a length: that of the first field that has it.
@@ -49,8 +108,15 @@ class FrozenArrays:
             lengths |= {size: got for size, got in named if isinstance(size, str)}
             object.__setattr__(self, spec.name, array)
 
+    def rows(self, kept: NDArray[np.bool_]) -> Self:
+        """Return the rows that a mask (N,) keeps, of every field whose shape begins with ``N``."""
+        own = cast(Any, self)
+        names = [f.name for f in fields(own) if f.metadata.get("shape", ("",))[0] == "N"]
+        present = [name for name in names if getattr(own, name) is not None]
+        return cast(Self, replace(own, **{name: getattr(own, name)[kept] for name in present}))
 
-class ReadOnlyArrays:
+
+class ReadOnlyArrays(ShortRepr):
     """Clear the write flag of every array field, without copy: for arrays made on the spot."""
 
     __slots__ = ()

@@ -27,7 +27,7 @@ from ssm_graph.study.methods import FAMILIES
 from ssm_graph.study.processes import JobProcesses
 from ssm_graph.study.runner import Progress, StudyResult, example_estimates, open_store, run_study
 from ssm_graph.study.scenario import Study, read_study, study_of_folders
-from ssm_graph.study.table import parquet_module, write_rows
+from ssm_graph.study.store import parquet_module, write_rows
 
 FOLDER_METHODS: Final = ("smoother-log", "smoother-gaussian")
 PLAIN_EVERY_S: Final = 30.0

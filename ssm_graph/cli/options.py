@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from factors.kernels import KernelChoice
 from factors.similarity import Kernel
@@ -57,6 +57,38 @@ def _table_format(word: str) -> TableFormat:
         return TableFormat[word.upper()]
     except KeyError:
         raise argparse.ArgumentTypeError(f"expected csv or parquet, got {word!r}") from None
+
+
+PARAMETERS: Final = {
+    "dof": ("NUMBER", "degrees of freedom"),
+    "width": ("SIGMAS", "residual at which a beam begins to be or is an outlier"),
+    "phi": ("SIGMAS2", "squared residual up to which a beam counts in full"),
+}
+"""Metavariable and meaning of the kernels' parameters."""
+KERNEL_HELP: Final = (
+    "log, sqrt, exp: similarity kernels; gaussian: least squares; huber, cauchy, dcs, "
+    "geman-mcclure: classical M-estimators"
+)
+
+
+def add_kernel_options(
+    parser: argparse.ArgumentParser, choices: Mapping[str, KernelChoice], *, more: str = ""
+) -> None:
+    """Add the kernel and the parameters of kernels."""
+    parser.add_argument(
+        "--kernel", choices=choices, default="log", help=f"{KERNEL_HELP}{more} (default: log)"
+    )
+    for name, (metavar, meaning) in PARAMETERS.items():
+        owners = {k: c.default for k, c in choices.items() if c.parameter == name}
+        defaults = ", ".join(f"{default:.5g} for {kernel}" for kernel, default in owners.items())
+        help_text = f"{meaning} (default: {defaults})"
+        parser.add_argument(f"--{name}", type=float, metavar=metavar, help=help_text)
+
+
+def kernel_of(arguments: argparse.Namespace, choices: Mapping[str, KernelChoice]) -> Kernel:
+    """Return the kernel that was asked for by :func:`add_kernel_options`."""
+    given = {name: getattr(arguments, name) for name in PARAMETERS}
+    return kernel_from(choices, arguments.kernel, **given)
 
 
 def kernel_from(choices: Mapping[str, KernelChoice], name: str, **given: float | None) -> Kernel:

@@ -8,11 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 
 from ssm_graph.base.errors import ConfigError, DataError
-from ssm_graph.evaluation import Metrics, evaluate, reference_from_gnss
+from ssm_graph.evaluation import Metrics, evaluate, reference_from_gnss, withhold_gnss
 from ssm_graph.io.mission_folder.calibration_toml import CALIBRATION_NAME
 from ssm_graph.io.mission_folder.reader import read_mission
 from ssm_graph.io.mission_folder.toml import read_mission_toml
@@ -81,7 +80,10 @@ def run_mission(
         mission = read_mission(arguments.mission)
         withheld: GnssLog | None = None
         if arguments.gnss_until is not None:
-            mission, withheld = withhold_gnss(mission, arguments.gnss_until)
+            try:
+                mission, withheld = withhold_gnss(mission, arguments.gnss_until)
+            except ConfigError as error:
+                raise ConfigError(f"--gnss-until: {error}") from error
         estimate = solve(mission, graph, show)
         show.stage("writing results")
         estimate, reference, metrics = _compare(estimate, mission, withheld)
@@ -106,33 +108,6 @@ def run_mission(
         path = arguments.out / CALIBRATION_NAME
         console.print(f"lines for mission.toml in {path}", highlight=False, soft_wrap=True)
     return estimate.status.is_good
-
-
-def withhold_gnss(mission: Mission, until_s: float) -> tuple[Mission, GnssLog]:
-    """Return the mission with GNSS up to ``until_s`` after its begin, and the other fixes."""
-    gnss = mission.gnss
-    if gnss is None:
-        raise ConfigError("--gnss-until: expected a mission with GNSS, got one without")
-    used = gnss.time_s < mission.imu.start_s + until_s
-    if not used.any() or used.all():
-        first, last = gnss.time_s[[0, -1]] - mission.imu.start_s
-        raise ConfigError(
-            f"--gnss-until: expected a time between the first fix at {first:.1f} s and the last "
-            f"at {last:.1f} s, got {until_s:g} s"
-        )
-    return replace(mission, gnss=fixes_where(gnss, used)), fixes_where(gnss, ~used)
-
-
-def fixes_where(gnss: GnssLog, kept: np.ndarray[Any, np.dtype[np.bool_]]) -> GnssLog:
-    """Return the fixes that a mask (N,) keeps."""
-    return replace(
-        gnss,
-        time_s=gnss.time_s[kept],
-        lat=gnss.lat[kept],
-        lon=gnss.lon[kept],
-        height=gnss.height[kept],
-        sigma_enu=gnss.sigma_enu[kept],
-    )
 
 
 def _compare(

@@ -3,13 +3,26 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 
+from ssm_graph.base.frozen import Array
 from ssm_graph.cli.options import add_command, add_mission_output
 from ssm_graph.io.mission_folder.reader import write_mission
-from ssm_graph.simulation import SCENARIOS, Grade, OutlierKind, Outliers, scenario_config, simulate
+from ssm_graph.sensors.dvl import MOST_BEAMS
+from ssm_graph.simulation import (
+    SCENARIOS,
+    Grade,
+    OutlierKind,
+    Outliers,
+    default_mount,
+    janus_beams,
+    scenario_config,
+    simulate,
+)
 
 
 def add_parser(commands: Any, *, epilog: str) -> None:
@@ -38,6 +51,13 @@ def add_parser(commands: Any, *, epilog: str) -> None:
     parser.add_argument(
         "--rate", type=float, help="share of pings with an outlier, 0 to 1 (default: 0.1)"
     )
+    parser.add_argument(
+        "--beams",
+        type=_beams,
+        metavar="1..8|velocity",
+        help="DVL of so many beams around (of five one looks down), or one that gives a velocity: "
+        "three beams along its axes (default: 4)",
+    )
     parser.add_argument("--duration", type=float, metavar="SECONDS", help="length of the mission")
     parser.add_argument("--imu-rate", type=float, metavar="HZ", help="inertial samples per second")
     parser.add_argument("--seed", type=int, default=0, help="same seed, same mission (default: 0)")
@@ -54,6 +74,9 @@ def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
         changes["duration_s"] = arguments.duration
     if arguments.imu_rate is not None:
         changes["imu_rate_hz"] = arguments.imu_rate
+    if arguments.beams is not None:
+        dvl = scenario_config(arguments.scenario).dvl
+        changes["dvl"] = replace(dvl, mount=default_mount(arguments.beams))
     if arguments.outliers is not None or arguments.rate is not None:
         default = scenario_config(arguments.scenario).outliers
         kind = OutlierKind[arguments.outliers.upper()] if arguments.outliers else default.kind
@@ -70,3 +93,12 @@ def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
         soft_wrap=True,
     )
     return True
+
+
+def _beams(word: str) -> Array:
+    """Return beam directions (B, 3) in instrument axes."""
+    if word == "velocity":
+        return np.eye(3)
+    if not word.isdecimal() or not 1 <= int(word) <= MOST_BEAMS:
+        raise argparse.ArgumentTypeError(f"expected 1 to {MOST_BEAMS} or velocity, got {word!r}")
+    return janus_beams(int(word))

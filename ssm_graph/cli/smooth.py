@@ -11,7 +11,7 @@ from factors.kernels import KERNELS, KernelChoice
 from factors.m_estimators import TruncatedKernel
 from factors.similarity import Similarity
 from ssm_graph.base.errors import ConfigError
-from ssm_graph.cli.options import add_command, kernel_from
+from ssm_graph.cli.options import add_command, add_kernel_options, kernel_of
 from ssm_graph.cli.run_mission import add_mission_arguments, run_mission
 from ssm_graph.engine.gnc import GncStart, Graduation
 from ssm_graph.mission.estimate import Estimate
@@ -25,12 +25,6 @@ from ssm_graph.smoothers.mission import smooth
 GNC = "gnc-tls"
 CHOICES = {**KERNELS, GNC: KernelChoice(TruncatedKernel, "width")}
 """Kernels by name; that of graduated non-convexity comes with a schedule of its own."""
-PARAMETERS = {
-    "dof": ("NUMBER", "degrees of freedom"),
-    "width": ("SIGMAS", "residual at which a beam begins to be or is an outlier"),
-    "phi": ("SIGMAS2", "squared residual up to which a beam counts in full"),
-}
-"""Metavariable and meaning of the kernels' parameters."""
 
 
 def add_parser(commands: Any, *, epilog: str) -> None:
@@ -52,27 +46,8 @@ def add_parser(commands: Any, *, epilog: str) -> None:
 
 
 def _add_kernel_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--kernel",
-        choices=CHOICES,
-        default="log",
-        help="log, sqrt, exp: similarity kernels; gaussian: least squares; huber, cauchy, dcs, "
-        "geman-mcclure: classical M-estimators; gnc-tls: truncated least squares by graduated "
-        "non-convexity (default: log)",
-    )
-    for name, (metavar, meaning) in PARAMETERS.items():
-        defaults = (
-            f"{choice.default:.5g} for {kernel}"
-            for kernel, choice in CHOICES.items()
-            if choice.parameter == name
-        )
-        parser.add_argument(
-            f"--{name}",
-            type=float,
-            default=None,
-            metavar=metavar,
-            help=f"{meaning} (default: {', '.join(defaults)})",
-        )
+    more = "; gnc-tls: truncated least squares by graduated non-convexity"
+    add_kernel_options(parser, CHOICES, more=more)
     parser.add_argument(
         "--gnc-start",
         choices=[start.name.lower() for start in GncStart],
@@ -126,7 +101,6 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
 
 def loop_from(arguments: argparse.Namespace) -> SmootherConfig:
     """Return the settings of the loop; what does not belong to the kernel is refused."""
-    given = {name: getattr(arguments, name) for name in PARAMETERS}
     graduation = None
     if arguments.kernel == GNC:
         graduation = Graduation(GncStart[(arguments.gnc_start or GncStart.ONES.name).upper()])
@@ -136,7 +110,7 @@ def loop_from(arguments: argparse.Namespace) -> SmootherConfig:
         )
     similarity = arguments.similarity
     return SmootherConfig(
-        kernel=kernel_from(CHOICES, arguments.kernel, **given),
+        kernel=kernel_of(arguments, CHOICES),
         similarity=None if similarity is None else Similarity[similarity.upper()],
         graduation=graduation,
         fault_search=FaultSearch() if arguments.find_faults else None,

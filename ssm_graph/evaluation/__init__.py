@@ -1,6 +1,5 @@
 """Comparison of trajectories with references, and honest statistics over many runs."""
 
-from ssm_graph.evaluation.alignment import gap_limit_s, interpolate_within
 from ssm_graph.evaluation.comparison import (
     FILTER_ORACLE,
     METRICS,
@@ -11,7 +10,7 @@ from ssm_graph.evaluation.comparison import (
     MethodResult,
     compare_methods,
 )
-from ssm_graph.evaluation.errors import ErrorSeries, error_series
+from ssm_graph.evaluation.errors import ErrorSeries, error_series, gap_limit_s, interpolate_within
 from ssm_graph.evaluation.metrics import Metrics, evaluate
 from ssm_graph.evaluation.statistics import (
     Interval,
@@ -24,7 +23,7 @@ from ssm_graph.evaluation.statistics import (
     paired_ratio,
     signed_rank,
 )
-from ssm_graph.evaluation.withheld import reference_from_gnss
+from ssm_graph.evaluation.withheld import reference_from_gnss, withhold_gnss
 
 __all__ = [
     "FILTER_ORACLE",
@@ -51,4 +50,5 @@ __all__ = [
     "paired_ratio",
     "reference_from_gnss",
     "signed_rank",
+    "withhold_gnss",
 ]

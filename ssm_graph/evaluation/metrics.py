@@ -6,14 +6,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ssm_graph.base.frozen import Array
+from ssm_graph.base.frozen import Array, ShortRepr
 from ssm_graph.evaluation.errors import ErrorSeries, error_series
 from ssm_graph.mission.estimate import Trajectory, path_length_m
 from ssm_graph.mission.mission import Reference
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Metrics:
+class Metrics(ShortRepr):
     """Summary of an :class:`ErrorSeries`; NaN where the reference lacks the quantity."""
 
     n_epochs: int

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ssm_graph.base.earth import LocalFrame
+from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frames import R_lb_from_roll_pitch_heading
-from ssm_graph.evaluation.alignment import interpolate_within
+from ssm_graph.evaluation.errors import interpolate_within
 from ssm_graph.mission.estimate import Trajectory
-from ssm_graph.mission.mission import Reference
+from ssm_graph.mission.mission import Mission, Reference
 from ssm_graph.sensors.gnss import GnssLog
 
 
@@ -46,3 +49,24 @@ def reference_from_gnss(gnss: GnssLog, trajectory: Trajectory) -> Reference:
         roll_pitch_heading=unknown,
         position_sigma_enu=gnss.sigma_enu[kept],
     )
+
+
+def withhold_gnss(mission: Mission, until_s: float) -> tuple[Mission, GnssLog]:
+    """Return the mission with fixes up to ``until_s`` after its begin alone, and the other fixes.
+
+    Raises
+    ------
+    ConfigError
+        The mission has no GNSS, or all of its fixes are on one side of that time.
+    """
+    gnss = mission.gnss
+    if gnss is None:
+        raise ConfigError("expected a mission with GNSS, got one without")
+    used = gnss.time_s < mission.imu.start_s + until_s
+    if not used.any() or used.all():
+        first, last = gnss.time_s[[0, -1]] - mission.imu.start_s
+        raise ConfigError(
+            f"expected a time between the first fix at {first:.1f} s and the last at "
+            f"{last:.1f} s, got {until_s:g} s"
+        )
+    return replace(mission, gnss=gnss.rows(used)), gnss.rows(~used)

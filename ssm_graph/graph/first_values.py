@@ -19,7 +19,7 @@ from factors.similarity import Kernel
 from factors.so3 import cross
 from ssm_graph.base.earth import SEMI_MAJOR_AXIS
 from ssm_graph.base.errors import SolverError
-from ssm_graph.base.frozen import Array
+from ssm_graph.base.frozen import Array, ShortRepr
 from ssm_graph.engine.error_state import POSITION, ROTATION, STATE_DIM, VELOCITY
 from ssm_graph.graph.aids.of_problem import weighted_aids
 from ssm_graph.graph.augmented_rows import RowStates
@@ -48,7 +48,7 @@ GRAVITY_REACH = 20.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FirstValues:
+class FirstValues(ShortRepr):
     """Where the smoother starts."""
 
     states: States

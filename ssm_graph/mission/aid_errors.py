@@ -9,8 +9,9 @@ from typing import Final
 import numpy as np
 
 from ssm_graph.engine.extras import Extra
-from ssm_graph.mission.mission import AidLogs
-from ssm_graph.sensors.compass import HeadingErrors
+from ssm_graph.mission.mission import Aids
+from ssm_graph.sensors.acoustic import RangeLog
+from ssm_graph.sensors.compass import HeadingErrors, HeadingLog
 
 BEACON: Final = "beacon_"
 """Followed by the beacon's number."""
@@ -52,22 +53,23 @@ def beacon_name(number: int) -> str:
     return f"{BEACON}{number}"
 
 
-def aid_extras(aids: AidLogs) -> tuple[Extra, ...]:
+def aid_extras(aids: Aids) -> tuple[Extra, ...]:
     """Return what the further aids ask to estimate."""
     extras: list[Extra] = []
-    if aids.ranges is not None:
-        heard = np.unique(aids.ranges.beacon)
+    ranges, heading = aids.get(RangeLog), aids.get(HeadingLog)
+    if ranges is not None:
+        heard = np.unique(ranges.beacon)
         extras += [
             Extra(
                 beacon_name(beacon.number),
                 tuple(f"{beacon_name(beacon.number)}_{axis}_m" for axis in ("east", "north", "up")),
                 beacon.position_sigma_enu,
             )
-            for beacon in aids.ranges.beacons
+            for beacon in ranges.beacons
             if not beacon.is_known and beacon.number in heard
         ]
-    if aids.heading is not None:
-        extras += _of_heading(aids.heading.errors)
+    if heading is not None:
+        extras += _of_heading(heading.errors)
     return tuple(extras)
 
 

@@ -9,7 +9,7 @@ from enum import Enum
 import numpy as np
 
 from ssm_graph.base.earth import LocalFrame
-from ssm_graph.base.frozen import Array, FrozenArrays, shaped
+from ssm_graph.base.frozen import Array, FrozenArrays, ShortRepr, shaped
 from ssm_graph.mission.mission import InitialState
 
 OUTLIER_WEIGHT = 0.05
@@ -182,7 +182,7 @@ class CalibratedValue:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Calibration:
+class Calibration(ShortRepr):
     """What was found of the instruments."""
 
     values: tuple[CalibratedValue, ...]
@@ -198,7 +198,7 @@ class Calibration:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Found:
+class Found(ShortRepr):
     """What a live estimator knows by now, beside the state of the vehicle."""
 
     calibration: Calibration | None = None
@@ -208,7 +208,7 @@ class Found:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class NoiseFound:
+class NoiseFound(ShortRepr):
     """How noisy the data are by what the answer misses of them."""
 
     beam_factor: Array
@@ -224,7 +224,7 @@ class NoiseFound:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Estimate:
+class Estimate(ShortRepr):
     """The answer of one estimator on one mission."""
 
     method: str

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from factors import so3
 from ssm_graph.base.earth import LocalFrame
-from ssm_graph.base.frozen import Array, ReadOnlyArrays
+from ssm_graph.base.frozen import Array, ReadOnlyArrays, ShortRepr
 from ssm_graph.mission.aids import Fixes, fixes_at
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.ping_motion import turn_between
@@ -75,7 +75,7 @@ class Standstills(ReadOnlyArrays):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FurtherAids:
+class FurtherAids(ShortRepr):
     """What a problem has beside beams, depth and GNSS; for estimators that weigh it."""
 
     usbl: Fixes | None = None
@@ -92,18 +92,21 @@ NO_FURTHER = FurtherAids()
 def further_aids(mission: Mission, keyframe_s: Array) -> tuple[FurtherAids, tuple[str, ...]]:
     """Return the further aids of a mission at keyframes (K,), and notes on what is left out."""
     aids = mission.aids
+    usbl, ranges, heading = aids.get(UsblLog), aids.get(RangeLog), aids.get(HeadingLog)
     notes: tuple[str, ...] = ()
     for log_s, what in (
-        (aids.usbl.valid_s if aids.usbl else np.zeros(0), "USBL fix"),
-        (aids.ranges.time_s if aids.ranges else np.zeros(0), "range"),
+        (usbl.valid_s if usbl else np.zeros(0), "USBL fix"),
+        (ranges.time_s if ranges else np.zeros(0), "range"),
     ):
         inside = is_inside(log_s, keyframe_s[0], keyframe_s[-1])
         notes += left_out(what, int(np.sum(~inside)), keyframe_s[0], keyframe_s[-1])
     found = FurtherAids(
-        usbl=_usbl(mission, aids.usbl, keyframe_s) if aids.usbl else None,
-        ranges=_ranges(mission.frame, aids.ranges, keyframe_s) if aids.ranges else None,
-        headings=_headings(mission, aids.heading, keyframe_s) if aids.heading else None,
-        standstills=_standstills(aids.standstills, keyframe_s) if aids.standstills else None,
+        usbl=_usbl(mission, usbl, keyframe_s) if usbl else None,
+        ranges=_ranges(mission.frame, ranges, keyframe_s) if ranges else None,
+        headings=_headings(mission, heading, keyframe_s) if heading else None,
+        standstills=_standstills(aids.all(Standstill), keyframe_s)
+        if aids.all(Standstill)
+        else None,
         sections=aids.sections,
     )
     return found, notes

@@ -6,42 +6,90 @@ north, up at the vehicle.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import ClassVar, Protocol, TypeVar
 
 from ssm_graph.base.earth import LocalFrame
-from ssm_graph.base.frozen import Array, FrozenArrays, optional_shaped, shaped
-from ssm_graph.sensors.acoustic import RangeLog, UsblLog
-from ssm_graph.sensors.compass import HeadingLog
+from ssm_graph.base.errors import DataError
+from ssm_graph.base.frozen import Array, FrozenArrays, ShortRepr, optional_shaped, shaped
 from ssm_graph.sensors.current import CurrentModel
 from ssm_graph.sensors.depth import DepthLog
 from ssm_graph.sensors.dvl import DvlLog
 from ssm_graph.sensors.gnss import GnssLog
 from ssm_graph.sensors.imu import ImuLog
-from ssm_graph.sensors.standstill import Standstill
+
+L = TypeVar("L")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class AidLogs:
-    """All of them; what a mission does not have is None or empty."""
+class AidLog(Protocol):
+    """What one more instrument says of a run; ``sensors/`` has them, such as ``UsblLog``."""
 
-    usbl: UsblLog | None = None
-    ranges: RangeLog | None = None
-    heading: HeadingLog | None = None
-    standstills: tuple[Standstill, ...] = ()
+    SECTION: ClassVar[str]
+    """Of ``mission.toml``, as it is written there: ``[usbl]``"""
+
+
+class Aids:
+    """What a run is aided by beside beams, depth and GNSS: logs of any instruments, by their type.
+
+    ``aids.get(UsblLog)`` is the log of that type, or None. It never changes.
+    """
+
+    __slots__ = ("_logs",)
+
+    def __init__(self, *logs: AidLog | None) -> None:
+        """Take logs in any order; None is left out."""
+        self._logs = tuple(log for log in logs if log is not None)
+
+    def __iter__(self) -> Iterator[AidLog]:
+        return iter(self._logs)
+
+    def __bool__(self) -> bool:
+        return bool(self._logs)
+
+    def __repr__(self) -> str:
+        return f"Aids({', '.join(type(log).__name__ for log in self._logs)})"
+
+    def all(self, kind: type[L]) -> tuple[L, ...]:
+        """Return all logs of a type, in the order given: standstills may be several."""
+        return tuple(log for log in self._logs if isinstance(log, kind))
+
+    def get(self, kind: type[L]) -> L | None:
+        """Return the log of a type, None if there is none.
+
+        Raises
+        ------
+        DataError
+            If there are several.
+        """
+        found = self.all(kind)
+        if len(found) > 1:
+            raise DataError(
+                f"aids: expected one {kind.__name__}, got {len(found)}; put what they say into one"
+            )
+        return found[0] if found else None
+
+    def __getitem__(self, kind: type[L]) -> L:
+        """Return the log of a type that is known to be there."""
+        log = self.get(kind)
+        if log is None:
+            raise DataError(f"aids: expected a {kind.__name__}, got {self}; ask with aids.get")
+        return log
+
+    def having(self, log: AidLog) -> Aids:
+        """Return the same with a log in the place of all of its type, or behind the others."""
+        kinds = [type(other) for other in self._logs]
+        at = kinds.index(type(log)) if type(log) in kinds else len(kinds)
+        others = [other for other in self._logs if type(other) is not type(log)]
+        return Aids(*others[:at], log, *others[at:])
 
     @property
     def sections(self) -> tuple[str, ...]:
-        """Sections of ``mission.toml`` that hold what there is."""
-        present = {
-            "[usbl]": self.usbl is not None,
-            "[ranges]": self.ranges is not None,
-            "[heading]": self.heading is not None,
-            "[[standstill]]": bool(self.standstills),
-        }
-        return tuple(name for name, is_there in present.items() if is_there)
+        """Sections of ``mission.toml`` that hold what there is, each once."""
+        return tuple(dict.fromkeys(log.SECTION for log in self._logs))
 
 
-NO_AIDS = AidLogs()
+NO_AIDS = Aids()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,7 +139,7 @@ class Reference(FrozenArrays):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Mission:
+class Mission(ShortRepr):
     """One recorded run: everything that an estimator may look at, and the reference."""
 
     name: str
@@ -101,8 +149,8 @@ class Mission:
     dvl: DvlLog
     depth: DepthLog | None = None
     gnss: GnssLog | None = None
-    aids: AidLogs = NO_AIDS
-    """What else the batch smoother is aided by."""
+    aids: Aids = NO_AIDS
+    """What else the smoothers are aided by."""
     initial: InitialState | None = None
     reference: Reference | None = None
     current: CurrentModel | None = None

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array, ReadOnlyArrays
-from ssm_graph.mission.mission import AidLogs, Mission
+from ssm_graph.mission.mission import Aids, Mission
+from ssm_graph.sensors.acoustic import RangeLog, UsblLog
 
 MIN_SPACING_S = 1e-3
 """Times closer than this share a keyframe."""
@@ -75,10 +76,11 @@ def build_timeline(mission: Mission, *, start_s: float, interval_s: float) -> Ti
     )
 
 
-def _acoustic_s(aids: AidLogs, start_s: float, end_s: float) -> list[Array]:
+def _acoustic_s(aids: Aids, start_s: float, end_s: float) -> list[Array]:
     """Return the times of acoustic fixes and ranges within the span."""
-    times = [aids.usbl.valid_s] if aids.usbl else []
-    times += [aids.ranges.time_s] if aids.ranges else []
+    usbl, ranges = aids.get(UsblLog), aids.get(RangeLog)
+    times = [usbl.valid_s] if usbl else []
+    times += [ranges.time_s] if ranges else []
     return [time_s[is_inside(time_s, start_s, end_s)] for time_s in times]
 
 

@@ -6,7 +6,9 @@ import numpy as np
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
-from ssm_graph.mission.mission import AidLogs, Mission
+from ssm_graph.mission.mission import Aids, Mission
+from ssm_graph.sensors.acoustic import RangeLog, UsblLog
+from ssm_graph.sensors.compass import HeadingLog
 
 
 def require_usable(mission: Mission) -> None:
@@ -56,8 +58,8 @@ def _require_aids(mission: Mission) -> None:
             _positive(f"initial.{name}", getattr(initial, name))
 
 
-def _require_further(aids: AidLogs) -> None:
-    usbl, ranges, heading = aids.usbl, aids.ranges, aids.heading
+def _require_further(aids: Aids) -> None:
+    usbl, ranges, heading = aids.get(UsblLog), aids.get(RangeLog), aids.get(HeadingLog)
     if usbl is not None:
         _positive("aids.usbl.sigma_enu", usbl.sigma_enu)
         for name in ("time_s", "delay_s", "lat", "lon", "height", "lever_arm_b"):

@@ -6,6 +6,7 @@ Acoustics err grossly now and then: each of their measurements is weighted as th
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -19,6 +20,8 @@ class UsblLog(FrozenArrays):
 
     A fix travels: it is stamped when it is known, and was valid ``delay_s`` before.
     """
+
+    SECTION: ClassVar[str] = "[usbl]"
 
     time_s: Array = shaped("N")
     """(N,) s as stamped, strictly increasing."""
@@ -65,6 +68,8 @@ class Beacon(FrozenArrays):
 @dataclass(frozen=True, slots=True, eq=False)
 class RangeLog(FrozenArrays):
     """Acoustic ranges from the vehicle's transducer to beacons."""
+
+    SECTION: ClassVar[str] = "[ranges]"
 
     beacons: tuple[Beacon, ...]
     time_s: Array = shaped("N")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from ssm_graph.base.frozen import Array, FrozenArrays, shaped
 
@@ -31,6 +32,8 @@ class HeadingErrors:
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadingLog(FrozenArrays):
     """Readings of a magnetic or any other compass, or of a directional gyro."""
+
+    SECTION: ClassVar[str] = "[heading]"
 
     sigma: float
     """Standard deviation of a reading, rad."""

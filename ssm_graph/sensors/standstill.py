@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 from ssm_graph.base.errors import DataError
 
@@ -11,6 +12,8 @@ from ssm_graph.base.errors import DataError
 @dataclass(frozen=True, slots=True)
 class Standstill:
     """A time in which the vehicle did not go anywhere: on deck, moored, on the bottom."""
+
+    SECTION: ClassVar[str] = "[[standstill]]"
 
     begin_s: float
     end_s: float

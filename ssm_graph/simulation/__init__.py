@@ -3,23 +3,23 @@
 ``simulate(scenario_config("survey", grade=Grade.TACTICAL, seed=3)).mission``
 """
 
-from ssm_graph.simulation.aids import DepthSettings, GnssSettings
-from ssm_graph.simulation.config import SimulationConfig
-from ssm_graph.simulation.currents import Current, CurrentSettings, WaterTrack
-from ssm_graph.simulation.drifts import DriftSettings
-from ssm_graph.simulation.dvl_model import DvlSettings, default_mount, janus_beams
-from ssm_graph.simulation.faults import Loss, OutlierKind, Outliers
-from ssm_graph.simulation.further_aids import (
+from ssm_graph.simulation.aids import (
     AidSettings,
     BeaconSettings,
     CompassSettings,
+    DepthSettings,
+    GnssSettings,
     GrossErrors,
     RangingSettings,
     UsblSettings,
 )
+from ssm_graph.simulation.beam_faults import Fault, FaultShape, Loss, OutlierKind, Outliers
+from ssm_graph.simulation.config import SCENARIOS, Scenario, SimulationConfig, scenario_config
+from ssm_graph.simulation.currents import Current, CurrentSettings, WaterTrack
+from ssm_graph.simulation.dvl_model import DvlSettings, default_mount, janus_beams
 from ssm_graph.simulation.grades import IMU_NOISE, START_SIGMAS, Grade, StartSigmas
 from ssm_graph.simulation.mission import SimulatedMission, simulate, with_dvl_errors
-from ssm_graph.simulation.programmed import Fault, FaultShape
+from ssm_graph.simulation.randomness import DriftSettings
 from ssm_graph.simulation.routes import (
     DepthProfile,
     DiveRoute,
@@ -29,7 +29,6 @@ from ssm_graph.simulation.routes import (
     SurveyRoute,
     TransitRoute,
 )
-from ssm_graph.simulation.scenarios import SCENARIOS, Scenario, scenario_config
 from ssm_graph.simulation.trajectory import CALM, Trajectory, Waves
 
 __all__ = [

@@ -10,50 +10,42 @@ from numpy.typing import NDArray
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.sensors.current import CurrentModel
-from ssm_graph.sensors.dvl import N_BEAMS
-from ssm_graph.simulation._checks import (
-    require,
-    require_beams,
-    require_not_negative,
-    require_positive,
+from ssm_graph.simulation.checked import (
+    BEAMS,
+    NOT_NEGATIVE,
+    POSITIVE,
+    VELOCITY,
+    Rule,
+    Settings,
+    checked,
 )
-from ssm_graph.simulation.drifts import gauss_markov
+from ssm_graph.simulation.randomness import gauss_markov
 
 _STEP_S = 1.0
 """The random part is drawn so often, and linear between."""
+_EVERY = Rule(
+    lambda n: n == 0 or n >= 2, "0, or 2 and more", "4 makes every fourth ping one off the water"
+)
 
 
 @dataclass(frozen=True, slots=True)
-class CurrentSettings:
+class CurrentSettings(Settings):
     """A current that is the same everywhere: steady, tidal and random parts add up."""
 
-    steady_enu: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    steady_enu: tuple[float, float, float] = checked(VELOCITY, (0.0, 0.0, 0.0))
     """m/s along east, north, up."""
-    tide: float = 0.0
+    tide: float = checked(NOT_NEGATIVE, 0.0, hint="try 0.3 m/s")
     """Speed of a part that turns clockwise with the tide, m/s; where it begins is drawn."""
-    tide_period_s: float = 44714.0
+    tide_period_s: float = checked(POSITIVE, 44714.0, hint="try 20000 s")
     """s; that of the moon's semidiurnal tide."""
-    sigma: float = 0.0
+    sigma: float = checked(NOT_NEGATIVE, 0.0, hint="try 0.3 m/s")
     """Of a Gauss-Markov part along east and along north, m/s."""
-    vertical_sigma: float = 0.0
+    vertical_sigma: float = checked(NOT_NEGATIVE, 0.0, hint="try 0.3 m/s")
     """Of one along up, m/s."""
-    correlation_s: float = 21600.0
+    correlation_s: float = checked(POSITIVE, 21600.0, hint="try 20000 s")
     """Of the Gauss-Markov parts, s."""
     stated: CurrentModel | None = None
     """What the mission says of the current; None for the truth's own variance and correlation."""
-
-    def __post_init__(self) -> None:
-        require(
-            len(self.steady_enu) == 3 and all(math.isfinite(c) for c in self.steady_enu),
-            "CurrentSettings.steady_enu",
-            expected="three finite numbers, m/s",
-            got=self.steady_enu,
-            hint="axes are east, north, up",
-        )
-        for name in ("tide", "sigma", "vertical_sigma"):
-            require_not_negative(f"CurrentSettings.{name}", getattr(self, name), hint="try 0.3 m/s")
-        for name in ("tide_period_s", "correlation_s"):
-            require_positive(f"CurrentSettings.{name}", getattr(self, name), hint="try 20000 s")
 
     @property
     def model(self) -> CurrentModel:
@@ -70,29 +62,18 @@ class CurrentSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class WaterTrack:
+class WaterTrack(Settings):
     """A DVL that pings off the water where it has no bottom lock."""
 
-    noise: float = 0.01
+    noise: float = checked(POSITIVE, 0.01, hint="try 0.01 m/s")
     """Standard deviation of a beam speed off the water, m/s."""
-    beams: tuple[int, ...] = (0, 1, 2, 3)
-    """Beams from 0 that the water returns."""
-    every: int = 0
+    beams: tuple[int, ...] | None = checked(BEAMS, None)
+    """Beams from 0 that the water returns; None for all."""
+    every: int = checked(_EVERY, 0)
     """With bottom lock, each ping of this number is off the water nevertheless; 0 for none."""
 
-    def __post_init__(self) -> None:
-        require_positive("WaterTrack.noise", self.noise, hint="try 0.01 m/s")
-        require_beams("WaterTrack.beams", self.beams, N_BEAMS)
-        require(
-            self.every == 0 or self.every >= 2,
-            "WaterTrack.every",
-            expected="0, or 2 and more",
-            got=self.every,
-            hint="4 makes every fourth ping one off the water",
-        )
-
     def pings(self, lost: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Return which pings are off the water, of beams without bottom lock ``lost`` (N, 4)."""
+        """Return which pings are off the water, of beams without bottom lock ``lost`` (N, B)."""
         is_water = np.asarray(lost.all(axis=1))
         if self.every:
             is_water[self.every - 1 :: self.every] = True

@@ -11,61 +11,84 @@ from scipy.spatial.transform import Rotation
 
 from ssm_graph.base.earth import R_el_from_lat_lon, geodetic_from_ecef
 from ssm_graph.base.frozen import Array
-from ssm_graph.sensors.dvl import N_BEAMS, DvlMount
-from ssm_graph.simulation._checks import require, require_not_negative, require_positive
-from ssm_graph.simulation.drifts import DriftSettings
+from ssm_graph.sensors.dvl import DvlMount
+from ssm_graph.simulation.checked import (
+    NOT_NEGATIVE,
+    POINT,
+    POSITIVE,
+    Rule,
+    Settings,
+    checked,
+    require,
+)
+from ssm_graph.simulation.randomness import DriftSettings
 from ssm_graph.simulation.taylor import Series
 from ssm_graph.simulation.trajectory import Motion, Trajectory, Vector, stacked
 
-_AZIMUTHS = tuple(math.radians(degrees) for degrees in (45.0, 135.0, 225.0, 315.0))
+Point = tuple[float, float, float]
+
+_RELATIVE = Rule(lambda x: abs(x) < 1.0, "a relative error below 1", "write 2 % as 0.02")
+_VERTICAL = np.array([[0.0, 0.0, 1.0]])
 
 
 def janus_beams(
+    n_beams: int = 4,
     *,
-    azimuth: Sequence[float] = _AZIMUTHS,
+    azimuth: Sequence[float] | None = None,
     janus: float = math.radians(30.0),
 ) -> Array:
-    """Return unit beam directions (4, 3) in instrument axes, x forward mark, y starboard, z down.
+    """Return unit beam directions (B, 3) in instrument axes, x forward mark, y starboard, z down.
 
     Each beam is the z axis, tilted by ``janus`` towards x and then turned by its azimuth from x
-    towards y, rad.
+    towards y, rad. Without azimuths the beams are spread evenly, half a step from x on; of five
+    one looks straight down, as makers of such instruments have it.
     """
+    if azimuth is None:
+        n_slanted = 4 if n_beams == 5 else n_beams
+        azimuth = 2.0 * math.pi * (np.arange(n_slanted) + 0.5) / n_slanted
     angles = np.column_stack([azimuth, np.full(len(azimuth), janus)])
-    return np.asarray(Rotation.from_euler("ZY", angles).apply([0.0, 0.0, 1.0]))
+    beams_d = np.asarray(Rotation.from_euler("ZY", angles).apply([0.0, 0.0, 1.0]))
+    return beams_d if n_beams != 5 or len(azimuth) == 5 else np.vstack([beams_d, _VERTICAL])
 
 
-def default_mount() -> DvlMount:
-    """Return a 30-degree Janus array, 0.5 m ahead of the IMU and 0.3 m below, slightly askew."""
+def default_mount(beams_d: Array | None = None) -> DvlMount:
+    """Return an instrument 0.5 m ahead of the IMU and 0.3 m below, slightly askew.
+
+    Its beams (B, 3) are a 30-degree Janus array of four unless given; ``numpy.eye(3)`` is an
+    instrument that gives a velocity alone.
+    """
     askew = Rotation.from_euler("ZYX", np.radians([2.0, -1.0, 0.5]))
     return DvlMount(
-        beams_d=janus_beams(), R_bd=askew.as_matrix(), lever_arm_b=np.array([0.5, 0.0, 0.3])
+        beams_d=janus_beams() if beams_d is None else beams_d,
+        R_bd=askew.as_matrix(),
+        lever_arm_b=np.array([0.5, 0.0, 0.3]),
     )
 
 
 @dataclass(frozen=True, slots=True)
-class DvlSettings:
+class DvlSettings(Settings):
     """The instrument, and in which ways it differs from what is written about it."""
 
     mount: DvlMount = field(default_factory=default_mount)
-    """The geometry as written into the mission."""
-    rate_hz: float = 1.0
+    """The geometry as written into the mission; any number of beams in any directions."""
+    rate_hz: float = checked(POSITIVE, 1.0, hint="try 1 Hz")
     """Pings per second."""
     first_s: float | None = None
     """Time of the first ping, s; None for one interval after the start."""
-    jitter_s: float = 0.0
+    jitter_s: float = checked(NOT_NEGATIVE, 0.0, hint="try 0.02 s")
     """Each ping is early or late by up to this much, uniformly; its stamp is true."""
-    noise: float = 0.005
+    noise: float = checked(POSITIVE, 0.005, hint="try 0.005 m/s")
     """Standard deviation of a beam speed, m/s."""
-    scale_error: float = 0.0
+    scale_error: float = checked(_RELATIVE, 0.0)
     """Speeds are read ``1 + scale_error`` too large."""
-    misalignment: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    misalignment: Point = (0.0, 0.0, 0.0)
     """Rotation vector, rad, by which the true mounting differs: ``R_bd_true = R_bd Exp(m)``."""
     late_s: float = 0.0
     """Stamps are later than the pings by this much, s."""
-    lever_arm_error_b: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    lever_arm_error_b: Point = checked(POINT, (0.0, 0.0, 0.0))
     """The instrument truly sits this much further on, body axes, m."""
-    beam_scale_errors: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    """On top of ``scale_error``, each beam's own."""
+    beam_scale_errors: tuple[float, ...] = ()
+    """On top of ``scale_error``, each beam's own; empty for none."""
     scale_drift_per_h: float = 0.0
     """By so much the scale error grows in an hour."""
     drift: DriftSettings | None = None
@@ -74,9 +97,7 @@ class DvlSettings:
     """Depth of a level sea floor; given, ranges are written as well."""
 
     def __post_init__(self) -> None:
-        require_positive("DvlSettings.rate_hz", self.rate_hz, hint="try 1 Hz")
-        require_positive("DvlSettings.noise", self.noise, hint="try 0.005 m/s")
-        require_not_negative("DvlSettings.jitter_s", self.jitter_s, hint="try 0.02 s")
+        super(DvlSettings, self).__post_init__()
         require(
             self.jitter_s < 0.5 / self.rate_hz,
             "DvlSettings.jitter_s",
@@ -85,10 +106,10 @@ class DvlSettings:
             hint="pings must stay in order",
         )
         require(
-            abs(self.scale_error) < 1.0,
-            "DvlSettings.scale_error",
-            expected="a relative error below 1",
-            got=self.scale_error,
+            len(self.beam_scale_errors) in (0, self.mount.n_beams),
+            "DvlSettings.beam_scale_errors",
+            expected=f"none, or one for each of the {self.mount.n_beams} beams",
+            got=self.beam_scale_errors,
             hint="write 2 % as 0.02",
         )
 
@@ -112,7 +133,7 @@ def true_beam_speeds(
     *,
     current_enu: Array | None = None,
 ) -> Array:
-    """Return how fast the instrument moves along each of its beams (N, 4), m/s, over ground.
+    """Return how fast the instrument moves along each of its beams (N, B), m/s, over ground.
 
     The instrument's path over the Earth is differentiated as it is; ``v + omega x l`` is nowhere
     used. With a current (N, 3), m/s along east, north, up, it is the motion through the water.
@@ -126,16 +147,17 @@ def true_beam_speeds(
     v_e: Vector = (Series([x]), Series([y]), Series([z]))
     v_b = stacked(motion.body_from_earth(v_e))
     read = (1.0 + settings.scale_error + settings.scale_drift_per_h * time_s / 3600.0)[:, None]
-    read = read * (1.0 + np.array(settings.beam_scale_errors))
+    if settings.beam_scale_errors:
+        read = read * (1.0 + np.array(settings.beam_scale_errors))
     return np.asarray(v_b @ _true_beams_b(settings).T * read)
 
 
 def beam_ranges(trajectory: Trajectory, settings: DvlSettings, time_s: Array) -> Array:
-    """Return the range (N, 4) along each beam to a level sea floor, m; NaN if it never meets it."""
+    """Return the range (N, B) along each beam to a level sea floor, m; NaN if it never meets it."""
     seabed = math.nan if settings.seabed_depth_m is None else settings.seabed_depth_m
     motion = trajectory.at(time_s)
     _, _, height = geodetic_from_ecef(stacked(motion.point_e(_true_lever_arm_b(settings))))
-    down = np.empty((len(time_s), N_BEAMS))
+    down = np.empty((len(time_s), settings.mount.n_beams))
     for beam, direction in enumerate(_true_beams_b(settings)):
         down[:, beam] = _down_part(motion, direction)
     altitude = seabed + height[:, None]
@@ -149,7 +171,7 @@ def _true_lever_arm_b(settings: DvlSettings) -> Array:
 
 
 def _true_beams_b(settings: DvlSettings) -> Array:
-    """Return the beams (4, 3) in body axes as they really point."""
+    """Return the beams (B, 3) in body axes as they really point."""
     R_dd = Rotation.from_rotvec(settings.misalignment).as_matrix()
     return np.asarray(settings.mount.beams_d @ (settings.mount.R_bd @ R_dd).T)
 

@@ -43,63 +43,31 @@ class StartSigmas:
     """rad"""
 
 
-def _data_sheet(
-    *,
-    gyro_deg_per_h: float,
-    gyro_walk_deg_per_sqrt_h: float,
-    gyro_bias_walk_deg_per_h_per_sqrt_h: float,
-    accel_ug: float,
-    accel_walk_ug_per_sqrt_hz: float,
-    accel_bias_walk_ug_per_sqrt_h: float,
-) -> ImuNoise:
+_DATA_SHEETS: Final[Mapping[Grade, tuple[float, ...]]] = {
+    Grade.NAVIGATION: (0.01, 0.002, 0.001, 50.0, 5.0, 5.0),
+    Grade.TACTICAL: (1.0, 0.05, 0.3, 500.0, 50.0, 50.0),
+    Grade.INDUSTRIAL: (10.0, 0.15, 3.0, 2000.0, 80.0, 200.0),
+    Grade.MEMS: (100.0, 0.4, 30.0, 5000.0, 150.0, 1000.0),
+}
+"""Gyro bias in deg/h, its white noise in deg/sqrt(h), walk of the bias in deg/h/sqrt(h); bias of
+the accelerometer in ug, its white noise in ug/sqrt(Hz), walk of the bias in ug/sqrt(h)."""
+
+
+def _noise(sheet: tuple[float, ...]) -> ImuNoise:
     """Return the densities in SI units; the one place of this package with other units."""
+    gyro_bias, gyro_noise, gyro_walk, accel_bias, accel_noise, accel_walk = sheet
     return ImuNoise(
-        gyro_density=math.radians(gyro_walk_deg_per_sqrt_h) * _PER_ROOT_HOUR,
-        accel_density=accel_walk_ug_per_sqrt_hz * _MICRO_G,
-        gyro_bias_sigma=math.radians(gyro_deg_per_h) * _PER_HOUR,
-        accel_bias_sigma=accel_ug * _MICRO_G,
-        gyro_bias_density=(
-            math.radians(gyro_bias_walk_deg_per_h_per_sqrt_h) * _PER_HOUR * _PER_ROOT_HOUR
-        ),
-        accel_bias_density=accel_bias_walk_ug_per_sqrt_h * _MICRO_G * _PER_ROOT_HOUR,
+        gyro_density=math.radians(gyro_noise) * _PER_ROOT_HOUR,
+        accel_density=accel_noise * _MICRO_G,
+        gyro_bias_sigma=math.radians(gyro_bias) * _PER_HOUR,
+        accel_bias_sigma=accel_bias * _MICRO_G,
+        gyro_bias_density=math.radians(gyro_walk) * _PER_HOUR * _PER_ROOT_HOUR,
+        accel_bias_density=accel_walk * _MICRO_G * _PER_ROOT_HOUR,
     )
 
 
 IMU_NOISE: Final[Mapping[Grade, ImuNoise]] = MappingProxyType(
-    {
-        Grade.NAVIGATION: _data_sheet(
-            gyro_deg_per_h=0.01,
-            gyro_walk_deg_per_sqrt_h=0.002,
-            gyro_bias_walk_deg_per_h_per_sqrt_h=0.001,
-            accel_ug=50.0,
-            accel_walk_ug_per_sqrt_hz=5.0,
-            accel_bias_walk_ug_per_sqrt_h=5.0,
-        ),
-        Grade.TACTICAL: _data_sheet(
-            gyro_deg_per_h=1.0,
-            gyro_walk_deg_per_sqrt_h=0.05,
-            gyro_bias_walk_deg_per_h_per_sqrt_h=0.3,
-            accel_ug=500.0,
-            accel_walk_ug_per_sqrt_hz=50.0,
-            accel_bias_walk_ug_per_sqrt_h=50.0,
-        ),
-        Grade.INDUSTRIAL: _data_sheet(
-            gyro_deg_per_h=10.0,
-            gyro_walk_deg_per_sqrt_h=0.15,
-            gyro_bias_walk_deg_per_h_per_sqrt_h=3.0,
-            accel_ug=2000.0,
-            accel_walk_ug_per_sqrt_hz=80.0,
-            accel_bias_walk_ug_per_sqrt_h=200.0,
-        ),
-        Grade.MEMS: _data_sheet(
-            gyro_deg_per_h=100.0,
-            gyro_walk_deg_per_sqrt_h=0.4,
-            gyro_bias_walk_deg_per_h_per_sqrt_h=30.0,
-            accel_ug=5000.0,
-            accel_walk_ug_per_sqrt_hz=150.0,
-            accel_bias_walk_ug_per_sqrt_h=1000.0,
-        ),
-    }
+    {grade: _noise(sheet) for grade, sheet in _DATA_SHEETS.items()}
 )
 """Noise of each grade."""
 

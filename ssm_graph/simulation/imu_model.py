@@ -9,7 +9,7 @@ from numpy.polynomial.legendre import leggauss
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.sensors.imu import ImuNoise
-from ssm_graph.simulation.streams import Streams
+from ssm_graph.simulation.randomness import Streams
 from ssm_graph.simulation.trajectory import Trajectory
 
 N_NODES = 3
@@ -64,14 +64,14 @@ def imu_errors(
     gyro = _triad_errors(
         (noise.gyro_bias_sigma, noise.gyro_density, noise.gyro_bias_density),
         (streams.gyro_bias, streams.gyro_noise, streams.gyro_walk),
-        rate_hz=rate_hz,
-        n_samples=n_samples,
+        rate_hz,
+        n_samples,
     )
     accel = _triad_errors(
         (noise.accel_bias_sigma, noise.accel_density, noise.accel_bias_density),
         (streams.accel_bias, streams.accel_noise, streams.accel_walk),
-        rate_hz=rate_hz,
-        n_samples=n_samples,
+        rate_hz,
+        n_samples,
     )
     return gyro, accel
 
@@ -79,7 +79,6 @@ def imu_errors(
 def _triad_errors(
     sigmas: tuple[float, float, float],
     rngs: tuple[np.random.Generator, np.random.Generator, np.random.Generator],
-    *,
     rate_hz: float,
     n_samples: int,
 ) -> ImuErrors:

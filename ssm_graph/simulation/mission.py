@@ -11,41 +11,46 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ssm_graph.base.earth import LocalFrame
-from ssm_graph.base.frozen import Array
+from ssm_graph.base.frozen import Array, ShortRepr
 from ssm_graph.mission.mission import Mission, Reference
 from ssm_graph.sensors.depth import DepthLog
-from ssm_graph.sensors.dvl import N_BEAMS, DvlLog
+from ssm_graph.sensors.dvl import DvlLog
 from ssm_graph.sensors.gnss import GnssLog
 from ssm_graph.sensors.imu import ImuLog
-from ssm_graph.simulation.aids import depth_log, gnss_log
+from ssm_graph.simulation.aids import SimulatedAids, aid_logs, depth_log, gnss_log
+from ssm_graph.simulation.beam_faults import (
+    Fault,
+    Loss,
+    Outliers,
+    add_faults,
+    draw_dropouts,
+    draw_outliers,
+    lost_beams,
+)
 from ssm_graph.simulation.config import SimulationConfig
 from ssm_graph.simulation.currents import Current
-from ssm_graph.simulation.drifts import draw_drift
 from ssm_graph.simulation.dvl_model import beam_ranges, ping_times, true_beam_speeds
-from ssm_graph.simulation.faults import Loss, Outliers, draw_dropouts, draw_outliers, lost_beams
-from ssm_graph.simulation.further_aids import SimulatedAids, aid_logs
 from ssm_graph.simulation.grades import initial_state
 from ssm_graph.simulation.imu_model import averaged_imu, imu_errors
-from ssm_graph.simulation.programmed import Fault, add_faults
-from ssm_graph.simulation.streams import Streams, spawn_streams
+from ssm_graph.simulation.randomness import Streams, draw_drift, spawn_streams
 from ssm_graph.simulation.trajectory import Trajectory
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class SimulatedMission:
+class SimulatedMission(ShortRepr):
     """A mission as an estimator may see it, and everything that it may not."""
 
     config: SimulationConfig
     mission: Mission
     """The recorded run; its reference is the truth at ``config.reference_rate_hz``."""
     is_outlier: NDArray[np.bool_]
-    """(N, 4) beams that an outlier or fault acts on; False where the beam is missing."""
+    """(N, B) beams that an outlier or fault acts on; False where the beam is missing."""
     beam_offset: Array
-    """(N, 4) what outliers and faults added to the speeds, m/s."""
+    """(N, B) what outliers and faults added to the speeds, m/s."""
     true_speed: Array
-    """(N, 4) beam speeds over ground without noise, outliers, faults or losses, m/s."""
+    """(N, B) beam speeds over ground without noise, outliers, faults or losses, m/s."""
     water_speed: Array
-    """(N, 4) the same through the water, m/s."""
+    """(N, B) the same through the water, m/s."""
     ping_time_s: Array
     """(N,) when the pings really happened, s."""
     gyro_bias: Array
@@ -189,7 +194,7 @@ def _imu(config: SimulationConfig, streams: Streams, n_samples: int) -> tuple[Im
 
 
 class _TrueSpeeds(NamedTuple):
-    """Of the instrument along its beams, both (N, 4), m/s."""
+    """Of the instrument along its beams, both (N, B), m/s."""
 
     over_ground: Array
     through_water: Array
@@ -214,11 +219,13 @@ class _Dvl(NamedTuple):
 def _dvl(config: SimulationConfig, streams: Streams, time_s: Array, speeds: _TrueSpeeds) -> _Dvl:
     """Return the pings as read, and what was done to them."""
     settings, water = config.dvl, config.water_track
-    lost = lost_beams(time_s, config.losses)
+    n_beams = settings.mount.n_beams
+    lost = lost_beams(time_s, n_beams, config.losses)
     is_water = np.zeros(len(time_s), bool) if water is None else water.pings(lost)
     noise = np.where(is_water, settings.noise if water is None else water.noise, settings.noise)
-    returns = np.isin(np.arange(N_BEAMS), () if water is None else water.beams)
-    missing = draw_dropouts(time_s, dropout_rate=config.dropout_rate, rng=streams.dropouts)
+    named = None if water is None else water.beams
+    returns = np.isin(np.arange(n_beams), np.arange(n_beams) if named is None else named)
+    missing = draw_dropouts(lost.shape, dropout_rate=config.dropout_rate, rng=streams.dropouts)
     missing |= np.where(is_water[:, None], ~returns, lost)
     speed = np.where(is_water[:, None], speeds.through_water, speeds.over_ground)
     drawn = draw_outliers(config.outliers, time_s, speed, rng=streams.outliers)

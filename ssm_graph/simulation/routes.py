@@ -15,13 +15,24 @@ from typing import final
 import numpy as np
 from scipy.special import ellipkinc
 
-from ssm_graph.simulation._checks import require, require_not_negative, require_positive
+from ssm_graph.simulation.checked import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    Rule,
+    Settings,
+    checked,
+    require,
+)
 from ssm_graph.simulation.taylor import Series, antiderivative, constant, log, sin_cos, sqrt, tanh
 
 Position = tuple[Series, Series, Series]
 
+_PERIODS = Rule(
+    lambda periods: all(map(POSITIVE.holds, periods)), POSITIVE.expected, "try (47, 61, 83)"
+)
 
-class Route(ABC):
+
+class Route(Settings, ABC):
     """Where the vehicle means to be, and where it looks."""
 
     @abstractmethod
@@ -34,7 +45,7 @@ class Route(ABC):
 
 
 @dataclass(frozen=True, slots=True)
-class DepthProfile:
+class DepthProfile(Settings):
     """Smooth change from one depth to another: a hyperbolic tangent in time."""
 
     start_m: float = 30.0
@@ -43,11 +54,8 @@ class DepthProfile:
     """Depth long after it, m."""
     mid_s: float = 0.0
     """Time of the fastest change, s."""
-    tau_s: float = 25.0
+    tau_s: float = checked(POSITIVE, 25.0, hint="try 25")
     """Time constant; the fastest vertical speed is ``(end_m - start_m) / (2 tau_s)``."""
-
-    def __post_init__(self) -> None:
-        require_positive("DepthProfile.tau_s", self.tau_s, hint="try 25")
 
     def height(self, t: Series) -> Series:
         """Return the height above the ellipsoid, m."""
@@ -74,21 +82,16 @@ class SurveyRoute(Route):
     the first kind across them.
     """
 
-    speed: float = 1.5
+    speed: float = checked(POSITIVE, 1.5, hint="try 1.5 m/s")
     """m/s"""
-    line_m: float = 300.0
+    line_m: float = checked(POSITIVE, 300.0, hint="try 300 m")
     """Distance sailed per line and turn, m."""
-    sharpness: float = 0.1
+    sharpness: float = checked(POSITIVE, 0.1, hint="try 0.1")
     """The ``e`` above: slope of the lines and inverse sharpness of the turns, of radius
     ``e * line_m / pi``."""
     course: float = math.radians(30.0)
     """Direction of the first line from north, rad."""
     depth: DepthProfile = DepthProfile()
-
-    def __post_init__(self) -> None:
-        require_positive("SurveyRoute.speed", self.speed, hint="try 1.5 m/s")
-        require_positive("SurveyRoute.line_m", self.line_m, hint="try 300 m")
-        require_positive("SurveyRoute.sharpness", self.sharpness, hint="try 0.1")
 
     def east_north_height(self, t: Series) -> Position:
         """Return metres east and north of the start, and metres above the ellipsoid."""
@@ -112,17 +115,13 @@ class SurveyRoute(Route):
 class SpiralRoute(Route):
     """Flat logarithmic spiral outwards at constant speed."""
 
-    speed: float = 1.2
+    speed: float = checked(POSITIVE, 1.2, hint="leave the default")
     """Speed around the centre, m/s."""
-    radius_m: float = 15.0
+    radius_m: float = checked(POSITIVE, 15.0, hint="leave the default")
     """Radius at the start, m."""
-    growth: float = 0.05
+    growth: float = checked(POSITIVE, 0.05, hint="leave the default")
     """Speed away from the centre, m/s."""
     depth: DepthProfile = DepthProfile(20.0, 20.0)
-
-    def __post_init__(self) -> None:
-        for name in ("speed", "radius_m", "growth"):
-            require_positive(f"SpiralRoute.{name}", getattr(self, name), hint="leave the default")
 
     def east_north_height(self, t: Series) -> Position:
         """Return metres east and north of the start, and metres above the ellipsoid."""
@@ -137,22 +136,21 @@ class SpiralRoute(Route):
 class DiveRoute(Route):
     """Helix from the surface down and up again, over and over, with a slow drift of its centre."""
 
-    speed: float = 1.2
+    speed: float = checked(POSITIVE, 1.2, hint="leave the default")
     """Speed around the centre, m/s."""
-    radius_m: float = 25.0
+    radius_m: float = checked(POSITIVE, 25.0, hint="leave the default")
     """m"""
     surface_m: float = 0.3
     """Least depth, m."""
     depth_m: float = 60.0
     """Greatest depth, m."""
-    period_s: float = 1200.0
+    period_s: float = checked(POSITIVE, 1200.0, hint="leave the default")
     """Time from surface to surface, s."""
     drift: float = 0.05
     """Northward speed of the centre, m/s."""
 
     def __post_init__(self) -> None:
-        for name in ("speed", "radius_m", "period_s"):
-            require_positive(f"DiveRoute.{name}", getattr(self, name), hint="leave the default")
+        super(DiveRoute, self).__post_init__()
         require(
             abs(self.drift) < self.speed,
             "DiveRoute.drift",
@@ -176,7 +174,7 @@ class DiveRoute(Route):
 class HoverRoute(Route):
     """Station keeping: slow sway of position and heading about a point; at rest with both zero."""
 
-    sway_m: float = 0.8
+    sway_m: float = checked(NOT_NEGATIVE, 0.8, hint="0 is at rest")
     """Amplitude of each sinusoid east and north, m."""
     yaw: float = math.radians(15.0)
     """Amplitude of the heading, rad."""
@@ -184,13 +182,8 @@ class HoverRoute(Route):
     """rad"""
     depth_m: float = 15.0
     """m"""
-    periods_s: tuple[float, float, float] = (47.0, 61.0, 83.0)
+    periods_s: tuple[float, float, float] = checked(_PERIODS, (47.0, 61.0, 83.0))
     """Periods of the sway east, north, and of the heading, s."""
-
-    def __post_init__(self) -> None:
-        require_not_negative("HoverRoute.sway_m", self.sway_m, hint="0 is at rest")
-        for period in self.periods_s:
-            require_positive("HoverRoute.periods_s", period, hint="try (47, 61, 83)")
 
     def east_north_height(self, t: Series) -> Position:
         """Return metres east and north of the start, and metres above the ellipsoid."""
@@ -209,14 +202,11 @@ class HoverRoute(Route):
 class TransitRoute(Route):
     """Straight run: latitude and longitude linear in time; fit for many hours."""
 
-    speed: float = 2.0
+    speed: float = checked(POSITIVE, 2.0, hint="try 2 m/s")
     """m/s at the start."""
     course: float = math.radians(50.0)
     """rad from north at the start."""
     depth: DepthProfile = DepthProfile(40.0, 40.0)
-
-    def __post_init__(self) -> None:
-        require_positive("TransitRoute.speed", self.speed, hint="try 2 m/s")
 
     def east_north_height(self, t: Series) -> Position:
         """Return metres east and north of the start, and metres above the ellipsoid."""

@@ -25,17 +25,26 @@ from ssm_graph.base.earth import (
 )
 from ssm_graph.base.frozen import Array
 from ssm_graph.mission.mission import Reference
-from ssm_graph.simulation._checks import require, require_positive
+from ssm_graph.simulation.checked import POSITIVE, Rule, Settings, checked
 from ssm_graph.simulation.routes import Route
 from ssm_graph.simulation.taylor import Series, atan2, sin_cos, sqrt, time_series
 
 Vector = tuple[Series, Series, Series]
 
-_MAX_LAT = math.radians(80.0)
+_LAT = Rule(
+    lambda lat: abs(lat) <= math.radians(80.0),
+    "a latitude between -80 and 80 degrees, in radians",
+    "convert degrees with math.radians",
+)
+_LON = Rule(
+    lambda lon: math.isfinite(lon) and abs(lon) <= 2.0 * math.pi,
+    "a longitude in radians",
+    "convert degrees with math.radians",
+)
 
 
 @dataclass(frozen=True, slots=True)
-class Waves:
+class Waves(Settings):
     """Sinusoidal motion that the sea adds to the route; amplitudes of zero are calm water."""
 
     roll: float = math.radians(4.0)
@@ -46,14 +55,10 @@ class Waves:
     """Amplitude, rad."""
     heave_m: float = 0.3
     """Amplitude, m."""
-    roll_period_s: float = 7.0
-    pitch_period_s: float = 6.0
-    yaw_period_s: float = 8.0
-    heave_period_s: float = 6.5
-
-    def __post_init__(self) -> None:
-        for name in ("roll_period_s", "pitch_period_s", "yaw_period_s", "heave_period_s"):
-            require_positive(f"Waves.{name}", getattr(self, name), hint="try 7 s")
+    roll_period_s: float = checked(POSITIVE, 7.0, hint="try 7 s")
+    pitch_period_s: float = checked(POSITIVE, 6.0, hint="try 7 s")
+    yaw_period_s: float = checked(POSITIVE, 8.0, hint="try 7 s")
+    heave_period_s: float = checked(POSITIVE, 6.5, hint="try 7 s")
 
 
 CALM = Waves(roll=0.0, pitch=0.0, yaw=0.0, heave_m=0.0)
@@ -171,7 +176,7 @@ def stacked(v: Vector, *, derivative: int = 0) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
-class Trajectory:
+class Trajectory(Settings):
     """A route laid on the ellipsoid, with waves.
 
     Latitude and longitude are linear in the route's north and east metres, by the radii of
@@ -181,26 +186,10 @@ class Trajectory:
 
     route: Route
     waves: Waves
-    lat: float
+    lat: float = checked(_LAT)
     """Latitude of the start, rad."""
-    lon: float
+    lon: float = checked(_LON)
     """Longitude of the start, rad."""
-
-    def __post_init__(self) -> None:
-        require(
-            abs(self.lat) <= _MAX_LAT,
-            "lat",
-            expected="a latitude between -80 and 80 degrees, in radians",
-            got=self.lat,
-            hint="convert degrees with math.radians",
-        )
-        require(
-            math.isfinite(self.lon) and abs(self.lon) <= 2.0 * math.pi,
-            "lon",
-            expected="a longitude in radians",
-            got=self.lon,
-            hint="convert degrees with math.radians",
-        )
 
     def at(self, time_s: ArrayLike) -> Motion:
         """Return the motion at these times, s since the start."""

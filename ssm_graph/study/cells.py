@@ -22,7 +22,6 @@ from ssm_graph.simulation import (
     scenario_config,
 )
 
-N_BEAMS: Final = 4
 WITHOUT_SIZE: Final = {OutlierKind.NONE, OutlierKind.BLOCKED}
 """Kinds whose offsets are not drawn."""
 
@@ -44,13 +43,15 @@ class StudyFault:
     shape: FaultShape = FaultShape.CONSTANT
     share: float = 0.0
     """By how much a covered beam reads low in the end."""
+    n_beams: int = 4
+    """Of the scenario's DVL."""
 
     def of_trial(self, seed: int) -> Fault:
         """Return the fault of one trial."""
         turn = seed if self.is_turned_by_seed else 0
         offsets = self.offset_m_per_s
         return Fault(
-            beams=tuple((beam + turn) % N_BEAMS for beam in self.beams),
+            beams=tuple((beam + turn) % self.n_beams for beam in self.beams),
             start_s=self.start_s,
             end_s=self.start_s + self.length_s,
             offset_m_per_s=offsets[0] if len(offsets) == 1 else offsets,

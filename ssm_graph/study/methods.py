@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Final, Protocol
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Final
 
 from factors.kernels import KERNELS, KernelChoice
 from factors.m_estimators import TruncatedKernel
@@ -14,28 +15,26 @@ from ssm_graph.engine.gnc import Graduation
 from ssm_graph.filters.geodetic.filter import GeodeticConfig
 from ssm_graph.filters.navigation.named import (
     FILTERS,
-    FilterChoice,
     filter_geodetic,
     filter_problems,
 )
 from ssm_graph.mission.estimate import Estimate, OnKeyframe
+from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.problem import ProblemConfig, build_problem
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
 from ssm_graph.smoothers.beam_faults import FaultSearch
 from ssm_graph.smoothers.fixed_lag import FixedLagConfig, solve_fixed_lag
-from ssm_graph.study.trials import Trial
+from ssm_graph.smoothers.mission import OnStage
+from ssm_graph.study.trials import Trial, with_initial
 
 ORACLE: Final = "oracle"
 
 
-class Solver(Protocol):
-    """Estimates every trial; a batched one all of them at once, any other one at a time.
+Solver = Callable[[Sequence[Trial], OnKeyframe | None], Sequence[Estimate]]
+"""Estimates every trial; a batched one all of them at once, any other one at a time.
 
-    One that goes keyframe by keyframe calls ``on_keyframe`` after each.
-    """
-
-    def __call__(  # noqa: D102
-        self, trials: Sequence[Trial], *, on_keyframe: OnKeyframe | None = None
-    ) -> Sequence[Estimate]: ...
+One that goes keyframe by keyframe calls what it is handed after each.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +52,8 @@ class Family:
     """A method, but for its parameter."""
 
     description: str
-    make: Callable[[float | None], Solver]
-    """Takes the parameter, None where none is given; a ValueError says what is wrong with it."""
+    make: Callable[[Any], Solver]
+    """Takes the parameter, None for a method without one; a ValueError says what is wrong."""
     default: float | None = None
     """The parameter where none is given; None for a method without one."""
     is_batched: bool = False
@@ -89,7 +88,7 @@ class Method:
         try:
             # NumPy rounds a stack of one otherwise: a trial must not depend on its company.
             is_alone = self.is_batched and len(trials) == 1
-            estimates = list(self.solver([*trials, *trials] if is_alone else trials))
+            estimates = list(self.solver([*trials, *trials] if is_alone else trials, None))
             estimates = estimates[: len(trials)] if is_alone else estimates
         except Exception as error:
             if len(trials) > 1:
@@ -105,18 +104,17 @@ def shown(error: Exception) -> str:
     return str(error) if isinstance(error, SsmGraphError) else f"{type(error).__name__}: {error}"
 
 
-def _smoother(config: SmootherConfig, *, is_oracle: bool = False) -> Solver:
-    def solve(trials: Sequence[Trial], *, on_keyframe: OnKeyframe | None = None) -> list[Estimate]:
-        del on_keyframe  # there is none to tell of: all keyframes are solved for at once
-        smoother = SsmSmoother(config)
-        return [
-            smoother.solve(trial.oracle_problem)
-            if is_oracle
-            else smoother.solve(trial.problem, first=trial.warm_start)
-            for trial in trials
-        ]
+def _smooth(
+    config: SmootherConfig, is_oracle: bool, trials: Sequence[Trial], _: OnKeyframe | None
+) -> list[Estimate]:
+    smoother = SsmSmoother(config)
+    if is_oracle:
+        return [smoother.solve(trial.oracle_problem) for trial in trials]
+    return [smoother.solve(trial.problem, first=trial.warm_start) for trial in trials]
 
-    return solve
+
+def _smoother(config: SmootherConfig, *, is_oracle: bool = False) -> Solver:
+    return partial(_smooth, config, is_oracle)
 
 
 def _kernel_family(name: str, choice: KernelChoice, similarity: Similarity | None) -> Family:
@@ -128,73 +126,59 @@ def _kernel_family(name: str, choice: KernelChoice, similarity: Similarity | Non
     )
 
 
-def _filter_family(name: str, choice: FilterChoice, **how: bool) -> Family:
-    is_oracle, smoothed = how.get("is_oracle", False), how.get("smoothed", False)
+def _filter_family(name: str, *, is_oracle: bool = False, is_smoothed: bool = False) -> Family:
+    choice = FILTERS[name]
+
+    def solve(
+        value: float | None, trials: Sequence[Trial], on_keyframe: OnKeyframe | None
+    ) -> list[Estimate]:
+        problems = [t.oracle_problem if is_oracle else t.problem for t in trials]
+        return filter_problems(
+            problems, name, value=value, smoothed=is_smoothed, on_keyframe=on_keyframe
+        )
 
     def make(value: float | None) -> Solver:
         choice.make(choice.default if value is None else value)  # refuses a wrong parameter now
-
-        def solve(
-            trials: Sequence[Trial], *, on_keyframe: OnKeyframe | None = None
-        ) -> list[Estimate]:
-            problems = [t.oracle_problem if is_oracle else t.problem for t in trials]
-            return filter_problems(
-                problems, name, value=value, smoothed=smoothed, on_keyframe=on_keyframe
-            )
-
-        return solve
+        return partial(solve, value)
 
     told = ", without the bad beams" if is_oracle else ""
-    back = ", and a Rauch-Tung-Striebel pass backwards" if smoothed else ""
+    back = ", and a Rauch-Tung-Striebel pass backwards" if is_smoothed else ""
     description = choice.description + told + back
     return Family(description, make, choice.default, True, is_oracle, is_recursive=True)
 
 
-def _make_geodetic(value: float | None) -> Solver:
-    config = GeodeticConfig(KERNELS["log"].kernel(value))
+def _geodetic(
+    config: GeodeticConfig, trials: Sequence[Trial], on_keyframe: OnKeyframe | None
+) -> list[Estimate]:
+    problems, imu = [t.problem for t in trials], [t.mission.imu for t in trials]
+    return filter_geodetic(problems, imu, config, on_keyframe=on_keyframe)
 
-    def solve(trials: Sequence[Trial], *, on_keyframe: OnKeyframe | None = None) -> list[Estimate]:
-        problems, imu = [t.problem for t in trials], [t.mission.imu for t in trials]
-        return filter_geodetic(problems, imu, config, on_keyframe=on_keyframe)
 
-    return solve
+def _fixed_lag(
+    states: str, lag_s: float | None, trials: Sequence[Trial], on_keyframe: OnKeyframe | None
+) -> list[Estimate]:
+    config = FixedLagConfig() if lag_s is None else FixedLagConfig(lag_s)
+    solved = (solve_fixed_lag(t.problem, config, on_keyframe=on_keyframe) for t in trials)
+    return [getattr(result, states) for result in solved]
 
 
 def _fixed_lag_family(states: str, description: str, lag_s: float | None = None) -> Family:
     def make(value: float | None) -> Solver:
         chosen_s = value if lag_s is None else lag_s
-        config = FixedLagConfig() if chosen_s is None else FixedLagConfig(chosen_s)
-
-        def solve(
-            trials: Sequence[Trial], *, on_keyframe: OnKeyframe | None = None
-        ) -> list[Estimate]:
-            results = (
-                solve_fixed_lag(trial.problem, config, on_keyframe=on_keyframe) for trial in trials
-            )
-            return [getattr(result, states) for result in results]
-
-        return solve
+        if chosen_s is not None:
+            FixedLagConfig(chosen_s)  # refuses a wrong lag now
+        return partial(_fixed_lag, states, chosen_s)
 
     default = FixedLagConfig().lag_s if lag_s is None else None
     return Family(description, make, default, is_recursive=True)
 
 
-def _make_gnc(value: float | None) -> Solver:
-    kernel = TruncatedKernel() if value is None else TruncatedKernel(value)
-    return _smoother(SmootherConfig(kernel, graduation=Graduation()))
-
-
-def _make_fault_search(value: float | None) -> Solver:
-    search = FaultSearch() if value is None else FaultSearch(significance=value)
-    return _smoother(SmootherConfig(fault_search=search))
-
-
-def _make_oracle(_: float | None) -> Solver:
-    return _smoother(SmootherConfig(GaussianKernel()), is_oracle=True)
-
-
 FAMILIES: Final[Mapping[str, Family]] = {
-    ORACLE: Family("least squares without the bad beams", _make_oracle, is_oracle=True),
+    ORACLE: Family(
+        "least squares without the bad beams",
+        lambda _: _smoother(SmootherConfig(GaussianKernel()), is_oracle=True),
+        is_oracle=True,
+    ),
     **{f"smoother-{name}": _kernel_family(name, choice, None) for name, choice in KERNELS.items()},
     **{
         f"smoother-plain-{name}": _kernel_family(name, KERNELS[name], Similarity.PLAIN)
@@ -202,18 +186,15 @@ FAMILIES: Final[Mapping[str, Family]] = {
     },
     "smoother-log-faults": Family(
         "batch smoother, log kernel, without stretches of a beam off by so many sigmas of its mean",
-        _make_fault_search,
+        lambda value: _smoother(SmootherConfig(fault_search=FaultSearch(significance=value))),
         FaultSearch().significance,
     ),
-    **{name: _filter_family(name, choice) for name, choice in FILTERS.items()},
-    **{
-        f"{name}+rts": _filter_family(name, choice, smoothed=True)
-        for name, choice in FILTERS.items()
-    },
-    "ekf-oracle": _filter_family("ekf", FILTERS["ekf"], is_oracle=True),
+    **{name: _filter_family(name) for name in FILTERS},
+    **{f"{name}+rts": _filter_family(name, is_smoothed=True) for name in FILTERS},
+    "ekf-oracle": _filter_family("ekf", is_oracle=True),
     "geodetic-log": Family(
         "the filter of the paper in geodetic coordinates, similarity weights for every beam",
-        _make_geodetic,
+        lambda value: partial(_geodetic, GeodeticConfig(KERNELS["log"].kernel(value))),
         KERNELS["log"].default,
         is_batched=True,
         is_recursive=True,
@@ -231,11 +212,14 @@ FAMILIES: Final[Mapping[str, Family]] = {
     ),
     "smoother-gnc-tls": Family(
         "batch smoother, truncated least squares by graduated non-convexity",
-        _make_gnc,
+        lambda value: _smoother(SmootherConfig(TruncatedKernel(value), graduation=Graduation())),
         TruncatedKernel().width,
     ),
 }
 """All methods by the name in front of the colon."""
+RECURSIVE: Final = {n: f for n, f in FAMILIES.items() if f.is_recursive and not f.is_oracle}
+"""Those that need nothing but the mission and go keyframe by keyframe."""
+DEFAULT_FILTER: Final = "ssm-log"
 
 
 def parse_method(text: str) -> Method:
@@ -275,3 +259,47 @@ def parse_methods(texts: Sequence[str], *, where: str) -> tuple[str, ...]:
     if not names:
         raise ConfigError(f"{where}: expected at least one method; known: {', '.join(FAMILIES)}")
     return tuple(names)
+
+
+def parse_filter(text: str) -> Method:
+    """Return the method of :data:`RECURSIVE` that is named, as :func:`parse_method` does."""
+    name = text.strip().partition(":")[0]
+    if name not in RECURSIVE:
+        raise ConfigError(f"{text!r} is no filter; {nearest_hint(name, RECURSIVE)}")
+    return parse_method(text)
+
+
+def filter_mission(
+    mission: Mission,
+    method: str = DEFAULT_FILTER,
+    *,
+    problem_config: ProblemConfig | None = None,
+    on_keyframe: OnKeyframe | None = None,
+    on_stage: OnStage | None = None,
+) -> Estimate:
+    """Filter a mission, or smooth it with a fixed lag; without an initial state, align first.
+
+    Parameters
+    ----------
+    mission : from :func:`ssm_graph.read_mission` or a simulation.
+    method : one of ``ssm-graph filter --help``, for example ``ssm-log``, ``ekf-gate-beam:0.99`` or
+        ``fixed-lag:10``.
+    problem_config : rates and intervals of the keyframes.
+    on_keyframe : called with number and total after each keyframe.
+    on_stage : called with a line of text when a new stage begins.
+
+    Raises
+    ------
+    SsmGraphError
+        With a sentence that says what is wrong, if there is no such filter, or it cannot be used.
+    """
+    say = on_stage or (lambda _: None)
+    chosen = parse_filter(method)
+    if mission.initial is None:
+        say("aligning")
+        mission = with_initial(mission)
+    say("preintegrating")
+    problem = build_problem(mission, problem_config)
+    say(f"{chosen.name}: {problem.n_keyframes} keyframes")
+    (estimate,) = chosen.solver([Trial(0, mission, problem)], on_keyframe)
+    return replace(estimate, notes=mission.notes + estimate.notes)

@@ -1,29 +1,31 @@
-"""Run a study: do what is missing, keep it at once, and gather everything."""
+"""Run a study: find what is missing, do it, keep it at once, and gather everything."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Final, cast
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.mission.estimate import Estimate
 from ssm_graph.mission.mission import Reference
-from ssm_graph.simulation import OutlierKind
-from ssm_graph.study.cells import Cell, Recording
+from ssm_graph.simulation import Grade, OutlierKind
+from ssm_graph.study.cells import Cell, Recording, Source
 from ssm_graph.study.code import code_version
 from ssm_graph.study.jobs import Execute, Job, JobResult, RunKey, do_job
 from ssm_graph.study.methods import parse_method
-from ssm_graph.study.plan import missing_jobs, wanted_keys
 from ssm_graph.study.scenario import Study
 from ssm_graph.study.scoring import Row
 from ssm_graph.study.store import Series, StudyStore, gather_series
-from ssm_graph.study.trials import Trial, recorded_trial, simulated_trials
+from ssm_graph.study.trials import Trial, block_size, recorded_trial, simulated_trials
 
-FORMAT = 1
+FORMAT: Final = 1
 """Of the store."""
+MAX_RUNS: Final = 20
+"""Runs of a job whose methods take missions one by one; an interruption costs the jobs at work."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,6 +116,83 @@ def _span(job: Job) -> str:
         return ""
     first, last = job.seeds[0], job.seeds[-1]
     return f"seed {first}" if first == last else f"seeds {first}-{last}"
+
+
+def wanted_keys(study: Study) -> list[RunKey]:
+    """Return the keys of all runs of a study, in the order of its table."""
+    return [
+        RunKey(source.id, "" if grade is None else grade.name.lower(), seed, method)
+        for source in study.sources
+        for grade in study.grades
+        for method in study.method_names
+        for seed in _seeds(study, source, method)
+    ]
+
+
+def _seeds(study: Study, source: Source, method: str) -> Sequence[int]:
+    return (0,) if isinstance(source, Recording) else study.seeds_of(method)
+
+
+def missing_jobs(study: Study, done: Container[RunKey]) -> list[Job]:
+    """Return the jobs for all runs that are not done.
+
+    Cells of the same seeds follow each other: a process that simulates those seeds for the first
+    cell only draws the DVL for the others.
+    """
+    jobs = []
+    for grade in study.grades:
+        for length, sources in groupby(sorted(study.sources, key=_length), key=_length):
+            size = block_size(length)
+            jobs += list(_jobs_of(study, grade, tuple(sources), size, done))
+    return jobs
+
+
+def _length(source: Source) -> float:
+    return source.duration_s
+
+
+def _jobs_of(
+    study: Study, grade: Grade | None, sources: Sequence[Source], size: int, done: Container[RunKey]
+) -> Iterator[Job]:
+    """Yield the jobs of sources of one length, block of seeds by block of seeds."""
+    batched = [name for name in study.method_names if parse_method(name).is_batched]
+    single = [name for name in study.method_names if name not in batched]
+    n_seeds = max(len(_seeds(study, sources[0], name)) for name in study.method_names)
+    small_size = max(1, MAX_RUNS // max(1, len(single)))
+    first = study.first_seed if isinstance(sources[0], Cell) else 0
+    for begin in range(first, first + n_seeds, size):
+        end = min(begin + size, first + n_seeds)
+        for source in sources:
+            for name in batched:
+                yield from _jobs(study, source, grade, range(begin, end), [name], done)
+        for small in range(begin, end, small_size):
+            seeds = range(small, min(small + small_size, end))
+            for source in sources:
+                yield from _jobs(study, source, grade, seeds, single, done)
+
+
+def _jobs(
+    study: Study,
+    source: Source,
+    grade: Grade | None,
+    seeds: range,
+    methods: Sequence[str],
+    done: Container[RunKey],
+) -> Iterator[Job]:
+    """Yield one job for all methods that miss the same seeds."""
+    grade_name = "" if grade is None else grade.name.lower()
+    missing: dict[tuple[int, ...], list[str]] = {}
+    for method in methods:
+        wanted = _seeds(study, source, method)
+        left = tuple(
+            seed
+            for seed in seeds
+            if seed in wanted and RunKey(source.id, grade_name, seed, method) not in done
+        )
+        if left:
+            missing.setdefault(left, []).append(method)
+    for left, names in missing.items():
+        yield Job(study.name, source, grade, left, tuple(names))
 
 
 def example_estimates(study: Study) -> list[tuple[str, Estimate, Reference]]:

@@ -5,22 +5,32 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from ssm_graph.base.errors import ConfigError, DataError, nearest_hint
 from ssm_graph.io.mission_folder.reader import read_mission
-from ssm_graph.simulation import SCENARIOS, FaultShape, Grade, Loss, OutlierKind, Outliers
+from ssm_graph.simulation import (
+    SCENARIOS,
+    CurrentSettings,
+    FaultShape,
+    Grade,
+    Loss,
+    OutlierKind,
+    Outliers,
+    SimulationConfig,
+    WaterTrack,
+)
+from ssm_graph.study import keys
 from ssm_graph.study.cells import WITHOUT_SIZE, Cell, Recording, Source, StudyFault, digest
+from ssm_graph.study.keys import StudyTable
 from ssm_graph.study.methods import parse_method, parse_methods
-from ssm_graph.study.toml_table import TomlTable
-from ssm_graph.study.water_keys import read_current, read_water_track
 
 _Made = TypeVar("_Made")
 
 DEFAULT_SEEDS: Final = 20
-ALL_BEAMS: Final = (0, 1, 2, 3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,26 +101,80 @@ def read_study(path: Path) -> Study:
     return study_from(raw, where=path.name)
 
 
+_STUDY: Final = {
+    "name": keys.text(keys.REQUIRED),
+    "scenario": keys.text("survey"),
+    "duration_s": keys.seconds(),
+    "grades": keys.texts(("navigation",)),
+    "first_seed": keys.count(0),
+    "methods": keys.tables(),
+    "cases": keys.tables(),
+    "baseline": keys.text(),
+}
+_METHODS: Final = {
+    "names": keys.texts(keys.REQUIRED),
+    "seeds": keys.positive_count(DEFAULT_SEEDS),
+}
+_CASE: Final = {
+    "name": keys.text(),
+    "kinds": keys.texts(("none",)),
+    "rates": keys.fractions((0.1,)),
+    "sizes_m_per_s": keys.pairs((None,)),
+    "duration_s": keys.seconds(),
+    "faults": keys.tables(),
+    "losses": keys.tables(),
+    "dropout_rate": keys.fraction(0.0),
+    "current": keys.table(),
+    "water_track": keys.table(),
+}
+_LOSS: Final = {
+    "beams": keys.counts(),
+    "start_s": keys.number(keys.REQUIRED),
+    "length_s": keys.seconds(keys.REQUIRED),
+}
+_FAULT: Final = {
+    **_LOSS,
+    "beams": keys.counts(keys.REQUIRED),
+    "turn_by_seed": keys.flag(False),
+    "shape": keys.text("constant"),
+    "offset_m_per_s": keys.numbers(),
+    "share": keys.number(),
+}
+_CURRENT: Final = {
+    "steady_enu_m_per_s": keys.three(),
+    "tide_m_per_s": keys.number(),
+    "tide_period_s": keys.number(),
+    "sigma_m_per_s": keys.number(),
+    "vertical_sigma_m_per_s": keys.number(),
+    "correlation_s": keys.number(),
+}
+_WATER_TRACK: Final = {
+    "noise_m_per_s": keys.number(),
+    "beams": keys.counts(),
+    "every": keys.count(),
+}
+
+
 def study_from(raw: dict[str, Any], *, where: str) -> Study:
     """Return the study that a parsed file describes."""
-    table = TomlTable(where, raw)
-    scenario = table.text("scenario", "survey")
+    table = keys.read_table(raw, "", _STUDY, file=where)
+    scenario = table["scenario"]
     if scenario not in SCENARIOS:
         hint = nearest_hint(scenario, SCENARIOS)
-        raise table.fault("scenario", expected="a known scenario", got=scenario, hint=hint)
-    duration_s = _positive(table, "duration_s", SCENARIOS[scenario].config.duration_s)
-    name = table.text("name")
-    grades = table.choices("grades", Grade, (Grade.NAVIGATION,))
-    first_seed = table.count("first_seed", 0)
-    methods = tuple(_method_set(entry) for entry in table.tables("methods"))
-    cells = [c for entry in table.tables("cases") for c in _cells(entry, scenario, duration_s)]
-    baseline = table.text("baseline") if table.has("baseline") else None
-    table.end()
+        raise table.fault("scenario", "a known scenario", scenario, hint)
+    config = SCENARIOS[scenario].config
+    config = replace(config, duration_s=table["duration_s"] or config.duration_s)
+    methods = tuple(
+        MethodSet(parse_methods(t["names"], where=f"{t.where} names"), t["seeds"])
+        for t in table.of("methods", _METHODS)
+    )
+    cells = [c for t in table.of("cases", _CASE) for c in _cells(t, scenario, config)]
     for key, given in (("methods", methods), ("cases", cells)):
         if not given:
             raise ConfigError(f"{where}: expected at least one [[{key}]], got none; see --help")
-    study = Study(name, _unique(where, cells), methods, grades, first_seed)
-    return _with_baseline(study, baseline, where)
+    grades = table.choices("grades", Grade)
+    study = Study(table["name"], _unique(where, cells), methods, grades, table["first_seed"])
+    return _with_baseline(study, table["baseline"], where)
 
 
 def _with_baseline(study: Study, baseline: str | None, where: str) -> Study:
@@ -134,59 +198,46 @@ def _unique(where: str, cells: Sequence[Cell]) -> tuple[Cell, ...]:
     return tuple(named.values())
 
 
-def _method_set(table: TomlTable) -> MethodSet:
-    names = parse_methods(table.texts("names"), where=f"{table.where} names")
-    group = MethodSet(names, table.count("seeds", DEFAULT_SEEDS, least=1))
-    table.end()
-    return group
-
-
-def _cells(table: TomlTable, scenario: str, duration_s: float) -> list[Cell]:
+def _cells(table: StudyTable, scenario: str, config: SimulationConfig) -> list[Cell]:
     """Return the cells of one ``[[cases]]``: every kind with every rate and size."""
-    name = table.text("name") if table.has("name") else None
-    outliers = _outliers(table)
-    duration_s = _positive(table, "duration_s", duration_s)
-    faults = tuple(_fault(entry, duration_s) for entry in table.tables("faults"))
-    losses = tuple(_loss(entry, duration_s) for entry in table.tables("losses"))
-    dropout_rate = _fraction(table, "dropout_rate", table.number("dropout_rate", 0.0))
-    current, water_track = read_current(table), read_water_track(table)
-    table.end()
+    name, outliers = table["name"], _outliers(table)
+    config = replace(config, duration_s=table["duration_s"] or config.duration_s)
+    case = replace(
+        Cell("", scenario, config.duration_s),
+        faults=tuple(_fault(entry, config) for entry in table.of("faults", _FAULT)),
+        losses=tuple(_loss(entry, config) for entry in table.of("losses", _LOSS)),
+        dropout_rate=table["dropout_rate"],
+        current=_made(CurrentSettings, table.of("current", _CURRENT)),
+        water_track=_made(WaterTrack, table.of("water_track", _WATER_TRACK)),
+    )
     if name is not None and len(outliers) > 1:
-        raise table.fault(
-            "name",
-            expected="a name for a single kind, rate and size only",
-            got=name,
-            hint="leave it out, the cases name themselves",
-        )
-    if name is None and (faults or losses or dropout_rate or current or water_track):
+        expected = "a name for a single kind, rate and size only"
+        raise table.fault("name", expected, name, "leave it out, the cases name themselves")
+    if name is None and case != Cell("", scenario, config.duration_s):
         raise ConfigError(
             f"{table.where} name: expected a name for a case with faults, losses, dropouts or "
             'currents, got nothing; try name = "fault"'
         )
-    case = replace(
-        Cell("", scenario, duration_s),
-        faults=faults,
-        losses=losses,
-        dropout_rate=dropout_rate,
-        current=current,
-        water_track=water_track,
-    )
     return [replace(case, case=name or _case_name(each), outliers=each) for each in outliers]
 
 
-def _outliers(table: TomlTable) -> list[Outliers]:
-    kinds = table.choices("kinds", OutlierKind, (OutlierKind.NONE,))
-    rates = tuple(_fraction(table, "rates", rate) for rate in table.numbers("rates", (0.1,)))
-    sizes = table.pairs("sizes_m_per_s") if table.has("sizes_m_per_s") else (None,)
+def _made(kind: Callable[..., _Made], tables: Sequence[StudyTable]) -> _Made | None:
+    """Return settings of the simulator whose fields are the keys without their unit."""
+    for table in tables:
+        given = {key.removesuffix("_m_per_s"): table[key] for key in table.settings.values}
+        return table.checked(partial(kind, **given))
+    return None
+
+
+def _outliers(table: StudyTable) -> list[Outliers]:
     found: dict[Outliers, None] = {}
-    for kind, rate, size in product(kinds, rates, sizes):
+    combined = product(table.choices("kinds", OutlierKind), table["rates"], table["sizes_m_per_s"])
+    for kind, rate, size in combined:
         if kind is OutlierKind.NONE:
             found[Outliers()] = None
             continue
-        try:
-            found[Outliers(kind, rate, None if kind in WITHOUT_SIZE else size)] = None
-        except ConfigError as error:
-            raise ConfigError(f"{table.where} sizes_m_per_s: {error}") from error
+        chosen = None if kind in WITHOUT_SIZE else size
+        found[table.checked(partial(Outliers, kind, rate, chosen), "sizes_m_per_s")] = None
     return list(found)
 
 
@@ -200,71 +251,55 @@ def _case_name(outliers: Outliers) -> str:
     return f"{name}_{outliers.size[0]:g}to{outliers.size[1]:g}"
 
 
-def _fault(table: TomlTable, duration_s: float) -> StudyFault:
-    start_s, length_s = _window(table, duration_s)
-    shape = table.choice("shape", FaultShape, FaultShape.CONSTANT)
+def _fault(table: StudyTable, config: SimulationConfig) -> StudyFault:
+    (shape,) = table.choices("shape", FaultShape)
     has_offset = shape in (FaultShape.CONSTANT, FaultShape.DRIFT)
+    for key, is_asked in (("offset_m_per_s", has_offset), ("share", shape is FaultShape.COVERED)):
+        if is_asked and table[key] is None:
+            raise table.settings.fault(key, f"the key is missing; expected {_FAULT[key].wanted}")
+        if not is_asked and table[key] is not None:
+            raise table.settings.fault(key, f"expected none with shape = {shape.name.lower()!r}")
+    start_s, length_s = _window(table, config)
     fault = StudyFault(
-        beams=_beams(table, table.counts("beams")),
+        beams=_beams(table, config),
         start_s=start_s,
         length_s=length_s,
-        offset_m_per_s=table.numbers("offset_m_per_s") if has_offset else (0.0,),
-        is_turned_by_seed=table.flag("turn_by_seed", False),
+        offset_m_per_s=table["offset_m_per_s"] or (0.0,),
+        is_turned_by_seed=table["turn_by_seed"],
         shape=shape,
-        share=table.number("share") if shape is FaultShape.COVERED else 0.0,
+        share=table["share"] or 0.0,
+        n_beams=config.dvl.mount.n_beams,
     )
-    table.end()
-    _checked(table, lambda: fault.of_trial(0))
+    table.checked(lambda: fault.of_trial(0))
     return fault
 
 
-def _loss(table: TomlTable, duration_s: float) -> Loss:
-    beams = _beams(table, table.counts("beams", ALL_BEAMS))
-    start_s, length_s = _window(table, duration_s)
-    table.end()
-    return _checked(table, lambda: Loss(start_s, start_s + length_s, beams))
+def _loss(table: StudyTable, config: SimulationConfig) -> Loss:
+    beams = _beams(table, config)
+    start_s, length_s = _window(table, config)
+    return table.checked(lambda: Loss(start_s, start_s + length_s, beams))
 
 
-def _window(table: TomlTable, duration_s: float) -> tuple[float, float]:
-    start_s, length_s = table.number("start_s"), _positive(table, "length_s")
-    if not 0.0 <= start_s < start_s + length_s <= duration_s:
+def _window(table: StudyTable, config: SimulationConfig) -> tuple[float, float]:
+    start_s, length_s = table["start_s"], table["length_s"]
+    if not 0.0 <= start_s < start_s + length_s <= config.duration_s:
         raise table.fault(
             "start_s",
-            expected=f"a window within the {duration_s:g} s of the mission",
-            got=f"{start_s:g} to {start_s + length_s:g} s",
-            hint="make duration_s longer, or begin earlier",
+            f"a window within the {config.duration_s:g} s of the mission",
+            f"{start_s:g} to {start_s + length_s:g} s",
+            "make duration_s longer, or begin earlier",
         )
     return start_s, length_s
 
 
-def _beams(table: TomlTable, beams: tuple[int, ...]) -> tuple[int, ...]:
-    if len(set(beams)) < len(beams) or not set(beams) <= set(ALL_BEAMS):
-        raise table.fault(
-            "beams", expected="different numbers from 0 to 3", got=beams, hint="beams count from 0"
-        )
+def _beams(table: StudyTable, config: SimulationConfig) -> tuple[int, ...]:
+    """Return the beams that are named, all where none is."""
+    known = range(config.dvl.mount.n_beams)
+    beams = tuple(known) if table["beams"] is None else table["beams"]
+    if len(set(beams)) < len(beams) or not set(beams) <= set(known):
+        expected = f"different numbers from 0 to {known[-1]}"
+        raise table.fault("beams", expected, beams, "beams count from 0")
     return beams
-
-
-def _checked(table: TomlTable, make: Callable[[], _Made]) -> _Made:
-    try:
-        return make()
-    except ConfigError as error:
-        raise ConfigError(f"{table.where}: {error}") from error
-
-
-def _positive(table: TomlTable, key: str, *default: float) -> float:
-    value = table.number(key, *default)
-    if value <= 0.0:
-        raise table.fault(key, expected="seconds above 0", got=value, hint="try 600")
-    return value
-
-
-def _fraction(table: TomlTable, key: str, value: float) -> float:
-    if not 0.0 <= value <= 1.0:
-        raise table.fault(
-            key, expected="a fraction between 0 and 1", got=value, hint="write 10 % as 0.1"
-        )
-    return value
 
 
 def study_of_folders(folders: Sequence[Path], methods: Sequence[str]) -> Study:

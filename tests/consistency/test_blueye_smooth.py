@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import ssm_graph as sg
-from ssm_graph.cli.run_mission import withhold_gnss
+from ssm_graph.evaluation import withhold_gnss
 from ssm_graph.evaluation.errors import error_series
 from ssm_graph.io.blueye.convert import convert_blueye
 

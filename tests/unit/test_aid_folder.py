@@ -15,8 +15,9 @@ from ssm_graph.io.mission_folder.reader import read_mission, write_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle, vehicle_of
 from ssm_graph.io.results.tables import read_results, write_results
 from ssm_graph.mission.estimate import Estimate
-from ssm_graph.mission.mission import AidLogs, Mission
+from ssm_graph.mission.mission import Aids, Mission
 from ssm_graph.mission.problem import build_problem
+from ssm_graph.sensors.acoustic import RangeLog
 from ssm_graph.simulation import SimulatedMission
 from ssm_graph.smoothers.batch import SsmSmoother
 from tests.aids_fixture import UNKNOWN, ranging, with_every_aid
@@ -34,10 +35,9 @@ def sim() -> SimulatedMission:
 def test_round_trip(tmp_path: Path, sim: SimulatedMission, order: str) -> None:
     """Every value comes back, several ranges of one time too, in either order of the rows."""
     aids = sim.mission.aids
-    assert aids.ranges is not None
-    together = aids.ranges.time_s.copy()
+    together = aids[RangeLog].time_s.copy()
     together[1::2] = together[0 : 2 * len(together[1::2]) : 2]  # both beacons answer one ping
-    mission = replace(sim.mission, aids=replace(aids, ranges=replace(aids.ranges, time_s=together)))
+    mission = replace(sim.mission, aids=aids.having(replace(aids[RangeLog], time_s=together)))
     write_mission(tmp_path, mission)
     path = tmp_path / "mission.toml"
     path.write_text(f'order = "{order}"\n' + path.read_text(encoding="utf-8"), encoding="utf-8")
@@ -53,7 +53,7 @@ def test_sections_say_what_there_is(tmp_path: Path, sim: SimulatedMission) -> No
     assert vehicle_of(sim.mission).further_aids == names
     write_mission(tmp_path, sim.mission)
     assert read_vehicle(tmp_path).further_aids == names
-    assert AidLogs().sections == ()
+    assert Aids().sections == ()
 
 
 def answer(mission: Mission) -> Estimate:
@@ -80,7 +80,7 @@ def test_results_tell_of_every_measurement(tmp_path: Path, sim: SimulatedMission
     calibration = read_results(tmp_path).summary["calibration"]
     assert calibration["beacon_7_east_m"]["prior_sigma"] == pytest.approx(40.0)
     assert calibration["heading_offset_deg"]["prior_sigma"] == pytest.approx(4.0)
-    plain = replace(sim.mission, aids=AidLogs())
+    plain = replace(sim.mission, aids=Aids())
     write_results(tmp_path, answer(plain), mission=plain, metrics=None, settings={})
     assert not (tmp_path / "aids.csv").exists()
     assert "aids" not in read_results(tmp_path).summary

@@ -9,7 +9,7 @@ import numpy as np
 
 from ssm_graph.base.frames import wrap_to_pi
 from ssm_graph.mission.estimate import Status
-from ssm_graph.mission.mission import AidLogs
+from ssm_graph.mission.mission import Aids
 from ssm_graph.mission.start.alignment import align
 from ssm_graph.mission.start.body_velocity import body_velocities
 from ssm_graph.sensors.compass import HeadingErrors
@@ -60,7 +60,7 @@ def test_a_compass_gives_the_heading_that_nothing_else_does() -> None:
     truth = sim.truth_at(np.array([start.time_s])).roll_pitch_heading[0, 2]
     assert abs(wrap_to_pi(start.heading - truth)) < start.attitude_sigma[2]
     assert start.attitude_sigma[2] < math.radians(12.0)
-    without = align(replace(sim.mission, aids=AidLogs()))
+    without = align(replace(sim.mission, aids=Aids()))
     assert len(without.candidates) > 1
     estimate = smooth(sim.mission)
     assert estimate.status is Status.CONVERGED
@@ -88,7 +88,7 @@ def test_a_standstill_is_a_velocity_of_zero() -> None:
     """In the place of the pings within it, whatever these say."""
     sim = hovering(Grade.TACTICAL, compass=None, route=HoverRoute())
     still = Standstill(20.0, 40.5)
-    at_rest = body_velocities(replace(sim.mission, aids=AidLogs(standstills=(still,))))
+    at_rest = body_velocities(replace(sim.mission, aids=Aids(still)))
     inside = (at_rest.time_s >= 20.0) & (at_rest.time_s <= 40.5)
     assert inside.sum() >= 21
     assert not at_rest.v_b[inside].any()

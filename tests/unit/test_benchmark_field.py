@@ -23,7 +23,7 @@ from benchmarks.field_runs import (
 )
 from ssm_graph.io.blueye.vehicle import GYRO_BIAS
 from ssm_graph.mission.mission import Mission
-from ssm_graph.report.mission.style import save
+from ssm_graph.report.style import save
 from ssm_graph.simulation import GnssSettings, Grade, scenario_config, simulate
 
 

@@ -21,7 +21,7 @@ from benchmarks.lag import (
     grade_lines,
     run_mission,
 )
-from ssm_graph.report.mission.style import save
+from ssm_graph.report.style import save
 
 
 def made_up(lags: tuple[str, ...]) -> Rows:

@@ -20,7 +20,7 @@ from benchmarks.soak_stream import (
     soak,
 )
 from ssm_graph.mission.navigation import Health
-from ssm_graph.report.mission.style import save
+from ssm_graph.report.style import save
 from ssm_graph.simulation import Grade
 
 GOOD, DEGRADED = HEALTHS.index(Health.GOOD), HEALTHS.index(Health.DEGRADED)

@@ -12,6 +12,7 @@ from ssm_graph.base.errors import DataError, MissingExtraError
 from ssm_graph.io.blueye.convert import GAP_S, convert_blueye, smooth_arrivals
 from ssm_graph.io.blueye.log import TOPICS, read_blueye_tables
 from ssm_graph.mission.mission import Mission
+from ssm_graph.sensors.compass import HeadingLog
 
 ROOT = Path(__file__).parents[2]
 LOGS = Path(os.environ.get("SSM_GRAPH_DATA", ROOT / "../shared/data")) / "blueye_x3"
@@ -124,7 +125,7 @@ def test_the_heading_of_the_dvl_turns_as_the_gyros_do(
 ) -> None:
     """To 2 degrees rms in two to four minutes, with up to 2000 of turns; a reset is bridged."""
     mission = missions[name]
-    imu, log = mission.imu, mission.aids.heading
+    imu, log = mission.imu, mission.aids.get(HeadingLog)
     assert log is not None
     angle = np.cumsum(imu.gyro_b[:, 2] * np.diff(imu.time_s, prepend=imu.start_s))
     off = np.unwrap(log.heading - np.interp(log.time_s, imu.time_s, angle))

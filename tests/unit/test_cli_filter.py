@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from ssm_graph.base.errors import ConfigError
-from ssm_graph.cli.filter import METHODS, method_from
+from ssm_graph.cli.filter import method_from
 from ssm_graph.cli.main import ExitCode, main
 from ssm_graph.io.results.tables import read_results
+from ssm_graph.study.methods import RECURSIVE as METHODS
 
 
 @pytest.fixture(scope="module")

@@ -13,17 +13,22 @@ from matplotlib.image import imread
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.mission.estimate import BeamTable
+from ssm_graph.report import style
 from ssm_graph.report.comparison.cells import Series, clean_case, end_error_cells, rate_sweeps
-from ssm_graph.report.comparison.figures import NAMES, save_figures
-from ssm_graph.report.comparison.missions import Example, draw_beam_weights, draw_errors_over_time
+from ssm_graph.report.comparison.figures import (
+    NAMES,
+    Example,
+    draw_beam_weights,
+    draw_errors_over_time,
+    save_figures,
+)
 from ssm_graph.report.comparison.runs import (
     draw_end_error,
     draw_error_against_rate,
     draw_error_against_size,
     draw_nees,
 )
-from ssm_graph.report.comparison.style import DEFAULT_METHODS, looks_of, shown_methods
-from ssm_graph.report.mission import style
+from ssm_graph.report.style import DEFAULT_METHODS, looks_of, shown_methods
 from tests.estimate_fixture import make_run
 
 NAN = math.nan
@@ -238,7 +243,7 @@ def test_beam_weights_contrast_per_beam_with_per_ping() -> None:
     methods = ("smoother-log", "ssmkf-log", "ssm-log")
     figure = draw_beam_weights(make_examples(methods), looks_of(methods))
     assert figure is not None
-    assert legend_texts(figure)[2:] == ["weight, ssm-log", "weight, ssmkf-log"]
+    assert legend_texts(figure)[3:] == ["weight, ssm-log", "weight, ssmkf-log"]
     assert len(figure.axes) == 8
     name, estimate, reference = make_examples()[0]
     bare = replace(estimate, beams=BeamTable(*[np.empty(0)] * 5))

@@ -10,9 +10,14 @@ import numpy as np
 import pytest
 
 from ssm_graph.evaluation import Comparison, compare_methods
-from ssm_graph.report.comparison.legend import LEGEND
-from ssm_graph.report.comparison.tables import latex, markdown
-from ssm_graph.report.comparison.text import digits, interval, probability
+from ssm_graph.report.comparison.tables import (
+    LEGEND,
+    digits,
+    interval,
+    latex,
+    markdown,
+    probability,
+)
 
 METHODS = ("oracle", "ekf-oracle", "ssm-log", "t_robust", "bad")
 

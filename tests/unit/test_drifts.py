@@ -13,7 +13,7 @@ from ssm_graph.mission.estimate import Status
 from ssm_graph.mission.problem import build_problem, with_dvl, with_stated_noise, with_white_noise
 from ssm_graph.sensors.drift import Drift
 from ssm_graph.simulation import DriftSettings, DvlSettings, GnssSettings
-from ssm_graph.simulation.drifts import draw_drift
+from ssm_graph.simulation.randomness import draw_drift
 from ssm_graph.smoothers.batch import SsmSmoother
 from tests.helpers import drifting, simulated
 

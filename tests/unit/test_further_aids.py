@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -18,9 +19,9 @@ from ssm_graph.graph.first_values import first_values
 from ssm_graph.graph.forward_aids import settled_weights
 from ssm_graph.graph.gtsam_graph import gtsam_graph
 from ssm_graph.mission.estimate import Determined, Status
-from ssm_graph.mission.mission import AidLogs
+from ssm_graph.mission.mission import Aids
 from ssm_graph.mission.problem import build_problem
-from ssm_graph.sensors.acoustic import RangeLog
+from ssm_graph.sensors.acoustic import RangeLog, UsblLog
 from ssm_graph.sensors.compass import HeadingLog
 from ssm_graph.sensors.standstill import Standstill
 from ssm_graph.simulation import (
@@ -45,25 +46,22 @@ def test_fixes_and_ranges_have_keyframes_of_when_they_were_valid() -> None:
     """Between the pings; a fix that came late goes back to its time."""
     sim = with_every_aid()
     problem, aids = build_problem(sim.mission), sim.mission.aids
-    assert aids.usbl is not None
-    assert aids.ranges is not None
     further = problem.further
     assert further.usbl is not None
     assert further.ranges is not None
-    np.testing.assert_allclose(problem.keyframe_s[further.usbl.keyframe], aids.usbl.valid_s)
-    np.testing.assert_allclose(problem.keyframe_s[further.ranges.keyframe], aids.ranges.time_s)
-    assert aids.usbl.valid_s[0] == pytest.approx(aids.usbl.time_s[0] - 1.5)
+    np.testing.assert_allclose(problem.keyframe_s[further.usbl.keyframe], aids[UsblLog].valid_s)
+    np.testing.assert_allclose(problem.keyframe_s[further.ranges.keyframe], aids[RangeLog].time_s)
+    assert aids[UsblLog].valid_s[0] == pytest.approx(aids[UsblLog].time_s[0] - 1.5)
     numbers = further.ranges.number[further.ranges.beacon]
-    np.testing.assert_array_equal(numbers, aids.ranges.beacon)
+    np.testing.assert_array_equal(numbers, aids[RangeLog].beacon)
 
 
 def test_what_lies_outside_is_left_out_and_said() -> None:
     """Fixes that were valid before the start."""
     sim = simulated(aids=usbl(delay_s=0.0, interval_s=2.0))
-    log = sim.mission.aids.usbl
-    assert log is not None
+    log = sim.mission.aids[UsblLog]
     late = replace(log, delay_s=np.where(np.arange(len(log.time_s)) < 3, 100.0, 0.0))
-    problem = build_problem(replace(sim.mission, aids=AidLogs(usbl=late)))
+    problem = build_problem(replace(sim.mission, aids=Aids(late)))
     assert problem.further.usbl is not None
     assert len(problem.further.usbl.keyframe) == len(log.time_s) - 3
     assert any("3 USBL fixes outside" in note for note in problem.notes)
@@ -73,18 +71,16 @@ def test_an_aid_without_a_measurement_in_the_mission_is_none() -> None:
     """Each kind beside another one, and all of them together."""
     sim = with_every_aid()
     aids = sim.mission.aids
-    assert aids.usbl is not None
-    assert aids.ranges is not None
-    assert aids.heading is not None
-    late = AidLogs(
-        usbl=replace(aids.usbl, time_s=aids.usbl.time_s + 1e3),
-        ranges=replace(aids.ranges, time_s=aids.ranges.time_s + 1e3),
-        heading=replace(aids.heading, time_s=aids.heading.time_s + 1e3),
-        standstills=(Standstill(1e3, 2e3),),
+    fixes, ranges, heading = (
+        replace(aids[UsblLog], time_s=aids[UsblLog].time_s + 1e3),
+        replace(aids[RangeLog], time_s=aids[RangeLog].time_s + 1e3),
+        replace(aids[HeadingLog], time_s=aids[HeadingLog].time_s + 1e3),
     )
+    still = Standstill(1e3, 2e3)
+    late = Aids(fixes, ranges, heading, still)
     for logs in (
-        replace(aids, standstills=late.standstills, usbl=late.usbl),
-        replace(aids, standstills=late.standstills, ranges=late.ranges, heading=late.heading),
+        aids.having(still).having(fixes),
+        aids.having(still).having(ranges).having(heading),
         late,
     ):
         estimate = SsmSmoother().solve(build_problem(replace(sim.mission, aids=logs)))
@@ -95,10 +91,9 @@ def test_an_aid_without_a_measurement_in_the_mission_is_none() -> None:
 def test_a_keyframe_has_one_heading_led_to_it_by_the_gyros() -> None:
     """At a quarter of a second from its reading, in a turn, and without noise, to 1e-4 rad."""
     sim = simulated(perfect_sensors=True, aids=compass(rate_hz=2.0), route=HoverRoute())
-    shifted = sim.mission.aids.heading
-    assert shifted is not None
+    shifted = sim.mission.aids[HeadingLog]
     shifted = replace(shifted, time_s=shifted.time_s + 0.25)  # its readings are of 0.25 s before
-    headings = build_problem(replace(sim.mission, aids=AidLogs(heading=shifted))).further.headings
+    headings = build_problem(replace(sim.mission, aids=Aids(shifted))).further.headings
     assert headings is not None
     assert len(np.unique(headings.keyframe)) == len(headings.keyframe)
     problem = build_problem(sim.mission)
@@ -113,7 +108,7 @@ def test_the_vehicle_stands_still_at_every_keyframe_of_a_standstill() -> None:
     """Where two overlap the stricter one counts."""
     sim = simulated()
     stills = (Standstill(3.0, 8.0), Standstill(6.0, 9.5, sigma=0.01))
-    problem = build_problem(replace(sim.mission, aids=AidLogs(standstills=stills)))
+    problem = build_problem(replace(sim.mission, aids=Aids(*stills)))
     further = problem.further.standstills
     assert further is not None
     time_s = problem.keyframe_s[further.keyframe]
@@ -302,7 +297,7 @@ def test_a_disturbed_compass_loses_its_weight() -> None:
     sim = simulated(duration_s=200.0, aids=compass(rate_hz=1.0, gross=GrossErrors(0.2, (0.3, 1.0))))
     estimate = SsmSmoother().solve(build_problem(sim.mission))
     assert estimate.status is Status.CONVERGED
-    table, log = estimate.aids, sim.mission.aids.heading
+    table, log = estimate.aids, sim.mission.aids.get(HeadingLog)
     assert table is not None
     assert log is not None
     reading = np.argmin(np.abs(log.time_s - table.time_s[:, None]), axis=1)
@@ -340,20 +335,16 @@ def test_what_a_compass_errs_by_is_found_within_its_sigma() -> None:
 def test_an_aid_that_contradicts_the_answer_is_named() -> None:
     """A datum that is 40 m off, and a compass mounted backwards."""
     sim = simulated(duration_s=120.0, aids=usbl(interval_s=2.0), gnss=None)
-    log = sim.mission.aids.usbl
-    assert log is not None
+    log = sim.mission.aids[UsblLog]
     wrong = replace(log, height=log.height + 200.0)
-    estimate = SsmSmoother().solve(build_problem(replace(sim.mission, aids=AidLogs(usbl=wrong))))
+    estimate = SsmSmoother().solve(build_problem(replace(sim.mission, aids=Aids(wrong))))
     assert estimate.status is Status.SUSPECT
     assert "USBL measurements contradict" in estimate.reason
     assert "datum" in estimate.reason
     sim = simulated(duration_s=60.0, aids=compass())
-    heading = sim.mission.aids.heading
-    assert heading is not None
+    heading = sim.mission.aids[HeadingLog]
     backwards = replace(heading, heading=heading.heading + np.pi)
-    estimate = SsmSmoother().solve(
-        build_problem(replace(sim.mission, aids=AidLogs(heading=backwards)))
-    )
+    estimate = SsmSmoother().solve(build_problem(replace(sim.mission, aids=Aids(backwards))))
     assert estimate.status is Status.SUSPECT
     assert "heading" in estimate.reason
 
@@ -361,7 +352,7 @@ def test_an_aid_that_contradicts_the_answer_is_named() -> None:
 def test_without_aids_nothing_changes() -> None:
     """The same mission, whether or not its aids are taken away: bit by bit that without them."""
     plain, aided = simulated(), with_every_aid()
-    taken = replace(aided.mission, aids=AidLogs())
+    taken = replace(aided.mission, aids=Aids())
     for log in ("imu", "dvl", "depth"):
         for name in ("time_s", "speed", "gyro_b", "depth"):
             if hasattr(getattr(plain.mission, log), name):
@@ -414,7 +405,7 @@ def test_at_rest_nothing_drifts() -> None:
         aids=AidSettings(standstills=(Standstill(0.0, 120.0),)),
     )
     apart = []
-    for mission in (sim.mission, replace(sim.mission, aids=AidLogs())):
+    for mission in (sim.mission, replace(sim.mission, aids=Aids())):
         estimate = SsmSmoother().solve(build_problem(mission))
         end = estimate.trajectory
         truth = sim.truth_at(end.time_s[-1:])
@@ -425,8 +416,7 @@ def test_at_rest_nothing_drifts() -> None:
 def test_logs_refuse_what_cannot_be() -> None:
     """Ranges to a beacon that nobody stated, and a standstill that ends before it begins."""
     sim = simulated(aids=ranging(UNKNOWN))
-    log = sim.mission.aids.ranges
-    assert log is not None
+    log = sim.mission.aids[RangeLog]
     with pytest.raises(DataError, match="numbers of the beacons"):
         RangeLog(
             beacons=log.beacons,
@@ -469,18 +459,18 @@ def test_plain_weights_ignore_the_posterior() -> None:
 def test_a_value_that_no_smoother_can_use_is_named(log: str, field: str, value: float) -> None:
     """In missions made in Python, which no reader has checked."""
     mission = with_every_aid(duration_s=10.0).mission
-    changed = getattr(getattr(mission.aids, log), field).copy()
+    whole = next(aid for aid in mission.aids if f"[{log}]" == aid.SECTION)
+    changed = getattr(whole, field).copy()
     changed.flat[-1] = value
-    spoilt = replace(getattr(mission.aids, log), **{field: changed})
+    spoilt = replace(cast(Any, whole), **{field: changed})
     with pytest.raises(DataError, match=f"aids.{log}.{field}"):
-        build_problem(replace(mission, aids=replace(mission.aids, **{log: spoilt})))
+        build_problem(replace(mission, aids=mission.aids.having(spoilt)))
 
 
 def test_a_beacon_known_along_one_axis_alone_is_named() -> None:
     """Its prior would be infinitely strong there."""
     mission = simulated(duration_s=10.0, aids=ranging(UNKNOWN)).mission
-    log = mission.aids.ranges
-    assert log is not None
+    log = mission.aids[RangeLog]
     flat = replace(log.beacons[0], position_sigma_enu=np.array([40.0, 40.0, 0.0]))
     with pytest.raises(DataError, match="number 7, position_sigma_enu"):
-        build_problem(replace(mission, aids=AidLogs(ranges=replace(log, beacons=(flat,)))))
+        build_problem(replace(mission, aids=Aids(replace(log, beacons=(flat,)))))

@@ -21,10 +21,10 @@ from ssm_graph.live.run.replay_source import ReplaySource
 from ssm_graph.live.run.run_folder import RunFolder
 from ssm_graph.live.run.run_summary import MOST_FAILURES, RunEnd, StopReason
 from ssm_graph.live.run.runner import Runner, RunnerConfig
-from ssm_graph.live.run.status import LinkState, RunStatus
 from ssm_graph.live.sockets.outputs import OutputFormat
 from ssm_graph.live.sockets.publisher import Every, Publisher
 from ssm_graph.mission.navigation import Event, Navigation, Severity
+from ssm_graph.mission.run_status import LinkState, RunStatus
 from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.sensors.messages import Message

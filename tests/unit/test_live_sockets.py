@@ -17,12 +17,12 @@ from ssm_graph.live.protocols.json_messages import JsonDecoder, encode_message
 from ssm_graph.live.protocols.nmea import NmeaDecoder
 from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
 from ssm_graph.live.run.feed import CHUNK, CountingDecoder, Limits
-from ssm_graph.live.run.status import LinkState
 from ssm_graph.live.sockets.endpoints import LOOPBACK, OUTPUTS, Endpoint, Transport, parse_endpoint
 from ssm_graph.live.sockets.listeners import TcpServerInput, UdpInput
 from ssm_graph.live.sockets.outputs import MAX_CLIENTS, MAX_WAITING, OutputFormat, TcpServerOutput
 from ssm_graph.live.sockets.sockets import InputConfig, OutputConfig, SocketHub
 from ssm_graph.mission.navigation import Severity
+from ssm_graph.mission.run_status import LinkState
 from ssm_graph.sensors.depth import DepthReading
 from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.gnss import Fix

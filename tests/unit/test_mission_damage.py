@@ -14,6 +14,8 @@ from hypothesis import strategies as st
 from ssm_graph.base.errors import SsmGraphError
 from ssm_graph.io.mission_folder.reader import read_mission
 from ssm_graph.mission.mission import Mission
+from ssm_graph.sensors.acoustic import RangeLog, UsblLog
+from ssm_graph.sensors.compass import HeadingLog
 from tests.mission_damage import AIDS_TABLES, aided
 from tests.mission_fixture import write_example
 
@@ -165,15 +167,20 @@ def assert_sound(mission: Mission) -> None:
         needed += [gnss.time_s, gnss.lat, gnss.lon, gnss.height, gnss.lever_arm_b]
         sigmas.append(gnss.sigma_enu)
     aids = mission.aids
-    if aids.usbl is not None:
-        needed += [aids.usbl.valid_s, aids.usbl.lat, aids.usbl.lon, aids.usbl.height]
-        sigmas.append(aids.usbl.sigma_enu)
-    if aids.ranges is not None:
-        needed += [aids.ranges.time_s, aids.ranges.range_m, aids.ranges.lever_arm_b]
-        sigmas.append(aids.ranges.sigma)
-    if aids.heading is not None:
-        needed += [aids.heading.time_s, aids.heading.heading]
-        sigmas.append(np.array([aids.heading.sigma, aids.heading.errors.correlation_s]))
+    if aids.get(UsblLog):
+        needed += [
+            aids[UsblLog].valid_s,
+            aids[UsblLog].lat,
+            aids[UsblLog].lon,
+            aids[UsblLog].height,
+        ]
+        sigmas.append(aids[UsblLog].sigma_enu)
+    if aids.get(RangeLog):
+        needed += [aids[RangeLog].time_s, aids[RangeLog].range_m, aids[RangeLog].lever_arm_b]
+        sigmas.append(aids[RangeLog].sigma)
+    if aids.get(HeadingLog):
+        needed += [aids[HeadingLog].time_s, aids[HeadingLog].heading]
+        sigmas.append(np.array([aids[HeadingLog].sigma, aids[HeadingLog].errors.correlation_s]))
     if mission.initial is not None:
         needed.append(mission.initial.velocity_enu)
         sigmas.append(mission.initial.attitude_sigma)

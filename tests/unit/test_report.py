@@ -15,10 +15,10 @@ from rich.console import Console, RenderableType
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.evaluation import evaluate
-from ssm_graph.mission.estimate import BeamTable, Estimate, Iteration, Status
+from ssm_graph.mission.estimate import OUTLIER_WEIGHT, BeamTable, Estimate, Iteration, Status
 from ssm_graph.report import ProgressDisplay, save_figure, summary_table
 from ssm_graph.report.mission.figure import draw_figure
-from ssm_graph.report.mission.style import (
+from ssm_graph.report.style import (
     broken_at_gaps,
     thinned,
     thinned_outliers_first,
@@ -145,6 +145,23 @@ def test_page_shows_errors_with_a_reference() -> None:
     for axes in figure.axes:
         for label in (axes.get_xlabel(), axes.get_ylabel()):
             assert label == "" or ", " in label
+
+
+@pytest.mark.parametrize("n_beams", [1, 3, 8])
+def test_page_and_table_of_any_number_of_beams(n_beams: int) -> None:
+    """A column of panels and a count of outliers for each beam that there is."""
+    estimate, reference = make_run(n=100, outlier_share=0.2)
+    beam = 1.0 + np.arange(len(estimate.beams.beam)) % n_beams
+    estimate = replace(estimate, beams=replace(estimate.beams, beam=beam), noise=None)
+    found = panels(draw_figure(estimate, reference))
+    named = [name for name in found if name.startswith("Beam ")]
+    assert named == [f"Beam {i + 1}" for i in range(n_beams)]
+    shown = text_of(summary_table(estimate))
+    (row,) = (line for line in shown.splitlines() if "outliers of beams" in line)
+    assert f"outliers of beams 1 to {n_beams} " in row
+    counts = [int(word) for word in row.split(f"1 to {n_beams}")[1].replace(",", " ").split()]
+    assert len(counts) == n_beams
+    assert sum(counts) == (estimate.beams.weight < OUTLIER_WEIGHT).sum()
 
 
 def test_page_shows_bounds_without_a_reference() -> None:

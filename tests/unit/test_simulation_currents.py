@@ -147,7 +147,8 @@ def test_what_is_stated_of_the_current() -> None:
         (lambda: CurrentSettings(steady_enu=(0.0, np.nan, 0.0)), "three finite numbers"),
         (lambda: WaterTrack(noise=0.0), "WaterTrack.noise"),
         (lambda: WaterTrack(every=1), "WaterTrack.every"),
-        (lambda: WaterTrack(beams=(4,)), "WaterTrack.beams"),
+        (lambda: SimulationConfig(water_track=WaterTrack(beams=(4,))), "WaterTrack.beams"),
+        (lambda: WaterTrack(beams=(1, 1)), "WaterTrack.beams"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(make: Any, words: str) -> None:

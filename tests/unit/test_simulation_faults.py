@@ -8,9 +8,26 @@ import numpy as np
 import pytest
 
 from ssm_graph.base.errors import ConfigError
-from ssm_graph.simulation import Fault, FaultShape, Loss, OutlierKind, Outliers
-from ssm_graph.simulation.faults import BeamFaults, draw_missing, draw_outliers
-from ssm_graph.simulation.programmed import add_faults
+from ssm_graph.simulation import (
+    CALM,
+    DvlSettings,
+    Fault,
+    FaultShape,
+    Loss,
+    OutlierKind,
+    Outliers,
+    SimulationConfig,
+    default_mount,
+    janus_beams,
+    simulate,
+)
+from ssm_graph.simulation.beam_faults import (
+    BeamFaults,
+    add_faults,
+    draw_dropouts,
+    draw_outliers,
+    lost_beams,
+)
 
 N = 4000
 TIMES = np.arange(1.0, N + 1.0)
@@ -139,11 +156,12 @@ def test_losses_and_dropouts() -> None:
         Loss(180.0, 780.0),
     )
     rng = np.random.default_rng(1)
-    left = 4 - draw_missing(TIMES, losses, dropout_rate=0.0, rng=rng).sum(axis=1)
+    lost = lost_beams(TIMES, 4, losses)
+    left = 4 - lost.sum(axis=1)
     assert [int(left[k]) for k in (30, 90, 150, 500, 2000)] == [3, 2, 1, 0, 4]
     assert (left == 0).sum() == 600
-    missing = draw_missing(TIMES, losses, dropout_rate=0.05, rng=rng)
-    assert missing[1000:].mean() == pytest.approx(0.05, abs=0.01)
+    missing = draw_dropouts(lost.shape, dropout_rate=0.05, rng=rng)
+    assert missing.mean() == pytest.approx(0.05, abs=0.01)
 
 
 def test_impossible_faults_are_refused() -> None:
@@ -153,9 +171,13 @@ def test_impossible_faults_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"Outliers\.size"):
         Outliers(OutlierKind.SPARSE, size=(3.0, 0.5))
     with pytest.raises(ConfigError, match=r"Outliers\.beam"):
-        Outliers(OutlierKind.BURST, beam=4)
+        SimulationConfig(outliers=Outliers(OutlierKind.BURST, beam=4))
     with pytest.raises(ConfigError, match=r"Fault\.beams: .* counted from 0"):
-        Fault(beams=(4,), start_s=0.0, end_s=1.0, offset_m_per_s=1.0)
+        SimulationConfig(faults=(Fault(beams=(4,), start_s=0.0, end_s=1.0, offset_m_per_s=1.0),))
+    with pytest.raises(ConfigError, match=r"Loss\.beams: .* out of 0\.\.2"):
+        SimulationConfig(dvl=velocity_dvl(), losses=(Loss(0.0, 1.0, beams=(3,)),))
+    with pytest.raises(ConfigError, match=r"Loss\.beams: .* got \(8,\)"):
+        Loss(0.0, 1.0, beams=(8,))
     with pytest.raises(ConfigError, match=r"Fault\.offset_m_per_s: expected 1 or 2 offsets"):
         Fault(beams=(0, 1), start_s=0.0, end_s=1.0, offset_m_per_s=(1.0, 2.0, 3.0))
     with pytest.raises(ConfigError, match=r"Fault\.offset_m_per_s: expected none with STUCK"):
@@ -166,3 +188,47 @@ def test_impossible_faults_are_refused() -> None:
         Loss(10.0, 10.0)
     with pytest.raises(ConfigError, match="Fault: expected"):
         Fault(beams=(0,), start_s=math.nan, end_s=1.0, offset_m_per_s=1.0)
+
+
+def velocity_dvl() -> DvlSettings:
+    """Return an instrument that gives a velocity alone."""
+    return DvlSettings(mount=default_mount(np.eye(3)))
+
+
+@pytest.mark.parametrize("n_beams", [1, 2, 3, 5, 8])
+@pytest.mark.parametrize("kind", list(OutlierKind))
+def test_faults_of_any_number_of_beams(n_beams: int, kind: OutlierKind) -> None:
+    """Outliers, faults, dropouts and losses reach every beam that there is, and no other."""
+    config = SimulationConfig(
+        duration_s=600.0,
+        imu_rate_hz=10.0,
+        waves=CALM,
+        dvl=DvlSettings(mount=default_mount(janus_beams(n_beams)), seabed_depth_m=60.0),
+        outliers=Outliers(kind, 0.4, beam=n_beams - 1),
+        faults=(Fault((n_beams - 1,), 500.0, 510.0, 2.0),),
+        losses=(Loss(520.0, 540.0), Loss(550.0, 560.0, beams=(n_beams - 1,))),
+        dropout_rate=0.05,
+        perfect_sensors=True,
+    )
+    run = simulate(config)
+    speed = run.mission.dvl.speed
+    assert speed.shape == run.is_outlier.shape == (600, n_beams)
+    assert run.mission.dvl.range_m is not None
+    ping_s = run.ping_time_s
+    assert np.isnan(speed[(ping_s >= 520.0) & (ping_s < 540.0)]).all()
+    last = speed[(ping_s >= 550.0) & (ping_s < 560.0)]
+    assert np.isnan(last[:, -1]).all()
+    assert n_beams == 1 or np.isfinite(last[:, 0]).mean() > 0.5
+    good = ~run.is_outlier & np.isfinite(speed)
+    np.testing.assert_allclose(speed[good], run.true_speed[good], atol=1e-12)
+    assert run.is_outlier[:, -1].sum() > (10 if kind is OutlierKind.NONE else 60) * 0.5
+
+
+def test_an_instrument_that_gives_a_velocity() -> None:
+    """Three beams along its axes read the velocity of the instrument, in its own axes."""
+    run = simulate(SimulationConfig(duration_s=60.0, dvl=velocity_dvl(), perfect_sensors=True))
+    mount = run.mission.dvl.mount
+    over_ground = simulate(SimulationConfig(duration_s=60.0, perfect_sensors=True)).mission.dvl
+    v_d = np.linalg.lstsq(over_ground.mount.beams_d, over_ground.speed.T, rcond=None)[0].T
+    np.testing.assert_allclose(run.mission.dvl.speed, v_d, atol=1e-9)
+    np.testing.assert_array_equal(mount.beams_d, np.eye(3))

@@ -15,6 +15,7 @@ from ssm_graph.mission.mission import NO_AIDS, Mission
 from ssm_graph.mission.start.alignment import align
 from ssm_graph.mission.start.body_velocity import BodyVelocities, body_velocities
 from ssm_graph.mission.start.start_fixes import NEAR_S, start_fixes
+from ssm_graph.sensors.acoustic import UsblLog
 from ssm_graph.simulation import GnssSettings, Grade, SimulatedMission
 from ssm_graph.smoothers.mission import smooth
 from tests.aids_fixture import KNOWN, ranging, usbl
@@ -30,10 +31,9 @@ def adrift(rate: float = 0.0, **changes: object) -> SimulatedMission:
 
 def first_wrong(mission: Mission, n_wrong: int) -> Mission:
     """Return the mission with its first fixes 300 m off to the north."""
-    log = mission.aids.usbl
-    assert log is not None
+    log = mission.aids[UsblLog]
     lat = log.lat + np.where(np.arange(len(log.lat)) < n_wrong, 300.0 / 6.4e6, 0.0)
-    return replace(mission, aids=replace(mission.aids, usbl=replace(log, lat=lat)))
+    return replace(mission, aids=mission.aids.having(replace(log, lat=lat)))
 
 
 def test_the_start_is_within_its_sigmas() -> None:
@@ -42,8 +42,7 @@ def test_the_start_is_within_its_sigmas() -> None:
     alignment = align(sim.mission)
     assert "position from USBL" in alignment.method
     start = alignment.candidates[0]
-    log = sim.mission.aids.usbl
-    assert log is not None
+    log = sim.mission.aids[UsblLog]
     assert start.time_s == log.valid_s[log.valid_s >= sim.mission.imu.start_s][0]
     truth = sim.truth_at(np.array([start.time_s]))
     off_n = sim.mission.frame.p_n_from_geodetic(
@@ -109,11 +108,10 @@ def test_without_fixes_the_error_says_what_to_try() -> None:
         align(replace(mission, aids=NO_AIDS))
     with pytest.raises(ConfigError, match=r"ranges to beacons alone give none: add \[initial\]"):
         align(adrift(aids=ranging(KNOWN)).mission)
-    log = mission.aids.usbl
-    assert log is not None
+    log = mission.aids[UsblLog]
     late = replace(log, time_s=log.time_s + 1e4)
     with pytest.raises(DataError, match=r"got fixes of USBL 10.*check the clocks"):
-        align(replace(mission, aids=replace(mission.aids, usbl=late)))
+        align(replace(mission, aids=mission.aids.having(late)))
 
 
 def test_usbl_says_where_on_earth(tmp_path: Path) -> None:
@@ -123,7 +121,7 @@ def test_usbl_says_where_on_earth(tmp_path: Path) -> None:
     path = tmp_path / "mission.toml"
     before, _, after = path.read_text().partition("[origin]\n")
     path.write_text(before + after[after.index("\n[") :])
-    log, got = mission.aids.usbl, read_mission(tmp_path)
+    log, got = mission.aids[UsblLog], read_mission(tmp_path)
     assert log is not None
     np.testing.assert_allclose([got.frame.lat, got.frame.lon], [log.lat[0], log.lon[0]])
     assert got.frame.height == pytest.approx(log.height[0])

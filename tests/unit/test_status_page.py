@@ -10,13 +10,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from ssm_graph.cli.online import view_of
-from ssm_graph.live.run.status import Latency, LinkState, OutputStatus, RunStatus, SourceStatus
 from ssm_graph.mission.estimate import CalibratedValue, Calibration, CurrentTrack, Found
 from ssm_graph.mission.navigation import Event, Health, Severity
+from ssm_graph.mission.run_status import Latency, LinkState, OutputStatus, RunStatus, SourceStatus
 from ssm_graph.report.terminal.status_page import (
     StatusPage,
-    StatusView,
     plain_line,
     render,
     weight_bar,
@@ -52,16 +50,16 @@ STATUS = RunStatus(
 )
 
 
-def text_of(view: StatusView, *, width: int = 80) -> str:
+def text_of(status: RunStatus, *, width: int = 80) -> str:
     """Return the page as plain text."""
     stream = io.StringIO()
-    Console(file=stream, width=width).print(render(view))
+    Console(file=stream, width=width).print(render(status))
     return stream.getvalue()
 
 
 def test_the_page_has_everything() -> None:
     """Health and reason, all states with sigmas and units, beams, sources, events, disk."""
-    text = text_of(view_of(STATUS), width=100)
+    text = text_of(STATUS, width=100)
     for expected in (
         "otter [2]",
         "1:02:03",
@@ -93,7 +91,7 @@ def test_the_page_has_everything() -> None:
         "runs/1",
     ):
         assert expected in text, f"{expected!r} is missing in\n{text}"
-    narrow = text_of(view_of(STATUS))
+    narrow = text_of(STATUS)
     assert "heading 350.00 ±0.5°" in narrow
     assert "last aid 0.2 s ago" in narrow
     row = next(line for line in text.splitlines() if "16171" in line)
@@ -102,7 +100,7 @@ def test_the_page_has_everything() -> None:
 
 def test_the_page_before_the_first_answer() -> None:
     """What is waited for stands where the answer will be."""
-    view = StatusView(
+    view = RunStatus(
         "otter",
         "runs/1",
         0.0,
@@ -125,13 +123,13 @@ def test_the_page_before_the_first_answer() -> None:
 
 def test_a_plain_line_says_the_most_important() -> None:
     """One line without markup; the reason where all is not well."""
-    line = plain_line(view_of(STATUS))
+    line = plain_line(STATUS)
     assert line.startswith("1:02:03; GOOD; lat 40.1070457 lon -40.1070457 deg; height -20.00 m; ")
     assert "sigma 0.50 m; heading 350.0 deg; bottom lock" in line
     assert "dvl waiting 8/s" in line
     assert "all is well" not in line
     navigation = a_navigation(1.0, health=Health.BAD, bottom_lock=False, since_aid_s=math.inf)
-    bad = StatusView("otter", "", 0.0, 1, navigation, "it has run away")
+    bad = RunStatus("otter", "", 0.0, 1, navigation, "it has run away")
     assert "BAD" in plain_line(bad)
     assert "no bottom lock" in plain_line(bad)
     assert "last aid not yet" in text_of(bad)
@@ -142,7 +140,7 @@ def test_without_a_terminal_a_line_every_ten_seconds() -> None:
     stream, now = io.StringIO(), [0.0]
     with StatusPage(Console(file=stream, width=80), steady_s=lambda: now[0]) as show:
         for _ in range(41):
-            show(view_of(STATUS))
+            show(STATUS)
             now[0] += 0.5
     lines = stream.getvalue().splitlines()
     assert len(lines) == 3
@@ -154,8 +152,8 @@ def test_on_a_terminal_the_page_is_drawn_again() -> None:
     stream = io.StringIO()
     console = Console(file=stream, width=120, force_terminal=True, color_system="standard")
     with StatusPage(console) as show:
-        show(view_of(STATUS))
-        show(view_of(STATUS))
+        show(STATUS)
+        show(STATUS)
     assert "\x1b[1;32m GOOD" in stream.getvalue()
 
 
@@ -178,9 +176,21 @@ def test_the_page_has_what_was_found_besides() -> None:
         ),
         CurrentTrack(np.zeros(1), np.array([[0.3, -0.4, 0.0]]), np.diag([0.01, 0.04, 0.0])[None]),
     )
-    text = text_of(view_of(replace(STATUS, found=found)), width=100)
+    text = text_of(replace(STATUS, found=found), width=100)
     assert "dvl_mounting_z_deg +2 ±0.2" in text
     assert "current  east +0.30 ±0.10  north -0.40 ±0.20" in text
-    plain = text_of(view_of(STATUS))
+    plain = text_of(STATUS)
     assert "off what is stated" not in plain
     assert "current" not in plain
+
+
+@pytest.mark.parametrize("n_beams", [1, 3, 8])
+def test_the_page_has_every_beam(n_beams: int) -> None:
+    """However many the instrument has; what does not fit goes on in the next line."""
+    weights = np.linspace(1.0, 0.0, n_beams)
+    navigation = a_navigation(100.0, 0.7, beam_weights=weights)
+    page = text_of(replace(STATUS, navigation=navigation))
+    shown = " ".join(page.replace("│", "").split())
+    for number, weight in enumerate(weights, start=1):
+        assert f" {number}{weight_bar(weight)} {weight:.2f}" in shown
+    assert f" {n_beams + 1}{weight_bar(0.0)}" not in shown

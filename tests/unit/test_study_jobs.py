@@ -28,8 +28,8 @@ from ssm_graph.smoothers.batch import SsmSmoother
 from ssm_graph.study.cluster import merged
 from ssm_graph.study.jobs import Job, do_job
 from ssm_graph.study.methods import FAMILIES, Family
-from ssm_graph.study.plan import missing_jobs, wanted_keys
 from ssm_graph.study.processes import best_job
+from ssm_graph.study.runner import missing_jobs, wanted_keys
 from ssm_graph.study.scoring import COLUMNS, beam_truth
 from ssm_graph.study.trials import (
     CACHE,
@@ -170,7 +170,7 @@ def test_failure_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
     """One method that breaks neither ends the job nor disappears."""
 
     def make(_: float | None) -> Any:
-        def solve(_: Any) -> Any:
+        def solve(_: Any, __: Any) -> Any:
             raise SolverError("no finite solution")
 
         return solve

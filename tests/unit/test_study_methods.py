@@ -55,7 +55,7 @@ def test_bad_names_are_refused(text: str, message: str) -> None:
 def fake_solver(bad: int, error: Exception, calls: list[int]) -> Any:
     """Return a solver that cannot do trial ``bad``; it returns trials for estimates."""
 
-    def solve(trials: Sequence[Trial]) -> list[Estimate]:
+    def solve(trials: Sequence[Trial], _: object) -> list[Estimate]:
         calls.append(len(trials))
         if bad in cast(Sequence[int], trials):
             raise error

@@ -13,7 +13,7 @@ from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.mission.current import CURRENT
 from ssm_graph.simulation import CurrentSettings, FaultShape, Grade, Loss, OutlierKind, WaterTrack
 from ssm_graph.study.cells import Cell
-from ssm_graph.study.plan import wanted_keys
+from ssm_graph.study.runner import wanted_keys
 from ssm_graph.study.scenario import Study, read_study, study_from, study_of_folders
 from ssm_graph.study.trials import MissionCache, simulated_trials
 from tests.study_fixture import SPARSE, TINY, tiny_study
@@ -108,7 +108,7 @@ def test_slow_faults_have_a_shape() -> None:
     assert (drift.shape, drift.offset_m_per_s) == (FaultShape.DRIFT, 0.1)
     assert (covered.shape, covered.share) == (FaultShape.COVERED, 0.3)
     assert stuck.shape is FaultShape.STUCK
-    with pytest.raises(ConfigError, match="share: expected a finite number, got nothing"):
+    with pytest.raises(ConfigError, match="share: the key is missing; expected a finite number"):
         cells_of({"name": "f", "faults": [{**window, "shape": "covered"}]})
     with pytest.raises(ConfigError, match="shape: expected some of constant, drift"):
         cells_of({"name": "f", "faults": [{**window, "shape": "silt"}]})
@@ -198,17 +198,17 @@ def test_cells_in_other_waters_share_no_mission() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"grade": ["mems"]}, "tiny.toml: unknown key 'grade'; did you mean 'grades'"),
+        ({"grade": ["mems"]}, "tiny.toml grade: unknown key; did you mean 'grades'"),
         ({"grades": ["MEMS"]}, "tiny.toml grades: expected some of .*, got 'MEMS'"),
         ({"scenario": "surve"}, "tiny.toml scenario: .* did you mean 'survey'"),
         ({"name": 3}, "tiny.toml name: expected a text in quotes, got 3"),
         ({"duration_s": 0}, "duration_s: expected seconds above 0, got 0"),
-        ({"duration_s": True}, "duration_s: expected a finite number, got True"),
+        ({"duration_s": True}, "duration_s: expected seconds above 0, got True"),
         ({"first_seed": -1}, "first_seed: expected a whole number from 0, got -1"),
         ({"methods": []}, "methods: expected tables"),
         ({"methods": [{"names": ["orakel"]}]}, r"\[\[methods\]\] 1 names: .*mean 'oracle'"),
         ({"methods": [{"names": ["oracle"], "seeds": 0}]}, "seeds: expected a whole number from 1"),
-        ({"methods": [{"names": ["oracle"], "seed": 1}]}, "unknown key 'seed'; .*'seeds'"),
+        ({"methods": [{"names": ["oracle"], "seed": 1}]}, "seed: unknown key; .*'seeds'"),
         ({"baseline": "smoother-exp"}, "baseline: expected a method of the study"),
         ({"cases": [{"kinds": ["sparce"]}]}, r"\[\[cases\]\] 1 kinds: .*did you mean 'sparse'"),
         ({"cases": [{"rates": [10]}]}, "rates: expected a fraction between 0 and 1"),
@@ -245,7 +245,7 @@ def test_cells_in_other_waters_share_no_mission() -> None:
         ({"cases": [{"current": {"tide_m_per_s": 0.2}}]}, "name: expected a name for a case with"),
         (
             {"cases": [{"name": "x", "current": {"tide": 0.2}}]},
-            r"\[\[cases\]\] 1 current: unknown key 'tide'; .*tide_m_per_s",
+            r"\[\[cases\]\] 1 current tide: unknown key; .*tide_m_per_s",
         ),
         (
             {"cases": [{"name": "x", "current": {"steady_enu_m_per_s": [1, 2]}}]},
@@ -260,7 +260,10 @@ def test_cells_in_other_waters_share_no_mission() -> None:
             "1 water_track: WaterTrack.every: expected 0, or 2 and more, got 1",
         ),
         ({"cases": [{"name": "x", "water_track": 3}]}, "water_track: expected a table of keys"),
-        ({"cases": [{"name": "x", "faults": [LOSS]}]}, "beams: expected a list of whole numbers"),
+        (
+            {"cases": [{"name": "x", "faults": [LOSS]}]},
+            "beams: the key is missing; expected a list of whole",
+        ),
     ],
 )
 def test_bad_studies_are_refused(changes: dict[str, Any], message: str) -> None:

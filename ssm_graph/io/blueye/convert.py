@@ -46,7 +46,7 @@ from ssm_graph.io.blueye.vehicle import (
     gnss_calibration,
 )
 from ssm_graph.io.blueye.witness import compare_imus
-from ssm_graph.mission.mission import AidLogs, Mission
+from ssm_graph.mission.mission import Aids, Mission
 from ssm_graph.sensors.depth import DepthLog
 from ssm_graph.sensors.dvl import N_BEAMS, DvlLog
 from ssm_graph.sensors.gnss import GnssLog
@@ -100,7 +100,7 @@ def convert_blueye(log: Path) -> Mission:
         dvl=dvl,
         depth=depth,
         gnss=gnss,
-        aids=AidLogs(heading=heading),
+        aids=Aids(heading),
         notes=(
             *imu_notes,
             *compare_imus(imu, tables.witness),

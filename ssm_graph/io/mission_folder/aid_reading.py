@@ -12,7 +12,7 @@ from ssm_graph.io.mission_folder.toml import MissionToml
 from ssm_graph.io.mission_folder.units import to_si
 from ssm_graph.io.tables.settings import Settings
 from ssm_graph.io.tables.table import POSITION_SIGMA, Table
-from ssm_graph.mission.mission import AidLogs
+from ssm_graph.mission.mission import Aids
 from ssm_graph.sensors.acoustic import Beacon, RangeLog, UsblLog
 from ssm_graph.sensors.compass import HeadingErrors, HeadingLog
 from ssm_graph.sensors.standstill import Standstill
@@ -20,7 +20,7 @@ from ssm_graph.sensors.standstill import Standstill
 _DEFAULT_STANDSTILL = Standstill(0.0, 1.0)
 
 
-def read_aids(tables: dict[str, Table], toml: MissionToml) -> tuple[AidLogs, list[str]]:
+def read_aids(tables: dict[str, Table], toml: MissionToml) -> tuple[Aids, list[str]]:
     """Return the further aids of a mission, and notes on what is odd about them."""
     notes: list[str] = []
     usbl, ranges, heading = None, None, None
@@ -37,7 +37,7 @@ def read_aids(tables: dict[str, Table], toml: MissionToml) -> tuple[AidLogs, lis
         notes += check_heading(tables["heading"])
         heading = _heading(tables["heading"], toml["heading"])
     standstills = tuple(_standstill(settings, tables) for settings in toml.lists["standstill"])
-    return AidLogs(usbl, ranges, heading, standstills), notes
+    return Aids(usbl, ranges, heading, *standstills), notes
 
 
 def sections_of_aids(toml: MissionToml) -> tuple[str, ...]:

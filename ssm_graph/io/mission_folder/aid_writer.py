@@ -9,45 +9,46 @@ import numpy as np
 from ssm_graph.base.frozen import Array
 from ssm_graph.io.mission_folder.units import from_si
 from ssm_graph.io.tables.table import POSITION_SIGMA, TIME
-from ssm_graph.mission.mission import AidLogs
-from ssm_graph.sensors.acoustic import Beacon, RangeLog
+from ssm_graph.mission.mission import Aids
+from ssm_graph.sensors.acoustic import Beacon, RangeLog, UsblLog
 from ssm_graph.sensors.compass import HeadingLog
+from ssm_graph.sensors.standstill import Standstill
 
 
-def aid_settings(aids: AidLogs, suffix: str) -> dict[str, Any]:
+def aid_settings(aids: Aids, suffix: str) -> dict[str, Any]:
     """Return the sections of ``mission.toml``; ``suffix`` is the ending of the tables' names."""
     settings: dict[str, Any] = {}
-    if aids.usbl is not None:
+    if aids.get(UsblLog):
         settings["usbl"] = {
             "file": f"usbl{suffix}",
-            "lever_arm_m": aids.usbl.lever_arm_b.tolist(),
+            "lever_arm_m": aids[UsblLog].lever_arm_b.tolist(),
         }
-    if aids.ranges is not None:
+    if aids.get(RangeLog):
         settings["ranges"] = {
             "file": f"ranges{suffix}",
-            "noise_m": _nominal_sigma(aids.ranges),
-            "lever_arm_m": aids.ranges.lever_arm_b.tolist(),
+            "noise_m": _nominal_sigma(aids[RangeLog]),
+            "lever_arm_m": aids[RangeLog].lever_arm_b.tolist(),
         }
-        settings["beacon"] = [_beacon(beacon) for beacon in aids.ranges.beacons]
-    if aids.heading is not None:
-        settings["heading"] = {"file": f"heading{suffix}", **_heading(aids.heading)}
-    if aids.standstills:
+        settings["beacon"] = [_beacon(beacon) for beacon in aids[RangeLog].beacons]
+    if aids.get(HeadingLog):
+        settings["heading"] = {"file": f"heading{suffix}", **_heading(aids[HeadingLog])}
+    if aids.all(Standstill):
         settings["standstill"] = [
             {
                 "begin_s": float(still.begin_s),
                 "end_s": float(still.end_s),
                 "sigma_m_per_s": float(still.sigma),
             }
-            for still in aids.standstills
+            for still in aids.all(Standstill)
         ]
     return settings
 
 
-def aid_tables(aids: AidLogs) -> dict[str, dict[str, Array]]:
+def aid_tables(aids: Aids) -> dict[str, dict[str, Array]]:
     """Return the columns of the tables that there are."""
     tables = {}
-    if aids.usbl is not None:
-        log = aids.usbl
+    if aids.get(UsblLog):
+        log = aids[UsblLog]
         tables["usbl"] = {
             TIME: log.time_s,
             "lat_deg": np.degrees(log.lat),
@@ -56,11 +57,11 @@ def aid_tables(aids: AidLogs) -> dict[str, dict[str, Array]]:
             **{name: log.sigma_enu[:, i] for i, name in enumerate(POSITION_SIGMA)},
             "delay_s": log.delay_s,
         }
-    if aids.ranges is not None:
-        tables["ranges"] = _range_table(aids.ranges)
-    if aids.heading is not None:
-        read = np.degrees(aids.heading.heading)
-        tables["heading"] = {TIME: aids.heading.time_s, "heading_deg": read}
+    if aids.get(RangeLog):
+        tables["ranges"] = _range_table(aids[RangeLog])
+    if aids.get(HeadingLog):
+        read = np.degrees(aids[HeadingLog].heading)
+        tables["heading"] = {TIME: aids[HeadingLog].time_s, "heading_deg": read}
     return tables
 
 

@@ -6,11 +6,12 @@ import numpy as np
 
 from ssm_graph.mission.estimate import Calibration, Determined
 from ssm_graph.mission.mission import Mission
+from ssm_graph.sensors.acoustic import RangeLog
 
 
 def beacon_lines(mission: Mission, calibration: Calibration) -> list[str]:
     """Return a section ``[[beacon]]`` for each whose place was estimated."""
-    ranges, lines = mission.aids.ranges, []
+    ranges, lines = mission.aids.get(RangeLog), []
     for beacon in ranges.beacons if ranges is not None else ():
         found = [v for v in calibration.values if v.variable == f"beacon_{beacon.number}"]
         if not found:

@@ -15,6 +15,7 @@ from ssm_graph.io.mission_folder.beacon_toml import beacon_lines
 from ssm_graph.io.mission_folder.units import rpy_from_R_bd
 from ssm_graph.mission.estimate import CalibratedValue, Calibration, Determined
 from ssm_graph.mission.mission import Mission
+from ssm_graph.sensors.compass import HeadingLog
 
 CALIBRATION_NAME: Final = "calibration.toml"
 
@@ -65,8 +66,7 @@ def _gnss_late(mission: Mission) -> float:
 
 
 def _declination_deg(mission: Mission, off: Array, axes: BodyAxes) -> Array:  # noqa: ARG001
-    assert mission.aids.heading is not None
-    return np.degrees(mission.aids.heading.declination - off)
+    return np.degrees(mission.aids[HeadingLog].declination - off)
 
 
 _KEYS: Final[Mapping[str, _Key]] = {

@@ -46,6 +46,16 @@ class Key:
             text += f" not below {self.low:g}"
         return text
 
+    def problem(self, value: Any) -> str:
+        """Return "" for a good value, "type" or "range" for a bad one."""
+        if self.shape is None:
+            return "" if isinstance(value, str) and value.strip() else "type"
+        numbers = _numbers(value, self.shape)
+        if numbers is None or not all(math.isfinite(number) for number in numbers):
+            return "type"
+        low_ok = all(x > 0.0 for x in numbers) if self.positive else min(numbers) >= self.low
+        return "" if low_ok and max(numbers) <= self.high else "range"
+
 
 def sigma_key(high: float, hint: str = "", *, required: bool = True) -> Key:
     """Return the key of a standard deviation: above zero."""
@@ -116,20 +126,20 @@ def read_settings(
     file : the file's name in messages.
     may_miss : required keys that this file can do without.
     """
-    place = place_of(section)
+    place = f"{file} {place_of(section)}".rstrip()
     if not isinstance(raw, dict):
-        raise ConfigError(f"{file} {place}: expected a section, got {shown(raw)}")
+        raise ConfigError(f"{place}: expected a section, got {shown(raw)}")
     for key in raw:
         if key not in known:
             missing = [name for name in known if name not in raw]
             hint = nearest_hint(key, missing or known)
-            raise ConfigError(f"{file} {place} {key}: unknown key; {hint}")
+            raise ConfigError(f"{place} {key}: unknown key; {hint}")
     for name, key in known.items():
         if key.required and name not in raw and name not in may_miss:
-            raise ConfigError(f"{file} {place} {name}: the key is missing; expected {key.wanted}")
+            raise ConfigError(f"{place} {name}: the key is missing; expected {key.wanted}")
     settings = Settings(section, {name: _plain(value) for name, value in raw.items()}, file)
     for name, value in settings.values.items():
-        problem = _problem(known[name], value)
+        problem = known[name].problem(value)
         if problem:
             tail = f"; {known[name].hint}" if known[name].hint and problem == "range" else ""
             raise settings.fault(
@@ -140,7 +150,7 @@ def read_settings(
 
 def place_of(section: str) -> str:
     """Return a section's name as it stands in the file."""
-    return section if section.startswith("[[") else f"[{section}]"
+    return section if section.startswith("[[") or not section else f"[{section}]"
 
 
 def shown(value: object) -> str:
@@ -159,17 +169,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, int) and not isinstance(value, bool):
         return float(value) if abs(value) < 10**300 else math.inf
     return value
-
-
-def _problem(key: Key, value: Any) -> str:
-    """Return "" for a good value, "type" or "range" for a bad one."""
-    if key.shape is None:
-        return "" if isinstance(value, str) and value.strip() else "type"
-    numbers = _numbers(value, key.shape)
-    if numbers is None or not all(math.isfinite(number) for number in numbers):
-        return "type"
-    low_ok = all(x > 0.0 for x in numbers) if key.positive else min(numbers) >= key.low
-    return "" if low_ok and max(numbers) <= key.high else "range"
 
 
 def _numbers(value: Any, shape: tuple[int, ...]) -> list[float] | None:

@@ -11,8 +11,8 @@ from ssm_graph.base.errors import ConfigError
 from ssm_graph.live.protocols.decoder import Decoder
 from ssm_graph.live.protocols.framing import TokenBucket
 from ssm_graph.live.run.notices import BURST, Notices
-from ssm_graph.live.run.status import LinkState, SourceStatus
 from ssm_graph.mission.navigation import Severity
+from ssm_graph.mission.run_status import LinkState, SourceStatus
 from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.sensors.messages import Message
 

@@ -6,10 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.live.run.status import SourceStatus
 from ssm_graph.live.sockets.publisher import Outlet
 from ssm_graph.mission.estimate import BeamTable, CurrentTrack, Found, Trajectory
 from ssm_graph.mission.navigation import Event, Health, Navigation
+from ssm_graph.mission.run_status import SourceStatus
 from ssm_graph.sensors.messages import Message
 
 

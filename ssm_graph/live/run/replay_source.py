@@ -8,8 +8,8 @@ from itertools import islice
 from typing import Final
 
 from ssm_graph.base.errors import ConfigError
-from ssm_graph.live.run.status import LinkState, SourceStatus
 from ssm_graph.mission.navigation import Event
+from ssm_graph.mission.run_status import LinkState, SourceStatus
 from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.sensors.messages import Message
 

@@ -13,10 +13,10 @@ from ssm_graph.live.run.interfaces import Connect, Connections, Delayed, Engine,
 from ssm_graph.live.run.notices import Notices
 from ssm_graph.live.run.run_folder import Resumed, RunFolder
 from ssm_graph.live.run.run_summary import MOST_FAILURES, RunEnd, StopReason, summary_of
-from ssm_graph.live.run.status import Latency, RunStatus
 from ssm_graph.live.sockets.publisher import Every, Outlet, Publisher
 from ssm_graph.mission.estimate import Found
 from ssm_graph.mission.navigation import Event, Navigation, Severity
+from ssm_graph.mission.run_status import Latency, RunStatus
 from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.sensors.messages import Message
 

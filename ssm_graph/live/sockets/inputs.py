@@ -9,9 +9,9 @@ import socket
 from abc import ABC, abstractmethod
 
 from ssm_graph.live.run.feed import CHUNK, Channel, Feed, Now
-from ssm_graph.live.run.status import LinkState, SourceStatus
 from ssm_graph.live.sockets.endpoints import Endpoint, resolve
 from ssm_graph.mission.navigation import Severity
+from ssm_graph.mission.run_status import LinkState, SourceStatus
 from ssm_graph.sensors.messages import Message
 
 

@@ -8,10 +8,10 @@ from typing import Final
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.live.run.feed import CHUNK, Channel, Feed, Now
-from ssm_graph.live.run.status import LinkState, SourceStatus
 from ssm_graph.live.sockets.endpoints import Endpoint, Transport, resolve
 from ssm_graph.live.sockets.inputs import Input
 from ssm_graph.mission.navigation import Severity
+from ssm_graph.mission.run_status import LinkState, SourceStatus
 from ssm_graph.sensors.messages import Message
 
 MAX_DATAGRAMS: Final = 64

@@ -10,10 +10,10 @@ from typing import Final
 
 from ssm_graph.live.run.feed import CHUNK, Now
 from ssm_graph.live.run.notices import Notices
-from ssm_graph.live.run.status import OutputStatus
 from ssm_graph.live.sockets.endpoints import Endpoint, resolve
 from ssm_graph.live.sockets.listeners import bound
 from ssm_graph.mission.navigation import Severity
+from ssm_graph.mission.run_status import OutputStatus
 
 MAX_CLIENTS: Final = 8
 MAX_WAITING: Final = 64 * 1024

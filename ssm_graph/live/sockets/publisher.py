@@ -7,9 +7,9 @@ from typing import Final, Protocol
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.live.protocols.json_messages import encode_navigation
 from ssm_graph.live.protocols.nmea_encoder import encode_nmea
-from ssm_graph.live.run.status import OutputStatus
 from ssm_graph.live.sockets.outputs import OutputFormat
 from ssm_graph.mission.navigation import Navigation
+from ssm_graph.mission.run_status import OutputStatus
 
 _ROUNDING: Final = 1e-6
 """Of a period: sampling times are not exact."""

@@ -11,12 +11,12 @@ from typing import Self
 
 from ssm_graph.live.run.feed import CountingDecoder, Feed, Limits, Now
 from ssm_graph.live.run.notices import Notices
-from ssm_graph.live.run.status import OutputStatus, SourceStatus
 from ssm_graph.live.sockets.endpoints import Endpoint, Transport
 from ssm_graph.live.sockets.inputs import Input, TcpClientInput
 from ssm_graph.live.sockets.listeners import TcpServerInput, UdpInput
 from ssm_graph.live.sockets.outputs import Output, OutputFormat, TcpServerOutput, UdpOutput
 from ssm_graph.mission.navigation import Event
+from ssm_graph.mission.run_status import OutputStatus, SourceStatus
 from ssm_graph.sensors.messages import Message
 
 

@@ -42,7 +42,7 @@ class BodyVelocities:
 def body_velocities(mission: Mission) -> BodyVelocities:
     """Return the velocities of the pings, and zero while the mission stands still."""
     velocities = _of_pings(mission)
-    for still in mission.aids.standstills:
+    for still in mission.aids.all(Standstill):
         velocities = _at_rest(velocities, still)
     return velocities
 

@@ -10,6 +10,7 @@ from ssm_graph.base.frames import wrap_to_pi
 from ssm_graph.base.frozen import Array
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.start.track_heading import HeadingFit, gyro_attitudes
+from ssm_graph.sensors.compass import HeadingLog
 
 NONE = HeadingFit(0.0, math.inf)
 UNKNOWN_OFFSET = math.radians(90.0)
@@ -31,7 +32,7 @@ def heading_from_compass(
     R_lb : (3, 3) body to local level at the start; its heading is what is sought, so any will do.
     window_s : as long as the gyros keep the heading.
     """
-    log = mission.aids.heading
+    log = mission.aids.get(HeadingLog)
     if log is None or log.errors.offset_sigma >= UNKNOWN_OFFSET:
         return NONE
     used = (log.time_s > start_s) & (log.time_s <= start_s + window_s)

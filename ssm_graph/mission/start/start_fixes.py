@@ -13,7 +13,7 @@ from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array, FrozenArrays, shaped
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.start.body_velocity import BodyVelocities
-from ssm_graph.sensors.acoustic import UsblLog
+from ssm_graph.sensors.acoustic import RangeLog, UsblLog
 from ssm_graph.sensors.gnss import GnssLog
 
 ACOUSTIC: Final = "USBL"
@@ -82,12 +82,12 @@ def start_fixes(mission: Mission, velocities: BodyVelocities) -> StartFixes:
 def _all_fixes(mission: Mission) -> tuple[StartFixes, ...]:
     found = tuple(
         _in_order(mission, source, log)
-        for source, log in (("GNSS", mission.gnss), (ACOUSTIC, mission.aids.usbl))
+        for source, log in (("GNSS", mission.gnss), (ACOUSTIC, mission.aids.get(UsblLog)))
         if log is not None and len(log.time_s)
     )
     if found:
         return found
-    alone = "" if mission.aids.ranges is None else ", and ranges to beacons alone give none"
+    alone = "" if mission.aids.get(RangeLog) is None else ", and ranges to beacons alone give none"
     raise ConfigError(
         "mission.toml: expected [initial], [gnss] or [usbl], got none of them; without one the "
         f"start is unknown{alone}: add [initial] with position, attitude and their sigmas"

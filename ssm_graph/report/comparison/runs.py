@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Final
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Final
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import NullLocator
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.evaluation import chi2_interval, mean_with_interval
@@ -28,108 +26,136 @@ from ssm_graph.report.comparison.cells import (
     text,
     values,
 )
-from ssm_graph.report.comparison.style import (
+from ssm_graph.report.style import (
+    GREY,
+    Band,
+    Curve,
     Look,
+    Panel,
     add_footnote,
     add_legend,
+    draw_panel,
     line,
-    log_ticks,
     new_figure,
     shown_methods,
+    time_axis,
 )
-from ssm_graph.report.mission.style import dress, time_axis
 
 Looks = Mapping[str, Look]
+Place = tuple[int, int]
+"""Row and column."""
 
 MEAN_NOTE: Final = (
     "Mean of the horizontal rms error over the missions that a method finished, with its 95 % "
     "confidence band (Student's t)."
 )
-BAND_COLOR: Final = "#D9D9D9"
+BAND: Final = {"color": "#D9D9D9", "zorder": 0.6}
 MAX_COLUMNS: Final = 3
+
+
+def draw_grid(
+    title: str,
+    panels: Mapping[Place, Panel],
+    methods: Sequence[str],
+    looks: Looks,
+    note: str,
+    left_out: Sequence[str] = (),
+    *,
+    height: float = 2.8,
+    width: float | None = None,
+    has_markers: bool = False,
+    extra: Sequence[object] = (),
+) -> Figure:
+    """Draw panels on a grid, a legend of the methods beside it and a note below.
+
+    A panel without curves leaves its place empty. Height and width are a panel's, in inches.
+    """
+    n_rows, n_columns = (1 + max(place[i] for place in panels) for i in (0, 1))
+    width = width or {1: 5.0, 2: 3.7}.get(n_columns, 3.1)
+    figure = new_figure(n_columns * width + 1.7, n_rows * height + 0.8, title)
+    grid = figure.subplots(n_rows, n_columns, squeeze=False)
+    for place in np.ndindex(n_rows, n_columns):
+        panel = panels.get((place[0], place[1]))
+        if panel is not None and panel.curves:
+            draw_panel(grid[place], panel)
+        else:
+            figure.delaxes(grid[place])
+    add_legend(figure, methods, looks, has_markers=has_markers, extra=extra)
+    add_footnote(figure, note, left_out)
+    return figure
 
 
 def draw_error_against_rate(rows: Sequence[Row], looks: Looks) -> Figure | None:
     """Draw the mean error against the share of outliers; None without two rates of a kind."""
-    sweeps = rate_sweeps(rows)
-    if not sweeps:
-        return None
     title = "Horizontal position error against the rate of outliers"
-    return _draw_sweeps(sweeps, looks, title, x="rate of outliers, %", factor=100.0)
+    return _draw_sweeps(rate_sweeps(rows), looks, title, x="rate of outliers, %", factor=100.0)
 
 
 def draw_error_against_size(rows: Sequence[Row], looks: Looks) -> Figure | None:
     """Draw the mean error against the size of outliers; None without two sizes of a kind."""
-    sweeps = size_sweeps(rows)
-    if not sweeps:
-        return None
     title = "Horizontal position error against the size of outliers"
-    return _draw_sweeps(sweeps, looks, title, x="size of outliers (middle of range), m/s")
+    return _draw_sweeps(
+        size_sweeps(rows), looks, title, x="size of outliers (middle of range), m/s"
+    )
 
 
 def _draw_sweeps(
     sweeps: Sequence[Sweep], looks: Looks, title: str, *, x: str, factor: float = 1.0
-) -> Figure:
+) -> Figure | None:
+    if not sweeps:
+        return None
     swept = [row for sweep in sweeps for rows in sweep.points.values() for row in rows]
     methods, left_out = shown_methods(methods_of(swept))
+    panels = {
+        place: _sweep_panel(sweep, methods, looks, x, factor)
+        for sweep, place in zip(sweeps, _places(sweeps), strict=True)
+    }
+    return draw_grid(title, panels, methods, looks, MEAN_NOTE, left_out, has_markers=True)
+
+
+def _places(sweeps: Sequence[Sweep]) -> list[Place]:
+    """Return the place of every sweep: kinds in columns, grades in rows, where that is a table."""
     kinds = list(dict.fromkeys(sweep.kind for sweep in sweeps))
     grades = list(dict.fromkeys(sweep.grade for sweep in sweeps))
-    n_rows, n_columns, place = _places(sweeps, kinds, grades)
-    figure, panels = _panels(n_rows, n_columns, title)
-    is_rate = factor != 1.0
-    for sweep, (i, j) in zip(sweeps, place, strict=True):
-        axes = panels[i][j]
-        extent = _draw_sweep(axes, sweep, methods, looks, factor)
-        dress(axes, title=_sweep_title(sweep, is_rate=is_rate), x=x, y="mean horizontal rms, m")
-        if extent is not None:
-            log_ticks(axes.yaxis, extent[0] / 1.35, extent[1] * 1.35)
-        ticks = [factor * at for at in sweep.points]
-        if not is_rate:
-            log_ticks(axes.xaxis, ticks[0] / 1.25, ticks[-1] * 1.25)
-        axes.set_xticks(_apart(ticks, is_log=not is_rate))
-        axes.xaxis.set_minor_locator(NullLocator())
-    _remove_empty(figure, panels)
-    add_legend(figure, methods, looks, has_markers=True)
-    add_footnote(figure, MEAN_NOTE, left_out)
-    return figure
-
-
-def _places(
-    sweeps: Sequence[Sweep], kinds: Sequence[str], grades: Sequence[str]
-) -> tuple[int, int, list[tuple[int, int]]]:
-    """Return rows, columns and the place of every sweep: kinds in columns, grades in rows."""
     if len(grades) == 1 or len(kinds) == 1 or len(kinds) > MAX_COLUMNS:
-        n_columns = min(len(sweeps), MAX_COLUMNS)
-        places = [divmod(k, n_columns) for k in range(len(sweeps))]
-        return math.ceil(len(sweeps) / n_columns), n_columns, places
-    at = [(grades.index(sweep.grade), kinds.index(sweep.kind)) for sweep in sweeps]
-    return len(grades), len(kinds), at
+        return [divmod(k, min(len(sweeps), MAX_COLUMNS)) for k in range(len(sweeps))]
+    return [(grades.index(sweep.grade), kinds.index(sweep.kind)) for sweep in sweeps]
 
 
-def _draw_sweep(
-    axes: Axes, sweep: Sweep, methods: Sequence[str], looks: Looks, factor: float
-) -> tuple[float, float] | None:
-    """Draw lines and bands; return the least and largest mean."""
-    x = factor * np.array(list(sweep.points))
-    all_means: list[float] = []
+def _sweep_panel(
+    sweep: Sweep, methods: Sequence[str], looks: Looks, x: str, factor: float
+) -> Panel:
+    """Return lines and bands; a rate has a factor that makes it per cent, a size has none."""
+    ticks = [factor * at for at in sweep.points]
+    is_rate, at = factor != 1.0, np.array(ticks)
+    curves, bands, all_means = [], [], []
     for method in reversed(methods):  # the first on top
-        means, low, high = (np.full(len(x), np.nan) for _ in range(3))
-        for k, rows in enumerate(sweep.points.values()):
+        look, intervals = looks[method], []
+        for rows in sweep.points.values():
             samples = [v for v in values(rows, method, "horizontal_rms_m") if v > 0.0]
-            if samples:
-                mean = mean_with_interval(samples)
-                means[k], low[k], high[k] = mean.value, mean.low, mean.high
+            mean = mean_with_interval(samples) if samples else None
+            intervals.append((mean.value, mean.low, mean.high) if mean else (math.nan,) * 3)
+        means, low, high = np.array(intervals).T
         known = np.isfinite(means)
-        look = looks[method]
-        axes.plot(x[known], means[known], marker=look.marker, **line(look))
+        curves.append(Curve(at[known], means[known], {**line(look), "marker": look.marker}))
         if known.any() and np.isfinite(high).any():
             low = np.where(np.isfinite(low), np.maximum(low, 0.05 * means), means)
             high = np.where(np.isfinite(high), high, means)
-            axes.fill_between(
-                x[known], low[known], high[known], color=look.color, alpha=0.13, linewidth=0.0
-            )
-        all_means.extend(means[known].tolist())
-    return (min(all_means), max(all_means)) if all_means else None
+            band = {"color": look.color, "alpha": 0.13}
+            bands.append(Band(at[known], low[known], high[known], band))
+        all_means += means[known].tolist()
+    return Panel(
+        title=_sweep_title(sweep, is_rate=is_rate),
+        x=x,
+        y="mean horizontal rms, m",
+        bands=bands,
+        curves=curves,
+        y_limits=(min(all_means) / 1.35, max(all_means) * 1.35) if all_means else None,
+        is_log_y=True,
+        x_limits=None if is_rate else (ticks[0] / 1.25, ticks[-1] * 1.25),
+        is_log_x=not is_rate,
+        x_ticks=_apart(ticks, is_log=not is_rate),
+    )
 
 
 def _sweep_title(sweep: Sweep, *, is_rate: bool) -> str:
@@ -160,56 +186,55 @@ def draw_nees(
 ) -> Figure | None:
     """Draw the mean NEES of position over the runs of clean cells and of ones with outliers."""
     cells = series_cells(rows, series)
-    shown_cells = {cell for cells_of in cells for cell in cells_of}
-    methods, left_out = shown_methods(m for c, g, m in series if (c, g) in shown_cells)
-    if not any(
-        np.isfinite(nees).any() for (c, g, _), (*_, nees) in series.items() if (c, g) in shown_cells
-    ):
+    places = {cell: (i, j) for i, row in enumerate(cells) for j, cell in enumerate(row)}
+    mine = {key: told for key, told in series.items() if key[:2] in places}
+    if not any(np.isfinite(nees).any() for *_, nees in mine.values()):
         return None
-    title = "Consistency of the position: mean NEES divided by its dimension"
-    figure, panels = _panels(len(cells), max(map(len, cells)), title)
-    counts: set[int] = set()
-    for i, cells_of in enumerate(cells):
-        for j, (case, grade) in enumerate(cells_of):
-            mine = {m: series[case, grade, m] for m in methods if (case, grade, m) in series}
-            counts.add(_draw_nees_panel(panels[i][j], mine, looks))
-            label = panels[i][j].get_xlabel()
-            dress(panels[i][j], title=_joined(case, grade), x=label, y="mean NEES/3, –")
-    _remove_empty(figure, panels)
-    band = Patch(color=BAND_COLOR, label="95 % if consistent")
-    expected = Line2D([], [], color="#8C8C8C", linewidth=0.8, label="expected, 1")
-    add_legend(figure, methods, looks, extra=(band, expected))
+    methods, left_out = shown_methods(method for _, _, method in mine)
+    panels, counts = {}, set()
+    for (case, grade), place in places.items():
+        told = {m: mine[case, grade, m] for m in methods if (case, grade, m) in mine}
+        panels[place], n_runs = _nees_panel(told, looks, _joined(case, grade))
+        counts.add(n_runs)
+    band = Patch(color=BAND["color"], label="95 % if consistent")
+    expected = Line2D([], [], color=GREY, linewidth=0.8, label="expected, 1")
     runs = " or ".join(f"{n}" for n in sorted(counts - {0}))
     note = f"Grey band: where 95 % of such means over {runs} runs lie (chi-square). "
     note += "Above it a method claims to be more certain than it is, below it less."
-    add_footnote(figure, note, left_out)
-    return figure
+    title = "Consistency of the position: mean NEES divided by its dimension"
+    return draw_grid(title, panels, methods, looks, note, left_out, extra=(band, expected))
 
 
-def _draw_nees_panel(axes: Axes, mine: Mapping[str, Series], looks: Looks) -> int:
-    """Draw one cell; return the number of runs that its band is of."""
-    n_runs, extremes = 0, [1.0]
-    label, span = "", np.zeros(0)
-    for method in reversed(list(mine)):
-        time_s, _, _, nees = mine[method]
+def _nees_panel(told: Mapping[str, Series], looks: Looks, title: str) -> tuple[Panel, int]:
+    """Return one cell, and the number of runs that its band is of."""
+    n_runs, extremes, curves = 0, [1.0], []
+    label, span = "", np.zeros(2)
+    for method in reversed(list(told)):
+        time_s, _, _, nees = told[method]
         mean = _mean_over_runs(nees)
         known = np.isfinite(mean) & (mean > 0.0)
         if not known.any():
             continue
         divisor, label = time_axis(time_s)
         span = np.array([time_s[0], time_s[-1]]) / divisor
-        axes.plot(time_s / divisor, np.where(known, mean, np.nan), **line(looks[method]))
+        curves.append(Curve(time_s / divisor, np.where(known, mean, np.nan), line(looks[method])))
         extremes += [float(np.quantile(mean[known], 0.01)), float(mean[known].max())]
         n_runs = max(n_runs, int(np.isfinite(nees).any(axis=1).sum()))
-    if n_runs > 0:
-        band = chi2_interval(3, n_runs)
-        axes.fill_between(span, band.low, band.high, color=BAND_COLOR, linewidth=0.0, zorder=0.6)
-        axes.axhline(1.0, color="#8C8C8C", linewidth=0.8, zorder=0.7)
-        axes.set_xlim(float(span[0]), float(span[1]))
-        low, high = min(*extremes, band.low), max(*extremes, band.high)
-        log_ticks(axes.yaxis, low / 1.2, high * 1.2)
-    axes.set_xlabel(label)
-    return n_runs
+    look: dict[str, Any] = {"title": title, "x": label, "y": "mean NEES/3, –"}
+    if n_runs == 0:
+        return Panel(**look), 0
+    band = chi2_interval(3, n_runs)
+    low, high = min(*extremes, band.low), max(*extremes, band.high)
+    panel = Panel(
+        bands=[Band(span, band.low, band.high, BAND)],
+        curves=curves,
+        level=1.0,
+        x_limits=(float(span[0]), float(span[1])),
+        y_limits=(low / 1.2, high * 1.2),
+        is_log_y=True,
+        **look,
+    )
+    return panel, n_runs
 
 
 def _mean_over_runs(nees: Array) -> Array:
@@ -228,33 +253,41 @@ def draw_end_error(rows: Sequence[Row], looks: Looks) -> Figure | None:
     if not cells:
         return None
     methods, left_out = shown_methods(methods_of([row for _, _, mine in cells for row in mine]))
-    n_columns = min(len(cells), MAX_COLUMNS)
+    panels = {
+        divmod(k, min(len(cells), MAX_COLUMNS)): _end_error_panel(
+            {method: _end_errors(mine, method) for method in reversed(methods)},
+            looks,
+            _joined(case, grade),
+        )
+        for k, (grade, case, mine) in enumerate(cells)
+    }
     title = "Distribution of the horizontal position error at the end of the mission"
-    figure, panels = _panels(math.ceil(len(cells) / n_columns), n_columns, title, height=3.4)
-    for k, (grade, case, mine) in enumerate(cells):
-        axes = panels[k // n_columns][k % n_columns]
-        finite: list[float] = []
-        for method in reversed(methods):
-            errors = _end_errors(mine, method)
-            kept = [error for error in errors if math.isfinite(error)]
-            share = np.arange(len(kept) + 1) / max(len(errors), 1)
-            if kept:
-                look = line(looks[method])
-                axes.plot([kept[0], *kept], share, drawstyle="steps-post", **look)
-                axes.plot([kept[-1], 1e12], share[[-1, -1]], **look)
-            finite += kept
-        dress(axes, title=_joined(case, grade), x="end error, m", y="share of missions, –")
-        if finite:
-            log_ticks(axes.xaxis, min(finite) / 1.15, max(finite) * 1.25)
-        axes.set_ylim(0.0, 1.03)
-    _remove_empty(figure, panels)
-    add_legend(figure, methods, looks)
     note = "Empirical distribution; a failed run counts as an unbounded error."
-    add_footnote(figure, note, left_out)
-    return figure
+    return draw_grid(title, panels, methods, looks, note, left_out, height=3.4)
 
 
-def _end_errors(rows: Sequence[Row], method: str) -> list[float]:
+def _end_error_panel(errors: Mapping[str, list[float]], looks: Looks, title: str) -> Panel:
+    """Return the share of missions (failed ones last) over their error, by method."""
+    curves, finite = [], []
+    for method, ascending in errors.items():
+        kept = np.array([error for error in ascending if math.isfinite(error)])
+        share = np.arange(len(kept) + 1) / max(len(ascending), 1)
+        if len(kept):
+            steps = {**line(looks[method]), "drawstyle": "steps-post"}
+            curves.append(Curve(np.r_[kept[0], kept, 1e12], np.r_[share, share[-1]], steps))
+            finite += kept.tolist()
+    return Panel(
+        title=title,
+        x="end error, m",
+        y="share of missions, –",
+        curves=curves,
+        x_limits=(min(finite) / 1.15, max(finite) * 1.25) if finite else None,
+        is_log_x=True,
+        y_limits=(0.0, 1.03),
+    )
+
+
+def _end_errors(rows: Iterable[Row], method: str) -> list[float]:
     """Return the errors in ascending order, infinite for failed runs; unknown ones are left out."""
     mine = [row for row in rows if text(row, "method") == method]
     errors = [math.inf if has_failed(row) else number(row, "end_error_m") for row in mine]
@@ -265,18 +298,3 @@ def _joined(case: str, grade: str) -> str:
     name = case.replace("_", " ")
     name = name[:1].upper() + name[1:]
     return f"{name}, {grade} grade" if grade else name
-
-
-def _panels(
-    n_rows: int, n_columns: int, title: str, *, height: float = 2.8
-) -> tuple[Figure, list[list[Axes]]]:
-    """Return a figure with room for a legend, and its axes."""
-    width = {1: 5.0, 2: 3.7}.get(n_columns, 3.1)
-    figure = new_figure(n_columns * width + 1.7, n_rows * height + 0.8, title)
-    grid = figure.subplots(n_rows, n_columns, squeeze=False)
-    return figure, [list(axes) for axes in grid]
-
-
-def _remove_empty(figure: Figure, panels: Sequence[Sequence[Axes]]) -> None:
-    for axes in [axes for row in panels for axes in row if not axes.lines]:
-        figure.delaxes(axes)

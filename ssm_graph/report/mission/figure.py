@@ -2,26 +2,71 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any, Final
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.gridspec import SubplotSpec
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.ticker import MaxNLocator
 
+from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import DataError
-from ssm_graph.evaluation import Metrics, evaluate
-from ssm_graph.mission.estimate import Estimate, Trajectory
+from ssm_graph.base.frozen import Array
+from ssm_graph.evaluation import ErrorSeries, Metrics, evaluate
+from ssm_graph.mission.estimate import (
+    OUTLIER_WEIGHT,
+    Calibration,
+    CurrentTrack,
+    Determined,
+    Estimate,
+    Trajectory,
+)
 from ssm_graph.mission.mission import Reference
-from ssm_graph.report.mission.beam_panels import draw_beams
-from ssm_graph.report.mission.calibration_panel import draw_calibration
-from ssm_graph.report.mission.current_panel import draw_current
-from ssm_graph.report.mission.error_panels import draw_heading, draw_position, draw_velocity
-from ssm_graph.report.mission.style import INK, SMALL, save
-from ssm_graph.report.mission.track_panel import draw_track
+from ssm_graph.report.beams import (
+    draw_points,
+    innovation_axis,
+    n_beams_of,
+    points_of,
+    top_of_weights,
+)
+from ssm_graph.report.style import (
+    BOUND,
+    EAST_NORTH_UP,
+    ESTIMATE,
+    INK,
+    OUTLIER,
+    REDUCED,
+    REFERENCE,
+    SMALL,
+    Band,
+    Curve,
+    Panel,
+    broken_at_gaps,
+    draw_panel,
+    dress,
+    save,
+    thinned,
+    time_axis,
+)
 
 PAGE_INCHES = (8.27, 10.8)
 PAGE_DPI = 170
+AXES_NAMES = ("east", "north", "up")
+MAX_MARKS: Final = 200
+"""Rejected pings that are marked; more would hide the track."""
+WIDE_BEAMS: Final = 4
+"""So many panels have room for a full time axis side by side."""
+LEVEL_LABELS: Final = 6
+"""So many labels have room side by side."""
+COLOURS: Final = {
+    Determined.GREEN: EAST_NORTH_UP[2],
+    Determined.AMBER: REDUCED,
+    Determined.RED: OUTLIER,
+}
 
 
 def save_figure(
@@ -74,11 +119,14 @@ def draw_figure(
     heights = [5.9 - 0.6 * len(further), 3.5 - 0.5 * len(further), *(1.1 for _ in further)]
     grid = figure.add_gridspec(len(heights), 1, height_ratios=heights)
     upper = grid[0].subgridspec(4, 2, width_ratios=[1.2, 1.0], height_ratios=[1.0, 1.0, 1.0, 1.25])
-    draw_track(figure.add_subplot(upper[:3, 0]), estimate, reference if errors else None)
-    draw_position([figure.add_subplot(upper[i, 1]) for i in range(3)], trajectory, errors)
-    draw_velocity(figure.add_subplot(upper[3, 0]), trajectory, errors)
-    draw_heading(figure.add_subplot(upper[3, 1]), trajectory, errors)
-    draw_beams(figure, grid[1], estimate.beams, trajectory_s=trajectory.time_s)
+    _draw_track(figure.add_subplot(upper[:3, 0]), estimate, reference if errors else None)
+    for i, panel in enumerate(_position_panels(trajectory, errors)):
+        axes = figure.add_subplot(upper[i, 1])
+        draw_panel(axes, panel)
+        axes.tick_params(labelbottom=bool(panel.x))
+    draw_panel(figure.add_subplot(upper[3, 0]), _velocity_panel(trajectory, errors))
+    draw_panel(figure.add_subplot(upper[3, 1]), _heading_panel(trajectory, errors))
+    _draw_beams(figure, grid[1], estimate)
     for row, draw in enumerate(further, start=2):
         draw(figure.add_subplot(grid[row]))
     return figure
@@ -89,9 +137,9 @@ def _further_panels(estimate: Estimate) -> list[Callable[[Axes], None]]:
     current, calibration = estimate.current, estimate.calibration
     panels: list[Callable[[Axes], None]] = []
     if current is not None:
-        panels.append(lambda axes: draw_current(axes, current))
+        panels.append(lambda axes: draw_panel(axes, _current_panel(current)))
     if calibration is not None:
-        panels.append(lambda axes: draw_calibration(axes, calibration))
+        panels.append(lambda axes: _draw_calibration(axes, calibration))
     return panels
 
 
@@ -112,3 +160,235 @@ def _caption(estimate: Estimate, metrics: Metrics | None) -> str:
         if metrics.path_length_m > 0.0:
             parts.append(f"{metrics.drift_percent:.2g} % of {metrics.path_length_m:.0f} m")
     return "  ·  ".join(parts)
+
+
+def _corner(n_columns: int) -> dict[str, Any]:
+    """Return the options of a legend beside the title."""
+    place = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.98), "borderpad": 0.0}
+    return {**place, "ncols": n_columns, "columnspacing": 1.0}
+
+
+def _error_panel(
+    what: str,
+    trajectory: Trajectory,
+    errors: ErrorSeries | None,
+    values: Array | None,
+    sigma: Array,
+    *,
+    names: Sequence[str],
+    colors: Sequence[str] = EAST_NORTH_UP,
+    **look: Any,
+) -> Panel:
+    """Return errors (E, C) inside the widest of the bounds (K, C) that the estimator claims.
+
+    Without errors these are shown: one as a band, several as a curve each.
+    """
+    divisor, x = time_axis(trajectory.time_s)
+    kept = thinned(len(sigma))
+    since = (trajectory.time_s[kept] - trajectory.time_s[0]) / divisor
+    known = errors is not None and values is not None and bool(np.isfinite(values).any())
+    look = {"x": x, "title": f"{what} {'error' if known else 'uncertainty'}", **look}
+    if not known and len(names) > 1:
+        curves = [
+            Curve(since, 3.0 * s[kept], _line(color, f"3σ {name}"))
+            for s, color, name in zip(sigma.T, colors, names, strict=False)
+        ]
+        return Panel(curves=curves, y_limits=(0.0, None), **look)
+    widest = sigma.max(axis=1)
+    bound = 3.0 * widest[kept]
+    band = Band(since, -bound, bound, {"color": BOUND, "alpha": 0.45, "label": "±3σ"})
+    curves = []
+    if errors is not None and values is not None and known:
+        kept = thinned(len(values))
+        error_s = (errors.time_s[kept] - trajectory.time_s[0]) / divisor
+        for value, color, name in zip(values[kept].T, colors, names, strict=False):
+            curves.append(Curve(*broken_at_gaps(error_s, value), _line(color, name)))
+    limit = _limit(values if known else np.zeros(1), widest)
+    return Panel(bands=[band], curves=curves, y_limits=limit, **look)
+
+
+def _line(color: str, label: str) -> dict[str, Any]:
+    return {"color": color, "linewidth": 0.9, "label": label}
+
+
+def _limit(error: Array | None, sigma: Array) -> tuple[float, float] | None:
+    """Return limits that show all of the error and, unless they dwarf it, all of the bounds."""
+    largest = 0.0 if error is None else float(np.nanmax(np.abs(error), initial=0.0))
+    bound = 3.0 * float(np.nanmax(sigma, initial=0.0))
+    limit = 1.1 * max(largest, min(bound, 8.0 * largest) if largest > 0.0 else bound)
+    return (-limit, limit) if np.isfinite(limit) and limit > 0.0 else None
+
+
+def _position_panels(trajectory: Trajectory, errors: ErrorSeries | None) -> list[Panel]:
+    """Return east, north and up, one above the other."""
+    variance = np.diagonal(trajectory.position_cov_enu, axis1=1, axis2=2)
+    sigma = np.sqrt(np.maximum(variance, 0.0))
+    panels = []
+    for i, axis in enumerate(AXES_NAMES):
+        look: dict[str, Any] = {"y": f"{axis}, m"}
+        look |= {"legend": _corner(2)} if i == 0 else {"title": ""}
+        look |= {} if i == 2 else {"x": ""}
+        values = None if errors is None else errors.position_enu[:, [i]]
+        panels.append(
+            _error_panel(
+                "Position",
+                trajectory,
+                errors,
+                values,
+                sigma[:, [i]],
+                names=["error"],
+                colors=[EAST_NORTH_UP[i]],
+                **look,
+            )
+        )
+    return panels
+
+
+def _velocity_panel(trajectory: Trajectory, errors: ErrorSeries | None) -> Panel:
+    return _error_panel(
+        "Velocity",
+        trajectory,
+        errors,
+        None if errors is None else errors.velocity_enu,
+        trajectory.velocity_sigma_enu,
+        names=AXES_NAMES,
+        y="velocity, m/s",
+        legend=_corner(4),
+    )
+
+
+def _heading_panel(trajectory: Trajectory, errors: ErrorSeries | None) -> Panel:
+    """Return the angle that a DVL track depends on."""
+    return _error_panel(
+        "Heading",
+        trajectory,
+        errors,
+        None if errors is None else np.rad2deg(errors.roll_pitch_heading[:, [2]]),
+        np.rad2deg(trajectory.attitude_sigma[:, [2]]),
+        names=["error"],
+        y="heading, deg",
+    )
+
+
+def _current_panel(current: CurrentTrack) -> Panel:
+    """Return the components of the current that were estimated, each with its own bounds."""
+    divisor, x = time_axis(current.time_s)
+    kept = thinned(len(current.time_s))
+    since = (current.time_s[kept] - current.time_s[0]) / divisor
+    value, bound = current.velocity_enu[kept], 3.0 * current.sigma_enu[kept]
+    bands, curves = [], []
+    for i in np.flatnonzero(current.sigma_enu.any(axis=0)):
+        low, high, color = value[:, i] - bound[:, i], value[:, i] + bound[:, i], EAST_NORTH_UP[i]
+        bands.append(Band(since, low, high, {"color": color, "alpha": 0.2}))
+        curves.append(Curve(since, value[:, i], _line(color, AXES_NAMES[i])))
+    title = "Current of the water, with ±3σ"
+    look: dict[str, Any] = {"title": title, "x": x, "y": "current, m/s", "legend": _corner(3)}
+    return Panel(bands=bands, curves=curves, **look)
+
+
+def _draw_calibration(axes: Axes, calibration: Calibration) -> None:
+    """Draw each value with three of its sigmas, in units of the sigma that it had before."""
+    values = calibration.values
+    axes.axhspan(-3.0, 3.0, color=BOUND, alpha=0.35, linewidth=0.0)
+    for i, value in enumerate(values):
+        axes.errorbar(
+            i,
+            value.value / value.prior_sigma,
+            yerr=3.0 * value.sigma / value.prior_sigma,
+            fmt="o",
+            color=COLOURS[value.determined],
+            markersize=3.0,
+            elinewidth=1.2,
+            capsize=2.0,
+        )
+    labels = [f"{v.label}\n{v.value / v.unit:.3g}" for v in values]
+    axes.set_xticks(np.arange(len(values)), labels)
+    if len(values) > LEVEL_LABELS:
+        axes.tick_params(axis="x", labelrotation=18.0)
+    axes.set_xlim(-0.7, len(values) - 0.3)
+    title = "Calibration: off what is stated, with ±3σ; the band is what was known before"
+    dress(axes, title=title, y="sigmas before")
+    axes.tick_params(axis="x", labelsize=SMALL - 1.0)
+    axes.grid(visible=False, axis="x")
+
+
+def _draw_track(axes: Axes, estimate: Estimate, reference: Reference | None) -> None:
+    """Draw east and north of the first keyframe, m or km, with the pings of rejected beams."""
+    path = estimate.trajectory
+    frame = LocalFrame(float(path.lat[0]), float(path.lon[0]), float(path.height[0]))
+    p_n = frame.p_n_from_geodetic(path.lat, path.lon, path.height)[:, :2]
+    unit, scale = ("km", 1e-3) if np.nanmax(np.abs(p_n), initial=0.0) > 5000.0 else ("m", 1.0)
+    p_n = scale * p_n
+    curves = []
+    if reference is not None:
+        track = scale * _reference_track(reference, frame, path.time_s)
+        look = {"color": REFERENCE, "linewidth": 2.6, "alpha": 0.35, "label": "reference"}
+        curves.append(Curve(*track.T, look))
+    look = {"color": ESTIMATE, "linewidth": 1.3, "label": "estimate"}
+    curves.append(Curve(*p_n[thinned(len(p_n))].T, look))
+    rejected = np.unique(estimate.beams.time_s[estimate.beams.weight < OUTLIER_WEIGHT])
+    rejected = rejected[thinned(len(rejected), MAX_MARKS)]
+    if len(rejected):
+        at = [np.interp(rejected, path.time_s, column) for column in p_n.T]
+        look = {"marker": "x", "markersize": 3.2, "markeredgewidth": 0.8, "color": OUTLIER}
+        look |= {"linestyle": "", "label": f"beam weight < {OUTLIER_WEIGHT:g}"}
+        curves.append(Curve(at[0], at[1], look))
+    for place, marker, face, label in ((0, "o", INK, "start"), (-1, "s", "white", "end")):
+        look = {"marker": marker, "color": INK, "markersize": 5.5, "markerfacecolor": face}
+        curves.append(Curve(*p_n[[place]].T, {**look, "linestyle": "", "label": label}))
+    below = {"loc": "upper left", "bbox_to_anchor": (-0.04, -0.09), "ncols": 5}
+    below |= {"columnspacing": 0.8, "handletextpad": 0.4}
+    x, y = f"east, {unit}", f"north, {unit}"
+    draw_panel(axes, Panel(title="Track", x=x, y=y, curves=curves, legend=below))
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.06)
+
+
+def _reference_track(reference: Reference, frame: LocalFrame, time_s: Array) -> Array:
+    """Return the part (M, 2) of the reference that belongs to the estimate's time, m."""
+    p_n = frame.p_n_from_geodetic(reference.lat, reference.lon, reference.height)
+    kept = np.isfinite(p_n).all(axis=1)
+    kept &= (reference.time_s >= time_s[0] - 1.0) & (reference.time_s <= time_s[-1] + 1.0)
+    _, track = broken_at_gaps(reference.time_s[kept], p_n[kept, :2])
+    return np.asarray(track[thinned(len(track))])
+
+
+def _draw_beams(figure: Figure, place: SubplotSpec, estimate: Estimate) -> None:
+    """Draw innovations above weights, a column per beam, all on the same scales."""
+    beams, time_s, n_beams = estimate.beams, estimate.trajectory.time_s, n_beams_of(estimate)
+    divisor, label = time_axis(time_s)
+    span = float(np.ptp(time_s)) / divisor or 1.0
+    grid = place.subgridspec(2, n_beams, height_ratios=[1.35, 1.0])
+    upper: list[Axes] = []
+    lower: list[Axes] = []
+    for beam in range(n_beams):
+        points = points_of(beams, beam)
+        since = (points.time_s - time_s[0]) / divisor
+        first = upper[0] if upper else None
+        innovation = figure.add_subplot(grid[0, beam], sharey=first)
+        weight = figure.add_subplot(grid[1, beam], sharex=innovation)
+        draw_points(innovation, since, points.innovation, points.weight)
+        draw_points(weight, since, points.weight, points.weight)
+        innovation.set_xlim(-0.03 * span, 1.03 * span)
+        weight.set_ylim(-0.06, top_of_weights(beams))
+        dress(innovation, title=f"Beam {beam + 1}", y="" if upper else "innovation, m/s")
+        x = label if n_beams <= WIDE_BEAMS else label.replace("time since start", "time")
+        dress(weight, x=x, y="" if upper else "weight, –")
+        if n_beams > WIDE_BEAMS:
+            weight.xaxis.set_major_locator(MaxNLocator(2))
+        innovation.tick_params(labelbottom=False, labelleft=not upper)
+        weight.tick_params(labelleft=not upper)
+        upper.append(innovation)
+        lower.append(weight)
+    figure.align_ylabels([upper[0], lower[0]])
+    innovation_axis(upper[0], beams.innovation)
+    handles, names = upper[0].get_legend_handles_labels()
+    figure.legend(
+        handles,
+        names,
+        loc="outside lower center",
+        ncols=len(names),
+        fontsize=SMALL,
+        frameon=False,
+        markerscale=1.6,
+    )

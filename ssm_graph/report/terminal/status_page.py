@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from types import TracebackType
 from typing import Final, Self
 
@@ -18,8 +17,8 @@ from rich.text import Text
 
 from ssm_graph.mission.estimate import Found
 from ssm_graph.mission.navigation import Event, Health, Navigation, Severity
+from ssm_graph.mission.run_status import Latency, OutputStatus, RunStatus, SourceStatus
 from ssm_graph.report.mission.summary import DETERMINED_STYLE
-from ssm_graph.sensors.dvl import N_BEAMS
 
 PLAIN_EVERY_S: Final = 10.0
 HEALTH_STYLE: Final = {
@@ -40,53 +39,13 @@ _FIRST_UNIX_S: Final = 1e9
 """Later times are Unix time, shown as time of day."""
 
 
-@dataclass(frozen=True, slots=True)
-class SourceRow:
-    """One source, or one output."""
-
-    name: str
-    address: str
-    state: str
-    rate_hz: float = math.nan
-    """Messages passed on; NaN where it is not known."""
-    n_messages: int = 0
-    n_refused: int = 0
-    """Damaged, not understood, or too many."""
-    n_reconnects: int = 0
-    age_s: float = math.inf
-    """Since the last message."""
-
-
-@dataclass(frozen=True, slots=True)
-class StatusView:
-    """Everything on the page."""
-
-    vehicle: str
-    folder: str
-    elapsed_s: float
-    n_messages: int
-    navigation: Navigation | None
-    reason: str
-    latency_s: tuple[float, float, float] | None = None
-    """Median, 99th percentile and largest, from arrival to answer."""
-    sources: tuple[SourceRow, ...] = ()
-    outputs: tuple[SourceRow, ...] = ()
-    events: tuple[Event, ...] = ()
-    """Newest last."""
-    log_problem: str | None = None
-    checkpoint_age_s: float = math.inf
-    found: Found = Found()
-    """What is known beside the state of the vehicle."""
-    note: str = ""
-
-
 class StatusPage:
     """Shows one view after the other.
 
     ::
 
         with StatusPage(Console(stderr=True)) as show:
-            show(view)
+            show(status)
     """
 
     def __init__(self, console: Console, *, steady_s: Callable[[], float] = time.monotonic) -> None:
@@ -109,34 +68,34 @@ class StatusPage:
         if self._is_live:
             self._live.stop()
 
-    def __call__(self, view: StatusView) -> None:
+    def __call__(self, status: RunStatus) -> None:
         """Show how it goes now; without a terminal one line every ten seconds."""
         if self._is_live:
-            self._live.update(render(view), refresh=True)
+            self._live.update(render(status), refresh=True)
         elif self._steady_s() - self._printed_s >= PLAIN_EVERY_S:
             self._printed_s = self._steady_s()
-            self._console.print(plain_line(view), markup=False, highlight=False, soft_wrap=True)
+            self._console.print(plain_line(status), markup=False, highlight=False, soft_wrap=True)
 
 
-def render(view: StatusView) -> RenderableType:
+def render(status: RunStatus) -> RenderableType:
     """Return the page."""
-    parts: list[RenderableType] = [_headline(view)]
-    if view.navigation is not None:
-        parts.append(_state(view.navigation))
-        parts.append(_beams(view.navigation))
-    parts += [*_found(view.found), _latency(view), _links(view)]
-    parts += [_event(event) for event in view.events[-N_EVENTS:]]
-    parts.append(_disk(view))
-    title = f"{view.vehicle}   {_clock(view.elapsed_s)}   {view.n_messages} messages"
+    parts: list[RenderableType] = [_headline(status)]
+    if status.navigation is not None:
+        parts.append(_state(status.navigation))
+        parts.append(_beams(status.navigation))
+    parts += [*_found(status.found), _latency(status.latency), _links(status)]
+    parts += [_event(event) for event in status.events[-N_EVENTS:]]
+    parts.append(_disk(status))
+    title = f"{status.vehicle}   {_clock(status.elapsed_s)}   {status.n_messages} messages"
     return Panel(Group(*parts), title=Text(title), title_align="left")
 
 
-def plain_line(view: StatusView) -> str:
+def plain_line(status: RunStatus) -> str:
     """Return the most important in one line."""
-    words = [_clock(view.elapsed_s), _health(view).name]
-    navigation = view.navigation
+    words = [_clock(status.elapsed_s), _health(status).name]
+    navigation = status.navigation
     if navigation is None:
-        words.append(view.reason)
+        words.append(status.reason)
     else:
         words += [
             f"lat {math.degrees(navigation.lat):.7f} lon {math.degrees(navigation.lon):.7f} deg",
@@ -147,10 +106,12 @@ def plain_line(view: StatusView) -> str:
         ]
         if navigation.health is not Health.GOOD:
             words.append(navigation.reason)
-    words += [f"{source.name} {source.state} {source.rate_hz:.0f}/s" for source in view.sources]
-    if view.log_problem:
-        words.append(view.log_problem)
-    return "; ".join([*words, view.note] if view.note else words)
+    words += [
+        f"{source.name} {source.state.value} {source.rate_hz:.0f}/s" for source in status.sources
+    ]
+    if status.log_problem:
+        words.append(status.log_problem)
+    return "; ".join([*words, status.note] if status.note else words)
 
 
 def weight_bar(weight: float) -> str:
@@ -160,17 +121,17 @@ def weight_bar(weight: float) -> str:
     return BAR[max(0, min(len(BAR) - 1, math.floor(weight * len(BAR))))]
 
 
-def _health(view: StatusView) -> Health:
-    return Health.ALIGNING if view.navigation is None else view.navigation.health
+def _health(status: RunStatus) -> Health:
+    return Health.ALIGNING if status.navigation is None else status.navigation.health
 
 
-def _headline(view: StatusView) -> Text:
-    health = _health(view)
-    text = Text.assemble((f" {health.name} ", HEALTH_STYLE[health]), " ", view.reason)
-    if view.navigation is not None:
-        text.append(f"   confidence {view.navigation.confidence:.2f}", "dim")
-    if view.note:
-        text.append(f"   {view.note}", "bold")
+def _headline(status: RunStatus) -> Text:
+    health = _health(status)
+    text = Text.assemble((f" {health.name} ", HEALTH_STYLE[health]), " ", status.reason)
+    if status.navigation is not None:
+        text.append(f"   confidence {status.navigation.confidence:.2f}", "dim")
+    if status.note:
+        text.append(f"   {status.note}", "bold")
     return text
 
 
@@ -203,8 +164,7 @@ def _state(navigation: Navigation) -> Table:
 
 def _beams(navigation: Navigation) -> Text:
     text = Text("beams")
-    for number in range(N_BEAMS):
-        weight = float(navigation.beam_weights[number])
+    for number, weight in enumerate(navigation.beam_weights.tolist()):
         style = "green" if weight > 0.5 else "yellow" if weight > 0.05 else "red"
         shown = f"{weight:.2f}" if math.isfinite(weight) else _NONE
         text.append(f"  {number + 1}").append(weight_bar(weight), style).append(f" {shown}")
@@ -227,32 +187,42 @@ def _found(found: Found) -> Iterator[Text]:
         yield text
 
 
-def _latency(view: StatusView) -> Text:
-    if view.latency_s is None:
+def _latency(latency: Latency | None) -> Text:
+    if latency is None:
         return Text("latency  nothing has come yet", "dim")
-    median, p99, largest = (1e3 * value for value in view.latency_s)
+    median, p99, largest = (1e3 * t for t in (latency.median_s, latency.p99_s, latency.max_s))
     return Text(f"latency  median {median:.1f} ms, 99 % {p99:.1f} ms, max {largest:.1f} ms")
 
 
-def _links(view: StatusView) -> Table:
+def _links(status: RunStatus) -> Table:
     table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False, header_style="dim")
     for name, width in (("source", 8), ("state", 11)):
         table.add_column(name, no_wrap=True, min_width=width)
     for name, width in (("per s", 6), ("messages", 8), ("refused", 7), ("again", 5), ("last", 6)):
         table.add_column(name, justify="right", no_wrap=True, min_width=width)
     table.add_column("address", no_wrap=True, overflow="ellipsis")
-    for row in view.sources:
-        rate = f"{row.rate_hz:.1f}" if math.isfinite(row.rate_hz) else _NONE
-        _add_link(table, row, rate, f"{row.n_reconnects}", _age(row.age_s))
-    for row in view.outputs:
-        _add_link(table, row, "", "", "")
+    for row in status.sources:
+        _add_source(table, row)
+    for row in status.outputs:
+        _add_output(table, row)
     return table
 
 
-def _add_link(table: Table, row: SourceRow, rate: str, again: str, last: str) -> None:
-    refused = Text(f"{row.n_refused}", "yellow" if row.n_refused else "")
-    texts = [Text(row.name), Text(row.state)]
-    table.add_row(*texts, rate, f"{row.n_messages}", refused, again, last, Text(row.address))
+def _add_source(table: Table, row: SourceStatus) -> None:
+    texts = [Text(row.name), Text(row.state.value)]
+    refused = _refused(row.n_refused + row.n_limited)
+    numbers = (f"{row.rate_hz:.1f}", f"{row.n_messages}", refused, f"{row.n_reconnects}")
+    table.add_row(*texts, *numbers, _age(row.age_s), Text(row.address))
+
+
+def _add_output(table: Table, row: OutputStatus) -> None:
+    texts = [Text(f"→ {row.name}"), Text(f"{row.n_clients} listening")]
+    numbers = ("", f"{row.n_sent}", _refused(row.n_dropped), "")
+    table.add_row(*texts, *numbers, "", Text(row.address))
+
+
+def _refused(n: int) -> Text:
+    return Text(f"{n}", "yellow" if n else "")
 
 
 def _event(event: Event) -> Text:
@@ -263,11 +233,11 @@ def _event(event: Event) -> Text:
     return Text(f"{when}  {event.text}", style, no_wrap=True, overflow="ellipsis")
 
 
-def _disk(view: StatusView) -> Text:
-    text = Text(f"{view.folder}   ", "dim")
-    if view.log_problem:
-        return text.append(view.log_problem, "bold red")
-    return text.append(f"log as it comes; checkpoint {_ago(view.checkpoint_age_s)}")
+def _disk(status: RunStatus) -> Text:
+    text = Text(f"{status.folder}   ", "dim")
+    if status.log_problem:
+        return text.append(status.log_problem, "bold red")
+    return text.append(f"log as it comes; checkpoint {_ago(status.checkpoint_age_s)}")
 
 
 def _horizontal(navigation: Navigation) -> float:

@@ -88,13 +88,13 @@ class RunStatus:
     navigation: Navigation | None
     reason: str
     """Of its health; before there is an answer, what is waited for."""
-    latency: Latency | None
-    sources: tuple[SourceStatus, ...]
-    outputs: tuple[OutputStatus, ...]
-    events: tuple[Event, ...]
+    latency: Latency | None = None
+    sources: tuple[SourceStatus, ...] = ()
+    outputs: tuple[OutputStatus, ...] = ()
+    events: tuple[Event, ...] = ()
     """The last ones, newest last."""
-    log_problem: str | None
-    checkpoint_age_s: float
+    log_problem: str | None = None
+    checkpoint_age_s: float = math.inf
     """Data time since the last one; infinite before the first."""
     found: Found = Found()
     """What is known beside the state of the vehicle."""

@@ -1,0 +1,74 @@
+"""Random numbers: a stream for every source of error, and errors that change slowly.
+
+Changing one setting leaves every other source as it was, so that two missions of the same seed
+differ only in what was changed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from ssm_graph.base.frozen import Array
+from ssm_graph.simulation.checked import NOT_NEGATIVE, POSITIVE, Settings, checked
+
+
+@dataclass(frozen=True, slots=True)
+class Streams:
+    """One generator per source; new ones go to the end, so that old seeds keep their meaning."""
+
+    gyro_bias: np.random.Generator
+    gyro_noise: np.random.Generator
+    gyro_walk: np.random.Generator
+    accel_bias: np.random.Generator
+    accel_noise: np.random.Generator
+    accel_walk: np.random.Generator
+    initial: np.random.Generator
+    ping_time: np.random.Generator
+    beam_noise: np.random.Generator
+    outliers: np.random.Generator
+    dropouts: np.random.Generator
+    depth: np.random.Generator
+    gnss: np.random.Generator
+    usbl: np.random.Generator
+    ranges: np.random.Generator
+    heading: np.random.Generator
+    current: np.random.Generator
+    dvl_drift: np.random.Generator
+    gnss_drift: np.random.Generator
+
+
+def spawn_streams(seed: int) -> Streams:
+    """Return the streams of one seed."""
+    children = np.random.SeedSequence(seed).spawn(len(fields(Streams)))
+    return Streams(*(np.random.default_rng(child) for child in children))
+
+
+@dataclass(frozen=True, slots=True)
+class DriftSettings(Settings):
+    """How large an error is that changes slowly, and how slowly."""
+
+    sigma: float = checked(NOT_NEGATIVE, hint="try 0.006 m/s or 0.5 m")
+    """Standard deviation at any time, of each component."""
+    correlation_s: float = checked(POSITIVE, hint="try 60 s")
+    """Time after which 1/e of it is left in the mean, s."""
+
+
+def draw_drift(settings: DriftSettings, time_s: Array, rng: np.random.Generator) -> Array:
+    """Return three independent components (N, 3) at increasing times (N,)."""
+    unit = rng.standard_normal((len(time_s), 3))
+    return settings.sigma * gauss_markov(unit, time_s, settings.correlation_s)
+
+
+def gauss_markov(unit: Array, time_s: Array, correlation_s: float) -> Array:
+    """Return processes of variance 1, (N, d), at increasing times (N,).
+
+    ``unit`` (N, d) are the standard normal numbers that drive them.
+    """
+    kept = np.exp(-np.diff(time_s) / correlation_s)
+    fresh = np.sqrt(1.0 - kept**2)[:, None] * unit[1:]
+    process = unit.copy()
+    for k in range(len(kept)):
+        process[k + 1] = kept[k] * process[k] + fresh[k]
+    return process

@@ -1,0 +1,103 @@
+"""What ``import ssm_graph`` gives: every name documented, light to import, short to show."""
+
+from __future__ import annotations
+
+import inspect
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from estimate_fixture import make_mission, make_run
+
+import ssm_graph as sg
+
+ROOT = Path(__file__).parents[2]
+LONGEST_REPR = 1500
+PLAIN = {"FILTERS", "KERNELS", "SCENARIOS"}
+"""Mappings; what they hold is documented where they are made."""
+WANTED = {
+    *("Vehicle", "Ping", "ImuSample", "DepthReading", "Fix", "ImuLog", "DvlLog", "DvlMount"),
+    *("DepthLog", "GnssLog", "UsblLog", "RangeLog", "Beacon", "HeadingLog", "Standstill"),
+    *("CurrentModel", "HuberKernel", "CauchyKernel", "DcsKernel", "GemanMcClureKernel"),
+    *("convert_blueye", "convert_rosbag", "simulate", "SimulationConfig", "filter", "smooth"),
+    *("read_vehicle", "read_study", "run_study", "compare_methods", "withhold_gnss"),
+}
+
+
+def test_names_are_sorted_and_there() -> None:
+    """A user finds what a user needs, once, in order."""
+    assert list(sg.__all__) == sorted(set(sg.__all__))
+    assert set(sg.__all__) >= WANTED
+    assert {*sg.__all__, "__version__"} <= set(dir(sg))
+    assert sg.__version__.split(".")[0].isdigit()
+
+
+@pytest.mark.parametrize("name", sg.__all__)
+def test_every_name_is_documented(name: str) -> None:
+    """More than what `dataclass` writes by itself, and public at home as well."""
+    value = getattr(sg, name)
+    if name in PLAIN:
+        assert len(value) > 2
+        return
+    text = inspect.getdoc(value) or ""
+    assert len(text) > 15
+    assert not text.startswith(f"{name}(")
+    assert not value.__name__.startswith("_")
+
+
+def test_an_unknown_name_is_refused() -> None:
+    """As of any module."""
+    with pytest.raises(AttributeError, match="no attribute 'smoothe'"):
+        _ = sg.smoothe  # type: ignore[attr-defined]
+
+
+def test_to_import_costs_nothing() -> None:
+    """No heavy module is loaded before a name is asked for."""
+    code = "import sys, ssm_graph; print({'gtsam', 'scipy', 'matplotlib'} & set(sys.modules))"
+    assert run("-c", code).strip() == "set()"
+
+
+def test_the_package_runs_as_a_module() -> None:
+    """As the command does."""
+    assert run("-m", "ssm_graph", "--version").strip() == sg.__version__
+
+
+def run(*words: str) -> str:
+    """Return what Python says, started with these words."""
+    done = subprocess.run([sys.executable, *words], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_values_of_any_size_are_shown_in_one_line() -> None:
+    """An array as its shape and range, a value within a value by its lengths."""
+    estimate, reference = make_run()
+    mission = make_mission(estimate, reference)
+    for value in (mission, mission.imu, estimate, estimate.trajectory, estimate.beams, reference):
+        text = repr(value)
+        assert len(text) < LONGEST_REPR
+        assert "\n" not in text
+        assert text.startswith(f"{type(value).__name__}(")
+    assert "status=CONVERGED" in repr(estimate)
+    assert "trajectory=Trajectory(N=300)" in repr(estimate)
+    assert "lever_arm_b=[1., 2., 3.]" in repr(
+        sg.DepthLog(sigma=0.1, time_s=[], depth=[], lever_arm_b=np.array([1.0, 2.0, 3.0]))  # type: ignore[arg-type]
+    )
+    speed = np.array([[1.0, np.nan, -2.0], [0.5, 0.0, 4.0]])
+    mount = sg.DvlMount(beams_d=np.eye(3), R_bd=np.eye(3), lever_arm_b=np.zeros(3))
+    log = sg.DvlLog(mount=mount, time_s=np.arange(2.0), speed=speed, sigma=np.ones((2, 3)))
+    assert "speed=<2 x 3, -2 to 4, 1 not finite>" in repr(log)
+
+
+def test_rows_of_a_log_are_taken_together() -> None:
+    """Every column and nothing else; what is not there stays away."""
+    mount = sg.DvlMount(beams_d=np.eye(3), R_bd=np.eye(3), lever_arm_b=np.zeros(3))
+    speed = np.arange(9.0).reshape(3, 3)
+    log = sg.DvlLog(mount=mount, time_s=np.arange(3.0), speed=speed, sigma=np.ones((3, 3)))
+    kept = log.rows(np.array([True, False, True]))
+    np.testing.assert_array_equal(kept.time_s, [0.0, 2.0])
+    np.testing.assert_array_equal(kept.speed, speed[[0, 2]])
+    assert kept.range_m is None
+    assert kept.mount is mount
