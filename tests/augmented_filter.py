@@ -30,8 +30,8 @@ from ssm_graph.engine.error_state import (
 from ssm_graph.engine.extras import Extra
 from ssm_graph.engine.states import AugmentedStates, NavigationStates, local_D_deviation
 from ssm_graph.filters.navigation.process import Process
-from ssm_graph.filters.rules.model import NOMINAL, Iterate, Runs
 from ssm_graph.filters.rules.ssm import SsmUpdate
+from ssm_graph.filters.rules.update import NOMINAL, Iterate, Runs
 from ssm_graph.imu.arrays import interval_arrays
 from ssm_graph.mission.calibration import (
     DEPTH_OFFSET,

@@ -51,7 +51,7 @@ class Beams(ReadOnlyArrays):
     keyframe: NDArray[np.intp]
     """(M,)"""
     beam: NDArray[np.intp]
-    """(M,) 0 to 3"""
+    """(M,) from 0"""
     speed: Array
     """(M,) m/s"""
     sigma: Array
@@ -68,6 +68,8 @@ class Beams(ReadOnlyArrays):
     """(M,) the ping of each, counted from 0"""
     is_water: NDArray[np.bool_]
     """(M,) off the water instead of the ground: relative to its current"""
+    n_beams: int
+    """Of the instrument, B"""
     motion: MotionBefore | None = None
     """Inertial readings about the pings, where the DVL's clock or lever arm is in doubt."""
     white_share: float = 1.0
@@ -252,6 +254,7 @@ def _beams(mission: Mission, ping: Indices, ping_keyframe: Indices, extras: Extr
         R_bd=dvl.mount.R_bd,
         ping=row,
         is_water=is_water[row],
+        n_beams=dvl.mount.n_beams,
         motion=MotionBefore(mission.imu, dvl.ping_s[ping]) if needs_motion(extras) else None,
         white_share=dvl.mount.drift.white_share,
     )

@@ -20,6 +20,7 @@ from ssm_graph.mission.aids import Fixes
 from ssm_graph.mission.calibration import DEPTH_OFFSET
 from ssm_graph.mission.heights import height_track, mean_rises
 from ssm_graph.mission.problem import Beams
+from ssm_graph.sensors.dvl import N_BEAMS
 from ssm_graph.smoothers.keyframe import BeamSpeeds, Keyframe, Sensors
 
 _SEEN_BY_BEAMS = np.r_[ROTATION, VELOCITY, GYRO_BIAS]
@@ -60,6 +61,7 @@ def _augmented_rows(sensors: Sensors, beams: BeamSpeeds, states: AugmentedStates
         R_bd=sensors.R_bd,
         ping=np.zeros(count, np.intp),
         is_water=beams.is_water > 0.0,
+        n_beams=N_BEAMS,
     )
     extended = AugmentedBeams(table, sensors.extras, sensors.frame)
     at = _row_states(states)

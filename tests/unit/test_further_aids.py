@@ -184,7 +184,7 @@ def test_ranges_of_one_keyframe_find_a_start_that_is_off(
     lat, lon, height = (float(x) for x in frame.geodetic_from_p_n(start_n))
     sigma_enu = np.array([20.0, 20.0, 1.0])
     off = replace(start, lat=lat, lon=lon, height=height, position_sigma_enu=sigma_enu)
-    problem = build_problem(replace(mission, aids=AidLogs(ranges=ranges)), start=off)
+    problem = build_problem(replace(mission, aids=Aids(ranges)), start=off)
     first = first_values(problem, kernel=KERNEL)
     assert problem.further.ranges is not None
     (k,) = np.unique(problem.further.ranges.keyframe)

@@ -15,14 +15,17 @@ from factors.similarity import Similarity
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.engine.error_state import Linearised
 from ssm_graph.filters.geodetic.filter import GeodeticConfig, run_geodetic, to_navigation
-from ssm_graph.filters.navigation.filter import Grouping, run_filter
-from ssm_graph.filters.navigation.history import estimates_from_history
-from ssm_graph.filters.navigation.rts import smooth_history
+from ssm_graph.filters.navigation.filter import (
+    Grouping,
+    estimates_from_history,
+    run_filter,
+    smooth_history,
+)
 from ssm_graph.filters.rules.correntropy import CorrentropyUpdate
 from ssm_graph.filters.rules.kalman import Gate, GatedUpdate, KalmanUpdate
-from ssm_graph.filters.rules.model import UpdateRule
 from ssm_graph.filters.rules.ssm import SsmUpdate
 from ssm_graph.filters.rules.student import StudentUpdate
+from ssm_graph.filters.rules.update import UpdateRule
 from ssm_graph.mission.bottom_track import without_water_track
 from ssm_graph.mission.estimate import Estimate, OnKeyframe
 from ssm_graph.mission.problem import Problem

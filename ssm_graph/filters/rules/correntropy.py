@@ -11,15 +11,18 @@ from numpy.typing import NDArray
 from factors.similarity import WEIGHT_FLOOR
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
-from ssm_graph.filters.rules.linear_update import (
+from ssm_graph.filters.rules.update import (
     Corrected,
     Groups,
+    MeasurementModel,
     Result,
+    Runs,
+    Update,
+    UpdateRule,
     correct,
     each_or_nan,
     prepare,
 )
-from ssm_graph.filters.rules.model import MeasurementModel, Runs, Update, UpdateRule
 
 
 @final

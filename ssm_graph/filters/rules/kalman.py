@@ -11,8 +11,16 @@ from scipy.stats import chi2
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
-from ssm_graph.filters.rules.linear_update import Groups, Prepared, Result, correct, prepare
-from ssm_graph.filters.rules.model import MeasurementModel, Update, UpdateRule
+from ssm_graph.filters.rules.update import (
+    Groups,
+    MeasurementModel,
+    Prepared,
+    Result,
+    Update,
+    UpdateRule,
+    correct,
+    prepare,
+)
 
 LEFT_OUT = 1e-12
 """Weight of a row that a gate rejects: none, but regular."""

@@ -16,15 +16,19 @@ from numpy.typing import NDArray
 from factors.similarity import WEIGHT_FLOOR, Kernel, LogKernel, Similarity
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import Linearised
-from ssm_graph.filters.rules.linear_update import (
+from ssm_graph.filters.rules.update import (
     Corrected,
     Groups,
+    Iterate,
+    MeasurementModel,
     Prepared,
     Result,
+    Runs,
+    Update,
+    UpdateRule,
     correct,
     prepare,
 )
-from ssm_graph.filters.rules.model import Iterate, MeasurementModel, Runs, Update, UpdateRule
 
 
 class StopRule(Enum):

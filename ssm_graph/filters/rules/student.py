@@ -10,8 +10,15 @@ import numpy as np
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
-from ssm_graph.filters.rules.linear_update import Groups, Result, correct, prepare
-from ssm_graph.filters.rules.model import MeasurementModel, Update, UpdateRule
+from ssm_graph.filters.rules.update import (
+    Groups,
+    MeasurementModel,
+    Result,
+    Update,
+    UpdateRule,
+    correct,
+    prepare,
+)
 
 
 class Scale(Enum):
