@@ -32,7 +32,15 @@ from ssm_graph.engine.error_state import (
     STATE_DIM,
     VELOCITY,
 )
-from ssm_graph.filters.geodetic.error_model import (
+from ssm_graph.filters.geodetic.measurements import (
+    Places,
+    beam_rows,
+    correct,
+    nominal_rows,
+    places_of,
+    settle,
+)
+from ssm_graph.filters.geodetic.mechanisation import (
     DP,
     DV,
     EPS,
@@ -40,19 +48,20 @@ from ssm_graph.filters.geodetic.error_model import (
     NABLA,
     PHI,
     Feedback,
+    GeodeticState,
+    Samples,
+    Track,
+    advance,
     enu_D_place,
     feed_back,
     initial_moments,
     noise_densities,
     propagate,
 )
-from ssm_graph.filters.geodetic.measurements import Measurements, beam_rows, gather, nominal_rows
-from ssm_graph.filters.geodetic.mechanisation import GeodeticState, Samples, Track, advance
-from ssm_graph.filters.geodetic.update import correct, settle
+from ssm_graph.filters.side_by_side import Measurements, side_by_side
 from ssm_graph.imu.increments import merge_samples
 from ssm_graph.mission.estimate import OnKeyframe
 from ssm_graph.mission.problem import Problem
-from ssm_graph.sensors.dvl import N_BEAMS
 from ssm_graph.sensors.imu import ImuLog
 
 
@@ -96,13 +105,13 @@ class GeodeticHistory(ReadOnlyArrays):
     accel_bias: Array
     """(B, K, 3) m/s^2"""
     covariance: Array
-    """(B, K, 15, 15) of the errors of :mod:`ssm_graph.filters.geodetic.error_model`"""
+    """(B, K, 15, 15) of the errors of :mod:`ssm_graph.filters.geodetic.mechanisation`"""
     weight: Array
-    """(B, K, 4) NaN where there is no beam, as in the two that follow"""
+    """(B, K, n) of n beams; NaN where there is none, as in the two that follow"""
     mahalanobis_sq: Array
-    """(B, K, 4) t at the posterior"""
+    """(B, K, n) t at the posterior"""
     innovation: Array
-    """(B, K, 4) measured minus predicted before the update, m/s"""
+    """(B, K, n) measured minus predicted before the update, m/s"""
     iterations: NDArray[np.intp]
     """(B, K) 0 where there is no beam"""
 
@@ -148,14 +157,15 @@ def run_geodetic(
     """
     config = config or GeodeticConfig()
     samples, first = _merged(problems, imu, rate_hz=config.merge_rate_hz)
-    measurements = gather(problems)
+    measured = side_by_side(problems)
+    places = places_of(measured.fixes, [problem.frame for problem in problems])
     state, P = initial_moments(
         [problem.start for problem in problems],
         [problem.imu_noise_bias_sigma for problem in problems],
     )
     density = noise_densities([log.noise for log in imu], state)
     X = np.zeros((len(problems), ERROR_DIM))
-    recorder = _Recorder(len(problems), problems[0].n_keyframes)
+    recorder = _Recorder(len(problems), problems[0].n_keyframes, measured.beams.speed.shape[2])
     track: Track | None = None
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for k in range(problems[0].n_keyframes):
@@ -163,7 +173,7 @@ def run_geodetic(
                 track = advance(state, Samples(*(a[:, first[k - 1] : first[k]] for a in samples)))
                 X, P = propagate(X, P, track, density)
                 state = track.end
-            X, P = _update(X, P, state, measurements, k, track, config, recorder)
+            X, P = _update(X, P, state, (measured, places), k, track, config, recorder)
             state, X, P = feed_back(state, X, P, config.feedback)
             recorder.keep(k, state, X, P)
             if on_keyframe is not None:
@@ -199,19 +209,20 @@ def _update(
     X: Array,
     P: Array,
     state: GeodeticState,
-    measurements: Measurements,
+    measurements: tuple[Measurements, Places],
     k: int,
     track: Track | None,
     config: GeodeticConfig,
     recorder: _Recorder,
 ) -> tuple[Array, Array]:
     """Correct by depth and fix, then by the beams; the order changes nothing but the work."""
-    rows = beam_rows(measurements.beams, k, state)
+    beams = measurements[0].beams
+    rows = beam_rows(beams, k, state)
     recorder.innovation[:, k] = (rows.H @ X[..., None])[..., 0] - rows.Z
-    nominal = nominal_rows(measurements, k, state, track, X)
+    nominal = nominal_rows(*measurements, k, state, track, X)
     if nominal is not None:
         X, P = correct(X, P, nominal)
-    has_beam = np.isfinite(measurements.beams.speed[:, k])
+    has_beam = np.isfinite(beams.sigma[k])
     recorder.innovation[:, k][~has_beam] = np.nan
     if not has_beam.any():
         return X, P
@@ -232,14 +243,14 @@ def _update(
 class _Recorder:
     """Room for the history, filled keyframe by keyframe."""
 
-    def __init__(self, n_runs: int, n_keyframes: int) -> None:
+    def __init__(self, n_runs: int, n_keyframes: int, n_beams: int) -> None:
         shape = n_runs, n_keyframes
         self.place = np.empty((3, *shape))
         self.velocity_enu = np.empty((*shape, 3))
         self.R_lb = np.empty((*shape, 3, 3))
         self.gyro_bias, self.accel_bias = np.empty((2, *shape, 3))
         self.covariance = np.empty((*shape, ERROR_DIM, ERROR_DIM))
-        self.weight, self.mahalanobis_sq, self.innovation = np.full((3, *shape, N_BEAMS), np.nan)
+        self.weight, self.mahalanobis_sq, self.innovation = np.full((3, *shape, n_beams), np.nan)
         self.iterations = np.zeros(shape, np.intp)
 
     def keep(self, k: int, state: GeodeticState, X: Array, P: Array) -> None:
