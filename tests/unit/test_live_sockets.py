@@ -16,9 +16,16 @@ from ssm_graph.live.protocols.decoder import Clock
 from ssm_graph.live.protocols.json_messages import JsonDecoder, encode_message
 from ssm_graph.live.protocols.nmea import NmeaDecoder
 from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
-from ssm_graph.live.run.feed import CHUNK, CountingDecoder, Limits
-from ssm_graph.live.sockets.endpoints import LOOPBACK, OUTPUTS, Endpoint, Transport, parse_endpoint
-from ssm_graph.live.sockets.listeners import TcpServerInput, UdpInput
+from ssm_graph.live.sockets.endpoints import (
+    CHUNK,
+    LOOPBACK,
+    OUTPUTS,
+    Endpoint,
+    Transport,
+    parse_endpoint,
+)
+from ssm_graph.live.sockets.feed import CountingDecoder, Limits
+from ssm_graph.live.sockets.inputs import TcpServerInput, UdpInput
 from ssm_graph.live.sockets.outputs import MAX_CLIENTS, MAX_WAITING, OutputFormat, TcpServerOutput
 from ssm_graph.live.sockets.sockets import InputConfig, OutputConfig, SocketHub
 from ssm_graph.mission.navigation import Severity
