@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import traceback
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Final
 
 from ssm_graph.mission.navigation import Event, Severity
@@ -63,6 +64,14 @@ class EventLog:
         frames = traceback.extract_tb(error.__traceback__)
         at = f" ({frames[-1].filename}:{frames[-1].lineno})" if frames else ""
         self.note(place, kind, text + at, Severity.ERROR)
+
+    @contextmanager
+    def surviving(self, place: str, kind: str) -> Iterator[None]:
+        """Go on after what is done here, with a :meth:`failure` where it raises an exception."""
+        try:
+            yield
+        except Exception as error:
+            self.failure(place, kind, error)
 
     def take(self) -> tuple[Event, ...]:
         """Return what has not been taken yet."""

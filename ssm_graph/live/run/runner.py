@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Final, NamedTuple, Protocol
@@ -191,10 +193,8 @@ class Runner:
                 messages = source.poll(POLL_S)
                 begin_s = self._steady_s()
                 for message in messages:
-                    try:
+                    with self._events.surviving("raw log", "log_failed"):
                         log.append(message)
-                    except Exception as error:
-                        self._events.failure("raw log", "log_failed", error)
                     self._push(message)
                 if messages:
                     self._publish(outlet, source.time_s)
@@ -211,12 +211,8 @@ class Runner:
             return StopReason.ASKED
         if source.is_finished:
             return StopReason.SOURCE_ENDED
-        duration_s = self.config.duration_s
-        return (
-            StopReason.DURATION
-            if duration_s is not None and source.elapsed_s >= duration_s
-            else None
-        )
+        is_over = source.elapsed_s >= (self.config.duration_s or math.inf)
+        return StopReason.DURATION if is_over else None
 
     def _now_s(self) -> float:
         return self._data_s if self._connections is None else self._connections.source.time_s
@@ -263,36 +259,32 @@ class Runner:
         self._n_messages += 1
         if isinstance(message, ImuSample) or self._data_s == 0.0:
             self._data_s = message.time_s
-        try:
+        self._n_failures += 1
+        with self._of_estimator():
             self._estimator.push(message)
             self._n_failures = 0
-        except Exception as error:
-            self._n_failures += 1
-            self._events.failure("estimator", "estimator_failed", error)
+
+    def _of_estimator(self) -> AbstractContextManager[None]:
+        return self._events.surviving("estimator", "estimator_failed")
 
     def _publish(self, outlet: Outlet, now_s: float) -> None:
         for form in self._publisher.due(outlet, now_s):
             navigation = self._newest()
             if navigation is not None:
-                try:
+                with self._events.surviving("publisher", "publish_failed"):
                     self._publisher.send(outlet, form, navigation)
-                except Exception as error:
-                    self._events.failure("publisher", "publish_failed", error)
 
     def _newest(self) -> Navigation | None:
         """Return the newest answer; the one before where it cannot be had."""
-        try:
+        with self._of_estimator():
             self._navigation = self._estimator.newest()
-        except Exception as error:
-            self._events.failure("estimator", "estimator_failed", error)
         return self._navigation
 
     def _found(self) -> Found:
-        try:
-            return self._estimator.found()
-        except Exception as error:
-            self._events.failure("estimator", "estimator_failed", error)
-            return Found()
+        found = Found()
+        with self._of_estimator():
+            found = self._estimator.found()
+        return found
 
     def _keep(self, source: Source) -> None:
         """Write what has come about, and show it."""
@@ -311,11 +303,9 @@ class Runner:
             self._write_delayed(self._estimator.take_delayed)
 
     def _take_events(self) -> None:
-        try:
+        with self._of_estimator():
             for event in self._estimator.take_events():
                 self._note_event(event)
-        except Exception as error:
-            self._events.failure("estimator", "estimator_failed", error)
         for event in self._events.take():
             self._note_event(event)
 
@@ -325,11 +315,9 @@ class Runner:
 
     def _write_delayed(self, take: Callable[[], Sequence[Delayed]]) -> None:
         assert self.folder.results is not None
-        try:
+        with self._events.surviving("results", "results_failed"):
             for delayed in take():
                 self.folder.results.append(delayed.trajectory, delayed.beams, delayed.current)
-        except Exception as error:
-            self._events.failure("results", "results_failed", error)
 
     def _keep_checkpoint(self) -> None:
         """Write one where it is due and the disk is done with the last one."""
@@ -356,14 +344,12 @@ class Runner:
         self._take_events()
         if self.folder.problems() is not None:  # it would count on what is not on the disk
             return
-        try:
-            arrays, meta = self._estimator.checkpoint()
+        with self._events.surviving("checkpoint", "checkpoint_failed"):
+            n_messages, data_s = self._n_messages, self._data_s
             self.folder.write_checkpoint(
-                arrays, meta, n_messages=self._n_messages, data_s=self._data_s
+                *self._estimator.checkpoint(), n_messages=n_messages, data_s=data_s
             )
-            self._checkpoint_s = self._data_s
-        except Exception as failure:
-            self._events.failure("checkpoint", "checkpoint_failed", failure)
+            self._checkpoint_s = data_s
 
     def _end(self, reason: StopReason) -> RunEnd:
         self._note = "writing the last results"
@@ -385,10 +371,8 @@ class Runner:
     def _show(self, *, at_once: bool = False) -> None:
         if self._on_status is None or not (self._status.is_due(self._steady_s()) or at_once):
             return
-        try:
+        with self._events.surviving("status", "status_failed"):
             self._on_status(self._run_status())
-        except Exception as error:
-            self._events.failure("status", "status_failed", error)
 
     def _run_status(self) -> RunStatus:
         connections, navigation = self._connections, self._newest()

@@ -31,15 +31,14 @@ class Input(ABC):
     """One source. The hub calls :meth:`on_ready` for its sockets and :meth:`tick` all the time."""
 
     def __init__(self, feed: Feed, selector: selectors.BaseSelector) -> None:
-        self.feed, self._selector = feed, selector
+        self.feed, self.name, self._selector = feed, feed.name, selector
         self._reading: dict[socket.socket, Channel] = {}
         self._is_paused = False
 
     def on_ready(self, ready: socket.socket, now: Now) -> list[Message]:
         """Return the messages of a socket that can be read or has connected."""
         channel = self._reading.get(ready)
-        data = None if channel is None else received(ready)
-        if channel is None or data is None:
+        if channel is None or (data := received(ready)) is None:
             return []
         if isinstance(data, str):
             return self._lose(ready, now, data)

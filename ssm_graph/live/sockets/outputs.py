@@ -38,7 +38,7 @@ class Output(ABC):
     """One place that answers go to."""
 
     def __init__(self, form: OutputFormat, address: str, events: EventLog) -> None:
-        self.form, self.address = form, address
+        self.form, self.address, self.name = form, address, address
         self._events = events
         self._n_sent = self._n_dropped = 0
 

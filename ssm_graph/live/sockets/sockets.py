@@ -6,7 +6,6 @@ import selectors
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Self
 
 from ssm_graph.live.sockets.endpoints import Endpoint, Transport
@@ -104,13 +103,11 @@ class SocketHub:
                 else:
                     messages += key.data.on_ready(key.fileobj, now)
             except Exception as error:  # a defect: others go on
-                self._events.failure(_name(key.data), "socket_failed", error)
+                self._events.failure(key.data.name, "socket_failed", error)
                 key.data.abandon(key.fileobj)
         for link in self._links:
-            try:
+            with self._events.surviving(link.name, "socket_failed"):
                 messages += link.tick(now) or []  # outputs have none
-            except Exception as error:
-                self._events.failure(_name(link), "socket_failed", error)
         return messages
 
     def wait(self, timeout_s: float) -> None:
@@ -129,10 +126,8 @@ class SocketHub:
         """Send an answer to everybody who listens to this form; never waits."""
         for output in self.outputs:
             if output.form is form:
-                try:
+                with self._events.surviving(output.name, "socket_failed"):
                     output.send(data)
-                except Exception as error:
-                    self._events.failure(_name(output), "socket_failed", error)
 
     def take_events(self) -> tuple[Event, ...]:
         """Return what happened since the last call."""
@@ -156,12 +151,7 @@ class SocketHub:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        at: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _input(self, config: InputConfig) -> Input:
@@ -177,7 +167,3 @@ class SocketHub:
         if config.endpoint.transport is Transport.UDP:
             return UdpOutput(config.form, config.endpoint, self._events)
         return TcpServerOutput(config.form, config.endpoint, self._events, self._selector)
-
-
-def _name(link: Input | Output) -> str:
-    return link.feed.name if isinstance(link, Input) else link.address
