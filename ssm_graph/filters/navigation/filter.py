@@ -17,15 +17,15 @@ References
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
-from ssm_graph.engine.error_state import STATE_DIM, VELOCITY
+from ssm_graph.engine.error_state import VELOCITY
 from ssm_graph.engine.states import NavigationStates
 from ssm_graph.filters.navigation.measurements import KeyframeModel
 from ssm_graph.filters.navigation.process import Process
@@ -52,8 +52,7 @@ class Grouping(Enum):
         return np.arange(n_beams) if per_beam else np.zeros(n_beams, dtype=np.intp)
 
 
-@dataclass(slots=True, eq=False)
-class StateHistory:
+class StateHistory(NamedTuple):
     """States of R runs at K keyframes with covariances in their own error states."""
 
     R_nb: Array
@@ -68,32 +67,20 @@ class StateHistory:
     """(K, R, 15, 15)"""
 
     @classmethod
-    def empty(cls, n_keyframes: int, n_runs: int) -> StateHistory:
-        """Return a history to be filled."""
-        n = (n_keyframes, n_runs)
-        shapes = ((3, 3), (3,), (3,), (6,), (STATE_DIM, STATE_DIM))
-        return cls(*(np.empty((*n, *shape)) for shape in shapes))
-
-    def put(self, k: int, states: NavigationStates, covariance: Array) -> None:
-        """Keep the states of keyframe ``k``."""
-        self.R_nb[k], self.p_n[k], self.v_n[k], self.bias[k] = states
-        self.covariance[k] = covariance
-
-    def lose(self, k: int, is_lost: NDArray[np.bool_]) -> None:
-        """Forget the states of runs that have run away."""
-        for array in (self.R_nb, self.p_n, self.v_n, self.bias, self.covariance):
-            array[k, is_lost] = np.nan
+    def of(cls, steps: Sequence[tuple[NavigationStates, Array]]) -> StateHistory:
+        """Return the history of states and covariances keyframe by keyframe."""
+        return cls(*_stacked([(*states, covariance) for states, covariance in steps]))
 
     def at(self, k: int) -> NavigationStates:
         """Return the states of keyframe ``k``."""
-        return NavigationStates(self.R_nb[k], self.p_n[k], self.v_n[k], self.bias[k])
+        return NavigationStates(*(column[k] for column in self[:4]))
 
 
-@dataclass(slots=True, eq=False)
-class FilterHistory:
+class FilterHistory(NamedTuple):
     """All that a filter found out on its way."""
 
     posterior: StateHistory
+    """NaN from where a run has run away"""
     predicted: StateHistory
     transition: Array
     """(K - 1, R, 15, 15) of the error state from keyframe to keyframe."""
@@ -105,21 +92,6 @@ class FilterHistory:
     """(K, R, B) 1 = nominal"""
     n_iterations: Array
     """(K, R)"""
-
-    @classmethod
-    def empty(cls, n_keyframes: int, n_runs: int, n_beams: int) -> FilterHistory:
-        """Return a history to be filled."""
-        beams = (n_keyframes, n_runs, n_beams)
-        innovation, mahalanobis_sq, weight = (np.full(beams, np.nan) for _ in range(3))
-        return cls(
-            posterior=StateHistory.empty(n_keyframes, n_runs),
-            predicted=StateHistory.empty(n_keyframes, n_runs),
-            transition=np.empty((n_keyframes - 1, n_runs, STATE_DIM, STATE_DIM)),
-            innovation=innovation,
-            mahalanobis_sq=mahalanobis_sq,
-            weight=weight,
-            n_iterations=np.zeros(beams[:2]),
-        )
 
 
 def run_filter(
@@ -174,23 +146,28 @@ class _Filter:
 
     def run(self, on_keyframe: OnKeyframe | None) -> FilterHistory:
         n_keyframes = len(self._measured.keyframe_s)
-        history = FilterHistory.empty(n_keyframes, len(self._lost), len(self._groups))
+        predictions, posteriors, transitions, beams = [], [], [], []
         predicted, covariance = self._start, self._start_cov
         states = None
         for k in range(n_keyframes):
             if states is not None:
-                prediction = self._process.predict(k - 1, states)
-                predicted, F = prediction.states, prediction.transition
-                covariance = F @ covariance @ np.swapaxes(F, 1, 2) + prediction.process_cov
-                history.transition[k - 1] = F
-            history.predicted.put(k, predicted, covariance)
-            states, covariance = self._correct(k, predicted, covariance, states, history)
+                predicted, F, process_cov = self._process.predict(k - 1, states)
+                covariance = F @ covariance @ np.swapaxes(F, 1, 2) + process_cov
+                transitions.append(F)
+            predictions.append((predicted, covariance))
+            states, covariance, of_beams = self._correct(k, predicted, covariance, states)
             states, covariance = self._without_lost(states, covariance)
-            history.posterior.put(k, states, covariance)
-            history.posterior.lose(k, self._lost)
+            kept = [_where(self._lost, np.nan, own) for own in (*states, covariance)]
+            posteriors.append((NavigationStates(*kept[:4]), kept[4]))
+            beams.append(of_beams)
             if on_keyframe is not None:
                 on_keyframe(k + 1, n_keyframes)
-        return history
+        return FilterHistory(
+            StateHistory.of(posteriors),
+            StateHistory.of(predictions),
+            np.array(transitions),
+            *_stacked(beams),
+        )
 
     def _without_lost(
         self, states: NavigationStates, covariance: Array
@@ -206,21 +183,14 @@ class _Filter:
         if not np.any(self._lost):
             return states, covariance
         self._measured.silence(self._lost)
-        columns = (
-            np.where(self._lost.reshape(-1, *(1,) * (own.ndim - 1)), start, own)
-            for own, start in zip(states, self._start, strict=True)
-        )
-        kept = np.where(self._lost[:, None, None], self._start_cov, covariance)
-        return NavigationStates(*columns), kept
+        pairs = zip(self._start, states, strict=True)
+        kept = NavigationStates(*(_where(self._lost, start, own) for start, own in pairs))
+        return kept, _where(self._lost, self._start_cov, covariance)
 
     def _correct(
-        self,
-        k: int,
-        predicted: NavigationStates,
-        covariance: Array,
-        before: NavigationStates | None,
-        history: FilterHistory,
-    ) -> tuple[NavigationStates, Array]:
+        self, k: int, predicted: NavigationStates, P: Array, before: NavigationStates | None
+    ) -> tuple[NavigationStates, Array, tuple[Array, ...]]:
+        """Return states, covariances, and what :class:`FilterHistory` keeps of the beams."""
         model = KeyframeModel(
             self._measured,
             k,
@@ -229,16 +199,25 @@ class _Filter:
             beam_groups=self._groups,
             before=before,
         )
+        present = model.present[:, : model.n_beams]
+        nothing = np.full(present.shape, np.nan)
         if not np.any(model.present):
-            return predicted, covariance
-        update = self._rule(covariance, model)
-        beams = slice(len(self._groups))
-        present = model.present[:, beams]
-        history.innovation[k] = model.beam_innovations()
-        history.mahalanobis_sq[k] = np.where(present, update.mahalanobis_sq[:, beams], np.nan)
-        history.weight[k] = np.where(present, update.weights[:, beams], np.nan)
-        history.n_iterations[k] = update.n_iterations
-        return predicted.displaced(update.xi), update.covariance
+            return predicted, P, (nothing, nothing, nothing, np.zeros(len(P)))
+        update = self._rule(P, model)
+        own = (update.mahalanobis_sq, update.weights)
+        found = (np.where(present, rows[:, : model.n_beams], np.nan) for rows in own)
+        of_beams = (model.beam_innovations(), *found, update.n_iterations)
+        return predicted.displaced(update.xi), update.covariance, of_beams
+
+
+def _stacked(steps: Sequence[tuple[Array, ...]]) -> list[Array]:
+    """Return the columns of K steps, (K, ...) each."""
+    return [np.stack(column) for column in zip(*steps, strict=True)]
+
+
+def _where(runs: NDArray[np.bool_], one: Array | float, other: Array) -> Array:
+    """Return ``one`` for some runs (R,) and ``other`` (R, ...) for the rest."""
+    return np.where(runs.reshape(-1, *(1,) * (other.ndim - 1)), one, other)
 
 
 def smooth_history(history: FilterHistory) -> StateHistory:
@@ -248,19 +227,18 @@ def smooth_history(history: FilterHistory) -> StateHistory:
     smoothed states differ from the predicted ones goes back through the gain ``P F' P_pred^-1``.
     """
     posterior, predicted = history.posterior, history.predicted
-    n_keyframes, n_runs = posterior.p_n.shape[:2]
-    smoothed = StateHistory.empty(n_keyframes, n_runs)
-    states, covariance = posterior.at(n_keyframes - 1), posterior.covariance[-1]
-    smoothed.put(n_keyframes - 1, states, covariance)
-    for k in range(n_keyframes - 2, -1, -1):
+    last = len(posterior.p_n) - 1
+    states, covariance = posterior.at(last), posterior.covariance[last]
+    smoothed = [(states, covariance)]
+    for k in range(last - 1, -1, -1):
         gain = _gain(posterior.covariance[k], history.transition[k], predicted.covariance[k + 1])
         missed = predicted.at(k + 1).deviation_of(states)
         states = posterior.at(k).displaced((gain @ missed[..., None])[..., 0])
         change = covariance - predicted.covariance[k + 1]
         covariance = posterior.covariance[k] + gain @ change @ np.swapaxes(gain, 1, 2)
         covariance = 0.5 * (covariance + np.swapaxes(covariance, 1, 2))
-        smoothed.put(k, states, covariance)
-    return smoothed
+        smoothed.append((states, covariance))
+    return StateHistory.of(smoothed[::-1])
 
 
 def _gain(posterior: Array, transition: Array, predicted: Array) -> Array:
@@ -290,9 +268,7 @@ def estimates_from_history(
         estimates.append(
             recursive_estimate(
                 problem,
-                NavigationStates(
-                    *(getattr(states, name)[:, run] for name in NavigationStates._fields)
-                ),
+                NavigationStates(*(column[:, run] for column in states[:4])),
                 states.covariance[:, run],
                 RecursiveBeams(
                     None if is_smoothed else history.innovation[at],

@@ -103,7 +103,7 @@ class Source(Protocol):
     @property
     def elapsed_s(self) -> float: ...  # noqa: D102
     def poll(self, timeout_s: float) -> list[Message]: ...  # noqa: D102
-    def take_events(self) -> list[Event]: ...  # noqa: D102
+    def take_events(self) -> Sequence[Event]: ...  # noqa: D102
     def source_status(self) -> tuple[SourceStatus, ...]: ...  # noqa: D102
 
 
