@@ -10,6 +10,7 @@ import json
 import math
 import socket
 import tempfile
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -201,7 +202,7 @@ class Voyage:
         self.vessel.n_lost += not is_received
         return is_received
 
-    def take_events(self) -> list[Event]:
+    def take_events(self) -> Sequence[Event]:
         """Return what happened at the sockets."""
         return self.vessel.hub.take_events()
 

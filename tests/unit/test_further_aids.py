@@ -163,7 +163,7 @@ def test_ranges_of_one_keyframe_find_a_start_that_is_off(
     known = tuple(BeaconSettings(number + 1, enu) for number, enu in enumerate(around))
     sim = simulated(duration_s=10.0, aids=ranging(*known), gnss=None)
     mission, frame = sim.mission, sim.mission.frame
-    log, start = mission.aids.ranges, mission.initial
+    log, start = mission.aids.get(RangeLog), mission.initial
     assert log is not None
     assert start is not None
     at_s, beacons = 5.0, [log.beacons[i] for i in order]
