@@ -14,7 +14,7 @@ import numpy as np
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
-from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator import ONLINE, FixedLagSmoother
 from ssm_graph.mission.navigation import Event, Health, Navigation
 from ssm_graph.mission.vehicle import Vehicle

@@ -161,7 +161,7 @@ MODES: Mapping[str, Callable[[Mission], Mission]] = {
 def used_fixes(mission: Mission, protocol: Protocol, until_s: float = GNSS_END_S) -> Mask:
     """Return which fixes (N,) an estimator sees; ``until_s`` is for protocol A."""
     gnss = _gnss(mission)
-    elapsed = gnss.time_s - mission.imu.start_s
+    elapsed = gnss.valid_s - mission.imu.start_s
     if protocol is Protocol.C:
         return np.ones(len(elapsed), dtype=bool)
     if protocol is Protocol.B:
@@ -208,7 +208,7 @@ def evaluate_case(mission: Mission, case: Case, until_s: float = GNSS_END_S) -> 
     used = used_fixes(mission, case.protocol, until_s)
     scored = used if case.protocol is Protocol.C else ~used
     if case.protocol is Protocol.A:
-        scored = scored & (gnss.time_s > gnss.time_s[used][-1])
+        scored = scored & (gnss.valid_s > gnss.valid_s[used][-1])
     seen = replace(mission, gnss=gnss.rows(used))
     spoilt = with_faults(seen, case.faults, case.seed)
     nothing = Score(np.nan, np.nan, np.nan, np.nan, np.nan, "-", None, None)
@@ -226,9 +226,9 @@ def _score(estimate: Estimate, mission: Mission, scored: Mask, used: Mask) -> Sc
     reference = reference_from_gnss(gnss.rows(scored), estimate.trajectory)
     errors = error_series(estimate.trajectory, reference)
     is_open = scored.all()
-    before = used & (gnss.time_s < gnss.time_s[scored][0])
-    begin_s = float(gnss.time_s[0] if is_open else gnss.time_s[before][-1])
-    sigma_at = float(gnss.time_s[-1]) if is_open else begin_s
+    before = used & (gnss.valid_s < gnss.valid_s[scored][0])
+    begin_s = float(gnss.valid_s[0] if is_open else gnss.valid_s[before][-1])
+    sigma_at = float(gnss.valid_s[-1]) if is_open else begin_s
     trajectory = estimate.trajectory
     sigma = errors.position_sigma_enu[:, :2]
     rms = float(np.sqrt(np.mean(errors.horizontal**2)))

@@ -24,7 +24,7 @@ from ssm_graph.evaluation import error_series, reference_from_gnss, withhold_gns
 from ssm_graph.filters.navigation.named import filter_problems
 from ssm_graph.io.blueye.convert import convert_blueye
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
-from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator import ONLINE, FixedLagSmoother
 from ssm_graph.mission.estimate import Trajectory, since_first_ping
 from ssm_graph.mission.mission import Mission, Reference
@@ -95,7 +95,7 @@ def stream_ours(duration_s: float, seed: int, dvl_hz: float, config: FixedLagCon
     run = run_stream(
         smoother, messages_of(sim.mission), every_s=1.0 / ASK_HZ, duration_s=duration_s
     )
-    first_s = float(sim.mission.dvl.ping_s[0])
+    first_s = float(sim.mission.dvl.valid_s[0])
     rows = run.answers.first_after_keyframe(begin_s=first_s)
     assert run.delayed is not None
     delayed = since_first_ping(run.delayed)

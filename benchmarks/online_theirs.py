@@ -18,7 +18,7 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.engine.states import AugmentedStates
 from ssm_graph.graph.gtsam_graph import prior_graph
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
-from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator.asked import sensors_of_vehicle
 from ssm_graph.live.estimator.buffers import Buffers
 from ssm_graph.live.estimator.keyframes import KeyframeMaker

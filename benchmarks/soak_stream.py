@@ -16,7 +16,7 @@ from benchmarks.online_stream import HEALTHS, Answers, run_stream
 from ssm_graph.base.frozen import Array
 from ssm_graph.evaluation import error_series
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
-from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator import FixedLagSmoother
 from ssm_graph.mission.mission import Mission, Reference
 from ssm_graph.mission.navigation import Health

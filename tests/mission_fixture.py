@@ -10,12 +10,12 @@ import numpy as np
 from ssm_graph.base.earth import EARTH_RATE, LocalFrame, normal_gravity
 from ssm_graph.base.frames import R_lb_from_roll_pitch_heading
 from ssm_graph.base.frozen import Array
-from ssm_graph.io.mission_folder.units import MICRO_G, beams_from_angles
+from ssm_graph.base.units import MICRO_G
 from ssm_graph.io.mission_folder.writer import mission_tables
-from ssm_graph.io.tables.table import write_table
+from ssm_graph.io.tables.files import write_table
 from ssm_graph.mission.mission import InitialState, Mission, Reference
 from ssm_graph.sensors.depth import DepthLog
-from ssm_graph.sensors.dvl import DvlLog, DvlMount
+from ssm_graph.sensors.dvl import DvlLog, DvlMount, beams_from_angles
 from ssm_graph.sensors.gnss import GnssLog
 from ssm_graph.sensors.imu import ImuLog, ImuNoise
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
-from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator import ONLINE, FixedLagSmoother
 from ssm_graph.live.estimator.delayed import Delayed
 from ssm_graph.mission.navigation import Navigation

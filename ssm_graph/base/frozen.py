@@ -66,7 +66,7 @@ class ShortRepr:
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
         if "__repr__" not in cls.__dict__:  # or else `dataclass` would write one of its own
-            cls.__repr__ = ShortRepr._short  # type: ignore[method-assign]
+            cls.__repr__ = ShortRepr._short  # type: ignore[method-assign, assignment]
 
     def _short(self) -> str:
         specs = (spec for spec in fields(cast(Any, self)) if spec.repr)

@@ -17,7 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemaini
 from rich.progress import Progress as Bar
 
 from ssm_graph.base.errors import ConfigError
-from ssm_graph.cli.options import add_command, method_lines, table_format_option
+from ssm_graph.cli.options import add_command, method_lines, say, table_format_option
 from ssm_graph.evaluation.comparison import compare_methods
 from ssm_graph.io.mission_folder.reader import TableFormat
 from ssm_graph.report.comparison.tables import latex, markdown
@@ -132,10 +132,9 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     except KeyboardInterrupt:
         # As many as the file has: the signal may have come between writing and counting.
         store = open_store(study, arguments.out, fresh=False)
-        errors.print(
+        say(
+            errors,
             f"{len(store)} finished runs are kept in {store.path}; the same command goes on there",
-            highlight=False,
-            soft_wrap=True,
         )
         raise
     command = shlex.join(["ssm-graph", *sys.argv[1:]])
@@ -143,11 +142,10 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     if not arguments.no_figures:
         _write_figures(arguments.out / "figures", study, result, errors)
     headline = text.partition("\n## Every cell")[0]
-    console.print(headline, markup=False, highlight=False, soft_wrap=True)
-    console.print(
+    say(console, headline)
+    say(
+        console,
         f"{len(result.rows)} runs, {result.n_failed} without a result; results in {arguments.out}",
-        highlight=False,
-        soft_wrap=True,
     )
     return result.n_failed == 0
 
@@ -242,10 +240,8 @@ class StudyDisplay:
         s_per_run = (now - self._said) / max(progress.n_done - self._n_said, 1)
         self._said, self._n_said = now, progress.n_done
         left_s = s_per_run * (progress.n_wanted - progress.n_done)
-        self._console.print(
+        say(
+            self._console,
             f"{progress.n_done} of {progress.n_wanted} runs, {progress.label}, "
             f"{left_s / 60.0:.1f} min left",
-            markup=False,
-            highlight=False,
-            soft_wrap=True,
         )

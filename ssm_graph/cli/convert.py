@@ -11,7 +11,7 @@ from rich.console import Console
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frames import BodyAxes
-from ssm_graph.cli.options import add_command, add_mission_output
+from ssm_graph.cli.options import add_command, add_mission_output, number_option, say
 from ssm_graph.io.blueye.convert import convert_blueye
 from ssm_graph.io.mission_folder.reader import write_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle
@@ -72,26 +72,15 @@ def _add_ros_options(parser: argparse.ArgumentParser) -> None:
         help="axes of the IMU messages: forward-left-up as REP 103 has it, forward-right-down, "
         "right-forward-up (default: FLU)",
     )
-    group.add_argument(
-        "--water-density",
-        type=_number,
-        metavar="KG_PER_M3",
-        help=f"of the water (default: {SEA_WATER:g}; fresh water has 1000)",
-    )
-    group.add_argument(
-        "--atmosphere",
-        type=_number,
-        metavar="PA",
-        help="pressure at the surface, 0 for a sensor that reads 0 there "
-        f"(default: {STANDARD_ATMOSPHERE:.0f})",
-    )
-    group.add_argument(
-        "--surface-height",
-        type=_number,
-        metavar="M",
-        help="height of the water's surface above the WGS-84 ellipsoid (default: by the fixes, "
-        "else 0)",
-    )
+    density = f"of the water (default: {SEA_WATER:g}; fresh water has 1000)"
+    air = "pressure at the surface, 0 for a sensor that reads 0 there "
+    surface = "height of the water's surface above the WGS-84 ellipsoid "
+    for flag, metavar, meaning in (
+        ("--water-density", "KG_PER_M3", density),
+        ("--atmosphere", "PA", f"{air}(default: {STANDARD_ATMOSPHERE:.0f})"),
+        ("--surface-height", "M", f"{surface}(default: by the fixes, else 0)"),
+    ):
+        number_option(group, flag, metavar, meaning, kind=_number)
     group.add_argument(
         "--beams-against",
         action="store_true",
@@ -118,11 +107,10 @@ def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
     write_mission(arguments.out, mission, table_format=arguments.format)
     n_fixes = len(mission.gnss.time_s) if mission.gnss is not None else 0
     span_s = mission.imu.time_s[-1] - mission.imu.start_s
-    console.print(
+    say(
+        console,
         f"{arguments.out}: {span_s:.1f} s, {len(mission.imu.time_s)} inertial samples, "
         f"{len(mission.dvl.time_s)} pings, {n_fixes} GNSS fixes",
-        highlight=False,
-        soft_wrap=True,
     )
     for note in mission.notes:
         console.print(f"note: {note}", style="yellow", highlight=False, markup=False)

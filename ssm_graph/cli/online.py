@@ -18,10 +18,16 @@ from factors.kernels import KERNELS
 from ssm_graph.base.errors import ConfigError, SolverError
 from ssm_graph.base.frames import BodyAxes
 from ssm_graph.base.frozen import Array
-from ssm_graph.cli.options import add_command, add_kernel_options, kernel_of
+from ssm_graph.cli.options import (
+    add_command,
+    add_kernel_options,
+    kernel_of,
+    number_option,
+    say,
+)
 from ssm_graph.io.mission_folder.reader import read_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle, vehicle_of
-from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator import ONLINE, FixedLagSmoother
 from ssm_graph.live.protocols.decoder import Clock
 from ssm_graph.live.protocols.json_messages import JsonDecoder
@@ -227,10 +233,10 @@ def _report(end: RunEnd, folder: Path, console: Console) -> bool:
     text = f"{end.navigation.health.name}: {end.navigation.reason}; {end.reason.value}"
     if end.n_errors:
         text += f"; {end.n_errors} errors survived, see {folder / 'events.jsonl'}"
-    console.print(text, markup=False, highlight=False, soft_wrap=True)
+    say(console, text)
     if end.found.calibration is not None:
         console.print(calibration_table(end.found.calibration))
-    console.print(f"results in {folder}", markup=False, highlight=False, soft_wrap=True)
+    say(console, f"results in {folder}")
     return end.navigation.health is Health.GOOD and end.reason is not StopReason.FAILED
 
 
@@ -285,13 +291,7 @@ def add_connections(parser: argparse.ArgumentParser) -> None:
 
 def add_estimator_options(parser: argparse.ArgumentParser) -> None:
     """Add lag and kernel."""
-    parser.add_argument(
-        "--lag",
-        type=float,
-        default=ONLINE.lag_s,
-        metavar="SECONDS",
-        help=f"states so old are settled (default: {ONLINE.lag_s:g})",
-    )
+    number_option(parser, "--lag", "SECONDS", "states so old are settled", ONLINE.lag_s)
     add_kernel_options(parser, KERNELS)
 
 
@@ -305,16 +305,8 @@ def add_rates(parser: argparse.ArgumentParser) -> None:
         ("max-rate", limits.messages_per_s, "N", MAX_RATE),
         ("stall", limits.stall_s, "SECONDS", "a connection silent for so long is given up"),
     ):
-        parser.add_argument(
-            f"--{name}",
-            type=float,
-            default=default,
-            metavar=metavar,
-            help=f"{meaning} (default: {default:g})",
-        )
-    parser.add_argument(
-        "--duration", type=float, metavar="SECONDS", help="end by itself (default: never)"
-    )
+        number_option(parser, f"--{name}", metavar, meaning, default)
+    number_option(parser, "--duration", "SECONDS", "end by itself (default: never)")
 
 
 def replay_speed(word: str) -> float | None:

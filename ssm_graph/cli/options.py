@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
+
+from rich.console import Console
 
 from factors.kernels import KernelChoice
 from factors.similarity import Kernel
@@ -23,6 +25,24 @@ def add_command(commands: Any, name: str, *, summary: str, description: str, epi
         epilog=epilog,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+
+
+def say(console: Console, text: str) -> None:
+    """Print a text as it is, whatever it holds and however long it is."""
+    console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def number_option(
+    parser: Any,
+    flag: str,
+    metavar: str,
+    meaning: str,
+    default: float | None = None,
+    kind: Callable[[str], float] = float,
+) -> None:
+    """Add an option that holds a number; without a default the meaning says what is the case."""
+    tail = "" if default is None else f" (default: {default:g})"
+    parser.add_argument(flag, type=kind, default=default, metavar=metavar, help=meaning + tail)
 
 
 def method_lines(families: Mapping[str, Family]) -> str:

@@ -11,6 +11,7 @@ from typing import Any
 from rich.console import Console
 
 from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.cli.options import number_option, say
 from ssm_graph.evaluation import Metrics, evaluate, reference_from_gnss, withhold_gnss
 from ssm_graph.io.mission_folder.calibration_toml import CALIBRATION_NAME
 from ssm_graph.io.mission_folder.reader import read_mission
@@ -33,28 +34,12 @@ def add_mission_arguments(parser: argparse.ArgumentParser) -> None:
     graph = ProblemConfig()
     parser.add_argument("mission", type=Path, metavar="MISSION", help="mission folder")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="result folder")
-    parser.add_argument(
-        "--merge-rate",
-        type=float,
-        default=graph.merge_rate_hz,
-        metavar="HZ",
-        help=f"rate to which inertial samples are merged (default: {graph.merge_rate_hz:g})",
-    )
-    parser.add_argument(
-        "--keyframe-interval",
-        type=float,
-        default=graph.keyframe_interval_s,
-        metavar="SECONDS",
-        help="keyframes this far apart while DVL and GNSS are silent "
-        f"(default: {graph.keyframe_interval_s:g})",
-    )
-    parser.add_argument(
-        "--gnss-until",
-        type=float,
-        metavar="SECONDS",
-        help="use GNSS only so long from the begin of the inertial data; the rest becomes the "
-        "reference",
-    )
+    merged = "rate to which inertial samples are merged"
+    number_option(parser, "--merge-rate", "HZ", merged, graph.merge_rate_hz)
+    apart = "keyframes this far apart while DVL and GNSS are silent"
+    number_option(parser, "--keyframe-interval", "SECONDS", apart, graph.keyframe_interval_s)
+    until = "use GNSS only so long from the begin of the inertial data; the rest becomes the "
+    number_option(parser, "--gnss-until", "SECONDS", until + "reference")
     parser.add_argument("--no-figure", action="store_true", help="write no figure.png")
 
 
@@ -103,10 +88,10 @@ def run_mission(
         if not arguments.no_figure:
             save_figure(arguments.out / "figure.png", estimate, reference, title=mission.name)
     console.print(summary_table(estimate, metrics))
-    console.print(f"results in {arguments.out}", highlight=False, soft_wrap=True)
+    say(console, f"results in {arguments.out}")
     if estimate.calibration is not None:
         path = arguments.out / CALIBRATION_NAME
-        console.print(f"lines for mission.toml in {path}", highlight=False, soft_wrap=True)
+        say(console, f"lines for mission.toml in {path}")
     return estimate.status.is_good
 
 

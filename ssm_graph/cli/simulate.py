@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import Console
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.cli.options import add_command, add_mission_output
+from ssm_graph.cli.options import add_command, add_mission_output, say
 from ssm_graph.io.mission_folder.reader import write_mission
 from ssm_graph.sensors.dvl import MOST_BEAMS
 from ssm_graph.simulation import (
@@ -85,12 +85,11 @@ def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
     simulated = simulate(scenario_config(arguments.scenario, **changes))
     write_mission(arguments.out, simulated.mission, table_format=arguments.format)
     mission = simulated.mission
-    console.print(
+    say(
+        console,
         f"{arguments.out}: {len(mission.imu.time_s)} inertial samples, "
         f"{len(mission.dvl.time_s)} pings, {int(simulated.is_outlier.sum())} beam outliers, "
         f"seed {arguments.seed}",
-        highlight=False,
-        soft_wrap=True,
     )
     return True
 

@@ -27,7 +27,7 @@ def reference_from_gnss(gnss: GnssLog, trajectory: Trajectory) -> Reference:
     Errors contain the noise of the fixes; their sigmas count beside those of the estimate.
     """
     angles = interpolate_within(
-        gnss.time_s,
+        gnss.valid_s,
         known_s=trajectory.time_s,
         values=np.unwrap(trajectory.roll_pitch_heading, axis=0),
     )
@@ -41,7 +41,7 @@ def reference_from_gnss(gnss: GnssLog, trajectory: Trajectory) -> Reference:
         lat, lon, height = frame.geodetic_from_p_n(antenna_n - lever_n)
     unknown = np.full((int(kept.sum()), 3), np.nan)
     return Reference(
-        time_s=gnss.time_s[kept],
+        time_s=gnss.valid_s[kept],
         lat=lat,
         lon=lon,
         height=height,
@@ -62,9 +62,9 @@ def withhold_gnss(mission: Mission, until_s: float) -> tuple[Mission, GnssLog]:
     gnss = mission.gnss
     if gnss is None:
         raise ConfigError("expected a mission with GNSS, got one without")
-    used = gnss.time_s < mission.imu.start_s + until_s
+    used = gnss.valid_s < mission.imu.start_s + until_s
     if not used.any() or used.all():
-        first, last = gnss.time_s[[0, -1]] - mission.imu.start_s
+        first, last = gnss.valid_s[[0, -1]] - mission.imu.start_s
         raise ConfigError(
             f"expected a time between the first fix at {first:.1f} s and the last at "
             f"{last:.1f} s, got {until_s:g} s"

@@ -62,7 +62,7 @@ def depths_of(mission: Mission, timeline: Timeline) -> Depths | None:
     return Depths(
         keyframe=np.searchsorted(keyframe_s, log.time_s[used]),
         time_s=log.time_s[used],
-        depth=log.depth[used],
+        depth=log.true_depth[used],
         gyro_b=mean_gyro(mission.imu, keyframe_s),
         sigma=log.sigma,
         lever_arm_b=log.lever_arm_b,
@@ -79,7 +79,7 @@ def fix_covariance_n(frame: LocalFrame, position_n: Array, sigma_enu: Array) -> 
 def fixes_of(mission: Mission, log: GnssLog, timeline: Timeline) -> Fixes:
     """Return the GNSS fixes that a timeline uses."""
     fixes = fixes_at(
-        mission, log, timeline.fix, time_s=log.time_s[timeline.fix], keyframe=timeline.fix_keyframe
+        mission, log, timeline.fix, time_s=log.valid_s[timeline.fix], keyframe=timeline.fix_keyframe
     )
     return replace(fixes, white_share=log.calibration.drift.white_share)
 

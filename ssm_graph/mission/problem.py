@@ -22,7 +22,7 @@ from ssm_graph.mission.ping_motion import MotionBefore, mean_gyro
 from ssm_graph.mission.start.moments import initial_moments
 from ssm_graph.mission.timeline import MIN_SPACING_S, Indices, build_timeline, is_inside, nearest
 from ssm_graph.mission.usable import require_usable
-from ssm_graph.sensors.dvl import stuck_beams
+from ssm_graph.sensors.dvl_readings import stuck_beams
 from ssm_graph.sensors.imu import ImuLog
 
 NO_EXTRAS = Extras()
@@ -163,7 +163,7 @@ def with_dvl(problem: Problem, mission: Mission) -> Problem:
     The inertial chain, most of the work, is kept; so the pings have to be at keyframes.
     """
     mission, _ = _without_stuck_beams(mission)
-    keyframe_s, ping_s = problem.keyframe_s, mission.dvl.ping_s
+    keyframe_s, ping_s = problem.keyframe_s, mission.dvl.valid_s
     is_used = np.isfinite(mission.dvl.speed).any(axis=1)
     is_used &= is_inside(ping_s, keyframe_s[0], keyframe_s[-1])
     ping = np.flatnonzero(is_used)
@@ -217,7 +217,7 @@ def _without_stuck_beams(mission: Mission) -> tuple[Mission, tuple[str, ...]]:
     if not count.any():
         return mission, ()
     beams = ", ".join(f"beam {b + 1}: {count[b]}" for b in np.flatnonzero(count))
-    first_s = float(dvl.ping_s[is_stuck.any(axis=1)][0])
+    first_s = float(dvl.valid_s[is_stuck.any(axis=1)][0])
     note = (
         f"speeds of a beam that repeats one reading while the others change are left out: {beams}; "
         f"the first at {first_s:.3f} s"
@@ -240,21 +240,21 @@ def _gap_note(imu: ImuLog) -> tuple[str, ...]:
 
 def _beams(mission: Mission, ping: Indices, ping_keyframe: Indices, extras: Extras) -> Beams:
     dvl, is_water = mission.dvl, mission.dvl.is_water[ping]
-    speed = dvl.speed[ping]
+    speed, sigma, beams_b = (rows[ping] for rows in dvl.independent())
     row, beam = np.nonzero(np.isfinite(speed))
-    gyro_b = mean_gyro(mission.imu, dvl.ping_s[ping]) if len(ping) else np.zeros((0, 3))
+    gyro_b = mean_gyro(mission.imu, dvl.valid_s[ping]) if len(ping) else np.zeros((0, 3))
     return Beams(
         keyframe=ping_keyframe[row],
         beam=beam,
         speed=speed[row, beam],
-        sigma=dvl.sigma[ping][row, beam],
+        sigma=sigma[row, beam],
         gyro_b=gyro_b[row],
-        beam_b=dvl.mount.beams_b[beam],
+        beam_b=beams_b[row, beam],
         lever_arm_b=dvl.mount.lever_arm_b,
         R_bd=dvl.mount.R_bd,
         ping=row,
         is_water=is_water[row],
         n_beams=dvl.mount.n_beams,
-        motion=MotionBefore(mission.imu, dvl.ping_s[ping]) if needs_motion(extras) else None,
+        motion=MotionBefore(mission.imu, dvl.valid_s[ping]) if needs_motion(extras) else None,
         white_share=dvl.mount.drift.white_share,
     )

@@ -55,9 +55,9 @@ def build_timeline(mission: Mission, *, start_s: float, interval_s: float) -> Ti
         raise DataError(
             f"the start at {start_s:.3f} s leaves no inertial data, which end at {end_s:.3f} s"
         )
-    ping_s = mission.dvl.ping_s
+    ping_s = mission.dvl.valid_s
     has_beam = np.isfinite(mission.dvl.speed).any(axis=1)
-    fix_s = mission.gnss.time_s if mission.gnss is not None else np.zeros(0)
+    fix_s = mission.gnss.valid_s if mission.gnss is not None else np.zeros(0)
     ping = np.flatnonzero(has_beam & is_inside(ping_s, start_s, end_s))
     fix = np.flatnonzero(is_inside(fix_s, start_s, end_s))
     notes = left_out("ping", int(has_beam.sum()) - len(ping), start_s, end_s)

@@ -2,44 +2,57 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
 
 from ssm_graph.base.earth import LocalFrame
-from ssm_graph.base.frozen import Array, FrozenArrays, shaped
-from ssm_graph.mission.mission import InitialState
+from ssm_graph.mission.mission import NO_AIDS, Aids, InitialState
 from ssm_graph.sensors.current import CurrentModel
-from ssm_graph.sensors.depth import DepthCalibration
-from ssm_graph.sensors.dvl import DvlMount
-from ssm_graph.sensors.gnss import GnssCalibration
-from ssm_graph.sensors.imu import ImuNoise
+from ssm_graph.sensors.depth import DepthLog
+from ssm_graph.sensors.dvl import DvlMount, empty_dvl
+from ssm_graph.sensors.gnss import GNSS, GnssLog
+from ssm_graph.sensors.imu import ImuLog, ImuNoise
+from ssm_graph.sensors.standstill import Standstill
+
+GNSS_AT_ORIGIN: Final = GnssLog(**GNSS.empty(), lever_arm_b=np.zeros(3))
+"""A receiver of which nothing is stated: its antenna at the body's origin, its clock exact."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Vehicle(FrozenArrays):
-    """What is known of a vehicle and its instruments before the first message."""
+class Vehicle:
+    """What is known of a vehicle and its instruments before the first message.
+
+    Of each instrument beside IMU and DVL it has a log without rows: noise, lever arm, calibration.
+    """
 
     name: str
     imu_noise: ImuNoise
     mount: DvlMount
     beam_sigma: float
     """Nominal standard deviation of a beam speed, m/s."""
-    depth_lever_arm_b: Array = shaped(3)
-    """(3,) body origin to depth sensor, m."""
-    gnss_lever_arm_b: Array = shaped(3)
-    """(3,) body origin to antenna, m."""
     water_sigma: float | None = None
     """Nominal standard deviation of a beam speed off the water, m/s; None for as off the ground."""
     current: CurrentModel | None = None
     """What is known of the water's current; None leaves pings off the water out."""
-    depth_sigma: float | None = None
-    """m; None where there is no depth sensor."""
-    depth_calibration: DepthCalibration = DepthCalibration()
-    """What is known of the depth sensor's errors."""
-    gnss_calibration: GnssCalibration = GnssCalibration()
-    """What is known of the receiver's errors."""
+    depth: DepthLog | None = None
+    """None where there is no depth sensor."""
+    gnss: GnssLog = GNSS_AT_ORIGIN
+    aids: Aids = NO_AIDS
+    """What else it has, for the batch smoother."""
     frame: LocalFrame | None = None
     """Navigation frame; None takes the first fix."""
     initial: InitialState | None = None
     """None lets the estimator align itself."""
-    further_aids: tuple[str, ...] = ()
-    """Sections of its file that only the batch smoother uses."""
+
+    @property
+    def bare_logs(self) -> Mapping[type, Any]:
+        """Every instrument as a log without rows, by the type of the log."""
+        none = np.zeros((0, 3))
+        imu = ImuLog(0.0, self.imu_noise, np.zeros(0), none, none)
+        logs = (imu, empty_dvl(self.mount), self.depth, self.gnss, *self.aids)
+        return {
+            type(log): log for log in logs if log is not None and not isinstance(log, Standstill)
+        }

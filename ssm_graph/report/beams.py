@@ -11,18 +11,12 @@ from matplotlib.ticker import FuncFormatter, NullLocator
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.mission.estimate import OUTLIER_WEIGHT, BeamTable, Estimate
-from ssm_graph.report.style import (
-    NOMINAL,
-    OUTLIER,
-    REDUCED,
-    REDUCED_WEIGHT,
-    thinned_outliers_first,
-)
+from ssm_graph.report import style
 
 CLASSES: Final = (
-    (REDUCED_WEIGHT, np.inf, NOMINAL, f"weight ≥ {REDUCED_WEIGHT:g}", 1.6),
-    (OUTLIER_WEIGHT, REDUCED_WEIGHT, REDUCED, "reduced", 3.0),
-    (-np.inf, OUTLIER_WEIGHT, OUTLIER, f"below {OUTLIER_WEIGHT:g}", 3.4),
+    (style.REDUCED_WEIGHT, np.inf, style.NOMINAL, f"weight ≥ {style.REDUCED_WEIGHT:g}", 1.6),
+    (OUTLIER_WEIGHT, style.REDUCED_WEIGHT, style.REDUCED, "reduced", 3.0),
+    (-np.inf, OUTLIER_WEIGHT, style.OUTLIER, f"below {OUTLIER_WEIGHT:g}", 3.4),
 )
 """Least and largest weight, colour, name and size of the three kinds of points."""
 
@@ -44,7 +38,7 @@ def n_beams_of(estimate: Estimate) -> int:
 def points_of(beams: BeamTable, beam: int) -> BeamPoints:
     """Return the points of a beam, counted from 0; outliers are thinned last."""
     mine = np.flatnonzero(beams.beam == beam + 1)
-    mine = mine[thinned_outliers_first(beams.weight[mine])]
+    mine = mine[style.thinned_outliers_first(beams.weight[mine])]
     return BeamPoints(beams.time_s[mine], beams.innovation[mine], beams.weight[mine])
 
 
@@ -58,7 +52,7 @@ def draw_points(axes: Axes, since: Array, values: Array, weight: Array) -> None:
     """Draw values over time, each point by the class of its weight."""
     for low, high, color, name, size in CLASSES:
         mine = (weight >= low) & (weight < high)
-        alpha = 0.55 if color == NOMINAL else 0.9
+        alpha = 0.55 if color == style.NOMINAL else 0.9
         axes.plot(since[mine], values[mine], **dots(color, size, alpha=alpha, label=name))
 
 

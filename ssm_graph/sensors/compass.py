@@ -3,9 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Final
 
+import numpy as np
+
+from ssm_graph.base.frames import BodyAxes
 from ssm_graph.base.frozen import Array, FrozenArrays, shaped
+from ssm_graph.base.settings import FILE_KEY, Key, optional_key, sigma_key
+from ssm_graph.base.tables import Table
+from ssm_graph.base.units import DEG_PER_H, DEGREE
+from ssm_graph.sensors.instrument import Column, Instrument
+from ssm_graph.sensors.messages import Message
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,3 +52,64 @@ class HeadingLog(FrozenArrays):
     declination: float = 0.0
     """rad, of the compass's north from true north, positive east."""
     errors: HeadingErrors = HeadingErrors()
+
+
+@dataclass(frozen=True, slots=True)
+class HeadingReading(Message):
+    """One reading of a compass."""
+
+    heading: float
+    """rad as read, clockwise from the compass's north."""
+
+
+_DEGREES: Final = "the unit is degrees"
+_HEADING: Final = Column(
+    "heading",
+    "heading_deg",
+    low=-360.0,
+    high=360.0,
+    expected="expected degrees up to 360, clockwise from north",
+    told="heading {:g} rad: degrees?",
+    unit=DEGREE,
+)
+_KEYS: Final = {
+    "file": FILE_KEY,
+    "noise_deg": sigma_key("sigma", 90.0, _DEGREES, unit=DEGREE),
+    "declination_deg": optional_key("declination", -180.0, 180.0, _DEGREES, unit=DEGREE),
+    "offset_sigma_deg": optional_key("errors.offset_sigma", 0.0, 180.0, _DEGREES, unit=DEGREE),
+    "rate_sigma_deg_per_h": optional_key(
+        "errors.rate_sigma", 0.0, 1e4, "the unit is degrees per hour", unit=DEG_PER_H
+    ),
+    "walk_sigma_deg": optional_key("errors.walk_sigma", 0.0, 90.0, _DEGREES, unit=DEGREE),
+    "correlation_s": Key(
+        "errors.correlation_s",
+        positive=True,
+        high=1e6,
+        required=False,
+        hint="the unit is seconds",
+        beside=(
+            "walk_sigma_deg",
+            "expected with a walk_sigma_deg above 0, got none; 1 is usual",
+        ),
+    ),
+    "one_cycle_sigma_deg": optional_key("errors.one_cycle_sigma", 0.0, 90.0, _DEGREES, unit=DEGREE),
+    "two_cycle_sigma_deg": optional_key("errors.two_cycle_sigma", 0.0, 90.0, _DEGREES, unit=DEGREE),
+}
+
+
+class _Compass(Instrument):
+    """The way of compasses: some give radians."""
+
+    __slots__ = ()
+
+    def check(self, table: Table, bare: HeadingLog, axes: BodyAxes) -> list[str]:
+        super().check(table, bare, axes)
+        if np.all(np.abs(table["heading_deg"]) <= 2.0 * np.pi):
+            return [
+                f"{table.label}: all headings lie within 6.3 degrees of north; if they are in "
+                "radians, multiply them by 180/pi"
+            ]
+        return []
+
+
+COMPASS: Final = _Compass("heading", HeadingLog, _KEYS, (_HEADING,), HeadingReading, "h")

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
+
+from ssm_graph.base.settings import optional_key, sigma_key
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,3 +22,11 @@ class CurrentModel:
     """The current of so long before is forgotten to 37 percent, s."""
     vertical_sigma: float = 0.02
     """Of the vertical component, m/s; zero for a current that is level."""
+
+
+CURRENT_KEYS: Final = {
+    "sigma_m_per_s": sigma_key("sigma", 20.0, "the unit is m/s", required=False),
+    "correlation_s": sigma_key("correlation_s", 1e8, "the unit is seconds", required=False),
+    "vertical_sigma_m_per_s": optional_key("vertical_sigma", 0.0, 20.0, "the unit is m/s"),
+}
+"""Of the section ``[current]``."""

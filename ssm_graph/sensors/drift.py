@@ -1,8 +1,11 @@
-"""Errors that change slowly, of any instrument."""
+"""Errors that several kinds of instruments have: slow ones, late clocks, lever arms in doubt."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
+
+from ssm_graph.base.settings import Key, optional_key
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,3 +22,50 @@ class Drift:
     """It forgets within so much, s; above zero where there is a drift."""
     white_share: float = 1.0
     """Of the stated sigmas, what is left as white noise where the drift is modelled, in (0, 1]."""
+
+
+ARM_SIGMA: Final = (0.0, 100.0, "the unit is metres")
+"""Limits of the key of a doubted lever arm."""
+_SECONDS: Final = "the unit is seconds, not milliseconds"
+
+
+def late_keys(owner: str) -> dict[str, Key]:
+    """Return the keys of a clock that is late; ``owner`` has the fields."""
+    return {
+        "time_offset_s": optional_key(f"{owner}.time_offset_s", -10.0, 10.0, _SECONDS),
+        "time_offset_sigma_s": optional_key(f"{owner}.time_offset_sigma_s", 0.0, 10.0, _SECONDS),
+    }
+
+
+def drift_keys(name: str, owner: str, high: float, hint: str) -> dict[str, Key]:
+    """Return the keys of a drift; ``name`` is that of its sigma, ``owner`` has its fields."""
+    stands_with = (name, f"expected with a {name} above 0, got none")
+    return {
+        name: Key(
+            f"{owner}.sigma",
+            low=0.0,
+            high=high,
+            required=False,
+            hint=hint,
+            beside=(
+                "drift_correlation_s",
+                "expected with a drift_correlation_s, got none; 20 is a third of a minute",
+            ),
+        ),
+        "drift_correlation_s": Key(
+            f"{owner}.correlation_s",
+            positive=True,
+            high=1e8,
+            required=False,
+            hint="the unit is seconds",
+            beside=stands_with,
+        ),
+        "drift_white_share": Key(
+            f"{owner}.white_share",
+            positive=True,
+            high=1.0,
+            required=False,
+            hint="all of the noise is 1",
+            beside=stands_with,
+        ),
+    }

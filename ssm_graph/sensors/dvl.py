@@ -1,16 +1,19 @@
-"""Doppler velocity log: where its beams point, what they read, and beams that are stuck."""
+"""Doppler velocity log: where its beams point and what they read."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ssm_graph.base.errors import DataError
+from ssm_graph.base.frames import rotation_zyx
 from ssm_graph.base.frozen import Array, FrozenArrays, optional_shaped, shaped
 from ssm_graph.sensors.drift import Drift
+from ssm_graph.sensors.messages import Message
 
 MOST_BEAMS: Final = 8
 """An instrument may have 1 to so many beams."""
@@ -106,6 +109,9 @@ class DvlLog(FrozenArrays):
     """(N, B) range along each beam, m; NaN where unknown."""
     water_track: Array | None = optional_shaped("N")
     """(N,) 1 where a ping is off the water, 0 where it is off the ground; None for all ground."""
+    covariance: Array | None = optional_shaped("N", "B", "B")
+    """(N, B, B) of the speeds of a ping, m^2/s^2, of an instrument whose speeds err together;
+    NaN in pings that state none, None for none at all. ``sigma`` holds its diagonal."""
 
     def __post_init__(self) -> None:
         super(DvlLog, self).__post_init__()
@@ -132,27 +138,48 @@ class DvlLog(FrozenArrays):
         if self.water_track is None:
             return self
         kept = ~self.is_water
-        return replace(
-            self,
-            time_s=self.time_s[kept],
-            speed=self.speed[kept],
-            sigma=self.sigma[kept],
-            range_m=None if self.range_m is None else self.range_m[kept],
-            water_track=None,
-        )
+        rows: dict[str, Any] = {
+            name: None if getattr(self, name) is None else getattr(self, name)[kept]
+            for name in ("time_s", "speed", "sigma", "range_m", "covariance")
+        }
+        return replace(self, water_track=None, **rows)
+
+    def independent(self) -> tuple[Array, Array, Array]:
+        """Return speeds (N, B) and their sigmas (N, B) that err independently, and what they read.
+
+        The third, (N, B, 3), is what each reads of a velocity in body axes. Without a covariance
+        that is the beams themselves; with one, speeds and directions are turned to its principal
+        axes, ping by ping: where ``C = U diag(s^2) U'``, the speeds ``U' speed`` of the directions
+        ``U' beams`` have the sigmas ``s``. A ping that lacks a speed keeps its beams, with the
+        marginal sigmas.
+        """
+        beams_b = np.broadcast_to(self.mount.beams_b, (*self.speed.shape, 3))
+        if self.covariance is None:
+            return self.speed, self.sigma, beams_b
+        speed, sigma, beams_b = self.speed.copy(), self.sigma.copy(), beams_b.copy()
+        whole = np.isfinite(speed).all(axis=1) & np.isfinite(self.covariance).all(axis=(1, 2))
+        variance, axes = np.linalg.eigh(self.covariance[whole])
+        turned = np.swapaxes(axes, 1, 2)
+        speed[whole] = np.einsum("nij,nj->ni", turned, speed[whole])
+        sigma[whole] = np.sqrt(variance)
+        beams_b[whole] = turned @ self.mount.beams_b
+        return speed, sigma, beams_b
 
     @property
-    def ping_s(self) -> Array:
+    def valid_s(self) -> Array:
         """(N,) when the pings were taken: stamps less the mount's time offset, s."""
         return np.asarray(self.time_s - self.mount.time_offset_s)
 
 
 @dataclass(frozen=True, slots=True)
-class Ping:
-    """One ping; a speed is positive when the instrument moves along the beam."""
+class Ping(Message):
+    """One ping; a speed is positive when the instrument moves along the beam.
 
-    time_s: float
-    """As stamped, s; the mount's time offset is not yet applied."""
+    The mount's time offset is not yet taken off its stamp.
+    """
+
+    MAY_MISS: ClassVar[frozenset[str]] = frozenset({"speed", "sigma"})
+
     speed: tuple[float, ...]
     """(B,) m/s; NaN marks a beam without lock."""
     sigma: tuple[float, ...] | None = None
@@ -161,29 +188,37 @@ class Ping:
     """Whether it is off the water: its speeds are relative to the current, not to the ground."""
 
 
-STUCK_PINGS: Final = 8
-"""So many equal readings in a row, while other beams change with every ping, are no measurements.
+def beams_from_angles(azimuth: Array, janus: float) -> Array:
+    """Return unit beam directions (B, 3) in instrument axes, radians.
 
-A beam of a resting vehicle whose noise is half of its resolution repeats itself in some half of the
-pings, and others change as well in most of them: eight in a row come once in a thousand pings, and
-then leave out what the other beams tell too.
-"""
+    ``janus`` is counted from the vertical (instrument z), ``azimuth`` from x towards y.
+    """
+    down = np.full_like(azimuth, np.cos(janus))
+    return np.stack([np.cos(azimuth) * np.sin(janus), np.sin(azimuth) * np.sin(janus), down], -1)
 
 
-def stuck_beams(speed: Array) -> NDArray[np.bool_]:
-    """Return which beam speeds (P, B), m/s, NaN without bottom lock, belong to a stuck beam."""
-    is_stuck = np.zeros(speed.shape, bool)
-    if len(speed) < STUCK_PINGS:
-        return is_stuck
-    repeats = speed[1:] == speed[:-1]
-    has_changed = np.isfinite(speed[1:] - speed[:-1]) & ~repeats
-    repeats &= has_changed.any(axis=1)[:, None]
-    for beam in np.flatnonzero(repeats.sum(axis=0) >= STUCK_PINGS - 1):
-        edges = np.flatnonzero(np.diff(repeats[:, beam].astype(np.int8), prepend=0, append=0))
-        for begin, end in edges.reshape(-1, 2).tolist():
-            if end - begin >= STUCK_PINGS - 1:
-                is_stuck[begin : end + 1, beam] = True
-    return is_stuck
+def R_bd_from_rpy(roll_pitch_yaw: Array) -> Array:
+    """Return the mounting ``Rz(yaw) Ry(pitch) Rx(roll)``, (3, 3), instrument to body, radians."""
+    roll, pitch, yaw = roll_pitch_yaw
+    return rotation_zyx(yaw, pitch, roll)
+
+
+def rpy_from_R_bd(R_bd: Array) -> Array:
+    """Return roll, pitch, yaw (3,) of a mounting, radians; yaw is 0 where the pitch is vertical."""
+    horizontal = math.hypot(R_bd[0, 0], R_bd[1, 0])
+    pitch = math.atan2(-R_bd[2, 0], horizontal)
+    if horizontal < 1e-9:
+        return np.array([math.atan2(math.copysign(1.0, pitch) * R_bd[0, 1], R_bd[1, 1]), pitch, 0])
+    return np.array([math.atan2(R_bd[2, 1], R_bd[2, 2]), pitch, math.atan2(R_bd[1, 0], R_bd[0, 0])])
+
+
+_NOISE_OF_EMPTY_LOG: Final = 0.01
+
+
+def empty_dvl(mount: DvlMount) -> DvlLog:
+    """Return the log without pings of an instrument."""
+    none = np.zeros((0, mount.n_beams))
+    return DvlLog(mount=mount, time_s=np.zeros(0), speed=none, sigma=none)
 
 
 def counted_sigma(
@@ -203,3 +238,14 @@ def counted_sigma(
     nominal = np.where(is_water, water_sigma or ground_sigma, ground_sigma)[..., None]
     stated = np.asarray(stated)
     return np.where(stated > 0.0, stated, nominal)
+
+
+def nominal_sigma(log: DvlLog) -> float:
+    """Return the standard deviation that stands for those of all beams off the ground, m/s."""
+    sigma = log.sigma[~log.is_water] if (~log.is_water).any() else log.sigma
+    return float(np.median(sigma)) if sigma.size else _NOISE_OF_EMPTY_LOG
+
+
+def sigma_off_water(log: DvlLog) -> float:
+    """Return the standard deviation that stands for those of all beams off the water, m/s."""
+    return float(np.median(log.sigma[log.is_water]))

@@ -3,9 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
+import numpy as np
+
+from ssm_graph.base.frames import BodyAxes
 from ssm_graph.base.frozen import Array, FrozenArrays, Vector, shaped
-from ssm_graph.sensors.drift import Drift
+from ssm_graph.base.settings import FILE_KEY, LEVER_ARM_KEY, optional_key
+from ssm_graph.base.tables import Table
+from ssm_graph.sensors.drift import ARM_SIGMA, Drift, drift_keys, late_keys
+from ssm_graph.sensors.instrument import Instrument
+from ssm_graph.sensors.messages import Message
+from ssm_graph.sensors.place import POSITION, SIGMA_ENU, check_positions
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +36,7 @@ class GnssLog(FrozenArrays):
     """Position fixes of a GNSS antenna."""
 
     time_s: Array = shaped("N")
-    """(N,) s, strictly increasing."""
+    """(N,) s as stamped, strictly increasing."""
     lat: Array = shaped("N")
     """(N,) rad"""
     lon: Array = shaped("N")
@@ -39,14 +48,17 @@ class GnssLog(FrozenArrays):
     lever_arm_b: Array = shaped(3)
     """(3,) body origin to antenna, m."""
     calibration: GnssCalibration = GnssCalibration()
-    """Its time offset is taken off ``time_s`` already."""
+
+    @property
+    def valid_s(self) -> Array:
+        """(N,) when the antenna was there: stamps less the known offset of the clock, s."""
+        return np.asarray(self.time_s - self.calibration.time_offset_s)
 
 
 @dataclass(frozen=True, slots=True)
-class Fix:
-    """One GNSS fix of the antenna."""
+class Fix(Message):
+    """One GNSS fix of the antenna; the receiver's time offset is not yet taken off its stamp."""
 
-    time_s: float
     lat: float
     """rad"""
     lon: float
@@ -55,3 +67,33 @@ class Fix:
     """m above the ellipsoid"""
     sigma_enu: Vector
     """m"""
+
+
+_KEYS: Final = {
+    "file": FILE_KEY,
+    "lever_arm_m": LEVER_ARM_KEY,
+    "lever_arm_sigma_m": optional_key("calibration.lever_arm_sigma", *ARM_SIGMA),
+    **late_keys("calibration"),
+    **drift_keys("drift_sigma_m", "calibration.drift", 1000.0, "the unit is metres"),
+}
+
+
+class _Gnss(Instrument):
+    """The way of receivers: codes for no fix, radians."""
+
+    __slots__ = ()
+
+    def check(self, table: Table, bare: GnssLog, axes: BodyAxes) -> list[str]:
+        notes = check_positions(table)
+        return notes + super().check(table, bare, axes)
+
+
+GNSS: Final = _Gnss(
+    "gnss",
+    GnssLog,
+    _KEYS,
+    (*POSITION, SIGMA_ENU),
+    Fix,
+    "g",
+    late="calibration.time_offset_s",
+)

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, fields
+from typing import ClassVar
 
-from ssm_graph.sensors.depth import DepthReading
-from ssm_graph.sensors.dvl import Ping
-from ssm_graph.sensors.gnss import Fix
-from ssm_graph.sensors.imu import ImuSample
 
-Message = ImuSample | Ping | DepthReading | Fix
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One reading; those of each instrument say what was read, SI units, radians, body axes FRD."""
+
+    MAY_MISS: ClassVar[frozenset[str]] = frozenset()
+    """Fields whose numbers may be NaN."""
+
+    time_s: float
+    """As stamped, s on the vehicle's clock."""
 
 
 def bad_number(message: Message) -> str | None:
@@ -17,12 +23,12 @@ def bad_number(message: Message) -> str | None:
 
     Missing beams and sigmas of a ping are NaN on purpose; infinite ones are not.
     """
-    for name in type(message).__slots__:
-        value = getattr(message, name)
+    for spec in fields(message):
+        value = getattr(message, spec.name)
         if value is None:
             continue
-        may_miss = isinstance(message, Ping) and name in ("speed", "sigma")
+        may_miss = spec.name in message.MAY_MISS
         for number in value if isinstance(value, tuple) else (value,):
             if not math.isfinite(number) and not (may_miss and math.isnan(number)):
-                return name
+                return spec.name
     return None

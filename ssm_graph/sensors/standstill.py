@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Final
 
 from ssm_graph.base.errors import DataError
+from ssm_graph.base.settings import Key, Settings, build
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,3 +29,31 @@ class Standstill:
             )
         if not 0.0 < self.sigma < math.inf:
             raise DataError(f"Standstill.sigma: expected m/s above zero, got {self.sigma}")
+
+
+STANDSTILL_KEYS: Final = {
+    "begin_s": Key("begin_s"),
+    "end_s": Key("end_s"),
+    "sigma_m_per_s": Key("sigma", positive=True, high=10.0, required=False, hint="the unit is m/s"),
+}
+"""Of a section ``[[standstill]]``."""
+
+
+def standstill(settings: Settings) -> Standstill:
+    """Return the standstill that a section states."""
+    begin_s, end_s = settings.number("begin_s"), settings.number("end_s")
+    if not begin_s < end_s:
+        raise settings.fault("end_s", f"expected a time after {begin_s:z.3f} s, got {end_s:z.3f} s")
+    return build(Standstill, settings.given())
+
+
+def check_during(
+    still: Standstill, settings: Settings, *, first_s: float, last_s: float, label: str
+) -> None:
+    """Raise where a standstill lies outside the inertial data, of the table ``label``."""
+    if still.end_s < first_s or still.begin_s > last_s:
+        raise settings.fault(
+            "begin_s",
+            f"{still.begin_s:z.3f} to {still.end_s:z.3f} s lies outside {label}, "
+            f"{first_s:z.3f} to {last_s:z.3f} s; give times on the clock of the tables",
+        )

@@ -27,15 +27,7 @@ from ssm_graph.sensors.compass import HeadingErrors, HeadingLog
 from ssm_graph.sensors.depth import DepthLog
 from ssm_graph.sensors.gnss import GnssLog
 from ssm_graph.sensors.standstill import Standstill
-from ssm_graph.simulation.checked import (
-    FRACTION,
-    POINT,
-    POSITIVE,
-    SIZES,
-    WINDOWS,
-    Settings,
-    checked,
-)
+from ssm_graph.simulation import checked
 from ssm_graph.simulation.randomness import DriftSettings, Streams, draw_drift, gauss_markov
 from ssm_graph.simulation.trajectory import Trajectory, stacked
 
@@ -45,63 +37,63 @@ Rng = np.random.Generator
 
 
 @dataclass(frozen=True, slots=True)
-class DepthSettings(Settings):
+class DepthSettings(checked.Settings):
     """A pressure sensor."""
 
-    rate_hz: float = checked(POSITIVE, 2.0, hint="try 2 Hz")
-    sigma: float = checked(POSITIVE, 0.05, hint="try 0.05 m")
+    rate_hz: float = checked.positive(2.0, hint="try 2 Hz")
+    sigma: float = checked.positive(0.05, hint="try 0.05 m")
     """m"""
-    lever_arm_b: Point = checked(POINT, (0.2, 0.1, 0.0))
+    lever_arm_b: Point = checked.point((0.2, 0.1, 0.0))
     """Body origin to sensor, body axes, m."""
     offset: float = 0.0
     """Depths are read too large by this much, m."""
 
 
 @dataclass(frozen=True, slots=True)
-class GnssSettings(Settings):
+class GnssSettings(checked.Settings):
     """A receiver that works at the surface only."""
 
-    rate_hz: float = checked(POSITIVE, 1.0, hint="try 1 Hz")
-    sigma_horizontal: float = checked(POSITIVE, 0.5, hint="try 0.5 m")
+    rate_hz: float = checked.positive(1.0, hint="try 1 Hz")
+    sigma_horizontal: float = checked.positive(0.5, hint="try 0.5 m")
     """Each of east and north, m."""
-    sigma_vertical: float = checked(POSITIVE, 1.0, hint="try 1 m")
+    sigma_vertical: float = checked.positive(1.0, hint="try 1 m")
     """m"""
-    lever_arm_b: Point = checked(POINT, (-0.3, 0.0, -0.6))
+    lever_arm_b: Point = checked.point((-0.3, 0.0, -0.6))
     """Body origin to antenna, body axes, m."""
-    lever_arm_error_b: Point = checked(POINT, (0.0, 0.0, 0.0))
+    lever_arm_error_b: Point = checked.point((0.0, 0.0, 0.0))
     """The antenna truly sits this much further on, m."""
     late_s: float = 0.0
     """Stamps are later than the fixes by this much, s."""
     drift: DriftSettings | None = None
     """Of the fixes on top of their noise, each of east, north and up, m."""
-    windows: tuple[tuple[float, float], ...] | None = checked(WINDOWS, None)
+    windows: tuple[tuple[float, float], ...] | None = checked.windows(None)
     """Times with fixes, s, each ``[start, end)``; None for whenever the route is at the surface."""
     surface_depth_m: float = 0.5
     """The route is at the surface where its depth, waves left out, is less than this, m."""
 
 
 @dataclass(frozen=True, slots=True)
-class GrossErrors(Settings):
+class GrossErrors(checked.Settings):
     """How often a reading is grossly wrong, and by how much."""
 
-    rate: float = checked(FRACTION, 0.0)
+    rate: float = checked.fraction(0.0)
     """Fraction of the readings."""
-    size: tuple[float, float] = checked(SIZES, (5.0, 50.0))
+    size: tuple[float, float] = checked.sizes((5.0, 50.0))
     """Smallest and largest absolute error, m or rad, drawn uniformly; the sign or direction too."""
 
 
 @dataclass(frozen=True, slots=True)
-class UsblSettings(Settings):
+class UsblSettings(checked.Settings):
     """Acoustic fixes of a transponder on the vehicle."""
 
-    interval_s: float = checked(POSITIVE, 5.0, hint="try 5 s")
-    sigma_horizontal: float = checked(POSITIVE, 2.0, hint="try 2 m")
+    interval_s: float = checked.positive(5.0, hint="try 5 s")
+    sigma_horizontal: float = checked.positive(2.0, hint="try 2 m")
     """Each of east and north, m."""
-    sigma_vertical: float = checked(POSITIVE, 2.0, hint="try 2 m")
+    sigma_vertical: float = checked.positive(2.0, hint="try 2 m")
     """m"""
     delay_s: float = 1.5
     """How much later than it was valid a fix is stamped, s."""
-    lever_arm_b: Point = checked(POINT, (-0.5, 0.0, -0.4))
+    lever_arm_b: Point = checked.point((-0.5, 0.0, -0.4))
     """Body origin to transponder, body axes, m."""
     gross: GrossErrors = GrossErrors()
 
@@ -120,31 +112,31 @@ class BeaconSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class RangingSettings(Settings):
+class RangingSettings(checked.Settings):
     """Acoustic ranges to beacons, one after the other."""
 
     beacons: tuple[BeaconSettings, ...]
-    interval_s: float = checked(POSITIVE, 4.0, hint="try 4 s")
+    interval_s: float = checked.positive(4.0, hint="try 4 s")
     """From one range to the next, whichever beacon it is to."""
-    sigma: float = checked(POSITIVE, 0.3, hint="try 0.3 m")
+    sigma: float = checked.positive(0.3, hint="try 0.3 m")
     """m"""
-    lever_arm_b: Point = checked(POINT, (0.4, 0.1, -0.3))
+    lever_arm_b: Point = checked.point((0.4, 0.1, -0.3))
     """Body origin to transducer, body axes, m."""
     gross: GrossErrors = GrossErrors()
 
 
 @dataclass(frozen=True, slots=True)
-class CompassSettings(Settings):
+class CompassSettings(checked.Settings):
     """A compass; the errors are drawn from what the mission states of them."""
 
-    rate_hz: float = checked(POSITIVE, 4.0, hint="try 4 Hz")
-    sigma: float = checked(POSITIVE, math.radians(1.0), hint="try 0.02 rad")
+    rate_hz: float = checked.positive(4.0, hint="try 4 Hz")
+    sigma: float = checked.positive(math.radians(1.0), hint="try 0.02 rad")
     """rad"""
     declination: float = 0.0
     """rad, taken off what is read"""
     errors: HeadingErrors = HeadingErrors()
     gross: GrossErrors = GrossErrors(size=(0.2, 1.0))
-    gross_s: float = checked(POSITIVE, 3.0, hint="try 3 s")
+    gross_s: float = checked.positive(3.0, hint="try 3 s")
     """A disturbance lasts so long, s."""
 
 
@@ -309,6 +301,7 @@ def _ranges(
         range_m=range_m,
         sigma=np.full(len(time_s), settings.sigma),
         lever_arm_b=np.array(settings.lever_arm_b),
+        nominal_sigma=settings.sigma,
     )
     return log, is_gross
 

@@ -16,15 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.simulation.checked import (
-    BEAMS,
-    FRACTION,
-    SIZES,
-    WINDOW,
-    Settings,
-    checked,
-    require,
-)
+from ssm_graph.simulation import checked
 
 Mask = NDArray[np.bool_]
 
@@ -58,13 +50,13 @@ _EVENT_S: Final[Mapping[OutlierKind, tuple[float, float]]] = MappingProxyType(
 
 
 @dataclass(frozen=True, slots=True)
-class Outliers(Settings):
+class Outliers(checked.Settings):
     """Random outliers of one kind."""
 
     kind: OutlierKind = OutlierKind.NONE
-    rate: float = checked(FRACTION, 0.1)
+    rate: float = checked.fraction(0.1)
     """Fraction of pings with an outlier; of the time, for kinds that come as events."""
-    size: tuple[float, float] | None = checked(SIZES, None)
+    size: tuple[float, float] | None = checked.sizes(None)
     """Smallest and largest absolute offset, m/s; None for that of the kind."""
     beam: int | None = None
     """The beam that suffers, from 0; None draws it. Not for TWO_BEAMS."""
@@ -81,17 +73,17 @@ class Outliers(Settings):
 
 
 @dataclass(frozen=True, slots=True)
-class Loss(Settings):
+class Loss(checked.Settings):
     """No bottom lock of some beams in ``[start_s, end_s)``."""
 
     start_s: float
     end_s: float
-    beams: tuple[int, ...] | None = checked(BEAMS, None)
+    beams: tuple[int, ...] | None = checked.beams(None)
     """Beams from 0; None for all."""
 
     def __post_init__(self) -> None:
         super(Loss, self).__post_init__()
-        _require_window("Loss", self.start_s, self.end_s)
+        checked.require_rule("Loss", checked.WINDOW, (self.start_s, self.end_s))
 
 
 class BeamFaults(NamedTuple):
@@ -206,10 +198,10 @@ class FaultShape(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Fault(Settings):
+class Fault:
     """A fault of some beams in ``[start_s, end_s)``."""
 
-    beams: tuple[int, ...] = checked(BEAMS)
+    beams: tuple[int, ...]
     """Beams from 0."""
     start_s: float
     end_s: float
@@ -220,17 +212,17 @@ class Fault(Settings):
     """By how much a COVERED beam reads low in the end; 1 reads zero."""
 
     def __post_init__(self) -> None:
-        super(Fault, self).__post_init__()
-        _require_window("Fault", self.start_s, self.end_s)
+        checked.require_rule("Fault.beams", checked.BEAMS, self.beams)
+        checked.require_rule("Fault", checked.WINDOW, (self.start_s, self.end_s))
         size = np.size(self.offset_m_per_s)
-        require(
+        checked.require(
             size in (1, len(self.beams)),
             "Fault.offset_m_per_s",
             expected=f"1 or {len(self.beams)} offsets",
             got=self.offset_m_per_s,
             hint="give one offset for all beams or one for each",
         )
-        require(
+        checked.require(
             self.has_offset or not np.any(self.offset_m_per_s),
             "Fault.offset_m_per_s",
             expected=f"none with {self.shape.name}",
@@ -238,7 +230,7 @@ class Fault(Settings):
             hint="leave it out",
         )
         is_covered = self.shape is FaultShape.COVERED
-        require(
+        checked.require(
             0.0 < self.share <= 1.0 if is_covered else self.share == 0.0,
             "Fault.share",
             expected="above 0, at most 1, with COVERED alone",
@@ -276,7 +268,3 @@ def add_faults(
         offset[where] += fault.offset(time_s[inside], speed[where])
         mask[where] = True
     return BeamFaults(offset, mask)
-
-
-def _require_window(where: str, *window: float) -> None:
-    require(WINDOW.holds(window), where, expected=WINDOW.expected, got=window, hint=WINDOW.hint)

@@ -5,9 +5,11 @@ Each message says where, what was expected, what came, what to try.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import MISSING, field, fields
+from dataclasses import MISSING, fields
+from functools import partial
 from typing import Any, Final, NamedTuple, cast
 
 from ssm_graph.base.errors import ConfigError
@@ -62,24 +64,36 @@ def require(condition: bool, where: str, *, expected: str, got: object, hint: st
         raise ConfigError(f"{where}: expected {expected}, got {got!r}; {hint}")
 
 
-def require_beams(where: str, beams: Sequence[int], n_beams: int) -> None:
+def require_rule(where: str, rule: Rule, value: object, *, hint: str = "") -> None:
+    """Raise :class:`ConfigError` unless a rule holds."""
+    is_good = rule.holds(value)
+    require(is_good, where, expected=rule.expected, got=value, hint=hint or rule.hint)
+
+
+def require_beams(where: str, named: Sequence[int], n_beams: int) -> None:
     """Refuse beams that an instrument of ``n_beams`` does not have."""
-    require(
-        set(beams) <= set(range(n_beams)),
-        where,
-        expected=f"different beams out of 0..{n_beams - 1}",
-        got=tuple(beams),
-        hint="beams are counted from 0",
-    )
+    expected = f"different beams out of 0..{n_beams - 1}"
+    is_known = set(named) <= set(range(n_beams))
+    require(is_known, where, expected=expected, got=tuple(named), hint=BEAMS.hint)
 
 
-def checked(rule: Rule, default: Any = MISSING, *, hint: str = "") -> Any:
+def field(rule: Rule, default: Any = MISSING, *, hint: str = "") -> Any:
     """Declare a field of :class:`Settings` with what it may hold; None is always left alone."""
-    return field(default=default, metadata={"rule": rule, "hint": hint or rule.hint})
+    metadata = {"rule": rule, "hint": hint or rule.hint}
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+positive, not_negative = partial(field, POSITIVE), partial(field, NOT_NEGATIVE)
+fraction, point, velocity = (
+    partial(field, FRACTION),
+    partial(field, POINT),
+    partial(field, VELOCITY),
+)
+sizes, windows, beams = partial(field, SIZES), partial(field, WINDOWS), partial(field, BEAMS)
 
 
 class Settings:
-    """Checks every field that is declared with :func:`checked`."""
+    """Checks every field that is declared with :func:`field`."""
 
     __slots__ = ()
 
@@ -87,10 +101,5 @@ class Settings:
         for spec in fields(cast(Any, self)):
             rule, value = spec.metadata.get("rule"), getattr(self, spec.name)
             if rule is not None and value is not None:
-                require(
-                    rule.holds(value),
-                    f"{type(self).__name__}.{spec.name}",
-                    expected=rule.expected,
-                    got=value,
-                    hint=spec.metadata["hint"],
-                )
+                where = f"{type(self).__name__}.{spec.name}"
+                require_rule(where, rule, value, hint=spec.metadata["hint"])

@@ -13,6 +13,7 @@ import numpy as np
 from ssm_graph.base.errors import ConfigError, nearest_hint
 from ssm_graph.sensors.compass import HeadingErrors
 from ssm_graph.sensors.imu import ImuNoise
+from ssm_graph.simulation import checked
 from ssm_graph.simulation.aids import (
     AidSettings,
     BeaconSettings,
@@ -24,15 +25,6 @@ from ssm_graph.simulation.aids import (
     UsblSettings,
 )
 from ssm_graph.simulation.beam_faults import Fault, Loss, OutlierKind, Outliers
-from ssm_graph.simulation.checked import (
-    FRACTION,
-    POSITIVE,
-    Rule,
-    Settings,
-    checked,
-    require,
-    require_beams,
-)
 from ssm_graph.simulation.currents import CurrentSettings, WaterTrack
 from ssm_graph.simulation.dvl_model import DvlSettings
 from ssm_graph.simulation.grades import IMU_NOISE, START_SIGMAS, Grade, StartSigmas
@@ -47,28 +39,28 @@ from ssm_graph.simulation.routes import (
 )
 from ssm_graph.simulation.trajectory import Trajectory, Waves
 
-_IMU_RATE = Rule(lambda rate: 10.0 <= rate <= 10_000.0, "10 to 10000 Hz", "try 100 Hz")
-_SEED = Rule(
-    lambda seed: isinstance(seed, (int, np.integer)) and seed >= 0,
+_IMU_RATE = checked.Rule(lambda rate: 10.0 <= rate <= 10_000.0, "10 to 10000 Hz", "try 100 Hz")
+_SEED = checked.Rule(
+    lambda seed: isinstance(seed, (int, np.integer)) and bool(seed >= 0),
     "a whole number from 0",
     "the number of the trial makes a good seed",
 )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SimulationConfig(Settings):
+class SimulationConfig(checked.Settings):
     """All of a simulated mission; angles in radians, times in seconds since the start."""
 
     name: str = "survey"
     """Name of the mission."""
     route: Route = SurveyRoute()
     waves: Waves = Waves()
-    duration_s: float = checked(POSITIVE, 1200.0, hint="try 1200")
+    duration_s: float = checked.positive(1200.0, hint="try 1200")
     lat: float = math.radians(45.7)
     """Latitude of the start, rad, within 80 degrees of the equator."""
     lon: float = math.radians(126.6)
     """rad"""
-    seed: int = checked(_SEED, 0)
+    seed: int = checked.field(_SEED, 0)
     """Same seed, same mission; every source of error has a stream of its own."""
 
     grade: Grade = Grade.NAVIGATION
@@ -76,15 +68,15 @@ class SimulationConfig(Settings):
     """Noise of the inertial sensors; None for that of the grade."""
     start_sigmas: StartSigmas | None = None
     """How well the initial state is known; None for that of the grade."""
-    imu_rate_hz: float = checked(_IMU_RATE, 100.0)
-    reference_rate_hz: float = checked(POSITIVE, 10.0, hint="try 10 Hz")
+    imu_rate_hz: float = checked.field(_IMU_RATE, 100.0)
+    reference_rate_hz: float = checked.positive(10.0, hint="try 10 Hz")
     """At 10 Hz cubic interpolation of the truth errs by less than 0.1 mm."""
 
     dvl: DvlSettings = field(default_factory=DvlSettings)
     outliers: Outliers = Outliers()
     faults: tuple[Fault, ...] = ()
     losses: tuple[Loss, ...] = ()
-    dropout_rate: float = checked(FRACTION, 0.0)
+    dropout_rate: float = checked.fraction(0.0)
     """Fraction of beam readings that are missing, each beam for itself."""
     current: CurrentSettings | None = None
     """None for water at rest."""
@@ -104,7 +96,7 @@ class SimulationConfig(Settings):
 
     def __post_init__(self) -> None:
         super(SimulationConfig, self).__post_init__()
-        require(
+        checked.require(
             self.duration_s * self.imu_rate_hz >= 1.0,
             "SimulationConfig.duration_s",
             expected="at least one IMU sample",
@@ -116,7 +108,7 @@ class SimulationConfig(Settings):
         named += [("Loss.beams", loss.beams or ()) for loss in self.losses]
         named += [("WaterTrack.beams", self.water_track.beams or ())] if self.water_track else []
         for where, beams in named:
-            require_beams(where, beams, self.dvl.mount.n_beams)
+            checked.require_beams(where, beams, self.dvl.mount.n_beams)
         _ = self.trajectory  # checks the place of the start
 
     @property

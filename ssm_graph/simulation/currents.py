@@ -10,39 +10,31 @@ from numpy.typing import NDArray
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.sensors.current import CurrentModel
-from ssm_graph.simulation.checked import (
-    BEAMS,
-    NOT_NEGATIVE,
-    POSITIVE,
-    VELOCITY,
-    Rule,
-    Settings,
-    checked,
-)
+from ssm_graph.simulation import checked
 from ssm_graph.simulation.randomness import gauss_markov
 
 _STEP_S = 1.0
 """The random part is drawn so often, and linear between."""
-_EVERY = Rule(
+_EVERY = checked.Rule(
     lambda n: n == 0 or n >= 2, "0, or 2 and more", "4 makes every fourth ping one off the water"
 )
 
 
 @dataclass(frozen=True, slots=True)
-class CurrentSettings(Settings):
+class CurrentSettings(checked.Settings):
     """A current that is the same everywhere: steady, tidal and random parts add up."""
 
-    steady_enu: tuple[float, float, float] = checked(VELOCITY, (0.0, 0.0, 0.0))
+    steady_enu: tuple[float, float, float] = checked.velocity((0.0, 0.0, 0.0))
     """m/s along east, north, up."""
-    tide: float = checked(NOT_NEGATIVE, 0.0, hint="try 0.3 m/s")
+    tide: float = checked.not_negative(0.0, hint="try 0.3 m/s")
     """Speed of a part that turns clockwise with the tide, m/s; where it begins is drawn."""
-    tide_period_s: float = checked(POSITIVE, 44714.0, hint="try 20000 s")
+    tide_period_s: float = checked.positive(44714.0, hint="try 20000 s")
     """s; that of the moon's semidiurnal tide."""
-    sigma: float = checked(NOT_NEGATIVE, 0.0, hint="try 0.3 m/s")
+    sigma: float = checked.not_negative(0.0, hint="try 0.3 m/s")
     """Of a Gauss-Markov part along east and along north, m/s."""
-    vertical_sigma: float = checked(NOT_NEGATIVE, 0.0, hint="try 0.3 m/s")
+    vertical_sigma: float = checked.not_negative(0.0, hint="try 0.3 m/s")
     """Of one along up, m/s."""
-    correlation_s: float = checked(POSITIVE, 21600.0, hint="try 20000 s")
+    correlation_s: float = checked.positive(21600.0, hint="try 20000 s")
     """Of the Gauss-Markov parts, s."""
     stated: CurrentModel | None = None
     """What the mission says of the current; None for the truth's own variance and correlation."""
@@ -62,14 +54,14 @@ class CurrentSettings(Settings):
 
 
 @dataclass(frozen=True, slots=True)
-class WaterTrack(Settings):
+class WaterTrack(checked.Settings):
     """A DVL that pings off the water where it has no bottom lock."""
 
-    noise: float = checked(POSITIVE, 0.01, hint="try 0.01 m/s")
+    noise: float = checked.positive(0.01, hint="try 0.01 m/s")
     """Standard deviation of a beam speed off the water, m/s."""
-    beams: tuple[int, ...] | None = checked(BEAMS, None)
+    beams: tuple[int, ...] | None = checked.beams(None)
     """Beams from 0 that the water returns; None for all."""
-    every: int = checked(_EVERY, 0)
+    every: int = checked.field(_EVERY, 0)
     """With bottom lock, each ping of this number is off the water nevertheless; 0 for none."""
 
     def pings(self, lost: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -12,22 +12,14 @@ from scipy.spatial.transform import Rotation
 from ssm_graph.base.earth import R_el_from_lat_lon, geodetic_from_ecef
 from ssm_graph.base.frozen import Array
 from ssm_graph.sensors.dvl import DvlMount
-from ssm_graph.simulation.checked import (
-    NOT_NEGATIVE,
-    POINT,
-    POSITIVE,
-    Rule,
-    Settings,
-    checked,
-    require,
-)
+from ssm_graph.simulation import checked
 from ssm_graph.simulation.randomness import DriftSettings
 from ssm_graph.simulation.taylor import Series
 from ssm_graph.simulation.trajectory import Motion, Trajectory, Vector, stacked
 
 Point = tuple[float, float, float]
 
-_RELATIVE = Rule(lambda x: abs(x) < 1.0, "a relative error below 1", "write 2 % as 0.02")
+_RELATIVE = checked.Rule(lambda x: abs(x) < 1.0, "a relative error below 1", "write 2 % as 0.02")
 _VERTICAL = np.array([[0.0, 0.0, 1.0]])
 
 
@@ -43,12 +35,13 @@ def janus_beams(
     towards y, rad. Without azimuths the beams are spread evenly, half a step from x on; of five
     one looks straight down, as makers of such instruments have it.
     """
-    if azimuth is None:
-        n_slanted = 4 if n_beams == 5 else n_beams
-        azimuth = 2.0 * math.pi * (np.arange(n_slanted) + 0.5) / n_slanted
-    angles = np.column_stack([azimuth, np.full(len(azimuth), janus)])
+    has_vertical = azimuth is None and n_beams == 5
+    n_slanted = n_beams - has_vertical
+    even = 2.0 * math.pi * (np.arange(n_slanted) + 0.5) / n_slanted
+    turns = even if azimuth is None else np.asarray(azimuth, float)
+    angles = np.column_stack([turns, np.full(len(turns), janus)])
     beams_d = np.asarray(Rotation.from_euler("ZY", angles).apply([0.0, 0.0, 1.0]))
-    return beams_d if n_beams != 5 or len(azimuth) == 5 else np.vstack([beams_d, _VERTICAL])
+    return np.vstack([beams_d, _VERTICAL]) if has_vertical else beams_d
 
 
 def default_mount(beams_d: Array | None = None) -> DvlMount:
@@ -66,26 +59,26 @@ def default_mount(beams_d: Array | None = None) -> DvlMount:
 
 
 @dataclass(frozen=True, slots=True)
-class DvlSettings(Settings):
+class DvlSettings(checked.Settings):
     """The instrument, and in which ways it differs from what is written about it."""
 
     mount: DvlMount = field(default_factory=default_mount)
     """The geometry as written into the mission; any number of beams in any directions."""
-    rate_hz: float = checked(POSITIVE, 1.0, hint="try 1 Hz")
+    rate_hz: float = checked.positive(1.0, hint="try 1 Hz")
     """Pings per second."""
     first_s: float | None = None
     """Time of the first ping, s; None for one interval after the start."""
-    jitter_s: float = checked(NOT_NEGATIVE, 0.0, hint="try 0.02 s")
+    jitter_s: float = checked.not_negative(0.0, hint="try 0.02 s")
     """Each ping is early or late by up to this much, uniformly; its stamp is true."""
-    noise: float = checked(POSITIVE, 0.005, hint="try 0.005 m/s")
+    noise: float = checked.positive(0.005, hint="try 0.005 m/s")
     """Standard deviation of a beam speed, m/s."""
-    scale_error: float = checked(_RELATIVE, 0.0)
+    scale_error: float = checked.field(_RELATIVE, 0.0)
     """Speeds are read ``1 + scale_error`` too large."""
     misalignment: Point = (0.0, 0.0, 0.0)
     """Rotation vector, rad, by which the true mounting differs: ``R_bd_true = R_bd Exp(m)``."""
     late_s: float = 0.0
     """Stamps are later than the pings by this much, s."""
-    lever_arm_error_b: Point = checked(POINT, (0.0, 0.0, 0.0))
+    lever_arm_error_b: Point = checked.point((0.0, 0.0, 0.0))
     """The instrument truly sits this much further on, body axes, m."""
     beam_scale_errors: tuple[float, ...] = ()
     """On top of ``scale_error``, each beam's own; empty for none."""
@@ -98,14 +91,14 @@ class DvlSettings(Settings):
 
     def __post_init__(self) -> None:
         super(DvlSettings, self).__post_init__()
-        require(
+        checked.require(
             self.jitter_s < 0.5 / self.rate_hz,
             "DvlSettings.jitter_s",
             expected=f"less than half an interval, {0.5 / self.rate_hz} s",
             got=self.jitter_s,
             hint="pings must stay in order",
         )
-        require(
+        checked.require(
             len(self.beam_scale_errors) in (0, self.mount.n_beams),
             "DvlSettings.beam_scale_errors",
             expected=f"none, or one for each of the {self.mount.n_beams} beams",

@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.simulation.checked import NOT_NEGATIVE, POSITIVE, Settings, checked
+from ssm_graph.simulation import checked
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,12 +46,12 @@ def spawn_streams(seed: int) -> Streams:
 
 
 @dataclass(frozen=True, slots=True)
-class DriftSettings(Settings):
+class DriftSettings(checked.Settings):
     """How large an error is that changes slowly, and how slowly."""
 
-    sigma: float = checked(NOT_NEGATIVE, hint="try 0.006 m/s or 0.5 m")
+    sigma: float = checked.not_negative(hint="try 0.006 m/s or 0.5 m")
     """Standard deviation at any time, of each component."""
-    correlation_s: float = checked(POSITIVE, hint="try 60 s")
+    correlation_s: float = checked.positive(hint="try 60 s")
     """Time after which 1/e of it is left in the mean, s."""
 
 

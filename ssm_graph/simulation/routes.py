@@ -15,24 +15,19 @@ from typing import final
 import numpy as np
 from scipy.special import ellipkinc
 
-from ssm_graph.simulation.checked import (
-    NOT_NEGATIVE,
-    POSITIVE,
-    Rule,
-    Settings,
-    checked,
-    require,
-)
+from ssm_graph.simulation import checked
 from ssm_graph.simulation.taylor import Series, antiderivative, constant, log, sin_cos, sqrt, tanh
 
 Position = tuple[Series, Series, Series]
 
-_PERIODS = Rule(
-    lambda periods: all(map(POSITIVE.holds, periods)), POSITIVE.expected, "try (47, 61, 83)"
+_PERIODS = checked.Rule(
+    lambda periods: all(map(checked.POSITIVE.holds, periods)),
+    checked.POSITIVE.expected,
+    "try (47, 61, 83)",
 )
 
 
-class Route(Settings, ABC):
+class Route(checked.Settings, ABC):
     """Where the vehicle means to be, and where it looks."""
 
     @abstractmethod
@@ -45,7 +40,7 @@ class Route(Settings, ABC):
 
 
 @dataclass(frozen=True, slots=True)
-class DepthProfile(Settings):
+class DepthProfile(checked.Settings):
     """Smooth change from one depth to another: a hyperbolic tangent in time."""
 
     start_m: float = 30.0
@@ -54,7 +49,7 @@ class DepthProfile(Settings):
     """Depth long after it, m."""
     mid_s: float = 0.0
     """Time of the fastest change, s."""
-    tau_s: float = checked(POSITIVE, 25.0, hint="try 25")
+    tau_s: float = checked.positive(25.0, hint="try 25")
     """Time constant; the fastest vertical speed is ``(end_m - start_m) / (2 tau_s)``."""
 
     def height(self, t: Series) -> Series:
@@ -82,11 +77,11 @@ class SurveyRoute(Route):
     the first kind across them.
     """
 
-    speed: float = checked(POSITIVE, 1.5, hint="try 1.5 m/s")
+    speed: float = checked.positive(1.5, hint="try 1.5 m/s")
     """m/s"""
-    line_m: float = checked(POSITIVE, 300.0, hint="try 300 m")
+    line_m: float = checked.positive(300.0, hint="try 300 m")
     """Distance sailed per line and turn, m."""
-    sharpness: float = checked(POSITIVE, 0.1, hint="try 0.1")
+    sharpness: float = checked.positive(0.1, hint="try 0.1")
     """The ``e`` above: slope of the lines and inverse sharpness of the turns, of radius
     ``e * line_m / pi``."""
     course: float = math.radians(30.0)
@@ -115,11 +110,11 @@ class SurveyRoute(Route):
 class SpiralRoute(Route):
     """Flat logarithmic spiral outwards at constant speed."""
 
-    speed: float = checked(POSITIVE, 1.2, hint="leave the default")
+    speed: float = checked.positive(1.2, hint="leave the default")
     """Speed around the centre, m/s."""
-    radius_m: float = checked(POSITIVE, 15.0, hint="leave the default")
+    radius_m: float = checked.positive(15.0, hint="leave the default")
     """Radius at the start, m."""
-    growth: float = checked(POSITIVE, 0.05, hint="leave the default")
+    growth: float = checked.positive(0.05, hint="leave the default")
     """Speed away from the centre, m/s."""
     depth: DepthProfile = DepthProfile(20.0, 20.0)
 
@@ -136,22 +131,22 @@ class SpiralRoute(Route):
 class DiveRoute(Route):
     """Helix from the surface down and up again, over and over, with a slow drift of its centre."""
 
-    speed: float = checked(POSITIVE, 1.2, hint="leave the default")
+    speed: float = checked.positive(1.2, hint="leave the default")
     """Speed around the centre, m/s."""
-    radius_m: float = checked(POSITIVE, 25.0, hint="leave the default")
+    radius_m: float = checked.positive(25.0, hint="leave the default")
     """m"""
     surface_m: float = 0.3
     """Least depth, m."""
     depth_m: float = 60.0
     """Greatest depth, m."""
-    period_s: float = checked(POSITIVE, 1200.0, hint="leave the default")
+    period_s: float = checked.positive(1200.0, hint="leave the default")
     """Time from surface to surface, s."""
     drift: float = 0.05
     """Northward speed of the centre, m/s."""
 
     def __post_init__(self) -> None:
         super(DiveRoute, self).__post_init__()
-        require(
+        checked.require(
             abs(self.drift) < self.speed,
             "DiveRoute.drift",
             expected="less than the speed, so that the course stays defined",
@@ -174,7 +169,7 @@ class DiveRoute(Route):
 class HoverRoute(Route):
     """Station keeping: slow sway of position and heading about a point; at rest with both zero."""
 
-    sway_m: float = checked(NOT_NEGATIVE, 0.8, hint="0 is at rest")
+    sway_m: float = checked.not_negative(0.8, hint="0 is at rest")
     """Amplitude of each sinusoid east and north, m."""
     yaw: float = math.radians(15.0)
     """Amplitude of the heading, rad."""
@@ -182,7 +177,7 @@ class HoverRoute(Route):
     """rad"""
     depth_m: float = 15.0
     """m"""
-    periods_s: tuple[float, float, float] = checked(_PERIODS, (47.0, 61.0, 83.0))
+    periods_s: tuple[float, float, float] = checked.field(_PERIODS, (47.0, 61.0, 83.0))
     """Periods of the sway east, north, and of the heading, s."""
 
     def east_north_height(self, t: Series) -> Position:
@@ -202,7 +197,7 @@ class HoverRoute(Route):
 class TransitRoute(Route):
     """Straight run: latitude and longitude linear in time; fit for many hours."""
 
-    speed: float = checked(POSITIVE, 2.0, hint="try 2 m/s")
+    speed: float = checked.positive(2.0, hint="try 2 m/s")
     """m/s at the start."""
     course: float = math.radians(50.0)
     """rad from north at the start."""

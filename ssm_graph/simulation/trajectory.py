@@ -25,18 +25,18 @@ from ssm_graph.base.earth import (
 )
 from ssm_graph.base.frozen import Array
 from ssm_graph.mission.mission import Reference
-from ssm_graph.simulation.checked import POSITIVE, Rule, Settings, checked
+from ssm_graph.simulation import checked
 from ssm_graph.simulation.routes import Route
 from ssm_graph.simulation.taylor import Series, atan2, sin_cos, sqrt, time_series
 
 Vector = tuple[Series, Series, Series]
 
-_LAT = Rule(
+_LAT = checked.Rule(
     lambda lat: abs(lat) <= math.radians(80.0),
     "a latitude between -80 and 80 degrees, in radians",
     "convert degrees with math.radians",
 )
-_LON = Rule(
+_LON = checked.Rule(
     lambda lon: math.isfinite(lon) and abs(lon) <= 2.0 * math.pi,
     "a longitude in radians",
     "convert degrees with math.radians",
@@ -44,7 +44,7 @@ _LON = Rule(
 
 
 @dataclass(frozen=True, slots=True)
-class Waves(Settings):
+class Waves(checked.Settings):
     """Sinusoidal motion that the sea adds to the route; amplitudes of zero are calm water."""
 
     roll: float = math.radians(4.0)
@@ -55,10 +55,10 @@ class Waves(Settings):
     """Amplitude, rad."""
     heave_m: float = 0.3
     """Amplitude, m."""
-    roll_period_s: float = checked(POSITIVE, 7.0, hint="try 7 s")
-    pitch_period_s: float = checked(POSITIVE, 6.0, hint="try 7 s")
-    yaw_period_s: float = checked(POSITIVE, 8.0, hint="try 7 s")
-    heave_period_s: float = checked(POSITIVE, 6.5, hint="try 7 s")
+    roll_period_s: float = checked.positive(7.0, hint="try 7 s")
+    pitch_period_s: float = checked.positive(6.0, hint="try 7 s")
+    yaw_period_s: float = checked.positive(8.0, hint="try 7 s")
+    heave_period_s: float = checked.positive(6.5, hint="try 7 s")
 
 
 CALM = Waves(roll=0.0, pitch=0.0, yaw=0.0, heave_m=0.0)
@@ -176,7 +176,7 @@ def stacked(v: Vector, *, derivative: int = 0) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
-class Trajectory(Settings):
+class Trajectory(checked.Settings):
     """A route laid on the ellipsoid, with waves.
 
     Latitude and longitude are linear in the route's north and east metres, by the radii of
@@ -186,9 +186,9 @@ class Trajectory(Settings):
 
     route: Route
     waves: Waves
-    lat: float = checked(_LAT)
+    lat: float = checked.field(_LAT)
     """Latitude of the start, rad."""
-    lon: float = checked(_LON)
+    lon: float = checked.field(_LON)
     """Longitude of the start, rad."""
 
     def at(self, time_s: ArrayLike) -> Motion:

@@ -9,7 +9,7 @@ from enum import Enum
 from typing import Any, Final, TypeVar
 
 from ssm_graph.base.errors import ConfigError, nearest_hint
-from ssm_graph.io.tables.settings import Key, Settings, read_settings
+from ssm_graph.base.settings import Key, Settings, read_settings
 
 _Choice = TypeVar("_Choice", bound=Enum)
 _Made = TypeVar("_Made")
@@ -98,7 +98,7 @@ REQUIRED: Any = object()
 _FRACTION: Final = _tested(lambda x: 0.0 <= x <= 1.0)
 
 
-def _kind(expected: str, read: _Read, hint: str = "see --help") -> Callable[[Any], StudyKey]:
+def _kind(expected: str, read: _Read, hint: str = "see --help") -> Callable[..., StudyKey]:
     def make(default: Any = None) -> StudyKey:
         is_required = default is REQUIRED
         return StudyKey(

@@ -24,7 +24,7 @@ from ssm_graph.cli.main import ExitCode
 from ssm_graph.cli.online import engine_of
 from ssm_graph.io.mission_folder.reader import write_mission
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
-from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.io.results.tables import read_results
 from ssm_graph.live.estimator import ONLINE
 from ssm_graph.live.protocols.json_messages import JsonDecoder, encode_message

@@ -50,9 +50,9 @@ def test_sections_say_what_there_is(tmp_path: Path, sim: SimulatedMission) -> No
     """In a mission as in its vehicle, whose live estimator does without."""
     names = ("[usbl]", "[ranges]", "[heading]", "[[standstill]]")
     assert sim.mission.aids.sections == names
-    assert vehicle_of(sim.mission).further_aids == names
+    assert vehicle_of(sim.mission).aids.sections == names
     write_mission(tmp_path, sim.mission)
-    assert read_vehicle(tmp_path).further_aids == names
+    assert read_vehicle(tmp_path).aids.sections == names
     assert Aids().sections == ()
 
 

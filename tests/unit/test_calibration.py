@@ -12,7 +12,7 @@ from benchmarks.calibration_cases import AIDS, DVL, as_stated, asking
 from ssm_graph.evaluation import evaluate
 from ssm_graph.filters.navigation.named import filter_problems
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
-from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator.buffers import Buffers
 from ssm_graph.live.estimator.smoother import FixedLagSmoother
 from ssm_graph.mission.estimate import Calibration, Determined, Estimate, Status
@@ -127,10 +127,13 @@ def test_the_live_estimator_says_so_too_and_takes_known_offsets_off() -> None:
     """
     sim = miscalibrated(duration_s=8.0)
     vehicle = vehicle_of(asking(sim.mission))
+    depth, gnss = vehicle.depth, vehicle.gnss
+    assert depth is not None
+    late = replace(gnss.calibration, time_offset_s=0.2)
     vehicle = replace(
         vehicle,
-        depth_calibration=replace(vehicle.depth_calibration, offset=0.4),
-        gnss_calibration=replace(vehicle.gnss_calibration, time_offset_s=0.2),
+        depth=replace(depth, calibration=replace(depth.calibration, offset=0.4)),
+        gnss=replace(gnss, calibration=late),
     )
     smoother = FixedLagSmoother(vehicle)
     for message in messages_of(sim.mission):
@@ -139,11 +142,11 @@ def test_the_live_estimator_says_so_too_and_takes_known_offsets_off() -> None:
     assert "dvl_time_offset" in event.text
     assert "dvl_scale" not in event.text
     buffers = Buffers(vehicle)
-    fix, depth = Fix(1.2, 0.5, 0.5, 0.0, (1.0, 1.0, 1.0)), DepthReading(1.0, 2.4)
+    fix, reading = Fix(1.2, 0.5, 0.5, 0.0, (1.0, 1.0, 1.0)), DepthReading(1.0, 2.4)
     assert buffers.time_of(fix) == pytest.approx(1.0)
-    assert buffers.time_of(depth) == 1.0
-    assert buffers.add(depth)
-    assert buffers.depths.all[0, 1] == pytest.approx(2.0)
+    assert buffers.time_of(reading) == 1.0
+    assert buffers.add(reading)
+    np.testing.assert_allclose(buffers.depths_between(0.0, 2.0), [[1.0, 2.0]])
 
 
 @pytest.mark.parametrize("with_gnss", [True, False])

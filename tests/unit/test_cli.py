@@ -37,6 +37,20 @@ def test_simulate_writes_what_was_asked_for(tmp_path: Path) -> None:
     assert (tmp_path / "m" / "imu.parquet").exists()
 
 
+@pytest.mark.parametrize(("word", "n_beams"), [("3", 3), ("velocity", 3), ("1", 1), ("8", 8)])
+def test_simulate_any_number_of_beams(tmp_path: Path, word: str, n_beams: int) -> None:
+    """The instrument that was asked for, as written and read again."""
+    words = ["simulate", "survey", "--duration", "30", "--beams", word, "--outliers", "sparse"]
+    assert main([*words, "--rate", "0.5", "--out", str(tmp_path)]) == ExitCode.GOOD
+    dvl = read_mission(tmp_path).dvl
+    assert dvl.speed.shape == (30, n_beams)
+    mount = dvl.mount
+    assert (word == "velocity") == np.allclose(mount.beams_d, np.eye(3) if n_beams == 3 else 0.0)
+    for bad in ("0", "9", "many"):
+        with pytest.raises(SystemExit):
+            main([*words[:4], "--beams", bad, "--out", str(tmp_path)])
+
+
 def test_smooth_writes_results_and_figure(
     mission: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ssm_graph.base.frames import BodyAxes, to_frd
-from ssm_graph.io.mission_folder.units import SI
+from ssm_graph.base.units import MICRO_G
 from ssm_graph.io.results.tables import trajectory_columns
 from ssm_graph.live.protocols.json_messages import (
     KEYS,
@@ -24,11 +24,14 @@ from ssm_graph.live.protocols.json_messages import (
 )
 from ssm_graph.mission.estimate import Trajectory
 from ssm_graph.mission.navigation import Health, Navigation
+from ssm_graph.sensors.acoustic import AcousticRange, UsblFix
+from ssm_graph.sensors.compass import HeadingReading
 from ssm_graph.sensors.depth import DepthReading
 from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.gnss import Fix
 from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.sensors.messages import Message, bad_number
+from ssm_graph.sensors.registry import BY_MESSAGE
 from tests.helpers import STEADY
 
 NUMBER = st.floats(-1e9, 1e9)
@@ -54,6 +57,17 @@ MESSAGES = st.one_of(
         NUMBER,
         st.tuples(SIGMA, SIGMA, SIGMA),
     ),
+    st.builds(
+        UsblFix,
+        NUMBER,
+        st.floats(-math.pi / 2, math.pi / 2),
+        st.floats(-math.pi, math.pi),
+        NUMBER,
+        st.tuples(SIGMA, SIGMA, SIGMA),
+        NUMBER,
+    ),
+    st.builds(AcousticRange, NUMBER, NUMBER, NUMBER, BEAM_SIGMA),
+    st.builds(HeadingReading, NUMBER, st.floats(-2.0 * math.pi, 2.0 * math.pi)),
 )
 LINES = {
     "imu": '{"type": "imu", "time_s": 1, "gyro_rad_per_s": [1, 2, 3], "accel_m_per_s2": [4, 5, 6]}',
@@ -61,6 +75,10 @@ LINES = {
     "depth": '{"type": "depth", "time_s": 2, "depth_m": 30.5}',
     "gnss": '{"type": "gnss", "time_s": 3, "lat_deg": 63.5, "lon_deg": -10, "height_m": 40,'
     ' "sigma_m": [1, 2, 3]}',
+    "usbl": '{"type": "usbl", "time_s": 4, "lat_deg": 63.5, "lon_deg": 350, "height_m": -40,'
+    ' "sigma_m": [1, 2, 3], "delay_s": 1.5}',
+    "ranges": '{"type": "ranges", "time_s": 5, "beacon": 4, "range_m": 130.5, "sigma_m": 0.3}',
+    "heading": '{"type": "heading", "time_s": 6, "heading_deg": 90}',
 }
 
 
@@ -88,18 +106,22 @@ def test_every_message_comes_back(message: Message, axes: BodyAxes) -> None:
 
 def test_all_kinds_of_message_have_a_schema() -> None:
     """A new message needs a line here."""
-    assert len(KEYS) == len(get_args(Message)) == len(LINES)
+    assert len(KEYS) == len(BY_MESSAGE) == len(LINES)
 
 
 def test_lines_of_the_documentation() -> None:
     """Written by hand: integers are numbers, null is a missing beam, degrees become radians."""
     messages, refused = decode("\n".join([*LINES.values(), ""]).encode())
-    imu, ping, depth, fix = messages
+    imu, ping, depth, fix, acoustic, reach, heading = messages
     assert imu == ImuSample(1.0, (1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
     assert isinstance(ping, Ping)
     assert ping == Ping(1.5, (0.1, math.nan, -0.3, 0.4))
     assert depth == DepthReading(2.0, 30.5)
     assert fix == Fix(3.0, math.radians(63.5), math.radians(-10.0), 40.0, (1.0, 2.0, 3.0))
+    place = (math.radians(63.5), math.radians(-10.0), -40.0)
+    assert acoustic == UsblFix(4.0, *place, (1.0, 2.0, 3.0), 1.5)
+    assert reach == AcousticRange(5.0, 4.0, 130.5, 0.3)
+    assert heading == HeadingReading(6.0, math.radians(90.0))
     assert not refused
 
 
@@ -145,7 +167,7 @@ def changed(kind: str, **changes: Any) -> str:
         (changed("imu", gyro_rad_per_s=[1, 2]), "list of 3 numbers"),
         (changed("imu", gyro_rad_per_s=[1, 2, {}]), "expected a number"),
         (changed("imu", gyro_rad_per_s={"x": 1}), "list of 3 numbers"),
-        (changed("dvl", beam_m_per_s=[1, 2, 3]), "list of 4 numbers"),
+        (changed("dvl", beam_m_per_s=list(range(9))), "list of 1 to 8 numbers"),
         (changed("dvl", beam_m_per_s=[1, 2, 3, False]), "expected a number"),
         (changed("dvl", sigma_m_per_s=[1, 2, 3, 0]), "sigma_m_per_s"),
         (changed("depth", depth_m=[1]), "expected a number"),
@@ -228,7 +250,7 @@ def test_an_answer_speaks_as_the_trajectory_table() -> None:
         "since_aid_s",
         "latency_s",
     }
-    assert fields["accel_bias_x_ug"] == pytest.approx(1e-3 / SI["accel_bias_ug"])
+    assert fields["accel_bias_x_ug"] == pytest.approx(1e-3 / MICRO_G)
 
 
 def test_an_answer_is_one_line_of_plain_json() -> None:

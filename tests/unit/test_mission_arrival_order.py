@@ -11,13 +11,15 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from ssm_graph.base.errors import ConfigError, DataError, SsmGraphError
-from ssm_graph.io.mission_folder.arrival_tables import read_arrival_table
-from ssm_graph.io.mission_folder.keys import TABLES
+from ssm_graph.base.tables import Table
 from ssm_graph.io.mission_folder.reader import read_mission
-from ssm_graph.io.tables.table import Table, read_table
+from ssm_graph.io.tables.arrival import read_arrival_table
+from ssm_graph.io.tables.files import read_table
+from ssm_graph.sensors.depth import DEPTH
+from ssm_graph.sensors.dvl_instrument import DVL
 from tests.mission_damage import Damage as FolderDamage
 from tests.mission_damage import cell, columns, lines, toml
-from tests.mission_fixture import write_example
+from tests.mission_fixture import make_mission, write_example
 from tests.unit.test_mission_damage import (
     Damage,
     assert_sound,
@@ -30,6 +32,7 @@ from tests.unit.test_mission_damage import (
 from tests.unit.test_mission_roundtrip import assert_same
 
 ARRIVAL = toml('name = "straight-run"', 'name = "straight-run"\norder = "arrival"')
+DVL_LOG = make_mission().dvl
 HEADER = "time_s,beam1_m_per_s,beam2_m_per_s,beam3_m_per_s,beam4_m_per_s\n"
 ROWS = [f"{k}.5,{k}.25,-1.0,,{k}e-3\n" for k in range(1, 9)]
 
@@ -45,7 +48,7 @@ def read_dvl(text: str | bytes) -> Table:
     with tempfile.TemporaryDirectory() as name:
         path = Path(name) / "dvl.csv"
         path.write_bytes(text if isinstance(text, bytes) else text.encode())
-        return read_arrival_table(path, "dvl.csv", TABLES["dvl"])
+        return read_arrival_table(path, "dvl.csv", DVL.spec(DVL_LOG))
 
 
 def assert_same_rows(got: Table, want: Table) -> None:
@@ -215,7 +218,7 @@ def test_any_order_with_repeats_and_torn_lines(
     with tempfile.TemporaryDirectory() as name:
         path = Path(name) / "dvl.csv"
         path.write_text(HEADER + "".join(ROWS))
-        assert_same_rows(got, read_table(path, "dvl.csv", TABLES["dvl"]))
+        assert_same_rows(got, read_table(path, "dvl.csv", DVL.spec(DVL_LOG)))
     note = "".join(got.notes)
     assert len(got.notes) <= 1
     assert (f"{len(repeats)} row" in note) == bool(repeats)
@@ -232,7 +235,7 @@ def test_parquet_in_order_of_arrival(tmp_path: Path) -> None:
     path = tmp_path / "depth.parquet"
     times, depths = [3.0, 1.0, 2.0, 1.0, 4.0], [0.3, 0.1, 0.2, 0.1, np.nan]
     pa.parquet.write_table(pa.table({"time_s": times, "depth_m": depths}), path)
-    got = read_arrival_table(path, "depth.parquet", TABLES["depth"])
+    got = read_arrival_table(path, "depth.parquet", DEPTH.spec(None))
     np.testing.assert_array_equal(got["depth_m"], [0.1, 0.2, 0.3])
     assert got.file.place(2) == "depth.parquet: row 1"
     assert got.file.cell(2, "depth_m") == "0.3"

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ssm_graph.io.mission_folder.checks.motion import check_motion
+from ssm_graph.io.mission_folder.motion import check_motion
 from ssm_graph.mission.mission import Mission
 from ssm_graph.simulation import CALM, Grade, HoverRoute, scenario_config, simulate
 

@@ -38,6 +38,7 @@ def beams_of(sigma: Array) -> Beams:
         R_bd=np.eye(3),
         ping=rows // 4,
         is_water=np.zeros(len(rows), bool),
+        n_beams=4,
     )
 
 

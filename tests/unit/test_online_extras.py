@@ -14,7 +14,7 @@ from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
-from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator import ONLINE, FixedLagSmoother
 from ssm_graph.live.estimator.recovery import Doubted, reanchored
 from ssm_graph.mission.calibration import DVL_MOUNTING, DVL_SCALE

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from estimate_fixture import make_mission, make_run
 
 import ssm_graph as sg
+from tests.estimate_fixture import make_mission, make_run
 
 ROOT = Path(__file__).parents[2]
 LONGEST_REPR = 1500

@@ -22,13 +22,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ssm_graph.base.errors import ConfigError
+from ssm_graph.base.units import DEGREE, exactly_in_unit
 from ssm_graph.io.mission_folder.reader import read_mission
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.io.raw_log import log as raw_log
 from ssm_graph.io.raw_log import replay as raw_replay
 from ssm_graph.io.raw_log.log import RawLog, replay
-from ssm_graph.io.raw_log.mission_messages import messages_of
-from ssm_graph.io.raw_log.rows import ROW_KINDS, degrees_of
+from ssm_graph.io.raw_log.rows import ALWAYS, messages_of, row_kinds
 from ssm_graph.sensors.depth import DepthReading
 from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.gnss import Fix
@@ -39,7 +39,7 @@ from tests.unit.test_mission_roundtrip import assert_same
 
 FORK = multiprocessing.get_context("fork")
 VEHICLE = vehicle_of(make_mission())
-TABLES = [kind.file for kind in ROW_KINDS.values()]
+TABLES = list(ALWAYS)
 NAN = math.nan
 FLOATS = st.floats(allow_nan=False)
 TRIPLES = st.tuples(FLOATS, FLOATS, FLOATS)
@@ -137,7 +137,7 @@ def test_a_simulated_mission_comes_back(tmp_path: Path) -> None:
 @given(MESSAGES)
 def test_any_message_becomes_a_row_and_back(message: Message) -> None:
     """Bit for bit, but for degrees and for sigmas that say nothing."""
-    kind = ROW_KINDS[type(message)]
+    kind = row_kinds(VEHICLE)[type(message)]
     got = kind.parse(kind.row(message).rstrip())
     if isinstance(message, Ping) and np.isnan(message.sigma or NAN).all():
         message = replace(message, sigma=None)
@@ -152,7 +152,7 @@ def test_any_message_becomes_a_row_and_back(message: Message) -> None:
 @given(st.lists(MESSAGES, max_size=8), st.integers(0, 8))
 def test_any_messages_are_replayed(messages: list[Message], n_before: int) -> None:
     """In the order in which they came, from any checkpoint on, whatever the times say."""
-    rows = [ROW_KINDS[type(message)].row(message) for message in messages]
+    rows = [row_kinds(VEHICLE)[type(message)].row(message) for message in messages]
     with tempfile.TemporaryDirectory() as name:
         with log_of(Path(name) / "log", messages[:n_before]) as log:
             offsets = log.offsets()
@@ -160,17 +160,17 @@ def test_any_messages_are_replayed(messages: list[Message], n_before: int) -> No
                 log.append(message)
         for start, want in ((None, rows), (offsets, rows[n_before:])):
             got = replayed(Path(name) / "log", start)
-            assert [ROW_KINDS[type(message)].row(message) for message in got] == want
+            assert [row_kinds(VEHICLE)[type(message)].row(message) for message in got] == want
 
 
 @given(st.floats(-math.pi, math.pi))
 def test_degrees_come_back_to_a_neighbour_at_worst(angle: float) -> None:
     """And by the formula of NumPy, which the reader uses, as by that of ``math``."""
-    back = float(np.radians(degrees_of(angle)))
-    assert back == math.radians(degrees_of(angle))
+    back = float(np.radians(exactly_in_unit(angle, DEGREE)))
+    assert back == math.radians(exactly_in_unit(angle, DEGREE))
     assert abs(back - angle) <= math.ulp(angle)
-    assert degrees_of(back) == pytest.approx(degrees_of(angle), rel=4e-16)
-    assert math.radians(degrees_of(back)) == back
+    assert exactly_in_unit(back, DEGREE) == pytest.approx(exactly_in_unit(angle, DEGREE), rel=4e-16)
+    assert math.radians(exactly_in_unit(back, DEGREE)) == back
 
 
 def test_numbers_of_other_types_are_written_as_floats(tmp_path: Path) -> None:
@@ -264,7 +264,7 @@ def test_killed_at_every_byte_of_the_last_rows(
     log = log_of(tmp_path, messages)
     log.close()
     whole = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
-    kind = next(type_ for type_, kind in ROW_KINDS.items() if kind.file == table)
+    kind = next(type_ for type_, kind in row_kinds(VEHICLE).items() if kind.file == table)
     last = next(k for k in reversed(range(len(messages))) if type(messages[k]) is kind)
     row = whole[table].splitlines(keepends=True)[-1]
     n_letters = len(whole["arrivals"])
@@ -366,7 +366,7 @@ def test_a_row_that_cannot_be_taken_back_is_ended(
         raise OSError(errno.EIO, "no")
 
     monkeypatch.setattr(os, "ftruncate", refuse)
-    failing += [len(ROW_KINDS[ImuSample].row(sample(1))) - 2, -1]
+    failing += [len(row_kinds(VEHICLE)[ImuSample].row(sample(1))) - 2, -1]
     log.append(sample(1))
     failing += [8, -1]
     log.append(ImuSample(5.0, (0.0,) * 3, (0.0,) * 3))

@@ -151,7 +151,7 @@ def test_page_shows_errors_with_a_reference() -> None:
 def test_page_and_table_of_any_number_of_beams(n_beams: int) -> None:
     """A column of panels and a count of outliers for each beam that there is."""
     estimate, reference = make_run(n=100, outlier_share=0.2)
-    beam = 1.0 + np.arange(len(estimate.beams.beam)) % n_beams
+    beam = 1.0 + np.arange(float(len(estimate.beams.beam))) % n_beams
     estimate = replace(estimate, beams=replace(estimate.beams, beam=beam), noise=None)
     found = panels(draw_figure(estimate, reference))
     named = [name for name in found if name.startswith("Beam ")]

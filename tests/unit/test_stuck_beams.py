@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from ssm_graph.mission.problem import build_problem
-from ssm_graph.sensors.dvl import STUCK_PINGS, Ping, stuck_beams
+from ssm_graph.sensors.dvl import Ping
+from ssm_graph.sensors.dvl_readings import STUCK_PINGS, stuck_beams
 from tests.helpers import simulated
 from tests.online_fixture import SHORT, joined, messages, run, stream
 
@@ -58,7 +59,7 @@ def test_a_recorded_stuck_beam_is_left_out_and_said() -> None:
     speed = mission.dvl.speed.copy()
     speed[20:50, 3] = speed[20, 3]
     problem = build_problem(replace(mission, dvl=replace(mission.dvl, speed=speed)))
-    left_out = np.isin(problem.keyframe_s[problem.beams.keyframe], mission.dvl.ping_s[20:50])
+    left_out = np.isin(problem.keyframe_s[problem.beams.keyframe], mission.dvl.valid_s[20:50])
     assert set(problem.beams.beam[left_out].tolist()) == {0, 1, 2}
     assert any("beam 4: 30" in note for note in problem.notes)
 

@@ -119,7 +119,7 @@ def test_few_beams_are_lost_for_minutes() -> None:
     study = read_study(next(path for path in STUDIES if path.stem == "few_beams"))
     (cell,) = study.sources
     assert isinstance(cell, Cell)
-    lengths = {4 - len(loss.beams): loss.end_s - loss.start_s for loss in cell.losses}
+    lengths = {4 - len(loss.beams or ()): loss.end_s - loss.start_s for loss in cell.losses}
     assert lengths == {3: 180.0, 2: 180.0, 1: 180.0, 0: 600.0}
     assert cell.losses[0] == Loss(300.0, 480.0, (3,))
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from ssm_graph.base.errors import ConfigError, SsmGraphError
+from ssm_graph.base.tables import Order
 from ssm_graph.io.mission_folder.reader import read_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle, vehicle_of, write_vehicle
-from ssm_graph.io.raw_log.mission_messages import messages_of
-from ssm_graph.io.tables.table import Order
-from ssm_graph.live.estimator.buffers import SIGMAS, Buffers
+from ssm_graph.io.raw_log.rows import messages_of
+from ssm_graph.live.estimator.buffers import Buffers
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.current import CurrentModel
@@ -76,8 +76,9 @@ def test_lever_arms_turn_to_forward_right_down(tmp_path: Path) -> None:
     text = TOML.replace('"FRD"', '"FLU"').replace("[0.0, 0.0, 0.0]", "[1.0, 2.0, 3.0]")
     vehicle = read_vehicle(write(tmp_path, text))
     np.testing.assert_array_equal(vehicle.mount.lever_arm_b, [0.2, 0.0, -0.1])
-    np.testing.assert_array_equal(vehicle.depth_lever_arm_b, [1.0, -2.0, -3.0])
-    np.testing.assert_array_equal(vehicle.gnss_lever_arm_b, [1.0, -2.0, -3.0])
+    assert vehicle.depth is not None
+    np.testing.assert_array_equal(vehicle.depth.lever_arm_b, [1.0, -2.0, -3.0])
+    np.testing.assert_array_equal(vehicle.gnss.lever_arm_b, [1.0, -2.0, -3.0])
 
 
 def test_frame_is_that_of_the_origin_then_of_the_initial_state(tmp_path: Path) -> None:
@@ -99,9 +100,9 @@ def test_a_vehicle_that_could_be_anywhere_is_refused(tmp_path: Path) -> None:
 def test_optional_sensors_may_be_missing(tmp_path: Path) -> None:
     """A vehicle without depth sensor says so."""
     vehicle = read_vehicle(write(tmp_path, without(TOML, "depth", "gnss", "initial")))
-    assert vehicle.depth_sigma is None
+    assert vehicle.depth is None
     assert vehicle.initial is None
-    np.testing.assert_array_equal(vehicle.gnss_lever_arm_b, np.zeros(3))
+    np.testing.assert_array_equal(vehicle.gnss.lever_arm_b, np.zeros(3))
 
 
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:
@@ -126,7 +127,7 @@ def test_the_reader_of_missions_checks_it(case: Malformed, tmp_path: Path) -> No
     assert str(from_vehicle.value) == str(from_mission.value)
 
 
-@pytest.mark.parametrize("dropped", [(), ("frame",), ("initial",), ("depth_sigma",)])
+@pytest.mark.parametrize("dropped", [(), ("frame",), ("initial",), ("depth",)])
 def test_written_and_read_again(tmp_path: Path, dropped: tuple[str, ...]) -> None:
     """All values come back to rounding, whatever is missing."""
     changes: dict[str, None] = {name: None for name in dropped}
@@ -147,7 +148,7 @@ def test_every_field_is_written(tmp_path: Path) -> None:
     )
     write_vehicle(tmp_path, vehicle)
     got = read_vehicle(tmp_path)
-    assert len(fields(Vehicle)) == 14  # further_aids is of tables that are not there
+    assert len(fields(Vehicle)) == 11
     assert all(getattr(got, spec.name) is not None for spec in fields(Vehicle))
     assert (got.water_sigma, got.current) == (vehicle.water_sigma, vehicle.current)
 
@@ -160,7 +161,7 @@ def test_live_pings_count_with_the_sigma_of_what_they_are_off() -> None:
     buffers.add(Ping(2.0, (1.0,) * 4, is_water=True))
     buffers.add(Ping(3.0, (1.0,) * 4, own, is_water=True))
     np.testing.assert_array_equal(
-        buffers.pings.all[:, SIGMAS], [[0.01] * 4, [0.08] * 4, [0.5, 0.08, 0.5, 0.5]]
+        buffers.pings.all[:, buffers.sigmas], [[0.01] * 4, [0.08] * 4, [0.5, 0.08, 0.5, 0.5]]
     )
 
 

@@ -18,7 +18,7 @@ from ssm_graph.graph.first_values import first_values
 from ssm_graph.graph.gtsam_graph import gtsam_graph
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.states import States
-from ssm_graph.io.raw_log.mission_messages import messages_of
+from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.mission.bottom_track import without_water_track
 from ssm_graph.mission.current import CURRENT, CURRENT_UP
 from ssm_graph.mission.estimate import Estimate, Status

@@ -13,7 +13,7 @@ What these logs need before they can be used, all of it measured on logs of 2025
 * The DVL's own clock, the running sum of ``delta_time``, is good; its offset to the arrivals is a
   running median. They scatter by +-22 ms about it, the publishing period of that topic.
 * The DVL dead-reckons with a gyro of its own, and its heading is among the sensors of the vehicle's
-  position estimate: another gyro, see :mod:`ssm_graph.io.blueye.heading`.
+  position estimate: another gyro, see :mod:`ssm_graph.io.blueye.gyros`.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from typing import Any, Final
 import numpy as np
 from scipy.ndimage import median_filter, uniform_filter1d
 
-from ssm_graph.base.earth import LocalFrame, normal_gravity
+from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
-from ssm_graph.io.blueye.heading import dvl_heading
+from ssm_graph.io.blueye.gyros import compare_imus, dvl_heading
 from ssm_graph.io.blueye.log import GNSS_SENSOR_ID, BlueyeTables, read_blueye_tables
 from ssm_graph.io.blueye.vehicle import (
     BEAM_SIGMA,
@@ -45,13 +45,21 @@ from ssm_graph.io.blueye.vehicle import (
     dvl_mount,
     gnss_calibration,
 )
-from ssm_graph.io.blueye.witness import compare_imus
-from ssm_graph.mission.mission import Aids, Mission
+from ssm_graph.io.mission_folder.assembly import mission_from
+from ssm_graph.mission.mission import Mission
 from ssm_graph.sensors.depth import DepthLog
-from ssm_graph.sensors.dvl import N_BEAMS, DvlLog
+from ssm_graph.sensors.dvl import DvlLog
 from ssm_graph.sensors.gnss import GnssLog
 from ssm_graph.sensors.imu import ImuLog
 
+LABELS: Final = {
+    "imu": "Imu2Tel",
+    "dvl": "DvlVelocityTel",
+    "depth": "DepthTel",
+    "gnss": "PositionEstimateTel",
+    "heading": "PositionEstimateTel of the DVL",
+}
+"""What messages call the source of each instrument's readings."""
 STANDARD_GRAVITY: Final = 9.80665
 """m/s^2, of an accelerometer that counts in g."""
 
@@ -93,18 +101,15 @@ def convert_blueye(log: Path) -> Mission:
         f"speeds are taken to be {100.0 * DVL_SCALE_ERROR:.1f} % high, give or take "
         f"{100.0 * DVL_SCALE_SIGMA:g} %; this and both delays are estimated about these values."
     )
-    return Mission(
+    return mission_from(
+        [part for part in (imu, dvl, depth, gnss, heading) if part is not None],
+        None,
         name=log.stem,
+        labels=LABELS,
         frame=frame,
-        imu=imu,
-        dvl=dvl,
-        depth=depth,
-        gnss=gnss,
-        aids=Aids(heading),
         notes=(
             *imu_notes,
             *compare_imus(imu, tables.witness),
-            *_gravity_notes(imu, frame),
             *dvl_notes,
             *heading_notes,
             *gnss_notes,
@@ -197,15 +202,6 @@ def _check_gyro_unit(gyro_z: Array, yaw_rate: Array) -> None:
         )
 
 
-def _gravity_notes(imu: ImuLog, frame: LocalFrame) -> tuple[str, ...]:
-    ratio = np.median(np.linalg.norm(imu.accel_b, axis=1)) / normal_gravity(frame.lat, 0.0)
-    if abs(ratio - 1.0) < 0.005:
-        return ()
-    return (
-        f"The accelerometer's median length is {100.0 * ratio:.1f} % of gravity; not corrected.",
-    )
-
-
 def _dvl(tables: BlueyeTables, imu: ImuLog) -> tuple[DvlLog, tuple[str, ...]]:
     """Return new reports with beam speeds on the instrument's own clock."""
     table = tables.dvl[_is_new(tables.dvl[:, 1:])]
@@ -217,7 +213,7 @@ def _dvl(tables: BlueyeTables, imu: ImuLog) -> tuple[DvlLog, tuple[str, ...]]:
     table, time_s = table[kept], time_s[kept]
     if len(table) < 2:
         raise DataError("DvlVelocityTel: fewer than two new reports while the IMU ran")
-    speed, valid, ranges = np.split(table[:, 4 : 4 + 3 * N_BEAMS], 3, axis=1)
+    speed, valid, ranges = np.split(table[:, 4:-3], 3, axis=1)
     water_track = table[:, 2] > 0.0
     is_one_number = np.ptp(speed, axis=1, keepdims=True) == 0.0
     speed = np.where((valid > 0.0) & ~is_one_number, speed, np.nan)
@@ -272,7 +268,7 @@ def _gnss(tables: BlueyeTables, imu: ImuLog, depth: DepthLog) -> tuple[GnssLog, 
     if len(table) == 0:
         raise DataError(f"PositionEstimateTel: no valid fix of sensor {GNSS_SENSOR_ID} (GNSS)")
     table = table[_is_new(table[:, 1:3])]
-    time_s = table[:, 0] - GNSS_DELAY_S
+    time_s = table[:, 0] - GNSS_DELAY_S  # when the fixes were true
     during = (time_s >= imu.start_s) & (time_s <= imu.time_s[-1]) & _strictly_later(time_s)
     good = (table[:, 3] <= GNSS_SIGMA_LIMIT) & (table[:, 3] > 0.0)
     n_new, n_bad = len(table), int(np.sum(during & ~good))
@@ -284,7 +280,7 @@ def _gnss(tables: BlueyeTables, imu: ImuLog, depth: DepthLog) -> tuple[GnssLog, 
     sigma = table[:, 3]
     height = -np.interp(time_s, depth.time_s, depth.depth) - GNSS_LEVER_ARM[2]
     log = GnssLog(
-        time_s=time_s,
+        time_s=table[:, 0],
         lat=np.deg2rad(table[:, 1]),
         lon=np.deg2rad(table[:, 2]),
         height=height,
@@ -299,7 +295,7 @@ def _gnss(tables: BlueyeTables, imu: ImuLog, depth: DepthLog) -> tuple[GnssLog, 
     ]
     fixes = (
         f"GNSS: {len(table)} new fixes kept of {n_new}, {n_bad} with sigma above "
-        f"{GNSS_SIGMA_LIMIT} m dropped; stamps moved {GNSS_DELAY_S} s earlier, for they came late; "
+        f"{GNSS_SIGMA_LIMIT} m dropped; stamps {GNSS_DELAY_S} s late; "
         f"longer silences: {', '.join(gaps) or 'none'}."
     )
     heights = (

@@ -10,7 +10,7 @@ import numpy as np
 
 from ssm_graph.base.errors import DataError, MissingExtraError
 from ssm_graph.base.frozen import Array
-from ssm_graph.sensors.dvl import N_BEAMS
+from ssm_graph.io.blueye.vehicle import BEAM_AZIMUTH
 
 PREFIX: Final = "blueye.protocol."
 TOPICS: Final = tuple(
@@ -111,7 +111,7 @@ def _append(rows: dict[str, list[tuple[float, ...]]], topic: str, time: float, m
     elif topic == "DvlVelocityTel":
         dvl = msg.dvl_velocity
         beams = sorted(dvl.transducers, key=lambda beam: int(beam.id))
-        if [beam.id for beam in beams] != list(range(N_BEAMS)):
+        if [beam.id for beam in beams] != list(range(len(BEAM_AZIMUTH))):
             raise IndexError(f"expected transducers 0 to 3, got {[beam.id for beam in beams]}")
         columns = zip(
             *((beam.velocity, beam.beam_valid, beam.distance) for beam in beams), strict=True

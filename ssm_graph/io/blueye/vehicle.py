@@ -13,7 +13,7 @@ import numpy as np
 
 from ssm_graph.sensors.compass import HeadingErrors
 from ssm_graph.sensors.drift import Drift
-from ssm_graph.sensors.dvl import N_BEAMS, DvlMount
+from ssm_graph.sensors.dvl import DvlMount, beams_from_angles
 from ssm_graph.sensors.gnss import GnssCalibration
 from ssm_graph.sensors.imu import ImuNoise
 
@@ -90,10 +90,8 @@ BEAM_AZIMUTH: Final = np.deg2rad([-45.0, 45.0, 135.0, -135.0])
 
 def dvl_mount() -> DvlMount:
     """Return the A50 on the vehicle, its scale and delay to be estimated about what is known."""
-    sin_janus, cos_janus = np.sin(JANUS_ANGLE), np.cos(JANUS_ANGLE)
-    forward, starboard = sin_janus * np.cos(BEAM_AZIMUTH), sin_janus * np.sin(BEAM_AZIMUTH)
     return DvlMount(
-        beams_d=np.column_stack([forward, starboard, np.full(N_BEAMS, cos_janus)]),
+        beams_d=beams_from_angles(BEAM_AZIMUTH, JANUS_ANGLE),
         R_bd=np.eye(3),
         lever_arm_b=np.array(DVL_LEVER_ARM),
         scale_error=DVL_SCALE_ERROR,

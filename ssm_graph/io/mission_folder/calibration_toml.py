@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from ssm_graph.base.frames import R_FRD, BodyAxes
 from ssm_graph.base.frozen import Array
-from ssm_graph.io.mission_folder.beacon_toml import beacon_lines
-from ssm_graph.io.mission_folder.units import rpy_from_R_bd
 from ssm_graph.mission.estimate import CalibratedValue, Calibration, Determined
 from ssm_graph.mission.mission import Mission
+from ssm_graph.sensors.acoustic import RangeLog
 from ssm_graph.sensors.compass import HeadingLog
+from ssm_graph.sensors.dvl import rpy_from_R_bd
 
 CALIBRATION_NAME: Final = "calibration.toml"
 
@@ -120,7 +120,7 @@ def calibration_toml(
         for name, key in keys.items():
             if name in found:
                 lines += _lines(key, found[name], mission, axes)
-    lines += beacon_lines(mission, calibration)
+    lines += _beacon_lines(mission, calibration)
     return "\n".join(lines) + "\n"
 
 
@@ -143,3 +143,30 @@ def _number(total: Array) -> str:
     """Return a number, or a list of several, with the digits that a calibration can have."""
     digits: list[Any] = [float(f"{x:.7g}") + 0.0 for x in total]
     return str(digits[0] if len(digits) == 1 else digits)
+
+
+def _beacon_lines(mission: Mission, calibration: Calibration) -> list[str]:
+    """Return a section ``[[beacon]]`` for each whose place was estimated."""
+    ranges, lines = mission.aids.get(RangeLog), []
+    for beacon in ranges.beacons if ranges is not None else ():
+        found = [v for v in calibration.values if v.variable == f"beacon_{beacon.number}"]
+        if not found:
+            continue
+        frame = mission.frame
+        stated_n = frame.p_n_from_geodetic(beacon.lat, beacon.lon, beacon.height)
+        off_enu = np.array([value.value for value in found])
+        lat, lon, height = frame.geodetic_from_p_n(stated_n + frame.R_nl_at(stated_n) @ off_enu)
+        sigmas = ", ".join(f"{value.sigma:.2g}" for value in found)
+        unsure = [value.label for value in found if value.determined is Determined.RED]
+        remark = [f"# not determined: {', '.join(unsure)}"] if unsure else []
+        lines += [
+            "",
+            "[[beacon]]",
+            *remark,
+            f"number = {beacon.number}",
+            f"lat_deg = {np.degrees(lat):.9f}",
+            f"lon_deg = {np.degrees(lon):.9f}",
+            f"height_m = {height:.3f}",
+            f"# position_sigma_m = [{sigmas}]",
+        ]
+    return lines

@@ -3,28 +3,98 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
-from enum import Enum
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Final
 
+from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import ConfigError, nearest_hint
 from ssm_graph.base.frames import BodyAxes
-from ssm_graph.io.mission_folder.aid_keys import LISTS
-from ssm_graph.io.mission_folder.keys import (
-    FORMAT,
-    OPTIONAL_TABLES,
-    REQUIRED_SECTIONS,
-    SECTIONS,
-    TABLES,
-    Stamp,
-)
-from ssm_graph.io.tables.settings import TOML_NAME, Settings, read_settings, shown
-from ssm_graph.io.tables.table import Order
+from ssm_graph.base.settings import FILE_KEY, Key, Settings, build, read_settings, shown
+from ssm_graph.base.tables import Order, Table
+from ssm_graph.base.units import DEGREE
+from ssm_graph.mission.mission import InitialState, Reference
+from ssm_graph.sensors.current import CURRENT_KEYS
+from ssm_graph.sensors.instrument import ENU, Column, Instrument
+from ssm_graph.sensors.place import PLACE_KEYS, POSITION, check_positions
+from ssm_graph.sensors.registry import INSTRUMENTS
+from ssm_graph.sensors.standstill import STANDSTILL_KEYS
 
-_Choice = TypeVar("_Choice", bound=Enum)
+TOML_NAME: Final = "mission.toml"
+FORMAT: Final = 1
 _ABOUT_TABLES = frozenset({"file", "stamp"})
+
+VELOCITY: Final = Column(
+    "velocity_enu",
+    "vel_{}_m_per_s",
+    ENU,
+    low=-100.0,
+    high=100.0,
+    expected="expected m/s; is it in mm/s?",
+    optional=True,
+)
+ATTITUDE: Final = Column(
+    "roll_pitch_heading",
+    "{}_deg",
+    ("roll", "pitch", "heading"),
+    low=-360.0,
+    high=360.0,
+    expected="expected degrees up to 360",
+    unit=DEGREE,
+    optional=True,
+)
+_PITCH: Final = Column("", "pitch_deg", low=-90.0, high=90.0, expected="expected degrees up to 90")
+
+
+class _Reference(Instrument):
+    """An outside trajectory is read and written as instruments are."""
+
+    __slots__ = ()
+
+    def check(self, table: Table, bare: Reference, axes: BodyAxes) -> list[str]:
+        notes = check_positions(table)
+        _PITCH.beyond(table)
+        return notes + super().check(table, bare, axes)
+
+
+REFERENCE: Final = _Reference(
+    "reference", Reference, {"file": FILE_KEY}, (*POSITION, VELOCITY, ATTITUDE)
+)
+INITIAL_KEYS: Final[Mapping[str, Key]] = {
+    "time_s": Key("time_s"),
+    **PLACE_KEYS,
+    "vel_enu_m_per_s": Key(
+        "velocity_enu", shape=(3,), low=-50.0, high=50.0, hint="the unit is m/s"
+    ),
+    "roll_deg": Key("roll", low=-180.0, high=180.0, unit=DEGREE),
+    "pitch_deg": Key("pitch", low=-90.0, high=90.0, unit=DEGREE),
+    "heading_deg": Key(
+        "heading", low=-180.0, high=360.0, hint="heading is clockwise from north", unit=DEGREE
+    ),
+    "position_sigma_m": Key("position_sigma_enu", shape=(3,), positive=True, high=1e7),
+    "velocity_sigma_m_per_s": Key("velocity_sigma_enu", shape=(3,), positive=True, high=1e3),
+    "attitude_sigma_deg": Key("attitude_sigma", shape=(3,), positive=True, high=360.0, unit=DEGREE),
+}
+TABLES: Final = (*INSTRUMENTS, REFERENCE)
+"""Everything that has a table, in the order in which tables are read."""
+SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
+    "frames": {"body": Key(shape=None)},
+    "origin": PLACE_KEYS,
+    "current": CURRENT_KEYS,
+    "initial": INITIAL_KEYS,
+    **{one.section: one.keys for one in TABLES},
+}
+LISTS: Final[Mapping[str, Mapping[str, Key]]] = {
+    **{name: keys for one in INSTRUMENTS for name, keys in one.lists.items()},
+    "standstill": STANDSTILL_KEYS,
+}
+"""Sections that may come several times, ``[[beacon]]``."""
+REQUIRED_SECTIONS: Final = (
+    "frames",
+    *(one.section for one in INSTRUMENTS if one.is_required),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +107,6 @@ class MissionToml:
     name: str
     order: Order
     body: BodyAxes
-    stamp: Stamp
     sections: dict[str, Settings]
     lists: dict[str, tuple[Settings, ...]]
     """The sections that may come several times."""
@@ -47,6 +116,21 @@ class MissionToml:
 
     def __contains__(self, section: str) -> bool:
         return section in self.sections
+
+    def bare(self, instrument: Instrument) -> Any:
+        """Return the log without rows of an instrument that has a section."""
+        return instrument.bare(self[instrument.section], self.lists)
+
+    def frame(self, section: str) -> LocalFrame | None:
+        """Return the frame at the place that ``[origin]`` or ``[initial]`` states."""
+        if section not in self:
+            return None
+        given = self[section].given()
+        return LocalFrame(*(float(given[name]) for name in ("lat", "lon", "height")))
+
+    def initial(self) -> InitialState | None:
+        """Return the state that ``[initial]`` states."""
+        return build(InitialState, self["initial"].given()) if "initial" in self else None
 
     def fault_of_no_place(self) -> ConfigError:
         """Return the error of a mission that may be anywhere on Earth."""
@@ -80,20 +164,22 @@ def _checked(raw: dict[str, Any], path: Path, may_miss: frozenset[str]) -> Missi
     for name in REQUIRED_SECTIONS:
         if name not in raw:
             raise ConfigError(f"{file} [{name}]: the section is missing; every mission needs it")
+    frames = read_settings("frames", raw["frames"], known=SECTIONS["frames"], file=file)
+    body = frames.choice("body", BodyAxes, BodyAxes.FRD)
     sections = {
-        name: read_settings(name, raw[name], known=SECTIONS[name], file=file, may_miss=may_miss)
+        name: read_settings(
+            name, raw[name], known=SECTIONS[name], file=file, axes=body, may_miss=may_miss
+        )
         for name in raw
         if name in SECTIONS
     }
-    _check_beam_keys(sections["dvl"])
-    top = Settings("", {"order": raw.get("order", Order.TIME.value)}, file)
+    top = Settings("", {"order": raw.get("order", Order.TIME.value)}, file, {})
     return MissionToml(
         folder=path.parent,
         file=file,
         name=_mission_name(raw, file),
-        order=_choice(top, "order", Order),
-        body=_choice(sections["frames"], "body", BodyAxes),
-        stamp=_choice(sections["imu"], "stamp", Stamp) if "stamp" in sections["imu"] else Stamp.END,
+        order=top.choice("order", Order, Order.TIME),
+        body=body,
         sections=sections,
         lists={name: _read_list(name, raw.get(name, []), file) for name in LISTS},
     )
@@ -124,11 +210,11 @@ def table_path(toml: MissionToml, section: str) -> Path | None:
             return path
     except OSError as error:
         raise toml[section].fault("file", f"cannot be read: {error.strerror}") from error
-    others = {toml[name].text("file") for name in TABLES if name in toml}
+    others = {toml[one.section].text("file") for one in TABLES if one.section in toml}
     found = sorted(p.name for p in toml.folder.iterdir() if p.name not in {*others, TOML_NAME})
     stems = {Path(name).stem: name for name in reversed(found)}
     close = get_close_matches(Path(label).stem, stems, n=1, cutoff=0.75)
-    if section in OPTIONAL_TABLES and not close:
+    if section not in REQUIRED_SECTIONS and not close:
         return None
     hint = f"did you mean {stems[close[0]]!r}?" if close else "paths start at the mission folder"
     raise toml[section].fault("file", f"there is no file {label!r}; {hint}")
@@ -166,27 +252,3 @@ def _mission_name(raw: dict[str, Any], file: str) -> str:
         got = "nothing" if name is None else shown(name)
         raise ConfigError(f"{file} name: expected a text in quotes, got {got}")
     return name
-
-
-def _choice(settings: Settings, key: str, choices: type[_Choice]) -> _Choice:
-    try:
-        return choices(settings.values[key])
-    except ValueError:
-        known = [str(choice.value) for choice in choices]
-        raise settings.fault(
-            key,
-            f"expected one of {', '.join(known)}, got {shown(settings.values[key])}",
-        ) from None
-
-
-def _check_beam_keys(dvl: Settings) -> None:
-    angles = ("beam_azimuth_deg", "beam_janus_deg")
-    given = [key for key in angles if key in dvl]
-    if "beam_vectors" in dvl and given:
-        raise dvl.fault("beam_vectors", f"given together with {given[0]}; keep one of the two")
-    if "beam_vectors" not in dvl and len(given) < len(angles):
-        missing = next(key for key in angles if key not in dvl)
-        raise dvl.fault(
-            missing,
-            "the key is missing; expected beam_azimuth_deg with beam_janus_deg, or beam_vectors",
-        )

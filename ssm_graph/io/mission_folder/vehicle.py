@@ -2,49 +2,31 @@
 
 from __future__ import annotations
 
-import os
-import tomllib
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tomli_w
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frames import BodyAxes
-from ssm_graph.base.frozen import Array
-from ssm_graph.io.mission_folder.aid_reading import sections_of_aids
-from ssm_graph.io.mission_folder.instruments import (
-    current_model,
-    depth_calibration,
-    dvl_mount,
-    gnss_calibration,
-    imu_noise,
-    initial_state,
-    lever_arm_b,
-    stated_frame,
-)
-from ssm_graph.io.mission_folder.keys import FORMAT, SECTIONS
-from ssm_graph.io.mission_folder.toml import read_vehicle_toml
+from ssm_graph.base.settings import build, written
+from ssm_graph.base.tables import Order
+from ssm_graph.io.mission_folder.toml import FORMAT, SECTIONS, TOML_NAME, read_vehicle_toml
 from ssm_graph.io.mission_folder.writer import (
-    current_settings,
-    depth_calibration_settings,
-    dvl_settings,
-    gnss_calibration_settings,
-    imu_settings,
-    initial_settings,
-    nominal_sigma,
-    origin_settings,
-    sigma_off_water,
+    common_sections,
+    instrument_sections,
+    write_toml_part,
 )
-from ssm_graph.io.tables.settings import TOML_NAME
-from ssm_graph.io.tables.table import Order, TableFormat
-from ssm_graph.mission.mission import Mission
-from ssm_graph.mission.vehicle import Vehicle
+from ssm_graph.io.tables.files import TableFormat
+from ssm_graph.mission.mission import Aids, Mission
+from ssm_graph.mission.vehicle import GNSS_AT_ORIGIN, Vehicle
 from ssm_graph.sensors.current import CurrentModel
-from ssm_graph.sensors.depth import DepthCalibration
-from ssm_graph.sensors.gnss import GnssCalibration
+from ssm_graph.sensors.depth import DEPTH
+from ssm_graph.sensors.dvl import nominal_sigma, sigma_off_water
+from ssm_graph.sensors.gnss import GNSS
+from ssm_graph.sensors.place import PLACE_KEYS
+from ssm_graph.sensors.registry import BY_LOG, INSTRUMENTS
+from ssm_graph.sensors.standstill import Standstill, standstill
 
 
 def read_vehicle(path: Path | str) -> Vehicle:
@@ -67,35 +49,38 @@ def read_vehicle(path: Path | str) -> Vehicle:
     """
     path = Path(path)
     toml = read_vehicle_toml(path / TOML_NAME if path.is_dir() else path)
-    frame = stated_frame(toml, "origin") or stated_frame(toml, "initial")
+    frame = toml.frame("origin") or toml.frame("initial")
     if frame is None and "gnss" not in toml:
         raise toml.fault_of_no_place()
+    bare = {one.section: toml.bare(one) for one in INSTRUMENTS if one.section in toml}
+    imu, dvl = bare.pop("imu"), bare.pop("dvl")
+    depth, gnss = bare.pop("depth", None), bare.pop("gnss", GNSS_AT_ORIGIN)
     return Vehicle(
         name=toml.name,
-        imu_noise=imu_noise(toml["imu"]),
-        mount=dvl_mount(toml),
+        imu_noise=imu.noise,
+        mount=dvl.mount,
         beam_sigma=toml["dvl"].number("beam_noise_m_per_s"),
         water_sigma=toml["dvl"].number("water_noise_m_per_s") or None,
-        current=current_model(toml["current"]) if "current" in toml else None,
-        depth_lever_arm_b=lever_arm_b(toml, "depth"),
-        gnss_lever_arm_b=lever_arm_b(toml, "gnss"),
-        depth_sigma=toml["depth"].number("noise_m") if "depth" in toml else None,
-        depth_calibration=depth_calibration(toml),
-        gnss_calibration=gnss_calibration(toml),
+        current=build(CurrentModel, toml["current"].given()) if "current" in toml else None,
+        depth=depth,
+        gnss=gnss,
+        aids=Aids(*bare.values(), *map(standstill, toml.lists["standstill"])),
         frame=frame,
-        initial=initial_state(toml["initial"]) if "initial" in toml else None,
-        further_aids=sections_of_aids(toml),
+        initial=toml.initial(),
     )
 
 
 def vehicle_of(mission: Mission) -> Vehicle:
     """Return the vehicle of a recorded mission; its beam sigma is the median of those recorded.
 
-    The offsets of depth and GNSS are those that are left in the mission's values: none. It has a
-    current where there are pings off the water: the default one if the mission states none.
+    It has a current where there are pings off the water: the default one if the mission states
+    none.
     """
-    depth, gnss = mission.depth, mission.gnss
     hears_water = mission.dvl.hears_water
+    aids = (
+        log if isinstance(log, Standstill) else BY_LOG[type(log)].without_rows(log)
+        for log in mission.aids
+    )
     return Vehicle(
         name=mission.name,
         imu_noise=mission.imu.noise,
@@ -103,40 +88,26 @@ def vehicle_of(mission: Mission) -> Vehicle:
         beam_sigma=nominal_sigma(mission.dvl),
         water_sigma=sigma_off_water(mission.dvl) if hears_water else None,
         current=(mission.current or CurrentModel()) if hears_water else None,
-        depth_lever_arm_b=np.zeros(3) if depth is None else depth.lever_arm_b,
-        gnss_lever_arm_b=np.zeros(3) if gnss is None else gnss.lever_arm_b,
-        depth_sigma=None if depth is None else depth.sigma,
-        depth_calibration=(
-            DepthCalibration() if depth is None else replace(depth.calibration, offset=0.0)
-        ),
-        gnss_calibration=(
-            GnssCalibration() if gnss is None else replace(gnss.calibration, time_offset_s=0.0)
-        ),
+        depth=None if mission.depth is None else DEPTH.without_rows(mission.depth),
+        gnss=GNSS_AT_ORIGIN if mission.gnss is None else GNSS.without_rows(mission.gnss),
+        aids=Aids(*aids),
         frame=mission.frame,
         initial=mission.initial,
-        further_aids=mission.aids.sections,
     )
 
 
 def write_vehicle(folder: Path | str, vehicle: Vehicle, *, order: Order = Order.ARRIVAL) -> None:
     """Write the ``mission.toml`` of a folder whose tables are written by someone else.
 
-    The tables are ``imu.csv`` (body axes FRD, stamps at the interval's end), ``dvl.csv``,
-    ``gnss.csv`` and, where the vehicle has a depth sensor, ``depth.csv``. The file appears whole
-    or not at all; one that is there is replaced.
+    The tables are called as their sections, ``imu.csv`` (body axes FRD, stamps at the interval's
+    end) and so on. The file appears whole or not at all; one that is there is replaced.
     """
-    path = Path(folder) / TOML_NAME
-    part = path.with_name(f"{TOML_NAME}.part")
-    with part.open("wb") as stream:
-        tomli_w.dump(vehicle_settings(vehicle, order=order), stream)
-        stream.flush()
-        os.fsync(stream.fileno())
-    part.replace(path)
+    settings = vehicle_settings(vehicle, order=order)
+    write_toml_part(Path(folder), settings).replace(Path(folder) / TOML_NAME)
 
 
 def vehicle_settings(vehicle: Vehicle, *, order: Order = Order.ARRIVAL) -> dict[str, Any]:
     """Return the content of the ``mission.toml`` that :func:`write_vehicle` writes."""
-    suffix = TableFormat.CSV.value
     settings: dict[str, Any] = {
         "format": FORMAT,
         "name": vehicle.name,
@@ -144,36 +115,18 @@ def vehicle_settings(vehicle: Vehicle, *, order: Order = Order.ARRIVAL) -> dict[
         "frames": {"body": BodyAxes.FRD.value},
     }
     if vehicle.frame is not None:
-        settings["origin"] = origin_settings(vehicle.frame)
-    settings["imu"] = imu_settings(vehicle.imu_noise, suffix)
-    settings["dvl"] = dvl_settings(vehicle.mount, float(vehicle.beam_sigma), suffix)
+        settings["origin"] = written(vehicle.frame, PLACE_KEYS)
+    settings |= instrument_sections(vehicle.bare_logs.values(), TableFormat.CSV.value)
+    settings["dvl"]["beam_noise_m_per_s"] = float(vehicle.beam_sigma)
     if vehicle.water_sigma is not None:
         settings["dvl"]["water_noise_m_per_s"] = float(vehicle.water_sigma)
-    if vehicle.current is not None:
-        settings["current"] = current_settings(vehicle.current)
-    if vehicle.depth_sigma is not None:
-        settings["depth"] = {
-            "file": f"depth{suffix}",
-            "noise_m": float(vehicle.depth_sigma),
-            "lever_arm_m": _listed(vehicle.depth_lever_arm_b),
-            **depth_calibration_settings(vehicle.depth_calibration),
-        }
-    settings["gnss"] = {
-        "file": f"gnss{suffix}",
-        "lever_arm_m": _listed(vehicle.gnss_lever_arm_b),
-        **gnss_calibration_settings(vehicle.gnss_calibration),
-    }
-    if vehicle.initial is not None:
-        settings["initial"] = initial_settings(vehicle.initial)
-    return settings
+    return settings | common_sections(vehicle)
 
 
 def check_same_vehicle(folder: Path | str, vehicle: Vehicle) -> None:
     """Raise :class:`ConfigError` unless the log in ``folder`` was begun for just this vehicle."""
-    path = Path(folder) / TOML_NAME
-    read_vehicle_toml(path)
-    found = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    place = _difference(found, vehicle_settings(vehicle))
+    logged = read_vehicle(Path(folder) / TOML_NAME)
+    place = _difference(vehicle_settings(logged), vehicle_settings(vehicle))
     if place is not None:
         raise ConfigError(
             f"{TOML_NAME} {place}: the log in {str(folder)!r} was begun with another value; "
@@ -194,7 +147,3 @@ def _difference(found: Any, wanted: Any, place: str = "") -> str | None:
     except (TypeError, ValueError):  # texts, missing keys, lists of other lengths
         is_same = found == wanted
     return None if is_same else place
-
-
-def _listed(lever_arm: Array) -> list[float]:
-    return [float(x) + 0.0 for x in lever_arm]  # no minus zero in a file for people

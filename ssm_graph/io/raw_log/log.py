@@ -1,6 +1,6 @@
 """The log of everything that a live estimator receives, written before it is used.
 
-The folder is a mission folder in order of arrival (``mission.toml`` and four tables) with one file
+The folder is a mission folder in order of arrival (``mission.toml`` and its tables) with one file
 more, ``arrivals``: a letter per row, in the order in which the rows of all tables came. Where a
 process went on with the log of another, ``arrivals`` holds a line with the sizes of the tables at
 that moment, so that a row that was written without its letter shifts no other.
@@ -9,18 +9,18 @@ that moment, so that a row that was written without its letter shifts no other.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
 from ssm_graph.base.errors import ConfigError
+from ssm_graph.io.mission_folder.toml import TOML_NAME
 from ssm_graph.io.mission_folder.vehicle import check_same_vehicle, write_vehicle
 from ssm_graph.io.raw_log.replay import check_columns, replay
-from ssm_graph.io.raw_log.rows import ARRIVALS, ROW_KINDS, RowKind
+from ssm_graph.io.raw_log.rows import ALWAYS, ARRIVALS, RowKind, row_kinds
 from ssm_graph.io.tables.append_file import TORN_ROW, AppendFile, sync_folder
-from ssm_graph.io.tables.settings import TOML_NAME
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.messages import Message
 
@@ -74,10 +74,12 @@ class RawLog:
     ) -> None:
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        _refuse_content(folder)
-        self._open(folder, max_waiting=max_waiting, retry_every=retry_every)
-        for kind in ROW_KINDS.values():
-            self._tables[kind.file].append(kind.header)
+        kinds = row_kinds(vehicle)
+        _refuse_content(folder, kinds.values())
+        self._open(folder, kinds, max_waiting=max_waiting, retry_every=retry_every)
+        for kind in kinds.values():
+            if kind.file in self._tables:
+                self._tables[kind.file].append(kind.header)
         self._commit()
         for file in self._files():
             file.sync()
@@ -109,29 +111,36 @@ class RawLog:
             Where the files cannot be opened.
         """
         check_same_vehicle(folder, vehicle)
-        check_columns(folder)
+        kinds = row_kinds(vehicle)
+        check_columns(folder, kinds.values())
         log = cls.__new__(cls)
-        log._open(Path(folder), max_waiting=max_waiting, retry_every=retry_every)
-        sizes = ",".join(str(table.size) for table in log._tables.values())
+        log._open(Path(folder), kinds, max_waiting=max_waiting, retry_every=retry_every)
+        tables = [log._tables.get(kind.file) for kind in kinds.values()]
+        sizes = ",".join(str(0 if table is None else table.size) for table in tables)
         log._waiting.append(_Row(log._arrivals, f"\n@{sizes};\n".encode(), b""))
-        for kind in ROW_KINDS.values():
-            table = log._tables[kind.file]
-            if table.size < len(kind.header):  # a power failure took it
+        for kind, table in zip(kinds.values(), tables, strict=True):
+            if table is not None and table.size < len(kind.header):  # a power failure took it
                 table.cut(0)
                 log._waiting.append(_Row(table, kind.header, b""))
         log._commit()
         log._write_waiting(len(log._waiting))
         return log
 
-    def _open(self, folder: Path, *, max_waiting: int, retry_every: int) -> None:
+    def _open(
+        self,
+        folder: Path,
+        kinds: Mapping[type[Message], RowKind],
+        *,
+        max_waiting: int,
+        retry_every: int,
+    ) -> None:
+        self._folder, self._kinds = folder, kinds
         self._tables = {
             kind.file: AppendFile(folder / kind.file, ending=TORN_ROW)
-            for kind in ROW_KINDS.values()
+            for kind in kinds.values()
+            if kind.file in ALWAYS or (folder / kind.file).exists()
         }
         self._arrivals = AppendFile(folder / ARRIVALS, ending=b"\n")
-        self._targets: Mapping[type, tuple[RowKind, AppendFile]] = {
-            kind: (rows, self._tables[rows.file]) for kind, rows in ROW_KINDS.items()
-        }
         self._offsets: dict[str, int] = {}
         self._waiting: deque[_Row] = deque()
         self._max_waiting, self._retry_every = max_waiting, retry_every
@@ -145,7 +154,10 @@ class RawLog:
         Every number comes back bit for bit, latitude and longitude, which the table has in degrees,
         to 5e-16 rad; a ping whose sigmas are all NaN comes back with None.
         """
-        kind, table = self._targets[type(message)]
+        kind = self._kinds[type(message)]
+        table = self._tables.get(kind.file) or self._begin_table(kind)
+        if table is None:
+            return
         row = _Row(table, kind.row(message), kind.letter)
         if self._waiting:
             self._wait(row)
@@ -153,6 +165,18 @@ class RawLog:
         elif not self._write(row):
             self._wait(row)
             self._tried_s, self._since_tried = message.time_s, 0
+
+    def _begin_table(self, kind: RowKind) -> AppendFile | None:
+        """Return the table of an instrument that is heard for the first time; None if refused."""
+        try:
+            table = AppendFile(self._folder / kind.file, ending=TORN_ROW)
+        except OSError as error:
+            self._n_lost, self._reason = self._n_lost + 1, error.strerror or str(error)
+            return None
+        self._tables[kind.file] = table
+        self._waiting.append(_Row(table, kind.header, b""))
+        self._write_waiting(len(self._waiting))
+        return table
 
     def offsets(self) -> dict[str, int]:
         """Return the size of every file up to the last row that is wholly written, bytes.
@@ -244,9 +268,9 @@ class RawLog:
         return True
 
 
-def _refuse_content(folder: Path) -> None:
+def _refuse_content(folder: Path, kinds: Iterable[RowKind]) -> None:
     """Raise where a folder holds a mission; remove what a start that was cut short left there."""
-    heads = {kind.file: kind.header for kind in ROW_KINDS.values()} | {ARRIVALS: b""}
+    heads = {kind.file: kind.header for kind in kinds} | {ARRIVALS: b""}
     begun = [folder / name for name in heads if (folder / name).exists()]
     is_used = any(path.stat().st_size > len(heads[path.name]) for path in begun)
     if is_used or (folder / TOML_NAME).exists():

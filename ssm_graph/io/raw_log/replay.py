@@ -5,16 +5,17 @@ from __future__ import annotations
 import heapq
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.io.mission_folder.vehicle import check_same_vehicle
-from ssm_graph.io.raw_log.rows import ARRIVALS, ROW_KINDS, RowKind
+from ssm_graph.io.raw_log.rows import ARRIVALS, RowKind, row_kinds
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.messages import Message
 
+_FEWEST_TABLES = 4
 _SIZES = re.compile(rb"@(\d+(?:,\d+)*);")
 
 
@@ -62,19 +63,20 @@ def replay(
         For a folder without a log, and for the log of another vehicle or of another version.
     """
     check_same_vehicle(folder, vehicle)
-    check_columns(folder)
+    kinds = row_kinds(vehicle)
+    check_columns(folder, kinds.values())
     starts = offsets or {}
     arrivals = _read_from(Path(folder) / ARRIVALS, starts.get(ARRIVALS, 0))
     tables = {
         kind.letter[0]: _Rows(Path(folder) / kind.file, kind, starts.get(kind.file, 0))
-        for kind in ROW_KINDS.values()
+        for kind in kinds.values()
     }
     return _in_order_of_arrival(arrivals, tables)
 
 
-def check_columns(folder: Path | str) -> None:
+def check_columns(folder: Path | str, kinds: Iterable[RowKind]) -> None:
     """Raise :class:`ConfigError` for a log whose tables have other columns than ours."""
-    for kind in ROW_KINDS.values():
+    for kind in kinds:
         path = Path(folder) / kind.file
         if not path.exists():
             continue
@@ -104,8 +106,8 @@ def _runs(arrivals: bytes, n_tables: int) -> Iterator[tuple[bytes, tuple[float, 
     for line in arrivals.split(b"\n"):
         sizes = _SIZES.fullmatch(line)
         limits = tuple(float(size) for size in sizes[1].split(b",")) if sizes else ()
-        if len(limits) == n_tables:
-            yield letters, limits
+        if _FEWEST_TABLES <= len(limits) <= n_tables:  # there were none of later instruments
+            yield letters, limits + (0.0,) * (n_tables - len(limits))
             letters = b""
         elif not line.startswith(b"@"):  # else a line of sizes that was torn
             letters += line

@@ -20,8 +20,8 @@ import numpy as np
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frames import BodyAxes
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.units import DEG_PER_H, MICRO_G
 from ssm_graph.io.mission_folder.calibration_toml import CALIBRATION_NAME, calibration_toml
-from ssm_graph.io.mission_folder.units import SI
 from ssm_graph.io.results.summary import MetricsLike, build_summary
 from ssm_graph.io.tables.csv_tables import (
     CsvFile,
@@ -160,10 +160,8 @@ def trajectory_columns(trajectory: Trajectory) -> Columns:
         **_spread("sigma_{}_m", enu, position_sigma, "%.7g"),
         **_spread("sigma_vel_{}_m_per_s", enu, trajectory.velocity_sigma_enu, "%.7g"),
         **_spread("sigma_{}_deg", rph, np.rad2deg(trajectory.attitude_sigma), "%.7g"),
-        **_spread(
-            "gyro_bias_{}_deg_per_h", xyz, trajectory.gyro_bias / SI["gyro_bias_deg_per_h"], "%.9g"
-        ),
-        **_spread("accel_bias_{}_ug", xyz, trajectory.accel_bias / SI["accel_bias_ug"], "%.9g"),
+        **_spread("gyro_bias_{}_deg_per_h", xyz, trajectory.gyro_bias / DEG_PER_H, "%.9g"),
+        **_spread("accel_bias_{}_ug", xyz, trajectory.accel_bias / MICRO_G, "%.9g"),
         "n_beams": (trajectory.n_beams, "%.0f"),
     }
 

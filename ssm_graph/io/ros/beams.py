@@ -15,7 +15,7 @@ import numpy as np
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frames import rotation_zyx
 from ssm_graph.base.frozen import Array
-from ssm_graph.io.mission_folder.units import beams_from_angles
+from ssm_graph.sensors.dvl import beams_from_angles
 
 WATER_LINKED_BEAMS: Final = beams_from_angles(
     np.radians([135.0, -135.0, -45.0, 45.0]), float(np.radians(22.5))
@@ -37,7 +37,7 @@ class Beams(NamedTuple):
     """The outcome: directions, sign to apply to the speeds, and what a user should know."""
 
     beams_d: Array
-    """(4, 3)"""
+    """(B, 3)"""
     sign: float
     notes: tuple[str, ...]
 
@@ -49,7 +49,7 @@ class _Candidate(NamedTuple):
 
 
 def stated_beams(beams_d: Array | None) -> Array | None:
-    """Return directions (4, 3) as a message states them, None where they cannot be any."""
+    """Return directions (B, 3) as a message states them, None where they cannot be any."""
     if beams_d is None or not np.isfinite(beams_d).all():
         return None
     length = np.linalg.norm(beams_d, axis=1)
@@ -62,7 +62,7 @@ def stated_beams(beams_d: Array | None) -> Array | None:
 def known_beams(beams_d: Array, *, speed: Array, velocity_d: Array) -> Beams:
     """Return directions that the user gave, and the sign that the data show.
 
-    ``speed`` is (N, 4), ``velocity_d`` (N, 3), both NaN where unknown.  Directions that do not fit
+    ``speed`` is (N, B), ``velocity_d`` (N, 3), both NaN where unknown.  Directions that do not fit
     are kept and noted, for the instrument may give its velocity in other axes.
     """
     choices = [_Candidate(beams_d, sign, _sign_change(sign)) for sign in (1.0, -1.0)]
@@ -87,11 +87,11 @@ def proven_beams(
 
     Parameters
     ----------
-    stated : (4, 3) directions of the messages, or None.
+    stated : (B, 3) directions of the messages, or None.
     water_linked : the messages are ``dvl_msgs``: the maker's geometry and sign are taken, turned
         by quarters where the velocity shows a mounting rotation.
     may_turn : whether the data may turn the sign of the speeds.
-    speed, velocity_d : (N, 4) and (N, 3), m/s, NaN where unknown.
+    speed, velocity_d : (N, B) and (N, 3), m/s, NaN where unknown.
 
     Raises
     ------
@@ -207,5 +207,5 @@ def _best(
 
 
 def _rms(values: Array) -> Array:
-    """Return the root mean square (N,) of the beams (N, 4) that are not NaN."""
+    """Return the root mean square (N,) of the beams (N, B) that are not NaN."""
     return np.asarray(np.sqrt(np.nanmean(values**2, axis=1)))

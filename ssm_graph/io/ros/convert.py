@@ -6,8 +6,9 @@ comes from a vehicle, or is assumed and said in the mission's notes.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from array import array
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
@@ -16,16 +17,27 @@ import numpy as np
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
-from ssm_graph.io.ros.beams import Beams, known_beams, proven_beams
-from ssm_graph.io.ros.messages import STANDARD_GRAVITY, WATER_LINKED_TYPE, BeamSign, RosOptions
-from ssm_graph.io.ros.rows import BagTopic, in_order, read_topics
-from ssm_graph.mission.mission import InitialState, Mission
-from ssm_graph.mission.vehicle import Vehicle
-from ssm_graph.sensors.depth import DepthCalibration, DepthLog
+from ssm_graph.io.mission_folder.assembly import mission_from
+from ssm_graph.io.ros.beams import Beams, known_beams, proven_beams, stated_beams
+from ssm_graph.io.ros.log import REQUIRED_ROLES, BagMessage, read_rosbag
+from ssm_graph.io.ros.messages import (
+    STANDARD_GRAVITY,
+    WATER_LINKED_TYPE,
+    BeamSign,
+    RosOptions,
+    depth_reading,
+    depth_sigma,
+    dvl_report,
+    fix,
+    has_stated_sigma,
+    imu_sample,
+)
+from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.vehicle import GNSS_AT_ORIGIN, Vehicle
+from ssm_graph.sensors.depth import DEEPEST_M, DEPTH, DepthLog
 from ssm_graph.sensors.dvl import DvlLog, DvlMount, counted_sigma
-from ssm_graph.sensors.gnss import GnssCalibration, GnssLog
+from ssm_graph.sensors.gnss import GnssLog
 from ssm_graph.sensors.imu import ImuLog, ImuNoise
-from ssm_graph.sensors.limits import DEEPEST_M
 
 NOISE: Final = ImuNoise(
     gyro_density=1.2e-4,
@@ -41,6 +53,8 @@ BEAM_SIGMA: Final = 0.02
 DEPTH_SIGMA: Final = 0.1
 """m"""
 
+WATER_LATER_S: Final = 1e-3
+"""A ping off the water that has the time of one off the ground is put so much later."""
 _GAP_STEPS: Final = 5.0
 _GRAVITY_SHARE: Final = 0.1
 _ABOVE_WATER_M: Final = 2.0
@@ -75,30 +89,27 @@ def convert_rosbag(
         The recording is damaged, or its messages cannot be what they say they are.
     """
     bag, options = Path(bag), RosOptions() if options is None else options
-    read = read_topics(bag, topics or {}, options)
+    if vehicle is not None:
+        options = replace(options, n_beams=vehicle.mount.n_beams)
+    read = _read_topics(bag, topics or {}, options)
     tables, notes = {}, []
     for role, topic in read.items():
-        tables[role], some = in_order(topic)
+        tables[role], some = _in_order(topic, options.n_beams)
         notes += some
     imu = _imu(bag, tables["imu"], vehicle, options)
     notes += _imu_notes(imu, read["imu"], vehicle)
     dvl, some = _dvl(bag, tables["dvl"], read["dvl"], vehicle, options)
-    _check_same_clock(bag, imu, dvl, read)
     notes += some
     gnss, some = _gnss(tables.get("gnss"), read, vehicle, options)
     notes += some
     depth, some = _depth(bag, tables.get("depth"), gnss, vehicle, options)
-    initial, initial_notes = _initial(imu, vehicle)
-    return Mission(
+    return mission_from(
+        [log for log in (imu, dvl, depth, gnss) if log is not None],
+        vehicle,
         name=bag.stem,
+        labels={role: f"{bag}: {topic.name}" for role, topic in read.items()},
         frame=_frame(bag, vehicle, gnss),
-        imu=imu,
-        dvl=dvl,
-        depth=depth,
-        gnss=gnss,
-        initial=initial,
-        current=None if vehicle is None else vehicle.current,
-        notes=(*notes, *some, *initial_notes),
+        notes=[*notes, *some],
     )
 
 
@@ -160,13 +171,19 @@ def _imu_notes(imu: ImuLog, topic: BagTopic, vehicle: Vehicle | None) -> list[st
 def _dvl(
     bag: Path, table: Array, topic: BagTopic, vehicle: Vehicle | None, options: RosOptions
 ) -> tuple[DvlLog, list[str]]:
-    _, speed, sigma, ranges, velocity_d, water = np.split(table, [1, 5, 9, 13, 16], axis=1)
+    n = options.n_beams
+    edges = np.cumsum([1, n, n, n, 3, 9])
+    _, speed, sigma, ranges, velocity_d, covariance, water = np.split(table, edges, axis=1)
+    water_track = water[:, 0] if water.any() else None
     if not np.isfinite(speed).any():
+        if vehicle is not None and _gives_velocity(vehicle.mount, velocity_d):
+            return _velocities(table[:, 0], velocity_d, covariance, vehicle, water_track)
         raise DataError(
             f"{bag}: topic {topic.name} holds {len(table)} messages and not one beam speed; "
             "expected the speeds of the beams, not only the velocity made of them (for "
             "marine_acoustic_msgs: beam_velocities_valid, num_good_beams and beam_velocity; for "
-            "dvl_msgs: velocity_valid and beams)"
+            "dvl_msgs: velocity_valid and beams); for an instrument that has only the velocity, "
+            "give a --vehicle whose beam_vectors are its three axes"
         )
     try:
         beams = _beams(topic, vehicle, options, speed=speed, velocity_d=velocity_d)
@@ -191,9 +208,45 @@ def _dvl(
             water_sigma=None if vehicle is None else vehicle.water_sigma,
         ),
         range_m=ranges if np.isfinite(ranges).any() else None,
-        water_track=water[:, 0] if water.any() else None,
+        water_track=water_track,
     )
     return log, notes
+
+
+def _gives_velocity(mount: DvlMount, velocity_d: Array) -> bool:
+    """Return whether the vehicle's DVL has three axes for beams, and messages a velocity."""
+    beams_d = mount.beams_d
+    is_axes = mount.n_beams == 3 and np.allclose(beams_d @ beams_d.T, np.eye(3), atol=1e-6)
+    return bool(is_axes and np.isfinite(velocity_d).any())
+
+
+def _velocities(
+    time_s: Array,
+    velocity_d: Array,
+    covariance: Array,
+    vehicle: Vehicle,
+    water_track: Array | None,
+) -> tuple[DvlLog, list[str]]:
+    """Return velocities (N, 3) as speeds along the instrument's axes, and how they are counted."""
+    turn = vehicle.mount.beams_d
+    matrix = turn @ covariance.reshape(-1, 3, 3) @ turn.T
+    is_stated = np.asarray(np.isfinite(matrix).all(axis=(1, 2)))
+    is_stated[is_stated] = np.linalg.eigvalsh(matrix[is_stated])[:, 0] > 0.0
+    matrix = np.where(is_stated[:, None, None], matrix, np.nan)
+    sigma = np.full(velocity_d.shape, vehicle.beam_sigma)
+    sigma[is_stated] = np.sqrt(np.diagonal(matrix[is_stated], axis1=1, axis2=2))
+    log = DvlLog(
+        mount=vehicle.mount,
+        time_s=time_s,
+        speed=velocity_d @ turn.T,
+        sigma=sigma,
+        water_track=water_track,
+        covariance=matrix if is_stated.any() else None,
+    )
+    return log, [
+        f"The DVL's messages hold no beam speeds: its velocity counts, with the covariance that "
+        f"{is_stated.sum()} of {len(time_s)} messages state."
+    ]
 
 
 def _beams(topic: BagTopic, vehicle: Vehicle | None, options: RosOptions, **data: Array) -> Beams:
@@ -205,15 +258,6 @@ def _beams(topic: BagTopic, vehicle: Vehicle | None, options: RosOptions, **data
         may_turn=options.beam_sign is BeamSign.ALONG,
         **data,
     )
-
-
-def _check_same_clock(bag: Path, imu: ImuLog, dvl: DvlLog, read: Mapping[str, BagTopic]) -> None:
-    if dvl.time_s[-1] < imu.start_s or dvl.time_s[0] > imu.time_s[-1]:
-        raise DataError(
-            f"{bag}: the stamps of {read['dvl'].name} run from {dvl.time_s[0]:.3f} to "
-            f"{dvl.time_s[-1]:.3f} s, those of {read['imu'].name} from {imu.start_s:.3f} to "
-            f"{imu.time_s[-1]:.3f} s; expected one clock; is one stamped by the instrument's own?"
-        )
 
 
 def _gnss(
@@ -228,15 +272,13 @@ def _gnss(
             f"{topic.name}: {topic.n_unstated} fixes do not say how good they are and are given "
             f"{sigma[0]:g}, {sigma[1]:g}, {sigma[2]:g} m east, north, up."
         )
-    known = GnssCalibration() if vehicle is None else vehicle.gnss_calibration
-    log = GnssLog(
-        time_s=table[:, 0] - known.time_offset_s,
+    log = replace(
+        GNSS_AT_ORIGIN if vehicle is None else vehicle.gnss,
+        time_s=table[:, 0],
         lat=table[:, 1],
         lon=table[:, 2],
         height=table[:, 3],
         sigma_enu=table[:, 4:7],
-        lever_arm_b=np.zeros(3) if vehicle is None else vehicle.gnss_lever_arm_b,
-        calibration=known,
     )
     return log, notes
 
@@ -258,14 +300,10 @@ def _depth(
         )
     stated = table[np.isfinite(table[:, 2]), 2]
     sigma = float(np.median(stated)) if len(stated) else DEPTH_SIGMA
-    known = DepthCalibration() if vehicle is None else vehicle.depth_calibration
-    log = DepthLog(
-        sigma=sigma if vehicle is None or vehicle.depth_sigma is None else vehicle.depth_sigma,
-        time_s=table[:, 0],
-        depth=table[:, 1] - known.offset,
-        lever_arm_b=np.zeros(3) if vehicle is None else vehicle.depth_lever_arm_b,
-        calibration=known,
-    )
+    known = None if vehicle is None else vehicle.depth
+    if known is None:
+        known = DepthLog(sigma=sigma, lever_arm_b=np.zeros(3), **DEPTH.empty())
+    log = replace(known, time_s=table[:, 0], depth=table[:, 1])
     notes = [
         f"Depth is pressure above {options.atmosphere:.0f} Pa in water of "
         f"{options.water_density:g} kg/m^3, with a sigma of {log.sigma:.3g} m."
@@ -279,9 +317,9 @@ def _depth(
 def _surface(depth: DepthLog, gnss: GnssLog | None) -> tuple[float, str]:
     """Return the height of the water's surface above the ellipsoid by the fixes, and how."""
     if gnss is not None:
-        both = (gnss.time_s >= depth.time_s[0]) & (gnss.time_s <= depth.time_s[-1])
+        both = (gnss.valid_s >= depth.time_s[0]) & (gnss.valid_s <= depth.time_s[-1])
         if both.any():
-            below = np.interp(gnss.time_s[both], depth.time_s, depth.depth)
+            below = np.interp(gnss.valid_s[both], depth.time_s, depth.true_depth)
             lower = depth.lever_arm_b[2] - gnss.lever_arm_b[2]  # of a level vehicle
             surface = float(np.median(gnss.height[both] + below - lower))
             return surface, (
@@ -294,17 +332,6 @@ def _surface(depth: DepthLog, gnss: GnssLog | None) -> tuple[float, str]:
     )
 
 
-def _initial(imu: ImuLog, vehicle: Vehicle | None) -> tuple[InitialState | None, list[str]]:
-    if vehicle is None or vehicle.initial is None:
-        return None, []
-    if imu.start_s <= vehicle.initial.time_s <= imu.time_s[-1]:
-        return vehicle.initial, []
-    return None, [
-        f"[initial] of the vehicle file is for {vehicle.initial.time_s:.3f} s, outside the "
-        "recording, and not used."
-    ]
-
-
 def _frame(bag: Path, vehicle: Vehicle | None, gnss: GnssLog | None) -> LocalFrame:
     if vehicle is not None and vehicle.frame is not None:
         return vehicle.frame
@@ -314,3 +341,100 @@ def _frame(bag: Path, vehicle: Vehicle | None, gnss: GnssLog | None) -> LocalFra
         f"{bag}: nothing says where on Earth the recording was made: it holds no usable NavSatFix; "
         "give  --vehicle FILE  with [origin]"
     )
+
+
+@dataclass(slots=True)
+class BagTopic:
+    """What one topic held: the rows of its messages, and what went wrong."""
+
+    role: str
+    name: str = ""
+    type_name: str = ""
+    rows: array[float] = field(default_factory=lambda: array("d"))
+    """IMU: time, gyro, accelerometer; DVL: time, speeds, sigmas, ranges, velocity and covariance, 1
+    off the water; depth: time, depth, sigma; GNSS: time, latitude, longitude, height, sigmas. SI
+    units, FRD, NaN if unknown."""
+    n_messages: int = 0
+    refused: list[str] = field(default_factory=list)
+    beams_d: Array | None = None
+    """(B, 3) directions of the beams as the messages state them."""
+    n_unstated: int = 0
+    """Fixes that do not say how good they are."""
+
+
+def _width(role: str, n_beams: int) -> int:
+    """Return how many numbers a row has."""
+    return {"imu": 7, "dvl": 1 + 3 * n_beams + 13, "depth": 3, "gnss": 7}[role]
+
+
+def _read_topics(bag: Path, topics: Mapping[str, str], options: RosOptions) -> dict[str, BagTopic]:
+    """Return by role what the recording holds; raises as `convert_rosbag`."""
+    read = {role: BagTopic(role) for role in REQUIRED_ROLES}
+    for item in read_rosbag(bag, topics):
+        topic = read.setdefault(item.role, BagTopic(item.role))
+        topic.name, topic.type_name = item.topic, item.type_name
+        topic.n_messages += 1
+        try:
+            topic.rows.extend(_row(item, topic, options))
+        except DataError as error:
+            topic.refused.append(str(error))
+    for role in REQUIRED_ROLES:
+        topic = read[role]
+        if len(topic.rows) < 2 * _width(role, options.n_beams):
+            raise DataError(
+                f"{bag}: expected at least two messages for the {role}, got {topic.n_messages}"
+                + (f", {len(topic.refused)} refused: {topic.refused[0]}" if topic.refused else "")
+            )
+    return read
+
+
+def _row(item: BagMessage, topic: BagTopic, options: RosOptions) -> Sequence[float]:
+    """Return the numbers of one message, time first."""
+    if item.role == "imu":
+        sample = imu_sample(item.message, item.received_s, options)
+        return (sample.time_s, *sample.gyro_b, *sample.accel_b)
+    if item.role == "dvl":
+        report = dvl_report(item.message, item.received_s, options)
+        if topic.beams_d is None and report.beams_d is not None:
+            topic.beams_d = stated_beams(np.array(report.beams_d))
+        sigma = report.ping.sigma or (np.nan,) * options.n_beams
+        beams = (*report.ping.speed, *sigma, *report.range_m)
+        velocity = (*report.velocity_d, *report.covariance_d)
+        return (report.ping.time_s, *beams, *velocity, float(report.ping.is_water))
+    if item.role == "depth":
+        reading = depth_reading(item.message, item.received_s, options)
+        return (reading.time_s, reading.depth, depth_sigma(item.message, options))
+    position = fix(item.message, item.received_s, options)
+    topic.n_unstated += not has_stated_sigma(item.message)
+    return (position.time_s, position.lat, position.lon, position.height, *position.sigma_enu)
+
+
+def _part_tracks(table: Array) -> list[str]:
+    """Put pings off the water apart from those off the ground, where both have one time."""
+    is_water = table[:, -1] > 0.0
+    together = is_water & np.isin(table[:, 0], table[~is_water, 0])
+    table[together, 0] += WATER_LATER_S
+    n_together = int(together.sum())
+    return [f"{n_together} off the water put 1 ms behind those off the ground"] * (n_together > 0)
+
+
+def _in_order(topic: BagTopic, n_beams: int) -> tuple[Array, list[str]]:
+    """Return the rows with strictly increasing times, and what that took."""
+    table = np.array(topic.rows, dtype=float).reshape(-1, _width(topic.role, n_beams))
+    said = _part_tracks(table) if topic.role == "dvl" else []
+    n_late = int(np.sum(np.diff(table[:, 0], prepend=-np.inf) < 0.0))
+    table = table[np.argsort(table[:, 0], kind="stable")]
+    again = np.diff(table[:, 0], prepend=-np.inf) == 0.0
+    before = np.roll(table, 1, axis=0)
+    alike = np.all((table == before) | (np.isnan(table) & np.isnan(before)), axis=1)
+    n_repeats, n_rivals = int(np.sum(again & alike)), int(np.sum(again & ~alike))
+    if topic.refused:
+        said.append(f"{len(topic.refused)} refused ({topic.refused[0]})")
+    if n_late:
+        said.append(f"{n_late} out of order, sorted by time")
+    if n_repeats:
+        said.append(f"{n_repeats} exact repeats dropped")
+    if n_rivals:
+        said.append(f"{n_rivals} dropped that differ from another of the same time")
+    head = f"{topic.name}: of {topic.n_messages} messages "
+    return table[~again], [f"{head}{'; '.join(said)}."] if said else []

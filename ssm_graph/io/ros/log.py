@@ -27,7 +27,7 @@ from ssm_graph.io.ros.messages import (
     PRESSURE_TYPE,
     WATER_LINKED_TYPE,
 )
-from ssm_graph.sensors.dvl import N_BEAMS
+from ssm_graph.sensors.dvl import MOST_BEAMS
 
 ROLES: Final[Mapping[str, tuple[str, ...]]] = {
     "imu": (IMU_TYPE,),
@@ -234,7 +234,7 @@ def _decoder(bag: Path, connection: Any, raw: bytes) -> Decoder:
             continue
         if _makes_sense(message):
             return decode
-        reasons.append("beams are not numbered 0 to 3")
+        reasons.append("beams are not numbered from 0")
     raise DataError(
         f"{bag}: the messages of topic {connection.topic} fit no known definition of "
         f"{connection.msgtype} ({'; '.join(dict.fromkeys(reasons))}); record it as MCAP, which "
@@ -283,4 +283,4 @@ def _types_from_idl(text: str, types: Any) -> dict[str, Any]:
 def _makes_sense(message: Any) -> bool:
     """Return False for a Water Linked message read by a layout that is not its own."""
     ids = [beam.id for beam in getattr(message, "beams", ())]
-    return len(set(ids)) == len(ids) and set(ids) <= set(range(N_BEAMS))
+    return len(set(ids)) == len(ids) and set(ids) <= set(range(MOST_BEAMS))

@@ -29,13 +29,13 @@ from typing import Any, Final, NamedTuple
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frames import BodyAxes, turned
 from ssm_graph.base.frozen import Vector
-from ssm_graph.io.mission_folder.instruments import radians_wrapped
+from ssm_graph.base.units import wrapped
 from ssm_graph.sensors.depth import DepthReading
-from ssm_graph.sensors.dvl import N_BEAMS, Ping
+from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.gnss import Fix
 from ssm_graph.sensors.imu import ImuSample
-from ssm_graph.sensors.limits import LON_RANGE_DEG
 from ssm_graph.sensors.messages import Message
+from ssm_graph.sensors.place import LATITUDES_DEG, LONGITUDES_DEG
 
 IMU_TYPE: Final = "sensor_msgs/msg/Imu"
 MARINE_DVL_TYPE: Final = "marine_acoustic_msgs/msg/Dvl"
@@ -56,8 +56,6 @@ _NANOSECONDS: Final = 1_000_000_000
 _WATER_TRACK: Final = 2
 """``DVL_MODE_WATER`` of ``marine_acoustic_msgs``."""
 _COVARIANCE_UNKNOWN: Final = 0
-
-Four = tuple[float, float, float, float]
 
 
 class BeamSign(Enum):
@@ -83,6 +81,8 @@ class RosOptions:
     """Height of the water's surface above the ellipsoid, m; None takes 0 or finds it in a bag."""
     fix_sigma_enu: Vector = FIX_SIGMA
     """m, of a fix that does not say how good it is."""
+    n_beams: int = 4
+    """Transducers of the DVL, the first ones of a message that has room for more."""
 
     @property
     def weight_density(self) -> float:
@@ -97,12 +97,14 @@ class DvlReport(NamedTuple):
     """One message of a DVL: the ping, and what else the message says of the beams."""
 
     ping: Ping
-    range_m: Four
-    """m along the beams, NaN where unknown."""
+    range_m: tuple[float, ...]
+    """(B,) m along the beams, NaN where unknown."""
     beams_d: tuple[Vector, ...] | None
     """Beam directions as the message states them; None where it does not."""
     velocity_d: Vector
     """The velocity that the instrument made of its beams, m/s, NaN where there is none."""
+    covariance_d: tuple[float, ...]
+    """(9,) of that velocity, m^2/s^2, row by row; NaN where it states none."""
 
 
 def stamp_s(message: Any, received_s: float) -> float:
@@ -182,13 +184,13 @@ def fix(message: Any, received_s: float, options: RosOptions = DEFAULTS) -> Fix:
     if int(message.status.status) < 0:
         raise DataError("NavSatFix: the receiver says that it has no fix")
     lat, lon = _finite(message, "latitude"), _finite(message, "longitude")
-    is_on_earth = abs(lat) <= 90.0 and LON_RANGE_DEG[0] <= lon <= LON_RANGE_DEG[1]
+    is_on_earth = abs(lat) <= LATITUDES_DEG[1] and LONGITUDES_DEG[0] <= lon <= LONGITUDES_DEG[1]
     if not is_on_earth or lat == lon == 0.0:
         raise DataError(f"NavSatFix: expected degrees of a place on Earth, got {lat:g}, {lon:g}")
     return Fix(
         time_s=stamp_s(message, received_s),
         lat=math.radians(lat),
-        lon=float(radians_wrapped(lon)),
+        lon=float(wrapped(math.radians(lon))),
         height=_finite(message, "altitude"),
         sigma_enu=_fix_sigma(message, options.fix_sigma_enu),
     )
@@ -211,22 +213,28 @@ CONVERTERS: Final[Mapping[str, Callable[..., Message]]] = {
 
 
 def _marine(message: Any, time_s: float, options: RosOptions) -> DvlReport:
-    sign = 1.0 if options.beam_sign is BeamSign.ALONG else -1.0
-    sigma = _four(_sigma(value) for value in message.beam_velocity_covar)
-    ranges = [float(value) for value in message.range]
+    sign, n_beams = 1.0 if options.beam_sign is BeamSign.ALONG else -1.0, options.n_beams
+    if n_beams > len(message.beam_velocity):
+        raise DataError(f"Dvl: expected {n_beams} beams, got room for {len(message.beam_velocity)}")
+    sigma = tuple(_sigma(value) for value in message.beam_velocity_covar)[:n_beams]
+    good = _good_beams(message)
+    speed = tuple(
+        sign * float(value) if is_good else math.nan
+        for value, is_good in zip(message.beam_velocity, good, strict=True)
+    )
     return DvlReport(
         ping=Ping(
             time_s=time_s,
-            speed=_four(
-                sign * float(speed) if good else math.nan
-                for speed, good in zip(message.beam_velocity, _good_beams(message), strict=True)
-            ),
+            speed=speed[:n_beams],
             sigma=None if all(math.isnan(value) for value in sigma) else sigma,
             is_water=int(message.velocity_mode) == _WATER_TRACK,
         ),
-        range_m=_four(_range(value) if message.beam_ranges_valid else math.nan for value in ranges),
-        beams_d=tuple(_vector(beam) for beam in message.beam_unit_vec),
+        range_m=tuple(
+            _range(value) if message.beam_ranges_valid else math.nan for value in message.range
+        )[:n_beams],
+        beams_d=tuple(_vector(beam) for beam in message.beam_unit_vec)[:n_beams],
         velocity_d=_vector(message.velocity),
+        covariance_d=_covariance(getattr(message, "velocity_covar", ())),
     )
 
 
@@ -237,7 +245,7 @@ def _good_beams(message: Any) -> list[bool]:
     ``num_good_beams`` are left, nobody can say which are good, and none is used.
     """
     if not message.beam_velocities_valid:
-        return [False] * N_BEAMS
+        return [False] * len(message.beam_velocity)
     nearest = math.ulp(0.0) if message.beam_ranges_valid else 0.0
     speeds = [float(speed) for speed in message.beam_velocity]
     good = [
@@ -247,25 +255,27 @@ def _good_beams(message: Any) -> list[bool]:
     count = int(message.num_good_beams)
     if sum(good) > count:
         good = [one and speed != 0.0 for one, speed in zip(good, speeds, strict=True)]
-    return good if sum(good) <= count else [False] * N_BEAMS
+    return good if sum(good) <= count else [False] * len(good)
 
 
-def _water_linked(message: Any, time_s: float, _: RosOptions) -> DvlReport:
-    speed, ranges = [math.nan] * N_BEAMS, [math.nan] * N_BEAMS
+def _water_linked(message: Any, time_s: float, options: RosOptions) -> DvlReport:
+    n_beams = options.n_beams
+    speed, ranges = [math.nan] * n_beams, [math.nan] * n_beams
     ids = [int(beam.id) for beam in message.beams]
-    if len(set(ids)) != len(ids) or not set(ids) <= set(range(N_BEAMS)):
-        raise DataError(f"DVL: expected beams with ids 0 to {N_BEAMS - 1}, got {ids}")
+    if len(set(ids)) != len(ids) or not set(ids) <= set(range(n_beams)):
+        raise DataError(f"DVL: expected beams with ids 0 to {n_beams - 1}, got {ids}")
     for beam in message.beams if message.velocity_valid else ():
         if beam.valid and math.isfinite(beam.velocity):
             speed[int(beam.id)] = float(beam.velocity)
             ranges[int(beam.id)] = _range(beam.distance)
     return DvlReport(
-        ping=Ping(time_s, _four(speed)),
-        range_m=_four(ranges),
+        ping=Ping(time_s, tuple(speed)),
+        range_m=tuple(ranges),
         beams_d=None,
         velocity_d=_vector(message.velocity)
         if message.velocity_valid
         else (math.nan, math.nan, math.nan),
+        covariance_d=_covariance(getattr(message, "covariance", ())),
     )
 
 
@@ -309,6 +319,8 @@ def _vector(value: Any) -> Vector:
     return (float(value.x), float(value.y), float(value.z))
 
 
-def _four(values: Iterable[float]) -> Four:
-    one, two, three, four = values
-    return (one, two, three, four)
+def _covariance(values: Iterable[Any]) -> tuple[float, ...]:
+    """Return nine numbers; NaN where there are others, or a variance is not above zero."""
+    found = tuple(float(value) for value in values)
+    is_stated = len(found) == 9 and all(found[i] > 0.0 for i in (0, 4, 8))
+    return found if is_stated else (math.nan,) * 9

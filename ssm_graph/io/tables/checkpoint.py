@@ -27,7 +27,7 @@ from ssm_graph.io.tables.append_file import sync_folder
 JSON = None | bool | int | float | str | list["JSON"] | dict[str, "JSON"]
 
 CHECKPOINT_NAME: Final = "checkpoint.npz"
-VERSION: Final = 2
+VERSION: Final = 3
 _COMMENT: Final = "ssm-graph checkpoint {version:08d} sha256 {digest:0>64}"
 _COMMENT_LENGTH: Final = len(_COMMENT.format(version=VERSION, digest=""))
 _COMMENT_PATTERN: Final = re.compile(rb"ssm-graph checkpoint (\d{8}) sha256 ([0-9a-f]{64})")

@@ -25,20 +25,20 @@ def not_calibrated(vehicle: Vehicle) -> tuple[str, ...]:
 
 def sensors_of_vehicle(vehicle: Vehicle, frame: LocalFrame) -> Sensors:
     """Return what is the same at all keyframes."""
-    sigma = vehicle.depth_sigma
+    depth = vehicle.depth
     return Sensors(
         frame,
         vehicle.mount.lever_arm_b,
-        vehicle.depth_lever_arm_b,
-        vehicle.gnss_lever_arm_b,
-        np.inf if sigma is None else sigma,
+        np.zeros(3) if depth is None else depth.lever_arm_b,
+        vehicle.gnss.lever_arm_b,
+        np.inf if depth is None else depth.sigma,
         vehicle.mount.R_bd,
         extras_of_vehicle(vehicle),
     )
 
 
 def _asked(vehicle: Vehicle) -> Extras:
-    depth = None if vehicle.depth_sigma is None else vehicle.depth_calibration
+    depth = None if vehicle.depth is None else vehicle.depth.calibration
     of_water = () if vehicle.current is None else current_extras(vehicle.current)
-    of_instruments = calibration_extras(vehicle.mount, depth, vehicle.gnss_calibration)
+    of_instruments = calibration_extras(vehicle.mount, depth, vehicle.gnss.calibration)
     return Extras((*of_instruments, *of_water))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -12,68 +12,79 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.live.estimator.rows import TimedRows
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.vehicle import Vehicle
-from ssm_graph.sensors.depth import DepthLog, DepthReading
-from ssm_graph.sensors.dvl import N_BEAMS, STUCK_PINGS, DvlLog, Ping, counted_sigma, stuck_beams
-from ssm_graph.sensors.gnss import Fix, GnssLog
-from ssm_graph.sensors.imu import ImuLog, ImuSample
+from ssm_graph.sensors.depth import DEPTH, DepthLog
+from ssm_graph.sensors.dvl import Ping, counted_sigma
+from ssm_graph.sensors.dvl_instrument import DVL
+from ssm_graph.sensors.dvl_readings import STUCK_PINGS, stuck_beams
+from ssm_graph.sensors.gnss import GNSS, GnssLog
+from ssm_graph.sensors.imu import IMU, ImuLog, ImuSample
 from ssm_graph.sensors.messages import Message
+from ssm_graph.sensors.registry import BY_LOG, BY_MESSAGE
 
-SPEEDS: Final = slice(1, 1 + N_BEAMS)
-SIGMAS: Final = slice(1 + N_BEAMS, 1 + 2 * N_BEAMS)
-OFF_WATER: Final = 1 + 2 * N_BEAMS
-"""Columns of a ping's row, its time first."""
+OFF_WATER: Final = -1
+"""Column of a ping's row that is 1 off the water."""
 PERIOD_EVERY: Final = 100
 DEFAULT_PERIOD_S: Final = 0.01
 """Sampling interval of the inertial data before there are two samples."""
 
 
 class Buffers:
-    """Received rows in order of time; pings at the time they were taken."""
+    """Received rows of every instrument of a vehicle, in order of the time they were true.
+
+    A row is that time, and the numbers of the message as the instrument said them.
+    """
 
     def __init__(self, vehicle: Vehicle) -> None:
         self.vehicle = vehicle
-        self.imu = TimedRows(6)
-        self.pings = TimedRows(2 * N_BEAMS + 1)
-        self.depths = TimedRows(1)
-        self.fixes = TimedRows(6)
+        self._bare = {BY_LOG[kind].section: log for kind, log in vehicle.bare_logs.items()}
+        self.rows = {
+            one.section: TimedRows(one.width(self._bare[one.section]), n_key=len(one.row_key))
+            for one in map(BY_LOG.__getitem__, vehicle.bare_logs)
+            if one.message is not None
+        }
+        """By the section of the instrument."""
+        self.imu, self.pings, self.fixes = (self.rows[one.section] for one in (IMU, DVL, GNSS))
+        n_beams = vehicle.mount.n_beams
+        self.speeds, self.sigmas = slice(1, 1 + n_beams), slice(1 + n_beams, 1 + 2 * n_beams)
+        """Columns of a ping's row."""
         self._period_s, self._n_imu = DEFAULT_PERIOD_S, 0
         self.shortest_period_s = np.inf
         """Sampling interval of the inertial data when most of them came, s"""
 
+    def bare(self, message: Message) -> Any | None:
+        """Return what is known of a message's instrument; None where the vehicle has none."""
+        return self._bare.get(BY_MESSAGE[type(message)].section)
+
     def time_of(self, message: Message) -> float:
         """Return when a message's content was true, s."""
-        match message:
-            case Ping():
-                return message.time_s - self.vehicle.mount.time_offset_s
-            case Fix():
-                return message.time_s - self.vehicle.gnss_calibration.time_offset_s
-        return message.time_s
+        return BY_MESSAGE[type(message)].valid_s(message, self.bare(message))
 
     def add(self, message: Message) -> bool:
         """Take a message; return False if one of its time is known."""
-        row = [self.time_of(message)]
-        match message:
-            case ImuSample():
-                self._n_imu += 1
-                return self.imu.add(np.array([*row, *message.gyro_b, *message.accel_b]))
-            case Ping():
-                sigma = counted_sigma(
-                    message.sigma or (np.nan,) * N_BEAMS,
-                    message.is_water,
-                    ground_sigma=self.vehicle.beam_sigma,
-                    water_sigma=self.vehicle.water_sigma,
-                )
-                columns = (*row, *message.speed, *sigma, float(message.is_water))
-                return self.pings.add(np.array(columns))
-            case DepthReading():
-                depth = message.depth - self.vehicle.depth_calibration.offset
-                return self.depths.add(np.array([*row, depth]))
-            case Fix():
-                place = message.lat, message.lon, message.height
-                return self.fixes.add(np.array([*row, *place, *message.sigma_enu]))
+        one = BY_MESSAGE[type(message)]
+        row = np.array(one.numbers(message))
+        row[0] = self.time_of(message)
+        if isinstance(message, ImuSample):
+            self._n_imu += 1
+        elif isinstance(message, Ping):
+            row[self.sigmas] = counted_sigma(
+                row[self.sigmas],
+                message.is_water,
+                ground_sigma=self.vehicle.beam_sigma,
+                water_sigma=self.vehicle.water_sigma,
+            )
+        return self.rows[one.section].add(row)
+
+    def depths_between(self, begin_s: float, end_s: float) -> Array:
+        """Return the depths (D, 2) after ``begin_s`` up to and with ``end_s``: time, true depth."""
+        if DEPTH.section not in self.rows:
+            return np.zeros((0, 2))
+        rows = self.rows[DEPTH.section].between(begin_s, end_s)
+        log: DepthLog = DEPTH.log_of(rows, self._bare[DEPTH.section])
+        return np.column_stack([log.time_s, log.true_depth])
 
     def pings_between(self, begin_s: float, end_s: float) -> Array:
-        """Return the pings (P, 10) after ``begin_s`` up to and with ``end_s``, as they count.
+        """Return the pings (P, 2 B + 2) after ``begin_s`` up to and with ``end_s``, as they count.
 
         Speeds of stuck beams and those of infinite sigma are kept but not used.
         """
@@ -81,18 +92,19 @@ class Buffers:
         begin, end = (rows.index(t, after=True) for t in (begin_s, end_s))
         first = max(begin - STUCK_PINGS, 0)
         near = rows.all[first : end + STUCK_PINGS]
-        is_stuck = stuck_beams(near[:, 1 : 1 + N_BEAMS])
+        is_stuck = stuck_beams(near[:, self.speeds])
         here = slice(begin - first, end - first)
         counting = near[here].copy()
-        speed, sigma = counting[:, SPEEDS], counting[:, SIGMAS]
+        speed, sigma = counting[:, self.speeds], counting[:, self.sigmas]
         unused = np.isinf(sigma) | is_stuck[here]
         speed[unused], sigma[unused] = np.nan, self.vehicle.beam_sigma
         return counting
 
     def drop_before(self, time_s: float) -> None:
         """Forget what is older than a time, but for the pings that tell whether a beam is stuck."""
-        for rows in (self.imu, self.depths, self.fixes):
-            rows.drop_before(time_s)
+        for section, rows in self.rows.items():
+            if section != DVL.section:
+                rows.drop_before(time_s)
         first = max(self.pings.index(time_s) - STUCK_PINGS, 0)
         self.pings.drop_before(self.pings.all[first, 0] if first else -np.inf)
 
@@ -114,50 +126,22 @@ class Buffers:
         last = rows.index(end_s) + 1 + margin
         found = rows.all[first:last]
         start_s = rows.all[first - 1, 0] if first else found[0, 0] - self.period_s
-        return ImuLog(
-            float(start_s), self.vehicle.imu_noise, found[:, 0], found[:, 1:4], found[:, 4:]
-        )
+        log: ImuLog = IMU.log_of(found, self._bare[IMU.section])
+        return replace(log, start_s=float(start_s))
 
     def mission(self, frame: LocalFrame) -> Mission:
-        """Return everything as a mission, to align with.
-
-        What is known to be off in stamps, fixes and depths has been taken off.
-        """
+        """Return everything as a mission, to align with."""
         vehicle = self.vehicle
-        pings = self.pings_between(-np.inf, np.inf)
-        depths, fixes = self.depths.all, self.fixes.all
-        end_s = self.imu.last_s
-        stamps = pings[:, 0] + vehicle.mount.time_offset_s
-        depth = None
-        if vehicle.depth_sigma is not None and len(depths):
-            depth = DepthLog(
-                vehicle.depth_sigma,
-                depths[:, 0],
-                depths[:, 1],
-                vehicle.depth_lever_arm_b,
-                replace(vehicle.depth_calibration, offset=0.0),
-            )
+        depths = self.rows.get(DEPTH.section, ())
+        dvl = DVL.log_of(self.pings_between(-np.inf, np.inf), self._bare[DVL.section])
+        gnss: GnssLog = GNSS.log_of(self.fixes.all, vehicle.gnss)
         return Mission(
             vehicle.name,
             frame,
-            self.imu_log(-np.inf, end_s, margin=0),
-            DvlLog(
-                vehicle.mount,
-                stamps,
-                pings[:, SPEEDS],
-                pings[:, SIGMAS],
-                water_track=pings[:, OFF_WATER],
-            ),
-            depth,
-            GnssLog(
-                time_s=fixes[:, 0],
-                lat=fixes[:, 1],
-                lon=fixes[:, 2],
-                height=fixes[:, 3],
-                sigma_enu=fixes[:, 4:],
-                lever_arm_b=vehicle.gnss_lever_arm_b,
-                calibration=replace(vehicle.gnss_calibration, time_offset_s=0.0),
-            ),
+            self.imu_log(-np.inf, self.imu.last_s, margin=0),
+            dvl,
+            DEPTH.log_of(depths.all, vehicle.depth) if depths else None,
+            gnss,
             current=vehicle.current,
         )
 
@@ -167,8 +151,8 @@ class Measured(NamedTuple):
 
     time_s: float
     pings: Array
-    """(P, 10) time, speeds, sigmas, 1 for off the water"""
+    """(P, 2 B + 2) time, speeds, sigmas, 1 for off the water"""
     fixes: Array
     """(F, 7) time, latitude, longitude, height, sigmas"""
     depths: Array
-    """(D, 2) time, depth"""
+    """(D, 2) time, depth without the known offset"""

@@ -16,7 +16,7 @@ import numpy as np
 from ssm_graph.base.errors import SolverError
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import VELOCITY
-from ssm_graph.live.estimator.buffers import SIGMAS, SPEEDS, Buffers, Measured
+from ssm_graph.live.estimator.buffers import Buffers, Measured
 from ssm_graph.live.estimator.keyframes import KeyframeMaker
 from ssm_graph.live.estimator.recovery import Doubt, Doubted, doubt_of, reanchored, watch_after
 from ssm_graph.live.estimator.reserve import Reserve
@@ -190,10 +190,10 @@ class Course:
     def _agree(self, measured: Measured) -> bool:
         """Return whether all four beams of the ping are there and agree with each other."""
         pings = measured.pings
-        if len(pings) == 0 or not np.all(np.isfinite(pings[-1, SPEEDS])):
+        if len(pings) == 0 or not np.all(np.isfinite(pings[-1, self._buffers.speeds])):
             return False
-        sigma = float(np.sqrt(np.sum((self._null * pings[-1, SIGMAS]) ** 2)))
-        return bool(abs(pings[-1, SPEEDS] @ self._null) < 5.0 * sigma)
+        sigma = float(np.sqrt(np.sum((self._null * pings[-1, self._buffers.sigmas]) ** 2)))
+        return bool(abs(pings[-1, self._buffers.speeds] @ self._null) < 5.0 * sigma)
 
     def _tell(self, before: Watch, after: Watch, keyframe: Keyframe) -> None:
         if after.trouble_s == keyframe.time_s and after.trouble != before.trouble:

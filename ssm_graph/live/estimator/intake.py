@@ -15,17 +15,14 @@ from ssm_graph.live.estimator.buffers import Buffers
 from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.navigation import Severity
 from ssm_graph.mission.vehicle import Vehicle
-from ssm_graph.sensors.depth import DepthReading
-from ssm_graph.sensors.dvl import N_BEAMS, STUCK_PINGS, Ping, stuck_beams
-from ssm_graph.sensors.gnss import Fix
+from ssm_graph.sensors.dvl import Ping
+from ssm_graph.sensors.dvl_readings import STUCK_PINGS, stuck_beams
 from ssm_graph.sensors.imu import ImuSample
-from ssm_graph.sensors.limits import DEEPEST_M, HIGHEST_M, LARGEST_SPEED, LON_RANGE_DEG
 from ssm_graph.sensors.messages import Message, bad_number
+from ssm_graph.sensors.registry import BY_MESSAGE
 
-LARGEST_RATE: Final = 35.0
-"""rad/s"""
-LARGEST_FORCE: Final = 200.0
-"""m/s^2"""
+AIDED_BY: Final = frozenset({"imu", "dvl", "depth", "gnss"})
+"""Sections of the instruments whose messages change the answer; the others are kept beside."""
 AHEAD_S: Final = 5.0
 """Messages further ahead of the inertial data than this belong to another clock."""
 NEXT_S: Final = 2.5
@@ -71,9 +68,8 @@ class Intake:
                 message, now_s, "clock", f"{ahead_s:.1f} s ahead of the inertial data: wrong clock?"
             )
             return None
-        if isinstance(message, Ping):
-            message = self._checked_ping(message, now_s)
-        if not self._add(message):
+        message = self._sifted(message, time_s, now_s)
+        if not self._add(message) or _name(message) not in AIDED_BY:
             return None
         return self._since_stuck(message, time_s) if isinstance(message, Ping) else time_s
 
@@ -85,7 +81,7 @@ class Intake:
         rows = self.buffers.pings.all
         at = self.buffers.pings.index(time_s)
         first = max(at - STUCK_PINGS, 0)
-        near = rows[first : at + STUCK_PINGS, 1 : 1 + N_BEAMS]
+        near = rows[first : at + STUCK_PINGS, self.buffers.speeds]
         known = np.delete(near, at - first, axis=0)
         was = np.insert(stuck_beams(known), at - first, False, axis=0)
         now = stuck_beams(near)
@@ -103,52 +99,24 @@ class Intake:
         name = bad_number(message)
         if name is not None:
             return "not_finite", f"{name} is not a finite number"
-        match message:
-            case ImuSample():
-                if max(map(abs, message.gyro_b)) > LARGEST_RATE:
-                    return "implausible", f"body rate {message.gyro_b} rad/s: degrees?"
-                if max(map(abs, message.accel_b)) > LARGEST_FORCE:
-                    return "implausible", f"specific force {message.accel_b} m/s^2: a wrong unit?"
-            case Ping():
-                if message.is_water and self.buffers.vehicle.current is None:
-                    return "water_track", "off the water, and the vehicle file has no [current]"
-            case DepthReading():
-                if not -HIGHEST_M <= message.depth <= DEEPEST_M:
-                    return "implausible", f"depth {message.depth:g} m: a wrong unit?"
-            case Fix():
-                west, east = np.radians(LON_RANGE_DEG)
-                if abs(message.lat) > np.pi / 2 or not west <= message.lon <= east:
-                    return "implausible", "latitude or longitude out of range: degrees?"
-                if min(message.sigma_enu) <= 0.0:
-                    return "implausible", f"sigmas {message.sigma_enu} m, expected above zero"
-        return None
+        one, bare = BY_MESSAGE[type(message)], self.buffers.bare(message)
+        if bare is None:
+            return "undeclared", f"the vehicle file has no [{one.section}]"
+        if isinstance(message, Ping) and message.is_water and self.buffers.vehicle.current is None:
+            return "water_track", "off the water, and the vehicle file has no [current]"
+        text = one.problem(message, bare)
+        return None if text is None else ("implausible", text)
 
-    def _checked_ping(self, ping: Ping, now_s: float) -> Ping:
-        """Return the ping without beams that no beam can have measured."""
-        speeds = ping.speed
-        valid = [v for v in speeds if not np.isnan(v)]
-        if len(valid) == N_BEAMS and len(set(valid)) == 1:
-            self._refuse(ping, now_s, "identical_beams", f"four beams of {valid[0]:g} m/s each")
-            valid = []
-        elif valid and self._is_frozen(ping):
-            self._refuse(ping, now_s, "repeated_speeds", f"the speeds {speeds} m/s once more")
-            # Kept without counting: the next copy has to be known as one.
-            return replace(ping, sigma=(np.inf, np.inf, np.inf, np.inf))
-        if not valid:
-            return replace(ping, speed=(np.nan, np.nan, np.nan, np.nan))
-        if max(map(abs, valid)) > LARGEST_SPEED:
-            self._refuse(ping, now_s, "implausible", f"beam speeds {speeds} m/s: a wrong unit?")
-            kept = [v if abs(v) <= LARGEST_SPEED else np.nan for v in speeds]
-            return replace(ping, speed=(kept[0], kept[1], kept[2], kept[3]))
-        return ping
-
-    def _is_frozen(self, ping: Ping) -> bool:
-        """Return whether the ping before or after, at another time, has the very same speeds."""
-        rows, time_s = self.buffers.pings, self.buffers.time_of(ping)
+    def _sifted(self, message: Message, time_s: float, now_s: float) -> Message:
+        """Return a message without what its instrument cannot have measured, told and counted."""
+        rows = self.buffers.rows[_name(message)]
         at = rows.index(time_s)
         near = rows.all[max(at - 1, 0) : at + 2]
-        others = near[near[:, 0] != time_s, 1 : 1 + N_BEAMS]
-        return any(np.array_equal(other, ping.speed, equal_nan=True) for other in others)
+        one, bare = BY_MESSAGE[type(message)], self.buffers.bare(message)
+        sifted, fault = one.sifted(message, near[near[:, 0] != time_s], bare)
+        if fault is not None:
+            self._refuse(message, now_s, *fault)
+        return sifted
 
     def _accept_sample(self, sample: ImuSample, now_s: float) -> float | None:
         """Take an inertial sample where one may be: next, after a gap, or in one."""
@@ -220,4 +188,4 @@ class Intake:
 
 
 def _name(message: Message) -> str:
-    return {ImuSample: "imu", Ping: "dvl", DepthReading: "depth", Fix: "gnss"}[type(message)]
+    return BY_MESSAGE[type(message)].section

@@ -12,7 +12,7 @@ import numpy as np
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
 from ssm_graph.imu.preintegration import LIVELY_S, imu_gaps, preintegrate
-from ssm_graph.live.estimator.buffers import OFF_WATER, SIGMAS, SPEEDS, Buffers, Measured
+from ssm_graph.live.estimator.buffers import OFF_WATER, Buffers, Measured
 from ssm_graph.mission.aids import fix_covariance_n
 from ssm_graph.mission.ping_motion import PING_WINDOW_S, mean_gyro
 from ssm_graph.mission.problem import ProblemConfig
@@ -29,7 +29,7 @@ class KeyframeMaker:
         self._buffers, self._frame, self._config = buffers, frame, config
         vehicle = buffers.vehicle
         self._white_beams = _white_share(vehicle.mount.drift)
-        self._white_fixes = _white_share(vehicle.gnss_calibration.drift)
+        self._white_fixes = _white_share(vehicle.gnss.calibration.drift)
         self.not_before_s = -np.inf
         """Where the inertial data have to be before asking again is worth while."""
 
@@ -48,7 +48,7 @@ class KeyframeMaker:
             at_s,
             self._usable_pings(begin_s, end_s),
             buffers.fixes.between(begin_s, end_s),
-            buffers.depths.between(last_s, at_s),
+            buffers.depths_between(last_s, at_s),
         )
 
     def _next_time(self, last_s: float) -> float:
@@ -61,7 +61,7 @@ class KeyframeMaker:
 
     def _usable_pings(self, begin_s: float, end_s: float) -> Array:
         pings = self._buffers.pings_between(begin_s, end_s)
-        return pings[np.isfinite(pings[:, SPEEDS]).any(axis=1)]
+        return pings[np.isfinite(pings[:, self._buffers.speeds]).any(axis=1)]
 
     def _covers(self, time_s: float) -> bool:
         """Return whether the inertial data reach far enough beyond a time."""
@@ -75,14 +75,13 @@ class KeyframeMaker:
         imu = self._imu(begin_s, at_s)
         way = None if last_s is None else self._integrate(imu, last_s, at_s)
         gyro_b = mean_gyro(imu, np.array([at_s]))[0]
-        depths, has_depth = measured.depths, self._buffers.vehicle.depth_sigma is not None
         fix_n, fix_cov_n = self._fixes(measured.fixes)
         return Keyframe(
             time_s=at_s,
             gyro_b=gyro_b,
             beams=self._beams(measured.pings, gyro_b),
-            depth_s=depths[:, 0] if has_depth else np.zeros(0),
-            depth=depths[:, 1] if has_depth else np.zeros(0),
+            depth_s=measured.depths[:, 0],
+            depth=measured.depths[:, 1],
             fix_n=fix_n,
             fix_cov_n=fix_cov_n,
             way=way,
@@ -113,12 +112,13 @@ class KeyframeMaker:
         return Way(chain.measurements[0], chain.params[0])
 
     def _beams(self, pings: Array, gyro_b: Array) -> BeamSpeeds:
-        row, beam = np.nonzero(np.isfinite(pings[:, SPEEDS]))
+        speed, sigma = pings[:, self._buffers.speeds], pings[:, self._buffers.sigmas]
+        row, beam = np.nonzero(np.isfinite(speed))
         is_water = pings[row, OFF_WATER]
         return BeamSpeeds(
             beam.astype(float),
-            pings[:, SPEEDS][row, beam],
-            pings[:, SIGMAS][row, beam] * np.where(is_water > 0.0, 1.0, self._white_beams),
+            speed[row, beam],
+            sigma[row, beam] * np.where(is_water > 0.0, 1.0, self._white_beams),
             np.broadcast_to(gyro_b, (len(row), 3)),
             self._buffers.vehicle.mount.beams_b[beam],
             is_water,

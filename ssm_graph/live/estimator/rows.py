@@ -12,10 +12,17 @@ _SPARE: Final = 1024
 
 
 class TimedRows:
-    """Rows of numbers sorted by the first one, the time; no time twice."""
+    """Rows of numbers sorted by the first one, the time; no time twice.
 
-    def __init__(self, width: int) -> None:
+    Parameters
+    ----------
+    width : numbers of a row beside its time.
+    n_key : so many numbers behind the time tell rows of one time apart.
+    """
+
+    def __init__(self, width: int, *, n_key: int = 0) -> None:
         self._rows = np.empty((_SPARE, 1 + width))
+        self._key = slice(0, 1 + n_key)
         self._begin = self._end = 0
 
     def __len__(self) -> int:
@@ -38,8 +45,8 @@ class TimedRows:
             self._rows[self._end] = row
             self._end += 1
             return True
-        at = self.index(row[0])
-        if self.all[at, 0] == row[0]:
+        at, same = self.index(row[0]), self.index(row[0], after=True)
+        if np.any(np.all(self.all[at:same, self._key] == row[self._key], axis=1)):
             return False
         self._rows = np.insert(self._rows, self._begin + at, row, axis=0)
         self._end += 1

@@ -151,7 +151,7 @@ class FixedLagSmoother:
         self._begun_s = beginning.time_s
         for note in not_calibrated(self.vehicle):
             self._events.tell(beginning.time_s, Severity.INFO, "not_calibrated", note)
-        for note in not_used(self.vehicle.further_aids):
+        for note in not_used(self.vehicle.aids.sections):
             self._events.tell(beginning.time_s, Severity.INFO, "not_aided", note)
         maker = KeyframeMaker(buffers, beginning.frame, self._problem_config)
         first = Keyframe.unmeasured(beginning.time_s, np.zeros(3), None)

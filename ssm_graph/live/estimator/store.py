@@ -7,7 +7,7 @@ later steps follow from these, and so does the answer to every late message.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -19,19 +19,17 @@ from ssm_graph.live.estimator.reserve import Reserve
 from ssm_graph.live.estimator.watch import Contradicted, Watch
 from ssm_graph.smoothers.stretch import Stretch
 
-TABLES: Final = ("imu", "pings", "depths", "fixes")
-
 
 def pack_buffers(buffers: Buffers) -> dict[str, Array]:
     """Return all rows that were received and kept."""
-    return {f"rows_{name}": getattr(buffers, name).all.copy() for name in TABLES}
+    return {f"rows_{section}": rows.all.copy() for section, rows in buffers.rows.items()}
 
 
 def unpack_buffers(arrays: Mapping[str, Array], buffers: Buffers) -> None:
     """Fill empty buffers."""
-    for name in TABLES:
-        for row in arrays[f"rows_{name}"]:
-            getattr(buffers, name).add(row)
+    for section, rows in buffers.rows.items():
+        for row in arrays[f"rows_{section}"]:
+            rows.add(row)
 
 
 def pack_step(step: Step) -> tuple[dict[str, Array], dict[str, Any]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 from decimal import Context, Decimal
 from typing import Any, Final
 
@@ -12,7 +11,7 @@ import numpy as np
 
 from ssm_graph.base.errors import nearest_hint
 from ssm_graph.base.frames import BodyAxes, turned
-from ssm_graph.base.frozen import Vector
+from ssm_graph.base.units import DEG_PER_H, DEGREE, MICRO_G
 from ssm_graph.live.protocols.decoder import (
     RefusedError,
     flag,
@@ -25,12 +24,10 @@ from ssm_graph.live.protocols.decoder import (
 from ssm_graph.live.protocols.framed_decoder import FramedDecoder
 from ssm_graph.live.protocols.framing import MAX_LENGTH, LineFramer
 from ssm_graph.mission.navigation import Navigation
-from ssm_graph.sensors.depth import DepthReading
-from ssm_graph.sensors.dvl import N_BEAMS, Ping
-from ssm_graph.sensors.gnss import Fix
-from ssm_graph.sensors.imu import ImuSample
-from ssm_graph.sensors.limits import LON_RANGE_DEG
+from ssm_graph.sensors.dvl import MOST_BEAMS
+from ssm_graph.sensors.instrument import Column
 from ssm_graph.sensors.messages import Message
+from ssm_graph.sensors.registry import BY_MESSAGE, BY_SECTION, INSTRUMENTS
 
 PLACE: Final = "json"
 _EXACT = Context(prec=40)
@@ -38,19 +35,16 @@ _PI = Decimal("3.141592653589793238462643383279502884197169")
 _RAD_PER_DEG = _EXACT.divide(_PI, Decimal(180))
 _DIGITS = Context(prec=24)
 """As many digits as bring every angle back bit for bit."""
-_DEG_PER_H = math.radians(1.0) / 3600.0
-_MICRO_G = 9.80665e-6
-_Beams = tuple[float, float, float, float]
-
-
-KEYS: Final[dict[str, tuple[str, ...]]] = {
-    "imu": ("type", "time_s", "gyro_rad_per_s", "accel_m_per_s2"),
-    "dvl": ("type", "time_s", "beam_m_per_s", "sigma_m_per_s", "water_track"),
-    "depth": ("type", "time_s", "depth_m"),
-    "gnss": ("type", "time_s", "lat_deg", "lon_deg", "height_m", "sigma_m"),
+_COLUMNS: Final = {
+    one.section: tuple(column for column in one.columns if column.is_live)
+    for one in INSTRUMENTS
+    if one.message is not None
+}
+KEYS: Final = {
+    kind: ("type", "time_s", *(column.key for column in columns))
+    for kind, columns in _COLUMNS.items()
 }
 """Type of a message to its keys."""
-_OPTIONAL: Final = frozenset({"sigma_m_per_s", "water_track"})
 
 
 class JsonDecoder(FramedDecoder):
@@ -58,7 +52,7 @@ class JsonDecoder(FramedDecoder):
 
     Parameters
     ----------
-    axes : body axes of the inertial vectors as they come.
+    axes : body axes of the vectors as they come.
     max_length : of a line, bytes.
     """
 
@@ -80,15 +74,19 @@ def decode_message(line: str, *, axes: BodyAxes = BodyAxes.FRD) -> Message:
         hint = nearest_hint(kind[:20], KEYS) if isinstance(kind, str) else "it is a text"
         raise RefusedError(f"unknown type {shown(kind)}; {hint}")
     reject_unknown(fields, KEYS[kind])
-    for key in KEYS[kind]:
-        if key not in _OPTIONAL:
-            require(fields, key)
-    if kind == "gnss":  # all digits of the angles count
+    columns = _COLUMNS[kind]
+    for key in ("time_s", *(column.key for column in columns if not column.optional)):
+        require(fields, key)
+    if any(column.unit != 1.0 for column in columns):  # all digits of the angles count
         fields = parse_object(line, parse_float=Decimal)
     try:
-        return _READERS[kind](fields, axes)
+        time_s = number(fields["time_s"], key="time_s")
+        given = {c.told_as: _read(fields, c, axes) for c in columns if c.key in fields}
     except RefusedError as error:
         raise RefusedError(f"{kind}: {error}") from None
+    make = BY_SECTION[kind].message
+    assert make is not None
+    return make(time_s, **given)
 
 
 def encode_message(message: Message, *, axes: BodyAxes = BodyAxes.FRD) -> bytes:
@@ -97,25 +95,22 @@ def encode_message(message: Message, *, axes: BodyAxes = BodyAxes.FRD) -> bytes:
     A missing beam is null; a nominal sigma of a beam too. Numbers are written with all their
     digits, angles with 24.
     """
-    if isinstance(message, ImuSample):
-        gyro, accel = (turned(x, axes) for x in (message.gyro_b, message.accel_b))
-        return _line(type="imu", time_s=message.time_s, gyro_rad_per_s=gyro, accel_m_per_s2=accel)
-    if isinstance(message, Ping):
-        sigma = {} if message.sigma is None else {"sigma_m_per_s": message.sigma}
-        water = {"water_track": True} if message.is_water else {}
-        return _line(
-            type="dvl", time_s=message.time_s, beam_m_per_s=message.speed, **sigma, **water
-        )
-    if isinstance(message, DepthReading):
-        return _line(type="depth", time_s=message.time_s, depth_m=message.depth)
-    return _line(
-        type="gnss",
-        time_s=message.time_s,
-        lat_deg=_degrees(message.lat),
-        lon_deg=_degrees(message.lon),
-        height_m=message.height,
-        sigma_m=message.sigma_enu,
-    )
+    kind = BY_MESSAGE[type(message)].section
+    cells: dict[str, Any] = {"type": kind, "time_s": message.time_s}
+    for column in _COLUMNS[kind]:
+        value = getattr(message, column.told_as)
+        is_silent = value is None or value is False or value != value  # NaN
+        if column.optional and is_silent:
+            continue
+        if column.is_body:
+            value = turned(value, axes)
+        if column.unit != 1.0:
+            exact = _exact(column.unit)
+            parts = value if column.over else (value,)
+            digits = tuple(_DIGITS.divide(Decimal(float(part)), exact) for part in parts)
+            value = digits if column.over else digits[0]
+        cells[column.key] = value
+    return _line(**cells)
 
 
 def navigation_fields(navigation: Navigation) -> dict[str, Any]:
@@ -138,8 +133,8 @@ def navigation_fields(navigation: Navigation) -> dict[str, Any]:
         **_spread("sigma_{}_m", enu, navigation.position_sigma_enu),
         **_spread("sigma_vel_{}_m_per_s", enu, navigation.velocity_sigma_enu),
         **_spread("sigma_{}_deg", rph, np.degrees(navigation.attitude_sigma)),
-        **_spread("gyro_bias_{}_deg_per_h", xyz, navigation.gyro_bias / _DEG_PER_H),
-        **_spread("accel_bias_{}_ug", xyz, navigation.accel_bias / _MICRO_G),
+        **_spread("gyro_bias_{}_deg_per_h", xyz, navigation.gyro_bias / DEG_PER_H),
+        **_spread("accel_bias_{}_ug", xyz, navigation.accel_bias / MICRO_G),
         "beam_weights": navigation.beam_weights.tolist(),
         "health": navigation.health.name,
         "reason": navigation.reason,
@@ -175,75 +170,50 @@ def _line(**fields: str | float | Decimal | tuple[float, ...]) -> bytes:
 def _cell(value: str | float | Decimal | tuple[float, ...]) -> str:
     if isinstance(value, Decimal):
         return str(value)
+    if isinstance(value, tuple) and isinstance(value[0], Decimal):
+        return f"[{', '.join(map(str, value))}]"
     plain = list(map(float, value)) if isinstance(value, tuple) else value
     return json.dumps(_finite(plain), allow_nan=False)
 
 
-def _degrees(angle: float) -> Decimal:
-    return _DIGITS.divide(Decimal(float(angle)), _RAD_PER_DEG)
+def _exact(unit: float) -> Decimal:
+    return _RAD_PER_DEG if unit == DEGREE else Decimal(repr(unit))
 
 
-def _radians(value: Any, *, key: str, range_deg: tuple[float, float]) -> float:
-    """Return an angle in [-pi, pi]."""
-    number(value, key=key, low=range_deg[0], high=range_deg[1])
+def _read(fields: dict[str, Any], column: Column, axes: BodyAxes) -> Any:
+    """Return what a message says of one column, in SI units and axes forward-right-down."""
+    key, value = column.key, fields[column.key]
+    if column.is_flag:
+        return flag(fields, key)
+    if column.is_many:
+        return tuple(
+            math.nan if item is None else _number(item, column)
+            for item in _list(value, (1, MOST_BEAMS), key=key)
+        )
+    if not column.over:
+        return _number(value, column)
+    count = len(column.over)
+    numbers = tuple(_number(item, column) for item in _list(value, (count, count), key=key))
+    return turned((numbers[0], numbers[1], numbers[2]), axes) if column.is_body else numbers
+
+
+def _number(value: Any, column: Column) -> float:
+    """Return a number in SI units; what no such unit or no sigma can be is refused.
+
+    Whether an instrument can mean a number that can be is for the intake to say.
+    """
+    if column.unit == 1.0:
+        return number(value, key=column.key, low=column.low if column.low > 0.0 else -math.inf)
+    number(value, key=column.key, low=column.low, high=column.high)
     exact = Decimal(value) if isinstance(value, int) else value
-    wrapped = _EXACT.subtract(exact, Decimal(360)) if exact > 180 else exact
-    return float(_EXACT.multiply(wrapped, _RAD_PER_DEG))
+    if column.wraps and exact > 180:
+        exact = _EXACT.subtract(exact, Decimal(360))
+    return float(_EXACT.multiply(exact, _exact(column.unit)))
 
 
-def _list(value: Any, count: int, *, key: str) -> list[Any]:
-    if not isinstance(value, list) or len(value) != count:
-        raise RefusedError(f"{key}: expected a list of {count} numbers, got {shown(str(value))}")
+def _list(value: Any, counts: tuple[int, int], *, key: str) -> list[Any]:
+    least, most = counts
+    if not isinstance(value, list) or not least <= len(value) <= most:
+        words = f"{least} to {most}" if least < most else str(most)
+        raise RefusedError(f"{key}: expected a list of {words} numbers, got {shown(str(value))}")
     return value
-
-
-def _vector(fields: dict[str, Any], key: str, *, low: float = -math.inf) -> Vector:
-    x, y, z = (number(item, key=key, low=low) for item in _list(fields[key], 3, key=key))
-    return x, y, z
-
-
-def _beams(fields: dict[str, Any], key: str, *, low: float = -math.inf) -> _Beams:
-    a, b, c, d = (
-        math.nan if item is None else number(item, key=key, low=low)
-        for item in _list(fields[key], N_BEAMS, key=key)
-    )
-    return a, b, c, d
-
-
-def _time(fields: dict[str, Any]) -> float:
-    return number(fields["time_s"], key="time_s")
-
-
-def _imu(fields: dict[str, Any], axes: BodyAxes) -> Message:
-    gyro, accel = _vector(fields, "gyro_rad_per_s"), _vector(fields, "accel_m_per_s2")
-    return ImuSample(_time(fields), turned(gyro, axes), turned(accel, axes))
-
-
-def _dvl(fields: dict[str, Any], _: BodyAxes) -> Message:
-    has_sigma = "sigma_m_per_s" in fields
-    sigma = _beams(fields, "sigma_m_per_s", low=_SMALLEST_SIGMA) if has_sigma else None
-    is_water = "water_track" in fields and flag(fields, "water_track")
-    return Ping(_time(fields), _beams(fields, "beam_m_per_s"), sigma, is_water=is_water)
-
-
-def _depth(fields: dict[str, Any], _: BodyAxes) -> Message:
-    return DepthReading(_time(fields), number(fields["depth_m"], key="depth_m"))
-
-
-def _gnss(fields: dict[str, Any], _: BodyAxes) -> Message:
-    return Fix(
-        _time(fields),
-        lat=_radians(fields["lat_deg"], key="lat_deg", range_deg=(-90.0, 90.0)),
-        lon=_radians(fields["lon_deg"], key="lon_deg", range_deg=LON_RANGE_DEG),
-        height=number(fields["height_m"], key="height_m"),
-        sigma_enu=_vector(fields, "sigma_m", low=_SMALLEST_SIGMA),
-    )
-
-
-_SMALLEST_SIGMA = 1e-9
-_READERS: Final[dict[str, Callable[[dict[str, Any], BodyAxes], Message]]] = {
-    "imu": _imu,
-    "dvl": _dvl,
-    "depth": _depth,
-    "gnss": _gnss,
-}

@@ -23,11 +23,12 @@ from ssm_graph.live.protocols.nmea_fields import (
     split_sentence,
     utc_seconds,
 )
-from ssm_graph.sensors.depth import DepthReading
+from ssm_graph.sensors.depth import DEEPEST_M, DepthReading
 from ssm_graph.sensors.gnss import Fix
-from ssm_graph.sensors.limits import DEEPEST_M, HIGHEST_M
 from ssm_graph.sensors.messages import Message
 
+ABOVE_SURFACE_M: Final = 100.0
+"""m: a pressure sensor in air, and tides"""
 PLACE: Final = "nmea"
 MAX_SENTENCE: Final = 1024
 """Bytes; the standard allows 82, makers write longer ones."""
@@ -152,7 +153,7 @@ class NmeaDecoder(FramedDecoder):
         kind = name if name.startswith("P") else name[-3:]
         if kind in _DEPTHS and DepthSentence[kind] in self._options.depth_sentences:
             below_surface = _DEPTHS[kind](fields, self._options)
-            depth = number(below_surface, key="depth, m", low=-HIGHEST_M, high=DEEPEST_M)
+            depth = number(below_surface, key="depth, m", low=-ABOVE_SURFACE_M, high=DEEPEST_M)
             depth -= self._options.surface_height_m
             return [DepthReading(self._stamper.stamp(None, arrival_s), depth)]
         return []

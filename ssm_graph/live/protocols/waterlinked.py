@@ -44,14 +44,15 @@ from ssm_graph.live.protocols.decoder import (
 )
 from ssm_graph.live.protocols.framed_decoder import FramedDecoder
 from ssm_graph.live.protocols.framing import MAX_LENGTH, ObjectFramer
-from ssm_graph.sensors.dvl import N_BEAMS, Ping
+from ssm_graph.sensors.dvl import Ping
+from ssm_graph.sensors.dvl_readings import LARGEST_SPEED
 from ssm_graph.sensors.messages import Message
 
 PLACE: Final = "water linked"
 IGNORED: Final = frozenset({"position_local", "response"})
 """Types of the protocol that say nothing of the beams."""
-_LARGEST_SPEED = 100.0
-_NONE_VALID = (math.nan, math.nan, math.nan, math.nan)
+_NUMBERS: Final = ([0, 1, 2], [0, 1, 2, 3])
+"""Of the transducers of an instrument."""
 
 
 class BeamRule(Enum):
@@ -65,7 +66,7 @@ class BeamRule(Enum):
 class WaterLinkedDecoder(FramedDecoder):
     """Velocity reports to pings, in any layout: one a line, spread over lines, back to back.
 
-    A report without a beam that counts is a ping of four missing beams. The same report again (by
+    A report without a beam that counts is a ping of missing beams. The same report again (by
     ``time_of_validity``, or by content where there is none) is dropped and counted.
 
     Parameters
@@ -106,7 +107,7 @@ class WaterLinkedDecoder(FramedDecoder):
                 return None
             raise RefusedError(f"expected a report of type 'velocity', got {shown(kind)}")
         beams = _transducers(report)
-        speed = _speeds(beams) if self._counts(report, beams) else _NONE_VALID
+        speed = _speeds(beams) if self._counts(report, beams) else (math.nan,) * len(beams)
         centre_s = _time_of_validity(report)
         if self._is_repeat(report):
             self.n_repeats += 1
@@ -134,23 +135,26 @@ class WaterLinkedDecoder(FramedDecoder):
 
 
 def _transducers(report: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the four transducers in the order of their numbers, checked."""
+    """Return the transducers in the order of their numbers, checked."""
     found = require(report, "transducers")
     if not isinstance(found, list) or not all(isinstance(beam, dict) for beam in found):
-        raise RefusedError(f"transducers: expected a list of 4 objects, got {shown(str(found))}")
+        raise RefusedError(
+            f"transducers: expected a list of 3 or 4 objects, got {shown(str(found))}"
+        )
     numbers = [require(beam, "id") for beam in found]
-    if any(type(n) is not int for n in numbers) or sorted(numbers) != list(range(N_BEAMS)):
-        raise RefusedError(f"transducers: expected the numbers 0 to 3, got {shown(str(numbers))}")
+    if any(type(n) is not int for n in numbers) or sorted(numbers) not in _NUMBERS:
+        raise RefusedError(
+            f"transducers: expected the numbers 0 to 3, or 0 to 2, got {shown(str(numbers))}"
+        )
     beams = sorted(found, key=lambda beam: int(beam["id"]))
     for beam in beams:
-        flag(beam, "beam_valid")
-        number(require(beam, "velocity"), key="velocity", low=-_LARGEST_SPEED, high=_LARGEST_SPEED)
+        largest = LARGEST_SPEED if flag(beam, "beam_valid") else math.inf
+        number(require(beam, "velocity"), key="velocity", low=-largest, high=largest)
     return beams
 
 
-def _speeds(beams: list[dict[str, Any]]) -> tuple[float, float, float, float]:
-    a, b, c, d = (float(x["velocity"]) if x["beam_valid"] else math.nan for x in beams)
-    return a, b, c, d
+def _speeds(beams: list[dict[str, Any]]) -> tuple[float, ...]:
+    return tuple(float(x["velocity"]) if x["beam_valid"] else math.nan for x in beams)
 
 
 def _time_of_validity(report: dict[str, Any]) -> float | None:

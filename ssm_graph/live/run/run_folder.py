@@ -30,6 +30,7 @@ import numpy as np
 
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
+from ssm_graph.io.mission_folder.toml import TOML_NAME
 from ssm_graph.io.mission_folder.vehicle import check_same_vehicle
 from ssm_graph.io.raw_log.log import RawLog, replay
 from ssm_graph.io.results.growing import GrowingResults
@@ -37,7 +38,6 @@ from ssm_graph.io.results.summary import as_json
 from ssm_graph.io.results.tables import BEAMS_NAME, SUMMARY_NAME, TRAJECTORY_NAME
 from ssm_graph.io.tables.append_file import AppendFile
 from ssm_graph.io.tables.checkpoint import CHECKPOINT_NAME, newest_checkpoint, write_checkpoint
-from ssm_graph.io.tables.settings import TOML_NAME
 from ssm_graph.mission.navigation import Event
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.messages import Message

@@ -76,7 +76,7 @@ def _of_pings(mission: Mission) -> BodyVelocities:
     n_needed = 4 if np.mean(valid.all(axis=1)) > 0.5 else 3
     is_good = (valid.sum(axis=1) >= n_needed) & (np.abs(parity) < PARITY_GATE * sigma)
     usable = np.flatnonzero(is_good)
-    time_s = dvl.ping_s[usable]
+    time_s = dvl.valid_s[usable]
     if len(usable) == 0:
         return BodyVelocities(time_s, np.zeros((0, 3)))
     v_b = np.array([np.linalg.lstsq(beams_b[valid[i]], dvl.speed[i, valid[i]])[0] for i in usable])

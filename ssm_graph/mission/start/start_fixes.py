@@ -95,7 +95,7 @@ def _all_fixes(mission: Mission) -> tuple[StartFixes, ...]:
 
 
 def _in_order(mission: Mission, source: str, log: GnssLog | UsblLog) -> StartFixes:
-    time_s = log.time_s if isinstance(log, GnssLog) else log.valid_s
+    time_s = log.valid_s
     order = np.argsort(time_s, kind="stable")
     position_n = mission.frame.p_n_from_geodetic(log.lat, log.lon, log.height)
     return StartFixes(

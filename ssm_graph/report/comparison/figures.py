@@ -16,6 +16,7 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.evaluation import ErrorSeries, evaluate
 from ssm_graph.mission.estimate import Estimate
 from ssm_graph.mission.mission import Reference
+from ssm_graph.report import style
 from ssm_graph.report.beams import (
     CLASSES,
     dots,
@@ -33,21 +34,7 @@ from ssm_graph.report.comparison.runs import (
     draw_grid,
     draw_nees,
 )
-from ssm_graph.report.style import (
-    INK,
-    SMALL,
-    Curve,
-    Look,
-    Panel,
-    add_footnote,
-    dress,
-    line,
-    looks_of,
-    new_figure,
-    save,
-    shown_methods,
-    time_axis,
-)
+from ssm_graph.report.style import Curve, Look, Panel
 
 Example = tuple[str, Estimate, Reference]
 """Name of the method, its estimate, and the truth of the mission."""
@@ -105,7 +92,7 @@ def save_figures(
     except OSError as error:
         raise DataError(f"{folder}: cannot make the folder: {error.strerror or error}") from error
     names = [str(row["method"]) for row in rows] + [method for _, _, method in series]
-    looks = looks_of([*names, *(name for name, _, _ in examples)])
+    looks = style.looks_of([*names, *(name for name, _, _ in examples)])
     figures: Sequence[Figure | None] = (
         draw_errors_over_time(examples, looks),
         draw_beam_weights(examples, looks),
@@ -115,7 +102,7 @@ def save_figures(
         draw_end_error(rows, looks),
     )
     return [
-        save(figure, folder / name)
+        style.save(figure, folder / name)
         for name, figure in zip(NAMES, figures, strict=True)
         if figure is not None
     ]
@@ -126,10 +113,10 @@ def draw_errors_over_time(examples: Sequence[Example], looks: Mapping[str, Look]
     errors = _errors(examples)
     if not errors:
         return None
-    methods, left_out = shown_methods(errors)
+    methods, left_out = style.shown_methods(errors)
     start_s = min(series.time_s[0] for series in errors.values())
     span_s = max(series.time_s[-1] for series in errors.values()) - start_s
-    divisor, label = time_axis(np.array([0.0, span_s]))
+    divisor, label = style.time_axis(np.array([0.0, span_s]))
     n_epochs = max(len(series.time_s) for series in errors.values())
     window_s = _window_s(span_s) if n_epochs > MAX_WINDOWS else 0.0
     panels = {}
@@ -138,7 +125,7 @@ def draw_errors_over_time(examples: Sequence[Example], looks: Mapping[str, Look]
         for method in reversed(methods):
             norm = _norm(errors[method], is_velocity=what == "velocity")
             time_s, values = _windowed(errors[method].time_s, norm, start_s, window_s)
-            curves.append(Curve((time_s - start_s) / divisor, values, line(looks[method])))
+            curves.append(Curve((time_s - start_s) / divisor, values, style.line(looks[method])))
         limits, is_log = _scale([curve.y for curve in curves])
         panels[row, 0] = Panel(
             title=f"Horizontal {what} error",
@@ -215,10 +202,10 @@ def draw_beam_weights(examples: Sequence[Example], looks: Mapping[str, Look]) ->
     beams, n_beams = told[main].beams, n_beams_of(told[main])
     n_rows = (n_beams + 1) // 2
     start_s = float(beams.time_s.min())
-    divisor, label = time_axis(beams.time_s)
+    divisor, label = style.time_axis(beams.time_s)
     span = float(np.ptp(beams.time_s)) / divisor or 1.0
     title = f"Innovations of the beams and their weights, {main}"
-    figure = new_figure(10.0, 3.6 * n_rows + 0.8, title)
+    figure = style.new_figure(10.0, 3.6 * n_rows + 0.8, title)
     grid = figure.add_gridspec(n_rows, 2)
     columns: tuple[list[Axes], list[Axes]] = ([], [])
     for beam in range(n_beams):
@@ -236,8 +223,8 @@ def draw_beam_weights(examples: Sequence[Example], looks: Mapping[str, Look]) ->
         upper.set_xlim(-0.01 * span, 1.01 * span)
         innovation_axis(upper, beams.innovation)
         lower.set_ylim(-0.06, top_of_weights(*(told[method].beams for method in shown)))
-        dress(upper, title=f"Beam {beam + 1}", y="innovation, m/s")
-        dress(lower, x=label if beam >= n_beams - 2 else "", y="weight, –")
+        style.dress(upper, title=f"Beam {beam + 1}", y="innovation, m/s")
+        style.dress(lower, x=label if beam >= n_beams - 2 else "", y="weight, –")
         upper.tick_params(labelbottom=False)
         columns[beam % 2].extend([upper, lower])
     for column in columns:
@@ -247,14 +234,14 @@ def draw_beam_weights(examples: Sequence[Example], looks: Mapping[str, Look]) ->
     figure.legend(
         handles=[Line2D([], [], **dots(c, 5.0, alpha=1.0, label=name)) for c, name in entries],
         loc="outside right center",
-        fontsize=SMALL + 1.0,
+        fontsize=style.SMALL + 1.0,
         frameon=False,
         handlelength=1.2,
         labelspacing=0.8,
-        labelcolor=INK,
+        labelcolor=style.INK,
     )
     note = "Innovation axes are linear over the noise of good beams, logarithmic beyond."
     if PER_PING in shown[:-1]:
         note += f" {PER_PING} has one weight for all beams of a ping."
-    add_footnote(figure, note)
+    style.add_footnote(figure, note)
     return figure

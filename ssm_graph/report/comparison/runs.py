@@ -14,6 +14,7 @@ from matplotlib.patches import Patch
 from ssm_graph.base.frozen import Array
 from ssm_graph.evaluation import chi2_interval, mean_with_interval
 from ssm_graph.evaluation.comparison import has_failed, number
+from ssm_graph.report import style
 from ssm_graph.report.comparison.cells import (
     Row,
     Series,
@@ -26,20 +27,7 @@ from ssm_graph.report.comparison.cells import (
     text,
     values,
 )
-from ssm_graph.report.style import (
-    GREY,
-    Band,
-    Curve,
-    Look,
-    Panel,
-    add_footnote,
-    add_legend,
-    draw_panel,
-    line,
-    new_figure,
-    shown_methods,
-    time_axis,
-)
+from ssm_graph.report.style import Band, Curve, Look, Panel
 
 Looks = Mapping[str, Look]
 Place = tuple[int, int]
@@ -49,7 +37,7 @@ MEAN_NOTE: Final = (
     "Mean of the horizontal rms error over the missions that a method finished, with its 95 % "
     "confidence band (Student's t)."
 )
-BAND: Final = {"color": "#D9D9D9", "zorder": 0.6}
+BAND_COLOR: Final = "#D9D9D9"
 MAX_COLUMNS: Final = 3
 
 
@@ -72,16 +60,17 @@ def draw_grid(
     """
     n_rows, n_columns = (1 + max(place[i] for place in panels) for i in (0, 1))
     width = width or {1: 5.0, 2: 3.7}.get(n_columns, 3.1)
-    figure = new_figure(n_columns * width + 1.7, n_rows * height + 0.8, title)
+    figure = style.new_figure(n_columns * width + 1.7, n_rows * height + 0.8, title)
     grid = figure.subplots(n_rows, n_columns, squeeze=False)
-    for place in np.ndindex(n_rows, n_columns):
-        panel = panels.get((place[0], place[1]))
-        if panel is not None and panel.curves:
-            draw_panel(grid[place], panel)
-        else:
-            figure.delaxes(grid[place])
-    add_legend(figure, methods, looks, has_markers=has_markers, extra=extra)
-    add_footnote(figure, note, left_out)
+    for i, row in enumerate(grid):
+        for j, axes in enumerate(row):
+            panel = panels.get((i, j))
+            if panel is not None and panel.curves:
+                style.draw_panel(axes, panel)
+            else:
+                figure.delaxes(axes)
+    style.add_legend(figure, methods, looks, has_markers=has_markers, extra=extra)
+    style.add_footnote(figure, note, left_out)
     return figure
 
 
@@ -105,7 +94,7 @@ def _draw_sweeps(
     if not sweeps:
         return None
     swept = [row for sweep in sweeps for rows in sweep.points.values() for row in rows]
-    methods, left_out = shown_methods(methods_of(swept))
+    methods, left_out = style.shown_methods(methods_of(swept))
     panels = {
         place: _sweep_panel(sweep, methods, looks, x, factor)
         for sweep, place in zip(sweeps, _places(sweeps), strict=True)
@@ -137,7 +126,7 @@ def _sweep_panel(
             intervals.append((mean.value, mean.low, mean.high) if mean else (math.nan,) * 3)
         means, low, high = np.array(intervals).T
         known = np.isfinite(means)
-        curves.append(Curve(at[known], means[known], {**line(look), "marker": look.marker}))
+        curves.append(Curve(at[known], means[known], {**style.line(look), "marker": look.marker}))
         if known.any() and np.isfinite(high).any():
             low = np.where(np.isfinite(low), np.maximum(low, 0.05 * means), means)
             high = np.where(np.isfinite(high), high, means)
@@ -190,14 +179,14 @@ def draw_nees(
     mine = {key: told for key, told in series.items() if key[:2] in places}
     if not any(np.isfinite(nees).any() for *_, nees in mine.values()):
         return None
-    methods, left_out = shown_methods(method for _, _, method in mine)
+    methods, left_out = style.shown_methods(method for _, _, method in mine)
     panels, counts = {}, set()
     for (case, grade), place in places.items():
         told = {m: mine[case, grade, m] for m in methods if (case, grade, m) in mine}
         panels[place], n_runs = _nees_panel(told, looks, _joined(case, grade))
         counts.add(n_runs)
-    band = Patch(color=BAND["color"], label="95 % if consistent")
-    expected = Line2D([], [], color=GREY, linewidth=0.8, label="expected, 1")
+    band = Patch(color=BAND_COLOR, label="95 % if consistent")
+    expected = Line2D([], [], color=style.GREY, linewidth=0.8, label="expected, 1")
     runs = " or ".join(f"{n}" for n in sorted(counts - {0}))
     note = f"Grey band: where 95 % of such means over {runs} runs lie (chi-square). "
     note += "Above it a method claims to be more certain than it is, below it less."
@@ -215,9 +204,11 @@ def _nees_panel(told: Mapping[str, Series], looks: Looks, title: str) -> tuple[P
         known = np.isfinite(mean) & (mean > 0.0)
         if not known.any():
             continue
-        divisor, label = time_axis(time_s)
+        divisor, label = style.time_axis(time_s)
         span = np.array([time_s[0], time_s[-1]]) / divisor
-        curves.append(Curve(time_s / divisor, np.where(known, mean, np.nan), line(looks[method])))
+        curves.append(
+            Curve(time_s / divisor, np.where(known, mean, np.nan), style.line(looks[method]))
+        )
         extremes += [float(np.quantile(mean[known], 0.01)), float(mean[known].max())]
         n_runs = max(n_runs, int(np.isfinite(nees).any(axis=1).sum()))
     look: dict[str, Any] = {"title": title, "x": label, "y": "mean NEES/3, –"}
@@ -226,7 +217,7 @@ def _nees_panel(told: Mapping[str, Series], looks: Looks, title: str) -> tuple[P
     band = chi2_interval(3, n_runs)
     low, high = min(*extremes, band.low), max(*extremes, band.high)
     panel = Panel(
-        bands=[Band(span, band.low, band.high, BAND)],
+        bands=[Band(span, band.low, band.high, {"color": BAND_COLOR, "zorder": 0.6})],
         curves=curves,
         level=1.0,
         x_limits=(float(span[0]), float(span[1])),
@@ -252,7 +243,9 @@ def draw_end_error(rows: Sequence[Row], looks: Looks) -> Figure | None:
     ]
     if not cells:
         return None
-    methods, left_out = shown_methods(methods_of([row for _, _, mine in cells for row in mine]))
+    methods, left_out = style.shown_methods(
+        methods_of([row for _, _, mine in cells for row in mine])
+    )
     panels = {
         divmod(k, min(len(cells), MAX_COLUMNS)): _end_error_panel(
             {method: _end_errors(mine, method) for method in reversed(methods)},
@@ -273,7 +266,7 @@ def _end_error_panel(errors: Mapping[str, list[float]], looks: Looks, title: str
         kept = np.array([error for error in ascending if math.isfinite(error)])
         share = np.arange(len(kept) + 1) / max(len(ascending), 1)
         if len(kept):
-            steps = {**line(looks[method]), "drawstyle": "steps-post"}
+            steps = {**style.line(looks[method]), "drawstyle": "steps-post"}
             curves.append(Curve(np.r_[kept[0], kept, 1e12], np.r_[share, share[-1]], steps))
             finite += kept.tolist()
     return Panel(

@@ -26,6 +26,7 @@ from ssm_graph.mission.estimate import (
     Trajectory,
 )
 from ssm_graph.mission.mission import Reference
+from ssm_graph.report import style
 from ssm_graph.report.beams import (
     draw_points,
     innovation_axis,
@@ -33,25 +34,7 @@ from ssm_graph.report.beams import (
     points_of,
     top_of_weights,
 )
-from ssm_graph.report.style import (
-    BOUND,
-    EAST_NORTH_UP,
-    ESTIMATE,
-    INK,
-    OUTLIER,
-    REDUCED,
-    REFERENCE,
-    SMALL,
-    Band,
-    Curve,
-    Panel,
-    broken_at_gaps,
-    draw_panel,
-    dress,
-    save,
-    thinned,
-    time_axis,
-)
+from ssm_graph.report.style import Band, Curve, Panel
 
 PAGE_INCHES = (8.27, 10.8)
 PAGE_DPI = 170
@@ -63,9 +46,9 @@ WIDE_BEAMS: Final = 4
 LEVEL_LABELS: Final = 6
 """So many labels have room side by side."""
 COLOURS: Final = {
-    Determined.GREEN: EAST_NORTH_UP[2],
-    Determined.AMBER: REDUCED,
-    Determined.RED: OUTLIER,
+    Determined.GREEN: style.EAST_NORTH_UP[2],
+    Determined.AMBER: style.REDUCED,
+    Determined.RED: style.OUTLIER,
 }
 
 
@@ -99,7 +82,7 @@ def save_figure(
         raise DataError(
             f"{path}: cannot write a figure of type {path.suffix!r}; known are {', '.join(known)}"
         )
-    save(figure, path, dpi=PAGE_DPI)
+    style.save(figure, path, dpi=PAGE_DPI)
 
 
 def draw_figure(
@@ -111,10 +94,10 @@ def draw_figure(
     errors = metrics.errors if metrics else None
     layout = ConstrainedLayoutEngine(h_pad=0.05, w_pad=0.05)
     figure = Figure(figsize=PAGE_INCHES, layout=layout)
-    heading = figure.suptitle(f"{title or 'Estimate'}\n", x=0.012, ha="left", color=INK)
+    heading = figure.suptitle(f"{title or 'Estimate'}\n", x=0.012, ha="left", color=style.INK)
     heading.set(fontsize=12.0, fontweight="bold", linespacing=1.4)
     caption = _caption(estimate, metrics)
-    figure.text(0.012, 0.973, caption, va="top", fontsize=SMALL + 0.5, color=INK)
+    figure.text(0.012, 0.973, caption, va="top", fontsize=style.SMALL + 0.5, color=style.INK)
     further = _further_panels(estimate)
     heights = [5.9 - 0.6 * len(further), 3.5 - 0.5 * len(further), *(1.1 for _ in further)]
     grid = figure.add_gridspec(len(heights), 1, height_ratios=heights)
@@ -122,10 +105,10 @@ def draw_figure(
     _draw_track(figure.add_subplot(upper[:3, 0]), estimate, reference if errors else None)
     for i, panel in enumerate(_position_panels(trajectory, errors)):
         axes = figure.add_subplot(upper[i, 1])
-        draw_panel(axes, panel)
+        style.draw_panel(axes, panel)
         axes.tick_params(labelbottom=bool(panel.x))
-    draw_panel(figure.add_subplot(upper[3, 0]), _velocity_panel(trajectory, errors))
-    draw_panel(figure.add_subplot(upper[3, 1]), _heading_panel(trajectory, errors))
+    style.draw_panel(figure.add_subplot(upper[3, 0]), _velocity_panel(trajectory, errors))
+    style.draw_panel(figure.add_subplot(upper[3, 1]), _heading_panel(trajectory, errors))
     _draw_beams(figure, grid[1], estimate)
     for row, draw in enumerate(further, start=2):
         draw(figure.add_subplot(grid[row]))
@@ -137,7 +120,7 @@ def _further_panels(estimate: Estimate) -> list[Callable[[Axes], None]]:
     current, calibration = estimate.current, estimate.calibration
     panels: list[Callable[[Axes], None]] = []
     if current is not None:
-        panels.append(lambda axes: draw_panel(axes, _current_panel(current)))
+        panels.append(lambda axes: style.draw_panel(axes, _current_panel(current)))
     if calibration is not None:
         panels.append(lambda axes: _draw_calibration(axes, calibration))
     return panels
@@ -176,15 +159,15 @@ def _error_panel(
     sigma: Array,
     *,
     names: Sequence[str],
-    colors: Sequence[str] = EAST_NORTH_UP,
+    colors: Sequence[str] = style.EAST_NORTH_UP,
     **look: Any,
 ) -> Panel:
     """Return errors (E, C) inside the widest of the bounds (K, C) that the estimator claims.
 
     Without errors these are shown: one as a band, several as a curve each.
     """
-    divisor, x = time_axis(trajectory.time_s)
-    kept = thinned(len(sigma))
+    divisor, x = style.time_axis(trajectory.time_s)
+    kept = style.thinned(len(sigma))
     since = (trajectory.time_s[kept] - trajectory.time_s[0]) / divisor
     known = errors is not None and values is not None and bool(np.isfinite(values).any())
     look = {"x": x, "title": f"{what} {'error' if known else 'uncertainty'}", **look}
@@ -196,13 +179,13 @@ def _error_panel(
         return Panel(curves=curves, y_limits=(0.0, None), **look)
     widest = sigma.max(axis=1)
     bound = 3.0 * widest[kept]
-    band = Band(since, -bound, bound, {"color": BOUND, "alpha": 0.45, "label": "±3σ"})
+    band = Band(since, -bound, bound, {"color": style.BOUND, "alpha": 0.45, "label": "±3σ"})
     curves = []
     if errors is not None and values is not None and known:
-        kept = thinned(len(values))
+        kept = style.thinned(len(values))
         error_s = (errors.time_s[kept] - trajectory.time_s[0]) / divisor
         for value, color, name in zip(values[kept].T, colors, names, strict=False):
-            curves.append(Curve(*broken_at_gaps(error_s, value), _line(color, name)))
+            curves.append(Curve(*style.broken_at_gaps(error_s, value), _line(color, name)))
     limit = _limit(values if known else np.zeros(1), widest)
     return Panel(bands=[band], curves=curves, y_limits=limit, **look)
 
@@ -237,7 +220,7 @@ def _position_panels(trajectory: Trajectory, errors: ErrorSeries | None) -> list
                 values,
                 sigma[:, [i]],
                 names=["error"],
-                colors=[EAST_NORTH_UP[i]],
+                colors=[style.EAST_NORTH_UP[i]],
                 **look,
             )
         )
@@ -272,13 +255,14 @@ def _heading_panel(trajectory: Trajectory, errors: ErrorSeries | None) -> Panel:
 
 def _current_panel(current: CurrentTrack) -> Panel:
     """Return the components of the current that were estimated, each with its own bounds."""
-    divisor, x = time_axis(current.time_s)
-    kept = thinned(len(current.time_s))
+    divisor, x = style.time_axis(current.time_s)
+    kept = style.thinned(len(current.time_s))
     since = (current.time_s[kept] - current.time_s[0]) / divisor
     value, bound = current.velocity_enu[kept], 3.0 * current.sigma_enu[kept]
     bands, curves = [], []
     for i in np.flatnonzero(current.sigma_enu.any(axis=0)):
-        low, high, color = value[:, i] - bound[:, i], value[:, i] + bound[:, i], EAST_NORTH_UP[i]
+        low, high = value[:, i] - bound[:, i], value[:, i] + bound[:, i]
+        color = style.EAST_NORTH_UP[i]
         bands.append(Band(since, low, high, {"color": color, "alpha": 0.2}))
         curves.append(Curve(since, value[:, i], _line(color, AXES_NAMES[i])))
     title = "Current of the water, with ±3σ"
@@ -289,7 +273,7 @@ def _current_panel(current: CurrentTrack) -> Panel:
 def _draw_calibration(axes: Axes, calibration: Calibration) -> None:
     """Draw each value with three of its sigmas, in units of the sigma that it had before."""
     values = calibration.values
-    axes.axhspan(-3.0, 3.0, color=BOUND, alpha=0.35, linewidth=0.0)
+    axes.axhspan(-3.0, 3.0, color=style.BOUND, alpha=0.35, linewidth=0.0)
     for i, value in enumerate(values):
         axes.errorbar(
             i,
@@ -307,8 +291,8 @@ def _draw_calibration(axes: Axes, calibration: Calibration) -> None:
         axes.tick_params(axis="x", labelrotation=18.0)
     axes.set_xlim(-0.7, len(values) - 0.3)
     title = "Calibration: off what is stated, with ±3σ; the band is what was known before"
-    dress(axes, title=title, y="sigmas before")
-    axes.tick_params(axis="x", labelsize=SMALL - 1.0)
+    style.dress(axes, title=title, y="sigmas before")
+    axes.tick_params(axis="x", labelsize=style.SMALL - 1.0)
     axes.grid(visible=False, axis="x")
 
 
@@ -322,24 +306,26 @@ def _draw_track(axes: Axes, estimate: Estimate, reference: Reference | None) -> 
     curves = []
     if reference is not None:
         track = scale * _reference_track(reference, frame, path.time_s)
-        look = {"color": REFERENCE, "linewidth": 2.6, "alpha": 0.35, "label": "reference"}
-        curves.append(Curve(*track.T, look))
-    look = {"color": ESTIMATE, "linewidth": 1.3, "label": "estimate"}
-    curves.append(Curve(*p_n[thinned(len(p_n))].T, look))
+        look = {"color": style.REFERENCE, "linewidth": 2.6, "alpha": 0.35, "label": "reference"}
+        curves.append(Curve(track[:, 0], track[:, 1], look))
+    look = {"color": style.ESTIMATE, "linewidth": 1.3, "label": "estimate"}
+    kept = style.thinned(len(p_n))
+    curves.append(Curve(p_n[kept, 0], p_n[kept, 1], look))
     rejected = np.unique(estimate.beams.time_s[estimate.beams.weight < OUTLIER_WEIGHT])
-    rejected = rejected[thinned(len(rejected), MAX_MARKS)]
+    rejected = rejected[style.thinned(len(rejected), MAX_MARKS)]
     if len(rejected):
         at = [np.interp(rejected, path.time_s, column) for column in p_n.T]
-        look = {"marker": "x", "markersize": 3.2, "markeredgewidth": 0.8, "color": OUTLIER}
+        look = {"marker": "x", "markersize": 3.2, "markeredgewidth": 0.8, "color": style.OUTLIER}
         look |= {"linestyle": "", "label": f"beam weight < {OUTLIER_WEIGHT:g}"}
         curves.append(Curve(at[0], at[1], look))
-    for place, marker, face, label in ((0, "o", INK, "start"), (-1, "s", "white", "end")):
-        look = {"marker": marker, "color": INK, "markersize": 5.5, "markerfacecolor": face}
-        curves.append(Curve(*p_n[[place]].T, {**look, "linestyle": "", "label": label}))
+    for place, marker, face, label in ((0, "o", style.INK, "start"), (-1, "s", "white", "end")):
+        look = {"marker": marker, "color": style.INK, "markersize": 5.5, "markerfacecolor": face}
+        look |= {"linestyle": "", "label": label}
+        curves.append(Curve(p_n[[place], 0], p_n[[place], 1], look))
     below = {"loc": "upper left", "bbox_to_anchor": (-0.04, -0.09), "ncols": 5}
     below |= {"columnspacing": 0.8, "handletextpad": 0.4}
     x, y = f"east, {unit}", f"north, {unit}"
-    draw_panel(axes, Panel(title="Track", x=x, y=y, curves=curves, legend=below))
+    style.draw_panel(axes, Panel(title="Track", x=x, y=y, curves=curves, legend=below))
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.06)
 
@@ -349,14 +335,14 @@ def _reference_track(reference: Reference, frame: LocalFrame, time_s: Array) -> 
     p_n = frame.p_n_from_geodetic(reference.lat, reference.lon, reference.height)
     kept = np.isfinite(p_n).all(axis=1)
     kept &= (reference.time_s >= time_s[0] - 1.0) & (reference.time_s <= time_s[-1] + 1.0)
-    _, track = broken_at_gaps(reference.time_s[kept], p_n[kept, :2])
-    return np.asarray(track[thinned(len(track))])
+    _, track = style.broken_at_gaps(reference.time_s[kept], p_n[kept, :2])
+    return np.asarray(track[style.thinned(len(track))])
 
 
 def _draw_beams(figure: Figure, place: SubplotSpec, estimate: Estimate) -> None:
     """Draw innovations above weights, a column per beam, all on the same scales."""
     beams, time_s, n_beams = estimate.beams, estimate.trajectory.time_s, n_beams_of(estimate)
-    divisor, label = time_axis(time_s)
+    divisor, label = style.time_axis(time_s)
     span = float(np.ptp(time_s)) / divisor or 1.0
     grid = place.subgridspec(2, n_beams, height_ratios=[1.35, 1.0])
     upper: list[Axes] = []
@@ -371,9 +357,9 @@ def _draw_beams(figure: Figure, place: SubplotSpec, estimate: Estimate) -> None:
         draw_points(weight, since, points.weight, points.weight)
         innovation.set_xlim(-0.03 * span, 1.03 * span)
         weight.set_ylim(-0.06, top_of_weights(beams))
-        dress(innovation, title=f"Beam {beam + 1}", y="" if upper else "innovation, m/s")
+        style.dress(innovation, title=f"Beam {beam + 1}", y="" if upper else "innovation, m/s")
         x = label if n_beams <= WIDE_BEAMS else label.replace("time since start", "time")
-        dress(weight, x=x, y="" if upper else "weight, –")
+        style.dress(weight, x=x, y="" if upper else "weight, –")
         if n_beams > WIDE_BEAMS:
             weight.xaxis.set_major_locator(MaxNLocator(2))
         innovation.tick_params(labelbottom=False, labelleft=not upper)
@@ -388,7 +374,7 @@ def _draw_beams(figure: Figure, place: SubplotSpec, estimate: Estimate) -> None:
         names,
         loc="outside lower center",
         ncols=len(names),
-        fontsize=SMALL,
+        fontsize=style.SMALL,
         frameon=False,
         markerscale=1.6,
     )

@@ -132,7 +132,7 @@ def _comparison(metrics: Metrics) -> Table:
 
 def calibration_table(calibration: Calibration) -> Table:
     """Return what was found of the instruments, each value in the colour of its certainty."""
-    rows = []
+    rows: list[tuple[str | float | Text, ...]] = []
     for value in calibration.values:
         numbers = (value.value, value.sigma, value.prior_sigma)
         how = Text(value.determined.name.lower(), style=DETERMINED_STYLE[value.determined])

@@ -203,8 +203,8 @@ def _links(status: RunStatus) -> Table:
     table.add_column("address", no_wrap=True, overflow="ellipsis")
     for row in status.sources:
         _add_source(table, row)
-    for row in status.outputs:
-        _add_output(table, row)
+    for output in status.outputs:
+        _add_output(table, output)
     return table
 
 

@@ -9,11 +9,9 @@ import numpy as np
 from ssm_graph.base.earth import normal_gravity
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
-from ssm_graph.io.mission_folder.checks.motion import check_motion
-from ssm_graph.io.mission_folder.keys import WATER_TRACK
-from ssm_graph.io.mission_folder.toml import MissionToml
-from ssm_graph.io.tables.settings import TOML_NAME
-from ssm_graph.io.tables.table import Table
+from ssm_graph.base.tables import Table
+from ssm_graph.io.mission_folder.motion import check_motion
+from ssm_graph.io.mission_folder.toml import TOML_NAME
 from ssm_graph.mission.mission import Mission
 
 FARTHEST_M: Final = 100e3
@@ -24,14 +22,21 @@ _GRAVITY_SHARE: Final = 0.005
 _UNITS: Final = ((1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds"))
 
 
-def check_mission(mission: Mission, tables: dict[str, Table], toml: MissionToml) -> list[str]:
-    """Check the parts of a mission against each other; return the notes."""
+def check_mission(mission: Mission, tables: dict[str, Table], *, has_origin: bool) -> list[str]:
+    """Check the parts of a mission against each other; return the notes.
+
+    Parameters
+    ----------
+    mission : its instruments are sound by themselves.
+    tables : by section, where their readings came from.
+    has_origin : whether the frame was stated, not taken from the first position.
+    """
     notes = _times(mission, tables)
     _initial_time(mission, tables["imu"].label)
-    _initial_position(mission, toml)
+    _initial_position(mission, has_origin=has_origin)
     for name in ("gnss", "usbl", "reference"):
         if name in tables:
-            _table_position(mission, tables[name], has_origin="origin" in toml)
+            _table_position(mission, tables[name], has_origin=has_origin)
     notes += _current(mission)
     notes += _gravity(mission, tables["imu"].label)
     return notes + check_motion(mission, {name: table.label for name, table in tables.items()})
@@ -86,13 +91,13 @@ def _initial_time(mission: Mission, label: str) -> None:
         )
 
 
-def _initial_position(mission: Mission, toml: MissionToml) -> None:
+def _initial_position(mission: Mission, *, has_origin: bool) -> None:
     initial = mission.initial
     if initial is None:
         return
     distance = _distance(mission, np.array([initial.lat]), np.array([initial.lon]))[0]
     if distance > _limit(mission):
-        origin = "[origin]" if "origin" in toml else "the first GNSS fix"
+        origin = "[origin]" if has_origin else "the first GNSS fix"
         raise ConfigError(
             f"{TOML_NAME} [initial] lat_deg, lon_deg: the position is {distance / 1e3:.0f} km from "
             f"{origin}; expected less than {_limit(mission) / 1e3:.0f} km; "
@@ -150,7 +155,7 @@ def _current(mission: Mission) -> list[str]:
         return []
     return [
         f"{TOML_NAME} [current]: no ping is off the water, so the section changes nothing; a 1 in "
-        f"column {WATER_TRACK!r} of the DVL's table marks such a ping"
+        f"column 'water_track' of the DVL's table marks such a ping"
     ]
 
 

@@ -17,7 +17,15 @@ from numpy.typing import NDArray
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
-from ssm_graph.io.mission_folder.keys import LIMITS
+from ssm_graph.base.tables import (
+    LARGEST_TIME_S,
+    Table,
+    TableFile,
+    TableSpec,
+    check_finite,
+    check_names,
+    is_repeated,
+)
 from ssm_graph.io.tables.csv_tables import (
     NUMBER,
     CsvFile,
@@ -25,18 +33,7 @@ from ssm_graph.io.tables.csv_tables import (
     read_csv_header,
     read_csv_values,
 )
-from ssm_graph.io.tables.table import (
-    LARGEST_TIME_S,
-    Table,
-    TableFile,
-    TableFormat,
-    TableSpec,
-    check_finite,
-    check_names,
-    is_repeated,
-    read_parquet,
-    table_format,
-)
+from ssm_graph.io.tables.files import TableFormat, read_parquet, table_format
 
 _CHUNK = 65536
 _FEW = 10
@@ -120,7 +117,7 @@ def read_arrival_table(path: Path, label: str, spec: TableSpec) -> Table:
 
     Left out and counted in one note are rows that repeat a time (the first stays), lines that are
     no complete row, a last line without its newline, and rows with numbers that are not finite or
-    beyond :data:`.keys.LIMITS`. Where they outnumber the good ones the table
+    beyond the limits of the columns. Where they outnumber the good ones the table
     is not torn but of another kind, and is refused like any other.
 
     Parameters
@@ -210,10 +207,10 @@ def _without_impossible(table: Table, spec: TableSpec, counts: Counts) -> Table:
     bad = np.abs(table.time_s) > LARGEST_TIME_S
     for name, values in table.columns.items():
         bad |= np.isinf(values) if name in spec.may_be_blank else ~np.isfinite(values)
-        low, high = LIMITS.get(name, (-np.inf, np.inf))
+        low, high = spec.limits.get(name, (-np.inf, np.inf))
         bad |= (values < low) | (values > high)
-    if "lat_deg" in table:
-        bad |= (table["lat_deg"] == 0.0) & (table["lon_deg"] == 0.0)  # a code for no fix
+    if spec.nowhere:
+        bad |= np.all(table.stack(spec.nowhere) == 0.0, axis=1)  # a code for no fix
     n_bad = int(bad.sum())
     if _is_too_many(n_bad, len(table) - n_bad):
         check_finite(table, spec)

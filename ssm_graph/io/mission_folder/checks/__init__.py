@@ -1,1 +1,0 @@
-"""Checks whether a mission is physically possible."""
