@@ -47,14 +47,9 @@ class KalmanUpdate(UpdateRule):
     def __str__(self) -> str:
         return "gaussian"
 
-    def __call__(
-        self,
-        covariance: Array,
-        model: MeasurementModel,
-        mean: Array | None = None,  # noqa: ARG002
-    ) -> Update:
+    def __call__(self, P: Array, model: MeasurementModel, mean: Array | None = None) -> Update:  # noqa: ARG002
         """Correct the predictions of B runs."""
-        prepared = prepare(model.at(np.zeros(covariance.shape[:2])), covariance)
+        prepared = prepare(model.at(np.zeros(P.shape[:2])), P)
         return _once(prepared, model, np.ones(model.present.shape))
 
 
@@ -80,14 +75,9 @@ class GatedUpdate(UpdateRule):
     def __str__(self) -> str:
         return f"gate({self.confidence:g} on each {self.by.name.lower()})"
 
-    def __call__(
-        self,
-        covariance: Array,
-        model: MeasurementModel,
-        mean: Array | None = None,  # noqa: ARG002
-    ) -> Update:
+    def __call__(self, P: Array, model: MeasurementModel, mean: Array | None = None) -> Update:  # noqa: ARG002
         """Correct the predictions of B runs."""
-        prepared = prepare(model.at(np.zeros(covariance.shape[:2])), covariance)
+        prepared = prepare(model.at(np.zeros(P.shape[:2])), P)
         rows, robust = prepared.iterate, Groups(model).is_robust
         S = prepared.HPHt + np.eye(model.present.shape[1])
         if self.by is Gate.BEAM:

@@ -110,14 +110,12 @@ class UpdateRule(ABC):
     """One way to correct predictions by measurements."""
 
     @abstractmethod
-    def __call__(
-        self, covariance: Array, model: MeasurementModel, mean: Array | None = None
-    ) -> Update:
+    def __call__(self, P: Array, model: MeasurementModel, mean: Array | None = None) -> Update:
         """Correct the predictions of B runs.
 
         Parameters
         ----------
-        covariance : (B, n, n) of the predictions.
+        P : (B, n, n) covariance of the predictions.
         model : the measurements.
         mean : (B, n) predicted means where the state is a plain vector; published stopping rules
             ask for its length. Error states have none: zero.
