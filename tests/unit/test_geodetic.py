@@ -395,6 +395,26 @@ def test_two_pings_at_one_keyframe_are_refused() -> None:
         side_by_side([dataclasses.replace(problem, beams=same)])
 
 
+def test_fixes_of_one_keyframe_are_one() -> None:
+    """Two of the same place, each with twice the variance: what one fix says."""
+    problem: Problem = survey_problem()
+    fixes = problem.fixes
+    assert fixes is not None
+    both = {
+        "keyframe": np.repeat(fixes.keyframe, 2),
+        "position_n": np.repeat(fixes.position_n, 2, axis=0),
+        "covariance_n": np.repeat(2.0 * fixes.covariance_n, 2, axis=0),
+        "gyro_b": np.repeat(fixes.gyro_b, 2, axis=0),
+    }
+    twice = dataclasses.replace(problem, fixes=dataclasses.replace(fixes, **both))
+    one, other = (side_by_side([p]).fixes for p in (problem, twice))
+    np.testing.assert_allclose(other.position_n, one.position_n, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(other.root_information, one.root_information, rtol=1e-9, atol=1e-12)
+    place = places_of(other, [problem.frame]).place[fixes.keyframe, 0]
+    expected = np.stack(problem.frame.geodetic_from_p_n(fixes.position_n), axis=-1)
+    np.testing.assert_allclose(place, expected, rtol=0.0, atol=1e-9)
+
+
 def test_a_run_that_ran_away_says_so() -> None:
     """Beam speeds beyond all reason: the status says it, and the run beside is as it was."""
     mission = survey().mission

@@ -474,7 +474,6 @@ def test_a_replay_keeps_the_pace() -> None:
     assert "% done" in status.address
     assert source.elapsed_s == pytest.approx(1.94)
     assert source.take_events() == []
-    source.close()
 
 
 def test_a_replay_at_full_speed_gives_one_sample_at_a_time() -> None:
