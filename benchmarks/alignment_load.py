@@ -24,10 +24,10 @@ from benchmarks.speed import table
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator import FixedLagSmoother
-from ssm_graph.live.estimator.events import EventLog
 from ssm_graph.live.estimator.intake import Intake
 from ssm_graph.live.estimator.start import MOST_MS, SHARE
 from ssm_graph.live.estimator.store import pack_buffers
+from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.navigation import Health
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.messages import Message

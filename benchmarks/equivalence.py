@@ -25,10 +25,9 @@ import numpy as np
 from factors.similarity import LogKernel, Similarity
 from ssm_graph.engine.error_state import POSITION, VELOCITY, Linearised
 from ssm_graph.engine.states import NavigationStates
-from ssm_graph.filters.geodetic.error_model import Feedback
 from ssm_graph.filters.geodetic.filter import GeodeticConfig, run_geodetic, to_navigation
-from ssm_graph.filters.navigation.filter import Grouping, run_filter
-from ssm_graph.filters.navigation.history import FilterHistory
+from ssm_graph.filters.geodetic.mechanisation import Feedback
+from ssm_graph.filters.navigation.filter import FilterHistory, Grouping, run_filter
 from ssm_graph.filters.rules.ssm import SsmUpdate
 from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.simulation import (

@@ -10,6 +10,7 @@ import json
 import math
 import socket
 import tempfile
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -51,11 +52,10 @@ from ssm_graph.io.raw_log.log import replay
 from ssm_graph.live.estimator import ONLINE
 from ssm_graph.live.protocols.json_messages import JsonDecoder, encode_message
 from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
-from ssm_graph.live.run.interfaces import Connections
 from ssm_graph.live.run.run_folder import LOG_NAME, RunFolder
-from ssm_graph.live.run.runner import Runner, RunnerConfig
+from ssm_graph.live.run.runner import Connections, Runner, RunnerConfig
 from ssm_graph.live.sockets.endpoints import LOOPBACK, Endpoint, Transport
-from ssm_graph.live.sockets.listeners import TcpServerInput
+from ssm_graph.live.sockets.inputs import TcpServerInput
 from ssm_graph.live.sockets.outputs import OutputFormat
 from ssm_graph.live.sockets.sockets import InputConfig, OutputConfig, SocketHub
 from ssm_graph.mission.navigation import Event, Health, Severity
@@ -202,7 +202,7 @@ class Voyage:
         self.vessel.n_lost += not is_received
         return is_received
 
-    def take_events(self) -> list[Event]:
+    def take_events(self) -> Sequence[Event]:
         """Return what happened at the sockets."""
         return self.vessel.hub.take_events()
 

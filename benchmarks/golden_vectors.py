@@ -25,10 +25,15 @@ from factors.similarity import ExpKernel, Kernel, LogKernel, SqrtKernel
 from ssm_graph.base.frozen import Array
 from ssm_graph.filters.rules.correntropy import CorrentropyUpdate
 from ssm_graph.filters.rules.kalman import KalmanUpdate
-from ssm_graph.filters.rules.linear import LinearModel, LinearSystem, run_linear_filter
-from ssm_graph.filters.rules.model import Update, UpdateRule
 from ssm_graph.filters.rules.ssm import Floor, SsmUpdate, StopRule
 from ssm_graph.filters.rules.student import Scale, StudentUpdate
+from ssm_graph.filters.rules.update import (
+    LinearModel,
+    LinearSystem,
+    Update,
+    UpdateRule,
+    run_linear_filter,
+)
 
 Vectors = Mapping[str, Array]
 TOLERANCE = 1e-8

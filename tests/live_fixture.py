@@ -11,8 +11,8 @@ import numpy as np
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
-from ssm_graph.live.run.interfaces import Connections, Engine
 from ssm_graph.live.run.run_folder import RunFolder
+from ssm_graph.live.run.runner import Connections, Engine
 from ssm_graph.live.sockets.outputs import OutputFormat
 from ssm_graph.mission.estimate import BeamTable, CurrentTrack, Found, Trajectory
 from ssm_graph.mission.navigation import Event, Health, Navigation, Severity

@@ -19,9 +19,9 @@ from ssm_graph.io.mission_folder.reader import read_mission, write_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle, vehicle_of, write_vehicle
 from ssm_graph.io.raw_log.log import RawLog, replay
 from ssm_graph.io.raw_log.rows import messages_of
-from ssm_graph.live.estimator.events import EventLog
 from ssm_graph.live.estimator.intake import Intake
 from ssm_graph.live.protocols.json_messages import decode_message, encode_message
+from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.mission import Aids
 from tests.mission_fixture import make_mission
 from tests.unit.test_mission_roundtrip import assert_same

@@ -33,15 +33,12 @@ from ssm_graph.live.protocols.decoder import Clock
 from ssm_graph.live.protocols.json_messages import JsonDecoder
 from ssm_graph.live.protocols.nmea import NmeaDecoder, NmeaOptions
 from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
-from ssm_graph.live.run.feed import CountingDecoder, Limits
-from ssm_graph.live.run.interfaces import Connections, Engine
 from ssm_graph.live.run.replay_source import ReplaySource
 from ssm_graph.live.run.run_folder import RunFolder
-from ssm_graph.live.run.run_summary import RunEnd, StopReason
-from ssm_graph.live.run.runner import Runner, RunnerConfig
+from ssm_graph.live.run.runner import Connections, Engine, RunEnd, Runner, RunnerConfig, StopReason
 from ssm_graph.live.sockets.endpoints import OUTPUTS, parse_endpoint
-from ssm_graph.live.sockets.outputs import OutputFormat
-from ssm_graph.live.sockets.publisher import Publisher
+from ssm_graph.live.sockets.feed import CountingDecoder, Limits
+from ssm_graph.live.sockets.outputs import OutputFormat, Publisher
 from ssm_graph.live.sockets.sockets import InputConfig, OutputConfig, SocketHub
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.navigation import Health

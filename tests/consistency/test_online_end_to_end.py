@@ -30,12 +30,11 @@ from ssm_graph.live.estimator import ONLINE
 from ssm_graph.live.protocols.json_messages import JsonDecoder, encode_message
 from ssm_graph.live.protocols.nmea import NmeaDecoder
 from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
-from ssm_graph.live.run.feed import Limits
-from ssm_graph.live.run.interfaces import Connections
 from ssm_graph.live.run.run_folder import RunFolder
-from ssm_graph.live.run.runner import Runner
+from ssm_graph.live.run.runner import Connections, Runner
 from ssm_graph.live.sockets.endpoints import LOOPBACK, Endpoint, Transport
-from ssm_graph.live.sockets.listeners import UdpInput
+from ssm_graph.live.sockets.feed import Limits
+from ssm_graph.live.sockets.inputs import UdpInput
 from ssm_graph.live.sockets.outputs import OutputFormat, TcpServerOutput
 from ssm_graph.live.sockets.sockets import InputConfig, OutputConfig, SocketHub
 from ssm_graph.sensors.depth import DepthReading

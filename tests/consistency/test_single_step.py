@@ -15,7 +15,7 @@ import pytest
 from benchmarks.equivalence import Difference, against_filter, against_geodetic, missions
 from factors.similarity import Similarity
 from ssm_graph.engine.error_state import Linearised
-from ssm_graph.filters.geodetic.error_model import Feedback
+from ssm_graph.filters.geodetic.mechanisation import Feedback
 from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.simulation import GnssSettings, Grade, Loss, OutlierKind, Outliers, SimulatedMission
 from tests.helpers import simulated

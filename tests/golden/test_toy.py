@@ -12,10 +12,9 @@ from factors.similarity import ExpKernel, Kernel, LogKernel, SqrtKernel
 from ssm_graph.base.frozen import Array
 from ssm_graph.filters.rules.correntropy import CorrentropyUpdate
 from ssm_graph.filters.rules.kalman import KalmanUpdate
-from ssm_graph.filters.rules.linear import LinearModel, LinearSystem, run_linear_filter
-from ssm_graph.filters.rules.model import UpdateRule
 from ssm_graph.filters.rules.ssm import Floor, SsmUpdate, StopRule
 from ssm_graph.filters.rules.student import Scale, StudentUpdate
+from ssm_graph.filters.rules.update import LinearModel, LinearSystem, UpdateRule, run_linear_filter
 
 GOLDEN = Path(__file__).parents[2] / "../shared/golden/toy_a.npz"
 pytestmark = pytest.mark.skipif(not GOLDEN.is_file(), reason=f"no golden vectors in {GOLDEN}")

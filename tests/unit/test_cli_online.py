@@ -18,8 +18,8 @@ from ssm_graph.io.results.tables import read_results
 from ssm_graph.live.protocols.json_messages import JsonDecoder
 from ssm_graph.live.protocols.nmea import NmeaDecoder
 from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
-from ssm_graph.live.run.feed import Limits
 from ssm_graph.live.sockets.endpoints import Transport
+from ssm_graph.live.sockets.feed import Limits
 from ssm_graph.live.sockets.outputs import OutputFormat
 from tests.mission_fixture import make_mission
 from tests.window_fixture import asked, off

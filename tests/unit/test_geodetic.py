@@ -14,25 +14,29 @@ from ssm_graph.base.earth import EARTH_RATE
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.states import States
-from ssm_graph.filters.geodetic.error_model import (
-    DP,
-    ERROR_DIM,
-    NABLA,
-    Feedback,
-    feed_back,
-    initial_moments,
-    noise_densities,
-    propagate,
-)
 from ssm_graph.filters.geodetic.filter import (
     GeodeticConfig,
     GeodeticHistory,
     run_geodetic,
     to_navigation,
 )
-from ssm_graph.filters.geodetic.measurements import beam_rows, gather, nominal_rows
-from ssm_graph.filters.geodetic.mechanisation import GeodeticState, Samples, Track, advance
+from ssm_graph.filters.geodetic.measurements import beam_rows, nominal_rows, places_of
+from ssm_graph.filters.geodetic.mechanisation import (
+    DP,
+    ERROR_DIM,
+    NABLA,
+    Feedback,
+    GeodeticState,
+    Samples,
+    Track,
+    advance,
+    feed_back,
+    initial_moments,
+    noise_densities,
+    propagate,
+)
 from ssm_graph.filters.navigation.named import filter_geodetic
+from ssm_graph.filters.side_by_side import side_by_side
 from ssm_graph.imu.preintegration import INTEGRATION_DENSITY, imu_params
 from ssm_graph.mission.estimate import Status
 from ssm_graph.mission.mission import Mission
@@ -196,7 +200,7 @@ def test_noise_has_the_floors_of_the_graph() -> None:
 def test_beam_prediction_is_the_motion_of_the_instrument() -> None:
     """``z = u . (velocity + rate relative to the Earth x lever arm)``, written out."""
     problem = survey_problem()
-    grid, state = gather([problem]).beams, a_state()
+    grid, state = side_by_side([problem]).beams, a_state()
     k = int(problem.beams.keyframe[0])
     rows = beam_rows(grid, k, state)
     R_bl = state.R_lb[0].T
@@ -212,20 +216,21 @@ def test_beam_prediction_is_the_motion_of_the_instrument() -> None:
 def test_rows_are_the_derivatives_of_what_they_measure(axis: int) -> None:
     """``H`` of beams, depth and fix against differences of ``Z``, the gyro drift included."""
     problem = survey_problem()
-    measurements, state = gather([problem]), a_state()
+    measured, state = side_by_side([problem]), a_state()
+    places = places_of(measured.fixes, [problem.frame])
     k = int(problem.beams.keyframe[0])
     # Metres are those about the state: a fix belongs near it.
-    measurements.fixes.place[:, k] = state.lat[0], state.lon[0], state.height[0]
+    places.place[k] = state.lat[0], state.lon[0], state.height[0]
     X, no_X = STEP * np.eye(ERROR_DIM)[axis], np.zeros((1, ERROR_DIM))
     Zs = []
     for sign in (1.0, -1.0):
         off = off_by(state, sign * X)
-        drifted = measurements.beams._replace(gyro_b=measurements.beams.gyro_b + sign * X[9:12])
-        nominal = nominal_rows(measurements, k, off, None, no_X)
+        drifted = measured.beams._replace(gyro_b=measured.beams.gyro_b + sign * X[9:12])
+        nominal = nominal_rows(measured, places, k, off, None, no_X)
         assert nominal is not None
         Zs.append(np.concatenate([beam_rows(drifted, k, off).Z[0], nominal.Z[0]]))
-    rows = beam_rows(measurements.beams, k, state)
-    nominal = nominal_rows(measurements, k, state, None, no_X)
+    rows = beam_rows(measured.beams, k, state)
+    nominal = nominal_rows(measured, places, k, state, None, no_X)
     assert nominal is not None
     H = np.concatenate([rows.H[0], nominal.H[0]])
     assert H.shape == (8, ERROR_DIM)
@@ -239,14 +244,14 @@ def test_depths_are_compared_at_their_own_times() -> None:
     k = int(problem.depths.keyframe[4])
     ours = np.flatnonzero(problem.depths.keyframe == k)
     track = an_interval(a_state(), gyro=np.zeros(3), accel=np.zeros(3))
-    grid = gather([problem]).depths
+    measured = side_by_side([problem])
     lever_up = track.turned[0] @ problem.depths.lever_arm_b @ track.middle.R_lb[0, 2]
     before_s = problem.keyframe_s[k] - problem.depths.time_s[ours]
     at_reading = np.interp(1.0 - before_s, track.elapsed_s[0], track.height[0] + lever_up)
-    grid.depth[0, k, : len(ours)] = -at_reading
-    measurements = gather([problem])._replace(depths=grid)
-    measurements.fixes.place[:] = np.nan
-    rows = nominal_rows(measurements, k, track.end, track, np.zeros((1, ERROR_DIM)))
+    measured.depths.depth[k, 0, : len(ours)] = -at_reading
+    places = places_of(measured.fixes, [problem.frame])
+    places.place[:] = np.nan
+    rows = nominal_rows(measured, places, k, track.end, track, np.zeros((1, ERROR_DIM)))
     assert rows is not None
     np.testing.assert_allclose(rows.Z, 0.0, atol=1e-9)
     assert rows.sigma[0, 0] == pytest.approx(problem.depths.sigma / np.sqrt(len(ours)))
@@ -386,8 +391,24 @@ def test_two_pings_at_one_keyframe_are_refused() -> None:
     """They would overwrite each other."""
     problem: Problem = survey_problem()
     same = dataclasses.replace(problem.beams, keyframe=np.ones_like(problem.beams.keyframe))
-    with pytest.raises(DataError, match="share a keyframe"):
-        gather([dataclasses.replace(problem, beams=same)])
+    with pytest.raises(DataError, match=r"two pings within a millisecond at 1\.000 s"):
+        side_by_side([dataclasses.replace(problem, beams=same)])
+
+
+def test_fixes_of_one_keyframe_are_one() -> None:
+    """Two of the same place, each with twice the variance: what one fix says."""
+    problem: Problem = survey_problem()
+    fixes = problem.fixes
+    assert fixes is not None
+    both = fixes.take(np.repeat(np.arange(len(fixes)), 2))
+    both = dataclasses.replace(both, covariance_n=2.0 * both.covariance_n)
+    twice = dataclasses.replace(problem, fixes=both)
+    one, other = (side_by_side([p]).fixes for p in (problem, twice))
+    np.testing.assert_allclose(other.position_n, one.position_n, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(other.root_information, one.root_information, rtol=1e-9, atol=1e-12)
+    place = places_of(other, [problem.frame]).place[fixes.keyframe, 0]
+    expected = np.stack(problem.frame.geodetic_from_p_n(fixes.position_n), axis=-1)
+    np.testing.assert_allclose(place, expected, rtol=0.0, atol=1e-9)
 
 
 def test_a_run_that_ran_away_says_so() -> None:

@@ -15,14 +15,18 @@ from ssm_graph.io.mission_folder.reader import read_mission
 from ssm_graph.io.raw_log.log import RawLog
 from ssm_graph.io.results.tables import read_results
 from ssm_graph.io.tables.checkpoint import CHECKPOINT_NAME, older_name
-from ssm_graph.live.run.checkpoint_writer import CheckpointWriter
-from ssm_graph.live.run.interfaces import Connections, Engine
 from ssm_graph.live.run.replay_source import ReplaySource
-from ssm_graph.live.run.run_folder import RunFolder
-from ssm_graph.live.run.run_summary import MOST_FAILURES, RunEnd, StopReason
-from ssm_graph.live.run.runner import Runner, RunnerConfig
-from ssm_graph.live.sockets.outputs import OutputFormat
-from ssm_graph.live.sockets.publisher import Every, Publisher
+from ssm_graph.live.run.run_folder import CheckpointWriter, RunFolder
+from ssm_graph.live.run.runner import (
+    MOST_FAILURES,
+    Connections,
+    Engine,
+    RunEnd,
+    Runner,
+    RunnerConfig,
+    StopReason,
+)
+from ssm_graph.live.sockets.outputs import Every, OutputFormat, Publisher
 from ssm_graph.mission.navigation import Event, Navigation, Severity
 from ssm_graph.mission.run_status import LinkState, RunStatus
 from ssm_graph.sensors.dvl import Ping
@@ -340,7 +344,7 @@ def test_a_slow_disk_does_not_hold_up_the_loop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A checkpoint that is due while the last one is on its way waits, and it is said."""
-    monkeypatch.setattr("ssm_graph.live.run.checkpoint_writer.CheckpointWriter.is_busy", True)
+    monkeypatch.setattr("ssm_graph.live.run.run_folder.CheckpointWriter.is_busy", True)
     ticks = iter(range(100_000))
     run(tmp_path, ListSource(some_messages()), steady_s=lambda: float(next(ticks)))
     assert "checkpoint_late" in kinds(tmp_path)
@@ -352,7 +356,7 @@ def test_a_checkpoint_that_fails_is_said(tmp_path: Path, monkeypatch: pytest.Mon
     def fail(*_: object) -> None:
         raise OSError("no space left")
 
-    monkeypatch.setattr("ssm_graph.live.run.checkpoint_writer.write_checkpoint", fail)
+    monkeypatch.setattr("ssm_graph.live.run.run_folder.write_checkpoint", fail)
     run(tmp_path, ListSource(some_messages()))
     assert "checkpoint_failed" in kinds(tmp_path)
 
@@ -470,7 +474,6 @@ def test_a_replay_keeps_the_pace() -> None:
     assert "% done" in status.address
     assert source.elapsed_s == pytest.approx(1.94)
     assert source.take_events() == []
-    source.close()
 
 
 def test_a_replay_at_full_speed_gives_one_sample_at_a_time() -> None:

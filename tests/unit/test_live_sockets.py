@@ -16,12 +16,19 @@ from ssm_graph.live.protocols.decoder import Clock
 from ssm_graph.live.protocols.json_messages import JsonDecoder, encode_message
 from ssm_graph.live.protocols.nmea import NmeaDecoder
 from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
-from ssm_graph.live.run.feed import CHUNK, CountingDecoder, Limits
-from ssm_graph.live.sockets.endpoints import LOOPBACK, OUTPUTS, Endpoint, Transport, parse_endpoint
-from ssm_graph.live.sockets.listeners import TcpServerInput, UdpInput
+from ssm_graph.live.sockets.endpoints import (
+    CHUNK,
+    LOOPBACK,
+    OUTPUTS,
+    Endpoint,
+    Transport,
+    parse_endpoint,
+)
+from ssm_graph.live.sockets.feed import CountingDecoder, Limits
+from ssm_graph.live.sockets.inputs import TcpServerInput, UdpInput
 from ssm_graph.live.sockets.outputs import MAX_CLIENTS, MAX_WAITING, OutputFormat, TcpServerOutput
 from ssm_graph.live.sockets.sockets import InputConfig, OutputConfig, SocketHub
-from ssm_graph.mission.navigation import Severity
+from ssm_graph.mission.navigation import Event, Severity
 from ssm_graph.mission.run_status import LinkState
 from ssm_graph.sensors.depth import DepthReading
 from ssm_graph.sensors.dvl import Ping
@@ -369,7 +376,7 @@ def test_a_flood_harms_nobody_else_and_is_said() -> None:
         attacker.setblocking(False)
         sender = UdpSender(port_of(hub, 1))
         messages: list[Message] = []
-        events = []
+        events: list[Event] = []
         for k in range(round(duration_s / step_s)):
             for _ in range(10):
                 try:

@@ -16,9 +16,9 @@ from ssm_graph.base.stepwise import Steps, finished
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator import FixedLagSmoother, start
-from ssm_graph.live.estimator.events import EventLog
 from ssm_graph.live.estimator.intake import Intake
 from ssm_graph.live.estimator.start import MOST_MS, Beginning, Starter
+from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.navigation import Health, Navigation
 from ssm_graph.mission.problem import ProblemConfig, build_problem
 from ssm_graph.mission.start.alignment import N_HYPOTHESES, align

@@ -15,9 +15,8 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import Linearised
 from ssm_graph.filters.rules.correntropy import CorrentropyUpdate
 from ssm_graph.filters.rules.kalman import Gate, GatedUpdate, KalmanUpdate
-from ssm_graph.filters.rules.linear import LinearModel, LinearSystem
-from ssm_graph.filters.rules.model import NOMINAL, Iterate, Runs
 from ssm_graph.filters.rules.ssm import Floor, SsmUpdate, StopRule
+from ssm_graph.filters.rules.update import NOMINAL, Iterate, LinearModel, LinearSystem, Runs
 from tests.update_fixture import (
     ALL_ROWS,
     EACH_ROW,

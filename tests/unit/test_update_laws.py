@@ -11,10 +11,9 @@ from factors.similarity import ExpKernel, LogKernel, SqrtKernel
 from ssm_graph.engine.error_state import Linearised
 from ssm_graph.filters.rules.correntropy import CorrentropyUpdate
 from ssm_graph.filters.rules.kalman import Gate, GatedUpdate, KalmanUpdate
-from ssm_graph.filters.rules.linear import LinearModel, LinearSystem
-from ssm_graph.filters.rules.model import NOMINAL, Runs, UpdateRule
 from ssm_graph.filters.rules.ssm import SsmUpdate
 from ssm_graph.filters.rules.student import Scale, StudentUpdate
+from ssm_graph.filters.rules.update import NOMINAL, LinearModel, LinearSystem, Runs, UpdateRule
 from tests.update_fixture import (
     ALL_ROWS,
     EACH_ROW,

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +31,15 @@ from ssm_graph.engine.error_state import (
     STATE_DIM,
     VELOCITY,
 )
-from ssm_graph.filters.geodetic.error_model import (
+from ssm_graph.filters.geodetic.measurements import (
+    Rows,
+    beam_rows,
+    correct,
+    nominal_rows,
+    places_of,
+    settle,
+)
+from ssm_graph.filters.geodetic.mechanisation import (
     DP,
     DV,
     EPS,
@@ -40,19 +47,20 @@ from ssm_graph.filters.geodetic.error_model import (
     NABLA,
     PHI,
     Feedback,
+    Samples,
+    Track,
+    advance,
     enu_D_place,
     feed_back,
     initial_moments,
     noise_densities,
     propagate,
 )
-from ssm_graph.filters.geodetic.measurements import Measurements, beam_rows, gather, nominal_rows
-from ssm_graph.filters.geodetic.mechanisation import GeodeticState, Samples, Track, advance
-from ssm_graph.filters.geodetic.update import correct, settle
+from ssm_graph.filters.navigation.filter import StateHistory
+from ssm_graph.filters.side_by_side import side_by_side
 from ssm_graph.imu.increments import merge_samples
 from ssm_graph.mission.estimate import OnKeyframe
 from ssm_graph.mission.problem import Problem
-from ssm_graph.sensors.dvl import N_BEAMS
 from ssm_graph.sensors.imu import ImuLog
 
 
@@ -96,30 +104,15 @@ class GeodeticHistory(ReadOnlyArrays):
     accel_bias: Array
     """(B, K, 3) m/s^2"""
     covariance: Array
-    """(B, K, 15, 15) of the errors of :mod:`ssm_graph.filters.geodetic.error_model`"""
+    """(B, K, 15, 15) of the errors of :mod:`ssm_graph.filters.geodetic.mechanisation`"""
     weight: Array
-    """(B, K, 4) NaN where there is no beam, as in the two that follow"""
+    """(B, K, n) of n beams; NaN where there is none, as in the two that follow"""
     mahalanobis_sq: Array
-    """(B, K, 4) t at the posterior"""
+    """(B, K, n) t at the posterior"""
     innovation: Array
-    """(B, K, 4) measured minus predicted before the update, m/s"""
+    """(B, K, n) measured minus predicted before the update, m/s"""
     iterations: NDArray[np.intp]
     """(B, K) 0 where there is no beam"""
-
-
-class Posteriors(NamedTuple):
-    """One run in the package's own terms: see :mod:`ssm_graph.engine.error_state`."""
-
-    R_nb: Array
-    """(K, 3, 3)"""
-    p_n: Array
-    """(K, 3) m"""
-    v_n: Array
-    """(K, 3) m/s"""
-    bias: Array
-    """(K, 6) accelerometer m/s^2, gyro rad/s"""
-    covariance: Array
-    """(K, 15, 15)"""
 
 
 def run_geodetic(
@@ -148,27 +141,35 @@ def run_geodetic(
     """
     config = config or GeodeticConfig()
     samples, first = _merged(problems, imu, rate_hz=config.merge_rate_hz)
-    measurements = gather(problems)
+    measured = side_by_side(problems)
+    places = places_of(measured.fixes, [problem.frame for problem in problems])
     state, P = initial_moments(
         [problem.start for problem in problems],
         [problem.imu_noise_bias_sigma for problem in problems],
     )
     density = noise_densities([log.noise for log in imu], state)
     X = np.zeros((len(problems), ERROR_DIM))
-    recorder = _Recorder(len(problems), problems[0].n_keyframes)
+    steps: list[tuple[Array, ...]] = []
     track: Track | None = None
+    n_keyframes = problems[0].n_keyframes
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        for k in range(problems[0].n_keyframes):
+        for k in range(n_keyframes):
             if k > 0:
                 track = advance(state, Samples(*(a[:, first[k - 1] : first[k]] for a in samples)))
                 X, P = propagate(X, P, track, density)
                 state = track.end
-            X, P = _update(X, P, state, measurements, k, track, config, recorder)
+            nominal = nominal_rows(measured, places, k, state, track, X)
+            rows, has_beam = (
+                beam_rows(measured.beams, k, state),
+                np.isfinite(measured.beams.sigma[k]),
+            )
+            X, P, of_beams = _update(X, P, rows, has_beam, nominal, config)
             state, X, P = feed_back(state, X, P, config.feedback)
-            recorder.keep(k, state, X, P)
+            biases = state.gyro_bias + X[:, EPS], state.accel_bias + X[:, NABLA]
+            steps.append((*state[:5], *biases, P, *of_beams))
             if on_keyframe is not None:
-                on_keyframe(k + 1, problems[0].n_keyframes)
-    return recorder.history()
+                on_keyframe(k + 1, n_keyframes)
+    return GeodeticHistory(*(np.stack(column, axis=1) for column in zip(*steps, strict=True)))
 
 
 def _merged(
@@ -198,23 +199,21 @@ def _merged(
 def _update(
     X: Array,
     P: Array,
-    state: GeodeticState,
-    measurements: Measurements,
-    k: int,
-    track: Track | None,
+    rows: Rows,
+    has_beam: NDArray[np.bool_],
+    nominal: Rows | None,
     config: GeodeticConfig,
-    recorder: _Recorder,
-) -> tuple[Array, Array]:
-    """Correct by depth and fix, then by the beams; the order changes nothing but the work."""
-    rows = beam_rows(measurements.beams, k, state)
-    recorder.innovation[:, k] = (rows.H @ X[..., None])[..., 0] - rows.Z
-    nominal = nominal_rows(measurements, k, state, track, X)
+) -> tuple[Array, Array, tuple[Array, ...]]:
+    """Correct by depth and fix, then by the beams; the order changes nothing but the work.
+
+    Returns errors, covariance, and what :class:`GeodeticHistory` keeps of the beams.
+    """
+    innovation = np.where(has_beam, (rows.H @ X[..., None])[..., 0] - rows.Z, np.nan)
     if nominal is not None:
         X, P = correct(X, P, nominal)
-    has_beam = np.isfinite(measurements.beams.speed[:, k])
-    recorder.innovation[:, k][~has_beam] = np.nan
+    nothing = np.full(has_beam.shape, np.nan)
     if not has_beam.any():
-        return X, P
+        return X, P, (nothing, nothing, innovation, np.zeros(len(X), np.intp))
     settled = settle(
         X,
         P,
@@ -223,40 +222,13 @@ def _update(
         tolerance=config.tolerance,
         max_iterations=config.max_iterations,
     )
-    recorder.weight[:, k] = np.where(has_beam, settled.weight, np.nan)
-    recorder.mahalanobis_sq[:, k] = np.where(has_beam, settled.mahalanobis_sq, np.nan)
-    recorder.iterations[:, k] = np.where(has_beam.any(axis=1), settled.iterations, 0)
-    return settled.X, settled.P
+    found = (np.where(has_beam, own, np.nan) for own in (settled.weight, settled.mahalanobis_sq))
+    iterations = np.where(has_beam.any(axis=1), settled.iterations, 0)
+    return settled.X, settled.P, (*found, innovation, iterations)
 
 
-class _Recorder:
-    """Room for the history, filled keyframe by keyframe."""
-
-    def __init__(self, n_runs: int, n_keyframes: int) -> None:
-        shape = n_runs, n_keyframes
-        self.place = np.empty((3, *shape))
-        self.velocity_enu = np.empty((*shape, 3))
-        self.R_lb = np.empty((*shape, 3, 3))
-        self.gyro_bias, self.accel_bias = np.empty((2, *shape, 3))
-        self.covariance = np.empty((*shape, ERROR_DIM, ERROR_DIM))
-        self.weight, self.mahalanobis_sq, self.innovation = np.full((3, *shape, N_BEAMS), np.nan)
-        self.iterations = np.zeros(shape, np.intp)
-
-    def keep(self, k: int, state: GeodeticState, X: Array, P: Array) -> None:
-        self.place[..., k] = state.lat, state.lon, state.height
-        self.velocity_enu[:, k], self.R_lb[:, k] = state.velocity_enu, state.R_lb
-        self.gyro_bias[:, k] = state.gyro_bias + X[:, EPS]
-        self.accel_bias[:, k] = state.accel_bias + X[:, NABLA]
-        self.covariance[:, k] = P
-
-    def history(self) -> GeodeticHistory:
-        named = {name: array for name, array in vars(self).items() if name != "place"}
-        lat, lon, height = self.place
-        return GeodeticHistory(lat=lat, lon=lon, height=height, **named)
-
-
-def to_navigation(problem: Problem, history: GeodeticHistory, run: int) -> Posteriors:
-    """Return one run in the navigation frame of its problem, with its covariances.
+def to_navigation(problem: Problem, history: GeodeticHistory, run: int) -> StateHistory:
+    """Return one run (K, ...) in the navigation frame of its problem, with its covariances.
 
     Errors there are true relative to estimated, ``R_nb Exp(phi_b)``, ``p_n + R_nb dp_b``,
     ``v_n + dv_n``. With ``theta = (dlat, -dlon cos(lat), -dlon sin(lat))``, the turn from the
@@ -279,7 +251,7 @@ def to_navigation(problem: Problem, history: GeodeticHistory, run: int) -> Poste
     J[:, VELOCITY, DV] = -R_nl
     J[:, ACCEL_BIAS, NABLA] = np.eye(3)
     J[:, GYRO_BIAS, EPS] = np.eye(3)
-    return Posteriors(
+    return StateHistory(
         R_nb=R_nl @ R_lb,
         p_n=problem.frame.p_n_from_geodetic(lat, lon, height),
         v_n=(R_nl @ v_l[..., None])[..., 0],

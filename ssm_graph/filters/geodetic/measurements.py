@@ -1,7 +1,7 @@
-"""Measurements of the geodetic filter as linear rows ``Z = H X + noise``, computed minus measured.
+"""Measurements as rows ``Z = H X + noise``, and steps 5.1 to 5.5 of the paper that take them.
 
-Rows of many runs stand side by side; a row that a run does not have is all zeros with sigma 1 and
-changes nothing.
+Rows are computed minus measured. Those of R runs stand side by side; a row that a run does not have
+is all zeros and changes nothing.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.similarity import Kernel, expected_mahalanobis_sq
 from factors.so3 import cross, skew
 from ssm_graph.base.earth import LocalFrame
-from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
-from ssm_graph.filters.geodetic.error_model import (
+from ssm_graph.filters.geodetic.mechanisation import (
     DP,
     DV,
     EPS,
@@ -24,141 +24,49 @@ from ssm_graph.filters.geodetic.error_model import (
     HEIGHT,
     LAT,
     PHI,
+    GeodeticState,
+    Track,
+    earth_terms,
     enu_D_place,
 )
-from ssm_graph.filters.geodetic.mechanisation import GeodeticState, Track, earth_terms
-from ssm_graph.graph.aids.depth import Depths
-from ssm_graph.graph.aids.gnss import Fixes
-from ssm_graph.mission.bottom_track import require_bottom_track
-from ssm_graph.mission.problem import Beams, Problem
-from ssm_graph.sensors.dvl import N_BEAMS
+from ssm_graph.filters.side_by_side import BeamGrid, FixGrid, Measurements
 
 
 class Rows(NamedTuple):
     """Linearised measurements of one keyframe."""
 
     Z: Array
-    """(B, m) computed minus measured"""
+    """(R, m) computed minus measured"""
     H: Array
-    """(B, m, 15)"""
+    """(R, m, 15)"""
     sigma: Array
-    """(B, m) nominal standard deviation"""
+    """(R, m) nominal standard deviation, of missing rows 1"""
 
 
-class BeamGrid(NamedTuple):
-    """Beams at their keyframes; NaN speed where there is none."""
-
-    speed: Array
-    """(B, K, 4) m/s"""
-    sigma: Array
-    """(B, K, 4) m/s"""
-    gyro_b: Array
-    """(B, K, 4, 3) rad/s"""
-    beam_b: Array
-    """(B, K, 4, 3)"""
-    arm_b: Array
-    """(B, K, 4, 3) lever arm x beam, m"""
-
-
-class DepthGrid(NamedTuple):
-    """Depth readings at their keyframes, at most R each; NaN where there is none."""
-
-    depth: Array
-    """(B, K, R) m"""
-    before_s: Array
-    """(B, K, R) how long before the keyframe, s"""
-    sigma: Array
-    """(B,) m"""
-    lever_arm_b: Array
-    """(B, 3) m"""
-
-
-class FixGrid(NamedTuple):
-    """GNSS fixes at their keyframes; NaN where there is none."""
+class Places(NamedTuple):
+    """Position fixes in geodetic coordinates."""
 
     place: Array
-    """(B, K, 3) latitude, longitude, rad, height, m, of the antenna"""
+    """(K, R, 3) latitude, longitude, rad, height, m, of the antenna; NaN where there is none"""
     whitener: Array
-    """(B, K, 3, 3) ``W`` with ``W' W`` the information along east, north, up"""
+    """(K, R, 3, 3) ``W`` with ``W' W`` the information along east, north, up"""
     lever_arm_b: Array
-    """(B, 3) m"""
+    """(R, 3) m"""
 
 
-class Measurements(NamedTuple):
-    """All measurements of B runs."""
-
-    beams: BeamGrid
-    depths: DepthGrid
-    fixes: FixGrid
-
-
-def gather(problems: Sequence[Problem]) -> Measurements:
-    """Lay the measurements of runs with equally many keyframes side by side."""
-    for problem in problems:
-        require_bottom_track(problem)
-    n = problems[0].n_keyframes
-    widest = max((_most_per_keyframe(p.depths) for p in problems), default=0)
-    return Measurements(
-        beams=BeamGrid(*_stacked([_beam_grid(p.beams, n) for p in problems])),
-        depths=DepthGrid(*_stacked([_depth_grid(p, widest) for p in problems])),
-        fixes=FixGrid(*_stacked([_fix_grid(p.fixes, p.frame, n) for p in problems])),
-    )
-
-
-def _stacked(grids: Sequence[tuple[Array, ...]]) -> list[Array]:
-    return [np.stack(arrays) for arrays in zip(*grids, strict=True)]
-
-
-def _beam_grid(beams: Beams, n: int) -> tuple[Array, ...]:
-    _require_single("beam", beams.keyframe * N_BEAMS + beams.beam)
-    at = beams.keyframe, beams.beam
-    speed, sigma = np.full((n, N_BEAMS), np.nan), np.ones((n, N_BEAMS))
-    gyro_b, beam_b, arm_b = np.zeros((3, n, N_BEAMS, 3))
-    speed[at], sigma[at] = beams.speed, beams.sigma
-    gyro_b[at], beam_b[at] = beams.gyro_b, beams.beam_b
-    arm_b[at] = cross(beams.lever_arm_b, beams.beam_b)
-    return speed, sigma, gyro_b, beam_b, arm_b
-
-
-def _most_per_keyframe(depths: Depths | None) -> int:
-    return 0 if depths is None else int(np.max(np.bincount(depths.keyframe), initial=0))
-
-
-def _depth_grid(problem: Problem, widest: int) -> tuple[Array, ...]:
-    depths, n = problem.depths, problem.n_keyframes
-    depth, before_s = np.full((2, n, widest), np.nan)
-    if depths is None:
-        return depth, before_s, np.ones(()), np.zeros(3)
-    count = np.bincount(depths.keyframe, minlength=n)
-    column = np.arange(len(depths.depth)) - np.repeat(np.cumsum(count) - count, count)
-    at = depths.keyframe, column
-    depth[at] = depths.depth
-    before_s[at] = problem.keyframe_s[depths.keyframe] - depths.time_s
-    return depth, before_s, np.asarray(depths.sigma), depths.lever_arm_b
-
-
-def _fix_grid(fixes: Fixes | None, frame: LocalFrame, n: int) -> tuple[Array, ...]:
-    place, whitener = np.full((n, 3), np.nan), np.zeros((n, 3, 3))
-    if fixes is None:
-        return place, whitener, np.zeros(3)
-    _require_single("GNSS fix", fixes.keyframe)
-    place[fixes.keyframe] = np.stack(frame.geodetic_from_p_n(fixes.position_n), axis=-1)
-    R_nl = frame.R_nl_at(fixes.position_n)
-    covariance_l = np.swapaxes(R_nl, 1, 2) @ fixes.covariance_n @ R_nl
-    whitener[fixes.keyframe] = np.linalg.inv(np.linalg.cholesky(covariance_l))
-    return place, whitener, fixes.lever_arm_b
-
-
-def _require_single(what: str, slot: NDArray[np.intp]) -> None:
-    if len(np.unique(slot)) < len(slot):
-        raise DataError(
-            f"two readings of one {what} share a keyframe: expected at most one; drop readings "
-            "less than 2 ms apart"
-        )
+def places_of(fixes: FixGrid, frames: Sequence[LocalFrame]) -> Places:
+    """Return fixes in geodetic coordinates, each run's by the navigation frame of its problem."""
+    place, whitener = np.full(fixes.position_n.shape, np.nan), fixes.root_information.copy()
+    for run, frame in enumerate(frames):
+        used = fixes.root_information[:, run].any(axis=(1, 2))
+        position_n = fixes.position_n[used, run]
+        place[used, run] = np.stack(frame.geodetic_from_p_n(position_n), axis=-1)
+        whitener[used, run] = whitener[used, run] @ frame.R_nl_at(position_n)
+    return Places(place, whitener, fixes.lever_arm_b)
 
 
 def beam_rows(grid: BeamGrid, k: int, state: GeodeticState) -> Rows:
-    """Return the four beams of a keyframe, each a scalar measurement of its own.
+    """Return the B beams of a keyframe, each a scalar measurement of its own.
 
     With ``a`` the beam and ``m`` the lever arm x beam, both turned into local axes, and the drift
     ``eps`` that is still in the gyro reading (eqs. 19 to 24 of the paper, with lever arm)::
@@ -166,48 +74,50 @@ def beam_rows(grid: BeamGrid, k: int, state: GeodeticState) -> Rows:
         h = a . v + m_b . gyro_b - m . w_ie
         H = [v x a - w_ie x m,  a,  -m . d w_ie/d lat,  m_b,  0]
     """
-    turn = np.swapaxes(state.R_lb, 1, 2)
-    beam, arm, arm_b = grid.beam_b[:, k] @ turn, grid.arm_b[:, k] @ turn, grid.arm_b[:, k]
+    turn, has = np.swapaxes(state.R_lb, 1, 2), np.isfinite(grid.sigma[k])
+    arm_b = cross(grid.lever_arm_b[:, None], grid.beam_b[k])
+    beam, arm = grid.beam_b[k] @ turn, arm_b @ turn
     omega_ie = earth_terms(state).omega_ie[:, None]
-    v = state.velocity_enu[:, None]
-    speed = grid.speed[:, k]
-    has = np.isfinite(speed)
-    gyro_b = grid.gyro_b[:, k] - state.gyro_bias[:, None]
+    v, gyro_b = state.velocity_enu[:, None], (grid.gyro_b[k] - state.gyro_bias)[:, None]
     computed = (beam * v + arm_b * gyro_b - arm * omega_ie).sum(axis=-1)
-    H = np.zeros((*speed.shape, ERROR_DIM))
+    H = np.zeros((*has.shape, ERROR_DIM))
     H[..., PHI] = cross(v, beam) - cross(omega_ie, arm)
     H[..., DV] = beam
     H[..., LAT] = arm[..., 1] * omega_ie[..., 2] - arm[..., 2] * omega_ie[..., 1]
     H[..., EPS] = arm_b
-    return Rows(np.where(has, computed - speed, 0.0), H, grid.sigma[:, k])
+    return Rows(np.where(has, computed - grid.speed[k], 0.0), H, np.where(has, grid.sigma[k], 1.0))
 
 
 def nominal_rows(
-    measurements: Measurements, k: int, state: GeodeticState, track: Track | None, X: Array
+    measured: Measurements,
+    places: Places,
+    k: int,
+    state: GeodeticState,
+    track: Track | None,
+    X: Array,
 ) -> Rows | None:
     """Return depth and fix of a keyframe, four rows; None where no run has either.
 
     Parameters
     ----------
-    measurements : of all keyframes.
+    measured, places : of all keyframes.
     k : keyframe.
     state : as mechanised, at the keyframe.
     track : the interval that ends there; None at the first keyframe.
-    X : (B, 15) predicted errors at the keyframe.
+    X : (R, 15) predicted errors at the keyframe.
     """
-    has_depth = np.isfinite(measurements.depths.depth[:, k]).any()
-    has_fix = np.isfinite(measurements.fixes.place[:, k]).any()
-    if not (has_depth or has_fix):
+    rows = []
+    if np.isfinite(measured.depths.depth[k]).any():
+        rows.append(_depth_row(measured, k, state, track, X))
+    if np.isfinite(places.place[k]).any():
+        rows.append(_fix_rows(places, k, state))
+    if not rows:
         return None
-    rows = [
-        *([_depth_row(measurements.depths, k, state, track, X)] if has_depth else []),
-        *([_fix_rows(measurements.fixes, k, state)] if has_fix else []),
-    ]
     return Rows(*(np.concatenate(arrays, axis=1) for arrays in zip(*rows, strict=True)))
 
 
 def _depth_row(
-    grid: DepthGrid, k: int, state: GeodeticState, track: Track | None, X: Array
+    measured: Measurements, k: int, state: GeodeticState, track: Track | None, X: Array
 ) -> Rows:
     """Return the mean of the readings since the last keyframe, carried to this one.
 
@@ -217,7 +127,8 @@ def _depth_row(
 
         Z = mean(h(t_i) + depth_i + dh (1 - (t_i / T)^2)),   H = dh - (phi x lever arm) . up
     """
-    depth, before_s = grid.depth[:, k], grid.before_s[:, k]
+    grid = measured.depths
+    depth, before_s = grid.depth[k], measured.keyframe_s[k, :, None] - grid.time_s[k]
     lever_l = (state.R_lb @ grid.lever_arm_b[..., None])[..., 0]
     height = (state.height + lever_l[:, 2])[:, None]
     grown = np.zeros_like(depth)
@@ -228,16 +139,16 @@ def _depth_row(
         time_s = np.clip(span - np.nan_to_num(before_s), 0.0, span)
         height = _interpolated(track.elapsed_s, track.height + lever_up, time_s)
         grown = X[:, HEIGHT, None] * (1.0 - (time_s / span) ** 2)
-    has = np.isfinite(depth)
-    count = has.sum(axis=1)
-    total = np.where(has, height + depth + grown, 0.0).sum(axis=1)
+    is_read = np.isfinite(depth)
+    count = is_read.sum(axis=1)
+    has, divisor = count > 0, np.maximum(count, 1)
     H = np.zeros((len(depth), 1, ERROR_DIM))
-    H[:, 0, HEIGHT] = count > 0
+    H[:, 0, HEIGHT] = has
     # e_up x lever arm
-    H[:, 0, 0] = np.where(count > 0, -lever_l[:, 1], 0.0)
-    H[:, 0, 1] = np.where(count > 0, lever_l[:, 0], 0.0)
-    Z = total / np.maximum(count, 1)
-    sigma = np.where(count > 0, grid.sigma / np.sqrt(np.maximum(count, 1)), 1.0)
+    H[:, 0, 0] = np.where(has, -lever_l[:, 1], 0.0)
+    H[:, 0, 1] = np.where(has, lever_l[:, 0], 0.0)
+    Z = np.where(is_read, height + depth + grown, 0.0).sum(axis=1) / divisor
+    sigma = np.where(has, grid.sigma / np.sqrt(divisor), 1.0)
     return Rows(Z[:, None], H, sigma[:, None])
 
 
@@ -250,9 +161,9 @@ def _interpolated(nodes: Array, values: Array, at: Array) -> Array:
     return np.asarray(y_0 + (y_1 - y_0) * (at - x_0) / (x_1 - x_0))
 
 
-def _fix_rows(grid: FixGrid, k: int, state: GeodeticState) -> Rows:
+def _fix_rows(grid: Places, k: int, state: GeodeticState) -> Rows:
     """Return a fix as three whitened rows: ``W (place computed - place measured + lever arm)``."""
-    place, W = grid.place[:, k], grid.whitener[:, k]
+    place, W = grid.place[k], grid.whitener[k]
     lever_l = (state.R_lb @ grid.lever_arm_b[..., None])[..., 0]
     computed = np.stack([state.lat, state.lon, state.height], axis=-1)
     off = np.where(np.isfinite(place), computed - place, 0.0)
@@ -262,3 +173,96 @@ def _fix_rows(grid: FixGrid, k: int, state: GeodeticState) -> Rows:
     H[:, :, DP] = W @ D
     Z = (W @ ((D @ off[..., None]) + lever_l[..., None]))[..., 0]
     return Rows(Z, H, np.ones_like(Z))
+
+
+class Settled(NamedTuple):
+    """The posterior of one keyframe and the beams' part in it, B runs."""
+
+    X: Array
+    """(B, 15)"""
+    P: Array
+    """(B, 15, 15)"""
+    weight: Array
+    """(B, m) the auxiliary parameters, as in the last gain"""
+    mahalanobis_sq: Array
+    """(B, m) t at the posterior"""
+    iterations: NDArray[np.intp]
+    """(B,)"""
+
+
+def correct(X: Array, P: Array, rows: Rows) -> tuple[Array, Array]:
+    """Return errors and covariance after measurements with their nominal noise."""
+    return _gained(X, P, rows, rows.sigma**2)
+
+
+def _gained(X: Array, P: Array, rows: Rows, variance: Array) -> tuple[Array, Array]:
+    """Kalman gain, state, and covariance in Joseph's form."""
+    H = rows.H
+    PHt = P @ np.swapaxes(H, 1, 2)
+    K = PHt @ np.linalg.inv(_with_diagonal(H @ PHt, variance))
+    innovation = rows.Z - (H @ X[..., None])[..., 0]
+    A = np.eye(X.shape[1]) - K @ H
+    P = A @ P @ np.swapaxes(A, 1, 2) + (K * variance[:, None]) @ np.swapaxes(K, 1, 2)
+    P = 0.5 * (P + np.swapaxes(P, 1, 2))
+    return X + (K @ innovation[..., None])[..., 0], P
+
+
+def settle(
+    X: Array, P: Array, rows: Rows, *, kernel: Kernel, tolerance: float, max_iterations: int
+) -> Settled:
+    """Correct by beams whose noise variances adapt to their agreement, each for itself.
+
+    From the prediction, ``X^0 = X-`` and ``P^0 = P-``, all beams jointly, for t = 0, 1, ...::
+
+        lambda_j = -2 f'(((Z_j - H_j X^t)^2 + H_j P^t H_j') / sigma_j^2)
+        K        = P- H' (H P- H' + diag(sigma_j^2 / lambda_j))^-1
+        X^(t+1)  = X- + K (Z - H X-)
+        P^(t+1)  = (I - K H) P- (I - K H)' + K diag(sigma_j^2 / lambda_j) K'
+
+    until ``|X^(t+1) - X^t| <= tolerance |X^(t+1)|``, every error in its own predicted sigma: the
+    paper's norm would add radians and metres.  The iteration itself needs ``H X`` and ``H P H'``
+    only; the covariance follows once at its end. Runs end each at its own time.
+    """
+    H, sigma_sq = rows.H, rows.sigma**2
+    PHt = P @ np.swapaxes(H, 1, 2)
+    spread = H @ PHt
+    innovation = rows.Z - (H @ X[..., None])[..., 0]
+    unit = np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), np.finfo(float).tiny))
+    scaled_PHt = PHt / unit[..., None]
+    prior = X / unit
+    previous = prior.copy()
+    error, variance_left = innovation.copy(), np.diagonal(spread, axis1=1, axis2=2).copy()
+    weight = np.ones_like(rows.Z)
+    iterations = np.zeros(len(X), np.intp)
+    going = np.arange(len(X))
+    while len(going):
+        t = expected_mahalanobis_sq(error[going], variance_left[going], sigma=rows.sigma[going])
+        weight[going] = kernel.weight(t)
+        S = _with_diagonal(spread[going], sigma_sq[going] / weight[going])
+        gain: Array = np.asarray(np.linalg.inv(S))
+        corrected = prior[going] + _times(scaled_PHt[going], _times(gain, innovation[going]))
+        gain = spread[going] @ gain
+        error[going] = innovation[going] - _times(gain, innovation[going])
+        left = (gain * spread[going]).sum(axis=-1)
+        variance_left[going] = np.diagonal(spread[going], axis1=1, axis2=2) - left
+        np.maximum(variance_left, 0.0, out=variance_left)
+        iterations[going] += 1
+        change = np.linalg.norm(corrected - previous[going], axis=1)
+        previous[going] = corrected
+        more = change > tolerance * np.linalg.norm(corrected, axis=1)
+        going = going[more & (iterations[going] < max_iterations)]
+    t = expected_mahalanobis_sq(error, variance_left, sigma=rows.sigma)
+    X, P = _gained(X, P, rows, sigma_sq / weight)
+    return Settled(X, P, weight, t, iterations)
+
+
+def _with_diagonal(matrix: Array, added: Array) -> Array:
+    """Return a copy of (B, m, m) with (B, m) added to its diagonals."""
+    result = matrix.copy()
+    diagonal = np.arange(added.shape[1])
+    result[:, diagonal, diagonal] += added
+    return result
+
+
+def _times(matrix: Array, vector: Array) -> Array:
+    return np.asarray((matrix @ vector[..., None])[..., 0])

@@ -1,31 +1,39 @@
-"""The navigation filter: predict with the inertial sensors, correct by one update rule.
+"""The navigation filter: predict with the inertial sensors, correct by one update rule, smooth.
 
 Any rule of the literature goes in; the process and the measurements are the same for all, and the
 same as the graph's. With :class:`SsmUpdate` and a group for every beam it is the filter of [1]_.
+A pass backwards [2]_ may follow the history of any of them.
+
+Shapes: K keyframes, R runs, B beams.
 
 References
 ----------
 .. [1] Xu et al., "Combined navigation robust filtering method based on statistical similarity
    measurement", 2021, steps 5.1 to 5.5.
+.. [2] H. E. Rauch, F. Tung, C. T. Striebel, "Maximum likelihood estimates of linear dynamic
+   systems", AIAA Journal 3, 1965.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import VELOCITY
 from ssm_graph.engine.states import NavigationStates
-from ssm_graph.filters.navigation.history import FilterHistory
 from ssm_graph.filters.navigation.measurements import KeyframeModel
-from ssm_graph.filters.navigation.stack import Stack, stack_problems
-from ssm_graph.filters.rules.model import Update, UpdateRule
-from ssm_graph.mission.estimate import OnKeyframe
-from ssm_graph.mission.problem import Problem
-from ssm_graph.sensors.dvl import N_BEAMS
+from ssm_graph.filters.navigation.process import Process
+from ssm_graph.filters.rules.update import UpdateRule
+from ssm_graph.filters.side_by_side import require_alike, side_by_side
+from ssm_graph.mission.estimate import Estimate, OnKeyframe
+from ssm_graph.mission.problem import Problem, start_of
+from ssm_graph.mission.recursive import RecursiveBeams, recursive_estimate
 
 RUNAWAY_SIGMA = 1e4
 """m/s; a filter this uncertain of its velocity has run away."""
@@ -37,11 +45,52 @@ class Grouping(Enum):
     PER_BEAM = "one for every beam"
     PER_PING = "one for the whole ping"
 
-    @property
-    def groups(self) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-        """(4,) group of each beam."""
+    def groups(self, n_beams: int) -> NDArray[np.intp]:
+        """Return the group of each beam, (B,)."""
         per_beam = self is Grouping.PER_BEAM
-        return np.arange(N_BEAMS) if per_beam else np.zeros(N_BEAMS, dtype=np.intp)
+        return np.arange(n_beams) if per_beam else np.zeros(n_beams, dtype=np.intp)
+
+
+class StateHistory(NamedTuple):
+    """States of R runs at K keyframes with covariances in their own error states."""
+
+    R_nb: Array
+    """(K, R, 3, 3)"""
+    p_n: Array
+    """(K, R, 3) m"""
+    v_n: Array
+    """(K, R, 3) m/s"""
+    bias: Array
+    """(K, R, 6) accelerometer m/s^2, gyro rad/s"""
+    covariance: Array
+    """(K, R, 15, 15)"""
+
+    @classmethod
+    def of(cls, steps: Sequence[tuple[NavigationStates, Array]]) -> StateHistory:
+        """Return the history of states and covariances keyframe by keyframe."""
+        return cls(*_stacked([(*states, covariance) for states, covariance in steps]))
+
+    def at(self, k: int) -> NavigationStates:
+        """Return the states of keyframe ``k``."""
+        return NavigationStates(*(column[k] for column in self[:4]))
+
+
+class FilterHistory(NamedTuple):
+    """All that a filter found out on its way."""
+
+    posterior: StateHistory
+    """NaN from where a run has run away"""
+    predicted: StateHistory
+    transition: Array
+    """(K - 1, R, 15, 15) of the error state from keyframe to keyframe."""
+    innovation: Array
+    """(K, R, B) m/s, measured minus predicted before the update; NaN without a beam."""
+    mahalanobis_sq: Array
+    """(K, R, B)"""
+    weight: Array
+    """(K, R, B) 1 = nominal"""
+    n_iterations: Array
+    """(K, R)"""
 
 
 def run_filter(
@@ -51,45 +100,73 @@ def run_filter(
     grouping: Grouping,
     on_keyframe: OnKeyframe | None = None,
 ) -> FilterHistory:
-    """Filter B runs side by side.
+    """Filter R runs side by side.
 
     Parameters
     ----------
-    problems : with equal numbers of keyframes, one navigation frame, and the same kinds of aids.
+    problems : with equal numbers of keyframes and beams, one navigation frame, and the same kinds
+        of aids.
     rule : how a ping corrects the prediction.
     grouping : which beams the rule takes as one measurement.
     on_keyframe : called after each keyframe.
+
+    Raises
+    ------
+    ConfigError
+        If the problems differ in shape: filter them one by one.
     """
+    require_alike(
+        problems,
+        {
+            "depth sensor, or none": lambda p: "none" if p.depths is None else "one",
+            "GNSS, or none": lambda p: "none" if p.fixes is None else "one",
+        },
+    )
+    if any(problem.frame != problems[0].frame for problem in problems):
+        raise ConfigError(
+            f"runs side by side: expected one navigation frame of all {len(problems)}; filter them "
+            "one by one"
+        )
     # A run that overflows is found by what comes of it, and is no reason to warn.
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        return _Filter(stack_problems(problems), rule, grouping).run(on_keyframe)
+        return _Filter(problems, rule, grouping).run(on_keyframe)
 
 
 class _Filter:
-    def __init__(self, stack: Stack, rule: UpdateRule, grouping: Grouping) -> None:
-        self._stack, self._rule, self._groups = stack, rule, grouping.groups
-        self._lost = np.zeros(len(stack.problems), dtype=bool)
+    def __init__(self, problems: Sequence[Problem], rule: UpdateRule, grouping: Grouping) -> None:
+        self._rule, self._frame = rule, problems[0].frame
+        self._measured = side_by_side(problems)
+        self._groups = grouping.groups(self._measured.beams.speed.shape[2])
+        self._process = Process([p.chain.intervals for p in problems], self._frame)
+        starts = [start_of(p) for p in problems]
+        self._start = NavigationStates(*(np.array([s[i] for s in starts]) for i in range(4)))
+        self._start_cov = np.array([s.covariance for s in starts])
+        self._lost = np.zeros(len(problems), dtype=bool)
 
     def run(self, on_keyframe: OnKeyframe | None) -> FilterHistory:
-        stack = self._stack
-        n_keyframes = stack.n_keyframes
-        history = FilterHistory.empty(n_keyframes, len(self._lost))
-        predicted, covariance = stack.start, stack.start_cov
+        n_keyframes = len(self._measured.keyframe_s)
+        predictions, posteriors, transitions, beams = [], [], [], []
+        predicted, covariance = self._start, self._start_cov
         states = None
         for k in range(n_keyframes):
             if states is not None:
-                prediction = stack.process.predict(k - 1, states)
-                predicted, F = prediction.states, prediction.transition
-                covariance = F @ covariance @ np.swapaxes(F, 1, 2) + prediction.process_cov
-                history.transition[k - 1] = F
-            history.predicted.put(k, predicted, covariance)
-            states, covariance = self._correct(k, predicted, covariance, states, history)
+                predicted, F, process_cov = self._process.predict(k - 1, states)
+                covariance = F @ covariance @ np.swapaxes(F, 1, 2) + process_cov
+                transitions.append(F)
+            predictions.append((predicted, covariance))
+            states, covariance, of_beams = self._correct(k, predicted, covariance, states)
             states, covariance = self._without_lost(states, covariance)
-            history.posterior.put(k, states, covariance)
-            history.posterior.lose(k, self._lost)
+            kept = [_where(self._lost, np.nan, own) for own in (*states, covariance)]
+            posteriors.append((NavigationStates(*kept[:4]), kept[4]))
+            beams.append(of_beams)
             if on_keyframe is not None:
                 on_keyframe(k + 1, n_keyframes)
-        return history
+        return FilterHistory(
+            StateHistory.of(posteriors),
+            StateHistory.of(predictions),
+            np.array(transitions),
+            *_stacked(beams),
+        )
 
     def _without_lost(
         self, states: NavigationStates, covariance: Array
@@ -104,36 +181,103 @@ class _Filter:
         self._lost |= ~np.all(np.isfinite(states.p_n + states.v_n), axis=1)
         if not np.any(self._lost):
             return states, covariance
-        self._stack.silence(self._lost)
-        columns = (
-            np.where(self._lost.reshape(-1, *(1,) * (own.ndim - 1)), start, own)
-            for own, start in zip(states, self._stack.start, strict=True)
-        )
-        kept = np.where(self._lost[:, None, None], self._stack.start_cov, covariance)
-        return NavigationStates(*columns), kept
+        self._measured.silence(self._lost)
+        pairs = zip(self._start, states, strict=True)
+        kept = NavigationStates(*(_where(self._lost, start, own) for start, own in pairs))
+        return kept, _where(self._lost, self._start_cov, covariance)
 
     def _correct(
-        self,
-        k: int,
-        predicted: NavigationStates,
-        covariance: Array,
-        before: NavigationStates | None,
-        history: FilterHistory,
-    ) -> tuple[NavigationStates, Array]:
-        model = KeyframeModel(self._stack, k, predicted, beam_groups=self._groups, before=before)
+        self, k: int, predicted: NavigationStates, P: Array, before: NavigationStates | None
+    ) -> tuple[NavigationStates, Array, tuple[Array, ...]]:
+        """Return states, covariances, and what :class:`FilterHistory` keeps of the beams."""
+        model = KeyframeModel(
+            self._measured,
+            k,
+            predicted,
+            frame=self._frame,
+            beam_groups=self._groups,
+            before=before,
+        )
+        present = model.present[:, : model.n_beams]
+        nothing = np.full(present.shape, np.nan)
         if not np.any(model.present):
-            return predicted, covariance
-        update = self._rule(covariance, model)
-        self._keep_beams(k, model, update, history)
-        return predicted.displaced(update.xi), update.covariance
+            return predicted, P, (nothing, nothing, nothing, np.zeros(len(P)))
+        update = self._rule(P, model)
+        own = (update.mahalanobis_sq, update.weights)
+        found = (np.where(present, rows[:, : model.n_beams], np.nan) for rows in own)
+        of_beams = (model.beam_innovations(), *found, update.n_iterations)
+        return predicted.displaced(update.xi), update.covariance, of_beams
 
-    def _keep_beams(
-        self, k: int, model: KeyframeModel, update: Update, history: FilterHistory
-    ) -> None:
-        root_information = self._stack.beams.root_information[k]
-        present = model.present[:, :N_BEAMS]
-        scale = np.where(present, root_information, np.nan)
-        history.innovation[k] = model.predicted.innovation[:, :N_BEAMS] / scale
-        history.mahalanobis_sq[k] = np.where(present, update.mahalanobis_sq[:, :N_BEAMS], np.nan)
-        history.weight[k] = np.where(present, update.weights[:, :N_BEAMS], np.nan)
-        history.n_iterations[k] = update.n_iterations
+
+def _stacked(steps: Sequence[tuple[Array, ...]]) -> list[Array]:
+    """Return the columns of K steps, (K, ...) each."""
+    return [np.stack(column) for column in zip(*steps, strict=True)]
+
+
+def _where(runs: NDArray[np.bool_], one: Array | float, other: Array) -> Array:
+    """Return ``one`` for some runs (R,) and ``other`` (R, ...) for the rest."""
+    return np.where(runs.reshape(-1, *(1,) * (other.ndim - 1)), one, other)
+
+
+def smooth_history(history: FilterHistory) -> StateHistory:
+    """Return the states given all measurements, by one pass backwards in time [2]_.
+
+    Error states of successive keyframes are related by the filter's own transitions; what the
+    smoothed states differ from the predicted ones goes back through the gain ``P F' P_pred^-1``.
+    """
+    posterior, predicted = history.posterior, history.predicted
+    last = len(posterior.p_n) - 1
+    states, covariance = posterior.at(last), posterior.covariance[last]
+    smoothed = [(states, covariance)]
+    for k in range(last - 1, -1, -1):
+        gain = _gain(posterior.covariance[k], history.transition[k], predicted.covariance[k + 1])
+        missed = predicted.at(k + 1).deviation_of(states)
+        states = posterior.at(k).displaced((gain @ missed[..., None])[..., 0])
+        change = covariance - predicted.covariance[k + 1]
+        covariance = posterior.covariance[k] + gain @ change @ np.swapaxes(gain, 1, 2)
+        covariance = 0.5 * (covariance + np.swapaxes(covariance, 1, 2))
+        smoothed.append((states, covariance))
+    return StateHistory.of(smoothed[::-1])
+
+
+def _gain(posterior: Array, transition: Array, predicted: Array) -> Array:
+    """Return ``P F' P_pred^-1`` (R, 15, 15), solved in correlation form."""
+    scale = np.sqrt(np.diagonal(predicted, axis1=1, axis2=2))
+    correlation = predicted / (scale[:, :, None] * scale[:, None, :])
+    cross = transition @ posterior / scale[:, :, None]
+    return np.swapaxes(np.linalg.solve(correlation, cross) / scale[:, :, None], 1, 2)
+
+
+def estimates_from_history(
+    problems: Sequence[Problem],
+    history: FilterHistory,
+    states: StateHistory,
+    *,
+    method: str,
+    kernel: str,
+    wall_s: float,
+) -> list[Estimate]:
+    """Return the estimate of every run; ``states`` are the posterior or smoothed ones.
+
+    Smoothed states have innovations of their own; squared lengths and weights stay the filter's.
+    """
+    estimates, is_smoothed = [], states is not history.posterior
+    for run, problem in enumerate(problems):
+        at = problem.beams.keyframe, run, problem.beams.beam
+        estimates.append(
+            recursive_estimate(
+                problem,
+                NavigationStates(*(column[:, run] for column in states[:4])),
+                states.covariance[:, run],
+                RecursiveBeams(
+                    None if is_smoothed else history.innovation[at],
+                    history.mahalanobis_sq[at],
+                    history.weight[at],
+                ),
+                history.n_iterations[:, run],
+                method=method,
+                kernel=kernel,
+                wall_s=wall_s,
+            )
+        )
+    return estimates

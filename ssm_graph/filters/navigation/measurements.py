@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import final
+from typing import NamedTuple, final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from factors.dvl_beam import beam_residual
 from factors.so3 import cross
+from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import GYRO_BIAS, POSITION, ROTATION, STATE_DIM, VELOCITY
 from ssm_graph.engine.states import NavigationStates, local_D_deviation
-from ssm_graph.filters.navigation.stack import Stack
-from ssm_graph.filters.rules.model import NOMINAL, Iterate, Runs
+from ssm_graph.filters.rules.update import NOMINAL, Iterate, Runs
+from ssm_graph.filters.side_by_side import Measurements
 from ssm_graph.graph.aids.heights import HeightTrack, height_on_the_way, height_track
-from ssm_graph.sensors.dvl import N_BEAMS
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,42 +28,49 @@ class NavigationIterate(Iterate):
     def take(self, kept: NDArray[np.bool_]) -> NavigationIterate:
         """Return the iterate of some runs."""
         base = Iterate.take(self, kept)
-        return NavigationIterate(
-            base.xi,
-            base.innovation,
-            base.jacobian,
-            base.local_D_xi,
-            states=self.states.take(kept),
-        )
+        own = base.xi, base.innovation, base.jacobian, base.local_D_xi
+        return NavigationIterate(*own, states=self.states.take(kept))
 
 
 @final
 class KeyframeModel:
-    """Beams, depth and GNSS of keyframe ``k``, about the predicted states of B runs.
+    """Beams, depth and position fix of keyframe ``k``, about the predicted states of R runs.
 
-    Rows are the four beams, then the depth, then three of GNSS, as far as the keyframe has them.
+    Rows are the B beams, then the depth, then three of the fix, as far as the keyframe has them.
+
+    Parameters
+    ----------
+    measured : of all keyframes.
+    k : the keyframe.
+    predicted : its states.
+    frame : of navigation.
+    beam_groups : (B,) which beams share an auxiliary parameter.
+    before : states at the keyframe before, None at the first.
     """
 
     def __init__(
         self,
-        stack: Stack,
+        measured: Measurements,
         k: int,
         predicted: NavigationStates,
         *,
+        frame: LocalFrame,
         beam_groups: NDArray[np.intp],
         before: NavigationStates | None,
     ) -> None:
-        self._stack, self._k, self._predicted = stack, k, predicted
-        has_beam = stack.beams.root_information[k] > 0.0
-        present, groups = [has_beam], [beam_groups]
-        self._depth = _DepthRow(stack, k, predicted, before) if _has_depth(stack, k) else None
-        if self._depth is not None:
+        self._measured, self._frame, self._k, self._predicted = measured, frame, k, predicted
+        self._root_information = 1.0 / measured.beams.sigma[k]
+        self.n_beams = len(beam_groups)
+        """B, how many of the rows are beams"""
+        present, groups = [self._root_information > 0.0], [beam_groups]
+        self._depth: _DepthRow | None = None
+        if np.any(np.isfinite(measured.depths.depth[k])):
+            self._depth = _depth_row(measured, k, predicted, before, frame)
             present.append(self._depth.root_information[:, None] > 0.0)
             groups.append(np.array([NOMINAL]))
-        self._has_fix = stack.fixes is not None and bool(np.any(stack.fixes.root_information[k]))
+        has_fix = measured.fixes.root_information[k].any(axis=(1, 2))
+        self._has_fix = bool(np.any(has_fix))
         if self._has_fix:
-            assert stack.fixes is not None
-            has_fix = stack.fixes.root_information[k].any(axis=(1, 2))
             present.append(np.repeat(has_fix[:, None], 3, axis=1))
             groups.append(np.full(3, NOMINAL))
         self.present = np.concatenate(present, axis=1)
@@ -86,13 +93,18 @@ class KeyframeModel:
         xi = self._predicted.take(runs).deviation_of(states)
         return self._at(states, xi, runs, local_D_deviation(xi))
 
+    def beam_innovations(self) -> Array:
+        """Return measured minus predicted beam speeds (R, B) before the update, m/s, or NaN."""
+        present = self.present[:, : self.n_beams]
+        scale = np.where(present, self._root_information, np.nan)
+        return np.asarray(self.predicted.innovation[:, : self.n_beams] / scale)
+
     def _at(
         self, states: NavigationStates, xi: Array, runs: Runs, local_D_xi: Array | None
     ) -> NavigationIterate:
-        n_rows = len(self.group)
+        n_rows, end = len(self.group), self.n_beams
         innovation, jacobian = np.zeros((len(runs), n_rows)), np.zeros((len(runs), n_rows, 15))
-        self._beam_rows(states, runs, innovation, jacobian)
-        end = N_BEAMS
+        self._beam_rows(states, runs, innovation[:, :end], jacobian[:, :end])
         if self._depth is not None:
             self._depth.fill(states, runs, innovation[:, end], jacobian[:, end])
             end += 1
@@ -103,91 +115,90 @@ class KeyframeModel:
     def _beam_rows(
         self, states: NavigationStates, runs: Runs, innovation: Array, jacobian: Array
     ) -> None:
-        beams = self._stack.beams
+        beams = self._measured.beams
         residual = beam_residual(
             states.R_nb[:, None],
             states.v_n[:, None],
             states.bias[:, None, 3:],
             speed=beams.speed[self._k, runs],
-            gyro_b=beams.gyro_b[self._k, runs],
-            beam_b=beams.beam_b[runs],
-            lever_arm_b=beams.lever_arm_b[runs],
-            omega_ie_n=beams.omega_ie_n,
+            gyro_b=beams.gyro_b[self._k, runs, None],
+            beam_b=beams.beam_b[self._k, runs],
+            lever_arm_b=beams.lever_arm_b[runs, None],
+            omega_ie_n=self._frame.omega_ie_n,
         )
-        scale = beams.root_information[self._k, runs]
-        innovation[:, :N_BEAMS] = -scale * residual.error
-        rows, scale = jacobian[:, :N_BEAMS], scale[..., None]
-        rows[..., ROTATION] = scale * residual.error_D_rotation
-        rows[..., VELOCITY] = scale * residual.error_D_velocity_n
-        rows[..., GYRO_BIAS] = scale * residual.error_D_gyro_bias
+        scale = self._root_information[runs]
+        innovation[...] = -scale * residual.error
+        jacobian[..., ROTATION] = scale[..., None] * residual.error_D_rotation
+        jacobian[..., VELOCITY] = scale[..., None] * residual.error_D_velocity_n
+        jacobian[..., GYRO_BIAS] = scale[..., None] * residual.error_D_gyro_bias
 
     def _fix_rows(
         self, states: NavigationStates, runs: Runs, innovation: Array, jacobian: Array
     ) -> None:
-        fixes = self._stack.fixes
-        assert fixes is not None
+        fixes = self._measured.fixes
         root, lever = fixes.root_information[self._k, runs], fixes.lever_arm_b[runs]
-        antenna = states.p_n + (states.R_nb @ lever[..., None])[..., 0]
-        missed = fixes.position_n[self._k, runs] - antenna
+        missed = fixes.position_n[self._k, runs] - _sensor(states, lever)
         innovation[...] = (root @ missed[..., None])[..., 0]
         jacobian[..., ROTATION] = root @ cross(lever[:, None], states.R_nb)
         jacobian[..., POSITION] = root @ states.R_nb
 
 
-def _has_depth(stack: Stack, k: int) -> bool:
-    return stack.depths is not None and bool(np.any(stack.depths.counts[k]))
-
-
-class _DepthRow:
+class _DepthRow(NamedTuple):
     """The mean of the depth readings since the last keyframe, carried to this one."""
 
-    def __init__(
-        self, stack: Stack, k: int, predicted: NavigationStates, before: NavigationStates | None
-    ) -> None:
-        assert stack.depths is not None
-        depths = stack.depths
-        end = _track(stack, k, predicted)
-        counts, height = depths.counts[k], depths.height[k]
-        too_low = height - end.height[:, None]
-        if before is not None:
-            too_low = height - height_on_the_way(
-                _columns(_track(stack, k - 1, before)),
-                _columns(end),
-                elapsed_s=depths.elapsed_s[k],
-                span_s=stack.span_s[k - 1][:, None],
-            )
-        n_readings = counts.sum(axis=1)
-        self.mean = (counts * too_low).sum(axis=1) / np.maximum(n_readings, 1.0)
-        self.root_information = np.sqrt(n_readings) / depths.sigma
-        self.lever_arm_b, self.up_n = depths.lever_arm_b, end.up_n
-        self.sensor_n = end.sensor_n
+    mean: Array
+    """(R,) m, how much higher the sensor is than predicted"""
+    root_information: Array
+    """(R,) 1/m, zero without a reading"""
+    lever_arm_b: Array
+    up_n: Array
+    sensor_n: Array
+    """(R, 3) m, as predicted"""
 
     def fill(
         self, states: NavigationStates, runs: Runs, innovation: Array, jacobian: Array
     ) -> None:
         """Write the row; a run without a reading gets zeros."""
-        up_n, scale, lever = self.up_n[runs], self.root_information[runs], self.lever_arm_b[runs]
-        risen = (up_n * (_sensor(states, lever) - self.sensor_n[runs])).sum(axis=1)
-        innovation[:] = scale * (self.mean[runs] - risen)
+        mean, scale, lever, up_n, sensor_n = (column[runs] for column in self)
+        risen = (up_n * (_sensor(states, lever) - sensor_n)).sum(axis=1)
+        innovation[:] = scale * (mean - risen)
         up_b = (up_n[:, None] @ states.R_nb)[:, 0]
         jacobian[:, ROTATION] = scale[:, None] * cross(lever, up_b)
         jacobian[:, POSITION] = scale[:, None] * up_b
 
 
+def _depth_row(
+    measured: Measurements,
+    k: int,
+    predicted: NavigationStates,
+    before: NavigationStates | None,
+    frame: LocalFrame,
+) -> _DepthRow:
+    depths, keyframe_s = measured.depths, measured.keyframe_s
+
+    def track(k: int, states: NavigationStates) -> HeightTrack:
+        R_nb, p_n, v_n, _ = states
+        at = {"gyro_b": depths.gyro_b[k], "lever_arm_b": depths.lever_arm_b}
+        return height_track(frame, R_nb=R_nb, p_n=p_n, v_n=v_n, **at)
+
+    end, reading = track(k, predicted), depths.depth[k]
+    sensor = end.height[:, None]
+    if before is not None:
+        sensor = height_on_the_way(
+            _columns(track(k - 1, before)),
+            _columns(end),
+            elapsed_s=depths.time_s[k] - keyframe_s[k - 1, :, None],
+            span_s=(keyframe_s[k] - keyframe_s[k - 1])[:, None],
+        )
+    is_read = np.isfinite(reading)
+    n_readings = is_read.sum(axis=1)
+    mean = np.where(is_read, -reading - sensor, 0.0).sum(axis=1) / np.maximum(n_readings, 1)
+    root_information = np.sqrt(n_readings) / depths.sigma
+    return _DepthRow(mean, root_information, depths.lever_arm_b, end.up_n, end.sensor_n)
+
+
 def _sensor(states: NavigationStates, lever_arm_b: Array) -> Array:
     return np.asarray(states.p_n + (states.R_nb @ lever_arm_b[..., None])[..., 0])
-
-
-def _track(stack: Stack, k: int, states: NavigationStates) -> HeightTrack:
-    assert stack.depths is not None
-    return height_track(
-        stack.frame,
-        R_nb=states.R_nb,
-        p_n=states.p_n,
-        v_n=states.v_n,
-        gyro_b=stack.depths.gyro_b[k],
-        lever_arm_b=stack.depths.lever_arm_b,
-    )
 
 
 def _columns(track: HeightTrack) -> HeightTrack:

@@ -15,14 +15,17 @@ from factors.similarity import Similarity
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.engine.error_state import Linearised
 from ssm_graph.filters.geodetic.filter import GeodeticConfig, run_geodetic, to_navigation
-from ssm_graph.filters.navigation.filter import Grouping, run_filter
-from ssm_graph.filters.navigation.history import estimates_from_history
-from ssm_graph.filters.navigation.rts import smooth_history
+from ssm_graph.filters.navigation.filter import (
+    Grouping,
+    estimates_from_history,
+    run_filter,
+    smooth_history,
+)
 from ssm_graph.filters.rules.correntropy import CorrentropyUpdate
 from ssm_graph.filters.rules.kalman import Gate, GatedUpdate, KalmanUpdate
-from ssm_graph.filters.rules.model import UpdateRule
 from ssm_graph.filters.rules.ssm import SsmUpdate
 from ssm_graph.filters.rules.student import StudentUpdate
+from ssm_graph.filters.rules.update import UpdateRule
 from ssm_graph.mission.bottom_track import without_water_track
 from ssm_graph.mission.estimate import Estimate, OnKeyframe
 from ssm_graph.mission.problem import Problem
@@ -42,73 +45,66 @@ class FilterChoice:
     """The parameter where none is given; None for a filter without one."""
 
 
-def _ssm(name: str, grouping: Grouping = Grouping.PER_BEAM) -> FilterChoice:
-    choice = KERNELS[name]
-    return FilterChoice(
-        f"similarity weights, {grouping.value}, the prediction trusted, {name} kernel",
-        lambda value: SsmUpdate(choice.kernel(value), linearised=Linearised.ONCE),
-        grouping,
-        choice.default,
-    )
+def _similar(
+    about: str, kernel: str, grouping: Grouping, *, state: bool = False, plain: bool = False
+) -> FilterChoice:
+    """Return a filter by similarity weights, with the parameter of its kernel.
 
-
-def _ssmkf(name: str) -> FilterChoice:
-    choice = KERNELS[name]
+    Parameters
+    ----------
+    about : what it is, but for the kernel.
+    kernel : name of the kernel.
+    grouping : which beams share a weight.
+    state : whether the prediction gets a weight as well.
+    plain : whether a beam is judged by its residual alone.
+    """
 
     def make(value: float | None) -> UpdateRule:
-        kernel = choice.kernel(value)
-        return SsmUpdate(kernel, state_kernel=kernel, linearised=Linearised.ONCE)
+        own = KERNELS[kernel].kernel(value)
+        return SsmUpdate(
+            own,
+            state_kernel=own if state else None,
+            similarity=Similarity.PLAIN if plain else Similarity.EXPECTED,
+            linearised=Linearised.ONCE,
+        )
 
-    return FilterChoice(
-        f"SSMKF: one similarity weight for the ping, one for the prediction, {name} kernel",
-        make,
-        Grouping.PER_PING,
-        choice.default,
-    )
-
-
-def _gated(gate: Gate, value: float | None) -> UpdateRule:
-    return GatedUpdate(gate) if value is None else GatedUpdate(gate, value)
+    return FilterChoice(f"{about}, {kernel} kernel", make, grouping, KERNELS[kernel].default)
 
 
-def _plain_log(value: float | None) -> UpdateRule:
-    kernel = KERNELS["log"].kernel(value)
-    return SsmUpdate(kernel, similarity=Similarity.PLAIN, linearised=Linearised.ONCE)
+def _gated(about: str, gate: Gate, grouping: Grouping) -> FilterChoice:
+    usual = GatedUpdate(gate).confidence
+
+    def make(value: float | None) -> UpdateRule:
+        return GatedUpdate(gate, usual if value is None else value)
+
+    return FilterChoice(f"Kalman filter, chi-square gate on {about}", make, grouping, usual)
 
 
+_BEAM, _PING = Grouping.PER_BEAM, Grouping.PER_PING
+_SSMKF = "SSMKF: one similarity weight for the ping, one for the prediction"
+_TRUSTED = "similarity weights, {}, the prediction trusted"
 FILTERS: Final[Mapping[str, FilterChoice]] = {
-    "ekf": FilterChoice("Kalman filter", lambda _: KalmanUpdate(), Grouping.PER_PING),
-    "ekf-gate-ping": FilterChoice(
-        "Kalman filter, chi-square gate on the whole ping",
-        lambda value: _gated(Gate.PING, value),
-        Grouping.PER_PING,
-        GatedUpdate(Gate.PING).confidence,
-    ),
-    "ekf-gate-beam": FilterChoice(
-        "Kalman filter, chi-square gate on every beam",
-        lambda value: _gated(Gate.BEAM, value),
-        Grouping.PER_BEAM,
-        GatedUpdate(Gate.BEAM).confidence,
-    ),
+    "ekf": FilterChoice("Kalman filter", lambda _: KalmanUpdate(), _PING),
+    "ekf-gate-ping": _gated("the whole ping", Gate.PING, _PING),
+    "ekf-gate-beam": _gated("every beam", Gate.BEAM, _BEAM),
     "rstkf": FilterChoice(
         "Student's t filter, inverse-Wishart prediction covariance",
         lambda _: StudentUpdate(),
-        Grouping.PER_PING,
+        _PING,
     ),
     "mckf": FilterChoice(
         "maximum correntropy filter",
         lambda value: CorrentropyUpdate() if value is None else CorrentropyUpdate(value),
-        Grouping.PER_BEAM,
+        _BEAM,
         CorrentropyUpdate().width,
     ),
-    **{f"ssmkf-{name}": _ssmkf(name) for name in ("log", "sqrt", "exp")},
-    **{f"ssm-{name}": _ssm(name) for name in ("log", "sqrt", "exp")},
-    "ssm-ping-log": _ssm("log", Grouping.PER_PING),
-    "ssm-plain-log": FilterChoice(
-        "as ssm-log, a beam judged by its residual alone",
-        _plain_log,
-        Grouping.PER_BEAM,
-        KERNELS["log"].default,
+    **{f"ssmkf-{k}": _similar(_SSMKF, k, _PING, state=True) for k in ("log", "sqrt", "exp")},
+    **{
+        f"ssm-{k}": _similar(_TRUSTED.format(_BEAM.value), k, _BEAM) for k in ("log", "sqrt", "exp")
+    },
+    "ssm-ping-log": _similar(_TRUSTED.format(_PING.value), "log", _PING),
+    "ssm-plain-log": _similar(
+        "as ssm-log, a beam judged by its residual alone", "log", _BEAM, plain=True
     ),
 }
 """Names as on the command line."""

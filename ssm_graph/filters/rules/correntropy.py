@@ -11,15 +11,18 @@ from numpy.typing import NDArray
 from factors.similarity import WEIGHT_FLOOR
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
-from ssm_graph.filters.rules.linear_update import (
+from ssm_graph.filters.rules.update import (
     Corrected,
     Groups,
+    MeasurementModel,
     Result,
+    Runs,
+    Update,
+    UpdateRule,
     correct,
     each_or_nan,
     prepare,
 )
-from ssm_graph.filters.rules.model import MeasurementModel, Runs, Update, UpdateRule
 
 
 @final
@@ -56,15 +59,13 @@ class CorrentropyUpdate(UpdateRule):
     def __str__(self) -> str:
         return f"correntropy(width={self.width:g})"
 
-    def __call__(
-        self, covariance: Array, model: MeasurementModel, mean: Array | None = None
-    ) -> Update:
+    def __call__(self, P: Array, model: MeasurementModel, mean: Array | None = None) -> Update:
         """Correct the predictions of B runs."""
-        result, is_robust = Result(covariance, model), Groups(model).is_robust
-        runs: Runs = np.arange(len(covariance))
-        sigma = np.sqrt(np.einsum("bii->bi", covariance))
+        result, is_robust = Result(P, model), Groups(model).is_robust
+        runs: Runs = np.arange(len(P))
+        sigma = np.sqrt(np.einsum("bii->bi", P))
         unit = sigma[:, :, None] * sigma[:, None, :]
-        root = sigma[:, :, None] * each_or_nan(np.linalg.cholesky, covariance / unit)
+        root = sigma[:, :, None] * each_or_nan(np.linalg.cholesky, P / unit)
         iterate = model.at(np.zeros(sigma.shape))
         for number in range(1, self.max_iterations + 1):
             own = root[runs]
@@ -83,7 +84,7 @@ class CorrentropyUpdate(UpdateRule):
                 runs,
                 has_stopped,
                 iterate.xi,
-                covariance=_joseph(covariance[runs], done),
+                covariance=_joseph(P[runs], done),
                 weights=g_rows,
                 state_weight=g_state.min(axis=1),
                 mahalanobis_sq=iterate.innovation**2,

@@ -11,8 +11,16 @@ from scipy.stats import chi2
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
-from ssm_graph.filters.rules.linear_update import Groups, Prepared, Result, correct, prepare
-from ssm_graph.filters.rules.model import MeasurementModel, Update, UpdateRule
+from ssm_graph.filters.rules.update import (
+    Groups,
+    MeasurementModel,
+    Prepared,
+    Result,
+    Update,
+    UpdateRule,
+    correct,
+    prepare,
+)
 
 LEFT_OUT = 1e-12
 """Weight of a row that a gate rejects: none, but regular."""
@@ -39,14 +47,9 @@ class KalmanUpdate(UpdateRule):
     def __str__(self) -> str:
         return "gaussian"
 
-    def __call__(
-        self,
-        covariance: Array,
-        model: MeasurementModel,
-        mean: Array | None = None,  # noqa: ARG002
-    ) -> Update:
+    def __call__(self, P: Array, model: MeasurementModel, mean: Array | None = None) -> Update:  # noqa: ARG002
         """Correct the predictions of B runs."""
-        prepared = prepare(model.at(np.zeros(covariance.shape[:2])), covariance)
+        prepared = prepare(model.at(np.zeros(P.shape[:2])), P)
         return _once(prepared, model, np.ones(model.present.shape))
 
 
@@ -72,14 +75,9 @@ class GatedUpdate(UpdateRule):
     def __str__(self) -> str:
         return f"gate({self.confidence:g} on each {self.by.name.lower()})"
 
-    def __call__(
-        self,
-        covariance: Array,
-        model: MeasurementModel,
-        mean: Array | None = None,  # noqa: ARG002
-    ) -> Update:
+    def __call__(self, P: Array, model: MeasurementModel, mean: Array | None = None) -> Update:  # noqa: ARG002
         """Correct the predictions of B runs."""
-        prepared = prepare(model.at(np.zeros(covariance.shape[:2])), covariance)
+        prepared = prepare(model.at(np.zeros(P.shape[:2])), P)
         rows, robust = prepared.iterate, Groups(model).is_robust
         S = prepared.HPHt + np.eye(model.present.shape[1])
         if self.by is Gate.BEAM:

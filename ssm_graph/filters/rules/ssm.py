@@ -16,15 +16,19 @@ from numpy.typing import NDArray
 from factors.similarity import WEIGHT_FLOOR, Kernel, LogKernel, Similarity
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import Linearised
-from ssm_graph.filters.rules.linear_update import (
+from ssm_graph.filters.rules.update import (
     Corrected,
     Groups,
+    Iterate,
+    MeasurementModel,
     Prepared,
     Result,
+    Runs,
+    Update,
+    UpdateRule,
     correct,
     prepare,
 )
-from ssm_graph.filters.rules.model import Iterate, MeasurementModel, Runs, Update, UpdateRule
 
 
 class StopRule(Enum):
@@ -82,15 +86,13 @@ class SsmUpdate(UpdateRule):
         plain = ", plain" if self.similarity is Similarity.PLAIN else ""
         return f"{self.kernel}{state}{plain}"
 
-    def __call__(
-        self, covariance: Array, model: MeasurementModel, mean: Array | None = None
-    ) -> Update:
+    def __call__(self, P: Array, model: MeasurementModel, mean: Array | None = None) -> Update:
         """Correct the predictions of B runs."""
-        groups, result = Groups(model), Result(covariance, model)
-        runs: Runs = np.arange(len(covariance))
+        groups, result = Groups(model), Result(P, model)
+        runs: Runs = np.arange(len(P))
         weights, state_weight = np.ones(model.present.shape), np.ones(len(runs))
         is_once = self.linearised is Linearised.ONCE
-        prepared = prepare(model.at(np.zeros(covariance.shape[:2])), covariance)
+        prepared = prepare(model.at(np.zeros(P.shape[:2])), P)
         for number in range(1, self.max_iterations + 1):
             done = correct(prepared, weights=weights, state_weight=state_weight)
             at = prepared.iterate

@@ -10,8 +10,15 @@ import numpy as np
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
-from ssm_graph.filters.rules.linear_update import Groups, Result, correct, prepare
-from ssm_graph.filters.rules.model import MeasurementModel, Update, UpdateRule
+from ssm_graph.filters.rules.update import (
+    Groups,
+    MeasurementModel,
+    Result,
+    Update,
+    UpdateRule,
+    correct,
+    prepare,
+)
 
 
 class Scale(Enum):
@@ -51,19 +58,14 @@ class StudentUpdate(UpdateRule):
     def __str__(self) -> str:
         return f"student(dof={self.measurement_dof:g})"
 
-    def __call__(
-        self,
-        covariance: Array,
-        model: MeasurementModel,
-        mean: Array | None = None,  # noqa: ARG002
-    ) -> Update:
+    def __call__(self, P: Array, model: MeasurementModel, mean: Array | None = None) -> Update:  # noqa: ARG002
         """Correct the predictions of B runs."""
-        groups, result = Groups(model), Result(covariance, model)
-        runs = np.arange(len(covariance))
-        n_states, size = covariance.shape[1], groups.size(runs)
-        iterate = model.at(np.zeros(covariance.shape[:2]))
-        posterior = scale_cov = covariance
-        squares = prepare(iterate, covariance).squares()
+        groups, result = Groups(model), Result(P, model)
+        runs = np.arange(len(P))
+        n_states, size = P.shape[1], groups.size(runs)
+        iterate = model.at(np.zeros(P.shape[:2]))
+        posterior = scale_cov = P
+        squares = prepare(iterate, P).squares()
         for _ in range(self.n_iterations):
             xi = iterate.xi
             moment = posterior + xi[:, :, None] * xi[:, None, :]
@@ -72,7 +74,7 @@ class StudentUpdate(UpdateRule):
             t = groups.total(squares)
             weights = (self.measurement_dof + size) / (self.measurement_dof + t)
             if self.scale is Scale.ESTIMATED:
-                scale_cov = self.tau * covariance + state_weight[:, None, None] * moment
+                scale_cov = self.tau * P + state_weight[:, None, None] * moment
                 scale_cov = scale_cov / (self.tau + 1.0)
             done = correct(
                 prepare(iterate, scale_cov),

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from ssm_graph.live.estimator.buffers import Buffers
-from ssm_graph.live.estimator.events import EventLog
+from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.navigation import Severity
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.dvl import Ping

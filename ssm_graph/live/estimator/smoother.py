@@ -16,7 +16,6 @@ from ssm_graph.live.estimator.answer import answer
 from ssm_graph.live.estimator.asked import not_calibrated, sensors_of_vehicle
 from ssm_graph.live.estimator.course import REACH_S, Course, Step
 from ssm_graph.live.estimator.delayed import Delayed, delayed_of
-from ssm_graph.live.estimator.events import EventLog
 from ssm_graph.live.estimator.found import found_by
 from ssm_graph.live.estimator.intake import Intake
 from ssm_graph.live.estimator.keyframes import KeyframeMaker
@@ -35,6 +34,7 @@ from ssm_graph.live.estimator.store import (
 from ssm_graph.live.estimator.tail import Tail
 from ssm_graph.live.estimator.watch import Watch
 from ssm_graph.mission.estimate import Found
+from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.navigation import Event, Health, Navigation, Severity
 from ssm_graph.mission.problem import ProblemConfig
 from ssm_graph.mission.vehicle import Vehicle

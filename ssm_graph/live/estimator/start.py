@@ -15,8 +15,8 @@ from ssm_graph.engine.error_state import InitialMoments
 from ssm_graph.engine.extras import with_extras
 from ssm_graph.live.estimator.asked import extras_of_vehicle
 from ssm_graph.live.estimator.buffers import Buffers
-from ssm_graph.live.estimator.events import EventLog
 from ssm_graph.mission.calibration import windowed
+from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.mission import InitialState, Mission
 from ssm_graph.mission.navigation import Severity
 from ssm_graph.mission.problem import ProblemConfig, build_problem_steps

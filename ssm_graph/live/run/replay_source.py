@@ -95,9 +95,6 @@ class ReplaySource:
         status = SourceStatus(self._name, address, state, n_messages=self._n_messages, age_s=0.0)
         return (status,)
 
-    def close(self) -> None:
-        """Do nothing."""
-
     def _take(self, is_due: Callable[[Message], bool]) -> list[Message]:
         taken: list[Message] = []
         while self._next is not None and len(taken) < MOST and is_due(self._next):

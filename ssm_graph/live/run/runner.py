@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Final
+from enum import Enum
+from typing import Any, Final, NamedTuple, Protocol
 
 from ssm_graph.base.errors import ConfigError
-from ssm_graph.live.run.interfaces import Connect, Connections, Delayed, Engine, Source
-from ssm_graph.live.run.notices import Notices
-from ssm_graph.live.run.run_folder import Resumed, RunFolder
-from ssm_graph.live.run.run_summary import MOST_FAILURES, RunEnd, StopReason, summary_of
-from ssm_graph.live.sockets.publisher import Every, Outlet, Publisher
-from ssm_graph.mission.estimate import Found
-from ssm_graph.mission.navigation import Event, Navigation, Severity
-from ssm_graph.mission.run_status import Latency, RunStatus
+from ssm_graph.base.frozen import Array
+from ssm_graph.io.results.summary import as_json, calibration_fields, current_fields, versions
+from ssm_graph.live.protocols.json_messages import navigation_fields
+from ssm_graph.live.run.run_folder import LOG_NAME, Resumed, RunFolder
+from ssm_graph.live.sockets.outputs import Every, Outlet, Publisher
+from ssm_graph.mission.estimate import BeamTable, CurrentTrack, Found, Status, Trajectory
+from ssm_graph.mission.events import EventLog
+from ssm_graph.mission.navigation import Event, Health, Navigation, Severity
+from ssm_graph.mission.run_status import Latency, RunStatus, SourceStatus
 from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.sensors.messages import Message
 
@@ -25,6 +29,93 @@ LATE_S: Final = 5.0
 """A disk that needs longer for a checkpoint is complained of."""
 N_EVENTS: Final = 8
 """Shown to a person."""
+MOST_FAILURES: Final = 100
+"""Messages in a row that an estimator may fail at before the run is given up."""
+_STATUS: Final = {
+    Health.GOOD: Status.CONVERGED,
+    Health.DEGRADED: Status.SUSPECT,
+    Health.BAD: Status.DIVERGED,
+    Health.ALIGNING: Status.SUSPECT,
+}
+
+
+class StopReason(Enum):
+    """Why a run ended; the text is shown to the user."""
+
+    SOURCE_ENDED = "all messages were given"
+    ASKED = "it was asked to stop"
+    DURATION = "its time was over"
+    FAILED = f"the estimator failed at {MOST_FAILURES} messages in a row: a defect"
+
+
+class RunEnd(NamedTuple):
+    """How a run ended."""
+
+    reason: StopReason
+    navigation: Navigation | None
+    """The last answer."""
+    found: Found
+    """What was known then beside it."""
+    n_messages: int
+    n_errors: int
+    """Exceptions that nobody expected and the run survived."""
+
+
+class Delayed(Protocol):
+    """Successive states that nothing will change any more."""
+
+    @property
+    def trajectory(self) -> Trajectory: ...  # noqa: D102
+    @property
+    def beams(self) -> BeamTable: ...  # noqa: D102
+    @property
+    def current(self) -> CurrentTrack | None: ...  # noqa: D102
+
+
+class Estimator(Protocol):
+    """What is run: `ssm_graph.live.estimator.FixedLagSmoother`, or a stand-in for it."""
+
+    def push(self, message: Message) -> None: ...  # noqa: D102
+    def newest(self) -> Navigation | None: ...  # noqa: D102
+    def found(self) -> Found: ...  # noqa: D102
+    def status(self) -> tuple[Health, str]: ...  # noqa: D102
+    def take_events(self) -> Sequence[Event]: ...  # noqa: D102
+    def take_delayed(self) -> Sequence[Delayed]: ...  # noqa: D102
+    def finish(self) -> Sequence[Delayed]: ...  # noqa: D102
+    def checkpoint(self) -> tuple[Mapping[str, Array], Mapping[str, Any]]: ...  # noqa: D102
+
+
+class Engine(NamedTuple):
+    """How an estimator is made."""
+
+    new: Callable[[], Estimator]
+    restore: Callable[[Mapping[str, Array], Mapping[str, Any]], Estimator]
+    """From the arrays and the meta values of a checkpoint."""
+
+
+class Source(Protocol):
+    """Where messages come from."""
+
+    @property
+    def is_finished(self) -> bool: ...  # noqa: D102
+    @property
+    def time_s(self) -> float: ...  # noqa: D102
+    @property
+    def elapsed_s(self) -> float: ...  # noqa: D102
+    def poll(self, timeout_s: float) -> list[Message]: ...  # noqa: D102
+    def take_events(self) -> Sequence[Event]: ...  # noqa: D102
+    def source_status(self) -> tuple[SourceStatus, ...]: ...  # noqa: D102
+
+
+class Connections(NamedTuple):
+    """What a run is connected with."""
+
+    source: Source
+    outlet: Outlet
+
+
+Connect = Callable[[int], Connections]
+"""Opens the connections, told how many messages earlier processes of the run were given."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +165,7 @@ class Runner:
         self._engine, self._connect = engine, connect
         self._publisher = publisher or Publisher()
         self._on_status, self._steady_s = on_status, steady_s
-        self._notices = Notices(self._now_s, steady_s)
+        self._events = EventLog(self._now_s, steady_s)
         self._connections: Connections | None = None
         self._data_s, self._n_messages, self._n_failures = 0.0, 0, 0
         self._checkpoint_s, self._written_s = float("-inf"), 0.0
@@ -82,7 +173,7 @@ class Runner:
         self._asked = False
         self._note = ""
         self._navigation: Navigation | None = None
-        self._events: deque[Event] = deque(maxlen=N_EVENTS)
+        self._shown: deque[Event] = deque(maxlen=N_EVENTS)
         self._latencies: deque[float] = deque(maxlen=1000)
         self._checkpoints = Every(self.config.checkpoint_every_s)
         self._delayed = Every(self.config.delayed_every_s)
@@ -102,10 +193,8 @@ class Runner:
                 messages = source.poll(POLL_S)
                 begin_s = self._steady_s()
                 for message in messages:
-                    try:
+                    with self._events.surviving("raw log", "log_failed"):
                         log.append(message)
-                    except Exception as error:
-                        self._notices.failure("raw log", "log_failed", error)
                     self._push(message)
                 if messages:
                     self._publish(outlet, source.time_s)
@@ -122,12 +211,8 @@ class Runner:
             return StopReason.ASKED
         if source.is_finished:
             return StopReason.SOURCE_ENDED
-        duration_s = self.config.duration_s
-        return (
-            StopReason.DURATION
-            if duration_s is not None and source.elapsed_s >= duration_s
-            else None
-        )
+        is_over = source.elapsed_s >= (self.config.duration_s or math.inf)
+        return StopReason.DURATION if is_over else None
 
     def _now_s(self) -> float:
         return self._data_s if self._connections is None else self._connections.source.time_s
@@ -152,9 +237,9 @@ class Runner:
                 f"gone on with: {n_before} messages from the checkpoint and "
                 f"{self._n_messages - n_before} from the log after it"
             )
-            self._notices.tell("run", "resumed", text, Severity.INFO)
+            self._events.note("run", "resumed", text, Severity.INFO)
         for note in resumed.notes:
-            self._notices.tell("run", "resumed_with_loss", note, Severity.WARNING, burst=10)
+            self._events.note("run", "resumed_with_loss", note, Severity.WARNING, burst=10)
 
     def _restored(self, resumed: Resumed) -> Resumed:
         """Make the estimator; return where it is."""
@@ -163,7 +248,7 @@ class Runner:
                 self._estimator = self._engine.restore(resumed.arrays, resumed.meta)
                 return resumed
             except Exception as error:
-                self._notices.failure("checkpoint", "restore_failed", error)
+                self._events.failure("checkpoint", "restore_failed", error)
                 resumed = resumed.without_checkpoint(
                     "the checkpoint could not be restored; the whole log was gone through"
                 )
@@ -174,36 +259,32 @@ class Runner:
         self._n_messages += 1
         if isinstance(message, ImuSample) or self._data_s == 0.0:
             self._data_s = message.time_s
-        try:
+        self._n_failures += 1
+        with self._of_estimator():
             self._estimator.push(message)
             self._n_failures = 0
-        except Exception as error:
-            self._n_failures += 1
-            self._notices.failure("estimator", "estimator_failed", error)
+
+    def _of_estimator(self) -> AbstractContextManager[None]:
+        return self._events.surviving("estimator", "estimator_failed")
 
     def _publish(self, outlet: Outlet, now_s: float) -> None:
         for form in self._publisher.due(outlet, now_s):
             navigation = self._newest()
             if navigation is not None:
-                try:
+                with self._events.surviving("publisher", "publish_failed"):
                     self._publisher.send(outlet, form, navigation)
-                except Exception as error:
-                    self._notices.failure("publisher", "publish_failed", error)
 
     def _newest(self) -> Navigation | None:
         """Return the newest answer; the one before where it cannot be had."""
-        try:
+        with self._of_estimator():
             self._navigation = self._estimator.newest()
-        except Exception as error:
-            self._notices.failure("estimator", "estimator_failed", error)
         return self._navigation
 
     def _found(self) -> Found:
-        try:
-            return self._estimator.found()
-        except Exception as error:
-            self._notices.failure("estimator", "estimator_failed", error)
-            return Found()
+        found = Found()
+        with self._of_estimator():
+            found = self._estimator.found()
+        return found
 
     def _keep(self, source: Source) -> None:
         """Write what has come about, and show it."""
@@ -213,7 +294,7 @@ class Runner:
         self._keep_checkpoint()
         problem = self.folder.problems()
         if problem is not None:
-            self._notices.tell("disk", "disk", problem, Severity.ERROR)
+            self._events.note("disk", "disk", problem, Severity.ERROR)
         self._show()
 
     def _keep_results(self) -> None:
@@ -222,25 +303,21 @@ class Runner:
             self._write_delayed(self._estimator.take_delayed)
 
     def _take_events(self) -> None:
-        try:
+        with self._of_estimator():
             for event in self._estimator.take_events():
                 self._note_event(event)
-        except Exception as error:
-            self._notices.failure("estimator", "estimator_failed", error)
-        for event in self._notices.take():
+        for event in self._events.take():
             self._note_event(event)
 
     def _note_event(self, event: Event) -> None:
-        self._events.append(event)
+        self._shown.append(event)
         self.folder.write_event(event)
 
     def _write_delayed(self, take: Callable[[], Sequence[Delayed]]) -> None:
         assert self.folder.results is not None
-        try:
+        with self._events.surviving("results", "results_failed"):
             for delayed in take():
                 self.folder.results.append(delayed.trajectory, delayed.beams, delayed.current)
-        except Exception as error:
-            self._notices.failure("results", "results_failed", error)
 
     def _keep_checkpoint(self) -> None:
         """Write one where it is due and the disk is done with the last one."""
@@ -254,12 +331,12 @@ class Runner:
             self._write_checkpoint()
         elif self._steady_s() - self._written_s > LATE_S:
             text = f"the disk has been busy with the last one for more than {LATE_S:g} s"
-            self._notices.tell("checkpoint", "checkpoint_late", text, Severity.WARNING)
+            self._events.note("checkpoint", "checkpoint_late", text, Severity.WARNING)
 
     def _tell_unwritten(self) -> None:
         error = self.folder.writer.take_error()
         if error is not None:
-            self._notices.failure("checkpoint", "checkpoint_failed", error)
+            self._events.failure("checkpoint", "checkpoint_failed", error)
 
     def _write_checkpoint(self) -> None:
         self._written_s = self._steady_s()
@@ -267,14 +344,12 @@ class Runner:
         self._take_events()
         if self.folder.problems() is not None:  # it would count on what is not on the disk
             return
-        try:
-            arrays, meta = self._estimator.checkpoint()
+        with self._events.surviving("checkpoint", "checkpoint_failed"):
+            n_messages, data_s = self._n_messages, self._data_s
             self.folder.write_checkpoint(
-                arrays, meta, n_messages=self._n_messages, data_s=self._data_s
+                *self._estimator.checkpoint(), n_messages=n_messages, data_s=data_s
             )
-            self._checkpoint_s = self._data_s
-        except Exception as failure:
-            self._notices.failure("checkpoint", "checkpoint_failed", failure)
+            self._checkpoint_s = data_s
 
     def _end(self, reason: StopReason) -> RunEnd:
         self._note = "writing the last results"
@@ -286,9 +361,9 @@ class Runner:
         self._tell_unwritten()
         navigation, found = self._newest(), self._found()
         self._write_delayed(self._estimator.finish)
-        self._notices.tell("run", "ended", reason.value, Severity.INFO)
+        self._events.note("run", "ended", reason.value, Severity.INFO)
         self._take_events()
-        end = RunEnd(reason, navigation, found, self._n_messages, self._notices.n_errors)
+        end = RunEnd(reason, navigation, found, self._n_messages, self._events.n_errors)
         assert self.folder.results is not None
         self.folder.results.finish(summary_of(self.folder, end))
         return end
@@ -296,10 +371,8 @@ class Runner:
     def _show(self, *, at_once: bool = False) -> None:
         if self._on_status is None or not (self._status.is_due(self._steady_s()) or at_once):
             return
-        try:
+        with self._events.surviving("status", "status_failed"):
             self._on_status(self._run_status())
-        except Exception as error:
-            self._notices.failure("status", "status_failed", error)
 
     def _run_status(self) -> RunStatus:
         connections, navigation = self._connections, self._newest()
@@ -313,9 +386,35 @@ class Runner:
             latency=Latency.of(self._latencies),
             sources=() if connections is None else connections.source.source_status(),
             outputs=() if connections is None else connections.outlet.output_status(),
-            events=tuple(self._events),
+            events=tuple(self._shown),
             log_problem=self.folder.problems(),
             checkpoint_age_s=self._data_s - self._checkpoint_s,
             found=self._found(),
             note=self._note,
         )
+
+
+def summary_of(folder: RunFolder, end: RunEnd) -> dict[str, Any]:
+    """Return how a run ended, in the terms of the summaries of other estimators."""
+    navigation = end.navigation
+    health = Health.ALIGNING if navigation is None else navigation.health
+    status = _STATUS[health]
+    summary: dict[str, Any] = {
+        "mission": folder.vehicle.name,
+        "method": "live fixed lag, delayed states",
+        "kernel": folder.settings.get("kernel"),
+        "status": status.name,
+        "status_text": status.value,
+        "is_good": status.is_good,
+        "reason": health.value if navigation is None else navigation.reason,
+        "ended": end.reason.value,
+        "n_messages": end.n_messages,
+        "raw_log": LOG_NAME,
+        "newest": None if navigation is None else navigation_fields(navigation),
+        "settings": folder.settings,
+        "calibration": calibration_fields(end.found.calibration),
+        "current": current_fields(end.found.current),
+        "notes": [],
+        "versions": versions(),
+    }
+    return {key: as_json(value) for key, value in summary.items()}

@@ -1,4 +1,4 @@
-"""Addresses of sources and listeners: ``tcp://HOST:PORT``, ``tcp-listen://:PORT``, ``udp://:PORT``.
+"""Addresses, ``tcp://HOST:PORT``, ``tcp-listen://:PORT``, ``udp://:PORT``, and who listens there.
 
 What is bound is bound to this computer only, 127.0.0.1, unless another interface is named.
 """
@@ -7,15 +7,20 @@ from __future__ import annotations
 
 import ipaddress
 import re
+import selectors
 import socket
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Final, NamedTuple
 
 from ssm_graph.base.errors import ConfigError, nearest_hint
+from ssm_graph.mission.navigation import Severity
 
 LOOPBACK: Final = "127.0.0.1"
+CHUNK: Final = 65536
+"""Bytes that are read of one socket before the others have their turn."""
+_ACCEPT_PAUSE_S: Final = 1.0
 _ADDRESS = re.compile(
     r"(?P<scheme>[A-Za-z-]+)://(?P<host>\[[^\[\]]*\]|[^:/\[\]@]*):(?P<port>\d{1,5})/?", re.ASCII
 )
@@ -106,6 +111,109 @@ def resolve(endpoint: Endpoint) -> list[Resolved]:
             f"{endpoint}: the host is not known ({error}); give its number instead"
         ) from error
     return [Resolved(family, address) for family, _, _, _, address in found]
+
+
+def bound(endpoint: Endpoint) -> socket.socket:
+    """Return a socket that listens at an address.
+
+    Raises
+    ------
+    ConfigError
+        Where the address is not one of this computer, or in use.
+    """
+    found = resolve(endpoint)[0]
+    is_udp = endpoint.transport is Transport.UDP
+    sock = socket.socket(found.family, socket.SOCK_DGRAM if is_udp else socket.SOCK_STREAM)
+    try:
+        if found.family == socket.AF_INET6:  # [::] is not to be IPv4 as well
+            sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+        if not is_udp:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        sock.setblocking(False)
+        sock.bind(found.address)
+        if not is_udp:
+            sock.listen(8)
+    except OSError as error:
+        sock.close()
+        raise ConfigError(
+            f"{endpoint}: cannot listen there ({error.strerror or error}); "
+            "is another process at this port, or the address another computer's?"
+        ) from error
+    return sock
+
+
+class Listener:
+    """A server's socket: takes clients as long as there is room.
+
+    Parameters
+    ----------
+    endpoint : where it listens.
+    selector, owner : whom the selector names when somebody calls.
+    most : clients at once; more are refused.
+    tell : notes an event, of this kind, text and severity.
+    """
+
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        selector: selectors.BaseSelector,
+        owner: object,
+        *,
+        most: int,
+        tell: Callable[[str, str, Severity], None],
+    ) -> None:
+        self.socket = bound(endpoint)
+        self.port = int(self.socket.getsockname()[1])
+        self._selector, self._owner, self._most, self._tell = selector, owner, most, tell
+        self._again_s = float("-inf")
+        selector.register(self.socket, selectors.EVENT_READ, owner)
+
+    def accept(self, steady_s: float, n_clients: int) -> socket.socket | None:
+        """Return the client that has called; None for one too many, or already gone."""
+        try:
+            client, address = self.socket.accept()
+        except (BlockingIOError, InterruptedError):
+            return None
+        except OSError as error:  # no more files, for example: the client stays in the queue
+            self._selector.unregister(self.socket)
+            self._again_s = steady_s + _ACCEPT_PAUSE_S
+            self._tell("accept_failed", error.strerror or str(error), Severity.WARNING)
+            return None
+        client.setblocking(False)
+        place = f"client {address[0]}:{address[1]}"
+        if n_clients >= self._most:
+            client.close()
+            text = f"{place} refused: there are {n_clients} already"
+            self._tell("client_refused", text, Severity.WARNING)
+            return None
+        self._tell("connected", f"{place} has called", Severity.INFO)
+        return client
+
+    def tick(self, steady_s: float) -> None:
+        """Listen again after there was no room."""
+        if self.socket not in self._selector.get_map() and steady_s >= self._again_s:
+            self._selector.register(self.socket, selectors.EVENT_READ, self._owner)
+
+    def close(self) -> None:
+        """Listen no more."""
+        let_go(self.socket, self._selector)
+
+
+def received(sock: socket.socket) -> bytes | str | None:
+    """Return what has come: bytes, None for nothing yet, or in words why nothing will any more."""
+    try:
+        return sock.recv(CHUNK) or "closed by the other side"
+    except (BlockingIOError, InterruptedError):
+        return None
+    except OSError as error:
+        return error.strerror or str(error)
+
+
+def let_go(sock: socket.socket, selector: selectors.BaseSelector) -> None:
+    """Close a socket, and have the selector forget it."""
+    if sock.fileno() >= 0 and sock in selector.get_map():
+        selector.unregister(sock)
+    sock.close()
 
 
 def _host(written: str, transport: Transport, where: str, text: str) -> str:

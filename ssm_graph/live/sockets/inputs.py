@@ -1,4 +1,4 @@
-"""Sources behind sockets: what they share, and a server that is called."""
+"""Sources behind sockets: servers that are called, clients that call us, datagrams."""
 
 from __future__ import annotations
 
@@ -7,25 +7,44 @@ import os
 import selectors
 import socket
 from abc import ABC, abstractmethod
+from typing import Final
 
-from ssm_graph.live.run.feed import CHUNK, Channel, Feed, Now
-from ssm_graph.live.sockets.endpoints import Endpoint, resolve
+from ssm_graph.live.sockets.endpoints import (
+    CHUNK,
+    Endpoint,
+    Listener,
+    bound,
+    let_go,
+    received,
+    resolve,
+)
+from ssm_graph.live.sockets.feed import Channel, Feed, Now
 from ssm_graph.mission.navigation import Severity
 from ssm_graph.mission.run_status import LinkState, SourceStatus
 from ssm_graph.sensors.messages import Message
+
+MAX_DATAGRAMS: Final = 64
+"""Read of one source before the others have their turn."""
 
 
 class Input(ABC):
     """One source. The hub calls :meth:`on_ready` for its sockets and :meth:`tick` all the time."""
 
     def __init__(self, feed: Feed, selector: selectors.BaseSelector) -> None:
-        self.feed, self._selector = feed, selector
+        self.feed, self.name, self._selector = feed, feed.name, selector
         self._reading: dict[socket.socket, Channel] = {}
         self._is_paused = False
 
-    @abstractmethod
     def on_ready(self, ready: socket.socket, now: Now) -> list[Message]:
         """Return the messages of a socket that can be read or has connected."""
+        channel = self._reading.get(ready)
+        if channel is None or (data := received(ready)) is None:
+            return []
+        if isinstance(data, str):
+            return self._lose(ready, now, data)
+        messages = self.feed.take(channel, data, now)
+        self._pause_if_over(now)
+        return messages
 
     def tick(self, now: Now) -> list[Message]:
         """Return messages that a decoder releases; look after patience and connections."""
@@ -33,10 +52,16 @@ class Input(ABC):
             self._is_paused = False
             for sock in self._reading:
                 self._selector.register(sock, selectors.EVENT_READ, self)
-        released: list[Message] = []
-        for channel in list(self._reading.values()):
-            released += self.feed.idle(channel, now)
-        return released
+        messages: list[Message] = []
+        for sock, channel in list(self._reading.items()):
+            messages += self.feed.idle(channel, now)
+            if not self._is_paused and self.feed.is_silent(channel, now):
+                messages += self._lose(sock, now, f"silent for {self.feed.limits.stall_s:g} s")
+        return messages
+
+    @abstractmethod
+    def _lose(self, sock: socket.socket, now: Now, why: str) -> list[Message]:
+        """Give a connection up; return the messages of what it still held."""
 
     @abstractmethod
     def status(self, now: Now) -> SourceStatus:
@@ -66,9 +91,13 @@ class Input(ABC):
 
     def _forget(self, sock: socket.socket) -> None:
         self._reading.pop(sock, None)
-        if sock in self._selector.get_map():
-            self._selector.unregister(sock)
-        sock.close()
+        let_go(sock, self._selector)
+
+    def _end(self, sock: socket.socket, now: Now) -> list[Message]:
+        """Hang up; a message that was cut off ends here and does not meet the next one's begin."""
+        channel = self._reading[sock]
+        self._forget(sock)
+        return self.feed.take(channel, b"\n", now)
 
     def _pause_if_over(self, now: Now) -> None:
         """Stop reading a source that sends too much: TCP holds it back, of UDP the rest is lost."""
@@ -102,31 +131,18 @@ class TcpClientInput(Input):
         if ready is self._calling:
             self._answered(ready, now)
             return []
-        channel = self._reading.get(ready)
-        if channel is None:
-            return []
-        try:
-            data = ready.recv(CHUNK)
-        except (BlockingIOError, InterruptedError):
-            return []
-        except OSError as error:
-            return self._lose(now, error.strerror or str(error))
-        if not data:
-            return self._lose(now, "closed by the other side")
-        self._wait_s = self.feed.limits.retry_s[0]
-        messages = self.feed.take(channel, data, now)
-        self._pause_if_over(now)
+        messages = super().on_ready(ready, now)
+        if ready in self._reading:
+            self._wait_s = self.feed.limits.retry_s[0]
         return messages
 
     def tick(self, now: Now) -> list[Message]:
-        """Call where nobody is called; give up who does not answer or has become silent."""
+        """Call where nobody is called; give up who does not answer."""
         messages = super().tick(now)
         if self._calling is not None and now.steady_s > self._next_try_s:
             self._failed(f"no answer within {self.feed.limits.connect_s:g} s", now)
         elif self._calling is None and not self._reading and now.steady_s >= self._next_try_s:
             self._call(now)
-        elif self._reading and not self._is_paused and self._is_silent(now):
-            messages += self._lose(now, f"silent for {self.feed.limits.stall_s:g} s")
         return messages
 
     def status(self, now: Now) -> SourceStatus:
@@ -140,9 +156,6 @@ class TcpClientInput(Input):
         if self._calling is not None:
             self._forget(self._calling)
             self._calling = None
-
-    def _is_silent(self, now: Now) -> bool:
-        return self._channel is not None and self.feed.is_silent(self._channel, now)
 
     def _call(self, now: Now) -> None:
         family, address = self._addresses[self._n_tries % len(self._addresses)]
@@ -183,12 +196,8 @@ class TcpClientInput(Input):
             Severity.WARNING,
         )
 
-    def _lose(self, now: Now, why: str) -> list[Message]:
-        """Hang up; a message that was cut off ends here and does not meet the next one's begin."""
-        messages = []
-        for sock, channel in list(self._reading.items()):
-            self._forget(sock)
-            messages += self.feed.take(channel, b"\n", now)
+    def _lose(self, sock: socket.socket, now: Now, why: str) -> list[Message]:
+        messages = self._end(sock, now)
         self._wait(now)
         kind = "source_silent" if why.startswith("silent") else "connection_lost"
         self.feed.tell(kind, f"{self.feed.address}: {why}; it is called again", Severity.WARNING)
@@ -197,6 +206,98 @@ class TcpClientInput(Input):
     def _wait(self, now: Now) -> None:
         self._next_try_s = now.steady_s + self._wait_s
         self._wait_s = min(2.0 * self._wait_s, self.feed.limits.retry_s[1])
+
+
+class TcpServerInput(Input):
+    """A few clients that call us; more are refused, silent ones make room."""
+
+    def __init__(self, feed: Feed, selector: selectors.BaseSelector, endpoint: Endpoint) -> None:
+        super().__init__(feed, selector)
+        most = feed.limits.max_clients
+        self._listener = Listener(endpoint, selector, self, most=most, tell=feed.tell)
+        self.port = self._listener.port
+
+    def on_ready(self, ready: socket.socket, now: Now) -> list[Message]:
+        """Read a client, or take a new one."""
+        if ready is not self._listener.socket:
+            return super().on_ready(ready, now)
+        client = self._listener.accept(now.steady_s, len(self._reading))
+        if client is not None:
+            self._read_from(client, self.feed.channel(now))
+        return []
+
+    def tick(self, now: Now) -> list[Message]:
+        """Drop who is silent."""
+        messages = super().tick(now)
+        self._listener.tick(now.steady_s)
+        return messages
+
+    def status(self, now: Now) -> SourceStatus:
+        """Return how it is doing."""
+        state = LinkState.CONNECTED if self._reading else LinkState.LISTENING
+        return self.feed.status(state, now)
+
+    def close(self) -> None:
+        """Hang up, and listen no more."""
+        super().close()
+        self._listener.close()
+
+    def _lose(self, sock: socket.socket, now: Now, why: str) -> list[Message]:
+        self.feed.tell("connection_lost", f"a client is gone: {why}", Severity.WARNING)
+        return self._end(sock, now)
+
+
+class UdpInput(Input):
+    """Datagrams; each ends what it holds, so that one that was cut off spoils no other."""
+
+    def __init__(self, feed: Feed, selector: selectors.BaseSelector, endpoint: Endpoint) -> None:
+        super().__init__(feed, selector)
+        self._socket = bound(endpoint)
+        self.port = int(self._socket.getsockname()[1])
+        self._channel: Channel | None = None
+        self._is_silent = False
+
+    def on_ready(self, ready: socket.socket, now: Now) -> list[Message]:
+        """Read what waits, so much of it."""
+        assert self._channel is not None
+        data = bytearray()
+        for _ in range(MAX_DATAGRAMS):
+            try:
+                datagram = ready.recv(CHUNK)
+            except (BlockingIOError, InterruptedError):
+                break
+            except OSError as error:  # an ICMP message about something else
+                self.feed.tell("receive_failed", error.strerror or str(error), Severity.WARNING)
+                break
+            data += datagram if datagram.endswith(b"\n") else datagram + b"\n"
+            if len(data) >= CHUNK:
+                break
+        self._is_silent = False
+        messages = self.feed.take(self._channel, bytes(data), now)
+        self._pause_if_over(now)
+        return messages
+
+    def tick(self, now: Now) -> list[Message]:
+        """Say it where nothing comes any more."""
+        if self._channel is None:
+            self._channel = self.feed.channel(now)
+            self._read_from(self._socket, self._channel)
+        return super().tick(now)
+
+    def status(self, now: Now) -> SourceStatus:
+        """Return how it is doing."""
+        return self.feed.status(LinkState.SILENT if self._is_silent else LinkState.LISTENING, now)
+
+    def close(self) -> None:
+        """Listen no more."""
+        super().close()
+        self._socket.close()
+
+    def _lose(self, sock: socket.socket, now: Now, why: str) -> list[Message]:  # noqa: ARG002
+        if not self._is_silent:
+            self._is_silent = True
+            self.feed.tell("source_silent", f"{self.feed.address}: {why}", Severity.WARNING)
+        return []
 
 
 def _fault_of(sock: socket.socket) -> int:

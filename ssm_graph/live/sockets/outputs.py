@@ -1,4 +1,7 @@
-"""Where answers go: datagrams, and clients of a server; nobody who is slow holds anything up."""
+"""Answers on their way out: each form at its own rate, as datagrams and to clients of a server.
+
+Nobody who is slow holds anything up.
+"""
 
 from __future__ import annotations
 
@@ -6,19 +9,22 @@ import selectors
 import socket
 from abc import ABC, abstractmethod
 from enum import Enum
-from typing import Final
+from typing import Final, Protocol
 
-from ssm_graph.live.run.feed import CHUNK, Now
-from ssm_graph.live.run.notices import Notices
-from ssm_graph.live.sockets.endpoints import Endpoint, resolve
-from ssm_graph.live.sockets.listeners import bound
-from ssm_graph.mission.navigation import Severity
+from ssm_graph.base.errors import ConfigError
+from ssm_graph.live.protocols.json_messages import encode_navigation
+from ssm_graph.live.protocols.nmea_encoder import encode_nmea
+from ssm_graph.live.sockets.endpoints import Endpoint, Listener, let_go, received, resolve
+from ssm_graph.live.sockets.feed import Now
+from ssm_graph.mission.events import EventLog
+from ssm_graph.mission.navigation import Navigation, Severity
 from ssm_graph.mission.run_status import OutputStatus
 
 MAX_CLIENTS: Final = 8
 MAX_WAITING: Final = 64 * 1024
 """Bytes that wait for a client, besides as many in the system; one who is slower is dropped."""
-_ACCEPT_PAUSE_S: Final = 1.0
+_ROUNDING: Final = 1e-6
+"""Of a period: sampling times are not exact."""
 
 
 class OutputFormat(Enum):
@@ -31,9 +37,9 @@ class OutputFormat(Enum):
 class Output(ABC):
     """One place that answers go to."""
 
-    def __init__(self, form: OutputFormat, address: str, notices: Notices) -> None:
-        self.form, self.address = form, address
-        self._notices = notices
+    def __init__(self, form: OutputFormat, address: str, events: EventLog) -> None:
+        self.form, self.address, self.name = form, address, address
+        self._events = events
         self._n_sent = self._n_dropped = 0
 
     @property
@@ -45,16 +51,13 @@ class Output(ABC):
     def send(self, data: bytes) -> None:
         """Send whole messages, or drop them; never waits."""
 
-    @abstractmethod
-    def on_ready(self, ready: socket.socket, mask: int, now: Now) -> None:
-        """Look after a socket that can be read or written."""
+    def on_ready(self, ready: socket.socket, mask: int, now: Now) -> None:  # noqa: B027
+        """Look after a socket that can be read or written; there is none where nobody calls."""
 
-    @abstractmethod
-    def tick(self, now: Now) -> None:
+    def tick(self, now: Now) -> None:  # noqa: B027
         """Look after what time brings."""
 
-    @abstractmethod
-    def abandon(self, sock: socket.socket) -> None:
+    def abandon(self, sock: socket.socket) -> None:  # noqa: B027
         """Let go of a socket that made something fail."""
 
     @abstractmethod
@@ -69,7 +72,7 @@ class Output(ABC):
 
     def tell(self, kind: str, text: str, severity: Severity) -> None:
         """Note an event about this output."""
-        self._notices.tell(f"{self.form.value} to {self.address}", kind, text, severity)
+        self._events.note(f"{self.form.value} to {self.address}", kind, text, severity)
 
 
 class UdpOutput(Output):
@@ -77,8 +80,8 @@ class UdpOutput(Output):
 
     n_clients = 1
 
-    def __init__(self, form: OutputFormat, endpoint: Endpoint, notices: Notices) -> None:
-        super().__init__(form, str(endpoint), notices)
+    def __init__(self, form: OutputFormat, endpoint: Endpoint, events: EventLog) -> None:
+        super().__init__(form, str(endpoint), events)
         family, self._target = resolve(endpoint)[0]
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
@@ -92,15 +95,6 @@ class UdpOutput(Output):
             self._n_dropped += 1
             self.tell("send_failed", error.strerror or str(error), Severity.WARNING)
 
-    def on_ready(self, ready: socket.socket, mask: int, now: Now) -> None:
-        """Do nothing: nothing is read here."""
-
-    def tick(self, now: Now) -> None:
-        """Do nothing."""
-
-    def abandon(self, sock: socket.socket) -> None:
-        """Do nothing."""
-
     def close(self) -> None:
         """Close the socket."""
         self._socket.close()
@@ -113,16 +107,14 @@ class TcpServerOutput(Output):
         self,
         form: OutputFormat,
         endpoint: Endpoint,
-        notices: Notices,
+        events: EventLog,
         selector: selectors.BaseSelector,
     ) -> None:
-        super().__init__(form, str(endpoint), notices)
+        super().__init__(form, str(endpoint), events)
         self._selector = selector
         self._waiting: dict[socket.socket, bytearray] = {}
-        self._listener = bound(endpoint)
-        self.port = int(self._listener.getsockname()[1])
-        self._selector.register(self._listener, selectors.EVENT_READ, self)
-        self._next_accept_s = float("-inf")
+        self._listener = Listener(endpoint, selector, self, most=MAX_CLIENTS, tell=self.tell)
+        self.port = self._listener.port
 
     @property
     def n_clients(self) -> int:
@@ -142,27 +134,20 @@ class TcpServerOutput(Output):
 
     def on_ready(self, ready: socket.socket, mask: int, now: Now) -> None:
         """Take a client, write what waits, see who has gone."""
-        if ready is self._listener:
+        if ready is self._listener.socket:
             self._accept(now)
             return
         waiting = self._waiting.get(ready)
-        if waiting is None:
-            return
-        if mask & selectors.EVENT_WRITE:
+        if waiting is not None and mask & selectors.EVENT_WRITE:
             self._flush(ready, waiting)
-        if mask & selectors.EVENT_READ and ready in self._waiting:
-            try:
-                if not ready.recv(CHUNK):
-                    self._drop(ready, "it has hung up", Severity.INFO)
-            except (BlockingIOError, InterruptedError):
-                pass
-            except OSError as error:
-                self._drop(ready, error.strerror or str(error), Severity.INFO)
+        if ready in self._waiting and mask & selectors.EVENT_READ:
+            why = received(ready)
+            if isinstance(why, str):
+                self._drop(ready, why, Severity.INFO)
 
     def tick(self, now: Now) -> None:
         """Listen again after there was no room."""
-        if self._listener not in self._selector.get_map() and now.steady_s >= self._next_accept_s:
-            self._selector.register(self._listener, selectors.EVENT_READ, self)
+        self._listener.tick(now.steady_s)
 
     def abandon(self, sock: socket.socket) -> None:
         """Drop a client."""
@@ -177,33 +162,16 @@ class TcpServerOutput(Output):
             self._flush(client, waiting)
             if client in self._waiting:
                 self._drop(client, "the run has ended", Severity.INFO)
-        if self._listener.fileno() >= 0:
-            if self._listener in self._selector.get_map():
-                self._selector.unregister(self._listener)
-            self._listener.close()
+        self._listener.close()
 
     def _accept(self, now: Now) -> None:
-        try:
-            client, address = self._listener.accept()
-        except (BlockingIOError, InterruptedError):
-            return
-        except OSError as error:
-            self._selector.unregister(self._listener)
-            self._next_accept_s = now.steady_s + _ACCEPT_PAUSE_S
-            self.tell("accept_failed", error.strerror or str(error), Severity.WARNING)
-            return
-        client.setblocking(False)
-        place = f"client {address[0]}:{address[1]}"
-        if len(self._waiting) >= MAX_CLIENTS:
-            client.close()
-            text = f"{place} refused: there are {MAX_CLIENTS} already"
-            self.tell("client_refused", text, Severity.WARNING)
+        client = self._listener.accept(now.steady_s, len(self._waiting))
+        if client is None:
             return
         client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MAX_WAITING)
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._waiting[client] = bytearray()
         self._selector.register(client, selectors.EVENT_READ, self)
-        self.tell("connected", f"{place} has called", Severity.INFO)
 
     def _flush(self, client: socket.socket, waiting: bytearray) -> None:
         try:
@@ -219,7 +187,75 @@ class TcpServerOutput(Output):
 
     def _drop(self, client: socket.socket, why: str, severity: Severity = Severity.WARNING) -> None:
         self._waiting.pop(client, None)
-        if client in self._selector.get_map():
-            self._selector.unregister(client)
-        client.close()
+        let_go(client, self._selector)
         self.tell("client_lost", f"a client: {why}", severity)
+
+
+class Outlet(Protocol):
+    """Takes answers as bytes; never waits."""
+
+    def wants(self, form: OutputFormat) -> bool:
+        """Return whether anybody listens to this form."""
+        ...
+
+    def send(self, form: OutputFormat, data: bytes) -> None:
+        """Send one answer to everybody who listens to this form."""
+        ...
+
+    def output_status(self) -> tuple[OutputStatus, ...]:
+        """Return how the outputs are doing."""
+        ...
+
+
+class Every:
+    """Says when something is due again; a clock that was set begins anew."""
+
+    def __init__(self, period_s: float, *, at_once: bool = False) -> None:
+        self._period_s, self._at_once = period_s, at_once
+        self._last_s: float | None = None
+
+    def is_due(self, now_s: float) -> bool:
+        """Return whether it is due now, and take it as done."""
+        if self._last_s is None:
+            self._last_s = now_s
+            return self._at_once
+        if abs(now_s - self._last_s) < self._period_s * (1.0 - _ROUNDING):
+            return False
+        self._last_s = now_s
+        return True
+
+
+class Publisher:
+    """Sends the newest answer, in every form that somebody listens to.
+
+    Parameters
+    ----------
+    rate_hz, nmea_rate_hz : JSON lines and NMEA sentences at most so often, by the vehicle's clock.
+    geoid_separation_m : of the heights in NMEA sentences.
+    """
+
+    def __init__(
+        self, *, rate_hz: float = 50.0, nmea_rate_hz: float = 1.0, geoid_separation_m: float = 0.0
+    ) -> None:
+        for name, rate in (("output rate", rate_hz), ("NMEA rate", nmea_rate_hz)):
+            if not 0.0 < rate < float("inf"):
+                raise ConfigError(f"{name}: expected a number above 0 Hz, got {rate}")
+        self._geoid_separation_m = geoid_separation_m
+        self._dues = {
+            OutputFormat.JSON: Every(1.0 / rate_hz, at_once=True),
+            OutputFormat.NMEA: Every(1.0 / nmea_rate_hz, at_once=True),
+        }
+
+    def due(self, outlet: Outlet, now_s: float) -> list[OutputFormat]:
+        """Return the forms in which an answer is due and wanted."""
+        return [
+            form for form, every in self._dues.items() if outlet.wants(form) and every.is_due(now_s)
+        ]
+
+    def send(self, outlet: Outlet, form: OutputFormat, navigation: Navigation) -> None:
+        """Send one answer in one form."""
+        if form is OutputFormat.JSON:
+            outlet.send(form, encode_navigation(navigation))
+        else:
+            separation_m = self._geoid_separation_m
+            outlet.send(form, encode_nmea(navigation, geoid_separation_m=separation_m))

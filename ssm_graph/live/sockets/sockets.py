@@ -6,15 +6,13 @@ import selectors
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Self
 
-from ssm_graph.live.run.feed import CountingDecoder, Feed, Limits, Now
-from ssm_graph.live.run.notices import Notices
 from ssm_graph.live.sockets.endpoints import Endpoint, Transport
-from ssm_graph.live.sockets.inputs import Input, TcpClientInput
-from ssm_graph.live.sockets.listeners import TcpServerInput, UdpInput
+from ssm_graph.live.sockets.feed import CountingDecoder, Feed, Limits, Now
+from ssm_graph.live.sockets.inputs import Input, TcpClientInput, TcpServerInput, UdpInput
 from ssm_graph.live.sockets.outputs import Output, OutputFormat, TcpServerOutput, UdpOutput
+from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.navigation import Event
 from ssm_graph.mission.run_status import OutputStatus, SourceStatus
 from ssm_graph.sensors.messages import Message
@@ -66,7 +64,7 @@ class SocketHub:
     ) -> None:
         self._wall_s, self._steady_s = wall_s, steady_s
         self._begin_s = steady_s()
-        self._notices = Notices(wall_s, steady_s)
+        self._events = EventLog(wall_s, steady_s)
         self._selector = selectors.DefaultSelector()
         self.inputs: list[Input] = []
         self.outputs: list[Output] = []
@@ -105,13 +103,11 @@ class SocketHub:
                 else:
                     messages += key.data.on_ready(key.fileobj, now)
             except Exception as error:  # a defect: others go on
-                self._notices.failure(_name(key.data), "socket_failed", error)
+                self._events.failure(key.data.name, "socket_failed", error)
                 key.data.abandon(key.fileobj)
         for link in self._links:
-            try:
+            with self._events.surviving(link.name, "socket_failed"):
                 messages += link.tick(now) or []  # outputs have none
-            except Exception as error:
-                self._notices.failure(_name(link), "socket_failed", error)
         return messages
 
     def wait(self, timeout_s: float) -> None:
@@ -130,14 +126,12 @@ class SocketHub:
         """Send an answer to everybody who listens to this form; never waits."""
         for output in self.outputs:
             if output.form is form:
-                try:
+                with self._events.surviving(output.name, "socket_failed"):
                     output.send(data)
-                except Exception as error:
-                    self._notices.failure(_name(output), "socket_failed", error)
 
-    def take_events(self) -> list[Event]:
+    def take_events(self) -> tuple[Event, ...]:
         """Return what happened since the last call."""
-        return self._notices.take()
+        return self._events.take()
 
     def source_status(self) -> tuple[SourceStatus, ...]:
         """Return how the sources are doing."""
@@ -157,35 +151,19 @@ class SocketHub:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        at: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _input(self, config: InputConfig) -> Input:
+        where = str(config.endpoint)
         feed = Feed(
-            config.name,
-            str(config.endpoint),
-            config.make_decoder,
-            limits=config.limits,
-            notices=self._notices,
+            config.name, where, config.make_decoder, limits=config.limits, events=self._events
         )
-        match config.endpoint.transport:
-            case Transport.TCP_CLIENT:
-                return TcpClientInput(feed, self._selector, config.endpoint)
-            case Transport.TCP_SERVER:
-                return TcpServerInput(feed, self._selector, config.endpoint)
-            case Transport.UDP:
-                return UdpInput(feed, self._selector, config.endpoint)
+        kinds = {Transport.TCP_CLIENT: TcpClientInput, Transport.TCP_SERVER: TcpServerInput}
+        kind = kinds.get(config.endpoint.transport, UdpInput)
+        return kind(feed, self._selector, config.endpoint)
 
     def _output(self, config: OutputConfig) -> Output:
         if config.endpoint.transport is Transport.UDP:
-            return UdpOutput(config.form, config.endpoint, self._notices)
-        return TcpServerOutput(config.form, config.endpoint, self._notices, self._selector)
-
-
-def _name(link: Input | Output) -> str:
-    return link.feed.name if isinstance(link, Input) else link.address
+            return UdpOutput(config.form, config.endpoint, self._events)
+        return TcpServerOutput(config.form, config.endpoint, self._events, self._selector)

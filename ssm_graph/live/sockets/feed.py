@@ -10,18 +10,18 @@ from typing import Final, NamedTuple, Protocol
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.live.protocols.decoder import Decoder
 from ssm_graph.live.protocols.framing import TokenBucket
-from ssm_graph.live.run.notices import BURST, Notices
+from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.navigation import Severity
 from ssm_graph.mission.run_status import LinkState, SourceStatus
 from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.sensors.messages import Message
 
-CHUNK: Final = 65536
-"""Bytes that are read of one source before the others have their turn."""
 IDLE_S: Final = 1.0
 """A source that is silent so long gets to feed nothing, which lets a decoder release what waits."""
 OTHERS_SHARE: Final = 0.1
 """Of the rate of inertial samples, what each other kind of message may come at."""
+BURST: Final = 5
+"""Refusals of one source that may be told at once: their texts differ."""
 _AHEAD_S: Final = 0.1
 
 
@@ -87,7 +87,7 @@ class Feed:
     name : for people, such as ``dvl``.
     address : where it comes from, for people.
     make_decoder : of a new connection.
-    limits, notices : what it may do and where it is told.
+    limits, events : what it may do and where it is told.
     """
 
     def __init__(
@@ -97,11 +97,11 @@ class Feed:
         make_decoder: Callable[[], CountingDecoder],
         *,
         limits: Limits,
-        notices: Notices,
+        events: EventLog,
     ) -> None:
         self.name, self.address, self.limits = name, address, limits
         self.n_reconnects = 0
-        self._make_decoder, self._notices = make_decoder, notices
+        self._make_decoder, self._events = make_decoder, events
         self._buckets: dict[type[Message], TokenBucket] = {}
         self._n_bytes = self._n_messages = self._n_refused = 0
         self._free_s = self._last_s = -math.inf
@@ -124,7 +124,7 @@ class Feed:
             messages = decoder.feed(data, arrival_s=now.wall_s)
             refusals = decoder.take_refusals()
         except Exception as error:  # a decoder never raises; if it does, others go on
-            self._notices.failure(self.name, "decoder_failed", error)
+            self._events.failure(self.name, "decoder_failed", error)
             channel.decoder = self._make_decoder()
             return []
         self._n_refused += decoder.n_refused - n_before
@@ -146,7 +146,7 @@ class Feed:
 
     def tell(self, kind: str, text: str, severity: Severity, *, burst: int = 1) -> None:
         """Note an event about this source."""
-        self._notices.tell(self.name, kind, text, severity, burst=burst)
+        self._events.note(self.name, kind, text, severity, burst=burst)
 
     def status(self, state: LinkState, now: Now) -> SourceStatus:
         """Return the counts."""

@@ -1,16 +1,125 @@
-"""The linear update that every rule repeats, and the book-keeping of runs that have stopped."""
+"""One update of many runs: what a rule is given and returns, the linear step that all repeat.
+
+Shapes: B runs side by side, of them R that still go on; n states, m rows. A linear filter over any
+rule is at the end, for problems that are vectors and matrices.
+"""
 
 from __future__ import annotations
 
 import contextlib
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol, final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
-from ssm_graph.filters.rules.model import NOMINAL, Iterate, MeasurementModel, Runs, Update
+
+Runs = NDArray[np.intp]
+NOMINAL = -1
+"""Group of rows that always count in full."""
+
+
+@dataclass(frozen=True, slots=True)
+class Iterate:
+    """Where R runs have got to, and their measurements linearised there.
+
+    Rows are whitened: noise of unit variance, zeros where nothing was measured.
+    """
+
+    xi: Array
+    """(R, n) deviation from the prediction: a difference in a vector space, a chart on a
+    manifold"""
+    innovation: Array
+    """(R, m) measured minus predicted"""
+    jacobian: Array
+    """(R, m, n) of the prediction, with respect to the local error"""
+    local_D_xi: Array | None = None
+    """(R, c, c) how the first ``c`` components of the local error follow those of ``xi``; the
+    others, and all where None, are the same."""
+
+    def take(self, kept: NDArray[np.bool_]) -> Iterate:
+        """Return the iterate of some runs."""
+        J = None if self.local_D_xi is None else self.local_D_xi[kept]
+        return Iterate(self.xi[kept], self.innovation[kept], self.jacobian[kept], J)
+
+    def linear_move(self, step: Array) -> Iterate:
+        """Return the iterate after steps (R, n), the measurements as they were linearised."""
+        moved = (self.jacobian @ step[..., None])[..., 0]
+        return Iterate(self.xi + step, self.innovation - moved, self.jacobian)
+
+    def in_chart(self, rows: Array) -> Array:
+        """Return Jacobian rows (R, m, n) of the local error as those of ``xi``."""
+        J = self.local_D_xi
+        if J is None:
+            return rows
+        c = J.shape[-1]
+        return np.concatenate([rows[..., :c] @ J, rows[..., c:]], axis=-1)
+
+    def to_local(self, columns: Array) -> Array:
+        """Return columns (R, n, k) of ``xi`` as those of the local error."""
+        J = self.local_D_xi
+        if J is None:
+            return columns
+        c = J.shape[-1]
+        return np.concatenate([J @ columns[:, :c], columns[:, c:]], axis=1)
+
+    def both_to_local(self, covariance: Array) -> Array:
+        """Return a covariance (R, n, n) of ``xi`` as that of the local error."""
+        return self.to_local(np.swapaxes(self.to_local(covariance), 1, 2))
+
+
+class MeasurementModel(Protocol):
+    """Measurements of one step of B runs side by side, about their predictions."""
+
+    present: NDArray[np.bool_]
+    """(B, m) which rows were measured"""
+    group: NDArray[np.intp]
+    """(m,) rows of one group share an auxiliary parameter; :data:`NOMINAL` rows have none"""
+
+    def at(self, xi: Array) -> Iterate:
+        """Return all B runs at deviations (B, n) from their predictions."""
+
+    def move(self, iterate: Iterate, step: Array, runs: Runs) -> Iterate:
+        """Return where local steps (R, n) lead; ``runs`` (R,) says which runs these are."""
+
+
+class Update(NamedTuple):
+    """Result of one update of B runs."""
+
+    xi: Array
+    """(B, n) posterior mean as a deviation from the prediction"""
+    covariance: Array
+    """(B, n, n) posterior covariance of the local error at the last linearisation"""
+    weights: Array
+    """(B, m) weight of each row in the last pass; 1 for nominal and missing rows"""
+    state_weight: Array
+    """(B,) weight of the prediction; 1 where the rule trusts it"""
+    mahalanobis_sq: Array
+    """(B, m) squared length of each row's group at the end"""
+    innovation: Array
+    """(B, m) whitened, at the end"""
+    n_iterations: NDArray[np.intp]
+    """(B,) linear updates made"""
+
+
+class UpdateRule(ABC):
+    """One way to correct predictions by measurements."""
+
+    @abstractmethod
+    def __call__(self, P: Array, model: MeasurementModel, mean: Array | None = None) -> Update:
+        """Correct the predictions of B runs.
+
+        Parameters
+        ----------
+        P : (B, n, n) covariance of the predictions.
+        model : the measurements.
+        mean : (B, n) predicted means where the state is a plain vector; published stopping rules
+            ask for its length. Error states have none: zero.
+        """
 
 
 class Prepared(NamedTuple):
@@ -198,3 +307,104 @@ class Result:
             innovation=end.innovation,
             weights=np.where(self._model.present, update.weights, 1.0),
         )
+
+
+class LinearSystem(NamedTuple):
+    """``x' = F x + w``, ``z = H x + v`` with ``w ~ N(0, Q)``, ``v ~ N(0, R)``."""
+
+    F: Array
+    """(n, n)"""
+    Q: Array
+    """(n, n)"""
+    H: Array
+    """(m, n)"""
+    R: Array
+    """(m, m)"""
+
+
+@final
+class LinearModel:
+    """A measurement ``z`` (B, m) of vectors, about their predicted means (B, n)."""
+
+    def __init__(self, system: LinearSystem, mean: Array, z: Array, *, group: Runs) -> None:
+        self.present = np.isfinite(z)
+        self.group = group
+        # Missing components drop out before whitening: the others keep their own noise.
+        whitened, self._H = _whitened(system, z, self.present)
+        self._missed = whitened - (self._H @ mean[..., None])[..., 0]
+
+    def at(self, xi: Array) -> Iterate:
+        """Return all runs at their predicted means plus ``xi``."""
+        return Iterate(xi, self._missed - (self._H @ xi[..., None])[..., 0], self._H)
+
+    def move(self, iterate: Iterate, step: Array, runs: Runs) -> Iterate:  # noqa: ARG002
+        """Return the sums."""
+        return iterate.linear_move(step)
+
+
+def _whitened(system: LinearSystem, z: Array, present: NDArray[np.bool_]) -> tuple[Array, Array]:
+    n_runs, n_rows = z.shape
+    whitened, H = np.zeros((n_runs, n_rows)), np.zeros((n_runs, *system.H.shape))
+    for pattern in np.unique(present, axis=0):
+        runs = np.all(present == pattern, axis=1)
+        root = np.linalg.cholesky(system.R[np.ix_(pattern, pattern)])
+        whitened[np.ix_(runs, pattern)] = np.linalg.solve(root, z[np.ix_(runs, pattern)].T).T
+        H[np.ix_(runs, pattern)] = np.linalg.solve(root, system.H[pattern])
+    return whitened, H
+
+
+class LinearHistory(NamedTuple):
+    """Result of a linear filter: K steps of B runs."""
+
+    x: Array
+    """(K, B, n) posterior means"""
+    P: Array
+    """(K, B, n, n) posterior covariances"""
+    x_prior: Array
+    """(K, B, n)"""
+    P_prior: Array
+    """(K, B, n, n)"""
+    updates: tuple[Update, ...]
+    """Everything else of every step."""
+
+
+def run_linear_filter(
+    system: LinearSystem,
+    z: Array,
+    *,
+    x0: Array,
+    P0: Array,
+    rule: UpdateRule,
+    group: Runs | None = None,
+) -> LinearHistory:
+    """Filter measurements (K, B, m) of B runs; NaN marks a missing component.
+
+    Each step predicts first, then makes one update: ``x0`` and ``P0`` are those before the first
+    prediction.
+
+    Parameters
+    ----------
+    system : the model.
+    z : (K, B, m) measurements.
+    x0 : (B, n) means.
+    P0 : (B, n, n) covariances.
+    rule : how a measurement corrects the prediction.
+    group : (m,) rows that share an auxiliary parameter; one group of all when left out.
+    """
+    if z.ndim != 3 or z.shape[2] != len(system.H):
+        raise ConfigError(f"z: expected (steps, runs, {len(system.H)}), got {z.shape}")
+    group = np.zeros(z.shape[2], dtype=np.intp) if group is None else group
+    if np.any(group < NOMINAL):
+        raise ConfigError(f"group: expected numbers from {NOMINAL}, got {group.min()}")
+    x, P = x0, P0
+    steps: list[tuple[Array, Array, Array, Array]] = []
+    updates: list[Update] = []
+    for measured in z:
+        x_prior, P_prior = x @ system.F.T, system.F @ P @ system.F.T + system.Q
+        model = LinearModel(system, x_prior, measured, group=group)
+        update = rule(P_prior, model, mean=x_prior)
+        x, P = x_prior + update.xi, update.covariance
+        steps.append((x, P, x_prior, P_prior))
+        updates.append(update)
+    x_all, P_all, x_prior_all, P_prior_all = (np.array(c) for c in zip(*steps, strict=True))
+    return LinearHistory(x_all, P_all, x_prior_all, P_prior_all, tuple(updates))
