@@ -1,7 +1,8 @@
-"""The report of a benchmark: what was run, on which machine, and where the text goes."""
+"""A benchmark's command line and page: what was run, on which machine, and where it goes."""
 
 from __future__ import annotations
 
+import argparse
 import os
 import platform
 import shlex
@@ -9,30 +10,91 @@ import sys
 from collections.abc import Iterable, Sequence
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ssm_graph.evaluation import Interval, mean_with_interval, paired_ratio
 from ssm_graph.study.code import code_version
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
+DOCS = ROOT / "docs"
+
+
+class Option(NamedTuple):
+    """One option of a command line."""
+
+    flag: str
+    """``--name``, or ``name`` for an argument that has to be given"""
+    default: Any
+    """Its type is the option's; False or a list means a switch or several values, a type itself an
+    option without a default"""
+    text: str
+    choices: Iterable[str] | None = None
+
+    def add_to(self, parser: argparse.ArgumentParser) -> None:
+        """Make the parser know it."""
+        default = self.default
+        more: dict[str, Any] = {} if self.choices is None else {"choices": [*self.choices]}
+        if default is False:
+            parser.add_argument(self.flag, action="store_true", help=self.text)
+        elif isinstance(default, type):
+            parser.add_argument(self.flag, type=default, help=self.text, **more)
+        else:
+            several = isinstance(default, list)
+            kind, nargs = (type(default[0]), "*") if several else (type(default), None)
+            settings = {"type": kind, "nargs": nargs, "default": default, **more}
+            parser.add_argument(self.flag, help=self.text, **settings)
 
 
 class Report:
-    """One benchmark's page; made before the work, for it holds the load of the machine then."""
+    """A benchmark's command line and page; made before the work, for it holds the load then."""
 
-    def __init__(self, name: str, title: str, argv: Sequence[str] | None) -> None:
-        """Take the name of script and page, the page's title, and what ``main`` was called with."""
-        self._name, self._title = name, title
-        command = ["python", f"benchmarks/{name}.py", *(sys.argv[1:] if argv is None else argv)]
-        self._command = shlex.join(command)
-        self._about = f"{machine()}; load average before {os.getloadavg()[0]:.1f}."
+    def __init__(self, file: str, title: str, about: str | None, *options: Option) -> None:
+        """Read the command line.
 
-    def head(self) -> list[str]:
-        """Return title, command and machine as lines."""
-        return [f"# {self._title}", "", f"    {self._command}", "", self._about, ""]
+        Parameters
+        ----------
+        file, about : ``__file__`` and ``__doc__`` of the benchmark's module.
+        title : of the page; the page has the name of the module, or of the folder of a ``run.py``.
+        options : besides ``--out`` and ``--keep``, which all have.
+        """
+        path = Path(file).resolve().relative_to(ROOT).with_suffix("")
+        module = ".".join(path.parts)
+        self._title, self._name = title, path.parent.name if path.name == "run" else path.name
+        parser = argparse.ArgumentParser(
+            prog=f"python -m {module}",
+            description=(about or "").partition("\n")[0],
+            formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        )
+        for option in options:
+            option.add_to(parser)
+        Option("--out", Path("out") / self._name, "folder of the page").add_to(parser)
+        Option("--keep", False, "write to benchmarks/results, figures to docs, too").add_to(parser)
+        self.args = parser.parse_args()
+        self._command = shlex.join(["python", "-m", module, *sys.argv[1:]])
+        self._load = os.getloadavg()[0]
 
-    def write(self, text: str, folders: Iterable[Path]) -> None:
-        """Print the page, and write it to each of the folders."""
-        print(text)
+    def places(self, kept: Path = RESULTS) -> list[Path]:
+        """Return the folders to write to: that of ``--out``, and with ``--keep`` another."""
+        folders = [self.args.out, kept] if self.args.keep else [self.args.out]
         for folder in folders:
             folder.mkdir(parents=True, exist_ok=True)
-            (folder / f"{self._name}.md").write_text(text, encoding="utf-8")
+        return folders
+
+    def write(self, lines: Iterable[str], *, part: str = "", of: str = "") -> None:
+        """Print the page and write it; one of several is named by its part, and says of what."""
+        before, self._load = self._load, os.getloadavg()[0]
+        about = f"{machine()}; load average before {before:.1f}, after {self._load:.1f}."
+        title = f"{self._title}: {of}" if of else self._title
+        text = "\n".join([f"# {title}", "", f"    {self._command}", "", about, "", *lines])
+        text = text.rstrip() + "\n"
+        print(text)
+        for folder in self.places():
+            name = f"{self._name}_{part}.md" if part else f"{self._name}.md"
+            (folder / name).write_text(text, encoding="utf-8")
 
 
 def machine() -> str:
@@ -46,3 +108,50 @@ def machine() -> str:
         f"{model}, {os.cpu_count()} cores; ssm-graph {code_version()}, gtsam {version('gtsam')}, "
         f"numpy {version('numpy')}, Python {platform.python_version()}"
     )
+
+
+def note(text: str) -> None:
+    """Say on the way what is done."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """Return the lines of a Markdown table."""
+    return [f"| {' | '.join(cells)} |" for cells in (header, ["---"] * len(header), *rows)]
+
+
+def interval_text(interval: Interval, digits: str = ".3g") -> str:
+    """Return a value with its interval."""
+    value, low, high = (f"{x:{digits}}" for x in (interval.value, interval.low, interval.high))
+    return f"{value} ({low} to {high})"
+
+
+def mean_text(samples: ArrayLike, digits: str = ".3g") -> str:
+    """Return a mean with its 95 % interval (Student's t); a dash for nothing but NaN."""
+    if np.isnan(samples).all():
+        return "–"
+    return interval_text(mean_with_interval(samples), digits)
+
+
+def spread_text(samples: ArrayLike) -> str:
+    """Return a mean ± half of its 95 % interval (Student's t); a dash for none."""
+    n = np.size(samples)
+    if n == 0:
+        return "–"
+    mean = mean_with_interval(samples)
+    return f"{mean.value:.3g} ± {mean.half_width:.2g}" if n > 1 else f"{mean.value:.3g}"
+
+
+def ratio_text(ours: ArrayLike, other: ArrayLike) -> str:
+    """Return the ratio of means over the same missions, with its 95 % bootstrap interval."""
+    return interval_text(paired_ratio(ours, other, np.random.default_rng(0)), ".3f")
+
+
+def number_text(x: float) -> str:
+    """Return three digits, or a dash."""
+    return f"{x:.3g}" if np.isfinite(x) else "–"
+
+
+def rms(errors: ArrayLike) -> float:
+    """Return the root mean square."""
+    return float(np.sqrt(np.mean(np.square(errors))))

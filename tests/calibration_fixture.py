@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from benchmarks.calibration_cases import wrong_depth, wrong_dvl, wrong_gnss
 from ssm_graph.simulation import DepthProfile, SimulatedMission, SurveyRoute
+from tests.calibration_cases import wrong_depth, wrong_dvl, wrong_gnss
 from tests.helpers import simulated
 
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.calibration_cases import MOUNTING, SCALE, as_stated
 from ssm_graph.mission.estimate import Calibration, Estimate
 from ssm_graph.mission.mission import Mission
 from ssm_graph.sensors.depth import DepthCalibration
@@ -22,6 +21,7 @@ from ssm_graph.simulation import (
     SurveyRoute,
 )
 from ssm_graph.smoothers.fixed_lag import FixedLagConfig
+from tests.calibration_cases import MOUNTING, SCALE, as_stated
 from tests.helpers import simulated
 
 SHORT = FixedLagConfig(8.0, tolerance=1e-2, max_iterations=5, relinearise_sigmas=1e-2, reweigh=1e-2)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.calibration import LABELS, Run, transit, turns
 from factors.similarity import GaussianKernel, Kernel, LogKernel
+from tests.calibration_runs import LABELS, Run, transit, turns
 from tests.helpers import assert_consistent
 
 RUNS = 8

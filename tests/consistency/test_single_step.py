@@ -12,15 +12,14 @@ from functools import cache
 import numpy as np
 import pytest
 
-from benchmarks.equivalence import Difference, against_filter, against_geodetic, missions
 from factors.similarity import Similarity
 from ssm_graph.engine.error_state import Linearised
 from ssm_graph.filters.geodetic.mechanisation import Feedback
 from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.simulation import GnssSettings, Grade, Loss, OutlierKind, Outliers, SimulatedMission
 from tests.helpers import simulated
+from tests.single_step import GRADES, Difference, against_filter, against_geodetic, missions
 
-GRADES = (Grade.NAVIGATION, Grade.TACTICAL, Grade.INDUSTRIAL)
 each_grade = pytest.mark.parametrize("grade", GRADES, ids=lambda grade: grade.name)
 each_similarity = pytest.mark.parametrize("similarity", Similarity, ids=lambda s: s.name)
 

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.calibration_cases import MOUNTING, SCALE
 from ssm_graph.base.frozen import Array
 from ssm_graph.mission.calibration import DVL_MOUNTING, DVL_SCALE
 from ssm_graph.mission.estimate import Estimate
 from ssm_graph.mission.problem import build_problem
 from ssm_graph.simulation import SimulatedMission
 from ssm_graph.smoothers.fixed_lag import solve_fixed_lag
+from tests.calibration_cases import MOUNTING, SCALE
 from tests.helpers import assert_consistent
 from tests.window_fixture import SHORT, asked, found, off
 

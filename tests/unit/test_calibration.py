@@ -8,7 +8,6 @@ from functools import cache
 import numpy as np
 import pytest
 
-from benchmarks.calibration_cases import AIDS, DVL, as_stated, asking
 from ssm_graph.evaluation import evaluate
 from ssm_graph.filters.navigation.named import filter_problems
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
@@ -31,6 +30,7 @@ from ssm_graph.simulation import (
 )
 from ssm_graph.smoothers.batch import SsmSmoother
 from ssm_graph.smoothers.fixed_lag import FixedLagConfig, solve_fixed_lag
+from tests.calibration_cases import AIDS, DVL, as_stated, asking
 from tests.calibration_fixture import miscalibrated
 
 

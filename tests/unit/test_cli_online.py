@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.calibration_cases import SCALE
 from ssm_graph.cli.main import ExitCode, build_parser, main
 from ssm_graph.cli.online import input_configs, output_configs, replay_speed
 from ssm_graph.io.mission_folder.reader import read_mission, write_mission
@@ -21,6 +20,7 @@ from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
 from ssm_graph.live.sockets.endpoints import Transport
 from ssm_graph.live.sockets.feed import Limits
 from ssm_graph.live.sockets.outputs import OutputFormat
+from tests.calibration_cases import SCALE
 from tests.mission_fixture import make_mission
 from tests.window_fixture import asked, off
 

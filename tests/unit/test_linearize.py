@@ -9,7 +9,6 @@ import gtsam
 import numpy as np
 import pytest
 
-from benchmarks.calibration_cases import as_stated, asking
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import STATE_DIM
@@ -29,6 +28,7 @@ from ssm_graph.simulation import (
     UsblSettings,
 )
 from tests.aids_fixture import KNOWN
+from tests.calibration_cases import as_stated, asking
 from tests.calibration_fixture import miscalibrated
 from tests.helpers import drifting, simulated, true_states
 

@@ -1,4 +1,4 @@
-"""Damaged traffic, a little of it; and that the benchmark sees what it looks for."""
+"""Damaged traffic, a little of it; and that what is looked for is seen."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import random
 
 import pytest
 
-from benchmarks.fuzz import Target, damaged, json_traffic, report_lines, run, targets
 from ssm_graph.sensors.depth import DepthReading
 from ssm_graph.sensors.messages import Message
+from tests.damaged_traffic import Target, damaged, json_traffic, run, targets
 
 
 @pytest.mark.parametrize("k", range(len(targets())))
@@ -19,7 +19,6 @@ def test_damaged_traffic_does_no_harm(k: int) -> None:
     run(others[k], others, 50_000, random.Random(7))
     assert others[k].failures == []
     assert others[k].messages > 20
-    assert "**No failure.**" in report_lines(others, growth_mb=0.0)
 
 
 def test_traffic_is_sound_before_it_is_damaged() -> None:
@@ -63,5 +62,3 @@ def test_failures_are_seen() -> None:
     text = " ".join(target.failures)
     for word in ("KeyError", "holds 1000000", "depth of", "kept 100", "refusal"):
         assert word in text
-    assert any("FAILURES" in line for line in report_lines([target], growth_mb=0.0))
-    assert any("grew by 99" in line for line in report_lines([], growth_mb=99.0))

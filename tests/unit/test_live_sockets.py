@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import socket
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import pairwise
@@ -508,11 +507,10 @@ def test_a_client_that_never_reads_is_dropped() -> None:
         receiver.until(lambda: output.n_clients == 2)
         assert hub.wants(OutputFormat.JSON)
         assert not hub.wants(OutputFormat.NMEA)
-        n_sent, got, longest_s = 0, bytearray(), 0.0
+        assert not any(client.getblocking() for client in output._waiting)
+        n_sent, got = 0, bytearray()
         while output.n_clients == 2:
-            begin_s = time.perf_counter()
             hub.send(OutputFormat.JSON, answer)
-            longest_s = max(longest_s, time.perf_counter() - begin_s)
             n_sent += 1
             receiver.poll(0.0)
             _read_all(good, got)
@@ -521,7 +519,6 @@ def test_a_client_that_never_reads_is_dropped() -> None:
         receiver._after_poll = lambda: _read_all(good, got)
         receiver.until(lambda: len(got) == n_sent * len(answer))
         assert bytes(got) == answer * n_sent
-        assert longest_s < 0.5
         receiver.poll()
         assert "client_lost" in receiver.kinds
         assert hub.output_status()[0].n_dropped == 1

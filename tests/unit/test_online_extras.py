@@ -9,7 +9,6 @@ from functools import cache
 import numpy as np
 import pytest
 
-from benchmarks.calibration_cases import MOUNTING, SCALE
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import STATE_DIM
@@ -26,6 +25,7 @@ from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.messages import Message
 from ssm_graph.simulation import GnssSettings, Loss
 from ssm_graph.smoothers.fixed_lag import run_fixed_lag
+from tests.calibration_cases import MOUNTING, SCALE
 from tests.water_fixture import in_current
 from tests.window_fixture import asked, off
 

@@ -1,4 +1,4 @@
-"""Faults that the live estimator has to live through; `benchmarks/faults.py` has them all."""
+"""Faults that the live estimator has to live through; `benchmarks/faults/` has them all."""
 
 from __future__ import annotations
 

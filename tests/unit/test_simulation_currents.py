@@ -50,11 +50,11 @@ def test_water_speeds_are_those_of_the_motion_through_the_water() -> None:
 
 
 def test_random_part_has_its_sigma_and_correlation() -> None:
-    """Over many seeds, at the begin and 6000 s later."""
+    """Over many seeds, at the begin and 600 s later."""
     pairs = np.array(
         [
-            drawn(seed, sigma=0.4, vertical_sigma=0.02, correlation_s=6000.0, end_s=7000.0).at(
-                np.array([0.0, 6000.0])
+            drawn(seed, sigma=0.4, vertical_sigma=0.02, correlation_s=600.0, end_s=700.0).at(
+                np.array([0.0, 600.0])
             )
             for seed in range(400)
         ]

@@ -12,7 +12,7 @@ from tests.window_fixture import asked, found, off
 
 def test_a_window_of_the_whole_mission_is_the_batch() -> None:
     """Track, calibration and sigmas, to a fiftieth of a sigma."""
-    problem = build_problem(asked(off().mission))
+    problem = build_problem(asked(off(duration_s=40.0).mission))
     batch = SsmSmoother().solve(problem)
     config = FixedLagConfig(
         1e3, max_iterations=20, tolerance=1e-4, relinearise_sigmas=1e-3, reweigh=1e-3

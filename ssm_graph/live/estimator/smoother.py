@@ -53,7 +53,7 @@ ONLINE: Final = FixedLagConfig(
     gate_sigmas=6.0,
     first_estimates=True,
 )
-"""What a vehicle can afford; `benchmarks/online.py` compares it with windows solved to the end."""
+"""What a vehicle can afford; `benchmarks/online/` compares it with windows solved to the end."""
 LONGEST_GAP_S: Final = 10.0
 """After a longer gap of the inertial data the attitude has to be found anew."""
 CATCH_UP_STEPS: Final = 1

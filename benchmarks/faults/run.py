@@ -1,0 +1,101 @@
+"""Faults injected into missions, one a row: what happens, what is lost, how it comes back.
+
+``python -m benchmarks.faults.run --keep`` (some minutes on two cores); ``--only clock`` runs the
+rows whose name has that word. Exit code 1 if a row fails.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+
+from benchmarks.faults.case import (
+    BEGIN_S,
+    GROUPS,
+    LAG_S,
+    LOOK_S,
+    Case,
+    Rule,
+    Stage,
+    run_case,
+    shares_inside,
+    undisturbed,
+)
+from benchmarks.faults.data import data_cases
+from benchmarks.faults.judge import HEADER, RULES, Row, judge, share_text
+from benchmarks.faults.process import PROCESS_ROWS, run_process_row
+from benchmarks.faults.transforms import untouched
+from benchmarks.processes import side_by_side
+from benchmarks.report import Option, Report, table
+from ssm_graph.mission.navigation import Health
+
+PROCESS = """\
+Kills and disks: `ssm-graph online` replays 40 s as fast as it goes, a checkpoint every 3 s; the
+folder that is left is compared with that of an uninterrupted run, results to nine digits, the log
+byte by byte. Connections: the same runner behind real sockets, 60 s with GNSS for 20 s, inertial
+data, depth and GNSS as JSON lines over TCP and the DVL as a Water Linked server, on a clock that
+runs with the data.
+"""
+DURATION = f"{Stage().duration_s:.0f} s"
+LEGEND = f"""\
+Simulated survey lines of 60 m in waves: tactical-grade inertial data at 100 Hz, DVL and depth at
+2 Hz, GNSS at 1 Hz for 60 s, {DURATION} unless the fault needs longer; `FixedLagSmoother` as on a
+vehicle with a lag of {LAG_S:.0f} s. Faults begin at {BEGIN_S:.0f} s unless the row says otherwise;
+the newest answer is looked at every {LOOK_S:g} s. "Good again" counts from the end of the fault, or
+from its begin where it never ends. The shares are those of position, velocity and attitude.
+"""
+
+
+def run_row(name: str) -> Row:
+    """Run the case of this name; a numerical warning counts as an exception."""
+    if name in PROCESS_ROWS:
+        return run_process_row(name)
+    case = next(case for case in data_cases() if case.name == name)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        return judge(case, run_case(case))
+
+
+def summary(data: Sequence[Row], process: Sequence[Row]) -> str:
+    """Return how many rows passed."""
+    parts = [
+        f"{sum(row.has_passed for row in rows)} of {len(rows)} faults of {what}"
+        for rows, what in ((data, "data"), (process, "processes and connections"))
+        if rows
+    ]
+    return f"**Passed: {', '.join(parts)}.**"
+
+
+def undisturbed_line() -> str:
+    """Return how good the undisturbed mission is."""
+    case = Case("", "", untouched, Rule())
+    shares = shares_inside(undisturbed(case.stage).looks, case, Health.GOOD)
+    return f"Undisturbed, the truth is inside in {share_text(shares)} ({', '.join(GROUPS)})."
+
+
+def lines_of(data: Sequence[Row], process: Sequence[Row]) -> list[str]:
+    """Return the page."""
+    lines = [summary(data, process), "", LEGEND, RULES, undisturbed_line(), ""]
+    for title, text, rows in (("Data", "", data), ("Processes and connections", PROCESS, process)):
+        if rows:
+            lines += [f"## {title}", "", *([text] if text else [])]
+            lines += [*table(HEADER, [row.texts for row in rows]), ""]
+    return lines
+
+
+def main() -> int:
+    """Run the benchmark and write its report."""
+    report = Report(
+        *(__file__, "Faults", __doc__),
+        Option("--only", "", "rows whose name has this word"),
+        Option("--jobs", 2, "processes"),
+    )
+    every = [case.name for case in data_cases()], PROCESS_ROWS
+    of_data, of_process = ([x for x in names if report.args.only in x] for names in every)
+    rows = side_by_side(run_row, [(x,) for x in (*of_data, *of_process)], report.args.jobs)
+    report.write(lines_of(rows[: len(of_data)], rows[len(of_data) :]))
+    return 0 if all(row.has_passed for row in rows) else 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,39 @@
+"""Work in fresh processes: side by side, or alone where memory and time are counted by process."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable, Iterable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from typing import Any, TypeVar
+
+from benchmarks.report import note
+
+T = TypeVar("T")
+
+
+def side_by_side(
+    task: Callable[..., T], cases: Iterable[tuple[Any, ...]], jobs: int, *, each_fresh: bool = False
+) -> list[T]:
+    """Return what a task makes of the arguments of each case, in order, and tell how far it is.
+
+    Parameters
+    ----------
+    task : a function of a module that processes can import.
+    jobs : processes at a time.
+    each_fresh : give each case a process of its own.
+    """
+    context = multiprocessing.get_context("spawn")
+    per_child = 1 if each_fresh else None
+    with ProcessPoolExecutor(jobs, context, max_tasks_per_child=per_child) as pool:
+        futures = {pool.submit(task, *case): case for case in cases}
+        for number, future in enumerate(as_completed(futures), start=1):
+            future.result()
+            note(f"{number} of {len(futures)}: {futures[future]} done")
+        return [future.result() for future in futures]
+
+
+def in_fresh_process(task: Callable[..., T], *args: object) -> T:
+    """Return what ``task`` returns in a process of its own: peak memory is counted by process."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(task, *args).result()
