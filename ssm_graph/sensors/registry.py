@@ -14,7 +14,15 @@ from ssm_graph.sensors.imu import IMU
 from ssm_graph.sensors.instrument import Instrument
 from ssm_graph.sensors.messages import Message
 
-INSTRUMENTS: Final[tuple[Instrument, ...]] = (IMU, DVL, DEPTH, GNSS, USBL, RANGES, COMPASS)
+INSTRUMENTS: Final[tuple[Instrument, ...]] = (
+    IMU,
+    DVL,
+    DEPTH,
+    GNSS,
+    USBL,
+    RANGES,
+    COMPASS,
+)
 """In the order in which a folder has their tables, and a log counts them."""
 BY_SECTION: Final[Mapping[str, Instrument]] = {one.section: one for one in INSTRUMENTS}
 BY_LOG: Final[Mapping[type, Instrument]] = {one.log: one for one in INSTRUMENTS}
