@@ -162,8 +162,7 @@ class FixedLagSmoother:
 
     def _follow(self, step: Step, maker: KeyframeMaker) -> None:
         """Make all steps from a first one on."""
-        null_b = np.linalg.svd(self.vehicle.mount.beams_b.T)[2][-1]
-        self._course = Course(step, maker, self._intake.buffers, self._events, null_b)
+        self._course = Course(step, maker, self._intake.buffers, self._events)
         self._course.advance()
         self._intake.horizon_s = self._course.horizon_s
         self._tail = self._tail_of(self._course.newest)
