@@ -1,7 +1,7 @@
 """What a live estimator's alignment costs its caller: processor time of every push.
 
-``python -m benchmarks.online.alignment --keep`` (about two minutes on one core). A vehicle hovers at
-the surface with GNSS and does not know its heading, so that eight are tried: the most work there
+``python -m benchmarks.online.alignment --keep`` (about two minutes on one core). A vehicle hovers
+at the surface with GNSS and does not know its heading, so that eight are tried: the most work there
 is. The alignment is begun with so many seconds of data, and messages go on to come.
 """
 

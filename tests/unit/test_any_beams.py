@@ -163,7 +163,7 @@ def test_zeros_in_all_beams_are_no_lock_everywhere() -> None:
     lost = replace(mission, dvl=replace(mission.dvl, speed=speed))
     labels = {name: name for name in ("imu", "dvl", "depth", "gnss")}
     logs = (lost.imu, lost.dvl, lost.depth, lost.gnss)
-    made = mission_from(logs, None, name="x", labels=labels, frame=lost.frame)
+    made = mission_from(logs, None, source=Path("x.bag"), labels=labels)
     assert np.isnan(made.dvl.speed[20:30]).all()
     assert made.dvl.speed[40, 2] == 0.0
     assert any("10 of 60 pings hold exactly 0 in all beams" in note for note in made.notes)

@@ -24,6 +24,7 @@ def test_an_instrument_is_one_file_and_one_line(tmp_path: Path) -> None:
     text = registry.read_text()
     imported = "from ssm_graph.sensors.fluxgate import FLUXGATE\nfrom ssm_graph.sensors.mess"
     text = text.replace("from ssm_graph.sensors.mess", imported)
+    assert "    COMPASS,\n" in text
     registry.write_text(text.replace("    COMPASS,\n", "    COMPASS,\n    FLUXGATE,\n"))
     ran = subprocess.run(
         [sys.executable, "-m", "tests.new_instrument_script", str(tmp_path)],

@@ -7,6 +7,7 @@ import errno
 import math
 import multiprocessing
 import os
+import re
 import resource
 import tempfile
 import time
@@ -29,6 +30,7 @@ from ssm_graph.io.raw_log import log as raw_log
 from ssm_graph.io.raw_log import replay as raw_replay
 from ssm_graph.io.raw_log.log import RawLog, replay
 from ssm_graph.io.raw_log.rows import ALWAYS, messages_of, row_kinds
+from ssm_graph.sensors.acoustic import AcousticRange
 from ssm_graph.sensors.depth import DepthReading
 from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.gnss import Fix
@@ -300,6 +302,37 @@ def test_rows_without_letters_come_last_in_order_of_time(tmp_path: Path) -> None
     again = replayed(tmp_path)
     assert sorted(shown(again)) == sorted(shown(want))
     assert shown(again[:20]) == shown(messages[:20])
+
+
+def test_a_log_from_before_acoustics_and_headings(tmp_path: Path) -> None:
+    """It counts four tables where its processes changed; a row without its letter shifts none."""
+    messages = mixed(20)
+    log_of(tmp_path, messages[:9]).close()
+    arrivals = tmp_path / "arrivals"
+    arrivals.write_bytes(arrivals.read_bytes()[:-1])
+    with RawLog.reopen(tmp_path, VEHICLE) as log:
+        for message in messages[9:]:
+            log.append(message)
+    text = arrivals.read_bytes()
+    sizes = re.search(rb"@(.*?);", text)
+    assert sizes is not None
+    four = b",".join(sizes[1].split(b",")[:4])
+    assert sizes[1] == four + b",0,0,0"
+    want = shown(replayed(tmp_path))
+    arrivals.write_bytes(text.replace(sizes[1], four))
+    assert shown(replayed(tmp_path)) == want == shown(messages)
+
+
+def test_an_instrument_that_the_vehicle_does_not_have_is_logged(tmp_path: Path) -> None:
+    """Its table begins with its first message, and its rows come back in order of arrival."""
+    late = AcousticRange(2.5, 4.0, 120.0)
+    messages = [*mixed(10), late, *mixed(3)]
+    log_of(tmp_path, messages[:11]).close()
+    assert not (tmp_path / "usbl.csv").exists()
+    with RawLog.reopen(tmp_path, VEHICLE) as log:
+        for message in messages[11:]:
+            log.append(message)
+    assert shown(replayed(tmp_path)) == shown(messages)
 
 
 def test_arrivals_outlive_rows_in_a_power_failure(tmp_path: Path) -> None:

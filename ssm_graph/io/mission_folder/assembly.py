@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -47,9 +48,8 @@ def mission_from(
     logs: Iterable[Any],
     vehicle: Vehicle | None,
     *,
-    name: str,
+    source: Path,
     labels: Mapping[str, str],
-    frame: LocalFrame,
     notes: Sequence[str] = (),
 ) -> Mission:
     """Return the mission of logs that were made of messages, checked as a folder's tables are.
@@ -57,15 +57,16 @@ def mission_from(
     Parameters
     ----------
     logs : of instruments of the registry, forward-right-down, SI units; IMU and DVL at least.
-    vehicle : its start is taken where it lies within the inertial data, and its current; None
-        where nothing is known beside the logs.
-    name : of the mission.
+    vehicle : its frame is taken, its current, and its start where it lies within the inertial
+        data; None where nothing is known beside the logs.
+    source : the recording; the mission has its name.
     labels : by section, what messages call the place that the readings came from.
-    frame : the navigation frame.
     notes : what the converter noticed, one sentence each; what the checks notice follows.
 
     Raises
     ------
+    ConfigError
+        Where neither vehicle nor fixes say where on Earth the mission was.
     DataError
         For readings that cannot be what they are said to be, or that contradict each other.
     """
@@ -77,11 +78,18 @@ def mission_from(
         found += one.check(table, log, BodyAxes.FRD)
         parts[one.section] = Part(one.cleaned(log), table)
     initial, some = _initial_within(parts["imu"].log, vehicle)
+    stated = None if vehicle is None else vehicle.frame
+    frame = first_frame(stated, parts, None)
+    if frame is None:
+        raise ConfigError(
+            f"{source}: nothing says where on Earth the recording was made: it holds no usable "
+            "fix; give  --vehicle FILE  with [origin]"
+        )
     return assembled(
-        name,
+        source.stem,
         parts,
         frame=frame,
-        has_origin=vehicle is not None and vehicle.frame is not None,
+        has_origin=stated is not None,
         initial=initial,
         current=None if vehicle is None else vehicle.current,
         notes=[*found, *some],

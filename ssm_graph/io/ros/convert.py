@@ -14,8 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from ssm_graph.base.earth import LocalFrame
-from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.io.mission_folder.assembly import mission_from
 from ssm_graph.io.ros.beams import Beams, known_beams, proven_beams, stated_beams
@@ -103,9 +102,8 @@ def convert_rosbag(
     return mission_from(
         [log for log in (imu, dvl, depth, gnss) if log is not None],
         vehicle,
-        name=bag.stem,
+        source=bag,
         labels={role: f"{bag}: {topic.name}" for role, topic in read.items()},
-        frame=_frame(bag, vehicle, gnss),
         notes=[*notes, *some],
     )
 
@@ -306,17 +304,6 @@ def _surface(depth: DepthLog, gnss: GnssLog | None) -> tuple[float, str]:
             )
     return 0.0, (
         "No fix shows the height of the water's surface: it is taken as 0 m above the ellipsoid."
-    )
-
-
-def _frame(bag: Path, vehicle: Vehicle | None, gnss: GnssLog | None) -> LocalFrame:
-    if vehicle is not None and vehicle.frame is not None:
-        return vehicle.frame
-    if gnss is not None:
-        return LocalFrame(float(gnss.lat[0]), float(gnss.lon[0]), float(gnss.height[0]))
-    raise ConfigError(
-        f"{bag}: nothing says where on Earth the recording was made: it holds no usable NavSatFix; "
-        "give  --vehicle FILE  with [origin]"
     )
 
 

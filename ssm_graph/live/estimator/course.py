@@ -13,7 +13,6 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from ssm_graph.base.errors import SolverError
-from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import VELOCITY
 from ssm_graph.graph.inertial_rows import InertialRows
 from ssm_graph.live.estimator.buffers import Buffers, Measured
@@ -59,13 +58,12 @@ class Course:
     """Makes one step after the other, and keeps those that late messages may go back to."""
 
     def __init__(
-        self, first: Step, maker: KeyframeMaker, buffers: Buffers, events: EventLog, null_b: Array
+        self, first: Step, maker: KeyframeMaker, buffers: Buffers, events: EventLog
     ) -> None:
-        """``null_b`` (B,) is the array's parity: orthogonal to the speeds of any velocity."""
         self._steps = deque([first])
         self._maker, self._buffers, self._events = maker, buffers, events
         sensors = first.window.sensors
-        self._null, self._inertial = null_b, InertialRows(sensors.frame, sensors.extras)
+        self._inertial = InertialRows(sensors.frame, sensors.extras)
         self._settled: list[Stretch] = []
 
     @property
@@ -190,12 +188,12 @@ class Course:
         )
 
     def _agree(self, measured: Measured) -> bool:
-        """Return whether all four beams of the ping are there and agree with each other."""
-        pings = measured.pings
-        if len(pings) == 0 or not np.all(np.isfinite(pings[-1, self._buffers.speeds])):
+        """Return whether all beams of the ping are there and agree; three or fewer never say so."""
+        if len(measured.pings) == 0:
             return False
-        sigma = float(np.sqrt(np.sum((self._null * pings[-1, self._buffers.sigmas]) ** 2)))
-        return bool(abs(pings[-1, self._buffers.speeds] @ self._null) < 5.0 * sigma)
+        newest, buffers = measured.pings[-1], self._buffers
+        parity = buffers.vehicle.mount.parity(newest[buffers.speeds], newest[buffers.sigmas])
+        return bool(parity < 5.0)
 
     def _tell(self, before: Watch, after: Watch, keyframe: Keyframe) -> None:
         if after.trouble_s == keyframe.time_s and after.trouble != before.trouble:

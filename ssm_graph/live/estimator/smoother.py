@@ -166,8 +166,7 @@ class FixedLagSmoother:
         self._course = self._course_from(Step(window, Watch(), None, Reserve.of(window)), maker)
 
     def _course_from(self, step: Step, maker: KeyframeMaker) -> Course:
-        null_b = np.linalg.svd(self.vehicle.mount.beams_b.T)[2][-1]
-        course = Course(step, maker, self._intake.buffers, self._events, null_b)
+        course = Course(step, maker, self._intake.buffers, self._events)
         self._intake.horizon_s = course.horizon_s
         return course
 
