@@ -62,7 +62,7 @@ assert "expected microtesla" in said(first, far, file="magnetometer.csv")
 
 labels = {name: f"bag: /{name}" for name in ("imu", "dvl", "depth", "gnss", "magnetometer")}
 logs = (plain.imu, plain.dvl, plain.depth, plain.gnss, log)
-made = mission_from(logs, None, name="bag", labels=labels, frame=plain.frame)
+made = mission_from(logs, None, source=Path("bag"), labels=labels)
 assert_same(made.aids, mission.aids)
 
 vehicle = vehicle_of(mission)

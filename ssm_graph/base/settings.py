@@ -79,12 +79,7 @@ def optional_key(field: str, low: float, high: float, hint: str, *, unit: float 
 FILE_KEY: Final = Key(shape=None)
 """Where the table of an instrument is."""
 LEVER_ARM_KEY: Final = Key(
-    "lever_arm_b",
-    shape=(3,),
-    low=-100.0,
-    high=100.0,
-    hint="lever arms are in metres",
-    is_body=True,
+    "lever_arm_b", shape=(3,), low=-100.0, high=100.0, hint="lever arms are in metres", is_body=True
 )
 
 
@@ -220,18 +215,18 @@ def written(value: object, keys: Mapping[str, Key]) -> dict[str, Any]:
     for name, key in keys.items():
         if not key.field:
             continue
-        owner, field = _place(value, key.field)
+        owner, field = owner_of(value, key.field)
         inside = getattr(owner, field)
         if not key.required and (inside is None or np.all(inside == _default(owner, field))):
             continue
-        if key.beside[0] and not getattr(*_place(value, keys[key.beside[0]].field)):
+        if key.beside[0] and not getattr(*owner_of(value, keys[key.beside[0]].field)):
             continue
         cells = [in_unit(float(x), key.unit) for x in np.ravel(inside)]
         found[name] = np.reshape(cells, np.shape(inside)).tolist() if key.shape else cells[0]
     return found
 
 
-def _place(value: object, dotted: str) -> tuple[object, str]:
+def owner_of(value: object, dotted: str) -> tuple[object, str]:
     """Return the value within a value that has a field, and the field."""
     *outer, field = dotted.split(".")
     for part in outer:

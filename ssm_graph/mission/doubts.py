@@ -6,9 +6,10 @@ import numpy as np
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.mission.problem import Problem
+from ssm_graph.sensors import dvl_readings
 
-LARGEST_SPEED = 50.0
-"""m/s"""
+LARGEST_SPEED = dvl_readings.LARGEST_SPEED
+"""m/s, of the vehicle: what a beam that looks ahead could still read."""
 LOW_WEIGHT = 0.1
 TRUSTED = 0.5
 """Beams of at least this weight are believed."""

@@ -6,9 +6,9 @@ north, up at the vehicle.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Protocol, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar
 
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import DataError
@@ -157,3 +157,9 @@ class Mission:
     """Of the water, where pings are off it; None for one that is not stated."""
     notes: tuple[str, ...] = ()
     """What the reader noticed and a user should know, one sentence each."""
+
+    @property
+    def logs(self) -> Mapping[type, Any]:
+        """Every instrument's log by its type; standstills may be several, see ``aids``."""
+        every = (self.imu, self.dvl, self.depth, self.gnss, *self.aids)
+        return {type(log): log for log in every if log is not None}

@@ -146,27 +146,24 @@ LONGEST_RANGE_M: Final = 20_000.0
 _DELAY: Final = Column(
     "delay_s",
     "delay_s",
-    low=0.0,
-    high=LONGEST_DELAY_S,
+    limits=(0.0, LONGEST_DELAY_S),
     expected=f"expected seconds from 0 to {LONGEST_DELAY_S:g}; is it in milliseconds?",
     told="delay {:g} s: milliseconds?",
     optional=True,
     missing=0.0,
 )
-_BEACON: Final = Column("beacon", "beacon", low=0.0, high=1e6)
+_BEACON: Final = Column("beacon", "beacon", limits=(0.0, 1e6))
 _RANGE: Final = Column(
     "range_m",
     "range_m",
-    low=0.0,
-    high=LONGEST_RANGE_M,
+    limits=(0.0, LONGEST_RANGE_M),
     expected=f"expected metres from 0 to {LONGEST_RANGE_M:g}; is it in mm?",
     told="range {:g} m: mm?",
 )
 _RANGE_SIGMA: Final = Column(
     "sigma",
     "sigma_m",
-    low=SMALLEST_SIGMA,
-    high=1e4,
+    limits=(SMALLEST_SIGMA, 1e4),
     expected="expected a standard deviation above 0, in metres",
     told="sigma {:g} m, expected above zero",
     optional=True,
@@ -281,11 +278,7 @@ USBL: Final = _Usbl(
 RANGES: Final = _Ranges(
     "ranges",
     RangeLog,
-    {
-        "file": FILE_KEY,
-        "noise_m": sigma_key("nominal_sigma", 1000.0),
-        "lever_arm_m": LEVER_ARM_KEY,
-    },
+    {"file": FILE_KEY, "noise_m": sigma_key("nominal_sigma", 1000.0), "lever_arm_m": LEVER_ARM_KEY},
     (_BEACON, _RANGE, _RANGE_SIGMA),
     AcousticRange,
     "r",

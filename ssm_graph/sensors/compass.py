@@ -12,7 +12,7 @@ from ssm_graph.base.frozen import Array, FrozenArrays, shaped
 from ssm_graph.base.settings import FILE_KEY, Key, optional_key, sigma_key
 from ssm_graph.base.tables import Table
 from ssm_graph.base.units import DEG_PER_H, DEGREE
-from ssm_graph.sensors.instrument import Column, Instrument
+from ssm_graph.sensors.instrument import Calibrated, Column, Instrument
 from ssm_graph.sensors.messages import Message
 
 
@@ -66,8 +66,7 @@ _DEGREES: Final = "the unit is degrees"
 _HEADING: Final = Column(
     "heading",
     "heading_deg",
-    low=-360.0,
-    high=360.0,
+    limits=(-360.0, 360.0),
     expected="expected degrees up to 360, clockwise from north",
     told="heading {:g} rad: degrees?",
     unit=DEGREE,
@@ -87,14 +86,19 @@ _KEYS: Final = {
         high=1e6,
         required=False,
         hint="the unit is seconds",
-        beside=(
-            "walk_sigma_deg",
-            "expected with a walk_sigma_deg above 0, got none; 1 is usual",
-        ),
+        beside=("walk_sigma_deg", "expected with a walk_sigma_deg above 0, got none; 1 is usual"),
     ),
     "one_cycle_sigma_deg": optional_key("errors.one_cycle_sigma", 0.0, 90.0, _DEGREES, unit=DEGREE),
     "two_cycle_sigma_deg": optional_key("errors.two_cycle_sigma", 0.0, 90.0, _DEGREES, unit=DEGREE),
 }
+
+
+def _less(log: HeadingLog, stated: float | Array, off: Array) -> Array:  # noqa: ARG001
+    """Return the declination of a compass whose headings were found to be too large by so much."""
+    return np.asarray(stated - off)
+
+
+_CALIBRATED: Final = {"heading_offset": Calibrated("declination_deg", "offset_sigma_deg", _less)}
 
 
 class _Compass(Instrument):
@@ -112,4 +116,6 @@ class _Compass(Instrument):
         return []
 
 
-COMPASS: Final = _Compass("heading", HeadingLog, _KEYS, (_HEADING,), HeadingReading, "h")
+COMPASS: Final = _Compass(
+    "heading", HeadingLog, _KEYS, (_HEADING,), HeadingReading, "h", calibrated=_CALIBRATED
+)

@@ -12,7 +12,7 @@ from ssm_graph.base.frames import BodyAxes
 from ssm_graph.base.frozen import Array, FrozenArrays, shaped
 from ssm_graph.base.settings import FILE_KEY, LEVER_ARM_KEY, optional_key, sigma_key
 from ssm_graph.base.tables import Table
-from ssm_graph.sensors.instrument import Column, Instrument
+from ssm_graph.sensors.instrument import Calibrated, Column, Instrument
 from ssm_graph.sensors.messages import Message
 
 DEEPEST_M: Final = 12_000.0
@@ -63,8 +63,7 @@ _METRES: Final = "the unit is metres"
 _DEPTH: Final = Column(
     "depth",
     "depth_m",
-    low=-HIGHEST_M,
-    high=DEEPEST_M,
+    limits=(-HIGHEST_M, DEEPEST_M),
     expected="expected metres, positive down",
     told="depth {:g} m: a wrong unit?",
 )
@@ -75,6 +74,9 @@ _KEYS: Final = {
     "offset_m": optional_key("calibration.offset", -1000.0, 1000.0, _METRES),
     "offset_sigma_m": optional_key("calibration.offset_sigma", 0.0, 1000.0, _METRES),
 }
+
+
+_CALIBRATED: Final = {"depth_offset": Calibrated("offset_m", "offset_sigma_m")}
 
 
 class _Depth(Instrument):
@@ -92,4 +94,6 @@ class _Depth(Instrument):
         return super().check(table, bare, axes)
 
 
-DEPTH: Final = _Depth("depth", DepthLog, _KEYS, (_DEPTH,), DepthReading, "z")
+DEPTH: Final = _Depth(
+    "depth", DepthLog, _KEYS, (_DEPTH,), DepthReading, "z", calibrated=_CALIBRATED
+)

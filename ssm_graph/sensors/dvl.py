@@ -80,6 +80,19 @@ class DvlMount(FrozenArrays):
         scale = (1.0 + self.scale_error) * (1.0 + self.beam_scale_errors)
         return np.asarray((self.beams_d * scale[:, None]) @ self.R_bd.T)
 
+    def parity(self, speed: Array, sigma: Array) -> Array:
+        """Return how far beam speeds (..., B) contradict each other, in sigmas.
+
+        B beams measure three components, and B - 3 combinations of them, the parities, read nothing
+        of any velocity: the largest of these counts. NaN where a beam is missing, and of
+        instruments of three beams or fewer, which agree with anything.
+        """
+        if self.n_beams < 4:
+            return np.full(speed.shape[:-1], np.nan)
+        null = np.linalg.svd(self.beams_b.T)[2][3:]
+        largest = np.abs(speed @ null.T) / np.sqrt(sigma**2 @ (null**2).T)
+        return np.asarray(largest.max(axis=-1))
+
     def as_stated(self) -> DvlMount:
         """Return the mount as one that is exact."""
         return replace(

@@ -14,6 +14,7 @@ from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frames import BodyAxes
@@ -53,7 +54,14 @@ from ssm_graph.sensors.dvl_readings import (
     no_lock,
     without_false_speeds,
 )
-from ssm_graph.sensors.instrument import SMALLEST_SIGMA, Column, Instrument, Lists
+from ssm_graph.sensors.instrument import (
+    SMALLEST_SIGMA,
+    Calibrated,
+    Column,
+    Instrument,
+    Lists,
+    compounded,
+)
 from ssm_graph.sensors.messages import Message
 
 MOST_CORRELATED: Final = 3
@@ -68,8 +76,7 @@ _SPEED_UNIT: Final = "the unit is m/s, not mm/s"
 _SPEED: Final = Column(
     "speed",
     "beam{}_m_per_s",
-    low=-LARGEST_SPEED,
-    high=LARGEST_SPEED,
+    limits=(-LARGEST_SPEED, LARGEST_SPEED),
     expected=f"expected m/s, up to {LARGEST_SPEED:g}; {LEAVE_EMPTY}",
     blank=True,
     is_many=True,
@@ -78,8 +85,7 @@ _SPEED: Final = Column(
 _SIGMA: Final = Column(
     "sigma",
     "beam{}_sigma_m_per_s",
-    low=SMALLEST_SIGMA,
-    high=1e3,
+    limits=(SMALLEST_SIGMA, 1e3),
     expected="expected a standard deviation above 0, in m/s; leave the cell empty to use "
     "beam_noise_m_per_s",
     told="sigmas {} m/s, expected above zero",
@@ -90,7 +96,7 @@ _SIGMA: Final = Column(
 _RANGE: Final = Column(
     "range_m",
     "range{}_m",
-    low=0.0,
+    limits=(0.0, math.inf),
     expected="expected metres, not below 0; leave the cell empty where it is unknown",
     optional=True,
     is_many=True,
@@ -99,8 +105,7 @@ _RANGE: Final = Column(
 _WATER: Final = Column(
     "water_track",
     "water_track",
-    low=0.0,
-    high=1.0,
+    limits=(0.0, 1.0),
     expected="expected 1 for a ping off the water, 0 or nothing for one off the ground",
     optional=True,
     missing=0.0,
@@ -138,12 +143,7 @@ _KEYS: Final = {
         ),
     ),
     "beam_scale_error": Key(
-        "mount.beam_scale_error",
-        shape=(_BEAMS,),
-        low=-0.5,
-        high=0.5,
-        required=False,
-        hint=_PERCENT,
+        "mount.beam_scale_error", shape=(_BEAMS,), low=-0.5, high=0.5, required=False, hint=_PERCENT
     ),
     "beam_scale_sigma": optional_key("mount.beam_scale_sigma", 0.0, 1.0, _PERCENT),
     "lever_arm_sigma_m": optional_key("mount.lever_arm_sigma", *ARM_SIGMA),
@@ -303,6 +303,11 @@ class _Dvl(Instrument):
         return message, None
 
 
+def _turned_further(log: DvlLog, _: float | Array, off: Array) -> Array:
+    """Return roll, pitch and yaw of an instrument that is turned about its own axes, radians."""
+    return rpy_from_R_bd(log.mount.R_bd @ Rotation.from_rotvec(off).as_matrix())
+
+
 DVL: Final = _Dvl(
     "dvl",
     DvlLog,
@@ -311,6 +316,13 @@ DVL: Final = _Dvl(
     Ping,
     "d",
     late="mount.time_offset_s",
+    calibrated={
+        "dvl_mounting": Calibrated("mounting_rpy_deg", "misalignment_sigma_deg", _turned_further),
+        "dvl_scale": Calibrated("scale_error", "scale_sigma", compounded),
+        "dvl_beam_scale": Calibrated("beam_scale_error", "beam_scale_sigma", compounded),
+        "dvl_lever_arm": Calibrated("lever_arm_m", "lever_arm_sigma_m"),
+        "dvl_time_offset": Calibrated("time_offset_s", "time_offset_sigma_s"),
+    },
     is_required=True,
 )
 

@@ -12,7 +12,7 @@ from ssm_graph.base.frozen import Array, FrozenArrays, Vector, shaped
 from ssm_graph.base.settings import FILE_KEY, LEVER_ARM_KEY, optional_key
 from ssm_graph.base.tables import Table
 from ssm_graph.sensors.drift import ARM_SIGMA, Drift, drift_keys, late_keys
-from ssm_graph.sensors.instrument import Instrument
+from ssm_graph.sensors.instrument import Calibrated, Instrument
 from ssm_graph.sensors.messages import Message
 from ssm_graph.sensors.place import POSITION, SIGMA_ENU, check_positions
 
@@ -96,4 +96,8 @@ GNSS: Final = _Gnss(
     Fix,
     "g",
     late="calibration.time_offset_s",
+    calibrated={
+        "gnss_lever_arm": Calibrated("lever_arm_m", "lever_arm_sigma_m"),
+        "gnss_time_offset": Calibrated("time_offset_s", "time_offset_sigma_s"),
+    },
 )

@@ -9,9 +9,9 @@ an offset, a scale) is taken off by the log's own properties, and nowhere else.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -42,8 +42,7 @@ class Column:
     pattern: str
     """Name of its column in the table; braces stand for each of ``over``."""
     over: tuple[str, ...] = ()
-    low: float = -math.inf
-    high: float = math.inf
+    limits: tuple[float, float] = (-math.inf, math.inf)
     """The least and the largest number that the column can hold, in its unit."""
     expected: str = ""
     """What is told of a number beyond."""
@@ -111,14 +110,35 @@ class Column:
         """Raise :class:`DataError` for the first number of a table that is beyond the limits."""
         for name in self.names:
             if name in table:
-                bad = (table[name] < self.low) | (table[name] > self.high)
+                bad = (table[name] < self.limits[0]) | (table[name] > self.limits[1])
                 if bad.any():
                     raise table.cell_fault(int(np.argmax(bad)), name, self.expected)
 
     def is_beyond(self, numbers: Sequence[float]) -> bool:
         """Return whether one of some numbers in SI units is beyond the limits; NaN is not."""
-        low, high = self.low * self.unit, self.high * self.unit
+        low, high = (limit * self.unit for limit in self.limits)
         return any(x < low or x > high for x in numbers)
+
+
+def added(log: Any, stated: float | Array, off: Array) -> Array:  # noqa: ARG001
+    """Return a value that was found to be off by so much."""
+    return np.asarray(stated + off)
+
+
+def compounded(log: Any, stated: float | Array, off: Array) -> Array:  # noqa: ARG001
+    """Return a scale error that was found to be off by another, of what is left."""
+    return np.asarray((1.0 + stated) * (1.0 + off) - 1.0)
+
+
+class Calibrated(NamedTuple):
+    """Where a file states what a calibration finds."""
+
+    key: str
+    """Of its value."""
+    sigma_key: str
+    """Of its prior sigma."""
+    total: Callable[[Any, float | Array, Array], Array] = added
+    """Makes the value of the log, of what it states and of what that was found to be off by, SI."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,6 +165,8 @@ class Instrument:
     """Columns that tell readings of one time apart."""
     lists: Mapping[str, Mapping[str, Key]] = field(default_factory=dict)
     """Sections that may come several times and belong to it."""
+    calibrated: Mapping[str, Calibrated] = field(default_factory=dict)
+    """What is estimated of it, by the name of the variable."""
     is_required: bool = False
     """Every mission has one."""
 
@@ -172,7 +194,7 @@ class Instrument:
             tuple(name for c in columns if c.optional for name in c.names),
             frozenset(name for c in columns if c.blank for name in c.names),
             key=self.row_key,
-            limits={name: (c.low, c.high) for c in columns for name in c.names},
+            limits={name: c.limits for c in columns for name in c.names},
             nowhere=place if {*place} <= {c.pattern for c in columns} else (),
         )
 

@@ -19,19 +19,11 @@ LATITUDES_DEG: Final = (-90.0, 90.0)
 HEIGHTS_M: Final = (-DEEPEST_M, 20000.0)
 
 _SWAPPED: Final = "latitude or longitude out of range: degrees?"
-LAT: Final = Column(
-    "lat",
-    "lat_deg",
-    low=LATITUDES_DEG[0],
-    high=LATITUDES_DEG[1],
-    told=_SWAPPED,
-    unit=DEGREE,
-)
+LAT: Final = Column("lat", "lat_deg", limits=LATITUDES_DEG, told=_SWAPPED, unit=DEGREE)
 LON: Final = Column(
     "lon",
     "lon_deg",
-    low=LONGITUDES_DEG[0],
-    high=LONGITUDES_DEG[1],
+    limits=LONGITUDES_DEG,
     expected="expected degrees from {:g} to {:g}".format(*LONGITUDES_DEG),
     told=_SWAPPED,
     unit=DEGREE,
@@ -40,8 +32,7 @@ LON: Final = Column(
 HEIGHT: Final = Column(
     "height",
     "height_m",
-    low=HEIGHTS_M[0],
-    high=HEIGHTS_M[1],
+    limits=HEIGHTS_M,
     expected="expected metres, up; is it in mm?",
     told="height {:g} m: a wrong unit?",
 )
@@ -49,8 +40,7 @@ SIGMA_ENU: Final = Column(
     "sigma_enu",
     "sigma_{}_m",
     ENU,
-    low=SMALLEST_SIGMA,
-    high=1e7,
+    limits=(SMALLEST_SIGMA, 1e7),
     expected="expected a standard deviation above 0, in metres; delete fixes of unknown quality",
     told="sigmas {} m, expected above zero",
 )

@@ -20,6 +20,7 @@ from ssm_graph.live.estimator.intake import Intake
 from ssm_graph.live.protocols.json_messages import decode_message, encode_message
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.problem import build_problem
+from ssm_graph.mission.start.body_velocity import body_velocities
 from ssm_graph.sensors.dvl import DvlLog, Ping
 from tests.mission_damage import lines, new_column, toml
 from tests.mission_fixture import make_mission, write_example
@@ -162,7 +163,7 @@ def test_zeros_in_all_beams_are_no_lock_everywhere() -> None:
     lost = replace(mission, dvl=replace(mission.dvl, speed=speed))
     labels = {name: name for name in ("imu", "dvl", "depth", "gnss")}
     logs = (lost.imu, lost.dvl, lost.depth, lost.gnss)
-    made = mission_from(logs, None, name="x", labels=labels, frame=lost.frame)
+    made = mission_from(logs, None, source=Path("x.bag"), labels=labels)
     assert np.isnan(made.dvl.speed[20:30]).all()
     assert made.dvl.speed[40, 2] == 0.0
     assert any("10 of 60 pings hold exactly 0 in all beams" in note for note in made.notes)
@@ -172,3 +173,16 @@ def test_zeros_in_all_beams_are_no_lock_everywhere() -> None:
     assert intake.counts["dvl no_lock"] == 10
     kept = intake.buffers.mission(mission.frame).dvl.speed
     np.testing.assert_array_equal(np.isnan(kept), np.isnan(made.dvl.speed)[: len(kept)])
+
+
+@pytest.mark.parametrize("n_beams", [3, 5])
+def test_alignment_takes_any_beams_that_agree(n_beams: int) -> None:
+    """Body velocities come of every ping, but for one that contradicts itself, if it can."""
+    mission = with_beams(directions(n_beams))
+    speed = mission.dvl.speed.copy()
+    speed[5, 0] += 0.5
+    mission = replace(mission, dvl=replace(mission.dvl, speed=speed))
+    found = body_velocities(mission)
+    kept = np.ones(len(speed), bool)
+    kept[5] = n_beams == 3
+    np.testing.assert_array_equal(found.time_s, mission.dvl.valid_s[kept])

@@ -26,6 +26,7 @@ def test_a_magnetometer_is_one_file_and_one_line(tmp_path: Path) -> None:
         "from ssm_graph.sensors.magnetometer import MAGNETOMETER\nfrom ssm_graph.sensors.mess"
     )
     text = text.replace("from ssm_graph.sensors.mess", imported)
+    assert "    COMPASS,\n" in text
     registry.write_text(text.replace("    COMPASS,\n", "    COMPASS,\n    MAGNETOMETER,\n"))
     ran = subprocess.run(
         [sys.executable, "-m", "tests.new_instrument_script", str(tmp_path)],

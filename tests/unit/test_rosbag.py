@@ -531,7 +531,7 @@ def test_disorder_repeats_gaps_and_refusals_are_said(
         item for item in imu_messages(mission, ros) if not 5 < item.nanoseconds / 1e9 - EPOCH_S < 7
     ]
     bag = write_bag(tmp_path / "gap", ros, gap + sent[len(imu) + 2 :] + aid_messages(mission, ros))
-    assert any("1 gaps, the longest 2.0" in note for note in convert_rosbag(bag).notes)
+    assert any("1 gaps in time, the longest 2.0" in note for note in convert_rosbag(bag).notes)
 
 
 def test_stamp_of_zero_is_receipt(mission: Mission, ros: Ros, tmp_path: Path) -> None:
@@ -674,7 +674,7 @@ def no_aids(mission: Mission, ros: Ros) -> list[Sent]:
         (no_dvl, DataError, r"no topic for the dvl; expected one of type .*; found .*/imu \("),
         (no_beam_speeds, DataError, "not one beam speed"),
         (all_nan, DataError, r"two messages for the imu, got 9, 9 refused: .*not finite"),
-        (in_g, DataError, "are they in g"),
+        (in_g, DataError, "the readings are in g"),
         (no_place, ConfigError, r"\[origin\]"),
         (gauge, DataError, "--atmosphere 0"),
         (other_clock, DataError, "expected one clock"),

@@ -25,7 +25,6 @@ from typing import Any, Final
 import numpy as np
 from scipy.ndimage import median_filter, uniform_filter1d
 
-from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.io.blueye.gyros import compare_imus, dvl_heading
@@ -95,7 +94,6 @@ def convert_blueye(log: Path) -> Mission:
     heading, heading_notes = dvl_heading(tables.dvl_heading, imu)
     depth = _depth(tables)
     gnss, gnss_notes = _gnss(tables, imu, depth)
-    frame = LocalFrame(float(gnss.lat[0]), float(gnss.lon[0]), float(gnss.height[0]))
     assumed = (
         "Noise, biases, delays, scale and lever arms are those measured on one Blueye X3; DVL "
         f"speeds are taken to be {100.0 * DVL_SCALE_ERROR:.1f} % high, give or take "
@@ -104,9 +102,8 @@ def convert_blueye(log: Path) -> Mission:
     return mission_from(
         [part for part in (imu, dvl, depth, gnss, heading) if part is not None],
         None,
-        name=log.stem,
+        source=log,
         labels=LABELS,
-        frame=frame,
         notes=(
             *imu_notes,
             *compare_imus(imu, tables.witness),
@@ -170,8 +167,6 @@ def _imu(tables: BlueyeTables) -> tuple[ImuLog, tuple[str, ...]]:
         f"{jitter_ms:.1f} ms rms of jitter removed; "
         f"the gyro biases known of the X3, {GYRO_BIAS} rad/s, are taken off."
     ]
-    if n_gaps := int(np.sum(steps >= GAP_S)):
-        notes.append(f"The IMU has {n_gaps} gaps, the longest {steps.max():.2f} s.")
     return imu, tuple(notes)
 
 

@@ -1,18 +1,25 @@
 """One way into a mission, for files and converters alike: the logs, checked against each other.
 
-No check is chosen by the author of a reader: whoever has logs hands them in here.
+No check is chosen by the author of a reader: whoever has logs hands them in here. They have to fit
+each other: clocks, positions, gravity, and the motion that they tell of.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any, Final, NamedTuple
 
-from ssm_graph.base.earth import LocalFrame
+import numpy as np
+
+from ssm_graph.base.earth import LocalFrame, normal_gravity
+from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frames import BodyAxes
+from ssm_graph.base.frozen import Array
 from ssm_graph.base.tables import Table, table_of
-from ssm_graph.io.mission_folder.checks import check_mission
+from ssm_graph.io.mission_folder.motion import check_motion
+from ssm_graph.io.mission_folder.toml import TOML_NAME
 from ssm_graph.mission.mission import Aids, InitialState, Mission
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.current import CurrentModel
@@ -20,6 +27,12 @@ from ssm_graph.sensors.gnss import GnssLog
 from ssm_graph.sensors.registry import BY_LOG, INSTRUMENTS
 from ssm_graph.sensors.standstill import Standstill
 
+FARTHEST_M: Final = 100e3
+"""From the origin; a longer mission may go 5 m/s times its length."""
+_FASTEST: Final = 5.0
+_EDGE_S: Final = 1.0
+_GRAVITY_SHARE: Final = 0.005
+_UNITS: Final = ((1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds"))
 _OWN_FIELDS = ("imu", "dvl", "depth", "gnss")
 """Sections that are fields of a mission; the others are among its aids."""
 
@@ -35,9 +48,8 @@ def mission_from(
     logs: Iterable[Any],
     vehicle: Vehicle | None,
     *,
-    name: str,
+    source: Path,
     labels: Mapping[str, str],
-    frame: LocalFrame,
     notes: Sequence[str] = (),
 ) -> Mission:
     """Return the mission of logs that were made of messages, checked as a folder's tables are.
@@ -45,15 +57,16 @@ def mission_from(
     Parameters
     ----------
     logs : of instruments of the registry, forward-right-down, SI units; IMU and DVL at least.
-    vehicle : its start is taken where it lies within the inertial data, and its current; None
-        where nothing is known beside the logs.
-    name : of the mission.
+    vehicle : its frame is taken, its current, and its start where it lies within the inertial
+        data; None where nothing is known beside the logs.
+    source : the recording; the mission has its name.
     labels : by section, what messages call the place that the readings came from.
-    frame : the navigation frame.
     notes : what the converter noticed, one sentence each; what the checks notice follows.
 
     Raises
     ------
+    ConfigError
+        Where neither vehicle nor fixes say where on Earth the mission was.
     DataError
         For readings that cannot be what they are said to be, or that contradict each other.
     """
@@ -65,11 +78,18 @@ def mission_from(
         found += one.check(table, log, BodyAxes.FRD)
         parts[one.section] = Part(one.cleaned(log), table)
     initial, some = _initial_within(parts["imu"].log, vehicle)
+    stated = None if vehicle is None else vehicle.frame
+    frame = first_frame(stated, parts, None)
+    if frame is None:
+        raise ConfigError(
+            f"{source}: nothing says where on Earth the recording was made: it holds no usable "
+            "fix; give  --vehicle FILE  with [origin]"
+        )
     return assembled(
-        name,
+        source.stem,
         parts,
         frame=frame,
-        has_origin=vehicle is not None and vehicle.frame is not None,
+        has_origin=stated is not None,
         initial=initial,
         current=None if vehicle is None else vehicle.current,
         notes=[*found, *some],
@@ -100,7 +120,7 @@ def assembled(
         **own,
     )
     tables = {section: part.table for section, part in parts.items()}
-    return replace(mission, notes=(*notes, *check_mission(mission, tables, has_origin=has_origin)))
+    return replace(mission, notes=(*notes, *_check(mission, tables, has_origin=has_origin)))
 
 
 def first_frame(
@@ -132,4 +152,154 @@ def _initial_within(imu: Any, vehicle: Vehicle | None) -> tuple[InitialState | N
     return None, [
         f"[initial] of the vehicle file is for {vehicle.initial.time_s:.3f} s, outside the "
         "recording, and not used."
+    ]
+
+
+def _check(mission: Mission, tables: dict[str, Table], *, has_origin: bool) -> list[str]:
+    """Check the parts of a mission against each other; return the notes.
+
+    Parameters
+    ----------
+    mission : its instruments are sound by themselves.
+    tables : by section, where their readings came from.
+    has_origin : whether the frame was stated, not taken from the first position.
+    """
+    notes = _times(mission, tables)
+    _initial_time(mission, tables["imu"].label)
+    _initial_position(mission, has_origin=has_origin)
+    for name in ("gnss", "usbl", "reference"):
+        if name in tables:
+            _table_position(mission, tables[name], has_origin=has_origin)
+    notes += _current(mission)
+    notes += _gravity(mission, tables["imu"].label)
+    return notes + check_motion(mission, {name: table.label for name, table in tables.items()})
+
+
+def _times(mission: Mission, tables: dict[str, Table]) -> list[str]:
+    notes = []
+    start, end = mission.imu.start_s, float(mission.imu.time_s[-1])
+    for name, table in tables.items():
+        if name == "imu" or len(table) == 0:
+            continue
+        time_s = table.time_s
+        if "delay_s" in table:
+            time_s = time_s - np.nan_to_num(table["delay_s"])
+        first, last = float(time_s[0]), float(time_s[-1])
+        inside = (time_s >= start - _EDGE_S) & (time_s <= end + _EDGE_S)
+        ratio = (last - first) / (end - start)
+        if not inside.any() or (ratio > 20.0 and inside.mean() < 0.5):
+            raise DataError(
+                f"{table.label}: the times run from {first:z.3f} to {last:z.3f} s, those of "
+                f"{tables['imu'].label} from {start:z.3f} to {end:z.3f} s; expected one clock in "
+                f"seconds; {_clock_hint(ratio, first, start)}"
+            )
+        outside = int(np.sum(~inside))
+        if outside:
+            notes.append(
+                f"{table.label}: {outside} of {len(table)} rows lie outside the time of the IMU"
+            )
+    return notes
+
+
+def _clock_hint(ratio: float, first: float, start: float) -> str:
+    for size, unit in _UNITS:
+        if 0.3 < ratio / size < 3.0:
+            return f"are these in {unit}?"
+        if 0.3 < ratio * size < 3.0:
+            return f"are those of the IMU in {unit}?"
+    if max(abs(first), abs(start)) > 1e8 > min(abs(first), abs(start)):
+        return "one counts from 1970 or 1980 and the other from its own start: shift one of them"
+    return "shift one of them"
+
+
+def _initial_time(mission: Mission, label: str) -> None:
+    imu, initial = mission.imu, mission.initial
+    step = float(np.median(np.diff(imu.time_s)))
+    start, end = imu.start_s, float(imu.time_s[-1])
+    if initial is not None and not start - 2.0 * step <= initial.time_s <= end:
+        raise ConfigError(
+            f"{TOML_NAME} [initial] time_s: expected a time between {start:z.3f} and {end:z.3f} s, "
+            f"the span of {label}, got {initial.time_s:z.3f} s; give the time of the stated "
+            "position on the clock of the tables"
+        )
+
+
+def _initial_position(mission: Mission, *, has_origin: bool) -> None:
+    initial = mission.initial
+    if initial is None:
+        return
+    distance = _distance(mission, np.array([initial.lat]), np.array([initial.lon]))[0]
+    if distance > _limit(mission):
+        origin = "[origin]" if has_origin else "the first GNSS fix"
+        raise ConfigError(
+            f"{TOML_NAME} [initial] lat_deg, lon_deg: the position is {distance / 1e3:.0f} km from "
+            f"{origin}; expected less than {_limit(mission) / 1e3:.0f} km; "
+            + _position_hint(mission, initial.lat, initial.lon)
+        )
+
+
+def _table_position(mission: Mission, table: Table, *, has_origin: bool) -> None:
+    lat, lon = np.radians(table["lat_deg"]), np.radians(table["lon_deg"])
+    far = _distance(mission, lat, lon) > _limit(mission)
+    if not far.any():
+        return
+    row = int(np.argmax(far))
+    distance = _distance(mission, lat, lon)[row] / 1e3
+    origin = "the mission's origin" if has_origin else "the first GNSS fix or [initial]"
+    hint = _position_hint(mission, lat[row], lon[row])
+    if far.mean() > 0.5 and not has_origin:
+        hint = "most rows are: is that first position wrong?"
+    raise table.fault(
+        row,
+        f"the position {table['lat_deg'][row]:.6g}, {table['lon_deg'][row]:.6g} degrees is "
+        f"{distance:.0f} km from {origin}; expected less than {_limit(mission) / 1e3:.0f} km; "
+        f"{hint}",
+    )
+
+
+def _position_hint(mission: Mission, lat: float, lon: float) -> str:
+    """Name the slip that would explain a position far from the origin."""
+    slips = {
+        "latitude and longitude seem swapped": (lon, lat),
+        "the position seems to be in radians": (np.degrees(lat), np.degrees(lon)),
+        "the longitude seems to have the wrong sign": (lat, -lon),
+        "the latitude seems to have the wrong sign": (-lat, lon),
+    }
+    for text, (slip_lat, slip_lon) in slips.items():
+        if abs(slip_lat) <= 0.5 * np.pi:
+            distance = _distance(mission, np.array([slip_lat]), np.array([slip_lon]))[0]
+            if distance < FARTHEST_M:
+                return text
+    return "correct or delete it"
+
+
+def _distance(mission: Mission, lat: Array, lon: Array) -> Array:
+    p_n = mission.frame.p_n_from_geodetic(lat, lon, mission.frame.height)
+    return np.asarray(np.linalg.norm(p_n, axis=-1))
+
+
+def _limit(mission: Mission) -> float:
+    return max(FARTHEST_M, _FASTEST * float(mission.imu.time_s[-1] - mission.imu.start_s))
+
+
+def _current(mission: Mission) -> list[str]:
+    """Note a current that nothing measures."""
+    if mission.current is None or mission.dvl.water_track is not None:
+        return []
+    return [
+        f"{TOML_NAME} [current]: no ping is off the water, so the section changes nothing; a 1 in "
+        f"column 'water_track' of the DVL's table marks such a ping"
+    ]
+
+
+def _gravity(mission: Mission, label: str) -> list[str]:
+    force = float(np.median(np.linalg.norm(mission.imu.accel_b, axis=1)))
+    gravity = float(normal_gravity(mission.frame.lat, mission.frame.height))
+    share = force / gravity - 1.0
+    if abs(share) < _GRAVITY_SHARE:
+        return []
+    return [
+        f"{label}: the median specific force is {force:z.3f} m/s^2, {100 * abs(share):.1f} % "
+        f"{'above' if share > 0 else 'below'} gravity there ({gravity:z.3f}); accel_bias_ug should "
+        "cover that"
     ]

@@ -2,93 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ssm_graph.base.frames import R_FRD, BodyAxes
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.settings import owner_of
 from ssm_graph.mission.estimate import CalibratedValue, Calibration, Determined
 from ssm_graph.mission.mission import Mission
 from ssm_graph.sensors.acoustic import RangeLog
-from ssm_graph.sensors.compass import HeadingLog
-from ssm_graph.sensors.dvl import rpy_from_R_bd
+from ssm_graph.sensors.instrument import Calibrated, Instrument
+from ssm_graph.sensors.registry import INSTRUMENTS
 
 CALIBRATION_NAME: Final = "calibration.toml"
-
-Total = Callable[[Mission, Array, BodyAxes], Array]
-"""Makes the value of a key of what the mission states and what it is off by."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Key:
-    """A key that holds a calibrated value, and the one of its prior sigma."""
-
-    section: str
-    name: str
-    sigma_name: str
-    total: Total
-
-
-def _mounting(mission: Mission, off: Array, axes: BodyAxes) -> Array:  # noqa: ARG001
-    R_bd = mission.dvl.mount.R_bd @ Rotation.from_rotvec(off).as_matrix()
-    return np.degrees(rpy_from_R_bd(R_bd))
-
-
-def _dvl_arm(mission: Mission, off: Array, axes: BodyAxes) -> Array:
-    return np.asarray((mission.dvl.mount.lever_arm_b + off) @ R_FRD[axes])
-
-
-def _gnss_arm(mission: Mission, off: Array, axes: BodyAxes) -> Array:
-    assert mission.gnss is not None
-    return np.asarray((mission.gnss.lever_arm_b + off) @ R_FRD[axes])
-
-
-def _added(stated: Callable[[Mission], float | Array]) -> Total:
-    return lambda mission, off, axes: np.asarray(stated(mission) + off)  # noqa: ARG005
-
-
-def _compounded(stated: Callable[[Mission], float | Array]) -> Total:
-    return lambda mission, off, axes: np.asarray(  # noqa: ARG005
-        (1.0 + stated(mission)) * (1.0 + off) - 1.0
-    )
-
-
-def _depth_offset(mission: Mission) -> float:
-    return 0.0 if mission.depth is None else mission.depth.calibration.offset
-
-
-def _gnss_late(mission: Mission) -> float:
-    return 0.0 if mission.gnss is None else mission.gnss.calibration.time_offset_s
-
-
-def _declination_deg(mission: Mission, off: Array, axes: BodyAxes) -> Array:  # noqa: ARG001
-    return np.degrees(mission.aids[HeadingLog].declination - off)
-
-
-_KEYS: Final[Mapping[str, _Key]] = {
-    "dvl_mounting": _Key("dvl", "mounting_rpy_deg", "misalignment_sigma_deg", _mounting),
-    "dvl_scale": _Key(
-        "dvl", "scale_error", "scale_sigma", _compounded(lambda m: m.dvl.mount.scale_error)
-    ),
-    "dvl_beam_scale": _Key(
-        "dvl",
-        "beam_scale_error",
-        "beam_scale_sigma",
-        _compounded(lambda m: m.dvl.mount.beam_scale_errors),
-    ),
-    "dvl_lever_arm": _Key("dvl", "lever_arm_m", "lever_arm_sigma_m", _dvl_arm),
-    "dvl_time_offset": _Key(
-        "dvl", "time_offset_s", "time_offset_sigma_s", _added(lambda m: m.dvl.mount.time_offset_s)
-    ),
-    "depth_offset": _Key("depth", "offset_m", "offset_sigma_m", _added(_depth_offset)),
-    "gnss_lever_arm": _Key("gnss", "lever_arm_m", "lever_arm_sigma_m", _gnss_arm),
-    "heading_offset": _Key("heading", "declination_deg", "offset_sigma_deg", _declination_deg),
-    "gnss_time_offset": _Key("gnss", "time_offset_s", "time_offset_sigma_s", _added(_gnss_late)),
-}
 
 
 def calibration_toml(
@@ -112,30 +39,37 @@ def calibration_toml(
     found: dict[str, list[CalibratedValue]] = {}
     for value in calibration.values:
         found.setdefault(value.variable, []).append(value)
-    for section in ("dvl", "depth", "gnss", "heading"):
-        keys = {name: key for name, key in _KEYS.items() if key.section == section}
-        if not keys.keys() & found.keys():
-            continue
-        lines += ["", f"[{section}]"]
-        for name, key in keys.items():
-            if name in found:
-                lines += _lines(key, found[name], mission, axes)
+    for one in INSTRUMENTS:
+        names = [name for name in one.calibrated if name in found]
+        lines += ["", f"[{one.section}]"] if names else []
+        for name in names:
+            lines += _lines(one, one.calibrated[name], found[name], mission, axes)
     lines += _beacon_lines(mission, calibration)
     return "\n".join(lines) + "\n"
 
 
-def _lines(key: _Key, values: list[CalibratedValue], mission: Mission, axes: BodyAxes) -> list[str]:
+def _lines(
+    one: Instrument,
+    calibrated: Calibrated,
+    values: list[CalibratedValue],
+    mission: Mission,
+    axes: BodyAxes,
+) -> list[str]:
     sigmas = [value.sigma / value.unit for value in values]
     shown = ", ".join(f"{sigma:.2g}" for sigma in sigmas)
     if all(value.determined is Determined.RED for value in values):
         prior = values[0].prior_sigma / values[0].unit
-        return [f"# {key.name}: not determined, sigma {shown} of {prior:.2g} before"]
-    total = key.total(mission, np.array([value.value for value in values]), axes)
+        return [f"# {calibrated.key}: not determined, sigma {shown} of {prior:.2g} before"]
+    log, key = mission.logs[one.log], one.keys[calibrated.key]
+    stated = getattr(*owner_of(log, key.field)) if key.field else None
+    off = np.array([value.value for value in values])
+    total = calibrated.total(log, 0.0 if stated is None else stated, off)
+    total = total @ R_FRD[axes] if key.is_body else total
     unsure = [v.label for v in values if v.determined is Determined.RED]
     remark = f"; not determined: {', '.join(unsure)}" if unsure else ""
     return [
-        f"{key.name} = {_number(total)}  # sigma {shown}{remark}",
-        f"# {key.sigma_name} = {max(sigmas):.2g}",
+        f"{calibrated.key} = {_number(total / key.unit)}  # sigma {shown}{remark}",
+        f"# {calibrated.sigma_key} = {max(sigmas):.2g}",
     ]
 
 

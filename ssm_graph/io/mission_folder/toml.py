@@ -30,8 +30,7 @@ VELOCITY: Final = Column(
     "velocity_enu",
     "vel_{}_m_per_s",
     ENU,
-    low=-100.0,
-    high=100.0,
+    limits=(-100.0, 100.0),
     expected="expected m/s; is it in mm/s?",
     optional=True,
 )
@@ -39,13 +38,12 @@ ATTITUDE: Final = Column(
     "roll_pitch_heading",
     "{}_deg",
     ("roll", "pitch", "heading"),
-    low=-360.0,
-    high=360.0,
+    limits=(-360.0, 360.0),
     expected="expected degrees up to 360",
     unit=DEGREE,
     optional=True,
 )
-_PITCH: Final = Column("", "pitch_deg", low=-90.0, high=90.0, expected="expected degrees up to 90")
+_PITCH: Final = Column("", "pitch_deg", limits=(-90.0, 90.0), expected="expected degrees up to 90")
 
 
 class _Reference(Instrument):
@@ -91,10 +89,7 @@ LISTS: Final[Mapping[str, Mapping[str, Key]]] = {
     "standstill": STANDSTILL_KEYS,
 }
 """Sections that may come several times, ``[[beacon]]``."""
-REQUIRED_SECTIONS: Final = (
-    "frames",
-    *(one.section for one in INSTRUMENTS if one.is_required),
-)
+REQUIRED_SECTIONS: Final = ("frames", *(one.section for one in INSTRUMENTS if one.is_required))
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,11 +12,7 @@ from ssm_graph.base.frames import BodyAxes
 from ssm_graph.base.settings import build, written
 from ssm_graph.base.tables import Order
 from ssm_graph.io.mission_folder.toml import FORMAT, SECTIONS, TOML_NAME, read_vehicle_toml
-from ssm_graph.io.mission_folder.writer import (
-    common_sections,
-    instrument_sections,
-    write_toml_part,
-)
+from ssm_graph.io.mission_folder.writer import common_sections, instrument_sections, write_toml_part
 from ssm_graph.io.tables.files import TableFormat
 from ssm_graph.mission.mission import Aids, Mission
 from ssm_graph.mission.vehicle import GNSS_AT_ORIGIN, Vehicle
@@ -116,7 +112,7 @@ def vehicle_settings(vehicle: Vehicle, *, order: Order = Order.ARRIVAL) -> dict[
     }
     if vehicle.frame is not None:
         settings["origin"] = written(vehicle.frame, PLACE_KEYS)
-    settings |= instrument_sections(vehicle.bare_logs.values(), TableFormat.CSV.value)
+    settings |= instrument_sections(vehicle.bare_logs, TableFormat.CSV.value)
     settings["dvl"]["beam_noise_m_per_s"] = float(vehicle.beam_sigma)
     if vehicle.water_sigma is not None:
         settings["dvl"]["water_noise_m_per_s"] = float(vehicle.water_sigma)

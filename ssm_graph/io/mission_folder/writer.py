@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.current import CURRENT_KEYS
 from ssm_graph.sensors.place import PLACE_KEYS
-from ssm_graph.sensors.registry import BY_LOG
+from ssm_graph.sensors.registry import INSTRUMENTS
 from ssm_graph.sensors.standstill import STANDSTILL_KEYS, Standstill
 
 
@@ -70,7 +70,7 @@ def mission_settings(mission: Mission, table_format: TableFormat) -> dict[str, A
         "name": mission.name,
         "frames": {"body": BodyAxes.FRD.value},
         "origin": written(mission.frame, PLACE_KEYS),
-        **instrument_sections(_logs(mission), suffix),
+        **instrument_sections(mission.logs, suffix),
         **common_sections(mission),
     }
     stills = [written(still, STANDSTILL_KEYS) for still in mission.aids.all(Standstill)]
@@ -91,26 +91,21 @@ def common_sections(source: Mission | Vehicle) -> dict[str, Any]:
     return sections
 
 
-def instrument_sections(logs: Iterable[Any], suffix: str) -> dict[str, Any]:
+def instrument_sections(logs: Mapping[type, Any], suffix: str) -> dict[str, Any]:
     """Return the sections that describe instruments; ``suffix`` is that of their tables' names."""
     sections: dict[str, Any] = {}
-    for log in logs:
-        one = BY_LOG[type(log)]
-        sections[one.section] = {"file": f"{one.section}{suffix}", **one.settings_of(log)}
-        sections |= one.lists_of(log)
+    for one in INSTRUMENTS:
+        if one.log in logs:
+            settings = one.settings_of(logs[one.log])
+            sections[one.section] = {"file": f"{one.section}{suffix}", **settings}
+            sections |= one.lists_of(logs[one.log])
     return sections
 
 
 def mission_tables(mission: Mission) -> dict[str, dict[str, Array]]:
     """Return the columns of every table."""
-    tables = {BY_LOG[type(log)].section: BY_LOG[type(log)].table_of(log) for log in _logs(mission)}
+    logs = mission.logs
+    tables = {one.section: one.table_of(logs[one.log]) for one in INSTRUMENTS if one.log in logs}
     if mission.reference is not None:
         tables["reference"] = REFERENCE.table_of(mission.reference)
     return tables
-
-
-def _logs(mission: Mission) -> list[Any]:
-    """Return the logs of all instruments of a mission, in the order of the registry."""
-    logs = (mission.imu, mission.dvl, mission.depth, mission.gnss, *mission.aids)
-    found = {type(log): log for log in logs}
-    return [found[kind] for kind in BY_LOG if kind in found]

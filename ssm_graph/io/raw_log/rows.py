@@ -13,7 +13,7 @@ from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.instrument import Instrument
 from ssm_graph.sensors.messages import Message
-from ssm_graph.sensors.registry import BY_LOG, BY_SECTION, INSTRUMENTS
+from ssm_graph.sensors.registry import BY_LOG, INSTRUMENTS
 
 ARRIVALS: Final = "arrivals"
 """The file of a log that has a letter for every row, in order of arrival."""
@@ -94,11 +94,10 @@ def messages_of(mission: Mission) -> Iterator[Message]:
     in the order of the registry: IMU, DVL, depth, GNSS. Rows are turned into messages as they are
     asked for, so that a day of data needs no more memory than the mission itself.
     """
-    every = (mission.imu, mission.dvl, mission.depth, mission.gnss, *mission.aids)
-    logs: dict[type, Any] = {type(log): log for log in every}
+    logs = mission.logs
     streams = [
         one.messages_of(logs[one.log])
-        for one in BY_SECTION.values()
+        for one in INSTRUMENTS
         if one.message is not None and one.log in logs
     ]
     return heapq.merge(*streams, key=lambda message: message.time_s)

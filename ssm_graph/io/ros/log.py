@@ -96,7 +96,6 @@ LAYOUTS: Final[Mapping[str, tuple[str, ...]]] = {
 
 _MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
 _MCAP_PROFILE_AT: Final = len(_MCAP_MAGIC) + 1 + 8
-_BAG_ENDINGS: Final = (".mcap", ".db3")
 
 Decoder = Callable[[bytes], Any]
 

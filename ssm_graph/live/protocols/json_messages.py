@@ -207,9 +207,10 @@ def _number(value: Any, key: str, column: Column) -> float:
 
     Whether an instrument can mean a number that can be is for the intake to say.
     """
+    low, high = column.limits
     if column.unit == 1.0:
-        return number(value, key=key, low=column.low if column.low > 0.0 else -math.inf)
-    number(value, key=key, low=column.low, high=column.high)
+        return number(value, key=key, low=low if low > 0.0 else -math.inf)
+    number(value, key=key, low=low, high=high)
     exact = Decimal(value) if isinstance(value, int) else value
     if column.wraps and exact > 180:
         exact = _EXACT.subtract(exact, Decimal(360))

@@ -60,22 +60,18 @@ def _at_rest(velocities: BodyVelocities, still: Standstill) -> BodyVelocities:
 
 
 def _of_pings(mission: Mission) -> BodyVelocities:
-    """Solve pings of four agreeing beams, or of three, for the velocity of the body origin.
+    """Solve pings of agreeing beams, or of three, for the velocity of the body origin.
 
-    Four beams measure three components, and the fourth number is the array's parity: ``n . b``
-    with ``n`` the unit null vector of the beam directions. It is blind to faults that ``n`` is
-    orthogonal to, so what passes here is no more than a start. Pings off the water are left out.
+    Parities are blind to some faults, so what passes here is no more than a start. Pings off the
+    water are left out.
     """
     dvl = mission.dvl.of_ground()
     beams_b = dvl.mount.beams_b
-    null = np.linalg.svd(beams_b.T)[2][-1]
     valid = np.isfinite(dvl.speed)
-    parity = np.where(valid.all(axis=1), dvl.speed @ null, 0.0)
-    sigma = np.sqrt(np.sum((null * dvl.sigma) ** 2, axis=1))
-    # Three beams agree with anything: they count only where four are rare.
-    n_needed = 4 if np.mean(valid.all(axis=1)) > 0.5 else 3
-    is_good = (valid.sum(axis=1) >= n_needed) & (np.abs(parity) < PARITY_GATE * sigma)
-    usable = np.flatnonzero(is_good)
+    # Three beams agree with anything: they count only where pings of all beams are rare.
+    n_needed = max(3, dvl.mount.n_beams if np.mean(valid.all(axis=1)) > 0.5 else 3)
+    contradicts = dvl.mount.parity(dvl.speed, dvl.sigma) >= PARITY_GATE
+    usable = np.flatnonzero((valid.sum(axis=1) >= n_needed) & ~contradicts)
     time_s = dvl.valid_s[usable]
     if len(usable) == 0:
         return BodyVelocities(time_s, np.zeros((0, 3)))
