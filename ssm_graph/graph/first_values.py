@@ -24,9 +24,8 @@ from ssm_graph.engine.states import NavigationStates, States
 from ssm_graph.graph.aids.aid import RowStates
 from ssm_graph.graph.beacon_start import find_beacons
 from ssm_graph.graph.beam_rows import BeamRows, linearize_beams
-from ssm_graph.graph.beam_weights import met_weights, settle_weights, updated_trust
-from ssm_graph.graph.forward_aids import ForwardAids
-from ssm_graph.graph.forward_extras import ForwardExtras
+from ssm_graph.graph.first_weights import met_weights, settle_weights, updated_trust
+from ssm_graph.graph.forward_pass import ForwardAids, ForwardExtras
 from ssm_graph.graph.inertial_rows import InertialRows
 from ssm_graph.graph.measurements import Measurements
 from ssm_graph.imu.preintegration import gravity_gradient, gtsam_gravity

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from factors.so3 import cross
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps, finished
@@ -89,8 +90,8 @@ def merge_samples_steps(imu: ImuLog, keyframe_s: Array, *, rate_hz: float) -> St
     yield 3e-4 * len(sample)
     first = _group_starts(piece_edges, keyframe_s, rate_hz)
     scale = h**3 / 12.0
-    theta = omega * h + scale * np.cross(omega, omega_slope)
-    v = force * h + scale * (np.cross(omega, force_slope) + np.cross(force, omega_slope))
+    theta = omega * h + scale * cross(omega, omega_slope)
+    v = force * h + scale * (cross(omega, force_slope) + cross(force, omega_slope))
     yield 5e-4 * len(sample)
     theta, v = yield from _merge_steps(theta, v, first)
     dt = np.add.reduceat(h[:, 0], first)
@@ -153,7 +154,7 @@ def _merge_steps(theta: Array, v: Array, first: NDArray[np.intp]) -> Steps[tuple
 def _left_jacobian_times(phi: Array, vector: Array) -> Array:
     """Return ``int_0^1 Exp(s phi) ds vector``: the left Jacobian of SO(3) times (..., 3)."""
     angle = np.linalg.norm(phi, axis=-1, keepdims=True)
-    first = np.cross(phi, vector)
+    first = cross(phi, vector)
     # (1 - cos a) / a^2 and (a - sin a) / a^3, without cancellation.
     half_sinc_sq = 0.5 * np.sinc(0.5 * angle / np.pi) ** 2
     cubic = np.where(
@@ -161,7 +162,7 @@ def _left_jacobian_times(phi: Array, vector: Array) -> Array:
         (1.0 - angle**2 / 20.0) / 6.0,
         (angle - np.sin(angle)) / np.maximum(angle, 1e-9) ** 3,
     )
-    return np.asarray(vector + half_sinc_sq * first + cubic * np.cross(phi, first))
+    return np.asarray(vector + half_sinc_sq * first + cubic * cross(phi, first))
 
 
 def _left_jacobian_solve(phi: Array, vector: Array) -> Array:
@@ -172,5 +173,5 @@ def _left_jacobian_solve(phi: Array, vector: Array) -> Array:
     factor = np.where(
         angle < 1e-2, (1.0 + angle**2 / 60.0) / 12.0, (1.0 - half / np.tan(half)) / (4.0 * half**2)
     )
-    first = np.cross(phi, vector)
-    return np.asarray(vector - 0.5 * first + factor * np.cross(phi, first))
+    first = cross(phi, vector)
+    return np.asarray(vector - 0.5 * first + factor * cross(phi, first))

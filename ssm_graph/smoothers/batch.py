@@ -27,11 +27,10 @@ from ssm_graph.mission.problem import Problem, with_white_noise
 from ssm_graph.mission.trajectory import trajectory_from_states
 from ssm_graph.smoothers.aid_weights import AidWeighing
 from ssm_graph.smoothers.beam_faults import FaultSearch
-from ssm_graph.smoothers.calibrated import calibration_of, undetermined
-from ssm_graph.smoothers.current import current_of
 from ssm_graph.smoothers.fault_watch import FaultWatch
 from ssm_graph.smoothers.noise import MAX_ADAPTATIONS, adaptation, noise_notes, with_sigmas
 from ssm_graph.smoothers.passes import Pass, Solved, descend_steps, noise_of_steps
+from ssm_graph.smoothers.variables import calibration_of, current_of, undetermined
 from ssm_graph.smoothers.verdict import contradictions
 
 __all__ = ["OnIteration", "Similarity", "SmootherConfig", "SsmSmoother"]

@@ -13,7 +13,7 @@ from ssm_graph.base.times import Indices
 from ssm_graph.engine.states import States
 from ssm_graph.graph.aids.aid import Aid, Rows, RowStates
 from ssm_graph.graph.aids.standstill import AnySpeed
-from ssm_graph.graph.forward_aids import settled_weights
+from ssm_graph.graph.first_weights import settled_weights
 from ssm_graph.graph.measurements import JudgedAid, aid_kernel
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors
 

@@ -20,7 +20,7 @@ from ssm_graph.graph.aids.standstill import Standstills
 from ssm_graph.graph.aids.usbl import UsblFixes
 from ssm_graph.graph.beacon_start import BeaconRanges, beacon_start, rival_place
 from ssm_graph.graph.first_values import first_values
-from ssm_graph.graph.forward_aids import settled_weights
+from ssm_graph.graph.first_weights import settled_weights
 from ssm_graph.graph.gtsam_graph import gtsam_graph
 from ssm_graph.mission.estimate import Determined, Status
 from ssm_graph.mission.mission import Aids

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.so3 import cross
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
 
@@ -29,7 +30,7 @@ def height_track(
 ) -> HeightTrack:
     """Return the track of a sensor ``lever_arm_b`` off the body origin, leading axes (...)."""
     arm_n = (R_nb @ lever_arm_b[..., None])[..., 0]
-    swing_n = (R_nb @ np.cross(gyro_b, lever_arm_b)[..., None])[..., 0]
+    swing_n = (R_nb @ cross(gyro_b, lever_arm_b)[..., None])[..., 0]
     up_n = frame.R_nl_at(p_n)[..., 2]
     sensor_n = p_n + arm_n
     return HeightTrack(
