@@ -47,7 +47,7 @@ def met_weights(
 
 
 def updated_trust(trust: Array, beam: Indices, weights: Array) -> Array:
-    """Return what each beam (4,) is worth after one more ping with weights (m,) of its beams.
+    """Return what each beam (B,) is worth after one more ping with weights (m,) of its beams.
 
     A ping without a beam that agrees says nothing of any of them.
     """

@@ -30,7 +30,6 @@ from ssm_graph.graph.inertial_rows import InertialRows
 from ssm_graph.graph.measurements import Measurements
 from ssm_graph.imu.preintegration import gravity_gradient, gtsam_gravity
 from ssm_graph.mission.problem import NO_EXTRAS, Problem, start_of
-from ssm_graph.sensors.dvl import N_BEAMS
 
 LOCKED_OUT_PINGS = 3
 """After so many pings in a row without one good beam the prediction is doubted instead."""
@@ -94,7 +93,7 @@ class _ForwardPass:
         self.aids = Measurements.weighted(problem)
         self.met = ForwardAids(self.aids)
         self.weights = np.ones(len(problem.beams.speed))
-        self.trust = np.ones(N_BEAMS)
+        self.trust = np.ones(problem.beams.n_beams)
         self.without_beam = 0
         self.n_doubts = 0
         self.gravity_at = np.full(3, np.inf)

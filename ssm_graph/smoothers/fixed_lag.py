@@ -20,8 +20,11 @@ from ssm_graph.graph.measurements import aid_table, doubts_of_aids
 from ssm_graph.mission.estimate import Estimate, OnKeyframe
 from ssm_graph.mission.problem import Problem, start_of, with_white_noise
 from ssm_graph.mission.recursive import RecursiveBeams, recursive_estimate
-from ssm_graph.smoothers.calibrated import calibration_of_last, undetermined
-from ssm_graph.smoothers.current import current_along
+from ssm_graph.smoothers.calibration_and_current import (
+    calibration_of_last,
+    current_along,
+    undetermined,
+)
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
 from ssm_graph.smoothers.keyframe import keyframes_of, sensors_of
 from ssm_graph.smoothers.stretch import Stretch, joined

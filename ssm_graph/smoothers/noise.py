@@ -21,7 +21,6 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.graph.inertial_rows import InertialFit
 from ssm_graph.mission.estimate import OUTLIER_WEIGHT, NoiseFound
 from ssm_graph.mission.problem import Beams, Problem
-from ssm_graph.sensors.dvl import N_BEAMS
 
 FEWEST = 30.0
 """Degrees of freedom below which nothing is said."""
@@ -50,7 +49,7 @@ LARGEST_CHANGE = 3.0
 def beam_noise(
     beams: Beams, *, error: Array, variance: Array, weights: Array
 ) -> tuple[Array, Array]:
-    """Return estimated over stated sigma of each beam, and degrees of freedom, both (4,).
+    """Return estimated over stated sigma of each beam, and degrees of freedom, both (B,).
 
     Parameters
     ----------
@@ -59,10 +58,10 @@ def beam_noise(
     variance : (M,) of the answer along the beams, ``H P H'``.
     weights : (M,)
     """
-    factor, dof = np.full(N_BEAMS, np.nan), np.zeros(N_BEAMS)
+    factor, dof = np.full(beams.n_beams, np.nan), np.zeros(beams.n_beams)
     share = 1.0 - np.clip(weights * variance / beams.sigma**2, 0.0, LARGEST_LEVERAGE)
     square = (error / beams.sigma) ** 2 / share
-    for beam in range(N_BEAMS):
+    for beam in range(beams.n_beams):
         counts = (beams.beam == beam) & (weights >= OUTLIER_WEIGHT)
         dof[beam] = share[counts].sum()
         if dof[beam] >= FEWEST:
@@ -98,7 +97,7 @@ def noise_found(
     problem : with the sigmas that the answer was made with.
     error, variance, weights : as in :func:`beam_noise`.
     inertial : the fit of the inertial data.
-    used : (4,) those sigmas over the stated ones.
+    used : (B,) those sigmas over the stated ones.
     """
     factor, dof = beam_noise(problem.beams, error=error, variance=variance, weights=weights)
     return NoiseFound(
@@ -111,7 +110,7 @@ def noise_found(
 
 
 def adaptation(found: NoiseFound) -> Array | None:
-    """Return by what (4,) to multiply the sigmas that were used, None if they are right."""
+    """Return by what (B,) to multiply the sigmas that were used, None if they are right."""
     change = np.where(np.isfinite(found.beam_factor), found.beam_factor / found.beam_used, 1.0)
     if np.all(np.abs(np.log(change)) < ADAPTED):
         return None
@@ -119,7 +118,7 @@ def adaptation(found: NoiseFound) -> Array | None:
 
 
 def with_sigmas(problem: Problem, change: Array) -> Problem:
-    """Return the problem with the sigma of each beam multiplied by ``change`` (4,)."""
+    """Return the problem with the sigma of each beam multiplied by ``change`` (B,)."""
     beams = problem.beams
     return replace(problem, beams=replace(beams, sigma=beams.sigma * change[beams.beam]))
 
@@ -134,7 +133,8 @@ def _note_of_beams(found: NoiseFound) -> str:
     if np.any(found.beam_used != 1.0):
         used = ", ".join(f"{factor:.2f}" for factor in found.beam_used)
         return (
-            f"sigmas of beams 1 to {N_BEAMS} were adapted to their errors: {used} times as stated"
+            f"sigmas of beams 1 to {len(found.beam_used)} were adapted to their errors: {used} "
+            "times as stated"
         )
     # The logarithm of a sigma estimated with n degrees of freedom has the deviation 1 / sqrt(2 n).
     off = np.abs(np.log(found.beam_factor))

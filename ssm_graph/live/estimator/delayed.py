@@ -10,7 +10,7 @@ from ssm_graph.base.earth import LocalFrame
 from ssm_graph.engine.extras import Extras
 from ssm_graph.mission.estimate import BeamTable, CurrentTrack, Trajectory
 from ssm_graph.mission.trajectory import trajectory_at
-from ssm_graph.smoothers.current import current_along
+from ssm_graph.smoothers.calibration_and_current import current_along
 from ssm_graph.smoothers.stretch import Stretch
 
 
