@@ -32,6 +32,13 @@ from tests.mission_damage import (
     toml,
 )
 
+
+def without_first_beam(row: str) -> str:
+    """Return a line of a DVL's table with the cell of its first beam left empty."""
+    time, _, *others = row.split(",")
+    return ",".join([time, "", *others])
+
+
 TOML_CASES = (
     Malformed("No mission.toml", remove("mission.toml"), ConfigError, ("there is none in",)),
     Malformed(
@@ -349,6 +356,12 @@ TABLE_CASES = (
         lines("gnss.csv", lambda rows: [*rows[:4], rows[3], *rows[4:]]),
         DataError,
         ("gnss.csv:5", "the row before is repeated", "delete the copies"),
+    ),
+    Malformed(
+        "Two rows of one time, one of them with a beam missing",
+        lines("dvl.csv", lambda rows: [*rows[:4], without_first_beam(rows[3]), *rows[4:]]),
+        DataError,
+        ("dvl.csv:5", "time_s repeats", "delete one"),
     ),
     Malformed(
         "Times written with too few digits",

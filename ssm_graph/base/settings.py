@@ -53,7 +53,7 @@ class Key:
         if self.shape is None:
             return "a text in quotes"
         sizes = [f"{n[0]} to {n[1]}" if isinstance(n, tuple) else str(n) for n in self.shape]
-        words = {(): "a number", (3,): "a list of 3 numbers"}
+        words: dict[object, str] = {(): "a number", (3,): "a list of 3 numbers"}
         text = words.get(self.shape, " lists of ".join(sizes) + " numbers")
         if self.positive:
             text += f" above 0 and up to {self.high:g}" if self.high < math.inf else " above 0"

@@ -168,6 +168,7 @@ def is_repeated(table: Table, spec: TableSpec) -> NDArray[np.bool_]:
 
 
 def check_increasing(table: Table, spec: TableSpec) -> None:
+    """Raise for the first time that is not after the one before."""
     step = np.diff(table.time_s)
     if np.all(step > 0.0):
         return
@@ -186,7 +187,8 @@ def check_increasing(table: Table, spec: TableSpec) -> None:
             f"time_s goes back from {before:.6f} to {now:.6f}{also}; expected increasing times; "
             "sort the rows by time, and split the mission where the clock was set back",
         )
-    same = all(v[row] == v[row - 1] or np.isnan(v[row]) for v in table.columns.values())
+    rows = np.array([values[row - 1 : row + 1] for values in table.columns.values()])
+    same = np.array_equal(rows[:, 0], rows[:, 1], equal_nan=True)
     what = "the row before is repeated" if same else f"time_s repeats {now:.6f}"
     hint = "delete the copies" if same else "write the times with more digits, or delete one"
     raise table.fault(row, f"{what}{also}; expected increasing times; {hint}")

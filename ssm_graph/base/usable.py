@@ -20,6 +20,7 @@ def require_positive(name: str, values: Array) -> None:
 
 def require_increasing(name: str, times: Array) -> None:
     """Raise unless times increase strictly."""
+    require_finite(name, times)
     wrong = np.zeros(len(times), bool)
     wrong[1:] = ~(np.diff(times) > 0.0)
     _refuse(name, times, wrong, "times that increase strictly")

@@ -1,1 +1,1 @@
-"""The command line: ``ssm-graph simulate | smooth | convert``."""
+"""The command line: ``ssm-graph simulate | smooth | filter | online | compare | convert``."""

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from factors.similarity import WEIGHT_FLOOR, Kernel
+from factors.similarity import Kernel
 from factors.so3 import cross
 from ssm_graph.base.earth import SEMI_MAJOR_AXIS
 from ssm_graph.base.errors import SolverError
@@ -23,9 +23,8 @@ from ssm_graph.engine.states import NavigationStates, States
 from ssm_graph.graph.aids.aid import RowStates
 from ssm_graph.graph.beacon_start import find_beacons
 from ssm_graph.graph.beam_rows import BeamRows, linearize_beams
-from ssm_graph.graph.beam_weights import met_weights, settle_weights, updated_trust
-from ssm_graph.graph.forward_aids import ForwardAids
-from ssm_graph.graph.forward_extras import ForwardExtras
+from ssm_graph.graph.first_weights import met_weights, settle_weights, updated_trust
+from ssm_graph.graph.forward_pass import ForwardAids, ForwardExtras
 from ssm_graph.graph.inertial_rows import InertialRows
 from ssm_graph.graph.measurements import Measurements
 from ssm_graph.imu.preintegration import gravity_gradient, gtsam_gravity
@@ -35,6 +34,10 @@ LOCKED_OUT_PINGS = 3
 """After so many pings in a row without one good beam the prediction is doubted instead."""
 ANCHOR_SIGMA = 1.0
 """m/s; after a silence that leaves the beams this uncertain they set the velocity anew."""
+AID_ROUNDS = 5
+"""How often the aids of a keyframe are linearised anew."""
+AID_REACH = 0.1
+"""Sigmas of an aid; where a round moves what is predicted by less, the next one is spared."""
 _NONE = np.zeros(0)
 GRAVITY_REACH = 20.0
 """m, how far gravity is carried linearly before it is evaluated anew."""
@@ -153,17 +156,23 @@ class _ForwardPass:
             self._correct(H, innovation, H @ self.P @ H.T + fixes.covariance_n[i])
 
     def _update_aids(self, k: int) -> None:
-        """Correct by the weighted aids of one keyframe, each by itself."""
-        extras = self.extras
-        walks, constants = (extras.walks, extras.constants) if extras else (_NONE, _NONE)
-        for met in self.met.at(
-            k, RowStates(*self._state, walks, constants, self.problem.extras, self._g_n)
-        ):
+        """Correct by the weighted aids of one keyframe, together, linearised where they lead to.
+
+        An uncertain position bends the distances to it by more than their sigmas.
+        """
+        if not self.met.has(k):
+            return
+        step = np.zeros(len(self.P))
+        for _ in range(AID_ROUNDS):
+            met = self.met.at(k, self._moved(step))
+            innovation = met.innovation + met.H @ step
             predicted = met.H @ self.P @ met.H.T
-            weight = self.met.weigh(met, predicted, self.kernel)
-            if weight > WEIGHT_FLOOR:
-                S = predicted + np.eye(len(met.innovation)) / weight
-                self._correct(met.H, met.innovation, S)
+            weights = self.met.weigh(met, innovation, predicted, self.kernel)
+            S = predicted + np.diag(1.0 / weights)
+            last, step = step, self.P @ met.H.T @ np.linalg.solve(S, innovation)
+            if np.abs(met.H @ (step - last)).max() < AID_REACH:
+                break
+        self._correct(met.H, innovation, S)
 
     def _depth_row(self, rows: range, k: int) -> _Rows:
         depths = self.problem.depths
@@ -254,14 +263,19 @@ class _ForwardPass:
     def _correct(self, H: Array, innovation: Array, innovation_cov: Array) -> None:
         PHt = self.P @ H.T
         gain = np.linalg.solve(innovation_cov, PHt.T).T
-        step = gain @ innovation
+        moved = self._moved(gain @ innovation)
         P = self.P - gain @ PHt.T
         self.P = 0.5 * (P + P.T)
-        here = NavigationStates(*(column[None] for column in self._state))
-        moved = here.moved(step[None, :STATE_DIM])
-        self.R_nb, self.p_n, self.v_n, self.bias = (column[0] for column in moved)
+        self.R_nb, self.p_n, self.v_n, self.bias = moved[:4]
         if self.extras:
-            self.extras.correct(step[STATE_DIM:])
+            self.extras.walks, self.extras.constants = moved.walks, moved.constants
+
+    def _moved(self, step: Array) -> RowStates:
+        """Return the state after a step (E,) of the error state and what is behind it."""
+        here = NavigationStates(*(column[None] for column in self._state))
+        R_nb, p_n, v_n, bias = (column[0] for column in here.moved(step[None, :STATE_DIM]))
+        walks, constants = self.extras.moved(step[STATE_DIM:]) if self.extras else (_NONE, _NONE)
+        return RowStates(R_nb, p_n, v_n, bias, walks, constants, self.problem.extras, self._g_n)
 
 
 class _RowsByKeyframe:

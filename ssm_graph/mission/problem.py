@@ -15,7 +15,7 @@ from ssm_graph.base.times import MIN_SPACING_S, Indices, is_inside, nearest
 from ssm_graph.engine.error_state import InitialMoments
 from ssm_graph.engine.extras import Extras
 from ssm_graph.graph.aids import AIDS
-from ssm_graph.graph.aids.aid import Aid, Table
+from ssm_graph.graph.aids.aid import Aid, Keyframes, Table
 from ssm_graph.graph.aids.depth import Depths
 from ssm_graph.graph.aids.gnss import GNSS_DRIFT, Fixes
 from ssm_graph.imu.ping_motion import MotionBefore, mean_gyro
@@ -164,16 +164,8 @@ def build_problem(
     )
     noise = mission.imu.noise
     extras = extras_of(mission)
-    aids = (
-        kind.of(
-            mission.aids,
-            frame=mission.frame,
-            imu=mission.imu,
-            keyframe_s=timeline.keyframe_s,
-            begin_s=begin_s,
-        )
-        for kind in AIDS
-    )
+    keyframes = Keyframes(mission.frame, mission.imu, timeline.keyframe_s, begin_s)
+    aids = (kind.of(mission.aids, keyframes) for kind in AIDS)
     return Problem(
         frame=mission.frame,
         start=start,

@@ -16,13 +16,13 @@ def require_usable(mission: Mission) -> None:
     come without it.
     """
     imu, dvl = mission.imu, mission.dvl
+    require_finite("imu.start_s", np.array([imu.start_s]))
     require_finite("imu.time_s", imu.time_s)
     require_finite("imu.gyro_b", imu.gyro_b)
     require_finite("imu.accel_b", imu.accel_b)
     require_increasing("imu.time_s", np.concatenate([[imu.start_s], imu.time_s]))
     for name in ("gyro_density", "accel_density", "gyro_bias_sigma", "accel_bias_sigma"):
         require_positive(f"imu.noise.{name}", np.array([getattr(imu.noise, name)]))
-    require_finite("dvl.time_s", dvl.time_s)
     require_increasing("dvl.time_s", dvl.time_s)
     require_finite("dvl.mount.beams_b", dvl.mount.beams_b)
     require_finite("dvl.mount.lever_arm_b", dvl.mount.lever_arm_b)
@@ -42,12 +42,12 @@ def _require_aids(mission: Mission) -> None:
     if depth is not None:
         require_increasing("depth.time_s", depth.time_s)
         require_positive("depth.sigma", np.array([depth.sigma]))
-        for name in ("time_s", "depth", "lever_arm_b"):
+        for name in ("depth", "lever_arm_b"):
             require_finite(f"depth.{name}", getattr(depth, name))
     if gnss is not None:
         require_increasing("gnss.time_s", gnss.time_s)
         require_positive("gnss.sigma_enu", gnss.sigma_enu)
-        for name in ("time_s", "lat", "lon", "height", "lever_arm_b"):
+        for name in ("lat", "lon", "height", "lever_arm_b"):
             require_finite(f"gnss.{name}", getattr(gnss, name))
     if initial is not None:
         for name in ("time_s", "lat", "lon", "height", "roll", "pitch", "heading"):

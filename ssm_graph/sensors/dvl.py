@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frames import rotation_zyx
@@ -138,7 +138,7 @@ class DvlLog(FrozenArrays):
         if self.water_track is None:
             return self
         kept = ~self.is_water
-        rows = {
+        rows: dict[str, Any] = {
             name: None if getattr(self, name) is None else getattr(self, name)[kept]
             for name in ("time_s", "speed", "sigma", "range_m", "covariance")
         }
@@ -219,6 +219,25 @@ def empty_dvl(mount: DvlMount) -> DvlLog:
     """Return the log without pings of an instrument."""
     none = np.zeros((0, mount.n_beams))
     return DvlLog(mount=mount, time_s=np.zeros(0), speed=none, sigma=none)
+
+
+def counted_sigma(
+    stated: ArrayLike, is_water: ArrayLike, *, ground_sigma: float, water_sigma: float | None
+) -> Array:
+    """Return the standard deviations (..., B) that beam speeds count with, m/s.
+
+    One that the DVL does not state is the nominal one of what its ping is off.
+
+    Parameters
+    ----------
+    stated : (..., B) m/s; NaN, zero and less for none.
+    is_water : (...) whether a ping is off the water.
+    ground_sigma : nominal one off the ground, m/s.
+    water_sigma : nominal one off the water, m/s; None or 0 for that off the ground.
+    """
+    nominal = np.where(is_water, water_sigma or ground_sigma, ground_sigma)[..., None]
+    stated = np.asarray(stated)
+    return np.where(stated > 0.0, stated, nominal)
 
 
 def nominal_sigma(log: DvlLog) -> float:

@@ -38,6 +38,7 @@ from ssm_graph.sensors.dvl import (
     Ping,
     R_bd_from_rpy,
     beams_from_angles,
+    counted_sigma,
     empty_dvl,
     nominal_sigma,
     rpy_from_R_bd,
@@ -178,7 +179,7 @@ class _Dvl(Instrument):
         covariance = (Column("", name, optional=True, is_live=False) for *_, name in pairs)
         return (*many, _WATER, *covariance)
 
-    def check(self, table: Table, bare: DvlLog, axes: BodyAxes) -> list[str]:
+    def check(self, table: Table, bare: DvlLog, axes: BodyAxes) -> list[str]:  # noqa: ARG002
         notes = _geometry_note(bare.mount, table.label)
         speed, *others = self.columns_of(bare)
         if len(table):
@@ -196,15 +197,17 @@ class _Dvl(Instrument):
             stated = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
             rows["sigma"] = np.where(np.isnan(stated), rows["sigma"], stated)
         water = rows["water_track"]
-        noise = settings.number("beam_noise_m_per_s")
-        off_water = settings.number("water_noise_m_per_s") or noise
-        nominal = np.where(water > 0.0, off_water, noise)[:, None]
         has_range = any(name in table for name in _RANGE.sized(bare.mount.n_beams).names)
         log = DvlLog(
             mount=bare.mount,
             time_s=table.time_s,
             speed=rows["speed"],
-            sigma=np.where(np.isnan(rows["sigma"]), nominal, rows["sigma"]),
+            sigma=counted_sigma(
+                rows["sigma"],
+                water > 0.0,
+                ground_sigma=settings.number("beam_noise_m_per_s"),
+                water_sigma=settings.number("water_noise_m_per_s"),
+            ),
             range_m=rows["range_m"] if has_range else None,
             water_track=water if water.any() else None,
             covariance=covariance,

@@ -180,8 +180,8 @@ def _zeros(table: Table, speed: Array) -> list[str]:
     if not count:
         return []
     return [
-        f"{table.file.place(int(np.argmax(zero)))}: {count} of {len(speed)} pings hold exactly 0 in "
-        "all beams: taken for no bottom lock; a time at rest may be stated as [[standstill]]"
+        f"{table.file.place(int(np.argmax(zero)))}: {count} of {len(speed)} pings hold exactly 0 "
+        "in all beams: taken for no bottom lock; a time at rest may be stated as [[standstill]]"
     ]
 
 

@@ -237,7 +237,8 @@ def _times(table: Table) -> list[str]:
     if gaps.any():
         notes.append(
             f"{table.label}: {gaps.sum()} gaps in time, the longest {steps[row]:z.3f} s after "
-            f"{table.time_s[row]:z.3f} s; the reading after a gap is held over all of it"
+            f"{table.time_s[row]:z.3f} s; each is bridged by the mean of the readings on both "
+            "sides, with larger process noise"
         )
     return notes
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cache
 from typing import Any, Final
 
 import numpy as np
@@ -93,7 +92,7 @@ class Column:
         return self.json or self.pattern.replace("{}_", "")
 
     def read(self, table: Table, axes: BodyAxes) -> Array:
-        """Return its numbers (N,) or (N, len(over)) in SI units, body vectors forward-right-down."""
+        """Return its numbers (N,) or (N, len(over)) in SI units, body vectors in axes FRD."""
         values = table.stack(self.names) * self.unit
         if self.wraps:
             values = wrapped(values)
@@ -155,7 +154,7 @@ class Instrument:
         """Return the log without rows that a section describes; raise where it cannot be."""
         return build(self.log, self.empty() | settings.given())
 
-    def empty(self) -> dict[str, Array]:
+    def empty(self) -> dict[str, Any]:
         """Return the fields of a log that has no rows."""
         shapes = {c.field: (0, len(c.over)) if c.over else (0,) for c in self.columns}
         return {name: np.zeros(shape) for name, shape in {"time_s": (0,), **shapes}.items()}
@@ -274,7 +273,10 @@ class Instrument:
         return None
 
     def sifted(
-        self, message: Message, near: Array, bare: Any
+        self,
+        message: Message,
+        near: Array,  # noqa: ARG002
+        bare: Any,  # noqa: ARG002
     ) -> tuple[Message, tuple[str, str] | None]:
         """Return a message without what cannot have been measured, and what was and why.
 
@@ -317,6 +319,11 @@ class Instrument:
                 yield self.message_of(row, log)
 
 
-@cache
+_FIELDS: Final[dict[type, tuple[str, ...]]] = {}
+
+
 def _fields(kind: type[Message]) -> tuple[str, ...]:
-    return tuple(spec.name for spec in fields(kind))
+    """Return the names of a message's fields; asked for every message of an IMU."""
+    if kind not in _FIELDS:
+        _FIELDS[kind] = tuple(spec.name for spec in fields(kind))
+    return _FIELDS[kind]

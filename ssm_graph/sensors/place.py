@@ -1,4 +1,4 @@
-"""Positions on Earth as columns of a table and keys of a section, whichever instrument says them."""
+"""Positions on Earth as columns of a table and keys of a section, whoever says them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ LON: Final = Column(
     "lon_deg",
     low=LONGITUDES_DEG[0],
     high=LONGITUDES_DEG[1],
-    expected="expected degrees from -180 to 360",
+    expected="expected degrees from {:g} to {:g}".format(*LONGITUDES_DEG),
     told=_SWAPPED,
     unit=DEGREE,
     wraps=True,

@@ -39,7 +39,6 @@ from ssm_graph.mission.problem import Problem, with_white_noise
 from ssm_graph.mission.trajectory import trajectory_from_states
 from ssm_graph.smoothers.aid_weights import AidWeighing
 from ssm_graph.smoothers.beam_faults import FaultSearch, FaultWatch
-from ssm_graph.smoothers.calibration_and_current import calibration_of, current_of, undetermined
 from ssm_graph.smoothers.noise import (
     MAX_ADAPTATIONS,
     adaptation,
@@ -47,6 +46,7 @@ from ssm_graph.smoothers.noise import (
     noise_notes,
     with_sigmas,
 )
+from ssm_graph.smoothers.variables import calibration_of, current_of, undetermined
 from ssm_graph.smoothers.verdict import contradictions
 
 __all__ = ["OnIteration", "Similarity", "SmootherConfig", "SsmSmoother"]
@@ -367,7 +367,7 @@ class SsmSmoother:
 
 
 def noise_of(solved: Solved, used: Array) -> NoiseFound:
-    """Return what a solution says of the noise; ``used`` (4,) are its sigmas over the stated."""
+    """Return what a solution says of the noise; ``used`` (B,) are its sigmas over the stated."""
     linearizer, last = solved.linearizer, solved.last
     return noise_found(
         linearizer.problem,

@@ -120,9 +120,7 @@ def find_beam_faults(
     found: list[Stretch] = []
     for piece, middle in pieces_of(len(edges) - 1):
         judged = evidence.of(edges[piece.start : piece.stop + 1], own, shared)
-        for stretch in _search(
-            without_shared(judged, shared.shape[1]), search, n_beams=beams.n_beams
-        ):
+        for stretch in _search(without_shared(judged, shared.shape[1]), search, beams.n_beams):
             begin = max(stretch.begin + piece.start, middle.start)
             end = min(stretch.end + piece.start, middle.stop)
             if begin < end:
@@ -198,13 +196,13 @@ def _freed(evidence: Evidence, columns: NDArray[np.intp], information: float) ->
     return Evidence(score - crossed @ explained[:, -1], among - crossed @ explained[:, :-1])
 
 
-def _search(evidence: Evidence, search: FaultSearch, *, n_beams: int) -> list[Stretch]:
+def _search(evidence: Evidence, search: FaultSearch, n_beams: int) -> list[Stretch]:
     """Take out the most significant stretch until none is significant any more."""
     n_blocks = len(evidence.score) // n_beams
     is_free, is_blamed = np.zeros((2, n_blocks, n_beams), dtype=bool)
     found: list[Stretch] = []
     while len(found) < MAX_FOUND:
-        chi_sq = np.stack([stretch_chi_sq(evidence, beam, n_beams) for beam in range(n_beams)])
+        chi_sq = np.stack([stretch_chi_sq(evidence, beam, n_blocks) for beam in range(n_beams)])
         best, begin, end = (int(i) for i in np.unravel_index(np.argmax(chi_sq), chi_sq.shape))
         if chi_sq[best, begin, end] < search.significance**2:
             break
@@ -239,13 +237,13 @@ def who_is_off(chi_sq: Array, is_blamed: Mask, *, margin: float) -> int | None:
     return None
 
 
-def stretch_chi_sq(evidence: Evidence, beam: int, n_beams: int) -> Array:
+def stretch_chi_sq(evidence: Evidence, beam: int, n_blocks: int) -> Array:
     """Return the chi-square of an offset of one beam in every stretch, by begin and end block.
 
     (N + 1, N + 1), one degree of freedom; zero where the end is not after the begin, or where
     nothing can be said.
     """
-    n_blocks, own = len(evidence.score) // n_beams, slice(beam, None, n_beams)
+    own = slice(beam, None, len(evidence.score) // n_blocks)
     score = np.concatenate([[0.0], np.cumsum(evidence.score[own])])
     summed = np.zeros((n_blocks + 1, n_blocks + 1))
     summed[1:, 1:] = evidence.information[own, own].cumsum(axis=0).cumsum(axis=1)

@@ -20,14 +20,10 @@ from ssm_graph.graph.measurements import aid_table, doubts_of_aids
 from ssm_graph.mission.estimate import Estimate, OnKeyframe
 from ssm_graph.mission.problem import Problem, start_of, with_white_noise
 from ssm_graph.mission.recursive import RecursiveBeams, recursive_estimate
-from ssm_graph.smoothers.calibration_and_current import (
-    calibration_of_last,
-    current_along,
-    undetermined,
-)
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
 from ssm_graph.smoothers.keyframe import keyframes_of, sensors_of
 from ssm_graph.smoothers.stretch import Stretch, joined
+from ssm_graph.smoothers.variables import calibration_of_last, current_along, undetermined
 from ssm_graph.smoothers.window import Window
 from ssm_graph.smoothers.window_graph import beam_rows
 

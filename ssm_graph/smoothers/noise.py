@@ -132,20 +132,18 @@ def noise_notes(found: NoiseFound) -> tuple[str, ...]:
 def _note_of_beams(found: NoiseFound) -> str:
     if np.any(found.beam_used != 1.0):
         used = ", ".join(f"{factor:.2f}" for factor in found.beam_used)
-        return (
-            f"sigmas of beams 1 to {len(found.beam_used)} were adapted to their errors: {used} "
-            "times as stated"
-        )
+        beams = f"beams 1 to {len(found.beam_used)}"
+        return f"sigmas of {beams} were adapted to their errors: {used} times as stated"
     # The logarithm of a sigma estimated with n degrees of freedom has the deviation 1 / sqrt(2 n).
     off = np.abs(np.log(found.beam_factor))
     is_significant = off * np.sqrt(2.0 * found.beam_dof) > SIGNIFICANT
-    beams = np.flatnonzero(is_significant & (off > np.log(NOTABLE_BEAM)))
-    if len(beams) == 0:
+    notable = np.flatnonzero(is_significant & (off > np.log(NOTABLE_BEAM)))
+    if len(notable) == 0:
         return ""
-    asked = ", ".join(f"{found.beam_factor[beam]:.2f} of beam {beam + 1}" for beam in beams)
+    asked = ", ".join(f"{found.beam_factor[beam]:.2f} of beam {beam + 1}" for beam in notable)
     return (
         f"the errors of the beams are not as stated: they ask for sigmas of {asked} times as much "
-        f"({found.beam_dof[beams].min():.0f} degrees of freedom or more); correct the noise of "
+        f"({found.beam_dof[notable].min():.0f} degrees of freedom or more); correct the noise of "
         "[dvl], or adapt it"
     )
 

@@ -17,7 +17,7 @@ from ssm_graph.engine.error_state import InitialMoments, Linearised
 from ssm_graph.engine.marginal_prior import moved_chart
 from ssm_graph.engine.reweighting import Mixing
 from ssm_graph.engine.states import States
-from ssm_graph.graph.beam_weights import met_weights, updated_trust
+from ssm_graph.graph.first_weights import met_weights, updated_trust
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors
 from ssm_graph.smoothers.stretch import Stretch

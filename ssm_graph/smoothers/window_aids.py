@@ -13,7 +13,7 @@ from ssm_graph.base.times import Indices
 from ssm_graph.engine.states import States
 from ssm_graph.graph.aids.aid import Aid, Rows, RowStates
 from ssm_graph.graph.aids.standstill import AnySpeed
-from ssm_graph.graph.forward_aids import settled_weight
+from ssm_graph.graph.first_weights import settled_weights
 from ssm_graph.graph.measurements import JudgedAid, aid_kernel
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors
 
@@ -156,22 +156,27 @@ class WindowAids:
         return tuple(left_out)
 
     def meet_prediction(self, k: int, step: Array, root_cov: Array, kernel: Kernel) -> bool:
-        """Weigh the measurements of the newest keyframe by what all before it predict.
+        """Weigh the measurements of the newest keyframe by what all before it predict, together.
 
         Returns whether there are any.
         """
-        has_any = False
-        for name in self._weighted:
-            one = self._all[name]
-            rows = one.rows_of(k, k + 1)
-            weight = one.weight.copy()
-            for i in range(rows.start, rows.stop):
-                root = one.jacobian[i] @ root_cov
-                innovation = -one.error[i] - one.jacobian[i] @ step
-                weight[i] = settled_weight(innovation, root @ root.T, aid_kernel(kernel))
-                has_any = True
-            self._all[name] = one._replace(weight=weight)
-        return has_any
+        met = [(name, self._all[name].rows_of(k, k + 1)) for name in self._weighted]
+        met = [(name, rows) for name, rows in met if rows.stop > rows.start]
+        if not met:
+            return False
+        some = [self._all[name].take(rows) for name, rows in met]
+        H = np.concatenate([one.jacobian.reshape(-1, len(step)) for one in some])
+        error, root = np.concatenate([one.error.ravel() for one in some]), H @ root_cov
+        dims = np.concatenate([np.full(len(one.aid), one.aid.dim) for one in some])
+        measurement = np.repeat(np.arange(len(dims)), dims)
+        weights = settled_weights(-error - H @ step, root @ root.T, measurement, aid_kernel(kernel))
+        begin = 0
+        for name, rows in met:
+            one, count = self._all[name], rows.stop - rows.start
+            own = np.concatenate([one.weight[: rows.start], weights[begin : begin + count]])
+            self._all[name] = one._replace(weight=own)
+            begin += count
+        return True
 
     def judge(self, step: Array, covariance: Array, similarity: Similarity) -> None:
         """Find the ``t`` of all measurements with weights at a solution (K, n), (K, n, n)."""

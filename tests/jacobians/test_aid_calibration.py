@@ -67,6 +67,18 @@ def test_jacobians_of_a_fix(late_s: float) -> None:
         np.testing.assert_allclose(block, want, atol=1e-8)
 
 
+def test_each_fix_has_the_clock_of_its_own_keyframe() -> None:
+    """Several at once are those one by one, where the clock is carried in the states."""
+    late_s, each = np.array([0.0, 0.3]), []
+    fixed = {"lever_arm_b": LEVER, "omega_b": OMEGA, "position_n": FIX}
+    for tau in late_s:
+        each.append(fix_residual(R_NB, P_N, V_N, time_offset=np.asarray(tau), **fixed))
+    R, p, v = (np.stack([x, x]) for x in (R_NB, P_N, V_N))
+    both = fix_residual(R, p, v, time_offset=late_s, **fixed)
+    for together, *alone in zip(both, *each, strict=True):
+        np.testing.assert_allclose(together, np.stack(alone), rtol=0.0, atol=1e-14)
+
+
 def test_a_late_fix_lies_behind() -> None:
     """Of an antenna on a turning vehicle, half a second late; the turn is of second order."""
     late_s, turn = 0.5, 0.01 * OMEGA

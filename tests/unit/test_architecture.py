@@ -126,6 +126,20 @@ def test_gtsam_stays_in_its_place(path: Path) -> None:
         assert outside <= known | {"typing", "enum", "functools"}
 
 
+def test_missions_of_files_and_logs_are_made_through_one_door() -> None:
+    """No reader and no converter chooses its own checks: each hands its logs to the assembly."""
+    makers = {
+        str(path.relative_to(ROOT / "ssm_graph" / "io"))
+        for path in MODULES
+        if part_of(dotted_name(path)) == "io"
+        for node in ast.walk(parse(path))
+        if isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Name)
+        and node.func.id == "Mission"
+    }
+    assert makers == {"mission_folder/assembly.py"}
+
+
 def test_import_rules_see_every_form_of_import() -> None:
     """The parser behind the rules: absolute, relative, aliased and local imports."""
     source = """

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from factors.similarity import WEIGHT_FLOOR, LogKernel
-from ssm_graph.graph.beam_weights import MEMORY_PINGS, met_weights, updated_trust
+from ssm_graph.graph.first_weights import MEMORY_PINGS, met_weights, updated_trust
 
 KERNEL = LogKernel()
 VARIANCE = np.full(4, 0.005**2)

@@ -108,11 +108,11 @@ def test_gnss_ends_at_the_dive(missions: dict[str, Mission]) -> None:
     gnss, depth = mission.gnss, mission.depth
     assert gnss is not None
     assert depth is not None
-    since_start = gnss.time_s - mission.imu.start_s
+    since_start = gnss.valid_s - mission.imu.start_s
     assert np.all((since_start < 24.0) | (since_start > 144.0))
     assert gnss.sigma_enu[:, :2].max() <= 1.0
     assert any("10 with sigma above 1.0 m dropped" in note for note in mission.notes)
-    antenna = -np.interp(gnss.time_s, depth.time_s, depth.depth) - gnss.lever_arm_b[2]
+    antenna = -np.interp(gnss.valid_s, depth.time_s, depth.depth) - gnss.lever_arm_b[2]
     np.testing.assert_allclose(gnss.height, antenna)
     np.testing.assert_allclose([depth.depth.min(), depth.depth.max()], [0.196, 7.668], atol=1e-3)
     assert np.isnan(mission.dvl.speed).sum() == 15
@@ -146,8 +146,8 @@ def test_turning_and_moving_agree_with_gnss(missions: dict[str, Mission]) -> Non
     step = forward_right * np.exp(1j * np.interp(time_s, imu.time_s, angle))
     track = np.cumsum(step * np.diff(time_s, prepend=time_s[0]))
     fixes = mission.frame.p_n_from_geodetic(gnss.lat, gnss.lon, gnss.height)
-    inside = gnss.time_s < time_s[-1]
-    walked = np.interp(gnss.time_s[inside], time_s, track)
+    inside = gnss.valid_s < time_s[-1]
+    walked = np.interp(gnss.valid_s[inside], time_s, track)
     design = np.column_stack([walked, np.ones_like(walked)])
     north_east = fixes[inside, 1] + 1j * fixes[inside, 0]
     (scale, _), *_ = np.linalg.lstsq(design, north_east, rcond=None)

@@ -127,10 +127,13 @@ def test_the_live_estimator_says_so_too_and_takes_known_offsets_off() -> None:
     """
     sim = miscalibrated(duration_s=8.0)
     vehicle = vehicle_of(asking(sim.mission))
+    depth, gnss = vehicle.depth, vehicle.gnss
+    assert depth is not None
+    late = replace(gnss.calibration, time_offset_s=0.2)
     vehicle = replace(
         vehicle,
-        depth_calibration=replace(vehicle.depth_calibration, offset=0.4),
-        gnss_calibration=replace(vehicle.gnss_calibration, time_offset_s=0.2),
+        depth=replace(depth, calibration=replace(depth.calibration, offset=0.4)),
+        gnss=replace(gnss, calibration=late),
     )
     smoother = FixedLagSmoother(vehicle)
     for message in messages_of(sim.mission):
@@ -139,11 +142,13 @@ def test_the_live_estimator_says_so_too_and_takes_known_offsets_off() -> None:
     assert "dvl_time_offset" in event.text
     assert "dvl_scale" not in event.text
     buffers = Buffers(vehicle)
-    fix, depth = Fix(1.2, 0.5, 0.5, 0.0, (1.0, 1.0, 1.0)), DepthReading(1.0, 2.4)
+    fix, reading = Fix(1.2, 0.5, 0.5, 0.0, (1.0, 1.0, 1.0)), DepthReading(1.0, 2.4)
     assert buffers.time_of(fix) == pytest.approx(1.0)
-    assert buffers.time_of(depth) == 1.0
-    assert buffers.add(depth)
-    assert buffers.depths.all[0, 1] == pytest.approx(2.0)
+    assert buffers.time_of(reading) == 1.0
+    assert buffers.add(reading)
+    depth = buffers.logs_between(0.0, 2.0).depth
+    assert depth is not None
+    np.testing.assert_allclose(depth.true_depth, [2.0])
 
 
 @pytest.mark.parametrize("with_gnss", [True, False])

@@ -133,8 +133,8 @@ def test_a_damaged_one_does_not_push_out_the_older_one(tmp_path: Path) -> None:
     [
         (b"", "expected a checkpoint, got another file"),
         (b"PK\x03\x04 some archive", "expected a checkpoint"),
-        (b"ssm-graph checkpoint 00000001 sha256 " + b"0" * 64, "of version 2, got version 1"),
-        (b"ssm-graph checkpoint 00000002 sha256 " + b"0" * 64, "damaged: its digest"),
+        (b"ssm-graph checkpoint 00000001 sha256 " + b"0" * 64, "of version 3, got version 1"),
+        (b"ssm-graph checkpoint 00000003 sha256 " + b"0" * 64, "damaged: its digest"),
     ],
 )
 def test_foreign_files_are_refused(tmp_path: Path, content: bytes, message: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import tomllib
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ssm_graph import cli
 from ssm_graph.base.errors import SsmGraphError
 from ssm_graph.cli.main import EXIT_CODES, ExitCode, main
 from ssm_graph.io.mission_folder.reader import read_mission
@@ -163,3 +165,13 @@ def test_every_kind_of_error_has_a_code() -> None:
 
     covered = {kind for kind, _ in EXIT_CODES}
     assert leaves(SsmGraphError) <= covered
+
+
+def test_the_package_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    """In the order of the help."""
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    shown = re.findall(r"^    (\w+)  ", capsys.readouterr().out, flags=re.MULTILINE)
+    named = re.findall(r"(\w+)(?: \||``)", cli.__doc__ or "")
+    assert len(named) == 6
+    assert named == shown

@@ -12,7 +12,7 @@ import pytest
 from ssm_graph.base.errors import DataError, SsmGraphError, nearest_hint
 from ssm_graph.base.frozen import FrozenArrays, read_only
 from ssm_graph.mission.mission import Reference
-from ssm_graph.sensors.dvl import DvlLog, DvlMount
+from ssm_graph.sensors.dvl import DvlLog, DvlMount, counted_sigma
 from ssm_graph.sensors.imu import ImuLog
 from ssm_graph.simulation import IMU_NOISE, Grade, default_mount
 from tests.helpers import simulated
@@ -125,3 +125,16 @@ def test_errors_have_one_base_and_hints_name_the_nearest() -> None:
     assert nearest_hint("zzz", ["lon", "lat"]) == "known are: lat, lon"
     with pytest.raises(SsmGraphError):
         Reference([0.0], [0.0, 1.0], [0.0], [0.0], np.zeros((1, 3)), np.zeros((1, 3)))  # type: ignore[arg-type]
+
+
+def test_a_sigma_that_is_not_stated_is_that_of_ground_or_water() -> None:
+    """NaN, zero and less state none; one nominal sigma may stand for both."""
+    stated = np.array([[0.5, np.nan, 0.0, -1.0], [np.nan, 0.3, np.inf, np.nan]])
+    water = np.array([False, True])
+    np.testing.assert_array_equal(
+        counted_sigma(stated, water, ground_sigma=0.01, water_sigma=0.08),
+        [[0.5, 0.01, 0.01, 0.01], [0.08, 0.3, np.inf, 0.08]],
+    )
+    for none in (None, 0.0):
+        alike = counted_sigma(np.full(4, np.nan), True, ground_sigma=0.01, water_sigma=none)
+        np.testing.assert_array_equal(alike, np.full(4, 0.01))

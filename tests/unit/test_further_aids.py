@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from typing import Any, cast
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from factors.m_estimators import HuberKernel, TruncatedKernel
-from factors.similarity import WEIGHT_FLOOR, ExpKernel, LogKernel, Similarity
+from factors.similarity import ExpKernel, LogKernel, Similarity
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.engine.reweighting import Graduation
 from ssm_graph.filters.navigation.named import filter_problems
@@ -19,7 +20,7 @@ from ssm_graph.graph.aids.standstill import Standstills
 from ssm_graph.graph.aids.usbl import UsblFixes
 from ssm_graph.graph.beacon_start import BeaconRanges, beacon_start, rival_place
 from ssm_graph.graph.first_values import first_values
-from ssm_graph.graph.forward_aids import settled_weight
+from ssm_graph.graph.first_weights import settled_weights
 from ssm_graph.graph.gtsam_graph import gtsam_graph
 from ssm_graph.mission.estimate import Determined, Status
 from ssm_graph.mission.mission import Aids
@@ -120,16 +121,80 @@ def test_the_vehicle_stands_still_at_every_keyframe_of_a_standstill() -> None:
     np.testing.assert_array_equal(further.sigma, np.where(time_s >= 6.0, 0.01, 0.05))
 
 
+def test_first_weights_are_those_of_the_posterior() -> None:
+    """Of its mean and of its covariance, here in information form; a fix beside two ranges."""
+    rng = np.random.default_rng(4)
+    root = rng.standard_normal((5, 5))
+    predicted, innovation = 2.0 * root @ root.T, np.array([1.0, -0.5, 0.3, 2.0, -6.0])
+    measurement = np.array([0, 0, 0, 1, 2])
+    weights = settled_weights(innovation, predicted, measurement, KERNEL)
+    information = np.diag(weights[measurement])
+    covariance = np.linalg.inv(np.linalg.inv(predicted) + information)
+    left = innovation - covariance @ information @ innovation
+    t = np.bincount(measurement, weights=left**2 + covariance.diagonal())
+    np.testing.assert_allclose(weights, KERNEL.weight(t, dim=np.array([3.0, 1.0, 1.0])), atol=0.02)
+
+
 @pytest.mark.parametrize("dim", [1, 3])
-def test_weights_of_the_first_pass(dim: int) -> None:
-    """What agrees counts in full, what is beyond the gate not at all, and between less and less."""
-    predicted = 2.0 * np.eye(dim)
-    agrees = settled_weight(np.zeros(dim), predicted, KERNEL)
-    odd = settled_weight(np.full(dim, 6.0), predicted, KERNEL)
-    gross = settled_weight(np.full(dim, 60.0), predicted, KERNEL)
-    assert agrees > 1.0
-    assert gross == WEIGHT_FLOOR
-    assert gross < odd < agrees
+def test_first_weights_begin_at_the_gate(dim: int) -> None:
+    """A vague prediction agrees with all that it can mean, and with nothing beyond."""
+    predicted, first = 100.0 * np.eye(dim), np.eye(dim)[-1] * np.sqrt(101.0)
+    within, beyond = (
+        settled_weights(far * first, predicted, np.zeros(dim, np.intp), KERNEL)
+        for far in (4.99, 5.01)
+    )
+    assert within > 0.9
+    assert beyond < 0.01
+
+
+@pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
+def test_measurements_of_one_keyframe_judge_each_other(order: tuple[int, ...]) -> None:
+    """A gross one that is alone within reach of the prediction loses, whichever comes first."""
+    innovation = np.array([0.3, -0.2, 30.0])[list(order)]
+    weights = settled_weights(innovation, np.full((3, 3), 1e4), np.arange(3), KERNEL)
+    gross = weights[np.argmax(innovation)]
+    assert gross < 0.01
+    assert np.delete(weights, np.argmax(innovation)).min() > 0.9
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2, 3), (2, 3, 1, 0)])
+@pytest.mark.parametrize("n_gross", [0, 1])
+def test_ranges_of_one_keyframe_find_a_start_that_is_off(
+    order: tuple[int, ...], n_gross: int
+) -> None:
+    """By 25 m, as its sigmas say; exact ranges to four beacons around, and one that is an echo."""
+    around = [(300.0, 0.0, -50.0), (0.0, 300.0, -50.0), (-300.0, 0.0, -50.0), (0.0, -300.0, -50.0)]
+    known = tuple(BeaconSettings(number + 1, enu) for number, enu in enumerate(around))
+    sim = simulated(duration_s=10.0, aids=ranging(*known), gnss=None)
+    mission, frame = sim.mission, sim.mission.frame
+    log, start = mission.aids[RangeLog], mission.initial
+    assert start is not None
+    at_s, beacons = 5.0, [log.beacons[i] for i in order]
+    truth = sim.truth_at(np.array([at_s]))
+    place_n = frame.p_n_from_geodetic(truth.lat, truth.lon, truth.height)[0]
+    beacon_n = np.array([frame.p_n_from_geodetic(b.lat, b.lon, b.height) for b in beacons])
+    distance = np.linalg.norm(beacon_n - place_n, axis=1) + np.array([35.0 * n_gross, 0, 0, 0])
+    ranges = RangeLog(
+        log.beacons,
+        np.full(4, at_s),
+        np.array([float(b.number) for b in beacons]),
+        distance,
+        np.full(4, 0.3),
+        np.zeros(3),
+    )
+    start_n = frame.p_n_from_geodetic(start.lat, start.lon, start.height)
+    start_n = start_n + np.array([20.0, -15.0, 0.0])
+    lat, lon, height = (float(x) for x in frame.geodetic_from_p_n(start_n))
+    sigma_enu = np.array([20.0, 20.0, 1.0])
+    off = replace(start, lat=lat, lon=lon, height=height, position_sigma_enu=sigma_enu)
+    problem = build_problem(replace(mission, aids=Aids(ranges)), start=off)
+    first = first_values(problem, kernel=KERNEL)
+    met = problem.aid(Ranges)
+    assert met is not None
+    (k,) = np.unique(met.keyframe)
+    assert np.linalg.norm((first.states.p_n[k] - place_n)[:2]) < 0.5
+    assert first.aid_weights[n_gross:].min() > 0.8
+    assert np.all(first.aid_weights[:n_gross] < 0.01)
 
 
 def circle(n: int = 200) -> np.ndarray:

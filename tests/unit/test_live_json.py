@@ -61,7 +61,7 @@ MESSAGES = st.one_of(
         UsblFix,
         NUMBER,
         st.floats(-math.pi / 2, math.pi / 2),
-        st.floats(-math.pi, 2.0 * math.pi),
+        st.floats(-math.pi, math.pi),
         NUMBER,
         st.tuples(SIGMA, SIGMA, SIGMA),
         NUMBER,
@@ -118,11 +118,21 @@ def test_lines_of_the_documentation() -> None:
     assert ping == Ping(1.5, (0.1, math.nan, -0.3, 0.4))
     assert depth == DepthReading(2.0, 30.5)
     assert fix == Fix(3.0, math.radians(63.5), math.radians(-10.0), 40.0, (1.0, 2.0, 3.0))
-    place = (math.radians(63.5), math.radians(350.0), -40.0)
+    place = (math.radians(63.5), math.radians(-10.0), -40.0)
     assert acoustic == UsblFix(4.0, *place, (1.0, 2.0, 3.0), 1.5)
     assert reach == AcousticRange(5.0, 4.0, 130.5, 0.3)
     assert heading == HeadingReading(6.0, math.radians(90.0))
     assert not refused
+
+
+@pytest.mark.parametrize("lon_deg", [-180, -10, 180, 190.125, 360])
+def test_longitudes_may_go_once_around(lon_deg: float) -> None:
+    """As in all other inputs; what is beyond half a turn is west of Greenwich."""
+    (fix,), refused = decode(f"{changed('gnss', lon_deg=lon_deg)}\n".encode())
+    assert isinstance(fix, Fix)
+    assert not refused
+    west = lon_deg - 360 if lon_deg > 180 else lon_deg
+    assert fix.lon == pytest.approx(math.radians(west), rel=1e-15)
 
 
 @pytest.mark.parametrize("axes", BodyAxes)
@@ -163,7 +173,8 @@ def changed(kind: str, **changes: Any) -> str:
         (changed("depth", depth_m=[1]), "expected a number"),
         (changed("depth", lat_deg=1), "unknown key 'lat_deg'"),
         (changed("gnss", lat_deg=90.001), "check the unit"),
-        (changed("gnss", lon_deg=-181), "check the unit"),
+        (changed("gnss", lon_deg=-181), "expected -180 to 360, got -181; check the unit"),
+        (changed("gnss", lon_deg=360.5), "expected -180 to 360"),
         (changed("gnss", lat_deg="63"), "expected a number"),
         (changed("gnss", sigma_m=[1, -1, 1]), "sigma_m"),
         (LINES["gnss"].replace("63.5", "NaN"), "finite"),

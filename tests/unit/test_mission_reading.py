@@ -109,9 +109,11 @@ def test_calibration_keys_are_read(tmp_path: Path) -> None:
     longer = np.linalg.norm(mount.beams_b, axis=1)
     np.testing.assert_allclose(longer, [0.97, 0.97 * 1.01, 0.97, 0.97])
     assert (depth.calibration.offset, depth.calibration.offset_sigma) == (0.5, 0.2)
-    np.testing.assert_allclose(depth.depth, plain.depth.depth - 0.5)
+    np.testing.assert_array_equal(depth.depth, plain.depth.depth)
+    np.testing.assert_allclose(depth.true_depth, plain.depth.depth - 0.5)
     assert (gnss.calibration.time_offset_sigma_s, gnss.calibration.lever_arm_sigma) == (0.1, 0.4)
-    np.testing.assert_allclose(gnss.time_s, plain.gnss.time_s - 0.3)
+    np.testing.assert_array_equal(gnss.time_s, plain.gnss.time_s)
+    np.testing.assert_allclose(gnss.valid_s, plain.gnss.time_s - 0.3)
 
 
 def test_a_scale_that_walks_needs_a_sigma_to_start_from(tmp_path: Path) -> None:

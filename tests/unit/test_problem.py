@@ -217,3 +217,24 @@ def test_start_after_the_data_is_refused() -> None:
     """Through the whole of build_problem."""
     with pytest.raises(DataError, match="leaves no inertial data"):
         build_problem(with_initial(simulated().mission, time_s=99.0))
+
+
+@pytest.mark.parametrize("log", ["imu", "dvl", "depth", "gnss"])
+@pytest.mark.parametrize("row", [0, 1, -1])
+def test_a_time_that_is_no_number_is_called_so(log: str, row: int) -> None:
+    """And not one that does not increase, as its neighbours do."""
+    mission = simulated(gnss=GnssSettings(windows=((0.0, 30.0),))).mission
+    time_s = getattr(mission, log).time_s.copy()
+    time_s[row] = math.nan
+    changed = dataclasses.replace(getattr(mission, log), time_s=time_s)
+    at = row % len(time_s)
+    with pytest.raises(DataError, match=rf"{log}.time_s, row {at}: expected a finite number, got"):
+        build_problem(dataclasses.replace(mission, **{log: changed}))
+
+
+def test_inertial_data_that_begin_at_no_time_are_refused() -> None:
+    """By their own name."""
+    mission = simulated(gnss=GnssSettings(windows=((0.0, 30.0),))).mission
+    imu = dataclasses.replace(mission.imu, start_s=math.nan)
+    with pytest.raises(DataError, match=r"imu.start_s, row 0: expected a finite number, got nan"):
+        build_problem(dataclasses.replace(mission, imu=imu))

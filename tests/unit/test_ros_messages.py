@@ -274,12 +274,19 @@ def test_fix_of_unknown_quality_gets_the_stated_one(kind: int) -> None:
     assert has_stated_sigma(nav_sat_fix(position_covariance_type=kind))
 
 
+def test_longitudes_may_go_once_around() -> None:
+    """What is beyond half a turn is west of Greenwich."""
+    assert fix(nav_sat_fix(longitude=240.0), RECEIVED_S).lon == pytest.approx(math.radians(-120.0))
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
         ({"status": SimpleNamespace(status=-1)}, "no fix"),
         ({"latitude": NAN}, "latitude is not finite"),
         ({"latitude": 91.0}, "place on Earth"),
+        ({"longitude": -181.0}, "place on Earth"),
+        ({"longitude": 361.0}, "place on Earth"),
         ({"latitude": 0.0, "longitude": 0.0}, "place on Earth"),
         ({"altitude": NAN}, "altitude is not finite"),
     ],

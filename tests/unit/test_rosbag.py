@@ -27,6 +27,7 @@ from ssm_graph.io.ros.convert import BEAM_SIGMA, NOISE, WATER_LATER_S, convert_r
 from ssm_graph.io.ros.log import LAYOUTS, is_rosbag
 from ssm_graph.io.ros.messages import BeamSign, RosOptions
 from ssm_graph.mission.mission import Mission
+from ssm_graph.sensors.current import CurrentModel
 from ssm_graph.sensors.dvl import DvlMount
 from ssm_graph.sensors.imu import ImuNoise
 from ssm_graph.simulation import GnssSettings
@@ -336,6 +337,28 @@ def test_a_bag_keeps_the_water_track(mission: Mission, ros: Ros, tmp_path: Path)
     assert any(f"{len(both)} off the water put 1 ms behind" in note for note in got.notes)
 
 
+def test_a_vehicle_says_how_good_pings_off_the_water_are(
+    mission: Mission, ros: Ros, tmp_path: Path
+) -> None:
+    """Its sigma off the water, where the message states none, and its current."""
+    sent = marine_bag(mission, ros)
+    pings = [one for one in sent if one.type_name == MARINE]
+    for ping in pings[1::2]:
+        ping.message.velocity_mode = 2
+    pings[3].message.beam_velocity_covar = np.full(4, 0.03**2, dtype=np.float32)
+    vehicle = replace(
+        vehicle_of(mission), beam_sigma=0.01, water_sigma=0.08, current=CurrentModel(sigma=0.2)
+    )
+    bag = write_bag(tmp_path / "run", ros, sent)
+    got = convert_rosbag(bag, vehicle=vehicle, options=ON_ELLIPSOID)
+    expected = np.where(got.dvl.is_water, 0.08, 0.01)
+    expected[3] = 0.03
+    np.testing.assert_allclose(got.dvl.sigma, np.tile(expected[:, None], 4), rtol=1e-6)
+    assert got.current == vehicle.current
+    alike = convert_rosbag(bag, vehicle=replace(vehicle, water_sigma=None), options=ON_ELLIPSOID)
+    np.testing.assert_allclose(np.delete(alike.dvl.sigma, 3, axis=0), 0.01)
+
+
 def test_a_single_file_is_a_bag_too(mission: Mission, ros: Ros, tmp_path: Path) -> None:
     """The folder's metadata are not needed."""
     bag = write_bag(tmp_path / "run", ros, marine_bag(mission, ros))
@@ -359,7 +382,7 @@ def test_water_linked_in_every_layout(
     sent += imu_messages(mission, ros)[:200] + aid_messages(mission, ros)
     bag = write_bag(tmp_path / "wl", ros, sent, StoragePlugin.SQLITE3)
     got = convert_rosbag(bag if embedded else forget_definitions(bag), options=ON_ELLIPSOID)
-    is_zero = ~body_v.any(axis=1)  # zeros in all beams are a driver's word for no bottom lock
+    is_zero = np.asarray(~body_v.any(axis=1))  # a driver's word for no lock
     np.testing.assert_array_equal(got.dvl.speed, np.where(is_zero[:, None], np.nan, speed))
     np.testing.assert_array_equal(got.dvl.mount.beams_d, WATER_LINKED_BEAMS)
     assert got.imu.noise == NOISE

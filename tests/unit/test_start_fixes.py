@@ -13,7 +13,7 @@ from ssm_graph.evaluation import evaluate
 from ssm_graph.io.mission_folder.reader import read_mission, write_mission
 from ssm_graph.mission.mission import NO_AIDS, Mission
 from ssm_graph.mission.start.alignment import align
-from ssm_graph.mission.start.body_velocity import body_velocities
+from ssm_graph.mission.start.body_velocity import BodyVelocities, body_velocities
 from ssm_graph.mission.start.start_fixes import NEAR_S, start_fixes
 from ssm_graph.sensors.acoustic import UsblLog
 from ssm_graph.simulation import GnssSettings, Grade, SimulatedMission
@@ -68,6 +68,29 @@ def test_gross_fixes_start_nothing() -> None:
     found, expected = start_fixes(wrong, velocities), start_fixes(mission, velocities)
     np.testing.assert_array_equal(found.time_s, expected.time_s[3:])
     np.testing.assert_array_equal(found.position_n, expected.position_n[3:])
+
+
+@pytest.mark.parametrize(("far", "is_kept"), [(3.9, True), (4.1, False)])
+def test_a_fix_disagrees_beyond_four_sigmas(far: float, is_kept: bool) -> None:
+    """Of both fixes together, at rest and without a lever arm; the last one comes after the end."""
+    mission = adrift().mission
+    log = mission.aids[UsblLog]
+    n, sigma = len(log.time_s), 0.5
+    place_n = np.zeros((n, 3))
+    place_n[0, 0] = far * sigma * np.sqrt(6.0)
+    lat, lon, height = mission.frame.geodetic_from_p_n(place_n)
+    fixes = replace(
+        log,
+        delay_s=np.zeros(n),
+        lat=lat,
+        lon=lon,
+        height=height,
+        sigma_enu=np.full((n, 3), sigma),
+        lever_arm_b=np.zeros(3),
+    )
+    at_rest = BodyVelocities(log.time_s, place_n * 0.0)
+    found = start_fixes(replace(mission, aids=mission.aids.having(fixes)), at_rest)
+    np.testing.assert_array_equal(found.time_s, log.time_s[0 if is_kept else 1 : -1])
 
 
 def test_gnss_goes_first_unless_it_is_late() -> None:

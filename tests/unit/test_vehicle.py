@@ -14,6 +14,7 @@ from ssm_graph.base.tables import Order
 from ssm_graph.io.mission_folder.reader import read_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle, vehicle_of, write_vehicle
 from ssm_graph.io.raw_log.rows import messages_of
+from ssm_graph.live.estimator.buffers import Buffers
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.current import CurrentModel
@@ -150,6 +151,18 @@ def test_every_field_is_written(tmp_path: Path) -> None:
     assert len(fields(Vehicle)) == 11
     assert all(getattr(got, spec.name) is not None for spec in fields(Vehicle))
     assert (got.water_sigma, got.current) == (vehicle.water_sigma, vehicle.current)
+
+
+def test_live_pings_count_with_the_sigma_of_what_they_are_off() -> None:
+    """Off the ground or off the water, unless they state their own."""
+    buffers = Buffers(replace(vehicle_of(make_mission()), beam_sigma=0.01, water_sigma=0.08))
+    own = (0.5, float("nan"), 0.5, 0.5)
+    buffers.add(Ping(1.0, (1.0,) * 4))
+    buffers.add(Ping(2.0, (1.0,) * 4, is_water=True))
+    buffers.add(Ping(3.0, (1.0,) * 4, own, is_water=True))
+    np.testing.assert_array_equal(
+        buffers.pings.all[:, buffers.sigmas], [[0.01] * 4, [0.08] * 4, [0.5, 0.08, 0.5, 0.5]]
+    )
 
 
 def test_messages_come_in_order_of_time() -> None:

@@ -26,6 +26,17 @@ from ssm_graph.sensors.imu import ImuLog
 Rows = slice | NDArray[np.intp] | NDArray[np.bool_]
 
 
+class Keyframes(NamedTuple):
+    """Where and when measurements are wanted, with the inertial data that lead to there."""
+
+    frame: LocalFrame
+    imu: ImuLog
+    time_s: Array
+    """(K,) s"""
+    begin_s: float | None = None
+    """s, from where on errors that grow are counted; None for the first reading of each log"""
+
+
 class RowStates(NamedTuple):
     """The state of each row's own keyframe, leading axes (...), or one for all rows."""
 
@@ -133,20 +144,11 @@ class Aid(Table, ABC):
     """Whether each of them asks for a keyframe of its own; see :meth:`times`"""
 
     @classmethod
-    def of(
-        cls,
-        aids: Aids,  # noqa: ARG003
-        *,
-        frame: LocalFrame,  # noqa: ARG003
-        imu: ImuLog,  # noqa: ARG003
-        keyframe_s: Array,  # noqa: ARG003
-        begin_s: float | None = None,  # noqa: ARG003
-    ) -> Self | None:
-        """Return what the log of a mission says at keyframes (K,), s; None without a log.
+    def of(cls, aids: Aids, keyframes: Keyframes) -> Self | None:  # noqa: ARG003
+        """Return what the log of a mission says at keyframes; None without a log.
 
         Each measurement belongs to the keyframe that it asked for, or to the first one after it, so
-        that what a keyframe has does not depend on later ones. Errors that grow are counted from
-        ``begin_s``, s, on, or from the first reading of the log.
+        that what a keyframe has does not depend on later ones.
         """
         return None
 

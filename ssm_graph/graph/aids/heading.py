@@ -20,11 +20,10 @@ from ssm_graph.base.times import MIN_SPACING_S
 from ssm_graph.base.usable import require_finite, require_increasing, require_positive
 from ssm_graph.engine.error_state import ROTATION
 from ssm_graph.engine.extras import Extra
-from ssm_graph.graph.aids.aid import Aid, Linearised, RowStates
+from ssm_graph.graph.aids.aid import Aid, Keyframes, Linearised, RowStates
 from ssm_graph.imu.ping_motion import turn_between
 from ssm_graph.mission.mission import Aids
 from ssm_graph.sensors.compass import HeadingLog
-from ssm_graph.sensors.imu import ImuLog
 
 HEADING_OFFSET: Final = "heading_offset"
 HEADING_RATE: Final = "heading_rate"
@@ -55,19 +54,12 @@ class Headings(Aid):
     frame: LocalFrame
 
     @classmethod
-    def of(
-        cls,
-        aids: Aids,
-        *,
-        frame: LocalFrame,
-        imu: ImuLog,
-        keyframe_s: Array,
-        begin_s: float | None = None,
-    ) -> Self | None:
+    def of(cls, aids: Aids, keyframes: Keyframes) -> Self | None:
         """Return the last reading up to each keyframe, of those after the keyframe before."""
         log = aids.get(HeadingLog)
         if log is None:
             return None
+        frame, imu, keyframe_s, begin_s = keyframes
         time_s, late_s = log.time_s, keyframe_s + MIN_SPACING_S
         reading = np.searchsorted(time_s, late_s, side="right") - 1
         before = np.searchsorted(time_s, np.append(keyframe_s[0] - MIN_SPACING_S, late_s[:-1]))

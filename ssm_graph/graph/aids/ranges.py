@@ -9,16 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.beacon_range import range_residual
-from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.times import Indices, is_inside, nearest
 from ssm_graph.base.usable import require_finite, require_positive
 from ssm_graph.engine.error_state import POSITION, ROTATION
 from ssm_graph.engine.extras import Extra
-from ssm_graph.graph.aids.aid import Aid, Linearised, RowStates
+from ssm_graph.graph.aids.aid import Aid, Keyframes, Linearised, RowStates
 from ssm_graph.mission.mission import Aids
 from ssm_graph.sensors.acoustic import RangeLog
-from ssm_graph.sensors.imu import ImuLog
 
 _BEACON: Final = "beacon_"
 """Followed by the beacon's number."""
@@ -58,27 +56,19 @@ class Ranges(Aid):
     """(B,)"""
 
     @classmethod
-    def of(
-        cls,
-        aids: Aids,
-        *,
-        frame: LocalFrame,
-        imu: ImuLog,
-        keyframe_s: Array,
-        begin_s: float | None = None,
-    ) -> Self | None:
+    def of(cls, aids: Aids, keyframes: Keyframes) -> Self | None:
         """Return the ranges within the keyframes."""
-        del imu, begin_s
         log = aids.get(RangeLog)
         if log is None:
             return None
-        used = is_inside(log.time_s, keyframe_s[0], keyframe_s[-1])
+        frame, _, time_s, _ = keyframes
+        used = is_inside(log.time_s, time_s[0], time_s[-1])
         number = np.array([beacon.number for beacon in log.beacons], dtype=np.intp)
         lat, lon, height = np.array([(b.lat, b.lon, b.height) for b in log.beacons]).T
         beacon_n = frame.p_n_from_geodetic(lat, lon, height)
         order = np.argsort(number)
         return cls(
-            keyframe=nearest(keyframe_s, log.time_s[used]),
+            keyframe=nearest(time_s, log.time_s[used]),
             beacon=order[np.searchsorted(number[order], log.beacon[used])],
             range_m=log.range_m[used],
             sigma=log.sigma[used],

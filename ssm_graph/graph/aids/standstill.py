@@ -8,13 +8,11 @@ from typing import Self
 import numpy as np
 
 from factors.standstill import standstill_residual
-from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import VELOCITY
-from ssm_graph.graph.aids.aid import Aid, Linearised, RowStates
+from ssm_graph.graph.aids.aid import Aid, Keyframes, Linearised, RowStates
 from ssm_graph.graph.aids.gnss import EAST_NORTH_UP
 from ssm_graph.mission.mission import Aids
-from ssm_graph.sensors.imu import ImuLog
 from ssm_graph.sensors.standstill import Standstill
 
 
@@ -31,23 +29,15 @@ class Standstills(Aid):
     """(M,) m/s"""
 
     @classmethod
-    def of(
-        cls,
-        aids: Aids,
-        *,
-        frame: LocalFrame,
-        imu: ImuLog,
-        keyframe_s: Array,
-        begin_s: float | None = None,
-    ) -> Self | None:
+    def of(cls, aids: Aids, keyframes: Keyframes) -> Self | None:
         """Return the keyframes within standstills; where two overlap the stricter one counts."""
-        del frame, imu, begin_s
         standstills = aids.all(Standstill)
         if not standstills:
             return None
-        sigma = np.full(len(keyframe_s), np.inf)
+        time_s = keyframes.time_s
+        sigma = np.full(len(time_s), np.inf)
         for still in standstills:
-            inside = (keyframe_s >= still.begin_s) & (keyframe_s <= still.end_s)
+            inside = (time_s >= still.begin_s) & (time_s <= still.end_s)
             sigma[inside] = np.minimum(sigma[inside], still.sigma)
         keyframe = np.flatnonzero(np.isfinite(sigma))
         return cls(keyframe, sigma[keyframe])

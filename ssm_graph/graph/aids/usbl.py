@@ -7,14 +7,13 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.times import is_inside, nearest
 from ssm_graph.base.usable import require_finite, require_positive
+from ssm_graph.graph.aids.aid import Keyframes
 from ssm_graph.graph.aids.gnss import Fixes
 from ssm_graph.mission.mission import Aids
 from ssm_graph.sensors.acoustic import UsblLog
-from ssm_graph.sensors.imu import ImuLog
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,24 +30,16 @@ class UsblFixes(Fixes):
     DRIFT: ClassVar[str] = ""
 
     @classmethod
-    def of(
-        cls,
-        aids: Aids,
-        *,
-        frame: LocalFrame,
-        imu: ImuLog,
-        keyframe_s: Array,
-        begin_s: float | None = None,
-    ) -> Self | None:
+    def of(cls, aids: Aids, keyframes: Keyframes) -> Self | None:
         """Return the fixes that were valid within the keyframes."""
-        del begin_s
         log = aids.get(UsblLog)
         if log is None:
             return None
-        fix = np.flatnonzero(is_inside(log.valid_s, keyframe_s[0], keyframe_s[-1]))
+        frame, imu, time_s, _ = keyframes
+        fix = np.flatnonzero(is_inside(log.valid_s, time_s[0], time_s[-1]))
         fix = fix[np.argsort(log.valid_s[fix], kind="stable")]
         valid_s = log.valid_s[fix]
-        keyframe = nearest(keyframe_s, valid_s)
+        keyframe = nearest(time_s, valid_s)
         return cls.of_log(log, fix, time_s=valid_s, keyframe=keyframe, frame=frame, imu=imu)
 
     @classmethod

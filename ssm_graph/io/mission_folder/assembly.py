@@ -89,7 +89,7 @@ def assembled(
 ) -> Mission:
     """Return the mission of logs that are sound by themselves, checked against each other."""
     logs = {section: part.log for section, part in parts.items()}
-    own = {section: logs.get(section) for section in (*_OWN_FIELDS, "reference")}
+    own: dict[str, Any] = {section: logs.get(section) for section in (*_OWN_FIELDS, "reference")}
     aids = [logs.get(one.section) for one in INSTRUMENTS if one.section not in _OWN_FIELDS]
     mission = Mission(
         name=name,

@@ -20,14 +20,12 @@ from ssm_graph.io.mission_folder.toml import TOML_NAME
 from ssm_graph.io.mission_folder.vehicle import check_same_vehicle, write_vehicle
 from ssm_graph.io.raw_log.replay import check_columns, replay
 from ssm_graph.io.raw_log.rows import ALWAYS, ARRIVALS, RowKind, row_kinds
-from ssm_graph.io.tables.append_file import AppendFile, sync_folder
+from ssm_graph.io.tables.append_file import TORN_ROW, AppendFile, sync_folder
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.messages import Message
 
 __all__ = ["RawLog", "replay"]
 
-_TORN: Final = b",torn\n"
-"""Ends a torn row: with a word in it, no number of cells makes it a whole one."""
 _RETRY_S: Final = 1.0
 _BATCH: Final = 1000
 """Rows that one append may write of those that waited, so that it takes no longer than 10 ms."""
@@ -122,7 +120,7 @@ class RawLog:
         log._waiting.append(_Row(log._arrivals, f"\n@{sizes};\n".encode(), b""))
         for kind, table in zip(kinds.values(), tables, strict=True):
             if table is not None and table.size < len(kind.header):  # a power failure took it
-                table.clear()
+                table.cut(0)
                 log._waiting.append(_Row(table, kind.header, b""))
         log._commit()
         log._write_waiting(len(log._waiting))
@@ -138,7 +136,7 @@ class RawLog:
     ) -> None:
         self._folder, self._kinds = folder, kinds
         self._tables = {
-            kind.file: AppendFile(folder / kind.file, ending=_TORN)
+            kind.file: AppendFile(folder / kind.file, ending=TORN_ROW)
             for kind in kinds.values()
             if kind.file in ALWAYS or (folder / kind.file).exists()
         }
@@ -169,9 +167,9 @@ class RawLog:
             self._tried_s, self._since_tried = message.time_s, 0
 
     def _begin_table(self, kind: RowKind) -> AppendFile | None:
-        """Return the table of an instrument that is heard for the first time, if there can be one."""
+        """Return the table of an instrument that is heard for the first time; None if refused."""
         try:
-            table = AppendFile(self._folder / kind.file, ending=_TORN)
+            table = AppendFile(self._folder / kind.file, ending=TORN_ROW)
         except OSError as error:
             self._n_lost, self._reason = self._n_lost + 1, error.strerror or str(error)
             return None

@@ -94,8 +94,8 @@ def messages_of(mission: Mission) -> Iterator[Message]:
     in the order of the registry: IMU, DVL, depth, GNSS. Rows are turned into messages as they are
     asked for, so that a day of data needs no more memory than the mission itself.
     """
-    logs = {type(log): log for log in (mission.imu, mission.dvl, mission.depth, mission.gnss)}
-    logs |= {type(log): log for log in mission.aids}
+    every = (mission.imu, mission.dvl, mission.depth, mission.gnss, *mission.aids)
+    logs: dict[type, Any] = {type(log): log for log in every}
     streams = [
         one.messages_of(logs[one.log])
         for one in BY_SECTION.values()

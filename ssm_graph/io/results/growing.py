@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 from collections.abc import Mapping
@@ -23,6 +22,7 @@ from ssm_graph.io.results.tables import (
     format_table,
     trajectory_columns,
 )
+from ssm_graph.io.tables.append_file import TORN_ROW, AppendFile
 from ssm_graph.mission.estimate import BeamTable, CurrentTrack, Trajectory
 
 HEADERS: Final = {TRAJECTORY_NAME: TRAJECTORY_COLUMNS, BEAMS_NAME: BEAM_COLUMNS}
@@ -47,22 +47,23 @@ class GrowingResults:
         self.problem: str | None = None
         """Why the last rows are not on disk, if they are not."""
         self._waiting: dict[str, str] = dict.fromkeys(HEADERS, "")
+        self._files: dict[str, AppendFile] = {}
         try:
             folder.mkdir(parents=True, exist_ok=True)
             (folder / SUMMARY_NAME).unlink(missing_ok=True)
             beside = CURRENT_COLUMNS if has_current else ()
             for name, columns in (HEADERS | {TRAJECTORY_NAME: TRAJECTORY_COLUMNS + beside}).items():
-                size = (sizes or {}).get(name, 0)
-                with (folder / name).open("ab") as stream:
-                    stream.truncate(min(size, stream.tell()))
-                    if stream.seek(0, os.SEEK_END) == 0:
-                        stream.write((",".join(columns) + "\n").encode())
+                file = self._files[name] = AppendFile(folder / name, ending=TORN_ROW)
+                file.cut((sizes or {}).get(name, 0))
+                if file.size == 0:
+                    file.append((",".join(columns) + "\n").encode())
         except OSError as error:
+            self.close()
             raise DataError(f"{folder}: cannot write results: {error.strerror or error}") from error
 
     def sizes(self) -> dict[str, int]:
-        """Return how large the files are, for a checkpoint."""
-        return {name: (self._folder / name).stat().st_size for name in HEADERS}
+        """Return how large the files are, bytes, for a checkpoint."""
+        return {name: file.size for name, file in self._files.items()}
 
     def append(
         self, trajectory: Trajectory, beams: BeamTable, current: CurrentTrack | None = None
@@ -72,30 +73,28 @@ class GrowingResults:
             trajectory_columns(trajectory) | current_columns(current)
         )
         self._waiting[BEAMS_NAME] += _rows(beam_columns(beams))
+        self._write_waiting()
+
+    def _write_waiting(self) -> None:
         self.problem = None
         for name, text in self._waiting.items():
-            if text:
-                self._write(name, text)
-
-    def _write(self, name: str, text: str) -> None:
-        path, size = self._folder / name, 0
-        try:
-            size = path.stat().st_size
-            with path.open("ab") as stream:
-                stream.write(text.encode())
-            self._waiting[name] = ""
-        except OSError as error:
-            self.problem = f"{path}: cannot be written: {error.strerror or error}"
-            _truncate(path, size)
+            try:
+                if text:
+                    self._files[name].append(text.encode())
+                    self._waiting[name] = ""
+            except OSError as error:
+                path = self._folder / name
+                self.problem = f"{path}: cannot be written: {error.strerror or error}"
 
     def finish(self, summary: Mapping[str, Any]) -> None:
-        """Write ``summary.json``, which makes the folder complete.
+        """Write what waits, and ``summary.json``, which makes the folder complete.
 
         Raises
         ------
         DataError
             It cannot be written.
         """
+        self._write_waiting()
         text = json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
         part = self._folder / f".{SUMMARY_NAME}.part-{os.getpid()}"
         try:
@@ -107,12 +106,11 @@ class GrowingResults:
                 f"{self._folder / SUMMARY_NAME}: cannot be written: {error.strerror or error}"
             ) from error
 
+    def close(self) -> None:
+        """Close the files; a second time does nothing."""
+        for file in self._files.values():
+            file.close()
+
 
 def _rows(columns: Columns) -> str:
     return format_table(columns).partition("\n")[2]
-
-
-def _truncate(path: Path, size: int) -> None:
-    """Take back what was written in part."""
-    with contextlib.suppress(OSError):  # the reader drops a torn last line
-        os.truncate(path, size)

@@ -35,7 +35,7 @@ from ssm_graph.io.ros.messages import (
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.vehicle import GNSS_AT_ORIGIN, Vehicle
 from ssm_graph.sensors.depth import DEEPEST_M, DEPTH, DepthLog
-from ssm_graph.sensors.dvl import DvlLog, DvlMount
+from ssm_graph.sensors.dvl import DvlLog, DvlMount, counted_sigma
 from ssm_graph.sensors.gnss import GnssLog
 from ssm_graph.sensors.imu import ImuLog, ImuNoise
 
@@ -189,7 +189,6 @@ def _dvl(
         beams = _beams(topic, vehicle, options, speed=speed, velocity_d=velocity_d)
     except DataError as error:
         raise DataError(f"{bag}: topic {topic.name}: {error}") from None
-    nominal = BEAM_SIGMA if vehicle is None else vehicle.beam_sigma
     notes = list(beams.notes)
     if vehicle is None and np.isnan(sigma).any():
         notes.append(f"Beam speeds without a stated variance are given {BEAM_SIGMA} m/s.")
@@ -202,7 +201,12 @@ def _dvl(
         mount=mount,
         time_s=table[:, 0],
         speed=beams.sign * speed,
-        sigma=np.where(np.isnan(sigma), nominal, sigma),
+        sigma=counted_sigma(
+            sigma,
+            water[:, 0] > 0.0,
+            ground_sigma=BEAM_SIGMA if vehicle is None else vehicle.beam_sigma,
+            water_sigma=None if vehicle is None else vehicle.water_sigma,
+        ),
         range_m=ranges if np.isfinite(ranges).any() else None,
         water_track=water_track,
     )
@@ -226,7 +230,7 @@ def _velocities(
     """Return velocities (N, 3) as speeds along the instrument's axes, and how they are counted."""
     turn = vehicle.mount.beams_d
     matrix = turn @ covariance.reshape(-1, 3, 3) @ turn.T
-    is_stated = np.isfinite(matrix).all(axis=(1, 2))
+    is_stated = np.asarray(np.isfinite(matrix).all(axis=(1, 2)))
     is_stated[is_stated] = np.linalg.eigvalsh(matrix[is_stated])[:, 0] > 0.0
     matrix = np.where(is_stated[:, None, None], matrix, np.nan)
     sigma = np.full(velocity_d.shape, vehicle.beam_sigma)

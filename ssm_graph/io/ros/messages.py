@@ -29,11 +29,13 @@ from typing import Any, Final, NamedTuple
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frames import BodyAxes, turned
 from ssm_graph.base.frozen import Vector
+from ssm_graph.base.units import wrapped
 from ssm_graph.sensors.depth import DepthReading
 from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.gnss import Fix
 from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.sensors.messages import Message
+from ssm_graph.sensors.place import LATITUDES_DEG, LONGITUDES_DEG
 
 IMU_TYPE: Final = "sensor_msgs/msg/Imu"
 MARINE_DVL_TYPE: Final = "marine_acoustic_msgs/msg/Dvl"
@@ -182,12 +184,13 @@ def fix(message: Any, received_s: float, options: RosOptions = DEFAULTS) -> Fix:
     if int(message.status.status) < 0:
         raise DataError("NavSatFix: the receiver says that it has no fix")
     lat, lon = _finite(message, "latitude"), _finite(message, "longitude")
-    if abs(lat) > 90.0 or abs(lon) > 360.0 or lat == lon == 0.0:
+    is_on_earth = abs(lat) <= LATITUDES_DEG[1] and LONGITUDES_DEG[0] <= lon <= LONGITUDES_DEG[1]
+    if not is_on_earth or lat == lon == 0.0:
         raise DataError(f"NavSatFix: expected degrees of a place on Earth, got {lat:g}, {lon:g}")
     return Fix(
         time_s=stamp_s(message, received_s),
         lat=math.radians(lat),
-        lon=math.radians(lon),
+        lon=float(wrapped(math.radians(lon))),
         height=_finite(message, "altitude"),
         sigma_enu=_fix_sigma(message, options.fix_sigma_enu),
     )

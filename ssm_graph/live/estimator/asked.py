@@ -7,6 +7,7 @@ import numpy as np
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.engine.extras import Extras
 from ssm_graph.graph.aids import AIDS
+from ssm_graph.graph.aids.aid import Keyframes
 from ssm_graph.live.estimator.buffers import Logs
 from ssm_graph.live.estimator.keyframes import aids_at
 from ssm_graph.mission.calibration import calibration_extras, taken_as_exact, windowed
@@ -32,7 +33,7 @@ def sensors_of_vehicle(vehicle: Vehicle, frame: LocalFrame) -> Sensors:
     """Return what is the same at all keyframes."""
     at_rest = ImuLog(0.0, vehicle.imu_noise, np.ones(1), np.zeros((1, 3)), np.zeros((1, 3)))
     logs = Logs(vehicle.gnss, vehicle.depth, vehicle.aids)
-    aids = (aid.take(np.s_[:0]) for aid in aids_at(logs, frame, at_rest, np.array([0.0, 1.0])))
+    aids = (aid.take(np.s_[:0]) for aid in aids_at(logs, Keyframes(frame, at_rest, np.arange(2.0))))
     return Sensors.of(frame, Beams.of_mount(vehicle.mount), aids, extras_of_vehicle(vehicle))
 
 

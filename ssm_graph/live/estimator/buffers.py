@@ -15,7 +15,7 @@ from ssm_graph.live.estimator.rows import TimedRows
 from ssm_graph.mission.mission import Aids, Mission
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.depth import DepthLog
-from ssm_graph.sensors.dvl import Ping
+from ssm_graph.sensors.dvl import Ping, counted_sigma
 from ssm_graph.sensors.dvl_instrument import DVL
 from ssm_graph.sensors.dvl_readings import STUCK_PINGS, stuck_beams
 from ssm_graph.sensors.gnss import GNSS, GnssLog
@@ -72,11 +72,12 @@ class Buffers:
         if isinstance(message, ImuSample):
             self._n_imu += 1
         elif isinstance(message, Ping):
-            nominal = self.vehicle.beam_sigma
-            if message.is_water:
-                nominal = self.vehicle.water_sigma or nominal
-            sigma = row[self.sigmas]
-            row[self.sigmas] = np.where(sigma > 0.0, sigma, nominal)
+            row[self.sigmas] = counted_sigma(
+                row[self.sigmas],
+                message.is_water,
+                ground_sigma=self.vehicle.beam_sigma,
+                water_sigma=self.vehicle.water_sigma,
+            )
         return self.rows[one.section].add(row)
 
     def logs_between(self, begin_s: float, end_s: float) -> Logs:

@@ -61,7 +61,7 @@ class Course:
     def __init__(
         self, first: Step, maker: KeyframeMaker, buffers: Buffers, events: EventLog, null_b: Array
     ) -> None:
-        """``null_b`` (4,) is the array's parity: orthogonal to the speeds of any velocity."""
+        """``null_b`` (B,) is the array's parity: orthogonal to the speeds of any velocity."""
         self._steps = deque([first])
         self._maker, self._buffers, self._events = maker, buffers, events
         sensors = first.window.sensors

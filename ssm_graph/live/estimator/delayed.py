@@ -8,10 +8,11 @@ import numpy as np
 
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.engine.extras import Extras
-from ssm_graph.mission.estimate import BeamTable, CurrentTrack, Trajectory
+from ssm_graph.graph.measurements import aid_table
+from ssm_graph.mission.estimate import AidTable, BeamTable, CurrentTrack, Trajectory
 from ssm_graph.mission.trajectory import trajectory_at
-from ssm_graph.smoothers.calibration_and_current import current_along
 from ssm_graph.smoothers.stretch import Stretch
+from ssm_graph.smoothers.variables import current_along
 
 
 class Delayed(NamedTuple):
@@ -21,6 +22,8 @@ class Delayed(NamedTuple):
     beams: BeamTable
     current: CurrentTrack | None
     """Beside the trajectory; None of a vehicle without one."""
+    aids: AidTable | None
+    """What became of the aids' measurements; None if there were none."""
 
 
 def delayed_of(stretch: Stretch, frame: LocalFrame, extras: Extras, *, shift_s: float) -> Delayed:
@@ -39,4 +42,5 @@ def delayed_of(stretch: Stretch, frame: LocalFrame, extras: Extras, *, shift_s: 
             weight=stretch.weight,
         ),
         current_along(extras, stretch._replace(time_s=time_s)),
+        aid_table([one._replace(time_s=one.time_s - shift_s) for one in stretch.aids.values()]),
     )

@@ -17,7 +17,7 @@ from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.times import MIN_SPACING_S
 from ssm_graph.graph.aids import AIDS
-from ssm_graph.graph.aids.aid import Aid
+from ssm_graph.graph.aids.aid import Aid, Keyframes
 from ssm_graph.graph.aids.depth import DepthMeans, Depths
 from ssm_graph.graph.aids.gnss import Fixes
 from ssm_graph.imu.ping_motion import PING_WINDOW_S, mean_gyro
@@ -82,8 +82,8 @@ class KeyframeMaker:
         imu = self._imu(begin_s, at_s)
         inertial = None if last_s is None else self._integrate(imu, last_s, at_s).intervals
         gyro_b = mean_gyro(imu, np.array([at_s]))[0]
-        keyframe_s = np.array([begin_s, at_s])
-        aids = aids_at(measured.logs, self._frame, imu, keyframe_s, begin_s=self._begin_s)
+        times = np.array([begin_s, at_s])
+        aids = aids_at(measured.logs, Keyframes(self._frame, imu, times, self._begin_s))
         return Keyframe(
             at_s,
             self._beams(measured.pings, gyro_b),
@@ -135,14 +135,10 @@ class KeyframeMaker:
         )
 
 
-def aids_at(
-    logs: Logs, frame: LocalFrame, imu: ImuLog, keyframe_s: Array, *, begin_s: float | None = None
-) -> Iterator[Aid]:
-    """Yield what the logs say at the second of two keyframes (2,), s, also where it is nothing.
-
-    Errors that grow are counted from ``begin_s``, s, on.
-    """
+def aids_at(logs: Logs, keyframes: Keyframes) -> Iterator[Aid]:
+    """Yield what the logs say at the second of two keyframes, also where it is nothing."""
     gnss, depth, aids = logs
+    frame, imu, keyframe_s, _ = keyframes
     fix = np.arange(len(gnss.time_s))
     fixes = Fixes.of_log(
         gnss,
@@ -158,7 +154,7 @@ def aids_at(
         readings = Depths.of(depth, imu, keyframe_s)
         yield DepthMeans.of_readings(readings, keyframe_s, frame).at(1)
     for kind in AIDS:
-        aid = kind.of(aids, frame=frame, imu=imu, keyframe_s=keyframe_s, begin_s=begin_s)
+        aid = kind.of(aids, keyframes)
         if aid is not None:
             yield aid.at(1)
 

@@ -48,7 +48,7 @@ class Kept(NamedTuple):
     covariance: Array
     """(n, n)"""
     trust: Array
-    """(4,) what each beam was worth then, 0 to 1"""
+    """(B,) what each beam was worth then, 0 to 1"""
 
     @property
     def states(self) -> States:

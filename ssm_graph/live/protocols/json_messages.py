@@ -36,15 +36,21 @@ _RAD_PER_DEG = _EXACT.divide(_PI, Decimal(180))
 _DIGITS = Context(prec=24)
 """As many digits as bring every angle back bit for bit."""
 _COLUMNS: Final = {
-    one.section: tuple(column for column in one.columns if column.is_live)
+    one.section: tuple((column.key, column) for column in one.columns if column.is_live)
     for one in INSTRUMENTS
     if one.message is not None
 }
 KEYS: Final = {
-    kind: ("type", "time_s", *(column.key for column in columns))
-    for kind, columns in _COLUMNS.items()
+    kind: ("type", "time_s", *(key for key, _ in columns)) for kind, columns in _COLUMNS.items()
 }
 """Type of a message to its keys."""
+_REQUIRED: Final = {
+    kind: ("time_s", *(key for key, column in columns if not column.optional))
+    for kind, columns in _COLUMNS.items()
+}
+_HAS_UNITS: Final = {
+    kind: any(column.unit != 1.0 for _, column in columns) for kind, columns in _COLUMNS.items()
+}
 
 
 class JsonDecoder(FramedDecoder):
@@ -75,13 +81,13 @@ def decode_message(line: str, *, axes: BodyAxes = BodyAxes.FRD) -> Message:
         raise RefusedError(f"unknown type {shown(kind)}; {hint}")
     reject_unknown(fields, KEYS[kind])
     columns = _COLUMNS[kind]
-    for key in ("time_s", *(column.key for column in columns if not column.optional)):
+    for key in _REQUIRED[kind]:
         require(fields, key)
-    if any(column.unit != 1.0 for column in columns):  # all digits of the angles count
+    if _HAS_UNITS[kind]:  # all digits of the angles count
         fields = parse_object(line, parse_float=Decimal)
     try:
         time_s = number(fields["time_s"], key="time_s")
-        given = {c.told_as: _read(fields, c, axes) for c in columns if c.key in fields}
+        given = {c.told_as: _read(fields[key], key, c, axes) for key, c in columns if key in fields}
     except RefusedError as error:
         raise RefusedError(f"{kind}: {error}") from None
     make = BY_SECTION[kind].message
@@ -97,7 +103,7 @@ def encode_message(message: Message, *, axes: BodyAxes = BodyAxes.FRD) -> bytes:
     """
     kind = BY_MESSAGE[type(message)].section
     cells: dict[str, Any] = {"type": kind, "time_s": message.time_s}
-    for column in _COLUMNS[kind]:
+    for key, column in _COLUMNS[kind]:
         value = getattr(message, column.told_as)
         is_silent = value is None or value is False or value != value  # NaN
         if column.optional and is_silent:
@@ -109,7 +115,7 @@ def encode_message(message: Message, *, axes: BodyAxes = BodyAxes.FRD) -> bytes:
             parts = value if column.over else (value,)
             digits = tuple(_DIGITS.divide(Decimal(float(part)), exact) for part in parts)
             value = digits if column.over else digits[0]
-        cells[column.key] = value
+        cells[key] = value
     return _line(**cells)
 
 
@@ -180,32 +186,33 @@ def _exact(unit: float) -> Decimal:
     return _RAD_PER_DEG if unit == DEGREE else Decimal(repr(unit))
 
 
-def _read(fields: dict[str, Any], column: Column, axes: BodyAxes) -> Any:
+def _read(value: Any, key: str, column: Column, axes: BodyAxes) -> Any:
     """Return what a message says of one column, in SI units and axes forward-right-down."""
-    key, value = column.key, fields[column.key]
     if column.is_flag:
-        return flag(fields, key)
+        return flag({key: value}, key)
     if column.is_many:
         return tuple(
-            math.nan if item is None else _number(item, column)
+            math.nan if item is None else _number(item, key, column)
             for item in _list(value, (1, MOST_BEAMS), key=key)
         )
     if not column.over:
-        return _number(value, column)
+        return _number(value, key, column)
     count = len(column.over)
-    numbers = tuple(_number(item, column) for item in _list(value, (count, count), key=key))
+    numbers = tuple(_number(item, key, column) for item in _list(value, (count, count), key=key))
     return turned((numbers[0], numbers[1], numbers[2]), axes) if column.is_body else numbers
 
 
-def _number(value: Any, column: Column) -> float:
+def _number(value: Any, key: str, column: Column) -> float:
     """Return a number in SI units; what no such unit or no sigma can be is refused.
 
     Whether an instrument can mean a number that can be is for the intake to say.
     """
     if column.unit == 1.0:
-        return number(value, key=column.key, low=column.low if column.low > 0.0 else -math.inf)
-    number(value, key=column.key, low=column.low, high=column.high)
+        return number(value, key=key, low=column.low if column.low > 0.0 else -math.inf)
+    number(value, key=key, low=column.low, high=column.high)
     exact = Decimal(value) if isinstance(value, int) else value
+    if column.wraps and exact > 180:
+        exact = _EXACT.subtract(exact, Decimal(360))
     return float(_EXACT.multiply(exact, _exact(column.unit)))
 
 

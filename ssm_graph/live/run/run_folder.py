@@ -200,6 +200,8 @@ class RunFolder:
         if self.log is not None:
             self.log.sync()
             self.log.close()
+        if self.results is not None:
+            self.results.close()
         with contextlib.suppress(OSError):
             self._events.sync()
         self._events.close()

@@ -1,16 +1,85 @@
-"""Extra variables in the forward pass: their values so far, and the rows that depend on them."""
+"""What the first pass meets and carries beside the error state: weighted aids, extra variables.
+
+The aids of a keyframe meet the prediction together, as beams do, for one of them judges the others:
+met one after the other, a gross one that an uncertain prediction lets pass would have all later
+ones refused. What a prediction and its covariance cannot mean starts without weight; the smoother,
+which knows the whole mission, judges again. Ranges to a beacon whose place is unknown are left to
+:mod:`ssm_graph.graph.beacon_start`: their linearisation there would mean nothing.
+"""
 
 from __future__ import annotations
 
-import numpy as np
+from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.similarity import Kernel
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import STATE_DIM
-from ssm_graph.graph.aids.aid import RowStates
+from ssm_graph.graph.aids.aid import Aid, RowStates
 from ssm_graph.graph.aids.depth import DEPTH_OFFSET
+from ssm_graph.graph.aids.ranges import Ranges
 from ssm_graph.graph.beam_rows import BeamRows, CalibratedBeams, PreparedBeams
+from ssm_graph.graph.first_weights import settled_weights
+from ssm_graph.graph.measurements import Measurements
 from ssm_graph.mission.current import CURRENTS
 from ssm_graph.mission.problem import Problem
+
+
+class Met(NamedTuple):
+    """The measurements of one keyframe, linearised at one state: R components of m of them."""
+
+    numbers: list[int]
+    """(m,) among all measurements"""
+    measurement: NDArray[np.intp]
+    """(R,) which of the m a component is of"""
+    innovation: Array
+    """(R,) measured minus predicted, whitened"""
+    H: Array
+    """(R, width)"""
+
+
+class ForwardAids:
+    """The weighted aids of a problem, keyframe by keyframe."""
+
+    def __init__(self, aids: Measurements) -> None:
+        self.weights = np.ones(len(aids))
+        """(M,) of all measurements, as far as they have been met"""
+        self._at: dict[int, list[tuple[Aid, int]]] = {}
+        number = 0
+        for aid in aids.all:
+            is_unknown = ~aid.is_known[aid.beacon] if isinstance(aid, Ranges) else None
+            for i, k in enumerate(aid.keyframe.tolist()):
+                if is_unknown is None or not is_unknown[i]:
+                    self._at.setdefault(k, []).append((aid.take(slice(i, i + 1)), number))
+                number += 1
+
+    def has(self, k: int) -> bool:
+        """Return whether a keyframe has measurements to meet."""
+        return k in self._at
+
+    def at(self, k: int, state: RowStates) -> Met:
+        """Return the measurements of a keyframe that has some, linearised at a state."""
+        here, own = self._at[k], state.rows_of_one()
+        errors, jacobians = zip(*(aid.whitened(own) for aid, _ in here), strict=True)
+        return Met(
+            numbers=[number for _, number in here],
+            measurement=np.repeat(np.arange(len(here)), [aid.dim for aid, _ in here]),
+            innovation=-np.concatenate(errors, axis=1)[0],
+            H=np.concatenate(jacobians, axis=1)[0],
+        )
+
+    def weigh(self, met: Met, innovation: Array, predicted: Array, kernel: Kernel) -> Array:
+        """Return the weights (R,) of the components, and keep those of their measurements.
+
+        ``innovation`` (R,) is that at the prediction, ``predicted`` (R, R) the covariance of what
+        was predicted, both in the measurements' sigmas.
+        """
+        weights = settled_weights(innovation, predicted, met.measurement, kernel)
+        self.weights[met.numbers] = weights
+        return weights[met.measurement]
+
 
 REACH_S = 2e-2
 REACH_TURN = 2e-2
@@ -54,10 +123,10 @@ class ForwardExtras:
                 covariance[:, own] = 0.0
                 covariance[own, own] = variance * np.eye(own.stop - own.start)
 
-    def correct(self, step: Array) -> None:
-        """Take the part of a step that is behind the error state."""
-        self.walks = self.walks + step[: len(self.walks)]
-        self.constants = self.constants + step[len(self.walks) :]
+    def moved(self, step: Array) -> tuple[Array, Array]:
+        """Return walks and constants after the part of a step that is behind the error state."""
+        n_walks = len(self.walks)
+        return self.walks + step[:n_walks], self.constants + step[n_walks:]
 
     def beam_rows(
         self, rows: slice, state: tuple[Array, Array, Array, Array], g_n: Array

@@ -1,8 +1,9 @@
-"""The weights that the beams of one ping get from what was predicted before them."""
+"""The weights that the measurements of a keyframe get from what was predicted before them."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factors.similarity import WEIGHT_FLOOR, Kernel, expected_mahalanobis_sq
 from ssm_graph.base.frozen import Array
@@ -84,4 +85,35 @@ def settle_weights(
         if np.abs(settled - weights).max() < 1e-2:
             return settled
         weights = settled
+    return weights
+
+
+def settled_weights(
+    innovation: Array, predicted: Array, measurement: NDArray[np.intp], kernel: Kernel
+) -> Array:
+    """Return the weights (m,) of whitened measurements that meet one prediction together.
+
+    Those beyond the gate begin with none. With ``S = H P H' + 1 / weight`` the posterior of the
+    innovation has mean ``innovation - H P H' S^-1 innovation`` and covariance ``H P H' - H P H'
+    S^-1 H P H'``.
+
+    Parameters
+    ----------
+    innovation : (R,) measured minus predicted, in sigmas.
+    predicted : (R, R) covariance of what was predicted.
+    measurement : (R,) which measurement, 0 to m - 1 in order, a component is of.
+    kernel : turns Mahalanobis distances into weights.
+    """
+    dim, spread = np.bincount(measurement).astype(float), predicted.diagonal()
+    is_odd = np.bincount(measurement, weights=innovation**2 >= GATE**2 * (spread + 1.0)) > 0.0
+    weights = np.where(is_odd, WEIGHT_FLOOR, 1.0)
+    for _ in range(WEIGHT_ROUNDS):
+        S = predicted + np.diag(1.0 / weights[measurement])
+        gain = np.linalg.solve(S, predicted).T
+        left = innovation - gain @ innovation
+        left_variance = np.maximum(spread - (gain * predicted).sum(axis=1), 0.0)
+        t = np.bincount(measurement, weights=left**2 + left_variance)
+        last, weights = weights, kernel.weight(t, dim=dim)
+        if np.abs(weights - last).max() < 1e-2:
+            break
     return weights

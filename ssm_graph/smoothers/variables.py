@@ -1,4 +1,4 @@
-"""What the smoother found of instruments and current, as parts of its answer."""
+"""What a smoother found beside the states, as part of its answer: calibrations and the current."""
 
 from __future__ import annotations
 
