@@ -21,8 +21,8 @@ from ssm_graph.base.errors import MissingExtraError as MissingExtraError
 from ssm_graph.base.errors import SolverError as SolverError
 from ssm_graph.base.errors import SsmGraphError as SsmGraphError
 from ssm_graph.base.frames import BodyAxes as BodyAxes
-from ssm_graph.engine.gnc import GncStart as GncStart
-from ssm_graph.engine.gnc import Graduation as Graduation
+from ssm_graph.engine.reweighting import GncStart as GncStart
+from ssm_graph.engine.reweighting import Graduation as Graduation
 from ssm_graph.evaluation import Comparison as Comparison
 from ssm_graph.evaluation import ErrorSeries as ErrorSeries
 from ssm_graph.evaluation import Metrics as Metrics

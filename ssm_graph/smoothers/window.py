@@ -16,7 +16,7 @@ from ssm_graph.base.stepwise import Steps, finished
 from ssm_graph.base.times import MIN_SPACING_S
 from ssm_graph.engine.error_state import InitialMoments, Linearised
 from ssm_graph.engine.marginal_prior import moved_chart
-from ssm_graph.engine.mixing import Mixing
+from ssm_graph.engine.reweighting import Mixing
 from ssm_graph.engine.states import States
 from ssm_graph.graph.first_weights import met_weights, updated_trust
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig

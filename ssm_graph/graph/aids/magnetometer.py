@@ -19,10 +19,9 @@ from ssm_graph.base.times import last_readings
 from ssm_graph.base.usable import require_finite, require_increasing, require_positive
 from ssm_graph.engine.error_state import ROTATION
 from ssm_graph.engine.extras import Extra
-from ssm_graph.graph.aids.aid import Aid, Linearised, RowStates, along_axes
+from ssm_graph.graph.aids.aid import Aid, Keyframes, Linearised, RowStates, along_axes
 from ssm_graph.imu.ping_motion import turn_between
 from ssm_graph.mission.mission import Aids
-from ssm_graph.sensors.imu import ImuLog
 from ssm_graph.sensors.magnetometer import MICROTESLA, MagnetometerLog
 
 EARTH_FIELD: Final = "magnetic_field"
@@ -59,20 +58,12 @@ class MagneticFields(Aid):
     frame: LocalFrame
 
     @classmethod
-    def of(
-        cls,
-        aids: Aids,
-        *,
-        frame: LocalFrame,
-        imu: ImuLog,
-        keyframe_s: Array,
-        begin_s: float | None = None,
-    ) -> Self | None:
+    def of(cls, aids: Aids, keyframes: Keyframes) -> Self | None:
         """Return the last reading up to each keyframe, of those after the keyframe before."""
-        del begin_s
         log = aids.get(MagnetometerLog)
         if log is None:
             return None
+        frame, imu, keyframe_s, _ = keyframes
         keyframe, reading = last_readings(keyframe_s, log.time_s)
         turn_b = turn_between(imu, log.time_s[reading], keyframe_s[keyframe])
         return cls(
