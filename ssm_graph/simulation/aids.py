@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from ssm_graph.base.earth import (
     geodetic_from_ecef,
 )
 from ssm_graph.base.frozen import Array
-from ssm_graph.mission.mission import Aids
+from ssm_graph.mission.mission import AidLog, Aids
 from ssm_graph.sensors.acoustic import Beacon, RangeLog, UsblLog
 from ssm_graph.sensors.compass import HeadingErrors, HeadingLog
 from ssm_graph.sensors.depth import DepthLog
@@ -140,6 +140,15 @@ class CompassSettings(checked.Settings):
     """A disturbance lasts so long, s."""
 
 
+class AidSimulator(Protocol):
+    """Settings of one more instrument, and how it reads; a file of its own beside this one."""
+
+    def read(
+        self, trajectory: Trajectory, *, end_s: float, streams: Streams, noisy: bool
+    ) -> tuple[AidLog, Mask]:
+        """Return its log over ``(0, end_s]``, and which readings are grossly wrong."""
+
+
 @dataclass(frozen=True, slots=True)
 class AidSettings:
     """All of them; None or empty is none."""
@@ -149,6 +158,7 @@ class AidSettings:
     compass: CompassSettings | None = None
     standstills: tuple[Standstill, ...] = ()
     """What the mission says; whether it is true is up to the route."""
+    others: tuple[AidSimulator, ...] = ()
 
 
 class SimulatedAids(NamedTuple):
@@ -156,7 +166,7 @@ class SimulatedAids(NamedTuple):
 
     logs: Aids
     gross: dict[str, Mask]
-    """By section: usbl, ranges, heading"""
+    """By section: usbl, ranges, heading ..."""
     heading_errors: Array
     """(6,) of the compass: offset, sine and cosine once, sine and cosine twice, rad; rate, rad/s"""
 
@@ -177,7 +187,13 @@ def aid_logs(
         heading, gross["heading"], errors = _heading(
             trajectory, settings.compass, end_s, streams.heading, noisy
         )
-    return SimulatedAids(Aids(usbl, ranges, heading, *settings.standstills), gross, errors)
+    others = []
+    for instrument in settings.others:
+        log, is_gross = instrument.read(trajectory, end_s=end_s, streams=streams, noisy=noisy)
+        others.append(log)
+        gross[log.SECTION.strip("[]")] = is_gross
+    logs = Aids(usbl, ranges, heading, *settings.standstills, *others)
+    return SimulatedAids(logs, gross, errors)
 
 
 def regular_times(rate_hz: float, end_s: float) -> Array:
@@ -262,7 +278,7 @@ def _usbl(
 ) -> tuple[UsblLog, Mask]:
     time_s, sigma_enu = regular_times(1.0 / settings.interval_s, end_s), _sigma_enu(settings)
     unit, direction = rng.standard_normal((2, len(time_s), 3))
-    size, is_gross = _gross(settings.gross, len(time_s), rng=rng)
+    size, is_gross = gross_errors(settings.gross, len(time_s), rng=rng)
     direction[:, 2] *= 0.3
     off_enu = size[:, None] * direction / np.linalg.norm(direction, axis=1, keepdims=True)
     error_enu = float(noisy) * unit * sigma_enu + off_enu
@@ -290,7 +306,7 @@ def _ranges(
     point_e = stacked(trajectory.at(time_s).point_e(np.array(settings.lever_arm_b)))
     true_m = np.linalg.norm(point_e - beacon_e[turn], axis=1)
     noise = settings.sigma * rng.standard_normal(len(time_s))
-    size, is_gross = _gross(settings.gross, len(time_s), rng=rng)
+    size, is_gross = gross_errors(settings.gross, len(time_s), rng=rng)
     # An echo comes later than the answer; an answer to someone else may come at any time.
     sign = np.where(rng.random(len(time_s)) < 0.8, 1.0, -1.0)
     range_m = np.maximum(true_m + float(noisy) * noise + sign * size, 0.0)
@@ -332,7 +348,7 @@ def _heading(
         read = read + settings.sigma * noise + errors.walk_sigma * walk
     n_events = math.ceil(len(time_s) / (settings.gross_s * settings.rate_hz))
     event = (time_s / settings.gross_s).astype(int) % n_events
-    size, is_gross = _gross(settings.gross, n_events, rng=rng)
+    size, is_gross = gross_errors(settings.gross, n_events, rng=rng)
     sign = rng.choice([-1.0, 1.0], size=n_events)
     rate = float(noisy) * errors.rate_sigma * rng.standard_normal()
     read = read + (sign * size)[event] + rate * (time_s - time_s[0]) - settings.declination
@@ -346,7 +362,7 @@ def _heading(
     return log, is_gross[event], np.append(drawn, rate)
 
 
-def _gross(settings: GrossErrors, count: int, *, rng: Rng) -> tuple[Array, Mask]:
+def gross_errors(settings: GrossErrors, count: int, *, rng: Rng) -> tuple[Array, Mask]:
     """Return absolute errors of ``count`` readings, most of them zero, and which have one."""
     is_gross = rng.random(count) < settings.rate
     return np.where(is_gross, rng.uniform(*settings.size, size=count), 0.0), is_gross

@@ -16,8 +16,9 @@ from ssm_graph.simulation import checked
 
 @dataclass(frozen=True, slots=True)
 class Streams:
-    """One generator per source; new ones go to the end, so that old seeds keep their meaning."""
+    """One generator per source, which keeps its meaning; new sources go by their name."""
 
+    seed: int
     gyro_bias: np.random.Generator
     gyro_noise: np.random.Generator
     gyro_walk: np.random.Generator
@@ -38,11 +39,15 @@ class Streams:
     dvl_drift: np.random.Generator
     gnss_drift: np.random.Generator
 
+    def of(self, source: str) -> np.random.Generator:
+        """Return the stream of a source that goes by its name, from its begin."""
+        return np.random.default_rng([self.seed, *source.encode()])
+
 
 def spawn_streams(seed: int) -> Streams:
     """Return the streams of one seed."""
-    children = np.random.SeedSequence(seed).spawn(len(fields(Streams)))
-    return Streams(*(np.random.default_rng(child) for child in children))
+    children = np.random.SeedSequence(seed).spawn(len(fields(Streams)) - 1)
+    return Streams(seed, *(np.random.default_rng(child) for child in children))
 
 
 @dataclass(frozen=True, slots=True)
