@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 from ssm_graph.sensors.compass import HeadingErrors
+from ssm_graph.sensors.magnetometer import MagneticErrors
 from ssm_graph.sensors.standstill import Standstill
 from ssm_graph.simulation import (
     AidSettings,
@@ -16,6 +17,7 @@ from ssm_graph.simulation import (
     SimulatedMission,
     UsblSettings,
 )
+from ssm_graph.simulation.magnetometer import MagnetometerSettings
 from tests.helpers import simulated
 
 KNOWN = BeaconSettings(3, (200.0, 60.0, -50.0))
@@ -27,6 +29,11 @@ COMPASS_ERRORS = HeadingErrors(
     correlation_s=200.0,
     one_cycle_sigma=math.radians(2.0),
     two_cycle_sigma=math.radians(1.0),
+)
+
+
+IRON = MagneticErrors(
+    field_sigma=0.2e-6, hard_iron_sigma=2e-6, soft_iron_sigma=0.02, walk_sigma=0.1e-6
 )
 
 
@@ -47,6 +54,12 @@ def compass(rate: float = 0.0, **changes: Any) -> AidSettings:
     return AidSettings(compass=CompassSettings(**(config | changes)))
 
 
+def magnetometer(rate: float = 0.0, **changes: Any) -> AidSettings:
+    """Return a magnetometer on a vehicle of iron, which passes more of it now and then."""
+    config: dict[str, Any] = {"errors": IRON, "gross": GrossErrors(rate, (5e-6, 50e-6))}
+    return AidSettings(others=(MagnetometerSettings(**(config | changes)),))
+
+
 def with_every_aid(**changes: Any) -> SimulatedMission:
     """Return a short mission with all of them, a beacon whose place is not known among them."""
     aids = AidSettings(
@@ -54,5 +67,6 @@ def with_every_aid(**changes: Any) -> SimulatedMission:
         ranging=RangingSettings((KNOWN, UNKNOWN), interval_s=1.3),
         compass=CompassSettings(errors=COMPASS_ERRORS, declination=0.1),
         standstills=(Standstill(4.0, 6.5),),
+        others=(MagnetometerSettings(errors=IRON),),
     )
     return simulated(**({"duration_s": 30.0, "aids": aids} | changes))

@@ -24,6 +24,7 @@ from ssm_graph.simulation import (
     SimulatedMission,
     UsblSettings,
 )
+from ssm_graph.simulation.magnetometer import MagnetometerSettings
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
 from ssm_graph.smoothers.fixed_lag import FixedLagConfig, solve_fixed_lag
 from ssm_graph.smoothers.keyframe import keyframes_of, sensors_of
@@ -40,6 +41,7 @@ def of_known(**changes: object) -> SimulatedMission:
         ranging=RangingSettings((KNOWN,), interval_s=1.3, gross=GrossErrors(0.2, (5.0, 50.0))),
         compass=CompassSettings(errors=HeadingErrors()),
         standstills=(Standstill(4.0, 5.5, sigma=0.5),),
+        others=(MagnetometerSettings(gross=GrossErrors(0.2, (5e-6, 50e-6))),),
     )
     return simulated(**({"duration_s": 10.0, "aids": aids, "seed": 2} | changes))
 
@@ -61,7 +63,7 @@ def test_a_window_of_the_whole_mission_weighs_every_aid_as_the_batch() -> None:
     np.testing.assert_allclose(mine.height, other.height, rtol=0.0, atol=1e-6)
     np.testing.assert_allclose(mine.velocity_sigma_enu, sigma, rtol=1e-6)
     own, table = table_of(whole), table_of(batch)
-    assert set(own.aid) == {"USBL", "range", "heading", "standstill"}
+    assert set(own.aid) == {"USBL", "range", "heading", "standstill", "magnetometer"}
     assert own.aid == table.aid
     assert own.component == table.component
     np.testing.assert_array_equal(own.time_s, table.time_s)
@@ -79,7 +81,7 @@ def test_constants_of_aids_are_carried_in_the_state_as_the_batch_finds_them() ->
     assert batch.calibration is not None
     assert whole.calibration is not None
     found = {value.label: value for value in whole.calibration.values}
-    assert {"beacon_7_east_m", "heading_offset_deg", "heading_rate_deg_per_h"} <= set(found)
+    assert {"beacon_7_east_m", "heading_offset_deg", "magnetometer_hard_iron_x_ut"} <= set(found)
     for value in batch.calibration.values:
         assert abs(found[value.label].value - value.value) < 0.02 * value.sigma, value.label
         assert found[value.label].sigma == pytest.approx(value.sigma, rel=0.02), value.label
@@ -147,6 +149,6 @@ def test_the_vehicle_is_aided_as_the_smoother_offline() -> None:
         assert abs(own.value - other.value) < 0.2 * other.sigma, own.label
         assert own.sigma == pytest.approx(other.sigma, rel=0.1), own.label
     tables = [part.aids for part in estimator.finish() if part.aids is not None]
-    for name in ("USBL", "range", "heading", "standstill"):
+    for name in ("USBL", "range", "heading", "standstill", "magnetometer"):
         n_rows = sum(table.aid.count(name) for table in tables)
         assert n_rows == pytest.approx(table_of(offline).aid.count(name), abs=3)
