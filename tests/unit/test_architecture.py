@@ -29,7 +29,8 @@ MAY_IMPORT = {
     "filters": VALUES | {"filters.rules", "graph.aids", "mission", "engine", "imu", "factors"},
     "io": VALUES,
     "live": VALUES | {"io"},
-    "live.estimator": VALUES | {"smoothers", "graph.aids", "mission", "engine", "imu", "factors"},
+    "live.estimator": VALUES
+    | {"smoothers", "graph", "graph.aids", "mission", "engine", "imu", "factors"},
     "simulation": VALUES,
     "evaluation": VALUES,
     "study": VALUES
