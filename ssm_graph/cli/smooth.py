@@ -13,7 +13,7 @@ from factors.similarity import Similarity
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.cli.options import add_command, kernel_from
 from ssm_graph.cli.run_mission import add_mission_arguments, run_mission
-from ssm_graph.engine.gnc import GncStart, Graduation
+from ssm_graph.engine.reweighting import GncStart, Graduation
 from ssm_graph.mission.estimate import Estimate
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.problem import ProblemConfig

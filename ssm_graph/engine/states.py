@@ -18,6 +18,8 @@ from ssm_graph.engine.error_state import (
     InitialMoments,
 )
 
+_EYE = np.eye(3)
+
 
 class NavigationStates(NamedTuple):
     """States of B runs at one time, or of B keyframes of one run."""
@@ -33,12 +35,14 @@ class NavigationStates(NamedTuple):
 
     def moved(self, step: Array) -> NavigationStates:
         """Return the states moved by local errors (B, 15), the pose as GTSAM retracts it."""
-        phi, rho = step[:, ROTATION], step[:, POSITION]
-        return self._at(step, shift_b=so3.left_jacobian_times(phi, rho))
+        jacobians = so3.Jacobians.of(step[:, ROTATION])
+        J = jacobians.left()
+        turn = _EYE + jacobians.skew @ J
+        return self._at(step, turn=turn, shift_b=(J @ step[:, POSITION, None])[..., 0])
 
     def displaced(self, xi: Array) -> NavigationStates:
         """Return the states at deviations (B, 15): the inverse of :meth:`deviation_of`."""
-        return self._at(xi, shift_b=xi[:, POSITION])
+        return self._at(xi, turn=so3.exp(xi[:, ROTATION]), shift_b=xi[:, POSITION])
 
     def deviation_of(self, other: NavigationStates) -> Array:
         """Return how far other states are (B, 15), position along the body axes of these."""
@@ -55,9 +59,9 @@ class NavigationStates(NamedTuple):
         """Return these states, then the others."""
         return NavigationStates(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
 
-    def _at(self, step: Array, *, shift_b: Array) -> NavigationStates:
+    def _at(self, step: Array, *, turn: Array, shift_b: Array) -> NavigationStates:
         return NavigationStates(
-            R_nb=self.R_nb @ so3.exp(step[:, ROTATION]),
+            R_nb=self.R_nb @ turn,
             p_n=self.p_n + (self.R_nb @ shift_b[..., None])[..., 0],
             v_n=self.v_n + step[:, VELOCITY],
             bias=self.bias + step[:, 9:],

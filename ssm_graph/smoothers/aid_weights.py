@@ -6,8 +6,7 @@ import numpy as np
 
 from factors.similarity import Kernel, Similarity
 from ssm_graph.base.frozen import Array
-from ssm_graph.engine.gnc import NEAR_SIGMAS
-from ssm_graph.engine.mixing import Mixing
+from ssm_graph.engine.reweighting import NEAR_SIGMAS, Mixing
 from ssm_graph.engine.states import States
 from ssm_graph.graph.measurements import JudgedAid, Measurements, StepLike, aid_kernel
 

@@ -1,10 +1,22 @@
-"""The batch smoother: a weight for every beam by iteratively reweighted least squares."""
+"""The batch smoother: a weight for every beam by iteratively reweighted least squares.
+
+The loop, :meth:`SsmSmoother._solve`: weights of the forward pass, then again and again ::
+
+    linearise all measurements at the states, each row scaled by the root of its weight
+    eliminate the chain by QR; move, half as far for as long as that raises the cost
+    marginal covariance of every keyframe, and H P H' of every row
+    t and weight of every measurement
+
+until the largest update is below the tolerance in its own posterior sigmas, no weight changes by
+more, and the kernel in force is the one that was asked for.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,21 +26,26 @@ from ssm_graph.base.errors import ConfigError, SolverError
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.chain import ChainSolution
 from ssm_graph.engine.error_state import STATE_DIM
-from ssm_graph.engine.gnc import GncSchedule, Graduation, Schedule, WarmSchedule
+from ssm_graph.engine.reweighting import GncSchedule, Graduation, Schedule, WarmSchedule
 from ssm_graph.engine.states import States
 from ssm_graph.graph.beacon_start import ambiguous_beacons
 from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.first_values import FirstValues, first_values
+from ssm_graph.graph.inertial_rows import inertial_fit
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.measurements import aid_table, doubts_of_aids
 from ssm_graph.mission.estimate import BeamTable, Estimate, Iteration, NoiseFound, Status
 from ssm_graph.mission.problem import Problem, with_white_noise
 from ssm_graph.mission.trajectory import trajectory_from_states
 from ssm_graph.smoothers.aid_weights import AidWeighing
-from ssm_graph.smoothers.beam_faults import FaultSearch
-from ssm_graph.smoothers.fault_watch import FaultWatch
-from ssm_graph.smoothers.noise import MAX_ADAPTATIONS, adaptation, noise_notes, with_sigmas
-from ssm_graph.smoothers.passes import Pass, Solved, descend, noise_of
+from ssm_graph.smoothers.beam_faults import FaultSearch, FaultWatch
+from ssm_graph.smoothers.noise import (
+    MAX_ADAPTATIONS,
+    adaptation,
+    noise_found,
+    noise_notes,
+    with_sigmas,
+)
 from ssm_graph.smoothers.variables import calibration_of, current_of, undetermined
 from ssm_graph.smoothers.verdict import contradictions
 
@@ -41,6 +58,10 @@ WARM_KERNEL = LogKernel()
 """Kernel of the first pass and of the first iterations, whichever is asked for in the end."""
 RUNAWAY_SPEED = 1e4
 """m/s; ten silent minutes of a MEMS unit may begin with 100 m/s and still come back."""
+
+MAX_HALVINGS = 10
+COST_SLACK = 1e-2
+"""A rise of the cost by less is rounding: one residual at its sigma costs 0.5."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +122,39 @@ def _notes_of(first: FirstValues) -> tuple[str, ...]:
 def warm_start(problem: Problem) -> FirstValues:
     """Return the states and weights that every smoother of this problem starts from."""
     return first_values(with_white_noise(problem), kernel=WARM_KERNEL)
+
+
+class Pass(NamedTuple):
+    """State of the loop after one iteration."""
+
+    states: States
+    step: ChainSolution
+    beam_rows: BeamRows
+    mahalanobis_sq: Array
+    weights: Array
+    update_sigmas: float
+    weight_change: float
+
+
+class Solved(NamedTuple):
+    """How a solution ended."""
+
+    linearizer: GraphLinearizer
+    last: Pass
+    iterations: tuple[Iteration, ...]
+    status: Status
+    notes: tuple[str, ...]
+    first: FirstValues
+    aids: AidWeighing
+
+    def again(self) -> FirstValues:
+        """Return where another solution may start."""
+        return replace(
+            self.first,
+            states=self.last.states,
+            weights=self.last.weights,
+            aid_weights=self.aids.settled,
+        )
 
 
 class SsmSmoother:
@@ -310,3 +364,38 @@ class SsmSmoother:
                 last.step.covariance_of(slice(STATE_DIM, None)),
             ),
         )
+
+
+def noise_of(solved: Solved, used: Array) -> NoiseFound:
+    """Return what a solution says of the noise; ``used`` (B,) are its sigmas over the stated."""
+    linearizer, last = solved.linearizer, solved.last
+    return noise_found(
+        linearizer.problem,
+        error=last.beam_rows.error,
+        variance=last.step.variance(linearizer.problem.beams.keyframe, last.beam_rows.jacobian),
+        weights=last.weights,
+        inertial=inertial_fit(linearizer.inertial_rows(last.states), last.step),
+        used=used,
+    )
+
+
+def descend(
+    linearizer: GraphLinearizer,
+    states: States,
+    step: ChainSolution,
+    weights: Array,
+    cost: float,
+    *,
+    aid_weights: Array | None = None,
+) -> tuple[States, BeamRows]:
+    """Take the Gauss-Newton step, halved while it raises the cost at these weights.
+
+    Returns the states moved to, and their beams.
+    """
+    for halvings in range(MAX_HALVINGS):
+        scale = 0.5**halvings
+        moved = states.moved(scale * step.step, scale * step.constants_step)
+        rows = linearizer.beam_rows(moved)
+        if linearizer.cost(moved, rows, weights, aid_weights) <= cost + COST_SLACK:
+            return moved, rows
+    return states, linearizer.beam_rows(states)

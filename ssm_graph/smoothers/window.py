@@ -15,7 +15,7 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.base.times import MIN_SPACING_S
 from ssm_graph.engine.error_state import InitialMoments, Linearised
 from ssm_graph.engine.marginal_prior import moved_chart
-from ssm_graph.engine.mixing import Mixing
+from ssm_graph.engine.reweighting import Mixing
 from ssm_graph.engine.states import States
 from ssm_graph.graph.first_weights import met_weights, updated_trust
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
@@ -255,7 +255,7 @@ class Window:
                 self._renew(self._settled())
         J = moved_chart(self._step[0])
         self._covariance = J @ self._covariance @ J.T
-        chain.root = chain.root @ np.linalg.inv(J)
+        chain.move(J)
         return number
 
     def _solve(self) -> Array:

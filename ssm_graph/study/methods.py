@@ -10,7 +10,7 @@ from factors.kernels import KERNELS, KernelChoice
 from factors.m_estimators import TruncatedKernel
 from factors.similarity import GaussianKernel, Similarity
 from ssm_graph.base.errors import ConfigError, SsmGraphError, nearest_hint
-from ssm_graph.engine.gnc import Graduation
+from ssm_graph.engine.reweighting import Graduation
 from ssm_graph.filters.geodetic.filter import GeodeticConfig
 from ssm_graph.filters.navigation.named import (
     FILTERS,

@@ -30,17 +30,17 @@ from ssm_graph.simulation import (
     SimulatedMission,
     UsblSettings,
 )
-from ssm_graph.smoothers import beam_faults, fault_watch
+from ssm_graph.smoothers import beam_faults
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
 from ssm_graph.smoothers.beam_faults import (
     KERNEL,
     FaultSearch,
+    FaultWatch,
     calibration_columns,
     stretch_chi_sq,
     who_is_off,
     without_shared,
 )
-from ssm_graph.smoothers.fault_watch import FaultWatch
 from tests.aids_fixture import with_every_aid
 from tests.helpers import simulated, with_initial
 
@@ -217,7 +217,7 @@ def test_findings_stop_changing(monkeypatch: pytest.MonkeyPatch) -> None:
         begin, end = next(answers)
         return beam_faults.Found((np.arange(n_rows) >= begin) & (np.arange(n_rows) < end), ())
 
-    monkeypatch.setattr(fault_watch, "find_beam_faults", undecided)
+    monkeypatch.setattr(beam_faults, "find_beam_faults", undecided)
     states = first_values(problem, kernel=KERNEL).states
     assert not watch.look(states, rows, update_sigmas=3.0, is_settled=False)
     assert watch.look(states, rows, update_sigmas=0.5, is_settled=False)

@@ -12,7 +12,7 @@ import pytest
 from factors.m_estimators import HuberKernel, TruncatedKernel
 from factors.similarity import ExpKernel, LogKernel, Similarity
 from ssm_graph.base.errors import ConfigError, DataError
-from ssm_graph.engine.gnc import Graduation
+from ssm_graph.engine.reweighting import Graduation
 from ssm_graph.filters.navigation.named import filter_problems
 from ssm_graph.graph.aids.heading import Headings
 from ssm_graph.graph.aids.ranges import Ranges

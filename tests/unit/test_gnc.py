@@ -11,7 +11,7 @@ import pytest
 from factors.m_estimators import HuberKernel, TruncatedKernel
 from factors.similarity import WEIGHT_FLOOR, GaussianKernel, LogKernel
 from ssm_graph.base.errors import ConfigError
-from ssm_graph.engine.gnc import GncSchedule, GncStart, Graduation, first_mu
+from ssm_graph.engine.reweighting import GncSchedule, GncStart, Graduation, first_mu
 from ssm_graph.mission.estimate import Estimate, Status
 from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.simulation import OutlierKind, Outliers

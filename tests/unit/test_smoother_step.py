@@ -12,7 +12,7 @@ from ssm_graph.engine.chain import ChainSolution
 from ssm_graph.engine.states import States
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.mission.problem import build_problem
-from ssm_graph.smoothers.passes import descend
+from ssm_graph.smoothers.batch import descend
 from tests.helpers import simulated, state_errors, true_states
 
 

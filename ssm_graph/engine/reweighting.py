@@ -24,10 +24,9 @@ from typing import final
 import numpy as np
 
 from factors.m_estimators import TruncatedKernel
-from factors.similarity import GaussianKernel, Kernel
+from factors.similarity import WEIGHT_FLOOR, GaussianKernel, Kernel
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
-from ssm_graph.engine.mixing import Mixing
 
 NEAR_SIGMAS = 1.0
 """The next kernel takes over once the updates are below this many of their own sigmas."""
@@ -38,6 +37,35 @@ MAX_PASSES = 5
 grade twenty passes of it ran away so far that the graduation did not come back."""
 BINARY = 1e-4
 """Weights this close to 0 or 1 are taken for it; GTSAM's."""
+
+
+class Mixing:
+    """Anderson acceleration of depth one for the fixed point of the weights [1]_.
+
+    Plain reweighting closes in by a constant factor a pass; two passes tell the factor, and the
+    rest of the way is taken at once. The fixed point stays what it is.
+
+    References
+    ----------
+    .. [1] H. F. Walker, P. Ni, "Anderson Acceleration for Fixed-Point Iterations", SIAM Journal on
+       Numerical Analysis 49, 2011.
+    """
+
+    def __init__(self) -> None:
+        self._last: tuple[Array, Array] | None = None
+
+    def next_weights(self, used: Array, settled: Array) -> Array:
+        """Return the weights to try next, from those used and those they led to."""
+        change = settled - used
+        last, self._last = self._last, (change, settled)
+        if last is None:
+            return settled
+        turn = change - last[0]
+        length_sq = float(turn @ turn)
+        if length_sq < 1e-16:
+            return settled
+        mixed = settled - float(change @ turn) / length_sq * (settled - last[1])
+        return np.asarray(np.clip(mixed, WEIGHT_FLOOR, max(1.0, 2.0 * float(settled.max()))))
 
 
 class Schedule(ABC):
