@@ -228,6 +228,10 @@ class Chain:
             raise SolverError(_UNDETERMINED) from error
         return solved[:, 0], solved[:, 1:] @ solved[:, 1:].T
 
+    def move(self, jacobian: Array) -> None:
+        """Let ``root`` be of a last keyframe whose errors are ``jacobian`` (n, n) times these."""
+        self.root = self.root @ np.linalg.inv(jacobian)
+
     def drop(self, count: int) -> None:
         """Forget the first keyframes; what they carried on to the others stays.
 

@@ -276,7 +276,7 @@ class _ForwardPass:
         self.P = 0.5 * (P + P.T)
         self.R_nb, self.p_n, self.v_n, self.bias = moved[:4]
         if self.extras:
-            self.extras.walks, self.extras.constants = moved.walks, moved.constants
+            self.extras.keep(moved.walks, moved.constants)
 
     def _moved(self, step: Array) -> RowStates:
         """Return the state after a step (E,) of the error state and what is behind it."""

@@ -113,6 +113,10 @@ class ForwardExtras:
         own = np.arange(STATE_DIM, end)
         covariance[own, own] += self._walk_sigma[k] ** 2
 
+    def keep(self, walks: Array, constants: Array) -> None:
+        """Take the values (s,) and (C,) that a correction led to."""
+        self.walks, self.constants = walks, constants
+
     def forget_current(self, covariance: Array, variance: float) -> None:
         """Let the current be anything of this variance, (m/s)^2, in place."""
         extras = self._problem.extras

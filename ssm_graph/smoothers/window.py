@@ -261,7 +261,7 @@ class Window:
                 self._renew(self._settled())
         J = moved_chart(self._step[0])
         self._covariance = J @ self._covariance @ J.T
-        chain.root = chain.root @ np.linalg.inv(J)
+        chain.move(J)
         return number
 
     def _solve(self) -> Array:

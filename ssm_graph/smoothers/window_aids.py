@@ -106,11 +106,12 @@ class WindowAids:
                 continue
             head, some, tail = (one.take(r) for r in _parts(rows))
             aid, k = some.aid, some.aid.keyframe
-            own = row_states(self._sensors, at.take(k))
-            led = aid.led_along(row_states(self._sensors, at.take(np.maximum(k - 1, 0))), own)
-            if k[0] == 0:
-                n_first = int(np.searchsorted(k, 1))
-                led = aid.take(np.s_[:n_first]).followed_by(led.take(np.s_[n_first:]))
+            own, n_first = row_states(self._sensors, at.take(k)), int(np.searchsorted(k, 1))
+            led = aid
+            if n_first < len(k):
+                way = (row_states(self._sensors, at.take(k[n_first:] - i)) for i in (1, 0))
+                rest = aid.take(np.s_[n_first:]).led_along(*way)
+                led = aid.take(np.s_[:n_first]).followed_by(rest) if n_first else rest
             anew = self._linearised(led, own)._replace(weight=some.weight, t=some.t)
             self._all[name] = head.followed_by(anew).followed_by(tail)
 

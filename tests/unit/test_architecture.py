@@ -209,3 +209,116 @@ def test_only_the_border_prints(path: Path) -> None:
     calls = [node for node in ast.walk(parse(path)) if isinstance(node, ast.Call)]
     printing = [c.lineno for c in calls if isinstance(c.func, ast.Name) and c.func.id == "print"]
     assert not printing, f"print on lines {printing}"
+
+
+def names_of_own_values(function: Function) -> set[str]:
+    """Return the names that a function binds to what it has just made, and so may fill in.
+
+    That is the result of a call, of ``copy.copy`` or ``cls.__new__`` for example; what a parameter,
+    a loop or an attribute names belongs to somebody else.
+    """
+    return {
+        target.id
+        for node in ast.walk(function)
+        if isinstance(node, ast.Assign) and isinstance(node.value, ast.Call)
+        for target in node.targets
+        if isinstance(target, ast.Name)
+    }
+
+
+def writes_of(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Yield line and text of every write to a value that the writer did not make itself."""
+    functions = [node for node in ast.walk(tree) if isinstance(node, Function)]
+    inside = {id(node): f for f in functions for node in ast.walk(f)}
+    for node in ast.walk(tree):
+        function = inside.get(id(node))
+        own = {"self", "cls"} | (names_of_own_values(function) if function else set())
+        targets: list[ast.expr] = []
+        if isinstance(node, ast.Assign):
+            targets = node.targets
+        elif isinstance(node, ast.AugAssign | ast.AnnAssign):
+            targets = [node.target]
+        for target in targets:
+            for part in ast.walk(target):
+                if not (isinstance(part, ast.Attribute) and isinstance(part.ctx, ast.Store)):
+                    continue
+                owner = part.value
+                is_own = isinstance(owner, ast.Name) and owner.id in own
+                if not is_own:
+                    yield node.lineno, ast.unparse(part)
+        if isinstance(node, ast.Call):
+            called = ast.unparse(node.func)
+            is_first = function is not None and function.name == "__post_init__"
+            if called == "object.__setattr__" and not is_first:
+                yield node.lineno, called
+            if called.endswith(".setflags") and any(
+                k.arg == "write" and isinstance(k.value, ast.Constant) and k.value.value is True
+                for k in node.keywords
+            ):
+                yield node.lineno, called
+
+
+MAY_WRITE = {
+    "ssm_graph/io/raw_log/log.py": {"row.is_in_table"},
+    "ssm_graph/io/ros/convert.py": {"topic.n_unstated", "topic.beams_d"},
+    "ssm_graph/io/tables/arrival.py": {
+        f"counts.{name}"
+        for name in ("torn", "torn_end", "impossible", "late", "repeated", "contrary")
+    },
+    "ssm_graph/io/tables/checkpoint.py": {"archive.comment"},
+    "ssm_graph/live/estimator/smoother.py": {"self._intake.horizon_s", "intake.shift_s"},
+    "ssm_graph/live/run/feed.py": {"channel.fed_s", "channel.heard_s", "channel.decoder"},
+    "ssm_graph/live/sockets/inputs.py": {"self._channel.heard_s", "self.feed.n_reconnects"},
+    "ssm_graph/report/mission/summary.py": {
+        "table.columns[1].justify",
+        "table.columns[0].min_width",
+        "table.columns[4].justify",
+    },
+    "ssm_graph/study/processes.py": {"worker.job", "deaths.in_a_row"},
+}
+"""By file: counters, channels and tables of others' libraries, none of them a value."""
+
+
+@pytest.mark.parametrize("path", MODULES, ids=IDS)
+def test_nobody_writes_what_another_made(path: Path) -> None:
+    """A value is what it was made as: who wants another makes another."""
+    allowed = MAY_WRITE.get(str(path.relative_to(ROOT)), set())
+    found = [(line, text) for line, text in writes_of(parse(path)) if text not in allowed]
+    assert not found
+
+
+def test_the_rule_sees_writes() -> None:
+    """To a parameter, an attribute of an attribute, a frozen value; not to what was just made."""
+    source = """
+class A:
+    def f(self, problem):
+        self.x = 1
+        made = B()
+        made.y = 2
+        problem.chain.gravity = 3
+        self.chain.params.n_gravity = 4
+        object.__setattr__(problem, "x", 1)
+        problem.p_n.setflags(write=True)
+        problem.n += 1
+"""
+    assert sorted(line for line, _ in writes_of(ast.parse(source))) == [7, 8, 9, 10, 11]
+
+
+UNITS = {"m", "m/s", "m/s^2", "rad", "rad/s", "s", "Hz", "deg", "m/sqrt(s)", "rad^2"}
+
+
+def test_the_engine_holds_no_number_of_water() -> None:
+    """Constants of the eliminations and schedules are pure numbers, sigmas and counts."""
+    for path in MODULES:
+        if part_of(dotted_name(path)) != "engine":
+            continue
+        body = parse(path).body
+        for node, after in zip(body, [*body[1:], None], strict=True):
+            if not isinstance(node, ast.Assign | ast.AnnAssign):
+                continue
+            if not any(isinstance(part, ast.Constant) for part in ast.walk(node)):
+                continue
+            said = after.value if isinstance(after, ast.Expr) else None
+            text = said.value if isinstance(said, ast.Constant) else ""
+            first = str(text).split(",")[0].split(";")[0].split(".")[0].strip()
+            assert first not in UNITS, f"{path.name}: {ast.unparse(node)} is in {first}"

@@ -207,7 +207,7 @@ def _from_reserve(kept: Kept, time_s: float, *, has_velocity: bool) -> InitialMo
 def _from_prediction(window: Window, keyframe: Keyframe, what: Doubted) -> InitialMoments:
     predicted, covariance = window.predicted(keyframe)
     P = covariance.copy()
-    R_nb, p_n, v_n, bias, extra = (column[0] for column in predicted)
+    R_nb, p_n, v_n, bias, extra = (column[0] for column in predicted[:5])
     if what is Doubted.VELOCITY_AFTER_SILENCE:
         v_n = slowed(v_n)
         forget(P, VELOCITY, SPEED_SIGMA)
