@@ -400,13 +400,14 @@ def test_fixes_of_one_keyframe_are_one() -> None:
     problem: Problem = survey_problem()
     fixes = problem.fixes
     assert fixes is not None
-    both = {
-        "keyframe": np.repeat(fixes.keyframe, 2),
-        "position_n": np.repeat(fixes.position_n, 2, axis=0),
-        "covariance_n": np.repeat(2.0 * fixes.covariance_n, 2, axis=0),
-        "gyro_b": np.repeat(fixes.gyro_b, 2, axis=0),
-    }
-    twice = dataclasses.replace(problem, fixes=dataclasses.replace(fixes, **both))
+    both = dataclasses.replace(
+        fixes,
+        keyframe=np.repeat(fixes.keyframe, 2),
+        position_n=np.repeat(fixes.position_n, 2, axis=0),
+        covariance_n=np.repeat(2.0 * fixes.covariance_n, 2, axis=0),
+        gyro_b=np.repeat(fixes.gyro_b, 2, axis=0),
+    )
+    twice = dataclasses.replace(problem, fixes=both)
     one, other = (side_by_side([p]).fixes for p in (problem, twice))
     np.testing.assert_allclose(other.position_n, one.position_n, rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(other.root_information, one.root_information, rtol=1e-9, atol=1e-12)

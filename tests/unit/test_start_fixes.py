@@ -11,7 +11,7 @@ import pytest
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.evaluation import evaluate
 from ssm_graph.io.mission_folder.reader import read_mission, write_mission
-from ssm_graph.mission.mission import NO_AIDS, Mission
+from ssm_graph.mission.mission import NO_AIDS, Aids, Mission
 from ssm_graph.mission.start.alignment import align
 from ssm_graph.mission.start.body_velocity import BodyVelocities, body_velocities
 from ssm_graph.mission.start.start_fixes import NEAR_S, start_fixes
@@ -74,7 +74,7 @@ def test_gross_fixes_start_nothing() -> None:
 def test_a_fix_disagrees_beyond_four_sigmas(far: float, is_kept: bool) -> None:
     """Of both fixes together, at rest and without a lever arm; the last one comes after the end."""
     mission = adrift().mission
-    log = mission.aids.usbl
+    log = mission.aids.get(UsblLog)
     assert log is not None
     n, sigma = len(log.time_s), 0.5
     place_n = np.zeros((n, 3))
@@ -90,7 +90,7 @@ def test_a_fix_disagrees_beyond_four_sigmas(far: float, is_kept: bool) -> None:
         lever_arm_b=np.zeros(3),
     )
     at_rest = BodyVelocities(log.time_s, place_n * 0.0)
-    found = start_fixes(replace(mission, aids=replace(mission.aids, usbl=fixes)), at_rest)
+    found = start_fixes(replace(mission, aids=Aids(fixes)), at_rest)
     np.testing.assert_array_equal(found.time_s, log.time_s[0 if is_kept else 1 : -1])
 
 
