@@ -245,7 +245,7 @@ def writes_of(tree: ast.Module) -> Iterator[tuple[int, str]]:
                 owner = part.value
                 is_own = isinstance(owner, ast.Name) and owner.id in own
                 if not is_own:
-                    yield node.lineno, ast.unparse(part)
+                    yield part.lineno, ast.unparse(part)
         if isinstance(node, ast.Call):
             called = ast.unparse(node.func)
             is_first = function is not None and function.name == "__post_init__"

@@ -11,7 +11,7 @@ import pytest
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.evaluation import evaluate
 from ssm_graph.io.mission_folder.reader import read_mission, write_mission
-from ssm_graph.mission.mission import NO_AIDS, Aids, Mission
+from ssm_graph.mission.mission import NO_AIDS, Mission
 from ssm_graph.mission.start.alignment import align
 from ssm_graph.mission.start.body_velocity import BodyVelocities, body_velocities
 from ssm_graph.mission.start.start_fixes import NEAR_S, start_fixes
