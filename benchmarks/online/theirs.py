@@ -187,7 +187,8 @@ class Theirs:
     ) -> None:
         """Add the mean of the readings, carried along the track as ours are, once."""
         before, at = (row_states(self._sensors, states) for states in (self.states, predicted))
-        target_n, up_n = depth.led_along(before, at).target(at)
+        depth = depth.led_along(before, at)
+        target_n, up_n = depth.target_n, depth.up_n
         root = np.zeros((3, 3))
         root[0] = up_n[0] * depth.root_information[0, 0]
         noise = gtsam.noiseModel.Gaussian.SqrtInformation(root, False)

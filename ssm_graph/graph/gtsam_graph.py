@@ -162,7 +162,7 @@ def depth_graph(problem: Problem, depths: Depths, states: States) -> gtsam.Nonli
     aids.follow(states)
     (means,) = aids.all
     assert isinstance(means, DepthMeans)
-    target_n, up_n = means.target(aids.at_keyframes(means, states))
+    target_n, up_n = means.target_n, means.up_n
     root_information = np.zeros((len(means), 3, 3))
     root_information[:, 0] = up_n * means.root_information[:, 0]
     graph = gtsam.NonlinearFactorGraph()

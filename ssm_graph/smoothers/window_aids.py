@@ -85,9 +85,8 @@ class WindowAids:
         for name, aid in keyframe.aids.items():
             here = np.zeros(len(aid), np.intp)
             own = row_states(self._sensors, at.take(here))
-            if before is not None:
-                aid = aid.led_along(row_states(self._sensors, before.take(here)), own)
-            added = self._linearised(aid.moved_to(k), own)
+            way = None if before is None else row_states(self._sensors, before.take(here))
+            added = self._linearised(aid.led_along(way, own).moved_to(k), own)
             known = self._all.get(name)
             self._all[name] = added if known is None else known.followed_by(added)
 
@@ -98,7 +97,8 @@ class WindowAids:
     def linearise(self, begin: int, end: int, at: States) -> None:
         """Linearise those of successive keyframes anew at the states (K, ...) of all.
 
-        What follows the way from the keyframe before is led along it, but at the first one.
+        What follows the way from the keyframe before is led along it, but at the first one; those
+        of a single keyframe keep what its prediction came with.
         """
         for name, one in self._all.items():
             rows = one.rows_of(begin, end)
@@ -110,8 +110,11 @@ class WindowAids:
             led = aid
             if n_first < len(k):
                 way = (row_states(self._sensors, at.take(k[n_first:] - i)) for i in (1, 0))
-                rest = aid.take(np.s_[n_first:]).led_along(*way)
-                led = aid.take(np.s_[:n_first]).followed_by(rest) if n_first else rest
+                led = aid.take(np.s_[n_first:]).led_along(*way)
+            if n_first and len(at.p_n) > 1:
+                here = row_states(self._sensors, at.take(k[:n_first]))
+                first = aid.take(np.s_[:n_first]).led_along(None, here)
+                led = first.followed_by(led) if n_first < len(k) else first
             anew = self._linearised(led, own)._replace(weight=some.weight, t=some.t)
             self._all[name] = head.followed_by(anew).followed_by(tail)
 

@@ -180,8 +180,11 @@ class Aid(Table, ABC):
     def measured(self, at: RowStates) -> Linearised:
         """Linearise the measurements at their states."""
 
-    def led_along(self, before: RowStates, at: RowStates) -> Self:  # noqa: ARG002
-        """Return the same after states of the keyframes before and of their own, if they follow."""
+    def led_along(self, before: RowStates | None, at: RowStates) -> Self:  # noqa: ARG002
+        """Return the same after states of the keyframes before and of their own, if they follow.
+
+        Without those before, the way from there to here stays as it was.
+        """
         return self
 
     @final

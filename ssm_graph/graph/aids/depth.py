@@ -85,6 +85,10 @@ class DepthMeans(Aid):
     """(M, 3) rad/s"""
     rise: Array
     """(M,) m, from the readings to the keyframe, along the track last followed"""
+    up_n: Array
+    """(M, 3) the vertical at the states last followed, which alone counts"""
+    target_n: Array
+    """(M, 3) m, where the readings put the sensor then"""
     sigma: float
     """m, of one reading"""
     lever_arm_b: Array
@@ -115,6 +119,8 @@ class DepthMeans(Aid):
             gyro_before_b=depths.gyro_b[np.maximum(read - 1, 0)],
             gyro_b=depths.gyro_b[read],
             rise=np.zeros(len(read)),
+            up_n=np.zeros((len(read), 3)),
+            target_n=np.zeros((len(read), 3)),
             sigma=depths.sigma,
             lever_arm_b=depths.lever_arm_b,
             frame=frame,
@@ -140,29 +146,26 @@ class DepthMeans(Aid):
             lever_arm_b=self.lever_arm_b,
         )
 
-    def led_along(self, before: RowStates, at: RowStates) -> Self:
-        """Return the same with the rises along another track."""
-        begin, end = self._track(before, self.gyro_before_b), self._track(at, self.gyro_b)
-        rise = self.rise_of_way * (end.height - begin.height)
-        rise = rise + self.rise_of_begin_s * begin.climb + self.rise_of_end_s * end.climb
-        return replace(self, rise=rise)
-
-    def target(self, at: RowStates) -> tuple[Array, Array]:
-        """Return where readings put the sensor, m, and the vertical that counts, both (M, 3)."""
-        track = self._track(at, self.gyro_b)
-        too_low = self.rise - self.depth - track.height
-        return track.sensor_n + track.up_n * too_low[:, None], track.up_n
+    def led_along(self, before: RowStates | None, at: RowStates) -> Self:
+        """Return the same with the rises along another track, and the plane that is level there."""
+        end, rise = self._track(at, self.gyro_b), self.rise
+        if before is not None:
+            begin = self._track(before, self.gyro_before_b)
+            rise = self.rise_of_way * (end.height - begin.height)
+            rise = rise + self.rise_of_begin_s * begin.climb + self.rise_of_end_s * end.climb
+        too_low = rise - self.depth - end.height
+        target_n = end.sensor_n + end.up_n * too_low[:, None]
+        return replace(self, rise=rise, up_n=end.up_n, target_n=target_n)
 
     def measured(self, at: RowStates) -> Linearised:
-        """Linearise heights: one component each."""
-        target_n, up_n = self.target(at)
+        """Linearise heights, after :meth:`led_along`: one component each."""
         residual = height_residual(
             at.R_nb,
             at.p_n,
             lever_arm_b=self.lever_arm_b,
             offset=at.value(DEPTH_OFFSET, 1)[..., 0],
-            up_n=up_n,
-            target_n=target_n,
+            up_n=self.up_n,
+            target_n=self.target_n,
         )
         jacobian = np.zeros((*residual.error.shape, 1, at.extras.width))
         jacobian[..., 0, ROTATION] = residual.error_D_rotation
