@@ -26,7 +26,7 @@ from ssm_graph.simulation.aids import (
 )
 from ssm_graph.simulation.beam_faults import Fault, Loss, OutlierKind, Outliers
 from ssm_graph.simulation.currents import CurrentSettings, WaterTrack
-from ssm_graph.simulation.dvl_model import DvlSettings
+from ssm_graph.simulation.dvl_model import DvlSettings, default_mount, janus_beams
 from ssm_graph.simulation.grades import IMU_NOISE, START_SIGMAS, Grade, StartSigmas
 from ssm_graph.simulation.routes import (
     DepthProfile,
@@ -200,6 +200,16 @@ SCENARIOS: Final[Mapping[str, Scenario]] = MappingProxyType(
             "survey with late acoustic fixes, ranges to a known and an unknown beacon, a compass; "
             "5 % of them grossly wrong",
             SimulationConfig(name="aided", aids=_AIDED),
+        ),
+        "three-beams": Scenario(
+            "survey with a DVL of three beams around",
+            SimulationConfig(
+                name="three-beams", dvl=DvlSettings(mount=default_mount(janus_beams(3)))
+            ),
+        ),
+        "velocity": Scenario(
+            "survey with a DVL that gives a velocity alone: three beams along its axes",
+            SimulationConfig(name="velocity", dvl=DvlSettings(mount=default_mount(np.eye(3)))),
         ),
         "midwater": Scenario(
             "survey lines at 30 m depth, 40 min, a tide of 0.5 m/s: half without bottom lock",
