@@ -13,6 +13,7 @@ from ssm_graph.base.errors import nearest_hint
 from ssm_graph.base.frames import BodyAxes, turned
 from ssm_graph.base.units import DEG_PER_H, DEGREE, MICRO_G
 from ssm_graph.live.protocols.decoder import (
+    Decoder,
     RefusedError,
     flag,
     number,
@@ -21,7 +22,6 @@ from ssm_graph.live.protocols.decoder import (
     require,
     shown,
 )
-from ssm_graph.live.protocols.framed_decoder import FramedDecoder
 from ssm_graph.live.protocols.framing import MAX_LENGTH, LineFramer
 from ssm_graph.mission.navigation import Navigation
 from ssm_graph.sensors.dvl import MOST_BEAMS
@@ -53,7 +53,7 @@ _HAS_UNITS: Final = {
 }
 
 
-class JsonDecoder(FramedDecoder):
+class JsonDecoder(Decoder):
     """JSON lines to messages.
 
     Parameters

@@ -6,6 +6,7 @@ The way out is :mod:`ssm_graph.live.protocols.nmea_encoder`.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
@@ -13,16 +14,8 @@ from typing import Final, NamedTuple
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Vector
-from ssm_graph.live.protocols.decoder import Clock, RefusedError, Stamper, number, shown
-from ssm_graph.live.protocols.framed_decoder import FramedDecoder
+from ssm_graph.live.protocols.decoder import Clock, Decoder, RefusedError, Stamper, number, shown
 from ssm_graph.live.protocols.framing import LineFramer
-from ssm_graph.live.protocols.nmea_fields import (
-    angle,
-    optional_number,
-    required_number,
-    split_sentence,
-    utc_seconds,
-)
 from ssm_graph.sensors.depth import DEEPEST_M, DepthReading
 from ssm_graph.sensors.gnss import Fix
 from ssm_graph.sensors.messages import Message
@@ -37,6 +30,11 @@ STANDARD_GRAVITY: Final = 9.80665
 """m/s^2"""
 _FIXES = {"1", "2", "3", "4", "5", "9"}
 _NO_FIX = {"", "0"}
+DAY_S: Final = 86400.0
+_NUMBER = re.compile(r"[+-]?(?:\d{1,12}(?:\.\d{0,12})?|\.\d{1,12})", re.ASCII)
+_ANGLE = re.compile(r"(\d{2,3})(\d{2}(?:\.\d{0,12})?)", re.ASCII)
+_TIME = re.compile(r"(\d{2})(\d{2})(\d{2}(?:\.\d{0,9})?)", re.ASCII)
+_CHECKSUM = re.compile(r"[0-9A-Fa-f]{2}", re.ASCII)
 
 
 class DepthSentence(Enum):
@@ -103,7 +101,7 @@ class _Gga(NamedTuple):
     hdop: float | None
 
 
-class NmeaDecoder(FramedDecoder):
+class NmeaDecoder(Decoder):
     """GGA (with GST) to fixes, pressures to depths; all other sentences are ignored.
 
     ``height`` is that of GGA above the geoid plus its separation: above the ellipsoid. Sigmas are
@@ -238,7 +236,7 @@ def _water_column(pressure: str, unit: str, options: NmeaOptions) -> float:
     return water_dbar * PASCAL_PER_DBAR / (options.water_density_kg_per_m3 * STANDARD_GRAVITY)
 
 
-def _prvat(fields: list[str], options: NmeaOptions) -> float:
+def _pressure(fields: list[str], options: NmeaOptions) -> float:
     _, _, pressure, unit = _first(fields, 4)
     return _water_column(pressure, unit, options)
 
@@ -246,11 +244,6 @@ def _prvat(fields: list[str], options: NmeaOptions) -> float:
 def _pips(fields: list[str], options: NmeaOptions) -> float:
     value, unit = _first(fields, 2)
     return required_number(value, "depth") if unit == "M" else _water_column(value, unit, options)
-
-
-def _pvips2(fields: list[str], options: NmeaOptions) -> float:
-    _, _, pressure, unit = _first(fields, 4)
-    return _water_column(pressure, unit, options)
 
 
 def _dpt(fields: list[str], _: NmeaOptions) -> float:
@@ -274,10 +267,76 @@ def _first(fields: list[str], count: int) -> list[str]:
 
 
 _DEPTHS: Final[dict[str, Callable[[list[str], NmeaOptions], float]]] = {
-    "PRVAT": _prvat,
+    "PRVAT": _pressure,
     "PIPS": _pips,
-    "PVIPS2": _pvips2,
+    "PVIPS2": _pressure,
     "DPT": _dpt,
     "DBT": _dbt,
 }
 """Depth below the surface, m, from the fields of each of :class:`DepthSentence`."""
+
+
+def checksum(body: str) -> str:
+    """Return the two hexadecimal digits of a sentence, of what stands between ``$`` and ``*``."""
+    result = 0
+    for byte in body.encode("ascii"):
+        result ^= byte
+    return f"{result:02X}"
+
+
+def split_sentence(body: str) -> list[str]:
+    """Return name and fields of a sentence whose checksum is right."""
+    content, star, given = body.rpartition("*")
+    if not star or not _CHECKSUM.fullmatch(given):
+        raise RefusedError(f"expected a checksum '*hh' at the end, got {shown('$' + body)}")
+    if not content.isascii() or not content.isprintable():
+        raise RefusedError(
+            f"expected printable ASCII, got {shown('$' + body)}; check the baud rate"
+        )
+    if checksum(content) != given.upper():
+        raise RefusedError(
+            f"expected checksum {checksum(content)}, got {given} in {shown('$' + body)}"
+        )
+    return content.split(",")
+
+
+def optional_number(field: str, key: str) -> float | None:
+    """Return a number, None where the field is empty."""
+    return required_number(field, key) if field else None
+
+
+def required_number(field: str, key: str) -> float:
+    """Return a number; plain decimals only, whatever Python would take."""
+    if not _NUMBER.fullmatch(field):
+        raise RefusedError(f"{key}: expected a number, got {shown(field)}")
+    return float(field)
+
+
+def angle(field: str, side: str, sides: str, *, limit_deg: float) -> float:
+    """Return ``dddmm.mmm`` with its hemisphere in radians, positive to the first of ``sides``."""
+    found = _ANGLE.fullmatch(field)
+    if not found or side not in tuple(sides) or float(found[2]) >= 60.0:
+        raise RefusedError(
+            f"expected an angle as dddmm.mmm,{sides[0]}, got {shown(field)},{shown(side)}"
+        )
+    degrees = number(float(found[1]) + float(found[2]) / 60.0, key="angle, deg", high=limit_deg)
+    return math.radians(degrees if side == sides[0] else -degrees)
+
+
+def utc_seconds(field: str, arrival_s: float) -> float | None:
+    """Return the instant with this UTC of day that is nearest to the arrival, Unix s."""
+    if not field:
+        return None
+    found = _TIME.fullmatch(field)
+    if not found:
+        raise RefusedError(f"expected UTC as hhmmss.sss, got {shown(field)}")
+    hours, minutes, seconds = float(found[1]), float(found[2]), float(found[3])
+    if hours >= 24.0 or minutes >= 60.0 or seconds >= 61.0:
+        raise RefusedError(f"expected UTC as hhmmss.sss, got {shown(field)}")
+    of_day = 3600.0 * hours + 60.0 * minutes + seconds
+    if not math.isfinite(arrival_s):
+        return None
+    return of_day + DAY_S * round((arrival_s - of_day) / DAY_S)
+
+
+##### live/protocols/nmea.py

@@ -7,7 +7,8 @@ from typing import Final
 
 import numpy as np
 
-from ssm_graph.live.protocols.nmea_fields import checksum
+from ssm_graph.base.frozen import Array
+from ssm_graph.live.protocols.nmea import checksum
 from ssm_graph.mission.navigation import Health, Navigation
 
 TALKER: Final = "IN"
@@ -21,13 +22,9 @@ _MINUTE = 1_000_000
 
 def encode_nmea(navigation: Navigation, *, geoid_separation_m: float = 0.0) -> bytes:
     """Return GGA, VTG and HDT, each ended by CR LF."""
-    return "".join(
-        (
-            encode_gga(navigation, geoid_separation_m=geoid_separation_m),
-            encode_vtg(navigation),
-            encode_hdt(navigation),
-        )
-    ).encode("ascii")
+    altitude_m = {"geoid_separation_m": geoid_separation_m}
+    sentences = encode_gga(navigation, **altitude_m), encode_vtg(navigation), encode_hdt(navigation)
+    return "".join(sentences).encode("ascii")
 
 
 def encode_gga(navigation: Navigation, *, geoid_separation_m: float = 0.0) -> str:
@@ -39,9 +36,8 @@ def encode_gga(navigation: Navigation, *, geoid_separation_m: float = 0.0) -> st
     """
     geodetic = np.array([navigation.lat, navigation.lon, navigation.height, navigation.time_s])
     if not _is_usable(navigation, geodetic):
-        return _sentence(
-            "GGA", _utc(navigation.time_s), *[""] * 4, "0", "00", "", "", "M", "", "M", "", ""
-        )
+        empty = (*[""] * 4, "0", "00", "", "", "M", "", "M", "", "")
+        return _sentence("GGA", _utc(navigation.time_s), *empty)
     altitude_m = navigation.height - geoid_separation_m
     return _sentence(
         "GGA",
@@ -71,9 +67,7 @@ def encode_hdt(navigation: Navigation) -> str:
     return _sentence("HDT", _degrees(float(heading[0])) if is_usable else "", "T")
 
 
-def _is_usable(
-    navigation: Navigation, values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]
-) -> bool:
+def _is_usable(navigation: Navigation, values: Array) -> bool:
     return navigation.health in USABLE and bool(np.isfinite(values).all())
 
 

@@ -34,6 +34,7 @@ from typing import Any, Final
 
 from ssm_graph.live.protocols.decoder import (
     Clock,
+    Decoder,
     RefusedError,
     Stamper,
     flag,
@@ -42,7 +43,6 @@ from ssm_graph.live.protocols.decoder import (
     require,
     shown,
 )
-from ssm_graph.live.protocols.framed_decoder import FramedDecoder
 from ssm_graph.live.protocols.framing import MAX_LENGTH, ObjectFramer
 from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.dvl_readings import LARGEST_SPEED
@@ -63,7 +63,7 @@ class BeamRule(Enum):
     VELOCITY = "beams flagged valid, where the report has a valid velocity"
 
 
-class WaterLinkedDecoder(FramedDecoder):
+class WaterLinkedDecoder(Decoder):
     """Velocity reports to pings, in any layout: one a line, spread over lines, back to back.
 
     A report without a beam that counts is a ping of missing beams. The same report again (by

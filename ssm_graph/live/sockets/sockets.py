@@ -8,8 +8,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Self
 
+from ssm_graph.live.protocols.decoder import Decoder
 from ssm_graph.live.sockets.endpoints import Endpoint, Transport
-from ssm_graph.live.sockets.feed import CountingDecoder, Feed, Limits, Now
+from ssm_graph.live.sockets.feed import Feed, Limits, Now
 from ssm_graph.live.sockets.inputs import Input, TcpClientInput, TcpServerInput, UdpInput
 from ssm_graph.live.sockets.outputs import Output, OutputFormat, TcpServerOutput, UdpOutput
 from ssm_graph.mission.events import EventLog
@@ -24,7 +25,7 @@ class InputConfig:
 
     name: str
     endpoint: Endpoint
-    make_decoder: Callable[[], CountingDecoder]
+    make_decoder: Callable[[], Decoder]
     limits: Limits = Limits()
 
 
