@@ -120,18 +120,14 @@ def _is_adrift(watch: Watch, sigma: Array, keyframe: Keyframe) -> bool:
 
 
 def watch_after(was: Watch, begun: Window, last: Stretch, doubt: Doubt) -> Watch:
-    """Return what is remembered of an answer that was begun anew; it has to prove itself.
+    """Return what is remembered of an answer that was begun anew, and has to prove itself.
 
-    Parameters
-    ----------
-    was : what was remembered before.
-    begun : the window of the new answer.
-    last : the newest keyframe before.
-    doubt : why it was begun anew.
+    ``begun`` is its window, ``last`` the newest keyframe before.
     """
     newest, refusals = begun.newest, was.depths_refused
     time_s = float(newest.time_s[0])
     is_aided = bool(np.any(newest.weight >= TRUSTED))
+    is_grounded = counts_off_the_ground(newest, begun.keyframes[-1])
     contradicted, moved = was.contradicted, was.moved
     if doubt.what in (Doubted.POSITION, Doubted.HEIGHT):
         reckoned_n = last.states.p_n[0] + last.states.v_n[0] * (time_s - last.time_s[0])
@@ -146,9 +142,7 @@ def watch_after(was: Watch, begun: Window, last: Stretch, doubt: Doubt) -> Watch
         moved = (*(t for t in moved if time_s - t < ASTRAY_S), time_s)
     return Watch(
         last_beam_s=time_s if is_aided else was.last_beam_s,
-        last_ground_s=time_s
-        if counts_off_the_ground(newest, begun.keyframes[-1])
-        else was.last_ground_s,
+        last_ground_s=time_s if is_grounded else was.last_ground_s,
         depths_refused=refusals + (refusals == LOCKED_OUT_DEPTHS),
         out_since_s=np.inf if is_aided else was.out_since_s,
         torn_since_s=was.torn_since_s,
@@ -168,15 +162,10 @@ def is_astray(watch: Watch) -> bool:
 
 
 def reanchored(window: Window, keyframe: Keyframe, kept: Kept, what: Doubted) -> Window:
-    """Return a window that begins at ``keyframe`` without what is doubted.
+    """Return a window that begins at ``keyframe``, the next one of ``window``, without a doubt.
 
-    Parameters
-    ----------
-    window : up to the keyframe before.
-    keyframe : the next one.
-    kept : an older answer, led on to ``keyframe`` by the inertial data.
-    what : of position, height, or velocity after a silence, the rest of the prediction is gone on
-        from; otherwise ``kept`` is.
+    With position, height, or velocity after a silence in doubt it goes on from the rest of the
+    prediction, otherwise from ``kept``, an older answer led on to there by the inertial data.
     """
     if what in (Doubted.ANSWER, Doubted.VELOCITY):
         trust = kept.trust

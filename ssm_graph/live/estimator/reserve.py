@@ -60,10 +60,9 @@ class Kept(NamedTuple):
         assert keyframe.inertial is not None
         ahead = inertial.predict(keyframe.inertial, self.states)
         covariance = ahead.covariance(self.covariance)
-        R_nb, p_n, v_n, bias, walks, _ = ahead.states
-        led = self._replace(
-            R_nb=R_nb, p_n=p_n, v_n=v_n, bias=bias, extra=walks, covariance=covariance
-        )
+        names = ("R_nb", "p_n", "v_n", "bias", "extra")
+        now: dict[str, Any] = dict(zip(names, ahead.states, strict=False))
+        led = self._replace(**now, covariance=covariance)
         is_lost = np.trace(covariance[VELOCITY, VELOCITY]) > (LOST_FACTOR * SPEED_SIGMA) ** 2
         return led.without_velocity(keyframe.time_s) if is_lost else led
 

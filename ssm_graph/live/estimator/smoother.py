@@ -12,25 +12,14 @@ import numpy as np
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.times import MIN_SPACING_S
-from ssm_graph.live.estimator.answer import answer
-from ssm_graph.live.estimator.asked import not_calibrated, sensors_of_vehicle
+from ssm_graph.live.estimator.answers import Delayed, answer, delayed_of, found_by
 from ssm_graph.live.estimator.course import REACH_S, Course, Step
-from ssm_graph.live.estimator.delayed import Delayed, delayed_of
-from ssm_graph.live.estimator.found import found_by
 from ssm_graph.live.estimator.intake import Intake
 from ssm_graph.live.estimator.keyframes import KeyframeMaker
 from ssm_graph.live.estimator.recovery import ASTRAY_TIMES, is_astray
 from ssm_graph.live.estimator.reserve import Reserve
-from ssm_graph.live.estimator.start import Beginning, Starter
-from ssm_graph.live.estimator.store import (
-    pack_buffers,
-    pack_step,
-    unpack_buffers,
-    unpack_left,
-    unpack_reserve,
-    unpack_watch,
-    window_arrays,
-)
+from ssm_graph.live.estimator.start import Starter, not_calibrated, sensors_of_vehicle
+from ssm_graph.live.estimator.store import pack_buffers, pack_step, unpack_buffers, unpack_step
 from ssm_graph.live.estimator.tail import Tail
 from ssm_graph.live.estimator.watch import Watch
 from ssm_graph.mission.estimate import Found
@@ -134,9 +123,8 @@ class FixedLagSmoother:
         )
         self._intake.horizon_s = course.horizon_s
         if is_astray(course.newest.watch):
-            self._lose(
-                time_s, f"fixes contradicted the position {ASTRAY_TIMES} times: wrong heading?"
-            )
+            reason = f"fixes contradicted the position {ASTRAY_TIMES} times: wrong heading?"
+            self._lose(time_s, reason)
             return True
         if is_behind and n_made == CATCH_UP_STEPS:
             return True
@@ -150,23 +138,23 @@ class FixedLagSmoother:
         beginning = self._starter.find(self._intake.buffers)
         if beginning is None:
             return False
-        self._begin(beginning)
-        return True
-
-    def _begin(self, beginning: Beginning) -> None:
-        self._frame, buffers = beginning.frame, self._intake.buffers
-        self._begun_s = beginning.begin_s
+        self._frame, self._begun_s = beginning.frame, beginning.begin_s
         for note in not_calibrated(self.vehicle):
             self._events.tell(beginning.time_s, Severity.INFO, "not_calibrated", note)
-        maker = KeyframeMaker(buffers, beginning.frame, self._problem_config, begin_s=self._begun_s)
-        sensors = sensors_of_vehicle(self.vehicle, beginning.frame)
+        sensors = sensors_of_vehicle(self.vehicle, self._frame)
         first = Keyframe(beginning.time_s, sensors.beams)
         window = Window(sensors, self.config, first, beginning.moments)
         window.iterate()
-        self._course = self._course_from(Step(window, Watch(), None, Reserve.of(window)), maker)
+        self._course = self._course_from(Step(window, Watch(), None, Reserve.of(window)))
+        return True
 
-    def _course_from(self, step: Step, maker: KeyframeMaker) -> Course:
-        course = Course(step, maker, self._intake.buffers, self._events)
+    def _maker(self) -> KeyframeMaker:
+        assert self._frame is not None
+        buffers, config = self._intake.buffers, self._problem_config
+        return KeyframeMaker(buffers, self._frame, config, begin_s=self._begun_s)
+
+    def _course_from(self, step: Step) -> Course:
+        course = Course(step, self._maker(), self._intake.buffers, self._events)
         self._intake.horizon_s = course.horizon_s
         return course
 
@@ -215,19 +203,14 @@ class FixedLagSmoother:
             smoother._frame = LocalFrame(*meta["frame"])
         if meta["watch"] is None:
             smoother._starter.go_on_from(meta["alignment"], intake.buffers)
-        if meta["watch"] is not None:
+        else:
             assert smoother._frame is not None
-            maker = KeyframeMaker(
-                intake.buffers,
-                smoother._frame,
-                smoother._problem_config,
-                begin_s=smoother._begun_s,
+            sensors, inertial = (
+                sensors_of_vehicle(vehicle, smoother._frame),
+                smoother._maker().inertial,
             )
-            sensors = sensors_of_vehicle(vehicle, smoother._frame)
-            window = Window.unpack(window_arrays(arrays), sensors, smoother.config, maker.inertial)
-            watch, left = unpack_watch(meta["watch"]), unpack_left(arrays, sensors)
-            step = Step(window, watch, left, unpack_reserve(arrays))
-            smoother._course = course = smoother._course_from(step, maker)
+            step = unpack_step(arrays, meta["watch"], sensors, smoother.config, inertial)
+            smoother._course = course = smoother._course_from(step)
             course.advance()
             intake.horizon_s = course.horizon_s
             smoother._tail = smoother._tail_of(course.newest)
@@ -241,12 +224,8 @@ class FixedLagSmoother:
     def _lose(self, time_s: float, reason: str) -> None:
         """Give the answer up, keep what was found, and align anew."""
         assert self._course is not None
-        self._events.tell(
-            time_s,
-            Severity.ERROR,
-            "lost",
-            f"{reason}; position and attitude have to be found anew",
-        )
+        text = f"{reason}; position and attitude have to be found anew"
+        self._events.tell(time_s, Severity.ERROR, "lost", text)
         self._finished += self._take(self._course, all_of_them=True)
         self._course = self._tail = None
         self._intake.horizon_s = time_s
@@ -260,14 +239,10 @@ class FixedLagSmoother:
 
     def _tail_of(self, step: Step) -> Tail:
         assert self._frame is not None
-        newest = step.window.newest
-        tail = Tail(
-            step.window.keyframes[-1],
-            newest.states,
-            newest.covariance[0],
-            noise=self.vehicle.imu_noise,
-            sensors=step.window.sensors,
-        )
+        newest, noise = step.window.newest, self.vehicle.imu_noise
+        keyframe, covariance = step.window.keyframes[-1], newest.covariance[0]
+        sensors = step.window.sensors
+        tail = Tail(keyframe, newest.states, covariance, noise=noise, sensors=sensors)
         imu = self._intake.buffers.imu
         tail.add(imu.all[max(imu.index(step.time_s, after=True) - 1, 0) :])
         return tail

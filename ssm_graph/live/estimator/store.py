@@ -6,19 +6,22 @@ later steps follow from these, and so does the answer to every late message.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
+from factors.inertial import Intervals
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.states import States
 from ssm_graph.live.estimator.buffers import Buffers
 from ssm_graph.live.estimator.course import Step
 from ssm_graph.live.estimator.reserve import Reserve
 from ssm_graph.live.estimator.watch import Contradicted, Watch
+from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
 from ssm_graph.smoothers.keyframe import Sensors
 from ssm_graph.smoothers.stretch import Stretch, pack_judged, unpack_judged
+from ssm_graph.smoothers.window import Window
 
 
 def pack_buffers(buffers: Buffers) -> dict[str, Array]:
@@ -45,14 +48,24 @@ def pack_step(step: Step) -> tuple[dict[str, Array], dict[str, Any]]:
     return arrays, {name: _plain(value) for name, value in step.watch._asdict().items()}
 
 
-def window_arrays(arrays: Mapping[str, Array]) -> dict[str, Array]:
-    """Return what :meth:`ssm_graph.smoothers.window.Window.pack` gave of the step."""
-    prefix = "window_"
+def unpack_step(
+    arrays: Mapping[str, Array],
+    watch: Mapping[str, Any],
+    sensors: Sensors,
+    config: FixedLagConfig,
+    inertial: Callable[[float, float], Intervals],
+) -> Step:
+    """Return the step that was packed; ``inertial`` is that of the keyframes' maker."""
+    window = Window.unpack(_part(arrays, "window_"), sensors, config, inertial)
+    reserve = Reserve.unpack(_part(arrays, "reserve_"))
+    return Step(window, _watch(watch), _left(_part(arrays, "left_"), sensors), reserve)
+
+
+def _part(arrays: Mapping[str, Array], prefix: str) -> dict[str, Array]:
     return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
 
 
-def unpack_watch(plain: Mapping[str, Any]) -> Watch:
-    """Return the watch that was packed."""
+def _watch(plain: Mapping[str, Any]) -> Watch:
     numbers: dict[str, Any] = {
         name: float(value) if isinstance(value, str) and name != "trouble" else value
         for name, value in plain.items()
@@ -65,21 +78,13 @@ def unpack_watch(plain: Mapping[str, Any]) -> Watch:
     return Watch(**numbers)
 
 
-def unpack_reserve(arrays: Mapping[str, Array]) -> Reserve:
-    """Return the reserve of the step."""
-    prefix = "reserve_"
-    return Reserve.unpack({k.removeprefix(prefix): v for k, v in arrays.items() if prefix in k})
-
-
-def unpack_left(arrays: Mapping[str, Array], sensors: Sensors) -> Stretch | None:
+def _left(arrays: Mapping[str, Array], sensors: Sensors) -> Stretch | None:
     """Return what had left the window with the step."""
-    if "left_time_s" not in arrays:
+    if "time_s" not in arrays:
         return None
-    states = States(*(arrays[f"left_states_{n}"] for n in States._fields))
-    aids = unpack_judged(arrays, sensors.aids, prefix="left_")
-    others: dict[str, Any] = {
-        n: arrays[f"left_{n}"] for n in Stretch._fields if n not in ("states", "aids")
-    }
+    states = States(*(arrays[f"states_{name}"] for name in States._fields))
+    aids = unpack_judged(arrays, sensors.aids, prefix="")
+    others: dict[str, Any] = {n: arrays[n] for n in Stretch._fields if n not in ("states", "aids")}
     others["beam"] = others["beam"].astype(np.intp)
     return Stretch(states=states, aids=aids, **others)
 
