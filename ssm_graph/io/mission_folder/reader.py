@@ -16,8 +16,7 @@ from ssm_graph.io.mission_folder.toml import (
     table_path,
 )
 from ssm_graph.io.mission_folder.writer import write_mission
-from ssm_graph.io.tables.arrival import read_arrival_table
-from ssm_graph.io.tables.files import TableFormat, read_table
+from ssm_graph.io.tables.files import TableFormat, read_arrival_table, read_table
 from ssm_graph.mission.mission import Mission
 from ssm_graph.sensors.current import CurrentModel
 from ssm_graph.sensors.instrument import Instrument

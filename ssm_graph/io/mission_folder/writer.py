@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from ssm_graph.base.frames import BodyAxes
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.settings import written
 from ssm_graph.io.mission_folder.toml import FORMAT, INITIAL_KEYS, REFERENCE, TOML_NAME
+from ssm_graph.io.tables.append_file import write_through
 from ssm_graph.io.tables.files import TableFormat, write_table
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.vehicle import Vehicle
@@ -55,10 +55,7 @@ def write_mission(
 def write_toml_part(folder: Path, settings: dict[str, Any]) -> Path:
     """Write a ``mission.toml`` under another name, on the disk when this returns."""
     part = folder / f"{TOML_NAME}.part"
-    with part.open("wb") as stream:
-        tomli_w.dump(settings, stream)
-        stream.flush()
-        os.fsync(stream.fileno())
+    write_through(part, tomli_w.dumps(settings).encode())
     return part
 
 

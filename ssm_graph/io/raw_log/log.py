@@ -12,14 +12,12 @@ from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Final, Self
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.io.mission_folder.toml import TOML_NAME
 from ssm_graph.io.mission_folder.vehicle import check_same_vehicle, write_vehicle
-from ssm_graph.io.raw_log.replay import check_columns, replay
-from ssm_graph.io.raw_log.rows import ALWAYS, ARRIVALS, RowKind, row_kinds
+from ssm_graph.io.raw_log.rows import ALWAYS, ARRIVALS, RowKind, check_columns, replay, row_kinds
 from ssm_graph.io.tables.append_file import TORN_ROW, AppendFile, sync_folder
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.messages import Message
@@ -218,12 +216,7 @@ class RawLog:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        at: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _files(self) -> list[AppendFile]:

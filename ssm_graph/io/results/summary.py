@@ -21,44 +21,14 @@ from ssm_graph.mission.estimate import (
 )
 from ssm_graph.mission.mission import InitialState, Mission
 
-PACKAGES: Final = {
-    "ssm_graph": "ssm-graph",
-    "gtsam": "gtsam",
-    "numpy": "numpy",
-    "scipy": "scipy",
-}
-"""Names in the summary and of the distributions."""
+PACKAGES: Final = ("ssm_graph", "gtsam", "numpy", "scipy")
+"""Names in the summary; distributions have hyphens."""
 
 
 class MetricsLike(Protocol):
-    """What a summary needs of `ssm_graph.evaluation.Metrics`; angles in rad."""
+    """What a summary needs of `ssm_graph.evaluation.Metrics`."""
 
-    @property
-    def n_epochs(self) -> int: ...  # noqa: D102
-    @property
-    def first_s(self) -> float: ...  # noqa: D102
-    @property
-    def last_s(self) -> float: ...  # noqa: D102
-    @property
-    def rmse_horizontal_m(self) -> float: ...  # noqa: D102
-    @property
-    def rmse_vertical_m(self) -> float: ...  # noqa: D102
-    @property
-    def max_horizontal_m(self) -> float: ...  # noqa: D102
-    @property
-    def end_error_m(self) -> float: ...  # noqa: D102
-    @property
-    def path_length_m(self) -> float: ...  # noqa: D102
-    @property
-    def drift_percent(self) -> float: ...  # noqa: D102
-    @property
-    def rmse_velocity_m_per_s(self) -> float: ...  # noqa: D102
-    @property
-    def rmse_attitude(self) -> tuple[float, float, float]: ...  # noqa: D102
-    @property
-    def nees_position(self) -> float: ...  # noqa: D102
-    @property
-    def inside_3_sigma(self) -> tuple[float, float, float]: ...  # noqa: D102
+    def summary_fields(self) -> dict[str, Any]: ...  # noqa: D102
 
 
 def build_summary(
@@ -101,14 +71,10 @@ def build_summary(
         "noise": _noise(estimate),
         **({"aids": _aids(estimate.aids)} if estimate.aids is not None else {}),
         "current": current_fields(estimate.current),
-        **(_comparison(metrics) if metrics is not None else {}),
+        **(metrics.summary_fields() if metrics is not None else {}),
         "settings": settings,
         "history": [
-            {
-                "update_sigmas": step.update_sigmas,
-                "weight_change": step.weight_change,
-                "kernel": step.kernel,
-            }
+            {name: getattr(step, name) for name in ("update_sigmas", "weight_change", "kernel")}
             for step in estimate.iterations
         ],
         "notes": estimate.notes,
@@ -121,9 +87,9 @@ def build_summary(
 def versions() -> dict[str, str | None]:
     """Return the versions of everything that makes the numbers; None for what is not installed."""
     found: dict[str, str | None] = {"python": platform.python_version()}
-    for name, distribution in PACKAGES.items():
+    for name in PACKAGES:
         try:
-            found[name] = version(distribution)
+            found[name] = version(name.replace("_", "-"))
         except PackageNotFoundError:
             found[name] = None
     return found
@@ -144,27 +110,6 @@ def as_json(value: Any) -> Any:
     if isinstance(value, Sequence | set | frozenset):
         return [as_json(item) for item in value]
     return str(value)
-
-
-def _comparison(metrics: MetricsLike) -> dict[str, Any]:
-    roll, pitch, heading = np.rad2deg(metrics.rmse_attitude).tolist()
-    return {
-        "rmse_horizontal_m": metrics.rmse_horizontal_m,
-        "rmse_vertical_m": metrics.rmse_vertical_m,
-        "max_horizontal_m": metrics.max_horizontal_m,
-        "end_error_m": metrics.end_error_m,
-        "path_length_m": metrics.path_length_m,
-        "drift_percent": metrics.drift_percent,
-        "rmse_velocity_m_per_s": metrics.rmse_velocity_m_per_s,
-        "rmse_roll_deg": roll,
-        "rmse_pitch_deg": pitch,
-        "rmse_heading_deg": heading,
-        "nees_position": metrics.nees_position,
-        "inside_3_sigma": dict(zip(("east", "north", "up"), metrics.inside_3_sigma, strict=True)),
-        "compared_epochs": metrics.n_epochs,
-        "compared_from_s": metrics.first_s,
-        "compared_to_s": metrics.last_s,
-    }
 
 
 def calibration_fields(calibration: Calibration | None) -> dict[str, Any]:

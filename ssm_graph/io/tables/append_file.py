@@ -77,6 +77,14 @@ class AppendFile:
             self.size = size
 
 
+def write_through(path: Path, content: bytes) -> None:
+    """Write a file; it is on the disk when this returns."""
+    with path.open("wb") as stream:
+        stream.write(content)
+        stream.flush()
+        os.fsync(stream.fileno())
+
+
 def sync_folder(folder: Path) -> None:
     """Wait until the names of a folder's files are on the disk."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)

@@ -10,7 +10,6 @@ import contextlib
 import hashlib
 import io
 import json
-import os
 import re
 import zipfile
 from collections.abc import Mapping
@@ -22,7 +21,7 @@ import numpy as np
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
-from ssm_graph.io.tables.append_file import sync_folder
+from ssm_graph.io.tables.append_file import sync_folder, write_through
 
 JSON = None | bool | int | float | str | list["JSON"] | dict[str, "JSON"]
 
@@ -67,10 +66,7 @@ def write_checkpoint(path: Path, arrays: Mapping[str, Array], meta: Mapping[str,
     content = _content(arrays, meta)
     part = path.with_name(f"{path.name}.part")
     try:
-        with part.open("wb") as stream:
-            stream.write(content)
-            stream.flush()
-            os.fsync(stream.fileno())
+        write_through(part, content)
         if _is_sound(path):
             path.replace(older_name(path))
         part.replace(path)

@@ -205,10 +205,8 @@ class FixedLagSmoother:
             smoother._starter.go_on_from(meta["alignment"], intake.buffers)
         else:
             assert smoother._frame is not None
-            sensors, inertial = (
-                sensors_of_vehicle(vehicle, smoother._frame),
-                smoother._maker().inertial,
-            )
+            sensors = sensors_of_vehicle(vehicle, smoother._frame)
+            inertial = smoother._maker().inertial
             step = unpack_step(arrays, meta["watch"], sensors, smoother.config, inertial)
             smoother._course = course = smoother._course_from(step)
             course.advance()

@@ -169,9 +169,8 @@ class Starter:
             self._wait(f"{text} is there")
             return None
         begin_s = estimate.start.time_s
-        start = estimate.start
         problem = yield from build_problem_steps(
-            mission, self._config, start=start, begin_s=begin_s
+            mission, self._config, start=estimate.start, begin_s=begin_s
         )
         run = yield from run_fixed_lag_steps(problem, FixedLagConfig(0.0, tolerance=1e-3))
         newest = run.newest

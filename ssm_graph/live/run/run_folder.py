@@ -33,9 +33,8 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.io.mission_folder.toml import TOML_NAME
 from ssm_graph.io.mission_folder.vehicle import check_same_vehicle
 from ssm_graph.io.raw_log.log import RawLog, replay
-from ssm_graph.io.results.growing import GrowingResults
 from ssm_graph.io.results.summary import as_json
-from ssm_graph.io.results.tables import BEAMS_NAME, SUMMARY_NAME, TRAJECTORY_NAME
+from ssm_graph.io.results.tables import BEAMS_NAME, SUMMARY_NAME, TRAJECTORY_NAME, GrowingResults
 from ssm_graph.io.tables.append_file import AppendFile
 from ssm_graph.io.tables.checkpoint import CHECKPOINT_NAME, newest_checkpoint, write_checkpoint
 from ssm_graph.mission.navigation import Event
