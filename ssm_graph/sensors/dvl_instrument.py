@@ -71,6 +71,9 @@ _FLATTEST_GEOMETRY: Final = 0.01
 """Least singular value of directions that measure every component of a velocity."""
 _BEAMS: Final = (1, MOST_BEAMS)
 _PERCENT: Final = "1 percent is 0.01"
+_START_OF_WALK: Final = (
+    "expected with a scale_sigma above 0, the sigma at the start, got none; 0.01 is 1 percent"
+)
 _SPEED_UNIT: Final = "the unit is m/s, not mm/s"
 
 _SPEED: Final = Column(
@@ -115,11 +118,9 @@ _WATER: Final = Column(
 _KEYS: Final = {
     "file": FILE_KEY,
     "beam_azimuth_deg": Key(shape=(_BEAMS,), low=-360.0, high=360.0, required=False, unit=DEGREE),
-    "beam_janus_deg": Key(
-        positive=True,
-        high=45.0,
+    "beam_janus_deg": sigma_key(
+        *("", 45.0, "it is counted from the vertical; the horizontal angle is 90 minus this"),
         required=False,
-        hint="it is counted from the vertical; the horizontal angle is 90 minus this",
         unit=DEGREE,
     ),
     "beam_vectors": Key(shape=(_BEAMS, 3), required=False),
@@ -132,18 +133,13 @@ _KEYS: Final = {
     "scale_sigma": optional_key("mount.scale_sigma", 0.0, 1.0, _PERCENT),
     **late_keys("mount"),
     "scale_error": optional_key("mount.scale_error", -0.5, 0.5, _PERCENT),
-    "scale_walk_per_sqrt_h": replace(
-        optional_key(
-            "mount.scale_walk_density", 0.0, 1.0, "1 percent in an hour is 0.01", unit=PER_SQRT_H
-        ),
-        beside=(
-            "scale_sigma",
-            "expected with a scale_sigma above 0, the sigma at the start, got none; "
-            "0.01 is 1 percent",
-        ),
+    "scale_walk_per_sqrt_h": optional_key(
+        *("mount.scale_walk_density", 0.0, 1.0, "1 percent in an hour is 0.01"),
+        unit=PER_SQRT_H,
+        beside=("scale_sigma", _START_OF_WALK),
     ),
-    "beam_scale_error": Key(
-        "mount.beam_scale_error", shape=(_BEAMS,), low=-0.5, high=0.5, required=False, hint=_PERCENT
+    "beam_scale_error": optional_key(
+        "mount.beam_scale_error", -0.5, 0.5, _PERCENT, shape=(_BEAMS,)
     ),
     "beam_scale_sigma": optional_key("mount.beam_scale_sigma", 0.0, 1.0, _PERCENT),
     "lever_arm_sigma_m": optional_key("mount.lever_arm_sigma", *ARM_SIGMA),
@@ -154,8 +150,6 @@ _KEYS: Final = {
 
 class _Dvl(Instrument):
     """The way of a DVL: as many columns as it has beams, and sigmas that differ off the water."""
-
-    __slots__ = ()
 
     def bare(self, settings: Settings, lists: Lists) -> DvlLog:  # noqa: ARG002
         beams_d = _beams_d(settings)

@@ -111,25 +111,20 @@ def convert_rosbag(
 def _imu(bag: Path, table: Array, vehicle: Vehicle | None, options: RosOptions) -> ImuLog:
     if len(table) < 2:
         raise DataError(f"{bag}: the IMU's messages all have the same time")
-    _check_axes(bag, table[:, 4:7], options)
-    time_s = table[:, 0]
-    return ImuLog(
-        start_s=float(time_s[0] - np.median(np.diff(time_s))),
-        noise=NOISE if vehicle is None else vehicle.imu_noise,
-        time_s=time_s,
-        gyro_b=table[:, 1:4],
-        accel_b=table[:, 4:7],
-    )
-
-
-def _check_axes(bag: Path, accel_b: Array, options: RosOptions) -> None:
-    """Refuse specific force in other axes than the options state."""
+    time_s, accel_b = table[:, 0], table[:, 4:7]
     if np.median(accel_b[:, 2]) > 0.5 * np.median(np.linalg.norm(accel_b, axis=1)):
         raise DataError(
             f"{bag}: in {options.body.value} axes, linear_acceleration points down at rest; "
             "expected specific force, which points up; are the axes other ones: try  --body FRD  "
             "or  --body FLU"
         )
+    return ImuLog(
+        start_s=float(time_s[0] - np.median(np.diff(time_s))),
+        noise=NOISE if vehicle is None else vehicle.imu_noise,
+        time_s=time_s,
+        gyro_b=table[:, 1:4],
+        accel_b=accel_b,
+    )
 
 
 def _imu_notes(imu: ImuLog, topic: BagTopic, vehicle: Vehicle | None) -> list[str]:
