@@ -203,17 +203,14 @@ class Instrument:
     ) -> tuple[Any, list[str]]:
         """Check a table and return its log, and what is odd about it, a sentence each.
 
+        Raises :class:`DataError` for numbers that cannot be what their columns say.
+
         Parameters
         ----------
         table : with the columns of :meth:`spec`.
         bare : what :meth:`bare` made of the section.
         settings : the section.
         axes : of its body vectors.
-
-        Raises
-        ------
-        DataError
-            For numbers that cannot be what their columns say.
         """
         notes = self.check(table, bare, axes)
         return self.filled(table, bare, settings, axes), notes

@@ -208,7 +208,7 @@ def test_interrupted_write_keeps_the_old_mission(
     def fail(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(tomli_w, "dump", fail)
+    monkeypatch.setattr(tomli_w, "dumps", fail)
     shorter = without_optional_parts(make_mission())
     with pytest.raises(KeyboardInterrupt):
         write_mission(tmp_path, shorter)

@@ -46,6 +46,9 @@ class RawLog:
     and after :meth:`sync` a power failure. A disk that is full or fails stops nobody: rows then
     wait in memory, and :meth:`problems` says so.
 
+    Raises :class:`ConfigError` for a folder that holds a mission already. Raises :class:`OSError`
+    where the folder and the heads of its tables cannot be written.
+
     Parameters
     ----------
     folder : made if it does not exist; one that holds a mission is refused.
@@ -53,13 +56,6 @@ class RawLog:
     max_waiting : rows that may wait in memory for the disk; those that come then are lost.
     retry_every : rows after which the disk is tried again; at the latest, that is, for it is tried
         after a second of message time as well.
-
-    Raises
-    ------
-    ConfigError
-        For a folder that holds a mission already.
-    OSError
-        Where the folder and the heads of its tables cannot be written.
     """
 
     def __init__(
@@ -95,18 +91,14 @@ class RawLog:
     ) -> Self:
         """Go on with a log that another process began, full disk or not.
 
+        Raises :class:`ConfigError` for a folder without a log, and for the log of another vehicle
+        or of another version. Raises :class:`OSError` where the files cannot be opened.
+
         Parameters
         ----------
         folder : the log's.
         vehicle : that of the log; another one is refused.
         max_waiting, retry_every : as for a new log.
-
-        Raises
-        ------
-        ConfigError
-            For a folder without a log, and for the log of another vehicle or of another version.
-        OSError
-            Where the files cannot be opened.
         """
         check_same_vehicle(folder, vehicle)
         kinds = row_kinds(vehicle)

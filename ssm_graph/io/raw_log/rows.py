@@ -141,16 +141,14 @@ def replay(
     Rows whose letter was not written come last in the log of their process, the tables merged by
     time. Rows that are appended after this call are not among them.
 
+    Raises :class:`ConfigError` for a folder without a log, and for the log of another vehicle or of
+    another version.
+
     Parameters
     ----------
     folder : the log's.
     vehicle : that of the log; another one is refused.
     offsets : those of :meth:`RawLog.offsets`; a file that is not named is read from its start.
-
-    Raises
-    ------
-    ConfigError
-        For a folder without a log, and for the log of another vehicle or of another version.
     """
     check_same_vehicle(folder, vehicle)
     kinds = row_kinds(vehicle)

@@ -247,10 +247,7 @@ class GrowingResults:
 
         With a current ``trajectory.csv`` has its columns, and all rows have one.
 
-        Raises
-        ------
-        DataError
-            The folder cannot be made or written.
+        Raises :class:`DataError`: the folder cannot be made or written.
         """
         self._folder = folder
         self.problem: str | None = None
@@ -298,10 +295,7 @@ class GrowingResults:
     def finish(self, summary: Mapping[str, Any]) -> None:
         """Write what waits, and ``summary.json``, which makes the folder complete.
 
-        Raises
-        ------
-        DataError
-            It cannot be written.
+        Raises :class:`DataError`: it cannot be written.
         """
         self._write_waiting()
         part = self._folder / f".{SUMMARY_NAME}.part-{os.getpid()}"

@@ -78,6 +78,8 @@ def proven_beams(
 ) -> Beams:
     """Return directions and sign from the messages alone.
 
+    Raises :class:`DataError`: there are no directions, or they contradict the velocity.
+
     Parameters
     ----------
     stated : (B, 3) directions of the messages, or None.
@@ -85,11 +87,6 @@ def proven_beams(
         by quarters where the velocity shows a mounting rotation.
     may_turn : whether the data may turn the sign of the speeds.
     speed, velocity_d : (N, B) and (N, 3), m/s, NaN where unknown.
-
-    Raises
-    ------
-    DataError
-        There are no directions, or they contradict the velocity.
     """
     if water_linked:
         choices = _quarter_turns(WATER_LINKED_BEAMS)

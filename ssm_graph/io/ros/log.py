@@ -125,19 +125,14 @@ def is_rosbag(path: Path) -> bool:
 def read_rosbag(bag: Path, topics: Mapping[str, str]) -> Iterator[BagMessage]:
     """Yield the messages of the chosen topics in the order of their recording.
 
+    Raises :class:`MissingExtraError`: ``rosbags`` is not installed. Raises :class:`ConfigError`: A
+    role or topic is unknown, or more than one topic could serve a role. Raises :class:`DataError`:
+    the recording is damaged, has no topic for IMU or DVL, or messages of another layout.
+
     Parameters
     ----------
     bag : a recording, see `is_rosbag`.
     topics : by role, for every role that more than one topic could serve.
-
-    Raises
-    ------
-    MissingExtraError
-        ``rosbags`` is not installed.
-    ConfigError
-        A role or topic is unknown, or more than one topic could serve a role.
-    DataError
-        The recording is damaged, has no topic for IMU or DVL, or messages of another layout.
     """
     try:
         reader_class = import_module("rosbags.rosbag2").Reader

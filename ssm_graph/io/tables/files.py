@@ -74,17 +74,14 @@ class ParquetFile:
 def read_table(path: Path, label: str, spec: TableSpec) -> Table:
     """Read one table and check what needs no knowledge of the sensor.
 
+    Raises :class:`DataError` for a file that is no table, a missing, unknown or repeated column, a
+    cell that is no finite number, and times that do not increase; the message names the line.
+
     Parameters
     ----------
     path : the file; its ending decides the format.
     label : its name in messages.
     spec : the columns it must and may have.
-
-    Raises
-    ------
-    DataError
-        For a file that is no table, a missing, unknown or repeated column, a cell that is no
-        finite number, and times that do not increase; the message names the line.
     """
     table = _read(path, label, spec, _read_csv)
     check_finite(table, spec)
@@ -227,17 +224,14 @@ def read_arrival_table(path: Path, label: str, spec: TableSpec) -> Table:
     beyond the limits of the columns. Where they outnumber the good ones the table
     is not torn but of another kind, and is refused like any other.
 
+    Raises :class:`DataError` for a file that is no table, a missing, unknown or repeated column,
+    and rows most of which cannot be read.
+
     Parameters
     ----------
     path : the file; its ending decides the format.
     label : its name in messages.
     spec : the columns it must and may have.
-
-    Raises
-    ------
-    DataError
-        For a file that is no table, a missing, unknown or repeated column, and rows most of which
-        cannot be read.
     """
     counts = Counts()
     table = _read(path, label, spec, partial(_read_csv_as_it_came, counts=counts))

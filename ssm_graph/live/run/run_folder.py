@@ -126,19 +126,15 @@ class CheckpointWriter:
 class RunFolder:
     """One live run on the disk.
 
+    Raises :class:`ConfigError` for the run of another vehicle or of other settings, one that
+    another process writes, and for a folder that holds something else. Raises :class:`DataError`
+    for a folder that cannot be written.
+
     Parameters
     ----------
     folder : made if it does not exist; one that holds a run is gone on with.
     vehicle : whose run it is.
     settings : of the estimator; plain values with units in the keys.
-
-    Raises
-    ------
-    ConfigError
-        For the run of another vehicle or of other settings, one that another process writes, and
-        for a folder that holds something else.
-    DataError
-        For a folder that cannot be written.
     """
 
     def __init__(self, folder: Path, vehicle: Vehicle, settings: Mapping[str, Any]) -> None:

@@ -40,16 +40,13 @@ class OutputConfig:
 class SocketHub:
     """Reads all sources and sends to all outputs.
 
+    Raises :class:`ConfigError` for an unknown host, and for an address where nothing can listen.
+
     Parameters
     ----------
     inputs, outputs : what there is; connections are made on the way, again and again if need be.
     wall_s : the vehicle's clock, which stamps arrivals.
     steady_s : a clock that is never set, for rates and patience.
-
-    Raises
-    ------
-    ConfigError
-        For an unknown host, and for an address where nothing can listen.
     """
 
     is_finished = False
