@@ -176,14 +176,8 @@ def read_settings(
 ) -> Settings:
     """Check every key of a section.
 
-    Parameters
-    ----------
-    section : its name; with both brackets, ``[[beacon]] 2``, for one of a list.
-    raw : what the file holds under that name.
-    known : the keys that it may have.
-    file : the file's name in messages.
-    axes : body axes of its vectors.
-    may_miss : required keys that this file can do without.
+    ``section`` is its name; with both brackets, ``[[beacon]] 2``, for one of a list. ``may_miss``
+    are required keys that this file can do without.
     """
     place = f"{file} {place_of(section)}".rstrip()
     if not isinstance(raw, dict):

@@ -205,12 +205,7 @@ class Instrument:
 
         Raises :class:`DataError` for numbers that cannot be what their columns say.
 
-        Parameters
-        ----------
-        table : with the columns of :meth:`spec`.
-        bare : what :meth:`bare` made of the section.
-        settings : the section.
-        axes : of its body vectors.
+        ``bare`` is what :meth:`bare` made of the section; ``axes`` are those of its body vectors.
         """
         notes = self.check(table, bare, axes)
         return self.filled(table, bare, settings, axes), notes
@@ -299,11 +294,8 @@ class Instrument:
     ) -> tuple[Message, tuple[str, str] | None]:
         """Return a message without what cannot have been measured, and what was and why.
 
-        Parameters
-        ----------
-        message : with nothing that :meth:`problem` names.
-        near : (M, 1 + width) rows of the readings before and after it, as :meth:`log_of` has them.
-        bare : the instrument.
+        The message has nothing that :meth:`problem` names; ``near`` (M, 1 + width) are the readings
+        before and after it, as :meth:`log_of` has them.
         """
         return message, None
 

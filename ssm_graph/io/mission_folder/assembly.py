@@ -155,11 +155,8 @@ def _initial_within(imu: Any, vehicle: Vehicle | None) -> tuple[InitialState | N
 def _check(mission: Mission, tables: dict[str, Table], *, has_origin: bool) -> list[str]:
     """Check the parts of a mission against each other; return the notes.
 
-    Parameters
-    ----------
-    mission : its instruments are sound by themselves.
-    tables : by section, where their readings came from.
-    has_origin : whether the frame was stated, not taken from the first position.
+    ``tables`` by section are where the readings of its instruments, sound by themselves, came from;
+    ``has_origin`` says that the frame was stated, not taken from the first position.
     """
     notes = _times(mission, tables)
     _initial_time(mission, tables["imu"].label)

@@ -26,11 +26,7 @@ def calibration_toml(
     What the mission did not determine stays as it is stated, and a comment says so. The prior
     sigmas for going on from here are comments as well: without them the values are exact.
 
-    Parameters
-    ----------
-    mission : what was calibrated.
-    calibration : what was found.
-    axes : body axes of the file that the lines are for.
+    ``axes`` are the body axes of the file that the lines are for.
     """
     lines = [
         f"# Calibrated with mission {mission.name!r}. Put these values in the place of the stated",

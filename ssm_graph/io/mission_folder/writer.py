@@ -31,11 +31,8 @@ def write_mission(
     digits; angles may differ by rounding. An interrupted write leaves the old mission, or a folder
     without ``mission.toml``, never a mixture.
 
-    Parameters
-    ----------
-    folder : made if it does not exist; files of the same names are replaced.
-    mission : what to write; its notes are not.
-    table_format : CSV or Parquet.
+    The folder is made if it does not exist; files of the same names are replaced. The mission's
+    notes are not written.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)

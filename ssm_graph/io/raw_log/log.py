@@ -93,12 +93,6 @@ class RawLog:
 
         Raises :class:`ConfigError` for a folder without a log, and for the log of another vehicle
         or of another version. Raises :class:`OSError` where the files cannot be opened.
-
-        Parameters
-        ----------
-        folder : the log's.
-        vehicle : that of the log; another one is refused.
-        max_waiting, retry_every : as for a new log.
         """
         check_same_vehicle(folder, vehicle)
         kinds = row_kinds(vehicle)

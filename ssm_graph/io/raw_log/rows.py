@@ -28,10 +28,7 @@ _SIZES = re.compile(rb"@(\d+(?:,\d+)*);")
 class RowKind:
     """How messages of one instrument are written.
 
-    Parameters
-    ----------
-    instrument : one that is heard live.
-    bare : what is known of it: how many numbers a message has.
+    What is known of the instrument, ``bare``, says how many numbers a message has.
     """
 
     def __init__(self, instrument: Instrument, bare: Any) -> None:
@@ -144,11 +141,8 @@ def replay(
     Raises :class:`ConfigError` for a folder without a log, and for the log of another vehicle or of
     another version.
 
-    Parameters
-    ----------
-    folder : the log's.
-    vehicle : that of the log; another one is refused.
-    offsets : those of :meth:`RawLog.offsets`; a file that is not named is read from its start.
+    ``offsets`` are those of :meth:`RawLog.offsets`; a file that is not named is read from its
+    start.
     """
     check_same_vehicle(folder, vehicle)
     kinds = row_kinds(vehicle)

@@ -129,10 +129,7 @@ def read_rosbag(bag: Path, topics: Mapping[str, str]) -> Iterator[BagMessage]:
     role or topic is unknown, or more than one topic could serve a role. Raises :class:`DataError`:
     the recording is damaged, has no topic for IMU or DVL, or messages of another layout.
 
-    Parameters
-    ----------
-    bag : a recording, see `is_rosbag`.
-    topics : by role, for every role that more than one topic could serve.
+    ``topics`` names by role those that more than one topic could serve.
     """
     try:
         reader_class = import_module("rosbags.rosbag2").Reader

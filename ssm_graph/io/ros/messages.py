@@ -120,11 +120,7 @@ def imu_sample(message: Any, received_s: float, options: RosOptions = DEFAULTS) 
     Raises :class:`DataError`: the message has no turn rate or no acceleration, or they are not
     finite.
 
-    Parameters
-    ----------
-    message : any object with the fields of the type.
-    received_s : taken as the time where the header's stamp is zero, s.
-    options : its ``body`` names the axes of the message.
+    ``received_s`` is its time where the header's stamp is zero; the options name its axes.
     """
     for field in ("angular_velocity", "linear_acceleration"):
         if float(getattr(message, f"{field}_covariance")[0]) == -1.0:

@@ -77,11 +77,7 @@ def read_table(path: Path, label: str, spec: TableSpec) -> Table:
     Raises :class:`DataError` for a file that is no table, a missing, unknown or repeated column, a
     cell that is no finite number, and times that do not increase; the message names the line.
 
-    Parameters
-    ----------
-    path : the file; its ending decides the format.
-    label : its name in messages.
-    spec : the columns it must and may have.
+    The ending of ``path`` decides the format; ``label`` is its name in messages.
     """
     table = _read(path, label, spec, _read_csv)
     check_finite(table, spec)
@@ -227,11 +223,7 @@ def read_arrival_table(path: Path, label: str, spec: TableSpec) -> Table:
     Raises :class:`DataError` for a file that is no table, a missing, unknown or repeated column,
     and rows most of which cannot be read.
 
-    Parameters
-    ----------
-    path : the file; its ending decides the format.
-    label : its name in messages.
-    spec : the columns it must and may have.
+    The ending of ``path`` decides the format; ``label`` is its name in messages.
     """
     counts = Counts()
     table = _read(path, label, spec, partial(_read_csv_as_it_came, counts=counts))

@@ -14,10 +14,7 @@ _SPARE: Final = 1024
 class TimedRows:
     """Rows of numbers sorted by the first one, the time; no time twice.
 
-    Parameters
-    ----------
-    width : numbers of a row beside its time.
-    n_key : so many numbers behind the time tell rows of one time apart.
+    ``width`` numbers stand beside the time; the first ``n_key`` tell rows of one time apart.
     """
 
     def __init__(self, width: int, *, n_key: int = 0) -> None:

@@ -157,10 +157,7 @@ def parse_object(
     Refused beyond the grammar: NaN and Infinity, numbers that overflow, integers of more than 20
     digits, keys that come twice, more than 200 brackets (and with them deep nesting).
 
-    Parameters
-    ----------
-    text : one object.
-    parse_float : reads a number with a point or exponent; the nearest float unless given.
+    ``parse_float`` reads a number with a point or exponent; the nearest float unless given.
     """
     if text.count("[") + text.count("{") > _MAX_BRACKETS:
         raise RefusedError(f"expected a flat JSON object, got more than {_MAX_BRACKETS} brackets")

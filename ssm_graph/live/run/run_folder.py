@@ -77,10 +77,7 @@ class Resumed:
 class CheckpointWriter:
     """Writes one checkpoint at a time in a thread of its own.
 
-    Parameters
-    ----------
-    folder : where they go.
-    synced : files that have to be on the disk before the checkpoint that counts on them.
+    Files that are ``synced`` have to be on the disk before the checkpoint that counts on them.
     """
 
     def __init__(self, folder: Path, synced: Sequence[Path] = ()) -> None:
@@ -130,11 +127,8 @@ class RunFolder:
     another process writes, and for a folder that holds something else. Raises :class:`DataError`
     for a folder that cannot be written.
 
-    Parameters
-    ----------
-    folder : made if it does not exist; one that holds a run is gone on with.
-    vehicle : whose run it is.
-    settings : of the estimator; plain values with units in the keys.
+    The folder is made if it does not exist; one that holds a run is gone on with. The settings are
+    those of the estimator: plain values with units in the keys.
     """
 
     def __init__(self, folder: Path, vehicle: Vehicle, settings: Mapping[str, Any]) -> None:

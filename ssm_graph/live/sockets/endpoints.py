@@ -71,11 +71,8 @@ def parse_endpoint(text: str, *, where: str, allowed: Collection[Transport] = IN
 
     Raises :class:`ConfigError` for any other text.
 
-    Parameters
-    ----------
-    text : for example ``tcp://192.168.194.95:16171``, ``udp://:9000``, ``tcp-listen://[::1]:7000``.
-    where : the option it belongs to, for the message.
-    allowed : what may be used there.
+    For example ``tcp://192.168.194.95:16171``, ``udp://:9000``, ``tcp-listen://[::1]:7000``;
+    ``where`` is the option it belongs to, ``allowed`` what may be used there.
     """
     wanted = " or ".join(FORMS[kind] for kind in Transport if kind in allowed)
     found = _ADDRESS.fullmatch(text.strip())
@@ -136,12 +133,8 @@ def bound(endpoint: Endpoint) -> socket.socket:
 class Listener:
     """A server's socket: takes clients as long as there is room.
 
-    Parameters
-    ----------
-    endpoint : where it listens.
-    selector, owner : whom the selector names when somebody calls.
-    most : clients at once; more are refused.
-    tell : notes an event, of this kind, text and severity.
+    More than ``most`` clients at once are refused. ``tell`` notes an event, of this kind, text and
+    severity; the selector names ``owner`` when somebody calls.
     """
 
     def __init__(

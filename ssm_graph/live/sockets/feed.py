@@ -73,12 +73,7 @@ class Channel:
 class Feed:
     """One source: bytes to messages, limited and counted.
 
-    Parameters
-    ----------
-    name : for people, such as ``dvl``.
-    address : where it comes from, for people.
-    make_decoder : of a new connection.
-    limits, events : what it may do and where it is told.
+    ``name`` and ``address`` are for people; every connection has a decoder of its own.
     """
 
     def __init__(

@@ -228,10 +228,7 @@ class Every:
 class Publisher:
     """Sends the newest answer, in every form that somebody listens to.
 
-    Parameters
-    ----------
-    rate_hz, nmea_rate_hz : JSON lines and NMEA sentences at most so often, by the vehicle's clock.
-    geoid_separation_m : of the heights in NMEA sentences.
+    JSON lines and NMEA sentences go at most so often, by the vehicle's clock.
     """
 
     def __init__(

@@ -42,11 +42,8 @@ class SocketHub:
 
     Raises :class:`ConfigError` for an unknown host, and for an address where nothing can listen.
 
-    Parameters
-    ----------
-    inputs, outputs : what there is; connections are made on the way, again and again if need be.
-    wall_s : the vehicle's clock, which stamps arrivals.
-    steady_s : a clock that is never set, for rates and patience.
+    Connections are made on the way, again and again if need be. ``wall_s`` is the vehicle's clock,
+    which stamps arrivals; ``steady_s`` one that is never set, for rates and patience.
     """
 
     is_finished = False
