@@ -14,9 +14,8 @@ from hypothesis import strategies as st
 
 from ssm_graph.base.errors import ConfigError, DataError, MissingExtraError
 from ssm_graph.base.units import in_unit
-from ssm_graph.io.mission_folder.reader import read_mission
+from ssm_graph.io.mission_folder.folder import read_mission, write_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle, vehicle_of
-from ssm_graph.io.mission_folder.writer import write_mission
 from ssm_graph.io.tables import files as tables_module
 from ssm_graph.io.tables.files import TableFormat
 from ssm_graph.mission.mission import Aids, Mission

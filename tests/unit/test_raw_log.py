@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.units import DEGREE, exactly_in_unit
-from ssm_graph.io.mission_folder.reader import read_mission
+from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.io.raw_log import log as raw_log
 from ssm_graph.io.raw_log import rows as raw_rows

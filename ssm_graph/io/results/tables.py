@@ -21,7 +21,7 @@ from ssm_graph.base.errors import DataError
 from ssm_graph.base.frames import BodyAxes
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.units import DEG_PER_H, MICRO_G
-from ssm_graph.io.mission_folder.calibration_toml import CALIBRATION_NAME, calibration_toml
+from ssm_graph.io.mission_folder.folder import CALIBRATION_NAME, calibration_toml
 from ssm_graph.io.results.summary import MetricsLike, build_summary
 from ssm_graph.io.tables.append_file import TORN_ROW, AppendFile, write_through
 from ssm_graph.io.tables.csv_tables import (
