@@ -41,14 +41,8 @@ def ecef_from_geodetic(lat: Array | float, lon: Array | float, height: Array | f
     )
     _, radius = radii_of_curvature(lat)
     horizontal = (radius + height) * np.cos(lat)
-    return np.stack(
-        [
-            horizontal * np.cos(lon),
-            horizontal * np.sin(lon),
-            (radius * (1.0 - ECCENTRICITY_SQ) + height) * np.sin(lat),
-        ],
-        axis=-1,
-    )
+    z = (radius * (1.0 - ECCENTRICITY_SQ) + height) * np.sin(lat)
+    return np.stack([horizontal * np.cos(lon), horizontal * np.sin(lon), z], axis=-1)
 
 
 def geodetic_from_ecef(p_e: Array) -> tuple[Array, Array, Array]:
@@ -69,12 +63,8 @@ def geodetic_from_ecef(p_e: Array) -> tuple[Array, Array, Array]:
         )
         beta = np.arctan2((1.0 - FLATTENING) * np.sin(lat), np.cos(lat))
     sin_lat, cos_lat = np.sin(lat), np.cos(lat)
-    height = (
-        horizontal * cos_lat
-        + z * sin_lat
-        - SEMI_MAJOR_AXIS * np.sqrt(1.0 - ECCENTRICITY_SQ * sin_lat**2)
-    )
-    return lat, np.arctan2(y, x), height
+    surface = SEMI_MAJOR_AXIS * np.sqrt(1.0 - ECCENTRICITY_SQ * sin_lat**2)
+    return lat, np.arctan2(y, x), horizontal * cos_lat + z * sin_lat - surface
 
 
 def R_el_from_lat_lon(lat: Array | float, lon: Array | float) -> Array:

@@ -153,14 +153,10 @@ class _Dvl(Instrument):
 
     def bare(self, settings: Settings, lists: Lists) -> DvlLog:  # noqa: ARG002
         beams_d = _beams_d(settings)
-        if "beam_scale_error" in settings and len(settings.array("beam_scale_error")) != len(
-            beams_d
-        ):
-            raise settings.fault(
-                "beam_scale_error",
-                f"expected {len(beams_d)} numbers, one of each beam, got "
-                f"{len(settings.array('beam_scale_error'))}",
-            )
+        key, n_beams = "beam_scale_error", len(beams_d)
+        if key in settings and len(settings.array(key)) != n_beams:
+            got = len(settings.array(key))
+            raise settings.fault(key, f"expected {n_beams} numbers, one of each beam, got {got}")
         given = {name.removeprefix("mount."): value for name, value in settings.given().items()}
         R_bd = R_bd_from_rpy(np.asarray(settings.si("mounting_rpy_deg")))
         mount = build(DvlMount, {"beams_d": beams_d, "R_bd": R_bd, **given})

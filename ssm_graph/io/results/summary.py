@@ -10,6 +10,8 @@ from typing import Any, Final, Protocol
 
 import numpy as np
 
+from ssm_graph.base.settings import written
+from ssm_graph.io.mission_folder.toml import INITIAL_KEYS
 from ssm_graph.mission.estimate import (
     OUTLIER_WEIGHT,
     AidTable,
@@ -19,7 +21,7 @@ from ssm_graph.mission.estimate import (
     Trajectory,
     path_length_m,
 )
-from ssm_graph.mission.mission import InitialState, Mission
+from ssm_graph.mission.mission import Mission
 
 PACKAGES: Final = ("ssm_graph", "gtsam", "numpy", "scipy")
 """Names in the summary; distributions have hyphens."""
@@ -64,7 +66,8 @@ def build_summary(
         "total_path_length_m": total_path,
         "final": _final(trajectory),
         "start": {
-            **_start(estimate.start),
+            **written(estimate.start, INITIAL_KEYS),
+            "heading_deg": np.rad2deg(estimate.start.heading) % 360.0,
             "origin": "mission" if mission.initial is not None else "alignment",
         },
         "calibration": calibration_fields(estimate.calibration),
@@ -159,23 +162,6 @@ def current_fields(current: CurrentTrack | None) -> dict[str, Any]:
         "mean_sigma_enu_m_per_s": current.sigma_enu.mean(axis=0),
         "final_enu_m_per_s": current.velocity_enu[-1],
         "final_sigma_enu_m_per_s": current.sigma_enu[-1],
-    }
-
-
-def _start(start: InitialState) -> dict[str, Any]:
-    """Return the initial state with the keys of the mission format's ``[initial]``."""
-    return {
-        "time_s": start.time_s,
-        "lat_deg": np.rad2deg(start.lat),
-        "lon_deg": np.rad2deg(start.lon),
-        "height_m": start.height,
-        "vel_enu_m_per_s": start.velocity_enu,
-        "roll_deg": np.rad2deg(start.roll),
-        "pitch_deg": np.rad2deg(start.pitch),
-        "heading_deg": np.rad2deg(start.heading) % 360.0,
-        "position_sigma_m": start.position_sigma_enu,
-        "velocity_sigma_m_per_s": start.velocity_sigma_enu,
-        "attitude_sigma_deg": np.rad2deg(start.attitude_sigma),
     }
 
 

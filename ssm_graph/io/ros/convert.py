@@ -150,7 +150,7 @@ def _dvl(
     _, speed, sigma, ranges, velocity_d, covariance, water = np.split(table, edges, axis=1)
     water_track = water[:, 0] if water.any() else None
     if not np.isfinite(speed).any():
-        if vehicle is not None and _gives_velocity(vehicle.mount, velocity_d):
+        if vehicle is not None and _has_axes(vehicle.mount) and np.isfinite(velocity_d).any():
             return _velocities(table[:, 0], velocity_d, covariance, vehicle, water_track)
         raise DataError(
             f"{bag}: topic {topic.name} holds {len(table)} messages and not one beam speed; "
@@ -187,11 +187,10 @@ def _dvl(
     return log, notes
 
 
-def _gives_velocity(mount: DvlMount, velocity_d: Array) -> bool:
-    """Return whether the vehicle's DVL has three axes for beams, and messages a velocity."""
+def _has_axes(mount: DvlMount) -> bool:
+    """Return whether an instrument has its three axes for beams: a velocity alone."""
     beams_d = mount.beams_d
-    is_axes = mount.n_beams == 3 and np.allclose(beams_d @ beams_d.T, np.eye(3), atol=1e-6)
-    return bool(is_axes and np.isfinite(velocity_d).any())
+    return mount.n_beams == 3 and np.allclose(beams_d @ beams_d.T, np.eye(3), atol=1e-6)
 
 
 def _velocities(

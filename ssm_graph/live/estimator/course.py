@@ -17,8 +17,14 @@ from ssm_graph.engine.error_state import VELOCITY
 from ssm_graph.graph.inertial_rows import InertialRows
 from ssm_graph.live.estimator.buffers import Buffers, Measured
 from ssm_graph.live.estimator.keyframes import KeyframeMaker
-from ssm_graph.live.estimator.recovery import Doubt, Doubted, doubt_of, reanchored, watch_after
-from ssm_graph.live.estimator.reserve import Reserve
+from ssm_graph.live.estimator.recovery import (
+    Doubt,
+    Doubted,
+    Reserve,
+    doubt_of,
+    reanchored,
+    watch_after,
+)
 from ssm_graph.live.estimator.watch import Watch, is_sound, observe
 from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.navigation import Severity

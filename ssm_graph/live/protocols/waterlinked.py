@@ -97,24 +97,24 @@ class WaterLinkedDecoder(Decoder):
         self._last: dict[str, Any] = {}
 
     def _decode(self, text: str, arrival_s: float) -> list[Message]:
-        ping = self._ping(parse_object(text), arrival_s)
-        return [] if ping is None else [ping]
-
-    def _ping(self, report: dict[str, Any], arrival_s: float) -> Ping | None:
+        report = parse_object(text)
         kind = require(report, "type")
         if kind != "velocity":
             if isinstance(kind, str) and kind in IGNORED:
-                return None
+                return []
             raise RefusedError(f"expected a report of type 'velocity', got {shown(kind)}")
         beams = _transducers(report)
-        speed = _speeds(beams) if self._counts(report, beams) else (math.nan,) * len(beams)
+        counts = self._counts(report, beams)
+        speed = tuple(
+            float(x["velocity"]) if counts and x["beam_valid"] else math.nan for x in beams
+        )
         centre_s = _time_of_validity(report)
         if self._is_repeat(report):
             self.n_repeats += 1
-            return None
+            return []
         ping = Ping(time_s=self._stamper.stamp(centre_s, arrival_s), speed=speed)
         self._last = report
-        return ping
+        return [ping]
 
     def _is_repeat(self, report: dict[str, Any]) -> bool:
         stamp = report.get("time_of_validity", 0)
@@ -151,10 +151,6 @@ def _transducers(report: dict[str, Any]) -> list[dict[str, Any]]:
         largest = LARGEST_SPEED if flag(beam, "beam_valid") else math.inf
         number(require(beam, "velocity"), key="velocity", low=-largest, high=largest)
     return beams
-
-
-def _speeds(beams: list[dict[str, Any]]) -> tuple[float, ...]:
-    return tuple(float(x["velocity"]) if x["beam_valid"] else math.nan for x in beams)
 
 
 def _time_of_validity(report: dict[str, Any]) -> float | None:

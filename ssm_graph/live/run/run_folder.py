@@ -22,7 +22,7 @@ import sys
 import threading
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import IO, Any, Final
 
@@ -32,7 +32,8 @@ from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.io.mission_folder.toml import TOML_NAME
 from ssm_graph.io.mission_folder.vehicle import check_same_vehicle
-from ssm_graph.io.raw_log.log import RawLog, replay
+from ssm_graph.io.raw_log.log import RawLog
+from ssm_graph.io.raw_log.rows import ALWAYS, ARRIVALS, replay
 from ssm_graph.io.results.summary import as_json
 from ssm_graph.io.results.tables import BEAMS_NAME, SUMMARY_NAME, TRAJECTORY_NAME, GrowingResults
 from ssm_graph.io.tables.append_file import AppendFile
@@ -68,10 +69,6 @@ class Resumed:
     """Time of the last inertial one of them."""
     notes: tuple[str, ...] = ()
     """What a person should know, one sentence each."""
-
-    def without_checkpoint(self, why: str) -> Resumed:
-        """Return the begin of the run."""
-        return Resumed(notes=(*self.notes, why))
 
 
 class CheckpointWriter:
@@ -147,8 +144,9 @@ class RunFolder:
         self.event_problem: str | None = None
         self.results: GrowingResults | None = None
         self.log: RawLog | None = None
-        names = (*_log_names(folder), folder / TRAJECTORY_NAME, folder / BEAMS_NAME)
-        self.writer = CheckpointWriter(folder, names)
+        log_names = [f"{LOG_NAME}/{name}" for name in (*ALWAYS, ARRIVALS)]
+        names = (*log_names, TRAJECTORY_NAME, BEAMS_NAME)
+        self.writer = CheckpointWriter(folder, [folder / name for name in names])
         self._known: Counter[bytes] = Counter()
 
     def resume(self) -> Resumed:
@@ -176,7 +174,9 @@ class RunFolder:
         """Return what was logged since, and get ready to write results and events once more."""
         has_current = self.vehicle.current is not None
         self.results = GrowingResults(self.path, sizes=resumed.sizes, has_current=has_current)
-        self._known = _lines_from(self.path / EVENTS_NAME, resumed.sizes.get(EVENTS_NAME, 0))
+        with (self.path / EVENTS_NAME).open("rb") as stream:
+            stream.seek(resumed.sizes.get(EVENTS_NAME, 0))
+            self._known = Counter(stream)
         if not self._has_log:
             return iter(())
         return replay(self.path / LOG_NAME, self.vehicle, resumed.offsets)
@@ -313,24 +313,8 @@ def _locked(folder: Path) -> IO[str]:
     return lock
 
 
-def _log_names(folder: Path) -> tuple[Path, ...]:
-    names = ("imu.csv", "dvl.csv", "depth.csv", "gnss.csv", "arrivals")
-    return tuple(folder / LOG_NAME / name for name in names)
-
-
-def _lines_from(path: Path, start: int) -> Counter[bytes]:
-    with path.open("rb") as stream:
-        stream.seek(start)
-        return Counter(stream)
-
-
 def _line(event: Event) -> bytes:
-    fields = {
-        "time_s": event.time_s,
-        "severity": event.severity.value,
-        "kind": event.kind,
-        "text": event.text,
-    }
+    fields = asdict(event) | {"severity": event.severity.value}
     return (json.dumps(as_json(fields), ensure_ascii=False) + "\n").encode()
 
 

@@ -243,9 +243,8 @@ class Runner:
                 return resumed
             except Exception as error:
                 self._events.failure("checkpoint", "restore_failed", error)
-                resumed = resumed.without_checkpoint(
-                    "the checkpoint could not be restored; the whole log was gone through"
-                )
+                lost = "the checkpoint could not be restored; the whole log was gone through"
+                resumed = Resumed(notes=(*resumed.notes, lost))
         self._estimator = self._engine.new()
         return resumed
 

@@ -192,19 +192,11 @@ class TcpServerOutput(Output):
 
 
 class Outlet(Protocol):
-    """Takes answers as bytes; never waits."""
+    """Takes answers as bytes, in the forms that somebody wants, and says how they are doing."""
 
-    def wants(self, form: OutputFormat) -> bool:
-        """Return whether anybody listens to this form."""
-        ...
-
-    def send(self, form: OutputFormat, data: bytes) -> None:
-        """Send one answer to everybody who listens to this form."""
-        ...
-
-    def output_status(self) -> tuple[OutputStatus, ...]:
-        """Return how the outputs are doing."""
-        ...
+    def wants(self, form: OutputFormat) -> bool: ...  # noqa: D102
+    def send(self, form: OutputFormat, data: bytes) -> None: ...  # noqa: D102
+    def output_status(self) -> tuple[OutputStatus, ...]: ...  # noqa: D102
 
 
 class Every:
