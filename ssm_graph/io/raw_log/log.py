@@ -70,7 +70,7 @@ class RawLog:
         folder.mkdir(parents=True, exist_ok=True)
         kinds = row_kinds(vehicle)
         _refuse_content(folder, kinds.values())
-        self._open(folder, kinds, max_waiting=max_waiting, retry_every=retry_every)
+        self._open(folder, kinds, max_waiting, retry_every)
         for kind in kinds.values():
             if kind.file in self._tables:
                 self._tables[kind.file].append(kind.header)
@@ -98,7 +98,7 @@ class RawLog:
         kinds = row_kinds(vehicle)
         check_columns(folder, kinds.values())
         log = cls.__new__(cls)
-        log._open(Path(folder), kinds, max_waiting=max_waiting, retry_every=retry_every)
+        log._open(Path(folder), kinds, max_waiting, retry_every)
         tables = [log._tables.get(kind.file) for kind in kinds.values()]
         sizes = ",".join(str(0 if table is None else table.size) for table in tables)
         log._waiting.append(_Row(log._arrivals, f"\n@{sizes};\n".encode(), b""))
@@ -114,7 +114,6 @@ class RawLog:
         self,
         folder: Path,
         kinds: Mapping[type[Message], RowKind],
-        *,
         max_waiting: int,
         retry_every: int,
     ) -> None:

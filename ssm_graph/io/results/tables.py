@@ -23,14 +23,8 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.base.units import DEG_PER_H, MICRO_G
 from ssm_graph.io.mission_folder.folder import CALIBRATION_NAME, calibration_toml
 from ssm_graph.io.results.summary import MetricsLike, build_summary
+from ssm_graph.io.tables import csv_tables
 from ssm_graph.io.tables.append_file import TORN_ROW, AppendFile, write_through
-from ssm_graph.io.tables.csv_tables import (
-    CsvFile,
-    check_is_text,
-    check_last_line,
-    read_csv_header,
-    read_csv_values,
-)
 from ssm_graph.mission.estimate import AidTable, BeamTable, CurrentTrack, Estimate, Trajectory
 from ssm_graph.mission.mission import Mission
 
@@ -223,15 +217,15 @@ def _summary_text(summary: Mapping[str, Any]) -> str:
 
 def _read_table(path: Path, required: tuple[str, ...]) -> dict[str, Array]:
     """Return the columns of one table by name."""
-    file = CsvFile(path, str(path))
+    file = csv_tables.CsvFile(path, str(path))
     try:
-        check_is_text(file)
-        names = read_csv_header(file)
+        csv_tables.check_is_text(file)
+        names = csv_tables.read_csv_header(file)
         missing = [name for name in required if name not in names]
         if missing:
             raise DataError(f"{path}:1: column {missing[0]!r} is missing; is it a result table?")
-        values = read_csv_values(file, names, blank=frozenset(names))
-        check_last_line(file)
+        values = csv_tables.read_csv_values(file, names, blank=frozenset(names))
+        csv_tables.check_last_line(file)
     except OSError as error:
         raise DataError(f"{path}: cannot be read: {error.strerror or error}") from error
     return {name: values[:, index] for index, name in enumerate(names)}
