@@ -19,8 +19,8 @@ from ssm_graph.base.stepwise import Steps, finished
 from ssm_graph.imu.increments import MergedSamples, merge_samples_steps
 from ssm_graph.sensors.imu import ImuLog, ImuNoise
 
-AT_ONCE = 64
-"""So many intervals are read from GTSAM at a time: some 6 ms."""
+AT_ONCE = 16
+"""So many intervals are read from GTSAM at a time: some 1.6 ms."""
 INTEGRATION_DENSITY = 1e-4
 """m/sqrt(s): what the integration itself loses. At 20 Hz a constant force within each sample costs
 0.15 mm of position a wave; this density costs 6 mm in an hour. It also keeps intervals of one

@@ -86,8 +86,8 @@ class AidTable(FrozenArrays):
     def counts(self) -> dict[str, tuple[int, int]]:
         """Return how many measurements each aid had, and how many ended as outliers."""
         names = np.array(self.aid)
-        # The first component stands for the measurement: east of positions and velocities.
-        is_first = ~np.isin(self.component, ("north", "up"))
+        # The first component stands for the measurement: east, or x, of what is a vector.
+        is_first = ~np.isin(self.component, ("north", "up", "y", "z"))
         found = {}
         for name in dict.fromkeys(self.aid):
             weights = self.weight[is_first & (names == name)]

@@ -192,7 +192,7 @@ def aid_logs(
         log, is_gross = instrument.read(trajectory, end_s=end_s, streams=streams, noisy=noisy)
         others.append(log)
         gross[log.SECTION.strip("[]")] = is_gross
-    logs = Aids(usbl, ranges, heading, *settings.standstills, *others)
+    logs = Aids(usbl, ranges, heading, *others, *settings.standstills)
     return SimulatedAids(logs, gross, errors)
 
 

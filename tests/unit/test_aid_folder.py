@@ -48,7 +48,7 @@ def test_round_trip(tmp_path: Path, sim: SimulatedMission, order: str) -> None:
 
 def test_sections_say_what_there_is(tmp_path: Path, sim: SimulatedMission) -> None:
     """In a mission as in its vehicle, whose live estimator does without."""
-    names = ("[usbl]", "[ranges]", "[heading]", "[[standstill]]")
+    names = ("[usbl]", "[ranges]", "[heading]", "[magnetometer]", "[[standstill]]")
     assert sim.mission.aids.sections == names
     assert vehicle_of(sim.mission).aids.sections == names
     write_mission(tmp_path, sim.mission)
@@ -69,12 +69,24 @@ def test_results_tell_of_every_measurement(tmp_path: Path, sim: SimulatedMission
     write_results(tmp_path, estimate, mission=sim.mission, metrics=metrics, settings={})
     with (tmp_path / "aids.csv").open(encoding="utf-8", newline="") as stream:
         rows = list(csv.DictReader(stream))
-    assert {row["aid"] for row in rows} == {"USBL", "range", "heading", "standstill"}
-    assert {row["unit"] for row in rows} == {"m", "deg", "m/s"}
+    assert {row["aid"] for row in rows} == {
+        "USBL",
+        "range",
+        "heading",
+        "magnetometer",
+        "standstill",
+    }
+    assert {row["unit"] for row in rows} == {"m", "deg", "m/s", "uT"}
     headings = [float(row["innovation"]) for row in rows if row["unit"] == "deg"]
     assert 0.2 < np.std(headings) < 5.0
     counted = read_results(tmp_path).summary["aids"]
-    for name, components in (("USBL", 3), ("range", 1), ("heading", 1), ("standstill", 3)):
+    for name, components in (
+        ("USBL", 3),
+        ("range", 1),
+        ("heading", 1),
+        ("magnetometer", 3),
+        ("standstill", 3),
+    ):
         n_rows = sum(row["aid"] == name for row in rows)
         assert counted[name]["n_measurements"] * components == n_rows
     calibration = read_results(tmp_path).summary["calibration"]

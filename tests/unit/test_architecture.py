@@ -266,8 +266,12 @@ MAY_WRITE = {
         for name in ("torn", "torn_end", "impossible", "late", "repeated", "contrary")
     },
     "ssm_graph/io/tables/checkpoint.py": {"archive.comment"},
-    "ssm_graph/live/estimator/smoother.py": {"self._intake.horizon_s", "intake.shift_s"},
-    "ssm_graph/live/run/feed.py": {"channel.fed_s", "channel.heard_s", "channel.decoder"},
+    "ssm_graph/live/estimator/smoother.py": {
+        "self._intake.horizon_s",
+        "intake.horizon_s",
+        "intake.shift_s",
+    },
+    "ssm_graph/live/sockets/feed.py": {"channel.fed_s", "channel.heard_s", "channel.decoder"},
     "ssm_graph/live/sockets/inputs.py": {"self._channel.heard_s", "self.feed.n_reconnects"},
     "ssm_graph/report/mission/summary.py": {
         "table.columns[1].justify",

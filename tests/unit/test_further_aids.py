@@ -377,8 +377,9 @@ def test_every_aid_at_once() -> None:
     estimate = SsmSmoother().solve(build_problem(at_rest.mission))
     assert estimate.status is Status.CONVERGED, estimate.reason
     assert estimate.aids is not None
-    assert set(estimate.aids.aid) == {"USBL", "range", "heading", "standstill"}
+    assert set(estimate.aids.aid) == {"USBL", "range", "heading", "magnetometer", "standstill"}
     assert set(estimate.aids.component) == {
+        *("x", "y", "z"),
         "east",
         "north",
         "up",

@@ -30,6 +30,7 @@ from ssm_graph.sensors.depth import DepthReading
 from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.gnss import Fix
 from ssm_graph.sensors.imu import ImuSample
+from ssm_graph.sensors.magnetometer import MagneticReading
 from ssm_graph.sensors.messages import Message, bad_number
 from ssm_graph.sensors.registry import BY_MESSAGE
 from tests.helpers import STEADY
@@ -79,6 +80,7 @@ LINES = {
     ' "sigma_m": [1, 2, 3], "delay_s": 1.5}',
     "ranges": '{"type": "ranges", "time_s": 5, "beacon": 4, "range_m": 130.5, "sigma_m": 0.3}',
     "heading": '{"type": "heading", "time_s": 6, "heading_deg": 90}',
+    "magnetometer": '{"type": "magnetometer", "time_s": 7, "mag_ut": [20, -5, 44]}',
 }
 
 
@@ -112,7 +114,7 @@ def test_all_kinds_of_message_have_a_schema() -> None:
 def test_lines_of_the_documentation() -> None:
     """Written by hand: integers are numbers, null is a missing beam, degrees become radians."""
     messages, refused = decode("\n".join([*LINES.values(), ""]).encode())
-    imu, ping, depth, fix, acoustic, reach, heading = messages
+    imu, ping, depth, fix, acoustic, reach, heading, magnetic = messages
     assert imu == ImuSample(1.0, (1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
     assert isinstance(ping, Ping)
     assert ping == Ping(1.5, (0.1, math.nan, -0.3, 0.4))
@@ -122,6 +124,8 @@ def test_lines_of_the_documentation() -> None:
     assert acoustic == UsblFix(4.0, *place, (1.0, 2.0, 3.0), 1.5)
     assert reach == AcousticRange(5.0, 4.0, 130.5, 0.3)
     assert heading == HeadingReading(6.0, math.radians(90.0))
+    assert isinstance(magnetic, MagneticReading)
+    assert magnetic.field_b == pytest.approx((20e-6, -5e-6, 44e-6))
     assert not refused
 
 

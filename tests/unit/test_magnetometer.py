@@ -53,7 +53,9 @@ def test_another_unit_is_named(tmp_path: Path, factor: float, unit: str) -> None
     table = folder_of(tmp_path) / "magnetometer.csv"
     head, *rows = table.read_text().splitlines()
     cells = [[float(cell) for cell in row.split(",")] for row in rows]
-    scaled = [",".join(map(repr, [t, *(0.3 * factor * x for x in read)])) for t, *read in cells]
+    scaled = [
+        ",".join(map(repr, [t, *(20.0 / 49.5 * factor * x for x in read)])) for t, *read in cells
+    ]
     table.write_text("\n".join([head, *scaled]) + "\n")
     toml = table.with_name("mission.toml")
     text = toml.read_text()

@@ -39,7 +39,7 @@ class MagneticFields(Aid):
 
     SHARED = frozenset({"sigma", "field_enu", "hard_iron_b", "soft_iron", "frame"})
     name = "magnetometer"
-    unit = "T"
+    unit = "uT"
     hint = "look at its axes, the stated field and declination, and at what iron is near it"
     section = MagnetometerLog.SECTION
 
@@ -118,8 +118,8 @@ class MagneticFields(Aid):
 
     @property
     def root_information(self) -> Array:
-        """(M, 3, 3) 1/T."""
-        return np.broadcast_to(np.eye(3) / self.sigma, (len(self), 3, 3))
+        """(M, 3, 3) 1/uT."""
+        return np.broadcast_to(np.eye(3) * (MICROTESLA / self.sigma), (len(self), 3, 3))
 
     @property
     def labels(self) -> list[str]:
@@ -127,7 +127,7 @@ class MagneticFields(Aid):
         return ["x", "y", "z"] * len(self)
 
     def measured(self, at: RowStates) -> Linearised:
-        """Linearise readings: three components each, in the body axes of the reading."""
+        """Linearise readings: three components each, body axes of the reading, in microtesla."""
         extras, R_nl = at.extras, self.frame.R_nl_at(at.p_n)
         field_enu = self.field_enu + at.value(EARTH_FIELD, 3)
         residual = field_residual(
@@ -147,4 +147,4 @@ class MagneticFields(Aid):
         ):
             if name in extras:
                 jacobian[..., extras.columns(name)] = block
-        return Linearised(residual.error, jacobian)
+        return Linearised(residual.error / MICROTESLA, jacobian / MICROTESLA)
