@@ -198,20 +198,11 @@ class Instrument:
             nowhere=place if {*place} <= {c.pattern for c in columns} else (),
         )
 
-    def read(
-        self, table: Table, bare: Any, settings: Settings, *, axes: BodyAxes
-    ) -> tuple[Any, list[str]]:
-        """Check a table and return its log, and what is odd about it, a sentence each.
-
-        Raises :class:`DataError` for numbers that cannot be what their columns say.
+    def check(self, table: Table, bare: Any, axes: BodyAxes) -> list[str]:  # noqa: ARG002
+        """Refuse a table whose numbers cannot be what its columns say; return what is odd.
 
         ``bare`` is what :meth:`bare` made of the section; ``axes`` are those of its body vectors.
         """
-        notes = self.check(table, bare, axes)
-        return self.filled(table, bare, settings, axes), notes
-
-    def check(self, table: Table, bare: Any, axes: BodyAxes) -> list[str]:  # noqa: ARG002
-        """Refuse a table whose numbers cannot be what its columns say; return what is odd."""
         for column in self.columns_of(bare):
             column.beyond(table)
         return []

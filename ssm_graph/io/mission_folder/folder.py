@@ -73,10 +73,10 @@ def read_mission(folder: Path | str) -> Mission:
     parts: dict[str, Part] = {}
     for one in TABLES:
         if one.section in tables:
-            table, settings = tables[one.section], toml[one.section]
-            log, some = one.read(table, bare[one.section], settings, axes=toml.body)
+            table, own = tables[one.section], bare[one.section]
+            notes += one.check(table, own, toml.body)
+            log = one.filled(table, own, toml[one.section], toml.body)
             parts[one.section] = Part(log, table)
-            notes += some
     notes += _lists_without_section(toml)
     initial = toml.initial()
     frame = first_frame(toml.frame("origin"), parts, initial)

@@ -9,7 +9,7 @@ that moment, so that a row that was written without its letter shifts no other.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Self
@@ -111,11 +111,7 @@ class RawLog:
         return log
 
     def _open(
-        self,
-        folder: Path,
-        kinds: Mapping[type[Message], RowKind],
-        max_waiting: int,
-        retry_every: int,
+        self, folder: Path, kinds: dict[type[Message], RowKind], max_waiting: int, retry_every: int
     ) -> None:
         self._folder, self._kinds = folder, kinds
         self._tables = {

@@ -51,14 +51,8 @@ class Output(ABC):
     def send(self, data: bytes) -> None:
         """Send whole messages, or drop them; never waits."""
 
-    def on_ready(self, ready: socket.socket, mask: int, now: Now) -> None:  # noqa: B027
-        """Look after a socket that can be read or written; there is none where nobody calls."""
-
     def tick(self, now: Now) -> None:  # noqa: B027
         """Look after what time brings."""
-
-    def abandon(self, sock: socket.socket) -> None:  # noqa: B027
-        """Let go of a socket that made something fail."""
 
     @abstractmethod
     def close(self) -> None:

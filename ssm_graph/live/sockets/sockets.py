@@ -93,7 +93,7 @@ class SocketHub:
         messages: list[Message] = []
         for key, mask in ready:
             try:
-                if isinstance(key.data, Output):
+                if isinstance(key.data, TcpServerOutput):
                     key.data.on_ready(key.fileobj, mask, now)  # type: ignore[arg-type]
                 else:
                     messages += key.data.on_ready(key.fileobj, now)
