@@ -241,15 +241,11 @@ def _gnss(
             f"{topic.name}: {topic.n_unstated} fixes do not say how good they are and are given "
             f"{sigma[0]:g}, {sigma[1]:g}, {sigma[2]:g} m east, north, up."
         )
-    log = replace(
-        GNSS_AT_ORIGIN if vehicle is None else vehicle.gnss,
-        time_s=table[:, 0],
-        lat=table[:, 1],
-        lon=table[:, 2],
-        height=table[:, 3],
-        sigma_enu=table[:, 4:7],
-    )
-    return log, notes
+    known = GNSS_AT_ORIGIN if vehicle is None else vehicle.gnss
+    time_s, lat, lon, height, *sigmas = table.T
+    sigma_enu = np.column_stack(sigmas)
+    place = {"lat": lat, "lon": lon, "height": height, "sigma_enu": sigma_enu}
+    return replace(known, time_s=time_s, **place), notes
 
 
 def _depth(
