@@ -94,8 +94,8 @@ def gtsam_gravity(frame: LocalFrame, p_n: Array) -> Array:
     ``n``, and plumb-line gravity holds the centrifugal acceleration already, so that term is added
     back: ``g_n(p) + omega x (omega x p)``.
     """
-    omega = frame.omega_ie_n
-    return np.asarray(frame.g_n_at(p_n) + np.cross(omega, np.cross(omega, p_n)))
+    turn = so3.skew(frame.omega_ie_n).T
+    return np.asarray(frame.g_n_at(p_n) + p_n @ turn @ turn)
 
 
 def gravity_gradient(frame: LocalFrame, p_n: Array = ORIGIN) -> Array:
