@@ -288,4 +288,3 @@ class WindowGraph:
                 np.concatenate([old[: rows.start], new, old[rows.stop :]]) for old, new in parts
             )
         self.error, self.jacobian = error, jacobian
-
