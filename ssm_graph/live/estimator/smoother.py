@@ -101,15 +101,18 @@ class FixedLagSmoother:
             return
         is_late = time_s < newest_s or not isinstance(message, ImuSample)
         self._latest_s = max(self._latest_s, message.time_s + self._intake.shift_s)
-        is_made = self._update(message, time_s, is_late=is_late)
+        is_made = self._update(message, time_s, newest_s, is_late=is_late)
         if is_made:
             self._cost_s = time.perf_counter() - begin
 
-    def _update(self, message: Message, time_s: float, *, is_late: bool) -> bool:
-        """Let the answer follow what has come; return whether a keyframe was made."""
+    def _update(self, message: Message, time_s: float, newest_s: float, *, is_late: bool) -> bool:
+        """Let the answer follow what has come; return whether a keyframe was made.
+
+        ``newest_s`` is the time of the last inertial sample before it came, s.
+        """
         course, buffers = self._course, self._intake.buffers
         is_sample = isinstance(message, ImuSample)
-        if is_sample and self._is_gap(time_s):
+        if is_sample and self._is_gap(time_s, newest_s):
             buffers.drop_before(time_s)
             if course is None:
                 self._starter.begin_anew()
@@ -218,7 +221,9 @@ class FixedLagSmoother:
             smoother._tail = smoother._tail_of(course.newest)
         return smoother
 
-    def _is_gap(self, time_s: float) -> bool:
+    def _is_gap(self, time_s: float, newest_s: float) -> bool:
+        if newest_s < time_s <= newest_s + LONGEST_GAP_S:
+            return False
         samples = self._intake.buffers.imu
         at = samples.index(time_s)
         return bool(at > 0 and time_s - samples.all[at - 1, 0] > LONGEST_GAP_S)
