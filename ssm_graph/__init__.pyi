@@ -33,8 +33,8 @@ from ssm_graph.evaluation import withhold_gnss as withhold_gnss
 from ssm_graph.filters.navigation.named import FILTERS as FILTERS
 from ssm_graph.filters.navigation.named import filter_problems as filter_problems
 from ssm_graph.io.blueye.convert import convert_blueye as convert_blueye
-from ssm_graph.io.mission_folder.reader import read_mission as read_mission
-from ssm_graph.io.mission_folder.reader import write_mission as write_mission
+from ssm_graph.io.mission_folder.folder import read_mission as read_mission
+from ssm_graph.io.mission_folder.folder import write_mission as write_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle as read_vehicle
 from ssm_graph.io.mission_folder.vehicle import vehicle_of as vehicle_of
 from ssm_graph.io.mission_folder.vehicle import write_vehicle as write_vehicle

@@ -7,7 +7,7 @@ import tempfile
 from pathlib import Path
 
 from ssm_graph.base.errors import SsmGraphError
-from ssm_graph.io.mission_folder.reader import read_mission
+from ssm_graph.io.mission_folder.folder import read_mission
 from tests.malformed_aids import AID_CASES
 from tests.malformed_case import Malformed
 from tests.malformed_cases import PHYSICS_CASES, TABLE_CASES, TOML_CASES

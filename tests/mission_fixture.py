@@ -11,7 +11,7 @@ from ssm_graph.base.earth import EARTH_RATE, LocalFrame, normal_gravity
 from ssm_graph.base.frames import R_lb_from_roll_pitch_heading
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.units import MICRO_G
-from ssm_graph.io.mission_folder.writer import mission_tables
+from ssm_graph.io.mission_folder.folder import mission_tables
 from ssm_graph.io.tables.files import write_table
 from ssm_graph.mission.mission import InitialState, Mission, Reference
 from ssm_graph.sensors.depth import DepthLog

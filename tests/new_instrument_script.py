@@ -15,7 +15,7 @@ from ssm_graph.sensors.fluxgate import (  # type: ignore[import-not-found]
 
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.io.mission_folder.assembly import mission_from
-from ssm_graph.io.mission_folder.reader import read_mission, write_mission
+from ssm_graph.io.mission_folder.folder import read_mission, write_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle, vehicle_of, write_vehicle
 from ssm_graph.io.raw_log.log import RawLog, replay
 from ssm_graph.io.raw_log.rows import messages_of

@@ -12,7 +12,7 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator import ONLINE, FixedLagSmoother
-from ssm_graph.live.estimator.delayed import Delayed
+from ssm_graph.live.estimator.answers import Delayed
 from ssm_graph.mission.navigation import Navigation
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.messages import Message

@@ -21,7 +21,7 @@ import numpy as np
 from benchmarks.faults.case import Stage, simulated_stage
 from benchmarks.faults.judge import Row, judge
 from benchmarks.faults.sockets import SOCKET_CASES, run_socket_case
-from ssm_graph.io.mission_folder.writer import write_mission
+from ssm_graph.io.mission_folder.folder import write_mission
 from ssm_graph.io.tables.checkpoint import CHECKPOINT_NAME, older_name
 from ssm_graph.live.run.run_folder import LOG_NAME
 

@@ -13,9 +13,10 @@ import numpy as np
 from benchmarks.faults.case import Sent, Stream, Transform
 from ssm_graph.base.frozen import Array
 from ssm_graph.mission.vehicle import Vehicle
-from ssm_graph.sensors.dvl import N_BEAMS
 from ssm_graph.sensors.messages import Message
 
+N_BEAMS = 4
+"""Of the vehicles whose messages are damaged here."""
 Edit = Callable[[Any], Message | None]
 """Returns a message changed, or None to take it away."""
 

@@ -16,7 +16,7 @@ from benchmarks.report import rms
 from ssm_graph.base.frozen import Array
 from ssm_graph.evaluation import ErrorSeries, error_series
 from ssm_graph.live.estimator import FixedLagSmoother
-from ssm_graph.live.estimator.delayed import Delayed
+from ssm_graph.live.estimator.answers import Delayed
 from ssm_graph.mission.estimate import Trajectory
 from ssm_graph.mission.mission import Reference
 from ssm_graph.mission.navigation import Event, Health, Navigation

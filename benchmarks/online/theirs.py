@@ -22,9 +22,9 @@ from ssm_graph.graph.inertial_rows import InertialRows
 from ssm_graph.imu.preintegration import InertialChain, Preintegrated, gravity_between
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.io.raw_log.rows import messages_of
-from ssm_graph.live.estimator.asked import sensors_of_vehicle
 from ssm_graph.live.estimator.buffers import Buffers
 from ssm_graph.live.estimator.keyframes import KeyframeMaker
+from ssm_graph.live.estimator.start import sensors_of_vehicle
 from ssm_graph.mission.estimate import Trajectory
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.problem import NO_EXTRAS, ProblemConfig, build_problem, start_of

@@ -41,14 +41,8 @@ def ecef_from_geodetic(lat: Array | float, lon: Array | float, height: Array | f
     )
     _, radius = radii_of_curvature(lat)
     horizontal = (radius + height) * np.cos(lat)
-    return np.stack(
-        [
-            horizontal * np.cos(lon),
-            horizontal * np.sin(lon),
-            (radius * (1.0 - ECCENTRICITY_SQ) + height) * np.sin(lat),
-        ],
-        axis=-1,
-    )
+    z = (radius * (1.0 - ECCENTRICITY_SQ) + height) * np.sin(lat)
+    return np.stack([horizontal * np.cos(lon), horizontal * np.sin(lon), z], axis=-1)
 
 
 def geodetic_from_ecef(p_e: Array) -> tuple[Array, Array, Array]:
@@ -69,12 +63,8 @@ def geodetic_from_ecef(p_e: Array) -> tuple[Array, Array, Array]:
         )
         beta = np.arctan2((1.0 - FLATTENING) * np.sin(lat), np.cos(lat))
     sin_lat, cos_lat = np.sin(lat), np.cos(lat)
-    height = (
-        horizontal * cos_lat
-        + z * sin_lat
-        - SEMI_MAJOR_AXIS * np.sqrt(1.0 - ECCENTRICITY_SQ * sin_lat**2)
-    )
-    return lat, np.arctan2(y, x), height
+    surface = SEMI_MAJOR_AXIS * np.sqrt(1.0 - ECCENTRICITY_SQ * sin_lat**2)
+    return lat, np.arctan2(y, x), horizontal * cos_lat + z * sin_lat - surface
 
 
 def R_el_from_lat_lon(lat: Array | float, lon: Array | float) -> Array:
@@ -83,8 +73,13 @@ def R_el_from_lat_lon(lat: Array | float, lon: Array | float) -> Array:
     sin_lat, cos_lat, sin_lon, cos_lon = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)
     east = np.stack([-sin_lon, cos_lon, np.zeros_like(lat)], axis=-1)
     north = np.stack([-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat], axis=-1)
-    up = np.stack([cos_lat * cos_lon, cos_lat * sin_lon, sin_lat], axis=-1)
-    return np.stack([east, north, up], axis=-1)
+    return np.stack([east, north, _up_e(lat, lon)], axis=-1)
+
+
+def _up_e(lat: Array, lon: Array) -> Array:
+    """Return the normal (..., 3) of the ellipsoid in Earth-fixed axes."""
+    cos_lat = np.cos(lat)
+    return np.stack([cos_lat * np.cos(lon), cos_lat * np.sin(lon), np.sin(lat)], axis=-1)
 
 
 def normal_gravity(lat: Array | float, height: Array | float) -> Array:
@@ -148,5 +143,8 @@ class LocalFrame:
     def g_n_at(self, p_n: Array) -> Array:
         """Return plumb-line gravity (..., 3) at positions ``p_n``, in ``n``, m/s^2."""
         lat, lon, height = self.geodetic_from_p_n(p_n)
-        up_n = R_el_from_lat_lon(lat, lon)[..., :, 2] @ self.R_en
-        return np.asarray(-normal_gravity(lat, height)[..., None] * up_n)
+        return np.asarray(-normal_gravity(lat, height)[..., None] * self.up_n_at(lat, lon))
+
+    def up_n_at(self, lat: Array, lon: Array) -> Array:
+        """Return the local vertical (..., 3) in ``n`` at latitudes and longitudes, rad."""
+        return np.asarray(_up_e(lat, lon) @ self.R_en)

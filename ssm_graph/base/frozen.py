@@ -108,6 +108,13 @@ class FrozenArrays(ShortRepr):
             lengths |= {size: got for size, got in named if isinstance(size, str)}
             object.__setattr__(self, spec.name, array)
 
+    @classmethod
+    def empty(cls) -> Self:
+        """Return a value of nothing but arrays without any rows: every lettered length is zero."""
+        shapes = {spec.name: spec.metadata["shape"] for spec in fields(cast(Any, cls))}
+        sizes = {k: [n if isinstance(n, int) else 0 for n in shape] for k, shape in shapes.items()}
+        return cls(**{name: np.zeros(size) for name, size in sizes.items()})
+
     def rows(self, kept: NDArray[np.bool_]) -> Self:
         """Return the rows that a mask (N,) keeps, of every field whose shape begins with ``N``."""
         own = cast(Any, self)

@@ -74,16 +74,25 @@ class Key:
         return "" if low_ok and max(numbers) <= self.high else "range"
 
 
-def sigma_key(
-    field: str, high: float, hint: str = "", *, required: bool = True, unit: float = 1.0
-) -> Key:
-    """Return the key of a standard deviation: above zero."""
-    return Key(field, positive=True, high=high, required=required, hint=hint, unit=unit)
+def sigma_key(field: str, high: float, hint: str = "", **more: Any) -> Key:
+    """Return the key of a standard deviation: above zero; ``more`` are other fields of a key."""
+    return Key(field, positive=True, high=high, hint=hint, **more)
 
 
-def optional_key(field: str, low: float, high: float, hint: str, *, unit: float = 1.0) -> Key:
+def number_key(field: str, low: float, high: float, hint: str = "", **more: Any) -> Key:
+    """Return the key of numbers within limits; ``more`` are other fields of a key."""
+    return Key(field, low=low, high=high, hint=hint, **more)
+
+
+def optional_key(field: str, low: float, high: float, hint: str, **more: Any) -> Key:
     """Return a key of a number that may be left out; it is zero, or what its field says, then."""
-    return Key(field, low=low, high=high, required=False, hint=hint, unit=unit)
+    return number_key(field, low, high, hint, required=False, **more)
+
+
+def correlation_key(field: str, high: float, beside: tuple[str, str]) -> Key:
+    """Return the key of how long an error is remembered, s, which stands ``beside`` its sigma."""
+    hint = "the unit is seconds"
+    return Key(field, positive=True, high=high, required=False, hint=hint, beside=beside)
 
 
 FILE_KEY: Final = Key(shape=None)
@@ -167,14 +176,8 @@ def read_settings(
 ) -> Settings:
     """Check every key of a section.
 
-    Parameters
-    ----------
-    section : its name; with both brackets, ``[[beacon]] 2``, for one of a list.
-    raw : what the file holds under that name.
-    known : the keys that it may have.
-    file : the file's name in messages.
-    axes : body axes of its vectors.
-    may_miss : required keys that this file can do without.
+    ``section`` is its name; with both brackets, ``[[beacon]] 2``, for one of a list. ``may_miss``
+    are required keys that this file can do without.
     """
     place = f"{file} {place_of(section)}".rstrip()
     if not isinstance(raw, dict):

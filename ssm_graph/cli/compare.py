@@ -19,7 +19,7 @@ from rich.progress import Progress as Bar
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.cli.options import add_command, method_lines, say, table_format_option
 from ssm_graph.evaluation.comparison import compare_methods
-from ssm_graph.io.mission_folder.reader import TableFormat
+from ssm_graph.io.mission_folder.folder import TableFormat
 from ssm_graph.report.comparison.tables import latex, markdown
 from ssm_graph.study.cluster import DaskCluster
 from ssm_graph.study.jobs import Execute

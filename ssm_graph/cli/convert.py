@@ -13,7 +13,7 @@ from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frames import BodyAxes
 from ssm_graph.cli.options import add_command, add_mission_output, number_option, say
 from ssm_graph.io.blueye.convert import convert_blueye
-from ssm_graph.io.mission_folder.reader import write_mission
+from ssm_graph.io.mission_folder.folder import write_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle
 from ssm_graph.io.ros.convert import convert_rosbag
 from ssm_graph.io.ros.log import ROLES, is_rosbag

@@ -25,11 +25,11 @@ from ssm_graph.cli.options import (
     number_option,
     say,
 )
-from ssm_graph.io.mission_folder.reader import read_mission
+from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle, vehicle_of
 from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator import ONLINE, FixedLagSmoother
-from ssm_graph.live.protocols.decoder import Clock
+from ssm_graph.live.protocols.decoder import Clock, Decoder
 from ssm_graph.live.protocols.json_messages import JsonDecoder
 from ssm_graph.live.protocols.nmea import NmeaDecoder, NmeaOptions
 from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
@@ -37,7 +37,7 @@ from ssm_graph.live.run.replay_source import ReplaySource
 from ssm_graph.live.run.run_folder import RunFolder
 from ssm_graph.live.run.runner import Connections, Engine, RunEnd, Runner, RunnerConfig, StopReason
 from ssm_graph.live.sockets.endpoints import OUTPUTS, parse_endpoint
-from ssm_graph.live.sockets.feed import CountingDecoder, Limits
+from ssm_graph.live.sockets.feed import Limits
 from ssm_graph.live.sockets.outputs import OutputFormat, Publisher
 from ssm_graph.live.sockets.sockets import InputConfig, OutputConfig, SocketHub
 from ssm_graph.mission.mission import Mission
@@ -356,7 +356,7 @@ def output_configs(arguments: argparse.Namespace) -> list[OutputConfig]:
     ]
 
 
-def _decoder(name: str, arguments: argparse.Namespace) -> Callable[[], CountingDecoder]:
+def _decoder(name: str, arguments: argparse.Namespace) -> Callable[[], Decoder]:
     clock, axes = Clock[arguments.clock.upper()], BodyAxes(arguments.axes)
     if name == "dvl":
         return lambda: WaterLinkedDecoder(clock=clock)

@@ -12,7 +12,7 @@ from rich.console import Console
 from factors.kernels import KernelChoice
 from factors.similarity import Kernel
 from ssm_graph.base.errors import ConfigError
-from ssm_graph.io.mission_folder.reader import TableFormat
+from ssm_graph.io.mission_folder.folder import TableFormat
 from ssm_graph.study.methods import Family
 
 

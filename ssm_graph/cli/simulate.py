@@ -11,7 +11,7 @@ from rich.console import Console
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.cli.options import add_command, add_mission_output, say
-from ssm_graph.io.mission_folder.reader import write_mission
+from ssm_graph.io.mission_folder.folder import write_mission
 from ssm_graph.sensors.dvl import MOST_BEAMS
 from ssm_graph.simulation import (
     SCENARIOS,

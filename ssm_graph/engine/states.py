@@ -129,8 +129,14 @@ class States(NamedTuple):
 
     def take(self, keyframes: NDArray[np.intp] | slice) -> States:
         """Return the states of some keyframes."""
-        R_nb, p_n, v_n, bias, walks = (column[keyframes] for column in self[:5])
-        return States(R_nb, p_n, v_n, bias, walks, self.constants)
+        return States(
+            self.R_nb[keyframes],
+            self.p_n[keyframes],
+            self.v_n[keyframes],
+            self.bias[keyframes],
+            self.walks[keyframes],
+            self.constants,
+        )
 
     def followed_by(self, *others: States) -> States:
         """Return these states, then the others, which have the same constants."""

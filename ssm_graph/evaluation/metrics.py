@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -42,6 +43,27 @@ class Metrics(ShortRepr):
     """Share of epochs with the east, north, up error within three posterior sigmas; 0.997."""
     errors: ErrorSeries = field(repr=False)
     """The errors themselves, for figures and tests."""
+
+    def summary_fields(self) -> dict[str, Any]:
+        """Return all but the errors with the keys of ``summary.json``, angles in degrees."""
+        roll, pitch, heading = np.rad2deg(self.rmse_attitude).tolist()
+        return {
+            "rmse_horizontal_m": self.rmse_horizontal_m,
+            "rmse_vertical_m": self.rmse_vertical_m,
+            "max_horizontal_m": self.max_horizontal_m,
+            "end_error_m": self.end_error_m,
+            "path_length_m": self.path_length_m,
+            "drift_percent": self.drift_percent,
+            "rmse_velocity_m_per_s": self.rmse_velocity_m_per_s,
+            "rmse_roll_deg": roll,
+            "rmse_pitch_deg": pitch,
+            "rmse_heading_deg": heading,
+            "nees_position": self.nees_position,
+            "inside_3_sigma": dict(zip(("east", "north", "up"), self.inside_3_sigma, strict=True)),
+            "compared_epochs": self.n_epochs,
+            "compared_from_s": self.first_s,
+            "compared_to_s": self.last_s,
+        }
 
 
 def evaluate(trajectory: Trajectory, reference: Reference) -> Metrics:

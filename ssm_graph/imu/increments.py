@@ -138,9 +138,9 @@ def _merge_steps(theta: Array, v: Array, first: NDArray[np.intp]) -> Steps[tuple
     constant specific force along with a constant rate would need to give the same velocity change.
     """
     size = np.diff(np.append(first, len(theta)))
-    turned = Rotation.identity(len(first))
-    gained = np.zeros((len(first), 3))
-    for step in range(int(size.max())):
+    turned = Rotation.from_rotvec(theta[first])
+    gained = _left_jacobian_times(theta[first], v[first])
+    for step in range(1, int(size.max())):
         has_piece = (step < size)[:, None]
         piece = np.minimum(first + step, len(theta) - 1)
         theta_k, v_k = theta[piece] * has_piece, v[piece] * has_piece

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, V, X
 
 from factors import so3
 from factors.inertial import Intervals
@@ -94,8 +94,8 @@ def gtsam_gravity(frame: LocalFrame, p_n: Array) -> Array:
     ``n``, and plumb-line gravity holds the centrifugal acceleration already, so that term is added
     back: ``g_n(p) + omega x (omega x p)``.
     """
-    omega = frame.omega_ie_n
-    return np.asarray(frame.g_n_at(p_n) + np.cross(omega, np.cross(omega, p_n)))
+    turn = so3.skew(frame.omega_ie_n).T
+    return np.asarray(frame.g_n_at(p_n) + p_n @ turn @ turn)
 
 
 def gravity_gradient(frame: LocalFrame, p_n: Array = ORIGIN) -> Array:
@@ -131,11 +131,13 @@ def preintegrate_steps(
     samples = yield from merge_samples_steps(bridged(imu, gaps), keyframe_s, rate_hz=rate_hz)
     bias = np.zeros(6) if bias is None else bias
     nowhere = np.zeros(3)  # gravity is no part of what is measured
+    without_gap = imu_params(imu.noise, g_n=nowhere, frame=frame)
     params = [
         imu_params(imu.noise, g_n=nowhere, frame=frame, unseen=motion, span_s=span_s)
+        if motion.gap_s
+        else without_gap
         for motion, span_s in zip(unseen, np.diff(keyframe_s).tolist(), strict=True)
     ]
-    yield 0.02 * len(params)
     measured = yield from _integrate_steps(samples, params, bias)
     parts = []
     for begin in range(0, len(measured), AT_ONCE):
@@ -150,11 +152,11 @@ def _integrate_steps(
 ) -> Steps[list[Preintegrated]]:
     about = gtsam.imuBias.ConstantBias(bias[:3], bias[3:])
     measurements = []
-    dts = merged.dt.tolist()
-    for k, interval_params in enumerate(params):
+    samples = list(zip(merged.accel_b, merged.gyro_b, merged.dt.tolist(), strict=True))
+    for interval_params, (begin, end) in zip(params, pairwise(merged.first.tolist()), strict=True):
         measured = Preintegrated(interval_params, about)
-        for i in range(merged.first[k], merged.first[k + 1]):
-            measured.integrateMeasurement(merged.accel_b[i], merged.gyro_b[i], dts[i])
+        for sample in samples[begin:end]:
+            measured.integrateMeasurement(*sample)
         measurements.append(measured)
         yield 0.02
     return measurements
@@ -174,32 +176,15 @@ def intervals_of(measurements: Sequence[Preintegrated], frame: LocalFrame) -> In
     )
 
 
-# Columns of a linearised factor: x_i 6, v_i 3, x_j 6, v_j 3, b_i 6, b_j 6.
-_BEGIN_BIAS, _END = slice(18, 24), np.r_[9:18, 24:30]
-
-
 def _delta_D_bias(measurements: Sequence[Preintegrated], omega_ie_n: Array) -> Array:
-    """Return the bias Jacobians (N, 9, 6), which GTSAM does not show, from linearised factors."""
+    """Return the bias Jacobians (N, 9, 6): those of where a state at rest is led to."""
     at_rest = gtsam.NavState()
-    values = gtsam.Values()
-    for k in (0, 1):
-        values.insert(X(k), pose3=at_rest.pose())
-        values.insert(V(k), at_rest.velocity())
-        values.insert(B(k), constant_bias=gtsam.imuBias.ConstantBias())
-    whitened, R_nb = np.empty((len(measurements), 15, 30)), np.empty((len(measurements), 3, 3))
-    for i, measured in enumerate(measurements):
-        about = measured.biasHat()
-        end = measured.predict(at_rest, about)
-        values.update(X(1), pose3=end.pose())
-        values.update(V(1), end.velocity())
-        values.update(B(0), constant_bias=about)
-        factor = gtsam.GalileanCombinedImuFactor(X(0), V(0), X(1), V(1), B(0), B(1), measured)
-        whitened[i] = factor.linearize(values).jacobian()[0]
-        R_nb[i] = end.attitude().matrix()
-    moved = np.linalg.solve(whitened[:, :, _END], -whitened[:, :, _BEGIN_BIAS])[:, :9]
-    # The end's velocity is relative to the Earth and along the navigation axes.
-    velocity_n = moved[:, 6:] + so3.skew(omega_ie_n) @ R_nb @ moved[:, 3:6]
-    return np.concatenate([moved[:, :6], R_nb.mT @ velocity_n], axis=1)
+    jacobian, R_nb = np.empty((len(measurements), 9, 6)), np.empty((len(measurements), 3, 3))
+    for measured, own, R in zip(measurements, jacobian, R_nb, strict=True):
+        R[:] = measured.predict(at_rest, measured.biasHat(), H2=own).attitude().matrix()
+    # GTSAM's end has its velocity relative to the Earth.
+    jacobian[:, 6:] += R_nb.mT @ so3.skew(omega_ie_n) @ R_nb @ jacobian[:, 3:6]
+    return jacobian
 
 
 def imu_params(

@@ -14,24 +14,31 @@ import numpy as np
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frames import BodyAxes
-from ssm_graph.base.frozen import Array, FrozenArrays, Vector, shaped
+from ssm_graph.base.frozen import Array, FrozenArrays, shaped
 from ssm_graph.base.settings import (
     FILE_KEY,
     LEVER_ARM_KEY,
-    Key,
     Settings,
     build,
+    number_key,
     sigma_key,
     written,
 )
 from ssm_graph.base.tables import Table
 from ssm_graph.sensors.instrument import SMALLEST_SIGMA, Column, Instrument, Lists
 from ssm_graph.sensors.messages import Message
-from ssm_graph.sensors.place import PLACE_KEYS, POSITION, SIGMA_ENU, check_positions
+from ssm_graph.sensors.place import (
+    PLACE_KEYS,
+    POSITION,
+    SIGMA_ENU,
+    PositionInstrument,
+    PositionLog,
+    PositionMessage,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class UsblLog(FrozenArrays):
+class UsblLog(PositionLog):
     """Acoustic position fixes of a transponder on the vehicle: USBL, or LBL as its maker solves it.
 
     A fix travels: it is stamped when it is known, and was valid ``delay_s`` before.
@@ -39,20 +46,8 @@ class UsblLog(FrozenArrays):
 
     SECTION: ClassVar[str] = "[usbl]"
 
-    time_s: Array = shaped("N")
-    """(N,) s as stamped, strictly increasing."""
     delay_s: Array = shaped("N")
     """(N,) s, how much older than its stamp each fix is."""
-    lat: Array = shaped("N")
-    """(N,) rad"""
-    lon: Array = shaped("N")
-    """(N,) rad"""
-    height: Array = shaped("N")
-    """(N,) m above the ellipsoid"""
-    sigma_enu: Array = shaped("N", 3)
-    """(N, 3) m, east, north, up, above zero."""
-    lever_arm_b: Array = shaped(3)
-    """(3,) body origin to transponder, m."""
 
     @property
     def valid_s(self) -> Array:
@@ -61,17 +56,9 @@ class UsblLog(FrozenArrays):
 
 
 @dataclass(frozen=True, slots=True)
-class UsblFix(Message):
+class UsblFix(PositionMessage):
     """One acoustic fix of the transponder, stamped when it was known."""
 
-    lat: float
-    """rad"""
-    lon: float
-    """rad"""
-    height: float
-    """m above the ellipsoid"""
-    sigma_enu: Vector
-    """m"""
     delay_s: float = 0.0
     """How much older than its stamp it is, s."""
 
@@ -169,29 +156,19 @@ _RANGE_SIGMA: Final = Column(
     optional=True,
 )
 _BEACON_KEYS: Final = {
-    "number": Key(
-        "number", low=0.0, high=1e6, hint="it is what column 'beacon' of [ranges] calls it"
-    ),
+    "number": number_key("number", 0.0, 1e6, "it is what column 'beacon' of [ranges] calls it"),
     **PLACE_KEYS,
-    "position_sigma_m": Key(
-        "position_sigma_enu",
+    "position_sigma_m": sigma_key(
+        *("position_sigma_enu", 1e5),
+        "east, north and up; leave the key out where the place is known",
         shape=(3,),
-        positive=True,
-        high=1e5,
         required=False,
-        hint="east, north and up; leave the key out where the place is known",
     ),
 }
 
 
-class _Usbl(Instrument):
+class _Usbl(PositionInstrument):
     """The way of acoustic fixes: each was true some time before its stamp."""
-
-    __slots__ = ()
-
-    def check(self, table: Table, bare: UsblLog, axes: BodyAxes) -> list[str]:
-        notes = check_positions(table)
-        return notes + super().check(table, bare, axes)
 
     def valid_s(self, message: Message, bare: UsblLog) -> float:  # noqa: ARG002
         assert isinstance(message, UsblFix)
@@ -204,8 +181,6 @@ class _Usbl(Instrument):
 
 class _Ranges(Instrument):
     """The way of ranges: to beacons that the file states as well."""
-
-    __slots__ = ()
 
     def bare(self, settings: Settings, lists: Lists) -> RangeLog:
         beacons = [_beacon(one) for one in lists["beacon"]]

@@ -9,7 +9,7 @@ import numpy as np
 
 from ssm_graph.base.frames import BodyAxes
 from ssm_graph.base.frozen import Array, FrozenArrays, shaped
-from ssm_graph.base.settings import FILE_KEY, Key, optional_key, sigma_key
+from ssm_graph.base.settings import FILE_KEY, correlation_key, optional_key, sigma_key
 from ssm_graph.base.tables import Table
 from ssm_graph.base.units import DEG_PER_H, DEGREE
 from ssm_graph.sensors.instrument import Calibrated, Column, Instrument
@@ -80,13 +80,10 @@ _KEYS: Final = {
         "errors.rate_sigma", 0.0, 1e4, "the unit is degrees per hour", unit=DEG_PER_H
     ),
     "walk_sigma_deg": optional_key("errors.walk_sigma", 0.0, 90.0, _DEGREES, unit=DEGREE),
-    "correlation_s": Key(
+    "correlation_s": correlation_key(
         "errors.correlation_s",
-        positive=True,
-        high=1e6,
-        required=False,
-        hint="the unit is seconds",
-        beside=("walk_sigma_deg", "expected with a walk_sigma_deg above 0, got none; 1 is usual"),
+        1e6,
+        ("walk_sigma_deg", "expected with a walk_sigma_deg above 0, got none; 1 is usual"),
     ),
     "one_cycle_sigma_deg": optional_key("errors.one_cycle_sigma", 0.0, 90.0, _DEGREES, unit=DEGREE),
     "two_cycle_sigma_deg": optional_key("errors.two_cycle_sigma", 0.0, 90.0, _DEGREES, unit=DEGREE),
@@ -103,8 +100,6 @@ _CALIBRATED: Final = {"heading_offset": Calibrated("declination_deg", "offset_si
 
 class _Compass(Instrument):
     """The way of compasses: some give radians."""
-
-    __slots__ = ()
 
     def check(self, table: Table, bare: HeadingLog, axes: BodyAxes) -> list[str]:
         super().check(table, bare, axes)

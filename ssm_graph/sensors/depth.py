@@ -82,8 +82,6 @@ _CALIBRATED: Final = {"depth_offset": Calibrated("offset_m", "offset_sigma_m")}
 class _Depth(Instrument):
     """The way of depth sensors: some give pressure, or millimetres."""
 
-    __slots__ = ()
-
     def check(self, table: Table, bare: DepthLog, axes: BodyAxes) -> list[str]:
         depth = table["depth_m"]
         if len(depth) and np.median(np.abs(depth)) > DEEPEST_M:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from ssm_graph.base.settings import Key, optional_key
+from ssm_graph.base.settings import Key, correlation_key, optional_key, sigma_key
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,32 +40,12 @@ def late_keys(owner: str) -> dict[str, Key]:
 def drift_keys(name: str, owner: str, high: float, hint: str) -> dict[str, Key]:
     """Return the keys of a drift; ``name`` is that of its sigma, ``owner`` has its fields."""
     stands_with = (name, f"expected with a {name} above 0, got none")
+    needed = "expected with a drift_correlation_s, got none; 20 is a third of a minute"
+    needs = ("drift_correlation_s", needed)
     return {
-        name: Key(
-            f"{owner}.sigma",
-            low=0.0,
-            high=high,
-            required=False,
-            hint=hint,
-            beside=(
-                "drift_correlation_s",
-                "expected with a drift_correlation_s, got none; 20 is a third of a minute",
-            ),
-        ),
-        "drift_correlation_s": Key(
-            f"{owner}.correlation_s",
-            positive=True,
-            high=1e8,
-            required=False,
-            hint="the unit is seconds",
-            beside=stands_with,
-        ),
-        "drift_white_share": Key(
-            f"{owner}.white_share",
-            positive=True,
-            high=1.0,
-            required=False,
-            hint="all of the noise is 1",
-            beside=stands_with,
+        name: optional_key(f"{owner}.sigma", 0.0, high, hint, beside=needs),
+        "drift_correlation_s": correlation_key(f"{owner}.correlation_s", 1e8, stands_with),
+        "drift_white_share": sigma_key(
+            f"{owner}.white_share", 1.0, "all of the noise is 1", required=False, beside=stands_with
         ),
     }

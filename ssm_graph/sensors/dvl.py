@@ -17,7 +17,6 @@ from ssm_graph.sensors.messages import Message
 
 MOST_BEAMS: Final = 8
 """An instrument may have 1 to so many beams."""
-N_BEAMS = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)

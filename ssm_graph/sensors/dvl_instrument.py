@@ -31,6 +31,7 @@ from ssm_graph.base.settings import (
 )
 from ssm_graph.base.tables import Table
 from ssm_graph.base.units import DEGREE, PER_SQRT_H, in_unit
+from ssm_graph.sensors import dvl_readings as readings
 from ssm_graph.sensors.drift import ARM_SIGMA, drift_keys, late_keys
 from ssm_graph.sensors.dvl import (
     MOST_BEAMS,
@@ -44,15 +45,6 @@ from ssm_graph.sensors.dvl import (
     nominal_sigma,
     rpy_from_R_bd,
     sigma_off_water,
-)
-from ssm_graph.sensors.dvl_readings import (
-    COUNTS,
-    LARGEST_SPEED,
-    LEAVE_EMPTY,
-    check_speeds,
-    identical_beams,
-    no_lock,
-    without_false_speeds,
 )
 from ssm_graph.sensors.instrument import (
     SMALLEST_SIGMA,
@@ -71,13 +63,16 @@ _FLATTEST_GEOMETRY: Final = 0.01
 """Least singular value of directions that measure every component of a velocity."""
 _BEAMS: Final = (1, MOST_BEAMS)
 _PERCENT: Final = "1 percent is 0.01"
+_START_OF_WALK: Final = (
+    "expected with a scale_sigma above 0, the sigma at the start, got none; 0.01 is 1 percent"
+)
 _SPEED_UNIT: Final = "the unit is m/s, not mm/s"
 
 _SPEED: Final = Column(
     "speed",
     "beam{}_m_per_s",
-    limits=(-LARGEST_SPEED, LARGEST_SPEED),
-    expected=f"expected m/s, up to {LARGEST_SPEED:g}; {LEAVE_EMPTY}",
+    limits=(-readings.LARGEST_SPEED, readings.LARGEST_SPEED),
+    expected=f"expected m/s, up to {readings.LARGEST_SPEED:g}; {readings.LEAVE_EMPTY}",
     blank=True,
     is_many=True,
     json="beam_m_per_s",
@@ -115,11 +110,9 @@ _WATER: Final = Column(
 _KEYS: Final = {
     "file": FILE_KEY,
     "beam_azimuth_deg": Key(shape=(_BEAMS,), low=-360.0, high=360.0, required=False, unit=DEGREE),
-    "beam_janus_deg": Key(
-        positive=True,
-        high=45.0,
+    "beam_janus_deg": sigma_key(
+        *("", 45.0, "it is counted from the vertical; the horizontal angle is 90 minus this"),
         required=False,
-        hint="it is counted from the vertical; the horizontal angle is 90 minus this",
         unit=DEGREE,
     ),
     "beam_vectors": Key(shape=(_BEAMS, 3), required=False),
@@ -132,18 +125,13 @@ _KEYS: Final = {
     "scale_sigma": optional_key("mount.scale_sigma", 0.0, 1.0, _PERCENT),
     **late_keys("mount"),
     "scale_error": optional_key("mount.scale_error", -0.5, 0.5, _PERCENT),
-    "scale_walk_per_sqrt_h": replace(
-        optional_key(
-            "mount.scale_walk_density", 0.0, 1.0, "1 percent in an hour is 0.01", unit=PER_SQRT_H
-        ),
-        beside=(
-            "scale_sigma",
-            "expected with a scale_sigma above 0, the sigma at the start, got none; "
-            "0.01 is 1 percent",
-        ),
+    "scale_walk_per_sqrt_h": optional_key(
+        *("mount.scale_walk_density", 0.0, 1.0, "1 percent in an hour is 0.01"),
+        unit=PER_SQRT_H,
+        beside=("scale_sigma", _START_OF_WALK),
     ),
-    "beam_scale_error": Key(
-        "mount.beam_scale_error", shape=(_BEAMS,), low=-0.5, high=0.5, required=False, hint=_PERCENT
+    "beam_scale_error": optional_key(
+        "mount.beam_scale_error", -0.5, 0.5, _PERCENT, shape=(_BEAMS,)
     ),
     "beam_scale_sigma": optional_key("mount.beam_scale_sigma", 0.0, 1.0, _PERCENT),
     "lever_arm_sigma_m": optional_key("mount.lever_arm_sigma", *ARM_SIGMA),
@@ -155,18 +143,12 @@ _KEYS: Final = {
 class _Dvl(Instrument):
     """The way of a DVL: as many columns as it has beams, and sigmas that differ off the water."""
 
-    __slots__ = ()
-
     def bare(self, settings: Settings, lists: Lists) -> DvlLog:  # noqa: ARG002
         beams_d = _beams_d(settings)
-        if "beam_scale_error" in settings and len(settings.array("beam_scale_error")) != len(
-            beams_d
-        ):
-            raise settings.fault(
-                "beam_scale_error",
-                f"expected {len(beams_d)} numbers, one of each beam, got "
-                f"{len(settings.array('beam_scale_error'))}",
-            )
+        key, n_beams = "beam_scale_error", len(beams_d)
+        if key in settings and len(settings.array(key)) != n_beams:
+            got = len(settings.array(key))
+            raise settings.fault(key, f"expected {n_beams} numbers, one of each beam, got {got}")
         given = {name.removeprefix("mount."): value for name, value in settings.given().items()}
         R_bd = R_bd_from_rpy(np.asarray(settings.si("mounting_rpy_deg")))
         mount = build(DvlMount, {"beams_d": beams_d, "R_bd": R_bd, **given})
@@ -188,7 +170,7 @@ class _Dvl(Instrument):
             _check_flags(table)
             _check_covariance(table, bare)
         is_water = table.stack(_WATER.names)[:, 0] > 0.0
-        return notes + check_speeds(table, speed, is_water)
+        return notes + readings.check_speeds(table, speed, is_water)
 
     def filled(self, table: Table, bare: DvlLog, settings: Settings, axes: BodyAxes) -> DvlLog:
         rows = {c.field: c.read(table, axes) for c in self.columns_of(bare) if c.field}
@@ -215,7 +197,7 @@ class _Dvl(Instrument):
         return self.cleaned(log)
 
     def cleaned(self, log: DvlLog) -> DvlLog:
-        return replace(log, speed=without_false_speeds(log.speed, log.is_water))
+        return replace(log, speed=readings.without_false_speeds(log.speed, log.is_water))
 
     def without_rows(self, log: DvlLog) -> DvlLog:
         return empty_dvl(log.mount)
@@ -286,16 +268,16 @@ class _Dvl(Instrument):
         none = (math.nan,) * n_beams
         if np.isnan(speed).all():
             return replace(message, speed=none), None
-        if no_lock(speed[None])[0]:
+        if readings.no_lock(speed[None])[0]:
             return replace(message, speed=none), ("no_lock", "0 m/s in all beams: no bottom lock")
-        if identical_beams(speed[None])[0]:
-            text = f"{COUNTS[n_beams]} beams of {speed[0]:g} m/s each"
+        if readings.identical_beams(speed[None])[0]:
+            text = f"{readings.COUNTS[n_beams]} beams of {speed[0]:g} m/s each"
             return replace(message, speed=none), ("identical_beams", text)
         same_track = near[near[:, -1] == float(message.is_water), 1 : 1 + n_beams]
         if any(np.array_equal(other, speed, equal_nan=True) for other in same_track):
             text = f"the speeds {message.speed} m/s once more"
             return replace(message, sigma=(math.inf,) * n_beams), ("repeated_speeds", text)
-        beyond = np.abs(speed) > LARGEST_SPEED
+        beyond = np.abs(speed) > readings.LARGEST_SPEED
         if beyond.any():
             kept = tuple(np.where(beyond, math.nan, speed).tolist())
             text = f"beam speeds {message.speed} m/s: a wrong unit?"
@@ -356,7 +338,7 @@ def _beams_d(settings: Settings) -> Array:
         raise settings.fault(
             key,
             f"the beams lie in one plane and cannot measure a velocity; expected "
-            f"{COUNTS[len(beams)]} different directions around the vertical",
+            f"{readings.COUNTS[len(beams)]} different directions around the vertical",
         )
     return beams
 
@@ -372,9 +354,9 @@ def _geometry_note(mount: DvlMount, label: str) -> list[str]:
         return []
     rank = rank_of(mount.beams_d)
     return [
-        f"{label}: {COUNTS[mount.n_beams]} beam{'s' * (mount.n_beams > 1)} measure"
-        f"{'s' * (mount.n_beams == 1)} {COUNTS[rank]} of three components of the velocity; the "
-        "others come from the inertial sensors alone"
+        f"{label}: {readings.COUNTS[mount.n_beams]} beam{'s' * (mount.n_beams > 1)} measure"
+        f"{'s' * (mount.n_beams == 1)} {readings.COUNTS[rank]} of three components of the velocity;"
+        " the others come from the inertial sensors alone"
     ]
 
 

@@ -7,14 +7,17 @@ from typing import Final
 
 import numpy as np
 
-from ssm_graph.base.frames import BodyAxes
-from ssm_graph.base.frozen import Array, FrozenArrays, Vector, shaped
+from ssm_graph.base.frozen import Array
 from ssm_graph.base.settings import FILE_KEY, LEVER_ARM_KEY, optional_key
-from ssm_graph.base.tables import Table
 from ssm_graph.sensors.drift import ARM_SIGMA, Drift, drift_keys, late_keys
-from ssm_graph.sensors.instrument import Calibrated, Instrument
-from ssm_graph.sensors.messages import Message
-from ssm_graph.sensors.place import POSITION, SIGMA_ENU, check_positions
+from ssm_graph.sensors.instrument import Calibrated
+from ssm_graph.sensors.place import (
+    POSITION,
+    SIGMA_ENU,
+    PositionInstrument,
+    PositionLog,
+    PositionMessage,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,21 +35,9 @@ class GnssCalibration:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class GnssLog(FrozenArrays):
+class GnssLog(PositionLog):
     """Position fixes of a GNSS antenna."""
 
-    time_s: Array = shaped("N")
-    """(N,) s as stamped, strictly increasing."""
-    lat: Array = shaped("N")
-    """(N,) rad"""
-    lon: Array = shaped("N")
-    """(N,) rad"""
-    height: Array = shaped("N")
-    """(N,) m above the ellipsoid"""
-    sigma_enu: Array = shaped("N", 3)
-    """(N, 3) m, east, north, up, above zero."""
-    lever_arm_b: Array = shaped(3)
-    """(3,) body origin to antenna, m."""
     calibration: GnssCalibration = GnssCalibration()
 
     @property
@@ -56,17 +47,8 @@ class GnssLog(FrozenArrays):
 
 
 @dataclass(frozen=True, slots=True)
-class Fix(Message):
+class Fix(PositionMessage):
     """One GNSS fix of the antenna; the receiver's time offset is not yet taken off its stamp."""
-
-    lat: float
-    """rad"""
-    lon: float
-    """rad"""
-    height: float
-    """m above the ellipsoid"""
-    sigma_enu: Vector
-    """m"""
 
 
 _KEYS: Final = {
@@ -78,17 +60,7 @@ _KEYS: Final = {
 }
 
 
-class _Gnss(Instrument):
-    """The way of receivers: codes for no fix, radians."""
-
-    __slots__ = ()
-
-    def check(self, table: Table, bare: GnssLog, axes: BodyAxes) -> list[str]:
-        notes = check_positions(table)
-        return notes + super().check(table, bare, axes)
-
-
-GNSS: Final = _Gnss(
+GNSS: Final = PositionInstrument(
     "gnss",
     GnssLog,
     _KEYS,

@@ -143,8 +143,6 @@ _KEYS: Final = {
 class _Imu(Instrument):
     """The way of inertial sensors: stamps name any instant of an interval."""
 
-    __slots__ = ()
-
     def empty(self) -> dict[str, Any]:
         return super().empty() | {"start_s": 0.0}
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -20,7 +20,7 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.base.settings import Key, Settings, build, written
 from ssm_graph.base.tables import TIME, Table, TableSpec
 from ssm_graph.base.units import wrapped
-from ssm_graph.sensors.messages import Message
+from ssm_graph.sensors.messages import Message, field_names
 
 XYZ: Final = ("x", "y", "z")
 ENU: Final = ("east", "north", "up")
@@ -116,8 +116,8 @@ class Column:
 
     def is_beyond(self, numbers: Sequence[float]) -> bool:
         """Return whether one of some numbers in SI units is beyond the limits; NaN is not."""
-        low, high = (limit * self.unit for limit in self.limits)
-        return any(x < low or x > high for x in numbers)
+        low, high = self.limits[0] * self.unit, self.limits[1] * self.unit
+        return any(number < low or number > high for number in numbers)
 
 
 def added(log: Any, stated: float | Array, off: Array) -> Array:  # noqa: ARG001
@@ -198,28 +198,11 @@ class Instrument:
             nowhere=place if {*place} <= {c.pattern for c in columns} else (),
         )
 
-    def read(
-        self, table: Table, bare: Any, settings: Settings, *, axes: BodyAxes
-    ) -> tuple[Any, list[str]]:
-        """Check a table and return its log, and what is odd about it, a sentence each.
-
-        Parameters
-        ----------
-        table : with the columns of :meth:`spec`.
-        bare : what :meth:`bare` made of the section.
-        settings : the section.
-        axes : of its body vectors.
-
-        Raises
-        ------
-        DataError
-            For numbers that cannot be what their columns say.
-        """
-        notes = self.check(table, bare, axes)
-        return self.filled(table, bare, settings, axes), notes
-
     def check(self, table: Table, bare: Any, axes: BodyAxes) -> list[str]:  # noqa: ARG002
-        """Refuse a table whose numbers cannot be what its columns say; return what is odd."""
+        """Refuse a table whose numbers cannot be what its columns say; return what is odd.
+
+        ``bare`` is what :meth:`bare` made of the section; ``axes`` are those of its body vectors.
+        """
         for column in self.columns_of(bare):
             column.beyond(table)
         return []
@@ -266,7 +249,7 @@ class Instrument:
     def numbers(self, message: Message) -> list[float]:
         """Return a message as plain numbers in SI units, time first, NaN where one is missing."""
         row: list[float] = []
-        for name in _fields(type(message)):
+        for name in field_names(type(message)):
             value = getattr(message, name)
             row.extend(value) if isinstance(value, tuple) else row.append(float(value))
         return row
@@ -288,7 +271,9 @@ class Instrument:
 
     def problem(self, message: Message, bare: Any) -> str | None:
         """Return why a message cannot be a reading, None where it can."""
-        for column in self.live_columns(bare):
+        for column in self.columns_of(bare):
+            if not column.is_live:
+                continue
             value = getattr(message, column.told_as)
             if column.is_beyond(value if column.over else (value,)):
                 return column.told.format(value)
@@ -302,20 +287,19 @@ class Instrument:
     ) -> tuple[Message, tuple[str, str] | None]:
         """Return a message without what cannot have been measured, and what was and why.
 
-        Parameters
-        ----------
-        message : with nothing that :meth:`problem` names.
-        near : (M, 1 + width) rows of the readings before and after it, as :meth:`log_of` has them.
-        bare : the instrument.
+        The message has nothing that :meth:`problem` names; ``near`` (M, 1 + width) are the readings
+        before and after it, as :meth:`log_of` has them.
         """
         return message, None
 
     def late_s(self, bare: Any) -> float:
         """Return how late the stamps are known to be, s."""
+        if not self.late:
+            return 0.0
         value = bare
-        for part in filter(None, self.late.split(".")):
+        for part in self.late.split("."):
             value = getattr(value, part)
-        return float(value) if self.late else 0.0
+        return float(value)
 
     def valid_s(self, message: Message, bare: Any) -> float:
         """Return when the content of a message was true, s."""
@@ -339,13 +323,3 @@ class Instrument:
             rows = np.column_stack([column[start : start + _CHUNK] for column in columns])
             for row in rows.tolist():
                 yield self.message_of(row, log)
-
-
-_FIELDS: Final[dict[type, tuple[str, ...]]] = {}
-
-
-def _fields(kind: type[Message]) -> tuple[str, ...]:
-    """Return the names of a message's fields; asked for every message of an IMU."""
-    if kind not in _FIELDS:
-        _FIELDS[kind] = tuple(spec.name for spec in fields(kind))
-    return _FIELDS[kind]

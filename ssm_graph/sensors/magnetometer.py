@@ -15,7 +15,14 @@ import numpy as np
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frames import BodyAxes
 from ssm_graph.base.frozen import Array, FrozenArrays, optional_shaped, shaped
-from ssm_graph.base.settings import FILE_KEY, Key, optional_key, sigma_key
+from ssm_graph.base.settings import (
+    FILE_KEY,
+    Key,
+    correlation_key,
+    number_key,
+    optional_key,
+    sigma_key,
+)
 from ssm_graph.base.tables import Table
 from ssm_graph.base.units import DEGREE
 from ssm_graph.sensors.instrument import XYZ, Column, Instrument
@@ -110,44 +117,29 @@ _KEYS: Final = {
     "file": FILE_KEY,
     "noise_ut": sigma_key("sigma", 100.0, _UT, unit=MICROTESLA),
     "declination_deg": Key("earth.declination", low=-180.0, high=180.0, unit=DEGREE),
-    "inclination_deg": Key(
-        "earth.inclination", low=-90.0, high=90.0, hint="positive down", unit=DEGREE
-    ),
-    "intensity_ut": Key(
-        "earth.intensity", low=EARTH_UT[0], high=EARTH_UT[1], hint=_UT, unit=MICROTESLA
-    ),
+    "inclination_deg": number_key("earth.inclination", -90.0, 90.0, "positive down", unit=DEGREE),
+    "intensity_ut": number_key("earth.intensity", *EARTH_UT, _UT, unit=MICROTESLA),
     "field_sigma_ut": optional_key("errors.field_sigma", 0.0, 100.0, _UT, unit=MICROTESLA),
-    "hard_iron_ut": Key(
-        "hard_iron_b",
+    "hard_iron_ut": optional_key(
+        *("hard_iron_b", -STRONGEST_UT, STRONGEST_UT, _UT),
         shape=(3,),
-        low=-STRONGEST_UT,
-        high=STRONGEST_UT,
-        required=False,
-        hint=_UT,
         unit=MICROTESLA,
         is_body=True,
     ),
     "hard_iron_sigma_ut": optional_key("errors.hard_iron_sigma", 0.0, 200.0, _UT, unit=MICROTESLA),
-    "soft_iron": Key(
-        "soft_iron", shape=(6,), low=-0.9, high=0.9, required=False, hint="1 percent is 0.01"
-    ),
+    "soft_iron": optional_key("soft_iron", -0.9, 0.9, "1 percent is 0.01", shape=(6,)),
     "soft_iron_sigma": optional_key("errors.soft_iron_sigma", 0.0, 0.9, "1 percent is 0.01"),
     "walk_sigma_ut": optional_key("errors.walk_sigma", 0.0, 100.0, _UT, unit=MICROTESLA),
-    "correlation_s": Key(
+    "correlation_s": correlation_key(
         "errors.correlation_s",
-        positive=True,
-        high=1e6,
-        required=False,
-        hint="the unit is seconds",
-        beside=("walk_sigma_ut", "expected with a walk_sigma_ut above 0, got none; 0.5 is usual"),
+        1e6,
+        ("walk_sigma_ut", "expected with a walk_sigma_ut above 0, got none; 0.5 is usual"),
     ),
 }
 
 
 class _Magnetometer(Instrument):
     """The way of magnetometers: some give gauss, or the direction alone."""
-
-    __slots__ = ()
 
     def check(self, table: Table, bare: MagnetometerLog, axes: BodyAxes) -> list[str]:
         notes = super().check(table, bare, axes)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from functools import cache
 from typing import ClassVar
 
 
@@ -18,17 +19,24 @@ class Message:
     """As stamped, s on the vehicle's clock."""
 
 
+@cache
+def field_names(kind: type[Message]) -> tuple[str, ...]:
+    """Return the names of a message's fields; asked for every message of an IMU."""
+    return tuple(spec.name for spec in fields(kind))
+
+
 def bad_number(message: Message) -> str | None:
     """Return the name of the first field that is not finite, None if all are usable.
 
     Missing beams and sigmas of a ping are NaN on purpose; infinite ones are not.
     """
-    for spec in fields(message):
-        value = getattr(message, spec.name)
+    for name in field_names(type(message)):
+        value = getattr(message, name)
         if value is None:
             continue
-        may_miss = spec.name in message.MAY_MISS
-        for number in value if isinstance(value, tuple) else (value,):
-            if not math.isfinite(number) and not (may_miss and math.isnan(number)):
-                return spec.name
+        numbers = value if isinstance(value, tuple) else (value,)
+        if all(map(math.isfinite, numbers)):
+            continue
+        if name not in message.MAY_MISS or any(map(math.isinf, numbers)):
+            return name
     return None

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Final
+from dataclasses import dataclass, replace
+from typing import Any, Final
 
 import numpy as np
 
-from ssm_graph.base.settings import Key
+from ssm_graph.base.frames import BodyAxes
+from ssm_graph.base.frozen import Array, FrozenArrays, Vector, shaped
+from ssm_graph.base.settings import number_key
 from ssm_graph.base.tables import Table
 from ssm_graph.base.units import DEGREE
 from ssm_graph.sensors.depth import DEEPEST_M
-from ssm_graph.sensors.instrument import ENU, SMALLEST_SIGMA, Column
+from ssm_graph.sensors.instrument import ENU, SMALLEST_SIGMA, Column, Instrument
+from ssm_graph.sensors.messages import Message
 
 LONGITUDES_DEG: Final = (-180.0, 360.0)
 """Receivers count either way from Greenwich, or east alone."""
@@ -46,28 +49,55 @@ SIGMA_ENU: Final = Column(
 )
 POSITION: Final = (LAT, LON, HEIGHT)
 PLACE_KEYS: Final = {
-    "lat_deg": Key(
-        "lat",
-        low=LATITUDES_DEG[0],
-        high=LATITUDES_DEG[1],
-        hint="are latitude and longitude swapped?",
-        unit=DEGREE,
+    "lat_deg": number_key(
+        "lat", *LATITUDES_DEG, "are latitude and longitude swapped?", unit=DEGREE
     ),
-    "lon_deg": Key(
-        "lon",
-        low=LONGITUDES_DEG[0],
-        high=LONGITUDES_DEG[1],
-        hint="longitude is in degrees",
-        unit=DEGREE,
-        wraps=True,
+    "lon_deg": number_key(
+        "lon", *LONGITUDES_DEG, "longitude is in degrees", unit=DEGREE, wraps=True
     ),
-    "height_m": Key(
-        "height",
-        low=HEIGHTS_M[0],
-        high=HEIGHTS_M[1],
-        hint="height is in metres above the ellipsoid, up",
-    ),
+    "height_m": number_key("height", *HEIGHTS_M, "height is in metres above the ellipsoid, up"),
 }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PositionLog(FrozenArrays):
+    """Positions on Earth as an instrument found them."""
+
+    time_s: Array = shaped("N")
+    """(N,) s as stamped, strictly increasing."""
+    lat: Array = shaped("N")
+    """(N,) rad"""
+    lon: Array = shaped("N")
+    """(N,) rad"""
+    height: Array = shaped("N")
+    """(N,) m above the ellipsoid"""
+    sigma_enu: Array = shaped("N", 3)
+    """(N, 3) m, east, north, up, above zero."""
+    lever_arm_b: Array = shaped(3)
+    """(3,) body origin to antenna or transponder, m."""
+
+
+@dataclass(frozen=True, slots=True)
+class PositionMessage(Message):
+    """One position."""
+
+    lat: float
+    """rad"""
+    lon: float
+    """rad"""
+    height: float
+    """m above the ellipsoid"""
+    sigma_enu: Vector
+    """m"""
+
+
+class PositionInstrument(Instrument):
+    """The way of receivers: codes for no fix, radians."""
+
+    def check(self, table: Table, bare: Any, axes: BodyAxes) -> list[str]:
+        """Refuse what is no place on Earth, then as for any other table."""
+        notes = check_positions(table)
+        return notes + super().check(table, bare, axes)
 
 
 def check_positions(table: Table) -> list[str]:

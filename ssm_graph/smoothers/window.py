@@ -317,8 +317,7 @@ class Window:
 
     def _mahalanobis_sq(self) -> Array:
         graph = self._graph
-        keyframe = np.repeat(np.arange(len(self.keyframes)), np.diff(graph.first_row))
-        seen = graph.seen_by_beams
+        keyframe, seen = graph.keyframe_of_row, graph.seen_by_beams
         H = graph.jacobian[:, seen]
         error = graph.error + (H * self._step[:, seen][keyframe]).sum(axis=1)
         spread = np.zeros(len(H))

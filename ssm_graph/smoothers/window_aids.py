@@ -39,17 +39,28 @@ class _Measured(NamedTuple):
 
     def take(self, rows: Rows) -> _Measured:
         """Return some measurements."""
+        if rows == slice(0, len(self.weight)):
+            return self
         return _Measured(self.aid.take(rows), *(column[rows] for column in self[1:]))
+
+    def replaced(self, rows: slice, by: _Measured) -> _Measured:
+        """Return these with as many others in the place of successive ones."""
+        if rows.stop - rows.start == len(self.weight):
+            return by
+        head, tail = self.take(np.s_[: rows.start]), self.take(np.s_[rows.stop :])
+        return head.followed_by(by).followed_by(tail)
 
     def followed_by(self, other: _Measured) -> _Measured:
         """Return these, then the others."""
+        if len(self.weight) == 0 or len(other.weight) == 0:
+            return other if len(self.weight) == 0 else self
         columns = (np.concatenate(pair) for pair in zip(self[1:], other[1:], strict=True))
         return _Measured(self.aid.followed_by(other.aid), *columns)
 
     def rows_of(self, begin: int, end: int) -> slice:
         """Return which belong to successive keyframes."""
-        first, last = np.searchsorted(self.aid.keyframe, [begin, end]).tolist()
-        return slice(first, last)
+        search = self.aid.keyframe.searchsorted
+        return slice(int(search(begin)), int(search(end)))
 
 
 class WindowAids:
@@ -104,9 +115,9 @@ class WindowAids:
             rows = one.rows_of(begin, end)
             if rows.start == rows.stop:
                 continue
-            head, some, tail = (one.take(r) for r in _parts(rows))
+            some = one.take(rows)
             aid, k = some.aid, some.aid.keyframe
-            own, n_first = row_states(self._sensors, at.take(k)), int(np.searchsorted(k, 1))
+            own, n_first = row_states(self._sensors, at.take(k)), int(k.searchsorted(1))
             led = aid
             if n_first < len(k):
                 way = (row_states(self._sensors, at.take(k[n_first:] - i)) for i in (1, 0))
@@ -115,8 +126,8 @@ class WindowAids:
                 here = row_states(self._sensors, at.take(k[:n_first]))
                 first = aid.take(np.s_[:n_first]).led_along(None, here)
                 led = first.followed_by(led) if n_first < len(k) else first
-            anew = self._linearised(led, own)._replace(weight=some.weight, t=some.t)
-            self._all[name] = head.followed_by(anew).followed_by(tail)
+            anew = _Measured(led, *led.whitened(own), some.weight, some.t)
+            self._all[name] = one.replaced(rows, anew)
 
     def drop(self, count: int) -> None:
         """Forget the first keyframes."""
@@ -132,10 +143,12 @@ class WindowAids:
         n = self._sensors.state_dim
         keyframes, blocks = [np.zeros(0, np.intp)], [np.zeros((0, n + 1))]
         for one in self._all.values():
-            some = one.take(one.rows_of(begin, 1 << 62))
-            scale = np.sqrt(some.weight)[:, None, None]
-            rows = scale * np.concatenate([some.jacobian, -some.error[..., None]], axis=-1)
-            keyframes.append(np.repeat(some.aid.keyframe, rows.shape[1]))
+            first = int(one.aid.keyframe.searchsorted(begin))
+            rows = np.empty((*one.error[first:].shape, n + 1))
+            rows[..., :n] = one.jacobian[first:]
+            np.negative(one.error[first:], out=rows[..., n])
+            rows *= np.sqrt(one.weight[first:])[:, None, None]
+            keyframes.append(np.repeat(one.aid.keyframe[first:], rows.shape[1]))
             blocks.append(rows.reshape(-1, n + 1))
         return np.concatenate(keyframes), np.concatenate(blocks)
 
@@ -256,7 +269,3 @@ class WindowAids:
         """Return what was measured at one keyframe."""
         found = {name: one.aid.at(k) for name, one in self._all.items()}
         return {name: aid for name, aid in found.items() if len(aid)}
-
-
-def _parts(rows: slice) -> tuple[slice, slice, slice]:
-    return slice(0, rows.start), rows, slice(rows.stop, None)

@@ -13,6 +13,7 @@ from scipy.linalg import solve_triangular
 from factors.inertial import Intervals
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.times import Indices
 from ssm_graph.engine.chain import Chain
 from ssm_graph.engine.error_state import GYRO_BIAS, ROTATION, STATE_DIM, VELOCITY, InitialMoments
 from ssm_graph.engine.extras import Extras
@@ -86,12 +87,18 @@ class WindowGraph:
         self.prior: MarginalPrior = prior_at_start(start)
         self._between: list[Array] = []
         self._stale = 0
-        self.first_row = np.zeros(1, np.intp)
-        """(K + 1,) where the beams of each keyframe begin, and where they end"""
+        self.first_row = self.keyframe_of_row = np.zeros(0, np.intp)
+        self._number_rows(np.zeros(1, np.intp))
         self.bends = Bends.of(sensors.extras)
         self.seen_by_beams = np.r_[ROTATION, VELOCITY, GYRO_BIAS, STATE_DIM:n]
         """Components of the state that a beam may depend on"""
         self._measure(first)
+
+    def _number_rows(self, first_row: Indices) -> None:
+        """Take (K + 1,) where the beams of each keyframe begin, and where they end."""
+        self.first_row = first_row
+        count = first_row[1:] - first_row[:-1]
+        self.keyframe_of_row = np.repeat(np.arange(len(count)), count)
 
     def successor(self) -> Self:
         """Return a graph that goes its own way from here, and takes the chain along."""
@@ -142,7 +149,7 @@ class WindowGraph:
         graph = cls(sensors, keyframes[0], at.moments(np.eye(n)))
         graph.keyframes, graph.at, graph.beams, graph.aids = keyframes, at, beams, aids
         graph.prior = MarginalPrior(*(arrays[f"prior_{n}"] for n in MarginalPrior._fields))
-        graph.first_row = first_row
+        graph._number_rows(first_row)
         graph._between = list(arrays["between"])
         graph.chain = Chain(n, root=arrays["root"])
         graph._linearise_beams(0, len(keyframes))
@@ -169,7 +176,7 @@ class WindowGraph:
         """Add a keyframe's measurements, linearised; ``before`` (1, ...) is the state before."""
         self.keyframes.append(keyframe)
         self.beams = self.beams.followed_by(keyframe.beams)
-        self.first_row = np.append(self.first_row, len(self.beams))
+        self._number_rows(np.append(self.first_row, len(self.beams)))
         at = self.at.take(np.s_[-1:])
         here = np.zeros(len(keyframe.beams), np.intp)
         error, jacobian = beam_rows(self.sensors, keyframe.beams, at.take(here))
@@ -183,7 +190,7 @@ class WindowGraph:
         end = self.keyframes[-1]
         self.drop(len(self.keyframes) - 1)
         self._drop_rows(len(self.error))
-        self.first_row = np.zeros(2, np.intp)
+        self._number_rows(np.zeros(2, np.intp))
         self.at = last
         self.keyframes = [Keyframe(end.time_s, self.sensors.beams, inertial=end.inertial)]
         self.aids.drop(1)
@@ -200,7 +207,7 @@ class WindowGraph:
     def drop(self, count: int) -> None:
         """Forget the first keyframes."""
         self._drop_rows(int(self.first_row[count]))
-        self.first_row = self.first_row[count:] - self.first_row[count]
+        self._number_rows(self.first_row[count:] - self.first_row[count])
         self.chain.drop(count)
         self._stale = max(self._stale - count, 0)
         self.at = self.at.take(np.s_[count:])
@@ -217,17 +224,20 @@ class WindowGraph:
         begin = self._stale
         if begin == len(self.keyframes):
             return
-        row = self.first_row[begin]
-        rows = np.column_stack([self.jacobian[row:], -self.error[row:]])
-        rows *= (np.sqrt(weights[row:]) / self.beams.sigma[row:])[:, None]
+        row, n_keyframes = self.first_row[begin], len(self.keyframes)
+        of_beams = np.empty((len(self.error) - row, self.state_dim + 1))
+        of_beams[:, :-1] = self.jacobian[row:]
+        np.negative(self.error[row:], out=of_beams[:, -1])
+        of_beams *= (np.sqrt(weights[row:]) / self.beams.sigma[row:])[:, None]
         keyframe, of_aids = self.aids.rows(begin)
-        n_keyframes = len(self.keyframes)
-        of_beams = np.repeat(np.arange(begin, n_keyframes), np.diff(self.first_row[begin:]))
-        keyframe = np.concatenate([of_beams, keyframe])
-        order = np.argsort(keyframe, kind="stable")
-        rows = np.concatenate([rows, of_aids])[order]
-        edges = np.searchsorted(keyframe[order], np.arange(begin, n_keyframes + 1)).tolist()
-        own = [rows[first:last] for first, last in pairwise(edges)]
+        rows = np.concatenate([of_beams, of_aids])
+        own = [rows]
+        if begin + 1 < n_keyframes:
+            keyframe = np.concatenate([self.keyframe_of_row[row:], keyframe])
+            order = np.argsort(keyframe, kind="stable")
+            rows = rows[order]
+            edges = np.searchsorted(keyframe[order], np.arange(begin, n_keyframes + 1)).tolist()
+            own = [rows[first:last] for first, last in pairwise(edges)]
         carried = self.prior.rows(self.at) if begin == 0 else self.chain.carried[begin]
         self.chain.eliminate(carried, own, self._between[begin:], begin=begin)
         self._stale = len(self.keyframes)
@@ -254,8 +264,10 @@ class WindowGraph:
     def linearise(self, begin: int, end: int, step: Array) -> None:
         """Move successive keyframes by ``step`` (end - begin, n) and linearise there."""
         moved = self.at.take(np.s_[begin:end]).moved(step)
-        head, tail = self.at.take(np.s_[:begin]), self.at.take(np.s_[end:])
-        self.at = head.followed_by(moved).followed_by(tail)
+        if end - begin < len(self.keyframes):
+            head, tail = self.at.take(np.s_[:begin]), self.at.take(np.s_[end:])
+            moved = head.followed_by(moved, tail)
+        self.at = moved
         before, behind = max(begin - 1, 0), min(end + 1, len(self.keyframes))
         if len(self.keyframes) > 1:  # a single keyframe keeps what its prediction came with
             keyframes, at = self.keyframes[before + 1 : behind], self.at.take(np.s_[before:behind])
@@ -266,11 +278,13 @@ class WindowGraph:
 
     def _linearise_beams(self, begin: int, end: int) -> None:
         """Linearise the beams of successive keyframes."""
-        first = self.first_row
-        rows = slice(first[begin], first[end])
-        keyframe = np.repeat(np.arange(begin, end), np.diff(first[begin : end + 1]))
-        error, jacobian = beam_rows(self.sensors, self.beams.take(rows), self.at.take(keyframe))
-        parts = [(self.error, error), (self.jacobian, jacobian)]
-        self.error, self.jacobian = (
-            np.concatenate([old[: rows.start], new, old[rows.stop :]]) for old, new in parts
-        )
+        rows = slice(self.first_row[begin], self.first_row[end])
+        keyframe = self.keyframe_of_row[rows]
+        beams = self.beams if len(keyframe) == len(self.error) else self.beams.take(rows)
+        error, jacobian = beam_rows(self.sensors, beams, self.at.take(keyframe))
+        if len(error) < len(self.error):
+            parts = [(self.error, error), (self.jacobian, jacobian)]
+            error, jacobian = (
+                np.concatenate([old[: rows.start], new, old[rows.stop :]]) for old, new in parts
+            )
+        self.error, self.jacobian = error, jacobian

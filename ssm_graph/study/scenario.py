@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from ssm_graph.base.errors import ConfigError, DataError, nearest_hint
-from ssm_graph.io.mission_folder.reader import read_mission
+from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.simulation import (
     SCENARIOS,
     CurrentSettings,

@@ -18,7 +18,7 @@ import numpy as np
 
 from ssm_graph.base.errors import ConfigError, DataError, MissingExtraError
 from ssm_graph.base.frozen import Array
-from ssm_graph.io.mission_folder.reader import TableFormat
+from ssm_graph.io.mission_folder.folder import TableFormat
 from ssm_graph.study.cells import digest
 from ssm_graph.study.jobs import JobResult, RunKey
 from ssm_graph.study.scoring import COLUMNS, COUNT_COLUMNS, LOST, SERIES_STEP_S, TEXT_COLUMNS, Row

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.graph.first_values import FirstValues
-from ssm_graph.io.mission_folder.reader import read_mission
+from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.mission.mission import Mission, Reference
 from ssm_graph.mission.problem import Problem, build_problem, with_dvl
 from ssm_graph.mission.start.alignment import align

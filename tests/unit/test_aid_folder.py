@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ssm_graph.evaluation import evaluate
-from ssm_graph.io.mission_folder.reader import read_mission, write_mission
+from ssm_graph.io.mission_folder.folder import read_mission, write_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle, vehicle_of
 from ssm_graph.io.results.tables import read_results, write_results
 from ssm_graph.mission.estimate import Estimate

@@ -261,7 +261,7 @@ def writes_of(tree: ast.Module) -> Iterator[tuple[int, str]]:
 MAY_WRITE = {
     "ssm_graph/io/raw_log/log.py": {"row.is_in_table"},
     "ssm_graph/io/ros/convert.py": {"topic.n_unstated", "topic.beams_d"},
-    "ssm_graph/io/tables/arrival.py": {
+    "ssm_graph/io/tables/files.py": {
         f"counts.{name}"
         for name in ("torn", "torn_end", "impossible", "late", "repeated", "contrary")
     },

@@ -9,7 +9,7 @@ import pytest
 
 from ssm_graph.base.frames import wrap_to_pi
 from ssm_graph.base.frozen import Array
-from ssm_graph.io.blueye.gyros import dvl_heading
+from ssm_graph.io.blueye.convert import dvl_heading
 from ssm_graph.sensors.compass import HeadingLog
 from ssm_graph.sensors.imu import ImuLog, ImuNoise
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.io.blueye.gyros import compare_imus
+from ssm_graph.io.blueye.convert import compare_imus
 from ssm_graph.sensors.imu import ImuLog, ImuNoise
 
 OFFSET = np.array([0.037, -0.040, -0.085])

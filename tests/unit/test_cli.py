@@ -14,7 +14,7 @@ import pytest
 from ssm_graph import cli
 from ssm_graph.base.errors import SsmGraphError
 from ssm_graph.cli.main import EXIT_CODES, ExitCode, main
-from ssm_graph.io.mission_folder.reader import read_mission
+from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.io.results.tables import read_results
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from ssm_graph.cli.main import ExitCode, build_parser, main
 from ssm_graph.cli.online import input_configs, output_configs, replay_speed
-from ssm_graph.io.mission_folder.reader import read_mission, write_mission
+from ssm_graph.io.mission_folder.folder import read_mission, write_mission
 from ssm_graph.io.results.tables import read_results
 from ssm_graph.live.protocols.json_messages import JsonDecoder
 from ssm_graph.live.protocols.nmea import NmeaDecoder

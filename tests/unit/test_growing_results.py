@@ -11,8 +11,7 @@ from typing import Any
 import pytest
 
 from ssm_graph.base.errors import DataError
-from ssm_graph.io.results.growing import GrowingResults
-from ssm_graph.io.results.tables import BEAMS_NAME, SUMMARY_NAME, TRAJECTORY_NAME
+from ssm_graph.io.results.tables import BEAMS_NAME, SUMMARY_NAME, TRAJECTORY_NAME, GrowingResults
 from tests.estimate_fixture import make_run
 
 NAMES = (TRAJECTORY_NAME, BEAMS_NAME)

@@ -56,11 +56,11 @@ def far_transit(
 
 def errors_of(graph: gtsam.NonlinearFactorGraph, states: States) -> Array:
     """Return unwhitened errors, one row a factor."""
-    rows = []
+    rows, values = [], gtsam_values(states)
     for k in range(graph.size()):
         factor = graph.at(k)
         assert isinstance(factor, gtsam.NoiseModelFactor)
-        rows.append(factor.unwhitenedError(gtsam_values(states)))
+        rows.append(factor.unwhitenedError(values))
     return np.array(rows)
 
 
@@ -112,9 +112,9 @@ def test_depth_counts_the_height_error_and_its_readings() -> None:
     states = States.of(truth.R_nb, raised, truth.v_n, truth.bias)
     np.testing.assert_allclose(depth_errors(problem, states), 0.2, atol=1e-5)
     assert problem.depths is not None
-    graph = depth_graph(problem, problem.depths, states)
+    graph, values = depth_graph(problem, problem.depths, states), gtsam_values(states)
     counts = np.bincount(problem.depths.keyframe, minlength=problem.n_keyframes)
-    costs = [graph.at(k).error(gtsam_values(states)) for k in range(graph.size())]
+    costs = [graph.at(k).error(values) for k in range(graph.size())]
     expected = 0.5 * counts[counts > 0] * (0.2 / problem.depths.sigma) ** 2
     np.testing.assert_allclose(costs, expected, rtol=2e-4)
 

@@ -12,9 +12,16 @@ from hypothesis import strategies as st
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.live.protocols.decoder import Clock
-from ssm_graph.live.protocols.nmea import DepthSentence, NmeaDecoder, NmeaOptions
-from ssm_graph.live.protocols.nmea_encoder import encode_gga, encode_hdt, encode_nmea, encode_vtg
-from ssm_graph.live.protocols.nmea_fields import checksum
+from ssm_graph.live.protocols.nmea import (
+    DepthSentence,
+    NmeaDecoder,
+    NmeaOptions,
+    checksum,
+    encode_gga,
+    encode_hdt,
+    encode_nmea,
+    encode_vtg,
+)
 from ssm_graph.mission.navigation import Health, Navigation
 from ssm_graph.sensors.depth import DepthReading
 from ssm_graph.sensors.gnss import Fix

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from ssm_graph.base.errors import ConfigError, DataError
-from ssm_graph.io.mission_folder.reader import read_mission
+from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.io.raw_log.log import RawLog
 from ssm_graph.io.results.tables import read_results
 from ssm_graph.io.tables.checkpoint import CHECKPOINT_NAME, older_name

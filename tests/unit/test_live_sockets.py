@@ -11,7 +11,7 @@ from itertools import pairwise
 import pytest
 
 from ssm_graph.base.errors import ConfigError
-from ssm_graph.live.protocols.decoder import Clock
+from ssm_graph.live.protocols.decoder import Clock, Decoder
 from ssm_graph.live.protocols.json_messages import JsonDecoder, encode_message
 from ssm_graph.live.protocols.nmea import NmeaDecoder
 from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
@@ -23,7 +23,7 @@ from ssm_graph.live.sockets.endpoints import (
     Transport,
     parse_endpoint,
 )
-from ssm_graph.live.sockets.feed import CountingDecoder, Limits
+from ssm_graph.live.sockets.feed import Limits
 from ssm_graph.live.sockets.inputs import TcpServerInput, UdpInput
 from ssm_graph.live.sockets.outputs import MAX_CLIENTS, MAX_WAITING, OutputFormat, TcpServerOutput
 from ssm_graph.live.sockets.sockets import InputConfig, OutputConfig, SocketHub
@@ -75,7 +75,7 @@ def listening(
     transport: Transport,
     name: str = "imu",
     limits: Limits = QUICK,
-    make: Callable[[], CountingDecoder] = JsonDecoder,
+    make: Callable[[], Decoder] = JsonDecoder,
 ) -> InputConfig:
     """Return a source that we listen for, at any free port."""
     return InputConfig(name, Endpoint(transport, LOOPBACK, 0), make, limits)
@@ -457,7 +457,7 @@ def test_a_defect_at_a_socket_drops_that_socket(monkeypatch: pytest.MonkeyPatch)
 @pytest.mark.parametrize("is_nmea", [True, False])
 def test_depth_by_arrival(*, is_nmea: bool) -> None:
     """A sensor without a clock is stamped when it comes."""
-    make: Callable[[], CountingDecoder] = NmeaDecoder if is_nmea else JsonDecoder
+    make: Callable[[], Decoder] = NmeaDecoder if is_nmea else JsonDecoder
     reading = DepthReading(WALL_S, 12.5)
     with SocketHub([listening(Transport.UDP, "depth", make=make)], wall_s=lambda: WALL_S) as hub:
         receiver = Receiver(hub)

@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 
 from ssm_graph.base.errors import ConfigError, DataError, SsmGraphError
 from ssm_graph.base.tables import Table
-from ssm_graph.io.mission_folder.reader import read_mission
-from ssm_graph.io.tables.arrival import read_arrival_table
-from ssm_graph.io.tables.files import read_table
+from ssm_graph.io.mission_folder.folder import read_mission
+from ssm_graph.io.tables.files import read_arrival_table, read_table
 from ssm_graph.sensors.depth import DEPTH
 from ssm_graph.sensors.dvl_instrument import DVL
 from tests.mission_damage import Damage as FolderDamage

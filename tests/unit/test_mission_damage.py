@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from ssm_graph.base.errors import SsmGraphError
-from ssm_graph.io.mission_folder.reader import read_mission
+from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.mission.mission import Mission
 from ssm_graph.sensors.acoustic import RangeLog, UsblLog
 from ssm_graph.sensors.compass import HeadingLog

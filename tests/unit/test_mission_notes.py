@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.io.mission_folder.reader import read_mission
+from ssm_graph.io.mission_folder.folder import read_mission
 from tests.mission_damage import (
     ACCEL,
     BEAMS,

@@ -10,7 +10,7 @@ import pytest
 
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
-from ssm_graph.io.mission_folder.reader import read_mission
+from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.mission.mission import Mission
 from ssm_graph.sensors.drift import Drift
 from tests.mission_damage import (

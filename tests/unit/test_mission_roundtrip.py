@@ -14,9 +14,8 @@ from hypothesis import strategies as st
 
 from ssm_graph.base.errors import ConfigError, DataError, MissingExtraError
 from ssm_graph.base.units import in_unit
-from ssm_graph.io.mission_folder.reader import read_mission
+from ssm_graph.io.mission_folder.folder import read_mission, write_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle, vehicle_of
-from ssm_graph.io.mission_folder.writer import write_mission
 from ssm_graph.io.tables import files as tables_module
 from ssm_graph.io.tables.files import TableFormat
 from ssm_graph.mission.mission import Aids, Mission
@@ -208,7 +207,7 @@ def test_interrupted_write_keeps_the_old_mission(
     def fail(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(tomli_w, "dump", fail)
+    monkeypatch.setattr(tomli_w, "dumps", fail)
     shorter = without_optional_parts(make_mission())
     with pytest.raises(KeyboardInterrupt):
         write_mission(tmp_path, shorter)

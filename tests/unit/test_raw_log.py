@@ -24,10 +24,10 @@ from hypothesis import strategies as st
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.units import DEGREE, exactly_in_unit
-from ssm_graph.io.mission_folder.reader import read_mission
+from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.io.raw_log import log as raw_log
-from ssm_graph.io.raw_log import replay as raw_replay
+from ssm_graph.io.raw_log import rows as raw_rows
 from ssm_graph.io.raw_log.log import RawLog, replay
 from ssm_graph.io.raw_log.rows import ALWAYS, messages_of, row_kinds
 from ssm_graph.sensors.acoustic import AcousticRange
@@ -260,7 +260,7 @@ def test_killed_at_every_byte_of_the_last_rows(
     tmp_path: Path, table: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The torn row goes, one without its letter stays, later ones keep their order."""
-    for module in (raw_log, raw_replay):  # it takes longer than all the rest
+    for module in (raw_log, raw_rows):  # it takes longer than all the rest
         monkeypatch.setattr(module, "check_same_vehicle", lambda *_: None)
     messages = mixed(36)
     log = log_of(tmp_path, messages)

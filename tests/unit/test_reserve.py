@@ -6,8 +6,17 @@ import numpy as np
 
 from ssm_graph.engine.error_state import POSITION, ROTATION, VELOCITY
 from ssm_graph.live.estimator import FixedLagSmoother
-from ssm_graph.live.estimator.recovery import Doubt, Doubted, doubt_of, is_astray, watch_after
-from ssm_graph.live.estimator.reserve import RENEW_S, SPEED_SIGMA, Kept, Reserve
+from ssm_graph.live.estimator.recovery import (
+    RENEW_S,
+    SPEED_SIGMA,
+    Doubt,
+    Doubted,
+    Kept,
+    Reserve,
+    doubt_of,
+    is_astray,
+    watch_after,
+)
 from ssm_graph.live.estimator.watch import Contradicted, Watch
 from ssm_graph.smoothers.keyframe import Keyframe
 from tests.online_fixture import SHORT, messages, stream

@@ -160,12 +160,12 @@ def test_interrupted_write_leaves_no_mixture(
     write_results(tmp_path, estimate, mission=mission, metrics=None, settings={"run": 1})
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
 
-    def no_space(path: Path, text: str) -> None:
-        path.write_text(text[:100])
+    def no_space(path: Path, content: bytes) -> None:
+        path.write_bytes(content[:100])
         if "beams" in path.name:
             raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(results_module, "_write_through", no_space)
+    monkeypatch.setattr(results_module, "write_through", no_space)
     with pytest.raises(DataError, match="No space left"):
         write_results(tmp_path, estimate, mission=mission, metrics=None, settings={"run": 2})
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before

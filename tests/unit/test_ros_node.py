@@ -26,7 +26,7 @@ from examples.ros2_node.ssm_graph_node import (
 )
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import ConfigError
-from ssm_graph.io.mission_folder.reader import write_mission
+from ssm_graph.io.mission_folder.folder import write_mission
 from ssm_graph.io.ros.messages import IMU_TYPE, WATER_LINKED_TYPE
 from ssm_graph.mission.navigation import Event, Health, Navigation, Severity
 from ssm_graph.sensors.imu import ImuSample

@@ -19,7 +19,7 @@ from ssm_graph.base.errors import ConfigError, DataError, MissingExtraError
 from ssm_graph.base.frames import R_FRD, BodyAxes
 from ssm_graph.base.frozen import Array
 from ssm_graph.cli.main import ExitCode, main
-from ssm_graph.io.mission_folder.reader import read_mission, write_mission
+from ssm_graph.io.mission_folder.folder import read_mission, write_mission
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.io.ros import log as rosbag_log
 from ssm_graph.io.ros.beams import WATER_LINKED_BEAMS, proven_beams

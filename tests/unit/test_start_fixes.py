@@ -10,7 +10,7 @@ import pytest
 
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.evaluation import evaluate
-from ssm_graph.io.mission_folder.reader import read_mission, write_mission
+from ssm_graph.io.mission_folder.folder import read_mission, write_mission
 from ssm_graph.mission.mission import NO_AIDS, Mission
 from ssm_graph.mission.start.alignment import align
 from ssm_graph.mission.start.body_velocity import BodyVelocities, body_velocities

@@ -9,7 +9,7 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.engine.states import States
 from ssm_graph.imu.preintegration import GAP_ACCEL, GAP_GYRO_RATE, GRAVITY
 from ssm_graph.live.estimator import FixedLagSmoother
-from ssm_graph.live.estimator.asked import sensors_of_vehicle
+from ssm_graph.live.estimator.start import sensors_of_vehicle
 from ssm_graph.live.estimator.tail import LONGEST_S, Tail
 from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.smoothers.keyframe import Keyframe

@@ -11,7 +11,7 @@ import pytest
 
 from ssm_graph.base.errors import ConfigError, SsmGraphError
 from ssm_graph.base.tables import Order
-from ssm_graph.io.mission_folder.reader import read_mission
+from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle, vehicle_of, write_vehicle
 from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator.buffers import Buffers

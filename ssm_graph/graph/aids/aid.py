@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cache
 from typing import ClassVar, NamedTuple, Self, final
 
@@ -92,15 +92,34 @@ class Table(ReadOnlyArrays):
 
     def take(self, rows: Rows) -> Self:
         """Return some of the rows."""
-        return replace(self, **{name: getattr(self, name)[rows] for name in self.columns()})
+        return self._with({name: getattr(self, name)[rows] for name in self.columns()})
+
+    def _with(self, columns: Mapping[str, Array | Indices]) -> Self:
+        """Return the same with other columns, as `dataclasses.replace` does in many times this."""
+        made = object.__new__(type(self))
+        for name in self._names():
+            column = columns.get(name)
+            if column is None:
+                column = getattr(self, name)
+            else:
+                column.setflags(write=False)
+            object.__setattr__(made, name, column)
+        return made
+
+    @classmethod
+    @cache
+    def _names(cls) -> tuple[str, ...]:
+        return tuple(spec.name for spec in fields(cls))
 
     def joined(self, tables: Sequence[Self]) -> Self:
         """Return the rows of several tables, one after the other, with what these share."""
         names = self.columns()
-        return replace(self, **{n: np.concatenate([getattr(t, n) for t in tables]) for n in names})
+        return self._with({n: np.concatenate([getattr(t, n) for t in tables]) for n in names})
 
     def followed_by(self, other: Self) -> Self:
         """Return these rows, then the others."""
+        if len(self) == 0 or len(other) == 0:
+            return other if len(self) == 0 else self
         return self.joined([self, other])
 
     def at(self, keyframe: int) -> Self:
@@ -110,7 +129,7 @@ class Table(ReadOnlyArrays):
 
     def moved_to(self, keyframe: int | Indices) -> Self:
         """Return the same rows at other keyframes."""
-        return replace(self, keyframe=np.broadcast_to(np.intp(keyframe), len(self)))
+        return self._with({"keyframe": np.full(len(self), keyframe, np.intp)})
 
     def pack(self) -> Iterator[tuple[str, Array]]:
         """Yield name and array of each column, for checkpoints."""
@@ -120,7 +139,7 @@ class Table(ReadOnlyArrays):
     def unpack(self, arrays: Mapping[str, Array]) -> Self:
         """Return these with the rows that were packed."""
         types = {name: getattr(self, name).dtype for name in self.columns()}
-        return replace(self, **{name: arrays[name].astype(t) for name, t in types.items()})
+        return self._with({name: arrays[name].astype(t) for name, t in types.items()})
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final, Self
 
 import numpy as np
@@ -14,7 +14,7 @@ from ssm_graph.base.times import Indices
 from ssm_graph.engine.error_state import POSITION, ROTATION
 from ssm_graph.engine.extras import Extra
 from ssm_graph.graph.aids.aid import Aid, Linearised, RowStates
-from ssm_graph.graph.aids.heights import HeightTrack, height_track
+from ssm_graph.graph.aids.heights import height_track
 from ssm_graph.imu.ping_motion import mean_gyro
 from ssm_graph.sensors.depth import DepthCalibration, DepthLog
 from ssm_graph.sensors.imu import ImuLog
@@ -136,26 +136,25 @@ class DepthMeans(Aid):
         """(M,) always the same."""
         return ["depth"] * len(self)
 
-    def _track(self, at: RowStates, gyro_b: Array) -> HeightTrack:
-        return height_track(
-            self.frame,
-            R_nb=at.R_nb,
-            p_n=at.p_n,
-            v_n=at.v_n,
-            gyro_b=gyro_b,
-            lever_arm_b=self.lever_arm_b,
-        )
-
     def led_along(self, before: RowStates | None, at: RowStates) -> Self:
         """Return the same with the rises along another track, and the plane that is level there."""
-        end, rise = self._track(at, self.gyro_b), self.rise
+        states = [at] if before is None else [at, before]
+        track = height_track(
+            self.frame,
+            R_nb=np.stack([x.R_nb for x in states]),
+            p_n=np.stack([x.p_n for x in states]),
+            v_n=np.stack([x.v_n for x in states]),
+            gyro_b=np.stack([self.gyro_b, self.gyro_before_b][: len(states)]),
+            lever_arm_b=self.lever_arm_b,
+        )
+        height, climb = track.height, track.climb
+        rise = self.rise
         if before is not None:
-            begin = self._track(before, self.gyro_before_b)
-            rise = self.rise_of_way * (end.height - begin.height)
-            rise = rise + self.rise_of_begin_s * begin.climb + self.rise_of_end_s * end.climb
-        too_low = rise - self.depth - end.height
-        target_n = end.sensor_n + end.up_n * too_low[:, None]
-        return replace(self, rise=rise, up_n=end.up_n, target_n=target_n)
+            rise = self.rise_of_way * (height[0] - height[1])
+            rise = rise + self.rise_of_begin_s * climb[1] + self.rise_of_end_s * climb[0]
+        too_low = rise - self.depth - height[0]
+        target_n = track.sensor_n[0] + track.up_n[0] * too_low[:, None]
+        return self._with({"rise": rise, "up_n": track.up_n[0], "target_n": target_n})
 
     def measured(self, at: RowStates) -> Linearised:
         """Linearise heights, after :meth:`led_along`: one component each."""

@@ -31,10 +31,11 @@ def height_track(
     """Return the track of a sensor ``lever_arm_b`` off the body origin, leading axes (...)."""
     arm_n = (R_nb @ lever_arm_b[..., None])[..., 0]
     swing_n = (R_nb @ cross(gyro_b, lever_arm_b)[..., None])[..., 0]
-    up_n = frame.R_nl_at(p_n)[..., 2]
     sensor_n = p_n + arm_n
+    lat, lon, height = frame.geodetic_from_p_n(np.stack([p_n, sensor_n]))
+    up_n = frame.up_n_at(lat[0], lon[0])
     return HeightTrack(
-        height=frame.geodetic_from_p_n(sensor_n)[2],
+        height=height[1],
         climb=((v_n + swing_n) * up_n).sum(axis=-1),
         up_n=up_n,
         sensor_n=sensor_n,

@@ -54,6 +54,10 @@ def mission_from(
 ) -> Mission:
     """Return the mission of logs that were made of messages, checked as a folder's tables are.
 
+    Raises :class:`ConfigError` where neither vehicle nor fixes say where on Earth the mission was.
+    Raises :class:`DataError` for readings that cannot be what they are said to be, or that
+    contradict each other.
+
     Parameters
     ----------
     logs : of instruments of the registry, forward-right-down, SI units; IMU and DVL at least.
@@ -62,13 +66,6 @@ def mission_from(
     source : the recording; the mission has its name.
     labels : by section, what messages call the place that the readings came from.
     notes : what the converter noticed, one sentence each; what the checks notice follows.
-
-    Raises
-    ------
-    ConfigError
-        Where neither vehicle nor fixes say where on Earth the mission was.
-    DataError
-        For readings that cannot be what they are said to be, or that contradict each other.
     """
     parts: dict[str, Part] = {}
     found = list(notes)
@@ -158,11 +155,8 @@ def _initial_within(imu: Any, vehicle: Vehicle | None) -> tuple[InitialState | N
 def _check(mission: Mission, tables: dict[str, Table], *, has_origin: bool) -> list[str]:
     """Check the parts of a mission against each other; return the notes.
 
-    Parameters
-    ----------
-    mission : its instruments are sound by themselves.
-    tables : by section, where their readings came from.
-    has_origin : whether the frame was stated, not taken from the first position.
+    ``tables`` by section are where the readings of its instruments, sound by themselves, came from;
+    ``has_origin`` says that the frame was stated, not taken from the first position.
     """
     notes = _times(mission, tables)
     _initial_time(mission, tables["imu"].label)

@@ -206,7 +206,7 @@ def _turn_signs(mission: Mission, label: str) -> list[str]:
     edges = np.append(time_s - half, time_s[-1] + half)
     force = _force_direction(mission, edges, half)
     before, after = force[:-1], force[1:]
-    turn = _turned(mission, time_s, half)
+    turn = _gained(mission, mission.imu.gyro_b, time_s, half)
     predicted, seen = -np.cross(turn, 0.5 * (before + after)), after - before
     notes = []
     for axis, motion in enumerate(("pitches", "rolls")):
@@ -224,12 +224,8 @@ def _turn_signs(mission: Mission, label: str) -> list[str]:
 def _level_bias(mission: Mission, drift: Array, label: str) -> list[str]:
     """Note gyros about the level axes that read far more than the vehicle tilts.
 
-    Parameters
-    ----------
-    mission : the recorded run.
-    drift : (3,) how fast the direction of the specific force leaves the one by the gyros, 1/s;
-        that is ``bias x force``.
-    label : the table.
+    ``drift`` (3,) is how fast the direction of the specific force leaves the one by the gyros, 1/s;
+    that is ``bias x force``.
     """
     force = np.median(mission.imu.accel_b, axis=0)
     bias = np.cross(force / np.linalg.norm(force), drift)
@@ -336,11 +332,6 @@ def _gravity_direction(
     gravity = _gained(mission, mission.imu.accel_b, time_s, half) - gained
     gravity = gravity - np.cross(_gained(mission, mission.imu.gyro_b, time_s, half), v_b)
     return _unit(gravity)
-
-
-def _turned(mission: Mission, time_s: Array, half: float) -> Array:
-    """Return how far the gyros turn (N, 3) around each time, rad."""
-    return _gained(mission, mission.imu.gyro_b, time_s, half)
 
 
 def _gained(mission: Mission, values: Array, time_s: Array, half: float) -> Array:

@@ -12,13 +12,13 @@ from typing import Any, Final
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import ConfigError, nearest_hint
 from ssm_graph.base.frames import BodyAxes
-from ssm_graph.base.settings import FILE_KEY, Key, Settings, build, read_settings, shown
+from ssm_graph.base.settings import FILE_KEY, Key, Settings, build, number_key, read_settings, shown
 from ssm_graph.base.tables import Order, Table
 from ssm_graph.base.units import DEGREE
 from ssm_graph.mission.mission import InitialState, Reference
 from ssm_graph.sensors.current import CURRENT_KEYS
 from ssm_graph.sensors.instrument import ENU, Column, Instrument
-from ssm_graph.sensors.place import PLACE_KEYS, POSITION, check_positions
+from ssm_graph.sensors.place import PLACE_KEYS, POSITION, PositionInstrument
 from ssm_graph.sensors.registry import INSTRUMENTS
 from ssm_graph.sensors.standstill import STANDSTILL_KEYS
 
@@ -46,15 +46,12 @@ ATTITUDE: Final = Column(
 _PITCH: Final = Column("", "pitch_deg", limits=(-90.0, 90.0), expected="expected degrees up to 90")
 
 
-class _Reference(Instrument):
+class _Reference(PositionInstrument):
     """An outside trajectory is read and written as instruments are."""
 
-    __slots__ = ()
-
     def check(self, table: Table, bare: Reference, axes: BodyAxes) -> list[str]:
-        notes = check_positions(table)
         _PITCH.beyond(table)
-        return notes + super().check(table, bare, axes)
+        return super().check(table, bare, axes)
 
 
 REFERENCE: Final = _Reference(
@@ -63,13 +60,11 @@ REFERENCE: Final = _Reference(
 INITIAL_KEYS: Final[Mapping[str, Key]] = {
     "time_s": Key("time_s"),
     **PLACE_KEYS,
-    "vel_enu_m_per_s": Key(
-        "velocity_enu", shape=(3,), low=-50.0, high=50.0, hint="the unit is m/s"
-    ),
+    "vel_enu_m_per_s": number_key("velocity_enu", -50.0, 50.0, "the unit is m/s", shape=(3,)),
     "roll_deg": Key("roll", low=-180.0, high=180.0, unit=DEGREE),
     "pitch_deg": Key("pitch", low=-90.0, high=90.0, unit=DEGREE),
-    "heading_deg": Key(
-        "heading", low=-180.0, high=360.0, hint="heading is clockwise from north", unit=DEGREE
+    "heading_deg": number_key(
+        "heading", -180.0, 360.0, "heading is clockwise from north", unit=DEGREE
     ),
     "position_sigma_m": Key("position_sigma_enu", shape=(3,), positive=True, high=1e7),
     "velocity_sigma_m_per_s": Key("velocity_sigma_enu", shape=(3,), positive=True, high=1e3),

@@ -11,8 +11,8 @@ from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frames import BodyAxes
 from ssm_graph.base.settings import build, written
 from ssm_graph.base.tables import Order
+from ssm_graph.io.mission_folder.folder import common_sections, instrument_sections, write_toml_part
 from ssm_graph.io.mission_folder.toml import FORMAT, SECTIONS, TOML_NAME, read_vehicle_toml
-from ssm_graph.io.mission_folder.writer import common_sections, instrument_sections, write_toml_part
 from ssm_graph.io.tables.files import TableFormat
 from ssm_graph.mission.mission import Aids, Mission
 from ssm_graph.mission.vehicle import GNSS_AT_ORIGIN, Vehicle

@@ -9,17 +9,15 @@ that moment, so that a row that was written without its letter shifts no other.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Final, Self
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.io.mission_folder.toml import TOML_NAME
 from ssm_graph.io.mission_folder.vehicle import check_same_vehicle, write_vehicle
-from ssm_graph.io.raw_log.replay import check_columns, replay
-from ssm_graph.io.raw_log.rows import ALWAYS, ARRIVALS, RowKind, row_kinds
+from ssm_graph.io.raw_log.rows import ALWAYS, ARRIVALS, RowKind, check_columns, replay, row_kinds
 from ssm_graph.io.tables.append_file import TORN_ROW, AppendFile, sync_folder
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.messages import Message
@@ -48,6 +46,9 @@ class RawLog:
     and after :meth:`sync` a power failure. A disk that is full or fails stops nobody: rows then
     wait in memory, and :meth:`problems` says so.
 
+    Raises :class:`ConfigError` for a folder that holds a mission already. Raises :class:`OSError`
+    where the folder and the heads of its tables cannot be written.
+
     Parameters
     ----------
     folder : made if it does not exist; one that holds a mission is refused.
@@ -55,13 +56,6 @@ class RawLog:
     max_waiting : rows that may wait in memory for the disk; those that come then are lost.
     retry_every : rows after which the disk is tried again; at the latest, that is, for it is tried
         after a second of message time as well.
-
-    Raises
-    ------
-    ConfigError
-        For a folder that holds a mission already.
-    OSError
-        Where the folder and the heads of its tables cannot be written.
     """
 
     def __init__(
@@ -76,7 +70,7 @@ class RawLog:
         folder.mkdir(parents=True, exist_ok=True)
         kinds = row_kinds(vehicle)
         _refuse_content(folder, kinds.values())
-        self._open(folder, kinds, max_waiting=max_waiting, retry_every=retry_every)
+        self._open(folder, kinds, max_waiting, retry_every)
         for kind in kinds.values():
             if kind.file in self._tables:
                 self._tables[kind.file].append(kind.header)
@@ -97,24 +91,14 @@ class RawLog:
     ) -> Self:
         """Go on with a log that another process began, full disk or not.
 
-        Parameters
-        ----------
-        folder : the log's.
-        vehicle : that of the log; another one is refused.
-        max_waiting, retry_every : as for a new log.
-
-        Raises
-        ------
-        ConfigError
-            For a folder without a log, and for the log of another vehicle or of another version.
-        OSError
-            Where the files cannot be opened.
+        Raises :class:`ConfigError` for a folder without a log, and for the log of another vehicle
+        or of another version. Raises :class:`OSError` where the files cannot be opened.
         """
         check_same_vehicle(folder, vehicle)
         kinds = row_kinds(vehicle)
         check_columns(folder, kinds.values())
         log = cls.__new__(cls)
-        log._open(Path(folder), kinds, max_waiting=max_waiting, retry_every=retry_every)
+        log._open(Path(folder), kinds, max_waiting, retry_every)
         tables = [log._tables.get(kind.file) for kind in kinds.values()]
         sizes = ",".join(str(0 if table is None else table.size) for table in tables)
         log._waiting.append(_Row(log._arrivals, f"\n@{sizes};\n".encode(), b""))
@@ -127,12 +111,7 @@ class RawLog:
         return log
 
     def _open(
-        self,
-        folder: Path,
-        kinds: Mapping[type[Message], RowKind],
-        *,
-        max_waiting: int,
-        retry_every: int,
+        self, folder: Path, kinds: dict[type[Message], RowKind], max_waiting: int, retry_every: int
     ) -> None:
         self._folder, self._kinds = folder, kinds
         self._tables = {
@@ -218,12 +197,7 @@ class RawLog:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        at: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _files(self) -> list[AppendFile]:

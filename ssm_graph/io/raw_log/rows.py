@@ -1,14 +1,18 @@
-"""Messages as rows of the tables of a mission folder, and back, and a mission as messages."""
+"""A raw log's rows: messages as rows of a mission folder's tables, and read again as they came."""
 
 from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Iterator
-from typing import Any, Final
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, BinaryIO, Final
 
+from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.tables import TIME
 from ssm_graph.base.units import exactly_in_unit
+from ssm_graph.io.mission_folder.vehicle import check_same_vehicle
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.instrument import Instrument
@@ -17,15 +21,14 @@ from ssm_graph.sensors.registry import BY_LOG, INSTRUMENTS
 
 ARRIVALS: Final = "arrivals"
 """The file of a log that has a letter for every row, in order of arrival."""
+_FEWEST_TABLES = 4
+_SIZES = re.compile(rb"@(\d+(?:,\d+)*);")
 
 
 class RowKind:
     """How messages of one instrument are written.
 
-    Parameters
-    ----------
-    instrument : one that is heard live.
-    bare : what is known of it: how many numbers a message has.
+    What is known of the instrument, ``bare``, says how many numbers a message has.
     """
 
     def __init__(self, instrument: Instrument, bare: Any) -> None:
@@ -101,3 +104,122 @@ def messages_of(mission: Mission) -> Iterator[Message]:
         if one.message is not None and one.log in logs
     ]
     return heapq.merge(*streams, key=lambda message: message.time_s)
+
+
+class _Rows:
+    """The rows of one table, in order of arrival; torn ones are left out."""
+
+    def __init__(self, path: Path, kind: RowKind, start: int) -> None:
+        self._kind = kind
+        end = path.stat().st_size if path.exists() else 0
+        self._lines = _lines(path, start, end)
+        self._next: tuple[int, bytes] | None = next(self._lines, None)
+
+    def take(self, limit: float = math.inf) -> Message | None:
+        """Return the next message of a line that starts before ``limit``, None if there is none."""
+        while self._next is not None and self._next[0] < limit:
+            message = self._kind.parse(self._next[1])
+            self._next = next(self._lines, None)
+            if message is not None:
+                return message
+        return None
+
+    def take_all(self, limit: float) -> Iterator[Message]:
+        """Yield the messages of all lines that start before ``limit``."""
+        while (message := self.take(limit)) is not None:
+            yield message
+
+
+def replay(
+    folder: Path | str, vehicle: Vehicle, offsets: Mapping[str, int] | None = None
+) -> Iterator[Message]:
+    """Return what was logged after a checkpoint, in order of arrival.
+
+    Rows whose letter was not written come last in the log of their process, the tables merged by
+    time. Rows that are appended after this call are not among them.
+
+    Raises :class:`ConfigError` for a folder without a log, and for the log of another vehicle or of
+    another version.
+
+    ``offsets`` are those of :meth:`RawLog.offsets`; a file that is not named is read from its
+    start.
+    """
+    check_same_vehicle(folder, vehicle)
+    kinds = row_kinds(vehicle)
+    check_columns(folder, kinds.values())
+    starts = offsets or {}
+    arrivals = _read_from(Path(folder) / ARRIVALS, starts.get(ARRIVALS, 0))
+    tables = {
+        kind.letter[0]: _Rows(Path(folder) / kind.file, kind, starts.get(kind.file, 0))
+        for kind in kinds.values()
+    }
+    return _in_order_of_arrival(arrivals, tables)
+
+
+def check_columns(folder: Path | str, kinds: Iterable[RowKind]) -> None:
+    """Raise :class:`ConfigError` for a log whose tables have other columns than ours."""
+    for kind in kinds:
+        path = Path(folder) / kind.file
+        if not path.exists():
+            continue
+        with path.open("rb") as stream:
+            head = stream.readline()
+        if head.endswith(b"\n") and head != kind.header:
+            raise ConfigError(
+                f"{path}: expected the columns {kind.header.decode().strip()}, got "
+                f"{head.decode(errors='replace').strip()[:200]}; it is the log of another version: "
+                "begin a new one in another folder; ssm-graph smooth and --replay read the old one"
+            )
+
+
+def _in_order_of_arrival(arrivals: bytes, tables: dict[int, _Rows]) -> Iterator[Message]:
+    for letters, limits in _runs(arrivals, len(tables)):
+        limit_of = dict(zip(tables, limits, strict=True))
+        for letter in letters:
+            if letter in tables and (message := tables[letter].take(limit_of[letter])) is not None:
+                yield message
+        rest = [table.take_all(limit_of[letter]) for letter, table in tables.items()]
+        yield from heapq.merge(*rest, key=lambda message: message.time_s)
+
+
+def _runs(arrivals: bytes, n_tables: int) -> Iterator[tuple[bytes, tuple[float, ...]]]:
+    """Yield the letters of each process and the sizes of the tables when it had ended."""
+    letters = b""
+    for line in arrivals.split(b"\n"):
+        sizes = _SIZES.fullmatch(line)
+        limits = tuple(float(size) for size in sizes[1].split(b",")) if sizes else ()
+        if _FEWEST_TABLES <= len(limits) <= n_tables:  # there were none of later instruments
+            yield letters, limits + (0.0,) * (n_tables - len(limits))
+            letters = b""
+        elif not line.startswith(b"@"):  # else a line of sizes that was torn
+            letters += line
+    yield letters, (math.inf,) * n_tables
+
+
+def _lines(path: Path, start: int, end: int) -> Iterator[tuple[int, bytes]]:
+    """Yield place and text of the whole lines between two places of a file."""
+    if start >= end:
+        return
+    with path.open("rb") as stream:
+        place = _skip_to_line(stream, start)
+        for line in stream:
+            if place + len(line) > end or not line.endswith(b"\n"):
+                return
+            yield place, line[:-1]
+            place += len(line)
+
+
+def _skip_to_line(stream: BinaryIO, start: int) -> int:
+    """Go to ``start``, or to the next begin of a line where it is amid one; return the place."""
+    if start > 0:
+        stream.seek(start - 1)
+        stream.readline()
+    return stream.tell()
+
+
+def _read_from(path: Path, start: int) -> bytes:
+    if not path.exists():
+        return b""
+    with path.open("rb") as stream:
+        stream.seek(start)
+        return stream.read()

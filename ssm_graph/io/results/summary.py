@@ -10,6 +10,8 @@ from typing import Any, Final, Protocol
 
 import numpy as np
 
+from ssm_graph.base.settings import written
+from ssm_graph.io.mission_folder.toml import INITIAL_KEYS
 from ssm_graph.mission.estimate import (
     OUTLIER_WEIGHT,
     AidTable,
@@ -19,46 +21,16 @@ from ssm_graph.mission.estimate import (
     Trajectory,
     path_length_m,
 )
-from ssm_graph.mission.mission import InitialState, Mission
+from ssm_graph.mission.mission import Mission
 
-PACKAGES: Final = {
-    "ssm_graph": "ssm-graph",
-    "gtsam": "gtsam",
-    "numpy": "numpy",
-    "scipy": "scipy",
-}
-"""Names in the summary and of the distributions."""
+PACKAGES: Final = ("ssm_graph", "gtsam", "numpy", "scipy")
+"""Names in the summary; distributions have hyphens."""
 
 
 class MetricsLike(Protocol):
-    """What a summary needs of `ssm_graph.evaluation.Metrics`; angles in rad."""
+    """What a summary needs of `ssm_graph.evaluation.Metrics`."""
 
-    @property
-    def n_epochs(self) -> int: ...  # noqa: D102
-    @property
-    def first_s(self) -> float: ...  # noqa: D102
-    @property
-    def last_s(self) -> float: ...  # noqa: D102
-    @property
-    def rmse_horizontal_m(self) -> float: ...  # noqa: D102
-    @property
-    def rmse_vertical_m(self) -> float: ...  # noqa: D102
-    @property
-    def max_horizontal_m(self) -> float: ...  # noqa: D102
-    @property
-    def end_error_m(self) -> float: ...  # noqa: D102
-    @property
-    def path_length_m(self) -> float: ...  # noqa: D102
-    @property
-    def drift_percent(self) -> float: ...  # noqa: D102
-    @property
-    def rmse_velocity_m_per_s(self) -> float: ...  # noqa: D102
-    @property
-    def rmse_attitude(self) -> tuple[float, float, float]: ...  # noqa: D102
-    @property
-    def nees_position(self) -> float: ...  # noqa: D102
-    @property
-    def inside_3_sigma(self) -> tuple[float, float, float]: ...  # noqa: D102
+    def summary_fields(self) -> dict[str, Any]: ...  # noqa: D102
 
 
 def build_summary(
@@ -94,21 +66,18 @@ def build_summary(
         "total_path_length_m": total_path,
         "final": _final(trajectory),
         "start": {
-            **_start(estimate.start),
+            **written(estimate.start, INITIAL_KEYS),
+            "heading_deg": np.rad2deg(estimate.start.heading) % 360.0,
             "origin": "mission" if mission.initial is not None else "alignment",
         },
         "calibration": calibration_fields(estimate.calibration),
         "noise": _noise(estimate),
         **({"aids": _aids(estimate.aids)} if estimate.aids is not None else {}),
         "current": current_fields(estimate.current),
-        **(_comparison(metrics) if metrics is not None else {}),
+        **(metrics.summary_fields() if metrics is not None else {}),
         "settings": settings,
         "history": [
-            {
-                "update_sigmas": step.update_sigmas,
-                "weight_change": step.weight_change,
-                "kernel": step.kernel,
-            }
+            {name: getattr(step, name) for name in ("update_sigmas", "weight_change", "kernel")}
             for step in estimate.iterations
         ],
         "notes": estimate.notes,
@@ -121,9 +90,9 @@ def build_summary(
 def versions() -> dict[str, str | None]:
     """Return the versions of everything that makes the numbers; None for what is not installed."""
     found: dict[str, str | None] = {"python": platform.python_version()}
-    for name, distribution in PACKAGES.items():
+    for name in PACKAGES:
         try:
-            found[name] = version(distribution)
+            found[name] = version(name.replace("_", "-"))
         except PackageNotFoundError:
             found[name] = None
     return found
@@ -144,27 +113,6 @@ def as_json(value: Any) -> Any:
     if isinstance(value, Sequence | set | frozenset):
         return [as_json(item) for item in value]
     return str(value)
-
-
-def _comparison(metrics: MetricsLike) -> dict[str, Any]:
-    roll, pitch, heading = np.rad2deg(metrics.rmse_attitude).tolist()
-    return {
-        "rmse_horizontal_m": metrics.rmse_horizontal_m,
-        "rmse_vertical_m": metrics.rmse_vertical_m,
-        "max_horizontal_m": metrics.max_horizontal_m,
-        "end_error_m": metrics.end_error_m,
-        "path_length_m": metrics.path_length_m,
-        "drift_percent": metrics.drift_percent,
-        "rmse_velocity_m_per_s": metrics.rmse_velocity_m_per_s,
-        "rmse_roll_deg": roll,
-        "rmse_pitch_deg": pitch,
-        "rmse_heading_deg": heading,
-        "nees_position": metrics.nees_position,
-        "inside_3_sigma": dict(zip(("east", "north", "up"), metrics.inside_3_sigma, strict=True)),
-        "compared_epochs": metrics.n_epochs,
-        "compared_from_s": metrics.first_s,
-        "compared_to_s": metrics.last_s,
-    }
 
 
 def calibration_fields(calibration: Calibration | None) -> dict[str, Any]:
@@ -214,23 +162,6 @@ def current_fields(current: CurrentTrack | None) -> dict[str, Any]:
         "mean_sigma_enu_m_per_s": current.sigma_enu.mean(axis=0),
         "final_enu_m_per_s": current.velocity_enu[-1],
         "final_sigma_enu_m_per_s": current.sigma_enu[-1],
-    }
-
-
-def _start(start: InitialState) -> dict[str, Any]:
-    """Return the initial state with the keys of the mission format's ``[initial]``."""
-    return {
-        "time_s": start.time_s,
-        "lat_deg": np.rad2deg(start.lat),
-        "lon_deg": np.rad2deg(start.lon),
-        "height_m": start.height,
-        "vel_enu_m_per_s": start.velocity_enu,
-        "roll_deg": np.rad2deg(start.roll),
-        "pitch_deg": np.rad2deg(start.pitch),
-        "heading_deg": np.rad2deg(start.heading) % 360.0,
-        "position_sigma_m": start.position_sigma_enu,
-        "velocity_sigma_m_per_s": start.velocity_sigma_enu,
-        "attitude_sigma_deg": np.rad2deg(start.attitude_sigma),
     }
 
 

@@ -21,15 +21,10 @@ from ssm_graph.base.errors import DataError
 from ssm_graph.base.frames import BodyAxes
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.units import DEG_PER_H, MICRO_G
-from ssm_graph.io.mission_folder.calibration_toml import CALIBRATION_NAME, calibration_toml
+from ssm_graph.io.mission_folder.folder import CALIBRATION_NAME, calibration_toml
 from ssm_graph.io.results.summary import MetricsLike, build_summary
-from ssm_graph.io.tables.csv_tables import (
-    CsvFile,
-    check_is_text,
-    check_last_line,
-    read_csv_header,
-    read_csv_values,
-)
+from ssm_graph.io.tables import csv_tables
+from ssm_graph.io.tables.append_file import TORN_ROW, AppendFile, write_through
 from ssm_graph.mission.estimate import AidTable, BeamTable, CurrentTrack, Estimate, Trajectory
 from ssm_graph.mission.mission import Mission
 
@@ -94,13 +89,12 @@ def write_results(
         content[AIDS_NAME] = format_aids(estimate.aids)
     if estimate.calibration is not None:
         content[CALIBRATION_NAME] = calibration_toml(mission, estimate.calibration, axes=axes)
-    text = json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False)
-    content[SUMMARY_NAME] = text + "\n"
+    content[SUMMARY_NAME] = _summary_text(summary)
     parts = {name: folder / f".{name}.part-{os.getpid()}" for name in content}
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, text in content.items():
-            _write_through(parts[name], text)
+            write_through(parts[name], text.encode())
         for name in (SUMMARY_NAME, CALIBRATION_NAME, AIDS_NAME):
             (folder / name).unlink(missing_ok=True)
         for name, part in parts.items():
@@ -211,53 +205,108 @@ def _spread(pattern: str, names: tuple[str, ...], values: Array, cell: str) -> C
     return {pattern.format(name): (values[:, i], cell) for i, name in enumerate(names)}
 
 
-def _trajectory_names() -> tuple[str, ...]:
-    empty, vector = np.empty(0), np.empty((0, 3))
-    return tuple(
-        trajectory_columns(
-            Trajectory(
-                time_s=empty,
-                lat=empty,
-                lon=empty,
-                height=empty,
-                velocity_enu=vector,
-                roll_pitch_heading=vector,
-                gyro_bias=vector,
-                accel_bias=vector,
-                position_cov_enu=np.empty((0, 3, 3)),
-                velocity_sigma_enu=vector,
-                attitude_sigma=vector,
-                n_beams=empty,
-            )
-        )
-    )
+TRAJECTORY_COLUMNS: Final = tuple(trajectory_columns(Trajectory.empty()))
+CURRENT_COLUMNS: Final = tuple(current_columns(CurrentTrack.empty()))
+BEAM_COLUMNS: Final = tuple(beam_columns(BeamTable.empty()))
+HEADERS: Final = {TRAJECTORY_NAME: TRAJECTORY_COLUMNS, BEAMS_NAME: BEAM_COLUMNS}
 
 
-TRAJECTORY_COLUMNS: Final = _trajectory_names()
-CURRENT_COLUMNS: Final = tuple(
-    current_columns(CurrentTrack(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3))))
-)
-BEAM_COLUMNS: Final = tuple(beam_columns(BeamTable(*[np.empty(0)] * 5)))
-
-
-def _write_through(path: Path, text: str) -> None:
-    with path.open("w", encoding="utf-8", newline="\n") as stream:
-        stream.write(text)
-        stream.flush()
-        os.fsync(stream.fileno())
+def _summary_text(summary: Mapping[str, Any]) -> str:
+    return json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
 
 
 def _read_table(path: Path, required: tuple[str, ...]) -> dict[str, Array]:
     """Return the columns of one table by name."""
-    file = CsvFile(path, str(path))
+    file = csv_tables.CsvFile(path, str(path))
     try:
-        check_is_text(file)
-        names = read_csv_header(file)
+        csv_tables.check_is_text(file)
+        names = csv_tables.read_csv_header(file)
         missing = [name for name in required if name not in names]
         if missing:
             raise DataError(f"{path}:1: column {missing[0]!r} is missing; is it a result table?")
-        values = read_csv_values(file, names, blank=frozenset(names))
-        check_last_line(file)
+        values = csv_tables.read_csv_values(file, names, blank=frozenset(names))
+        csv_tables.check_last_line(file)
     except OSError as error:
         raise DataError(f"{path}: cannot be read: {error.strerror or error}") from error
     return {name: values[:, index] for index, name in enumerate(names)}
+
+
+class GrowingResults:
+    """Appends to ``trajectory.csv`` and ``beams.csv``; a restart continues where it was kept."""
+
+    def __init__(
+        self, folder: Path, *, sizes: Mapping[str, int] | None = None, has_current: bool = False
+    ) -> None:
+        """Begin in a folder, or go on at the sizes (bytes) that a checkpoint knew.
+
+        With a current ``trajectory.csv`` has its columns, and all rows have one.
+
+        Raises :class:`DataError`: the folder cannot be made or written.
+        """
+        self._folder = folder
+        self.problem: str | None = None
+        """Why the last rows are not on disk, if they are not."""
+        self._waiting: dict[str, str] = dict.fromkeys(HEADERS, "")
+        self._files: dict[str, AppendFile] = {}
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / SUMMARY_NAME).unlink(missing_ok=True)
+            beside = CURRENT_COLUMNS if has_current else ()
+            for name, columns in (HEADERS | {TRAJECTORY_NAME: TRAJECTORY_COLUMNS + beside}).items():
+                file = self._files[name] = AppendFile(folder / name, ending=TORN_ROW)
+                file.cut((sizes or {}).get(name, 0))
+                if file.size == 0:
+                    file.append((",".join(columns) + "\n").encode())
+        except OSError as error:
+            self.close()
+            raise DataError(f"{folder}: cannot write results: {error.strerror or error}") from error
+
+    def sizes(self) -> dict[str, int]:
+        """Return how large the files are, bytes, for a checkpoint."""
+        return {name: file.size for name, file in self._files.items()}
+
+    def append(
+        self, trajectory: Trajectory, beams: BeamTable, current: CurrentTrack | None = None
+    ) -> None:
+        """Add rows; what the disk does not take waits for the next time."""
+        self._waiting[TRAJECTORY_NAME] += _rows(
+            trajectory_columns(trajectory) | current_columns(current)
+        )
+        self._waiting[BEAMS_NAME] += _rows(beam_columns(beams))
+        self._write_waiting()
+
+    def _write_waiting(self) -> None:
+        self.problem = None
+        for name, text in self._waiting.items():
+            try:
+                if text:
+                    self._files[name].append(text.encode())
+                    self._waiting[name] = ""
+            except OSError as error:
+                path = self._folder / name
+                self.problem = f"{path}: cannot be written: {error.strerror or error}"
+
+    def finish(self, summary: Mapping[str, Any]) -> None:
+        """Write what waits, and ``summary.json``, which makes the folder complete.
+
+        Raises :class:`DataError`: it cannot be written.
+        """
+        self._write_waiting()
+        part = self._folder / f".{SUMMARY_NAME}.part-{os.getpid()}"
+        try:
+            write_through(part, _summary_text(summary).encode())
+            part.replace(self._folder / SUMMARY_NAME)
+        except OSError as error:
+            part.unlink(missing_ok=True)
+            raise DataError(
+                f"{self._folder / SUMMARY_NAME}: cannot be written: {error.strerror or error}"
+            ) from error
+
+    def close(self) -> None:
+        """Close the files; a second time does nothing."""
+        for file in self._files.values():
+            file.close()
+
+
+def _rows(columns: Columns) -> str:
+    return format_table(columns).partition("\n")[2]

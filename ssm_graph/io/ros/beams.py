@@ -7,7 +7,6 @@ Linked A50 with its 22.5 degrees counted from the horizontal, and others leave t
 
 from __future__ import annotations
 
-from itertools import product
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -42,12 +41,6 @@ class Beams(NamedTuple):
     notes: tuple[str, ...]
 
 
-class _Candidate(NamedTuple):
-    beams_d: Array
-    sign: float
-    change: str
-
-
 def stated_beams(beams_d: Array | None) -> Array | None:
     """Return directions (B, 3) as a message states them, None where they cannot be any."""
     if beams_d is None or not np.isfinite(beams_d).all():
@@ -65,25 +58,27 @@ def known_beams(beams_d: Array, *, speed: Array, velocity_d: Array) -> Beams:
     ``speed`` is (N, B), ``velocity_d`` (N, 3), both NaN where unknown.  Directions that do not fit
     are kept and noted, for the instrument may give its velocity in other axes.
     """
-    choices = [_Candidate(beams_d, sign, _sign_change(sign)) for sign in (1.0, -1.0)]
+    choices = [Beams(beams_d, 1.0, ()), Beams(beams_d, -1.0, (_AGAINST,))]
     found = _best(choices, speed, velocity_d)
     if found is None:
         return Beams(beams_d, 1.0, (_UNCHECKED,))
     best, misfit = found
-    if misfit > _LARGEST_MISFIT:
-        text = (
-            "The beam directions of the vehicle file do not reproduce the velocity that the DVL "
-            f"published (misfit {100.0 * misfit:.0f} %): are they right, or is that velocity in "
-            "other axes than the instrument's?"
-        )
-        return Beams(beams_d, 1.0, (text,))
-    return Beams(beams_d, best.sign, (best.change,) if best.change else ())
+    if misfit <= _LARGEST_MISFIT:
+        return best
+    text = (
+        "The beam directions of the vehicle file do not reproduce the velocity that the DVL "
+        f"published (misfit {100.0 * misfit:.0f} %): are they right, or is that velocity in "
+        "other axes than the instrument's?"
+    )
+    return Beams(beams_d, 1.0, (text,))
 
 
 def proven_beams(
     stated: Array | None, *, water_linked: bool, may_turn: bool, speed: Array, velocity_d: Array
 ) -> Beams:
     """Return directions and sign from the messages alone.
+
+    Raises :class:`DataError`: there are no directions, or they contradict the velocity.
 
     Parameters
     ----------
@@ -92,11 +87,6 @@ def proven_beams(
         by quarters where the velocity shows a mounting rotation.
     may_turn : whether the data may turn the sign of the speeds.
     speed, velocity_d : (N, B) and (N, 3), m/s, NaN where unknown.
-
-    Raises
-    ------
-    DataError
-        There are no directions, or they contradict the velocity.
     """
     if water_linked:
         choices = _quarter_turns(WATER_LINKED_BEAMS)
@@ -107,12 +97,11 @@ def proven_beams(
             f"{_GIVE_VEHICLE}"
         )
     else:
-        signs = (1.0, -1.0) if may_turn else (1.0,)
-        both = ((stated, ""), (_swapped(stated), _SWAPPED))
-        choices = [
-            _Candidate(beams, sign, " ".join(filter(None, (change, _sign_change(sign)))))
-            for (beams, change), sign in product(both, signs)
-        ]
+        swapped = _swapped(stated)
+        choices = [Beams(stated, 1.0, ()), Beams(swapped, 1.0, (_SWAPPED,))]
+        if may_turn:
+            both = f"{_SWAPPED} {_AGAINST}"
+            choices += [Beams(stated, -1.0, (_AGAINST,)), Beams(swapped, -1.0, (both,))]
     found = _best(choices, speed, velocity_d)
     if found is None:
         return Beams(stated, 1.0, (_UNCHECKED,))
@@ -123,7 +112,7 @@ def proven_beams(
             f"misfit below {100.0 * _LARGEST_MISFIT:.0f} %, got {100.0 * misfit:.0f} %; "
             f"{_GIVE_VEHICLE}"
         )
-    return Beams(best.beams_d, best.sign, (best.change,) if best.change else ())
+    return best
 
 
 _UNCHECKED: Final = (
@@ -138,31 +127,20 @@ _GIVE_VEHICLE: Final = (
     "give the directions with  --vehicle FILE  ([dvl] beam_azimuth_deg and beam_janus_deg, or "
     "beam_vectors)"
 )
+_AGAINST: Final = (
+    "The published velocity shows that the driver's beam speeds are positive against the motion "
+    "along the beam; their sign is turned."
+)
+_TURNED: Final = (
+    "The DVL's velocity is turned by {:.0f} degrees against its transducers "
+    "(mounting_rotation_offset); the beam directions are turned along."
+)
 
 
-def _sign_change(sign: float) -> str:
-    return (
-        ""
-        if sign > 0.0
-        else (
-            "The published velocity shows that the driver's beam speeds are positive against the "
-            "motion along the beam; their sign is turned."
-        )
-    )
-
-
-def _quarter_turns(beams_d: Array) -> list[_Candidate]:
-    return [
-        _Candidate(
-            np.asarray(beams_d @ rotation_zyx(np.radians(angle), 0.0, 0.0).T),
-            1.0,
-            f"The DVL's velocity is turned by {angle:.0f} degrees against its transducers "
-            "(mounting_rotation_offset); the beam directions are turned along."
-            if angle
-            else "",
-        )
-        for angle in (0.0, 90.0, 180.0, 270.0)
-    ]
+def _quarter_turns(beams_d: Array) -> list[Beams]:
+    turns = [rotation_zyx(np.radians(angle), 0.0, 0.0) for angle in (0.0, 90.0, 180.0, 270.0)]
+    notes = [(), *((_TURNED.format(angle),) for angle in (90.0, 180.0, 270.0))]
+    return [Beams(beams_d @ R.T, 1.0, note) for R, note in zip(turns, notes, strict=True)]
 
 
 def _swapped(beams_d: Array) -> Array:
@@ -178,9 +156,7 @@ def _swapped(beams_d: Array) -> Array:
     return np.where(is_tilted, swapped, beams_d)
 
 
-def _best(
-    choices: list[_Candidate], speed: Array, velocity_d: Array
-) -> tuple[_Candidate, float] | None:
+def _best(choices: list[Beams], speed: Array, velocity_d: Array) -> tuple[Beams, float] | None:
     """Return the choice that fits best, or the first, and its misfit; None if none can be judged.
 
     Half of the pings are used, the faster ones; the typical residual is set against the typical

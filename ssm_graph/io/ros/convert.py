@@ -111,25 +111,20 @@ def convert_rosbag(
 def _imu(bag: Path, table: Array, vehicle: Vehicle | None, options: RosOptions) -> ImuLog:
     if len(table) < 2:
         raise DataError(f"{bag}: the IMU's messages all have the same time")
-    _check_axes(bag, table[:, 4:7], options)
-    time_s = table[:, 0]
-    return ImuLog(
-        start_s=float(time_s[0] - np.median(np.diff(time_s))),
-        noise=NOISE if vehicle is None else vehicle.imu_noise,
-        time_s=time_s,
-        gyro_b=table[:, 1:4],
-        accel_b=table[:, 4:7],
-    )
-
-
-def _check_axes(bag: Path, accel_b: Array, options: RosOptions) -> None:
-    """Refuse specific force in other axes than the options state."""
+    time_s, accel_b = table[:, 0], table[:, 4:7]
     if np.median(accel_b[:, 2]) > 0.5 * np.median(np.linalg.norm(accel_b, axis=1)):
         raise DataError(
             f"{bag}: in {options.body.value} axes, linear_acceleration points down at rest; "
             "expected specific force, which points up; are the axes other ones: try  --body FRD  "
             "or  --body FLU"
         )
+    return ImuLog(
+        start_s=float(time_s[0] - np.median(np.diff(time_s))),
+        noise=NOISE if vehicle is None else vehicle.imu_noise,
+        time_s=time_s,
+        gyro_b=table[:, 1:4],
+        accel_b=accel_b,
+    )
 
 
 def _imu_notes(imu: ImuLog, topic: BagTopic, vehicle: Vehicle | None) -> list[str]:
@@ -155,7 +150,7 @@ def _dvl(
     _, speed, sigma, ranges, velocity_d, covariance, water = np.split(table, edges, axis=1)
     water_track = water[:, 0] if water.any() else None
     if not np.isfinite(speed).any():
-        if vehicle is not None and _gives_velocity(vehicle.mount, velocity_d):
+        if vehicle is not None and _has_axes(vehicle.mount) and np.isfinite(velocity_d).any():
             return _velocities(table[:, 0], velocity_d, covariance, vehicle, water_track)
         raise DataError(
             f"{bag}: topic {topic.name} holds {len(table)} messages and not one beam speed; "
@@ -192,11 +187,10 @@ def _dvl(
     return log, notes
 
 
-def _gives_velocity(mount: DvlMount, velocity_d: Array) -> bool:
-    """Return whether the vehicle's DVL has three axes for beams, and messages a velocity."""
+def _has_axes(mount: DvlMount) -> bool:
+    """Return whether an instrument has its three axes for beams: a velocity alone."""
     beams_d = mount.beams_d
-    is_axes = mount.n_beams == 3 and np.allclose(beams_d @ beams_d.T, np.eye(3), atol=1e-6)
-    return bool(is_axes and np.isfinite(velocity_d).any())
+    return mount.n_beams == 3 and np.allclose(beams_d @ beams_d.T, np.eye(3), atol=1e-6)
 
 
 def _velocities(
@@ -247,15 +241,11 @@ def _gnss(
             f"{topic.name}: {topic.n_unstated} fixes do not say how good they are and are given "
             f"{sigma[0]:g}, {sigma[1]:g}, {sigma[2]:g} m east, north, up."
         )
-    log = replace(
-        GNSS_AT_ORIGIN if vehicle is None else vehicle.gnss,
-        time_s=table[:, 0],
-        lat=table[:, 1],
-        lon=table[:, 2],
-        height=table[:, 3],
-        sigma_enu=table[:, 4:7],
-    )
-    return log, notes
+    known = GNSS_AT_ORIGIN if vehicle is None else vehicle.gnss
+    time_s, lat, lon, height, *sigmas = table.T
+    sigma_enu = np.column_stack(sigmas)
+    place = {"lat": lat, "lon": lon, "height": height, "sigma_enu": sigma_enu}
+    return replace(known, time_s=time_s, **place), notes
 
 
 def _depth(

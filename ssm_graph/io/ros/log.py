@@ -20,20 +20,14 @@ from ssm_graph.base.errors import (
     SsmGraphError,
     nearest_hint,
 )
-from ssm_graph.io.ros.messages import (
-    FIX_TYPE,
-    IMU_TYPE,
-    MARINE_DVL_TYPE,
-    PRESSURE_TYPE,
-    WATER_LINKED_TYPE,
-)
+from ssm_graph.io.ros import messages as ros_messages
 from ssm_graph.sensors.dvl import MOST_BEAMS
 
 ROLES: Final[Mapping[str, tuple[str, ...]]] = {
-    "imu": (IMU_TYPE,),
-    "dvl": (MARINE_DVL_TYPE, WATER_LINKED_TYPE),
-    "depth": (PRESSURE_TYPE,),
-    "gnss": (FIX_TYPE,),
+    "imu": (ros_messages.IMU_TYPE,),
+    "dvl": (ros_messages.MARINE_DVL_TYPE, ros_messages.WATER_LINKED_TYPE),
+    "depth": (ros_messages.PRESSURE_TYPE,),
+    "gnss": (ros_messages.FIX_TYPE,),
 }
 """What a topic is for, and the message types that serve it."""
 REQUIRED_ROLES: Final = ("imu", "dvl")
@@ -81,8 +75,8 @@ bool valid
 """
 _TIMES: Final = "int64 time_of_validity\nint64 time_of_transmission"
 LAYOUTS: Final[Mapping[str, tuple[str, ...]]] = {
-    MARINE_DVL_TYPE: (_MARINE_DVL,),
-    WATER_LINKED_TYPE: tuple(
+    ros_messages.MARINE_DVL_TYPE: (_MARINE_DVL,),
+    ros_messages.WATER_LINKED_TYPE: tuple(
         _WATER_LINKED.format(covariance=covariance, beams=beams, times=times)
         for covariance, beams, times in (
             ("float64[] covariance", "DVLBeam[]", _TIMES),
@@ -125,19 +119,11 @@ def is_rosbag(path: Path) -> bool:
 def read_rosbag(bag: Path, topics: Mapping[str, str]) -> Iterator[BagMessage]:
     """Yield the messages of the chosen topics in the order of their recording.
 
-    Parameters
-    ----------
-    bag : a recording, see `is_rosbag`.
-    topics : by role, for every role that more than one topic could serve.
+    Raises :class:`MissingExtraError`: ``rosbags`` is not installed. Raises :class:`ConfigError`: A
+    role or topic is unknown, or more than one topic could serve a role. Raises :class:`DataError`:
+    the recording is damaged, has no topic for IMU or DVL, or messages of another layout.
 
-    Raises
-    ------
-    MissingExtraError
-        ``rosbags`` is not installed.
-    ConfigError
-        A role or topic is unknown, or more than one topic could serve a role.
-    DataError
-        The recording is damaged, has no topic for IMU or DVL, or messages of another layout.
+    ``topics`` names by role those that more than one topic could serve.
     """
     try:
         reader_class = import_module("rosbags.rosbag2").Reader

@@ -117,16 +117,10 @@ def stamp_s(message: Any, received_s: float) -> float:
 def imu_sample(message: Any, received_s: float, options: RosOptions = DEFAULTS) -> ImuSample:
     """Return ``sensor_msgs/Imu`` in forward-right-down axes.
 
-    Parameters
-    ----------
-    message : any object with the fields of the type.
-    received_s : taken as the time where the header's stamp is zero, s.
-    options : its ``body`` names the axes of the message.
+    Raises :class:`DataError`: the message has no turn rate or no acceleration, or they are not
+    finite.
 
-    Raises
-    ------
-    DataError
-        The message has no turn rate or no acceleration, or they are not finite.
+    ``received_s`` is its time where the header's stamp is zero; the options name its axes.
     """
     for field in ("angular_velocity", "linear_acceleration"):
         if float(getattr(message, f"{field}_covariance")[0]) == -1.0:
@@ -143,10 +137,7 @@ def dvl_report(message: Any, received_s: float, options: RosOptions = DEFAULTS) 
 
     Beams without bottom lock are NaN in the ping.
 
-    Raises
-    ------
-    DataError
-        The beams of the message are not numbered 0 to 3.
+    Raises :class:`DataError`: the beams of the message are not numbered 0 to 3.
     """
     report = _water_linked if hasattr(message, "beams") else _marine
     return report(message, stamp_s(message, received_s), options)
@@ -176,10 +167,8 @@ def depth_sigma(message: Any, options: RosOptions = DEFAULTS) -> float:
 def fix(message: Any, received_s: float, options: RosOptions = DEFAULTS) -> Fix:
     """Return ``sensor_msgs/NavSatFix``.
 
-    Raises
-    ------
-    DataError
-        The receiver had no fix, the position is no place on Earth, or the altitude is missing.
+    Raises :class:`DataError`: the receiver had no fix, the position is no place on Earth, or the
+    altitude is missing.
     """
     if int(message.status.status) < 0:
         raise DataError("NavSatFix: the receiver says that it has no fix")

@@ -18,11 +18,6 @@ class AppendFile:
     A record that the system takes only in part (disk full) is taken back. Where that is refused
     too, and where another process was killed amid its last record, the next record is preceded by
     ``ending``, which must make a line of what was torn that nobody takes for a whole one.
-
-    Parameters
-    ----------
-    path : made if it does not exist.
-    ending : ends a torn record; its last byte is a newline.
     """
 
     def __init__(self, path: Path, *, ending: bytes) -> None:
@@ -75,6 +70,14 @@ class AppendFile:
             size = os.fstat(self._file).st_size
             self._is_torn = self._is_torn or size != self.size
             self.size = size
+
+
+def write_through(path: Path, content: bytes) -> None:
+    """Write a file; it is on the disk when this returns."""
+    with path.open("wb") as stream:
+        stream.write(content)
+        stream.flush()
+        os.fsync(stream.fileno())
 
 
 def sync_folder(folder: Path) -> None:

@@ -10,7 +10,6 @@ import contextlib
 import hashlib
 import io
 import json
-import os
 import re
 import zipfile
 from collections.abc import Mapping
@@ -22,7 +21,7 @@ import numpy as np
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
-from ssm_graph.io.tables.append_file import sync_folder
+from ssm_graph.io.tables.append_file import sync_folder, write_through
 
 JSON = None | bool | int | float | str | list["JSON"] | dict[str, "JSON"]
 
@@ -51,26 +50,19 @@ def write_checkpoint(path: Path, arrays: Mapping[str, Array], meta: Mapping[str,
     When this returns, it is on the disk. Whenever the process or the power ends before, the one
     that was the newest is still there, whole, under its own name or that of the older one.
 
+    Raises :class:`OSError` where the disk is full or fails; the old ones are as they were. Raises
+    :class:`DataError` for an array of objects, and for a meta value that JSON cannot hold.
+
     Parameters
     ----------
     path : where; :func:`newest_checkpoint` looks for :data:`CHECKPOINT_NAME`.
     arrays : numbers of any shape; they come back bit for bit.
     meta : anything that JSON can hold, NaN and infinities too; a tuple comes back as a list.
-
-    Raises
-    ------
-    OSError
-        Where the disk is full or fails; the old ones are as they were.
-    DataError
-        For an array of objects, and for a meta value that JSON cannot hold.
     """
     content = _content(arrays, meta)
     part = path.with_name(f"{path.name}.part")
     try:
-        with part.open("wb") as stream:
-            stream.write(content)
-            stream.flush()
-            os.fsync(stream.fileno())
+        write_through(part, content)
         if _is_sound(path):
             path.replace(older_name(path))
         part.replace(path)
@@ -84,10 +76,8 @@ def write_checkpoint(path: Path, arrays: Mapping[str, Array], meta: Mapping[str,
 def read_checkpoint(path: Path) -> tuple[dict[str, Array], dict[str, JSON]]:
     """Read a checkpoint; return its arrays and its meta values.
 
-    Raises
-    ------
-    DataError
-        For a file that is missing, damaged, cut off, of another version, or no checkpoint at all.
+    Raises :class:`DataError` for a file that is missing, damaged, cut off, of another version, or
+    no checkpoint at all.
     """
     with np.load(io.BytesIO(_sound_content(path)), allow_pickle=False) as members:
         arrays = {
@@ -99,10 +89,7 @@ def read_checkpoint(path: Path) -> tuple[dict[str, Array], dict[str, JSON]]:
 def newest_checkpoint(folder: Path, *, name: str = CHECKPOINT_NAME) -> Checkpoint | None:
     """Return the newest sound checkpoint of a folder, None where there never was one.
 
-    Raises
-    ------
-    DataError
-        Where there are checkpoints and none of them is sound.
+    Raises :class:`DataError` where there are checkpoints and none of them is sound.
     """
     newest = folder / name
     found = [path for path in (newest, older_name(newest)) if path.exists()]

@@ -115,7 +115,7 @@ def read_csv_header(file: CsvFile) -> list[str]:
 def read_csv_values(file: CsvFile, names: Sequence[str], *, blank: frozenset[str]) -> Array:
     """Return all numbers, (rows, columns); cells of the columns ``blank`` may be empty: NaN."""
     try:
-        if _has_rows(file):
+        if next(file.lines(), None) is not None:
             with file.open() as stream:
                 stream.readline()
                 values = np.loadtxt(stream, delimiter=",", comments=None, ndmin=2)
@@ -166,10 +166,6 @@ def _split_header(line: str) -> list[str]:
     except csv.Error:
         cells = line.split(",")
     return [cell.strip() for cell in cells]
-
-
-def _has_rows(file: CsvFile) -> bool:
-    return next(file.lines(), None) is not None
 
 
 def _read_carefully(file: CsvFile, names: Sequence[str], *, blank: frozenset[str]) -> Array:

@@ -1,19 +1,39 @@
-"""Tables in files, CSV or Parquet: which format, reading with every defect named, writing."""
+"""Tables in files, CSV or Parquet: which format, reading with every defect named, writing.
+
+A log that is written while the vehicle is under way ends where the process was killed, and goes on
+in the next line: its rows stand in order of arrival. What such a log cannot help having, late,
+repeated and torn rows, is put right or left out, and counted; what would mean another unit or
+another format is refused as in any other table.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from enum import Enum
+from functools import partial
 from importlib import import_module
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ssm_graph.base.errors import ConfigError, DataError, MissingExtraError
 from ssm_graph.base.frozen import Array
-from ssm_graph.base.tables import Table, TableSpec, check_finite, check_increasing, check_names
+from ssm_graph.base.tables import (
+    LARGEST_TIME_S,
+    Table,
+    TableFile,
+    TableSpec,
+    check_finite,
+    check_increasing,
+    check_names,
+    is_repeated,
+)
 from ssm_graph.io.tables.csv_tables import (
+    NUMBER,
     CsvFile,
     check_is_text,
     check_last_line,
@@ -21,6 +41,10 @@ from ssm_graph.io.tables.csv_tables import (
     read_csv_values,
     write_csv,
 )
+
+_CHUNK = 65536
+_FEW = 10
+"""So many bad rows are left out even where they are most of the table."""
 
 
 class TableFormat(Enum):
@@ -50,26 +74,25 @@ class ParquetFile:
 def read_table(path: Path, label: str, spec: TableSpec) -> Table:
     """Read one table and check what needs no knowledge of the sensor.
 
-    Parameters
-    ----------
-    path : the file; its ending decides the format.
-    label : its name in messages.
-    spec : the columns it must and may have.
+    Raises :class:`DataError` for a file that is no table, a missing, unknown or repeated column, a
+    cell that is no finite number, and times that do not increase; the message names the line.
 
-    Raises
-    ------
-    DataError
-        For a file that is no table, a missing, unknown or repeated column, a cell that is no
-        finite number, and times that do not increase; the message names the line.
+    The ending of ``path`` decides the format; ``label`` is its name in messages.
     """
-    read = _read_csv if table_format(path, label) is TableFormat.CSV else read_parquet
-    try:
-        table = read(path, label, spec)
-    except OSError as error:
-        raise DataError(f"{label}: cannot be read: {error.strerror or error}") from error
+    table = _read(path, label, spec, _read_csv)
     check_finite(table, spec)
     check_increasing(table, spec)
     return table
+
+
+def _read(
+    path: Path, label: str, spec: TableSpec, read_csv: Callable[[Path, str, TableSpec], Table]
+) -> Table:
+    read = read_csv if table_format(path, label) is TableFormat.CSV else read_parquet
+    try:
+        return read(path, label, spec)
+    except OSError as error:
+        raise DataError(f"{label}: cannot be read: {error.strerror or error}") from error
 
 
 def table_format(path: Path, label: str) -> TableFormat:
@@ -127,6 +150,190 @@ def read_parquet(path: Path, label: str, spec: TableSpec) -> Table:
             "was it cut off, or is it another format?"
         ) from error
     return Table(ParquetFile(path, label), columns)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PickedRows:
+    """The file of a table whose rows are some of the file's, in another order."""
+
+    file: TableFile
+    rows: NDArray[np.int64]
+    """(N,) the row of the file for each of the table."""
+
+    @property
+    def label(self) -> str:
+        """How messages call the file."""
+        return self.file.label
+
+    def place(self, row: int) -> str:
+        """Return file and line of a row."""
+        return self.file.place(int(self.rows[row]))
+
+    def cell(self, row: int, column: str) -> str:
+        """Return the content of a cell as it stands in the file."""
+        return self.file.cell(int(self.rows[row]), column)
+
+
+@dataclass(slots=True)
+class Counts:
+    """What was put right in one table."""
+
+    late: int = 0
+    repeated: int = 0
+    contrary: int = 0
+    """Rows of a time that an earlier row has, with another content."""
+    torn: int = 0
+    impossible: int = 0
+    torn_end: bool = False
+
+    def note(self, label: str) -> str | None:
+        """Return one sentence, None where there was nothing to put right."""
+        left_out = [
+            f"{count} {word if count == 1 else words}"
+            for count, word, words in (
+                (self.repeated, "row repeated exactly", "rows repeated exactly"),
+                (
+                    self.contrary,
+                    "row whose time an earlier row has with other numbers",
+                    "rows whose times earlier rows have with other numbers",
+                ),
+                (self.impossible, "row of impossible numbers", "rows of impossible numbers"),
+                (self.torn, "torn line", "torn lines"),
+            )
+            if count
+        ]
+        if self.torn_end:
+            left_out.append("the last line, which has no end")
+        parts = []
+        if self.late:
+            parts.append(f"{self.late} row{'s' * (self.late > 1)} came late and went to their time")
+        if left_out:
+            parts.append(f"left out: {', '.join(left_out)}")
+        return f"{label}: {'; '.join(parts)}" if parts else None
+
+
+def read_arrival_table(path: Path, label: str, spec: TableSpec) -> Table:
+    """Read a table in order of arrival; return it in order of time, each time once.
+
+    Left out and counted in one note are rows that repeat a time (the first stays), lines that are
+    no complete row, a last line without its newline, and rows with numbers that are not finite or
+    beyond the limits of the columns. Where they outnumber the good ones the table
+    is not torn but of another kind, and is refused like any other.
+
+    Raises :class:`DataError` for a file that is no table, a missing, unknown or repeated column,
+    and rows most of which cannot be read.
+
+    The ending of ``path`` decides the format; ``label`` is its name in messages.
+    """
+    counts = Counts()
+    table = _read(path, label, spec, partial(_read_csv_as_it_came, counts=counts))
+    table = _without_impossible(table, spec, counts)
+    table = _in_order_of_time(table, spec, counts)
+    note = counts.note(label)
+    return replace(table, notes=(note,) if note else ())
+
+
+def _read_csv_as_it_came(path: Path, label: str, spec: TableSpec, counts: Counts) -> Table:
+    file = CsvFile(path, label, errors="replace")
+    check_is_text(file, may_hold_zeros=True)
+    names = read_csv_header(file)
+    check_names(f"{label}:1", names, spec)
+    values, rows = _read_lines(file, names, spec.may_be_blank, counts)
+    if _is_too_many(counts.torn, len(rows)):
+        read_csv_values(CsvFile(path, label), names, blank=spec.may_be_blank)  # names the line
+    columns = {name: values[:, index] for index, name in enumerate(names)}
+    return Table(PickedRows(file, rows), columns)
+
+
+def _read_lines(
+    file: CsvFile, names: Sequence[str], blank: frozenset[str], counts: Counts
+) -> tuple[Array, NDArray[np.int64]]:
+    """Return the numbers (N, columns) that can be read, and the row (N,) of the file of each."""
+    found, rows, row = [np.empty((0, len(names)))], [np.empty(0, dtype=np.int64)], 0
+    stream = (line for _, line in file.lines())
+    while chunk := list(islice(stream, _CHUNK)):
+        first, row = row, row + len(chunk)
+        if not chunk[-1].endswith("\n"):  # only the last line of all
+            counts.torn_end = True
+            del chunk[-1]
+        values = _numbers(chunk, len(names))
+        kept = np.arange(len(chunk), dtype=np.int64)
+        if values is None:
+            good = list(_good_rows(chunk, names, blank))
+            counts.torn += len(chunk) - len(good)
+            values = np.array([cells for _, cells in good]).reshape(len(good), len(names))
+            kept = np.array([index for index, _ in good], dtype=np.int64)
+        found.append(values)
+        rows.append(first + kept)
+    return np.concatenate(found), np.concatenate(rows)
+
+
+def _numbers(lines: list[str], n_columns: int) -> Array | None:
+    """Return the numbers of sound lines, None where one of them is not."""
+    if not lines:
+        return np.empty((0, n_columns))
+    try:
+        values = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2)
+    except ValueError:
+        return None
+    return values if values.shape == (len(lines), n_columns) else None
+
+
+def _good_rows(
+    lines: list[str], names: Sequence[str], blank: frozenset[str]
+) -> Iterator[tuple[int, list[float]]]:
+    for index, line in enumerate(lines):
+        cells = [cell.strip() for cell in line.split(",")]
+        if len(cells) == len(names) and all(
+            NUMBER.fullmatch(cell) or (not cell and name in blank)
+            for name, cell in zip(names, cells, strict=True)
+        ):
+            yield index, [float(cell) if cell else np.nan for cell in cells]
+
+
+def _without_impossible(table: Table, spec: TableSpec, counts: Counts) -> Table:
+    bad = np.abs(table.time_s) > LARGEST_TIME_S
+    for name, values in table.columns.items():
+        bad |= np.isinf(values) if name in spec.may_be_blank else ~np.isfinite(values)
+        low, high = spec.limits.get(name, (-np.inf, np.inf))
+        bad |= (values < low) | (values > high)
+    if spec.nowhere:
+        bad |= np.all(table.stack(spec.nowhere) == 0.0, axis=1)  # a code for no fix
+    n_bad = int(bad.sum())
+    if _is_too_many(n_bad, len(table) - n_bad):
+        check_finite(table, spec)
+        return table  # the checks of each sensor say what is wrong
+    counts.impossible = n_bad
+    return _picked(table, np.flatnonzero(~bad)) if n_bad else table
+
+
+def _in_order_of_time(table: Table, spec: TableSpec, counts: Counts) -> Table:
+    time_s = table.time_s
+    if len(time_s) == 0 or np.all(np.diff(time_s) > 0.0):
+        return table
+    counts.late = int(np.sum(time_s < np.maximum.accumulate(time_s)))
+    keys = [table[name] for name in reversed(spec.key)]
+    table = _picked(table, np.lexsort((*keys, time_s)))
+    is_first = ~is_repeated(table, spec)
+    first_of = np.flatnonzero(is_first)[np.cumsum(is_first) - 1]
+    is_same = np.ones(len(table), dtype=bool)
+    for values in table.columns.values():
+        is_same &= (values == values[first_of]) | (np.isnan(values) & np.isnan(values[first_of]))
+    counts.repeated = int(np.sum(is_same & ~is_first))
+    counts.contrary = int(np.sum(~is_same))
+    return _picked(table, np.flatnonzero(is_first))
+
+
+def _picked(table: Table, rows: NDArray[np.intp]) -> Table:
+    columns = {name: values[rows] for name, values in table.columns.items()}
+    file = table.file
+    if isinstance(file, PickedRows):
+        return Table(PickedRows(file.file, file.rows[rows]), columns)
+    return Table(PickedRows(file, rows.astype(np.int64)), columns)
+
+
+def _is_too_many(n_bad: int, n_good: int) -> bool:
+    return n_bad > max(_FEW, n_good)
 
 
 def _pyarrow(module: str) -> Any:

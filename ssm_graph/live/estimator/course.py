@@ -17,8 +17,14 @@ from ssm_graph.engine.error_state import VELOCITY
 from ssm_graph.graph.inertial_rows import InertialRows
 from ssm_graph.live.estimator.buffers import Buffers, Measured
 from ssm_graph.live.estimator.keyframes import KeyframeMaker
-from ssm_graph.live.estimator.recovery import Doubt, Doubted, doubt_of, reanchored, watch_after
-from ssm_graph.live.estimator.reserve import Reserve
+from ssm_graph.live.estimator.recovery import (
+    Doubt,
+    Doubted,
+    Reserve,
+    doubt_of,
+    reanchored,
+    watch_after,
+)
 from ssm_graph.live.estimator.watch import Watch, is_sound, observe
 from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.navigation import Severity
@@ -119,7 +125,9 @@ class Course:
         """Forget the steps that nothing can undo any more."""
         kept_s = self.newest.time_s - max(self.newest.window.config.lag_s, LEAST_LATE_S) - REACH_S
         while len(self._steps) > 1 and self._steps[1].time_s <= kept_s:
-            self._settle(self._steps.popleft())
+            gone = self._steps.popleft().left
+            if gone is not None:
+                self._settled.append(joined([gone]))  # a copy: a view keeps the whole window
         self._buffers.drop_before(self.oldest.window.keyframes[0].time_s - 1.0)
 
     def _thin_out(self) -> None:
@@ -132,10 +140,6 @@ class Course:
         left = [stretch for stretch in (steps[at].left, behind.left) if stretch is not None]
         steps[at + 1] = behind._replace(left=joined(left) if left else None)
         del steps[at]
-
-    def _settle(self, step: Step) -> None:
-        if step.left is not None:
-            self._settled.append(joined([step.left]))  # a copy: a view keeps the whole window
 
     def _step(self, measured: Measured) -> Step:
         last = self.newest
@@ -156,7 +160,8 @@ class Course:
         watch = self._observed(keyframe, window, parity=self._agree(measured))
         if is_sound(watch, keyframe.time_s):
             reserve = reserve.renewed(window)
-        self._tell(last.watch, watch, keyframe)
+        if watch.trouble_s == keyframe.time_s and watch.trouble != last.watch.trouble:
+            self._events.tell(keyframe.time_s, Severity.WARNING, "doubt", watch.trouble)
         return Step(window, watch, left, reserve)
 
     def _anew(self, keyframe: Keyframe, doubt: Doubt, reserve: Reserve) -> Step:
@@ -194,7 +199,3 @@ class Course:
         newest, buffers = measured.pings[-1], self._buffers
         parity = buffers.vehicle.mount.parity(newest[buffers.speeds], newest[buffers.sigmas])
         return bool(parity < 5.0)
-
-    def _tell(self, before: Watch, after: Watch, keyframe: Keyframe) -> None:
-        if after.trouble_s == keyframe.time_s and after.trouble != before.trouble:
-            self._events.tell(keyframe.time_s, Severity.WARNING, "doubt", after.trouble)

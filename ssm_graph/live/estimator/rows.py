@@ -14,16 +14,15 @@ _SPARE: Final = 1024
 class TimedRows:
     """Rows of numbers sorted by the first one, the time; no time twice.
 
-    Parameters
-    ----------
-    width : numbers of a row beside its time.
-    n_key : so many numbers behind the time tell rows of one time apart.
+    ``width`` numbers stand beside the time; the first ``n_key`` tell rows of one time apart.
     """
 
     def __init__(self, width: int, *, n_key: int = 0) -> None:
         self._rows = np.empty((_SPARE, 1 + width))
         self._key = slice(0, 1 + n_key)
         self._begin = self._end = 0
+        self.last_s = -np.inf
+        """Time of the last row, minus infinity if there is none."""
 
     def __len__(self) -> int:
         return self._end - self._begin
@@ -33,17 +32,13 @@ class TimedRows:
         """All rows (N, 1 + width), time first."""
         return self._rows[self._begin : self._end]
 
-    @property
-    def last_s(self) -> float:
-        """Time of the last row, minus infinity if there is none."""
-        return float(self._rows[self._end - 1, 0]) if len(self) else -np.inf
-
     def add(self, row: Array) -> bool:
         """Add a row (1 + width,); return False, and leave it out, if its time is known."""
         if row[0] > self.last_s:
             self._make_room()
             self._rows[self._end] = row
             self._end += 1
+            self.last_s = float(row[0])
             return True
         at, same = self.index(row[0]), self.index(row[0], after=True)
         if np.any(np.all(self.all[at:same, self._key] == row[self._key], axis=1)):
@@ -55,7 +50,7 @@ class TimedRows:
     def index(self, time_s: float, *, after: bool = False) -> int:
         """Return how many rows lie before a time, or, with ``after``, not after it."""
         if time_s > self.last_s:
-            return len(self)
+            return self._end - self._begin
         return int(self.all[:, 0].searchsorted(time_s, side="right" if after else "left"))
 
     def between(self, begin_s: float, end_s: float) -> Array:
@@ -65,6 +60,8 @@ class TimedRows:
     def drop_before(self, time_s: float) -> None:
         """Forget the rows before a time."""
         self._begin += self.index(time_s)
+        if self._begin == self._end:
+            self.last_s = -np.inf
 
     def _make_room(self) -> None:
         if self._end < len(self._rows):

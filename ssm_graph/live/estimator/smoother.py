@@ -3,36 +3,26 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import astuple, replace
 from typing import Any, Final, Self
 
 import numpy as np
 
+from factors.inertial import Intervals
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.times import MIN_SPACING_S
-from ssm_graph.live.estimator.answer import answer
-from ssm_graph.live.estimator.asked import not_calibrated, sensors_of_vehicle
+from ssm_graph.engine.states import States
+from ssm_graph.live.estimator.answers import Delayed, answer, delayed_of, found_by
+from ssm_graph.live.estimator.buffers import Buffers
 from ssm_graph.live.estimator.course import REACH_S, Course, Step
-from ssm_graph.live.estimator.delayed import Delayed, delayed_of
-from ssm_graph.live.estimator.found import found_by
 from ssm_graph.live.estimator.intake import Intake
 from ssm_graph.live.estimator.keyframes import KeyframeMaker
-from ssm_graph.live.estimator.recovery import ASTRAY_TIMES, is_astray
-from ssm_graph.live.estimator.reserve import Reserve
-from ssm_graph.live.estimator.start import Beginning, Starter
-from ssm_graph.live.estimator.store import (
-    pack_buffers,
-    pack_step,
-    unpack_buffers,
-    unpack_left,
-    unpack_reserve,
-    unpack_watch,
-    window_arrays,
-)
+from ssm_graph.live.estimator.recovery import ASTRAY_TIMES, Reserve, is_astray
+from ssm_graph.live.estimator.start import Starter, not_calibrated, sensors_of_vehicle
 from ssm_graph.live.estimator.tail import Tail
-from ssm_graph.live.estimator.watch import Watch
+from ssm_graph.live.estimator.watch import Contradicted, Watch
 from ssm_graph.mission.estimate import Found
 from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.navigation import Event, Health, Navigation, Severity
@@ -41,7 +31,8 @@ from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.sensors.messages import Message
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
-from ssm_graph.smoothers.keyframe import Keyframe
+from ssm_graph.smoothers.keyframe import Keyframe, Sensors
+from ssm_graph.smoothers.stretch import Stretch, pack_judged, unpack_judged
 from ssm_graph.smoothers.window import Window
 
 ONLINE: Final = FixedLagConfig(
@@ -110,15 +101,18 @@ class FixedLagSmoother:
             return
         is_late = time_s < newest_s or not isinstance(message, ImuSample)
         self._latest_s = max(self._latest_s, message.time_s + self._intake.shift_s)
-        is_made = self._update(message, time_s, is_late=is_late)
+        is_made = self._update(message, time_s, newest_s, is_late=is_late)
         if is_made:
             self._cost_s = time.perf_counter() - begin
 
-    def _update(self, message: Message, time_s: float, *, is_late: bool) -> bool:
-        """Let the answer follow what has come; return whether a keyframe was made."""
+    def _update(self, message: Message, time_s: float, newest_s: float, *, is_late: bool) -> bool:
+        """Let the answer follow what has come; return whether a keyframe was made.
+
+        ``newest_s`` is the time of the last inertial sample before it came, s.
+        """
         course, buffers = self._course, self._intake.buffers
         is_sample = isinstance(message, ImuSample)
-        if is_sample and self._is_gap(time_s):
+        if is_sample and self._is_gap(time_s, newest_s):
             buffers.drop_before(time_s)
             if course is None:
                 self._starter.begin_anew()
@@ -134,9 +128,8 @@ class FixedLagSmoother:
         )
         self._intake.horizon_s = course.horizon_s
         if is_astray(course.newest.watch):
-            self._lose(
-                time_s, f"fixes contradicted the position {ASTRAY_TIMES} times: wrong heading?"
-            )
+            reason = f"fixes contradicted the position {ASTRAY_TIMES} times: wrong heading?"
+            self._lose(time_s, reason)
             return True
         if is_behind and n_made == CATCH_UP_STEPS:
             return True
@@ -150,29 +143,31 @@ class FixedLagSmoother:
         beginning = self._starter.find(self._intake.buffers)
         if beginning is None:
             return False
-        self._begin(beginning)
-        return True
-
-    def _begin(self, beginning: Beginning) -> None:
-        self._frame, buffers = beginning.frame, self._intake.buffers
-        self._begun_s = beginning.begin_s
+        self._frame, self._begun_s = beginning.frame, beginning.begin_s
         for note in not_calibrated(self.vehicle):
             self._events.tell(beginning.time_s, Severity.INFO, "not_calibrated", note)
-        maker = KeyframeMaker(buffers, beginning.frame, self._problem_config, begin_s=self._begun_s)
-        sensors = sensors_of_vehicle(self.vehicle, beginning.frame)
+        sensors = sensors_of_vehicle(self.vehicle, self._frame)
         first = Keyframe(beginning.time_s, sensors.beams)
         window = Window(sensors, self.config, first, beginning.moments)
         window.iterate()
-        self._course = self._course_from(Step(window, Watch(), None, Reserve.of(window)), maker)
+        self._course = self._course_from(Step(window, Watch(), None, Reserve.of(window)))
+        return True
 
-    def _course_from(self, step: Step, maker: KeyframeMaker) -> Course:
-        course = Course(step, maker, self._intake.buffers, self._events)
+    def _maker(self) -> KeyframeMaker:
+        assert self._frame is not None
+        buffers, config = self._intake.buffers, self._problem_config
+        return KeyframeMaker(buffers, self._frame, config, begin_s=self._begun_s)
+
+    def _course_from(self, step: Step) -> Course:
+        course = Course(step, self._maker(), self._intake.buffers, self._events)
         self._intake.horizon_s = course.horizon_s
         return course
 
     def checkpoint(self) -> tuple[dict[str, Array], dict[str, Any]]:
         """Return the state as plain arrays and plain numbers, for :meth:`restore`.
 
+        That is the oldest step that messages may still undo, and everything received since: all
+        later steps follow from these, and so does the answer to every late message.
         Delayed states that have not been taken are not in it: take them first.
         """
         intake = self._intake
@@ -215,25 +210,20 @@ class FixedLagSmoother:
             smoother._frame = LocalFrame(*meta["frame"])
         if meta["watch"] is None:
             smoother._starter.go_on_from(meta["alignment"], intake.buffers)
-        if meta["watch"] is not None:
+        else:
             assert smoother._frame is not None
-            maker = KeyframeMaker(
-                intake.buffers,
-                smoother._frame,
-                smoother._problem_config,
-                begin_s=smoother._begun_s,
-            )
             sensors = sensors_of_vehicle(vehicle, smoother._frame)
-            window = Window.unpack(window_arrays(arrays), sensors, smoother.config, maker.inertial)
-            watch, left = unpack_watch(meta["watch"]), unpack_left(arrays, sensors)
-            step = Step(window, watch, left, unpack_reserve(arrays))
-            smoother._course = course = smoother._course_from(step, maker)
+            inertial = smoother._maker().inertial
+            step = unpack_step(arrays, meta["watch"], sensors, smoother.config, inertial)
+            smoother._course = course = smoother._course_from(step)
             course.advance()
             intake.horizon_s = course.horizon_s
             smoother._tail = smoother._tail_of(course.newest)
         return smoother
 
-    def _is_gap(self, time_s: float) -> bool:
+    def _is_gap(self, time_s: float, newest_s: float) -> bool:
+        if newest_s < time_s <= newest_s + LONGEST_GAP_S:
+            return False
         samples = self._intake.buffers.imu
         at = samples.index(time_s)
         return bool(at > 0 and time_s - samples.all[at - 1, 0] > LONGEST_GAP_S)
@@ -241,12 +231,8 @@ class FixedLagSmoother:
     def _lose(self, time_s: float, reason: str) -> None:
         """Give the answer up, keep what was found, and align anew."""
         assert self._course is not None
-        self._events.tell(
-            time_s,
-            Severity.ERROR,
-            "lost",
-            f"{reason}; position and attitude have to be found anew",
-        )
+        text = f"{reason}; position and attitude have to be found anew"
+        self._events.tell(time_s, Severity.ERROR, "lost", text)
         self._finished += self._take(self._course, all_of_them=True)
         self._course = self._tail = None
         self._intake.horizon_s = time_s
@@ -260,14 +246,10 @@ class FixedLagSmoother:
 
     def _tail_of(self, step: Step) -> Tail:
         assert self._frame is not None
-        newest = step.window.newest
-        tail = Tail(
-            step.window.keyframes[-1],
-            newest.states,
-            newest.covariance[0],
-            noise=self.vehicle.imu_noise,
-            sensors=step.window.sensors,
-        )
+        newest, noise = step.window.newest, self.vehicle.imu_noise
+        keyframe, covariance = step.window.keyframes[-1], newest.covariance[0]
+        sensors = step.window.sensors
+        tail = Tail(keyframe, newest.states, covariance, noise=noise, sensors=sensors)
         imu = self._intake.buffers.imu
         tail.add(imu.all[max(imu.index(step.time_s, after=True) - 1, 0) :])
         return tail
@@ -324,3 +306,75 @@ class FixedLagSmoother:
             for stretch in course.take_settled(all_of_them=all_of_them)
             if len(stretch.time_s)
         ]
+
+
+def pack_buffers(buffers: Buffers) -> dict[str, Array]:
+    """Return all rows that were received and kept."""
+    return {f"rows_{section}": rows.all.copy() for section, rows in buffers.rows.items()}
+
+
+def unpack_buffers(arrays: Mapping[str, Array], buffers: Buffers) -> None:
+    """Fill empty buffers."""
+    for section, rows in buffers.rows.items():
+        for row in arrays[f"rows_{section}"]:
+            rows.add(row)
+
+
+def pack_step(step: Step) -> tuple[dict[str, Array], dict[str, Any]]:
+    """Return arrays of the window and of what left it, and the plain numbers of the watch."""
+    arrays = {f"window_{name}": array for name, array in step.window.pack().items()}
+    if step.left is not None:
+        states = {f"states_{k}": v for k, v in step.left.states._asdict().items()}
+        others = {k: v for k, v in step.left._asdict().items() if k not in ("states", "aids")}
+        aids = dict(pack_judged(step.left.aids))
+        arrays |= {f"left_{name}": array for name, array in {**states, **others, **aids}.items()}
+    arrays |= {f"reserve_{name}": array for name, array in step.reserve.pack()}
+    return arrays, {name: _plain(value) for name, value in step.watch._asdict().items()}
+
+
+def unpack_step(
+    arrays: Mapping[str, Array],
+    watch: Mapping[str, Any],
+    sensors: Sensors,
+    config: FixedLagConfig,
+    inertial: Callable[[float, float], Intervals],
+) -> Step:
+    """Return the step that was packed; ``inertial`` is that of the keyframes' maker."""
+    window = Window.unpack(_part(arrays, "window_"), sensors, config, inertial)
+    reserve = Reserve.unpack(_part(arrays, "reserve_"))
+    return Step(window, _watch(watch), _left(_part(arrays, "left_"), sensors), reserve)
+
+
+def _part(arrays: Mapping[str, Array], prefix: str) -> dict[str, Array]:
+    return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+
+
+def _watch(plain: Mapping[str, Any]) -> Watch:
+    numbers: dict[str, Any] = {
+        name: float(value) if isinstance(value, str) and name != "trouble" else value
+        for name, value in plain.items()
+    }
+    numbers["beam_weights"] = tuple(float(weight) for weight in plain["beam_weights"])
+    numbers["moved"] = tuple(plain["moved"])
+    if plain["contradicted"] is not None:
+        since_s, text, reckoned_n, sigma = plain["contradicted"]
+        numbers["contradicted"] = Contradicted(since_s, text, tuple(reckoned_n), sigma)
+    return Watch(**numbers)
+
+
+def _left(arrays: Mapping[str, Array], sensors: Sensors) -> Stretch | None:
+    """Return what had left the window with the step."""
+    if "time_s" not in arrays:
+        return None
+    states = States(*(arrays[f"states_{name}"] for name in States._fields))
+    aids = unpack_judged(arrays, sensors.aids, prefix="")
+    others: dict[str, Any] = {n: arrays[n] for n in Stretch._fields if n not in ("states", "aids")}
+    others["beam"] = others["beam"].astype(np.intp)
+    return Stretch(states=states, aids=aids, **others)
+
+
+def _plain(value: Any) -> Any:
+    """Return a number that JSON can hold: infinite ones and NaN as text."""
+    if isinstance(value, tuple):
+        return [_plain(v) for v in value]
+    return str(value) if isinstance(value, float) and not np.isfinite(value) else value

@@ -12,19 +12,24 @@ from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import SsmGraphError
 from ssm_graph.base.stepwise import Steps
 from ssm_graph.engine.error_state import InitialMoments
-from ssm_graph.engine.extras import with_extras
-from ssm_graph.live.estimator.asked import extras_of_vehicle
-from ssm_graph.live.estimator.buffers import Buffers
-from ssm_graph.mission.calibration import windowed
+from ssm_graph.engine.extras import Extras, with_extras
+from ssm_graph.graph.aids import AIDS
+from ssm_graph.graph.aids.aid import Keyframes
+from ssm_graph.live.estimator.buffers import Buffers, Logs
+from ssm_graph.live.estimator.keyframes import aids_at
+from ssm_graph.mission.calibration import calibration_extras, taken_as_exact, windowed
+from ssm_graph.mission.current import current_extras
 from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.mission import InitialState, Mission
 from ssm_graph.mission.navigation import Severity
-from ssm_graph.mission.problem import ProblemConfig, build_problem_steps
+from ssm_graph.mission.problem import Beams, ProblemConfig, build_problem_steps
 from ssm_graph.mission.start.alignment import SAFE_HEADING_SIGMA
 from ssm_graph.mission.start.moments import initial_moments
 from ssm_graph.mission.vehicle import Vehicle
+from ssm_graph.sensors.imu import ImuLog
 from ssm_graph.smoothers.fixed_lag import run_fixed_lag_steps
 from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
+from ssm_graph.smoothers.keyframe import Sensors
 from ssm_graph.smoothers.mission import smooth_steps
 
 SETTLE_S: Final = 1.0
@@ -140,9 +145,8 @@ class Starter:
         time_s = max(initial.time_s, first_s)
         if time_s - initial.time_s > STALE_S:
             self._initial, self._now_s = None, last_s
-            self._wait(
-                f"[initial] is {time_s - initial.time_s:.0f} s older than the data: left out"
-            )
+            age_s = time_s - initial.time_s
+            self._wait(f"[initial] is {age_s:.0f} s older than the data: left out")
             return None
         frame = self._frame(buffers)
         assert frame is not None  # an initial state has a place
@@ -161,10 +165,8 @@ class Starter:
         estimate = yield from smooth_steps(mission, problem_config=self._config)
         sigma = float(estimate.trajectory.attitude_sigma[-1, 2])
         if not estimate.status.is_good or sigma > SAFE_HEADING_SIGMA:
-            self._wait(
-                f"heading sigma {np.degrees(sigma):.0f} deg: {estimate.reason}; move while GNSS "
-                "is there",
-            )
+            text = f"heading sigma {np.degrees(sigma):.0f} deg: {estimate.reason}; move while GNSS"
+            self._wait(f"{text} is there")
             return None
         begin_s = estimate.start.time_s
         problem = yield from build_problem_steps(
@@ -175,9 +177,8 @@ class Starter:
         found = newest.states.take(np.s_[-1:]).moments(newest.covariance[-1])
         moments = with_extras(found, extras_of_vehicle(self._vehicle), windowed(problem.extras))
         self.reason = "aligned: catching up with what has come meanwhile"
-        self._events.tell(
-            self._now_s, Severity.INFO, "aligned", "; ".join(estimate.notes) or "heading found"
-        )
+        text = "; ".join(estimate.notes) or "heading found"
+        self._events.tell(self._now_s, Severity.INFO, "aligned", text)
         return Beginning(float(newest.time_s[-1]), moments, mission.frame, begin_s)
 
     def _frame(self, buffers: Buffers) -> LocalFrame | None:
@@ -193,3 +194,30 @@ class Starter:
     def _wait(self, reason: str) -> None:
         self.reason = reason
         self._events.tell(self._now_s, Severity.INFO, "aligning", reason)
+
+
+def extras_of_vehicle(vehicle: Vehicle) -> Extras:
+    """Return what a vehicle asks to find that is carried in each keyframe's state."""
+    return windowed(_all_asked_for(vehicle))
+
+
+def not_calibrated(vehicle: Vehicle) -> tuple[str, ...]:
+    """Return the note of what it asks to calibrate and is taken as stated."""
+    carried = [block.name for block in extras_of_vehicle(vehicle).blocks]
+    return taken_as_exact(_all_asked_for(vehicle).without(carried))
+
+
+def sensors_of_vehicle(vehicle: Vehicle, frame: LocalFrame) -> Sensors:
+    """Return what is the same at all keyframes."""
+    at_rest = ImuLog(0.0, vehicle.imu_noise, np.ones(1), np.zeros((1, 3)), np.zeros((1, 3)))
+    logs = Logs(vehicle.gnss, vehicle.depth, vehicle.aids)
+    aids = (aid.take(np.s_[:0]) for aid in aids_at(logs, Keyframes(frame, at_rest, np.arange(2.0))))
+    return Sensors.of(frame, Beams.of_mount(vehicle.mount), aids, extras_of_vehicle(vehicle))
+
+
+def _all_asked_for(vehicle: Vehicle) -> Extras:
+    depth = None if vehicle.depth is None else vehicle.depth.calibration
+    of_instruments = calibration_extras(vehicle.mount, depth, vehicle.gnss.calibration)
+    of_aids = (extra for kind in AIDS for extra in kind.variables(vehicle.aids))
+    of_water = () if vehicle.current is None else current_extras(vehicle.current)
+    return Extras((*of_instruments, *of_aids, *of_water))

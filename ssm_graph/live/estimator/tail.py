@@ -60,10 +60,9 @@ class Tail:
                 self._last = np.array(row)
                 continue
             self._gap_s = max(self._gap_s, dt if dt > LONGEST_S else 0.0)
-            reading = np.array(row)
-            here = (
-                reading if self._last is None or dt <= LONGEST_S else 0.5 * (self._last + reading)
-            )
+            reading, here = np.array(row), np.array(row)
+            if self._last is not None and dt > LONGEST_S:
+                here = 0.5 * (self._last + reading)
             gyro_b, accel_b, self._last = here[:3], here[3:], reading
             self._measured.integrateMeasurement(accel_b, gyro_b, dt)
             self._end_s = time_s

@@ -107,15 +107,12 @@ def observe(
     gap_s: float,
     missing: float,
 ) -> Watch:
-    """Return what is remembered after one more keyframe.
+    """Return what is remembered after one more keyframe, with which the window is settled.
 
     Parameters
     ----------
-    watch : what was remembered before.
-    keyframe : as it was handed to the window.
-    window : settled with it.
     last_s : time of the keyframe before, s.
-    parity : whether its beams agree with each other.
+    parity : whether the beams of this one agree with each other.
     force : mean specific force since the keyframe before, m/s^2.
     gap_s : longest time without an inertial sample since then.
     missing : share of the inertial samples that have not come since then.
@@ -243,14 +240,9 @@ class Verdict(NamedTuple):
 
 
 def verdict(watch: Watch, *, now_s: float, imu_s: float, covariance: Array) -> Verdict:
-    """Judge the newest answer.
+    """Judge the newest answer, of the covariance (15, 15), by what is remembered.
 
-    Parameters
-    ----------
-    watch : what is remembered.
-    now_s : newest time of any message.
-    imu_s : newest time of the inertial data.
-    covariance : (15, 15) of the newest answer.
+    ``now_s`` is the newest time of any message, ``imu_s`` that of the inertial data.
     """
     since_beam_s = imu_s - watch.last_beam_s
     since_aid_s = imu_s - max(watch.last_beam_s, watch.last_fix_s, watch.last_aid_s)

@@ -1,16 +1,18 @@
-"""What all decoders share: their protocol, refusals, time stamps, and JSON that cannot hurt."""
+"""What all decoders are: bytes of one connection in, messages out, and JSON that cannot hurt."""
 
 from __future__ import annotations
 
 import json
 import math
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable
 from decimal import Decimal
 from enum import Enum
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from ssm_graph.base.errors import nearest_hint
+from ssm_graph.live.protocols.framing import LineFramer, ObjectFramer
 from ssm_graph.sensors.messages import Message
 
 MAX_REFUSALS: Final = 20
@@ -19,29 +21,6 @@ LARGEST_NUMBER: Final = 1e12
 _SHOWN: Final = 60
 _MAX_DIGITS: Final = 20
 _MAX_BRACKETS: Final = 200
-
-
-class Decoder(Protocol):
-    """Bytes of one connection in, messages out."""
-
-    def feed(self, data: bytes, *, arrival_s: float) -> list[Message]:
-        """Return the messages that these bytes complete; never raises, whatever the bytes are.
-
-        Parameters
-        ----------
-        data : the next bytes of the stream, cut anywhere.
-        arrival_s : when they came, s on the vehicle's clock.
-        """
-        ...
-
-    def take_refusals(self) -> list[str]:
-        """Return what was refused since the last call, a sentence each, and forget it."""
-        ...
-
-    @property
-    def n_held(self) -> int:
-        """Bytes held of what is not complete yet."""
-        ...
 
 
 class Clock(Enum):
@@ -91,11 +70,8 @@ class Stamper:
     def __init__(
         self, clock: Clock, *, max_clock_error_s: float, refusals: Refusals, place: str
     ) -> None:
-        self._clock = clock
-        self._max_error_s = max_clock_error_s
-        self._refusals = refusals
-        self._place = place
-        self._is_off = False
+        self._clock, self._max_error_s = clock, max_clock_error_s
+        self._refusals, self._place, self._is_off = refusals, place, False
 
     def stamp(self, instrument_s: float | None, arrival_s: float) -> float:
         """Return the time of a message, s; raise :class:`RefusedError` where there is none."""
@@ -117,6 +93,56 @@ class Stamper:
         return arrival_s if is_off else instrument_s
 
 
+class Decoder(ABC):
+    """Texts that a framer cuts out of a stream to messages; the rest is refused."""
+
+    _framer: LineFramer | ObjectFramer
+
+    def __init__(self, place: str) -> None:
+        """``place`` is how refusals call the source."""
+        self._place = place
+        self._refusals = Refusals()
+
+    @property
+    def n_held(self) -> int:
+        """Bytes held of an unfinished text."""
+        return self._framer.n_held
+
+    @property
+    def n_refused(self) -> int:
+        """How much was refused so far."""
+        return self._refusals.n_total
+
+    def feed(self, data: bytes, *, arrival_s: float) -> list[Message]:
+        """Return the messages that the next bytes complete, and those that waited long enough.
+
+        Never raises, whatever the bytes are and wherever the stream was cut; they came at
+        ``arrival_s``, s on the vehicle's clock.
+        """
+        messages: list[Message] = []
+        for text in self._framer.feed(data):
+            try:
+                messages += self._decode(text, arrival_s)
+            except RefusedError as error:
+                self._refuse(str(error))
+        return messages + self._overdue(arrival_s)
+
+    def take_refusals(self) -> list[str]:
+        """Return what was refused since the last call, a sentence each, and forget it."""
+        return self._refusals.take()
+
+    @abstractmethod
+    def _decode(self, text: str, arrival_s: float) -> list[Message]:
+        """Return the messages of one text; raise :class:`RefusedError` for what is none."""
+
+    def _overdue(self, arrival_s: float) -> list[Message]:  # noqa: ARG002
+        """Return messages that waited for others long enough; most protocols have none."""
+        return []
+
+    def _refuse(self, text: str) -> None:
+        self._refusals.add(f"{self._place}: {text}")
+
+
 def shown(value: object) -> str:
     """Return a value as it came, cut to a length for people and free of control characters."""
     text = repr(value[: _SHOWN + 1]) if isinstance(value, str) else repr(value)
@@ -131,10 +157,7 @@ def parse_object(
     Refused beyond the grammar: NaN and Infinity, numbers that overflow, integers of more than 20
     digits, keys that come twice, more than 200 brackets (and with them deep nesting).
 
-    Parameters
-    ----------
-    text : one object.
-    parse_float : reads a number with a point or exponent; the nearest float unless given.
+    ``parse_float`` reads a number with a point or exponent; the nearest float unless given.
     """
     if text.count("[") + text.count("{") > _MAX_BRACKETS:
         raise RefusedError(f"expected a flat JSON object, got more than {_MAX_BRACKETS} brackets")
@@ -176,9 +199,12 @@ def reject_unknown(fields: Iterable[str], known: Iterable[str]) -> None:
 
 def number(value: object, *, key: str, low: float = -math.inf, high: float = math.inf) -> float:
     """Return a JSON number as float; refuse other types, damage and what is out of range."""
-    if isinstance(value, bool) or not isinstance(value, (int, float, Decimal)):
+    if type(value) is float:  # nearly all of them
+        result = value
+    elif isinstance(value, bool) or not isinstance(value, (int, float, Decimal)):
         raise RefusedError(f"{key}: expected a number, got {shown(value)}")
-    result = float(value)
+    else:
+        result = float(value)
     if not abs(result) <= LARGEST_NUMBER:
         raise RefusedError(
             f"{key}: expected a number below {LARGEST_NUMBER:g}, got {shown(result)}"

@@ -23,10 +23,8 @@ class LineFramer:
     """Lines of UTF-8 text; one that is too long or not UTF-8 is dropped and told to ``refuse``."""
 
     def __init__(self, refuse: Callable[[str], None], *, max_length: int = MAX_LENGTH) -> None:
-        self._refuse = refuse
-        self._max_length = max_length
-        self._rest = bytearray()
-        self._is_skipping = False
+        self._refuse, self._max_length = refuse, max_length
+        self._rest, self._is_skipping = bytearray(), False
 
     @property
     def n_held(self) -> int:
@@ -68,14 +66,9 @@ class ObjectFramer:
     """
 
     def __init__(self, refuse: Callable[[str], None], *, max_length: int = MAX_LENGTH) -> None:
-        self._refuse = refuse
-        self._max_length = max_length
-        self._rest = b""
-        self._start = 0
-        self._scanned = 0
-        self._depth = 0
-        self._is_quoted = False
-        self._is_skipping = False
+        self._refuse, self._max_length = refuse, max_length
+        self._rest, self._start, self._scanned, self._depth = b"", 0, 0, 0
+        self._is_quoted = self._is_skipping = False
         self._objects: list[str] = []
 
     @property
@@ -135,9 +128,8 @@ class ObjectFramer:
         self._start, self._depth, self._is_skipping = start, 0, True
 
     def _drop_long(self, start: int) -> None:
-        self._drop(
-            f"expected JSON objects of at most {self._max_length} bytes, got a longer one", start
-        )
+        text = f"expected JSON objects of at most {self._max_length} bytes, got a longer one"
+        self._drop(text, start)
 
     def _leave_out(self, between: bytes) -> None:
         if not self._is_skipping and between.strip(_BETWEEN):
@@ -158,9 +150,7 @@ class TokenBucket:
             )
         self.n_refused = 0
         """How many were refused so far."""
-        self._rate_per_s = rate_per_s
-        self._burst = float(burst)
-        self._tokens = float(burst)
+        self._rate_per_s, self._burst, self._tokens = rate_per_s, float(burst), float(burst)
         self._last_s: float | None = None
 
     def admit(self, now_s: float) -> bool:

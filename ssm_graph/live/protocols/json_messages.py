@@ -13,6 +13,7 @@ from ssm_graph.base.errors import nearest_hint
 from ssm_graph.base.frames import BodyAxes, turned
 from ssm_graph.base.units import DEG_PER_H, DEGREE, MICRO_G
 from ssm_graph.live.protocols.decoder import (
+    Decoder,
     RefusedError,
     flag,
     number,
@@ -21,7 +22,6 @@ from ssm_graph.live.protocols.decoder import (
     require,
     shown,
 )
-from ssm_graph.live.protocols.framed_decoder import FramedDecoder
 from ssm_graph.live.protocols.framing import MAX_LENGTH, LineFramer
 from ssm_graph.mission.navigation import Navigation
 from ssm_graph.sensors.dvl import MOST_BEAMS
@@ -53,7 +53,7 @@ _HAS_UNITS: Final = {
 }
 
 
-class JsonDecoder(FramedDecoder):
+class JsonDecoder(Decoder):
     """JSON lines to messages.
 
     Parameters
@@ -82,7 +82,8 @@ def decode_message(line: str, *, axes: BodyAxes = BodyAxes.FRD) -> Message:
     reject_unknown(fields, KEYS[kind])
     columns = _COLUMNS[kind]
     for key in _REQUIRED[kind]:
-        require(fields, key)
+        if key not in fields:
+            require(fields, key)
     if _HAS_UNITS[kind]:  # all digits of the angles count
         fields = parse_object(line, parse_float=Decimal)
     try:
@@ -190,26 +191,29 @@ def _read(value: Any, key: str, column: Column, axes: BodyAxes) -> Any:
     """Return what a message says of one column, in SI units and axes forward-right-down."""
     if column.is_flag:
         return flag({key: value}, key)
-    if column.is_many:
-        return tuple(
-            math.nan if item is None else _number(item, key, column)
-            for item in _list(value, (1, MOST_BEAMS), key=key)
-        )
-    if not column.over:
-        return _number(value, key, column)
+    if not column.over and not column.is_many:
+        return _numbers([value], key, column)[0]
     count = len(column.over)
-    numbers = tuple(_number(item, key, column) for item in _list(value, (count, count), key=key))
+    numbers = _numbers(
+        _list(value, (1, MOST_BEAMS) if column.is_many else (count, count), key=key), key, column
+    )
     return turned((numbers[0], numbers[1], numbers[2]), axes) if column.is_body else numbers
 
 
-def _number(value: Any, key: str, column: Column) -> float:
-    """Return a number in SI units; what no such unit or no sigma can be is refused.
+def _numbers(items: list[Any], key: str, column: Column) -> tuple[float, ...]:
+    """Return numbers in SI units; what no such unit or no sigma can be is refused.
 
     Whether an instrument can mean a number that can be is for the intake to say.
     """
+    missing = None if column.is_many else items  # which no item is
+    if column.unit != 1.0:
+        return tuple([math.nan if x is missing else _converted(x, key, column) for x in items])
+    low = max(column.limits[0], 0.0) or -math.inf
+    return tuple([math.nan if x is missing else number(x, key=key, low=low) for x in items])
+
+
+def _converted(value: Any, key: str, column: Column) -> float:
     low, high = column.limits
-    if column.unit == 1.0:
-        return number(value, key=key, low=low if low > 0.0 else -math.inf)
     number(value, key=key, low=low, high=high)
     exact = Decimal(value) if isinstance(value, int) else value
     if column.wraps and exact > 180:

@@ -1,32 +1,32 @@
-"""NMEA 0183 in: GNSS fixes and depths from sentences with a checksum.
-
-The way out is :mod:`ssm_graph.live.protocols.nmea_encoder`.
-"""
+"""NMEA 0183: GNSS fixes and depths in, answers out as GGA, VTG and HDT of integrated navigation."""
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from typing import Final, NamedTuple
 
+import numpy as np
+
 from ssm_graph.base.errors import ConfigError
-from ssm_graph.base.frozen import Vector
-from ssm_graph.live.protocols.decoder import Clock, RefusedError, Stamper, number, shown
-from ssm_graph.live.protocols.framed_decoder import FramedDecoder
+from ssm_graph.base.frozen import Array, Vector
+from ssm_graph.live.protocols.decoder import Clock, Decoder, RefusedError, Stamper, number, shown
 from ssm_graph.live.protocols.framing import LineFramer
-from ssm_graph.live.protocols.nmea_fields import (
-    angle,
-    optional_number,
-    required_number,
-    split_sentence,
-    utc_seconds,
-)
+from ssm_graph.mission.navigation import Health, Navigation
 from ssm_graph.sensors.depth import DEEPEST_M, DepthReading
 from ssm_graph.sensors.gnss import Fix
 from ssm_graph.sensors.messages import Message
 
+TALKER: Final = "IN"
+USABLE: Final = frozenset({Health.GOOD, Health.DEGRADED})
+"""What may be steered by; with any other health the fields of a sentence are empty."""
+_KNOTS = 3600.0 / 1852.0
+_DAY_MS = 86_400_000
+_MINUTE = 1_000_000
+"""Parts of a minute of arc that are written: 2 mm."""
 ABOVE_SURFACE_M: Final = 100.0
 """m: a pressure sensor in air, and tides"""
 PLACE: Final = "nmea"
@@ -37,6 +37,11 @@ STANDARD_GRAVITY: Final = 9.80665
 """m/s^2"""
 _FIXES = {"1", "2", "3", "4", "5", "9"}
 _NO_FIX = {"", "0"}
+DAY_S: Final = 86400.0
+_NUMBER = re.compile(r"[+-]?(?:\d{1,12}(?:\.\d{0,12})?|\.\d{1,12})", re.ASCII)
+_ANGLE = re.compile(r"(\d{2,3})(\d{2}(?:\.\d{0,12})?)", re.ASCII)
+_TIME = re.compile(r"(\d{2})(\d{2})(\d{2}(?:\.\d{0,9})?)", re.ASCII)
+_CHECKSUM = re.compile(r"[0-9A-Fa-f]{2}", re.ASCII)
 
 
 class DepthSentence(Enum):
@@ -103,7 +108,7 @@ class _Gga(NamedTuple):
     hdop: float | None
 
 
-class NmeaDecoder(FramedDecoder):
+class NmeaDecoder(Decoder):
     """GGA (with GST) to fixes, pressures to depths; all other sentences are ignored.
 
     ``height`` is that of GGA above the geoid plus its separation: above the ellipsoid. Sigmas are
@@ -238,7 +243,7 @@ def _water_column(pressure: str, unit: str, options: NmeaOptions) -> float:
     return water_dbar * PASCAL_PER_DBAR / (options.water_density_kg_per_m3 * STANDARD_GRAVITY)
 
 
-def _prvat(fields: list[str], options: NmeaOptions) -> float:
+def _pressure(fields: list[str], options: NmeaOptions) -> float:
     _, _, pressure, unit = _first(fields, 4)
     return _water_column(pressure, unit, options)
 
@@ -246,11 +251,6 @@ def _prvat(fields: list[str], options: NmeaOptions) -> float:
 def _pips(fields: list[str], options: NmeaOptions) -> float:
     value, unit = _first(fields, 2)
     return required_number(value, "depth") if unit == "M" else _water_column(value, unit, options)
-
-
-def _pvips2(fields: list[str], options: NmeaOptions) -> float:
-    _, _, pressure, unit = _first(fields, 4)
-    return _water_column(pressure, unit, options)
 
 
 def _dpt(fields: list[str], _: NmeaOptions) -> float:
@@ -274,10 +274,155 @@ def _first(fields: list[str], count: int) -> list[str]:
 
 
 _DEPTHS: Final[dict[str, Callable[[list[str], NmeaOptions], float]]] = {
-    "PRVAT": _prvat,
+    "PRVAT": _pressure,
     "PIPS": _pips,
-    "PVIPS2": _pvips2,
+    "PVIPS2": _pressure,
     "DPT": _dpt,
     "DBT": _dbt,
 }
 """Depth below the surface, m, from the fields of each of :class:`DepthSentence`."""
+
+
+def checksum(body: str) -> str:
+    """Return the two hexadecimal digits of a sentence, of what stands between ``$`` and ``*``."""
+    result = 0
+    for byte in body.encode("ascii"):
+        result ^= byte
+    return f"{result:02X}"
+
+
+def split_sentence(body: str) -> list[str]:
+    """Return name and fields of a sentence whose checksum is right."""
+    content, star, given = body.rpartition("*")
+    if not star or not _CHECKSUM.fullmatch(given):
+        raise RefusedError(f"expected a checksum '*hh' at the end, got {shown('$' + body)}")
+    if not content.isascii() or not content.isprintable():
+        raise RefusedError(
+            f"expected printable ASCII, got {shown('$' + body)}; check the baud rate"
+        )
+    if checksum(content) != given.upper():
+        raise RefusedError(
+            f"expected checksum {checksum(content)}, got {given} in {shown('$' + body)}"
+        )
+    return content.split(",")
+
+
+def optional_number(field: str, key: str) -> float | None:
+    """Return a number, None where the field is empty."""
+    return required_number(field, key) if field else None
+
+
+def required_number(field: str, key: str) -> float:
+    """Return a number; plain decimals only, whatever Python would take."""
+    if not _NUMBER.fullmatch(field):
+        raise RefusedError(f"{key}: expected a number, got {shown(field)}")
+    return float(field)
+
+
+def angle(field: str, side: str, sides: str, *, limit_deg: float) -> float:
+    """Return ``dddmm.mmm`` with its hemisphere in radians, positive to the first of ``sides``."""
+    found = _ANGLE.fullmatch(field)
+    if not found or side not in tuple(sides) or float(found[2]) >= 60.0:
+        raise RefusedError(
+            f"expected an angle as dddmm.mmm,{sides[0]}, got {shown(field)},{shown(side)}"
+        )
+    degrees = number(float(found[1]) + float(found[2]) / 60.0, key="angle, deg", high=limit_deg)
+    return math.radians(degrees if side == sides[0] else -degrees)
+
+
+def utc_seconds(field: str, arrival_s: float) -> float | None:
+    """Return the instant with this UTC of day that is nearest to the arrival, Unix s."""
+    if not field:
+        return None
+    found = _TIME.fullmatch(field)
+    if not found:
+        raise RefusedError(f"expected UTC as hhmmss.sss, got {shown(field)}")
+    hours, minutes, seconds = float(found[1]), float(found[2]), float(found[3])
+    if hours >= 24.0 or minutes >= 60.0 or seconds >= 61.0:
+        raise RefusedError(f"expected UTC as hhmmss.sss, got {shown(field)}")
+    of_day = 3600.0 * hours + 60.0 * minutes + seconds
+    if not math.isfinite(arrival_s):
+        return None
+    return of_day + DAY_S * round((arrival_s - of_day) / DAY_S)
+
+
+##### live/protocols/nmea.py
+
+
+def encode_nmea(navigation: Navigation, *, geoid_separation_m: float = 0.0) -> bytes:
+    """Return GGA, VTG and HDT, each ended by CR LF."""
+    altitude_m = {"geoid_separation_m": geoid_separation_m}
+    sentences = encode_gga(navigation, **altitude_m), encode_vtg(navigation), encode_hdt(navigation)
+    return "".join(sentences).encode("ascii")
+
+
+def encode_gga(navigation: Navigation, *, geoid_separation_m: float = 0.0) -> str:
+    """Return a GGA: quality 6, estimated; 0 and empty fields where the answer is not usable.
+
+    UTC is ``time_s`` of the vehicle's clock modulo a day: right where that clock is Unix time.
+    Altitude is the height above the ellipsoid less ``geoid_separation_m``, so that their sum, which
+    readers form, is right whatever the separation.
+    """
+    geodetic = np.array([navigation.lat, navigation.lon, navigation.height, navigation.time_s])
+    if not _is_usable(navigation, geodetic):
+        empty = (*[""] * 4, "0", "00", "", "", "M", "", "M", "", "")
+        return _sentence("GGA", _utc(navigation.time_s), *empty)
+    altitude_m = navigation.height - geoid_separation_m
+    return _sentence(
+        "GGA",
+        _utc(navigation.time_s),
+        *_angle(navigation.lat, "NS", width=2),
+        *_angle(math.remainder(navigation.lon, 2.0 * math.pi), "EW", width=3),
+        *("6", "00", ""),
+        *(f"{altitude_m:.3f}", "M", f"{geoid_separation_m:.3f}", "M", "", ""),
+    )
+
+
+def encode_vtg(navigation: Navigation) -> str:
+    """Return a VTG: course over ground from true north and speed; mode E, estimated, or N."""
+    if not _is_usable(navigation, navigation.velocity_enu[:2]):
+        return _sentence("VTG", "", "T", "", "M", "", "N", "", "K", "N")
+    east, north = navigation.velocity_enu[:2]
+    speed = math.hypot(east, north)
+    course = _degrees(math.atan2(east, north))
+    knots, km_per_h = f"{speed * _KNOTS:.3f}", f"{speed * 3.6:.3f}"
+    return _sentence("VTG", course, "T", "", "M", knots, "N", km_per_h, "K", "E")
+
+
+def encode_hdt(navigation: Navigation) -> str:
+    """Return an HDT: heading from true north; empty where the answer is not usable."""
+    heading = navigation.roll_pitch_heading[2:]
+    is_usable = _is_usable(navigation, heading)
+    return _sentence("HDT", _degrees(float(heading[0])) if is_usable else "", "T")
+
+
+def _is_usable(navigation: Navigation, values: Array) -> bool:
+    return navigation.health in USABLE and bool(np.isfinite(values).all())
+
+
+def _sentence(kind: str, *fields: str) -> str:
+    body = ",".join((TALKER + kind, *fields))
+    return f"${body}*{checksum(body)}\r\n"
+
+
+def _utc(time_s: float) -> str:
+    """Return ``hhmmss.sss``; empty where there is no time."""
+    if not math.isfinite(time_s):
+        return ""
+    seconds, ms = divmod(round(time_s % 86400.0 * 1e3) % _DAY_MS, 1000)
+    minutes, seconds = divmod(seconds, 60)
+    return f"{minutes // 60:02d}{minutes % 60:02d}{seconds:02d}.{ms:03d}"
+
+
+def _angle(angle: float, sides: str, *, width: int) -> tuple[str, str]:
+    """Return ``dddmm.mmmmmm`` and its side; rounded as a whole, so that minutes stay below 60."""
+    parts = round(abs(math.degrees(angle)) * 60 * _MINUTE)
+    degrees, parts = divmod(parts, 60 * _MINUTE)
+    minutes, parts = divmod(parts, _MINUTE)
+    return f"{degrees:0{width}d}{minutes:02d}.{parts:06d}", sides[1 if angle < 0.0 else 0]
+
+
+def _degrees(angle: float) -> str:
+    """Return an angle as degrees from 0 to 359.99."""
+    hundredths = round(math.degrees(angle) * 100.0) % 36000
+    return f"{hundredths // 100}.{hundredths % 100:02d}"

@@ -34,6 +34,7 @@ from typing import Any, Final
 
 from ssm_graph.live.protocols.decoder import (
     Clock,
+    Decoder,
     RefusedError,
     Stamper,
     flag,
@@ -42,7 +43,6 @@ from ssm_graph.live.protocols.decoder import (
     require,
     shown,
 )
-from ssm_graph.live.protocols.framed_decoder import FramedDecoder
 from ssm_graph.live.protocols.framing import MAX_LENGTH, ObjectFramer
 from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.dvl_readings import LARGEST_SPEED
@@ -63,7 +63,7 @@ class BeamRule(Enum):
     VELOCITY = "beams flagged valid, where the report has a valid velocity"
 
 
-class WaterLinkedDecoder(FramedDecoder):
+class WaterLinkedDecoder(Decoder):
     """Velocity reports to pings, in any layout: one a line, spread over lines, back to back.
 
     A report without a beam that counts is a ping of missing beams. The same report again (by
@@ -97,24 +97,24 @@ class WaterLinkedDecoder(FramedDecoder):
         self._last: dict[str, Any] = {}
 
     def _decode(self, text: str, arrival_s: float) -> list[Message]:
-        ping = self._ping(parse_object(text), arrival_s)
-        return [] if ping is None else [ping]
-
-    def _ping(self, report: dict[str, Any], arrival_s: float) -> Ping | None:
+        report = parse_object(text)
         kind = require(report, "type")
         if kind != "velocity":
             if isinstance(kind, str) and kind in IGNORED:
-                return None
+                return []
             raise RefusedError(f"expected a report of type 'velocity', got {shown(kind)}")
         beams = _transducers(report)
-        speed = _speeds(beams) if self._counts(report, beams) else (math.nan,) * len(beams)
+        counts = self._counts(report, beams)
+        speed = tuple(
+            float(x["velocity"]) if counts and x["beam_valid"] else math.nan for x in beams
+        )
         centre_s = _time_of_validity(report)
         if self._is_repeat(report):
             self.n_repeats += 1
-            return None
+            return []
         ping = Ping(time_s=self._stamper.stamp(centre_s, arrival_s), speed=speed)
         self._last = report
-        return ping
+        return [ping]
 
     def _is_repeat(self, report: dict[str, Any]) -> bool:
         stamp = report.get("time_of_validity", 0)
@@ -151,10 +151,6 @@ def _transducers(report: dict[str, Any]) -> list[dict[str, Any]]:
         largest = LARGEST_SPEED if flag(beam, "beam_valid") else math.inf
         number(require(beam, "velocity"), key="velocity", low=-largest, high=largest)
     return beams
-
-
-def _speeds(beams: list[dict[str, Any]]) -> tuple[float, ...]:
-    return tuple(float(x["velocity"]) if x["beam_valid"] else math.nan for x in beams)
 
 
 def _time_of_validity(report: dict[str, Any]) -> float | None:

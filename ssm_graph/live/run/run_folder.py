@@ -22,7 +22,7 @@ import sys
 import threading
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import IO, Any, Final
 
@@ -32,10 +32,10 @@ from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.io.mission_folder.toml import TOML_NAME
 from ssm_graph.io.mission_folder.vehicle import check_same_vehicle
-from ssm_graph.io.raw_log.log import RawLog, replay
-from ssm_graph.io.results.growing import GrowingResults
+from ssm_graph.io.raw_log.log import RawLog
+from ssm_graph.io.raw_log.rows import ALWAYS, ARRIVALS, replay
 from ssm_graph.io.results.summary import as_json
-from ssm_graph.io.results.tables import BEAMS_NAME, SUMMARY_NAME, TRAJECTORY_NAME
+from ssm_graph.io.results.tables import BEAMS_NAME, SUMMARY_NAME, TRAJECTORY_NAME, GrowingResults
 from ssm_graph.io.tables.append_file import AppendFile
 from ssm_graph.io.tables.checkpoint import CHECKPOINT_NAME, newest_checkpoint, write_checkpoint
 from ssm_graph.mission.navigation import Event
@@ -70,18 +70,11 @@ class Resumed:
     notes: tuple[str, ...] = ()
     """What a person should know, one sentence each."""
 
-    def without_checkpoint(self, why: str) -> Resumed:
-        """Return the begin of the run."""
-        return Resumed(notes=(*self.notes, why))
-
 
 class CheckpointWriter:
     """Writes one checkpoint at a time in a thread of its own.
 
-    Parameters
-    ----------
-    folder : where they go.
-    synced : files that have to be on the disk before the checkpoint that counts on them.
+    Files that are ``synced`` have to be on the disk before the checkpoint that counts on them.
     """
 
     def __init__(self, folder: Path, synced: Sequence[Path] = ()) -> None:
@@ -127,19 +120,12 @@ class CheckpointWriter:
 class RunFolder:
     """One live run on the disk.
 
-    Parameters
-    ----------
-    folder : made if it does not exist; one that holds a run is gone on with.
-    vehicle : whose run it is.
-    settings : of the estimator; plain values with units in the keys.
+    Raises :class:`ConfigError` for the run of another vehicle or of other settings, one that
+    another process writes, and for a folder that holds something else. Raises :class:`DataError`
+    for a folder that cannot be written.
 
-    Raises
-    ------
-    ConfigError
-        For the run of another vehicle or of other settings, one that another process writes, and
-        for a folder that holds something else.
-    DataError
-        For a folder that cannot be written.
+    The folder is made if it does not exist; one that holds a run is gone on with. The settings are
+    those of the estimator: plain values with units in the keys.
     """
 
     def __init__(self, folder: Path, vehicle: Vehicle, settings: Mapping[str, Any]) -> None:
@@ -158,8 +144,9 @@ class RunFolder:
         self.event_problem: str | None = None
         self.results: GrowingResults | None = None
         self.log: RawLog | None = None
-        names = (*_log_names(folder), folder / TRAJECTORY_NAME, folder / BEAMS_NAME)
-        self.writer = CheckpointWriter(folder, names)
+        log_names = [f"{LOG_NAME}/{name}" for name in (*ALWAYS, ARRIVALS)]
+        names = (*log_names, TRAJECTORY_NAME, BEAMS_NAME)
+        self.writer = CheckpointWriter(folder, [folder / name for name in names])
         self._known: Counter[bytes] = Counter()
 
     def resume(self) -> Resumed:
@@ -187,7 +174,9 @@ class RunFolder:
         """Return what was logged since, and get ready to write results and events once more."""
         has_current = self.vehicle.current is not None
         self.results = GrowingResults(self.path, sizes=resumed.sizes, has_current=has_current)
-        self._known = _lines_from(self.path / EVENTS_NAME, resumed.sizes.get(EVENTS_NAME, 0))
+        with (self.path / EVENTS_NAME).open("rb") as stream:
+            stream.seek(resumed.sizes.get(EVENTS_NAME, 0))
+            self._known = Counter(stream)
         if not self._has_log:
             return iter(())
         return replay(self.path / LOG_NAME, self.vehicle, resumed.offsets)
@@ -324,24 +313,8 @@ def _locked(folder: Path) -> IO[str]:
     return lock
 
 
-def _log_names(folder: Path) -> tuple[Path, ...]:
-    names = ("imu.csv", "dvl.csv", "depth.csv", "gnss.csv", "arrivals")
-    return tuple(folder / LOG_NAME / name for name in names)
-
-
-def _lines_from(path: Path, start: int) -> Counter[bytes]:
-    with path.open("rb") as stream:
-        stream.seek(start)
-        return Counter(stream)
-
-
 def _line(event: Event) -> bytes:
-    fields = {
-        "time_s": event.time_s,
-        "severity": event.severity.value,
-        "kind": event.kind,
-        "text": event.text,
-    }
+    fields = asdict(event) | {"severity": event.severity.value}
     return (json.dumps(as_json(fields), ensure_ascii=False) + "\n").encode()
 
 

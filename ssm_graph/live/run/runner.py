@@ -140,14 +140,8 @@ class RunnerConfig:
 class Runner:
     """Runs an estimator until it is told to stop, or its source ends.
 
-    Parameters
-    ----------
-    folder : where everything goes, and where an earlier process of the same run left it.
-    engine : makes the estimator.
-    connect : opens sockets, once an earlier process has been caught up with.
-    publisher, config : what goes out and how often.
-    on_status : told twice a second how it goes.
-    steady_s : a clock that is never set.
+    ``connect`` opens sockets once an earlier process of the same run has been caught up with;
+    ``on_status`` is told twice a second how it goes; ``steady_s`` is a clock that is never set.
     """
 
     def __init__(
@@ -249,9 +243,8 @@ class Runner:
                 return resumed
             except Exception as error:
                 self._events.failure("checkpoint", "restore_failed", error)
-                resumed = resumed.without_checkpoint(
-                    "the checkpoint could not be restored; the whole log was gone through"
-                )
+                lost = "the checkpoint could not be restored; the whole log was gone through"
+                resumed = Resumed(notes=(*resumed.notes, lost))
         self._estimator = self._engine.new()
         return resumed
 

@@ -69,16 +69,10 @@ class Resolved(NamedTuple):
 def parse_endpoint(text: str, *, where: str, allowed: Collection[Transport] = INPUTS) -> Endpoint:
     """Return the endpoint of an address as it is written.
 
-    Parameters
-    ----------
-    text : for example ``tcp://192.168.194.95:16171``, ``udp://:9000``, ``tcp-listen://[::1]:7000``.
-    where : the option it belongs to, for the message.
-    allowed : what may be used there.
+    Raises :class:`ConfigError` for any other text.
 
-    Raises
-    ------
-    ConfigError
-        For anything else.
+    For example ``tcp://192.168.194.95:16171``, ``udp://:9000``, ``tcp-listen://[::1]:7000``;
+    ``where`` is the option it belongs to, ``allowed`` what may be used there.
     """
     wanted = " or ".join(FORMS[kind] for kind in Transport if kind in allowed)
     found = _ADDRESS.fullmatch(text.strip())
@@ -98,10 +92,7 @@ def parse_endpoint(text: str, *, where: str, allowed: Collection[Transport] = IN
 def resolve(endpoint: Endpoint) -> list[Resolved]:
     """Return the numeric addresses of an endpoint; may ask a name server, so not within a loop.
 
-    Raises
-    ------
-    ConfigError
-        For a name that is not known.
+    Raises :class:`ConfigError` for a name that is not known.
     """
     kind = socket.SOCK_DGRAM if endpoint.transport is Transport.UDP else socket.SOCK_STREAM
     try:
@@ -116,10 +107,7 @@ def resolve(endpoint: Endpoint) -> list[Resolved]:
 def bound(endpoint: Endpoint) -> socket.socket:
     """Return a socket that listens at an address.
 
-    Raises
-    ------
-    ConfigError
-        Where the address is not one of this computer, or in use.
+    Raises :class:`ConfigError` where the address is not one of this computer, or in use.
     """
     found = resolve(endpoint)[0]
     is_udp = endpoint.transport is Transport.UDP
@@ -145,12 +133,8 @@ def bound(endpoint: Endpoint) -> socket.socket:
 class Listener:
     """A server's socket: takes clients as long as there is room.
 
-    Parameters
-    ----------
-    endpoint : where it listens.
-    selector, owner : whom the selector names when somebody calls.
-    most : clients at once; more are refused.
-    tell : notes an event, of this kind, text and severity.
+    More than ``most`` clients at once are refused. ``tell`` notes an event, of this kind, text and
+    severity; the selector names ``owner`` when somebody calls.
     """
 
     def __init__(

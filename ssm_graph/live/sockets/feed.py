@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.live.protocols.decoder import Decoder
@@ -32,15 +32,6 @@ class Now(NamedTuple):
     """The vehicle's clock, which stamps arrivals."""
     steady_s: float
     """A clock that is never set, for rates and patience."""
-
-
-class CountingDecoder(Decoder, Protocol):
-    """A decoder that counts what it refuses."""
-
-    @property
-    def n_refused(self) -> int:
-        """How much was refused so far."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +64,7 @@ class Limits:
 class Channel:
     """One connection's decoder, and when it last heard something, s on the steady clock."""
 
-    def __init__(self, decoder: CountingDecoder, now: Now) -> None:
+    def __init__(self, decoder: Decoder, now: Now) -> None:
         self.decoder = decoder
         self.heard_s = now.steady_s
         self.fed_s = now.steady_s
@@ -82,19 +73,14 @@ class Channel:
 class Feed:
     """One source: bytes to messages, limited and counted.
 
-    Parameters
-    ----------
-    name : for people, such as ``dvl``.
-    address : where it comes from, for people.
-    make_decoder : of a new connection.
-    limits, events : what it may do and where it is told.
+    ``name`` and ``address`` are for people; every connection has a decoder of its own.
     """
 
     def __init__(
         self,
         name: str,
         address: str,
-        make_decoder: Callable[[], CountingDecoder],
+        make_decoder: Callable[[], Decoder],
         *,
         limits: Limits,
         events: EventLog,

@@ -103,12 +103,8 @@ class Input(ABC):
         """Stop reading a source that sends too much: TCP holds it back, of UDP the rest is lost."""
         if not self._is_paused and self.feed.is_over(now):
             self._is_paused = True
-            self.feed.tell(
-                "byte_limited",
-                f"expected at most {self.feed.limits.bytes_per_s:g} bytes/s, got more; it is read "
-                "no faster",
-                Severity.WARNING,
-            )
+            most = f"expected at most {self.feed.limits.bytes_per_s:g} bytes/s, got more"
+            self.feed.tell("byte_limited", f"{most}; it is read no faster", Severity.WARNING)
             for sock in self._reading:
                 self._selector.unregister(sock)
 
@@ -190,11 +186,8 @@ class TcpClientInput(Input):
         self._forget(self._calling)
         self._calling = None
         self._wait(now)
-        self.feed.tell(
-            "connect_failed",
-            f"cannot connect to {self.feed.address}: {why}; it is tried again and again",
-            Severity.WARNING,
-        )
+        text = f"cannot connect to {self.feed.address}: {why}; it is tried again and again"
+        self.feed.tell("connect_failed", text, Severity.WARNING)
 
     def _lose(self, sock: socket.socket, now: Now, why: str) -> list[Message]:
         messages = self._end(sock, now)

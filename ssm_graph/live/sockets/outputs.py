@@ -13,7 +13,7 @@ from typing import Final, Protocol
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.live.protocols.json_messages import encode_navigation
-from ssm_graph.live.protocols.nmea_encoder import encode_nmea
+from ssm_graph.live.protocols.nmea import encode_nmea
 from ssm_graph.live.sockets.endpoints import Endpoint, Listener, let_go, received, resolve
 from ssm_graph.live.sockets.feed import Now
 from ssm_graph.mission.events import EventLog
@@ -51,14 +51,8 @@ class Output(ABC):
     def send(self, data: bytes) -> None:
         """Send whole messages, or drop them; never waits."""
 
-    def on_ready(self, ready: socket.socket, mask: int, now: Now) -> None:  # noqa: B027
-        """Look after a socket that can be read or written; there is none where nobody calls."""
-
     def tick(self, now: Now) -> None:  # noqa: B027
         """Look after what time brings."""
-
-    def abandon(self, sock: socket.socket) -> None:  # noqa: B027
-        """Let go of a socket that made something fail."""
 
     @abstractmethod
     def close(self) -> None:
@@ -192,19 +186,11 @@ class TcpServerOutput(Output):
 
 
 class Outlet(Protocol):
-    """Takes answers as bytes; never waits."""
+    """Takes answers as bytes, in the forms that somebody wants, and says how they are doing."""
 
-    def wants(self, form: OutputFormat) -> bool:
-        """Return whether anybody listens to this form."""
-        ...
-
-    def send(self, form: OutputFormat, data: bytes) -> None:
-        """Send one answer to everybody who listens to this form."""
-        ...
-
-    def output_status(self) -> tuple[OutputStatus, ...]:
-        """Return how the outputs are doing."""
-        ...
+    def wants(self, form: OutputFormat) -> bool: ...  # noqa: D102
+    def send(self, form: OutputFormat, data: bytes) -> None: ...  # noqa: D102
+    def output_status(self) -> tuple[OutputStatus, ...]: ...  # noqa: D102
 
 
 class Every:
@@ -228,10 +214,7 @@ class Every:
 class Publisher:
     """Sends the newest answer, in every form that somebody listens to.
 
-    Parameters
-    ----------
-    rate_hz, nmea_rate_hz : JSON lines and NMEA sentences at most so often, by the vehicle's clock.
-    geoid_separation_m : of the heights in NMEA sentences.
+    JSON lines and NMEA sentences go at most so often, by the vehicle's clock.
     """
 
     def __init__(

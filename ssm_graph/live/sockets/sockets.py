@@ -8,8 +8,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Self
 
+from ssm_graph.live.protocols.decoder import Decoder
 from ssm_graph.live.sockets.endpoints import Endpoint, Transport
-from ssm_graph.live.sockets.feed import CountingDecoder, Feed, Limits, Now
+from ssm_graph.live.sockets.feed import Feed, Limits, Now
 from ssm_graph.live.sockets.inputs import Input, TcpClientInput, TcpServerInput, UdpInput
 from ssm_graph.live.sockets.outputs import Output, OutputFormat, TcpServerOutput, UdpOutput
 from ssm_graph.mission.events import EventLog
@@ -24,7 +25,7 @@ class InputConfig:
 
     name: str
     endpoint: Endpoint
-    make_decoder: Callable[[], CountingDecoder]
+    make_decoder: Callable[[], Decoder]
     limits: Limits = Limits()
 
 
@@ -39,16 +40,10 @@ class OutputConfig:
 class SocketHub:
     """Reads all sources and sends to all outputs.
 
-    Parameters
-    ----------
-    inputs, outputs : what there is; connections are made on the way, again and again if need be.
-    wall_s : the vehicle's clock, which stamps arrivals.
-    steady_s : a clock that is never set, for rates and patience.
+    Raises :class:`ConfigError` for an unknown host, and for an address where nothing can listen.
 
-    Raises
-    ------
-    ConfigError
-        For an unknown host, and for an address where nothing can listen.
+    Connections are made on the way, again and again if need be. ``wall_s`` is the vehicle's clock,
+    which stamps arrivals; ``steady_s`` one that is never set, for rates and patience.
     """
 
     is_finished = False
@@ -98,7 +93,7 @@ class SocketHub:
         messages: list[Message] = []
         for key, mask in ready:
             try:
-                if isinstance(key.data, Output):
+                if isinstance(key.data, TcpServerOutput):
                     key.data.on_ready(key.fileobj, mask, now)  # type: ignore[arg-type]
                 else:
                     messages += key.data.on_ready(key.fileobj, now)

@@ -1,0 +1,307 @@
+"""A mission folder: read into one :class:`~ssm_graph.mission.mission.Mission`, and written again.
+
+What a calibration found is written as lines that can be put into ``mission.toml``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import tomli_w
+
+from ssm_graph.base.frames import R_FRD, BodyAxes
+from ssm_graph.base.frozen import Array
+from ssm_graph.base.settings import build, owner_of, written
+from ssm_graph.base.tables import Order, Table
+from ssm_graph.io.mission_folder.assembly import Part, assembled, first_frame
+from ssm_graph.io.mission_folder.toml import (
+    FORMAT,
+    INITIAL_KEYS,
+    REFERENCE,
+    REQUIRED_SECTIONS,
+    TABLES,
+    TOML_NAME,
+    MissionToml,
+    read_mission_toml,
+    table_path,
+)
+from ssm_graph.io.tables.append_file import write_through
+from ssm_graph.io.tables.files import TableFormat, read_arrival_table, read_table, write_table
+from ssm_graph.mission.estimate import CalibratedValue, Calibration, Determined
+from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.vehicle import Vehicle
+from ssm_graph.sensors.acoustic import RangeLog
+from ssm_graph.sensors.current import CURRENT_KEYS, CurrentModel
+from ssm_graph.sensors.instrument import Calibrated, Instrument
+from ssm_graph.sensors.place import PLACE_KEYS
+from ssm_graph.sensors.registry import INSTRUMENTS
+from ssm_graph.sensors.standstill import STANDSTILL_KEYS, Standstill, check_during, standstill
+
+__all__ = ["TableFormat", "read_mission", "write_mission"]
+
+CALIBRATION_NAME: Final = "calibration.toml"
+
+
+def read_mission(folder: Path | str) -> Mission:
+    """Read and check a mission folder.
+
+    Parameters
+    ----------
+    folder : the folder that holds ``mission.toml`` and the tables it names.
+
+    Returns
+    -------
+    Mission
+        In SI units, radians and body axes forward-right-down; ``notes`` holds, one sentence each,
+        what was noticed and is no error.
+
+    Raises
+    ------
+    ConfigError
+        For a key of ``mission.toml`` that is missing, unknown or out of range.
+    DataError
+        For a table that is damaged, or whose numbers cannot be what the format says they are.
+    MissingExtraError
+        For a Parquet table where pyarrow is not installed.
+    """
+    toml = read_mission_toml(Path(folder))
+    bare = {one.section: toml.bare(one) for one in TABLES if one.section in toml}
+    tables, notes = _read_tables(toml, bare)
+    parts: dict[str, Part] = {}
+    for one in TABLES:
+        if one.section in tables:
+            table, own = tables[one.section], bare[one.section]
+            notes += one.check(table, own, toml.body)
+            log = one.filled(table, own, toml[one.section], toml.body)
+            parts[one.section] = Part(log, table)
+    notes += _lists_without_section(toml)
+    initial = toml.initial()
+    frame = first_frame(toml.frame("origin"), parts, initial)
+    if frame is None:
+        raise toml.fault_of_no_place()
+    return assembled(
+        toml.name,
+        parts,
+        frame=frame,
+        has_origin="origin" in toml,
+        standstills=_standstills(toml, parts["imu"].table),
+        initial=initial,
+        current=build(CurrentModel, toml["current"].given()) if "current" in toml else None,
+        notes=notes,
+    )
+
+
+def _read_tables(toml: MissionToml, bare: dict[str, Any]) -> tuple[dict[str, Table], list[str]]:
+    tables: dict[str, Table] = {}
+    notes: list[str] = []
+    read = read_table if toml.order is Order.TIME else read_arrival_table
+    for one in TABLES:
+        section = one.section
+        if section not in toml:
+            continue
+        label = toml[section].text("file")
+        path = table_path(toml, section)
+        if path is None:
+            notes.append(f"{label}: there is no such file; going on without [{section}]")
+            continue
+        table = read(path, label, one.spec(bare[section]))
+        notes += table.notes
+        if len(table) or section in REQUIRED_SECTIONS:
+            tables[section] = table
+        else:
+            notes.append(f"{label}: the table has no rows; going on without [{section}]")
+    return tables, notes
+
+
+def _lists_without_section(toml: MissionToml) -> list[str]:
+    """Note the beacons of ranges that there are none of."""
+
+    def is_idle(one: Instrument, name: str) -> bool:
+        return bool(toml.lists[name]) and one.section not in toml
+
+    return [
+        f"{toml.file} [[{name}]]: there is no [{one.section}]; going on without {name}s"
+        for one in TABLES
+        for name in one.lists
+        if is_idle(one, name)
+    ]
+
+
+def _standstills(toml: MissionToml, imu: Table) -> list[Standstill]:
+    first_s, last_s = float(imu.time_s[0]), float(imu.time_s[-1])
+    found = []
+    for settings in toml.lists["standstill"]:
+        still = standstill(settings)
+        check_during(still, settings, first_s=first_s, last_s=last_s, label=imu.label)
+        found.append(still)
+    return found
+
+
+def write_mission(
+    folder: Path | str, mission: Mission, *, table_format: TableFormat = TableFormat.CSV
+) -> None:
+    """Write ``mission`` as a folder that :func:`read_mission` turns into the same values.
+
+    Body axes are FRD and IMU stamps name the interval's end. Every number is written with all its
+    digits; angles may differ by rounding. An interrupted write leaves the old mission, or a folder
+    without ``mission.toml``, never a mixture.
+
+    The folder is made if it does not exist; files of the same names are replaced. The mission's
+    notes are not written.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    settings = mission_settings(mission, table_format)
+    parts = {}
+    for section, columns in mission_tables(mission).items():
+        path = folder / settings[section]["file"]
+        parts[path] = path.with_name(f"{path.stem}.part{path.suffix}")
+        write_table(parts[path], columns)
+    toml_part = write_toml_part(folder, settings)
+    (folder / TOML_NAME).unlink(missing_ok=True)
+    for path, part in parts.items():
+        part.replace(path)
+    toml_part.replace(folder / TOML_NAME)
+
+
+def write_toml_part(folder: Path, settings: dict[str, Any]) -> Path:
+    """Write a ``mission.toml`` under another name, on the disk when this returns."""
+    part = folder / f"{TOML_NAME}.part"
+    write_through(part, tomli_w.dumps(settings).encode())
+    return part
+
+
+def mission_settings(mission: Mission, table_format: TableFormat) -> dict[str, Any]:
+    """Return the content of ``mission.toml``."""
+    suffix = table_format.value
+    settings: dict[str, Any] = {
+        "format": FORMAT,
+        "name": mission.name,
+        "frames": {"body": BodyAxes.FRD.value},
+        "origin": written(mission.frame, PLACE_KEYS),
+        **instrument_sections(mission.logs, suffix),
+        **common_sections(mission),
+    }
+    stills = [written(still, STANDSTILL_KEYS) for still in mission.aids.all(Standstill)]
+    if stills:
+        settings["standstill"] = stills
+    if mission.reference is not None:
+        settings["reference"] = {"file": f"reference{suffix}"}
+    return settings
+
+
+def common_sections(source: Mission | Vehicle) -> dict[str, Any]:
+    """Return the sections of a mission or a vehicle that are of no instrument."""
+    sections = {}
+    if source.current is not None:
+        sections["current"] = written(source.current, CURRENT_KEYS)
+    if source.initial is not None:
+        sections["initial"] = written(source.initial, INITIAL_KEYS)
+    return sections
+
+
+def instrument_sections(logs: Mapping[type, Any], suffix: str) -> dict[str, Any]:
+    """Return the sections that describe instruments; ``suffix`` is that of their tables' names."""
+    sections: dict[str, Any] = {}
+    for one in INSTRUMENTS:
+        if one.log in logs:
+            settings = one.settings_of(logs[one.log])
+            sections[one.section] = {"file": f"{one.section}{suffix}", **settings}
+            sections |= one.lists_of(logs[one.log])
+    return sections
+
+
+def mission_tables(mission: Mission) -> dict[str, dict[str, Array]]:
+    """Return the columns of every table."""
+    logs = mission.logs
+    tables = {one.section: one.table_of(logs[one.log]) for one in INSTRUMENTS if one.log in logs}
+    if mission.reference is not None:
+        tables["reference"] = REFERENCE.table_of(mission.reference)
+    return tables
+
+
+def calibration_toml(
+    mission: Mission, calibration: Calibration, *, axes: BodyAxes = BodyAxes.FRD
+) -> str:
+    """Return the lines of ``mission.toml`` that a calibration changes, with comments.
+
+    What the mission did not determine stays as it is stated, and a comment says so. The prior
+    sigmas for going on from here are comments as well: without them the values are exact.
+
+    ``axes`` are the body axes of the file that the lines are for.
+    """
+    lines = [
+        f"# Calibrated with mission {mission.name!r}. Put these values in the place of the stated",
+        "# ones; the sigmas, made keys, let the next mission calibrate on from here.",
+    ]
+    found: dict[str, list[CalibratedValue]] = {}
+    for value in calibration.values:
+        found.setdefault(value.variable, []).append(value)
+    for one in INSTRUMENTS:
+        names = [name for name in one.calibrated if name in found]
+        lines += ["", f"[{one.section}]"] if names else []
+        for name in names:
+            lines += _lines(one, one.calibrated[name], found[name], mission, axes)
+    lines += _beacon_lines(mission, calibration)
+    return "\n".join(lines) + "\n"
+
+
+def _lines(
+    one: Instrument,
+    calibrated: Calibrated,
+    values: list[CalibratedValue],
+    mission: Mission,
+    axes: BodyAxes,
+) -> list[str]:
+    sigmas = [value.sigma / value.unit for value in values]
+    shown = ", ".join(f"{sigma:.2g}" for sigma in sigmas)
+    if all(value.determined is Determined.RED for value in values):
+        prior = values[0].prior_sigma / values[0].unit
+        return [f"# {calibrated.key}: not determined, sigma {shown} of {prior:.2g} before"]
+    log, key = mission.logs[one.log], one.keys[calibrated.key]
+    stated = getattr(*owner_of(log, key.field)) if key.field else None
+    off = np.array([value.value for value in values])
+    total = calibrated.total(log, 0.0 if stated is None else stated, off)
+    total = total @ R_FRD[axes] if key.is_body else total
+    unsure = [v.label for v in values if v.determined is Determined.RED]
+    remark = f"; not determined: {', '.join(unsure)}" if unsure else ""
+    return [
+        f"{calibrated.key} = {_number(total / key.unit)}  # sigma {shown}{remark}",
+        f"# {calibrated.sigma_key} = {max(sigmas):.2g}",
+    ]
+
+
+def _number(total: Array) -> str:
+    """Return a number, or a list of several, with the digits that a calibration can have."""
+    digits: list[Any] = [float(f"{x:.7g}") + 0.0 for x in total]
+    return str(digits[0] if len(digits) == 1 else digits)
+
+
+def _beacon_lines(mission: Mission, calibration: Calibration) -> list[str]:
+    """Return a section ``[[beacon]]`` for each whose place was estimated."""
+    ranges, lines = mission.aids.get(RangeLog), []
+    for beacon in ranges.beacons if ranges is not None else ():
+        found = [v for v in calibration.values if v.variable == f"beacon_{beacon.number}"]
+        if not found:
+            continue
+        frame = mission.frame
+        stated_n = frame.p_n_from_geodetic(beacon.lat, beacon.lon, beacon.height)
+        off_enu = np.array([value.value for value in found])
+        lat, lon, height = frame.geodetic_from_p_n(stated_n + frame.R_nl_at(stated_n) @ off_enu)
+        sigmas = ", ".join(f"{value.sigma:.2g}" for value in found)
+        unsure = [value.label for value in found if value.determined is Determined.RED]
+        remark = [f"# not determined: {', '.join(unsure)}"] if unsure else []
+        lines += [
+            "",
+            "[[beacon]]",
+            *remark,
+            f"number = {beacon.number}",
+            f"lat_deg = {np.degrees(lat):.9f}",
+            f"lon_deg = {np.degrees(lon):.9f}",
+            f"height_m = {height:.3f}",
+            f"# position_sigma_m = [{sigmas}]",
+        ]
+    return lines
