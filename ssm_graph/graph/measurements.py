@@ -144,6 +144,15 @@ class Measurements:
         """Return the squared whitened errors (M,)."""
         return self._summed(self.rows(states).error ** 2)
 
+    def loss(self, states: States, kernel: Kernel) -> float:
+        """Return what they cost with their robust loss in place of their squares."""
+        t, total = self.squares(states), 0.0
+        for dim in np.unique(self.dim):
+            own = t[self.dim == dim]
+            loss = kernel.similarity(np.zeros_like(own), dim=dim) - kernel.similarity(own, dim=dim)
+            total += float(loss.sum())
+        return total
+
     def of(self, aid: Aid, values: Array) -> Array:
         """Return what is one of the aids' of values (M,), as a view."""
         begin = sum(len(before) for before in self.all[: self.all.index(aid)])

@@ -119,8 +119,6 @@ class Problem(ReadOnlyArrays):
     aids: tuple[Aid, ...] = ()
     """What the smoothers are aided by besides; another estimator says that it is not."""
     notes: tuple[str, ...] = ()
-    is_noise_white: bool = False
-    """Whether sigmas of beams and fixes leave out what drifts stand for: `with_white_noise`"""
 
     def aid(self, kind: type[A]) -> A | None:
         """Return the aid of a kind, None if there is none."""
@@ -226,33 +224,23 @@ def with_dvl(problem: Problem, mission: Mission) -> Problem:
             "with_dvl: expected pings off the ground, as those of the problem, got some off the "
             "water, whose current it does not have; build a problem of its own"
         )
-    return replace(with_stated_noise(problem), beams=beams)
+    return replace(problem, beams=beams)
 
 
 def with_white_noise(problem: Problem) -> Problem:
-    """Return the problem for an estimator whose variables are its drifts, too.
+    """Return what an estimator whose variables are the drifts, too, makes of a problem, once.
 
-    The sigmas of beams and fixes are then those of white noise alone; as they are stated, they
-    stand for what changes slowly as well.
+    A problem states the noise of beams and fixes with all that changes slowly; here their sigmas
+    are those of white noise alone, all of which is white.
     """
-    return problem if problem.is_noise_white else _scaled_noise(problem, is_noise_white=True)
-
-
-def with_stated_noise(problem: Problem) -> Problem:
-    """Return the problem for an estimator without drifts."""
-    return _scaled_noise(problem, is_noise_white=False) if problem.is_noise_white else problem
-
-
-def _scaled_noise(problem: Problem, *, is_noise_white: bool) -> Problem:
-    power = 1.0 if is_noise_white else -1.0
     beams, fixes = problem.beams, problem.fixes
     if DVL_DRIFT in problem.extras:
-        share = np.where(beams.is_water, 1.0, beams.white_share**power)
-        beams = replace(beams, sigma=beams.sigma * share)
+        share = np.where(beams.is_water, 1.0, beams.white_share)
+        beams = replace(beams, sigma=beams.sigma * share, white_share=1.0)
     if fixes is not None and GNSS_DRIFT in problem.extras:
-        covariance_n = fixes.covariance_n * fixes.white_share ** (2.0 * power)
-        fixes = replace(fixes, covariance_n=covariance_n)
-    return replace(problem, beams=beams, fixes=fixes, is_noise_white=is_noise_white)
+        covariance_n = fixes.covariance_n * fixes.white_share**2
+        fixes = replace(fixes, covariance_n=covariance_n, white_share=1.0)
+    return replace(problem, beams=beams, fixes=fixes)
 
 
 def _without_stuck_beams(mission: Mission) -> tuple[Mission, tuple[str, ...]]:

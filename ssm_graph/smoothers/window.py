@@ -232,7 +232,7 @@ class Window:
         """Solve and reweigh; what has moved is linearised anew at each pass."""
         config, n_keyframes = self.config, len(self.keyframes)
         tolerance = max(config.tolerance, ROUNDING) if n_keyframes > 1 else config.tolerance
-        mixing = Mixing()
+        mixing: Mixing | None = None
         for number in range(1, config.max_iterations + 1):
             update = self._solve()
             self._relinearise()
@@ -245,7 +245,8 @@ class Window:
                 # A single keyframe's weights are those of the filter, pass by pass.
                 if n_keyframes > 1:
                     used = np.concatenate([self._weights, self._graph.aids.weights])
-                    settled = mixing.next_weights(used, settled)
+                    mixing = Mixing.after(mixing, used, settled)
+                    settled = mixing.weights
                 self._renew(settled)
         return number
 
