@@ -51,11 +51,9 @@ class MEstimator(Kernel):
 class HuberKernel(MEstimator):
     """Least squares up to ``width``, the absolute value beyond [1]_."""
 
+    name: ClassVar[str] = "huber"
     width: float = 1.345
     """Sigmas up to which a residual counts in full; 95 % efficient, and GTSAM's default."""
-
-    def __post_init__(self) -> None:
-        require_positive("width", self.width)
 
     def similarity(self, t: Array, *, dim: int = 1) -> Array:  # noqa: ARG002
         """Return minus the loss."""
@@ -64,9 +62,6 @@ class HuberKernel(MEstimator):
 
     def _weight(self, t: Array, dim: int | Array) -> Array:  # noqa: ARG002
         return np.asarray(self.width / np.sqrt(np.maximum(t, self.width**2)))
-
-    def __str__(self) -> str:
-        return f"huber(width={self.width:g})"
 
 
 @final
@@ -77,11 +72,9 @@ class CauchyKernel(MEstimator):
     The log kernel with ``dof = width^2``, but for its norm: the weight is 1 at ``t = 0``.
     """
 
+    name: ClassVar[str] = "cauchy"
     width: float = 2.3849
     """Sigmas at which the weight is a half; 95 % efficient [2]_. GTSAM's default is 0.1."""
-
-    def __post_init__(self) -> None:
-        require_positive("width", self.width)
 
     def similarity(self, t: Array, *, dim: int = 1) -> Array:  # noqa: ARG002
         """Return minus the loss."""
@@ -89,9 +82,6 @@ class CauchyKernel(MEstimator):
 
     def _weight(self, t: Array, dim: int | Array) -> Array:  # noqa: ARG002
         return np.asarray(1.0 / (1.0 + t / self.width**2))
-
-    def __str__(self) -> str:
-        return f"cauchy(width={self.width:g})"
 
 
 @final
@@ -102,12 +92,10 @@ class DcsKernel(MEstimator):
     The paper gives the scale ``s``; the loss is what it integrates to.
     """
 
+    name: ClassVar[str] = "dcs"
     phi: float = 1.0
     """Squared sigmas up to which a residual counts in full; 1 in the paper and in GTSAM, which is
     64 % efficient on Gaussian noise; 3.60 is 95 %."""
-
-    def __post_init__(self) -> None:
-        require_positive("phi", self.phi)
 
     def similarity(self, t: Array, *, dim: int = 1) -> Array:  # noqa: ARG002
         """Return minus the loss."""
@@ -117,21 +105,16 @@ class DcsKernel(MEstimator):
     def _weight(self, t: Array, dim: int | Array) -> Array:  # noqa: ARG002
         return np.square(np.minimum(1.0, 2.0 * self.phi / (self.phi + t)))
 
-    def __str__(self) -> str:
-        return f"dcs(phi={self.phi:g})"
-
 
 @final
 @dataclass(frozen=True)
 class GemanMcClureKernel(MEstimator):
     """``f = -width^2/2 t/(width^2 + t)``: bounded."""
 
+    name: ClassVar[str] = "geman-mcclure"
     width: float = 1.0
     """Sigmas at which the weight is a quarter; 1 in [3]_ and in GTSAM, which is 44 % efficient on
     Gaussian noise; 3.79 is 95 %."""
-
-    def __post_init__(self) -> None:
-        require_positive("width", self.width)
 
     def similarity(self, t: Array, *, dim: int = 1) -> Array:  # noqa: ARG002
         """Return minus the loss."""
@@ -139,9 +122,6 @@ class GemanMcClureKernel(MEstimator):
 
     def _weight(self, t: Array, dim: int | Array) -> Array:  # noqa: ARG002
         return np.asarray((1.0 + t / self.width**2) ** -2.0)
-
-    def __str__(self) -> str:
-        return f"geman-mcclure(width={self.width:g})"
 
 
 @final
