@@ -12,13 +12,10 @@ from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from factors import so3
 from factors.dvl_beam import beam_error
-from factors.so3 import cross, times
-
-Array = NDArray[np.float64]
+from factors.so3 import Array, cross, times
 
 
 class Motion(NamedTuple):

@@ -8,7 +8,7 @@ Mahalanobis length with the posterior variance in it::
 
 Every similarity kernel has ``weight(dim) = 1``: a residual of expected size keeps its nominal
 noise.
-The classical M-estimators of :mod:`factors.m_estimators` are kernels as well, of another norm.
+The classical M-estimators of :mod:`factors.kernels` are kernels as well, of another norm.
 """
 
 from __future__ import annotations

@@ -18,13 +18,7 @@ from factors.kernels import KERNELS
 from ssm_graph.base.errors import ConfigError, SolverError
 from ssm_graph.base.frames import BodyAxes
 from ssm_graph.base.frozen import Array
-from ssm_graph.cli.options import (
-    add_command,
-    add_kernel_options,
-    kernel_of,
-    number_option,
-    say,
-)
+from ssm_graph.cli.options import add_command, add_kernel_options, kernel_of, number_option, say
 from ssm_graph.io.mission_folder.reader import read_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle, vehicle_of
 from ssm_graph.io.raw_log.rows import messages_of
@@ -45,7 +39,7 @@ from ssm_graph.mission.navigation import Health
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.report.mission.summary import calibration_table
 from ssm_graph.report.terminal.status_page import StatusPage
-from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
+from ssm_graph.smoothers.window import FixedLagConfig
 
 DESCRIPTION: Final = """\
 Navigate live: messages of the instruments in, position, velocity and attitude with their sigmas

@@ -23,7 +23,7 @@ from typing import NamedTuple, final
 
 import numpy as np
 
-from factors.m_estimators import TruncatedKernel
+from factors.kernels import TruncatedKernel
 from factors.similarity import WEIGHT_FLOOR, GaussianKernel, Kernel
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array

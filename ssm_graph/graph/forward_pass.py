@@ -23,7 +23,7 @@ from ssm_graph.graph.aids.ranges import Ranges
 from ssm_graph.graph.beam_rows import BeamRows, CalibratedBeams, PreparedBeams
 from ssm_graph.graph.first_weights import settled_weights
 from ssm_graph.graph.measurements import Measurements
-from ssm_graph.mission.current import CURRENTS
+from ssm_graph.mission.calibration import CURRENTS
 from ssm_graph.mission.problem import Problem
 
 

@@ -18,7 +18,7 @@ from ssm_graph.engine.extras import Extras
 from ssm_graph.engine.states import States
 from ssm_graph.graph.aids.aid import Aid, RowStates
 from ssm_graph.graph.aids.depth import DepthMeans
-from ssm_graph.mission.doubts import LOW_WEIGHT, MISFIT, SUSPECT_SHARE, TRUSTED
+from ssm_graph.mission.answer import LOW_WEIGHT, MISFIT, SUSPECT_SHARE, TRUSTED
 from ssm_graph.mission.estimate import AidTable
 from ssm_graph.mission.problem import Problem
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array, ReadOnlyArrays
-from ssm_graph.base.stepwise import Steps, finished
+from ssm_graph.base.stepwise import Steps, at_once
 from ssm_graph.base.times import MIN_SPACING_S, Indices, is_inside, nearest
 from ssm_graph.engine.error_state import InitialMoments
 from ssm_graph.engine.extras import Extras
@@ -21,8 +21,14 @@ from ssm_graph.graph.aids.depth import Depths
 from ssm_graph.graph.aids.gnss import GNSS_DRIFT, Fixes
 from ssm_graph.imu.ping_motion import MotionBefore, mean_gyro
 from ssm_graph.imu.preintegration import InertialChain, imu_gaps, preintegrate_steps
-from ssm_graph.mission.calibration import DVL_DRIFT, extras_of, needs_motion
-from ssm_graph.mission.current import CURRENT, current_note
+from ssm_graph.mission.calibration import (
+    CURRENT,
+    CURRENTS,
+    DVL_DRIFT,
+    current_note,
+    extras_of,
+    needs_motion,
+)
 from ssm_graph.mission.mission import InitialState, Mission
 from ssm_graph.mission.start.moments import initial_moments
 from ssm_graph.mission.timeline import Timeline, build_timeline
@@ -130,13 +136,13 @@ class Problem(ReadOnlyArrays):
         return len(self.keyframe_s)
 
 
-def build_problem(
+def build_problem_steps(
     mission: Mission,
     config: ProblemConfig | None = None,
     *,
     start: InitialState | None = None,
     begin_s: float | None = None,
-) -> Problem:
+) -> Steps[Problem]:
     """Turn a mission into an estimation problem.
 
     Parameters
@@ -148,17 +154,6 @@ def build_problem(
     begin_s : when errors of aids that grow are counted from, s; from the first reading of each when
         left out.
     """
-    return finished(build_problem_steps(mission, config, start=start, begin_s=begin_s))
-
-
-def build_problem_steps(
-    mission: Mission,
-    config: ProblemConfig | None = None,
-    *,
-    start: InitialState | None = None,
-    begin_s: float | None = None,
-) -> Steps[Problem]:
-    """Make :func:`build_problem` in steps."""
     require_usable(mission)
     mission, stuck_note = _without_stuck_beams(mission)
     config = config or ProblemConfig()
@@ -187,13 +182,11 @@ def build_problem_steps(
         imu_noise_bias_sigma=np.repeat([noise.accel_bias_sigma, noise.gyro_bias_sigma], 3),
         extras=extras,
         aids=tuple(aid for aid in aids if aid is not None),
-        notes=(
-            *timeline.notes,
-            *_gap_note(mission.imu),
-            *stuck_note,
-            *current_note(mission),
-        ),
+        notes=(*timeline.notes, *_gap_note(mission.imu), *stuck_note, *current_note(mission)),
     )
+
+
+build_problem = at_once(build_problem_steps)
 
 
 def start_of(problem: Problem) -> InitialMoments:
@@ -311,4 +304,39 @@ def _beams(mission: Mission, ping: Indices, ping_keyframe: Indices, extras: Extr
         n_beams=dvl.mount.n_beams,
         motion=MotionBefore(mission.imu, dvl.valid_s[ping]) if needs_motion(extras) else None,
         white_share=dvl.mount.drift.white_share,
+    )
+
+
+def without_water_track(problem: Problem) -> Problem:
+    """Return the problem with the pings off the ground alone, and a note of those left out."""
+    beams = problem.beams
+    if not beams.is_water.any():
+        return problem
+    kept = ~beams.is_water
+    n_pings = len(np.unique(beams.ping[beams.is_water]))
+    rows = {
+        name: getattr(beams, name)[kept]
+        for name in ("keyframe", "beam", "speed", "sigma", "gyro_b", "beam_b", "ping", "is_water")
+    }
+    return replace(
+        problem,
+        beams=replace(beams, **rows),
+        extras=problem.extras.without(CURRENTS),
+        notes=(*problem.notes, _note(n_pings)),
+    )
+
+
+def require_bottom_track(problem: Problem) -> None:
+    """Raise :class:`ConfigError` for a problem with pings off the water."""
+    if problem.beams.is_water.any():
+        raise ConfigError(
+            "this estimator has no current: expected pings off the ground, got some off the water; "
+            "leave them out by without_water_track"
+        )
+
+
+def _note(n_pings: int) -> str:
+    return (
+        f"{n_pings} pings off the water are left out: this estimator has no current, and would "
+        "take them for pings off the ground; ssm-graph smooth uses them"
     )

@@ -27,7 +27,7 @@ from ssm_graph.simulation.aids import (
 from ssm_graph.simulation.beam_faults import Fault, Loss, OutlierKind, Outliers
 from ssm_graph.simulation.currents import CurrentSettings, WaterTrack
 from ssm_graph.simulation.dvl_model import DvlSettings
-from ssm_graph.simulation.grades import IMU_NOISE, START_SIGMAS, Grade, StartSigmas
+from ssm_graph.simulation.inertial import IMU_NOISE, START_SIGMAS, Grade, StartSigmas
 from ssm_graph.simulation.routes import (
     DepthProfile,
     DiveRoute,

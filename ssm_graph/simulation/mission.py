@@ -30,8 +30,7 @@ from ssm_graph.simulation.beam_faults import (
 from ssm_graph.simulation.config import SimulationConfig
 from ssm_graph.simulation.currents import Current
 from ssm_graph.simulation.dvl_model import beam_ranges, ping_times, true_beam_speeds
-from ssm_graph.simulation.grades import initial_state
-from ssm_graph.simulation.imu_model import averaged_imu, imu_errors
+from ssm_graph.simulation.inertial import averaged_imu, imu_errors, initial_state
 from ssm_graph.simulation.randomness import Streams, draw_drift, spawn_streams
 from ssm_graph.simulation.trajectory import Trajectory
 

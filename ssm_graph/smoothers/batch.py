@@ -20,11 +20,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from factors.m_estimators import TruncatedKernel
+from factors.kernels import TruncatedKernel
 from factors.similarity import Kernel, LogKernel, Similarity, expected_mahalanobis_sq
 from ssm_graph.base.errors import ConfigError, SolverError
 from ssm_graph.base.frozen import Array
-from ssm_graph.base.stepwise import Steps, finished
+from ssm_graph.base.stepwise import Steps, at_once
 from ssm_graph.engine.chain import ChainSolution
 from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.engine.reweighting import GncSchedule, Graduation, Schedule, WarmSchedule
@@ -35,19 +35,19 @@ from ssm_graph.graph.first_values import FirstValues, first_values, first_values
 from ssm_graph.graph.inertial_rows import inertial_fit
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.measurements import aid_kernel, aid_table, doubts_of_aids
+from ssm_graph.mission.answer import trajectory_from_states
 from ssm_graph.mission.estimate import BeamTable, Estimate, Iteration, NoiseFound, Status
 from ssm_graph.mission.problem import Problem, with_white_noise
-from ssm_graph.mission.trajectory import trajectory_from_states
 from ssm_graph.smoothers.beam_faults import FaultSearch, FaultWatch
-from ssm_graph.smoothers.noise import (
+from ssm_graph.smoothers.track import calibration_of, current_of, undetermined
+from ssm_graph.smoothers.verdict import (
     MAX_ADAPTATIONS,
     adaptation,
+    contradictions,
     noise_found,
     noise_notes,
     with_sigmas,
 )
-from ssm_graph.smoothers.variables import calibration_of, current_of, undetermined
-from ssm_graph.smoothers.verdict import contradictions
 
 __all__ = ["OnIteration", "Similarity", "SmootherConfig", "SsmSmoother"]
 
@@ -164,10 +164,8 @@ class Weights(NamedTuple):
 
     def may_end(self, last: Pass) -> bool:
         """Return whether the weights that the pass led to may be those of the answer."""
-        has_aids = len(self.aids) > 0
-        return self.of_beams.may_end(last.weights) and (
-            not has_aids or self.of_aids.may_end(last.aid_weights)
-        )
+        of_aids = len(self.aids) == 0 or self.of_aids.may_end(last.aid_weights)
+        return of_aids and self.of_beams.may_end(last.weights)
 
 
 class Solved(NamedTuple):
@@ -196,13 +194,13 @@ class SsmSmoother:
     def __init__(self, config: SmootherConfig | None = None) -> None:
         self.config = config or SmootherConfig()
 
-    def solve(
+    def solve_steps(
         self,
         problem: Problem,
         *,
         first: FirstValues | None = None,
         on_iteration: OnIteration | None = None,
-    ) -> Estimate:
+    ) -> Steps[Estimate]:
         """Return the smoothed trajectory with the weight of every beam.
 
         An interrupt from the keyboard ends the loop with what the last iteration found.
@@ -219,16 +217,6 @@ class SsmSmoother:
         SolverError
             If no finite solution was found.
         """
-        return finished(self.solve_steps(problem, first=first, on_iteration=on_iteration))
-
-    def solve_steps(
-        self,
-        problem: Problem,
-        *,
-        first: FirstValues | None = None,
-        on_iteration: OnIteration | None = None,
-    ) -> Steps[Estimate]:
-        """Make :meth:`solve` in steps."""
         begin, used = time.perf_counter(), np.ones(problem.beams.n_beams)
         iterations: tuple[Iteration, ...] = ()
         for adaptations in range(MAX_ADAPTATIONS + 1):
@@ -245,6 +233,8 @@ class SsmSmoother:
         estimate = self._estimate(solved, noise, wall_s=time.perf_counter() - begin)
         yield 0.015 * problem.n_keyframes
         return estimate
+
+    solve = at_once(solve_steps)
 
     def _solve_steps(
         self, problem: Problem, first: FirstValues | None, on_iteration: OnIteration | None
@@ -366,10 +356,7 @@ class SsmSmoother:
         )
         doubts = contradictions(linearizer, last.states, last.beam_rows, last.weights)
         judged = linearizer.weighted.judged(
-            last.states,
-            linearizer.problem.keyframe_s,
-            last.aid_mahalanobis_sq,
-            last.aid_weights,
+            last.states, linearizer.problem.keyframe_s, last.aid_mahalanobis_sq, last.aid_weights
         )
         doubts += doubts_of_aids(judged)
         doubts += ambiguous_beacons(

@@ -38,11 +38,11 @@ from ssm_graph.filters.geodetic.mechanisation import (
 from ssm_graph.filters.navigation.named import filter_geodetic
 from ssm_graph.filters.side_by_side import side_by_side
 from ssm_graph.imu.preintegration import INTEGRATION_DENSITY, imu_params
+from ssm_graph.mission.answer import trajectory_from_states
 from ssm_graph.mission.estimate import Status
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.mission.start import moments
-from ssm_graph.mission.trajectory import trajectory_from_states
 from ssm_graph.simulation import (
     GnssSettings,
     Grade,

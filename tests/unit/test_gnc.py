@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from factors.m_estimators import HuberKernel, TruncatedKernel
+from factors.kernels import HuberKernel, TruncatedKernel
 from factors.similarity import WEIGHT_FLOOR, GaussianKernel, LogKernel
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.engine.reweighting import (

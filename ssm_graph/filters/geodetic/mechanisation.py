@@ -28,12 +28,7 @@ import numpy as np
 
 from factors import so3
 from factors.so3 import cross, skew
-from ssm_graph.base.earth import (
-    EARTH_RATE,
-    SEMI_MAJOR_AXIS,
-    normal_gravity,
-    radii_of_curvature,
-)
+from ssm_graph.base.earth import EARTH_RATE, SEMI_MAJOR_AXIS, normal_gravity, radii_of_curvature
 from ssm_graph.base.frames import R_lb_from_roll_pitch_heading, phi_D_roll_pitch_heading
 from ssm_graph.base.frozen import Array
 from ssm_graph.imu.preintegration import INTEGRATION_DENSITY

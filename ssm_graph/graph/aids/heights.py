@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factors.so3 import cross
 from ssm_graph.base.earth import LocalFrame
@@ -55,30 +54,3 @@ def height_on_the_way(
         + rise * s**2 * (3.0 - 2.0 * s)
         + span_s * s * (1.0 - s) * (begin.climb * (1.0 - s) - end.climb * s)
     )
-
-
-def mean_rises(
-    track: HeightTrack, keyframe_s: Array, *, reading_keyframe: NDArray[np.intp], reading_s: Array
-) -> Array:
-    """Return how much higher the sensor is at each keyframe (K,) than at its readings, m, mean.
-
-    Zero where there are none, and at the first keyframe: what came before it is not known here.
-
-    Parameters
-    ----------
-    track : of the sensor at K keyframes.
-    keyframe_s : (K,) s.
-    reading_keyframe : (M,) the first keyframe at or after each reading.
-    reading_s : (M,) s.
-    """
-    between = reading_keyframe > 0
-    end, time_s = reading_keyframe[between], reading_s[between]
-    end_track = HeightTrack(*(column[end] for column in track))
-    on_the_way = height_on_the_way(
-        HeightTrack(*(column[end - 1] for column in track)),
-        end_track,
-        elapsed_s=time_s - keyframe_s[end - 1],
-        span_s=keyframe_s[end] - keyframe_s[end - 1],
-    )
-    total = np.bincount(end, weights=end_track.height - on_the_way, minlength=len(keyframe_s))
-    return np.asarray(total / np.maximum(np.bincount(end, minlength=len(keyframe_s)), 1))

@@ -7,8 +7,8 @@ import numpy as np
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.live.estimator.tail import Newest
 from ssm_graph.live.estimator.watch import Watch, verdict
+from ssm_graph.mission.answer import trajectory_at
 from ssm_graph.mission.navigation import Navigation
-from ssm_graph.mission.trajectory import trajectory_at
 
 
 def answer(

@@ -10,8 +10,12 @@ from ssm_graph.graph.aids import AIDS
 from ssm_graph.graph.aids.aid import Keyframes
 from ssm_graph.live.estimator.buffers import Logs
 from ssm_graph.live.estimator.keyframes import aids_at
-from ssm_graph.mission.calibration import calibration_extras, taken_as_exact, windowed
-from ssm_graph.mission.current import current_extras
+from ssm_graph.mission.calibration import (
+    calibration_extras,
+    current_extras,
+    taken_as_exact,
+    windowed,
+)
 from ssm_graph.mission.problem import Beams
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.imu import ImuLog

@@ -9,10 +9,9 @@ import numpy as np
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.engine.extras import Extras
 from ssm_graph.graph.measurements import aid_table
+from ssm_graph.mission.answer import trajectory_at
 from ssm_graph.mission.estimate import AidTable, BeamTable, CurrentTrack, Trajectory
-from ssm_graph.mission.trajectory import trajectory_at
-from ssm_graph.smoothers.stretch import Stretch
-from ssm_graph.smoothers.variables import current_along
+from ssm_graph.smoothers.track import Stretch, current_along
 
 
 class Delayed(NamedTuple):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ssm_graph.mission.estimate import Found
-from ssm_graph.smoothers.variables import calibration_of_last, current_along
+from ssm_graph.smoothers.track import calibration_of_last, current_along
 from ssm_graph.smoothers.window import Window
 
 

@@ -40,9 +40,8 @@ from ssm_graph.mission.problem import ProblemConfig
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.sensors.messages import Message
-from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
 from ssm_graph.smoothers.keyframe import Keyframe
-from ssm_graph.smoothers.window import Window
+from ssm_graph.smoothers.window import FixedLagConfig, Window
 
 ONLINE: Final = FixedLagConfig(
     max_iterations=3,

@@ -24,8 +24,8 @@ from ssm_graph.mission.start.alignment import SAFE_HEADING_SIGMA
 from ssm_graph.mission.start.moments import initial_moments
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.smoothers.fixed_lag import run_fixed_lag_steps
-from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
 from ssm_graph.smoothers.mission import smooth_steps
+from ssm_graph.smoothers.window import FixedLagConfig
 
 SETTLE_S: Final = 1.0
 """So much inertial data is waited for, since the first samples may come late as well."""

@@ -18,7 +18,7 @@ from ssm_graph.live.estimator.course import Step
 from ssm_graph.live.estimator.reserve import Reserve
 from ssm_graph.live.estimator.watch import Contradicted, Watch
 from ssm_graph.smoothers.keyframe import Sensors
-from ssm_graph.smoothers.stretch import Stretch, pack_judged, unpack_judged
+from ssm_graph.smoothers.track import Stretch, pack_judged, unpack_judged
 
 
 def pack_buffers(buffers: Buffers) -> dict[str, Array]:
