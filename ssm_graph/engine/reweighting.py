@@ -39,7 +39,7 @@ BINARY = 1e-4
 """Weights this close to 0 or 1 are taken for it; GTSAM's."""
 
 
-class Mixing(NamedTuple):
+class Anderson(NamedTuple):
     """Anderson acceleration of depth one for the fixed point of the weights [1]_.
 
     Plain reweighting closes in by a constant factor a pass; two passes tell the factor, and the
@@ -58,7 +58,7 @@ class Mixing(NamedTuple):
     settled: Array
 
     @classmethod
-    def after(cls, last: Mixing | None, used: Array, settled: Array) -> Mixing:
+    def after(cls, last: Anderson | None, used: Array, settled: Array) -> Anderson:
         """Go on from a pass with weights ``used`` that led to ``settled``, and from the last."""
         change = settled - used
         turn = np.zeros(0) if last is None else change - last.change
@@ -106,7 +106,7 @@ class WarmSchedule(Schedule):
 
     wanted: Kernel
     kernel: Kernel
-    mixing: Mixing | None = None
+    anderson: Anderson | None = None
 
     def first_weights(self, gated: Array) -> Array:
         """Return the weights of the forward pass."""
@@ -123,9 +123,11 @@ class WarmSchedule(Schedule):
         """Return mixed weights near the end, those of the kernel before."""
         if update_sigmas >= NEAR_SIGMAS:
             return self, settled
-        mixing = Mixing.after(self.mixing, used, settled)
+        anderson = Anderson.after(self.anderson, used, settled)
         is_warm = self.kernel != self.wanted
-        return WarmSchedule(self.wanted, self.wanted, None if is_warm else mixing), mixing.weights
+        return WarmSchedule(
+            self.wanted, self.wanted, None if is_warm else anderson
+        ), anderson.weights
 
     def may_end(self, settled: Array) -> bool:  # noqa: ARG002
         """Return whether the kernel in force is the one asked for."""

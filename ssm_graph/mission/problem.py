@@ -167,7 +167,7 @@ def build_problem_steps(
     chain = yield from preintegrate_steps(
         mission.imu, timeline.keyframe_s, frame=mission.frame, rate_hz=config.merge_rate_hz
     )
-    noise = mission.imu.noise
+    noise, depth = mission.imu.noise, mission.depth
     extras = extras_of(mission)
     keyframes = Keyframes(mission.frame, mission.imu, timeline.keyframe_s, begin_s)
     aids = (kind.of(mission.aids, keyframes) for kind in AIDS)
@@ -177,7 +177,7 @@ def build_problem_steps(
         keyframe_s=timeline.keyframe_s,
         chain=chain,
         beams=_beams(mission, timeline.ping, timeline.ping_keyframe, extras),
-        depths=_depths(mission, timeline),
+        depths=None if depth is None else Depths.of(depth, mission.imu, timeline.keyframe_s),
         fixes=_fixes(mission, timeline),
         imu_noise_bias_sigma=np.repeat([noise.accel_bias_sigma, noise.gyro_bias_sigma], 3),
         extras=extras,
@@ -265,11 +265,6 @@ def _gap_note(imu: ImuLog) -> tuple[str, ...]:
     )
 
 
-def _depths(mission: Mission, timeline: Timeline) -> Depths | None:
-    log = mission.depth
-    return None if log is None else Depths.of(log, mission.imu, timeline.keyframe_s)
-
-
 def _fixes(mission: Mission, timeline: Timeline) -> Fixes | None:
     log = mission.gnss
     if log is None:
@@ -313,7 +308,11 @@ def without_water_track(problem: Problem) -> Problem:
     if not beams.is_water.any():
         return problem
     kept = ~beams.is_water
-    n_pings = len(np.unique(beams.ping[beams.is_water]))
+    note = (
+        f"{len(np.unique(beams.ping[beams.is_water]))} pings off the water are left out: this "
+        "estimator has no current, and would take them for pings off the ground; ssm-graph smooth "
+        "uses them"
+    )
     rows = {
         name: getattr(beams, name)[kept]
         for name in ("keyframe", "beam", "speed", "sigma", "gyro_b", "beam_b", "ping", "is_water")
@@ -322,7 +321,7 @@ def without_water_track(problem: Problem) -> Problem:
         problem,
         beams=replace(beams, **rows),
         extras=problem.extras.without(CURRENTS),
-        notes=(*problem.notes, _note(n_pings)),
+        notes=(*problem.notes, note),
     )
 
 
@@ -333,10 +332,3 @@ def require_bottom_track(problem: Problem) -> None:
             "this estimator has no current: expected pings off the ground, got some off the water; "
             "leave them out by without_water_track"
         )
-
-
-def _note(n_pings: int) -> str:
-    return (
-        f"{n_pings} pings off the water are left out: this estimator has no current, and would "
-        "take them for pings off the ground; ssm-graph smooth uses them"
-    )

@@ -57,7 +57,6 @@ def contradictions(
             if name in misfits
         ),
         *_doubt_extras(linearizer.problem.extras, states),
-        *_doubt_current(linearizer.problem.extras, states),
     ]
     return [doubt for doubt in doubts if doubt]
 
@@ -90,37 +89,30 @@ def _doubt_sensor(name: str, misfit: Misfit, hint: str) -> str:
 
 
 def _doubt_extras(extras: Extras, states: States) -> list[str]:
-    """Look for a calibration that lies further off than its prior can mean."""
-    doubts = []
+    """Look for what lies further off than its prior can mean: calibrations, then the current."""
+    calibrations, currents = [], []
     for block in extras.blocks:
-        if block.name in CURRENTS:
+        is_current = block.name in CURRENTS
+        walks = states.walks if is_current else states.walks[:1]
+        value = extras.value(block.name, walks, states.constants, default=np.zeros(0))
+        whitened = np.atleast_2d(value / block.sigma)
+        chi_sq = np.sum(whitened**2, axis=-1)
+        worst = int(np.argmax(chi_sq))
+        if chi2.sf(float(chi_sq[worst]), df=len(block.sigma)) >= PRIOR_TAIL:
             continue
-        value = extras.value(block.name, states.walks[0], states.constants, default=np.zeros(0))
-        whitened = value / block.sigma
-        if chi2.sf(float(whitened @ whitened), df=len(whitened)) < PRIOR_TAIL:
-            doubts.append(
+        if is_current:
+            speed = np.linalg.norm(np.atleast_2d(value)[worst])
+            currents.append(
+                f"a current of {speed:.2f} m/s ({' and '.join(block.labels)}) with a sigma of "
+                f"{block.sigma[0]:g} m/s each: state a larger one in [current]; or are pings off "
+                "the ground marked as water_track"
+            )
+        else:
+            calibrations.append(
                 f"the calibration of {block.name} lies {np.max(np.abs(whitened)):.0f} of its prior "
                 "sigmas off: state it nearer, or a larger sigma; or another instrument is wrong"
             )
-    return doubts
-
-
-def _doubt_current(extras: Extras, states: States) -> list[str]:
-    """Look for a current that is larger than what is known beforehand can mean."""
-    doubts = []
-    for block in extras.blocks:
-        if block.name not in CURRENTS:
-            continue
-        value = extras.value(block.name, states.walks, states.constants, default=np.zeros(0))
-        chi_sq = np.sum((value / block.sigma) ** 2, axis=-1)
-        worst = int(np.argmax(chi_sq))
-        if chi2.sf(float(chi_sq[worst]), df=len(block.sigma)) < PRIOR_TAIL:
-            doubts.append(
-                f"a current of {np.linalg.norm(value[worst]):.2f} m/s "
-                f"({' and '.join(block.labels)}) with a sigma of {block.sigma[0]:g} m/s each: "
-                "state a larger one in [current]; or are pings off the ground marked as water_track"
-            )
-    return doubts
+    return calibrations + currents
 
 
 FEWEST = 30.0

@@ -17,7 +17,7 @@ from ssm_graph.base.stepwise import Steps, at_once
 from ssm_graph.base.times import MIN_SPACING_S
 from ssm_graph.engine.error_state import InitialMoments, Linearised
 from ssm_graph.engine.marginal_prior import moved_chart
-from ssm_graph.engine.reweighting import Mixing
+from ssm_graph.engine.reweighting import Anderson
 from ssm_graph.engine.states import States
 from ssm_graph.graph.first_weights import met_weights, updated_trust
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors
@@ -271,7 +271,7 @@ class Window:
         """Solve and reweigh; what has moved is linearised anew at each pass."""
         config, n_keyframes = self.config, len(self.keyframes)
         tolerance = max(config.tolerance, ROUNDING) if n_keyframes > 1 else config.tolerance
-        mixing: Mixing | None = None
+        anderson: Anderson | None = None
         for number in range(1, config.max_iterations + 1):
             update = self._solve()
             self._relinearise()
@@ -284,8 +284,8 @@ class Window:
                 # A single keyframe's weights are those of the filter, pass by pass.
                 if n_keyframes > 1:
                     used = np.concatenate([self._weights, self._graph.aids.weights])
-                    mixing = Mixing.after(mixing, used, settled)
-                    settled = mixing.weights
+                    anderson = Anderson.after(anderson, used, settled)
+                    settled = anderson.weights
                 self._renew(settled)
         return number
 
