@@ -106,7 +106,7 @@ class WarmSchedule(Schedule):
 
     wanted: Kernel
     kernel: Kernel
-    anderson: Anderson | None = None
+    last: Anderson | None = None
 
     def first_weights(self, gated: Array) -> Array:
         """Return the weights of the forward pass."""
@@ -123,11 +123,9 @@ class WarmSchedule(Schedule):
         """Return mixed weights near the end, those of the kernel before."""
         if update_sigmas >= NEAR_SIGMAS:
             return self, settled
-        anderson = Anderson.after(self.anderson, used, settled)
+        step = Anderson.after(self.last, used, settled)
         is_warm = self.kernel != self.wanted
-        return WarmSchedule(
-            self.wanted, self.wanted, None if is_warm else anderson
-        ), anderson.weights
+        return WarmSchedule(self.wanted, self.wanted, None if is_warm else step), step.weights
 
     def may_end(self, settled: Array) -> bool:  # noqa: ARG002
         """Return whether the kernel in force is the one asked for."""

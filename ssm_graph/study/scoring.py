@@ -100,11 +100,8 @@ def score(labels: Row, trial: Trial, outcome: Outcome) -> tuple[Row, Array]:
 def _score(labels: Row, trial: Trial, outcome: Estimate) -> tuple[Row, Array]:
     metrics = _metrics(trial, outcome)
     numbers = dict.fromkeys(NUMBER_COLUMNS, math.nan)
-    numbers |= (
-        {"path_length_m": path_length_m(outcome.trajectory)}
-        if metrics is None
-        else _errors(metrics)
-    )
+    numbers["path_length_m"] = path_length_m(outcome.trajectory)
+    numbers |= {} if metrics is None else _errors(metrics)
     numbers |= _weights(trial, outcome)
     numbers |= {"iterations": outcome.n_iterations, "wall_s": outcome.wall_s}
     is_known = math.isfinite(numbers["horizontal_rms_m"]) or trial.simulated is None
