@@ -85,7 +85,8 @@ def add_parser(commands: Any, *, epilog: str) -> None:
         help="TOML file of the vehicle, or a mission folder of it; with --replay that mission's",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="RUN", help="run folder")
-    add_estimator_options(parser)
+    number_option(parser, "--lag", "SECONDS", "states so old are settled", ONLINE.lag_s)
+    add_kernel_options(parser, KERNELS)
     add_connections(parser)
     add_rates(parser)
     parser.set_defaults(run=run)
@@ -103,7 +104,8 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     config = RunnerConfig(
         checkpoint_every_s=arguments.checkpoint_every, duration_s=arguments.duration
     )
-    lag = _lag_config(arguments)
+    kernel = kernel_of(arguments, KERNELS)
+    lag = replace(ONLINE, lag_s=arguments.lag, kernel=kernel, similarity=kernel.published_with)
     _check_sources(arguments, inputs)
     mission = None if arguments.replay is None else read_mission(arguments.replay)
     vehicle = _vehicle(arguments.vehicle, mission)
@@ -158,11 +160,6 @@ def _vehicle(path: Path | None, mission: Mission | None) -> Vehicle:
     if mission is None:
         raise ConfigError("VEHICLE: expected its TOML file; it is left out with --replay only")
     return vehicle_of(mission)
-
-
-def _lag_config(arguments: argparse.Namespace) -> FixedLagConfig:
-    kernel = kernel_of(arguments, KERNELS)
-    return replace(ONLINE, lag_s=arguments.lag, kernel=kernel, similarity=kernel.published_with)
 
 
 def _settings(config: FixedLagConfig) -> dict[str, Any]:
@@ -281,12 +278,6 @@ def add_connections(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--nmea", action="append", metavar="ADDRESS", help="answers as GGA, VTG, HDT; repeatable"
     )
-
-
-def add_estimator_options(parser: argparse.ArgumentParser) -> None:
-    """Add lag and kernel."""
-    number_option(parser, "--lag", "SECONDS", "states so old are settled", ONLINE.lag_s)
-    add_kernel_options(parser, KERNELS)
 
 
 def add_rates(parser: argparse.ArgumentParser) -> None:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factors.dvl_beam import beam_residual
 from factors.inertial import MovingState
@@ -192,7 +191,9 @@ def recursive_estimate(
     status, reason = _settled(n_iterations, max_iterations)
     error = _beam_errors(problem, states) if beams.error is None else beams.error
     every = [*doubts_of_beams(problem, states.v_n, error, beams.weight), *doubts]
-    lost = np.flatnonzero(~_is_finite(states.R_nb, states.p_n, states.v_n, covariance))
+    known = (states.R_nb, states.p_n, states.v_n, covariance)
+    finite = [np.isfinite(x).reshape(len(x), -1).all(axis=1) for x in known]
+    lost = np.flatnonzero(~np.all(finite, axis=0))
     if len(lost):
         begin_s = problem.keyframe_s[lost[0]]
         status, reason = Status.DIVERGED, f"{Status.DIVERGED.value} at {begin_s:.1f} s"
@@ -247,12 +248,6 @@ def _beam_errors(problem: Problem, states: MovingState) -> Array:
         lever_arm_b=beams.lever_arm_b,
         omega_ie_n=problem.frame.omega_ie_n,
     ).error
-
-
-def _is_finite(*arrays: Array) -> NDArray[np.bool_]:
-    """Return (K,) whether all that is known of a keyframe is finite."""
-    finite = [np.isfinite(a).reshape(len(a), -1).all(axis=1) for a in arrays]
-    return np.asarray(np.all(finite, axis=0))
 
 
 def _settled(n_iterations: Array, limit: int | None) -> tuple[Status, str]:

@@ -121,7 +121,8 @@ def _metrics(trial: Trial, estimate: Estimate) -> Metrics | None:
     None without a common time with a reference: nothing may be finite.
     """
     trajectory = since_first_ping(estimate.trajectory)
-    reference = trial.reference_at(trajectory.time_s)
+    told, truth = trial.simulated, trial.mission.reference
+    reference = truth if told is None else told.truth_at(trajectory.time_s)
     if reference is None:
         return None
     try:

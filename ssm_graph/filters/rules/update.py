@@ -65,10 +65,6 @@ class Iterate:
         c = J.shape[-1]
         return np.concatenate([J @ columns[:, :c], columns[:, c:]], axis=1)
 
-    def both_to_local(self, covariance: Array) -> Array:
-        """Return a covariance (R, n, n) of ``xi`` as that of the local error."""
-        return self.to_local(np.swapaxes(self.to_local(covariance), 1, 2))
-
 
 class MeasurementModel(Protocol):
     """Measurements of one step of B runs side by side, about their predictions."""
@@ -301,7 +297,7 @@ class Result:
         update = self._update
         end = self._model.at(update.xi)
         return update._replace(
-            covariance=end.both_to_local(update.covariance),
+            covariance=end.to_local(end.to_local(update.covariance).mT),
             innovation=end.innovation,
             weights=np.where(self._model.present, update.weights, 1.0),
         )
