@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.base.frames import R_lb_from_roll_pitch_heading, phi_D_roll_pitch_heading
 from ssm_graph.base.frozen import Array, ReadOnlyArrays
 from ssm_graph.base.stepwise import Steps, at_once
 from ssm_graph.base.times import MIN_SPACING_S, Indices, is_inside, nearest
-from ssm_graph.engine.error_state import InitialMoments
+from ssm_graph.engine.error_state import POSITION, ROTATION, STATE_DIM, VELOCITY, InitialMoments
 from ssm_graph.engine.extras import Extras
 from ssm_graph.graph.aids import AIDS
 from ssm_graph.graph.aids.aid import Aid, Keyframes, Table
@@ -30,7 +31,6 @@ from ssm_graph.mission.calibration import (
     needs_motion,
 )
 from ssm_graph.mission.mission import InitialState, Mission
-from ssm_graph.mission.start.moments import initial_moments
 from ssm_graph.mission.timeline import Timeline, build_timeline
 from ssm_graph.mission.usable import require_usable
 from ssm_graph.sensors.dvl import DvlMount
@@ -332,3 +332,25 @@ def require_bottom_track(problem: Problem) -> None:
             "this estimator has no current: expected pings off the ground, got some off the water; "
             "leave them out by without_water_track"
         )
+
+
+def initial_moments(start: InitialState, frame: LocalFrame, *, bias_sigma: Array) -> InitialMoments:
+    """Turn an initial state in geodetic terms into the first keyframe's mean and covariance.
+
+    Parameters
+    ----------
+    start : initial state with sigmas along east, north, up and of roll, pitch, heading.
+    frame : navigation frame.
+    bias_sigma : (6,) turn-on bias sigmas, accelerometer then gyro.
+    """
+    p_n = frame.p_n_from_geodetic(start.lat, start.lon, start.height)
+    R_nl = frame.R_nl_at(p_n)
+    R_lb = R_lb_from_roll_pitch_heading(start.roll, start.pitch, start.heading)
+    R_nb = R_nl @ R_lb
+    J = phi_D_roll_pitch_heading(start.roll, start.pitch)
+    covariance = np.zeros((STATE_DIM, STATE_DIM))
+    covariance[ROTATION, ROTATION] = J @ np.diag(start.attitude_sigma**2) @ J.T
+    covariance[POSITION, POSITION] = R_lb.T @ np.diag(start.position_sigma_enu**2) @ R_lb
+    covariance[VELOCITY, VELOCITY] = R_nl @ np.diag(start.velocity_sigma_enu**2) @ R_nl.T
+    covariance[9:, 9:] = np.diag(bias_sigma**2)
+    return InitialMoments(R_nb, p_n, R_nl @ start.velocity_enu, np.zeros(6), covariance)

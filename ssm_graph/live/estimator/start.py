@@ -19,9 +19,8 @@ from ssm_graph.mission.calibration import windowed
 from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.mission import InitialState, Mission
 from ssm_graph.mission.navigation import Severity
-from ssm_graph.mission.problem import ProblemConfig, build_problem_steps
+from ssm_graph.mission.problem import ProblemConfig, build_problem_steps, initial_moments
 from ssm_graph.mission.start.alignment import SAFE_HEADING_SIGMA
-from ssm_graph.mission.start.moments import initial_moments
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.smoothers.fixed_lag import run_fixed_lag_steps
 from ssm_graph.smoothers.mission import smooth_steps
