@@ -218,3 +218,22 @@ KERNELS: Final[Mapping[str, KernelChoice]] = {
     "geman-mcclure": KernelChoice(GemanMcClureKernel, "width"),
 }
 """Names as on the command line."""
+
+
+def parse_kernel(text: str) -> Kernel:
+    """Return the kernel named, for example, ``log``, ``log:7`` or ``huber:1.5``.
+
+    Raises
+    ------
+    ValueError
+        The name is not known, or the number behind the colon cannot be used.
+    """
+    name, colon, number = text.partition(":")
+    if name not in KERNELS:
+        raise ValueError(f"there is no kernel {name!r}; known: {', '.join(KERNELS)}")
+    choice = KERNELS[name]
+    try:
+        return choice.kernel(float(number) if colon else None)
+    except ValueError as error:
+        wanted = f"{choice.parameter} after the colon" if choice.parameter else "the name alone"
+        raise ValueError(f"kernel {text!r}: expected {wanted} ({error}); try log:5") from error

@@ -23,6 +23,7 @@ from factors.kernels import (
     HuberKernel,
     MEstimator,
     TruncatedKernel,
+    parse_kernel,
 )
 from factors.similarity import WEIGHT_FLOOR, GaussianKernel, Kernel, LogKernel, Similarity
 from ssm_graph.base.errors import ConfigError
@@ -199,19 +200,28 @@ def test_kernels_say_what_they_are() -> None:
 def test_every_kernel_has_a_name() -> None:
     """Its name begins its text, and its default is that of the class."""
     for name, choice in KERNELS.items():
-        kernel = choice.kernel()
+        kernel = parse_kernel(name)
         assert kernel == choice.make()
-        assert str(kernel).split("(")[0] == name == kernel.name
+        assert str(kernel).split("(")[0] == name
         if choice.default is not None:
-            assert choice.kernel(choice.default) == kernel
-    assert KERNELS["log"].kernel(7.0) == LogKernel(dof=7.0)
-    assert KERNELS["dcs"].kernel(2.0) == DcsKernel(phi=2.0)
-    for name, value, message in (
-        ("huber", -1.0, "width: expected a number above zero"),
-        ("gaussian", 3.0, "expected no parameter, got 3"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            KERNELS[name].kernel(value)
+            assert parse_kernel(f"{name}:{choice.default!r}") == kernel
+    assert parse_kernel("log:7") == LogKernel(dof=7.0)
+    assert parse_kernel("dcs:2") == DcsKernel(phi=2.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("lgo", "there is no kernel 'lgo'; known: log, sqrt"),
+        ("log:", "expected dof after the colon"),
+        ("huber:-1", "width: expected a number above zero"),
+        ("gaussian:3", "expected the name alone"),
+    ],
+)
+def test_bad_names_are_refused(text: str, message: str) -> None:
+    """With what was expected."""
+    with pytest.raises(ValueError, match=message):
+        parse_kernel(text)
 
 
 def test_command_line_refuses_what_a_kernel_does_not_have() -> None:
