@@ -260,6 +260,8 @@ def _aids(
     of_depth, of_gnss, of_drift = (None,) * 3 if config.perfect_sensors else rngs
     depth, gnss, path = config.depth, config.gnss, config.trajectory
     return (
-        depth and depth_log(path, depth, end_s=end_s, rng=of_depth),
-        gnss and gnss_log(path, gnss, end_s=end_s, rng=of_gnss, drift_rng=of_drift),
+        None if depth is None else depth_log(path, depth, end_s=end_s, rng=of_depth),
+        None
+        if gnss is None
+        else gnss_log(path, gnss, end_s=end_s, rng=of_gnss, drift_rng=of_drift),
     )
