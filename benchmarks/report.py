@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ssm_graph.evaluation import Interval, mean_with_interval, paired_ratio
-from ssm_graph.study.code import code_version
+from ssm_graph.study.jobs import code_version
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"

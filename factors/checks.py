@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from factors.so3 import Array
 
 
 def checked_array(factor: str, name: str, value: Array, shape: tuple[int, ...]) -> Array:

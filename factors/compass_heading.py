@@ -6,11 +6,9 @@ from typing import NamedTuple
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from factors.checks import check_numbers, checked_array
-
-Array = NDArray[np.float64]
+from factors.so3 import Array
 
 STEEPEST = 1e-2
 """Cosine of a pitch at which a heading has no meaning any more; the Jacobian stays finite."""

@@ -5,11 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from factors.so3 import cross, times
-
-Array = NDArray[np.float64]
+from factors.so3 import Array, cross, times
 
 
 class HeightResidual(NamedTuple):

@@ -6,12 +6,9 @@ from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from factors.checks import check_numbers, checked_array
-from factors.so3 import cross, times
-
-Array = NDArray[np.float64]
+from factors.so3 import Array, cross, times
 
 
 class BeamResidual(NamedTuple):

@@ -12,13 +12,10 @@ from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from factors import so3
 from factors.dvl_beam import beam_error
-from factors.so3 import cross, times
-
-Array = NDArray[np.float64]
+from factors.so3 import Array, cross, times
 
 
 class Motion(NamedTuple):
@@ -167,7 +164,7 @@ def calibrated_beam_residual(
     tau = np.asarray(tau)[..., None]
     R_then = R_nb @ R_back
     v_then = v_n - times(R_nb, gain) - tau * g_n
-    R_then_T = _T(R_then)
+    R_then_T = R_then.mT
     omega_ib = motion.gyro_b - bias[..., 3:]
     omega_ie_b = times(R_then_T, omega_ie_n)
     v_b, omega_eb = times(R_then_T, v_then), omega_ib - omega_ie_b
@@ -191,7 +188,7 @@ def calibrated_beam_residual(
         error_D_velocity_n=gain_3 * times(R_nb, D_v_b),
         error_D_accel_bias=gain_3 * tau * D_v_b,
         error_D_gyro_bias=gain_3 * (tau * times(J_back, D_phi) - arm),
-        error_D_mounting=gain_3 * times(_T(turn_D_mounting), beam_x_v + beam_x_swing),
+        error_D_mounting=gain_3 * times(turn_D_mounting.mT, beam_x_v + beam_x_swing),
         error_D_scale=predicted,
         error_D_lever_arm_b=gain_3 * beam_x_omega,
         error_D_time_offset=gain_1 * D_late,
@@ -293,7 +290,3 @@ def _blocks(residual: CalibratedResidual) -> list[Array]:
     pose = np.hstack([residual.error_D_rotation, np.zeros(3)])
     blocks = [pose, residual.error_D_velocity_n, biases, *residual[5:]]
     return [np.reshape(block, (1, -1)).copy() for block in blocks]
-
-
-def _T(matrix: Array) -> Array:
-    return np.swapaxes(matrix, -1, -2)

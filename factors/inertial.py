@@ -27,8 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import so3
-
-Array = NDArray[np.float64]
+from factors.so3 import Array
 
 _ROTATION, _POSITION, _VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
 _BIAS = slice(9, 15)
@@ -276,13 +275,7 @@ def whitened_rows(
 
 
 def _fill_rows(
-    rows: Array,
-    m: Intervals,
-    begin: MovingState,
-    end: MovingState,
-    *,
-    g_n: Array,
-    gradient: Array,
+    rows: Array, m: Intervals, begin: MovingState, end: MovingState, *, g_n: Array, gradient: Array
 ) -> None:
     increment = _corrected(m, begin.bias, derivative=True)
     predicted = _predicted(m, begin, increment, g_n)
@@ -350,11 +343,7 @@ def _between(end: MovingState, predicted: InertialState) -> tuple[Array, Array]:
 
 
 def _slopes(
-    m: Intervals,
-    begin: MovingState,
-    end: MovingState,
-    increment: _Increment,
-    gradient: Array,
+    m: Intervals, begin: MovingState, end: MovingState, increment: _Increment, gradient: Array
 ) -> _Slopes:
     """Return how the predicted end follows the begin; gravity there is that of ``end``."""
     n, R_nb, R = len(begin.p_n), begin.R_nb, increment.R

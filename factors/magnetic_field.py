@@ -6,12 +6,9 @@ from typing import NamedTuple
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from factors.checks import check_numbers, checked_array
-from factors.so3 import skew, times
-
-Array = NDArray[np.float64]
+from factors.so3 import Array, skew, times
 
 _ROWS, _COLUMNS = (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)
 """Where the six numbers of soft iron stand: xx, yy, zz, xy, xz, yz."""

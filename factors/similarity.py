@@ -8,14 +8,14 @@ Mahalanobis length with the posterior variance in it::
 
 Every similarity kernel has ``weight(dim) = 1``: a residual of expected size keeps its nominal
 noise.
-The classical M-estimators of :mod:`factors.m_estimators` are kernels as well, of another norm.
+The classical M-estimators of :mod:`factors.kernels` are kernels as well, of another norm.
 """
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import Enum
 from typing import ClassVar, final
 
@@ -45,15 +45,26 @@ class Similarity(Enum):
     PLAIN = "residual alone: the plain M-estimator"
 
 
+@dataclass(frozen=True)
 class Kernel(ABC):
     """A decreasing, convex function ``f`` of ``t`` and the weight ``-2 f'``, which never rises.
 
-    Where the weight is 1 is a matter of the family: at ``t = dim`` for the similarity kernels, at
-    ``t = 0`` for M-estimators.
+    Its fields are its parameters, numbers above zero. Where the weight is 1 is a matter of the
+    family: at ``t = dim`` for the similarity kernels, at ``t = 0`` for M-estimators.
     """
 
     published_with: ClassVar[Similarity] = Similarity.EXPECTED
     """The ``t`` that the kernel was published for; the other one may be asked for."""
+    name: ClassVar[str]
+    """As on the command line."""
+
+    def __post_init__(self) -> None:
+        for parameter in fields(self):
+            require_positive(parameter.name, getattr(self, parameter.name))
+
+    def __str__(self) -> str:
+        values = ", ".join(f"{p.name}={getattr(self, p.name):g}" for p in fields(self))
+        return f"{self.name}({values})" if values else self.name
 
     @abstractmethod
     def similarity(self, t: Array, *, dim: int = 1) -> Array:
@@ -89,6 +100,8 @@ def require_positive(name: str, value: float) -> None:
 class GaussianKernel(Kernel):
     """``f = -t/2``: least squares, every weight 1."""
 
+    name: ClassVar[str] = "gaussian"
+
     def similarity(self, t: Array, *, dim: int = 1) -> Array:  # noqa: ARG002
         """Return ``-t / 2``."""
         return -0.5 * t
@@ -96,20 +109,15 @@ class GaussianKernel(Kernel):
     def _weight(self, t: Array, dim: int | Array) -> Array:  # noqa: ARG002
         return np.ones_like(t)
 
-    def __str__(self) -> str:
-        return "gaussian"
-
 
 @final
 @dataclass(frozen=True)
 class LogKernel(Kernel):
     """``f = -(dof + dim)/2 ln(1 + t/dof)``: Student's t."""
 
+    name: ClassVar[str] = "log"
     dof: float = 5.0
     """Degrees of freedom; large is Gaussian."""
-
-    def __post_init__(self) -> None:
-        require_positive("dof", self.dof)
 
     def similarity(self, t: Array, *, dim: int = 1) -> Array:
         """Return ``f(t)``."""
@@ -118,20 +126,15 @@ class LogKernel(Kernel):
     def _weight(self, t: Array, dim: int | Array) -> Array:
         return np.asarray((self.dof + dim) / (self.dof + t))
 
-    def __str__(self) -> str:
-        return f"log(dof={self.dof:g})"
-
 
 @final
 @dataclass(frozen=True)
 class SqrtKernel(Kernel):
     """``f = -sqrt((dof + dim)(dof + t))``."""
 
+    name: ClassVar[str] = "sqrt"
     dof: float = 2.0
     """Degrees of freedom; large is Gaussian."""
-
-    def __post_init__(self) -> None:
-        require_positive("dof", self.dof)
 
     def similarity(self, t: Array, *, dim: int = 1) -> Array:
         """Return ``f(t)``."""
@@ -140,20 +143,15 @@ class SqrtKernel(Kernel):
     def _weight(self, t: Array, dim: int | Array) -> Array:
         return np.sqrt((self.dof + dim) / (self.dof + t))
 
-    def __str__(self) -> str:
-        return f"sqrt(dof={self.dof:g})"
-
 
 @final
 @dataclass(frozen=True)
 class ExpKernel(Kernel):
     """``f = width^2 exp((dim - t) / (2 width^2))``: correntropy."""
 
+    name: ClassVar[str] = "exp"
     width: float = 5.0
     """Kernel width in sigmas; large is Gaussian."""
-
-    def __post_init__(self) -> None:
-        require_positive("width", self.width)
 
     def similarity(self, t: Array, *, dim: int = 1) -> Array:
         """Return ``f(t)``."""
@@ -161,6 +159,3 @@ class ExpKernel(Kernel):
 
     def _weight(self, t: Array, dim: int | Array) -> Array:
         return np.asarray(np.exp((dim - t) / (2.0 * self.width**2)))
-
-    def __str__(self) -> str:
-        return f"exp(width={self.width:g})"

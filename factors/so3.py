@@ -181,20 +181,3 @@ class Jacobians(NamedTuple):
         straight = skew(k[..., :1] * vectors + k[..., 1:2] * once)
         bent = k[..., 1:2, None] * (S[..., None, :, :] @ skew(vectors))
         return np.asarray(along[..., None] * self.phi[..., None, None, :] - straight - bent)
-
-
-def right_jacobian_series(adjoint: Array, *, angle: float) -> Array:
-    """Return ``sum_n (-ad)^n / (n + 1)!`` (..., m, m): the right Jacobian of poses.
-
-    ``adjoint`` is the small adjoint of the tangent vector, ``angle`` the largest rotation in it:
-    powers grow by the rotation alone, so it tells how many terms rounding needs.
-    """
-    identity = np.eye(adjoint.shape[-1])
-    n_terms, term = 2, max(angle, 1e-12) / 6.0
-    while term > 1e-18 and n_terms < 60:
-        n_terms += 1
-        term *= angle / (n_terms + 1)
-    total = np.broadcast_to(identity, adjoint.shape)
-    for n in range(n_terms, 0, -1):
-        total = identity - adjoint @ total / (n + 1)
-    return np.asarray(total)

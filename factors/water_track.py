@@ -15,9 +15,7 @@ from numpy.typing import NDArray
 
 from factors.checks import checked_array
 from factors.dvl_beam import beam_blocks, beam_error, beam_residual, checked_beam
-from factors.so3 import times
-
-Array = NDArray[np.float64]
+from factors.so3 import Array, times
 
 IS_WATER = np.array(True)
 

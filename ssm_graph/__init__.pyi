@@ -1,13 +1,13 @@
 """The public names of this package and where each is at home; loaded when first asked for."""
 
 from factors.kernels import KERNELS as KERNELS
+from factors.kernels import CauchyKernel as CauchyKernel
+from factors.kernels import DcsKernel as DcsKernel
+from factors.kernels import GemanMcClureKernel as GemanMcClureKernel
+from factors.kernels import HuberKernel as HuberKernel
+from factors.kernels import MEstimator as MEstimator
+from factors.kernels import TruncatedKernel as TruncatedKernel
 from factors.kernels import parse_kernel as parse_kernel
-from factors.m_estimators import CauchyKernel as CauchyKernel
-from factors.m_estimators import DcsKernel as DcsKernel
-from factors.m_estimators import GemanMcClureKernel as GemanMcClureKernel
-from factors.m_estimators import HuberKernel as HuberKernel
-from factors.m_estimators import MEstimator as MEstimator
-from factors.m_estimators import TruncatedKernel as TruncatedKernel
 from factors.similarity import ExpKernel as ExpKernel
 from factors.similarity import GaussianKernel as GaussianKernel
 from factors.similarity import Kernel as Kernel

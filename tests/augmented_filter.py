@@ -29,20 +29,20 @@ from ssm_graph.engine.error_state import (
 )
 from ssm_graph.engine.extras import Extra
 from ssm_graph.engine.states import NavigationStates, States, local_D_deviation
-from ssm_graph.filters.navigation.process import Process
+from ssm_graph.filters.navigation.filter import Process
 from ssm_graph.filters.rules.ssm import SsmUpdate
 from ssm_graph.filters.rules.update import NOMINAL, Iterate, Runs
-from ssm_graph.graph.aids.depth import DEPTH_OFFSET
+from ssm_graph.graph.aids.depth import DEPTH_OFFSET, HeightTrack, height_on_the_way, height_track
 from ssm_graph.graph.aids.gnss import GNSS_DRIFT, GNSS_LEVER_ARM, GNSS_TIME_OFFSET
-from ssm_graph.graph.aids.heights import HeightTrack, height_on_the_way, height_track
 from ssm_graph.mission.calibration import (
+    CURRENT,
+    CURRENT_UP,
     DVL_BEAM_SCALE,
     DVL_DRIFT,
     DVL_MOUNTING,
     DVL_SCALE,
     windowed,
 )
-from ssm_graph.mission.current import CURRENT, CURRENT_UP
 from ssm_graph.mission.problem import Problem, start_of, with_white_noise
 
 

@@ -24,7 +24,7 @@ from ssm_graph.simulation import (
     Outliers,
     SimulatedMission,
 )
-from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
+from ssm_graph.smoothers.window import FixedLagConfig
 from tests.helpers import simulated
 
 SHORT = replace(ONLINE, lag_s=3.0)

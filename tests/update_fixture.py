@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.filters.rules.update import LinearModel, LinearSystem, Runs, Update, UpdateRule
+from ssm_graph.filters.rules.update import Runs, Update, UpdateRule
+from tests.linear_filter import LinearModel, LinearSystem
 
 N_STATES, N_ROWS, N_RUNS = 5, 4, 6
 EACH_ROW, ALL_ROWS = np.arange(N_ROWS), np.zeros(N_ROWS, dtype=np.intp)

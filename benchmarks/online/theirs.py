@@ -25,10 +25,10 @@ from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator.buffers import Buffers
 from ssm_graph.live.estimator.keyframes import KeyframeMaker
 from ssm_graph.live.estimator.start import sensors_of_vehicle
+from ssm_graph.mission.answer import trajectory_at
 from ssm_graph.mission.estimate import Trajectory
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.problem import NO_EXTRAS, ProblemConfig, build_problem, start_of
-from ssm_graph.mission.trajectory import trajectory_at
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors
 from ssm_graph.smoothers.window_aids import row_states
 

@@ -25,12 +25,10 @@ from ssm_graph.filters.rules.kalman import KalmanUpdate
 from ssm_graph.filters.rules.ssm import Floor, SsmUpdate, StopRule
 from ssm_graph.filters.rules.student import Scale, StudentUpdate
 from ssm_graph.filters.rules.update import (
-    LinearModel,
-    LinearSystem,
     Update,
     UpdateRule,
-    run_linear_filter,
 )
+from tests.linear_filter import LinearModel, LinearSystem, run_linear_filter
 
 Vectors = Mapping[str, Array]
 TOLERANCE = 1e-8

@@ -23,7 +23,7 @@ from benchmarks.soak.stream import AXES, CASES, HOUR_S, Soaked, longest_run, soa
 from ssm_graph.base.frozen import Array
 from ssm_graph.report.style import save
 from ssm_graph.simulation import Grade
-from ssm_graph.study.code import code_version
+from ssm_graph.study.jobs import code_version
 
 WANTED = 0.99
 """Share of the good time that the truth has to lie inside three sigmas, every axis for itself"""

@@ -14,8 +14,7 @@ from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
 from ssm_graph.graph.gtsam_graph import prior_graph
 from ssm_graph.mission.mission import Mission
-from ssm_graph.mission.problem import Beams, Problem
-from ssm_graph.mission.start.moments import initial_moments
+from ssm_graph.mission.problem import Beams, Problem, initial_moments
 from ssm_graph.sensors.imu import ImuNoise
 
 CAUCHY = gtsam.noiseModel.mEstimator.Cauchy.Create(2.3849)

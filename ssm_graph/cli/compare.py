@@ -9,7 +9,6 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Final
 
 from rich.console import Console
@@ -21,10 +20,9 @@ from ssm_graph.cli.options import add_command, method_lines, say, table_format_o
 from ssm_graph.evaluation.comparison import compare_methods
 from ssm_graph.io.mission_folder.folder import TableFormat
 from ssm_graph.report.comparison.tables import latex, markdown
-from ssm_graph.study.cluster import DaskCluster
 from ssm_graph.study.jobs import Execute
 from ssm_graph.study.methods import FAMILIES
-from ssm_graph.study.processes import JobProcesses
+from ssm_graph.study.processes import DaskCluster, JobProcesses
 from ssm_graph.study.runner import Progress, StudyResult, example_estimates, open_store, run_study
 from ssm_graph.study.scenario import Study, read_study, study_of_folders
 from ssm_graph.study.store import parquet_module, write_rows
@@ -217,12 +215,7 @@ class StudyDisplay:
         self._bar.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._bar.stop()
 
     def __call__(self, progress: Progress) -> None:

@@ -18,13 +18,7 @@ from factors.kernels import KERNELS
 from ssm_graph.base.errors import ConfigError, SolverError
 from ssm_graph.base.frames import BodyAxes
 from ssm_graph.base.frozen import Array
-from ssm_graph.cli.options import (
-    add_command,
-    add_kernel_options,
-    kernel_of,
-    number_option,
-    say,
-)
+from ssm_graph.cli.options import add_command, add_kernel_options, kernel_of, number_option, say
 from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle, vehicle_of
 from ssm_graph.io.raw_log.rows import messages_of
@@ -45,7 +39,7 @@ from ssm_graph.mission.navigation import Health
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.report.mission.summary import calibration_table
 from ssm_graph.report.terminal.status_page import StatusPage
-from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
+from ssm_graph.smoothers.window import FixedLagConfig
 
 DESCRIPTION: Final = """\
 Navigate live: messages of the instruments in, position, velocity and attitude with their sigmas
@@ -91,7 +85,8 @@ def add_parser(commands: Any, *, epilog: str) -> None:
         help="TOML file of the vehicle, or a mission folder of it; with --replay that mission's",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="RUN", help="run folder")
-    add_estimator_options(parser)
+    number_option(parser, "--lag", "SECONDS", "states so old are settled", ONLINE.lag_s)
+    add_kernel_options(parser, KERNELS)
     add_connections(parser)
     add_rates(parser)
     parser.set_defaults(run=run)
@@ -109,7 +104,8 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     config = RunnerConfig(
         checkpoint_every_s=arguments.checkpoint_every, duration_s=arguments.duration
     )
-    lag = _lag_config(arguments)
+    kernel = kernel_of(arguments, KERNELS)
+    lag = replace(ONLINE, lag_s=arguments.lag, kernel=kernel, similarity=kernel.published_with)
     _check_sources(arguments, inputs)
     mission = None if arguments.replay is None else read_mission(arguments.replay)
     vehicle = _vehicle(arguments.vehicle, mission)
@@ -164,11 +160,6 @@ def _vehicle(path: Path | None, mission: Mission | None) -> Vehicle:
     if mission is None:
         raise ConfigError("VEHICLE: expected its TOML file; it is left out with --replay only")
     return vehicle_of(mission)
-
-
-def _lag_config(arguments: argparse.Namespace) -> FixedLagConfig:
-    kernel = kernel_of(arguments, KERNELS)
-    return replace(ONLINE, lag_s=arguments.lag, kernel=kernel, similarity=kernel.published_with)
 
 
 def _settings(config: FixedLagConfig) -> dict[str, Any]:
@@ -287,12 +278,6 @@ def add_connections(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--nmea", action="append", metavar="ADDRESS", help="answers as GGA, VTG, HDT; repeatable"
     )
-
-
-def add_estimator_options(parser: argparse.ArgumentParser) -> None:
-    """Add lag and kernel."""
-    number_option(parser, "--lag", "SECONDS", "states so old are settled", ONLINE.lag_s)
-    add_kernel_options(parser, KERNELS)
 
 
 def add_rates(parser: argparse.ArgumentParser) -> None:

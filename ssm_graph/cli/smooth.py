@@ -7,8 +7,7 @@ from typing import Any
 
 from rich.console import Console
 
-from factors.kernels import KERNELS, KernelChoice
-from factors.m_estimators import TruncatedKernel
+from factors.kernels import KERNELS, KernelChoice, TruncatedKernel
 from factors.similarity import Similarity
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.cli.options import add_command, add_kernel_options, kernel_of

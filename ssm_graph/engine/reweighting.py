@@ -19,11 +19,11 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import final
+from typing import NamedTuple, final
 
 import numpy as np
 
-from factors.m_estimators import TruncatedKernel
+from factors.kernels import TruncatedKernel
 from factors.similarity import WEIGHT_FLOOR, GaussianKernel, Kernel
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
@@ -39,7 +39,7 @@ BINARY = 1e-4
 """Weights this close to 0 or 1 are taken for it; GTSAM's."""
 
 
-class Mixing:
+class Anderson(NamedTuple):
     """Anderson acceleration of depth one for the fixed point of the weights [1]_.
 
     Plain reweighting closes in by a constant factor a pass; two passes tell the factor, and the
@@ -51,43 +51,47 @@ class Mixing:
        Numerical Analysis 49, 2011.
     """
 
-    def __init__(self) -> None:
-        self._last: tuple[Array, Array] | None = None
+    weights: Array
+    """(M,) to try next"""
+    change: Array
+    """(M,) from the weights that were used to those they led to, ``settled``"""
+    settled: Array
 
-    def next_weights(self, used: Array, settled: Array) -> Array:
-        """Return the weights to try next, from those used and those they led to."""
+    @classmethod
+    def after(cls, last: Anderson | None, used: Array, settled: Array) -> Anderson:
+        """Go on from a pass with weights ``used`` that led to ``settled``, and from the last."""
         change = settled - used
-        last, self._last = self._last, (change, settled)
-        if last is None:
-            return settled
-        turn = change - last[0]
+        turn = np.zeros(0) if last is None else change - last.change
         length_sq = float(turn @ turn)
-        if length_sq < 1e-16:
-            return settled
-        mixed = settled - float(change @ turn) / length_sq * (settled - last[1])
-        return np.asarray(np.clip(mixed, WEIGHT_FLOOR, max(1.0, 2.0 * float(settled.max()))))
+        if last is None or length_sq < 1e-16:
+            return cls(settled, change, settled)
+        mixed = settled - float(change @ turn) / length_sq * (settled - last.settled)
+        weights = np.clip(mixed, WEIGHT_FLOOR, max(1.0, 2.0 * float(settled.max())))
+        return cls(weights, change, settled)
 
 
 class Schedule(ABC):
-    """The weights of one solution, from its first pass to its last."""
+    """What weighs the beams in one pass of a solution; each pass has its own."""
 
     kernel: Kernel
-    """In force in the pass at hand."""
+    """In force in the pass."""
 
     @abstractmethod
     def first_weights(self, gated: Array) -> Array:
         """Return the weights of the first pass; ``gated`` are those of the forward pass."""
 
     @abstractmethod
-    def next_weights(self, used: Array, settled: Array, *, t: Array, update_sigmas: float) -> Array:
-        """Return the weights of the next pass, whose kernel may be another.
+    def after(
+        self, used: Array, settled: Array, *, t: Array, update_sigmas: float
+    ) -> tuple[Schedule, Array]:
+        """Return the schedule and the weights of the next pass.
 
         Parameters
         ----------
-        used : (M,) weights of the last pass.
-        settled : (M,) weights that its kernel gives to its residuals.
+        used : (M,) weights of this pass.
+        settled : (M,) weights that the kernel gives to its residuals.
         t : (M,) squared Mahalanobis lengths behind ``settled``.
-        update_sigmas : largest update of the last pass, in posterior sigmas.
+        update_sigmas : largest update of the pass, in posterior sigmas.
         """
 
     @abstractmethod
@@ -96,37 +100,36 @@ class Schedule(ABC):
 
 
 @final
+@dataclass(frozen=True, slots=True)
 class WarmSchedule(Schedule):
     """A warm kernel until the updates are near, then the one asked for, with mixed weights."""
 
-    def __init__(self, wanted: Kernel, warm: Kernel) -> None:
-        self.kernel = warm
-        self._wanted = wanted
-        self._mixing = Mixing()
+    wanted: Kernel
+    kernel: Kernel
+    last: Anderson | None = None
 
     def first_weights(self, gated: Array) -> Array:
         """Return the weights of the forward pass."""
         return gated
 
-    def next_weights(
+    def after(
         self,
         used: Array,
         settled: Array,
         *,
         t: Array,  # noqa: ARG002
         update_sigmas: float,
-    ) -> Array:
+    ) -> tuple[Schedule, Array]:
         """Return mixed weights near the end, those of the kernel before."""
         if update_sigmas >= NEAR_SIGMAS:
-            return settled
-        weights = self._mixing.next_weights(used, settled)
-        if self.kernel != self._wanted:
-            self.kernel, self._mixing = self._wanted, Mixing()
-        return weights
+            return self, settled
+        step = Anderson.after(self.last, used, settled)
+        is_warm = self.kernel != self.wanted
+        return WarmSchedule(self.wanted, self.wanted, None if is_warm else step), step.weights
 
     def may_end(self, settled: Array) -> bool:  # noqa: ARG002
         """Return whether the kernel in force is the one asked for."""
-        return self.kernel == self._wanted
+        return self.kernel == self.wanted
 
 
 class GncStart(Enum):
@@ -162,45 +165,43 @@ def first_mu(largest_t: float, width: float) -> float:
 
 
 @final
+@dataclass(frozen=True, slots=True)
 class GncSchedule(Schedule):
     """A starting solution, then one for each surrogate of growing ``mu``."""
 
-    def __init__(self, wanted: TruncatedKernel, graduation: Graduation, warm: Kernel) -> None:
-        self._wanted = wanted
-        self._graduation = graduation
-        self._mu: float | None = None
-        self._passes = 0
-        self.kernel = GaussianKernel() if self._starts_from_ones else warm
+    wanted: TruncatedKernel
+    graduation: Graduation
+    kernel: Kernel
+    mu: float | None = None
+    """None for the starting solution."""
+    passes: int = 0
+    """Of the solution at this ``mu`` so far."""
 
-    @property
-    def _starts_from_ones(self) -> bool:
-        return self._graduation.start is GncStart.ONES
+    @classmethod
+    def begin(cls, wanted: TruncatedKernel, graduation: Graduation, warm: Kernel) -> GncSchedule:
+        """Return that of the first pass."""
+        is_from_ones = graduation.start is GncStart.ONES
+        return cls(wanted, graduation, GaussianKernel() if is_from_ones else warm)
 
     def first_weights(self, gated: Array) -> Array:
         """Return ones, or the weights of the forward pass."""
-        return np.ones_like(gated) if self._starts_from_ones else gated
+        return np.ones_like(gated) if self.graduation.start is GncStart.ONES else gated
 
-    def next_weights(
-        self,
-        used: Array,
-        settled: Array,
-        *,
-        t: Array,
-        update_sigmas: float,
-    ) -> Array:
+    def after(
+        self, used: Array, settled: Array, *, t: Array, update_sigmas: float
+    ) -> tuple[Schedule, Array]:
         """Return weights of the next surrogate once a solution is near, until then the same."""
-        self._passes += 1
-        if update_sigmas >= NEAR_SIGMAS and self._passes < MAX_PASSES:
-            return settled if self._mu is None else used
-        self._passes = 0
-        if self._mu is None:
-            self._mu = first_mu(float(np.max(t, initial=0.0)), self._wanted.width)
+        passes = self.passes + 1
+        if update_sigmas >= NEAR_SIGMAS and passes < MAX_PASSES:
+            return replace(self, passes=passes), settled if self.mu is None else used
+        if self.mu is None:
+            mu = first_mu(float(np.max(t, initial=0.0)), self.wanted.width)
         else:
-            self._mu *= self._graduation.mu_step
-        self.kernel = replace(self._wanted, mu=self._mu)
-        return self.kernel.weight(t)
+            mu = self.mu * self.graduation.mu_step
+        kernel = replace(self.wanted, mu=mu)
+        return replace(self, kernel=kernel, mu=mu, passes=0), kernel.weight(t)
 
     def may_end(self, settled: Array) -> bool:
         """Return whether every weight is 0 or 1."""
         is_binary = np.minimum(settled, np.abs(1.0 - settled)) <= BINARY
-        return self._mu is not None and bool(np.all(is_binary))
+        return self.mu is not None and bool(np.all(is_binary))

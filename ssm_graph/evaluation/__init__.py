@@ -10,8 +10,16 @@ from ssm_graph.evaluation.comparison import (
     MethodResult,
     compare_methods,
 )
-from ssm_graph.evaluation.errors import ErrorSeries, error_series, gap_limit_s, interpolate_within
-from ssm_graph.evaluation.metrics import Metrics, evaluate
+from ssm_graph.evaluation.errors import (
+    ErrorSeries,
+    Metrics,
+    error_series,
+    evaluate,
+    gap_limit_s,
+    interpolate_within,
+    reference_from_gnss,
+    withhold_gnss,
+)
 from ssm_graph.evaluation.statistics import (
     Interval,
     Paired,
@@ -23,7 +31,6 @@ from ssm_graph.evaluation.statistics import (
     paired_ratio,
     signed_rank,
 )
-from ssm_graph.evaluation.withheld import reference_from_gnss, withhold_gnss
 
 __all__ = [
     "FILTER_ORACLE",

@@ -1,21 +1,22 @@
-"""Errors of a trajectory against a reference, epoch by epoch, only where it really exists."""
+"""Errors of a trajectory against a reference, and the numbers by which it is judged."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
 from ssm_graph.base.earth import LocalFrame
-from ssm_graph.base.errors import DataError
-from ssm_graph.base.frames import wrap_to_pi
-from ssm_graph.base.frozen import Array, FrozenArrays, shaped
-from ssm_graph.mission.estimate import Trajectory
-from ssm_graph.mission.mission import Reference
+from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.base.frames import R_lb_from_roll_pitch_heading, wrap_to_pi
+from ssm_graph.base.frozen import Array, FrozenArrays, ShortRepr, shaped
+from ssm_graph.mission.estimate import Trajectory, path_length_m
+from ssm_graph.mission.mission import Mission, Reference
+from ssm_graph.sensors.gnss import GnssLog
 
 NO_REFERENCE: Final = 10.0
 """m; along an axis where its own sigma is larger a reference tells nothing, as the height of fixes
@@ -213,3 +214,162 @@ def _interpolate_column(time_s: Array, known_s: Array, samples: Array) -> Array:
             curve = PchipInterpolator(known_s[begin:end] - first, samples[begin:end])
             result[inside] = curve(np.clip(time_s[inside], first, last) - first)
     return result
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Metrics(ShortRepr):
+    """Summary of an :class:`ErrorSeries`; NaN where the reference lacks the quantity."""
+
+    n_epochs: int
+    """Keyframes that were compared."""
+    first_s: float
+    """Time of the first of them, s."""
+    last_s: float
+    """Time of the last of them, s."""
+    rmse_horizontal_m: float
+    """Root mean square of the length of the horizontal error."""
+    rmse_vertical_m: float
+    max_horizontal_m: float
+    end_error_m: float
+    """Horizontal error at the last compared epoch."""
+    path_length_m: float
+    """Horizontal path of the estimate from the first to the last compared epoch."""
+    drift_percent: float
+    """100 ``end_error_m`` / ``path_length_m``; NaN for a vehicle that did not move."""
+    rmse_velocity_m_per_s: float
+    """Root mean square of the length of the velocity error."""
+    rmse_attitude: tuple[float, float, float]
+    """Roll, pitch, heading, rad."""
+    nees_position: float
+    """Mean over epochs of the three-dimensional NEES, divided by 3: 1 is expected."""
+    inside_3_sigma: tuple[float, float, float]
+    """Share of epochs with the east, north, up error within three posterior sigmas; 0.997."""
+    errors: ErrorSeries = field(repr=False)
+    """The errors themselves, for figures and tests."""
+
+    def summary_fields(self) -> dict[str, Any]:
+        """Return all but the errors with the keys of ``summary.json``, angles in degrees."""
+        roll, pitch, heading = np.rad2deg(self.rmse_attitude).tolist()
+        return {
+            "rmse_horizontal_m": self.rmse_horizontal_m,
+            "rmse_vertical_m": self.rmse_vertical_m,
+            "max_horizontal_m": self.max_horizontal_m,
+            "end_error_m": self.end_error_m,
+            "path_length_m": self.path_length_m,
+            "drift_percent": self.drift_percent,
+            "rmse_velocity_m_per_s": self.rmse_velocity_m_per_s,
+            "rmse_roll_deg": roll,
+            "rmse_pitch_deg": pitch,
+            "rmse_heading_deg": heading,
+            "nees_position": self.nees_position,
+            "inside_3_sigma": dict(zip(("east", "north", "up"), self.inside_3_sigma, strict=True)),
+            "compared_epochs": self.n_epochs,
+            "compared_from_s": self.first_s,
+            "compared_to_s": self.last_s,
+        }
+
+
+def evaluate(trajectory: Trajectory, reference: Reference) -> Metrics:
+    """Compare an estimated trajectory with a reference.
+
+    Every keyframe within the reference counts once. The path is horizontal, as the error that
+    ``drift_percent`` relates to it, and the estimate's own, as a reference may be noisy or have
+    gaps; without a gap of the reference it is the distance travelled.
+
+    Raises
+    ------
+    DataError
+        The two have no time in common.
+    """
+    errors = error_series(trajectory, reference)
+    first_s, last_s = float(errors.time_s[0]), float(errors.time_s[-1])
+    length = path_length_m(trajectory, first_s=first_s, last_s=last_s)
+    end_error = float(errors.horizontal[-1])
+    return Metrics(
+        n_epochs=len(errors.time_s),
+        first_s=first_s,
+        last_s=last_s,
+        rmse_horizontal_m=_rms(errors.horizontal),
+        rmse_vertical_m=_rms(errors.position_enu[:, 2]),
+        max_horizontal_m=float(errors.horizontal.max()),
+        end_error_m=end_error,
+        path_length_m=length,
+        drift_percent=100.0 * end_error / length if length > 0.0 else np.nan,
+        rmse_velocity_m_per_s=_rms(np.linalg.norm(errors.velocity_enu, axis=1)),
+        rmse_attitude=_per_axis(np.sqrt([_mean(x**2) for x in errors.roll_pitch_heading.T])),
+        nees_position=_mean(errors.nees_position) / 3.0,
+        inside_3_sigma=_per_axis(np.array([_mean(x) for x in errors.inside_3_sigma.T])),
+        errors=errors,
+    )
+
+
+def _mean(values: Array) -> float:
+    """Return the mean of the finite values, NaN if there are none."""
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if len(finite) else np.nan
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(_mean(values**2)))
+
+
+def _per_axis(values: Array) -> tuple[float, float, float]:
+    first, second, third = (float(x) for x in values)
+    return first, second, third
+
+
+def reference_from_gnss(gnss: GnssLog, trajectory: Trajectory) -> Reference:
+    """Return positions of the body origin from fixes of the antenna.
+
+    The lever arm is turned with the estimate's own attitude, at the fix (``l`` local level)::
+
+        p_origin = p_antenna - R_lb lever_arm_b
+
+    An error of the heading moves that by no more than the lever arm's length times the error.
+    Fixes outside of the trajectory, or in its gaps, are left out; velocity and attitude are NaN.
+    Errors contain the noise of the fixes; their sigmas count beside those of the estimate.
+    """
+    angles = interpolate_within(
+        gnss.valid_s,
+        known_s=trajectory.time_s,
+        values=np.unwrap(trajectory.roll_pitch_heading, axis=0),
+    )
+    kept = np.isfinite(angles).all(axis=1)
+    lat, lon, height = gnss.lat[kept], gnss.lon[kept], gnss.height[kept]
+    if np.any(kept) and np.any(gnss.lever_arm_b != 0.0):
+        frame = LocalFrame(float(lat[0]), float(lon[0]), float(height[0]))
+        antenna_n = frame.p_n_from_geodetic(lat, lon, height)
+        lever_l = R_lb_from_roll_pitch_heading(*angles[kept].T) @ gnss.lever_arm_b
+        lever_n = np.einsum("nij,nj->ni", frame.R_nl_at(antenna_n), lever_l)
+        lat, lon, height = frame.geodetic_from_p_n(antenna_n - lever_n)
+    unknown = np.full((int(kept.sum()), 3), np.nan)
+    return Reference(
+        time_s=gnss.valid_s[kept],
+        lat=lat,
+        lon=lon,
+        height=height,
+        velocity_enu=unknown,
+        roll_pitch_heading=unknown,
+        position_sigma_enu=gnss.sigma_enu[kept],
+    )
+
+
+def withhold_gnss(mission: Mission, until_s: float) -> tuple[Mission, GnssLog]:
+    """Return the mission with fixes up to ``until_s`` after its begin alone, and the other fixes.
+
+    Raises
+    ------
+    ConfigError
+        The mission has no GNSS, or all of its fixes are on one side of that time.
+    """
+    gnss = mission.gnss
+    if gnss is None:
+        raise ConfigError("expected a mission with GNSS, got one without")
+    used = gnss.valid_s < mission.imu.start_s + until_s
+    if not used.any() or used.all():
+        first, last = gnss.valid_s[[0, -1]] - mission.imu.start_s
+        raise ConfigError(
+            f"expected a time between the first fix at {first:.1f} s and the last at "
+            f"{last:.1f} s, got {until_s:g} s"
+        )
+    return replace(mission, gnss=gnss.rows(used)), gnss.rows(~used)

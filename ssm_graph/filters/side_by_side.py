@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
-from ssm_graph.mission.bottom_track import require_bottom_track
-from ssm_graph.mission.problem import Problem
+from ssm_graph.mission.problem import Problem, require_bottom_track
 
 
 class BeamGrid(NamedTuple):

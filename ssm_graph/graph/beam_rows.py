@@ -29,6 +29,8 @@ from ssm_graph.engine.error_state import ACCEL_BIAS, GYRO_BIAS, ROTATION, STATE_
 from ssm_graph.engine.extras import Extras
 from ssm_graph.graph.aids.aid import RowStates
 from ssm_graph.mission.calibration import (
+    CURRENT,
+    CURRENT_UP,
     DVL_BEAM_SCALE,
     DVL_DRIFT,
     DVL_LEVER_ARM,
@@ -36,7 +38,6 @@ from ssm_graph.mission.calibration import (
     DVL_SCALE,
     DVL_TIME_OFFSET,
 )
-from ssm_graph.mission.current import CURRENT, CURRENT_UP
 from ssm_graph.mission.problem import Beams
 
 LEAST_SHARE = 0.5
@@ -53,13 +54,7 @@ class BeamRows(NamedTuple):
 
 
 def linearize_beams(
-    beams: Beams,
-    *,
-    rows: slice = np.s_[:],
-    R_nb: Array,
-    v_n: Array,
-    bias: Array,
-    omega_ie_n: Array,
+    beams: Beams, *, rows: slice = np.s_[:], R_nb: Array, v_n: Array, bias: Array, omega_ie_n: Array
 ) -> BeamRows:
     """Linearise the beams of ``rows`` at states given for each row, or one for all."""
     residual = beam_residual(
@@ -86,14 +81,7 @@ class WaterRows:
         self._is_water, self._extras, self._frame = beams.is_water, extras, frame
         self._has_current = CURRENT in extras
 
-    def relative(
-        self,
-        v_n: Array,
-        *,
-        p_n: Array,
-        walks: Array,
-        rows: slice,
-    ) -> ThroughWater | None:
+    def relative(self, v_n: Array, *, p_n: Array, walks: Array, rows: slice) -> ThroughWater | None:
         """Return velocities relative to what reflects each beam; None for all off the ground.
 
         Parameters

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from factors.similarity import WEIGHT_FLOOR, Kernel, expected_mahalanobis_sq
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.times import Indices
-from ssm_graph.mission.doubts import LOW_WEIGHT, TRUSTED
+from ssm_graph.mission.answer import LOW_WEIGHT, TRUSTED
 
 GATE = 5.0
 """Beams further than this many innovation sigmas from the prediction start without weight."""

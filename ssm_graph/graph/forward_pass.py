@@ -23,11 +23,11 @@ from ssm_graph.graph.aids.ranges import Ranges
 from ssm_graph.graph.beam_rows import BeamRows, CalibratedBeams, PreparedBeams
 from ssm_graph.graph.first_weights import settled_weights
 from ssm_graph.graph.measurements import Measurements
-from ssm_graph.mission.current import CURRENTS
+from ssm_graph.mission.calibration import CURRENTS
 from ssm_graph.mission.problem import Problem
 
 
-class Met(NamedTuple):
+class AidsOfKeyframe(NamedTuple):
     """The measurements of one keyframe, linearised at one state: R components of m of them."""
 
     numbers: list[int]
@@ -59,18 +59,20 @@ class ForwardAids:
         """Return whether a keyframe has measurements to meet."""
         return k in self._at
 
-    def at(self, k: int, state: RowStates) -> Met:
+    def at(self, k: int, state: RowStates) -> AidsOfKeyframe:
         """Return the measurements of a keyframe that has some, linearised at a state."""
         here, own = self._at[k], state.rows_of_one()
         errors, jacobians = zip(*(aid.whitened(own) for aid, _ in here), strict=True)
-        return Met(
+        return AidsOfKeyframe(
             numbers=[number for _, number in here],
             measurement=np.repeat(np.arange(len(here)), [aid.dim for aid, _ in here]),
             innovation=-np.concatenate(errors, axis=1)[0],
             H=np.concatenate(jacobians, axis=1)[0],
         )
 
-    def weigh(self, met: Met, innovation: Array, predicted: Array, kernel: Kernel) -> Array:
+    def weigh(
+        self, met: AidsOfKeyframe, innovation: Array, predicted: Array, kernel: Kernel
+    ) -> Array:
         """Return the weights (R,) of the components, and keep those of their measurements.
 
         ``innovation`` (R,) is that at the prediction, ``predicted`` (R, R) the covariance of what

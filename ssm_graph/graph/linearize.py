@@ -69,11 +69,7 @@ class GraphLinearizer:
         return self._beams.rows(self._at_beams(states), prepared)
 
     def solve(
-        self,
-        states: States,
-        beam_rows: BeamRows,
-        weights: Array,
-        aid_weights: Array | None = None,
+        self, states: States, beam_rows: BeamRows, weights: Array, aid_weights: Array | None = None
     ) -> ChainSolution:
         """Return the step at ``states``, with their beam rows and weights (M,).
 
@@ -82,11 +78,7 @@ class GraphLinearizer:
         return finished(self.solve_steps(states, beam_rows, weights, aid_weights))
 
     def solve_steps(
-        self,
-        states: States,
-        beam_rows: BeamRows,
-        weights: Array,
-        aid_weights: Array | None = None,
+        self, states: States, beam_rows: BeamRows, weights: Array, aid_weights: Array | None = None
     ) -> Steps[ChainSolution]:
         """Make :meth:`solve` in steps."""
         extras, prior = self.problem.extras, self.prior.rows(states)
@@ -108,11 +100,7 @@ class GraphLinearizer:
         return self._inertial.rows(self.problem.chain.intervals, states)
 
     def cost(
-        self,
-        states: States,
-        beam_rows: BeamRows,
-        weights: Array,
-        aid_weights: Array | None = None,
+        self, states: States, beam_rows: BeamRows, weights: Array, aid_weights: Array | None = None
     ) -> float:
         """Return half the weighted sum of squares that :meth:`solve` makes least."""
         squares = np.sum(weights * (beam_rows.error / self.problem.beams.sigma) ** 2)
@@ -138,11 +126,7 @@ class GraphLinearizer:
         return states_at(states, self.problem.beams.keyframe, self.problem.extras, g_n=g_n)
 
     def _own_rows(
-        self,
-        states: States,
-        beam_rows: BeamRows,
-        weights: Array,
-        aid_weights: Array | None,
+        self, states: States, beam_rows: BeamRows, weights: Array, aid_weights: Array | None
     ) -> list[Array]:
         """Return the rows (m, width + 1) of each keyframe alone."""
         beams = self.problem.beams

@@ -18,7 +18,7 @@ from ssm_graph.engine.extras import Extras
 from ssm_graph.engine.states import States
 from ssm_graph.graph.aids.aid import Aid, RowStates
 from ssm_graph.graph.aids.depth import DepthMeans
-from ssm_graph.mission.doubts import LOW_WEIGHT, MISFIT, SUSPECT_SHARE, TRUSTED
+from ssm_graph.mission.answer import LOW_WEIGHT, MISFIT, SUSPECT_SHARE, TRUSTED
 from ssm_graph.mission.estimate import AidTable
 from ssm_graph.mission.problem import Problem
 
@@ -143,6 +143,15 @@ class Measurements:
     def squares(self, states: States) -> Array:
         """Return the squared whitened errors (M,)."""
         return self._summed(self.rows(states).error ** 2)
+
+    def loss(self, states: States, kernel: Kernel) -> float:
+        """Return what they cost with their robust loss in place of their squares."""
+        t, total = self.squares(states), 0.0
+        for dim in np.unique(self.dim):
+            own = t[self.dim == dim]
+            loss = kernel.similarity(np.zeros_like(own), dim=dim) - kernel.similarity(own, dim=dim)
+            total += float(loss.sum())
+        return total
 
     def of(self, aid: Aid, values: Array) -> Array:
         """Return what is one of the aids' of values (M,), as a view."""

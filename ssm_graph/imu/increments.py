@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from factors.so3 import cross
+from factors.so3 import cross, left_jacobian_solve, left_jacobian_times
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps, finished
@@ -139,39 +139,13 @@ def _merge_steps(theta: Array, v: Array, first: NDArray[np.intp]) -> Steps[tuple
     """
     size = np.diff(np.append(first, len(theta)))
     turned = Rotation.from_rotvec(theta[first])
-    gained = _left_jacobian_times(theta[first], v[first])
+    gained = left_jacobian_times(theta[first], v[first])
     for step in range(1, int(size.max())):
         has_piece = (step < size)[:, None]
         piece = np.minimum(first + step, len(theta) - 1)
         theta_k, v_k = theta[piece] * has_piece, v[piece] * has_piece
-        gained += turned.apply(_left_jacobian_times(theta_k, v_k))
+        gained += turned.apply(left_jacobian_times(theta_k, v_k))
         turned = turned * Rotation.from_rotvec(theta_k)
         yield 5e-4 * len(first)
     theta_all = turned.as_rotvec()
-    return theta_all, _left_jacobian_solve(theta_all, gained)
-
-
-def _left_jacobian_times(phi: Array, vector: Array) -> Array:
-    """Return ``int_0^1 Exp(s phi) ds vector``: the left Jacobian of SO(3) times (..., 3)."""
-    angle = np.linalg.norm(phi, axis=-1, keepdims=True)
-    first = cross(phi, vector)
-    # (1 - cos a) / a^2 and (a - sin a) / a^3, without cancellation.
-    half_sinc_sq = 0.5 * np.sinc(0.5 * angle / np.pi) ** 2
-    cubic = np.where(
-        angle < 1e-2,
-        (1.0 - angle**2 / 20.0) / 6.0,
-        (angle - np.sin(angle)) / np.maximum(angle, 1e-9) ** 3,
-    )
-    return np.asarray(vector + half_sinc_sq * first + cubic * cross(phi, first))
-
-
-def _left_jacobian_solve(phi: Array, vector: Array) -> Array:
-    """Return ``x`` such that ``_left_jacobian_times(phi, x) = vector``, (..., 3)."""
-    angle = np.linalg.norm(phi, axis=-1, keepdims=True)
-    half = np.maximum(0.5 * angle, 1e-9)
-    # (1 - a/2 cot(a/2)) / a^2
-    factor = np.where(
-        angle < 1e-2, (1.0 + angle**2 / 60.0) / 12.0, (1.0 - half / np.tan(half)) / (4.0 * half**2)
-    )
-    first = cross(phi, vector)
-    return np.asarray(vector - 0.5 * first + factor * cross(phi, first))
+    return theta_all, left_jacobian_solve(theta_all, gained)

@@ -1,4 +1,4 @@
-"""Which instruments a mission asks to calibrate, as extra variables of the problem."""
+"""What a mission asks to estimate beside the states: its instruments, and the current."""
 
 from __future__ import annotations
 
@@ -11,18 +11,49 @@ from ssm_graph.engine.extras import Extra, Extras
 from ssm_graph.graph.aids import AIDS
 from ssm_graph.graph.aids.aid import along_axes, drift_variable
 from ssm_graph.graph.aids.depth import DEPTH_OFFSET, depth_variables
-from ssm_graph.graph.aids.gnss import (
-    GNSS_DRIFT,
-    GNSS_LEVER_ARM,
-    GNSS_TIME_OFFSET,
-    gnss_variables,
-)
-from ssm_graph.mission.current import current_extras, has_water_pings
+from ssm_graph.graph.aids.gnss import GNSS_DRIFT, GNSS_LEVER_ARM, GNSS_TIME_OFFSET, gnss_variables
 from ssm_graph.mission.mission import Mission
 from ssm_graph.sensors.current import CurrentModel
 from ssm_graph.sensors.depth import DepthCalibration
 from ssm_graph.sensors.dvl import DvlMount
 from ssm_graph.sensors.gnss import GnssCalibration
+
+CURRENT: Final = "current"
+"""East and north at the vehicle."""
+CURRENT_UP: Final = "current_up"
+CURRENTS: Final = frozenset({CURRENT, CURRENT_UP})
+"""Those of the extra variables that tell of the water."""
+
+
+def has_water_pings(mission: Mission) -> bool:
+    """Return whether a ping off the water has a speed."""
+    return mission.dvl.hears_water
+
+
+def current_extras(model: CurrentModel) -> tuple[Extra, ...]:
+    """Return the current as walks that keep their variance."""
+    parts = (
+        (CURRENT, ("current_east_m_per_s", "current_north_m_per_s"), model.sigma),
+        (CURRENT_UP, ("current_up_m_per_s",), model.vertical_sigma),
+    )
+    return tuple(
+        Extra.gauss_markov(name, labels, sigma, correlation_s=model.correlation_s)
+        for name, labels, sigma in parts
+        if sigma > 0.0
+    )
+
+
+def current_note(mission: Mission) -> tuple[str, ...]:
+    """Return the note of a current that has to be assumed."""
+    if mission.current is not None or not has_water_pings(mission):
+        return ()
+    model = CurrentModel()
+    return (
+        "pings off the water, and nothing says what their current is like: taken as "
+        f"{model.sigma:g} m/s along east and north, {model.vertical_sigma:g} m/s up (1 sigma), "
+        f"correlated over {model.correlation_s / 3600.0:g} h; state it in [current]",
+    )
+
 
 DVL_MOUNTING: Final = "dvl_mounting"
 DVL_SCALE: Final = "dvl_scale"

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.base.frames import R_lb_from_roll_pitch_heading, phi_D_roll_pitch_heading
 from ssm_graph.base.frozen import Array, ReadOnlyArrays
-from ssm_graph.base.stepwise import Steps, finished
+from ssm_graph.base.stepwise import Steps, at_once
 from ssm_graph.base.times import MIN_SPACING_S, Indices, is_inside, nearest
-from ssm_graph.engine.error_state import InitialMoments
+from ssm_graph.engine.error_state import POSITION, ROTATION, STATE_DIM, VELOCITY, InitialMoments
 from ssm_graph.engine.extras import Extras
 from ssm_graph.graph.aids import AIDS
 from ssm_graph.graph.aids.aid import Aid, Keyframes, Table
@@ -21,10 +22,15 @@ from ssm_graph.graph.aids.depth import Depths
 from ssm_graph.graph.aids.gnss import GNSS_DRIFT, Fixes
 from ssm_graph.imu.ping_motion import MotionBefore, mean_gyro
 from ssm_graph.imu.preintegration import InertialChain, imu_gaps, preintegrate_steps
-from ssm_graph.mission.calibration import DVL_DRIFT, extras_of, needs_motion
-from ssm_graph.mission.current import CURRENT, current_note
+from ssm_graph.mission.calibration import (
+    CURRENT,
+    CURRENTS,
+    DVL_DRIFT,
+    current_note,
+    extras_of,
+    needs_motion,
+)
 from ssm_graph.mission.mission import InitialState, Mission
-from ssm_graph.mission.start.moments import initial_moments
 from ssm_graph.mission.timeline import Timeline, build_timeline
 from ssm_graph.mission.usable import require_usable
 from ssm_graph.sensors.dvl import DvlMount
@@ -119,8 +125,6 @@ class Problem(ReadOnlyArrays):
     aids: tuple[Aid, ...] = ()
     """What the smoothers are aided by besides; another estimator says that it is not."""
     notes: tuple[str, ...] = ()
-    is_noise_white: bool = False
-    """Whether sigmas of beams and fixes leave out what drifts stand for: `with_white_noise`"""
 
     def aid(self, kind: type[A]) -> A | None:
         """Return the aid of a kind, None if there is none."""
@@ -132,13 +136,13 @@ class Problem(ReadOnlyArrays):
         return len(self.keyframe_s)
 
 
-def build_problem(
+def build_problem_steps(
     mission: Mission,
     config: ProblemConfig | None = None,
     *,
     start: InitialState | None = None,
     begin_s: float | None = None,
-) -> Problem:
+) -> Steps[Problem]:
     """Turn a mission into an estimation problem.
 
     Parameters
@@ -150,17 +154,6 @@ def build_problem(
     begin_s : when errors of aids that grow are counted from, s; from the first reading of each when
         left out.
     """
-    return finished(build_problem_steps(mission, config, start=start, begin_s=begin_s))
-
-
-def build_problem_steps(
-    mission: Mission,
-    config: ProblemConfig | None = None,
-    *,
-    start: InitialState | None = None,
-    begin_s: float | None = None,
-) -> Steps[Problem]:
-    """Make :func:`build_problem` in steps."""
     require_usable(mission)
     mission, stuck_note = _without_stuck_beams(mission)
     config = config or ProblemConfig()
@@ -174,7 +167,7 @@ def build_problem_steps(
     chain = yield from preintegrate_steps(
         mission.imu, timeline.keyframe_s, frame=mission.frame, rate_hz=config.merge_rate_hz
     )
-    noise = mission.imu.noise
+    noise, depth = mission.imu.noise, mission.depth
     extras = extras_of(mission)
     keyframes = Keyframes(mission.frame, mission.imu, timeline.keyframe_s, begin_s)
     aids = (kind.of(mission.aids, keyframes) for kind in AIDS)
@@ -184,18 +177,16 @@ def build_problem_steps(
         keyframe_s=timeline.keyframe_s,
         chain=chain,
         beams=_beams(mission, timeline.ping, timeline.ping_keyframe, extras),
-        depths=_depths(mission, timeline),
+        depths=None if depth is None else Depths.of(depth, mission.imu, timeline.keyframe_s),
         fixes=_fixes(mission, timeline),
         imu_noise_bias_sigma=np.repeat([noise.accel_bias_sigma, noise.gyro_bias_sigma], 3),
         extras=extras,
         aids=tuple(aid for aid in aids if aid is not None),
-        notes=(
-            *timeline.notes,
-            *_gap_note(mission.imu),
-            *stuck_note,
-            *current_note(mission),
-        ),
+        notes=(*timeline.notes, *_gap_note(mission.imu), *stuck_note, *current_note(mission)),
     )
+
+
+build_problem = at_once(build_problem_steps)
 
 
 def start_of(problem: Problem) -> InitialMoments:
@@ -226,33 +217,23 @@ def with_dvl(problem: Problem, mission: Mission) -> Problem:
             "with_dvl: expected pings off the ground, as those of the problem, got some off the "
             "water, whose current it does not have; build a problem of its own"
         )
-    return replace(with_stated_noise(problem), beams=beams)
+    return replace(problem, beams=beams)
 
 
 def with_white_noise(problem: Problem) -> Problem:
-    """Return the problem for an estimator whose variables are its drifts, too.
+    """Return what an estimator whose variables are the drifts, too, makes of a problem, once.
 
-    The sigmas of beams and fixes are then those of white noise alone; as they are stated, they
-    stand for what changes slowly as well.
+    A problem states the noise of beams and fixes with all that changes slowly; here their sigmas
+    are those of white noise alone, all of which is white.
     """
-    return problem if problem.is_noise_white else _scaled_noise(problem, is_noise_white=True)
-
-
-def with_stated_noise(problem: Problem) -> Problem:
-    """Return the problem for an estimator without drifts."""
-    return _scaled_noise(problem, is_noise_white=False) if problem.is_noise_white else problem
-
-
-def _scaled_noise(problem: Problem, *, is_noise_white: bool) -> Problem:
-    power = 1.0 if is_noise_white else -1.0
     beams, fixes = problem.beams, problem.fixes
     if DVL_DRIFT in problem.extras:
-        share = np.where(beams.is_water, 1.0, beams.white_share**power)
-        beams = replace(beams, sigma=beams.sigma * share)
+        share = np.where(beams.is_water, 1.0, beams.white_share)
+        beams = replace(beams, sigma=beams.sigma * share, white_share=1.0)
     if fixes is not None and GNSS_DRIFT in problem.extras:
-        covariance_n = fixes.covariance_n * fixes.white_share ** (2.0 * power)
-        fixes = replace(fixes, covariance_n=covariance_n)
-    return replace(problem, beams=beams, fixes=fixes, is_noise_white=is_noise_white)
+        covariance_n = fixes.covariance_n * fixes.white_share**2
+        fixes = replace(fixes, covariance_n=covariance_n, white_share=1.0)
+    return replace(problem, beams=beams, fixes=fixes)
 
 
 def _without_stuck_beams(mission: Mission) -> tuple[Mission, tuple[str, ...]]:
@@ -282,11 +263,6 @@ def _gap_note(imu: ImuLog) -> tuple[str, ...]:
         f"{end[longest] - begin[longest]:.2f} s at {begin[longest]:.3f} s; bridged with larger "
         "process noise",
     )
-
-
-def _depths(mission: Mission, timeline: Timeline) -> Depths | None:
-    log = mission.depth
-    return None if log is None else Depths.of(log, mission.imu, timeline.keyframe_s)
 
 
 def _fixes(mission: Mission, timeline: Timeline) -> Fixes | None:
@@ -324,3 +300,57 @@ def _beams(mission: Mission, ping: Indices, ping_keyframe: Indices, extras: Extr
         motion=MotionBefore(mission.imu, dvl.valid_s[ping]) if needs_motion(extras) else None,
         white_share=dvl.mount.drift.white_share,
     )
+
+
+def without_water_track(problem: Problem) -> Problem:
+    """Return the problem with the pings off the ground alone, and a note of those left out."""
+    beams = problem.beams
+    if not beams.is_water.any():
+        return problem
+    kept = ~beams.is_water
+    note = (
+        f"{len(np.unique(beams.ping[beams.is_water]))} pings off the water are left out: this "
+        "estimator has no current, and would take them for pings off the ground; ssm-graph smooth "
+        "uses them"
+    )
+    rows = {
+        name: getattr(beams, name)[kept]
+        for name in ("keyframe", "beam", "speed", "sigma", "gyro_b", "beam_b", "ping", "is_water")
+    }
+    return replace(
+        problem,
+        beams=replace(beams, **rows),
+        extras=problem.extras.without(CURRENTS),
+        notes=(*problem.notes, note),
+    )
+
+
+def require_bottom_track(problem: Problem) -> None:
+    """Raise :class:`ConfigError` for a problem with pings off the water."""
+    if problem.beams.is_water.any():
+        raise ConfigError(
+            "this estimator has no current: expected pings off the ground, got some off the water; "
+            "leave them out by without_water_track"
+        )
+
+
+def initial_moments(start: InitialState, frame: LocalFrame, *, bias_sigma: Array) -> InitialMoments:
+    """Turn an initial state in geodetic terms into the first keyframe's mean and covariance.
+
+    Parameters
+    ----------
+    start : initial state with sigmas along east, north, up and of roll, pitch, heading.
+    frame : navigation frame.
+    bias_sigma : (6,) turn-on bias sigmas, accelerometer then gyro.
+    """
+    p_n = frame.p_n_from_geodetic(start.lat, start.lon, start.height)
+    R_nl = frame.R_nl_at(p_n)
+    R_lb = R_lb_from_roll_pitch_heading(start.roll, start.pitch, start.heading)
+    R_nb = R_nl @ R_lb
+    J = phi_D_roll_pitch_heading(start.roll, start.pitch)
+    covariance = np.zeros((STATE_DIM, STATE_DIM))
+    covariance[ROTATION, ROTATION] = J @ np.diag(start.attitude_sigma**2) @ J.T
+    covariance[POSITION, POSITION] = R_lb.T @ np.diag(start.position_sigma_enu**2) @ R_lb
+    covariance[VELOCITY, VELOCITY] = R_nl @ np.diag(start.velocity_sigma_enu**2) @ R_nl.T
+    covariance[9:, 9:] = np.diag(bias_sigma**2)
+    return InitialMoments(R_nb, p_n, R_nl @ start.velocity_enu, np.zeros(6), covariance)

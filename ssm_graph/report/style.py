@@ -46,21 +46,6 @@ GREY: Final = "#8C8C8C"
 
 MAX_METHODS: Final = 8
 """As many methods or fewer are all shown; of more, those of `DEFAULT_METHODS`."""
-DEFAULT_METHODS: Final = (
-    "oracle",
-    "ekf-oracle",
-    "ekf",
-    "ekf-gate-beam",
-    "ssmkf-log",
-    "rstkf",
-    "mckf",
-    "ssm-log",
-    "ssm-log+rts",
-    "smoother-log",
-    "gnc-tls",
-    "smoother-gnc-tls",
-)
-"""What figures show where there are more methods than a reader can tell apart."""
 GRAPH_PREFIXES: Final = ("smoother", "gnc", "fixed-lag", "graph")
 """Names of methods that solve a factor graph begin like this; so does the `oracle`."""
 
@@ -107,14 +92,9 @@ LOOKS: Final[Mapping[str, Look]] = {
     "smoother-gnc-tls": Look("#009E73", "-", "s"),
 }
 """Colours by Okabe and Ito, and by Tol; lines and markers differ where colours are close."""
-OTHER_COLORS: Final = (
-    "#44AA99",
-    "#332288",
-    "#AA4499",
-    "#117733",
-    "#6699CC",
-    "#CC6677",
-)
+DEFAULT_METHODS: Final = tuple(LOOKS)
+"""What figures show where there are more methods than a reader can tell apart."""
+OTHER_COLORS: Final = ("#44AA99", "#332288", "#AA4499", "#117733", "#6699CC", "#CC6677")
 """Of the methods without a look of their own (Paul Tol's muted colours)."""
 OTHER_DASHES: Final = (DASHED, DASH_DOT, SHORT, DASH_DOT_DOT, LONG)
 MARKERS: Final = "hpd*vs^D<P>X"

@@ -17,7 +17,7 @@ from ssm_graph.simulation.beam_faults import Fault, FaultShape, Loss, OutlierKin
 from ssm_graph.simulation.config import SCENARIOS, Scenario, SimulationConfig, scenario_config
 from ssm_graph.simulation.currents import Current, CurrentSettings, WaterTrack
 from ssm_graph.simulation.dvl_model import DvlSettings, default_mount, janus_beams
-from ssm_graph.simulation.grades import IMU_NOISE, START_SIGMAS, Grade, StartSigmas
+from ssm_graph.simulation.inertial import IMU_NOISE, START_SIGMAS, Grade, StartSigmas
 from ssm_graph.simulation.mission import SimulatedMission, simulate, with_dvl_errors
 from ssm_graph.simulation.randomness import DriftSettings
 from ssm_graph.simulation.routes import (

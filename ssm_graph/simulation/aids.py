@@ -226,10 +226,7 @@ def depth_log(
     if rng is not None:
         depth = depth + settings.sigma * rng.standard_normal(len(time_s))
     return DepthLog(
-        sigma=settings.sigma,
-        time_s=time_s,
-        depth=depth,
-        lever_arm_b=np.array(settings.lever_arm_b),
+        sigma=settings.sigma, time_s=time_s, depth=depth, lever_arm_b=np.array(settings.lever_arm_b)
     )
 
 

@@ -27,7 +27,7 @@ from ssm_graph.simulation.aids import (
 from ssm_graph.simulation.beam_faults import Fault, Loss, OutlierKind, Outliers
 from ssm_graph.simulation.currents import CurrentSettings, WaterTrack
 from ssm_graph.simulation.dvl_model import DvlSettings
-from ssm_graph.simulation.grades import IMU_NOISE, START_SIGMAS, Grade, StartSigmas
+from ssm_graph.simulation.inertial import IMU_NOISE, Grade, StartSigmas
 from ssm_graph.simulation.routes import (
     DepthProfile,
     DiveRoute,
@@ -120,11 +120,6 @@ class SimulationConfig(checked.Settings):
     def noise(self) -> ImuNoise:
         """The noise of the inertial sensors, by default that of the grade."""
         return IMU_NOISE[self.grade] if self.imu_noise is None else self.imu_noise
-
-    @property
-    def initial_sigmas(self) -> StartSigmas:
-        """Standard deviations of the initial state, by default those of the grade."""
-        return START_SIGMAS[self.grade] if self.start_sigmas is None else self.start_sigmas
 
 
 @dataclass(frozen=True, slots=True)

@@ -79,10 +79,12 @@ class Current:
         self, settings: CurrentSettings | None, *, end_s: float, rng: np.random.Generator
     ) -> None:
         """Draw it from 0 to ``end_s``; there is none without settings."""
-        self._settings = settings or CurrentSettings()
+        self._settings = own = settings or CurrentSettings()
         self._phase = 2.0 * math.pi * rng.random()
         self._time_s = np.arange(0.0, end_s + 2.0 * _STEP_S, _STEP_S)
-        self._random = self._gauss_markov(rng)
+        fresh = rng.standard_normal((len(self._time_s), 3))
+        sigma = np.array([own.sigma, own.sigma, own.vertical_sigma])
+        self._random = sigma * gauss_markov(fresh, self._time_s, own.correlation_s)
 
     def at(self, time_s: Array) -> Array:
         """Return the current (N, 3) along east, north, up, m/s."""
@@ -93,9 +95,3 @@ class Current:
         )
         random = np.column_stack([np.interp(time_s, self._time_s, c) for c in self._random.T])
         return np.asarray(np.array(settings.steady_enu) + tide + random)
-
-    def _gauss_markov(self, rng: np.random.Generator) -> Array:
-        settings = self._settings
-        sigma = np.array([settings.sigma, settings.sigma, settings.vertical_sigma])
-        fresh = rng.standard_normal((len(self._time_s), 3))
-        return np.asarray(sigma * gauss_markov(fresh, self._time_s, settings.correlation_s))

@@ -24,10 +24,7 @@ _VERTICAL = np.array([[0.0, 0.0, 1.0]])
 
 
 def janus_beams(
-    n_beams: int = 4,
-    *,
-    azimuth: Sequence[float] | None = None,
-    janus: float = math.radians(30.0),
+    n_beams: int = 4, *, azimuth: Sequence[float] | None = None, janus: float = math.radians(30.0)
 ) -> Array:
     """Return unit beam directions (B, 3) in instrument axes, x forward mark, y starboard, z down.
 

@@ -30,8 +30,7 @@ from ssm_graph.simulation.beam_faults import (
 from ssm_graph.simulation.config import SimulationConfig
 from ssm_graph.simulation.currents import Current
 from ssm_graph.simulation.dvl_model import beam_ranges, ping_times, true_beam_speeds
-from ssm_graph.simulation.grades import initial_state
-from ssm_graph.simulation.imu_model import averaged_imu, imu_errors
+from ssm_graph.simulation.inertial import START_SIGMAS, averaged_imu, imu_errors, initial_state
 from ssm_graph.simulation.randomness import Streams, draw_drift, spawn_streams
 from ssm_graph.simulation.trajectory import Trajectory
 
@@ -112,7 +111,9 @@ def simulate(config: SimulationConfig) -> SimulatedMission:
         depth=depth,
         gnss=gnss,
         aids=aids.logs,
-        initial=initial_state(truth, config.initial_sigmas, rng=initial_rng),
+        initial=initial_state(
+            truth, config.start_sigmas or START_SIGMAS[config.grade], rng=initial_rng
+        ),
         reference=truth,
         current=None if config.current is None else config.current.model,
     )
@@ -255,14 +256,12 @@ def _aids(
     config: SimulationConfig, streams: Streams, end_s: float
 ) -> tuple[DepthLog | None, GnssLog | None]:
     """Return the readings of depth sensor and GNSS receiver, where there are any."""
-    noisy = not config.perfect_sensors
-    depth: DepthLog | None = None
-    gnss: GnssLog | None = None
-    if config.depth is not None:
-        rng = streams.depth if noisy else None
-        depth = depth_log(config.trajectory, config.depth, end_s=end_s, rng=rng)
-    if config.gnss is not None:
-        rng = streams.gnss if noisy else None
-        drift_rng = streams.gnss_drift if noisy else None
-        gnss = gnss_log(config.trajectory, config.gnss, end_s=end_s, rng=rng, drift_rng=drift_rng)
-    return depth, gnss
+    rngs = (streams.depth, streams.gnss, streams.gnss_drift)
+    of_depth, of_gnss, of_drift = (None,) * 3 if config.perfect_sensors else rngs
+    depth, gnss, path = config.depth, config.gnss, config.trajectory
+    return (
+        None if depth is None else depth_log(path, depth, end_s=end_s, rng=of_depth),
+        None
+        if gnss is None
+        else gnss_log(path, gnss, end_s=end_s, rng=of_gnss, drift_rng=of_drift),
+    )

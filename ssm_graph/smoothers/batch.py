@@ -20,11 +20,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from factors.m_estimators import TruncatedKernel
+from factors.kernels import TruncatedKernel
 from factors.similarity import Kernel, LogKernel, Similarity, expected_mahalanobis_sq
 from ssm_graph.base.errors import ConfigError, SolverError
 from ssm_graph.base.frozen import Array
-from ssm_graph.base.stepwise import Steps, finished
+from ssm_graph.base.stepwise import Steps, at_once
 from ssm_graph.engine.chain import ChainSolution
 from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.engine.reweighting import GncSchedule, Graduation, Schedule, WarmSchedule
@@ -34,21 +34,20 @@ from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.first_values import FirstValues, first_values, first_values_steps
 from ssm_graph.graph.inertial_rows import inertial_fit
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.graph.measurements import aid_table, doubts_of_aids
+from ssm_graph.graph.measurements import aid_kernel, aid_table, doubts_of_aids
+from ssm_graph.mission.answer import trajectory_from_states
 from ssm_graph.mission.estimate import BeamTable, Estimate, Iteration, NoiseFound, Status
 from ssm_graph.mission.problem import Problem, with_white_noise
-from ssm_graph.mission.trajectory import trajectory_from_states
-from ssm_graph.smoothers.aid_weights import AidWeighing
 from ssm_graph.smoothers.beam_faults import FaultSearch, FaultWatch
-from ssm_graph.smoothers.noise import (
+from ssm_graph.smoothers.track import calibration_of, current_of, undetermined
+from ssm_graph.smoothers.verdict import (
     MAX_ADAPTATIONS,
     adaptation,
+    contradictions,
     noise_found,
     noise_notes,
     with_sigmas,
 )
-from ssm_graph.smoothers.variables import calibration_of, current_of, undetermined
-from ssm_graph.smoothers.verdict import contradictions
 
 __all__ = ["OnIteration", "Similarity", "SmootherConfig", "SsmSmoother"]
 
@@ -108,7 +107,7 @@ class SmootherConfig:
         if self.graduation is None:
             return WarmSchedule(self.kernel, WARM_KERNEL)
         assert isinstance(self.kernel, TruncatedKernel)
-        return GncSchedule(self.kernel, self.graduation, WARM_KERNEL)
+        return GncSchedule.begin(self.kernel, self.graduation, WARM_KERNEL)
 
 
 def _notes_of(first: FirstValues) -> tuple[str, ...]:
@@ -126,15 +125,47 @@ def warm_start(problem: Problem) -> FirstValues:
 
 
 class Pass(NamedTuple):
-    """State of the loop after one iteration."""
+    """What one pass came to."""
 
     states: States
     step: ChainSolution
     beam_rows: BeamRows
     mahalanobis_sq: Array
+    """(M,) of the beams"""
     weights: Array
+    """(M,) that these lead to"""
+    aid_mahalanobis_sq: Array
+    """(A,) of the measurements of weighted aids"""
+    aid_weights: Array
+    """(A,)"""
     update_sigmas: float
     weight_change: float
+
+
+class Weights(NamedTuple):
+    """Of one pass, and the schedules that say by which kernels they are judged."""
+
+    beams: Array
+    """(M,)"""
+    aids: Array
+    """(A,)"""
+    of_beams: Schedule
+    of_aids: Schedule
+
+    def after(self, last: Pass, faults: FaultWatch) -> Weights:
+        """Return those of the pass after ``last``."""
+        of_beams, beams = self.of_beams.after(
+            self.beams, last.weights, t=last.mahalanobis_sq, update_sigmas=last.update_sigmas
+        )
+        of_aids, aids = self.of_aids.after(
+            self.aids, last.aid_weights, t=last.aid_mahalanobis_sq, update_sigmas=last.update_sigmas
+        )
+        return Weights(faults.leave_out(beams), aids, of_beams, of_aids)
+
+    def may_end(self, last: Pass) -> bool:
+        """Return whether the weights that the pass led to may be those of the answer."""
+        of_aids = len(self.aids) == 0 or self.of_aids.may_end(last.aid_weights)
+        return of_aids and self.of_beams.may_end(last.weights)
 
 
 class Solved(NamedTuple):
@@ -146,7 +177,6 @@ class Solved(NamedTuple):
     status: Status
     notes: tuple[str, ...]
     first: FirstValues
-    aids: AidWeighing
 
     def again(self) -> FirstValues:
         """Return where another solution may start."""
@@ -154,7 +184,7 @@ class Solved(NamedTuple):
             self.first,
             states=self.last.states,
             weights=self.last.weights,
-            aid_weights=self.aids.settled,
+            aid_weights=self.last.aid_weights,
         )
 
 
@@ -164,13 +194,13 @@ class SsmSmoother:
     def __init__(self, config: SmootherConfig | None = None) -> None:
         self.config = config or SmootherConfig()
 
-    def solve(
+    def solve_steps(
         self,
         problem: Problem,
         *,
         first: FirstValues | None = None,
         on_iteration: OnIteration | None = None,
-    ) -> Estimate:
+    ) -> Steps[Estimate]:
         """Return the smoothed trajectory with the weight of every beam.
 
         An interrupt from the keyboard ends the loop with what the last iteration found.
@@ -187,18 +217,7 @@ class SsmSmoother:
         SolverError
             If no finite solution was found.
         """
-        return finished(self.solve_steps(problem, first=first, on_iteration=on_iteration))
-
-    def solve_steps(
-        self,
-        problem: Problem,
-        *,
-        first: FirstValues | None = None,
-        on_iteration: OnIteration | None = None,
-    ) -> Steps[Estimate]:
-        """Make :meth:`solve` in steps."""
         begin, used = time.perf_counter(), np.ones(problem.beams.n_beams)
-        problem = with_white_noise(problem)
         iterations: tuple[Iteration, ...] = ()
         for adaptations in range(MAX_ADAPTATIONS + 1):
             solved = yield from self._solve_steps(problem, first, on_iteration)
@@ -215,79 +234,76 @@ class SsmSmoother:
         yield 0.015 * problem.n_keyframes
         return estimate
 
+    solve = at_once(solve_steps)
+
     def _solve_steps(
         self, problem: Problem, first: FirstValues | None, on_iteration: OnIteration | None
     ) -> Steps[Solved]:
         """Iterate states and weights until both have settled."""
-        linearizer = GraphLinearizer(problem)
+        white = with_white_noise(problem)
+        linearizer = GraphLinearizer(white)
         yield 0.03 * problem.n_keyframes
         if first is None:
-            first = yield from first_values_steps(problem, kernel=WARM_KERNEL)
+            first = yield from first_values_steps(white, kernel=WARM_KERNEL)
         states, rows = first.states, linearizer.beam_rows(first.states)
         schedule = self.config.schedule()
-        weights = schedule.first_weights(first.weights)
         faults = FaultWatch(problem, self.config.fault_search)
         yield 0.03 * problem.n_keyframes
-        aids = self._aids(linearizer, first)
+        weights = Weights(
+            schedule.first_weights(first.weights),
+            first.aid_weights,
+            of_beams=schedule,
+            of_aids=WarmSchedule(aid_kernel(self.config.kernel), WARM_KERNEL),
+        )
         iterations: list[Iteration] = []
         status = Status.MAX_ITERATIONS
         for number in range(self.config.max_iterations):
             try:
-                this = yield from self._iterate(
-                    linearizer, states, rows, weights, schedule.kernel, faults, aids
-                )
+                this = yield from self._iterate(linearizer, states, rows, weights, faults)
             except KeyboardInterrupt:
                 if not iterations:
                     raise
                 status = Status.INTERRUPTED
                 break
             states, rows = this.states, this.beam_rows
-            iterations.append(
-                Iteration(this.update_sigmas, this.weight_change, str(schedule.kernel))
-            )
+            kernel = str(weights.of_beams.kernel)
+            iterations.append(Iteration(this.update_sigmas, this.weight_change, kernel))
             if on_iteration is not None:
                 on_iteration(number + 1, self.config.max_iterations, iterations[-1])
             is_settled = max(this.update_sigmas, this.weight_change) < self.config.tolerance
-            is_settled = is_settled and schedule.may_end(this.weights) and aids.may_end
+            is_settled = is_settled and weights.may_end(this)
             has_news = yield from faults.look_steps(
                 states,
                 rows,
                 update_sigmas=this.update_sigmas,
                 is_settled=is_settled,
-                aid_weights=aids.settled,
+                aid_weights=this.aid_weights,
             )
             if is_settled and not has_news:
                 status = Status.CONVERGED
                 break
             yield 0.007 * problem.n_keyframes
-            aids.go_on(this.update_sigmas)
-            weights = faults.leave_out(
-                schedule.next_weights(
-                    weights, this.weights, t=this.mahalanobis_sq, update_sigmas=this.update_sigmas
-                )
-            )
+            weights = weights.after(this, faults)
         notes = problem.notes + faults.notes(rows.error) + _notes_of(first)
-        return Solved(linearizer, this, tuple(iterations), status, notes, first, aids)
+        return Solved(linearizer, this, tuple(iterations), status, notes, first)
 
     def _iterate(
         self,
         linearizer: GraphLinearizer,
         states: States,
         rows: BeamRows,
-        weights: Array,
-        kernel: Kernel,
+        used: Weights,
         faults: FaultWatch,
-        aids: AidWeighing,
     ) -> Steps[Pass]:
         problem = linearizer.problem
         if linearizer.follow(states):
             rows = linearizer.beam_rows(states)
         yield 0.004 * problem.n_keyframes
-        step = yield from linearizer.solve_steps(states, rows, weights, aids.used)
-        cost = linearizer.cost(states, rows, weights, aids.used)
+        step = yield from linearizer.solve_steps(states, rows, used.beams, used.aids)
+        cost = linearizer.cost(states, rows, used.beams, used.aids)
         yield 0.005 * problem.n_keyframes
         states, rows = yield from descend_steps(
-            linearizer, states, step, weights, cost, aid_weights=aids.used
+            linearizer, states, step, used.beams, cost, aid_weights=used.aids
         )
         # What is judged as settled is the step that was wanted, however little of it was taken.
         wanted, sigma = np.concatenate([step.step.ravel(), step.constants_step]), step.sigma
@@ -298,18 +314,21 @@ class SsmSmoother:
                 "noise of [imu], and the initial heading"
             )
         t = self._mahalanobis_sq(problem, rows, step)
-        settled = faults.leave_out(kernel.weight(t))
-        change = float(np.max(np.abs(settled - weights), initial=0.0))
-        change = max(change, aids.judge(states, step))
-        return Pass(states, step, rows, t, settled, float(np.max(np.abs(wanted) / sigma)), change)
-
-    def _aids(self, linearizer: GraphLinearizer, first: FirstValues) -> AidWeighing:
-        return AidWeighing(
-            linearizer.weighted,
-            first.aid_weights,
-            wanted=self.config.kernel,
-            warm=WARM_KERNEL,
-            judged_by=self.config.judged_by,
+        settled = faults.leave_out(used.of_beams.kernel.weight(t))
+        aids = linearizer.weighted
+        aid_t = aids.mahalanobis_sq(states, step, self.config.judged_by)
+        aid_settled = used.of_aids.kernel.weight(aid_t, dim=aids.dim)
+        change = np.concatenate([settled - used.beams, aid_settled - used.aids])
+        return Pass(
+            states,
+            step,
+            rows,
+            t,
+            settled,
+            aid_t,
+            aid_settled,
+            update_sigmas=float(np.max(np.abs(wanted) / sigma)),
+            weight_change=float(np.max(np.abs(change), initial=0.0)),
         )
 
     def _mahalanobis_sq(self, problem: Problem, rows: BeamRows, step: ChainSolution) -> Array:
@@ -320,14 +339,14 @@ class SsmSmoother:
             spread = step.variance(beams.keyframe, H)
         return expected_mahalanobis_sq(rows.error, spread, sigma=beams.sigma)
 
-    def _cost(self, linearizer: GraphLinearizer, last: Pass, aids: AidWeighing) -> float:
-        """Return the cost with each beam's robust loss in place of its weighted square."""
+    def _cost(self, linearizer: GraphLinearizer, last: Pass) -> float:
+        """Return the cost with the robust losses of beams and aids for their weighted squares."""
         kernel, rows = self.config.kernel, last.beam_rows
         t = (rows.error / linearizer.problem.beams.sigma) ** 2
         loss = kernel.similarity(np.zeros_like(t)) - kernel.similarity(t)
-        no_aids = np.zeros(len(linearizer.weighted))
-        others = linearizer.cost(last.states, rows, np.zeros_like(t), no_aids)
-        return others + float(np.sum(loss)) + aids.cost(last.states)
+        aids = linearizer.weighted
+        others = linearizer.cost(last.states, rows, np.zeros_like(t), np.zeros(len(aids)))
+        return others + float(np.sum(loss)) + aids.loss(last.states, aid_kernel(kernel))
 
     def _estimate(self, solved: Solved, noise: NoiseFound, *, wall_s: float) -> Estimate:
         linearizer, last, status = solved.linearizer, solved.last, solved.status
@@ -336,7 +355,9 @@ class SsmSmoother:
             f"{last.weight_change:.1e}"
         )
         doubts = contradictions(linearizer, last.states, last.beam_rows, last.weights)
-        judged = solved.aids.judged(last.states, linearizer.problem.keyframe_s)
+        judged = linearizer.weighted.judged(
+            last.states, linearizer.problem.keyframe_s, last.aid_mahalanobis_sq, last.aid_weights
+        )
         doubts += doubts_of_aids(judged)
         doubts += ambiguous_beacons(
             last.states,
@@ -372,7 +393,7 @@ class SsmSmoother:
             ),
             iterations=solved.iterations,
             wall_s=wall_s,
-            cost=self._cost(linearizer, last, solved.aids),
+            cost=self._cost(linearizer, last),
             start=problem.start,
             notes=solved.notes + noise_notes(noise) + undetermined(calibration),
             calibration=calibration,

@@ -29,7 +29,7 @@ from ssm_graph.engine.states import States
 from ssm_graph.graph.beam_rows import BeamRows, WaterRows
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.mission.calibration import CALIBRATIONS, DRIFTS
-from ssm_graph.mission.problem import Problem, with_stated_noise
+from ssm_graph.mission.problem import Problem
 
 Mask = NDArray[np.bool_]
 
@@ -269,16 +269,17 @@ def _kept(extras: Extras) -> Extras:
 
 
 class FaultWatch:
-    """Keeps the beams out of a solution that the search finds, while it is iterated."""
+    """Keeps the beams out of a solution that the search finds, while it is iterated.
+
+    It has no drifts among its variables, so it counts the noise of the ``problem`` as stated.
+    """
 
     def __init__(self, problem: Problem, search: FaultSearch | None) -> None:
         self._search = search
         self._extras, self._kept = problem.extras, _kept(problem.extras)
         self._linearizer = None
         if search is not None:
-            self._linearizer = GraphLinearizer(
-                replace(with_stated_noise(problem), extras=self._kept)
-            )
+            self._linearizer = GraphLinearizer(replace(problem, extras=self._kept))
         self._beams, self._time_s = problem.beams, problem.keyframe_s[problem.beams.keyframe]
         self._found = Found(np.zeros(len(self._time_s), dtype=bool), ())
         self._n_looks = 0

@@ -15,18 +15,22 @@ from typing import NamedTuple
 import numpy as np
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.base.stepwise import Steps, finished
+from ssm_graph.base.stepwise import Steps, at_once
 from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.engine.extras import with_extras
 from ssm_graph.graph.measurements import aid_table, doubts_of_aids
+from ssm_graph.mission.answer import RecursiveBeams, recursive_estimate
 from ssm_graph.mission.estimate import Estimate, OnKeyframe
 from ssm_graph.mission.problem import Problem, start_of, with_white_noise
-from ssm_graph.mission.recursive import RecursiveBeams, recursive_estimate
-from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
 from ssm_graph.smoothers.keyframe import keyframes_of, sensors_of
-from ssm_graph.smoothers.stretch import Stretch, joined
-from ssm_graph.smoothers.variables import calibration_of_last, current_along, undetermined
-from ssm_graph.smoothers.window import Window
+from ssm_graph.smoothers.track import (
+    Stretch,
+    calibration_of_last,
+    current_along,
+    joined,
+    undetermined,
+)
+from ssm_graph.smoothers.window import FixedLagConfig, Window
 from ssm_graph.smoothers.window_graph import beam_rows
 
 __all__ = ["FixedLagConfig", "FixedLagEstimates", "FixedLagRun", "run_fixed_lag", "solve_fixed_lag"]
@@ -51,10 +55,7 @@ class FixedLagEstimates(NamedTuple):
 
 
 def solve_fixed_lag(
-    problem: Problem,
-    config: FixedLagConfig | None = None,
-    *,
-    on_keyframe: OnKeyframe | None = None,
+    problem: Problem, config: FixedLagConfig | None = None, *, on_keyframe: OnKeyframe | None = None
 ) -> FixedLagEstimates:
     """Return the newest states of a mission and those that left the window, as estimates.
 
@@ -75,17 +76,10 @@ def solve_fixed_lag(
     )
 
 
-def run_fixed_lag(
-    problem: Problem, config: FixedLagConfig, *, on_keyframe: OnKeyframe | None = None
-) -> FixedLagRun:
-    """Go through the keyframes one by one."""
-    return finished(run_fixed_lag_steps(problem, config, on_keyframe=on_keyframe))
-
-
 def run_fixed_lag_steps(
     problem: Problem, config: FixedLagConfig, *, on_keyframe: OnKeyframe | None = None
 ) -> Steps[FixedLagRun]:
-    """Make :func:`run_fixed_lag` in steps."""
+    """Go through the keyframes one by one."""
     problem = with_white_noise(problem)
     keyframes = keyframes_of(problem)
     first = next(keyframes)
@@ -104,6 +98,9 @@ def run_fixed_lag_steps(
     return FixedLagRun(joined(newest), joined(delayed), np.array(n_iterations, float))
 
 
+run_fixed_lag = at_once(run_fixed_lag_steps)
+
+
 def _estimate(
     problem: Problem,
     config: FixedLagConfig,
@@ -120,9 +117,7 @@ def _estimate(
     calibration = calibration_of_last(sensors.extras, track, span_s=span_s)
     estimate = recursive_estimate(
         replace(
-            problem,
-            extras=extras.without([block.name for block in sensors.extras.blocks]),
-            aids=(),
+            problem, extras=extras.without([block.name for block in sensors.extras.blocks]), aids=()
         ),
         track.states,
         track.covariance[:, :STATE_DIM, :STATE_DIM],

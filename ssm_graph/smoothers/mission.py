@@ -9,7 +9,7 @@ import numpy as np
 
 from ssm_graph.base.errors import SolverError
 from ssm_graph.base.frames import wrap_to_pi
-from ssm_graph.base.stepwise import Steps, finished
+from ssm_graph.base.stepwise import Steps, at_once
 from ssm_graph.mission.estimate import Estimate, Status
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.problem import Problem, ProblemConfig, build_problem_steps
@@ -28,14 +28,14 @@ POOR_HEADING = np.radians(3.0)
 OnStage = Callable[[str], None]
 
 
-def smooth(
+def smooth_steps(
     mission: Mission,
     config: SmootherConfig | None = None,
     *,
     problem_config: ProblemConfig | None = None,
     on_iteration: OnIteration | None = None,
     on_stage: OnStage | None = None,
-) -> Estimate:
+) -> Steps[Estimate]:
     """Smooth a mission; without an initial state, align first.
 
     Where alignment finds no safe heading, several are smoothed and the one that explains the data
@@ -55,26 +55,6 @@ def smooth(
     SsmGraphError
         With a sentence that says what is wrong, if the mission cannot be smoothed.
     """
-    return finished(
-        smooth_steps(
-            mission,
-            config,
-            problem_config=problem_config,
-            on_iteration=on_iteration,
-            on_stage=on_stage,
-        )
-    )
-
-
-def smooth_steps(
-    mission: Mission,
-    config: SmootherConfig | None = None,
-    *,
-    problem_config: ProblemConfig | None = None,
-    on_iteration: OnIteration | None = None,
-    on_stage: OnStage | None = None,
-) -> Steps[Estimate]:
-    """Make :func:`smooth` in steps."""
     say = on_stage or (lambda _: None)
     smoother = SsmSmoother(config or SmootherConfig(fault_search=FaultSearch()))
     if mission.initial is not None:
@@ -99,6 +79,9 @@ def smooth_steps(
             break
     chosen = _choose([estimate for estimate in estimates if estimate is not None], alignment)
     return _with_notes(chosen, (*mission.notes, f"aligned: {alignment.method}"))
+
+
+smooth = at_once(smooth_steps)
 
 
 def _try_steps(

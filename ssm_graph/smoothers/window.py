@@ -4,25 +4,66 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Self
 
 import numpy as np
 
 from factors.inertial import Intervals
-from factors.similarity import Similarity, expected_mahalanobis_sq
-from ssm_graph.base.errors import SolverError
+from factors.similarity import Kernel, LogKernel, Similarity, expected_mahalanobis_sq
+from ssm_graph.base.errors import ConfigError, SolverError
 from ssm_graph.base.frozen import Array
-from ssm_graph.base.stepwise import Steps, finished
+from ssm_graph.base.stepwise import Steps, at_once
 from ssm_graph.base.times import MIN_SPACING_S
 from ssm_graph.engine.error_state import InitialMoments, Linearised
 from ssm_graph.engine.marginal_prior import moved_chart
-from ssm_graph.engine.reweighting import Mixing
+from ssm_graph.engine.reweighting import Anderson
 from ssm_graph.engine.states import States
 from ssm_graph.graph.first_weights import met_weights, updated_trust
-from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors
-from ssm_graph.smoothers.stretch import Stretch
+from ssm_graph.smoothers.track import Stretch
 from ssm_graph.smoothers.window_graph import WindowGraph, inertial_data
+
+
+@dataclass(frozen=True, slots=True)
+class FixedLagConfig:
+    """Settings of the fixed-lag smoother."""
+
+    lag_s: float = 30.0
+    """Keyframes older than this are marginalised; zero makes it the filter."""
+    kernel: Kernel = field(default_factory=LogKernel)
+    similarity: Similarity = Similarity.EXPECTED
+    max_iterations: int = 50
+    tolerance: float = 1e-8
+    """Largest update, in its own posterior sigmas, at which a keyframe's iteration ends; not below
+    1e-7 while the window has several."""
+    linearised: Linearised = Linearised.EACH_PASS
+    relinearise_sigmas: float = 1e-5
+    """A keyframe of several is linearised anew once its attitude has moved by so many posterior
+    sigmas, or anything else, which bends the measurements far less, by ten times as many."""
+    relinearise_turn: float = 0.0
+    """And only if its attitude has moved by so many rad, or its velocity by a hundred times as many
+    m/s: what is less bends nothing, however certain."""
+    reweigh: float = 1e-9
+    """A beam's weight, in a window of several keyframes, is renewed once it is off by so much."""
+    gate_sigmas: float = np.inf
+    """Depth and GNSS further than this from what is predicted are left out."""
+    first_estimates: bool = False
+    """Keep the oldest keyframe where its prior was made, with the Jacobians of that point."""
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.lag_s) and self.lag_s >= 0.0):
+            raise ConfigError(f"lag_s: expected zero or more seconds, got {self.lag_s}")
+        if self.max_iterations < 1:
+            raise ConfigError(f"max_iterations: expected 1 or more, got {self.max_iterations}")
+        if not 0.0 < self.tolerance < 1.0:
+            raise ConfigError(f"tolerance: expected a number in (0, 1), got {self.tolerance}")
+        for name in ("relinearise_sigmas", "relinearise_turn", "reweigh"):
+            if not 0.0 <= getattr(self, name) < 1.0:
+                raise ConfigError(f"{name}: expected a number in [0, 1), got {getattr(self, name)}")
+        if self.linearised is Linearised.ONCE and self.lag_s > 0.0:
+            raise ConfigError(f"linearised once: expected with lag_s zero, got {self.lag_s}")
+
 
 _PACKED = ("step", "covariance", "innovation", "weights", "t", "trust")
 RUNAWAY_SPEED = 100.0
@@ -217,22 +258,20 @@ class Window:
         if not (speed < RUNAWAY_SPEED and np.all(np.isfinite(newest.covariance))):
             raise SolverError(f"the answer ran away, {speed:.3g} m/s")
 
-    def iterate(self) -> int:
-        """Reweight and solve until the window has settled; return the number of passes."""
-        return finished(self.iterate_steps())
-
     def iterate_steps(self) -> Steps[int]:
-        """Make :meth:`iterate` in steps, pass by pass."""
+        """Reweight and solve until the window has settled; return the number of passes."""
         is_linear = self.config.linearised is Linearised.ONCE
         n_passes = self._reweigh() if is_linear else (yield from self._settle_steps())
         is_idle = len(self.keyframes) == 1 and not self.keyframes[0].is_measured
         return 0 if is_idle else n_passes
 
+    iterate = at_once(iterate_steps)
+
     def _settle_steps(self) -> Steps[int]:
         """Solve and reweigh; what has moved is linearised anew at each pass."""
         config, n_keyframes = self.config, len(self.keyframes)
         tolerance = max(config.tolerance, ROUNDING) if n_keyframes > 1 else config.tolerance
-        mixing = Mixing()
+        anderson: Anderson | None = None
         for number in range(1, config.max_iterations + 1):
             update = self._solve()
             self._relinearise()
@@ -245,7 +284,8 @@ class Window:
                 # A single keyframe's weights are those of the filter, pass by pass.
                 if n_keyframes > 1:
                     used = np.concatenate([self._weights, self._graph.aids.weights])
-                    settled = mixing.next_weights(used, settled)
+                    anderson = Anderson.after(anderson, used, settled)
+                    settled = anderson.weights
                 self._renew(settled)
         return number
 

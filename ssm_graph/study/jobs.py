@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Final, NamedTuple
 
 import numpy as np
 
+import factors.similarity
 from ssm_graph.base.frozen import Array
 from ssm_graph.simulation import Grade
 from ssm_graph.study.cells import Recording, Source
-from ssm_graph.study.code import code_version
 from ssm_graph.study.methods import parse_method, shown
 from ssm_graph.study.scoring import LOST, Row, failed_row, score
 from ssm_graph.study.trials import Trial, recorded_trial, simulated_trials
@@ -137,3 +141,26 @@ def failed_job(job: Job, message: str, **status: str) -> JobResult:
 def lost_job(job: Job, message: str) -> JobResult:
     """Return the result of a job that took its process with it."""
     return failed_job(job, message, status=LOST)
+
+
+_LEFT_OUT: Final = ("report", "cli")
+"""Parts of the package that no number of a study depends on."""
+
+
+@cache
+def code_version() -> str:
+    """Return the package version with a digest of all that a study's numbers depend on.
+
+    The version alone does not do: between releases the source changes. The versions of GTSAM,
+    NumPy and SciPy are part of the digest.
+    """
+    package, others = Path(__file__).parents[1], Path(factors.similarity.__file__).parent
+    sources = {p.relative_to(package).as_posix(): p for p in package.rglob("*.py")}
+    digest = hashlib.sha256()
+    for name in sorted(name for name in sources if name.split("/")[0] not in _LEFT_OUT):
+        digest.update(f"ssm_graph/{name}\0".encode() + sources[name].read_bytes())
+    for path in sorted(others.glob("*.py")):
+        digest.update(f"factors/{path.name}\0".encode() + path.read_bytes())
+    for name in ("gtsam", "numpy", "scipy"):
+        digest.update(f"{name} {version(name)}\0".encode())
+    return f"{version('ssm-graph')}+{digest.hexdigest()[:10]}"

@@ -7,17 +7,12 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Final
 
-from factors.kernels import KERNELS, KernelChoice
-from factors.m_estimators import TruncatedKernel
+from factors.kernels import KERNELS, KernelChoice, TruncatedKernel
 from factors.similarity import GaussianKernel, Similarity
 from ssm_graph.base.errors import ConfigError, SsmGraphError, nearest_hint
 from ssm_graph.engine.reweighting import Graduation
 from ssm_graph.filters.geodetic.filter import GeodeticConfig
-from ssm_graph.filters.navigation.named import (
-    FILTERS,
-    filter_geodetic,
-    filter_problems,
-)
+from ssm_graph.filters.navigation.named import FILTERS, filter_geodetic, filter_problems
 from ssm_graph.mission.estimate import Estimate, OnKeyframe
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.problem import ProblemConfig, build_problem

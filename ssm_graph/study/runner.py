@@ -6,6 +6,7 @@ from collections.abc import Callable, Container, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final, cast
 
@@ -14,8 +15,7 @@ from ssm_graph.mission.estimate import Estimate
 from ssm_graph.mission.mission import Reference
 from ssm_graph.simulation import Grade, OutlierKind
 from ssm_graph.study.cells import Cell, Recording, Source
-from ssm_graph.study.code import code_version
-from ssm_graph.study.jobs import Execute, Job, JobResult, RunKey, do_job
+from ssm_graph.study.jobs import Execute, Job, JobResult, RunKey, code_version, do_job
 from ssm_graph.study.methods import parse_method
 from ssm_graph.study.scenario import Study
 from ssm_graph.study.scoring import Row
@@ -88,10 +88,6 @@ def run_study(
                 n_done += result.job.n_runs
                 if on_progress is not None:
                     on_progress(Progress(n_done, n_wanted, _label(result.job)))
-    return _gather(study, store)
-
-
-def _gather(study: Study, store: StudyStore) -> StudyResult:
     rows: dict[RunKey, Row] = {key: store[key] for key in wanted_keys(study)}
     series = gather_series(store.samples(), rows)
     return StudyResult(tuple(rows.values()), series, store.settings["code"])
@@ -139,16 +135,12 @@ def missing_jobs(study: Study, done: Container[RunKey]) -> list[Job]:
     Cells of the same seeds follow each other: a process that simulates those seeds for the first
     cell only draws the DVL for the others.
     """
-    jobs = []
+    jobs, length_of = [], attrgetter("duration_s")
     for grade in study.grades:
-        for length, sources in groupby(sorted(study.sources, key=_length), key=_length):
+        for length, sources in groupby(sorted(study.sources, key=length_of), key=length_of):
             size = block_size(length)
             jobs += list(_jobs_of(study, grade, tuple(sources), size, done))
     return jobs
-
-
-def _length(source: Source) -> float:
-    return source.duration_s
 
 
 def _jobs_of(

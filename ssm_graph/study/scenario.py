@@ -111,10 +111,7 @@ _STUDY: Final = {
     "cases": keys.tables(),
     "baseline": keys.text(),
 }
-_METHODS: Final = {
-    "names": keys.texts(keys.REQUIRED),
-    "seeds": keys.positive_count(DEFAULT_SEEDS),
-}
+_METHODS: Final = {"names": keys.texts(keys.REQUIRED), "seeds": keys.positive_count(DEFAULT_SEEDS)}
 _CASE: Final = {
     "name": keys.text(),
     "kinds": keys.texts(("none",)),

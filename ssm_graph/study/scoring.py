@@ -100,7 +100,8 @@ def score(labels: Row, trial: Trial, outcome: Outcome) -> tuple[Row, Array]:
 def _score(labels: Row, trial: Trial, outcome: Estimate) -> tuple[Row, Array]:
     metrics = _metrics(trial, outcome)
     numbers = dict.fromkeys(NUMBER_COLUMNS, math.nan)
-    numbers |= _length(outcome) if metrics is None else _errors(metrics)
+    numbers["path_length_m"] = path_length_m(outcome.trajectory)
+    numbers |= {} if metrics is None else _errors(metrics)
     numbers |= _weights(trial, outcome)
     numbers |= {"iterations": outcome.n_iterations, "wall_s": outcome.wall_s}
     is_known = math.isfinite(numbers["horizontal_rms_m"]) or trial.simulated is None
@@ -120,17 +121,14 @@ def _metrics(trial: Trial, estimate: Estimate) -> Metrics | None:
     None without a common time with a reference: nothing may be finite.
     """
     trajectory = since_first_ping(estimate.trajectory)
-    reference = trial.reference_at(trajectory.time_s)
+    told, truth = trial.simulated, trial.mission.reference
+    reference = truth if told is None else told.truth_at(trajectory.time_s)
     if reference is None:
         return None
     try:
         return evaluate(trajectory, reference)
     except DataError:
         return None
-
-
-def _length(estimate: Estimate) -> dict[str, float]:
-    return {"path_length_m": path_length_m(estimate.trajectory)}
 
 
 def _errors(metrics: Metrics) -> dict[str, float]:

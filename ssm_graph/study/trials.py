@@ -11,10 +11,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ssm_graph.base.frozen import Array
 from ssm_graph.graph.first_values import FirstValues
 from ssm_graph.io.mission_folder.folder import read_mission
-from ssm_graph.mission.mission import Mission, Reference
+from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.problem import Problem, build_problem, with_dvl
 from ssm_graph.mission.start.alignment import align
 from ssm_graph.simulation import Grade, SimulatedMission, simulate, with_dvl_errors
@@ -69,12 +68,6 @@ class Trial:
     def duration_s(self) -> float:
         """Length of the inertial data, s."""
         return float(self.mission.imu.time_s[-1] - self.mission.imu.start_s)
-
-    def reference_at(self, time_s: Array) -> Reference | None:
-        """Return the truth at any times, or the recorded reference; None where there is none."""
-        if self.simulated is None:
-            return self.mission.reference
-        return self.simulated.truth_at(time_s)
 
 
 class MissionCache:

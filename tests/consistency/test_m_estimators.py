@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from factors.kernels import KERNELS
-from factors.m_estimators import HuberKernel, TruncatedKernel
+from factors.kernels import KERNELS, HuberKernel, TruncatedKernel
 from factors.similarity import GaussianKernel
 from ssm_graph.engine.reweighting import GncStart, Graduation
 from ssm_graph.evaluation import evaluate

@@ -14,7 +14,7 @@ from ssm_graph.mission.estimate import Status, Trajectory
 from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.sensors.imu import ImuNoise
 from ssm_graph.simulation import DepthSettings, DvlSettings, GnssSettings, Grade, Loss
-from ssm_graph.simulation.grades import IMU_NOISE, START_SIGMAS, StartSigmas
+from ssm_graph.simulation.inertial import IMU_NOISE, START_SIGMAS, StartSigmas
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
 from tests.helpers import covariances, estimated_states, simulated, state_errors
 

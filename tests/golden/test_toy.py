@@ -14,7 +14,8 @@ from ssm_graph.filters.rules.correntropy import CorrentropyUpdate
 from ssm_graph.filters.rules.kalman import KalmanUpdate
 from ssm_graph.filters.rules.ssm import Floor, SsmUpdate, StopRule
 from ssm_graph.filters.rules.student import Scale, StudentUpdate
-from ssm_graph.filters.rules.update import LinearModel, LinearSystem, UpdateRule, run_linear_filter
+from ssm_graph.filters.rules.update import UpdateRule
+from tests.linear_filter import LinearModel, LinearSystem, run_linear_filter
 
 GOLDEN = Path(__file__).parents[2] / "../shared/golden/toy_a.npz"
 pytestmark = pytest.mark.skipif(not GOLDEN.is_file(), reason=f"no golden vectors in {GOLDEN}")

@@ -11,7 +11,7 @@ from ssm_graph.base.frames import wrap_to_pi
 from ssm_graph.mission.estimate import Status
 from ssm_graph.mission.mission import Aids
 from ssm_graph.mission.start.alignment import align
-from ssm_graph.mission.start.body_velocity import body_velocities
+from ssm_graph.mission.start.measured import body_velocities
 from ssm_graph.sensors.compass import HeadingErrors
 from ssm_graph.sensors.standstill import Standstill
 from ssm_graph.simulation import (

@@ -13,7 +13,7 @@ from ssm_graph.base.frames import wrap_to_pi
 from ssm_graph.mission.estimate import Status
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.start.alignment import N_HYPOTHESES, SAFE_HEADING_SIGMA, align
-from ssm_graph.mission.start.body_velocity import body_velocities
+from ssm_graph.mission.start.measured import body_velocities
 from ssm_graph.simulation import (
     GnssSettings,
     Grade,

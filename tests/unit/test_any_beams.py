@@ -20,7 +20,7 @@ from ssm_graph.live.protocols.json_messages import decode_message, encode_messag
 from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.problem import build_problem
-from ssm_graph.mission.start.body_velocity import body_velocities
+from ssm_graph.mission.start.measured import body_velocities
 from ssm_graph.sensors.dvl import DvlLog, Ping
 from tests.mission_damage import lines, new_column, toml
 from tests.mission_fixture import make_mission, write_example

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, V, X
 
-import ssm_graph.filters.navigation.process as process_module
+import ssm_graph.filters.navigation.filter as process_module
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import POSITION, VELOCITY
 from ssm_graph.engine.states import NavigationStates, local_D_deviation
-from ssm_graph.filters.navigation.process import Process
+from ssm_graph.filters.navigation.filter import Process
 from ssm_graph.imu.preintegration import gtsam_gravity
 from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.simulation import Grade

@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from factors.m_estimators import HuberKernel, TruncatedKernel
+from factors.kernels import HuberKernel, TruncatedKernel
 from factors.similarity import ExpKernel, LogKernel, Similarity
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.engine.reweighting import Graduation

@@ -38,11 +38,10 @@ from ssm_graph.filters.geodetic.mechanisation import (
 from ssm_graph.filters.navigation.named import filter_geodetic
 from ssm_graph.filters.side_by_side import side_by_side
 from ssm_graph.imu.preintegration import INTEGRATION_DENSITY, imu_params
+from ssm_graph.mission.answer import trajectory_from_states
 from ssm_graph.mission.estimate import Status
 from ssm_graph.mission.mission import Mission
-from ssm_graph.mission.problem import Problem, build_problem
-from ssm_graph.mission.start import moments
-from ssm_graph.mission.trajectory import trajectory_from_states
+from ssm_graph.mission.problem import Problem, build_problem, start_of
 from ssm_graph.simulation import (
     GnssSettings,
     Grade,
@@ -263,9 +262,7 @@ def test_start_is_that_of_the_graph() -> None:
     problem = build_problem(sim.mission)
     history = run_geodetic([problem], [sim.mission.imu])
     states = to_navigation(problem, history, 0)
-    expected = moments.initial_moments(
-        problem.start, problem.frame, bias_sigma=problem.imu_noise_bias_sigma
-    )
+    expected = start_of(problem)
     np.testing.assert_allclose(states.R_nb[0], expected.R_nb, atol=1e-14)
     np.testing.assert_allclose(states.p_n[0], expected.p_n, atol=1e-8)
     np.testing.assert_allclose(states.v_n[0], expected.v_n, atol=1e-14)

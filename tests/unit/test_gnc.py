@@ -8,10 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from factors.m_estimators import HuberKernel, TruncatedKernel
+from factors.kernels import HuberKernel, TruncatedKernel
 from factors.similarity import WEIGHT_FLOOR, GaussianKernel, LogKernel
 from ssm_graph.base.errors import ConfigError
-from ssm_graph.engine.reweighting import GncSchedule, GncStart, Graduation, first_mu
+from ssm_graph.engine.reweighting import (
+    GncSchedule,
+    GncStart,
+    Graduation,
+    Schedule,
+    first_mu,
+)
 from ssm_graph.mission.estimate import Estimate, Status
 from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.simulation import OutlierKind, Outliers
@@ -38,17 +44,17 @@ def test_first_mu_by_hand() -> None:
 
 def test_schedule_by_hand() -> None:
     """Least squares until it is near, then mu by the remark, then 1.4 times as much each time."""
-    schedule = GncSchedule(TruncatedKernel(2.0), Graduation(), LogKernel())
+    schedule: Schedule = GncSchedule.begin(TruncatedKernel(2.0), Graduation(), LogKernel())
     t = np.array([0.01, 1.0, 100.0])
     ones = schedule.first_weights(np.array([1.0, 0.5, 1e-8]))
     np.testing.assert_array_equal(ones, 1.0)
-    far = schedule.next_weights(ones, ones, t=t, update_sigmas=5.0)
+    schedule, far = schedule.after(ones, ones, t=t, update_sigmas=5.0)
     np.testing.assert_array_equal(far, 1.0)
     assert str(schedule.kernel) == "gaussian"
     assert not schedule.may_end(ones)
     mu = 4.0 / 196.0
     for _ in range(3):
-        weights = schedule.next_weights(ones, ones, t=t, update_sigmas=0.5)
+        schedule, weights = schedule.after(ones, ones, t=t, update_sigmas=0.5)
         assert schedule.kernel == TruncatedKernel(2.0, mu=mu)
         # eq. (14), in the words of the paper.
         for r, weight in zip(np.sqrt(t), weights, strict=True):
@@ -64,25 +70,25 @@ def test_schedule_by_hand() -> None:
 def test_weights_stay_while_their_solution_is_far_but_not_for_ever() -> None:
     """Five passes at most, for least squares on outliers may never settle."""
     width = TruncatedKernel().width
-    schedule = GncSchedule(TruncatedKernel(), Graduation(mu_step=2.0), LogKernel())
+    schedule: Schedule = GncSchedule.begin(TruncatedKernel(), Graduation(mu_step=2.0), LogKernel())
     t = np.array([1.0, 1e4])
     used = np.array([0.7, 0.3])
     for mu in (None, first_mu(1e4, width)):
         for _ in range(4):
-            kept = schedule.next_weights(used, np.ones(2), t=t, update_sigmas=7.0)
+            schedule, kept = schedule.after(used, np.ones(2), t=t, update_sigmas=7.0)
             np.testing.assert_array_equal(kept, np.ones(2) if mu is None else used)
             kernel = str(schedule.kernel)
             assert kernel == ("gaussian" if mu is None else str(TruncatedKernel(mu=mu)))
-        schedule.next_weights(used, np.ones(2), t=t, update_sigmas=7.0)
+        schedule, _ = schedule.after(used, np.ones(2), t=t, update_sigmas=7.0)
     assert schedule.kernel == TruncatedKernel(mu=2.0 * first_mu(1e4, width))
-    schedule.next_weights(used, np.ones(2), t=t, update_sigmas=0.9)
+    schedule, _ = schedule.after(used, np.ones(2), t=t, update_sigmas=0.9)
     assert schedule.kernel == TruncatedKernel(mu=4.0 * first_mu(1e4, width))
 
 
 def test_only_binary_weights_are_an_answer() -> None:
     """The floor counts as 0."""
-    schedule = GncSchedule(TruncatedKernel(), Graduation(), LogKernel())
-    schedule.next_weights(np.ones(2), np.ones(2), t=np.array([1.0, 1e4]), update_sigmas=0.0)
+    schedule: Schedule = GncSchedule.begin(TruncatedKernel(), Graduation(), LogKernel())
+    schedule, _ = schedule.after(np.ones(2), np.ones(2), t=np.array([1.0, 1e4]), update_sigmas=0.0)
     assert schedule.may_end(np.array([1.0, WEIGHT_FLOOR, 0.99995]))
     assert not schedule.may_end(np.array([1.0, 0.999, WEIGHT_FLOOR]))
     assert not schedule.may_end(np.array([1.0, 0.01]))
@@ -90,7 +96,9 @@ def test_only_binary_weights_are_an_answer() -> None:
 
 def test_a_gated_start_keeps_the_weights_of_the_forward_pass() -> None:
     """And the warm kernel, until it is near."""
-    schedule = GncSchedule(TruncatedKernel(), Graduation(GncStart.GATED), LogKernel())
+    schedule: Schedule = GncSchedule.begin(
+        TruncatedKernel(), Graduation(GncStart.GATED), LogKernel()
+    )
     gated = np.array([1.0, 1e-8])
     assert schedule.first_weights(gated) is gated
     assert schedule.kernel == LogKernel()

@@ -13,12 +13,11 @@ from hypothesis import strategies as st
 from scipy.integrate import quad_vec
 from scipy.spatial.transform import Rotation
 
+from factors.so3 import left_jacobian_solve, left_jacobian_times
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.imu.increments import (
     MergedSamples,
-    _left_jacobian_solve,
-    _left_jacobian_times,
     merge_samples,
 )
 from ssm_graph.sensors.imu import ImuLog
@@ -249,25 +248,25 @@ vectors = st.tuples(*[st.floats(-3.0, 3.0)] * 3).map(np.array)
 
 @STEADY
 @given(axis=vectors, log_angle=st.floats(-9.0, 0.45), vector=vectors)
-def test_left_jacobian_is_the_mean_rotation(axis: Array, log_angle: float, vector: Array) -> None:
+def testleft_jacobian_is_the_mean_rotation(axis: Array, log_angle: float, vector: Array) -> None:
     """``int_0^1 Exp(s phi) ds v`` by quadrature, from 1e-9 to 2.8 rad; the solve undoes it."""
     phi = 10.0**log_angle * axis / max(float(np.linalg.norm(axis)), 1e-6)
     s, weights = np.polynomial.legendre.leggauss(16)
     turned = Rotation.from_rotvec(0.5 * (s[:, None] + 1.0) * phi).apply(vector)
     expected = 0.5 * weights @ turned
-    got = _left_jacobian_times(phi, vector)
+    got = left_jacobian_times(phi, vector)
     np.testing.assert_allclose(got, expected, rtol=0.0, atol=1e-12)
-    np.testing.assert_allclose(_left_jacobian_solve(phi, got), vector, rtol=0.0, atol=1e-11)
+    np.testing.assert_allclose(left_jacobian_solve(phi, got), vector, rtol=0.0, atol=1e-11)
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.00999999, 0.01000001])
-def test_left_jacobian_has_no_seam(angle: float) -> None:
+def testleft_jacobian_has_no_seam(angle: float) -> None:
     """Either side of the switch to the series both forms agree to rounding."""
     phi, vector = angle * np.array([0.6, 0.0, 0.8]), np.array([1.0, -2.0, 3.0])
     s, weights = np.polynomial.legendre.leggauss(8)
     expected = 0.5 * weights @ Rotation.from_rotvec(0.5 * (s[:, None] + 1.0) * phi).apply(vector)
-    np.testing.assert_allclose(_left_jacobian_times(phi, vector), expected, rtol=0.0, atol=5e-14)
-    np.testing.assert_allclose(_left_jacobian_solve(phi, expected), vector, rtol=0.0, atol=5e-14)
+    np.testing.assert_allclose(left_jacobian_times(phi, vector), expected, rtol=0.0, atol=5e-14)
+    np.testing.assert_allclose(left_jacobian_solve(phi, expected), vector, rtol=0.0, atol=5e-14)
 
 
 @pytest.mark.parametrize("rate_hz", [0.0, -20.0, math.nan, math.inf])

@@ -55,7 +55,7 @@ class _Broken:
 
 def test_failures_are_seen() -> None:
     """Raising, holding, numbers that are not finite, refusals too many or not printable."""
-    target = Target("broken", _Broken(), json_traffic)
+    target = Target("broken", cast(Decoder, _Broken()), json_traffic)
     target.feed(b"x", 0.0)
     target.feed(b"y", 0.0)
     target.take()

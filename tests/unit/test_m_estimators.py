@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from scipy.stats import chi2, norm
 
 import ssm_graph
-from factors.kernels import KERNELS, parse_kernel
-from factors.m_estimators import (
+from factors.kernels import (
+    KERNELS,
     WIDTH_OF_99_PERCENT,
     CauchyKernel,
     DcsKernel,
@@ -23,6 +23,7 @@ from factors.m_estimators import (
     HuberKernel,
     MEstimator,
     TruncatedKernel,
+    parse_kernel,
 )
 from factors.similarity import WEIGHT_FLOOR, GaussianKernel, Kernel, LogKernel, Similarity
 from ssm_graph.base.errors import ConfigError

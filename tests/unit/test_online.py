@@ -18,7 +18,7 @@ from ssm_graph.sensors.gnss import Fix
 from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.sensors.messages import Message
 from ssm_graph.smoothers.fixed_lag import solve_fixed_lag
-from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
+from ssm_graph.smoothers.window import FixedLagConfig
 from tests.online_fixture import SHORT, joined, messages, run, stream
 
 

@@ -37,8 +37,8 @@ from ssm_graph.simulation import (
     simulate,
 )
 from ssm_graph.smoothers.fixed_lag import run_fixed_lag
-from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
 from ssm_graph.smoothers.mission import smooth, smooth_steps
+from ssm_graph.smoothers.window import FixedLagConfig
 from tests.online_fixture import SHORT
 
 AT_SURFACE = DepthProfile(0.3, 0.3)

@@ -16,7 +16,8 @@ from ssm_graph.engine.error_state import Linearised
 from ssm_graph.filters.rules.correntropy import CorrentropyUpdate
 from ssm_graph.filters.rules.kalman import Gate, GatedUpdate, KalmanUpdate
 from ssm_graph.filters.rules.ssm import Floor, SsmUpdate, StopRule
-from ssm_graph.filters.rules.update import NOMINAL, Iterate, LinearModel, LinearSystem, Runs
+from ssm_graph.filters.rules.update import NOMINAL, Iterate, Runs
+from tests.linear_filter import LinearModel, LinearSystem
 from tests.update_fixture import (
     ALL_ROWS,
     EACH_ROW,

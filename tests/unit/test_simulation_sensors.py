@@ -32,8 +32,7 @@ from ssm_graph.simulation import (
 )
 from ssm_graph.simulation.aids import depth_log, gnss_log
 from ssm_graph.simulation.dvl_model import beam_ranges, ping_times, true_beam_speeds
-from ssm_graph.simulation.grades import initial_state
-from ssm_graph.simulation.imu_model import averaged_imu, imu_errors
+from ssm_graph.simulation.inertial import averaged_imu, imu_errors, initial_state
 from ssm_graph.simulation.randomness import spawn_streams
 
 LAT, LON = math.radians(-33.0), math.radians(18.0)

@@ -8,8 +8,8 @@ from ssm_graph.base.frames import wrap_to_pi
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.engine.states import States
+from ssm_graph.mission.answer import trajectory_from_states
 from ssm_graph.mission.problem import Problem, build_problem
-from ssm_graph.mission.trajectory import trajectory_from_states
 from ssm_graph.simulation import DiveRoute, Waves
 from tests.helpers import simulated, true_states
 

@@ -42,16 +42,6 @@ def test_left_jacobian_is_the_mean_rotation(angle: float) -> None:
     np.testing.assert_allclose(so3.left_jacobian_solve(phi, moved), arm, rtol=0.0, atol=1e-12)
 
 
-def test_right_jacobian_series_is_the_left_jacobian_of_the_opposite() -> None:
-    """``J_r(phi) = J_l(-phi)``; with nothing to turn it is the identity."""
-    phi = vectors(2.0)
-    series = so3.right_jacobian_series(so3.skew(phi), angle=2.0)
-    np.testing.assert_allclose(series, so3.left_jacobian(-phi), rtol=0.0, atol=1e-14)
-    np.testing.assert_array_equal(
-        so3.right_jacobian_series(np.zeros((2, 6, 6)), angle=0.0)[1], np.eye(6)
-    )
-
-
 def test_skew_is_the_cross_product() -> None:
     """``[a x] b = a x b``."""
     a, b = vectors(1.3), vectors(0.4)[::-1]

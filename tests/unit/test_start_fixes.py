@@ -13,8 +13,7 @@ from ssm_graph.evaluation import evaluate
 from ssm_graph.io.mission_folder.folder import read_mission, write_mission
 from ssm_graph.mission.mission import NO_AIDS, Mission
 from ssm_graph.mission.start.alignment import align
-from ssm_graph.mission.start.body_velocity import BodyVelocities, body_velocities
-from ssm_graph.mission.start.start_fixes import NEAR_S, start_fixes
+from ssm_graph.mission.start.measured import NEAR_S, BodyVelocities, body_velocities, start_fixes
 from ssm_graph.sensors.acoustic import UsblLog
 from ssm_graph.simulation import GnssSettings, Grade, SimulatedMission
 from ssm_graph.smoothers.mission import smooth

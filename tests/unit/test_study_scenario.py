@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ssm_graph.base.errors import ConfigError, DataError
-from ssm_graph.mission.current import CURRENT
+from ssm_graph.mission.calibration import CURRENT
 from ssm_graph.simulation import CurrentSettings, FaultShape, Grade, Loss, OutlierKind, WaterTrack
 from ssm_graph.study.cells import Cell
 from ssm_graph.study.runner import wanted_keys

@@ -13,7 +13,8 @@ from ssm_graph.filters.rules.correntropy import CorrentropyUpdate
 from ssm_graph.filters.rules.kalman import Gate, GatedUpdate, KalmanUpdate
 from ssm_graph.filters.rules.ssm import SsmUpdate
 from ssm_graph.filters.rules.student import Scale, StudentUpdate
-from ssm_graph.filters.rules.update import NOMINAL, LinearModel, LinearSystem, Runs, UpdateRule
+from ssm_graph.filters.rules.update import NOMINAL, Runs, UpdateRule
+from tests.linear_filter import LinearModel, LinearSystem
 from tests.update_fixture import (
     ALL_ROWS,
     EACH_ROW,

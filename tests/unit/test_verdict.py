@@ -12,7 +12,7 @@ import pytest
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.states import States
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.mission.doubts import SUSPECT_STRETCH_S
+from ssm_graph.mission.answer import SUSPECT_STRETCH_S
 from ssm_graph.mission.estimate import Status
 from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.simulation import DiveRoute, GnssSettings, Grade, SimulatedMission, TransitRoute

@@ -20,11 +20,10 @@ from ssm_graph.graph.first_values import first_values
 from ssm_graph.graph.gtsam_graph import gtsam_graph
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.io.raw_log.rows import messages_of
-from ssm_graph.mission.bottom_track import without_water_track
-from ssm_graph.mission.current import CURRENT, CURRENT_UP
+from ssm_graph.mission.calibration import CURRENT, CURRENT_UP
 from ssm_graph.mission.estimate import Estimate, Status
 from ssm_graph.mission.mission import Mission
-from ssm_graph.mission.problem import build_problem, with_dvl
+from ssm_graph.mission.problem import build_problem, with_dvl, without_water_track
 from ssm_graph.mission.start.alignment import align
 from ssm_graph.sensors.compass import HeadingErrors
 from ssm_graph.sensors.current import CurrentModel

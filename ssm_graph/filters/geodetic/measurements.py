@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.similarity import Kernel, expected_mahalanobis_sq
-from factors.so3 import cross, skew
+from factors.so3 import cross, skew, times
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
 from ssm_graph.filters.geodetic.mechanisation import (
@@ -240,9 +240,9 @@ def settle(
         weight[going] = kernel.weight(t)
         S = _with_diagonal(spread[going], sigma_sq[going] / weight[going])
         gain: Array = np.asarray(np.linalg.inv(S))
-        corrected = prior[going] + _times(scaled_PHt[going], _times(gain, innovation[going]))
+        corrected = prior[going] + times(scaled_PHt[going], times(gain, innovation[going]))
         gain = spread[going] @ gain
-        error[going] = innovation[going] - _times(gain, innovation[going])
+        error[going] = innovation[going] - times(gain, innovation[going])
         left = (gain * spread[going]).sum(axis=-1)
         variance_left[going] = np.diagonal(spread[going], axis1=1, axis2=2) - left
         np.maximum(variance_left, 0.0, out=variance_left)
@@ -262,7 +262,3 @@ def _with_diagonal(matrix: Array, added: Array) -> Array:
     diagonal = np.arange(added.shape[1])
     result[:, diagonal, diagonal] += added
     return result
-
-
-def _times(matrix: Array, vector: Array) -> Array:
-    return np.asarray((matrix @ vector[..., None])[..., 0])

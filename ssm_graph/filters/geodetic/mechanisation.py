@@ -28,12 +28,7 @@ import numpy as np
 
 from factors import so3
 from factors.so3 import cross, skew
-from ssm_graph.base.earth import (
-    EARTH_RATE,
-    SEMI_MAJOR_AXIS,
-    normal_gravity,
-    radii_of_curvature,
-)
+from ssm_graph.base.earth import EARTH_RATE, SEMI_MAJOR_AXIS, normal_gravity, radii_of_curvature
 from ssm_graph.base.frames import R_lb_from_roll_pitch_heading, phi_D_roll_pitch_heading
 from ssm_graph.base.frozen import Array
 from ssm_graph.imu.preintegration import INTEGRATION_DENSITY
@@ -315,10 +310,10 @@ def propagate(X: Array, P: Array, track: Track, density: Array) -> tuple[Array, 
     Phi = eye + Ft + Ft_sq @ (0.5 * eye + Ft / 6.0)
     Phi_half = eye + 0.5 * Ft + 0.125 * Ft_sq
     q = density[:, None, None, :] * (piece_s[..., None, None] / 6.0)
-    Q = (4.0 * q * Phi_half) @ _T(Phi_half) + (q * Phi) @ _T(Phi) + q * eye
+    Q = (4.0 * q * Phi_half) @ Phi_half.mT + (q * Phi) @ Phi.mT + q * eye
     for piece in range(F.shape[1]):
         X = (Phi[:, piece] @ X[..., None])[..., 0]
-        P = Phi[:, piece] @ P @ _T(Phi[:, piece]) + Q[:, piece]
+        P = Phi[:, piece] @ P @ Phi[:, piece].mT + Q[:, piece]
     return X, P
 
 
@@ -374,7 +369,7 @@ def feed_back(
     J = so3.left_jacobian(X[:, PHI])
     P = P.copy()
     P[:, PHI] = J @ P[:, PHI]
-    P[:, :, PHI] = P[:, :, PHI] @ _T(J)
+    P[:, :, PHI] = P[:, :, PHI] @ J.mT
     return corrected, np.zeros_like(X), P
 
 
@@ -410,7 +405,7 @@ def initial_moments(
     sigma = np.array(bias_sigmas)[:, None]
     root[:, EPS, EPS] = np.eye(3) * sigma[..., 3:]
     root[:, NABLA, NABLA] = np.eye(3) * sigma[..., :3]
-    return state, np.asarray(root @ _T(root))
+    return state, np.asarray(root @ root.mT)
 
 
 def enu_D_place(lat: Array, height: Array) -> Array:
@@ -431,7 +426,3 @@ def place_D_enu(lat: Array, height: Array) -> Array:
     inverse[:, 1, 0] = 1.0 / forward[:, 0, 1]
     inverse[:, 2, 2] = 1.0
     return inverse
-
-
-def _T(matrix: Array) -> Array:
-    return np.swapaxes(matrix, -1, -2)

@@ -23,17 +23,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.inertial import Intervals, predict
+from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import VELOCITY
 from ssm_graph.engine.states import NavigationStates
 from ssm_graph.filters.navigation.measurements import KeyframeModel
-from ssm_graph.filters.navigation.process import Process
 from ssm_graph.filters.rules.update import UpdateRule
 from ssm_graph.filters.side_by_side import require_alike, side_by_side
+from ssm_graph.imu.preintegration import gravity_gradient, gtsam_gravity
+from ssm_graph.mission.answer import RecursiveBeams, recursive_estimate
 from ssm_graph.mission.estimate import Estimate, OnKeyframe
 from ssm_graph.mission.problem import Problem, start_of
-from ssm_graph.mission.recursive import RecursiveBeams, recursive_estimate
 
 RUNAWAY_SIGMA = 1e4
 """m/s; a filter this uncertain of its velocity has run away."""
@@ -191,12 +193,7 @@ class _Filter:
     ) -> tuple[NavigationStates, Array, tuple[Array, ...]]:
         """Return states, covariances, and what :class:`FilterHistory` keeps of the beams."""
         model = KeyframeModel(
-            self._measured,
-            k,
-            predicted,
-            frame=self._frame,
-            beam_groups=self._groups,
-            before=before,
+            self._measured, k, predicted, frame=self._frame, beam_groups=self._groups, before=before
         )
         present = model.present[:, : model.n_beams]
         nothing = np.full(present.shape, np.nan)
@@ -281,3 +278,31 @@ def estimates_from_history(
             )
         )
     return estimates
+
+
+class Prediction(NamedTuple):
+    """States of B runs at the end of an interval."""
+
+    states: NavigationStates
+    transition: Array
+    """(B, 15, 15) of the error state."""
+    process_cov: Array
+    """(B, 15, 15)"""
+
+
+class Process:
+    """Predicts B runs from keyframe to keyframe."""
+
+    def __init__(self, intervals: Sequence[Intervals], frame: LocalFrame) -> None:
+        columns = zip(*intervals, strict=True)
+        self._intervals = Intervals(*(np.stack(column, axis=1) for column in columns))
+        self._frame = frame
+        self._gravity_gradient = gravity_gradient(frame)
+
+    def predict(self, k: int, states: NavigationStates) -> Prediction:
+        """Predict from keyframe ``k`` to the next."""
+        interval = Intervals(*(column[k] for column in self._intervals))
+        middle = states.p_n + 0.5 * interval.span_s[:, None] * states.v_n
+        g_n = gtsam_gravity(self._frame, middle)
+        moved = predict(interval, states, g_n=g_n, gradient=self._gravity_gradient)
+        return Prediction(NavigationStates(*moved.state), moved.transition, moved.noise(interval))

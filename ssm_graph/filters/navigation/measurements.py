@@ -16,7 +16,7 @@ from ssm_graph.engine.error_state import GYRO_BIAS, POSITION, ROTATION, STATE_DI
 from ssm_graph.engine.states import NavigationStates, local_D_deviation
 from ssm_graph.filters.rules.update import NOMINAL, Iterate, Runs
 from ssm_graph.filters.side_by_side import Measurements
-from ssm_graph.graph.aids.heights import HeightTrack, height_on_the_way, height_track
+from ssm_graph.graph.aids.depth import HeightTrack, height_on_the_way, height_track
 
 
 @dataclass(frozen=True, slots=True)

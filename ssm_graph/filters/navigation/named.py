@@ -26,10 +26,9 @@ from ssm_graph.filters.rules.kalman import Gate, GatedUpdate, KalmanUpdate
 from ssm_graph.filters.rules.ssm import SsmUpdate
 from ssm_graph.filters.rules.student import StudentUpdate
 from ssm_graph.filters.rules.update import UpdateRule
-from ssm_graph.mission.bottom_track import without_water_track
+from ssm_graph.mission.answer import RecursiveBeams, recursive_estimate
 from ssm_graph.mission.estimate import Estimate, OnKeyframe
-from ssm_graph.mission.problem import Problem
-from ssm_graph.mission.recursive import RecursiveBeams, recursive_estimate
+from ssm_graph.mission.problem import Problem, without_water_track
 from ssm_graph.sensors.imu import ImuLog
 
 

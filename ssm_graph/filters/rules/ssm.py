@@ -97,7 +97,8 @@ class SsmUpdate(UpdateRule):
             done = correct(prepared, weights=weights, state_weight=state_weight)
             at = prepared.iterate
             iterate = at.linear_move(done.step) if is_once else model.move(at, done.step, runs)
-            t = groups.total(self._squares(iterate, done))
+            is_plain = self.similarity is Similarity.PLAIN
+            t = groups.total(iterate.innovation**2 if is_plain else done.expected_squares(iterate))
             has_stopped = self._has_settled(done, iterate, mean, runs)
             has_stopped |= ~np.isfinite(done.step).all(axis=1)  # run away: its caller will see
             if number == self.max_iterations:
@@ -131,11 +132,6 @@ class SsmUpdate(UpdateRule):
             return same._replace(iterate=Iterate(xi, innovation, same.iterate.jacobian))
         P = prepared.predicted_cov
         return prepare(iterate, P) if all_left else prepare(iterate.take(left), P[left])
-
-    def _squares(self, iterate: Iterate, done: Corrected) -> Array:
-        if self.similarity is Similarity.PLAIN:
-            return np.asarray(iterate.innovation**2)
-        return done.expected_squares(iterate)
 
     def _has_settled(
         self, done: Corrected, iterate: Iterate, mean: Array | None, runs: Runs

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, Self
+from typing import Final, NamedTuple, Self
 
 import numpy as np
 
 from factors.depth_height import height_residual
+from factors.so3 import cross
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array, ReadOnlyArrays
 from ssm_graph.base.times import Indices
 from ssm_graph.engine.error_state import POSITION, ROTATION
 from ssm_graph.engine.extras import Extra
 from ssm_graph.graph.aids.aid import Aid, Linearised, RowStates
-from ssm_graph.graph.aids.heights import height_track
 from ssm_graph.imu.ping_motion import mean_gyro
 from ssm_graph.sensors.depth import DepthCalibration, DepthLog
 from ssm_graph.sensors.imu import ImuLog
@@ -58,7 +58,7 @@ class DepthMeans(Aid):
     """The mean of each keyframe's readings.
 
     Between keyframes the sensor's height follows the cubic through both heights and climbs, see
-    :func:`ssm_graph.graph.aids.heights.height_on_the_way`: how much it rises from the readings to
+    :func:`height_on_the_way`: how much it rises from the readings to
     the keyframe, on average, is a sum of these with the factors ``rise_of_...``. At the first
     keyframe it is taken as nothing: what came before it is not known.
     """
@@ -178,3 +178,49 @@ class DepthMeans(Aid):
 def depth_variables(calibration: DepthCalibration) -> tuple[Extra, ...]:
     """Return what the sigmas of a depth sensor switch on."""
     return (Extra(DEPTH_OFFSET, ("depth_offset_m",), np.array([calibration.offset_sigma])),)
+
+
+class HeightTrack(NamedTuple):
+    """The depth sensor at keyframes."""
+
+    height: Array
+    """(...) m above the ellipsoid"""
+    climb: Array
+    """(...) m/s, upwards"""
+    up_n: Array
+    """(..., 3) local vertical"""
+    sensor_n: Array
+    """(..., 3) m"""
+
+
+def height_track(
+    frame: LocalFrame, *, R_nb: Array, p_n: Array, v_n: Array, gyro_b: Array, lever_arm_b: Array
+) -> HeightTrack:
+    """Return the track of a sensor ``lever_arm_b`` off the body origin, leading axes (...)."""
+    arm_n = (R_nb @ lever_arm_b[..., None])[..., 0]
+    swing_n = (R_nb @ cross(gyro_b, lever_arm_b)[..., None])[..., 0]
+    sensor_n = p_n + arm_n
+    lat, lon, height = frame.geodetic_from_p_n(np.stack([p_n, sensor_n]))
+    up_n = frame.up_n_at(lat[0], lon[0])
+    return HeightTrack(
+        height=height[1],
+        climb=((v_n + swing_n) * up_n).sum(axis=-1),
+        up_n=up_n,
+        sensor_n=sensor_n,
+    )
+
+
+def height_on_the_way(
+    begin: HeightTrack, end: HeightTrack, *, elapsed_s: Array, span_s: Array
+) -> Array:
+    """Return the sensor's height (...) after ``elapsed_s`` of ``span_s`` between two keyframes.
+
+    It follows the cubic through both heights and climbs.
+    """
+    s = elapsed_s / span_s
+    rise = end.height - begin.height
+    return np.asarray(
+        begin.height
+        + rise * s**2 * (3.0 - 2.0 * s)
+        + span_s * s * (1.0 - s) * (begin.climb * (1.0 - s) - end.climb * s)
+    )

@@ -11,11 +11,10 @@ from ssm_graph.engine.extras import Extras
 from ssm_graph.graph.measurements import aid_table
 from ssm_graph.live.estimator.tail import Newest
 from ssm_graph.live.estimator.watch import Watch, verdict
+from ssm_graph.mission.answer import trajectory_at
 from ssm_graph.mission.estimate import AidTable, BeamTable, CurrentTrack, Found, Trajectory
 from ssm_graph.mission.navigation import Navigation
-from ssm_graph.mission.trajectory import trajectory_at
-from ssm_graph.smoothers.stretch import Stretch
-from ssm_graph.smoothers.variables import calibration_of_last, current_along
+from ssm_graph.smoothers.track import Stretch, calibration_of_last, current_along
 from ssm_graph.smoothers.window import Window
 
 

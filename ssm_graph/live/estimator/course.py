@@ -29,7 +29,7 @@ from ssm_graph.live.estimator.watch import Watch, is_sound, observe
 from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.navigation import Severity
 from ssm_graph.smoothers.keyframe import Keyframe
-from ssm_graph.smoothers.stretch import Stretch, joined
+from ssm_graph.smoothers.track import Stretch, joined
 from ssm_graph.smoothers.window import Window
 
 REACH_S: Final = 0.1

@@ -26,9 +26,9 @@ from ssm_graph.live.estimator.watch import (
     Watch,
     counts_off_the_ground,
 )
-from ssm_graph.mission.doubts import TRUSTED
+from ssm_graph.mission.answer import TRUSTED
 from ssm_graph.smoothers.keyframe import Keyframe
-from ssm_graph.smoothers.stretch import Stretch
+from ssm_graph.smoothers.track import Stretch
 from ssm_graph.smoothers.window import Window
 
 RENEW_S: Final = 15.0

@@ -30,10 +30,9 @@ from ssm_graph.mission.problem import ProblemConfig
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.sensors.messages import Message
-from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors
-from ssm_graph.smoothers.stretch import Stretch, pack_judged, unpack_judged
-from ssm_graph.smoothers.window import Window
+from ssm_graph.smoothers.track import Stretch, pack_judged, unpack_judged
+from ssm_graph.smoothers.window import FixedLagConfig, Window
 
 ONLINE: Final = FixedLagConfig(
     max_iterations=3,

@@ -17,20 +17,28 @@ from ssm_graph.graph.aids import AIDS
 from ssm_graph.graph.aids.aid import Keyframes
 from ssm_graph.live.estimator.buffers import Buffers, Logs
 from ssm_graph.live.estimator.keyframes import aids_at
-from ssm_graph.mission.calibration import calibration_extras, taken_as_exact, windowed
-from ssm_graph.mission.current import current_extras
+from ssm_graph.mission.calibration import (
+    calibration_extras,
+    current_extras,
+    taken_as_exact,
+    windowed,
+)
 from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.mission import InitialState, Mission
 from ssm_graph.mission.navigation import Severity
-from ssm_graph.mission.problem import Beams, ProblemConfig, build_problem_steps
+from ssm_graph.mission.problem import (
+    Beams,
+    ProblemConfig,
+    build_problem_steps,
+    initial_moments,
+)
 from ssm_graph.mission.start.alignment import SAFE_HEADING_SIGMA
-from ssm_graph.mission.start.moments import initial_moments
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.imu import ImuLog
 from ssm_graph.smoothers.fixed_lag import run_fixed_lag_steps
-from ssm_graph.smoothers.fixed_lag_config import FixedLagConfig
 from ssm_graph.smoothers.keyframe import Sensors
 from ssm_graph.smoothers.mission import smooth_steps
+from ssm_graph.smoothers.window import FixedLagConfig
 
 SETTLE_S: Final = 1.0
 """So much inertial data is waited for, since the first samples may come late as well."""

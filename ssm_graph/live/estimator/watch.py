@@ -15,10 +15,10 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import POSITION, VELOCITY
 from ssm_graph.graph.aids.depth import DepthMeans
 from ssm_graph.graph.aids.gnss import Fixes
-from ssm_graph.mission.doubts import LARGEST_SPEED, LOW_WEIGHT, MISFIT, TRUSTED
+from ssm_graph.mission.answer import LARGEST_SPEED, LOW_WEIGHT, MISFIT, TRUSTED
 from ssm_graph.mission.navigation import Health
 from ssm_graph.smoothers.keyframe import Keyframe
-from ssm_graph.smoothers.stretch import Stretch
+from ssm_graph.smoothers.track import Stretch
 from ssm_graph.smoothers.window import Window
 
 LOCK_LOST_S: Final = 3.0

@@ -25,13 +25,21 @@ from ssm_graph.base.frames import (
     wrap_to_pi,
 )
 from ssm_graph.base.frozen import Array
-from ssm_graph.base.stepwise import Steps, finished
+from ssm_graph.base.stepwise import Steps, at_once
 from ssm_graph.imu.increments import merge_samples_steps
 from ssm_graph.mission.mission import InitialState, Mission
-from ssm_graph.mission.start.body_velocity import BodyVelocities, body_velocities
-from ssm_graph.mission.start.compass_start import heading_from_compass_steps
-from ssm_graph.mission.start.start_fixes import MIN_WINDOW_S, StartFixes, start_fixes
-from ssm_graph.mission.start.track_heading import HeadingFit, heading_from_track_steps
+from ssm_graph.mission.start.heading import (
+    HeadingFit,
+    heading_from_compass_steps,
+    heading_from_track_steps,
+)
+from ssm_graph.mission.start.measured import (
+    MIN_WINDOW_S,
+    BodyVelocities,
+    StartFixes,
+    body_velocities,
+    start_fixes,
+)
 from ssm_graph.mission.usable import require_usable
 from ssm_graph.sensors.imu import ImuNoise
 
@@ -57,7 +65,7 @@ class Alignment:
     """One sentence: how roll, pitch and heading were found, with sigmas."""
 
 
-def align(mission: Mission) -> Alignment:
+def align_steps(mission: Mission) -> Steps[Alignment]:
     """Find the initial state of a mission from its first minutes.
 
     Raises
@@ -67,11 +75,6 @@ def align(mission: Mission) -> Alignment:
     DataError
         If no inertial data follow the first fix.
     """
-    return finished(align_steps(mission))
-
-
-def align_steps(mission: Mission) -> Steps[Alignment]:
-    """Make :func:`align` in steps."""
     require_usable(mission)
     velocities = body_velocities(mission)
     yield 0.03 * len(velocities.time_s)
@@ -95,6 +98,9 @@ def align_steps(mission: Mission) -> Steps[Alignment]:
         f"{math.degrees(level):.2f} deg; position from {fixes.source}"
     )
     return Alignment(tuple(starts), method)
+
+
+align = at_once(align_steps)
 
 
 def _window(mission: Mission, start_s: float) -> float:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
-from types import TracebackType
 from typing import Final, Self
 
 import numpy as np
@@ -59,12 +58,7 @@ class StatusPage:
             self._live.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._is_live:
             self._live.stop()
 
@@ -147,10 +141,7 @@ def _state(navigation: Navigation) -> Table:
         f"height {navigation.height:.2f} ±{up:.2f} m",
     )
     velocity = zip(
-        ("east", "north", "up"),
-        navigation.velocity_enu,
-        navigation.velocity_sigma_enu,
-        strict=True,
+        ("east", "north", "up"), navigation.velocity_enu, navigation.velocity_sigma_enu, strict=True
     )
     table.add_row(*(f"{n} {v:+.3f} ±{s:.3f} m/s" for n, v, s in velocity))
     angles = np.degrees(navigation.roll_pitch_heading)

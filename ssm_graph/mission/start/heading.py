@@ -1,4 +1,4 @@
-"""Heading from the displacement that fixes see against the one that DVL and gyros see."""
+"""Heading at the start, from a compass, or from fixes against DVL and gyros."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ssm_graph.base.frames import wrap_to_pi
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps
 from ssm_graph.imu.increments import merge_samples_steps
 from ssm_graph.mission.mission import Mission
-from ssm_graph.mission.start.body_velocity import BodyVelocities
-from ssm_graph.mission.start.start_fixes import StartFixes
+from ssm_graph.mission.start.measured import BodyVelocities, StartFixes
+from ssm_graph.sensors.compass import HeadingLog
 
 SILENCE_S = 5.0
 """A gap between pings that ends the dead reckoning."""
@@ -47,8 +48,7 @@ def heading_from_track_steps(
         return HeadingFit(0.0, math.inf)
     fix_l = (fix_n @ mission.frame.R_nl_at(fix_n[0]))[:, :2]
     seen_l = np.stack(
-        [np.interp(used.time_s, time_s, axis) for axis in (track_l + antenna_l)[:, :2].T],
-        axis=-1,
+        [np.interp(used.time_s, time_s, axis) for axis in (track_l + antenna_l)[:, :2].T], axis=-1
     )
     noise = float(np.sqrt(np.mean(used.sigma_enu[:, :2] ** 2)))
     drift = mission.imu.noise.gyro_bias_sigma
@@ -106,3 +106,46 @@ def gyro_attitudes_steps(mission: Mission, time_s: Array, R_lb: Array) -> Steps[
         attitudes.append(R)
         yield 0.15
     return np.array(attitudes)
+
+
+NONE = HeadingFit(0.0, math.inf)
+UNKNOWN_OFFSET = math.radians(90.0)
+"""A compass that may be off by so much, a directional gyro, says nothing of the start."""
+
+
+def heading_from_compass_steps(
+    mission: Mission, start_s: float, R_lb: Array, *, window_s: float
+) -> Steps[HeadingFit]:
+    """Return the median of what the readings of a window say, each led back to its begin.
+
+    The median keeps disturbances out that are shorter than half the window. Its sigma is that of
+    one reading with all the errors that the mission states of the compass, as if none averaged out.
+
+    Parameters
+    ----------
+    mission : with or without a compass.
+    start_s : begin of the window, s.
+    R_lb : (3, 3) body to local level at the start; its heading is what is sought, so any will do.
+    window_s : as long as the gyros keep the heading.
+    """
+    log = mission.aids.get(HeadingLog)
+    if log is None or log.errors.offset_sigma >= UNKNOWN_OFFSET:
+        return NONE
+    used = (log.time_s > start_s) & (log.time_s <= start_s + window_s)
+    if not used.any():
+        return NONE
+    time_s = np.concatenate([[start_s], log.time_s[used]])
+    attitudes = yield from gyro_attitudes_steps(mission, time_s, R_lb)
+    assumed = np.arctan2(attitudes[:, 0, 0], attitudes[:, 1, 0])
+    off = log.heading[used] + log.declination - assumed[1:]
+    middle = math.atan2(float(np.mean(np.sin(off))), float(np.mean(np.cos(off))))
+    off = middle + wrap_to_pi(off - middle)
+    errors = log.errors
+    sigma = math.hypot(
+        log.sigma,
+        errors.offset_sigma,
+        errors.walk_sigma,
+        errors.one_cycle_sigma,
+        errors.two_cycle_sigma,
+    )
+    return HeadingFit(float(wrap_to_pi(assumed[0] + float(np.median(off)))), sigma)
