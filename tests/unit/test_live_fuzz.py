@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import random
+from typing import cast
 
 import pytest
 
+from ssm_graph.live.protocols.decoder import Decoder
 from ssm_graph.sensors.depth import DepthReading
 from ssm_graph.sensors.messages import Message
 from tests.damaged_traffic import Target, damaged, json_traffic, run, targets
