@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from functools import cache
-from typing import ClassVar
+from typing import ClassVar, Final
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,10 +18,14 @@ class Message:
     """As stamped, s on the vehicle's clock."""
 
 
-@cache
+_FIELDS: Final[dict[type, tuple[str, ...]]] = {}
+
+
 def field_names(kind: type[Message]) -> tuple[str, ...]:
     """Return the names of a message's fields; asked for every message of an IMU."""
-    return tuple(spec.name for spec in fields(kind))
+    if kind not in _FIELDS:
+        _FIELDS[kind] = tuple(spec.name for spec in fields(kind))
+    return _FIELDS[kind]
 
 
 def bad_number(message: Message) -> str | None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import random
+from typing import cast
 
 import pytest
 
+from ssm_graph.live.protocols.decoder import Decoder
 from ssm_graph.sensors.depth import DepthReading
 from ssm_graph.sensors.messages import Message
 from tests.damaged_traffic import Target, damaged, json_traffic, run, targets
@@ -55,7 +57,7 @@ class _Broken:
 
 def test_failures_are_seen() -> None:
     """Raising, holding, numbers that are not finite, refusals too many or not printable."""
-    target = Target("broken", _Broken(), json_traffic)
+    target = Target("broken", cast(Decoder, _Broken()), json_traffic)
     target.feed(b"x", 0.0)
     target.feed(b"y", 0.0)
     target.take()
