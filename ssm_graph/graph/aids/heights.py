@@ -32,7 +32,7 @@ def height_track(
     arm_n = (R_nb @ lever_arm_b[..., None])[..., 0]
     swing_n = (R_nb @ cross(gyro_b, lever_arm_b)[..., None])[..., 0]
     sensor_n = p_n + arm_n
-    lat, lon, height = frame.geodetic_from_p_n(np.stack([p_n, sensor_n]))
+    lat, lon, height = frame.geodetic_from_p_n(np.array([p_n, sensor_n]))
     up_n = frame.up_n_at(lat[0], lon[0])
     return HeightTrack(
         height=height[1],
