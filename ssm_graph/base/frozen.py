@@ -129,8 +129,8 @@ class ReadOnlyArrays(ShortRepr):
     __slots__ = ()
 
     def __post_init__(self) -> None:
-        for spec in fields(cast(Any, self)):
-            value = getattr(self, spec.name)
+        for name in cast(Any, self).__dataclass_fields__:
+            value = getattr(self, name)
             if isinstance(value, np.ndarray):
                 value.setflags(write=False)
 

@@ -95,16 +95,8 @@ class Table(ReadOnlyArrays):
         return self._with({name: getattr(self, name)[rows] for name in self.columns()})
 
     def _with(self, columns: Mapping[str, Array | Indices]) -> Self:
-        """Return the same with other columns, as `dataclasses.replace` does in many times this."""
-        made = object.__new__(type(self))
-        for name in self._names():
-            column = columns.get(name)
-            if column is None:
-                column = getattr(self, name)
-            else:
-                column.setflags(write=False)
-            object.__setattr__(made, name, column)
-        return made
+        """Return the same with other columns: `dataclasses.replace` takes many times this."""
+        return type(self)(*[columns.get(n, getattr(self, n)) for n in self._names()])
 
     @classmethod
     @cache
