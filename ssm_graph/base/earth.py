@@ -51,7 +51,8 @@ def geodetic_from_ecef(p_e: Array) -> tuple[Array, Array, Array]:
     Bowring's formula followed by two fixed-point steps: exact to rounding from 10 km below the
     ellipsoid to satellite heights, the poles included.
     """
-    x, y, z = np.moveaxis(np.asarray(p_e, float), -1, 0)
+    p_e = np.asarray(p_e, float)
+    x, y, z = p_e[..., 0], p_e[..., 1], p_e[..., 2]
     horizontal = np.hypot(x, y)
     semi_minor = SEMI_MAJOR_AXIS * (1.0 - FLATTENING)
     second_ecc_sq = ECCENTRICITY_SQ / (1.0 - ECCENTRICITY_SQ)

@@ -141,10 +141,10 @@ class DepthMeans(Aid):
         states = [at] if before is None else [at, before]
         track = height_track(
             self.frame,
-            R_nb=np.stack([x.R_nb for x in states]),
-            p_n=np.stack([x.p_n for x in states]),
-            v_n=np.stack([x.v_n for x in states]),
-            gyro_b=np.stack([self.gyro_b, self.gyro_before_b][: len(states)]),
+            R_nb=np.array([x.R_nb for x in states]),
+            p_n=np.array([x.p_n for x in states]),
+            v_n=np.array([x.v_n for x in states]),
+            gyro_b=np.array([self.gyro_b, self.gyro_before_b][: len(states)]),
             lever_arm_b=self.lever_arm_b,
         )
         height, climb = track.height, track.climb
@@ -200,7 +200,7 @@ def height_track(
     arm_n = (R_nb @ lever_arm_b[..., None])[..., 0]
     swing_n = (R_nb @ cross(gyro_b, lever_arm_b)[..., None])[..., 0]
     sensor_n = p_n + arm_n
-    lat, lon, height = frame.geodetic_from_p_n(np.stack([p_n, sensor_n]))
+    lat, lon, height = frame.geodetic_from_p_n(np.array([p_n, sensor_n]))
     up_n = frame.up_n_at(lat[0], lon[0])
     return HeightTrack(
         height=height[1],
