@@ -145,7 +145,7 @@ class Jacobians(NamedTuple):
     def of(cls, phi: Array) -> Jacobians:
         """Return them of rotation vectors, rad, angles below 2 pi."""
         square = (phi * phi).sum(axis=-1, keepdims=True)
-        found = square**_POWERS @ _SERIES
+        found = np.minimum(square, SMALL_SQUARE) ** _POWERS @ _SERIES
         if square.max(initial=0.0) > SMALL_SQUARE:
             large = square > SMALL_SQUARE
             square = np.where(large, square, 1.0)
