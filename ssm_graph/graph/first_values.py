@@ -39,6 +39,8 @@ AID_ROUNDS = 5
 """How often the aids of a keyframe are linearised anew."""
 AID_REACH = 0.1
 """Sigmas of an aid; where a round moves what is predicted by less, the next one is spared."""
+MOST_TURN = 1e6
+"""rad; a correction beyond any meaning, at which the arithmetic would overflow soon."""
 _NONE = np.zeros(0)
 GRAVITY_REACH = 20.0
 """m, how far gravity is carried linearly before it is evaluated anew."""
@@ -280,6 +282,9 @@ class _ForwardPass:
 
     def _moved(self, step: Array) -> RowStates:
         """Return the state after a step (E,) of the error state and what is behind it."""
+        turn = float(np.abs(step[ROTATION]).max())
+        if not turn < MOST_TURN:
+            raise np.linalg.LinAlgError(f"an attitude corrected by {turn:.3g} rad")
         here = NavigationStates(*(column[None] for column in self._state))
         R_nb, p_n, v_n, bias = (column[0] for column in here.moved(step[None, :STATE_DIM]))
         walks, constants = self.extras.moved(step[STATE_DIM:]) if self.extras else (_NONE, _NONE)
