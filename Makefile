@@ -7,7 +7,7 @@ OUT ?= out
 # Small matrices: BLAS threads only get in each other's way.
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: demo test test-slow format check clean
+.PHONY: demo test test-slow test-benchmarks format check clean
 
 demo: $(VENV)/.installed  ## simulate the default mission with failing beams, smooth it, show table and figure
 	$(BIN)/ssm-graph simulate demo --out $(OUT)/demo/mission
@@ -19,6 +19,9 @@ test: check  ## format, lint, types and the fast tests
 
 test-slow: $(VENV)/.installed-dev  ## the tests that take minutes
 	$(BIN)/python -m pytest -n 2 -m slow
+
+test-benchmarks: $(VENV)/.installed-dev  ## every benchmark in its smallest form
+	$(BIN)/python -m pytest -n 2 -m benchmark
 
 check: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .

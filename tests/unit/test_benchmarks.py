@@ -90,7 +90,7 @@ def test_no_test_needs_a_benchmark() -> None:
     assert not [path for path in (ROOT / "tests").rglob("*.py") if imports.search(read(path))]
 
 
-@pytest.mark.slow
+@pytest.mark.benchmark
 def test_speed(tmp_path: Path) -> None:
     """Ours and the plain script end at the same place."""
     done = run("speed.run", "--minutes 0.2 --lengths 0.2 --repeats 1", "speed", tmp_path)
@@ -100,7 +100,7 @@ def test_speed(tmp_path: Path) -> None:
     assert [row[1] for row in done.rows("0.2")] == ["13"]
 
 
-@pytest.mark.slow
+@pytest.mark.benchmark
 def test_online(tmp_path: Path) -> None:
     """GTSAM's smoothers take the same keyframes; ours are near, at each lag."""
     options = "--hours 0.01 --their-minutes 0.2 --lag-minutes 0.2 --lags 0,5 --seeds 2"
@@ -117,7 +117,7 @@ def test_online(tmp_path: Path) -> None:
     assert settings.count("| online |") == settings.count("| settled |") == 2
 
 
-@pytest.mark.slow
+@pytest.mark.benchmark
 def test_lag(tmp_path: Path) -> None:
     """A lag as long as the mission is the batch."""
     done = run("online.lag", "--missions 2 --duration 10 --lags 0,10", "lag", tmp_path)
@@ -127,7 +127,7 @@ def test_lag(tmp_path: Path) -> None:
     assert (tmp_path / "lag.png").stat().st_size > 10_000
 
 
-@pytest.mark.slow
+@pytest.mark.benchmark
 @pytest.mark.parametrize(
     "name",
     ["clock back 0.5", "garbage on the DVL", "a client that never reads", "kill -9, torn log"],
@@ -139,7 +139,7 @@ def test_faults(name: str, tmp_path: Path) -> None:
     assert [row[-1] for row in done.rows(name)] == ["pass"]
 
 
-@pytest.mark.slow
+@pytest.mark.benchmark
 def test_fuzz(tmp_path: Path) -> None:
     """No decoder falls over 100 kB."""
     done = run("faults.fuzz", "--bytes 100000", "fuzz", tmp_path)
@@ -147,7 +147,7 @@ def test_fuzz(tmp_path: Path) -> None:
     assert "**No failure.**" in done.page
 
 
-@pytest.mark.slow
+@pytest.mark.benchmark
 def test_soak(tmp_path: Path) -> None:
     """Half a minute of everything that goes wrong is inside its sigmas; what is done is kept."""
     options = "--hours 0.01 --cases depth 'all of these' --jobs 1"
@@ -162,7 +162,7 @@ def test_soak(tmp_path: Path) -> None:
     assert {path: path.stat().st_mtime_ns for path in tmp_path.glob("*.npz")} == kept
 
 
-@pytest.mark.slow
+@pytest.mark.benchmark
 @needs_logs
 def test_field(tmp_path: Path) -> None:
     """A real run whose GNSS ends is good to 1 % of the path."""
@@ -174,7 +174,7 @@ def test_field(tmp_path: Path) -> None:
     assert (tmp_path / "field.png").stat().st_size > 10_000
 
 
-@pytest.mark.slow
+@pytest.mark.benchmark
 def test_aids(tmp_path: Path) -> None:
     """What helps is better than nothing."""
     done = run("science.aids", "--runs 2 --cases Standstill", "aids", tmp_path)
@@ -183,7 +183,7 @@ def test_aids(tmp_path: Path) -> None:
     assert aided[-1] == "2 / 0"
 
 
-@pytest.mark.slow
+@pytest.mark.benchmark
 def test_alignment(tmp_path: Path) -> None:
     """A mission of each grade and start: none is wrong without a word."""
     done = run("science.alignment", "--missions 1", "alignment", tmp_path)
@@ -192,7 +192,7 @@ def test_alignment(tmp_path: Path) -> None:
     assert all(row[10] == "0" for row in rows if len(row) == 12)
 
 
-@pytest.mark.slow
+@pytest.mark.benchmark
 def test_calibration(tmp_path: Path) -> None:
     """The scale is found, with and without outliers, and all of its errors are in the page."""
     options = "--runs 2 --transits 2 --minutes 2 --repeats 1"
@@ -203,7 +203,7 @@ def test_calibration(tmp_path: Path) -> None:
     assert [row[2] for row in scales[2:]] == ["green", "red"]
 
 
-@pytest.mark.slow
+@pytest.mark.benchmark
 def test_currents(tmp_path: Path) -> None:
     """Water track is better than nothing, and the current known better than both."""
     options = "--missions 2 --grades industrial --loss 80"
@@ -215,7 +215,7 @@ def test_currents(tmp_path: Path) -> None:
     assert ground[7] == known[7] == "–"
 
 
-@pytest.mark.slow
+@pytest.mark.benchmark
 def test_equivalence(tmp_path: Path) -> None:
     """Graph and filter are the same to rounding, with as many iterations."""
     done = run("science.equivalence", "--missions 1 --duration 40", "equivalence", tmp_path)
@@ -224,7 +224,7 @@ def test_equivalence(tmp_path: Path) -> None:
     assert all(first_number(cell) < 1e-6 for row in rows for cell in row[3:])
 
 
-@pytest.mark.slow
+@pytest.mark.benchmark
 def test_noise(tmp_path: Path) -> None:
     """Every way of stating sigmas is a row; the right ones are the measure."""
     done = run("science.noise", "--seeds 2 --duration 30", "noise", tmp_path)
@@ -234,7 +234,7 @@ def test_noise(tmp_path: Path) -> None:
     assert first_number(rows[2][5]) > first_number(rows[0][5])
 
 
-@pytest.mark.slow
+@pytest.mark.benchmark
 def test_golden_vectors(tmp_path: Path) -> None:
     """A Kalman filter agrees with its own formulas, and not with a result that is off."""
     rng = np.random.default_rng(0)
