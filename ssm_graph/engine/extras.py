@@ -10,7 +10,7 @@ the columns of that name beside those of its keyframe's error state::
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Final, Self
 
@@ -110,6 +110,12 @@ class Extras:
     def columns(self, name: str) -> slice:
         """Return the columns of a variable in a row."""
         return self._columns[name]
+
+    def fill(self, rows: Array, blocks: Mapping[str, Array]) -> None:
+        """Write derivatives to those variables that there are into rows (..., width), in place."""
+        for name, block in blocks.items():
+            if name in self:
+                rows[..., self.columns(name)] = block
 
     def only(self, names: Collection[str]) -> Extras:
         """Return those of these names."""

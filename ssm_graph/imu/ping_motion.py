@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from factors import so3
 from factors.dvl_calibration import Motion
-from factors.so3 import cross
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.times import Indices, last_readings
 from ssm_graph.sensors.imu import ImuLog
 
 PING_WINDOW_S = 0.1
@@ -40,6 +41,19 @@ def turn_between(imu: ImuLog, begin_s: Array, end_s: Array) -> Array:
     edges, angle = _angles(imu)
     turned = [np.interp(end_s, edges, axis) - np.interp(begin_s, edges, axis) for axis in angle.T]
     return np.asarray(np.stack(turned, axis=-1))
+
+
+def last_readings_led(
+    imu: ImuLog, keyframe_s: Array, time_s: Array
+) -> tuple[Indices, Indices, Array]:
+    """Return keyframes (M,) with a reading since the one before, the last of each, and its way.
+
+    The third is the rotation (M, 3, 3) of body axes at the reading to those at the keyframe, by the
+    gyros: ``R_nb`` of the keyframe times it is the attitude at the reading.
+    """
+    keyframe, reading = last_readings(keyframe_s, time_s)
+    turn_b = turn_between(imu, time_s[reading], keyframe_s[keyframe])
+    return keyframe, reading, so3.exp(-turn_b)
 
 
 def _angles(imu: ImuLog) -> tuple[Array, Array]:
@@ -78,7 +92,7 @@ class MotionBefore:
         return Motion(
             turn_b=turn_b,
             # Each force along the axes at the keyframe, as if it and the rate were constant.
-            gain_b=gain_b - 0.5 * cross(turn_b, gain_b),
+            gain_b=gain_b - 0.5 * so3.cross(turn_b, gain_b),
             gyro_b=mean[:, :3],
             accel_b=mean[:, 3:],
             gyro_rate_b=(behind - before)[:, :3] / (2.0 * window_s),

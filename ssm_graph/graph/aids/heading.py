@@ -12,16 +12,14 @@ from typing import Final, Self
 
 import numpy as np
 
-from factors import so3
 from factors.compass_heading import CompassErrors, heading_residual
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
-from ssm_graph.base.times import last_readings
 from ssm_graph.base.usable import require_finite, require_increasing, require_positive
 from ssm_graph.engine.error_state import ROTATION
 from ssm_graph.engine.extras import Extra
 from ssm_graph.graph.aids.aid import Aid, Keyframes, Linearised, RowStates
-from ssm_graph.imu.ping_motion import turn_between
+from ssm_graph.imu.ping_motion import last_readings_led
 from ssm_graph.mission.mission import Aids
 from ssm_graph.sensors.compass import HeadingLog
 
@@ -61,15 +59,14 @@ class Headings(Aid):
             return None
         frame, imu, keyframe_s, begin_s = keyframes
         time_s = log.time_s
-        keyframe, reading = last_readings(keyframe_s, time_s)
-        turn_b = turn_between(imu, time_s[reading], keyframe_s[keyframe])
+        keyframe, reading, R_back = last_readings_led(imu, keyframe_s, time_s)
         if begin_s is None:
             begin_s = float(time_s[0]) if len(time_s) else 0.0
         return cls(
             keyframe=keyframe,
             heading=log.heading[reading] + log.declination,
             since_s=time_s[reading] - begin_s,
-            R_back=so3.exp(-turn_b),
+            R_back=R_back,
             sigma=log.sigma,
             frame=frame,
         )
@@ -149,13 +146,12 @@ class Headings(Aid):
         turned = (self.R_back @ residual.error_D_rotation[..., None])[..., 0]
         jacobian[..., 0, ROTATION] = turned
         one = np.ones((*residual.error.shape, 1))
-        for name, block in (
-            (HEADING_OFFSET, one),
-            (HEADING_RATE, since_s),
-            (HEADING_WALK, one),
-            (HEADING_ONE_CYCLE, residual.error_D_one_cycle),
-            (HEADING_TWO_CYCLE, residual.error_D_two_cycle),
-        ):
-            if name in extras:
-                jacobian[..., 0, extras.columns(name)] = block
+        blocks = {
+            HEADING_OFFSET: one,
+            HEADING_RATE: since_s,
+            HEADING_WALK: one,
+            HEADING_ONE_CYCLE: residual.error_D_one_cycle,
+            HEADING_TWO_CYCLE: residual.error_D_two_cycle,
+        }
+        extras.fill(jacobian[..., 0, :], blocks)
         return Linearised(residual.error[..., None], jacobian)

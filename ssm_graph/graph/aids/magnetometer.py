@@ -15,12 +15,11 @@ from factors import so3
 from factors.magnetic_field import field_residual
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
-from ssm_graph.base.times import last_readings
 from ssm_graph.base.usable import require_finite, require_increasing, require_positive
 from ssm_graph.engine.error_state import ROTATION
 from ssm_graph.engine.extras import Extra
 from ssm_graph.graph.aids.aid import Aid, Keyframes, Linearised, RowStates, along_axes
-from ssm_graph.imu.ping_motion import turn_between
+from ssm_graph.imu.ping_motion import last_readings_led
 from ssm_graph.mission.mission import Aids
 from ssm_graph.sensors.magnetometer import MICROTESLA, MagnetometerLog
 
@@ -64,12 +63,11 @@ class MagneticFields(Aid):
         if log is None:
             return None
         frame, imu, keyframe_s, _ = keyframes
-        keyframe, reading = last_readings(keyframe_s, log.time_s)
-        turn_b = turn_between(imu, log.time_s[reading], keyframe_s[keyframe])
+        keyframe, reading, R_back = last_readings_led(imu, keyframe_s, log.time_s)
         return cls(
             keyframe=keyframe,
             reading_b=log.field_b[reading],
-            R_back=so3.exp(-turn_b),
+            R_back=R_back,
             sigma=log.sigma,
             field_enu=log.earth.enu,
             hard_iron_b=np.zeros(3) if log.hard_iron_b is None else log.hard_iron_b,
@@ -139,12 +137,11 @@ class MagneticFields(Aid):
         )
         jacobian = np.zeros((*residual.error.shape, extras.width))
         jacobian[..., ROTATION] = residual.error_D_rotation @ np.swapaxes(self.R_back, -1, -2)
-        for name, block in (
-            (EARTH_FIELD, residual.error_D_field_n @ R_nl),
-            (HARD_IRON, np.eye(3)),
-            (MAGNETIC_WALK, np.eye(3)),
-            (SOFT_IRON, residual.error_D_soft_iron),
-        ):
-            if name in extras:
-                jacobian[..., extras.columns(name)] = block
+        blocks = {
+            EARTH_FIELD: residual.error_D_field_n @ R_nl,
+            HARD_IRON: np.eye(3),
+            MAGNETIC_WALK: np.eye(3),
+            SOFT_IRON: residual.error_D_soft_iron,
+        }
+        extras.fill(jacobian, blocks)
         return Linearised(residual.error / MICROTESLA, jacobian / MICROTESLA)
