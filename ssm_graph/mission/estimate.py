@@ -10,6 +10,7 @@ import numpy as np
 
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array, FrozenArrays, ShortRepr, shaped
+from ssm_graph.mission.fault import DetectedFault
 from ssm_graph.mission.mission import InitialState
 
 OUTLIER_WEIGHT = 0.05
@@ -255,6 +256,8 @@ class Estimate(ShortRepr):
     """What was found of their noise; None of what goes keyframe by keyframe."""
     current: CurrentTrack | None = None
     """What was found of the water's current; None without pings off the water."""
+    faults: tuple[DetectedFault, ...] = ()
+    """Sensors that were off for long, in the order of their begins."""
 
     @property
     def n_iterations(self) -> float:

@@ -42,7 +42,7 @@ MAY_IMPORT = {
 """Rooms that each room may import, itself apart; the rest may import anything."""
 MISSION_VALUES = {
     f"ssm_graph.mission.{name}"
-    for name in ("mission", "vehicle", "estimate", "navigation", "run_status", "events")
+    for name in ("mission", "vehicle", "fault", "estimate", "navigation", "run_status", "events")
 }
 TOP = {"", "cli", "__main__"}
 """The package's own namespace and its command line stand above everything."""
