@@ -17,11 +17,7 @@ def side_by_side(
 ) -> list[T]:
     """Return what a task makes of the arguments of each case, in order, and tell how far it is.
 
-    Parameters
-    ----------
-    task : a function of a module that processes can import.
-    jobs : processes at a time.
-    each_fresh : give each case a process of its own.
+    So many jobs at a time are done; with ``each_fresh`` each by a process of its own.
     """
     context = multiprocessing.get_context("spawn")
     per_child = 1 if each_fresh else None

@@ -53,13 +53,10 @@ class Report:
     """A benchmark's command line and page; made before the work, for it holds the load then."""
 
     def __init__(self, file: str, title: str, about: str | None, *options: Option) -> None:
-        """Read the command line.
+        """Read the command line of a module, of which ``__file__`` and ``__doc__`` are given.
 
-        Parameters
-        ----------
-        file, about : ``__file__`` and ``__doc__`` of the benchmark's module.
-        title : of the page; the page has the name of the module, or of the folder of a ``run.py``.
-        options : besides ``--out`` and ``--keep``, which all have.
+        The page has the name of the module, or of the folder of a ``run.py``; all have ``--out``
+        and ``--keep``.
         """
         path = Path(file).resolve().relative_to(ROOT).with_suffix("")
         module = ".".join(path.parts)

@@ -18,8 +18,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from benchmarks.faults.case import Stage, simulated_stage
-from benchmarks.faults.judge import Row, judge
+from benchmarks.faults.case import Row, Stage, judge, simulated_stage
 from benchmarks.faults.sockets import SOCKET_CASES, run_socket_case
 from ssm_graph.io.mission_folder.folder import write_mission
 from ssm_graph.io.tables.checkpoint import CHECKPOINT_NAME, older_name
@@ -176,22 +175,16 @@ def kinds(run: Path) -> Counter[str]:
     return found
 
 
-class ProcessFault(NamedTuple):
-    """A row."""
-
-    fault: Fault
-    is_lossless: bool
-    """Whether all results and logs have to be those of the uninterrupted run, byte by byte."""
-
-
-FAULTS: Final = {
-    "kill -9, three times": ProcessFault(kill_thrice, True),
-    "kill -9, torn checkpoint": ProcessFault(torn_checkpoint, True),
-    "kill -9, no sound checkpoint": ProcessFault(no_sound_checkpoint, True),
-    "kill -9, torn log": ProcessFault(removed_log, False),
-    "disk full for a while": ProcessFault(full_disk_for_a_while, True),
-    "disk full for ever": ProcessFault(full_disk_for_ever, False),
+FAULTS: Final[dict[str, Fault]] = {
+    "kill -9, three times": kill_thrice,
+    "kill -9, torn checkpoint": torn_checkpoint,
+    "kill -9, no sound checkpoint": no_sound_checkpoint,
+    "kill -9, torn log": removed_log,
+    "disk full for a while": full_disk_for_a_while,
+    "disk full for ever": full_disk_for_ever,
 }
+LOSSY: Final = (removed_log, full_disk_for_ever)
+"""After all others results and logs have to be those of the uninterrupted run, byte by byte."""
 PROCESS_ROWS: Final = (*FAULTS, *SOCKET_CASES)
 
 
@@ -203,17 +196,17 @@ def run_process_row(name: str) -> Row:
         mission = Path(folder) / "mission"
         write_mission(mission, simulated_stage(STAGE)[0].mission)
         whole = finish(mission, Path(folder) / "whole", [])
-        return _compared(name, FAULTS[name].fault(mission, Path(folder) / "run"), whole)
+        return _compared(name, FAULTS[name](mission, Path(folder) / "run"), whole)
 
 
 def _compared(name: str, outcome: Outcome, whole: Outcome) -> Row:
     """Compare a run with the uninterrupted one."""
-    fault, is_lossless = FAULTS[name]
+    fault = FAULTS[name]
     faults = [*whole.notes, *outcome.notes]
     told = kinds(outcome.folder)
     faults += [f"{kind} told" for kind in told if kind.endswith("_failed") and kind != "disk"]
     differing = [x for x in RESULTS if not _same(outcome.folder / x, whole.folder / x)]
-    if is_lossless and differing:
+    if fault not in LOSSY and differing:
         faults.append(f"other than uninterrupted: {', '.join(differing)}")
     missing = _n_lines(whole.folder / "log") - _n_lines(outcome.folder / "log")
     cells = (

@@ -12,17 +12,21 @@ from collections.abc import Sequence
 from benchmarks.faults.case import (
     BEGIN_S,
     GROUPS,
+    HEADER,
     LAG_S,
     LOOK_S,
+    RULES,
     Case,
+    Row,
     Rule,
     Stage,
+    judge,
     run_case,
+    share_text,
     shares_inside,
     undisturbed,
 )
 from benchmarks.faults.data import data_cases
-from benchmarks.faults.judge import HEADER, RULES, Row, judge, share_text
 from benchmarks.faults.process import PROCESS_ROWS, run_process_row
 from benchmarks.faults.transforms import untouched
 from benchmarks.processes import side_by_side

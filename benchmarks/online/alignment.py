@@ -98,18 +98,10 @@ def report(loads: Sequence[Load]) -> list[str]:
     rows = []
     for load in loads:
         aligning, catching_up = 1e3 * np.array(load.aligning_s), 1e3 * np.array(load.catching_up_s)
-        rows.append(
-            [
-                f"{load.data_s:.0f}",
-                load.outcome,
-                f"{load.until_s:.1f}",
-                f"{aligning.sum() / 1e3:.1f}",
-                f"{aligning.mean():.1f}",
-                f"{np.quantile(aligning, 0.99):.1f}",
-                f"{aligning.max():.1f}",
-                f"{catching_up.max():.1f}" if len(catching_up) else "",
-            ]
-        )
+        of_push = aligning.mean(), np.quantile(aligning, 0.99), aligning.max()
+        numbers = [f"{x:.1f}" for x in (load.until_s, aligning.sum() / 1e3, *of_push)]
+        last = f"{catching_up.max():.1f}" if len(catching_up) else ""
+        rows.append([f"{load.data_s:.0f}", load.outcome, *numbers, last])
     header = ["data, s", "outcome", "after, s", "aligning, s", "a push, ms", "99 %", "largest"]
     return table([*header, "largest, catching up"], rows)
 

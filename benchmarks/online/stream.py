@@ -8,13 +8,13 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from benchmarks.report import rms
 from ssm_graph.base.frozen import Array
-from ssm_graph.evaluation import ErrorSeries, error_series
+from ssm_graph.evaluation import error_series
 from ssm_graph.live.estimator import FixedLagSmoother
 from ssm_graph.live.estimator.answers import Delayed
 from ssm_graph.mission.estimate import Trajectory
@@ -88,19 +88,18 @@ class Answers:
         place = self.column("place")[rows]
         sigma = self.column("position_sigma_enu")[rows]
         nothing = np.full((len(place), 3), np.nan)
+        names = ("velocity_enu", "roll_pitch_heading", "velocity_sigma_enu", "attitude_sigma")
+        own: dict[str, Any] = {name: self.column(name)[rows] for name in names}
         return Trajectory(
             time_s=self.column("time_s")[rows],
             lat=place[:, 0],
             lon=place[:, 1],
             height=place[:, 2],
-            velocity_enu=self.column("velocity_enu")[rows],
-            roll_pitch_heading=self.column("roll_pitch_heading")[rows],
             gyro_bias=nothing,
             accel_bias=nothing,
             position_cov_enu=sigma[:, :, None] ** 2 * np.eye(3),
-            velocity_sigma_enu=self.column("velocity_sigma_enu")[rows],
-            attitude_sigma=self.column("attitude_sigma")[rows],
             n_beams=np.zeros(len(place)),
+            **own,
         )
 
 
@@ -197,11 +196,7 @@ NOT_SCORED = Accuracy(*[np.nan] * 6)
 
 def accuracy(trajectory: Trajectory, truth: Callable[[Array], Reference]) -> Accuracy:
     """Score a trajectory against the truth at its own times."""
-    return accuracy_of(error_series(trajectory, truth(trajectory.time_s)))
-
-
-def accuracy_of(e: ErrorSeries) -> Accuracy:
-    """Return the summary of errors."""
+    e = error_series(trajectory, truth(trajectory.time_s))
     with np.errstate(invalid="ignore", divide="ignore"):
         position = (e.position_enu / e.position_sigma_enu) ** 2
         velocity = (e.velocity_enu / e.velocity_sigma_enu) ** 2

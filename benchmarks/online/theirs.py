@@ -12,8 +12,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
-from benchmarks.speed.plain import add_beams
-from ssm_graph.base.earth import LocalFrame
+from benchmarks.speed.tasks import add_beams
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.states import States
 from ssm_graph.graph.aids.depth import DepthMeans
@@ -215,29 +214,13 @@ class Theirs:
         return covariance
 
 
-class _Columns:
-    """What a run collects, keyframe by keyframe."""
-
-    def __init__(self) -> None:
-        self.time_s: list[float] = []
-        self.states: list[States] = []
-        self.covariance: list[Array] = []
-        self.seconds: list[tuple[float, float, float, float]] = []
-
-    def trajectory(self, frame: LocalFrame) -> Trajectory:
-        states = States(*(np.concatenate(c) for c in zip(*self.states, strict=True)))
-        return trajectory_at(
-            frame,
-            np.array(self.time_s),
-            states,
-            np.array(self.covariance),
-            n_beams=np.full(len(self.time_s), 4.0),
-        )
-
-
 def run_theirs(mission: Mission, config: TheirConfig, *, most_wall_s: float = np.inf) -> TheirRun:
     """Feed a mission keyframe by keyframe until it ends, GTSAM gives up, or time runs out."""
-    theirs, columns, failure = Theirs(mission, config), _Columns(), ""
+    theirs, failure = Theirs(mission, config), ""
+    time_s: list[float] = []
+    states: list[States] = []
+    covariances: list[Array] = []
+    seconds: list[tuple[float, float, float, float]] = []
     reads = config.reads_covariance and config.kind is Kind.INCREMENTAL
     covariance, begun = np.full((15, 15), np.nan), time.perf_counter()
     for timed in keyframes_live(mission):
@@ -257,15 +240,20 @@ def run_theirs(mission: Mission, config: TheirConfig, *, most_wall_s: float = np
         if not all(np.all(np.isfinite(column)) for column in theirs.states):
             failure = f"not finite from {timed.keyframe.time_s:.1f} s on"
             break
-        columns.time_s.append(timed.keyframe.time_s)
-        columns.states.append(theirs.states)
-        columns.covariance.append(covariance)
-        columns.seconds.append((timed.seconds, updated - begin, read_s, spent_s))
+        time_s.append(timed.keyframe.time_s)
+        states.append(theirs.states)
+        covariances.append(covariance)
+        seconds.append((timed.seconds, updated - begin, read_s, spent_s))
         if time.perf_counter() - begun > most_wall_s:
             failure = f"stopped at {timed.keyframe.time_s:.1f} s: out of time"
             break
-    seconds = np.array(columns.seconds).reshape(-1, 4)
     wall_s = time.perf_counter() - begun
-    front_s, update_s, covariance_s, cpu_s = seconds.T
-    trajectory = columns.trajectory(mission.frame)
+    trajectory = trajectory_at(
+        mission.frame,
+        np.array(time_s),
+        States(*(np.concatenate(c) for c in zip(*states, strict=True))),
+        np.array(covariances),
+        n_beams=np.full(len(time_s), 4.0),
+    )
+    front_s, update_s, covariance_s, cpu_s = np.array(seconds).reshape(-1, 4).T
     return TheirRun(trajectory, front_s, update_s, covariance_s, cpu_s, failure, wall_s)

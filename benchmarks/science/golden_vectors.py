@@ -24,10 +24,7 @@ from ssm_graph.filters.rules.correntropy import CorrentropyUpdate
 from ssm_graph.filters.rules.kalman import KalmanUpdate
 from ssm_graph.filters.rules.ssm import Floor, SsmUpdate, StopRule
 from ssm_graph.filters.rules.student import Scale, StudentUpdate
-from ssm_graph.filters.rules.update import (
-    Update,
-    UpdateRule,
-)
+from ssm_graph.filters.rules.update import Update, UpdateRule
 from tests.linear_filter import LinearModel, LinearSystem, run_linear_filter
 
 Vectors = Mapping[str, Array]
