@@ -3,7 +3,7 @@
 import ssm_graph as sg
 
 config = sg.scenario_config(
-    "survey", duration_s=300.0, outliers=sg.Outliers(sg.OutlierKind.SPARSE, 0.1)
+    "survey", duration_s=120.0, outliers=sg.Outliers(sg.OutlierKind.SPARSE, 0.1)
 )
 sg.write_mission("mission", sg.simulate(config).mission)
 

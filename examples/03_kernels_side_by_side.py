@@ -3,7 +3,7 @@
 import ssm_graph as sg
 
 config = sg.scenario_config(
-    "survey", duration_s=240.0, seed=4, outliers=sg.Outliers(sg.OutlierKind.ONE_BEAM, 0.5)
+    "survey", duration_s=120.0, seed=4, outliers=sg.Outliers(sg.OutlierKind.ONE_BEAM, 0.5)
 )
 simulated = sg.simulate(config)
 truth = simulated.mission.reference

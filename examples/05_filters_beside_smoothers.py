@@ -3,7 +3,7 @@
 import ssm_graph as sg
 
 config = sg.scenario_config(
-    "survey", duration_s=120.0, seed=4, outliers=sg.Outliers(sg.OutlierKind.SPARSE, 0.2)
+    "survey", duration_s=60.0, seed=4, outliers=sg.Outliers(sg.OutlierKind.SPARSE, 0.2)
 )
 mission = sg.simulate(config).mission
 truth = mission.reference

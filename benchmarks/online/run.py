@@ -40,7 +40,7 @@ from benchmarks.report import (
     table,
 )
 from ssm_graph.base.frozen import Array
-from ssm_graph.evaluation import Interval
+from ssm_graph.evaluation.statistics import Interval
 from ssm_graph.live.estimator import ONLINE
 
 P99_MS = 20.0

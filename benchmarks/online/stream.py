@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.report import rms
 from ssm_graph.base.frozen import Array
-from ssm_graph.evaluation import error_series
+from ssm_graph.evaluation.errors import error_series
 from ssm_graph.live.estimator import FixedLagSmoother
 from ssm_graph.live.estimator.answers import Delayed
 from ssm_graph.mission.estimate import Trajectory

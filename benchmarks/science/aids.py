@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks.report import Option, Report, mean_text, note, table
 from factors.similarity import GaussianKernel, Kernel, LogKernel
 from ssm_graph import SmootherConfig, SsmSmoother, build_problem, evaluate
-from ssm_graph.evaluation import chi2_interval
+from ssm_graph.evaluation.statistics import chi2_interval
 from ssm_graph.mission.estimate import Calibration
 from ssm_graph.mission.mission import Aids
 from ssm_graph.sensors.compass import HeadingErrors

@@ -16,7 +16,7 @@ from benchmarks.report import Option, Report, mean_text, note, ratio_text, table
 from factors.similarity import GaussianKernel, LogKernel
 from ssm_graph import Mission, SsmSmoother, build_problem
 from ssm_graph.base.frozen import Array
-from ssm_graph.evaluation import chi2_interval
+from ssm_graph.evaluation.statistics import chi2_interval
 from ssm_graph.simulation import Grade
 from tests.calibration_cases import asking
 from tests.calibration_runs import LABELS, Run, transit, turns

@@ -16,7 +16,7 @@ from benchmarks.missions import survey
 from benchmarks.report import Option, Report, mean_text, note, ratio_text, rms, table
 from ssm_graph import Estimate, Mission, Problem, SsmSmoother, Status, build_problem, evaluate
 from ssm_graph.base.frozen import Array
-from ssm_graph.evaluation import chi2_interval
+from ssm_graph.evaluation.statistics import chi2_interval
 from ssm_graph.mission.calibration import CURRENTS as CURRENT_VARIABLES
 from ssm_graph.mission.problem import with_dvl
 from ssm_graph.simulation import (

@@ -16,7 +16,7 @@ from benchmarks.missions import sparse
 from benchmarks.online.stream import HEALTHS, Answers, run_stream
 from benchmarks.report import note
 from ssm_graph.base.frozen import Array
-from ssm_graph.evaluation import error_series
+from ssm_graph.evaluation.errors import error_series
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator import FixedLagSmoother

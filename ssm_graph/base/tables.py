@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,33 +49,29 @@ class TableSpec:
         return self.blank | frozenset(self.optional)
 
 
-class TableFile(Protocol):
+@dataclass(frozen=True, slots=True, eq=False)
+class TableFile(ABC):
     """Where the rows of a table stand."""
 
-    @property
-    def label(self) -> str:
-        """How messages call the file."""
+    label: str
+    """How messages call the file."""
 
     def place(self, row: int) -> str:
-        """Return file and line of a row."""
+        """Return where a row is: in a text its line, else its number, counted from 1."""
+        return f"{self.label}: row {row + 1}"
 
+    @abstractmethod
     def cell(self, row: int, column: str) -> str:
-        """Return the content of a cell."""
+        """Return the content of a cell as it stands there."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class NoFile:
+class NoFile(TableFile):
     """Rows that stand in no file."""
 
-    label: str
     columns: Mapping[str, Array]
 
-    def place(self, row: int) -> str:
-        """Return the name and the number of a row, counted from 1."""
-        return f"{self.label}: row {row + 1}"
-
-    def cell(self, row: int, column: str) -> str:
-        """Return the content of a cell."""
+    def cell(self, row: int, column: str) -> str:  # noqa: D102
         return f"{self.columns[column][row]:.10g}"
 
 
@@ -85,6 +82,14 @@ class Table:
     file: TableFile
     columns: dict[str, Array]
     notes: tuple[str, ...] = ()
+    label: str = field(init=False)
+    """What messages call the table."""
+    time_s: Array = field(init=False)
+    """(N,) the column ``time_s``."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "label", self.file.label)
+        object.__setattr__(self, "time_s", self.columns[TIME])
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -94,16 +99,6 @@ class Table:
 
     def __contains__(self, name: str) -> bool:
         return name in self.columns
-
-    @property
-    def label(self) -> str:
-        """What messages call the table."""
-        return self.file.label
-
-    @property
-    def time_s(self) -> Array:
-        """(N,) the column ``time_s``."""
-        return self.columns[TIME]
 
     def stack(self, names: Sequence[str]) -> Array:
         """Return columns side by side, (N, len(names)); NaN where the table has no such column."""

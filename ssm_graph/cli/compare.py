@@ -16,7 +16,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemaini
 from rich.progress import Progress as Bar
 
 from ssm_graph.base.errors import ConfigError
-from ssm_graph.cli.options import add_command, method_lines, say, table_format_option
+from ssm_graph.cli.options import (
+    add_command,
+    method_lines,
+    number_option,
+    say,
+    table_format_option,
+)
 from ssm_graph.evaluation.comparison import compare_methods
 from ssm_graph.io.mission_folder.folder import TableFormat
 from ssm_graph.report.comparison.tables import latex, markdown
@@ -97,13 +103,7 @@ def add_parser(commands: Any, *, epilog: str) -> None:
     parser.add_argument(
         "--seeds", type=int, metavar="N", help="this many trials instead of the study file's"
     )
-    parser.add_argument(
-        "--jobs",
-        type=int,
-        default=os.cpu_count() or 1,
-        metavar="N",
-        help="processes (default: %(default)s)",
-    )
+    number_option(parser, "--jobs", "N", "processes", os.cpu_count() or 1, kind=int)
     parser.add_argument(
         "--scheduler",
         metavar="ADDRESS",

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frames import BodyAxes
-from ssm_graph.cli.options import add_command, add_mission_output, number_option, say
+from ssm_graph.cli.options import add_command, add_mission_output, choice_option, number_option, say
 from ssm_graph.io.blueye.convert import convert_blueye
 from ssm_graph.io.mission_folder.folder import write_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle
@@ -66,12 +66,8 @@ def _add_ros_options(parser: argparse.ArgumentParser) -> None:
         metavar="SENSOR=NAME",
         help="the topic to read where several fit, such as imu=/imu/data; may be repeated",
     )
-    group.add_argument(
-        "--body",
-        choices=[axes.value for axes in BodyAxes],
-        help="axes of the IMU messages: forward-left-up as REP 103 has it, forward-right-down, "
-        "right-forward-up (default: FLU)",
-    )
+    meaning = "axes of the IMU messages: forward-left-up as REP 103 has it, forward-right-down, "
+    choice_option(group, "--body", BodyAxes, f"{meaning}right-forward-up (default: FLU)")
     density = f"of the water (default: {SEA_WATER:g}; fresh water has 1000)"
     air = "pressure at the surface, 0 for a sensor that reads 0 there "
     surface = "height of the water's surface above the WGS-84 ellipsoid "
@@ -91,12 +87,7 @@ def _add_ros_options(parser: argparse.ArgumentParser) -> None:
 
 
 ROS_OPTIONS = (
-    "vehicle",
-    "topic",
-    "body",
-    "water_density",
-    "atmosphere",
-    "surface_height",
+    *("vehicle", "topic", "body", "water_density", "atmosphere", "surface_height"),
     "beams_against",
 )
 
@@ -136,7 +127,7 @@ def _from_rosbag(arguments: argparse.Namespace) -> Mission:
         raise ConfigError(f"--water-density: expected a number above zero, got {density:g}")
     against = bool(arguments.beams_against)
     options = RosOptions(
-        body=BodyAxes(arguments.body) if arguments.body else defaults.body,
+        body=arguments.body or defaults.body,
         beam_sign=BeamSign.AGAINST if against else BeamSign.ALONG,
         water_density=defaults.water_density if density is None else density,
         atmosphere=defaults.atmosphere if atmosphere is None else atmosphere,

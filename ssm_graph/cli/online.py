@@ -18,7 +18,14 @@ from factors.kernels import KERNELS
 from ssm_graph.base.errors import ConfigError, SolverError
 from ssm_graph.base.frames import BodyAxes
 from ssm_graph.base.frozen import Array
-from ssm_graph.cli.options import add_command, add_kernel_options, kernel_of, number_option, say
+from ssm_graph.cli.options import (
+    add_command,
+    add_kernel_options,
+    choice_option,
+    kernel_of,
+    number_option,
+    say,
+)
 from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle, vehicle_of
 from ssm_graph.io.raw_log.rows import messages_of
@@ -245,32 +252,15 @@ def add_connections(parser: argparse.ArgumentParser) -> None:
         metavar="1|N|full",
         help="of --replay: as recorded, N times as fast, or as fast as it goes (default: 1)",
     )
-    group.add_argument(
-        "--clock",
-        choices=[clock.name.lower() for clock in Clock],
-        default=Clock.INSTRUMENT.name.lower(),
-        help="stamp DVL and GNSS by the instrument's own UTC where it agrees with the arrival, or "
-        "by the arrival (default: instrument)",
-    )
-    group.add_argument(
-        "--axes",
-        choices=[axes.value for axes in BodyAxes],
-        default=BodyAxes.FRD.value,
-        help="body axes of inertial vectors in JSON (default: FRD)",
-    )
-    group.add_argument(
-        "--surface-height",
-        type=float,
-        default=0.0,
-        metavar="M",
-        help="of the water above the ellipsoid, for --depth (default: 0)",
-    )
-    group.add_argument(
-        "--geoid-separation",
-        type=float,
-        metavar="M",
-        help="geoid above ellipsoid: for fixes that leave it out, and for --nmea (default: none)",
-    )
+    meaning = "stamp DVL and GNSS by the instrument's own UTC where it agrees with the arrival, or "
+    meaning += "by the arrival (default: instrument)"
+    choice_option(group, "--clock", Clock, meaning, Clock.INSTRUMENT)
+    meaning = "body axes of inertial vectors in JSON (default: FRD)"
+    choice_option(group, "--axes", BodyAxes, meaning, BodyAxes.FRD)
+    meaning = "of the water above the ellipsoid, for --depth"
+    number_option(group, "--surface-height", "M", meaning, 0.0)
+    meaning = "geoid above ellipsoid: for fixes that leave it out, and for --nmea (default: none)"
+    number_option(group, "--geoid-separation", "M", meaning)
     group = parser.add_argument_group("outputs")
     group.add_argument(
         "--publish", action="append", metavar="ADDRESS", help="answers as JSON lines; repeatable"
@@ -342,7 +332,7 @@ def output_configs(arguments: argparse.Namespace) -> list[OutputConfig]:
 
 
 def _decoder(name: str, arguments: argparse.Namespace) -> Callable[[], Decoder]:
-    clock, axes = Clock[arguments.clock.upper()], BodyAxes(arguments.axes)
+    clock, axes = arguments.clock, arguments.axes
     if name == "dvl":
         return lambda: WaterLinkedDecoder(clock=clock)
     if name in ("imu", "messages"):

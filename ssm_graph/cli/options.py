@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping
+from enum import Enum
 from pathlib import Path
 from typing import Any, Final
 
@@ -45,6 +46,23 @@ def number_option(
     parser.add_argument(flag, type=kind, default=default, metavar=metavar, help=meaning + tail)
 
 
+def choice_option(
+    parser: Any, flag: str, kind: type[Enum], meaning: str, default: Enum | None = None
+) -> None:
+    """Add an option that names a member of an enumeration, in upper or lower case."""
+    names = [str(m.value) if m.value == m.name else m.name.lower() for m in kind]
+
+    def member(word: str) -> Enum:
+        try:
+            return kind[word.upper()]
+        except KeyError:
+            expected = f"{', '.join(names[:-1])} or {names[-1]}"
+            raise argparse.ArgumentTypeError(f"expected {expected}, got {word!r}") from None
+
+    choices = "{" + ",".join(names) + "}"
+    parser.add_argument(flag, type=member, default=default, metavar=choices, help=meaning)
+
+
 def method_lines(families: Mapping[str, Family]) -> str:
     """Return what methods there are, one a line, each with its parameter's default."""
     return "\n".join(
@@ -62,21 +80,8 @@ def add_mission_output(parser: argparse.ArgumentParser) -> None:
 
 def table_format_option(parser: argparse.ArgumentParser) -> None:
     """Add in which format tables are written."""
-    parser.add_argument(
-        "--format",
-        type=_table_format,
-        choices=list(TableFormat),
-        default=TableFormat.CSV,
-        metavar="{" + ",".join(table.name.lower() for table in TableFormat) + "}",
-        help="format of the tables (default: csv)",
-    )
-
-
-def _table_format(word: str) -> TableFormat:
-    try:
-        return TableFormat[word.upper()]
-    except KeyError:
-        raise argparse.ArgumentTypeError(f"expected csv or parquet, got {word!r}") from None
+    meaning = "format of the tables (default: csv)"
+    choice_option(parser, "--format", TableFormat, meaning, TableFormat.CSV)
 
 
 PARAMETERS: Final = {

@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import Console
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.cli.options import add_command, add_mission_output, say
+from ssm_graph.cli.options import add_command, add_mission_output, choice_option, say
 from ssm_graph.io.mission_folder.folder import write_mission
 from ssm_graph.sensors.dvl import MOST_BEAMS
 from ssm_graph.simulation import (
@@ -36,18 +36,9 @@ def add_parser(commands: Any, *, epilog: str) -> None:
         epilog=epilog,
     )
     parser.add_argument("scenario", metavar="SCENARIO", choices=list(SCENARIOS))
-    parser.add_argument(
-        "--grade",
-        type=str.lower,
-        choices=[grade.name.lower() for grade in Grade],
-        help="grade of the inertial sensors (default: that of the scenario)",
-    )
-    parser.add_argument(
-        "--outliers",
-        type=str.lower,
-        choices=[kind.name.lower() for kind in OutlierKind],
-        help="kind of DVL outliers (default: that of the scenario)",
-    )
+    usual = "(default: that of the scenario)"
+    choice_option(parser, "--grade", Grade, f"grade of the inertial sensors {usual}")
+    choice_option(parser, "--outliers", OutlierKind, f"kind of DVL outliers {usual}")
     parser.add_argument(
         "--rate", type=float, help="share of pings with an outlier, 0 to 1 (default: 0.1)"
     )
@@ -67,21 +58,19 @@ def add_parser(commands: Any, *, epilog: str) -> None:
 
 def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
     """Simulate and write."""
-    changes: dict[str, Any] = {"seed": arguments.seed}
-    if arguments.grade is not None:
-        changes["grade"] = Grade[arguments.grade.upper()]
-    if arguments.duration is not None:
-        changes["duration_s"] = arguments.duration
-    if arguments.imu_rate is not None:
-        changes["imu_rate_hz"] = arguments.imu_rate
+    usual = scenario_config(arguments.scenario)
+    told: dict[str, Any] = {
+        "seed": arguments.seed,
+        "grade": arguments.grade,
+        "duration_s": arguments.duration,
+        "imu_rate_hz": arguments.imu_rate,
+    }
     if arguments.beams is not None:
-        dvl = scenario_config(arguments.scenario).dvl
-        changes["dvl"] = replace(dvl, mount=default_mount(arguments.beams))
+        told["dvl"] = replace(usual.dvl, mount=default_mount(arguments.beams))
     if arguments.outliers is not None or arguments.rate is not None:
-        default = scenario_config(arguments.scenario).outliers
-        kind = OutlierKind[arguments.outliers.upper()] if arguments.outliers else default.kind
-        rate = arguments.rate if arguments.rate is not None else default.rate
-        changes["outliers"] = Outliers(kind, rate)
+        rate = usual.outliers.rate if arguments.rate is None else arguments.rate
+        told["outliers"] = Outliers(arguments.outliers or usual.outliers.kind, rate)
+    changes = {name: value for name, value in told.items() if value is not None}
     simulated = simulate(scenario_config(arguments.scenario, **changes))
     write_mission(arguments.out, simulated.mission, table_format=arguments.format)
     mission = simulated.mission

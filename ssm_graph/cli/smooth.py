@@ -10,7 +10,13 @@ from rich.console import Console
 from factors.kernels import KERNELS, KernelChoice, TruncatedKernel
 from factors.similarity import Similarity
 from ssm_graph.base.errors import ConfigError
-from ssm_graph.cli.options import add_command, add_kernel_options, kernel_of
+from ssm_graph.cli.options import (
+    add_command,
+    add_kernel_options,
+    choice_option,
+    kernel_of,
+    number_option,
+)
 from ssm_graph.cli.run_mission import add_mission_arguments, run_mission
 from ssm_graph.engine.reweighting import GncStart, Graduation
 from ssm_graph.mission.estimate import Estimate
@@ -47,32 +53,17 @@ def add_parser(commands: Any, *, epilog: str) -> None:
 def _add_kernel_options(parser: argparse.ArgumentParser) -> None:
     more = "; gnc-tls: truncated least squares by graduated non-convexity"
     add_kernel_options(parser, CHOICES, more=more)
-    parser.add_argument(
-        "--gnc-start",
-        choices=[start.name.lower() for start in GncStart],
-        default=None,
-        help="start gnc-tls from least squares with every weight 1, as published, or from the "
-        "gated forward pass (default: ones)",
-    )
-    parser.add_argument(
-        "--similarity",
-        choices=[kind.name.lower() for kind in Similarity],
-        default=None,
-        help="judge a beam by residual and posterior variance, or by the residual alone "
-        "(default: expected for similarity kernels, plain for M-estimators and gnc-tls)",
-    )
+    meaning = "start gnc-tls from least squares with every weight 1, as published, or from the "
+    meaning += "gated forward pass (default: ones)"
+    choice_option(parser, "--gnc-start", GncStart, meaning)
+    meaning = "judge a beam by residual and posterior variance, or by the residual alone "
+    meaning += "(default: expected for similarity kernels, plain for M-estimators and gnc-tls)"
+    choice_option(parser, "--similarity", Similarity, meaning)
 
 
 def _add_loop_options(parser: argparse.ArgumentParser) -> None:
-    loop = SmootherConfig()
-    parser.add_argument(
-        "--max-iterations",
-        type=int,
-        default=loop.max_iterations,
-        metavar="N",
-        help=f"limit of the similarity loop (default: {loop.max_iterations})",
-    )
-
+    limit, most = "limit of the similarity loop", SmootherConfig().max_iterations
+    number_option(parser, "--max-iterations", "N", limit, most, kind=int)
     parser.add_argument(
         "--adapt-noise",
         action="store_true",
@@ -102,15 +93,14 @@ def loop_from(arguments: argparse.Namespace) -> SmootherConfig:
     """Return the settings of the loop; what does not belong to the kernel is refused."""
     graduation = None
     if arguments.kernel == GNC:
-        graduation = Graduation(GncStart[(arguments.gnc_start or GncStart.ONES.name).upper()])
+        graduation = Graduation(arguments.gnc_start or GncStart.ONES)
     elif arguments.gnc_start is not None:
         raise ConfigError(
             f"--gnc-start: expected with --kernel {GNC}, got {arguments.kernel}; leave it out"
         )
-    similarity = arguments.similarity
     return SmootherConfig(
         kernel=kernel_of(arguments, CHOICES),
-        similarity=None if similarity is None else Similarity[similarity.upper()],
+        similarity=arguments.similarity,
         graduation=graduation,
         fault_search=FaultSearch() if arguments.find_faults else None,
         adapt_noise=arguments.adapt_noise,

@@ -53,6 +53,7 @@ from ssm_graph.sensors.instrument import (
     Instrument,
     Lists,
     compounded,
+    read_columns,
 )
 from ssm_graph.sensors.messages import Message
 
@@ -164,22 +165,22 @@ class _Dvl(Instrument):
     def check(self, table: Table, bare: DvlLog, axes: BodyAxes) -> list[str]:  # noqa: ARG002
         notes = _geometry_note(bare.mount, table.label)
         speed, *others = self.columns_of(bare)
-        if len(table):
+        flag = table.stack(_WATER.names)[:, 0]
+        if len(flag):
             for column in others:
                 column.beyond(table)
-            _check_flags(table)
+            _check_flags(table, flag)
             _check_covariance(table, bare)
-        is_water = table.stack(_WATER.names)[:, 0] > 0.0
-        return notes + readings.check_speeds(table, speed, is_water)
+        return notes + readings.check_speeds(table, speed, flag > 0.0)
 
     def filled(self, table: Table, bare: DvlLog, settings: Settings, axes: BodyAxes) -> DvlLog:
-        rows = {c.field: c.read(table, axes) for c in self.columns_of(bare) if c.field}
+        rows = read_columns(table, [c for c in self.columns_of(bare) if c.field], axes)
         covariance = _covariance(table, bare)
         if covariance is not None:
             stated = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
             rows["sigma"] = np.where(np.isnan(stated), rows["sigma"], stated)
         water = rows["water_track"]
-        has_range = any(name in table for name in _RANGE.sized(bare.mount.n_beams).names)
+        has_range = any(name in table.columns for name in _RANGE.sized(bare.mount.n_beams).names)
         log = DvlLog(
             mount=bare.mount,
             time_s=table.time_s,
@@ -368,9 +369,8 @@ def _mounting(mount: DvlMount) -> list[float]:
     return [in_unit(float(angle), DEGREE) for angle in rpy]
 
 
-def _check_flags(table: Table) -> None:
+def _check_flags(table: Table, flag: Array) -> None:
     """Refuse a flag that is neither yes nor no."""
-    flag = table.stack(_WATER.names)[:, 0]
     bad = np.isfinite(flag) & (flag != 0.0) & (flag != 1.0)
     if bad.any():
         raise table.cell_fault(int(np.argmax(bad)), _WATER.pattern, _WATER.expected)
@@ -387,11 +387,11 @@ def _covariance(table: Table, bare: DvlLog) -> Array | None:
     """Return the covariances (N, B, B) that a table states, NaN in pings without; None for none."""
     n_beams = bare.mount.n_beams
     pairs = _pairs(n_beams) if n_beams <= MOST_CORRELATED else []
-    if not any(name in table for _, _, name in pairs):
+    if not any(name in table.columns for _, _, name in pairs):
         return None
-    found = np.full((len(table), n_beams, n_beams), np.nan)
-    for i, j, name in pairs:
-        found[:, i, j] = found[:, j, i] = table.stack([name])[:, 0]
+    found = np.full((len(table.time_s), n_beams, n_beams), np.nan)
+    for (i, j, _), cells in zip(pairs, table.stack([name for *_, name in pairs]).T, strict=True):
+        found[:, i, j] = found[:, j, i] = cells
     return found
 
 
@@ -400,7 +400,7 @@ def _check_covariance(table: Table, bare: DvlLog) -> None:
     covariance = _covariance(table, bare)
     if covariance is None:
         return
-    sigmas = [name for name in _SIGMA.sized(bare.mount.n_beams).names if name in table]
+    sigmas = [name for name in _SIGMA.sized(bare.mount.n_beams).names if name in table.columns]
     if sigmas:
         raise DataError(
             f"{table.label}: columns {sigmas[0]!r} and 'cov11_m2_per_s2' stand together; expected "
@@ -412,7 +412,7 @@ def _check_covariance(table: Table, bare: DvlLog) -> None:
             "expected no beam_scale_error and no beam_scale_sigma; state scale_error instead"
         )
     whole = np.isfinite(covariance).all(axis=(1, 2))
-    least = np.full(len(table), np.inf)
+    least = np.full(len(covariance), np.inf)
     least[whole] = np.linalg.eigvalsh(covariance[whole])[:, 0]
     least = np.minimum(
         least, np.nan_to_num(np.diagonal(covariance, axis1=1, axis2=2), nan=1.0).min(axis=1)

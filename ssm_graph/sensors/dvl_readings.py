@@ -107,12 +107,12 @@ def check_speeds(table: Table, column: Column, is_water: Mask) -> list[str]:
 
     What the notes say to be left out is what :func:`without_false_speeds` leaves out.
     """
-    if len(table) == 0:
-        return [f"{table.label}: the table has no rows; nothing will aid the inertial sensors"]
     speed = table.stack(column.names)
+    if len(speed) == 0:
+        return [f"{table.label}: the table has no rows; nothing will aid the inertial sensors"]
     if np.isnan(speed).all():
         return [f"{table.label}: no beam ever had bottom lock; every speed is empty or NaN"]
-    if len(table) > 2 and np.median(np.diff(table.time_s)) < SHORTEST_STEP_S:
+    if len(speed) > 2 and np.median(np.diff(table.time_s)) < SHORTEST_STEP_S:
         raise DataError(
             f"{table.label}: the rows are {np.median(np.diff(table.time_s)):.3g} s apart; expected "
             "seconds between pings, at least 0.001; are the times in minutes or hours?"
@@ -164,7 +164,7 @@ def _small_codes(table: Table, speed: Array, column: Column) -> None:
     for code in _CODES:
         exact = int(np.sum(speed == code))
         near = int(np.sum(np.abs(speed - code) < 0.05)) - exact
-        if exact > max(2, _CODE_SHARE * len(table), 3 * near):
+        if exact > max(2, _CODE_SHARE * len(speed), 3 * near):
             row, beam = np.argwhere(speed == code)[0]
             raise table.cell_fault(
                 int(row),
@@ -211,10 +211,10 @@ def _repeats(table: Table, speed: Array, is_water: Mask) -> list[str]:
         return []
     row = int(np.argmax(repeated))
     text = (
-        f"{count} of {len(table)} pings ({100 * count / len(table):.0f} %) repeat all "
+        f"{count} of {len(speed)} pings ({100 * count / len(speed):.0f} %) repeat all "
         f"{COUNTS[speed.shape[1]]} speeds of the ping before under a new time"
     )
-    if count > _REPEATED_SHARE * len(table) and count >= _FEW:
+    if count > _REPEATED_SHARE * len(speed) and count >= _FEW:
         raise table.fault(
             row, f"{text}; expected each report once; the driver republishes: delete the copies"
         )

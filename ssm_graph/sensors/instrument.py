@@ -90,9 +90,9 @@ class Column:
         """Its key in a JSON message."""
         return self.json or self.pattern.replace("{}_", "")
 
-    def read(self, table: Table, axes: BodyAxes) -> Array:
-        """Return its numbers (N,) or (N, len(over)) in SI units, body vectors in axes FRD."""
-        values = table.stack(self.names) * self.unit
+    def si(self, cells: Array, axes: BodyAxes) -> Array:
+        """Return its cells (N, columns) as (N,) or (N, len(over)) in SI units, axes FRD."""
+        values = cells * self.unit
         if self.wraps:
             values = wrapped(values)
         if self.is_body:
@@ -102,15 +102,16 @@ class Column:
         return values if self.over else values[:, 0]
 
     def written(self, values: Array) -> dict[str, Array]:
-        """Return its columns of numbers in SI units; the inverse of :meth:`read` in axes FRD."""
+        """Return its columns of numbers in SI units; the inverse of :meth:`si` in axes FRD."""
         columns = np.asarray(values).reshape(-1, len(self.names)) / self.unit
         return {name: columns[:, index] for index, name in enumerate(self.names)}
 
     def beyond(self, table: Table) -> None:
         """Raise :class:`DataError` for the first number of a table that is beyond the limits."""
         for name in self.names:
-            if name in table:
-                bad = (table[name] < self.limits[0]) | (table[name] > self.limits[1])
+            if name in table.columns:
+                values = table.columns[name]
+                bad = (values < self.limits[0]) | (values > self.limits[1])
                 if bad.any():
                     raise table.cell_fault(int(np.argmax(bad)), name, self.expected)
 
@@ -118,6 +119,14 @@ class Column:
         """Return whether one of some numbers in SI units is beyond the limits; NaN is not."""
         low, high = self.limits[0] * self.unit, self.limits[1] * self.unit
         return any(number < low or number > high for number in numbers)
+
+
+def read_columns(table: Table, columns: Sequence[Column], axes: BodyAxes) -> dict[str, Array]:
+    """Return what columns of a table hold, by the fields of the log, SI units and axes FRD."""
+    cells = table.stack([name for column in columns for name in column.names])
+    edges = np.cumsum([len(column.names) for column in columns])[:-1]
+    parts = zip(columns, np.split(cells, edges, axis=1), strict=True)
+    return {column.field: column.si(part, axes) for column, part in parts}
 
 
 def added(log: Any, stated: float | Array, off: Array) -> Array:  # noqa: ARG001
@@ -209,7 +218,7 @@ class Instrument:
 
     def filled(self, table: Table, bare: Any, settings: Settings, axes: BodyAxes) -> Any:  # noqa: ARG002
         """Return the log of a checked table."""
-        rows = {column.field: column.read(table, axes) for column in self.columns_of(bare)}
+        rows = read_columns(table, self.columns_of(bare), axes)
         return replace(bare, time_s=table.time_s, **rows)
 
     def cleaned(self, log: Any) -> Any:

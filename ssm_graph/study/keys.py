@@ -39,103 +39,69 @@ class StudyKey(Key):
         return ""
 
 
-def _number(value: Any) -> float:
-    if not isinstance(value, float) or not math.isfinite(value):
-        raise TypeError
-    return value
+def _of(kind: type, test: Callable[[Any], Any] = lambda _: True) -> _Read:
+    """Return what reads a value of a kind that passes a test."""
 
-
-def _text(value: Any) -> str:
-    if not isinstance(value, str) or not value.strip():
-        raise TypeError
-    return value
-
-
-def _exactly(kind: type) -> _Read:
     def read(value: Any) -> Any:
-        if not isinstance(value, kind):
+        if not isinstance(value, kind) or not test(value):
             raise TypeError
         return value
 
     return read
 
 
-def _tested(test: Callable[[float], bool]) -> _Read:
-    def read(value: Any) -> float:
-        if not test(_number(value)):
-            raise ValueError
-        return float(value)
-
-    return read
-
-
 def _whole(least: int) -> _Read:
-    return lambda value: int(_tested(lambda n: n >= least and n == int(n))(value))
+    number = _of(float, lambda n: n >= least and n.is_integer())
+    return lambda value: int(number(value))
 
 
-def _list(read: _Read) -> _Read:
+def _list(read: _Read, *, count: int | None = None, or_alone: bool = False) -> _Read:
+    """Return what reads a list of one or more, or of so many; one alone may be a list of one."""
+
     def read_all(value: Any) -> tuple[Any, ...]:
-        if not isinstance(value, list) or not value:
+        items = [value] if or_alone and not isinstance(value, list) else value
+        if not isinstance(items, list) or not items or len(items) != (count or len(items)):
             raise TypeError
-        return tuple(read(item) for item in value)
+        return tuple(map(read, items))
 
     return read_all
 
 
-def _numbers(value: Any) -> tuple[float, ...]:
-    """Read a list of numbers; a number alone is a list of one."""
-    values: tuple[float, ...] = _list(_number)(value if isinstance(value, list) else [value])
-    return values
-
-
-def _pair(value: Any) -> tuple[float, float]:
-    first, second = value
-    return _number(first), _number(second)
-
-
 REQUIRED: Any = object()
 """For ``default``: the key must be there."""
-_FRACTION: Final = _tested(lambda x: 0.0 <= x <= 1.0)
+_NUMBER: Final = _of(float, math.isfinite)
+_FRACTION: Final = _of(float, lambda x: 0.0 <= x <= 1.0)
 
 
 def _kind(expected: str, read: _Read, hint: str = "see --help") -> Callable[..., StudyKey]:
     def make(default: Any = None) -> StudyKey:
-        is_required = default is REQUIRED
-        return StudyKey(
-            required=is_required,
-            hint=hint,
-            read=read,
-            expected=expected,
-            default=None if is_required else default,
-        )
+        told: dict[str, Any] = {"hint": hint, "read": read, "expected": expected}
+        if default is REQUIRED:
+            return StudyKey(**told)
+        return StudyKey(required=False, default=default, **told)
 
     return make
 
 
-text = _kind("a text in quotes", _text)
-texts = _kind("a list of texts", _list(_text))
-number = _kind("a finite number", _number)
-numbers = _kind("a list of numbers", _numbers)
-three = _kind("three numbers", lambda v: _three(v), "along east, north, up, as [0.3, 0.0, 0.0]")
-seconds = _kind("seconds above 0", _tested(lambda x: x > 0.0), "try 600")
+text = _kind("a text in quotes", _of(str, str.strip))
+texts = _kind("a list of texts", _list(_of(str, str.strip)))
+number = _kind("a finite number", _NUMBER)
+numbers = _kind("a list of numbers", _list(_NUMBER, or_alone=True))
+three = _kind("three numbers", _list(_NUMBER, count=3), "along east, north, up, as [0.3, 0.0, 0.0]")
+seconds = _kind("seconds above 0", _of(float, lambda x: 0.0 < x < math.inf), "try 600")
 fraction = _kind("a fraction between 0 and 1", _FRACTION, "write 10 % as 0.1")
 fractions = _kind(
     "a fraction between 0 and 1, or a list of them",
-    lambda value: tuple(map(_FRACTION, _numbers(value))),
+    _list(_FRACTION, or_alone=True),
     "write 10 % as 0.1",
 )
 count = _kind("a whole number from 0", _whole(0), "raise it")
 positive_count = _kind("a whole number from 1", _whole(1), "raise it")
 counts = _kind("a list of whole numbers", _list(_whole(0)))
-pairs = _kind("a list of pairs, as [[0.5, 3.0]]", _list(_pair))
-flag = _kind("true or false", _exactly(bool))
-table = _kind("a table of keys", _exactly(dict))
-tables = _kind("tables", _list(_exactly(dict)))
-
-
-def _three(value: Any) -> tuple[float, float, float]:
-    x, y, z = _numbers(value)
-    return x, y, z
+pairs = _kind("a list of pairs, as [[0.5, 3.0]]", _list(_list(_NUMBER, count=2)))
+flag = _kind("true or false", _of(bool))
+table = _kind("a table of keys", _of(dict))
+tables = _kind("tables", _list(_of(dict)))
 
 
 @dataclass(frozen=True, slots=True)

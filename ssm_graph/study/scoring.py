@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
-from ssm_graph.evaluation import Metrics, evaluate
+from ssm_graph.evaluation.errors import Metrics, evaluate
 from ssm_graph.mission.estimate import (
     OUTLIER_WEIGHT,
     Estimate,

@@ -12,8 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 import ssm_graph as sg
-from ssm_graph.evaluation import withhold_gnss
-from ssm_graph.evaluation.errors import error_series
+from ssm_graph.evaluation.errors import error_series, withhold_gnss
 from ssm_graph.io.blueye.convert import convert_blueye
 from ssm_graph.sensors.gnss import GnssLog
 

@@ -10,7 +10,7 @@ import pytest
 from factors.similarity import GaussianKernel
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.states import States
-from ssm_graph.evaluation import chi2_interval
+from ssm_graph.evaluation.statistics import chi2_interval
 from ssm_graph.filters.geodetic.filter import (
     GeodeticConfig,
     GeodeticHistory,

@@ -10,7 +10,7 @@ import pytest
 from factors.kernels import KERNELS, HuberKernel, TruncatedKernel
 from factors.similarity import GaussianKernel
 from ssm_graph.engine.reweighting import GncStart, Graduation
-from ssm_graph.evaluation import evaluate
+from ssm_graph.evaluation.errors import evaluate
 from ssm_graph.mission.estimate import Estimate, Status
 from ssm_graph.mission.problem import build_problem
 from ssm_graph.simulation import Fault, Grade, OutlierKind, Outliers, SimulatedMission

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ssm_graph.evaluation import chi2_interval, paired_ratio
+from ssm_graph.evaluation.statistics import chi2_interval, paired_ratio
 from ssm_graph.simulation import Grade, OutlierKind, Outliers
 from ssm_graph.study.cells import Cell
 from ssm_graph.study.jobs import Job, do_job

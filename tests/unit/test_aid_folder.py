@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ssm_graph.evaluation import evaluate
+from ssm_graph.evaluation.errors import evaluate
 from ssm_graph.io.mission_folder.folder import read_mission, write_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle, vehicle_of
 from ssm_graph.io.results.tables import read_results, write_results

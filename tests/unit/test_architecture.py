@@ -55,6 +55,7 @@ Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
 @cache
+@cache
 def parse(path: Path) -> ast.Module:
     """Return the syntax tree of a module."""
     return ast.parse(path.read_text(encoding="utf-8"), str(path))
@@ -230,9 +231,10 @@ def writes_of(tree: ast.Module) -> Iterator[tuple[int, str]]:
     """Yield line and text of every write to a value that the writer did not make itself."""
     functions = [node for node in ast.walk(tree) if isinstance(node, Function)]
     inside = {id(node): f for f in functions for node in ast.walk(f)}
+    own_of = {f: {"self", "cls"} | names_of_own_values(f) for f in functions}
     for node in ast.walk(tree):
         function = inside.get(id(node))
-        own = {"self", "cls"} | (names_of_own_values(function) if function else set())
+        own = own_of[function] if function else {"self", "cls"}
         targets: list[ast.expr] = []
         if isinstance(node, ast.Assign):
             targets = node.targets
@@ -246,7 +248,7 @@ def writes_of(tree: ast.Module) -> Iterator[tuple[int, str]]:
                 is_own = isinstance(owner, ast.Name) and owner.id in own
                 if not is_own:
                     yield part.lineno, ast.unparse(part)
-        if isinstance(node, ast.Call):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
             called = ast.unparse(node.func)
             is_first = function is not None and function.name == "__post_init__"
             if called == "object.__setattr__" and not is_first:

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ssm_graph.evaluation import evaluate
+from ssm_graph.evaluation.errors import evaluate
 from ssm_graph.filters.navigation.named import filter_problems
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.io.raw_log.rows import messages_of

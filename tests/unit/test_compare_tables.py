@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ssm_graph.evaluation import Comparison, compare_methods
+from ssm_graph.evaluation.comparison import Comparison, compare_methods
 from ssm_graph.report.comparison.tables import (
     LEGEND,
     digits,

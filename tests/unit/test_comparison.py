@@ -10,9 +10,9 @@ import pytest
 from scipy.stats import t, wilcoxon
 
 from ssm_graph.base.errors import DataError
-from ssm_graph.evaluation import (
+from ssm_graph.evaluation.comparison import compare_methods
+from ssm_graph.evaluation.statistics import (
     chi2_interval,
-    compare_methods,
     holm,
     mean_with_interval,
     paired_difference,

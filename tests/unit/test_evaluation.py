@@ -10,16 +10,14 @@ import pytest
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
-from ssm_graph.evaluation import (
-    chi2_interval,
+from ssm_graph.evaluation.errors import (
     error_series,
     evaluate,
     gap_limit_s,
     interpolate_within,
-    mean_with_interval,
-    paired_ratio,
     reference_from_gnss,
 )
+from ssm_graph.evaluation.statistics import chi2_interval, mean_with_interval, paired_ratio
 from ssm_graph.mission.estimate import Trajectory, path_length_m
 from ssm_graph.mission.mission import Reference
 from ssm_graph.sensors.gnss import GnssLog

@@ -14,7 +14,7 @@ from rich.console import Console, RenderableType
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
-from ssm_graph.evaluation import evaluate
+from ssm_graph.evaluation.errors import evaluate
 from ssm_graph.mission.estimate import OUTLIER_WEIGHT, BeamTable, Estimate, Iteration, Status
 from ssm_graph.report import ProgressDisplay, save_figure, summary_table
 from ssm_graph.report.mission.figure import draw_figure

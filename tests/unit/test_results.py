@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ssm_graph.base.errors import DataError
-from ssm_graph.evaluation import evaluate
+from ssm_graph.evaluation.errors import evaluate
 from ssm_graph.io.results import tables as results_module
 from ssm_graph.io.results.summary import as_json
 from ssm_graph.io.results.tables import read_results, write_results

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ssm_graph.base.errors import ConfigError, DataError
-from ssm_graph.evaluation import evaluate
+from ssm_graph.evaluation.errors import evaluate
 from ssm_graph.io.mission_folder.folder import read_mission, write_mission
 from ssm_graph.mission.mission import NO_AIDS, Mission
 from ssm_graph.mission.start.alignment import align

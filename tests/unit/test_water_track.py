@@ -12,7 +12,7 @@ import pytest
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.states import States
-from ssm_graph.evaluation import evaluate
+from ssm_graph.evaluation.errors import evaluate
 from ssm_graph.filters.navigation.filter import Grouping, run_filter
 from ssm_graph.filters.navigation.named import filter_geodetic, filter_problems
 from ssm_graph.filters.rules.kalman import KalmanUpdate

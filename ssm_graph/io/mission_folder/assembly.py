@@ -173,11 +173,10 @@ def _times(mission: Mission, tables: dict[str, Table]) -> list[str]:
     notes = []
     start, end = mission.imu.start_s, float(mission.imu.time_s[-1])
     for name, table in tables.items():
-        if name == "imu" or len(table) == 0:
-            continue
         time_s = table.time_s
-        if "delay_s" in table:
-            time_s = time_s - np.nan_to_num(table["delay_s"])
+        if name == "imu" or len(time_s) == 0:
+            continue
+        time_s = time_s - np.nan_to_num(table.columns.get("delay_s", 0.0))
         first, last = float(time_s[0]), float(time_s[-1])
         inside = (time_s >= start - _EDGE_S) & (time_s <= end + _EDGE_S)
         ratio = (last - first) / (end - start)
@@ -190,7 +189,7 @@ def _times(mission: Mission, tables: dict[str, Table]) -> list[str]:
         outside = int(np.sum(~inside))
         if outside:
             notes.append(
-                f"{table.label}: {outside} of {len(table)} rows lie outside the time of the IMU"
+                f"{table.label}: {outside} of {len(time_s)} rows lie outside the time of the IMU"
             )
     return notes
 

@@ -55,12 +55,14 @@ def check_motion(mission: Mission, labels: dict[str, str]) -> list[str]:
     Pings off the water are left out.
     """
     mission, notes = replace(mission, dvl=mission.dvl.of_ground()), []
+    ping_s = mission.dvl.valid_s
+    pings = _velocities(mission, ping_s)
     if mission.depth is not None:
         notes += _depth_sign(mission, mission.depth, labels["depth"])
         notes += _depth_surface(mission, mission.depth, labels["depth"])
-        notes += _vertical_speed(mission, mission.depth, labels)
-    notes += _turn_signs(mission, labels["imu"])
-    notes += _rates_at_rest(mission, labels["imu"])
+        notes += _vertical_speed(mission, mission.depth, pings, labels)
+    notes += _turn_signs(mission, pings, labels["imu"])
+    notes += _rates_at_rest(mission, ping_s, labels["imu"])
     notes += _beams_agree(mission, labels["dvl"])
     return notes
 
@@ -119,14 +121,16 @@ def _depth_surface(mission: Mission, depth: DepthLog, label: str) -> list[str]:
     ]
 
 
-def _vertical_speed(mission: Mission, depth: DepthLog, labels: dict[str, str]) -> list[str]:
+def _vertical_speed(
+    mission: Mission, depth: DepthLog, pings: tuple[Array, Array], labels: dict[str, str]
+) -> list[str]:
     """Compare the DVL's downward speed with the change of depth, down being against the force."""
     imu = mission.imu
     half = 0.5 * max(_WINDOW_S, 2.0 * float(np.median(np.diff(depth.time_s, prepend=-np.inf))))
     begin = max(imu.time_s[0], depth.time_s[0]) + half
     end = min(imu.time_s[-1], depth.time_s[-1]) - half
     begin, end = begin + _LAGS_S[-1], end + _LAGS_S[0]
-    time_s, v_b = _velocities(mission)
+    time_s, v_b = pings
     inside = (time_s > begin) & (time_s < end)
     if inside.sum() < _FEWEST_PINGS:
         return []
@@ -195,7 +199,7 @@ def _beams_agree(mission: Mission, label: str) -> list[str]:
     ]
 
 
-def _turn_signs(mission: Mission, label: str) -> list[str]:
+def _turn_signs(mission: Mission, pings: tuple[Array, Array], label: str) -> list[str]:
     """Compare turn rates with the accelerometer: tilting the vehicle tilts the specific force."""
     imu = mission.imu
     half = 0.5 * _TILT_STEP_S
@@ -212,7 +216,7 @@ def _turn_signs(mission: Mission, label: str) -> list[str]:
     for axis, motion in enumerate(("pitches", "rolls")):
         notes += _tilt_agrees(seen[:, axis], predicted[:, axis], f"{label}: the vehicle {motion}")
     # What moves the vehicle is in the force as well, and turns with it: only gravity stays behind.
-    ping_s, velocity = _velocities(mission)
+    ping_s, velocity = pings
     if len(ping_s) < _FEWEST_PINGS:
         return notes
     gravity = _gravity_direction(mission, edges, half, ping_s=ping_s, velocity=velocity)
@@ -242,15 +246,14 @@ def _level_bias(mission: Mission, drift: Array, label: str) -> list[str]:
     ]
 
 
-def _rates_at_rest(mission: Mission, label: str) -> list[str]:
+def _rates_at_rest(mission: Mission, ping_s: Array, label: str) -> list[str]:
     """Note gyros that turn while the accelerometer and the DVL are still."""
     imu, noise = mission.imu, mission.imu.noise
     spread = np.hypot(noise.gyro_bias_sigma, noise.gyro_density / _REST_S**0.5)
     limit = EARTH_RATE + _BIAS_SIGMAS * float(spread)
     for begin in np.arange(imu.start_s, imu.time_s[-1] - _REST_S, _REST_S):
         now = (imu.time_s > begin) & (imu.time_s <= begin + _REST_S)
-        ping = (mission.dvl.valid_s > begin) & (mission.dvl.valid_s <= begin + _REST_S)
-        speed = mission.dvl.speed[ping]
+        speed = mission.dvl.speed[(ping_s > begin) & (ping_s <= begin + _REST_S)]
         if now.sum() < _FEWEST_PINGS or not np.isfinite(speed).any():
             continue
         is_still = np.max(np.std(imu.accel_b[now], axis=0)) < _REST_FORCE
@@ -303,7 +306,7 @@ def _left_over(mission: Mission, speed: Array) -> Array:
     return np.asarray(np.linalg.norm(speed @ beyond, axis=-1))
 
 
-def _velocities(mission: Mission) -> tuple[Array, Array]:
+def _velocities(mission: Mission, ping_s: Array) -> tuple[Array, Array]:
     """Return times (N,) and body velocities (N, 3) by all beams, without most of the outliers."""
     dvl = mission.dvl
     used = np.isfinite(dvl.speed).all(axis=1)
@@ -312,7 +315,7 @@ def _velocities(mission: Mission) -> tuple[Array, Array]:
     if dvl.mount.n_beams > 3:
         left = _left_over(mission, dvl.speed)
         used &= left <= 3.0 * np.median(left[used])
-    return dvl.valid_s[used], dvl.speed[used] @ np.linalg.pinv(dvl.mount.beams_b).T
+    return ping_s[used], dvl.speed[used] @ np.linalg.pinv(dvl.mount.beams_b).T
 
 
 def _force_direction(mission: Mission, time_s: Array, half: float) -> Array:

@@ -217,7 +217,7 @@ def _summary_text(summary: Mapping[str, Any]) -> str:
 
 def _read_table(path: Path, required: tuple[str, ...]) -> dict[str, Array]:
     """Return the columns of one table by name."""
-    file = csv_tables.CsvFile(path, str(path))
+    file = csv_tables.CsvFile(str(path), path)
     try:
         csv_tables.check_is_text(file)
         names = csv_tables.read_csv_header(file)

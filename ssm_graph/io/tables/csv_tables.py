@@ -16,6 +16,7 @@ import numpy as np
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.tables import TableFile
 
 NUMBER = re.compile(
     r"[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE
@@ -31,21 +32,18 @@ _TAIL_LINES = 100
 _SHOWN = 40
 
 
-@dataclass(frozen=True, slots=True)
-class CsvFile:
-    """One CSV file: where it is, and how messages call it."""
+@dataclass(frozen=True, slots=True, eq=False)
+class CsvFile(TableFile):
+    """One CSV file."""
 
     path: Path
-    label: str
     errors: str = "strict"
     """What to do with bytes that are no UTF-8, as in :func:`open`."""
 
-    def place(self, row: int) -> str:
-        """Return ``label:line`` of data row ``row`` (0 is the first below the header)."""
+    def place(self, row: int) -> str:  # noqa: D102
         return f"{self.label}:{self._line(row)[0]}"
 
-    def cell(self, row: int, column: str) -> str:
-        """Return the text of one cell as it stands in the file."""
+    def cell(self, row: int, column: str) -> str:  # noqa: D102
         return self._line(row)[1].split(",")[self.header().index(column)].strip()
 
     def header(self) -> list[str]:

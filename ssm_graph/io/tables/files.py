@@ -54,19 +54,13 @@ class TableFormat(Enum):
     PARQUET = ".parquet"
 
 
-@dataclass(frozen=True, slots=True)
-class ParquetFile:
-    """One Parquet file: where it is, and how messages call it."""
+@dataclass(frozen=True, slots=True, eq=False)
+class ParquetFile(TableFile):
+    """One Parquet file."""
 
     path: Path
-    label: str
 
-    def place(self, row: int) -> str:
-        """Return file and row, counted from 1."""
-        return f"{self.label}: row {row + 1}"
-
-    def cell(self, row: int, column: str) -> str:
-        """Return the value of one cell as text."""
+    def cell(self, row: int, column: str) -> str:  # noqa: D102
         value = _pyarrow("pyarrow.parquet").read_table(self.path, columns=[column])[0][row].as_py()
         return "null" if value is None else str(value)
 
@@ -116,7 +110,7 @@ def write_table(path: Path, columns: dict[str, Array]) -> None:
 
 
 def _read_csv(path: Path, label: str, spec: TableSpec) -> Table:
-    file = CsvFile(path, label)
+    file = CsvFile(label, path)
     check_is_text(file)
     names = read_csv_header(file)
     check_names(f"{label}:1", names, spec)
@@ -149,28 +143,21 @@ def read_parquet(path: Path, label: str, spec: TableSpec) -> Table:
             f"{label}: expected a Parquet table, got a file that cannot be read as one; "
             "was it cut off, or is it another format?"
         ) from error
-    return Table(ParquetFile(path, label), columns)
+    return Table(ParquetFile(label, path), columns)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PickedRows:
+class PickedRows(TableFile):
     """The file of a table whose rows are some of the file's, in another order."""
 
     file: TableFile
     rows: NDArray[np.int64]
     """(N,) the row of the file for each of the table."""
 
-    @property
-    def label(self) -> str:
-        """How messages call the file."""
-        return self.file.label
-
-    def place(self, row: int) -> str:
-        """Return file and line of a row."""
+    def place(self, row: int) -> str:  # noqa: D102
         return self.file.place(int(self.rows[row]))
 
-    def cell(self, row: int, column: str) -> str:
-        """Return the content of a cell as it stands in the file."""
+    def cell(self, row: int, column: str) -> str:  # noqa: D102
         return self.file.cell(int(self.rows[row]), column)
 
 
@@ -234,15 +221,15 @@ def read_arrival_table(path: Path, label: str, spec: TableSpec) -> Table:
 
 
 def _read_csv_as_it_came(path: Path, label: str, spec: TableSpec, counts: Counts) -> Table:
-    file = CsvFile(path, label, errors="replace")
+    file = CsvFile(label, path, errors="replace")
     check_is_text(file, may_hold_zeros=True)
     names = read_csv_header(file)
     check_names(f"{label}:1", names, spec)
     values, rows = _read_lines(file, names, spec.may_be_blank, counts)
     if _is_too_many(counts.torn, len(rows)):
-        read_csv_values(CsvFile(path, label), names, blank=spec.may_be_blank)  # names the line
+        read_csv_values(CsvFile(label, path), names, blank=spec.may_be_blank)  # names the line
     columns = {name: values[:, index] for index, name in enumerate(names)}
-    return Table(PickedRows(file, rows), columns)
+    return Table(PickedRows(label, file, rows), columns)
 
 
 def _read_lines(
@@ -326,10 +313,7 @@ def _in_order_of_time(table: Table, spec: TableSpec, counts: Counts) -> Table:
 
 def _picked(table: Table, rows: NDArray[np.intp]) -> Table:
     columns = {name: values[rows] for name, values in table.columns.items()}
-    file = table.file
-    if isinstance(file, PickedRows):
-        return Table(PickedRows(file.file, file.rows[rows]), columns)
-    return Table(PickedRows(file, rows.astype(np.int64)), columns)
+    return Table(PickedRows(table.label, table.file, rows), columns)
 
 
 def _is_too_many(n_bad: int, n_good: int) -> bool:

@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
-from ssm_graph.evaluation import ErrorSeries, evaluate
+from ssm_graph.evaluation.errors import ErrorSeries, evaluate
 from ssm_graph.mission.estimate import Estimate
 from ssm_graph.mission.mission import Reference
 from ssm_graph.report import style

@@ -12,8 +12,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.evaluation import chi2_interval, mean_with_interval
 from ssm_graph.evaluation.comparison import has_failed, number
+from ssm_graph.evaluation.statistics import chi2_interval, mean_with_interval
 from ssm_graph.report import style
 from ssm_graph.report.comparison.cells import (
     Row,

@@ -9,15 +9,15 @@ from itertools import groupby
 from statistics import geometric_mean
 from typing import Final
 
-from ssm_graph.evaluation import (
+from ssm_graph.evaluation.comparison import (
     FILTER_ORACLE,
     ORACLE,
     Cell,
     Comparison,
-    Interval,
     Measure,
     MethodResult,
 )
+from ssm_graph.evaluation.statistics import Interval
 
 MAX_OPEN_CELLS: Final = 6
 """With more cells than these their tables are folded away."""

@@ -16,7 +16,7 @@ from matplotlib.ticker import MaxNLocator
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
-from ssm_graph.evaluation import ErrorSeries, Metrics, evaluate
+from ssm_graph.evaluation.errors import ErrorSeries, Metrics, evaluate
 from ssm_graph.mission.estimate import (
     OUTLIER_WEIGHT,
     Calibration,

@@ -11,7 +11,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from ssm_graph.evaluation import Metrics
+from ssm_graph.evaluation.errors import Metrics
 from ssm_graph.mission.estimate import (
     OUTLIER_WEIGHT,
     Calibration,
