@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from operator import attrgetter
+
 import numpy as np
 
 from ssm_graph.base.errors import DataError
@@ -24,6 +26,16 @@ def require_increasing(name: str, times: Array) -> None:
     wrong = np.zeros(len(times), bool)
     wrong[1:] = ~(np.diff(times) > 0.0)
     _refuse(name, times, wrong, "times that increase strictly")
+
+
+def require_fields(
+    name: str, value: object, *, increasing: str = "", finite: str = "", positive: str = ""
+) -> None:
+    """Raise for the first field of a value that is not as it has to be; dotted ones lie within."""
+    checks = ((require_increasing, increasing), (require_positive, positive))
+    for check, fields in (*checks, (require_finite, finite)):
+        for field in fields.split():
+            check(f"{name}.{field}", np.atleast_1d(attrgetter(field)(value)))
 
 
 def _refuse(

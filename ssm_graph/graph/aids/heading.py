@@ -15,7 +15,7 @@ import numpy as np
 from factors.compass_heading import CompassErrors, heading_residual
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
-from ssm_graph.base.usable import require_finite, require_increasing, require_positive
+from ssm_graph.base.usable import require_fields
 from ssm_graph.engine.error_state import ROTATION
 from ssm_graph.engine.extras import Extra
 from ssm_graph.graph.aids.aid import Aid, Keyframes, Linearised, RowStates
@@ -109,13 +109,9 @@ class Headings(Aid):
     def require_usable(cls, aids: Aids) -> None:
         """Refuse numbers that are not finite, and times that do not increase."""
         log = aids.get(HeadingLog)
-        if log is None:
-            return
-        require_increasing("aids.heading.time_s", log.time_s)
-        require_finite("aids.heading.heading", log.heading)
-        require_positive("aids.heading.sigma", np.array([log.sigma]))
-        correlation_s = np.array([log.errors.correlation_s])
-        require_positive("aids.heading.errors.correlation_s", correlation_s)
+        if log is not None:
+            usable = {"increasing": "time_s", "positive": "sigma errors.correlation_s"}
+            require_fields("aids.heading", log, finite="heading", **usable)
 
     @property
     def root_information(self) -> Array:

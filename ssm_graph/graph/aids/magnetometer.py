@@ -15,7 +15,7 @@ from factors import so3
 from factors.magnetic_field import field_residual
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
-from ssm_graph.base.usable import require_finite, require_increasing, require_positive
+from ssm_graph.base.usable import require_fields
 from ssm_graph.engine.error_state import ROTATION
 from ssm_graph.engine.extras import Extra
 from ssm_graph.graph.aids.aid import Aid, Keyframes, Linearised, RowStates, along_axes
@@ -105,14 +105,9 @@ class MagneticFields(Aid):
     def require_usable(cls, aids: Aids) -> None:
         """Refuse numbers that are not finite, and times that do not increase."""
         log = aids.get(MagnetometerLog)
-        if log is None:
-            return
-        require_increasing("aids.magnetometer.time_s", log.time_s)
-        require_finite("aids.magnetometer.field_b", log.field_b)
-        require_finite("aids.magnetometer.earth", log.earth.enu)
-        require_positive("aids.magnetometer.sigma", np.array([log.sigma]))
-        correlation_s = np.array([log.errors.correlation_s])
-        require_positive("aids.magnetometer.errors.correlation_s", correlation_s)
+        if log is not None:
+            usable = {"increasing": "time_s", "positive": "sigma errors.correlation_s"}
+            require_fields("aids.magnetometer", log, finite="field_b earth.enu", **usable)
 
     @property
     def root_information(self) -> Array:

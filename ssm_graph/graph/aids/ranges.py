@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from factors.beacon_range import range_residual
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.times import Indices, is_inside, nearest
-from ssm_graph.base.usable import require_finite, require_positive
+from ssm_graph.base.usable import require_fields, require_finite, require_positive
 from ssm_graph.engine.error_state import POSITION, ROTATION
 from ssm_graph.engine.extras import Extra
 from ssm_graph.graph.aids.aid import Aid, Keyframes, Linearised, RowStates
@@ -103,9 +103,8 @@ class Ranges(Aid):
         log = aids.get(RangeLog)
         if log is None:
             return
-        require_positive("aids.ranges.sigma", log.sigma)
-        for name in ("time_s", "range_m", "lever_arm_b"):
-            require_finite(f"aids.ranges.{name}", getattr(log, name))
+        finite = "time_s range_m lever_arm_b"
+        require_fields("aids.ranges", log, positive="sigma", finite=finite)
         for beacon in log.beacons:
             of_beacon = f"aids.ranges.beacons, number {beacon.number}"
             require_finite(of_beacon, np.array([beacon.lat, beacon.lon, beacon.height]))

@@ -9,7 +9,7 @@ import numpy as np
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.times import is_inside, nearest
-from ssm_graph.base.usable import require_finite, require_positive
+from ssm_graph.base.usable import require_fields
 from ssm_graph.graph.aids.aid import Keyframes
 from ssm_graph.graph.aids.gnss import Fixes
 from ssm_graph.mission.mission import Aids
@@ -46,11 +46,9 @@ class UsblFixes(Fixes):
     def require_usable(cls, aids: Aids) -> None:
         """Refuse numbers that are not finite, and sigmas of zero."""
         log = aids.get(UsblLog)
-        if log is None:
-            return
-        require_positive("aids.usbl.sigma_enu", log.sigma_enu)
-        for name in ("time_s", "delay_s", "lat", "lon", "height", "lever_arm_b"):
-            require_finite(f"aids.usbl.{name}", getattr(log, name))
+        if log is not None:
+            finite = "time_s delay_s lat lon height lever_arm_b"
+            require_fields("aids.usbl", log, positive="sigma_enu", finite=finite)
 
     @classmethod
     def times(cls, aids: Aids) -> tuple[str, Array]:
