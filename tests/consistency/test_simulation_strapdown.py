@@ -70,12 +70,11 @@ def inertial_steps(imu: ImuLog, R_ib_start: Rotation) -> tuple[Array, Rotation]:
     return np.asarray(before.apply(push)), R_ib
 
 
-def gravitation_i(p_i: Array, time_s: float) -> Array:
-    """Return the attraction of the Earth alone, inertial axes, m/s^2."""
-    R_ie = Rotation.from_rotvec(EARTH_AXIS * time_s)
-    lat, lon, height = geodetic_from_ecef(R_ie.inv().apply(p_i))
-    up_i = R_ie.apply(R_el_from_lat_lon(lat, lon)[:, 2])
-    centrifugal = -np.cross(EARTH_AXIS, np.cross(EARTH_AXIS, p_i))
+def gravitation_i(p_i: Array, R_ie: Array) -> Array:
+    """Return the attraction of the Earth alone, inertial axes, m/s^2; its axis is the third."""
+    lat, lon, height = geodetic_from_ecef(R_ie.T @ p_i)
+    up_i = R_ie @ R_el_from_lat_lon(lat, lon)[:, 2]
+    centrifugal = EARTH_RATE**2 * p_i * [1.0, 1.0, 0.0]
     return np.asarray(-normal_gravity(lat, height) * up_i - centrifugal)
 
 
@@ -104,15 +103,17 @@ def navigate(imu: ImuLog, trajectory: Trajectory, *, every: int) -> tuple[Array,
     push_i, R_ib = inertial_steps(imu, trajectory.R_eb(0.0)[0])
     dt = float(imu.time_s[0] - imu.start_s)
     span = every * dt
-    gravity = gravitation_i(p_i - 0.5 * span * v_i, -0.5 * span)
-    gains = zip(*gains_per_stretch(push_i, dt=dt, every=every), strict=True)
-    for k, (push, shift) in enumerate(gains):
+    pushes, shifts = gains_per_stretch(push_i, dt=dt, every=every)
+    middles_s = (np.arange(len(pushes) + 1) - 0.5) * span
+    R_ie = Rotation.from_rotvec(EARTH_AXIS * middles_s[:, None]).as_matrix()
+    gravity = gravitation_i(p_i - 0.5 * span * v_i, R_ie[0])
+    for push, shift, turned in zip(pushes, shifts, R_ie[1:], strict=True):
         middle_i = p_i + 0.5 * span * v_i + 0.25 * shift + 0.125 * gravity * span**2
-        before, gravity = gravity, gravitation_i(middle_i, (k + 0.5) * span)
+        before, gravity = gravity, gravitation_i(middle_i, turned)
         p_i = p_i + v_i * span + shift + (0.5 * gravity - (gravity - before) / 12.0) * span**2
         v_i = v_i + push + gravity * span
-    R_ie = Rotation.from_rotvec(EARTH_AXIS * float(imu.time_s[-1]))
-    return np.asarray(R_ie.inv().apply(p_i)), R_ib[-1]
+    at_end = Rotation.from_rotvec(EARTH_AXIS * float(imu.time_s[-1]))
+    return np.asarray(at_end.inv().apply(p_i)), R_ib[-1]
 
 
 def closing_error(config: SimulationConfig, *, every: int) -> tuple[float, float, float]:
