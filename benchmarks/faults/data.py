@@ -62,6 +62,20 @@ def water_track(current_enu: tuple[float, float, float]) -> Edit:
     return edit
 
 
+def lasting(
+    name: str,
+    injected: str,
+    spoil: Transform,
+    rule: Rule,
+    end_s: float = INF,
+    stage: Stage = USUAL,
+) -> Case:
+    """Return a fault from the usual begin to an end, or for ever, and say so."""
+    until = f" to {end_s:.0f} s" if end_s < INF else " s on"
+    injected = f"{injected}from {BEGIN_S:.0f}{until}"
+    return Case(name, injected, spoil, rule, end_s=end_s, stage=stage)
+
+
 def _numbers() -> list[Case]:
     """NaN and infinities, two of three messages of a sensor for 10 s."""
     fields = (
@@ -103,27 +117,19 @@ def _units() -> list[Case]:
         ("depth in cm", DepthReading, scaled("depth", factor=100.0)),
         ("depth sign", DepthReading, scaled("depth", factor=-1.0)),
     )
-    cases = [
-        Case(
-            name, f"from {BEGIN_S:.0f} s on", edited(kind, edit, BEGIN_S), Rule(TOLD, 5.0, None)
-        )
-        for name, kind, edit in rows
-    ]  # fmt: skip
     in_degrees = scaled("lat", "lon", factor=math.degrees(1.0))
-    cases.append(
-        Case(
-            "latitude, longitude in degrees", f"GNSS all the time, from {BEGIN_S:.0f} s on",
-            edited(Fix, in_degrees, BEGIN_S), Rule(told="gnss_implausible"), stage=GNSS_ALL,
-        )
-    )  # fmt: skip
     flip = beams(lambda speed: speed * np.array([-1.0, 1.0, 1.0, 1.0]))
-    cases.append(
-        Case(
-            "one beam's sign", f"beam 1, from {BEGIN_S:.0f} s on",
-            edited(Ping, flip, BEGIN_S), Rule(good_after_s=15.0),
-        )
-    )  # fmt: skip
-    return cases
+    for_good = Rule(TOLD, 5.0, None)
+    return [
+        *(lasting(name, "", edited(kind, edit, BEGIN_S), for_good) for name, kind, edit in rows),
+        lasting(
+            "latitude, longitude in degrees", "GNSS all the time, ",
+            edited(Fix, in_degrees, BEGIN_S), Rule(told="gnss_implausible"), stage=GNSS_ALL,
+        ),
+        lasting(
+            "one beam's sign", "beam 1, ", edited(Ping, flip, BEGIN_S), Rule(good_after_s=15.0)
+        ),
+    ]  # fmt: skip
 
 
 def _dvl() -> list[Case]:
@@ -132,16 +138,8 @@ def _dvl() -> list[Case]:
     def row(
         name: str, injected: str, edit: Edit, rule: Rule, end_s: float = INF, stage: Stage = USUAL
     ) -> Case:
-        return lasting(
-            name, f"{injected}, ", edited(Ping, edit, begin_s, end_s), rule, end_s, stage
-        )
-
-    def lasting(
-        name: str, injected: str, spoil: Transform, rule: Rule, end_s: float, stage: Stage = USUAL
-    ) -> Case:
-        until = f" to {end_s:.0f} s" if end_s < INF else " s on"
-        injected = f"{injected}from {begin_s:.0f}{until}"
-        return Case(name, injected, spoil, rule, end_s=end_s, stage=stage)
+        spoil = edited(Ping, edit, begin_s, end_s)
+        return lasting(name, f"{injected}, ", spoil, rule, end_s, stage)
 
     alike = beams(lambda speed: np.full(4, speed[0]))
     stuck = beams(lambda speed: np.array([0.0, *speed[1:]]))
@@ -244,10 +242,8 @@ def _clock() -> list[Case]:
 def _imu() -> list[Case]:
     def gap(length_s: float, rule: Rule, stage: Stage = USUAL) -> Case:
         end_s = BEGIN_S + length_s
-        until = f" to {end_s:.0f} s" if end_s < INF else " s on"
-        lost = silent(ImuSample, BEGIN_S, end_s)
         name = f"IMU gap {length_s:g} s" if end_s < INF else "IMU silent for ever"
-        return Case(name, f"from {BEGIN_S:.0f}{until}", lost, rule, end_s=end_s, stage=stage)
+        return lasting(name, "", silent(ImuSample, BEGIN_S, end_s), rule, end_s, stage)
 
     return [
         gap(1.0, Rule()),
@@ -261,19 +257,12 @@ def _aids() -> list[Case]:
     begin_s = BEGIN_S
     jump, north = moved("depth", 20.0), moved("lat", 100.0 / 6.371e6)
     return [
-        Case(
-            "depth stuck", f"from {begin_s:.0f} s on", frozen(DepthReading, begin_s),
-            Rule(good_after_s=None),
+        lasting("depth stuck", "", frozen(DepthReading, begin_s), Rule(good_after_s=None)),
+        lasting(
+            "depth jumps 20 m", "", edited(DepthReading, jump, begin_s, begin_s + 10.0),
+            Rule(TOLD, 5.0), begin_s + 10.0,
         ),
-        Case(
-            "depth jumps 20 m", f"from {begin_s:.0f} to {begin_s + 10:.0f} s",
-            edited(DepthReading, jump, begin_s, begin_s + 10.0), Rule(TOLD, 5.0),
-            end_s=begin_s + 10.0,
-        ),
-        Case(
-            "depth 20 m off", f"from {begin_s:.0f} s on", edited(DepthReading, jump, begin_s),
-            FOLLOWED,
-        ),
+        lasting("depth 20 m off", "", edited(DepthReading, jump, begin_s), FOLLOWED),
         Case(
             "one GNSS outlier", "100 m to the north, at 40 s",
             edited(Fix, north, 40.0, 40.9), Rule(told="doubt"), 40.0, 40.9,

@@ -12,7 +12,7 @@ import math
 import random
 import socket
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -45,7 +45,7 @@ from ssm_graph.live.sockets.inputs import TcpServerInput
 from ssm_graph.live.sockets.outputs import OutputFormat, TcpServerOutput
 from ssm_graph.live.sockets.sockets import InputConfig, OutputConfig, SocketHub
 from ssm_graph.mission.navigation import Event, Health, Severity
-from ssm_graph.mission.run_status import RunStatus, SourceStatus
+from ssm_graph.mission.run_status import RunStatus
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.depth import DepthLog, DepthReading
 from ssm_graph.sensors.dvl import Ping
@@ -293,7 +293,7 @@ class Voyage:
         self._stream = iter(undisturbed_stream(STAGE))
         self._next: Sent | None = next(self._stream)
         self._disturb = disturb
-        self.now_s = 0.0
+        self.elapsed_s = 0.0
         self.n_sent = 0
         dvl = Dvl()
         dvl_at = Endpoint(Transport.TCP_CLIENT, LOOPBACK, dvl.port)
@@ -308,8 +308,12 @@ class Voyage:
             InputConfig("messages", others_at, JsonDecoder),
         ]
         hub = SocketHub(
-            inputs, outputs, wall_s=lambda: EPOCH_S + self.now_s, steady_s=lambda: self.now_s
+            inputs,
+            outputs,
+            wall_s=lambda: EPOCH_S + self.elapsed_s,
+            steady_s=lambda: self.elapsed_s,
         )
+        self.take_events, self.source_status = hub.take_events, hub.source_status
         messages_in = hub.inputs[1]
         assert isinstance(messages_in, TcpServerInput)
         others = socket.create_connection((LOOPBACK, messages_in.port))
@@ -325,12 +329,7 @@ class Voyage:
     @property
     def time_s(self) -> float:
         """The vehicle's clock, s."""
-        return EPOCH_S + self.now_s
-
-    @property
-    def elapsed_s(self) -> float:
-        """Since the begin, s."""
-        return self.now_s
+        return EPOCH_S + self.elapsed_s
 
     def poll(self, timeout_s: float) -> list[Message]:
         """Send all messages up to the next inertial sample and receive what comes of it."""
@@ -338,7 +337,7 @@ class Voyage:
         n_expected = 0
         while self._next is not None:
             sent, self._next = self._next, next(self._stream, None)
-            self.now_s = sent.true_s
+            self.elapsed_s = sent.true_s
             n_expected += self._send(sent)
             if self._next is not None and isinstance(self._next.message, ImuSample):
                 break
@@ -361,14 +360,6 @@ class Voyage:
         self.n_sent += is_received
         self.vessel.n_lost += not is_received
         return is_received
-
-    def take_events(self) -> Sequence[Event]:
-        """Return what happened at the sockets."""
-        return self.vessel.hub.take_events()
-
-    def source_status(self) -> tuple[SourceStatus, ...]:
-        """Return how the sources are doing."""
-        return self.vessel.hub.source_status()
 
     def close(self) -> None:
         """Close everything."""
@@ -405,10 +396,10 @@ def _run(voyage: Voyage, folder: Path, vehicle: Vehicle) -> Run:
     def look(status: RunStatus) -> None:
         navigation = status.navigation
         if navigation is None:
-            looks.append(Look(voyage.now_s, Health.ALIGNING, status.reason, None))
+            looks.append(Look(voyage.elapsed_s, Health.ALIGNING, status.reason, None))
         else:
             navigation = replace(navigation, time_s=navigation.time_s - EPOCH_S)
-            looks.append(Look(voyage.now_s, navigation.health, navigation.reason, navigation))
+            looks.append(Look(voyage.elapsed_s, navigation.health, navigation.reason, navigation))
 
     runner = Runner(
         RunFolder(folder, vehicle, {}),
@@ -416,7 +407,7 @@ def _run(voyage: Voyage, folder: Path, vehicle: Vehicle) -> Run:
         lambda n: Connections(voyage, voyage.vessel.hub),  # noqa: ARG005
         config=RunnerConfig(),
         on_status=look,
-        steady_s=lambda: voyage.now_s,
+        steady_s=lambda: voyage.elapsed_s,
     )
     end = runner.run()
     events = tuple(_events(folder))

@@ -265,16 +265,11 @@ def run_streams(args: argparse.Namespace) -> list[str]:
     return [*lines, *stream_lines(short)]
 
 
-def lags_of(args: argparse.Namespace) -> list[float]:
-    """Return the lags asked for, s."""
-    return [float(lag) for lag in args.lags.split(",")]
-
-
 def run_lags(args: argparse.Namespace) -> list[str]:
     """Run ours with several lags, and what goes offline."""
     duration_s, stream = 60.0 * args.lag_minutes, (args.seed, args.dvl_hz)
     runs = []
-    for lag in lags_of(args):
+    for lag in map(float, args.lags.split(",")):
         note(f"lag {lag:g} s ...")
         config = replace(ONLINE, lag_s=lag)
         runs.append(in_fresh_process(stream_ours, duration_s, *stream, config))
@@ -295,7 +290,7 @@ def run_settings(args: argparse.Namespace) -> list[str]:
 def run_logs(args: argparse.Namespace) -> list[str]:
     """Run the real logs, with several lags."""
     rows = []
-    configs = [replace(ONLINE, lag_s=lag) for lag in lags_of(args)]
+    configs = [replace(ONLINE, lag_s=lag) for lag in map(float, args.lags.split(","))]
     for name in LOGS:
         note(f"{name} ...")
         rows += in_fresh_process(log_rows, args.data / "blueye_x3" / name, configs)

@@ -27,19 +27,9 @@ HEALTHS = tuple(Health)
 TAKE_S = 60.0
 """Delayed states and events are taken, and the resident size is read, so often."""
 _PAGE_MB = os.sysconf("SC_PAGE_SIZE") / 1e6
-_COLUMNS = {
-    "time_s": 1,
-    "place": 3,
-    "velocity_enu": 3,
-    "roll_pitch_heading": 3,
-    "position_sigma_enu": 3,
-    "velocity_sigma_enu": 3,
-    "attitude_sigma": 3,
-    "health": 1,
-    "latency_s": 1,
-    "cpu_s": 1,
-    "newest_s": 1,
-}
+_VECTORS = ("velocity_enu", "roll_pitch_heading", "velocity_sigma_enu", "attitude_sigma")
+_COLUMNS = {"time_s": 1, **dict.fromkeys(("place", "position_sigma_enu", *_VECTORS), 3)}
+_COLUMNS |= dict.fromkeys(("health", "latency_s", "cpu_s", "newest_s"), 1)
 _ENDS = np.cumsum(list(_COLUMNS.values())).tolist()
 _SLICES = {
     name: slice(end - width, end)
@@ -67,8 +57,8 @@ class Answers:
         n = navigation
         row = self._rows[self._count]
         row[:] = (
-            *(n.time_s, n.lat, n.lon, n.height, *n.velocity_enu, *n.roll_pitch_heading),
-            *(*n.position_sigma_enu, *n.velocity_sigma_enu, *n.attitude_sigma),
+            *(n.time_s, n.lat, n.lon, n.height, *n.position_sigma_enu),
+            *(x for name in _VECTORS for x in getattr(n, name)),
             *(HEALTHS.index(n.health), n.latency_s, cpu_s, newest_s),
         )
         self._count += 1
@@ -88,8 +78,7 @@ class Answers:
         place = self.column("place")[rows]
         sigma = self.column("position_sigma_enu")[rows]
         nothing = np.full((len(place), 3), np.nan)
-        names = ("velocity_enu", "roll_pitch_heading", "velocity_sigma_enu", "attitude_sigma")
-        own: dict[str, Any] = {name: self.column(name)[rows] for name in names}
+        own: dict[str, Any] = {name: self.column(name)[rows] for name in _VECTORS}
         return Trajectory(
             time_s=self.column("time_s")[rows],
             lat=place[:, 0],

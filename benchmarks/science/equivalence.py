@@ -4,8 +4,7 @@ Ten missions with outliers, dropouts, a bottom loss and a GNSS start, three grad
 estimated by the graph in single steps and by the filter in gains and covariances, which linearises
 anew at each pass as the graph does or, as ``ssm-log``, once; and, with measurements linearised
 once, by the graph and by the geodetic filter. Differences are the largest over all keyframes and
-components, in posterior sigmas. ``--missions 2 --duration 40`` is a quick
-look.
+components, in posterior sigmas. A quick look is ``--missions 2 --duration 40``.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from ssm_graph.filters.rules.correntropy import CorrentropyUpdate
 from ssm_graph.filters.rules.kalman import KalmanUpdate
 from ssm_graph.filters.rules.ssm import Floor, SsmUpdate, StopRule
 from ssm_graph.filters.rules.student import Scale, StudentUpdate
-from ssm_graph.filters.rules.update import Update, UpdateRule
+from ssm_graph.filters.rules.update import UpdateRule
 from tests.linear_filter import LinearModel, LinearSystem, run_linear_filter
 
 Vectors = Mapping[str, Array]
@@ -99,7 +99,10 @@ def compare(vectors: Vectors, sequence: str, name: str) -> Agreement | None:
     P0 = vectors["mckfw_P0" if is_near else "P0"]
     with np.errstate(all="ignore"):  # published rules without a floor overflow
         loop = run_linear_filter(system, z, x0=x0[None], P0=P0[None], rule=rule)
-        steps = [one_step(system, rule, z[k], x_prior[k], P_prior[k]) for k in range(n_rows)]
+        steps = []
+        for mean, before, now in zip(x_prior[:, None], P_prior[:, None], z, strict=True):
+            model = LinearModel(system, mean, now, group=np.zeros(now.shape[1], dtype=np.intp))
+            steps.append(rule(before, model, mean=mean))
     counts = np.array([update.n_iterations[0] for update in steps])
     x_steps = x_prior + np.array([update.xi[0] for update in steps])
     P_steps = np.array([update.covariance[0] for update in steps])
@@ -112,15 +115,6 @@ def compare(vectors: Vectors, sequence: str, name: str) -> Agreement | None:
         _worst((P_steps - P) / np.max(np.abs(P), axis=(1, 2), keepdims=True)),
         bool(np.array_equal(counts, iters.astype(int).ravel())),
     )
-
-
-def one_step(
-    system: LinearSystem, rule: UpdateRule, z: Array, x_prior: Array, P_prior: Array
-) -> Update:
-    """Return the update from a stored prediction."""
-    mean = x_prior[None]
-    model = LinearModel(system, mean, z, group=np.zeros(z.shape[1], dtype=np.intp))
-    return rule(P_prior[None], model, mean=mean)
 
 
 def _worst(difference: Array) -> float:

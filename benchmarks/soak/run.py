@@ -83,8 +83,10 @@ def draw_errors(axes: Axes, run: Soaked) -> None:
     band = 3.0 * np.hypot(run.sigma[:, 0], run.sigma[:, 1])
     at = hours[edges]
     low = max(float(np.nanpercentile(error, 1.0)), 1e-2)
-    axes.fill_between(at, low, binned(band, edges), color=BOUND, linewidth=0.0, step="post")
-    axes.step(at, binned(error, edges), color=OUTLIER, linewidth=0.8, where="post")
+    axes.fill_between(
+        at, low, np.fmax.reduceat(band, edges), color=BOUND, linewidth=0.0, step="post"
+    )
+    axes.step(at, np.fmax.reduceat(error, edges), color=OUTLIER, linewidth=0.8, where="post")
     axes.set_yscale("log")
     axes.set_ylim(bottom=low)
     worst = np.maximum.reduceat(run.health, edges)
@@ -116,11 +118,6 @@ def hourly(run: Soaked) -> list[list[float]]:
     hour = (run.time_s[is_new] / HOUR_S).astype(int)
     ms = 1e3 * run.latency_s[is_new]
     return [np.percentile(ms[hour == h], [50.0, 99.0, 100.0]).tolist() for h in np.unique(hour)]
-
-
-def binned(values: Array, edges: np.ndarray[tuple[int], np.dtype[np.intp]]) -> Array:
-    """Return the largest value of each bin."""
-    return np.asarray(np.fmax.reduceat(values, edges))
 
 
 WANTED = 0.99

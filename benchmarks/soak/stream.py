@@ -180,7 +180,8 @@ def soak(name: str, *, hours: float, seed: int, dvl_hz: float, grade: str) -> So
         on_minute=on_minute,
     )
     for event in run.events:
-        events[event.kind] += 1 + more_untold(event.text)
+        more = re.search(r"\(and (\d+) more since\)$", event.text)
+        events[event.kind] += 1 + (int(more[1]) if more else 0)
     time_s, error, sigma = errors_of(run.answers, truth)
     return Soaked(
         name,
@@ -195,12 +196,6 @@ def soak(name: str, *, hours: float, seed: int, dvl_hz: float, grade: str) -> So
         run.rss_mb,
         run.wall_s,
     )
-
-
-def more_untold(text: str) -> int:
-    """Return how many more events a text stands for."""
-    found = re.search(r"\(and (\d+) more since\)$", text)
-    return int(found.group(1)) if found else 0
 
 
 def errors_of(answers: Answers, truth: Callable[[Array], Reference]) -> tuple[Array, Array, Array]:

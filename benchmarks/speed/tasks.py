@@ -56,8 +56,7 @@ def plain_graph(mission: Mission, problem: Problem) -> gtsam.NonlinearFactorGrap
     graph = prior_graph(problem)
     _add_inertial(graph, mission, problem.keyframe_s)
     beams, omega_ie_n = problem.beams, problem.frame.omega_ie_n
-    keyframes = beams.keyframe.tolist()
-    add_beams(graph, beams, keyframes, omega_ie_n=omega_ie_n)
+    add_beams(graph, beams, beams.keyframe.tolist(), omega_ie_n=omega_ie_n)
     _add_depth(graph, mission, problem.keyframe_s)
     return graph
 

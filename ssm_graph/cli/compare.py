@@ -24,14 +24,14 @@ from ssm_graph.cli.options import (
     table_format_option,
 )
 from ssm_graph.evaluation.comparison import compare_methods
-from ssm_graph.io.mission_folder.folder import TableFormat
+from ssm_graph.io.tables.files import TableFormat, pyarrow_module
 from ssm_graph.report.comparison.tables import latex, markdown
 from ssm_graph.study.jobs import Execute
 from ssm_graph.study.methods import FAMILIES
 from ssm_graph.study.processes import DaskCluster, JobProcesses
 from ssm_graph.study.runner import Progress, StudyResult, example_estimates, open_store, run_study
 from ssm_graph.study.scenario import Study, read_study, study_of_folders
-from ssm_graph.study.store import parquet_module, write_rows
+from ssm_graph.study.store import write_rows
 
 FOLDER_METHODS: Final = ("smoother-log", "smoother-gaussian")
 PLAIN_EVERY_S: Final = 30.0
@@ -119,7 +119,7 @@ def add_parser(commands: Any, *, epilog: str) -> None:
 def run(arguments: argparse.Namespace, console: Console, errors: Console) -> bool:
     """Run what is missing, then write table, summaries and figures."""
     if arguments.format is TableFormat.PARQUET:
-        parquet_module("pyarrow")
+        pyarrow_module("pyarrow")
     study, execute = study_from(arguments), execute_from(arguments)
     store = open_store(study, arguments.out, fresh=arguments.fresh)
     if len(store) > 0:

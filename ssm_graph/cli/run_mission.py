@@ -51,12 +51,7 @@ def run_mission(
 ) -> bool:
     """Read, estimate, compare, write and show; return whether the result may be trusted.
 
-    Parameters
-    ----------
-    arguments : those of :func:`add_mission_arguments`.
-    console, errors : where the result and the progress are shown.
-    solve : the estimator.
-    settings : its settings, for ``summary.json``.
+    The settings are those of the estimator, for ``summary.json``.
     """
     graph = ProblemConfig(arguments.merge_rate, arguments.keyframe_interval)
     with ProgressDisplay(errors) as show:

@@ -38,19 +38,9 @@ FILTER_ORACLE: Final = "ekf-oracle"
 BASELINES: Final = ("ssm-log", "smoother-log")
 """What the others are compared with unless told, the first that is there."""
 MEANS: Final = (
-    "nees_position",
-    "vertical_rms_m",
-    "heading_rms_deg",
-    "path_length_m",
-    "end_error_percent",
-    "inside_3sigma_east",
-    "inside_3sigma_north",
-    "inside_3sigma_up",
-    "outliers_rejected",
-    "good_weight",
-    "good_rejected",
-    "iterations",
-    "wall_s",
+    *("nees_position", "vertical_rms_m", "heading_rms_deg", "path_length_m", "end_error_percent"),
+    *("inside_3sigma_east", "inside_3sigma_north", "inside_3sigma_up", "outliers_rejected"),
+    *("good_weight", "good_rejected", "iterations", "wall_s"),
 )
 """What is told of a method without an interval."""
 RESAMPLES: Final = 1000
@@ -155,7 +145,7 @@ def compare_methods(rows: Sequence[Row], *, baseline: str | None = None) -> Comp
     groups: dict[tuple[str, str, float], dict[str, dict[int, Row]]] = {}
     for row in rows:
         # `number` returns one and the same NaN object: unknown durations make one key.
-        key = (_text(row, "case"), _text(row, "grade"), number(row, "duration_s"))
+        key = (text(row, "case"), text(row, "grade"), number(row, "duration_s"))
         runs = groups.setdefault(key, {}).setdefault(str(row["method"]), {})
         seed = int(float(row["seed"]))
         if seed in runs:
@@ -177,7 +167,8 @@ def has_failed(row: Row) -> bool:
     return str(failed).strip().lower() not in {"0", "0.0", "false"}
 
 
-def _text(row: Row, name: str) -> str:
+def text(row: Row, name: str) -> str:
+    """Return a text of a row, empty if it is unknown."""
     value = row.get(name)
     return "" if value is None else str(value)
 
@@ -190,9 +181,9 @@ def _cell(runs: Mapping[str, Mapping[int, Row]], baseline: str) -> Cell:
     }
     measures = {metric: _measures(done, metric, baseline) for metric in METRICS}
     return Cell(
-        case=_text(first, "case"),
-        grade=_text(first, "grade"),
-        kind=_text(first, "kind"),
+        case=text(first, "case"),
+        grade=text(first, "grade"),
+        kind=text(first, "kind"),
         rate=number(first, "rate"),
         size_low_m_per_s=number(first, "size_low_m_per_s"),
         size_high_m_per_s=number(first, "size_high_m_per_s"),
@@ -293,8 +284,8 @@ def _result(method: str, rows: list[Row], measures: dict[str, Measure]) -> Metho
         method=method,
         n_runs=len(rows),
         n_failed=len(failed),
-        statuses=MappingProxyType(Counter(_text(row, "status") for row in rows)),
-        failures=MappingProxyType(Counter(_text(row, "error") for row in failed)),
+        statuses=MappingProxyType(Counter(text(row, "status") for row in rows)),
+        failures=MappingProxyType(Counter(text(row, "error") for row in failed)),
         measures=MappingProxyType(measures),
         nees_final=_nees(done),
         means=MappingProxyType({name: _mean(done, name) for name in MEANS}),

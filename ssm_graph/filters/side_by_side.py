@@ -103,13 +103,7 @@ def side_by_side(problems: Sequence[Problem]) -> Measurements:
 def require_alike(
     problems: Sequence[Problem], kinds: Mapping[str, Callable[[Problem], object]]
 ) -> None:
-    """Raise :class:`ConfigError` where something of the problems differs that has to be the same.
-
-    Parameters
-    ----------
-    problems : one or more.
-    kinds : for each thing its name, and what it is of a problem.
-    """
+    """Raise :class:`ConfigError` where something of the problems, by its name, is not the same."""
     for what, of in kinds.items():
         found = [of(problem) for problem in problems]
         if any(value != found[0] for value in found):

@@ -29,37 +29,14 @@ SERIES_STEP_S: Final = 10.0
 """Time between the samples that are kept for figures, s."""
 
 LABEL_COLUMNS: Final = (
-    "study",
-    "case",
-    "grade",
-    "kind",
-    "rate",
-    "size_low_m_per_s",
-    "size_high_m_per_s",
-    "duration_s",
-    "seed",
-    "method",
+    *("study", "case", "grade", "kind", "rate", "size_low_m_per_s", "size_high_m_per_s"),
+    *("duration_s", "seed", "method"),
 )
 NUMBER_COLUMNS: Final = (
-    "horizontal_rms_m",
-    "vertical_rms_m",
-    "velocity_rms_m_per_s",
-    "heading_rms_deg",
-    "end_error_m",
-    "path_length_m",
-    "end_error_percent",
-    "n_epochs",
-    "nees_position",
-    "nees_position_final",
-    "inside_3sigma_east",
-    "inside_3sigma_north",
-    "inside_3sigma_up",
-    "n_outliers",
-    "outliers_rejected",
-    "good_weight",
-    "good_rejected",
-    "iterations",
-    "wall_s",
+    *("horizontal_rms_m", "vertical_rms_m", "velocity_rms_m_per_s", "heading_rms_deg"),
+    *("end_error_m", "path_length_m", "end_error_percent", "n_epochs", "nees_position"),
+    *("nees_position_final", "inside_3sigma_east", "inside_3sigma_north", "inside_3sigma_up"),
+    *("n_outliers", "outliers_rejected", "good_weight", "good_rejected", "iterations", "wall_s"),
 )
 COLUMNS: Final = (*LABEL_COLUMNS, "status", "failed", "error", *NUMBER_COLUMNS)
 """Columns of the table, in their order."""

@@ -10,15 +10,14 @@ import json
 import math
 import os
 from collections.abc import Mapping, Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from ssm_graph.base.errors import ConfigError, DataError, MissingExtraError
+from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
-from ssm_graph.io.mission_folder.folder import TableFormat
+from ssm_graph.io.tables.files import TableFormat, pyarrow_module
 from ssm_graph.study.cells import digest
 from ssm_graph.study.jobs import JobResult, RunKey
 from ssm_graph.study.scoring import COLUMNS, COUNT_COLUMNS, LOST, SERIES_STEP_S, TEXT_COLUMNS, Row
@@ -210,7 +209,7 @@ def write_rows(path: Path, rows: Sequence[Row]) -> None:
             writer.writerow(COLUMNS)
             writer.writerows([_cell(row[name]) for name in COLUMNS] for row in rows)
         return
-    arrow = parquet_module("pyarrow")
+    arrow = pyarrow_module("pyarrow")
     types = {name: arrow.float64() for name in COLUMNS}
     types |= {name: arrow.string() for name in TEXT_COLUMNS}
     types |= {name: arrow.int64() for name in COUNT_COLUMNS}
@@ -218,15 +217,7 @@ def write_rows(path: Path, rows: Sequence[Row]) -> None:
         name: arrow.array([row[name] for row in rows], types[name], from_pandas=True)
         for name in COLUMNS
     }
-    parquet_module("pyarrow.parquet").write_table(arrow.table(columns), path)
-
-
-def parquet_module(name: str) -> Any:
-    """Return a module of pyarrow; asked for early, its lack is known before the work is done."""
-    try:
-        return import_module(name)
-    except ImportError as error:
-        raise MissingExtraError("pyarrow", extra="parquet", purpose="--format parquet") from error
+    pyarrow_module("pyarrow.parquet").write_table(arrow.table(columns), path)
 
 
 def _cell(value: str | float) -> str:

@@ -16,7 +16,6 @@ from ssm_graph.mission.estimate import BeamTable
 from ssm_graph.report import style
 from ssm_graph.report.comparison.cells import Series, clean_case, end_error_cells, rate_sweeps
 from ssm_graph.report.comparison.figures import (
-    NAMES,
     Example,
     draw_beam_weights,
     draw_errors_over_time,
@@ -32,6 +31,10 @@ from ssm_graph.report.style import DEFAULT_METHODS, looks_of, shown_methods
 from tests.estimate_fixture import make_run
 
 NAN = math.nan
+ORDER = (
+    *("errors_over_time.png", "beam_weights.png", "error_against_rate.png"),
+    *("error_against_size.png", "nees_over_time.png", "end_error_cdf.png"),
+)
 FEW = ("oracle", "ekf", "smoother-log")
 MANY = (*DEFAULT_METHODS, "vbakf", "ssm-sqrt", "smoother-huber")
 Row = dict[str, object]
@@ -132,7 +135,7 @@ def test_figures_are_written(
     """Each from its own data, larger than a thumbnail and not blank; nothing else is left."""
     folder = tmp_path / "new" / "figures"
     paths = save_figures(folder, rows, series, examples)
-    assert [path.name for path in paths] == [name for name in NAMES if name in names]
+    assert [path.name for path in paths] == [name for name in ORDER if name in names]
     assert {path.name for path in folder.iterdir()} == set(names)
     for path in paths:
         image = imread(path)

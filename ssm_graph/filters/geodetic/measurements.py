@@ -96,15 +96,10 @@ def nominal_rows(
     track: Track | None,
     X: Array,
 ) -> Rows | None:
-    """Return depth and fix of a keyframe, four rows; None where no run has either.
+    """Return depth and fix of keyframe ``k``, four rows; None where no run has either.
 
-    Parameters
-    ----------
-    measured, places : of all keyframes.
-    k : keyframe.
-    state : as mechanised, at the keyframe.
-    track : the interval that ends there; None at the first keyframe.
-    X : (R, 15) predicted errors at the keyframe.
+    State and predicted errors ``X`` (R, 15) are those at the keyframe as mechanised; the track is
+    the interval that ends there, None at the first.
     """
     rows = []
     if np.isfinite(measured.depths.depth[k]).any():

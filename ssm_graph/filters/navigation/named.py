@@ -49,13 +49,7 @@ def _similar(
 ) -> FilterChoice:
     """Return a filter by similarity weights, with the parameter of its kernel.
 
-    Parameters
-    ----------
-    about : what it is, but for the kernel.
-    kernel : name of the kernel.
-    grouping : which beams share a weight.
-    state : whether the prediction gets a weight as well.
-    plain : whether a beam is judged by its residual alone.
+    With ``state`` the prediction gets a weight too; ``plain`` judges by the residual alone.
     """
 
     def make(value: float | None) -> UpdateRule:
@@ -160,11 +154,7 @@ def filter_geodetic(
 ) -> list[Estimate]:
     """Filter problems side by side by the paper's own filter, in geodetic coordinates.
 
-    Parameters
-    ----------
-    problems, imu : as :func:`ssm_graph.filters.geodetic.filter.run_geodetic` takes them.
-    config : kernel, feedback and stopping rule.
-    on_keyframe : called after each keyframe.
+    All is as :func:`ssm_graph.filters.geodetic.filter.run_geodetic` takes it.
     """
     begin = time.perf_counter()
     config = config or GeodeticConfig()

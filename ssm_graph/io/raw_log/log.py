@@ -53,24 +53,18 @@ class RawLog:
     ----------
     folder : made if it does not exist; one that holds a mission is refused.
     vehicle : what ``mission.toml`` says.
-    max_waiting : rows that may wait in memory for the disk; those that come then are lost.
-    retry_every : rows after which the disk is tried again; at the latest, that is, for it is tried
-        after a second of message time as well.
+    max_waiting : rows that may wait in memory for the disk, 100 000 unless told; those that come
+        then are lost.
+    retry_every : rows after which the disk is tried again, 500 unless told; at the latest, that
+        is, for it is tried after a second of message time as well.
     """
 
-    def __init__(
-        self,
-        folder: Path | str,
-        vehicle: Vehicle,
-        *,
-        max_waiting: int = 100_000,
-        retry_every: int = 500,
-    ) -> None:
+    def __init__(self, folder: Path | str, vehicle: Vehicle, **limits: int) -> None:
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         kinds = row_kinds(vehicle)
         _refuse_content(folder, kinds.values())
-        self._open(folder, kinds, max_waiting, retry_every)
+        self._open(folder, kinds, **limits)
         for kind in kinds.values():
             if kind.file in self._tables:
                 self._tables[kind.file].append(kind.header)
@@ -81,14 +75,7 @@ class RawLog:
         sync_folder(folder)
 
     @classmethod
-    def reopen(
-        cls,
-        folder: Path | str,
-        vehicle: Vehicle,
-        *,
-        max_waiting: int = 100_000,
-        retry_every: int = 500,
-    ) -> Self:
+    def reopen(cls, folder: Path | str, vehicle: Vehicle, **limits: int) -> Self:
         """Go on with a log that another process began, full disk or not.
 
         Raises :class:`ConfigError` for a folder without a log, and for the log of another vehicle
@@ -98,7 +85,7 @@ class RawLog:
         kinds = row_kinds(vehicle)
         check_columns(folder, kinds.values())
         log = cls.__new__(cls)
-        log._open(Path(folder), kinds, max_waiting, retry_every)
+        log._open(Path(folder), kinds, **limits)
         tables = [log._tables.get(kind.file) for kind in kinds.values()]
         sizes = ",".join(str(0 if table is None else table.size) for table in tables)
         log._waiting.append(_Row(log._arrivals, f"\n@{sizes};\n".encode(), b""))
@@ -111,7 +98,12 @@ class RawLog:
         return log
 
     def _open(
-        self, folder: Path, kinds: dict[type[Message], RowKind], max_waiting: int, retry_every: int
+        self,
+        folder: Path,
+        kinds: dict[type[Message], RowKind],
+        *,
+        max_waiting: int = 100_000,
+        retry_every: int = 500,
     ) -> None:
         self._folder, self._kinds = folder, kinds
         self._tables = {

@@ -61,7 +61,11 @@ class ParquetFile(TableFile):
     path: Path
 
     def cell(self, row: int, column: str) -> str:  # noqa: D102
-        value = _pyarrow("pyarrow.parquet").read_table(self.path, columns=[column])[0][row].as_py()
+        value = (
+            pyarrow_module("pyarrow.parquet")
+            .read_table(self.path, columns=[column])[0][row]
+            .as_py()
+        )
         return "null" if value is None else str(value)
 
 
@@ -105,8 +109,8 @@ def write_table(path: Path, columns: dict[str, Array]) -> None:
     if TableFormat(path.suffix) is TableFormat.CSV:
         write_csv(path, columns)
     else:
-        table = _pyarrow("pyarrow").table({name: np.array(v) for name, v in columns.items()})
-        _pyarrow("pyarrow.parquet").write_table(table, path)
+        table = pyarrow_module("pyarrow").table({name: np.array(v) for name, v in columns.items()})
+        pyarrow_module("pyarrow.parquet").write_table(table, path)
 
 
 def _read_csv(path: Path, label: str, spec: TableSpec) -> Table:
@@ -122,7 +126,7 @@ def _read_csv(path: Path, label: str, spec: TableSpec) -> Table:
 
 def read_parquet(path: Path, label: str, spec: TableSpec) -> Table:
     """Read a Parquet table, whatever its numbers; raise where it is none of this kind."""
-    arrow, parquet = _pyarrow("pyarrow"), _pyarrow("pyarrow.parquet")
+    arrow, parquet = pyarrow_module("pyarrow"), pyarrow_module("pyarrow.parquet")
     try:
         schema = parquet.read_schema(path)
         check_names(label, schema.names, spec)
@@ -320,10 +324,10 @@ def _is_too_many(n_bad: int, n_good: int) -> bool:
     return n_bad > max(_FEW, n_good)
 
 
-def _pyarrow(module: str) -> Any:
+def pyarrow_module(name: str) -> Any:
+    """Return a module of pyarrow; asked for early, its lack is known before the work is done."""
     try:
-        return import_module(module)
+        return import_module(name)
     except ImportError as error:
-        raise MissingExtraError(
-            "pyarrow", extra="parquet", purpose="reading or writing Parquet tables"
-        ) from error
+        purpose = "reading or writing Parquet tables"
+        raise MissingExtraError("pyarrow", extra="parquet", purpose=purpose) from error

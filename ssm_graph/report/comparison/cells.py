@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.evaluation.comparison import has_failed, number
+from ssm_graph.evaluation.comparison import has_failed, number, text
 
 Row = Mapping[str, Any]
 Series = tuple[Array, Array, Array, Array]
@@ -31,12 +31,6 @@ class Sweep:
     fixed: float | tuple[float, float]
     """What they have in common: their sizes (m/s) if the rate varies, or else their rate."""
     points: Points
-
-
-def text(row: Row, name: str) -> str:
-    """Return a text of a row, empty if it is unknown."""
-    value = row.get(name)
-    return "" if value is None else str(value)
 
 
 def has_outliers(row: Row) -> bool:

@@ -48,15 +48,6 @@ MAX_WINDOWS: Final = 120
 WINDOWS_S: Final = (1.0, 2.0, 5.0, 10.0, 20.0, 30.0, 60.0, 120.0, 300.0, 600.0, 1800.0, 3600.0)
 LARGE_RATIO: Final = 5.0
 """A panel whose methods differ by more than this is logarithmic."""
-NAMES: Final = (
-    "errors_over_time.png",
-    "beam_weights.png",
-    "error_against_rate.png",
-    "error_against_size.png",
-    "nees_over_time.png",
-    "end_error_cdf.png",
-)
-"""All figures, in the order in which they are written."""
 
 
 def save_figures(
@@ -93,19 +84,15 @@ def save_figures(
         raise DataError(f"{folder}: cannot make the folder: {error.strerror or error}") from error
     names = [str(row["method"]) for row in rows] + [method for _, _, method in series]
     looks = style.looks_of([*names, *(name for name, _, _ in examples)])
-    figures: Sequence[Figure | None] = (
-        draw_errors_over_time(examples, looks),
-        draw_beam_weights(examples, looks),
-        draw_error_against_rate(rows, looks),
-        draw_error_against_size(rows, looks),
-        draw_nees(rows, series, looks),
-        draw_end_error(rows, looks),
-    )
-    return [
-        style.save(figure, folder / name)
-        for name, figure in zip(NAMES, figures, strict=True)
-        if figure is not None
-    ]
+    figures = {
+        "errors_over_time.png": draw_errors_over_time(examples, looks),
+        "beam_weights.png": draw_beam_weights(examples, looks),
+        "error_against_rate.png": draw_error_against_rate(rows, looks),
+        "error_against_size.png": draw_error_against_size(rows, looks),
+        "nees_over_time.png": draw_nees(rows, series, looks),
+        "end_error_cdf.png": draw_end_error(rows, looks),
+    }
+    return [style.save(figure, folder / name) for name, figure in figures.items() if figure]
 
 
 def draw_errors_over_time(examples: Sequence[Example], looks: Mapping[str, Look]) -> Figure | None:

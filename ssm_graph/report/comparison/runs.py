@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.evaluation.comparison import has_failed, number
+from ssm_graph.evaluation.comparison import has_failed, number, text
 from ssm_graph.evaluation.statistics import chi2_interval, mean_with_interval
 from ssm_graph.report import style
 from ssm_graph.report.comparison.cells import (
@@ -24,7 +24,6 @@ from ssm_graph.report.comparison.cells import (
     rate_sweeps,
     series_cells,
     size_sweeps,
-    text,
     values,
 )
 from ssm_graph.report.style import Band, Curve, Look, Panel
