@@ -26,9 +26,8 @@ from ssm_graph.cli.options import (
 from ssm_graph.evaluation.comparison import compare_methods
 from ssm_graph.io.tables.files import TableFormat, pyarrow_module
 from ssm_graph.report.comparison.tables import latex, markdown
-from ssm_graph.study.jobs import Execute
+from ssm_graph.study.jobs import DaskCluster, Execute, JobProcesses
 from ssm_graph.study.methods import FAMILIES
-from ssm_graph.study.processes import DaskCluster, JobProcesses
 from ssm_graph.study.runner import Progress, StudyResult, example_estimates, open_store, run_study
 from ssm_graph.study.scenario import Study, read_study, study_of_folders
 from ssm_graph.study.store import write_rows

@@ -18,7 +18,7 @@ import pytest
 
 from ssm_graph.base.errors import ConfigError, MissingExtraError
 from ssm_graph.cli.main import ExitCode, main
-from ssm_graph.study.processes import DaskCluster
+from ssm_graph.study.jobs import DaskCluster
 from ssm_graph.study.scoring import TIMING_COLUMNS
 
 STUDY = """\
@@ -102,7 +102,7 @@ def test_killed_worker_changes_nothing(tmp_path: Path) -> None:
 @needs_dask
 def test_address_of_nobody_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """The message says what an address looks like."""
-    monkeypatch.setattr("ssm_graph.study.processes.CONNECT_S", 0.2)
+    monkeypatch.setattr("ssm_graph.study.jobs.CONNECT_S", 0.2)
     with pytest.raises(ConfigError, match="--scheduler: expected the address of a Dask scheduler"):
         list(DaskCluster("tcp://127.0.0.1:1")([]))
 

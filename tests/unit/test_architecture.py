@@ -280,7 +280,7 @@ MAY_WRITE = {
         "table.columns[0].min_width",
         "table.columns[4].justify",
     },
-    "ssm_graph/study/processes.py": {"worker.job", "deaths.in_a_row"},
+    "ssm_graph/study/jobs.py": {"worker.job", "deaths.in_a_row"},
 }
 """By file: counters, channels and tables of others' libraries, none of them a value."""
 

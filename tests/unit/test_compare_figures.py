@@ -14,7 +14,6 @@ from matplotlib.image import imread
 from ssm_graph.base.errors import DataError
 from ssm_graph.mission.estimate import BeamTable
 from ssm_graph.report import style
-from ssm_graph.report.comparison.cells import Series, clean_case, end_error_cells, rate_sweeps
 from ssm_graph.report.comparison.figures import (
     Example,
     draw_beam_weights,
@@ -22,10 +21,14 @@ from ssm_graph.report.comparison.figures import (
     save_figures,
 )
 from ssm_graph.report.comparison.runs import (
+    Series,
+    clean_case,
     draw_end_error,
     draw_error_against_rate,
     draw_error_against_size,
     draw_nees,
+    end_error_cells,
+    rate_sweeps,
 )
 from ssm_graph.report.style import DEFAULT_METHODS, looks_of, shown_methods
 from tests.estimate_fixture import make_run

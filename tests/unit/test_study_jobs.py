@@ -25,9 +25,8 @@ from ssm_graph.simulation import (
     with_dvl_errors,
 )
 from ssm_graph.smoothers.batch import SsmSmoother
-from ssm_graph.study.jobs import Job, do_job
+from ssm_graph.study.jobs import Job, best_job, do_job, merged
 from ssm_graph.study.methods import FAMILIES, Family
-from ssm_graph.study.processes import best_job, merged
 from ssm_graph.study.runner import missing_jobs, wanted_keys
 from ssm_graph.study.scoring import COLUMNS, beam_truth
 from ssm_graph.study.trials import (

@@ -20,8 +20,7 @@ from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.cli.main import ExitCode, main
 from ssm_graph.io.mission_folder.folder import write_mission
 from ssm_graph.simulation import Grade, scenario_config, simulate
-from ssm_graph.study.jobs import Job, JobResult, do_job
-from ssm_graph.study.processes import JobProcesses
+from ssm_graph.study.jobs import Job, JobProcesses, JobResult, do_job
 from ssm_graph.study.runner import (
     Progress,
     example_estimates,

@@ -26,8 +26,9 @@ from ssm_graph.report.beams import (
     points_of,
     top_of_weights,
 )
-from ssm_graph.report.comparison.cells import Row, Series
 from ssm_graph.report.comparison.runs import (
+    Row,
+    Series,
     draw_end_error,
     draw_error_against_rate,
     draw_error_against_size,
