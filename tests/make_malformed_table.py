@@ -8,9 +8,7 @@ from pathlib import Path
 
 from ssm_graph.base.errors import SsmGraphError
 from ssm_graph.io.mission_folder.folder import read_mission
-from tests.malformed_aids import AID_CASES
-from tests.malformed_case import Malformed
-from tests.malformed_cases import PHYSICS_CASES, TABLE_CASES, TOML_CASES
+from tests.malformed_cases import AID_CASES, PHYSICS_CASES, TABLE_CASES, TOML_CASES, Malformed
 from tests.mission_fixture import write_example
 
 DOC = Path(__file__).parents[1] / "docs" / "malformed-input.md"
@@ -22,7 +20,7 @@ what to try. `imu.csv:17` is line 17 of the file as an editor counts; Parquet ta
 counted from 1. What is odd and may yet be right becomes a note of the mission instead.
 
 This page is made by `python -m tests.make_malformed_table` from the cases of
-`tests/malformed_cases.py` and `tests/malformed_aids.py`, each of which is also a test.
+`tests/malformed_cases.py`, each of which is also a test.
 """
 HEAD = "| what was wrong | message |\n|---|---|\n"
 

@@ -73,10 +73,7 @@ def error_series(trajectory: Trajectory, reference: Reference) -> ErrorSeries:
     The reference is interpolated (positions in a local Cartesian frame, angles unwrapped), never
     extrapolated, and not across its gaps: see :func:`interpolate_within`.
 
-    Raises
-    ------
-    DataError
-        The two have no time in common.
+    Raises :class:`DataError`: the two have no time in common.
     """
     time_s = trajectory.time_s
     places = np.stack([reference.lat, reference.lon, reference.height])
@@ -276,10 +273,7 @@ def evaluate(trajectory: Trajectory, reference: Reference) -> Metrics:
     ``drift_percent`` relates to it, and the estimate's own, as a reference may be noisy or have
     gaps; without a gap of the reference it is the distance travelled.
 
-    Raises
-    ------
-    DataError
-        The two have no time in common.
+    Raises :class:`DataError`: the two have no time in common.
     """
     errors = error_series(trajectory, reference)
     first_s, last_s = float(errors.time_s[0]), float(errors.time_s[-1])
@@ -357,10 +351,8 @@ def reference_from_gnss(gnss: GnssLog, trajectory: Trajectory) -> Reference:
 def withhold_gnss(mission: Mission, until_s: float) -> tuple[Mission, GnssLog]:
     """Return the mission with fixes up to ``until_s`` after its begin alone, and the other fixes.
 
-    Raises
-    ------
-    ConfigError
-        The mission has no GNSS, or all of its fixes are on one side of that time.
+    Raises :class:`ConfigError`: the mission has no GNSS, or all of its fixes are on one side of
+    that time.
     """
     gnss = mission.gnss
     if gnss is None:

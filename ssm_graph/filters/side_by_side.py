@@ -76,12 +76,8 @@ class Measurements(NamedTuple):
 def side_by_side(problems: Sequence[Problem]) -> Measurements:
     """Lay the measurements of problems side by side.
 
-    Raises
-    ------
-    ConfigError
-        If their numbers of keyframes or of beams differ, and for pings off the water.
-    DataError
-        For two pings at one keyframe.
+    Raises :class:`ConfigError` where their numbers of keyframes or of beams differ, and for pings
+    off the water. Raises :class:`DataError` for two pings at one keyframe.
     """
     require_alike(
         problems,

@@ -220,10 +220,7 @@ DEFAULT_FILTER: Final = "ssm-log"
 def parse_method(text: str) -> Method:
     """Return the method named, for example, ``oracle``, ``smoother-log`` or ``smoother-log:7``.
 
-    Raises
-    ------
-    ConfigError
-        The name or its number cannot be used.
+    Raises :class:`ConfigError`: the name or its number cannot be used.
     """
     name, colon, number = text.strip().partition(":")
     family = FAMILIES.get(name)
@@ -274,6 +271,9 @@ def filter_mission(
 ) -> Estimate:
     """Filter a mission, or smooth it with a fixed lag; without an initial state, align first.
 
+    Raises :class:`SsmGraphError` with a sentence that says what is wrong, if there is no such
+    filter, or it cannot be used.
+
     Parameters
     ----------
     mission : from :func:`ssm_graph.read_mission` or a simulation.
@@ -282,11 +282,6 @@ def filter_mission(
     problem_config : rates and intervals of the keyframes.
     on_keyframe : called with number and total after each keyframe.
     on_stage : called with a line of text when a new stage begins.
-
-    Raises
-    ------
-    SsmGraphError
-        With a sentence that says what is wrong, if there is no such filter, or it cannot be used.
     """
     say = on_stage or (lambda _: None)
     chosen = parse_filter(method)

@@ -85,10 +85,7 @@ class Study:
 def read_study(path: Path) -> Study:
     """Read a study file.
 
-    Raises
-    ------
-    ConfigError
-        Naming file, table and key.
+    Raises :class:`ConfigError`, naming file, table and key.
     """
     try:
         raw = tomllib.loads(path.read_bytes().decode("utf-8-sig"))
@@ -302,12 +299,9 @@ def _beams(table: StudyTable, config: SimulationConfig) -> tuple[int, ...]:
 def study_of_folders(folders: Sequence[Path], methods: Sequence[str]) -> Study:
     """Return the study that compares methods on recorded missions.
 
-    Raises
-    ------
-    ConfigError
-        Two folders of one name, an unknown method, or one that has to know the truth.
-    DataError
-        A mission that cannot be read: better now than in a process elsewhere, hours later.
+    Raises :class:`ConfigError`: two folders of one name, an unknown method, or one that has to know
+    the truth. Raises :class:`DataError`: a mission that cannot be read: better now than in a
+    process elsewhere, hours later.
     """
     names = parse_methods(methods, where="--methods")
     told = [name for name in names if parse_method(name).is_oracle]

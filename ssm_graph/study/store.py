@@ -45,18 +45,14 @@ class StudyStore:
     def __init__(self, folder: Path, settings: dict[str, Any], *, fresh: bool = False) -> None:
         """Open or create the files.
 
+        Raises :class:`ConfigError`: the files were made with other settings. Raises
+        :class:`DataError`: A line other than the last cannot be read.
+
         Parameters
         ----------
         folder : where ``runs.jsonl`` is, and the folder ``series``.
         settings : whatever must be the same for all runs of the file.
         fresh : throw old files away.
-
-        Raises
-        ------
-        ConfigError
-            The files were made with other settings.
-        DataError
-            A line other than the last cannot be read.
         """
         self.folder = folder
         self.path = folder / RUNS_NAME

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.make_malformed_table import DOC, INTRO, message_of, row_of
-from tests.malformed_case import Malformed
-from tests.malformed_cases import CASES
+from tests.malformed_cases import CASES, Malformed
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.title)

@@ -22,8 +22,7 @@ from ssm_graph.sensors.depth import DepthReading
 from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.gnss import Fix
 from ssm_graph.sensors.imu import ImuSample
-from tests.malformed_case import Malformed
-from tests.malformed_cases import TOML_CASES
+from tests.malformed_cases import TOML_CASES, Malformed
 from tests.mission_fixture import TOML, make_mission, write_example
 from tests.unit.test_mission_roundtrip import assert_same
 

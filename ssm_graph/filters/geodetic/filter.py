@@ -127,17 +127,14 @@ def run_geodetic(
     The loop is closed at every keyframe, with measurements or without. No run looks at another; a
     run that runs away ends in NaN.
 
+    Raises :class:`ConfigError` where the runs differ in shape: filter them one by one.
+
     Parameters
     ----------
     problems : runs with equally many keyframes.
     imu : their inertial data, merging into equally many samples between keyframes.
     config : kernel and stopping rule.
     on_keyframe : called after each keyframe.
-
-    Raises
-    ------
-    ConfigError
-        If the runs differ in shape: filter them one by one.
     """
     config = config or GeodeticConfig()
     samples, first = _merged(problems, imu, rate_hz=config.merge_rate_hz)

@@ -104,6 +104,8 @@ def run_filter(
 ) -> FilterHistory:
     """Filter R runs side by side.
 
+    Raises :class:`ConfigError` where the problems differ in shape: filter them one by one.
+
     Parameters
     ----------
     problems : with equal numbers of keyframes and beams, one navigation frame, and the same kinds
@@ -111,11 +113,6 @@ def run_filter(
     rule : how a ping corrects the prediction.
     grouping : which beams the rule takes as one measurement.
     on_keyframe : called after each keyframe.
-
-    Raises
-    ------
-    ConfigError
-        If the problems differ in shape: filter them one by one.
     """
     require_alike(
         problems,

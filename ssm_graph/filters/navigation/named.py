@@ -113,6 +113,9 @@ def filter_problems(
 ) -> list[Estimate]:
     """Filter problems side by side by the filter of a name.
 
+    Raises :class:`ConfigError` where the filter has no parameter, or not this one, or the problems
+    differ in shape.
+
     Parameters
     ----------
     problems : with equal numbers of keyframes, one navigation frame, and the same kinds of aids.
@@ -120,11 +123,6 @@ def filter_problems(
     value : its parameter.
     smoothed : whether a Rauch-Tung-Striebel pass goes back over the result.
     on_keyframe : called after each keyframe.
-
-    Raises
-    ------
-    ConfigError
-        If the filter has no parameter, or not this one, or the problems differ in shape.
     """
     begin = time.perf_counter()
     choice = FILTERS[name]

@@ -81,16 +81,13 @@ def convert_blueye(log: Path) -> Mission:
     Times stay Unix seconds; body and instrument axes are forward-right-down. The vehicle's own
     position estimate is not used. Everything assumed or dropped is in the mission's notes.
 
+    Raises :class:`MissingExtraError`: the packages of the extra ``blueye`` are not installed.
+    Raises :class:`DataError`: not a complete MCAP file, topics missing, or values of unknown units
+    or axes.
+
     Parameters
     ----------
     log : MCAP file with the topics of `ssm_graph.io.blueye.log.TOPICS`.
-
-    Raises
-    ------
-    MissingExtraError
-        The packages of the extra ``blueye`` are not installed.
-    DataError
-        Not a complete MCAP file, topics missing, or values of unknown units or axes.
     """
     log = Path(log)
     tables = read_blueye_tables(log)

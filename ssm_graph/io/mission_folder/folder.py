@@ -48,6 +48,11 @@ CALIBRATION_NAME: Final = "calibration.toml"
 def read_mission(folder: Path | str) -> Mission:
     """Read and check a mission folder.
 
+    Raises :class:`ConfigError` for a key of ``mission.toml`` that is missing, unknown or out of
+    range. Raises :class:`DataError` for a table that is damaged, or whose numbers cannot be what
+    the format says they are. Raises :class:`MissingExtraError` for a Parquet table where pyarrow is
+    not installed.
+
     Parameters
     ----------
     folder : the folder that holds ``mission.toml`` and the tables it names.
@@ -57,15 +62,6 @@ def read_mission(folder: Path | str) -> Mission:
     Mission
         In SI units, radians and body axes forward-right-down; ``notes`` holds, one sentence each,
         what was noticed and is no error.
-
-    Raises
-    ------
-    ConfigError
-        For a key of ``mission.toml`` that is missing, unknown or out of range.
-    DataError
-        For a table that is damaged, or whose numbers cannot be what the format says they are.
-    MissingExtraError
-        For a Parquet table where pyarrow is not installed.
     """
     toml = read_mission_toml(Path(folder))
     bare = {one.section: toml.bare(one) for one in TABLES if one.section in toml}
@@ -177,14 +173,7 @@ def write_toml_part(folder: Path, settings: dict[str, Any]) -> Path:
 def mission_settings(mission: Mission, table_format: TableFormat) -> dict[str, Any]:
     """Return the content of ``mission.toml``."""
     suffix = table_format.value
-    settings: dict[str, Any] = {
-        "format": FORMAT,
-        "name": mission.name,
-        "frames": {"body": BodyAxes.FRD.value},
-        "origin": written(mission.frame, PLACE_KEYS),
-        **instrument_sections(mission.logs, suffix),
-        **common_sections(mission),
-    }
+    settings = settings_of(mission, mission.logs, suffix)
     stills = [written(still, STANDSTILL_KEYS) for still in mission.aids.all(Standstill)]
     if stills:
         settings["standstill"] = stills
@@ -193,25 +182,27 @@ def mission_settings(mission: Mission, table_format: TableFormat) -> dict[str, A
     return settings
 
 
-def common_sections(source: Mission | Vehicle) -> dict[str, Any]:
-    """Return the sections of a mission or a vehicle that are of no instrument."""
-    sections = {}
-    if source.current is not None:
-        sections["current"] = written(source.current, CURRENT_KEYS)
-    if source.initial is not None:
-        sections["initial"] = written(source.initial, INITIAL_KEYS)
-    return sections
+def settings_of(
+    source: Mission | Vehicle, logs: Mapping[type, Any], suffix: str, **more: str
+) -> dict[str, Any]:
+    """Return what a ``mission.toml`` says of a mission or vehicle and its instruments.
 
-
-def instrument_sections(logs: Mapping[type, Any], suffix: str) -> dict[str, Any]:
-    """Return the sections that describe instruments; ``suffix`` is that of their tables' names."""
-    sections: dict[str, Any] = {}
+    ``suffix`` is that of the names of their tables; ``more`` are keys above all sections.
+    """
+    settings: dict[str, Any] = {"format": FORMAT, "name": source.name, **more}
+    settings["frames"] = {"body": BodyAxes.FRD.value}
+    if source.frame is not None:
+        settings["origin"] = written(source.frame, PLACE_KEYS)
     for one in INSTRUMENTS:
         if one.log in logs:
-            settings = one.settings_of(logs[one.log])
-            sections[one.section] = {"file": f"{one.section}{suffix}", **settings}
-            sections |= one.lists_of(logs[one.log])
-    return sections
+            keys = one.settings_of(logs[one.log])
+            settings[one.section] = {"file": f"{one.section}{suffix}", **keys}
+            settings |= one.lists_of(logs[one.log])
+    if source.current is not None:
+        settings["current"] = written(source.current, CURRENT_KEYS)
+    if source.initial is not None:
+        settings["initial"] = written(source.initial, INITIAL_KEYS)
+    return settings
 
 
 def mission_tables(mission: Mission) -> dict[str, dict[str, Array]]:

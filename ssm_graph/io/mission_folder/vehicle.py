@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 
 from ssm_graph.base.errors import ConfigError
-from ssm_graph.base.frames import BodyAxes
-from ssm_graph.base.settings import build, written
+from ssm_graph.base.settings import build
 from ssm_graph.base.tables import Order
-from ssm_graph.io.mission_folder.folder import common_sections, instrument_sections, write_toml_part
-from ssm_graph.io.mission_folder.toml import FORMAT, SECTIONS, TOML_NAME, read_vehicle_toml
+from ssm_graph.io.mission_folder.folder import settings_of, write_toml_part
+from ssm_graph.io.mission_folder.toml import SECTIONS, TOML_NAME, read_vehicle_toml
 from ssm_graph.io.tables.files import TableFormat
 from ssm_graph.mission.mission import Aids, Mission
 from ssm_graph.mission.vehicle import GNSS_AT_ORIGIN, Vehicle
@@ -20,7 +19,6 @@ from ssm_graph.sensors.current import CurrentModel
 from ssm_graph.sensors.depth import DEPTH
 from ssm_graph.sensors.dvl import nominal_sigma, sigma_off_water
 from ssm_graph.sensors.gnss import GNSS
-from ssm_graph.sensors.place import PLACE_KEYS
 from ssm_graph.sensors.registry import BY_LOG, INSTRUMENTS
 from ssm_graph.sensors.standstill import Standstill, standstill
 
@@ -33,15 +31,13 @@ def read_vehicle(path: Path | str) -> Vehicle:
     which holds for the lever arms of the file. The navigation frame is at ``[origin]``, else at
     ``[initial]``, else left to the first fix.
 
+    Raises :class:`ConfigError` for a key that is missing, unknown or out of range, and where
+    neither ``[origin]`` nor ``[initial]`` nor a ``[gnss]`` receiver will ever say where on Earth
+    the vehicle is.
+
     Parameters
     ----------
     path : a TOML file, or a mission folder.
-
-    Raises
-    ------
-    ConfigError
-        For a key that is missing, unknown or out of range, and where neither ``[origin]`` nor
-        ``[initial]`` nor a ``[gnss]`` receiver will ever say where on Earth the vehicle is.
     """
     path = Path(path)
     toml = read_vehicle_toml(path / TOML_NAME if path.is_dir() else path)
@@ -104,19 +100,12 @@ def write_vehicle(folder: Path | str, vehicle: Vehicle, *, order: Order = Order.
 
 def vehicle_settings(vehicle: Vehicle, *, order: Order = Order.ARRIVAL) -> dict[str, Any]:
     """Return the content of the ``mission.toml`` that :func:`write_vehicle` writes."""
-    settings: dict[str, Any] = {
-        "format": FORMAT,
-        "name": vehicle.name,
-        "order": order.value,
-        "frames": {"body": BodyAxes.FRD.value},
-    }
-    if vehicle.frame is not None:
-        settings["origin"] = written(vehicle.frame, PLACE_KEYS)
-    settings |= instrument_sections(vehicle.bare_logs, TableFormat.CSV.value)
+    suffix = TableFormat.CSV.value
+    settings = settings_of(vehicle, vehicle.bare_logs, suffix, order=order.value)
     settings["dvl"]["beam_noise_m_per_s"] = float(vehicle.beam_sigma)
     if vehicle.water_sigma is not None:
         settings["dvl"]["water_noise_m_per_s"] = float(vehicle.water_sigma)
-    return settings | common_sections(vehicle)
+    return settings
 
 
 def check_same_vehicle(folder: Path | str, vehicle: Vehicle) -> None:

@@ -68,21 +68,16 @@ def convert_rosbag(
     Times stay Unix seconds, body axes are forward-right-down. Everything assumed, dropped or
     sorted is in the mission's notes.
 
+    Raises :class:`MissingExtraError`: ``rosbags`` is not installed. Raises :class:`ConfigError`: a
+    choice of topics is open or wrong, or nothing says where on Earth the mission was. Raises
+    :class:`DataError`: the recording is damaged, or its messages cannot be what they say they are.
+
     Parameters
     ----------
     bag : folder with ``metadata.yaml``, or a single ``.mcap`` or ``.db3`` file.
     vehicle : noise, lever arms and mounting; its beam directions go before those of the messages.
     topics : by role (``imu``, ``dvl``, ``depth``, ``gnss``), where several could serve it.
     options : axes of the IMU, water, atmosphere; None for the defaults.
-
-    Raises
-    ------
-    MissingExtraError
-        ``rosbags`` is not installed.
-    ConfigError
-        A choice of topics is open or wrong, or nothing says where on Earth the mission was.
-    DataError
-        The recording is damaged, or its messages cannot be what they say they are.
     """
     bag, options = Path(bag), RosOptions() if options is None else options
     if vehicle is not None:

@@ -62,6 +62,8 @@ def save_figures(
     Methods look the same in all figures. Where there are more than eight, lines are drawn for
     those of `ssm_graph.report.style.DEFAULT_METHODS`, and a footnote names the others.
 
+    Raises :class:`DataError`: a file cannot be written.
+
     Parameters
     ----------
     folder : where the PNG files go; made if it does not exist.
@@ -73,11 +75,6 @@ def save_figures(
     Returns
     -------
     The files that were written.
-
-    Raises
-    ------
-    DataError
-        A file cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -60,16 +60,13 @@ def save_figure(
     With a reference errors are shown inside their 3-sigma bounds, else the bounds alone. Long
     runs are thinned to what a page can show; outliers are kept.
 
+    Raises :class:`DataError`: there is nothing to draw, or the file cannot be written.
+
     Parameters
     ----------
     path : for example ``run/figure.png``; the folder must exist.
     estimate, reference : what is drawn; a reference without overlap in time is left out.
     title : heading of the page, for example the mission's name.
-
-    Raises
-    ------
-    DataError
-        There is nothing to draw, or the file cannot be written.
     """
     path = Path(path)
     if len(estimate.trajectory.time_s) == 0:
@@ -103,12 +100,11 @@ def draw_figure(
     grid = figure.add_gridspec(len(heights), 1, height_ratios=heights)
     upper = grid[0].subgridspec(4, 2, width_ratios=[1.2, 1.0], height_ratios=[1.0, 1.0, 1.0, 1.25])
     _draw_track(figure.add_subplot(upper[:3, 0]), estimate, reference if errors else None)
-    for i, panel in enumerate(_position_panels(trajectory, errors)):
-        axes = figure.add_subplot(upper[i, 1])
+    places = (upper[0, 1], upper[1, 1], upper[2, 1], upper[3, 0], upper[3, 1])
+    for panel, place in zip(_error_panels(trajectory, errors), places, strict=True):
+        axes = figure.add_subplot(place)
         style.draw_panel(axes, panel)
         axes.tick_params(labelbottom=bool(panel.x))
-    style.draw_panel(figure.add_subplot(upper[3, 0]), _velocity_panel(trajectory, errors))
-    style.draw_panel(figure.add_subplot(upper[3, 1]), _heading_panel(trajectory, errors))
     _draw_beams(figure, grid[1], estimate)
     for row, draw in enumerate(further, start=2):
         draw(figure.add_subplot(grid[row]))
@@ -202,55 +198,27 @@ def _limit(error: Array | None, sigma: Array) -> tuple[float, float] | None:
     return (-limit, limit) if np.isfinite(limit) and limit > 0.0 else None
 
 
-def _position_panels(trajectory: Trajectory, errors: ErrorSeries | None) -> list[Panel]:
-    """Return east, north and up, one above the other."""
+def _error_panels(trajectory: Trajectory, errors: ErrorSeries | None) -> list[Panel]:
+    """Return east, north and up, then the velocity, then the angle that a DVL track depends on."""
     variance = np.diagonal(trajectory.position_cov_enu, axis1=1, axis2=2)
-    sigma = np.sqrt(np.maximum(variance, 0.0))
+    position, velocity = np.sqrt(np.maximum(variance, 0.0)), trajectory.velocity_sigma_enu
+    heading = np.rad2deg(trajectory.attitude_sigma[:, [2]])
+    known: list[Array | None] = [None] * 5
+    if errors is not None:
+        known = [errors.position_enu[:, [i]] for i in range(3)]
+        known += [errors.velocity_enu, np.rad2deg(errors.roll_pitch_heading[:, [2]])]
+    own = trajectory, errors
     panels = []
     for i, axis in enumerate(AXES_NAMES):
-        look: dict[str, Any] = {"y": f"{axis}, m"}
+        look: dict[str, Any] = {"y": f"{axis}, m", "colors": [style.EAST_NORTH_UP[i]]}
         look |= {"legend": _corner(2)} if i == 0 else {"title": ""}
         look |= {} if i == 2 else {"x": ""}
-        values = None if errors is None else errors.position_enu[:, [i]]
-        panels.append(
-            _error_panel(
-                "Position",
-                trajectory,
-                errors,
-                values,
-                sigma[:, [i]],
-                names=["error"],
-                colors=[style.EAST_NORTH_UP[i]],
-                **look,
-            )
-        )
-    return panels
-
-
-def _velocity_panel(trajectory: Trajectory, errors: ErrorSeries | None) -> Panel:
-    return _error_panel(
-        "Velocity",
-        trajectory,
-        errors,
-        None if errors is None else errors.velocity_enu,
-        trajectory.velocity_sigma_enu,
-        names=AXES_NAMES,
-        y="velocity, m/s",
-        legend=_corner(4),
-    )
-
-
-def _heading_panel(trajectory: Trajectory, errors: ErrorSeries | None) -> Panel:
-    """Return the angle that a DVL track depends on."""
-    return _error_panel(
-        "Heading",
-        trajectory,
-        errors,
-        None if errors is None else np.rad2deg(errors.roll_pitch_heading[:, [2]]),
-        np.rad2deg(trajectory.attitude_sigma[:, [2]]),
-        names=["error"],
-        y="heading, deg",
-    )
+        sigma = position[:, [i]]
+        panels.append(_error_panel("Position", *own, known[i], sigma, names=["error"], **look))
+    look = {"names": AXES_NAMES, "y": "velocity, m/s", "legend": _corner(4)}
+    panels.append(_error_panel("Velocity", *own, known[3], velocity, **look))
+    look = {"names": ["error"], "y": "heading, deg"}
+    return [*panels, _error_panel("Heading", *own, known[4], heading, **look)]
 
 
 def _current_panel(current: CurrentTrack) -> Panel:

@@ -16,7 +16,7 @@ from rich.text import Text
 
 from ssm_graph.mission.estimate import Found
 from ssm_graph.mission.navigation import Event, Health, Navigation, Severity
-from ssm_graph.mission.run_status import Latency, OutputStatus, RunStatus, SourceStatus
+from ssm_graph.mission.run_status import Latency, RunStatus
 from ssm_graph.report.mission.summary import DETERMINED_STYLE
 
 PLAIN_EVERY_S: Final = 10.0
@@ -193,23 +193,15 @@ def _links(status: RunStatus) -> Table:
         table.add_column(name, justify="right", no_wrap=True, min_width=width)
     table.add_column("address", no_wrap=True, overflow="ellipsis")
     for row in status.sources:
-        _add_source(table, row)
-    for output in status.outputs:
-        _add_output(table, output)
+        names = (Text(row.name), Text(row.state.value))
+        came = (f"{row.rate_hz:.1f}", f"{row.n_messages}", _refused(row.n_refused + row.n_limited))
+        last = (f"{row.n_reconnects}", _age(row.age_s), Text(row.address))
+        table.add_row(*names, *came, *last)
+    for out in status.outputs:
+        names = (Text(f"→ {out.name}"), Text(f"{out.n_clients} listening"))
+        sent = ("", f"{out.n_sent}", _refused(out.n_dropped))
+        table.add_row(*names, *sent, "", "", Text(out.address))
     return table
-
-
-def _add_source(table: Table, row: SourceStatus) -> None:
-    texts = [Text(row.name), Text(row.state.value)]
-    refused = _refused(row.n_refused + row.n_limited)
-    numbers = (f"{row.rate_hz:.1f}", f"{row.n_messages}", refused, f"{row.n_reconnects}")
-    table.add_row(*texts, *numbers, _age(row.age_s), Text(row.address))
-
-
-def _add_output(table: Table, row: OutputStatus) -> None:
-    texts = [Text(f"→ {row.name}"), Text(f"{row.n_clients} listening")]
-    numbers = ("", f"{row.n_sent}", _refused(row.n_dropped), "")
-    table.add_row(*texts, *numbers, "", Text(row.address))
 
 
 def _refused(n: int) -> Text:
