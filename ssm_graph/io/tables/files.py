@@ -8,6 +8,7 @@ another format is refused as in any other table.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -15,7 +16,7 @@ from functools import partial
 from importlib import import_module
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -165,42 +166,28 @@ class PickedRows(TableFile):
         return self.file.cell(int(self.rows[row]), column)
 
 
-@dataclass(slots=True)
-class Counts:
-    """What was put right in one table."""
+_LEFT_OUT: Final = {
+    "repeated": ("{} row repeated exactly", "{} rows repeated exactly"),
+    "contrary": (
+        "{} row whose time an earlier row has with other numbers",
+        "{} rows whose times earlier rows have with other numbers",
+    ),
+    "impossible": ("{} row of impossible numbers", "{} rows of impossible numbers"),
+    "torn": ("{} torn line", "{} torn lines"),
+    "torn_end": ("the last line, which has no end",) * 2,
+}
+"""What a table in order of arrival may hold and is left out, once and more often."""
 
-    late: int = 0
-    repeated: int = 0
-    contrary: int = 0
-    """Rows of a time that an earlier row has, with another content."""
-    torn: int = 0
-    impossible: int = 0
-    torn_end: bool = False
 
-    def note(self, label: str) -> str | None:
-        """Return one sentence, None where there was nothing to put right."""
-        left_out = [
-            f"{count} {word if count == 1 else words}"
-            for count, word, words in (
-                (self.repeated, "row repeated exactly", "rows repeated exactly"),
-                (
-                    self.contrary,
-                    "row whose time an earlier row has with other numbers",
-                    "rows whose times earlier rows have with other numbers",
-                ),
-                (self.impossible, "row of impossible numbers", "rows of impossible numbers"),
-                (self.torn, "torn line", "torn lines"),
-            )
-            if count
-        ]
-        if self.torn_end:
-            left_out.append("the last line, which has no end")
-        parts = []
-        if self.late:
-            parts.append(f"{self.late} row{'s' * (self.late > 1)} came late and went to their time")
-        if left_out:
-            parts.append(f"left out: {', '.join(left_out)}")
-        return f"{label}: {'; '.join(parts)}" if parts else None
+def _note(counts: Counter[str], label: str) -> tuple[str, ...]:
+    """Return one sentence on what was put right in a table, none where nothing was."""
+    late, parts = counts["late"], []
+    if late:
+        parts.append(f"{late} row{'s' * (late > 1)} came late and went to their time")
+    kinds = [(counts[kind], words) for kind, words in _LEFT_OUT.items() if counts[kind]]
+    if kinds:
+        parts.append(f"left out: {', '.join(words[n > 1].format(n) for n, words in kinds)}")
+    return (f"{label}: {'; '.join(parts)}",) if parts else ()
 
 
 def read_arrival_table(path: Path, label: str, spec: TableSpec) -> Table:
@@ -216,28 +203,27 @@ def read_arrival_table(path: Path, label: str, spec: TableSpec) -> Table:
 
     The ending of ``path`` decides the format; ``label`` is its name in messages.
     """
-    counts = Counts()
+    counts: Counter[str] = Counter()
     table = _read(path, label, spec, partial(_read_csv_as_it_came, counts=counts))
     table = _without_impossible(table, spec, counts)
     table = _in_order_of_time(table, spec, counts)
-    note = counts.note(label)
-    return replace(table, notes=(note,) if note else ())
+    return replace(table, notes=_note(counts, label))
 
 
-def _read_csv_as_it_came(path: Path, label: str, spec: TableSpec, counts: Counts) -> Table:
+def _read_csv_as_it_came(path: Path, label: str, spec: TableSpec, counts: Counter[str]) -> Table:
     file = CsvFile(label, path, errors="replace")
     check_is_text(file, may_hold_zeros=True)
     names = read_csv_header(file)
     check_names(f"{label}:1", names, spec)
     values, rows = _read_lines(file, names, spec.may_be_blank, counts)
-    if _is_too_many(counts.torn, len(rows)):
+    if _is_too_many(counts["torn"], len(rows)):
         read_csv_values(CsvFile(label, path), names, blank=spec.may_be_blank)  # names the line
     columns = {name: values[:, index] for index, name in enumerate(names)}
     return Table(PickedRows(label, file, rows), columns)
 
 
 def _read_lines(
-    file: CsvFile, names: Sequence[str], blank: frozenset[str], counts: Counts
+    file: CsvFile, names: Sequence[str], blank: frozenset[str], counts: Counter[str]
 ) -> tuple[Array, NDArray[np.int64]]:
     """Return the numbers (N, columns) that can be read, and the row (N,) of the file of each."""
     found, rows, row = [np.empty((0, len(names)))], [np.empty(0, dtype=np.int64)], 0
@@ -245,13 +231,13 @@ def _read_lines(
     while chunk := list(islice(stream, _CHUNK)):
         first, row = row, row + len(chunk)
         if not chunk[-1].endswith("\n"):  # only the last line of all
-            counts.torn_end = True
+            counts["torn_end"] = 1
             del chunk[-1]
         values = _numbers(chunk, len(names))
         kept = np.arange(len(chunk), dtype=np.int64)
         if values is None:
             good = list(_good_rows(chunk, names, blank))
-            counts.torn += len(chunk) - len(good)
+            counts["torn"] += len(chunk) - len(good)
             values = np.array([cells for _, cells in good]).reshape(len(good), len(names))
             kept = np.array([index for index, _ in good], dtype=np.int64)
         found.append(values)
@@ -282,7 +268,7 @@ def _good_rows(
             yield index, [float(cell) if cell else np.nan for cell in cells]
 
 
-def _without_impossible(table: Table, spec: TableSpec, counts: Counts) -> Table:
+def _without_impossible(table: Table, spec: TableSpec, counts: Counter[str]) -> Table:
     bad = np.abs(table.time_s) > LARGEST_TIME_S
     for name, values in table.columns.items():
         bad |= np.isinf(values) if name in spec.may_be_blank else ~np.isfinite(values)
@@ -294,15 +280,15 @@ def _without_impossible(table: Table, spec: TableSpec, counts: Counts) -> Table:
     if _is_too_many(n_bad, len(table) - n_bad):
         check_finite(table, spec)
         return table  # the checks of each sensor say what is wrong
-    counts.impossible = n_bad
+    counts["impossible"] = n_bad
     return _picked(table, np.flatnonzero(~bad)) if n_bad else table
 
 
-def _in_order_of_time(table: Table, spec: TableSpec, counts: Counts) -> Table:
+def _in_order_of_time(table: Table, spec: TableSpec, counts: Counter[str]) -> Table:
     time_s = table.time_s
     if len(time_s) == 0 or np.all(np.diff(time_s) > 0.0):
         return table
-    counts.late = int(np.sum(time_s < np.maximum.accumulate(time_s)))
+    counts["late"] = int(np.sum(time_s < np.maximum.accumulate(time_s)))
     keys = [table[name] for name in reversed(spec.key)]
     table = _picked(table, np.lexsort((*keys, time_s)))
     is_first = ~is_repeated(table, spec)
@@ -310,8 +296,8 @@ def _in_order_of_time(table: Table, spec: TableSpec, counts: Counts) -> Table:
     is_same = np.ones(len(table), dtype=bool)
     for values in table.columns.values():
         is_same &= (values == values[first_of]) | (np.isnan(values) & np.isnan(values[first_of]))
-    counts.repeated = int(np.sum(is_same & ~is_first))
-    counts.contrary = int(np.sum(~is_same))
+    counts["repeated"] = int(np.sum(is_same & ~is_first))
+    counts["contrary"] = int(np.sum(~is_same))
     return _picked(table, np.flatnonzero(is_first))
 
 
