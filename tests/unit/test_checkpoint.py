@@ -185,7 +185,7 @@ def test_interrupted_anywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, f
         if fails == "fsync":
             patch.setattr(os, "fsync", fail)
         if fails == "folder":
-            patch.setattr(checkpoint_module, "sync_folder", fail)
+            patch.setattr(checkpoint_module, "sync_path", fail)
         patch.setattr(Path, "replace", counted)
         with pytest.raises(OSError, match="no"):
             write(tmp_path, 3)

@@ -18,7 +18,7 @@ from ssm_graph.base.errors import ConfigError
 from ssm_graph.io.mission_folder.toml import TOML_NAME
 from ssm_graph.io.mission_folder.vehicle import check_same_vehicle, write_vehicle
 from ssm_graph.io.raw_log.rows import ALWAYS, ARRIVALS, RowKind, check_columns, replay, row_kinds
-from ssm_graph.io.tables.append_file import TORN_ROW, AppendFile, sync_folder
+from ssm_graph.io.tables.append_file import TORN_ROW, AppendFile, sync_path
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.messages import Message
 
@@ -72,7 +72,7 @@ class RawLog:
         for file in self._files():
             file.sync()
         write_vehicle(folder, vehicle)
-        sync_folder(folder)
+        sync_path(folder)
 
     @classmethod
     def reopen(cls, folder: Path | str, vehicle: Vehicle, **limits: int) -> Self:

@@ -7,7 +7,7 @@ import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import Any, Final
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.tables import TIME
@@ -201,20 +201,15 @@ def _lines(path: Path, start: int, end: int) -> Iterator[tuple[int, bytes]]:
     if start >= end:
         return
     with path.open("rb") as stream:
-        place = _skip_to_line(stream, start)
+        if start > 0:  # or to the next begin of a line where that is amid one
+            stream.seek(start - 1)
+            stream.readline()
+        place = stream.tell()
         for line in stream:
             if place + len(line) > end or not line.endswith(b"\n"):
                 return
             yield place, line[:-1]
             place += len(line)
-
-
-def _skip_to_line(stream: BinaryIO, start: int) -> int:
-    """Go to ``start``, or to the next begin of a line where it is amid one; return the place."""
-    if start > 0:
-        stream.seek(start - 1)
-        stream.readline()
-    return stream.tell()
 
 
 def _read_from(path: Path, start: int) -> bytes:

@@ -247,11 +247,7 @@ def _decoders(connection: Any) -> Iterator[Decoder]:
     for base, parsed in sources:
         store = types.get_typestore(base)
         store.register(parsed)
-        yield partial(_decode, store, type_name)
-
-
-def _decode(store: Any, type_name: str, raw: bytes) -> Any:
-    return store.deserialize_cdr(raw, type_name)
+        yield partial(store.deserialize_cdr, typename=type_name)
 
 
 def _types_from_idl(text: str, types: Any) -> dict[str, Any]:

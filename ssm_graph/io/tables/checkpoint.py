@@ -21,7 +21,7 @@ import numpy as np
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
-from ssm_graph.io.tables.append_file import sync_folder, write_through
+from ssm_graph.io.tables.append_file import sync_path, write_through
 
 JSON = None | bool | int | float | str | list["JSON"] | dict[str, "JSON"]
 
@@ -70,7 +70,7 @@ def write_checkpoint(path: Path, arrays: Mapping[str, Array], meta: Mapping[str,
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
         raise
-    sync_folder(path.parent)
+    sync_path(path.parent)
 
 
 def read_checkpoint(path: Path) -> tuple[dict[str, Array], dict[str, JSON]]:

@@ -36,7 +36,7 @@ from ssm_graph.io.raw_log.log import RawLog
 from ssm_graph.io.raw_log.rows import ALWAYS, ARRIVALS, replay
 from ssm_graph.io.results.summary import as_json
 from ssm_graph.io.results.tables import BEAMS_NAME, SUMMARY_NAME, TRAJECTORY_NAME, GrowingResults
-from ssm_graph.io.tables.append_file import AppendFile
+from ssm_graph.io.tables.append_file import AppendFile, sync_path
 from ssm_graph.io.tables.checkpoint import CHECKPOINT_NAME, newest_checkpoint, write_checkpoint
 from ssm_graph.mission.navigation import Event
 from ssm_graph.mission.vehicle import Vehicle
@@ -111,7 +111,8 @@ class CheckpointWriter:
     def _write(self, arrays: dict[str, Array], meta: dict[str, Any]) -> None:
         try:
             for path in self._synced:
-                _sync(path)
+                with contextlib.suppress(FileNotFoundError):
+                    sync_path(path)
             write_checkpoint(self._path, arrays, meta)
         except Exception as error:  # told by the thread that navigates
             self._error = error
@@ -326,12 +327,3 @@ def _difference(found: Any, wanted: dict[str, Any]) -> str:
             if key != "settings" and before.get(key) != now[key]:
                 return f"{key} = {before.get(key)!r}, not {now[key]!r}"
     return "other settings"
-
-
-def _sync(path: Path) -> None:
-    with contextlib.suppress(FileNotFoundError):
-        file = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(file)
-        finally:
-            os.close(file)

@@ -103,13 +103,16 @@ def draw_errors_over_time(examples: Sequence[Example], looks: Mapping[str, Look]
     span_s = max(series.time_s[-1] for series in errors.values()) - start_s
     divisor, label = style.time_axis(np.array([0.0, span_s]))
     n_epochs = max(len(series.time_s) for series in errors.values())
-    window_s = _window_s(span_s) if n_epochs > MAX_WINDOWS else 0.0
+    short_s = span_s / MAX_WINDOWS if n_epochs > MAX_WINDOWS else 0.0
+    window_s = short_s and next((w for w in WINDOWS_S if w >= short_s), short_s)
     panels = {}
     for row, what in enumerate(("velocity", "position")):
         curves = []
         for method in reversed(methods):
-            norm = _norm(errors[method], is_velocity=what == "velocity")
-            time_s, values = _windowed(errors[method].time_s, norm, start_s, window_s)
+            own = errors[method]
+            vector = own.position_enu if row else own.velocity_enu
+            norm = np.hypot(vector[:, 0], vector[:, 1])
+            time_s, values = _windowed(own.time_s, norm, start_s, window_s)
             curves.append(Curve((time_s - start_s) / divisor, values, style.line(looks[method])))
         limits, is_log = _scale([curve.y for curve in curves])
         panels[row, 0] = Panel(
@@ -139,16 +142,6 @@ def _errors(examples: Sequence[Example]) -> dict[str, ErrorSeries]:
         except DataError:
             continue
     return errors
-
-
-def _norm(errors: ErrorSeries, *, is_velocity: bool) -> Array:
-    if not is_velocity:
-        return errors.horizontal
-    return np.asarray(np.hypot(errors.velocity_enu[:, 0], errors.velocity_enu[:, 1]))
-
-
-def _window_s(span_s: float) -> float:
-    return next((w for w in WINDOWS_S if span_s / w <= MAX_WINDOWS), span_s / MAX_WINDOWS)
 
 
 def _windowed(time_s: Array, values: Array, start_s: float, window_s: float) -> tuple[Array, Array]:
