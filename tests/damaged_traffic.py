@@ -9,7 +9,8 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
-from ssm_graph.live.protocols.decoder import MAX_LENGTH, MAX_REFUSALS, Decoder
+from ssm_graph.live.protocols.decoder import MAX_REFUSALS, Decoder
+from ssm_graph.live.protocols.framing import MAX_LENGTH
 from ssm_graph.live.protocols.json_messages import JsonDecoder, encode_message
 from ssm_graph.live.protocols.nmea import NmeaDecoder, checksum
 from ssm_graph.live.protocols.waterlinked import BeamRule, WaterLinkedDecoder

@@ -14,15 +14,13 @@ from ssm_graph.base.errors import ConfigError
 from ssm_graph.live.protocols.decoder import (
     MAX_REFUSALS,
     Clock,
-    LineFramer,
-    ObjectFramer,
     Refusals,
     RefusedError,
     Stamper,
-    TokenBucket,
     parse_object,
     shown,
 )
+from ssm_graph.live.protocols.framing import LineFramer, ObjectFramer, TokenBucket
 from tests.helpers import STEADY
 
 SOUP = st.lists(

@@ -13,9 +13,7 @@ from ssm_graph.base.errors import nearest_hint
 from ssm_graph.base.frames import BodyAxes, turned
 from ssm_graph.base.units import DEG_PER_H, DEGREE, MICRO_G
 from ssm_graph.live.protocols.decoder import (
-    MAX_LENGTH,
     Decoder,
-    LineFramer,
     RefusedError,
     flag,
     number,
@@ -24,6 +22,7 @@ from ssm_graph.live.protocols.decoder import (
     require,
     shown,
 )
+from ssm_graph.live.protocols.framing import MAX_LENGTH, LineFramer
 from ssm_graph.mission.navigation import Navigation
 from ssm_graph.sensors.dvl import MOST_BEAMS
 from ssm_graph.sensors.instrument import Column

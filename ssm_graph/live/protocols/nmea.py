@@ -13,15 +13,8 @@ import numpy as np
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array, Vector
-from ssm_graph.live.protocols.decoder import (
-    Clock,
-    Decoder,
-    LineFramer,
-    RefusedError,
-    Stamper,
-    number,
-    shown,
-)
+from ssm_graph.live.protocols.decoder import Clock, Decoder, RefusedError, Stamper, number, shown
+from ssm_graph.live.protocols.framing import LineFramer
 from ssm_graph.mission.navigation import Health, Navigation
 from ssm_graph.sensors.depth import DEEPEST_M, DepthReading
 from ssm_graph.sensors.gnss import Fix

@@ -33,10 +33,8 @@ from enum import Enum
 from typing import Any, Final
 
 from ssm_graph.live.protocols.decoder import (
-    MAX_LENGTH,
     Clock,
     Decoder,
-    ObjectFramer,
     RefusedError,
     Stamper,
     flag,
@@ -45,6 +43,7 @@ from ssm_graph.live.protocols.decoder import (
     require,
     shown,
 )
+from ssm_graph.live.protocols.framing import MAX_LENGTH, ObjectFramer
 from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.dvl_readings import LARGEST_SPEED
 from ssm_graph.sensors.messages import Message

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from ssm_graph.base.errors import ConfigError
-from ssm_graph.live.protocols.decoder import Decoder, TokenBucket
+from ssm_graph.live.protocols.decoder import Decoder
+from ssm_graph.live.protocols.framing import TokenBucket
 from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.navigation import Severity
 from ssm_graph.mission.run_status import LinkState, SourceStatus
