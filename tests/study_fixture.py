@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from ssm_graph.simulation import OutlierKind, Outliers
+from ssm_graph.study.cells import Cell
 from ssm_graph.study.scenario import Study, study_from
 from ssm_graph.study.scoring import COLUMNS, TIMING_COLUMNS, Row
-from ssm_graph.study.trials import Cell
 
 DURATION_S = 20.0
 SPARSE = Cell("sparse10", "survey", DURATION_S, Outliers(OutlierKind.SPARSE, 0.1))

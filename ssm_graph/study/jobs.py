@@ -27,9 +27,10 @@ import factors.similarity
 from ssm_graph.base.errors import ConfigError, MissingExtraError, SsmGraphError
 from ssm_graph.base.frozen import Array
 from ssm_graph.simulation import Grade
+from ssm_graph.study.cells import Recording, Source
 from ssm_graph.study.methods import parse_method, shown
 from ssm_graph.study.scoring import LOST, Row, failed_row, score
-from ssm_graph.study.trials import Recording, Source, Trial, recorded_trial, simulated_trials
+from ssm_graph.study.trials import Trial, recorded_trial, simulated_trials
 
 
 class RunKey(NamedTuple):

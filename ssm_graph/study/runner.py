@@ -14,20 +14,13 @@ from ssm_graph.base.errors import DataError
 from ssm_graph.mission.estimate import Estimate
 from ssm_graph.mission.mission import Reference
 from ssm_graph.simulation import Grade, OutlierKind
+from ssm_graph.study.cells import Cell, Recording, Source
 from ssm_graph.study.jobs import Execute, Job, JobResult, RunKey, code_version, do_job
 from ssm_graph.study.methods import parse_method
 from ssm_graph.study.scenario import Study
 from ssm_graph.study.scoring import Row
 from ssm_graph.study.store import Series, StudyStore, gather_series
-from ssm_graph.study.trials import (
-    Cell,
-    Recording,
-    Source,
-    Trial,
-    block_size,
-    recorded_trial,
-    simulated_trials,
-)
+from ssm_graph.study.trials import Trial, block_size, recorded_trial, simulated_trials
 
 FORMAT: Final = 1
 """Of the store."""

@@ -24,9 +24,9 @@ from ssm_graph.simulation import (
     WaterTrack,
 )
 from ssm_graph.study import keys
+from ssm_graph.study.cells import WITHOUT_SIZE, Cell, Recording, Source, StudyFault, digest
 from ssm_graph.study.keys import StudyTable
 from ssm_graph.study.methods import parse_method, parse_methods
-from ssm_graph.study.trials import WITHOUT_SIZE, Cell, Recording, Source, StudyFault, digest
 
 _Made = TypeVar("_Made")
 

@@ -18,9 +18,9 @@ import numpy as np
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.io.tables.files import TableFormat, pyarrow_module
+from ssm_graph.study.cells import digest
 from ssm_graph.study.jobs import JobResult, RunKey
 from ssm_graph.study.scoring import COLUMNS, COUNT_COLUMNS, LOST, SERIES_STEP_S, TEXT_COLUMNS, Row
-from ssm_graph.study.trials import digest
 
 RUNS_NAME: Final = "runs.jsonl"
 SERIES_NAME: Final = "series"

@@ -7,9 +7,9 @@ import pytest
 
 from ssm_graph.evaluation.statistics import chi2_interval, paired_ratio
 from ssm_graph.simulation import Grade, OutlierKind, Outliers
+from ssm_graph.study.cells import Cell
 from ssm_graph.study.jobs import Job, do_job
 from ssm_graph.study.scoring import Row
-from ssm_graph.study.trials import Cell
 
 SEEDS = tuple(range(8))
 CLEAN = Cell("clean", "survey", 240.0)

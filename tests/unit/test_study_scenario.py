@@ -12,9 +12,10 @@ import pytest
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.mission.calibration import CURRENT
 from ssm_graph.simulation import CurrentSettings, FaultShape, Grade, Loss, OutlierKind, WaterTrack
+from ssm_graph.study.cells import Cell
 from ssm_graph.study.runner import wanted_keys
 from ssm_graph.study.scenario import Study, read_study, study_from, study_of_folders
-from ssm_graph.study.trials import Cell, MissionCache, simulated_trials
+from ssm_graph.study.trials import MissionCache, simulated_trials
 from tests.study_fixture import SPARSE, TINY, tiny_study
 
 STUDIES = sorted((Path(__file__).parents[2] / "benchmarks" / "studies").glob("*.toml"))
