@@ -13,11 +13,13 @@ from ssm_graph.simulation.aids import (
     RangingSettings,
     UsblSettings,
 )
-from ssm_graph.simulation.beam_faults import Fault, FaultShape, Loss, OutlierKind, Outliers
+from ssm_graph.simulation.beam_faults import Loss, OutlierKind, Outliers
 from ssm_graph.simulation.config import SCENARIOS, Scenario, SimulationConfig, scenario_config
 from ssm_graph.simulation.currents import Current, CurrentSettings, WaterTrack
 from ssm_graph.simulation.dvl_model import DvlSettings, default_mount, janus_beams
+from ssm_graph.simulation.faults import Fault, FaultShape, Sensor
 from ssm_graph.simulation.inertial import IMU_NOISE, START_SIGMAS, Grade, StartSigmas
+from ssm_graph.simulation.lasting_faults import BrokenMission, with_faults
 from ssm_graph.simulation.mission import SimulatedMission, simulate, with_dvl_errors
 from ssm_graph.simulation.randomness import DriftSettings
 from ssm_graph.simulation.routes import (
@@ -38,6 +40,7 @@ __all__ = [
     "START_SIGMAS",
     "AidSettings",
     "BeaconSettings",
+    "BrokenMission",
     "CompassSettings",
     "Current",
     "CurrentSettings",
@@ -58,6 +61,7 @@ __all__ = [
     "RangingSettings",
     "Route",
     "Scenario",
+    "Sensor",
     "SimulatedMission",
     "SimulationConfig",
     "SpiralRoute",
@@ -73,4 +77,5 @@ __all__ = [
     "scenario_config",
     "simulate",
     "with_dvl_errors",
+    "with_faults",
 ]

@@ -24,9 +24,10 @@ from ssm_graph.simulation.aids import (
     RangingSettings,
     UsblSettings,
 )
-from ssm_graph.simulation.beam_faults import Fault, Loss, OutlierKind, Outliers
+from ssm_graph.simulation.beam_faults import Loss, OutlierKind, Outliers
 from ssm_graph.simulation.currents import CurrentSettings, WaterTrack
 from ssm_graph.simulation.dvl_model import DvlSettings, default_mount, janus_beams
+from ssm_graph.simulation.faults import Fault
 from ssm_graph.simulation.inertial import IMU_NOISE, Grade, StartSigmas
 from ssm_graph.simulation.routes import (
     DepthProfile,

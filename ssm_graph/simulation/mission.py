@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,7 +19,6 @@ from ssm_graph.sensors.gnss import GnssLog
 from ssm_graph.sensors.imu import ImuLog
 from ssm_graph.simulation.aids import SimulatedAids, aid_logs, depth_log, gnss_log
 from ssm_graph.simulation.beam_faults import (
-    Fault,
     Loss,
     Outliers,
     add_faults,
@@ -30,7 +29,9 @@ from ssm_graph.simulation.beam_faults import (
 from ssm_graph.simulation.config import SimulationConfig
 from ssm_graph.simulation.currents import Current
 from ssm_graph.simulation.dvl_model import beam_ranges, ping_times, true_beam_speeds
+from ssm_graph.simulation.faults import Fault
 from ssm_graph.simulation.inertial import START_SIGMAS, averaged_imu, imu_errors, initial_state
+from ssm_graph.simulation.lasting_faults import BrokenMission, with_faults
 from ssm_graph.simulation.randomness import Streams, draw_drift, spawn_streams
 from ssm_graph.simulation.trajectory import Trajectory
 
@@ -59,6 +60,11 @@ class SimulatedMission(ShortRepr):
     accel_bias: Array
     """(M, 3) true accelerometer bias of each IMU sample, m/s^2."""
     current: Current
+    intact: Mission
+    """The mission without the faults that came when all was read: those of beams are in it."""
+    is_bad: Mapping[str, NDArray[np.bool_]]
+    """Readings that a fault acts on, by the section of their log, as
+    :attr:`BrokenMission.is_bad`; ``dvl`` is ``is_outlier``."""
 
     @property
     def trajectory(self) -> Trajectory:
@@ -82,10 +88,11 @@ class SimulatedMission(ShortRepr):
         return dataclasses.replace(self.mission, dvl=known)
 
     def without_outliers(self) -> Mission:
-        """Return the mission of the oracle, who is told the bad beams: they are missing."""
-        dvl = self.mission.dvl
-        speed = np.where(self.is_outlier, np.nan, dvl.speed)
-        return dataclasses.replace(self.mission, dvl=dataclasses.replace(dvl, speed=speed))
+        """Return the mission of the oracle, who is told what is bad: it is missing.
+
+        Inertial data with a fault are those of ``intact``.
+        """
+        return BrokenMission(self.mission, self.is_bad).told(self.intact)
 
 
 def simulate(config: SimulationConfig) -> SimulatedMission:
@@ -103,7 +110,7 @@ def simulate(config: SimulationConfig) -> SimulatedMission:
     aids = aid_logs(config.trajectory, config.aids, end_s=end_s, streams=streams, noisy=noisy)
     truth = config.trajectory.truth(_reference_times(config, end_s))
     initial_rng = streams.initial if config.draw_initial_errors else None
-    mission = Mission(
+    intact = Mission(
         name=config.name,
         frame=LocalFrame(lat=config.lat, lon=config.lon, height=0.0),
         imu=imu,
@@ -119,9 +126,7 @@ def simulate(config: SimulationConfig) -> SimulatedMission:
     )
     return SimulatedMission(
         config=config,
-        mission=mission,
-        is_outlier=dvl.is_outlier,
-        beam_offset=dvl.offset,
+        **_broken(config, intact, dvl),
         true_speed=speeds.over_ground,
         water_speed=speeds.through_water,
         ping_time_s=ping_s,
@@ -156,13 +161,25 @@ def with_dvl_errors(
     streams = spawn_streams(config.seed)
     speeds = _TrueSpeeds(simulated.true_speed, simulated.water_speed)
     dvl = _dvl(config, streams, simulated.ping_time_s, speeds)
-    return dataclasses.replace(
-        simulated,
-        config=config,
-        mission=dataclasses.replace(simulated.mission, dvl=dvl.log),
-        is_outlier=dvl.is_outlier,
-        beam_offset=dvl.offset,
-    )
+    intact = dataclasses.replace(simulated.intact, dvl=dvl.log)
+    return dataclasses.replace(simulated, config=config, **_broken(config, intact, dvl))
+
+
+def _broken(config: SimulationConfig, intact: Mission, dvl: _Dvl) -> dict[str, Any]:
+    """Return the fields of a simulated mission that faults decide."""
+    faults = [fault for fault in config.faults if not fault.is_before_noise]
+    broken = with_faults(intact, faults, truth=config.trajectory.truth, seed=config.seed)
+    mission, offset, is_outlier = broken.mission, dvl.offset, dvl.is_outlier
+    if "dvl" in broken.is_bad:
+        is_outlier = is_outlier | broken.is_bad["dvl"]
+        offset = offset + np.nan_to_num(mission.dvl.speed - intact.dvl.speed)
+    return {
+        "intact": intact,
+        "mission": mission,
+        "is_outlier": is_outlier,
+        "beam_offset": offset,
+        "is_bad": {**broken.is_bad, "dvl": is_outlier},
+    }
 
 
 def _reference_times(config: SimulationConfig, end_s: float) -> Array:
