@@ -89,6 +89,8 @@ _OF: Final = {
 """Sensors that each shape befalls."""
 _WITHOUT_SIZE: Final = {FaultShape.COVERED, FaultShape.STUCK, FaultShape.ZERO}
 _WITHOUT_SIZE |= {FaultShape.COASTING, FaultShape.FLAT}
+WHOLE_ARRAY: Final = {FaultShape.MOVING_BOTTOM, FaultShape.SLIP, FaultShape.LATE}
+"""Shapes of the DVL that befall all beams together."""
 _ABOVE_ZERO: Final = {FaultShape.CLIPPED, FaultShape.LOW_PASS, FaultShape.CLOCK}
 _TO_AN_END: Final = {FaultShape.DRIFT, FaultShape.COVERED}
 
@@ -240,7 +242,7 @@ class Fault:
     @property
     def needs_whole_array(self) -> bool:
         """Whether all beams suffer together."""
-        return self.shape in (FaultShape.MOVING_BOTTOM, FaultShape.SLIP, FaultShape.LATE)
+        return self.shape in WHOLE_ARRAY
 
     @property
     def is_before_noise(self) -> bool:

@@ -161,9 +161,7 @@ def _break_scalar(
     return replace(log, **{name: value}), bad
 
 
-def _break_place(
-    log: Any, fault: Fault, truth: Truth, _: Mission, rng: Rng
-) -> tuple[Any, Mask]:
+def _break_place(log: Any, fault: Fault, truth: Truth, _: Mission, rng: Rng) -> tuple[Any, Mask]:
     """Break fixes, of GNSS or acoustic."""
     rows, bad = fault.inside(log.time_s), np.zeros(len(log.time_s), bool)
     if len(rows) == 0:

@@ -247,7 +247,8 @@ def _dvl(config: SimulationConfig, streams: Streams, time_s: Array, speeds: _Tru
     missing |= np.where(is_water[:, None], ~returns, lost)
     speed = np.where(is_water[:, None], speeds.through_water, speeds.over_ground)
     drawn = draw_outliers(config.outliers, time_s, speed, rng=streams.outliers)
-    offset, is_outlier = add_faults(drawn, config.faults, time_s, speed)
+    before_noise = [fault for fault in config.faults if fault.is_before_noise]
+    offset, is_outlier = add_faults(drawn, before_noise, time_s, speed)
     speed = speed + offset
     if not config.perfect_sensors:
         speed = speed + noise[:, None] * streams.beam_noise.standard_normal(speed.shape)
