@@ -19,9 +19,16 @@ from ssm_graph.simulation.currents import Current, CurrentSettings, WaterTrack
 from ssm_graph.simulation.dvl_model import DvlSettings, default_mount, janus_beams
 from ssm_graph.simulation.faults import Fault, FaultShape, Sensor
 from ssm_graph.simulation.inertial import IMU_NOISE, START_SIGMAS, Grade, StartSigmas
+from ssm_graph.simulation.instruments import (
+    INERTIAL_ERRORS,
+    BeamNoise,
+    InertialErrors,
+    InstrumentErrors,
+    errors_of,
+)
 from ssm_graph.simulation.lasting_faults import BrokenMission, with_faults
 from ssm_graph.simulation.mission import SimulatedMission, simulate, with_dvl_errors
-from ssm_graph.simulation.randomness import DriftSettings
+from ssm_graph.simulation.randomness import DriftSettings, SlowPart
 from ssm_graph.simulation.routes import (
     DepthProfile,
     DiveRoute,
@@ -36,10 +43,12 @@ from ssm_graph.simulation.trajectory import CALM, Trajectory, Waves
 __all__ = [
     "CALM",
     "IMU_NOISE",
+    "INERTIAL_ERRORS",
     "SCENARIOS",
     "START_SIGMAS",
     "AidSettings",
     "BeaconSettings",
+    "BeamNoise",
     "BrokenMission",
     "CompassSettings",
     "Current",
@@ -55,6 +64,8 @@ __all__ = [
     "Grade",
     "GrossErrors",
     "HoverRoute",
+    "InertialErrors",
+    "InstrumentErrors",
     "Loss",
     "OutlierKind",
     "Outliers",
@@ -64,6 +75,7 @@ __all__ = [
     "Sensor",
     "SimulatedMission",
     "SimulationConfig",
+    "SlowPart",
     "SpiralRoute",
     "StartSigmas",
     "SurveyRoute",
@@ -73,6 +85,7 @@ __all__ = [
     "WaterTrack",
     "Waves",
     "default_mount",
+    "errors_of",
     "janus_beams",
     "scenario_config",
     "simulate",

@@ -12,9 +12,12 @@ from enum import Enum
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.simulation import checked
+
+Rows = NDArray[np.intp]
 
 
 class Sensor(Enum):
@@ -87,8 +90,13 @@ _OF: Final = {
     FaultShape.CLOCK: frozenset({Sensor.IMU}),
 }
 """Sensors that each shape befalls."""
-_WITHOUT_SIZE: Final = {FaultShape.COVERED, FaultShape.STUCK, FaultShape.ZERO}
-_WITHOUT_SIZE |= {FaultShape.COASTING, FaultShape.FLAT}
+_WITHOUT_SIZE: Final = {
+    FaultShape.COVERED,
+    FaultShape.STUCK,
+    FaultShape.ZERO,
+    FaultShape.COASTING,
+    FaultShape.FLAT,
+}
 WHOLE_ARRAY: Final = {FaultShape.MOVING_BOTTOM, FaultShape.SLIP, FaultShape.LATE}
 """Shapes of the DVL that befall all beams together."""
 _ABOVE_ZERO: Final = {FaultShape.CLIPPED, FaultShape.LOW_PASS, FaultShape.CLOCK}
@@ -249,11 +257,11 @@ class Fault:
         """Whether the simulator adds it to clean speeds of beams, whose noise goes on."""
         return self.sensor is Sensor.DVL and self.shape in _BEFORE_NOISE
 
-    def beams_of(self, n_beams: int) -> tuple[int, ...]:
+    def beams_of(self, n_beams: int) -> Rows:
         """Return the beams that suffer, of so many."""
-        return self.beams or tuple(range(n_beams))
+        return np.array(self.beams or range(n_beams), np.intp)
 
-    def inside(self, time_s: Array) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+    def inside(self, time_s: Array) -> Rows:
         """Return the readings, by number, at times inside the fault."""
         return np.flatnonzero((self.start_s <= time_s) & (time_s < self.end_s))
 

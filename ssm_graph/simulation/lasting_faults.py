@@ -1,4 +1,4 @@
-"""Break a finished mission, recorded or simulated: the faults of :mod:`.faults`, sensor by sensor."""
+"""Break a finished mission, recorded or simulated, with the faults of :mod:`.faults`."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def _changed(
         return reading + more * rng.standard_normal(reading.shape), every
     if fault.shape is FaultShape.SPIKES:
         touched = rng.random(reading.shape) < fault.share
-        off = sigma * rng.uniform(*np.sort(fault.sizes), reading.shape)
+        off = sigma * rng.uniform(fault.sizes.min(), fault.sizes.max(), reading.shape)
         return np.where(touched, reading + off, reading), touched
     return reading + fault.offset(time_s, reading), every
 
@@ -201,7 +201,7 @@ def _break_dvl(
     """Break beams; one that is missing stays so."""
     checked.require_beams("Fault.beams", fault.beams, log.mount.n_beams)
     rows, speed = fault.inside(log.time_s), log.speed.copy()
-    beams = np.array(fault.beams_of(log.mount.n_beams))
+    beams = fault.beams_of(log.mount.n_beams)
     where, bad = np.ix_(rows, beams), np.zeros(speed.shape, bool)
     if len(rows) == 0:
         return log, bad

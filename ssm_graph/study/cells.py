@@ -93,12 +93,14 @@ class Cell:
     """None for that of the scenario."""
     gnss_windows_s: tuple[tuple[float, float], ...] | None = field(default=None, repr=False)
     """Times with fixes, s; None for those of the scenario."""
+    realistic: bool = field(default=False, repr=False)
+    """Whether instruments err as real ones of the grade."""
 
     @property
     def id(self) -> str:
         """Name and digest of the whole definition: runs of another one are never taken for it."""
         water = repr((self.current, self.water_track)) if self.current or self.water_track else ""
-        further = [self.gnss_windows_s, *(fault.further for fault in self.faults)]
+        further = [self.gnss_windows_s, self.realistic, *(fault.further for fault in self.faults)]
         more = repr(further) if any(further) else ""
         return f"{self.case}#{digest(repr(self) + water + more)}"
 
@@ -123,6 +125,7 @@ class Cell:
             current=self.current or config.current,
             water_track=water_track,
             losses=self.losses if water_track else (),
+            realistic=self.realistic or config.realistic,
             gnss=config.gnss
             if self.gnss_windows_s is None
             else replace(config.gnss or GnssSettings(), windows=self.gnss_windows_s),

@@ -127,6 +127,7 @@ _CASE: Final = {
     "current": keys.table(),
     "water_track": keys.table(),
     "gnss_windows_s": keys.pairs(),
+    "realistic": keys.flag(False),
 }
 _LOSS: Final = {
     "beams": keys.counts(),
@@ -214,14 +215,15 @@ def _cells(table: StudyTable, scenario: str, config: SimulationConfig) -> list[C
         current=_made(CurrentSettings, table.of("current", _CURRENT)),
         water_track=_made(WaterTrack, table.of("water_track", _WATER_TRACK)),
         gnss_windows_s=table["gnss_windows_s"],
+        realistic=table["realistic"],
     )
     if name is not None and len(outliers) > 1:
         expected = "a name for a single kind, rate and size only"
         raise table.fault("name", expected, name, "leave it out, the cases name themselves")
     if name is None and case != Cell("", scenario, config.duration_s):
         raise ConfigError(
-            f"{table.where} name: expected a name for a case with faults, losses, dropouts or "
-            'currents, got nothing; try name = "fault"'
+            f"{table.where} name: expected a name for a case with faults, losses, dropouts, currents, "
+            'GNSS or realistic instruments, got nothing; try name = "fault"'
         )
     return [replace(case, case=name or _case_name(each), outliers=each) for each in outliers]
 

@@ -119,7 +119,8 @@ def _simulated_trial(cell: Cell, grade: Grade, seed: int, cache: MissionCache) -
         return simulated, build_problem(simulated.mission)
 
     water = (config.current, config.water_track, config.losses)
-    key = (cell.scenario, grade.name, cell.duration_s, seed, water, config.gnss)
+    more = (config.gnss, config.realistic)
+    key = (cell.scenario, grade.name, cell.duration_s, seed, water, more)
     clean, problem = cache.get(key, make, length_s=cell.duration_s)
     simulated = with_dvl_errors(
         clean,
