@@ -1,4 +1,4 @@
-"""Lies that last, or that sensors share: is the answer right, or does the status say that it is not?
+"""Lies that last, or that sensors share: the answer is right, or the status says that it is not.
 
 ``python -m benchmarks.trust.run --keep`` (hours; a quick look is ``--seeds 2 --grades tactical``).
 Missions of 400 s, DVL 5 mm/s; what lies, when and by how much is drawn for every seed.
@@ -245,11 +245,8 @@ def main() -> None:
     seeds = range(args.first_seed, args.first_seed + args.seeds)
     labels = [label for label in LIES if args.only in label]
     lies = [(label, grade) for label in labels for grade in args.grades.split(",")]
-    fair = (
-        []
-        if args.only
-        else [(x, g) for x in (CLEAN, REALISTIC) for g in args.clean_grades.split(",")]
-    )
+    fair = [(x, grade) for x in (CLEAN, REALISTIC) for grade in args.clean_grades.split(",")]
+    fair = [] if args.only else fair
     cells = [(*cell, args.realistic) for cell in lies]
     cells += [(label, grade, label == REALISTIC) for label, grade in fair]
     cases = [(label, grade, seed, real) for label, grade, real in cells for seed in seeds]
