@@ -70,7 +70,7 @@ class FaultShape(Enum):
 
 
 _OFFSETS: Final = (FaultShape.CONSTANT, FaultShape.DRIFT, FaultShape.RAMP)
-_OF: Final = {
+SENSORS: Final = {
     FaultShape.CONSTANT: _ALL - {Sensor.IMU},
     FaultShape.DRIFT: _ALL - {Sensor.IMU},
     FaultShape.COVERED: _DVL,
@@ -134,7 +134,7 @@ class Fault:
 
     def __post_init__(self) -> None:
         checked.require_rule("Fault", checked.WINDOW, (self.start_s, self.end_s))
-        name, allowed = self.shape.name, _OF[self.shape]
+        name, allowed = self.shape.name, SENSORS[self.shape]
         checked.require(
             self.sensor in allowed,
             "Fault.sensor",
@@ -266,26 +266,36 @@ class Fault:
         return np.flatnonzero((self.start_s <= time_s) & (time_s < self.end_s))
 
     def offset(self, time_s: Array, reading: Array) -> Array:
-        """Return what the fault adds (N, n) to ``reading`` (N, n), where that alone decides.
+        """Return what an offset, COVERED or STUCK adds (N, n) to ``reading`` (N, n).
 
         The readings at ``time_s`` (N,) are those inside the fault; units are theirs.
         """
         age_s = (time_s - self.start_s)[:, None]
-        if self.shape is FaultShape.STUCK:
-            first = np.isfinite(reading).argmax(axis=0)
-            return np.asarray(np.take_along_axis(reading, first[None], 0) - reading)
-        if self.shape is FaultShape.ZERO:
-            return -reading
-        if self.shape is FaultShape.SCALE:
-            return np.asarray((self.sizes[0] - 1.0) * reading)
-        if self.shape is FaultShape.CLIPPED:
-            return np.asarray(np.clip(reading, -self.sizes[0], self.sizes[0]) - reading)
         grown = age_s / (self.end_s - self.start_s)
+        if self.shape is FaultShape.STUCK:
+            return np.asarray(_first(reading) - reading)
         if self.shape is FaultShape.COVERED:
             return np.asarray(-self.share * grown * reading)
         size = self.offset_m_per_s if self.has_offset else self.sizes
         factor = {FaultShape.DRIFT: grown, FaultShape.RAMP: age_s}.get(self.shape, 1.0)
         return np.asarray(np.broadcast_to(size, reading.shape) * factor)
+
+    def changed(self, time_s: Array, reading: Array) -> Array:
+        """Return ``reading`` (N, n) as a fault makes it that nothing but the reading decides."""
+        if self.shape is FaultShape.STUCK:
+            return np.broadcast_to(_first(reading), reading.shape)
+        if self.shape is FaultShape.ZERO:
+            return np.where(np.isnan(reading), np.nan, 0.0)
+        if self.shape is FaultShape.SCALE:
+            return np.asarray(self.sizes[0] * reading)
+        if self.shape is FaultShape.CLIPPED:
+            return np.clip(reading, -self.sizes[0], self.sizes[0])
+        return np.asarray(reading + self.offset(time_s, reading))
+
+
+def _first(reading: Array) -> Array:
+    """Return the first reading of each column that there is, (1, n)."""
+    return np.take_along_axis(reading, np.isfinite(reading).argmax(axis=0)[None], 0)
 
 
 _BEFORE_NOISE: Final = {

@@ -126,7 +126,7 @@ def _changed(
         touched = rng.random(reading.shape) < fault.share
         off = sigma * rng.uniform(fault.sizes.min(), fault.sizes.max(), reading.shape)
         return np.where(touched, reading + off, reading), touched
-    return reading + fault.offset(time_s, reading), every
+    return fault.changed(time_s, reading), every
 
 
 def _break_scalar(
