@@ -223,7 +223,7 @@ def _break_dvl(
                 slip = R_bd @ Rotation.from_rotvec(fault.sizes).as_matrix() @ R_bd.T
                 off = v_b @ (slip - np.eye(3)) @ beams_b.T
         read = speed[where] + off
-    speed[where], bad[where] = read, touched
+    speed[where], bad[where] = np.where(np.isnan(speed[where]), np.nan, read), touched
     return replace(log, speed=speed), bad & np.isfinite(speed)
 
 
