@@ -99,7 +99,19 @@ _WITHOUT_SIZE: Final = {
 }
 WHOLE_ARRAY: Final = {FaultShape.MOVING_BOTTOM, FaultShape.SLIP, FaultShape.LATE}
 """Shapes of the DVL that befall all beams together."""
-_ABOVE_ZERO: Final = {FaultShape.CLIPPED, FaultShape.LOW_PASS, FaultShape.CLOCK}
+_ABOVE: Final = {
+    FaultShape.NOISE,
+    FaultShape.CLIPPED,
+    FaultShape.LOW_PASS,
+    FaultShape.CLOCK,
+}
+"""Shapes whose size is above one, or zero."""
+_BEFORE_NOISE: Final = {
+    FaultShape.CONSTANT,
+    FaultShape.DRIFT,
+    FaultShape.COVERED,
+    FaultShape.STUCK,
+}
 _TO_AN_END: Final = {FaultShape.DRIFT, FaultShape.COVERED}
 
 
@@ -142,11 +154,11 @@ class Fault:
             got=self.sensor.name,
             hint="take another shape",
         )
+        ends = self.shape in _TO_AN_END
         checked.require(
-            math.isfinite(self.end_s) == (self.shape in _TO_AN_END)
-            or self.shape not in _TO_AN_END | {FaultShape.CLOCK},
+            math.isfinite(self.end_s) == ends or not (ends or self.shape is FaultShape.CLOCK),
             "Fault.end_s",
-            expected=f"{'a time' if self.shape in _TO_AN_END else 'none'} with {name}",
+            expected=f"{'a time' if ends else 'none'} with {name}",
             got=self.end_s,
             hint="a drift grows until it ends, a clock that was set stays so",
         )
@@ -212,11 +224,8 @@ class Fault:
             hint="see Fault.size for what they are",
         )
         least = 1.0 if self.shape is FaultShape.NOISE else 0.0
-        is_good = (self.shape is not FaultShape.NOISE or sizes[0] >= 1.0) and (
-            self.shape not in _ABOVE_ZERO or sizes[0] > 0.0
-        )
         checked.require(
-            is_good,
+            self.shape not in _ABOVE or bool(sizes[0] > least),
             "Fault.size",
             expected=f"more than {least:g} with {name}",
             got=self.size,
@@ -296,11 +305,3 @@ class Fault:
 def _first(reading: Array) -> Array:
     """Return the first reading of each column that there is, (1, n)."""
     return np.take_along_axis(reading, np.isfinite(reading).argmax(axis=0)[None], 0)
-
-
-_BEFORE_NOISE: Final = {
-    FaultShape.CONSTANT,
-    FaultShape.DRIFT,
-    FaultShape.COVERED,
-    FaultShape.STUCK,
-}

@@ -79,9 +79,9 @@ def with_faults(
         A fault that needs a truth of which the reference knows nothing.
     """
     known = truth or (lambda time_s: _between(mission.reference, time_s))
-    rng = np.random.default_rng([seed, *b"faults"])
     broken, is_bad = mission, dict[str, Mask]()
-    for fault in faults:
+    for i, fault in enumerate(faults):
+        rng = np.random.default_rng([seed, *b"faults", i])
         if fault.sensor.is_inertial:
             broken, bad = _break_imu(broken, fault, rng)
         else:
