@@ -162,24 +162,34 @@ class Fault:
             got=self.end_s,
             hint="a drift grows until it ends, a clock that was set stays so",
         )
-        self._check_where()
-        self._check_offset_and_share()
-        self._check_size()
-
-    def _check_where(self) -> None:
-        if self.beams:
-            checked.require_rule("Fault.beams", checked.BEAMS, self.beams)
-        for what, given, allowed in (
-            ("beams", self.beams, self.sensor is Sensor.DVL and not self.needs_whole_array),
-            ("axes", self.axes, self.sensor in _TRIADS),
+        self._check_beams_and_axes()
+        has_share = self.shape in (FaultShape.COVERED, FaultShape.SPIKES)
+        of_dvl = self.sensor is Sensor.DVL
+        for what, given, is_asked in (
+            ("beams", len(self.beams), of_dvl and self.shape not in WHOLE_ARRAY),
+            ("axes", len(self.axes), self.sensor in _TRIADS),
+            ("offset_m_per_s", self.offset_m_per_s, self.has_offset),
+            ("share", self.share, has_share),
         ):
             checked.require(
-                allowed or not given,
+                is_asked or not np.any(given),
                 f"Fault.{what}",
-                expected=f"none of {self.sensor.name} with {self.shape.name}",
-                got=given,
+                expected=f"none with {name} of {self.sensor.name}",
+                got=getattr(self, what),
                 hint="leave it out",
             )
+        checked.require(
+            0.0 < self.share <= 1.0 or not has_share,
+            "Fault.share",
+            expected="above 0, at most 1",
+            got=self.share,
+            hint="write 30 % as 0.3",
+        )
+        self._check_size()
+
+    def _check_beams_and_axes(self) -> None:
+        if self.beams:
+            checked.require_rule("Fault.beams", checked.BEAMS, self.beams)
         checked.require(
             set(self.axes) <= {0, 1, 2} and len(set(self.axes)) == len(self.axes),
             "Fault.axes",
@@ -187,30 +197,12 @@ class Fault:
             got=self.axes,
             hint="axes are counted from 0",
         )
-
-    def _check_offset_and_share(self) -> None:
-        count = np.size(self.offset_m_per_s)
         checked.require(
-            count in (1, len(self.beams)),
+            np.size(self.offset_m_per_s) in (1, len(self.beams)),
             "Fault.offset_m_per_s",
             expected=f"1 or {len(self.beams)} offsets",
             got=self.offset_m_per_s,
             hint="give one offset for all beams or one for each",
-        )
-        checked.require(
-            self.has_offset or not np.any(self.offset_m_per_s),
-            "Fault.offset_m_per_s",
-            expected=f"none with {self.shape.name} of {self.sensor.name}",
-            got=self.offset_m_per_s,
-            hint="leave it out",
-        )
-        has_share = self.shape in (FaultShape.COVERED, FaultShape.SPIKES)
-        checked.require(
-            0.0 < self.share <= 1.0 if has_share else self.share == 0.0,
-            "Fault.share",
-            expected="above 0, at most 1, with COVERED and SPIKES alone",
-            got=self.share,
-            hint="write 30 % as 0.3" if has_share else "leave it out",
         )
 
     def _check_size(self) -> None:
@@ -255,11 +247,6 @@ class Fault:
     def has_offset(self) -> bool:
         """Whether it has a size in m/s, of beams."""
         return self.sensor is Sensor.DVL and self.shape in (FaultShape.CONSTANT, FaultShape.DRIFT)
-
-    @property
-    def needs_whole_array(self) -> bool:
-        """Whether all beams suffer together."""
-        return self.shape in WHOLE_ARRAY
 
     @property
     def is_before_noise(self) -> bool:

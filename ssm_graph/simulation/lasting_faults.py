@@ -19,7 +19,7 @@ from ssm_graph.mission.mission import Aids, Mission, Reference
 from ssm_graph.sensors.acoustic import RangeLog, UsblLog
 from ssm_graph.sensors.compass import HeadingLog
 from ssm_graph.simulation import checked
-from ssm_graph.simulation.faults import Fault, FaultShape, Sensor
+from ssm_graph.simulation.faults import WHOLE_ARRAY, Fault, FaultShape, Sensor
 
 Mask = NDArray[np.bool_]
 Truth = Callable[[Array], Reference]
@@ -205,7 +205,7 @@ def _break_dvl(
     where, bad = np.ix_(rows, beams), np.zeros(speed.shape, bool)
     if len(rows) == 0:
         return log, bad
-    if not fault.needs_whole_array:
+    if fault.shape not in WHOLE_ARRAY:
         read, touched = _changed(fault, log.time_s[rows], speed[where], log.sigma[where], rng)
     else:
         valid_s, touched = log.valid_s[rows], np.ones((len(rows), len(beams)), bool)
