@@ -70,7 +70,7 @@ class FaultShape(Enum):
 
 
 _OFFSETS: Final = (FaultShape.CONSTANT, FaultShape.DRIFT, FaultShape.RAMP)
-_OF: Final = {
+SENSORS: Final = {
     FaultShape.CONSTANT: _ALL - {Sensor.IMU},
     FaultShape.DRIFT: _ALL - {Sensor.IMU},
     FaultShape.COVERED: _DVL,
@@ -99,7 +99,19 @@ _WITHOUT_SIZE: Final = {
 }
 WHOLE_ARRAY: Final = {FaultShape.MOVING_BOTTOM, FaultShape.SLIP, FaultShape.LATE}
 """Shapes of the DVL that befall all beams together."""
-_ABOVE_ZERO: Final = {FaultShape.CLIPPED, FaultShape.LOW_PASS, FaultShape.CLOCK}
+_ABOVE: Final = {
+    FaultShape.NOISE,
+    FaultShape.CLIPPED,
+    FaultShape.LOW_PASS,
+    FaultShape.CLOCK,
+}
+"""Shapes whose size is above one, or zero."""
+_BEFORE_NOISE: Final = {
+    FaultShape.CONSTANT,
+    FaultShape.DRIFT,
+    FaultShape.COVERED,
+    FaultShape.STUCK,
+}
 _TO_AN_END: Final = {FaultShape.DRIFT, FaultShape.COVERED}
 
 
@@ -134,7 +146,7 @@ class Fault:
 
     def __post_init__(self) -> None:
         checked.require_rule("Fault", checked.WINDOW, (self.start_s, self.end_s))
-        name, allowed = self.shape.name, _OF[self.shape]
+        name, allowed = self.shape.name, SENSORS[self.shape]
         checked.require(
             self.sensor in allowed,
             "Fault.sensor",
@@ -142,32 +154,42 @@ class Fault:
             got=self.sensor.name,
             hint="take another shape",
         )
+        ends = self.shape in _TO_AN_END
         checked.require(
-            math.isfinite(self.end_s) == (self.shape in _TO_AN_END)
-            or self.shape not in _TO_AN_END | {FaultShape.CLOCK},
+            math.isfinite(self.end_s) == ends or not (ends or self.shape is FaultShape.CLOCK),
             "Fault.end_s",
-            expected=f"{'a time' if self.shape in _TO_AN_END else 'none'} with {name}",
+            expected=f"{'a time' if ends else 'none'} with {name}",
             got=self.end_s,
             hint="a drift grows until it ends, a clock that was set stays so",
         )
-        self._check_where()
-        self._check_offset_and_share()
-        self._check_size()
-
-    def _check_where(self) -> None:
-        if self.beams:
-            checked.require_rule("Fault.beams", checked.BEAMS, self.beams)
-        for what, given, allowed in (
-            ("beams", self.beams, self.sensor is Sensor.DVL and not self.needs_whole_array),
-            ("axes", self.axes, self.sensor in _TRIADS),
+        self._check_beams_and_axes()
+        has_share = self.shape in (FaultShape.COVERED, FaultShape.SPIKES)
+        of_dvl = self.sensor is Sensor.DVL
+        for what, given, is_asked in (
+            ("beams", len(self.beams), of_dvl and self.shape not in WHOLE_ARRAY),
+            ("axes", len(self.axes), self.sensor in _TRIADS),
+            ("offset_m_per_s", self.offset_m_per_s, self.has_offset),
+            ("share", self.share, has_share),
         ):
             checked.require(
-                allowed or not given,
+                is_asked or not np.any(given),
                 f"Fault.{what}",
-                expected=f"none of {self.sensor.name} with {self.shape.name}",
-                got=given,
+                expected=f"none with {name} of {self.sensor.name}",
+                got=getattr(self, what),
                 hint="leave it out",
             )
+        checked.require(
+            0.0 < self.share <= 1.0 or not has_share,
+            "Fault.share",
+            expected="above 0, at most 1",
+            got=self.share,
+            hint="write 30 % as 0.3",
+        )
+        self._check_size()
+
+    def _check_beams_and_axes(self) -> None:
+        if self.beams:
+            checked.require_rule("Fault.beams", checked.BEAMS, self.beams)
         checked.require(
             set(self.axes) <= {0, 1, 2} and len(set(self.axes)) == len(self.axes),
             "Fault.axes",
@@ -175,30 +197,12 @@ class Fault:
             got=self.axes,
             hint="axes are counted from 0",
         )
-
-    def _check_offset_and_share(self) -> None:
-        count = np.size(self.offset_m_per_s)
         checked.require(
-            count in (1, len(self.beams)),
+            np.size(self.offset_m_per_s) in (1, len(self.beams)),
             "Fault.offset_m_per_s",
             expected=f"1 or {len(self.beams)} offsets",
             got=self.offset_m_per_s,
             hint="give one offset for all beams or one for each",
-        )
-        checked.require(
-            self.has_offset or not np.any(self.offset_m_per_s),
-            "Fault.offset_m_per_s",
-            expected=f"none with {self.shape.name} of {self.sensor.name}",
-            got=self.offset_m_per_s,
-            hint="leave it out",
-        )
-        has_share = self.shape in (FaultShape.COVERED, FaultShape.SPIKES)
-        checked.require(
-            0.0 < self.share <= 1.0 if has_share else self.share == 0.0,
-            "Fault.share",
-            expected="above 0, at most 1, with COVERED and SPIKES alone",
-            got=self.share,
-            hint="write 30 % as 0.3" if has_share else "leave it out",
         )
 
     def _check_size(self) -> None:
@@ -212,11 +216,8 @@ class Fault:
             hint="see Fault.size for what they are",
         )
         least = 1.0 if self.shape is FaultShape.NOISE else 0.0
-        is_good = (self.shape is not FaultShape.NOISE or sizes[0] >= 1.0) and (
-            self.shape not in _ABOVE_ZERO or sizes[0] > 0.0
-        )
         checked.require(
-            is_good,
+            self.shape not in _ABOVE or bool(sizes[0] > least),
             "Fault.size",
             expected=f"more than {least:g} with {name}",
             got=self.size,
@@ -248,11 +249,6 @@ class Fault:
         return self.sensor is Sensor.DVL and self.shape in (FaultShape.CONSTANT, FaultShape.DRIFT)
 
     @property
-    def needs_whole_array(self) -> bool:
-        """Whether all beams suffer together."""
-        return self.shape in WHOLE_ARRAY
-
-    @property
     def is_before_noise(self) -> bool:
         """Whether the simulator adds it to clean speeds of beams, whose noise goes on."""
         return self.sensor is Sensor.DVL and self.shape in _BEFORE_NOISE
@@ -266,31 +262,33 @@ class Fault:
         return np.flatnonzero((self.start_s <= time_s) & (time_s < self.end_s))
 
     def offset(self, time_s: Array, reading: Array) -> Array:
-        """Return what the fault adds (N, n) to ``reading`` (N, n), where that alone decides.
+        """Return what an offset, COVERED or STUCK adds (N, n) to ``reading`` (N, n).
 
         The readings at ``time_s`` (N,) are those inside the fault; units are theirs.
         """
         age_s = (time_s - self.start_s)[:, None]
-        if self.shape is FaultShape.STUCK:
-            first = np.isfinite(reading).argmax(axis=0)
-            return np.asarray(np.take_along_axis(reading, first[None], 0) - reading)
-        if self.shape is FaultShape.ZERO:
-            return -reading
-        if self.shape is FaultShape.SCALE:
-            return np.asarray((self.sizes[0] - 1.0) * reading)
-        if self.shape is FaultShape.CLIPPED:
-            return np.asarray(np.clip(reading, -self.sizes[0], self.sizes[0]) - reading)
         grown = age_s / (self.end_s - self.start_s)
+        if self.shape is FaultShape.STUCK:
+            return np.asarray(_first(reading) - reading)
         if self.shape is FaultShape.COVERED:
             return np.asarray(-self.share * grown * reading)
         size = self.offset_m_per_s if self.has_offset else self.sizes
         factor = {FaultShape.DRIFT: grown, FaultShape.RAMP: age_s}.get(self.shape, 1.0)
         return np.asarray(np.broadcast_to(size, reading.shape) * factor)
 
+    def changed(self, time_s: Array, reading: Array) -> Array:
+        """Return ``reading`` (N, n) as a fault makes it that nothing but the reading decides."""
+        if self.shape is FaultShape.STUCK:
+            return np.broadcast_to(_first(reading), reading.shape)
+        if self.shape is FaultShape.ZERO:
+            return np.where(np.isnan(reading), np.nan, 0.0)
+        if self.shape is FaultShape.SCALE:
+            return np.asarray(self.sizes[0] * reading)
+        if self.shape is FaultShape.CLIPPED:
+            return np.clip(reading, -self.sizes[0], self.sizes[0])
+        return np.asarray(reading + self.offset(time_s, reading))
 
-_BEFORE_NOISE: Final = {
-    FaultShape.CONSTANT,
-    FaultShape.DRIFT,
-    FaultShape.COVERED,
-    FaultShape.STUCK,
-}
+
+def _first(reading: Array) -> Array:
+    """Return the first reading of each column that there is, (1, n)."""
+    return np.take_along_axis(reading, np.isfinite(reading).argmax(axis=0)[None], 0)

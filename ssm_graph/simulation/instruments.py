@@ -127,7 +127,7 @@ class InstrumentErrors:
 
     inertial: InertialErrors | None = None
     beams: BeamNoise | None = BeamNoise()
-    depth: SlowPart | None = SlowPart(0.25, 60.0)
+    depth: SlowPart | None = SlowPart(0.25, 20.0)
     """Swell and drag that the pressure port reads."""
     gnss: SlowPart | None = SlowPart(0.25, 100.0)
     """Multipath and atmosphere."""

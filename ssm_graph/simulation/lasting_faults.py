@@ -19,7 +19,7 @@ from ssm_graph.mission.mission import Aids, Mission, Reference
 from ssm_graph.sensors.acoustic import RangeLog, UsblLog
 from ssm_graph.sensors.compass import HeadingLog
 from ssm_graph.simulation import checked
-from ssm_graph.simulation.faults import Fault, FaultShape, Sensor
+from ssm_graph.simulation.faults import WHOLE_ARRAY, Fault, FaultShape, Sensor
 
 Mask = NDArray[np.bool_]
 Truth = Callable[[Array], Reference]
@@ -79,9 +79,9 @@ def with_faults(
         A fault that needs a truth of which the reference knows nothing.
     """
     known = truth or (lambda time_s: _between(mission.reference, time_s))
-    rng = np.random.default_rng([seed, *b"faults"])
     broken, is_bad = mission, dict[str, Mask]()
-    for fault in faults:
+    for i, fault in enumerate(faults):
+        rng = np.random.default_rng([seed, *b"faults", i])
         if fault.sensor.is_inertial:
             broken, bad = _break_imu(broken, fault, rng)
         else:
@@ -126,7 +126,7 @@ def _changed(
         touched = rng.random(reading.shape) < fault.share
         off = sigma * rng.uniform(fault.sizes.min(), fault.sizes.max(), reading.shape)
         return np.where(touched, reading + off, reading), touched
-    return reading + fault.offset(time_s, reading), every
+    return fault.changed(time_s, reading), every
 
 
 def _break_scalar(
@@ -205,7 +205,7 @@ def _break_dvl(
     where, bad = np.ix_(rows, beams), np.zeros(speed.shape, bool)
     if len(rows) == 0:
         return log, bad
-    if not fault.needs_whole_array:
+    if fault.shape not in WHOLE_ARRAY:
         read, touched = _changed(fault, log.time_s[rows], speed[where], log.sigma[where], rng)
     else:
         valid_s, touched = log.valid_s[rows], np.ones((len(rows), len(beams)), bool)
@@ -223,7 +223,7 @@ def _break_dvl(
                 slip = R_bd @ Rotation.from_rotvec(fault.sizes).as_matrix() @ R_bd.T
                 off = v_b @ (slip - np.eye(3)) @ beams_b.T
         read = speed[where] + off
-    speed[where], bad[where] = read, touched
+    speed[where], bad[where] = np.where(np.isnan(speed[where]), np.nan, read), touched
     return replace(log, speed=speed), bad & np.isfinite(speed)
 
 

@@ -222,8 +222,8 @@ def _cells(table: StudyTable, scenario: str, config: SimulationConfig) -> list[C
         raise table.fault("name", expected, name, "leave it out, the cases name themselves")
     if name is None and case != Cell("", scenario, config.duration_s):
         raise ConfigError(
-            f"{table.where} name: expected a name for a case with faults, losses, dropouts, currents, "
-            'GNSS or realistic instruments, got nothing; try name = "fault"'
+            f"{table.where} name: expected a name for a case with faults, losses, dropouts, "
+            'currents, fixes or realistic instruments, got nothing; try name = "fault"'
         )
     return [replace(case, case=name or _case_name(each), outliers=each) for each in outliers]
 
