@@ -17,6 +17,7 @@ from ssm_graph.mission.estimate import (
     Status,
     Trajectory,
 )
+from ssm_graph.mission.fault import DetectedFault, Treatment
 from ssm_graph.mission.mission import InitialState, Mission, Reference
 from ssm_graph.sensors.dvl import DvlLog, DvlMount
 from ssm_graph.sensors.imu import ImuLog, ImuNoise
@@ -160,3 +161,30 @@ def with_current(estimate: Estimate) -> Estimate:
     velocity = 0.5 * np.column_stack([np.sin(turned), np.cos(turned), np.zeros(len(time_s))])
     covariance = np.tile(np.diag([4e-4, 4e-4, 0.0]), (len(time_s), 1, 1))
     return replace(estimate, current=CurrentTrack(time_s, velocity, covariance))
+
+
+def with_faults(estimate: Estimate) -> Estimate:
+    """Return the estimate with a beam that was left out, and fixes of which it is not sure."""
+    begin_s = float(estimate.trajectory.time_s[0])
+    left_out = DetectedFault(
+        sensor="DVL beam 2",
+        what="+0.050 m/s",
+        begin_s=begin_s + 3.0,
+        end_s=begin_s + 5.0,
+        chi_sq=60.0,
+        dof=1,
+        treatment=Treatment.LEFT_OUT,
+    )
+    undecided = DetectedFault(
+        sensor="GNSS",
+        what="3.1 m to the east",
+        begin_s=begin_s + 10.0,
+        end_s=begin_s + 14.0,
+        chi_sq=80.0,
+        dof=3,
+        treatment=Treatment.COVERED,
+        rivals=("DVL, 0.20 m/s to the north",),
+        cost_m=2.5,
+        remedy="look at its datum",
+    )
+    return replace(estimate, faults=(left_out, undecided))

@@ -51,6 +51,12 @@ def add_parser(commands: Any, *, epilog: str) -> None:
     )
     parser.add_argument("--duration", type=float, metavar="SECONDS", help="length of the mission")
     parser.add_argument("--imu-rate", type=float, metavar="HZ", help="inertial samples per second")
+    parser.add_argument(
+        "--realistic",
+        action="store_true",
+        help="instruments err as real ones of the grade: scale factors, misalignments, vibration, "
+        "noise with tails that changes slowly (default: bias, walk and white noise as stated)",
+    )
     parser.add_argument("--seed", type=int, default=0, help="same seed, same mission (default: 0)")
     add_mission_output(parser)
     parser.set_defaults(run=run)
@@ -64,6 +70,7 @@ def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
         "grade": arguments.grade,
         "duration_s": arguments.duration,
         "imu_rate_hz": arguments.imu_rate,
+        "realistic": arguments.realistic or None,
     }
     if arguments.beams is not None:
         told["dvl"] = replace(usual.dvl, mount=default_mount(arguments.beams))

@@ -258,3 +258,13 @@ def test_golden_vectors(tmp_path: Path) -> None:
         done = run("science.golden_vectors", path, "golden_vectors", tmp_path)
         assert done.code == code
         assert done.rows("S | kf")[0][-1] == ("yes", "NO")[code]
+
+
+@pytest.mark.benchmark
+def test_trust(tmp_path: Path) -> None:
+    """A row for each lie and grade; clean missions are called good."""
+    options = "--seeds 1 --jobs 1 --grades tactical --only 'one beam' --clean-grades tactical"
+    done = run("trust.run", options, "trust", tmp_path)
+    lies, clean = done.rows("one beam"), done.rows("no fault")
+    assert [row[1] for row in lies] == ["tactical"] * 2
+    assert clean == []

@@ -24,7 +24,7 @@ from ssm_graph.report.style import (
     thinned_outliers_first,
     time_axis,
 )
-from tests.estimate_fixture import NOTES, calibrated, make_run, with_current
+from tests.estimate_fixture import NOTES, calibrated, make_run, with_current, with_faults
 
 N_PANELS = 14
 """Of a page with a reference, without current and calibration."""
@@ -63,6 +63,25 @@ def test_a_current_is_told_and_drawn() -> None:
     (panel,) = [axes for axes in figure.axes if axes.get_title(loc="left").startswith("Current")]
     assert [line.get_label() for line in panel.get_lines()] == ["east", "north"]
     assert len(figure.axes) == N_PANELS + 1
+
+
+def test_who_was_off_is_told_and_drawn(tmp_path: Path) -> None:
+    """A row a sensor, red where the answer may be wrong for it, and a bar from when to when."""
+    estimate, reference = make_run()
+    estimate = with_faults(estimate)
+    text = text_of(summary_table(estimate))
+    assert "Sensors that were off" in text
+    assert "3.1 m to the east" in text
+    assert "or it is DVL, 0.20 m/s to the north" in " ".join(text.split())
+    assert "Sensors that were off" not in text_of(summary_table(make_run()[0]))
+    figure = draw_figure(estimate, reference)
+    (panel,) = [a for a in figure.axes if a.get_title(loc="left").startswith("Sensors that")]
+    assert [label.get_text() for label in panel.get_yticklabels()] == ["DVL beam 2", "GNSS"]
+    first, second = (container[0] for container in panel.containers)
+    assert (first.get_x(), first.get_width()) == pytest.approx((3.0, 2.0))
+    assert first.get_facecolor() != second.get_facecolor()
+    assert len(figure.axes) == N_PANELS + 1
+    save_figure(tmp_path / "figure.png", estimate, reference)
 
 
 def test_a_calibration_is_drawn_in_sigmas_before(tmp_path: Path) -> None:

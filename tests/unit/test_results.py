@@ -17,7 +17,14 @@ from ssm_graph.io.results import tables as results_module
 from ssm_graph.io.results.summary import as_json
 from ssm_graph.io.results.tables import read_results, write_results
 from ssm_graph.mission.estimate import BeamTable, Status, path_length_m
-from tests.estimate_fixture import EPOCH, NOTES, make_mission, make_run, with_current
+from tests.estimate_fixture import (
+    EPOCH,
+    NOTES,
+    make_mission,
+    make_run,
+    with_current,
+    with_faults,
+)
 
 TRAJECTORY_HEADER = (
     "time_s,lat_deg,lon_deg,height_m,vel_east_m_per_s,vel_north_m_per_s,vel_up_m_per_s,"
@@ -34,7 +41,7 @@ def test_names_are_the_contract(tmp_path: Path) -> None:
     estimate, _ = make_run(n=20)
     write_results(tmp_path, estimate, mission=make_mission(estimate), metrics=None, settings={})
     lines = (tmp_path / "trajectory.csv").read_text().splitlines()
-    assert lines[0] == TRAJECTORY_HEADER
+    assert lines[0] == f"{TRAJECTORY_HEADER},suspect"
     assert len(lines) == 21
     lines = (tmp_path / "beams.csv").read_text().splitlines()
     assert lines[0] == "time_s,beam,innovation_m_per_s,mahalanobis_sq,weight"
@@ -52,7 +59,7 @@ def test_a_current_has_columns_of_its_own(tmp_path: Path) -> None:
     write_results(tmp_path, estimate, mission=make_mission(estimate), metrics=None, settings={})
     header = (tmp_path / "trajectory.csv").read_text().splitlines()[0]
     columns = [f"{name}_{axis}_m_per_s" for name in NAMES for axis in ("east", "north", "up")]
-    assert header == ",".join([TRAJECTORY_HEADER, *columns])
+    assert header == ",".join([TRAJECTORY_HEADER, *columns, "suspect"])
     assert estimate.current is not None
     got = read_results(tmp_path)
     np.testing.assert_allclose(
@@ -68,6 +75,23 @@ def test_a_current_has_columns_of_its_own(tmp_path: Path) -> None:
 
 
 NAMES = ("current", "sigma_current")
+
+
+def test_who_was_off_is_told(tmp_path: Path) -> None:
+    """A row of the summary each; the trajectory is doubtful where one of them is not settled."""
+    estimate = with_faults(make_run(n=20)[0])
+    write_results(tmp_path, estimate, mission=make_mission(estimate), metrics=None, settings={})
+    got = read_results(tmp_path)
+    since = got.trajectory["time_s"] - got.trajectory["time_s"][0]
+    np.testing.assert_array_equal(got.trajectory["suspect"], (since >= 10.0) & (since <= 14.0))
+    left_out, undecided = got.summary["faults"]
+    assert left_out["sensor"] == "DVL beam 2"
+    assert left_out["treatment"] == "left_out"
+    assert not left_out["is_suspect"]
+    assert undecided["rivals"] == ["DVL, 0.20 m/s to the north"]
+    assert undecided["what"] == "3.1 m to the east"
+    assert undecided["is_suspect"]
+    assert undecided["cost_m"] == 2.5
 
 
 def test_numbers_survive(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from ssm_graph.mission.estimate import (
     Trajectory,
     path_length_m,
 )
+from ssm_graph.mission.fault import DetectedFault
 from ssm_graph.mission.mission import Mission
 
 PACKAGES: Final = ("ssm_graph", "gtsam", "numpy", "scipy")
@@ -74,6 +75,7 @@ def build_summary(
         "noise": _noise(estimate),
         **({"aids": _aids(estimate.aids)} if estimate.aids is not None else {}),
         "current": current_fields(estimate.current),
+        "faults": [fault_fields(fault) for fault in estimate.faults],
         **(metrics.summary_fields() if metrics is not None else {}),
         "settings": settings,
         "history": [
@@ -127,6 +129,23 @@ def calibration_fields(calibration: Calibration | None) -> dict[str, Any]:
             "determined": value.determined.name.lower(),
         }
         for value in calibration.values
+    }
+
+
+def fault_fields(fault: DetectedFault) -> dict[str, Any]:
+    """Return which sensor was off, when, how, and what became of it."""
+    return {
+        "sensor": fault.sensor,
+        "what": fault.what,
+        "begin_s": fault.begin_s,
+        "end_s": fault.end_s,
+        "chi_square": fault.chi_sq,
+        "degrees_of_freedom": fault.dof,
+        "treatment": fault.treatment.name.lower(),
+        "rivals": fault.rivals,
+        "cost_m": fault.cost_m,
+        "remedy": fault.remedy,
+        "is_suspect": fault.is_suspect,
     }
 
 

@@ -81,7 +81,9 @@ def write_results(
     summary = build_summary(estimate, mission=mission, metrics=metrics, settings=settings)
     content = {
         TRAJECTORY_NAME: format_table(
-            trajectory_columns(estimate.trajectory) | current_columns(estimate.current)
+            trajectory_columns(estimate.trajectory)
+            | current_columns(estimate.current)
+            | suspect_column(estimate)
         ),
         BEAMS_NAME: format_table(beam_columns(estimate.beams)),
     }
@@ -169,6 +171,14 @@ def current_columns(current: CurrentTrack | None) -> Columns:
         **_spread("current_{}_m_per_s", enu, current.velocity_enu, "%.7f"),
         **_spread("sigma_current_{}_m_per_s", enu, current.sigma_enu, "%.7g"),
     }
+
+
+def suspect_column(estimate: Estimate) -> Columns:
+    """Return the last column of ``trajectory.csv``: 1 where a fault makes the answer doubtful."""
+    time_s = estimate.trajectory.time_s
+    suspects = [fault for fault in estimate.faults if fault.is_suspect]
+    inside = [(fault.begin_s <= time_s) & (time_s <= fault.end_s) for fault in suspects]
+    return {"suspect": (np.any([np.zeros(len(time_s), bool), *inside], axis=0), "%.0f")}
 
 
 def beam_columns(beams: BeamTable) -> Columns:

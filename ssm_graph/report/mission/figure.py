@@ -25,6 +25,7 @@ from ssm_graph.mission.estimate import (
     Estimate,
     Trajectory,
 )
+from ssm_graph.mission.fault import DetectedFault
 from ssm_graph.mission.mission import Reference
 from ssm_graph.report import style
 from ssm_graph.report.beams import (
@@ -113,8 +114,10 @@ def draw_figure(
 
 def _further_panels(estimate: Estimate) -> list[Callable[[Axes], None]]:
     """Return what draws the panels that not every run has."""
-    current, calibration = estimate.current, estimate.calibration
+    current, calibration, faults = estimate.current, estimate.calibration, estimate.faults
     panels: list[Callable[[Axes], None]] = []
+    if faults:
+        panels.append(lambda axes: _draw_faults(axes, faults, estimate.trajectory.time_s))
     if current is not None:
         panels.append(lambda axes: style.draw_panel(axes, _current_panel(current)))
     if calibration is not None:
@@ -236,6 +239,25 @@ def _current_panel(current: CurrentTrack) -> Panel:
     title = "Current of the water, with ±3σ"
     look: dict[str, Any] = {"title": title, "x": x, "y": "current, m/s", "legend": _corner(3)}
     return Panel(bands=bands, curves=curves, **look)
+
+
+def _draw_faults(axes: Axes, faults: Sequence[DetectedFault], time_s: Array) -> None:
+    """Draw a row for each sensor that was off, a bar from when to when with what it did."""
+    divisor, x = style.time_axis(time_s)
+    sensors = list(dict.fromkeys(fault.sensor for fault in faults))
+    for fault in faults:
+        row, begin = sensors.index(fault.sensor), (fault.begin_s - time_s[0]) / divisor
+        color = style.OUTLIER if fault.is_suspect else style.REDUCED
+        width = (fault.end_s - fault.begin_s) / divisor
+        axes.barh(row, width, left=begin, height=0.7, color=color, alpha=0.75)
+        is_late = begin > 0.6 * np.ptp(time_s) / divisor
+        place = {"ha": "right", "x": begin + width} if is_late else {"ha": "left", "x": begin}
+        axes.text(y=row, s=f" {fault.what} ", va="center", fontsize=style.SMALL - 1.0, **place)
+    axes.set_yticks(np.arange(len(sensors)), sensors)
+    axes.set_ylim(len(sensors) - 0.5, -0.5)
+    axes.set_xlim(0.0, np.ptp(time_s) / divisor or 1.0)
+    title = "Sensors that were off; red where the answer may be wrong for it"
+    style.dress(axes, title=title, x=x)
 
 
 def _draw_calibration(axes: Axes, calibration: Calibration) -> None:

@@ -20,6 +20,7 @@ from ssm_graph.mission.estimate import (
     Status,
     path_length_m,
 )
+from ssm_graph.mission.fault import DetectedFault
 from ssm_graph.report.beams import n_beams_of
 
 STATUS_STYLE: Final = {
@@ -63,6 +64,8 @@ def summary_table(estimate: Estimate, metrics: Metrics | None = None) -> Rendera
         header = ("", "measurements", f"weight < {OUTLIER_WEIGHT:g}")
         counts = [(name, *map(str, count)) for name, count in estimate.aids.counts().items()]
         parts.append(_table("Further aids", counts, header=header))
+    if estimate.faults:
+        parts.append(_faults(estimate.faults))
     parts.extend(Text(f"note: {note}", style="yellow") for note in estimate.notes)
     return Group(*parts)
 
@@ -91,6 +94,30 @@ def _overview(estimate: Estimate) -> Table:
     )
     table = _table("Estimate", rows)
     table.columns[1].justify = "left"
+    return table
+
+
+def _faults(faults: Sequence[DetectedFault]) -> Table:
+    """Return who was off, when and how, red where the answer may be wrong for it."""
+    table = Table(
+        title="Sensors that were off",
+        title_justify="left",
+        title_style="bold",
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
+    )
+    for heading in ("sensor", "from - to, s", "what", "what became of it"):
+        table.add_column(heading, overflow="fold")
+    for fault in faults:
+        treatment = fault.treatment.value
+        if fault.rivals:
+            treatment += f"; or it is {' or '.join(fault.rivals)}"
+        table.add_row(
+            Text(fault.sensor, style="bold red" if fault.is_suspect else "yellow"),
+            f"{fault.begin_s:.0f} - {fault.end_s:.0f}",
+            fault.what,
+            treatment,
+        )
     return table
 
 
