@@ -182,7 +182,14 @@ def _errors(sim: SimulatedMission, estimate: Estimate) -> _Errors:
     return _Errors(rms_m, float(z.max()), inside, metrics.nees_position)
 
 
-HEADER = ("what lies", "grade", "ratio to oracle, median", "ratio, largest", "right", "said")
+HEADER: tuple[str, ...] = (
+    "what lies",
+    "grade",
+    "ratio to oracle, median",
+    "ratio, largest",
+    "right",
+    "said",
+)
 HEADER += (
     "covered",
     "any of these",
@@ -196,7 +203,13 @@ vertical, whichever is larger. Right: up to {AS_GOOD}. Said: not CONVERGED, and 
 is among those named. Covered: no error beyond {BEYOND:g} of its sigmas, and the sensor is named.
 z: largest error of a position in its own sigma.
 """
-CLEAN_HEADER = ("mission", "grade", "not CONVERGED", "sensors blamed", "missions with blame")
+CLEAN_HEADER: tuple[str, ...] = (
+    "mission",
+    "grade",
+    "not CONVERGED",
+    "sensors blamed",
+    "missions with blame",
+)
 CLEAN_HEADER += ("inside 1 sigma E/N/U, %", "inside 2 sigma, %", "inside 3 sigma, %", "NEES / 3")
 CLEAN_HEADER += ("rms with search / without", "time with search / without")
 
