@@ -29,7 +29,7 @@ from ssm_graph.graph.forward_pass import ForwardAids, ForwardExtras
 from ssm_graph.graph.inertial_rows import InertialRows
 from ssm_graph.graph.measurements import Measurements
 from ssm_graph.imu.preintegration import gravity_gradient, gtsam_gravity
-from ssm_graph.mission.problem import NO_EXTRAS, Problem, start_of
+from ssm_graph.mission.problem import Problem, start_of
 
 LOCKED_OUT_PINGS = 3
 """After so many pings in a row without one good beam the prediction is doubted instead."""
@@ -100,7 +100,7 @@ class _ForwardPass:
         self.extras = ForwardExtras(problem) if problem.extras else None
         self.P = self.extras.begin(start.covariance) if self.extras else start.covariance
         self.no_rows = _Rows(np.zeros((0, len(self.P))), np.zeros(0), np.zeros(0))
-        self.inertial = InertialRows(problem.frame, NO_EXTRAS)
+        self.inertial = InertialRows(problem.frame, problem.extras)
         self.aids = Measurements.weighted(problem)
         self.met = ForwardAids(self.aids)
         self.weights = np.ones(len(problem.beams.speed))
@@ -136,10 +136,12 @@ class _ForwardPass:
         interval = self.problem.chain.intervals.take(np.s_[k : k + 1])
         self._g_n = self._gravity(self.p_n + 0.5 * interval.span_s * self.v_n)
         here = States.of(*(column[None] for column in self._state))
+        if self.extras:
+            here = here._replace(walks=self.extras.walks[None], constants=self.extras.constants)
         ahead = self.inertial.predict(interval, here, g_n=self._g_n)
         self.P = ahead.covariance(self.P)
         if self.extras:
-            self.extras.predict(k, self.P)
+            self.extras.keep(ahead.states.walks[0], self.extras.constants)
         self.R_nb, self.p_n, self.v_n = (column[0] for column in ahead.states[:3])
 
     def _gravity(self, p_n: Array) -> Array:

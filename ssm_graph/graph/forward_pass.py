@@ -97,23 +97,11 @@ class ForwardExtras:
         extras = problem.extras
         self.walks, self.constants = np.zeros(extras.n_walks), np.zeros(extras.n_constants)
         self._beams = CalibratedBeams(problem.beams, extras, problem.frame)
-        self._walk_factor, self._walk_sigma = extras.transitions(np.diff(problem.keyframe_s))
         self._last: PreparedBeams | None = None
 
     def begin(self, covariance: Array) -> Array:
         """Return the covariance (E, E) at the start from that of the error state."""
         return self._problem.extras.behind(covariance)
-
-    def predict(self, k: int, covariance: Array) -> None:
-        """Let the walks go on from keyframe ``k``, in place."""
-        if len(self.walks) == 0:
-            return
-        factor, end = self._walk_factor[k], STATE_DIM + len(self.walks)
-        self.walks = factor * self.walks
-        covariance[STATE_DIM:end] *= factor[:, None]
-        covariance[:, STATE_DIM:end] *= factor
-        own = np.arange(STATE_DIM, end)
-        covariance[own, own] += self._walk_sigma[k] ** 2
 
     def keep(self, walks: Array, constants: Array) -> None:
         """Take the values (s,) and (C,) that a correction led to."""

@@ -12,10 +12,12 @@ import gtsam
 import numpy as np
 
 from factors import so3
+from factors.imu_errors import NONE, increment_jacobians, taken_off
 from factors.inertial import Intervals
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps, finished
+from ssm_graph.base.times import Indices
 from ssm_graph.imu.increments import MergedSamples, merge_samples_steps
 from ssm_graph.sensors.imu import ImuLog, ImuNoise
 
@@ -58,6 +60,18 @@ class Unseen(NamedTuple):
     """m/s^2"""
 
 
+class ErrorSource(NamedTuple):
+    """What intervals are made of where errors of the sensors are variables, to make them anew."""
+
+    imu: ImuLog
+    keyframe_s: Array
+    rate_hz: float
+    columns: Indices
+    """(E,) which of the 27 of :mod:`factors.imu_errors`"""
+    errors: Array
+    """(27,) that are taken off already"""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class InertialChain:
     """Preintegrated inertial data between K successive keyframes, and what they were made of."""
@@ -71,6 +85,24 @@ class InertialChain:
     """(K - 1) what is bridged in each interval"""
     bias: Array
     """(6,) about which all are preintegrated, accelerometer m/s^2, gyro rad/s"""
+    source: ErrorSource | None = None
+    """None where no errors of the sensors are variables"""
+
+    def about_steps(self, errors: Array) -> Steps[InertialChain]:
+        """Preintegrate anew with errors (27,) taken off; for a chain with a source."""
+        assert self.source is not None
+        imu, keyframe_s, rate_hz, columns, _ = self.source
+        return (
+            yield from preintegrate_steps(
+                imu,
+                keyframe_s,
+                frame=self.frame,
+                rate_hz=rate_hz,
+                bias=self.bias,
+                columns=columns,
+                errors=errors,
+            )
+        )
 
     def measured(self, g_n: Array) -> list[Preintegrated]:
         """Return GTSAM's measurements, made anew, for gravity (K - 1, 3) that stays theirs."""
@@ -122,9 +154,24 @@ def preintegrate(
 
 
 def preintegrate_steps(
-    imu: ImuLog, keyframe_s: Array, *, frame: LocalFrame, rate_hz: float, bias: Array | None = None
+    imu: ImuLog,
+    keyframe_s: Array,
+    *,
+    frame: LocalFrame,
+    rate_hz: float,
+    bias: Array | None = None,
+    columns: Indices | None = None,
+    errors: Array = NONE,
 ) -> Steps[InertialChain]:
-    """Make :func:`preintegrate` in steps."""
+    """Make :func:`preintegrate` in steps.
+
+    ``columns`` (E,) are the errors of the sensors that are variables, none when left out;
+    ``errors`` (27,), all of them, are taken off the readings first.
+    """
+    source = None
+    if columns is not None and len(columns):
+        source = ErrorSource(imu, keyframe_s, rate_hz, columns, errors)
+        imu = without_errors(imu, errors)
     gaps = imu_gaps(imu)
     unseen = tuple(_unseen(imu, keyframe_s, gaps))
     yield 3e-4 * len(imu.time_s)
@@ -144,7 +191,48 @@ def preintegrate_steps(
         parts.append(intervals_of(measured[begin : begin + AT_ONCE], frame))
         yield 0.1 * len(parts[-1].span_s)
     intervals = Intervals.joined(parts) if parts else intervals_of([], frame)
-    return InertialChain(intervals, frame, samples, imu.noise, unseen, bias)
+    if source is not None:
+        jacobians = yield from _error_jacobians_steps(samples, errors, bias)
+        intervals = intervals._replace(
+            errors=np.tile(errors[columns], (len(jacobians), 1)),
+            delta_D_errors=jacobians[:, :, columns],
+        )
+    return InertialChain(intervals, frame, samples, imu.noise, unseen, bias, source)
+
+
+def without_errors(imu: ImuLog, errors: Array) -> ImuLog:
+    """Return the log with errors (27,) of :mod:`factors.imu_errors` taken off."""
+    if not errors.any():
+        return imu
+    gyro_b, accel_b = taken_off(errors, imu.gyro_b, imu.accel_b)
+    return replace(imu, gyro_b=gyro_b, accel_b=accel_b)
+
+
+def error_jacobians(samples: MergedSamples, errors: Array, bias: Array) -> Array:
+    """Return how the increments of intervals follow all errors of the sensors, (I, 9, 27).
+
+    ``errors`` (27,) are taken off the samples already, ``bias`` (6,) are those integrated about.
+    """
+    return finished(_error_jacobians_steps(samples, errors, bias))
+
+
+def _error_jacobians_steps(samples: MergedSamples, errors: Array, bias: Array) -> Steps[Array]:
+    parts = [np.zeros((0, 9, len(errors)))]
+    for begin in range(0, len(samples.first) - 1, 2 * AT_ONCE):
+        first = samples.first[begin : begin + 2 * AT_ONCE + 1]
+        own = slice(int(first[0]), int(first[-1]))
+        parts.append(
+            increment_jacobians(
+                errors,
+                dt=samples.dt[own],
+                gyro_b=samples.gyro_b[own],
+                accel_b=samples.accel_b[own],
+                first=first - first[0],
+                bias=bias,
+            )
+        )
+        yield 0.05 * len(parts[-1])
+    return np.concatenate(parts)
 
 
 def _integrate_steps(

@@ -19,6 +19,7 @@ from ssm_graph.base.frozen import Array, FrozenArrays, Vector, shaped
 from ssm_graph.base.settings import FILE_KEY, Key, Settings, optional_key, sigma_key
 from ssm_graph.base.tables import Table
 from ssm_graph.base.units import DEG_PER_H, DEGREE, MICRO_G, PER_SQRT_H
+from ssm_graph.sensors.imu_calibration import CALIBRATED, ImuCalibration, calibration_keys
 from ssm_graph.sensors.instrument import XYZ, Column, Instrument, Lists
 from ssm_graph.sensors.messages import Message
 
@@ -57,6 +58,19 @@ class ImuLog(FrozenArrays):
     """(N, 3) body rate relative to inertial space, rad/s."""
     accel_b: Array = shaped("N", 3)
     """(N, 3) specific force, m/s^2; at rest (0, 0, -9.8)."""
+    calibration: ImuCalibration = ImuCalibration()
+
+    @property
+    def calibrated(self) -> ImuLog:
+        """The log with what is known of scale, misalignment and g-sensitivity taken off.
+
+        The sigmas of what is left are kept, the values are none: once more changes nothing.
+        """
+        known = self.calibration
+        if not known.is_stated:
+            return self
+        gyro_b, accel_b = known.taken_off(self.gyro_b, self.accel_b)
+        return replace(self, gyro_b=gyro_b, accel_b=accel_b, calibration=known.exact())
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,6 +151,7 @@ _KEYS: Final = {
     "accel_bias_walk_ug_per_sqrt_h": optional_key(
         "noise.accel_bias_density", 0.0, 1e7, _WALK, unit=MICRO_G * PER_SQRT_H
     ),
+    **calibration_keys("calibration"),
 }
 
 
@@ -182,10 +197,19 @@ class _Imu(Instrument):
         return ImuSample(time_s, (gx, gy, gz), (ax, ay, az))
 
     def log_of(self, rows: Array, bare: ImuLog) -> ImuLog:
-        return ImuLog(bare.start_s, bare.noise, rows[:, 0], rows[:, 1:4], rows[:, 4:7])
+        return replace(bare, time_s=rows[:, 0], gyro_b=rows[:, 1:4], accel_b=rows[:, 4:7])
 
 
-IMU: Final = _Imu("imu", ImuLog, _KEYS, (_GYRO, _ACCEL), ImuSample, "i", is_required=True)
+IMU: Final = _Imu(
+    "imu",
+    ImuLog,
+    _KEYS,
+    (_GYRO, _ACCEL),
+    ImuSample,
+    "i",
+    calibrated=CALIBRATED,
+    is_required=True,
+)
 
 
 def interval_ends(time_s: Array, stamp: Stamp) -> tuple[float, Array]:

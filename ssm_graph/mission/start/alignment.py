@@ -12,7 +12,7 @@ its turning gives heading, if the gyros sense the Earth.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -76,6 +76,7 @@ def align_steps(mission: Mission) -> Steps[Alignment]:
         If no inertial data follow the first fix.
     """
     require_usable(mission)
+    mission = replace(mission, imu=mission.imu.calibrated)
     velocities = body_velocities(mission)
     yield 0.03 * len(velocities.time_s)
     fixes = start_fixes(mission, velocities)
