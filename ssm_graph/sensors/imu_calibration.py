@@ -75,7 +75,8 @@ class ImuCalibration(FrozenArrays):
 
     def exact(self) -> ImuCalibration:
         """Return what is asked for of sensors whose known errors are taken off."""
-        return replace(self, **dict.fromkeys(VALUES)) if self.is_stated else self
+        none: dict[str, Any] = dict.fromkeys(VALUES)
+        return replace(self, **none) if self.is_stated else self
 
     def taken_off(self, gyro_b: Array, accel_b: Array) -> tuple[Array, Array]:
         """Return readings (N, 3) of gyros and accelerometers without what is known."""
@@ -85,7 +86,7 @@ class ImuCalibration(FrozenArrays):
         S_a = _matrix(self.accel_scale_error, self.accel_misalignment)
         force = np.linalg.solve(np.eye(3) + S_a, accel_b.T)
         rate = np.linalg.solve(np.eye(3) + S_g, gyro_b.T - _matrix(self.gyro_g_sensitivity) @ force)
-        return rate.T, force.T
+        return np.asarray(rate.T), np.asarray(force.T)
 
 
 def _matrix(*parts: Array | None) -> Array:
