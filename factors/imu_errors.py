@@ -5,9 +5,9 @@ An error is a share of what is *read*, so that it acts on each sample as a bias 
     rate  = gyro  - W gyro  - G accel - gyro_bias
     force = accel - A accel           - accel_bias
 
-For people they are a share of what is true, ``gyro = (I + S_g) rate + S_f force + bias`` and
-``accel = (I + S_a) force + bias``: the same but for the square of the error, see :func:`stated`.
-The columns of all are, row by row, those of ``W``, ``A`` and ``G``.
+As variables, and for people, they are a share of what is true, ``gyro = (I + S_g) rate + S_f force
++ bias`` and ``accel = (I + S_a) force + bias``: the same but for the square of the error, see
+:func:`of_readings`. The columns of all are, row by row, those of ``W``, ``A`` and ``G``.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Final
 
 import numpy as np
 
-from factors.so3 import Array, skew
+from factors.so3 import Array, skew, times
 
 SIZE: Final = 27
 GYRO: Final = slice(0, 9)
@@ -52,23 +52,63 @@ def put_on(errors: Array, gyro_b: Array, accel_b: Array) -> tuple[Array, Array]:
     return (gyro_b + accel @ G.T) @ np.linalg.inv(np.eye(3) - W).T, accel
 
 
-def stated(errors: Array) -> tuple[Array, Array]:
-    """Return errors (27,) of what is read as such of what is true, and the slope (27, 27).
+def of_readings(stated: Array) -> tuple[Array, Array]:
+    """Return errors (..., 27) of what is read from those of what is true, and the slope.
 
-    ``I + S_g = (I - W)^-1``, ``I + S_a = (I - A)^-1``, ``S_f = (I + S_g) G (I + S_a)``. The inverse
-    is the same but for signs: ``-stated(-errors)``.
+    ``stated`` (..., 27) are ``S_g``, ``S_a`` and ``S_f``: ``W = I - (I + S_g)^-1``,
+    ``A = I - (I + S_a)^-1``, ``G = (I + S_g)^-1 S_f (I + S_a)^-1``. The slope is (..., 27, 27).
     """
-    W, A, G = matrices(errors)
-    gyro, accel = np.linalg.inv(np.eye(3) - W), np.linalg.inv(np.eye(3) - A)
-    by_force = gyro @ G @ accel
-    slope = np.zeros((SIZE, SIZE))
-    # Row by row, the derivative of X M Y is that of Kronecker.
-    slope[GYRO, GYRO], slope[ACCEL, ACCEL] = np.kron(gyro, gyro.T), np.kron(accel, accel.T)
-    slope[BY_FORCE, GYRO] = np.kron(gyro, by_force.T)
-    slope[BY_FORCE, ACCEL] = np.kron(by_force, accel.T)
-    slope[BY_FORCE, BY_FORCE] = np.kron(gyro, accel.T)
-    parts = gyro - np.eye(3), accel - np.eye(3), by_force
-    return np.concatenate([part.ravel() for part in parts]), slope
+    S_g, S_a, S_f = matrices(stated)
+    eye = np.eye(3)
+    gyro, accel = np.linalg.inv(eye + S_g), np.linalg.inv(eye + S_a)
+    by_force = gyro @ S_f @ accel
+    slope = np.zeros((*stated.shape, SIZE))
+    slope[..., GYRO, GYRO], slope[..., ACCEL, ACCEL] = _around(gyro, gyro), _around(accel, accel)
+    slope[..., BY_FORCE, GYRO] = -_around(gyro, by_force)
+    slope[..., BY_FORCE, ACCEL] = -_around(by_force, accel)
+    slope[..., BY_FORCE, BY_FORCE] = _around(gyro, accel)
+    parts = (part.reshape(*stated.shape[:-1], 9) for part in (eye - gyro, eye - accel, by_force))
+    return np.concatenate([*parts], axis=-1), slope
+
+
+def _around(left: Array, right: Array) -> Array:
+    """Return the derivative (..., 9, 9) of ``left M right`` by ``M``, row by row."""
+    product = np.einsum("...ij,...kl->...iljk", left, right)
+    return np.asarray(product.reshape(*left.shape[:-2], 9, 9))
+
+
+def noise_scale(errors: Array) -> Array:
+    """Return what becomes of the noise of increments, (..., 15, 15), once errors are taken off.
+
+    Of rotation by ``I - W``, of position and velocity by ``I - A``; biases are those of what is
+    left. The turn within an interval is not looked at: it matters where axes differ by much.
+    """
+    W, A, _ = matrices(errors)
+    scale = np.zeros((*errors.shape[:-1], 15, 15))
+    scale[...] = np.eye(15)
+    scale[..., :3, :3] -= W
+    scale[..., 3:6, 3:6] -= A
+    scale[..., 6:9, 6:9] -= A
+    return scale
+
+
+def by_noise_scale(errors: Array, error: Array) -> Array:
+    """Return how errors (I, 3, 3) of increments follow through the noise that they are counted in.
+
+    Whitened by the inverse of :func:`noise_scale`, ``T(x) e`` has the slope ``T (e' + E T e)`` with
+    ``E`` that of ``W`` or ``A``: this is the second part, (I, 3, 3, 27).
+    """
+    W, A, _ = matrices(errors)
+    eye = np.eye(3)
+    turn, force = np.linalg.inv(eye - W), np.linalg.inv(eye - A)
+    made = np.zeros((*error.shape, SIZE))
+    turned = times(turn, error[:, 0])
+    pushed = error[:, 1:] @ force.mT
+    for i in range(3):
+        own = 3 * i + np.arange(3)
+        made[:, 0, i, GYRO.start + own] = turned
+        made[:, 1:, i, ACCEL.start + own] = pushed
+    return made
 
 
 def increment_jacobians(

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import so3
+from factors.imu_errors import by_noise_scale, noise_scale
 from factors.so3 import Array
 
 _ROTATION, _POSITION, _VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
@@ -95,8 +96,8 @@ class Intervals(NamedTuple):
     by_gravity: Array
     """(I, 6, 3) the same from gravity"""
     errors: Array
-    """(I, E) errors of the sensors, see :mod:`factors.imu_errors`, that are taken off already, of
-    those that are variables; E is zero where none is"""
+    """(I, E) errors of the sensors, see :mod:`factors.imu_errors`, that are taken off already; E is
+    27, or zero where none of them is a variable"""
     delta_D_errors: Array
     """(I, 9, E) how the increment follows them, as it does the biases"""
 
@@ -162,16 +163,29 @@ class Intervals(NamedTuple):
         return Intervals(*(column[which] for column in self))
 
     def without_errors(self, errors: Array) -> Intervals:
-        """Return the same with other errors (E,) or (I, E) taken off, as if they were known."""
+        """Return the same with errors (27,) or (I, 27) taken off, as if they were known."""
         if self.errors.shape[1] == 0:
             return self
         moved = _corrected(self, self.bias, errors, derivative=False)
-        return self._replace(
+        return self.as_noisy_as(errors)._replace(
             delta_R=moved.R,
             delta_pv=moved.pv,
             errors=self.errors[:, :0],
             delta_D_errors=self.delta_D_errors[:, :, :0],
         )
+
+    def as_noisy_as(self, errors: Array | None) -> Intervals:
+        """Return the same with the noise that is left where errors (27,) or (I, 27) are taken off.
+
+        White noise is that of readings: of ``(I - W) gyro`` it is ``I - W`` times as much. Were it
+        not, a scale that makes the readings vanish would explain them best.
+        """
+        if errors is None or self.errors.shape[1] == 0:
+            return self
+        scale = noise_scale(errors)
+        grown = scale @ self.covariance @ scale.mT
+        root = self.root_information @ np.linalg.inv(scale)
+        return self._replace(covariance=grown, root_information=root)
 
     @staticmethod
     def joined(parts: Sequence[Intervals]) -> Intervals:
@@ -261,7 +275,8 @@ def predict(
     gradient : (3, 3) 1/s^2, how gravity changes with position. It is that of the middle between
         both ends, so the transition knows of half the change at either; the state itself takes
         ``g_n`` as it is.
-    errors : (I, E) or (E,) of the sensors; those that are taken off already when left out.
+    errors : (I, 27) or (27,) of the sensors, where ``m`` follows them; those that are taken off
+        already when left out.
     """
     increment = _corrected(m, begin.bias, errors, derivative=True)
     end = _predicted(m, begin, increment, g_n)
@@ -289,6 +304,7 @@ def whitened_error(
     errors: Array | None = None,
 ) -> Array:
     """Return the whitened errors (I, 15) of states at both ends, parameters of :func:`predict`."""
+    m = m.as_noisy_as(errors)
     predicted = _predicted(m, begin, _corrected(m, begin.bias, errors, derivative=False), g_n)
     R, pv = _between(end, predicted)
     phi = so3.log(R)
@@ -333,6 +349,7 @@ def _fill_rows(
     gradient: Array,
     errors: Array,
 ) -> None:
+    m = m.as_noisy_as(errors)
     increment = _corrected(m, begin.bias, errors, derivative=True)
     predicted = _predicted(m, begin, increment, g_n)
     slopes = _slopes(m, begin, end, increment, gradient)
@@ -355,6 +372,8 @@ def _fill_rows(
     error[:, 1:, :, n + 3 : n + 6] = from_nav @ slopes.gravity
     error[:, 1, :, n + 3 : n + 6] -= from_left
     error[:, 2, :, n + 6 : n + 9] = -from_nav[:, 0]
+    if n > 15:
+        error[..., 15:n] += by_noise_scale(errors, np.concatenate([phi[:, None], tangent], axis=1))
     error[:, 0, :, -1] = -phi
     error[:, 1:, :, -1] = -tangent
     root = m.root_information

@@ -40,7 +40,7 @@ from ssm_graph.mission.calibration import (
     DVL_SCALE,
     DVL_TIME_OFFSET,
 )
-from ssm_graph.mission.imu_variables import columns_of_errors, imu_columns, imu_errors
+from ssm_graph.mission.imu_variables import columns_of_errors, imu_errors
 from ssm_graph.mission.problem import Beams
 
 LEAST_SHARE = 0.5
@@ -128,8 +128,10 @@ class PreparedBeams(NamedTuple):
     time_offset: Array
     bias: Array | None
     """(6,) of all pings; None where each has that of its keyframe"""
-    errors: Array
-    """(27,) of the inertial sensors, see :mod:`factors.imu_errors`"""
+    errors: tuple[Array, Array]
+    """Of the inertial sensors, see :func:`ssm_graph.mission.imu_variables.imu_errors`"""
+    constants: Array
+    """(C,)"""
     read: Motion | None
     """(P, ...) what these read, as it is; None as ``back``"""
 
@@ -141,7 +143,7 @@ class CalibratedBeams:
         self._beams, self._extras, self._omega_ie_n = beams, extras, frame.omega_ie_n
         self._water = WaterRows(beams, extras, frame)
         self._ping_keyframe = beams.keyframe[np.flatnonzero(np.diff(beams.ping, prepend=-1))]
-        self._errors, self._columns = imu_columns(extras), columns_of_errors(extras)
+        self._columns = columns_of_errors(extras)
         self._share = {DVL_TIME_OFFSET: 1.0, DVL_LEVER_ARM: 1.0}
 
     def judge(self, at: RowStates, bias: Array) -> None:
@@ -184,12 +186,12 @@ class CalibratedBeams:
         if DVL_TIME_OFFSET in extras and motion is not None:
             of_ping = bias if bias.ndim == 1 else bias[self._ping_keyframe]
             read = motion.at(float(late_s))
-            back = led_back(_taken_off(errors, read), of_ping, late_s)
+            back = led_back(_taken_off(errors[0], read), of_ping, late_s)
         instrument = turned_instrument(
             mounting, beams.beam_b, R_bd=beams.R_bd, lever_arm_b=beams.lever_arm_b
         )
         of_all = bias if bias.ndim == 1 else None
-        return PreparedBeams(instrument, back, mounting, late_s, of_all, errors, read)
+        return PreparedBeams(instrument, back, mounting, late_s, of_all, errors, constants, read)
 
     def instrument_of(self, walks: Array, constants: Array) -> tuple[Array, Array]:
         """Return mounting (3,) and time offset (): what it takes long to prepare for.
@@ -228,7 +230,7 @@ class CalibratedBeams:
         if through is not None:
             self._water.fill(jacobian, residual.error_D_velocity_n, through)
         if len(self._columns):
-            jacobian[:, self._columns] = self._by_errors(residual, prepared, rows)
+            jacobian[:, self._columns] = self._by_errors(residual, at, prepared, rows)
         error = residual.error
         if DVL_DRIFT in extras:
             # In instrument axes, and on top of what is read: no scale, no lever arm.
@@ -252,7 +254,8 @@ class CalibratedBeams:
         if prepared.back is None:
             gyro_b = beams.gyro_b[rows]
             if len(self._columns):
-                gyro_b = gyro_b - times(matrices(self._errors_at(at, prepared))[0], gyro_b)
+                errors, _ = self._errors_at(at, prepared)
+                gyro_b = gyro_b - times(matrices(errors)[0], gyro_b)
             back = no_way_back(gyro_b)
         else:
             back = _of_pings(prepared.back, beams.ping[rows])
@@ -272,16 +275,16 @@ class CalibratedBeams:
             g_n=at.g_n,
         )
 
-    def _errors_at(self, at: RowStates, prepared: PreparedBeams) -> Array:
-        """Return the errors of the inertial sensors, (M, 27) or (27,)."""
+    def _errors_at(self, at: RowStates, prepared: PreparedBeams) -> tuple[Array, Array]:
+        """Return the errors of the inertial sensors, (M, 27) or (27,), and their slope."""
         if prepared.bias is not None:
             return prepared.errors
         return imu_errors(self._extras, at.walks, at.constants)
 
     def _by_errors(
-        self, residual: CalibratedResidual, prepared: PreparedBeams, rows: slice
+        self, residual: CalibratedResidual, at: RowStates, prepared: PreparedBeams, rows: slice
     ) -> Array:
-        """Return derivatives (M, E) to errors of the inertial sensors: biases that are known.
+        """Return derivatives (M, E) by errors of the inertial sensors: biases that are known.
 
         What gyros read of the force, 1e-5 m/s at a lever arm of 1 m, is left out.
         """
@@ -293,15 +296,16 @@ class CalibratedBeams:
             block = residual.error_D_accel_bias[..., None] * accel_b[:, None]
             found[:, ACCEL] = block.reshape(n_rows, 9)
         found[:, GYRO] = (residual.error_D_gyro_bias[..., None] * gyro_b[:, None]).reshape(-1, 9)
-        return found[:, self._errors]
+        _, slope = self._errors_at(at, prepared)
+        return np.asarray((found[:, None] @ slope)[:, 0])
 
     def _since(self, at: RowStates, prepared: PreparedBeams) -> Array:
         """Return how far the variables (E,) are from what the beams are prepared for."""
         extras, since = self._extras, np.zeros(self._extras.width)
         assert prepared.bias is not None
         since[STATE_DIM - 6 : STATE_DIM] = at.bias - prepared.bias
-        moved_on = imu_errors(extras, at.walks, at.constants) - prepared.errors
-        since[self._columns] = moved_on[self._errors]
+        moved_on = np.concatenate([at.walks, at.constants - prepared.constants])
+        since[self._columns] = moved_on[self._columns - STATE_DIM]
         mounting, late_s = self.instrument_of(at.walks, at.constants)
         if DVL_MOUNTING in extras:
             since[extras.columns(DVL_MOUNTING)] = mounting - prepared.mounting

@@ -12,16 +12,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.imu_errors import NONE
+from factors.imu_errors import NONE, SIZE
 from factors.inertial import Intervals, Predicted, predict, whitened_error, whitened_rows
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.stepwise import finished
 from ssm_graph.engine.chain import ChainSolution
 from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.engine.extras import Extras
 from ssm_graph.engine.states import States
 from ssm_graph.imu.preintegration import (
-    error_jacobians,
     gravity_between,
     gravity_gradient,
     gtsam_gravity,
@@ -46,26 +46,27 @@ class InertialRows:
 
         Columns are those of the keyframe before, of the one after, and of C constants.
         """
-        intervals = self._seen(intervals)
+        begin, (errors, slope) = states.take(np.s_[:-1]), self._errors(states.take(np.s_[:-1]))
         pairs = whitened_rows(
-            intervals,
-            states.take(np.s_[:-1]),
+            self._seen(intervals),
+            begin,
             states.take(np.s_[1:]),
             g_n=gravity_between(self._frame, states.p_n),
             gradient=self._gradient,
-            errors=self._errors(intervals, states.take(np.s_[:-1])),
+            errors=errors,
         )
+        pairs = _by_variables(pairs, slope, from_column=2 * STATE_DIM)
         return self._with_walks(pairs, intervals, states.walks)
 
     def errors(self, intervals: Intervals, states: States) -> Array:
         """Return the whitened errors (I, n) of inertial data, then of the walks."""
-        intervals = self._seen(intervals)
+        begin = states.take(np.s_[:-1])
         inertial = whitened_error(
-            intervals,
-            states.take(np.s_[:-1]),
+            self._seen(intervals),
+            begin,
             states.take(np.s_[1:]),
             g_n=gravity_between(self._frame, states.p_n),
-            errors=self._errors(intervals, states.take(np.s_[:-1])),
+            errors=self._errors(begin)[0],
         )
         if self._extras.n_walks == 0:
             return inertial
@@ -78,31 +79,27 @@ class InertialRows:
 
         ``g_n`` (3,) is gravity between them, m/s^2; that of the frame when left out.
         """
-        interval = self._seen(interval)
+        interval, (errors, slope) = self._seen(interval), self._errors(last)
         if g_n is None:
             g_n = gtsam_gravity(self._frame, last.p_n[0] + 0.5 * interval.span_s * last.v_n[0])
-        moved = predict(
-            interval,
-            last,
-            g_n=g_n[None],
-            gradient=self._gradient,
-            errors=self._errors(interval, last),
-        )
+        moved = predict(interval, last, g_n=g_n[None], gradient=self._gradient, errors=errors)
+        transition = _by_variables(moved.transition, slope, from_column=STATE_DIM)
+        moved = moved._replace(transition=transition)
         walks = last.walks
         if self._extras.n_walks:
             walks = walks * self._extras.transitions(interval.span_s)[0]
-        return Ahead(States(*moved.state, walks, last.constants), interval, moved, self)
+        ahead = States(*moved.state, walks, last.constants)
+        return Ahead(ahead, interval.as_noisy_as(errors), moved, self)
 
     def _seen(self, intervals: Intervals) -> Intervals:
         """Return intervals without columns of errors that are no variables here."""
         return intervals if len(self._own) else intervals.without_errors(intervals.errors)
 
-    def _errors(self, intervals: Intervals, begin: States) -> Array | None:
-        """Return the errors of the sensors (I, E) in intervals; None where they are none's."""
-        if intervals.errors.shape[1] == 0:
-            return None
-        constants = np.broadcast_to(begin.constants, (len(begin.p_n), len(begin.constants)))
-        return np.hstack([begin.walks, constants])[:, self._own - STATE_DIM]
+    def _errors(self, begin: States) -> tuple[Array | None, Array | None]:
+        """Return errors of what is read (I, 27), or (27,) of all, and their slope; None if none."""
+        if len(self._own) == 0:
+            return None, None
+        return imu_errors(self._extras, begin.walks, begin.constants)
 
     def _with_walks(self, pairs: Array, intervals: Intervals, walks: Array) -> Array:
         """Return inertial rows (I, 15, 31 + E) with columns and rows of the walks (I + 1, s)."""
@@ -121,6 +118,15 @@ class InertialRows:
         wide[:, own, own], wide[:, own, n + own] = -factor / sigma, 1.0 / sigma
         wide[:, own, -1] = (factor * walks[:-1] - walks[1:]) / sigma
         return wide
+
+
+def _by_variables(rows: Array, slope: Array | None, *, from_column: int) -> Array:
+    """Return rows (I, r, c) with columns of the variables in the place of those of 27 errors."""
+    if slope is None or rows.shape[2] == from_column:
+        return rows
+    end = from_column + SIZE
+    parts = rows[:, :, :from_column], rows[:, :, from_column:end] @ slope, rows[:, :, end:]
+    return np.concatenate(parts, axis=2)
 
 
 class Ahead(NamedTuple):
@@ -165,19 +171,16 @@ def imu_error_columns(problem: Problem, states: States) -> Array:
     They are those of :mod:`factors.imu_errors`, in its order, at the states (K, ...) and at the
     values that they have there; whether or not they are variables of the problem.
     """
-    chain = problem.chain
-    taken = NONE if chain.source is None else chain.source.errors
-    intervals = chain.intervals._replace(
-        errors=np.tile(taken, (len(states.p_n) - 1, 1)),
-        delta_D_errors=error_jacobians(chain.samples, taken, chain.bias),
-    )
+    chain, intervals = problem.chain, problem.chain.intervals
+    if chain.source is None:
+        intervals = finished(following_errors_steps(intervals, chain.samples, NONE, chain.bias))
     rows = whitened_rows(
         intervals,
         states.take(np.s_[:-1]),
         states.take(np.s_[1:]),
         g_n=gravity_between(problem.frame, states.p_n),
         gradient=gravity_gradient(problem.frame),
-        errors=imu_errors(problem.extras, states.walks[:-1], states.constants),
+        errors=imu_errors(problem.extras, states.walks[:-1], states.constants)[0],
     )
     return rows[:, :, 2 * STATE_DIM : -1]
 

@@ -24,7 +24,7 @@ from ssm_graph.graph.beam_rows import BeamRows, CalibratedBeams
 from ssm_graph.graph.inertial_rows import InertialRows
 from ssm_graph.graph.measurements import Measurements, states_at
 from ssm_graph.mission.calibration import needs_motion
-from ssm_graph.mission.imu_variables import imu_columns, imu_errors
+from ssm_graph.mission.imu_variables import imu_errors
 from ssm_graph.mission.problem import Problem, start_of
 
 JUDGED_PASSES = 2
@@ -77,15 +77,15 @@ class GraphLinearizer:
         source = self._chain.source
         if source is None:
             return
-        errors = imu_errors(self.problem.extras, states.walks[0], states.constants)
+        errors, _ = imu_errors(self.problem.extras, states.walks[0], states.constants)
         if np.abs(errors - source.errors).max() > ERRORS_REACH:
             self._chain = yield from self._chain.about_steps(errors)
             self.intervals = self._chain.intervals
 
     def intervals_at(self, states: States) -> Intervals:
         """Return the inertial data without the errors that the states say the sensors have."""
-        errors = imu_errors(self.problem.extras, states.walks[0], states.constants)
-        return self.intervals.without_errors(errors[imu_columns(self.problem.extras)])
+        errors, _ = imu_errors(self.problem.extras, states.walks[0], states.constants)
+        return self.intervals.without_errors(errors)
 
     def beam_rows(self, states: States) -> BeamRows:
         """Linearise all beams at ``states``."""

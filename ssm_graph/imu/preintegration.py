@@ -12,12 +12,11 @@ import gtsam
 import numpy as np
 
 from factors import so3
-from factors.imu_errors import NONE, increment_jacobians, taken_off
+from factors.imu_errors import increment_jacobians, taken_off
 from factors.inertial import Intervals
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps, finished
-from ssm_graph.base.times import Indices
 from ssm_graph.imu.increments import MergedSamples, merge_samples_steps
 from ssm_graph.sensors.imu import ImuLog, ImuNoise
 
@@ -66,10 +65,8 @@ class ErrorSource(NamedTuple):
     imu: ImuLog
     keyframe_s: Array
     rate_hz: float
-    columns: Indices
-    """(E,) which of the 27 of :mod:`factors.imu_errors`"""
     errors: Array
-    """(27,) that are taken off already"""
+    """(27,) that are taken off already, see :mod:`factors.imu_errors`"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,7 +88,7 @@ class InertialChain:
     def about_steps(self, errors: Array) -> Steps[InertialChain]:
         """Preintegrate anew with errors (27,) taken off; for a chain with a source."""
         assert self.source is not None
-        imu, keyframe_s, rate_hz, columns, _ = self.source
+        imu, keyframe_s, rate_hz, _ = self.source
         return (
             yield from preintegrate_steps(
                 imu,
@@ -99,7 +96,6 @@ class InertialChain:
                 frame=self.frame,
                 rate_hz=rate_hz,
                 bias=self.bias,
-                columns=columns,
                 errors=errors,
             )
         )
@@ -160,17 +156,16 @@ def preintegrate_steps(
     frame: LocalFrame,
     rate_hz: float,
     bias: Array | None = None,
-    columns: Indices | None = None,
-    errors: Array = NONE,
+    errors: Array | None = None,
 ) -> Steps[InertialChain]:
     """Make :func:`preintegrate` in steps.
 
-    ``columns`` (E,) are the errors of the sensors that are variables, none when left out;
-    ``errors`` (27,), all of them, are taken off the readings first.
+    Where ``errors`` (27,) are given, they are taken off the readings first, and the increments
+    follow them, see :mod:`factors.imu_errors`.
     """
     source = None
-    if columns is not None and len(columns):
-        source = ErrorSource(imu, keyframe_s, rate_hz, columns, errors)
+    if errors is not None:
+        source = ErrorSource(imu, keyframe_s, rate_hz, errors)
         imu = without_errors(imu, errors)
     gaps = imu_gaps(imu)
     unseen = tuple(_unseen(imu, keyframe_s, gaps))
@@ -191,12 +186,8 @@ def preintegrate_steps(
         parts.append(intervals_of(measured[begin : begin + AT_ONCE], frame))
         yield 0.1 * len(parts[-1].span_s)
     intervals = Intervals.joined(parts) if parts else intervals_of([], frame)
-    if source is not None:
-        jacobians = yield from _error_jacobians_steps(samples, errors, bias)
-        intervals = intervals._replace(
-            errors=np.tile(errors[columns], (len(jacobians), 1)),
-            delta_D_errors=jacobians[:, :, columns],
-        )
+    if errors is not None:
+        intervals = yield from following_errors_steps(intervals, samples, errors, bias)
     return InertialChain(intervals, frame, samples, imu.noise, unseen, bias, source)
 
 
@@ -208,15 +199,13 @@ def without_errors(imu: ImuLog, errors: Array) -> ImuLog:
     return replace(imu, gyro_b=gyro_b, accel_b=accel_b)
 
 
-def error_jacobians(samples: MergedSamples, errors: Array, bias: Array) -> Array:
-    """Return how the increments of intervals follow all errors of the sensors, (I, 9, 27).
+def following_errors_steps(
+    intervals: Intervals, samples: MergedSamples, errors: Array, bias: Array
+) -> Steps[Intervals]:
+    """Return intervals that follow the errors of the sensors, made of these samples.
 
     ``errors`` (27,) are taken off the samples already, ``bias`` (6,) are those integrated about.
     """
-    return finished(_error_jacobians_steps(samples, errors, bias))
-
-
-def _error_jacobians_steps(samples: MergedSamples, errors: Array, bias: Array) -> Steps[Array]:
     parts = [np.zeros((0, 9, len(errors)))]
     for begin in range(0, len(samples.first) - 1, 2 * AT_ONCE):
         first = samples.first[begin : begin + 2 * AT_ONCE + 1]
@@ -231,8 +220,10 @@ def _error_jacobians_steps(samples: MergedSamples, errors: Array, bias: Array) -
                 bias=bias,
             )
         )
-        yield 0.05 * len(parts[-1])
-    return np.concatenate(parts)
+        yield 0.1 * len(parts[-1])
+    jacobians = np.concatenate(parts)
+    taken = np.tile(errors, (len(jacobians), 1))
+    return intervals._replace(errors=taken, delta_D_errors=jacobians)
 
 
 def _integrate_steps(

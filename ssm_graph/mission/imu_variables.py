@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.imu_errors import ACCEL, BY_FORCE, GYRO, SIZE, stated
+from factors.imu_errors import ACCEL, BY_FORCE, GYRO, SIZE, of_readings
 from ssm_graph.base.frames import MATRIX_PLACES
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import STATE_DIM
@@ -48,32 +48,18 @@ def columns_of_errors(extras: Extras) -> NDArray[np.intp]:
     return np.concatenate([np.zeros(0, np.intp), *own])
 
 
-def imu_errors(extras: Extras, walks: Array, constants: Array) -> Array:
-    """Return all errors of the sensors (..., 27), zero where they are no variables.
+def imu_errors(extras: Extras, walks: Array, constants: Array) -> tuple[Array, Array]:
+    """Return all errors of what the sensors read (..., 27), and how they follow the variables.
 
-    ``walks`` are (..., s) of the keyframes asked for, ``constants`` (C,).
+    The slope is (..., 27, E). A variable is the error as it is stated, a share of what is true; see
+    :mod:`factors.imu_errors`. ``walks`` are (..., s) of the keyframes asked for, ``constants``
+    (C,); of constants alone both are those of all keyframes, without the axes before.
     """
-    own = columns_of_errors(extras) - STATE_DIM
-    values = np.concatenate(
-        [walks, np.broadcast_to(constants, (*walks.shape[:-1], len(constants)))], axis=-1
-    )
-    errors = np.zeros((*walks.shape[:-1], SIZE))
-    errors[..., imu_columns(extras)] = values[..., own]
-    return errors
-
-
-def shown_errors(extras: Extras, values: Array) -> tuple[Array, Array]:
-    """Return the values (s + C,) of all variables as people state them, and the slope of that.
-
-    The errors of the inertial sensors are a share of what is read; stated is that of what is true.
-    """
-    place, own = imu_columns(extras), columns_of_errors(extras) - STATE_DIM
-    slope = np.eye(len(values))
-    if len(own) == 0:
-        return values, slope
-    errors = np.zeros(SIZE)
-    errors[place] = values[own]
-    found, derivative = stated(errors)
-    shown = values.copy()
-    shown[own], slope[np.ix_(own, own)] = found[place], derivative[np.ix_(place, place)]
-    return shown, slope
+    own, which = columns_of_errors(extras) - STATE_DIM, imu_columns(extras)
+    if not np.any(own < extras.n_walks):
+        walks = np.zeros(extras.n_walks)
+    stated = np.zeros((*walks.shape[:-1], SIZE))
+    constants = np.broadcast_to(constants, (*walks.shape[:-1], len(constants)))
+    stated[..., which] = np.concatenate([walks, constants], axis=-1)[..., own]
+    errors, slope = of_readings(stated)
+    return errors, slope[..., which]

@@ -8,6 +8,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.imu_errors import NONE
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frames import R_lb_from_roll_pitch_heading, phi_D_roll_pitch_heading
@@ -172,7 +173,7 @@ def build_problem_steps(
         timeline.keyframe_s,
         frame=mission.frame,
         rate_hz=config.merge_rate_hz,
-        columns=imu_columns(extras),
+        errors=NONE if len(imu_columns(extras)) else None,
     )
     noise, depth = mission.imu.noise, mission.depth
     keyframes = Keyframes(mission.frame, mission.imu, timeline.keyframe_s, begin_s)

@@ -16,7 +16,6 @@ from ssm_graph.graph.aids.aid import Aid
 from ssm_graph.graph.measurements import JudgedAid, joined_aids
 from ssm_graph.mission.calibration import CURRENT, CURRENT_UP
 from ssm_graph.mission.estimate import CalibratedValue, Calibration, CurrentTrack, Determined
-from ssm_graph.mission.imu_variables import shown_errors
 
 
 class Stretch(NamedTuple):
@@ -93,8 +92,7 @@ def calibration_of(
     covariance : (E, E) of the walks at the last keyframe and of the constants.
     span_s : from the first keyframe to the last, s.
     """
-    found, slope = shown_errors(extras, np.concatenate([walks[-1], constants]))
-    covariance = slope @ covariance @ slope.T
+    found = np.concatenate([walks[-1], constants])
     prior = _prior_sigma_at_end(extras, span_s)
     values, kept = [], []
     for block in extras.blocks:
