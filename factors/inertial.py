@@ -112,12 +112,11 @@ class Intervals(NamedTuple):
         covariance: Array,
         *,
         omega_ie_n: Array,
-        errors: Array | None = None,
-        delta_D_errors: Array | None = None,
     ) -> Self:
-        """Return intervals from what is measured, see there, and the turn of the Earth (3,)."""
-        if errors is None or delta_D_errors is None:
-            errors, delta_D_errors = np.zeros((len(span_s), 0)), np.zeros((len(span_s), 9, 0))
+        """Return intervals from what is measured, see there, and the turn of the Earth (3,).
+
+        They do not follow errors of the sensors.
+        """
         turn = span_s[:, None] * omega_ie_n
         Omega, t = so3.skew(omega_ie_n), span_s[:, None, None]
         E = so3.exp(-turn)
@@ -151,8 +150,8 @@ class Intervals(NamedTuple):
             along,
             by_force,
             np.concatenate([p_D_g, v_D_g], axis=1),
-            errors,
-            delta_D_errors,
+            np.zeros((len(span_s), 0)),
+            np.zeros((len(span_s), 9, 0)),
         )
         for column in made:
             column.setflags(write=False)

@@ -22,6 +22,7 @@ from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.engine.extras import Extras
 from ssm_graph.engine.states import States
 from ssm_graph.imu.preintegration import (
+    following_errors_steps,
     gravity_between,
     gravity_gradient,
     gtsam_gravity,
