@@ -201,27 +201,35 @@ def test_graph_rows_follow_the_variables(with_clock: bool) -> None:
     own = columns_of_errors(problem.extras) - STATE_DIM
     assert len(own) == SIZE
     linearizer = GraphLinearizer(problem)
-    rows, beams = linearizer.inertial_rows(states), linearizer.beam_rows(states)
+    found: dict[str, list[Array]] = {"inertial": [], "beams": []}
     for column in own:
         step = np.zeros(problem.extras.n_constants)
         step[column] = 1e-2 * problem.extras.sigma[column]
         up, down = (states._replace(constants=states.constants + s * step) for s in (1, -1))
-        for found, expected, atol in (
-            (
-                linearizer.inertial_rows(up)[:, :, -1] - linearizer.inertial_rows(down)[:, :, -1],
-                -rows[:, :, 2 * STATE_DIM + column],
-                1e-5,
-            ),
-            (
-                linearizer.beam_rows(up).error - linearizer.beam_rows(down).error,
-                beams.jacobian[:, STATE_DIM + column],
-                # A late ping is led back as if the rate were constant.
-                1e-2 if with_clock else 1e-6,
-            ),
-        ):
-            slope = found / (2.0 * step[column])
-            scale = max(np.abs(expected).max(), np.abs(beams.jacobian[:, 12:15]).max() * 1e-2)
-            np.testing.assert_allclose(slope / scale, expected / scale, rtol=0.0, atol=atol)
+        inertial = [linearizer.inertial_rows(end)[:, :, -1] for end in (down, up)]
+        beams = [linearizer.beam_rows(end).error for end in (up, down)]
+        for name, ends in (("inertial", inertial), ("beams", beams)):
+            found[name].append((ends[0] - ends[1]) / (2.0 * step[column]))
+    rows = linearizer.inertial_rows(states)[:, :, 2 * STATE_DIM + own]
+    slopes = np.stack(found["inertial"], axis=-1)
+    scale = np.abs(rows).max(axis=(0, 1))
+    np.testing.assert_allclose(slopes / scale, rows / scale, rtol=0.0, atol=1e-5)
+    seen = linearizer.beam_rows(states).jacobian[:, STATE_DIM + own]
+    slopes = np.stack(found["beams"], axis=-1)
+    # A late ping is led back as if rate and force were those at the ping.
+    atol = 1e-2 if with_clock else 1e-6
+    names = np.repeat([block.name[:5] for block in problem.extras.blocks], lengths(problem))[own]
+    for sensor in ("gyro_", "accel"):
+        of_sensor = names == sensor
+        scale = max(np.abs(seen[:, of_sensor]).max(), 1e-3)
+        np.testing.assert_allclose(
+            slopes[:, of_sensor] / scale, seen[:, of_sensor] / scale, rtol=0.0, atol=atol
+        )
+
+
+def lengths(problem: Problem) -> list[int]:
+    """Return how many components each variable has."""
+    return [len(block.sigma) for block in problem.extras.blocks]
 
 
 def test_columns_of_errors_that_are_no_variables() -> None:
