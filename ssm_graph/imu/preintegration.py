@@ -134,7 +134,13 @@ def gravity_gradient(frame: LocalFrame, p_n: Array = ORIGIN) -> Array:
 
 
 def preintegrate(
-    imu: ImuLog, keyframe_s: Array, *, frame: LocalFrame, rate_hz: float, bias: Array | None = None
+    imu: ImuLog,
+    keyframe_s: Array,
+    *,
+    frame: LocalFrame,
+    rate_hz: float,
+    bias: Array | None = None,
+    errors: Array | None = None,
 ) -> InertialChain:
     """Preintegrate the inertial data between keyframes.
 
@@ -145,8 +151,12 @@ def preintegrate(
     frame : navigation frame; gives the Earth rate.
     rate_hz : rate to which raw samples are merged first.
     bias : (6,) accelerometer and gyro bias about which to linearise, m/s^2 and rad/s.
+    errors : (27,) of the sensors, see :mod:`factors.imu_errors`, that are taken off first, and that
+        the increments follow; without them they do not.
     """
-    return finished(preintegrate_steps(imu, keyframe_s, frame=frame, rate_hz=rate_hz, bias=bias))
+    return finished(
+        preintegrate_steps(imu, keyframe_s, frame=frame, rate_hz=rate_hz, bias=bias, errors=errors)
+    )
 
 
 def preintegrate_steps(
@@ -158,11 +168,7 @@ def preintegrate_steps(
     bias: Array | None = None,
     errors: Array | None = None,
 ) -> Steps[InertialChain]:
-    """Make :func:`preintegrate` in steps.
-
-    Where ``errors`` (27,) are given, they are taken off the readings first, and the increments
-    follow them, see :mod:`factors.imu_errors`.
-    """
+    """Make :func:`preintegrate` in steps."""
     source = None
     if errors is not None:
         source = ErrorSource(imu, keyframe_s, rate_hz, errors)

@@ -31,7 +31,6 @@ from ssm_graph.mission.calibration import (
     extras_of,
     needs_motion,
 )
-from ssm_graph.mission.imu_variables import imu_columns
 from ssm_graph.mission.mission import InitialState, Mission
 from ssm_graph.mission.timeline import Timeline, build_timeline
 from ssm_graph.mission.usable import require_usable
@@ -173,7 +172,7 @@ def build_problem_steps(
         timeline.keyframe_s,
         frame=mission.frame,
         rate_hz=config.merge_rate_hz,
-        errors=NONE if len(imu_columns(extras)) else None,
+        errors=NONE if mission.imu.calibration.is_asked else None,
     )
     noise, depth = mission.imu.noise, mission.depth
     keyframes = Keyframes(mission.frame, mission.imu, timeline.keyframe_s, begin_s)

@@ -166,12 +166,12 @@ class _Imu(Instrument):
         log: ImuLog = super().bare(settings, lists)
         return log
 
-    def check(self, table: Table, bare: ImuLog, axes: BodyAxes) -> list[str]:  # noqa: ARG002
+    def check(self, table: Table, bare: ImuLog, axes: BodyAxes) -> list[str]:
         if len(table) < 2:
             got = f"{len(table)} row" if len(table) else "a header and no rows"
             raise DataError(f"{table.label}: the table has {got}; expected at least 2 samples")
         notes = _times(table)
-        _specific_force(table)
+        _specific_force(table, bare.calibration, axes)
         _turn_rates(table)
         notes += _gravity_direction(table, axes)
         readings = table.stack([*_GYRO.names, *_ACCEL.names])
@@ -263,8 +263,9 @@ def _times(table: Table) -> list[str]:
     return notes
 
 
-def _specific_force(table: Table) -> None:
-    force = table.stack(_ACCEL.names)
+def _specific_force(table: Table, known: ImuCalibration, axes: BodyAxes) -> None:
+    gyro_b, accel_b = (to_frd(table.stack(names), axes) for names in (_GYRO.names, _ACCEL.names))
+    _, force = known.taken_off(gyro_b, accel_b)
     median = float(np.median(_length(force)))
     low, high = FORCE_RANGE
     if not low <= median <= high:

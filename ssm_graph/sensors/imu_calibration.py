@@ -73,6 +73,11 @@ class ImuCalibration(FrozenArrays):
         values = (getattr(self, name) for name in VALUES)
         return any(value is not None and bool(value.any()) for value in values)
 
+    @property
+    def is_asked(self) -> bool:
+        """Whether any of it is to be found."""
+        return any(getattr(self, f"{name}_sigma") > 0.0 for name in CALIBRATED)
+
     def exact(self) -> ImuCalibration:
         """Return what is asked for of sensors whose known errors are taken off."""
         none: dict[str, Any] = dict.fromkeys(VALUES)

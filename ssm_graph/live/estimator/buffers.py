@@ -143,6 +143,13 @@ class Buffers:
         log: ImuLog = IMU.log_of(found, self._bare[IMU.section])
         return replace(log, start_s=float(start_s)).calibrated
 
+    def inertial(self, rows: Array) -> Array:
+        """Return inertial rows (N, 7) with what is known of the sensors' errors taken off."""
+        known = self.vehicle.imu_calibration
+        if not known.is_stated:
+            return rows
+        return np.column_stack([rows[:, 0], *known.taken_off(rows[:, 1:4], rows[:, 4:])])
+
     def mission(self, frame: LocalFrame, *, until_s: float = np.inf) -> Mission:
         """Return everything, or what is of a time ``until_s``, as a mission to align with."""
         vehicle = self.vehicle
