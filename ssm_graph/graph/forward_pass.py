@@ -24,6 +24,7 @@ from ssm_graph.graph.beam_rows import BeamRows, CalibratedBeams, PreparedBeams
 from ssm_graph.graph.first_weights import settled_weights
 from ssm_graph.graph.measurements import Measurements
 from ssm_graph.mission.calibration import CURRENTS
+from ssm_graph.mission.imu_variables import GYRO_SCALE
 from ssm_graph.mission.problem import Problem
 
 
@@ -102,6 +103,19 @@ class ForwardExtras:
     def begin(self, covariance: Array) -> Array:
         """Return the covariance (E, E) at the start from that of the error state."""
         return self._problem.extras.behind(covariance)
+
+    def begin_scale(self, covariance: Array, sigmas: float) -> Array:
+        """Take the gyros' scale to be so many prior sigmas off, and return what is known then.
+
+        ``covariance`` (E, E) is that at the start; of the scale half a sigma is left.
+        """
+        extras = self._problem.extras
+        own = extras.columns(GYRO_SCALE)
+        at = slice(own.start - extras.state_dim, own.stop - extras.state_dim)
+        self.constants[at] = sigmas * np.sqrt(np.diagonal(covariance)[own])
+        halved = covariance.copy()
+        halved[own, own] *= 0.25
+        return halved
 
     def keep(self, walks: Array, constants: Array) -> None:
         """Take the values (s,) and (C,) that a correction led to."""

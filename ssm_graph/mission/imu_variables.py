@@ -17,8 +17,9 @@ from ssm_graph.sensors.imu_calibration import LABELS, UNITS, ImuCalibration
 
 AS_A_TURN: Final = 1.0
 """A share of what is read bends what is measured as much as a turn by it."""
+GYRO_SCALE: Final = "gyro_scale"
 COLUMNS: Final = {
-    "gyro_scale": GYRO.start + np.array(MATRIX_PLACES[3]),
+    GYRO_SCALE: GYRO.start + np.array(MATRIX_PLACES[3]),
     "gyro_misalignment": GYRO.start + np.array(MATRIX_PLACES[6]),
     "gyro_g_sensitivity": BY_FORCE.start + np.array(MATRIX_PLACES[9]),
     "accel_scale": ACCEL.start + np.array(MATRIX_PLACES[3]),
