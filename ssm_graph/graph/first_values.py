@@ -117,7 +117,7 @@ class _Rows(NamedTuple):
 class _ForwardPass:
     """A filter on the same inertial factors as the graph, in covariance form."""
 
-    def __init__(self, problem: Problem, kernel: Kernel, scale: float | None) -> None:
+    def __init__(self, problem: Problem, kernel: Kernel, scale: float | None = None) -> None:
         """Begin at so many prior sigmas of the gyros' scale, known to half of one; None for 0."""
         self.problem = problem
         self.kernel = kernel

@@ -87,6 +87,10 @@ class GraphLinearizer:
         errors, _ = imu_errors(self.problem.extras, states.walks[0], states.constants)
         return self.intervals.without_errors(errors)
 
+    def take_inertial(self, intervals: Intervals) -> None:
+        """Take other inertial data of the same intervals, such as those of :meth:`intervals_at`."""
+        self.intervals = intervals
+
     def beam_rows(self, states: States) -> BeamRows:
         """Linearise all beams at ``states``."""
         prepared = self._beams.prepare(states.walks, states.constants, states.bias)

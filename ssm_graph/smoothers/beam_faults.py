@@ -311,7 +311,7 @@ class FaultWatch:
             return False
         self._n_looks += 1
         if intervals is not None:
-            self._linearizer.intervals = intervals
+            self._linearizer.take_inertial(intervals)
         alone, before = self._without_calibration(states, rows), self._found
         found = yield from find_beam_faults_steps(
             self._linearizer, *alone, self._search, aid_weights
