@@ -60,7 +60,7 @@ def of_readings(stated: Array) -> tuple[Array, Array]:
     """
     S_g, S_a, S_f = matrices(stated)
     eye = np.eye(3)
-    gyro, accel = np.linalg.inv(eye + S_g), np.linalg.inv(eye + S_a)
+    gyro, accel = (np.asarray(np.linalg.inv(eye + S), np.float64) for S in (S_g, S_a))
     by_force = gyro @ S_f @ accel
     slope = np.zeros((*stated.shape, SIZE))
     slope[..., GYRO, GYRO], slope[..., ACCEL, ACCEL] = _around(gyro, gyro), _around(accel, accel)
@@ -100,7 +100,7 @@ def by_noise_scale(errors: Array, error: Array) -> Array:
     """
     W, A, _ = matrices(errors)
     eye = np.eye(3)
-    turn, force = np.linalg.inv(eye - W), np.linalg.inv(eye - A)
+    turn, force = (np.asarray(np.linalg.inv(eye - M), np.float64) for M in (W, A))
     made = np.zeros((*error.shape, SIZE))
     turned = times(turn, error[:, 0])
     pushed = error[:, 1:] @ force.mT

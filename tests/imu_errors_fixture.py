@@ -73,5 +73,7 @@ def distorted(grade: Grade, seed: int, **changes: Any) -> Distorted:
 
 def asking(mission: Mission, sigmas: tuple[float, ...]) -> Mission:
     """Return the mission with these prior sigmas, in the order of the names."""
-    named = {f"{name}_sigma": sigma for name, sigma in zip(NAMES, sigmas, strict=True)}
+    named: dict[str, Any] = {
+        f"{name}_sigma": sigma for name, sigma in zip(NAMES, sigmas, strict=True)
+    }
     return replace(mission, imu=replace(mission.imu, calibration=ImuCalibration(**named)))

@@ -6,6 +6,7 @@ import tomllib
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ from ssm_graph.sensors.imu_calibration import (
     DEG_PER_H_PER_G,
     MRAD,
     PPM,
+    VALUES,
     ImuCalibration,
 )
 from ssm_graph.simulation import CALM, GnssSettings, Grade
@@ -186,9 +188,7 @@ def test_what_is_not_asked_for_costs_nothing() -> None:
 def test_what_is_known_is_taken_off_the_readings() -> None:
     """A mission that states its errors is smoothed as one that has none; the log stays as it is."""
     sim = turning(duration_s=20.0, grade=Grade.TACTICAL)
-    names = ("gyro_scale_error", "gyro_misalignment", "gyro_g_sensitivity")
-    names += ("accel_scale_error", "accel_misalignment")
-    errors = np.concatenate([getattr(STATED, name) for name in names])
+    errors = np.concatenate([getattr(STATED, name) for name in VALUES])
     off = read_with(sim.mission, errors)
     stated = replace(off, imu=replace(off.imu, calibration=replace(STATED, **NO_SIGMAS)))
     np.testing.assert_allclose(stated.imu.calibrated.gyro_b, sim.mission.imu.gyro_b, atol=1e-12)
@@ -201,7 +201,7 @@ def test_what_is_known_is_taken_off_the_readings() -> None:
     )
 
 
-NO_SIGMAS = {"gyro_scale_sigma": 0.0, "accel_misalignment_sigma": 0.0}
+NO_SIGMAS: dict[str, Any] = {"gyro_scale_sigma": 0.0, "accel_misalignment_sigma": 0.0}
 
 
 @pytest.mark.parametrize("axes", list(BodyAxes))
@@ -217,7 +217,7 @@ def test_lines_of_the_estimate_are_a_mission_in_its_axes(tmp_path: Path, axes: B
     settings["imu"] |= keys
     settings["frames"]["body"] = axes.value
     path.write_text(tomli_w.dumps(settings))
-    calibration = read_vehicle(path).imu_calibration
+    calibration: Any = read_vehicle(path).imu_calibration
     values = found(estimate)
     np.testing.assert_allclose(
         calibration.gyro_scale_error, values.of("gyro_scale"), rtol=1e-5, atol=1e-9
@@ -264,7 +264,7 @@ def test_keys_are_read_as_they_are_written(tmp_path: Path) -> None:
     assert "mrad" not in text
 
 
-def vars_of(calibration: ImuCalibration) -> dict[str, object]:
+def vars_of(calibration: ImuCalibration) -> dict[str, Any]:
     """Return the fields of a value with slots."""
     return {name: getattr(calibration, name) for name in ImuCalibration.__slots__}
 

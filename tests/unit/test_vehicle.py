@@ -155,6 +155,7 @@ def test_every_field_is_written(tmp_path: Path) -> None:
     assert len(fields(Vehicle)) == 12
     assert all(getattr(got, spec.name) is not None for spec in fields(Vehicle))
     assert (got.water_sigma, got.current) == (vehicle.water_sigma, vehicle.current)
+    assert got.imu_calibration.gyro_scale_error is not None
     np.testing.assert_allclose(got.imu_calibration.gyro_scale_error, 1e-3)
     assert got.imu_calibration.accel_scale_sigma == pytest.approx(2e-3)
 
