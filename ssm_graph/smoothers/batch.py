@@ -278,6 +278,7 @@ class SsmSmoother:
                 update_sigmas=this.update_sigmas,
                 is_settled=is_settled,
                 aid_weights=this.aid_weights,
+                intervals=linearizer.intervals_at(states),
             )
             if is_settled and not has_news:
                 status = Status.CONVERGED
@@ -296,6 +297,7 @@ class SsmSmoother:
         faults: FaultWatch,
     ) -> Steps[Pass]:
         problem = linearizer.problem
+        yield from linearizer.integrate_steps(states)
         if linearizer.follow(states):
             rows = linearizer.beam_rows(states)
         yield 0.004 * problem.n_keyframes
