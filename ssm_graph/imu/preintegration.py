@@ -302,10 +302,10 @@ def imu_params(
     # sigma in an hour is none.
     floor = 1e-3 / 60.0
     params.setBiasOmegaCovariance(
-        max(noise.gyro_bias_density, floor * noise.gyro_bias_sigma) ** 2 * eye
+        max(noise.gyro_bias_walk, floor * noise.gyro_bias_sigma) ** 2 * eye
     )
     params.setBiasAccCovariance(
-        max(noise.accel_bias_density, floor * noise.accel_bias_sigma) ** 2 * eye
+        max(noise.accel_bias_walk, floor * noise.accel_bias_sigma) ** 2 * eye
     )
     return params
 

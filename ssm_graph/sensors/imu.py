@@ -6,6 +6,7 @@ are copied in, checked for shape and made read-only; times are seconds on one cl
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -24,6 +25,13 @@ from ssm_graph.sensors.instrument import XYZ, Column, Instrument, Lists
 from ssm_graph.sensors.messages import Message
 
 
+OF_INSTABILITY: Final = 0.3
+"""Random walk, per square root of a second, that wanders in 100 s as far as flicker noise does whose
+Allan deviation has a floor of 1. The variance of flicker's increments grows with the logarithm of
+time, some ``2 s^2`` a decade with ``s = 1.29`` of the floor (IEEE Std 952, annex C); biases are told
+apart over minutes."""
+
+
 @dataclass(frozen=True, slots=True)
 class ImuNoise:
     """Noise of the inertial sensors, as continuous-time densities."""
@@ -40,6 +48,20 @@ class ImuNoise:
     """Random walk of the gyro bias, rad/s/sqrt(s)."""
     accel_bias_density: float = 0.0
     """Random walk of the accelerometer bias, m/s^2/sqrt(s)."""
+    gyro_bias_instability: float = 0.0
+    """Floor of the gyros' Allan deviation, rad/s."""
+    accel_bias_instability: float = 0.0
+    """Floor of the accelerometers' Allan deviation, m/s^2."""
+
+    @property
+    def gyro_bias_walk(self) -> float:
+        """Random walk that covers walk and instability of the gyro bias, rad/s/sqrt(s)."""
+        return math.hypot(self.gyro_bias_density, OF_INSTABILITY * self.gyro_bias_instability)
+
+    @property
+    def accel_bias_walk(self) -> float:
+        """Random walk that covers walk and instability of the accelerometer bias, m/s^2/sqrt(s)."""
+        return math.hypot(self.accel_bias_density, OF_INSTABILITY * self.accel_bias_instability)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,6 +172,12 @@ _KEYS: Final = {
     ),
     "accel_bias_walk_ug_per_sqrt_h": optional_key(
         "noise.accel_bias_density", 0.0, 1e7, _WALK, unit=MICRO_G * PER_SQRT_H
+    ),
+    "gyro_bias_instability_deg_per_h": optional_key(
+        "noise.gyro_bias_instability", 0.0, 1e6, _WALK, unit=DEG_PER_H
+    ),
+    "accel_bias_instability_ug": optional_key(
+        "noise.accel_bias_instability", 0.0, 1e7, _WALK, unit=MICRO_G
     ),
     **calibration_keys("calibration"),
 }

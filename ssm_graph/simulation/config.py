@@ -96,7 +96,8 @@ class SimulationConfig(checked.Settings):
     instruments: InstrumentErrors | None = None
     """Their sizes one by one; None for those of the grade if ``realistic``, for none otherwise."""
     calibrates_imu: bool = False
-    """Whether the mission asks for the calibration of the errors that its IMU has."""
+    """Whether the mission states the instability of its IMU's biases, and asks for the calibration of
+    its other errors."""
     perfect_sensors: bool = False
     """Draw no sensor error at all; noise stays as stated, outliers and losses as asked for."""
     draw_initial_errors: bool = True

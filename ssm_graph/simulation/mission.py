@@ -220,7 +220,12 @@ def _imu(config: SimulationConfig, streams: Streams, n_samples: int) -> tuple[Im
         accel_b=read.accel_b,
     )
     if config.calibrates_imu and inertial:
-        log = dataclasses.replace(log, calibration=inertial.asked)
+        noise = dataclasses.replace(
+            config.noise,
+            gyro_bias_instability=inertial.gyro_instability,
+            accel_bias_instability=inertial.accel_instability,
+        )
+        log = dataclasses.replace(log, calibration=inertial.asked, noise=noise)
     return log, read
 
 
