@@ -27,6 +27,7 @@ from typing import Final, Protocol
 import numpy as np
 from scipy.linalg import solve_triangular
 
+from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.times import Indices
 from ssm_graph.mission.mission import Mission
@@ -50,6 +51,7 @@ GRAVITY: Final = 9.81
 """m/s^2"""
 SLOPE: Final = 0.002
 """rad, to which the level axes are known."""
+TINY: Final = 1e-12
 SILENCE_S: Final = 3.0
 """Longer gaps between pings are bridged by the accelerometers alone."""
 
@@ -423,7 +425,7 @@ class FixPart:
             columns.append(self.time_s < of.jump_s)
         X = self.whiten @ np.stack(columns, axis=1)
         residual, c = robust_residual(y, X)
-        size = abs(c[0])
+        size = max(abs(c[0]), TINY)
         if abs(size - 1.0) > LARGEST_SCALE:
             way = X[:, 0] * c[0] / size * np.clip(size, 1.0 - LARGEST_SCALE, 1.0 + LARGEST_SCALE)
             residual = robust_residual(y - way, X[:, 1:])[0]
@@ -431,13 +433,11 @@ class FixPart:
 
 
 def _swapped(lat: Array, lon: Array) -> Array:
-    from ssm_graph.base.earth import LocalFrame
-
-    if np.any(np.abs(lon) > 0.5 * np.pi):
-        return np.zeros(len(lat), complex)
-    frame = LocalFrame(float(lon[0]), float(lat[0]), 0.0)
-    p = frame.p_n_from_geodetic(lon, lat, np.zeros(len(lat)))
-    return np.asarray(p[:, 0] + 1j * p[:, 1])
+    """Return positions (n,), complex, m, with longitudes taken for latitudes."""
+    lat, lon = lon, lat
+    frame = LocalFrame(float(lat[0]), float(lon[0]), 0.0)
+    p_n = frame.p_n_from_geodetic(lat, lon, np.zeros(len(lat)))
+    return np.asarray(p_n[:, 0] + 1j * p_n[:, 1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -483,7 +483,7 @@ class DepthPart:
         X = np.stack(
             [np.ones_like(up), *(part for way in ways for part in (way.real, way.imag))], axis=1
         )
-        return robust_residual(self.whiten @ (self.depth * of.depth_scale + up), self.whiten @ X)[0]
+        return robust_residual(self.whiten @ (self.depth + up / of.depth_scale), self.whiten @ X)[0]
 
 
 @dataclass(frozen=True, eq=False)

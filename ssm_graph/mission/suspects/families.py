@@ -151,7 +151,7 @@ def scale_families(mission: Mission) -> Iterator[Family]:
         yield Family("Janus angle", janus, near, angles, JANUS_LEAST, null=stated)
     yield Family(
         "DVL axes",
-        lambda base, k: _composed(base, AXES[int(k)]),
+        lambda base, k: _composed(base, mount.R_bd @ AXES[int(k)] @ mount.R_bd.T),
         *((), tuple(range(1, len(AXES))), 0.5),
         is_discrete=True,
     )
@@ -161,9 +161,10 @@ def scale_families(mission: Mission) -> Iterator[Family]:
         *(NEAR_SCALES, tuple(DEPTH_UNITS), DEPTH_LEAST),
         null=1.0,
     )
-    yield Family(
-        "fix axes",
-        lambda base, k: replace(base, is_swapped=base.is_swapped or k > 0.5),
-        *((), (1.0,), 0.5),
-        is_discrete=True,
-    )
+    if mission.gnss is not None and np.all(np.abs(mission.gnss.lon) < 0.5 * math.pi):
+        yield Family(
+            "fix axes",
+            lambda base, k: replace(base, is_swapped=base.is_swapped or k > 0.5),
+            *((), (1.0,), 0.5),
+            is_discrete=True,
+        )

@@ -42,9 +42,9 @@ def find_suspects(mission: Mission) -> tuple[DetectedFault, ...]:
     Nothing is said of a mission whose logs are short or say little: a straight run has no turn to
     compare. The rate of false alarms is in ``docs/method.md``.
     """
-    plain = [*of_gravity(mission), *of_heights(mission)]
-    if any(fault.sensor in ("IMU", "accelerometers") for fault in plain) or not is_enough(mission):
-        return tuple(plain)
+    plain = tuple(of_gravity(mission))
+    if plain or not is_enough(mission):
+        return plain
     by_parity = order_by_parity(mission)
     order = None if by_parity is None else by_parity[0]
     found = search(mission if order is None else reordered(mission, order))
@@ -56,7 +56,9 @@ def find_suspects(mission: Mission) -> tuple[DetectedFault, ...]:
     ):
         what, remedy = said_order(order, 1.0)
         faults.insert(0, fault_of(mission, "DVL", what, remedy, by_parity[1]))
-    return (*faults, *plain)
+    if not any(one.family.name == "depth scale" for one in found):
+        faults += of_heights(mission)
+    return tuple(faults)
 
 
 def with_suspects(estimate: Estimate, suspects: tuple[DetectedFault, ...]) -> Estimate:

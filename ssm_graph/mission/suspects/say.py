@@ -78,16 +78,11 @@ def said(found: Found, mission: Mission, order: tuple[int, ...] | None = None) -
 
 def _stretch(found: Found, mission: Mission) -> tuple[float, float]:
     begin_s, end_s = mission.imu.start_s, float(mission.imu.time_s[-1])
-    delay = _delay(found)
-    if delay is None or delay.before_s == delay.after_s:
+    delay = found.delay
+    if delay is None or not found.is_set:
         return begin_s, end_s
     is_before = abs(delay.before_s) > abs(delay.after_s)
     return (begin_s, delay.switch_s) if is_before else (delay.switch_s, end_s)
-
-
-def _delay(found: Found) -> Delay | None:
-    clock = found.family.clock
-    return getattr(found.hypothesis, clock) if clock else None
 
 
 def _words(found: Found, mission: Mission, order: tuple[int, ...] | None) -> tuple[str, str]:
@@ -121,8 +116,8 @@ def _unit(value: float, units: dict[float, str]) -> str:
 
 
 def _of_clock(found: Found, mission: Mission) -> tuple[str, str]:
-    sensor, delay = sensor_of(found), _delay(found)
-    if delay is None or delay.before_s == delay.after_s:
+    sensor, delay = sensor_of(found), found.delay
+    if delay is None or not found.is_set:
         late_s = -found.value if sensor == "IMU" else found.value
         what = f"{_late(late_s)} (sigma {found.sigma:.2g} s){_leap(late_s, found.sigma)}"
         if sensor not in OFFSETS:
@@ -138,7 +133,7 @@ def _of_clock(found: Found, mission: Mission) -> tuple[str, str]:
     change = delay.after_s - delay.before_s
     what = (
         f"{_late(late_s)} {side} {delay.switch_s:.0f} s on, where the clock was set by "
-        f"{change:+.1f} s{_leap(late_s, 0.3)}"
+        f"{change:+.1f} s{_leap(late_s, found.sigma)}"
     ).replace(" s on, where", " s, where" if is_before else " s on, where")
     section = SECTIONS.get(sensor, "[dvl]")
     return what, (
@@ -152,9 +147,8 @@ def _late(late_s: float) -> str:
 
 
 def _leap(late_s: float, sigma: float) -> str:
-    near = min(LEAP_SECONDS, key=lambda s: abs(s - late_s))
-    is_leap = abs(near - late_s) < max(0.3, min(4.0 * sigma, 0.5))
-    return f": {LEAP_SECONDS[near]}" if is_leap else ""
+    reach = max(0.3, min(4.0 * sigma, 0.7))
+    return next((f": {what}" for s, what in LEAP_SECONDS.items() if abs(s - late_s) < reach), "")
 
 
 def _of_gyros(name: str, value: float) -> tuple[str, str]:
@@ -181,7 +175,7 @@ def _of_speed(value: float, mount: DvlMount) -> tuple[str, str]:
 
 def _of_axes(M: Array, mount: DvlMount, order: tuple[int, ...] | None) -> tuple[str, str]:
     if np.linalg.det(M) > 0.0 and order is None:
-        roll, pitch, yaw = np.degrees(rpy_from_R_bd(M @ mount.R_bd)) + 0.0
+        roll, pitch, yaw = np.degrees(rpy_from_R_bd(mount.R_bd @ M)) + 0.0
         turned = np.degrees(math.acos(np.clip(0.5 * (np.trace(M) - 1.0), -1.0, 1.0)))
         return (
             f"a mounting turned by {turned:.0f} deg fits",
@@ -208,14 +202,15 @@ def said_order(order: tuple[int, ...], sign: float) -> tuple[str, str]:
 def order_of(
     mount: DvlMount, M: Array, order: tuple[int, ...] | None
 ) -> tuple[tuple[int, ...], float] | None:
-    """Return the order of the beams, and their sign, that turns velocities by ``M`` (3, 3).
+    """Return the order of the beams, and their sign, that changes velocities by ``M`` (3, 3), instrument
+    axes.
 
     ``order`` is the one that the velocities were solved with; None if none of them does.
     """
-    inverse = np.linalg.pinv(mount.beams_b)
+    inverse = np.linalg.pinv(mount.beams_d)
     solved = order or tuple(range(mount.n_beams))
     speeds = np.zeros((mount.n_beams, 3))
-    speeds[list(solved)] = mount.beams_b
+    speeds[list(solved)] = mount.beams_d
     for one, sign in product(permutations(range(mount.n_beams)), (1.0, -1.0)):
         if np.allclose(sign * inverse @ speeds[list(one)], M, atol=0.05):
             return one, sign

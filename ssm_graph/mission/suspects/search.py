@@ -34,6 +34,9 @@ POOR_BLOCK: Final = 4.0
 CURVED: Final = 8.0
 """Rise of the loss between neighbours up to which it is a parabola."""
 ROUNDS: Final = 9
+LEAST_STEP_S: Final = 0.7
+"""By less no clock is set: they are set by whole seconds."""
+STEP_WIDTH_S: Final = 0.1
 STEP_BETTER: Final = 15.0
 """Gain over one constant delay that a clock that was set needs: a second delay and a time."""
 JUMP_AS_GOOD: Final = 6.0
@@ -94,7 +97,18 @@ class Found:
         """Whether it is beyond what errors of healthy instruments make."""
         off = abs(self.value - self.family.null)
         enough = self.gain > ENOUGH and self.without_best > WITHOUT_BEST
-        return enough and off > max(self.family.least, SURE * self.sigma)
+        least = LEAST_STEP_S if self.is_set else self.family.least
+        return enough and off > max(least, SURE * self.sigma)
+
+    @property
+    def delay(self) -> Delay | None:
+        """The delay of its clock, None of what is none."""
+        return getattr(self.hypothesis, self.family.clock) if self.family.clock else None
+
+    @property
+    def is_set(self) -> bool:
+        """Whether it is a clock that was set in mid-run."""
+        return self.delay is not None and self.delay.before_s != self.delay.after_s
 
 
 @dataclass(eq=False)
@@ -161,15 +175,24 @@ class Evidence:
             if at[0] - at.min() < HINT:
                 return None
         values = sorted({null, *family.near, *(family.far if is_poor else ())})
+        for only in dict.fromkeys((first, "")):
+            values = self._refined(family, base, values, only)
+        return self._found(family, base, values)
+
+    def _refined(
+        self, family: Family, base: Hypothesis, values: list[float], only: str
+    ) -> list[float]:
+        """Return values about the least loss so near each other that it is a parabola there."""
+        null = family.null
         for _ in range(ROUNDS):
-            total = self.total([family.make(base, v) for v in values], first)
+            total = self.total([family.make(base, v) for v in values], only)
             at = int(np.argmin(total))
             around = slice(max(at - 1, 0), at + 2)
             if family.is_discrete or np.ptp(total[around]) < CURVED:
                 break
             fine = np.linspace(values[around][0], values[around][-1], 7).tolist()
             values = sorted({null, *fine, values[at]})
-        return self._found(family, base, sorted({null, *values[around]}))
+        return sorted({null, *values[around]})
 
     def _found(self, family: Family, base: Hypothesis, values: list[float]) -> Found | None:
         hypotheses = [family.make(base, v) for v in values]
@@ -251,10 +274,14 @@ class Evidence:
         by_part = self.losses([base, of(Delay()), of(best)])
         blocks = np.concatenate(list(by_part.values()), axis=1)
         gains = blocks[1] - blocks[2]
+        side = "before_s" if abs(best.before_s) > abs(best.after_s) else "after_s"
+        late_s = getattr(best, side)
+        around = late_s + np.array([-STEP_WIDTH_S, 0.0, STEP_WIDTH_S])
+        bent = self.losses([of(replace(best, **{side: v})) for v in around], family.part)
         return Found(
             family,
             value=best.before_s - best.after_s,
-            sigma=0.0,
+            sigma=vertex(around, bent[family.part])[1],
             hypothesis=of(best),
             gain=float((blocks[0] - blocks[2]).sum()),
             without_best=float(gains.sum() - gains.max()),
