@@ -25,13 +25,14 @@ from functools import cached_property
 from typing import Final, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
-from ssm_graph.base.times import Indices
+from ssm_graph.base.times import Indices, is_inside
 from ssm_graph.mission.mission import Mission
-from ssm_graph.mission.suspects.motion import Inertial, Velocities
+from ssm_graph.mission.suspects.motion import STEP_S, Inertial, Velocities
 from ssm_graph.sensors.compass import HeadingLog
 from ssm_graph.sensors.imu import ImuNoise
 
@@ -51,7 +52,15 @@ GRAVITY: Final = 9.81
 """m/s^2"""
 SLOPE: Final = 0.002
 """rad, to which the level axes are known."""
+PROLONGED: Final = 60
+"""Steps of the grid at either end that say how the vehicle came and went on."""
+FARTHEST_S: Final = 60.0
 TINY: Final = 1e-12
+MEDIAN_SQUARE: Final = 0.455
+"""Of a standard Gaussian."""
+NEUTRAL: Final = 0.926
+"""A residual whose loss is that of a standard Gaussian one in the mean."""
+Mask = NDArray[np.bool_]
 SILENCE_S: Final = 3.0
 """Longer gaps between pings are bridged by the accelerometers alone."""
 
@@ -180,16 +189,20 @@ def twice_walk_covariance(time_s: Array) -> Array:
     return np.asarray(low**2 * (3.0 * high - low) / 6.0)
 
 
-def robust_residual(y: Array, X: Array, *, rounds: int = 3) -> tuple[Array, Array]:
-    """Return residuals (n,) and coefficients (c,) of a regression with a Student loss."""
-    weight = np.ones(len(y))
+def robust_residual(y: Array, X: Array, known: Mask, *, rounds: int = 3) -> tuple[Array, Array]:
+    """Return residuals (n,) and coefficients (c,) of a regression with a Student loss.
+
+    Rows that are not ``known`` (n,), before or after all logs, say nothing for or against.
+    """
+    weight = known.astype(float)
     for _ in range(rounds):
         root = np.sqrt(weight)
         coefficients = np.linalg.lstsq(X * root[:, None], y * root, rcond=1e-10)[0]
         residual = y - X @ coefficients
-        scale_sq = max(float(np.median(np.abs(residual) ** 2)) / 0.455, 1e-12)
-        weight = (DOF + 1.0) / (DOF + np.abs(residual) ** 2 / scale_sq)
-    return residual, coefficients
+        usual = np.median(np.abs(residual[known]) ** 2) if known.any() else 1.0
+        scale_sq = max(float(usual) / MEDIAN_SQUARE, TINY)
+        weight = known * (DOF + 1.0) / (DOF + np.abs(residual) ** 2 / scale_sq)
+    return np.where(known, residual, NEUTRAL), coefficients
 
 
 @dataclass(frozen=True)
@@ -305,9 +318,16 @@ def _integral(time_s: Array, rate: Array) -> Array:
     return np.concatenate([np.zeros_like(total[:1]), total])
 
 
+def _prolonged(grid: Array) -> Array:
+    """Return a quantity (G,) of an even grid with a point far before and after, as it went on."""
+    before, after = grid[PROLONGED] - grid[0], grid[-1] - grid[-1 - PROLONGED]
+    far = FARTHEST_S / (PROLONGED * STEP_S)
+    return np.concatenate([[grid[0] - far * before], grid, [grid[-1] + far * after]])
+
+
 @dataclass(frozen=True, eq=False)
 class _Track:
-    """The way by pings and gyros, in level axes that do not turn."""
+    """The way by pings and gyros, in level axes that do not turn; at the ends as it went on."""
 
     time_s: Array
     """(G,)"""
@@ -333,10 +353,13 @@ class _Track:
         up = np.sum(v_i * inertial.up_i, axis=1)
         forward, right = (np.sum(v_i * inertial.R_ib[:, :, k], axis=1) for k in (0, 1))
         rates = (level, along * level, up, forward + 1j * right)
-        return cls(t, *(_integral(t, rate) for rate in rates))
+        return cls(*(_prolonged(x) for x in (t, *(_integral(t, rate) for rate in rates))))
 
     def at(self, quantity: Array, time_s: Array) -> Array:
         return np.interp(time_s, self.time_s, quantity)
+
+    def covers(self, time_s: Array) -> Mask:
+        return is_inside(time_s, float(self.time_s[1]), float(self.time_s[-2]))
 
 
 def _arm(logs: Logs, of: Hypothesis, lever_arm_b: Array, time_s: Array) -> tuple[Array, Array]:
@@ -424,12 +447,14 @@ class FixPart:
         if of.jump_s > self.time_s[0]:
             columns.append(self.time_s < of.jump_s)
         X = self.whiten @ np.stack(columns, axis=1)
-        residual, c = robust_residual(y, X)
+        known = track.covers(at_s)
+        residual, c = robust_residual(y, X, known)
         size = max(abs(c[0]), TINY)
         if abs(size - 1.0) > LARGEST_SCALE:
             way = X[:, 0] * c[0] / size * np.clip(size, 1.0 - LARGEST_SCALE, 1.0 + LARGEST_SCALE)
-            residual = robust_residual(y - way, X[:, 1:])[0]
-        return np.concatenate([residual.real, residual.imag])
+            residual, _ = robust_residual(y - way, X[:, 1:], known)
+        imaginary = np.where(known, residual.imag, NEUTRAL)
+        return np.concatenate([residual.real, imaginary])
 
 
 def _swapped(lat: Array, lon: Array) -> Array:
@@ -483,7 +508,8 @@ class DepthPart:
         X = np.stack(
             [np.ones_like(up), *(part for way in ways for part in (way.real, way.imag))], axis=1
         )
-        return robust_residual(self.whiten @ (self.depth + up / of.depth_scale), self.whiten @ X)[0]
+        y = self.whiten @ (self.depth + up / of.depth_scale)
+        return robust_residual(y, self.whiten @ X, track.covers(at_s))[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -532,4 +558,5 @@ class CompassPart:
         X = np.stack(
             [np.ones_like(s), s, np.sin(h), np.cos(h), np.sin(2 * h), np.cos(2 * h)], axis=1
         )
-        return robust_residual(self.whiten @ (h - turned), self.whiten @ X)[0]
+        known = is_inside(at_s, float(inertial.time_s[0]), float(inertial.time_s[-1]))
+        return robust_residual(self.whiten @ (h - turned), self.whiten @ X, known)[0]

@@ -95,25 +95,24 @@ def janus_of(mount: DvlMount) -> float | None:
 
 
 def clock_families(mission: Mission) -> Iterator[Family]:
-    """Yield the clocks; a delay that a calibration takes care of is none."""
+    """Yield the clocks."""
 
-    def of(name: str, *clocks: str, least: float, part: str) -> Family:
+    def of(name: str, *clocks: str, least: float, part: str, sigma_s: float = 0.0) -> Family:
         def make(base: Hypothesis, late_s: float) -> Hypothesis:
             return replace(base, **{c: getattr(base, c).later(late_s) for c in clocks})
 
-        clock = clocks[0] if len(clocks) == 1 else ""
-        return Family(name, make, NEAR_S, FAR_S, least, clock=clock, part=part)
+        cared = BOUND * sigma_s
+        return Family(name, make, NEAR_S, FAR_S, least, cared=cared, clocks=clocks, part=part)
 
-    mount = mission.dvl.mount
-    dvl = max(DVL_LEAST_S, BOUND * mount.time_offset_sigma_s)
-    yield of("DVL clock", "dvl", least=dvl, part="accelerometers")
+    dvl_s = mission.dvl.mount.time_offset_sigma_s
+    yield of("DVL clock", "dvl", least=DVL_LEAST_S, part="accelerometers", sigma_s=dvl_s)
     if mission.gnss is not None:
-        sigma_s = mission.gnss.calibration.time_offset_sigma_s
-        yield of("GNSS clock", "gnss", least=max(FIX_LEAST_S, BOUND * sigma_s), part="fixes")
+        gnss_s = mission.gnss.calibration.time_offset_sigma_s
+        yield of("GNSS clock", "gnss", least=FIX_LEAST_S, part="fixes", sigma_s=gnss_s)
     yield of("depth clock", "depth", least=DEPTH_LEAST_S, part="depth")
     yield of("compass clock", "compass", least=DEPTH_LEAST_S, part="compass")
     every = ("dvl", "gnss", "depth", "compass")
-    yield of("IMU clock", *every, least=dvl, part="accelerometers")
+    yield of("IMU clock", *every, least=DVL_LEAST_S, part="accelerometers")
 
 
 def scale_families(mission: Mission) -> Iterator[Family]:
@@ -132,12 +131,12 @@ def scale_families(mission: Mission) -> Iterator[Family]:
             part="accelerometers",
         )
     mount = mission.dvl.mount
-    speed = max(SPEED_LEAST, BOUND * mount.scale_sigma)
     yield Family(
         "speed",
         lambda base, by: _composed(base, by * np.eye(3)),
-        *(NEAR_SCALES, ALL_SCALES, speed),
+        *(NEAR_SCALES, ALL_SCALES, SPEED_LEAST),
         null=1.0,
+        cared=BOUND * mount.scale_sigma,
     )
     stated = janus_of(mount)
     if stated is not None:

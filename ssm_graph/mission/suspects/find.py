@@ -88,8 +88,8 @@ def search(mission: Mission) -> list[Found]:
             break
         best = max(sure, key=lambda one: one.gain)
         same = [one for one in sure if one is not best and one.gain > best.gain - AS_GOOD]
-        best = replace(best, rivals=tuple(same))
-        found.append(best)
+        if not best.is_cared_for:
+            found.append(replace(best, rivals=tuple(same)))
         base = best.hypothesis
         families = [family for family in families if family is not best.family]
     return found
@@ -103,12 +103,12 @@ def _set_clocks(
     found = []
     for family in families:
         is_worth = family.part in poor or any(one.family is family for one in sure)
-        if not family.clock or not is_worth:
+        if not family.clocks or not is_worth:
             continue
         step = evidence.set_clock(family, base, SET_S)
         if step is None or not step.is_sure or step.gain < best + STEP_BETTER:
             continue
-        if family.clock == "gnss":
+        if family.clocks == ("gnss",):
             switch_s = step.hypothesis.gnss.switch_s
             jump = replace(base, gnss=Delay(), jump_s=switch_s)
             of_step, of_jump = evidence.total([step.hypothesis, jump])

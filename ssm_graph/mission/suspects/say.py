@@ -117,28 +117,26 @@ def _unit(value: float, units: dict[float, str]) -> str:
 
 def _of_clock(found: Found, mission: Mission) -> tuple[str, str]:
     sensor, delay = sensor_of(found), found.delay
-    if delay is None or not found.is_set:
-        late_s = -found.value if sensor == "IMU" else found.value
-        what = f"{_late(late_s)} (sigma {found.sigma:.2g} s){_leap(late_s, found.sigma)}"
-        if sensor not in OFFSETS:
-            return what, f"take {late_s:.2f} s off time_s in the table of {SECTIONS[sensor]}"
-        gnss = mission.gnss
-        stated = mission.dvl.mount.time_offset_s
-        if sensor == "GNSS" and gnss is not None:
-            stated = gnss.calibration.time_offset_s
-        return what, f"[{sensor.lower()}] time_offset_s = {stated + late_s:.2f}"
-    is_before = abs(delay.before_s) > abs(delay.after_s)
-    late_s = delay.before_s if is_before else delay.after_s
-    side = "before" if is_before else "from"
-    change = delay.after_s - delay.before_s
-    what = (
-        f"{_late(late_s)} {side} {delay.switch_s:.0f} s on, where the clock was set by "
-        f"{change:+.1f} s{_leap(late_s, found.sigma)}"
-    ).replace(" s on, where", " s, where" if is_before else " s on, where")
+    sign = -1.0 if sensor == "IMU" else 1.0
     section = SECTIONS.get(sensor, "[dvl]")
-    return what, (
-        f"take {late_s:.1f} s off time_s of the rows {side} {delay.switch_s:.0f} s in the table of "
-        f"{section}"
+    if delay is None or not found.is_set:
+        late_s = sign * found.value
+        leap_s, why = _leap(late_s, found.sigma)
+        what = f"{_late(late_s)} (sigma {found.sigma:.1g} s){why}"
+        if sensor not in OFFSETS:
+            return what, f"take {leap_s:.2f} s off time_s in the table of {section}"
+        stated = mission.dvl.mount.time_offset_s
+        if sensor == "GNSS" and mission.gnss is not None:
+            stated = mission.gnss.calibration.time_offset_s
+        return what, f"{section} time_offset_s = {stated + leap_s:.2f}"
+    is_before = abs(delay.before_s) > abs(delay.after_s)
+    late_s = sign * (delay.before_s if is_before else delay.after_s)
+    leap_s, why = _leap(late_s, found.sigma)
+    rows = f"before {delay.switch_s:.0f} s" if is_before else f"from {delay.switch_s:.0f} s on"
+    change = sign * (delay.after_s - delay.before_s)
+    return (
+        f"{_late(late_s)} {rows}, where the clock was set by {change:+.1f} s{why}",
+        f"take {leap_s:.1f} s off time_s of the rows {rows} in the table of {section}",
     )
 
 
@@ -146,9 +144,13 @@ def _late(late_s: float) -> str:
     return f"stamps {abs(late_s):.2f} s {'late' if late_s > 0.0 else 'early'}"
 
 
-def _leap(late_s: float, sigma: float) -> str:
+def _leap(late_s: float, sigma: float) -> tuple[float, str]:
+    """Return a delay, or the leap seconds that it must be, and what these mean."""
     reach = max(0.3, min(4.0 * sigma, 0.7))
-    return next((f": {what}" for s, what in LEAP_SECONDS.items() if abs(s - late_s) < reach), "")
+    for leap_s, what in LEAP_SECONDS.items():
+        if abs(leap_s - late_s) < reach:
+            return leap_s, f": {what}"
+    return late_s, ""
 
 
 def _of_gyros(name: str, value: float) -> tuple[str, str]:

@@ -66,12 +66,14 @@ class Family:
     least: float
     """How far from the null it has to be to matter."""
     null: float = 0.0
+    cared: float = 0.0
+    """How far from it a calibration that the mission asks for takes care of."""
     is_discrete: bool = False
     """Whether values between those to try mean nothing."""
     only_poor: bool = False
     """Whether it is only tried where the logs agree poorly."""
-    clock: str = ""
-    """The field of the hypothesis, if it is a delay that may change."""
+    clocks: tuple[str, ...] = ()
+    """The delays of the hypothesis that it changes, if it is a clock."""
     part: str = ""
     """The part that says most of it."""
 
@@ -101,9 +103,14 @@ class Found:
         return enough and off > max(least, SURE * self.sigma)
 
     @property
+    def is_cared_for(self) -> bool:
+        """Whether the mission asks for a calibration that finds it."""
+        return not self.is_set and abs(self.value - self.family.null) <= self.family.cared
+
+    @property
     def delay(self) -> Delay | None:
         """The delay of its clock, None of what is none."""
-        return getattr(self.hypothesis, self.family.clock) if self.family.clock else None
+        return getattr(self.hypothesis, self.family.clocks[0]) if self.family.clocks else None
 
     @property
     def is_set(self) -> bool:
@@ -229,10 +236,9 @@ class Evidence:
         part = next((p for p in self.logs.parts if p.name == family.part), None)
         if part is None or len(part.begin_s) < 3:
             return None
-        steady = replace(base, **{family.clock: Delay()})
 
         def of(delay: Delay) -> Hypothesis:
-            return replace(steady, **{family.clock: delay})
+            return replace(base, **dict.fromkeys(family.clocks, delay))
 
         def loss_of(delays: Sequence[Delay]) -> Array:
             return self.total([of(d) for d in delays], family.part)
