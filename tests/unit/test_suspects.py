@@ -23,9 +23,10 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.io.blueye.convert import convert_blueye
 from ssm_graph.mission.fault import DetectedFault, Treatment
 from ssm_graph.mission.mission import Mission
-from ssm_graph.mission.suspects.evidence import Delay, robust_residual, walk_covariance, whitener
 from ssm_graph.mission.suspects.find import find_suspects, with_suspects
+from ssm_graph.mission.suspects.hypothesis import Delay
 from ssm_graph.mission.suspects.motion import Inertial
+from ssm_graph.mission.suspects.regression import robust_residual, walk_covariance, whitener
 from ssm_graph.mission.suspects.search import vertex
 from ssm_graph.sensors.compass import HeadingLog
 from ssm_graph.sensors.dvl import beams_from_angles, rpy_from_R_bd
@@ -121,7 +122,8 @@ def number(text: str) -> float:
 
 
 @pytest.mark.parametrize(
-    ("route", "grade"), zip(ROUTES, 2 * [Grade.NAVIGATION, Grade.TACTICAL, Grade.MEMS], strict=True)
+    ("route", "grade"),
+    list(zip(ROUTES, 2 * [Grade.NAVIGATION, Grade.TACTICAL, Grade.MEMS], strict=True)),
 )
 def test_nobody_is_accused_without_a_fault(route: str, grade: Grade) -> None:
     """With realistic instruments and waves; a straight run has no turn and says nothing."""

@@ -20,24 +20,33 @@ that it is bad.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.times import Indices, is_inside
-from ssm_graph.mission.mission import Mission
-from ssm_graph.mission.suspects.motion import STEP_S, Inertial, Velocities
+from ssm_graph.mission.suspects.hypothesis import NOTHING, Hypothesis
+from ssm_graph.mission.suspects.regression import (
+    NEUTRAL,
+    TINY,
+    robust_residual,
+    twice_walk_covariance,
+    walk_covariance,
+    whitener,
+)
+from ssm_graph.mission.suspects.track import (
+    GRAVITY,
+    Logs,
+    arm_of,
+    integral,
+    track_covariance,
+)
 from ssm_graph.sensors.compass import HeadingLog
-from ssm_graph.sensors.imu import ImuNoise
 
-DOF: Final = 4.0
-"""Of the Student distribution that residuals are judged by."""
 WINDOW_S: Final = 30.0
 FEWEST: Final = 12
 """Readings of a window or a part."""
@@ -48,74 +57,22 @@ LARGEST_SCALE: Final = 0.07
 """The DVL's speeds may be off by so much of what the fixes say before it is a question of units."""
 WALK: Final = 0.01
 """Of the speed, 1/sqrt(s): what a track of pings walks beside the noise of the beams."""
-GRAVITY: Final = 9.81
-"""m/s^2"""
-SLOPE: Final = 0.002
-"""rad, to which the level axes are known."""
-PROLONGED: Final = 60
-"""Steps of the grid at either end that say how the vehicle came and went on."""
-FARTHEST_S: Final = 60.0
-TINY: Final = 1e-12
-MEDIAN_SQUARE: Final = 0.455
-"""Of a standard Gaussian."""
-NEUTRAL: Final = 0.926
-"""A residual whose loss is that of a standard Gaussian one in the mean."""
-Mask = NDArray[np.bool_]
-SILENCE_S: Final = 3.0
-"""Longer gaps between pings are bridged by the accelerometers alone."""
-
-
-@dataclass(frozen=True)
-class Delay:
-    """How late the stamps of an instrument are; what differs from a switch on was set there."""
-
-    before_s: float = 0.0
-    after_s: float = 0.0
-    switch_s: float = -np.inf
-
-    def at(self, time_s: Array) -> Array:
-        """Return the delay at stamps (n,)."""
-        return np.where(time_s < self.switch_s, self.before_s, self.after_s)
-
-    def later(self, by_s: float) -> Delay:
-        """Return a delay that is longer throughout."""
-        return Delay(self.before_s + by_s, self.after_s + by_s, self.switch_s)
-
-
-ON_TIME: Final = Delay()
-
-
-@dataclass(frozen=True)
-class Hypothesis:
-    """What is wrong with the logs; by default nothing."""
-
-    gyro: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Readings about x, y, z are to be multiplied by these."""
-    velocity: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-    """(9,) matrix, row by row, that leads the velocities of the DVL to the true ones, body axes."""
-    dvl: Delay = ON_TIME
-    gnss: Delay = ON_TIME
-    depth: Delay = ON_TIME
-    compass: Delay = ON_TIME
-    depth_scale: float = 1.0
-    """Depths are to be multiplied by this."""
-    is_swapped: bool = False
-    """Whether longitudes and latitudes of the fixes have changed places."""
-    jump_s: float = -np.inf
-    """Before this, fixes are off by a constant."""
-
-
-NOTHING: Final = Hypothesis()
 
 
 class Part(Protocol):
     """One comparison of instruments."""
 
-    name: str
-    group: Indices
-    """(n,) the block, from 0, that each residual belongs to; blocks err independently."""
-    begin_s: Array
-    """(g,) when the blocks begin"""
+    @property
+    def name(self) -> str:
+        """What people call it."""
+
+    @property
+    def group(self) -> Indices:
+        """(n,) the block, from 0, that each residual belongs to; blocks err independently."""
+
+    @property
+    def begin_s(self) -> Array:
+        """(g,) when the blocks begin, s."""
 
     def depends_on(self, of: Hypothesis) -> tuple[object, ...]:
         """Return what of a hypothesis the residuals depend on."""
@@ -124,93 +81,12 @@ class Part(Protocol):
         """Return the whitened residuals (n,)."""
 
 
-class Logs:
-    """A mission as its parts need it, with the inertial data summed up once for each scale."""
-
-    def __init__(self, mission: Mission) -> None:
-        """Take the logs of a mission."""
-        self.mission = mission
-        self.velocities = Velocities.of(mission.dvl)
-        self._inertial: dict[tuple[float, float, float], Inertial] = {}
-        self._tracks: dict[tuple[object, ...], _Track] = {}
-
-    def inertial(self, of: Hypothesis) -> Inertial:
-        """Return the inertial data with the gyros of a hypothesis."""
-        if of.gyro not in self._inertial:
-            self._inertial[of.gyro] = Inertial.of(self.mission.imu, np.array(of.gyro))
-        return self._inertial[of.gyro]
-
-    def pings(self, of: Hypothesis) -> Velocities:
-        """Return the velocities of a hypothesis."""
-        stamps = self.velocities.time_s
-        scaled = self.velocities.scaled(np.reshape(of.velocity, (3, 3)))
-        return scaled.at_times(stamps - of.dvl.at(stamps))
-
-    def track(self, of: Hypothesis) -> _Track:
-        """Return the track of a hypothesis."""
-        key = (of.gyro, of.velocity, of.dvl)
-        if key not in self._tracks:
-            self._tracks[key] = _Track.of(self, of)
-        return self._tracks[key]
-
-    @cached_property
-    def parts(self) -> list[Part]:
-        """What there is to compare."""
-        made = (kind.of(self) for kind in (VelocityPart, FixPart, DepthPart, CompassPart))
-        return [part for part in made if part is not None]
-
-
-def whitener(covariance: Array) -> Array:
-    """Return the matrix that whitens errors of a covariance (n, n)."""
-    n = len(covariance)
-    return np.asarray(solve_triangular(np.linalg.cholesky(covariance), np.eye(n), lower=True))
-
-
-def track_covariance(time_s: Array, pings: Velocities, noise: ImuNoise, walk: float) -> Array:
-    """Return the covariance (n, n) of a track that walks, most of all where pings are missing."""
-    gap_s = np.diff(pings.time_s)
-    force = noise.accel_bias_sigma + SLOPE * GRAVITY
-    lost = np.where(gap_s > SILENCE_S, (force * gap_s**3 / 12.0) ** 2, 0.0)
-    total = walk * pings.time_s + np.concatenate([[0.0], np.cumsum(lost)])
-    variance = np.interp(time_s, pings.time_s, total - total[0])
-    return np.minimum.outer(variance, variance)
-
-
-def walk_covariance(time_s: Array) -> Array:
-    """Return the covariance (n, n) of a random walk of unit density, from the first time on."""
-    t = time_s - time_s[0]
-    return np.minimum.outer(t, t)
-
-
-def twice_walk_covariance(time_s: Array) -> Array:
-    """Return the covariance (n, n) of the integral of a random walk of unit density."""
-    t = time_s - time_s[0]
-    low, high = np.minimum.outer(t, t), np.maximum.outer(t, t)
-    return np.asarray(low**2 * (3.0 * high - low) / 6.0)
-
-
-def robust_residual(y: Array, X: Array, known: Mask, *, rounds: int = 3) -> tuple[Array, Array]:
-    """Return residuals (n,) and coefficients (c,) of a regression with a Student loss.
-
-    Rows that are not ``known`` (n,), before or after all logs, say nothing for or against.
-    """
-    weight = known.astype(float)
-    for _ in range(rounds):
-        root = np.sqrt(weight)
-        coefficients = np.linalg.lstsq(X * root[:, None], y * root, rcond=1e-10)[0]
-        residual = y - X @ coefficients
-        usual = np.median(np.abs(residual[known]) ** 2) if known.any() else 1.0
-        scale_sq = max(float(usual) / MEDIAN_SQUARE, TINY)
-        weight = known * (DOF + 1.0) / (DOF + np.abs(residual) ** 2 / scale_sq)
-    return np.where(known, residual, NEUTRAL), coefficients
-
-
 @dataclass(frozen=True)
 class _Window:
     rows: slice
     axes: Array
     """(3, 3) the axes that do not turn to two level ones and up"""
-    whiten: tuple[Array, Array, Array]
+    whiten: tuple[Array, ...]
     """(n, n) whitens errors of each of these, less what a parabola takes up"""
 
     @classmethod
@@ -253,7 +129,7 @@ class VelocityPart:
             return None
         edges = np.arange(pings.time_s[0], pings.time_s[-1] + WINDOW_S, WINDOW_S)
         cuts = np.searchsorted(pings.time_s, edges)
-        ranges = [(a, b) for a, b in zip(cuts[:-1], cuts[1:], strict=True) if b - a >= FEWEST]
+        ranges = [(a, b) for a, b in pairwise(cuts.tolist()) if b - a >= FEWEST]
         ranges = ranges[:: 1 + len(ranges) // MOST_WINDOWS]
         if not ranges:
             return None
@@ -281,22 +157,15 @@ class VelocityPart:
         error = pings.in_i(inertial) - inertial.at(inertial.gained_i, pings.time_s)
         return self._whitened(error)
 
-    def columns(self, logs: Logs, of: Hypothesis) -> Array:
-        """Return how the residuals (n, 9) follow the matrix of the velocities, row by row."""
-        inertial, pings = logs.inertial(of), logs.pings(of)
-        R_ib = inertial.at(inertial.R_ib, pings.time_s)
-        columns = np.einsum("nij,nk->nijk", R_ib, pings.v_b).reshape(len(pings), 3, 9)
-        return self._whitened(columns)
-
 
 def _of_biases(time_s: Array, v_i: Array, logs: Logs) -> Array:
     """Return what biases of one sigma, fixed to the body, add to an error (n, 3, 6), m/s."""
     inertial, noise = logs.inertial(NOTHING), logs.mission.imu.noise
     grid = slice(*np.searchsorted(inertial.time_s, [time_s[0] - 0.1, time_s[-1] + 0.1]))
     t = inertial.time_s[grid]
-    turned = _integral(t, inertial.R_ib[grid])
+    turned = integral(t, inertial.R_ib[grid])
     force = np.gradient(inertial.gained_i[grid], t, axis=0)
-    lost = _integral(t, np.cross(turned, force[:, :, None], axis=1))
+    lost = integral(t, np.cross(turned, force[:, :, None], axis=1))
     at = np.clip(np.searchsorted(t, time_s), 0, len(t) - 1)
     of_gyro = np.cross(turned[at], v_i[:, :, None], axis=1) - lost[at]
     return np.concatenate(
@@ -309,66 +178,6 @@ def _without_parabola(time_s: Array, covariance: Array) -> Array:
     s = (time_s - time_s.mean()) / WINDOW_S
     Q = np.linalg.qr(W @ np.stack([np.ones_like(s), s, s**2], axis=1))[0]
     return np.asarray(W - Q @ (Q.T @ W))
-
-
-def _integral(time_s: Array, rate: Array) -> Array:
-    """Return the integral (n, ...) of a rate by trapezoids."""
-    step = 0.5 * np.diff(time_s).reshape((-1,) + (1,) * (rate.ndim - 1))
-    total = np.cumsum(step * (rate[1:] + rate[:-1]), axis=0)
-    return np.concatenate([np.zeros_like(total[:1]), total])
-
-
-def _prolonged(grid: Array) -> Array:
-    """Return a quantity (G,) of an even grid with a point far before and after, as it went on."""
-    before, after = grid[PROLONGED] - grid[0], grid[-1] - grid[-1 - PROLONGED]
-    far = FARTHEST_S / (PROLONGED * STEP_S)
-    return np.concatenate([[grid[0] - far * before], grid, [grid[-1] + far * after]])
-
-
-@dataclass(frozen=True, eq=False)
-class _Track:
-    """The way by pings and gyros, in level axes that do not turn; at the ends as it went on."""
-
-    time_s: Array
-    """(G,)"""
-    way: Array
-    """(G,) complex, m"""
-    drift: Array
-    """(G,) complex: what an error of heading or scale that grows adds, m"""
-    up: Array
-    """(G,) m"""
-    along_b: Array
-    """(G,) complex, forward and to the right as the body goes, m"""
-
-    @classmethod
-    def of(cls, logs: Logs, of: Hypothesis) -> _Track:
-        inertial, pings = logs.inertial(of), logs.pings(of)
-        t, gained = inertial.time_s, inertial.gained_i
-        # Between pings the accelerometers say how the velocity changes.
-        off = pings.in_i(inertial) - inertial.at(gained, pings.time_s)
-        v_i = gained + np.stack([np.interp(t, pings.time_s, axis) for axis in off.T], axis=-1)
-        first, second = inertial.level_i
-        level = np.sum(v_i * first, axis=1) + 1j * np.sum(v_i * second, axis=1)
-        along = (t - 0.5 * (t[0] + t[-1])) / (t[-1] - t[0])
-        up = np.sum(v_i * inertial.up_i, axis=1)
-        forward, right = (np.sum(v_i * inertial.R_ib[:, :, k], axis=1) for k in (0, 1))
-        rates = (level, along * level, up, forward + 1j * right)
-        return cls(*(_prolonged(x) for x in (t, *(_integral(t, rate) for rate in rates))))
-
-    def at(self, quantity: Array, time_s: Array) -> Array:
-        return np.interp(time_s, self.time_s, quantity)
-
-    def covers(self, time_s: Array) -> Mask:
-        return is_inside(time_s, float(self.time_s[1]), float(self.time_s[-2]))
-
-
-def _arm(logs: Logs, of: Hypothesis, lever_arm_b: Array, time_s: Array) -> tuple[Array, Array]:
-    """Return a lever arm in the level axes, complex (n,), and its part upwards (n,), m."""
-    inertial = logs.inertial(of)
-    arm_i = inertial.at(inertial.R_ib, time_s) @ lever_arm_b
-    first, second, up = (inertial.at(x, time_s) for x in (*inertial.level_i, inertial.up_i))
-    level = np.sum(arm_i * first, axis=1) + 1j * np.sum(arm_i * second, axis=1)
-    return level, np.sum(arm_i * up, axis=1)
 
 
 def _chosen(time_s: Array, logs: Logs) -> Indices:
@@ -440,12 +249,12 @@ class FixPart:
         at_s = self.time_s - of.gnss.at(self.time_s)
         track = logs.track(of)
         assert logs.mission.gnss is not None
-        arm = _arm(logs, of, logs.mission.gnss.lever_arm_b, at_s)[0]
+        arm = arm_of(logs, of, logs.mission.gnss.lever_arm_b, at_s)[0]
         way = track.at(track.way, at_s) + arm
         y = self.whiten @ (self.swapped if of.is_swapped else self.fix)
         columns = [way, np.ones_like(way), track.at(track.drift, at_s)]
         if of.jump_s > self.time_s[0]:
-            columns.append(self.time_s < of.jump_s)
+            columns.append((self.time_s < of.jump_s).astype(float))
         X = self.whiten @ np.stack(columns, axis=1)
         known = track.covers(at_s)
         residual, c = robust_residual(y, X, known)
@@ -503,7 +312,7 @@ class DepthPart:
         """Return the whitened residuals (n,)."""
         at_s, track = self.time_s - of.depth.at(self.time_s), logs.track(of)
         assert logs.mission.depth is not None
-        up = track.at(track.up, at_s) + _arm(logs, of, logs.mission.depth.lever_arm_b, at_s)[1]
+        up = track.at(track.up, at_s) + arm_of(logs, of, logs.mission.depth.lever_arm_b, at_s)[1]
         ways = [track.at(way, at_s) for way in (track.way, track.along_b)]
         X = np.stack(
             [np.ones_like(up), *(part for way in ways for part in (way.real, way.imag))], axis=1
@@ -560,3 +369,14 @@ class CompassPart:
         )
         known = is_inside(at_s, float(inertial.time_s[0]), float(inertial.time_s[-1]))
         return robust_residual(self.whiten @ (h - turned), self.whiten @ X, known)[0]
+
+
+def parts_of(logs: Logs) -> tuple[Part, ...]:
+    """Return what there is to compare."""
+    made: tuple[Part | None, ...] = (
+        VelocityPart.of(logs),
+        FixPart.of(logs),
+        DepthPart.of(logs),
+        CompassPart.of(logs),
+    )
+    return tuple(part for part in made if part is not None)

@@ -12,7 +12,7 @@ import numpy as np
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.mission.mission import Mission
-from ssm_graph.mission.suspects.evidence import Hypothesis
+from ssm_graph.mission.suspects.hypothesis import Hypothesis, with_delays
 from ssm_graph.mission.suspects.search import Family
 from ssm_graph.sensors.dvl import DvlMount
 
@@ -99,7 +99,7 @@ def clock_families(mission: Mission) -> Iterator[Family]:
 
     def of(name: str, *clocks: str, least: float, part: str, sigma_s: float = 0.0) -> Family:
         def make(base: Hypothesis, late_s: float) -> Hypothesis:
-            return replace(base, **{c: getattr(base, c).later(late_s) for c in clocks})
+            return with_delays(base, {c: getattr(base, c).later(late_s) for c in clocks})
 
         cared = BOUND * sigma_s
         return Family(name, make, NEAR_S, FAR_S, least, cared=cared, clocks=clocks, part=part)
@@ -120,8 +120,8 @@ def scale_families(mission: Mission) -> Iterator[Family]:
     for name, axes in (("gyros", (0, 1, 2)), ("gyro x", (0,)), ("gyro y", (1,)), ("gyro z", (2,))):
 
         def turn(base: Hypothesis, by: float, axes: tuple[int, ...] = axes) -> Hypothesis:
-            gyro = tuple(g * by if i in axes else g for i, g in enumerate(base.gyro))
-            return replace(base, gyro=gyro)
+            x, y, z = (g * by if i in axes else g for i, g in enumerate(base.gyro))
+            return replace(base, gyro=(x, y, z))
 
         far = GYRO_SCALES if len(axes) == 3 else (-1.0,)
         yield Family(

@@ -8,16 +8,8 @@ from typing import Final
 from ssm_graph.mission.estimate import Estimate, Status
 from ssm_graph.mission.fault import DetectedFault
 from ssm_graph.mission.mission import Mission
-from ssm_graph.mission.suspects.evidence import NOTHING, Delay, Hypothesis, Logs
 from ssm_graph.mission.suspects.families import SET_S, clock_families, scale_families
-from ssm_graph.mission.suspects.search import (
-    ENOUGH,
-    JUMP_AS_GOOD,
-    STEP_BETTER,
-    Evidence,
-    Family,
-    Found,
-)
+from ssm_graph.mission.suspects.hypothesis import NOTHING, Delay, Hypothesis
 from ssm_graph.mission.suspects.motion import is_enough
 from ssm_graph.mission.suspects.plain import (
     fault_of,
@@ -27,6 +19,13 @@ from ssm_graph.mission.suspects.plain import (
     reordered,
 )
 from ssm_graph.mission.suspects.say import said, said_order
+from ssm_graph.mission.suspects.search import (
+    JUMP_AS_GOOD,
+    STEP_BETTER,
+    Evidence,
+    Family,
+    Found,
+)
 
 MOST: Final = 3
 """Suspects of one mission; with more, nothing is known."""
@@ -76,7 +75,7 @@ def with_suspects(estimate: Estimate, suspects: tuple[DetectedFault, ...]) -> Es
 
 def search(mission: Mission) -> list[Found]:
     """Return the hypotheses that the logs ask for, the best first, each beside those before."""
-    evidence, base = Evidence(Logs(mission)), NOTHING
+    evidence, base = Evidence.of(mission), NOTHING
     families = [*clock_families(mission), *scale_families(mission)]
     found: list[Found] = []
     for _ in range(MOST):
@@ -86,10 +85,11 @@ def search(mission: Mission) -> list[Found]:
         sure += _set_clocks(evidence, families, base, poor, sure)
         if not sure:
             break
-        best = max(sure, key=lambda one: one.gain)
-        same = [one for one in sure if one is not best and one.gain > best.gain - AS_GOOD]
+        most = max(one.gain for one in sure)
+        good = [one for one in sure if one.gain > most - AS_GOOD]
+        best = max(good, key=lambda one: (one.is_cared_for, one.gain))
         if not best.is_cared_for:
-            found.append(replace(best, rivals=tuple(same)))
+            found.append(replace(best, rivals=tuple(one for one in good if one is not best)))
         base = best.hypothesis
         families = [family for family in families if family is not best.family]
     return found

@@ -151,10 +151,10 @@ class Velocities:
         """Return the velocity of the body origin (P, 3) in the axes that do not turn, m/s."""
         R_ib = inertial.at(inertial.R_ib, self.time_s)
         arm_b = np.cross(inertial.at(inertial.gyro_b, self.time_s), self.lever_arm_b)
-        return np.einsum("nij,nj->ni", R_ib, self.v_b - arm_b)
+        return np.asarray(np.einsum("nij,nj->ni", R_ib, self.v_b - arm_b))
 
 
 def is_enough(mission: Mission) -> bool:
     """Return whether there is anything to compare."""
     imu = mission.imu
-    return len(imu.time_s) > 2 and imu.time_s[-1] - imu.start_s > 2.0 * LEVEL_S
+    return len(imu.time_s) > 2 and bool(imu.time_s[-1] - imu.start_s > 2.0 * LEVEL_S)

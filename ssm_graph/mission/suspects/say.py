@@ -11,7 +11,6 @@ import numpy as np
 from ssm_graph.base.frozen import Array
 from ssm_graph.mission.fault import DetectedFault, Treatment
 from ssm_graph.mission.mission import Mission
-from ssm_graph.mission.suspects.evidence import Delay
 from ssm_graph.mission.suspects.families import AXES, DEPTH_UNITS, UNITS
 from ssm_graph.mission.suspects.search import Found
 from ssm_graph.sensors.dvl import DvlMount, rpy_from_R_bd
@@ -204,8 +203,7 @@ def said_order(order: tuple[int, ...], sign: float) -> tuple[str, str]:
 def order_of(
     mount: DvlMount, M: Array, order: tuple[int, ...] | None
 ) -> tuple[tuple[int, ...], float] | None:
-    """Return the order of the beams, and their sign, that changes velocities by ``M`` (3, 3), instrument
-    axes.
+    """Return the order and sign of the beams that change velocities by ``M`` (3, 3) in their axes.
 
     ``order`` is the one that the velocities were solved with; None if none of them does.
     """

@@ -15,7 +15,11 @@ from typing import Final
 import numpy as np
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.mission.suspects.evidence import DOF, NOTHING, Delay, Hypothesis, Logs, Part
+from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.suspects.evidence import Part, parts_of
+from ssm_graph.mission.suspects.hypothesis import Delay, Hypothesis, with_delays
+from ssm_graph.mission.suspects.regression import EXPECTED_LOSS, loss, scale_of
+from ssm_graph.mission.suspects.track import Logs
 
 ENOUGH: Final = 25.0
 """Gain in the logarithm of the likelihood that is asked for; 6 sigma are 18."""
@@ -25,8 +29,6 @@ WITHOUT_BEST: Final = 10.0
 """Of the gain, what has to remain without the block that says most."""
 HINT: Final = 3.0
 """Gain of a small step from the null that makes a family worth a scan."""
-EXPECTED_LOSS: Final = 0.485
-"""Mean loss of a standard Gaussian residual."""
 POOR: Final = 1.6
 """Mean loss of a part over the expected one, above which every hypothesis about it is tried,"""
 POOR_BLOCK: Final = 4.0
@@ -41,16 +43,6 @@ STEP_BETTER: Final = 15.0
 """Gain over one constant delay that a clock that was set needs: a second delay and a time."""
 JUMP_AS_GOOD: Final = 6.0
 """A step of the position may explain the fixes better by so much."""
-
-
-def loss(residual: Array, scale: float) -> Array:
-    """Return minus the logarithm of the likelihood of each residual (n,), less a constant."""
-    return np.asarray(0.5 * (DOF + 1.0) * np.log1p((residual / scale) ** 2 / DOF))
-
-
-def scale_of(residual: Array) -> float:
-    """Return the scale of residuals whose sigma is stated as one; not less than one."""
-    return max(1.0, float(np.sqrt(np.median(residual**2) / 0.455)))
 
 
 @dataclass(frozen=True)
@@ -123,7 +115,14 @@ class Evidence:
     """Residuals of all parts, each made once for what it depends on."""
 
     logs: Logs
+    parts: tuple[Part, ...]
     _made: dict[tuple[object, ...], Array] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, mission: Mission) -> Evidence:
+        """Return that of a mission."""
+        logs = Logs(mission)
+        return cls(logs, parts_of(logs))
 
     def residual(self, part: Part, of: Hypothesis) -> Array:
         """Return the residuals (n,) of a part."""
@@ -137,8 +136,8 @@ class Evidence:
 
         All residuals of a part are on one scale, the least that one of the hypotheses needs.
         """
-        found = {}
-        for part in self.logs.parts:
+        found: dict[str, Array] = {}
+        for part in self.parts:
             differs = len({part.depends_on(of) for of in hypotheses}) > 1
             if not differs or only not in ("", part.name):
                 continue
@@ -146,7 +145,10 @@ class Evidence:
             scale = min(scale_of(r) for r in residuals)
             n = int(part.group[-1]) + 1
             found[part.name] = np.stack(
-                [np.bincount(part.group, loss(r, scale), minlength=n) for r in residuals]
+                [
+                    np.bincount(part.group, loss(r, scale), minlength=n).astype(float)
+                    for r in residuals
+                ]
             )
         return found
 
@@ -158,7 +160,7 @@ class Evidence:
     def poor(self, of: Hypothesis) -> set[str]:
         """Return the names of the parts that agree poorly."""
         names = set()
-        for part in self.logs.parts:
+        for part in self.parts:
             each = loss(self.residual(part, of), 1.0) / EXPECTED_LOSS
             blocks = np.bincount(part.group, each) / np.bincount(part.group)
             if each.mean() > POOR or blocks.max() > POOR_BLOCK:
@@ -168,7 +170,7 @@ class Evidence:
     def best_of(self, family: Family, base: Hypothesis, poor: set[str]) -> Found | None:
         """Return the best value of a family beside a base; None where nothing hints at it."""
         ends = [family.make(base, family.null), family.make(base, family.far[0])]
-        touched = {p.name for p in self.logs.parts if len({p.depends_on(h) for h in ends}) > 1}
+        touched = {p.name for p in self.parts if len({p.depends_on(h) for h in ends}) > 1}
         if not touched:
             return None
         first = family.part if family.part in touched else ""
@@ -233,12 +235,12 @@ class Evidence:
         base : what is known besides; its own delay of that clock is left out.
         values : delays to try before or after the change, s.
         """
-        part = next((p for p in self.logs.parts if p.name == family.part), None)
+        part = next((p for p in self.parts if p.name == family.part), None)
         if part is None or len(part.begin_s) < 3:
             return None
 
         def of(delay: Delay) -> Hypothesis:
-            return replace(base, **dict.fromkeys(family.clocks, delay))
+            return with_delays(base, dict.fromkeys(family.clocks, delay))
 
         def loss_of(delays: Sequence[Delay]) -> Array:
             return self.total([of(d) for d in delays], family.part)
@@ -265,7 +267,7 @@ class Evidence:
         losses = self.losses([of(d) for d in delays], part.name)[part.name]
         gains = losses[0] - losses[1:]
         for of_run, is_before in ((np.cumsum(gains, axis=1), True), (_sums_behind(gains), False)):
-            for v, block in zip(*np.unravel_index(np.argsort(of_run.ravel())[-4:], of_run.shape)):
+            for v, block in np.argwhere(of_run >= np.sort(of_run.ravel())[-4]):
                 at = min(int(block) + is_before, len(part.begin_s) - 1)
                 yield _step(values[int(v)], float(part.begin_s[at]), is_before)
         jumps = np.argsort(losses[0])[-2:]
@@ -325,4 +327,4 @@ def vertex(values: Array, curve: Array) -> tuple[float, float]:
     left_out, _ = least(total[:, None] - curve)
     n = len(left_out)
     scatter = np.sqrt((n - 1) / n * np.sum((left_out - left_out.mean()) ** 2))
-    return float(at), float(max(scatter, 1.0 / np.sqrt(max(bend, 1e-12))))
+    return float(at), max(float(scatter), max(float(bend), 1e-12) ** -0.5)
