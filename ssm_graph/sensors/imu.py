@@ -129,7 +129,7 @@ FASTEST_TURN: Final = 6.0
 """rad/s, of 99 % of the samples: no vehicle turns once a second for long."""
 _HALF_G: Final = 4.9
 _REPEATED_SHARE: Final = 0.2
-_FORCE_UNITS: Final = (
+FORCE_UNITS: Final = (
     (1.0, "g", "multiply them by 9.80665"),
     (1e3, "mg", "multiply them by 0.00980665"),
     (1e6, "ug", "multiply them by 9.80665e-6"),
@@ -297,7 +297,7 @@ def _specific_force(table: Table, known: ImuCalibration, axes: BodyAxes) -> None
     median = float(np.median(_length(force)))
     low, high = FORCE_RANGE
     if not low <= median <= high:
-        found = [(u, todo) for size, u, todo in _FORCE_UNITS if abs(median / size - 1.0) < 0.06]
+        found = [(u, todo) for size, u, todo in FORCE_UNITS if abs(median / size - 1.0) < 0.06]
         if found:
             hint = f"the readings are in {found[0][0]}: {found[0][1]}"
         elif median < 2.0:
