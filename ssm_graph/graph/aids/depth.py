@@ -67,7 +67,6 @@ class DepthMeans(Aid):
     name = "depth"
     unit = "m"
     hint = "look at its zero, sign and unit"
-    is_weighted = False
 
     depth: Array
     """(M,) m, positive down"""
