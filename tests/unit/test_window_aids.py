@@ -44,7 +44,12 @@ def of_known(**changes: object) -> SimulatedMission:
         standstills=(Standstill(4.0, 5.5, sigma=0.5),),
         others=(MagnetometerSettings(gross=GrossErrors(0.2, (5e-6, 50e-6))),),
     )
-    config = {"duration_s": 10.0, "aids": aids, "gnss": GnssSettings(windows=((0.0, 9.0),)), "seed": 2}
+    config = {
+        "duration_s": 10.0,
+        "aids": aids,
+        "gnss": GnssSettings(windows=((0.0, 9.0),)),
+        "seed": 2,
+    }
     return simulated(**(config | changes))
 
 

@@ -14,7 +14,7 @@ from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import GYRO_BIAS, POSITION, ROTATION, STATE_DIM, VELOCITY
 from ssm_graph.engine.states import NavigationStates, local_D_deviation
-from ssm_graph.filters.rules.update import NOMINAL, Iterate, Runs
+from ssm_graph.filters.rules.update import Iterate, Runs
 from ssm_graph.filters.side_by_side import Measurements
 from ssm_graph.graph.aids.depth import HeightTrack, height_on_the_way, height_track
 
@@ -36,7 +36,8 @@ class NavigationIterate(Iterate):
 class KeyframeModel:
     """Beams, depth and position fix of keyframe ``k``, about the predicted states of R runs.
 
-    Rows are the B beams, then the depth, then three of the fix, as far as the keyframe has them.
+    Rows are the B beams, then the depth, then three of the fix, as far as the keyframe has them;
+    depth and fix have an auxiliary parameter each. Fixes of one keyframe are one.
 
     Parameters
     ----------
@@ -63,16 +64,17 @@ class KeyframeModel:
         self.n_beams = len(beam_groups)
         """B, how many of the rows are beams"""
         present, groups = [self._root_information > 0.0], [beam_groups]
+        own_group = int(beam_groups.max(initial=-1)) + 1
         self._depth: _DepthRow | None = None
         if np.any(np.isfinite(measured.depths.depth[k])):
             self._depth = _depth_row(measured, k, predicted, before, frame)
             present.append(self._depth.root_information[:, None] > 0.0)
-            groups.append(np.array([NOMINAL]))
+            groups.append(np.array([own_group]))
         has_fix = measured.fixes.root_information[k].any(axis=(1, 2))
         self._has_fix = bool(np.any(has_fix))
         if self._has_fix:
             present.append(np.repeat(has_fix[:, None], 3, axis=1))
-            groups.append(np.full(3, NOMINAL))
+            groups.append(np.full(3, own_group + 1))
         self.present = np.concatenate(present, axis=1)
         self.group = np.concatenate(groups)
         runs = np.arange(len(self.present))
