@@ -101,6 +101,37 @@ class KeyframeModel:
         scale = np.where(present, self._root_information, np.nan)
         return np.asarray(self.predicted.innovation[:, : self.n_beams] / scale)
 
+    def aid_innovations(self) -> Array:
+        """Return how far (R, 4) depth and fix miss before the update, m, or NaN.
+
+        The height first, then the fix in navigation axes.
+        """
+        whitened = np.full((len(self.present), 4), np.nan)
+        whitened[:, self._aid_columns] = self.predicted.innovation[:, self.n_beams :]
+        found = np.full_like(whitened, np.nan)
+        depth = self._depth
+        if depth is not None:
+            has = depth.root_information > 0.0
+            found[has, 0] = whitened[has, 0] / depth.root_information[has]
+        if self._has_fix:
+            root = self._measured.fixes.root_information[self._k]
+            has = root.any(axis=(1, 2))
+            found[has, 1:] = np.linalg.solve(root[has], whitened[has, 1:, None])[..., 0]
+        return found
+
+    def of_aids(self, per_row: Array) -> Array:
+        """Return what rows (R, m) say of depth and fix, (R, 2), or NaN."""
+        found = np.full((len(per_row), 4), np.nan)
+        own = np.where(self.present, per_row, np.nan)[:, self.n_beams :]
+        found[:, self._aid_columns] = own
+        return found[:, :2]
+
+    @property
+    def _aid_columns(self) -> NDArray[np.intp]:
+        """Return where the rows behind the beams are among those of a depth and a fix."""
+        has = [self._depth is not None, *[self._has_fix] * 3]
+        return np.flatnonzero(has)
+
     def _at(
         self, states: NavigationStates, xi: Array, runs: Runs, local_D_xi: Array | None
     ) -> NavigationIterate:
