@@ -19,7 +19,8 @@ from ssm_graph.engine.extras import Extras
 from ssm_graph.engine.states import States
 from ssm_graph.graph.aids.aid import Aid, RowStates
 from ssm_graph.graph.aids.depth import DepthMeans
-from ssm_graph.mission.answer import LOW_WEIGHT, SUSPECT_SHARE
+from ssm_graph.graph.aids.gnss import Fixes
+from ssm_graph.mission.answer import LOW_WEIGHT, MISFIT, SUSPECT_SHARE, TRUSTED
 from ssm_graph.mission.estimate import AidTable
 from ssm_graph.mission.problem import Problem
 
@@ -210,7 +211,7 @@ def aid_table(judged: Sequence[JudgedAid]) -> AidTable | None:
 
 
 RUN = 20
-"""Successive measurements of an aid that are looked at together."""
+"""Successive depths, or position fixes, that are looked at together."""
 SHORTEST_RUN = 8
 """Of fewer nothing is said."""
 RUN_TAIL = 0.03
@@ -232,7 +233,21 @@ def _doubt(one: JudgedAid) -> str:
             f"{100.0 * share:.0f} % of the {len(weights)} {aid.name} measurements contradict "
             f"the answer (weight below {LOW_WEIGHT}): {aid.hint}"
         )
-    size = min(RUN, len(weights))
+    if isinstance(aid, DepthMeans | Fixes):
+        return _doubt_run(one)
+    trusted = np.mean(one.error**2, axis=1)[weights >= TRUSTED]
+    misfit = float(np.mean(trusted)) if len(trusted) else 0.0
+    if misfit <= MISFIT:
+        return ""
+    return (
+        f"{aid.name} measurements that count miss the answer by {np.sqrt(misfit):.1f} of their "
+        f"own sigmas (rms): their noise is stated too small, or {aid.hint}"
+    )
+
+
+def _doubt_run(one: JudgedAid) -> str:
+    """Look for successive measurements of place that miss the answer together."""
+    aid, size = one.aid, min(RUN, len(one.weight))
     if size < SHORTEST_RUN:
         return ""
     runs = np.lib.stride_tricks.sliding_window_view(np.sum(one.error**2, axis=1), size)
