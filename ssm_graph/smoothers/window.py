@@ -46,6 +46,9 @@ class FixedLagConfig:
     m/s: what is less bends nothing, however certain."""
     reweigh: float = 1e-9
     """A beam's weight, in a window of several keyframes, is renewed once it is off by so much."""
+    gate_sigmas: float = np.inf
+    """A depth or GNSS fix further than this from what is predicted gets no weight, and keeps none:
+    a height that little is known of would follow many of them, however far off."""
     first_estimates: bool = False
     """Keep the oldest keyframe where its prior was made, with the Jacobians of that point."""
 
@@ -225,6 +228,8 @@ class Window:
         graph = self._graph
         step, root_cov = graph.prediction(self._weights)
         k, row = len(self.keyframes) - 1, graph.first_row[-2]
+        if np.isfinite(self.config.gate_sigmas):
+            graph.aids.refuse_far(k, step, root_cov, sigmas=self.config.gate_sigmas)
         if graph.aids.meet_prediction(k, step, root_cov, self.config.kernel):
             graph.changed_from(k)
         H = graph.jacobian[row:]
