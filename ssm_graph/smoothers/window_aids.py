@@ -152,7 +152,9 @@ class WindowAids:
             rows = np.empty((*one.error[first:].shape, n + 1))
             rows[..., :n] = one.jacobian[first:]
             np.negative(one.error[first:], out=rows[..., n])
-            rows *= np.sqrt(one.weight[first:])[:, None, None]
+            # What is out has no row at all: floors of what is far off would move a free height.
+            weight = np.where(one.is_out[first:], 0.0, one.weight[first:])
+            rows *= np.sqrt(weight)[:, None, None]
             keyframes.append(np.repeat(one.aid.keyframe[first:], rows.shape[1]))
             blocks.append(rows.reshape(-1, n + 1))
         return np.concatenate(keyframes), np.concatenate(blocks)
@@ -188,7 +190,7 @@ class WindowAids:
         dims = np.concatenate([np.full(len(one.aid), one.aid.dim) for one in some])
         measurement = np.repeat(np.arange(len(dims)), dims)
         is_out = np.concatenate([one.is_out for one in some])
-        counts = np.where(is_out, np.sqrt(WEIGHT_FLOOR), 1.0)[measurement]
+        counts = np.where(is_out, 0.0, 1.0)[measurement]
         H = np.concatenate([one.jacobian.reshape(-1, len(step)) for one in some])
         H = H * counts[:, None]
         error = counts * np.concatenate([one.error.ravel() for one in some])

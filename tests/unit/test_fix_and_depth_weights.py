@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from factors.similarity import LogKernel
+from factors.similarity import WEIGHT_FLOOR, LogKernel
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import POSITION
 from ssm_graph.filters.navigation.named import filter_geodetic, filter_problems
@@ -264,3 +264,27 @@ def test_every_fix_is_one_measurement_of_three_components() -> None:
     weight = estimate.aids.weight[of_gnss].reshape(-1, 3)
     assert len(weight) == len(problem.fixes)
     np.testing.assert_array_equal(weight, np.repeat(weight[:, :1], 3, axis=1))
+
+
+def test_what_is_beyond_the_gate_of_a_window_is_listed_and_never_counts() -> None:
+    """Many depths of another unit against a height that nothing else holds: not by a millimetre."""
+    mission = surfaced().mission
+    depth, start = depth_of(mission), mission.initial
+    assert start is not None
+    bad = np.where(depth.time_s > 20.0, 100.0 * depth.depth, depth.depth)
+    config = FixedLagConfig(5.0, gate_sigmas=6.0)
+    fixes = np.flatnonzero(gnss_of(mission).time_s > 20.0)
+    no_fixes = without(mission, fixes, np.array([], int))
+    found, expected = (
+        solve_fixed_lag(build_problem(replace(no_fixes, depth=log)), config).delayed
+        for log in (
+            replace(depth, depth=bad),
+            depth_of(without(mission, fixes, np.flatnonzero(depth.time_s > 20.0))),
+        )
+    )
+    np.testing.assert_allclose(found.trajectory.height, expected.trajectory.height, atol=1e-3)
+    assert found.aids is not None
+    weight = weights_of(found.aids, "depth")
+    assert len(weight) == len(depth.depth)
+    assert weight[depth.time_s > 20.5].max() == WEIGHT_FLOOR
+    assert "depth measurements contradict" in found.reason
