@@ -58,10 +58,10 @@ def add_parser(commands: Any, *, epilog: str) -> None:
         "noise with tails that changes slowly (default: bias, walk and white noise as stated)",
     )
     parser.add_argument(
-        "--calibrate-imu",
+        "--calibrate",
         action="store_true",
-        help="with --realistic, the mission asks for scale, misalignment and g-sensitivity of its "
-        "IMU, in the sizes of the grade",
+        help="with --realistic, the mission states what its instruments err in: it asks for scale, "
+        "misalignment and g-sensitivity of its IMU, in the sizes of the grade, and for slow errors",
     )
     parser.add_argument("--seed", type=int, default=0, help="same seed, same mission (default: 0)")
     add_mission_output(parser)
@@ -77,7 +77,7 @@ def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
         "duration_s": arguments.duration,
         "imu_rate_hz": arguments.imu_rate,
         "realistic": arguments.realistic or None,
-        "calibrates_imu": arguments.calibrate_imu or None,
+        "calibrates": arguments.calibrate or None,
     }
     if arguments.beams is not None:
         told["dvl"] = replace(usual.dvl, mount=default_mount(arguments.beams))

@@ -10,7 +10,7 @@ import numpy as np
 from ssm_graph.engine.extras import Extra, Extras
 from ssm_graph.graph.aids import AIDS
 from ssm_graph.graph.aids.aid import along_axes, drift_variable
-from ssm_graph.graph.aids.depth import DEPTH_OFFSET, depth_variables
+from ssm_graph.graph.aids.depth import DEPTH_DRIFT, DEPTH_OFFSET, depth_variables
 from ssm_graph.graph.aids.gnss import GNSS_DRIFT, GNSS_LEVER_ARM, GNSS_TIME_OFFSET, gnss_variables
 from ssm_graph.mission.imu_variables import COLUMNS as IMU_ERRORS
 from ssm_graph.mission.imu_variables import imu_extras
@@ -78,7 +78,7 @@ CALIBRATIONS: Final = frozenset(
     }
 )
 """Those of the extra variables that tell of the instruments of every estimator."""
-DRIFTS: Final = frozenset({DVL_DRIFT, GNSS_DRIFT})
+DRIFTS: Final = frozenset({DVL_DRIFT, GNSS_DRIFT, DEPTH_DRIFT})
 """Those that tell of slow errors."""
 
 SEEN_BY_READINGS: Final = frozenset({DVL_TIME_OFFSET, DVL_LEVER_ARM})
@@ -120,7 +120,7 @@ def calibration_extras(
             as_a_turn=1e2,
         ),
         Extra(DVL_TIME_OFFSET, ("dvl_time_offset_s",), np.array([mount.time_offset_sigma_s])),
-        *drift_variable(DVL_DRIFT, "dvl_drift_{}_m_per_s", mount.drift),
+        *drift_variable(DVL_DRIFT, along_axes("dvl_drift_{}_m_per_s"), mount.drift),
     ]
     if depth is not None:
         extras += depth_variables(depth)

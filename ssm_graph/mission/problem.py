@@ -19,7 +19,7 @@ from ssm_graph.engine.error_state import POSITION, ROTATION, STATE_DIM, VELOCITY
 from ssm_graph.engine.extras import Extras
 from ssm_graph.graph.aids import AIDS
 from ssm_graph.graph.aids.aid import Aid, Keyframes, Table
-from ssm_graph.graph.aids.depth import Depths
+from ssm_graph.graph.aids.depth import DEPTH_DRIFT, Depths
 from ssm_graph.graph.aids.gnss import GNSS_DRIFT, Fixes
 from ssm_graph.imu.ping_motion import MotionBefore, mean_gyro
 from ssm_graph.imu.preintegration import InertialChain, imu_gaps, preintegrate_steps
@@ -230,17 +230,19 @@ def with_dvl(problem: Problem, mission: Mission) -> Problem:
 def with_white_noise(problem: Problem) -> Problem:
     """Return what an estimator whose variables are the drifts, too, makes of a problem, once.
 
-    A problem states the noise of beams and fixes with all that changes slowly; here their sigmas
-    are those of white noise alone, all of which is white.
+    A problem states the noise of beams, fixes and depths with all that changes slowly; here their
+    sigmas are those of white noise alone, all of which is white.
     """
-    beams, fixes = problem.beams, problem.fixes
+    beams, fixes, depths = problem.beams, problem.fixes, problem.depths
     if DVL_DRIFT in problem.extras:
         share = np.where(beams.is_water, 1.0, beams.white_share)
         beams = replace(beams, sigma=beams.sigma * share, white_share=1.0)
     if fixes is not None and GNSS_DRIFT in problem.extras:
         covariance_n = fixes.covariance_n * fixes.white_share**2
         fixes = replace(fixes, covariance_n=covariance_n, white_share=1.0)
-    return replace(problem, beams=beams, fixes=fixes)
+    if depths is not None and DEPTH_DRIFT in problem.extras:
+        depths = replace(depths, sigma=depths.sigma * depths.white_share, white_share=1.0)
+    return replace(problem, beams=beams, fixes=fixes, depths=depths)
 
 
 def _without_stuck_beams(mission: Mission) -> tuple[Mission, tuple[str, ...]]:

@@ -27,8 +27,8 @@ from ssm_graph.sensors.messages import Message
 OF_INSTABILITY: Final = 0.3
 """Random walk, per square root of a second, that wanders in 100 s as far as flicker noise whose
 Allan deviation has a floor of 1. The variance of flicker's increments grows with the logarithm of
-time, some ``2 s^2`` a decade with ``s = 1.29`` of the floor (IEEE Std 952, annex C); biases are told
-apart over minutes."""
+time, some ``2 s^2`` a decade with ``s = 1.29`` of the floor (IEEE Std 952, annex C); biases are
+told apart over minutes."""
 
 
 @dataclass(frozen=True, slots=True)

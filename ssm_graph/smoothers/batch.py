@@ -20,14 +20,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from factors.kernels import TruncatedKernel
+from factors.kernels import GeneralKernel, TruncatedKernel
 from factors.similarity import Kernel, LogKernel, Similarity, expected_mahalanobis_sq
 from ssm_graph.base.errors import ConfigError, SolverError
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps, at_once
 from ssm_graph.engine.chain import ChainSolution
 from ssm_graph.engine.error_state import STATE_DIM
-from ssm_graph.engine.reweighting import GncSchedule, Graduation, Schedule, WarmSchedule
+from ssm_graph.engine.reweighting import (
+    AdaptiveSchedule,
+    GncSchedule,
+    Graduation,
+    Schedule,
+    WarmSchedule,
+)
 from ssm_graph.engine.states import States
 from ssm_graph.graph.beacon_start import ambiguous_beacons
 from ssm_graph.graph.beam_rows import BeamRows
@@ -73,6 +79,8 @@ class SmootherConfig:
     """What a beam is judged by; None for what the kernel was published with."""
     graduation: Graduation | None = None
     """Come to a truncated kernel by graduated non-convexity; None goes straight to the kernel."""
+    adapt_shape: bool = False
+    """Give a general kernel the shape under which the residuals of the beams are likeliest."""
     fault_search: FaultSearch | None = None
     """Look for stretches in which one beam is off for long, and leave them out; None does not."""
     adapt_noise: bool = False
@@ -88,6 +96,8 @@ class SmootherConfig:
             raise ConfigError(f"tolerance: expected a number in (0, 1), got {self.tolerance}")
         if self.graduation is not None and not isinstance(self.kernel, TruncatedKernel):
             raise ConfigError(f"graduation: expected with a TruncatedKernel, got {self.kernel}")
+        if self.adapt_shape and not isinstance(self.kernel, GeneralKernel):
+            raise ConfigError(f"adapt_shape: expected with a GeneralKernel, got {self.kernel}")
 
     @property
     def judged_by(self) -> Similarity:
@@ -97,6 +107,9 @@ class SmootherConfig:
     @property
     def weighting(self) -> str:
         """Kernel and schedule as text, for example ``log(dof=5)``."""
+        if self.adapt_shape:
+            assert isinstance(self.kernel, GeneralKernel)
+            return f"adaptive(width={self.kernel.width:g})"
         if self.graduation is None:
             return str(self.kernel)
         assert isinstance(self.kernel, TruncatedKernel)
@@ -104,6 +117,9 @@ class SmootherConfig:
 
     def schedule(self) -> Schedule:
         """Return which kernel weighs the beams, pass by pass, from the begin."""
+        if self.adapt_shape:
+            assert isinstance(self.kernel, GeneralKernel)
+            return AdaptiveSchedule(self.kernel, WARM_KERNEL)
         if self.graduation is None:
             return WarmSchedule(self.kernel, WARM_KERNEL)
         assert isinstance(self.kernel, TruncatedKernel)
@@ -175,6 +191,8 @@ class Solved(NamedTuple):
     last: Pass
     iterations: tuple[Iteration, ...]
     status: Status
+    kernel: Kernel
+    """That of the answer"""
     notes: tuple[str, ...]
     first: FirstValues
 
@@ -286,7 +304,8 @@ class SsmSmoother:
             yield 0.007 * problem.n_keyframes
             weights = weights.after(this, faults)
         notes = problem.notes + faults.notes(rows.error) + _notes_of(first)
-        return Solved(linearizer, this, tuple(iterations), status, notes, first)
+        kernel = weights.of_beams.wanted
+        return Solved(linearizer, this, tuple(iterations), status, kernel, notes, first)
 
     def _iterate(
         self,
@@ -341,9 +360,9 @@ class SsmSmoother:
             spread = step.variance(beams.keyframe, H)
         return expected_mahalanobis_sq(rows.error, spread, sigma=beams.sigma)
 
-    def _cost(self, linearizer: GraphLinearizer, last: Pass) -> float:
+    def _cost(self, linearizer: GraphLinearizer, last: Pass, kernel: Kernel) -> float:
         """Return the cost with the robust losses of beams and aids for their weighted squares."""
-        kernel, rows = self.config.kernel, last.beam_rows
+        rows = last.beam_rows
         t = (rows.error / linearizer.problem.beams.sigma) ** 2
         loss = kernel.similarity(np.zeros_like(t)) - kernel.similarity(t)
         aids = linearizer.weighted
@@ -395,7 +414,7 @@ class SsmSmoother:
             ),
             iterations=solved.iterations,
             wall_s=wall_s,
-            cost=self._cost(linearizer, last),
+            cost=self._cost(linearizer, last, solved.kernel),
             start=problem.start,
             notes=solved.notes + noise_notes(noise) + undetermined(calibration),
             calibration=calibration,

@@ -47,7 +47,8 @@ class FixedLagConfig:
     reweigh: float = 1e-9
     """A beam's weight, in a window of several keyframes, is renewed once it is off by so much."""
     gate_sigmas: float = np.inf
-    """Depth and GNSS further than this from what is predicted are left out."""
+    """A depth or GNSS fix further than this from what is predicted gets no weight, and keeps none:
+    a height that little is known of would follow many of them, however far off."""
     first_estimates: bool = False
     """Keep the oldest keyframe where its prior was made, with the Jacobians of that point."""
 
@@ -226,9 +227,9 @@ class Window:
         """
         graph = self._graph
         step, root_cov = graph.prediction(self._weights)
-        if np.isfinite(self.config.gate_sigmas):
-            graph.leave_out_far(step, root_cov, sigmas=self.config.gate_sigmas)
         k, row = len(self.keyframes) - 1, graph.first_row[-2]
+        if np.isfinite(self.config.gate_sigmas):
+            graph.aids.refuse_far(k, step, root_cov, sigmas=self.config.gate_sigmas)
         if graph.aids.meet_prediction(k, step, root_cov, self.config.kernel):
             graph.changed_from(k)
         H = graph.jacobian[row:]

@@ -227,7 +227,7 @@ class FixPart:
         speed_sq = float(np.mean(np.sum(pings.v_b**2, axis=1)))
         walk = pings.sigma[0] ** 2 * float(np.median(np.diff(pings.time_s))) + WALK**2 * speed_sq
         drift = gnss.calibration.drift
-        white = sigma * (drift.white_share if drift.sigma else 1.0)
+        white = sigma * drift.white
         if drift.sigma:
             walk += 2.0 * drift.sigma**2 / drift.correlation_s
         covariance = np.diag(white**2)
