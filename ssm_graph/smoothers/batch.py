@@ -303,8 +303,9 @@ class SsmSmoother:
             yield 0.007 * problem.n_keyframes
             weights = weights.after(this, faults)
         notes = problem.notes + faults.notes(rows.error) + _notes_of(first)
-        kernel = weights.of_beams.wanted
-        return Solved(linearizer, this, tuple(iterations), status, kernel, notes, first)
+        return Solved(
+            linearizer, this, tuple(iterations), status, weights.of_beams.wanted, notes, first
+        )
 
     def _iterate(
         self,
