@@ -168,9 +168,9 @@ class AdaptiveSchedule(Schedule):
     ) -> tuple[Schedule, Array]:
         """Return the weights of the likeliest shape."""
         if self.fixed is not None:
-            fixed, weights = self.fixed.after(used, settled, t=t, update_sigmas=update_sigmas)
-            assert isinstance(fixed, WarmSchedule)
-            return replace(self, fixed=fixed), weights
+            now, weights = self.fixed.after(used, settled, t=t, update_sigmas=update_sigmas)
+            assert isinstance(now, WarmSchedule)
+            return replace(self, fixed=now), weights
         if update_sigmas >= NEAR_SIGMAS and self.shapes == 0:
             return self, settled
         shape = fitted_shape(t, width=self.wanted.width)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from enum import Enum
+from typing import Any
 
 import numpy as np
 
@@ -91,14 +92,16 @@ class AidTable(FrozenArrays):
     @classmethod
     def joined(cls, parts: Sequence[AidTable]) -> AidTable | None:
         """Return the rows of several tables, one after the other; None if there are none."""
-        columns = {
+        columns: dict[str, Any] = {
             spec.name: [value for part in parts for value in getattr(part, spec.name)]
             for spec in fields(cls)
         }
         if not columns["aid"]:
             return None
-        texts = {name: tuple(columns.pop(name)) for name in ("aid", "component", "unit")}
-        return cls(**texts, **{name: np.array(values) for name, values in columns.items()})
+        for name, values in columns.items():
+            is_text = name in ("aid", "component", "unit")
+            columns[name] = tuple(values) if is_text else np.array(values)
+        return cls(**columns)
 
     def counts(self) -> dict[str, tuple[int, int]]:
         """Return how many measurements each aid had, and how many ended as outliers."""

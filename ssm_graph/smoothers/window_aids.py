@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +45,8 @@ class _Measured(NamedTuple):
         """Return some measurements."""
         if rows == slice(0, len(self.weight)):
             return self
-        return _Measured(self.aid.take(rows), *(column[rows] for column in self[1:]))
+        columns: tuple[Any, ...] = tuple(column[rows] for column in self[1:])
+        return _Measured(self.aid.take(rows), *columns)
 
     def replaced(self, rows: slice, by: _Measured) -> _Measured:
         """Return these with as many others in the place of successive ones."""
@@ -58,7 +59,8 @@ class _Measured(NamedTuple):
         """Return these, then the others."""
         if len(self.weight) == 0 or len(other.weight) == 0:
             return other if len(self.weight) == 0 else self
-        columns = (np.concatenate(pair) for pair in zip(self[1:], other[1:], strict=True))
+        pairs = zip(self[1:], other[1:], strict=True)
+        columns: tuple[Any, ...] = tuple(np.concatenate(pair) for pair in pairs)
         return _Measured(self.aid.followed_by(other.aid), *columns)
 
     def rows_of(self, begin: int, end: int) -> slice:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from factors.similarity import WEIGHT_FLOOR, LogKernel
-from ssm_graph.base.frozen import Array
+from ssm_graph.base.times import Indices
 from ssm_graph.engine.error_state import POSITION
 from ssm_graph.filters.navigation.named import filter_geodetic, filter_problems
 from ssm_graph.graph.aids.depth import DepthMeans, Depths
@@ -46,7 +46,7 @@ def depth_of(mission: Mission) -> DepthLog:
     return mission.depth
 
 
-def with_wild(mission: Mission, fixes: Array, readings: Array) -> Mission:
+def with_wild(mission: Mission, fixes: Indices, readings: Indices) -> Mission:
     """Return the mission with fixes (F,) 50 m to the north, and depths (D,) 10 m too deep."""
     gnss, depth = gnss_of(mission), depth_of(mission)
     lat, deep = gnss.lat.copy(), depth.depth.copy()
@@ -55,7 +55,7 @@ def with_wild(mission: Mission, fixes: Array, readings: Array) -> Mission:
     return replace(mission, gnss=replace(gnss, lat=lat), depth=replace(depth, depth=deep))
 
 
-def without(mission: Mission, fixes: Array, readings: Array) -> Mission:
+def without(mission: Mission, fixes: Indices, readings: Indices) -> Mission:
     """Return the mission as if these had not been measured."""
     gnss, depth = gnss_of(mission), depth_of(mission)
     kept, read = np.ones(len(gnss.lat), bool), np.ones(len(depth.depth), bool)
@@ -136,7 +136,7 @@ def test_a_wild_fix_and_a_wild_depth_move_nothing(estimate: object) -> None:
 
 
 @pytest.mark.parametrize("first", [(np.array([0]), np.array([], int)), (np.array([0]),) * 2])
-def test_a_wild_first_fix_does_not_derail_the_smoother(first: tuple[Array, Array]) -> None:
+def test_a_wild_first_fix_does_not_derail_the_smoother(first: tuple[Indices, Indices]) -> None:
     """Of a start known to 10 km, which believes it: the next ones together are right."""
     mission = surfaced().mission
     start = mission.initial

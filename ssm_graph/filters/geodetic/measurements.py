@@ -47,9 +47,10 @@ class Rows(NamedTuple):
 
     def followed_by(self, other: Rows) -> Rows:
         """Return these rows, then others with groups of their own."""
-        columns = (np.concatenate(pair, axis=1) for pair in zip(self[:3], other[:3], strict=True))
-        group = np.append(self.group, other.group + self.group[-1] + 1)
-        return Rows(*columns, group)
+        Z, H, sigma = (
+            np.concatenate(pair, axis=1) for pair in zip(self[:3], other[:3], strict=True)
+        )
+        return Rows(Z, H, sigma, np.append(self.group, other.group + self.group[-1] + 1))
 
 
 class Places(NamedTuple):

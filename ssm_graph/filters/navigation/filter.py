@@ -33,6 +33,7 @@ from ssm_graph.engine.states import NavigationStates
 from ssm_graph.filters.navigation.measurements import KeyframeModel
 from ssm_graph.filters.rules.update import UpdateRule
 from ssm_graph.filters.side_by_side import require_alike, side_by_side
+from ssm_graph.graph.aids.aid import Aid
 from ssm_graph.graph.aids.depth import DepthMeans
 from ssm_graph.graph.aids.gnss import EAST_NORTH_UP, Fixes
 from ssm_graph.imu.preintegration import gravity_gradient, gtsam_gravity
@@ -293,7 +294,8 @@ def _aid_table(problem: Problem, history: FilterHistory, run: int) -> AidTable |
     """Return what became of depths and fixes in one run; None if it has none."""
     innovation = history.aid_innovation[:, run]
     parts = []
-    for i, (aid, first) in enumerate(((DepthMeans, 0), (Fixes, 1))):
+    kinds: tuple[tuple[type[Aid], int], ...] = ((DepthMeans, 0), (Fixes, 1))
+    for i, (aid, first) in enumerate(kinds):
         weight = history.aid_weight[:, run, i]
         k = np.flatnonzero(np.isfinite(weight))
         labels = EAST_NORTH_UP if aid is Fixes else (aid.name,)
