@@ -9,6 +9,7 @@ import numpy as np
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.engine.extras import Extras
 from ssm_graph.graph.measurements import aid_table
+from ssm_graph.live.estimator.guard import Guarded
 from ssm_graph.live.estimator.tail import Newest
 from ssm_graph.live.estimator.watch import Watch, verdict
 from ssm_graph.mission.answer import trajectory_at
@@ -21,6 +22,7 @@ from ssm_graph.smoothers.window import Window
 def answer(
     newest: Newest,
     watch: Watch,
+    guarded: Guarded,
     frame: LocalFrame,
     *,
     latest_s: float,
@@ -32,7 +34,13 @@ def answer(
     ``latest_s`` is the newest time of any message, s; ``shift_s`` how far the vehicle's clock is
     behind that of the states; ``latency_s`` what the last update cost.
     """
-    told = verdict(watch, now_s=latest_s, imu_s=newest.time_s, covariance=newest.covariance)
+    told = verdict(
+        watch,
+        guarded.doubt,
+        now_s=latest_s,
+        imu_s=newest.time_s,
+        covariance=newest.covariance,
+    )
     time_s, covariance = np.array([newest.time_s]), newest.covariance[None]
     at = trajectory_at(frame, time_s, newest.states, covariance, n_beams=np.zeros(1))
     return Navigation(
@@ -50,6 +58,9 @@ def answer(
         gyro_bias=at.gyro_bias[0],
         accel_bias=at.accel_bias[0],
         beam_weights=np.array(watch.beam_weights),
+        protection_m=guarded.protection.horizontal,
+        protection_up_m=guarded.protection.up,
+        innovation_ratios=guarded.ratios,
     )
 
 

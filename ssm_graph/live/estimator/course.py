@@ -16,6 +16,7 @@ from ssm_graph.base.errors import SolverError
 from ssm_graph.engine.error_state import VELOCITY
 from ssm_graph.graph.inertial_rows import InertialRows
 from ssm_graph.live.estimator.buffers import Buffers, Measured
+from ssm_graph.live.estimator.guard import Guard, Guarded, Guardian
 from ssm_graph.live.estimator.keyframes import KeyframeMaker
 from ssm_graph.live.estimator.recovery import (
     Doubt,
@@ -53,6 +54,7 @@ class Step(NamedTuple):
     left: Stretch | None
     """What left the window since the step that is kept before it."""
     reserve: Reserve
+    guard: Guard
 
     @property
     def time_s(self) -> float:
@@ -64,8 +66,14 @@ class Course:
     """Makes one step after the other, and keeps those that late messages may go back to."""
 
     def __init__(
-        self, first: Step, maker: KeyframeMaker, buffers: Buffers, events: EventLog
+        self,
+        first: Step,
+        maker: KeyframeMaker,
+        buffers: Buffers,
+        events: EventLog,
+        guardian: Guardian,
     ) -> None:
+        self.guardian = guardian
         self._steps = deque([first])
         self._maker, self._buffers, self._events = maker, buffers, events
         sensors = first.window.sensors
@@ -76,6 +84,11 @@ class Course:
     def newest(self) -> Step:
         """The last step."""
         return self._steps[-1]
+
+    @property
+    def guarded(self) -> Guarded:
+        """What watches over the newest step says of it."""
+        return self.guardian.told(self.newest.guard)
 
     @property
     def oldest(self) -> Step:
@@ -162,7 +175,25 @@ class Course:
             reserve = reserve.renewed(window)
         if watch.trouble_s == keyframe.time_s and watch.trouble != last.watch.trouble:
             self._events.tell(keyframe.time_s, Severity.WARNING, "doubt", watch.trouble)
-        return Step(window, watch, left, reserve)
+        guard = self._guarded(keyframe, window, is_anew=False)
+        return Step(window, watch, left, reserve, guard)
+
+    def _guarded(self, keyframe: Keyframe, window: Window, *, is_anew: bool) -> Guard:
+        """Return the guard at the next keyframe, and tell what is found to contradict."""
+        last = self.newest
+        state = last.window.newest.states
+        guard = self.guardian.led_on(last.guard, state, keyframe, window, is_anew=is_anew)
+        known = {one.suspect for one in last.guard.contradictions}
+        now = {one.suspect for one in guard.contradictions}
+        for suspect in sorted(now - known):
+            text = self.guardian.judge.sentence(guard.contradictions)
+            kind = f"contradicted_{self.guardian.bank.suspects[suspect]}".replace(" ", "_")
+            self._events.tell(keyframe.time_s, Severity.WARNING, kind, text)
+        for suspect in sorted(known - now):
+            name = self.guardian.bank.suspects[suspect]
+            text = f"the answer agrees again with what is independent of {name}"
+            self._events.tell(keyframe.time_s, Severity.INFO, "contradiction_ended", text)
+        return guard
 
     def _anew(self, keyframe: Keyframe, doubt: Doubt, reserve: Reserve) -> Step:
         """Begin a new window at the next keyframe."""
@@ -174,7 +205,8 @@ class Course:
         if doubt.what not in (Doubted.ANSWER, Doubted.VELOCITY):
             reserve = Reserve.of(window)
         watch = watch_after(last.watch, window, last.window.newest, doubt)
-        return Step(window, watch, last.window.all, reserve)
+        guard = self._guarded(keyframe, window, is_anew=True)
+        return Step(window, watch, last.window.all, reserve, guard)
 
     def _observed(self, keyframe: Keyframe, window: Window, *, parity: bool) -> Watch:
         last, period_s = self.newest, self._buffers.shortest_period_s

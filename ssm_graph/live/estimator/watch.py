@@ -239,10 +239,13 @@ class Verdict(NamedTuple):
     since_aid_s: float
 
 
-def verdict(watch: Watch, *, now_s: float, imu_s: float, covariance: Array) -> Verdict:
+def verdict(
+    watch: Watch, doubt: str, *, now_s: float, imu_s: float, covariance: Array
+) -> Verdict:
     """Judge the newest answer, of the covariance (15, 15), by what is remembered.
 
-    ``now_s`` is the newest time of any message, ``imu_s`` that of the inertial data.
+    ``doubt`` is what speaks against it beside the window, ``now_s`` the newest time of any message,
+    ``imu_s`` that of the inertial data.
     """
     since_beam_s = imu_s - watch.last_beam_s
     since_aid_s = imu_s - max(watch.last_beam_s, watch.last_fix_s, watch.last_aid_s)
@@ -261,6 +264,8 @@ def verdict(watch: Watch, *, now_s: float, imu_s: float, covariance: Array) -> V
         health, reason = Health.DEGRADED, watch.trouble
     elif watch.contradicted is not None:
         health, reason = Health.DEGRADED, watch.contradicted.text
+    elif doubt:
+        health, reason = Health.DEGRADED, doubt
     elif not has_lock:
         health = Health.DEGRADED
         beam = "beam" if since_beam_s >= LOCK_LOST_S else "beam off the ground"

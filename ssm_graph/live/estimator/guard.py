@@ -1,0 +1,147 @@
+"""What watches over the answer beside the window: lanes, what contradicts, how far it may be off.
+
+Everything is a function of the data up to a keyframe, as the window is, and goes with its steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.states import States
+from ssm_graph.live.estimator.lanes import FIXES, SUSPECT_OF, LaneBank, Lanes
+from ssm_graph.live.estimator.separation import (
+    Contradiction,
+    IntegrityConfig,
+    Judge,
+    Protection,
+    pack_contradictions,
+    unpack_contradictions,
+)
+from ssm_graph.sensors.imu import ImuNoise
+from ssm_graph.smoothers.keyframe import Keyframe, Sensors
+from ssm_graph.smoothers.window import Window
+
+
+class Guard(NamedTuple):
+    """What is known at a keyframe."""
+
+    lanes: Lanes
+    contradictions: tuple[Contradiction, ...]
+    protection: Protection
+    fixed_s: float
+    """When the position was last known by itself: by a fix, or where all began, s"""
+    levels: Array
+    """(K, 3) time, s, and protection levels, m, of the keyframes of the window"""
+
+    def pack(self) -> Iterator[tuple[str, Array]]:
+        """Yield name and array of all but the contradictions."""
+        yield from self.lanes.pack()
+        yield "levels", self.levels
+        yield "fixed_s", np.array(self.fixed_s)
+
+
+class Guarded(NamedTuple):
+    """What a user is told of it."""
+
+    doubt: str
+    """Why the answer is not good; empty where nothing speaks against it"""
+    protection: Protection
+    ratios: dict[str, float]
+    """Low-passed innovation of each sensor, in sigmas"""
+
+
+class Guardian:
+    """Makes one guard of the one before."""
+
+    def __init__(self, sensors: Sensors, noise: ImuNoise, config: IntegrityConfig) -> None:
+        self._frame, self.config = sensors.frame, config
+        self.bank = LaneBank(sensors, noise)
+        self.judge = Judge(self.bank, config)
+
+    def begin(self, window: Window, known: Sequence[Mapping[str, Any]] = ()) -> Guard:
+        """Return the guard of a window that has just begun; ``known`` is what is remembered."""
+        time_s = window.keyframes[-1].time_s
+        contradictions = unpack_contradictions(known, self.bank.suspects)
+        lanes = self.bank.begin(window, [one.suspect for one in contradictions])
+        return self._guard(lanes, contradictions, window, time_s, np.zeros((0, 3)))
+
+    def led_on(
+        self, guard: Guard, last: States, keyframe: Keyframe, window: Window, *, is_anew: bool
+    ) -> Guard:
+        """Return the guard at the next keyframe, with which the window is settled.
+
+        ``last`` (1, ...) is the newest state of the window before; ``is_anew`` whether the window
+        was begun anew there.
+        """
+        step = self.bank.after_doubt if is_anew else self.bank.led_on
+        lanes = step(guard.lanes, last, keyframe, window)
+        is_fixed = any(SUSPECT_OF.get(name) in FIXES for name in window.keyframes[-1].aids)
+        lanes, known = self.judge.judged(lanes, guard.contradictions, keyframe.time_s)
+        fixed_s = keyframe.time_s if is_fixed else guard.fixed_s
+        levels = guard.levels[guard.levels[:, 0] >= window.keyframes[0].time_s - 1.0]
+        return self._guard(lanes, known, window, fixed_s, levels)
+
+    def _guard(
+        self,
+        lanes: Lanes,
+        known: tuple[Contradiction, ...],
+        window: Window,
+        fixed_s: float,
+        levels: Array,
+    ) -> Guard:
+        newest = window.newest.states
+        time_s = window.keyframes[-1].time_s
+        R_lb = self._frame.R_nl_at(newest.p_n[0]).T @ newest.R_nb[0]
+        level = self.judge.protection(lanes, R_lb, time_s, fixed_s)
+        return Guard(lanes, known, level, fixed_s, np.vstack([levels, [time_s, *level]]))
+
+    def told(self, guard: Guard) -> Guarded:
+        """Return what a user is told."""
+        return Guarded(self.sentence(guard), guard.protection, self.ratios(guard))
+
+    def sentence(self, guard: Guard) -> str:
+        """Say what contradicts the answer, or that it is protected worse than was asked for."""
+        text = self.judge.sentence(guard.contradictions)
+        if text:
+            return text
+        asked = (self.config.protection_m, self.config.protection_up_m)
+        for name, level, wanted in zip(("horizontal", "vertical"), guard.protection, asked, strict=True):
+            if not level < wanted:
+                return (
+                    f"{name} protection level {level:.3g} m, {wanted:g} m are asked for: a fault "
+                    "of one sensor could move the answer so far unseen"
+                )
+        return ""
+
+    def ratios(self, guard: Guard) -> dict[str, float]:
+        """Return the low-passed innovation of each sensor that was heard, in sigmas."""
+        found = {}
+        for name, ratio in zip(self.bank.suspects, guard.lanes.ratio, strict=True):
+            seen = ratio[np.isfinite(ratio)]
+            if len(seen):
+                found[name] = float(np.sqrt(np.mean(seen**2)))
+        return found
+
+    def plain(self, guard: Guard) -> list[Any]:
+        """Return the contradictions as plain values."""
+        return pack_contradictions(guard.contradictions, self.bank.suspects)
+
+    def unpack(
+        self, arrays: Mapping[str, Array], known: Sequence[Mapping[str, Any]], window: Window
+    ) -> Guard:
+        """Return the guard that was packed; one that begins where there is none."""
+        if "levels" not in arrays:
+            return self.begin(window, known)
+        contradictions = unpack_contradictions(known, self.bank.suspects)
+        levels = arrays["levels"]
+        return Guard(
+            Lanes.unpack(arrays),
+            contradictions,
+            Protection(*levels[-1, 1:].tolist()),
+            float(arrays["fixed_s"]),
+            levels,
+        )

@@ -1,0 +1,300 @@
+"""Cheap filters beside the window, each of which leaves one sensor out for a while.
+
+A lane begins with what all sensors say and goes on without one of them for 10, 60 or 240 s; two of
+each length take turns. What it says then owes nothing to what that sensor did since, so that a
+sensor that lies for long, or whose readings all lie alike, parts the lanes from the answer: solution
+separation. One more lane leaves nothing out. It is the measure of the others: lanes and measure
+have the same model, in which noise that lasts is as large as it may be, and then the covariance
+of their separation is the difference of their covariances.
+
+All lanes are linear about the answer of the window, whose rows and weights they use, and are
+carried as deviations from it in arrays: a keyframe costs as much as a few small products.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from factors import so3
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import ROTATION, STATE_DIM
+from ssm_graph.engine.states import States
+from ssm_graph.graph.aids.depth import DepthMeans
+from ssm_graph.graph.aids.gnss import Fixes
+from ssm_graph.graph.aids.heading import Headings
+from ssm_graph.graph.aids.magnetometer import MagneticFields
+from ssm_graph.graph.aids.ranges import Ranges
+from ssm_graph.graph.aids.usbl import UsblFixes
+from ssm_graph.graph.inertial_rows import InertialRows
+from ssm_graph.imu.preintegration import GRAVITY
+from ssm_graph.sensors.dvl import MOST_BEAMS
+from ssm_graph.sensors.imu import ImuNoise
+from ssm_graph.smoothers.keyframe import Keyframe, Sensors
+from ssm_graph.smoothers.window import BEAMS, Window
+from ssm_graph.smoothers.window_aids import SensorRows
+
+LENGTHS_S: Final = (10.0, 60.0, 240.0)
+"""So long a lane leaves its sensor out; two of each, half of it apart."""
+DVL, DEPTH = "DVL", "depth"
+ACOUSTICS: Final = "acoustic fixes"
+COMPASS: Final = "compass"
+SUSPECT_OF: Final = {
+    BEAMS: DVL,
+    Fixes.name: Fixes.name,
+    UsblFixes.name: ACOUSTICS,
+    Ranges.name: ACOUSTICS,
+    DepthMeans.name: DEPTH,
+    Headings.name: COMPASS,
+    MagneticFields.name: COMPASS,
+}
+"""What is left out together, by the name of the sensor's rows; others are never left out."""
+FIXES: Final = (Fixes.name, ACOUSTICS)
+"""Those that tell where the vehicle is."""
+LASTING: Final = {DVL: 0.125, DEPTH: 0.25}
+"""Share of a sensor's variance that lasts, by suspect. Of a Workhorse's beams it is an eighth."""
+LASTING_OF_OTHERS: Final = 0.125
+LASTING_S: Final = 20.0
+"""Correlation time of what lasts."""
+TURN_S: Final = 10.0
+"""So long a turn goes on, over which the errors of the gyros' scales and axes add up."""
+LEAST_WEIGHT: Final = 1e-3
+MEMORY_S: Final = 10.0
+"""Time constant of the low-passed innovation ratios."""
+DOUBT_FACTOR: Final = 2.0
+"""What the window says is doubted by so much where lanes begin with it: it knows nothing of noise
+that lasts."""
+MEASURE: Final = 0
+"""The lane that leaves nothing out."""
+
+
+class Lanes(NamedTuple):
+    """L lanes at a keyframe, n components of state, of S suspects."""
+
+    deviation: Array
+    """(L, n) from the newest state of the window"""
+    covariance: Array
+    """(L, n, n)"""
+    begun_s: Array
+    """(L,) s; infinite for a lane that is not used"""
+    n_out: Array
+    """(L,) rows left out since"""
+    n_fixes: Array
+    """(L,) rows of fixes that counted since"""
+    chi_sq: Array
+    """(L,) of the innovations that counted since"""
+    dof: Array
+    """(L,) and how many those were"""
+    is_nested: Array
+    """(L,) 1 where the lane and the measure have the same past, else 0"""
+    last_s: Array
+    """(S,) when each suspect was last heard, s"""
+    ratio: Array
+    """(S, 8) low-passed innovations in their sigmas, NaN where there are none"""
+    rate_b: Array
+    """(3,) rad/s, low-passed"""
+
+    def pack(self) -> Iterator[tuple[str, Array]]:
+        """Yield name and array of everything."""
+        yield from self._asdict().items()
+
+    @classmethod
+    def unpack(cls, arrays: Mapping[str, Array]) -> Lanes:
+        """Return the lanes that were packed."""
+        return cls(*(arrays[name] for name in cls._fields))
+
+    def with_copy(self, into: int, of: int) -> Lanes:
+        """Return the lanes with one of them as another one is."""
+        changed: dict[str, Any] = {}
+        for name in _BY_LANE:
+            column = getattr(self, name).copy()
+            column[into] = column[of]
+            changed[name] = column
+        return self._replace(**changed)
+
+
+_BY_LANE: Final = Lanes._fields[: Lanes._fields.index("last_s")]
+
+
+class LaneBank:
+    """Which lanes a vehicle has, and how they go on from keyframe to keyframe."""
+
+    def __init__(self, sensors: Sensors, noise: ImuNoise) -> None:
+        named = [BEAMS, *sensors.aids]
+        self.suspects = tuple(dict.fromkeys(s for n, s in SUSPECT_OF.items() if n in named))
+        """What is left out, each in its turn"""
+        n, each = len(self.suspects), np.repeat(LENGTHS_S, 2)
+        self.suspect = np.concatenate([[-1], np.repeat(np.arange(n), len(each) + 1)])
+        """(L,) which of them each lane leaves out, -1 for none"""
+        self.length_s = np.concatenate([[np.inf], np.tile(np.append(each, np.inf), n)])
+        """(L,) how long; infinite for the measure, and for a lane that is held"""
+        stagger = np.append(np.tile([0.0, 0.5], len(LENGTHS_S)) * each, 0.0)
+        self._stagger_s = np.concatenate([[0.0], np.tile(stagger, n)])
+        self.held = 1 + np.arange(n) * (len(each) + 1) + len(each)
+        """(S,) the lane of each suspect that is led on once it contradicts"""
+        self._fixes = [k for k, name in enumerate(self.suspects) if name in FIXES]
+        self._inertial = InertialRows(sensors.frame, sensors.extras)
+        self._n = sensors.state_dim
+        self._scale = noise.accel_bias_sigma / GRAVITY
+        """Errors of scales and axes are to gravity as the bias: 50 ppm, 500 ppm, 5000 ppm"""
+
+    def lanes_of(self, suspect: int) -> range:
+        """Return the lanes that leave a suspect out, that which is held last."""
+        held = int(self.held[suspect])
+        return range(held - 2 * len(LENGTHS_S), held + 1)
+
+    def begin(self, window: Window, led_on: Sequence[int] = ()) -> Lanes:
+        """Return the lanes that begin with the newest state of a window.
+
+        ``led_on`` are suspects that are known to contradict.
+        """
+        L, S = len(self.suspect), len(self.suspects)
+        time_s = window.keyframes[-1].time_s
+        covariance = window.newest.covariance[0] * DOUBT_FACTOR**2
+        begun_s = time_s - self._stagger_s
+        begun_s[self.held] = np.inf
+        begun_s[self.held[list(led_on)]] = time_s
+        return Lanes(
+            np.zeros((L, self._n)),
+            np.tile(covariance, (L, 1, 1)),
+            begun_s,
+            *(np.zeros(L) for _ in range(4)),
+            np.ones(L),
+            np.full(S, -np.inf),
+            np.full((S, MOST_BEAMS), np.nan),
+            np.zeros(3),
+        )
+
+    def led_on(self, lanes: Lanes, last: States, keyframe: Keyframe, window: Window) -> Lanes:
+        """Return the lanes at the next keyframe, with which the window is settled.
+
+        ``last`` (1, ...) is the state of the window before it.
+        """
+        lanes = self._predicted(lanes, last, keyframe, window)
+        measured = list(window.newest_rows())
+        if measured:
+            lanes = self._updated(lanes, measured, keyframe.time_s)
+        return self._begun_anew(lanes, keyframe.time_s)
+
+    def after_doubt(self, lanes: Lanes, last: States, keyframe: Keyframe, window: Window) -> Lanes:
+        """Return the lanes at a keyframe where a window was begun anew.
+
+        They are what they were; the measure is what the window says.
+        """
+        lanes = self._predicted(lanes, last, keyframe, window)
+        deviation, covariance = lanes.deviation.copy(), lanes.covariance.copy()
+        deviation[MEASURE], covariance[MEASURE] = 0.0, window.newest.covariance[0]
+        is_nested = np.zeros(len(deviation))
+        is_nested[MEASURE] = 1.0
+        lanes = lanes._replace(deviation=deviation, covariance=covariance, is_nested=is_nested)
+        return self._begun_anew(lanes, keyframe.time_s)
+
+    def _predicted(self, lanes: Lanes, last: States, keyframe: Keyframe, window: Window) -> Lanes:
+        assert keyframe.inertial is not None
+        interval, now = keyframe.inertial, window.newest.states
+        ahead = self._inertial.predict(interval, last)
+        covariance = ahead.covariance(lanes.covariance)
+        # What the gyros are off in a turn lasts as long as the turn; waves come and go.
+        span_s = float(interval.span_s[0])
+        turn_b = so3.log(interval.delta_R)[0]
+        share = 1.0 - np.exp(-span_s / TURN_S)
+        rate_b = lanes.rate_b + share * (turn_b / span_s - lanes.rate_b)
+        lasting = float(rate_b @ rate_b) * span_s * TURN_S + float(turn_b @ turn_b)
+        turned = np.arange(STATE_DIM)[ROTATION]
+        covariance[:, turned, turned] += self._scale**2 * lasting
+        # From the prediction to where the window is now.
+        off = now.navigation.deviation_of(ahead.states.navigation)[0]
+        off = np.append(off, ahead.states.walks[0] - now.walks[0])
+        deviation = off + ahead.deviation(lanes.deviation)
+        return lanes._replace(deviation=deviation, covariance=covariance, rate_b=rate_b)
+
+    def _updated(self, lanes: Lanes, measured: Sequence[SensorRows], time_s: float) -> Lanes:
+        suspect = [self._number(rows.sensor) for rows in measured]
+        counts = [len(rows.error) for rows in measured]
+        of_row = np.repeat(suspect, counts)
+        H = np.concatenate([rows.jacobian for rows in measured])
+        weight = np.concatenate([rows.weight for rows in measured])
+        noise = np.repeat([self._inflation(lanes, s, time_s) for s in suspect], counts)
+        noise = noise / np.clip(weight, LEAST_WEIGHT, 1.0)
+        innovation = -np.concatenate([rows.error for rows in measured]) - lanes.deviation @ H.T
+        lanes = self._with_ratios(lanes, measured, suspect, innovation[MEASURE], time_s)
+        counts_in = (of_row != self.suspect[:, None]) | (of_row < 0)
+        H = H * counts_in[..., None]
+        innovation = innovation * counts_in
+        P = lanes.covariance
+        PHt = P @ H.mT
+        S = H @ PHt
+        rows = np.arange(len(of_row))
+        S[:, rows, rows] += noise
+        solved = np.linalg.solve(S, np.concatenate([PHt.mT, innovation[..., None]], axis=2))
+        deviation = lanes.deviation + (PHt @ solved[..., -1:])[..., 0]
+        P = P - PHt @ solved[..., :-1]
+        is_fix = np.isin(of_row, self._fixes)
+        return lanes._replace(
+            deviation=deviation,
+            covariance=0.5 * (P + P.mT),
+            n_out=lanes.n_out + np.sum(~counts_in, axis=1),
+            n_fixes=lanes.n_fixes + np.sum(counts_in & is_fix, axis=1),
+            chi_sq=lanes.chi_sq + np.sum(innovation * solved[..., -1], axis=1),
+            dof=lanes.dof + np.sum(counts_in, axis=1),
+        )
+
+    def _number(self, sensor: str) -> int:
+        name = SUSPECT_OF.get(sensor)
+        return -1 if name is None else self.suspects.index(name)
+
+    def _inflation(self, lanes: Lanes, suspect: int, time_s: float) -> float:
+        """Return by how much more variance single readings say as little as those that last.
+
+        Of an error that is correlated over tau, readings dt apart are worth what white ones of
+        2 tau / dt times the variance are.
+        """
+        if suspect < 0:
+            return 1.0
+        since_s = max(time_s - float(lanes.last_s[suspect]), 1e-3)
+        share = LASTING.get(self.suspects[suspect], LASTING_OF_OTHERS)
+        return 1.0 + share * max(2.0 * LASTING_S / since_s - 1.0, 0.0)
+
+    def _with_ratios(
+        self,
+        lanes: Lanes,
+        measured: Sequence[SensorRows],
+        suspect: Sequence[int],
+        innovation: Array,
+        time_s: float,
+    ) -> Lanes:
+        """Return the lanes with what is remembered of each sensor; ``innovation`` (m,)."""
+        last_s, ratio, begin = lanes.last_s.copy(), lanes.ratio.copy(), 0
+        P = lanes.covariance[MEASURE]
+        for rows, s in zip(measured, suspect, strict=True):
+            H, end = rows.jacobian, begin + len(rows.error)
+            own, at, begin = innovation[begin:end], rows.component, end
+            if s < 0:
+                continue
+            sigma = np.sqrt(1.0 + np.sum((H @ P) * H, axis=1))
+            before = np.nan_to_num(ratio[s, at])
+            share = -np.expm1(-min(time_s - float(last_s[s]), MEMORY_S) / MEMORY_S)
+            ratio[s, at] = before + share * (own / sigma - before)
+            last_s[s] = time_s
+        return lanes._replace(last_s=last_s, ratio=ratio)
+
+    def _begun_anew(self, lanes: Lanes, time_s: float) -> Lanes:
+        """Return the lanes with those begun anew whose time is over."""
+        is_over = time_s - lanes.begun_s > self.length_s
+        if not is_over.any():
+            return lanes
+        deviation, covariance = lanes.deviation.copy(), lanes.covariance.copy()
+        deviation[is_over], covariance[is_over] = deviation[MEASURE], covariance[MEASURE]
+        nothing = {n: np.where(is_over, 0.0, getattr(lanes, n)) for n in _COUNTS}
+        return lanes._replace(
+            deviation=deviation,
+            covariance=covariance,
+            begun_s=np.where(is_over, time_s, lanes.begun_s),
+            is_nested=np.where(is_over, 1.0, lanes.is_nested),
+            **nothing,
+        )
+
+
+_COUNTS: Final = ("n_out", "n_fixes", "chi_sq", "dof")
