@@ -53,9 +53,9 @@ SUSPECT_OF: Final = {
 """What is left out together, by the name of the sensor's rows; others are never left out."""
 FIXES: Final = (Fixes.name, ACOUSTICS)
 """Those that tell where the vehicle is."""
-LASTING: Final = {DVL: 0.125, DEPTH: 0.25}
-"""Share of a sensor's variance that lasts, by suspect. Of a Workhorse's beams it is an eighth."""
-LASTING_OF_OTHERS: Final = 0.125
+LASTING: Final = {DVL: 0.5}
+"""Share of a sensor's variance that may last, by suspect: it is a state of every lane."""
+LASTING_OF_OTHERS: Final = 0.25
 LASTING_S: Final = 20.0
 """Correlation time of what lasts."""
 TURN_S: Final = 10.0
@@ -71,10 +71,14 @@ MEASURE: Final = 0
 
 
 class Lanes(NamedTuple):
-    """L lanes at a keyframe, n components of state, of S suspects."""
+    """L lanes at a keyframe, n components of state, of S suspects.
+
+    The state is that of the window's keyframes, then what lasts of each component that is measured,
+    in sigmas of its noise.
+    """
 
     deviation: Array
-    """(L, n) from the newest state of the window"""
+    """(L, n) from the newest state of the window, where nothing lasts"""
     covariance: Array
     """(L, n, n)"""
     begun_s: Array
@@ -136,6 +140,16 @@ class LaneBank:
         """(S,) the lane of each suspect that is led on once it contradicts"""
         self._fixes = [k for k, name in enumerate(self.suspects) if name in FIXES]
         self._inertial = InertialRows(sensors.frame, sensors.extras)
+        dims = {BEAMS: sensors.beams.n_beams, **{k: aid.dim for k, aid in sensors.aids.items()}}
+        self._lasting: dict[str, slice] = {}
+        shares, end = [], sensors.state_dim
+        for name, suspect in SUSPECT_OF.items():
+            if name in dims:
+                self._lasting[name] = slice(end, end + dims[name])
+                end += dims[name]
+                shares += [LASTING.get(suspect, LASTING_OF_OTHERS)] * dims[name]
+        self._share = np.array(shares)
+        """Variance of what lasts, in that of the noise"""
         self._n = sensors.state_dim
         self._scale = noise.accel_bias_sigma / GRAVITY
         """Errors of scales and axes are to gravity as the bias: 50 ppm, 500 ppm, 5000 ppm"""
@@ -152,12 +166,12 @@ class LaneBank:
         """
         L, S = len(self.suspect), len(self.suspects)
         time_s = window.keyframes[-1].time_s
-        covariance = window.newest.covariance[0] * DOUBT_FACTOR**2
+        covariance = self._beside(window.newest.covariance[0] * DOUBT_FACTOR**2)
         begun_s = time_s - self._stagger_s
         begun_s[self.held] = np.inf
         begun_s[self.held[list(led_on)]] = time_s
         return Lanes(
-            np.zeros((L, self._n)),
+            np.zeros((L, len(covariance))),
             np.tile(covariance, (L, 1, 1)),
             begun_s,
             *(np.zeros(L) for _ in range(4)),
@@ -185,11 +199,18 @@ class LaneBank:
         """
         lanes = self._predicted(lanes, last, keyframe, window)
         deviation, covariance = lanes.deviation.copy(), lanes.covariance.copy()
-        deviation[MEASURE], covariance[MEASURE] = 0.0, window.newest.covariance[0]
+        deviation[MEASURE] = 0.0
+        covariance[MEASURE] = self._beside(window.newest.covariance[0])
         is_nested = np.zeros(len(deviation))
         is_nested[MEASURE] = 1.0
         lanes = lanes._replace(deviation=deviation, covariance=covariance, is_nested=is_nested)
         return self._begun_anew(lanes, keyframe.time_s)
+
+    def _beside(self, covariance: Array) -> Array:
+        """Return a covariance (n, n) with that of what lasts beside it."""
+        n, whole = len(covariance), np.diag(np.append(np.zeros(len(covariance)), self._share))
+        whole[:n, :n] = covariance
+        return whole
 
     def _predicted(self, lanes: Lanes, last: States, keyframe: Keyframe, window: Window) -> Lanes:
         assert keyframe.inertial is not None
@@ -204,22 +225,27 @@ class LaneBank:
         lasting = float(rate_b @ rate_b) * span_s * TURN_S + float(turn_b @ turn_b)
         turned = np.arange(STATE_DIM)[ROTATION]
         covariance[:, turned, turned] += self._scale**2 * lasting
+        n, kept = self._n, np.exp(-span_s / LASTING_S)
+        covariance[:, n:] *= kept
+        covariance[:, :, n:] *= kept
+        own = n + np.arange(len(self._share))
+        covariance[:, own, own] += self._share * (1.0 - kept**2)
         # From the prediction to where the window is now.
         off = now.navigation.deviation_of(ahead.states.navigation)[0]
         off = np.append(off, ahead.states.walks[0] - now.walks[0])
-        deviation = off + ahead.deviation(lanes.deviation)
+        moved = off + ahead.deviation(lanes.deviation[:, :n])
+        deviation = np.concatenate([moved, lanes.deviation[:, n:] * kept], axis=1)
         return lanes._replace(deviation=deviation, covariance=covariance, rate_b=rate_b)
 
     def _updated(self, lanes: Lanes, measured: Sequence[SensorRows], time_s: float) -> Lanes:
         suspect = [self._number(rows.sensor) for rows in measured]
         counts = [len(rows.error) for rows in measured]
         of_row = np.repeat(suspect, counts)
-        H = np.concatenate([rows.jacobian for rows in measured])
+        H, share = self._rows(measured)
         weight = np.concatenate([rows.weight for rows in measured])
-        noise = np.repeat([self._inflation(lanes, s, time_s) for s in suspect], counts)
-        noise = noise / np.clip(weight, LEAST_WEIGHT, 1.0)
+        noise = (1.0 - share) / np.clip(weight, LEAST_WEIGHT, 1.0)
         innovation = -np.concatenate([rows.error for rows in measured]) - lanes.deviation @ H.T
-        lanes = self._with_ratios(lanes, measured, suspect, innovation[MEASURE], time_s)
+        lanes = self._with_ratios(lanes, measured, suspect, innovation[MEASURE], H, time_s)
         counts_in = (of_row != self.suspect[:, None]) | (of_row < 0)
         H = H * counts_in[..., None]
         innovation = innovation * counts_in
@@ -245,17 +271,19 @@ class LaneBank:
         name = SUSPECT_OF.get(sensor)
         return -1 if name is None else self.suspects.index(name)
 
-    def _inflation(self, lanes: Lanes, suspect: int, time_s: float) -> float:
-        """Return by how much more variance single readings say as little as those that last.
-
-        Of an error that is correlated over tau, readings dt apart are worth what white ones of
-        2 tau / dt times the variance are.
-        """
-        if suspect < 0:
-            return 1.0
-        since_s = max(time_s - float(lanes.last_s[suspect]), 1e-3)
-        share = LASTING.get(self.suspects[suspect], LASTING_OF_OTHERS)
-        return 1.0 + share * max(2.0 * LASTING_S / since_s - 1.0, 0.0)
+    def _rows(self, measured: Sequence[SensorRows]) -> tuple[Array, Array]:
+        """Return Jacobians (m, n) with those of what lasts, and the share (m,) that may."""
+        blocks, shares = [], []
+        for rows in measured:
+            H, share = np.zeros((len(rows.error), self._n + len(self._share))), 0.0
+            H[:, : self._n] = rows.jacobian
+            if rows.sensor in self._lasting:
+                begin = self._lasting[rows.sensor].start
+                H[np.arange(len(H)), begin + rows.component] = 1.0
+                share = float(self._share[begin - self._n])
+            blocks.append(H)
+            shares.append(np.full(len(H), share))
+        return np.concatenate(blocks), np.concatenate(shares)
 
     def _with_ratios(
         self,
@@ -263,17 +291,18 @@ class LaneBank:
         measured: Sequence[SensorRows],
         suspect: Sequence[int],
         innovation: Array,
+        jacobian: Array,
         time_s: float,
     ) -> Lanes:
         """Return the lanes with what is remembered of each sensor; ``innovation`` (m,)."""
         last_s, ratio, begin = lanes.last_s.copy(), lanes.ratio.copy(), 0
-        P = lanes.covariance[MEASURE]
+        spread = np.sum((jacobian @ lanes.covariance[MEASURE]) * jacobian, axis=1)
+        sigmas = np.sqrt(1.0 + spread)
         for rows, s in zip(measured, suspect, strict=True):
-            H, end = rows.jacobian, begin + len(rows.error)
-            own, at, begin = innovation[begin:end], rows.component, end
+            end = begin + len(rows.error)
+            own, sigma, at, begin = innovation[begin:end], sigmas[begin:end], rows.component, end
             if s < 0:
                 continue
-            sigma = np.sqrt(1.0 + np.sum((H @ P) * H, axis=1))
             before = np.nan_to_num(ratio[s, at])
             share = -np.expm1(-min(time_s - float(last_s[s]), MEMORY_S) / MEMORY_S)
             ratio[s, at] = before + share * (own / sigma - before)
