@@ -53,7 +53,7 @@ SUSPECT_OF: Final = {
 """What is left out together, by the name of the sensor's rows; others are never left out."""
 FIXES: Final = (Fixes.name, ACOUSTICS)
 """Those that tell where the vehicle is."""
-LASTING: Final = {DVL: 0.5}
+LASTING: Final = {DVL: 0.5, Fixes.name: 0.05}
 """Share of a sensor's variance that may last, by suspect: it is a state of every lane."""
 LASTING_OF_OTHERS: Final = 0.25
 LASTING_S: Final = 20.0
