@@ -36,7 +36,7 @@ def answer(
     """
     told = verdict(
         watch,
-        guarded.doubt,
+        guarded,
         now_s=latest_s,
         imu_s=newest.time_s,
         covariance=newest.covariance,

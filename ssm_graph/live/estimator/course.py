@@ -186,7 +186,7 @@ class Course:
         known = {one.suspect for one in last.guard.contradictions}
         now = {one.suspect for one in guard.contradictions}
         for suspect in sorted(now - known):
-            text = self.guardian.judge.sentence(guard.contradictions)
+            text = self.guardian.sentence(guard)
             kind = f"contradicted_{self.guardian.bank.suspects[suspect]}".replace(" ", "_")
             self._events.tell(keyframe.time_s, Severity.WARNING, kind, text)
         for suspect in sorted(known - now):

@@ -47,8 +47,10 @@ class Guard(NamedTuple):
 class Guarded(NamedTuple):
     """What a user is told of it."""
 
-    doubt: str
-    """Why the answer is not good; empty where nothing speaks against it"""
+    contradiction: str
+    """Which sensors contradict the answer; empty where none does"""
+    shortfall: str
+    """Why it is protected worse than was asked for; empty where it is not"""
     protection: Protection
     ratios: dict[str, float]
     """Low-passed innovation of each sensor, in sigmas"""
@@ -101,23 +103,27 @@ class Guardian:
 
     def told(self, guard: Guard) -> Guarded:
         """Return what a user is told."""
-        return Guarded(self.sentence(guard), guard.protection, self.ratios(guard))
+        return Guarded(
+            self.sentence(guard), self._shortfall(guard), guard.protection, self._ratios(guard)
+        )
 
     def sentence(self, guard: Guard) -> str:
-        """Say what contradicts the answer, or that it is protected worse than was asked for."""
-        text = self.judge.sentence(guard.contradictions)
-        if text:
-            return text
+        """Say what contradicts the answer; an empty text where nothing does."""
+        return self.judge.sentence(guard.lanes, guard.contradictions)
+
+    def _shortfall(self, guard: Guard) -> str:
+        """Say that the answer is protected worse than was asked for, if so."""
+        names = ("horizontal", "vertical")
         asked = (self.config.protection_m, self.config.protection_up_m)
-        for name, level, wanted in zip(("horizontal", "vertical"), guard.protection, asked, strict=True):
+        for name, level, wanted in zip(names, guard.protection, asked, strict=True):
             if not level < wanted:
                 return (
-                    f"{name} protection level {level:.3g} m, {wanted:g} m are asked for: a fault "
-                    "of one sensor could move the answer so far unseen"
+                    f"the {name} protection level is {level:.3g} m, below {wanted:g} m was asked "
+                    "for: a fault of one sensor could move the answer so far unseen"
                 )
         return ""
 
-    def ratios(self, guard: Guard) -> dict[str, float]:
+    def _ratios(self, guard: Guard) -> dict[str, float]:
         """Return the low-passed innovation of each sensor that was heard, in sigmas."""
         found = {}
         for name, ratio in zip(self.bank.suspects, guard.lanes.ratio, strict=True):

@@ -53,7 +53,7 @@ SUSPECT_OF: Final = {
 """What is left out together, by the name of the sensor's rows; others are never left out."""
 FIXES: Final = (Fixes.name, ACOUSTICS)
 """Those that tell where the vehicle is."""
-LASTING: Final = {DVL: 0.5, Fixes.name: 0.05}
+LASTING: Final = {DVL: 0.5, Fixes.name: 0.02}
 """Share of a sensor's variance that may last, by suspect: it is a state of every lane."""
 LASTING_OF_OTHERS: Final = 0.25
 LASTING_S: Final = 20.0
@@ -87,10 +87,8 @@ class Lanes(NamedTuple):
     """(L,) rows left out since"""
     n_fixes: Array
     """(L,) rows of fixes that counted since"""
-    chi_sq: Array
-    """(L,) of the innovations that counted since"""
-    dof: Array
-    """(L,) and how many those were"""
+    evidence: Array
+    """(L,) by how much more than noise the measure's chi-square has grown since than the lane's"""
     is_nested: Array
     """(L,) 1 where the lane and the measure have the same past, else 0"""
     last_s: Array
@@ -174,7 +172,7 @@ class LaneBank:
             np.zeros((L, len(covariance))),
             np.tile(covariance, (L, 1, 1)),
             begun_s,
-            *(np.zeros(L) for _ in range(4)),
+            *(np.zeros(L) for _ in range(3)),
             np.ones(L),
             np.full(S, -np.inf),
             np.full((S, MOST_BEAMS), np.nan),
@@ -257,14 +255,14 @@ class LaneBank:
         solved = np.linalg.solve(S, np.concatenate([PHt.mT, innovation[..., None]], axis=2))
         deviation = lanes.deviation + (PHt @ solved[..., -1:])[..., 0]
         P = P - PHt @ solved[..., :-1]
+        surplus = np.sum(innovation * solved[..., -1] - counts_in, axis=1)
         is_fix = np.isin(of_row, self._fixes)
         return lanes._replace(
             deviation=deviation,
             covariance=0.5 * (P + P.mT),
             n_out=lanes.n_out + np.sum(~counts_in, axis=1),
             n_fixes=lanes.n_fixes + np.sum(counts_in & is_fix, axis=1),
-            chi_sq=lanes.chi_sq + np.sum(innovation * solved[..., -1], axis=1),
-            dof=lanes.dof + np.sum(counts_in, axis=1),
+            evidence=lanes.evidence + surplus[MEASURE] - surplus,
         )
 
     def _number(self, sensor: str) -> int:
@@ -326,4 +324,4 @@ class LaneBank:
         )
 
 
-_COUNTS: Final = ("n_out", "n_fixes", "chi_sq", "dof")
+_COUNTS: Final = ("n_out", "n_fixes", "evidence")

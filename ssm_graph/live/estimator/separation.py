@@ -29,6 +29,8 @@ UNASKED: Final = 0.01
 than a tenth of its own sigma is not asked for."""
 AGREED_S: Final = 10.0
 """A contradiction ends once the lane that is led on has agreed for so long."""
+RIVAL: Final = 0.5
+"""A sensor that explains so much of what the likeliest one explains is named beside it."""
 INERTIAL: Final = "the inertial data"
 
 
@@ -66,10 +68,6 @@ class Contradiction(NamedTuple):
     """0 in velocity, 1 in position"""
     size: float
     """m/s or m"""
-    excess: float
-    """Chi-square per degree of freedom of all that the lane was still told"""
-    n_fixes: float
-    """Fixes that it was still told"""
     agreed_s: float
     """Since when the lane that is led on agrees, s; infinite where it does not"""
 
@@ -141,7 +139,10 @@ class Judge:
                 before = kept.get(suspect)
                 if lane != held:
                     lanes = lanes.with_copy(held, lane)
-                kept[suspect] = self._new(lanes, found, lane, part, suspect, time_s, before)
+                size = float(found.size[lane, part])
+                if before is None:
+                    before = Contradiction(suspect, time_s, time_s, part, size, np.inf)
+                kept[suspect] = before._replace(last_s=time_s, agreed_s=np.inf)
             elif suspect in kept:
                 still = self._still(kept[suspect], found, held, time_s)
                 if still is None:
@@ -152,27 +153,6 @@ class Judge:
                 else:
                     kept[suspect] = still
         return lanes, tuple(kept.values())
-
-    @staticmethod
-    def _new(
-        lanes: Lanes,
-        found: Separations,
-        lane: int,
-        part: int,
-        suspect: int,
-        time_s: float,
-        before: Contradiction | None,
-    ) -> Contradiction:
-        return Contradiction(
-            suspect,
-            time_s if before is None else before.since_s,
-            time_s,
-            part if before is None else before.part,
-            float(found.size[lane, part]) if before is None else before.size,
-            float(lanes.chi_sq[lane] / max(lanes.dof[lane], 1.0)),
-            float(lanes.n_fixes[lane]),
-            np.inf,
-        )
 
     def _still(
         self, was: Contradiction, found: Separations, held: int, time_s: float
@@ -185,23 +165,27 @@ class Judge:
         agreed_s = min(was.agreed_s, time_s) if could_see else np.inf
         return None if time_s - agreed_s > AGREED_S else was._replace(agreed_s=agreed_s)
 
-    def sentence(self, known: tuple[Contradiction, ...]) -> str:
+    def blamed(self, lanes: Lanes, known: tuple[Contradiction, ...]) -> list[Contradiction]:
+        """Return those without which what the others say fits, the clearest first."""
+        evidence = {one.suspect: lanes.evidence[self._bank.held[one.suspect]] for one in known}
+        order = sorted(known, key=lambda one: -evidence[one.suspect])
+        best = evidence[order[0].suspect] if order else 0.0
+        return [one for one in order if evidence[one.suspect] >= RIVAL * best]
+
+    def sentence(self, lanes: Lanes, known: tuple[Contradiction, ...]) -> str:
         """Say which sensors contradict the answer; an empty text where none does."""
-        if not known:
+        blamed = self.blamed(lanes, known)
+        if not blamed:
             return ""
-        names = self._bank.suspects
-        # The lane without what lies is told nothing that does not fit.
-        best = min(one.excess for one in known)
-        fitting = [one for one in known if one.excess < 2.0 * best + 1.0]
-        blamed = [names[one.suspect] for one in fitting]
-        if any(names[one.suspect] == DVL and one.n_fixes == 0 for one in fitting):
-            blamed.append(INERTIAL)
-        first = min(fitting, key=lambda one: one.since_s)
-        part = ("velocity", "position")[first.part]
+        names, first = self._bank.suspects, blamed[0]
+        said = [names[one.suspect] for one in blamed]
+        if DVL in said and lanes.n_fixes[self._bank.held[names.index(DVL)]] == 0.0:
+            said.append(INERTIAL)
         return (
-            f"{' or '.join(blamed)}: without {names[first.suspect]} the {part} was another by "
-            f"{first.size:.2g} {UNITS[first.part]} at {first.since_s:.0f} s, and nothing "
-            "independent has shown since that the answer is right"
+            f"{' or '.join(said)}: without {names[first.suspect]} the "
+            f"{('velocity', 'position')[first.part]} was another by {first.size:.2g} "
+            f"{UNITS[first.part]} at {first.since_s:.0f} s, and nothing independent has shown "
+            "since that the answer is right"
         )
 
     def protection(self, lanes: Lanes, R_up: Array, time_s: float, fixed_s: float) -> Protection:
