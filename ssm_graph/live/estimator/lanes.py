@@ -20,7 +20,7 @@ import numpy as np
 
 from factors import so3
 from ssm_graph.base.frozen import Array
-from ssm_graph.engine.error_state import ROTATION, STATE_DIM
+from ssm_graph.engine.error_state import ACCEL_BIAS, GYRO_BIAS, ROTATION, STATE_DIM
 from ssm_graph.engine.states import States
 from ssm_graph.graph.aids.depth import DepthMeans
 from ssm_graph.graph.aids.gnss import Fixes
@@ -60,6 +60,10 @@ LASTING_S: Final = 20.0
 """Correlation time of what lasts."""
 TURN_S: Final = 10.0
 """So long a turn goes on, over which the errors of the gyros' scales and axes add up."""
+INSTABILITY: Final = 0.4
+"""Share of their turn-on sigma by which the biases of inertial sensors wander,"""
+INSTABILITY_S: Final = 300.0
+"""within so much: an instability that data sheets state as the floor of the Allan deviation."""
 LEAST_WEIGHT: Final = 1e-3
 MEMORY_S: Final = 10.0
 """Time constant of the low-passed innovation ratios."""
@@ -149,6 +153,8 @@ class LaneBank:
         self._share = np.array(shares)
         """Variance of what lasts, in that of the noise"""
         self._n = sensors.state_dim
+        bias_sigma = np.repeat([noise.accel_bias_sigma, noise.gyro_bias_sigma], 3)
+        self._wander = 2.0 * (INSTABILITY * bias_sigma) ** 2 / INSTABILITY_S
         self._scale = noise.accel_bias_sigma / GRAVITY
         """Errors of scales and axes are to gravity as the bias: 50 ppm, 500 ppm, 5000 ppm"""
 
@@ -223,6 +229,8 @@ class LaneBank:
         lasting = float(rate_b @ rate_b) * span_s * TURN_S + float(turn_b @ turn_b)
         turned = np.arange(STATE_DIM)[ROTATION]
         covariance[:, turned, turned] += self._scale**2 * lasting
+        biases = np.r_[np.arange(STATE_DIM)[ACCEL_BIAS], np.arange(STATE_DIM)[GYRO_BIAS]]
+        covariance[:, biases, biases] += self._wander * span_s
         n, kept = self._n, np.exp(-span_s / LASTING_S)
         covariance[:, n:] *= kept
         covariance[:, :, n:] *= kept
