@@ -14,7 +14,13 @@ from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.live.run.run_folder import RunFolder
 from ssm_graph.live.run.runner import Connections, Engine
 from ssm_graph.live.sockets.outputs import OutputFormat
-from ssm_graph.mission.estimate import BeamTable, CurrentTrack, Found, Trajectory
+from ssm_graph.mission.estimate import (
+    BeamTable,
+    CurrentTrack,
+    Found,
+    ProtectionTrack,
+    Trajectory,
+)
 from ssm_graph.mission.navigation import Event, Health, Navigation, Severity
 from ssm_graph.mission.run_status import LinkState, OutputStatus, SourceStatus
 from ssm_graph.mission.vehicle import Vehicle
@@ -33,6 +39,7 @@ class Delayed(NamedTuple):
     trajectory: Trajectory
     beams: BeamTable
     current: CurrentTrack | None = None
+    protection: ProtectionTrack | None = None
 
 
 class FakeEstimator:

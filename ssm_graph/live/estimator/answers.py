@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +14,14 @@ from ssm_graph.live.estimator.guard import Guarded
 from ssm_graph.live.estimator.tail import Newest
 from ssm_graph.live.estimator.watch import Watch, verdict
 from ssm_graph.mission.answer import trajectory_at
-from ssm_graph.mission.estimate import AidTable, BeamTable, CurrentTrack, Found, Trajectory
+from ssm_graph.mission.estimate import (
+    AidTable,
+    BeamTable,
+    CurrentTrack,
+    Found,
+    ProtectionTrack,
+    Trajectory,
+)
 from ssm_graph.mission.navigation import Navigation
 from ssm_graph.smoothers.track import Stretch, calibration_of_last, current_along
 from ssm_graph.smoothers.window import Window
@@ -83,9 +91,17 @@ class Delayed(NamedTuple):
     """Beside the trajectory; None of a vehicle without one."""
     aids: AidTable | None
     """What became of the aids' measurements; None if there were none."""
+    protection: ProtectionTrack
 
 
-def delayed_of(stretch: Stretch, frame: LocalFrame, extras: Extras, *, shift_s: float) -> Delayed:
+def delayed_of(
+    stretch: Stretch,
+    protection: ProtectionTrack,
+    frame: LocalFrame,
+    extras: Extras,
+    *,
+    shift_s: float,
+) -> Delayed:
     """Return a stretch on the vehicle's clock, which is ``shift_s`` behind ours.
 
     ``extras`` are what each keyframe of it carries beside the error state.
@@ -102,4 +118,5 @@ def delayed_of(stretch: Stretch, frame: LocalFrame, extras: Extras, *, shift_s: 
         ),
         current_along(extras, stretch._replace(time_s=time_s)),
         aid_table([one._replace(time_s=one.time_s - shift_s) for one in stretch.aids.values()]),
+        replace(protection, time_s=time_s),
     )

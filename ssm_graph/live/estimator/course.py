@@ -16,7 +16,7 @@ from ssm_graph.base.errors import SolverError
 from ssm_graph.engine.error_state import VELOCITY
 from ssm_graph.graph.inertial_rows import InertialRows
 from ssm_graph.live.estimator.buffers import Buffers, Measured
-from ssm_graph.live.estimator.guard import Guard, Guarded, Guardian
+from ssm_graph.live.estimator.guard import Guard, Guarded, Guardian, protection_at
 from ssm_graph.live.estimator.keyframes import KeyframeMaker
 from ssm_graph.live.estimator.recovery import (
     Doubt,
@@ -27,6 +27,7 @@ from ssm_graph.live.estimator.recovery import (
     watch_after,
 )
 from ssm_graph.live.estimator.watch import Watch, is_sound, observe
+from ssm_graph.mission.estimate import ProtectionTrack
 from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.navigation import Severity
 from ssm_graph.smoothers.keyframe import Keyframe
@@ -62,6 +63,13 @@ class Step(NamedTuple):
         return self.window.keyframes[-1].time_s
 
 
+class Settled(NamedTuple):
+    """Successive keyframes that have left the window for good."""
+
+    stretch: Stretch
+    protection: ProtectionTrack
+
+
 class Course:
     """Makes one step after the other, and keeps those that late messages may go back to."""
 
@@ -78,7 +86,7 @@ class Course:
         self._maker, self._buffers, self._events = maker, buffers, events
         sensors = first.window.sensors
         self._inertial = InertialRows(sensors.frame, sensors.extras)
-        self._settled: list[Stretch] = []
+        self._settled: list[Settled] = []
 
     @property
     def newest(self) -> Step:
@@ -126,13 +134,16 @@ class Course:
             self._thin_out()
         return count
 
-    def take_settled(self, *, all_of_them: bool = False) -> list[Stretch]:
+    def take_settled(self, *, all_of_them: bool = False) -> list[Settled]:
         """Return what has left the window for good since the last call, or all there is."""
         settled, self._settled = self._settled, []
         if all_of_them:
-            settled += [step.left for step in self._steps if step.left is not None]
-            settled.append(self.newest.window.all)
+            left = [step.left for step in self._steps if step.left is not None]
+            settled += map(self._with_levels, (*left, self.newest.window.all))
         return settled
+
+    def _with_levels(self, stretch: Stretch) -> Settled:
+        return Settled(stretch, protection_at(self.newest.guard, stretch.time_s))
 
     def _let_go(self) -> None:
         """Forget the steps that nothing can undo any more."""
@@ -140,7 +151,9 @@ class Course:
         while len(self._steps) > 1 and self._steps[1].time_s <= kept_s:
             gone = self._steps.popleft().left
             if gone is not None:
-                self._settled.append(joined([gone]))  # a copy: a view keeps the whole window
+                self._settled.append(
+                    self._with_levels(joined([gone]))
+                )  # a copy: a view keeps the whole window
         self._buffers.drop_before(self.oldest.window.keyframes[0].time_s - 1.0)
 
     def _thin_out(self) -> None:

@@ -6,7 +6,7 @@ Everything is a function of the data up to a keyframe, as the window is, and goe
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -21,9 +21,14 @@ from ssm_graph.live.estimator.separation import (
     pack_contradictions,
     unpack_contradictions,
 )
+from ssm_graph.mission.estimate import ProtectionTrack
 from ssm_graph.sensors.imu import ImuNoise
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors
 from ssm_graph.smoothers.window import Window
+
+UNSETTLED: Final = 2.0
+"""Lags until a keyframe settles: it leaves the window, and then no late message undoes that."""
+SPARE_S: Final = 15.0
 
 
 class Guard(NamedTuple):
@@ -35,13 +40,21 @@ class Guard(NamedTuple):
     fixed_s: float
     """When the position was last known by itself: by a fix, or where all began, s"""
     levels: Array
-    """(K, 3) time, s, and protection levels, m, of the keyframes of the window"""
+    """(K, 3) time, s, and protection levels, m, of all keyframes that have not settled"""
 
     def pack(self) -> Iterator[tuple[str, Array]]:
         """Yield name and array of all but the contradictions."""
         yield from self.lanes.pack()
         yield "levels", self.levels
         yield "fixed_s", np.array(self.fixed_s)
+
+
+def protection_at(guard: Guard, time_s: Array) -> ProtectionTrack:
+    """Return the protection levels at keyframes (K,), infinite where there were no lanes yet."""
+    known_s = guard.levels[:, 0]
+    at = np.minimum(np.searchsorted(known_s, time_s), len(known_s) - 1)
+    found = np.where((known_s[at] == time_s)[:, None], guard.levels[at, 1:], np.inf)
+    return ProtectionTrack(time_s, *found.T)
 
 
 class Guarded(NamedTuple):
@@ -84,7 +97,8 @@ class Guardian:
         is_fixed = any(SUSPECT_OF.get(name) in FIXES for name in window.keyframes[-1].aids)
         lanes, known = self.judge.judged(lanes, guard.contradictions, keyframe.time_s)
         fixed_s = keyframe.time_s if is_fixed else guard.fixed_s
-        levels = guard.levels[guard.levels[:, 0] >= window.keyframes[0].time_s - 1.0]
+        unsettled_s = UNSETTLED * window.config.lag_s + SPARE_S
+        levels = guard.levels[guard.levels[:, 0] > keyframe.time_s - unsettled_s]
         return self._guard(lanes, known, window, fixed_s, levels)
 
     def _guard(

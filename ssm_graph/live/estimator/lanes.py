@@ -1,13 +1,12 @@
 """Cheap filters beside the window, each of which leaves one sensor out for a while.
 
 A lane begins with what all sensors say and goes on without one of them for 10, 60 or 240 s; two of
-each length take turns. What it says then owes nothing to what that sensor did since, so that a
-sensor that lies for long, or whose readings all lie alike, parts the lanes from the answer: solution
-separation. One more lane leaves nothing out. It is the measure of the others: lanes and measure
-have the same model, in which noise that lasts is as large as it may be, and then the covariance
-of their separation is the difference of their covariances.
+each length take turns. What it says then owes nothing to what that sensor did since: a sensor that
+lies for long, or whose readings all lie alike, parts the lanes from the answer. That is solution
+separation. One more lane leaves nothing out and is the measure of the others: all have one model,
+in which noise that lasts is as large as it may be, and then the covariance of a separation is the
+difference of their covariances.
 
-All lanes are linear about the answer of the window, whose rows and weights they use, and are
 carried as deviations from it in arrays: a keyframe costs as much as a few small products.
 """
 

@@ -324,9 +324,9 @@ class FixedLagSmoother:
         assert self._frame is not None
         shift_s, extras = self._intake.shift_s, course.newest.window.sensors.extras
         return [
-            delayed_of(stretch, self._frame, extras, shift_s=shift_s)
-            for stretch in course.take_settled(all_of_them=all_of_them)
-            if len(stretch.time_s)
+            delayed_of(*settled, self._frame, extras, shift_s=shift_s)
+            for settled in course.take_settled(all_of_them=all_of_them)
+            if len(settled.stretch.time_s)
         ]
 
 
