@@ -7,6 +7,7 @@ separation. One more lane leaves nothing out and is the measure of the others: a
 in which noise that lasts is as large as it may be, and then the covariance of a separation is the
 difference of their covariances.
 
+All lanes are linear about the answer of the window, whose rows and weights they use, and are
 carried as deviations from it in arrays: a keyframe costs as much as a few small products.
 """
 
@@ -177,7 +178,9 @@ class LaneBank:
             np.zeros((L, len(covariance))),
             np.tile(covariance, (L, 1, 1)),
             begun_s,
-            *(np.zeros(L) for _ in range(3)),
+            np.zeros(L),
+            np.zeros(L),
+            np.zeros(L),
             np.ones(L),
             np.full(S, -np.inf),
             np.full((S, MOST_BEAMS), np.nan),

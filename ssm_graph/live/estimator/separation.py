@@ -8,7 +8,7 @@ its sensor, until that lane, by what is independent of the sensor, can say that 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -67,7 +67,7 @@ class Contradiction(NamedTuple):
     part: int
     """0 in velocity, 1 in position"""
     size: float
-    """m/s or m"""
+    """Largest so far, m/s or m"""
     agreed_s: float
     """Since when the lane that is led on agrees, s; infinite where it does not"""
 
@@ -142,7 +142,8 @@ class Judge:
                 size = float(found.size[lane, part])
                 if before is None:
                     before = Contradiction(suspect, time_s, time_s, part, size, np.inf)
-                kept[suspect] = before._replace(last_s=time_s, agreed_s=np.inf)
+                largest = max(before.size, float(found.size[lane, before.part]))
+                kept[suspect] = before._replace(last_s=time_s, size=largest, agreed_s=np.inf)
             elif suspect in kept:
                 still = self._still(kept[suspect], found, held, time_s)
                 if still is None:
@@ -183,8 +184,8 @@ class Judge:
             said.append(INERTIAL)
         return (
             f"{' or '.join(said)}: without {names[first.suspect]} the "
-            f"{('velocity', 'position')[first.part]} was another by {first.size:.2g} "
-            f"{UNITS[first.part]} at {first.since_s:.0f} s, and nothing independent has shown "
+            f"{('velocity', 'position')[first.part]} has been another by {first.size:.2g} "
+            f"{UNITS[first.part]} since {first.since_s:.0f} s, and nothing independent has shown "
             "since that the answer is right"
         )
 
@@ -238,7 +239,7 @@ def pack_contradictions(known: tuple[Contradiction, ...], names: tuple[str, ...]
 
 
 def unpack_contradictions(
-    packed: list[Mapping[str, Any]], names: tuple[str, ...]
+    packed: Sequence[Mapping[str, Any]], names: tuple[str, ...]
 ) -> tuple[Contradiction, ...]:
     """Return the contradictions that were packed."""
     return tuple(

@@ -232,10 +232,12 @@ class FixedLagSmoother:
             assert smoother._frame is not None
             sensors = sensors_of_vehicle(vehicle, smoother._frame)
             inertial = smoother._maker().inertial
-            window, *rest = unpack_step(arrays, meta["watch"], sensors, smoother.config, inertial)
+            packed = arrays, meta["watch"], sensors, smoother.config
+            window, watch, left, reserve = unpack_step(*packed, inertial)
             guardian = smoother._guardian(sensors)
             guard = guardian.unpack(_part(arrays, "guard_"), smoother._known, window)
-            smoother._course = course = smoother._course_from(Step(window, *rest, guard), guardian)
+            step = Step(window, watch, left, reserve, guard)
+            smoother._course = course = smoother._course_from(step, guardian)
             course.advance()
             intake.horizon_s = course.horizon_s
             smoother._tail = smoother._tail_of(course.newest)
