@@ -159,6 +159,16 @@ class Window:
         return self._stretch(len(self.keyframes) - 1, len(self.keyframes))
 
     @property
+    def newest_states(self) -> States:
+        """The estimate (1, ...) of the newest keyframe."""
+        return self._graph.at.take(np.s_[-1:]).moved(self._step[-1:])
+
+    @property
+    def newest_covariance(self) -> Array:
+        """That of its error state and what it carries beside, (n, n)."""
+        return self._covariance[-1]
+
+    @property
     def newest_sigma(self) -> Array:
         """Standard deviations (n,) of the newest keyframe."""
         return np.asarray(np.sqrt(np.diagonal(self._covariance[-1])))

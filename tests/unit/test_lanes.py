@@ -15,7 +15,7 @@ from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.live.estimator import ONLINE, FixedLagSmoother, IntegrityConfig
 from ssm_graph.live.estimator.guard import Guardian
 from ssm_graph.live.estimator.lanes import MEASURE, Lanes
-from ssm_graph.live.estimator.separation import AGREED_S, UNASKED
+from ssm_graph.live.estimator.separation import AGREED_S, UNASKED, Contradiction
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.navigation import Health
 from ssm_graph.simulation import Grade, SimulatedMission
@@ -184,18 +184,24 @@ def held_off(lanes: Lanes, guardian: Guardian, off_m: float, sigma: float) -> La
 def test_only_a_lane_that_could_tell_ends_a_contradiction() -> None:
     """One that has become uncertain agrees with everything, and does not count; ten seconds do."""
     guardian, lanes = guardian_of(after("calm")[1])
-    judge = guardian.judge
-    lanes, known = judge.judged(held_off(lanes, guardian, 3.0, 0.1), (), 100.0)
+
+    def judged(
+        off_m: float, sigma: float, known: tuple[Contradiction, ...], time_s: float
+    ) -> tuple[Lanes, tuple[Contradiction, ...]]:
+        now = held_off(lanes, guardian, off_m, sigma)
+        return guardian.judge.judged(now, guardian.judge.separations(now), known, time_s)
+
+    lanes, known = judged(3.0, 0.1, (), 100.0)
     (one,) = known
     assert guardian.bank.suspects[one.suspect] == "GNSS"
     assert one.size == pytest.approx(3.0)
     for k in range(100):
-        _, known = judge.judged(held_off(lanes, guardian, 0.0, 10.0), known, 101.0 + k)
+        _, known = judged(0.0, 10.0, known, 101.0 + k)
     assert len(known) == 1
     for k in range(int(AGREED_S)):
-        _, known = judge.judged(held_off(lanes, guardian, 0.0, 0.1), known, 201.0 + k)
+        _, known = judged(0.0, 0.1, known, 201.0 + k)
     assert len(known) == 1
-    agreed, known = judge.judged(held_off(lanes, guardian, 0.0, 0.1), known, 212.5)
+    agreed, known = judged(0.0, 0.1, known, 212.5)
     assert known == ()
     assert np.isinf(agreed.begun_s[guardian.bank.held]).all()
 

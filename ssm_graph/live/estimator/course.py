@@ -194,7 +194,7 @@ class Course:
     def _guarded(self, keyframe: Keyframe, window: Window, *, is_anew: bool) -> Guard:
         """Return the guard at the next keyframe, and tell what is found to contradict."""
         last = self.newest
-        state = last.window.newest.states
+        state = last.window.newest_states
         guard = self.guardian.led_on(last.guard, state, keyframe, window, is_anew=is_anew)
         known = {one.suspect for one in last.guard.contradictions}
         now = {one.suspect for one in guard.contradictions}

@@ -18,6 +18,7 @@ from ssm_graph.live.estimator.separation import (
     IntegrityConfig,
     Judge,
     Protection,
+    Separations,
     pack_contradictions,
     unpack_contradictions,
 )
@@ -82,7 +83,8 @@ class Guardian:
         time_s = window.keyframes[-1].time_s
         contradictions = unpack_contradictions(known, self.bank.suspects)
         lanes = self.bank.begin(window, [one.suspect for one in contradictions])
-        return self._guard(lanes, contradictions, window, time_s, np.zeros((0, 3)))
+        found = self.judge.separations(lanes)
+        return self._guard(lanes, found, contradictions, window, time_s, np.zeros((0, 3)))
 
     def led_on(
         self, guard: Guard, last: States, keyframe: Keyframe, window: Window, *, is_anew: bool
@@ -95,24 +97,26 @@ class Guardian:
         step = self.bank.after_doubt if is_anew else self.bank.led_on
         lanes = step(guard.lanes, last, keyframe, window)
         is_fixed = any(SUSPECT_OF.get(name) in FIXES for name in window.keyframes[-1].aids)
-        lanes, known = self.judge.judged(lanes, guard.contradictions, keyframe.time_s)
+        found = self.judge.separations(lanes)
+        lanes, known = self.judge.judged(lanes, found, guard.contradictions, keyframe.time_s)
         fixed_s = keyframe.time_s if is_fixed else guard.fixed_s
         unsettled_s = UNSETTLED * window.config.lag_s + SPARE_S
         levels = guard.levels[guard.levels[:, 0] > keyframe.time_s - unsettled_s]
-        return self._guard(lanes, known, window, fixed_s, levels)
+        return self._guard(lanes, found, known, window, fixed_s, levels)
 
     def _guard(
         self,
         lanes: Lanes,
+        found: Separations,
         known: tuple[Contradiction, ...],
         window: Window,
         fixed_s: float,
         levels: Array,
     ) -> Guard:
-        newest = window.newest.states
+        newest = window.newest_states
         time_s = window.keyframes[-1].time_s
         R_lb = self._frame.R_nl_at(newest.p_n[0]).T @ newest.R_nb[0]
-        level = self.judge.protection(lanes, R_lb, time_s, fixed_s)
+        level = self.judge.protection(lanes, found, R_lb, time_s=time_s, fixed_s=fixed_s)
         return Guard(lanes, known, level, fixed_s, np.vstack([levels, [time_s, *level]]))
 
     def told(self, guard: Guard) -> Guarded:

@@ -170,7 +170,7 @@ class LaneBank:
         """
         L, S = len(self.suspect), len(self.suspects)
         time_s = window.keyframes[-1].time_s
-        covariance = self._beside(window.newest.covariance[0] * DOUBT_FACTOR**2)
+        covariance = self._beside(window.newest_covariance * DOUBT_FACTOR**2)
         begun_s = time_s - self._stagger_s
         begun_s[self.held] = np.inf
         begun_s[self.held[list(led_on)]] = time_s
@@ -206,7 +206,7 @@ class LaneBank:
         lanes = self._predicted(lanes, last, keyframe, window)
         deviation, covariance = lanes.deviation.copy(), lanes.covariance.copy()
         deviation[MEASURE] = 0.0
-        covariance[MEASURE] = self._beside(window.newest.covariance[0])
+        covariance[MEASURE] = self._beside(window.newest_covariance)
         is_nested = np.zeros(len(deviation))
         is_nested[MEASURE] = 1.0
         lanes = lanes._replace(deviation=deviation, covariance=covariance, is_nested=is_nested)
@@ -220,7 +220,7 @@ class LaneBank:
 
     def _predicted(self, lanes: Lanes, last: States, keyframe: Keyframe, window: Window) -> Lanes:
         assert keyframe.inertial is not None
-        interval, now = keyframe.inertial, window.newest.states
+        interval, now = keyframe.inertial, window.newest_states
         ahead = self._inertial.predict(interval, last)
         covariance = ahead.covariance(lanes.covariance)
         # What the gyros are off in a turn lasts as long as the turn; waves come and go.

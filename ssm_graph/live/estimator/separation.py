@@ -18,7 +18,7 @@ from scipy.stats import chi2, norm
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import POSITION, VELOCITY
-from ssm_graph.live.estimator.lanes import DEPTH, DVL, LENGTHS_S, MEASURE, LaneBank, Lanes
+from ssm_graph.live.estimator.lanes import DEPTH, DVL, FIXES, LENGTHS_S, MEASURE, LaneBank, Lanes
 
 PARTS: Final = (VELOCITY, POSITION)
 UNITS: Final = ("m/s", "m")
@@ -29,6 +29,10 @@ UNASKED: Final = 0.01
 than a tenth of its own sigma is not asked for."""
 AGREED_S: Final = 10.0
 """A contradiction ends once the lane that is led on has agreed for so long."""
+CONFIRMED: Final = 1.0 / 3.0
+"""Share of its way at a false velocity by which the measure, held by fixes, parts from a lane."""
+CONFIRMED_S: Final = 40.0
+"""So long a lane without fixes has to go to confirm the DVL."""
 RIVAL: Final = 0.5
 """A sensor that explains so much of what the likeliest one explains is named beside it."""
 INERTIAL: Final = "the inertial data"
@@ -125,10 +129,13 @@ class Judge:
         return Separations(test, size, sigma)
 
     def judged(
-        self, lanes: Lanes, known: tuple[Contradiction, ...], time_s: float
+        self,
+        lanes: Lanes,
+        found: Separations,
+        known: tuple[Contradiction, ...],
+        time_s: float,
     ) -> tuple[Lanes, tuple[Contradiction, ...]]:
         """Return the contradictions after one more keyframe, and the lanes with those led on."""
-        found = self.separations(lanes)
         kept = {one.suspect: one for one in known}
         for suspect in range(len(self._bank.suspects)):
             own = self._bank.lanes_of(suspect)
@@ -145,7 +152,7 @@ class Judge:
                 largest = max(before.size, float(found.size[lane, before.part]))
                 kept[suspect] = before._replace(last_s=time_s, size=largest, agreed_s=np.inf)
             elif suspect in kept:
-                still = self._still(kept[suspect], found, held, time_s)
+                still = self._still(kept[suspect], lanes, found, time_s)
                 if still is None:
                     del kept[suspect]
                     begun_s = lanes.begun_s.copy()
@@ -156,15 +163,37 @@ class Judge:
         return lanes, tuple(kept.values())
 
     def _still(
-        self, was: Contradiction, found: Separations, held: int, time_s: float
+        self, was: Contradiction, lanes: Lanes, found: Separations, time_s: float
     ) -> Contradiction | None:
-        """Return a contradiction while the lane led on cannot rule it out; None once it has."""
-        could_see = self.detectable * found.sigma[held, was.part] <= was.size
-        if was.part == 0:
-            moved = was.size * (time_s - was.since_s)
-            could_see |= bool(self.detectable * found.sigma[held, 1] <= moved)
-        agreed_s = min(was.agreed_s, time_s) if could_see else np.inf
+        """Return a contradiction while nothing can rule it out; None once something has."""
+        own = int(self._bank.held[was.suspect]), was.part
+        is_out = bool(found.size[own] + self.detectable * found.sigma[own] <= was.size)
+        if self._bank.suspects[was.suspect] == DVL and was.part == 0:
+            is_out |= self._is_confirmed(was, lanes, found, time_s)
+        agreed_s = min(was.agreed_s, time_s) if is_out else np.inf
         return None if time_s - agreed_s > AGREED_S else was._replace(agreed_s=agreed_s)
+
+    def _is_confirmed(
+        self, was: Contradiction, lanes: Lanes, found: Separations, time_s: float
+    ) -> bool:
+        """Return whether fixes have shown since that the DVL leads to where the vehicle is.
+
+        A lane without fixes, begun since, would be off by the velocity that was found times its
+        age, and what has all sensors by a good part of that.
+        """
+        for suspect, name in enumerate(self._bank.suspects):
+            if name not in FIXES:
+                continue
+            own = self._bank.lanes_of(suspect)
+            if found.test[own.start : own.stop].max() > self.threshold:
+                return False
+            for lane in own[:-1]:
+                age_s = time_s - lanes.begun_s[lane]
+                is_since = lanes.begun_s[lane] > was.last_s and lanes.n_out[lane] > 0.0
+                seen = self.detectable * found.sigma[lane, 1] <= CONFIRMED * was.size * age_s
+                if is_since and age_s > CONFIRMED_S and seen:
+                    return True
+        return False
 
     def blamed(self, lanes: Lanes, known: tuple[Contradiction, ...]) -> list[Contradiction]:
         """Return those without which what the others say fits, the clearest first."""
@@ -189,11 +218,14 @@ class Judge:
             "since that the answer is right"
         )
 
-    def protection(self, lanes: Lanes, R_up: Array, time_s: float, fixed_s: float) -> Protection:
+    def protection(
+        self, lanes: Lanes, found: Separations, R_up: Array, *, time_s: float, fixed_s: float
+    ) -> Protection:
         """Return the protection level of the window's answer.
 
-        ``R_up`` (3, 3) turns position in body axes to east, north, up; ``fixed_s`` is when the
-        position was last known by itself, s: by a fix, or where all began.
+        ``found`` are the separations of those that are not led on; ``R_up`` (3, 3) turns position
+        in body axes to east, north, up; ``fixed_s`` is when the position was last known by itself,
+        s: by a fix, or where all began.
         """
         off = np.abs(lanes.deviation[:, POSITION] @ R_up.T)
         P = R_up @ lanes.covariance[:, POSITION, POSITION] @ R_up.T
@@ -205,7 +237,6 @@ class Judge:
             ],
             axis=1,
         )
-        found = self.separations(lanes)
         worst = bound[MEASURE].copy()
         for suspect, name in enumerate(self._bank.suspects):
             own, held = self._bank.lanes_of(suspect), int(self._bank.held[suspect])
