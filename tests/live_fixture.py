@@ -251,5 +251,8 @@ def a_navigation(time_s: float, value: float = 0.5, **changes: Any) -> Navigatio
         "gyro_bias": np.zeros(3),
         "accel_bias": np.zeros(3),
         "beam_weights": np.array([1.0, 0.6, 0.02, np.nan]),
+        "protection_m": 2.5,
+        "protection_up_m": 0.75,
+        "innovation_ratios": {"DVL": 0.12, "GNSS": 0.7, "depth": 1.4},
     }
     return Navigation(**{**fields, **changes})

@@ -64,6 +64,8 @@ INSTABILITY: Final = 0.4
 """Share of their turn-on sigma by which the biases of inertial sensors wander,"""
 INSTABILITY_S: Final = 300.0
 """within so much: an instability that data sheets state as the floor of the Allan deviation."""
+MISFIT_S: Final = 10.0
+"""A misfit is forgotten within so much."""
 LEAST_WEIGHT: Final = 1e-3
 MEMORY_S: Final = 10.0
 """Time constant of the low-passed innovation ratios."""
@@ -93,6 +95,8 @@ class Lanes(NamedTuple):
     """(L,) rows of fixes that counted since"""
     evidence: Array
     """(L,) by how much more than noise the measure's chi-square has grown since than the lane's"""
+    misfit: Array
+    """(L,) by how much more than noise its own chi-square has grown lately"""
     is_nested: Array
     """(L,) 1 where the lane and the measure have the same past, else 0"""
     last_s: Array
@@ -181,6 +185,7 @@ class LaneBank:
             np.zeros(L),
             np.zeros(L),
             np.zeros(L),
+            np.zeros(L),
             np.ones(L),
             np.full(S, -np.inf),
             np.full((S, MOST_BEAMS), np.nan),
@@ -209,7 +214,11 @@ class LaneBank:
         covariance[MEASURE] = self._beside(window.newest_covariance)
         is_nested = np.zeros(len(deviation))
         is_nested[MEASURE] = 1.0
-        lanes = lanes._replace(deviation=deviation, covariance=covariance, is_nested=is_nested)
+        misfit = lanes.misfit.copy()
+        misfit[MEASURE] = 0.0
+        lanes = lanes._replace(
+            deviation=deviation, covariance=covariance, misfit=misfit, is_nested=is_nested
+        )
         return self._begun_anew(lanes, keyframe.time_s)
 
     def _beside(self, covariance: Array) -> Array:
@@ -243,7 +252,10 @@ class LaneBank:
         off = np.append(off, ahead.states.walks[0] - now.walks[0])
         moved = off + ahead.deviation(lanes.deviation[:, :n])
         deviation = np.concatenate([moved, lanes.deviation[:, n:] * kept], axis=1)
-        return lanes._replace(deviation=deviation, covariance=covariance, rate_b=rate_b)
+        misfit = lanes.misfit * np.exp(-span_s / MISFIT_S)
+        return lanes._replace(
+            deviation=deviation, covariance=covariance, misfit=misfit, rate_b=rate_b
+        )
 
     def _updated(self, lanes: Lanes, measured: Sequence[SensorRows], time_s: float) -> Lanes:
         suspect = [self._number(rows.sensor) for rows in measured]
@@ -273,6 +285,7 @@ class LaneBank:
             n_out=lanes.n_out + np.sum(~counts_in, axis=1),
             n_fixes=lanes.n_fixes + np.sum(counts_in & is_fix, axis=1),
             evidence=lanes.evidence + surplus[MEASURE] - surplus,
+            misfit=np.maximum(lanes.misfit + surplus, 0.0),
         )
 
     def _number(self, sensor: str) -> int:
@@ -334,4 +347,4 @@ class LaneBank:
         )
 
 
-_COUNTS: Final = ("n_out", "n_fixes", "evidence")
+_COUNTS: Final = ("n_out", "n_fixes", "evidence", "misfit")

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import chi2, norm
 
 from ssm_graph.base.errors import ConfigError
@@ -33,6 +34,8 @@ CONFIRMED: Final = 1.0 / 3.0
 """Share of its way at a false velocity by which the measure, held by fixes, parts from a lane."""
 CONFIRMED_S: Final = 40.0
 """So long a lane without fixes has to go to confirm the DVL."""
+FITS: Final = 0.75
+"""Misfit of the measure, in thresholds, below which it fits all that is measured."""
 RIVAL: Final = 0.5
 """A sensor that explains so much of what the likeliest one explains is named beside it."""
 INERTIAL: Final = "the inertial data"
@@ -125,8 +128,16 @@ class Judge:
             test[:, k] = np.sum(off * np.linalg.solve(D, off[..., None])[..., 0], axis=1)
             size[:, k] = np.linalg.norm(off, axis=1)
             sigma[:, k] = np.sqrt(np.linalg.eigvalsh(D)[:, -1])
-        test[(lanes.n_out == 0.0) | ~np.isfinite(lanes.begun_s)] = 0.0
+        test[(lanes.n_out == 0.0) | ~np.isfinite(lanes.begun_s) | self.is_refuted(lanes)] = 0.0
         return Separations(test, size, sigma)
+
+    def is_refuted(self, lanes: Lanes) -> NDArray[np.bool_]:
+        """Return (L,) whether a lane is contradicted by its own sensors, which the measure fits.
+
+        Such a lane accuses nobody: what is wrong is in what it began with, or in the inertial data.
+        """
+        fits = lanes.misfit[MEASURE] < FITS * self.threshold
+        return np.asarray(fits & (lanes.misfit > self.threshold))
 
     def judged(
         self,
@@ -167,6 +178,8 @@ class Judge:
     ) -> Contradiction | None:
         """Return a contradiction while nothing can rule it out; None once something has."""
         own = int(self._bank.held[was.suspect]), was.part
+        if self.is_refuted(lanes)[own[0]]:
+            return None
         is_out = bool(found.size[own] + self.detectable * found.sigma[own] <= was.size)
         if self._bank.suspects[was.suspect] == DVL and was.part == 0:
             is_out |= self._is_confirmed(was, lanes, found, time_s)
@@ -197,7 +210,10 @@ class Judge:
 
     def blamed(self, lanes: Lanes, known: tuple[Contradiction, ...]) -> list[Contradiction]:
         """Return those without which what the others say fits, the clearest first."""
-        evidence = {one.suspect: lanes.evidence[self._bank.held[one.suspect]] for one in known}
+        held = {one.suspect: self._bank.held[one.suspect] for one in known}
+        sound = tuple(one for one in known if lanes.misfit[held[one.suspect]] < self.threshold)
+        known = sound or known
+        evidence = {one.suspect: lanes.evidence[held[one.suspect]] for one in known}
         order = sorted(known, key=lambda one: -evidence[one.suspect])
         best = evidence[order[0].suspect] if order else 0.0
         return [one for one in order if evidence[one.suspect] >= RIVAL * best]
