@@ -94,7 +94,7 @@ def test_pings_off_the_water_are_logged_and_count(tmp_path: Path) -> None:
     assert log.current is not None
     logged = log.dvl
     np.testing.assert_array_equal(logged.is_water, water[: len(logged.time_s)] > 0.0)
-    assert logged.is_water.sum() == 5
+    assert logged.is_water.sum() == 7
 
 
 def test_a_run_without_an_answer_has_its_code(

@@ -24,7 +24,9 @@ from tests.estimate_fixture import make_run
 
 NAMES = (TRAJECTORY_NAME, BEAMS_NAME, PROTECTION_NAME)
 
-LEVELS = ProtectionTrack(np.array([1.0, 2.0]), np.array([3.5, np.inf]), np.array([0.5, 0.7]))
+LEVELS = ProtectionTrack(
+    np.array([1.0, 2.0]), np.array([3.512345, 3.523456]), np.array([0.512345, 0.723456])
+)
 
 
 def add(results: GrowingResults, times: int = 1) -> None:

@@ -267,7 +267,7 @@ class GrowingResults:
         self._folder = folder
         self.problem: str | None = None
         """Why the last rows are not on disk, if they are not."""
-        headers = {**HEADERS, PROTECTION_NAME: PROTECTION_COLUMNS}
+        headers = {PROTECTION_NAME: PROTECTION_COLUMNS, **HEADERS}
         self._waiting: dict[str, str] = dict.fromkeys(headers, "")
         self._files: dict[str, AppendFile] = {}
         try:
