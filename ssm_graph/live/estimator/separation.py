@@ -36,6 +36,8 @@ CONFIRMED_S: Final = 40.0
 """So long a lane without fixes has to go to confirm the DVL."""
 FITS: Final = 0.75
 """Misfit of the measure, in thresholds, below which it fits all that is measured."""
+TOGETHER_S: Final = 10.0
+"""Contradictions that begin within so much compete for the blame."""
 RIVAL: Final = 0.5
 """A sensor that explains so much of what the likeliest one explains is named beside it."""
 INERTIAL: Final = "the inertial data"
@@ -209,12 +211,17 @@ class Judge:
         return False
 
     def blamed(self, lanes: Lanes, known: tuple[Contradiction, ...]) -> list[Contradiction]:
-        """Return those without which what the others say fits, the clearest first."""
+        """Return those without which what the others say fits, the clearest first.
+
+        What contradicts long after the first one does so since the answer has followed that.
+        """
         held = {one.suspect: self._bank.held[one.suspect] for one in known}
-        sound = tuple(one for one in known if lanes.misfit[held[one.suspect]] < self.threshold)
-        known = sound or known
-        evidence = {one.suspect: lanes.evidence[held[one.suspect]] for one in known}
-        order = sorted(known, key=lambda one: -evidence[one.suspect])
+        sound = [one for one in known if lanes.misfit[held[one.suspect]] < self.threshold]
+        rest = sound or list(known)
+        first_s = min((one.since_s for one in rest), default=0.0)
+        rest = [one for one in rest if one.since_s - first_s < TOGETHER_S]
+        evidence = {one.suspect: lanes.evidence[held[one.suspect]] for one in rest}
+        order = sorted(rest, key=lambda one: -evidence[one.suspect])
         best = evidence[order[0].suspect] if order else 0.0
         return [one for one in order if evidence[one.suspect] >= RIVAL * best]
 
