@@ -36,10 +36,14 @@ CONFIRMED_S: Final = 40.0
 """So long a lane without fixes has to go to confirm the DVL."""
 FITS: Final = 0.75
 """Misfit of the measure, in thresholds, below which it fits all that is measured."""
+WEIGHED_S: Final = 5.0
+"""Evidence is taken while a contradiction is so young."""
 TOGETHER_S: Final = 10.0
 """Contradictions that begin within so much compete for the blame."""
 RIVAL: Final = 0.5
 """A sensor that explains so much of what the likeliest one explains is named beside it."""
+NEAR: Final = 25.0
+"""And so is one whose chi-square is within so much."""
 INERTIAL: Final = "the inertial data"
 
 
@@ -77,6 +81,8 @@ class Contradiction(NamedTuple):
     """0 in velocity, 1 in position"""
     size: float
     """Largest so far, m/s or m"""
+    evidence: float
+    """By how much less of chi-square was left without it while it began"""
     agreed_s: float
     """Since when the lane that is led on agrees, s; infinite where it does not"""
 
@@ -161,7 +167,7 @@ class Judge:
                     lanes = lanes.with_copy(held, lane)
                 size = float(found.size[lane, part])
                 if before is None:
-                    before = Contradiction(suspect, time_s, time_s, part, size, np.inf)
+                    before = Contradiction(suspect, time_s, time_s, part, size, -np.inf, np.inf)
                 largest = max(before.size, float(found.size[lane, before.part]))
                 kept[suspect] = before._replace(last_s=time_s, size=largest, agreed_s=np.inf)
             elif suspect in kept:
@@ -173,7 +179,13 @@ class Judge:
                     lanes = lanes._replace(begun_s=begun_s)
                 else:
                     kept[suspect] = still
-        return lanes, tuple(kept.values())
+        return lanes, tuple(self._weighed(one, lanes, time_s) for one in kept.values())
+
+    def _weighed(self, one: Contradiction, lanes: Lanes, time_s: float) -> Contradiction:
+        """Return a contradiction with the evidence of its first seconds."""
+        if time_s - one.since_s > WEIGHED_S:
+            return one
+        return one._replace(evidence=max(one.evidence, self._evidence(lanes, one.suspect)))
 
     def _still(
         self, was: Contradiction, lanes: Lanes, found: Separations, time_s: float
@@ -210,24 +222,26 @@ class Judge:
                     return True
         return False
 
-    def blamed(self, lanes: Lanes, known: tuple[Contradiction, ...]) -> list[Contradiction]:
+    def _evidence(self, lanes: Lanes, suspect: int) -> float:
+        """Return what speaks for a suspect, by its oldest lane: those of all began together."""
+        own = self._bank.lanes_of(suspect)[:-1]
+        return float(lanes.evidence[own[int(np.argmin(lanes.begun_s[own.start : own.stop]))]])
+
+    def blamed(self, known: tuple[Contradiction, ...]) -> list[Contradiction]:
         """Return those without which what the others say fits, the clearest first.
 
         What contradicts long after the first one does so since the answer has followed that.
         """
-        held = {one.suspect: self._bank.held[one.suspect] for one in known}
-        sound = [one for one in known if lanes.misfit[held[one.suspect]] < self.threshold]
-        rest = sound or list(known)
-        first_s = min((one.since_s for one in rest), default=0.0)
-        rest = [one for one in rest if one.since_s - first_s < TOGETHER_S]
-        evidence = {one.suspect: lanes.evidence[held[one.suspect]] for one in rest}
-        order = sorted(rest, key=lambda one: -evidence[one.suspect])
-        best = evidence[order[0].suspect] if order else 0.0
-        return [one for one in order if evidence[one.suspect] >= RIVAL * best]
+        first_s = min((one.since_s for one in known), default=0.0)
+        rest = [one for one in known if one.since_s - first_s < TOGETHER_S]
+        order = sorted(rest, key=lambda one: -one.evidence)
+        best = order[0].evidence if order else 0.0
+        least = min(RIVAL * best, best - NEAR)
+        return [one for one in order if one.evidence >= least]
 
     def sentence(self, lanes: Lanes, known: tuple[Contradiction, ...]) -> str:
         """Say which sensors contradict the answer; an empty text where none does."""
-        blamed = self.blamed(lanes, known)
+        blamed = self.blamed(known)
         if not blamed:
             return ""
         names, first = self._bank.suspects, blamed[0]
