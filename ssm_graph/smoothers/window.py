@@ -166,7 +166,7 @@ class Window:
     @property
     def newest_covariance(self) -> Array:
         """That of its error state and what it carries beside, (n, n)."""
-        return self._covariance[-1]
+        return np.asarray(self._covariance[-1])
 
     @property
     def newest_sigma(self) -> Array:
