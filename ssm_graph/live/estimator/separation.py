@@ -246,7 +246,8 @@ class Judge:
             return ""
         names, first = self._bank.suspects, blamed[0]
         said = [names[one.suspect] for one in blamed]
-        if DVL in said and lanes.n_fixes[self._bank.held[names.index(DVL)]] == 0.0:
+        has_fixes = lanes.n_fixes[self._bank.held[blamed[0].suspect]] > 0.0
+        if DVL in said and not (has_fixes and len(known) == 1):
             said.append(INERTIAL)
         return (
             f"{' or '.join(said)}: without {names[first.suspect]} the "
