@@ -145,25 +145,36 @@ class Ahead(NamedTuple):
         return self.between._with_walks(self.moved.rows(self.interval), self.interval, walks)
 
     def covariance(self, before: Array) -> Array:
-        """Return the covariance (n + C, n + C) here from that at the keyframe before."""
+        """Return the covariance (..., n + C, n + C) here from that at the keyframe before."""
         F, Q = self.moved.transition[0], self.moved.noise(self.interval)[0]
-        if len(before) == STATE_DIM:
+        if before.shape[-1] == STATE_DIM:
             return np.asarray(F @ before @ F.T + Q)
         carried = before.copy()
-        seen: slice | NDArray[np.intp] = np.s_[:STATE_DIM]
-        if F.shape[1] > STATE_DIM:
-            seen = np.concatenate([np.arange(STATE_DIM), self.between._own])
-        carried[:STATE_DIM] = F @ before[seen]
-        carried[:, :STATE_DIM] = carried[:, seen] @ F.T
-        carried[:STATE_DIM, :STATE_DIM] += Q
+        seen = self._seen
+        carried[..., :STATE_DIM, :] = F @ before[..., seen, :]
+        carried[..., :STATE_DIM] = carried[..., seen] @ F.T
+        carried[..., :STATE_DIM, :STATE_DIM] += Q
         if self.between._extras.n_walks == 0:
             return carried
         (factor,), (sigma,) = self.between._extras.transitions(self.interval.span_s)
         own = np.arange(STATE_DIM, STATE_DIM + len(factor))
-        carried[own] *= factor[:, None]
-        carried[:, own] *= factor
-        carried[own, own] += sigma**2
+        carried[..., own, :] *= factor[:, None]
+        carried[..., own] *= factor
+        carried[..., own, own] += sigma**2
         return carried
+
+    def deviation(self, before: Array) -> Array:
+        """Return the deviations (..., n) from these states of what was off by ``before`` there."""
+        own, (factor,) = STATE_DIM, self.between._extras.transitions(self.interval.span_s)[0]
+        moved = before[..., self._seen] @ self.moved.transition[0].T
+        return np.concatenate([moved, before[..., own:] * factor], axis=-1)
+
+    @property
+    def _seen(self) -> slice | NDArray[np.intp]:
+        """Columns of the state that the inertial data depend on."""
+        if self.moved.transition.shape[2] == STATE_DIM:
+            return np.s_[:STATE_DIM]
+        return np.concatenate([np.arange(STATE_DIM), self.between._own])
 
 
 def imu_error_columns(problem: Problem, states: States) -> Array:

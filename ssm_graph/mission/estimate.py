@@ -145,6 +145,17 @@ class Trajectory(FrozenArrays):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class ProtectionTrack(FrozenArrays):
+    """What bounded the errors of live answers at the keyframes, as it was known there and then."""
+
+    time_s: Array = shaped("N")
+    horizontal: Array = shaped("N")
+    """(N,) m, radius; infinite where nothing was known"""
+    up: Array = shaped("N")
+    """(N,) m"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class CurrentTrack(FrozenArrays):
     """The current of the water along the vehicle's way, at the keyframes."""
 

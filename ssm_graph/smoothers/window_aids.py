@@ -25,6 +25,20 @@ def row_states(sensors: Sensors, states: States) -> RowStates:
     return RowStates(*states, sensors.extras, np.zeros(3))
 
 
+class SensorRows(NamedTuple):
+    """What one sensor measured at a keyframe, whitened by the stated noise."""
+
+    sensor: str
+    error: Array
+    """(m,) predicted minus measured"""
+    jacobian: Array
+    """(m, n)"""
+    weight: Array
+    """(m,)"""
+    component: Indices
+    """(m,) which beam or axis"""
+
+
 class _Measured(NamedTuple):
     """All measurements of one aid."""
 
@@ -260,6 +274,17 @@ class WindowAids:
                     some.aid, times, self._errors(some, step), some.t, some.weight
                 )
         return found
+
+    def rows_at(self, k: int, step: Array) -> Iterator[SensorRows]:
+        """Yield what each aid measured at keyframe ``k``, where a step (K, n) leads to."""
+        for name, one in self._all.items():
+            own = one.take(one.rows_of(k, k + 1))
+            if len(own.aid):
+                weight = np.repeat(own.weight, own.aid.dim)
+                error = self._errors(own, step).ravel()
+                component = np.arange(len(error)) % own.aid.dim
+                H = own.jacobian.reshape(len(error), -1)
+                yield SensorRows(name, error, H, weight, component)
 
     def pack(self) -> Iterator[tuple[str, Array]]:
         """Yield name and array of all that :meth:`unpack` needs."""

@@ -15,6 +15,7 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import POSITION, VELOCITY
 from ssm_graph.graph.aids.depth import DepthMeans
 from ssm_graph.graph.aids.gnss import Fixes
+from ssm_graph.live.estimator.guard import Guarded
 from ssm_graph.mission.answer import LARGEST_SPEED, LOW_WEIGHT, MISFIT, TRUSTED
 from ssm_graph.mission.navigation import Health
 from ssm_graph.smoothers.keyframe import Keyframe
@@ -246,10 +247,13 @@ class Verdict(NamedTuple):
     since_aid_s: float
 
 
-def verdict(watch: Watch, *, now_s: float, imu_s: float, covariance: Array) -> Verdict:
+def verdict(
+    watch: Watch, guarded: Guarded, *, now_s: float, imu_s: float, covariance: Array
+) -> Verdict:
     """Judge the newest answer, of the covariance (15, 15), by what is remembered.
 
-    ``now_s`` is the newest time of any message, ``imu_s`` that of the inertial data.
+    ``guarded`` is what the lanes say, ``now_s`` the newest time of any message, ``imu_s`` that of
+    the inertial data.
     """
     since_beam_s = imu_s - watch.last_beam_s
     since_aid_s = imu_s - max(watch.last_beam_s, watch.last_fix_s, watch.last_aid_s)
@@ -264,10 +268,14 @@ def verdict(watch: Watch, *, now_s: float, imu_s: float, covariance: Array) -> V
         health, reason = Health.BAD, "the answer has run away"
     elif imu_s - watch.begun_anew_s < PROBATION_S:
         health, reason = Health.BAD, f"being recovered: {watch.trouble}"
+    elif guarded.contradiction:
+        health, reason = Health.DEGRADED, guarded.contradiction
     elif imu_s - watch.trouble_s < PROBATION_S:
         health, reason = Health.DEGRADED, watch.trouble
     elif watch.contradicted is not None:
         health, reason = Health.DEGRADED, watch.contradicted.text
+    elif guarded.shortfall:
+        health, reason = Health.DEGRADED, guarded.shortfall
     elif not has_lock:
         health = Health.DEGRADED
         beam = "beam" if since_beam_s >= LOCK_LOST_S else "beam off the ground"

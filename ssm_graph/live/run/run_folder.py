@@ -4,6 +4,7 @@
 ``log/``               everything received, a mission folder: ``ssm-graph smooth RUN/log`` reads it
 ``trajectory.csv``,    smoothed states and their beams, as they leave the window
 ``beams.csv``
+``protection.csv``     protection levels at their times, as they were known then
 ``events.jsonl``       what happened, a line of JSON each
 ``checkpoint.npz``     the estimator, and the sizes of the files above at that moment
 ``summary.json``       how it ended; not there while it goes on
@@ -35,7 +36,13 @@ from ssm_graph.io.mission_folder.vehicle import check_same_vehicle
 from ssm_graph.io.raw_log.log import RawLog
 from ssm_graph.io.raw_log.rows import ALWAYS, ARRIVALS, replay
 from ssm_graph.io.results.summary import as_json
-from ssm_graph.io.results.tables import BEAMS_NAME, SUMMARY_NAME, TRAJECTORY_NAME, GrowingResults
+from ssm_graph.io.results.tables import (
+    BEAMS_NAME,
+    PROTECTION_NAME,
+    SUMMARY_NAME,
+    TRAJECTORY_NAME,
+    GrowingResults,
+)
 from ssm_graph.io.tables.append_file import AppendFile, sync_path
 from ssm_graph.io.tables.checkpoint import CHECKPOINT_NAME, newest_checkpoint, write_checkpoint
 from ssm_graph.mission.navigation import Event
@@ -146,7 +153,7 @@ class RunFolder:
         self.results: GrowingResults | None = None
         self.log: RawLog | None = None
         log_names = [f"{LOG_NAME}/{name}" for name in (*ALWAYS, ARRIVALS)]
-        names = (*log_names, TRAJECTORY_NAME, BEAMS_NAME)
+        names = (*log_names, TRAJECTORY_NAME, BEAMS_NAME, PROTECTION_NAME)
         self.writer = CheckpointWriter(folder, [folder / name for name in names])
         self._known: Counter[bytes] = Counter()
 
