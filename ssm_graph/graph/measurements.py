@@ -16,8 +16,9 @@ from factors.similarity import Kernel, LogKernel, Similarity
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.extras import Extras
 from ssm_graph.engine.states import States
-from ssm_graph.graph.aids.aid import Aid, RowStates
+from ssm_graph.graph.aids.aid import Aid, Linearised, RowStates
 from ssm_graph.graph.aids.depth import DepthMeans
+from ssm_graph.graph.freed import Freed
 from ssm_graph.mission.answer import LOW_WEIGHT, MISFIT, SUSPECT_SHARE, TRUSTED
 from ssm_graph.mission.estimate import AidTable
 from ssm_graph.mission.problem import Problem
@@ -80,9 +81,9 @@ def aids_of(problem: Problem) -> tuple[Aid, ...]:
 class Measurements:
     """Some aids of a problem, their M measurements of R components one after the other."""
 
-    def __init__(self, aids: Iterable[Aid], extras: Extras) -> None:
+    def __init__(self, aids: Iterable[Aid], extras: Extras, freed: Freed | None = None) -> None:
         self.all = tuple(aids)
-        self._extras = extras
+        self._extras, self._freed = extras, freed
         sizes = [np.full(len(aid), aid.dim) for aid in self.all]
         self.dim = np.concatenate([np.zeros(0, dtype=np.intp), *sizes])
         """(M,) components of each measurement"""
@@ -90,14 +91,14 @@ class Measurements:
         """(R,) of each component"""
 
     @classmethod
-    def weighted(cls, problem: Problem) -> Measurements:
+    def weighted(cls, problem: Problem, freed: Freed | None = None) -> Measurements:
         """Return those of a problem that have weights."""
-        return cls((aid for aid in aids_of(problem) if aid.is_weighted), problem.extras)
+        return cls((aid for aid in aids_of(problem) if aid.is_weighted), problem.extras, freed)
 
     @classmethod
-    def in_full(cls, problem: Problem) -> Measurements:
+    def in_full(cls, problem: Problem, freed: Freed | None = None) -> Measurements:
         """Return those of a problem that count in full."""
-        return cls((aid for aid in aids_of(problem) if not aid.is_weighted), problem.extras)
+        return cls((aid for aid in aids_of(problem) if not aid.is_weighted), problem.extras, freed)
 
     def __len__(self) -> int:
         return len(self.dim)
@@ -105,6 +106,13 @@ class Measurements:
     def at_keyframes(self, aid: Aid, states: States) -> RowStates:
         """Return the states of all measurements of one aid."""
         return states_at(states, aid.keyframe, self._extras)
+
+    def whitened(self, aid: Aid, states: States) -> Linearised:
+        """Linearise one aid, with what it was found to be off by."""
+        rows = aid.whitened(self.at_keyframes(aid, states))
+        if self._freed is None:
+            return rows
+        return self._freed.on_aid(aid.name, rows, self._extras, states.constants)
 
     def follow(self, states: States) -> None:
         """Let what is only slowly a function of the states follow them."""
@@ -121,7 +129,7 @@ class Measurements:
         keyframes, errors = [np.zeros(0, dtype=np.intp)], [np.zeros(0)]
         jacobians = [np.zeros((0, self._extras.width))]
         for aid in self.all:
-            error, jacobian = aid.whitened(self.at_keyframes(aid, states))
+            error, jacobian = self.whitened(aid, states)
             keyframes.append(np.repeat(aid.keyframe, aid.dim))
             errors.append(error.ravel())
             jacobians.append(jacobian.reshape(-1, self._extras.width))
@@ -166,7 +174,7 @@ class Measurements:
             JudgedAid(
                 aid,
                 keyframe_s[aid.keyframe],
-                aid.whitened(self.at_keyframes(aid, states)).error,
+                self.whitened(aid, states).error,
                 self.of(aid, mahalanobis_sq),
                 self.of(aid, weights),
             )

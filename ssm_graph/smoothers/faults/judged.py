@@ -1,0 +1,218 @@
+"""How much better the data fit once a hypothesis is allowed for, of all stretches at once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.evidence import ChainEvidence, Evidence
+from ssm_graph.smoothers.faults.columns import BEAM, IMU, Channels, Linear
+from ssm_graph.smoothers.faults.hypotheses import Course, Hypothesis, charge_of
+from ssm_graph.smoothers.faults.nuisances import Nuisances
+
+TREND_S = 100.0
+"""s, in which the rate of a trend is counted here."""
+LEAST = 1e-9
+"""Information that an error of any size has at least: it keeps what nothing tells apart regular."""
+
+
+class Grid(NamedTuple):
+    """Blocks of keyframes, whose edges are where stretches begin and end."""
+
+    edges: NDArray[np.intp]
+    """(N + 1) keyframes, the last one after the mission's end"""
+    middle_s: Array
+    """(N,) s"""
+
+    @classmethod
+    def of(cls, keyframe_s: Array, edges_s: Iterable[float]) -> Grid:
+        """Return the blocks between some times, s, and the ends of the mission."""
+        inner = np.searchsorted(keyframe_s, np.array(sorted(edges_s)))
+        edges = np.unique(np.concatenate([[0], inner, [len(keyframe_s)]]))
+        last = np.append(keyframe_s, keyframe_s[-1])
+        return cls(edges, 0.5 * (last[edges[:-1]] + last[edges[1:]]))
+
+    @property
+    def n_blocks(self) -> int:
+        return len(self.middle_s)
+
+
+class Candidate(NamedTuple):
+    """A hypothesis over a stretch of blocks."""
+
+    hypothesis: Hypothesis
+    begin: int
+    """Block"""
+    end: int
+    """The first block after it"""
+    chi_sq: float
+    merit: float
+    """By which that exceeds what it has to"""
+
+
+class Fault(NamedTuple):
+    """A hypothesis over a stretch of keyframes."""
+
+    hypothesis: Hypothesis
+    begin: int
+    """Keyframe"""
+    end: int
+    """The first keyframe after it"""
+    chi_sq: float = 0.0
+    merit: float = 0.0
+    sizes: tuple[float, ...] = ()
+    rivals: tuple[Fault, ...] = ()  # type: ignore[misc]
+    cost_m: float = 0.0
+
+
+class Judge:
+    """Evidence of one linearised mission, on any grid and with any faults freed."""
+
+    def __init__(self, linear: Linear, channels: Channels, nuisances: Nuisances) -> None:
+        self.linear, self.channels, self._nuisances = linear, channels, nuisances
+        self._chain = ChainEvidence(linear.solution, linear.own, linear.between)
+
+    def on(self, grid: Grid) -> Judged:
+        """Return the evidence on a grid, with nothing freed but the nuisances."""
+        shared, prior, score = self._nuisances.shared
+        whole = self._chain.of(grid.edges, self.channels.columns, shared)
+        n = grid.n_blocks * self.channels.width
+        common = np.arange(n, n + len(prior))
+        whole.score[common] += score
+        columns, precision = self._nuisances.of_blocks(grid.middle_s)
+        every = np.concatenate([columns, common])
+        inverse = np.zeros((len(every), len(every)))
+        inverse[: len(columns), : len(columns)] = precision
+        inverse[len(columns) :, len(columns) :] = prior
+        left = whole.without(every, inverse)
+        return Judged(Evidence(left.score[:n], left.information[:n, :n]), grid, self.channels)
+
+
+class Judged:
+    """Evidence of the channels' columns on the blocks of a grid."""
+
+    def __init__(self, evidence: Evidence, grid: Grid, channels: Channels) -> None:
+        self.evidence, self.grid, self.channels = evidence, grid, channels
+
+    def with_freed(self, faults: Sequence[Fault]) -> Judged:
+        """Return what is left once some faults may be of any size."""
+        evidence = self.evidence
+        for fault in faults:
+            combined, prior = self.combined(fault)
+            evidence = evidence.freed(combined, prior)
+        return Judged(evidence, self.grid, self.channels)
+
+    def combined(self, fault: Fault) -> tuple[Array, Array]:
+        """Return the columns of a fault as sums of those here, and its prior information."""
+        hypothesis, width = fault.hypothesis, self.channels.width
+        own = self.channels.of(hypothesis.channel).columns
+        begin, end = np.searchsorted(self.grid.edges, [fault.begin, fault.end])
+        n_blocks, d = int(end - begin), hypothesis.combined.shape[1]
+        if hypothesis.course is Course.ANYTHING:
+            shapes = np.eye(n_blocks)
+        else:
+            shapes = self._moments(hypothesis)[begin:end]
+        made = np.zeros((self.grid.n_blocks, width, shapes.shape[1] * d))
+        for i in range(n_blocks):
+            made[begin + i, own] = np.kron(shapes[i], hypothesis.combined)
+        sigma = np.tile(hypothesis.sigma, shapes.shape[1])
+        return made.reshape(self.grid.n_blocks * width, -1), np.diag(1.0 / sigma**2)
+
+    def chi_sq(self, fault: Fault) -> float:
+        """Return by how much the data fit better with a fault freed."""
+        combined, prior = self.combined(fault)
+        score = combined.T @ self.evidence.score
+        inner = combined.T @ self.evidence.information @ combined + prior
+        return float(score @ np.linalg.solve(inner, score))
+
+    def sizes(self, faults: Sequence[Fault]) -> list[Array]:
+        """Return how large faults are if all of them are freed together."""
+        if not faults:
+            return []
+        parts = [self.combined(fault) for fault in faults]
+        combined = np.hstack([part for part, _ in parts])
+        prior = np.concatenate([np.diagonal(p) for _, p in parts])
+        inner = combined.T @ self.evidence.information @ combined + np.diag(prior)
+        size = np.linalg.solve(inner, combined.T @ self.evidence.score)
+        return np.split(size, np.cumsum([part.shape[1] for part, _ in parts])[:-1])
+
+    def best_of(self, hypotheses: Iterable[Hypothesis]) -> list[Candidate]:
+        """Return the best stretch of each hypothesis, the best ones first."""
+        found = []
+        for hypothesis in hypotheses:
+            chi_sq, charge = self.table(hypothesis)
+            merit = chi_sq - charge
+            begin, end = np.unravel_index(int(np.argmax(merit)), merit.shape)
+            best = Candidate(
+                hypothesis, int(begin), int(end), float(chi_sq[begin, end]), float(merit[begin, end])
+            )
+            found.append(best)
+        return sorted(found, key=lambda candidate: -candidate.merit)
+
+    def table(self, hypothesis: Hypothesis) -> tuple[Array, Array]:
+        """Return chi-square and what it has to exceed, by begin and end block (N + 1, N + 1)."""
+        if hypothesis.course is Course.ANYTHING:
+            return self._table_of_anything(hypothesis)
+        n = self.grid.n_blocks
+        score, information = self._projected(hypothesis)
+        moments = self._moments(hypothesis)
+        d = score.shape[1] * moments.shape[1]
+        score = (moments[:, :, None] * score[:, None, :]).reshape(n, d)
+        information = np.einsum("im,ipjq,jn->impjnq", moments, information, moments, optimize=True)
+        summed = np.zeros((n + 1, d, n + 1, d))
+        summed[1:, :, 1:] = information.reshape(n, d, n, d).cumsum(axis=0).cumsum(axis=2)
+        begin, end = np.triu_indices(n + 1, 1)
+        swapped = summed.transpose(0, 2, 1, 3)
+        inner = (
+            swapped[end, end] + swapped[begin, begin] - swapped[begin, end] - swapped[end, begin]
+        )
+        prior = np.diag(1.0 / np.tile(hypothesis.sigma, moments.shape[1]) ** 2)
+        summed_score = np.concatenate([np.zeros((1, d)), score.cumsum(axis=0)])
+        of_stretch = summed_score[end] - summed_score[begin]
+        if d == 1:
+            square = of_stretch[:, 0] ** 2 / (inner[:, 0, 0] + prior[0, 0])
+        else:
+            solved = np.linalg.solve(inner + prior, of_stretch[..., None])[..., 0]
+            square = np.sum(solved * of_stretch, axis=1)
+        chi_sq = np.full((n + 1, n + 1), -np.inf)
+        chi_sq[begin, end] = square
+        return chi_sq, np.full_like(chi_sq, hypothesis.charge())
+
+    def _table_of_anything(self, hypothesis: Hypothesis) -> tuple[Array, Array]:
+        n = self.grid.n_blocks
+        score, information = self._projected(hypothesis)
+        d = score.shape[1]
+        flat = information.reshape(n * d, n * d) + np.diag(np.tile(1.0 / hypothesis.sigma**2, n))
+        chi_sq = np.full((n + 1, n + 1), -np.inf)
+        charge = np.array([hypothesis.charge(d * count) if count else np.inf for count in range(n + 1)])
+        for begin in range(n):
+            root = np.linalg.cholesky(flat[begin * d :, begin * d :])
+            half = np.linalg.solve(root, score[begin:].ravel())
+            chi_sq[begin, begin + 1 :] = np.cumsum(half.reshape(-1, d) ** 2 @ np.ones(d))
+        length = np.maximum(np.arange(n + 1)[None, :] - np.arange(n + 1)[:, None], 0)
+        return chi_sq, charge[length]
+
+    def _projected(self, hypothesis: Hypothesis) -> tuple[Array, Array]:
+        """Return score (N, d) and information (N, d, N, d) of a hypothesis in each block."""
+        n, width = self.grid.n_blocks, self.channels.width
+        own = self.channels.of(hypothesis.channel).columns
+        C = hypothesis.combined
+        information = self.evidence.information.reshape(n, width, n, width)[:, own, :, own]
+        # Slices on both sides of an index keep their places.
+        projected = np.einsum("ap,iajb,bq->ipjq", C, information, C, optimize=True)
+        return self.evidence.score.reshape(n, width)[:, own] @ C, projected
+
+    def _moments(self, hypothesis: Hypothesis) -> Array:
+        """Return how a hypothesis goes on over the blocks (N, 1 or 2)."""
+        one = np.ones((self.grid.n_blocks, 1))
+        if hypothesis.course is not Course.TREND:
+            return one
+        since = (self.grid.middle_s - self.grid.middle_s.mean()) / TREND_S
+        return np.column_stack([one, since])
+
+
+__all__ = ["BEAM", "IMU", "Candidate", "Fault", "Grid", "Judge", "Judged", "charge_of"]
