@@ -18,7 +18,7 @@ from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.problem import ProblemConfig
 from ssm_graph.report.terminal.progress import ProgressDisplay
 from ssm_graph.smoothers.batch import SmootherConfig
-from ssm_graph.smoothers.beam_faults import FaultSearch
+from ssm_graph.smoothers.faults.search import FaultSearch
 from ssm_graph.smoothers.mission import smooth
 
 GNC = "gnc-tls"

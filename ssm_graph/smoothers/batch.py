@@ -37,8 +37,10 @@ from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.measurements import aid_kernel, aid_table, doubts_of_aids
 from ssm_graph.mission.answer import trajectory_from_states
 from ssm_graph.mission.estimate import BeamTable, Estimate, Iteration, NoiseFound, Status
+from ssm_graph.mission.fault import DetectedFault
 from ssm_graph.mission.problem import Problem, with_white_noise
-from ssm_graph.smoothers.beam_faults import FaultSearch, FaultWatch
+from ssm_graph.smoothers.faults.search import FaultSearch
+from ssm_graph.smoothers.faults.watch import FaultWatch
 from ssm_graph.smoothers.track import calibration_of, current_of, undetermined
 from ssm_graph.smoothers.verdict import (
     MAX_ADAPTATIONS,
@@ -177,6 +179,7 @@ class Solved(NamedTuple):
     status: Status
     notes: tuple[str, ...]
     first: FirstValues
+    faults: tuple[DetectedFault, ...]
 
     def again(self) -> FirstValues:
         """Return where another solution may start."""
@@ -245,9 +248,11 @@ class SsmSmoother:
         yield 0.03 * problem.n_keyframes
         if first is None:
             first = yield from first_values_steps(white, kernel=WARM_KERNEL)
-        states, rows = first.states, linearizer.beam_rows(first.states)
+        own = first.states.constants[: white.extras.n_constants]
+        states = first.states._replace(constants=own)
+        rows = linearizer.beam_rows(states)
         schedule = self.config.schedule()
-        faults = FaultWatch(problem, self.config.fault_search)
+        faults = FaultWatch(white, self.config.fault_search)
         yield 0.03 * problem.n_keyframes
         weights = Weights(
             schedule.first_weights(first.weights),
@@ -272,20 +277,21 @@ class SsmSmoother:
                 on_iteration(number + 1, self.config.max_iterations, iterations[-1])
             is_settled = max(this.update_sigmas, this.weight_change) < self.config.tolerance
             is_settled = is_settled and weights.may_end(this)
-            has_news = yield from faults.look_steps(
-                states,
-                rows,
-                update_sigmas=this.update_sigmas,
-                is_settled=is_settled,
-                aid_weights=this.aid_weights,
-            )
-            if is_settled and not has_news:
+            changed = None
+            if number + 1 < self.config.max_iterations:
+                changed = yield from faults.look_steps(states, update_sigmas=this.update_sigmas)
+            if changed is not None:
+                linearizer, states = changed
+                rows = linearizer.beam_rows(states)
+            elif is_settled:
                 status = Status.CONVERGED
                 break
             yield 0.007 * problem.n_keyframes
             weights = weights.after(this, faults)
-        notes = problem.notes + faults.notes(rows.error) + _notes_of(first)
-        return Solved(linearizer, this, tuple(iterations), status, notes, first)
+        found = faults.faults(this.states)
+        said = tuple(fault.sentence for fault in found)
+        notes = problem.notes + said + _notes_of(first)
+        return Solved(linearizer, this, tuple(iterations), status, notes, first, found)
 
     def _iterate(
         self,
@@ -355,6 +361,7 @@ class SsmSmoother:
             f"{last.weight_change:.1e}"
         )
         doubts = contradictions(linearizer, last.states, last.beam_rows, last.weights)
+        doubts += [fault.sentence for fault in solved.faults if fault.is_suspect]
         judged = linearizer.weighted.judged(
             last.states, linearizer.problem.keyframe_s, last.aid_mahalanobis_sq, last.aid_weights
         )
@@ -395,6 +402,7 @@ class SsmSmoother:
             wall_s=wall_s,
             cost=self._cost(linearizer, last),
             start=problem.start,
+            faults=solved.faults,
             notes=solved.notes + noise_notes(noise) + undetermined(calibration),
             calibration=calibration,
             aids=aid_table(judged),

@@ -15,7 +15,7 @@ from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.problem import Problem, ProblemConfig, build_problem_steps
 from ssm_graph.mission.start.alignment import Alignment, align_steps
 from ssm_graph.smoothers.batch import OnIteration, SmootherConfig, SsmSmoother
-from ssm_graph.smoothers.beam_faults import FaultSearch
+from ssm_graph.smoothers.faults.search import FaultSearch
 
 AMBIGUOUS_COST = 6.0
 """Another heading whose cost is higher by less than this is as good an explanation (a likelihood

@@ -98,7 +98,7 @@ class Linear:
 
 
 def linear_of_steps(
-    linearizer: GraphLinearizer, states: States, beams: BeamRows, left_out: Mapping[str, Array]
+    linearizer: GraphLinearizer, states: States, beams: BeamRows
 ) -> Steps[Linear]:
     """Weigh all measurements, solve for the trajectory, and return rows and what they miss.
 
@@ -107,17 +107,14 @@ def linear_of_steps(
     linearizer : of the problem with nothing freed.
     states : near the answer.
     beams : linearised there.
-    left_out : (m,) of a sensor, by its name, what counts for nothing.
     """
     problem = linearizer.problem
     n = problem.extras.state_dim
     beam_weights = _beam_weights(problem, beams)
-    beam_weights[left_out.get(BEAM, np.zeros(len(beam_weights), bool))] = 1e-8
     aid_weights = {}
     for aid in (*linearizer.aids.all, *linearizer.weighted.all):
         error = aid.whitened(linearizer.weighted.at_keyframes(aid, states)).error
         aid_weights[aid.name] = spike_weights(error)
-        aid_weights[aid.name][left_out.get(aid.name, np.zeros(len(aid), bool))] = 1e-8
     scale = np.sqrt(beam_weights) / problem.beams.sigma
     keyframes, rows = [problem.beams.keyframe], [
         np.column_stack([beams.jacobian, -beams.error]) * scale[:, None]
@@ -184,6 +181,7 @@ class Channels:
         self.beams = self._beams()
         self.between = self._between()
         self.aids = {aid.name: aid.root_information for aid in linear.aids if len(aid)}
+        self.aid_keyframe = {aid.name: aid.keyframe for aid in linear.aids if len(aid)}
         self.columns = self._columns()
 
     def of(self, name: str) -> Channel:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -10,8 +11,8 @@ from numpy.typing import NDArray
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.evidence import ChainEvidence, Evidence
-from ssm_graph.smoothers.faults.columns import BEAM, IMU, Channels, Linear
-from ssm_graph.smoothers.faults.hypotheses import Course, Hypothesis, charge_of
+from ssm_graph.smoothers.faults.columns import Channels, Linear
+from ssm_graph.smoothers.faults.hypotheses import Course, Hypothesis
 from ssm_graph.smoothers.faults.nuisances import Nuisances
 
 TREND_S = 100.0
@@ -54,7 +55,8 @@ class Candidate(NamedTuple):
     """By which that exceeds what it has to"""
 
 
-class Fault(NamedTuple):
+@dataclass(frozen=True, slots=True, eq=False)
+class Fault:
     """A hypothesis over a stretch of keyframes."""
 
     hypothesis: Hypothesis
@@ -63,10 +65,13 @@ class Fault(NamedTuple):
     end: int
     """The first keyframe after it"""
     chi_sq: float = 0.0
+    """By which the data fit better"""
     merit: float = 0.0
-    sizes: tuple[float, ...] = ()
-    rivals: tuple[Fault, ...] = ()  # type: ignore[misc]
+    """By which that exceeds what it has to"""
+    rivals: tuple[Fault, ...] = ()
+    """Others that explain the data as well"""
     cost_m: float = 0.0
+    """By how much the horizontal position moves between the explanations, m"""
 
 
 class Judge:
@@ -140,12 +145,21 @@ class Judged:
         size = np.linalg.solve(inner, combined.T @ self.evidence.score)
         return np.split(size, np.cumsum([part.shape[1] for part, _ in parts])[:-1])
 
-    def best_of(self, hypotheses: Iterable[Hypothesis]) -> list[Candidate]:
-        """Return the best stretch of each hypothesis, the best ones first."""
+    def best_of(
+        self, hypotheses: Iterable[Hypothesis], *, near: Fault | None = None
+    ) -> list[Candidate]:
+        """Return the best stretch of each hypothesis, the best ones first.
+
+        ``near`` a fault, only stretches that overlap it are looked at.
+        """
         found = []
+        edges = self.grid.edges
+        is_apart = np.zeros((len(edges), len(edges)), bool)
+        if near is not None:
+            is_apart = (edges[:, None] >= near.end) | (edges[None, :] <= near.begin)
         for hypothesis in hypotheses:
             chi_sq, charge = self.table(hypothesis)
-            merit = chi_sq - charge
+            merit = np.where(is_apart, -np.inf, chi_sq - charge)
             begin, end = np.unravel_index(int(np.argmax(merit)), merit.shape)
             best = Candidate(
                 hypothesis, int(begin), int(end), float(chi_sq[begin, end]), float(merit[begin, end])
@@ -192,7 +206,7 @@ class Judged:
         for begin in range(n):
             root = np.linalg.cholesky(flat[begin * d :, begin * d :])
             half = np.linalg.solve(root, score[begin:].ravel())
-            chi_sq[begin, begin + 1 :] = np.cumsum(half.reshape(-1, d) ** 2 @ np.ones(d))
+            chi_sq[begin, begin + 1 :] = np.cumsum(np.sum(half.reshape(-1, d) ** 2, axis=1))
         length = np.maximum(np.arange(n + 1)[None, :] - np.arange(n + 1)[:, None], 0)
         return chi_sq, charge[length]
 
@@ -214,5 +228,3 @@ class Judged:
         since = (self.grid.middle_s - self.grid.middle_s.mean()) / TREND_S
         return np.column_stack([one, since])
 
-
-__all__ = ["BEAM", "IMU", "Candidate", "Fault", "Grid", "Judge", "Judged", "charge_of"]

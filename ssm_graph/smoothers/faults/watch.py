@@ -1,0 +1,233 @@
+"""Looks for faults while a solution is iterated, and keeps the graph free of what was found."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.similarity import WEIGHT_FLOOR
+from ssm_graph.base.frozen import Array
+from ssm_graph.base.stepwise import Steps
+from ssm_graph.engine.extras import Extras
+from ssm_graph.engine.reweighting import NEAR_SIGMAS
+from ssm_graph.engine.states import States
+from ssm_graph.graph.freed import Freed
+from ssm_graph.graph.linearize import GraphLinearizer
+from ssm_graph.mission.fault import DetectedFault, Treatment
+from ssm_graph.mission.problem import Problem
+from ssm_graph.smoothers.faults.columns import BEAM, IMU, Channels, linear_of_steps
+from ssm_graph.smoothers.faults.hypotheses import Course
+from ssm_graph.smoothers.faults.judged import TREND_S, Fault, Judge
+from ssm_graph.smoothers.faults.nuisances import Nuisances
+from ssm_graph.smoothers.faults.search import FaultSearch, Look
+
+MOST_LOOKS = 8
+"""Looks after which the search ends whatever it finds."""
+
+
+class Changed(NamedTuple):
+    """The graph once something else is freed, and the states to go on from."""
+
+    linearizer: GraphLinearizer
+    states: States
+
+
+class FaultWatch:
+    """Keeps a solution free of what a search finds, while it is iterated."""
+
+    def __init__(self, problem: Problem, search: FaultSearch | None) -> None:
+        """Take the problem as the smoother solves it; without a search nothing is ever found."""
+        self._problem, self._search = problem, search
+        self._bare = None if search is None else GraphLinearizer(problem)
+        self._found: list[Fault] = []
+        self._beams_out = np.zeros(len(problem.beams.speed), bool)
+        self._n_looks, self._is_done = 0, search is None
+
+    def leave_out(self, weights: Array) -> Array:
+        """Return the weights (M,) with the floor for beams that may have read anything."""
+        return np.where(self._beams_out, WEIGHT_FLOOR, weights)
+
+    def look_steps(self, states: States, *, update_sigmas: float) -> Steps[Changed | None]:
+        """Search once the solution is near; return what has changed, None for nothing.
+
+        What is found is freed; then it is searched again at what the solution has become, until
+        nothing changes any more.
+        """
+        if self._is_done or self._bare is None or self._search is None:
+            return None
+        if update_sigmas >= NEAR_SIGMAS:
+            return None
+        self._n_looks += 1
+        n_own = self._problem.extras.n_constants
+        bare_states = states._replace(constants=states.constants[:n_own])
+        self._bare.follow(bare_states)
+        beams = self._bare.beam_rows(bare_states)
+        linear = yield from linear_of_steps(self._bare, bare_states, beams)
+        channels = Channels(linear)
+        judge = Judge(linear, channels, Nuisances(linear, channels))
+        yield 0.02 * self._problem.n_keyframes
+        look = Look(judge, channels, self._search)
+        found = yield from look.find_steps(self._found)
+        is_same = same_faults(found, self._found, self._problem.keyframe_s)
+        self._is_done = is_same or self._n_looks >= MOST_LOOKS
+        if is_same:
+            return None
+        self._found = sorted(found, key=lambda fault: (fault.begin, fault.end))
+        freed = self._freed(channels)
+        problem = self._problem
+        if len(freed.sigma):
+            blocks = (*problem.extras.blocks, freed.variable)
+            problem = replace(problem, extras=Extras(blocks))
+        constants = np.concatenate([bare_states.constants, np.zeros(len(freed.sigma))])
+        return Changed(
+            GraphLinearizer(problem, freed), bare_states._replace(constants=constants)
+        )
+
+    def _freed(self, channels: Channels) -> Freed:
+        """Return the columns of all that was found, and what is left out."""
+        keyframe_s, beams = self._problem.keyframe_s, self._problem.beams
+        self._beams_out = np.zeros(len(beams.speed), bool)
+        sigma = [np.zeros(0)]
+        on_beams = [np.zeros((len(beams.speed), 0))]
+        between = [np.zeros((*channels.between.shape[:2], 0))]
+        of_aid: dict[str, list[Array]] = {name: [] for name in channels.aids}
+        left_out: dict[str, NDArray[np.bool_]] = {}
+        aid_keyframe = channels.aid_keyframe
+        for fault in freed_faults(self._found):
+            hypothesis, name = fault.hypothesis, fault.hypothesis.channel
+            C = hypothesis.combined
+            if hypothesis.course is Course.ANYTHING:
+                if name == BEAM:
+                    is_own = np.isin(beams.beam, np.flatnonzero(C.any(axis=1)))
+                    self._beams_out |= is_own & _inside(beams.keyframe, fault)
+                else:
+                    out = left_out.get(name, np.zeros(len(aid_keyframe[name]), bool))
+                    left_out[name] = out | _inside(aid_keyframe[name], fault)
+                continue
+            d = C.shape[1] * (2 if hypothesis.course is Course.TREND else 1)
+            sigma.append(np.tile(hypothesis.sigma, d // C.shape[1]))
+            columns = channels.of(name).columns
+            at_beams = channels.beams[:, columns] @ C if name not in (*of_aid, IMU) else None
+            on_beams.append(
+                _over(at_beams, beams.keyframe, fault, keyframe_s)
+                if at_beams is not None
+                else np.zeros((len(beams.speed), d))
+            )
+            at_imu = channels.between @ C if name == IMU else None
+            between.append(
+                np.zeros((*channels.between.shape[:2], d))
+                if at_imu is None
+                else _over(at_imu, np.arange(len(at_imu)), fault, keyframe_s)
+            )
+            for aid, parts in of_aid.items():
+                root = channels.aids[aid]
+                if aid == name:
+                    parts.append(_over(root @ C, aid_keyframe[aid], fault, keyframe_s))
+                else:
+                    parts.append(np.zeros((*root.shape[:2], d)))
+        return Freed(
+            sigma=np.concatenate(sigma),
+            beams=np.hstack(on_beams),
+            between=np.concatenate(between, axis=2),
+            aids={
+                aid: np.concatenate(parts, axis=2)
+                for aid, parts in of_aid.items()
+                if any(np.any(part) for part in parts)
+            },
+            left_out=left_out,
+        )
+
+    def faults(self, states: States) -> tuple[DetectedFault, ...]:
+        """Return what was found, with the sizes that the answer gives it."""
+        sizes = states.constants[self._problem.extras.n_constants :]
+        found, begin = [], 0
+        end_s = np.append(self._problem.keyframe_s, self._problem.keyframe_s[-1])
+        for fault in self._found:
+            hypothesis = fault.hypothesis
+            is_anything = hypothesis.course is Course.ANYTHING
+            own = sizes[begin : begin + hypothesis.n_numbers]
+            what, begin = said(fault, own), begin + (0 if is_anything else hypothesis.n_numbers)
+            rivals = []
+            for rival in fault.rivals:
+                is_out = rival.hypothesis.course is Course.ANYTHING
+                count = 0 if is_out else rival.hypothesis.n_numbers
+                rivals.append(
+                    f"{rival.hypothesis.sensor}, {end_s[rival.begin]:.0f}-{end_s[rival.end]:.0f} s, "
+                    f"{said(rival, sizes[begin : begin + count])}"
+                )
+                begin += count
+            found.append(
+                DetectedFault(
+                    sensor=hypothesis.sensor,
+                    what=what,
+                    begin_s=float(end_s[fault.begin]),
+                    end_s=float(end_s[fault.end]),
+                    chi_sq=fault.chi_sq,
+                    dof=hypothesis.n_numbers,
+                    treatment=Treatment.COVERED
+                    if rivals
+                    else Treatment.LEFT_OUT
+                    if is_anything
+                    else Treatment.FREED,
+                    rivals=tuple(rivals),
+                    cost_m=fault.cost_m,
+                )
+            )
+        return tuple(found)
+
+
+def said(fault: Fault, sizes: Array) -> str:
+    """Return words for what a fault is, of these sizes."""
+    hypothesis = fault.hypothesis
+    if hypothesis.course is Course.ANYTHING:
+        return "reads what nothing else agrees with"
+    d = hypothesis.combined.shape[1]
+    text = hypothesis.say(sizes[:d])
+    if hypothesis.course is Course.TREND:
+        text += f", and within a minute more by {hypothesis.say(60.0 / TREND_S * sizes[d:])}"
+    return text
+
+
+def freed_faults(found: Sequence[Fault]) -> list[Fault]:
+    """Return all that is to be freed: what was found, each with its rivals behind it."""
+    return [one for fault in found for one in (fault, *fault.rivals)]
+
+
+def same_faults(some: Sequence[Fault], others: Sequence[Fault], keyframe_s: Array) -> bool:
+    """Return whether these are the same faults, to the second."""
+    time_s = np.append(keyframe_s, keyframe_s[-1])
+
+    def keys(faults: Sequence[Fault]) -> list[tuple[str, str, str, float, float]]:
+        return sorted(
+            (
+                f.hypothesis.sensor,
+                f.hypothesis.channel,
+                f.hypothesis.course.name,
+                round(float(time_s[f.begin])),
+                round(float(time_s[f.end])),
+            )
+            for f in freed_faults(faults)
+        )
+
+    return keys(some) == keys(others)
+
+
+def _inside(keyframe: NDArray[np.intp], fault: Fault) -> NDArray[np.bool_]:
+    return (keyframe >= fault.begin) & (keyframe < fault.end)
+
+
+def _over(
+    columns: Array, keyframe: NDArray[np.intp], fault: Fault, keyframe_s: Array
+) -> Array:
+    """Return columns (N, ..., d) of rows at keyframes (N,) over the stretch of a fault."""
+    inside = _inside(keyframe, fault).reshape(-1, *[1] * (columns.ndim - 1))
+    constant = columns * inside
+    if fault.hypothesis.course is not Course.TREND:
+        return np.asarray(constant)
+    since = (keyframe_s[keyframe] - keyframe_s[fault.begin]) / TREND_S
+    rate = constant * since.reshape(inside.shape)
+    return np.concatenate([constant, rate], axis=-1)
