@@ -48,7 +48,7 @@ class Freed:
         error, jacobian = rows
         columns = self.aids.get(name)
         if columns is not None:
-            error = error + columns @ constants[-len(self.sigma) :]
+            error = error + columns @ constants[len(constants) - len(self.sigma) :]
             jacobian = jacobian.copy()
             jacobian[..., extras.columns(FAULTS)] = columns
         out = self.left_out.get(name)

@@ -154,7 +154,8 @@ class GraphLinearizer:
 
     def _off_by(self, states: States) -> Array:
         """Return what sensors are off by (F,)."""
-        return states.constants[-len(self.problem.extras.only({FAULTS}).sigma) :]
+        assert self._freed is not None
+        return states.constants[len(states.constants) - len(self._freed.sigma) :]
 
     def _at_beams(self, states: States) -> RowStates:
         g_n = self.problem.frame.g_n_at(states.p_n)

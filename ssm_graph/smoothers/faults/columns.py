@@ -93,8 +93,24 @@ class Linear:
     """(R,) rows of beams, then of each aid, in the order of their keyframes"""
     constants: Columns
     """The calibrations of the problem"""
-    R_nb: Array
-    """(K, 3, 3)"""
+    linearizer: GraphLinearizer
+
+    def solved_steps(self, own: Array, between: Array) -> Steps[Array]:
+        """Return the step (K, n) of the trajectory alone for errors (R,) and (K - 1, m) of rows."""
+        solution = yield from self.linearizer.solve_rows_steps(
+            self.states,
+            self.own.keyframe,
+            np.column_stack([self.own.jacobian, self.constants.own, self.own.missed - own]),
+            np.concatenate(
+                [
+                    self.between.jacobian,
+                    self.constants.between,
+                    (self.between.missed - between)[:, :, None],
+                ],
+                axis=2,
+            ),
+        )
+        return solution.step - solution.sensitivity @ solution.constants_step
 
 
 def linear_of_steps(
@@ -146,7 +162,7 @@ def linear_of_steps(
         between=BetweenRows(between[:, :, : 2 * n], missed_between),
         order=order,
         constants=Columns(own[:, n:-1], between[:, :, 2 * n : -1]),
-        R_nb=states.R_nb,
+        linearizer=linearizer,
     )
 
 

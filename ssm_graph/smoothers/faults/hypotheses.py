@@ -28,7 +28,9 @@ from ssm_graph.smoothers.faults.columns import (
 TAIL = 1e-6
 """Probability of one stretch's chi-square where nothing is off."""
 PER_NUMBER = 6.0
-"""Chi-square that each further number of a hypothesis has to earn besides."""
+"""Chi-square that each further number of a hypothesis has to earn besides, against others."""
+LEAST_PER_NUMBER = 2.0
+"""And by itself: stretches are many, and many numbers more than their tails allow for."""
 
 
 class Course(Enum):
@@ -61,14 +63,14 @@ class Hypothesis:
         """Of one stretch that is not by anything."""
         return self.combined.shape[1] * (2 if self.course is Course.TREND else 1)
 
-    def charge(self, n_numbers: int | None = None) -> float:
-        """Return what it costs, in chi-square: begin and end of the stretch, and each number."""
-        return charge_of(self.n_numbers if n_numbers is None else n_numbers) + self.handicap
+    def charge(self, n_numbers: int) -> float:
+        """Return the chi-square that hypotheses are compared beyond: each number has its price."""
+        return self.least(n_numbers) + (PER_NUMBER - LEAST_PER_NUMBER) * (n_numbers - 1)
 
-
-def charge_of(n_numbers: int) -> float:
-    """Return the chi-square that a stretch of so many numbers has to exceed."""
-    return float(chi2.isf(TAIL, n_numbers)) + PER_NUMBER * (n_numbers - 1)
+    def least(self, n_numbers: int) -> float:
+        """Return the chi-square from which on so many numbers are no chance."""
+        beyond_chance = float(chi2.isf(TAIL, n_numbers)) + LEAST_PER_NUMBER * (n_numbers - 1)
+        return beyond_chance + self.handicap
 
 
 def hypotheses_of(channels: Channels) -> tuple[Hypothesis, ...]:

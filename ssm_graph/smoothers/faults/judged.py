@@ -10,10 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.stepwise import Steps
+from ssm_graph.engine.error_state import POSITION
 from ssm_graph.engine.evidence import ChainEvidence, Evidence
 from ssm_graph.smoothers.faults.columns import Channels, Linear
 from ssm_graph.smoothers.faults.hypotheses import Course, Hypothesis
-from ssm_graph.smoothers.faults.nuisances import Nuisances
+from ssm_graph.smoothers.faults.nuisances import WIDER, WIDTHS, Nuisances
 
 TREND_S = 100.0
 """s, in which the rate of a trend is counted here."""
@@ -52,7 +54,17 @@ class Candidate(NamedTuple):
     """The first block after it"""
     chi_sq: float
     merit: float
-    """By which that exceeds what it has to"""
+    """By which that exceeds its charge"""
+
+    def n_numbers(self) -> int:
+        """Return how many numbers it has."""
+        is_anything = self.hypothesis.course is Course.ANYTHING
+        return self.hypothesis.n_numbers * (self.end - self.begin if is_anything else 1)
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether it is no chance."""
+        return self.chi_sq > self.hypothesis.least(self.n_numbers())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,11 +79,19 @@ class Fault:
     chi_sq: float = 0.0
     """By which the data fit better"""
     merit: float = 0.0
-    """By which that exceeds what it has to"""
+    """By which that exceeds its charge"""
     rivals: tuple[Fault, ...] = ()
     """Others that explain the data as well"""
     cost_m: float = 0.0
     """By how much the horizontal position moves between the explanations, m"""
+
+
+class Apart(NamedTuple):
+    """How far two answers are apart, at most."""
+
+    sigmas: float
+    level_m: float
+    """Horizontally, m"""
 
 
 class Judge:
@@ -80,21 +100,57 @@ class Judge:
     def __init__(self, linear: Linear, channels: Channels, nuisances: Nuisances) -> None:
         self.linear, self.channels, self._nuisances = linear, channels, nuisances
         self._chain = ChainEvidence(linear.solution, linear.own, linear.between)
+        self._last: tuple[NDArray[np.intp], Evidence] | None = None
+
+        self.widths = (1.0, 1.0, 1.0)
+        """Of the nuisances of beams, aids and inertial data"""
+
+    def fit(self, grid: Grid, faults: Sequence[Fault]) -> None:
+        """Let the nuisances be as wide as the data ask for, once faults are freed."""
+        evidence = self._whole(grid)
+        width = self.channels.width
+        for fault in faults:
+            combined, prior = combined_of(fault, grid, self.channels)
+            padded = np.zeros((len(evidence.score), combined.shape[1]))
+            padded[: grid.n_blocks * width] = combined
+            evidence = evidence.freed(padded, prior)
+        priors = self._nuisances.priors(grid.middle_s)
+        self.widths = priors.fitted(evidence, choices=WIDER if faults else WIDTHS)
 
     def on(self, grid: Grid) -> Judged:
         """Return the evidence on a grid, with nothing freed but the nuisances."""
-        shared, prior, score = self._nuisances.shared
-        whole = self._chain.of(grid.edges, self.channels.columns, shared)
-        n = grid.n_blocks * self.channels.width
-        common = np.arange(n, n + len(prior))
-        whole.score[common] += score
-        columns, precision = self._nuisances.of_blocks(grid.middle_s)
-        every = np.concatenate([columns, common])
-        inverse = np.zeros((len(every), len(every)))
-        inverse[: len(columns), : len(columns)] = precision
-        inverse[len(columns) :, len(columns) :] = prior
-        left = whole.without(every, inverse)
+        whole, n = self._whole(grid), grid.n_blocks * self.channels.width
+        priors = self._nuisances.priors(grid.middle_s)
+        left = whole.without(priors.columns, priors.information(self.widths))
         return Judged(Evidence(left.score[:n], left.information[:n, :n]), grid, self.channels)
+
+    def way_steps(self, judged: Judged, faults: Sequence[Fault]) -> Steps[Array]:
+        """Return where the trajectory goes (K, 3), in body axes, m, if these are freed."""
+        effect = np.zeros(judged.grid.n_blocks * self.channels.width)
+        for fault, size in zip(faults, judged.sizes(faults), strict=True):
+            effect += judged.combined(fault)[0] @ size
+        linear, columns = self.linear, self.channels.columns
+        of_block = effect.reshape(judged.grid.n_blocks, -1)
+        block = np.searchsorted(judged.grid.edges, np.arange(len(linear.states.R_nb)), side="right") - 1
+        own = np.einsum("rc,rc->r", columns.own, of_block[block[linear.own.keyframe]])
+        between = np.einsum("kic,kc->ki", columns.between, of_block[block[:-1]])
+        solution = yield from linear.solved_steps(own, between)
+        return solution[:, POSITION]
+
+    def apart(self, one: Array, other: Array) -> Apart:
+        """Return how far two ways (K, 3) of :meth:`way_steps` are apart."""
+        off_b, linear = one - other, self.linear
+        P = linear.solution.covariance_of(POSITION)
+        sigmas = np.sqrt(np.einsum("ki,ki->k", off_b, np.linalg.solve(P, off_b[..., None])[..., 0]))
+        off_n = np.einsum("kij,kj->ki", linear.states.R_nb, off_b)
+        return Apart(float(np.max(sigmas)), float(np.max(np.hypot(off_n[:, 0], off_n[:, 1]))))
+
+    def _whole(self, grid: Grid) -> Evidence:
+        if self._last is None or not np.array_equal(self._last[0], grid.edges):
+            whole = self._chain.of(grid.edges, self.channels.columns, self._nuisances.shared)
+            whole.score[grid.n_blocks * self.channels.width :] += self._nuisances.score
+            self._last = grid.edges, whole
+        return self._last[1]
 
 
 class Judged:
@@ -113,19 +169,7 @@ class Judged:
 
     def combined(self, fault: Fault) -> tuple[Array, Array]:
         """Return the columns of a fault as sums of those here, and its prior information."""
-        hypothesis, width = fault.hypothesis, self.channels.width
-        own = self.channels.of(hypothesis.channel).columns
-        begin, end = np.searchsorted(self.grid.edges, [fault.begin, fault.end])
-        n_blocks, d = int(end - begin), hypothesis.combined.shape[1]
-        if hypothesis.course is Course.ANYTHING:
-            shapes = np.eye(n_blocks)
-        else:
-            shapes = self._moments(hypothesis)[begin:end]
-        made = np.zeros((self.grid.n_blocks, width, shapes.shape[1] * d))
-        for i in range(n_blocks):
-            made[begin + i, own] = np.kron(shapes[i], hypothesis.combined)
-        sigma = np.tile(hypothesis.sigma, shapes.shape[1])
-        return made.reshape(self.grid.n_blocks * width, -1), np.diag(1.0 / sigma**2)
+        return combined_of(fault, self.grid, self.channels)
 
     def chi_sq(self, fault: Fault) -> float:
         """Return by how much the data fit better with a fault freed."""
@@ -146,17 +190,24 @@ class Judged:
         return np.split(size, np.cumsum([part.shape[1] for part, _ in parts])[:-1])
 
     def best_of(
-        self, hypotheses: Iterable[Hypothesis], *, near: Fault | None = None
+        self,
+        hypotheses: Iterable[Hypothesis],
+        *,
+        near: Fault | None = None,
+        apart_from: Fault | None = None,
     ) -> list[Candidate]:
         """Return the best stretch of each hypothesis, the best ones first.
 
-        ``near`` a fault, only stretches that overlap it are looked at.
+        ``near`` a fault, only stretches that overlap it are looked at; ``apart_from`` one, only
+        those that do not.
         """
         found = []
         edges = self.grid.edges
         is_apart = np.zeros((len(edges), len(edges)), bool)
         if near is not None:
             is_apart = (edges[:, None] >= near.end) | (edges[None, :] <= near.begin)
+        elif apart_from is not None:
+            is_apart = (edges[:, None] < apart_from.end) & (edges[None, :] > apart_from.begin)
         for hypothesis in hypotheses:
             chi_sq, charge = self.table(hypothesis)
             merit = np.where(is_apart, -np.inf, chi_sq - charge)
@@ -173,7 +224,7 @@ class Judged:
             return self._table_of_anything(hypothesis)
         n = self.grid.n_blocks
         score, information = self._projected(hypothesis)
-        moments = self._moments(hypothesis)
+        moments = moments_of(hypothesis, self.grid)
         d = score.shape[1] * moments.shape[1]
         score = (moments[:, :, None] * score[:, None, :]).reshape(n, d)
         information = np.einsum("im,ipjq,jn->impjnq", moments, information, moments, optimize=True)
@@ -194,7 +245,7 @@ class Judged:
             square = np.sum(solved * of_stretch, axis=1)
         chi_sq = np.full((n + 1, n + 1), -np.inf)
         chi_sq[begin, end] = square
-        return chi_sq, np.full_like(chi_sq, hypothesis.charge())
+        return chi_sq, np.full_like(chi_sq, hypothesis.charge(hypothesis.n_numbers))
 
     def _table_of_anything(self, hypothesis: Hypothesis) -> tuple[Array, Array]:
         n = self.grid.n_blocks
@@ -220,11 +271,28 @@ class Judged:
         projected = np.einsum("ap,iajb,bq->ipjq", C, information, C, optimize=True)
         return self.evidence.score.reshape(n, width)[:, own] @ C, projected
 
-    def _moments(self, hypothesis: Hypothesis) -> Array:
-        """Return how a hypothesis goes on over the blocks (N, 1 or 2)."""
-        one = np.ones((self.grid.n_blocks, 1))
-        if hypothesis.course is not Course.TREND:
-            return one
-        since = (self.grid.middle_s - self.grid.middle_s.mean()) / TREND_S
-        return np.column_stack([one, since])
 
+def combined_of(fault: Fault, grid: Grid, channels: Channels) -> tuple[Array, Array]:
+    """Return the columns of a fault (N w, m) as sums of those of a grid, and its prior."""
+    hypothesis, width = fault.hypothesis, channels.width
+    own = channels.of(hypothesis.channel).columns
+    begin, end = np.searchsorted(grid.edges, [fault.begin, fault.end]).tolist()
+    d = hypothesis.combined.shape[1]
+    if hypothesis.course is Course.ANYTHING:
+        shapes = np.eye(end - begin)
+    else:
+        shapes = moments_of(hypothesis, grid)[begin:end]
+    made = np.zeros((grid.n_blocks, width, shapes.shape[1] * d))
+    for block, shape in zip(range(begin, end), shapes, strict=True):
+        made[block, own] = np.kron(shape, hypothesis.combined)
+    sigma = np.tile(hypothesis.sigma, shapes.shape[1])
+    return made.reshape(grid.n_blocks * width, -1), np.diag(1.0 / sigma**2)
+
+
+def moments_of(hypothesis: Hypothesis, grid: Grid) -> Array:
+    """Return how a hypothesis goes on over the blocks (N, 1 or 2)."""
+    one = np.ones((grid.n_blocks, 1))
+    if hypothesis.course is not Course.TREND:
+        return one
+    since = (grid.middle_s - grid.middle_s.mean()) / TREND_S
+    return np.column_stack([one, since])

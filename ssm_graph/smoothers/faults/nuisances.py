@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, solve_triangular
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import STATE_DIM
-from ssm_graph.engine.evidence import Columns
+from ssm_graph.engine.evidence import Columns, Evidence
 from ssm_graph.imu.increments import MergedSamples
 from ssm_graph.mission.problem import Problem
 from ssm_graph.smoothers.faults.columns import BEAM, IMU, Channels, Linear
@@ -25,8 +25,13 @@ SLOW_AIDS = {"depth": (0.5, 20.0)}
 """The same of aids, by name."""
 SLOW_BIAS = (0.3, 300.0)
 """Turn-on sigmas of the biases, and s."""
-SCALE_OF_BIAS = 0.02
-"""Scale factors and misalignments of the IMU: an accelerometer's error by 1 g is this many... """
+
+
+BEAMS_GROUP, AIDS_GROUP, IMU_GROUP = range(3)
+WIDTHS = (0.25, 0.5, 1.0)
+"""Of what the sizes above say, how much there may be; the data choose."""
+WIDER = (0.25, 0.5, 1.0, 2.0, 4.0)
+"""The same once faults are freed, which otherwise pass for noise."""
 
 
 class Nuisances:
@@ -34,56 +39,112 @@ class Nuisances:
 
     def __init__(self, linear: Linear, channels: Channels) -> None:
         self._linear, self._channels = linear, channels
-        self.shared = self._shared()
-        """Columns over the whole mission, their prior information, and its score"""
+        self.shared, self._is_own, self._own_score = self._shared()
+        """Columns over the whole mission, of unit prior variance"""
+        self._wandering = self._wander()
 
-    def of_blocks(self, middle_s: Array) -> tuple[NDArray[np.intp], Array]:
-        """Return which columns of N blocks wander, and the information of their priors."""
-        width, columns, precisions = self._channels.width, [], []
+    @property
+    def score(self) -> Array:
+        """What the priors of the shared columns (C,) say of their sizes."""
+        return self._own_score
+
+    def priors(self, middle_s: Array) -> Priors:
+        """Return which columns of N blocks, and of all of them, are nuisances, and their priors."""
+        width, columns, parts = self._channels.width, [], []
         apart_s = np.abs(middle_s[:, None] - middle_s[None, :])
-        for column, sigma, correlation_s in self._wandering():
+        of_time: dict[float, Array] = {}
+        for column, sigma, correlation_s, group in self._wandering:
+            if correlation_s not in of_time:
+                covariance = np.exp(-apart_s / correlation_s) + 1e-6 * np.eye(len(middle_s))
+                of_time[correlation_s] = np.asarray(np.linalg.inv(covariance))
             columns.append(np.arange(len(middle_s)) * width + column)
-            covariance = np.exp(-apart_s / correlation_s) + 1e-6 * np.eye(len(middle_s))
-            precisions.append(np.linalg.inv(covariance) / sigma**2)
-        return np.concatenate(columns), block_diag(*precisions)
+            parts.append((of_time[correlation_s] / sigma**2, group))
+        common = len(middle_s) * width + np.arange(len(self._is_own))
+        return Priors(np.concatenate([*columns, common]), parts, self._is_own)
 
-    def _wandering(self) -> list[tuple[int, float, float]]:
-        """Return column, sigma and time of correlation (s) of each."""
-        problem, channels = self._linear.problem, self._channels
+    def _wander(self) -> list[tuple[int, float, float, int]]:
+        """Return column, sigma, time of correlation (s) and group of each."""
+        problem, channels, beams = self._linear.problem, self._channels, self._linear.problem.beams
         found = []
-        beams = problem.beams
-        for beam in range(beams.n_beams):
-            own = beams.beam == beam
-            if np.any(own):
-                share, correlation_s = SLOW_BEAM
-                found.append((channels.of(BEAM).columns.start + beam, share * float(np.median(beams.sigma[own])), correlation_s))
+        for beam in np.unique(beams.beam).tolist():
+            share, correlation_s = SLOW_BEAM
+            sigma = share * float(np.median(beams.sigma[beams.beam == beam]))
+            found.append((channels.of(BEAM).columns.start + beam, sigma, correlation_s, BEAMS_GROUP))
         for aid in self._linear.aids:
-            if aid.name in SLOW_AIDS and len(aid):
-                share, correlation_s = SLOW_AIDS[aid.name]
-                root = aid.root_information
-                sigma = problem.depths.sigma if problem.depths is not None and aid.name == "depth" else 1.0 / float(np.median(root[:, 0, 0]))
-                for column in range(aid.dim):
-                    found.append((channels.of(aid.name).columns.start + column, share * sigma, correlation_s))
+            if aid.name not in SLOW_AIDS or len(aid) == 0:
+                continue
+            share, correlation_s = SLOW_AIDS[aid.name]
+            sigma = share * problem.depths.sigma
+            first = channels.of(aid.name).columns.start
+            found.extend((first + i, sigma, correlation_s, AIDS_GROUP) for i in range(aid.dim))
         share, correlation_s = SLOW_BIAS
-        for i, sigma in enumerate(problem.imu_noise_bias_sigma):
-            found.append((channels.of(IMU).columns.start + i, share * float(sigma), correlation_s))
+        first = channels.of(IMU).columns.start
+        for i, sigma in enumerate(problem.imu_noise_bias_sigma.tolist()):
+            found.append((first + i, share * sigma, correlation_s, IMU_GROUP))
         return found
 
-    def _shared(self) -> tuple[Columns, Array, Array]:
+    def _shared(self) -> tuple[Columns, NDArray[np.bool_], Array]:
+        """Return columns of unit prior variance, which are the problem's own, and its score."""
         linear, problem = self._linear, self._linear.problem
-        extras = problem.extras
-        own_sigma = extras.sigma[extras.n_walks :]
-        of_imu = _imu_columns(linear, self._channels)
+        own_sigma = problem.extras.sigma[problem.extras.n_walks :]
         sigma = _imu_sigmas(problem)
         between = np.zeros((*linear.between.missed.shape, len(sigma)))
-        between[:, :STATE_DIM] = of_imu * sigma
+        between[:, :STATE_DIM] = _imu_columns(linear, self._channels) * sigma
         columns = Columns(
-            np.hstack([linear.constants.own, np.zeros((len(linear.own.missed), len(sigma)))]),
-            np.concatenate([linear.constants.between, between], axis=2),
+            np.hstack(
+                [linear.constants.own * own_sigma, np.zeros((len(linear.own.missed), len(sigma)))]
+            ),
+            np.concatenate([linear.constants.between * own_sigma, between], axis=2),
         )
-        prior = np.diag(np.concatenate([1.0 / own_sigma**2, np.ones(len(sigma))]))
-        score = np.concatenate([-linear.states.constants[: len(own_sigma)] / own_sigma**2, np.zeros(len(sigma))])
-        return columns, prior, score
+        is_own = np.arange(len(own_sigma) + len(sigma)) < len(own_sigma)
+        score = np.zeros(len(is_own))
+        score[is_own] = -linear.states.constants[: len(own_sigma)] / own_sigma
+        return columns, is_own, score
+
+
+class Priors:
+    """Information of the nuisances' priors, for any widths of their groups."""
+
+    def __init__(
+        self,
+        columns: NDArray[np.intp],
+        parts: list[tuple[Array, int]],
+        is_own: NDArray[np.bool_],
+    ) -> None:
+        self.columns, self._parts, self._is_own = columns, parts, is_own
+
+    def information(self, widths: tuple[float, ...]) -> Array:
+        """Return it (m, m) for the widths of beams, aids and inertial data."""
+        shared = np.where(self._is_own, 1.0, widths[IMU_GROUP] ** -2)
+        return block_diag(*(part / widths[g] ** 2 for part, g in self._parts), np.diag(shared))
+
+    def log_det(self, widths: tuple[float, ...]) -> float:
+        """Return the logarithm of its determinant, but for what no width changes."""
+        counts = np.zeros(3)
+        for part, group in self._parts:
+            counts[group] += len(part)
+        counts[IMU_GROUP] += np.sum(~self._is_own)
+        return float(-2.0 * np.sum(counts * np.log(widths)))
+
+    def fitted(self, evidence: Evidence, *, choices: tuple[float, ...]) -> tuple[float, ...]:
+        """Return the widths that make the data likeliest, one group after the other."""
+        score = evidence.score[self.columns]
+        among = evidence.information[np.ix_(self.columns, self.columns)]
+        known: dict[tuple[float, ...], float] = {}
+
+        def likelihood(widths: tuple[float, ...]) -> float:
+            if widths not in known:
+                root = np.linalg.cholesky(among + self.information(widths))
+                half = solve_triangular(root, score, lower=True, check_finite=False)
+                spread = 2.0 * float(np.sum(np.log(np.diagonal(root))))
+                known[widths] = 0.5 * (float(half @ half) - spread + self.log_det(widths))
+            return known[widths]
+
+        widths = (1.0, 1.0, 1.0)
+        for group in (IMU_GROUP, BEAMS_GROUP, AIDS_GROUP):
+            tried = [(*widths[:group], one, *widths[group + 1 :]) for one in choices]
+            widths = max(tried, key=likelihood)
+        return widths
 
 
 def _imu_columns(linear: Linear, channels: Channels) -> Array:

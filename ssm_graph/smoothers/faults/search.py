@@ -9,24 +9,30 @@ solution may be far off.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ssm_graph.base.errors import ConfigError
-from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps
-from ssm_graph.smoothers.faults.columns import Channels
-from ssm_graph.smoothers.faults.hypotheses import Hypothesis, hypotheses_of
+from ssm_graph.smoothers.faults.columns import IMU, Channels
+from ssm_graph.smoothers.faults.hypotheses import hypotheses_of
 from ssm_graph.smoothers.faults.judged import Candidate, Fault, Grid, Judge, Judged
 
 FINE_S = 1.0
 """s, to which edges are refined."""
 NEW_PER_LOOK = 3
 """Faults that one look adds: each bends the solution that the others are judged at."""
-MEDIAN_SQUARE = 0.4549364
-"""Of a standard Gaussian."""
-WITHIN_MARGIN = 12.0
+HINT = 0.75
+"""Share of its charge from which on a stretch of the coarse grid is looked at more closely."""
+JOLT = 30.0
+"""Chi-square of inertial data within few blocks, from which on an edge is looked for there."""
+LONGEST_JOLT = 2
+"""Blocks"""
+SAME_STRETCH = 0.5
+SAME_ANSWER_SIGMAS = 1.0
+"""Explanations whose answers are nowhere further apart are one."""
+MOST_RIVALS = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,92 +60,132 @@ class Look:
     def __init__(self, judge: Judge, channels: Channels, settings: FaultSearch) -> None:
         self._judge, self._settings = judge, settings
         self._keyframe_s = judge.linear.problem.keyframe_s
+        self._work = 0.2 * len(self._keyframe_s)
         self.hypotheses = hypotheses_of(channels)
 
     def find_steps(self, known: Sequence[Fault]) -> Steps[list[Fault]]:
-        """Return what is off, from what was thought to be before."""
-        found = yield from self._again_steps(known)
-        for _ in range(NEW_PER_LOOK):
-            coarse = self._judged(found)
-            yield 0.1 * len(self._keyframe_s)
-            best = best_of(coarse.with_freed(found), self.hypotheses)
-            yield 0.1 * len(self._keyframe_s)
-            if best.merit <= 0.0:
+        """Return what is off; where faults known before begin and end, new ones may as well."""
+        self._judge.fit(self._grid([]), with_rivals(known))
+        yield self._work
+        found: list[Fault] = []
+        for _ in range(len(known) + NEW_PER_LOOK):
+            best = yield from self._next_steps(found, known)
+            if best is None:
                 break
-            rough = self._fault(best, coarse)
-            fine = self._judged([*found, rough], refined=[rough])
-            yield 0.2 * len(self._keyframe_s)
-            left = fine.with_freed(found)
-            refined = best_of(left, self.hypotheses)
-            found.append(self._fault(refined, left))
-            yield 0.2 * len(self._keyframe_s)
-        return self._beyond_what_remains(found)
-
-    def _again_steps(self, known: Sequence[Fault]) -> Steps[list[Fault]]:
-        """Let each compete anew where it is, the others being freed."""
-        found = list(known)
-        if not found:
-            return found
-        fine = self._judged(found, refined=found)
-        yield 0.2 * len(self._keyframe_s)
-        for fault in sorted(known, key=lambda fault: fault.merit):
-            found.remove(fault)
-            left = fine.with_freed(found)
-            best = best_of(left, self.hypotheses, near=fault)
-            yield 0.2 * len(self._keyframe_s)
-            if best.merit > 0.0:
-                found.append(self._fault(best, left))
+            found.append(best)
+        if len(found) > 1:
+            found = yield from self._again_steps(found)
         return found
 
-    def _beyond_what_remains(self, found: list[Fault]) -> list[Fault]:
-        """Keep what stands out of the excess that is left when all that was found is freed."""
-        if not found:
-            return found
-        judged = self._judged(found)
-        excess = excess_of(judged.with_freed(found))
-        if excess <= 1.0:
-            return found
-        return [f for f in found if f.chi_sq / excess > f.chi_sq - f.merit]
+    def _next_steps(self, found: Sequence[Fault], known: Sequence[Fault]) -> Steps[Fault | None]:
+        """Return the best of what is left, None for nothing."""
+        coarse = self._judge.on(self._grid([*with_rivals(found), *with_rivals(known)]))
+        yield self._work
+        left = coarse.with_freed(with_rivals(found))
+        ranked = left.best_of(self.hypotheses)
+        yield self._work
+        hints = [fault_of(one, left) for one in hints_of(ranked)]
+        if not hints:
+            return None
+        fine = self._judge.on(self._grid(with_rivals(found), around=hints))
+        yield self._work
+        left = fine.with_freed(with_rivals(found))
+        ranked = left.best_of(self.hypotheses)
+        yield self._work
+        if not ranked[0].is_significant:
+            return None
+        best = fault_of(ranked[0], left)
+        rivals = rivals_of(best, ranked, left, margin=self._settings.margin)
+        return (yield from self._against_steps(best, rivals, fine, found))
 
-    def _judged(self, faults: Iterable[Fault], refined: Iterable[Fault] = ()) -> Judged:
-        """Return the evidence on blocks that begin and end where the faults do."""
-        last_s = self._keyframe_s[-1]
-        edges_s = [np.arange(self._keyframe_s[0], last_s, self._settings.block_s)]
+    def _again_steps(self, found: list[Fault]) -> Steps[list[Fault]]:
+        """Let each compete anew about where it is, the others being freed; some are none then."""
+        kept = list(found)
+        for fault in sorted(found, key=lambda fault: fault.merit):
+            others = [one for one in kept if one is not fault]
+            fine = self._judge.on(self._grid(with_rivals(others), around=[fault]))
+            yield self._work
+            left = fine.with_freed(with_rivals(others))
+            ranked = left.best_of(self.hypotheses, near=fault)
+            yield self._work
+            kept = others
+            if ranked[0].is_significant:
+                best = fault_of(ranked[0], left)
+                rivals = rivals_of(best, ranked, left, margin=self._settings.margin)
+                kept.append((yield from self._against_steps(best, rivals, fine, others)))
+        return kept
+
+    def _against_steps(
+        self, best: Fault, rivals: Sequence[Fault], fine: Judged, found: Sequence[Fault]
+    ) -> Steps[Fault]:
+        """Return a fault with those rivals whose answer is another one."""
+        if not rivals:
+            return best
+        others = with_rivals(found)
+        kept, cost_m = [], 0.0
+        own = yield from self._judge.way_steps(fine, [*others, best])
+        for rival in rivals:
+            other = yield from self._judge.way_steps(fine, [*others, rival])
+            apart = self._judge.apart(own, other)
+            if apart.sigmas > SAME_ANSWER_SIGMAS:
+                kept.append(rival)
+                cost_m = max(cost_m, apart.level_m)
+        return replace(best, rivals=tuple(kept[:MOST_RIVALS]), cost_m=cost_m)
+
+    def _grid(self, faults: Iterable[Fault], *, around: Iterable[Fault] = ()) -> Grid:
+        """Return blocks that begin and end where faults do, and fine ones about some."""
+        first_s, last_s, step_s = self._keyframe_s[0], self._keyframe_s[-1], self._settings.block_s
         time_s = np.append(self._keyframe_s, last_s + 1.0)
-        for fault in faults:
-            edges_s.append(time_s[[fault.begin, fault.end]])
-        around = np.arange(-self._settings.block_s, self._settings.block_s + FINE_S, FINE_S)
-        for fault in refined:
-            for edge_s in time_s[[fault.begin, fault.end]]:
-                edges_s.append(edge_s + around)
-        return self._judge.on(Grid.of(self._keyframe_s, np.concatenate(edges_s)))
-
-    def _fault(self, candidate: Candidate, judged: Judged) -> Fault:
-        edges = judged.grid.edges
-        return Fault(
-            candidate.hypothesis,
-            int(edges[candidate.begin]),
-            int(edges[candidate.end]),
-            candidate.chi_sq,
-            candidate.merit,
-        )
+        edges_s = [np.arange(first_s, last_s, step_s)]
+        edges_s.extend(time_s[[fault.begin, fault.end]] for fault in faults)
+        fine_s = np.arange(-step_s, step_s + FINE_S, FINE_S)
+        for fault in around:
+            edges_s.extend(edge_s + fine_s for edge_s in time_s[[fault.begin, fault.end]])
+        return Grid.of(self._keyframe_s, np.concatenate(edges_s))
 
 
-def best_of(
-    judged: Judged, hypotheses: Sequence[Hypothesis], *, near: Fault | None = None
-) -> Candidate:
-    """Return the best hypothesis with its stretch; ``near`` a fault, one that has to overlap it."""
-    return judged.best_of(hypotheses, near=near)[0]
+def fault_of(candidate: Candidate, judged: Judged) -> Fault:
+    """Return a candidate as a fault: its blocks are those of one grid only."""
+    begin, end = judged.grid.edges[[candidate.begin, candidate.end]].tolist()
+    return Fault(candidate.hypothesis, begin, end, candidate.chi_sq, candidate.merit)
 
 
-def excess_of(judged: Judged) -> float:
-    """Return by how much the chi-squares of single blocks exceed those of noise as stated.
+def hints_of(ranked: Sequence[Candidate]) -> list[Candidate]:
+    """Return what is worth a closer look: edges off the grid hide most of a fault.
 
-    Of the channels' medians the largest counts.
+    The inertial data show an edge of anything, as a jolt within its block.
     """
-    n, width = judged.grid.n_blocks, judged.channels.width
-    information = np.diagonal(judged.evidence.information).reshape(n, width)
-    square = judged.evidence.score.reshape(n, width) ** 2
-    chi_sq: Array = np.divide(square, information, out=np.zeros_like(square), where=information > 0)
-    medians = [np.median(chi_sq[:, channel.columns]) for channel in judged.channels.all]
-    return float(np.max(medians)) / MEDIAN_SQUARE
+    best = ranked[0]
+    hints = [best] if best.chi_sq > HINT * best.hypothesis.charge(best.n_numbers()) else []
+    jolt = next(one for one in ranked if one.hypothesis.channel == IMU)
+    is_short = jolt.end - jolt.begin <= LONGEST_JOLT
+    if is_short and jolt.chi_sq > JOLT and jolt is not best:
+        hints.append(jolt)
+    return hints
+
+
+def rivals_of(
+    best: Fault, ranked: Sequence[Candidate], judged: Judged, *, margin: float
+) -> list[Fault]:
+    """Return other sensors, and other stretches, that explain the data as well."""
+    found = [fault_of(one, judged) for one in ranked if one.merit > best.merit - margin]
+    elsewhere = judged.best_of([best.hypothesis], apart_from=best)[0]
+    if elsewhere.merit > best.merit - margin:
+        found.append(fault_of(elsewhere, judged))
+    return [one for one in found if not is_alike(one, best)]
+
+
+def is_alike(one: Fault, other: Fault) -> bool:
+    """Return whether both are one hypothesis over about the same stretch."""
+    return one.hypothesis is other.hypothesis and overlap(one, other) > SAME_STRETCH
+
+
+def overlap(one: Fault, other: Fault) -> float:
+    """Return how much of two stretches they share, of all that they cover."""
+    shared = min(one.end, other.end) - max(one.begin, other.begin)
+    return max(shared, 0) / (max(one.end, other.end) - min(one.begin, other.begin))
+
+
+def with_rivals(found: Iterable[Fault]) -> list[Fault]:
+    """Return all that is to be freed: what was found, each with its rivals behind it."""
+    return [one for fault in found for one in (fault, *fault.rivals)]

@@ -23,7 +23,7 @@ from ssm_graph.smoothers.faults.columns import BEAM, IMU, Channels, linear_of_st
 from ssm_graph.smoothers.faults.hypotheses import Course
 from ssm_graph.smoothers.faults.judged import TREND_S, Fault, Judge
 from ssm_graph.smoothers.faults.nuisances import Nuisances
-from ssm_graph.smoothers.faults.search import FaultSearch, Look
+from ssm_graph.smoothers.faults.search import FaultSearch, Look, with_rivals
 
 MOST_LOOKS = 8
 """Looks after which the search ends whatever it finds."""
@@ -97,7 +97,7 @@ class FaultWatch:
         of_aid: dict[str, list[Array]] = {name: [] for name in channels.aids}
         left_out: dict[str, NDArray[np.bool_]] = {}
         aid_keyframe = channels.aid_keyframe
-        for fault in freed_faults(self._found):
+        for fault in with_rivals(self._found):
             hypothesis, name = fault.hypothesis, fault.hypothesis.channel
             C = hypothesis.combined
             if hypothesis.course is Course.ANYTHING:
@@ -192,11 +192,6 @@ def said(fault: Fault, sizes: Array) -> str:
     return text
 
 
-def freed_faults(found: Sequence[Fault]) -> list[Fault]:
-    """Return all that is to be freed: what was found, each with its rivals behind it."""
-    return [one for fault in found for one in (fault, *fault.rivals)]
-
-
 def same_faults(some: Sequence[Fault], others: Sequence[Fault], keyframe_s: Array) -> bool:
     """Return whether these are the same faults, to the second."""
     time_s = np.append(keyframe_s, keyframe_s[-1])
@@ -210,7 +205,7 @@ def same_faults(some: Sequence[Fault], others: Sequence[Fault], keyframe_s: Arra
                 round(float(time_s[f.begin])),
                 round(float(time_s[f.end])),
             )
-            for f in freed_faults(faults)
+            for f in with_rivals(faults)
         )
 
     return keys(some) == keys(others)
