@@ -92,6 +92,7 @@ from ssm_graph.sensors.standstill import Standstill as Standstill
 from ssm_graph.simulation import SCENARIOS as SCENARIOS
 from ssm_graph.simulation import AidSettings as AidSettings
 from ssm_graph.simulation import BeaconSettings as BeaconSettings
+from ssm_graph.simulation import BeamNoise as BeamNoise
 from ssm_graph.simulation import CompassSettings as CompassSettings
 from ssm_graph.simulation import CurrentSettings as CurrentSettings
 from ssm_graph.simulation import DepthProfile as DepthProfile
@@ -105,13 +106,17 @@ from ssm_graph.simulation import GnssSettings as GnssSettings
 from ssm_graph.simulation import Grade as Grade
 from ssm_graph.simulation import GrossErrors as GrossErrors
 from ssm_graph.simulation import HoverRoute as HoverRoute
+from ssm_graph.simulation import InertialErrors as InertialErrors
+from ssm_graph.simulation import InstrumentErrors as InstrumentErrors
 from ssm_graph.simulation import Loss as Loss
 from ssm_graph.simulation import OutlierKind as OutlierKind
 from ssm_graph.simulation import Outliers as Outliers
 from ssm_graph.simulation import RangingSettings as RangingSettings
 from ssm_graph.simulation import Route as Route
+from ssm_graph.simulation import Sensor as Sensor
 from ssm_graph.simulation import SimulatedMission as SimulatedMission
 from ssm_graph.simulation import SimulationConfig as SimulationConfig
+from ssm_graph.simulation import SlowPart as SlowPart
 from ssm_graph.simulation import SpiralRoute as SpiralRoute
 from ssm_graph.simulation import SurveyRoute as SurveyRoute
 from ssm_graph.simulation import TransitRoute as TransitRoute
@@ -119,9 +124,11 @@ from ssm_graph.simulation import UsblSettings as UsblSettings
 from ssm_graph.simulation import WaterTrack as WaterTrack
 from ssm_graph.simulation import Waves as Waves
 from ssm_graph.simulation import default_mount as default_mount
+from ssm_graph.simulation import errors_of as errors_of
 from ssm_graph.simulation import janus_beams as janus_beams
 from ssm_graph.simulation import scenario_config as scenario_config
 from ssm_graph.simulation import simulate as simulate
+from ssm_graph.simulation import with_faults as with_faults
 from ssm_graph.smoothers.batch import SmootherConfig as SmootherConfig
 from ssm_graph.smoothers.batch import SsmSmoother as SsmSmoother
 from ssm_graph.smoothers.faults.search import FaultSearch as FaultSearch

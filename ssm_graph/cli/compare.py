@@ -67,6 +67,9 @@ study file (TOML):
              offset_m_per_s = 1.0}]  # on one line; beams from 0, turned: plus seed, modulo 4;
                                      # shape = "drift" grows to the offset, "covered" reads low
                                      # by a share that grows to share, "stuck" keeps its speed
+                                     # of any sensor, and more shapes: docs/mission-folder.md
+  realistic = true                   # instruments err as real ones of the grade
+  gnss_windows_s = [[0.0, 1200.0]]   # times with fixes
   losses = [{beams = [3], start_s = 300.0, length_s = 180.0}]
   current = {steady_enu_m_per_s = [0.3, 0.0, 0.0], tide_m_per_s = 0.2, tide_period_s = 44714.0,
              sigma_m_per_s = 0.1, vertical_sigma_m_per_s = 0.01, correlation_s = 21600.0}

@@ -60,6 +60,12 @@ def add_parser(commands: Any, *, epilog: str) -> None:
     )
     parser.add_argument("--duration", type=float, metavar="SECONDS", help="length of the mission")
     parser.add_argument("--imu-rate", type=float, metavar="HZ", help="inertial samples per second")
+    parser.add_argument(
+        "--realistic",
+        action="store_true",
+        help="instruments err as real ones of the grade: scale factors, misalignments, vibration, "
+        "noise with tails that changes slowly (default: bias, walk and white noise as stated)",
+    )
     parser.add_argument("--seed", type=int, default=0, help="same seed, same mission (default: 0)")
     add_mission_output(parser)
     parser.set_defaults(run=run)
@@ -68,6 +74,8 @@ def add_parser(commands: Any, *, epilog: str) -> None:
 def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
     """Simulate and write."""
     changes: dict[str, Any] = {"seed": arguments.seed}
+    if arguments.realistic:
+        changes["realistic"] = True
     if arguments.grade is not None:
         changes["grade"] = Grade[arguments.grade.upper()]
     if arguments.duration is not None:

@@ -28,7 +28,14 @@ from ssm_graph.sensors.depth import DepthLog
 from ssm_graph.sensors.gnss import GnssLog
 from ssm_graph.sensors.standstill import Standstill
 from ssm_graph.simulation import checked
-from ssm_graph.simulation.randomness import DriftSettings, Streams, draw_drift, gauss_markov
+from ssm_graph.simulation.randomness import (
+    DriftSettings,
+    SlowPart,
+    Streams,
+    draw_drift,
+    gauss_markov,
+    with_slow_part,
+)
 from ssm_graph.simulation.trajectory import Trajectory, stacked
 
 Mask = NDArray[np.bool_]
@@ -217,14 +224,21 @@ def _sigma_enu(settings: GnssSettings | UsblSettings) -> Array:
 
 
 def depth_log(
-    trajectory: Trajectory, settings: DepthSettings, *, end_s: float, rng: Rng | None
+    trajectory: Trajectory,
+    settings: DepthSettings,
+    *,
+    end_s: float,
+    rng: Rng | None,
+    slow: tuple[SlowPart, Rng] | None = None,
 ) -> DepthLog:
-    """Return the depth of the sensor over ``(0, end_s]``; None draws no noise."""
+    """Return the depth of the sensor over ``(0, end_s]``; None draws no noise, or no slow one."""
     time_s = regular_times(settings.rate_hz, end_s)
     point_e = trajectory.at(time_s).point_e(np.array(settings.lever_arm_b))
     depth = settings.offset - geodetic_from_ecef(stacked(point_e))[2]
     if rng is not None:
-        depth = depth + settings.sigma * rng.standard_normal(len(time_s))
+        unit = rng.standard_normal((len(time_s), 1))
+        unit = with_slow_part(unit, time_s, *slow) if slow else unit
+        depth = depth + settings.sigma * unit[:, 0]
     return DepthLog(
         sigma=settings.sigma, time_s=time_s, depth=depth, lever_arm_b=np.array(settings.lever_arm_b)
     )
@@ -237,11 +251,14 @@ def gnss_log(
     end_s: float,
     rng: Rng | None,
     drift_rng: Rng | None = None,
+    slow: tuple[SlowPart, Rng] | None = None,
 ) -> GnssLog | None:
     """Return the fixes over ``(0, end_s]``; None if there is not one. No ``rng``, no noise."""
     time_s, sigma_enu = regular_times(settings.rate_hz, end_s), _sigma_enu(settings)
     # Drawn before fixes are chosen: a fix keeps its noise when the windows change.
     unit = np.zeros((len(time_s), 3)) if rng is None else rng.standard_normal((len(time_s), 3))
+    if rng is not None and slow is not None:
+        unit = with_slow_part(unit, time_s, *slow)
     error_enu = unit * sigma_enu
     if drift_rng is not None and settings.drift is not None:
         error_enu = error_enu + draw_drift(settings.drift, time_s, drift_rng)

@@ -1,4 +1,4 @@
-"""What goes wrong with DVL beams: random outliers of six kinds, programmed faults, what is missing.
+"""What goes wrong with DVL beams: random outliers of six kinds, offsets, what is missing.
 
 An outlier or a fault is an offset added to a beam's speed; a dropout or a loss takes the beam away.
 Outliers are placed at random from the generator handed in, faults exactly where they are asked for.
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.simulation import checked
+from ssm_graph.simulation.faults import Fault
 
 Mask = NDArray[np.bool_]
 
@@ -188,83 +189,14 @@ def lost_beams(time_s: Array, n_beams: int, losses: Sequence[Loss]) -> Mask:
     return lost
 
 
-class FaultShape(Enum):
-    """How a programmed fault goes on from its begin."""
-
-    CONSTANT = "a constant offset"
-    DRIFT = "an offset that grows evenly from zero to its size at the end"
-    COVERED = "a covered transducer: reads low by a share that grows evenly from zero to its size"
-    STUCK = "the beam stays at the speed it had at the begin, its noise goes on"
-
-
-@dataclass(frozen=True, slots=True)
-class Fault:
-    """A fault of some beams in ``[start_s, end_s)``."""
-
-    beams: tuple[int, ...]
-    """Beams from 0."""
-    start_s: float
-    end_s: float
-    offset_m_per_s: float | tuple[float, ...] = 0.0
-    """m/s, one for all or one for each of ``beams``; of CONSTANT and DRIFT."""
-    shape: FaultShape = FaultShape.CONSTANT
-    share: float = 0.0
-    """By how much a COVERED beam reads low in the end; 1 reads zero."""
-
-    def __post_init__(self) -> None:
-        checked.require_rule("Fault.beams", checked.BEAMS, self.beams)
-        checked.require_rule("Fault", checked.WINDOW, (self.start_s, self.end_s))
-        size = np.size(self.offset_m_per_s)
-        checked.require(
-            size in (1, len(self.beams)),
-            "Fault.offset_m_per_s",
-            expected=f"1 or {len(self.beams)} offsets",
-            got=self.offset_m_per_s,
-            hint="give one offset for all beams or one for each",
-        )
-        checked.require(
-            self.has_offset or not np.any(self.offset_m_per_s),
-            "Fault.offset_m_per_s",
-            expected=f"none with {self.shape.name}",
-            got=self.offset_m_per_s,
-            hint="leave it out",
-        )
-        is_covered = self.shape is FaultShape.COVERED
-        checked.require(
-            0.0 < self.share <= 1.0 if is_covered else self.share == 0.0,
-            "Fault.share",
-            expected="above 0, at most 1, with COVERED alone",
-            got=self.share,
-            hint="write 30 % as 0.3" if is_covered else "leave it out",
-        )
-
-    @property
-    def has_offset(self) -> bool:
-        """Whether the shape has a size in m/s."""
-        return self.shape in (FaultShape.CONSTANT, FaultShape.DRIFT)
-
-    def offset(self, time_s: Array, speed: Array) -> Array:
-        """Return what the fault adds (N, n beams), m/s, to ``speed`` (N, n beams).
-
-        The pings at ``time_s`` (N,) are those inside the fault.
-        """
-        age = ((time_s - self.start_s) / (self.end_s - self.start_s))[:, None]
-        if self.shape is FaultShape.COVERED:
-            return np.asarray(-self.share * age * speed)
-        if self.shape is FaultShape.STUCK:
-            return np.asarray(speed[:1] - speed)
-        size = np.broadcast_to(self.offset_m_per_s, speed.shape)
-        return np.asarray(size * age if self.shape is FaultShape.DRIFT else size)
-
-
 def add_faults(
     drawn: BeamFaults, faults: Sequence[Fault], time_s: Array, speed: Array
 ) -> BeamFaults:
     """Return ``drawn`` with programmed faults added to pings of clean ``speed`` (N, B)."""
     offset, mask = drawn.offset.copy(), drawn.is_outlier.copy()
     for fault in faults:
-        inside = np.flatnonzero((fault.start_s <= time_s) & (time_s < fault.end_s))
-        where = np.ix_(inside, np.array(fault.beams))
+        inside = fault.inside(time_s)
+        where = np.ix_(inside, fault.beams_of(speed.shape[1]))
         offset[where] += fault.offset(time_s[inside], speed[where])
         mask[where] = True
     return BeamFaults(offset, mask)

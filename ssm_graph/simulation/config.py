@@ -24,10 +24,12 @@ from ssm_graph.simulation.aids import (
     RangingSettings,
     UsblSettings,
 )
-from ssm_graph.simulation.beam_faults import Fault, Loss, OutlierKind, Outliers
+from ssm_graph.simulation.beam_faults import Loss, OutlierKind, Outliers
 from ssm_graph.simulation.currents import CurrentSettings, WaterTrack
 from ssm_graph.simulation.dvl_model import DvlSettings, default_mount, janus_beams
+from ssm_graph.simulation.faults import Fault
 from ssm_graph.simulation.inertial import IMU_NOISE, Grade, StartSigmas
+from ssm_graph.simulation.instruments import SIMPLE, InstrumentErrors, errors_of
 from ssm_graph.simulation.routes import (
     DepthProfile,
     DiveRoute,
@@ -89,6 +91,10 @@ class SimulationConfig(checked.Settings):
     aids: AidSettings = AidSettings()
     """Acoustics, compass, times at rest: none of them by default."""
 
+    realistic: bool = False
+    """Whether instruments err as real ones of the grade: scale factors, slow noise and more."""
+    instruments: InstrumentErrors | None = None
+    """Their sizes one by one; None for those of the grade if ``realistic``, for none otherwise."""
     perfect_sensors: bool = False
     """Draw no sensor error at all; noise stays as stated, outliers and losses as asked for."""
     draw_initial_errors: bool = True
@@ -120,6 +126,13 @@ class SimulationConfig(checked.Settings):
     def noise(self) -> ImuNoise:
         """The noise of the inertial sensors, by default that of the grade."""
         return IMU_NOISE[self.grade] if self.imu_noise is None else self.imu_noise
+
+    @property
+    def errors(self) -> InstrumentErrors:
+        """What instruments do beyond their stated noise."""
+        if self.perfect_sensors or not (self.realistic or self.instruments):
+            return SIMPLE
+        return self.instruments or errors_of(self.grade)
 
 
 @dataclass(frozen=True, slots=True)

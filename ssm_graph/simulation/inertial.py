@@ -19,8 +19,8 @@ from ssm_graph.sensors.imu import ImuNoise
 from ssm_graph.simulation.randomness import Streams
 from ssm_graph.simulation.trajectory import Trajectory
 
-_MICRO_G = 9.80665e-6
-_PER_HOUR = 1.0 / 3600.0
+MICRO_G = 9.80665e-6
+PER_HOUR = 1.0 / 3600.0
 _PER_ROOT_HOUR = 1.0 / 60.0
 
 
@@ -62,11 +62,11 @@ def _noise(sheet: tuple[float, ...]) -> ImuNoise:
     gyro_bias, gyro_noise, gyro_walk, accel_bias, accel_noise, accel_walk = sheet
     return ImuNoise(
         gyro_density=math.radians(gyro_noise) * _PER_ROOT_HOUR,
-        accel_density=accel_noise * _MICRO_G,
-        gyro_bias_sigma=math.radians(gyro_bias) * _PER_HOUR,
-        accel_bias_sigma=accel_bias * _MICRO_G,
-        gyro_bias_density=math.radians(gyro_walk) * _PER_HOUR * _PER_ROOT_HOUR,
-        accel_bias_density=accel_walk * _MICRO_G * _PER_ROOT_HOUR,
+        accel_density=accel_noise * MICRO_G,
+        gyro_bias_sigma=math.radians(gyro_bias) * PER_HOUR,
+        accel_bias_sigma=accel_bias * MICRO_G,
+        gyro_bias_density=math.radians(gyro_walk) * PER_HOUR * _PER_ROOT_HOUR,
+        accel_bias_density=accel_walk * MICRO_G * _PER_ROOT_HOUR,
     )
 
 
@@ -135,13 +135,18 @@ class ImuErrors(NamedTuple):
 
 
 def averaged_imu(
-    trajectory: Trajectory, *, rate_hz: float, n_samples: int, n_nodes: int = N_NODES
+    trajectory: Trajectory,
+    *,
+    rate_hz: float,
+    n_samples: int,
+    n_nodes: int = N_NODES,
+    late_s: float = 0.0,
 ) -> tuple[Array, Array]:
     """Return the true mean body rate and specific force over each sample.
 
     Sample ``k`` covers ``(k, k + 1] / rate_hz``. Both are averages of vectors in body axes as the
     body turns, which is what a strapped-down triad reports; the estimators have to undo coning
-    and sculling themselves.
+    and sculling themselves. All of it happened ``late_s`` before.
 
     Returns
     -------
@@ -153,7 +158,8 @@ def averaged_imu(
     gyro_b, accel_b = np.empty((n_samples, 3)), np.empty((n_samples, 3))
     for begin in range(0, n_samples, _CHUNK):
         end = min(begin + _CHUNK, n_samples)
-        motion = trajectory.at((np.arange(begin, end) + fractions[:, None]) / rate_hz)
+        time_s = (np.arange(begin, end) + fractions[:, None]) / rate_hz - late_s
+        motion = trajectory.at(time_s)
         np.einsum("q,qki->ki", weights, motion.omega_ib_b(), out=gyro_b[begin:end])
         np.einsum("q,qki->ki", weights, motion.specific_force_b(), out=accel_b[begin:end])
     return gyro_b, accel_b

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,7 +19,6 @@ from ssm_graph.sensors.gnss import GnssLog
 from ssm_graph.sensors.imu import ImuLog
 from ssm_graph.simulation.aids import SimulatedAids, aid_logs, depth_log, gnss_log
 from ssm_graph.simulation.beam_faults import (
-    Fault,
     Loss,
     Outliers,
     add_faults,
@@ -30,7 +29,10 @@ from ssm_graph.simulation.beam_faults import (
 from ssm_graph.simulation.config import SimulationConfig
 from ssm_graph.simulation.currents import Current
 from ssm_graph.simulation.dvl_model import beam_ranges, ping_times, true_beam_speeds
+from ssm_graph.simulation.faults import Fault
 from ssm_graph.simulation.inertial import START_SIGMAS, averaged_imu, imu_errors, initial_state
+from ssm_graph.simulation.instruments import UNCALIBRATED, ImuCalibration, ReadImu, read_imu
+from ssm_graph.simulation.lasting_faults import BrokenMission, with_faults
 from ssm_graph.simulation.randomness import Streams, draw_drift, spawn_streams
 from ssm_graph.simulation.trajectory import Trajectory
 
@@ -58,7 +60,14 @@ class SimulatedMission(ShortRepr):
     """The further aids, with what is wrong with them"""
     accel_bias: Array
     """(M, 3) true accelerometer bias of each IMU sample, m/s^2."""
+    imu_calibration: ImuCalibration
+    """Scale factors, misalignments and g-sensitivity that were drawn; zeros without them."""
     current: Current
+    intact: Mission
+    """The mission without the faults that came when all was read: those of beams are in it."""
+    is_bad: Mapping[str, NDArray[np.bool_]]
+    """Readings that a fault acts on, by the section of their log, as
+    :attr:`BrokenMission.is_bad`; ``dvl`` is ``is_outlier``."""
 
     @property
     def trajectory(self) -> Trajectory:
@@ -82,10 +91,11 @@ class SimulatedMission(ShortRepr):
         return dataclasses.replace(self.mission, dvl=known)
 
     def without_outliers(self) -> Mission:
-        """Return the mission of the oracle, who is told the bad beams: they are missing."""
-        dvl = self.mission.dvl
-        speed = np.where(self.is_outlier, np.nan, dvl.speed)
-        return dataclasses.replace(self.mission, dvl=dataclasses.replace(dvl, speed=speed))
+        """Return the mission of the oracle, who is told what is bad: it is missing.
+
+        Inertial data with a fault are those of ``intact``.
+        """
+        return BrokenMission(self.mission, self.is_bad).told(self.intact)
 
 
 def simulate(config: SimulationConfig) -> SimulatedMission:
@@ -93,7 +103,7 @@ def simulate(config: SimulationConfig) -> SimulatedMission:
     streams = spawn_streams(config.seed)
     n_samples = math.floor(config.duration_s * config.imu_rate_hz + 1e-9)
     end_s = n_samples / config.imu_rate_hz
-    imu, gyro_bias, accel_bias = _imu(config, streams, n_samples)
+    imu, read = _imu(config, streams, n_samples)
     ping_s = ping_times(config.dvl, end_s=end_s, rng=streams.ping_time)
     current = Current(config.current, end_s=end_s, rng=streams.current)
     speeds = _true_speeds(config, ping_s, current)
@@ -103,7 +113,7 @@ def simulate(config: SimulationConfig) -> SimulatedMission:
     aids = aid_logs(config.trajectory, config.aids, end_s=end_s, streams=streams, noisy=noisy)
     truth = config.trajectory.truth(_reference_times(config, end_s))
     initial_rng = streams.initial if config.draw_initial_errors else None
-    mission = Mission(
+    intact = Mission(
         name=config.name,
         frame=LocalFrame(lat=config.lat, lon=config.lon, height=0.0),
         imu=imu,
@@ -119,15 +129,14 @@ def simulate(config: SimulationConfig) -> SimulatedMission:
     )
     return SimulatedMission(
         config=config,
-        mission=mission,
-        is_outlier=dvl.is_outlier,
-        beam_offset=dvl.offset,
+        **_broken(config, intact, dvl),
         true_speed=speeds.over_ground,
         water_speed=speeds.through_water,
         ping_time_s=ping_s,
-        gyro_bias=gyro_bias,
+        gyro_bias=read.gyro_bias,
         aids=aids,
-        accel_bias=accel_bias,
+        accel_bias=read.accel_bias,
+        imu_calibration=read.calibration,
         current=current,
     )
 
@@ -156,13 +165,25 @@ def with_dvl_errors(
     streams = spawn_streams(config.seed)
     speeds = _TrueSpeeds(simulated.true_speed, simulated.water_speed)
     dvl = _dvl(config, streams, simulated.ping_time_s, speeds)
-    return dataclasses.replace(
-        simulated,
-        config=config,
-        mission=dataclasses.replace(simulated.mission, dvl=dvl.log),
-        is_outlier=dvl.is_outlier,
-        beam_offset=dvl.offset,
-    )
+    intact = dataclasses.replace(simulated.intact, dvl=dvl.log)
+    return dataclasses.replace(simulated, config=config, **_broken(config, intact, dvl))
+
+
+def _broken(config: SimulationConfig, intact: Mission, dvl: _Dvl) -> dict[str, Any]:
+    """Return the fields of a simulated mission that faults decide."""
+    faults = [fault for fault in config.faults if not fault.is_before_noise]
+    broken = with_faults(intact, faults, truth=config.trajectory.truth, seed=config.seed)
+    mission, offset, is_outlier = broken.mission, dvl.offset, dvl.is_outlier
+    if "dvl" in broken.is_bad:
+        is_outlier = is_outlier | broken.is_bad["dvl"]
+        offset = offset + np.nan_to_num(mission.dvl.speed - intact.dvl.speed)
+    return {
+        "intact": intact,
+        "mission": mission,
+        "is_outlier": is_outlier,
+        "beam_offset": offset,
+        "is_bad": {**broken.is_bad, "dvl": is_outlier},
+    }
 
 
 def _reference_times(config: SimulationConfig, end_s: float) -> Array:
@@ -172,26 +193,33 @@ def _reference_times(config: SimulationConfig, end_s: float) -> Array:
     return time_s if end_s - time_s[-1] < 1e-9 else np.append(time_s, end_s)
 
 
-def _imu(config: SimulationConfig, streams: Streams, n_samples: int) -> tuple[ImuLog, Array, Array]:
-    """Return the readings and the true biases in them."""
-    rate_hz = config.imu_rate_hz
-    gyro_b, accel_b = averaged_imu(config.trajectory, rate_hz=rate_hz, n_samples=n_samples)
-    gyro_bias, accel_bias = np.zeros_like(gyro_b), np.zeros_like(accel_b)
-    if not config.perfect_sensors:
-        gyro, accel = imu_errors(
-            config.noise, rate_hz=rate_hz, n_samples=n_samples, streams=streams
-        )
-        gyro_bias, accel_bias = gyro.bias, accel.bias
-        gyro_b += gyro.bias + gyro.noise
-        accel_b += accel.bias + accel.noise
+def _imu(config: SimulationConfig, streams: Streams, n_samples: int) -> tuple[ImuLog, ReadImu]:
+    """Return the log, and what is true of it."""
+    rate_hz, inertial = config.imu_rate_hz, config.errors.inertial
+    late_s = inertial.late_s if inertial else 0.0
+    gyro_b, accel_b = averaged_imu(
+        config.trajectory, rate_hz=rate_hz, n_samples=n_samples, late_s=late_s
+    )
+    if config.perfect_sensors:
+        none = np.zeros_like(gyro_b)
+        read = ReadImu(gyro_b, accel_b, none, none, UNCALIBRATED)
+    else:
+        drawn = imu_errors(config.noise, rate_hz=rate_hz, n_samples=n_samples, streams=streams)
+        if inertial:
+            read = read_imu(inertial, (gyro_b, accel_b), drawn, rate_hz=rate_hz, streams=streams)
+        else:
+            gyro, accel = drawn
+            gyro_b += gyro.bias + gyro.noise
+            accel_b += accel.bias + accel.noise
+            read = ReadImu(gyro_b, accel_b, gyro.bias, accel.bias, UNCALIBRATED)
     log = ImuLog(
         start_s=0.0,
         noise=config.noise,
         time_s=np.arange(1, n_samples + 1) / rate_hz,
-        gyro_b=gyro_b,
-        accel_b=accel_b,
+        gyro_b=read.gyro_b,
+        accel_b=read.accel_b,
     )
-    return log, gyro_bias, accel_bias
+    return log, read
 
 
 class _TrueSpeeds(NamedTuple):
@@ -230,17 +258,22 @@ def _dvl(config: SimulationConfig, streams: Streams, time_s: Array, speeds: _Tru
     missing |= np.where(is_water[:, None], ~returns, lost)
     speed = np.where(is_water[:, None], speeds.through_water, speeds.over_ground)
     drawn = draw_outliers(config.outliers, time_s, speed, rng=streams.outliers)
-    offset, is_outlier = add_faults(drawn, config.faults, time_s, speed)
+    before_noise = [fault for fault in config.faults if fault.is_before_noise]
+    offset, is_outlier = add_faults(drawn, before_noise, time_s, speed)
     speed = speed + offset
-    if not config.perfect_sensors:
-        speed = speed + noise[:, None] * streams.beam_noise.standard_normal(speed.shape)
-        if settings.drift is not None:
-            drift_d = draw_drift(settings.drift, time_s, streams.dvl_drift)
-            speed = speed + drift_d @ settings.mount.beams_d.T
     ranges = None
     if settings.seabed_depth_m is not None:
         off_ground = beam_ranges(config.trajectory, settings, time_s)
         ranges = np.where(missing | is_water[:, None], np.nan, off_ground)
+    if not config.perfect_sensors:
+        beams = config.errors.beams
+        if beams is None:
+            speed = speed + noise[:, None] * streams.beam_noise.standard_normal(speed.shape)
+        else:
+            speed = speed + beams.draw(noise[:, None], speed, ranges, time_s, streams)
+        if settings.drift is not None:
+            drift_d = draw_drift(settings.drift, time_s, streams.dvl_drift)
+            speed = speed + drift_d @ settings.mount.beams_d.T
     log = DvlLog(
         mount=settings.mount,
         time_s=time_s + settings.late_s,
@@ -258,10 +291,14 @@ def _aids(
     """Return the readings of depth sensor and GNSS receiver, where there are any."""
     rngs = (streams.depth, streams.gnss, streams.gnss_drift)
     of_depth, of_gnss, of_drift = (None,) * 3 if config.perfect_sensors else rngs
-    depth, gnss, path = config.depth, config.gnss, config.trajectory
+    depth, gnss, path, slow = config.depth, config.gnss, config.trajectory, config.errors
+    slow_depth = (slow.depth, streams.of("slow depth")) if slow.depth else None
+    slow_gnss = (slow.gnss, streams.of("slow gnss")) if slow.gnss else None
     return (
-        None if depth is None else depth_log(path, depth, end_s=end_s, rng=of_depth),
+        None
+        if depth is None
+        else depth_log(path, depth, end_s=end_s, rng=of_depth, slow=slow_depth),
         None
         if gnss is None
-        else gnss_log(path, gnss, end_s=end_s, rng=of_gnss, drift_rng=of_drift),
+        else gnss_log(path, gnss, end_s=end_s, rng=of_gnss, drift_rng=of_drift, slow=slow_gnss),
     )

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
+from scipy.signal import lfilter
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.simulation import checked
@@ -60,6 +61,26 @@ class DriftSettings(checked.Settings):
     """Time after which 1/e of it is left in the mean, s."""
 
 
+@dataclass(frozen=True, slots=True)
+class SlowPart(checked.Settings):
+    """The part of an instrument's noise that changes slowly, as a Gauss-Markov process does."""
+
+    share: float = checked.fraction(hint="write an eighth as 0.125")
+    """Of the variance, which stays what it is."""
+    correlation_s: float = checked.positive(hint="try 20 s")
+    """Time after which 1/e of it is left in the mean, s."""
+
+
+def with_slow_part(
+    unit: Array, time_s: Array, slow: SlowPart | None, rng: np.random.Generator
+) -> Array:
+    """Return white noise of variance 1, (N, d), with a part of it slow; None leaves it white."""
+    if slow is None:
+        return unit
+    process = gauss_markov(rng.standard_normal(unit.shape), time_s, slow.correlation_s)
+    return np.asarray(np.sqrt(1.0 - slow.share) * unit + np.sqrt(slow.share) * process)
+
+
 def draw_drift(settings: DriftSettings, time_s: Array, rng: np.random.Generator) -> Array:
     """Return three independent components (N, 3) at increasing times (N,)."""
     unit = rng.standard_normal((len(time_s), 3))
@@ -77,3 +98,11 @@ def gauss_markov(unit: Array, time_s: Array, correlation_s: float) -> Array:
     for k in range(len(kept)):
         process[k + 1] = kept[k] * process[k] + fresh[k]
     return process
+
+
+def regular_gauss_markov(unit: Array, step_s: float, correlation_s: float) -> Array:
+    """Return the same as :func:`gauss_markov` at regular times, to rounding, but fast."""
+    kept = np.exp(-step_s / correlation_s)
+    drive = np.sqrt(1.0 - kept**2) * unit
+    drive[:1] = unit[:1]
+    return np.asarray(lfilter([1.0], [1.0, -kept], drive, axis=0))

@@ -13,10 +13,12 @@ from ssm_graph.simulation import (
     CurrentSettings,
     Fault,
     FaultShape,
+    GnssSettings,
     Grade,
     Loss,
     OutlierKind,
     Outliers,
+    Sensor,
     SimulationConfig,
     WaterTrack,
     scenario_config,
@@ -42,9 +44,18 @@ class StudyFault:
     """Whether the seed is added to the beams, modulo their number."""
     shape: FaultShape = FaultShape.CONSTANT
     share: float = 0.0
-    """By how much a covered beam reads low in the end."""
+    """By how much a covered beam reads low in the end; of readings with spikes."""
     n_beams: int = 4
     """Of the scenario's DVL."""
+    sensor: Sensor = field(default=Sensor.DVL, repr=False)
+    size: tuple[float, ...] = field(default=(), repr=False)
+    axes: tuple[int, ...] = field(default=(), repr=False)
+
+    @property
+    def further(self) -> object:
+        """What its ``repr`` leaves out, None for nothing: ids of old cells stay as they are."""
+        further = (self.sensor, self.size, self.axes)
+        return None if further == (Sensor.DVL, (), ()) else further
 
     def of_trial(self, seed: int) -> Fault:
         """Return the fault of one trial."""
@@ -57,6 +68,9 @@ class StudyFault:
             offset_m_per_s=offsets[0] if len(offsets) == 1 else offsets,
             shape=self.shape,
             share=self.share,
+            sensor=self.sensor,
+            size=self.size,
+            axes=self.axes,
         )
 
 
@@ -77,12 +91,18 @@ class Cell:
     """None for that of the scenario."""
     water_track: WaterTrack | None = field(default=None, repr=False)
     """None for that of the scenario."""
+    gnss_windows_s: tuple[tuple[float, float], ...] | None = field(default=None, repr=False)
+    """Times with fixes, s; None for those of the scenario."""
+    realistic: bool = field(default=False, repr=False)
+    """Whether instruments err as real ones of the grade."""
 
     @property
     def id(self) -> str:
         """Name and digest of the whole definition: runs of another one are never taken for it."""
         water = repr((self.current, self.water_track)) if self.current or self.water_track else ""
-        return f"{self.case}#{digest(repr(self) + water)}"
+        further = [self.gnss_windows_s, self.realistic, *(fault.further for fault in self.faults)]
+        more = repr(further) if any(further) else ""
+        return f"{self.case}#{digest(repr(self) + water + more)}"
 
     def clean_config(self, grade: Grade, seed: int) -> SimulationConfig:
         """Return the settings of the run without DVL errors, which all cells have in common.
@@ -105,6 +125,10 @@ class Cell:
             current=self.current or config.current,
             water_track=water_track,
             losses=self.losses if water_track else (),
+            realistic=self.realistic or config.realistic,
+            gnss=config.gnss
+            if self.gnss_windows_s is None
+            else replace(config.gnss or GnssSettings(), windows=self.gnss_windows_s),
         )
 
     def faults_of(self, seed: int) -> tuple[Fault, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -20,9 +21,11 @@ from ssm_graph.simulation import (
     Loss,
     OutlierKind,
     Outliers,
+    Sensor,
     SimulationConfig,
     WaterTrack,
 )
+from ssm_graph.simulation.faults import WHOLE_ARRAY
 from ssm_graph.study import keys
 from ssm_graph.study.cells import WITHOUT_SIZE, Cell, Recording, Source, StudyFault, digest
 from ssm_graph.study.keys import StudyTable
@@ -123,6 +126,8 @@ _CASE: Final = {
     "dropout_rate": keys.fraction(0.0),
     "current": keys.table(),
     "water_track": keys.table(),
+    "gnss_windows_s": keys.pairs(),
+    "realistic": keys.flag(False),
 }
 _LOSS: Final = {
     "beams": keys.counts(),
@@ -131,7 +136,10 @@ _LOSS: Final = {
 }
 _FAULT: Final = {
     **_LOSS,
-    "beams": keys.counts(keys.REQUIRED),
+    "length_s": keys.seconds(),
+    "sensor": keys.text("dvl"),
+    "size": keys.numbers(),
+    "axes": keys.counts(),
     "turn_by_seed": keys.flag(False),
     "shape": keys.text("constant"),
     "offset_m_per_s": keys.numbers(),
@@ -206,14 +214,16 @@ def _cells(table: StudyTable, scenario: str, config: SimulationConfig) -> list[C
         dropout_rate=table["dropout_rate"],
         current=_made(CurrentSettings, table.of("current", _CURRENT)),
         water_track=_made(WaterTrack, table.of("water_track", _WATER_TRACK)),
+        gnss_windows_s=table["gnss_windows_s"],
+        realistic=table["realistic"],
     )
     if name is not None and len(outliers) > 1:
         expected = "a name for a single kind, rate and size only"
         raise table.fault("name", expected, name, "leave it out, the cases name themselves")
     if name is None and case != Cell("", scenario, config.duration_s):
         raise ConfigError(
-            f"{table.where} name: expected a name for a case with faults, losses, dropouts or "
-            'currents, got nothing; try name = "fault"'
+            f"{table.where} name: expected a name for a case with faults, losses, dropouts, "
+            'currents, fixes or realistic instruments, got nothing; try name = "fault"'
         )
     return [replace(case, case=name or _case_name(each), outliers=each) for each in outliers]
 
@@ -249,16 +259,24 @@ def _case_name(outliers: Outliers) -> str:
 
 
 def _fault(table: StudyTable, config: SimulationConfig) -> StudyFault:
-    (shape,) = table.choices("shape", FaultShape)
-    has_offset = shape in (FaultShape.CONSTANT, FaultShape.DRIFT)
-    for key, is_asked in (("offset_m_per_s", has_offset), ("share", shape is FaultShape.COVERED)):
+    (shape,), (sensor,) = table.choices("shape", FaultShape), table.choices("sensor", Sensor)
+    of_dvl = sensor is Sensor.DVL
+    has_offset = of_dvl and shape in (FaultShape.CONSTANT, FaultShape.DRIFT)
+    has_share = shape in (FaultShape.COVERED, FaultShape.SPIKES)
+    is_whole = not of_dvl or shape in WHOLE_ARRAY
+    for key, is_asked, is_told in (
+        ("beams", of_dvl and not is_whole, of_dvl and not is_whole),
+        ("offset_m_per_s", has_offset, has_offset),
+        ("share", has_share, has_share),
+        ("size", False, not has_offset),
+    ):
         if is_asked and table[key] is None:
             raise table.settings.fault(key, f"the key is missing; expected {_FAULT[key].wanted}")
-        if not is_asked and table[key] is not None:
+        if not is_told and table[key] is not None:
             raise table.settings.fault(key, f"expected none with shape = {shape.name.lower()!r}")
     start_s, length_s = _window(table, config)
     fault = StudyFault(
-        beams=_beams(table, config),
+        beams=() if is_whole else _beams(table, config),
         start_s=start_s,
         length_s=length_s,
         offset_m_per_s=table["offset_m_per_s"] or (0.0,),
@@ -266,6 +284,9 @@ def _fault(table: StudyTable, config: SimulationConfig) -> StudyFault:
         shape=shape,
         share=table["share"] or 0.0,
         n_beams=config.dvl.mount.n_beams,
+        sensor=sensor,
+        size=table["size"] or (),
+        axes=table["axes"] or (),
     )
     table.checked(lambda: fault.of_trial(0))
     return fault
@@ -278,12 +299,15 @@ def _loss(table: StudyTable, config: SimulationConfig) -> Loss:
 
 
 def _window(table: StudyTable, config: SimulationConfig) -> tuple[float, float]:
+    """Return begin and length; one without a length goes on to the end."""
     start_s, length_s = table["start_s"], table["length_s"]
-    if not 0.0 <= start_s < start_s + length_s <= config.duration_s:
+    if length_s is None and 0.0 <= start_s < config.duration_s:
+        return start_s, math.inf
+    if length_s is None or not 0.0 <= start_s < start_s + length_s <= config.duration_s:
         raise table.fault(
             "start_s",
             f"a window within the {config.duration_s:g} s of the mission",
-            f"{start_s:g} to {start_s + length_s:g} s",
+            f"{start_s:g} to {start_s + (length_s or 0.0):g} s",
             "make duration_s longer, or begin earlier",
         )
     return start_s, length_s

@@ -44,15 +44,16 @@ class Trial:
 
     @cached_property
     def oracle_mission(self) -> Mission:
-        """The mission of a method that is told the bad beams: they are missing."""
+        """The mission of a method that is told the bad readings: they are missing."""
         if self.simulated is None:
             raise TypeError("nobody knows the bad beams of a recorded mission")
         return self.simulated.without_outliers()
 
     @cached_property
     def oracle_problem(self) -> Problem:
-        """The problem of a method that is told the bad beams."""
-        return with_dvl(self.problem, self.oracle_mission)
+        """The problem of a method that is told the bad readings."""
+        assert self.simulated is not None
+        return _problem_of(self.simulated, self.oracle_mission, self.problem)
 
     @cached_property
     def warm_start(self) -> FirstValues:
@@ -118,7 +119,8 @@ def _simulated_trial(cell: Cell, grade: Grade, seed: int, cache: MissionCache) -
         return simulated, build_problem(simulated.mission)
 
     water = (config.current, config.water_track, config.losses)
-    key = (cell.scenario, grade.name, cell.duration_s, seed, water)
+    more = (config.gnss, config.realistic)
+    key = (cell.scenario, grade.name, cell.duration_s, seed, water, more)
     clean, problem = cache.get(key, make, length_s=cell.duration_s)
     simulated = with_dvl_errors(
         clean,
@@ -127,7 +129,15 @@ def _simulated_trial(cell: Cell, grade: Grade, seed: int, cache: MissionCache) -
         losses=cell.losses,
         dropout_rate=cell.dropout_rate,
     )
-    return Trial(seed, simulated.mission, with_dvl(problem, simulated.mission), simulated)
+    problem = _problem_of(simulated, simulated.mission, problem)
+    return Trial(seed, simulated.mission, problem, simulated)
+
+
+def _problem_of(simulated: SimulatedMission, mission: Mission, clean: Problem) -> Problem:
+    """Return the problem of a mission; where no more than its beams are bad, by the clean one."""
+    if simulated.is_bad.keys() == {"dvl"}:
+        return with_dvl(clean, mission)
+    return build_problem(mission)
 
 
 def recorded_trial(recording: Recording, *, cache: MissionCache = CACHE) -> Trial:

@@ -37,6 +37,18 @@ def test_simulate_writes_what_was_asked_for(tmp_path: Path) -> None:
     assert (tmp_path / "m" / "imu.parquet").exists()
 
 
+def test_simulate_realistic_instruments(tmp_path: Path) -> None:
+    """The same run, read by other instruments."""
+    words = ["simulate", "survey", "--duration", "20", "--seed", "3", "--out"]
+    assert main([*words, str(tmp_path / "plain")]) == 0
+    assert main([*words, str(tmp_path / "real"), "--realistic"]) == 0
+    plain, real = (read_mission(tmp_path / name) for name in ("plain", "real"))
+    assert (plain.imu.gyro_b != real.imu.gyro_b).mean() > 0.9
+    assert plain.reference is not None
+    assert real.reference is not None
+    np.testing.assert_array_equal(plain.reference.lat, real.reference.lat)
+
+
 @pytest.mark.parametrize(("word", "n_beams"), [("3", 3), ("velocity", 3), ("1", 1), ("8", 8)])
 def test_simulate_any_number_of_beams(tmp_path: Path, word: str, n_beams: int) -> None:
     """The instrument that was asked for, as written and read again."""

@@ -19,12 +19,14 @@ from ssm_graph.simulation import (
     Loss,
     OutlierKind,
     Outliers,
+    Sensor,
     SimulatedMission,
     scenario_config,
     simulate,
     with_dvl_errors,
 )
 from ssm_graph.smoothers.batch import SsmSmoother
+from ssm_graph.study.cells import StudyFault
 from ssm_graph.study.jobs import Job, do_job
 from ssm_graph.study.methods import FAMILIES, Family
 from ssm_graph.study.processes import best_job, merged
@@ -95,6 +97,29 @@ def test_cached_trials_are_those_built_alone() -> None:
     assert trial.is_outlier is not None
     assert len(trial.oracle_problem.beams.speed) == len(expected.speed) - trial.is_outlier.sum()
     assert trial.duration_s == pytest.approx(DURATION_S)
+
+
+def test_trials_with_a_bad_sensor_have_problems_of_their_own() -> None:
+    """The fixes at fault are those of the problem; the oracle is told and does without them."""
+    fault = StudyFault((), 5.0, 4.0, sensor=Sensor.GNSS, size=(30.0, 0.0, 0.0))
+    windows = ((0.0, 1e4),)
+    cells = (
+        replace(SPARSE, gnss_windows_s=windows),
+        replace(SPARSE, gnss_windows_s=windows, faults=(fault,)),
+    )
+    cache = MissionCache()
+    clean, bad = (
+        simulated_trials(cell, Grade.NAVIGATION, [3], cache=cache)[0].problem for cell in cells
+    )
+    (trial,) = simulated_trials(cells[1], Grade.NAVIGATION, [3], cache=cache)
+    assert len(cache) == 1
+    told = trial.oracle_problem.fixes
+    assert clean.fixes is not None
+    assert bad.fixes is not None
+    assert told is not None
+    off = np.abs(bad.fixes.position_n - clean.fixes.position_n).max(axis=1)
+    assert (off > 29.0).sum() == 4
+    assert len(told.position_n) == len(clean.fixes.position_n) - 4
 
 
 def test_cache_is_bounded() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,16 @@ import pytest
 
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.mission.calibration import CURRENT
-from ssm_graph.simulation import CurrentSettings, FaultShape, Grade, Loss, OutlierKind, WaterTrack
+from ssm_graph.simulation import (
+    CurrentSettings,
+    Fault,
+    FaultShape,
+    Grade,
+    Loss,
+    OutlierKind,
+    Sensor,
+    WaterTrack,
+)
 from ssm_graph.study.cells import Cell
 from ssm_graph.study.runner import wanted_keys
 from ssm_graph.study.scenario import Study, read_study, study_from, study_of_folders
@@ -112,6 +122,37 @@ def test_slow_faults_have_a_shape() -> None:
         cells_of({"name": "f", "faults": [{**window, "shape": "covered"}]})
     with pytest.raises(ConfigError, match="shape: expected some of constant, drift"):
         cells_of({"name": "f", "faults": [{**window, "shape": "silt"}]})
+
+
+def test_any_sensor_may_be_at_fault() -> None:
+    """By its name, with the size that its shape has; without a length it goes on to the end."""
+    fixes = {"sensor": "gnss", "start_s": 5, "length_s": 4, "size": [3, 0, 0]}
+    stuck = {"sensor": "gyros", "shape": "stuck", "axes": [2], "start_s": 5}
+    bottom = {"shape": "moving_bottom", "start_s": 8, "size": [0.1, 0, 0]}
+    spikes = {"shape": "spikes", "beams": [1], "start_s": 8, "share": 0.3, "size": [2, 5]}
+    case = {"name": "f", "faults": [fixes, stuck, bottom, spikes], "gnss_windows_s": [[0, 20]]}
+    (cell,) = cells_of(case)
+    one, two, three, four = cell.faults_of(0)
+    assert one == Fault(start_s=5.0, end_s=9.0, sensor=Sensor.GNSS, size=(3.0, 0.0, 0.0))
+    assert (two.sensor, two.shape, two.axes) == (Sensor.GYROS, FaultShape.STUCK, (2,))
+    assert (three.beams, three.end_s, three.sizes.tolist()) == ((), math.inf, [0.1, 0.0, 0.0])
+    assert (four.beams, four.share, four.size) == ((1,), 0.3, (2.0, 5.0))
+    config = cell.clean_config(Grade.NAVIGATION, 0)
+    assert config.gnss is not None
+    assert (config.gnss.windows, config.realistic) == (((0.0, 20.0),), False)
+    (real,) = cells_of(case | {"realistic": True})
+    assert real.clean_config(Grade.NAVIGATION, 0).realistic
+    (further,) = cells_of(case | {"faults": [fixes | {"size": [4, 0, 0]}, stuck, bottom, spikes]})
+    assert len({cell.id, real.id, further.id}) == 3
+    for wrong, message in (
+        (fixes | {"size": [3]}, r"\[\[faults\]\] 1: Fault.size: expected 3 finite numbers"),
+        (fixes | {"beams": [1]}, "beams: expected none with shape = 'constant'"),
+        (fixes | {"sensor": "gps"}, "sensor: expected some of dvl, gnss, depth"),
+        (bottom | {"sensor": "depth"}, "Fault.sensor: expected with MOVING_BOTTOM one of DVL"),
+        (spikes | {"length_s": 15}, "expected a window within the 20 s of the mission"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            cells_of({"name": "f", "faults": [wrong]})
 
 
 def test_few_beams_are_lost_for_minutes() -> None:
