@@ -25,7 +25,7 @@ from ssm_graph.smoothers.faults.columns import (
     Channels,
 )
 
-TAIL = 1e-6
+TAIL = 2e-7
 """Probability of one stretch's chi-square where nothing is off."""
 PER_NUMBER = 6.0
 """Chi-square that each further number of a hypothesis has to earn besides, against others."""

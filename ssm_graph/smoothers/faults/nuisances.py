@@ -22,9 +22,13 @@ from ssm_graph.smoothers.faults.columns import BEAM, IMU, Channels, Linear
 SLOW_BEAM = (0.7, 20.0)
 """Sigmas of a beam, and s, of the part of its noise that is correlated."""
 SLOW_AIDS = {"depth": (0.5, 20.0)}
-"""The same of aids, by name."""
+SLOW_AID = (0.5, 100.0)
+"""The same of aids, by name, and of all others: swell at a pressure port, multipath of fixes."""
 SLOW_BIAS = (0.3, 300.0)
 """Turn-on sigmas of the biases, and s."""
+
+CLEARLY = 3.0
+"""Logarithm of the likelihood by which narrower ones have to be better: a ratio of 20."""
 
 
 BEAMS_GROUP, AIDS_GROUP, IMU_GROUP = range(3)
@@ -71,12 +75,15 @@ class Nuisances:
             sigma = share * float(np.median(beams.sigma[beams.beam == beam]))
             found.append((channels.of(BEAM).columns.start + beam, sigma, correlation_s, BEAMS_GROUP))
         for aid in self._linear.aids:
-            if aid.name not in SLOW_AIDS or len(aid) == 0:
+            if len(aid) == 0:
                 continue
-            share, correlation_s = SLOW_AIDS[aid.name]
-            sigma = share * problem.depths.sigma
+            share, correlation_s = SLOW_AIDS.get(aid.name, SLOW_AID)
+            roots = np.diagonal(aid.root_information, axis1=1, axis2=2)
             first = channels.of(aid.name).columns.start
-            found.extend((first + i, sigma, correlation_s, AIDS_GROUP) for i in range(aid.dim))
+            for i, root in enumerate(np.median(roots, axis=0).tolist()):
+                # A depth is the mean of some readings, whose slow part it has in full.
+                sigma = problem.depths.sigma if aid.name == "depth" else 1.0 / root
+                found.append((first + i, share * sigma, correlation_s, AIDS_GROUP))
         share, correlation_s = SLOW_BIAS
         first = channels.of(IMU).columns.start
         for i, sigma in enumerate(problem.imu_noise_bias_sigma.tolist()):
@@ -127,7 +134,10 @@ class Priors:
         return float(-2.0 * np.sum(counts * np.log(widths)))
 
     def fitted(self, evidence: Evidence, *, choices: tuple[float, ...]) -> tuple[float, ...]:
-        """Return the widths that make the data likeliest, one group after the other."""
+        """Return the widths that make the data likeliest, one group after the other.
+
+        Of several that are as likely the widest are taken.
+        """
         score = evidence.score[self.columns]
         among = evidence.information[np.ix_(self.columns, self.columns)]
         known: dict[tuple[float, ...], float] = {}
@@ -143,7 +153,8 @@ class Priors:
         widths = (1.0, 1.0, 1.0)
         for group in (IMU_GROUP, BEAMS_GROUP, AIDS_GROUP):
             tried = [(*widths[:group], one, *widths[group + 1 :]) for one in choices]
-            widths = max(tried, key=likelihood)
+            likeliest = max(likelihood(one) for one in tried)
+            widths = max(one for one in tried if likelihood(one) > likeliest - CLEARLY)
         return widths
 
 

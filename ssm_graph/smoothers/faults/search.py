@@ -41,14 +41,11 @@ class FaultSearch:
 
     block_s: float = 10.0
     """Stretches are looked for in blocks of this."""
-    significance: float = 4.9
-    """Sigmas by which one number must differ from zero: 1e-6; more numbers have to be as unlikely,
-    and each further one has to earn its keep besides."""
     margin: float = 12.0
     """A rival whose chi-square is less by no more than this explains the data as well."""
 
     def __post_init__(self) -> None:
-        for name in ("block_s", "significance", "margin"):
+        for name in ("block_s", "margin"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0.0):
                 raise ConfigError(f"{name}: expected a number above zero, got {value}")
