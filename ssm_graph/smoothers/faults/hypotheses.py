@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from enum import Enum
+from functools import cache
 
 import numpy as np
 from scipy.stats import chi2
@@ -25,8 +26,6 @@ from ssm_graph.smoothers.faults.columns import (
     Channels,
 )
 
-TAIL = 2e-7
-"""Probability of one stretch's chi-square where nothing is off."""
 PER_NUMBER = 6.0
 """Chi-square that each further number of a hypothesis has to earn besides, against others."""
 LEAST_PER_NUMBER = 2.0
@@ -57,6 +56,8 @@ class Hypothesis:
     course: Course = Course.CONSTANT
     handicap: float = 0.0
     """Chi-square by which it has to be better than others."""
+    tail: float = 2e-7
+    """Probability of one stretch's chi-square where nothing is off"""
 
     @property
     def n_numbers(self) -> int:
@@ -69,17 +70,24 @@ class Hypothesis:
 
     def least(self, n_numbers: int) -> float:
         """Return the chi-square from which on so many numbers are no chance."""
-        beyond_chance = float(chi2.isf(TAIL, n_numbers)) + LEAST_PER_NUMBER * (n_numbers - 1)
+        beyond_chance = chi_sq_at(self.tail, n_numbers) + LEAST_PER_NUMBER * (n_numbers - 1)
         return beyond_chance + self.handicap
 
 
-def hypotheses_of(channels: Channels) -> tuple[Hypothesis, ...]:
-    """Return all hypotheses of a mission."""
+@cache
+def chi_sq_at(tail: float, n_numbers: int) -> float:
+    """Return what a chi-square of so many numbers exceeds with this probability."""
+    return float(chi2.isf(tail, n_numbers))
+
+
+def hypotheses_of(channels: Channels, *, significance: float) -> tuple[Hypothesis, ...]:
+    """Return all hypotheses of a mission; ``significance`` in sigmas of one number."""
+    tail = float(chi2.sf(significance**2, 1))
     found = [*_of_beams(channels), *_of_the_array(channels), *_of_inertial()]
     for channel in channels.all:
         if channel.name not in (BEAM, BOTTOM, SCALE, MOUNTING, IMU):
             found.extend(_of_aid(channel.name, channel.columns.stop - channel.columns.start))
-    return tuple(found)
+    return tuple(replace(one, tail=tail) for one in found)
 
 
 def _of_beams(channels: Channels) -> Iterator[Hypothesis]:

@@ -41,11 +41,14 @@ class FaultSearch:
 
     block_s: float = 10.0
     """Stretches are looked for in blocks of this."""
+    significance: float = 5.2
+    """Sigmas by which one number must differ from zero, 2e-7; more numbers have to be as unlikely,
+    and each further one has to earn its keep besides."""
     margin: float = 12.0
     """A rival whose chi-square is less by no more than this explains the data as well."""
 
     def __post_init__(self) -> None:
-        for name in ("block_s", "margin"):
+        for name in ("block_s", "significance", "margin"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0.0):
                 raise ConfigError(f"{name}: expected a number above zero, got {value}")
@@ -58,7 +61,7 @@ class Look:
         self._judge, self._settings = judge, settings
         self._keyframe_s = judge.linear.problem.keyframe_s
         self._work = 0.2 * len(self._keyframe_s)
-        self.hypotheses = hypotheses_of(channels)
+        self.hypotheses = hypotheses_of(channels, significance=settings.significance)
 
     def find_steps(self, known: Sequence[Fault]) -> Steps[list[Fault]]:
         """Return what is off; where faults known before begin and end, new ones may as well."""
