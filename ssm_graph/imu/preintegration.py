@@ -17,7 +17,7 @@ from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps, finished
 from ssm_graph.imu.increments import MergedSamples, merge_samples_steps
-from ssm_graph.sensors.imu import ImuLog, ImuNoise
+from ssm_graph.sensors.imu import FrozenAxis, ImuLog, ImuNoise, frozen_axes
 
 AT_ONCE = 16
 """So many intervals are read from GTSAM at a time: some 1.6 ms."""
@@ -126,7 +126,7 @@ def preintegrate_steps(
 ) -> Steps[InertialChain]:
     """Make :func:`preintegrate` in steps."""
     gaps = imu_gaps(imu)
-    unseen = tuple(_unseen(imu, keyframe_s, gaps))
+    unseen = tuple(_unseen(imu, keyframe_s, gaps, frozen_axes(imu)))
     yield 3e-4 * len(imu.time_s)
     samples = yield from merge_samples_steps(bridged(imu, gaps), keyframe_s, rate_hz=rate_hz)
     bias = np.zeros(6) if bias is None else bias
@@ -233,15 +233,27 @@ def imu_gaps(imu: ImuLog) -> tuple[Array, Array]:
     return edges[:-1][is_gap], edges[1:][is_gap]
 
 
-def _unseen(imu: ImuLog, keyframe_s: Array, gaps: tuple[Array, Array]) -> list[Unseen]:
-    """Return what is not seen of each interval between keyframes: its longest stretch of a gap."""
+def _unseen(
+    imu: ImuLog, keyframe_s: Array, gaps: tuple[Array, Array], frozen: Sequence[FrozenAxis]
+) -> list[Unseen]:
+    """Return what is not seen of each interval between keyframes.
+
+    That is its longest stretch of a gap, or of gyros or accelerometers that repeat themselves.
+    """
+    stretches = [(*gap, *_liveliness(imu, *gap)) for gap in zip(*gaps, strict=True)]
+    for is_gyro, _, begin, end in frozen:
+        # What an axis does meanwhile, a turn perhaps, need not resemble what it did before.
+        stretches.append((begin, end, *((GAP_GYRO_RATE, 0.0) if is_gyro else (0.0, GAP_ACCEL))))
     unseen = [Unseen()] * (len(keyframe_s) - 1)
-    for begin, end in zip(*gaps, strict=True):
-        rate, force = _liveliness(imu, begin, end)
+    for begin, end, rate, force in stretches:
         overlap = np.minimum(end, keyframe_s[1:]) - np.maximum(begin, keyframe_s[:-1])
         for k in np.flatnonzero(overlap > 0.0).tolist():
-            if overlap[k] > unseen[k].gap_s:
-                unseen[k] = Unseen(float(overlap[k]), rate, force)
+            before = unseen[k]
+            unseen[k] = Unseen(
+                max(float(overlap[k]), before.gap_s),
+                max(rate, before.rate) if before.gap_s else rate,
+                max(force, before.force) if before.gap_s else force,
+            )
     return unseen
 
 

@@ -30,12 +30,13 @@ from ssm_graph.mission.calibration import (
     extras_of,
     needs_motion,
 )
+from ssm_graph.mission.fault import DetectedFault, Treatment
 from ssm_graph.mission.mission import InitialState, Mission
 from ssm_graph.mission.timeline import Timeline, build_timeline
 from ssm_graph.mission.usable import require_usable
 from ssm_graph.sensors.dvl import DvlMount
 from ssm_graph.sensors.dvl_readings import stuck_beams
-from ssm_graph.sensors.imu import ImuLog
+from ssm_graph.sensors.imu import ImuLog, frozen_axes
 
 NO_EXTRAS = Extras()
 A = TypeVar("A", bound=Aid)
@@ -125,6 +126,8 @@ class Problem(ReadOnlyArrays):
     aids: tuple[Aid, ...] = ()
     """What the smoothers are aided by besides; another estimator says that it is not."""
     notes: tuple[str, ...] = ()
+    faults: tuple[DetectedFault, ...] = ()
+    """What is plain from the readings alone"""
 
     def aid(self, kind: type[A]) -> A | None:
         """Return the aid of a kind, None if there is none."""
@@ -183,6 +186,7 @@ def build_problem_steps(
         extras=extras,
         aids=tuple(aid for aid in aids if aid is not None),
         notes=(*timeline.notes, *_gap_note(mission.imu), *stuck_note, *current_note(mission)),
+        faults=frozen_faults(mission.imu),
     )
 
 
@@ -251,6 +255,24 @@ def _without_stuck_beams(mission: Mission) -> tuple[Mission, tuple[str, ...]]:
     )
     speed = np.where(is_stuck, np.nan, dvl.speed)
     return replace(mission, dvl=replace(dvl, speed=speed)), (note,)
+
+
+def frozen_faults(imu: ImuLog) -> tuple[DetectedFault, ...]:
+    """Return the axes of gyros and accelerometers that repeat one reading."""
+    return tuple(
+        DetectedFault(
+            sensor="gyros" if frozen.is_gyro else "accelerometers",
+            what=f"one reading again and again about {'xyz'[frozen.axis]}"
+            if frozen.is_gyro
+            else f"one reading again and again along {'xyz'[frozen.axis]}",
+            begin_s=frozen.begin_s,
+            end_s=frozen.end_s,
+            chi_sq=np.inf,
+            dof=1,
+            treatment=Treatment.COVERED,
+        )
+        for frozen in frozen_axes(imu)
+    )
 
 
 def _gap_note(imu: ImuLog) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -67,6 +67,45 @@ class ImuSample(Message):
     """Body rate relative to inertial space, rad/s."""
     accel_b: Vector
     """Specific force, m/s^2; at rest (0, 0, -9.8)."""
+
+
+class FrozenAxis(NamedTuple):
+    """One axis of gyros or accelerometers that gives the same reading for long."""
+
+    is_gyro: bool
+    axis: int
+    """From 0, of the body"""
+    begin_s: float
+    end_s: float
+
+
+FROZEN_S: Final = 1.0
+FROZEN_SAMPLES: Final = 20
+"""So many equal readings in a row, for so long, are none: noise alone changes them."""
+USUALLY_EQUAL: Final = 0.2
+"""Where more of the other successive readings are equal, resolution makes them so, or rest."""
+
+
+def frozen_axes(log: ImuLog) -> list[FrozenAxis]:
+    """Return where an axis repeats one reading, in the order of axes, gyros first."""
+    found = []
+    for axis, values in enumerate(np.hstack([log.gyro_b, log.accel_b]).T):
+        equal = values[1:] == values[:-1]
+        edges = np.flatnonzero(np.diff(equal.astype(np.int8), prepend=0, append=0))
+        runs = [
+            (begin, end)
+            for begin, end in edges.reshape(-1, 2).tolist()
+            if end - begin >= FROZEN_SAMPLES and log.time_s[end] - log.time_s[begin] >= FROZEN_S
+        ]
+        inside = sum(end - begin for begin, end in runs)
+        others = len(equal) - inside
+        if inside > others or np.sum(equal) - inside > USUALLY_EQUAL * others:
+            continue
+        found.extend(
+            FrozenAxis(axis < 3, axis % 3, float(log.time_s[begin]), float(log.time_s[end]))
+            for begin, end in runs
+        )
+    return found
 
 
 class Stamp(Enum):

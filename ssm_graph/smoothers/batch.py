@@ -288,7 +288,7 @@ class SsmSmoother:
                 break
             yield 0.007 * problem.n_keyframes
             weights = weights.after(this, faults)
-        found = faults.faults(this.states)
+        found = problem.faults + faults.faults(this.states)
         said = tuple(fault.sentence for fault in found)
         notes = problem.notes + said + _notes_of(first)
         return Solved(linearizer, this, tuple(iterations), status, notes, first, found)

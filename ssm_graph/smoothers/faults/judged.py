@@ -19,8 +19,8 @@ from ssm_graph.smoothers.faults.nuisances import WIDER, WIDTHS, Nuisances
 
 TREND_S = 100.0
 """s, in which the rate of a trend is counted here."""
-LEAST = 1e-9
-"""Information that an error of any size has at least: it keeps what nothing tells apart regular."""
+WORTH = 15.0
+"""Chi-square of a constant from which on a sensor may be off by anything."""
 
 
 class Grid(NamedTuple):
@@ -208,8 +208,14 @@ class Judged:
             is_apart = (edges[:, None] >= near.end) | (edges[None, :] <= near.begin)
         elif apart_from is not None:
             is_apart = (edges[:, None] < apart_from.end) & (edges[None, :] > apart_from.begin)
+        best_so_far: dict[str, float] = {}
         for hypothesis in hypotheses:
+            # Where no constant is worth a look in any stretch, there is nothing of another course.
+            if hypothesis.course is Course.ANYTHING and best_so_far[hypothesis.sensor] < WORTH:
+                continue
             chi_sq, charge = self.table(hypothesis)
+            largest = float(np.max(chi_sq))
+            best_so_far[hypothesis.sensor] = max(best_so_far.get(hypothesis.sensor, 0.0), largest)
             merit = np.where(is_apart, -np.inf, chi_sq - charge)
             begin, end = np.unravel_index(int(np.argmax(merit)), merit.shape)
             best = Candidate(
@@ -227,7 +233,9 @@ class Judged:
         moments = moments_of(hypothesis, self.grid)
         d = score.shape[1] * moments.shape[1]
         score = (moments[:, :, None] * score[:, None, :]).reshape(n, d)
-        information = np.einsum("im,ipjq,jn->impjnq", moments, information, moments, optimize=True)
+        if moments.shape[1] > 1:
+            by_begin = moments[:, :, None, None, None, None] * information[:, None, :, :, None, :]
+            information = by_begin * moments[:, :, None]
         summed = np.zeros((n + 1, d, n + 1, d))
         summed[1:, :, 1:] = information.reshape(n, d, n, d).cumsum(axis=0).cumsum(axis=2)
         begin, end = np.triu_indices(n + 1, 1)
