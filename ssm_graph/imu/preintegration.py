@@ -14,7 +14,7 @@ import numpy as np
 from factors import so3
 from factors.inertial import Intervals
 from ssm_graph.base.earth import LocalFrame
-from ssm_graph.base.frozen import Array
+from ssm_graph.base.frozen import Array, Vector
 from ssm_graph.base.stepwise import Steps, finished
 from ssm_graph.imu.increments import MergedSamples, merge_samples_steps
 from ssm_graph.sensors.imu import FrozenAxis, ImuLog, ImuNoise, frozen_axes
@@ -52,10 +52,10 @@ class Unseen(NamedTuple):
     """Motion inside a gap of the inertial data, 1 sigma off what bridges it."""
 
     gap_s: float = 0.0
-    rate: float = GAP_GYRO_RATE
-    """rad/s"""
-    force: float = GAP_ACCEL
-    """m/s^2"""
+    rate: Vector = (GAP_GYRO_RATE,) * 3
+    """rad/s, about each axis"""
+    force: Vector = (GAP_ACCEL,) * 3
+    """m/s^2, along each axis"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -203,15 +203,15 @@ def imu_params(
     gap_s, rate, force = unseen or Unseen()
     # GTSAM takes continuous-time densities squared and divides by dt itself: do not pre-scale.
     # Every covariance defaults to identity, so each one is set.
-    gyro_sq = noise.gyro_density**2 + (rate * gap_s) ** 2 / span_s
-    # What the attitude is off, gravity pulls into the force.
-    force = math.hypot(force, 0.5 * GRAVITY * rate * gap_s)
-    accel_sq = noise.accel_density**2 + (force * gap_s) ** 2 / span_s
+    gyro_sq = noise.gyro_density**2 + (np.array(rate) * gap_s) ** 2 / span_s
+    # What roll and pitch are off, gravity pulls into the force.
+    pulled = np.hypot(force, 0.5 * GRAVITY * max(rate[:2]) * gap_s)
+    accel_sq = noise.accel_density**2 + (pulled * gap_s) ** 2 / span_s
     eye = np.eye(3)
     params = gtsam.PreintegrationCombinedParams(g_n)
     params.setOmegaCoriolis(frame.omega_ie_n)
-    params.setGyroscopeCovariance(gyro_sq * eye)
-    params.setAccelerometerCovariance(accel_sq * eye)
+    params.setGyroscopeCovariance(np.diag(gyro_sq))
+    params.setAccelerometerCovariance(np.diag(accel_sq))
     params.setIntegrationCovariance(INTEGRATION_DENSITY**2 * eye)
     # A bias that does not walk still needs a regular covariance: a thousandth of its turn-on
     # sigma in an hour is none.
@@ -240,19 +240,24 @@ def _unseen(
 
     That is its longest stretch of a gap, or of gyros or accelerometers that repeat themselves.
     """
-    stretches = [(*gap, *_liveliness(imu, *gap)) for gap in zip(*gaps, strict=True)]
-    for is_gyro, _, begin, end in frozen:
+    stretches = []
+    for gap in zip(*gaps, strict=True):
+        rate, force = _liveliness(imu, *gap)
+        stretches.append((*gap, np.full(3, rate), np.full(3, force)))
+    for is_gyro, axis, begin, end in frozen:
         # What an axis does meanwhile, a turn perhaps, need not resemble what it did before.
-        stretches.append((begin, end, *((GAP_GYRO_RATE, 0.0) if is_gyro else (0.0, GAP_ACCEL))))
+        own = np.eye(3)[axis]
+        rate_and_force = (GAP_GYRO_RATE * own, 0.0 * own) if is_gyro else (0.0 * own, GAP_ACCEL * own)
+        stretches.append((begin, end, *rate_and_force))
     unseen = [Unseen()] * (len(keyframe_s) - 1)
     for begin, end, rate, force in stretches:
         overlap = np.minimum(end, keyframe_s[1:]) - np.maximum(begin, keyframe_s[:-1])
         for k in np.flatnonzero(overlap > 0.0).tolist():
-            before = unseen[k]
+            before = unseen[k] if unseen[k].gap_s else Unseen(0.0, (0.0,) * 3, (0.0,) * 3)
             unseen[k] = Unseen(
                 max(float(overlap[k]), before.gap_s),
-                max(rate, before.rate) if before.gap_s else rate,
-                max(force, before.force) if before.gap_s else force,
+                tuple(np.maximum(rate, before.rate).tolist()),
+                tuple(np.maximum(force, before.force).tolist()),
             )
     return unseen
 
