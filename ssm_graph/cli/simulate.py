@@ -66,6 +66,12 @@ def add_parser(commands: Any, *, epilog: str) -> None:
         help="instruments err as real ones of the grade: scale factors, misalignments, vibration, "
         "noise with tails that changes slowly (default: bias, walk and white noise as stated)",
     )
+    parser.add_argument(
+        "--calibrate-imu",
+        action="store_true",
+        help="with --realistic, the mission asks for scale, misalignment and g-sensitivity of its "
+        "IMU, in the sizes of the grade",
+    )
     parser.add_argument("--seed", type=int, default=0, help="same seed, same mission (default: 0)")
     add_mission_output(parser)
     parser.set_defaults(run=run)
@@ -76,6 +82,8 @@ def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
     changes: dict[str, Any] = {"seed": arguments.seed}
     if arguments.realistic:
         changes["realistic"] = True
+    if arguments.calibrate_imu:
+        changes["calibrates_imu"] = True
     if arguments.grade is not None:
         changes["grade"] = Grade[arguments.grade.upper()]
     if arguments.duration is not None:

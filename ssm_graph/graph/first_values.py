@@ -20,6 +20,7 @@ from ssm_graph.base.errors import SolverError
 from ssm_graph.base.frozen import Array, ShortRepr
 from ssm_graph.base.stepwise import Steps, finished
 from ssm_graph.engine.error_state import POSITION, ROTATION, STATE_DIM, VELOCITY
+from ssm_graph.engine.extras import Extras
 from ssm_graph.engine.states import NavigationStates, States
 from ssm_graph.graph.aids.aid import RowStates
 from ssm_graph.graph.beacon_start import find_beacons
@@ -29,12 +30,17 @@ from ssm_graph.graph.forward_pass import ForwardAids, ForwardExtras
 from ssm_graph.graph.inertial_rows import InertialRows
 from ssm_graph.graph.measurements import Measurements
 from ssm_graph.imu.preintegration import gravity_gradient, gtsam_gravity
-from ssm_graph.mission.problem import NO_EXTRAS, Problem, start_of
+from ssm_graph.mission.imu_variables import GYRO_SCALE
+from ssm_graph.mission.problem import Problem, start_of
 
 LOCKED_OUT_PINGS = 3
 """After so many pings in a row without one good beam the prediction is doubted instead."""
 ANCHOR_SIGMA = 1.0
 """m/s; after a silence that leaves the beams this uncertain they set the velocity anew."""
+UNSURE_SCALE = 0.1
+"""Prior sigma of the gyros' scale from which on a turn may go anywhere."""
+BEGINS = (0.0, -0.5, 0.5, -1.0, 1.0)
+"""Prior sigmas of it that passes begin at then."""
 AID_ROUNDS = 5
 """How often the aids of a keyframe are linearised anew."""
 AID_REACH = 0.1
@@ -65,14 +71,33 @@ def first_values(problem: Problem, *, kernel: Kernel) -> FirstValues:
 
 
 def first_values_steps(problem: Problem, *, kernel: Kernel) -> Steps[FirstValues]:
-    """Make :func:`first_values` in steps."""
-    try:
-        first = yield from _ForwardPass(problem, kernel).run_steps()
-    except np.linalg.LinAlgError as error:
-        raise SolverError(f"the first pass ran away ({error}): {_HINT}") from error
+    """Make :func:`first_values` in steps.
+
+    Where the scale of the gyros is hardly known, the first turn bends everything. So passes are
+    made from scales half a prior sigma apart, each with half of it, and the one that leaves the
+    beams the most weight is taken.
+    """
+    passes, ran_away = [], None
+    for begin in _begins(problem.extras):
+        try:
+            passes.append((yield from _ForwardPass(problem, kernel, begin).run_steps()))
+        except np.linalg.LinAlgError as error:
+            ran_away = error
+    if not passes:
+        raise SolverError(f"the first pass ran away ({ran_away}): {_HINT}") from ran_away
+    first = max(passes, key=lambda own: float(own.weights.sum()))
     if not (np.all(np.isfinite(first.states.p_n)) and np.all(np.isfinite(first.states.v_n))):
         raise SolverError(f"the first pass became non-finite: {_HINT}")
     return first
+
+
+def _begins(extras: Extras) -> tuple[float | None, ...]:
+    """Return the prior sigmas of the gyros' scale that passes begin at; None for one as it is."""
+    if GYRO_SCALE in extras:
+        own = extras.columns(GYRO_SCALE).start - STATE_DIM
+        if extras.sigma[own] > UNSURE_SCALE:
+            return BEGINS
+    return (None,)
 
 
 _HINT = "check units, axes and noise of [imu], and the initial state with its sigmas"
@@ -92,15 +117,18 @@ class _Rows(NamedTuple):
 class _ForwardPass:
     """A filter on the same inertial factors as the graph, in covariance form."""
 
-    def __init__(self, problem: Problem, kernel: Kernel) -> None:
+    def __init__(self, problem: Problem, kernel: Kernel, scale: float | None) -> None:
+        """Begin at so many prior sigmas of the gyros' scale, known to half of one; None for 0."""
         self.problem = problem
         self.kernel = kernel
         start = start_of(problem)
         self.R_nb, self.p_n, self.v_n, self.bias = start[:4]
         self.extras = ForwardExtras(problem) if problem.extras else None
         self.P = self.extras.begin(start.covariance) if self.extras else start.covariance
+        if self.extras and scale is not None:
+            self.P = self.extras.begin_scale(self.P, scale)
         self.no_rows = _Rows(np.zeros((0, len(self.P))), np.zeros(0), np.zeros(0))
-        self.inertial = InertialRows(problem.frame, NO_EXTRAS)
+        self.inertial = InertialRows(problem.frame, problem.extras)
         self.aids = Measurements.weighted(problem)
         self.met = ForwardAids(self.aids)
         self.weights = np.ones(len(problem.beams.speed))
@@ -136,10 +164,12 @@ class _ForwardPass:
         interval = self.problem.chain.intervals.take(np.s_[k : k + 1])
         self._g_n = self._gravity(self.p_n + 0.5 * interval.span_s * self.v_n)
         here = States.of(*(column[None] for column in self._state))
+        if self.extras:
+            here = here._replace(walks=self.extras.walks[None], constants=self.extras.constants)
         ahead = self.inertial.predict(interval, here, g_n=self._g_n)
         self.P = ahead.covariance(self.P)
         if self.extras:
-            self.extras.predict(k, self.P)
+            self.extras.keep(ahead.states.walks[0], self.extras.constants)
         self.R_nb, self.p_n, self.v_n = (column[0] for column in ahead.states[:3])
 
     def _gravity(self, p_n: Array) -> Array:

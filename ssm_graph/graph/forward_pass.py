@@ -24,6 +24,7 @@ from ssm_graph.graph.beam_rows import BeamRows, CalibratedBeams, PreparedBeams
 from ssm_graph.graph.first_weights import settled_weights
 from ssm_graph.graph.measurements import Measurements
 from ssm_graph.mission.calibration import CURRENTS
+from ssm_graph.mission.imu_variables import GYRO_SCALE
 from ssm_graph.mission.problem import Problem
 
 
@@ -97,23 +98,24 @@ class ForwardExtras:
         extras = problem.extras
         self.walks, self.constants = np.zeros(extras.n_walks), np.zeros(extras.n_constants)
         self._beams = CalibratedBeams(problem.beams, extras, problem.frame)
-        self._walk_factor, self._walk_sigma = extras.transitions(np.diff(problem.keyframe_s))
         self._last: PreparedBeams | None = None
 
     def begin(self, covariance: Array) -> Array:
         """Return the covariance (E, E) at the start from that of the error state."""
         return self._problem.extras.behind(covariance)
 
-    def predict(self, k: int, covariance: Array) -> None:
-        """Let the walks go on from keyframe ``k``, in place."""
-        if len(self.walks) == 0:
-            return
-        factor, end = self._walk_factor[k], STATE_DIM + len(self.walks)
-        self.walks = factor * self.walks
-        covariance[STATE_DIM:end] *= factor[:, None]
-        covariance[:, STATE_DIM:end] *= factor
-        own = np.arange(STATE_DIM, end)
-        covariance[own, own] += self._walk_sigma[k] ** 2
+    def begin_scale(self, covariance: Array, sigmas: float) -> Array:
+        """Take the gyros' scale to be so many prior sigmas off, and return what is known then.
+
+        ``covariance`` (E, E) is that at the start; of the scale half a sigma is left.
+        """
+        extras = self._problem.extras
+        own = extras.columns(GYRO_SCALE)
+        at = slice(own.start - extras.state_dim, own.stop - extras.state_dim)
+        self.constants[at] = sigmas * np.sqrt(np.diagonal(covariance)[own])
+        halved = covariance.copy()
+        halved[own, own] *= 0.25
+        return halved
 
     def keep(self, walks: Array, constants: Array) -> None:
         """Take the values (s,) and (C,) that a correction led to."""

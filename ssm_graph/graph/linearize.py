@@ -25,10 +25,15 @@ from ssm_graph.graph.freed import FAULTS, Freed
 from ssm_graph.graph.inertial_rows import InertialRows
 from ssm_graph.graph.measurements import Measurements, states_at
 from ssm_graph.mission.calibration import needs_motion
+from ssm_graph.mission.imu_variables import imu_errors
 from ssm_graph.mission.problem import Problem, start_of
 
 JUDGED_PASSES = 2
 """The first pass is at the states of the forward pass, the second at smoothed ones."""
+ERRORS_REACH = 1e-2
+"""How far errors of the inertial sensors, shares of what is read, may move before the increments
+are made anew; the rest counts to first order along each, which loses half the square of the turn
+that it makes of one interval."""
 
 
 class Misfit(NamedTuple):
@@ -46,6 +51,9 @@ class GraphLinearizer:
     def __init__(self, problem: Problem, freed: Freed | None = None) -> None:
         """Take a problem, and what sensors are off by: with the last of its constants for it."""
         self.problem, self._freed = problem, freed
+        self.intervals = problem.chain.intervals
+        """Of the inertial data, about errors of the sensors near the states"""
+        self._chain = problem.chain
         self._inertial = InertialRows(problem.frame, problem.extras)
         self.prior = prior_at_start(with_extras(start_of(problem), problem.extras.walks))
         self.aids = Measurements.in_full(problem, freed)
@@ -66,6 +74,16 @@ class GraphLinearizer:
         self._n_judged += 1
         self._beams.judge(self._at_beams(states), states.bias)
         return True
+
+    def integrate_steps(self, states: States) -> Steps[None]:
+        """Preintegrate anew where errors of the inertial sensors have moved too far."""
+        source = self._chain.source
+        if source is None:
+            return
+        errors, _ = imu_errors(self.problem.extras, states.walks[0], states.constants)
+        if np.abs(errors - source.errors).max() > ERRORS_REACH:
+            self._chain = yield from self._chain.about_steps(errors)
+            self.intervals = self._chain.intervals
 
     def beam_rows(self, states: States) -> BeamRows:
         """Linearise all beams at ``states``."""
@@ -115,7 +133,7 @@ class GraphLinearizer:
 
     def inertial_rows(self, states: States) -> Array:
         """Return the rows of inertial data and walks, see :class:`InertialRows`."""
-        rows = self._inertial.rows(self.problem.chain.intervals, states)
+        rows = self._inertial.rows(self.intervals, states)
         if self._freed is not None:
             own, extras = self._freed.between, self.problem.extras
             columns = extras.columns(FAULTS)
@@ -125,7 +143,7 @@ class GraphLinearizer:
 
     def inertial_errors(self, states: States) -> Array:
         """Return the whitened errors (K - 1, n) of inertial data, then of the walks."""
-        errors = self._inertial.errors(self.problem.chain.intervals, states)
+        errors = self._inertial.errors(self.intervals, states)
         if self._freed is not None:
             errors[:, :STATE_DIM] += self._freed.between @ self._off_by(states)
         return errors

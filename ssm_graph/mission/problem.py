@@ -8,6 +8,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.imu_errors import NONE
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frames import R_lb_from_roll_pitch_heading, phi_D_roll_pitch_heading
@@ -158,6 +159,7 @@ def build_problem_steps(
         left out.
     """
     require_usable(mission)
+    mission = replace(mission, imu=mission.imu.calibrated)
     mission, stuck_note = _without_stuck_beams(mission)
     config = config or ProblemConfig()
     start = start or mission.initial
@@ -167,11 +169,15 @@ def build_problem_steps(
             "let align(mission) find the start"
         )
     timeline = build_timeline(mission, start_s=start.time_s, interval_s=config.keyframe_interval_s)
+    extras = extras_of(mission)
     chain = yield from preintegrate_steps(
-        mission.imu, timeline.keyframe_s, frame=mission.frame, rate_hz=config.merge_rate_hz
+        mission.imu,
+        timeline.keyframe_s,
+        frame=mission.frame,
+        rate_hz=config.merge_rate_hz,
+        errors=NONE if mission.imu.calibration.is_asked else None,
     )
     noise, depth = mission.imu.noise, mission.depth
-    extras = extras_of(mission)
     keyframes = Keyframes(mission.frame, mission.imu, timeline.keyframe_s, begin_s)
     aids = (kind.of(mission.aids, keyframes) for kind in AIDS)
     return Problem(
@@ -203,6 +209,7 @@ def with_dvl(problem: Problem, mission: Mission) -> Problem:
 
     The inertial chain, most of the work, is kept; so the pings have to be at keyframes.
     """
+    mission = replace(mission, imu=mission.imu.calibrated)
     mission, _ = _without_stuck_beams(mission)
     keyframe_s, ping_s = problem.keyframe_s, mission.dvl.valid_s
     is_used = np.isfinite(mission.dvl.speed).any(axis=1)

@@ -19,6 +19,7 @@ from ssm_graph.base.frozen import Array, FrozenArrays, Vector, shaped
 from ssm_graph.base.settings import FILE_KEY, Key, Settings, optional_key, sigma_key
 from ssm_graph.base.tables import Table
 from ssm_graph.base.units import DEG_PER_H, DEGREE, MICRO_G, PER_SQRT_H
+from ssm_graph.sensors.imu_calibration import CALIBRATED, ImuCalibration, calibration_keys
 from ssm_graph.sensors.instrument import XYZ, Column, Instrument, Lists
 from ssm_graph.sensors.messages import Message
 
@@ -57,6 +58,19 @@ class ImuLog(FrozenArrays):
     """(N, 3) body rate relative to inertial space, rad/s."""
     accel_b: Array = shaped("N", 3)
     """(N, 3) specific force, m/s^2; at rest (0, 0, -9.8)."""
+    calibration: ImuCalibration = ImuCalibration()
+
+    @property
+    def calibrated(self) -> ImuLog:
+        """The log with what is known of scale, misalignment and g-sensitivity taken off.
+
+        The sigmas of what is left are kept, the values are none: once more changes nothing.
+        """
+        known = self.calibration
+        if not known.is_stated:
+            return self
+        gyro_b, accel_b = known.taken_off(self.gyro_b, self.accel_b)
+        return replace(self, gyro_b=gyro_b, accel_b=accel_b, calibration=known.exact())
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,6 +190,7 @@ _KEYS: Final = {
     "accel_bias_walk_ug_per_sqrt_h": optional_key(
         "noise.accel_bias_density", 0.0, 1e7, _WALK, unit=MICRO_G * PER_SQRT_H
     ),
+    **calibration_keys("calibration"),
 }
 
 
@@ -190,12 +205,12 @@ class _Imu(Instrument):
         log: ImuLog = super().bare(settings, lists)
         return log
 
-    def check(self, table: Table, bare: ImuLog, axes: BodyAxes) -> list[str]:  # noqa: ARG002
+    def check(self, table: Table, bare: ImuLog, axes: BodyAxes) -> list[str]:
         if len(table) < 2:
             got = f"{len(table)} row" if len(table) else "a header and no rows"
             raise DataError(f"{table.label}: the table has {got}; expected at least 2 samples")
         notes = _times(table)
-        _specific_force(table)
+        _specific_force(table, bare.calibration, axes)
         _turn_rates(table)
         notes += _gravity_direction(table, axes)
         readings = table.stack([*_GYRO.names, *_ACCEL.names])
@@ -221,10 +236,19 @@ class _Imu(Instrument):
         return ImuSample(time_s, (gx, gy, gz), (ax, ay, az))
 
     def log_of(self, rows: Array, bare: ImuLog) -> ImuLog:
-        return ImuLog(bare.start_s, bare.noise, rows[:, 0], rows[:, 1:4], rows[:, 4:7])
+        return replace(bare, time_s=rows[:, 0], gyro_b=rows[:, 1:4], accel_b=rows[:, 4:7])
 
 
-IMU: Final = _Imu("imu", ImuLog, _KEYS, (_GYRO, _ACCEL), ImuSample, "i", is_required=True)
+IMU: Final = _Imu(
+    "imu",
+    ImuLog,
+    _KEYS,
+    (_GYRO, _ACCEL),
+    ImuSample,
+    "i",
+    calibrated=CALIBRATED,
+    is_required=True,
+)
 
 
 def interval_ends(time_s: Array, stamp: Stamp) -> tuple[float, Array]:
@@ -278,8 +302,9 @@ def _times(table: Table) -> list[str]:
     return notes
 
 
-def _specific_force(table: Table) -> None:
-    force = table.stack(_ACCEL.names)
+def _specific_force(table: Table, known: ImuCalibration, axes: BodyAxes) -> None:
+    gyro_b, accel_b = (to_frd(table.stack(names), axes) for names in (_GYRO.names, _ACCEL.names))
+    _, force = known.taken_off(gyro_b, accel_b)
     median = float(np.median(_length(force)))
     low, high = FORCE_RANGE
     if not low <= median <= high:

@@ -95,6 +95,8 @@ class SimulationConfig(checked.Settings):
     """Whether instruments err as real ones of the grade: scale factors, slow noise and more."""
     instruments: InstrumentErrors | None = None
     """Their sizes one by one; None for those of the grade if ``realistic``, for none otherwise."""
+    calibrates_imu: bool = False
+    """Whether the mission asks for the calibration of the errors that its IMU has."""
     perfect_sensors: bool = False
     """Draw no sensor error at all; noise stays as stated, outliers and losses as asked for."""
     draw_initial_errors: bool = True

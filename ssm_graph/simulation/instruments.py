@@ -15,6 +15,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from ssm_graph.base.frozen import Array
+from ssm_graph.sensors import imu_calibration
 from ssm_graph.simulation import checked
 from ssm_graph.simulation.inertial import MICRO_G, PER_HOUR, Grade, ImuErrors
 from ssm_graph.simulation.lasting_faults import low_passed
@@ -77,6 +78,17 @@ class InertialErrors(checked.Settings):
     """m/s^2"""
     carries_rest: bool = True
     """Whether what a step leaves over comes with the next sample, as in counted pulses."""
+
+    @property
+    def asked(self) -> imu_calibration.ImuCalibration:
+        """What a mission states that asks for the calibration of what is drawn of these sizes."""
+        return imu_calibration.ImuCalibration(
+            gyro_scale_sigma=self.gyro_scale,
+            gyro_misalignment_sigma=self.gyro_misalignment,
+            gyro_g_sensitivity_sigma=self.g_sensitivity,
+            accel_scale_sigma=self.accel_scale,
+            accel_misalignment_sigma=self.accel_misalignment,
+        )
 
 
 _DOF: Final = checked.Rule(

@@ -219,6 +219,8 @@ def _imu(config: SimulationConfig, streams: Streams, n_samples: int) -> tuple[Im
         gyro_b=read.gyro_b,
         accel_b=read.accel_b,
     )
+    if config.calibrates_imu and inertial:
+        log = dataclasses.replace(log, calibration=inertial.asked)
     return log, read
 
 

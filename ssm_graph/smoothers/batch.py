@@ -302,6 +302,7 @@ class SsmSmoother:
         faults: FaultWatch,
     ) -> Steps[Pass]:
         problem = linearizer.problem
+        yield from linearizer.integrate_steps(states)
         if linearizer.follow(states):
             rows = linearizer.beam_rows(states)
         yield 0.004 * problem.n_keyframes

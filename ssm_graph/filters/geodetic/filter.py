@@ -181,7 +181,7 @@ def _merged(
             f"{len(imu)} logs"
         )
     merged = [
-        merge_samples(log, problem.keyframe_s, rate_hz=rate_hz)
+        merge_samples(log.calibrated, problem.keyframe_s, rate_hz=rate_hz)
         for problem, log in zip(problems, imu, strict=True)
     ]
     first = merged[0].first

@@ -294,7 +294,7 @@ class Process:
     """Predicts B runs from keyframe to keyframe."""
 
     def __init__(self, intervals: Sequence[Intervals], frame: LocalFrame) -> None:
-        columns = zip(*intervals, strict=True)
+        columns = zip(*(own.without_errors(own.errors) for own in intervals), strict=True)
         self._intervals = Intervals(*(np.stack(column, axis=1) for column in columns))
         self._frame = frame
         self._gravity_gradient = gravity_gradient(frame)

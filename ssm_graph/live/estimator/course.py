@@ -178,7 +178,8 @@ class Course:
 
     def _observed(self, keyframe: Keyframe, window: Window, *, parity: bool) -> Watch:
         last, period_s = self.newest, self._buffers.shortest_period_s
-        samples = self._buffers.imu.between(last.time_s, keyframe.time_s)
+        buffers = self._buffers
+        samples = buffers.inertial(buffers.imu.between(last.time_s, keyframe.time_s))
         force = float(np.linalg.norm(samples[:, 4:], axis=1).mean()) if len(samples) else 9.8
         n_due = np.floor((keyframe.time_s - last.time_s) / period_s - 1.0)
         return observe(

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from factors.imu_errors import NONE
 from factors.inertial import Intervals
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
@@ -116,6 +117,7 @@ class KeyframeMaker:
             np.array([begin_s, end_s]),
             frame=self._frame,
             rate_hz=self._config.merge_rate_hz,
+            errors=NONE if self._buffers.vehicle.imu_calibration.is_asked else None,
         )
 
     def _beams(self, pings: Array, gyro_b: Array) -> Beams:

@@ -135,7 +135,7 @@ class FixedLagSmoother:
         if undone or n_made or self._tail is None or (is_late and is_sample):
             self._tail = self._tail_of(course.newest)
         elif is_sample:
-            self._tail.add(buffers.imu.between(self._tail.end_s, np.inf))
+            self._tail.add(buffers.inertial(buffers.imu.between(self._tail.end_s, np.inf)))
         return n_made > 0
 
     def _start(self) -> bool:
@@ -249,8 +249,9 @@ class FixedLagSmoother:
         keyframe, covariance = step.window.keyframes[-1], newest.covariance[0]
         sensors = step.window.sensors
         tail = Tail(keyframe, newest.states, covariance, noise=noise, sensors=sensors)
-        imu = self._intake.buffers.imu
-        tail.add(imu.all[max(imu.index(step.time_s, after=True) - 1, 0) :])
+        buffers, imu = self._intake.buffers, self._intake.buffers.imu
+        first = max(imu.index(step.time_s, after=True) - 1, 0)
+        tail.add(buffers.inertial(imu.all[first:]))
         return tail
 
     def newest(self) -> Navigation | None:

@@ -230,9 +230,11 @@ class Channels:
 
     def _between(self) -> Array:
         """Return what a unit of each bias does to the whitened inertial rows (K - 1, 15, 6)."""
-        rows, root = self._linear.between.jacobian, self._linear.problem.chain.intervals
-        by_bias = slice(ACCEL_BIAS.start, STATE_DIM)
-        return np.asarray(rows[:, :STATE_DIM, by_bias] - root.root_information[:, :, by_bias])
+        rows, n = self._linear.between.jacobian, self._linear.problem.extras.state_dim
+        # A bias at the begin acts on the motion and on the bias at the end, that at the end on the
+        # latter alone, the other way round.
+        begin, end = slice(ACCEL_BIAS.start, STATE_DIM), slice(n + ACCEL_BIAS.start, n + STATE_DIM)
+        return np.asarray(rows[:, :STATE_DIM, begin] + rows[:, :STATE_DIM, end])
 
     def _columns(self) -> Columns:
         linear = self._linear

@@ -64,6 +64,7 @@ class FaultWatch:
         self._n_looks += 1
         n_own = self._problem.extras.n_constants
         bare_states = states._replace(constants=states.constants[:n_own])
+        yield from self._bare.integrate_steps(bare_states)
         self._bare.follow(bare_states)
         beams = self._bare.beam_rows(bare_states)
         linear = yield from linear_of_steps(self._bare, bare_states, beams)
