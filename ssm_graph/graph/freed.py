@@ -1,4 +1,4 @@
-"""What sensors were found to be off by, as constants of the graph, and rows that are left out.
+"""What sensors were found to be off by, as constants of the graph.
 
 Each number has a column on the rows of the sensor while it was off, and nothing anywhere else; the
 columns stay as they were when it was found, so that the errors are linear functions of it.
@@ -10,10 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
 
-from factors.similarity import WEIGHT_FLOOR
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.extras import Extra, Extras
 from ssm_graph.graph.aids.aid import Linearised
@@ -34,8 +31,6 @@ class Freed:
     """(K - 1, 15, F) on the whitened inertial rows"""
     aids: Mapping[str, Array] = field(default_factory=dict)
     """(m, d, F) on the whitened measurements of an aid, by its name; none where nothing acts"""
-    left_out: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
-    """(m,) which measurements of an aid count for nothing, by its name"""
 
     @property
     def variable(self) -> Extra:
@@ -44,15 +39,11 @@ class Freed:
         return Extra(FAULTS, labels, self.sigma)
 
     def on_aid(self, name: str, rows: Linearised, extras: Extras, constants: Array) -> Linearised:
-        """Return whitened rows (m, d) of an aid with what it is off by, those left out at nothing."""
-        error, jacobian = rows
+        """Return whitened rows (m, d) of an aid with what it is off by."""
         columns = self.aids.get(name)
-        if columns is not None:
-            error = error + columns @ constants[len(constants) - len(self.sigma) :]
-            jacobian = jacobian.copy()
-            jacobian[..., extras.columns(FAULTS)] = columns
-        out = self.left_out.get(name)
-        if out is not None:
-            share = np.where(out, np.sqrt(WEIGHT_FLOOR), 1.0)
-            error, jacobian = error * share[:, None], jacobian * share[:, None, None]
-        return Linearised(error, jacobian)
+        if columns is None:
+            return rows
+        jacobian = rows.jacobian.copy()
+        jacobian[..., extras.columns(FAULTS)] = columns
+        own = constants[len(constants) - len(self.sigma) :]
+        return Linearised(rows.error + columns @ own, jacobian)

@@ -37,7 +37,7 @@ that it makes of one interval."""
 
 
 class Misfit(NamedTuple):
-    """How far one kind of measurement misses an answer."""
+    """How far the inertial data miss an answer."""
 
     sum_sq: float
     """Sum of its squared whitened errors"""
@@ -56,8 +56,7 @@ class GraphLinearizer:
         self._chain = problem.chain
         self._inertial = InertialRows(problem.frame, problem.extras)
         self.prior = prior_at_start(with_extras(start_of(problem), problem.extras.walks))
-        self.aids = Measurements.in_full(problem, freed)
-        self.weighted = Measurements.weighted(problem, freed)
+        self.weighted = Measurements.of_problem(problem, freed)
         self._beams = CalibratedBeams(problem.beams, problem.extras, problem.frame)
         self._n_judged = 0
 
@@ -67,7 +66,6 @@ class GraphLinearizer:
         In the first passes, how much motion there is to calibrate by is judged anew: only smoothed
         states tell acceleration from a bias. Then the beams are to be linearised anew.
         """
-        self.aids.follow(states)
         self.weighted.follow(states)
         if self._n_judged == JUDGED_PASSES or not needs_motion(self.problem.extras):
             return False
@@ -99,7 +97,7 @@ class GraphLinearizer:
     ) -> ChainSolution:
         """Return the step at ``states``, with their beam rows and weights (M,).
 
-        ``aid_weights`` are those of the weighted aids' measurements; all one when left out.
+        ``aid_weights`` are those of the aids' measurements; all one when left out.
         """
         return finished(self.solve_steps(states, beam_rows, weights, aid_weights))
 
@@ -154,21 +152,16 @@ class GraphLinearizer:
         """Return half the weighted sum of squares that :meth:`solve` makes least."""
         squares = np.sum(weights * (beam_rows.error / self.problem.beams.sigma) ** 2)
         squares += np.sum(self.prior.whitened(states) ** 2)
-        squares += np.sum(self.aids.rows(states).error ** 2)
         squares += np.sum(self.weighted.rows(states, aid_weights).error ** 2)
         constants_sigma = self.problem.extras.sigma[self.problem.extras.n_walks :]
         squares += np.sum((states.constants / constants_sigma) ** 2)
         squares += np.sum(self.inertial_errors(states) ** 2)
         return float(0.5 * squares)
 
-    def misfits(self, states: States) -> dict[str, Misfit]:
-        """Return the misfit of the aids and the inertial data, by name, where there are any."""
+    def inertial_misfit(self, states: States) -> Misfit:
+        """Return how far the inertial data miss these states."""
         errors = self.inertial_errors(states)[:, :STATE_DIM]
-        found = {"inertial": Misfit(float(np.sum(errors**2)), errors.size, len(errors))}
-        for aid in self.aids.all:
-            error = self.aids.whitened(aid, states).error
-            found[aid.name] = Misfit(float(np.sum(error**2)), error.size, len(error))
-        return {name: misfit for name, misfit in found.items() if misfit.n_factors}
+        return Misfit(float(np.sum(errors**2)), errors.size, len(errors))
 
     def _off_by(self, states: States) -> Array:
         """Return what sensors are off by (F,)."""
@@ -187,10 +180,9 @@ class GraphLinearizer:
         scale = np.sqrt(weights) / beams.sigma
         whitened = np.column_stack([beam_rows.jacobian, -beam_rows.error]) * scale[:, None]
         keyframes, blocks = [beams.keyframe], [whitened]
-        aid_rows = self.aids.rows(states), self.weighted.rows(states, aid_weights)
-        for keyframe, error, jacobian in aid_rows:
-            keyframes.append(keyframe)
-            blocks.append(np.column_stack([jacobian, -error]))
+        keyframe, error, jacobian = self.weighted.rows(states, aid_weights)
+        keyframes.append(keyframe)
+        blocks.append(np.column_stack([jacobian, -error]))
         keyframe = np.concatenate(keyframes)
         order = np.argsort(keyframe, kind="stable")
         return keyframe[order], np.concatenate(blocks)[order]

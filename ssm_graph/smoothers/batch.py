@@ -19,6 +19,7 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factors.kernels import TruncatedKernel
 from factors.similarity import Kernel, LogKernel, Similarity, expected_mahalanobis_sq
@@ -34,7 +35,7 @@ from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.first_values import FirstValues, first_values, first_values_steps
 from ssm_graph.graph.inertial_rows import inertial_fit
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.graph.measurements import aid_kernel, aid_table, doubts_of_aids
+from ssm_graph.graph.measurements import aid_kernel, aid_table, doubts_of_aids, without
 from ssm_graph.mission.answer import trajectory_from_states
 from ssm_graph.mission.estimate import BeamTable, Estimate, Iteration, NoiseFound, Status
 from ssm_graph.mission.fault import DetectedFault
@@ -162,7 +163,9 @@ class Weights(NamedTuple):
         of_aids, aids = self.of_aids.after(
             self.aids, last.aid_weights, t=last.aid_mahalanobis_sq, update_sigmas=last.update_sigmas
         )
-        return Weights(faults.leave_out(beams), aids, of_beams, of_aids)
+        return Weights(
+            faults.leave_out(beams), faults.leave_aids_out(aids), of_beams, of_aids
+        )
 
     def may_end(self, last: Pass) -> bool:
         """Return whether the weights that the pass led to may be those of the answer."""
@@ -180,6 +183,8 @@ class Solved(NamedTuple):
     notes: tuple[str, ...]
     first: FirstValues
     faults: tuple[DetectedFault, ...]
+    aids_out: NDArray[np.bool_] | None
+    """(A,) measurements of aids that are left out; None for none"""
 
     def again(self) -> FirstValues:
         """Return where another solution may start."""
@@ -291,7 +296,7 @@ class SsmSmoother:
         found = problem.faults + faults.faults(this.states)
         said = tuple(fault.sentence for fault in found)
         notes = problem.notes + said + _notes_of(first)
-        return Solved(linearizer, this, tuple(iterations), status, notes, first, found)
+        return Solved(linearizer, this, tuple(iterations), status, notes, first, found, faults.aids_out)
 
     def _iterate(
         self,
@@ -324,7 +329,7 @@ class SsmSmoother:
         settled = faults.leave_out(used.of_beams.kernel.weight(t))
         aids = linearizer.weighted
         aid_t = aids.mahalanobis_sq(states, step, self.config.judged_by)
-        aid_settled = used.of_aids.kernel.weight(aid_t, dim=aids.dim)
+        aid_settled = faults.leave_aids_out(used.of_aids.kernel.weight(aid_t, dim=aids.dim))
         change = np.concatenate([settled - used.beams, aid_settled - used.aids])
         return Pass(
             states,
@@ -366,7 +371,8 @@ class SsmSmoother:
         judged = linearizer.weighted.judged(
             last.states, linearizer.problem.keyframe_s, last.aid_mahalanobis_sq, last.aid_weights
         )
-        doubts += doubts_of_aids(judged)
+        counted = judged if solved.aids_out is None else without(judged, solved.aids_out)
+        doubts += doubts_of_aids(counted)
         doubts += ambiguous_beacons(
             last.states,
             linearizer.weighted,

@@ -46,8 +46,6 @@ class FixedLagConfig:
     m/s: what is less bends nothing, however certain."""
     reweigh: float = 1e-9
     """A beam's weight, in a window of several keyframes, is renewed once it is off by so much."""
-    gate_sigmas: float = np.inf
-    """Depth and GNSS further than this from what is predicted are left out."""
     first_estimates: bool = False
     """Keep the oldest keyframe where its prior was made, with the Jacobians of that point."""
 
@@ -226,8 +224,6 @@ class Window:
         """
         graph = self._graph
         step, root_cov = graph.prediction(self._weights)
-        if np.isfinite(self.config.gate_sigmas):
-            graph.leave_out_far(step, root_cov, sigmas=self.config.gate_sigmas)
         k, row = len(self.keyframes) - 1, graph.first_row[-2]
         if graph.aids.meet_prediction(k, step, root_cov, self.config.kernel):
             graph.changed_from(k)

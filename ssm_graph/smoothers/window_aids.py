@@ -12,7 +12,6 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.base.times import Indices
 from ssm_graph.engine.states import States
 from ssm_graph.graph.aids.aid import Aid, Rows, RowStates
-from ssm_graph.graph.aids.standstill import AnySpeed
 from ssm_graph.graph.first_weights import settled_weights
 from ssm_graph.graph.measurements import JudgedAid, aid_kernel
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors
@@ -151,26 +150,6 @@ class WindowAids:
             keyframes.append(np.repeat(one.aid.keyframe[first:], rows.shape[1]))
             blocks.append(rows.reshape(-1, n + 1))
         return np.concatenate(keyframes), np.concatenate(blocks)
-
-    def leave_out_far(
-        self, k: int, step: Array, root_cov: Array, *, sigmas: float
-    ) -> tuple[str, ...]:
-        """Leave out what counts in full at the newest keyframe and is far from its prediction.
-
-        Returns the names of what was left out; step (n,) and root (n, n) as the graph predicts.
-        """
-        left_out = []
-        for name, one in self._all.items():
-            rows = one.rows_of(k, k + 1)
-            if one.aid.is_weighted or isinstance(one.aid, AnySpeed) or rows.start == rows.stop:
-                continue
-            A = one.jacobian[rows].reshape(-1, len(step))
-            root, left = A @ root_cov, -one.error[rows].ravel() - A @ step
-            distance_sq = left @ np.linalg.solve(root @ root.T + np.eye(len(left)), left)
-            if distance_sq > sigmas**2 * len(left):
-                self._all[name] = one.take(np.s_[: rows.start])
-                left_out.append(name)
-        return tuple(left_out)
 
     def meet_prediction(self, k: int, step: Array, root_cov: Array, kernel: Kernel) -> bool:
         """Weigh the measurements of the newest keyframe by what all before it predict, together.

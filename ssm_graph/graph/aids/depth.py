@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factors.depth_height import height_residual
 from factors.so3 import cross
@@ -20,6 +21,10 @@ from ssm_graph.sensors.depth import DepthCalibration, DepthLog
 from ssm_graph.sensors.imu import ImuLog
 
 DEPTH_OFFSET: Final = "depth_offset"
+GATE: Final = 5.0
+"""Sigmas by which two readings of a keyframe may differ, and the next."""
+FASTEST_CLIMB: Final = 5.0
+"""m/s, of any underwater vehicle: so fast the way between the readings may change the height."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,16 +46,36 @@ class Depths(ReadOnlyArrays):
 
     @classmethod
     def of(cls, log: DepthLog, imu: ImuLog, keyframe_s: Array) -> Depths:
-        """Return the readings of a log within keyframes (K,)."""
-        used = (log.time_s >= keyframe_s[0]) & (log.time_s <= keyframe_s[-1])
+        """Return the readings of a log within keyframes (K,), without those the others outvote."""
+        used = np.flatnonzero((log.time_s >= keyframe_s[0]) & (log.time_s <= keyframe_s[-1]))
+        keyframe = np.searchsorted(keyframe_s, log.time_s[used])
+        agrees = _agrees_with_most(keyframe, log.time_s[used], log.depth[used], sigma=log.sigma)
+        used = used[agrees]
         return cls(
-            keyframe=np.searchsorted(keyframe_s, log.time_s[used]),
+            keyframe=keyframe[agrees],
             time_s=log.time_s[used],
             depth=log.true_depth[used],
             gyro_b=mean_gyro(imu, keyframe_s),
             sigma=log.sigma,
             lever_arm_b=log.lever_arm_b,
         )
+
+
+def _agrees_with_most(
+    keyframe: Indices, time_s: Array, depth: Array, *, sigma: float
+) -> NDArray[np.bool_]:
+    """Return which readings (M,) agree with the median one of their keyframe.
+
+    Where no more than half of a keyframe's readings do, nothing tells the good ones: all stay, and
+    their mean is weighed as a whole.
+    """
+    order = np.lexsort((depth, keyframe))
+    count = np.bincount(keyframe)
+    middle = order[(np.cumsum(count) - count + (np.maximum(count, 1) - 1) // 2)[keyframe]]
+    reach = GATE * np.sqrt(2.0) * sigma + FASTEST_CLIMB * np.abs(time_s - time_s[middle])
+    agrees = np.abs(depth - depth[middle]) <= reach
+    is_most = 2 * np.bincount(keyframe, weights=agrees) > count
+    return np.asarray(agrees | ~is_most[keyframe])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,7 +92,6 @@ class DepthMeans(Aid):
     name = "depth"
     unit = "m"
     hint = "look at its zero, sign and unit"
-    is_weighted = False
 
     depth: Array
     """(M,) m, positive down"""

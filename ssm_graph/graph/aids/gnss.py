@@ -33,7 +33,6 @@ class Fixes(Aid):
     name = "GNSS"
     unit = "m"
     hint = "look for a wrong datum or lever arm"
-    is_weighted = False
     LEVER_ARM: ClassVar[str] = GNSS_LEVER_ARM
     TIME_OFFSET: ClassVar[str] = GNSS_TIME_OFFSET
     DRIFT: ClassVar[str] = GNSS_DRIFT

@@ -40,7 +40,6 @@ ONLINE: Final = FixedLagConfig(
     relinearise_sigmas=0.1,
     relinearise_turn=5e-4,
     reweigh=0.02,
-    gate_sigmas=6.0,
     first_estimates=True,
 )
 """What a vehicle can afford; `benchmarks/online/` compares it with windows solved to the end."""

@@ -119,7 +119,7 @@ def observe(
     """
     newest, time_s = window.newest, keyframe.time_s
     kept = window.keyframes[-1]
-    no_fix, no_depth = (name not in kept.aids for name in (Fixes.name, DepthMeans.name))
+    no_fix, no_depth = (_is_refused(newest, name) for name in (Fixes.name, DepthMeans.name))
     share = 1.0 - math.exp(-(time_s - last_s) / MEMORY_S)
     watch = watch._replace(force=watch.force + share * (force - watch.force))
     if len(newest.weight):
@@ -135,7 +135,8 @@ def observe(
         )
     if DepthMeans.name in keyframe.aids:
         watch = watch._replace(depths_refused=watch.depths_refused + 1 if no_depth else 0)
-    if any(np.any(judged.weight >= TRUSTED) for judged in newest.aids.values()):
+    of_place = (judged for name, judged in newest.aids.items() if name != DepthMeans.name)
+    if any(np.any(judged.weight >= TRUSTED) for judged in of_place):
         watch = watch._replace(last_aid_s=time_s)
     if watch.contradicted is not None:
         watch = watch._replace(contradicted=_still(watch.contradicted, window))
@@ -145,6 +146,12 @@ def observe(
     elif missing > MOST_MISSING and not trouble:
         trouble = f"{100.0 * missing:.0f} % of the inertial samples are missing"
     return watch._replace(trouble_s=time_s, trouble=trouble) if trouble else watch
+
+
+def _is_refused(newest: Stretch, name: str) -> bool:
+    """Return whether nothing that an aid measured at the newest keyframe counts."""
+    judged = newest.aids.get(name)
+    return judged is None or bool(np.all(judged.weight < LOW_WEIGHT))
 
 
 def _with_beams(

@@ -24,7 +24,6 @@ from ssm_graph.engine.states import States
 from ssm_graph.graph.aids.aid import Aid
 from ssm_graph.graph.beam_rows import BeamRows, WaterRows
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.graph.measurements import Measurements
 from ssm_graph.mission.problem import Problem
 
 BEAM: Final = "beam"
@@ -128,18 +127,17 @@ def linear_of_steps(
     n = problem.extras.state_dim
     beam_weights = _beam_weights(problem, beams)
     aid_weights = {}
-    for aid in (*linearizer.aids.all, *linearizer.weighted.all):
+    for aid in linearizer.weighted.all:
         error = aid.whitened(linearizer.weighted.at_keyframes(aid, states)).error
         aid_weights[aid.name] = spike_weights(error)
     scale = np.sqrt(beam_weights) / problem.beams.sigma
     keyframes, rows = [problem.beams.keyframe], [
         np.column_stack([beams.jacobian, -beams.error]) * scale[:, None]
     ]
-    for group in (linearizer.aids, linearizer.weighted):
-        weights = _joined(group, aid_weights)
-        keyframe, error, jacobian = group.rows(states, weights)
-        keyframes.append(keyframe)
-        rows.append(np.column_stack([jacobian, -error]))
+    weights = np.concatenate([np.zeros(0), *aid_weights.values()])
+    aid_keyframe, error, jacobian = linearizer.weighted.rows(states, weights)
+    keyframes.append(aid_keyframe)
+    rows.append(np.column_stack([jacobian, -error]))
     keyframe, own = np.concatenate(keyframes), np.concatenate(rows)
     order = np.argsort(keyframe, kind="stable")
     keyframe, own = keyframe[order], own[order]
@@ -155,7 +153,7 @@ def linear_of_steps(
         states=states,
         beams=beams,
         beam_weights=beam_weights,
-        aids=(*linearizer.aids.all, *linearizer.weighted.all),
+        aids=linearizer.weighted.all,
         aid_weights=aid_weights,
         solution=solution,
         own=OwnRows(keyframe, own[:, :n], missed),
@@ -164,10 +162,6 @@ def linear_of_steps(
         constants=Columns(own[:, n:-1], between[:, :, 2 * n : -1]),
         linearizer=linearizer,
     )
-
-
-def _joined(group: Measurements, weights: Mapping[str, Array]) -> Array:
-    return np.concatenate([np.zeros(0), *(weights[aid.name] for aid in group.all)])
 
 
 def _beam_weights(problem: Problem, beams: BeamRows) -> Array:

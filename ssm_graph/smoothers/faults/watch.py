@@ -45,11 +45,17 @@ class FaultWatch:
         self._bare = None if search is None else GraphLinearizer(problem)
         self._found: list[Fault] = []
         self._beams_out = np.zeros(len(problem.beams.speed), bool)
+        self.aids_out: NDArray[np.bool_] | None = None
+        """(A,) measurements of aids that may have read anything; None for none"""
         self._n_looks, self._is_done = 0, search is None
 
     def leave_out(self, weights: Array) -> Array:
         """Return the weights (M,) with the floor for beams that may have read anything."""
         return np.where(self._beams_out, WEIGHT_FLOOR, weights)
+
+    def leave_aids_out(self, weights: Array) -> Array:
+        """Return the weights (A,) with the floor for measurements that may have read anything."""
+        return weights if self.aids_out is None else np.where(self.aids_out, WEIGHT_FLOOR, weights)
 
     def look_steps(self, states: States, *, update_sigmas: float) -> Steps[Changed | None]:
         """Search once the solution is near; return what has changed, None for nothing.
@@ -96,8 +102,8 @@ class FaultWatch:
         on_beams = [np.zeros((len(beams.speed), 0))]
         between = [np.zeros((*channels.between.shape[:2], 0))]
         of_aid: dict[str, list[Array]] = {name: [] for name in channels.aids}
-        left_out: dict[str, NDArray[np.bool_]] = {}
         aid_keyframe = channels.aid_keyframe
+        aids_out = {name: np.zeros(len(keyframe), bool) for name, keyframe in aid_keyframe.items()}
         for fault in with_rivals(self._found):
             hypothesis, name = fault.hypothesis, fault.hypothesis.channel
             C = hypothesis.combined
@@ -106,8 +112,7 @@ class FaultWatch:
                     is_own = np.isin(beams.beam, np.flatnonzero(C.any(axis=1)))
                     self._beams_out |= is_own & _inside(beams.keyframe, fault)
                 else:
-                    out = left_out.get(name, np.zeros(len(aid_keyframe[name]), bool))
-                    left_out[name] = out | _inside(aid_keyframe[name], fault)
+                    aids_out[name] |= _inside(aid_keyframe[name], fault)
                 continue
             d = C.shape[1] * (2 if hypothesis.course is Course.TREND else 1)
             sigma.append(np.tile(hypothesis.sigma, d // C.shape[1]))
@@ -130,6 +135,7 @@ class FaultWatch:
                     parts.append(_over(root @ C, aid_keyframe[aid], fault, keyframe_s))
                 else:
                     parts.append(np.zeros((*root.shape[:2], d)))
+        self.aids_out = np.concatenate([np.zeros(0, bool), *aids_out.values()])
         return Freed(
             sigma=np.concatenate(sigma),
             beams=np.hstack(on_beams),
@@ -139,7 +145,6 @@ class FaultWatch:
                 for aid, parts in of_aid.items()
                 if any(np.any(part) for part in parts)
             },
-            left_out=left_out,
         )
 
     def faults(self, states: States) -> tuple[DetectedFault, ...]:
