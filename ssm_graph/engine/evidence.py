@@ -19,7 +19,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, solve_triangular
+from scipy.linalg import solve_triangular
+from scipy.linalg.blas import dsyrk
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.chain import ChainSolution
@@ -33,25 +34,27 @@ class Evidence(NamedTuple):
     information: Array
     """(C, C)"""
 
-    def without(self, columns: NDArray[np.intp], prior: Array) -> Evidence:
-        """Return the same with some columns eliminated, whose prior information is (m, m)."""
-        inner = self.information[np.ix_(columns, columns)] + prior
-        return self._eliminated(self.information[:, columns], self.score[columns], inner)
+    def without(self, score: Array, crossed: Array, inner: Array) -> Evidence:
+        """Return the same with m further columns eliminated.
+
+        Parameters
+        ----------
+        score : (m,) of these.
+        crossed : (m, C) their information with the columns here.
+        inner : (m, m) that among themselves, with that of their prior.
+        """
+        root = np.linalg.cholesky(inner)
+        right = np.column_stack([crossed, score])
+        half = solve_triangular(root, right, lower=True, check_finite=False, overwrite_b=True)
+        explained = dsyrk(-1.0, half[:, :-1], beta=1.0, c=self.information, trans=1, lower=1)
+        lower = np.tril(explained)
+        information = lower + np.tril(explained, -1).T
+        return Evidence(self.score - half[:, :-1].T @ half[:, -1], information)
 
     def freed(self, combined: Array, prior: Array) -> Evidence:
         """Return the same once ``combined`` (C, m), sums of columns, may be of any size."""
-        crossed = self.information @ combined
-        inner = combined.T @ crossed + prior
-        return self._eliminated(crossed, combined.T @ self.score, inner)
-
-    def _eliminated(self, crossed: Array, score: Array, inner: Array) -> Evidence:
-        root, _ = cho_factor(inner, lower=True)
-        right = np.column_stack([crossed.T, score])
-        half = solve_triangular(root, right, lower=True, check_finite=False)
-        explained = half[:, :-1]
-        return Evidence(
-            self.score - explained.T @ half[:, -1], self.information - explained.T @ explained
-        )
+        crossed = combined.T @ self.information
+        return self.without(combined.T @ self.score, crossed, crossed @ combined + prior)
 
 
 class OwnRows(NamedTuple):

@@ -183,8 +183,8 @@ class Solved(NamedTuple):
     notes: tuple[str, ...]
     first: FirstValues
     faults: tuple[DetectedFault, ...]
-    aids_out: NDArray[np.bool_] | None
-    """(A,) measurements of aids that are left out; None for none"""
+    aids_out: NDArray[np.bool_]
+    """(A,) measurements of aids that are left out"""
 
     def again(self) -> FirstValues:
         """Return where another solution may start."""
@@ -284,11 +284,15 @@ class SsmSmoother:
             is_settled = is_settled and weights.may_end(this)
             changed = None
             if number + 1 < self.config.max_iterations:
-                changed = yield from faults.look_steps(states, update_sigmas=this.update_sigmas)
+                changed = yield from faults.look_steps(
+                    linearizer, states, update_sigmas=this.update_sigmas
+                )
             if changed is not None:
-                linearizer, states = changed
+                linearizer, states, *own = changed
                 rows = linearizer.beam_rows(states)
-            elif is_settled:
+                weights = Weights(*own, self.config.schedule(), weights.of_aids)
+                continue
+            if is_settled:
                 status = Status.CONVERGED
                 break
             yield 0.007 * problem.n_keyframes
@@ -371,8 +375,7 @@ class SsmSmoother:
         judged = linearizer.weighted.judged(
             last.states, linearizer.problem.keyframe_s, last.aid_mahalanobis_sq, last.aid_weights
         )
-        counted = judged if solved.aids_out is None else without(judged, solved.aids_out)
-        doubts += doubts_of_aids(counted)
+        doubts += doubts_of_aids(without(judged, solved.aids_out))
         doubts += ambiguous_beacons(
             last.states,
             linearizer.weighted,

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.similarity import LogKernel
+from factors.similarity import WEIGHT_FLOOR, LogKernel
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps
 from ssm_graph.engine.chain import ChainSolution
@@ -79,9 +79,8 @@ def spike_weights(whitened: Array) -> Array:
 class Linear:
     """A problem linearised at its states, weighed, and solved for the trajectory alone."""
 
-    problem: Problem
     states: States
-    beams: BeamRows
+    """With nothing freed"""
     beam_weights: Array
     aids: tuple[Aid, ...]
     aid_weights: Mapping[str, Array]
@@ -92,11 +91,16 @@ class Linear:
     """(R,) rows of beams, then of each aid, in the order of their keyframes"""
     constants: Columns
     """The calibrations of the problem"""
-    linearizer: GraphLinearizer
+    bare: GraphLinearizer
+
+    @property
+    def problem(self) -> Problem:
+        """With nothing freed."""
+        return self.bare.problem
 
     def solved_steps(self, own: Array, between: Array) -> Steps[Array]:
         """Return the step (K, n) of the trajectory alone for errors (R,) and (K - 1, m) of rows."""
-        solution = yield from self.linearizer.solve_rows_steps(
+        solution = yield from self.bare.solve_rows_steps(
             self.states,
             self.own.keyframe,
             np.column_stack([self.own.jacobian, self.constants.own, self.own.missed - own]),
@@ -113,54 +117,61 @@ class Linear:
 
 
 def linear_of_steps(
-    linearizer: GraphLinearizer, states: States, beams: BeamRows
+    bare: GraphLinearizer,
+    linearizer: GraphLinearizer,
+    states: States,
+    beams_out: NDArray[np.bool_],
+    aids_out: NDArray[np.bool_],
 ) -> Steps[Linear]:
     """Weigh all measurements, solve for the trajectory, and return rows and what they miss.
 
     Parameters
     ----------
-    linearizer : of the problem with nothing freed.
-    states : near the answer.
-    beams : linearised there.
+    bare : of the problem with nothing freed.
+    linearizer : of the same with what was found freed, which is taken off what rows miss.
+    states : of that, near the answer.
+    beams_out, aids_out : (M,) and (A,) which measurements count for nothing.
     """
-    problem = linearizer.problem
-    n = problem.extras.state_dim
+    problem = bare.problem
+    n, width = problem.extras.state_dim, problem.extras.width
+    beams = linearizer.beam_rows(states)
     beam_weights = _beam_weights(problem, beams)
-    aid_weights = {}
-    for aid in linearizer.weighted.all:
-        error = aid.whitened(linearizer.weighted.at_keyframes(aid, states)).error
-        aid_weights[aid.name] = spike_weights(error)
+    beam_weights[beams_out] = WEIGHT_FLOOR
+    weighted = linearizer.weighted
+    of_aids = [spike_weights(weighted.whitened(aid, states).error) for aid in weighted.all]
+    weights = np.concatenate([np.zeros(0), *of_aids])
+    weights[aids_out] = WEIGHT_FLOOR
     scale = np.sqrt(beam_weights) / problem.beams.sigma
-    keyframes, rows = [problem.beams.keyframe], [
-        np.column_stack([beams.jacobian, -beams.error]) * scale[:, None]
-    ]
-    weights = np.concatenate([np.zeros(0), *aid_weights.values()])
-    aid_keyframe, error, jacobian = linearizer.weighted.rows(states, weights)
-    keyframes.append(aid_keyframe)
-    rows.append(np.column_stack([jacobian, -error]))
-    keyframe, own = np.concatenate(keyframes), np.concatenate(rows)
+    aid_keyframe, error, jacobian = weighted.rows(states, weights)
+    own = np.concatenate(
+        [
+            np.column_stack([beams.jacobian[:, :width], -beams.error]) * scale[:, None],
+            np.column_stack([jacobian[:, :width], -error]),
+        ]
+    )
+    keyframe = np.concatenate([problem.beams.keyframe, aid_keyframe])
     order = np.argsort(keyframe, kind="stable")
     keyframe, own = keyframe[order], own[order]
     between = linearizer.inertial_rows(states)
+    between = np.concatenate([between[:, :, : n + width], between[:, :, -1:]], axis=2)
     yield 0.025 * problem.n_keyframes
-    solution = yield from linearizer.solve_rows_steps(states, keyframe, own, between)
+    states = states._replace(constants=states.constants[: problem.extras.n_constants])
+    solution = yield from bare.solve_rows_steps(states, keyframe, own, between)
     step = solution.step - solution.sensitivity @ solution.constants_step
     missed = own[:, -1] - np.einsum("ri,ri->r", own[:, :n], step[keyframe])
     both = np.concatenate([step[:-1], step[1:]], axis=1)
     missed_between = between[:, :, -1] - np.einsum("kij,kj->ki", between[:, :, : 2 * n], both)
     return Linear(
-        problem=problem,
         states=states,
-        beams=beams,
         beam_weights=beam_weights,
-        aids=linearizer.weighted.all,
-        aid_weights=aid_weights,
+        aids=weighted.all,
+        aid_weights={aid.name: weighted.of(aid, weights) for aid in weighted.all},
         solution=solution,
         own=OwnRows(keyframe, own[:, :n], missed),
         between=BetweenRows(between[:, :, : 2 * n], missed_between),
         order=order,
         constants=Columns(own[:, n:-1], between[:, :, 2 * n : -1]),
-        linearizer=linearizer,
+        bare=bare,
     )
 
 

@@ -14,7 +14,7 @@ from ssm_graph.base.stepwise import Steps
 from ssm_graph.engine.error_state import POSITION
 from ssm_graph.engine.evidence import ChainEvidence, Evidence
 from ssm_graph.smoothers.faults.columns import Channels, Linear
-from ssm_graph.smoothers.faults.hypotheses import Course, Hypothesis
+from ssm_graph.smoothers.faults.hypotheses import LEAST_PER_NUMBER, PER_NUMBER, Course, Hypothesis
 from ssm_graph.smoothers.faults.nuisances import WIDER, WIDTHS, Nuisances
 
 TREND_S = 100.0
@@ -30,14 +30,27 @@ class Grid(NamedTuple):
     """(N + 1) keyframes, the last one after the mission's end"""
     middle_s: Array
     """(N,) s"""
+    length_s: Array
+    """(N,) s"""
+    block_s: float
+    """Of a coarse block, s"""
 
     @classmethod
-    def of(cls, keyframe_s: Array, edges_s: Iterable[float]) -> Grid:
+    def of(cls, keyframe_s: Array, edges_s: Iterable[float], *, block_s: float = 10.0) -> Grid:
         """Return the blocks between some times, s, and the ends of the mission."""
         inner = np.searchsorted(keyframe_s, np.array(sorted(edges_s)))
         edges = np.unique(np.concatenate([[0], inner, [len(keyframe_s)]]))
         last = np.append(keyframe_s, keyframe_s[-1])
-        return cls(edges, 0.5 * (last[edges[:-1]] + last[edges[1:]]))
+        begin_s, end_s = last[edges[:-1]], last[edges[1:]]
+        return cls(edges, 0.5 * (begin_s + end_s), end_s - begin_s, block_s)
+
+    def coarse(self) -> tuple[NDArray[np.intp], Array]:
+        """Return the first block of each coarse one (G,), and their middles, s."""
+        begin_s = self.middle_s - 0.5 * self.length_s
+        number = np.floor((self.middle_s - begin_s[0]) / self.block_s)
+        first = np.flatnonzero(np.diff(number, prepend=-1.0))
+        ends_s = np.append(begin_s[first[1:]], begin_s[-1] + self.length_s[-1])
+        return first, 0.5 * (begin_s[first] + ends_s)
 
     @property
     def n_blocks(self) -> int:
@@ -82,8 +95,16 @@ class Fault:
     """By which that exceeds its charge"""
     rivals: tuple[Fault, ...] = ()
     """Others that explain the data as well"""
+    sizes: Array | None = None
+    """Of its numbers, taken off the rows already; None for what is new"""
     cost_m: float = 0.0
     """By how much the horizontal position moves between the explanations, m"""
+
+    @property
+    def n_constants(self) -> int:
+        """Of the graph, none where its rows are left out instead."""
+        is_anything = self.hypothesis.course is Course.ANYTHING
+        return 0 if is_anything else self.hypothesis.n_numbers
 
 
 class Apart(NamedTuple):
@@ -107,26 +128,32 @@ class Judge:
 
     def fit(self, grid: Grid, faults: Sequence[Fault]) -> None:
         """Let the nuisances be as wide as the data ask for, once faults are freed."""
-        evidence = self._whole(grid)
-        width = self.channels.width
+        evidence, width = self._whole(grid), self.channels.width
         for fault in faults:
             combined, prior = combined_of(fault, grid, self.channels)
             padded = np.zeros((len(evidence.score), combined.shape[1]))
             padded[: grid.n_blocks * width] = combined
             evidence = evidence.freed(padded, prior)
-        priors = self._nuisances.priors(grid.middle_s)
-        self.widths = priors.fitted(evidence, choices=WIDER if faults else WIDTHS)
+        priors = self._nuisances.priors(*grid.coarse())
+        crossed = priors.crossed(evidence, width)
+        self.widths = priors.fitted(
+            crossed.score, priors.among(crossed, width), choices=WIDER if faults else WIDTHS
+        )
 
     def on(self, grid: Grid) -> Judged:
         """Return the evidence on a grid, with nothing freed but the nuisances."""
-        whole, n = self._whole(grid), grid.n_blocks * self.channels.width
-        priors = self._nuisances.priors(grid.middle_s)
-        left = whole.without(priors.columns, priors.information(self.widths))
-        return Judged(Evidence(left.score[:n], left.information[:n, :n]), grid, self.channels)
+        width = self.channels.width
+        whole, n = self._whole(grid), grid.n_blocks * width
+        priors = self._nuisances.priors(*grid.coarse())
+        crossed = priors.crossed(whole, width)
+        inner = priors.among(crossed, width) + priors.information(self.widths)
+        blocks = Evidence(whole.score[:n], whole.information[:n, :n])
+        left = blocks.without(crossed.score, crossed.information[:, :n], inner)
+        return Judged(left, grid, self.channels)
 
     def way_steps(self, judged: Judged, faults: Sequence[Fault]) -> Steps[Array]:
         """Return where the trajectory goes (K, 3), in body axes, m, if these are freed."""
-        effect = np.zeros(judged.grid.n_blocks * self.channels.width)
+        effect = -judged.restored
         for fault, size in zip(faults, judged.sizes(faults), strict=True):
             effect += judged.combined(fault)[0] @ size
         linear, columns = self.linear, self.channels.columns
@@ -156,8 +183,21 @@ class Judge:
 class Judged:
     """Evidence of the channels' columns on the blocks of a grid."""
 
-    def __init__(self, evidence: Evidence, grid: Grid, channels: Channels) -> None:
+    def __init__(
+        self, evidence: Evidence, grid: Grid, channels: Channels, restored: Array | None = None
+    ) -> None:
         self.evidence, self.grid, self.channels = evidence, grid, channels
+        self.restored = np.zeros(len(evidence.score)) if restored is None else restored
+        """(C,) what is not taken off the rows here"""
+
+    def restoring(self, faults: Iterable[Fault]) -> Judged:
+        """Return what the data say if these had not been taken off the rows."""
+        restored = self.restored.copy()
+        for fault in faults:
+            if fault.sizes is not None:
+                restored += self.combined(fault)[0] @ fault.sizes
+        score = self.evidence.score + self.evidence.information @ (restored - self.restored)
+        return Judged(self.evidence._replace(score=score), self.grid, self.channels, restored)
 
     def with_freed(self, faults: Sequence[Fault]) -> Judged:
         """Return what is left once some faults may be of any size."""
@@ -165,7 +205,7 @@ class Judged:
         for fault in faults:
             combined, prior = self.combined(fault)
             evidence = evidence.freed(combined, prior)
-        return Judged(evidence, self.grid, self.channels)
+        return Judged(evidence, self.grid, self.channels, self.restored)
 
     def combined(self, fault: Fault) -> tuple[Array, Array]:
         """Return the columns of a fault as sums of those here, and its prior information."""
@@ -261,13 +301,16 @@ class Judged:
         d = score.shape[1]
         flat = information.reshape(n * d, n * d) + np.diag(np.tile(1.0 / hypothesis.sigma**2, n))
         chi_sq = np.full((n + 1, n + 1), -np.inf)
-        charge = np.array([hypothesis.charge(d * count) if count else np.inf for count in range(n + 1)])
         for begin in range(n):
             root = np.linalg.cholesky(flat[begin * d :, begin * d :])
             half = np.linalg.solve(root, score[begin:].ravel())
             chi_sq[begin, begin + 1 :] = np.cumsum(np.sum(half.reshape(-1, d) ** 2, axis=1))
-        length = np.maximum(np.arange(n + 1)[None, :] - np.arange(n + 1)[:, None], 0)
-        return chi_sq, charge[length]
+        count = np.maximum(np.arange(n + 1)[None, :] - np.arange(n + 1)[:, None], 0)
+        ends_s = np.append(0.0, np.cumsum(self.grid.length_s))
+        coarse = np.ceil((ends_s[None, :] - ends_s[:, None]) / self.grid.block_s - 0.1)
+        needed = np.array([hypothesis.least(d * one) if one else np.inf for one in range(n + 1)])
+        extra = (PER_NUMBER - LEAST_PER_NUMBER) * (d * np.maximum(coarse, 1.0) - 1.0)
+        return chi_sq, needed[count] + extra
 
     def _projected(self, hypothesis: Hypothesis) -> tuple[Array, Array]:
         """Return score (N, d) and information (N, d, N, d) of a hypothesis in each block."""
@@ -290,6 +333,9 @@ def combined_of(fault: Fault, grid: Grid, channels: Channels) -> tuple[Array, Ar
         shapes = np.eye(end - begin)
     else:
         shapes = moments_of(hypothesis, grid)[begin:end]
+        if hypothesis.course is Course.TREND:
+            # The rate counts from the begin of the stretch on.
+            shapes[:, 1] -= shapes[0, 1] - 0.5 * grid.length_s[begin] / TREND_S
     made = np.zeros((grid.n_blocks, width, shapes.shape[1] * d))
     for block, shape in zip(range(begin, end), shapes, strict=True):
         made[block, own] = np.kron(shape, hypothesis.combined)

@@ -52,19 +52,24 @@ class Nuisances:
         """What the priors of the shared columns (C,) say of their sizes."""
         return self._own_score
 
-    def priors(self, middle_s: Array) -> Priors:
-        """Return which columns of N blocks, and of all of them, are nuisances, and their priors."""
-        width, columns, parts = self._channels.width, [], []
+    def priors(self, coarse: Array, middle_s: Array) -> Priors:
+        """Return the nuisances of G coarse blocks, and their priors.
+
+        Parameters
+        ----------
+        coarse : (G,) the first of the blocks in each.
+        middle_s : (G,) s
+        """
         apart_s = np.abs(middle_s[:, None] - middle_s[None, :])
         of_time: dict[float, Array] = {}
+        columns, parts = [], []
         for column, sigma, correlation_s, group in self._wandering:
             if correlation_s not in of_time:
                 covariance = np.exp(-apart_s / correlation_s) + 1e-6 * np.eye(len(middle_s))
                 of_time[correlation_s] = np.asarray(np.linalg.inv(covariance))
-            columns.append(np.arange(len(middle_s)) * width + column)
+            columns.append(column)
             parts.append((of_time[correlation_s] / sigma**2, group))
-        common = len(middle_s) * width + np.arange(len(self._is_own))
-        return Priors(np.concatenate([*columns, common]), parts, self._is_own)
+        return Priors(coarse, np.array(columns), parts, self._is_own)
 
     def _wander(self) -> list[tuple[int, float, float, int]]:
         """Return column, sigma, time of correlation (s) and group of each."""
@@ -114,11 +119,29 @@ class Priors:
 
     def __init__(
         self,
+        coarse: Array,
         columns: NDArray[np.intp],
         parts: list[tuple[Array, int]],
         is_own: NDArray[np.bool_],
     ) -> None:
-        self.columns, self._parts, self._is_own = columns, parts, is_own
+        self._coarse, self._columns, self._parts, self._is_own = coarse, columns, parts, is_own
+
+    def crossed(self, evidence: Evidence, width: int) -> Evidence:
+        """Return scores (m,) of the nuisances, and their information (m, C) with all columns."""
+        n_shared = len(self._is_own)
+        n = len(evidence.score) - n_shared
+
+        def summed(rows: Array) -> Array:
+            blocks = rows[:n].reshape(n // width, width, -1)[:, self._columns]
+            own = np.add.reduceat(blocks, self._coarse, axis=0).swapaxes(0, 1)
+            return np.concatenate([own.reshape(-1, rows.shape[1]), rows[n:]])
+
+        return Evidence(summed(evidence.score[:, None])[:, 0], summed(evidence.information))
+
+    def among(self, crossed: Evidence, width: int) -> Array:
+        """Return the information (m, m) of the nuisances among themselves."""
+        turned = Evidence(np.zeros(crossed.information.shape[1]), crossed.information.T)
+        return self.crossed(turned, width).information
 
     def information(self, widths: tuple[float, ...]) -> Array:
         """Return it (m, m) for the widths of beams, aids and inertial data."""
@@ -133,13 +156,14 @@ class Priors:
         counts[IMU_GROUP] += np.sum(~self._is_own)
         return float(-2.0 * np.sum(counts * np.log(widths)))
 
-    def fitted(self, evidence: Evidence, *, choices: tuple[float, ...]) -> tuple[float, ...]:
+    def fitted(
+        self, score: Array, among: Array, *, choices: tuple[float, ...]
+    ) -> tuple[float, ...]:
         """Return the widths that make the data likeliest, one group after the other.
 
-        Of several that are as likely the widest are taken.
+        Of several that are as likely the widest are taken. ``score`` (m,) and ``among`` (m, m) are
+        what the data say of the nuisances.
         """
-        score = evidence.score[self.columns]
-        among = evidence.information[np.ix_(self.columns, self.columns)]
         known: dict[tuple[float, ...], float] = {}
 
         def likelihood(widths: tuple[float, ...]) -> float:

@@ -16,19 +16,23 @@ import numpy as np
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.stepwise import Steps
 from ssm_graph.smoothers.faults.columns import IMU, Channels
-from ssm_graph.smoothers.faults.hypotheses import hypotheses_of
+from ssm_graph.smoothers.faults.hypotheses import Course, hypotheses_of
 from ssm_graph.smoothers.faults.judged import Candidate, Fault, Grid, Judge, Judged
 
 FINE_S = 1.0
 """s, to which edges are refined."""
 NEW_PER_LOOK = 3
 """Faults that one look adds: each bends the solution that the others are judged at."""
+STRONG = 300.0
+"""Chi-square of a fault after which the solution is made anew before more is looked for."""
 HINT = 0.75
 """Share of its charge from which on a stretch of the coarse grid is looked at more closely."""
 JOLT = 30.0
 """Chi-square of inertial data within few blocks, from which on an edge is looked for there."""
 LONGEST_JOLT = 2
 """Blocks"""
+INERTIAL_SHARE = 0.5
+"""Of the merit of an inertial fault, from which on another sensor's is taken instead."""
 SAME_STRETCH = 0.5
 SAME_ANSWER_SIGMAS = 1.0
 """Explanations whose answers are nowhere further apart are one."""
@@ -64,22 +68,23 @@ class Look:
         self.hypotheses = hypotheses_of(channels, significance=settings.significance)
 
     def find_steps(self, known: Sequence[Fault]) -> Steps[list[Fault]]:
-        """Return what is off; where faults known before begin and end, new ones may as well."""
-        self._judge.fit(self._grid([]), with_rivals(known))
+        """Return what is off: what was thought to be before, as it competes now, and what is new.
+        """
+        self._judge.fit(self._grid(with_rivals(known)), with_rivals(known))
         yield self._work
-        found: list[Fault] = []
-        for _ in range(len(known) + NEW_PER_LOOK):
-            best = yield from self._next_steps(found, known)
+        found = list(known)
+        for _ in range(NEW_PER_LOOK):
+            best = yield from self._next_steps(found)
             if best is None:
                 break
             found.append(best)
-        if len(found) > 1:
-            found = yield from self._again_steps(found)
-        return found
+            if best.chi_sq > STRONG:
+                break
+        return (yield from self._again_steps(found)) if len(found) > 1 or known else found
 
-    def _next_steps(self, found: Sequence[Fault], known: Sequence[Fault]) -> Steps[Fault | None]:
+    def _next_steps(self, found: Sequence[Fault]) -> Steps[Fault | None]:
         """Return the best of what is left, None for nothing."""
-        coarse = self._judge.on(self._grid([*with_rivals(found), *with_rivals(known)]))
+        coarse = self._judge.on(self._grid(with_rivals(found)))
         yield self._work
         left = coarse.with_freed(with_rivals(found))
         ranked = left.best_of(self.hypotheses)
@@ -92,28 +97,45 @@ class Look:
         left = fine.with_freed(with_rivals(found))
         ranked = left.best_of(self.hypotheses)
         yield self._work
-        if not ranked[0].is_significant:
+        chosen = chosen_of(ranked)
+        if chosen is None:
             return None
-        best = fault_of(ranked[0], left)
+        best = fault_of(chosen, left)
         rivals = rivals_of(best, ranked, left, margin=self._settings.margin)
         return (yield from self._against_steps(best, rivals, fine, found))
 
     def _again_steps(self, found: list[Fault]) -> Steps[list[Fault]]:
-        """Let each compete anew about where it is, the others being freed; some are none then."""
-        kept = list(found)
-        for fault in sorted(found, key=lambda fault: fault.merit):
-            others = [one for one in kept if one is not fault]
-            fine = self._judge.on(self._grid(with_rivals(others), around=[fault]))
+        """Let each compete anew about where it is, the others being freed; some are none then.
+
+        The strongest come first, and without weaker ones that only make up for their edges.
+        """
+        kept: list[Fault] = []
+        waiting = sorted(found, key=lambda fault: -fault.merit)
+        while waiting:
+            fault, *waiting = waiting
+            if fault.hypothesis.course is Course.ANYTHING:
+                kept.append(fault)  # its rows count for nothing and can say no more
+                continue
+            beside = [one for one in waiting if self._touches(one, fault)]
+            others = [*kept, *(one for one in waiting if one not in beside)]
+            grid = self._grid(with_rivals([*others, *beside]), around=[fault])
+            fine = self._judge.on(grid).restoring(with_rivals([fault, *beside]))
             yield self._work
             left = fine.with_freed(with_rivals(others))
             ranked = left.best_of(self.hypotheses, near=fault)
             yield self._work
-            kept = others
-            if ranked[0].is_significant:
-                best = fault_of(ranked[0], left)
+            chosen = chosen_of(ranked)
+            if chosen is not None:
+                best = fault_of(chosen, left)
                 rivals = rivals_of(best, ranked, left, margin=self._settings.margin)
                 kept.append((yield from self._against_steps(best, rivals, fine, others)))
         return kept
+
+    def _touches(self, one: Fault, other: Fault) -> bool:
+        """Return whether an edge of one is near an edge of the other."""
+        time_s = np.append(self._keyframe_s, self._keyframe_s[-1])
+        edges = time_s[[one.begin, one.end]][:, None] - time_s[[other.begin, other.end]]
+        return bool(np.min(np.abs(edges)) <= self._settings.block_s)
 
     def _against_steps(
         self, best: Fault, rivals: Sequence[Fault], fine: Judged, found: Sequence[Fault]
@@ -138,16 +160,30 @@ class Look:
         time_s = np.append(self._keyframe_s, last_s + 1.0)
         edges_s = [np.arange(first_s, last_s, step_s)]
         edges_s.extend(time_s[[fault.begin, fault.end]] for fault in faults)
-        fine_s = np.arange(-step_s, step_s + FINE_S, FINE_S)
+        fine_s = np.concatenate([np.arange(-5.0, 6.0) * FINE_S, [-step_s, -0.75 * step_s, 0.75 * step_s, step_s]])
         for fault in around:
             edges_s.extend(edge_s + fine_s for edge_s in time_s[[fault.begin, fault.end]])
-        return Grid.of(self._keyframe_s, np.concatenate(edges_s))
+        return Grid.of(self._keyframe_s, np.concatenate(edges_s), block_s=step_s)
 
 
 def fault_of(candidate: Candidate, judged: Judged) -> Fault:
     """Return a candidate as a fault: its blocks are those of one grid only."""
     begin, end = judged.grid.edges[[candidate.begin, candidate.end]].tolist()
     return Fault(candidate.hypothesis, begin, end, candidate.chi_sq, candidate.merit)
+
+
+def chosen_of(ranked: Sequence[Candidate]) -> Candidate | None:
+    """Return what is to be freed, None if nothing is significant; inertial data come last.
+
+    Biases over stretches explain a part of anything.
+    """
+    significant = [one for one in ranked if one.is_significant]
+    if not significant:
+        return None
+    best = significant[0]
+    others = (one for one in significant if one.hypothesis.channel != IMU)
+    other = next(others, best)
+    return other if other.merit > INERTIAL_SHARE * best.merit else best
 
 
 def hints_of(ranked: Sequence[Candidate]) -> list[Candidate]:
@@ -172,12 +208,20 @@ def rivals_of(
     elsewhere = judged.best_of([best.hypothesis], apart_from=best)[0]
     if elsewhere.merit > best.merit - margin:
         found.append(fault_of(elsewhere, judged))
-    return [one for one in found if not is_alike(one, best)]
+    by_sensor: dict[tuple[str, bool], Fault] = {}
+    for one in found:
+        if one.hypothesis.sensor != best.hypothesis.sensor or not is_part_of(one, best):
+            by_sensor.setdefault((one.hypothesis.sensor, overlap(one, best) > SAME_STRETCH), one)
+    return list(by_sensor.values())
 
 
-def is_alike(one: Fault, other: Fault) -> bool:
-    """Return whether both are one hypothesis over about the same stretch."""
-    return one.hypothesis is other.hypothesis and overlap(one, other) > SAME_STRETCH
+def is_part_of(one: Fault, other: Fault) -> bool:
+    """Return whether one of both is the other, or part of it, over about the same stretch."""
+    a, b = one.hypothesis, other.hypothesis
+    if a.channel != b.channel or overlap(one, other) <= SAME_STRETCH:
+        return False
+    ranks = [np.linalg.matrix_rank(C) for C in (a.combined, b.combined)]
+    return bool(np.linalg.matrix_rank(np.hstack([a.combined, b.combined])) == max(ranks))
 
 
 def overlap(one: Fault, other: Fault) -> float:

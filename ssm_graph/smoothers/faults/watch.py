@@ -18,6 +18,7 @@ from ssm_graph.engine.states import States
 from ssm_graph.graph.freed import Freed
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.mission.fault import DetectedFault, Treatment
+from ssm_graph.graph.measurements import aids_of
 from ssm_graph.mission.problem import Problem
 from ssm_graph.smoothers.faults.columns import BEAM, IMU, Channels, linear_of_steps
 from ssm_graph.smoothers.faults.hypotheses import Course
@@ -34,6 +35,10 @@ class Changed(NamedTuple):
 
     linearizer: GraphLinearizer
     states: States
+    weights: Array
+    """(M,) of the beams: a lie that lasts has turned those that contradict it away"""
+    aid_weights: Array
+    """(A,)"""
 
 
 class FaultWatch:
@@ -45,8 +50,8 @@ class FaultWatch:
         self._bare = None if search is None else GraphLinearizer(problem)
         self._found: list[Fault] = []
         self._beams_out = np.zeros(len(problem.beams.speed), bool)
-        self.aids_out: NDArray[np.bool_] | None = None
-        """(A,) measurements of aids that may have read anything; None for none"""
+        self.aids_out = np.zeros(sum(len(aid) for aid in aids_of(problem)), bool)
+        """(A,) measurements of aids that may have read anything"""
         self._n_looks, self._is_done = 0, search is None
 
     def leave_out(self, weights: Array) -> Array:
@@ -55,30 +60,33 @@ class FaultWatch:
 
     def leave_aids_out(self, weights: Array) -> Array:
         """Return the weights (A,) with the floor for measurements that may have read anything."""
-        return weights if self.aids_out is None else np.where(self.aids_out, WEIGHT_FLOOR, weights)
+        return np.where(self.aids_out, WEIGHT_FLOOR, weights)
 
-    def look_steps(self, states: States, *, update_sigmas: float) -> Steps[Changed | None]:
+    def look_steps(
+        self, linearizer: GraphLinearizer, states: States, *, update_sigmas: float
+    ) -> Steps[Changed | None]:
         """Search once the solution is near; return what has changed, None for nothing.
 
         What is found is freed; then it is searched again at what the solution has become, until
-        nothing changes any more.
+        nothing changes any more. ``linearizer`` is that of the pass.
         """
         if self._is_done or self._bare is None or self._search is None:
             return None
         if update_sigmas >= NEAR_SIGMAS:
             return None
         self._n_looks += 1
-        n_own = self._problem.extras.n_constants
-        bare_states = states._replace(constants=states.constants[:n_own])
+        own = states.constants[: self._problem.extras.n_constants]
+        bare_states = states._replace(constants=own)
         yield from self._bare.integrate_steps(bare_states)
         self._bare.follow(bare_states)
-        beams = self._bare.beam_rows(bare_states)
-        linear = yield from linear_of_steps(self._bare, bare_states, beams)
+        linear = yield from linear_of_steps(
+            self._bare, linearizer, states, self._beams_out, self.aids_out
+        )
         channels = Channels(linear)
         judge = Judge(linear, channels, Nuisances(linear, channels))
         yield 0.02 * self._problem.n_keyframes
         look = Look(judge, channels, self._search)
-        found = yield from look.find_steps(self._found)
+        found = yield from look.find_steps(self._sized(states))
         is_same = same_faults(found, self._found, self._problem.keyframe_s)
         self._is_done = is_same or self._n_looks >= MOST_LOOKS
         if is_same:
@@ -91,8 +99,24 @@ class FaultWatch:
             problem = replace(problem, extras=Extras(blocks))
         constants = np.concatenate([bare_states.constants, np.zeros(len(freed.sigma))])
         return Changed(
-            GraphLinearizer(problem, freed), bare_states._replace(constants=constants)
+            GraphLinearizer(problem, freed),
+            bare_states._replace(constants=constants),
+            self.leave_out(linear.beam_weights),
+            self.leave_aids_out(np.concatenate([np.zeros(0), *linear.aid_weights.values()])),
         )
+
+    def _sized(self, states: States) -> list[Fault]:
+        """Return what was found with the sizes that the states give it."""
+        sizes = states.constants[self._problem.extras.n_constants :]
+        found, begin = [], 0
+        for fault in self._found:
+            parts = []
+            for one in (fault, *fault.rivals):
+                count = one.n_constants
+                parts.append(replace(one, sizes=sizes[begin : begin + count] if count else None))
+                begin += count
+            found.append(replace(parts[0], rivals=tuple(parts[1:])))
+        return found
 
     def _freed(self, channels: Channels) -> Freed:
         """Return the columns of all that was found, and what is left out."""
@@ -149,27 +173,19 @@ class FaultWatch:
 
     def faults(self, states: States) -> tuple[DetectedFault, ...]:
         """Return what was found, with the sizes that the answer gives it."""
-        sizes = states.constants[self._problem.extras.n_constants :]
-        found, begin = [], 0
         end_s = np.append(self._problem.keyframe_s, self._problem.keyframe_s[-1])
-        for fault in self._found:
+        found = []
+        for fault in self._sized(states):
             hypothesis = fault.hypothesis
+            rivals = [
+                f"{one.hypothesis.sensor}, {end_s[one.begin]:.0f}-{end_s[one.end]:.0f} s, {said(one)}"
+                for one in fault.rivals
+            ]
             is_anything = hypothesis.course is Course.ANYTHING
-            own = sizes[begin : begin + hypothesis.n_numbers]
-            what, begin = said(fault, own), begin + (0 if is_anything else hypothesis.n_numbers)
-            rivals = []
-            for rival in fault.rivals:
-                is_out = rival.hypothesis.course is Course.ANYTHING
-                count = 0 if is_out else rival.hypothesis.n_numbers
-                rivals.append(
-                    f"{rival.hypothesis.sensor}, {end_s[rival.begin]:.0f}-{end_s[rival.end]:.0f} s, "
-                    f"{said(rival, sizes[begin : begin + count])}"
-                )
-                begin += count
             found.append(
                 DetectedFault(
                     sensor=hypothesis.sensor,
-                    what=what,
+                    what=said(fault),
                     begin_s=float(end_s[fault.begin]),
                     end_s=float(end_s[fault.end]),
                     chi_sq=fault.chi_sq,
@@ -186,10 +202,10 @@ class FaultWatch:
         return tuple(found)
 
 
-def said(fault: Fault, sizes: Array) -> str:
-    """Return words for what a fault is, of these sizes."""
-    hypothesis = fault.hypothesis
-    if hypothesis.course is Course.ANYTHING:
+def said(fault: Fault) -> str:
+    """Return words for what a fault is."""
+    hypothesis, sizes = fault.hypothesis, fault.sizes
+    if sizes is None:
         return "reads what nothing else agrees with"
     d = hypothesis.combined.shape[1]
     text = hypothesis.say(sizes[:d])
