@@ -37,6 +37,7 @@ from ssm_graph.mission.timeline import Timeline, build_timeline
 from ssm_graph.mission.usable import require_usable
 from ssm_graph.sensors.dvl import DvlMount
 from ssm_graph.sensors.dvl_readings import stuck_beams
+from ssm_graph.sensors.frozen import frozen_runs
 from ssm_graph.sensors.imu import ImuLog, frozen_axes
 
 NO_EXTRAS = Extras()
@@ -161,6 +162,7 @@ def build_problem_steps(
     require_usable(mission)
     mission = replace(mission, imu=mission.imu.calibrated)
     mission, stuck_note = _without_stuck_beams(mission)
+    mission, frozen = without_frozen(mission)
     config = config or ProblemConfig()
     start = start or mission.initial
     if start is None:
@@ -192,7 +194,7 @@ def build_problem_steps(
         extras=extras,
         aids=tuple(aid for aid in aids if aid is not None),
         notes=(*timeline.notes, *_gap_note(mission.imu), *stuck_note, *current_note(mission)),
-        faults=frozen_faults(mission.imu),
+        faults=frozen,
     )
 
 
@@ -264,22 +266,41 @@ def _without_stuck_beams(mission: Mission) -> tuple[Mission, tuple[str, ...]]:
     return replace(mission, dvl=replace(dvl, speed=speed)), (note,)
 
 
-def frozen_faults(imu: ImuLog) -> tuple[DetectedFault, ...]:
-    """Return the axes of gyros and accelerometers that repeat one reading."""
-    return tuple(
-        DetectedFault(
-            sensor="gyros" if frozen.is_gyro else "accelerometers",
-            what=f"one reading again and again about {'xyz'[frozen.axis]}"
-            if frozen.is_gyro
-            else f"one reading again and again along {'xyz'[frozen.axis]}",
-            begin_s=frozen.begin_s,
-            end_s=frozen.end_s,
-            chi_sq=np.inf,
-            dof=1,
-            treatment=Treatment.COVERED,
-        )
-        for frozen in frozen_axes(imu)
-    )
+FROZEN_S = 5.0
+FROZEN_READINGS = 5
+"""So many fixes, or depths, in a row, and for so long, repeat one reading: they are none."""
+
+
+def without_frozen(mission: Mission) -> tuple[Mission, tuple[DetectedFault, ...]]:
+    """Return the mission without fixes and depths that repeat one reading, and what does so.
+
+    Axes of the inertial sensors that do are unseen motion, see
+    :func:`ssm_graph.imu.preintegration.preintegrate`.
+    """
+    found, logs = [], {}
+    for name, log in (("GNSS", mission.gnss), ("depth", mission.depth)):
+        if log is None:
+            continue
+        read = log.depth[:, None] if name == "depth" else np.column_stack([log.lat, log.lon])
+        is_frozen = np.zeros(len(log.time_s), bool)
+        runs = frozen_runs(log.time_s, read, least_s=FROZEN_S, least_count=FROZEN_READINGS)
+        for begin, end in runs:
+            is_frozen[begin + 1 : end + 1] = True
+            span_s = float(log.time_s[begin]), float(log.time_s[end])
+            found.append(_repeating(name, "repeats one reading", *span_s, Treatment.LEFT_OUT))
+        if runs:
+            logs[name.lower()] = log.rows(~is_frozen)
+    for is_gyro, axis, *span_s in frozen_axes(mission.imu):
+        name, where = ("gyros", "about") if is_gyro else ("accelerometers", "along")
+        what = f"one reading again and again {where} {'xyz'[axis]}"
+        found.append(_repeating(name, what, *span_s, Treatment.COVERED))
+    return replace(mission, **logs), tuple(found)
+
+
+def _repeating(
+    sensor: str, what: str, begin_s: float, end_s: float, treatment: Treatment
+) -> DetectedFault:
+    return DetectedFault(sensor, what, begin_s, end_s, chi_sq=np.inf, dof=1, treatment=treatment)
 
 
 def _gap_note(imu: ImuLog) -> tuple[str, ...]:

@@ -20,6 +20,7 @@ from ssm_graph.base.settings import FILE_KEY, Key, Settings, optional_key, sigma
 from ssm_graph.base.tables import Table
 from ssm_graph.base.units import DEG_PER_H, DEGREE, MICRO_G, PER_SQRT_H
 from ssm_graph.sensors.imu_calibration import CALIBRATED, ImuCalibration, calibration_keys
+from ssm_graph.sensors.frozen import frozen_runs
 from ssm_graph.sensors.instrument import XYZ, Column, Instrument, Lists
 from ssm_graph.sensors.messages import Message
 
@@ -96,30 +97,17 @@ class FrozenAxis(NamedTuple):
 FROZEN_S: Final = 1.0
 FROZEN_SAMPLES: Final = 20
 """So many equal readings in a row, for so long, are none: noise alone changes them."""
-USUALLY_EQUAL: Final = 0.2
-"""Where more of the other successive readings are equal, resolution makes them so, or rest."""
 
 
 def frozen_axes(log: ImuLog) -> list[FrozenAxis]:
     """Return where an axis repeats one reading, in the order of axes, gyros first."""
-    found = []
-    for axis, values in enumerate(np.hstack([log.gyro_b, log.accel_b]).T):
-        equal = values[1:] == values[:-1]
-        edges = np.flatnonzero(np.diff(equal.astype(np.int8), prepend=0, append=0))
-        runs = [
-            (begin, end)
-            for begin, end in edges.reshape(-1, 2).tolist()
-            if end - begin >= FROZEN_SAMPLES and log.time_s[end] - log.time_s[begin] >= FROZEN_S
-        ]
-        inside = sum(end - begin for begin, end in runs)
-        others = len(equal) - inside
-        if inside > others or np.sum(equal) - inside > USUALLY_EQUAL * others:
-            continue
-        found.extend(
-            FrozenAxis(axis < 3, axis % 3, float(log.time_s[begin]), float(log.time_s[end]))
-            for begin, end in runs
+    return [
+        FrozenAxis(axis < 3, axis % 3, float(log.time_s[begin]), float(log.time_s[end]))
+        for axis, values in enumerate(np.hstack([log.gyro_b, log.accel_b]).T)
+        for begin, end in frozen_runs(
+            log.time_s, values[:, None], least_s=FROZEN_S, least_count=FROZEN_SAMPLES
         )
-    return found
+    ]
 
 
 class Stamp(Enum):

@@ -40,6 +40,7 @@ from ssm_graph.mission.answer import trajectory_from_states
 from ssm_graph.mission.estimate import BeamTable, Estimate, Iteration, NoiseFound, Status
 from ssm_graph.mission.fault import DetectedFault
 from ssm_graph.mission.problem import Problem, with_white_noise
+from ssm_graph.smoothers.descent import descend_steps
 from ssm_graph.smoothers.faults.search import FaultSearch
 from ssm_graph.smoothers.faults.watch import FaultWatch
 from ssm_graph.smoothers.track import calibration_of, current_of, undetermined
@@ -61,10 +62,6 @@ WARM_KERNEL = LogKernel()
 """Kernel of the first pass and of the first iterations, whichever is asked for in the end."""
 RUNAWAY_SPEED = 1e4
 """m/s; ten silent minutes of a MEMS unit may begin with 100 m/s and still come back."""
-
-MAX_HALVINGS = 10
-COST_SLACK = 1e-2
-"""A rise of the cost by less is rounding: one residual at its sigma costs 0.5."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -439,28 +436,3 @@ def noise_of_steps(solved: Solved, used: Array) -> Steps[NoiseFound]:
         inertial=fit,
         used=used,
     )
-
-
-def descend_steps(
-    linearizer: GraphLinearizer,
-    states: States,
-    step: ChainSolution,
-    weights: Array,
-    cost: float,
-    *,
-    aid_weights: Array | None = None,
-) -> Steps[tuple[States, BeamRows]]:
-    """Take the Gauss-Newton step, halved while it raises the cost at these weights.
-
-    Returns the states moved to, and their beams.
-    """
-    for halvings in range(MAX_HALVINGS):
-        scale = 0.5**halvings
-        moved = states.moved(scale * step.step, scale * step.constants_step)
-        yield 0.006 * len(moved.p_n)
-        rows = linearizer.beam_rows(moved)
-        yield 0.004 * len(moved.p_n)
-        if linearizer.cost(moved, rows, weights, aid_weights) <= cost + COST_SLACK:
-            return moved, rows
-        yield 0.005 * len(moved.p_n)
-    return states, linearizer.beam_rows(states)

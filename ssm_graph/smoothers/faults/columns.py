@@ -50,10 +50,13 @@ class Channel(NamedTuple):
 
 
 def beside_median(values: Array) -> Array:
-    """Return readings (N, ...) less their running median, the ends mirrored."""
+    """Return readings (N, ...) less their running median, the ends mirrored.
+
+    Of fewer than would fill half of it nothing lasts: they are returned as they are.
+    """
     half = MEDIAN_OF // 2
     if len(values) <= half:
-        return np.zeros_like(values)
+        return values
     padded = np.pad(values, [(half, half)] + [(0, 0)] * (values.ndim - 1), mode="reflect")
     windows = np.lib.stride_tricks.sliding_window_view(padded, MEDIAN_OF, axis=0)
     return np.asarray(values - np.median(windows, axis=-1))

@@ -32,6 +32,11 @@ LEAST_PER_NUMBER = 2.0
 """And by itself: stretches are many, and many numbers more than their tails allow for."""
 
 
+AT_AN_END = 4.5
+"""Chi-square by which a stretch to the begin or the end of the mission needs less, and twice as
+much one over all of it: there are N and 1 of these, of others N^2 / 2."""
+
+
 class Course(Enum):
     """How an error goes on over its stretch."""
 

@@ -14,7 +14,7 @@ from ssm_graph.base.stepwise import Steps
 from ssm_graph.engine.error_state import POSITION
 from ssm_graph.engine.evidence import ChainEvidence, Evidence
 from ssm_graph.smoothers.faults.columns import Channels, Linear
-from ssm_graph.smoothers.faults.hypotheses import LEAST_PER_NUMBER, PER_NUMBER, Course, Hypothesis
+from ssm_graph.smoothers.faults.hypotheses import AT_AN_END, LEAST_PER_NUMBER, PER_NUMBER, Course, Hypothesis
 from ssm_graph.smoothers.faults.nuisances import WIDER, WIDTHS, Nuisances
 
 TREND_S = 100.0
@@ -68,6 +68,8 @@ class Candidate(NamedTuple):
     chi_sq: float
     merit: float
     """By which that exceeds its charge"""
+    discount: float
+    """Of what it needs, for the ends of the mission"""
 
     def n_numbers(self) -> int:
         """Return how many numbers it has."""
@@ -77,7 +79,7 @@ class Candidate(NamedTuple):
     @property
     def is_significant(self) -> bool:
         """Whether it is no chance."""
-        return self.chi_sq > self.hypothesis.least(self.n_numbers())
+        return self.chi_sq > self.hypothesis.least(self.n_numbers()) - self.discount
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -248,20 +250,21 @@ class Judged:
             is_apart = (edges[:, None] >= near.end) | (edges[None, :] <= near.begin)
         elif apart_from is not None:
             is_apart = (edges[:, None] < apart_from.end) & (edges[None, :] > apart_from.begin)
+        discount = np.zeros((len(edges), len(edges)))
+        discount[0] += AT_AN_END
+        discount[:, -1] += AT_AN_END
         best_so_far: dict[str, float] = {}
         for hypothesis in hypotheses:
             # Where no constant is worth a look in any stretch, there is nothing of another course.
-            if hypothesis.course is Course.ANYTHING and best_so_far[hypothesis.sensor] < WORTH:
+            if hypothesis.course is Course.ANYTHING and best_so_far.get(hypothesis.sensor, WORTH) < WORTH:
                 continue
             chi_sq, charge = self.table(hypothesis)
             largest = float(np.max(chi_sq))
             best_so_far[hypothesis.sensor] = max(best_so_far.get(hypothesis.sensor, 0.0), largest)
-            merit = np.where(is_apart, -np.inf, chi_sq - charge)
+            merit = np.where(is_apart, -np.inf, chi_sq - charge + discount)
             begin, end = np.unravel_index(int(np.argmax(merit)), merit.shape)
-            best = Candidate(
-                hypothesis, int(begin), int(end), float(chi_sq[begin, end]), float(merit[begin, end])
-            )
-            found.append(best)
+            own = (float(table[begin, end]) for table in (chi_sq, merit, discount))
+            found.append(Candidate(hypothesis, int(begin), int(end), *own))
         return sorted(found, key=lambda candidate: -candidate.merit)
 
     def table(self, hypothesis: Hypothesis) -> tuple[Array, Array]:
