@@ -232,18 +232,25 @@ RUN = 20
 """Successive depths, or position fixes, that are looked at together."""
 SHORTEST_RUN = 8
 """Of fewer nothing is said."""
+SLOW_SIGMAS = 6.0
+"""So long the median has to be where a search has looked for what lasts: the rest is swell and
+multipath, which are nobody's fault."""
 RUN_TAIL = 0.03
 """Share of Gaussian errors that are longer than the median of a run may be: three times the sigma
 of one component, twice that of three. Half of a run has to be that long, which has a chance of
 1e-10 for twenty and 6e-5 for eight; as many may be gross and say nothing."""
 
 
-def doubts_of_aids(judged: Sequence[JudgedAid]) -> list[str]:
-    """Say in a sentence each which aid disagrees with the answer."""
-    return [doubt for one in judged if len(one.aid) and (doubt := _doubt(one))]
+def doubts_of_aids(judged: Sequence[JudgedAid], *, is_searched: bool = False) -> list[str]:
+    """Say in a sentence each which aid disagrees with the answer.
+
+    ``is_searched`` if faults that last have been looked for.
+    """
+    least = SLOW_SIGMAS if is_searched else 0.0
+    return [doubt for one in judged if len(one.aid) and (doubt := _doubt(one, least))]
 
 
-def _doubt(one: JudgedAid) -> str:
+def _doubt(one: JudgedAid, least_sigmas: float) -> str:
     aid, weights = one.aid, one.weight
     share = float(np.mean(weights < LOW_WEIGHT))
     if share > SUSPECT_SHARE:
@@ -252,7 +259,7 @@ def _doubt(one: JudgedAid) -> str:
             f"the answer (weight below {LOW_WEIGHT}): {aid.hint}"
         )
     if isinstance(aid, DepthMeans | Fixes):
-        return _doubt_run(one)
+        return _doubt_run(one, least_sigmas)
     trusted = np.mean(one.error**2, axis=1)[weights >= TRUSTED]
     misfit = float(np.mean(trusted)) if len(trusted) else 0.0
     if misfit <= MISFIT:
@@ -263,7 +270,7 @@ def _doubt(one: JudgedAid) -> str:
     )
 
 
-def _doubt_run(one: JudgedAid) -> str:
+def _doubt_run(one: JudgedAid, least_sigmas: float) -> str:
     """Look for successive measurements of place that miss the answer together."""
     aid, size = one.aid, min(RUN, len(one.weight))
     if size < SHORTEST_RUN:
@@ -271,9 +278,9 @@ def _doubt_run(one: JudgedAid) -> str:
     runs = np.lib.stride_tricks.sliding_window_view(np.sum(one.error**2, axis=1), size)
     median = np.median(runs, axis=1)
     worst = int(np.argmax(median))
-    if median[worst] <= chi2.isf(RUN_TAIL, aid.dim):
-        return ""
     sigmas = np.sqrt(median[worst] / chi2.median(aid.dim))
+    if median[worst] <= chi2.isf(RUN_TAIL, aid.dim) or sigmas < least_sigmas:
+        return ""
     return (
         f"{aid.name} measurements from {one.time_s[worst]:.1f} s to "
         f"{one.time_s[worst + size - 1]:.1f} s miss the answer by "

@@ -372,7 +372,9 @@ class SsmSmoother:
         judged = linearizer.weighted.judged(
             last.states, linearizer.problem.keyframe_s, last.aid_mahalanobis_sq, last.aid_weights
         )
-        doubts += doubts_of_aids(without(judged, solved.aids_out))
+        doubts += doubts_of_aids(
+            without(judged, solved.aids_out), is_searched=self.config.fault_search is not None
+        )
         doubts += ambiguous_beacons(
             last.states,
             linearizer.weighted,

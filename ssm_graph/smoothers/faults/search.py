@@ -210,7 +210,7 @@ def rivals_of(
         found.append(fault_of(elsewhere, judged))
     by_sensor: dict[tuple[str, bool], Fault] = {}
     for one in found:
-        if one.hypothesis.sensor != best.hypothesis.sensor or not is_part_of(one, best):
+        if not is_part_of(one, best):
             by_sensor.setdefault((one.hypothesis.sensor, overlap(one, best) > SAME_STRETCH), one)
     return list(by_sensor.values())
 
