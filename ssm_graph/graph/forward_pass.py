@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from factors.similarity import Kernel
 from ssm_graph.base.frozen import Array
-from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.graph.aids.aid import Aid, RowStates
 from ssm_graph.graph.aids.depth import DepthMeans
 from ssm_graph.graph.aids.gnss import Fixes

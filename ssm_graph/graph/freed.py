@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
-
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.extras import Extra, Extras
 from ssm_graph.graph.aids.aid import Linearised

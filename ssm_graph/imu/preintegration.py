@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -332,7 +331,9 @@ def _unseen(
     for is_gyro, axis, begin, end in frozen:
         # What an axis does meanwhile, a turn perhaps, need not resemble what it did before.
         own = np.eye(3)[axis]
-        rate_and_force = (GAP_GYRO_RATE * own, 0.0 * own) if is_gyro else (0.0 * own, GAP_ACCEL * own)
+        rate_and_force = (
+            (GAP_GYRO_RATE * own, 0.0 * own) if is_gyro else (0.0 * own, GAP_ACCEL * own)
+        )
         stretches.append((begin, end, *rate_and_force))
     unseen = [Unseen()] * (len(keyframe_s) - 1)
     for begin, end, rate, force in stretches:

@@ -19,8 +19,8 @@ from ssm_graph.base.frozen import Array, FrozenArrays, Vector, shaped
 from ssm_graph.base.settings import FILE_KEY, Key, Settings, optional_key, sigma_key
 from ssm_graph.base.tables import Table
 from ssm_graph.base.units import DEG_PER_H, DEGREE, MICRO_G, PER_SQRT_H
-from ssm_graph.sensors.imu_calibration import CALIBRATED, ImuCalibration, calibration_keys
 from ssm_graph.sensors.frozen import frozen_runs
+from ssm_graph.sensors.imu_calibration import CALIBRATED, ImuCalibration, calibration_keys
 from ssm_graph.sensors.instrument import XYZ, Column, Instrument, Lists
 from ssm_graph.sensors.messages import Message
 

@@ -160,9 +160,7 @@ class Weights(NamedTuple):
         of_aids, aids = self.of_aids.after(
             self.aids, last.aid_weights, t=last.aid_mahalanobis_sq, update_sigmas=last.update_sigmas
         )
-        return Weights(
-            faults.leave_out(beams), faults.leave_aids_out(aids), of_beams, of_aids
-        )
+        return Weights(faults.leave_out(beams), faults.leave_aids_out(aids), of_beams, of_aids)
 
     def may_end(self, last: Pass) -> bool:
         """Return whether the weights that the pass led to may be those of the answer."""
@@ -297,7 +295,9 @@ class SsmSmoother:
         found = problem.faults + faults.faults(this.states)
         said = tuple(fault.sentence for fault in found)
         notes = problem.notes + said + _notes_of(first)
-        return Solved(linearizer, this, tuple(iterations), status, notes, first, found, faults.aids_out)
+        return Solved(
+            linearizer, this, tuple(iterations), status, notes, first, found, faults.aids_out
+        )
 
     def _iterate(
         self,

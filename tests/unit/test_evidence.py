@@ -57,7 +57,11 @@ def test_evidence_is_that_of_the_dense_matrix(blocks: list[int]) -> None:
     for i in range(n_blocks):
         for at, begin, stack in (
             (keyframe, 0, [own.own, shared.own]),
-            (of_interval, M, [part.between.reshape(-1, part.between.shape[2]) for part in (own, shared)]),
+            (
+                of_interval,
+                M,
+                [part.between.reshape(-1, part.between.shape[2]) for part in (own, shared)],
+            ),
         ):
             inside = np.flatnonzero((blocks[i] <= at) & (at < blocks[i + 1]))
             columns[begin + inside, 2 * i : 2 * i + 2] = stack[0][inside]

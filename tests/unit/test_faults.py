@@ -87,7 +87,13 @@ LIES = {
         "GNSS",
     ),
     "fixes that are pulled": (
-        Fault(sensor=Sensor.GNSS, start_s=60.0, end_s=160.0, size=(0.0, 0.1, 0.0), shape=FaultShape.RAMP),
+        Fault(
+            sensor=Sensor.GNSS,
+            start_s=60.0,
+            end_s=160.0,
+            size=(0.0, 0.1, 0.0),
+            shape=FaultShape.RAMP,
+        ),
         "GNSS",
     ),
     "a depth that is off": (
@@ -245,9 +251,7 @@ def test_chi_square_of_every_stretch(course: Course) -> None:
             since = np.arange(begin, end) / 10.0
             own = {
                 Course.CONSTANT: own.sum(axis=1),
-                Course.TREND: np.hstack(
-                    [own.sum(axis=1), np.einsum("rbd,b->rd", own, since)]
-                ),
+                Course.TREND: np.hstack([own.sum(axis=1), np.einsum("rbd,b->rd", own, since)]),
                 Course.ANYTHING: own.reshape(90, -1),
             }[course]
             prior = np.diag(np.tile(sigma**-2.0, own.shape[1] // 2))

@@ -99,9 +99,7 @@ def _of_beams(channels: Channels) -> Iterator[Hypothesis]:
     unit = np.eye(channels.of(BEAM).columns.stop)
     n_beams = len(unit)
     for beam in range(n_beams):
-        one = Hypothesis(
-            f"DVL beam {beam + 1}", BEAM, unit[:, [beam]], np.full(1, 3.0), _speeds
-        )
+        one = Hypothesis(f"DVL beam {beam + 1}", BEAM, unit[:, [beam]], np.full(1, 3.0), _speeds)
         yield one
         yield replace(one, course=Course.TREND)
         yield replace(one, course=Course.ANYTHING)

@@ -14,7 +14,13 @@ from ssm_graph.base.stepwise import Steps
 from ssm_graph.engine.error_state import POSITION
 from ssm_graph.engine.evidence import ChainEvidence, Evidence
 from ssm_graph.smoothers.faults.columns import Channels, Linear
-from ssm_graph.smoothers.faults.hypotheses import AT_AN_END, LEAST_PER_NUMBER, PER_NUMBER, Course, Hypothesis
+from ssm_graph.smoothers.faults.hypotheses import (
+    AT_AN_END,
+    LEAST_PER_NUMBER,
+    PER_NUMBER,
+    Course,
+    Hypothesis,
+)
 from ssm_graph.smoothers.faults.nuisances import WIDER, WIDTHS, Nuisances
 
 TREND_S = 100.0
@@ -54,6 +60,7 @@ class Grid(NamedTuple):
 
     @property
     def n_blocks(self) -> int:
+        """How many there are."""
         return len(self.middle_s)
 
 
@@ -160,7 +167,9 @@ class Judge:
             effect += judged.combined(fault)[0] @ size
         linear, columns = self.linear, self.channels.columns
         of_block = effect.reshape(judged.grid.n_blocks, -1)
-        block = np.searchsorted(judged.grid.edges, np.arange(len(linear.states.R_nb)), side="right") - 1
+        block = (
+            np.searchsorted(judged.grid.edges, np.arange(len(linear.states.R_nb)), side="right") - 1
+        )
         own = np.einsum("rc,rc->r", columns.own, of_block[block[linear.own.keyframe]])
         between = np.einsum("kic,kc->ki", columns.between, of_block[block[:-1]])
         solution = yield from linear.solved_steps(own, between)
@@ -256,7 +265,10 @@ class Judged:
         best_so_far: dict[str, float] = {}
         for hypothesis in hypotheses:
             # Where no constant is worth a look in any stretch, there is nothing of another course.
-            if hypothesis.course is Course.ANYTHING and best_so_far.get(hypothesis.sensor, WORTH) < WORTH:
+            if (
+                hypothesis.course is Course.ANYTHING
+                and best_so_far.get(hypothesis.sensor, WORTH) < WORTH
+            ):
                 continue
             chi_sq, charge = self.table(hypothesis)
             largest = float(np.max(chi_sq))

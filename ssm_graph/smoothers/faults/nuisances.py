@@ -1,9 +1,9 @@
-"""Errors that every instrument has and that are nobody's fault: eliminated before anything is judged.
+"""Errors that every instrument has and that are nobody's fault, eliminated before all else.
 
 *Of the inertial data* over the whole mission: scale factors, misalignments and sensitivity of the
-gyros to force, 3 x 3 numbers each; and biases that wander for minutes. *Of beams and depth*: half of
-the noise correlated over seconds, as bottom tracking and waves make it. With white noise alone all
-of these pass for faults.
+gyros to force, 3 x 3 numbers each; and biases that wander for minutes. *Of beams and aids*: a part
+of the noise correlated over seconds, as bottom tracking, waves and multipath make it. With white
+noise alone all of these pass for faults. How wide they are the data say.
 """
 
 from __future__ import annotations
@@ -78,7 +78,9 @@ class Nuisances:
         for beam in np.unique(beams.beam).tolist():
             share, correlation_s = SLOW_BEAM
             sigma = share * float(np.median(beams.sigma[beams.beam == beam]))
-            found.append((channels.of(BEAM).columns.start + beam, sigma, correlation_s, BEAMS_GROUP))
+            found.append(
+                (channels.of(BEAM).columns.start + beam, sigma, correlation_s, BEAMS_GROUP)
+            )
         for aid in self._linear.aids:
             if len(aid) == 0:
                 continue

@@ -1,9 +1,9 @@
 """The search for what was off, and when.
 
 All hypotheses compete over all stretches of whole blocks. The best one that exceeds its charge has
-its edges refined, competes again, is freed, which shows what the others look like without it, and so
-on, as in a step-wise regression. What was found before competes anew at every look, for the first
-solution may be far off.
+its edges refined, competes again, is freed, which shows what the others look like without it, and
+so on, as in a step-wise regression. What was found before competes anew at every look, for the
+first solution may be far off.
 """
 
 from __future__ import annotations
@@ -68,8 +68,7 @@ class Look:
         self.hypotheses = hypotheses_of(channels, significance=settings.significance)
 
     def find_steps(self, known: Sequence[Fault]) -> Steps[list[Fault]]:
-        """Return what is off: what was thought to be before, as it competes now, and what is new.
-        """
+        """Return what is off: what was before, as it competes now, and what is new."""
         self._judge.fit(self._grid(with_rivals(known)), with_rivals(known))
         yield self._work
         found = list(known)
@@ -160,7 +159,9 @@ class Look:
         time_s = np.append(self._keyframe_s, last_s + 1.0)
         edges_s = [np.arange(first_s, last_s, step_s)]
         edges_s.extend(time_s[[fault.begin, fault.end]] for fault in faults)
-        fine_s = np.concatenate([np.arange(-5.0, 6.0) * FINE_S, [-step_s, -0.75 * step_s, 0.75 * step_s, step_s]])
+        fine_s = np.concatenate(
+            [np.arange(-5.0, 6.0) * FINE_S, [-step_s, -0.75 * step_s, 0.75 * step_s, step_s]]
+        )
         for fault in around:
             edges_s.extend(edge_s + fine_s for edge_s in time_s[[fault.begin, fault.end]])
         return Grid.of(self._keyframe_s, np.concatenate(edges_s), block_s=step_s)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -17,10 +17,18 @@ from ssm_graph.engine.reweighting import NEAR_SIGMAS
 from ssm_graph.engine.states import States
 from ssm_graph.graph.freed import Freed
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.mission.fault import DetectedFault, Treatment
 from ssm_graph.graph.measurements import aids_of
+from ssm_graph.mission.fault import DetectedFault, Treatment
 from ssm_graph.mission.problem import Problem
-from ssm_graph.smoothers.faults.columns import BEAM, IMU, Channels, linear_of_steps
+from ssm_graph.smoothers.faults.columns import (
+    BEAM,
+    BOTTOM,
+    IMU,
+    MOUNTING,
+    SCALE,
+    Channels,
+    linear_of_steps,
+)
 from ssm_graph.smoothers.faults.hypotheses import Course
 from ssm_graph.smoothers.faults.judged import TREND_S, Fault, Judge
 from ssm_graph.smoothers.faults.nuisances import Nuisances
@@ -92,14 +100,14 @@ class FaultWatch:
         if is_same:
             return None
         self._found = sorted(found, key=lambda fault: (fault.begin, fault.end))
-        freed = self._freed(channels)
-        problem = self._problem
+        self._leave_out(channels)
+        freed, problem = self._freed(channels), self._problem
         if len(freed.sigma):
             blocks = (*problem.extras.blocks, freed.variable)
             problem = replace(problem, extras=Extras(blocks))
         constants = np.concatenate([bare_states.constants, np.zeros(len(freed.sigma))])
         return Changed(
-            GraphLinearizer(problem, freed),
+            GraphLinearizer(problem, freed if len(freed.sigma) else None),
             bare_states._replace(constants=constants),
             self.leave_out(linear.beam_weights),
             self.leave_aids_out(np.concatenate([np.zeros(0), *linear.aid_weights.values()])),
@@ -119,57 +127,43 @@ class FaultWatch:
         return found
 
     def _freed(self, channels: Channels) -> Freed:
-        """Return the columns of all that was found, and what is left out."""
-        keyframe_s, beams = self._problem.keyframe_s, self._problem.beams
-        self._beams_out = np.zeros(len(beams.speed), bool)
-        sigma = [np.zeros(0)]
-        on_beams = [np.zeros((len(beams.speed), 0))]
-        between = [np.zeros((*channels.between.shape[:2], 0))]
-        of_aid: dict[str, list[Array]] = {name: [] for name in channels.aids}
-        aid_keyframe = channels.aid_keyframe
-        aids_out = {name: np.zeros(len(keyframe), bool) for name, keyframe in aid_keyframe.items()}
-        for fault in with_rivals(self._found):
-            hypothesis, name = fault.hypothesis, fault.hypothesis.channel
-            C = hypothesis.combined
-            if hypothesis.course is Course.ANYTHING:
-                if name == BEAM:
-                    is_own = np.isin(beams.beam, np.flatnonzero(C.any(axis=1)))
-                    self._beams_out |= is_own & _inside(beams.keyframe, fault)
-                else:
-                    aids_out[name] |= _inside(aid_keyframe[name], fault)
-                continue
-            d = C.shape[1] * (2 if hypothesis.course is Course.TREND else 1)
-            sigma.append(np.tile(hypothesis.sigma, d // C.shape[1]))
-            columns = channels.of(name).columns
-            at_beams = channels.beams[:, columns] @ C if name not in (*of_aid, IMU) else None
-            on_beams.append(
-                _over(at_beams, beams.keyframe, fault, keyframe_s)
-                if at_beams is not None
-                else np.zeros((len(beams.speed), d))
-            )
-            at_imu = channels.between @ C if name == IMU else None
-            between.append(
-                np.zeros((*channels.between.shape[:2], d))
-                if at_imu is None
-                else _over(at_imu, np.arange(len(at_imu)), fault, keyframe_s)
-            )
-            for aid, parts in of_aid.items():
-                root = channels.aids[aid]
-                if aid == name:
-                    parts.append(_over(root @ C, aid_keyframe[aid], fault, keyframe_s))
-                else:
-                    parts.append(np.zeros((*root.shape[:2], d)))
-        self.aids_out = np.concatenate([np.zeros(0, bool), *aids_out.values()])
+        """Return the columns of all that was found."""
+        faults = [one for one in with_rivals(self._found) if one.n_constants]
+        beams, time_s = self._problem.beams, self._problem.keyframe_s
+        on_array = {
+            name: channels.beams[:, channels.of(name).columns]
+            for name in (BEAM, BOTTOM, SCALE, MOUNTING)
+        }
+        on_imu = {IMU: channels.between}
+        keyframes = np.arange(len(channels.between))
         return Freed(
-            sigma=np.concatenate(sigma),
-            beams=np.hstack(on_beams),
-            between=np.concatenate(between, axis=2),
+            sigma=np.concatenate(
+                [np.zeros(0), *(np.resize(one.hypothesis.sigma, one.n_constants) for one in faults)]
+            ),
+            beams=_columns(faults, on_array, beams.keyframe, time_s),
+            between=_columns(faults, on_imu, keyframes, time_s),
             aids={
-                aid: np.concatenate(parts, axis=2)
-                for aid, parts in of_aid.items()
-                if any(np.any(part) for part in parts)
+                name: _columns(faults, {name: root}, channels.aid_keyframe[name], time_s)
+                for name, root in channels.aids.items()
+                if any(one.hypothesis.channel == name for one in faults)
             },
         )
+
+    def _leave_out(self, channels: Channels) -> None:
+        """Note which measurements may have read anything."""
+        beams = self._problem.beams
+        self._beams_out = np.zeros(len(beams.speed), bool)
+        aids_out = {name: np.zeros(len(own), bool) for name, own in channels.aid_keyframe.items()}
+        for fault in with_rivals(self._found):
+            name = fault.hypothesis.channel
+            if fault.n_constants:
+                continue
+            if name == BEAM:
+                own = np.flatnonzero(fault.hypothesis.combined.any(axis=1))
+                self._beams_out |= np.isin(beams.beam, own) & _inside(beams.keyframe, fault)
+            else:
+                aids_out[name] |= _inside(channels.aid_keyframe[name], fault)
+        self.aids_out = np.concatenate([np.zeros(0, bool), *aids_out.values()])
 
     def faults(self, states: States) -> tuple[DetectedFault, ...]:
         """Return what was found, with the sizes that the answer gives it."""
@@ -178,10 +172,11 @@ class FaultWatch:
         for fault in self._sized(states):
             hypothesis = fault.hypothesis
             rivals = [
-                f"{one.hypothesis.sensor}, {end_s[one.begin]:.0f}-{end_s[one.end]:.0f} s, {said(one)}"
+                f"{one.hypothesis.sensor}, {end_s[one.begin]:.0f}-{end_s[one.end]:.0f} s, "
+                f"{said(one)}"
                 for one in fault.rivals
             ]
-            is_anything = hypothesis.course is Course.ANYTHING
+            treatment = Treatment.FREED if fault.n_constants else Treatment.LEFT_OUT
             found.append(
                 DetectedFault(
                     sensor=hypothesis.sensor,
@@ -190,11 +185,7 @@ class FaultWatch:
                     end_s=float(end_s[fault.end]),
                     chi_sq=fault.chi_sq,
                     dof=hypothesis.n_numbers,
-                    treatment=Treatment.COVERED
-                    if rivals
-                    else Treatment.LEFT_OUT
-                    if is_anything
-                    else Treatment.FREED,
+                    treatment=Treatment.COVERED if rivals else treatment,
                     rivals=tuple(rivals),
                     cost_m=fault.cost_m,
                 )
@@ -237,9 +228,29 @@ def _inside(keyframe: NDArray[np.intp], fault: Fault) -> NDArray[np.bool_]:
     return (keyframe >= fault.begin) & (keyframe < fault.end)
 
 
-def _over(
-    columns: Array, keyframe: NDArray[np.intp], fault: Fault, keyframe_s: Array
+def _columns(
+    faults: Sequence[Fault],
+    of_channels: Mapping[str, Array],
+    keyframe: NDArray[np.intp],
+    keyframe_s: Array,
 ) -> Array:
+    """Return the columns (N, ..., F) of faults on rows at keyframes (N,).
+
+    ``of_channels`` are those (N, ..., c) of the channels that act on these rows.
+    """
+    rows = next(iter(of_channels.values())).shape[:-1]
+    parts = [np.zeros((*rows, 0))]
+    for fault in faults:
+        hypothesis = fault.hypothesis
+        if hypothesis.channel in of_channels:
+            columns = of_channels[hypothesis.channel] @ hypothesis.combined
+            parts.append(_over(columns, keyframe, fault, keyframe_s))
+        else:
+            parts.append(np.zeros((*rows, fault.n_constants)))
+    return np.concatenate(parts, axis=-1)
+
+
+def _over(columns: Array, keyframe: NDArray[np.intp], fault: Fault, keyframe_s: Array) -> Array:
     """Return columns (N, ..., d) of rows at keyframes (N,) over the stretch of a fault."""
     inside = _inside(keyframe, fault).reshape(-1, *[1] * (columns.ndim - 1))
     constant = columns * inside
