@@ -150,6 +150,21 @@ class ChainEvidence:
         lower = np.tril(information)
         return Evidence(score, lower + np.tril(information, -1).T)
 
+    def each(self, blocks: NDArray[np.intp], own: Columns) -> tuple[Array, Array]:
+        """Return score (N, B) and information (N, B, B) of the columns of each block alone.
+
+        Parameters as of :meth:`of`.
+        """
+        n, width = self._n, own.own.shape[1]
+        history, outgoing = self._histories(blocks, own, width)
+        score, information = np.zeros((len(history), width)), np.zeros((len(history), width, width))
+        for i, (begin, end) in enumerate(itertools.pairwise(blocks.tolist())):
+            dense, missed = self._inside(begin, end, own)
+            y, onward = history[i][:, n:], outgoing[i][:, n:]
+            score[i] = dense.T @ missed
+            information[i] = dense.T @ dense - y.T @ y - onward.T @ self._ahead[end] @ onward
+        return score, information
+
     def _inside(self, begin: int, end: int, columns: Columns) -> tuple[Array, Array]:
         """Return columns and errors of all rows of a block."""
         rows = slice(self._first_row[begin], self._first_row[end])

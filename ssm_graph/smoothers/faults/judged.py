@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps
 from ssm_graph.engine.error_state import POSITION
-from ssm_graph.engine.evidence import ChainEvidence, Evidence
-from ssm_graph.smoothers.faults.columns import Channels, Linear
+from ssm_graph.engine.evidence import ChainEvidence, Columns, Evidence
+from ssm_graph.smoothers.faults.columns import IMU, Channels, Linear
 from ssm_graph.smoothers.faults.hypotheses import (
     AT_AN_END,
     LEAST_PER_NUMBER,
@@ -25,6 +25,10 @@ from ssm_graph.smoothers.faults.nuisances import WIDER, WIDTHS, Nuisances
 
 TREND_S = 100.0
 """s, in which the rate of a trend is counted here."""
+LEAST_FORCE = 10.0
+"""m/s^2, of a jump: it is no larger."""
+MEDIAN_OF_THREE = 2.366
+"""Of a chi-square with three degrees of freedom."""
 WORTH = 15.0
 """Chi-square of a constant from which on a sensor may be off by anything."""
 
@@ -159,6 +163,22 @@ class Judge:
         blocks = Evidence(whole.score[:n], whole.information[:n, :n])
         left = blocks.without(crossed.score, crossed.information[:, :n], inner)
         return Judged(left, grid, self.channels)
+
+    def jolts(self, grid: Grid) -> Array:
+        """Return the chi-square of a jump of velocity within each block alone (N,).
+
+        What begins or ends within it looks like one. It is for noise as usual in this mission.
+        """
+        columns = self.channels.columns
+        first = self.channels.of(IMU).columns.start
+        force = slice(first, first + 3)
+        own = Columns(columns.own[:, force], columns.between[:, :, force])
+        score, information = self._chain.each(grid.edges, own)
+        least = LEAST_FORCE**-2 * np.eye(3)
+        chi_sq = np.sum(
+            score * np.linalg.solve(information + least, score[..., None])[..., 0], axis=1
+        )
+        return np.asarray(chi_sq / max(float(np.median(chi_sq)) / MEDIAN_OF_THREE, 1.0))
 
     def way_steps(self, judged: Judged, faults: Sequence[Fault]) -> Steps[Array]:
         """Return where the trajectory goes (K, 3), in body axes, m, if these are freed."""

@@ -16,7 +16,7 @@ import numpy as np
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.stepwise import Steps
 from ssm_graph.smoothers.faults.columns import IMU, Channels
-from ssm_graph.smoothers.faults.hypotheses import Course, hypotheses_of
+from ssm_graph.smoothers.faults.hypotheses import Course, Hypothesis, hypotheses_of
 from ssm_graph.smoothers.faults.judged import Candidate, Fault, Grid, Judge, Judged
 
 FINE_S = 1.0
@@ -26,11 +26,11 @@ NEW_PER_LOOK = 3
 STRONG = 300.0
 """Chi-square of a fault after which the solution is made anew before more is looked for."""
 HINT = 0.75
-"""Share of its charge from which on a stretch of the coarse grid is looked at more closely."""
-JOLT = 30.0
-"""Chi-square of inertial data within few blocks, from which on an edge is looked for there."""
-LONGEST_JOLT = 2
-"""Blocks"""
+"""Share of its charge from which on a stretch of the coarse grid is looked at more closely:
+edges off the grid hide most of a fault."""
+JOLT = 22.0
+"""Chi-square of a jump of velocity, from which on an edge is looked for there: one of three numbers
+in 400 places is above it once in 50 missions."""
 INERTIAL_SHARE = 0.5
 """Of the merit of an inertial fault, from which on another sensor's is taken instead."""
 SAME_STRETCH = 0.5
@@ -88,7 +88,11 @@ class Look:
         left = coarse.with_freed(with_rivals(found))
         ranked = left.best_of(self.hypotheses)
         yield self._work
-        hints = [fault_of(one, left) for one in hints_of(ranked)]
+        best = ranked[0]
+        hints = []
+        if best.chi_sq > HINT * best.hypothesis.charge(best.n_numbers()):
+            hints.append(fault_of(best, left))
+        hints.extend(self._jolts(best.hypothesis))
         if not hints:
             return None
         fine = self._judge.on(self._grid(with_rivals(found), around=hints))
@@ -102,6 +106,23 @@ class Look:
         best = fault_of(chosen, left)
         rivals = rivals_of(best, ranked, left, margin=self._settings.margin)
         return (yield from self._against_steps(best, rivals, fine, found))
+
+    def _jolts(self, hypothesis: Hypothesis) -> list[Fault]:
+        """Return the second in which something may begin or end, if there is one.
+
+        Edges off the coarse grid hide most of a fault, but the inertial data show them.
+        """
+        found = []
+        for shift_s in (0.0, FINE_S):
+            begin_s = self._keyframe_s[0] + shift_s
+            edges_s = np.arange(begin_s, self._keyframe_s[-1], 2.0 * FINE_S)
+            grid = Grid.of(self._keyframe_s, edges_s)
+            jolts = self._judge.jolts(grid)
+            worst = int(np.argmax(jolts))
+            begin, end = grid.edges[worst : worst + 2].tolist()
+            found.append(Fault(hypothesis, begin, end, float(jolts[worst])))
+        worst_of_both = max(found, key=lambda one: one.chi_sq)
+        return [worst_of_both] if worst_of_both.chi_sq > JOLT else []
 
     def _again_steps(self, found: list[Fault]) -> Steps[list[Fault]]:
         """Let each compete anew about where it is, the others being freed; some are none then.
@@ -185,20 +206,6 @@ def chosen_of(ranked: Sequence[Candidate]) -> Candidate | None:
     others = (one for one in significant if one.hypothesis.channel != IMU)
     other = next(others, best)
     return other if other.merit > INERTIAL_SHARE * best.merit else best
-
-
-def hints_of(ranked: Sequence[Candidate]) -> list[Candidate]:
-    """Return what is worth a closer look: edges off the grid hide most of a fault.
-
-    The inertial data show an edge of anything, as a jolt within its block.
-    """
-    best = ranked[0]
-    hints = [best] if best.chi_sq > HINT * best.hypothesis.charge(best.n_numbers()) else []
-    jolt = next(one for one in ranked if one.hypothesis.channel == IMU)
-    is_short = jolt.end - jolt.begin <= LONGEST_JOLT
-    if is_short and jolt.chi_sq > JOLT and jolt is not best:
-        hints.append(jolt)
-    return hints
 
 
 def rivals_of(
