@@ -83,8 +83,9 @@ def _add_loop_options(parser: argparse.ArgumentParser) -> None:
         "--find-faults",
         action=argparse.BooleanOptionalAction,
         default=True,
-        help="look for stretches in which one beam is off for long (biased, drifting, covered, "
-        "stuck) and leave them out; single bad pings are the kernel's business (default: yes)",
+        help="look for what is off for long (beams, the bottom, scale, mounting, fixes, depth, "
+        "inertial data) and free the answer of it; single bad pings are the kernel's business "
+        "(default: yes)",
     )
 
 

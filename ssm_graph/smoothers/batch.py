@@ -283,9 +283,9 @@ class SsmSmoother:
                     linearizer, states, update_sigmas=this.update_sigmas
                 )
             if changed is not None:
-                linearizer, states, *own = changed
-                rows = linearizer.beam_rows(states)
-                weights = Weights(*own, self.config.schedule(), weights.of_aids)
+                linearizer, states = changed.linearizer, changed.states
+                rows, schedule = linearizer.beam_rows(states), self.config.schedule()
+                weights = Weights(changed.weights, changed.aid_weights, schedule, weights.of_aids)
                 continue
             if is_settled:
                 status = Status.CONVERGED

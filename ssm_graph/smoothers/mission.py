@@ -44,8 +44,8 @@ def smooth_steps(
     Parameters
     ----------
     mission : from :func:`ssm_graph.read_mission` or a simulation.
-    config : settings of the similarity loop; without, its defaults and the search for faults of
-        one beam that last.
+    config : settings of the similarity loop; without, its defaults and the search for faults
+        that last.
     problem_config : rates and intervals of the graph.
     on_iteration : called with number, limit and :class:`ssm_graph.Iteration` after each iteration.
     on_stage : called with a line of text when a new stage begins.

@@ -180,7 +180,7 @@ FAMILIES: Final[Mapping[str, Family]] = {
         for name in ("log", "sqrt", "exp")
     },
     "smoother-log-faults": Family(
-        "batch smoother, log kernel, without stretches of a beam off by so many sigmas of its mean",
+        "batch smoother, log kernel, freed of what lasts and is off by so many sigmas",
         lambda value: _smoother(SmootherConfig(fault_search=FaultSearch(significance=value))),
         FaultSearch().significance,
     ),

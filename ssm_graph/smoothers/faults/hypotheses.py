@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from enum import Enum
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 from scipy.stats import chi2
@@ -67,7 +67,7 @@ class Hypothesis:
     @property
     def n_numbers(self) -> int:
         """Of one stretch that is not by anything."""
-        return self.combined.shape[1] * (2 if self.course is Course.TREND else 1)
+        return int(self.combined.shape[1]) * (2 if self.course is Course.TREND else 1)
 
     def charge(self, n_numbers: int) -> float:
         """Return the chi-square that hypotheses are compared beyond: each number has its price."""
@@ -111,7 +111,7 @@ def _of_beams(channels: Channels) -> Iterator[Hypothesis]:
                 BEAM,
                 unit[:, [a]] + sign * unit[:, [b]],
                 np.full(1, 3.0),
-                lambda s, sign=sign: _speeds(np.array([s[0], sign * s[0]])),
+                partial(_pair, sign),
             )
         yield Hypothesis(sensor, BEAM, unit[:, [a, b]], np.full(2, 3.0), _speeds)
 
@@ -146,6 +146,10 @@ AIDS = {
     "heading": ("rad", 1.0),
 }
 """Unit and prior sigma of what an aid is off by."""
+
+
+def _pair(sign: float, s: Array) -> str:
+    return _speeds(np.array([s[0], sign * s[0]]))
 
 
 def _speeds(s: Array) -> str:

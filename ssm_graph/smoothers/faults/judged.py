@@ -136,7 +136,7 @@ class Judge:
         self._chain = ChainEvidence(linear.solution, linear.own, linear.between)
         self._last: tuple[NDArray[np.intp], Evidence] | None = None
 
-        self.widths = (1.0, 1.0, 1.0)
+        self.widths: tuple[float, ...] = (1.0, 1.0, 1.0)
         """Of the nuisances of beams, aids and inertial data"""
 
     def fit(self, grid: Grid, faults: Sequence[Fault]) -> None:

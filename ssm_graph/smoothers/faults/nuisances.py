@@ -52,7 +52,7 @@ class Nuisances:
         """What the priors of the shared columns (C,) say of their sizes."""
         return self._own_score
 
-    def priors(self, coarse: Array, middle_s: Array) -> Priors:
+    def priors(self, coarse: NDArray[np.intp], middle_s: Array) -> Priors:
         """Return the nuisances of G coarse blocks, and their priors.
 
         Parameters
@@ -121,7 +121,7 @@ class Priors:
 
     def __init__(
         self,
-        coarse: Array,
+        coarse: NDArray[np.intp],
         columns: NDArray[np.intp],
         parts: list[tuple[Array, int]],
         is_own: NDArray[np.bool_],
@@ -176,7 +176,7 @@ class Priors:
                 known[widths] = 0.5 * (float(half @ half) - spread + self.log_det(widths))
             return known[widths]
 
-        widths = (1.0, 1.0, 1.0)
+        widths: tuple[float, ...] = (1.0, 1.0, 1.0)
         for group in (IMU_GROUP, BEAMS_GROUP, AIDS_GROUP):
             tried = [(*widths[:group], one, *widths[group + 1 :]) for one in choices]
             likeliest = max(likelihood(one) for one in tried)

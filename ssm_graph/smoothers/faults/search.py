@@ -88,11 +88,10 @@ class Look:
         left = coarse.with_freed(with_rivals(found))
         ranked = left.best_of(self.hypotheses)
         yield self._work
-        best = ranked[0]
-        hints = []
-        if best.chi_sq > HINT * best.hypothesis.charge(best.n_numbers()):
-            hints.append(fault_of(best, left))
-        hints.extend(self._jolts(best.hypothesis))
+        first = ranked[0]
+        hints = self._jolts(first.hypothesis)
+        if first.chi_sq > HINT * first.hypothesis.charge(first.n_numbers()):
+            hints.append(fault_of(first, left))
         if not hints:
             return None
         fine = self._judge.on(self._grid(with_rivals(found), around=hints))
