@@ -29,7 +29,7 @@ from ssm_graph.smoothers.faults.columns import (
 PER_NUMBER = 6.0
 """Chi-square that each further number of a hypothesis has to earn besides, against others."""
 LEAST_PER_NUMBER = 2.0
-"""And by itself: stretches are many, and many numbers more than their tails allow for."""
+"""And by itself, where it may be anything: that fits more than its tail allows for."""
 
 
 AT_AN_END = 4.5
@@ -71,12 +71,12 @@ class Hypothesis:
 
     def charge(self, n_numbers: int) -> float:
         """Return the chi-square that hypotheses are compared beyond: each number has its price."""
-        return self.least(n_numbers) + (PER_NUMBER - LEAST_PER_NUMBER) * (n_numbers - 1)
+        return chi_sq_at(self.tail, n_numbers) + PER_NUMBER * (n_numbers - 1) + self.handicap
 
     def least(self, n_numbers: int) -> float:
         """Return the chi-square from which on so many numbers are no chance."""
-        beyond_chance = chi_sq_at(self.tail, n_numbers) + LEAST_PER_NUMBER * (n_numbers - 1)
-        return beyond_chance + self.handicap
+        more = LEAST_PER_NUMBER * (n_numbers - 1) if self.course is Course.ANYTHING else 0.0
+        return chi_sq_at(self.tail, n_numbers) + more + self.handicap
 
 
 @cache

@@ -24,7 +24,7 @@ SLOW_BEAM = (0.7, 20.0)
 SLOW_AIDS = {"depth": (0.5, 20.0)}
 SLOW_AID = (0.5, 100.0)
 """The same of aids, by name, and of all others: swell at a pressure port, multipath of fixes."""
-SLOW_BIAS = (0.3, 300.0)
+SLOW_BIAS = (0.6, 200.0)
 """Turn-on sigmas of the biases, and s."""
 
 CLEARLY = 3.0
@@ -32,9 +32,9 @@ CLEARLY = 3.0
 
 
 BEAMS_GROUP, AIDS_GROUP, IMU_GROUP = range(3)
-WIDTHS = (0.25, 0.5, 1.0)
+WIDTHS = (0.5, 1.0)
 """Of what the sizes above say, how much there may be; the data choose."""
-WIDER = (0.25, 0.5, 1.0, 2.0, 4.0)
+WIDER = (0.5, 1.0, 2.0, 4.0)
 """The same once faults are freed, which otherwise pass for noise."""
 
 
