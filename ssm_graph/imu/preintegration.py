@@ -324,10 +324,10 @@ def _unseen(
 
     That is its longest stretch of a gap, or of gyros or accelerometers that repeat themselves.
     """
-    stretches = []
+    stretches: list[tuple[float, float, Array, Array]] = []
     for gap in zip(*gaps, strict=True):
-        rate, force = _liveliness(imu, *gap)
-        stretches.append((*gap, np.full(3, rate), np.full(3, force)))
+        lively, pushed = _liveliness(imu, *gap)
+        stretches.append((*gap, np.full(3, lively), np.full(3, pushed)))
     for is_gyro, axis, begin, end in frozen:
         # What an axis does meanwhile, a turn perhaps, need not resemble what it did before.
         own = np.eye(3)[axis]

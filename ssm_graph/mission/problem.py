@@ -277,24 +277,31 @@ def without_frozen(mission: Mission) -> tuple[Mission, tuple[DetectedFault, ...]
     Axes of the inertial sensors that do are unseen motion, see
     :func:`ssm_graph.imu.preintegration.preintegrate`.
     """
-    found, logs = [], {}
-    for name, log in (("GNSS", mission.gnss), ("depth", mission.depth)):
-        if log is None:
-            continue
-        read = log.depth[:, None] if name == "depth" else np.column_stack([log.lat, log.lon])
-        is_frozen = np.zeros(len(log.time_s), bool)
-        runs = frozen_runs(log.time_s, read, least_s=FROZEN_S, least_count=FROZEN_READINGS)
-        for begin, end in runs:
-            is_frozen[begin + 1 : end + 1] = True
-            span_s = float(log.time_s[begin]), float(log.time_s[end])
-            found.append(_repeating(name, "repeats one reading", *span_s, Treatment.LEFT_OUT))
-        if runs:
-            logs[name.lower()] = log.rows(~is_frozen)
-    for is_gyro, axis, *span_s in frozen_axes(mission.imu):
-        name, where = ("gyros", "about") if is_gyro else ("accelerometers", "along")
-        what = f"one reading again and again {where} {'xyz'[axis]}"
-        found.append(_repeating(name, what, *span_s, Treatment.COVERED))
-    return replace(mission, **logs), tuple(found)
+    found: list[DetectedFault] = []
+    gnss, depth = mission.gnss, mission.depth
+    if gnss is not None:
+        kept = _measured("GNSS", gnss.time_s, np.column_stack([gnss.lat, gnss.lon]), found)
+        gnss = gnss if kept.all() else gnss.rows(kept)
+    if depth is not None:
+        kept = _measured("depth", depth.time_s, depth.depth[:, None], found)
+        depth = depth if kept.all() else depth.rows(kept)
+    for axis in frozen_axes(mission.imu):
+        name, where = ("gyros", "about") if axis.is_gyro else ("accelerometers", "along")
+        what = f"one reading again and again {where} {'xyz'[axis.axis]}"
+        found.append(_repeating(name, what, axis.begin_s, axis.end_s, Treatment.COVERED))
+    return replace(mission, gnss=gnss, depth=depth), tuple(found)
+
+
+def _measured(
+    sensor: str, time_s: Array, values: Array, found: list[DetectedFault]
+) -> NDArray[np.bool_]:
+    """Return which readings (N, d) do not repeat one, and note those that do."""
+    kept = np.ones(len(time_s), bool)
+    for begin, end in frozen_runs(time_s, values, least_s=FROZEN_S, least_count=FROZEN_READINGS):
+        kept[begin + 1 : end + 1] = False
+        span_s = float(time_s[begin]), float(time_s[end])
+        found.append(_repeating(sensor, "repeats one reading", *span_s, Treatment.LEFT_OUT))
+    return kept
 
 
 def _repeating(
