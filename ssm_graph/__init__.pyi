@@ -131,7 +131,7 @@ from ssm_graph.simulation import simulate as simulate
 from ssm_graph.simulation import with_faults as with_faults
 from ssm_graph.smoothers.batch import SmootherConfig as SmootherConfig
 from ssm_graph.smoothers.batch import SsmSmoother as SsmSmoother
-from ssm_graph.smoothers.beam_faults import FaultSearch as FaultSearch
+from ssm_graph.smoothers.faults.search import FaultSearch as FaultSearch
 from ssm_graph.smoothers.fixed_lag import FixedLagConfig as FixedLagConfig
 from ssm_graph.smoothers.fixed_lag import solve_fixed_lag as solve_fixed_lag
 from ssm_graph.smoothers.mission import smooth as smooth

@@ -24,7 +24,7 @@ from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.problem import ProblemConfig
 from ssm_graph.report.terminal.progress import ProgressDisplay
 from ssm_graph.smoothers.batch import SmootherConfig
-from ssm_graph.smoothers.beam_faults import FaultSearch
+from ssm_graph.smoothers.faults.search import FaultSearch
 from ssm_graph.smoothers.mission import smooth
 
 GNC = "gnc-tls"
@@ -88,8 +88,9 @@ def _add_loop_options(parser: argparse.ArgumentParser) -> None:
         "--find-faults",
         action=argparse.BooleanOptionalAction,
         default=True,
-        help="look for stretches in which one beam is off for long (biased, drifting, covered, "
-        "stuck) and leave them out; single bad pings are the kernel's business (default: yes)",
+        help="look for what is off for long (beams, the bottom, scale, mounting, fixes, depth, "
+        "inertial data) and free the answer of it; single bad pings are the kernel's business "
+        "(default: yes)",
     )
 
 

@@ -10,8 +10,8 @@ import itertools
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from factors.inertial import Intervals
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps, finished
 from ssm_graph.engine.chain import Chain, ChainSolution
@@ -21,6 +21,7 @@ from ssm_graph.engine.marginal_prior import prior_at_start
 from ssm_graph.engine.states import States
 from ssm_graph.graph.aids.aid import RowStates
 from ssm_graph.graph.beam_rows import BeamRows, CalibratedBeams
+from ssm_graph.graph.freed import FAULTS, Freed
 from ssm_graph.graph.inertial_rows import InertialRows
 from ssm_graph.graph.measurements import Measurements, states_at
 from ssm_graph.mission.calibration import needs_motion
@@ -47,14 +48,15 @@ class Misfit(NamedTuple):
 class GraphLinearizer:
     """Linearises and solves the whole graph of a problem at any states and beam weights."""
 
-    def __init__(self, problem: Problem) -> None:
-        self.problem = problem
+    def __init__(self, problem: Problem, freed: Freed | None = None) -> None:
+        """Take a problem, and what sensors are off by: with the last of its constants for it."""
+        self.problem, self._freed = problem, freed
         self.intervals = problem.chain.intervals
         """Of the inertial data, about errors of the sensors near the states"""
         self._chain = problem.chain
         self._inertial = InertialRows(problem.frame, problem.extras)
         self.prior = prior_at_start(with_extras(start_of(problem), problem.extras.walks))
-        self.weighted = Measurements.of_problem(problem)
+        self.weighted = Measurements.of_problem(problem, freed)
         self._beams = CalibratedBeams(problem.beams, problem.extras, problem.frame)
         self._n_judged = 0
 
@@ -81,19 +83,14 @@ class GraphLinearizer:
             self._chain = yield from self._chain.about_steps(errors)
             self.intervals = self._chain.intervals
 
-    def intervals_at(self, states: States) -> Intervals:
-        """Return the inertial data without the errors that the states say the sensors have."""
-        errors, _ = imu_errors(self.problem.extras, states.walks[0], states.constants)
-        return self.intervals.without_errors(errors)
-
-    def take_inertial(self, intervals: Intervals) -> None:
-        """Take other inertial data of the same intervals, such as those of :meth:`intervals_at`."""
-        self.intervals = intervals
-
     def beam_rows(self, states: States) -> BeamRows:
         """Linearise all beams at ``states``."""
         prepared = self._beams.prepare(states.walks, states.constants, states.bias)
-        return self._beams.rows(self._at_beams(states), prepared)
+        rows = self._beams.rows(self._at_beams(states), prepared)
+        if self._freed is None:
+            return rows
+        rows.jacobian[:, self.problem.extras.columns(FAULTS)] = self._freed.beams
+        return rows._replace(error=rows.error + self._freed.beams @ self._off_by(states))
 
     def solve(
         self, states: States, beam_rows: BeamRows, weights: Array, aid_weights: Array | None = None
@@ -108,15 +105,25 @@ class GraphLinearizer:
         self, states: States, beam_rows: BeamRows, weights: Array, aid_weights: Array | None = None
     ) -> Steps[ChainSolution]:
         """Make :meth:`solve` in steps."""
+        keyframe, own = self._own_rows(states, beam_rows, weights, aid_weights)
+        yield 0.005 * self.problem.n_keyframes
+        between = self.inertial_rows(states)
+        yield 0.02 * self.problem.n_keyframes
+        return (yield from self.solve_rows_steps(states, keyframe, own, between))
+
+    def solve_rows_steps(
+        self, states: States, keyframe: NDArray[np.intp], own: Array, between: Array
+    ) -> Steps[ChainSolution]:
+        """Solve rows (R, width + 1) of one keyframe each, in their order, and those between."""
         extras, prior = self.problem.extras, self.prior.rows(states)
         n, constants = extras.state_dim, np.zeros((extras.state_dim, extras.n_constants))
         chain = Chain(n, extras.n_constants)
-        own = self._own_rows(states, beam_rows, weights, aid_weights)
-        yield 0.005 * len(own)
-        between = self.inertial_rows(states)
-        yield 0.02 * len(own)
+        first = np.searchsorted(keyframe, np.arange(self.problem.n_keyframes + 1)).tolist()
         yield from chain.eliminate_steps(
-            np.hstack([prior[:, :n], constants, prior[:, n:]]), own, between, begin=0
+            np.hstack([prior[:, :n], constants, prior[:, n:]]),
+            [own[begin:end] for begin, end in itertools.pairwise(first)],
+            between,
+            begin=0,
         )
         sigma = extras.sigma[extras.n_walks :]
         border = np.column_stack([np.diag(1.0 / sigma), -states.constants / sigma])
@@ -124,7 +131,20 @@ class GraphLinearizer:
 
     def inertial_rows(self, states: States) -> Array:
         """Return the rows of inertial data and walks, see :class:`InertialRows`."""
-        return self._inertial.rows(self.intervals, states)
+        rows = self._inertial.rows(self.intervals, states)
+        if self._freed is not None:
+            own, extras = self._freed.between, self.problem.extras
+            columns = extras.columns(FAULTS)
+            rows[:, :STATE_DIM, extras.state_dim :][..., columns] = own
+            rows[:, :STATE_DIM, -1] -= own @ self._off_by(states)
+        return rows
+
+    def inertial_errors(self, states: States) -> Array:
+        """Return the whitened errors (K - 1, n) of inertial data, then of the walks."""
+        errors = self._inertial.errors(self.intervals, states)
+        if self._freed is not None:
+            errors[:, :STATE_DIM] += self._freed.between @ self._off_by(states)
+        return errors
 
     def cost(
         self, states: States, beam_rows: BeamRows, weights: Array, aid_weights: Array | None = None
@@ -135,13 +155,18 @@ class GraphLinearizer:
         squares += np.sum(self.weighted.rows(states, aid_weights).error ** 2)
         constants_sigma = self.problem.extras.sigma[self.problem.extras.n_walks :]
         squares += np.sum((states.constants / constants_sigma) ** 2)
-        squares += np.sum(self._inertial.errors(self.intervals, states) ** 2)
+        squares += np.sum(self.inertial_errors(states) ** 2)
         return float(0.5 * squares)
 
     def inertial_misfit(self, states: States) -> Misfit:
         """Return how far the inertial data miss these states."""
-        errors = self._inertial.errors(self.intervals, states)[:, :STATE_DIM]
+        errors = self.inertial_errors(states)[:, :STATE_DIM]
         return Misfit(float(np.sum(errors**2)), errors.size, len(errors))
+
+    def _off_by(self, states: States) -> Array:
+        """Return what sensors are off by (F,)."""
+        assert self._freed is not None
+        return states.constants[len(states.constants) - len(self._freed.sigma) :]
 
     def _at_beams(self, states: States) -> RowStates:
         g_n = self.problem.frame.g_n_at(states.p_n)
@@ -149,8 +174,8 @@ class GraphLinearizer:
 
     def _own_rows(
         self, states: States, beam_rows: BeamRows, weights: Array, aid_weights: Array | None
-    ) -> list[Array]:
-        """Return the rows (m, width + 1) of each keyframe alone."""
+    ) -> tuple[NDArray[np.intp], Array]:
+        """Return the rows (R, width + 1) of one keyframe alone, in the order of these."""
         beams = self.problem.beams
         scale = np.sqrt(weights) / beams.sigma
         whitened = np.column_stack([beam_rows.jacobian, -beam_rows.error]) * scale[:, None]
@@ -160,6 +185,4 @@ class GraphLinearizer:
         blocks.append(np.column_stack([jacobian, -error]))
         keyframe = np.concatenate(keyframes)
         order = np.argsort(keyframe, kind="stable")
-        rows = np.concatenate(blocks)[order]
-        first = np.searchsorted(keyframe[order], np.arange(self.problem.n_keyframes + 1)).tolist()
-        return [rows[begin:end] for begin, end in itertools.pairwise(first)]
+        return keyframe[order], np.concatenate(blocks)[order]

@@ -17,9 +17,10 @@ from factors.similarity import Kernel, LogKernel, Similarity
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.extras import Extras
 from ssm_graph.engine.states import States
-from ssm_graph.graph.aids.aid import Aid, RowStates
+from ssm_graph.graph.aids.aid import Aid, Linearised, RowStates
 from ssm_graph.graph.aids.depth import DepthMeans
 from ssm_graph.graph.aids.gnss import Fixes
+from ssm_graph.graph.freed import Freed
 from ssm_graph.mission.answer import LOW_WEIGHT, MISFIT, SUSPECT_SHARE, TRUSTED
 from ssm_graph.mission.estimate import AidTable
 from ssm_graph.mission.problem import Problem
@@ -82,9 +83,9 @@ def aids_of(problem: Problem) -> tuple[Aid, ...]:
 class Measurements:
     """Some aids of a problem, their M measurements of R components one after the other."""
 
-    def __init__(self, aids: Iterable[Aid], extras: Extras) -> None:
+    def __init__(self, aids: Iterable[Aid], extras: Extras, freed: Freed | None = None) -> None:
         self.all = tuple(aids)
-        self._extras = extras
+        self._extras, self._freed = extras, freed
         sizes = [np.full(len(aid), aid.dim) for aid in self.all]
         self.dim = np.concatenate([np.zeros(0, dtype=np.intp), *sizes])
         """(M,) components of each measurement"""
@@ -92,9 +93,9 @@ class Measurements:
         """(R,) of each component"""
 
     @classmethod
-    def of_problem(cls, problem: Problem) -> Measurements:
+    def of_problem(cls, problem: Problem, freed: Freed | None = None) -> Measurements:
         """Return those of a problem, each with a weight of its own."""
-        return cls(aids_of(problem), problem.extras)
+        return cls(aids_of(problem), problem.extras, freed)
 
     def __len__(self) -> int:
         return len(self.dim)
@@ -102,6 +103,13 @@ class Measurements:
     def at_keyframes(self, aid: Aid, states: States) -> RowStates:
         """Return the states of all measurements of one aid."""
         return states_at(states, aid.keyframe, self._extras)
+
+    def whitened(self, aid: Aid, states: States) -> Linearised:
+        """Linearise one aid, with what it was found to be off by."""
+        rows = aid.whitened(self.at_keyframes(aid, states))
+        if self._freed is None:
+            return rows
+        return self._freed.on_aid(aid.name, rows, self._extras, states.constants)
 
     def follow(self, states: States) -> None:
         """Let what is only slowly a function of the states follow them."""
@@ -118,7 +126,7 @@ class Measurements:
         keyframes, errors = [np.zeros(0, dtype=np.intp)], [np.zeros(0)]
         jacobians = [np.zeros((0, self._extras.width))]
         for aid in self.all:
-            error, jacobian = aid.whitened(self.at_keyframes(aid, states))
+            error, jacobian = self.whitened(aid, states)
             keyframes.append(np.repeat(aid.keyframe, aid.dim))
             errors.append(error.ravel())
             jacobians.append(jacobian.reshape(-1, self._extras.width))
@@ -163,7 +171,7 @@ class Measurements:
             JudgedAid(
                 aid,
                 keyframe_s[aid.keyframe],
-                aid.whitened(self.at_keyframes(aid, states)).error,
+                self.whitened(aid, states).error,
                 self.of(aid, mahalanobis_sq),
                 self.of(aid, weights),
             )
@@ -180,6 +188,16 @@ def joined_aids(judged: Sequence[JudgedAid]) -> JudgedAid:
     """Return successive measurements of one aid as one."""
     aids, *columns = zip(*judged, strict=True)
     return JudgedAid(aids[0].joined(aids), *(np.concatenate(column) for column in columns))
+
+
+def without(judged: Sequence[JudgedAid], left_out: NDArray[np.bool_]) -> list[JudgedAid]:
+    """Return what became of those measurements that are not left out (M,)."""
+    found, begin = [], 0
+    for one in judged:
+        kept = ~left_out[begin : begin + len(one.aid)]
+        begin += len(one.aid)
+        found.append(JudgedAid(one.aid.take(kept), *(column[kept] for column in one[1:])))
+    return found
 
 
 def aid_kernel(wanted: Kernel) -> Kernel:
@@ -214,18 +232,25 @@ RUN = 20
 """Successive depths, or position fixes, that are looked at together."""
 SHORTEST_RUN = 8
 """Of fewer nothing is said."""
+SLOW_SIGMAS = 6.0
+"""So long the median has to be where a search has looked for what lasts: the rest is swell and
+multipath, which are nobody's fault."""
 RUN_TAIL = 0.03
 """Share of Gaussian errors that are longer than the median of a run may be: three times the sigma
 of one component, twice that of three. Half of a run has to be that long, which has a chance of
 1e-10 for twenty and 6e-5 for eight; as many may be gross and say nothing."""
 
 
-def doubts_of_aids(judged: Sequence[JudgedAid]) -> list[str]:
-    """Say in a sentence each which aid disagrees with the answer."""
-    return [doubt for one in judged if len(one.aid) and (doubt := _doubt(one))]
+def doubts_of_aids(judged: Sequence[JudgedAid], *, is_searched: bool = False) -> list[str]:
+    """Say in a sentence each which aid disagrees with the answer.
+
+    ``is_searched`` if faults that last have been looked for.
+    """
+    least = SLOW_SIGMAS if is_searched else 0.0
+    return [doubt for one in judged if len(one.aid) and (doubt := _doubt(one, least))]
 
 
-def _doubt(one: JudgedAid) -> str:
+def _doubt(one: JudgedAid, least_sigmas: float) -> str:
     aid, weights = one.aid, one.weight
     share = float(np.mean(weights < LOW_WEIGHT))
     if share > SUSPECT_SHARE:
@@ -234,7 +259,7 @@ def _doubt(one: JudgedAid) -> str:
             f"the answer (weight below {LOW_WEIGHT}): {aid.hint}"
         )
     if isinstance(aid, DepthMeans | Fixes):
-        return _doubt_run(one)
+        return _doubt_run(one, least_sigmas)
     trusted = np.mean(one.error**2, axis=1)[weights >= TRUSTED]
     misfit = float(np.mean(trusted)) if len(trusted) else 0.0
     if misfit <= MISFIT:
@@ -245,7 +270,7 @@ def _doubt(one: JudgedAid) -> str:
     )
 
 
-def _doubt_run(one: JudgedAid) -> str:
+def _doubt_run(one: JudgedAid, least_sigmas: float) -> str:
     """Look for successive measurements of place that miss the answer together."""
     aid, size = one.aid, min(RUN, len(one.weight))
     if size < SHORTEST_RUN:
@@ -253,9 +278,9 @@ def _doubt_run(one: JudgedAid) -> str:
     runs = np.lib.stride_tricks.sliding_window_view(np.sum(one.error**2, axis=1), size)
     median = np.median(runs, axis=1)
     worst = int(np.argmax(median))
-    if median[worst] <= chi2.isf(RUN_TAIL, aid.dim):
-        return ""
     sigmas = np.sqrt(median[worst] / chi2.median(aid.dim))
+    if median[worst] <= chi2.isf(RUN_TAIL, aid.dim) or sigmas < least_sigmas:
+        return ""
     return (
         f"{aid.name} measurements from {one.time_s[worst]:.1f} s to "
         f"{one.time_s[worst + size - 1]:.1f} s miss the answer by "

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -15,10 +14,10 @@ from factors import so3
 from factors.imu_errors import increment_jacobians, taken_off
 from factors.inertial import Intervals
 from ssm_graph.base.earth import LocalFrame
-from ssm_graph.base.frozen import Array
+from ssm_graph.base.frozen import Array, Vector
 from ssm_graph.base.stepwise import Steps, finished
 from ssm_graph.imu.increments import MergedSamples, merge_samples_steps
-from ssm_graph.sensors.imu import ImuLog, ImuNoise
+from ssm_graph.sensors.imu import FrozenAxis, ImuLog, ImuNoise, frozen_axes
 
 AT_ONCE = 16
 """So many intervals are read from GTSAM at a time: some 1.6 ms."""
@@ -53,10 +52,10 @@ class Unseen(NamedTuple):
     """Motion inside a gap of the inertial data, 1 sigma off what bridges it."""
 
     gap_s: float = 0.0
-    rate: float = GAP_GYRO_RATE
-    """rad/s"""
-    force: float = GAP_ACCEL
-    """m/s^2"""
+    rate: Vector = (GAP_GYRO_RATE,) * 3
+    """rad/s, about each axis"""
+    force: Vector = (GAP_ACCEL,) * 3
+    """m/s^2, along each axis"""
 
 
 class ErrorSource(NamedTuple):
@@ -174,7 +173,7 @@ def preintegrate_steps(
         source = ErrorSource(imu, keyframe_s, rate_hz, errors)
         imu = without_errors(imu, errors)
     gaps = imu_gaps(imu)
-    unseen = tuple(_unseen(imu, keyframe_s, gaps))
+    unseen = tuple(_unseen(imu, keyframe_s, gaps, frozen_axes(imu)))
     yield 3e-4 * len(imu.time_s)
     samples = yield from merge_samples_steps(bridged(imu, gaps), keyframe_s, rate_hz=rate_hz)
     bias = np.zeros(6) if bias is None else bias
@@ -288,15 +287,15 @@ def imu_params(
     gap_s, rate, force = unseen or Unseen()
     # GTSAM takes continuous-time densities squared and divides by dt itself: do not pre-scale.
     # Every covariance defaults to identity, so each one is set.
-    gyro_sq = noise.gyro_density**2 + (rate * gap_s) ** 2 / span_s
-    # What the attitude is off, gravity pulls into the force.
-    force = math.hypot(force, 0.5 * GRAVITY * rate * gap_s)
-    accel_sq = noise.accel_density**2 + (force * gap_s) ** 2 / span_s
+    gyro_sq = noise.gyro_density**2 + (np.array(rate) * gap_s) ** 2 / span_s
+    # What roll and pitch are off, gravity pulls into the force.
+    pulled = np.hypot(force, 0.5 * GRAVITY * max(rate[:2]) * gap_s)
+    accel_sq = noise.accel_density**2 + (pulled * gap_s) ** 2 / span_s
     eye = np.eye(3)
     params = gtsam.PreintegrationCombinedParams(g_n)
     params.setOmegaCoriolis(frame.omega_ie_n)
-    params.setGyroscopeCovariance(gyro_sq * eye)
-    params.setAccelerometerCovariance(accel_sq * eye)
+    params.setGyroscopeCovariance(np.diag(gyro_sq))
+    params.setAccelerometerCovariance(np.diag(accel_sq))
     params.setIntegrationCovariance(INTEGRATION_DENSITY**2 * eye)
     # A bias that does not walk still needs a regular covariance: a thousandth of its turn-on
     # sigma in an hour is none.
@@ -318,15 +317,34 @@ def imu_gaps(imu: ImuLog) -> tuple[Array, Array]:
     return edges[:-1][is_gap], edges[1:][is_gap]
 
 
-def _unseen(imu: ImuLog, keyframe_s: Array, gaps: tuple[Array, Array]) -> list[Unseen]:
-    """Return what is not seen of each interval between keyframes: its longest stretch of a gap."""
+def _unseen(
+    imu: ImuLog, keyframe_s: Array, gaps: tuple[Array, Array], frozen: Sequence[FrozenAxis]
+) -> list[Unseen]:
+    """Return what is not seen of each interval between keyframes.
+
+    That is its longest stretch of a gap, or of gyros or accelerometers that repeat themselves.
+    """
+    stretches: list[tuple[float, float, Array, Array]] = []
+    for gap in zip(*gaps, strict=True):
+        lively, pushed = _liveliness(imu, *gap)
+        stretches.append((*gap, np.full(3, lively), np.full(3, pushed)))
+    for is_gyro, axis, begin, end in frozen:
+        # What an axis does meanwhile, a turn perhaps, need not resemble what it did before.
+        own = np.eye(3)[axis]
+        rate_and_force = (
+            (GAP_GYRO_RATE * own, 0.0 * own) if is_gyro else (0.0 * own, GAP_ACCEL * own)
+        )
+        stretches.append((begin, end, *rate_and_force))
     unseen = [Unseen()] * (len(keyframe_s) - 1)
-    for begin, end in zip(*gaps, strict=True):
-        rate, force = _liveliness(imu, begin, end)
+    for begin, end, rate, force in stretches:
         overlap = np.minimum(end, keyframe_s[1:]) - np.maximum(begin, keyframe_s[:-1])
         for k in np.flatnonzero(overlap > 0.0).tolist():
-            if overlap[k] > unseen[k].gap_s:
-                unseen[k] = Unseen(float(overlap[k]), rate, force)
+            before = unseen[k] if unseen[k].gap_s else Unseen(0.0, (0.0,) * 3, (0.0,) * 3)
+            unseen[k] = Unseen(
+                max(float(overlap[k]), before.gap_s),
+                tuple(np.maximum(rate, before.rate).tolist()),
+                tuple(np.maximum(force, before.force).tolist()),
+            )
     return unseen
 
 

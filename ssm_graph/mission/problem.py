@@ -31,12 +31,14 @@ from ssm_graph.mission.calibration import (
     extras_of,
     needs_motion,
 )
+from ssm_graph.mission.fault import DetectedFault, Treatment
 from ssm_graph.mission.mission import InitialState, Mission
 from ssm_graph.mission.timeline import Timeline, build_timeline
 from ssm_graph.mission.usable import require_usable
 from ssm_graph.sensors.dvl import DvlMount
 from ssm_graph.sensors.dvl_readings import stuck_beams
-from ssm_graph.sensors.imu import ImuLog
+from ssm_graph.sensors.frozen import frozen_runs
+from ssm_graph.sensors.imu import ImuLog, frozen_axes
 
 NO_EXTRAS = Extras()
 A = TypeVar("A", bound=Aid)
@@ -126,6 +128,8 @@ class Problem(ReadOnlyArrays):
     aids: tuple[Aid, ...] = ()
     """What the smoothers are aided by besides; another estimator says that it is not."""
     notes: tuple[str, ...] = ()
+    faults: tuple[DetectedFault, ...] = ()
+    """What is plain from the readings alone"""
 
     def aid(self, kind: type[A]) -> A | None:
         """Return the aid of a kind, None if there is none."""
@@ -158,6 +162,7 @@ def build_problem_steps(
     require_usable(mission)
     mission = replace(mission, imu=mission.imu.calibrated)
     mission, stuck_note = _without_stuck_beams(mission)
+    mission, frozen = without_frozen(mission)
     config = config or ProblemConfig()
     start = start or mission.initial
     if start is None:
@@ -189,6 +194,7 @@ def build_problem_steps(
         extras=extras,
         aids=tuple(aid for aid in aids if aid is not None),
         notes=(*timeline.notes, *_gap_note(mission.imu), *stuck_note, *current_note(mission)),
+        faults=frozen,
     )
 
 
@@ -260,6 +266,50 @@ def _without_stuck_beams(mission: Mission) -> tuple[Mission, tuple[str, ...]]:
     )
     speed = np.where(is_stuck, np.nan, dvl.speed)
     return replace(mission, dvl=replace(dvl, speed=speed)), (note,)
+
+
+FROZEN_S = 5.0
+FROZEN_READINGS = 5
+"""So many fixes, or depths, in a row, and for so long, repeat one reading: they are none."""
+
+
+def without_frozen(mission: Mission) -> tuple[Mission, tuple[DetectedFault, ...]]:
+    """Return the mission without fixes and depths that repeat one reading, and what does so.
+
+    Axes of the inertial sensors that do are unseen motion, see
+    :func:`ssm_graph.imu.preintegration.preintegrate`.
+    """
+    found: list[DetectedFault] = []
+    gnss, depth = mission.gnss, mission.depth
+    if gnss is not None:
+        kept = _measured("GNSS", gnss.time_s, np.column_stack([gnss.lat, gnss.lon]), found)
+        gnss = gnss if kept.all() else gnss.rows(kept)
+    if depth is not None:
+        kept = _measured("depth", depth.time_s, depth.depth[:, None], found)
+        depth = depth if kept.all() else depth.rows(kept)
+    for axis in frozen_axes(mission.imu):
+        name, where = ("gyros", "about") if axis.is_gyro else ("accelerometers", "along")
+        what = f"one reading again and again {where} {'xyz'[axis.axis]}"
+        found.append(_repeating(name, what, axis.begin_s, axis.end_s, Treatment.COVERED))
+    return replace(mission, gnss=gnss, depth=depth), tuple(found)
+
+
+def _measured(
+    sensor: str, time_s: Array, values: Array, found: list[DetectedFault]
+) -> NDArray[np.bool_]:
+    """Return which readings (N, d) do not repeat one, and note those that do."""
+    kept = np.ones(len(time_s), bool)
+    for begin, end in frozen_runs(time_s, values, least_s=FROZEN_S, least_count=FROZEN_READINGS):
+        kept[begin + 1 : end + 1] = False
+        span_s = float(time_s[begin]), float(time_s[end])
+        found.append(_repeating(sensor, "repeats one reading", *span_s, Treatment.LEFT_OUT))
+    return kept
+
+
+def _repeating(
+    sensor: str, what: str, begin_s: float, end_s: float, treatment: Treatment
+) -> DetectedFault:
+    return DetectedFault(sensor, what, begin_s, end_s, chi_sq=np.inf, dof=1, treatment=treatment)
 
 
 def _gap_note(imu: ImuLog) -> tuple[str, ...]:

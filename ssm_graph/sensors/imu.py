@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from ssm_graph.base.frozen import Array, FrozenArrays, Vector, shaped
 from ssm_graph.base.settings import FILE_KEY, Key, Settings, optional_key, sigma_key
 from ssm_graph.base.tables import Table
 from ssm_graph.base.units import DEG_PER_H, DEGREE, MICRO_G, PER_SQRT_H
+from ssm_graph.sensors.frozen import frozen_runs
 from ssm_graph.sensors.imu_calibration import CALIBRATED, ImuCalibration, calibration_keys
 from ssm_graph.sensors.instrument import XYZ, Column, Instrument, Lists
 from ssm_graph.sensors.messages import Message
@@ -102,6 +103,32 @@ class ImuSample(Message):
     """Body rate relative to inertial space, rad/s."""
     accel_b: Vector
     """Specific force, m/s^2; at rest (0, 0, -9.8)."""
+
+
+class FrozenAxis(NamedTuple):
+    """One axis of gyros or accelerometers that gives the same reading for long."""
+
+    is_gyro: bool
+    axis: int
+    """From 0, of the body"""
+    begin_s: float
+    end_s: float
+
+
+FROZEN_S: Final = 1.0
+FROZEN_SAMPLES: Final = 20
+"""So many equal readings in a row, for so long, are none: noise alone changes them."""
+
+
+def frozen_axes(log: ImuLog) -> list[FrozenAxis]:
+    """Return where an axis repeats one reading, in the order of axes, gyros first."""
+    return [
+        FrozenAxis(axis < 3, axis % 3, float(log.time_s[begin]), float(log.time_s[end]))
+        for axis, values in enumerate(np.hstack([log.gyro_b, log.accel_b]).T)
+        for begin, end in frozen_runs(
+            log.time_s, values[:, None], least_s=FROZEN_S, least_count=FROZEN_SAMPLES
+        )
+    ]
 
 
 class Stamp(Enum):

@@ -15,22 +15,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from factors.kernels import GeneralKernel, TruncatedKernel
-from factors.similarity import Kernel, LogKernel, Similarity, expected_mahalanobis_sq
-from ssm_graph.base.errors import ConfigError, SolverError
+from factors.similarity import Kernel, Similarity, expected_mahalanobis_sq
+from ssm_graph.base.errors import SolverError
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps, at_once
 from ssm_graph.engine.chain import ChainSolution
 from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.engine.reweighting import (
-    AdaptiveSchedule,
-    GncSchedule,
-    Graduation,
     Schedule,
     WarmSchedule,
 )
@@ -40,12 +37,14 @@ from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.first_values import FirstValues, first_values, first_values_steps
 from ssm_graph.graph.inertial_rows import inertial_fit
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.graph.measurements import aid_kernel, aid_table, doubts_of_aids
+from ssm_graph.graph.measurements import aid_kernel, aid_table, doubts_of_aids, without
 from ssm_graph.mission.answer import trajectory_from_states
 from ssm_graph.mission.estimate import BeamTable, Estimate, Iteration, NoiseFound, Status
+from ssm_graph.mission.fault import DetectedFault
 from ssm_graph.mission.problem import Problem, with_white_noise
-from ssm_graph.smoothers.beam_faults import FaultSearch, FaultWatch
 from ssm_graph.smoothers.descent import descend_steps
+from ssm_graph.smoothers.faults.watch import FaultWatch
+from ssm_graph.smoothers.settings import WARM_KERNEL, SmootherConfig
 from ssm_graph.smoothers.track import calibration_of, current_of, undetermined
 from ssm_graph.smoothers.verdict import (
     MAX_ADAPTATIONS,
@@ -61,66 +60,8 @@ __all__ = ["OnIteration", "Similarity", "SmootherConfig", "SsmSmoother"]
 OnIteration = Callable[[int, int, Iteration], None]
 """Called after each iteration with its number, the limit, and what happened."""
 
-WARM_KERNEL = LogKernel()
-"""Kernel of the first pass and of the first iterations, whichever is asked for in the end."""
 RUNAWAY_SPEED = 1e4
 """m/s; ten silent minutes of a MEMS unit may begin with 100 m/s and still come back."""
-
-
-@dataclass(frozen=True, slots=True)
-class SmootherConfig:
-    """Settings of the similarity loop."""
-
-    kernel: Kernel = field(default_factory=LogKernel)
-    similarity: Similarity | None = None
-    """What a beam is judged by; None for what the kernel was published with."""
-    graduation: Graduation | None = None
-    """Come to a truncated kernel by graduated non-convexity; None goes straight to the kernel."""
-    adapt_shape: bool = False
-    """Give a general kernel the shape under which the residuals of the beams are likeliest."""
-    fault_search: FaultSearch | None = None
-    """Look for stretches in which one beam is off for long, and leave them out; None does not."""
-    adapt_noise: bool = False
-    """Repeat the solution with the sigma of each beam that its errors ask for."""
-    max_iterations: int = 100
-    tolerance: float = 1e-3
-    """Updates in their own posterior sigmas, and changes of weights, below which it has settled."""
-
-    def __post_init__(self) -> None:
-        if self.max_iterations < 1:
-            raise ConfigError(f"max_iterations: expected 1 or more, got {self.max_iterations}")
-        if not 0.0 < self.tolerance < 1.0:
-            raise ConfigError(f"tolerance: expected a number in (0, 1), got {self.tolerance}")
-        if self.graduation is not None and not isinstance(self.kernel, TruncatedKernel):
-            raise ConfigError(f"graduation: expected with a TruncatedKernel, got {self.kernel}")
-        if self.adapt_shape and not isinstance(self.kernel, GeneralKernel):
-            raise ConfigError(f"adapt_shape: expected with a GeneralKernel, got {self.kernel}")
-
-    @property
-    def judged_by(self) -> Similarity:
-        """What a beam is judged by, whether asked for or the kernel's own."""
-        return self.similarity or self.kernel.published_with
-
-    @property
-    def weighting(self) -> str:
-        """Kernel and schedule as text, for example ``log(dof=5)``."""
-        if self.adapt_shape:
-            assert isinstance(self.kernel, GeneralKernel)
-            return f"adaptive(width={self.kernel.width:g})"
-        if self.graduation is None:
-            return str(self.kernel)
-        assert isinstance(self.kernel, TruncatedKernel)
-        return f"gnc-tls(width={self.kernel.width:g}, {self.graduation})"
-
-    def schedule(self) -> Schedule:
-        """Return which kernel weighs the beams, pass by pass, from the begin."""
-        if self.adapt_shape:
-            assert isinstance(self.kernel, GeneralKernel)
-            return AdaptiveSchedule(self.kernel, WARM_KERNEL)
-        if self.graduation is None:
-            return WarmSchedule(self.kernel, WARM_KERNEL)
-        assert isinstance(self.kernel, TruncatedKernel)
-        return GncSchedule.begin(self.kernel, self.graduation, WARM_KERNEL)
 
 
 def _notes_of(first: FirstValues) -> tuple[str, ...]:
@@ -173,7 +114,7 @@ class Weights(NamedTuple):
         of_aids, aids = self.of_aids.after(
             self.aids, last.aid_weights, t=last.aid_mahalanobis_sq, update_sigmas=last.update_sigmas
         )
-        return Weights(faults.leave_out(beams), aids, of_beams, of_aids)
+        return Weights(faults.leave_out(beams), faults.leave_aids_out(aids), of_beams, of_aids)
 
     def may_end(self, last: Pass) -> bool:
         """Return whether the weights that the pass led to may be those of the answer."""
@@ -192,6 +133,9 @@ class Solved(NamedTuple):
     """That of the answer"""
     notes: tuple[str, ...]
     first: FirstValues
+    faults: tuple[DetectedFault, ...]
+    aids_out: NDArray[np.bool_]
+    """(A,) measurements of aids that are left out"""
 
     def again(self) -> FirstValues:
         """Return where another solution may start."""
@@ -260,9 +204,11 @@ class SsmSmoother:
         yield 0.03 * problem.n_keyframes
         if first is None:
             first = yield from first_values_steps(white, kernel=WARM_KERNEL)
-        states, rows = first.states, linearizer.beam_rows(first.states)
+        own = first.states.constants[: white.extras.n_constants]
+        states = first.states._replace(constants=own)
+        rows = linearizer.beam_rows(states)
         schedule = self.config.schedule()
-        faults = FaultWatch(problem, self.config.fault_search)
+        faults = FaultWatch(white, self.config.fault_search)
         yield 0.03 * problem.n_keyframes
         weights = Weights(
             schedule.first_weights(first.weights),
@@ -287,22 +233,33 @@ class SsmSmoother:
                 on_iteration(number + 1, self.config.max_iterations, iterations[-1])
             is_settled = max(this.update_sigmas, this.weight_change) < self.config.tolerance
             is_settled = is_settled and weights.may_end(this)
-            has_news = yield from faults.look_steps(
-                states,
-                rows,
-                update_sigmas=this.update_sigmas,
-                is_settled=is_settled,
-                aid_weights=this.aid_weights,
-                intervals=linearizer.intervals_at(states),
-            )
-            if is_settled and not has_news:
+            changed = None
+            if number + 1 < self.config.max_iterations:
+                changed = yield from faults.look_steps(
+                    linearizer, states, update_sigmas=this.update_sigmas
+                )
+            if changed is not None:
+                linearizer, states = changed.linearizer, changed.states
+                rows, schedule = linearizer.beam_rows(states), self.config.schedule()
+                weights = Weights(changed.weights, changed.aid_weights, schedule, weights.of_aids)
+                continue
+            if is_settled:
                 status = Status.CONVERGED
                 break
             yield 0.007 * problem.n_keyframes
             weights = weights.after(this, faults)
-        notes = problem.notes + faults.notes(rows.error) + _notes_of(first)
+        found = problem.faults + faults.faults(this.states)
+        said = tuple(fault.sentence for fault in found)
         return Solved(
-            linearizer, this, tuple(iterations), status, weights.of_beams.wanted, notes, first
+            linearizer,
+            this,
+            tuple(iterations),
+            status,
+            weights.of_beams.wanted,
+            problem.notes + said + _notes_of(first),
+            first,
+            found,
+            faults.aids_out,
         )
 
     def _iterate(
@@ -336,7 +293,7 @@ class SsmSmoother:
         settled = faults.leave_out(used.of_beams.kernel.weight(t))
         aids = linearizer.weighted
         aid_t = aids.mahalanobis_sq(states, step, self.config.judged_by)
-        aid_settled = used.of_aids.kernel.weight(aid_t, dim=aids.dim)
+        aid_settled = faults.leave_aids_out(used.of_aids.kernel.weight(aid_t, dim=aids.dim))
         change = np.concatenate([settled - used.beams, aid_settled - used.aids])
         return Pass(
             states,
@@ -374,10 +331,13 @@ class SsmSmoother:
             f"{last.weight_change:.1e}"
         )
         doubts = contradictions(linearizer, last.states, last.beam_rows, last.weights)
+        doubts += [fault.sentence for fault in solved.faults if fault.is_suspect]
         judged = linearizer.weighted.judged(
             last.states, linearizer.problem.keyframe_s, last.aid_mahalanobis_sq, last.aid_weights
         )
-        doubts += doubts_of_aids(judged)
+        doubts += doubts_of_aids(
+            without(judged, solved.aids_out), is_searched=self.config.fault_search is not None
+        )
         doubts += ambiguous_beacons(
             last.states,
             linearizer.weighted,
@@ -414,6 +374,7 @@ class SsmSmoother:
             wall_s=wall_s,
             cost=self._cost(linearizer, last, solved.kernel),
             start=problem.start,
+            faults=solved.faults,
             notes=solved.notes + noise_notes(noise) + undetermined(calibration),
             calibration=calibration,
             aids=aid_table(judged),

@@ -1,4 +1,4 @@
-"""The step of one pass, as far as it lowers the cost."""
+"""A Gauss-Newton step that does not raise the cost."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from ssm_graph.mission.start.alignment import Alignment, align_steps
 from ssm_graph.mission.suspects.find import find_suspects, with_suspects
 from ssm_graph.mission.usable import require_usable
 from ssm_graph.smoothers.batch import OnIteration, SmootherConfig, SsmSmoother
-from ssm_graph.smoothers.beam_faults import FaultSearch
+from ssm_graph.smoothers.faults.search import FaultSearch
 
 AMBIGUOUS_COST = 6.0
 """Another heading whose cost is higher by less than this is as good an explanation (a likelihood
@@ -46,8 +46,8 @@ def smooth_steps(
     Parameters
     ----------
     mission : from :func:`ssm_graph.read_mission` or a simulation.
-    config : settings of the similarity loop; without, its defaults and the search for faults of
-        one beam that last.
+    config : settings of the similarity loop; without, its defaults and the search for faults
+        that last.
     problem_config : rates and intervals of the graph.
     on_iteration : called with number, limit and :class:`ssm_graph.Iteration` after each iteration.
     on_stage : called with a line of text when a new stage begins.

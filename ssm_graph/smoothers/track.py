@@ -13,6 +13,7 @@ from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.engine.extras import Extras
 from ssm_graph.engine.states import States
 from ssm_graph.graph.aids.aid import Aid
+from ssm_graph.graph.freed import FAULTS
 from ssm_graph.graph.measurements import JudgedAid, joined_aids
 from ssm_graph.mission.calibration import CURRENT, CURRENT_UP
 from ssm_graph.mission.estimate import CalibratedValue, Calibration, CurrentTrack, Determined
@@ -96,7 +97,7 @@ def calibration_of(
     prior = _prior_sigma_at_end(extras, span_s)
     values, kept = [], []
     for block in extras.blocks:
-        if not block.is_lasting:
+        if not block.is_lasting or block.name == FAULTS:
             continue
         columns = extras.columns(block.name)
         for label, i in zip(block.labels, range(columns.start, columns.stop), strict=True):

@@ -24,6 +24,7 @@ from ssm_graph.engine.extras import Extras
 from ssm_graph.engine.marginal_prior import MarginalPrior
 from ssm_graph.engine.states import States
 from ssm_graph.graph.beam_rows import BeamRows
+from ssm_graph.graph.freed import FAULTS
 from ssm_graph.graph.inertial_rows import InertialFit
 from ssm_graph.graph.linearize import GraphLinearizer, Misfit
 from ssm_graph.mission.answer import MISFIT, doubts_of_beams
@@ -81,7 +82,7 @@ def _doubt_inertial(misfit: Misfit) -> str:
 def _doubt_extras(extras: Extras, states: States) -> list[str]:
     """Look for what lies further off than its prior can mean: calibrations, then the current."""
     calibrations, currents = [], []
-    for block in extras.blocks:
+    for block in extras.without({FAULTS}).blocks:
         is_current = block.name in CURRENTS
         walks = states.walks if is_current else states.walks[:1]
         value = extras.value(block.name, walks, states.constants, default=np.zeros(0))

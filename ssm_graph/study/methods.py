@@ -17,7 +17,7 @@ from ssm_graph.mission.estimate import Estimate, OnKeyframe
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.problem import ProblemConfig, build_problem
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
-from ssm_graph.smoothers.beam_faults import FaultSearch
+from ssm_graph.smoothers.faults.search import FaultSearch
 from ssm_graph.smoothers.fixed_lag import FixedLagConfig, solve_fixed_lag
 from ssm_graph.smoothers.mission import OnStage
 from ssm_graph.study.trials import Trial, with_initial
@@ -135,7 +135,7 @@ def _family_with_search(name: str, config: SmootherConfig) -> Family:
         return _smoother(replace(config, fault_search=FaultSearch(significance=significance)))
 
     return Family(
-        f"batch smoother, {name}, without stretches of a beam off by so many sigmas of its mean",
+        f"batch smoother, {name}, freed of what lasts and is off by so many sigmas",
         make,
         FaultSearch().significance,
     )

@@ -38,7 +38,7 @@ from ssm_graph.simulation import (
     TransitRoute,
 )
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother, warm_start
-from ssm_graph.smoothers.beam_faults import FaultSearch
+from ssm_graph.smoothers.faults.search import FaultSearch
 from tests.aids_fixture import UNKNOWN, compass, ranging, usbl, weights_of, with_every_aid
 from tests.helpers import simulated
 

@@ -33,7 +33,7 @@ from ssm_graph.sensors.imu_calibration import (
 )
 from ssm_graph.simulation import CALM, GnssSettings, Grade
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
-from ssm_graph.smoothers.beam_faults import FaultSearch
+from ssm_graph.smoothers.faults.search import FaultSearch
 from ssm_graph.smoothers.fixed_lag import FixedLagConfig, run_fixed_lag, solve_fixed_lag
 from tests import mission_fixture
 from tests.helpers import simulated

@@ -16,7 +16,7 @@ from ssm_graph.mission.estimate import Estimate, NoiseFound, Status
 from ssm_graph.mission.problem import Beams, Problem, build_problem
 from ssm_graph.simulation import Grade, OutlierKind, Outliers
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
-from ssm_graph.smoothers.beam_faults import KERNEL
+from ssm_graph.smoothers.faults.columns import KERNEL
 from ssm_graph.smoothers.verdict import adaptation, beam_noise, noise_notes, with_sigmas
 from tests.helpers import simulated
 

@@ -43,9 +43,9 @@ from ssm_graph.simulation import (
     WaterTrack,
     default_mount,
 )
-from ssm_graph.smoothers.batch import WARM_KERNEL, SmootherConfig, SsmSmoother
-from ssm_graph.smoothers.beam_faults import FaultSearch
+from ssm_graph.smoothers.faults.search import FaultSearch
 from ssm_graph.smoothers.fixed_lag import FixedLagConfig, solve_fixed_lag
+from ssm_graph.smoothers.settings import WARM_KERNEL, SmootherConfig, SsmSmoother
 from tests.helpers import simulated, true_states, without_beams
 from tests.water_fixture import current_errors, in_current, without_water
 
@@ -310,9 +310,11 @@ def test_the_fault_search_tells_a_beam_from_the_current() -> None:
     for faults, n_found in (((), 0), ((fault,), 1)):
         sim = in_current(seed=5, faults=faults)
         estimate = smoothed(sim.mission, fault_search=FaultSearch())
-        found = [note for note in estimate.notes if "is off from" in note]
-        assert len(found) == n_found, found
-    assert "beam 3 is off from 90" in found[0]
+        assert len(estimate.faults) == n_found, estimate.notes
+    (found,) = estimate.faults
+    assert found.sensor == "DVL beam 3"
+    assert abs(found.begin_s - 90.0) < 2.0
+    assert abs(found.end_s - 210.0) < 2.0
 
 
 def test_current_and_further_aids_go_together() -> None:
@@ -329,7 +331,7 @@ def test_current_and_further_aids_go_together() -> None:
     assert estimate.status is Status.CONVERGED, estimate.reason
     assert estimate.current is not None
     assert np.abs(current_errors(estimate, sim) / estimate.current.sigma_enu).max() < 4.5
-    assert not any("is off from" in note for note in estimate.notes)
+    assert not estimate.faults
 
 
 def test_a_current_beyond_its_sigma_is_said() -> None:

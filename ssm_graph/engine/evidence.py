@@ -1,0 +1,230 @@
+"""What the data say of errors that rows have in common, whatever the trajectory.
+
+A column ``c`` of errors of the whitened rows, ``A d + c s = b + noise``, is judged with the
+trajectory ``d`` eliminated: with ``M = I - A (A'A)^-1 A'`` its size ``s`` has information ``c'M c``
+and score ``c'M b``. Residuals alone would not do: the trajectory takes over most of what a sensor
+is off by for long, and the sensors that are right get the rest.
+
+One elimination of the chain serves any number of columns, on rows of one keyframe or on those from
+one to the next. With its conditionals ``R_k d_k + S_k d_{k+1} = rhs_k`` what the trajectory
+explains is ``sum y_k'y_k``, ``y_k = R_k^-T (A_k'c - S_{k-1}' y_{k-1})``. Of a column that has ended
+n numbers go on, and all that they will explain to the end of the mission is one quadratic form,
+known from a pass backwards.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.linalg.blas import dsyrk
+
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.chain import ChainSolution
+
+
+class Evidence(NamedTuple):
+    """What the data say of the sizes of columns, the trajectory eliminated."""
+
+    score: Array
+    """(C,)"""
+    information: Array
+    """(C, C)"""
+
+    def without(self, score: Array, crossed: Array, inner: Array) -> Evidence:
+        """Return the same with m further columns eliminated.
+
+        Parameters
+        ----------
+        score : (m,) of these.
+        crossed : (m, C) their information with the columns here.
+        inner : (m, m) that among themselves, with that of their prior.
+        """
+        root = np.linalg.cholesky(inner)
+        right = np.column_stack([crossed, score])
+        half = solve_triangular(root, right, lower=True, check_finite=False, overwrite_b=True)
+        explained = dsyrk(-1.0, half[:, :-1], beta=1.0, c=self.information, trans=1, lower=1)
+        lower = np.tril(explained)
+        information = lower + np.tril(explained, -1).T
+        return Evidence(self.score - half[:, :-1].T @ half[:, -1], information)
+
+    def freed(self, combined: Array, prior: Array) -> Evidence:
+        """Return the same once ``combined`` (C, m), sums of columns, may be of any size."""
+        crossed = combined.T @ self.information
+        return self.without(combined.T @ self.score, crossed, crossed @ combined + prior)
+
+
+class OwnRows(NamedTuple):
+    """Whitened rows of one keyframe each, in the order of these."""
+
+    keyframe: NDArray[np.intp]
+    """(R,)"""
+    jacobian: Array
+    """(R, n)"""
+    missed: Array
+    """(R,) measured minus predicted, at the solution"""
+
+
+class BetweenRows(NamedTuple):
+    """Whitened rows from each keyframe to the next."""
+
+    jacobian: Array
+    """(K - 1, m, 2 n) by the keyframe before and the one after"""
+    missed: Array
+    """(K - 1, m)"""
+
+
+class Columns(NamedTuple):
+    """What a unit of each of C columns does to whitened rows."""
+
+    own: Array
+    """(R, C)"""
+    between: Array
+    """(K - 1, m, C)"""
+
+
+class ChainEvidence:
+    """One solution of the chain, ready for columns anywhere along it."""
+
+    def __init__(self, solution: ChainSolution, own: OwnRows, between: BetweenRows) -> None:
+        self._own, self._between = own, between
+        self._n_keyframes, self._n = solution.R.shape[:2]
+        self._first_row = np.searchsorted(own.keyframe, np.arange(self._n_keyframes + 1))
+        self._R_invT = np.swapaxes(np.linalg.inv(solution.R), 1, 2)
+        self._step = np.zeros_like(solution.R)
+        S = solution.R[:-1] @ solution.gain[:-1]
+        self._step[1:] = -self._R_invT[1:] @ np.swapaxes(S, 1, 2)
+        # All that what comes to a keyframe explains there and later.
+        self._ahead = np.empty((self._n_keyframes + 1, self._n, self._n))
+        self._ahead[-1] = 0.0
+        identity = np.eye(self._n)
+        self._ahead[-2] = identity
+        for k in range(self._n_keyframes - 2, -1, -1):
+            step = self._step[k + 1]
+            self._ahead[k] = identity + step.T @ self._ahead[k + 1] @ step
+
+    def of(self, blocks: NDArray[np.intp], own: Columns, shared: Columns) -> Evidence:
+        """Return the evidence of N blocks of B columns each, and of C columns in all the blocks.
+
+        Rows between two keyframes belong to the block of the first of them.
+
+        Parameters
+        ----------
+        blocks : (N + 1) growing keyframes; block ``i`` is from the i-th to before the next.
+        own : B columns that each block has for itself.
+        shared : C columns.
+        """
+        width, n_blocks, n = own.own.shape[1], len(blocks) - 1, self._n
+        both = Columns(
+            np.hstack([own.own, shared.own]),
+            np.concatenate([own.between, shared.between], axis=2),
+        )
+        history, outgoing = self._histories(blocks, both, width)
+        total = n_blocks * width
+        common = np.arange(total, total + shared.own.shape[1])
+        size = total + len(common)
+        score, information = np.zeros(size), np.zeros((size, size))
+        incoming = np.zeros((n, size))
+        for i, (begin, end) in enumerate(itertools.pairwise(blocks.tolist())):
+            now = np.arange(i * width, (i + 1) * width)
+            active, before = np.concatenate([now, common]), slice(0, i * width)
+            dense, missed = self._inside(begin, end, both)
+            score[active] += dense.T @ missed
+            flat = history[i]
+            flat[:, n + width :] += flat[:, :n] @ incoming[:, common]
+            explained = flat[:, n:].T @ flat
+            information[np.ix_(active, active)] += dense.T @ dense - explained[:, n:]
+            information[active, before] -= explained[:, :n] @ incoming[:, before]
+            onward = outgoing[i]
+            incoming[:, common] = onward[:, n + width :] + onward[:, :n] @ incoming[:, common]
+            incoming[:, before] = onward[:, :n] @ incoming[:, before]
+            incoming[:, now] = onward[:, n : n + width]
+            until_now = slice(0, (i + 1) * width)
+            ahead = self._ahead[end]
+            information[now, until_now] -= incoming[:, now].T @ ahead @ incoming[:, until_now]
+        information[common] -= incoming[:, common].T @ self._ahead[blocks[-1]] @ incoming
+        # Of two blocks, what the later one knows of the earlier one stands below the diagonal.
+        lower = np.tril(information)
+        return Evidence(score, lower + np.tril(information, -1).T)
+
+    def each(self, blocks: NDArray[np.intp], own: Columns) -> tuple[Array, Array]:
+        """Return score (N, B) and information (N, B, B) of the columns of each block alone.
+
+        Parameters as of :meth:`of`.
+        """
+        n, width = self._n, own.own.shape[1]
+        history, outgoing = self._histories(blocks, own, width)
+        score, information = np.zeros((len(history), width)), np.zeros((len(history), width, width))
+        for i, (begin, end) in enumerate(itertools.pairwise(blocks.tolist())):
+            dense, missed = self._inside(begin, end, own)
+            y, onward = history[i][:, n:], outgoing[i][:, n:]
+            score[i] = dense.T @ missed
+            information[i] = dense.T @ dense - y.T @ y - onward.T @ self._ahead[end] @ onward
+        return score, information
+
+    def _inside(self, begin: int, end: int, columns: Columns) -> tuple[Array, Array]:
+        """Return columns and errors of all rows of a block."""
+        rows = slice(self._first_row[begin], self._first_row[end])
+        between = columns.between[begin:end]
+        dense = np.concatenate([columns.own[rows], between.reshape(-1, between.shape[2])])
+        missed = [self._own.missed[rows], self._between.missed[begin:end].ravel()]
+        return dense, np.concatenate(missed)
+
+    def _loads(self, columns: Columns) -> tuple[Array, Array]:
+        """Return ``R^-T A'c`` (K, n, C) of own rows and those to the next, and of those before."""
+        n, width = self._n, columns.own.shape[1]
+        count = np.diff(self._first_row)
+        slot = np.arange(len(self._own.keyframe)) - self._first_row[self._own.keyframe]
+        jacobian = np.zeros((self._n_keyframes, int(count.max(initial=0)), n))
+        dense = np.zeros((*jacobian.shape[:2], width))
+        jacobian[self._own.keyframe, slot] = self._own.jacobian
+        dense[self._own.keyframe, slot] = columns.own
+        load = jacobian.mT @ dense
+        through = self._between.jacobian.mT @ columns.between
+        load[:-1] += through[:, :n]
+        before = np.zeros_like(load)
+        before[1:] = through[:, n:]
+        return self._R_invT @ load, self._R_invT @ before
+
+    def _histories(
+        self, blocks: NDArray[np.intp], columns: Columns, width: int
+    ) -> tuple[list[Array], list[Array]]:
+        """Take the columns of every block through its keyframes, all blocks side by side.
+
+        Returns of each block ``y`` at its keyframes (k n, n + B + C), and what comes to the first
+        keyframe after it (n, n + B + C): of what came to the block, of its own columns, and of the
+        shared ones as if they began with it.
+        """
+        n, size = self._n, self._n + columns.own.shape[1]
+        load, before = self._loads(columns)
+        length = np.diff(blocks)
+        order = np.argsort(-length, kind="stable")
+        longest = int(length.max(initial=0))
+        history = np.zeros((len(length), longest, n, size))
+        at = np.zeros((len(length), n, size))
+        at[:, :, :n] = np.eye(n)
+        begin = blocks[:-1][order]
+        # Shared columns also act on the rows that lead from the block before.
+        at[order > 0, :, n + width :] = before[begin[order > 0]][:, :, width:]
+        for t in range(longest):
+            going = int(np.sum(length > t))
+            k = begin[:going] + t
+            if t:
+                at[:going] = self._step[k] @ at[:going]
+                at[:going, :, n:] += before[k]
+            at[:going, :, n:] += load[k]
+            history[:going, t] = at[:going]
+        end = blocks[1:][order]
+        is_inside = end < self._n_keyframes
+        k = np.where(is_inside, end, 0)
+        onward = self._step[k] @ at
+        onward[:, :, n : n + width] += before[k][:, :, :width]
+        is_last = order == len(order) - 1
+        onward[is_last, :, n + width :] += before[k[is_last]][:, :, width:]
+        onward[~is_inside] = 0.0
+        place = np.argsort(order)
+        flat = [history[place[i], : length[i]].reshape(-1, size) for i in range(len(length))]
+        return flat, [onward[place[i]] for i in range(len(length))]

@@ -1,0 +1,271 @@
+"""What a unit of each error that lasts does to the rows of a mission: channels of columns.
+
+A channel is a sensor with the numbers that it may be off by: the beams each by itself, the ground
+that moves, the array's scale and mounting, the fixes along each axis, depth, biases of the inertial
+data. Hypotheses are sums of these over stretches (:mod:`ssm_graph.smoothers.faults.hypotheses`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.similarity import WEIGHT_FLOOR, LogKernel
+from ssm_graph.base.frozen import Array
+from ssm_graph.base.stepwise import Steps
+from ssm_graph.engine.chain import ChainSolution
+from ssm_graph.engine.error_state import ACCEL_BIAS, STATE_DIM
+from ssm_graph.engine.evidence import BetweenRows, Columns, OwnRows
+from ssm_graph.engine.states import States
+from ssm_graph.graph.aids.aid import Aid
+from ssm_graph.graph.beam_rows import BeamRows, WaterRows
+from ssm_graph.graph.linearize import GraphLinearizer
+from ssm_graph.mission.problem import Problem
+
+BEAM: Final = "beam"
+BOTTOM: Final = "bottom"
+SCALE: Final = "scale"
+MOUNTING: Final = "mounting"
+IMU: Final = "IMU"
+
+KERNEL = LogKernel()
+"""Weighs measurements by what they miss beside the running median: spikes must not make a fault,
+and what lasts must not be weighed away."""
+MEDIAN_OF = 7
+"""Successive readings of one beam, or of one component of an aid."""
+BESIDE_MEDIAN = 0.925
+"""Variance of a Gaussian reading less the median of seven, of which it is one."""
+
+
+class Channel(NamedTuple):
+    """A sensor and the numbers that it may be off by."""
+
+    name: str
+    columns: slice
+    """Among those of one block"""
+
+
+def beside_median(values: Array) -> Array:
+    """Return readings (N, ...) less their running median, the ends mirrored.
+
+    Of fewer than would fill half of it nothing lasts: they are returned as they are.
+    """
+    half = MEDIAN_OF // 2
+    if len(values) <= half:
+        return values
+    padded = np.pad(values, [(half, half)] + [(0, 0)] * (values.ndim - 1), mode="reflect")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, MEDIAN_OF, axis=0)
+    return np.asarray(values - np.median(windows, axis=-1))
+
+
+def spike_weights(whitened: Array) -> Array:
+    """Return weights (N,) of successive readings (N, d) by how far they stick out.
+
+    What sticks out is measured by what is usual here: sigmas stated too small would make faults of
+    noise. So weights are below one throughout where readings scatter more than stated.
+    """
+    off = beside_median(whitened) / np.sqrt(BESIDE_MEDIAN)
+    square, dim = np.sum(off**2, axis=1), whitened.shape[1]
+    excess = 1.0
+    for _ in range(4):
+        weights = KERNEL.weight(square / excess, dim=dim)
+        mean = float(np.sum(weights * square) / max(np.sum(weights) * dim, 1.0))
+        excess = max(mean, 1.0)
+    return np.asarray(weights / excess)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Linear:
+    """A problem linearised at its states, weighed, and solved for the trajectory alone."""
+
+    states: States
+    """With nothing freed"""
+    beam_weights: Array
+    aids: tuple[Aid, ...]
+    aid_weights: Mapping[str, Array]
+    solution: ChainSolution
+    own: OwnRows
+    between: BetweenRows
+    order: NDArray[np.intp]
+    """(R,) rows of beams, then of each aid, in the order of their keyframes"""
+    constants: Columns
+    """The calibrations of the problem"""
+    bare: GraphLinearizer
+
+    @property
+    def problem(self) -> Problem:
+        """With nothing freed."""
+        return self.bare.problem
+
+    def solved_steps(self, own: Array, between: Array) -> Steps[Array]:
+        """Return the step (K, n) of the trajectory alone for errors (R,) and (K - 1, m) of rows."""
+        solution = yield from self.bare.solve_rows_steps(
+            self.states,
+            self.own.keyframe,
+            np.column_stack([self.own.jacobian, self.constants.own, self.own.missed - own]),
+            np.concatenate(
+                [
+                    self.between.jacobian,
+                    self.constants.between,
+                    (self.between.missed - between)[:, :, None],
+                ],
+                axis=2,
+            ),
+        )
+        return solution.step - solution.sensitivity @ solution.constants_step
+
+
+def linear_of_steps(
+    bare: GraphLinearizer,
+    linearizer: GraphLinearizer,
+    states: States,
+    beams_out: NDArray[np.bool_],
+    aids_out: NDArray[np.bool_],
+) -> Steps[Linear]:
+    """Weigh all measurements, solve for the trajectory, and return rows and what they miss.
+
+    Parameters
+    ----------
+    bare : of the problem with nothing freed.
+    linearizer : of the same with what was found freed, which is taken off what rows miss.
+    states : of that, near the answer.
+    beams_out, aids_out : (M,) and (A,) which measurements count for nothing.
+    """
+    problem = bare.problem
+    n, width = problem.extras.state_dim, problem.extras.width
+    beams = linearizer.beam_rows(states)
+    beam_weights = _beam_weights(problem, beams)
+    beam_weights[beams_out] = WEIGHT_FLOOR
+    weighted = linearizer.weighted
+    of_aids = [spike_weights(weighted.whitened(aid, states).error) for aid in weighted.all]
+    weights = np.concatenate([np.zeros(0), *of_aids])
+    weights[aids_out] = WEIGHT_FLOOR
+    scale = np.sqrt(beam_weights) / problem.beams.sigma
+    aid_keyframe, error, jacobian = weighted.rows(states, weights)
+    own = np.concatenate(
+        [
+            np.column_stack([beams.jacobian[:, :width], -beams.error]) * scale[:, None],
+            np.column_stack([jacobian[:, :width], -error]),
+        ]
+    )
+    keyframe = np.concatenate([problem.beams.keyframe, aid_keyframe])
+    order = np.argsort(keyframe, kind="stable")
+    keyframe, own = keyframe[order], own[order]
+    between = linearizer.inertial_rows(states)
+    between = np.concatenate([between[:, :, : n + width], between[:, :, -1:]], axis=2)
+    yield 0.025 * problem.n_keyframes
+    states = states._replace(constants=states.constants[: problem.extras.n_constants])
+    solution = yield from bare.solve_rows_steps(states, keyframe, own, between)
+    step = solution.step - solution.sensitivity @ solution.constants_step
+    missed = own[:, -1] - np.einsum("ri,ri->r", own[:, :n], step[keyframe])
+    both = np.concatenate([step[:-1], step[1:]], axis=1)
+    missed_between = between[:, :, -1] - np.einsum("kij,kj->ki", between[:, :, : 2 * n], both)
+    return Linear(
+        states=states,
+        beam_weights=beam_weights,
+        aids=weighted.all,
+        aid_weights={aid.name: weighted.of(aid, weights) for aid in weighted.all},
+        solution=solution,
+        own=OwnRows(keyframe, own[:, :n], missed),
+        between=BetweenRows(between[:, :, : 2 * n], missed_between),
+        order=order,
+        constants=Columns(own[:, n:-1], between[:, :, 2 * n : -1]),
+        bare=bare,
+    )
+
+
+def _beam_weights(problem: Problem, beams: BeamRows) -> Array:
+    weights = np.ones(len(beams.error))
+    for beam in range(problem.beams.n_beams):
+        own = problem.beams.beam == beam
+        whitened = (beams.error / problem.beams.sigma)[own]
+        weights[own] = spike_weights(whitened[:, None])
+    return weights
+
+
+class Channels:
+    """All channels of a linearised mission, and their columns."""
+
+    def __init__(self, linear: Linear) -> None:
+        self._linear = linear
+        beams = linear.problem.beams
+        sizes = {BEAM: beams.n_beams, BOTTOM: 3, SCALE: 1, MOUNTING: 3}
+        sizes |= {aid.name: aid.dim for aid in linear.aids if len(aid)}
+        sizes[IMU] = 6
+        ends = np.cumsum(list(sizes.values())).tolist()
+        self.all = tuple(
+            Channel(name, slice(end - size, end))
+            for (name, size), end in zip(sizes.items(), ends, strict=True)
+        )
+        self.width = ends[-1]
+        self.beams = self._beams()
+        self.between = self._between()
+        self.aids = {aid.name: aid.root_information for aid in linear.aids if len(aid)}
+        self.aid_keyframe = {aid.name: aid.keyframe for aid in linear.aids if len(aid)}
+        self.columns = self._columns()
+
+    def of(self, name: str) -> Channel:
+        """Return a channel by its name."""
+        return next(channel for channel in self.all if channel.name == name)
+
+    @property
+    def beams_d(self) -> Array:
+        """(B, 3) the mean direction of each beam in instrument axes."""
+        beams = self._linear.problem.beams
+        of_rows, mean = beams.beam_b @ beams.R_bd, np.zeros((beams.n_beams, 3))
+        for beam in range(beams.n_beams):
+            if np.any(beams.beam == beam):
+                mean[beam] = of_rows[beams.beam == beam].mean(axis=0)
+        return mean
+
+    def _beams(self) -> Array:
+        """Return what a unit of each channel does to the beam speeds (M, B), m/s."""
+        linear, problem = self._linear, self._linear.problem
+        beams, states = problem.beams, linear.states
+        made = np.zeros((len(beams.speed), self.width))
+        made[np.arange(len(made)), beams.beam] = 1.0
+        R_nb = states.R_nb[beams.keyframe]
+        along_n = np.einsum("mij,mj->mi", R_nb, beams.beam_b)
+        made[:, self.of(BOTTOM).columns] = -along_n * ~beams.is_water[:, None]
+        calibration = calibration_columns(problem, states)
+        made[:, self.of(SCALE).columns] = calibration[:, :1]
+        made[:, self.of(MOUNTING).columns] = calibration[:, 1:]
+        return made
+
+    def _between(self) -> Array:
+        """Return what a unit of each bias does to the whitened inertial rows (K - 1, 15, 6)."""
+        rows, n = self._linear.between.jacobian, self._linear.problem.extras.state_dim
+        # A bias at the begin acts on the motion and on the bias at the end, that at the end on the
+        # latter alone, the other way round.
+        begin, end = slice(ACCEL_BIAS.start, STATE_DIM), slice(n + ACCEL_BIAS.start, n + STATE_DIM)
+        return np.asarray(rows[:, :STATE_DIM, begin] + rows[:, :STATE_DIM, end])
+
+    def _columns(self) -> Columns:
+        linear = self._linear
+        scale = np.sqrt(linear.beam_weights) / linear.problem.beams.sigma
+        rows = [self.beams * scale[:, None]]
+        for aid in linear.aids:
+            own = np.zeros((len(aid), aid.dim, self.width))
+            if len(aid):
+                root = np.sqrt(linear.aid_weights[aid.name])[:, None, None] * aid.root_information
+                own[:, :, self.of(aid.name).columns] = root
+            rows.append(own.reshape(-1, self.width))
+        between = np.zeros((*linear.between.missed.shape, self.width))
+        between[:, :STATE_DIM, self.of(IMU).columns] = self.between
+        return Columns(np.concatenate(rows)[linear.order], between)
+
+
+def calibration_columns(problem: Problem, states: States) -> Array:
+    """Return what scale (1) and mounting angles (3, rad) do to the beam speeds (M, 4), m/s."""
+    beams, k = problem.beams, problem.beams.keyframe
+    R_nb, v_n = states.R_nb[k], states.v_n[k]
+    water = WaterRows(beams, problem.extras, problem.frame)
+    through = water.relative(v_n, p_n=states.p_n[k], walks=states.walks[k], rows=np.s_[:])
+    v_n = v_n if through is None else through.v_n
+    v_b = np.einsum("mij,mi->mj", R_nb, v_n)
+    along = np.einsum("mi,mi->m", beams.beam_b, v_b)
+    return np.column_stack([along, np.cross(v_b, beams.beam_b)])

@@ -1,0 +1,191 @@
+"""What may be off for long: each hypothesis a sensor, the numbers of it, and words for them.
+
+A hypothesis is some sums of a channel's columns, over a stretch: by a constant, by a constant and
+a rate, or by anything. Another one is another line of :func:`hypotheses_of`.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from enum import Enum
+from functools import cache, partial
+
+import numpy as np
+from scipy.stats import chi2
+
+from ssm_graph.base.frozen import Array
+from ssm_graph.smoothers.faults.columns import (
+    BEAM,
+    BOTTOM,
+    IMU,
+    MOUNTING,
+    SCALE,
+    Channels,
+)
+
+PER_NUMBER = 6.0
+"""Chi-square that each further number of a hypothesis has to earn besides, against others."""
+LEAST_PER_NUMBER = 2.0
+"""And by itself, where it may be anything: that fits more than its tail allows for."""
+
+
+AT_AN_END = 4.5
+"""Chi-square by which a stretch to the begin or the end of the mission needs less, and twice as
+much one over all of it: there are N and 1 of these, of others N^2 / 2."""
+
+
+class Course(Enum):
+    """How an error goes on over its stretch."""
+
+    CONSTANT = "by a constant"
+    TREND = "by a constant and a rate"
+    ANYTHING = "by anything"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hypothesis:
+    """A way in which a sensor may be off over a stretch."""
+
+    sensor: str
+    """As people call it."""
+    channel: str
+    combined: Array
+    """(c, d) the numbers' columns as sums of those of the channel"""
+    sigma: Array
+    """(d,) of their priors: so large are they at most"""
+    say: Callable[[Array], str]
+    """Words for sizes (d,)"""
+    course: Course = Course.CONSTANT
+    handicap: float = 0.0
+    """Chi-square by which it has to be better than others."""
+    tail: float = 2e-7
+    """Probability of one stretch's chi-square where nothing is off"""
+
+    @property
+    def n_numbers(self) -> int:
+        """Of one stretch that is not by anything."""
+        return int(self.combined.shape[1]) * (2 if self.course is Course.TREND else 1)
+
+    def charge(self, n_numbers: int) -> float:
+        """Return the chi-square that hypotheses are compared beyond: each number has its price."""
+        return chi_sq_at(self.tail, n_numbers) + PER_NUMBER * (n_numbers - 1) + self.handicap
+
+    def least(self, n_numbers: int) -> float:
+        """Return the chi-square from which on so many numbers are no chance."""
+        more = LEAST_PER_NUMBER * (n_numbers - 1) if self.course is Course.ANYTHING else 0.0
+        return chi_sq_at(self.tail, n_numbers) + more + self.handicap
+
+
+@cache
+def chi_sq_at(tail: float, n_numbers: int) -> float:
+    """Return what a chi-square of so many numbers exceeds with this probability."""
+    return float(chi2.isf(tail, n_numbers))
+
+
+def hypotheses_of(channels: Channels, *, significance: float) -> tuple[Hypothesis, ...]:
+    """Return all hypotheses of a mission; ``significance`` in sigmas of one number."""
+    tail = float(chi2.sf(significance**2, 1))
+    found = [*_of_beams(channels), *_of_the_array(channels), *_of_inertial()]
+    for channel in channels.all:
+        if channel.name not in (BEAM, BOTTOM, SCALE, MOUNTING, IMU):
+            found.extend(_of_aid(channel.name, channel.columns.stop - channel.columns.start))
+    return tuple(replace(one, tail=tail) for one in found)
+
+
+def _of_beams(channels: Channels) -> Iterator[Hypothesis]:
+    unit = np.eye(channels.of(BEAM).columns.stop)
+    n_beams = len(unit)
+    for beam in range(n_beams):
+        one = Hypothesis(f"DVL beam {beam + 1}", BEAM, unit[:, [beam]], np.full(1, 3.0), _speeds)
+        yield one
+        yield replace(one, course=Course.TREND)
+        yield replace(one, course=Course.ANYTHING)
+    for a, b in itertools.combinations(range(n_beams), 2):
+        sensor = f"DVL beams {a + 1} and {b + 1}"
+        for sign in (1.0, -1.0):
+            yield Hypothesis(
+                sensor,
+                BEAM,
+                unit[:, [a]] + sign * unit[:, [b]],
+                np.full(1, 3.0),
+                partial(_pair, sign),
+            )
+        yield Hypothesis(sensor, BEAM, unit[:, [a, b]], np.full(2, 3.0), _speeds)
+
+
+def _of_the_array(channels: Channels) -> Iterator[Hypothesis]:
+    yield Hypothesis("DVL", BOTTOM, np.eye(3), np.full(3, 3.0), _bottom)
+    if len(channels.beams_d) >= 3:
+        yield Hypothesis("DVL", BEAM, channels.beams_d, np.full(3, 3.0), _axes)
+    yield Hypothesis("DVL", SCALE, np.eye(1), np.full(1, 1.0), _scale)
+    yield Hypothesis("DVL", MOUNTING, np.eye(3), np.full(3, 1.0), _turn)
+
+
+def _of_inertial() -> Iterator[Hypothesis]:
+    unit = np.eye(6)
+    yield Hypothesis("accelerometers", IMU, unit[:, :3], np.full(3, 0.3), _forces, handicap=12.0)
+    yield Hypothesis("gyros", IMU, unit[:, 3:], np.full(3, 0.1), _rates, handicap=12.0)
+
+
+def _of_aid(name: str, dim: int) -> Iterator[Hypothesis]:
+    unit, size = AIDS.get(name, ("", 1e3))
+    say = _place if dim == 3 else lambda s: f"{s[0]:+.3g} {unit}".rstrip()
+    one = Hypothesis(name, name, np.eye(dim), np.full(dim, size), say)
+    for course in Course:
+        yield replace(one, course=course)
+
+
+AIDS = {
+    "GNSS": ("m", 1e3),
+    "USBL": ("m", 1e3),
+    "depth": ("m", 1e2),
+    "range": ("m", 1e3),
+    "heading": ("rad", 1.0),
+}
+"""Unit and prior sigma of what an aid is off by."""
+
+
+def _pair(sign: float, s: Array) -> str:
+    return _speeds(np.array([s[0], sign * s[0]]))
+
+
+def _speeds(s: Array) -> str:
+    return " and ".join(f"{x:+.3f}" for x in s) + " m/s"
+
+
+def _bottom(s: Array) -> str:
+    speed, to = math.hypot(s[0], s[1]), math.degrees(math.atan2(s[0], s[1])) % 360.0
+    return (
+        f"what its beams see moves at {speed:.3f} m/s towards {to:.0f} deg and {s[2]:+.3f} m/s up: "
+        "a layer above the bottom, a bottom that drifts, or the water taken for it"
+    )
+
+
+def _axes(s: Array) -> str:
+    return f"its velocity is off by {s[0]:+.3f}, {s[1]:+.3f}, {s[2]:+.3f} m/s along its axes"
+
+
+def _scale(s: Array) -> str:
+    return f"reads {1.0 + s[0]:.4f} of the speed"
+
+
+def _turn(s: Array) -> str:
+    x, y, z = np.degrees(s)
+    return f"its mounting is turned by {x:+.2f}, {y:+.2f}, {z:+.2f} deg about x, y, z of the body"
+
+
+def _forces(s: Array) -> str:
+    return f"off by {s[0]:+.2g}, {s[1]:+.2g}, {s[2]:+.2g} m/s^2 along x, y, z"
+
+
+def _rates(s: Array) -> str:
+    x, y, z = np.degrees(s)
+    return f"off by {x:+.2g}, {y:+.2g}, {z:+.2g} deg/s about x, y, z"
+
+
+def _place(s: Array) -> str:
+    level, to = math.hypot(s[0], s[1]), math.degrees(math.atan2(s[0], s[1])) % 360.0
+    return f"{level:.2g} m towards {to:.0f} deg and {s[2]:+.2g} m up"

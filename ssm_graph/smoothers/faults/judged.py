@@ -1,0 +1,387 @@
+"""How much better the data fit once a hypothesis is allowed for, of all stretches at once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ssm_graph.base.frozen import Array
+from ssm_graph.base.stepwise import Steps
+from ssm_graph.engine.error_state import POSITION
+from ssm_graph.engine.evidence import ChainEvidence, Columns, Evidence
+from ssm_graph.smoothers.faults.columns import IMU, Channels, Linear
+from ssm_graph.smoothers.faults.hypotheses import (
+    AT_AN_END,
+    LEAST_PER_NUMBER,
+    PER_NUMBER,
+    Course,
+    Hypothesis,
+)
+from ssm_graph.smoothers.faults.nuisances import WIDER, WIDTHS, Nuisances
+
+TREND_S = 100.0
+"""s, in which the rate of a trend is counted here."""
+LEAST_FORCE = 10.0
+"""m/s^2, of a jump: it is no larger."""
+MEDIAN_OF_THREE = 2.366
+"""Of a chi-square with three degrees of freedom."""
+WORTH = 15.0
+"""Chi-square of a constant from which on a sensor may be off by anything."""
+
+
+class Grid(NamedTuple):
+    """Blocks of keyframes, whose edges are where stretches begin and end."""
+
+    edges: NDArray[np.intp]
+    """(N + 1) keyframes, the last one after the mission's end"""
+    middle_s: Array
+    """(N,) s"""
+    length_s: Array
+    """(N,) s"""
+    block_s: float
+    """Of a coarse block, s"""
+
+    @classmethod
+    def of(cls, keyframe_s: Array, edges_s: Iterable[float], *, block_s: float = 10.0) -> Grid:
+        """Return the blocks between some times, s, and the ends of the mission."""
+        inner = np.searchsorted(keyframe_s, np.array(sorted(edges_s)))
+        edges = np.unique(np.concatenate([[0], inner, [len(keyframe_s)]]))
+        last = np.append(keyframe_s, keyframe_s[-1])
+        begin_s, end_s = last[edges[:-1]], last[edges[1:]]
+        return cls(edges, 0.5 * (begin_s + end_s), end_s - begin_s, block_s)
+
+    def coarse(self) -> tuple[NDArray[np.intp], Array]:
+        """Return the first block of each coarse one (G,), and their middles, s."""
+        begin_s = self.middle_s - 0.5 * self.length_s
+        number = np.floor((self.middle_s - begin_s[0]) / self.block_s)
+        first = np.flatnonzero(np.diff(number, prepend=-1.0))
+        ends_s = np.append(begin_s[first[1:]], begin_s[-1] + self.length_s[-1])
+        return first, 0.5 * (begin_s[first] + ends_s)
+
+    @property
+    def n_blocks(self) -> int:
+        """How many there are."""
+        return len(self.middle_s)
+
+
+class Candidate(NamedTuple):
+    """A hypothesis over a stretch of blocks."""
+
+    hypothesis: Hypothesis
+    begin: int
+    """Block"""
+    end: int
+    """The first block after it"""
+    chi_sq: float
+    merit: float
+    """By which that exceeds its charge"""
+    discount: float
+    """Of what it needs, for the ends of the mission"""
+
+    def n_numbers(self) -> int:
+        """Return how many numbers it has."""
+        is_anything = self.hypothesis.course is Course.ANYTHING
+        return self.hypothesis.n_numbers * (self.end - self.begin if is_anything else 1)
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether it is no chance."""
+        return self.chi_sq > self.hypothesis.least(self.n_numbers()) - self.discount
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fault:
+    """A hypothesis over a stretch of keyframes."""
+
+    hypothesis: Hypothesis
+    begin: int
+    """Keyframe"""
+    end: int
+    """The first keyframe after it"""
+    chi_sq: float = 0.0
+    """By which the data fit better"""
+    merit: float = 0.0
+    """By which that exceeds its charge"""
+    rivals: tuple[Fault, ...] = ()
+    """Others that explain the data as well"""
+    sizes: Array | None = None
+    """Of its numbers, taken off the rows already; None for what is new"""
+    cost_m: float = 0.0
+    """By how much the horizontal position moves between the explanations, m"""
+
+    @property
+    def n_constants(self) -> int:
+        """Of the graph, none where its rows are left out instead."""
+        is_anything = self.hypothesis.course is Course.ANYTHING
+        return 0 if is_anything else self.hypothesis.n_numbers
+
+
+class Apart(NamedTuple):
+    """How far two answers are apart, at most."""
+
+    sigmas: float
+    level_m: float
+    """Horizontally, m"""
+
+
+class Judge:
+    """Evidence of one linearised mission, on any grid and with any faults freed."""
+
+    def __init__(self, linear: Linear, channels: Channels, nuisances: Nuisances) -> None:
+        self.linear, self.channels, self._nuisances = linear, channels, nuisances
+        self._chain = ChainEvidence(linear.solution, linear.own, linear.between)
+        self._last: tuple[NDArray[np.intp], Evidence] | None = None
+
+        self.widths: tuple[float, ...] = (1.0, 1.0, 1.0)
+        """Of the nuisances of beams, aids and inertial data"""
+
+    def fit(self, grid: Grid, faults: Sequence[Fault]) -> None:
+        """Let the nuisances be as wide as the data ask for, once faults are freed."""
+        evidence, width = self._whole(grid), self.channels.width
+        for fault in faults:
+            combined, prior = combined_of(fault, grid, self.channels)
+            padded = np.zeros((len(evidence.score), combined.shape[1]))
+            padded[: grid.n_blocks * width] = combined
+            evidence = evidence.freed(padded, prior)
+        priors = self._nuisances.priors(*grid.coarse())
+        crossed = priors.crossed(evidence, width)
+        self.widths = priors.fitted(
+            crossed.score, priors.among(crossed, width), choices=WIDER if faults else WIDTHS
+        )
+
+    def on(self, grid: Grid) -> Judged:
+        """Return the evidence on a grid, with nothing freed but the nuisances."""
+        width = self.channels.width
+        whole, n = self._whole(grid), grid.n_blocks * width
+        priors = self._nuisances.priors(*grid.coarse())
+        crossed = priors.crossed(whole, width)
+        inner = priors.among(crossed, width) + priors.information(self.widths)
+        blocks = Evidence(whole.score[:n], whole.information[:n, :n])
+        left = blocks.without(crossed.score, crossed.information[:, :n], inner)
+        return Judged(left, grid, self.channels)
+
+    def jolts(self, grid: Grid) -> Array:
+        """Return the chi-square of a jump of velocity within each block alone (N,).
+
+        What begins or ends within it looks like one. It is for noise as usual in this mission.
+        """
+        columns = self.channels.columns
+        first = self.channels.of(IMU).columns.start
+        force = slice(first, first + 3)
+        own = Columns(columns.own[:, force], columns.between[:, :, force])
+        score, information = self._chain.each(grid.edges, own)
+        least = LEAST_FORCE**-2 * np.eye(3)
+        chi_sq = np.sum(
+            score * np.linalg.solve(information + least, score[..., None])[..., 0], axis=1
+        )
+        return np.asarray(chi_sq / max(float(np.median(chi_sq)) / MEDIAN_OF_THREE, 1.0))
+
+    def way_steps(self, judged: Judged, faults: Sequence[Fault]) -> Steps[Array]:
+        """Return where the trajectory goes (K, 3), in body axes, m, if these are freed."""
+        effect = -judged.restored
+        for fault, size in zip(faults, judged.sizes(faults), strict=True):
+            effect += judged.combined(fault)[0] @ size
+        linear, columns = self.linear, self.channels.columns
+        of_block = effect.reshape(judged.grid.n_blocks, -1)
+        block = (
+            np.searchsorted(judged.grid.edges, np.arange(len(linear.states.R_nb)), side="right") - 1
+        )
+        own = np.einsum("rc,rc->r", columns.own, of_block[block[linear.own.keyframe]])
+        between = np.einsum("kic,kc->ki", columns.between, of_block[block[:-1]])
+        solution = yield from linear.solved_steps(own, between)
+        return solution[:, POSITION]
+
+    def apart(self, one: Array, other: Array) -> Apart:
+        """Return how far two ways (K, 3) of :meth:`way_steps` are apart."""
+        off_b, linear = one - other, self.linear
+        P = linear.solution.covariance_of(POSITION)
+        sigmas = np.sqrt(np.einsum("ki,ki->k", off_b, np.linalg.solve(P, off_b[..., None])[..., 0]))
+        off_n = np.einsum("kij,kj->ki", linear.states.R_nb, off_b)
+        return Apart(float(np.max(sigmas)), float(np.max(np.hypot(off_n[:, 0], off_n[:, 1]))))
+
+    def _whole(self, grid: Grid) -> Evidence:
+        if self._last is None or not np.array_equal(self._last[0], grid.edges):
+            whole = self._chain.of(grid.edges, self.channels.columns, self._nuisances.shared)
+            whole.score[grid.n_blocks * self.channels.width :] += self._nuisances.score
+            self._last = grid.edges, whole
+        return self._last[1]
+
+
+class Judged:
+    """Evidence of the channels' columns on the blocks of a grid."""
+
+    def __init__(
+        self, evidence: Evidence, grid: Grid, channels: Channels, restored: Array | None = None
+    ) -> None:
+        self.evidence, self.grid, self.channels = evidence, grid, channels
+        self.restored = np.zeros(len(evidence.score)) if restored is None else restored
+        """(C,) what is not taken off the rows here"""
+
+    def restoring(self, faults: Iterable[Fault]) -> Judged:
+        """Return what the data say if these had not been taken off the rows."""
+        restored = self.restored.copy()
+        for fault in faults:
+            if fault.sizes is not None:
+                restored += self.combined(fault)[0] @ fault.sizes
+        score = self.evidence.score + self.evidence.information @ (restored - self.restored)
+        return Judged(self.evidence._replace(score=score), self.grid, self.channels, restored)
+
+    def with_freed(self, faults: Sequence[Fault]) -> Judged:
+        """Return what is left once some faults may be of any size."""
+        evidence = self.evidence
+        for fault in faults:
+            combined, prior = self.combined(fault)
+            evidence = evidence.freed(combined, prior)
+        return Judged(evidence, self.grid, self.channels, self.restored)
+
+    def combined(self, fault: Fault) -> tuple[Array, Array]:
+        """Return the columns of a fault as sums of those here, and its prior information."""
+        return combined_of(fault, self.grid, self.channels)
+
+    def chi_sq(self, fault: Fault) -> float:
+        """Return by how much the data fit better with a fault freed."""
+        combined, prior = self.combined(fault)
+        score = combined.T @ self.evidence.score
+        inner = combined.T @ self.evidence.information @ combined + prior
+        return float(score @ np.linalg.solve(inner, score))
+
+    def sizes(self, faults: Sequence[Fault]) -> list[Array]:
+        """Return how large faults are if all of them are freed together."""
+        if not faults:
+            return []
+        parts = [self.combined(fault) for fault in faults]
+        combined = np.hstack([part for part, _ in parts])
+        prior = np.concatenate([np.diagonal(p) for _, p in parts])
+        inner = combined.T @ self.evidence.information @ combined + np.diag(prior)
+        size = np.linalg.solve(inner, combined.T @ self.evidence.score)
+        return np.split(size, np.cumsum([part.shape[1] for part, _ in parts])[:-1])
+
+    def best_of(
+        self,
+        hypotheses: Iterable[Hypothesis],
+        *,
+        near: Fault | None = None,
+        apart_from: Fault | None = None,
+    ) -> list[Candidate]:
+        """Return the best stretch of each hypothesis, the best ones first.
+
+        ``near`` a fault, only stretches that overlap it are looked at; ``apart_from`` one, only
+        those that do not.
+        """
+        found = []
+        edges = self.grid.edges
+        is_apart = np.zeros((len(edges), len(edges)), bool)
+        if near is not None:
+            is_apart = (edges[:, None] >= near.end) | (edges[None, :] <= near.begin)
+        elif apart_from is not None:
+            is_apart = (edges[:, None] < apart_from.end) & (edges[None, :] > apart_from.begin)
+        discount = np.zeros((len(edges), len(edges)))
+        discount[0] += AT_AN_END
+        discount[:, -1] += AT_AN_END
+        best_so_far: dict[str, float] = {}
+        for hypothesis in hypotheses:
+            # Where no constant is worth a look in any stretch, there is nothing of another course.
+            if (
+                hypothesis.course is Course.ANYTHING
+                and best_so_far.get(hypothesis.sensor, WORTH) < WORTH
+            ):
+                continue
+            chi_sq, charge = self.table(hypothesis)
+            largest = float(np.max(chi_sq))
+            best_so_far[hypothesis.sensor] = max(best_so_far.get(hypothesis.sensor, 0.0), largest)
+            merit = np.where(is_apart, -np.inf, chi_sq - charge + discount)
+            begin, end = np.unravel_index(int(np.argmax(merit)), merit.shape)
+            own = (float(table[begin, end]) for table in (chi_sq, merit, discount))
+            found.append(Candidate(hypothesis, int(begin), int(end), *own))
+        return sorted(found, key=lambda candidate: -candidate.merit)
+
+    def table(self, hypothesis: Hypothesis) -> tuple[Array, Array]:
+        """Return chi-square and what it has to exceed, by begin and end block (N + 1, N + 1)."""
+        if hypothesis.course is Course.ANYTHING:
+            return self._table_of_anything(hypothesis)
+        n = self.grid.n_blocks
+        score, information = self._projected(hypothesis)
+        moments = moments_of(hypothesis, self.grid)
+        d = score.shape[1] * moments.shape[1]
+        score = (moments[:, :, None] * score[:, None, :]).reshape(n, d)
+        if moments.shape[1] > 1:
+            by_begin = moments[:, :, None, None, None, None] * information[:, None, :, :, None, :]
+            information = by_begin * moments[:, :, None]
+        summed = np.zeros((n + 1, d, n + 1, d))
+        summed[1:, :, 1:] = information.reshape(n, d, n, d).cumsum(axis=0).cumsum(axis=2)
+        begin, end = np.triu_indices(n + 1, 1)
+        swapped = summed.transpose(0, 2, 1, 3)
+        inner = (
+            swapped[end, end] + swapped[begin, begin] - swapped[begin, end] - swapped[end, begin]
+        )
+        prior = np.diag(1.0 / np.tile(hypothesis.sigma, moments.shape[1]) ** 2)
+        summed_score = np.concatenate([np.zeros((1, d)), score.cumsum(axis=0)])
+        of_stretch = summed_score[end] - summed_score[begin]
+        if d == 1:
+            square = of_stretch[:, 0] ** 2 / (inner[:, 0, 0] + prior[0, 0])
+        else:
+            solved = np.linalg.solve(inner + prior, of_stretch[..., None])[..., 0]
+            square = np.sum(solved * of_stretch, axis=1)
+        chi_sq = np.full((n + 1, n + 1), -np.inf)
+        chi_sq[begin, end] = square
+        return chi_sq, np.full_like(chi_sq, hypothesis.charge(hypothesis.n_numbers))
+
+    def _table_of_anything(self, hypothesis: Hypothesis) -> tuple[Array, Array]:
+        n = self.grid.n_blocks
+        score, information = self._projected(hypothesis)
+        d = score.shape[1]
+        flat = information.reshape(n * d, n * d) + np.diag(np.tile(1.0 / hypothesis.sigma**2, n))
+        chi_sq = np.full((n + 1, n + 1), -np.inf)
+        for begin in range(n):
+            root = np.linalg.cholesky(flat[begin * d :, begin * d :])
+            half = np.linalg.solve(root, score[begin:].ravel())
+            chi_sq[begin, begin + 1 :] = np.cumsum(np.sum(half.reshape(-1, d) ** 2, axis=1))
+        count = np.maximum(np.arange(n + 1)[None, :] - np.arange(n + 1)[:, None], 0)
+        ends_s = np.append(0.0, np.cumsum(self.grid.length_s))
+        coarse = np.ceil((ends_s[None, :] - ends_s[:, None]) / self.grid.block_s - 0.1)
+        needed = np.array([hypothesis.least(d * one) if one else np.inf for one in range(n + 1)])
+        extra = (PER_NUMBER - LEAST_PER_NUMBER) * (d * np.maximum(coarse, 1.0) - 1.0)
+        return chi_sq, needed[count] + extra
+
+    def _projected(self, hypothesis: Hypothesis) -> tuple[Array, Array]:
+        """Return score (N, d) and information (N, d, N, d) of a hypothesis in each block."""
+        n, width = self.grid.n_blocks, self.channels.width
+        own = self.channels.of(hypothesis.channel).columns
+        C = hypothesis.combined
+        information = self.evidence.information.reshape(n, width, n, width)[:, own, :, own]
+        # Slices on both sides of an index keep their places.
+        projected = np.einsum("ap,iajb,bq->ipjq", C, information, C, optimize=True)
+        return self.evidence.score.reshape(n, width)[:, own] @ C, projected
+
+
+def combined_of(fault: Fault, grid: Grid, channels: Channels) -> tuple[Array, Array]:
+    """Return the columns of a fault (N w, m) as sums of those of a grid, and its prior."""
+    hypothesis, width = fault.hypothesis, channels.width
+    own = channels.of(hypothesis.channel).columns
+    begin, end = np.searchsorted(grid.edges, [fault.begin, fault.end]).tolist()
+    d = hypothesis.combined.shape[1]
+    if hypothesis.course is Course.ANYTHING:
+        shapes = np.eye(end - begin)
+    else:
+        shapes = moments_of(hypothesis, grid)[begin:end]
+        if hypothesis.course is Course.TREND:
+            # The rate counts from the begin of the stretch on.
+            shapes[:, 1] -= shapes[0, 1] - 0.5 * grid.length_s[begin] / TREND_S
+    made = np.zeros((grid.n_blocks, width, shapes.shape[1] * d))
+    for block, shape in zip(range(begin, end), shapes, strict=True):
+        made[block, own] = np.kron(shape, hypothesis.combined)
+    sigma = np.tile(hypothesis.sigma, shapes.shape[1])
+    return made.reshape(grid.n_blocks * width, -1), np.diag(1.0 / sigma**2)
+
+
+def moments_of(hypothesis: Hypothesis, grid: Grid) -> Array:
+    """Return how a hypothesis goes on over the blocks (N, 1 or 2)."""
+    one = np.ones((grid.n_blocks, 1))
+    if hypothesis.course is not Course.TREND:
+        return one
+    since = (grid.middle_s - grid.middle_s.mean()) / TREND_S
+    return np.column_stack([one, since])

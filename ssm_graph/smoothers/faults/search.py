@@ -1,0 +1,242 @@
+"""The search for what was off, and when.
+
+All hypotheses compete over all stretches of whole blocks. The best one that exceeds its charge has
+its edges refined, competes again, is freed, which shows what the others look like without it, and
+so on, as in a step-wise regression. What was found before competes anew at every look, for the
+first solution may be far off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ssm_graph.base.errors import ConfigError
+from ssm_graph.base.stepwise import Steps
+from ssm_graph.smoothers.faults.columns import IMU, Channels
+from ssm_graph.smoothers.faults.hypotheses import Course, Hypothesis, hypotheses_of
+from ssm_graph.smoothers.faults.judged import Candidate, Fault, Grid, Judge, Judged
+
+FINE_S = 1.0
+"""s, to which edges are refined."""
+NEW_PER_LOOK = 3
+"""Faults that one look adds: each bends the solution that the others are judged at."""
+STRONG = 300.0
+"""Chi-square of a fault after which the solution is made anew before more is looked for."""
+HINT = 0.75
+"""Share of its charge from which on a stretch of the coarse grid is looked at more closely:
+edges off the grid hide most of a fault."""
+JOLT = 22.0
+"""Chi-square of a jump of velocity, from which on an edge is looked for there: one of three numbers
+in 400 places is above it once in 50 missions."""
+INERTIAL_SHARE = 0.5
+"""Of the merit of an inertial fault, from which on another sensor's is taken instead."""
+SAME_STRETCH = 0.5
+SAME_ANSWER_SIGMAS = 1.0
+"""Explanations whose answers are nowhere further apart are one."""
+MOST_RIVALS = 2
+
+
+@dataclass(frozen=True, slots=True)
+class FaultSearch:
+    """Settings of the search."""
+
+    block_s: float = 10.0
+    """Stretches are looked for in blocks of this."""
+    significance: float = 5.2
+    """Sigmas by which one number must differ from zero, 2e-7; more numbers have to be as unlikely,
+    and each further one has to earn its keep besides."""
+    margin: float = 12.0
+    """A rival whose chi-square is less by no more than this explains the data as well."""
+
+    def __post_init__(self) -> None:
+        for name in ("block_s", "significance", "margin"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0.0):
+                raise ConfigError(f"{name}: expected a number above zero, got {value}")
+
+
+class Look:
+    """One look at a linearised mission, with what was found by those before."""
+
+    def __init__(self, judge: Judge, channels: Channels, settings: FaultSearch) -> None:
+        self._judge, self._settings = judge, settings
+        self._keyframe_s = judge.linear.problem.keyframe_s
+        self._work = 0.2 * len(self._keyframe_s)
+        self.hypotheses = hypotheses_of(channels, significance=settings.significance)
+
+    def find_steps(self, known: Sequence[Fault]) -> Steps[list[Fault]]:
+        """Return what is off: what was before, as it competes now, and what is new."""
+        self._judge.fit(self._grid(with_rivals(known)), with_rivals(known))
+        yield self._work
+        found = list(known)
+        for _ in range(NEW_PER_LOOK):
+            best = yield from self._next_steps(found)
+            if best is None:
+                break
+            found.append(best)
+            if best.chi_sq > STRONG:
+                break
+        return (yield from self._again_steps(found)) if len(found) > 1 or known else found
+
+    def _next_steps(self, found: Sequence[Fault]) -> Steps[Fault | None]:
+        """Return the best of what is left, None for nothing."""
+        coarse = self._judge.on(self._grid(with_rivals(found)))
+        yield self._work
+        left = coarse.with_freed(with_rivals(found))
+        ranked = left.best_of(self.hypotheses)
+        yield self._work
+        first = ranked[0]
+        hints = self._jolts(first.hypothesis)
+        if first.chi_sq > HINT * first.hypothesis.charge(first.n_numbers()):
+            hints.append(fault_of(first, left))
+        if not hints:
+            return None
+        fine = self._judge.on(self._grid(with_rivals(found), around=hints))
+        yield self._work
+        left = fine.with_freed(with_rivals(found))
+        ranked = left.best_of(self.hypotheses)
+        yield self._work
+        chosen = chosen_of(ranked)
+        if chosen is None:
+            return None
+        best = fault_of(chosen, left)
+        rivals = rivals_of(best, ranked, left, margin=self._settings.margin)
+        return (yield from self._against_steps(best, rivals, fine, found))
+
+    def _jolts(self, hypothesis: Hypothesis) -> list[Fault]:
+        """Return the second in which something may begin or end, if there is one.
+
+        Edges off the coarse grid hide most of a fault, but the inertial data show them.
+        """
+        found = []
+        for shift_s in (0.0, FINE_S):
+            begin_s = self._keyframe_s[0] + shift_s
+            edges_s = np.arange(begin_s, self._keyframe_s[-1], 2.0 * FINE_S)
+            grid = Grid.of(self._keyframe_s, edges_s)
+            jolts = self._judge.jolts(grid)
+            worst = int(np.argmax(jolts))
+            begin, end = grid.edges[worst : worst + 2].tolist()
+            found.append(Fault(hypothesis, begin, end, float(jolts[worst])))
+        worst_of_both = max(found, key=lambda one: one.chi_sq)
+        return [worst_of_both] if worst_of_both.chi_sq > JOLT else []
+
+    def _again_steps(self, found: list[Fault]) -> Steps[list[Fault]]:
+        """Let each compete anew about where it is, the others being freed; some are none then.
+
+        The strongest come first, and without weaker ones that only make up for their edges.
+        """
+        kept: list[Fault] = []
+        waiting = sorted(found, key=lambda fault: -fault.merit)
+        while waiting:
+            fault, *waiting = waiting
+            if fault.hypothesis.course is Course.ANYTHING:
+                kept.append(fault)  # its rows count for nothing and can say no more
+                continue
+            beside = [one for one in waiting if self._touches(one, fault)]
+            others = [*kept, *(one for one in waiting if one not in beside)]
+            grid = self._grid(with_rivals([*others, *beside]), around=[fault])
+            fine = self._judge.on(grid).restoring(with_rivals([fault, *beside]))
+            yield self._work
+            left = fine.with_freed(with_rivals(others))
+            ranked = left.best_of(self.hypotheses, near=fault)
+            yield self._work
+            chosen = chosen_of(ranked)
+            if chosen is not None:
+                best = fault_of(chosen, left)
+                rivals = rivals_of(best, ranked, left, margin=self._settings.margin)
+                kept.append((yield from self._against_steps(best, rivals, fine, others)))
+        return kept
+
+    def _touches(self, one: Fault, other: Fault) -> bool:
+        """Return whether an edge of one is near an edge of the other."""
+        time_s = np.append(self._keyframe_s, self._keyframe_s[-1])
+        edges = time_s[[one.begin, one.end]][:, None] - time_s[[other.begin, other.end]]
+        return bool(np.min(np.abs(edges)) <= self._settings.block_s)
+
+    def _against_steps(
+        self, best: Fault, rivals: Sequence[Fault], fine: Judged, found: Sequence[Fault]
+    ) -> Steps[Fault]:
+        """Return a fault with those rivals whose answer is another one."""
+        if not rivals:
+            return best
+        others = with_rivals(found)
+        kept, cost_m = [], 0.0
+        own = yield from self._judge.way_steps(fine, [*others, best])
+        for rival in rivals:
+            other = yield from self._judge.way_steps(fine, [*others, rival])
+            apart = self._judge.apart(own, other)
+            if apart.sigmas > SAME_ANSWER_SIGMAS:
+                kept.append(rival)
+                cost_m = max(cost_m, apart.level_m)
+        return replace(best, rivals=tuple(kept[:MOST_RIVALS]), cost_m=cost_m)
+
+    def _grid(self, faults: Iterable[Fault], *, around: Iterable[Fault] = ()) -> Grid:
+        """Return blocks that begin and end where faults do, and fine ones about some."""
+        first_s, last_s, step_s = self._keyframe_s[0], self._keyframe_s[-1], self._settings.block_s
+        time_s = np.append(self._keyframe_s, last_s + 1.0)
+        edges_s = [np.arange(first_s, last_s, step_s)]
+        edges_s.extend(time_s[[fault.begin, fault.end]] for fault in faults)
+        fine_s = np.concatenate(
+            [np.arange(-5.0, 6.0) * FINE_S, [-step_s, -0.75 * step_s, 0.75 * step_s, step_s]]
+        )
+        for fault in around:
+            edges_s.extend(edge_s + fine_s for edge_s in time_s[[fault.begin, fault.end]])
+        return Grid.of(self._keyframe_s, np.concatenate(edges_s), block_s=step_s)
+
+
+def fault_of(candidate: Candidate, judged: Judged) -> Fault:
+    """Return a candidate as a fault: its blocks are those of one grid only."""
+    begin, end = judged.grid.edges[[candidate.begin, candidate.end]].tolist()
+    return Fault(candidate.hypothesis, begin, end, candidate.chi_sq, candidate.merit)
+
+
+def chosen_of(ranked: Sequence[Candidate]) -> Candidate | None:
+    """Return what is to be freed, None if nothing is significant; inertial data come last.
+
+    Biases over stretches explain a part of anything.
+    """
+    significant = [one for one in ranked if one.is_significant]
+    if not significant:
+        return None
+    best = significant[0]
+    others = (one for one in significant if one.hypothesis.channel != IMU)
+    other = next(others, best)
+    return other if other.merit > INERTIAL_SHARE * best.merit else best
+
+
+def rivals_of(
+    best: Fault, ranked: Sequence[Candidate], judged: Judged, *, margin: float
+) -> list[Fault]:
+    """Return other sensors, and other stretches, that explain the data as well."""
+    found = [fault_of(one, judged) for one in ranked if one.merit > best.merit - margin]
+    elsewhere = judged.best_of([best.hypothesis], apart_from=best)[0]
+    if elsewhere.merit > best.merit - margin:
+        found.append(fault_of(elsewhere, judged))
+    by_sensor: dict[tuple[str, bool], Fault] = {}
+    for one in found:
+        if not is_part_of(one, best):
+            by_sensor.setdefault((one.hypothesis.sensor, overlap(one, best) > SAME_STRETCH), one)
+    return list(by_sensor.values())
+
+
+def is_part_of(one: Fault, other: Fault) -> bool:
+    """Return whether one of both is the other, or part of it, over about the same stretch."""
+    a, b = one.hypothesis, other.hypothesis
+    if a.channel != b.channel or overlap(one, other) <= SAME_STRETCH:
+        return False
+    ranks = [np.linalg.matrix_rank(C) for C in (a.combined, b.combined)]
+    return bool(np.linalg.matrix_rank(np.hstack([a.combined, b.combined])) == max(ranks))
+
+
+def overlap(one: Fault, other: Fault) -> float:
+    """Return how much of two stretches they share, of all that they cover."""
+    shared = min(one.end, other.end) - max(one.begin, other.begin)
+    return max(shared, 0) / (max(one.end, other.end) - min(one.begin, other.begin))
+
+
+def with_rivals(found: Iterable[Fault]) -> list[Fault]:
+    """Return all that is to be freed: what was found, each with its rivals behind it."""
+    return [one for fault in found for one in (fault, *fault.rivals)]

@@ -1,0 +1,261 @@
+"""Looks for faults while a solution is iterated, and keeps the graph free of what was found."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.similarity import WEIGHT_FLOOR
+from ssm_graph.base.frozen import Array
+from ssm_graph.base.stepwise import Steps
+from ssm_graph.engine.extras import Extras
+from ssm_graph.engine.reweighting import NEAR_SIGMAS
+from ssm_graph.engine.states import States
+from ssm_graph.graph.freed import Freed
+from ssm_graph.graph.linearize import GraphLinearizer
+from ssm_graph.graph.measurements import aids_of
+from ssm_graph.mission.fault import DetectedFault, Treatment
+from ssm_graph.mission.problem import Problem
+from ssm_graph.smoothers.faults.columns import (
+    BEAM,
+    BOTTOM,
+    IMU,
+    MOUNTING,
+    SCALE,
+    Channels,
+    linear_of_steps,
+)
+from ssm_graph.smoothers.faults.hypotheses import Course
+from ssm_graph.smoothers.faults.judged import TREND_S, Fault, Judge
+from ssm_graph.smoothers.faults.nuisances import Nuisances
+from ssm_graph.smoothers.faults.search import FaultSearch, Look, with_rivals
+
+MOST_LOOKS = 8
+"""Looks after which the search ends whatever it finds."""
+
+
+class Changed(NamedTuple):
+    """The graph once something else is freed, and the states to go on from."""
+
+    linearizer: GraphLinearizer
+    states: States
+    weights: Array
+    """(M,) of the beams: a lie that lasts has turned those that contradict it away"""
+    aid_weights: Array
+    """(A,)"""
+
+
+class FaultWatch:
+    """Keeps a solution free of what a search finds, while it is iterated."""
+
+    def __init__(self, problem: Problem, search: FaultSearch | None) -> None:
+        """Take the problem as the smoother solves it; without a search nothing is ever found."""
+        self._problem, self._search = problem, search
+        self._bare = None if search is None else GraphLinearizer(problem)
+        self._found: list[Fault] = []
+        self._beams_out = np.zeros(len(problem.beams.speed), bool)
+        self.aids_out = np.zeros(sum(len(aid) for aid in aids_of(problem)), bool)
+        """(A,) measurements of aids that may have read anything"""
+        self._n_looks, self._is_done = 0, search is None
+
+    def leave_out(self, weights: Array) -> Array:
+        """Return the weights (M,) with the floor for beams that may have read anything."""
+        return np.where(self._beams_out, WEIGHT_FLOOR, weights)
+
+    def leave_aids_out(self, weights: Array) -> Array:
+        """Return the weights (A,) with the floor for measurements that may have read anything."""
+        return np.where(self.aids_out, WEIGHT_FLOOR, weights)
+
+    def look_steps(
+        self, linearizer: GraphLinearizer, states: States, *, update_sigmas: float
+    ) -> Steps[Changed | None]:
+        """Search once the solution is near; return what has changed, None for nothing.
+
+        What is found is freed; then it is searched again at what the solution has become, until
+        nothing changes any more. ``linearizer`` is that of the pass.
+        """
+        if self._is_done or self._bare is None or self._search is None:
+            return None
+        if update_sigmas >= NEAR_SIGMAS:
+            return None
+        self._n_looks += 1
+        own = states.constants[: self._problem.extras.n_constants]
+        bare_states = states._replace(constants=own)
+        yield from self._bare.integrate_steps(bare_states)
+        self._bare.follow(bare_states)
+        linear = yield from linear_of_steps(
+            self._bare, linearizer, states, self._beams_out, self.aids_out
+        )
+        channels = Channels(linear)
+        judge = Judge(linear, channels, Nuisances(linear, channels))
+        yield 0.02 * self._problem.n_keyframes
+        look = Look(judge, channels, self._search)
+        found = yield from look.find_steps(self._sized(states))
+        is_same = same_faults(found, self._found, self._problem.keyframe_s)
+        self._is_done = is_same or self._n_looks >= MOST_LOOKS
+        if is_same:
+            return None
+        self._found = sorted(found, key=lambda fault: (fault.begin, fault.end))
+        self._leave_out(channels)
+        freed, problem = self._freed(channels), self._problem
+        if len(freed.sigma):
+            blocks = (*problem.extras.blocks, freed.variable)
+            problem = replace(problem, extras=Extras(blocks))
+        constants = np.concatenate([bare_states.constants, np.zeros(len(freed.sigma))])
+        return Changed(
+            GraphLinearizer(problem, freed if len(freed.sigma) else None),
+            bare_states._replace(constants=constants),
+            self.leave_out(linear.beam_weights),
+            self.leave_aids_out(np.concatenate([np.zeros(0), *linear.aid_weights.values()])),
+        )
+
+    def _sized(self, states: States) -> list[Fault]:
+        """Return what was found with the sizes that the states give it."""
+        sizes = states.constants[self._problem.extras.n_constants :]
+        found, begin = [], 0
+        for fault in self._found:
+            parts = []
+            for one in (fault, *fault.rivals):
+                count = one.n_constants
+                parts.append(replace(one, sizes=sizes[begin : begin + count] if count else None))
+                begin += count
+            found.append(replace(parts[0], rivals=tuple(parts[1:])))
+        return found
+
+    def _freed(self, channels: Channels) -> Freed:
+        """Return the columns of all that was found."""
+        faults = [one for one in with_rivals(self._found) if one.n_constants]
+        beams, time_s = self._problem.beams, self._problem.keyframe_s
+        on_array = {
+            name: channels.beams[:, channels.of(name).columns]
+            for name in (BEAM, BOTTOM, SCALE, MOUNTING)
+        }
+        on_imu = {IMU: channels.between}
+        keyframes = np.arange(len(channels.between))
+        return Freed(
+            sigma=np.concatenate(
+                [np.zeros(0), *(np.resize(one.hypothesis.sigma, one.n_constants) for one in faults)]
+            ),
+            beams=_columns(faults, on_array, beams.keyframe, time_s),
+            between=_columns(faults, on_imu, keyframes, time_s),
+            aids={
+                name: _columns(faults, {name: root}, channels.aid_keyframe[name], time_s)
+                for name, root in channels.aids.items()
+                if any(one.hypothesis.channel == name for one in faults)
+            },
+        )
+
+    def _leave_out(self, channels: Channels) -> None:
+        """Note which measurements may have read anything."""
+        beams = self._problem.beams
+        self._beams_out = np.zeros(len(beams.speed), bool)
+        aids_out = {name: np.zeros(len(own), bool) for name, own in channels.aid_keyframe.items()}
+        for fault in with_rivals(self._found):
+            name = fault.hypothesis.channel
+            if fault.n_constants:
+                continue
+            if name == BEAM:
+                own = np.flatnonzero(fault.hypothesis.combined.any(axis=1))
+                self._beams_out |= np.isin(beams.beam, own) & _inside(beams.keyframe, fault)
+            else:
+                aids_out[name] |= _inside(channels.aid_keyframe[name], fault)
+        self.aids_out = np.concatenate([np.zeros(0, bool), *aids_out.values()])
+
+    def faults(self, states: States) -> tuple[DetectedFault, ...]:
+        """Return what was found, with the sizes that the answer gives it."""
+        end_s = np.append(self._problem.keyframe_s, self._problem.keyframe_s[-1])
+        found = []
+        for fault in self._sized(states):
+            hypothesis = fault.hypothesis
+            rivals = [
+                f"{one.hypothesis.sensor}, {end_s[one.begin]:.0f}-{end_s[one.end]:.0f} s, "
+                f"{said(one)}"
+                for one in fault.rivals
+            ]
+            treatment = Treatment.FREED if fault.n_constants else Treatment.LEFT_OUT
+            found.append(
+                DetectedFault(
+                    sensor=hypothesis.sensor,
+                    what=said(fault),
+                    begin_s=float(end_s[fault.begin]),
+                    end_s=float(end_s[fault.end]),
+                    chi_sq=fault.chi_sq,
+                    dof=hypothesis.n_numbers,
+                    treatment=Treatment.COVERED if rivals else treatment,
+                    rivals=tuple(rivals),
+                    cost_m=fault.cost_m,
+                )
+            )
+        return tuple(found)
+
+
+def said(fault: Fault) -> str:
+    """Return words for what a fault is."""
+    hypothesis, sizes = fault.hypothesis, fault.sizes
+    if sizes is None:
+        return "reads what nothing else agrees with"
+    d = hypothesis.combined.shape[1]
+    text = hypothesis.say(sizes[:d])
+    if hypothesis.course is Course.TREND:
+        text += f", and within a minute more by {hypothesis.say(60.0 / TREND_S * sizes[d:])}"
+    return text
+
+
+def same_faults(some: Sequence[Fault], others: Sequence[Fault], keyframe_s: Array) -> bool:
+    """Return whether these are the same faults, to the second."""
+    time_s = np.append(keyframe_s, keyframe_s[-1])
+
+    def keys(faults: Sequence[Fault]) -> list[tuple[str, str, str, float, float]]:
+        return sorted(
+            (
+                f.hypothesis.sensor,
+                f.hypothesis.channel,
+                f.hypothesis.course.name,
+                round(float(time_s[f.begin])),
+                round(float(time_s[f.end])),
+            )
+            for f in with_rivals(faults)
+        )
+
+    return keys(some) == keys(others)
+
+
+def _inside(keyframe: NDArray[np.intp], fault: Fault) -> NDArray[np.bool_]:
+    return (keyframe >= fault.begin) & (keyframe < fault.end)
+
+
+def _columns(
+    faults: Sequence[Fault],
+    of_channels: Mapping[str, Array],
+    keyframe: NDArray[np.intp],
+    keyframe_s: Array,
+) -> Array:
+    """Return the columns (N, ..., F) of faults on rows at keyframes (N,).
+
+    ``of_channels`` are those (N, ..., c) of the channels that act on these rows.
+    """
+    rows = next(iter(of_channels.values())).shape[:-1]
+    parts = [np.zeros((*rows, 0))]
+    for fault in faults:
+        hypothesis = fault.hypothesis
+        if hypothesis.channel in of_channels:
+            columns = of_channels[hypothesis.channel] @ hypothesis.combined
+            parts.append(_over(columns, keyframe, fault, keyframe_s))
+        else:
+            parts.append(np.zeros((*rows, fault.n_constants)))
+    return np.concatenate(parts, axis=-1)
+
+
+def _over(columns: Array, keyframe: NDArray[np.intp], fault: Fault, keyframe_s: Array) -> Array:
+    """Return columns (N, ..., d) of rows at keyframes (N,) over the stretch of a fault."""
+    inside = _inside(keyframe, fault).reshape(-1, *[1] * (columns.ndim - 1))
+    constant = columns * inside
+    if fault.hypothesis.course is not Course.TREND:
+        return np.asarray(constant)
+    since = (keyframe_s[keyframe] - keyframe_s[fault.begin]) / TREND_S
+    rate = constant * since.reshape(inside.shape)
+    return np.concatenate([constant, rate], axis=-1)

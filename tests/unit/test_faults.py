@@ -1,0 +1,298 @@
+"""The search for what was off, and when: named, in time, freed; and nothing where nothing is."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ssm_graph.base.errors import ConfigError
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.evidence import Evidence
+from ssm_graph.graph.first_values import first_values
+from ssm_graph.graph.linearize import GraphLinearizer
+from ssm_graph.mission.estimate import Estimate, Status
+from ssm_graph.mission.fault import Treatment
+from ssm_graph.mission.mission import NO_AIDS
+from ssm_graph.mission.problem import build_problem
+from ssm_graph.sensors.dvl import DvlLog
+from ssm_graph.simulation import (
+    AidSettings,
+    CompassSettings,
+    DvlSettings,
+    Fault,
+    FaultShape,
+    GnssSettings,
+    Grade,
+    HoverRoute,
+    Loss,
+    OutlierKind,
+    Outliers,
+    SimulatedMission,
+    UsblSettings,
+    with_faults,
+)
+from ssm_graph.simulation.faults import Sensor
+from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
+from ssm_graph.smoothers.faults.columns import KERNEL, beside_median, calibration_columns
+from ssm_graph.smoothers.faults.hypotheses import Course, Hypothesis
+from ssm_graph.smoothers.faults.judged import Grid, Judged
+from ssm_graph.smoothers.faults.search import FaultSearch
+from tests.aids_fixture import with_every_aid
+from tests.helpers import simulated, with_initial
+
+SEARCH = SmootherConfig(fault_search=FaultSearch())
+QUIET = DvlSettings(noise=0.005)
+FIXES = GnssSettings(windows=((0.0, 1e9),))
+
+
+def smoothed(sim: SimulatedMission, config: SmootherConfig = SEARCH) -> Estimate:
+    """Return the estimate of a simulated mission."""
+    return SsmSmoother(config).solve(build_problem(sim.mission))
+
+
+def errors(estimate: Estimate, sim: SimulatedMission) -> tuple[float, float]:
+    """Return the horizontal rms, m, and the largest error of position in its sigmas."""
+    track, frame = estimate.trajectory, sim.mission.frame
+    truth = sim.truth_at(track.time_s)
+    off = frame.p_n_from_geodetic(track.lat, track.lon, track.height)
+    off -= frame.p_n_from_geodetic(truth.lat, truth.lon, truth.height)
+    sigma = np.sqrt(np.diagonal(track.position_cov_enu, axis1=1, axis2=2))
+    level = float(np.sqrt(np.mean(off[:, 0] ** 2 + off[:, 1] ** 2)))
+    return level, float(np.max(np.abs(off) / sigma))
+
+
+LIES = {
+    "one beam at two sigmas": (Fault((1,), 0.0, math.inf, 0.01), "DVL beam 2"),
+    "two beams that agree": (
+        Fault((0, 2), 70.0, 150.0, (0.05, -0.05)),
+        "DVL beams 1 and 3",
+    ),
+    "a false bottom": (
+        Fault(start_s=60.0, end_s=110.0, shape=FaultShape.MOVING_BOTTOM, size=(0.2, 0.0, 0.0)),
+        "DVL",
+    ),
+    "a scale that jumps": (
+        Fault((), 90.0, shape=FaultShape.SCALE, size=1.03),
+        "DVL",
+    ),
+    "a mounting that slips": (
+        Fault((), 90.0, shape=FaultShape.SLIP, size=(0.0, 0.0, 0.05)),
+        "DVL",
+    ),
+    "fixes off": (
+        Fault(sensor=Sensor.GNSS, start_s=60.0, end_s=140.0, size=(3.0, 0.0, 0.0)),
+        "GNSS",
+    ),
+    "fixes that are pulled": (
+        Fault(
+            sensor=Sensor.GNSS,
+            start_s=60.0,
+            end_s=160.0,
+            size=(0.0, 0.1, 0.0),
+            shape=FaultShape.RAMP,
+        ),
+        "GNSS",
+    ),
+    "a depth that is off": (
+        Fault(sensor=Sensor.DEPTH, start_s=70.0, end_s=150.0, size=0.5),
+        "depth",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", LIES)
+def test_lies_that_last_are_named_and_cost_little(name: str) -> None:
+    """Each is the first of all findings, in time to seconds, and is taken off; sigmas hold."""
+    fault, sensor = LIES[name]
+    gnss = FIXES if fault.sensor is Sensor.GNSS else None
+    sim = simulated(duration_s=200.0, dvl=QUIET, gnss=gnss, seed=3)
+    broken = with_faults(sim.mission, (fault,), truth=sim.truth_at)
+    lying = replace(sim, mission=broken.mission)
+    estimate = smoothed(lying)
+    assert estimate.status is Status.CONVERGED, estimate.reason
+    found = max(estimate.faults, key=lambda one: one.chi_sq)
+    assert found.sensor == sensor
+    assert found.treatment is Treatment.FREED
+    assert abs(found.begin_s - fault.start_s) < 12.0
+    assert abs(found.end_s - min(fault.end_s, 200.0)) < 12.0
+    assert found.sentence in estimate.notes
+    level, sigmas = errors(estimate, sim)
+    told = smoothed(replace(sim, mission=broken.told(sim.mission)), SmootherConfig())
+    assert level < 1.3 * errors(told, sim)[0]
+    assert sigmas < 5.0
+
+
+@pytest.mark.parametrize("grade", [Grade.NAVIGATION, Grade.TACTICAL])
+def test_what_cannot_be_decided_is_covered_and_said(grade: Grade) -> None:
+    """A bottom that drifts from half time on, or one that drifted until then."""
+    sim = simulated(duration_s=200.0, dvl=QUIET, grade=grade, seed=4)
+    fault = Fault(start_s=100.0, shape=FaultShape.MOVING_BOTTOM, size=(0.1, 0.0, 0.0))
+    broken = with_faults(sim.mission, (fault,), truth=sim.truth_at)
+    estimate = smoothed(replace(sim, mission=broken.mission))
+    assert errors(estimate, sim)[1] < 5.0
+    assert any(found.sensor == "DVL" for found in estimate.faults)
+    assert (estimate.status is Status.SUSPECT) == any(one.is_suspect for one in estimate.faults)
+
+
+def test_nothing_is_found_with_realistic_instruments() -> None:
+    """Slow noise, heavy tails, scale factors and misalignments are nobody's fault."""
+    for seed in (1, 2):
+        sim = simulated(duration_s=200.0, imu_rate_hz=50.0, gnss=FIXES, realistic=True, seed=seed)
+        assert not smoothed(sim).faults
+
+
+def test_the_search_goes_with_calibration() -> None:
+    """Extra variables take part with their priors while stretches are judged."""
+    sim = simulated(duration_s=140.0, faults=(Fault((2,), 40.0, 100.0, 0.03),))
+    dvl = sim.mission.dvl
+    asking = replace(dvl, mount=replace(dvl.mount, scale_sigma=0.02))
+    estimate = SsmSmoother(SEARCH).solve(build_problem(replace(sim.mission, dvl=asking)))
+    assert estimate.calibration
+    assert [value.variable for value in estimate.calibration.values] == ["dvl_scale"]
+    (found,) = estimate.faults
+    assert found.sensor == "DVL beam 3"
+
+
+def test_the_search_goes_by_further_aids() -> None:
+    """Three beams have no parity, and a poor IMU that starts at any velocity believes them all."""
+    aids = AidSettings(
+        usbl=UsblSettings(interval_s=2.0, sigma_horizontal=0.3, sigma_vertical=0.3),
+        compass=CompassSettings(sigma=math.radians(0.3)),
+    )
+    sim = simulated(
+        duration_s=200.0,
+        route=HoverRoute(),
+        grade=Grade.MEMS,
+        losses=(Loss(0.0, 200.0, (0,)),),
+        faults=(Fault((2,), 0.0, 200.0, 0.03),),
+        aids=aids,
+        seed=1,
+    )
+    start = with_initial(sim.mission, velocity_sigma_enu=np.full(3, 1.0))
+    (found,) = smoothed(replace(sim, mission=start)).faults
+    assert found.sensor == "DVL beam 3"
+    (alone,) = smoothed(replace(sim, mission=replace(start, aids=NO_AIDS))).faults
+    assert found.chi_sq > 1.2 * alone.chi_sq
+
+
+def test_errors_of_aids_are_carried_along() -> None:
+    """Those of a compass and the place of a beacon too; but it moves where it is said to rest."""
+    (found,) = smoothed(with_every_aid(duration_s=60.0)).faults
+    assert found.sensor == "standstill"
+
+
+@pytest.mark.parametrize(
+    "outliers",
+    [Outliers(), Outliers(OutlierKind.SPARSE, 0.1), Outliers(OutlierKind.ONE_BEAM, 0.3)],
+    ids=lambda outliers: outliers.kind.name,
+)
+def test_nothing_is_found_where_nothing_lasts(outliers: Outliers) -> None:
+    """Clean data and single bad pings: the estimate is that of the kernel alone, to the bit."""
+    sim = simulated(duration_s=120.0, grade=Grade.TACTICAL, outliers=outliers)
+    found, alone = smoothed(sim), smoothed(sim, SmootherConfig())
+    np.testing.assert_array_equal(found.trajectory.velocity_enu, alone.trajectory.velocity_enu)
+    np.testing.assert_array_equal(found.beams.weight, alone.beams.weight)
+    assert found.notes == alone.notes
+
+
+def test_a_wrong_scale_is_no_fault_of_a_beam() -> None:
+    """Four per cent of 2 m/s in all beams at once, with a start that is known well."""
+    sim = simulated(duration_s=120.0)
+    dvl = replace(sim.mission.dvl, speed=1.04 * sim.mission.dvl.speed)
+    assert isinstance(dvl, DvlLog)
+    estimate = SsmSmoother(SEARCH).solve(build_problem(replace(sim.mission, dvl=dvl)))
+    assert {found.sensor for found in estimate.faults} <= {"DVL"}
+
+
+def test_calibration_columns_are_the_change_of_the_speeds() -> None:
+    """Against the linearised beams: scale as the speed itself, angles as a turn of the body."""
+    problem = build_problem(simulated(perfect_sensors=True, duration_s=20.0).mission)
+    states = first_values(problem, kernel=KERNEL).states
+    columns = calibration_columns(problem, states)
+    rows = GraphLinearizer(problem).beam_rows(states)
+    lever = np.cross(problem.beams.gyro_b, problem.beams.lever_arm_b)
+    along_lever = np.einsum("mi,mi->m", problem.beams.beam_b, lever)
+    np.testing.assert_allclose(columns[:, 0], problem.beams.speed - along_lever, atol=1e-2)
+    # A turn of the mounting moves the beams as the opposite turn of the body moves the velocity.
+    np.testing.assert_allclose(columns[:, 1:], -rows.jacobian[:, :3], atol=1e-2)
+
+
+class OneChannel:
+    """Three columns of one sensor, as the search asks for them."""
+
+    width = 3
+    columns = slice(0, 3)
+
+    def of(self, name: str) -> OneChannel:
+        """Return the only one."""
+        assert name == "any"
+        return self
+
+
+@pytest.mark.parametrize("course", Course)
+def test_chi_square_of_every_stretch(course: Course) -> None:
+    """Against least squares of its columns, stretch by stretch."""
+    rng = np.random.default_rng(2)
+    columns, noise = rng.normal(size=(90, 15)), rng.normal(size=90)
+    evidence = Evidence(columns.T @ noise, columns.T @ columns)
+    grid = Grid.of(np.arange(50.0), [10.0, 20.0, 30.0, 40.0])
+    combined = rng.normal(size=(3, 2))
+    sigma = np.array([3.0, 5.0])
+    hypothesis = Hypothesis("any", "any", combined, sigma, str, course)
+    judged = Judged(evidence, grid, OneChannel())  # type: ignore[arg-type]
+    table, _ = judged.table(hypothesis)
+    by_block = columns.reshape(90, 5, 3) @ combined
+    for begin in range(5):
+        for end in range(begin + 1, 6):
+            own = by_block[:, begin:end]
+            since = np.arange(begin, end) / 10.0
+            own = {
+                Course.CONSTANT: own.sum(axis=1),
+                Course.TREND: np.hstack([own.sum(axis=1), np.einsum("rbd,b->rd", own, since)]),
+                Course.ANYTHING: own.reshape(90, -1),
+            }[course]
+            prior = np.diag(np.tile(sigma**-2.0, own.shape[1] // 2))
+            fitted = np.linalg.solve(own.T @ own + prior, own.T @ noise)
+            assert table[begin, end] == pytest.approx(noise @ own @ fitted, rel=2e-2)
+
+
+def test_what_stands_out_is_apart_from_what_lasts() -> None:
+    """A step stays, but for nothing beside the median; a spike does not."""
+    values: Array = np.where(np.arange(40) < 20, 0.0, 1.0)[:, None]
+    values[7] = 30.0
+    off = beside_median(values)
+    assert off[7, 0] == pytest.approx(30.0)
+    assert np.count_nonzero(off) == 1
+
+
+@pytest.mark.parametrize("name", ["block_s", "significance", "margin"])
+def test_settings_are_checked(name: str) -> None:
+    """Nothing below zero."""
+    with pytest.raises(ConfigError, match=f"{name}: expected a number above zero"):
+        FaultSearch(**{name: 0.0})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("grade", [Grade.NAVIGATION, Grade.TACTICAL])
+@pytest.mark.parametrize(
+    "fault",
+    [
+        Fault((1,), 200.0, 240.0, 0.15),
+        Fault((1,), 100.0, 400.0, 0.05, shape=FaultShape.DRIFT),
+        Fault((1,), 100.0, 600.0, shape=FaultShape.COVERED, share=0.3),
+    ],
+    ids=lambda fault: fault.shape.name,
+)
+def test_slow_faults_of_one_beam_cost_little(fault: Fault, grade: Grade) -> None:
+    """As the oracle does, and no other beam is named."""
+    sim = simulated(duration_s=600.0, grade=grade, faults=(fault,), seed=11)
+    estimate = smoothed(sim)
+    assert estimate.status is Status.CONVERGED, estimate.reason
+    assert {found.sensor for found in estimate.faults} == {"DVL beam 2"}
+    told = smoothed(replace(sim, mission=sim.without_outliers()), SmootherConfig())
+    level, sigmas = errors(estimate, sim)
+    assert level < 1.2 * errors(told, sim)[0]
+    assert sigmas < 5.0
