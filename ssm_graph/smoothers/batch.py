@@ -106,6 +106,13 @@ class Weights(NamedTuple):
     of_beams: Schedule
     of_aids: Schedule
 
+    @classmethod
+    def begin(cls, config: SmootherConfig, first: FirstValues) -> Weights:
+        """Return those of the first pass, after the forward pass."""
+        of_beams = config.schedule()
+        of_aids = WarmSchedule(aid_kernel(config.kernel), WARM_KERNEL)
+        return cls(of_beams.first_weights(first.weights), first.aid_weights, of_beams, of_aids)
+
     def after(self, last: Pass, faults: FaultWatch) -> Weights:
         """Return those of the pass after ``last``."""
         of_beams, beams = self.of_beams.after(
@@ -207,15 +214,9 @@ class SsmSmoother:
         own = first.states.constants[: white.extras.n_constants]
         states = first.states._replace(constants=own)
         rows = linearizer.beam_rows(states)
-        schedule = self.config.schedule()
         faults = FaultWatch(white, self.config.fault_search)
         yield 0.03 * problem.n_keyframes
-        weights = Weights(
-            schedule.first_weights(first.weights),
-            first.aid_weights,
-            of_beams=schedule,
-            of_aids=WarmSchedule(aid_kernel(self.config.kernel), WARM_KERNEL),
-        )
+        weights = Weights.begin(self.config, first)
         iterations: list[Iteration] = []
         status = Status.MAX_ITERATIONS
         for number in range(self.config.max_iterations):
@@ -227,8 +228,8 @@ class SsmSmoother:
                 status = Status.INTERRUPTED
                 break
             states, rows = this.states, this.beam_rows
-            kernel = str(weights.of_beams.kernel)
-            iterations.append(Iteration(this.update_sigmas, this.weight_change, kernel))
+            in_force = str(weights.of_beams.kernel)
+            iterations.append(Iteration(this.update_sigmas, this.weight_change, in_force))
             if on_iteration is not None:
                 on_iteration(number + 1, self.config.max_iterations, iterations[-1])
             is_settled = max(this.update_sigmas, this.weight_change) < self.config.tolerance
@@ -240,27 +241,18 @@ class SsmSmoother:
                 )
             if changed is not None:
                 linearizer, states = changed.linearizer, changed.states
-                rows, schedule = linearizer.beam_rows(states), self.config.schedule()
-                weights = Weights(changed.weights, changed.aid_weights, schedule, weights.of_aids)
+                rows, anew = linearizer.beam_rows(states), self.config.schedule()
+                weights = Weights(changed.weights, changed.aid_weights, anew, weights.of_aids)
                 continue
             if is_settled:
                 status = Status.CONVERGED
                 break
             yield 0.007 * problem.n_keyframes
             weights = weights.after(this, faults)
-        found = problem.faults + faults.faults(this.states)
-        said = tuple(fault.sentence for fault in found)
-        return Solved(
-            linearizer,
-            this,
-            tuple(iterations),
-            status,
-            weights.of_beams.wanted,
-            problem.notes + said + _notes_of(first),
-            first,
-            found,
-            faults.aids_out,
-        )
+        found, kernel = problem.faults + faults.faults(this.states), weights.of_beams.wanted
+        notes = (*problem.notes, *(fault.sentence for fault in found), *_notes_of(first))
+        ended = (linearizer, this, tuple(iterations), status)
+        return Solved(*ended, kernel, notes, first, found, faults.aids_out)
 
     def _iterate(
         self,

@@ -43,9 +43,10 @@ from ssm_graph.simulation import (
     WaterTrack,
     default_mount,
 )
+from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
 from ssm_graph.smoothers.faults.search import FaultSearch
 from ssm_graph.smoothers.fixed_lag import FixedLagConfig, solve_fixed_lag
-from ssm_graph.smoothers.settings import WARM_KERNEL, SmootherConfig, SsmSmoother
+from ssm_graph.smoothers.settings import WARM_KERNEL
 from tests.helpers import simulated, true_states, without_beams
 from tests.water_fixture import current_errors, in_current, without_water
 
