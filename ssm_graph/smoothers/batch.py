@@ -37,7 +37,7 @@ from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.first_values import FirstValues, first_values, first_values_steps
 from ssm_graph.graph.inertial_rows import inertial_fit
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.graph.measurements import aid_kernel, aid_table, doubts_of_aids, without
+from ssm_graph.graph.measurements import JudgedAid, aid_kernel, aid_table, doubts_of_aids, without
 from ssm_graph.mission.answer import trajectory_from_states
 from ssm_graph.mission.estimate import BeamTable, Estimate, Iteration, NoiseFound, Status
 from ssm_graph.mission.fault import DetectedFault
@@ -322,20 +322,10 @@ class SsmSmoother:
             f"{status.value}: last update {last.update_sigmas:.1e} sigma, largest weight change "
             f"{last.weight_change:.1e}"
         )
-        doubts = contradictions(linearizer, last.states, last.beam_rows, last.weights)
-        doubts += [fault.sentence for fault in solved.faults if fault.is_suspect]
         judged = linearizer.weighted.judged(
             last.states, linearizer.problem.keyframe_s, last.aid_mahalanobis_sq, last.aid_weights
         )
-        doubts += doubts_of_aids(
-            without(judged, solved.aids_out), is_searched=self.config.fault_search is not None
-        )
-        doubts += ambiguous_beacons(
-            last.states,
-            linearizer.weighted,
-            linearizer.problem.extras,
-            last.step.end_covariance(STATE_DIM),
-        )
+        doubts = self._doubts(solved, judged)
         if doubts:
             unsettled = [] if status is Status.CONVERGED else [reason]
             status, reason = Status.SUSPECT, "; ".join(doubts + unsettled)
@@ -378,6 +368,22 @@ class SsmSmoother:
                 last.step.covariance_of(slice(STATE_DIM, None)),
             ),
         )
+
+    def _doubts(self, solved: Solved, judged: list[JudgedAid]) -> list[str]:
+        """Say in a sentence each what makes the answer doubtful: first who was found to be off."""
+        linearizer, last = solved.linearizer, solved.last
+        is_searched = self.config.fault_search is not None
+        return [
+            *(fault.sentence for fault in solved.faults if fault.is_suspect),
+            *contradictions(linearizer, last.states, last.beam_rows, last.weights),
+            *doubts_of_aids(without(judged, solved.aids_out), is_searched=is_searched),
+            *ambiguous_beacons(
+                last.states,
+                linearizer.weighted,
+                linearizer.problem.extras,
+                last.step.end_covariance(STATE_DIM),
+            ),
+        ]
 
 
 def noise_of_steps(solved: Solved, used: Array) -> Steps[NoiseFound]:
