@@ -133,11 +133,11 @@ def _from_rosbag(arguments: argparse.Namespace) -> Mission:
         atmosphere=defaults.atmosphere if atmosphere is None else atmosphere,
         surface_height=arguments.surface_height,
     )
-    topics = arguments.topic or []
-    if len(dict(topics)) < len(topics):
-        raise ConfigError("--topic: expected each sensor once")
+    topics: dict[str, list[str]] = {}
+    for role, name in arguments.topic or ():
+        topics.setdefault(role, []).append(name)
     vehicle = None if arguments.vehicle is None else read_vehicle(arguments.vehicle)
-    return convert_rosbag(arguments.log, vehicle=vehicle, topics=dict(topics), options=options)
+    return convert_rosbag(arguments.log, vehicle=vehicle, topics=topics, options=options)
 
 
 def _topic(word: str) -> tuple[str, str]:

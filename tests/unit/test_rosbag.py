@@ -23,9 +23,10 @@ from ssm_graph.io.mission_folder.folder import read_mission, write_mission
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.io.ros import log as rosbag_log
 from ssm_graph.io.ros.beams import WATER_LINKED_BEAMS, proven_beams
-from ssm_graph.io.ros.convert import BEAM_SIGMA, NOISE, WATER_LATER_S, convert_rosbag
+from ssm_graph.io.ros.convert import BEAM_SIGMA, NOISE, convert_rosbag
 from ssm_graph.io.ros.log import LAYOUTS, is_rosbag
 from ssm_graph.io.ros.messages import BeamSign, RosOptions
+from ssm_graph.io.ros.topics import WATER_LATER_S
 from ssm_graph.mission.mission import Mission
 from ssm_graph.sensors.current import CurrentModel
 from ssm_graph.sensors.dvl import DvlMount
@@ -679,7 +680,7 @@ def no_aids(mission: Mission, ros: Ros) -> list[Sent]:
         (gauge, DataError, "--atmosphere 0"),
         (other_clock, DataError, "expected one clock"),
         (truncated, DataError, "mcap recover"),
-        (truncated_db3, DataError, "not a complete ROS 2 recording"),
+        (truncated_db3, DataError, "not a complete recording of ROS 2"),
         (no_files, DataError, "missing"),
         (bad_metadata, DataError, "YAML"),
         (other_bytes, DataError, "fit no known definition"),
@@ -719,7 +720,8 @@ def test_what_is_a_bag(tmp_path: Path) -> None:
     assert is_rosbag(tmp_path / "any.db3")
     for profile, expected in ((b"ros2", True), (b"ros1", False), (b"", False)):
         file = tmp_path / "file.mcap"
-        file.write_bytes(b"\x89MCAP0\r\n\x01" + bytes(8) + bytes([len(profile), 0, 0, 0]) + profile)
+        header = bytes([len(profile), 0, 0, 0]) + profile + bytes(4)
+        file.write_bytes(b"\x89MCAP0\r\n\x01" + bytes([len(header), *bytes(7)]) + header)
         assert is_rosbag(file) is expected
 
 

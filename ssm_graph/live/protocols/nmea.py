@@ -322,8 +322,7 @@ class NmeaDecoder(Decoder):
             self._say_once("height", f"{kind}: no height: the water's surface is taken, to 100 m")
         elif place.separation is None and self._options.geoid_separation_m is None:
             raise RefusedError(
-                "geoid separation is empty; set NmeaOptions.geoid_separation_m "
-                "(--geoid-separation)"
+                "geoid separation is empty; set NmeaOptions.geoid_separation_m (--geoid-separation)"
             )
         time_s = self._stamper.stamp(utc_seconds(place.utc, arrival_s), arrival_s)
         return _Pending(kind, time_s, arrival_s, place)
