@@ -214,7 +214,6 @@ def test_water_below_a_transducer_is_no_vehicle_depth() -> None:
         (sentence(GGA.replace(",N,", ",,")), "angle"),
         (sentence(GGA.replace("20.50", "nan")), "altitude"),
         (sentence(GGA.replace("20.50", "1_0")), "altitude"),
-        (sentence(GGA.replace("40.25", "")), "geoid_separation_m"),
         (sentence("GPGST,120000.00"), "expected 8 fields"),
         (sentence("PRVAT,00.115,M"), "depth_sentences"),
         (sentence("PIPS,1.0,"), "dBar"),

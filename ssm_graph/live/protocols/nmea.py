@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -43,9 +43,11 @@ MAX_OTHER: Final = 8192
 ASSUMED_HDOP: Final = 2.0
 """Where neither HDOP nor GST comes: a receiver with half of the sky."""
 HEIGHT_SIGMA_M: Final = 100.0
-"""Of the water's surface for a position without height; geoid and ellipsoid differ by up to 107."""
+"""Of a height that is not above the ellipsoid, or none: the geoid is up to 107 m away from it."""
 _MAX_KINDS: Final = 8
-_LIKE_SENTENCE = re.compile(r"[$!][A-Z]{2}[A-Z0-9]{2,},")
+_FEW_LETTERS: Final = 16
+"""Shorter printable pieces are of binary frames that a line end within cuts up."""
+_LIKE_SENTENCE = re.compile(r"[$!]?[A-Z]{2}[A-Z0-9]{2,},")
 _TAG_BLOCK = re.compile(r"\\([^\\]*)\*([0-9A-Fa-f]{2})\\\Z", re.ASCII)
 
 PRESSURE_SENTENCES: Final = frozenset(
@@ -64,7 +66,7 @@ class NmeaOptions:
     user_range_error_m: float = 5.0
     """Times HDOP: sigma of east and of north, where there is no GST; twice that of the height."""
     geoid_separation_m: float | None = None
-    """Geoid above ellipsoid where a sentence leaves its field empty; None refuses such a fix."""
+    """Geoid above ellipsoid where a sentence leaves its field empty; None: 0, to 100 m."""
     depth_sentences: frozenset[DepthSentence] = PRESSURE_SENTENCES
     """What is taken for vehicle depth; all others are ignored."""
     air_pressure_dbar: float = 10.1325
@@ -106,27 +108,29 @@ class _Preference:
     One is read once none before it in order has come for :data:`PREFERRED_S`.
     """
 
-    def __init__(self, order: Mapping[str, object]) -> None:
+    def __init__(self, order: Iterable[str]) -> None:
         self._order = list(order)
-        self.kind = self._order[0]
+        self._kind = self._order[0]
         self._heard_s = math.nan
 
     def takes(self, kind: str, arrival_s: float) -> bool:
         """Return whether a sentence is read, and take note that it came."""
+        if kind not in self._order:
+            return False
         is_old = not 0.0 <= arrival_s - self._heard_s < PREFERRED_S
         is_first = math.isnan(self._heard_s)
-        if self._order.index(kind) > self._order.index(self.kind) and (is_first or not is_old):
+        if self._order.index(kind) > self._order.index(self._kind) and (is_first or not is_old):
             self._heard_s = arrival_s if is_first else self._heard_s
             return False
-        self.kind, self._heard_s = kind, arrival_s
+        self._kind, self._heard_s = kind, arrival_s
         return True
 
 
 class NmeaDecoder(Decoder):
     """Positions (with GST) to fixes, pressures to depths, headings; other sentences are ignored.
 
-    Of GGA, GNS, RMC and GLL the first that comes is read, of HDT, THS, PASHR and HDG too; ``start``
-    names one of each that is known to be the best. ``height`` is that above the geoid plus the
+    Of GGA, GNS, RMC and GLL the first that comes is read, of HDT, THS, PASHR and HDG too; ``only``
+    names one of each that alone is read, whatever comes. ``height`` is that above the geoid plus the
     geoid's separation: above the ellipsoid. Sigmas are those of a GST of the same time of day,
     before or after its position, else from HDOP. A position that is estimated, typed in or
     simulated (quality 6, 7, 8) is refused: dead reckoning is no measurement, it might be our own.
@@ -135,7 +139,7 @@ class NmeaDecoder(Decoder):
     over; lines end in CR, LF or both.
     """
 
-    def __init__(self, options: NmeaOptions | None = None, *, start: tuple[str, ...] = ()) -> None:
+    def __init__(self, options: NmeaOptions | None = None, *, only: tuple[str, ...] = ()) -> None:
         super().__init__(PLACE)
         self.n_without_fix = 0
         """How many positions said that there is no fix; the first of a row is told."""
@@ -147,9 +151,10 @@ class NmeaDecoder(Decoder):
             refusals=self._refusals,
             place=PLACE,
         )
-        self._positions, self._headings = _Preference(POSITIONS), _Preference(HEADINGS)
-        for kind in start:
-            (self._positions if kind in POSITIONS else self._headings).kind = kind
+        self._positions, self._headings = (
+            _Preference([kind for kind in kinds if kind in only] or kinds)
+            for kinds in (POSITIONS, HEADINGS)
+        )
         self._has_fix = True
         self._pending: _Pending | None = None
         self._last_utc = ""
@@ -168,13 +173,12 @@ class NmeaDecoder(Decoder):
 
     def _decode(self, text: str, arrival_s: float) -> list[Message]:
         begin = text.rfind("$")
-        lead = text[:begin] if begin >= 0 else text
-        is_other = not text.isprintable() or not text.isascii()
-        if begin < 0 or (is_other and "*" not in text[begin:]):
-            if begin < 0 and "!" in text and not is_other:
-                return []
-            self._pass_over(text)
+        is_text = text.isascii() and text.isprintable()
+        if begin < 0 or not (is_text or _LIKE_SENTENCE.match(text, begin)):
+            if not (is_text and text.startswith(("!", "\\"))):  # which AIS is
+                self._pass_over(text)
             return []
+        lead = text[:begin].rstrip("$")
         if lead:
             self._pass_over(self._without_tag(lead))
         name, *fields = split_sentence(text[begin + 1 :])
@@ -215,7 +219,8 @@ class NmeaDecoder(Decoder):
         """Refuse what was to be a sentence or a text; count what is binary."""
         if not text:
             return
-        if (text.isascii() and text.isprintable()) or _LIKE_SENTENCE.search(text):
+        is_text = text.isascii() and text.isprintable() and len(text) >= _FEW_LETTERS
+        if is_text or _LIKE_SENTENCE.search(text):
             self._refuse(f"expected a sentence that begins with '$', got {shown(text)}")
             return
         self._n_other += len(text)
@@ -301,11 +306,22 @@ class NmeaDecoder(Decoder):
             hdop = place.hdop if place.hdop and place.hdop > 0.0 else ASSUMED_HDOP
             sigma = hdop * self._options.user_range_error_m
             sigma_enu = sigma, sigma, 2.0 * sigma
+        separation = place.separation
+        if separation is None:
+            separation = self._options.geoid_separation_m
         if place.altitude is None:
-            height, sigma_enu = self._options.surface_height_m, (*sigma_enu[:2], HEIGHT_SIGMA_M)
+            height = self._options.surface_height_m
+            self._say_once("height", f"{pending.kind}: no height: the water's surface, to 100 m")
         else:
-            separation = self._options.geoid_separation_m or 0.0
-            height = place.altitude + (separation if place.separation is None else place.separation)
+            height = place.altitude + (separation or 0.0)
+        if place.altitude is None or separation is None:
+            sigma_enu = (*sigma_enu[:2], max(sigma_enu[2], HEIGHT_SIGMA_M))
+        if place.altitude is not None and separation is None:
+            self._say_once(
+                "geoid",
+                f"{pending.kind}: geoid separation is empty: heights count to 100 m; set "
+                "NmeaOptions.geoid_separation_m (--geoid-separation)",
+            )
         return [Fix(pending.time_s, place.lat, place.lon, height, sigma_enu)]
 
     def _position(self, kind: str, fields: list[str], arrival_s: float) -> _Pending | None:
@@ -318,11 +334,5 @@ class NmeaDecoder(Decoder):
             self._has_fix = False
             return None
         self._has_fix = True
-        if place.altitude is None:
-            self._say_once("height", f"{kind}: no height: the water's surface is taken, to 100 m")
-        elif place.separation is None and self._options.geoid_separation_m is None:
-            raise RefusedError(
-                "geoid separation is empty; set NmeaOptions.geoid_separation_m (--geoid-separation)"
-            )
         time_s = self._stamper.stamp(utc_seconds(place.utc, arrival_s), arrival_s)
         return _Pending(kind, time_s, arrival_s, place)

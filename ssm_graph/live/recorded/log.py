@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import calendar
 import math
+import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -17,7 +18,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from ssm_graph.base.errors import DataError
+from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.io.raw_log.rows import RowKind
 from ssm_graph.io.tables.append_file import write_through
 from ssm_graph.live.protocols.decoder import RefusedError, parse_object
@@ -30,14 +31,17 @@ from ssm_graph.live.protocols.nmea_fields import (
     utc_seconds,
 )
 from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
-from ssm_graph.sensors.dvl import DvlMount
-from ssm_graph.sensors.dvl_instrument import DVL
+from ssm_graph.sensors.dvl import DvlMount, empty_dvl
 from ssm_graph.sensors.messages import Message
 from ssm_graph.sensors.registry import BY_MESSAGE
 
 _SET_BACK_S: Final = 1.0
 _SNIFFED: Final = 1 << 16
 _MANY_REFUSALS: Final = 3
+_SHORTEST_S: Final = 1e-3
+"""From one report to the next."""
+_ANY_CLOCK_S: Final = 1e12
+_SENTENCE = re.compile(rb"[$!][A-Z]{2}[A-Z0-9]{3,},")
 _UNIX_S: Final = 1e9
 """A larger number of seconds is Unix time."""
 
@@ -66,7 +70,7 @@ def read_recorded(log: Path, options: NmeaOptions | None = None) -> Recorded | N
     head = data[:_SNIFFED]
     if head.lstrip(b" \t\r\n\xef\xbb\xbf")[:1] in (b"{", b"[") and b'"' in head:
         found = _water_linked(data)
-    elif any(_sentences(head)):
+    elif _SENTENCE.search(head):
         found = _nmea(data, options or NmeaOptions())
     else:
         return None
@@ -76,7 +80,10 @@ def read_recorded(log: Path, options: NmeaOptions | None = None) -> Recorded | N
 
 
 def write_tables(folder: Path, messages: Iterable[Message]) -> dict[str, int]:
-    """Write messages as the tables of a mission folder; return their files and numbers of rows."""
+    """Write messages as the tables of a mission folder; return their files and numbers of rows.
+
+    Raises :class:`ConfigError` where one of them is there already.
+    """
     kinds: dict[type[Message], RowKind] = {}
     rows: dict[type[Message], list[bytes]] = {}
     for message in messages:
@@ -86,6 +93,12 @@ def write_tables(folder: Path, messages: Iterable[Message]) -> dict[str, int]:
             rows[kind] = [kinds[kind].header]
         rows[kind].append(kinds[kind].row(message))
     folder.mkdir(parents=True, exist_ok=True)
+    there = [kind.file for kind in kinds.values() if (folder / kind.file).exists()]
+    if there:
+        raise ConfigError(
+            f"{folder}: {', '.join(there)} is there already, and is not overwritten; expected a "
+            "folder without; choose another one, or move it away"
+        )
     for kind, lines in rows.items():
         write_through(folder / kinds[kind].file, b"".join(lines))
     return {kinds[kind].file: len(lines) - 1 for kind, lines in rows.items()}
@@ -97,7 +110,7 @@ def _bare(message: Message) -> Any:
     if speed is None:
         return None
     mount = DvlMount(np.tile([0.0, 0.0, 1.0], (len(speed), 1)), np.eye(3), np.zeros(3))
-    return DVL.log(mount=mount, **DVL.empty())
+    return empty_dvl(mount)
 
 
 def _in_order(log: Path, found: Recorded) -> Recorded:
@@ -128,18 +141,18 @@ def _said(refusals: list[str], n_refused: int) -> list[str]:
 
 
 def _water_linked(data: bytes) -> Recorded:
-    decoder = WaterLinkedDecoder(heading=True, max_clock_error_s=math.inf)
+    decoder = WaterLinkedDecoder(heading=True, max_clock_error_s=_ANY_CLOCK_S)
     framer = ObjectFramer(lambda _: None)
     messages: list[Message] = []
-    time_s, before, has_clock = 0.0, dict[str, Any](), True
+    time_s, last_s, before, has_clock = 0.0, -math.inf, dict[str, Any](), True
     for text in framer.feed(data + b"\n"):
         report = _object(text)
+        time_s = _unix(report, time_s)
         if "time_of_validity" not in report and "transducers" in report:
             has_clock = False
             if report != before:
-                time_s += 1e-3 * _number(report.get("time"))
-            before = report
-        time_s = _unix(report, time_s)
+                time_s = max(time_s + 1e-3 * _number(report.get("time")), last_s + _SHORTEST_S)
+            before, last_s = report, time_s
         messages += decoder.feed(text.encode() + b"\n", arrival_s=time_s)
     notes = _said(decoder.take_refusals(), decoder.n_refused)
     if decoder.n_repeats:
@@ -147,7 +160,8 @@ def _water_linked(data: bytes) -> Recorded:
     if not has_clock:
         notes.append(
             "Reports before format json_v3 have no clock: time_s is the sum of the times between "
-            "them, from the first one on; add what makes it the vehicle's."
+            "them, from the first one on or from the stamps of the dead reckoning beside them; add "
+            "what makes it the vehicle's."
         )
     return Recorded(tuple(messages), tuple(notes))
 
@@ -190,12 +204,12 @@ def _nmea(data: bytes, options: NmeaOptions) -> Recorded:
         kinds[kind] += _is_read(kind, fields)
         dated = _date(kind, fields) if math.isnan(dated) else dated
     order = (*POSITIONS, *HEADINGS)
-    start = tuple(
+    only = tuple(
         next(kind for kind in some if kinds[kind])
         for some in (POSITIONS, HEADINGS)
         if any(kinds[kind] for kind in some)
     )
-    decoder = NmeaDecoder(replace(options, max_clock_error_s=math.inf), start=start)
+    decoder = NmeaDecoder(replace(options, max_clock_error_s=_ANY_CLOCK_S), only=only)
     messages: list[Message] = []
     time_s = 0.0 if math.isnan(dated) else dated
     has_time = False
@@ -211,14 +225,15 @@ def _nmea(data: bytes, options: NmeaOptions) -> Recorded:
     notes = _said(decoder.take_refusals(), decoder.n_refused)
     if decoder.n_without_fix:
         notes.append(f"{decoder.n_without_fix} sentences say that the receiver has no fix.")
-    if start:
-        others = [kind for kind in order if kinds[kind] and kind not in start]
-        notes.append(f"{' and '.join(start)} read, not {', '.join(others) or 'others'}.")
+    if only:
+        others = [kind for kind in order if kinds[kind] and kind not in only]
+        notes.append(f"{' and '.join(only)} read, not {', '.join(others) or 'others'}.")
     if math.isnan(dated):
         notes.append("No sentence states a date: time_s is UTC of the day.")
+    if not messages:
+        notes.append(f"its sentences are {', '.join(sorted(kinds)[:12]) or 'without checksum'}")
     if not has_time and messages:
-        raise_from = "no sentence states a time, which depths and headings need"
-        return Recorded((), (raise_from,))
+        return Recorded((), ("no sentence states a time, which depths and headings need",))
     return Recorded(tuple(messages), tuple(notes))
 
 
