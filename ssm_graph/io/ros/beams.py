@@ -197,17 +197,17 @@ def _refuse_slips(beams: Beams, speed: Array, velocity_d: Array) -> None:
     predicted = velocity_d @ beams.beams_d.T
     known = np.isfinite(velocity_d).all(axis=1) & np.any(velocity_d != 0.0, axis=1)
     signed = beams.sign * speed
-    if not np.any(speed < 0.0) and _is_off(signed, predicted, known):
-        if not _is_off(np.abs(speed), np.abs(predicted), known):
-            raise DataError(
-                "the beam speeds have no sign: not one is below 0, and they are the sizes of what "
-                "the published velocity says; expected positive along the beam and negative "
-                "against it: mend the driver"
-            )
+    is_unsigned = not np.any(speed < 0.0) and _is_off(signed, predicted, known)
+    if is_unsigned and not _is_off(np.abs(speed), np.abs(predicted), known):
+        raise DataError(
+            "the beam speeds have no sign: not one is below 0, and they are the sizes of what the "
+            "published velocity says; expected positive along the beam and negative against it: "
+            "mend the driver"
+        )
     heard = np.isfinite(speed)
     count = heard.sum(axis=1)
     is_packed = ~np.any(~heard[:, :-1] & heard[:, 1:], axis=1)
-    at_front = known & is_packed & (count >= 2) & (count < speed.shape[1])
+    at_front = known & is_packed & (count >= _FEWEST_BEAMS) & (count < speed.shape[1])
     if not _is_off(signed, predicted, at_front):
         return
     spread = np.array([_spread(*row) for row in zip(signed, predicted, count, strict=True)])

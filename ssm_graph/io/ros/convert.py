@@ -18,6 +18,7 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.io.mission_folder.assembly import mission_from
 from ssm_graph.io.ros.beams import Beams, known_beams, proven_beams
 from ssm_graph.io.ros.clocks import check_never_set, check_one_clock
+from ssm_graph.io.ros.frames import seats
 from ssm_graph.io.ros.log import Topics
 from ssm_graph.io.ros.messages import (
     TWIST_TYPE,
@@ -78,7 +79,7 @@ def convert_rosbag(
     if vehicle is not None:
         options = replace(options, n_beams=vehicle.mount.n_beams)
     tables, notes = {}, list[str]()
-    read = read_topics(bag, topics or {}, options, notes)
+    read, frames = read_topics(bag, topics or {}, options, notes)
     read, some = _one_clock(bag, read, vehicle, options)
     notes += some
     for role, topic in read.items():
@@ -90,7 +91,17 @@ def convert_rosbag(
     notes += some
     gnss, some = _gnss(tables.get("gnss"), read, vehicle, options)
     notes += some
-    depth, some = _depth(bag, tables.get("depth"), gnss, vehicle, options)
+    arm_b = np.zeros(3)
+    if vehicle is None:
+        placed, some = seats(frames, {r: topic.frame_id for r, topic in read.items()}, options.body)
+        notes += some
+        if "dvl" in placed:
+            R_bd, dvl_arm_b = placed["dvl"]
+            dvl = replace(dvl, mount=replace(dvl.mount, R_bd=R_bd, lever_arm_b=dvl_arm_b))
+        if gnss is not None and "gnss" in placed:
+            gnss = replace(gnss, lever_arm_b=placed["gnss"].place)
+        arm_b = placed["depth"].place if "depth" in placed else arm_b
+    depth, some = _depth(bag, tables.get("depth"), gnss, vehicle, arm_b, options)
     return mission_from(
         [log for log in (imu, dvl, depth, gnss) if log is not None],
         vehicle,
@@ -150,8 +161,8 @@ def _imu_notes(imu: ImuLog, topic: BagTopic, vehicle: Vehicle | None) -> list[st
     if vehicle is None:
         notes.append(
             "No --vehicle: the IMU is taken for a consumer MEMS unit (100 deg/h, 0.4 deg/sqrt(h), "
-            "5 mg), and DVL, depth sensor and antenna as sitting at the IMU, the DVL's forward "
-            "mark ahead."
+            "5 mg), and DVL, depth sensor and antenna, where /tf_static says nothing else, as "
+            "sitting at the IMU, the DVL's forward mark ahead."
         )
     return notes
 
@@ -275,6 +286,7 @@ def _depth(
     table: Array | None,
     gnss: GnssLog | None,
     vehicle: Vehicle | None,
+    arm_b: Array,
     options: RosOptions,
 ) -> tuple[DepthLog | None, list[str]]:
     if table is None or len(table) == 0:
@@ -289,7 +301,7 @@ def _depth(
     sigma = float(np.median(stated)) if len(stated) else DEPTH_SIGMA
     known = None if vehicle is None else vehicle.depth
     if known is None:
-        known = DepthLog(sigma=sigma, lever_arm_b=np.zeros(3), **DEPTH.empty())
+        known = DepthLog(sigma=sigma, lever_arm_b=arm_b, **DEPTH.empty())
     log = replace(known, time_s=table[:, 0], depth=table[:, 1])
     notes = [
         f"Depth is pressure above {options.atmosphere:.0f} Pa in water of "

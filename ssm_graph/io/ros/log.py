@@ -24,6 +24,7 @@ from ssm_graph.base.errors import (
     nearest_hint,
 )
 from ssm_graph.io.ros import messages as ros_messages
+from ssm_graph.io.ros.frames import TF_TOPIC, TF_TYPE
 from ssm_graph.io.ros.mcap import McapFile, is_ros2_mcap, zstd_decompress
 from ssm_graph.sensors.dvl import MOST_BEAMS
 
@@ -110,6 +111,7 @@ class BagMessage(NamedTuple):
     """One message of a chosen topic."""
 
     role: str
+    """One of :data:`ROLES`, or ``tf_static``."""
     topic: str
     type_name: str
     received_s: float
@@ -269,7 +271,8 @@ def _choose(
                 f"{bag}: no topic for the {role}; expected one of type {' or '.join(types)}; found "
                 + (", ".join(sorted(f"{x.topic} ({x.msgtype})" for x in connections)) or "none")
             )
-    return chosen
+    transforms = [x for x in connections if x.msgtype == TF_TYPE and x.topic.endswith(TF_TOPIC)]
+    return chosen | ({TF_TOPIC: transforms} if transforms else {})
 
 
 def _are_tracks(bag: Path, readers: Sequence[Any], fitting: Sequence[Any]) -> bool:

@@ -13,6 +13,7 @@ import numpy as np
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.io.ros.beams import stated_beams
+from ssm_graph.io.ros.frames import TF_TOPIC, Frames
 from ssm_graph.io.ros.log import REQUIRED_ROLES, BagMessage, Topics, read_rosbag
 from ssm_graph.io.ros.messages import (
     RosOptions,
@@ -35,6 +36,8 @@ class BagTopic:
     role: str
     names: list[str] = field(default_factory=list)
     type_name: str = ""
+    frame_id: str = ""
+    """Of the headers; empty where they have none."""
     rows: array[float] = field(default_factory=lambda: array("d"))
     """IMU: time, gyro, accelerometer; DVL: time, speeds, sigmas, ranges, velocity and covariance, 1
     off the water; depth: time, depth, sigma; GNSS: time, latitude, longitude, height, sigmas. SI
@@ -69,14 +72,18 @@ def _width(role: str, n_beams: int) -> int:
 
 def read_topics(
     bag: Path, topics: Topics, options: RosOptions, notes: list[str]
-) -> dict[str, BagTopic]:
-    """Return by role what the recording holds; raises as `convert_rosbag`."""
-    read = {role: BagTopic(role) for role in REQUIRED_ROLES}
+) -> tuple[dict[str, BagTopic], Frames]:
+    """Return by role what the recording holds, and its frames; raises as `convert_rosbag`."""
+    read, frames = {role: BagTopic(role) for role in REQUIRED_ROLES}, Frames()
     for item in read_rosbag(bag, topics, notes):
+        if item.role == TF_TOPIC:
+            frames.add(item.message)
+            continue
         topic = read.setdefault(item.role, BagTopic(item.role))
         if item.topic not in topic.names:
             topic.names.append(item.topic)
         topic.type_name = item.type_name
+        topic.frame_id = topic.frame_id or str(item.message.header.frame_id)
         topic.n_messages += 1
         try:
             topic.rows.extend(_row(item, topic, options))
@@ -90,7 +97,7 @@ def read_topics(
                 f"{bag}: expected at least two messages for the {role}, got {topic.n_messages}"
                 + (f", {len(topic.refused)} refused: {topic.refused[0]}" if topic.refused else "")
             )
-    return read
+    return read, frames
 
 
 def _row(item: BagMessage, topic: BagTopic, options: RosOptions) -> Sequence[float]:
