@@ -783,7 +783,7 @@ def test_options_of_bags_are_for_bags(tmp_path: Path, capsys: pytest.CaptureFixt
     """A Blueye log knows its own axes."""
     words = ["convert", str(tmp_path / "x.mcap"), "--out", str(tmp_path / "m"), "--body", "FRD"]
     assert main(words) == ExitCode.USAGE
-    assert "--body is for ROS 2 bags" in capsys.readouterr().err
+    assert "--body is for ROS bags" in capsys.readouterr().err
 
 
 def test_defaults_are_plausible() -> None:

@@ -157,7 +157,7 @@ class NmeaDecoder(Decoder):
         )
         self._has_fix = True
         self._pending: _Pending | None = None
-        self._last_utc = ""
+        self._last_utc, self._last_kind = "", ""
         self._gst: tuple[str, Vector] | None = None
         self._gst_follows = False
         self._told: set[str] = set()
@@ -267,7 +267,9 @@ class NmeaDecoder(Decoder):
         if pending is None:
             return before
         utc = pending.position.utc
-        self._pending, self._last_utc = pending, utc
+        if utc and utc == self._last_utc and kind != self._last_kind:
+            return before  # when a better sentence begins to be read, amid an epoch
+        self._pending, self._last_utc, self._last_kind = pending, utc, kind
         if self._gst is not None and self._gst[0] == utc and utc:
             self._gst_follows = False
             return before + self._release(self._gst[1])
