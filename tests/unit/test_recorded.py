@@ -120,7 +120,7 @@ def test_a_receiver_without_dates(tmp_path: Path) -> None:
     """Times are of the day, which is said; a depth alone has none."""
     data = nmea(*(f"ECGLL,5119.881,N,00125.169,E,1643{k:02d},A,D" for k in range(9)))
     found = read(tmp_path / "gll.log", data)
-    assert [one.time_s for one in found.messages] == [59_000.0 - 20.0 + k for k in range(9)]
+    assert [one.time_s for one in found.messages] == [60_180.0 + k for k in range(9)]
     assert "No sentence states a date: time_s is UTC of the day." in found.notes
     with pytest.raises(DataError, match="no sentence states a time"):
         read(tmp_path / "depth.log", nmea("PIPS,0020.00,M") * 3)
@@ -151,7 +151,7 @@ def test_convert_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixtu
     log = tmp_path / "dvl.txt"
     log.write_text("\n".join(json.dumps(one) for one in reports(5)))
     words = ["convert", str(log), "--out", str(tmp_path / "m")]
-    assert main(words) == ExitCode.OK
+    assert main(words) == ExitCode.GOOD
     shown = capsys.readouterr().out
     assert "dvl.csv with 5 rows" in shown
     assert "note: Reports before format json_v3" in shown

@@ -91,7 +91,8 @@ def seats(
         if role == "dvl":
             R = found[role].R
             yaw, pitch = np.arctan2(R[1, 0], R[0, 0]), -np.arcsin(np.clip(R[2, 0], -1.0, 1.0))
-            roll, pitch, yaw = np.degrees([np.arctan2(R[2, 1], R[2, 2]), pitch, yaw])
+            angles = np.degrees([np.arctan2(R[2, 1], R[2, 2]), pitch, yaw])
+            roll, pitch, yaw = np.round(angles, 2) + 0.0
             mounting = f", mounted at {roll:.2f}, {pitch:.2f}, {yaw:.2f} deg (roll, pitch, yaw)"
             mounting += ", its frame's z axis taken to point up" if is_up else ""
         notes.append(

@@ -24,6 +24,9 @@ _LARGEST: Final = 1 << 30
 _SNIFFED: Final = 64 << 20
 """Bytes in which a file without a profile shows what it is."""
 _ENCODINGS: Final = {"ros2msg": "MSG", "ros2idl": "IDL"}
+_MESSAGE_HEAD: Final = struct.Struct("<HIQ")
+_MESSAGE_SIZE: Final = _MESSAGE_HEAD.size + 8
+"""Bytes before the content: channel, number, time of recording and of sending."""
 _HEAD: Final = struct.Struct("<BQ")
 
 
@@ -75,15 +78,18 @@ class McapFile:
     def __enter__(self) -> McapFile:
         schemas, channels, counts = dict[int, Any](), dict[int, Any](), dict[int, int]()
         for opcode, data in self._records():
-            if opcode == _SCHEMA:
-                number, schema = _schema(data)
-                schemas.setdefault(number, schema)
-            elif opcode == _CHANNEL:
-                number, channel = _channel(data)
-                channels.setdefault(number, channel)
-            elif opcode == _MESSAGE:
-                number = struct.unpack_from("<H", data)[0]
-                counts[number] = counts.get(number, 0) + 1
+            try:
+                if opcode == _SCHEMA:
+                    number, schema = _schema(data)
+                    schemas.setdefault(number, schema)
+                elif opcode == _CHANNEL:
+                    number, channel = _channel(data)
+                    channels.setdefault(number, channel)
+                elif opcode == _MESSAGE:
+                    number, _, _ = _MESSAGE_HEAD.unpack_from(data)
+                    counts[number] = counts.get(number, 0) + 1
+            except struct.error as error:
+                self.cut_off = f"a record of kind {opcode} is damaged ({error})"
         nothing = ("", SimpleNamespace(data="", format=SimpleNamespace(name="NONE")))
         for number, (schema, topic, encoding) in channels.items():
             name, definition = schemas.get(schema, nothing)
@@ -99,15 +105,15 @@ class McapFile:
         """Yield channel, time of recording in ns and bytes, in the order of the file."""
         wanted = {one.id: one for one in connections}
         for opcode, data in self._records():
-            if opcode == _MESSAGE:
-                number, _, time_ns = struct.unpack_from("<HIQ", data)
+            if opcode == _MESSAGE and len(data) >= _MESSAGE_SIZE:
+                number, _, time_ns = _MESSAGE_HEAD.unpack_from(data)
                 if number in wanted:
                     if wanted[number].encoding != "cdr":
                         raise DataError(
                             f"{self.path}: topic {wanted[number].topic} is written as "
                             f"{wanted[number].encoding!r}; expected cdr, as ROS 2 writes"
                         )
-                    yield wanted[number], time_ns, data[22:]
+                    yield wanted[number], time_ns, data[_MESSAGE_SIZE:]
 
     def _records(self) -> Iterator[tuple[int, bytes]]:
         """Yield opcode and content of all records, those in chunks as well, as far as sound."""

@@ -25,6 +25,7 @@ from ssm_graph.live.protocols.decoder import RefusedError, parse_object
 from ssm_graph.live.protocols.framing import ObjectFramer, SentenceFramer
 from ssm_graph.live.protocols.nmea import MAX_SENTENCE, NmeaDecoder, NmeaOptions
 from ssm_graph.live.protocols.nmea_fields import (
+    DAY_S,
     HEADINGS,
     POSITIONS,
     split_sentence,
@@ -38,10 +39,11 @@ from ssm_graph.sensors.registry import BY_MESSAGE
 _SET_BACK_S: Final = 1.0
 _SNIFFED: Final = 1 << 16
 _MANY_REFUSALS: Final = 3
+_NOON_S: Final = 0.5 * DAY_S - 1e-6
 _SHORTEST_S: Final = 1e-3
 """From one report to the next."""
 _ANY_CLOCK_S: Final = 1e12
-_SENTENCE = re.compile(rb"[$!][A-Z]{2}[A-Z0-9]{3,},")
+_SENTENCE = re.compile(rb"[$!][A-Z]{2}[A-Z0-9]{2,},")
 _UNIX_S: Final = 1e9
 """A larger number of seconds is Unix time."""
 
@@ -142,7 +144,8 @@ def _said(refusals: list[str], n_refused: int) -> list[str]:
 
 def _water_linked(data: bytes) -> Recorded:
     decoder = WaterLinkedDecoder(heading=True, max_clock_error_s=_ANY_CLOCK_S)
-    framer = ObjectFramer(lambda _: None)
+    torn: list[str] = []
+    framer = ObjectFramer(torn.append)
     messages: list[Message] = []
     time_s, last_s, before, has_clock = 0.0, -math.inf, dict[str, Any](), True
     for text in framer.feed(data + b"\n"):
@@ -154,7 +157,7 @@ def _water_linked(data: bytes) -> Recorded:
                 time_s = max(time_s + 1e-3 * _number(report.get("time")), last_s + _SHORTEST_S)
             before, last_s = report, time_s
         messages += decoder.feed(text.encode() + b"\n", arrival_s=time_s)
-    notes = _said(decoder.take_refusals(), decoder.n_refused)
+    notes = _said([*torn, *decoder.take_refusals()], len(torn) + decoder.n_refused)
     if decoder.n_repeats:
         notes.append(f"{decoder.n_repeats} reports came again and were left out.")
     if not has_clock:
@@ -199,10 +202,11 @@ def _sentences(data: bytes) -> Iterator[tuple[str, list[str]]]:
 
 
 def _nmea(data: bytes, options: NmeaOptions) -> Recorded:
-    kinds, dated = Counter[str](), math.nan
+    kinds, dated, first = Counter[str](), math.nan, None
     for kind, fields in _sentences(data):
         kinds[kind] += _is_read(kind, fields)
         dated = _date(kind, fields) if math.isnan(dated) else dated
+        first = _stamp(kind, fields, _NOON_S) if first is None else first
     order = (*POSITIONS, *HEADINGS)
     only = tuple(
         next(kind for kind in some if kinds[kind])
@@ -211,14 +215,12 @@ def _nmea(data: bytes, options: NmeaOptions) -> Recorded:
     )
     decoder = NmeaDecoder(replace(options, max_clock_error_s=_ANY_CLOCK_S), only=only)
     messages: list[Message] = []
-    time_s = 0.0 if math.isnan(dated) else dated
-    has_time = False
+    time_s = (first or 0.0) if math.isnan(dated) else dated
     for text in SentenceFramer(lambda _: None, max_length=MAX_SENTENCE).feed(data + b"\n"):
         if text.startswith("#"):  # a comment of who recorded
             continue
         for kind, fields in _sentences(text.encode("latin-1")):
             stated = _stamp(kind, fields, time_s)
-            has_time |= stated is not None
             time_s = time_s if stated is None else stated
         messages += decoder.feed(text.encode("latin-1") + b"\r\n", arrival_s=time_s)
     messages += decoder.feed(b"", arrival_s=math.inf)
@@ -232,7 +234,7 @@ def _nmea(data: bytes, options: NmeaOptions) -> Recorded:
         notes.append("No sentence states a date: time_s is UTC of the day.")
     if not messages:
         notes.append(f"its sentences are {', '.join(sorted(kinds)[:12]) or 'without checksum'}")
-    if not has_time and messages:
+    if first is None and messages:
         return Recorded((), ("no sentence states a time, which depths and headings need",))
     return Recorded(tuple(messages), tuple(notes))
 
@@ -261,10 +263,10 @@ def _date(kind: str, fields: list[str]) -> float:
         return math.nan
     noon = calendar.timegm((int(year), int(month), int(day), 12, 0, 0))
     try:
-        of_day = utc_seconds(utc, 0.5 * 86400.0 - 1e-6)
+        of_day = utc_seconds(utc, _NOON_S)
     except RefusedError:
         return math.nan
-    return math.nan if of_day is None else noon - 0.5 * 86400.0 + of_day % 86400.0
+    return math.nan if of_day is None else noon - 0.5 * DAY_S + of_day % DAY_S
 
 
 def _stamp(kind: str, fields: list[str], time_s: float) -> float | None:
