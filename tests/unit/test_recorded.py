@@ -36,7 +36,12 @@ def reports(n: int, form: str = "json_v1", n_beams: int = 4) -> list[dict[str, A
             {"id": i, "velocity": 0.1 * i + 0.001 * k, "distance": 1.6, "beam_valid": True}
             for i in range(n_beams)
         ]
-        fields = {"time": 100.0 + k, "vx": 0.1, "altitude": 1.5, "velocity_valid": True}
+        fields: dict[str, Any] = {
+            "time": 100.0 + k,
+            "vx": 0.1,
+            "altitude": 1.5,
+            "velocity_valid": True,
+        }
         fields |= {"transducers": beams, "status": 0, "format": form}
         if form != "json_v1":
             fields |= {"type": "velocity"}

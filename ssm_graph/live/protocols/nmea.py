@@ -47,7 +47,7 @@ HEIGHT_SIGMA_M: Final = 100.0
 _MAX_KINDS: Final = 8
 _FEW_LETTERS: Final = 16
 """Shorter printable pieces are of binary frames that a line end within cuts up."""
-_LIKE_SENTENCE = re.compile(r"[$!]?[A-Z]{2}[A-Z0-9]{2,},")
+_LIKE_SENTENCE = re.compile(r"[$!]?[A-Z]{2}[A-Z0-9]{2,8},")
 _TAG_BLOCK = re.compile(r"\\([^\\]*)\*([0-9A-Fa-f]{2})\\\Z", re.ASCII)
 
 PRESSURE_SENTENCES: Final = frozenset(
