@@ -123,13 +123,3 @@ def test_usbl_says_where_on_earth(tmp_path: Path) -> None:
     assert log is not None
     np.testing.assert_allclose([got.frame.lat, got.frame.lon], [log.lat[0], log.lon[0]])
     assert got.frame.height == pytest.approx(log.height[0])
-
-
-def test_before_the_first_ping_no_velocity_is_known() -> None:
-    """Without a word of NumPy on the console, which warnings as errors would show."""
-    mission = adrift().mission
-    none = replace(
-        mission.dvl,
-        **{name: getattr(mission.dvl, name)[:0] for name in ("time_s", "speed", "sigma")},
-    )
-    assert len(body_velocities(replace(mission, dvl=none)).time_s) == 0

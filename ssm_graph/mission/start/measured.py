@@ -74,8 +74,6 @@ def _of_pings(mission: Mission) -> BodyVelocities:
     dvl = mission.dvl.of_ground()
     beams_b = dvl.mount.beams_b
     valid = np.isfinite(dvl.speed)
-    if not valid.any():
-        return BodyVelocities(np.zeros(0), np.zeros((0, 3)))
     # Three beams agree with anything: they count only where pings of all beams are rare.
     n_needed = max(3, dvl.mount.n_beams if np.mean(valid.all(axis=1)) > 0.5 else 3)
     contradicts = dvl.mount.parity(dvl.speed, dvl.sigma) >= PARITY_GATE
