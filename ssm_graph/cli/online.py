@@ -61,6 +61,7 @@ addresses:
   tcp://HOST:PORT           a server that is called, again and again if need be
   tcp-listen://[HOST]:PORT  a server that others call
   udp://[HOST]:PORT         datagrams; for --publish and --nmea where they go to
+  serial:///dev/PORT?baud=BAUD  a serial port, 8 data bits, no parity; opened again if need be
 What listens, listens to this computer only (127.0.0.1) unless HOST names another interface.
 
 what is understood and written: docs/live-protocols.md; how to run it: docs/online.md

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import random
 import re
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,8 @@ from ssm_graph.live.recorded.log import Recorded, read_recorded, write_tables
 from ssm_graph.sensors.compass import HeadingReading
 from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.gnss import Fix
+from ssm_graph.sensors.messages import bad_number
+from tests.damaged_traffic import block_of, damaged, targets
 
 DATA = Path(os.environ.get("SSM_GRAPH_DATA", Path(__file__).parents[2] / "../shared/data"))
 RECEIVERS = DATA / "gpsd"
@@ -216,3 +219,21 @@ def test_pings_are_pings(tmp_path: Path) -> None:
     """A list of reports over several lines, as a recorder may write it."""
     found = read(tmp_path / "list.json", json.dumps(reports(6, "json_v2"), indent=2).encode())
     assert [type(one) for one in found.messages] == [Ping] * 6
+
+
+def test_damaged_recordings_do_no_harm(tmp_path: Path) -> None:
+    """A refusal by its cause, or finite numbers in increasing times; `fuzz.md` has the decoders."""
+    rng = random.Random(11)
+    others, n_read = targets(), 0
+    for k in range(60):
+        data = damaged(block_of(others[1 + k % 3], others, rng, DAY_S), rng)
+        (tmp_path / "log").write_bytes(data)
+        try:
+            found = read_recorded(tmp_path / "log")
+        except DataError as error:
+            assert str(tmp_path) in str(error)
+            continue
+        for message in found.messages if found is not None else ():
+            assert bad_number(message) is None
+            n_read += 1
+    assert n_read > 100
