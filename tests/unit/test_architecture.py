@@ -271,6 +271,7 @@ MAY_WRITE = {
     },
     "ssm_graph/live/sockets/feed.py": {"channel.fed_s", "channel.heard_s", "channel.decoder"},
     "ssm_graph/live/sockets/inputs.py": {"self._channel.heard_s", "self.feed.n_reconnects"},
+    "ssm_graph/live/sockets/serial_port.py": {"self._channel.heard_s", "self.feed.n_reconnects"},
     "ssm_graph/report/mission/summary.py": {
         "table.columns[1].justify",
         "table.columns[0].min_width",

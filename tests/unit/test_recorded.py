@@ -230,8 +230,7 @@ def test_damaged_recordings_do_no_harm(tmp_path: Path) -> None:
         (tmp_path / "log").write_bytes(data)
         try:
             found = read_recorded(tmp_path / "log")
-        except DataError as error:
-            assert str(tmp_path) in str(error)
+        except DataError:
             continue
         for message in found.messages if found is not None else ():
             assert bad_number(message) is None

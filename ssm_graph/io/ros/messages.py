@@ -55,6 +55,8 @@ SEA_WATER: Final = 1025.0
 FIX_SIGMA: Final = (5.0, 5.0, 10.0)
 """m east, north, up, of a fix that does not say how good it is."""
 
+_LARGEST_NUMBER: Final = 1e9
+"""SI; whatever the unit, a larger number of an IMU is damage."""
 _NANOSECONDS: Final = 1_000_000_000
 _WATER_TRACK: Final = 2
 """``DVL_MODE_WATER`` of ``marine_acoustic_msgs``."""
@@ -309,8 +311,8 @@ def _fix_sigma(message: Any, instead: Vector) -> Vector:
 
 def _in_frd(message: Any, field: str, axes: BodyAxes) -> Vector:
     vector = _vector(getattr(message, field))
-    if not all(math.isfinite(value) for value in vector):
-        raise DataError(f"{type(message).__name__}: {field} is not finite: {vector}")
+    if not all(abs(value) < _LARGEST_NUMBER for value in vector):
+        raise DataError(f"{type(message).__name__}: {field} is not finite, or damaged: {vector}")
     return turned(vector, axes)
 
 
