@@ -118,7 +118,7 @@ def test_a_clock_that_was_set(
 
 
 def test_late_messages_are_no_set_clock(mission: Mission, ros: Ros, tmp_path: Path) -> None:
-    """A network that stalls for five seconds and gives all it held at once."""
+    """A network that stalls for five seconds and gives all it held at once; a longer way."""
     held = (EPOCH_S + 10.0) * 1e9, (EPOCH_S + 15.0) * 1e9
     sent = [
         item._replace(nanoseconds=int(held[1]) + k)
@@ -127,6 +127,14 @@ def test_late_messages_are_no_set_clock(mission: Mission, ros: Ros, tmp_path: Pa
         for k, item in enumerate(marine_bag(mission, ros))
     ]
     bag = write_bag(tmp_path / "stall", ros, sent)
+    assert_same(convert_rosbag(bag, options=ON_ELLIPSOID), mission)
+    slower = [
+        item._replace(nanoseconds=item.nanoseconds + 8 * 10**8)
+        if item.type_name == IMU and item.nanoseconds > held[1]
+        else item
+        for item in marine_bag(mission, ros)
+    ]
+    bag = write_bag(tmp_path / "slower", ros, slower)
     assert_same(convert_rosbag(bag, options=ON_ELLIPSOID), mission)
 
 

@@ -26,6 +26,8 @@ GPS_AHEAD_S: Final = 18.0
 """GPS time less UTC since 2017."""
 _WINDOW_S: Final = 10.0
 _FEWEST: Final = 5
+_LITTLE_DELAY: Final = 0.9
+"""Quantile: delays only make stamps lag, so that the upper ones tell of the clock."""
 
 
 def check_never_set(place: str, stamp_s: Array, received_s: Array) -> None:
@@ -34,7 +36,11 @@ def check_never_set(place: str, stamp_s: Array, received_s: Array) -> None:
     ``place`` names the topic; the times are in the order of recording, s.
     """
     ahead = stamp_s - received_s
-    steps = np.diff(ahead)
+    steps, intervals = np.diff(ahead), np.diff(stamp_s)
+    if len(steps) == 0:
+        return
+    # where the stamps go on as ever it is the delay that has changed, not the clock
+    steps = np.where(np.abs(intervals - np.median(intervals)) > SMALLEST_STEP_S, steps, 0.0)
     order = np.argsort(-np.abs(steps))[: 4 * _FEWEST]
     for k in order[np.abs(steps[order]) > SMALLEST_STEP_S]:
         before, after = ahead[: k + 1], ahead[k + 1 :]
@@ -54,6 +60,11 @@ def check_never_set(place: str, stamp_s: Array, received_s: Array) -> None:
             )
 
 
+def ahead_of_recording(stamp_s: Array, received_s: Array) -> float:
+    """Return header less time of recording, s, of messages that come with little delay."""
+    return float(np.quantile(stamp_s - received_s, _LITTLE_DELAY))
+
+
 def check_one_clock(
     bag: Path, ahead_s: Mapping[str, tuple[str, float]], late_s: Mapping[str, float]
 ) -> tuple[dict[str, float], list[str]]:
@@ -64,13 +75,13 @@ def check_one_clock(
 
     Parameters
     ----------
-    ahead_s : by role, the topic and the median of header less time of recording, s.
+    ahead_s : by role, the topic and its :func:`ahead_of_recording`, s.
     late_s : by role, how far ahead its stamps are by the vehicle's file (``time_offset_s``), s.
     """
     take_off, notes = dict[str, float](), list[str]()
     imu_topic, imu_s = ahead_s["imu"]
-    for role, (topic, median_s) in ahead_s.items():
-        off = median_s - imu_s - late_s.get(role, 0.0)
+    for role, (topic, stamps_s) in ahead_s.items():
+        off = stamps_s - imu_s - late_s.get(role, 0.0)
         if role == "gnss" and GPS_AHEAD_S - 1.0 < off < GPS_AHEAD_S + LARGEST_AHEAD_S:
             take_off[role] = GPS_AHEAD_S
             notes.append(
@@ -81,7 +92,7 @@ def check_one_clock(
             raise DataError(
                 f"{bag}: {topic}: the stamps are {off:.4g} s ahead of those of {imu_topic}, by the "
                 "times at which both were recorded; expected one clock, and no stamp after its own "
-                f"recording; {_remedy(role, median_s - imu_s)}"
+                f"recording; {_remedy(role, stamps_s - imu_s)}"
             )
         elif off < -_LARGEST_DELAY_S:
             notes.append(

@@ -17,7 +17,7 @@ from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.io.mission_folder.assembly import mission_from
 from ssm_graph.io.ros.beams import Beams, known_beams, proven_beams
-from ssm_graph.io.ros.clocks import check_never_set, check_one_clock
+from ssm_graph.io.ros.clocks import ahead_of_recording, check_never_set, check_one_clock
 from ssm_graph.io.ros.frames import seats
 from ssm_graph.io.ros.log import Topics
 from ssm_graph.io.ros.messages import (
@@ -120,7 +120,7 @@ def _one_clock(
         if len(topic.rows):
             stamp_s, received_s = topic.table(options.n_beams)[:, 0], np.array(topic.received)
             check_never_set(f"{bag}: {topic.name}", stamp_s, received_s)
-            ahead[role] = (topic.name, float(np.median(stamp_s - received_s)))
+            ahead[role] = (topic.name, ahead_of_recording(stamp_s, received_s))
     late = {}
     if vehicle is not None:
         late = {
