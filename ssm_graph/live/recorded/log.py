@@ -18,7 +18,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.base.errors import DataError
 from ssm_graph.io.raw_log.rows import RowKind
 from ssm_graph.io.tables.append_file import write_through
 from ssm_graph.live.protocols.decoder import RefusedError, parse_object
@@ -82,10 +82,7 @@ def read_recorded(log: Path, options: NmeaOptions | None = None) -> Recorded | N
 
 
 def write_tables(folder: Path, messages: Iterable[Message]) -> dict[str, int]:
-    """Write messages as the tables of a mission folder; return their files and numbers of rows.
-
-    Raises :class:`ConfigError` where one of them is there already.
-    """
+    """Write messages as the tables of a mission folder; return their files and numbers of rows."""
     kinds: dict[type[Message], RowKind] = {}
     rows: dict[type[Message], list[bytes]] = {}
     for message in messages:
@@ -95,12 +92,6 @@ def write_tables(folder: Path, messages: Iterable[Message]) -> dict[str, int]:
             rows[kind] = [kinds[kind].header]
         rows[kind].append(kinds[kind].row(message))
     folder.mkdir(parents=True, exist_ok=True)
-    there = [kind.file for kind in kinds.values() if (folder / kind.file).exists()]
-    if there:
-        raise ConfigError(
-            f"{folder}: {', '.join(there)} is there already, and is not overwritten; expected a "
-            "folder without; choose another one, or move it away"
-        )
     for kind, lines in rows.items():
         write_through(folder / kinds[kind].file, b"".join(lines))
     return {kinds[kind].file: len(lines) - 1 for kind, lines in rows.items()}
