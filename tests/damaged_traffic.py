@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 from ssm_graph.live.protocols.decoder import MAX_REFUSALS, Decoder
 from ssm_graph.live.protocols.framing import MAX_LENGTH
 from ssm_graph.live.protocols.json_messages import JsonDecoder, encode_message
-from ssm_graph.live.protocols.nmea import NmeaDecoder, checksum
+from ssm_graph.live.protocols.nmea import NmeaDecoder
+from ssm_graph.live.protocols.nmea_fields import checksum
 from ssm_graph.live.protocols.waterlinked import BeamRule, WaterLinkedDecoder
 from ssm_graph.sensors.depth import DepthReading
 from ssm_graph.sensors.dvl import Ping
@@ -52,9 +53,8 @@ def json_traffic(rng: random.Random, time_s: float) -> bytes:
 def waterlinked_traffic(rng: random.Random, time_s: float) -> bytes:
     """Return a report of a DVL: mostly velocities, a line each or indented, some in a list."""
     if rng.random() < 0.2:
-        return (
-            json.dumps({"ts": time_s, "x": rng.random(), "type": "position_local"}).encode() + b"\n"
-        )
+        place = {"ts": time_s, "x": rng.random(), "yaw": 360.0 * rng.random() - 180.0}
+        return json.dumps({**place, "status": 0, "type": "position_local"}).encode() + b"\n"
     beams = [
         {
             "id": k,
@@ -75,7 +75,7 @@ def waterlinked_traffic(rng: random.Random, time_s: float) -> bytes:
         "velocity_valid": rng.random() < 0.8,
         "status": 0,
         "format": "json_v3.1",
-        "type": "velocity",
+        "type": rng.choice(["velocity", "velocity", "velocity_water"]),
         "time_of_validity": int((time_s - 0.15) * 1e6),
     }
     indent = 4 if rng.random() < 0.3 else None
@@ -94,10 +94,14 @@ def nmea_traffic(rng: random.Random, time_s: float) -> bytes:
         f"PRVAT,00.115,M,{10.0 + 30.0 * rng.random():08.3f},dBar",
         f"PIPS,{30.0 * rng.random():07.2f},M",
         "SDDPT,12.5,0.0",
-        "GPRMC,120000,V,,,,,,,,,,N",
+        f"GPRMC,{utc},A,{place},0.5,54.7,250625,,,A",
+        f"GNGLL,{place},{utc},A,A",
+        f"HEHDT,{rng.randrange(360)}.5,T",
+        f"HCHDG,{rng.randrange(360)}.5,1.0,E,,",
     ]
     kept = [body for body in bodies if rng.random() < 0.7]
-    return b"".join(f"${body}*{checksum(body)}\r\n".encode() for body in kept)
+    frame = b"\xb5\x62" + rng.randbytes(rng.randrange(100)) if rng.random() < 0.2 else b""
+    return frame + b"".join(f"${body}*{checksum(body)}\r\n".encode() for body in kept)
 
 
 @dataclass
@@ -165,7 +169,7 @@ def targets() -> list[Target]:
 
 
 def _each_beam() -> Decoder:
-    return WaterLinkedDecoder(beam_rule=BeamRule.EACH)
+    return WaterLinkedDecoder(beam_rule=BeamRule.EACH, heading=True)
 
 
 def block_of(target: Target, others: Sequence[Target], rng: random.Random, time_s: float) -> bytes:

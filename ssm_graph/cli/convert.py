@@ -1,32 +1,38 @@
-"""``ssm-graph convert``: turn a maker's log or a ROS 2 bag into a mission folder."""
+"""``ssm-graph convert``: turn a maker's log or a ROS bag into a mission folder."""
 
 from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from ssm_graph.base.errors import ConfigError
+from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frames import BodyAxes
 from ssm_graph.cli.options import add_command, add_mission_output, choice_option, number_option, say
 from ssm_graph.io.blueye.convert import convert_blueye
+from ssm_graph.io.file_kind import is_mcap, kind_of
 from ssm_graph.io.mission_folder.folder import write_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle
 from ssm_graph.io.ros.convert import convert_rosbag
 from ssm_graph.io.ros.log import ROLES, is_rosbag
 from ssm_graph.io.ros.messages import SEA_WATER, STANDARD_ATMOSPHERE, BeamSign, RosOptions
+from ssm_graph.live.recorded.log import Recorded, read_recorded, write_tables
 from ssm_graph.mission.mission import Mission
 
 DESCRIPTION = f"""\
 Convert a log. LOG is one of
 
-  a ROS 2 bag      the folder with metadata.yaml, or a single .mcap or .db3 file (extra 'ros')
+  a ROS bag        ROS 2: the folder, with metadata.yaml or without, or a single .mcap or .db3 file;
+                   ROS 1: a .bag (extra 'ros')
   a Blueye X3 log  MCAP of the maker (extra 'blueye')
+  an instrument's  Water Linked JSON (dvl.csv, heading.csv) or NMEA 0183 (gnss.csv, heading.csv):
+  own output       tables for a mission folder, which a mission.toml and imu.csv make whole
 
-Of a ROS 2 bag, topics are found by their type:
+Of a ROS bag, topics are found by their type:
 
 {chr(10).join(f"  {role:6} {' or '.join(types)}" for role, types in ROLES.items())}
 
@@ -40,7 +46,7 @@ def add_parser(commands: Any, *, epilog: str) -> None:
     parser = add_command(
         commands,
         "convert",
-        summary="turn a maker's log or a ROS 2 bag into a mission folder",
+        summary="turn a maker's log or a ROS bag into a mission folder",
         description=DESCRIPTION,
         epilog=epilog,
     )
@@ -51,7 +57,7 @@ def add_parser(commands: Any, *, epilog: str) -> None:
 
 
 def _add_ros_options(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("of ROS 2 bags only")
+    group = parser.add_argument_group("of ROS bags only")
     group.add_argument(
         "--vehicle",
         type=Path,
@@ -64,7 +70,8 @@ def _add_ros_options(parser: argparse.ArgumentParser) -> None:
         type=_topic,
         action="append",
         metavar="SENSOR=NAME",
-        help="the topic to read where several fit, such as imu=/imu/data; may be repeated",
+        help="the topic to read where several fit, such as imu=/imu/data; may be repeated, of the "
+        "DVL for one topic off the ground and one off the water",
     )
     meaning = "axes of the IMU messages: forward-left-up as REP 103 has it, forward-right-down, "
     choice_option(group, "--body", BodyAxes, f"{meaning}right-forward-up (default: FLU)")
@@ -94,7 +101,25 @@ ROS_OPTIONS = (
 
 def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
     """Convert and write."""
-    mission = _convert(arguments)
+    if is_rosbag(arguments.log):
+        return _write(_from_rosbag(arguments), arguments, console)
+    given = [name for name in ROS_OPTIONS if getattr(arguments, name) is not None]
+    if given:
+        raise ConfigError(
+            f"--{given[0].replace('_', '-')} is for ROS bags, and {arguments.log} is none: "
+            f"{kind_of(arguments.log)}"
+        )
+    if not arguments.log.exists():
+        raise DataError(f"{arguments.log}: there is no such file or folder")
+    if is_mcap(arguments.log):
+        return _write(convert_blueye(arguments.log), arguments, console)
+    recorded = None if arguments.log.is_dir() else read_recorded(arguments.log)
+    if recorded is None:
+        raise DataError(f"{arguments.log}: {kind_of(arguments.log)}")
+    return _write_tables(recorded, arguments.out, console)
+
+
+def _write(mission: Mission, arguments: argparse.Namespace, console: Console) -> bool:
     write_mission(arguments.out, mission, table_format=arguments.format)
     n_fixes = len(mission.gnss.time_s) if mission.gnss is not None else 0
     span_s = mission.imu.time_s[-1] - mission.imu.start_s
@@ -103,21 +128,21 @@ def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
         f"{arguments.out}: {span_s:.1f} s, {len(mission.imu.time_s)} inertial samples, "
         f"{len(mission.dvl.time_s)} pings, {n_fixes} GNSS fixes",
     )
-    for note in mission.notes:
-        console.print(f"note: {note}", style="yellow", highlight=False, markup=False)
+    _say_notes(mission.notes, console)
     return True
 
 
-def _convert(arguments: argparse.Namespace) -> Mission:
-    if is_rosbag(arguments.log):
-        return _from_rosbag(arguments)
-    given = [name for name in ROS_OPTIONS if getattr(arguments, name) is not None]
-    if given:
-        raise ConfigError(
-            f"--{given[0].replace('_', '-')} is for ROS 2 bags, and {arguments.log} is none: "
-            "expected a folder with metadata.yaml, or MCAP or .db3 recorded by ROS 2"
-        )
-    return convert_blueye(arguments.log)
+def _write_tables(recorded: Recorded, out: Path, console: Console) -> bool:
+    written = write_tables(out, recorded.messages)
+    rows = ", ".join(f"{name} with {count} rows" for name, count in written.items())
+    say(console, f"{out}: {rows}; imu.csv and mission.toml beside them make a mission")
+    _say_notes(recorded.notes, console)
+    return True
+
+
+def _say_notes(notes: Iterable[str], console: Console) -> None:
+    for note in notes:
+        console.print(f"note: {note}", style="yellow", highlight=False, markup=False)
 
 
 def _from_rosbag(arguments: argparse.Namespace) -> Mission:
@@ -133,11 +158,11 @@ def _from_rosbag(arguments: argparse.Namespace) -> Mission:
         atmosphere=defaults.atmosphere if atmosphere is None else atmosphere,
         surface_height=arguments.surface_height,
     )
-    topics = arguments.topic or []
-    if len(dict(topics)) < len(topics):
-        raise ConfigError("--topic: expected each sensor once")
+    topics: dict[str, list[str]] = {}
+    for role, name in arguments.topic or ():
+        topics.setdefault(role, []).append(name)
     vehicle = None if arguments.vehicle is None else read_vehicle(arguments.vehicle)
-    return convert_rosbag(arguments.log, vehicle=vehicle, topics=dict(topics), options=options)
+    return convert_rosbag(arguments.log, vehicle=vehicle, topics=topics, options=options)
 
 
 def _topic(word: str) -> tuple[str, str]:

@@ -32,7 +32,8 @@ from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator import ONLINE, FixedLagSmoother, IntegrityConfig
 from ssm_graph.live.protocols.decoder import Clock, Decoder
 from ssm_graph.live.protocols.json_messages import JsonDecoder
-from ssm_graph.live.protocols.nmea import NmeaDecoder, NmeaOptions
+from ssm_graph.live.protocols.nmea import PRESSURE_SENTENCES, NmeaDecoder, NmeaOptions
+from ssm_graph.live.protocols.nmea_fields import DepthSentence
 from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
 from ssm_graph.live.run.replay_source import ReplaySource
 from ssm_graph.live.run.run_folder import RunFolder
@@ -60,6 +61,7 @@ addresses:
   tcp://HOST:PORT           a server that is called, again and again if need be
   tcp-listen://[HOST]:PORT  a server that others call
   udp://[HOST]:PORT         datagrams; for --publish and --nmea where they go to
+  serial:///dev/PORT?baud=BAUD  a serial port, 8 data bits, no parity; opened again if need be
 What listens, listens to this computer only (127.0.0.1) unless HOST names another interface.
 
 what is understood and written: docs/live-protocols.md; how to run it: docs/online.md
@@ -68,6 +70,7 @@ _INPUTS: Final = {
     "dvl": "Water Linked DVL-A50 or A125, JSON over TCP port 16171",
     "gnss": "GNSS receiver, NMEA 0183",
     "depth": "pressure sensor, NMEA 0183",
+    "heading": "compass or gyrocompass, NMEA 0183 (HDT, THS, PASHR, HDG)",
     "imu": "inertial samples, JSON lines",
     "messages": "any messages, JSON lines",
 }
@@ -268,6 +271,19 @@ def add_connections(parser: argparse.ArgumentParser) -> None:
     number_option(group, "--surface-height", "M", meaning, 0.0)
     meaning = "geoid above ellipsoid: for fixes that leave it out, and for --nmea (default: none)"
     number_option(group, "--geoid-separation", "M", meaning)
+    group.add_argument(
+        "--depth-sentence",
+        type=_depth_sentence,
+        action="append",
+        metavar="{" + ",".join(one.name for one in DepthSentence) + "}",
+        help="what is read as the vehicle's depth; repeatable (default: the pressures, PRVAT, PIPS "
+        "and PVIPS2; DPT and DBT are mostly the water below)",
+    )
+    group.add_argument(
+        "--dvl-heading",
+        action="store_true",
+        help="read the yaw of the DVL's dead reckoning, as the [heading] of a directional gyro",
+    )
     group = parser.add_argument_group("outputs")
     group.add_argument(
         "--publish", action="append", metavar="ADDRESS", help="answers as JSON lines; repeatable"
@@ -369,15 +385,24 @@ def output_configs(arguments: argparse.Namespace) -> list[OutputConfig]:
     ]
 
 
+def _depth_sentence(word: str) -> DepthSentence:
+    try:
+        return DepthSentence[word.upper()]
+    except KeyError:
+        names = ", ".join(one.name for one in DepthSentence)
+        raise argparse.ArgumentTypeError(f"expected one of {names}, got {word!r}") from None
+
+
 def _decoder(name: str, arguments: argparse.Namespace) -> Callable[[], Decoder]:
     clock, axes = arguments.clock, arguments.axes
     if name == "dvl":
-        return lambda: WaterLinkedDecoder(clock=clock)
+        return lambda: WaterLinkedDecoder(clock=clock, heading=arguments.dvl_heading)
     if name in ("imu", "messages"):
         return lambda: JsonDecoder(axes=axes)
     options = NmeaOptions(
         clock=clock,
         geoid_separation_m=arguments.geoid_separation,
         surface_height_m=arguments.surface_height,
+        depth_sentences=frozenset(arguments.depth_sentence or PRESSURE_SENTENCES),
     )
     return lambda: NmeaDecoder(options)

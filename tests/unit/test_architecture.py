@@ -262,7 +262,7 @@ def writes_of(tree: ast.Module) -> Iterator[tuple[int, str]]:
 
 MAY_WRITE = {
     "ssm_graph/io/raw_log/log.py": {"row.is_in_table"},
-    "ssm_graph/io/ros/convert.py": {"topic.n_unstated", "topic.beams_d"},
+    "ssm_graph/io/ros/topics.py": {"topic.n_unstated", "topic.beams_d"},
     "ssm_graph/io/tables/checkpoint.py": {"archive.comment"},
     "ssm_graph/live/estimator/smoother.py": {
         "self._intake.horizon_s",
@@ -271,6 +271,7 @@ MAY_WRITE = {
     },
     "ssm_graph/live/sockets/feed.py": {"channel.fed_s", "channel.heard_s", "channel.decoder"},
     "ssm_graph/live/sockets/inputs.py": {"self._channel.heard_s", "self.feed.n_reconnects"},
+    "ssm_graph/live/sockets/serial_port.py": {"self._channel.heard_s", "self.feed.n_reconnects"},
     "ssm_graph/report/mission/summary.py": {
         "table.columns[1].justify",
         "table.columns[0].min_width",

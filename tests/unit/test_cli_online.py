@@ -16,6 +16,7 @@ from ssm_graph.io.mission_folder.folder import read_mission, write_mission
 from ssm_graph.io.results.tables import read_results
 from ssm_graph.live.protocols.json_messages import JsonDecoder
 from ssm_graph.live.protocols.nmea import NmeaDecoder
+from ssm_graph.live.protocols.nmea_fields import checksum
 from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
 from ssm_graph.live.sockets.endpoints import Transport
 from ssm_graph.live.sockets.feed import Limits
@@ -178,3 +179,24 @@ def test_speeds() -> None:
     """A number, or as fast as it goes."""
     assert replay_speed("full") is None
     assert replay_speed("2.5") == 2.5
+
+
+def test_what_of_nmea_and_the_dvl_is_read(capsys: pytest.CaptureFixture[str]) -> None:
+    """Depths by name, a compass, the yaw of the DVL; each only where it is asked for."""
+    depth = f"$SDDPT,12.5,0.0*{checksum('SDDPT,12.5,0.0')}\r\n".encode()
+    heading = f"$HEHDT,45.0,T*{checksum('HEHDT,45.0,T')}\r\n".encode()
+    yaw = b'{"type": "position_local", "yaw": 45.0, "status": 0}\n'
+    for words, counts in (
+        ((), [0, 1, 0]),
+        (("--depth-sentence", "dpt", "--dvl-heading"), [1, 1, 1]),
+    ):
+        inputs = ("--depth", "udp://:9", "--heading", "udp://:10", "--dvl", "tcp://a:11")
+        configs = {one.name: one for one in input_configs(parsed(*inputs, *words))}
+        found = [
+            len(configs[name].make_decoder().feed(data, arrival_s=1.7e9))
+            for name, data in (("depth", depth), ("heading", heading), ("dvl", yaw))
+        ]
+        assert found == counts
+    with pytest.raises(SystemExit):
+        parsed("--depth-sentence", "XDR")
+    assert "expected one of PRVAT, PIPS, PVIPS2, DPT, DBT, got 'XDR'" in capsys.readouterr().err

@@ -20,7 +20,7 @@ from ssm_graph.live.protocols.decoder import (
     parse_object,
     shown,
 )
-from ssm_graph.live.protocols.framing import LineFramer, ObjectFramer, TokenBucket
+from ssm_graph.live.protocols.framing import LineFramer, ObjectFramer, SentenceFramer, TokenBucket
 from tests.helpers import STEADY
 
 SOUP = st.lists(
@@ -31,6 +31,9 @@ SOUP = st.lists(
             b'"',
             b"\\",
             b"\n",
+            b"\r",
+            b"$",
+            b"\xff",
             b"[",
             b"]",
             b",",
@@ -51,11 +54,13 @@ def pieces(data: bytes, cuts: list[int]) -> list[bytes]:
     return [data[a:b] for a, b in pairwise(places)]
 
 
-@pytest.mark.parametrize("framer", [LineFramer, ObjectFramer])
+@pytest.mark.parametrize("framer", [LineFramer, ObjectFramer, SentenceFramer])
 @settings(STEADY, max_examples=25)
 @given(data=SOUP, cuts=CUTS)
 def test_chunks_do_not_matter(
-    framer: type[LineFramer] | type[ObjectFramer], data: bytes, cuts: list[int]
+    framer: type[LineFramer] | type[ObjectFramer] | type[SentenceFramer],
+    data: bytes,
+    cuts: list[int],
 ) -> None:
     """Whole, in pieces and byte by byte: the same comes out and the same is refused."""
     found = []

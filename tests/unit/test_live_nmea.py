@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import random
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -12,17 +14,11 @@ from hypothesis import strategies as st
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.live.protocols.decoder import Clock
-from ssm_graph.live.protocols.nmea import (
-    DepthSentence,
-    NmeaDecoder,
-    NmeaOptions,
-    checksum,
-    encode_gga,
-    encode_hdt,
-    encode_nmea,
-    encode_vtg,
-)
+from ssm_graph.live.protocols.nmea import NmeaDecoder, NmeaOptions
+from ssm_graph.live.protocols.nmea_fields import DepthSentence, checksum
+from ssm_graph.live.protocols.nmea_out import encode_gga, encode_hdt, encode_nmea, encode_vtg
 from ssm_graph.mission.navigation import Health, Navigation
+from ssm_graph.sensors.compass import HeadingReading
 from ssm_graph.sensors.depth import DepthReading
 from ssm_graph.sensors.gnss import Fix
 from ssm_graph.sensors.messages import Message
@@ -211,7 +207,6 @@ def test_water_below_a_transducer_is_no_vehicle_depth() -> None:
         (b"$GPGGA,1\r\n", "expected a checksum '*hh'"),
         (b"$GPGGA,1*4G\r\n", "expected a checksum '*hh'"),
         (b"GPGGA,1*00\r\n", "begins with '$'"),
-        (b"\xff\xfe\r\n", "byte 0xff"),
         (b"$" + b"A" * 2000 + b"\r\n", "at most 1024 bytes"),
         (sentence("GPGGA,120000"), "expected 14 fields"),
         (sentence(GGA.replace("120000.00", "250000")), "UTC as hhmmss"),
@@ -220,11 +215,8 @@ def test_water_below_a_transducer_is_no_vehicle_depth() -> None:
         (sentence(GGA.replace("6326.0000", "9026.0000")), "check the unit"),
         (sentence(GGA.replace(",N,", ",X,")), "angle"),
         (sentence(GGA.replace(",N,", ",,")), "angle"),
-        (sentence(GGA.replace("20.50", "")), "altitude"),
         (sentence(GGA.replace("20.50", "nan")), "altitude"),
         (sentence(GGA.replace("20.50", "1_0")), "altitude"),
-        (sentence(GGA.replace("40.25", "")), "geoid_separation_m"),
-        (sentence(GGA.replace(",0.8,", ",,")), "HDOP"),
         (sentence("GPGST,120000.00"), "expected 8 fields"),
         (sentence("PRVAT,00.115,M"), "depth_sentences"),
         (sentence("PIPS,1.0,"), "dBar"),
@@ -346,3 +338,184 @@ def test_position_comes_back(lat: float, lon: float, height: float) -> None:
     assert fix.lat == pytest.approx(lat, abs=2e-10)
     assert math.remainder(fix.lon - lon, 2.0 * math.pi) == pytest.approx(0.0, abs=2e-10)
     assert fix.height == pytest.approx(height, abs=1e-3)
+
+
+def test_a_fix_without_height_or_quality_is_poor_and_said_once() -> None:
+    """The surface's height to 100 m; twice the range error; so is an altitude above the geoid."""
+    no_height = GGA.replace("20.50", "").replace("40.25", "").replace(",0.8,", ",,")
+    (fix, again), refused = read(
+        no_height, no_height.replace("00.00", "01.00"), options=NmeaOptions(surface_height_m=39.0)
+    )
+    assert isinstance(fix, Fix)
+    assert fix.height == 39.0
+    assert fix.sigma_enu == (10.0, 10.0, 100.0)
+    assert isinstance(again, Fix)
+    assert ["no HDOP" in refused[0], "no height" in refused[1], len(refused)] == [True, True, 2]
+    (fix,), refused = read(GGA.replace("40.25", ""))
+    assert isinstance(fix, Fix)
+    assert (fix.height, fix.sigma_enu[2]) == (20.5, 100.0)
+    assert "--geoid-separation" in refused[0]
+
+
+PLACE = "6326.0000,N,01024.0000,E"
+POSITIONS_OF_ONE_EPOCH = {
+    "GNS": f"GNGNS,1200%02d.00,{PLACE},AN,10,0.9,20.50,40.25,,",
+    "RMC": f"GNRMC,1200%02d.00,A,{PLACE},0.5,54.7,250625,,,A",
+    "GLL": f"GNGLL,{PLACE},1200%02d.00,A,D",
+}
+
+
+@pytest.mark.parametrize(
+    ("sent", "read_as"),
+    [
+        (("GLL", "RMC", "GNS"), "GNS"),
+        (("GLL", "RMC"), "RMC"),
+        (("GLL",), "GLL"),
+        (("GGA", "GNS", "RMC", "GLL"), "GGA"),
+    ],
+)
+def test_positions_by_one_rule(sent: tuple[str, ...], read_as: str) -> None:
+    """The sentence that says most is read, from five seconds on where it is not GGA."""
+    decoder = NmeaDecoder()
+    bodies = {**POSITIONS_OF_ONE_EPOCH, "GGA": GGA.replace("120000", "1200%02d")}
+    fixes = []
+    for k in range(12):
+        data = b"".join(sentence(bodies[kind] % k) for kind in sent)
+        fixes += decoder.feed(data, arrival_s=NOON_S + k)
+    late = [fix for fix in fixes if fix.time_s >= NOON_S + 6.0]
+    assert [fix.time_s for fix in late] == [NOON_S + k for k in range(6, 12)]
+    assert all(a.time_s < b.time_s for a, b in pairwise(fixes))
+    assert (fixes[0].time_s == NOON_S) == (read_as == "GGA")
+    sigmas = {fix.sigma_enu[:2] for fix in late if isinstance(fix, Fix)}
+    assert sigmas == {{"GGA": (4.0, 4.0), "GNS": (4.5, 4.5)}.get(read_as, (10.0, 10.0))}
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ("GNGNS,120000.00,,,,,NN,00,,,,,", "no fix"),
+        ("GNRMC,120000.00,V,,,,,,,250625,,,N", "no fix"),
+        ("GNGLL,,,,,120000.00,V,N", "no fix"),
+        (f"GNGNS,120000.00,{PLACE},EE,10,0.9,20.50,40.25,,", "mode 'EE'"),
+        (f"GNRMC,120000.00,A,{PLACE},0.5,54.7,250625,,,S", "mode 'S'"),
+        (f"GNGLL,{PLACE},120000.00,A,M", "mode 'M'"),
+        (f"GNRMC,120000.00,A,{PLACE}", "expected 12 fields"),
+    ],
+)
+def test_other_positions_that_are_no_measured_fix(body: str, said: str) -> None:
+    """Not valid, estimated, simulated, typed in, cut off."""
+    kind = body[2:5]
+    decoder = NmeaDecoder(only=(kind,))
+    assert decoder.feed(sentence(body), arrival_s=NOON_S) == []
+    (text,) = decoder.take_refusals()
+    assert text.startswith(f"nmea: {kind}: ")
+    assert said in text
+
+
+@pytest.mark.parametrize(
+    ("body", "degrees"),
+    [
+        ("HEHDT,123.4,T", 123.4),
+        ("HETHS,5.0,A", 5.0),
+        ("PASHR,120000.00,359.9,T,0.1,0.2,0.0,0.1,0.1,0.2,1,1", 359.9),
+        ("HCHDG,10.0,2.0,W,3.0,E", 8.0),
+        ("HCHDG,10.0,,,3.0,E", 10.0),
+    ],
+)
+def test_headings(body: str, degrees: float) -> None:
+    """True, or magnetic with the deviation and without the variation, which is the vehicle's."""
+    name = "PASHR" if body.startswith("P") else body[2:5]
+    decoder = NmeaDecoder(only=(name,))
+    (reading,) = decoder.feed(sentence(body), arrival_s=NOON_S)
+    assert isinstance(reading, HeadingReading)
+    assert reading.heading == pytest.approx(math.radians(degrees))
+    assert reading.time_s == NOON_S
+    silent = {
+        "HDT": "HEHDT,,T",
+        "THS": "HETHS,5.0,V",
+        "PASHR": "PASHR,POS,1,2",
+        "HDG": "HCHDG,,,,,",
+    }
+    assert decoder.feed(sentence(silent[name]), arrival_s=NOON_S) == []
+    assert decoder.take_refusals() == []
+
+
+def test_one_heading_at_a_time() -> None:
+    """A true and a magnetic one of one instrument are not mixed, and our own is none."""
+    decoder = NmeaDecoder()
+    found = []
+    for k in range(10):
+        data = sentence("HCHDG,10.0,,,3.0,E") + sentence("HEHDT,13.0,T") + sentence("INHDT,99.0,T")
+        found += decoder.feed(data, arrival_s=NOON_S + k)
+    headings = [round(math.degrees(one.heading)) for one in found if hasattr(one, "heading")]
+    assert headings == [13] * 10
+    assert "expected a measured heading" in read("HETHS,5.0,E")[1][0]
+
+
+def ubx(payload: bytes) -> bytes:
+    """Return a binary frame of a u-blox receiver."""
+    body = b"\x01\x07" + len(payload).to_bytes(2, "little") + payload
+    first = second = 0
+    for byte in body:
+        first = (first + byte) & 255
+        second = (second + first) & 255
+    return b"\xb5\x62" + body + bytes((first, second))
+
+
+def test_binary_frames_between_cost_no_sentence() -> None:
+    """UBX and RTCM, with line ends, dollars and stars among their bytes; cut anywhere."""
+    rng = random.Random(3)
+    data = b""
+    for k in range(40):
+        noise = bytes(rng.choice((rng.randrange(256), 13, 10, 36, 42)) for _ in range(300))
+        rtcm = b"\xd3" + (90).to_bytes(2, "big") + rng.randbytes(93)
+        data += ubx(noise) + rtcm + b"\x00" * 5 + sentence(GGA.replace("120000", f"1200{k:02d}"))
+    decoder = NmeaDecoder()
+    fixes = []
+    for at in range(0, len(data), 37):
+        fixes += decoder.feed(data[at : at + 37], arrival_s=NOON_S + 20.0)
+    assert len(fixes) == 40
+
+
+def test_bytes_without_any_sentence_are_told_once() -> None:
+    """A wrong baud rate, or a port that speaks another protocol."""
+    decoder = NmeaDecoder()
+    decoder.feed(ubx(bytes(range(128, 256)) * 8) * 30, arrival_s=NOON_S)
+    (text,) = decoder.take_refusals()
+    assert "check the baud rate" in text
+    assert len(decoder.feed(b"\r\n" + sentence(GGA), arrival_s=NOON_S)) == 1
+
+
+@pytest.mark.parametrize("end", [b"\r", b"\n", b"\r\n", b"\n\r", b" \r\n"])
+def test_line_ends(end: bytes) -> None:
+    """CR alone as well."""
+    data = sentence(GGA).rstrip() + end
+    decoder = NmeaDecoder()
+    assert len(decoder.feed(data * 3, arrival_s=NOON_S)) == 3
+    assert decoder.n_refused == 0
+
+
+def test_tag_blocks() -> None:
+    """Before a sentence, of AIS too; one that is damaged costs no fix."""
+    tag = "s:GP0001,c:1750812360"
+    block = f"\\{tag}*{checksum(tag)}\\".encode()
+    decoder = NmeaDecoder()
+    data = block + sentence(GGA) + block + b"!AIVDM,1,1,,A,15,0*00\r\n" + b"$" + sentence(GGA)
+    assert len(decoder.feed(data, arrival_s=NOON_S)) == 2
+    assert decoder.n_refused == 0
+    assert len(decoder.feed(block.replace(b"c:1", b"c:2") + sentence(GGA), arrival_s=NOON_S)) == 1
+    assert "tag block checksum" in decoder.take_refusals()[0]
+
+
+def test_a_listener_that_reads_nothing_says_what_comes() -> None:
+    """After ten seconds, once, until something is read."""
+    decoder = NmeaDecoder()
+    for k in range(30):
+        data = sentence("GPVTG,,T,,M,0.0,N,0.0,K,A") + sentence("SDDPT,12.5,0.0")
+        assert decoder.feed(data, arrival_s=NOON_S + k) == []
+    (text,) = decoder.take_refusals()
+    assert "(VTG, DPT)" in text
+    assert "GGA, GNS, RMC, GLL" in text
+    assert len(decoder.feed(sentence("PIPS,0020.00,M"), arrival_s=NOON_S + 30.0)) == 1
+    decoder.feed(sentence("SDDPT,12.5,0.0"), arrival_s=NOON_S + 31.0)
+    assert decoder.take_refusals() == []

@@ -7,6 +7,7 @@ import csv
 import json
 import math
 import os
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import pytest
 
 from ssm_graph.live.protocols.decoder import Clock
 from ssm_graph.live.protocols.waterlinked import BeamRule, WaterLinkedDecoder
+from ssm_graph.sensors.compass import HeadingReading
 from ssm_graph.sensors.dvl import Ping
 
 DATA = Path(os.environ.get("SSM_GRAPH_DATA", Path(__file__).parents[2] / "../shared/data"))
@@ -233,3 +235,60 @@ def test_no_time_no_ping() -> None:
     decoder = WaterLinkedDecoder()
     assert decoder.feed(line(report()), arrival_s=math.nan) == []
     assert decoder.n_refused == 1
+
+
+def first_format(k: int, **changes: Any) -> dict[str, Any]:
+    """Return a report of format ``json_v1``, which has no type and no clock."""
+    fields = report(time=100.0 + k, format="json_v1", **changes)
+    del fields["type"], fields["time_of_validity"]
+    return fields
+
+
+def test_the_first_format_has_no_type() -> None:
+    """It is a velocity all the same; a later format without a type is damaged."""
+    pings, refused = read(*(first_format(k) for k in range(5)))
+    assert len(pings) == 5
+    assert not refused
+    assert pings[0].speed == pytest.approx((-0.2, -0.1, 0.0, 0.1))
+    assert "key 'type' is missing" in read(first_format(0) | {"format": "json_v3"})[1][0]
+
+
+def test_water_track_of_software_2_7() -> None:
+    """A type of its own; both tracks may have one time, and neither is the other's repeat."""
+    ground, water = report(), report(type="velocity_water", altitude=-1.0)
+    pings, refused = read(ground, water, water)
+    assert [ping.is_water for ping in pings] == [False, True]
+    assert not refused
+
+
+def test_yaw_of_its_dead_reckoning_is_a_directional_gyro() -> None:
+    """Where it is asked for, and its status is good."""
+    place = {"type": "position_local", "ts": ARRIVAL_S - 0.2, "x": 1.0, "yaw": -90.0, "status": 0}
+    decoder = WaterLinkedDecoder(heading=True)
+    bad = line({**place, "ts": ARRIVAL_S - 0.1, "status": 1})
+    (reading,) = decoder.feed(line(place) * 2 + bad, arrival_s=ARRIVAL_S)
+    assert isinstance(reading, HeadingReading)
+    assert (reading.time_s, reading.heading) == (ARRIVAL_S - 0.2, math.radians(-90.0))
+    assert decoder.n_repeats == 1
+    assert read(place) == ([], [])
+    decoder.feed(line({"type": "position_local", "yaw": 1e3}), arrival_s=ARRIVAL_S)
+    assert "yaw, deg" in decoder.take_refusals()[0]
+
+
+@needs_logs
+@pytest.mark.parametrize(
+    ("name", "n_pings", "n_repeats"),
+    [
+        ("out20210528.txt", 234, 16),
+        ("out20210528_straight+turn360.txt", 320, 22),
+        ("out_circle.txt", 31, 602),
+    ],
+)
+def test_recordings_of_the_first_format(name: str, n_pings: int, n_repeats: int) -> None:
+    """Read to the last report: as many as differ from the one before, and none refused."""
+    data = (LOGS / "mr_dvl" / name).read_bytes()
+    reports = data.splitlines()
+    assert sum(a != b for a, b in pairwise([b"", *reports])) == n_pings
+    decoder = WaterLinkedDecoder()
+    assert len(decoder.feed(data, arrival_s=ARRIVAL_S)) == n_pings
+    assert (decoder.n_repeats, decoder.n_refused) == (n_repeats, 0)

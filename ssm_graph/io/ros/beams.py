@@ -7,6 +7,7 @@ Linked A50 with its 22.5 degrees counted from the horizontal, and others leave t
 
 from __future__ import annotations
 
+from itertools import combinations
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -57,12 +58,15 @@ def known_beams(beams_d: Array, *, speed: Array, velocity_d: Array) -> Beams:
 
     ``speed`` is (N, B), ``velocity_d`` (N, 3), both NaN where unknown.  Directions that do not fit
     are kept and noted, for the instrument may give its velocity in other axes.
+
+    Raises :class:`DataError`: the speeds are packed to the front, or have no sign.
     """
     choices = [Beams(beams_d, 1.0, ()), Beams(beams_d, -1.0, (_AGAINST,))]
     found = _best(choices, speed, velocity_d)
     if found is None:
         return Beams(beams_d, 1.0, (_UNCHECKED,))
     best, misfit = found
+    _refuse_slips(best, speed, velocity_d)
     if misfit <= _LARGEST_MISFIT:
         return best
     text = (
@@ -78,7 +82,8 @@ def proven_beams(
 ) -> Beams:
     """Return directions and sign from the messages alone.
 
-    Raises :class:`DataError`: there are no directions, or they contradict the velocity.
+    Raises :class:`DataError`: there are no directions, or they contradict the velocity, or the
+    speeds are packed to the front, or have no sign.
 
     Parameters
     ----------
@@ -106,6 +111,7 @@ def proven_beams(
     if found is None:
         return Beams(stated, 1.0, (_UNCHECKED,))
     best, misfit = found
+    _refuse_slips(best, speed, velocity_d)
     if misfit > _LARGEST_MISFIT:
         raise DataError(
             "the beam directions do not reproduce the velocity that the DVL published: expected a "
@@ -180,6 +186,59 @@ def _best(choices: list[Beams], speed: Array, velocity_d: Array) -> tuple[Beams,
     if misfits[best] > 0.5 * misfits[0]:  # as good as: what is stated needs no change
         best = 0
     return choices[best], misfits[best]
+
+
+def _refuse_slips(beams: Beams, speed: Array, velocity_d: Array) -> None:
+    """Raise :class:`DataError` for two slips of drivers that the velocity shows.
+
+    Speeds without a sign: none is below zero, and they are the sizes of what the velocity says.
+    Beams packed to the front: with beams missing, those that are left stand first.
+    """
+    predicted = velocity_d @ beams.beams_d.T
+    known = np.isfinite(velocity_d).all(axis=1) & np.any(velocity_d != 0.0, axis=1)
+    signed = beams.sign * speed
+    is_unsigned = not np.any(speed < 0.0) and _is_off(signed, predicted, known)
+    if is_unsigned and not _is_off(np.abs(speed), np.abs(predicted), known):
+        raise DataError(
+            "the beam speeds have no sign: not one is below 0, and they are the sizes of what the "
+            "published velocity says; expected positive along the beam and negative against it: "
+            "mend the driver"
+        )
+    heard = np.isfinite(speed)
+    count = heard.sum(axis=1)
+    is_packed = ~np.any(~heard[:, :-1] & heard[:, 1:], axis=1)
+    at_front = known & is_packed & (count >= _FEWEST_BEAMS) & (count < speed.shape[1])
+    if not _is_off(signed, predicted, at_front):
+        return
+    spread = np.array([_spread(*row) for row in zip(signed, predicted, count, strict=True)])
+    if not _is_off(spread, predicted, at_front):
+        raise DataError(
+            f"in {int(at_front.sum())} pings with missing beams the speeds are packed to the "
+            "front: the published velocity shows that they belong to other beams; expected each "
+            "speed in the place of its beam: mend the driver"
+        )
+
+
+def _is_off(speed: Array, predicted: Array, used: Array) -> bool:
+    """Return whether speeds (N, B) of enough of the pings used (N,) do not fit the velocity."""
+    used = used & (np.isfinite(speed).sum(axis=1) > 0)
+    if used.sum() < _FEWEST_PINGS:
+        return False
+    size = float(np.median(_rms(np.where(np.isnan(speed), np.nan, predicted)[used])))
+    misfit = float(np.median(_rms((speed - predicted)[used])))
+    return size >= _SLOWEST and misfit > _LARGEST_MISFIT * size
+
+
+def _spread(speed: Array, predicted: Array, count: int) -> Array:
+    """Return speeds that stand first, put in the places, in order, where they fit best."""
+    best, least = speed, np.inf
+    for places in combinations(range(len(speed)), int(count)):
+        placed = np.full(len(speed), np.nan)
+        placed[list(places)] = speed[:count]
+        misfit = float(np.nansum((placed - predicted) ** 2))
+        if misfit < least:
+            best, least = placed, misfit
+    return best
 
 
 def _rms(values: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Import of ROS 2 bags as missions.
+"""Import of ROS bags as missions.
 
 Times are those of the message headers, receipt where a header has none.  What messages do not say
 comes from a vehicle, or is assumed and said in the mission's notes.
@@ -6,9 +6,8 @@ comes from a vehicle, or is assumed and said in the mission's notes.
 
 from __future__ import annotations
 
-from array import array
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -17,19 +16,17 @@ import numpy as np
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.io.mission_folder.assembly import mission_from
-from ssm_graph.io.ros.beams import Beams, known_beams, proven_beams, stated_beams
-from ssm_graph.io.ros.log import REQUIRED_ROLES, BagMessage, read_rosbag
+from ssm_graph.io.ros.beams import Beams, known_beams, proven_beams
+from ssm_graph.io.ros.clocks import ahead_of_recording, check_never_set, check_one_clock
+from ssm_graph.io.ros.frames import seats
+from ssm_graph.io.ros.log import Topics
 from ssm_graph.io.ros.messages import (
-    WATER_LINKED_TYPE,
+    TWIST_TYPE,
+    WATER_LINKED_TYPES,
     BeamSign,
     RosOptions,
-    depth_reading,
-    depth_sigma,
-    dvl_report,
-    fix,
-    has_stated_sigma,
-    imu_sample,
 )
+from ssm_graph.io.ros.topics import BagTopic, in_order, read_topics
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.vehicle import GNSS_AT_ORIGIN, Vehicle
 from ssm_graph.sensors.depth import DEEPEST_M, DEPTH, DepthLog
@@ -51,8 +48,6 @@ BEAM_SIGMA: Final = 0.02
 DEPTH_SIGMA: Final = 0.1
 """m"""
 
-WATER_LATER_S: Final = 1e-3
-"""A ping off the water that has the time of one off the ground is put so much later."""
 _ABOVE_WATER_M: Final = 2.0
 
 
@@ -60,10 +55,10 @@ def convert_rosbag(
     bag: Path,
     *,
     vehicle: Vehicle | None = None,
-    topics: Mapping[str, str] | None = None,
+    topics: Topics | None = None,
     options: RosOptions | None = None,
 ) -> Mission:
-    """Read a rosbag2 recording into a mission without reference.
+    """Read a recording of ROS 2 or ROS 1 into a mission without reference.
 
     Times stay Unix seconds, body axes are forward-right-down. Everything assumed, dropped or
     sorted is in the mission's notes.
@@ -74,18 +69,21 @@ def convert_rosbag(
 
     Parameters
     ----------
-    bag : folder with ``metadata.yaml``, or a single ``.mcap`` or ``.db3`` file.
+    bag : folder of ``.mcap`` or ``.db3`` files, one of them, or a ``.bag`` of ROS 1.
     vehicle : noise, lever arms and mounting; its beam directions go before those of the messages.
-    topics : by role (``imu``, ``dvl``, ``depth``, ``gnss``), where several could serve it.
+    topics : by role (``imu``, ``dvl``, ``depth``, ``gnss``), where several could serve it; two of
+        the DVL where its pings off the water have a topic of their own.
     options : axes of the IMU, water, atmosphere; None for the defaults.
     """
     bag, options = Path(bag), RosOptions() if options is None else options
     if vehicle is not None:
         options = replace(options, n_beams=vehicle.mount.n_beams)
-    read = _read_topics(bag, topics or {}, options)
-    tables, notes = {}, []
+    tables, notes = {}, list[str]()
+    read, frames = read_topics(bag, topics or {}, options, notes)
+    read, some = _one_clock(bag, read, vehicle, options)
+    notes += some
     for role, topic in read.items():
-        tables[role], some = _in_order(topic, options.n_beams)
+        tables[role], some = in_order(topic, options.n_beams)
         notes += some
     imu = _imu(bag, tables["imu"], vehicle, options)
     notes += _imu_notes(imu, read["imu"], vehicle)
@@ -93,7 +91,17 @@ def convert_rosbag(
     notes += some
     gnss, some = _gnss(tables.get("gnss"), read, vehicle, options)
     notes += some
-    depth, some = _depth(bag, tables.get("depth"), gnss, vehicle, options)
+    arm_b = np.zeros(3)
+    if vehicle is None:
+        placed, some = seats(frames, {r: topic.frame_id for r, topic in read.items()}, options.body)
+        notes += some
+        if "dvl" in placed:
+            R_bd, dvl_arm_b = placed["dvl"]
+            dvl = replace(dvl, mount=replace(dvl.mount, R_bd=R_bd, lever_arm_b=dvl_arm_b))
+        if gnss is not None and "gnss" in placed:
+            gnss = replace(gnss, lever_arm_b=placed["gnss"].place)
+        arm_b = placed["depth"].place if "depth" in placed else arm_b
+    depth, some = _depth(bag, tables.get("depth"), gnss, vehicle, arm_b, options)
     return mission_from(
         [log for log in (imu, dvl, depth, gnss) if log is not None],
         vehicle,
@@ -101,6 +109,28 @@ def convert_rosbag(
         labels={role: f"{bag}: {topic.name}" for role, topic in read.items()},
         notes=[*notes, *some],
     )
+
+
+def _one_clock(
+    bag: Path, read: Mapping[str, BagTopic], vehicle: Vehicle | None, options: RosOptions
+) -> tuple[dict[str, BagTopic], list[str]]:
+    """Return the topics with stamps of one clock, by their times of recording, and the notes."""
+    ahead = {}
+    for role, topic in read.items():
+        if len(topic.rows):
+            stamp_s, received_s = topic.table(options.n_beams)[:, 0], np.array(topic.received)
+            check_never_set(f"{bag}: {topic.name}", stamp_s, received_s)
+            ahead[role] = (topic.name, ahead_of_recording(stamp_s, received_s))
+    late = {}
+    if vehicle is not None:
+        late = {
+            "dvl": vehicle.mount.time_offset_s,
+            "gnss": vehicle.gnss.calibration.time_offset_s,
+        }
+    take_off, notes = check_one_clock(bag, ahead, late)
+    return {
+        role: replace(topic, take_off_s=take_off.get(role, 0.0)) for role, topic in read.items()
+    }, notes
 
 
 def _imu(bag: Path, table: Array, vehicle: Vehicle | None, options: RosOptions) -> ImuLog:
@@ -131,8 +161,8 @@ def _imu_notes(imu: ImuLog, topic: BagTopic, vehicle: Vehicle | None) -> list[st
     if vehicle is None:
         notes.append(
             "No --vehicle: the IMU is taken for a consumer MEMS unit (100 deg/h, 0.4 deg/sqrt(h), "
-            "5 mg), and DVL, depth sensor and antenna as sitting at the IMU, the DVL's forward "
-            "mark ahead."
+            "5 mg), and DVL, depth sensor and antenna, where /tf_static says nothing else, as "
+            "sitting at the IMU, the DVL's forward mark ahead."
         )
     return notes
 
@@ -145,8 +175,11 @@ def _dvl(
     _, speed, sigma, ranges, velocity_d, covariance, water = np.split(table, edges, axis=1)
     water_track = water[:, 0] if water.any() else None
     if not np.isfinite(speed).any():
-        if vehicle is not None and _has_axes(vehicle.mount) and np.isfinite(velocity_d).any():
-            return _velocities(table[:, 0], velocity_d, covariance, vehicle, water_track)
+        is_alone = topic.type_name == TWIST_TYPE and vehicle is None
+        mount = DvlMount(np.eye(3), np.eye(3), np.zeros(3)) if vehicle is None else vehicle.mount
+        if (is_alone or (vehicle and _has_axes(mount))) and np.isfinite(velocity_d).any():
+            sigma_m = BEAM_SIGMA if vehicle is None else vehicle.beam_sigma
+            return _velocities(table[:, 0], velocity_d, covariance, mount, sigma_m, water_track)
         raise DataError(
             f"{bag}: topic {topic.name} holds {len(table)} messages and not one beam speed; "
             "expected the speeds of the beams, not only the velocity made of them (for "
@@ -189,18 +222,23 @@ def _has_axes(mount: DvlMount) -> bool:
 
 
 def _velocities(
-    time_s: Array, velocity_d: Array, covariance: Array, vehicle: Vehicle, water_track: Array | None
+    time_s: Array,
+    velocity_d: Array,
+    covariance: Array,
+    mount: DvlMount,
+    nominal: float,
+    water_track: Array | None,
 ) -> tuple[DvlLog, list[str]]:
     """Return velocities (N, 3) as speeds along the instrument's axes, and how they are counted."""
-    turn = vehicle.mount.beams_d
+    turn = mount.beams_d
     matrix = turn @ covariance.reshape(-1, 3, 3) @ turn.T
     is_stated = np.asarray(np.isfinite(matrix).all(axis=(1, 2)))
     is_stated[is_stated] = np.linalg.eigvalsh(matrix[is_stated])[:, 0] > 0.0
     matrix = np.where(is_stated[:, None, None], matrix, np.nan)
-    sigma = np.full(velocity_d.shape, vehicle.beam_sigma)
+    sigma = np.full(velocity_d.shape, nominal)
     sigma[is_stated] = np.sqrt(np.diagonal(matrix[is_stated], axis1=1, axis2=2))
     log = DvlLog(
-        mount=vehicle.mount,
+        mount=mount,
         time_s=time_s,
         speed=velocity_d @ turn.T,
         sigma=sigma,
@@ -218,7 +256,7 @@ def _beams(topic: BagTopic, vehicle: Vehicle | None, options: RosOptions, **data
         return known_beams(vehicle.mount.beams_d, **data)
     return proven_beams(
         topic.beams_d,
-        water_linked=topic.type_name == WATER_LINKED_TYPE,
+        water_linked=topic.type_name in WATER_LINKED_TYPES,
         may_turn=options.beam_sign is BeamSign.ALONG,
         **data,
     )
@@ -248,6 +286,7 @@ def _depth(
     table: Array | None,
     gnss: GnssLog | None,
     vehicle: Vehicle | None,
+    arm_b: Array,
     options: RosOptions,
 ) -> tuple[DepthLog | None, list[str]]:
     if table is None or len(table) == 0:
@@ -256,13 +295,13 @@ def _depth(
     if not -_ABOVE_WATER_M < typical < DEEPEST_M:
         raise DataError(
             f"{bag}: the pressures are those of {typical:.1f} m depth; expected absolute pressure "
-            f"in pascal; for a sensor that reads 0 at the surface try  --atmosphere 0"
+            f"in pascal; {_other_pressures(typical, options)}"
         )
     stated = table[np.isfinite(table[:, 2]), 2]
     sigma = float(np.median(stated)) if len(stated) else DEPTH_SIGMA
     known = None if vehicle is None else vehicle.depth
     if known is None:
-        known = DepthLog(sigma=sigma, lever_arm_b=np.zeros(3), **DEPTH.empty())
+        known = DepthLog(sigma=sigma, lever_arm_b=arm_b, **DEPTH.empty())
     log = replace(known, time_s=table[:, 0], depth=table[:, 1])
     notes = [
         f"Depth is pressure above {options.atmosphere:.0f} Pa in water of "
@@ -272,6 +311,22 @@ def _depth(
         return log, notes
     surface, note = _surface(log, gnss)
     return replace(log, depth=log.depth - surface), [*notes, note]
+
+
+def _other_pressures(depth: float, options: RosOptions) -> str:
+    """Return what the pressures of a depth that cannot be may be."""
+    value = depth * options.weight_density + options.atmosphere
+    meant = []
+    for unit, pascal in (("hPa or mbar", 1e2), ("kPa", 1e3), ("dbar", 1e4), ("bar", 1e5)):
+        below = (value * pascal - options.atmosphere) / options.weight_density
+        if -_ABOVE_WATER_M < below < DEEPEST_M:
+            meant.append(f"{below:.1f} m in {unit}")
+    gauge = value / options.weight_density
+    if -_ABOVE_WATER_M < gauge < DEEPEST_M:
+        meant.append(
+            f"{gauge:.1f} m if the sensor reads 0 at the surface (then give  --atmosphere 0)"
+        )
+    return f"they would be {', '.join(meant)}: mend the driver's unit" if meant else "see its unit"
 
 
 def _surface(depth: DepthLog, gnss: GnssLog | None) -> tuple[float, str]:
@@ -290,100 +345,3 @@ def _surface(depth: DepthLog, gnss: GnssLog | None) -> tuple[float, str]:
     return 0.0, (
         "No fix shows the height of the water's surface: it is taken as 0 m above the ellipsoid."
     )
-
-
-@dataclass(slots=True)
-class BagTopic:
-    """What one topic held: the rows of its messages, and what went wrong."""
-
-    role: str
-    name: str = ""
-    type_name: str = ""
-    rows: array[float] = field(default_factory=lambda: array("d"))
-    """IMU: time, gyro, accelerometer; DVL: time, speeds, sigmas, ranges, velocity and covariance, 1
-    off the water; depth: time, depth, sigma; GNSS: time, latitude, longitude, height, sigmas. SI
-    units, FRD, NaN if unknown."""
-    n_messages: int = 0
-    refused: list[str] = field(default_factory=list)
-    beams_d: Array | None = None
-    """(B, 3) directions of the beams as the messages state them."""
-    n_unstated: int = 0
-    """Fixes that do not say how good they are."""
-
-
-def _width(role: str, n_beams: int) -> int:
-    """Return how many numbers a row has."""
-    return {"imu": 7, "dvl": 1 + 3 * n_beams + 13, "depth": 3, "gnss": 7}[role]
-
-
-def _read_topics(bag: Path, topics: Mapping[str, str], options: RosOptions) -> dict[str, BagTopic]:
-    """Return by role what the recording holds; raises as `convert_rosbag`."""
-    read = {role: BagTopic(role) for role in REQUIRED_ROLES}
-    for item in read_rosbag(bag, topics):
-        topic = read.setdefault(item.role, BagTopic(item.role))
-        topic.name, topic.type_name = item.topic, item.type_name
-        topic.n_messages += 1
-        try:
-            topic.rows.extend(_row(item, topic, options))
-        except DataError as error:
-            topic.refused.append(str(error))
-    for role in REQUIRED_ROLES:
-        topic = read[role]
-        if len(topic.rows) < 2 * _width(role, options.n_beams):
-            raise DataError(
-                f"{bag}: expected at least two messages for the {role}, got {topic.n_messages}"
-                + (f", {len(topic.refused)} refused: {topic.refused[0]}" if topic.refused else "")
-            )
-    return read
-
-
-def _row(item: BagMessage, topic: BagTopic, options: RosOptions) -> Sequence[float]:
-    """Return the numbers of one message, time first."""
-    if item.role == "imu":
-        sample = imu_sample(item.message, item.received_s, options)
-        return (sample.time_s, *sample.gyro_b, *sample.accel_b)
-    if item.role == "dvl":
-        report = dvl_report(item.message, item.received_s, options)
-        if topic.beams_d is None and report.beams_d is not None:
-            topic.beams_d = stated_beams(np.array(report.beams_d))
-        sigma = report.ping.sigma or (np.nan,) * options.n_beams
-        beams = (*report.ping.speed, *sigma, *report.range_m)
-        velocity = (*report.velocity_d, *report.covariance_d)
-        return (report.ping.time_s, *beams, *velocity, float(report.ping.is_water))
-    if item.role == "depth":
-        reading = depth_reading(item.message, item.received_s, options)
-        return (reading.time_s, reading.depth, depth_sigma(item.message, options))
-    position = fix(item.message, item.received_s, options)
-    topic.n_unstated += not has_stated_sigma(item.message)
-    return (position.time_s, position.lat, position.lon, position.height, *position.sigma_enu)
-
-
-def _part_tracks(table: Array) -> list[str]:
-    """Put pings off the water apart from those off the ground, where both have one time."""
-    is_water = table[:, -1] > 0.0
-    together = is_water & np.isin(table[:, 0], table[~is_water, 0])
-    table[together, 0] += WATER_LATER_S
-    n_together = int(together.sum())
-    return [f"{n_together} off the water put 1 ms behind those off the ground"] * (n_together > 0)
-
-
-def _in_order(topic: BagTopic, n_beams: int) -> tuple[Array, list[str]]:
-    """Return the rows with strictly increasing times, and what that took."""
-    table = np.array(topic.rows, dtype=float).reshape(-1, _width(topic.role, n_beams))
-    said = _part_tracks(table) if topic.role == "dvl" else []
-    n_late = int(np.sum(np.diff(table[:, 0], prepend=-np.inf) < 0.0))
-    table = table[np.argsort(table[:, 0], kind="stable")]
-    again = np.diff(table[:, 0], prepend=-np.inf) == 0.0
-    before = np.roll(table, 1, axis=0)
-    alike = np.all((table == before) | (np.isnan(table) & np.isnan(before)), axis=1)
-    n_repeats, n_rivals = int(np.sum(again & alike)), int(np.sum(again & ~alike))
-    if topic.refused:
-        said.append(f"{len(topic.refused)} refused ({topic.refused[0]})")
-    if n_late:
-        said.append(f"{n_late} out of order, sorted by time")
-    if n_repeats:
-        said.append(f"{n_repeats} exact repeats dropped")
-    if n_rivals:
-        said.append(f"{n_rivals} dropped that differ from another of the same time")
-    head = f"{topic.name}: of {topic.n_messages} messages "
-    return table[~again], [f"{head}{'; '.join(said)}."] if said else []

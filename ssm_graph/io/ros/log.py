@@ -1,12 +1,15 @@
-"""Reading of rosbag2 recordings without ROS: which topics there are, and their messages one by one.
+"""Reading of recordings of ROS without ROS: which topics there are, and their messages one by one.
 
-A recording is the folder with ``metadata.yaml``, or one of its ``.mcap`` or ``.db3`` files alone.
+A recording is the folder of ``.mcap`` or ``.db3`` files, with its ``metadata.yaml`` or, where the
+recorder was killed, without; one of these files alone; or a ``.bag`` of ROS 1.
 Bags of ROS 2 Humble and before carry no message definitions in ``.db3`` files; those of the DVL
 packages are therefore kept here, in every layout they have had.
 """
 
 from __future__ import annotations
 
+import contextlib
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from importlib import import_module
@@ -21,11 +24,17 @@ from ssm_graph.base.errors import (
     nearest_hint,
 )
 from ssm_graph.io.ros import messages as ros_messages
+from ssm_graph.io.ros.frames import TF_TOPIC, TF_TYPE
+from ssm_graph.io.ros.mcap import McapFile, is_ros2_mcap, zstd_decompress
 from ssm_graph.sensors.dvl import MOST_BEAMS
 
 ROLES: Final[Mapping[str, tuple[str, ...]]] = {
     "imu": (ros_messages.IMU_TYPE,),
-    "dvl": (ros_messages.MARINE_DVL_TYPE, ros_messages.WATER_LINKED_TYPE),
+    "dvl": (
+        ros_messages.MARINE_DVL_TYPE,
+        *ros_messages.WATER_LINKED_TYPES,
+        ros_messages.TWIST_TYPE,
+    ),
     "depth": (ros_messages.PRESSURE_TYPE,),
     "gnss": (ros_messages.FIX_TYPE,),
 }
@@ -88,8 +97,12 @@ LAYOUTS: Final[Mapping[str, tuple[str, ...]]] = {
 }
 """Definitions of the types that ROS itself does not have, newest first."""
 
-_MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
-_MCAP_PROFILE_AT: Final = len(_MCAP_MAGIC) + 1 + 8
+_ROS1_MAGIC: Final = b"#ROSBAG V2.0"
+_REINDEX: Final = "ros2 bag reindex"
+_ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
+_NAMED_FILE = re.compile(r"^\s*-\s+[\"']?(?:\S*/)?([^/\s\"']+\.mcap)[\"']?\s*$", re.MULTILINE)
+"""A file in the list of ``metadata.yaml``."""
+Topics = Mapping[str, str | Sequence[str]]
 
 Decoder = Callable[[bytes], Any]
 
@@ -98,6 +111,7 @@ class BagMessage(NamedTuple):
     """One message of a chosen topic."""
 
     role: str
+    """One of :data:`ROLES`, or ``tf_static``."""
     topic: str
     type_name: str
     received_s: float
@@ -106,62 +120,149 @@ class BagMessage(NamedTuple):
 
 
 def is_rosbag(path: Path) -> bool:
-    """Return whether this is a rosbag2 folder, a ``.db3`` file, or MCAP written by ROS 2."""
+    """Return whether this is a recording of ROS: a folder of its files, or one of them."""
     if path.is_dir():
-        return (path / "metadata.yaml").is_file()
-    if path.suffix != ".mcap" or not path.is_file():
-        return path.suffix == ".db3"
-    with path.open("rb") as stream:
-        head = stream.read(_MCAP_PROFILE_AT + 8)
-    return head.startswith(_MCAP_MAGIC) and head[_MCAP_PROFILE_AT:] == b"\x04\0\0\0ros2"
+        return (path / "metadata.yaml").is_file() or bool(
+            _files(path, "mcap") + _files(path, "db3")
+        )
+    if path.suffix == ".mcap" and path.is_file():
+        return is_ros2_mcap(path)
+    return path.suffix == ".db3" or _is_ros1(path)
 
 
-def read_rosbag(bag: Path, topics: Mapping[str, str]) -> Iterator[BagMessage]:
+def _is_ros1(path: Path) -> bool:
+    try:
+        with path.open("rb") as stream:
+            return stream.read(len(_ROS1_MAGIC)) == _ROS1_MAGIC
+    except OSError:
+        return False
+
+
+def _files(folder: Path, suffix: str) -> list[Path]:
+    """Return the files of a recording in their order: ``run_2`` before ``run_10``."""
+
+    def number(path: Path) -> tuple[int, str]:
+        found = re.search(r"_(\d+)\Z", path.stem)
+        return (int(found[1]) if found else -1, path.name)
+
+    return sorted(folder.glob(f"*.{suffix}"), key=number)
+
+
+def read_rosbag(bag: Path, topics: Topics, notes: list[str] | None = None) -> Iterator[BagMessage]:
     """Yield the messages of the chosen topics in the order of their recording.
 
     Raises :class:`MissingExtraError`: ``rosbags`` is not installed. Raises :class:`ConfigError`: A
     role or topic is unknown, or more than one topic could serve a role. Raises :class:`DataError`:
     the recording is damaged, has no topic for IMU or DVL, or messages of another layout.
 
-    ``topics`` names by role those that more than one topic could serve.
+    Parameters
+    ----------
+    bag : the recording.
+    topics : by role, those that more than one topic could serve; of the DVL also two, one off the
+        ground and one off the water.
+    notes : takes what is to be known of the recording.
     """
-    try:
-        reader_class = import_module("rosbags.rosbag2").Reader
-    except ImportError as error:
-        raise MissingExtraError("rosbags", extra="ros", purpose="reading ROS 2 bags") from error
     for role in topics:
         if role not in ROLES:
             raise ConfigError(f"--topic {role}: unknown sensor; {nearest_hint(role, ROLES)}")
+    notes = [] if notes is None else notes
     try:
-        with reader_class(bag) as reader:
-            yield from _messages(bag, reader, _choose(bag, reader.connections, topics))
+        with contextlib.ExitStack() as stack:
+            readers = [stack.enter_context(reader) for reader in _readers(bag, notes)]
+            connections = _merged(readers)
+            broken = [x.cut_off for x in readers if isinstance(x, McapFile) and x.cut_off]
+            if broken and not connections:
+                raise DataError(
+                    f"{bag}: no whole chunk of messages is left ({broken[0]}); try  mcap recover"
+                )
+            chosen = _choose(bag, readers, connections, topics)
+            for reader in readers:
+                yield from _messages(bag, reader, chosen)
+            notes += [
+                f"{reader.path.name} was cut off: {reader.cut_off}; read up to there."
+                for reader in readers
+                if isinstance(reader, McapFile) and reader.cut_off
+            ]
     except (SsmGraphError, GeneratorExit):
         raise
     except OSError as error:
         raise DataError(f"{bag}: cannot be read: {error.strerror or error}") from error
     except Exception as error:  # of rosbags, apsw, yaml, lz4 or zstd: damage raises many kinds
+        kind, remedy = "ROS 2", "sqlite3 FILE .recover" if bag.suffix == ".db3" else _REINDEX
+        if _is_ros1(bag):
+            kind, remedy = "ROS 1", "rosbag reindex  and  rosbag fix"
         raise DataError(
-            f"{bag}: not a complete ROS 2 recording ({type(error).__name__}: {error}); if it was "
-            "cut off, try  ros2 bag reindex  for a folder,  mcap recover  for a single file"
+            f"{bag}: not a complete recording of {kind} ({type(error).__name__}: {error}); if it "
+            f"was cut off, try  {remedy}"
         ) from error
 
 
+def _readers(bag: Path, notes: list[str]) -> list[Any]:
+    """Return what reads each of the files of a recording."""
+    try:
+        rosbag1, rosbag2 = (import_module(f"rosbags.rosbag{n}") for n in (1, 2))
+    except ImportError as error:
+        raise MissingExtraError("rosbags", extra="ros", purpose="reading ROS bags") from error
+    if not bag.is_dir():
+        if bag.suffix == ".mcap":
+            return [McapFile(bag)]
+        return [(rosbag1 if _is_ros1(bag) else rosbag2).Reader(bag)]
+    metadata = bag / "metadata.yaml"
+    files = _files(bag, "mcap")
+    if files:
+        text = metadata.read_text(errors="replace") if metadata.is_file() else ""
+        missing = sorted(set(_NAMED_FILE.findall(text)) - {path.name for path in files})
+        if missing:
+            raise DataError(f"{bag}: {', '.join(missing)} is missing, which metadata.yaml names")
+    if not metadata.is_file():
+        files = files or _files(bag, "db3")
+        notes.append(
+            f"{bag.name} has no metadata.yaml (was the recorder killed?): "
+            f"{', '.join(path.name for path in files)} read in this order."
+        )
+        if files[0].suffix == ".db3":
+            return [rosbag2.Reader(path) for path in files]
+    return [McapFile(path) for path in files] if files else [rosbag2.Reader(bag)]
+
+
+def _merged(readers: Sequence[Any]) -> list[Any]:
+    """Return the topics of all files, each with all of its messages counted."""
+    found: dict[tuple[str, str], Any] = {}
+    for reader in readers:
+        for one in reader.connections:
+            key = one.topic, one.msgtype
+            before = found.get(key)
+            count = one.msgcount + (before.msgcount if before else 0)
+            found[key] = (before or one)._replace(msgcount=count)
+    return list(found.values())
+
+
 def _choose(
-    bag: Path, connections: Sequence[Any], topics: Mapping[str, str]
+    bag: Path, readers: Sequence[Any], connections: Sequence[Any], topics: Topics
 ) -> dict[str, list[Any]]:
-    """Return by role the connections to read, all of one topic."""
+    """Return by role the connections to read, all of one topic; two tracks of a DVL of two."""
     chosen = {}
     for role, types in ROLES.items():
         fitting = [connection for connection in connections if connection.msgtype in types]
-        if role in topics:
-            fitting = _named(bag, role, topics[role], fitting, connections)
+        names = topics.get(role, ())
+        names = (names,) if isinstance(names, str) else tuple(names)
+        if names:
+            fitting = [x for name in names for x in _named(bag, role, name, fitting, connections)]
         elif any(connection.msgcount for connection in fitting):
             fitting = [connection for connection in fitting if connection.msgcount]
-        names = sorted({connection.topic for connection in fitting})
-        if len(names) > 1:
+            with_beams = [x for x in fitting if x.msgtype != ros_messages.TWIST_TYPE]
+            fitting = with_beams or fitting
+        found = sorted({connection.topic for connection in fitting})
+        is_open = len(found) > 1 and len(names) != len(found)
+        if len(names) > 1 and (role != "dvl" or len(found) > 2):
             raise ConfigError(
-                f"{bag}: {len(names)} topics could be the {role}: {', '.join(names)}; choose one "
-                f"with  --topic {role}={names[0]}"
+                f"--topic {role}: expected each sensor once, the DVL up to twice, off the ground "
+                f"and off the water; got {', '.join(names)}"
+            )
+        if is_open and not (role == "dvl" and _are_tracks(bag, readers, fitting)):
+            raise ConfigError(
+                f"{bag}: {len(found)} topics could be the {role}: {', '.join(found)}; choose one "
+                f"with  --topic {role}={found[0]}"
             )
         if fitting:
             chosen[role] = fitting
@@ -170,7 +271,19 @@ def _choose(
                 f"{bag}: no topic for the {role}; expected one of type {' or '.join(types)}; found "
                 + (", ".join(sorted(f"{x.topic} ({x.msgtype})" for x in connections)) or "none")
             )
-    return chosen
+    transforms = [x for x in connections if x.msgtype == TF_TYPE and x.topic.endswith(TF_TOPIC)]
+    return chosen | ({TF_TOPIC: transforms} if transforms else {})
+
+
+def _are_tracks(bag: Path, readers: Sequence[Any], fitting: Sequence[Any]) -> bool:
+    """Return whether two topics are one DVL's, off the ground and off the water."""
+    if len(fitting) != 2 or any(x.msgtype != ros_messages.MARINE_DVL_TYPE for x in fitting):
+        return False
+    modes = set()
+    for one in fitting:
+        items = (item for reader in readers for item in _messages(bag, reader, {"dvl": [one]}))
+        modes.add(next((ros_messages.is_off_water(item.message) for item in items), None))
+    return modes == {False, True}
 
 
 def _named(
@@ -191,21 +304,25 @@ def _named(
 
 
 def _messages(bag: Path, reader: Any, chosen: Mapping[str, Sequence[Any]]) -> Iterator[BagMessage]:
-    roles = {connection.topic: role for role, some in chosen.items() for connection in some}
+    roles = {(x.topic, x.msgtype): role for role, some in chosen.items() for x in some}
     decoders: dict[str, Decoder] = {}
-    wanted = [connection for some in chosen.values() for connection in some]
+    wanted = [one for one in reader.connections if (one.topic, one.msgtype) in roles]
+    if not wanted:
+        return
     for connection, nanoseconds, raw in reader.messages(connections=wanted):
         topic, type_name = connection.topic, connection.msgtype
+        data = zstd_decompress(raw) if bytes(raw[:4]) == _ZSTD_MAGIC else raw
         if topic not in decoders:
-            decoders[topic] = _decoder(bag, connection, raw)
+            decoders[topic] = _decoder(bag, connection, data)
         try:
-            message = decoders[topic](raw)
+            message = decoders[topic](data)
         except Exception as error:  # of rosbags: damage and other layouts raise many kinds
             raise DataError(
                 f"{bag}: topic {topic} holds a message at {nanoseconds / 1e9:.3f} s that is no "
                 f"{type_name} ({type(error).__name__}: {error})"
             ) from error
-        yield BagMessage(roles[topic], topic, type_name, nanoseconds / 1e9, message)
+        role = roles[topic, type_name]
+        yield BagMessage(role, topic, type_name, nanoseconds / 1e9, message)
 
 
 def _decoder(bag: Path, connection: Any, raw: bytes) -> Decoder:
@@ -247,7 +364,9 @@ def _decoders(connection: Any) -> Iterator[Decoder]:
     for base, parsed in sources:
         store = types.get_typestore(base)
         store.register(parsed)
-        yield partial(store.deserialize_cdr, typename=type_name)
+        is_ros1 = hasattr(connection.ext, "callerid")
+        decode = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
+        yield partial(decode, typename=type_name)
 
 
 def _types_from_idl(text: str, types: Any) -> dict[str, Any]:

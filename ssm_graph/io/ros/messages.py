@@ -40,6 +40,9 @@ from ssm_graph.sensors.place import LATITUDES_DEG, LONGITUDES_DEG
 IMU_TYPE: Final = "sensor_msgs/msg/Imu"
 MARINE_DVL_TYPE: Final = "marine_acoustic_msgs/msg/Dvl"
 WATER_LINKED_TYPE: Final = "dvl_msgs/msg/DVL"
+WATER_LINKED_TYPES: Final = (WATER_LINKED_TYPE, "waterlinked_a50_ros_driver/msg/DVL")
+"""Of ROS 2 and of ROS 1, which have one layout."""
+TWIST_TYPE: Final = "geometry_msgs/msg/TwistWithCovarianceStamped"
 PRESSURE_TYPE: Final = "sensor_msgs/msg/FluidPressure"
 FIX_TYPE: Final = "sensor_msgs/msg/NavSatFix"
 
@@ -52,6 +55,8 @@ SEA_WATER: Final = 1025.0
 FIX_SIGMA: Final = (5.0, 5.0, 10.0)
 """m east, north, up, of a fix that does not say how good it is."""
 
+_LARGEST_NUMBER: Final = 1e9
+"""SI; whatever the unit, a larger number of an IMU is damage."""
 _NANOSECONDS: Final = 1_000_000_000
 _WATER_TRACK: Final = 2
 """``DVL_MODE_WATER`` of ``marine_acoustic_msgs``."""
@@ -133,14 +138,22 @@ def imu_sample(message: Any, received_s: float, options: RosOptions = DEFAULTS) 
 
 
 def dvl_report(message: Any, received_s: float, options: RosOptions = DEFAULTS) -> DvlReport:
-    """Return ``marine_acoustic_msgs/Dvl`` or ``dvl_msgs/DVL``, told apart by their fields.
+    """Return ``marine_acoustic_msgs/Dvl``, ``dvl_msgs/DVL`` or a twist, told apart by their fields.
 
-    Beams without bottom lock are NaN in the ping.
+    Beams without bottom lock are NaN in the ping, and all are in that of a twist: a velocity alone.
 
     Raises :class:`DataError`: the beams of the message are not numbered 0 to 3.
     """
-    report = _water_linked if hasattr(message, "beams") else _marine
+    if hasattr(message, "twist"):
+        report = _twist
+    else:
+        report = _water_linked if hasattr(message, "beams") else _marine
     return report(message, stamp_s(message, received_s), options)
+
+
+def is_off_water(message: Any) -> bool:
+    """Return whether a ``marine_acoustic_msgs/Dvl`` holds speeds through the water."""
+    return int(message.velocity_mode) == _WATER_TRACK
 
 
 def ping(message: Any, received_s: float, options: RosOptions = DEFAULTS) -> Ping:
@@ -216,7 +229,7 @@ def _marine(message: Any, time_s: float, options: RosOptions) -> DvlReport:
             time_s=time_s,
             speed=speed[:n_beams],
             sigma=None if all(math.isnan(value) for value in sigma) else sigma,
-            is_water=int(message.velocity_mode) == _WATER_TRACK,
+            is_water=is_off_water(message),
         ),
         range_m=tuple(
             _range(value) if message.beam_ranges_valid else math.nan for value in message.range
@@ -268,6 +281,23 @@ def _water_linked(message: Any, time_s: float, options: RosOptions) -> DvlReport
     )
 
 
+def _twist(message: Any, time_s: float, options: RosOptions) -> DvlReport:
+    """Return a velocity in the body's axes, turned to forward-right-down."""
+    missing = (math.nan,) * options.n_beams
+    velocity = _vector(message.twist.twist.linear)
+    matrix = [float(value) for value in message.twist.covariance]
+    linear = _covariance(matrix[6 * row + column] for row in range(3) for column in range(3))
+    columns = [turned((linear[k], linear[3 + k], linear[6 + k]), options.body) for k in range(3)]
+    rows = [turned((columns[0][k], columns[1][k], columns[2][k]), options.body) for k in range(3)]
+    return DvlReport(
+        ping=Ping(time_s, missing),
+        range_m=missing,
+        beams_d=None,
+        velocity_d=turned(velocity, options.body),
+        covariance_d=tuple(value for row in rows for value in row),
+    )
+
+
 def _fix_sigma(message: Any, instead: Vector) -> Vector:
     if int(message.position_covariance_type) == _COVARIANCE_UNKNOWN:
         return instead
@@ -281,8 +311,8 @@ def _fix_sigma(message: Any, instead: Vector) -> Vector:
 
 def _in_frd(message: Any, field: str, axes: BodyAxes) -> Vector:
     vector = _vector(getattr(message, field))
-    if not all(math.isfinite(value) for value in vector):
-        raise DataError(f"{type(message).__name__}: {field} is not finite: {vector}")
+    if not all(abs(value) < _LARGEST_NUMBER for value in vector):
+        raise DataError(f"{type(message).__name__}: {field} is not finite, or damaged: {vector}")
     return turned(vector, axes)
 
 

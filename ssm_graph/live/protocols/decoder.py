@@ -12,7 +12,7 @@ from enum import Enum
 from typing import Any, Final
 
 from ssm_graph.base.errors import nearest_hint
-from ssm_graph.live.protocols.framing import LineFramer, ObjectFramer
+from ssm_graph.live.protocols.framing import LineFramer, ObjectFramer, SentenceFramer
 from ssm_graph.sensors.messages import Message
 
 MAX_REFUSALS: Final = 20
@@ -96,7 +96,7 @@ class Stamper:
 class Decoder(ABC):
     """Texts that a framer cuts out of a stream to messages; the rest is refused."""
 
-    _framer: LineFramer | ObjectFramer
+    _framer: LineFramer | ObjectFramer | SentenceFramer
 
     def __init__(self, place: str) -> None:
         """``place`` is how refusals call the source."""

@@ -17,6 +17,10 @@ MAX_LENGTH: Final = 64 * 1024
 MAX_DEPTH: Final = 32
 _TOKEN = re.compile(rb'\\[^\n]|\n\{|["{}\n]')
 _BETWEEN = b"[], \t\r\n"
+_LINE_END = re.compile(rb"[\r\n]")
+_TOO_LONG: Final = (
+    "expected lines of at most {} bytes, got a longer one; is the port another instrument's?"
+)
 
 
 class LineFramer:
@@ -47,14 +51,57 @@ class LineFramer:
         if self._is_skipping:
             return
         if len(self._rest) + len(part) > self._max_length:
-            self._refuse(
-                f"expected lines of at most {self._max_length} bytes, got a longer one; "
-                "is the port another instrument's?"
-            )
+            self._refuse(_TOO_LONG.format(self._max_length))
             self._rest.clear()
             self._is_skipping = True
         else:
             self._rest += part
+
+
+class SentenceFramer:
+    """Lines that end in CR, LF or both, one character a byte, whatever the bytes are.
+
+    What is longer than ``max_length`` is cut before its last ``$``: binary frames may stand before
+    a sentence. Text that is longer is dropped, up to the next ``$``, and told to ``refuse``.
+    """
+
+    def __init__(self, refuse: Callable[[str], None], *, max_length: int) -> None:
+        self._refuse, self._max_length = refuse, max_length
+        self._rest, self._is_skipping = b"", False
+
+    @property
+    def n_held(self) -> int:
+        """Bytes of the unfinished line, at most ``max_length``."""
+        return len(self._rest)
+
+    def feed(self, data: bytes) -> list[str]:
+        """Return the lines that end in ``data``, without space around, not empty."""
+        *ended, rest = _LINE_END.split(self._rest + data)
+        texts: list[bytes] = []
+        for part in ended:
+            texts.append(self._cut(part, texts))
+            self._is_skipping = False
+        self._rest = self._cut(rest, texts)
+        return [text.decode("latin-1") for text in map(bytes.strip, texts) if text]
+
+    def _cut(self, line: bytes, texts: list[bytes]) -> bytes:
+        """Return what is left of a line, short enough; put what stands before among the texts."""
+        while self._is_skipping or len(line) > self._max_length:
+            head = line[: self._max_length]
+            begin = head.rfind(b"$")
+            if self._is_skipping or (begin <= 0 and head.isascii() and head.decode().isprintable()):
+                if not self._is_skipping:
+                    self._refuse(_TOO_LONG.format(self._max_length))
+                begin = line.find(b"$", 0 if self._is_skipping else 1)
+                self._is_skipping = begin < 0
+                line = line[begin:] if begin >= 0 else b""
+                if self._is_skipping:
+                    return b""
+            else:
+                end = begin if begin > 0 else self._max_length
+                texts.append(line[:end])
+                line = line[end:]
+        return line
 
 
 class ObjectFramer:

@@ -44,13 +44,17 @@ from ssm_graph.live.protocols.decoder import (
     shown,
 )
 from ssm_graph.live.protocols.framing import MAX_LENGTH, ObjectFramer
+from ssm_graph.sensors.compass import HeadingReading
 from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.dvl_readings import LARGEST_SPEED
 from ssm_graph.sensors.messages import Message
 
 PLACE: Final = "water linked"
-IGNORED: Final = frozenset({"position_local", "response"})
-"""Types of the protocol that say nothing of the beams."""
+_TRACKS: Final = {"velocity": False, "velocity_water": True}
+"""Types of reports with beams, and whether they are off the water, as software 2.7 has them."""
+_DEAD_RECKONING: Final = "position_local"
+_IGNORED: Final = frozenset({"response"})
+"""Types of the protocol that say nothing of the motion."""
 _NUMBERS: Final = ([0, 1, 2], [0, 1, 2, 3])
 """Of the transducers of an instrument."""
 
@@ -75,6 +79,8 @@ class WaterLinkedDecoder(Decoder):
         0.2 s later.
     max_clock_error_s : a stamp further from the arrival is not believed.
     beam_rule : which beams count.
+    heading : whether the yaw of its dead reckoning is read, as the heading of a directional gyro:
+        its own inertial unit seeks no north.
     max_length : of a report, bytes.
     """
 
@@ -84,42 +90,61 @@ class WaterLinkedDecoder(Decoder):
         clock: Clock = Clock.INSTRUMENT,
         max_clock_error_s: float = 5.0,
         beam_rule: BeamRule = BeamRule.BOTTOM,
+        heading: bool = False,
         max_length: int = MAX_LENGTH,
     ) -> None:
         super().__init__(PLACE)
         self.n_repeats = 0
         """How many reports came again and were dropped."""
         self._framer = ObjectFramer(self._refuse, max_length=max_length)
-        self._stamper = Stamper(
-            clock, max_clock_error_s=max_clock_error_s, refusals=self._refusals, place=PLACE
+        self._stamper, self._yaw_stamper = (
+            Stamper(clock, max_clock_error_s=max_clock_error_s, refusals=self._refusals, place=one)
+            for one in (PLACE, f"{PLACE} {_DEAD_RECKONING}")
         )
-        self._beam_rule = beam_rule
-        self._last: dict[str, Any] = {}
+        self._beam_rule, self._reads_heading = beam_rule, heading
+        self._last: dict[str, dict[str, Any]] = {}
 
     def _decode(self, text: str, arrival_s: float) -> list[Message]:
         report = parse_object(text)
-        kind = require(report, "type")
-        if kind != "velocity":
-            if isinstance(kind, str) and kind in IGNORED:
-                return []
+        is_first_format = "type" not in report and report.get("format") == "json_v1"
+        kind = "velocity" if is_first_format else require(report, "type")
+        if not isinstance(kind, str) or kind not in {*_TRACKS, _DEAD_RECKONING, *_IGNORED}:
             raise RefusedError(f"expected a report of type 'velocity', got {shown(kind)}")
+        if kind in _IGNORED or (kind == _DEAD_RECKONING and not self._reads_heading):
+            return []
+        message = (
+            self._ping(report, arrival_s, is_water=_TRACKS[kind])
+            if kind in _TRACKS
+            else self._heading(report, arrival_s)
+        )
+        if self._is_repeat(report, kind):
+            self.n_repeats += 1
+            return []
+        self._last[kind] = report
+        return [message] if message is not None else []
+
+    def _ping(self, report: dict[str, Any], arrival_s: float, *, is_water: bool) -> Ping:
         beams = _transducers(report)
         counts = self._counts(report, beams)
         speed = tuple(
             float(x["velocity"]) if counts and x["beam_valid"] else math.nan for x in beams
         )
-        centre_s = _time_of_validity(report)
-        if self._is_repeat(report):
-            self.n_repeats += 1
-            return []
-        ping = Ping(time_s=self._stamper.stamp(centre_s, arrival_s), speed=speed)
-        self._last = report
-        return [ping]
+        time_s = self._stamper.stamp(_time_of_validity(report), arrival_s)
+        return Ping(time_s, speed, is_water=is_water)
 
-    def _is_repeat(self, report: dict[str, Any]) -> bool:
-        stamp = report.get("time_of_validity", 0)
+    def _heading(self, report: dict[str, Any], arrival_s: float) -> HeadingReading | None:
+        """Return the yaw of a dead reckoning, degrees clockwise; None where its status is bad."""
+        yaw = number(require(report, "yaw"), key="yaw, deg", low=-360.0, high=360.0)
+        stamp_s = number(report["ts"], key="ts") if "ts" in report else None
+        if number(report.get("status", 0), key="status") != 0.0:
+            return None
+        time_s = self._yaw_stamper.stamp(stamp_s, arrival_s)
+        return HeadingReading(time_s, math.radians(yaw))
+
+    def _is_repeat(self, report: dict[str, Any], kind: str) -> bool:
+        last, stamp = self._last.get(kind, {}), report.get("time_of_validity", 0)
         is_set = stamp > 0  # a clock that was never set may stand still
-        return report == self._last or (is_set and stamp == self._last.get("time_of_validity"))
+        return report == last or (is_set and stamp == last.get("time_of_validity"))
 
     def _counts(self, report: dict[str, Any], beams: list[dict[str, Any]]) -> bool:
         """Return whether the valid beams of a report are to be believed."""

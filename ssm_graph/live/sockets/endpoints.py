@@ -24,6 +24,7 @@ _ACCEPT_PAUSE_S: Final = 1.0
 _ADDRESS = re.compile(
     r"(?P<scheme>[A-Za-z-]+)://(?P<host>\[[^\[\]]*\]|[^:/\[\]@]*):(?P<port>\d{1,5})/?", re.ASCII
 )
+_SERIAL = re.compile(r"serial://(?P<path>/[!-<>@-~]+)\?baud=(?P<baud>\d{1,7})", re.ASCII)
 _HOST_NAME = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9_.-]{0,252}[A-Za-z0-9_])?", re.ASCII)
 
 
@@ -33,6 +34,7 @@ class Transport(Enum):
     TCP_CLIENT = "tcp"
     TCP_SERVER = "tcp-listen"
     UDP = "udp"
+    SERIAL = "serial"
 
 
 INPUTS: Final = frozenset(Transport)
@@ -41,6 +43,7 @@ FORMS: Final = {
     Transport.TCP_CLIENT: "tcp://HOST:PORT",
     Transport.TCP_SERVER: "tcp-listen://[HOST]:PORT",
     Transport.UDP: "udp://[HOST]:PORT",
+    Transport.SERIAL: "serial:///dev/PORT?baud=BAUD",
 }
 """How an address is written; a host in square brackets may be left out, or is IPv6."""
 
@@ -51,10 +54,13 @@ class Endpoint:
 
     transport: Transport
     host: str
+    """Of a serial port, its path."""
     port: int
-    """0 lets the system choose one, where something is bound."""
+    """0 lets the system choose one, where something is bound. Of a serial port, its baud."""
 
     def __str__(self) -> str:
+        if self.transport is Transport.SERIAL:
+            return f"serial://{self.host}?baud={self.port}"
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{self.transport.value}://{host}:{self.port}"
 
@@ -75,11 +81,14 @@ def parse_endpoint(text: str, *, where: str, allowed: Collection[Transport] = IN
     ``where`` is the option it belongs to, ``allowed`` what may be used there.
     """
     wanted = " or ".join(FORMS[kind] for kind in Transport if kind in allowed)
+    serial = _SERIAL.fullmatch(text.strip())
+    if serial and Transport.SERIAL in allowed:
+        return Endpoint(Transport.SERIAL, serial["path"], int(serial["baud"]))
     found = _ADDRESS.fullmatch(text.strip())
     if not found:
         raise ConfigError(f"{where}: expected {wanted}, got {text!r}")
     scheme, port = found["scheme"].lower(), int(found["port"])
-    names = {kind.value: kind for kind in Transport if kind in allowed}
+    names = {kind.value: kind for kind in Transport if kind in allowed and kind != Transport.SERIAL}
     if scheme not in names:
         raise ConfigError(
             f"{where}: expected {wanted}, got {scheme!r}; {nearest_hint(scheme, names)}"

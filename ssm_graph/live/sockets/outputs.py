@@ -13,7 +13,7 @@ from typing import Final, Protocol
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.live.protocols.json_messages import encode_navigation
-from ssm_graph.live.protocols.nmea import encode_nmea
+from ssm_graph.live.protocols.nmea_out import encode_nmea
 from ssm_graph.live.sockets.endpoints import Endpoint, Listener, let_go, received, resolve
 from ssm_graph.live.sockets.feed import Now
 from ssm_graph.mission.events import EventLog

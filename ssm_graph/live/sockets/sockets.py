@@ -13,6 +13,7 @@ from ssm_graph.live.sockets.endpoints import Endpoint, Transport
 from ssm_graph.live.sockets.feed import Feed, Limits, Now
 from ssm_graph.live.sockets.inputs import Input, TcpClientInput, TcpServerInput, UdpInput
 from ssm_graph.live.sockets.outputs import Output, OutputFormat, TcpServerOutput, UdpOutput
+from ssm_graph.live.sockets.serial_port import SerialInput
 from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.navigation import Event
 from ssm_graph.mission.run_status import OutputStatus, SourceStatus
@@ -154,8 +155,13 @@ class SocketHub:
         feed = Feed(
             config.name, where, config.make_decoder, limits=config.limits, events=self._events
         )
-        kinds = {Transport.TCP_CLIENT: TcpClientInput, Transport.TCP_SERVER: TcpServerInput}
-        kind = kinds.get(config.endpoint.transport, UdpInput)
+        kinds: dict[Transport, type[TcpClientInput | TcpServerInput | UdpInput | SerialInput]] = {
+            Transport.TCP_CLIENT: TcpClientInput,
+            Transport.TCP_SERVER: TcpServerInput,
+            Transport.UDP: UdpInput,
+            Transport.SERIAL: SerialInput,
+        }
+        kind = kinds[config.endpoint.transport]
         return kind(feed, self._selector, config.endpoint)
 
     def _output(self, config: OutputConfig) -> Output:

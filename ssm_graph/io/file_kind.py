@@ -1,0 +1,63 @@
+"""What a file is that no converter reads, by its first bytes, and what to do with it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+READ: Final = (
+    "a ROS 2 bag (a folder, .mcap or .db3), a ROS 1 .bag, a Blueye X3 log, Water Linked JSON or "
+    "NMEA 0183"
+)
+_MCAP: Final = b"\x89MCAP0\r\n"
+_COMPRESSED: Final = "a compressed file: unpack it first"
+_KINDS: Final = (
+    (b"#ROSBAG V1", "a ROS 1 bag of version 1: bring it to 2.0 with  rosbag fix"),
+    (b"\x28\xb5\x2f\xfd", f"{_COMPRESSED}, with  zstd -d"),
+    (b"\x04\x22\x4d\x18", f"{_COMPRESSED}, with  lz4 -d"),
+    (b"\x1f\x8b", f"{_COMPRESSED}, with  gunzip"),
+    (b"BZh", f"{_COMPRESSED}, with  bunzip2"),
+    (b"PK\x03\x04", f"{_COMPRESSED}, with  unzip"),
+    (b"\xa3\x95\x80", "an ArduPilot DataFlash log: export its tables with  mavlogdump.py"),
+    (b"ULog\x01\x12\x35", "a PX4 ULog: export its tables with  ulog2csv"),
+    (b"\x7f\x7f", "Teledyne PD0: export beam velocities as a table"),
+    (b"\xb5\x62", "binary of a u-blox receiver: have it write NMEA, or convert it"),
+    (b"SQLite format 3\0", "an SQLite database: a ROS 2 bag has it under the name .db3"),
+    (b"PAR1", "a Parquet table: put it into a mission folder"),
+    (b"\x89HDF\r\n", "an HDF5 file"),
+)
+
+
+def is_mcap(path: Path) -> bool:
+    """Return whether a file begins as MCAP does."""
+    return _head(path).startswith(_MCAP)
+
+
+def kind_of(path: Path) -> str:
+    """Return a sentence that says what a file is, as far as it shows, and what is read."""
+    if path.is_dir():
+        return f"a folder without .mcap or .db3 files; expected {READ}"
+    head = _head(path)
+    if not head:
+        return f"empty, or it cannot be read; expected {READ}"
+    for begin, what in _KINDS:
+        if head.startswith(begin):
+            return f"this is {what}; expected {READ}"
+    if _is_mavlink(head):
+        return f"this is a MAVLink telemetry log: export it with  mavlogdump.py; expected {READ}"
+    if head.startswith(_MCAP):
+        return f"MCAP without messages of ROS 2; expected {READ}"
+    return f"of no known kind, it begins with {head[:12]!r}; expected {READ}"
+
+
+def _is_mavlink(head: bytes) -> bool:
+    """Return whether eight bytes of time stand before a frame, or frames stand alone."""
+    return head[8:9] in (b"\xfd", b"\xfe") or head[:1] in (b"\xfd", b"\xfe")
+
+
+def _head(path: Path) -> bytes:
+    try:
+        with path.open("rb") as stream:
+            return stream.read(32)
+    except OSError:
+        return b""

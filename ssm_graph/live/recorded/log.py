@@ -1,0 +1,274 @@
+"""Recorded output of one instrument, Water Linked JSON or NMEA 0183, as tables of a mission folder.
+
+The decoders are those that listen to the instruments. The time of arrival, which a recording does
+not have, is made of what the reports say of time: the centre of the ping or the sum of the times
+between reports of a DVL, date and time of day of a receiver.
+"""
+
+from __future__ import annotations
+
+import calendar
+import math
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from ssm_graph.base.errors import DataError
+from ssm_graph.io.raw_log.rows import RowKind
+from ssm_graph.io.tables.append_file import write_through
+from ssm_graph.live.protocols.decoder import RefusedError, parse_object
+from ssm_graph.live.protocols.framing import ObjectFramer, SentenceFramer
+from ssm_graph.live.protocols.nmea import MAX_SENTENCE, NmeaDecoder, NmeaOptions
+from ssm_graph.live.protocols.nmea_fields import (
+    DAY_S,
+    HEADINGS,
+    POSITIONS,
+    split_sentence,
+    utc_seconds,
+)
+from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
+from ssm_graph.sensors.dvl import DvlMount, empty_dvl
+from ssm_graph.sensors.messages import Message
+from ssm_graph.sensors.registry import BY_MESSAGE
+
+_SET_BACK_S: Final = 1.0
+_SNIFFED: Final = 1 << 16
+_MANY_REFUSALS: Final = 3
+_NOON_S: Final = 0.5 * DAY_S - 1e-6
+_SHORTEST_S: Final = 1e-3
+"""From one report to the next."""
+_ANY_CLOCK_S: Final = 1e12
+_SENTENCE = re.compile(rb"[$!][A-Z]{2}[A-Z0-9]{2,},")
+_UNIX_S: Final = 1e9
+"""A larger number of seconds is Unix time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """What a recording holds."""
+
+    messages: tuple[Message, ...]
+    notes: tuple[str, ...]
+    """What was left out or assumed, one sentence each."""
+
+
+def read_recorded(log: Path, options: NmeaOptions | None = None) -> Recorded | None:
+    """Return the messages of a recording, None for a file of another kind.
+
+    Raises :class:`DataError` for a file that cannot be read, holds nothing of use, or whose clock
+    was set back.
+
+    ``options`` are those of NMEA: what of its depths is the vehicle's, and the water's surface.
+    """
+    try:
+        data = log.read_bytes()
+    except OSError as error:
+        raise DataError(f"{log}: cannot be read: {error.strerror or error}") from error
+    head = data[:_SNIFFED]
+    if head.lstrip(b" \t\r\n\xef\xbb\xbf")[:1] in (b"{", b"[") and b'"' in head:
+        found = _water_linked(data)
+    elif _SENTENCE.search(head):
+        found = _nmea(data, options or NmeaOptions())
+    else:
+        return None
+    if not found.messages:
+        raise DataError(f"{log}: not one report that is read; {'; '.join(found.notes) or 'empty'}")
+    return _in_order(log, found)
+
+
+def write_tables(folder: Path, messages: Iterable[Message]) -> dict[str, int]:
+    """Write messages as the tables of a mission folder; return their files and numbers of rows."""
+    kinds: dict[type[Message], RowKind] = {}
+    rows: dict[type[Message], list[bytes]] = {}
+    for message in messages:
+        kind = type(message)
+        if kind not in kinds:
+            kinds[kind] = RowKind(BY_MESSAGE[kind], _bare(message))
+            rows[kind] = [kinds[kind].header]
+        rows[kind].append(kinds[kind].row(message))
+    folder.mkdir(parents=True, exist_ok=True)
+    for kind, lines in rows.items():
+        write_through(folder / kinds[kind].file, b"".join(lines))
+    return {kinds[kind].file: len(lines) - 1 for kind, lines in rows.items()}
+
+
+def _bare(message: Message) -> Any:
+    """Return a DVL of as many beams as a ping has; other instruments need not be known."""
+    speed = getattr(message, "speed", None)
+    if speed is None:
+        return None
+    mount = DvlMount(np.tile([0.0, 0.0, 1.0], (len(speed), 1)), np.eye(3), np.zeros(3))
+    return empty_dvl(mount)
+
+
+def _in_order(log: Path, found: Recorded) -> Recorded:
+    """Return the messages with increasing times in each table."""
+    last: dict[type[Message], float] = {}
+    kept, n_late = [], 0
+    for message in found.messages:
+        before = last.get(type(message), -math.inf)
+        if message.time_s < before - _SET_BACK_S:
+            raise DataError(
+                f"{log}: the instrument's clock was set back by {before - message.time_s:.4g} s at "
+                f"{before:.3f} s; expected one clock: split the file there"
+            )
+        if message.time_s <= before:
+            n_late += 1
+            continue
+        last[type(message)] = message.time_s
+        kept.append(message)
+    late = f"{n_late} reports whose time does not increase were left out."
+    return Recorded(tuple(kept), (*found.notes, *((late,) if n_late else ())))
+
+
+def _said(refusals: list[str], n_refused: int) -> list[str]:
+    """Return the kinds of refusals as notes."""
+    shown = refusals[:_MANY_REFUSALS]
+    more = n_refused - len(shown)
+    return [*shown, *((f"{more} more were refused",) if more > 0 else ())]
+
+
+def _water_linked(data: bytes) -> Recorded:
+    decoder = WaterLinkedDecoder(heading=True, max_clock_error_s=_ANY_CLOCK_S)
+    torn: list[str] = []
+    framer = ObjectFramer(torn.append)
+    messages: list[Message] = []
+    time_s, last_s, before, has_clock = 0.0, -math.inf, dict[str, Any](), True
+    for text in framer.feed(data + b"\n"):
+        report = _object(text)
+        time_s = _unix(report, time_s)
+        if "time_of_validity" not in report and "transducers" in report:
+            has_clock = False
+            if report != before:
+                time_s = max(time_s + 1e-3 * _number(report.get("time")), last_s + _SHORTEST_S)
+            before, last_s = report, time_s
+        messages += decoder.feed(text.encode() + b"\n", arrival_s=time_s)
+    notes = _said([*torn, *decoder.take_refusals()], len(torn) + decoder.n_refused)
+    if decoder.n_repeats:
+        notes.append(f"{decoder.n_repeats} reports came again and were left out.")
+    if not has_clock:
+        notes.append(
+            "Reports before format json_v3 have no clock: time_s is the sum of the times between "
+            "them, from the first one on or from the stamps of the dead reckoning beside them; add "
+            "what makes it the vehicle's."
+        )
+    return Recorded(tuple(messages), tuple(notes))
+
+
+def _object(text: str) -> dict[str, Any]:
+    try:
+        return parse_object(text)
+    except RefusedError:
+        return {}  # which the decoder refuses and tells
+
+
+def _number(value: Any) -> float:
+    is_sound = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return float(value) if is_sound and 0.0 <= value < 1e6 else 0.0
+
+
+def _unix(report: Mapping[str, Any], time_s: float) -> float:
+    """Return the Unix time that a report states, or the one before."""
+    for key, unit in (("time_of_validity", 1e-6), ("ts", 1.0)):
+        value = report.get(key)
+        if isinstance(value, (int, float)) and value * unit > _UNIX_S:
+            return float(value) * unit
+    return time_s
+
+
+def _sentences(data: bytes) -> Iterator[tuple[str, list[str]]]:
+    """Yield kind and fields of the sentences of a recording that are sound."""
+    for text in SentenceFramer(lambda _: None, max_length=MAX_SENTENCE).feed(data + b"\n"):
+        begin = text.rfind("$")
+        try:
+            name, *fields = split_sentence(text[begin + 1 :] if begin >= 0 else "")
+        except RefusedError:
+            continue
+        yield (name if name.startswith("P") else name[-3:]), fields
+
+
+def _nmea(data: bytes, options: NmeaOptions) -> Recorded:
+    kinds, dated, first = Counter[str](), math.nan, None
+    for kind, fields in _sentences(data):
+        kinds[kind] += _is_read(kind, fields)
+        dated = _date(kind, fields) if math.isnan(dated) else dated
+        first = _stamp(kind, fields, _NOON_S) if first is None else first
+    order = (*POSITIONS, *HEADINGS)
+    only = tuple(
+        next(kind for kind in some if kinds[kind])
+        for some in (POSITIONS, HEADINGS)
+        if any(kinds[kind] for kind in some)
+    )
+    decoder = NmeaDecoder(replace(options, max_clock_error_s=_ANY_CLOCK_S), only=only)
+    messages: list[Message] = []
+    time_s = (first or 0.0) if math.isnan(dated) else dated
+    for text in SentenceFramer(lambda _: None, max_length=MAX_SENTENCE).feed(data + b"\n"):
+        if text.startswith("#"):  # a comment of who recorded
+            continue
+        for kind, fields in _sentences(text.encode("latin-1")):
+            stated = _stamp(kind, fields, time_s)
+            time_s = time_s if stated is None else stated
+        messages += decoder.feed(text.encode("latin-1") + b"\r\n", arrival_s=time_s)
+    messages += decoder.feed(b"", arrival_s=math.inf)
+    notes = _said(decoder.take_refusals(), decoder.n_refused)
+    if decoder.n_without_fix:
+        notes.append(f"{decoder.n_without_fix} sentences say that the receiver has no fix.")
+    if only:
+        others = [kind for kind in order if kinds[kind] and kind not in only]
+        notes.append(f"{' and '.join(only)} read, not {', '.join(others) or 'others'}.")
+    if math.isnan(dated):
+        notes.append("No sentence states a date: time_s is UTC of the day.")
+    if not messages:
+        notes.append(f"its sentences are {', '.join(sorted(kinds)[:12]) or 'without checksum'}")
+    if first is None and messages:
+        return Recorded((), ("no sentence states a time, which depths and headings need",))
+    return Recorded(tuple(messages), tuple(notes))
+
+
+def _is_read(kind: str, fields: list[str]) -> bool:
+    """Return whether a sentence holds a position or a heading."""
+    read: Any = POSITIONS.get(kind) or HEADINGS.get(kind)
+    try:
+        return read is not None and read(fields) is not None
+    except (RefusedError, IndexError):
+        return False
+
+
+def _date(kind: str, fields: list[str]) -> float:
+    """Return the instant that RMC or ZDA state, Unix s; NaN where there is none."""
+    if kind == "RMC" and len(fields) > 8 and len(fields[8]) == 6:
+        utc, day, month, year = fields[0], fields[8][:2], fields[8][2:4], fields[8][4:]
+        year = f"20{year}" if year < "80" else f"19{year}"
+    elif kind == "ZDA" and len(fields) > 3:
+        utc, day, month, year = fields[:4]
+    else:
+        return math.nan
+    if not all(part.isdecimal() and part.isascii() for part in (day, month, year)):
+        return math.nan
+    if not (1 <= int(month) <= 12 and 1 <= int(day) <= 31 and 1980 <= int(year) < 2100):
+        return math.nan
+    noon = calendar.timegm((int(year), int(month), int(day), 12, 0, 0))
+    try:
+        of_day = utc_seconds(utc, _NOON_S)
+    except RefusedError:
+        return math.nan
+    return math.nan if of_day is None else noon - 0.5 * DAY_S + of_day % DAY_S
+
+
+def _stamp(kind: str, fields: list[str], time_s: float) -> float | None:
+    """Return the instant that a sentence states, nearest to the one before; None if it has none."""
+    dated = _date(kind, fields)
+    if not math.isnan(dated):
+        return dated
+    place = {"GGA": 0, "GNS": 0, "RMC": 0, "GST": 0, "ZDA": 0, "PASHR": 0, "GLL": 4}.get(kind)
+    if place is None or len(fields) <= place:
+        return None
+    try:
+        return utc_seconds(fields[place], time_s)
+    except RefusedError:
+        return None

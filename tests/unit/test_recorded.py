@@ -1,0 +1,236 @@
+"""Recorded output of instruments becomes tables; what is of another kind is named."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import random
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ssm_graph.base.errors import DataError
+from ssm_graph.cli.main import ExitCode, main
+from ssm_graph.io.file_kind import kind_of
+from ssm_graph.live.protocols.nmea_fields import checksum
+from ssm_graph.live.recorded.log import Recorded, read_recorded, write_tables
+from ssm_graph.sensors.compass import HeadingReading
+from ssm_graph.sensors.dvl import Ping
+from ssm_graph.sensors.gnss import Fix
+from ssm_graph.sensors.messages import bad_number
+from tests.damaged_traffic import block_of, damaged, targets
+
+DATA = Path(os.environ.get("SSM_GRAPH_DATA", Path(__file__).parents[2] / "../shared/data"))
+RECEIVERS = DATA / "gpsd"
+needs_receivers = pytest.mark.skipif(not RECEIVERS.is_dir(), reason=f"no logs in {RECEIVERS}")
+DAY_S = 1_750_809_600.0
+"""25 June 2025."""
+
+
+def reports(n: int, form: str = "json_v1", n_beams: int = 4) -> list[dict[str, Any]]:
+    """Return reports 0.1 s and more apart, each with a speed of its own."""
+    found = []
+    for k in range(n):
+        beams = [
+            {"id": i, "velocity": 0.1 * i + 0.001 * k, "distance": 1.6, "beam_valid": True}
+            for i in range(n_beams)
+        ]
+        fields: dict[str, Any] = {
+            "time": 100.0 + k,
+            "vx": 0.1,
+            "altitude": 1.5,
+            "velocity_valid": True,
+        }
+        fields |= {"transducers": beams, "status": 0, "format": form}
+        if form != "json_v1":
+            fields |= {"type": "velocity"}
+        if form == "json_v3":
+            fields |= {"time_of_validity": int((DAY_S + 0.5 * k) * 1e6)}
+        found.append(fields)
+    return found
+
+
+def read(path: Path, data: bytes) -> Recorded:
+    """Return what a file with these bytes holds."""
+    path.write_bytes(data)
+    found = read_recorded(path)
+    assert found is not None
+    return found
+
+
+def nmea(*bodies: str) -> bytes:
+    """Return sentences with their checksums."""
+    return "".join(f"${body}*{checksum(body)}\r\n" for body in bodies).encode()
+
+
+def test_reports_without_a_clock_are_timed_by_their_sum(tmp_path: Path) -> None:
+    """Format json_v1: repeats add nothing, and the note says what the times are."""
+    lines = [json.dumps(one) for one in reports(5)]
+    lines.insert(2, lines[1])
+    found = read(tmp_path / "dvl.txt", "\n".join(lines).encode())
+    times = [one.time_s for one in found.messages]
+    np.testing.assert_allclose(times, np.cumsum([0.100, 0.101, 0.102, 0.103, 0.104]))
+    assert "1 reports came again" in found.notes[0]
+    assert "no clock" in found.notes[1]
+
+
+def test_reports_with_a_clock_keep_it(tmp_path: Path) -> None:
+    """The centre of the ping; the yaw of the dead reckoning beside it; a torn report is told."""
+    lines = [json.dumps(one) for one in reports(4, "json_v3")]
+    yaw = {"type": "position_local", "ts": DAY_S + 0.7, "yaw": 45.0, "status": 0}
+    text = "\n".join([lines[0], json.dumps(yaw), lines[1][:90], *lines[2:]])
+    found = read(tmp_path / "dvl.json", text.encode())
+    assert [one.time_s - DAY_S for one in found.messages] == pytest.approx([0.0, 0.7, 1.0, 1.5])
+    assert isinstance(found.messages[1], HeadingReading)
+    assert any("begin of the next" in note for note in found.notes)
+    back = "\n".join([lines[3], lines[0]])
+    with pytest.raises(DataError, match=r"set back by 1\.5 s"):
+        read(tmp_path / "back.json", back.encode())
+
+
+@pytest.mark.parametrize("n_beams", [3, 4])
+def test_tables_of_a_recording(tmp_path: Path, n_beams: int) -> None:
+    """One for each kind of message, as a mission folder has them."""
+    data = "\n".join(json.dumps(one) for one in reports(3, "json_v3", n_beams)).encode()
+    found = read(tmp_path / "dvl.json", data)
+    assert write_tables(tmp_path / "out", found.messages) == {"dvl.csv": 3}
+    head, first, *_ = (tmp_path / "out" / "dvl.csv").read_text().splitlines()
+    assert head.split(",")[: 1 + n_beams][-1] == f"beam{n_beams}_m_per_s"
+    assert float(first.split(",")[2]) == 0.1
+
+
+def test_a_receiver_is_dated_by_its_own_sentences(tmp_path: Path) -> None:
+    """RMC's date, midnight passed; comments and binary between; the best sentence alone is read."""
+    place = "6326.0000,N,01024.0000,E"
+    data = b"# Name: a receiver\n"
+    for utc, date in (("235959.00", "240625"), ("000000.00", "250625"), ("000001.00", "250625")):
+        data += b"\xb5\x62\x01\x07$*\r" + nmea(
+            f"GNRMC,{utc},A,{place},0.5,54.7,{date},,,A",
+            f"GNGGA,{utc},{place},1,10,0.8,20.50,M,40.25,M,,",
+            "HEHDT,45.0,T",
+        )
+    found = read(tmp_path / "gnss.log", data)
+    fixes = [one for one in found.messages if isinstance(one, Fix)]
+    assert [one.time_s - DAY_S for one in fixes] == [-1.0, 0.0, 1.0]
+    assert {one.height for one in fixes} == {60.75}
+    turns = [one for one in found.messages if isinstance(one, HeadingReading)]
+    assert [one.time_s - DAY_S for one in turns] == [-1.0, 0.0, 1.0]
+    assert "GGA and HDT read, not RMC." in found.notes
+
+
+def test_a_receiver_without_dates(tmp_path: Path) -> None:
+    """Times are of the day, which is said; a depth alone has none."""
+    data = nmea(*(f"ECGLL,5119.881,N,00125.169,E,1643{k:02d},A,D" for k in range(9)))
+    found = read(tmp_path / "gll.log", data)
+    assert [one.time_s for one in found.messages] == [60_180.0 + k for k in range(9)]
+    assert "No sentence states a date: time_s is UTC of the day." in found.notes
+    with pytest.raises(DataError, match="no sentence states a time"):
+        read(tmp_path / "depth.log", nmea("PIPS,0020.00,M") * 3)
+    with pytest.raises(DataError, match=r"not one report.*its sentences are DPT, VTG"):
+        read(tmp_path / "none.log", nmea("GPVTG,,T,,M,0.0,N,0.0,K,A", "SDDPT,12.5,0.0"))
+
+
+def test_what_is_no_recording(tmp_path: Path) -> None:
+    """Its kind is named, with what to do."""
+    for data, said in (
+        (b"\x28\xb5\x2f\xfd" + bytes(40), "zstd -d"),
+        (b"\xa3\x95\x80" * 40, "DataFlash"),
+        (b"\x7f\x7f" * 50, "PD0"),
+        (b"\xfe" * 100, "MAVLink"),
+        (b"", "empty"),
+        (b"hello world, this is text", "no known kind"),
+        (b"\x89MCAP0\r\n" + bytes(40), "without messages of ROS 2"),
+    ):
+        file = tmp_path / "file"
+        file.write_bytes(data)
+        assert read_recorded(file) is None
+        assert said in kind_of(file)
+    assert "a folder" in kind_of(tmp_path)
+
+
+def test_convert_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Counts and notes; a file that is not there, of no kind, and of another one."""
+    log = tmp_path / "dvl.txt"
+    log.write_text("\n".join(json.dumps(one) for one in reports(5)))
+    words = ["convert", str(log), "--out", str(tmp_path / "m")]
+    assert main(words) == ExitCode.GOOD
+    shown = capsys.readouterr().out
+    assert "dvl.csv with 5 rows" in shown
+    assert "note: Reports before format json_v3" in shown
+    log.write_bytes(b"\x7f\x7f" * 50)
+    assert main(words) == ExitCode.DATA
+    assert "PD0" in capsys.readouterr().err
+    log.unlink()
+    assert main(words) == ExitCode.DATA
+    assert "no such file" in capsys.readouterr().err
+
+
+def sound_fixes(data: bytes) -> int:
+    """Count the GGA of a recording with a right checksum and a measured fix, by themselves."""
+    count = 0
+    for body, given in re.findall(rb"\$([A-Z]{2}GGA,[ -~]*?)\*([0-9A-F]{2})", data):
+        quality = body.split(b",")[6]
+        count += checksum(body.decode()) == given.decode() and quality in b"1 2 3 4 5 9".split()
+    return count
+
+
+@needs_receivers
+@pytest.mark.parametrize(
+    ("name", "n_fixes"),
+    [
+        ("quectel-l76k-dual", 130),
+        ("ublox-zed-f9p_hpg1.11", 655),
+        ("skytraq-dgps", 96),
+        ("st-teseo-liv4f", 12),
+        ("saab-r4", 12),
+        ("unicore-um621", 16),
+    ],
+)
+def test_real_receivers_to_the_last_sentence(name: str, n_fixes: int) -> None:
+    """Every sound GGA is a fix, whatever stands between."""
+    log = RECEIVERS / f"{name}.log"
+    found = read_recorded(log)
+    assert found is not None
+    assert sum(isinstance(one, Fix) for one in found.messages) == n_fixes
+    assert sound_fixes(log.read_bytes()) == n_fixes
+
+
+@needs_receivers
+@pytest.mark.parametrize(
+    ("name", "n_fixes"), [("ait250", 34), ("sounder", 122), ("meinberg-gps164", 70)]
+)
+def test_real_receivers_without_gga(name: str, n_fixes: int) -> None:
+    """RMC and GLL: positions at the water's surface, to 100 m in height."""
+    found = read_recorded(RECEIVERS / f"{name}.log")
+    assert found is not None
+    fixes = [one for one in found.messages if isinstance(one, Fix)]
+    assert len(fixes) == n_fixes
+    assert {one.sigma_enu[2] for one in fixes} == {100.0}
+    assert all(math.isfinite(one.lat) for one in fixes)
+
+
+def test_pings_are_pings(tmp_path: Path) -> None:
+    """A list of reports over several lines, as a recorder may write it."""
+    found = read(tmp_path / "list.json", json.dumps(reports(6, "json_v2"), indent=2).encode())
+    assert [type(one) for one in found.messages] == [Ping] * 6
+
+
+def test_damaged_recordings_do_no_harm(tmp_path: Path) -> None:
+    """A refusal by its cause, or finite numbers in increasing times; `fuzz.md` has the decoders."""
+    rng = random.Random(11)
+    others, n_read = targets(), 0
+    for k in range(60):
+        data = damaged(block_of(others[1 + k % 3], others, rng, DAY_S), rng)
+        (tmp_path / "log").write_bytes(data)
+        try:
+            found = read_recorded(tmp_path / "log")
+        except DataError:
+            continue
+        for message in found.messages if found is not None else ():
+            assert bad_number(message) is None
+            n_read += 1
+    assert n_read > 100
