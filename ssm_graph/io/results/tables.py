@@ -249,7 +249,7 @@ class GrowingResults:
     ) -> None:
         """Begin in a folder, or go on at the sizes (bytes) that a checkpoint knew.
 
-        With a current ``trajectory.csv`` has its columns, and all rows have one.
+        A table that begins anew although rows are there is set aside as ``NAME.older.csv``. With a current ``trajectory.csv`` has its columns, and all rows have one.
 
         Raises :class:`DataError`: the folder cannot be made or written.
         """
@@ -262,11 +262,16 @@ class GrowingResults:
             folder.mkdir(parents=True, exist_ok=True)
             (folder / SUMMARY_NAME).unlink(missing_ok=True)
             beside = CURRENT_COLUMNS if has_current else ()
-            for name, columns in (HEADERS | {TRAJECTORY_NAME: TRAJECTORY_COLUMNS + beside}).items():
+            columns = HEADERS | {TRAJECTORY_NAME: TRAJECTORY_COLUMNS + beside}
+            self._heads = {name: (",".join(of) + "\n").encode() for name, of in columns.items()}
+            for name, head in self._heads.items():
+                size = (sizes or {}).get(name, 0)
+                if size == 0:
+                    _set_aside(folder / name, len(head))
                 file = self._files[name] = AppendFile(folder / name, ending=TORN_ROW)
-                file.cut((sizes or {}).get(name, 0))
+                file.cut(size)
                 if file.size == 0:
-                    file.append((",".join(columns) + "\n").encode())
+                    file.append(head)
         except OSError as error:
             self.close()
             raise DataError(f"{folder}: cannot write results: {error.strerror or error}") from error
@@ -274,6 +279,16 @@ class GrowingResults:
     def sizes(self) -> dict[str, int]:
         """Return how large the files are, bytes, for a checkpoint."""
         return {name: file.size for name, file in self._files.items()}
+
+    def regain(self) -> list[str]:
+        """Go on where somebody removed, replaced or changed a table; return what was done."""
+        texts = {name: self._files[name].regain(head) for name, head in self._heads.items()}
+        for name, text in texts.items():
+            if text and self._files[name].size < len(self._heads[name]):
+                self._files[name].cut(0)
+                self._waiting[name] = self._heads[name].decode() + self._waiting[name]
+        self._write_waiting()
+        return [text for text in texts.values() if text]
 
     def append(
         self, trajectory: Trajectory, beams: BeamTable, current: CurrentTrack | None = None
@@ -286,7 +301,7 @@ class GrowingResults:
         self._write_waiting()
 
     def _write_waiting(self) -> None:
-        self.problem = None
+        self.problem = next((file.problem for file in self._files.values() if file.problem), None)
         for name, text in self._waiting.items():
             try:
                 if text:
@@ -316,6 +331,14 @@ class GrowingResults:
         """Close the files; a second time does nothing."""
         for file in self._files.values():
             file.close()
+
+
+def _set_aside(path: Path, n_head: int) -> None:
+    """Rename a table that has rows; of several that were set aside the longest is kept."""
+    older = path.with_name(f"{path.stem}.older{path.suffix}")
+    n_older = older.stat().st_size if older.exists() else 0
+    if path.exists() and path.stat().st_size > max(n_head, n_older):
+        path.replace(older)
 
 
 def _rows(columns: Columns) -> str:

@@ -27,6 +27,8 @@ from ssm_graph.sensors.messages import Message
 POLL_S: Final = 0.05
 LATE_S: Final = 5.0
 """A disk that needs longer for a checkpoint is complained of."""
+WATCH_S: Final = 1.0
+"""From one look after the files of the run to the next."""
 N_EVENTS: Final = 8
 """Shown to a person."""
 MOST_FAILURES: Final = 100
@@ -171,6 +173,7 @@ class Runner:
         self._latencies: deque[float] = deque(maxlen=1000)
         self._checkpoints = Every(self.config.checkpoint_every_s)
         self._delayed = Every(self.config.delayed_every_s)
+        self._watch = Every(WATCH_S)
         self._status = Every(self.config.status_every_s, at_once=True)
 
     def stop(self) -> None:
@@ -283,6 +286,10 @@ class Runner:
         """Write what has come about, and show it."""
         for event in source.take_events():
             self._note_event(event)
+        if self._watch.is_due(self._steady_s()):
+            for text in self.folder.regain():
+                self._events.note("disk", "file_altered", text, Severity.ERROR, burst=20)
+                self._is_checkpoint_due = True  # the last one knows the files of before
         self._keep_results()
         self._keep_checkpoint()
         problem = self.folder.problems()
@@ -407,7 +414,7 @@ def summary_of(folder: RunFolder, end: RunEnd) -> dict[str, Any]:
         "settings": folder.settings,
         "calibration": calibration_fields(end.found.calibration),
         "current": current_fields(end.found.current),
-        "notes": [],
+        "notes": folder.notes,
         "versions": versions(),
     }
     return {key: as_json(value) for key, value in summary.items()}
