@@ -249,7 +249,8 @@ class GrowingResults:
     ) -> None:
         """Begin in a folder, or go on at the sizes (bytes) that a checkpoint knew.
 
-        A table that begins anew although rows are there is set aside as ``NAME.older.csv``. With a current ``trajectory.csv`` has its columns, and all rows have one.
+        A table that begins anew although it has rows is set aside, ``trajectory.older.csv``. With
+        a current ``trajectory.csv`` has its columns, and all rows have one.
 
         Raises :class:`DataError`: the folder cannot be made or written.
         """

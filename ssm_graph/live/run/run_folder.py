@@ -137,19 +137,20 @@ class RunFolder:
     def __init__(self, folder: Path, vehicle: Vehicle, settings: Mapping[str, Any]) -> None:
         self.path, self.vehicle, self.settings = folder, vehicle, dict(as_json(settings))
         self._noted = {"format": FORMAT, "vehicle": vehicle.name, "settings": self.settings}
-        self.notes: list[str] = []
-        """What somebody did to the files of the run while it was running, one sentence each."""
+        self._altered: list[str] = []
         self._folder_problem: str | None = None
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self._lock = _locked(folder)
         except OSError as error:
-            raise DataError(f"{folder}: cannot be written: {error.strerror or error}") from error
+            raise _unwritable(folder, error) from error
         try:
             self._check()
             self._events = AppendFile(folder / EVENTS_NAME, ending=b" torn\n")
-        except BaseException:
+        except BaseException as error:
             self._lock.close()
+            if isinstance(error, OSError):
+                raise _unwritable(folder, error) from error
             raise
         self.event_problem: str | None = None
         self.results: GrowingResults | None = None
@@ -200,9 +201,7 @@ class RunFolder:
         try:
             self.log = make(self.path / LOG_NAME, self.vehicle)
         except OSError as error:
-            raise DataError(
-                f"{self.path / LOG_NAME}: cannot be written: {error.strerror or error}"
-            ) from error
+            raise _unwritable(self.path / LOG_NAME, error) from error
         return self.log
 
     def write_event(self, event: Event) -> None:
@@ -249,6 +248,13 @@ class RunFolder:
         ]
         return "; ".join(text for text in found if text) or None
 
+    def settle(self) -> list[str]:
+        """Wait for the disk; return what is not on it, and what somebody altered there."""
+        if self.log is not None:
+            self.log.sync()
+        problem = self.problems()
+        return [*self._altered, *([f"at the end: {problem}"] if problem else [])]
+
     def close(self) -> None:
         """Wait for the disk, and let others have the folder."""
         self.writer.wait()
@@ -274,7 +280,7 @@ class RunFolder:
                 found = json.loads(path.read_text(encoding="utf-8"))
             except (OSError, ValueError) as error:
                 raise DataError(
-                    f"{path}: expected the settings of a run: {error}; bring the file back, or give "
+                    f"{path}: expected the settings of a run: {error}; bring it back, or give "
                     "another folder; nothing was changed"
                 ) from error
             if found != self._noted:
@@ -340,7 +346,7 @@ class RunFolder:
             self._folder_problem = str(error)
         events = self._events.regain()
         texts += [*self.log.regain(), *self.results.regain(), *([events] if events else [])]
-        self.notes += texts
+        self._altered += texts
         return texts
 
     def _missing(self, sizes: Mapping[str, int]) -> list[str]:
@@ -362,6 +368,10 @@ def _has_rows(path: Path, *, beyond: int) -> bool:
         return False
     except OSError:
         return True
+
+
+def _unwritable(folder: Path, error: OSError) -> DataError:
+    return DataError(f"{folder}: cannot be written: {error.strerror or error}")
 
 
 def _is_same(path: Path, stream: IO[str]) -> bool:

@@ -61,6 +61,8 @@ class RunEnd(NamedTuple):
     n_messages: int
     n_errors: int
     """Exceptions that nobody expected and the run survived."""
+    notes: tuple[str, ...] = ()
+    """What is not on the disk, or was altered there by somebody, one sentence each."""
 
 
 class Delayed(Protocol):
@@ -363,7 +365,8 @@ class Runner:
         self._write_delayed(self._estimator.finish)
         self._events.note("run", "ended", reason.value, Severity.INFO)
         self._take_events()
-        end = RunEnd(reason, navigation, found, self._n_messages, self._events.n_errors)
+        notes = tuple(self.folder.settle())
+        end = RunEnd(reason, navigation, found, self._n_messages, self._events.n_errors, notes)
         assert self.folder.results is not None
         self.folder.results.finish(summary_of(self.folder, end))
         return end
@@ -414,7 +417,7 @@ def summary_of(folder: RunFolder, end: RunEnd) -> dict[str, Any]:
         "settings": folder.settings,
         "calibration": calibration_fields(end.found.calibration),
         "current": current_fields(end.found.current),
-        "notes": folder.notes,
+        "notes": end.notes,
         "versions": versions(),
     }
     return {key: as_json(value) for key, value in summary.items()}
