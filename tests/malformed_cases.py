@@ -298,6 +298,13 @@ TABLE_CASES = cases(
             columns("imu.csv", ["time_s"], lambda t: np.round(t, 1)),
             "imu.csv:5 | time_s repeats | more digits",
         ),
+        "A clock that was begun anew amid a table (order of arrival)": (
+            both(
+                toml("format = 1", 'format = 1\norder = "arrival"'),
+                lines("imu.csv", lambda rows: [*rows, *rows[1:301]]),
+            ),
+            "imu.csv:1202 | falls from | two missions",
+        ),
         "Most rows partly written, where single ones may be (order of arrival)": (
             both(
                 toml("format = 1", 'format = 1\norder = "arrival"'),

@@ -44,6 +44,10 @@ from ssm_graph.io.tables.csv_tables import (
 )
 
 _CHUNK = 65536
+_SET_BACK_S: Final = 2.0
+"""Rows may come so late; a clock that falls by more ..."""
+_SET_BACK_ROWS: Final = 20
+"""... and goes on steadily from there for so many rows, as it did before, was set back."""
 _FEW = 10
 """So many bad rows are left out even where they are most of the table."""
 
@@ -199,13 +203,14 @@ def read_arrival_table(path: Path, label: str, spec: TableSpec) -> Table:
     is not torn but of another kind, and is refused like any other.
 
     Raises :class:`DataError` for a file that is no table, a missing, unknown or repeated column,
-    and rows most of which cannot be read.
+    rows most of which cannot be read, and a clock that was begun anew or set back on the way.
 
     The ending of ``path`` decides the format; ``label`` is its name in messages.
     """
     counts: Counter[str] = Counter()
     table = _read(path, label, spec, partial(_read_csv_as_it_came, counts=counts))
     table = _without_impossible(table, spec, counts)
+    _check_one_clock(table)
     table = _in_order_of_time(table, spec, counts)
     return replace(table, notes=_note(counts, label))
 
@@ -282,6 +287,24 @@ def _without_impossible(table: Table, spec: TableSpec, counts: Counter[str]) -> 
         return table  # the checks of each sensor say what is wrong
     counts["impossible"] = n_bad
     return _picked(table, np.flatnonzero(~bad)) if n_bad else table
+
+
+def _check_one_clock(table: Table) -> None:
+    """Refuse times that fall and go on from there: sorted, two missions would be woven into one.
+
+    A late row is followed by others that go on as before it.
+    """
+    time_s, n_rows = table.time_s, _SET_BACK_ROWS
+    for row in np.flatnonzero(np.diff(time_s) < -_SET_BACK_S) + 1:
+        before_s, after_s = time_s[max(row - n_rows, 0) : row], time_s[row : row + n_rows]
+        is_steady = np.all(np.diff(before_s) > 0.0) and np.all(np.diff(after_s) > 0.0)
+        if min(len(before_s), len(after_s)) == n_rows and is_steady and after_s[-1] < before_s[-1]:
+            raise table.fault(
+                int(row),
+                f"the time falls from {before_s[-1]:.3f} to {after_s[0]:.3f} s and goes on from "
+                "there: the clock was begun anew or set back, so these are two missions; cut all "
+                "tables there and give each part a folder of its own",
+            )
 
 
 def _in_order_of_time(table: Table, spec: TableSpec, counts: Counter[str]) -> Table:
