@@ -129,7 +129,7 @@ def test_no_ping_yet_is_no_velocity_and_no_warning() -> None:
     """A live estimator looks before the first ping has come."""
     mission = make_mission()
     dvl = mission.dvl
-    none = {name: getattr(dvl, name)[:0] for name in ("time_s", "speed", "sigma")}
+    none = {name: getattr(dvl, name)[:0] for name in ("time_s", "speed", "sigma", "range_m")}
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         found = body_velocities(replace(mission, dvl=replace(dvl, **none)))

@@ -34,6 +34,7 @@ from ssm_graph.io.mission_folder.toml import TOML_NAME
 from ssm_graph.io.mission_folder.vehicle import check_same_vehicle
 from ssm_graph.io.raw_log.log import RawLog
 from ssm_graph.io.raw_log.rows import ALWAYS, ARRIVALS, replay
+from ssm_graph.io.results.place import RUN_NAME
 from ssm_graph.io.results.summary import as_json
 from ssm_graph.io.results.tables import BEAMS_NAME, SUMMARY_NAME, TRAJECTORY_NAME, GrowingResults
 from ssm_graph.io.tables.append_file import AppendFile, sync_path, write_through
@@ -52,7 +53,6 @@ if sys.platform != "win32":
 
 LOG_NAME: Final = "log"
 EVENTS_NAME: Final = "events.jsonl"
-RUN_NAME: Final = "run.json"
 LOCK_NAME: Final = "lock"
 FORMAT: Final = 1
 
