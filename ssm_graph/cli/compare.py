@@ -130,6 +130,8 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     check_result_place(arguments.out)
     study, execute = study_from(arguments), execute_from(arguments)
     store = open_store(study, arguments.out, fresh=arguments.fresh)
+    for note in store.notes:
+        say(errors, f"note: {note}")
     if len(store) > 0:
         errors.print(f"going on: {len(store)} runs are done already", highlight=False)
     try:
