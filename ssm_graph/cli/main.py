@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from enum import IntEnum
 from importlib.metadata import version
 
-from rich.markup import escape
+from rich.text import Text
 
 from ssm_graph.base.errors import (
     ConfigError,
@@ -87,7 +87,7 @@ def main(words: Sequence[str] | None = None) -> int:
             is_good = arguments.run(arguments, console, errors)
         code = ExitCode.GOOD if is_good else ExitCode.NOT_GOOD
     except SsmGraphError as error:
-        errors.print(f"[bold red]error:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
+        errors.print(Text.assemble(("error:", "bold red"), f" {error}"), soft_wrap=True)
         code = next(code for kind, code in EXIT_CODES if isinstance(error, kind))
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""

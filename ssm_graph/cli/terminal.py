@@ -54,10 +54,12 @@ class TolerantStream:
 
 
 def console_on(stream: IO[str] | None, *, is_stderr: bool = False) -> Console:
-    """Return a console on a standard stream; None for one that was closed before the start."""
-    if stream is None:
-        return Console(stderr=is_stderr)
-    return Console(file=cast(IO[str], TolerantStream(stream)), stderr=is_stderr)
+    """Return a console on a standard stream; None for one that was closed before the start.
+
+    Names and paths are shown as they are, brackets and colons too.
+    """
+    file = None if stream is None else cast(IO[str], TolerantStream(stream))
+    return Console(file=file, stderr=is_stderr, markup=False, emoji=False)
 
 
 def occupy_closed_streams() -> None:

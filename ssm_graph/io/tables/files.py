@@ -147,10 +147,15 @@ def read_parquet(path: Path, label: str, spec: TableSpec) -> Table:
             name: np.asarray(data[name].cast(arrow.float64(), safe=False).to_numpy())
             for name in schema.names
         }
+    except MemoryError as error:  # Arrow's is one of its exceptions too
+        raise DataError(
+            f"{label}: there is not enough memory for this table ({error}); cut the mission into "
+            "parts, or use a computer with more of it"
+        ) from error
     except arrow.ArrowException as error:
         raise DataError(
-            f"{label}: expected a Parquet table, got a file that cannot be read as one; "
-            "was it cut off, or is it another format?"
+            f"{label}: expected a Parquet table, got a file that cannot be read as one: "
+            f"{' '.join(str(error).split())[:200]}"
         ) from error
     return Table(ParquetFile(label, path), columns)
 

@@ -77,6 +77,15 @@ class Channel:
         self.is_stale = False
         """Whether what waits came while this process stood still, nobody knows when."""
 
+    def stand_still(self, span_s: float) -> None:
+        """Take out a time in which nobody listened, s: what waits is stale, silence was none."""
+        self.heard_s += span_s
+        self.is_stale = True
+
+    def catch_up(self) -> None:
+        """All that waited has been read."""
+        self.is_stale = False
+
 
 class SampleClock:
     """The clock of the inertial data of all sources: remembered, and a stranger is refused.

@@ -45,15 +45,15 @@ class Input(ABC):
         if isinstance(data, str):
             return self._lose(ready, now, data)
         messages = self.feed.take(channel, data, now)
-        channel.is_stale = channel.is_stale and len(data) == CHUNK  # then more waits
+        if len(data) < CHUNK:  # else more waits
+            channel.catch_up()
         self._pause_if_over(now)
         return messages
 
     def stood_still(self, span_s: float) -> None:
         """Have nobody pay for the time in which this process did not listen."""
         for channel in self._reading.values():
-            channel.heard_s += span_s
-            channel.is_stale = True
+            channel.stand_still(span_s)
 
     def tick(self, now: Now) -> list[Message]:
         """Return messages that a decoder releases; look after patience and connections."""
@@ -64,7 +64,7 @@ class Input(ABC):
         messages: list[Message] = []
         for sock, channel in list(self._reading.items()):
             if not self._is_paused and channel.fed_s < now.steady_s:  # nothing waited for it
-                channel.is_stale = False
+                channel.catch_up()
             messages += self.feed.idle(channel, now)
             if not self._is_paused and self.feed.is_silent(channel, now):
                 messages += self._lose(sock, now, self.feed.silence)
@@ -284,7 +284,8 @@ class UdpInput(Input):
                 break
         messages = self.feed.take(self._channel, bytes(data), now)
         self._is_silent = self._is_silent and self.feed.is_silent(self._channel, now)
-        self._channel.is_stale = self._channel.is_stale and not is_all
+        if is_all:
+            self._channel.catch_up()
         self._pause_if_over(now)
         return messages
 
