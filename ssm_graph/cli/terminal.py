@@ -7,7 +7,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from typing import IO, Any, Final, cast
+from typing import IO, Any, Final, TextIO, cast
 
 from rich.console import Console
 
@@ -23,7 +23,7 @@ class TolerantStream:
     Characters that it cannot hold, and bytes of a path that are no text, are written as escapes.
     """
 
-    def __init__(self, stream: IO[str]) -> None:
+    def __init__(self, stream: TextIO) -> None:
         self._stream = stream
         self.failure: str | None = None
         """Why nothing is written any more."""
@@ -53,7 +53,7 @@ class TolerantStream:
                 os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
 
 
-def console_on(stream: IO[str] | None, *, is_stderr: bool = False) -> Console:
+def console_on(stream: TextIO | None, *, is_stderr: bool = False) -> Console:
     """Return a console on a standard stream; None for one that was closed before the start.
 
     Names and paths are shown as they are, brackets and colons too.

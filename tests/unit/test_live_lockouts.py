@@ -122,14 +122,14 @@ class Sifted:
     """What a clock lets pass of samples at times of arrival."""
 
     def __init__(self) -> None:
-        self.clock, self.passed, self.refused = SampleClock(), list[float](), list[str]()
+        self.clock, self.passed, self.refused = SampleClock(), list[float](), list[float]()
 
     def give(self, stamps: list[float], steady_s: float) -> None:
         """Have samples arrive together."""
         messages: list[Message] = [sample(stamp) for stamp in stamps]
-        passed, text = self.clock.sift(messages, steady_s)
+        passed, refused = self.clock.sift(messages, steady_s)
         self.passed += [message.time_s for message in passed]
-        self.refused += [text] if text else []
+        self.refused += [message.time_s for message in refused]
 
     def run(self, begin_s: float, end_s: float, *, offset_s: float = 0.0) -> list[float]:
         """Have a clock tick for a while."""
@@ -146,11 +146,29 @@ def test_strays_of_another_clock_are_refused(off_s: float, count: int) -> None:
     """Twenty in one datagram ended navigation; now they are refused when the known one goes on."""
     sifted = Sifted()
     before = sifted.run(100.0, 102.0)
-    sifted.give([102.0 + off_s + k * PERIOD_S for k in range(count)], 102.0)
+    strays = [102.0 + off_s + k * PERIOD_S for k in range(count)]
+    sifted.give(strays, 102.0)
     after = sifted.run(102.0, 104.0)
     assert sifted.passed == before + after
-    (said,) = sifted.refused
-    assert f"{count} inertial samples of another clock" in said
+    assert sifted.refused == strays
+
+
+def test_strays_in_a_datagram_are_counted_and_told() -> None:
+    """By the source that they came from."""
+    clock = Steady()
+    with hub_with(Transport.UDP, clock) as hub:
+        receiver = Receiver(hub)
+        receiver.poll()
+        sender = UdpSender(port_of(hub))
+        sender.send(encode_message(sample(50.0)))
+        receiver.until(lambda: receiver.messages)
+        sender.send(b"".join(encode_message(sample(9000.0 + 0.01 * k)) for k in range(20)))
+        sender.send(encode_message(sample(50.01)))
+        receiver.until(lambda: len(receiver.messages) == 2)
+        assert hub.source_status()[0].n_refused == 20
+        (said,) = (event.text for event in receiver.events if event.kind == "clock_refused")
+        assert "20 inertial samples of another clock, stamped +8949.99 s off" in said
+        sender.close()
 
 
 @pytest.mark.parametrize("off_s", [3600.0, -3600.0])

@@ -240,7 +240,7 @@ def test_rows_that_wait_are_written_where_the_table_is_now(tmp_path: Path) -> No
         log.append(sample)
     (tmp_path / "imu.csv").rename(tmp_path / "aside")
     imu = log._tables["imu.csv"]
-    append, imu.append = imu.append, _full  # type: ignore[method-assign]
+    append, imu.append = imu.append, _full  # type: ignore[method-assign,assignment]
     for sample in samples[10:20]:
         log.append(sample)
     imu.append = append  # type: ignore[method-assign]

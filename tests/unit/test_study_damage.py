@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from ssm_graph.base.errors import ConfigError
-from ssm_graph.study import store as store_module
+from ssm_graph.io.tables import append_file
 from ssm_graph.study.store import StudyStore
 from tests.unit.test_study_store import SETTINGS, a_result, key
 
@@ -119,6 +119,12 @@ def header(**changes: Any) -> Callable[[Path], object]:
     return change
 
 
+def folder_instead(path: Path) -> None:
+    """Put a folder in its place."""
+    path.unlink()
+    path.mkdir()
+
+
 def enormous(path: Path) -> None:
     """Claim an array that no memory holds."""
     with path.open("wb") as stream, zipfile.ZipFile(stream, "w") as archive:
@@ -138,7 +144,7 @@ SERIES: dict[str, Damage] = {
     "zeros": series(lambda path: path.write_bytes(bytes(path.stat().st_size))),
     "no archive": series(lambda path: path.write_bytes(b"something else")),
     "a pickle": series(lambda path: np.array([{}], dtype=object).dump(path)),
-    "a folder": series(lambda path: (path.unlink(), path.mkdir())),
+    "a folder": series(folder_instead),
     "no header": series(rewritten(header=None)),
     "a header of numbers": series(rewritten(header=np.zeros(3))),
     "a member missing": series(rewritten(m1=None)),
@@ -226,7 +232,7 @@ def test_errors_over_time_are_on_the_disk_before_their_row(
     """After a power failure there is no row without its series."""
     store = StudyStore(folder, SETTINGS)
     order: list[str] = []
-    write, sync = store_module.write_through, os.fsync
+    write, sync = append_file.write_through, os.fsync
 
     def written(path: Path, content: bytes) -> None:
         order.append(path.suffix)
@@ -236,7 +242,7 @@ def test_errors_over_time_are_on_the_disk_before_their_row(
         order.append("fsync")
         sync(descriptor)
 
-    monkeypatch.setattr(store_module, "write_through", written)
+    monkeypatch.setattr("ssm_graph.study.store.write_through", written)
     monkeypatch.setattr(os, "fsync", synced)
     store.append(a_result(7))
     assert order == [".part", "fsync", "fsync", "fsync"]

@@ -101,8 +101,10 @@ class SampleClock:
         self._strangers: list[ImuSample] = []
         self._stranger_s = 0.0
 
-    def sift(self, messages: list[Message], steady_s: float) -> tuple[list[Message], str | None]:
-        """Return what may pass, and in one sentence what was refused, if anything."""
+    def sift(
+        self, messages: list[Message], steady_s: float
+    ) -> tuple[list[Message], list[ImuSample]]:
+        """Return what may pass, and what was refused."""
         passed: list[Message] = []
         refused: list[ImuSample] = []
         for message in messages:
@@ -115,13 +117,11 @@ class SampleClock:
                 passed.append(message)
             else:
                 refused += self._meet(message, steady_s, passed)
-        if not refused:
-            return passed, None
-        off_s = refused[0].time_s - self._stamp_s
-        return passed, (
-            f"{len(refused)} inertial samples of another clock, stamped {off_s:+.6g} s off those "
-            "that go on: refused"
-        )
+        return passed, refused
+
+    def off_s(self, sample: ImuSample) -> float:
+        """Return how far a stamp is from the last one of the known clock, s."""
+        return sample.time_s - self._stamp_s
 
     def _is_known(self, stamp_s: float, steady_s: float) -> bool:
         if math.isnan(self._stamp_s):
@@ -197,9 +197,12 @@ class Feed:
             self.tell("message_refused", text, Severity.WARNING, burst=BURST)
         if decoder.n_sound > n_sound:
             channel.heard_s = now.steady_s
-        kept, stranger = self._clock.sift(self._limited(messages, now), now.steady_s)
-        if stranger is not None:
-            self.tell("clock_refused", stranger, Severity.WARNING)
+        kept, strangers = self._clock.sift(self._limited(messages, now), now.steady_s)
+        if strangers:
+            self._n_refused += len(strangers)
+            text = f"{len(strangers)} inertial samples of another clock, stamped "
+            text += f"{self._clock.off_s(strangers[0]):+.6g} s off those that go on: refused"
+            self.tell("clock_refused", text, Severity.WARNING)
         return kept
 
     def idle(self, channel: Channel, now: Now) -> list[Message]:
