@@ -159,7 +159,7 @@ class StudyStore:
         if not whole and torn[: len(begin)] == begin[: len(torn)]:
             return False
         header, *lines = whole.split(b"\n")
-        self._check(self._settings_of(header))
+        self._check(self._settings_of(header or torn))
         kept, bad = [header], []
         for number, line in enumerate(lines, 2):
             try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 import json
 import os
@@ -212,24 +213,57 @@ def test_a_table_that_is_replaced_or_cut_is_gone_on_with(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("kind", ["folder", "fifo", "foreign"])
-def test_what_cannot_be_gone_on_with_is_left_alone(tmp_path: Path, kind: str) -> None:
-    """It is told as a fault of the disk, and no checkpoint counts on it."""
+def test_what_is_in_the_way_is_set_aside(tmp_path: Path, kind: str) -> None:
+    """Whatever somebody put there is kept, and so is every record."""
     path = tmp_path / "dvl.csv"
     file = AppendFile(path, ending=TORN_ROW)
     file.append(b"a,b\n")
-    path.rename(tmp_path / "aside")
+    path.rename(tmp_path / "moved")
     if kind == "folder":
         path.mkdir()
     elif kind == "fifo":
         os.mkfifo(path)
     else:
         path.write_bytes(b"something else\n")
-    assert file.regain(b"a,b\n") is None
-    assert "cannot be gone on with" in str(file.problem)
-    file.append(b"1,2\n")
-    assert (tmp_path / "aside").read_bytes() == b"a,b\n1,2\n"
-    assert kind != "foreign" or path.read_bytes() == b"something else\n"
+    assert "is dvl.csv.aside now" in str(file.regain(b"a,b\n"))
+    assert file.problem is None
+    file.append(b"a,b\n1,2\n")
+    assert path.read_bytes() == b"a,b\n1,2\n"
+    assert (tmp_path / "moved").read_bytes() == b"a,b\n"
+    aside = tmp_path / "dvl.csv.aside"
+    assert kind != "foreign" or aside.read_bytes() == b"something else\n"
     file.close()
+
+
+def test_what_cannot_be_gone_on_with_is_a_problem_of_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A mount point cannot be renamed: records go on into the old file, and it is said."""
+    path = tmp_path / "dvl.csv"
+    file = AppendFile(path, ending=TORN_ROW)
+    path.rename(tmp_path / "moved")
+    path.mkdir()
+
+    def busy(*_: object) -> None:
+        raise OSError(errno.EBUSY, os.strerror(errno.EBUSY))
+
+    monkeypatch.setattr(Path, "rename", busy)
+    assert file.regain(b"a,b\n") is None
+    assert "cannot be gone on with: Device or resource busy" in str(file.problem)
+    file.append(b"1,2\n")
+    assert (tmp_path / "moved").read_bytes() == b"1,2\n"
+    file.close()
+
+
+def test_a_table_that_is_emptied_begins_with_its_head_again(tmp_path: Path) -> None:
+    """Rows that came until it was noticed stand aside, whole."""
+    path = tmp_path / "run"
+    imu = path / "log" / "imu.csv"
+    run(path, Meddled(some_messages(), 200, lambda: imu.write_bytes(b"")))
+    assert imu.read_bytes().startswith(b"time_s,")
+    aside = imu.with_name("imu.csv.aside").read_bytes()
+    assert aside.count(b"\n") + imu.read_bytes().count(b"\n") - 1 > 200
+    assert len(altered(path)) == 1
 
 
 def test_rows_that_wait_are_written_where_the_table_is_now(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import contextlib
 import errno
 import os
 import stat
+from itertools import count
 from pathlib import Path
 from typing import Final
 
@@ -50,20 +51,20 @@ class AppendFile:
     def regain(self, head: bytes = b"") -> str | None:
         """Go on in what is at the path now, where somebody removed, replaced or changed the file.
 
-        Return what was done to it, None where nothing was. What cannot be gone on with (a folder,
-        a file that does not begin with ``head``) is left alone: records then go on into the file
-        that was there before, and :attr:`problem` says so.
+        Return what was done to it, None where nothing was. What does not begin with ``head``, and
+        what is no file, is renamed, ``imu.csv.aside``. Where that cannot be either, records go on
+        into the file that was there before, and :attr:`problem` says so.
         """
         self.problem = None
         what = self._altered()
         if what is None:
             return None
         try:
+            if not _begins(self.path, head):
+                aside = _free_name(self.path)
+                self.path.rename(aside)
+                what += f", what was found there is {aside.name} now"
             file = _opened(self.path)
-            begin = os.pread(file, len(head), 0)
-            if not head.startswith(begin):
-                os.close(file)
-                raise OSError(errno.EEXIST, "something else is there now")
         except OSError as error:
             self.problem = f"{self.path} {what}, and cannot be gone on with: {error.strerror}"
             return None
@@ -114,6 +115,22 @@ class AppendFile:
             size = os.fstat(self._file).st_size
             self._is_torn = self._is_torn or size != self.size
             self.size = size
+
+
+def _begins(path: Path, head: bytes) -> bool:
+    """Return whether there is nothing, or a file that begins so."""
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):
+            return False
+    except FileNotFoundError:
+        return True
+    with path.open("rb") as stream:
+        return head.startswith(stream.read(len(head)))
+
+
+def _free_name(path: Path) -> Path:
+    names = (path.with_name(f"{path.name}.aside{k or ''}") for k in count())
+    return next(name for name in names if not name.exists())
 
 
 def _opened(path: Path) -> int:
