@@ -48,6 +48,16 @@ def gone(*names: str) -> Act:
     return act
 
 
+def replaced(name: str, make: Callable[[Path], object]) -> Act:
+    """Return what makes something else where a file or folder was."""
+
+    def act(path: Path) -> None:
+        gone(name)(path)
+        make(path / name)
+
+    return act
+
+
 def cut(name: str, share: float = 0.3) -> Act:
     """Return what cuts a file off."""
     return lambda path: os.truncate(path / name, int((path / name).stat().st_size * share))
@@ -66,7 +76,7 @@ def moved(name: str) -> Act:
 CHECKPOINTS = ("checkpoint.npz", "checkpoint.older.npz")
 AT_REST: dict[str, Act] = {
     "`log/` not mounted": gone("log"),
-    "`log/` an empty mount point": lambda p: (gone("log")(p), (p / "log").mkdir()),
+    "`log/` an empty mount point": replaced("log", os.mkdir),
     "`log/mission.toml` gone": gone("log/mission.toml"),
     "`log/mission.toml` empty": written("log/mission.toml", b""),
     "`log/mission.toml` of zeros": written("log/mission.toml", bytes(500)),
@@ -102,11 +112,8 @@ UNDER_WAY: dict[str, Act] = {
     "the whole run moved": moved("."),
     "`trajectory.csv` emptied": written("trajectory.csv", b""),
     "`log/imu.csv` emptied": written("log/imu.csv", b""),
-    "`beams.csv` replaced by a folder": lambda p: (gone("beams.csv")(p), (p / "beams.csv").mkdir()),
-    "`log/dvl.csv` replaced by a pipe": lambda p: (
-        gone("log/dvl.csv")(p),
-        os.mkfifo(p / "log" / "dvl.csv"),
-    ),
+    "`beams.csv` replaced by a folder": replaced("beams.csv", os.mkdir),
+    "`log/dvl.csv` replaced by a pipe": replaced("log/dvl.csv", os.mkfifo),
     "`log/dvl.csv` replaced by another table": written("log/dvl.csv", b"x\n"),
 }
 
