@@ -20,6 +20,9 @@ References
    Using Dynamic Covariance Scaling", ICRA 2013.
 .. [5] H. Yang, P. Antonante, V. Tzoumas, L. Carlone, "Graduated Non-Convexity for Robust Spatial
    Perception: From Non-Minimal Solvers to Global Outlier Rejection", RA-L 5, 2020.
+.. [6] J. T. Barron, "A General and Adaptive Robust Loss Function", CVPR 2019.
+.. [7] N. Chebrolu, T. Läbe, O. Vysotska, J. Behley, C. Stachniss, "Adaptive Robust Kernels for
+   Non-Linear Least Squares Problems", RA-L 6, 2021.
 """
 
 from __future__ import annotations
@@ -27,6 +30,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import ClassVar, Final, final
 
 import numpy as np
@@ -136,8 +140,94 @@ class GemanMcClureKernel(MEstimator):
 
 @final
 @dataclass(frozen=True)
+class GeneralKernel(MEstimator):
+    """The general loss [6]_: one shape from least squares to losses that end.
+
+    With ``x = t/width^2`` and ``b = |alpha - 2|``, times ``width^2`` so that ``f`` begins as
+    ``-t/2``::
+
+        f = -width^2 b/alpha ((x/b + 1)^(alpha/2) - 1),    weight = (x/b + 1)^(alpha/2 - 1)
+
+    ``alpha`` 2 is least squares, 1 Charbonnier's loss, 0 Cauchy's with ``sqrt(2) width``, -2 that
+    of Geman and McClure with ``2 width``, -infinity Welsch's.
+    """
+
+    name: ClassVar[str] = "general"
+    alpha: float = 0.0
+    """The shape, 2 or less; see :func:`fitted_shape`."""
+    width: float = 1.0
+    """Sigmas (the paper's c) up to which it is near to least squares; 1 is the noise as stated."""
+
+    def __post_init__(self) -> None:
+        require_positive("width", self.width)
+        if not self.alpha <= 2.0:
+            raise ValueError(f"alpha: expected a number of 2 or less, got {self.alpha}")
+
+    def similarity(self, t: Array, *, dim: int = 1) -> Array:  # noqa: ARG002
+        """Return minus the loss."""
+        return np.asarray(-(self.width**2) * _general_loss(t / self.width**2, self.alpha))
+
+    def _weight(self, t: Array, dim: int | Array) -> Array:  # noqa: ARG002
+        x, b = t / self.width**2, abs(self.alpha - 2.0)
+        if b == 0.0:
+            return np.ones_like(t)
+        if math.isinf(b):
+            return np.asarray(np.exp(-0.5 * x))
+        # (alpha/2 - 1) = -b/2
+        return np.asarray(np.exp(-0.5 * b * np.log1p(x / b)))
+
+
+def _general_loss(x: Array, alpha: float) -> Array:
+    """Return the general loss of squared residuals ``x`` in squared widths."""
+    if alpha == 2.0:
+        return np.asarray(0.5 * x)
+    if math.isinf(alpha):
+        return np.asarray(-np.expm1(-0.5 * x))
+    b = abs(alpha - 2.0)
+    if alpha == 0.0:
+        return np.log1p(x / b)
+    return np.asarray(b / alpha * np.expm1(0.5 * alpha * np.log1p(x / b)))
+
+
+SHAPES: Final = np.linspace(-10.0, 2.0, 121)
+"""Among which the shape is looked for [7]_; below -10 hardly anything changes."""
+TRUNCATED_AT: Final = 10.0
+"""Widths to which the density of a shape reaches [7]_: below zero it has no integral otherwise."""
+_WIDTHS = np.linspace(0.0, TRUNCATED_AT, 2001)
+
+
+@cache
+def log_partition(alpha: float) -> float:
+    """Return ``ln`` of the integral of ``exp(-loss)`` over residuals of up to 10 widths."""
+    return math.log(2.0 * float(np.trapezoid(np.exp(-_general_loss(_WIDTHS**2, alpha)), _WIDTHS)))
+
+
+def fitted_shape(t: Array, *, width: float = GeneralKernel.width) -> float:
+    """Return the shape under which residuals are most likely [7]_.
+
+    That of the least ``sum(loss) + N ln(width Z)``, with ``Z`` the truncated partition function:
+    what a heavy tail spares of large residuals it costs on the many small ones.
+
+    Parameters
+    ----------
+    t : (N,) squared whitened residuals; 2 without any.
+    width : as :attr:`GeneralKernel.width`.
+    """
+    x = np.asarray(t, dtype=np.float64) / width**2
+    costs = [
+        float(_general_loss(x, alpha).sum()) + len(x) * log_partition(alpha)
+        for alpha in SHAPES.round(1).tolist()
+    ]
+    # The last of equals: least squares where nothing is known.
+    return float(SHAPES.round(1)[len(costs) - 1 - int(np.argmin(costs[::-1]))])
+
+
+@final
+@dataclass(frozen=True)
 class TruncatedKernel(MEstimator):
     """Truncated least squares, ``f = -min(t, width^2)/2``, or a smoother surrogate of it.
+
+    Truncated for itself, without graduation, it is a hard gate on every measurement.
 
     The surrogate of graduated non-convexity [5]_ fills a band about ``width^2``::
 
@@ -146,6 +236,7 @@ class TruncatedKernel(MEstimator):
     For ``mu`` to 0 it is proportional to the absolute value, for ``mu`` to infinity truncated.
     """
 
+    name: ClassVar[str] = "truncated"
     width: float = WIDTH_OF_99_PERCENT
     """Sigmas beyond which a residual is an outlier (the paper's c bar); GTSAM's default."""
     mu: float = math.inf
@@ -191,7 +282,8 @@ class KernelChoice:
     make: Callable[..., Kernel]
     """Takes the parameter by its name, or nothing."""
     parameter: str = ""
-    """``dof``, ``width`` (sigmas) or ``phi`` (squared sigmas); empty where there is none."""
+    """``dof``, ``width`` (sigmas), ``phi`` (squared sigmas) or ``alpha``; empty where there is
+    none."""
 
     @property
     def default(self) -> float | None:
@@ -216,6 +308,8 @@ KERNELS: Final[Mapping[str, KernelChoice]] = {
     "cauchy": KernelChoice(CauchyKernel, "width"),
     "dcs": KernelChoice(DcsKernel, "phi"),
     "geman-mcclure": KernelChoice(GemanMcClureKernel, "width"),
+    "general": KernelChoice(GeneralKernel, "alpha"),
+    "truncated": KernelChoice(TruncatedKernel, "width"),
 }
 """Names as on the command line."""
 

@@ -5,6 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+
+from ssm_graph.base.frozen import Array
+from ssm_graph.mission.estimate import AidTable
 from ssm_graph.sensors.compass import HeadingErrors
 from ssm_graph.sensors.magnetometer import MagneticErrors
 from ssm_graph.sensors.standstill import Standstill
@@ -70,3 +74,10 @@ def with_every_aid(**changes: Any) -> SimulatedMission:
         others=(MagnetometerSettings(errors=IRON),),
     )
     return simulated(**({"duration_s": 30.0, "aids": aids} | changes))
+
+
+def weights_of(table: AidTable, name: str) -> Array:
+    """Return the weight (M,) of each measurement of an aid, of three components or of one."""
+    weight = table.weight[np.array(table.aid) == name]
+    step = 3 if name in ("GNSS", "USBL", "standstill", "magnetometer") else 1
+    return np.asarray(weight[::step])

@@ -31,7 +31,7 @@ from ssm_graph.engine.extras import Extra
 from ssm_graph.engine.states import NavigationStates, States, local_D_deviation
 from ssm_graph.filters.navigation.filter import Process
 from ssm_graph.filters.rules.ssm import SsmUpdate
-from ssm_graph.filters.rules.update import NOMINAL, Iterate, Runs
+from ssm_graph.filters.rules.update import Iterate, Runs
 from ssm_graph.graph.aids.depth import DEPTH_OFFSET, HeightTrack, height_on_the_way, height_track
 from ssm_graph.graph.aids.gnss import GNSS_DRIFT, GNSS_LEVER_ARM, GNSS_TIME_OFFSET
 from ssm_graph.mission.calibration import (
@@ -175,8 +175,9 @@ class _KeyframeModel:
         none = np.zeros(0, np.intp)
         self._depths = none if depths is None else np.flatnonzero(depths.keyframe == k)
         self._fixes = none if fixes is None else np.flatnonzero(fixes.keyframe == k)
-        n_nominal = min(len(self._depths), 1) + 3 * len(self._fixes)
-        self.group = np.append(np.arange(len(self.beams)), np.full(n_nominal, NOMINAL))
+        rows = [1] * min(len(self._depths), 1) + [3] * len(self._fixes)
+        of_aids = np.repeat(len(self.beams) + np.arange(len(rows)), rows)
+        self.group = np.append(np.arange(len(self.beams)), of_aids)
         self.present = np.ones((1, len(self.group)), bool)
         if len(self._depths):
             self._lead_depths(k, before)

@@ -14,7 +14,13 @@ from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.live.run.run_folder import RunFolder
 from ssm_graph.live.run.runner import Connections, Engine
 from ssm_graph.live.sockets.outputs import OutputFormat
-from ssm_graph.mission.estimate import BeamTable, CurrentTrack, Found, Trajectory
+from ssm_graph.mission.estimate import (
+    BeamTable,
+    CurrentTrack,
+    Found,
+    ProtectionTrack,
+    Trajectory,
+)
 from ssm_graph.mission.navigation import Event, Health, Navigation, Severity
 from ssm_graph.mission.run_status import LinkState, OutputStatus, SourceStatus
 from ssm_graph.mission.vehicle import Vehicle
@@ -33,6 +39,7 @@ class Delayed(NamedTuple):
     trajectory: Trajectory
     beams: BeamTable
     current: CurrentTrack | None = None
+    protection: ProtectionTrack | None = None
 
 
 class FakeEstimator:
@@ -244,5 +251,8 @@ def a_navigation(time_s: float, value: float = 0.5, **changes: Any) -> Navigatio
         "gyro_bias": np.zeros(3),
         "accel_bias": np.zeros(3),
         "beam_weights": np.array([1.0, 0.6, 0.02, np.nan]),
+        "protection_m": 2.5,
+        "protection_up_m": 0.75,
+        "innovation_ratios": {"DVL": 0.12, "GNSS": 0.7, "depth": 1.4},
     }
     return Navigation(**{**fields, **changes})

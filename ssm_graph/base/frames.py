@@ -37,9 +37,25 @@ R_FRD: Final[Mapping[BodyAxes, Array]] = {
 """Rotations to forward-right-down; each is its own inverse."""
 
 
+MATRIX_PLACES: Final = {3: [0, 4, 8], 6: [1, 2, 3, 5, 6, 7], 9: list(range(9))}
+"""Of so many numbers of a 3 x 3 matrix, the places among its nine, row by row."""
+
+
 def to_frd(vectors: Array, axes: BodyAxes) -> Array:
     """Return body vectors (..., 3) in forward-right-down."""
     return np.asarray(vectors @ R_FRD[axes].T)
+
+
+def matrix_to_frd(values: Array, axes: BodyAxes) -> Array:
+    """Return numbers of a matrix that takes body vectors to such, for axes FRD; its own inverse.
+
+    They are its diagonal (3,), the rows of what is beside it (6,), or all of its rows (9,).
+    """
+    place = MATRIX_PLACES[len(values)]
+    matrix = np.zeros(9)
+    matrix[place] = values
+    turn = R_FRD[axes]
+    return np.asarray((turn @ matrix.reshape(3, 3) @ turn.T).ravel()[place])
 
 
 def turned(vector: tuple[float, float, float], axes: BodyAxes) -> tuple[float, float, float]:

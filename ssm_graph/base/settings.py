@@ -16,7 +16,7 @@ from typing import Any, Final, TypeVar, cast, get_type_hints
 import numpy as np
 
 from ssm_graph.base.errors import ConfigError, nearest_hint
-from ssm_graph.base.frames import BodyAxes, to_frd
+from ssm_graph.base.frames import BodyAxes, matrix_to_frd, to_frd
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.units import in_unit, wrapped
 
@@ -49,6 +49,8 @@ class Key:
     """One unit of the file in SI."""
     is_body: bool = False
     """A vector in the body axes of the file."""
+    is_body_matrix: bool = False
+    """Numbers of a matrix in the body axes of the file, see :func:`matrix_to_frd`."""
     wraps: bool = False
     """An angle that is kept within half a turn."""
     beside: tuple[str, str] = ("", "")
@@ -158,6 +160,8 @@ class Settings:
             value = wrapped(value)
         if known.is_body:
             value = to_frd(value, self.axes)
+        if known.is_body_matrix:
+            value = matrix_to_frd(value, self.axes)
         return value if known.shape else float(value)
 
     def given(self) -> dict[str, float | Array]:

@@ -8,7 +8,7 @@ import gc
 import math
 import signal
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -30,7 +30,7 @@ from ssm_graph.cli.terminal import signals_to
 from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle, vehicle_of
 from ssm_graph.io.raw_log.rows import messages_of
-from ssm_graph.live.estimator import ONLINE, FixedLagSmoother
+from ssm_graph.live.estimator import ONLINE, FixedLagSmoother, IntegrityConfig
 from ssm_graph.live.protocols.decoder import Clock, Decoder
 from ssm_graph.live.protocols.json_messages import JsonDecoder
 from ssm_graph.live.protocols.nmea import NmeaDecoder, NmeaOptions
@@ -94,6 +94,7 @@ def add_parser(commands: Any, *, epilog: str) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="RUN", help="run folder")
     number_option(parser, "--lag", "SECONDS", "states so old are settled", ONLINE.lag_s)
     add_kernel_options(parser, KERNELS)
+    add_integrity(parser)
     add_connections(parser)
     add_rates(parser)
     parser.set_defaults(run=run)
@@ -113,14 +114,15 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     )
     kernel = kernel_of(arguments, KERNELS)
     lag = replace(ONLINE, lag_s=arguments.lag, kernel=kernel, similarity=kernel.published_with)
+    integrity = integrity_of(arguments)
     _check_sources(arguments, inputs)
     mission = None if arguments.replay is None else read_mission(arguments.replay)
     vehicle = _vehicle(arguments.vehicle, mission)
     with contextlib.ExitStack() as stack:
         show = stack.enter_context(StatusPage(errors))
         runner = Runner(
-            RunFolder(arguments.out, vehicle, _settings(lag)),
-            engine_of(vehicle, lag),
+            RunFolder(arguments.out, vehicle, _settings(lag, integrity)),
+            engine_of(vehicle, lag, integrity),
             _connector(stack, inputs, outputs, mission, speed),
             publisher=publisher,
             config=config,
@@ -138,13 +140,15 @@ def pass_over_imports() -> None:
     gc.freeze()
 
 
-def engine_of(vehicle: Vehicle, config: FixedLagConfig) -> Engine:
+def engine_of(
+    vehicle: Vehicle, config: FixedLagConfig, integrity: IntegrityConfig | None = None
+) -> Engine:
     """Return how the vehicle's estimator is made."""
 
     def restore(arrays: Mapping[str, Array], meta: Mapping[str, Any]) -> FixedLagSmoother:
-        return FixedLagSmoother.restore(vehicle, config, arrays, meta)
+        return FixedLagSmoother.restore(vehicle, config, arrays, meta, integrity=integrity)
 
-    return Engine(lambda: FixedLagSmoother(vehicle, config), restore)
+    return Engine(lambda: FixedLagSmoother(vehicle, config, integrity=integrity), restore)
 
 
 def _check_sources(arguments: argparse.Namespace, inputs: list[InputConfig]) -> None:
@@ -169,8 +173,11 @@ def _vehicle(path: Path | None, mission: Mission | None) -> Vehicle:
     return vehicle_of(mission)
 
 
-def _settings(config: FixedLagConfig) -> dict[str, Any]:
+def _settings(config: FixedLagConfig, integrity: IntegrityConfig) -> dict[str, Any]:
+    usual = IntegrityConfig()
+    asked = {k: v for k, v in asdict(integrity).items() if v != getattr(usual, k)}
     return {
+        **asked,
         "lag_s": config.lag_s,
         "kernel": str(config.kernel),
         "similarity": config.similarity.name.lower(),
@@ -266,6 +273,37 @@ def add_connections(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--nmea", action="append", metavar="ADDRESS", help="answers as GGA, VTG, HDT; repeatable"
+    )
+
+
+def add_integrity(parser: argparse.ArgumentParser) -> None:
+    """Add what the answer has to be protected within, and how often lanes may be wrong."""
+    group, usual = parser.add_argument_group("integrity"), IntegrityConfig()
+    number_option(group, "--protection", "M", "GOOD asks for a horizontal protection level below")
+    number_option(group, "--protection-up", "M", "and for a vertical one below")
+    number_option(
+        group,
+        "--false-alerts",
+        "PER_HOUR",
+        "sensors that are as stated are called contradicting so often",
+        usual.false_alerts_per_h,
+    )
+    number_option(
+        group,
+        "--missed-detection",
+        "P",
+        "probability that an unseen fault moves the answer out of its protection level",
+        usual.missed_detection,
+    )
+
+
+def integrity_of(arguments: argparse.Namespace) -> IntegrityConfig:
+    """Return what was asked for."""
+    asked = (arguments.protection, arguments.protection_up)
+    return IntegrityConfig(
+        arguments.false_alerts,
+        arguments.missed_detection,
+        *(math.inf if level is None else level for level in asked),
     )
 
 

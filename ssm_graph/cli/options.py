@@ -91,11 +91,12 @@ PARAMETERS: Final = {
     "dof": ("NUMBER", "degrees of freedom"),
     "width": ("SIGMAS", "residual at which a beam begins to be or is an outlier"),
     "phi": ("SIGMAS2", "squared residual up to which a beam counts in full"),
+    "alpha": ("SHAPE", "2 for least squares, 1, 0, -2 and less for losses that end ever sooner"),
 }
 """Metavariable and meaning of the kernels' parameters."""
 KERNEL_HELP: Final = (
     "log, sqrt, exp: similarity kernels; gaussian: least squares; huber, cauchy, dcs, "
-    "geman-mcclure: classical M-estimators"
+    "geman-mcclure: classical M-estimators; general: Barron's loss; truncated: a hard gate"
 )
 
 

@@ -58,6 +58,12 @@ def add_parser(commands: Any, *, epilog: str) -> None:
         help="instruments err as real ones of the grade: scale factors, misalignments, vibration, "
         "noise with tails that changes slowly (default: bias, walk and white noise as stated)",
     )
+    parser.add_argument(
+        "--calibrate",
+        action="store_true",
+        help="with --realistic, the mission states what its instruments err in: it asks for scale, "
+        "misalignment and g-sensitivity of its IMU, in the sizes of the grade, and for slow errors",
+    )
     parser.add_argument("--seed", type=int, default=0, help="same seed, same mission (default: 0)")
     add_mission_output(parser)
     parser.set_defaults(run=run)
@@ -73,6 +79,7 @@ def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
         "duration_s": arguments.duration,
         "imu_rate_hz": arguments.imu_rate,
         "realistic": arguments.realistic or None,
+        "calibrates": arguments.calibrate or None,
     }
     if arguments.beams is not None:
         told["dvl"] = replace(usual.dvl, mount=default_mount(arguments.beams))

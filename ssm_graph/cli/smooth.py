@@ -7,8 +7,8 @@ from typing import Any
 
 from rich.console import Console
 
-from factors.kernels import KERNELS, KernelChoice, TruncatedKernel
-from factors.similarity import Similarity
+from factors.kernels import KERNELS, GeneralKernel, KernelChoice, TruncatedKernel
+from factors.similarity import Kernel, Similarity
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.cli.options import (
     add_command,
@@ -28,8 +28,19 @@ from ssm_graph.smoothers.beam_faults import FaultSearch
 from ssm_graph.smoothers.mission import smooth
 
 GNC = "gnc-tls"
-CHOICES = {**KERNELS, GNC: KernelChoice(TruncatedKernel, "width")}
-"""Kernels by name; that of graduated non-convexity comes with a schedule of its own."""
+ADAPTIVE = "adaptive"
+
+
+def _general(width: float = GeneralKernel.width) -> Kernel:
+    return GeneralKernel(width=width)
+
+
+CHOICES = {
+    **KERNELS,
+    GNC: KernelChoice(TruncatedKernel, "width"),
+    ADAPTIVE: KernelChoice(_general, "width"),
+}
+"""Kernels by name; the last two come with schedules of their own."""
 
 
 def add_parser(commands: Any, *, epilog: str) -> None:
@@ -51,7 +62,10 @@ def add_parser(commands: Any, *, epilog: str) -> None:
 
 
 def _add_kernel_options(parser: argparse.ArgumentParser) -> None:
-    more = "; gnc-tls: truncated least squares by graduated non-convexity"
+    more = (
+        "; gnc-tls: truncated least squares by graduated non-convexity; adaptive: Barron's loss of "
+        "the shape under which the residuals are likeliest"
+    )
     add_kernel_options(parser, CHOICES, more=more)
     meaning = "start gnc-tls from least squares with every weight 1, as published, or from the "
     meaning += "gated forward pass (default: ones)"
@@ -102,6 +116,7 @@ def loop_from(arguments: argparse.Namespace) -> SmootherConfig:
         kernel=kernel_of(arguments, CHOICES),
         similarity=arguments.similarity,
         graduation=graduation,
+        adapt_shape=arguments.kernel == ADAPTIVE,
         fault_search=FaultSearch() if arguments.find_faults else None,
         adapt_noise=arguments.adapt_noise,
         max_iterations=arguments.max_iterations,

@@ -1,4 +1,4 @@
-"""Which kernel weighs the beams, pass by pass: a warm start, or graduated non-convexity.
+"""Which kernel weighs the beams, pass by pass: a warm start, its shape, graduated non-convexity.
 
 The warm schedule lets a benign kernel come near before the one asked for takes over. Graduated
 non-convexity comes to truncated least squares by way of ever less convex surrogates [1]_: with a
@@ -23,7 +23,7 @@ from typing import NamedTuple, final
 
 import numpy as np
 
-from factors.kernels import TruncatedKernel
+from factors.kernels import GeneralKernel, TruncatedKernel, fitted_shape
 from factors.similarity import WEIGHT_FLOOR, GaussianKernel, Kernel
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
@@ -73,6 +73,8 @@ class Anderson(NamedTuple):
 class Schedule(ABC):
     """What weighs the beams in one pass of a solution; each pass has its own."""
 
+    wanted: Kernel
+    """Of the answer."""
     kernel: Kernel
     """In force in the pass."""
 
@@ -130,6 +132,56 @@ class WarmSchedule(Schedule):
     def may_end(self, settled: Array) -> bool:  # noqa: ARG002
         """Return whether the kernel in force is the one asked for."""
         return self.kernel == self.wanted
+
+
+MOST_SHAPES = 20
+"""Passes in which the shape may change; from then on it stays, so that weights can settle."""
+
+
+@final
+@dataclass(frozen=True, slots=True)
+class AdaptiveSchedule(Schedule):
+    """A warm kernel until the updates are near, then the general loss of the likeliest shape [1]_.
+
+    Shape and solution take turns. A shape that has come twice in a row is kept.
+
+    References
+    ----------
+    .. [1] N. Chebrolu, T. Läbe, O. Vysotska, J. Behley, C. Stachniss, "Adaptive Robust Kernels for
+       Non-Linear Least Squares Problems", RA-L 6, 2021.
+    """
+
+    wanted: GeneralKernel
+    """Of the last shape"""
+    kernel: Kernel
+    shapes: int = 0
+    """How often the shape was looked for"""
+    fixed: WarmSchedule | None = None
+    """Once the shape is found"""
+
+    def first_weights(self, gated: Array) -> Array:
+        """Return the weights of the forward pass."""
+        return gated
+
+    def after(
+        self, used: Array, settled: Array, *, t: Array, update_sigmas: float
+    ) -> tuple[Schedule, Array]:
+        """Return the weights of the likeliest shape."""
+        if self.fixed is not None:
+            now, weights = self.fixed.after(used, settled, t=t, update_sigmas=update_sigmas)
+            assert isinstance(now, WarmSchedule)
+            return replace(self, fixed=now), weights
+        if update_sigmas >= NEAR_SIGMAS and self.shapes == 0:
+            return self, settled
+        shape = fitted_shape(t, width=self.wanted.width)
+        kernel = replace(self.wanted, alpha=shape)
+        is_found = kernel == self.kernel or self.shapes == MOST_SHAPES
+        fixed = WarmSchedule(kernel, kernel) if is_found else None
+        return AdaptiveSchedule(kernel, kernel, self.shapes + 1, fixed), kernel.weight(t)
+
+    def may_end(self, settled: Array) -> bool:  # noqa: ARG002
+        """Return whether the shape is found."""
+        return self.fixed is not None
 
 
 class GncStart(Enum):

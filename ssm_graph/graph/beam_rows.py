@@ -22,6 +22,8 @@ from factors.dvl_calibration import (
     no_way_back,
     turned_instrument,
 )
+from factors.imu_errors import ACCEL, GYRO, SIZE, matrices
+from factors.so3 import times
 from factors.water_track import ThroughWater, through_water
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
@@ -38,6 +40,7 @@ from ssm_graph.mission.calibration import (
     DVL_SCALE,
     DVL_TIME_OFFSET,
 )
+from ssm_graph.mission.imu_variables import columns_of_errors, imu_errors
 from ssm_graph.mission.problem import Beams
 
 LEAST_SHARE = 0.5
@@ -125,6 +128,12 @@ class PreparedBeams(NamedTuple):
     time_offset: Array
     bias: Array | None
     """(6,) of all pings; None where each has that of its keyframe"""
+    errors: tuple[Array, Array]
+    """Of the inertial sensors, see :func:`ssm_graph.mission.imu_variables.imu_errors`"""
+    constants: Array
+    """(C,)"""
+    read: Motion | None
+    """(P, ...) what these read, as it is; None as ``back``"""
 
 
 class CalibratedBeams:
@@ -134,6 +143,7 @@ class CalibratedBeams:
         self._beams, self._extras, self._omega_ie_n = beams, extras, frame.omega_ie_n
         self._water = WaterRows(beams, extras, frame)
         self._ping_keyframe = beams.keyframe[np.flatnonzero(np.diff(beams.ping, prepend=-1))]
+        self._columns = columns_of_errors(extras)
         self._share = {DVL_TIME_OFFSET: 1.0, DVL_LEVER_ARM: 1.0}
 
     def judge(self, at: RowStates, bias: Array) -> None:
@@ -171,14 +181,17 @@ class CalibratedBeams:
         """Return what beams share; ``bias`` is (K, 6) of the keyframes, or (6,) of all."""
         beams, extras = self._beams, self._extras
         mounting, late_s = self.instrument_of(walks, constants)
-        back, motion = None, beams.motion
+        back, read, motion = None, None, beams.motion
+        errors = imu_errors(extras, np.zeros(extras.n_walks), constants)
         if DVL_TIME_OFFSET in extras and motion is not None:
             of_ping = bias if bias.ndim == 1 else bias[self._ping_keyframe]
-            back = led_back(motion.at(float(late_s)), of_ping, late_s)
+            read = motion.at(float(late_s))
+            back = led_back(_taken_off(errors[0], read), of_ping, late_s)
         instrument = turned_instrument(
             mounting, beams.beam_b, R_bd=beams.R_bd, lever_arm_b=beams.lever_arm_b
         )
-        return PreparedBeams(instrument, back, mounting, late_s, bias if bias.ndim == 1 else None)
+        of_all = bias if bias.ndim == 1 else None
+        return PreparedBeams(instrument, back, mounting, late_s, of_all, errors, constants, read)
 
     def instrument_of(self, walks: Array, constants: Array) -> tuple[Array, Array]:
         """Return mounting (3,) and time offset (): what it takes long to prepare for.
@@ -216,6 +229,8 @@ class CalibratedBeams:
             jacobian[np.arange(len(jacobian)), first + beams.beam[rows]] = residual.error_D_scale
         if through is not None:
             self._water.fill(jacobian, residual.error_D_velocity_n, through)
+        if len(self._columns):
+            jacobian[:, self._columns] = self._by_errors(residual, at, prepared, rows)
         error = residual.error
         if DVL_DRIFT in extras:
             # In instrument axes, and on top of what is read: no scale, no lever arm.
@@ -237,7 +252,11 @@ class CalibratedBeams:
     ) -> CalibratedResidual:
         beams = self._beams
         if prepared.back is None:
-            back = no_way_back(beams.gyro_b[rows])
+            gyro_b = beams.gyro_b[rows]
+            if len(self._columns):
+                errors, _ = self._errors_at(at, prepared)
+                gyro_b = gyro_b - times(matrices(errors)[0], gyro_b)
+            back = no_way_back(gyro_b)
         else:
             back = _of_pings(prepared.back, beams.ping[rows])
         lever = self._share[DVL_LEVER_ARM] * self._value(DVL_LEVER_ARM, at.walks, at.constants, 3)
@@ -256,11 +275,37 @@ class CalibratedBeams:
             g_n=at.g_n,
         )
 
+    def _errors_at(self, at: RowStates, prepared: PreparedBeams) -> tuple[Array, Array]:
+        """Return the errors of the inertial sensors, (M, 27) or (27,), and their slope."""
+        if prepared.bias is not None:
+            return prepared.errors
+        return imu_errors(self._extras, at.walks, at.constants)
+
+    def _by_errors(
+        self, residual: CalibratedResidual, at: RowStates, prepared: PreparedBeams, rows: slice
+    ) -> Array:
+        """Return derivatives (M, E) by errors of the inertial sensors: biases that are known.
+
+        What gyros read of the force, 1e-5 m/s at a lever arm of 1 m, is left out.
+        """
+        gyro_b, n_rows = self._beams.gyro_b[rows], len(residual.error)
+        found = np.zeros((n_rows, SIZE))
+        if prepared.read is not None:
+            ping = self._beams.ping[rows]
+            gyro_b, accel_b = prepared.read.gyro_b[ping], prepared.read.accel_b[ping]
+            block = residual.error_D_accel_bias[..., None] * accel_b[:, None]
+            found[:, ACCEL] = block.reshape(n_rows, 9)
+        found[:, GYRO] = (residual.error_D_gyro_bias[..., None] * gyro_b[:, None]).reshape(-1, 9)
+        _, slope = self._errors_at(at, prepared)
+        return np.asarray((found[:, None] @ slope)[:, 0])
+
     def _since(self, at: RowStates, prepared: PreparedBeams) -> Array:
         """Return how far the variables (E,) are from what the beams are prepared for."""
         extras, since = self._extras, np.zeros(self._extras.width)
         assert prepared.bias is not None
         since[STATE_DIM - 6 : STATE_DIM] = at.bias - prepared.bias
+        moved_on = np.concatenate([at.walks, at.constants - prepared.constants])
+        since[self._columns] = moved_on[self._columns - STATE_DIM]
         mounting, late_s = self.instrument_of(at.walks, at.constants)
         if DVL_MOUNTING in extras:
             since[extras.columns(DVL_MOUNTING)] = mounting - prepared.mounting
@@ -293,6 +338,16 @@ def _share_of_motion(
     power = float(np.mean(whole**2))
     share = 1.0 - noise / power if power > 0.0 else 0.0
     return share if share > LEAST_SHARE else 0.0
+
+
+def _taken_off(errors: Array, read: Motion) -> Motion:
+    """Return what was read about pings without errors (27,) of the sensors, but of the force."""
+    if not errors.any():
+        return read
+    W, A, _ = matrices(errors)
+    of_gyro = (W, A, W, A, W)
+    columns = (own - own @ M.T for own, M in zip(read, of_gyro, strict=True))
+    return Motion(*columns)
 
 
 def _of_pings(back: Back, ping: NDArray[np.intp]) -> Back:

@@ -7,34 +7,37 @@ the weights of one ping settle before the next.
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from factors.similarity import Kernel
-from factors.so3 import cross
-from ssm_graph.base.earth import SEMI_MAJOR_AXIS
 from ssm_graph.base.errors import SolverError
 from ssm_graph.base.frozen import Array, ShortRepr
 from ssm_graph.base.stepwise import Steps, finished
 from ssm_graph.engine.error_state import POSITION, ROTATION, STATE_DIM, VELOCITY
+from ssm_graph.engine.extras import Extras
 from ssm_graph.engine.states import NavigationStates, States
 from ssm_graph.graph.aids.aid import RowStates
 from ssm_graph.graph.beacon_start import find_beacons
 from ssm_graph.graph.beam_rows import BeamRows, linearize_beams
 from ssm_graph.graph.first_weights import met_weights, settle_weights, updated_trust
-from ssm_graph.graph.forward_pass import ForwardAids, ForwardExtras
+from ssm_graph.graph.forward_pass import AidsOfKeyframe, ForwardAids, ForwardExtras
 from ssm_graph.graph.inertial_rows import InertialRows
 from ssm_graph.graph.measurements import Measurements
 from ssm_graph.imu.preintegration import gravity_gradient, gtsam_gravity
-from ssm_graph.mission.problem import NO_EXTRAS, Problem, start_of
+from ssm_graph.mission.imu_variables import GYRO_SCALE
+from ssm_graph.mission.problem import Problem, start_of
 
 LOCKED_OUT_PINGS = 3
 """After so many pings in a row without one good beam the prediction is doubted instead."""
 ANCHOR_SIGMA = 1.0
 """m/s; after a silence that leaves the beams this uncertain they set the velocity anew."""
+UNSURE_SCALE = 0.1
+"""Prior sigma of the gyros' scale from which on a turn may go anywhere."""
+BEGINS = (0.0, -0.5, 0.5, -1.0, 1.0)
+"""Prior sigmas of it that passes begin at then."""
 AID_ROUNDS = 5
 """How often the aids of a keyframe are linearised anew."""
 AID_REACH = 0.1
@@ -65,14 +68,33 @@ def first_values(problem: Problem, *, kernel: Kernel) -> FirstValues:
 
 
 def first_values_steps(problem: Problem, *, kernel: Kernel) -> Steps[FirstValues]:
-    """Make :func:`first_values` in steps."""
-    try:
-        first = yield from _ForwardPass(problem, kernel).run_steps()
-    except np.linalg.LinAlgError as error:
-        raise SolverError(f"the first pass ran away ({error}): {_HINT}") from error
+    """Make :func:`first_values` in steps.
+
+    Where the scale of the gyros is hardly known, the first turn bends everything. So passes are
+    made from scales half a prior sigma apart, each with half of it, and the one that leaves the
+    beams the most weight is taken.
+    """
+    passes, ran_away = [], None
+    for begin in _begins(problem.extras):
+        try:
+            passes.append((yield from _ForwardPass(problem, kernel, begin).run_steps()))
+        except np.linalg.LinAlgError as error:
+            ran_away = error
+    if not passes:
+        raise SolverError(f"the first pass ran away ({ran_away}): {_HINT}") from ran_away
+    first = max(passes, key=lambda own: float(own.weights.sum()))
     if not (np.all(np.isfinite(first.states.p_n)) and np.all(np.isfinite(first.states.v_n))):
         raise SolverError(f"the first pass became non-finite: {_HINT}")
     return first
+
+
+def _begins(extras: Extras) -> tuple[float | None, ...]:
+    """Return the prior sigmas of the gyros' scale that passes begin at; None for one as it is."""
+    if GYRO_SCALE in extras:
+        own = extras.columns(GYRO_SCALE).start - STATE_DIM
+        if extras.sigma[own] > UNSURE_SCALE:
+            return BEGINS
+    return (None,)
 
 
 _HINT = "check units, axes and noise of [imu], and the initial state with its sigmas"
@@ -92,19 +114,23 @@ class _Rows(NamedTuple):
 class _ForwardPass:
     """A filter on the same inertial factors as the graph, in covariance form."""
 
-    def __init__(self, problem: Problem, kernel: Kernel) -> None:
+    def __init__(self, problem: Problem, kernel: Kernel, scale: float | None = None) -> None:
+        """Begin at so many prior sigmas of the gyros' scale, known to half of one; None for 0."""
         self.problem = problem
         self.kernel = kernel
         start = start_of(problem)
         self.R_nb, self.p_n, self.v_n, self.bias = start[:4]
         self.extras = ForwardExtras(problem) if problem.extras else None
         self.P = self.extras.begin(start.covariance) if self.extras else start.covariance
-        self.no_rows = _Rows(np.zeros((0, len(self.P))), np.zeros(0), np.zeros(0))
-        self.inertial = InertialRows(problem.frame, NO_EXTRAS)
-        self.aids = Measurements.weighted(problem)
+        if self.extras and scale is not None:
+            self.P = self.extras.begin_scale(self.P, scale)
+        self.inertial = InertialRows(problem.frame, problem.extras)
+        self.aids = Measurements.of_problem(problem)
         self.met = ForwardAids(self.aids)
         self.weights = np.ones(len(problem.beams.speed))
         self.trust = np.ones(problem.beams.n_beams)
+        self.before: RowStates | None = None
+        """The state at the keyframe before"""
         self.without_beam = 0
         self.n_doubts = 0
         self.gravity_at = np.full(3, np.inf)
@@ -113,14 +139,14 @@ class _ForwardPass:
 
     def run_steps(self) -> Steps[FirstValues]:
         problem = self.problem
-        rows = _RowsByKeyframe(problem)
+        first_row = np.searchsorted(problem.beams.keyframe, np.arange(problem.n_keyframes + 1))
         history: list[tuple[Array, ...]] = []
         for k in range(problem.n_keyframes):
             if k > 0:
+                self.before = self._here
                 self._predict(k - 1)
-            self._update_fix(rows.fix[k])
             self._update_aids(k)
-            self._update_dvl(rows.beam[k], self._depth_row(rows.depth[k], k))
+            self._update_dvl(slice(*first_row[k : k + 2]))
             walks = (self.extras.walks,) if self.extras else ()
             history.append((self.R_nb, self.p_n, self.v_n, self.bias, *walks))
             yield 0.6
@@ -136,10 +162,12 @@ class _ForwardPass:
         interval = self.problem.chain.intervals.take(np.s_[k : k + 1])
         self._g_n = self._gravity(self.p_n + 0.5 * interval.span_s * self.v_n)
         here = States.of(*(column[None] for column in self._state))
+        if self.extras:
+            here = here._replace(walks=self.extras.walks[None], constants=self.extras.constants)
         ahead = self.inertial.predict(interval, here, g_n=self._g_n)
         self.P = ahead.covariance(self.P)
         if self.extras:
-            self.extras.predict(k, self.P)
+            self.extras.keep(ahead.states.walks[0], self.extras.constants)
         self.R_nb, self.p_n, self.v_n = (column[0] for column in ahead.states[:3])
 
     def _gravity(self, p_n: Array) -> Array:
@@ -151,64 +179,51 @@ class _ForwardPass:
             self.gravity, self.gravity_D_p = gtsam_gravity(frame, p_n), gravity_gradient(frame, p_n)
         return np.asarray(self.gravity + self.gravity_D_p @ moved)
 
-    def _update_fix(self, rows: range) -> None:
-        fixes = self.problem.fixes
-        for i in rows:
-            assert fixes is not None
-            if self.extras:
-                innovation, H = self.extras.fix_rows(i, self._state, self._g_n)
-                self._correct(H, innovation, H @ self.P @ H.T + fixes.covariance_n[i])
-                continue
-            H = np.zeros((3, STATE_DIM))
-            H[:, ROTATION] = cross(fixes.lever_arm_b, self.R_nb)
-            H[:, POSITION] = self.R_nb
-            innovation = fixes.position_n[i] - self.p_n - self.R_nb @ fixes.lever_arm_b
-            self._correct(H, innovation, H @ self.P @ H.T + fixes.covariance_n[i])
-
     def _update_aids(self, k: int) -> None:
         """Correct by the weighted aids of one keyframe, together, linearised where they lead to.
 
-        An uncertain position bends the distances to it by more than their sigmas.
+        An uncertain position bends the distances to it by more than their sigmas. Fixes or depths
+        that have contradicted the prediction several times in a row are believed instead.
         """
         if not self.met.has(k):
             return
+        self.met.lead(k, self.before, self._here)
+        met, innovation, weights = self._weigh_aids(k)
+        believed = self.met.locked_out(met, innovation, weights)
+        if np.any(believed):
+            offset = self.met.common_offset(met, believed)
+            if offset is None:
+                weights = np.where(believed, 1.0, weights)
+                self.met.weights[met.numbers] = weights
+            else:
+                A = np.linalg.pinv(met.H[believed[met.measurement], POSITION])
+                self.P[POSITION, POSITION] += offset**2 * (A @ A.T)
+                met, innovation, weights = self._weigh_aids(k)
+        S = met.H @ self.P @ met.H.T + np.diag(1.0 / weights[met.measurement])
+        self._correct(met.H, innovation, S)
+
+    def _weigh_aids(self, k: int) -> tuple[AidsOfKeyframe, Array, Array]:
+        """Return the aids of a keyframe, their innovation (R,), and their weights (m,)."""
         step = np.zeros(len(self.P))
         for _ in range(AID_ROUNDS):
             met = self.met.at(k, self._moved(step))
             innovation = met.innovation + met.H @ step
             predicted = met.H @ self.P @ met.H.T
             weights = self.met.weigh(met, innovation, predicted, self.kernel)
-            S = predicted + np.diag(1.0 / weights)
+            S = predicted + np.diag(1.0 / weights[met.measurement])
             last, step = step, self.P @ met.H.T @ np.linalg.solve(S, innovation)
             if np.abs(met.H @ (step - last)).max() < AID_REACH:
                 break
-        self._correct(met.H, innovation, S)
+        return met, innovation, weights
 
-    def _depth_row(self, rows: range, k: int) -> _Rows:
-        depths = self.problem.depths
-        if depths is None or len(rows) == 0:
-            return self.no_rows
-        i = rows[-1]
-        late = self.problem.keyframe_s[k] - depths.time_s[i]
-        x, y, z = self.p_n + self.R_nb @ depths.lever_arm_b
-        height = z + self.problem.frame.height + (x * x + y * y) / (2.0 * SEMI_MAJOR_AXIS)
-        H = np.zeros((1, STATE_DIM))
-        H[0, ROTATION] = cross(depths.lever_arm_b, self.R_nb[2])
-        H[0, POSITION] = self.R_nb[2]
-        innovation = float(-depths.depth[i] + late * self.v_n[2] - height)
-        variance = depths.sigma**2 + late**2 * (self.P[8, 8] + 1e-2)
-        if self.extras:
-            H, innovation = self.extras.depth_row(H, innovation)
-        return _Rows(H, np.array([innovation]), np.array([variance]))
-
-    def _update_dvl(self, rows: slice, depth: _Rows) -> None:
-        """Correct by the beams of one ping and a depth, together."""
-        beams = self._beam_rows(rows) if rows.start < rows.stop else self.no_rows
-        H, innovation, variance = (np.concatenate(pair) for pair in zip(beams, depth, strict=True))
-        if len(H):
-            S = H @ self.P @ H.T
-            S.flat[:: len(S) + 1] += variance
-            self._correct(H, innovation, S)
+    def _update_dvl(self, rows: slice) -> None:
+        """Correct by the beams of one ping, together."""
+        if rows.start == rows.stop:
+            return
+        H, innovation, variance = self._beam_rows(rows)
+        S = H @ self.P @ H.T
+        S.flat[:: len(S) + 1] += variance
+        self._correct(H, innovation, S)
 
     def _beam_rows(self, rows: slice) -> _Rows:
         """Return the beams of one ping with the variances that their weights give them."""
@@ -235,6 +250,11 @@ class _ForwardPass:
     @property
     def _state(self) -> tuple[Array, Array, Array, Array]:
         return self.R_nb, self.p_n, self.v_n, self.bias
+
+    @property
+    def _here(self) -> RowStates:
+        extra = (self.extras.walks, self.extras.constants) if self.extras else (_NONE, _NONE)
+        return RowStates(*self._state, *extra, self.problem.extras, self._g_n)
 
     def _linearized(self, rows: slice) -> BeamRows:
         if self.extras:
@@ -289,20 +309,3 @@ class _ForwardPass:
         R_nb, p_n, v_n, bias = (column[0] for column in here.moved(step[None, :STATE_DIM]))
         walks, constants = self.extras.moved(step[STATE_DIM:]) if self.extras else (_NONE, _NONE)
         return RowStates(R_nb, p_n, v_n, bias, walks, constants, self.problem.extras, self._g_n)
-
-
-class _RowsByKeyframe:
-    """Which rows of each measurement table belong to each keyframe."""
-
-    def __init__(self, problem: Problem) -> None:
-        n = problem.n_keyframes
-        self.beam = [slice(a, b) for a, b in _bounds(problem.beams.keyframe, n)]
-        fixes = problem.fixes.keyframe if problem.fixes else np.zeros(0, np.intp)
-        depths = problem.depths.keyframe if problem.depths else np.zeros(0, np.intp)
-        self.fix = [range(a, b) for a, b in _bounds(fixes, n)]
-        self.depth = [range(a, b) for a, b in _bounds(depths, n)]
-
-
-def _bounds(keyframe: np.ndarray[tuple[int], np.dtype[np.intp]], n: int) -> list[tuple[int, int]]:
-    edges = np.searchsorted(keyframe, np.arange(n + 1)).tolist()
-    return list(itertools.pairwise(edges))

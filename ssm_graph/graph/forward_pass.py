@@ -16,20 +16,28 @@ from numpy.typing import NDArray
 
 from factors.similarity import Kernel
 from ssm_graph.base.frozen import Array
-from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.graph.aids.aid import Aid, RowStates
-from ssm_graph.graph.aids.depth import DEPTH_OFFSET
+from ssm_graph.graph.aids.depth import DepthMeans
+from ssm_graph.graph.aids.gnss import Fixes
 from ssm_graph.graph.aids.ranges import Ranges
 from ssm_graph.graph.beam_rows import BeamRows, CalibratedBeams, PreparedBeams
-from ssm_graph.graph.first_weights import settled_weights
+from ssm_graph.graph.first_weights import GATE, settled_weights
 from ssm_graph.graph.measurements import Measurements
 from ssm_graph.mission.calibration import CURRENTS
+from ssm_graph.mission.imu_variables import GYRO_SCALE
 from ssm_graph.mission.problem import Problem
+
+REFUSED = 0.01
+"""A smaller weight is none."""
+LOCKED_OUT_PLACES = 3
+"""After so many fixes, or depths, in a row without weight the prediction is doubted instead."""
 
 
 class AidsOfKeyframe(NamedTuple):
     """The measurements of one keyframe, linearised at one state: R components of m of them."""
 
+    aids: list[Aid]
+    """(m,) of one measurement each"""
     numbers: list[int]
     """(m,) among all measurements"""
     measurement: NDArray[np.intp]
@@ -46,6 +54,8 @@ class ForwardAids:
     def __init__(self, aids: Measurements) -> None:
         self.weights = np.ones(len(aids))
         """(M,) of all measurements, as far as they have been met"""
+        self._refused: dict[str, list[Array]] = {}
+        """Innovations of the last measurements of place that were refused in a row, by name"""
         self._at: dict[int, list[tuple[Aid, int]]] = {}
         number = 0
         for aid in aids.all:
@@ -59,11 +69,18 @@ class ForwardAids:
         """Return whether a keyframe has measurements to meet."""
         return k in self._at
 
+    def lead(self, k: int, before: RowStates | None, state: RowStates) -> None:
+        """Lead those of a keyframe along the way from the state before to that of it."""
+        way = None if before is None else before.rows_of_one()
+        own = state.rows_of_one()
+        self._at[k] = [(aid.led_along(way, own), number) for aid, number in self._at[k]]
+
     def at(self, k: int, state: RowStates) -> AidsOfKeyframe:
         """Return the measurements of a keyframe that has some, linearised at a state."""
         here, own = self._at[k], state.rows_of_one()
         errors, jacobians = zip(*(aid.whitened(own) for aid, _ in here), strict=True)
         return AidsOfKeyframe(
+            aids=[aid for aid, _ in here],
             numbers=[number for _, number in here],
             measurement=np.repeat(np.arange(len(here)), [aid.dim for aid, _ in here]),
             innovation=-np.concatenate(errors, axis=1)[0],
@@ -73,14 +90,46 @@ class ForwardAids:
     def weigh(
         self, met: AidsOfKeyframe, innovation: Array, predicted: Array, kernel: Kernel
     ) -> Array:
-        """Return the weights (R,) of the components, and keep those of their measurements.
+        """Return the weights (m,) of the measurements, and keep them.
 
         ``innovation`` (R,) is that at the prediction, ``predicted`` (R, R) the covariance of what
         was predicted, both in the measurements' sigmas.
         """
         weights = settled_weights(innovation, predicted, met.measurement, kernel)
         self.weights[met.numbers] = weights
-        return weights[met.measurement]
+        return weights
+
+    def locked_out(
+        self, met: AidsOfKeyframe, innovation: Array, weights: Array
+    ) -> NDArray[np.bool_]:
+        """Return which measurements (m,) of place have been refused too often in a row.
+
+        ``innovation`` (R,) is that at the prediction, ``weights`` (m,) what came of them.
+        """
+        believed = np.zeros(len(weights), bool)
+        for i, aid in enumerate(met.aids):
+            if not isinstance(aid, Fixes | DepthMeans):
+                continue
+            refused = self._refused.setdefault(aid.name, [])
+            if weights[i] >= REFUSED:
+                refused.clear()
+                continue
+            refused.append(innovation[met.measurement == i])
+            believed[i] = len(refused) >= LOCKED_OUT_PLACES
+        return believed
+
+    def common_offset(self, met: AidsOfKeyframe, believed: NDArray[np.bool_]) -> float | None:
+        """Return how far off the prediction those agree it to be, in sigmas; None if they do not.
+
+        Where they do, it is the place that was wrong; otherwise it may be what led there. What was
+        remembered of them is forgotten.
+        """
+        largest, agree = 0.0, True
+        for i in np.flatnonzero(believed):
+            refused = np.array(self._refused.pop(met.aids[i].name))
+            agree &= bool(np.ptp(refused, axis=0).max() < GATE * np.sqrt(2.0))
+            largest = max(largest, float(np.abs(refused).max()))
+        return largest if agree else None
 
 
 REACH_S = 2e-2
@@ -97,23 +146,24 @@ class ForwardExtras:
         extras = problem.extras
         self.walks, self.constants = np.zeros(extras.n_walks), np.zeros(extras.n_constants)
         self._beams = CalibratedBeams(problem.beams, extras, problem.frame)
-        self._walk_factor, self._walk_sigma = extras.transitions(np.diff(problem.keyframe_s))
         self._last: PreparedBeams | None = None
 
     def begin(self, covariance: Array) -> Array:
         """Return the covariance (E, E) at the start from that of the error state."""
         return self._problem.extras.behind(covariance)
 
-    def predict(self, k: int, covariance: Array) -> None:
-        """Let the walks go on from keyframe ``k``, in place."""
-        if len(self.walks) == 0:
-            return
-        factor, end = self._walk_factor[k], STATE_DIM + len(self.walks)
-        self.walks = factor * self.walks
-        covariance[STATE_DIM:end] *= factor[:, None]
-        covariance[:, STATE_DIM:end] *= factor
-        own = np.arange(STATE_DIM, end)
-        covariance[own, own] += self._walk_sigma[k] ** 2
+    def begin_scale(self, covariance: Array, sigmas: float) -> Array:
+        """Take the gyros' scale to be so many prior sigmas off, and return what is known then.
+
+        ``covariance`` (E, E) is that at the start; of the scale half a sigma is left.
+        """
+        extras = self._problem.extras
+        own = extras.columns(GYRO_SCALE)
+        at = slice(own.start - extras.state_dim, own.stop - extras.state_dim)
+        self.constants[at] = sigmas * np.sqrt(np.diagonal(covariance)[own])
+        halved = covariance.copy()
+        halved[own, own] *= 0.25
+        return halved
 
     def keep(self, walks: Array, constants: Array) -> None:
         """Take the values (s,) and (C,) that a correction led to."""
@@ -140,27 +190,6 @@ class ForwardExtras:
         """Linearise the beams of one ping, with the columns of all variables."""
         at = RowStates(*state, self.walks, self.constants, self._problem.extras, g_n)
         return self._beams.rows(at, self._prepared(at.bias), rows)
-
-    def fix_rows(
-        self, i: int, state: tuple[Array, Array, Array, Array], g_n: Array
-    ) -> tuple[Array, Array]:
-        """Return innovation (3,), m, and Jacobian (3, E) of one fix."""
-        fixes = self._problem.fixes
-        assert fixes is not None
-        at = RowStates(*state, self.walks, self.constants, self._problem.extras, g_n)
-        error, jacobian = fixes.take(slice(i, i + 1)).measured(at.rows_of_one())
-        return -error[0], jacobian[0]
-
-    def depth_row(self, H: Array, innovation: float) -> tuple[Array, float]:
-        """Return a depth's row (1, E) and innovation, m, from those of the error state."""
-        extras = self._problem.extras
-        wide = np.zeros((1, extras.width))
-        wide[:, :STATE_DIM] = H
-        if DEPTH_OFFSET in extras:
-            wide[:, extras.columns(DEPTH_OFFSET)] = -1.0
-            value = extras.value(DEPTH_OFFSET, self.walks, self.constants, default=np.zeros(1))
-            innovation += float(value[0])
-        return wide, innovation
 
     def _prepared(self, bias: Array) -> PreparedBeams:
         """Return what beams share, made anew where the instrument has moved too far."""

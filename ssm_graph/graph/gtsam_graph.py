@@ -20,7 +20,7 @@ from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import POSITION, ROTATION, VELOCITY
 from ssm_graph.engine.states import States
-from ssm_graph.graph.aids.depth import DepthMeans, Depths
+from ssm_graph.graph.aids.depth import DepthMeans
 from ssm_graph.graph.aids.gnss import Fixes
 from ssm_graph.graph.aids.heading import Headings
 from ssm_graph.graph.aids.ranges import Ranges
@@ -46,7 +46,7 @@ def gtsam_graph(
     problem : the mission, with no calibration asked for.
     states : of all keyframes, for example those of :func:`warm_start`.
     weights : (M,) of the beams; all one when left out.
-    aid_weights : of the further aids' measurements, in their order; all one when left out.
+    aid_weights : of the aids' measurements, as :func:`aid_graph` takes them.
 
     Raises
     ------
@@ -59,7 +59,7 @@ def gtsam_graph(
             f"gtsam_graph: expected a problem of keyframes alone, got one that estimates {names}: "
             "take their prior sigmas, or the pings off the water, out of the mission"
         )
-    graph = graph_without_beams(problem, states)
+    graph = graph_without_beams(problem, states, aid_weights)
     beams = problem.beams
     weights = np.ones(len(beams.speed)) if weights is None else weights
     for row, k in enumerate(beams.keyframe.tolist()):
@@ -77,17 +77,16 @@ def gtsam_graph(
                 omega_ie_n=problem.frame.omega_ie_n,
             )
         )
-    graph.push_back(aid_graph(problem, states, aid_weights))
     return graph
 
 
-def graph_without_beams(problem: Problem, states: States) -> gtsam.NonlinearFactorGraph:
-    """Return the inertial factors, the initial state, GNSS and depth, led after ``states``."""
+def graph_without_beams(
+    problem: Problem, states: States, aid_weights: Array | None = None
+) -> gtsam.NonlinearFactorGraph:
+    """Return the inertial factors, the initial state and the aids, led after ``states``."""
     graph = inertial_graph(problem, states)
-    for part in (prior_graph(problem), gnss_graph(problem.fixes)):
+    for part in (prior_graph(problem), aid_graph(problem, states, aid_weights)):
         graph.push_back(part)
-    if problem.depths is not None:
-        graph.push_back(depth_graph(problem, problem.depths, states))
     return graph
 
 
@@ -141,55 +140,27 @@ def prior_graph(problem: Problem) -> gtsam.NonlinearFactorGraph:
     return graph
 
 
-def gnss_graph(fixes: Fixes | None) -> gtsam.NonlinearFactorGraph:
-    """Return GNSS position factors with lever arm."""
-    graph = gtsam.NonlinearFactorGraph()
-    if fixes is None:
-        return graph
-    for k, position_n, covariance_n in zip(
-        fixes.keyframe.tolist(), fixes.position_n, fixes.covariance_n, strict=True
-    ):
-        noise = gtsam.noiseModel.Gaussian.Covariance(covariance_n)
-        graph.add(gtsam.GPSFactorArm(X(k), position_n, fixes.lever_arm_b, noise))
-    return graph
-
-
-def depth_graph(problem: Problem, depths: Depths, states: States) -> gtsam.NonlinearFactorGraph:
-    """Return depth as GTSAM position factors that count along the local vertical only."""
-    aids = Measurements(
-        [DepthMeans.of_readings(depths, problem.keyframe_s, problem.frame)], problem.extras
-    )
-    aids.follow(states)
-    (means,) = aids.all
-    assert isinstance(means, DepthMeans)
-    target_n, up_n = means.target_n, means.up_n
-    root_information = np.zeros((len(means), 3, 3))
-    root_information[:, 0] = up_n * means.root_information[:, 0]
-    graph = gtsam.NonlinearFactorGraph()
-    for k, place_n, root in zip(means.keyframe.tolist(), target_n, root_information, strict=True):
-        noise = gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
-        graph.add(gtsam.GPSFactorArm(X(k), place_n, depths.lever_arm_b, noise))
-    return graph
-
-
 def aid_graph(
     problem: Problem, states: States, weights: Array | None = None
 ) -> gtsam.NonlinearFactorGraph:
-    """Return the further aids of a problem that estimates nothing of theirs.
+    """Return the aids of a problem that estimates nothing of theirs.
 
     Parameters
     ----------
     problem : with any of them, or none.
-    states : of all keyframes; they say where north is for the compass.
-    weights : (M,) of the measurements: USBL, ranges, headings, standstills; all one when left out.
+    states : of all keyframes; they say where north is for the compass, and lead the depth.
+    weights : (M,) of the measurements, as :attr:`FirstValues.aid_weights` has them: depth, GNSS,
+        USBL, ranges, headings, standstills; all one when left out.
     """
-    kinds = problem.aids
-    sizes = [len(aid) for aid in kinds]
-    weights = np.ones(sum(sizes)) if weights is None else weights
+    aids = Measurements.of_problem(problem)
+    aids.follow(states)
+    weights = np.ones(len(aids)) if weights is None else weights
     graph = gtsam.NonlinearFactorGraph()
-    for aid, size, end in zip(kinds, sizes, np.cumsum(sizes).tolist(), strict=True):
-        own = weights[end - size : end]
+    for aid in aids.all:
+        own = aids.of(aid, weights)
         match aid:
+            case DepthMeans():
+                factors = _depths(aid, own)
             case Fixes():
                 factors = _fixes(aid, own)
             case Ranges():
@@ -205,6 +176,17 @@ def aid_graph(
         for factor in factors:
             graph.add(factor)
     return graph
+
+
+def _depths(means: DepthMeans, weights: Array) -> Iterator[gtsam.NonlinearFactor]:
+    """Yield GTSAM's position factors that count along the local vertical only."""
+    root_information = np.zeros((len(means), 3, 3))
+    root_information[:, 0] = means.up_n * (means.root_information[:, 0] * np.sqrt(weights)[:, None])
+    for k, place_n, root in zip(
+        means.keyframe.tolist(), means.target_n, root_information, strict=True
+    ):
+        noise = gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
+        yield gtsam.GPSFactorArm(X(k), place_n, means.lever_arm_b, noise)
 
 
 def _fixes(fixes: Fixes, weights: Array) -> Iterator[gtsam.NonlinearFactor]:

@@ -10,15 +10,25 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from factors.imu_errors import NONE, SIZE
 from factors.inertial import Intervals, Predicted, predict, whitened_error, whitened_rows
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.stepwise import finished
 from ssm_graph.engine.chain import ChainSolution
 from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.engine.extras import Extras
 from ssm_graph.engine.states import States
-from ssm_graph.imu.preintegration import gravity_between, gravity_gradient, gtsam_gravity
+from ssm_graph.imu.preintegration import (
+    following_errors_steps,
+    gravity_between,
+    gravity_gradient,
+    gtsam_gravity,
+)
+from ssm_graph.mission.imu_variables import columns_of_errors, imu_errors
+from ssm_graph.mission.problem import Problem
 
 
 class InertialRows:
@@ -26,28 +36,38 @@ class InertialRows:
 
     def __init__(self, frame: LocalFrame, extras: Extras) -> None:
         self._frame, self._extras, self._gradient = frame, extras, gravity_gradient(frame)
+        self._own = columns_of_errors(extras)
+        """(E,) columns of the errors of the inertial sensors behind one keyframe's state"""
+        is_constant = self._own >= extras.state_dim
+        self._between = np.where(is_constant, extras.state_dim, 0) + self._own
+        """(E,) and those between two keyframes"""
 
     def rows(self, intervals: Intervals, states: States) -> Array:
         """Return the rows (I, n, 2 n + C + 1) of I intervals at their I + 1 states, ``b`` last.
 
         Columns are those of the keyframe before, of the one after, and of C constants.
         """
+        begin, (errors, slope) = states.take(np.s_[:-1]), self._errors(states.take(np.s_[:-1]))
         pairs = whitened_rows(
-            intervals,
-            states.take(np.s_[:-1]),
+            self._seen(intervals),
+            begin,
             states.take(np.s_[1:]),
             g_n=gravity_between(self._frame, states.p_n),
             gradient=self._gradient,
+            errors=errors,
         )
+        pairs = _by_variables(pairs, slope, from_column=2 * STATE_DIM)
         return self._with_walks(pairs, intervals, states.walks)
 
     def errors(self, intervals: Intervals, states: States) -> Array:
         """Return the whitened errors (I, n) of inertial data, then of the walks."""
+        begin = states.take(np.s_[:-1])
         inertial = whitened_error(
-            intervals,
-            states.take(np.s_[:-1]),
+            self._seen(intervals),
+            begin,
             states.take(np.s_[1:]),
             g_n=gravity_between(self._frame, states.p_n),
+            errors=self._errors(begin)[0],
         )
         if self._extras.n_walks == 0:
             return inertial
@@ -60,29 +80,54 @@ class InertialRows:
 
         ``g_n`` (3,) is gravity between them, m/s^2; that of the frame when left out.
         """
+        interval, (errors, slope) = self._seen(interval), self._errors(last)
         if g_n is None:
             g_n = gtsam_gravity(self._frame, last.p_n[0] + 0.5 * interval.span_s * last.v_n[0])
-        moved = predict(interval, last, g_n=g_n[None], gradient=self._gradient)
+        moved = predict(interval, last, g_n=g_n[None], gradient=self._gradient, errors=errors)
+        transition = _by_variables(moved.transition, slope, from_column=STATE_DIM)
+        moved = moved._replace(transition=transition)
         walks = last.walks
         if self._extras.n_walks:
             walks = walks * self._extras.transitions(interval.span_s)[0]
-        return Ahead(States(*moved.state, walks, last.constants), interval, moved, self)
+        ahead = States(*moved.state, walks, last.constants)
+        return Ahead(ahead, interval.as_noisy_as(errors), moved, self)
+
+    def _seen(self, intervals: Intervals) -> Intervals:
+        """Return intervals without columns of errors that are no variables here."""
+        return intervals if len(self._own) else intervals.without_errors(intervals.errors)
+
+    def _errors(self, begin: States) -> tuple[Array | None, Array | None]:
+        """Return errors of what is read (I, 27), or (27,) of all, and their slope; None if none."""
+        if len(self._own) == 0:
+            return None, None
+        return imu_errors(self._extras, begin.walks, begin.constants)
 
     def _with_walks(self, pairs: Array, intervals: Intervals, walks: Array) -> Array:
-        """Return inertial rows (I, 15, 31) with the columns and the rows of walks (I + 1, s)."""
+        """Return inertial rows (I, 15, 31 + E) with columns and rows of the walks (I + 1, s)."""
         extras = self._extras
         if not extras:
             return pairs
         n = extras.state_dim
         wide = np.zeros((len(pairs), n, n + extras.width + 1))
         wide[:, :STATE_DIM, :STATE_DIM] = pairs[:, :, :STATE_DIM]
-        wide[:, :STATE_DIM, n : n + STATE_DIM] = pairs[:, :, STATE_DIM:-1]
+        wide[:, :STATE_DIM, n : n + STATE_DIM] = pairs[:, :, STATE_DIM : 2 * STATE_DIM]
+        if pairs.shape[2] > 2 * STATE_DIM + 1:
+            wide[:, :STATE_DIM, self._between] = pairs[:, :, 2 * STATE_DIM : -1]
         wide[:, :STATE_DIM, -1] = pairs[:, :, -1]
         factor, sigma = extras.transitions(intervals.span_s)
         own = np.arange(STATE_DIM, n)
         wide[:, own, own], wide[:, own, n + own] = -factor / sigma, 1.0 / sigma
         wide[:, own, -1] = (factor * walks[:-1] - walks[1:]) / sigma
         return wide
+
+
+def _by_variables(rows: Array, slope: Array | None, *, from_column: int) -> Array:
+    """Return rows (I, r, c) with columns of the variables in the place of those of 27 errors."""
+    if slope is None or rows.shape[2] == from_column:
+        return rows
+    end = from_column + SIZE
+    parts = rows[:, :, :from_column], rows[:, :, from_column:end] @ slope, rows[:, :, end:]
+    return np.concatenate(parts, axis=2)
 
 
 class Ahead(NamedTuple):
@@ -100,22 +145,56 @@ class Ahead(NamedTuple):
         return self.between._with_walks(self.moved.rows(self.interval), self.interval, walks)
 
     def covariance(self, before: Array) -> Array:
-        """Return the covariance (n + C, n + C) here from that at the keyframe before."""
+        """Return the covariance (..., n + C, n + C) here from that at the keyframe before."""
         F, Q = self.moved.transition[0], self.moved.noise(self.interval)[0]
-        if len(before) == STATE_DIM:
+        if before.shape[-1] == STATE_DIM:
             return np.asarray(F @ before @ F.T + Q)
         carried = before.copy()
-        carried[:STATE_DIM] = F @ before[:STATE_DIM]
-        carried[:, :STATE_DIM] = carried[:, :STATE_DIM] @ F.T
-        carried[:STATE_DIM, :STATE_DIM] += Q
+        seen = self._seen
+        carried[..., :STATE_DIM, :] = F @ before[..., seen, :]
+        carried[..., :STATE_DIM] = carried[..., seen] @ F.T
+        carried[..., :STATE_DIM, :STATE_DIM] += Q
         if self.between._extras.n_walks == 0:
             return carried
         (factor,), (sigma,) = self.between._extras.transitions(self.interval.span_s)
         own = np.arange(STATE_DIM, STATE_DIM + len(factor))
-        carried[own] *= factor[:, None]
-        carried[:, own] *= factor
-        carried[own, own] += sigma**2
+        carried[..., own, :] *= factor[:, None]
+        carried[..., own] *= factor
+        carried[..., own, own] += sigma**2
         return carried
+
+    def deviation(self, before: Array) -> Array:
+        """Return the deviations (..., n) from these states of what was off by ``before`` there."""
+        own, (factor,) = STATE_DIM, self.between._extras.transitions(self.interval.span_s)[0]
+        moved = before[..., self._seen] @ self.moved.transition[0].T
+        return np.concatenate([moved, before[..., own:] * factor], axis=-1)
+
+    @property
+    def _seen(self) -> slice | NDArray[np.intp]:
+        """Columns of the state that the inertial data depend on."""
+        if self.moved.transition.shape[2] == STATE_DIM:
+            return np.s_[:STATE_DIM]
+        return np.concatenate([np.arange(STATE_DIM), self.between._own])
+
+
+def imu_error_columns(problem: Problem, states: States) -> Array:
+    """Return how the whitened inertial rows follow all errors of the sensors, (K - 1, 15, 27).
+
+    They are those of :mod:`factors.imu_errors`, in its order, at the states (K, ...) and at the
+    values that they have there; whether or not they are variables of the problem.
+    """
+    chain, intervals = problem.chain, problem.chain.intervals
+    if chain.source is None:
+        intervals = finished(following_errors_steps(intervals, chain.samples, NONE, chain.bias))
+    rows = whitened_rows(
+        intervals,
+        states.take(np.s_[:-1]),
+        states.take(np.s_[1:]),
+        g_n=gravity_between(problem.frame, states.p_n),
+        gradient=gravity_gradient(problem.frame),
+        errors=imu_errors(problem.extras, states.walks[:-1], states.constants)[0],
+    )
+    return rows[:, :, 2 * STATE_DIM : -1]
 
 
 class InertialFit(NamedTuple):
@@ -138,4 +217,8 @@ def inertial_fit(rows: Array, solution: ChainSolution) -> InertialFit:
     b, P = rows[:, :STATE_DIM, -1], solution.covariance(STATE_DIM)
     explained = np.sum((A_i @ P[:-1]) * A_i) + np.sum((A_j @ P[1:]) * A_j)
     explained += 2.0 * np.sum((A_i @ solution.neighbour_covariance(STATE_DIM)) * A_j)
+    A_c, crossed = rows[:, :STATE_DIM, 2 * n : -1], solution.sensitivity[:, :STATE_DIM]
+    if A_c.any():
+        through = 2.0 * (A_i @ crossed[:-1] + A_j @ crossed[1:]) + A_c
+        explained += np.sum((through @ solution.constants_cov) * A_c)
     return InertialFit(float(np.sum(b**2)), float(b.size - explained))

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from factors.inertial import Intervals
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps, finished
 from ssm_graph.engine.chain import Chain, ChainSolution
@@ -23,14 +24,19 @@ from ssm_graph.graph.beam_rows import BeamRows, CalibratedBeams
 from ssm_graph.graph.inertial_rows import InertialRows
 from ssm_graph.graph.measurements import Measurements, states_at
 from ssm_graph.mission.calibration import needs_motion
+from ssm_graph.mission.imu_variables import imu_errors
 from ssm_graph.mission.problem import Problem, start_of
 
 JUDGED_PASSES = 2
 """The first pass is at the states of the forward pass, the second at smoothed ones."""
+ERRORS_REACH = 1e-2
+"""How far errors of the inertial sensors, shares of what is read, may move before the increments
+are made anew; the rest counts to first order along each, which loses half the square of the turn
+that it makes of one interval."""
 
 
 class Misfit(NamedTuple):
-    """How far one kind of measurement misses an answer."""
+    """How far the inertial data miss an answer."""
 
     sum_sq: float
     """Sum of its squared whitened errors"""
@@ -43,9 +49,12 @@ class GraphLinearizer:
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
+        self.intervals = problem.chain.intervals
+        """Of the inertial data, about errors of the sensors near the states"""
+        self._chain = problem.chain
         self._inertial = InertialRows(problem.frame, problem.extras)
         self.prior = prior_at_start(with_extras(start_of(problem), problem.extras.walks))
-        self.aids, self.weighted = Measurements.in_full(problem), Measurements.weighted(problem)
+        self.weighted = Measurements.of_problem(problem)
         self._beams = CalibratedBeams(problem.beams, problem.extras, problem.frame)
         self._n_judged = 0
 
@@ -55,13 +64,31 @@ class GraphLinearizer:
         In the first passes, how much motion there is to calibrate by is judged anew: only smoothed
         states tell acceleration from a bias. Then the beams are to be linearised anew.
         """
-        self.aids.follow(states)
         self.weighted.follow(states)
         if self._n_judged == JUDGED_PASSES or not needs_motion(self.problem.extras):
             return False
         self._n_judged += 1
         self._beams.judge(self._at_beams(states), states.bias)
         return True
+
+    def integrate_steps(self, states: States) -> Steps[None]:
+        """Preintegrate anew where errors of the inertial sensors have moved too far."""
+        source = self._chain.source
+        if source is None:
+            return
+        errors, _ = imu_errors(self.problem.extras, states.walks[0], states.constants)
+        if np.abs(errors - source.errors).max() > ERRORS_REACH:
+            self._chain = yield from self._chain.about_steps(errors)
+            self.intervals = self._chain.intervals
+
+    def intervals_at(self, states: States) -> Intervals:
+        """Return the inertial data without the errors that the states say the sensors have."""
+        errors, _ = imu_errors(self.problem.extras, states.walks[0], states.constants)
+        return self.intervals.without_errors(errors)
+
+    def take_inertial(self, intervals: Intervals) -> None:
+        """Take other inertial data of the same intervals, such as those of :meth:`intervals_at`."""
+        self.intervals = intervals
 
     def beam_rows(self, states: States) -> BeamRows:
         """Linearise all beams at ``states``."""
@@ -73,7 +100,7 @@ class GraphLinearizer:
     ) -> ChainSolution:
         """Return the step at ``states``, with their beam rows and weights (M,).
 
-        ``aid_weights`` are those of the weighted aids' measurements; all one when left out.
+        ``aid_weights`` are those of the aids' measurements; all one when left out.
         """
         return finished(self.solve_steps(states, beam_rows, weights, aid_weights))
 
@@ -97,7 +124,7 @@ class GraphLinearizer:
 
     def inertial_rows(self, states: States) -> Array:
         """Return the rows of inertial data and walks, see :class:`InertialRows`."""
-        return self._inertial.rows(self.problem.chain.intervals, states)
+        return self._inertial.rows(self.intervals, states)
 
     def cost(
         self, states: States, beam_rows: BeamRows, weights: Array, aid_weights: Array | None = None
@@ -105,21 +132,16 @@ class GraphLinearizer:
         """Return half the weighted sum of squares that :meth:`solve` makes least."""
         squares = np.sum(weights * (beam_rows.error / self.problem.beams.sigma) ** 2)
         squares += np.sum(self.prior.whitened(states) ** 2)
-        squares += np.sum(self.aids.rows(states).error ** 2)
         squares += np.sum(self.weighted.rows(states, aid_weights).error ** 2)
         constants_sigma = self.problem.extras.sigma[self.problem.extras.n_walks :]
         squares += np.sum((states.constants / constants_sigma) ** 2)
-        squares += np.sum(self._inertial.errors(self.problem.chain.intervals, states) ** 2)
+        squares += np.sum(self._inertial.errors(self.intervals, states) ** 2)
         return float(0.5 * squares)
 
-    def misfits(self, states: States) -> dict[str, Misfit]:
-        """Return the misfit of the aids and the inertial data, by name, where there are any."""
-        errors = self._inertial.errors(self.problem.chain.intervals, states)[:, :STATE_DIM]
-        found = {"inertial": Misfit(float(np.sum(errors**2)), errors.size, len(errors))}
-        for aid in self.aids.all:
-            error = aid.whitened(self.aids.at_keyframes(aid, states)).error
-            found[aid.name] = Misfit(float(np.sum(error**2)), error.size, len(error))
-        return {name: misfit for name, misfit in found.items() if misfit.n_factors}
+    def inertial_misfit(self, states: States) -> Misfit:
+        """Return how far the inertial data miss these states."""
+        errors = self._inertial.errors(self.intervals, states)[:, :STATE_DIM]
+        return Misfit(float(np.sum(errors**2)), errors.size, len(errors))
 
     def _at_beams(self, states: States) -> RowStates:
         g_n = self.problem.frame.g_n_at(states.p_n)
@@ -133,10 +155,9 @@ class GraphLinearizer:
         scale = np.sqrt(weights) / beams.sigma
         whitened = np.column_stack([beam_rows.jacobian, -beam_rows.error]) * scale[:, None]
         keyframes, blocks = [beams.keyframe], [whitened]
-        aid_rows = self.aids.rows(states), self.weighted.rows(states, aid_weights)
-        for keyframe, error, jacobian in aid_rows:
-            keyframes.append(keyframe)
-            blocks.append(np.column_stack([jacobian, -error]))
+        keyframe, error, jacobian = self.weighted.rows(states, aid_weights)
+        keyframes.append(keyframe)
+        blocks.append(np.column_stack([jacobian, -error]))
         keyframe = np.concatenate(keyframes)
         order = np.argsort(keyframe, kind="stable")
         rows = np.concatenate(blocks)[order]

@@ -11,6 +11,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from factors.similarity import Kernel, LogKernel, Similarity
 from ssm_graph.base.frozen import Array
@@ -18,6 +19,7 @@ from ssm_graph.engine.extras import Extras
 from ssm_graph.engine.states import States
 from ssm_graph.graph.aids.aid import Aid, RowStates
 from ssm_graph.graph.aids.depth import DepthMeans
+from ssm_graph.graph.aids.gnss import Fixes
 from ssm_graph.mission.answer import LOW_WEIGHT, MISFIT, SUSPECT_SHARE, TRUSTED
 from ssm_graph.mission.estimate import AidTable
 from ssm_graph.mission.problem import Problem
@@ -90,14 +92,9 @@ class Measurements:
         """(R,) of each component"""
 
     @classmethod
-    def weighted(cls, problem: Problem) -> Measurements:
-        """Return those of a problem that have weights."""
-        return cls((aid for aid in aids_of(problem) if aid.is_weighted), problem.extras)
-
-    @classmethod
-    def in_full(cls, problem: Problem) -> Measurements:
-        """Return those of a problem that count in full."""
-        return cls((aid for aid in aids_of(problem) if not aid.is_weighted), problem.extras)
+    def of_problem(cls, problem: Problem) -> Measurements:
+        """Return those of a problem, each with a weight of its own."""
+        return cls(aids_of(problem), problem.extras)
 
     def __len__(self) -> int:
         return len(self.dim)
@@ -213,8 +210,18 @@ def aid_table(judged: Sequence[JudgedAid]) -> AidTable | None:
     )
 
 
+RUN = 20
+"""Successive depths, or position fixes, that are looked at together."""
+SHORTEST_RUN = 8
+"""Of fewer nothing is said."""
+RUN_TAIL = 0.03
+"""Share of Gaussian errors that are longer than the median of a run may be: three times the sigma
+of one component, twice that of three. Half of a run has to be that long, which has a chance of
+1e-10 for twenty and 6e-5 for eight; as many may be gross and say nothing."""
+
+
 def doubts_of_aids(judged: Sequence[JudgedAid]) -> list[str]:
-    """Say in a sentence each which weighted aid disagrees with the answer."""
+    """Say in a sentence each which aid disagrees with the answer."""
     return [doubt for one in judged if len(one.aid) and (doubt := _doubt(one))]
 
 
@@ -226,6 +233,8 @@ def _doubt(one: JudgedAid) -> str:
             f"{100.0 * share:.0f} % of the {len(weights)} {aid.name} measurements contradict "
             f"the answer (weight below {LOW_WEIGHT}): {aid.hint}"
         )
+    if isinstance(aid, DepthMeans | Fixes):
+        return _doubt_run(one)
     trusted = np.mean(one.error**2, axis=1)[weights >= TRUSTED]
     misfit = float(np.mean(trusted)) if len(trusted) else 0.0
     if misfit <= MISFIT:
@@ -233,4 +242,22 @@ def _doubt(one: JudgedAid) -> str:
     return (
         f"{aid.name} measurements that count miss the answer by {np.sqrt(misfit):.1f} of their "
         f"own sigmas (rms): their noise is stated too small, or {aid.hint}"
+    )
+
+
+def _doubt_run(one: JudgedAid) -> str:
+    """Look for successive measurements of place that miss the answer together."""
+    aid, size = one.aid, min(RUN, len(one.weight))
+    if size < SHORTEST_RUN:
+        return ""
+    runs = np.lib.stride_tricks.sliding_window_view(np.sum(one.error**2, axis=1), size)
+    median = np.median(runs, axis=1)
+    worst = int(np.argmax(median))
+    if median[worst] <= chi2.isf(RUN_TAIL, aid.dim):
+        return ""
+    sigmas = np.sqrt(median[worst] / chi2.median(aid.dim))
+    return (
+        f"{aid.name} measurements from {one.time_s[worst]:.1f} s to "
+        f"{one.time_s[worst + size - 1]:.1f} s miss the answer by "
+        f"{sigmas:.1f} of their own sigmas (median): their noise is stated too small, or {aid.hint}"
     )

@@ -12,6 +12,7 @@ import gtsam
 import numpy as np
 
 from factors import so3
+from factors.imu_errors import increment_jacobians, taken_off
 from factors.inertial import Intervals
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
@@ -58,6 +59,16 @@ class Unseen(NamedTuple):
     """m/s^2"""
 
 
+class ErrorSource(NamedTuple):
+    """What intervals are made of where errors of the sensors are variables, to make them anew."""
+
+    imu: ImuLog
+    keyframe_s: Array
+    rate_hz: float
+    errors: Array
+    """(27,) that are taken off already, see :mod:`factors.imu_errors`"""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class InertialChain:
     """Preintegrated inertial data between K successive keyframes, and what they were made of."""
@@ -71,6 +82,23 @@ class InertialChain:
     """(K - 1) what is bridged in each interval"""
     bias: Array
     """(6,) about which all are preintegrated, accelerometer m/s^2, gyro rad/s"""
+    source: ErrorSource | None = None
+    """None where no errors of the sensors are variables"""
+
+    def about_steps(self, errors: Array) -> Steps[InertialChain]:
+        """Preintegrate anew with errors (27,) taken off; for a chain with a source."""
+        assert self.source is not None
+        imu, keyframe_s, rate_hz, _ = self.source
+        return (
+            yield from preintegrate_steps(
+                imu,
+                keyframe_s,
+                frame=self.frame,
+                rate_hz=rate_hz,
+                bias=self.bias,
+                errors=errors,
+            )
+        )
 
     def measured(self, g_n: Array) -> list[Preintegrated]:
         """Return GTSAM's measurements, made anew, for gravity (K - 1, 3) that stays theirs."""
@@ -106,7 +134,13 @@ def gravity_gradient(frame: LocalFrame, p_n: Array = ORIGIN) -> Array:
 
 
 def preintegrate(
-    imu: ImuLog, keyframe_s: Array, *, frame: LocalFrame, rate_hz: float, bias: Array | None = None
+    imu: ImuLog,
+    keyframe_s: Array,
+    *,
+    frame: LocalFrame,
+    rate_hz: float,
+    bias: Array | None = None,
+    errors: Array | None = None,
 ) -> InertialChain:
     """Preintegrate the inertial data between keyframes.
 
@@ -117,14 +151,28 @@ def preintegrate(
     frame : navigation frame; gives the Earth rate.
     rate_hz : rate to which raw samples are merged first.
     bias : (6,) accelerometer and gyro bias about which to linearise, m/s^2 and rad/s.
+    errors : (27,) of the sensors, see :mod:`factors.imu_errors`, that are taken off first, and that
+        the increments follow; without them they do not.
     """
-    return finished(preintegrate_steps(imu, keyframe_s, frame=frame, rate_hz=rate_hz, bias=bias))
+    return finished(
+        preintegrate_steps(imu, keyframe_s, frame=frame, rate_hz=rate_hz, bias=bias, errors=errors)
+    )
 
 
 def preintegrate_steps(
-    imu: ImuLog, keyframe_s: Array, *, frame: LocalFrame, rate_hz: float, bias: Array | None = None
+    imu: ImuLog,
+    keyframe_s: Array,
+    *,
+    frame: LocalFrame,
+    rate_hz: float,
+    bias: Array | None = None,
+    errors: Array | None = None,
 ) -> Steps[InertialChain]:
     """Make :func:`preintegrate` in steps."""
+    source = None
+    if errors is not None:
+        source = ErrorSource(imu, keyframe_s, rate_hz, errors)
+        imu = without_errors(imu, errors)
     gaps = imu_gaps(imu)
     unseen = tuple(_unseen(imu, keyframe_s, gaps))
     yield 3e-4 * len(imu.time_s)
@@ -144,7 +192,44 @@ def preintegrate_steps(
         parts.append(intervals_of(measured[begin : begin + AT_ONCE], frame))
         yield 0.1 * len(parts[-1].span_s)
     intervals = Intervals.joined(parts) if parts else intervals_of([], frame)
-    return InertialChain(intervals, frame, samples, imu.noise, unseen, bias)
+    if errors is not None:
+        intervals = yield from following_errors_steps(intervals, samples, errors, bias)
+    return InertialChain(intervals, frame, samples, imu.noise, unseen, bias, source)
+
+
+def without_errors(imu: ImuLog, errors: Array) -> ImuLog:
+    """Return the log with errors (27,) of :mod:`factors.imu_errors` taken off."""
+    if not errors.any():
+        return imu
+    gyro_b, accel_b = taken_off(errors, imu.gyro_b, imu.accel_b)
+    return replace(imu, gyro_b=gyro_b, accel_b=accel_b)
+
+
+def following_errors_steps(
+    intervals: Intervals, samples: MergedSamples, errors: Array, bias: Array
+) -> Steps[Intervals]:
+    """Return intervals that follow the errors of the sensors, made of these samples.
+
+    ``errors`` (27,) are taken off the samples already, ``bias`` (6,) are those integrated about.
+    """
+    parts = [np.zeros((0, 9, len(errors)))]
+    for begin in range(0, len(samples.first) - 1, 2 * AT_ONCE):
+        first = samples.first[begin : begin + 2 * AT_ONCE + 1]
+        own = slice(int(first[0]), int(first[-1]))
+        parts.append(
+            increment_jacobians(
+                errors,
+                dt=samples.dt[own],
+                gyro_b=samples.gyro_b[own],
+                accel_b=samples.accel_b[own],
+                first=first - first[0],
+                bias=bias,
+            )
+        )
+        yield 0.1 * len(parts[-1])
+    jacobians = np.concatenate(parts)
+    taken = np.tile(errors, (len(jacobians), 1))
+    return intervals._replace(errors=taken, delta_D_errors=jacobians)
 
 
 def _integrate_steps(
@@ -217,10 +302,10 @@ def imu_params(
     # sigma in an hour is none.
     floor = 1e-3 / 60.0
     params.setBiasOmegaCovariance(
-        max(noise.gyro_bias_density, floor * noise.gyro_bias_sigma) ** 2 * eye
+        max(noise.gyro_bias_walk, floor * noise.gyro_bias_sigma) ** 2 * eye
     )
     params.setBiasAccCovariance(
-        max(noise.accel_bias_density, floor * noise.accel_bias_sigma) ** 2 * eye
+        max(noise.accel_bias_walk, floor * noise.accel_bias_sigma) ** 2 * eye
     )
     return params
 

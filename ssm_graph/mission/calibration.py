@@ -10,13 +10,16 @@ import numpy as np
 from ssm_graph.engine.extras import Extra, Extras
 from ssm_graph.graph.aids import AIDS
 from ssm_graph.graph.aids.aid import along_axes, drift_variable
-from ssm_graph.graph.aids.depth import DEPTH_OFFSET, depth_variables
+from ssm_graph.graph.aids.depth import DEPTH_DRIFT, DEPTH_OFFSET, depth_variables
 from ssm_graph.graph.aids.gnss import GNSS_DRIFT, GNSS_LEVER_ARM, GNSS_TIME_OFFSET, gnss_variables
+from ssm_graph.mission.imu_variables import COLUMNS as IMU_ERRORS
+from ssm_graph.mission.imu_variables import imu_extras
 from ssm_graph.mission.mission import Mission
 from ssm_graph.sensors.current import CurrentModel
 from ssm_graph.sensors.depth import DepthCalibration
 from ssm_graph.sensors.dvl import DvlMount
 from ssm_graph.sensors.gnss import GnssCalibration
+from ssm_graph.sensors.imu_calibration import ImuCalibration
 
 CURRENT: Final = "current"
 """East and north at the vehicle."""
@@ -71,10 +74,11 @@ CALIBRATIONS: Final = frozenset(
         DEPTH_OFFSET,
         GNSS_LEVER_ARM,
         GNSS_TIME_OFFSET,
+        *IMU_ERRORS,
     }
 )
 """Those of the extra variables that tell of the instruments of every estimator."""
-DRIFTS: Final = frozenset({DVL_DRIFT, GNSS_DRIFT})
+DRIFTS: Final = frozenset({DVL_DRIFT, GNSS_DRIFT, DEPTH_DRIFT})
 """Those that tell of slow errors."""
 
 SEEN_BY_READINGS: Final = frozenset({DVL_TIME_OFFSET, DVL_LEVER_ARM})
@@ -82,7 +86,10 @@ SEEN_BY_READINGS: Final = frozenset({DVL_TIME_OFFSET, DVL_LEVER_ARM})
 
 
 def calibration_extras(
-    mount: DvlMount, depth: DepthCalibration | None, gnss: GnssCalibration | None
+    mount: DvlMount,
+    depth: DepthCalibration | None,
+    gnss: GnssCalibration | None,
+    imu: ImuCalibration,
 ) -> tuple[Extra, ...]:
     """Return what the sigmas of instruments switch on, drifts too; None for one not there."""
     extras = [
@@ -113,12 +120,13 @@ def calibration_extras(
             as_a_turn=1e2,
         ),
         Extra(DVL_TIME_OFFSET, ("dvl_time_offset_s",), np.array([mount.time_offset_sigma_s])),
-        *drift_variable(DVL_DRIFT, "dvl_drift_{}_m_per_s", mount.drift),
+        *drift_variable(DVL_DRIFT, along_axes("dvl_drift_{}_m_per_s"), mount.drift),
     ]
     if depth is not None:
         extras += depth_variables(depth)
     if gnss is not None:
         extras += gnss_variables(gnss)
+    extras += imu_extras(imu)
     return tuple(extra for extra in extras if extra.sigma[0] > 0.0)
 
 
@@ -129,6 +137,7 @@ def extras_of(mission: Mission) -> Extras:
         mission.dvl.mount,
         None if depth is None else depth.calibration,
         None if gnss is None else gnss.calibration,
+        mission.imu.calibration,
     )
     of_aids = (extra for kind in AIDS for extra in kind.variables(mission.aids))
     of_water = current_extras(mission.current or CurrentModel()) if has_water_pings(mission) else ()

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from enum import Enum
+from typing import Any
 
 import numpy as np
 
@@ -67,22 +68,40 @@ class BeamTable(FrozenArrays):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AidTable(FrozenArrays):
-    """One row for every component of a measurement that was weighted beside the beams."""
+    """One row for every component of a measurement beside the beams.
+
+    Of depth that is the mean of a keyframe's readings, of which there are fewer than beam speeds.
+    """
 
     aid: tuple[str, ...]
-    """(N,) USBL, range, heading or standstill"""
+    """(N,) depth, GNSS, USBL, range, heading, magnetometer or standstill"""
     component: tuple[str, ...]
-    """(N,) east, north, up, heading, or the beacon of a range"""
+    """(N,) depth, east, north, up, heading, x, y, z, or the beacon of a range"""
     unit: tuple[str, ...]
     """(N,) of the innovation: m, rad or m/s"""
     time_s: Array = shaped("N")
     """(N,) s, when it was valid, or of the keyframe that it was led to."""
     innovation: Array = shaped("N")
-    """(N,) measured minus predicted, with the final states."""
+    """(N,) measured minus predicted, heights upwards: before the update in filters, with the final
+    states in smoothers."""
     mahalanobis_sq: Array = shaped("N")
     """(N,) the t of the whole measurement, posterior variance included."""
     weight: Array = shaped("N")
     """(N,) of the whole measurement, 1 = nominal."""
+
+    @classmethod
+    def joined(cls, parts: Sequence[AidTable]) -> AidTable | None:
+        """Return the rows of several tables, one after the other; None if there are none."""
+        columns: dict[str, Any] = {
+            spec.name: [value for part in parts for value in getattr(part, spec.name)]
+            for spec in fields(cls)
+        }
+        if not columns["aid"]:
+            return None
+        for name, values in columns.items():
+            is_text = name in ("aid", "component", "unit")
+            columns[name] = tuple(values) if is_text else np.array(values)
+        return cls(**columns)
 
     def counts(self) -> dict[str, tuple[int, int]]:
         """Return how many measurements each aid had, and how many ended as outliers."""
@@ -123,6 +142,17 @@ class Trajectory(FrozenArrays):
     """(N, 3) rad, of roll, pitch and heading"""
     n_beams: Array = shaped("N")
     """(N,) beam speeds used at the keyframe"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ProtectionTrack(FrozenArrays):
+    """What bounded the errors of live answers at the keyframes, as it was known there and then."""
+
+    time_s: Array = shaped("N")
+    horizontal: Array = shaped("N")
+    """(N,) m, radius; infinite where nothing was known"""
+    up: Array = shaped("N")
+    """(N,) m"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

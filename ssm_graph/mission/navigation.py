@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from enum import Enum
 
 from ssm_graph.base.frozen import Array, FrozenArrays, shaped
@@ -76,3 +78,11 @@ class Navigation(FrozenArrays):
     """(3,) m/s^2"""
     beam_weights: Array = shaped("B")
     """(B,) of the last ping, 1 = nominal; NaN for a beam that was missing."""
+    protection_m: float = math.inf
+    """Horizontal protection level: the radius that bounds the position's error under every fault of
+    one sensor that has not been excluded, at the probability that was asked for."""
+    protection_up_m: float = math.inf
+    """The same of the height."""
+    innovation_ratios: Mapping[str, float] = field(default_factory=dict)
+    """By sensor: its low-passed innovation in sigmas, root mean square of its components. An error
+    that lasts shows here long before it is out of any gate; noise alone is near 0.2."""

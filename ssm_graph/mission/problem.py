@@ -8,6 +8,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.imu_errors import NONE
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frames import R_lb_from_roll_pitch_heading, phi_D_roll_pitch_heading
@@ -18,7 +19,7 @@ from ssm_graph.engine.error_state import POSITION, ROTATION, STATE_DIM, VELOCITY
 from ssm_graph.engine.extras import Extras
 from ssm_graph.graph.aids import AIDS
 from ssm_graph.graph.aids.aid import Aid, Keyframes, Table
-from ssm_graph.graph.aids.depth import Depths
+from ssm_graph.graph.aids.depth import DEPTH_DRIFT, Depths
 from ssm_graph.graph.aids.gnss import GNSS_DRIFT, Fixes
 from ssm_graph.imu.ping_motion import MotionBefore, mean_gyro
 from ssm_graph.imu.preintegration import InertialChain, imu_gaps, preintegrate_steps
@@ -162,6 +163,7 @@ def build_problem_steps(
         left out.
     """
     require_usable(mission)
+    mission = replace(mission, imu=mission.imu.calibrated)
     mission, stuck_note = _without_stuck_beams(mission)
     config = config or ProblemConfig()
     start = start or mission.initial
@@ -171,11 +173,15 @@ def build_problem_steps(
             "let align(mission) find the start"
         )
     timeline = build_timeline(mission, start_s=start.time_s, interval_s=config.keyframe_interval_s)
+    extras = extras_of(mission)
     chain = yield from preintegrate_steps(
-        mission.imu, timeline.keyframe_s, frame=mission.frame, rate_hz=config.merge_rate_hz
+        mission.imu,
+        timeline.keyframe_s,
+        frame=mission.frame,
+        rate_hz=config.merge_rate_hz,
+        errors=NONE if mission.imu.calibration.is_asked else None,
     )
     noise, depth = mission.imu.noise, mission.depth
-    extras = extras_of(mission)
     keyframes = Keyframes(mission.frame, mission.imu, timeline.keyframe_s, begin_s)
     aids = (kind.of(mission.aids, keyframes) for kind in AIDS)
     return Problem(
@@ -206,6 +212,7 @@ def with_dvl(problem: Problem, mission: Mission) -> Problem:
 
     The inertial chain, most of the work, is kept; so the pings have to be at keyframes.
     """
+    mission = replace(mission, imu=mission.imu.calibrated)
     mission, _ = _without_stuck_beams(mission)
     keyframe_s, ping_s = problem.keyframe_s, mission.dvl.valid_s
     is_used = np.isfinite(mission.dvl.speed).any(axis=1)
@@ -230,17 +237,19 @@ def with_dvl(problem: Problem, mission: Mission) -> Problem:
 def with_white_noise(problem: Problem) -> Problem:
     """Return what an estimator whose variables are the drifts, too, makes of a problem, once.
 
-    A problem states the noise of beams and fixes with all that changes slowly; here their sigmas
-    are those of white noise alone, all of which is white.
+    A problem states the noise of beams, fixes and depths with all that changes slowly; here their
+    sigmas are those of white noise alone, all of which is white.
     """
-    beams, fixes = problem.beams, problem.fixes
+    beams, fixes, depths = problem.beams, problem.fixes, problem.depths
     if DVL_DRIFT in problem.extras:
         share = np.where(beams.is_water, 1.0, beams.white_share)
         beams = replace(beams, sigma=beams.sigma * share, white_share=1.0)
     if fixes is not None and GNSS_DRIFT in problem.extras:
         covariance_n = fixes.covariance_n * fixes.white_share**2
         fixes = replace(fixes, covariance_n=covariance_n, white_share=1.0)
-    return replace(problem, beams=beams, fixes=fixes)
+    if depths is not None and DEPTH_DRIFT in problem.extras:
+        depths = replace(depths, sigma=depths.sigma * depths.white_share, white_share=1.0)
+    return replace(problem, beams=beams, fixes=fixes, depths=depths)
 
 
 def _without_stuck_beams(mission: Mission) -> tuple[Mission, tuple[str, ...]]:

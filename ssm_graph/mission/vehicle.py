@@ -15,6 +15,7 @@ from ssm_graph.sensors.depth import DepthLog
 from ssm_graph.sensors.dvl import DvlMount, empty_dvl
 from ssm_graph.sensors.gnss import GNSS, GnssLog
 from ssm_graph.sensors.imu import ImuLog, ImuNoise
+from ssm_graph.sensors.imu_calibration import ImuCalibration
 from ssm_graph.sensors.standstill import Standstill
 
 GNSS_AT_ORIGIN: Final = GnssLog(**GNSS.empty(), lever_arm_b=np.zeros(3))
@@ -46,12 +47,14 @@ class Vehicle:
     """Navigation frame; None takes the first fix."""
     initial: InitialState | None = None
     """None lets the estimator align itself."""
+    imu_calibration: ImuCalibration = ImuCalibration()
+    """Of what inertial messages read."""
 
     @property
     def bare_logs(self) -> Mapping[type, Any]:
         """Every instrument as a log without rows, by the type of the log."""
         none = np.zeros((0, 3))
-        imu = ImuLog(0.0, self.imu_noise, np.zeros(0), none, none)
+        imu = ImuLog(0.0, self.imu_noise, np.zeros(0), none, none, self.imu_calibration)
         logs = (imu, empty_dvl(self.mount), self.depth, self.gnss, *self.aids)
         return {
             type(log): log for log in logs if log is not None and not isinstance(log, Standstill)

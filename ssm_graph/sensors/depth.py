@@ -12,6 +12,7 @@ from ssm_graph.base.frames import BodyAxes
 from ssm_graph.base.frozen import Array, FrozenArrays, shaped
 from ssm_graph.base.settings import FILE_KEY, LEVER_ARM_KEY, optional_key, sigma_key
 from ssm_graph.base.tables import Table
+from ssm_graph.sensors.drift import Drift, drift_keys
 from ssm_graph.sensors.instrument import Calibrated, Column, Instrument
 from ssm_graph.sensors.messages import Message
 
@@ -29,6 +30,8 @@ class DepthCalibration:
     """Depths are read too large by so much, m."""
     offset_sigma: float = 0.0
     """Prior sigma of what is left of that, m; above zero asks for its calibration."""
+    drift: Drift = Drift()
+    """What depths are off by slowly, m: swell, drag on the port, a sensor that warms up."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,6 +76,7 @@ _KEYS: Final = {
     "lever_arm_m": LEVER_ARM_KEY,
     "offset_m": optional_key("calibration.offset", -1000.0, 1000.0, _METRES),
     "offset_sigma_m": optional_key("calibration.offset_sigma", 0.0, 1000.0, _METRES),
+    **drift_keys("drift_sigma_m", "calibration.drift", 1000.0, _METRES),
 }
 
 

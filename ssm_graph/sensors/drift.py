@@ -23,6 +23,11 @@ class Drift:
     white_share: float = 1.0
     """Of the stated sigmas, what is left as white noise where the drift is modelled, in (0, 1]."""
 
+    @property
+    def white(self) -> float:
+        """Of the stated sigmas, what an estimator counts that carries the drift, if any."""
+        return self.white_share if self.sigma > 0.0 else 1.0
+
 
 ARM_SIGMA: Final = (0.0, 100.0, "the unit is metres")
 """Limits of the key of a doubted lever arm."""

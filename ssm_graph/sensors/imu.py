@@ -6,6 +6,7 @@ are copied in, checked for shape and made read-only; times are seconds on one cl
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -19,8 +20,15 @@ from ssm_graph.base.frozen import Array, FrozenArrays, Vector, shaped
 from ssm_graph.base.settings import FILE_KEY, Key, Settings, optional_key, sigma_key
 from ssm_graph.base.tables import Table
 from ssm_graph.base.units import DEG_PER_H, DEGREE, MICRO_G, PER_SQRT_H
+from ssm_graph.sensors.imu_calibration import CALIBRATED, ImuCalibration, calibration_keys
 from ssm_graph.sensors.instrument import XYZ, Column, Instrument, Lists
 from ssm_graph.sensors.messages import Message
+
+OF_INSTABILITY: Final = 0.3
+"""Random walk, per square root of a second, that wanders in 100 s as far as flicker noise whose
+Allan deviation has a floor of 1. The variance of flicker's increments grows with the logarithm of
+time, some ``2 s^2`` a decade with ``s = 1.29`` of the floor (IEEE Std 952, annex C); biases are
+told apart over minutes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +47,20 @@ class ImuNoise:
     """Random walk of the gyro bias, rad/s/sqrt(s)."""
     accel_bias_density: float = 0.0
     """Random walk of the accelerometer bias, m/s^2/sqrt(s)."""
+    gyro_bias_instability: float = 0.0
+    """Floor of the gyros' Allan deviation, rad/s."""
+    accel_bias_instability: float = 0.0
+    """Floor of the accelerometers' Allan deviation, m/s^2."""
+
+    @property
+    def gyro_bias_walk(self) -> float:
+        """Random walk that covers walk and instability of the gyro bias, rad/s/sqrt(s)."""
+        return math.hypot(self.gyro_bias_density, OF_INSTABILITY * self.gyro_bias_instability)
+
+    @property
+    def accel_bias_walk(self) -> float:
+        """Random walk that covers walk and instability of the accelerometer bias, m/s^2/sqrt(s)."""
+        return math.hypot(self.accel_bias_density, OF_INSTABILITY * self.accel_bias_instability)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,6 +79,19 @@ class ImuLog(FrozenArrays):
     """(N, 3) body rate relative to inertial space, rad/s."""
     accel_b: Array = shaped("N", 3)
     """(N, 3) specific force, m/s^2; at rest (0, 0, -9.8)."""
+    calibration: ImuCalibration = ImuCalibration()
+
+    @property
+    def calibrated(self) -> ImuLog:
+        """The log with what is known of scale, misalignment and g-sensitivity taken off.
+
+        The sigmas of what is left are kept, the values are none: once more changes nothing.
+        """
+        known = self.calibration
+        if not known.is_stated:
+            return self
+        gyro_b, accel_b = known.taken_off(self.gyro_b, self.accel_b)
+        return replace(self, gyro_b=gyro_b, accel_b=accel_b, calibration=known.exact())
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +128,7 @@ FASTEST_TURN: Final = 6.0
 """rad/s, of 99 % of the samples: no vehicle turns once a second for long."""
 _HALF_G: Final = 4.9
 _REPEATED_SHARE: Final = 0.2
-_FORCE_UNITS: Final = (
+FORCE_UNITS: Final = (
     (1.0, "g", "multiply them by 9.80665"),
     (1e3, "mg", "multiply them by 0.00980665"),
     (1e6, "ug", "multiply them by 9.80665e-6"),
@@ -137,6 +172,13 @@ _KEYS: Final = {
     "accel_bias_walk_ug_per_sqrt_h": optional_key(
         "noise.accel_bias_density", 0.0, 1e7, _WALK, unit=MICRO_G * PER_SQRT_H
     ),
+    "gyro_bias_instability_deg_per_h": optional_key(
+        "noise.gyro_bias_instability", 0.0, 1e6, _WALK, unit=DEG_PER_H
+    ),
+    "accel_bias_instability_ug": optional_key(
+        "noise.accel_bias_instability", 0.0, 1e7, _WALK, unit=MICRO_G
+    ),
+    **calibration_keys("calibration"),
 }
 
 
@@ -151,12 +193,12 @@ class _Imu(Instrument):
         log: ImuLog = super().bare(settings, lists)
         return log
 
-    def check(self, table: Table, bare: ImuLog, axes: BodyAxes) -> list[str]:  # noqa: ARG002
+    def check(self, table: Table, bare: ImuLog, axes: BodyAxes) -> list[str]:
         if len(table) < 2:
             got = f"{len(table)} row" if len(table) else "a header and no rows"
             raise DataError(f"{table.label}: the table has {got}; expected at least 2 samples")
         notes = _times(table)
-        _specific_force(table)
+        _specific_force(table, bare.calibration, axes)
         _turn_rates(table)
         notes += _gravity_direction(table, axes)
         readings = table.stack([*_GYRO.names, *_ACCEL.names])
@@ -182,10 +224,19 @@ class _Imu(Instrument):
         return ImuSample(time_s, (gx, gy, gz), (ax, ay, az))
 
     def log_of(self, rows: Array, bare: ImuLog) -> ImuLog:
-        return ImuLog(bare.start_s, bare.noise, rows[:, 0], rows[:, 1:4], rows[:, 4:7])
+        return replace(bare, time_s=rows[:, 0], gyro_b=rows[:, 1:4], accel_b=rows[:, 4:7])
 
 
-IMU: Final = _Imu("imu", ImuLog, _KEYS, (_GYRO, _ACCEL), ImuSample, "i", is_required=True)
+IMU: Final = _Imu(
+    "imu",
+    ImuLog,
+    _KEYS,
+    (_GYRO, _ACCEL),
+    ImuSample,
+    "i",
+    calibrated=CALIBRATED,
+    is_required=True,
+)
 
 
 def interval_ends(time_s: Array, stamp: Stamp) -> tuple[float, Array]:
@@ -239,12 +290,13 @@ def _times(table: Table) -> list[str]:
     return notes
 
 
-def _specific_force(table: Table) -> None:
-    force = table.stack(_ACCEL.names)
+def _specific_force(table: Table, known: ImuCalibration, axes: BodyAxes) -> None:
+    gyro_b, accel_b = (to_frd(table.stack(names), axes) for names in (_GYRO.names, _ACCEL.names))
+    _, force = known.taken_off(gyro_b, accel_b)
     median = float(np.median(_length(force)))
     low, high = FORCE_RANGE
     if not low <= median <= high:
-        found = [(u, todo) for size, u, todo in _FORCE_UNITS if abs(median / size - 1.0) < 0.06]
+        found = [(u, todo) for size, u, todo in FORCE_UNITS if abs(median / size - 1.0) < 0.06]
         if found:
             hint = f"the readings are in {found[0][0]}: {found[0][1]}"
         elif median < 2.0:

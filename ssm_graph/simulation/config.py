@@ -97,6 +97,9 @@ class SimulationConfig(checked.Settings):
     """Whether instruments err as real ones of the grade: scale factors, slow noise and more."""
     instruments: InstrumentErrors | None = None
     """Their sizes one by one; None for those of the grade if ``realistic``, for none otherwise."""
+    calibrates: bool = False
+    """Whether the mission states what its instruments err in slowly, and asks for the calibration
+    of what stays the same."""
     perfect_sensors: bool = False
     """Draw no sensor error at all; noise stays as stated, outliers and losses as asked for."""
     draw_initial_errors: bool = True

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from ssm_graph.base.frozen import Array
+from ssm_graph.mission.mission import Mission
+from ssm_graph.sensors import imu_calibration
 from ssm_graph.simulation import checked
 from ssm_graph.simulation.inertial import MICRO_G, PER_HOUR, Grade, ImuErrors
 from ssm_graph.simulation.lasting_faults import low_passed
@@ -77,6 +79,17 @@ class InertialErrors(checked.Settings):
     """m/s^2"""
     carries_rest: bool = True
     """Whether what a step leaves over comes with the next sample, as in counted pulses."""
+
+    @property
+    def asked(self) -> imu_calibration.ImuCalibration:
+        """What a mission states that asks for the calibration of what is drawn of these sizes."""
+        return imu_calibration.ImuCalibration(
+            gyro_scale_sigma=self.gyro_scale,
+            gyro_misalignment_sigma=self.gyro_misalignment,
+            gyro_g_sensitivity_sigma=self.g_sensitivity,
+            accel_scale_sigma=self.accel_scale,
+            accel_misalignment_sigma=self.accel_misalignment,
+        )
 
 
 _DOF: Final = checked.Rule(
@@ -330,3 +343,33 @@ def errors_of(grade: Grade) -> InstrumentErrors:
 
 SIMPLE: Final = InstrumentErrors(None, None, None, None)
 """Bias, walk and white noise, as stated."""
+
+
+def stating(mission: Mission, errors: InstrumentErrors) -> Mission:
+    """Return a mission that states what its instruments err in, as their data sheets would.
+
+    What stays the same of an IMU is to be calibrated, the instability of its biases is its noise;
+    slow errors of beams, fixes and depths are drifts.
+    """
+    imu, dvl, gnss, depth = mission.imu, mission.dvl, mission.gnss, mission.depth
+    if errors.inertial:
+        floors = errors.inertial.gyro_instability, errors.inertial.accel_instability
+        noise = replace(
+            imu.noise, gyro_bias_instability=floors[0], accel_bias_instability=floors[1]
+        )
+        imu = replace(imu, calibration=errors.inertial.asked, noise=noise)
+    if errors.beams and errors.beams.slow:
+        # Of a velocity along each axis of the instrument from beams that err each for itself.
+        mount = dvl.mount
+        covariance = np.linalg.inv(mount.beams_d.T @ mount.beams_d)
+        of_axis = math.sqrt(float(np.trace(covariance)) / 3.0)
+        drift = errors.beams.slow.drift(of_axis * float(np.mean(dvl.sigma)))
+        dvl = replace(dvl, mount=replace(mount, drift=drift))
+    if gnss and errors.gnss:
+        sigma = float(np.mean(gnss.sigma_enu))
+        known = replace(gnss.calibration, drift=errors.gnss.drift(sigma))
+        gnss = replace(gnss, calibration=known)
+    if depth and errors.depth:
+        known_depth = replace(depth.calibration, drift=errors.depth.drift(depth.sigma))
+        depth = replace(depth, calibration=known_depth)
+    return replace(mission, imu=imu, dvl=dvl, gnss=gnss, depth=depth)

@@ -31,7 +31,13 @@ from ssm_graph.simulation.currents import Current
 from ssm_graph.simulation.dvl_model import beam_ranges, ping_times, true_beam_speeds
 from ssm_graph.simulation.faults import Fault
 from ssm_graph.simulation.inertial import START_SIGMAS, averaged_imu, imu_errors, initial_state
-from ssm_graph.simulation.instruments import UNCALIBRATED, ImuCalibration, ReadImu, read_imu
+from ssm_graph.simulation.instruments import (
+    UNCALIBRATED,
+    ImuCalibration,
+    ReadImu,
+    read_imu,
+    stating,
+)
 from ssm_graph.simulation.lasting_faults import BrokenMission, with_faults
 from ssm_graph.simulation.randomness import Streams, draw_drift, spawn_streams
 from ssm_graph.simulation.trajectory import Trajectory
@@ -127,6 +133,8 @@ def simulate(config: SimulationConfig) -> SimulatedMission:
         reference=truth,
         current=None if config.current is None else config.current.model,
     )
+    if config.calibrates:
+        intact = stating(intact, config.errors)
     return SimulatedMission(
         config=config,
         **_broken(config, intact, dvl),

@@ -6,12 +6,14 @@ differ only in what was changed.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 
 import numpy as np
 from scipy.signal import lfilter
 
 from ssm_graph.base.frozen import Array
+from ssm_graph.sensors.drift import Drift
 from ssm_graph.simulation import checked
 
 
@@ -69,6 +71,11 @@ class SlowPart(checked.Settings):
     """Of the variance, which stays what it is."""
     correlation_s: float = checked.positive(hint="try 20 s")
     """Time after which 1/e of it is left in the mean, s."""
+
+    def drift(self, sigma: float) -> Drift:
+        """Return what a mission states of it, beside noise of so much."""
+        white = math.sqrt(1.0 - self.share)
+        return Drift(math.sqrt(self.share) * sigma, self.correlation_s, white)
 
 
 def with_slow_part(

@@ -20,14 +20,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from factors.kernels import TruncatedKernel
+from factors.kernels import GeneralKernel, TruncatedKernel
 from factors.similarity import Kernel, LogKernel, Similarity, expected_mahalanobis_sq
 from ssm_graph.base.errors import ConfigError, SolverError
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps, at_once
 from ssm_graph.engine.chain import ChainSolution
 from ssm_graph.engine.error_state import STATE_DIM
-from ssm_graph.engine.reweighting import GncSchedule, Graduation, Schedule, WarmSchedule
+from ssm_graph.engine.reweighting import (
+    AdaptiveSchedule,
+    GncSchedule,
+    Graduation,
+    Schedule,
+    WarmSchedule,
+)
 from ssm_graph.engine.states import States
 from ssm_graph.graph.beacon_start import ambiguous_beacons
 from ssm_graph.graph.beam_rows import BeamRows
@@ -39,6 +45,7 @@ from ssm_graph.mission.answer import trajectory_from_states
 from ssm_graph.mission.estimate import BeamTable, Estimate, Iteration, NoiseFound, Status
 from ssm_graph.mission.problem import Problem, with_white_noise
 from ssm_graph.smoothers.beam_faults import FaultSearch, FaultWatch
+from ssm_graph.smoothers.descent import descend_steps
 from ssm_graph.smoothers.track import calibration_of, current_of, undetermined
 from ssm_graph.smoothers.verdict import (
     MAX_ADAPTATIONS,
@@ -59,10 +66,6 @@ WARM_KERNEL = LogKernel()
 RUNAWAY_SPEED = 1e4
 """m/s; ten silent minutes of a MEMS unit may begin with 100 m/s and still come back."""
 
-MAX_HALVINGS = 10
-COST_SLACK = 1e-2
-"""A rise of the cost by less is rounding: one residual at its sigma costs 0.5."""
-
 
 @dataclass(frozen=True, slots=True)
 class SmootherConfig:
@@ -73,6 +76,8 @@ class SmootherConfig:
     """What a beam is judged by; None for what the kernel was published with."""
     graduation: Graduation | None = None
     """Come to a truncated kernel by graduated non-convexity; None goes straight to the kernel."""
+    adapt_shape: bool = False
+    """Give a general kernel the shape under which the residuals of the beams are likeliest."""
     fault_search: FaultSearch | None = None
     """Look for stretches in which one beam is off for long, and leave them out; None does not."""
     adapt_noise: bool = False
@@ -88,6 +93,8 @@ class SmootherConfig:
             raise ConfigError(f"tolerance: expected a number in (0, 1), got {self.tolerance}")
         if self.graduation is not None and not isinstance(self.kernel, TruncatedKernel):
             raise ConfigError(f"graduation: expected with a TruncatedKernel, got {self.kernel}")
+        if self.adapt_shape and not isinstance(self.kernel, GeneralKernel):
+            raise ConfigError(f"adapt_shape: expected with a GeneralKernel, got {self.kernel}")
 
     @property
     def judged_by(self) -> Similarity:
@@ -97,6 +104,9 @@ class SmootherConfig:
     @property
     def weighting(self) -> str:
         """Kernel and schedule as text, for example ``log(dof=5)``."""
+        if self.adapt_shape:
+            assert isinstance(self.kernel, GeneralKernel)
+            return f"adaptive(width={self.kernel.width:g})"
         if self.graduation is None:
             return str(self.kernel)
         assert isinstance(self.kernel, TruncatedKernel)
@@ -104,6 +114,9 @@ class SmootherConfig:
 
     def schedule(self) -> Schedule:
         """Return which kernel weighs the beams, pass by pass, from the begin."""
+        if self.adapt_shape:
+            assert isinstance(self.kernel, GeneralKernel)
+            return AdaptiveSchedule(self.kernel, WARM_KERNEL)
         if self.graduation is None:
             return WarmSchedule(self.kernel, WARM_KERNEL)
         assert isinstance(self.kernel, TruncatedKernel)
@@ -175,6 +188,8 @@ class Solved(NamedTuple):
     last: Pass
     iterations: tuple[Iteration, ...]
     status: Status
+    kernel: Kernel
+    """That of the answer"""
     notes: tuple[str, ...]
     first: FirstValues
 
@@ -278,6 +293,7 @@ class SsmSmoother:
                 update_sigmas=this.update_sigmas,
                 is_settled=is_settled,
                 aid_weights=this.aid_weights,
+                intervals=linearizer.intervals_at(states),
             )
             if is_settled and not has_news:
                 status = Status.CONVERGED
@@ -285,7 +301,9 @@ class SsmSmoother:
             yield 0.007 * problem.n_keyframes
             weights = weights.after(this, faults)
         notes = problem.notes + faults.notes(rows.error) + _notes_of(first)
-        return Solved(linearizer, this, tuple(iterations), status, notes, first)
+        return Solved(
+            linearizer, this, tuple(iterations), status, weights.of_beams.wanted, notes, first
+        )
 
     def _iterate(
         self,
@@ -296,6 +314,7 @@ class SsmSmoother:
         faults: FaultWatch,
     ) -> Steps[Pass]:
         problem = linearizer.problem
+        yield from linearizer.integrate_steps(states)
         if linearizer.follow(states):
             rows = linearizer.beam_rows(states)
         yield 0.004 * problem.n_keyframes
@@ -339,9 +358,9 @@ class SsmSmoother:
             spread = step.variance(beams.keyframe, H)
         return expected_mahalanobis_sq(rows.error, spread, sigma=beams.sigma)
 
-    def _cost(self, linearizer: GraphLinearizer, last: Pass) -> float:
+    def _cost(self, linearizer: GraphLinearizer, last: Pass, kernel: Kernel) -> float:
         """Return the cost with the robust losses of beams and aids for their weighted squares."""
-        kernel, rows = self.config.kernel, last.beam_rows
+        rows = last.beam_rows
         t = (rows.error / linearizer.problem.beams.sigma) ** 2
         loss = kernel.similarity(np.zeros_like(t)) - kernel.similarity(t)
         aids = linearizer.weighted
@@ -393,7 +412,7 @@ class SsmSmoother:
             ),
             iterations=solved.iterations,
             wall_s=wall_s,
-            cost=self._cost(linearizer, last),
+            cost=self._cost(linearizer, last, solved.kernel),
             start=problem.start,
             notes=solved.notes + noise_notes(noise) + undetermined(calibration),
             calibration=calibration,
@@ -421,28 +440,3 @@ def noise_of_steps(solved: Solved, used: Array) -> Steps[NoiseFound]:
         inertial=fit,
         used=used,
     )
-
-
-def descend_steps(
-    linearizer: GraphLinearizer,
-    states: States,
-    step: ChainSolution,
-    weights: Array,
-    cost: float,
-    *,
-    aid_weights: Array | None = None,
-) -> Steps[tuple[States, BeamRows]]:
-    """Take the Gauss-Newton step, halved while it raises the cost at these weights.
-
-    Returns the states moved to, and their beams.
-    """
-    for halvings in range(MAX_HALVINGS):
-        scale = 0.5**halvings
-        moved = states.moved(scale * step.step, scale * step.constants_step)
-        yield 0.006 * len(moved.p_n)
-        rows = linearizer.beam_rows(moved)
-        yield 0.004 * len(moved.p_n)
-        if linearizer.cost(moved, rows, weights, aid_weights) <= cost + COST_SLACK:
-            return moved, rows
-        yield 0.005 * len(moved.p_n)
-    return states, linearizer.beam_rows(states)

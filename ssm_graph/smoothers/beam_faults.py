@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.inertial import Intervals
 from factors.similarity import WEIGHT_FLOOR, LogKernel
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
@@ -296,17 +297,21 @@ class FaultWatch:
         update_sigmas: float,
         is_settled: bool,
         aid_weights: Array | None = None,
+        intervals: Intervals | None = None,
     ) -> Steps[bool]:
         """Search once the solution is near, and whenever it has settled; return what has changed.
 
         The first solution may be far off where a fault has not been left out yet: its findings are
         given up again where a later one disagrees. After ``FREE_LOOKS`` they only become more, so
-        that there is an end to it.
+        that there is an end to it. ``intervals`` are the inertial data without the errors that the
+        solution finds in the sensors.
         """
         is_due = is_settled or (self._n_looks == 0 and update_sigmas < NEAR_SIGMAS)
         if self._search is None or self._linearizer is None or not is_due:
             return False
         self._n_looks += 1
+        if intervals is not None:
+            self._linearizer.take_inertial(intervals)
         alone, before = self._without_calibration(states, rows), self._found
         found = yield from find_beam_faults_steps(
             self._linearizer, *alone, self._search, aid_weights

@@ -9,11 +9,13 @@ import numpy as np
 
 from ssm_graph.base.errors import SolverError
 from ssm_graph.base.frames import wrap_to_pi
-from ssm_graph.base.stepwise import Steps, at_once
+from ssm_graph.base.stepwise import Steps, finished
 from ssm_graph.mission.estimate import Estimate, Status
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.problem import Problem, ProblemConfig, build_problem_steps
 from ssm_graph.mission.start.alignment import Alignment, align_steps
+from ssm_graph.mission.suspects.find import find_suspects, with_suspects
+from ssm_graph.mission.usable import require_usable
 from ssm_graph.smoothers.batch import OnIteration, SmootherConfig, SsmSmoother
 from ssm_graph.smoothers.beam_faults import FaultSearch
 
@@ -81,7 +83,33 @@ def smooth_steps(
     return _with_notes(chosen, (*mission.notes, f"aligned: {alignment.method}"))
 
 
-smooth = at_once(smooth_steps)
+def smooth(
+    mission: Mission,
+    config: SmootherConfig | None = None,
+    *,
+    problem_config: ProblemConfig | None = None,
+    on_iteration: OnIteration | None = None,
+    on_stage: OnStage | None = None,
+) -> Estimate:
+    """Smooth a mission as :func:`smooth_steps` does, and look for clocks, units and axes.
+
+    What the logs contradict stands first in the reason, and in the message of a
+    :class:`SolverError`.
+    """
+    require_usable(mission)
+    suspects = find_suspects(mission)
+    steps = smooth_steps(
+        mission,
+        config,
+        problem_config=problem_config,
+        on_iteration=on_iteration,
+        on_stage=on_stage,
+    )
+    try:
+        return with_suspects(finished(steps), suspects)
+    except SolverError as error:
+        said = [suspect.sentence for suspect in suspects]
+        raise SolverError("; ".join([*said, str(error)])) from error
 
 
 def _try_steps(

@@ -35,27 +35,17 @@ PRIOR_TAIL = 1e-9
 """Probability below which the initial state is contradicted by the data."""
 
 
-HINTS = {
-    "GNSS": "look for a wrong datum or lever arm",
-    "depth": "look at its zero, sign and unit",
-    "inertial": "look at the noise of [imu], its units, axes and time stamps",
-}
-"""What to look at when a kind of measurement contradicts the answer."""
-
-
 def contradictions(
     linearizer: GraphLinearizer, states: States, beam_rows: BeamRows, weights: Array
 ) -> list[str]:
-    """Compare every kind of measurement with the answer; say in a sentence each what disagrees."""
-    misfits = linearizer.misfits(states)
+    """Compare beams, start, inertial data and calibrations with the answer.
+
+    Returns a sentence for each that disagrees.
+    """
     doubts = [
         *doubts_of_beams(linearizer.problem, states.v_n, beam_rows.error, weights),
         _doubt_prior(linearizer.prior, states),
-        *(
-            _doubt_sensor(name, misfits[name], hint)
-            for name, hint in HINTS.items()
-            if name in misfits
-        ),
+        _doubt_inertial(linearizer.inertial_misfit(states)),
         *_doubt_extras(linearizer.problem.extras, states),
     ]
     return [doubt for doubt in doubts if doubt]
@@ -78,13 +68,13 @@ def _doubt_prior(prior: MarginalPrior, states: States) -> str:
     return ""
 
 
-def _doubt_sensor(name: str, misfit: Misfit, hint: str) -> str:
-    mean_sq = misfit.sum_sq / misfit.n_rows
+def _doubt_inertial(misfit: Misfit) -> str:
+    mean_sq = misfit.sum_sq / max(misfit.n_rows, 1)
     if mean_sq <= MISFIT:
         return ""
     return (
-        f"{name} data miss the answer by {np.sqrt(mean_sq):.1f} of their own sigmas (rms over "
-        f"{misfit.n_factors} factors): {hint}"
+        f"inertial data miss the answer by {np.sqrt(mean_sq):.1f} of their own sigmas (rms over "
+        f"{misfit.n_factors} factors): look at the noise of [imu], its units, axes and time stamps"
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Self
 
@@ -22,6 +22,7 @@ from ssm_graph.engine.states import States
 from ssm_graph.graph.first_weights import met_weights, updated_trust
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors
 from ssm_graph.smoothers.track import Stretch
+from ssm_graph.smoothers.window_aids import SensorRows
 from ssm_graph.smoothers.window_graph import WindowGraph, inertial_data
 
 
@@ -47,7 +48,8 @@ class FixedLagConfig:
     reweigh: float = 1e-9
     """A beam's weight, in a window of several keyframes, is renewed once it is off by so much."""
     gate_sigmas: float = np.inf
-    """Depth and GNSS further than this from what is predicted are left out."""
+    """A depth or GNSS fix further than this from what is predicted gets no weight, and keeps none:
+    a height that little is known of would follow many of them, however far off."""
     first_estimates: bool = False
     """Keep the oldest keyframe where its prior was made, with the Jacobians of that point."""
 
@@ -68,6 +70,8 @@ class FixedLagConfig:
 _PACKED = ("step", "covariance", "innovation", "weights", "t", "trust")
 RUNAWAY_SPEED = 100.0
 """m/s"""
+BEAMS = "DVL"
+"""What the beams are called among the sensors."""
 ROUNDING = 1e-7
 """Posterior sigmas: updates of a window of several keyframes come down to a few 1e-8 and stay."""
 
@@ -156,6 +160,16 @@ class Window:
         return self._stretch(len(self.keyframes) - 1, len(self.keyframes))
 
     @property
+    def newest_states(self) -> States:
+        """The estimate (1, ...) of the newest keyframe."""
+        return self._graph.at.take(np.s_[-1:]).moved(self._step[-1:])
+
+    @property
+    def newest_covariance(self) -> Array:
+        """That of its error state and what it carries beside, (n, n)."""
+        return np.asarray(self._covariance[-1])
+
+    @property
     def newest_sigma(self) -> Array:
         """Standard deviations (n,) of the newest keyframe."""
         return np.asarray(np.sqrt(np.diagonal(self._covariance[-1])))
@@ -164,6 +178,17 @@ class Window:
     def all(self) -> Stretch:
         """All keyframes."""
         return self._stretch(0, len(self.keyframes))
+
+    def newest_rows(self) -> Iterator[SensorRows]:
+        """Yield what each sensor measured at the newest keyframe, where the estimate is."""
+        graph, k = self._graph, len(self.keyframes) - 1
+        rows, step = slice(int(graph.first_row[k]), None), self._step[k]
+        sigma, H = graph.beams.sigma[rows], graph.jacobian[rows]
+        if len(sigma):
+            error = (graph.error[rows] + H @ step) / sigma
+            beam, weight = graph.beams.beam[rows], self._weights[rows]
+            yield SensorRows(BEAMS, error, H / sigma[:, None], weight, beam)
+        yield from graph.aids.rows_at(k, self._step)
 
     def _stretch(self, begin: int, end: int) -> Stretch:
         first = self._graph.first_row
@@ -226,9 +251,9 @@ class Window:
         """
         graph = self._graph
         step, root_cov = graph.prediction(self._weights)
-        if np.isfinite(self.config.gate_sigmas):
-            graph.leave_out_far(step, root_cov, sigmas=self.config.gate_sigmas)
         k, row = len(self.keyframes) - 1, graph.first_row[-2]
+        if np.isfinite(self.config.gate_sigmas):
+            graph.aids.refuse_far(k, step, root_cov, sigmas=self.config.gate_sigmas)
         if graph.aids.meet_prediction(k, step, root_cov, self.config.kernel):
             graph.changed_from(k)
         H = graph.jacobian[row:]

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
-from factors.similarity import Kernel, Similarity
+from factors.similarity import WEIGHT_FLOOR, Kernel, Similarity
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.times import Indices
 from ssm_graph.engine.states import States
 from ssm_graph.graph.aids.aid import Aid, Rows, RowStates
-from ssm_graph.graph.aids.standstill import AnySpeed
+from ssm_graph.graph.aids.depth import DepthMeans
+from ssm_graph.graph.aids.gnss import Fixes
 from ssm_graph.graph.first_weights import settled_weights
 from ssm_graph.graph.measurements import JudgedAid, aid_kernel
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors
@@ -21,6 +23,20 @@ from ssm_graph.smoothers.keyframe import Keyframe, Sensors
 def row_states(sensors: Sensors, states: States) -> RowStates:
     """Return the states as rows take them; gravity, which none here asks for, is left out."""
     return RowStates(*states, sensors.extras, np.zeros(3))
+
+
+class SensorRows(NamedTuple):
+    """What one sensor measured at a keyframe, whitened by the stated noise."""
+
+    sensor: str
+    error: Array
+    """(m,) predicted minus measured"""
+    jacobian: Array
+    """(m, n)"""
+    weight: Array
+    """(m,)"""
+    component: Indices
+    """(m,) which beam or axis"""
 
 
 class _Measured(NamedTuple):
@@ -36,12 +52,15 @@ class _Measured(NamedTuple):
     """(M,)"""
     t: Array
     """(M,)"""
+    is_out: NDArray[np.bool_]
+    """(M,) which were too far from their prediction to get any weight later"""
 
     def take(self, rows: Rows) -> _Measured:
         """Return some measurements."""
         if rows == slice(0, len(self.weight)):
             return self
-        return _Measured(self.aid.take(rows), *(column[rows] for column in self[1:]))
+        columns: tuple[Any, ...] = tuple(column[rows] for column in self[1:])
+        return _Measured(self.aid.take(rows), *columns)
 
     def replaced(self, rows: slice, by: _Measured) -> _Measured:
         """Return these with as many others in the place of successive ones."""
@@ -54,7 +73,8 @@ class _Measured(NamedTuple):
         """Return these, then the others."""
         if len(self.weight) == 0 or len(other.weight) == 0:
             return other if len(self.weight) == 0 else self
-        columns = (np.concatenate(pair) for pair in zip(self[1:], other[1:], strict=True))
+        pairs = zip(self[1:], other[1:], strict=True)
+        columns: tuple[Any, ...] = tuple(np.concatenate(pair) for pair in pairs)
         return _Measured(self.aid.followed_by(other.aid), *columns)
 
     def rows_of(self, begin: int, end: int) -> slice:
@@ -103,7 +123,8 @@ class WindowAids:
 
     def _linearised(self, aid: Aid, at: RowStates) -> _Measured:
         error, jacobian = aid.whitened(at)
-        return _Measured(aid, error, jacobian, np.ones(len(aid)), np.zeros(len(aid)))
+        n = len(aid)
+        return _Measured(aid, error, jacobian, np.ones(n), np.zeros(n), np.zeros(n, bool))
 
     def linearise(self, begin: int, end: int, at: States) -> None:
         """Linearise those of successive keyframes anew at the states (K, ...) of all.
@@ -126,7 +147,7 @@ class WindowAids:
                 here = row_states(self._sensors, at.take(k[:n_first]))
                 first = aid.take(np.s_[:n_first]).led_along(None, here)
                 led = first.followed_by(led) if n_first < len(k) else first
-            anew = _Measured(led, *led.whitened(own), some.weight, some.t)
+            anew = _Measured(led, *led.whitened(own), some.weight, some.t, some.is_out)
             self._all[name] = one.replaced(rows, anew)
 
     def drop(self, count: int) -> None:
@@ -147,30 +168,30 @@ class WindowAids:
             rows = np.empty((*one.error[first:].shape, n + 1))
             rows[..., :n] = one.jacobian[first:]
             np.negative(one.error[first:], out=rows[..., n])
-            rows *= np.sqrt(one.weight[first:])[:, None, None]
+            # What is out has no row at all: floors of what is far off would move a free height.
+            weight = np.where(one.is_out[first:], 0.0, one.weight[first:])
+            rows *= np.sqrt(weight)[:, None, None]
             keyframes.append(np.repeat(one.aid.keyframe[first:], rows.shape[1]))
             blocks.append(rows.reshape(-1, n + 1))
         return np.concatenate(keyframes), np.concatenate(blocks)
 
-    def leave_out_far(
-        self, k: int, step: Array, root_cov: Array, *, sigmas: float
-    ) -> tuple[str, ...]:
-        """Leave out what counts in full at the newest keyframe and is far from its prediction.
+    def refuse_far(self, k: int, step: Array, root_cov: Array, *, sigmas: float) -> None:
+        """Let no depth or fix of the newest keyframe count that is too far from its prediction.
 
-        Returns the names of what was left out; step (n,) and root (n, n) as the graph predicts.
+        As for the others, step (n,) and root (n, n) are what the graph predicts.
         """
-        left_out = []
-        for name, one in self._all.items():
-            rows = one.rows_of(k, k + 1)
-            if one.aid.is_weighted or isinstance(one.aid, AnySpeed) or rows.start == rows.stop:
+        for name in (DepthMeans.name, Fixes.name):
+            one = self._all.get(name)
+            rows = np.s_[0:0] if one is None else one.rows_of(k, k + 1)
+            if one is None or rows.start == rows.stop:
                 continue
-            A = one.jacobian[rows].reshape(-1, len(step))
-            root, left = A @ root_cov, -one.error[rows].ravel() - A @ step
-            distance_sq = left @ np.linalg.solve(root @ root.T + np.eye(len(left)), left)
-            if distance_sq > sigmas**2 * len(left):
-                self._all[name] = one.take(np.s_[: rows.start])
-                left_out.append(name)
-        return tuple(left_out)
+            H, error = one.jacobian[rows], one.error[rows]
+            root, left = H @ root_cov, -error - H @ step
+            S = root @ np.swapaxes(root, 1, 2) + np.eye(one.aid.dim)
+            distance_sq = (left * np.linalg.solve(S, left[..., None])[..., 0]).sum(axis=1)
+            is_out = one.is_out.copy()
+            is_out[rows] = distance_sq > sigmas**2 * one.aid.dim
+            self._all[name] = one._replace(is_out=is_out)
 
     def meet_prediction(self, k: int, step: Array, root_cov: Array, kernel: Kernel) -> bool:
         """Weigh the measurements of the newest keyframe by what all before it predict, together.
@@ -182,11 +203,16 @@ class WindowAids:
         if not met:
             return False
         some = [self._all[name].take(rows) for name, rows in met]
-        H = np.concatenate([one.jacobian.reshape(-1, len(step)) for one in some])
-        error, root = np.concatenate([one.error.ravel() for one in some]), H @ root_cov
         dims = np.concatenate([np.full(len(one.aid), one.aid.dim) for one in some])
         measurement = np.repeat(np.arange(len(dims)), dims)
+        is_out = np.concatenate([one.is_out for one in some])
+        counts = np.where(is_out, 0.0, 1.0)[measurement]
+        H = np.concatenate([one.jacobian.reshape(-1, len(step)) for one in some])
+        H = H * counts[:, None]
+        error = counts * np.concatenate([one.error.ravel() for one in some])
+        root = H @ root_cov
         weights = settled_weights(-error - H @ step, root @ root.T, measurement, aid_kernel(kernel))
+        weights = np.where(is_out, WEIGHT_FLOOR, weights)
         begin = 0
         for name, rows in met:
             one, count = self._all[name], rows.stop - rows.start
@@ -212,8 +238,13 @@ class WindowAids:
     def settled(self, kernel: Kernel) -> Array:
         """Return the weights (M,) that the present ``t`` ask for."""
         kernel = aid_kernel(kernel)
-        of_each = (self._all[name] for name in self._weighted)
-        return np.concatenate([np.zeros(0), *(kernel.weight(x.t, dim=x.aid.dim) for x in of_each)])
+        settled = [np.zeros(0)]
+        for name in self._weighted:
+            one = self._all[name]
+            settled.append(
+                np.where(one.is_out, WEIGHT_FLOOR, kernel.weight(one.t, dim=one.aid.dim))
+            )
+        return np.concatenate(settled)
 
     def renew(self, settled: Array, *, threshold: float) -> int | None:
         """Take the weights (M,) that differ by more; return the first keyframe that has one."""
@@ -244,6 +275,17 @@ class WindowAids:
                 )
         return found
 
+    def rows_at(self, k: int, step: Array) -> Iterator[SensorRows]:
+        """Yield what each aid measured at keyframe ``k``, where a step (K, n) leads to."""
+        for name, one in self._all.items():
+            own = one.take(one.rows_of(k, k + 1))
+            if len(own.aid):
+                weight = np.repeat(own.weight, own.aid.dim)
+                error = self._errors(own, step).ravel()
+                component = np.arange(len(error)) % own.aid.dim
+                H = own.jacobian.reshape(len(error), -1)
+                yield SensorRows(name, error, H, weight, component)
+
     def pack(self) -> Iterator[tuple[str, Array]]:
         """Yield name and array of all that :meth:`unpack` needs."""
         for name, one in self._all.items():
@@ -251,6 +293,7 @@ class WindowAids:
                 yield f"aid_{name}_{column}", array
             yield f"aid_{name}_weight_now", one.weight
             yield f"aid_{name}_t_now", one.t
+            yield f"aid_{name}_out_now", one.is_out.astype(np.float64)
 
     @classmethod
     def unpack(cls, arrays: Mapping[str, Array], sensors: Sensors, at: States) -> Self:
@@ -262,7 +305,10 @@ class WindowAids:
             if own:
                 aid = template.unpack(own)
                 anew = aids._linearised(aid, row_states(sensors, at.take(aid.keyframe)))
-                aids._all[name] = anew._replace(weight=own["weight_now"], t=own["t_now"])
+                is_out = own.get("out_now", np.zeros(len(aid))) > 0.0  # older ones have none
+                aids._all[name] = anew._replace(
+                    weight=own["weight_now"], t=own["t_now"], is_out=is_out
+                )
         return aids
 
     def at(self, k: int) -> dict[str, Aid]:

@@ -253,14 +253,6 @@ class WindowGraph:
         solved = solve_triangular(carried[:, :-1], np.column_stack([identity, carried[:, -1]]))
         return solved[:, -1], solved[:, :-1]
 
-    def leave_out_far(self, step: Array, root_cov: Array, *, sigmas: float) -> None:
-        """Leave out of the newest keyframe what counts in full and is far from its prediction."""
-        k = len(self.keyframes) - 1
-        left_out = self.aids.leave_out_far(k, step, root_cov, sigmas=sigmas)
-        if left_out:
-            self.keyframes[k] = self.keyframes[k].without(*left_out)
-            self.changed_from(k)
-
     def linearise(self, begin: int, end: int, step: Array) -> None:
         """Move successive keyframes by ``step`` (end - begin, n) and linearise there."""
         moved = self.at.take(np.s_[begin:end]).moved(step)

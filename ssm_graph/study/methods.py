@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Final
 
-from factors.kernels import KERNELS, KernelChoice, TruncatedKernel
+from factors.kernels import KERNELS, GeneralKernel, KernelChoice, TruncatedKernel
 from factors.similarity import GaussianKernel, Similarity
 from ssm_graph.base.errors import ConfigError, SsmGraphError, nearest_hint
 from ssm_graph.engine.reweighting import Graduation
@@ -121,6 +121,26 @@ def _kernel_family(name: str, choice: KernelChoice, similarity: Similarity | Non
     )
 
 
+SEARCHED: Final[Mapping[str, SmootherConfig]] = {
+    **{name: SmootherConfig(KERNELS[name].kernel()) for name in ("log", "exp", "truncated")},
+    "gnc-tls": SmootherConfig(TruncatedKernel(), graduation=Graduation()),
+    "adaptive": SmootherConfig(GeneralKernel(), adapt_shape=True),
+}
+"""Weightings that are compared with the search for lasting faults as well."""
+
+
+def _family_with_search(name: str, config: SmootherConfig) -> Family:
+    def make(value: float | None) -> Solver:
+        significance = FaultSearch().significance if value is None else value
+        return _smoother(replace(config, fault_search=FaultSearch(significance=significance)))
+
+    return Family(
+        f"batch smoother, {name}, without stretches of a beam off by so many sigmas of its mean",
+        make,
+        FaultSearch().significance,
+    )
+
+
 def _filter_family(name: str, *, is_oracle: bool = False, is_smoothed: bool = False) -> Family:
     choice = FILTERS[name]
 
@@ -179,11 +199,10 @@ FAMILIES: Final[Mapping[str, Family]] = {
         f"smoother-plain-{name}": _kernel_family(name, KERNELS[name], Similarity.PLAIN)
         for name in ("log", "sqrt", "exp")
     },
-    "smoother-log-faults": Family(
-        "batch smoother, log kernel, without stretches of a beam off by so many sigmas of its mean",
-        lambda value: _smoother(SmootherConfig(fault_search=FaultSearch(significance=value))),
-        FaultSearch().significance,
-    ),
+    **{
+        f"smoother-{name}-faults": _family_with_search(name, config)
+        for name, config in SEARCHED.items()
+    },
     **{name: _filter_family(name) for name in FILTERS},
     **{f"{name}+rts": _filter_family(name, is_smoothed=True) for name in FILTERS},
     "ekf-oracle": _filter_family("ekf", is_oracle=True),
@@ -209,6 +228,11 @@ FAMILIES: Final[Mapping[str, Family]] = {
         "batch smoother, truncated least squares by graduated non-convexity",
         lambda value: _smoother(SmootherConfig(TruncatedKernel(value), graduation=Graduation())),
         TruncatedKernel().width,
+    ),
+    "smoother-adaptive": Family(
+        "batch smoother, general loss of this width and of the likeliest shape",
+        lambda value: _smoother(SmootherConfig(GeneralKernel(width=value), adapt_shape=True)),
+        GeneralKernel().width,
     ),
 }
 """All methods by the name in front of the colon."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, V, X
@@ -10,8 +12,7 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.engine.marginal_prior import prior_at_start
 from ssm_graph.engine.states import States
 from ssm_graph.graph.gtsam_graph import (
-    depth_graph,
-    gnss_graph,
+    aid_graph,
     gtsam_values,
     inertial_graph,
     prior_graph,
@@ -57,9 +58,8 @@ def test_prior_gnss_and_depth_jacobians(turn: Array) -> None:
     sim = simulated(duration_s=4.0, gnss=GnssSettings(windows=((0.0, 1e9),)))
     problem = build_problem(sim.mission)
     states = disturbed(true_states(problem, sim), turn, seed=2)
-    assert problem.depths is not None
-    depth = depth_graph(problem, problem.depths, states)
-    for graph in (gnss_graph(problem.fixes), depth):
+    for kept in (replace(problem, depths=None), replace(problem, fixes=None)):
+        graph = aid_graph(kept, states)
         assert graph.size() >= 4
         for k in range(graph.size()):
             assert_jacobians_match(graph.at(k), gtsam_values(states))

@@ -70,6 +70,7 @@ def test_results_tell_of_every_measurement(tmp_path: Path, sim: SimulatedMission
     with (tmp_path / "aids.csv").open(encoding="utf-8", newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert {row["aid"] for row in rows} == {
+        "depth",
         "USBL",
         "range",
         "heading",
@@ -81,6 +82,7 @@ def test_results_tell_of_every_measurement(tmp_path: Path, sim: SimulatedMission
     assert 0.2 < np.std(headings) < 5.0
     counted = read_results(tmp_path).summary["aids"]
     for name, components in (
+        ("depth", 1),
         ("USBL", 3),
         ("range", 1),
         ("heading", 1),
@@ -92,7 +94,7 @@ def test_results_tell_of_every_measurement(tmp_path: Path, sim: SimulatedMission
     calibration = read_results(tmp_path).summary["calibration"]
     assert calibration["beacon_7_east_m"]["prior_sigma"] == pytest.approx(40.0)
     assert calibration["heading_offset_deg"]["prior_sigma"] == pytest.approx(4.0)
-    plain = replace(sim.mission, aids=Aids())
+    plain = replace(sim.mission, aids=Aids(), depth=None, gnss=None)
     write_results(tmp_path, answer(plain), mission=plain, metrics=None, settings={})
     assert not (tmp_path / "aids.csv").exists()
     assert "aids" not in read_results(tmp_path).summary

@@ -44,7 +44,7 @@ def test_a_replay_is_a_run(
     """A mission without a word about its vehicle; results, log and settings are there."""
     run = tmp_path / "run"
     words = ["online", "--replay", str(mission), "--speed", "full", "--out", str(run)]
-    words += ["--kernel", "sqrt", "--dof", "4", "--lag", "5", "--duration", "20"]
+    words += ["--kernel", "sqrt", "--dof", "4", "--lag", "5", "--duration", "30"]
     assert main(words) == ExitCode.GOOD
     shown = capsys.readouterr()
     assert "GOOD" in shown.out
@@ -54,8 +54,8 @@ def test_a_replay_is_a_run(
     assert settings == {"lag_s": 5.0, "kernel": "sqrt(dof=4)", "similarity": "expected"}
     results = read_results(run)
     assert results.summary["kernel"] == "sqrt(dof=4)"
-    assert results.trajectory["time_s"][-1] == pytest.approx(20.0, abs=1.1)
-    assert len(read_mission(run / "log").imu.time_s) == pytest.approx(400, abs=5)
+    assert results.trajectory["time_s"][-1] == pytest.approx(30.0, abs=1.1)
+    assert len(read_mission(run / "log").imu.time_s) == pytest.approx(600, abs=5)
     assert main([*words[:-4], "--lag", "6"]) == ExitCode.USAGE
     assert "lag_s = 5.0, not 6.0" in capsys.readouterr().err
 
@@ -79,7 +79,7 @@ def test_pings_off_the_water_are_logged_and_count(tmp_path: Path) -> None:
     mission = make_mission()
     water = (np.arange(len(mission.dvl.time_s)) % 4 == 3).astype(float)
     write_mission(tmp_path / "m", replace(mission, dvl=replace(mission.dvl, water_track=water)))
-    words = ["online", "--replay", str(tmp_path / "m"), "--speed", "full", "--duration", "20"]
+    words = ["online", "--replay", str(tmp_path / "m"), "--speed", "full", "--duration", "30"]
     assert main([*words, "--out", str(tmp_path / "run")]) == ExitCode.GOOD
     assert "water_track" not in (tmp_path / "run" / "events.jsonl").read_text()
     found = json.loads((tmp_path / "run" / "summary.json").read_text())["current"]
@@ -94,7 +94,7 @@ def test_pings_off_the_water_are_logged_and_count(tmp_path: Path) -> None:
     assert log.current is not None
     logged = log.dvl
     np.testing.assert_array_equal(logged.is_water, water[: len(logged.time_s)] > 0.0)
-    assert logged.is_water.sum() == 5
+    assert logged.is_water.sum() == 7
 
 
 def test_a_run_without_an_answer_has_its_code(

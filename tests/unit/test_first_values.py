@@ -154,7 +154,7 @@ def test_one_exact_fix_moves_what_is_free_until_the_antenna_meets_it(free: slice
         # As far from the body origin as the antenna is: a rotation can reach it.
         target = truth.p_n[k] + truth.R_nb[k] @ lever
     gap = np.linalg.norm(state.p_n + state.R_nb @ lever - target)
-    state._update_fix(range(1))
+    state._update_aids(k)
     left = np.linalg.norm(state.p_n + state.R_nb @ lever - target)
     assert left < 0.02 * gap
 
@@ -191,7 +191,7 @@ def test_one_exact_depth_moves_what_is_free_until_the_sensor_meets_it(free: slic
 
     before = too_high()
     assert abs(before) > 0.1
-    state._update_dvl(slice(0, 0), state._depth_row(range(row, row + 1), k))
+    state._update_aids(k)
     # The Earth as a sphere: the ellipsoid's radii differ by 0.3 % of a fall of 5 m.
     assert abs(too_high()) < 0.02 * abs(before) + 0.02
 

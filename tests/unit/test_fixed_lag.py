@@ -74,8 +74,10 @@ def test_the_window_is_the_graph() -> None:
     states = window.states
     linearizer = GraphLinearizer(problem)
     linearizer.follow(states)
-    weights = window.all.weight
-    step = linearizer.solve(states, linearizer.beam_rows(states), weights)
+    judged = window.all.aids
+    of_aids = np.concatenate([judged[aid.name].weight for aid in linearizer.weighted.all])
+    rows = linearizer.beam_rows(states)
+    step = linearizer.solve(states, rows, window.all.weight, of_aids)
     covariance = step.covariance(15)
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     assert np.max(np.abs(step.step) / sigma) < 1e-6

@@ -39,7 +39,7 @@ from ssm_graph.simulation import (
 )
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother, warm_start
 from ssm_graph.smoothers.beam_faults import FaultSearch
-from tests.aids_fixture import UNKNOWN, compass, ranging, usbl, with_every_aid
+from tests.aids_fixture import UNKNOWN, compass, ranging, usbl, weights_of, with_every_aid
 from tests.helpers import simulated
 
 KERNEL = LogKernel()
@@ -89,7 +89,8 @@ def test_an_aid_without_a_measurement_in_the_mission_is_none() -> None:
     ):
         estimate = SsmSmoother().solve(build_problem(replace(sim.mission, aids=logs)))
         assert estimate.status is Status.CONVERGED
-        assert (estimate.aids is None) == (logs is late)
+        assert estimate.aids is not None
+        assert (set(estimate.aids.aid) == {"depth"}) == (logs is late)
 
 
 def test_a_keyframe_has_one_heading_led_to_it_by_the_gyros() -> None:
@@ -193,8 +194,9 @@ def test_ranges_of_one_keyframe_find_a_start_that_is_off(
     assert met is not None
     (k,) = np.unique(met.keyframe)
     assert np.linalg.norm((first.states.p_n[k] - place_n)[:2]) < 0.5
-    assert first.aid_weights[n_gross:].min() > 0.8
-    assert np.all(first.aid_weights[:n_gross] < 0.01)
+    weights = first.aid_weights[-4:]
+    assert weights[n_gross:].min() > 0.8
+    assert np.all(weights[:n_gross] < 0.01)
 
 
 def circle(n: int = 200) -> np.ndarray:
@@ -247,17 +249,15 @@ def test_the_smoother_starts_an_unknown_beacon_near_its_place() -> None:
     first = first_values(problem, kernel=KERNEL)
     np.testing.assert_allclose(first.states.constants, -np.array(UNKNOWN.stated_off), atol=8.0)
     gross = sim.aids.gross["ranges"]
-    assert first.aid_weights[gross].max() < 0.3
+    assert first.aid_weights[-len(gross) :][gross].max() < 0.3
 
 
 def outliers(sim: SimulatedMission, section: str, name: str) -> tuple[Status, np.ndarray]:
     """Return how the smoother ended, and the weights of gross errors and of good readings."""
     estimate = SsmSmoother().solve(build_problem(sim.mission))
     assert estimate.aids is not None
-    table = estimate.aids
-    assert set(table.aid) == {name}
-    first = np.array([c not in ("north", "up") for c in table.component])
-    weight, gross = table.weight[first], sim.aids.gross[section]
+    assert set(estimate.aids.aid) == {"depth", name}
+    weight, gross = weights_of(estimate.aids, name), sim.aids.gross[section]
     assert len(weight) == len(gross)
     assert weight[gross].max() < 0.15
     assert np.median(weight[~gross]) > 0.8
@@ -291,7 +291,7 @@ def test_whatever_weighs_the_beams_the_aids_are_robust(config: SmootherConfig) -
     estimate = SsmSmoother(config).solve(build_problem(sim.mission))
     assert estimate.status is Status.CONVERGED
     assert estimate.aids is not None
-    weight = estimate.aids.weight[::3]
+    weight = weights_of(estimate.aids, "USBL")
     assert weight[sim.aids.gross["usbl"]].max() < 0.15
     assert np.isfinite(estimate.cost)
 
@@ -304,10 +304,12 @@ def test_a_disturbed_compass_loses_its_weight() -> None:
     table, log = estimate.aids, sim.mission.aids.get(HeadingLog)
     assert table is not None
     assert log is not None
-    reading = np.argmin(np.abs(log.time_s - table.time_s[:, None]), axis=1)
+    time_s = table.time_s[np.array(table.aid) == "heading"]
+    reading = np.argmin(np.abs(log.time_s - time_s[:, None]), axis=1)
     gross = sim.aids.gross["heading"][reading]
-    assert table.weight[gross].max() < 0.15
-    assert np.median(table.weight[~gross]) > 0.8
+    weight = weights_of(table, "heading")
+    assert weight[gross].max() < 0.15
+    assert np.median(weight[~gross]) > 0.8
 
 
 def test_what_a_compass_errs_by_is_found_within_its_sigma() -> None:
@@ -366,7 +368,8 @@ def test_without_aids_nothing_changes() -> None:
     first, second = (SsmSmoother().solve(build_problem(m)) for m in (plain.mission, taken))
     np.testing.assert_array_equal(first.trajectory.lat, second.trajectory.lat)
     np.testing.assert_array_equal(first.beams.weight, second.beams.weight)
-    assert first.aids is None
+    assert first.aids is not None
+    assert set(first.aids.aid) == {"depth"}
     assert first.calibration is None
     assert first.notes == second.notes
 
@@ -377,12 +380,15 @@ def test_every_aid_at_once() -> None:
     estimate = SsmSmoother().solve(build_problem(at_rest.mission))
     assert estimate.status is Status.CONVERGED, estimate.reason
     assert estimate.aids is not None
-    assert set(estimate.aids.aid) == {"USBL", "range", "heading", "magnetometer", "standstill"}
+    assert set(estimate.aids.aid) == {
+        *("depth", "USBL", "range", "heading", "magnetometer", "standstill")
+    }
     assert set(estimate.aids.component) == {
         *("x", "y", "z"),
         "east",
         "north",
         "up",
+        "depth",
         "heading",
         "beacon_3",
         "beacon_7",

@@ -20,7 +20,7 @@ from ssm_graph.filters.geodetic.filter import (
     run_geodetic,
     to_navigation,
 )
-from ssm_graph.filters.geodetic.measurements import beam_rows, nominal_rows, places_of
+from ssm_graph.filters.geodetic.measurements import aid_rows, beam_rows, places_of
 from ssm_graph.filters.geodetic.mechanisation import (
     DP,
     ERROR_DIM,
@@ -225,11 +225,11 @@ def test_rows_are_the_derivatives_of_what_they_measure(axis: int) -> None:
     for sign in (1.0, -1.0):
         off = off_by(state, sign * X)
         drifted = measured.beams._replace(gyro_b=measured.beams.gyro_b + sign * X[9:12])
-        nominal = nominal_rows(measured, places, k, off, None, no_X)
+        nominal = aid_rows(measured, places, k, off, None, no_X)
         assert nominal is not None
         Zs.append(np.concatenate([beam_rows(drifted, k, off).Z[0], nominal.Z[0]]))
     rows = beam_rows(measured.beams, k, state)
-    nominal = nominal_rows(measured, places, k, state, None, no_X)
+    nominal = aid_rows(measured, places, k, state, None, no_X)
     assert nominal is not None
     H = np.concatenate([rows.H[0], nominal.H[0]])
     assert H.shape == (8, ERROR_DIM)
@@ -250,7 +250,7 @@ def test_depths_are_compared_at_their_own_times() -> None:
     measured.depths.depth[k, 0, : len(ours)] = -at_reading
     places = places_of(measured.fixes, [problem.frame])
     places.place[:] = np.nan
-    rows = nominal_rows(measured, places, k, track.end, track, np.zeros((1, ERROR_DIM)))
+    rows = aid_rows(measured, places, k, track.end, track, np.zeros((1, ERROR_DIM)))
     assert rows is not None
     np.testing.assert_allclose(rows.Z, 0.0, atol=1e-9)
     assert rows.sigma[0, 0] == pytest.approx(problem.depths.sigma / np.sqrt(len(ours)))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from factors.kernels import HuberKernel, TruncatedKernel
+from factors.kernels import GeneralKernel, HuberKernel, TruncatedKernel
 from factors.similarity import WEIGHT_FLOOR, GaussianKernel, LogKernel
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.engine.reweighting import (
@@ -126,7 +126,7 @@ def test_weights_end_binary_and_outliers_without(start: GncStart) -> None:
 
 def test_clean_data_are_least_squares() -> None:
     """With a width that no residual reaches nothing is truncated: the plain answer."""
-    problem = build_problem(simulated().mission)
+    problem = build_problem(simulated(depth=None).mission)
     estimate = graduated(problem, width=6.0)
     plain = SsmSmoother(SmootherConfig(kernel=GaussianKernel())).solve(problem)
     assert estimate.status is plain.status is Status.CONVERGED
@@ -151,3 +151,19 @@ def test_bad_settings_are_refused() -> None:
             Graduation(mu_step=mu_step)
     with pytest.raises(ConfigError, match="graduation: expected with a TruncatedKernel, got huber"):
         SmootherConfig(kernel=HuberKernel(), graduation=Graduation())
+
+
+def test_the_adaptive_loss_finds_its_shape_and_settles() -> None:
+    """Least squares without outliers, a loss that ends with some, and in the name of the answer."""
+    for outliers, is_plain in ((Outliers(), True), (SPARSE, False)):
+        sim = simulated(outliers=outliers, duration_s=60.0)
+        config = SmootherConfig(kernel=GeneralKernel(), adapt_shape=True)
+        estimate = SsmSmoother(config).solve(build_problem(sim.mission))
+        assert estimate.status is Status.CONVERGED, estimate.reason
+        assert estimate.kernel == "adaptive(width=1)"
+        text = estimate.iterations[-1].kernel
+        last = float(text.removeprefix("general(alpha=").partition(",")[0])
+        assert (last > 1.5) if is_plain else (last < 0.0)
+        bad = sim.is_outlier[np.isfinite(sim.mission.dvl.speed)]
+        assert np.all(estimate.beams.weight[bad] < 0.01)
+        assert np.median(estimate.beams.weight[~bad]) > 0.7

@@ -8,29 +8,41 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from ssm_graph.base.errors import DataError
-from ssm_graph.io.results.tables import BEAMS_NAME, SUMMARY_NAME, TRAJECTORY_NAME, GrowingResults
+from ssm_graph.io.results.tables import (
+    BEAMS_NAME,
+    PROTECTION_NAME,
+    SUMMARY_NAME,
+    TRAJECTORY_NAME,
+    GrowingResults,
+)
+from ssm_graph.mission.estimate import ProtectionTrack
 from tests.estimate_fixture import make_run
 
-NAMES = (TRAJECTORY_NAME, BEAMS_NAME)
+NAMES = (TRAJECTORY_NAME, BEAMS_NAME, PROTECTION_NAME)
+
+LEVELS = ProtectionTrack(
+    np.array([1.0, 2.0]), np.array([3.512345, 3.523456]), np.array([0.512345, 0.723456])
+)
 
 
 def add(results: GrowingResults, times: int = 1) -> None:
     """Append the rows of an estimate."""
     estimate, _ = make_run(n=20)
     for _ in range(times):
-        results.append(estimate.trajectory, estimate.beams)
+        results.append(estimate.trajectory, estimate.beams, protection=LEVELS)
 
 
 def content(folder: Path) -> list[bytes]:
-    """Return what both tables hold."""
+    """Return what all tables hold."""
     return [(folder / name).read_bytes() for name in NAMES]
 
 
 def undisturbed(folder: Path, times: int) -> list[bytes]:
-    """Return what both tables hold after so many appends that nothing disturbs."""
+    """Return what all tables hold after so many appends that nothing disturbs."""
     add(GrowingResults(folder), times)
     return content(folder)
 

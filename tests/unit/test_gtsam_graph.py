@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import gtsam
@@ -14,9 +15,8 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.engine.states import States
 from ssm_graph.graph.gtsam_graph import (
+    aid_graph,
     chain_ordering,
-    depth_graph,
-    gnss_graph,
     gtsam_values,
     prior_graph,
 )
@@ -64,18 +64,22 @@ def errors_of(graph: gtsam.NonlinearFactorGraph, states: States) -> Array:
     return np.array(rows)
 
 
+def depth_graph(problem: Problem, states: States) -> gtsam.NonlinearFactorGraph:
+    """Return the factors of depth alone."""
+    return aid_graph(replace(problem, fixes=None), states)
+
+
 def depth_errors(problem: Problem, states: States) -> Array:
     """Return what depth misses at the states, m."""
     assert problem.depths is not None
-    graph = depth_graph(problem, problem.depths, states)
-    return errors_of(graph, states)[:, 2]
+    return errors_of(depth_graph(problem, states), states)[:, 2]
 
 
 def test_gnss_is_zero_at_the_truth_10_km_away() -> None:
     """Antenna off by its lever arm, positions by the ellipsoid: rounding of 6e6 m is left."""
     _, problem, states = far_transit(depth_hz=1.0, waves=Waves())
     assert np.linalg.norm(states.p_n[-1]) > 9900.0
-    errors = errors_of(gnss_graph(problem.fixes), states)
+    errors = errors_of(aid_graph(replace(problem, depths=None), states), states)
     assert len(errors) == 200
     assert np.abs(errors).max() < 2e-8
 
@@ -112,7 +116,7 @@ def test_depth_counts_the_height_error_and_its_readings() -> None:
     states = States.of(truth.R_nb, raised, truth.v_n, truth.bias)
     np.testing.assert_allclose(depth_errors(problem, states), 0.2, atol=1e-5)
     assert problem.depths is not None
-    graph, values = depth_graph(problem, problem.depths, states), gtsam_values(states)
+    graph, values = depth_graph(problem, states), gtsam_values(states)
     counts = np.bincount(problem.depths.keyframe, minlength=problem.n_keyframes)
     costs = [graph.at(k).error(values) for k in range(graph.size())]
     expected = 0.5 * counts[counts > 0] * (0.2 / problem.depths.sigma) ** 2
@@ -123,7 +127,7 @@ def test_depth_says_nothing_of_the_local_level() -> None:
     """GTSAM's position factor is used along the vertical at the vehicle alone."""
     _, problem, truth = far_transit(depth_hz=1.0)
     assert problem.depths is not None
-    graph = depth_graph(problem, problem.depths, truth)
+    graph = depth_graph(problem, truth)
     level = np.array([5.0, -9.0, 0.0])
     shifted = truth.p_n + problem.frame.R_nl_at(truth.p_n) @ level
     aside = States.of(truth.R_nb, shifted, truth.v_n, truth.bias)

@@ -50,7 +50,7 @@ SIZES: dict[FaultShape, Any] = {
     FaultShape.CLOCK: 0.5,
 }
 OFFSETS = (FaultShape.CONSTANT, FaultShape.DRIFT, FaultShape.RAMP)
-EVERY = [(sensor, shape) for shape, sensors in SENSORS.items() for sensor in sensors]
+EVERY = [(sensor, shape) for shape, on in SENSORS.items() for sensor in Sensor if sensor in on]
 
 
 def config(**changes: Any) -> SimulationConfig:

@@ -97,15 +97,16 @@ def test_it_is_gtsams_graph(grade: Grade, monkeypatch: pytest.MonkeyPatch) -> No
     weights = rng.uniform(0.01, 1.1, len(problem.beams.speed))
     linearizer = GraphLinearizer(problem)
     linearizer.follow(states)
+    of_aids = rng.uniform(0.01, 1.1, len(linearizer.weighted))
     rows = linearizer.beam_rows(states)
-    found = linearizer.solve(states, rows, weights)
-    graph = gtsam_graph(problem, states, weights)
+    found = linearizer.solve(states, rows, weights, of_aids)
+    graph = gtsam_graph(problem, states, weights, of_aids)
     step, P = dense(graph, states)
     sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
     scale = sigma[:, :, None] * sigma[:, None, :]
     np.testing.assert_allclose(found.covariance(STATE_DIM) / scale, P / scale, rtol=0.0, atol=1e-8)
     np.testing.assert_allclose(found.step / sigma, step / sigma, rtol=0.0, atol=1e-7)
-    cost = linearizer.cost(states, rows, weights)
+    cost = linearizer.cost(states, rows, weights, of_aids)
     assert cost == pytest.approx(graph.error(gtsam_values(states)), rel=1e-9)
 
 
@@ -128,7 +129,7 @@ def test_it_is_gtsams_graph_with_further_aids(monkeypatch: pytest.MonkeyPatch) -
     linearizer = GraphLinearizer(problem)
     weights = rng.uniform(0.01, 1.1, len(problem.beams.speed))
     aid_weights = rng.uniform(0.01, 1.1, len(linearizer.weighted))
-    assert len(linearizer.weighted.all) == 4
+    assert len(linearizer.weighted.all) == 5
     linearizer.follow(states)
     rows = linearizer.beam_rows(states)
     found = linearizer.solve(states, rows, weights, aid_weights)
@@ -150,7 +151,7 @@ def test_gtsams_graph_has_no_calibration() -> None:
 
 
 def test_with_everything_known_it_is_the_graph_without() -> None:
-    """Step, covariance, cost and misfits are those of the keyframes alone."""
+    """Step, covariance, cost and misfit are those of the keyframes alone."""
     problem, plain, states = problems()
     known = with_small_priors(problem, 1e-7)
     states = states._replace(
@@ -166,19 +167,17 @@ def test_with_everything_known_it_is_the_graph_without() -> None:
         cost = linearizer.cost(at, rows, weights)
         variance = step.variance(plain.beams.keyframe, rows.jacobian)
         found.append(
-            (step.covariance(STATE_DIM), cost, variance, linearizer.misfits(at), step.step)
+            (step.covariance(STATE_DIM), cost, variance, linearizer.inertial_misfit(at), step.step)
         )
-    (P, cost, variance, misfits, update), (P_2, cost_2, variance_2, misfits_2, update_2) = found
+    (P, cost, variance, misfit, update), (P_2, cost_2, variance_2, misfit_2, update_2) = found
     sigma = np.sqrt(np.diagonal(P_2, axis1=1, axis2=2))
     scale = sigma[:, :, None] * sigma[:, None, :]
     np.testing.assert_allclose(P / scale, P_2 / scale, atol=1e-6)
     np.testing.assert_allclose(update / sigma, update_2 / sigma, atol=1e-4)
     np.testing.assert_allclose(variance, variance_2, rtol=1e-6)
     assert cost == pytest.approx(cost_2, rel=1e-9)
-    assert misfits.keys() == misfits_2.keys() == {"GNSS", "depth", "inertial"}
-    for name, misfit in misfits.items():
-        assert misfit.sum_sq == pytest.approx(misfits_2[name].sum_sq, rel=1e-9)
-        assert misfit[1:] == misfits_2[name][1:]
+    assert misfit.sum_sq == pytest.approx(misfit_2.sum_sq, rel=1e-9)
+    assert misfit[1:] == misfit_2[1:]
 
 
 def along(linearizer: GraphLinearizer, states: States, direction: Array) -> tuple[float, float]:

@@ -253,6 +253,9 @@ def test_an_answer_speaks_as_the_trajectory_table() -> None:
         "bottom_lock",
         "since_aid_s",
         "latency_s",
+        "protection_m",
+        "protection_up_m",
+        "innovation_ratios",
     }
     assert fields["accel_bias_x_ug"] == pytest.approx(1e-3 / MICRO_G)
 

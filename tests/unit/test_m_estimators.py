@@ -20,9 +20,12 @@ from factors.kernels import (
     CauchyKernel,
     DcsKernel,
     GemanMcClureKernel,
+    GeneralKernel,
     HuberKernel,
     MEstimator,
     TruncatedKernel,
+    fitted_shape,
+    log_partition,
     parse_kernel,
 )
 from factors.similarity import WEIGHT_FLOOR, GaussianKernel, Kernel, LogKernel, Similarity
@@ -38,7 +41,8 @@ loss_of = gtsam.noiseModel.mEstimator
 MAKERS = (HuberKernel, CauchyKernel, DcsKernel, GemanMcClureKernel, TruncatedKernel)
 parameters = st.floats(0.3, 50.0)
 surrogates = st.builds(TruncatedKernel, parameters, st.floats(1e-3, 1e3))
-estimators = st.one_of(surrogates, *(parameters.map(make) for make in MAKERS))
+shaped = st.builds(GeneralKernel, st.floats(-10.0, 2.0) | st.sampled_from([0.0, 1.0]), parameters)
+estimators = st.one_of(surrogates, shaped, *(parameters.map(make) for make in MAKERS))
 lengths = st.floats(0.0, 1e3)
 with_parameter = pytest.mark.parametrize("make", MAKERS)
 
@@ -245,3 +249,80 @@ def test_each_family_is_judged_as_it_was_published() -> None:
         config = SmootherConfig(kernel=HuberKernel(), similarity=similarity)
         assert config.judged_by is similarity
     assert ssm_graph.Similarity is batch.Similarity is Similarity
+
+
+T = np.array([0.0, 0.3, 2.0, 9.0, 1e3, 1e8])
+
+
+@pytest.mark.parametrize("width", [1.0, 2.7])
+@pytest.mark.parametrize(
+    ("alpha", "loss"),
+    [
+        (2.0, lambda x: 0.5 * x),
+        (1.0, lambda x: np.sqrt(x + 1.0) - 1.0),
+        (0.0, lambda x: np.log(0.5 * x + 1.0)),
+        (-2.0, lambda x: 2.0 * x / (x + 4.0)),
+        (-math.inf, lambda x: 1.0 - np.exp(-0.5 * x)),
+        (-3.4, lambda x: 5.4 / -3.4 * ((x / 5.4 + 1.0) ** (-1.7) - 1.0)),
+    ],
+)
+def test_general_loss_is_the_published_one(
+    alpha: float, loss: Callable[[Any], Any], width: float
+) -> None:
+    """Barron's loss in its named shapes and in one between them, in squared widths."""
+    kernel = GeneralKernel(alpha, width)
+    expected = -(width**2) * loss(T / width**2)
+    np.testing.assert_allclose(kernel.similarity(T), expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("limit", [2.0, 0.0, -math.inf])
+def test_general_loss_passes_smoothly_through_its_limits(limit: float) -> None:
+    """Just beside a shape with a formula of its own it is nearly that one."""
+    near = -1e7 if math.isinf(limit) else limit - 1e-7
+    own, beside = GeneralKernel(limit), GeneralKernel(near)
+    t = T[:-2]
+    np.testing.assert_allclose(beside.similarity(t), own.similarity(t), rtol=1e-5)
+    np.testing.assert_allclose(beside.raw_weight(t), own.raw_weight(t), rtol=1e-4)
+
+
+def test_general_loss_is_cauchys_and_geman_mcclures() -> None:
+    """With the widths that its docstring says."""
+    for general, known in (
+        (GeneralKernel(0.0, 1.5), CauchyKernel(1.5 * math.sqrt(2.0))),
+        (GeneralKernel(-2.0, 1.5), GemanMcClureKernel(3.0)),
+    ):
+        np.testing.assert_allclose(general.similarity(T), known.similarity(T), rtol=1e-12)
+        np.testing.assert_allclose(general.weight(T), known.weight(T), rtol=1e-12)
+
+
+def test_a_shape_above_two_is_refused() -> None:
+    """It would count large residuals more than small ones."""
+    with pytest.raises(ValueError, match=r"alpha: expected a number of 2 or less, got 2\.5"):
+        GeneralKernel(2.5)
+
+
+def test_the_partition_function_of_known_densities() -> None:
+    """A Gaussian's to 10 sigmas, and Cauchy's with scale sqrt(2), in closed form."""
+    assert log_partition(2.0) == pytest.approx(0.5 * math.log(2.0 * math.pi), abs=1e-9)
+    cauchy = 2.0 * math.sqrt(2.0) * math.atan(10.0 / math.sqrt(2.0))
+    assert log_partition(0.0) == pytest.approx(math.log(cauchy), abs=1e-6)
+
+
+def test_the_shape_follows_the_tails() -> None:
+    """Least squares for a Gaussian, near Cauchy's for Cauchy's, and lower the more is gross."""
+    rng = np.random.default_rng(1)
+    good = rng.normal(size=4000) ** 2
+    assert fitted_shape(good) == 2.0
+    assert fitted_shape(np.zeros(0)) == 2.0
+    cauchy = rng.standard_t(1.0, size=40000) * math.sqrt(2.0)
+    assert fitted_shape(cauchy[np.abs(cauchy) < 10.0] ** 2) == pytest.approx(0.0, abs=0.15)
+    some, many = (np.append(good, np.full(n, 1e4)) for n in (400, 4000))
+    assert fitted_shape(many) <= fitted_shape(some) < 0.0
+    assert fitted_shape(9.0 * good, width=3.0) == 2.0
+
+
+def test_a_wrong_use_of_shapes_is_refused() -> None:
+    """Only the general kernel has one to adapt."""
+    with pytest.raises(ConfigError, match="adapt_shape: expected with a GeneralKernel"):
+        SmootherConfig(adapt_shape=True)
+    assert SmootherConfig(GeneralKernel(), adapt_shape=True).weighting == "adaptive(width=1)"

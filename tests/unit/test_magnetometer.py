@@ -14,7 +14,7 @@ from ssm_graph.live.protocols.json_messages import decode_message
 from ssm_graph.mission.mission import Aids
 from ssm_graph.sensors.magnetometer import EarthField, MagneticReading, MagnetometerLog
 from ssm_graph.simulation import Grade, SimulatedMission
-from tests.aids_fixture import magnetometer
+from tests.aids_fixture import magnetometer, weights_of
 from tests.helpers import simulated
 
 
@@ -78,8 +78,10 @@ def test_readings_near_iron_lose_their_weight() -> None:
     estimate = sg.SsmSmoother().solve(sg.build_problem(sim.mission))
     assert estimate.aids is not None
     log = sim.mission.aids[MagnetometerLog]
-    reading = np.searchsorted(log.time_s, estimate.aids.time_s[::3] + 1e-3) - 1
-    is_gross, weight = sim.aids.gross["magnetometer"][reading], estimate.aids.weight[::3]
+    time_s = estimate.aids.time_s[np.array(estimate.aids.aid) == "magnetometer"][::3]
+    reading = np.searchsorted(log.time_s, time_s + 1e-3) - 1
+    is_gross = sim.aids.gross["magnetometer"][reading]
+    weight = weights_of(estimate.aids, "magnetometer")
     assert is_gross.any()
     assert weight[is_gross].max() < 0.05
     assert np.median(weight[~is_gross]) > 0.9

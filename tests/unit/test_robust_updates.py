@@ -14,7 +14,7 @@ from factors.similarity import WEIGHT_FLOOR, ExpKernel, LogKernel, Similarity
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import Linearised
 from ssm_graph.filters.rules.correntropy import CorrentropyUpdate
-from ssm_graph.filters.rules.kalman import Gate, GatedUpdate, KalmanUpdate
+from ssm_graph.filters.rules.kalman import GatedUpdate, KalmanUpdate
 from ssm_graph.filters.rules.ssm import Floor, SsmUpdate, StopRule
 from ssm_graph.filters.rules.update import NOMINAL, Iterate, Runs
 from tests.linear_filter import LinearModel, LinearSystem
@@ -104,8 +104,11 @@ def test_stop_and_floor_are_details() -> None:
     np.testing.assert_allclose(added, [clipped[0], WEIGHT_FLOOR, WEIGHT_FLOOR], rtol=1e-6)
 
 
-@pytest.mark.parametrize("gate", Gate)
-def test_gate_at_its_limit(gate: Gate) -> None:
+each_grouping = pytest.mark.parametrize("group", [EACH_ROW, ALL_ROWS], ids=["rows", "one group"])
+
+
+@each_grouping
+def test_gate_at_its_limit(group: Runs) -> None:
     """Just inside passes in full; just outside is as if it had not been measured."""
     rng = np.random.default_rng(12)
     P, system, z = predicted(rng), a_system(rng), rng.normal(size=(N_RUNS, N_ROWS))
@@ -114,14 +117,14 @@ def test_gate_at_its_limit(gate: Gate) -> None:
     S = prior.jacobian @ P @ np.swapaxes(prior.jacobian, 1, 2) + np.eye(N_ROWS)
     square = prior.innovation**2 / np.einsum("bii->bi", S)
     limit = chi2.ppf(0.9973, 1)
-    if gate is Gate.PING:
+    if group is ALL_ROWS:
         nu = prior.innovation[..., None]
         square, limit = (np.swapaxes(nu, 1, 2) @ np.linalg.solve(S, nu))[:, 0], chi2.ppf(0.9973, 3)
     at_limit = np.sqrt(limit / square.max(axis=1, keepdims=True)) * z
-    inside = corrected(GatedUpdate(gate), P, system, 0.999 * at_limit)
-    assert_same(inside, corrected(KalmanUpdate(), P, system, 0.999 * at_limit))
-    outside = corrected(GatedUpdate(gate), P, system, 1.001 * at_limit)
-    if gate is Gate.PING:
+    inside = corrected(GatedUpdate(), P, system, 0.999 * at_limit, group)
+    assert_same(inside, corrected(KalmanUpdate(), P, system, 0.999 * at_limit, group))
+    outside = corrected(GatedUpdate(), P, system, 1.001 * at_limit, group)
+    if group is ALL_ROWS:
         np.testing.assert_array_equal(outside.weights, np.where(np.isfinite(z), 0.0, 1.0))
         np.testing.assert_allclose(outside.xi, 0.0, atol=1e-9)
         np.testing.assert_allclose(outside.covariance, P, atol=1e-9)
@@ -130,8 +133,8 @@ def test_gate_at_its_limit(gate: Gate) -> None:
         np.testing.assert_array_equal(outside.weights, np.where(worst, 0.0, 1.0))
 
 
-@pytest.mark.parametrize("gate", Gate)
-def test_gate_passes_its_share(gate: Gate) -> None:
+@each_grouping
+def test_gate_passes_its_share(group: Runs) -> None:
     """Of good measurements, as many are rejected as the confidence says."""
     rng = np.random.default_rng(13)
     n_runs, confidence = 5_000, 0.98
@@ -139,7 +142,7 @@ def test_gate_passes_its_share(gate: Gate) -> None:
     system = a_system(rng)
     S = system.H @ P[0] @ system.H.T + system.R
     z = rng.normal(size=(n_runs, N_ROWS)) @ np.linalg.cholesky(S).T
-    passed = corrected(GatedUpdate(gate, confidence), P, system, z).weights.mean()
+    passed = corrected(GatedUpdate(confidence), P, system, z, group).weights.mean()
     assert passed == pytest.approx(confidence, abs=4.0 * np.sqrt(0.02 * 0.98 / n_runs))
 
 

@@ -13,7 +13,7 @@ from ssm_graph.engine.chain import ChainSolution
 from ssm_graph.engine.states import States
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.mission.problem import build_problem
-from ssm_graph.smoothers.batch import descend_steps
+from ssm_graph.smoothers.descent import descend_steps
 from tests.helpers import simulated, state_errors, true_states
 
 

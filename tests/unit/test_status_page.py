@@ -125,7 +125,7 @@ def test_a_plain_line_says_the_most_important() -> None:
     """One line without markup; the reason where all is not well."""
     line = plain_line(STATUS)
     assert line.startswith("1:02:03; GOOD; lat 40.1070457 lon -40.1070457 deg; height -20.00 m; ")
-    assert "sigma 0.50 m; heading 350.0 deg; bottom lock" in line
+    assert "sigma 0.50 m; protected within 2.5 m; heading 350.0 deg; bottom lock" in line
     assert "dvl waiting 8/s" in line
     assert "all is well" not in line
     navigation = a_navigation(1.0, health=Health.BAD, bottom_lock=False, since_aid_s=math.inf)

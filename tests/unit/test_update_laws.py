@@ -10,7 +10,7 @@ import pytest
 from factors.similarity import ExpKernel, LogKernel, SqrtKernel
 from ssm_graph.engine.error_state import Linearised
 from ssm_graph.filters.rules.correntropy import CorrentropyUpdate
-from ssm_graph.filters.rules.kalman import Gate, GatedUpdate, KalmanUpdate
+from ssm_graph.filters.rules.kalman import GatedUpdate, KalmanUpdate
 from ssm_graph.filters.rules.ssm import SsmUpdate
 from ssm_graph.filters.rules.student import Scale, StudentUpdate
 from ssm_graph.filters.rules.update import NOMINAL, Runs, UpdateRule
@@ -30,8 +30,7 @@ from tests.update_fixture import (
 SSM = SsmUpdate(LogKernel(5.0))
 RULES: dict[str, UpdateRule] = {
     "kalman": KalmanUpdate(),
-    "ping gate": GatedUpdate(Gate.PING),
-    "beam gate": GatedUpdate(Gate.BEAM),
+    "gate": GatedUpdate(),
     "log": SSM,
     "sqrt": SsmUpdate(SqrtKernel(2.0)),
     "exp": SsmUpdate(ExpKernel(5.0)),
@@ -117,7 +116,7 @@ def test_scalar_measurement(rule: UpdateRule) -> None:
 
 @every_rule
 def test_nominal_rows_count_in_full(rule: UpdateRule) -> None:
-    """Depth and GNSS have no weight to lose, however far off."""
+    """Rows without a group have no weight to lose, however far off."""
     rng = np.random.default_rng(5)
     z = measured(rng)
     z[:, 0] = 100.0
@@ -138,9 +137,7 @@ def test_units_of_the_state_do_not_matter(rule: UpdateRule) -> None:
     assert_same(found._replace(xi=xi, covariance=covariance), expected, atol=1e-7)
 
 
-@pytest.mark.parametrize(
-    "rule", [RULES["kalman"], RULES["beam gate"], SSM, RULES["log, state too"]]
-)
+@pytest.mark.parametrize("rule", [RULES["kalman"], RULES["gate"], SSM, RULES["log, state too"]])
 def test_a_known_component_stays(rule: UpdateRule) -> None:
     """A component without variance is no zero to divide by."""
     rng = np.random.default_rng(11)
@@ -161,7 +158,7 @@ def test_a_known_component_stays(rule: UpdateRule) -> None:
         StudentUpdate(Scale.FIXED, state_dof=1e13, measurement_dof=1e13),
         StudentUpdate(state_dof=1e13, measurement_dof=1e13, tau=1e13),
         CorrentropyUpdate(1e7),
-        GatedUpdate(Gate.PING, 1.0 - 1e-15),
+        GatedUpdate(1.0 - 1e-15),
     ],
 )
 def test_without_tails_it_is_the_kalman_filter(rule: UpdateRule) -> None:

@@ -22,6 +22,7 @@ from ssm_graph.sensors.depth import DepthReading
 from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.gnss import Fix
 from ssm_graph.sensors.imu import ImuSample
+from ssm_graph.sensors.imu_calibration import ImuCalibration
 from tests.malformed_cases import TOML_CASES, Malformed
 from tests.mission_fixture import TOML, make_mission, write_example
 from tests.unit.test_mission_roundtrip import assert_same
@@ -143,13 +144,19 @@ def test_written_and_read_again(tmp_path: Path, dropped: tuple[str, ...]) -> Non
 def test_every_field_is_written(tmp_path: Path) -> None:
     """A field that a vehicle is given one day has to find its key."""
     vehicle = replace(
-        vehicle_of(make_mission()), water_sigma=0.02, current=CurrentModel(0.3, 7200.0, 0.01)
+        vehicle_of(make_mission()),
+        water_sigma=0.02,
+        current=CurrentModel(0.3, 7200.0, 0.01),
+        imu_calibration=ImuCalibration(gyro_scale_error=np.full(3, 1e-3), accel_scale_sigma=2e-3),
     )
     write_vehicle(tmp_path, vehicle)
     got = read_vehicle(tmp_path)
-    assert len(fields(Vehicle)) == 11
+    assert len(fields(Vehicle)) == 12
     assert all(getattr(got, spec.name) is not None for spec in fields(Vehicle))
     assert (got.water_sigma, got.current) == (vehicle.water_sigma, vehicle.current)
+    assert got.imu_calibration.gyro_scale_error is not None
+    np.testing.assert_allclose(got.imu_calibration.gyro_scale_error, 1e-3)
+    assert got.imu_calibration.accel_scale_sigma == pytest.approx(2e-3)
 
 
 def test_live_pings_count_with_the_sigma_of_what_they_are_off() -> None:

@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from factors.similarity import LogKernel
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.states import States
 from ssm_graph.graph.linearize import GraphLinearizer
+from ssm_graph.graph.measurements import doubts_of_aids
 from ssm_graph.mission.answer import SUSPECT_STRETCH_S
 from ssm_graph.mission.estimate import Status
 from ssm_graph.mission.problem import Problem, build_problem
@@ -34,7 +36,11 @@ def doubts_at(problem: Problem, states: States, *, weights: Array | None = None)
     linearizer.follow(states)
     rows = linearizer.beam_rows(states)
     weights = np.ones(len(rows.error)) if weights is None else weights
-    return contradictions(linearizer, states, rows, weights)
+    aids = linearizer.weighted
+    square = aids.squares(states)
+    of_aids = LogKernel().weight(square, dim=aids.dim)
+    judged = aids.judged(states, problem.keyframe_s, square, of_aids)
+    return [*contradictions(linearizer, states, rows, weights), *doubts_of_aids(judged)]
 
 
 def moved(states: States, **changes: Array) -> States:
@@ -135,13 +141,13 @@ def test_gnss_and_depth_that_miss_are_named() -> None:
         sim.mission, gnss=dataclasses.replace(gnss, lat=gnss.lat + 20.0 / 6.4e6)
     )
     (doubt,) = doubts_at(build_problem(far), states)
-    assert doubt.startswith("GNSS data miss the answer by")
+    assert doubt.startswith("100 % of the 99 GNSS measurements contradict the answer")
     assert "datum or lever arm" in doubt
     deep = dataclasses.replace(
         sim.mission, depth=dataclasses.replace(depth, depth=depth.depth + 0.5)
     )
     (doubt,) = doubts_at(build_problem(deep), states)
-    assert doubt.startswith("depth data miss the answer by 1")
+    assert doubt.startswith("100 % of the 200 depth measurements contradict the answer")
     assert "zero, sign and unit" in doubt
 
 

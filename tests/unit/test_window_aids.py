@@ -19,6 +19,7 @@ from ssm_graph.sensors.standstill import Standstill
 from ssm_graph.simulation import (
     AidSettings,
     CompassSettings,
+    GnssSettings,
     GrossErrors,
     RangingSettings,
     SimulatedMission,
@@ -28,7 +29,7 @@ from ssm_graph.simulation.magnetometer import MagnetometerSettings
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
 from ssm_graph.smoothers.fixed_lag import FixedLagConfig, solve_fixed_lag
 from ssm_graph.smoothers.keyframe import keyframes_of, sensors_of
-from tests.aids_fixture import KNOWN, usbl, with_every_aid
+from tests.aids_fixture import KNOWN, usbl, weights_of, with_every_aid
 from tests.helpers import simulated
 
 WHOLE = FixedLagConfig(1e3, tolerance=1e-7)
@@ -43,7 +44,13 @@ def of_known(**changes: object) -> SimulatedMission:
         standstills=(Standstill(4.0, 5.5, sigma=0.5),),
         others=(MagnetometerSettings(gross=GrossErrors(0.2, (5e-6, 50e-6))),),
     )
-    return simulated(**({"duration_s": 10.0, "aids": aids, "seed": 2} | changes))
+    config = {
+        "duration_s": 10.0,
+        "aids": aids,
+        "gnss": GnssSettings(windows=((0.0, 9.0),)),
+        "seed": 2,
+    }
+    return simulated(**(config | changes))
 
 
 def table_of(estimate: Estimate) -> AidTable:
@@ -63,7 +70,10 @@ def test_a_window_of_the_whole_mission_weighs_every_aid_as_the_batch() -> None:
     np.testing.assert_allclose(mine.height, other.height, rtol=0.0, atol=1e-6)
     np.testing.assert_allclose(mine.velocity_sigma_enu, sigma, rtol=1e-6)
     own, table = table_of(whole), table_of(batch)
-    assert set(own.aid) == {"USBL", "range", "heading", "standstill", "magnetometer"}
+    assert set(own.aid) == {
+        *("depth", "GNSS"),
+        *("USBL", "range", "heading", "standstill", "magnetometer"),
+    }
     assert own.aid == table.aid
     assert own.component == table.component
     np.testing.assert_array_equal(own.time_s, table.time_s)
@@ -92,7 +102,7 @@ def test_with_a_short_lag_gross_fixes_count_for_nothing() -> None:
     """At once, and when they leave the window; the others bound the drift of the position."""
     sim = simulated(duration_s=60.0, aids=usbl(rate=0.3, interval_s=3.0), seed=5)
     for estimate in solve_fixed_lag(build_problem(sim.mission), FixedLagConfig(6.0)):
-        weight = table_of(estimate).weight[::3]
+        weight = weights_of(table_of(estimate), "USBL")
         gross = sim.aids.gross["usbl"]
         assert weight[gross].max() < 0.1
         assert np.median(weight[~gross]) > 0.8
@@ -149,6 +159,6 @@ def test_the_vehicle_is_aided_as_the_smoother_offline() -> None:
         assert abs(own.value - other.value) < 0.2 * other.sigma, own.label
         assert own.sigma == pytest.approx(other.sigma, rel=0.1), own.label
     tables = [part.aids for part in estimator.finish() if part.aids is not None]
-    for name in ("USBL", "range", "heading", "standstill", "magnetometer"):
+    for name in ("depth", "GNSS", "USBL", "range", "heading", "standstill", "magnetometer"):
         n_rows = sum(table.aid.count(name) for table in tables)
         assert n_rows == pytest.approx(table_of(offline).aid.count(name), abs=3)

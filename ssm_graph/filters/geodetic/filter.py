@@ -33,9 +33,8 @@ from ssm_graph.engine.error_state import (
 )
 from ssm_graph.filters.geodetic.measurements import (
     Rows,
+    aid_rows,
     beam_rows,
-    correct,
-    nominal_rows,
     places_of,
     settle,
 )
@@ -69,7 +68,7 @@ class GeodeticConfig:
     """How the filter runs."""
 
     kernel: Kernel = field(default_factory=LogKernel)
-    """Similarity kernel of the beams."""
+    """Similarity kernel of beams, depths and fixes."""
     feedback: Feedback = Feedback.COMPLETE
     """What closes the loop; the paper's own serves up to tactical grade."""
     merge_rate_hz: float = 20.0
@@ -155,12 +154,12 @@ def run_geodetic(
                 track = advance(state, Samples(*(a[:, first[k - 1] : first[k]] for a in samples)))
                 X, P = propagate(X, P, track, density)
                 state = track.end
-            nominal = nominal_rows(measured, places, k, state, track, X)
+            aids = aid_rows(measured, places, k, state, track, X)
             rows, has_beam = (
                 beam_rows(measured.beams, k, state),
                 np.isfinite(measured.beams.sigma[k]),
             )
-            X, P, of_beams = _update(X, P, rows, has_beam, nominal, config)
+            X, P, of_beams = _update(X, P, rows, has_beam, aids, config)
             state, X, P = feed_back(state, X, P, config.feedback)
             biases = state.gyro_bias + X[:, EPS], state.accel_bias + X[:, NABLA]
             steps.append((*state[:5], *biases, P, *of_beams))
@@ -178,7 +177,7 @@ def _merged(
             f"{len(imu)} logs"
         )
     merged = [
-        merge_samples(log, problem.keyframe_s, rate_hz=rate_hz)
+        merge_samples(log.calibrated, problem.keyframe_s, rate_hz=rate_hz)
         for problem, log in zip(problems, imu, strict=True)
     ]
     first = merged[0].first
@@ -198,28 +197,27 @@ def _update(
     P: Array,
     rows: Rows,
     has_beam: NDArray[np.bool_],
-    nominal: Rows | None,
+    aids: Rows | None,
     config: GeodeticConfig,
 ) -> tuple[Array, Array, tuple[Array, ...]]:
-    """Correct by depth and fix, then by the beams; the order changes nothing but the work.
+    """Correct by beams, depth and fix, together.
 
     Returns errors, covariance, and what :class:`GeodeticHistory` keeps of the beams.
     """
     innovation = np.where(has_beam, (rows.H @ X[..., None])[..., 0] - rows.Z, np.nan)
-    if nominal is not None:
-        X, P = correct(X, P, nominal)
-    nothing = np.full(has_beam.shape, np.nan)
-    if not has_beam.any():
+    if aids is None and not has_beam.any():
+        nothing = np.full(has_beam.shape, np.nan)
         return X, P, (nothing, nothing, innovation, np.zeros(len(X), np.intp))
     settled = settle(
         X,
         P,
-        rows,
+        rows if aids is None else rows.followed_by(aids),
         kernel=config.kernel,
         tolerance=config.tolerance,
         max_iterations=config.max_iterations,
     )
-    found = (np.where(has_beam, own, np.nan) for own in (settled.weight, settled.mahalanobis_sq))
+    of_rows = (settled.weight, settled.mahalanobis_sq)
+    found = (np.where(has_beam, own[:, : has_beam.shape[1]], np.nan) for own in of_rows)
     iterations = np.where(has_beam.any(axis=1), settled.iterations, 0)
     return settled.X, settled.P, (*found, innovation, iterations)
 

@@ -6,6 +6,7 @@ is all zeros and changes nothing.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -33,7 +34,7 @@ from ssm_graph.filters.side_by_side import BeamGrid, FixGrid, Measurements
 
 
 class Rows(NamedTuple):
-    """Linearised measurements of one keyframe."""
+    """Linearised measurements of one keyframe; those of one group share an auxiliary parameter."""
 
     Z: Array
     """(R, m) computed minus measured"""
@@ -41,6 +42,15 @@ class Rows(NamedTuple):
     """(R, m, 15)"""
     sigma: Array
     """(R, m) nominal standard deviation, of missing rows 1"""
+    group: NDArray[np.intp]
+    """(m,) of each row, from 0"""
+
+    def followed_by(self, other: Rows) -> Rows:
+        """Return these rows, then others with groups of their own."""
+        Z, H, sigma = (
+            np.concatenate(pair, axis=1) for pair in zip(self[:3], other[:3], strict=True)
+        )
+        return Rows(Z, H, sigma, np.append(self.group, other.group + self.group[-1] + 1))
 
 
 class Places(NamedTuple):
@@ -85,10 +95,11 @@ def beam_rows(grid: BeamGrid, k: int, state: GeodeticState) -> Rows:
     H[..., DV] = beam
     H[..., LAT] = arm[..., 1] * omega_ie[..., 2] - arm[..., 2] * omega_ie[..., 1]
     H[..., EPS] = arm_b
-    return Rows(np.where(has, computed - grid.speed[k], 0.0), H, np.where(has, grid.sigma[k], 1.0))
+    Z = np.where(has, computed - grid.speed[k], 0.0)
+    return Rows(Z, H, np.where(has, grid.sigma[k], 1.0), np.arange(has.shape[1]))
 
 
-def nominal_rows(
+def aid_rows(
     measured: Measurements,
     places: Places,
     k: int,
@@ -96,7 +107,7 @@ def nominal_rows(
     track: Track | None,
     X: Array,
 ) -> Rows | None:
-    """Return depth and fix of keyframe ``k``, four rows; None where no run has either.
+    """Return depth and fix of keyframe ``k``, at most four rows; None where no run has either.
 
     State and predicted errors ``X`` (R, 15) are those at the keyframe as mechanised; the track is
     the interval that ends there, None at the first.
@@ -106,9 +117,7 @@ def nominal_rows(
         rows.append(_depth_row(measured, k, state, track, X))
     if np.isfinite(places.place[k]).any():
         rows.append(_fix_rows(places, k, state))
-    if not rows:
-        return None
-    return Rows(*(np.concatenate(arrays, axis=1) for arrays in zip(*rows, strict=True)))
+    return functools.reduce(Rows.followed_by, rows) if rows else None
 
 
 def _depth_row(
@@ -144,7 +153,7 @@ def _depth_row(
     H[:, 0, 1] = np.where(has, lever_l[:, 0], 0.0)
     Z = np.where(is_read, height + depth + grown, 0.0).sum(axis=1) / divisor
     sigma = np.where(has, grid.sigma / np.sqrt(divisor), 1.0)
-    return Rows(Z[:, None], H, sigma[:, None])
+    return Rows(Z[:, None], H, sigma[:, None], np.zeros(1, np.intp))
 
 
 def _interpolated(nodes: Array, values: Array, at: Array) -> Array:
@@ -167,27 +176,22 @@ def _fix_rows(grid: Places, k: int, state: GeodeticState) -> Rows:
     H[:, :, PHI] = W @ skew(lever_l)
     H[:, :, DP] = W @ D
     Z = (W @ ((D @ off[..., None]) + lever_l[..., None]))[..., 0]
-    return Rows(Z, H, np.ones_like(Z))
+    return Rows(Z, H, np.ones_like(Z), np.zeros(3, np.intp))
 
 
 class Settled(NamedTuple):
-    """The posterior of one keyframe and the beams' part in it, B runs."""
+    """The posterior of one keyframe and what its measurements had to do with it, B runs."""
 
     X: Array
     """(B, 15)"""
     P: Array
     """(B, 15, 15)"""
     weight: Array
-    """(B, m) the auxiliary parameters, as in the last gain"""
+    """(B, m) the auxiliary parameter of each row, as in the last gain"""
     mahalanobis_sq: Array
-    """(B, m) t at the posterior"""
+    """(B, m) t of its group at the posterior"""
     iterations: NDArray[np.intp]
     """(B,)"""
-
-
-def correct(X: Array, P: Array, rows: Rows) -> tuple[Array, Array]:
-    """Return errors and covariance after measurements with their nominal noise."""
-    return _gained(X, P, rows, rows.sigma**2)
 
 
 def _gained(X: Array, P: Array, rows: Rows, variance: Array) -> tuple[Array, Array]:
@@ -205,9 +209,10 @@ def _gained(X: Array, P: Array, rows: Rows, variance: Array) -> tuple[Array, Arr
 def settle(
     X: Array, P: Array, rows: Rows, *, kernel: Kernel, tolerance: float, max_iterations: int
 ) -> Settled:
-    """Correct by beams whose noise variances adapt to their agreement, each for itself.
+    """Correct by measurements whose noise variances adapt to their agreement, each for itself.
 
-    From the prediction, ``X^0 = X-`` and ``P^0 = P-``, all beams jointly, for t = 0, 1, ...::
+    A beam or a depth is one row, a fix three: t is summed over them. From the prediction, ``X^0 =
+    X-`` and ``P^0 = P-``, all jointly, for t = 0, 1, ...::
 
         lambda_j = -2 f'(((Z_j - H_j X^t)^2 + H_j P^t H_j') / sigma_j^2)
         K        = P- H' (H P- H' + diag(sigma_j^2 / lambda_j))^-1
@@ -219,6 +224,8 @@ def settle(
     only; the covariance follows once at its end. Runs end each at its own time.
     """
     H, sigma_sq = rows.H, rows.sigma**2
+    same = (rows.group[:, None] == rows.group).astype(float)
+    dim = same.sum(axis=0)
     PHt = P @ np.swapaxes(H, 1, 2)
     spread = H @ PHt
     innovation = rows.Z - (H @ X[..., None])[..., 0]
@@ -232,7 +239,7 @@ def settle(
     going = np.arange(len(X))
     while len(going):
         t = expected_mahalanobis_sq(error[going], variance_left[going], sigma=rows.sigma[going])
-        weight[going] = kernel.weight(t)
+        weight[going] = kernel.weight(t @ same, dim=dim)
         S = _with_diagonal(spread[going], sigma_sq[going] / weight[going])
         gain: Array = np.asarray(np.linalg.inv(S))
         corrected = prior[going] + times(scaled_PHt[going], times(gain, innovation[going]))
@@ -246,7 +253,7 @@ def settle(
         previous[going] = corrected
         more = change > tolerance * np.linalg.norm(corrected, axis=1)
         going = going[more & (iterations[going] < max_iterations)]
-    t = expected_mahalanobis_sq(error, variance_left, sigma=rows.sigma)
+    t = expected_mahalanobis_sq(error, variance_left, sigma=rows.sigma) @ same
     X, P = _gained(X, P, rows, sigma_sq / weight)
     return Settled(X, P, weight, t, iterations)
 

@@ -286,11 +286,9 @@ def noise_densities(noises: Sequence[ImuNoise], state: GeodeticState) -> Array:
     q[:, PHI] = [[noise.gyro_density] * 3 for noise in noises]
     q[:, DV] = [[noise.accel_density] * 3 for noise in noises]
     q[:, DP] = INTEGRATION_DENSITY * place_D.max(axis=-1)
-    q[:, EPS] = [
-        [max(n.gyro_bias_density, BIAS_WALK_FLOOR * n.gyro_bias_sigma)] * 3 for n in noises
-    ]
+    q[:, EPS] = [[max(n.gyro_bias_walk, BIAS_WALK_FLOOR * n.gyro_bias_sigma)] * 3 for n in noises]
     q[:, NABLA] = [
-        [max(n.accel_bias_density, BIAS_WALK_FLOOR * n.accel_bias_sigma)] * 3 for n in noises
+        [max(n.accel_bias_walk, BIAS_WALK_FLOOR * n.accel_bias_sigma)] * 3 for n in noises
     ]
     return q**2
 

@@ -17,6 +17,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from enum import Enum
 from typing import NamedTuple
 
@@ -32,9 +33,12 @@ from ssm_graph.engine.states import NavigationStates
 from ssm_graph.filters.navigation.measurements import KeyframeModel
 from ssm_graph.filters.rules.update import UpdateRule
 from ssm_graph.filters.side_by_side import require_alike, side_by_side
+from ssm_graph.graph.aids.aid import Aid
+from ssm_graph.graph.aids.depth import DepthMeans
+from ssm_graph.graph.aids.gnss import EAST_NORTH_UP, Fixes
 from ssm_graph.imu.preintegration import gravity_gradient, gtsam_gravity
 from ssm_graph.mission.answer import RecursiveBeams, recursive_estimate
-from ssm_graph.mission.estimate import Estimate, OnKeyframe
+from ssm_graph.mission.estimate import AidTable, Estimate, OnKeyframe
 from ssm_graph.mission.problem import Problem, start_of
 
 RUNAWAY_SIGMA = 1e4
@@ -93,6 +97,13 @@ class FilterHistory(NamedTuple):
     """(K, R, B) 1 = nominal"""
     n_iterations: Array
     """(K, R)"""
+    aid_innovation: Array
+    """(K, R, 4) m, measured minus predicted before the update: height by the depth, then the fix in
+    navigation axes; NaN without one, as in the two that follow"""
+    aid_mahalanobis_sq: Array
+    """(K, R, 2) of depth and fix"""
+    aid_weight: Array
+    """(K, R, 2) 1 = nominal"""
 
 
 def run_filter(
@@ -188,19 +199,21 @@ class _Filter:
     def _correct(
         self, k: int, predicted: NavigationStates, P: Array, before: NavigationStates | None
     ) -> tuple[NavigationStates, Array, tuple[Array, ...]]:
-        """Return states, covariances, and what :class:`FilterHistory` keeps of the beams."""
+        """Return states, covariances, and what :class:`FilterHistory` keeps of measurements."""
         model = KeyframeModel(
             self._measured, k, predicted, frame=self._frame, beam_groups=self._groups, before=before
         )
         present = model.present[:, : model.n_beams]
         nothing = np.full(present.shape, np.nan)
         if not np.any(model.present):
-            return predicted, P, (nothing, nothing, nothing, np.zeros(len(P)))
+            none = (np.full((len(P), n), np.nan) for n in (4, 2, 2))
+            return predicted, P, (nothing, nothing, nothing, np.zeros(len(P)), *none)
         update = self._rule(P, model)
         own = (update.mahalanobis_sq, update.weights)
         found = (np.where(present, rows[:, : model.n_beams], np.nan) for rows in own)
-        of_beams = (model.beam_innovations(), *found, update.n_iterations)
-        return predicted.displaced(update.xi), update.covariance, of_beams
+        of_aids = (model.aid_innovations(), *map(model.of_aids, own))
+        kept = (model.beam_innovations(), *found, update.n_iterations, *of_aids)
+        return predicted.displaced(update.xi), update.covariance, kept
 
 
 def _stacked(steps: Sequence[tuple[Array, ...]]) -> list[Array]:
@@ -253,28 +266,52 @@ def estimates_from_history(
 ) -> list[Estimate]:
     """Return the estimate of every run; ``states`` are the posterior or smoothed ones.
 
-    Smoothed states have innovations of their own; squared lengths and weights stay the filter's.
+    Smoothed states have innovations of beams of their own; all else of measurements stays the
+    filter's.
     """
     estimates, is_smoothed = [], states is not history.posterior
     for run, problem in enumerate(problems):
         at = problem.beams.keyframe, run, problem.beams.beam
-        estimates.append(
-            recursive_estimate(
-                problem,
-                NavigationStates(*(column[:, run] for column in states[:4])),
-                states.covariance[:, run],
-                RecursiveBeams(
-                    None if is_smoothed else history.innovation[at],
-                    history.mahalanobis_sq[at],
-                    history.weight[at],
-                ),
-                history.n_iterations[:, run],
-                method=method,
-                kernel=kernel,
-                wall_s=wall_s,
+        estimate = recursive_estimate(
+            problem,
+            NavigationStates(*(column[:, run] for column in states[:4])),
+            states.covariance[:, run],
+            RecursiveBeams(
+                None if is_smoothed else history.innovation[at],
+                history.mahalanobis_sq[at],
+                history.weight[at],
+            ),
+            history.n_iterations[:, run],
+            method=method,
+            kernel=kernel,
+            wall_s=wall_s,
+        )
+        estimates.append(replace(estimate, aids=_aid_table(problem, history, run)))
+    return estimates
+
+
+def _aid_table(problem: Problem, history: FilterHistory, run: int) -> AidTable | None:
+    """Return what became of depths and fixes in one run; None if it has none."""
+    innovation = history.aid_innovation[:, run]
+    parts = []
+    kinds: tuple[tuple[type[Aid], int], ...] = ((DepthMeans, 0), (Fixes, 1))
+    for i, (aid, first) in enumerate(kinds):
+        weight = history.aid_weight[:, run, i]
+        k = np.flatnonzero(np.isfinite(weight))
+        labels = EAST_NORTH_UP if aid is Fixes else (aid.name,)
+        size = len(labels)
+        parts.append(
+            AidTable(
+                aid=(aid.name,) * (size * len(k)),
+                component=labels * len(k),
+                unit=(aid.unit,) * (size * len(k)),
+                time_s=np.repeat(problem.keyframe_s[k], size),
+                innovation=innovation[k, first : first + size].ravel(),
+                mahalanobis_sq=np.repeat(history.aid_mahalanobis_sq[k, run, i], size),
+                weight=np.repeat(weight[k], size),
             )
         )
-    return estimates
+    return AidTable.joined(parts)
 
 
 class Prediction(NamedTuple):
@@ -291,7 +328,7 @@ class Process:
     """Predicts B runs from keyframe to keyframe."""
 
     def __init__(self, intervals: Sequence[Intervals], frame: LocalFrame) -> None:
-        columns = zip(*intervals, strict=True)
+        columns = zip(*(own.without_errors(own.errors) for own in intervals), strict=True)
         self._intervals = Intervals(*(np.stack(column, axis=1) for column in columns))
         self._frame = frame
         self._gravity_gradient = gravity_gradient(frame)

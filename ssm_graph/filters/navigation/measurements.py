@@ -14,7 +14,7 @@ from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import GYRO_BIAS, POSITION, ROTATION, STATE_DIM, VELOCITY
 from ssm_graph.engine.states import NavigationStates, local_D_deviation
-from ssm_graph.filters.rules.update import NOMINAL, Iterate, Runs
+from ssm_graph.filters.rules.update import Iterate, Runs
 from ssm_graph.filters.side_by_side import Measurements
 from ssm_graph.graph.aids.depth import HeightTrack, height_on_the_way, height_track
 
@@ -36,7 +36,8 @@ class NavigationIterate(Iterate):
 class KeyframeModel:
     """Beams, depth and position fix of keyframe ``k``, about the predicted states of R runs.
 
-    Rows are the B beams, then the depth, then three of the fix, as far as the keyframe has them.
+    Rows are the B beams, then the depth, then three of the fix, as far as the keyframe has them;
+    depth and fix have an auxiliary parameter each. Fixes of one keyframe are one.
 
     Parameters
     ----------
@@ -63,16 +64,17 @@ class KeyframeModel:
         self.n_beams = len(beam_groups)
         """B, how many of the rows are beams"""
         present, groups = [self._root_information > 0.0], [beam_groups]
+        own_group = int(beam_groups.max(initial=-1)) + 1
         self._depth: _DepthRow | None = None
         if np.any(np.isfinite(measured.depths.depth[k])):
             self._depth = _depth_row(measured, k, predicted, before, frame)
             present.append(self._depth.root_information[:, None] > 0.0)
-            groups.append(np.array([NOMINAL]))
+            groups.append(np.array([own_group]))
         has_fix = measured.fixes.root_information[k].any(axis=(1, 2))
         self._has_fix = bool(np.any(has_fix))
         if self._has_fix:
             present.append(np.repeat(has_fix[:, None], 3, axis=1))
-            groups.append(np.full(3, NOMINAL))
+            groups.append(np.full(3, own_group + 1))
         self.present = np.concatenate(present, axis=1)
         self.group = np.concatenate(groups)
         runs = np.arange(len(self.present))
@@ -98,6 +100,37 @@ class KeyframeModel:
         present = self.present[:, : self.n_beams]
         scale = np.where(present, self._root_information, np.nan)
         return np.asarray(self.predicted.innovation[:, : self.n_beams] / scale)
+
+    def aid_innovations(self) -> Array:
+        """Return how far (R, 4) depth and fix miss before the update, m, or NaN.
+
+        The height first, then the fix in navigation axes.
+        """
+        whitened = np.full((len(self.present), 4), np.nan)
+        whitened[:, self._aid_columns] = self.predicted.innovation[:, self.n_beams :]
+        found = np.full_like(whitened, np.nan)
+        depth = self._depth
+        if depth is not None:
+            has = depth.root_information > 0.0
+            found[has, 0] = whitened[has, 0] / depth.root_information[has]
+        if self._has_fix:
+            root = self._measured.fixes.root_information[self._k]
+            has = root.any(axis=(1, 2))
+            found[has, 1:] = np.linalg.solve(root[has], whitened[has, 1:, None])[..., 0]
+        return found
+
+    def of_aids(self, per_row: Array) -> Array:
+        """Return what rows (R, m) say of depth and fix, (R, 2), or NaN."""
+        found = np.full((len(per_row), 4), np.nan)
+        own = np.where(self.present, per_row, np.nan)[:, self.n_beams :]
+        found[:, self._aid_columns] = own
+        return found[:, :2]
+
+    @property
+    def _aid_columns(self) -> NDArray[np.intp]:
+        """Return where the rows behind the beams are among those of a depth and a fix."""
+        has = [self._depth is not None, *[self._has_fix] * 3]
+        return np.flatnonzero(has)
 
     def _at(
         self, states: NavigationStates, xi: Array, runs: Runs, local_D_xi: Array | None

@@ -22,7 +22,7 @@ from ssm_graph.filters.navigation.filter import (
     smooth_history,
 )
 from ssm_graph.filters.rules.correntropy import CorrentropyUpdate
-from ssm_graph.filters.rules.kalman import Gate, GatedUpdate, KalmanUpdate
+from ssm_graph.filters.rules.kalman import GatedUpdate, KalmanUpdate
 from ssm_graph.filters.rules.ssm import SsmUpdate
 from ssm_graph.filters.rules.student import StudentUpdate
 from ssm_graph.filters.rules.update import UpdateRule
@@ -64,11 +64,11 @@ def _similar(
     return FilterChoice(f"{about}, {kernel} kernel", make, grouping, KERNELS[kernel].default)
 
 
-def _gated(about: str, gate: Gate, grouping: Grouping) -> FilterChoice:
-    usual = GatedUpdate(gate).confidence
+def _gated(about: str, grouping: Grouping) -> FilterChoice:
+    usual = GatedUpdate().confidence
 
     def make(value: float | None) -> UpdateRule:
-        return GatedUpdate(gate, usual if value is None else value)
+        return GatedUpdate(usual if value is None else value)
 
     return FilterChoice(f"Kalman filter, chi-square gate on {about}", make, grouping, usual)
 
@@ -78,8 +78,8 @@ _SSMKF = "SSMKF: one similarity weight for the ping, one for the prediction"
 _TRUSTED = "similarity weights, {}, the prediction trusted"
 FILTERS: Final[Mapping[str, FilterChoice]] = {
     "ekf": FilterChoice("Kalman filter", lambda _: KalmanUpdate(), _PING),
-    "ekf-gate-ping": _gated("the whole ping", Gate.PING, _PING),
-    "ekf-gate-beam": _gated("every beam", Gate.BEAM, _BEAM),
+    "ekf-gate-ping": _gated("the whole ping", _PING),
+    "ekf-gate-beam": _gated("every beam", _BEAM),
     "rstkf": FilterChoice(
         "Student's t filter, inverse-Wishart prediction covariance",
         lambda _: StudentUpdate(),

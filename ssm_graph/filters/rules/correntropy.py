@@ -34,7 +34,7 @@ class CorrentropyUpdate(UpdateRule):
 
     As published, the weights have no floor. A measurement beyond 38 kernel widths then underflows
     to weight zero and infinite noise, and drops out as if it were absent; a prediction that rows of
-    full weight (depth, GNSS) contradict as much gets an infinite covariance, and the run is lost.
+    full weight contradict as much gets an infinite covariance, and the run is lost.
     With a floor, neither happens.
 
     References

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum
 from typing import final
 
 import numpy as np
@@ -12,6 +11,7 @@ from scipy.stats import chi2
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
 from ssm_graph.filters.rules.update import (
+    NOMINAL,
     Groups,
     MeasurementModel,
     Prepared,
@@ -24,13 +24,6 @@ from ssm_graph.filters.rules.update import (
 
 LEFT_OUT = 1e-12
 """Weight of a row that a gate rejects: none, but regular."""
-
-
-class Gate(Enum):
-    """What a chi-square gate passes or rejects as a whole."""
-
-    PING = "all robust rows together"
-    BEAM = "every robust row for itself"
 
 
 @final
@@ -56,7 +49,7 @@ class KalmanUpdate(UpdateRule):
 @final
 @dataclass(frozen=True)
 class GatedUpdate(UpdateRule):
-    """The standard update behind a chi-square gate on the innovations.
+    """The standard update behind a chi-square gate on the innovations of each group of rows.
 
     References
     ----------
@@ -64,7 +57,6 @@ class GatedUpdate(UpdateRule):
        Navigation", Wiley, 2001, section 5.4.
     """
 
-    by: Gate
     confidence: float = 0.9973
     """Share of good measurements that pass; three sigma of one."""
 
@@ -73,23 +65,20 @@ class GatedUpdate(UpdateRule):
             raise ConfigError(f"confidence: expected a number in (0, 1), got {self.confidence}")
 
     def __str__(self) -> str:
-        return f"gate({self.confidence:g} on each {self.by.name.lower()})"
+        return f"gate({self.confidence:g})"
 
     def __call__(self, P: Array, model: MeasurementModel, mean: Array | None = None) -> Update:  # noqa: ARG002
         """Correct the predictions of B runs."""
         prepared = prepare(model.at(np.zeros(P.shape[:2])), P)
-        rows, robust = prepared.iterate, Groups(model).is_robust
-        S = prepared.HPHt + np.eye(model.present.shape[1])
-        if self.by is Gate.BEAM:
-            is_bad = rows.innovation**2 > chi2.ppf(self.confidence, 1) * np.einsum("bii->bi", S)
-        else:
+        S, weights = prepared.HPHt + np.eye(len(model.group)), np.ones(model.present.shape)
+        for name in np.unique(model.group[model.group != NOMINAL]):
             # Missing rows are zeros: they add nothing to the length.
-            inner = S[:, robust][:, :, robust]
-            nu = rows.innovation[:, robust]
+            own = np.flatnonzero(model.group == name)
+            nu, inner = prepared.iterate.innovation[:, own], S[:, own[:, None], own]
             nis = (nu * np.linalg.solve(inner, nu[..., None])[..., 0]).sum(axis=1)
-            n_rows = np.maximum(model.present[:, robust].sum(axis=1), 1)
-            is_bad = (nis > chi2.ppf(self.confidence, n_rows))[:, None] & np.ones_like(robust)
-        update = _once(prepared, model, np.where(is_bad & robust, LEFT_OUT, 1.0))
+            n_rows = np.maximum(model.present[:, own].sum(axis=1), 1)
+            weights[nis > chi2.ppf(self.confidence, n_rows), own[:, None]] = LEFT_OUT
+        update = _once(prepared, model, weights)
         return update._replace(weights=np.where(update.weights < 1.0, 0.0, 1.0))
 
 

@@ -216,12 +216,8 @@ def along_axes(pattern: str) -> tuple[str, ...]:
     return tuple(pattern.format(axis) for axis in "xyz")
 
 
-def drift_variable(name: str, pattern: str, drift: Drift) -> tuple[Extra, ...]:
-    """Return a drift of three components, or nothing."""
+def drift_variable(name: str, labels: tuple[str, ...], drift: Drift) -> tuple[Extra, ...]:
+    """Return a drift with a component for each label, or nothing."""
     if drift.sigma == 0.0:
         return ()
-    return (
-        Extra.gauss_markov(
-            name, along_axes(pattern), drift.sigma, correlation_s=drift.correlation_s
-        ),
-    )
+    return (Extra.gauss_markov(name, labels, drift.sigma, correlation_s=drift.correlation_s),)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factors.depth_height import height_residual
 from factors.so3 import cross
@@ -14,12 +15,17 @@ from ssm_graph.base.frozen import Array, ReadOnlyArrays
 from ssm_graph.base.times import Indices
 from ssm_graph.engine.error_state import POSITION, ROTATION
 from ssm_graph.engine.extras import Extra
-from ssm_graph.graph.aids.aid import Aid, Linearised, RowStates
+from ssm_graph.graph.aids.aid import Aid, Linearised, RowStates, drift_variable
 from ssm_graph.imu.ping_motion import mean_gyro
 from ssm_graph.sensors.depth import DepthCalibration, DepthLog
 from ssm_graph.sensors.imu import ImuLog
 
 DEPTH_OFFSET: Final = "depth_offset"
+DEPTH_DRIFT: Final = "depth_drift"
+GATE: Final = 5.0
+"""Sigmas by which two readings of a keyframe may differ, and the next."""
+FASTEST_CLIMB: Final = 5.0
+"""m/s, of any underwater vehicle: so fast the way between the readings may change the height."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,19 +44,42 @@ class Depths(ReadOnlyArrays):
     """m"""
     lever_arm_b: Array
     """(3,) m"""
+    white_share: float = 1.0
+    """Of the sigma, what is white where the drift is a variable"""
 
     @classmethod
     def of(cls, log: DepthLog, imu: ImuLog, keyframe_s: Array) -> Depths:
-        """Return the readings of a log within keyframes (K,)."""
-        used = (log.time_s >= keyframe_s[0]) & (log.time_s <= keyframe_s[-1])
+        """Return the readings of a log within keyframes (K,), without those the others outvote."""
+        used = np.flatnonzero((log.time_s >= keyframe_s[0]) & (log.time_s <= keyframe_s[-1]))
+        keyframe = np.searchsorted(keyframe_s, log.time_s[used])
+        agrees = _agrees_with_most(keyframe, log.time_s[used], log.depth[used], sigma=log.sigma)
+        used = used[agrees]
         return cls(
-            keyframe=np.searchsorted(keyframe_s, log.time_s[used]),
+            keyframe=keyframe[agrees],
             time_s=log.time_s[used],
             depth=log.true_depth[used],
             gyro_b=mean_gyro(imu, keyframe_s),
             sigma=log.sigma,
             lever_arm_b=log.lever_arm_b,
+            white_share=log.calibration.drift.white,
         )
+
+
+def _agrees_with_most(
+    keyframe: Indices, time_s: Array, depth: Array, *, sigma: float
+) -> NDArray[np.bool_]:
+    """Return which readings (M,) agree with the median one of their keyframe.
+
+    Where no more than half of a keyframe's readings do, nothing tells the good ones: all stay, and
+    their mean is weighed as a whole.
+    """
+    order = np.lexsort((depth, keyframe))
+    count = np.bincount(keyframe)
+    middle = order[(np.cumsum(count) - count + (np.maximum(count, 1) - 1) // 2)[keyframe]]
+    reach = GATE * np.sqrt(2.0) * sigma + FASTEST_CLIMB * np.abs(time_s - time_s[middle])
+    agrees = np.abs(depth - depth[middle]) <= reach
+    is_most = 2 * np.bincount(keyframe, weights=agrees) > count
+    return np.asarray(agrees | ~is_most[keyframe])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,7 +96,6 @@ class DepthMeans(Aid):
     name = "depth"
     unit = "m"
     hint = "look at its zero, sign and unit"
-    is_weighted = False
 
     depth: Array
     """(M,) m, positive down"""
@@ -162,22 +190,22 @@ class DepthMeans(Aid):
             at.R_nb,
             at.p_n,
             lever_arm_b=self.lever_arm_b,
-            offset=at.value(DEPTH_OFFSET, 1)[..., 0],
+            offset=(at.value(DEPTH_OFFSET, 1) + at.value(DEPTH_DRIFT, 1))[..., 0],
             up_n=self.up_n,
             target_n=self.target_n,
         )
         jacobian = np.zeros((*residual.error.shape, 1, at.extras.width))
         jacobian[..., 0, ROTATION] = residual.error_D_rotation
         jacobian[..., 0, POSITION] = residual.error_D_position
-        if DEPTH_OFFSET in at.extras:
-            own = at.extras.columns(DEPTH_OFFSET)
-            jacobian[..., 0, own] = residual.error_D_offset[..., None]
+        own = residual.error_D_offset[..., None]
+        at.extras.fill(jacobian[..., 0, :], {DEPTH_OFFSET: own, DEPTH_DRIFT: own})
         return Linearised(residual.error[..., None], jacobian)
 
 
 def depth_variables(calibration: DepthCalibration) -> tuple[Extra, ...]:
     """Return what the sigmas of a depth sensor switch on."""
-    return (Extra(DEPTH_OFFSET, ("depth_offset_m",), np.array([calibration.offset_sigma])),)
+    offset = Extra(DEPTH_OFFSET, ("depth_offset_m",), np.array([calibration.offset_sigma]))
+    return (offset, *drift_variable(DEPTH_DRIFT, ("depth_drift_m",), calibration.drift))
 
 
 class HeightTrack(NamedTuple):

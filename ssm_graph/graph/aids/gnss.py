@@ -33,7 +33,6 @@ class Fixes(Aid):
     name = "GNSS"
     unit = "m"
     hint = "look for a wrong datum or lever arm"
-    is_weighted = False
     LEVER_ARM: ClassVar[str] = GNSS_LEVER_ARM
     TIME_OFFSET: ClassVar[str] = GNSS_TIME_OFFSET
     DRIFT: ClassVar[str] = GNSS_DRIFT
@@ -117,4 +116,4 @@ def gnss_variables(calibration: GnssCalibration) -> tuple[Extra, ...]:
         Extra(GNSS_LEVER_ARM, along_axes("gnss_lever_arm_{}_m"), arm_sigma, as_a_turn=1e2),
         Extra(GNSS_TIME_OFFSET, ("gnss_time_offset_s",), late_sigma_s, as_a_turn=1e1),
     )
-    return (*known, *drift_variable(GNSS_DRIFT, "gnss_drift_{}_m", calibration.drift))
+    return (*known, *drift_variable(GNSS_DRIFT, along_axes("gnss_drift_{}_m"), calibration.drift))

@@ -23,7 +23,6 @@ class UsblFixes(Fixes):
     name = "USBL"
     hint = "look at its delay, datum, lever arm and the ship's heading"
     section = UsblLog.SECTION
-    is_weighted = True
     asks_for_keyframes = True
     LEVER_ARM: ClassVar[str] = ""
     TIME_OFFSET: ClassVar[str] = ""

@@ -158,6 +158,7 @@ def _check(mission: Mission, tables: dict[str, Table], *, has_origin: bool) -> l
     ``tables`` by section are where the readings of its instruments, sound by themselves, came from;
     ``has_origin`` says that the frame was stated, not taken from the first position.
     """
+    mission = replace(mission, imu=mission.imu.calibrated)
     notes = _times(mission, tables)
     _initial_time(mission, tables["imu"].label)
     _initial_position(mission, has_origin=has_origin)

@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 import tomli_w
 
-from ssm_graph.base.frames import R_FRD, BodyAxes
+from ssm_graph.base.frames import R_FRD, BodyAxes, matrix_to_frd
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.settings import build, owner_of, written
 from ssm_graph.base.tables import Order, Table
@@ -257,6 +257,7 @@ def _lines(
     off = np.array([value.value for value in values])
     total = calibrated.total(log, 0.0 if stated is None else stated, off)
     total = total @ R_FRD[axes] if key.is_body else total
+    total = matrix_to_frd(total, axes) if key.is_body_matrix else total
     unsure = [v.label for v in values if v.determined is Determined.RED]
     remark = f"; not determined: {', '.join(unsure)}" if unsure else ""
     return [

@@ -59,6 +59,7 @@ def read_vehicle(path: Path | str) -> Vehicle:
         aids=Aids(*bare.values(), *map(standstill, toml.lists["standstill"])),
         frame=frame,
         initial=toml.initial(),
+        imu_calibration=imu.calibration,
     )
 
 
@@ -85,6 +86,7 @@ def vehicle_of(mission: Mission) -> Vehicle:
         aids=Aids(*aids),
         frame=mission.frame,
         initial=mission.initial,
+        imu_calibration=mission.imu.calibration,
     )
 
 

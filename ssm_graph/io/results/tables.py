@@ -26,11 +26,19 @@ from ssm_graph.io.results.place import FIGURE_NAME, check_is_for_results
 from ssm_graph.io.results.summary import MetricsLike, build_summary
 from ssm_graph.io.tables import csv_tables
 from ssm_graph.io.tables.append_file import TORN_ROW, AppendFile, write_through
-from ssm_graph.mission.estimate import AidTable, BeamTable, CurrentTrack, Estimate, Trajectory
+from ssm_graph.mission.estimate import (
+    AidTable,
+    BeamTable,
+    CurrentTrack,
+    Estimate,
+    ProtectionTrack,
+    Trajectory,
+)
 from ssm_graph.mission.mission import Mission
 
 TRAJECTORY_NAME: Final = "trajectory.csv"
 BEAMS_NAME: Final = "beams.csv"
+PROTECTION_NAME: Final = "protection.csv"
 AIDS_NAME: Final = "aids.csv"
 SUMMARY_NAME: Final = "summary.json"
 Columns = dict[str, tuple[Array, str]]
@@ -206,6 +214,15 @@ def suspect_column(estimate: Estimate) -> Columns:
     return {"suspect": (np.any([np.zeros(len(time_s), bool), *inside], axis=0), "%.0f")}
 
 
+def protection_columns(protection: ProtectionTrack) -> Columns:
+    """Return the columns of ``protection.csv``, which live runs have."""
+    return {
+        "time_s": (protection.time_s, "%.7f"),
+        "protection_m": (protection.horizontal, "%.7g"),
+        "protection_up_m": (protection.up, "%.7g"),
+    }
+
+
 def beam_columns(beams: BeamTable) -> Columns:
     """Return the columns of ``beams.csv`` in the order of the contract."""
     return {
@@ -244,6 +261,7 @@ TRAJECTORY_COLUMNS: Final = tuple(trajectory_columns(Trajectory.empty()))
 CURRENT_COLUMNS: Final = tuple(current_columns(CurrentTrack.empty()))
 BEAM_COLUMNS: Final = tuple(beam_columns(BeamTable.empty()))
 HEADERS: Final = {TRAJECTORY_NAME: TRAJECTORY_COLUMNS, BEAMS_NAME: BEAM_COLUMNS}
+PROTECTION_COLUMNS: Final = tuple(protection_columns(ProtectionTrack.empty()))
 
 
 def _summary_text(summary: Mapping[str, Any]) -> str:
@@ -267,7 +285,10 @@ def _read_table(path: Path, required: tuple[str, ...]) -> dict[str, Array]:
 
 
 class GrowingResults:
-    """Appends to ``trajectory.csv`` and ``beams.csv``; a restart continues where it was kept."""
+    """Appends to ``trajectory.csv``, ``beams.csv`` and ``protection.csv``.
+
+    A restart continues where it was kept.
+    """
 
     def __init__(
         self, folder: Path, *, sizes: Mapping[str, int] | None = None, has_current: bool = False
@@ -282,14 +303,15 @@ class GrowingResults:
         self._folder = folder
         self.problem: str | None = None
         """Why the last rows are not on disk, if they are not."""
-        self._waiting: dict[str, str] = dict.fromkeys(HEADERS, "")
+        headers = {PROTECTION_NAME: PROTECTION_COLUMNS, **HEADERS}
+        self._waiting: dict[str, str] = dict.fromkeys(headers, "")
         self._files: dict[str, AppendFile] = {}
         try:
             folder.mkdir(parents=True, exist_ok=True)
             (folder / SUMMARY_NAME).unlink(missing_ok=True)
             beside = CURRENT_COLUMNS if has_current else ()
-            columns = HEADERS | {TRAJECTORY_NAME: TRAJECTORY_COLUMNS + beside}
-            self._heads = {name: (",".join(of) + "\n").encode() for name, of in columns.items()}
+            headers[TRAJECTORY_NAME] += beside
+            self._heads = {name: (",".join(of) + "\n").encode() for name, of in headers.items()}
             for name, head in self._heads.items():
                 size = (sizes or {}).get(name, 0)
                 if size == 0:
@@ -317,13 +339,19 @@ class GrowingResults:
         return [text for text in texts.values() if text]
 
     def append(
-        self, trajectory: Trajectory, beams: BeamTable, current: CurrentTrack | None = None
+        self,
+        trajectory: Trajectory,
+        beams: BeamTable,
+        current: CurrentTrack | None = None,
+        protection: ProtectionTrack | None = None,
     ) -> None:
         """Add rows; what the disk does not take waits for the next time."""
         self._waiting[TRAJECTORY_NAME] += _rows(
             trajectory_columns(trajectory) | current_columns(current)
         )
         self._waiting[BEAMS_NAME] += _rows(beam_columns(beams))
+        if protection is not None:
+            self._waiting[PROTECTION_NAME] += _rows(protection_columns(protection))
         self._write_waiting()
 
     def _write_waiting(self) -> None:

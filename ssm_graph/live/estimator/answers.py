@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -9,10 +10,18 @@ import numpy as np
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.engine.extras import Extras
 from ssm_graph.graph.measurements import aid_table
+from ssm_graph.live.estimator.guard import Guarded
 from ssm_graph.live.estimator.tail import Newest
 from ssm_graph.live.estimator.watch import Watch, verdict
 from ssm_graph.mission.answer import trajectory_at
-from ssm_graph.mission.estimate import AidTable, BeamTable, CurrentTrack, Found, Trajectory
+from ssm_graph.mission.estimate import (
+    AidTable,
+    BeamTable,
+    CurrentTrack,
+    Found,
+    ProtectionTrack,
+    Trajectory,
+)
 from ssm_graph.mission.navigation import Navigation
 from ssm_graph.smoothers.track import Stretch, calibration_of_last, current_along
 from ssm_graph.smoothers.window import Window
@@ -21,6 +30,7 @@ from ssm_graph.smoothers.window import Window
 def answer(
     newest: Newest,
     watch: Watch,
+    guarded: Guarded,
     frame: LocalFrame,
     *,
     latest_s: float,
@@ -32,7 +42,13 @@ def answer(
     ``latest_s`` is the newest time of any message, s; ``shift_s`` how far the vehicle's clock is
     behind that of the states; ``latency_s`` what the last update cost.
     """
-    told = verdict(watch, now_s=latest_s, imu_s=newest.time_s, covariance=newest.covariance)
+    told = verdict(
+        watch,
+        guarded,
+        now_s=latest_s,
+        imu_s=newest.time_s,
+        covariance=newest.covariance,
+    )
     time_s, covariance = np.array([newest.time_s]), newest.covariance[None]
     at = trajectory_at(frame, time_s, newest.states, covariance, n_beams=np.zeros(1))
     return Navigation(
@@ -50,6 +66,9 @@ def answer(
         gyro_bias=at.gyro_bias[0],
         accel_bias=at.accel_bias[0],
         beam_weights=np.array(watch.beam_weights),
+        protection_m=guarded.protection.horizontal,
+        protection_up_m=guarded.protection.up,
+        innovation_ratios=guarded.ratios,
     )
 
 
@@ -72,9 +91,17 @@ class Delayed(NamedTuple):
     """Beside the trajectory; None of a vehicle without one."""
     aids: AidTable | None
     """What became of the aids' measurements; None if there were none."""
+    protection: ProtectionTrack
 
 
-def delayed_of(stretch: Stretch, frame: LocalFrame, extras: Extras, *, shift_s: float) -> Delayed:
+def delayed_of(
+    stretch: Stretch,
+    protection: ProtectionTrack,
+    frame: LocalFrame,
+    extras: Extras,
+    *,
+    shift_s: float,
+) -> Delayed:
     """Return a stretch on the vehicle's clock, which is ``shift_s`` behind ours.
 
     ``extras`` are what each keyframe of it carries beside the error state.
@@ -91,4 +118,5 @@ def delayed_of(stretch: Stretch, frame: LocalFrame, extras: Extras, *, shift_s: 
         ),
         current_along(extras, stretch._replace(time_s=time_s)),
         aid_table([one._replace(time_s=one.time_s - shift_s) for one in stretch.aids.values()]),
+        replace(protection, time_s=time_s),
     )

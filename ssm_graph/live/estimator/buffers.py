@@ -134,14 +134,21 @@ class Buffers:
         return self._period_s
 
     def imu_log(self, begin_s: float, end_s: float, *, margin: int = 3) -> ImuLog:
-        """Return the samples that cover a span, and a few on both sides."""
+        """Return the samples that cover a span, and a few on both sides, known errors taken off."""
         rows = self.imu
         first = max(rows.index(begin_s, after=True) - margin, 0)
         last = rows.index(end_s) + 1 + margin
         found = rows.all[first:last]
         start_s = rows.all[first - 1, 0] if first else found[0, 0] - self.period_s
         log: ImuLog = IMU.log_of(found, self._bare[IMU.section])
-        return replace(log, start_s=float(start_s))
+        return replace(log, start_s=float(start_s)).calibrated
+
+    def inertial(self, rows: Array) -> Array:
+        """Return inertial rows (N, 7) with what is known of the sensors' errors taken off."""
+        known = self.vehicle.imu_calibration
+        if not known.is_stated:
+            return rows
+        return np.column_stack([rows[:, 0], *known.taken_off(rows[:, 1:4], rows[:, 4:])])
 
     def mission(self, frame: LocalFrame, *, until_s: float = np.inf) -> Mission:
         """Return everything, or what is of a time ``until_s``, as a mission to align with."""

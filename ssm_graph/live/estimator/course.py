@@ -16,6 +16,7 @@ from ssm_graph.base.errors import SolverError
 from ssm_graph.engine.error_state import VELOCITY
 from ssm_graph.graph.inertial_rows import InertialRows
 from ssm_graph.live.estimator.buffers import Buffers, Measured
+from ssm_graph.live.estimator.guard import Guard, Guarded, Guardian, protection_at
 from ssm_graph.live.estimator.keyframes import KeyframeMaker
 from ssm_graph.live.estimator.recovery import (
     Doubt,
@@ -26,6 +27,7 @@ from ssm_graph.live.estimator.recovery import (
     watch_after,
 )
 from ssm_graph.live.estimator.watch import Watch, is_sound, observe
+from ssm_graph.mission.estimate import ProtectionTrack
 from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.navigation import Severity
 from ssm_graph.smoothers.keyframe import Keyframe
@@ -53,6 +55,7 @@ class Step(NamedTuple):
     left: Stretch | None
     """What left the window since the step that is kept before it."""
     reserve: Reserve
+    guard: Guard
 
     @property
     def time_s(self) -> float:
@@ -60,22 +63,40 @@ class Step(NamedTuple):
         return self.window.keyframes[-1].time_s
 
 
+class Settled(NamedTuple):
+    """Successive keyframes that have left the window for good."""
+
+    stretch: Stretch
+    protection: ProtectionTrack
+
+
 class Course:
     """Makes one step after the other, and keeps those that late messages may go back to."""
 
     def __init__(
-        self, first: Step, maker: KeyframeMaker, buffers: Buffers, events: EventLog
+        self,
+        first: Step,
+        maker: KeyframeMaker,
+        buffers: Buffers,
+        events: EventLog,
+        guardian: Guardian,
     ) -> None:
+        self.guardian = guardian
         self._steps = deque([first])
         self._maker, self._buffers, self._events = maker, buffers, events
         sensors = first.window.sensors
         self._inertial = InertialRows(sensors.frame, sensors.extras)
-        self._settled: list[Stretch] = []
+        self._settled: list[Settled] = []
 
     @property
     def newest(self) -> Step:
         """The last step."""
         return self._steps[-1]
+
+    @property
+    def guarded(self) -> Guarded:
+        """What watches over the newest step says of it."""
+        return self.guardian.told(self.newest.guard)
 
     @property
     def oldest(self) -> Step:
@@ -113,13 +134,16 @@ class Course:
             self._thin_out()
         return count
 
-    def take_settled(self, *, all_of_them: bool = False) -> list[Stretch]:
+    def take_settled(self, *, all_of_them: bool = False) -> list[Settled]:
         """Return what has left the window for good since the last call, or all there is."""
         settled, self._settled = self._settled, []
         if all_of_them:
-            settled += [step.left for step in self._steps if step.left is not None]
-            settled.append(self.newest.window.all)
+            left = [step.left for step in self._steps if step.left is not None]
+            settled += map(self._with_levels, (*left, self.newest.window.all))
         return settled
+
+    def _with_levels(self, stretch: Stretch) -> Settled:
+        return Settled(stretch, protection_at(self.newest.guard, stretch.time_s))
 
     def _let_go(self) -> None:
         """Forget the steps that nothing can undo any more."""
@@ -127,7 +151,9 @@ class Course:
         while len(self._steps) > 1 and self._steps[1].time_s <= kept_s:
             gone = self._steps.popleft().left
             if gone is not None:
-                self._settled.append(joined([gone]))  # a copy: a view keeps the whole window
+                self._settled.append(
+                    self._with_levels(joined([gone]))
+                )  # a copy: a view keeps the whole window
         self._buffers.drop_before(self.oldest.window.keyframes[0].time_s - 1.0)
 
     def _thin_out(self) -> None:
@@ -162,7 +188,25 @@ class Course:
             reserve = reserve.renewed(window)
         if watch.trouble_s == keyframe.time_s and watch.trouble != last.watch.trouble:
             self._events.tell(keyframe.time_s, Severity.WARNING, "doubt", watch.trouble)
-        return Step(window, watch, left, reserve)
+        guard = self._guarded(keyframe, window, is_anew=False)
+        return Step(window, watch, left, reserve, guard)
+
+    def _guarded(self, keyframe: Keyframe, window: Window, *, is_anew: bool) -> Guard:
+        """Return the guard at the next keyframe, and tell what is found to contradict."""
+        last = self.newest
+        state = last.window.newest_states
+        guard = self.guardian.led_on(last.guard, state, keyframe, window, is_anew=is_anew)
+        known = {one.suspect for one in last.guard.contradictions}
+        now = {one.suspect for one in guard.contradictions}
+        for suspect in sorted(now - known):
+            text = self.guardian.sentence(guard)
+            kind = f"contradicted_{self.guardian.bank.suspects[suspect]}".replace(" ", "_")
+            self._events.tell(keyframe.time_s, Severity.WARNING, kind, text)
+        for suspect in sorted(known - now):
+            name = self.guardian.bank.suspects[suspect]
+            text = f"the answer agrees again with what is independent of {name}"
+            self._events.tell(keyframe.time_s, Severity.INFO, "contradiction_ended", text)
+        return guard
 
     def _anew(self, keyframe: Keyframe, doubt: Doubt, reserve: Reserve) -> Step:
         """Begin a new window at the next keyframe."""
@@ -174,11 +218,13 @@ class Course:
         if doubt.what not in (Doubted.ANSWER, Doubted.VELOCITY):
             reserve = Reserve.of(window)
         watch = watch_after(last.watch, window, last.window.newest, doubt)
-        return Step(window, watch, last.window.all, reserve)
+        guard = self._guarded(keyframe, window, is_anew=True)
+        return Step(window, watch, last.window.all, reserve, guard)
 
     def _observed(self, keyframe: Keyframe, window: Window, *, parity: bool) -> Watch:
         last, period_s = self.newest, self._buffers.shortest_period_s
-        samples = self._buffers.imu.between(last.time_s, keyframe.time_s)
+        buffers = self._buffers
+        samples = buffers.inertial(buffers.imu.between(last.time_s, keyframe.time_s))
         force = float(np.linalg.norm(samples[:, 4:], axis=1).mean()) if len(samples) else 9.8
         n_due = np.floor((keyframe.time_s - last.time_s) / period_s - 1.0)
         return observe(

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from factors.imu_errors import NONE
 from factors.inertial import Intervals
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
@@ -24,7 +25,6 @@ from ssm_graph.imu.ping_motion import PING_WINDOW_S, mean_gyro
 from ssm_graph.imu.preintegration import LIVELY_S, InertialChain, imu_gaps, preintegrate
 from ssm_graph.live.estimator.buffers import OFF_WATER, Buffers, Logs, Measured
 from ssm_graph.mission.problem import Beams, ProblemConfig
-from ssm_graph.sensors.drift import Drift
 from ssm_graph.sensors.imu import ImuLog
 from ssm_graph.smoothers.keyframe import Keyframe
 
@@ -40,7 +40,7 @@ class KeyframeMaker:
         self._begin_s = begin_s
         vehicle = buffers.vehicle
         self._no_beams = Beams.of_mount(vehicle.mount)
-        self._white_beams = _white_share(vehicle.mount.drift)
+        self._white_beams = vehicle.mount.drift.white
         self.not_before_s = -np.inf
         """Where the inertial data have to be before asking again is worth while."""
 
@@ -116,6 +116,7 @@ class KeyframeMaker:
             np.array([begin_s, end_s]),
             frame=self._frame,
             rate_hz=self._config.merge_rate_hz,
+            errors=NONE if self._buffers.vehicle.imu_calibration.is_asked else None,
         )
 
     def _beams(self, pings: Array, gyro_b: Array) -> Beams:
@@ -148,17 +149,13 @@ def aids_at(logs: Logs, keyframes: Keyframes) -> Iterator[Aid]:
         frame=frame,
         imu=imu,
     )
-    white = _white_share(gnss.calibration.drift)
+    white = gnss.calibration.drift.white
     yield replace(fixes, covariance_n=fixes.covariance_n * white**2)
     if depth is not None:
         readings = Depths.of(depth, imu, keyframe_s)
+        readings = replace(readings, sigma=readings.sigma * readings.white_share)
         yield DepthMeans.of_readings(readings, keyframe_s, frame).at(1)
     for kind in AIDS:
         aid = kind.of(aids, keyframes)
         if aid is not None:
             yield aid.at(1)
-
-
-def _white_share(drift: Drift) -> float:
-    """Return how much of the stated sigmas is white noise, where a drift is carried beside it."""
-    return drift.white_share if drift.sigma > 0.0 else 1.0

@@ -17,9 +17,11 @@ from ssm_graph.engine.states import States
 from ssm_graph.live.estimator.answers import Delayed, answer, delayed_of, found_by
 from ssm_graph.live.estimator.buffers import Buffers
 from ssm_graph.live.estimator.course import REACH_S, Course, Step
+from ssm_graph.live.estimator.guard import Guardian
 from ssm_graph.live.estimator.intake import Intake
 from ssm_graph.live.estimator.keyframes import KeyframeMaker
 from ssm_graph.live.estimator.recovery import ASTRAY_TIMES, Reserve, is_astray
+from ssm_graph.live.estimator.separation import IntegrityConfig
 from ssm_graph.live.estimator.start import Starter, not_calibrated, sensors_of_vehicle
 from ssm_graph.live.estimator.tail import Tail
 from ssm_graph.live.estimator.watch import Contradicted, Watch
@@ -71,9 +73,11 @@ class FixedLagSmoother:
         config: FixedLagConfig | None = None,
         *,
         problem_config: ProblemConfig | None = None,
+        integrity: IntegrityConfig | None = None,
     ) -> None:
         """Take a vehicle; ``config`` is :data:`ONLINE` when left out."""
         self.vehicle, self.config = vehicle, config or ONLINE
+        self.integrity = integrity or IntegrityConfig()
         self._problem_config = problem_config or ProblemConfig()
         self._events = EventLog()
         self._intake = Intake(vehicle, self._events)
@@ -84,6 +88,7 @@ class FixedLagSmoother:
         self._latest_s = -np.inf
         self._cost_s = 0.0
         self._begun_s, self._is_lost = 0.0, False
+        self._known: list[Any] = []
         self._finished: list[Delayed] = []
 
     @property
@@ -135,7 +140,7 @@ class FixedLagSmoother:
         if undone or n_made or self._tail is None or (is_late and is_sample):
             self._tail = self._tail_of(course.newest)
         elif is_sample:
-            self._tail.add(buffers.imu.between(self._tail.end_s, np.inf))
+            self._tail.add(buffers.inertial(buffers.imu.between(self._tail.end_s, np.inf)))
         return n_made > 0
 
     def _start(self) -> bool:
@@ -149,16 +154,22 @@ class FixedLagSmoother:
         first = Keyframe(beginning.time_s, sensors.beams)
         window = Window(sensors, self.config, first, beginning.moments)
         window.iterate()
-        self._course = self._course_from(Step(window, Watch(), None, Reserve.of(window)))
+        guardian = self._guardian(sensors)
+        guard = guardian.begin(window, self._known)
+        step = Step(window, Watch(), None, Reserve.of(window), guard)
+        self._course = self._course_from(step, guardian)
         return True
+
+    def _guardian(self, sensors: Sensors) -> Guardian:
+        return Guardian(sensors, self.vehicle.imu_noise, self.integrity)
 
     def _maker(self) -> KeyframeMaker:
         assert self._frame is not None
         buffers, config = self._intake.buffers, self._problem_config
         return KeyframeMaker(buffers, self._frame, config, begin_s=self._begun_s)
 
-    def _course_from(self, step: Step) -> Course:
-        course = Course(step, self._maker(), self._intake.buffers, self._events)
+    def _course_from(self, step: Step, guardian: Guardian) -> Course:
+        course = Course(step, self._maker(), self._intake.buffers, self._events, guardian)
         self._intake.horizon_s = course.horizon_s
         return course
 
@@ -179,10 +190,13 @@ class FixedLagSmoother:
             "begun_s": self._begun_s,
             "alignment": self._starter.pack(),
             "watch": None,
+            "contradictions": self._known,
         }
         if self._course is not None:
-            packed, meta["watch"] = pack_step(self._course.oldest)
-            arrays |= packed
+            oldest, guardian = self._course.oldest, self._course.guardian
+            packed, meta["watch"] = pack_step(oldest)
+            meta["contradictions"] = guardian.plain(oldest.guard)
+            arrays |= packed | {f"guard_{name}": array for name, array in oldest.guard.pack()}
         return arrays, meta
 
     @classmethod
@@ -194,15 +208,20 @@ class FixedLagSmoother:
         meta: Mapping[str, Any],
         *,
         problem_config: ProblemConfig | None = None,
+        integrity: IntegrityConfig | None = None,
     ) -> Self:
-        """Return the estimator as it was when ``checkpoint`` was called."""
-        smoother = cls(vehicle, config, problem_config=problem_config)
+        """Return the estimator as it was when ``checkpoint`` was called.
+
+        Lanes that it does not have, of an earlier version, begin anew.
+        """
+        smoother = cls(vehicle, config, problem_config=problem_config, integrity=integrity)
         intake = smoother._intake
         intake.shift_s = float(meta["shift_s"])
         intake.counts.update(meta["counts"])
         unpack_buffers(arrays, intake.buffers)
         smoother._latest_s = intake.buffers.imu.last_s
         smoother._begun_s = meta["begun_s"]
+        smoother._known = list(meta.get("contradictions", ()))
         if meta["is_lost"]:
             smoother._start_anew()
         if meta["frame"] is not None:
@@ -213,8 +232,12 @@ class FixedLagSmoother:
             assert smoother._frame is not None
             sensors = sensors_of_vehicle(vehicle, smoother._frame)
             inertial = smoother._maker().inertial
-            step = unpack_step(arrays, meta["watch"], sensors, smoother.config, inertial)
-            smoother._course = course = smoother._course_from(step)
+            packed = arrays, meta["watch"], sensors, smoother.config
+            window, watch, left, reserve = unpack_step(*packed, inertial)
+            guardian = smoother._guardian(sensors)
+            guard = guardian.unpack(_part(arrays, "guard_"), smoother._known, window)
+            step = Step(window, watch, left, reserve, guard)
+            smoother._course = course = smoother._course_from(step, guardian)
             course.advance()
             intake.horizon_s = course.horizon_s
             smoother._tail = smoother._tail_of(course.newest)
@@ -233,6 +256,7 @@ class FixedLagSmoother:
         text = f"{reason}; position and attitude have to be found anew"
         self._events.tell(time_s, Severity.ERROR, "lost", text)
         self._finished += self._take(self._course, all_of_them=True)
+        self._known = self._course.guardian.plain(self._course.newest.guard)
         self._course = self._tail = None
         self._intake.horizon_s = time_s
         self._start_anew()
@@ -249,8 +273,9 @@ class FixedLagSmoother:
         keyframe, covariance = step.window.keyframes[-1], newest.covariance[0]
         sensors = step.window.sensors
         tail = Tail(keyframe, newest.states, covariance, noise=noise, sensors=sensors)
-        imu = self._intake.buffers.imu
-        tail.add(imu.all[max(imu.index(step.time_s, after=True) - 1, 0) :])
+        buffers, imu = self._intake.buffers, self._intake.buffers.imu
+        first = max(imu.index(step.time_s, after=True) - 1, 0)
+        tail.add(buffers.inertial(imu.all[first:]))
         return tail
 
     def newest(self) -> Navigation | None:
@@ -261,6 +286,7 @@ class FixedLagSmoother:
         return answer(
             self._tail.newest(),
             self._course.newest.watch,
+            self._course.guarded,
             self._frame,
             latest_s=self._latest_s,
             shift_s=self._intake.shift_s,
@@ -301,9 +327,9 @@ class FixedLagSmoother:
         assert self._frame is not None
         shift_s, extras = self._intake.shift_s, course.newest.window.sensors.extras
         return [
-            delayed_of(stretch, self._frame, extras, shift_s=shift_s)
-            for stretch in course.take_settled(all_of_them=all_of_them)
-            if len(stretch.time_s)
+            delayed_of(*settled, self._frame, extras, shift_s=shift_s)
+            for settled in course.take_settled(all_of_them=all_of_them)
+            if len(settled.stretch.time_s)
         ]
 
 
@@ -337,11 +363,11 @@ def unpack_step(
     sensors: Sensors,
     config: FixedLagConfig,
     inertial: Callable[[float, float], Intervals],
-) -> Step:
+) -> tuple[Window, Watch, Stretch | None, Reserve]:
     """Return the step that was packed; ``inertial`` is that of the keyframes' maker."""
     window = Window.unpack(_part(arrays, "window_"), sensors, config, inertial)
     reserve = Reserve.unpack(_part(arrays, "reserve_"))
-    return Step(window, _watch(watch), _left(_part(arrays, "left_"), sensors), reserve)
+    return window, _watch(watch), _left(_part(arrays, "left_"), sensors), reserve
 
 
 def _part(arrays: Mapping[str, Array], prefix: str) -> dict[str, Array]:

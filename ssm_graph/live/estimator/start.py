@@ -220,7 +220,9 @@ def sensors_of_vehicle(vehicle: Vehicle, frame: LocalFrame) -> Sensors:
 
 def _all_asked_for(vehicle: Vehicle) -> Extras:
     depth = None if vehicle.depth is None else vehicle.depth.calibration
-    of_instruments = calibration_extras(vehicle.mount, depth, vehicle.gnss.calibration)
+    of_instruments = calibration_extras(
+        vehicle.mount, depth, vehicle.gnss.calibration, vehicle.imu_calibration
+    )
     of_aids = (extra for kind in AIDS for extra in kind.variables(vehicle.aids))
     of_water = () if vehicle.current is None else current_extras(vehicle.current)
     return Extras((*of_instruments, *of_aids, *of_water))

@@ -7,10 +7,12 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
+from factors.imu_errors import taken_off
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.states import States
 from ssm_graph.graph.inertial_rows import InertialRows
 from ssm_graph.imu.preintegration import Preintegrated, Unseen, imu_params, intervals_of
+from ssm_graph.mission.imu_variables import imu_errors
 from ssm_graph.sensors.imu import ImuNoise
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors
 
@@ -51,9 +53,16 @@ class Tail:
         params = imu_params(noise, g_n=np.zeros(3), frame=frame)
         self._measured = Preintegrated(params, bias)
         self._rows = InertialRows(frame, sensors.extras)
+        self._errors, _ = imu_errors(sensors.extras, states.walks[0], states.constants)
 
     def add(self, samples: Array) -> None:
-        """Integrate samples (N, 7): end of the interval s, gyro rad/s, specific force m/s^2."""
+        """Integrate samples (N, 7): end of the interval s, gyro rad/s, specific force m/s^2.
+
+        Of the sensors' errors what is known is taken off, what the keyframe has found is not.
+        """
+        if self._errors.any():
+            found = taken_off(self._errors, samples[:, 1:4], samples[:, 4:])
+            samples = np.column_stack([samples[:, 0], *found])
         for time_s, *row in samples.tolist():
             dt = time_s - self._end_s
             if dt <= 0.0:

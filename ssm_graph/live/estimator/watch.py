@@ -15,6 +15,7 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import POSITION, VELOCITY
 from ssm_graph.graph.aids.depth import DepthMeans
 from ssm_graph.graph.aids.gnss import Fixes
+from ssm_graph.live.estimator.guard import Guarded
 from ssm_graph.mission.answer import LARGEST_SPEED, LOW_WEIGHT, MISFIT, TRUSTED
 from ssm_graph.mission.navigation import Health
 from ssm_graph.smoothers.keyframe import Keyframe
@@ -119,7 +120,7 @@ def observe(
     """
     newest, time_s = window.newest, keyframe.time_s
     kept = window.keyframes[-1]
-    no_fix, no_depth = (name not in kept.aids for name in (Fixes.name, DepthMeans.name))
+    no_fix, no_depth = (_is_refused(newest, name) for name in (Fixes.name, DepthMeans.name))
     share = 1.0 - math.exp(-(time_s - last_s) / MEMORY_S)
     watch = watch._replace(force=watch.force + share * (force - watch.force))
     if len(newest.weight):
@@ -135,7 +136,8 @@ def observe(
         )
     if DepthMeans.name in keyframe.aids:
         watch = watch._replace(depths_refused=watch.depths_refused + 1 if no_depth else 0)
-    if any(np.any(judged.weight >= TRUSTED) for judged in newest.aids.values()):
+    of_place = (judged for name, judged in newest.aids.items() if name != DepthMeans.name)
+    if any(np.any(judged.weight >= TRUSTED) for judged in of_place):
         watch = watch._replace(last_aid_s=time_s)
     if watch.contradicted is not None:
         watch = watch._replace(contradicted=_still(watch.contradicted, window))
@@ -145,6 +147,12 @@ def observe(
     elif missing > MOST_MISSING and not trouble:
         trouble = f"{100.0 * missing:.0f} % of the inertial samples are missing"
     return watch._replace(trouble_s=time_s, trouble=trouble) if trouble else watch
+
+
+def _is_refused(newest: Stretch, name: str) -> bool:
+    """Return whether nothing that an aid measured at the newest keyframe counts."""
+    judged = newest.aids.get(name)
+    return judged is None or bool(np.all(judged.weight < LOW_WEIGHT))
 
 
 def _with_beams(
@@ -239,10 +247,13 @@ class Verdict(NamedTuple):
     since_aid_s: float
 
 
-def verdict(watch: Watch, *, now_s: float, imu_s: float, covariance: Array) -> Verdict:
+def verdict(
+    watch: Watch, guarded: Guarded, *, now_s: float, imu_s: float, covariance: Array
+) -> Verdict:
     """Judge the newest answer, of the covariance (15, 15), by what is remembered.
 
-    ``now_s`` is the newest time of any message, ``imu_s`` that of the inertial data.
+    ``guarded`` is what the lanes say, ``now_s`` the newest time of any message, ``imu_s`` that of
+    the inertial data.
     """
     since_beam_s = imu_s - watch.last_beam_s
     since_aid_s = imu_s - max(watch.last_beam_s, watch.last_fix_s, watch.last_aid_s)
@@ -257,10 +268,14 @@ def verdict(watch: Watch, *, now_s: float, imu_s: float, covariance: Array) -> V
         health, reason = Health.BAD, "the answer has run away"
     elif imu_s - watch.begun_anew_s < PROBATION_S:
         health, reason = Health.BAD, f"being recovered: {watch.trouble}"
+    elif guarded.contradiction:
+        health, reason = Health.DEGRADED, guarded.contradiction
     elif imu_s - watch.trouble_s < PROBATION_S:
         health, reason = Health.DEGRADED, watch.trouble
     elif watch.contradicted is not None:
         health, reason = Health.DEGRADED, watch.contradicted.text
+    elif guarded.shortfall:
+        health, reason = Health.DEGRADED, guarded.shortfall
     elif not has_lock:
         health = Health.DEGRADED
         beam = "beam" if since_beam_s >= LOCK_LOST_S else "beam off the ground"

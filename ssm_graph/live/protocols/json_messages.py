@@ -138,6 +138,8 @@ def navigation_fields(navigation: Navigation) -> dict[str, Any]:
         **_spread("vel_{}_m_per_s", enu, navigation.velocity_enu),
         **_spread("{}_deg", rph, angles),
         **_spread("sigma_{}_m", enu, navigation.position_sigma_enu),
+        "protection_m": navigation.protection_m,
+        "protection_up_m": navigation.protection_up_m,
         **_spread("sigma_vel_{}_m_per_s", enu, navigation.velocity_sigma_enu),
         **_spread("sigma_{}_deg", rph, np.degrees(navigation.attitude_sigma)),
         **_spread("gyro_bias_{}_deg_per_h", xyz, navigation.gyro_bias / DEG_PER_H),
@@ -149,6 +151,7 @@ def navigation_fields(navigation: Navigation) -> dict[str, Any]:
         "bottom_lock": bool(navigation.bottom_lock),
         "since_aid_s": navigation.since_aid_s,
         "latency_s": navigation.latency_s,
+        "innovation_ratios": dict(navigation.innovation_ratios),
     }
     return {key: _finite(value) for key, value in fields.items()}
 

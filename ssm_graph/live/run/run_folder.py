@@ -4,6 +4,7 @@
 ``log/``               everything received, a mission folder: ``ssm-graph smooth RUN/log`` reads it
 ``trajectory.csv``,    smoothed states and their beams, as they leave the window
 ``beams.csv``
+``protection.csv``     protection levels at their times, as they were known then
 ``events.jsonl``       what happened, a line of JSON each
 ``checkpoint.npz``     the estimator, and the sizes of the files above at that moment
 ``summary.json``       how it ended; not there while it goes on
@@ -36,7 +37,13 @@ from ssm_graph.io.raw_log.log import RawLog
 from ssm_graph.io.raw_log.rows import ALWAYS, ARRIVALS, replay
 from ssm_graph.io.results.place import RUN_NAME
 from ssm_graph.io.results.summary import as_json
-from ssm_graph.io.results.tables import BEAMS_NAME, SUMMARY_NAME, TRAJECTORY_NAME, GrowingResults
+from ssm_graph.io.results.tables import (
+    BEAMS_NAME,
+    PROTECTION_NAME,
+    SUMMARY_NAME,
+    TRAJECTORY_NAME,
+    GrowingResults,
+)
 from ssm_graph.io.tables.append_file import AppendFile, sync_path, write_through
 from ssm_graph.io.tables.checkpoint import (
     CHECKPOINT_NAME,
@@ -156,7 +163,7 @@ class RunFolder:
         self.results: GrowingResults | None = None
         self.log: RawLog | None = None
         log_names = [f"{LOG_NAME}/{name}" for name in (*ALWAYS, ARRIVALS)]
-        names = (*log_names, TRAJECTORY_NAME, BEAMS_NAME)
+        names = (*log_names, TRAJECTORY_NAME, BEAMS_NAME, PROTECTION_NAME)
         self.writer = CheckpointWriter(folder, [folder / name for name in names])
         self._known: Counter[bytes] = Counter()
 
@@ -316,7 +323,7 @@ class RunFolder:
         whole = (TOML_NAME, SUMMARY_NAME, CHECKPOINT_NAME, str(older_name(Path(CHECKPOINT_NAME))))
         logged = [f"{LOG_NAME}/{path.name}" for path in (self.path / LOG_NAME).glob("*.csv")]
         found = [name for name in (*whole, f"{LOG_NAME}/{TOML_NAME}") if self._exists(name)]
-        tables = (TRAJECTORY_NAME, BEAMS_NAME, *sorted(logged))
+        tables = (TRAJECTORY_NAME, BEAMS_NAME, PROTECTION_NAME, *sorted(logged))
         found += [name for name in tables if _has_rows(self.path / name, beyond=1)]
         beside = (EVENTS_NAME, f"{LOG_NAME}/{ARRIVALS}")
         return found + [name for name in beside if _has_rows(self.path / name, beyond=0)]

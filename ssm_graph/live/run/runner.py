@@ -17,7 +17,14 @@ from ssm_graph.io.results.summary import as_json, calibration_fields, current_fi
 from ssm_graph.live.protocols.json_messages import navigation_fields
 from ssm_graph.live.run.run_folder import LOG_NAME, Resumed, RunFolder
 from ssm_graph.live.sockets.outputs import Every, Outlet, Publisher
-from ssm_graph.mission.estimate import BeamTable, CurrentTrack, Found, Status, Trajectory
+from ssm_graph.mission.estimate import (
+    BeamTable,
+    CurrentTrack,
+    Found,
+    ProtectionTrack,
+    Status,
+    Trajectory,
+)
 from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.navigation import Event, Health, Navigation, Severity
 from ssm_graph.mission.run_status import Latency, RunStatus, SourceStatus
@@ -74,6 +81,8 @@ class Delayed(Protocol):
     def beams(self) -> BeamTable: ...  # noqa: D102
     @property
     def current(self) -> CurrentTrack | None: ...  # noqa: D102
+    @property
+    def protection(self) -> ProtectionTrack | None: ...  # noqa: D102
 
 
 class Estimator(Protocol):
@@ -319,7 +328,9 @@ class Runner:
         assert self.folder.results is not None
         with self._events.surviving("results", "results_failed"):
             for delayed in take():
-                self.folder.results.append(delayed.trajectory, delayed.beams, delayed.current)
+                self.folder.results.append(
+                    delayed.trajectory, delayed.beams, delayed.current, delayed.protection
+                )
 
     def _keep_checkpoint(self) -> None:
         """Write one where it is due and the disk is done with the last one."""

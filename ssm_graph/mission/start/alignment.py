@@ -12,7 +12,7 @@ its turning gives heading, if the gyros sense the Earth.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -41,7 +41,7 @@ from ssm_graph.mission.start.measured import (
     start_fixes,
 )
 from ssm_graph.mission.usable import require_usable
-from ssm_graph.sensors.imu import ImuNoise
+from ssm_graph.sensors.imu import ImuLog
 
 SAFE_HEADING_SIGMA = math.radians(10.0)
 """Above this, one heading is not safe and several are tried."""
@@ -76,6 +76,7 @@ def align_steps(mission: Mission) -> Steps[Alignment]:
         If no inertial data follow the first fix.
     """
     require_usable(mission)
+    mission = replace(mission, imu=mission.imu.calibrated)
     velocities = body_velocities(mission)
     yield 0.03 * len(velocities.time_s)
     fixes = start_fixes(mission, velocities)
@@ -83,11 +84,11 @@ def align_steps(mission: Mission) -> Steps[Alignment]:
     window_s = _window(mission, start_s)
     turned = yield from _integrate_gyros_steps(mission, start_s, window_s, velocities)
     R_lb = _level_and_compass(mission, turned)
-    compass = _compass_sigma(mission.imu.noise, turned, mission.frame.lat)
+    compass = _compass_sigma(mission.imu, turned, mission.frame.lat)
     track = yield from heading_from_track_steps(mission, fixes, R_lb, velocities)
     magnetic = yield from heading_from_compass_steps(mission, start_s, R_lb, window_s=window_s)
     heading, method = _choose_heading(R_lb, compass, track, magnetic, fixes.source)
-    level = _level_sigma(mission.imu.noise, turned)
+    level = _level_sigma(mission.imu, turned)
     roll, pitch, _ = roll_pitch_heading_from_R_lb(R_lb)
     starts = [
         _initial_state(mission, fixes, (float(roll), float(pitch), h), level, sigma, velocities)
@@ -170,10 +171,15 @@ def _level_and_compass(mission: Mission, turned: _Turned) -> Array:
     return R_lb
 
 
-def _compass_sigma(noise: ImuNoise, turned: _Turned, lat: float) -> float:
+def _rate_sigma(imu: ImuLog) -> float:
+    """Return the sigma of what lasts in the gyros under gravity, rad/s."""
+    return math.hypot(imu.noise.gyro_bias_sigma, 9.8 * imu.calibration.gyro_g_sensitivity_sigma)
+
+
+def _compass_sigma(imu: ImuLog, turned: _Turned, lat: float) -> float:
     """Return the standard deviation of a gyrocompass heading, rad."""
     window_s = turned.time_s[-1]
-    rate = math.hypot(noise.gyro_bias_sigma, noise.gyro_density / math.sqrt(window_s))
+    rate = math.hypot(_rate_sigma(imu), imu.noise.gyro_density / math.sqrt(window_s))
     # A velocity error of a few mm/s against the sideways gain g omega cos(lat) T^2 / 2.
     gain = 0.5 * 9.8 * window_s**2
     sigma = math.hypot(rate, 2.0 * _VELOCITY_SIGMA / gain) / (EARTH_RATE * math.cos(lat))
@@ -183,11 +189,12 @@ def _compass_sigma(noise: ImuNoise, turned: _Turned, lat: float) -> float:
 _VELOCITY_SIGMA = 0.02
 
 
-def _level_sigma(noise: ImuNoise, turned: _Turned) -> float:
-    window_s = turned.time_s[-1]
+def _level_sigma(imu: ImuLog, turned: _Turned) -> float:
+    window_s, noise = turned.time_s[-1], imu.noise
     parts = (
         noise.accel_bias_sigma / 9.8,
-        0.5 * noise.gyro_bias_sigma * window_s,
+        imu.calibration.accel_misalignment_sigma,
+        0.5 * _rate_sigma(imu) * window_s,
         2.0 * _VELOCITY_SIGMA / (9.8 * window_s),
         noise.gyro_density * math.sqrt(window_s),
     )

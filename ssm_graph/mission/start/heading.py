@@ -41,7 +41,8 @@ def heading_from_track_steps(
     R_lb : (3, 3) body to local level at the start; its heading is what is sought, so any will do.
     velocities : of the body at the pings.
     """
-    time_s, track_l, antenna_l = yield from _dead_reckon_steps(mission, fixes, R_lb, velocities)
+    track = yield from _dead_reckon_steps(mission, fixes, R_lb, velocities)
+    time_s, track_l, antenna_l, turned = track
     used = fixes.where(fixes.time_s <= time_s[-1])
     fix_n = used.position_n
     if len(fix_n) < 3:
@@ -51,10 +52,11 @@ def heading_from_track_steps(
         [np.interp(used.time_s, time_s, axis) for axis in (track_l + antenna_l)[:, :2].T], axis=-1
     )
     noise = float(np.sqrt(np.mean(used.sigma_enu[:, :2] ** 2)))
-    drift = mission.imu.noise.gyro_bias_sigma
-    elapsed = used.time_s - time_s[0]
+    by_bias = mission.imu.noise.gyro_bias_sigma * (used.time_s - time_s[0])
+    by_scale = mission.imu.calibration.gyro_scale_sigma * np.interp(used.time_s, time_s, turned)
+    drift = 0.5 * np.hypot(by_bias, by_scale)
     fits = [
-        _fit(seen_l[:n], fix_l[:n], noise=noise, drift=0.5 * drift * elapsed[n - 1])
+        _fit(seen_l[:n], fix_l[:n], noise=noise, drift=float(drift[n - 1]))
         for n in np.unique(np.geomspace(3, len(fix_l), 20).astype(int))
     ]
     turn, sigma = min(fits, key=lambda fit: fit.sigma)
@@ -73,10 +75,22 @@ def _fit(seen: Array, fixed: Array, *, noise: float, drift: float) -> HeadingFit
     return HeadingFit(turn, math.hypot(sigma, drift))
 
 
+class _Track(NamedTuple):
+    """A dead-reckoned way in the level axes assumed."""
+
+    time_s: Array
+    """(N,)"""
+    position_l: Array
+    """(N, 3) m"""
+    antenna_l: Array
+    """(N, 3) m, body origin to antenna"""
+    turned: Array
+    """(N,) rad, the most that the heading has been away from its first value until then"""
+
+
 def _dead_reckon_steps(
     mission: Mission, fixes: StartFixes, R_lb: Array, velocities: BodyVelocities
-) -> Steps[tuple[Array, Array, Array]]:
-    """Return times (N,), track (N, 3) and antenna offset (N, 3) in the level axes assumed, m."""
+) -> Steps[_Track]:
     start_s = float(fixes.time_s[0])
     end_s = min(float(fixes.time_s[-1]), float(mission.imu.time_s[-1]))
     pings = velocities.time_s[(velocities.time_s > start_s) & (velocities.time_s < end_s)]
@@ -84,12 +98,14 @@ def _dead_reckon_steps(
     pings = pings[: silent[0]] if len(silent) else pings
     time_s = np.concatenate([[start_s], pings])
     if len(time_s) < 2:
-        return time_s, np.zeros((1, 3)), (R_lb @ fixes.lever_arm_b)[None, :]
+        return _Track(time_s, np.zeros((1, 3)), (R_lb @ fixes.lever_arm_b)[None, :], np.zeros(1))
     R = yield from gyro_attitudes_steps(mission, time_s, R_lb)
     v_l = np.einsum("kij,kj->ki", R, velocities.at(time_s))
     step = 0.5 * (v_l[1:] + v_l[:-1]) * np.diff(time_s)[:, None]
     track = np.concatenate([np.zeros((1, 3)), np.cumsum(step, axis=0)])
-    return time_s, track, R @ fixes.lever_arm_b
+    heading = np.unwrap(np.arctan2(R[:, 0, 0], R[:, 1, 0]))
+    turned = np.maximum.accumulate(np.abs(heading - heading[0]))
+    return _Track(time_s, track, R @ fixes.lever_arm_b, turned)
 
 
 def gyro_attitudes_steps(mission: Mission, time_s: Array, R_lb: Array) -> Steps[Array]:

@@ -94,6 +94,10 @@ MIN_WINDOW_S: Final = 10.0
 NEAR_S: Final = 60.0
 """An acoustic fix is compared with those so long before and after it, and is preferred to one of
 GNSS that is so much later."""
+NEAR_AT_THE_SURFACE_S: Final = 5.0
+"""A fix of GNSS is compared with those so long before and after it."""
+FASTEST_AT_THE_SURFACE: Final = 3.0
+"""m/s, of the vehicle meanwhile."""
 GATE: Final = 4.0
 """It disagrees with one that is further off than the way swum and so many sigmas."""
 
@@ -127,8 +131,8 @@ class StartFixes(FrozenArrays):
 def start_fixes(mission: Mission, velocities: BodyVelocities) -> StartFixes:
     """Return the fixes of a mission that its start is found from.
 
-    Acoustic fixes err grossly now and then: those that disagree with most of the others near them
-    are left out here; the smoother judges them again.
+    Fixes err grossly now and then: those that disagree with most of the others near them are left
+    out here; the smoother judges them again.
 
     Raises
     ------
@@ -181,6 +185,8 @@ def _usable(mission: Mission, fixes: StartFixes, velocities: BodyVelocities) -> 
     used = fixes.where((fixes.time_s >= imu.start_s) & (fixes.time_s <= imu.time_s[-1]))
     if fixes.source == ACOUSTIC:
         used = used.where(_agreeing(used, velocities))
+    else:
+        used = used.where(_agreeing_at_the_surface(used))
     is_early = len(used.time_s) > 0 and used.time_s[0] <= imu.time_s[-1] - MIN_WINDOW_S
     return used if is_early else None
 
@@ -203,6 +209,24 @@ def _agreeing(fixes: StartFixes, velocities: BodyVelocities) -> NDArray[np.bool_
         fits = apart <= np.abs(swum[near] - swum[i]) + turned + GATE * sigma
         agrees[i] = np.count_nonzero(fits) >= math.ceil(np.count_nonzero(near) / 2)
     return agrees
+
+
+def _agreeing_at_the_surface(fixes: StartFixes) -> NDArray[np.bool_]:
+    """Return which fixes (N,) of GNSS agree with at least half of those near them.
+
+    At the surface the bottom may be out of reach, so that no speed is known.
+    """
+    time_s, sigma_sq = fixes.time_s, np.sum(fixes.sigma_enu**2, axis=1)
+    begin = np.searchsorted(time_s, time_s - NEAR_AT_THE_SURFACE_S)
+    end = np.searchsorted(time_s, time_s + NEAR_AT_THE_SURFACE_S, side="right")
+    turned, agrees = 2.0 * float(np.linalg.norm(fixes.lever_arm_b)), np.ones(len(time_s), bool)
+    for i, near in enumerate(map(slice, begin, end)):
+        apart = np.linalg.norm(fixes.position_n[near] - fixes.position_n[i], axis=1)
+        way = FASTEST_AT_THE_SURFACE * np.abs(time_s[near] - time_s[i])
+        fits = apart <= way + turned + GATE * np.sqrt(sigma_sq[near] + sigma_sq[i])
+        agrees[i] = 2 * (np.count_nonzero(fits) - 1) >= len(fits) - 1
+    # Of two that disagree either may be right: then the first one stays.
+    return agrees if agrees.any() else np.ones(len(agrees), bool)
 
 
 def _swum(time_s: Array, velocities: BodyVelocities) -> Array:

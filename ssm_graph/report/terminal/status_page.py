@@ -33,6 +33,8 @@ SEVERITY_STYLE: Final = {
 }
 BAR: Final = "▁▂▃▄▅▆▇█"
 N_EVENTS: Final = 5
+LASTING: Final = (0.5, 1.0)
+"""Low-passed innovations, in sigmas, from which on they are shown in yellow and in red."""
 _NONE: Final = "–"
 _FIRST_UNIX_S: Final = 1e9
 """Later times are Unix time, shown as time of day."""
@@ -77,6 +79,7 @@ def render(status: RunStatus) -> RenderableType:
     if status.navigation is not None:
         parts.append(_state(status.navigation))
         parts.append(_beams(status.navigation))
+        parts.append(_integrity(status.navigation))
     parts += [*_found(status.found), _latency(status.latency), _links(status)]
     parts += [_event(event) for event in status.events[-N_EVENTS:]]
     parts.append(_disk(status))
@@ -95,6 +98,7 @@ def plain_line(status: RunStatus) -> str:
             f"lat {math.degrees(navigation.lat):.7f} lon {math.degrees(navigation.lon):.7f} deg",
             f"height {navigation.height:.2f} m",
             f"sigma {_horizontal(navigation):.2f} m",
+            f"protected within {navigation.protection_m:.3g} m",
             f"heading {_heading(navigation):.1f} deg",
             "bottom lock" if navigation.bottom_lock else "no bottom lock",
         ]
@@ -162,6 +166,18 @@ def _beams(navigation: Navigation) -> Text:
     lock = ("bottom lock", "green") if navigation.bottom_lock else ("no bottom lock", "yellow")
     since = f"last aid {_ago(navigation.since_aid_s)}"
     return text.append("  ").append(*lock).append(f"  {since}")
+
+
+def _integrity(navigation: Navigation) -> Text:
+    """Return the protection levels, and the low-passed innovation of each sensor in its sigmas."""
+    text = Text("protected")
+    for name, level in (("within", navigation.protection_m), ("up", navigation.protection_up_m)):
+        shown = f"{level:.3g} m" if math.isfinite(level) else _NONE
+        text.append(f" {name} {shown}")
+    for name, ratio in navigation.innovation_ratios.items():
+        style = "green" if ratio < LASTING[0] else "yellow" if ratio < LASTING[1] else "red"
+        text.append(f"  {name} ").append(f"{ratio:.2f}", style)
+    return text.append("  (lasting innovations, sigmas)", "dim")
 
 
 def _found(found: Found) -> Iterator[Text]:

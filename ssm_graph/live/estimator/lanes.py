@@ -1,0 +1,350 @@
+"""Cheap filters beside the window, each of which leaves one sensor out for a while.
+
+A lane begins with what all sensors say and goes on without one of them for 10, 60 or 240 s; two of
+each length take turns. What it says then owes nothing to what that sensor did since: a sensor that
+lies for long, or whose readings all lie alike, parts the lanes from the answer. That is solution
+separation. One more lane leaves nothing out and is the measure of the others: all have one model,
+in which noise that lasts is as large as it may be, and then the covariance of a separation is the
+difference of their covariances.
+
+All lanes are linear about the answer of the window, whose rows and weights they use, and are
+carried as deviations from it in arrays: a keyframe costs as much as a few small products.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from factors import so3
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import ACCEL_BIAS, GYRO_BIAS, ROTATION, STATE_DIM
+from ssm_graph.engine.states import States
+from ssm_graph.graph.aids.depth import DepthMeans
+from ssm_graph.graph.aids.gnss import Fixes
+from ssm_graph.graph.aids.heading import Headings
+from ssm_graph.graph.aids.magnetometer import MagneticFields
+from ssm_graph.graph.aids.ranges import Ranges
+from ssm_graph.graph.aids.usbl import UsblFixes
+from ssm_graph.graph.inertial_rows import InertialRows
+from ssm_graph.imu.preintegration import GRAVITY
+from ssm_graph.sensors.dvl import MOST_BEAMS
+from ssm_graph.sensors.imu import ImuNoise
+from ssm_graph.smoothers.keyframe import Keyframe, Sensors
+from ssm_graph.smoothers.window import BEAMS, Window
+from ssm_graph.smoothers.window_aids import SensorRows
+
+LENGTHS_S: Final = (10.0, 60.0, 240.0)
+"""So long a lane leaves its sensor out; two of each, half of it apart."""
+DVL, DEPTH = "DVL", "depth"
+ACOUSTICS: Final = "acoustic fixes"
+COMPASS: Final = "compass"
+SUSPECT_OF: Final = {
+    BEAMS: DVL,
+    Fixes.name: Fixes.name,
+    UsblFixes.name: ACOUSTICS,
+    Ranges.name: ACOUSTICS,
+    DepthMeans.name: DEPTH,
+    Headings.name: COMPASS,
+    MagneticFields.name: COMPASS,
+}
+"""What is left out together, by the name of the sensor's rows; others are never left out."""
+FIXES: Final = (Fixes.name, ACOUSTICS)
+"""Those that tell where the vehicle is."""
+LASTING: Final = {DVL: 0.5, Fixes.name: 0.02}
+"""Share of a sensor's variance that may last, by suspect: it is a state of every lane."""
+LASTING_OF_OTHERS: Final = 0.25
+LASTING_S: Final = 20.0
+"""Correlation time of what lasts."""
+TURN_S: Final = 10.0
+"""So long a turn goes on, over which the errors of the gyros' scales and axes add up."""
+INSTABILITY: Final = 0.4
+"""Share of their turn-on sigma by which the biases of inertial sensors wander,"""
+INSTABILITY_S: Final = 300.0
+"""within so much: an instability that data sheets state as the floor of the Allan deviation."""
+MISFIT_S: Final = 10.0
+"""A misfit is forgotten within so much."""
+LEAST_WEIGHT: Final = 1e-3
+MEMORY_S: Final = 10.0
+"""Time constant of the low-passed innovation ratios."""
+DOUBT_FACTOR: Final = 2.0
+"""What the window says is doubted by so much where lanes begin with it: it knows nothing of noise
+that lasts."""
+MEASURE: Final = 0
+"""The lane that leaves nothing out."""
+
+
+class Lanes(NamedTuple):
+    """L lanes at a keyframe, n components of state, of S suspects.
+
+    The state is that of the window's keyframes, then what lasts of each component that is measured,
+    in sigmas of its noise.
+    """
+
+    deviation: Array
+    """(L, n) from the newest state of the window, where nothing lasts"""
+    covariance: Array
+    """(L, n, n)"""
+    begun_s: Array
+    """(L,) s; infinite for a lane that is not used"""
+    n_out: Array
+    """(L,) rows left out since"""
+    n_fixes: Array
+    """(L,) rows of fixes that counted since"""
+    evidence: Array
+    """(L,) by how much more than noise the measure's chi-square has grown since than the lane's"""
+    misfit: Array
+    """(L,) by how much more than noise its own chi-square has grown lately"""
+    is_nested: Array
+    """(L,) 1 where the lane and the measure have the same past, else 0"""
+    last_s: Array
+    """(S,) when each suspect was last heard, s"""
+    ratio: Array
+    """(S, 8) low-passed innovations in their sigmas, NaN where there are none"""
+    rate_b: Array
+    """(3,) rad/s, low-passed"""
+
+    def pack(self) -> Iterator[tuple[str, Array]]:
+        """Yield name and array of everything."""
+        yield from self._asdict().items()
+
+    @classmethod
+    def unpack(cls, arrays: Mapping[str, Array]) -> Lanes:
+        """Return the lanes that were packed."""
+        return cls(*(arrays[name] for name in cls._fields))
+
+    def with_copy(self, into: int, of: int) -> Lanes:
+        """Return the lanes with one of them as another one is."""
+        changed: dict[str, Any] = {}
+        for name in _BY_LANE:
+            column = getattr(self, name).copy()
+            column[into] = column[of]
+            changed[name] = column
+        return self._replace(**changed)
+
+
+_BY_LANE: Final = Lanes._fields[: Lanes._fields.index("last_s")]
+
+
+class LaneBank:
+    """Which lanes a vehicle has, and how they go on from keyframe to keyframe."""
+
+    def __init__(self, sensors: Sensors, noise: ImuNoise) -> None:
+        named = [BEAMS, *sensors.aids]
+        self.suspects = tuple(dict.fromkeys(s for n, s in SUSPECT_OF.items() if n in named))
+        """What is left out, each in its turn"""
+        n, each = len(self.suspects), np.repeat(LENGTHS_S, 2)
+        self.suspect = np.concatenate([[-1], np.repeat(np.arange(n), len(each) + 1)])
+        """(L,) which of them each lane leaves out, -1 for none"""
+        self.length_s = np.concatenate([[np.inf], np.tile(np.append(each, np.inf), n)])
+        """(L,) how long; infinite for the measure, and for a lane that is held"""
+        stagger = np.append(np.tile([0.0, 0.5], len(LENGTHS_S)) * each, 0.0)
+        self._stagger_s = np.concatenate([[0.0], np.tile(stagger, n)])
+        self.held = 1 + np.arange(n) * (len(each) + 1) + len(each)
+        """(S,) the lane of each suspect that is led on once it contradicts"""
+        self._fixes = [k for k, name in enumerate(self.suspects) if name in FIXES]
+        self._inertial = InertialRows(sensors.frame, sensors.extras)
+        dims = {BEAMS: sensors.beams.n_beams, **{k: aid.dim for k, aid in sensors.aids.items()}}
+        self._lasting: dict[str, slice] = {}
+        shares, end = [], sensors.state_dim
+        for name, suspect in SUSPECT_OF.items():
+            if name in dims:
+                self._lasting[name] = slice(end, end + dims[name])
+                end += dims[name]
+                shares += [LASTING.get(suspect, LASTING_OF_OTHERS)] * dims[name]
+        self._share = np.array(shares)
+        """Variance of what lasts, in that of the noise"""
+        self._n = sensors.state_dim
+        bias_sigma = np.repeat([noise.accel_bias_sigma, noise.gyro_bias_sigma], 3)
+        self._wander = 2.0 * (INSTABILITY * bias_sigma) ** 2 / INSTABILITY_S
+        self._scale = noise.accel_bias_sigma / GRAVITY
+        """Errors of scales and axes are to gravity as the bias: 50 ppm, 500 ppm, 5000 ppm"""
+
+    def lanes_of(self, suspect: int) -> range:
+        """Return the lanes that leave a suspect out, that which is held last."""
+        held = int(self.held[suspect])
+        return range(held - 2 * len(LENGTHS_S), held + 1)
+
+    def begin(self, window: Window, led_on: Sequence[int] = ()) -> Lanes:
+        """Return the lanes that begin with the newest state of a window.
+
+        ``led_on`` are suspects that are known to contradict.
+        """
+        L, S = len(self.suspect), len(self.suspects)
+        time_s = window.keyframes[-1].time_s
+        covariance = self._beside(window.newest_covariance * DOUBT_FACTOR**2)
+        begun_s = time_s - self._stagger_s
+        begun_s[self.held] = np.inf
+        begun_s[self.held[list(led_on)]] = time_s
+        return Lanes(
+            np.zeros((L, len(covariance))),
+            np.tile(covariance, (L, 1, 1)),
+            begun_s,
+            np.zeros(L),
+            np.zeros(L),
+            np.zeros(L),
+            np.zeros(L),
+            np.ones(L),
+            np.full(S, -np.inf),
+            np.full((S, MOST_BEAMS), np.nan),
+            np.zeros(3),
+        )
+
+    def led_on(self, lanes: Lanes, last: States, keyframe: Keyframe, window: Window) -> Lanes:
+        """Return the lanes at the next keyframe, with which the window is settled.
+
+        ``last`` (1, ...) is the state of the window before it.
+        """
+        lanes = self._predicted(lanes, last, keyframe, window)
+        measured = list(window.newest_rows())
+        if measured:
+            lanes = self._updated(lanes, measured, keyframe.time_s)
+        return self._begun_anew(lanes, keyframe.time_s)
+
+    def after_doubt(self, lanes: Lanes, last: States, keyframe: Keyframe, window: Window) -> Lanes:
+        """Return the lanes at a keyframe where a window was begun anew.
+
+        They are what they were; the measure is what the window says.
+        """
+        lanes = self._predicted(lanes, last, keyframe, window)
+        deviation, covariance = lanes.deviation.copy(), lanes.covariance.copy()
+        deviation[MEASURE] = 0.0
+        covariance[MEASURE] = self._beside(window.newest_covariance)
+        is_nested = np.zeros(len(deviation))
+        is_nested[MEASURE] = 1.0
+        misfit = lanes.misfit.copy()
+        misfit[MEASURE] = 0.0
+        lanes = lanes._replace(
+            deviation=deviation, covariance=covariance, misfit=misfit, is_nested=is_nested
+        )
+        return self._begun_anew(lanes, keyframe.time_s)
+
+    def _beside(self, covariance: Array) -> Array:
+        """Return a covariance (n, n) with that of what lasts beside it."""
+        n, whole = len(covariance), np.diag(np.append(np.zeros(len(covariance)), self._share))
+        whole[:n, :n] = covariance
+        return whole
+
+    def _predicted(self, lanes: Lanes, last: States, keyframe: Keyframe, window: Window) -> Lanes:
+        assert keyframe.inertial is not None
+        interval, now = keyframe.inertial, window.newest_states
+        ahead = self._inertial.predict(interval, last)
+        covariance = ahead.covariance(lanes.covariance)
+        # What the gyros are off in a turn lasts as long as the turn; waves come and go.
+        span_s = float(interval.span_s[0])
+        turn_b = so3.log(interval.delta_R)[0]
+        share = 1.0 - np.exp(-span_s / TURN_S)
+        rate_b = lanes.rate_b + share * (turn_b / span_s - lanes.rate_b)
+        lasting = float(rate_b @ rate_b) * span_s * TURN_S + float(turn_b @ turn_b)
+        turned = np.arange(STATE_DIM)[ROTATION]
+        covariance[:, turned, turned] += self._scale**2 * lasting
+        biases = np.r_[np.arange(STATE_DIM)[ACCEL_BIAS], np.arange(STATE_DIM)[GYRO_BIAS]]
+        covariance[:, biases, biases] += self._wander * span_s
+        n, kept = self._n, np.exp(-span_s / LASTING_S)
+        covariance[:, n:] *= kept
+        covariance[:, :, n:] *= kept
+        own = n + np.arange(len(self._share))
+        covariance[:, own, own] += self._share * (1.0 - kept**2)
+        # From the prediction to where the window is now.
+        off = now.navigation.deviation_of(ahead.states.navigation)[0]
+        off = np.append(off, ahead.states.walks[0] - now.walks[0])
+        moved = off + ahead.deviation(lanes.deviation[:, :n])
+        deviation = np.concatenate([moved, lanes.deviation[:, n:] * kept], axis=1)
+        misfit = lanes.misfit * np.exp(-span_s / MISFIT_S)
+        return lanes._replace(
+            deviation=deviation, covariance=covariance, misfit=misfit, rate_b=rate_b
+        )
+
+    def _updated(self, lanes: Lanes, measured: Sequence[SensorRows], time_s: float) -> Lanes:
+        suspect = [self._number(rows.sensor) for rows in measured]
+        counts = [len(rows.error) for rows in measured]
+        of_row = np.repeat(suspect, counts)
+        H, share = self._rows(measured)
+        weight = np.concatenate([rows.weight for rows in measured])
+        noise = (1.0 - share) / np.clip(weight, LEAST_WEIGHT, 1.0)
+        innovation = -np.concatenate([rows.error for rows in measured]) - lanes.deviation @ H.T
+        lanes = self._with_ratios(lanes, measured, suspect, innovation[MEASURE], H, time_s)
+        counts_in = (of_row != self.suspect[:, None]) | (of_row < 0)
+        H = H * counts_in[..., None]
+        innovation = innovation * counts_in
+        P = lanes.covariance
+        PHt = P @ H.mT
+        S = H @ PHt
+        rows = np.arange(len(of_row))
+        S[:, rows, rows] += noise
+        solved = np.linalg.solve(S, np.concatenate([PHt.mT, innovation[..., None]], axis=2))
+        deviation = lanes.deviation + (PHt @ solved[..., -1:])[..., 0]
+        P = P - PHt @ solved[..., :-1]
+        surplus = np.sum(innovation * solved[..., -1] - counts_in, axis=1)
+        is_fix = np.isin(of_row, self._fixes)
+        return lanes._replace(
+            deviation=deviation,
+            covariance=0.5 * (P + P.mT),
+            n_out=lanes.n_out + np.sum(~counts_in, axis=1),
+            n_fixes=lanes.n_fixes + np.sum(counts_in & is_fix, axis=1),
+            evidence=lanes.evidence + surplus[MEASURE] - surplus,
+            misfit=np.maximum(lanes.misfit + surplus, 0.0),
+        )
+
+    def _number(self, sensor: str) -> int:
+        name = SUSPECT_OF.get(sensor)
+        return -1 if name is None else self.suspects.index(name)
+
+    def _rows(self, measured: Sequence[SensorRows]) -> tuple[Array, Array]:
+        """Return Jacobians (m, n) with those of what lasts, and the share (m,) that may."""
+        blocks, shares = [], []
+        for rows in measured:
+            H, share = np.zeros((len(rows.error), self._n + len(self._share))), 0.0
+            H[:, : self._n] = rows.jacobian
+            if rows.sensor in self._lasting:
+                begin = self._lasting[rows.sensor].start
+                H[np.arange(len(H)), begin + rows.component] = 1.0
+                share = float(self._share[begin - self._n])
+            blocks.append(H)
+            shares.append(np.full(len(H), share))
+        return np.concatenate(blocks), np.concatenate(shares)
+
+    def _with_ratios(
+        self,
+        lanes: Lanes,
+        measured: Sequence[SensorRows],
+        suspect: Sequence[int],
+        innovation: Array,
+        jacobian: Array,
+        time_s: float,
+    ) -> Lanes:
+        """Return the lanes with what is remembered of each sensor; ``innovation`` (m,)."""
+        last_s, ratio, begin = lanes.last_s.copy(), lanes.ratio.copy(), 0
+        spread = np.sum((jacobian @ lanes.covariance[MEASURE]) * jacobian, axis=1)
+        sigmas = np.sqrt(1.0 + spread)
+        for rows, s in zip(measured, suspect, strict=True):
+            end = begin + len(rows.error)
+            own, sigma, at, begin = innovation[begin:end], sigmas[begin:end], rows.component, end
+            if s < 0:
+                continue
+            before = np.nan_to_num(ratio[s, at])
+            share = -np.expm1(-min(time_s - float(last_s[s]), MEMORY_S) / MEMORY_S)
+            ratio[s, at] = before + share * (own / sigma - before)
+            last_s[s] = time_s
+        return lanes._replace(last_s=last_s, ratio=ratio)
+
+    def _begun_anew(self, lanes: Lanes, time_s: float) -> Lanes:
+        """Return the lanes with those begun anew whose time is over."""
+        is_over = time_s - lanes.begun_s > self.length_s
+        if not is_over.any():
+            return lanes
+        deviation, covariance = lanes.deviation.copy(), lanes.covariance.copy()
+        deviation[is_over], covariance[is_over] = deviation[MEASURE], covariance[MEASURE]
+        nothing = {n: np.where(is_over, 0.0, getattr(lanes, n)) for n in _COUNTS}
+        return lanes._replace(
+            deviation=deviation,
+            covariance=covariance,
+            begun_s=np.where(is_over, time_s, lanes.begun_s),
+            is_nested=np.where(is_over, 1.0, lanes.is_nested),
+            **nothing,
+        )
+
+
+_COUNTS: Final = ("n_out", "n_fixes", "evidence", "misfit")

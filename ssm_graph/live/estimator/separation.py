@@ -1,0 +1,319 @@
+"""What the lanes say of the answer: which sensors contradict it, and how far it may be off.
+
+A lane contradicts where its velocity or its position parts from that of the lane with all sensors
+by more than noise would at the stated rate of false alerts. A step shows only while a lane is there
+that began before it; so a contradiction is remembered, and the lane that found it is led on without
+its sensor, until that lane, by what is independent of the sensor, can say that the answer is right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2, norm
+
+from ssm_graph.base.errors import ConfigError
+from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import POSITION, VELOCITY
+from ssm_graph.live.estimator.lanes import DEPTH, DVL, FIXES, LENGTHS_S, MEASURE, LaneBank, Lanes
+
+PARTS: Final = (VELOCITY, POSITION)
+UNITS: Final = ("m/s", "m")
+TEST_S: Final = 1.0
+"""What lanes say changes so slowly that of tests one in so long counts as another one."""
+UNASKED: Final = 0.01
+"""Share of the measure's covariance added to that of a separation: what moves the answer by less
+than a tenth of its own sigma is not asked for."""
+AGREED_S: Final = 10.0
+"""A contradiction ends once the lane that is led on has agreed for so long."""
+CONFIRMED: Final = 1.0 / 3.0
+"""Share of its way at a false velocity by which the measure, held by fixes, parts from a lane."""
+CONFIRMED_S: Final = 40.0
+"""So long a lane without fixes has to go to confirm the DVL."""
+FITS: Final = 0.75
+"""Misfit of the measure, in thresholds, below which it fits all that is measured."""
+WEIGHED_S: Final = 5.0
+"""Evidence is taken while a contradiction is so young."""
+TOGETHER_S: Final = 10.0
+"""Contradictions that begin within so much compete for the blame."""
+RIVAL: Final = 0.5
+"""A sensor that explains so much of what the likeliest one explains is named beside it."""
+NEAR: Final = 25.0
+"""And so is one whose chi-square is within so much."""
+INERTIAL: Final = "the inertial data"
+
+
+@dataclass(frozen=True, slots=True)
+class IntegrityConfig:
+    """How often lanes may be wrong, and what the user asks for."""
+
+    false_alerts_per_h: float = 1e-3
+    """Of all lanes together, while every sensor is as it is stated."""
+    missed_detection: float = 1e-3
+    """Probability that a fault moves the answer out of its protection level unseen."""
+    protection_m: float = np.inf
+    """A health of GOOD asks for a horizontal protection level below this, m."""
+    protection_up_m: float = np.inf
+    """And for a vertical one below this, m."""
+
+    def __post_init__(self) -> None:
+        for name, high in (("false_alerts_per_h", np.inf), ("missed_detection", 0.5)):
+            value = getattr(self, name)
+            if not 0.0 < value < high:
+                raise ConfigError(f"{name}: expected a number in (0, {high}), got {value}")
+        for name in ("protection_m", "protection_up_m"):
+            if not getattr(self, name) > 0.0:
+                raise ConfigError(f"{name}: expected metres above 0, got {getattr(self, name)}")
+
+
+class Contradiction(NamedTuple):
+    """A sensor without which a lane says something else than the answer."""
+
+    suspect: int
+    since_s: float
+    last_s: float
+    """When a lane last said so, s"""
+    part: int
+    """0 in velocity, 1 in position"""
+    size: float
+    """Largest so far, m/s or m"""
+    evidence: float
+    """By how much less of chi-square was left without it while it began"""
+    agreed_s: float
+    """Since when the lane that is led on agrees, s; infinite where it does not"""
+
+
+class Protection(NamedTuple):
+    """Bounds of the position's error under every fault that is not excluded."""
+
+    horizontal: float
+    """m, radius"""
+    up: float
+    """m"""
+
+
+class Separations(NamedTuple):
+    """Of L lanes from the measure, in velocity and in position."""
+
+    test: Array
+    """(L, 2) chi-square of 3 degrees of freedom; zero where a lane has left nothing out"""
+    size: Array
+    """(L, 2) m/s and m"""
+    sigma: Array
+    """(L, 2) in the most uncertain direction"""
+
+
+class Judge:
+    """Thresholds of a bank of lanes, and what is made of them."""
+
+    def __init__(self, bank: LaneBank, config: IntegrityConfig) -> None:
+        self._bank, self.config = bank, config
+        n_tests = 3600.0 / TEST_S * len(PARTS) * (len(bank.suspect) - 1)
+        self.threshold = float(chi2.isf(config.false_alerts_per_h / n_tests, 3))
+        """Of the chi-square of a separation"""
+        self._radius = float(np.sqrt(chi2.isf(config.missed_detection, 2)))
+        self._side = float(norm.isf(0.5 * config.missed_detection))
+
+    @property
+    def detectable(self) -> float:
+        """Sigmas of a separation by which a fault has to move it to be seen for certain."""
+        return float(np.sqrt(self.threshold)) + self._side
+
+    def separations(self, lanes: Lanes) -> Separations:
+        """Return how far lanes are from the measure."""
+        L = len(lanes.deviation)
+        test, size, sigma = (np.zeros((L, len(PARTS))) for _ in range(3))
+        sign = np.where(lanes.is_nested > 0.0, -1.0, 1.0)[:, None, None]
+        for k, part in enumerate(PARTS):
+            of_measure = lanes.covariance[MEASURE, part, part]
+            D = lanes.covariance[:, part, part] + (sign + UNASKED) * of_measure
+            D[MEASURE] = of_measure
+            off = lanes.deviation[:, part] - lanes.deviation[MEASURE, part]
+            test[:, k] = np.sum(off * np.linalg.solve(D, off[..., None])[..., 0], axis=1)
+            size[:, k] = np.linalg.norm(off, axis=1)
+            sigma[:, k] = np.sqrt(np.linalg.eigvalsh(D)[:, -1])
+        test[(lanes.n_out == 0.0) | ~np.isfinite(lanes.begun_s) | self.is_refuted(lanes)] = 0.0
+        return Separations(test, size, sigma)
+
+    def is_refuted(self, lanes: Lanes) -> NDArray[np.bool_]:
+        """Return (L,) whether a lane is contradicted by its own sensors, which the measure fits.
+
+        Such a lane accuses nobody: what is wrong is in what it began with, or in the inertial data.
+        """
+        fits = lanes.misfit[MEASURE] < FITS * self.threshold
+        return np.asarray(fits & (lanes.misfit > self.threshold))
+
+    def judged(
+        self,
+        lanes: Lanes,
+        found: Separations,
+        known: tuple[Contradiction, ...],
+        time_s: float,
+    ) -> tuple[Lanes, tuple[Contradiction, ...]]:
+        """Return the contradictions after one more keyframe, and the lanes with those led on."""
+        kept = {one.suspect: one for one in known}
+        for suspect in range(len(self._bank.suspects)):
+            own = self._bank.lanes_of(suspect)
+            test = found.test[own.start : own.stop]
+            row, part = (int(i) for i in np.unravel_index(np.argmax(test), test.shape))
+            lane, held = own.start + row, int(self._bank.held[suspect])
+            if test[row, part] > self.threshold:
+                before = kept.get(suspect)
+                if lane != held:
+                    lanes = lanes.with_copy(held, lane)
+                size = float(found.size[lane, part])
+                if before is None:
+                    before = Contradiction(suspect, time_s, time_s, part, size, -np.inf, np.inf)
+                largest = max(before.size, float(found.size[lane, before.part]))
+                kept[suspect] = before._replace(last_s=time_s, size=largest, agreed_s=np.inf)
+            elif suspect in kept:
+                still = self._still(kept[suspect], lanes, found, time_s)
+                if still is None:
+                    del kept[suspect]
+                    begun_s = lanes.begun_s.copy()
+                    begun_s[held] = np.inf
+                    lanes = lanes._replace(begun_s=begun_s)
+                else:
+                    kept[suspect] = still
+        return lanes, tuple(self._weighed(one, lanes, time_s) for one in kept.values())
+
+    def _weighed(self, one: Contradiction, lanes: Lanes, time_s: float) -> Contradiction:
+        """Return a contradiction with the evidence of its first seconds."""
+        if time_s - one.since_s > WEIGHED_S:
+            return one
+        return one._replace(evidence=max(one.evidence, self._evidence(lanes, one.suspect)))
+
+    def _still(
+        self, was: Contradiction, lanes: Lanes, found: Separations, time_s: float
+    ) -> Contradiction | None:
+        """Return a contradiction while nothing can rule it out; None once something has."""
+        own = int(self._bank.held[was.suspect]), was.part
+        if self.is_refuted(lanes)[own[0]]:
+            return None
+        is_out = bool(found.size[own] + self.detectable * found.sigma[own] <= was.size)
+        if self._bank.suspects[was.suspect] == DVL and was.part == 0:
+            is_out |= self._is_confirmed(was, lanes, found, time_s)
+        agreed_s = min(was.agreed_s, time_s) if is_out else np.inf
+        return None if time_s - agreed_s > AGREED_S else was._replace(agreed_s=agreed_s)
+
+    def _is_confirmed(
+        self, was: Contradiction, lanes: Lanes, found: Separations, time_s: float
+    ) -> bool:
+        """Return whether fixes have shown since that the DVL leads to where the vehicle is.
+
+        A lane without fixes, begun since, would be off by the velocity that was found times its
+        age, and what has all sensors by a good part of that.
+        """
+        for suspect, name in enumerate(self._bank.suspects):
+            if name not in FIXES:
+                continue
+            own = self._bank.lanes_of(suspect)
+            if found.test[own.start : own.stop].max() > self.threshold:
+                return False
+            for lane in own[:-1]:
+                age_s = time_s - lanes.begun_s[lane]
+                is_since = lanes.begun_s[lane] > was.last_s and lanes.n_out[lane] > 0.0
+                seen = self.detectable * found.sigma[lane, 1] <= CONFIRMED * was.size * age_s
+                if is_since and age_s > CONFIRMED_S and seen:
+                    return True
+        return False
+
+    def _evidence(self, lanes: Lanes, suspect: int) -> float:
+        """Return what speaks for a suspect, by its oldest lane: those of all began together."""
+        own = self._bank.lanes_of(suspect)[:-1]
+        return float(lanes.evidence[own[int(np.argmin(lanes.begun_s[own.start : own.stop]))]])
+
+    def blamed(self, known: tuple[Contradiction, ...]) -> list[Contradiction]:
+        """Return those without which what the others say fits, the clearest first.
+
+        What contradicts long after the first one does so since the answer has followed that.
+        """
+        first_s = min((one.since_s for one in known), default=0.0)
+        rest = [one for one in known if one.since_s - first_s < TOGETHER_S]
+        order = sorted(rest, key=lambda one: -one.evidence)
+        best = order[0].evidence if order else 0.0
+        least = min(RIVAL * best, best - NEAR)
+        return [one for one in order if one.evidence >= least]
+
+    def sentence(self, lanes: Lanes, known: tuple[Contradiction, ...]) -> str:
+        """Say which sensors contradict the answer; an empty text where none does."""
+        blamed = self.blamed(known)
+        if not blamed:
+            return ""
+        names, first = self._bank.suspects, blamed[0]
+        said = [names[one.suspect] for one in blamed]
+        has_fixes = lanes.n_fixes[self._bank.held[blamed[0].suspect]] > 0.0
+        if DVL in said and not (has_fixes and len(known) == 1):
+            said.append(INERTIAL)
+        return (
+            f"{' or '.join(said)}: without {names[first.suspect]} the "
+            f"{('velocity', 'position')[first.part]} has been another by {first.size:.2g} "
+            f"{UNITS[first.part]} since {first.since_s:.0f} s, and nothing independent has shown "
+            "since that the answer is right"
+        )
+
+    def protection(
+        self, lanes: Lanes, found: Separations, R_up: Array, *, time_s: float, fixed_s: float
+    ) -> Protection:
+        """Return the protection level of the window's answer.
+
+        ``found`` are the separations of those that are not led on; ``R_up`` (3, 3) turns position
+        in body axes to east, north, up; ``fixed_s`` is when the position was last known by itself,
+        s: by a fix, or where all began.
+        """
+        off = np.abs(lanes.deviation[:, POSITION] @ R_up.T)
+        P = R_up @ lanes.covariance[:, POSITION, POSITION] @ R_up.T
+        level = np.sqrt(np.linalg.eigvalsh(P[:, :2, :2])[:, -1])
+        bound = np.stack(
+            [
+                np.linalg.norm(off[:, :2], axis=1) + self._radius * level,
+                off[:, 2] + self._side * np.sqrt(P[:, 2, 2]),
+            ],
+            axis=1,
+        )
+        worst = bound[MEASURE].copy()
+        for suspect, name in enumerate(self._bank.suspects):
+            own, held = self._bank.lanes_of(suspect), int(self._bank.held[suspect])
+            if np.isfinite(lanes.begun_s[held]):
+                worst = np.maximum(worst, bound[held])
+            lane = np.array([i for i in own if i != held and lanes.n_out[i] > 0.0], dtype=np.intp)
+            if len(lane) == 0:
+                continue
+            age_s = time_s - lanes.begun_s[lane]
+            if name == DVL:
+                step = self.detectable * float(np.min(found.sigma[lane, 0]))
+                grown = bound[MEASURE] + step * age_s[:, None]
+                older = bound[MEASURE] + step * (time_s - fixed_s) * np.array([1.0, 0.0])
+                if time_s - fixed_s > LENGTHS_S[-1]:
+                    worst = np.maximum(worst, older)
+            else:
+                step = self.detectable * float(np.min(found.sigma[lane, 1]))
+                axis = np.array([0.0, 1.0]) if name == DEPTH else np.ones(2)
+                grown = np.tile(bound[MEASURE] + step * axis, (len(lane), 1))
+                worst = np.maximum(worst, grown[0])
+            worst = np.maximum(worst, np.min([bound[lane], grown], axis=0).max(axis=0))
+        return Protection(*worst.tolist())
+
+
+def pack_contradictions(known: tuple[Contradiction, ...], names: tuple[str, ...]) -> list[Any]:
+    """Return contradictions as plain values, with the names of the sensors."""
+    return [
+        {**one._asdict(), "suspect": names[one.suspect], "agreed_s": str(one.agreed_s)}
+        for one in known
+    ]
+
+
+def unpack_contradictions(
+    packed: Sequence[Mapping[str, Any]], names: tuple[str, ...]
+) -> tuple[Contradiction, ...]:
+    """Return the contradictions that were packed."""
+    return tuple(
+        Contradiction(
+            **{**one, "suspect": names.index(one["suspect"]), "agreed_s": float(one["agreed_s"])}
+        )
+        for one in packed
+    )

@@ -1,0 +1,1 @@
+"""Clocks, units and axes that a mission's own logs contradict."""
