@@ -10,7 +10,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 .PHONY: demo test test-slow test-benchmarks format check clean
 
 demo: $(VENV)/.installed  ## simulate the default mission with failing beams, smooth it, show table and figure
-	$(BIN)/ssm-graph simulate demo --out $(OUT)/demo/mission
+	$(BIN)/ssm-graph simulate demo --overwrite --out $(OUT)/demo/mission
 	$(BIN)/ssm-graph smooth $(OUT)/demo/mission --out $(OUT)/demo/result
 	@echo "figure: $(OUT)/demo/result/figure.png"
 

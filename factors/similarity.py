@@ -17,7 +17,7 @@ import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
 from enum import Enum
-from typing import ClassVar, final
+from typing import ClassVar, Final, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -89,10 +89,18 @@ class Kernel(ABC):
         return self._weight(np.asarray(t, dtype=np.float64), dim)
 
 
+LARGEST_PARAMETER: Final = 1e15
+
+
 def require_positive(name: str, value: float) -> None:
-    """Raise ValueError for a parameter that is no finite number above zero."""
+    """Raise ValueError for a parameter that is no number above zero, or whose square is none."""
     if not (math.isfinite(value) and value > 0.0):
         raise ValueError(f"{name}: expected a number above zero, got {value}")
+    if not 1.0 / LARGEST_PARAMETER <= value <= LARGEST_PARAMETER:
+        raise ValueError(
+            f"{name}: expected a number from {1.0 / LARGEST_PARAMETER:g} to "
+            f"{LARGEST_PARAMETER:g}, got {value:g}; beyond it nothing changes any more"
+        )
 
 
 @final

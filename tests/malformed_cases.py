@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -68,6 +69,22 @@ def without_first_beam(row: str) -> str:
 TOML_CASES = cases(
     ConfigError,
     {
+        "A pipe in the place of mission.toml": (
+            both(remove("mission.toml"), lambda folder: os.mkfifo(folder / "mission.toml")),
+            "mission.toml | expected a file",
+        ),
+        "Sections 50 000 deep": (
+            raw("mission.toml", lambda content: b"a." * 50_000 + b"a = 1\n" + content),
+            "mission.toml:1: expected at most 500 dots",
+        ),
+        "A settings file of 2 MB": (
+            raw("mission.toml", lambda content: content + b"#" * 2**21),
+            "mission.toml: expected at most 1048576 bytes | another file",
+        ),
+        "A sigma whose square is zero": (
+            toml("beam_noise_m_per_s = 0.005", "beam_noise_m_per_s = 1e-300"),
+            "mission.toml [dvl] beam_noise_m_per_s | 1e-300",
+        ),
         "No mission.toml": (remove("mission.toml"), "there is none in"),
         "Not valid TOML": (
             toml('name = "straight-run"', "name = straight-run"),
@@ -298,6 +315,13 @@ TABLE_CASES = cases(
             columns("imu.csv", ["time_s"], lambda t: np.round(t, 1)),
             "imu.csv:5 | time_s repeats | more digits",
         ),
+        "A clock that was begun anew amid a table (order of arrival)": (
+            both(
+                toml("format = 1", 'format = 1\norder = "arrival"'),
+                lines("imu.csv", lambda rows: [*rows, *rows[1:301]]),
+            ),
+            "imu.csv:1202 | falls from | two missions",
+        ),
         "Most rows partly written, where single ones may be (order of arrival)": (
             both(
                 toml("format = 1", 'format = 1\norder = "arrival"'),
@@ -311,7 +335,7 @@ TABLE_CASES = cases(
         ),
         "A Parquet table cut off": (
             parquet(raw("imu.parquet", lambda content: content[:5000])),
-            "imu.parquet | expected a Parquet table | cut off",
+            "imu.parquet | expected a Parquet table | magic bytes",
         ),
         "CSV under the name of Parquet": (
             parquet(raw("dvl.parquet", lambda _: b"time_s,beam1_m_per_s\n0.0,1.0\n")),

@@ -6,9 +6,11 @@ One declaration checks a section, builds a frozen value of it, and writes the se
 from __future__ import annotations
 
 import math
+import stat
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, fields
 from enum import Enum
+from pathlib import Path
 from typing import Any, Final, TypeVar, cast, get_type_hints
 
 import numpy as np
@@ -19,6 +21,11 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.base.units import in_unit, wrapped
 
 _SHOWN: Final = 60
+MOST_BYTES: Final = 2**20
+MOST_DOTS: Final = 500
+LEAST_SIZE: Final = 1e-12
+"""Smallest size that is not zero, in the unit of its key, whatever that is: less is a slip, and
+what is divided by its square overflows."""
 _Kind = TypeVar("_Kind")
 _Choice = TypeVar("_Choice", bound=Enum)
 
@@ -73,6 +80,8 @@ class Key:
         if numbers is None or not all(math.isfinite(number) for number in numbers):
             return "type"
         low_ok = all(x > 0.0 for x in numbers) if self.positive else min(numbers) >= self.low
+        if self.positive or self.low == 0.0:  # its square has to be told from zero
+            low_ok = low_ok and not any(0.0 < x < LEAST_SIZE for x in numbers)
         return "" if low_ok and max(numbers) <= self.high else "range"
 
 
@@ -271,6 +280,31 @@ def shown(value: object) -> str:
     except ValueError:  # an integer of more than 4300 digits
         text = "a number of very many digits"
     return text if len(text) <= _SHOWN else text[:_SHOWN] + "..."
+
+
+def read_settings_file(path: Path) -> bytes:
+    """Return the bytes of a file that people write; what would take for ever to read is refused.
+
+    Raises :class:`ConfigError` for a pipe, a folder, a file of more than :data:`MOST_BYTES`, and a
+    line of more than :data:`MOST_DOTS` dots, whose keys are as many sections within each other.
+    Raises :class:`OSError` where it cannot be read.
+    """
+    found = path.stat()
+    if not stat.S_ISREG(found.st_mode):
+        raise ConfigError(f"{path.name}: expected a file, got {str(path)!r}, which is none")
+    if found.st_size > MOST_BYTES:
+        raise ConfigError(
+            f"{path.name}: expected at most {MOST_BYTES} bytes of settings, got {found.st_size}; "
+            "is it another file?"
+        )
+    content = path.read_bytes()
+    for number, line in enumerate(content.split(b"\n"), 1):
+        if line.count(b".") > MOST_DOTS:
+            raise ConfigError(
+                f"{path.name}:{number}: expected at most {MOST_DOTS} dots in a line, got "
+                f"{line.count(b'.')}; write lists of numbers on several lines"
+            )
+    return content
 
 
 def _plain(value: Any) -> Any:

@@ -24,6 +24,8 @@ from ssm_graph.cli.options import (
     table_format_option,
 )
 from ssm_graph.evaluation.comparison import compare_methods
+from ssm_graph.io.results.place import check_result_place
+from ssm_graph.io.tables.append_file import write_through
 from ssm_graph.io.tables.files import TableFormat, pyarrow_module
 from ssm_graph.report.comparison.tables import latex, markdown
 from ssm_graph.study.jobs import DaskCluster, Execute, JobProcesses
@@ -83,6 +85,9 @@ study file (TOML):
 """
 
 
+FIGURES_NAME: Final = "figures"
+
+
 def add_parser(commands: Any, *, epilog: str) -> None:
     """Declare the command and its options."""
     parser = add_command(
@@ -122,8 +127,11 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     """Run what is missing, then write table, summaries and figures."""
     if arguments.format is TableFormat.PARQUET:
         pyarrow_module("pyarrow")
+    check_result_place(arguments.out)
     study, execute = study_from(arguments), execute_from(arguments)
     store = open_store(study, arguments.out, fresh=arguments.fresh)
+    for note in store.notes:
+        say(errors, f"note: {note}")
     if len(store) > 0:
         errors.print(f"going on: {len(store)} runs are done already", highlight=False)
     try:
@@ -140,7 +148,7 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     command = shlex.join(["ssm-graph", *sys.argv[1:]])
     text = write_study(arguments.out, study, result, arguments.format, command=command)
     if not arguments.no_figures:
-        _write_figures(arguments.out / "figures", study, result, errors)
+        _write_figures(arguments.out / FIGURES_NAME, study, result, errors)
     headline = text.partition("\n## Every cell")[0]
     say(console, headline)
     say(
@@ -178,14 +186,28 @@ def execute_from(arguments: argparse.Namespace) -> Execute:
 def write_study(
     folder: Path, study: Study, result: StudyResult, form: TableFormat, *, command: str
 ) -> str:
-    """Write the table and both summaries; return the summary for the terminal."""
-    write_rows(folder / f"table{form.value}", result.rows)
+    """Write the table and both summaries, one set; return the summary for the terminal.
+
+    Figures and tables of an earlier state of the study go first.
+    """
     comparison = compare_methods(result.rows, baseline=study.baseline)
     text = markdown(comparison, title=f"Study: {study.name}", command=command, code=result.code)
-    (folder / "summary.md").write_text(text, encoding="utf-8")
     caption = f"Study {study.name}: {command}; ssm-graph {result.code}"
     table = latex(comparison, caption=caption, label=f"tab:{study.name}")
-    (folder / "summary.tex").write_text(table, encoding="utf-8")
+    names = (f"table{form.value}", "summary.tex", "summary.md")
+    parts = {name: folder / f".part-{name}" for name in names}
+    try:
+        write_rows(parts[names[0]], result.rows)
+        write_through(parts[names[1]], table.encode())
+        write_through(parts[names[2]], text.encode())
+        old = [folder / names[2], *(folder / f"table{one.value}" for one in TableFormat)]
+        for path in (*old, *(folder / FIGURES_NAME).glob("*.png")):
+            path.unlink(missing_ok=True)
+        for name, part in parts.items():
+            part.replace(folder / name)
+    finally:
+        for part in parts.values():
+            part.unlink(missing_ok=True)
     return text
 
 

@@ -17,6 +17,7 @@ from ssm_graph.io.blueye.convert import convert_blueye
 from ssm_graph.io.file_kind import is_mcap, kind_of
 from ssm_graph.io.mission_folder.folder import write_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle
+from ssm_graph.io.results.place import check_is_free
 from ssm_graph.io.ros.convert import convert_rosbag
 from ssm_graph.io.ros.log import ROLES, is_rosbag
 from ssm_graph.io.ros.messages import SEA_WATER, STANDARD_ATMOSPHERE, BeamSign, RosOptions
@@ -101,6 +102,9 @@ ROS_OPTIONS = (
 
 def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
     """Convert and write."""
+    check_is_free(arguments.out, may_overwrite=arguments.overwrite)
+    if arguments.log.exists() and arguments.out.resolve() == arguments.log.resolve():
+        raise ConfigError(f"--out: expected another folder than that of LOG, got {arguments.out}")
     if is_rosbag(arguments.log):
         return _write(_from_rosbag(arguments), arguments, console)
     given = [name for name in ROS_OPTIONS if getattr(arguments, name) is not None]

@@ -8,8 +8,7 @@ from collections.abc import Sequence
 from enum import IntEnum
 from importlib.metadata import version
 
-from rich.console import Console
-from rich.markup import escape
+from rich.text import Text
 
 from ssm_graph.base.errors import (
     ConfigError,
@@ -20,6 +19,8 @@ from ssm_graph.base.errors import (
 )
 from ssm_graph.cli import compare, convert, online, simulate, smooth
 from ssm_graph.cli import filter as filter_command
+from ssm_graph.cli.options import say
+from ssm_graph.cli.terminal import console_on, interrupt, occupy_closed_streams, signals_to
 
 
 class ExitCode(IntEnum):
@@ -48,7 +49,8 @@ exit codes:
   5    smooth found no finite result, nothing is written; online: there never was an answer, what
        came is logged
   130  interrupted, nothing written; compare keeps finished runs and goes on when started again, and
-       so does online; it ends in order at the first SIGINT or SIGTERM, like this at the second
+       so does online; it ends in order at the first SIGINT, SIGTERM or SIGHUP, like this at a
+       second SIGINT or SIGTERM
 """
 
 EXIT_CODES: tuple[tuple[type[SsmGraphError], ExitCode], ...] = (
@@ -77,17 +79,30 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(words: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
+    occupy_closed_streams()
     arguments = build_parser().parse_args(words)
-    console, errors = Console(), Console(stderr=True)
+    console, errors = console_on(sys.stdout), console_on(sys.stderr, is_stderr=True)
     try:
-        is_good = arguments.run(arguments, console, errors)
+        with signals_to(interrupt):
+            is_good = arguments.run(arguments, console, errors)
+        code = ExitCode.GOOD if is_good else ExitCode.NOT_GOOD
     except SsmGraphError as error:
-        errors.print(f"[bold red]error:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
-        return next(code for kind, code in EXIT_CODES if isinstance(error, kind))
+        errors.print(Text.assemble(("error:", "bold red"), f" {error}"), soft_wrap=True)
+        code = next(code for kind, code in EXIT_CODES if isinstance(error, kind))
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        say(errors, f"error: {where}{error.strerror or error}")
+        code = ExitCode.DATA
+    except MemoryError as error:
+        say(errors, f"error: out of memory: {str(error) or 'for what was asked for'}")
+        code = ExitCode.DATA
     except KeyboardInterrupt:
         errors.print("interrupted")
-        return ExitCode.INTERRUPTED
-    return ExitCode.GOOD if is_good else ExitCode.NOT_GOOD
+        code = ExitCode.INTERRUPTED
+    failure = getattr(console.file, "failure", None)
+    if failure is not None:
+        say(errors, f"standard output: {failure}; files are not concerned")
+    return code
 
 
 if __name__ == "__main__":

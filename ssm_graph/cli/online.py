@@ -7,7 +7,7 @@ import contextlib
 import gc
 import math
 import signal
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final
@@ -26,6 +26,7 @@ from ssm_graph.cli.options import (
     number_option,
     say,
 )
+from ssm_graph.cli.terminal import signals_to
 from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle, vehicle_of
 from ssm_graph.io.raw_log.rows import messages_of
@@ -52,7 +53,7 @@ from ssm_graph.smoothers.window import FixedLagConfig
 DESCRIPTION: Final = """\
 Navigate live: messages of the instruments in, position, velocity and attitude with their sigmas
 out. Everything that comes is logged before it is used; started again with the same RUN after a
-crash or a power cut it goes on where it was. SIGINT or SIGTERM ends it in order.
+crash or a power cut it goes on where it was. SIGINT, SIGTERM or SIGHUP ends it in order.
 
 What VEHICLE gives prior sigmas for, a drift, and the current of its [current] are estimated along:
 values with sigmas on the page and in RUN/summary.json.
@@ -75,7 +76,6 @@ _INPUTS: Final = {
     "messages": "any messages, JSON lines",
 }
 MAX_RATE: Final = "inertial samples/s of one source, of other kinds a tenth; more are left out"
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 def add_parser(commands: Any, *, epilog: str) -> None:
@@ -131,7 +131,7 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
             config=config,
             on_status=show,
         )
-        stack.enter_context(_stopped_by_signals(runner.stop))
+        stack.enter_context(signals_to(_stopping(runner.stop)))
         pass_over_imports()
         end = runner.run()
     return _report(end, arguments.out, console)
@@ -211,24 +211,21 @@ def _connector(
     return connect
 
 
-@contextlib.contextmanager
-def _stopped_by_signals(stop: Callable[[], None]) -> Iterator[None]:
-    """Stop at the first SIGINT or SIGTERM; the second one interrupts at once."""
-    asked = False
+def _stopping(stop: Callable[[], None]) -> Callable[..., None]:
+    """Return what stops at the first signal; a second SIGINT or SIGTERM interrupts at once.
 
-    def on_signal(*_: object) -> None:
-        nonlocal asked
-        if asked:
+    A terminal that is closed sends SIGHUP more than once, and a service manager after SIGTERM.
+    """
+    n_asked = 0
+
+    def on_signal(number: int, *_: object) -> None:
+        nonlocal n_asked
+        if n_asked and number in (signal.SIGINT, signal.SIGTERM):
             raise KeyboardInterrupt
-        asked = True
+        n_asked += 1
         stop()
 
-    before = {number: signal.signal(number, on_signal) for number in _SIGNALS}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    return on_signal
 
 
 def _report(end: RunEnd, folder: Path, console: Console) -> bool:
@@ -244,6 +241,8 @@ def _report(end: RunEnd, folder: Path, console: Console) -> bool:
     say(console, text)
     if end.found.calibration is not None:
         console.print(calibration_table(end.found.calibration))
+    for note in end.notes:
+        say(console, f"note: {note}")
     say(console, f"results in {folder}")
     return end.navigation.health is Health.GOOD and end.reason is not StopReason.FAILED
 

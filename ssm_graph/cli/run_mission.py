@@ -15,6 +15,7 @@ from ssm_graph.cli.options import number_option, say
 from ssm_graph.evaluation.errors import Metrics, evaluate, reference_from_gnss, withhold_gnss
 from ssm_graph.io.mission_folder.folder import CALIBRATION_NAME, read_mission
 from ssm_graph.io.mission_folder.toml import read_mission_toml
+from ssm_graph.io.results.place import check_result_place
 from ssm_graph.io.results.tables import write_results
 from ssm_graph.mission.estimate import Estimate
 from ssm_graph.mission.mission import Mission, Reference
@@ -54,9 +55,11 @@ def run_mission(
     The settings are those of the estimator, for ``summary.json``.
     """
     graph = ProblemConfig(arguments.merge_rate, arguments.keyframe_interval)
+    check_result_place(arguments.out)
     with ProgressDisplay(errors) as show:
         show.stage("reading the mission")
         mission = read_mission(arguments.mission)
+        axes = read_mission_toml(arguments.mission).body
         withheld: GnssLog | None = None
         if arguments.gnss_until is not None:
             try:
@@ -66,6 +69,10 @@ def run_mission(
         estimate = solve(mission, graph, show)
         show.stage("writing results")
         estimate, reference, metrics = _compare(estimate, mission, withheld)
+
+        def draw(path: Path) -> None:
+            save_figure(path, estimate, reference, title=mission.name)
+
         write_results(
             arguments.out,
             estimate,
@@ -77,10 +84,9 @@ def run_mission(
                 "keyframe_interval_s": graph.keyframe_interval_s,
                 "gnss_until_s": arguments.gnss_until,
             },
-            axes=read_mission_toml(arguments.mission).body,
+            axes=axes,
+            draw=None if arguments.no_figure else draw,
         )
-        if not arguments.no_figure:
-            save_figure(arguments.out / "figure.png", estimate, reference, title=mission.name)
     console.print(summary_table(estimate, metrics))
     say(console, f"results in {arguments.out}")
     if estimate.calibration is not None:

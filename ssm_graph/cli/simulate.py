@@ -12,6 +12,7 @@ from rich.console import Console
 from ssm_graph.base.frozen import Array
 from ssm_graph.cli.options import add_command, add_mission_output, choice_option, say
 from ssm_graph.io.mission_folder.folder import write_mission
+from ssm_graph.io.results.place import check_is_free
 from ssm_graph.sensors.dvl import MOST_BEAMS
 from ssm_graph.simulation import (
     SCENARIOS,
@@ -70,6 +71,7 @@ def add_parser(commands: Any, *, epilog: str) -> None:
 
 def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
     """Simulate and write."""
+    check_is_free(arguments.out, may_overwrite=arguments.overwrite)
     usual = scenario_config(arguments.scenario)
     told: dict[str, Any] = {
         "seed": arguments.seed,

@@ -40,6 +40,7 @@ from ssm_graph.sensors.dvl_readings import stuck_beams
 from ssm_graph.sensors.frozen import frozen_runs
 from ssm_graph.sensors.imu import ImuLog, frozen_axes
 
+SHORTEST_INTERVAL_S = 0.01
 NO_EXTRAS = Extras()
 A = TypeVar("A", bound=Aid)
 
@@ -58,6 +59,12 @@ class ProblemConfig:
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0.0):
                 raise ConfigError(f"{name}: expected a number above zero, got {value}")
+        if self.keyframe_interval_s < SHORTEST_INTERVAL_S:
+            raise ConfigError(
+                f"keyframe_interval_s: expected {SHORTEST_INTERVAL_S:g} s or more, got "
+                f"{self.keyframe_interval_s:g}; no more keyframes are needed than there are "
+                "inertial samples"
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -37,7 +37,7 @@ class SourceStatus:
     n_messages: int = 0
     """Passed on."""
     n_refused: int = 0
-    """By the decoder."""
+    """By the decoder, or for another clock."""
     n_limited: int = 0
     """Above the message rate, left out."""
     n_reconnects: int = 0

@@ -11,11 +11,13 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis, XAxis
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
+from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 from numpy.typing import NDArray
 
@@ -225,10 +227,14 @@ def time_axis(time_s: Array) -> tuple[float, str]:
 
 
 def save(figure: Figure, path: Path, *, dpi: int | None = None) -> Path:
-    """Write a figure, whole or not at all, and return its path."""
+    """Write a figure, whole or not at all, and return its path; a ``$`` in a name is a ``$``."""
     part = path.with_name(f".{path.stem}.part-{os.getpid()}{path.suffix}")
+    for text in figure.findobj(Text):
+        assert isinstance(text, Text)
+        text.set_parse_math(False)
     try:
-        figure.savefig(part, dpi=dpi or DPI)
+        with rc_context({"text.parse_math": False}):  # of ticks that are made while drawing
+            figure.savefig(part, dpi=dpi or DPI)
         part.replace(path)
     except OSError as error:
         raise DataError(f"{path}: cannot write the figure: {error.strerror or error}") from error
@@ -346,9 +352,12 @@ def log_ticks(axis: Axis, low: float, high: float) -> None:
         axis.set_minor_locator(NullLocator())
 
 
+_RAISED: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
 def _plain(value: float, _position: object) -> str:
     if 1e-3 <= value < 1e5:
         return f"{value:g}"
     mantissa, exponent = f"{value:.0e}".split("e")
-    factor = "" if mantissa == "1" else f"{mantissa}\\cdot"
-    return f"${factor}10^{{{int(exponent)}}}$"
+    factor = "" if mantissa == "1" else f"{mantissa}·"
+    return f"{factor}10{str(int(exponent)).translate(_RAISED)}"

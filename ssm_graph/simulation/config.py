@@ -41,6 +41,8 @@ from ssm_graph.simulation.routes import (
 )
 from ssm_graph.simulation.trajectory import Trajectory, Waves
 
+MOST_SAMPLES: Final = 2e8
+"""Of an inertial log; more are 10 GB."""
 _IMU_RATE = checked.Rule(lambda rate: 10.0 <= rate <= 10_000.0, "10 to 10000 Hz", "try 100 Hz")
 _SEED = checked.Rule(
     lambda seed: isinstance(seed, (int, np.integer)) and bool(seed >= 0),
@@ -111,6 +113,13 @@ class SimulationConfig(checked.Settings):
             expected="at least one IMU sample",
             got=self.duration_s,
             hint="make the mission longer",
+        )
+        checked.require(
+            self.duration_s * self.imu_rate_hz <= MOST_SAMPLES,
+            "SimulationConfig.duration_s",
+            expected=f"at most {MOST_SAMPLES:g} IMU samples",
+            got=self.duration_s,
+            hint="make the mission shorter, or lower the rate",
         )
         named = [("Outliers.beam", self.outliers.beams)]
         named += [("Fault.beams", fault.beams) for fault in self.faults]

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from ssm_graph.base.errors import ConfigError, DataError, nearest_hint
+from ssm_graph.base.settings import read_settings_file
 from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.simulation import (
     SCENARIOS,
@@ -91,7 +92,7 @@ def read_study(path: Path) -> Study:
     Raises :class:`ConfigError`, naming file, table and key.
     """
     try:
-        raw = tomllib.loads(path.read_bytes().decode("utf-8-sig"))
+        raw = tomllib.loads(read_settings_file(path).decode("utf-8-sig"))
     except OSError as error:
         raise ConfigError(
             f"{path}: cannot be read ({error.strerror or error}); expected a study file"

@@ -6,17 +6,21 @@ One JSON line for every finished run, errors over time beside them, and one tabl
 from __future__ import annotations
 
 import csv
+import io
 import json
 import math
 import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.settings import shown
+from ssm_graph.io.tables.append_file import sync_path, write_through
 from ssm_graph.io.tables.files import TableFormat, pyarrow_module
 from ssm_graph.study.cells import digest
 from ssm_graph.study.jobs import JobResult, RunKey
@@ -24,6 +28,10 @@ from ssm_graph.study.scoring import COLUMNS, COUNT_COLUMNS, LOST, SERIES_STEP_S,
 
 RUNS_NAME: Final = "runs.jsonl"
 SERIES_NAME: Final = "series"
+DAMAGED_NAME: Final = "runs.damaged.jsonl"
+"""The whole file as it was found, where lines of it were damaged."""
+LARGEST: Final = 1e300
+"""No number of a run is larger."""
 
 
 class Series(NamedTuple):
@@ -45,8 +53,9 @@ class StudyStore:
     def __init__(self, folder: Path, settings: dict[str, Any], *, fresh: bool = False) -> None:
         """Open or create the files.
 
-        Raises :class:`ConfigError`: the files were made with other settings. Raises
-        :class:`DataError`: A line other than the last cannot be read.
+        What is damaged is named in :attr:`notes`, kept beside under another name, and counts as
+        not done. Raises :class:`ConfigError`: the files were made with other settings, or the line
+        that says with which is damaged.
 
         Parameters
         ----------
@@ -57,6 +66,8 @@ class StudyStore:
         self.folder = folder
         self.path = folder / RUNS_NAME
         self.settings = settings
+        self.notes: tuple[str, ...] = ()
+        """What was damaged, one sentence each."""
         self._rows: dict[RunKey, Row] = {}
         try:
             if fresh or not self.path.exists() or not self._load():
@@ -71,7 +82,7 @@ class StudyStore:
         (self.folder / SERIES_NAME).mkdir(parents=True, exist_ok=True)
         for old in (self.folder / SERIES_NAME).glob("*.npz"):
             old.unlink()
-        self.path.write_text(_line({"settings": self.settings}), encoding="utf-8")
+        write_through(self.path, _line({"settings": self.settings}).encode())
 
     def __contains__(self, key: object) -> bool:
         return key in self._rows
@@ -86,11 +97,12 @@ class StudyStore:
         """Write what came of a job; it is on disk when this returns."""
         if result.series:
             self._write_series(result)  # first: a row without its series would never get it
+        rows = {key: _plain(row) for key, row in result.rows.items()}
         with self.path.open("a", encoding="utf-8") as file:
-            file.writelines(_line({"key": list(k), **_plain(r)}) for k, r in result.rows.items())
+            file.writelines(_line({"key": list(key), **row}) for key, row in rows.items())
             file.flush()
             os.fsync(file.fileno())
-        self._rows |= {key: _row(_plain(row)) for key, row in result.rows.items()}
+        self._rows |= {key: _row(row) for key, row in rows.items()}
 
     def _write_series(self, result: JobResult) -> None:
         job = result.job
@@ -103,53 +115,99 @@ class StudyStore:
         }
         path = self.folder / SERIES_NAME / f"{name}.npz"
         path.parent.mkdir(parents=True, exist_ok=True)
-        with path.with_suffix(".part").open("wb") as file:
-            np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
+        content = io.BytesIO()
+        np.savez_compressed(content, header=np.array(json.dumps(header)), **arrays)
+        write_through(path.with_suffix(".part"), content.getvalue())
         path.with_suffix(".part").replace(path)
+        sync_path(path.parent)
 
     def samples(self) -> dict[RunKey, Array]:
         """Return the errors over time (T, 3) of all runs that have any."""
-        found: dict[RunKey, Array] = {}
-        for path in sorted((self.folder / SERIES_NAME).glob("*.npz")):
-            with np.load(path) as file:
-                header = json.loads(str(file["header"]))
-                for i, method in enumerate(header["methods"]):
-                    samples = file[f"m{i}"].astype(np.float64)
-                    for seed, sample in zip(header["seeds"], samples, strict=True):
-                        found[RunKey(header["source"], header["grade"], seed, method)] = sample
+        found, _ = self._read_series()
         return {key: sample for key, sample in found.items() if key in self._rows}
+
+    def _read_series(self) -> tuple[dict[RunKey, Array], dict[Path, str]]:
+        """Return what all sound files hold, and what is wrong with the others."""
+        found: dict[RunKey, Array] = {}
+        faults: dict[Path, str] = {}
+        read = {}
+        for path in sorted((self.folder / SERIES_NAME).glob("*.npz")):
+            try:
+                read[path] = _samples_of(path)
+            except Exception as error:  # whatever a damaged archive makes NumPy raise
+                faults[path] = str(error) or type(error).__name__
+        lengths = Counter((*key[:2], len(x)) for one in read.values() for key, x in one.items())
+        usual: dict[tuple[str, str], int] = {}
+        for (source, grade, length), _ in reversed(lengths.most_common()):
+            usual[source, grade] = length
+        for path, samples in read.items():
+            wrong = {len(x) for key, x in samples.items() if len(x) != usual[key[0], key[1]]}
+            if wrong:
+                faults[path] = f"of {wrong.pop()} times, unlike others of its missions"
+            else:
+                found |= samples
+        return found, faults
 
     def _load(self) -> bool:
         """Read what is there; False if not even the first line is whole."""
-        text = self.path.read_text(encoding="utf-8")
+        if not self.path.is_file():
+            raise ConfigError(f"{self.path}: expected a file, got something else; remove it")
+        content = self.path.read_bytes()
         # What follows the last line break was being written when the study was stopped.
-        whole, _, torn = text.rpartition("\n")
-        if not whole:
+        whole, _, torn = content.rpartition(b"\n")
+        begin = b'{"settings": '
+        if not whole and torn[: len(begin)] == begin[: len(torn)]:
             return False
-        header, *lines = [self._parse(i, line) for i, line in enumerate(whole.split("\n"), 1)]
-        self._check(header.get("settings"))
-        for values in lines:
-            key = RunKey(*values.pop("key"))
+        header, *lines = whole.split(b"\n")
+        self._check(self._settings_of(header or torn))
+        kept, bad = [header], []
+        for number, line in enumerate(lines, 2):
+            try:
+                key, values = _run_of(line)
+            except (ValueError, RecursionError) as error:  # of JSON or Unicode too
+                bad.append(f"line {number}: {error}")
+                continue
+            kept.append(line)
             if values["status"] != LOST:  # another try may go better
                 self._rows[key] = _row(values)
-        if torn:
-            self.path.write_text(whole + "\n", encoding="utf-8")
+        if bad:
+            write_through(self.folder / DAMAGED_NAME, content)
+            self.notes += tuple(f"{self.path}, {text}; that run is done again" for text in bad)
+        if bad or torn:
+            part = self.path.with_name(f"{RUNS_NAME}.part")
+            write_through(part, b"\n".join(kept) + b"\n")
+            part.replace(self.path)
+        self._leave_out_without_series()
         return True
 
-    def _parse(self, number: int, line: str) -> dict[str, Any]:
-        try:
-            values = json.loads(line)
-        except json.JSONDecodeError as error:
-            raise DataError(
-                f"{self.path}, line {number}: expected a JSON object, got {line[:40]!r}; "
-                "only the last line may be damaged, use --fresh to begin anew"
-            ) from error
-        return dict(values)
+    def _leave_out_without_series(self) -> None:
+        """Have runs done again whose errors over time are damaged or gone."""
+        found, faults = self._read_series()
+        for path, text in faults.items():
+            path.replace(path.with_suffix(".damaged"))
+            self.notes += (f"{path}: {text}; its runs are done again",)
+        gone = [key for key, row in self._rows.items() if not row["failed"] and key not in found]
+        for key in gone:
+            del self._rows[key]
+        if gone and not faults:
+            self.notes += (f"{len(gone)} runs whose file in {SERIES_NAME} is gone are done again",)
 
-    def _check(self, found: dict[str, Any] | None) -> None:
+    def _settings_of(self, line: bytes) -> dict[str, Any]:
+        try:
+            settings = _object_of(line).get("settings")
+            if isinstance(settings, dict):
+                return settings
+        except (ValueError, RecursionError):
+            pass
+        raise ConfigError(
+            f"{self.path}, line 1: expected the settings of a study, got {shown(line)}; without "
+            "them nobody knows what the runs are of: use --fresh to throw them away, or another "
+            "--out"
+        )
+
+    def _check(self, found: dict[str, Any]) -> None:
         if found == self.settings:
             return
-        found = found or {}
         differing = [
             f"{name}: expected {self.settings.get(name)!r}, got {found.get(name)!r}"
             for name in sorted(found.keys() | self.settings.keys())
@@ -159,6 +217,63 @@ class StudyStore:
             f"{self.path}: made with other settings ({'; '.join(differing)}); "
             "use --fresh to throw it away, or another --out"
         )
+
+
+def _object_of(line: bytes) -> dict[str, Any]:
+    """Return a JSON object of finite numbers; raise :class:`ValueError` for all that is none."""
+    try:
+        values = json.loads(line.decode(), parse_constant=_no_constant)
+    except ValueError as error:
+        raise ValueError(f"expected a JSON object, got {shown(line)}") from error
+    if not isinstance(values, dict):
+        raise ValueError(f"expected a JSON object, got {shown(line)}")
+    return values
+
+
+def _no_constant(text: str) -> float:
+    raise ValueError(text)
+
+
+def _run_of(line: bytes) -> tuple[RunKey, dict[str, Any]]:
+    """Return one finished run; raise :class:`ValueError` that says what it lacks."""
+    values = _object_of(line)
+    parts = values.pop("key", None)
+    kinds = (str, str, int, str)
+    is_key = isinstance(parts, list) and [type(part) for part in parts] == list(kinds)
+    if not is_key:
+        raise ValueError(f"expected a key of source, grade, seed and method, got {shown(parts)}")
+    key = RunKey(*parts)
+    for name in COLUMNS:
+        value = values.get(name, values)
+        if name in TEXT_COLUMNS:
+            is_good = isinstance(value, str)
+        elif name in COUNT_COLUMNS:
+            is_good = type(value) is int
+        else:
+            is_good = value is None or (type(value) in (int, float) and abs(value) <= LARGEST)
+        if not is_good:
+            got = "nothing" if value is values else shown(value)
+            raise ValueError(f"column {name!r}: expected a value of its kind, got {got}")
+    if (values["grade"], values["seed"], values["method"]) != (key.grade, key.seed, key.method):
+        raise ValueError(f"the key {shown(parts)} is that of another run")
+    return key, values
+
+
+def _samples_of(path: Path) -> dict[RunKey, Array]:
+    """Return the errors over time (T, 3) of the runs of one file; raise where it is damaged."""
+    found: dict[RunKey, Array] = {}
+    with path.open("rb") as stream, np.load(stream) as file:
+        header = json.loads(str(file["header"]))
+        for i, method in enumerate(header["methods"]):
+            samples = file[f"m{i}"].astype(np.float64)
+            if samples.ndim != 3 or samples.shape[2] != 3 or not samples.shape[1]:
+                raise ValueError(f"expected arrays (runs, times, 3), got {samples.shape}")
+            for seed, sample in zip(header["seeds"], samples, strict=True):
+                key = RunKey(header["source"], header["grade"], seed, method)
+                if [type(part) for part in key] != [str, str, int, str]:
+                    raise ValueError(f"expected names and seeds, got {shown(tuple(key))}")
+                found[key] = sample
+    return found
 
 
 def gather_series(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -24,6 +25,7 @@ from ssm_graph.simulation import (
     simulate,
 )
 from ssm_graph.smoothers.mission import smooth
+from tests.mission_fixture import make_mission
 
 
 def simulated(grade: Grade, *, scenario: str = "demo", seconds: float = 330.0) -> SimulatedMission:
@@ -121,6 +123,17 @@ def test_what_cannot_be_aligned_is_refused() -> None:
     assert gnss is not None
     with pytest.raises(DataError, match="clocks"):
         align(replace(mission, gnss=replace(gnss, time_s=gnss.time_s + 1e6)))
+
+
+def test_no_ping_yet_is_no_velocity_and_no_warning() -> None:
+    """A live estimator looks before the first ping has come."""
+    mission = make_mission()
+    dvl = mission.dvl
+    none = {name: getattr(dvl, name)[:0] for name in ("time_s", "speed", "sigma", "range_m")}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = body_velocities(replace(mission, dvl=replace(dvl, **none)))
+    assert found.v_b.shape == (0, 3)
 
 
 def test_body_velocities_leave_contradicting_pings_out() -> None:

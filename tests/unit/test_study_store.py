@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.base.errors import ConfigError
 from ssm_graph.simulation import Grade
 from ssm_graph.study.jobs import Job, JobResult, RunKey, failed_job, lost_job
 from ssm_graph.study.scoring import Row
@@ -82,15 +82,6 @@ def test_torn_first_line_begins_anew(folder: Path) -> None:
     assert len(StudyStore(folder, SETTINGS)) == 0
     assert json.loads(path.read_text()) == {"settings": SETTINGS}
     assert list((folder / "series").iterdir()) == []
-
-
-def test_damage_elsewhere_is_refused(folder: Path) -> None:
-    """The message names file and line."""
-    path = folder / "runs.jsonl"
-    lines = path.read_text().splitlines(keepends=True)
-    path.write_text("".join([lines[0], "{broken\n", *lines[1:]]))
-    with pytest.raises(DataError, match=r"runs\.jsonl, line 2: expected a JSON object"):
-        StudyStore(folder, SETTINGS)
 
 
 @pytest.mark.parametrize("changed", [{"code": "2"}, {"study": "x"}, {"new": 1}])

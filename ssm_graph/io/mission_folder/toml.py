@@ -12,8 +12,17 @@ from typing import Any, Final
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import ConfigError, nearest_hint
 from ssm_graph.base.frames import BodyAxes
-from ssm_graph.base.settings import FILE_KEY, Key, Settings, build, number_key, read_settings, shown
-from ssm_graph.base.tables import Order, Table
+from ssm_graph.base.settings import (
+    FILE_KEY,
+    Key,
+    Settings,
+    build,
+    number_key,
+    read_settings,
+    read_settings_file,
+    shown,
+)
+from ssm_graph.base.tables import LARGEST_TIME_S, Order, Table
 from ssm_graph.base.units import DEGREE
 from ssm_graph.mission.mission import InitialState, Reference
 from ssm_graph.sensors.current import CURRENT_KEYS
@@ -58,7 +67,7 @@ REFERENCE: Final = _Reference(
     "reference", Reference, {"file": FILE_KEY}, (*POSITION, VELOCITY, ATTITUDE)
 )
 INITIAL_KEYS: Final[Mapping[str, Key]] = {
-    "time_s": Key("time_s"),
+    "time_s": Key("time_s", low=-LARGEST_TIME_S, high=LARGEST_TIME_S),
     **PLACE_KEYS,
     "vel_enu_m_per_s": number_key("velocity_enu", -50.0, 50.0, "the unit is m/s", shape=(3,)),
     "roll_deg": Key("roll", low=-180.0, high=180.0, unit=DEGREE),
@@ -213,7 +222,8 @@ def table_path(toml: MissionToml, section: str) -> Path | None:
 def _parse(path: Path, wanted: str) -> dict[str, Any]:
     file = path.name
     try:
-        return tomllib.loads(path.read_bytes().decode("utf-8-sig"))
+        text = read_settings_file(path).decode("utf-8-sig")
+        return tomllib.loads(text)
     except (FileNotFoundError, NotADirectoryError):
         raise ConfigError(
             f"{file}: there is none in {str(path.parent)!r}; expected {wanted}"

@@ -8,6 +8,7 @@ that moment, so that a row that was written without its letter shifts no other.
 
 from __future__ import annotations
 
+import contextlib
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -64,6 +65,7 @@ class RawLog:
         folder.mkdir(parents=True, exist_ok=True)
         kinds = row_kinds(vehicle)
         _refuse_content(folder, kinds.values())
+        self._vehicle = vehicle
         self._open(folder, kinds, **limits)
         for kind in kinds.values():
             if kind.file in self._tables:
@@ -85,17 +87,43 @@ class RawLog:
         kinds = row_kinds(vehicle)
         check_columns(folder, kinds.values())
         log = cls.__new__(cls)
+        log._vehicle = vehicle
         log._open(Path(folder), kinds, **limits)
-        tables = [log._tables.get(kind.file) for kind in kinds.values()]
+        log._go_on()
+        return log
+
+    def regain(self) -> list[str]:
+        """Go on where somebody removed, replaced or changed files; return what was done to them.
+
+        Rows that come from now on are read in order, whatever has become of those before.
+        """
+        texts = []
+        with contextlib.suppress(OSError):  # then the tables cannot be made either, and say so
+            if not (self._folder / TOML_NAME).exists():
+                self._folder.mkdir(parents=True, exist_ok=True)
+                write_vehicle(self._folder, self._vehicle)
+                texts.append(f"{self._folder / TOML_NAME} was removed or moved; written again")
+        heads = {kind.file: kind.header for kind in self._kinds.values()}
+        found = [file.regain(heads.get(file.name, b"")) for file in self._files()]
+        altered = [text for text in found if text]
+        if altered:
+            self._go_on()
+        return texts + altered
+
+    def _go_on(self) -> None:
+        """Note how large the tables are, before all rows that wait: letters count from here on."""
+        tables = [self._tables.get(kind.file) for kind in self._kinds.values()]
         sizes = ",".join(str(0 if table is None else table.size) for table in tables)
-        log._waiting.append(_Row(log._arrivals, f"\n@{sizes};\n".encode(), b""))
-        for kind, table in zip(kinds.values(), tables, strict=True):
+        first = [_Row(self._arrivals, f"\n@{sizes};\n".encode(), b"")]
+        for kind, table in zip(self._kinds.values(), tables, strict=True):
             if table is not None and table.size < len(kind.header):  # a power failure took it
                 table.cut(0)
-                log._waiting.append(_Row(table, kind.header, b""))
-        log._commit()
-        log._write_waiting(len(log._waiting))
-        return log
+                first.append(_Row(table, kind.header, b""))
+        is_begun = bool(self._waiting) and self._waiting[0].is_in_table
+        for i, row in enumerate(first, start=int(is_begun)):
+            self._waiting.insert(i, row)
+        self._commit()
+        self._write_waiting(len(first) + is_begun)
 
     def _open(
         self,
@@ -165,6 +193,7 @@ class RawLog:
             parts.append(f"rows that wait in memory for the disk: {n_rows} ({self._reason})")
         if self._n_lost:
             parts.append(f"rows lost because {self._max_waiting} waited already: {self._n_lost}")
+        parts += [file.problem for file in self._files() if file.problem]
         if self._sync_failure:
             parts.append(f"the disk does not confirm what it was given ({self._sync_failure})")
         return f"raw log: {'; '.join(parts)}" if parts else None

@@ -9,7 +9,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 from ssm_graph.base.errors import ConfigError
+from ssm_graph.base.frozen import Array
 from ssm_graph.base.tables import TIME
 from ssm_graph.base.units import exactly_in_unit
 from ssm_graph.io.mission_folder.vehicle import check_same_vehicle
@@ -182,18 +185,23 @@ def _in_order_of_arrival(arrivals: bytes, tables: dict[int, _Rows]) -> Iterator[
         yield from heapq.merge(*rest, key=lambda message: message.time_s)
 
 
-def _runs(arrivals: bytes, n_tables: int) -> Iterator[tuple[bytes, tuple[float, ...]]]:
-    """Yield the letters of each process and the sizes of the tables when it had ended."""
-    letters = b""
+def _runs(arrivals: bytes, n_tables: int) -> list[tuple[bytes, Array]]:
+    """Return the letters of each process and the sizes of the tables when it had ended.
+
+    A table that was smaller later on was begun anew: it has nothing of what came before.
+    """
+    runs, letters = [], b""
     for line in arrivals.split(b"\n"):
         sizes = _SIZES.fullmatch(line)
         limits = tuple(float(size) for size in sizes[1].split(b",")) if sizes else ()
         if _FEWEST_TABLES <= len(limits) <= n_tables:  # there were none of later instruments
-            yield letters, limits + (0.0,) * (n_tables - len(limits))
+            runs.append((letters, limits + (0.0,) * (n_tables - len(limits))))
             letters = b""
         elif not line.startswith(b"@"):  # else a line of sizes that was torn
             letters += line
-    yield letters, (math.inf,) * n_tables
+    runs.append((letters, (math.inf,) * n_tables))
+    smallest = np.minimum.accumulate([limits for _, limits in runs][::-1])[::-1]
+    return [(letters, limits) for (letters, _), limits in zip(runs, smallest, strict=True)]
 
 
 def _lines(path: Path, start: int, end: int) -> Iterator[tuple[int, bytes]]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -22,6 +22,7 @@ from ssm_graph.base.frames import BodyAxes
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.units import DEG_PER_H, MICRO_G
 from ssm_graph.io.mission_folder.folder import CALIBRATION_NAME, calibration_toml
+from ssm_graph.io.results.place import FIGURE_NAME, check_is_for_results
 from ssm_graph.io.results.summary import MetricsLike, build_summary
 from ssm_graph.io.tables import csv_tables
 from ssm_graph.io.tables.append_file import TORN_ROW, AppendFile, write_through
@@ -65,11 +66,13 @@ def write_results(
     metrics: MetricsLike | None,
     settings: Mapping[str, Any],
     axes: BodyAxes = BodyAxes.FRD,
+    draw: Callable[[Path], None] | None = None,
 ) -> None:
     """Write one estimate as a result folder.
 
     All files are complete before the first takes its place, the old summary goes first and the
-    new one comes last: an interruption leaves a folder without summary, never a mixture.
+    new one comes last: an interruption leaves a folder without summary, never a mixture. What an
+    earlier run left and this one does not have, a figure or a calibration, goes too.
 
     Parameters
     ----------
@@ -79,13 +82,17 @@ def write_results(
     metrics : comparison with the reference, if there is one.
     settings : of the estimator, noted as they are; units belong into the keys.
     axes : body axes of the mission's file, for the lever arms of ``calibration.toml``.
+    draw : saves the figure at a path; none is written unless given.
 
     Raises
     ------
+    ConfigError
+        The folder is that of a mission or a live run.
     DataError
-        The folder cannot be made or written.
+        The folder cannot be made or written; or of the figure, with all else in its place.
     """
     folder = Path(folder)
+    check_is_for_results(folder)
     summary = build_summary(estimate, mission=mission, metrics=metrics, settings=settings)
     content = {
         TRAJECTORY_NAME: format_table(
@@ -100,21 +107,39 @@ def write_results(
     if estimate.calibration is not None:
         content[CALIBRATION_NAME] = calibration_toml(mission, estimate.calibration, axes=axes)
     content[SUMMARY_NAME] = _summary_text(summary)
-    parts = {name: folder / f".{name}.part-{os.getpid()}" for name in content}
+    process = os.getpid()
+    parts = {name: folder / f".{name}.part-{process}" for name in content}
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, text in content.items():
             write_through(parts[name], text.encode())
-        for name in (SUMMARY_NAME, CALIBRATION_NAME, AIDS_NAME):
+        failure = None
+        if draw is not None:
+            figure = folder / f".{process}-{FIGURE_NAME}"
+            parts = {FIGURE_NAME: figure, **parts}
+            failure = _drawn(draw, figure)
+        for name in (SUMMARY_NAME, CALIBRATION_NAME, AIDS_NAME, FIGURE_NAME):
             (folder / name).unlink(missing_ok=True)
         for name, part in parts.items():
-            part.replace(folder / name)
+            if name != FIGURE_NAME or failure is None:
+                part.replace(folder / name)
     except OSError as error:
         raise DataError(f"{folder}: cannot write results: {error.strerror or error}") from error
     finally:
         for part in parts.values():
             if folder.is_dir():
                 part.unlink(missing_ok=True)
+    if failure is not None:
+        raise failure
+
+
+def _drawn(draw: Callable[[Path], None], path: Path) -> Exception | None:
+    """Draw; return what went wrong, which must not cost the tables."""
+    try:
+        draw(path)
+    except Exception as error:
+        return error
+    return None
 
 
 def read_results(folder: Path | str) -> Results:
@@ -270,7 +295,8 @@ class GrowingResults:
     ) -> None:
         """Begin in a folder, or go on at the sizes (bytes) that a checkpoint knew.
 
-        With a current ``trajectory.csv`` has its columns, and all rows have one.
+        A table that begins anew although it has rows is set aside, ``trajectory.older.csv``. With
+        a current ``trajectory.csv`` has its columns, and all rows have one.
 
         Raises :class:`DataError`: the folder cannot be made or written.
         """
@@ -285,11 +311,15 @@ class GrowingResults:
             (folder / SUMMARY_NAME).unlink(missing_ok=True)
             beside = CURRENT_COLUMNS if has_current else ()
             headers[TRAJECTORY_NAME] += beside
-            for name, columns in headers.items():
+            self._heads = {name: (",".join(of) + "\n").encode() for name, of in headers.items()}
+            for name, head in self._heads.items():
+                size = (sizes or {}).get(name, 0)
+                if size == 0:
+                    _set_aside(folder / name, len(head))
                 file = self._files[name] = AppendFile(folder / name, ending=TORN_ROW)
-                file.cut((sizes or {}).get(name, 0))
+                file.cut(size)
                 if file.size == 0:
-                    file.append((",".join(columns) + "\n").encode())
+                    file.append(head)
         except OSError as error:
             self.close()
             raise DataError(f"{folder}: cannot write results: {error.strerror or error}") from error
@@ -297,6 +327,16 @@ class GrowingResults:
     def sizes(self) -> dict[str, int]:
         """Return how large the files are, bytes, for a checkpoint."""
         return {name: file.size for name, file in self._files.items()}
+
+    def regain(self) -> list[str]:
+        """Go on where somebody removed, replaced or changed a table; return what was done."""
+        texts = {name: self._files[name].regain(head) for name, head in self._heads.items()}
+        for name, text in texts.items():
+            if text and self._files[name].size < len(self._heads[name]):
+                self._files[name].cut(0)
+                self._waiting[name] = self._heads[name].decode() + self._waiting[name]
+        self._write_waiting()
+        return [text for text in texts.values() if text]
 
     def append(
         self,
@@ -315,7 +355,7 @@ class GrowingResults:
         self._write_waiting()
 
     def _write_waiting(self) -> None:
-        self.problem = None
+        self.problem = next((file.problem for file in self._files.values() if file.problem), None)
         for name, text in self._waiting.items():
             try:
                 if text:
@@ -345,6 +385,14 @@ class GrowingResults:
         """Close the files; a second time does nothing."""
         for file in self._files.values():
             file.close()
+
+
+def _set_aside(path: Path, n_head: int) -> None:
+    """Rename a table that has rows; of several that were set aside the longest is kept."""
+    older = path.with_name(f"{path.stem}.older{path.suffix}")
+    n_older = older.stat().st_size if older.exists() else 0
+    if path.exists() and path.stat().st_size > max(n_head, n_older):
+        path.replace(older)
 
 
 def _rows(columns: Columns) -> str:

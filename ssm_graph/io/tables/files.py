@@ -44,6 +44,10 @@ from ssm_graph.io.tables.csv_tables import (
 )
 
 _CHUNK = 65536
+_SET_BACK_S: Final = 2.0
+"""Rows may come so late; a clock that falls by more ..."""
+_SET_BACK_ROWS: Final = 20
+"""... and goes on steadily from there for so many rows, as it did before, was set back."""
 _FEW = 10
 """So many bad rows are left out even where they are most of the table."""
 
@@ -143,10 +147,15 @@ def read_parquet(path: Path, label: str, spec: TableSpec) -> Table:
             name: np.asarray(data[name].cast(arrow.float64(), safe=False).to_numpy())
             for name in schema.names
         }
+    except MemoryError as error:  # Arrow's is one of its exceptions too
+        raise DataError(
+            f"{label}: there is not enough memory for this table ({error}); cut the mission into "
+            "parts, or use a computer with more of it"
+        ) from error
     except arrow.ArrowException as error:
         raise DataError(
-            f"{label}: expected a Parquet table, got a file that cannot be read as one; "
-            "was it cut off, or is it another format?"
+            f"{label}: expected a Parquet table, got a file that cannot be read as one: "
+            f"{' '.join(str(error).split())[:200]}"
         ) from error
     return Table(ParquetFile(label, path), columns)
 
@@ -199,13 +208,14 @@ def read_arrival_table(path: Path, label: str, spec: TableSpec) -> Table:
     is not torn but of another kind, and is refused like any other.
 
     Raises :class:`DataError` for a file that is no table, a missing, unknown or repeated column,
-    and rows most of which cannot be read.
+    rows most of which cannot be read, and a clock that was begun anew or set back on the way.
 
     The ending of ``path`` decides the format; ``label`` is its name in messages.
     """
     counts: Counter[str] = Counter()
     table = _read(path, label, spec, partial(_read_csv_as_it_came, counts=counts))
     table = _without_impossible(table, spec, counts)
+    _check_one_clock(table)
     table = _in_order_of_time(table, spec, counts)
     return replace(table, notes=_note(counts, label))
 
@@ -282,6 +292,24 @@ def _without_impossible(table: Table, spec: TableSpec, counts: Counter[str]) -> 
         return table  # the checks of each sensor say what is wrong
     counts["impossible"] = n_bad
     return _picked(table, np.flatnonzero(~bad)) if n_bad else table
+
+
+def _check_one_clock(table: Table) -> None:
+    """Refuse times that fall and go on from there: sorted, two missions would be woven into one.
+
+    A late row is followed by others that go on as before it.
+    """
+    time_s, n_rows = table.time_s, _SET_BACK_ROWS
+    for row in np.flatnonzero(np.diff(time_s) < -_SET_BACK_S) + 1:
+        before_s, after_s = time_s[max(row - n_rows, 0) : row], time_s[row : row + n_rows]
+        is_steady = np.all(np.diff(before_s) > 0.0) and np.all(np.diff(after_s) > 0.0)
+        if min(len(before_s), len(after_s)) == n_rows and is_steady and after_s[-1] < before_s[-1]:
+            raise table.fault(
+                int(row),
+                f"the time falls from {before_s[-1]:.3f} to {after_s[0]:.3f} s and goes on from "
+                "there: the clock was begun anew or set back, so these are two missions; cut all "
+                "tables there and give each part a folder of its own",
+            )
 
 
 def _in_order_of_time(table: Table, spec: TableSpec, counts: Counter[str]) -> Table:

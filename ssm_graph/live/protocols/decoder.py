@@ -77,7 +77,8 @@ class Stamper:
         """Return the time of a message, s; raise :class:`RefusedError` where there is none."""
         if not math.isfinite(arrival_s):
             raise RefusedError(
-                "expected a finite time of arrival, got none; check the vehicle's clock"
+                "the time of arrival is not known: it came while this process stood still, or the "
+                "vehicle's clock is broken"
             )
         if self._clock is Clock.ARRIVAL or instrument_s is None:
             return arrival_s
@@ -102,6 +103,8 @@ class Decoder(ABC):
         """``place`` is how refusals call the source."""
         self._place = place
         self._refusals = Refusals()
+        self.n_sound = 0
+        """Texts so far that were what this protocol says, whether or not of use here."""
 
     @property
     def n_held(self) -> int:
@@ -121,10 +124,12 @@ class Decoder(ABC):
         """
         messages: list[Message] = []
         for text in self._framer.feed(data):
+            n_before = self.n_refused
             try:
                 messages += self._decode(text, arrival_s)
             except RefusedError as error:
                 self._refuse(str(error))
+            self.n_sound += self.n_refused == n_before
         return messages + self._overdue(arrival_s)
 
     def take_refusals(self) -> list[str]:

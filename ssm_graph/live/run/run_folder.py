@@ -35,6 +35,7 @@ from ssm_graph.io.mission_folder.toml import TOML_NAME
 from ssm_graph.io.mission_folder.vehicle import check_same_vehicle
 from ssm_graph.io.raw_log.log import RawLog
 from ssm_graph.io.raw_log.rows import ALWAYS, ARRIVALS, replay
+from ssm_graph.io.results.place import RUN_NAME
 from ssm_graph.io.results.summary import as_json
 from ssm_graph.io.results.tables import (
     BEAMS_NAME,
@@ -43,8 +44,13 @@ from ssm_graph.io.results.tables import (
     TRAJECTORY_NAME,
     GrowingResults,
 )
-from ssm_graph.io.tables.append_file import AppendFile, sync_path
-from ssm_graph.io.tables.checkpoint import CHECKPOINT_NAME, newest_checkpoint, write_checkpoint
+from ssm_graph.io.tables.append_file import AppendFile, sync_path, write_through
+from ssm_graph.io.tables.checkpoint import (
+    CHECKPOINT_NAME,
+    newest_checkpoint,
+    older_name,
+    write_checkpoint,
+)
 from ssm_graph.mission.navigation import Event
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.messages import Message
@@ -54,7 +60,6 @@ if sys.platform != "win32":
 
 LOG_NAME: Final = "log"
 EVENTS_NAME: Final = "events.jsonl"
-RUN_NAME: Final = "run.json"
 LOCK_NAME: Final = "lock"
 FORMAT: Final = 1
 
@@ -138,16 +143,21 @@ class RunFolder:
 
     def __init__(self, folder: Path, vehicle: Vehicle, settings: Mapping[str, Any]) -> None:
         self.path, self.vehicle, self.settings = folder, vehicle, dict(as_json(settings))
+        self._noted = {"format": FORMAT, "vehicle": vehicle.name, "settings": self.settings}
+        self._altered: list[str] = []
+        self._folder_problem: str | None = None
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self._lock = _locked(folder)
         except OSError as error:
-            raise DataError(f"{folder}: cannot be written: {error.strerror or error}") from error
+            raise _unwritable(folder, error) from error
         try:
             self._check()
             self._events = AppendFile(folder / EVENTS_NAME, ending=b" torn\n")
-        except BaseException:
+        except BaseException as error:
             self._lock.close()
+            if isinstance(error, OSError):
+                raise _unwritable(folder, error) from error
             raise
         self.event_problem: str | None = None
         self.results: GrowingResults | None = None
@@ -168,6 +178,7 @@ class RunFolder:
         if found is None:
             return Resumed()
         meta: dict[str, Any] = found.meta
+        in_log = {f"{LOG_NAME}/{name}": size for name, size in meta["offsets"].items()}
         return Resumed(
             arrays=found.arrays,
             meta=meta["estimator"],
@@ -175,19 +186,20 @@ class RunFolder:
             sizes=meta["sizes"],
             n_messages=meta["n_messages"],
             data_s=meta["data_s"],
-            notes=(*found.notes, *self._missing(meta["sizes"])),
+            notes=(*found.notes, *self._missing({**meta["sizes"], **in_log})),
         )
 
     def logged(self, resumed: Resumed) -> Iterator[Message]:
         """Return what was logged since, and get ready to write results and events once more."""
+        messages: Iterator[Message] = iter(())
+        if self._has_log:  # a log that cannot be read is refused before results are cut
+            messages = replay(self.path / LOG_NAME, self.vehicle, resumed.offsets)
         has_current = self.vehicle.current is not None
         self.results = GrowingResults(self.path, sizes=resumed.sizes, has_current=has_current)
         with (self.path / EVENTS_NAME).open("rb") as stream:
             stream.seek(resumed.sizes.get(EVENTS_NAME, 0))
             self._known = Counter(stream)
-        if not self._has_log:
-            return iter(())
-        return replay(self.path / LOG_NAME, self.vehicle, resumed.offsets)
+        return messages
 
     def open_log(self) -> RawLog:
         """Begin the log, or go on with it; from here on all events are new."""
@@ -196,9 +208,7 @@ class RunFolder:
         try:
             self.log = make(self.path / LOG_NAME, self.vehicle)
         except OSError as error:
-            raise DataError(
-                f"{self.path / LOG_NAME}: cannot be written: {error.strerror or error}"
-            ) from error
+            raise _unwritable(self.path / LOG_NAME, error) from error
         return self.log
 
     def write_event(self, event: Event) -> None:
@@ -240,8 +250,17 @@ class RunFolder:
             self.log.problems() if self.log is not None else None,
             self.results.problem if self.results is not None else None,
             self.event_problem,
+            self._events.problem,
+            self._folder_problem,
         ]
         return "; ".join(text for text in found if text) or None
+
+    def settle(self) -> list[str]:
+        """Wait for the disk; return what is not on it, and what somebody altered there."""
+        if self.log is not None:
+            self.log.sync()
+        problem = self.problems()
+        return [*self._altered, *([f"at the end: {problem}"] if problem else [])]
 
     def close(self) -> None:
         """Wait for the disk, and let others have the folder."""
@@ -261,35 +280,81 @@ class RunFolder:
         return (self.path / LOG_NAME / TOML_NAME).exists()
 
     def _check(self) -> None:
-        """Refuse what is not this run; note the settings of a new one."""
+        """Refuse what is not this run, before anything is changed; note a new one's settings."""
         path = self.path / RUN_NAME
-        wanted = {"format": FORMAT, "vehicle": self.vehicle.name, "settings": self.settings}
         if path.exists():
             try:
                 found = json.loads(path.read_text(encoding="utf-8"))
             except (OSError, ValueError) as error:
-                raise DataError(f"{path}: expected the settings of a run: {error}") from error
-            if found != wanted:
+                raise DataError(
+                    f"{path}: expected the settings of a run: {error}; bring it back, or give "
+                    "another folder; nothing was changed"
+                ) from error
+            if found != self._noted:
                 raise ConfigError(
-                    f"{path}: this run was begun with {_difference(found, wanted)}; go on with "
-                    "the same, or give another folder"
+                    f"{path}: this run was begun with {_difference(found, self._noted)}; go on "
+                    "with the same, or give another folder"
                 )
             if self._has_log:
                 check_same_vehicle(self.path / LOG_NAME, self.vehicle)
-            return
-        others = [
-            name
-            for name in (TOML_NAME, SUMMARY_NAME, TRAJECTORY_NAME)
-            if (self.path / name).exists()
-        ]
-        if others:
+            elif traces := self._traces():
+                raise ConfigError(
+                    f"{self.path / LOG_NAME / TOML_NAME}: not there, but {', '.join(traces)} of "
+                    "the run that was begun here; if the log was moved or its partition is not "
+                    "mounted, bring it back and start again; else give another folder; nothing was "
+                    "changed"
+                )
+        elif traces := self._traces():
             raise ConfigError(
-                f"{str(self.path)!r}: expected a new folder or that of a live run, found "
-                f"{others[0]} of something else; give another folder"
+                f"{str(self.path)!r}: expected a new folder or that of a live run ({RUN_NAME}), "
+                f"found {', '.join(traces)} of something else; give another folder, or bring "
+                f"{RUN_NAME} back; nothing was changed"
             )
-        part = path.with_name(f"{RUN_NAME}.part")
-        part.write_text(json.dumps(wanted, indent=2) + "\n", encoding="utf-8")
-        part.replace(path)
+        else:
+            self._note_settings()
+
+    def _note_settings(self) -> None:
+        part = self.path / f"{RUN_NAME}.part"
+        write_through(part, (json.dumps(self._noted, indent=2) + "\n").encode())
+        part.replace(self.path / RUN_NAME)
+
+    def _traces(self) -> list[str]:
+        """Return the files that a start that was cut short would not have left."""
+        whole = (TOML_NAME, SUMMARY_NAME, CHECKPOINT_NAME, str(older_name(Path(CHECKPOINT_NAME))))
+        logged = [f"{LOG_NAME}/{path.name}" for path in (self.path / LOG_NAME).glob("*.csv")]
+        found = [name for name in (*whole, f"{LOG_NAME}/{TOML_NAME}") if self._exists(name)]
+        tables = (TRAJECTORY_NAME, BEAMS_NAME, PROTECTION_NAME, *sorted(logged))
+        found += [name for name in tables if _has_rows(self.path / name, beyond=1)]
+        beside = (EVENTS_NAME, f"{LOG_NAME}/{ARRIVALS}")
+        return found + [name for name in beside if _has_rows(self.path / name, beyond=0)]
+
+    def _exists(self, name: str) -> bool:
+        return (self.path / name).exists()
+
+    def regain(self) -> list[str]:
+        """Go on where somebody removed, replaced or changed files of the run; return what happened.
+
+        What cannot be gone on with is among :meth:`problems`.
+        """
+        assert self.log is not None
+        assert self.results is not None
+        texts = []
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            if not self._exists(RUN_NAME):
+                self._note_settings()
+                texts.append(f"{self.path / RUN_NAME} was removed or moved; written again")
+            if not _is_same(self.path / LOCK_NAME, self._lock):
+                lock = _locked(self.path)
+                self._lock.close()
+                self._lock = lock
+            self._folder_problem = None
+        except (OSError, ConfigError) as error:
+            self._folder_problem = str(error)
+        events = self._events.regain()
+        texts += [*self.log.regain(), *self.results.regain(), *([events] if events else [])]
+        self._altered += texts
+        return texts
 
     def _missing(self, sizes: Mapping[str, int]) -> list[str]:
         """Return a sentence for every file that is shorter than the checkpoint knew it."""
@@ -299,6 +364,28 @@ class RunFolder:
             for name, path in found.items()
             if not path.exists() or path.stat().st_size < sizes[name]
         ]
+
+
+def _has_rows(path: Path, *, beyond: int) -> bool:
+    """Return whether a file has more than so many lines; what cannot be read has."""
+    try:
+        with path.open("rb") as stream:
+            return len([line for line, _ in zip(stream, range(beyond + 1), strict=False)]) > beyond
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
+
+
+def _unwritable(folder: Path, error: OSError) -> DataError:
+    return DataError(f"{folder}: cannot be written: {error.strerror or error}")
+
+
+def _is_same(path: Path, stream: IO[str]) -> bool:
+    try:
+        return os.path.samestat(path.stat(), os.fstat(stream.fileno()))
+    except FileNotFoundError:
+        return False
 
 
 def _locked(folder: Path) -> IO[str]:

@@ -34,6 +34,8 @@ from ssm_graph.sensors.messages import Message
 POLL_S: Final = 0.05
 LATE_S: Final = 5.0
 """A disk that needs longer for a checkpoint is complained of."""
+WATCH_S: Final = 1.0
+"""From one look after the files of the run to the next."""
 N_EVENTS: Final = 8
 """Shown to a person."""
 MOST_FAILURES: Final = 100
@@ -66,6 +68,8 @@ class RunEnd(NamedTuple):
     n_messages: int
     n_errors: int
     """Exceptions that nobody expected and the run survived."""
+    notes: tuple[str, ...] = ()
+    """What is not on the disk, or was altered there by somebody, one sentence each."""
 
 
 class Delayed(Protocol):
@@ -180,6 +184,7 @@ class Runner:
         self._latencies: deque[float] = deque(maxlen=1000)
         self._checkpoints = Every(self.config.checkpoint_every_s)
         self._delayed = Every(self.config.delayed_every_s)
+        self._watch = Every(WATCH_S)
         self._status = Every(self.config.status_every_s, at_once=True)
 
     def stop(self) -> None:
@@ -292,6 +297,10 @@ class Runner:
         """Write what has come about, and show it."""
         for event in source.take_events():
             self._note_event(event)
+        if self._watch.is_due(self._steady_s()):
+            for text in self.folder.regain():
+                self._events.note("disk", "file_altered", text, Severity.ERROR, burst=20)
+                self._is_checkpoint_due = True  # the last one knows the files of before
         self._keep_results()
         self._keep_checkpoint()
         problem = self.folder.problems()
@@ -367,7 +376,8 @@ class Runner:
         self._write_delayed(self._estimator.finish)
         self._events.note("run", "ended", reason.value, Severity.INFO)
         self._take_events()
-        end = RunEnd(reason, navigation, found, self._n_messages, self._events.n_errors)
+        notes = tuple(self.folder.settle())
+        end = RunEnd(reason, navigation, found, self._n_messages, self._events.n_errors, notes)
         assert self.folder.results is not None
         self.folder.results.finish(summary_of(self.folder, end))
         return end
@@ -418,7 +428,7 @@ def summary_of(folder: RunFolder, end: RunEnd) -> dict[str, Any]:
         "settings": folder.settings,
         "calibration": calibration_fields(end.found.calibration),
         "current": current_fields(end.found.current),
-        "notes": [],
+        "notes": end.notes,
         "versions": versions(),
     }
     return {key: as_json(value) for key, value in summary.items()}

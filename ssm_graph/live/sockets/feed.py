@@ -22,6 +22,12 @@ OTHERS_SHARE: Final = 0.1
 """Of the rate of inertial samples, what each other kind of message may come at."""
 BURST: Final = 5
 """Refusals of one source that may be told at once: their texts differ."""
+SAME_CLOCK_S: Final = 2.5
+"""Stamps of one clock may be so far from what was expected: delays of a link."""
+STRANGER_S: Final = 1.0
+"""A clock that is silent for so long may have been set."""
+MOST_STRANGERS: Final = 5000
+"""Samples of another clock that may wait; with more the other clock is believed."""
 _AHEAD_S: Final = 0.1
 
 
@@ -45,7 +51,7 @@ class Limits:
     bytes_per_s: float = 6e5
     """In the mean, 300 for every message; a source that sends more is read no faster."""
     stall_s: float = 10.0
-    """Silence after which a connection is given up."""
+    """Time without a sound message after which a connection is given up."""
     max_clients: int = 4
     """Connections to one server."""
     connect_s: float = 5.0
@@ -62,12 +68,83 @@ class Limits:
 
 
 class Channel:
-    """One connection's decoder, and when it last heard something, s on the steady clock."""
+    """One connection's decoder, and when it last heard a sound message, s on the steady clock."""
 
     def __init__(self, decoder: Decoder, now: Now) -> None:
         self.decoder = decoder
         self.heard_s = now.steady_s
         self.fed_s = now.steady_s
+        self.is_stale = False
+        """Whether what waits came while this process stood still, nobody knows when."""
+
+    def stand_still(self, span_s: float) -> None:
+        """Take out a time in which nobody listened, s: what waits is stale, silence was none."""
+        self.heard_s += span_s
+        self.is_stale = True
+
+    def catch_up(self) -> None:
+        """All that waited has been read."""
+        self.is_stale = False
+
+
+class SampleClock:
+    """The clock of the inertial data of all sources: remembered, and a stranger is refused.
+
+    A sample is of the known clock where it goes on from the last one, or where its stamp is as far
+    from the time of arrival as the last one's. Samples of another clock wait; they are let in, all
+    of them, once they have come for a second in which the known clock was silent (it was set, or
+    the instrument was exchanged), and refused where it is heard again before.
+    """
+
+    def __init__(self) -> None:
+        self._stamp_s = self._heard_s = math.nan
+        self._strangers: list[ImuSample] = []
+        self._stranger_s = 0.0
+
+    def sift(
+        self, messages: list[Message], steady_s: float
+    ) -> tuple[list[Message], list[ImuSample]]:
+        """Return what may pass, and what was refused."""
+        passed: list[Message] = []
+        refused: list[ImuSample] = []
+        for message in messages:
+            if not isinstance(message, ImuSample):
+                passed.append(message)
+            elif self._is_known(message.time_s, steady_s):
+                refused += self._strangers
+                self._strangers = []
+                self._stamp_s, self._heard_s = message.time_s, steady_s
+                passed.append(message)
+            else:
+                refused += self._meet(message, steady_s, passed)
+        return passed, refused
+
+    def off_s(self, sample: ImuSample) -> float:
+        """Return how far a stamp is from the last one of the known clock, s."""
+        return sample.time_s - self._stamp_s
+
+    def _is_known(self, stamp_s: float, steady_s: float) -> bool:
+        if math.isnan(self._stamp_s):
+            return True
+        step_s = stamp_s - self._stamp_s
+        off_s = step_s - (steady_s - self._heard_s)
+        return min(abs(step_s), abs(off_s)) <= SAME_CLOCK_S
+
+    def _meet(self, sample: ImuSample, steady_s: float, passed: list[Message]) -> list[ImuSample]:
+        """Have a stranger wait, or let all of them in; return those of a third clock."""
+        third: list[ImuSample] = []
+        waiting = self._strangers
+        if waiting and abs(sample.time_s - waiting[-1].time_s) > SAME_CLOCK_S:
+            third, self._strangers = waiting, []
+        if not self._strangers:
+            self._stranger_s = steady_s
+        self._strangers.append(sample)
+        since_s = max(self._heard_s, self._stranger_s)
+        if steady_s - since_s >= STRANGER_S or len(self._strangers) > MOST_STRANGERS:
+            passed += self._strangers
+            self._strangers = []
+            self._stamp_s, self._heard_s = sample.time_s, steady_s
+        return third
 
 
 class Feed:
@@ -84,8 +161,10 @@ class Feed:
         *,
         limits: Limits,
         events: EventLog,
+        clock: SampleClock,
     ) -> None:
         self.name, self.address, self.limits = name, address, limits
+        self._clock = clock
         self.n_reconnects = 0
         self._make_decoder, self._events = make_decoder, events
         self._buckets: dict[type[Message], TokenBucket] = {}
@@ -101,13 +180,13 @@ class Feed:
         """Return the messages that these bytes complete and that are not too many."""
         if data:
             self._n_bytes += len(data)
-            channel.heard_s = now.steady_s
             self._free_s = max(self._free_s, now.steady_s) + len(data) / self.limits.bytes_per_s
         channel.fed_s = now.steady_s
         decoder = channel.decoder
-        n_before = decoder.n_refused
+        n_before, n_sound = decoder.n_refused, decoder.n_sound
+        arrival_s = math.nan if channel.is_stale else now.wall_s
         try:
-            messages = decoder.feed(data, arrival_s=now.wall_s)
+            messages = decoder.feed(data, arrival_s=arrival_s)
             refusals = decoder.take_refusals()
         except Exception as error:  # a decoder never raises; if it does, others go on
             self._events.failure(self.name, "decoder_failed", error)
@@ -116,7 +195,15 @@ class Feed:
         self._n_refused += decoder.n_refused - n_before
         for text in refusals:
             self.tell("message_refused", text, Severity.WARNING, burst=BURST)
-        return self._limited(messages, now)
+        if decoder.n_sound > n_sound:
+            channel.heard_s = now.steady_s
+        kept, strangers = self._clock.sift(self._limited(messages, now), now.steady_s)
+        if strangers:
+            self._n_refused += len(strangers)
+            text = f"{len(strangers)} inertial samples of another clock, stamped "
+            text += f"{self._clock.off_s(strangers[0]):+.6g} s off those that go on: refused"
+            self.tell("clock_refused", text, Severity.WARNING)
+        return kept
 
     def idle(self, channel: Channel, now: Now) -> list[Message]:
         """Return what the decoder releases where nothing has come for a second."""
@@ -126,8 +213,13 @@ class Feed:
         """Return whether it has sent so many bytes that it has to wait."""
         return self._free_s - now.steady_s > _AHEAD_S
 
+    @property
+    def silence(self) -> str:
+        """What is wrong with a connection that :meth:`is_silent`, in words."""
+        return f"no sound message for {self.limits.stall_s:g} s"
+
     def is_silent(self, channel: Channel, now: Now) -> bool:
-        """Return whether a connection has been silent for too long."""
+        """Return whether nothing sound has come from a connection for too long."""
         return now.steady_s - channel.heard_s > self.limits.stall_s
 
     def tell(self, kind: str, text: str, severity: Severity, *, burst: int = 1) -> None:

@@ -23,6 +23,8 @@ from ssm_graph.mission.navigation import Severity
 from ssm_graph.mission.run_status import LinkState, SourceStatus
 from ssm_graph.sensors.messages import Message
 
+YOUNG_S: Final = 2.0
+"""A client that has sent no sound message for so long makes room for another one."""
 MAX_DATAGRAMS: Final = 64
 """Read of one source before the others have their turn."""
 
@@ -43,8 +45,15 @@ class Input(ABC):
         if isinstance(data, str):
             return self._lose(ready, now, data)
         messages = self.feed.take(channel, data, now)
+        if len(data) < CHUNK:  # else more waits
+            channel.catch_up()
         self._pause_if_over(now)
         return messages
+
+    def stood_still(self, span_s: float) -> None:
+        """Have nobody pay for the time in which this process did not listen."""
+        for channel in self._reading.values():
+            channel.stand_still(span_s)
 
     def tick(self, now: Now) -> list[Message]:
         """Return messages that a decoder releases; look after patience and connections."""
@@ -54,9 +63,11 @@ class Input(ABC):
                 self._selector.register(sock, selectors.EVENT_READ, self)
         messages: list[Message] = []
         for sock, channel in list(self._reading.items()):
+            if not self._is_paused and channel.fed_s < now.steady_s:  # nothing waited for it
+                channel.catch_up()
             messages += self.feed.idle(channel, now)
             if not self._is_paused and self.feed.is_silent(channel, now):
-                messages += self._lose(sock, now, f"silent for {self.feed.limits.stall_s:g} s")
+                messages += self._lose(sock, now, self.feed.silence)
         return messages
 
     @abstractmethod
@@ -192,7 +203,7 @@ class TcpClientInput(Input):
     def _lose(self, sock: socket.socket, now: Now, why: str) -> list[Message]:
         messages = self._end(sock, now)
         self._wait(now)
-        kind = "source_silent" if why.startswith("silent") else "connection_lost"
+        kind = "source_silent" if why == self.feed.silence else "connection_lost"
         self.feed.tell(kind, f"{self.feed.address}: {why}; it is called again", Severity.WARNING)
         return messages
 
@@ -214,10 +225,15 @@ class TcpServerInput(Input):
         """Read a client, or take a new one."""
         if ready is not self._listener.socket:
             return super().on_ready(ready, now)
-        client = self._listener.accept(now.steady_s, len(self._reading))
+        messages: list[Message] = []
+        silent = min(self._reading, key=lambda sock: self._reading[sock].heard_s, default=None)
+        has_one = silent and now.steady_s - self._reading[silent].heard_s > YOUNG_S
+        client = self._listener.accept(now.steady_s, len(self._reading) - bool(has_one))
         if client is not None:
+            if silent and len(self._reading) >= self.feed.limits.max_clients:
+                messages = self._lose(silent, now, "it sent nothing sound and made room")
             self._read_from(client, self.feed.channel(now))
-        return []
+        return messages
 
     def tick(self, now: Now) -> list[Message]:
         """Drop who is silent."""
@@ -253,11 +269,12 @@ class UdpInput(Input):
     def on_ready(self, ready: socket.socket, now: Now) -> list[Message]:
         """Read what waits, so much of it."""
         assert self._channel is not None
-        data = bytearray()
+        data, is_all = bytearray(), False
         for _ in range(MAX_DATAGRAMS):
             try:
                 datagram = ready.recv(CHUNK)
             except (BlockingIOError, InterruptedError):
+                is_all = True
                 break
             except OSError as error:  # an ICMP message about something else
                 self.feed.tell("receive_failed", error.strerror or str(error), Severity.WARNING)
@@ -265,8 +282,10 @@ class UdpInput(Input):
             data += datagram if datagram.endswith(b"\n") else datagram + b"\n"
             if len(data) >= CHUNK:
                 break
-        self._is_silent = False
         messages = self.feed.take(self._channel, bytes(data), now)
+        self._is_silent = self._is_silent and self.feed.is_silent(self._channel, now)
+        if is_all:
+            self._channel.catch_up()
         self._pause_if_over(now)
         return messages
 

@@ -23,6 +23,8 @@ from ssm_graph.mission.run_status import OutputStatus
 MAX_CLIENTS: Final = 8
 MAX_WAITING: Final = 64 * 1024
 """Bytes that wait for a client, besides as many in the system; one who is slower is dropped."""
+STAY_S: Final = 2.0
+"""Nobody makes room for another client before."""
 _ROUNDING: Final = 1e-6
 """Of a period: sampling times are not exact."""
 
@@ -107,6 +109,7 @@ class TcpServerOutput(Output):
         super().__init__(form, str(endpoint), events)
         self._selector = selector
         self._waiting: dict[socket.socket, bytearray] = {}
+        self._since_s: dict[socket.socket, float] = {}
         self._listener = Listener(endpoint, selector, self, most=MAX_CLIENTS, tell=self.tell)
         self.port = self._listener.port
 
@@ -159,9 +162,15 @@ class TcpServerOutput(Output):
         self._listener.close()
 
     def _accept(self, now: Now) -> None:
-        client = self._listener.accept(now.steady_s, len(self._waiting))
+        old = [x for x, since_s in self._since_s.items() if now.steady_s - since_s > STAY_S]
+        client = self._listener.accept(now.steady_s, len(self._waiting) - bool(old))
         if client is None:
             return
+        if len(self._waiting) >= MAX_CLIENTS:
+            # Who reads and who does not cannot be told apart before answers wait for him.
+            oldest = min(old, key=lambda x: (not self._waiting[x], self._since_s[x]))
+            self._drop(oldest, f"made room: there are {MAX_CLIENTS} already, it was the oldest")
+        self._since_s[client] = now.steady_s
         client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MAX_WAITING)
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._waiting[client] = bytearray()
@@ -181,6 +190,7 @@ class TcpServerOutput(Output):
 
     def _drop(self, client: socket.socket, why: str, severity: Severity = Severity.WARNING) -> None:
         self._waiting.pop(client, None)
+        self._since_s.pop(client, None)
         let_go(client, self._selector)
         self.tell("client_lost", f"a client: {why}", severity)
 

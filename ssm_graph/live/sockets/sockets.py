@@ -6,18 +6,21 @@ import selectors
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Final, Self
 
 from ssm_graph.live.protocols.decoder import Decoder
 from ssm_graph.live.sockets.endpoints import Endpoint, Transport
-from ssm_graph.live.sockets.feed import Feed, Limits, Now
+from ssm_graph.live.sockets.feed import Feed, Limits, Now, SampleClock
 from ssm_graph.live.sockets.inputs import Input, TcpClientInput, TcpServerInput, UdpInput
 from ssm_graph.live.sockets.outputs import Output, OutputFormat, TcpServerOutput, UdpOutput
 from ssm_graph.live.sockets.serial_port import SerialInput
 from ssm_graph.mission.events import EventLog
-from ssm_graph.mission.navigation import Event
+from ssm_graph.mission.navigation import Event, Severity
 from ssm_graph.mission.run_status import OutputStatus, SourceStatus
 from ssm_graph.sensors.messages import Message
+
+STANDSTILL_S: Final = 2.0
+"""Nobody has looked after the sockets for longer: the process was stopped, or something hung."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +62,8 @@ class SocketHub:
         steady_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._wall_s, self._steady_s = wall_s, steady_s
-        self._begin_s = steady_s()
+        self._begin_s = self._polled_s = steady_s()
+        self._clock = SampleClock()
         self._events = EventLog(wall_s, steady_s)
         self._selector = selectors.DefaultSelector()
         self.inputs: list[Input] = []
@@ -91,6 +95,7 @@ class SocketHub:
         """Wait until something comes, no longer than this; return what messages it completes."""
         ready = self._selector.select(max(0.0, timeout_s))
         now = Now(self._wall_s(), self._steady_s())
+        self._look_for_a_standstill(now, timeout_s)
         messages: list[Message] = []
         for key, mask in ready:
             try:
@@ -105,6 +110,17 @@ class SocketHub:
             with self._events.surviving(link.name, "socket_failed"):
                 messages += link.tick(now) or []  # outputs have none
         return messages
+
+    def _look_for_a_standstill(self, now: Now, timeout_s: float) -> None:
+        """Notice where this process was stopped: what waits came at times that nobody knows."""
+        span_s = now.steady_s - self._polled_s - max(0.0, timeout_s)
+        self._polled_s = now.steady_s
+        if self.inputs and span_s > STANDSTILL_S:
+            text = f"this process stood still for {span_s:.1f} s; what came meanwhile is refused "
+            text += "where only its arrival says when it was"
+            self._events.note("run", "stood_still", text, Severity.WARNING)
+            for source in self.inputs:
+                source.stood_still(span_s)
 
     def wait(self, timeout_s: float) -> None:
         """Look after the outputs so long; for a run whose messages come from elsewhere."""
@@ -153,7 +169,12 @@ class SocketHub:
     def _input(self, config: InputConfig) -> Input:
         where = str(config.endpoint)
         feed = Feed(
-            config.name, where, config.make_decoder, limits=config.limits, events=self._events
+            config.name,
+            where,
+            config.make_decoder,
+            limits=config.limits,
+            events=self._events,
+            clock=self._clock,
         )
         kinds: dict[Transport, type[TcpClientInput | TcpServerInput | UdpInput | SerialInput]] = {
             Transport.TCP_CLIENT: TcpClientInput,

@@ -72,6 +72,8 @@ def _of_pings(mission: Mission) -> BodyVelocities:
     water are left out.
     """
     dvl = mission.dvl.of_ground()
+    if len(dvl.time_s) == 0:
+        return BodyVelocities(dvl.time_s, np.zeros((0, 3)))
     beams_b = dvl.mount.beams_b
     valid = np.isfinite(dvl.speed)
     # Three beams agree with anything: they count only where pings of all beams are rare.

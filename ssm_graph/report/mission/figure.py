@@ -40,6 +40,8 @@ from ssm_graph.report.style import Band, Curve, Panel
 PAGE_INCHES = (8.27, 10.8)
 PAGE_DPI = 170
 AXES_NAMES = ("east", "north", "up")
+MAX_TITLE: Final = 80
+"""Letters of a heading that fit the page."""
 MAX_MARKS: Final = 200
 """Rejected pings that are marked; more would hide the track."""
 WIDE_BEAMS: Final = 4
@@ -92,6 +94,7 @@ def draw_figure(
     errors = metrics.errors if metrics else None
     layout = ConstrainedLayoutEngine(h_pad=0.05, w_pad=0.05)
     figure = Figure(figsize=PAGE_INCHES, layout=layout)
+    title = title if len(title) <= MAX_TITLE else f"{title[:MAX_TITLE]}…"
     heading = figure.suptitle(f"{title or 'Estimate'}\n", x=0.012, ha="left", color=style.INK)
     heading.set(fontsize=12.0, fontweight="bold", linespacing=1.4)
     caption = _caption(estimate, metrics)

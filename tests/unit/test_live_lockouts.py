@@ -1,0 +1,225 @@
+"""Who keeps whom out: alive means sound messages, a clock is remembered, a stop costs no sense."""
+
+from __future__ import annotations
+
+import socket
+from contextlib import ExitStack
+
+import pytest
+
+from ssm_graph.live.protocols.json_messages import JsonDecoder, encode_message
+from ssm_graph.live.protocols.nmea import NmeaDecoder
+from ssm_graph.live.sockets.endpoints import LOOPBACK, Endpoint, Transport
+from ssm_graph.live.sockets.feed import STRANGER_S, SampleClock
+from ssm_graph.live.sockets.inputs import TcpServerInput, UdpInput
+from ssm_graph.live.sockets.outputs import MAX_CLIENTS, OutputFormat, TcpServerOutput
+from ssm_graph.live.sockets.sockets import InputConfig, OutputConfig, SocketHub
+from ssm_graph.sensors.gnss import Fix
+from ssm_graph.sensors.imu import ImuSample
+from ssm_graph.sensors.messages import Message
+from tests.instrument_fixture import Receiver, UdpSender, gga
+
+WALL_S = 1_700_000_000.0
+PERIOD_S = 0.01
+
+
+def sample(stamp_s: float) -> ImuSample:
+    """Return an inertial sample."""
+    return ImuSample(stamp_s, (0.01, 0.0, 0.0), (0.0, 0.0, -9.8))
+
+
+class Steady:
+    """A clock that a test sets."""
+
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def __call__(self) -> float:
+        """Return seconds since some moment."""
+        return self.now_s
+
+
+def hub_with(transport: Transport, clock: Steady, *, nmea: bool = False) -> SocketHub:
+    """Return a hub that listens for one source."""
+    make = NmeaDecoder if nmea else JsonDecoder
+    config = InputConfig("imu", Endpoint(transport, LOOPBACK, 0), make)
+    return SocketHub([config], steady_s=clock, wall_s=lambda: WALL_S + clock.now_s)
+
+
+def port_of(hub: SocketHub) -> int:
+    """Return where it listens."""
+    (source,) = hub.inputs
+    assert isinstance(source, TcpServerInput | UdpInput)
+    return source.port
+
+
+def test_a_byte_now_and_then_keeps_nobody_out() -> None:
+    """Four clients with a byte every half second; the inertial data get in within five seconds."""
+    clock = Steady()
+    with hub_with(Transport.TCP_SERVER, clock) as hub, ExitStack() as stack:
+        receiver = Receiver(hub)
+        address = (LOOPBACK, port_of(hub))
+        slow = [stack.enter_context(socket.create_connection(address)) for _ in range(4)]
+        receiver.until(lambda: len(hub.inputs[0]._reading) == 4)
+        for _ in range(6):
+            clock.now_s += 0.5
+            for client in slow:
+                client.sendall(b"{")
+            receiver.poll()
+        imu = stack.enter_context(socket.create_connection(address))
+        imu.sendall(encode_message(sample(12.0)))
+        receiver.until(lambda: receiver.messages)
+        assert "client_refused" not in receiver.kinds
+        for k in range(40):  # and it stays, whoever calls
+            clock.now_s += 0.5
+            imu.sendall(encode_message(sample(12.5 + 0.5 * k)))
+            stack.enter_context(socket.create_connection(address))
+            receiver.until(lambda n=k: len(receiver.messages) == n + 2)  # type: ignore[misc]
+
+
+def test_sound_messages_that_hold_nothing_for_us_are_alive() -> None:
+    """A receiver without a fix is not called again and again for that."""
+    clock = Steady()
+    with hub_with(Transport.TCP_SERVER, clock, nmea=True) as hub:
+        receiver = Receiver(hub)
+        with socket.create_connection((LOOPBACK, port_of(hub))) as client:
+            for _ in range(30):
+                clock.now_s += 1.0
+                n_bytes = hub.source_status()[0].n_bytes
+                client.sendall(b"$GPGLL,,,,,,V,N*64\r\n")
+                receiver.until(lambda n=n_bytes: hub.source_status()[0].n_bytes > n)  # type: ignore[misc]
+        assert "connection_lost" not in receiver.kinds[:-1]
+
+
+def test_readers_that_do_nothing_block_no_output() -> None:
+    """With all places taken the oldest makes room, after two seconds at the earliest."""
+    clock = Steady()
+    place = Endpoint(Transport.TCP_SERVER, LOOPBACK, 0)
+    config = OutputConfig(OutputFormat.JSON, place)
+    with SocketHub(outputs=[config], steady_s=clock) as hub, ExitStack() as stack:
+        receiver = Receiver(hub)
+        (output,) = hub.outputs
+        assert isinstance(output, TcpServerOutput)
+        address = (LOOPBACK, output.port)
+        for _ in range(MAX_CLIENTS):
+            stack.enter_context(socket.create_connection(address))
+        receiver.until(lambda: output.n_clients == MAX_CLIENTS)
+        clock.now_s += 3.0
+        reader = stack.enter_context(socket.create_connection(address))
+        receiver.until(lambda: "client_lost" in receiver.kinds)
+        assert output.n_clients == MAX_CLIENTS
+        hub.send(OutputFormat.JSON, b"answer\n")
+        reader.settimeout(5.0)
+        assert reader.recv(100) == b"answer\n"
+        for client in output._since_s:  # as if all had just come
+            output._since_s[client] = clock.now_s
+        stack.enter_context(socket.create_connection(address))
+        receiver.until(lambda: "client_refused" in receiver.kinds)
+        assert output.n_clients == MAX_CLIENTS
+
+
+class Sifted:
+    """What a clock lets pass of samples at times of arrival."""
+
+    def __init__(self) -> None:
+        self.clock, self.passed, self.refused = SampleClock(), list[float](), list[float]()
+
+    def give(self, stamps: list[float], steady_s: float) -> None:
+        """Have samples arrive together."""
+        messages: list[Message] = [sample(stamp) for stamp in stamps]
+        passed, refused = self.clock.sift(messages, steady_s)
+        self.passed += [message.time_s for message in passed]
+        self.refused += [message.time_s for message in refused]
+
+    def run(self, begin_s: float, end_s: float, *, offset_s: float = 0.0) -> list[float]:
+        """Have a clock tick for a while."""
+        count = round((end_s - begin_s) / PERIOD_S)
+        stamps = [begin_s + offset_s + k * PERIOD_S for k in range(count)]
+        for stamp in stamps:
+            self.give([stamp], stamp - offset_s)
+        return stamps
+
+
+@pytest.mark.parametrize("off_s", [3600.0, -3600.0, 3.0, 1e9])
+@pytest.mark.parametrize("count", [1, 20, 400])
+def test_strays_of_another_clock_are_refused(off_s: float, count: int) -> None:
+    """Twenty in one datagram ended navigation; now they are refused when the known one goes on."""
+    sifted = Sifted()
+    before = sifted.run(100.0, 102.0)
+    strays = [102.0 + off_s + k * PERIOD_S for k in range(count)]
+    sifted.give(strays, 102.0)
+    after = sifted.run(102.0, 104.0)
+    assert sifted.passed == before + after
+    assert sifted.refused == strays
+
+
+def test_strays_in_a_datagram_are_counted_and_told() -> None:
+    """By the source that they came from."""
+    clock = Steady()
+    with hub_with(Transport.UDP, clock) as hub:
+        receiver = Receiver(hub)
+        receiver.poll()
+        sender = UdpSender(port_of(hub))
+        sender.send(encode_message(sample(50.0)))
+        receiver.until(lambda: receiver.messages)
+        sender.send(b"".join(encode_message(sample(9000.0 + 0.01 * k)) for k in range(20)))
+        sender.send(encode_message(sample(50.01)))
+        receiver.until(lambda: len(receiver.messages) == 2)
+        assert hub.source_status()[0].n_refused == 20
+        (said,) = (event.text for event in receiver.events if event.kind == "clock_refused")
+        assert "20 inertial samples of another clock, stamped +8949.99 s off" in said
+        sender.close()
+
+
+@pytest.mark.parametrize("off_s", [3600.0, -3600.0])
+def test_a_clock_that_was_set_is_believed_after_a_second(off_s: float) -> None:
+    """And not a sample is lost on the way."""
+    sifted = Sifted()
+    before = sifted.run(100.0, 102.0)
+    after = sifted.run(102.0, 104.0, offset_s=off_s)
+    assert sifted.passed == before + after
+    assert not sifted.refused
+
+
+def test_two_clocks_at_once_never_take_turns() -> None:
+    """The one that was there first goes on, however long the other one talks."""
+    sifted, known = Sifted(), []
+    for k in range(1000):
+        steady_s = 100.0 + k * PERIOD_S
+        known.append(steady_s)
+        sifted.give([steady_s], steady_s)
+        sifted.give([5000.0 + k * PERIOD_S], steady_s)
+    assert sifted.passed == known
+
+
+def test_gaps_and_delays_are_no_other_clock() -> None:
+    """An instrument that was off for a minute, a link that held back half a minute."""
+    sifted = Sifted()
+    before = sifted.run(100.0, 102.0)
+    late = [162.0 + k * PERIOD_S for k in range(3000)]
+    sifted.give(late[:1], 162.0)
+    sifted.give(late[1:], 192.0)
+    assert sifted.passed == before + late
+    assert STRANGER_S < 30.0
+
+
+def test_what_came_while_the_process_was_stopped_is_not_stamped_now() -> None:
+    """Half a minute old fixes are refused by name; nobody is called silent for the time."""
+    clock = Steady()
+    fix = Fix(WALL_S + 101.0, 1.1, 0.18, 40.0, (0.5, 0.5, 1.0))
+    later = Fix(WALL_S + 132.0, 1.1, 0.18, 40.0, (0.5, 0.5, 1.0))
+    with hub_with(Transport.UDP, clock, nmea=True) as hub:
+        receiver = Receiver(hub)
+        receiver.poll()
+        sender = UdpSender(port_of(hub))
+        sender.send(gga(fix))
+        clock.now_s += 30.0
+        receiver.until(lambda: hub.source_status()[0].n_refused)
+        assert "stood still" in " ".join(event.text for event in receiver.events)
+        assert "source_silent" not in receiver.kinds
+        clock.now_s += 1.5
+        receiver.poll()
+        sender.send(gga(later))
+        receiver.until(lambda: receiver.messages)
+        assert receiver.messages[0].time_s == pytest.approx(later.time_s, abs=1.0)
+        sender.close()
