@@ -156,7 +156,7 @@ def test_convert_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixtu
     """Counts and notes; a file that is not there, of no kind, and of another one."""
     log = tmp_path / "dvl.txt"
     log.write_text("\n".join(json.dumps(one) for one in reports(5)))
-    words = ["convert", str(log), "--out", str(tmp_path / "m")]
+    words = ["convert", str(log), "--out", str(tmp_path / "m"), "--overwrite"]
     assert main(words) == ExitCode.GOOD
     shown = capsys.readouterr().out
     assert "dvl.csv with 5 rows" in shown
