@@ -14,12 +14,13 @@ class Treatment(Enum):
     LEFT_OUT = "left out there"
     FREED = "estimated and taken off there"
     COVERED = "the sigmas cover what it may have cost"
+    CHANGING = "estimated there, but it was another at each look"
     SAID = "counted as it is"
 
     @property
     def is_harmless(self) -> bool:
         """Whether the answer does not rest on what is wrong."""
-        return self is not Treatment.SAID
+        return self not in (Treatment.SAID, Treatment.CHANGING)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

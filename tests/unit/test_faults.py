@@ -225,6 +225,7 @@ class OneChannel:
 
     width = 3
     columns = slice(0, 3)
+    rates = None
 
     def of(self, name: str) -> OneChannel:
         """Return the only one."""
@@ -244,6 +245,7 @@ def test_chi_square_of_every_stretch(course: Course) -> None:
     hypothesis = Hypothesis("any", "any", combined, sigma, str, course)
     judged = Judged(evidence, grid, OneChannel())  # type: ignore[arg-type]
     table, _ = judged.table(hypothesis)
+    middle = np.array([0.05, 0.15, 0.25, 0.35, 0.445])
     by_block = columns.reshape(90, 5, 3) @ combined
     for begin in range(5):
         for end in range(begin + 1, 6):
@@ -252,6 +254,7 @@ def test_chi_square_of_every_stretch(course: Course) -> None:
             own = {
                 Course.CONSTANT: own.sum(axis=1),
                 Course.TREND: np.hstack([own.sum(axis=1), np.einsum("rbd,b->rd", own, since)]),
+                Course.RAMP: np.einsum("rbd,b->rd", own, middle[begin:end] - since[0]),
                 Course.ANYTHING: own.reshape(90, -1),
             }[course]
             prior = np.diag(np.tile(sigma**-2.0, own.shape[1] // 2))

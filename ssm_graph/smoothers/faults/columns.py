@@ -32,6 +32,9 @@ SCALE: Final = "scale"
 MOUNTING: Final = "mounting"
 IMU: Final = "IMU"
 
+TREND_S = 100.0
+"""s, in which the rate of a trend is counted here."""
+
 KERNEL = LogKernel()
 """Weighs measurements by what they miss beside the running median: spikes must not make a fault,
 and what lasts must not be weighed away."""
@@ -47,6 +50,9 @@ class Channel(NamedTuple):
     name: str
     columns: slice
     """Among those of one block"""
+    rates: slice | None = None
+    """Those of the same numbers where they grow by one in :data:`TREND_S`, from the mission's begin
+    on; without, a rate goes in steps from block to block"""
 
 
 def beside_median(values: Array) -> Array:
@@ -196,12 +202,17 @@ class Channels:
         sizes = {BEAM: beams.n_beams, BOTTOM: 3, SCALE: 1, MOUNTING: 3}
         sizes |= {aid.name: aid.dim for aid in linear.aids if len(aid)}
         sizes[IMU] = 6
-        ends = np.cumsum(list(sizes.values())).tolist()
+        dims = {aid.name: aid.dim for aid in linear.aids if len(aid)}
+        widths = [*sizes.values(), *dims.values()]
+        slices = [
+            slice(end - size, end)
+            for size, end in zip(widths, np.cumsum(widths).tolist(), strict=True)
+        ]
+        rates = dict(zip(dims, slices[len(sizes) :], strict=True))
         self.all = tuple(
-            Channel(name, slice(end - size, end))
-            for (name, size), end in zip(sizes.items(), ends, strict=True)
+            Channel(name, own, rates.get(name)) for name, own in zip(sizes, slices, strict=False)
         )
-        self.width = ends[-1]
+        self.width = sum(widths)
         self.beams = self._beams()
         self.between = self._between()
         self.aids = {aid.name: aid.root_information for aid in linear.aids if len(aid)}
@@ -247,12 +258,15 @@ class Channels:
     def _columns(self) -> Columns:
         linear = self._linear
         scale = np.sqrt(linear.beam_weights) / linear.problem.beams.sigma
-        rows = [self.beams * scale[:, None]]
+        rows, keyframe_s = [self.beams * scale[:, None]], linear.problem.keyframe_s
         for aid in linear.aids:
             own = np.zeros((len(aid), aid.dim, self.width))
             if len(aid):
                 root = np.sqrt(linear.aid_weights[aid.name])[:, None, None] * aid.root_information
-                own[:, :, self.of(aid.name).columns] = root
+                channel = self.of(aid.name)
+                own[:, :, channel.columns] = root
+                since = (keyframe_s[aid.keyframe] - keyframe_s[0]) / TREND_S
+                own[:, :, channel.rates] = root * since[:, None, None]
             rows.append(own.reshape(-1, self.width))
         between = np.zeros((*linear.between.missed.shape, self.width))
         between[:, :STATE_DIM, self.of(IMU).columns] = self.between

@@ -32,6 +32,12 @@ LEAST_PER_NUMBER = 2.0
 """And by itself, where it may be anything: that fits more than its tail allows for."""
 
 
+USUAL = -6.0
+"""Handicap of a depth that drifts: tides, air pressure and warm-up make all of them do."""
+RISING_M_PER_S = 0.05
+"""Sigma of the vertical velocity of what is taken for the bottom: layers rise and sink slowly."""
+
+
 AT_AN_END = 4.5
 """Chi-square by which a stretch to the begin or the end of the mission needs less, and twice as
 much one over all of it: there are N and 1 of these, of others N^2 / 2."""
@@ -42,6 +48,7 @@ class Course(Enum):
 
     CONSTANT = "by a constant"
     TREND = "by a constant and a rate"
+    RAMP = "by a rate, from nothing on"
     ANYTHING = "by anything"
 
 
@@ -63,6 +70,11 @@ class Hypothesis:
     """Chi-square by which it has to be better than others."""
     tail: float = 2e-7
     """Probability of one stretch's chi-square where nothing is off"""
+
+    @property
+    def has_rate(self) -> bool:
+        """Whether one of its numbers grows with time."""
+        return self.course in (Course.TREND, Course.RAMP)
 
     @property
     def n_numbers(self) -> int:
@@ -91,7 +103,7 @@ def hypotheses_of(channels: Channels, *, significance: float) -> tuple[Hypothesi
     found = [*_of_beams(channels), *_of_the_array(channels), *_of_inertial()]
     for channel in channels.all:
         if channel.name not in (BEAM, BOTTOM, SCALE, MOUNTING, IMU):
-            found.extend(_of_aid(channel.name, channel.columns.stop - channel.columns.start))
+            found.extend(of_aid(channel.name, channel.columns.stop - channel.columns.start))
     return tuple(replace(one, tail=tail) for one in found)
 
 
@@ -117,7 +129,8 @@ def _of_beams(channels: Channels) -> Iterator[Hypothesis]:
 
 
 def _of_the_array(channels: Channels) -> Iterator[Hypothesis]:
-    yield Hypothesis("DVL", BOTTOM, np.eye(3), np.full(3, 3.0), _bottom)
+    yield Hypothesis("DVL", BOTTOM, np.eye(3)[:, :2], np.full(2, 3.0), _bottom)
+    yield Hypothesis("DVL", BOTTOM, np.eye(3), np.array([3.0, 3.0, RISING_M_PER_S]), _bottom)
     if len(channels.beams_d) >= 3:
         yield Hypothesis("DVL", BEAM, channels.beams_d, np.full(3, 3.0), _axes)
     yield Hypothesis("DVL", SCALE, np.eye(1), np.full(1, 1.0), _scale)
@@ -130,12 +143,14 @@ def _of_inertial() -> Iterator[Hypothesis]:
     yield Hypothesis("gyros", IMU, unit[:, 3:], np.full(3, 0.1), _rates, handicap=12.0)
 
 
-def _of_aid(name: str, dim: int) -> Iterator[Hypothesis]:
+def of_aid(name: str, dim: int) -> Iterator[Hypothesis]:
+    """Return the hypotheses of an aid of so many components, by its name."""
     unit, size = AIDS.get(name, ("", 1e3))
     say = _place if dim == 3 else lambda s: f"{s[0]:+.3g} {unit}".rstrip()
     one = Hypothesis(name, name, np.eye(dim), np.full(dim, size), say)
     for course in Course:
-        yield replace(one, course=course)
+        is_usual = name == "depth" and course is Course.RAMP
+        yield replace(one, course=course, handicap=USUAL if is_usual else 0.0)
 
 
 AIDS = {
@@ -158,8 +173,9 @@ def _speeds(s: Array) -> str:
 
 def _bottom(s: Array) -> str:
     speed, to = math.hypot(s[0], s[1]), math.degrees(math.atan2(s[0], s[1])) % 360.0
+    up = f" and {s[2]:+.3f} m/s up" if len(s) == 3 else ""
     return (
-        f"what its beams see moves at {speed:.3f} m/s towards {to:.0f} deg and {s[2]:+.3f} m/s up: "
+        f"what its beams see moves at {speed:.3f} m/s towards {to:.0f} deg{up}: "
         "a layer above the bottom, a bottom that drifts, or the water taken for it"
     )
 

@@ -8,12 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps
 from ssm_graph.engine.error_state import POSITION
 from ssm_graph.engine.evidence import ChainEvidence, Columns, Evidence
-from ssm_graph.smoothers.faults.columns import IMU, Channels, Linear
+from ssm_graph.smoothers.faults.columns import IMU, TREND_S, Channels, Linear
 from ssm_graph.smoothers.faults.hypotheses import (
     AT_AN_END,
     LEAST_PER_NUMBER,
@@ -23,8 +24,6 @@ from ssm_graph.smoothers.faults.hypotheses import (
 )
 from ssm_graph.smoothers.faults.nuisances import WIDER, WIDTHS, Nuisances
 
-TREND_S = 100.0
-"""s, in which the rate of a trend is counted here."""
 LEAST_FORCE = 10.0
 """m/s^2, of a jump: it is no larger."""
 MEDIAN_OF_THREE = 2.366
@@ -61,6 +60,17 @@ class Grid(NamedTuple):
         first = np.flatnonzero(np.diff(number, prepend=-1.0))
         ends_s = np.append(begin_s[first[1:]], begin_s[-1] + self.length_s[-1])
         return first, 0.5 * (begin_s[first] + ends_s)
+
+    @property
+    def begin_since(self) -> Array:
+        """(N,) what the rate of a trend counts where each block begins, from the first one on."""
+        return np.asarray(self.middle_since - 0.5 * self.length_s / TREND_S)
+
+    @property
+    def middle_since(self) -> Array:
+        """(N,) the same in their middles."""
+        begin_s = self.middle_s[0] - 0.5 * self.length_s[0]
+        return np.asarray((self.middle_s - begin_s) / TREND_S)
 
     @property
     def n_blocks(self) -> int:
@@ -304,23 +314,23 @@ class Judged:
         if hypothesis.course is Course.ANYTHING:
             return self._table_of_anything(hypothesis)
         n = self.grid.n_blocks
-        score, information = self._projected(hypothesis)
-        moments = moments_of(hypothesis, self.grid)
-        d = score.shape[1] * moments.shape[1]
-        score = (moments[:, :, None] * score[:, None, :]).reshape(n, d)
-        if moments.shape[1] > 1:
-            by_begin = moments[:, :, None, None, None, None] * information[:, None, :, :, None, :]
-            information = by_begin * moments[:, :, None]
+        score, information = self._by_moments(hypothesis)
+        d = score.shape[1]
         summed = np.zeros((n + 1, d, n + 1, d))
-        summed[1:, :, 1:] = information.reshape(n, d, n, d).cumsum(axis=0).cumsum(axis=2)
+        summed[1:, :, 1:] = information.cumsum(axis=0).cumsum(axis=2)
         begin, end = np.triu_indices(n + 1, 1)
         swapped = summed.transpose(0, 2, 1, 3)
         inner = (
             swapped[end, end] + swapped[begin, begin] - swapped[begin, end] - swapped[end, begin]
         )
-        prior = np.diag(1.0 / np.tile(hypothesis.sigma, moments.shape[1]) ** 2)
         summed_score = np.concatenate([np.zeros((1, d)), score.cumsum(axis=0)])
         of_stretch = summed_score[end] - summed_score[begin]
+        if hypothesis.has_rate:
+            inner, of_stretch = _from_begin(inner, of_stretch, self.grid.begin_since[begin])
+        if hypothesis.course is Course.RAMP:
+            d //= 2
+            inner, of_stretch = inner[:, d:, d:], of_stretch[:, d:]
+        prior = np.diag(1.0 / np.resize(hypothesis.sigma, d) ** 2)
         if d == 1:
             square = of_stretch[:, 0] ** 2 / (inner[:, 0, 0] + prior[0, 0])
         else:
@@ -347,41 +357,78 @@ class Judged:
         extra = (PER_NUMBER - LEAST_PER_NUMBER) * (d * np.maximum(coarse, 1.0) - 1.0)
         return chi_sq, needed[count] + extra
 
+    def _by_moments(self, hypothesis: Hypothesis) -> tuple[Array, Array]:
+        """Return the same as :meth:`_projected` with a rate behind, where there is one."""
+        if not hypothesis.has_rate:
+            return self._projected(hypothesis)
+        channel, C, n = (
+            self.channels.of(hypothesis.channel),
+            hypothesis.combined,
+            len(self.grid.edges) - 1,
+        )
+        if channel.rates is not None:
+            return self._summed(np.r_[channel.columns, channel.rates], block_diag(C, C))
+        score, information = self._projected(hypothesis)
+        moments = np.column_stack([np.ones(n), self.grid.middle_since])
+        d = 2 * score.shape[1]
+        score = (moments[:, :, None] * score[:, None, :]).reshape(n, d)
+        by_begin = moments[:, :, None, None, None, None] * information[:, None, :, :, None, :]
+        return score, (by_begin * moments[:, :, None]).reshape(n, d, n, d)
+
     def _projected(self, hypothesis: Hypothesis) -> tuple[Array, Array]:
         """Return score (N, d) and information (N, d, N, d) of a hypothesis in each block."""
-        n, width = self.grid.n_blocks, self.channels.width
         own = self.channels.of(hypothesis.channel).columns
-        C = hypothesis.combined
-        information = self.evidence.information.reshape(n, width, n, width)[:, own, :, own]
-        # Slices on both sides of an index keep their places.
+        return self._summed(np.r_[own], hypothesis.combined)
+
+    def _summed(self, own: NDArray[np.intp], C: Array) -> tuple[Array, Array]:
+        """Return score and information of sums (c, d) of some columns (c,) in each block."""
+        n, width = self.grid.n_blocks, self.channels.width
+        information = self.evidence.information.reshape(n, width, n, width)
+        information = information[:, own][:, :, :, own]
         projected = np.einsum("ap,iajb,bq->ipjq", C, information, C, optimize=True)
         return self.evidence.score.reshape(n, width)[:, own] @ C, projected
+
+
+def _from_begin(inner: Array, score: Array, since: Array) -> tuple[Array, Array]:
+    """Return information (P, 2 d, 2 d) and score (P, 2 d) with rates from each begin on.
+
+    ``since`` (P,) is what rates counted from the mission's begin on are there.
+    """
+    d = score.shape[1] // 2
+    turned = np.tile(np.eye(2 * d), (len(since), 1, 1))
+    turned[:, d:, :d] = -since[:, None, None] * np.eye(d)
+    return turned @ inner @ turned.swapaxes(1, 2), (turned @ score[..., None])[..., 0]
 
 
 def combined_of(fault: Fault, grid: Grid, channels: Channels) -> tuple[Array, Array]:
     """Return the columns of a fault (N w, m) as sums of those of a grid, and its prior."""
     hypothesis, width = fault.hypothesis, channels.width
-    own = channels.of(hypothesis.channel).columns
+    channel, C = channels.of(hypothesis.channel), hypothesis.combined
     begin, end = np.searchsorted(grid.edges, [fault.begin, fault.end]).tolist()
-    d = hypothesis.combined.shape[1]
+    d = C.shape[1]
+    made = np.zeros((grid.n_blocks, width, (end - begin) * d))
     if hypothesis.course is Course.ANYTHING:
-        shapes = np.eye(end - begin)
+        for block in range(begin, end):
+            first = (block - begin) * d
+            made[block, channel.columns, first : first + d] = C
     else:
-        shapes = moments_of(hypothesis, grid)[begin:end]
-        if hypothesis.course is Course.TREND:
-            # The rate counts from the begin of the stretch on.
-            shapes[:, 1] -= shapes[0, 1] - 0.5 * grid.length_s[begin] / TREND_S
-    made = np.zeros((grid.n_blocks, width, shapes.shape[1] * d))
-    for block, shape in zip(range(begin, end), shapes, strict=True):
-        made[block, own] = np.kron(shape, hypothesis.combined)
-    sigma = np.tile(hypothesis.sigma, shapes.shape[1])
+        made = np.zeros((grid.n_blocks, width, 2 * d))
+        made[begin:end, channel.columns, :d] = C
+        # The rate counts from the begin of the stretch on.
+        since = -np.full(end - begin, grid.begin_since[begin])
+        if channel.rates is not None:
+            made[begin:end, channel.rates, d:] = C
+        else:
+            since += grid.middle_since[begin:end]
+        made[begin:end, channel.columns, d:] = since[:, None, None] * C
+        made = made[:, :, OF_COURSE[hypothesis.course](d)]
+    sigma = np.resize(hypothesis.sigma, made.shape[2])
     return made.reshape(grid.n_blocks * width, -1), np.diag(1.0 / sigma**2)
 
 
-def moments_of(hypothesis: Hypothesis, grid: Grid) -> Array:
-    """Return how a hypothesis goes on over the blocks (N, 1 or 2)."""
-    one = np.ones((grid.n_blocks, 1))
-    if hypothesis.course is not Course.TREND:
-        return one
-    since = (grid.middle_s - grid.middle_s.mean()) / TREND_S
-    return np.column_stack([one, since])
+OF_COURSE = {
+    Course.CONSTANT: lambda d: slice(0, d),
+    Course.TREND: lambda d: slice(0, 2 * d),
+    Course.RAMP: lambda d: slice(d, 2 * d),
+}
+"""Which of d constants and d rates a course has."""

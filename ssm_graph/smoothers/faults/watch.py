@@ -26,11 +26,12 @@ from ssm_graph.smoothers.faults.columns import (
     IMU,
     MOUNTING,
     SCALE,
+    TREND_S,
     Channels,
     linear_of_steps,
 )
 from ssm_graph.smoothers.faults.hypotheses import Course
-from ssm_graph.smoothers.faults.judged import TREND_S, Fault, Judge
+from ssm_graph.smoothers.faults.judged import Fault, Judge
 from ssm_graph.smoothers.faults.nuisances import Nuisances
 from ssm_graph.smoothers.faults.search import FaultSearch, Look, with_rivals
 
@@ -57,6 +58,10 @@ class FaultWatch:
         self._problem, self._search = problem, search
         self._bare = None if search is None else GraphLinearizer(problem)
         self._found: list[Fault] = []
+        self._gone: list[Fault] = []
+        """What the last of all looks let go, and"""
+        self._new: list[Fault] = []
+        """what it found, if the search ended without settling"""
         self._beams_out = np.zeros(len(problem.beams.speed), bool)
         self.aids_out = np.zeros(sum(len(aid) for aid in aids_of(problem)), bool)
         """(A,) measurements of aids that may have read anything"""
@@ -99,6 +104,9 @@ class FaultWatch:
         self._is_done = is_same or self._n_looks >= MOST_LOOKS
         if is_same:
             return None
+        if self._is_done:
+            self._gone = beside(self._found, found, self._problem.keyframe_s)
+            self._new = beside(found, self._found, self._problem.keyframe_s)
         self._found = sorted(found, key=lambda fault: (fault.begin, fault.end))
         self._leave_out(channels)
         freed, problem = self._freed(channels), self._problem
@@ -169,7 +177,8 @@ class FaultWatch:
         """Return what was found, with the sizes that the answer gives it."""
         end_s = np.append(self._problem.keyframe_s, self._problem.keyframe_s[-1])
         found = []
-        for fault in self._sized(states):
+        new = [(one.hypothesis, one.begin, one.end) for one in self._new]
+        for fault in [*self._sized(states), *self._gone]:
             hypothesis = fault.hypothesis
             rivals = [
                 f"{one.hypothesis.sensor}, {end_s[one.begin]:.0f}-{end_s[one.end]:.0f} s, "
@@ -177,6 +186,11 @@ class FaultWatch:
                 for one in fault.rivals
             ]
             treatment = Treatment.FREED if fault.n_constants else Treatment.LEFT_OUT
+            treatment = Treatment.COVERED if rivals else treatment
+            if any(fault is one for one in self._gone):
+                treatment = Treatment.SAID
+            elif (hypothesis, fault.begin, fault.end) in new:
+                treatment = Treatment.CHANGING
             found.append(
                 DetectedFault(
                     sensor=hypothesis.sensor,
@@ -185,7 +199,7 @@ class FaultWatch:
                     end_s=float(end_s[fault.end]),
                     chi_sq=fault.chi_sq,
                     dof=hypothesis.n_numbers,
-                    treatment=Treatment.COVERED if rivals else treatment,
+                    treatment=treatment,
                     rivals=tuple(rivals),
                     cost_m=fault.cost_m,
                 )
@@ -198,10 +212,12 @@ def said(fault: Fault) -> str:
     hypothesis, sizes = fault.hypothesis, fault.sizes
     if sizes is None:
         return "reads what nothing else agrees with"
-    d = hypothesis.combined.shape[1]
+    d, minute = hypothesis.combined.shape[1], 60.0 / TREND_S
+    if hypothesis.course is Course.RAMP:
+        return f"from nothing on, and within each minute by {hypothesis.say(minute * sizes)}"
     text = hypothesis.say(sizes[:d])
     if hypothesis.course is Course.TREND:
-        text += f", and within a minute more by {hypothesis.say(60.0 / TREND_S * sizes[d:])}"
+        text += f", and within a minute more by {hypothesis.say(minute * sizes[d:])}"
     return text
 
 
@@ -222,6 +238,13 @@ def same_faults(some: Sequence[Fault], others: Sequence[Fault], keyframe_s: Arra
         )
 
     return keys(some) == keys(others)
+
+
+def beside(some: Sequence[Fault], others: Sequence[Fault], keyframe_s: Array) -> list[Fault]:
+    """Return those of some that are not among others."""
+    return [
+        one for one in some if not any(same_faults([one], [other], keyframe_s) for other in others)
+    ]
 
 
 def _inside(keyframe: NDArray[np.intp], fault: Fault) -> NDArray[np.bool_]:
@@ -254,8 +277,10 @@ def _over(columns: Array, keyframe: NDArray[np.intp], fault: Fault, keyframe_s: 
     """Return columns (N, ..., d) of rows at keyframes (N,) over the stretch of a fault."""
     inside = _inside(keyframe, fault).reshape(-1, *[1] * (columns.ndim - 1))
     constant = columns * inside
-    if fault.hypothesis.course is not Course.TREND:
+    if not fault.hypothesis.has_rate:
         return np.asarray(constant)
     since = (keyframe_s[keyframe] - keyframe_s[fault.begin]) / TREND_S
     rate = constant * since.reshape(inside.shape)
+    if fault.hypothesis.course is Course.RAMP:
+        return np.asarray(rate)
     return np.concatenate([constant, rate], axis=-1)
