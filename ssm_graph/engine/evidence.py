@@ -25,6 +25,9 @@ from scipy.linalg.blas import dsyrk
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.chain import ChainSolution
 
+TILE = 256
+"""Rows and columns that are mirrored at a time."""
+
 
 class Evidence(NamedTuple):
     """What the data say of the sizes of columns, the trajectory eliminated."""
@@ -46,10 +49,10 @@ class Evidence(NamedTuple):
         root = np.linalg.cholesky(inner)
         right = np.column_stack([crossed, score])
         half = solve_triangular(root, right, lower=True, check_finite=False, overwrite_b=True)
-        explained = dsyrk(-1.0, half[:, :-1], beta=1.0, c=self.information, trans=1, lower=1)
-        lower = np.tril(explained)
-        information = lower + np.tril(explained, -1).T
-        return Evidence(self.score - half[:, :-1].T @ half[:, -1], information)
+        # BLAS counts by columns: the transpose, which is the same, needs no turning round.
+        explained = dsyrk(-1.0, half[:, :-1], beta=1.0, c=self.information.T, trans=1, lower=1)
+        _mirror_lower(explained)
+        return Evidence(self.score - half[:, :-1].T @ half[:, -1], explained.T)
 
     def freed(self, combined: Array, prior: Array) -> Evidence:
         """Return the same once ``combined`` (C, m), sums of columns, may be of any size."""
@@ -148,8 +151,8 @@ class ChainEvidence:
             information[now, until_now] -= incoming[:, now].T @ ahead @ incoming[:, until_now]
         information[common] -= incoming[:, common].T @ self._ahead[blocks[-1]] @ incoming
         # Of two blocks, what the later one knows of the earlier one stands below the diagonal.
-        lower = np.tril(information)
-        return Evidence(score, lower + np.tril(information, -1).T)
+        _mirror_lower(information)
+        return Evidence(score, information)
 
     def each(self, blocks: NDArray[np.intp], own: Columns) -> tuple[Array, Array]:
         """Return score (N, B) and information (N, B, B) of the columns of each block alone.
@@ -247,3 +250,12 @@ class ChainEvidence:
         place = np.argsort(order)
         flat = [history[place[i], : length[i]].reshape(-1, size) for i in range(len(length))]
         return flat, [onward[place[i]] for i in range(len(length))]
+
+
+def _mirror_lower(square: Array) -> None:
+    """Set what is above the diagonal to what is below it, in tiles that fit the cache."""
+    for begin in range(0, len(square), TILE):
+        end = begin + TILE
+        square[:begin, begin:end] = square[begin:end, :begin].T
+        diagonal = square[begin:end, begin:end]
+        diagonal[:] = np.tril(diagonal) + np.tril(diagonal, -1).T
