@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
@@ -57,7 +57,8 @@ def test_nothing_is_found_in_pieces_where_nothing_is() -> None:
 def test_a_mission_of_one_piece_is_searched_as_a_whole() -> None:
     """Whatever longer the piece may be."""
     fault = Fault((1,), 105.0, 145.0, 0.1)
-    assert found_in(fault, piece_s=DURATION_S) == found_in(fault, piece_s=1e6)
+    whole, longer = found_in(fault, piece_s=DURATION_S), found_in(fault, piece_s=1e6)
+    assert [astuple(one) for one in whole] == [astuple(one) for one in longer]
 
 
 def test_pieces_overlap_by_half() -> None:
@@ -100,6 +101,18 @@ def test_what_one_piece_alone_finds_counts_in_its_middle() -> None:
         ("DVL beam 2", 20, 75),
         ("DVL beam 3", 75, 130),
     ]
+
+
+def test_rows_are_left_out_across_a_seam_only_where_both_pieces_say_so() -> None:
+    """They could say no more later, and the next piece may know better what they are."""
+    anything = replace(BEAM_2, course=Course.ANYTHING)
+    assert stretches([Found(anything, 20, 100)], [Found(BEAM_2, 50, 130)]) == [
+        ("DVL beam 2", 75, 130)
+    ]
+    assert stretches([Found(anything, 20, 100)], [Found(anything, 50, 130)]) == [
+        ("DVL beam 2", 20, 130)
+    ]
+    assert stretches([Found(anything, 20, 60)], []) == [("DVL beam 2", 20, 60)]
 
 
 def test_rivals_are_joined_as_their_faults_are() -> None:

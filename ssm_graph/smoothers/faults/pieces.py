@@ -8,7 +8,7 @@ find of the same is joined.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -94,7 +94,7 @@ def joined_of(found: Iterable[tuple[Piece, Iterable[Fault]]]) -> list[Fault]:
                 now.append(joined(before, fault, piece.from_seam))
             elif fault.begin + fault.end > 2 * piece.from_seam:
                 is_cut = 0 < piece.begin == fault.begin
-                now.append(replace(fault, begin=piece.from_seam) if is_cut else fault)
+                now.extend(_cut(fault, begin=piece.from_seam) if is_cut else [fault])
         done.extend(_until(last, piece.from_seam, last_end))
         last, last_end = now, piece.end
     return [*done, *last]
@@ -117,10 +117,19 @@ def joined(one: Fault, later: Fault, seam: int) -> Fault:
     return replace(stronger, begin=begin, end=end, rivals=rivals)
 
 
-def _until(faults: Iterable[Fault], seam: int, piece_end: int) -> list[Fault]:
-    """Return faults that the piece after theirs does not have."""
-    kept = (one for one in faults if one.begin + one.end <= 2 * seam)
-    return [replace(one, end=seam) if one.end == piece_end else one for one in kept]
+def _until(faults: Iterable[Fault], seam: int, piece_end: int) -> Iterator[Fault]:
+    """Yield faults that the piece after theirs does not have."""
+    for fault in faults:
+        if fault.begin + fault.end <= 2 * seam:
+            yield from _cut(fault, end=seam) if fault.end == piece_end else [fault]
+
+
+def _cut(fault: Fault, **edge: int) -> list[Fault]:
+    """Return a fault to a seam, none of rows that would count for nothing.
+
+    Those can say no more in later looks, in which the piece beyond may have taken over its name.
+    """
+    return [] if fault.hypothesis.course is Course.ANYTHING else [replace(fault, **edge)]
 
 
 def _same_of(faults: Iterable[Fault], other: Fault) -> Fault | None:
