@@ -94,7 +94,7 @@ def joined_of(found: Iterable[tuple[Piece, Iterable[Fault]]]) -> list[Fault]:
                 now.append(joined(before, fault, piece.from_seam))
             elif fault.begin + fault.end > 2 * piece.from_seam:
                 is_cut = 0 < piece.begin == fault.begin
-                now.extend(_cut(fault, begin=piece.from_seam) if is_cut else [fault])
+                now.extend(_cut(fault, piece.from_seam, fault.end) if is_cut else [fault])
         done.extend(_until(last, piece.from_seam, last_end))
         last, last_end = now, piece.end
     return [*done, *last]
@@ -121,15 +121,17 @@ def _until(faults: Iterable[Fault], seam: int, piece_end: int) -> Iterator[Fault
     """Yield faults that the piece after theirs does not have."""
     for fault in faults:
         if fault.begin + fault.end <= 2 * seam:
-            yield from _cut(fault, end=seam) if fault.end == piece_end else [fault]
+            yield from _cut(fault, fault.begin, seam) if fault.end == piece_end else [fault]
 
 
-def _cut(fault: Fault, **edge: int) -> list[Fault]:
-    """Return a fault to a seam, none of rows that would count for nothing.
+def _cut(fault: Fault, begin: int, end: int) -> list[Fault]:
+    """Return a fault on one side of a seam, none of rows that would count for nothing.
 
     Those can say no more in later looks, in which the piece beyond may have taken over its name.
     """
-    return [] if fault.hypothesis.course is Course.ANYTHING else [replace(fault, **edge)]
+    return (
+        [] if fault.hypothesis.course is Course.ANYTHING else [replace(fault, begin=begin, end=end)]
+    )
 
 
 def _same_of(faults: Iterable[Fault], other: Fault) -> Fault | None:
