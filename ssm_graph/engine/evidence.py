@@ -25,6 +25,9 @@ from scipy.linalg.blas import dsyrk
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.chain import ChainSolution
 
+TILE = 256
+"""Rows and columns that are mirrored at a time."""
+
 
 class Evidence(NamedTuple):
     """What the data say of the sizes of columns, the trajectory eliminated."""
@@ -46,10 +49,10 @@ class Evidence(NamedTuple):
         root = np.linalg.cholesky(inner)
         right = np.column_stack([crossed, score])
         half = solve_triangular(root, right, lower=True, check_finite=False, overwrite_b=True)
-        explained = dsyrk(-1.0, half[:, :-1], beta=1.0, c=self.information, trans=1, lower=1)
-        lower = np.tril(explained)
-        information = lower + np.tril(explained, -1).T
-        return Evidence(self.score - half[:, :-1].T @ half[:, -1], information)
+        # BLAS counts by columns: the transpose, which is the same, needs no turning round.
+        explained = dsyrk(-1.0, half[:, :-1], beta=1.0, c=self.information.T, trans=1, lower=1)
+        _mirror_lower(explained)
+        return Evidence(self.score - half[:, :-1].T @ half[:, -1], explained.T)
 
     def freed(self, combined: Array, prior: Array) -> Evidence:
         """Return the same once ``combined`` (C, m), sums of columns, may be of any size."""
@@ -118,6 +121,7 @@ class ChainEvidence:
         shared : C columns.
         """
         width, n_blocks, n = own.own.shape[1], len(blocks) - 1, self._n
+        own, shared = self._along(blocks, own), self._along(blocks, shared)
         both = Columns(
             np.hstack([own.own, shared.own]),
             np.concatenate([own.between, shared.between], axis=2),
@@ -131,7 +135,7 @@ class ChainEvidence:
         for i, (begin, end) in enumerate(itertools.pairwise(blocks.tolist())):
             now = np.arange(i * width, (i + 1) * width)
             active, before = np.concatenate([now, common]), slice(0, i * width)
-            dense, missed = self._inside(begin, end, both)
+            dense, missed = self._inside(blocks[0], begin, end, both)
             score[active] += dense.T @ missed
             flat = history[i]
             flat[:, n + width :] += flat[:, :n] @ incoming[:, common]
@@ -147,47 +151,63 @@ class ChainEvidence:
             information[now, until_now] -= incoming[:, now].T @ ahead @ incoming[:, until_now]
         information[common] -= incoming[:, common].T @ self._ahead[blocks[-1]] @ incoming
         # Of two blocks, what the later one knows of the earlier one stands below the diagonal.
-        lower = np.tril(information)
-        return Evidence(score, lower + np.tril(information, -1).T)
+        _mirror_lower(information)
+        return Evidence(score, information)
 
     def each(self, blocks: NDArray[np.intp], own: Columns) -> tuple[Array, Array]:
         """Return score (N, B) and information (N, B, B) of the columns of each block alone.
 
         Parameters as of :meth:`of`.
         """
-        n, width = self._n, own.own.shape[1]
+        n, width, own = self._n, own.own.shape[1], self._along(blocks, own)
         history, outgoing = self._histories(blocks, own, width)
         score, information = np.zeros((len(history), width)), np.zeros((len(history), width, width))
         for i, (begin, end) in enumerate(itertools.pairwise(blocks.tolist())):
-            dense, missed = self._inside(begin, end, own)
+            dense, missed = self._inside(blocks[0], begin, end, own)
             y, onward = history[i][:, n:], outgoing[i][:, n:]
             score[i] = dense.T @ missed
             information[i] = dense.T @ dense - y.T @ y - onward.T @ self._ahead[end] @ onward
         return score, information
 
-    def _inside(self, begin: int, end: int, columns: Columns) -> tuple[Array, Array]:
-        """Return columns and errors of all rows of a block."""
+    def _along(self, blocks: NDArray[np.intp], columns: Columns) -> Columns:
+        """Return columns on the rows of these blocks alone."""
+        begin, end = blocks[[0, -1]]
         rows = slice(self._first_row[begin], self._first_row[end])
-        between = columns.between[begin:end]
-        dense = np.concatenate([columns.own[rows], between.reshape(-1, between.shape[2])])
+        return Columns(columns.own[rows], columns.between[begin:end])
+
+    def _inside(self, first: int, begin: int, end: int, columns: Columns) -> tuple[Array, Array]:
+        """Return columns and errors of all rows of a block; those of columns are from first on."""
+        rows = slice(self._first_row[begin], self._first_row[end])
+        skipped = self._first_row[first]
+        between = columns.between[begin - first : end - first]
+        own = columns.own[rows.start - skipped : rows.stop - skipped]
+        dense = np.concatenate([own, between.reshape(-1, between.shape[2])])
         missed = [self._own.missed[rows], self._between.missed[begin:end].ravel()]
         return dense, np.concatenate(missed)
 
-    def _loads(self, columns: Columns) -> tuple[Array, Array]:
-        """Return ``R^-T A'c`` (K, n, C) of own rows and those to the next, and of those before."""
+    def _loads(self, blocks: NDArray[np.intp], columns: Columns) -> tuple[Array, Array]:
+        """Return ``R^-T A'c`` (K, n, C) of own rows and those to the next, and of those before.
+
+        K are the keyframes of the blocks, and the first one after them if there is one.
+        """
         n, width = self._n, columns.own.shape[1]
-        count = np.diff(self._first_row)
-        slot = np.arange(len(self._own.keyframe)) - self._first_row[self._own.keyframe]
-        jacobian = np.zeros((self._n_keyframes, int(count.max(initial=0)), n))
+        begin, end = blocks[[0, -1]].tolist()
+        rows = slice(self._first_row[begin], self._first_row[end])
+        keyframe = self._own.keyframe[rows]
+        slot = np.arange(rows.start, rows.stop) - self._first_row[keyframe]
+        count = np.diff(self._first_row[begin : end + 1])
+        n_keyframes = min(end + 1, self._n_keyframes) - begin
+        jacobian = np.zeros((n_keyframes, int(count.max(initial=0)), n))
         dense = np.zeros((*jacobian.shape[:2], width))
-        jacobian[self._own.keyframe, slot] = self._own.jacobian
-        dense[self._own.keyframe, slot] = columns.own
+        jacobian[keyframe - begin, slot] = self._own.jacobian[rows]
+        dense[keyframe - begin, slot] = columns.own
         load = jacobian.mT @ dense
-        through = self._between.jacobian.mT @ columns.between
+        through = self._between.jacobian[begin:end].mT @ columns.between
         load[:-1] += through[:, :n]
         before = np.zeros_like(load)
         before[1:] = through[:, n:]
-        return self._R_invT @ load, self._R_invT @ before
+        R_invT = self._R_invT[begin : end + 1]
+        return R_invT @ load, R_invT @ before
 
     def _histories(
         self, blocks: NDArray[np.intp], columns: Columns, width: int
@@ -199,7 +219,9 @@ class ChainEvidence:
         shared ones as if they began with it.
         """
         n, size = self._n, self._n + columns.own.shape[1]
-        load, before = self._loads(columns)
+        load, before = self._loads(blocks, columns)
+        steps = self._step[blocks[0] : blocks[-1] + 1]
+        blocks = blocks - blocks[0]
         length = np.diff(blocks)
         order = np.argsort(-length, kind="stable")
         longest = int(length.max(initial=0))
@@ -213,14 +235,14 @@ class ChainEvidence:
             going = int(np.sum(length > t))
             k = begin[:going] + t
             if t:
-                at[:going] = self._step[k] @ at[:going]
+                at[:going] = steps[k] @ at[:going]
                 at[:going, :, n:] += before[k]
             at[:going, :, n:] += load[k]
             history[:going, t] = at[:going]
         end = blocks[1:][order]
-        is_inside = end < self._n_keyframes
+        is_inside = end < len(steps)
         k = np.where(is_inside, end, 0)
-        onward = self._step[k] @ at
+        onward = steps[k] @ at
         onward[:, :, n : n + width] += before[k][:, :, :width]
         is_last = order == len(order) - 1
         onward[is_last, :, n + width :] += before[k[is_last]][:, :, width:]
@@ -228,3 +250,12 @@ class ChainEvidence:
         place = np.argsort(order)
         flat = [history[place[i], : length[i]].reshape(-1, size) for i in range(len(length))]
         return flat, [onward[place[i]] for i in range(len(length))]
+
+
+def _mirror_lower(square: Array) -> None:
+    """Set what is above the diagonal to what is below it, in tiles that fit the cache."""
+    for begin in range(0, len(square), TILE):
+        end = begin + TILE
+        square[:begin, begin:end] = square[begin:end, :begin].T
+        diagonal = square[begin:end, begin:end]
+        diagonal[:] = np.tril(diagonal) + np.tril(diagonal, -1).T

@@ -45,10 +45,21 @@ class Grid(NamedTuple):
     """Of a coarse block, s"""
 
     @classmethod
-    def of(cls, keyframe_s: Array, edges_s: Iterable[float], *, block_s: float = 10.0) -> Grid:
-        """Return the blocks between some times, s, and the ends of the mission."""
-        inner = np.searchsorted(keyframe_s, np.array(sorted(edges_s)))
-        edges = np.unique(np.concatenate([[0], inner, [len(keyframe_s)]]))
+    def of(
+        cls,
+        keyframe_s: Array,
+        edges_s: Iterable[float],
+        *,
+        block_s: float = 10.0,
+        piece: tuple[int, int] | None = None,
+    ) -> Grid:
+        """Return the blocks between some times, s, and the ends of the mission, or of a piece.
+
+        A piece is its first keyframe and the first one after it.
+        """
+        begin, end = piece or (0, len(keyframe_s))
+        inner = np.searchsorted(keyframe_s, np.array(sorted(edges_s))).clip(begin, end)
+        edges = np.unique(np.concatenate([[begin], inner, [end]]))
         last = np.append(keyframe_s, keyframe_s[-1])
         begin_s, end_s = last[edges[:-1]], last[edges[1:]]
         return cls(edges, 0.5 * (begin_s + end_s), end_s - begin_s, block_s)
@@ -196,10 +207,9 @@ class Judge:
         for fault, size in zip(faults, judged.sizes(faults), strict=True):
             effect += judged.combined(fault)[0] @ size
         linear, columns = self.linear, self.channels.columns
-        of_block = effect.reshape(judged.grid.n_blocks, -1)
-        block = (
-            np.searchsorted(judged.grid.edges, np.arange(len(linear.states.R_nb)), side="right") - 1
-        )
+        none = np.zeros((1, self.channels.width))  # before the blocks and after them
+        of_block = np.concatenate([none, effect.reshape(judged.grid.n_blocks, -1), none])
+        block = np.searchsorted(judged.grid.edges, np.arange(len(linear.states.R_nb)), side="right")
         own = np.einsum("rc,rc->r", columns.own, of_block[block[linear.own.keyframe]])
         between = np.einsum("kic,kc->ki", columns.between, of_block[block[:-1]])
         solution = yield from linear.solved_steps(own, between)

@@ -135,15 +135,17 @@ class Priors:
         n = len(evidence.score) - n_shared
 
         def summed(rows: Array) -> Array:
-            blocks = rows[:n].reshape(n // width, width, -1)[:, self._columns]
-            own = np.add.reduceat(blocks, self._coarse, axis=0).swapaxes(0, 1)
+            own = rows[:n].reshape(n // width, width, -1).swapaxes(0, 1)[self._columns]
+            if len(self._coarse) < n // width:
+                own = np.add.reduceat(own, self._coarse, axis=1)
             return np.concatenate([own.reshape(-1, rows.shape[1]), rows[n:]])
 
         return Evidence(summed(evidence.score[:, None])[:, 0], summed(evidence.information))
 
     def among(self, crossed: Evidence, width: int) -> Array:
         """Return the information (m, m) of the nuisances among themselves."""
-        turned = Evidence(np.zeros(crossed.information.shape[1]), crossed.information.T)
+        by_columns = np.ascontiguousarray(crossed.information.T)
+        turned = Evidence(np.zeros(len(by_columns)), by_columns)
         return self.crossed(turned, width).information
 
     def information(self, widths: tuple[float, ...]) -> Array:

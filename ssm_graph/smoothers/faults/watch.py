@@ -33,7 +33,8 @@ from ssm_graph.smoothers.faults.columns import (
 from ssm_graph.smoothers.faults.hypotheses import Course
 from ssm_graph.smoothers.faults.judged import Fault, Judge
 from ssm_graph.smoothers.faults.nuisances import Nuisances
-from ssm_graph.smoothers.faults.search import FaultSearch, Look, with_rivals
+from ssm_graph.smoothers.faults.pieces import find_steps
+from ssm_graph.smoothers.faults.search import FaultSearch, with_rivals
 
 MOST_LOOKS = 8
 """Looks after which the search ends whatever it finds."""
@@ -98,8 +99,7 @@ class FaultWatch:
         channels = Channels(linear)
         judge = Judge(linear, channels, Nuisances(linear, channels))
         yield 0.02 * self._problem.n_keyframes
-        look = Look(judge, channels, self._search)
-        found = yield from look.find_steps(self._sized(states))
+        found = yield from find_steps(judge, channels, self._search, self._sized(states))
         is_same = same_faults(found, self._found, self._problem.keyframe_s)
         self._is_done = is_same or self._n_looks >= MOST_LOOKS
         if is_same:

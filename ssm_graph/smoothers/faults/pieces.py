@@ -1,0 +1,146 @@
+"""The search over a long mission in pieces that overlap by half.
+
+The evidence of all stretches grows with the square of their number, so it is made of one piece at
+a time; the trajectory is that of the whole mission, but nuisances are each piece's own. What is
+found counts in the middle of its piece, where both of its edges are seen best; what two pieces
+find of the same is joined.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ssm_graph.base.frozen import Array
+from ssm_graph.base.stepwise import Steps
+from ssm_graph.smoothers.faults.columns import Channels
+from ssm_graph.smoothers.faults.hypotheses import Course
+from ssm_graph.smoothers.faults.judged import TREND_S, Fault, Judge
+from ssm_graph.smoothers.faults.search import FaultSearch, Look
+
+
+class Piece(NamedTuple):
+    """Keyframes that are searched together."""
+
+    begin: int
+    end: int
+    """The first one after it"""
+    from_seam: int
+    """Where its middle begins; that of the piece before ends there"""
+
+
+def pieces_of(keyframe_s: Array, piece_s: float) -> list[Piece]:
+    """Return pieces of ``piece_s`` that overlap by half; their middles are all of the mission."""
+    half_s, first_s = 0.5 * piece_s, float(keyframe_s[0])
+    n_more = int(np.ceil(max(float(keyframe_s[-1]) - first_s - piece_s, 0.0) / half_s))
+    begins_s = first_s + half_s * np.arange(n_more + 1)
+    begin = np.searchsorted(keyframe_s, begins_s).tolist()
+    end = np.searchsorted(keyframe_s, begins_s + piece_s)
+    seam = np.searchsorted(keyframe_s, begins_s[1:] + 0.5 * half_s).tolist()
+    n = len(keyframe_s)
+    ends = [*end[:-1].tolist(), n]
+    return [Piece(*one) for one in zip(begin, ends, [0, *seam], strict=True)]
+
+
+def find_steps(
+    judge: Judge, channels: Channels, settings: FaultSearch, known: Sequence[Fault]
+) -> Steps[list[Fault]]:
+    """Return what is off anywhere in a mission: what was before, and what is new."""
+    keyframe_s = judge.linear.problem.keyframe_s
+    found: list[tuple[Piece, list[Fault]]] = []
+    for piece in pieces_of(keyframe_s, settings.piece_s):
+        look = Look(judge, channels, settings, (piece.begin, piece.end))
+        own = yield from look.find_steps(parts_of(known, piece, keyframe_s))
+        found.append((piece, own))
+    return joined_of(found)
+
+
+def parts_of(faults: Iterable[Fault], piece: Piece, keyframe_s: Array) -> list[Fault]:
+    """Return what of faults is within a piece, and so of their rivals."""
+    found = []
+    for fault in faults:
+        begin, end = max(fault.begin, piece.begin), min(fault.end, piece.end)
+        if begin >= end:
+            continue
+        sizes = fault.sizes
+        if sizes is not None and fault.hypothesis.course is Course.TREND:
+            # The rate counts from the begin of the stretch on.
+            constant, rate = np.split(sizes, 2)
+            since = (keyframe_s[begin] - keyframe_s[fault.begin]) / TREND_S
+            sizes = np.concatenate([constant + since * rate, rate])
+        rivals = tuple(parts_of(fault.rivals, piece, keyframe_s))
+        found.append(replace(fault, begin=begin, end=end, sizes=sizes, rivals=rivals))
+    return found
+
+
+def joined_of(found: Iterable[tuple[Piece, Iterable[Fault]]]) -> list[Fault]:
+    """Return what was found in successive pieces, what two of them share being joined.
+
+    Of what one alone has, it stays where most of it is in that one's middle, and to the seam where
+    it goes on to the end of the piece.
+    """
+    done: list[Fault] = []
+    last: list[Fault] = []
+    last_end = 0
+    for piece, own in found:
+        now = []
+        for fault in own:
+            before = _same_of(last, fault)
+            if before is not None:
+                last.remove(before)
+                now.append(joined(before, fault, piece.from_seam))
+            elif fault.begin + fault.end > 2 * piece.from_seam:
+                is_cut = 0 < piece.begin == fault.begin
+                now.extend(_cut(fault, piece.from_seam, fault.end) if is_cut else [fault])
+        done.extend(_until(last, piece.from_seam, last_end))
+        last, last_end = now, piece.end
+    return [*done, *last]
+
+
+def joined(one: Fault, later: Fault, seam: int) -> Fault:
+    """Return what two pieces found of the same: each edge as the piece says that sees it best.
+
+    Rivals are those of the stronger of both, joined with the same ones of the other.
+    """
+    begin = one.begin if one.begin < seam else later.begin
+    end = later.end if later.end > seam else one.end
+    if one.merit > later.merit:
+        pairs = [(own, _same_of(later.rivals, own)) for own in one.rivals]
+        stronger = one
+    else:
+        pairs = [(_same_of(one.rivals, own), own) for own in later.rivals]
+        stronger = later
+    rivals = tuple(joined(a, b, seam) if a and b else a or b for a, b in pairs)
+    return replace(stronger, begin=begin, end=end, rivals=rivals)
+
+
+def _until(faults: Iterable[Fault], seam: int, piece_end: int) -> Iterator[Fault]:
+    """Yield faults that the piece after theirs does not have."""
+    for fault in faults:
+        if fault.begin + fault.end <= 2 * seam:
+            yield from _cut(fault, fault.begin, seam) if fault.end == piece_end else [fault]
+
+
+def _cut(fault: Fault, begin: int, end: int) -> list[Fault]:
+    """Return a fault on one side of a seam, none of rows that would count for nothing.
+
+    Those can say no more in later looks, in which the piece beyond may have taken over its name.
+    """
+    return (
+        [] if fault.hypothesis.course is Course.ANYTHING else [replace(fault, begin=begin, end=end)]
+    )
+
+
+def _same_of(faults: Iterable[Fault], other: Fault) -> Fault | None:
+    """Return the one with the same numbers of a sensor, over a stretch that overlaps."""
+    return next((one for one in faults if _is_same(one, other)), None)
+
+
+def _is_same(one: Fault, other: Fault) -> bool:
+    a, b = one.hypothesis, other.hypothesis
+    is_like = (a.channel, a.course) == (b.channel, b.course)
+    is_over_same = max(one.begin, other.begin) < min(one.end, other.end)
+    return is_over_same and is_like and np.array_equal(a.combined, b.combined)
