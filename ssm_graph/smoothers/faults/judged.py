@@ -431,14 +431,7 @@ def combined_of(fault: Fault, grid: Grid, channels: Channels) -> tuple[Array, Ar
         else:
             since += grid.middle_since[begin:end]
         made[begin:end, channel.columns, d:] = since[:, None, None] * C
-        made = made[:, :, OF_COURSE[hypothesis.course](d)]
+        if hypothesis.course is not Course.TREND:
+            made = made[:, :, d:] if hypothesis.has_rate else made[:, :, :d]
     sigma = np.resize(hypothesis.sigma, made.shape[2])
     return made.reshape(grid.n_blocks * width, -1), np.diag(1.0 / sigma**2)
-
-
-OF_COURSE = {
-    Course.CONSTANT: lambda d: slice(0, d),
-    Course.TREND: lambda d: slice(0, 2 * d),
-    Course.RAMP: lambda d: slice(d, 2 * d),
-}
-"""Which of d constants and d rates a course has."""
