@@ -16,9 +16,9 @@ import numpy as np
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps
-from ssm_graph.smoothers.faults.columns import Channels
+from ssm_graph.smoothers.faults.columns import TREND_S, Channels
 from ssm_graph.smoothers.faults.hypotheses import Course
-from ssm_graph.smoothers.faults.judged import TREND_S, Fault, Judge
+from ssm_graph.smoothers.faults.judged import Fault, Judge
 from ssm_graph.smoothers.faults.search import FaultSearch, Look
 
 
