@@ -262,6 +262,18 @@ def test_chi_square_of_every_stretch(course: Course) -> None:
             assert table[begin, end] == pytest.approx(noise @ own @ fitted, rel=2e-2)
 
 
+def test_what_the_last_look_changes_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One look that finds something has not settled."""
+    monkeypatch.setattr("ssm_graph.smoothers.faults.watch.MOST_LOOKS", 1)
+    sim = simulated(duration_s=120.0, dvl=QUIET, seed=3)
+    fault = Fault(sensor=Sensor.DEPTH, start_s=40.0, end_s=90.0, size=0.5)
+    broken = with_faults(sim.mission, (fault,), truth=sim.truth_at)
+    estimate = smoothed(replace(sim, mission=broken.mission))
+    assert estimate.status is Status.SUSPECT
+    assert [one.treatment for one in estimate.faults] == [Treatment.CHANGING]
+    assert estimate.reason.startswith("depth, ")
+
+
 def test_what_stands_out_is_apart_from_what_lasts() -> None:
     """A step stays, but for nothing beside the median; a spike does not."""
     values: Array = np.where(np.arange(40) < 20, 0.0, 1.0)[:, None]
