@@ -107,14 +107,15 @@ def joined(one: Fault, later: Fault, seam: int) -> Fault:
     """
     begin = one.begin if one.begin < seam else later.begin
     end = later.end if later.end > seam else one.end
-    if one.merit > later.merit:
-        pairs = [(own, _same_of(later.rivals, own)) for own in one.rivals]
-        stronger = one
-    else:
-        pairs = [(_same_of(one.rivals, own), own) for own in later.rivals]
-        stronger = later
-    rivals = tuple(joined(a, b, seam) if a and b else a or b for a, b in pairs)
-    return replace(stronger, begin=begin, end=end, rivals=rivals)
+    stronger, other = (one, later) if one.merit > later.merit else (later, one)
+    rivals = []
+    for rival in stronger.rivals:
+        same = _same_of(other.rivals, rival)
+        if same is not None:
+            first, second = (rival, same) if stronger is one else (same, rival)
+            rival = joined(first, second, seam)
+        rivals.append(rival)
+    return replace(stronger, begin=begin, end=end, rivals=tuple(rivals))
 
 
 def _until(faults: Iterable[Fault], seam: int, piece_end: int) -> Iterator[Fault]:
