@@ -52,8 +52,7 @@ class FaultSearch:
     """A rival whose chi-square is less by no more than this explains the data as well."""
     piece_s: float = 600.0
     """A longer mission is searched in pieces of this that overlap by half. Memory grows with its
-    square, and time too: an hour's search takes a fifth of the other passes' with 600 s, three
-    quarters with 1200 s, which are surer of what is little off for longer."""
+    square, and time too; longer ones are surer of what is little off for longer."""
 
     def __post_init__(self) -> None:
         for name in ("block_s", "significance", "margin", "piece_s"):
