@@ -84,19 +84,18 @@ def test_a_kernel_alone_does_not_find_a_small_bias(name: str) -> None:
     ],
 )
 def test_a_small_bias_of_one_beam_for_long_is_found(name: str, largest_rms: float) -> None:
-    """0.15 m/s for 40 s after GNSS has ended: the beam is left out, the others are kept.
+    """0.15 m/s for 40 s after GNSS has ended: that is taken off the beam, the others are kept.
 
     The error stays below 1 % of the path.
     """
     mission, withheld = withheld_after(name, 70.0)
     biased, is_off = with_a_small_bias(mission)
     estimate = sg.smooth(biased)
-    assert any(note.startswith("beam 2 is off") for note in estimate.notes)
+    assert any(fault.sensor == "DVL beam 2" for fault in estimate.faults)
     beams = estimate.beams
     then = (beams.time_s > mission.dvl.time_s[is_off][0]) & (
         beams.time_s < mission.dvl.time_s[is_off][-1] - 1.0
     )
-    assert beams.weight[then & (beams.beam == 2.0)].max() < 0.05
     assert beams.weight[then & (beams.beam != 2.0)].mean() > 0.8
     reference = sg.reference_from_gnss(withheld, estimate.trajectory)
     assert sg.evaluate(estimate.trajectory, reference).rmse_horizontal_m < largest_rms

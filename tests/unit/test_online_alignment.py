@@ -38,6 +38,7 @@ from ssm_graph.simulation import (
 )
 from ssm_graph.smoothers.fixed_lag import run_fixed_lag
 from ssm_graph.smoothers.mission import smooth, smooth_steps
+from ssm_graph.smoothers.settings import SmootherConfig
 from ssm_graph.smoothers.window import FixedLagConfig
 from tests.online_fixture import SHORT
 
@@ -219,7 +220,7 @@ def sizes(steps: Steps[object]) -> Array:
 def test_steps_are_small_however_long_the_data() -> None:
     """A step is a keyframe's, or goes through all of them at once and is small for each."""
     whole = replace(hovering().mission, initial=None)
-    found, n_pings = sizes(smooth_steps(whole)), len(whole.dvl.time_s)
+    found, n_pings = sizes(smooth_steps(whole, SmootherConfig())), len(whole.dvl.time_s)
     assert found.min() > 0.0
     assert 1.0 < found.max() < 0.031 * n_pings
     minutes = 150.0 / (n_pings / 5.0)

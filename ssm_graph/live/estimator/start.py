@@ -33,6 +33,7 @@ from ssm_graph.sensors.imu import ImuLog
 from ssm_graph.smoothers.fixed_lag import run_fixed_lag_steps
 from ssm_graph.smoothers.keyframe import Sensors
 from ssm_graph.smoothers.mission import smooth_steps
+from ssm_graph.smoothers.settings import SmootherConfig
 from ssm_graph.smoothers.window import FixedLagConfig
 
 SETTLE_S: Final = 1.0
@@ -165,7 +166,8 @@ class Starter:
     def _align_steps(self, mission: Mission) -> Steps[Beginning | None]:
         """Smooth what there is; begin at its end if that may be believed."""
         yield 1e-3 * len(mission.imu.time_s)  # for the mission itself
-        estimate = yield from smooth_steps(mission, problem_config=self._config)
+        # Without the search for faults: it goes through all at once, and lanes watch from here on.
+        estimate = yield from smooth_steps(mission, SmootherConfig(), problem_config=self._config)
         sigma = float(estimate.trajectory.attitude_sigma[-1, 2])
         if not estimate.status.is_good or sigma > SAFE_HEADING_SIGMA:
             text = f"heading sigma {np.degrees(sigma):.0f} deg: {estimate.reason}; move while GNSS"
