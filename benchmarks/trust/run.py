@@ -35,7 +35,7 @@ AS_GOOD = 1.2
 """Ratio to the oracle up to which an answer is right."""
 BEYOND = 5.0
 """Sigmas of an error that its sigma does not cover."""
-CLEAN, REALISTIC = "no fault", "no fault, realistic instruments"
+CLEAN, REALISTIC = "no fault", "no fault, realistic instruments, as stated by their preset"
 SHARES = (1.0, 2.0, 3.0)
 """Sigmas inside which errors are counted."""
 
@@ -96,6 +96,7 @@ def mission_of(grade: str, seed: int, *, with_gnss: bool, realistic: bool) -> Si
             dvl=DvlSettings(noise=SIGMA_M_PER_S),
             gnss=GnssSettings(windows=((0.0, DURATION_S),)) if with_gnss else None,
             realistic=realistic,
+            calibrates=realistic,
         )
     )
 
