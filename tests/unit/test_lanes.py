@@ -221,7 +221,7 @@ def test_the_threshold_keeps_the_rate_that_was_asked_for() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "grade"), zip(LIES, itertools.cycle([Grade.NAVIGATION, Grade.TACTICAL]), strict=False)
+    ("name", "grade"), list(zip(LIES, itertools.cycle([Grade.NAVIGATION, Grade.TACTICAL])))
 )
 def test_no_lie_stays_good_for_long(name: str, grade: Grade) -> None:
     """Never GOOD and beyond five sigmas for more than ten seconds."""
