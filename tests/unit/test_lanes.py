@@ -18,6 +18,7 @@ from ssm_graph.live.estimator.guard import Guardian
 from ssm_graph.live.estimator.lanes import MEASURE, Lanes
 from ssm_graph.live.estimator.separation import AGREED_S, UNASKED, Contradiction
 from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.navigation import Health
 from ssm_graph.simulation import Grade, SimulatedMission
 from ssm_graph.smoothers.window_aids import SensorRows
 from tests.lanes_fixture import LIES, Look, longest_good_lie, looks, survey
