@@ -129,12 +129,12 @@ from ssm_graph.simulation import janus_beams as janus_beams
 from ssm_graph.simulation import scenario_config as scenario_config
 from ssm_graph.simulation import simulate as simulate
 from ssm_graph.simulation import with_faults as with_faults
-from ssm_graph.smoothers.batch import SmootherConfig as SmootherConfig
 from ssm_graph.smoothers.batch import SsmSmoother as SsmSmoother
 from ssm_graph.smoothers.faults.search import FaultSearch as FaultSearch
 from ssm_graph.smoothers.fixed_lag import FixedLagConfig as FixedLagConfig
 from ssm_graph.smoothers.fixed_lag import solve_fixed_lag as solve_fixed_lag
 from ssm_graph.smoothers.mission import smooth as smooth
+from ssm_graph.smoothers.settings import SmootherConfig as SmootherConfig
 from ssm_graph.study.methods import filter_mission as filter  # noqa: F401
 from ssm_graph.study.runner import open_store as open_store
 from ssm_graph.study.runner import run_study as run_study

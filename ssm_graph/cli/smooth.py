@@ -23,9 +23,9 @@ from ssm_graph.mission.estimate import Estimate
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.problem import ProblemConfig
 from ssm_graph.report.terminal.progress import ProgressDisplay
-from ssm_graph.smoothers.batch import SmootherConfig
 from ssm_graph.smoothers.faults.search import FaultSearch
 from ssm_graph.smoothers.mission import smooth
+from ssm_graph.smoothers.settings import SmootherConfig
 
 GNC = "gnc-tls"
 ADAPTIVE = "adaptive"

@@ -15,7 +15,7 @@ from factors.imu_errors import increment_jacobians, taken_off
 from factors.inertial import Intervals
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array, Vector
-from ssm_graph.base.stepwise import Steps, finished
+from ssm_graph.base.stepwise import Steps, at_once, finished
 from ssm_graph.imu.increments import MergedSamples, merge_samples_steps
 from ssm_graph.sensors.imu import FrozenAxis, ImuLog, ImuNoise, frozen_axes
 
@@ -132,7 +132,7 @@ def gravity_gradient(frame: LocalFrame, p_n: Array = ORIGIN) -> Array:
     return np.asarray((at[:3] - at[3:]).T / (2.0 * GRADIENT_REACH))
 
 
-def preintegrate(
+def preintegrate_steps(
     imu: ImuLog,
     keyframe_s: Array,
     *,
@@ -140,7 +140,7 @@ def preintegrate(
     rate_hz: float,
     bias: Array | None = None,
     errors: Array | None = None,
-) -> InertialChain:
+) -> Steps[InertialChain]:
     """Preintegrate the inertial data between keyframes.
 
     Parameters
@@ -153,21 +153,6 @@ def preintegrate(
     errors : (27,) of the sensors, see :mod:`factors.imu_errors`, that are taken off first, and that
         the increments follow; without them they do not.
     """
-    return finished(
-        preintegrate_steps(imu, keyframe_s, frame=frame, rate_hz=rate_hz, bias=bias, errors=errors)
-    )
-
-
-def preintegrate_steps(
-    imu: ImuLog,
-    keyframe_s: Array,
-    *,
-    frame: LocalFrame,
-    rate_hz: float,
-    bias: Array | None = None,
-    errors: Array | None = None,
-) -> Steps[InertialChain]:
-    """Make :func:`preintegrate` in steps."""
     source = None
     if errors is not None:
         source = ErrorSource(imu, keyframe_s, rate_hz, errors)
@@ -194,6 +179,9 @@ def preintegrate_steps(
     if errors is not None:
         intervals = yield from following_errors_steps(intervals, samples, errors, bias)
     return InertialChain(intervals, frame, samples, imu.noise, unseen, bias, source)
+
+
+preintegrate = at_once(preintegrate_steps)
 
 
 def without_errors(imu: ImuLog, errors: Array) -> ImuLog:

@@ -10,8 +10,8 @@ import numpy as np
 from ssm_graph.engine.extras import Extra, Extras
 from ssm_graph.graph.aids import AIDS
 from ssm_graph.graph.aids.aid import along_axes, drift_variable
-from ssm_graph.graph.aids.depth import DEPTH_DRIFT, DEPTH_OFFSET, depth_variables
-from ssm_graph.graph.aids.gnss import GNSS_DRIFT, GNSS_LEVER_ARM, GNSS_TIME_OFFSET, gnss_variables
+from ssm_graph.graph.aids.depth import DEPTH_OFFSET, depth_variables
+from ssm_graph.graph.aids.gnss import GNSS_LEVER_ARM, GNSS_TIME_OFFSET, gnss_variables
 from ssm_graph.mission.imu_variables import COLUMNS as IMU_ERRORS
 from ssm_graph.mission.imu_variables import imu_extras
 from ssm_graph.mission.mission import Mission
@@ -78,8 +78,7 @@ CALIBRATIONS: Final = frozenset(
     }
 )
 """Those of the extra variables that tell of the instruments of every estimator."""
-DRIFTS: Final = frozenset({DVL_DRIFT, GNSS_DRIFT, DEPTH_DRIFT})
-"""Those that tell of slow errors."""
+
 
 SEEN_BY_READINGS: Final = frozenset({DVL_TIME_OFFSET, DVL_LEVER_ARM})
 """Those that only motion shows, as the IMU reads it about each ping."""

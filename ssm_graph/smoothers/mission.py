@@ -16,8 +16,9 @@ from ssm_graph.mission.problem import Problem, ProblemConfig, build_problem_step
 from ssm_graph.mission.start.alignment import Alignment, align_steps
 from ssm_graph.mission.suspects.find import find_suspects, with_suspects
 from ssm_graph.mission.usable import require_usable
-from ssm_graph.smoothers.batch import OnIteration, SmootherConfig, SsmSmoother
+from ssm_graph.smoothers.batch import OnIteration, SsmSmoother
 from ssm_graph.smoothers.faults.search import FaultSearch
+from ssm_graph.smoothers.settings import SmootherConfig
 
 AMBIGUOUS_COST = 6.0
 """Another heading whose cost is higher by less than this is as good an explanation (a likelihood

@@ -16,10 +16,11 @@ from ssm_graph.filters.navigation.named import FILTERS, filter_geodetic, filter_
 from ssm_graph.mission.estimate import Estimate, OnKeyframe
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.problem import ProblemConfig, build_problem
-from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
+from ssm_graph.smoothers.batch import SsmSmoother
 from ssm_graph.smoothers.faults.search import FaultSearch
 from ssm_graph.smoothers.fixed_lag import FixedLagConfig, solve_fixed_lag
 from ssm_graph.smoothers.mission import OnStage
+from ssm_graph.smoothers.settings import SmootherConfig
 from ssm_graph.study.trials import Trial, with_initial
 
 ORACLE: Final = "oracle"

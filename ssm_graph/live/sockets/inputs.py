@@ -120,6 +120,37 @@ class Input(ABC):
                 self._selector.unregister(sock)
 
 
+class Patience:
+    """When to try again: at once at first, then after ever longer waits, up to a limit."""
+
+    def __init__(self, retry_s: tuple[float, float]) -> None:
+        """Take the first wait and the longest one, s."""
+        self._retry_s = retry_s
+        self._wait_s = retry_s[0]
+        self._until_s = float("-inf")
+
+    def is_over(self, now: Now) -> bool:
+        """Return whether it is time to try."""
+        return now.steady_s >= self._until_s
+
+    def has_passed(self, now: Now) -> bool:
+        """Return whether the time to try is past."""
+        return now.steady_s > self._until_s
+
+    def wait_for(self, seconds: float, now: Now) -> None:
+        """Wait for so long, the next time as before."""
+        self._until_s = now.steady_s + seconds
+
+    def wait(self, now: Now) -> None:
+        """Wait from now on, and twice as long the next time."""
+        self.wait_for(self._wait_s, now)
+        self._wait_s = min(2.0 * self._wait_s, self._retry_s[1])
+
+    def renew(self) -> None:
+        """Begin with the first wait again: what was tried is well."""
+        self._wait_s = self._retry_s[0]
+
+
 class TcpClientInput(Input):
     """A server that is called, again and again if need be, ever more patiently."""
 
@@ -127,8 +158,7 @@ class TcpClientInput(Input):
         super().__init__(feed, selector)
         self._addresses = resolve(endpoint)
         self._n_tries = 0
-        self._wait_s = feed.limits.retry_s[0]
-        self._next_try_s = float("-inf")
+        self._patience = Patience(feed.limits.retry_s)
         self._was_connected = False
         self._calling: socket.socket | None = None
         self._channel: Channel | None = None
@@ -140,15 +170,15 @@ class TcpClientInput(Input):
             return []
         messages = super().on_ready(ready, now)
         if ready in self._reading:
-            self._wait_s = self.feed.limits.retry_s[0]
+            self._patience.renew()
         return messages
 
     def tick(self, now: Now) -> list[Message]:
         """Call where nobody is called; give up who does not answer."""
         messages = super().tick(now)
-        if self._calling is not None and now.steady_s > self._next_try_s:
+        if self._calling is not None and self._patience.has_passed(now):
             self._failed(f"no answer within {self.feed.limits.connect_s:g} s", now)
-        elif self._calling is None and not self._reading and now.steady_s >= self._next_try_s:
+        elif self._calling is None and not self._reading and self._patience.is_over(now):
             self._call(now)
         return messages
 
@@ -167,7 +197,7 @@ class TcpClientInput(Input):
     def _call(self, now: Now) -> None:
         family, address = self._addresses[self._n_tries % len(self._addresses)]
         self._n_tries += 1
-        self._next_try_s = now.steady_s + self.feed.limits.connect_s
+        self._patience.wait_for(self.feed.limits.connect_s, now)
         self._calling = socket.socket(family, socket.SOCK_STREAM)
         self._calling.setblocking(False)
         code = self._calling.connect_ex(address)
@@ -196,20 +226,16 @@ class TcpClientInput(Input):
         assert self._calling is not None
         self._forget(self._calling)
         self._calling = None
-        self._wait(now)
+        self._patience.wait(now)
         text = f"cannot connect to {self.feed.address}: {why}; it is tried again and again"
         self.feed.tell("connect_failed", text, Severity.WARNING)
 
     def _lose(self, sock: socket.socket, now: Now, why: str) -> list[Message]:
         messages = self._end(sock, now)
-        self._wait(now)
+        self._patience.wait(now)
         kind = "source_silent" if why == self.feed.silence else "connection_lost"
         self.feed.tell(kind, f"{self.feed.address}: {why}; it is called again", Severity.WARNING)
         return messages
-
-    def _wait(self, now: Now) -> None:
-        self._next_try_s = now.steady_s + self._wait_s
-        self._wait_s = min(2.0 * self._wait_s, self.feed.limits.retry_s[1])
 
 
 class TcpServerInput(Input):

@@ -15,7 +15,7 @@ from typing import Any, Final, cast
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.live.sockets.endpoints import Endpoint
 from ssm_graph.live.sockets.feed import Channel, Feed, Now
-from ssm_graph.live.sockets.inputs import Input
+from ssm_graph.live.sockets.inputs import Input, Patience
 from ssm_graph.mission.navigation import Severity
 from ssm_graph.mission.run_status import LinkState, SourceStatus
 from ssm_graph.sensors.messages import Message
@@ -74,21 +74,20 @@ class SerialInput(Input):
         super().__init__(feed, selector)
         self._endpoint = endpoint
         _speed(_termios(), endpoint.port)  # which is refused before anything runs
-        self._wait_s = feed.limits.retry_s[0]
-        self._next_try_s = float("-inf")
+        self._patience = Patience(feed.limits.retry_s)
         self._channel: Channel | None = None
 
     def on_ready(self, ready: socket.socket, now: Now) -> list[Message]:
         """Read; a port that can be read is well again."""
         messages = super().on_ready(ready, now)
         if ready in self._reading:
-            self._wait_s = self.feed.limits.retry_s[0]
+            self._patience.renew()
         return messages
 
     def tick(self, now: Now) -> list[Message]:
         """Open the port where it is not."""
         messages = super().tick(now)
-        if not self._reading and now.steady_s >= self._next_try_s:
+        if not self._reading and self._patience.is_over(now):
             self._open(now)
         return messages
 
@@ -101,7 +100,7 @@ class SerialInput(Input):
         try:
             port = SerialPort(self._endpoint.host, self._endpoint.port)
         except OSError as error:
-            self._wait(now)
+            self._patience.wait(now)
             text = f"cannot open {self.feed.address}: {error.strerror}; it is tried again and again"
             self.feed.tell("connect_failed", text, Severity.WARNING)
             return
@@ -115,14 +114,10 @@ class SerialInput(Input):
 
     def _lose(self, sock: socket.socket, now: Now, why: str) -> list[Message]:
         messages = self._end(sock, now)
-        self._wait(now)
+        self._patience.wait(now)
         text = f"{self.feed.address}: {why}; it is opened again"
         self.feed.tell("connection_lost", text, Severity.WARNING)
         return messages
-
-    def _wait(self, now: Now) -> None:
-        self._next_try_s = now.steady_s + self._wait_s
-        self._wait_s = min(2.0 * self._wait_s, self.feed.limits.retry_s[1])
 
 
 def _speed(termios: Any, baud: int) -> int:
