@@ -1,0 +1,248 @@
+"""The annealed particle filter: from a fix to a lane."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from ssm_graph.base.frozen import Array
+from ssm_graph.base.units import DEGREE, wrapped
+from ssm_graph.filters.rules.particles import effective_number, kld_number, normalised, systematic
+from ssm_graph.systems.road_map.drive import Curves
+from ssm_graph.systems.road_map.maps.index import LineIndex
+from ssm_graph.systems.road_map.maps.road_map import LineKind, Mark
+
+X, Y, YAW, SCALE, BIAS = range(5)
+"""Columns of a particle: m, m, rad, share of the speed beyond 1, rad/s."""
+CELL: Final = np.array([1.0, 1.0, 4.0 * DEGREE])
+"""Of the cells that tell how many particles are needed."""
+
+
+@dataclass(frozen=True, slots=True)
+class KindSettings:
+    """How the curves of one kind are compared with the map."""
+
+    sigma_m: float
+    """Of the distance between a curve's point and its line, at the end ..."""
+    annealed_m: float
+    """... and what is added to it in the beginning."""
+    cap_sq: float
+    """A squared distance in sigmas counts no more than this."""
+    information: float = 2.0
+    """So many independent points a curve is worth: its errors are common to its points."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LocatorSettings:
+    """Everything that can be chosen about the filter; tuned on routes 0 to 99 only."""
+
+    boundary: KindSettings = KindSettings(0.5, 2.0, 16.0)
+    line: KindSettings = KindSettings(0.3, 1.2, 9.0)
+    annealing: float = 8.0
+    """Pictures over which the widths fall by a factor e."""
+    n_points: int = 8
+    """Of each curve."""
+    cell_m: float = 2.0
+    """Of the grid of the first particles."""
+    most: int = 1000
+    """Particles in the beginning; the grid is made wider where they would be more."""
+    least: int = 300
+    yaw_sigma: float = 4.0 * DEGREE
+    """Of the first course, where the receiver gives one."""
+    off_road_m: float = 25.0
+    """First particles farther from every boundary and lane line are left out."""
+    way_sigma: float = 0.01
+    """Relative, of a step."""
+    way_floor_m: float = 0.01
+    turn_sigma: float = 0.1 * DEGREE
+    """rad in a tenth of a second."""
+    scale_sigma: float = 0.01
+    bias_sigma: float = 0.05 * DEGREE
+    """rad/s"""
+    roughening: tuple[float, float, float] = (0.15, 0.15, 0.3 * DEGREE)
+    """Sigma of what is added when particles are drawn anew: m, m, rad."""
+    corridor_weight: float = 0.15
+    """Log weight that each point of a boundary costs that lies within the corridor seen free."""
+    wrong_mark: float = 0.7
+    """Log weight that a lane line costs that is dashed where the map's is solid, or the reverse."""
+
+
+@dataclass(slots=True)
+class Particles:
+    """Particles (n, 5) with the logarithms of their weights (n,)."""
+
+    states: Array
+    log_weight: Array
+
+    @property
+    def weight(self) -> Array:
+        """Weights (n,), sum 1."""
+        return normalised(self.log_weight)
+
+
+@dataclass(slots=True)
+class Locator:
+    """The filter on its way: predict with the chassis, update with pictures."""
+
+    indices: Mapping[LineKind, LineIndex]
+    particles: Particles
+    rng: np.random.Generator
+    settings: LocatorSettings = field(default_factory=LocatorSettings)
+    n_pictures: int = 0
+    driven_m: float = 0.0
+
+    def predict(self, way_m: float, turn: float, dt: float) -> None:
+        """Move all particles by a step of the chassis: m, rad, s."""
+        p, s = self.particles.states, self.settings
+        n = len(p)
+        noise = self.rng.standard_normal((2, n))
+        way = way_m * (1.0 + p[:, SCALE]) + noise[0] * (s.way_sigma * abs(way_m) + s.way_floor_m)
+        turned = turn - p[:, BIAS] * dt + noise[1] * s.turn_sigma * np.sqrt(dt / 0.1)
+        middle = p[:, YAW] + 0.5 * turned
+        p[:, X] += way * np.cos(middle)
+        p[:, Y] += way * np.sin(middle)
+        p[:, YAW] += turned
+        self.driven_m += abs(way_m)
+
+    def update(self, curves: Curves, rows: slice) -> None:
+        """Weigh all particles by the curves of one picture, and draw them anew where few count."""
+        self.particles.log_weight += log_likelihood(
+            self.particles.states, curves, rows, self.indices, self.settings, self.n_pictures
+        )
+        self.n_pictures += 1
+        weight = self.particles.weight
+        if effective_number(weight) < 0.5 * len(weight):
+            self._draw(weight)
+
+    def _draw(self, weight: Array) -> None:
+        s, p = self.settings, self.particles.states
+        cells = np.floor(p[:, :3] / CELL).astype(np.int64)
+        n_cells = len(np.unique(cells[weight > 0.01 * weight.max()], axis=0))
+        n = int(np.clip(kld_number(n_cells), s.least, len(p)))
+        rows = systematic(weight, n, self.rng)
+        drawn = p[rows]
+        drawn[:, :3] += self.rng.standard_normal((n, 3)) * s.roughening
+        self.particles = Particles(drawn, np.zeros(n))
+
+
+def log_likelihood(
+    states: Array,
+    curves: Curves,
+    rows: slice,
+    indices: Mapping[LineKind, LineIndex],
+    settings: LocatorSettings,
+    n_pictures: int,
+) -> Array:
+    """Return how well the curves of a picture lie on the map's lines from poses (n, 3+): (n,).
+
+    For each curve, with D_j the distance of its point j to the nearest line of its kind::
+
+        information * mean_j( -min((D_j / s)^2, cap) / 2 ),    s = sigma + annealed exp(-k / K)
+    """
+    fade = float(np.exp(-n_pictures / settings.annealing))
+    total = np.zeros(len(states))
+    points = curves.points(rows, settings.n_points)
+    kinds, marks = curves.kind[rows], curves.mark[rows]
+    c, s = np.cos(states[:, YAW]), np.sin(states[:, YAW])
+    for kind, index in indices.items():
+        mine = kinds == kind
+        if not mine.any():
+            continue
+        how = settings.line if kind is LineKind.LANE_LINE else settings.boundary
+        body = points[mine]
+        px, py = body[..., 0].reshape(-1), body[..., 1].reshape(-1)
+        wx = states[:, X, None] + c[:, None] * px - s[:, None] * py
+        wy = states[:, Y, None] + s[:, None] * px + c[:, None] * py
+        distance, segment = index.nearest(wx, wy)
+        sigma = how.sigma_m + how.annealed_m * fade
+        cost = np.minimum(np.square(distance * (1.0 / sigma)), how.cap_sq)
+        total -= 0.5 * how.information / settings.n_points * cost.sum(axis=1)
+        if kind is LineKind.LANE_LINE:
+            seen = np.repeat(marks[mine], settings.n_points)
+            there = index.mark[segment]
+            wrong = (there != Mark.UNKNOWN) & (seen != Mark.UNKNOWN) & (there != seen)
+            near = cost < how.cap_sq
+            total -= settings.wrong_mark / settings.n_points * (wrong & near).sum(axis=1)
+        elif settings.corridor_weight > 0.0:
+            total -= (1.0 - fade) * settings.corridor_weight * _in_corridor(
+                states, curves, rows, index
+            )
+    return total
+
+
+def _in_corridor(states: Array, curves: Curves, rows: slice, index: LineIndex) -> Array:
+    """Return how many points of the corridor that was seen free lie on a boundary: (n,), at most 10.
+
+    The corridor is looked at along its middle, between the two boundaries seen.
+    """
+    kind, side, cubic = curves.kind[rows], curves.side[rows], curves.cubic[rows]
+    is_boundary = kind == LineKind.BOUNDARY
+    left, right = (np.flatnonzero(is_boundary & (side == s)) for s in (1.0, -1.0))
+    if not (left.size and right.size):
+        return np.zeros(len(states))
+    reach = curves.reach[rows]
+    high = min(reach[left[0], 1], reach[right[0], 1])
+    low = max(reach[left[0], 0], reach[right[0], 0])
+    if high - low < 4.0:
+        return np.zeros(len(states))
+    x = np.linspace(low, high, 6)
+    powers = x[:, None] ** np.arange(4)
+    yl, yr = powers @ cubic[left[0]], powers @ cubic[right[0]]
+    total = np.zeros(len(states))
+    c, s = np.cos(states[:, YAW]), np.sin(states[:, YAW])
+    for share in (0.3, 0.5, 0.7):
+        y = yr + share * (yl - yr)
+        free = np.minimum(yl - y, y - yr) - 1.0
+        use = free > 0.3
+        if not use.any():
+            continue
+        px, py = x[use], y[use]
+        wx = states[:, X, None] + c[:, None] * px - s[:, None] * py
+        wy = states[:, Y, None] + s[:, None] * px + c[:, None] * py
+        distance, _ = index.nearest(wx, wy)
+        total += (distance < free[use]).sum(axis=1)
+    return np.minimum(total, 10.0)
+
+
+def first_particles(
+    x_y: Array,
+    half_m: float,
+    yaw: float | None,
+    indices: Mapping[LineKind, LineIndex],
+    settings: LocatorSettings,
+    rng: np.random.Generator,
+) -> Particles:
+    """Return particles on a grid over the square about a fix, where lines are near.
+
+    Without a course (None) they look everywhere.
+    """
+    cell = settings.cell_m
+    while True:
+        side = np.arange(-half_m, half_m + 0.5 * cell, cell)
+        gx, gy = np.meshgrid(x_y[0] + side, x_y[1] + side, indexing="ij")
+        x, y = gx.ravel(), gy.ravel()
+        near = np.zeros(len(x), dtype=bool)
+        for index in indices.values():
+            d, _ = index.tree.query(np.column_stack([x, y]))
+            near |= d < settings.off_road_m
+        x, y = x[near], y[near]
+        n_yaw = 1 if yaw is not None else 24
+        if len(x) * n_yaw <= settings.most * (1 if yaw is not None else 12) or cell > half_m:
+            break
+        cell *= 1.1
+    n = len(x) * n_yaw
+    states = np.zeros((n, 5))
+    states[:, X], states[:, Y] = np.repeat(x, n_yaw), np.repeat(y, n_yaw)
+    states[:, :2] += rng.uniform(-0.5 * cell, 0.5 * cell, (n, 2))
+    if yaw is not None:
+        states[:, YAW] = yaw + settings.yaw_sigma * rng.standard_normal(n)
+    else:
+        states[:, YAW] = np.tile(2.0 * np.pi * np.arange(n_yaw) / n_yaw, len(x))
+        states[:, YAW] += rng.uniform(-np.pi / n_yaw, np.pi / n_yaw, n)
+    states[:, SCALE] = settings.scale_sigma * rng.standard_normal(n)
+    states[:, BIAS] = settings.bias_sigma * rng.standard_normal(n)
+    states[:, YAW] = wrapped(states[:, YAW])
+    return Particles(states, np.zeros(n))

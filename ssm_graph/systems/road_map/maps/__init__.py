@@ -1,0 +1,1 @@
+"""Maps of several formats as one neutral map."""
