@@ -1,0 +1,212 @@
+"""All lanes that a stretch of a drive could have been driven in, each with its evidence.
+
+The particles may have lost the right lane before they knew better. So the stretch as a whole is
+laid on the map from everywhere about the fix, coarsely, and the best places finely: what the map
+itself says is possible does not depend on which particles are left.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from factors.lane_line import line_residual
+from ssm_graph.base.frozen import Array
+from ssm_graph.base.units import DEGREE, wrapped
+from ssm_graph.systems.road_map.locator import LocatorSettings
+from ssm_graph.systems.road_map.maps.index import LineIndex
+from ssm_graph.systems.road_map.maps.road_map import LineKind, Mark
+from ssm_graph.systems.road_map.window import Window, in_plane
+
+LATERAL_M: Final = 1.2
+"""Places closer to each other across the road are one lane ..."""
+TURN: Final = 20.0 * DEGREE
+"""... if they face the same way."""
+ALONG_M: Final = 8.0
+"""Places of one lane farther apart along the road are told apart all the same."""
+_COARSE_M: Final = 2.0
+_COARSE_TURN: Final = 2.5 * DEGREE
+_COARSE_SIGMA_M: Final = 1.2
+_KEPT: Final = 40
+_ROUNDS: Final = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Hypothesis:
+    """A place where the last picture could have been taken."""
+
+    pose: tuple[float, float, float]
+    """x, y [m], yaw [rad]"""
+    log_evidence: float
+    """Of the stretch's curves, up to a constant."""
+    share: float = 1.0
+    """Of the evidence of all places, 0 to 1."""
+
+    def is_same_lane(self, pose: Array) -> bool:
+        """Whether another pose is within the same lane, wherever along it."""
+        across, _, turn = apart(np.array(self.pose), pose)
+        return abs(across) < LATERAL_M and abs(turn) < TURN
+
+
+def apart(pose: Array, other: Array) -> tuple[float, float, float]:
+    """Return how far ``other`` is across and along a pose (3,), m, and turned, rad."""
+    dx, dy = other[0] - pose[0], other[1] - pose[1]
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    return float(c * dy - s * dx), float(c * dx + s * dy), float(wrapped(other[2] - pose[2]))
+
+
+def search(
+    window: Window,
+    x_y: Array,
+    half_m: float,
+    yaws: Array,
+    indices: Mapping[LineKind, LineIndex],
+    settings: LocatorSettings,
+    extra: Array | None = None,
+) -> list[Hypothesis]:
+    """Return the places of the last picture that the stretch allows, best first, shares filled in.
+
+    Parameters
+    ----------
+    x_y, half_m : middle and half side of the square that is searched, m.
+    yaws : (n,) courses that are tried, rad.
+    extra : (m, 3) poses that are tried as well, such as those of the particles.
+    """
+    side = np.arange(-half_m, half_m + 0.5 * _COARSE_M, _COARSE_M)
+    gx, gy, gyaw = np.meshgrid(x_y[0] + side, x_y[1] + side, yaws, indexing="ij")
+    grid = np.column_stack([gx.ravel(), gy.ravel(), gyaw.ravel()])
+    near = np.zeros(len(grid), dtype=bool)
+    for index in indices.values():
+        distance, _ = index.nearest(grid[:, 0], grid[:, 1])
+        near |= distance < index.reach_m
+    grid = grid[near] if near.any() else grid
+    thin = _thinned(window)
+    coarse = _log_likelihood(thin, grid, indices, settings, _COARSE_SIGMA_M)
+    picked = _apart_from_each_other(grid, coarse, _KEPT)
+    starts = grid[picked] if extra is None else np.concatenate([grid[picked], extra])
+    fine = _fitted(thin, starts, indices, settings)
+    inside = np.abs(fine[:, :2] - x_y).max(axis=1) < half_m + 2.0 * _COARSE_M
+    fine = fine[inside] if inside.any() else fine
+    found = _log_likelihood(window, fine, indices, settings, 0.0)
+    kept = _apart_from_each_other(fine, found, _KEPT)
+    share = np.exp(found[kept] - found[kept].max())
+    share /= share.sum()
+    return [
+        Hypothesis((float(p[0]), float(p[1]), float(p[2])), float(e), float(w))
+        for p, e, w in zip(fine[kept], found[kept], share, strict=True)
+    ]
+
+
+def _thinned(window: Window, n_pictures: int = 10, n_points: int = 4) -> Window:
+    """Return the window with fewer pictures, the last among them, and fewer points a curve."""
+    n = len(window.time_s)
+    kept = np.unique(np.linspace(n - 1, 0, min(n, n_pictures)).astype(int))
+    mine = np.isin(window.picture, kept)
+    points = np.linspace(0, window.points.shape[1] - 1, n_points).astype(int)
+    return Window(
+        window.time_s[kept],
+        window.motion[kept],
+        np.searchsorted(kept, window.picture[mine]),
+        window.points[mine][:, points],
+        window.kind[mine],
+        window.mark[mine],
+        window.sigma_m[mine],
+    )
+
+
+def _log_likelihood(
+    window: Window,
+    last: Array,
+    indices: Mapping[LineKind, LineIndex],
+    settings: LocatorSettings,
+    wider_m: float,
+) -> Array:
+    """Return the log likelihood (n,) of the window that ends at the poses (n, 3)."""
+    poses = window.poses_from(last)[:, window.picture.astype(int)]
+    total = np.zeros(len(last))
+    n_points = window.points.shape[1]
+    for kind, index in indices.items():
+        mine = window.kind == kind
+        if not mine.any():
+            continue
+        how = settings.line if kind is LineKind.LANE_LINE else settings.boundary
+        x, y = in_plane(poses[:, mine, None], window.points[mine])
+        distance, segment = index.nearest(x, y)
+        sigma = how.sigma_m + wider_m
+        cost = np.minimum(np.square(distance / sigma), how.cap_sq)
+        total -= 0.5 * how.information / n_points * cost.sum(axis=(1, 2))
+        if kind is LineKind.LANE_LINE:
+            seen = window.mark[mine][:, None]
+            there = index.mark[segment]
+            wrong = (there != Mark.UNKNOWN) & (seen != Mark.UNKNOWN) & (there != seen)
+            wrong &= cost < how.cap_sq
+            total -= settings.wrong_mark / n_points * wrong.sum(axis=(1, 2))
+    return total
+
+
+def _apart_from_each_other(poses: Array, value: Array, most: int) -> list[int]:
+    """Return rows of the best poses (n, 3), none in the place of a better one."""
+    kept: list[int] = []
+    left = np.argsort(-value)[: 40 * most]
+    while left.size and len(kept) < most:
+        best = left[0]
+        kept.append(int(best))
+        d = poses[left, :2] - poses[best, :2]
+        c, s = np.cos(poses[best, 2]), np.sin(poses[best, 2])
+        across, along = np.abs(c * d[:, 1] - s * d[:, 0]), np.abs(c * d[:, 0] + s * d[:, 1])
+        turn = np.abs(wrapped(poses[left, 2] - poses[best, 2]))
+        left = left[~((across < LATERAL_M) & (along < ALONG_M) & (turn < TURN))]
+    return kept
+
+
+def _fitted(
+    window: Window,
+    last: Array,
+    indices: Mapping[LineKind, LineIndex],
+    settings: LocatorSettings,
+) -> Array:
+    """Return poses (n, 3) moved to where the window fits best nearby: damped Gauss-Newton.
+
+    The widths fall from round to round, as those of the particles do.
+    """
+    at = last.copy()
+    for number in range(_ROUNDS):
+        wider_m = _COARSE_SIGMA_M * 0.4**number
+        hessian = np.zeros((len(at), 3, 3)) + np.diag([0.05, 0.05, 30.0])
+        slope = np.zeros((len(at), 3))
+        poses = window.poses_from(at)[:, window.picture.astype(int)]
+        for kind, index in indices.items():
+            mine = window.kind == kind
+            if not mine.any():
+                continue
+            how = settings.line if kind is LineKind.LANE_LINE else settings.boundary
+            pose = poses[:, mine, None]
+            points = window.points[mine]
+            x_y = np.stack(in_plane(pose, points), axis=-1)
+            foot = index.foot(x_y)
+            step = index.step[foot.segment]
+            normal = np.stack([-step[..., 1], step[..., 0]], axis=-1)
+            normal /= np.hypot(step[..., 0], step[..., 1])[..., None]
+            found = line_residual(
+                pose[..., :2], pose[..., 2], point_b=points, foot=foot.x_y, normal=normal
+            )
+            sigma = how.sigma_m + wider_m
+            counted = (foot.distance < np.sqrt(how.cap_sq) * sigma) / sigma**2
+            # In world axes, and turned about the last picture's position.
+            arm = x_y - at[:, None, None, :2]
+            turn = normal[..., 1] * arm[..., 0] - normal[..., 0] * arm[..., 1]
+            block = np.concatenate([normal, turn[..., None]], axis=-1)
+            hessian += np.einsum("ncm,ncmi,ncmj->nij", counted, block, block)
+            error = np.where(counted > 0.0, found.error, 0.0)
+            slope += np.einsum("ncm,ncmi->ni", counted * error, block)
+        at = at - np.linalg.solve(hessian, slope[..., None])[..., 0]
+    return at
+
+
+def course_trials(yaw: float, sigma: float) -> Array:
+    """Return the courses that a search tries: within two and a half sigma of one, rad."""
+    n = max(1, int(np.ceil(2.5 * sigma / _COARSE_TURN)))
+    return yaw + _COARSE_TURN * np.arange(-n, n + 1)

@@ -1,0 +1,415 @@
+"""From a drive and a map to a lane, or to a word why not."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from typing import Final
+
+import numpy as np
+
+from ssm_graph.base.errors import DataError, SolverError
+from ssm_graph.base.frozen import Array, FrozenArrays, shaped
+from ssm_graph.base.units import DEGREE
+from ssm_graph.filters.rules.particles import moments
+from ssm_graph.systems.road_map.drive import Chassis, Drive, curve_groups, dead_reckoned
+from ssm_graph.systems.road_map.hypotheses import Hypothesis, apart, course_trials, search
+from ssm_graph.systems.road_map.locator import (
+    BIAS,
+    SCALE,
+    YAW,
+    Locator,
+    LocatorSettings,
+    Particles,
+    first_particles,
+)
+from ssm_graph.systems.road_map.maps.index import LineIndex
+from ssm_graph.systems.road_map.maps.road_map import LineKind, RoadMap
+from ssm_graph.systems.road_map.refinement import Prior, Refined, RefinementSettings, refine
+from ssm_graph.systems.road_map.simulate import indices_of
+from ssm_graph.systems.road_map.window import Window, window_of
+
+SENSOR_REACH_M: Final = 60.0
+"""Beyond the square of the fix, what the camera can see."""
+CARRIED: Final = 0.05
+"""A rival with more of the evidence makes the answer ambiguous."""
+INDEPENDENT_M: Final = 3.0
+"""Pictures closer to each other see the same errors of the map again."""
+
+
+class Verdict(Enum):
+    """What can be said of the lane; the text is shown to the user."""
+
+    CONVERGED = "the lane is known, and the place along it"
+    UNRESOLVED_ALONG = "the lane is known, the place along it is not: the road looks alike there"
+    AMBIGUOUS = "more than one lane explains what was seen"
+    FAILED = "no lane explains what was seen"
+
+    @property
+    def has_lane(self) -> bool:
+        """Whether the lane is known."""
+        return self in (Verdict.CONVERGED, Verdict.UNRESOLVED_ALONG)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VerdictSettings:
+    """When the lane is held to be known."""
+
+    lateral_sigma_m: float = 0.5
+    """Of the particles; more is no lane."""
+    position_sigma_m: float = 6.0
+    """Of the particles in any direction, before a first look at the rivals."""
+    least_driven_m: float = 20.0
+    window_s: float = 6.0
+    """Of the stretch that is laid on the map to find rivals."""
+    again_after_m: float = 10.0
+    """Between two looks at the rivals while the lane is not known ..."""
+    watch_m: float = 60.0
+    """... and once it is."""
+    misfit: float = 3.0
+    """Loss of log evidence per curve beyond which nothing explains what was seen."""
+    along_sigma_m: float = 4.0
+    """More is not resolved along the road."""
+    refined_pictures: int = 40
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track(FrozenArrays):
+    """The filter's answer at every picture."""
+
+    time_s: Array = shaped("N")
+    pose: Array = shaped("N", 3)
+    """x, y [m], yaw [rad], means of all particles."""
+    cov: Array = shaped("N", 3, 3)
+    driven_m: Array = shaped("N")
+    n_particles: Array = shaped("N")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Located:
+    """What came of a drive."""
+
+    verdict: Verdict
+    reason: str
+    """In words, with numbers."""
+    pose: Array
+    """(3,) at the last picture: x, y [m], yaw [rad]."""
+    sigmas: tuple[float, float, float]
+    """Across and along [m], yaw [rad]."""
+    hypotheses: tuple[Hypothesis, ...]
+    """Places that the last stretch allows, the one with most evidence first."""
+    first_fix_s: float
+    """When the lane was first known, s from the start; NaN for never."""
+    first_fix_m: float
+    first_fix: Array
+    """(3,) the pose then; NaN for none."""
+    track: Track
+    refined: Refined | None
+    window: Window | None
+    snapshots: tuple[tuple[float, Array], ...]
+    """Times with particles (n, 3), for figures."""
+    cpu_ms: float
+    """Processor time of one update, its share of the search among it."""
+
+
+@dataclass(slots=True)
+class _Judge:
+    """What was found of rivals, and when the next look is due."""
+
+    settings: VerdictSettings
+    verdict: Verdict = Verdict.AMBIGUOUS
+    hypotheses: list[Hypothesis] = field(default_factory=list)
+    next_m: float = 0.0
+    misfit: float = 0.0
+    first: tuple[float, float, Array] | None = None
+
+
+class Localiser:
+    """Follows one drive over one map; see `locate`."""
+
+    def __init__(
+        self,
+        drive: Drive,
+        road_map: RoadMap,
+        *,
+        settings: LocatorSettings | None = None,
+        verdict: VerdictSettings | None = None,
+        refinement: RefinementSettings | None = None,
+        seed: int = 0,
+        indices: Mapping[LineKind, LineIndex] | None = None,
+    ) -> None:
+        self.drive = drive
+        self.settings = settings or LocatorSettings()
+        self.judge = _Judge(verdict or VerdictSettings())
+        self.refinement = refinement or RefinementSettings()
+        self.half_m = square_of(drive)
+        fixes = drive.gnss.x_y
+        if indices is None:
+            indices = indices_of(road_map.within(fixes, self.half_m + SENSOR_REACH_M))
+        self.indices = indices
+        yaw, rng = _first_course(drive), np.random.default_rng([seed, 2])
+        particles = first_particles(
+            fixes[0], self.half_m, yaw, self.indices, self.settings, rng
+        )
+        self.locator = Locator(self.indices, particles, rng, self.settings)
+        t = drive.chassis.time_s
+        self.reckoned = dead_reckoned(np.zeros(3), t, drive.chassis)
+        self.groups = curve_groups(drive.curves)
+        self.snapshots: list[tuple[float, Array]] = []
+        self.rows: list[tuple[float, Array, Array, float, int]] = []
+        self.extras: list[tuple[Array, Array]] = []
+
+    def run(self) -> Located:
+        """Follow the drive to its end."""
+        began = time.process_time()
+        t, n_done = self.drive.chassis.time_s, 0
+        way = np.hypot(*np.diff(self.reckoned[:, :2], axis=0).T)
+        way *= np.sign(0.5 * (self.drive.chassis.speed[1:] + self.drive.chassis.speed[:-1]))
+        turn = np.diff(self.reckoned[:, 2])
+        self._keep(float(t[0]))
+        for k in range(1, len(t)):
+            while n_done < len(self.groups) and self.groups[n_done][0] < t[k]:
+                self._picture(n_done)
+                n_done += 1
+            self.locator.predict(float(way[k - 1]), float(turn[k - 1]), float(t[k] - t[k - 1]))
+        while n_done < len(self.groups) and self.groups[n_done][0] <= t[-1] + 1e-6:
+            self._picture(n_done)
+            n_done += 1
+        if not self.rows:
+            raise DataError(
+                f"{self.drive.name} curves: none within the times of the chassis, {t[0]:.3f} to "
+                f"{t[-1]:.3f} s; are the clocks the same?"
+            )
+        self._judge(len(self.rows) - 1)
+        cpu_ms = 1e3 * (time.process_time() - began) / len(self.rows)
+        return self._answer(cpu_ms)
+
+    def _picture(self, number: int) -> None:
+        when, group = self.groups[number]
+        locator = self.locator
+        locator.update(self.drive.curves, group)
+        p = locator.particles
+        weight = p.weight
+        mean, cov = moments(p.states, weight, YAW)
+        self.rows.append((when, mean[:3], cov[:3, :3], locator.driven_m, len(weight)))
+        self.extras.append((mean, cov))
+        if len(self.rows) in (3, 10, 25) or len(self.rows) % 60 == 0:
+            self._keep(when)
+        judge = self.judge
+        across, along = sigmas_of(mean[:3], cov[:3, :3])
+        is_narrow = across < judge.settings.lateral_sigma_m
+        is_narrow &= np.hypot(across, along) < judge.settings.position_sigma_m
+        is_due = locator.driven_m >= max(judge.next_m, judge.settings.least_driven_m)
+        if is_due and (is_narrow or locator.driven_m > 3.0 * judge.settings.least_driven_m):
+            self._judge(number)
+
+    def _keep(self, when: float) -> None:
+        self.snapshots.append((when, self.locator.particles.states[:, :3].copy()))
+
+    def _stretch(self, number: int) -> tuple[Window | None, list[tuple[float, slice]]]:
+        last = self.groups[number][0]
+        first = max(0, number - 200)
+        groups = [
+            g for g in self.groups[first : number + 1]
+            if g[0] > last - self.judge.settings.window_s
+        ]
+        return self._window(groups), groups
+
+    def _window(self, groups: list[tuple[float, slice]]) -> Window | None:
+        mean = self.extras[-1][0]
+        times = np.array([g[0] for g in groups])
+        t0 = max(float(self.drive.chassis.time_s[0]), float(times[0]))
+        times = np.maximum(times, t0)
+        motion = dead_reckoned(
+            np.zeros(3), times, self.drive.chassis, scale=1.0 + mean[SCALE], bias=mean[BIAS]
+        )
+        return window_of(self.drive.curves, groups, motion, self.settings.n_points)
+
+    def _judge(self, number: int) -> None:
+        """Look for rivals, judge, and put particles where the evidence is."""
+        judge, v = self.judge, self.judge.settings
+        number = min(number, len(self.groups) - 1)
+        window, groups = self._stretch(number)
+        when, mean, cov, driven_m, _ = self.rows[-1]
+        judge.next_m = driven_m + v.again_after_m
+        if window is None:
+            judge.verdict = Verdict.FAILED if judge.first is None else judge.verdict
+            return
+        fix = _fix_at(self.drive, when)
+        spread = max(float(np.sqrt(cov[2, 2])), self.settings.yaw_sigma / 2.0)
+        yaws = course_trials(float(mean[2]), min(spread, 10.0 * DEGREE))
+        found = search(
+            window, fix, self.half_m, yaws, self.indices, self.settings, mean[None, :3]
+        )
+        length = float(np.hypot(*np.diff(window.motion[:, :2], axis=0).T).sum())
+        temper = min(1.0, length / (INDEPENDENT_M * max(len(window.time_s) - 1, 1)))
+        found = _tempered(found, temper)
+        judge.hypotheses = found
+        judge.misfit = -found[0].log_evidence / len(window.picture)
+        across, _ = sigmas_of(mean, cov)
+        mine = sum(h.share for h in found if h.is_same_lane(mean))
+        if judge.misfit > v.misfit:
+            judge.verdict = Verdict.FAILED
+        elif across > v.lateral_sigma_m or mine < 1.0 - CARRIED:
+            judge.verdict = Verdict.AMBIGUOUS
+        else:
+            judge.verdict = Verdict.CONVERGED
+            judge.next_m = driven_m + v.watch_m
+            if judge.first is None and driven_m >= v.least_driven_m:
+                judge.first = (when, driven_m, mean)
+        if mine < 1.0 - CARRIED and judge.verdict is not Verdict.FAILED:
+            self.locator.particles = _spread_over(
+                found, self.locator.particles, self.settings, self.locator.rng
+            )
+
+    def _answer(self, cpu_ms: float) -> Located:
+        judge, v = self.judge, self.judge.settings
+        _, mean, cov, _, _ = self.rows[-1]
+        pose, sigmas = mean, (*sigmas_of(mean, cov), float(np.sqrt(cov[2, 2])))
+        refined, window, verdict = None, None, judge.verdict
+        reason = ""
+        if verdict is Verdict.CONVERGED:
+            try:
+                refined, window = self._refine()
+            except SolverError as error:
+                reason = str(error)
+        if refined is not None:
+            pose, sigmas = refined.poses[-1], refined.sigmas
+        if verdict is Verdict.CONVERGED and sigmas[1] > v.along_sigma_m:
+            verdict = Verdict.UNRESOLVED_ALONG
+        first = judge.first or (np.nan, np.nan, np.full(3, np.nan))
+        return Located(
+            verdict,
+            _reason(verdict, judge, pose, sigmas) + (f"; {reason}" if reason else ""),
+            np.array(pose),
+            sigmas,
+            tuple(judge.hypotheses),
+            first[0] - float(self.drive.chassis.time_s[0]),
+            first[1],
+            first[2],
+            _track(self.rows),
+            refined,
+            window,
+            tuple(self.snapshots),
+            cpu_ms,
+        )
+
+    def _refine(self) -> tuple[Refined | None, Window | None]:
+        """Lay the last pictures on the map as a graph, begun by the particles before them."""
+        n = min(self.judge.settings.refined_pictures, len(self.rows))
+        groups = self.groups[len(self.rows) - n : len(self.rows)]
+        window = self._window(groups)
+        if window is None:
+            return None, None
+        mean, cov = self.extras[len(self.rows) - n]
+        floor = np.diag([0.05, 0.05, 0.2 * DEGREE, 1e-3, 1e-5]) ** 2
+        cov = cov + floor
+        if n == len(self.rows):
+            cov = cov + np.diag([self.half_m**2 / 3.0, self.half_m**2 / 3.0, 0.0, 0.0, 0.0])
+        prior = Prior(mean, np.linalg.inv(cov))
+        start = window.poses_from(self.rows[-1][1])
+        return refine(window, start, prior, self.indices, self.refinement), window
+
+
+def locate(drive: Drive, road_map: RoadMap, **options: object) -> Located:
+    """Return in which lane a drive ends, with a verdict; options are those of `Localiser`."""
+    return Localiser(drive, road_map, **options).run()  # type: ignore[arg-type]
+
+
+def square_of(drive: Drive) -> float:
+    """Return half the side of the square about a fix in which the vehicle is, m."""
+    noise = 3.0 * float(drive.gnss.sigma_m[0]) if drive.gnss_bias_m == 0.0 else 2.0
+    return drive.gnss_bias_m + noise
+
+
+def sigmas_of(pose: Array, cov: Array) -> tuple[float, float]:
+    """Return the standard deviations across and along a pose (3,) from its covariance, m."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    along, across = np.array([c, s]), np.array([-s, c])
+    return (
+        float(np.sqrt(across @ cov[:2, :2] @ across)),
+        float(np.sqrt(along @ cov[:2, :2] @ along)),
+    )
+
+
+def _first_course(drive: Drive) -> float | None:
+    yaw = drive.gnss.yaw
+    if yaw is None or not np.isfinite(yaw[0]):
+        return None
+    return float(yaw[0])
+
+
+def _fix_at(drive: Drive, when: float) -> Array:
+    """Return the last fix before a time, carried on by dead reckoning, (2,) m."""
+    k = max(0, int(np.searchsorted(drive.gnss.time_s, when, side="right")) - 1)
+    return drive.gnss.x_y[k]
+
+
+def _tempered(found: list[Hypothesis], temper: float) -> list[Hypothesis]:
+    evidence = np.array([h.log_evidence for h in found]) * temper
+    share = np.exp(evidence - evidence.max())
+    share /= share.sum()
+    return [
+        replace(h, log_evidence=float(e), share=float(w))
+        for h, e, w in zip(found, evidence, share, strict=True)
+    ]
+
+
+def _spread_over(
+    found: list[Hypothesis],
+    old: Particles,
+    settings: LocatorSettings,
+    rng: np.random.Generator,
+) -> Particles:
+    """Return particles about all places with evidence, in proportion; some of the old ones stay."""
+    n = settings.most
+    kept = old.states[rng.choice(len(old.states), n // 5, p=old.weight)]
+    likely = [h for h in found if h.share > 1e-3]
+    share = np.array([h.share for h in likely])
+    share = np.maximum(share / share.sum(), 0.05)
+    rows = rng.choice(len(likely), n - len(kept), p=share / share.sum())
+    drawn = old.states[rng.choice(len(old.states), len(rows), p=old.weight)].copy()
+    drawn[:, :3] = np.array([h.pose for h in likely])[rows]
+    along = 2.0 * rng.standard_normal(len(rows))
+    drawn[:, 0] += along * np.cos(drawn[:, 2]) + 0.2 * rng.standard_normal(len(rows))
+    drawn[:, 1] += along * np.sin(drawn[:, 2]) + 0.2 * rng.standard_normal(len(rows))
+    drawn[:, 2] += 0.5 * DEGREE * rng.standard_normal(len(rows))
+    return Particles(np.concatenate([kept, drawn]), np.zeros(n))
+
+
+def _track(rows: list[tuple[float, Array, Array, float, int]]) -> Track:
+    return Track(
+        np.array([row[0] for row in rows]),
+        np.array([row[1] for row in rows]),
+        np.array([row[2] for row in rows]),
+        np.array([row[3] for row in rows]),
+        np.array([float(row[4]) for row in rows]),
+    )
+
+
+def _reason(
+    verdict: Verdict, judge: _Judge, pose: Array, sigmas: tuple[float, float, float]
+) -> str:
+    if not judge.hypotheses:
+        return "no curve was seen in the last stretch, so nothing tells one lane from another"
+    best = judge.hypotheses[0]
+    if verdict is Verdict.FAILED:
+        return (
+            f"the best place explains the curves with a loss of {judge.misfit:.1f} each, expected "
+            f"below {judge.settings.misfit:.1f}: another place, an old map, or curves in other axes"
+        )
+    rival = next((h for h in judge.hypotheses if not h.is_same_lane(pose)), None)
+    told = ""
+    if rival is not None:
+        across, along, turn = apart(pose, np.array(rival.pose))
+        told = (
+            f"; rival {across:+.1f} m across, {along:+.1f} m along, turned {np.degrees(turn):+.0f} "
+            f"deg, with {100.0 * rival.share:.1f} % of the evidence"
+        )
+    if verdict is Verdict.UNRESOLVED_ALONG:
+        return f"sigma along the road {sigmas[1]:.1f} m, across {sigmas[0]:.2f} m{told}"
+    if verdict is Verdict.AMBIGUOUS:
+        return f"the best place has {100.0 * best.share:.0f} % of the evidence{told}"
+    return f"sigma across {sigmas[0]:.3f} m, along {sigmas[1]:.2f} m{told}"

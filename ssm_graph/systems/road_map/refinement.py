@@ -1,0 +1,305 @@
+"""A window of poses against the map's lines, with a similarity weight for every point of a curve.
+
+The factor graph is small and stiff: K poses, one scale of the speed and one bias of the yaw rate,
+joined by the chassis, begun by a prior, and each curve's points tied to the lines nearest to them
+(found anew in each round). It is solved as it stands, so that the covariance is that of the whole:
+on a straight road it says along the road what the prior says and no more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.lane_line import curve_covariance, line_residual
+from factors.similarity import Kernel, LogKernel, expected_mahalanobis_sq
+from ssm_graph.base.errors import SolverError
+from ssm_graph.base.frozen import Array, ReadOnlyArrays
+from ssm_graph.base.units import DEGREE, wrapped
+from ssm_graph.systems.road_map.maps.index import LineIndex
+from ssm_graph.systems.road_map.maps.road_map import LineKind, Mark
+from ssm_graph.systems.road_map.window import Window, in_plane
+
+_FAR_M: Final = 1.5
+"""A point farther from every line of its kind is of none of them."""
+_CLOSE_M: Final = 2e-4
+_CLOSE_RAD: Final = 1e-4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RefinementSettings:
+    """Noise of the window; distances in m, angles in rad."""
+
+    rounds: int = 12
+    slope_sigma: float = 4e-3
+    """Of a detected curve."""
+    scatter_m: float = 0.03
+    """Of a point of a curve, and of the map's line there."""
+    way_sigma: float = 0.01
+    """Relative, of the way between two pictures; the common scale is a state beside it."""
+    way_floor_m: float = 0.01
+    turn_floor: float = 0.1 * DEGREE
+    """Of the turn between two pictures a fifth of a second apart."""
+    kernel: Kernel = LogKernel(5.0)
+    wrong_mark: float = 0.05
+    """Weight of a point on a line that is dashed where the curve is solid, or the reverse."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prior(ReadOnlyArrays):
+    """What is known of the first pose, the speed's scale and the yaw rate's bias beforehand."""
+
+    mean: Array
+    """(5,) x, y [m], yaw [rad], scale beyond 1, bias [rad/s]"""
+    information: Array
+    """(5, 5)"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refined(ReadOnlyArrays):
+    """Poses of a window with what is known of them."""
+
+    poses: Array
+    """(K, 3) x, y [m], yaw [rad]"""
+    scale: float
+    bias: float
+    """rad/s"""
+    covs: Array
+    """(K, 3, 3) of each pose in the axes of the plane."""
+    weight: Array
+    """(C, m) similarity weight of every curve point; 0 where no line is near."""
+    feet: Array
+    """(C, m, 2) m, where each point lies on the map."""
+    has_settled: bool
+    next_prior: Prior | None = None
+    """Of the second pose, the first one being left behind."""
+
+    @property
+    def sigmas(self) -> tuple[float, float, float]:
+        """Across and along the last pose [m], and its yaw [rad]."""
+        yaw, cov = self.poses[-1, 2], self.covs[-1]
+        c, s = np.cos(yaw), np.sin(yaw)
+        along, across = np.array([c, s]), np.array([-s, c])
+        return (
+            float(np.sqrt(across @ cov[:2, :2] @ across)),
+            float(np.sqrt(along @ cov[:2, :2] @ along)),
+            float(np.sqrt(cov[2, 2])),
+        )
+
+
+class _Lines:
+    """Curve points tied to the map at a set of poses: errors, normals, weights."""
+
+    def __init__(
+        self, window: Window, indices: Mapping[LineKind, LineIndex], settings: RefinementSettings
+    ) -> None:
+        self.window, self.indices, self.settings = window, indices, settings
+        self.of: NDArray[np.int64] = window.picture.astype(int)
+
+    def tie(self, poses: Array) -> None:
+        """Find the lines nearest to all points."""
+        shape = self.window.points.shape
+        at = poses[self.of][:, None]
+        x_y = np.stack(in_plane(at, self.window.points), axis=-1)
+        self.feet, self.normals = np.zeros(shape), np.zeros(shape)
+        self.normals[..., 1] = 1.0
+        self.trust = np.zeros(shape[:2])
+        for kind, index in self.indices.items():
+            mine = self.window.kind == kind
+            if not mine.any():
+                continue
+            foot = index.foot(x_y[mine])
+            step = index.step[foot.segment]
+            normal = np.stack([-step[..., 1], step[..., 0]], axis=-1)
+            self.normals[mine] = normal / np.hypot(step[..., 0], step[..., 1])[..., None]
+            self.feet[mine] = foot.x_y
+            trust = (foot.distance < _FAR_M).astype(float)
+            off = np.abs(np.sum(self.normals[mine] * (x_y[mine] - foot.x_y), axis=-1))
+            trust[foot.distance > off + 0.05] = 0.0  # beyond the end of a line
+            if kind is LineKind.LANE_LINE:
+                seen, there = self.window.mark[mine][:, None], index.mark[foot.segment]
+                wrong = (seen != Mark.UNKNOWN) & (there != Mark.UNKNOWN) & (seen != there)
+                trust = np.where(wrong, trust * self.settings.wrong_mark, trust)
+            self.trust[mine] = trust
+
+    def rows(self, poses: Array, covs: Array | None) -> tuple[Array, Array, Array]:
+        """Return whitened errors (C, m), blocks (C, m, 3) in plane axes, and weights (C, m)."""
+        w, s = self.window, self.settings
+        pose = poses[self.of]
+        found = line_residual(
+            pose[:, None, :2],
+            pose[:, None, 2],
+            point_b=w.points,
+            foot=self.feet,
+            normal=self.normals,
+        )
+        block = np.concatenate([self.normals, found.error_D_pose[..., 2:]], axis=-1)
+        x = w.points[..., 0]
+        variance = w.sigma_m[:, None] ** 2 + (s.slope_sigma * x) ** 2 + s.scatter_m**2
+        spread = np.zeros(x.shape)
+        if covs is not None:
+            spread = np.einsum("cmi,cij,cmj->cm", block, covs[self.of], block)
+        t = expected_mahalanobis_sq(found.error, spread, sigma=np.sqrt(variance))
+        weight = s.kernel.weight(t) * self.trust
+        cov = curve_covariance(
+            x,
+            np.maximum(weight, 1e-6),
+            offset=w.sigma_m,
+            slope=s.slope_sigma,
+            scatter=s.scatter_m,
+        )
+        root = np.linalg.cholesky(cov)
+        both = np.linalg.solve(root, np.concatenate([found.error[..., None], block], axis=-1))
+        return both[..., 0], both[..., 1:], weight
+
+
+def refine(
+    window: Window,
+    first: Array,
+    prior: Prior,
+    indices: Mapping[LineKind, LineIndex],
+    settings: RefinementSettings | None = None,
+) -> Refined:
+    """Return the poses of a window from first guesses (K, 3), with honest covariance.
+
+    Raises :class:`SolverError` where they run away.
+    """
+    s = settings or RefinementSettings()
+    lines = _Lines(window, indices, s)
+    poses, extra = np.array(first), np.array(prior.mean[3:])
+    covs, has_settled = None, False
+    for _ in range(s.rounds):
+        lines.tie(poses)
+        hessian, slope, weight = _system(window, lines, poses, extra, prior, s, covs)
+        cov = np.linalg.inv(hessian)
+        step = -cov @ slope
+        moved = step[:-2].reshape(-1, 3)
+        if not np.all(np.isfinite(step)) or np.abs(moved[:, :2]).max() > 100.0:
+            raise SolverError(
+                "refinement: the window ran away from the map; is it begun in the right lane?"
+            )
+        poses, extra = poses + moved, extra + step[-2:]
+        covs = np.stack([cov[i : i + 3, i : i + 3] for i in range(0, 3 * len(poses), 3)])
+        shift, turn = np.abs(moved[:, :2]).max(), np.abs(moved[:, 2]).max()
+        if shift < _CLOSE_M + 0.01 * np.sqrt(covs[-1, :2, :2].trace()) and turn < _CLOSE_RAD:
+            has_settled = True
+            break
+    return Refined(
+        poses,
+        float(extra[0]),
+        float(extra[1]),
+        covs if covs is not None else np.zeros((len(poses), 3, 3)),
+        weight,
+        lines.feet,
+        has_settled,
+        _leave_first(window, lines, poses, extra, prior, s, covs),
+    )
+
+
+def _system(
+    window: Window,
+    lines: _Lines,
+    poses: Array,
+    extra: Array,
+    prior: Prior,
+    s: RefinementSettings,
+    covs: Array | None,
+) -> tuple[Array, Array, Array]:
+    """Return the normal equations of all poses, scale and bias, and the weights of the points."""
+    n = len(poses)
+    size = 3 * n + 2
+    hessian, slope = np.zeros((size, size)), np.zeros(size)
+    head = np.array([0, 1, 2, size - 2, size - 1])
+    off = np.concatenate([poses[0], extra]) - prior.mean
+    off[2] = wrapped(off[2])
+    hessian[np.ix_(head, head)] += prior.information
+    slope[head] += prior.information @ off
+    error, block, weight = lines.rows(poses, covs)
+    own = np.zeros((n, 3, 3))
+    np.add.at(own, lines.of, np.einsum("cmi,cmj->cij", block, block))
+    pull = np.zeros((n, 3))
+    np.add.at(pull, lines.of, np.einsum("cmi,cm->ci", block, error))
+    for k in range(n):
+        hessian[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += own[k]
+    slope[: 3 * n] += pull.ravel()
+    moved, blocks = _motion(window, poses, extra, s)
+    for k in range(n - 1):
+        at = np.array([*range(3 * k, 3 * k + 6), size - 2, size - 1])
+        hessian[np.ix_(at, at)] += blocks[k].T @ blocks[k]
+        slope[at] += blocks[k].T @ moved[k]
+    return hessian, slope, weight
+
+
+def _motion(
+    window: Window, poses: Array, extra: Array, s: RefinementSettings
+) -> tuple[Array, Array]:
+    """Return whitened errors (K-1, 3) of the steps between pictures, and their blocks (.., 3, 8).
+
+    In the axes of the earlier picture, with the way d and turn a of the chassis over dt::
+
+        R' (t2 - t1) - (1 + scale) d,    yaw2 - yaw1 - (a - bias dt)
+    """
+    m = window.motion
+    dt = np.diff(window.time_s)
+    c0, s0 = np.cos(m[:-1, 2]), np.sin(m[:-1, 2])
+    d = np.diff(m, axis=0)
+    way = np.column_stack([c0 * d[:, 0] + s0 * d[:, 1], c0 * d[:, 1] - s0 * d[:, 0]])
+    c, sn = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
+    g = np.diff(poses, axis=0)
+    forward, left = c * g[:, 0] + sn * g[:, 1], c * g[:, 1] - sn * g[:, 0]
+    error = np.column_stack(
+        [
+            forward - (1.0 + extra[0]) * way[:, 0],
+            left - (1.0 + extra[0]) * way[:, 1],
+            wrapped(g[:, 2] - d[:, 2] + extra[1] * dt),
+        ]
+    )
+    block = np.zeros((len(dt), 3, 8))
+    block[:, 0, 3], block[:, 0, 4], block[:, 0, 2] = c, sn, left
+    block[:, 1, 3], block[:, 1, 4], block[:, 1, 2] = -sn, c, -forward
+    block[:, :2, :2] = -block[:, :2, 3:5]
+    block[:, 2, 2], block[:, 2, 5] = -1.0, 1.0
+    block[:, :2, 6] = -way
+    block[:, 2, 7] = dt
+    length = np.hypot(*way.T)
+    turn = s.turn_floor * np.sqrt(dt / 0.2)
+    sigma_way = s.way_sigma * length + s.way_floor_m
+    sigma = np.column_stack([sigma_way, 0.5 * length * turn + 0.5 * s.way_floor_m, turn])
+    return error / sigma, block / sigma[..., None]
+
+
+def _leave_first(
+    window: Window,
+    lines: _Lines,
+    poses: Array,
+    extra: Array,
+    prior: Prior,
+    s: RefinementSettings,
+    covs: Array | None,
+) -> Prior | None:
+    """Return the prior of the second pose once the first one is eliminated, with all it saw."""
+    if len(poses) < 2:
+        return None
+    error, block, _ = lines.rows(poses, covs)
+    mine = lines.of == 0
+    hessian, slope = np.zeros((8, 8)), np.zeros(8)
+    hessian[:3, :3] = np.einsum("cmi,cmj->ij", block[mine], block[mine])
+    slope[:3] = np.einsum("cmi,cm->i", block[mine], error[mine])
+    head = np.array([0, 1, 2, 6, 7])
+    off = np.concatenate([poses[0], extra]) - prior.mean
+    off[2] = wrapped(off[2])
+    hessian[np.ix_(head, head)] += prior.information
+    slope[head] += prior.information @ off
+    moved, blocks = _motion(window, poses, extra, s)
+    hessian += blocks[0].T @ blocks[0]
+    slope += blocks[0].T @ moved[0]
+    gain = np.linalg.solve(hessian[:3, :3], hessian[:3, 3:]).T
+    information = hessian[3:, 3:] - gain @ hessian[:3, 3:]
+    rest = slope[3:] - gain @ slope[:3]
+    mean = np.concatenate([poses[1], extra]) - np.linalg.solve(information, rest)
+    return Prior(mean, 0.5 * (information + information.T))
+
