@@ -16,7 +16,7 @@ import numpy as np
 from factors.lane_line import line_residual
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.units import DEGREE, wrapped
-from ssm_graph.systems.road_map.locator import LocatorSettings
+from ssm_graph.systems.road_map.locator import INDEPENDENT_M, LocatorSettings
 from ssm_graph.systems.road_map.maps.index import LineIndex
 from ssm_graph.systems.road_map.maps.road_map import LineKind, Mark
 from ssm_graph.systems.road_map.window import Window, in_plane
@@ -31,6 +31,8 @@ _COARSE_M: Final = 2.0
 _COARSE_TURN: Final = 2.5 * DEGREE
 _COARSE_SIGMA_M: Final = 1.2
 _KEPT: Final = 40
+SLIDE_M: Final = 24.0
+"""How far along the lane a place is looked for anew."""
 _ROUNDS: Final = 6
 
 
@@ -65,15 +67,15 @@ def search(
     yaws: Array,
     indices: Mapping[LineKind, LineIndex],
     settings: LocatorSettings,
-    extra: Array | None = None,
-) -> list[Hypothesis]:
-    """Return the places of the last picture that the stretch allows, best first, shares filled in.
+    own: Array,
+) -> tuple[list[Hypothesis], Hypothesis]:
+    """Return the places of the last picture that the stretch allows, best first, and the own one.
 
     Parameters
     ----------
     x_y, half_m : middle and half side of the square that is searched, m.
     yaws : (n,) courses that are tried, rad.
-    extra : (m, 3) poses that are tried as well, such as those of the particles.
+    own : (3,) pose that is tried as well, the mean of the particles.
     """
     side = np.arange(-half_m, half_m + 0.5 * _COARSE_M, _COARSE_M)
     gx, gy, gyaw = np.meshgrid(x_y[0] + side, x_y[1] + side, yaws, indexing="ij")
@@ -84,20 +86,49 @@ def search(
         near |= distance < index.reach_m
     grid = grid[near] if near.any() else grid
     thin = _thinned(window)
-    coarse = _log_likelihood(thin, grid, indices, settings, _COARSE_SIGMA_M)
-    picked = _apart_from_each_other(grid, coarse, _KEPT)
-    starts = grid[picked] if extra is None else np.concatenate([grid[picked], extra])
-    fine = _fitted(thin, starts, indices, settings)
+    coarse = _log_likelihood(_thinned(window, 6, 3), grid, indices, settings, _COARSE_SIGMA_M)
+    starts = np.concatenate([grid[_apart_from_each_other(grid, coarse, _KEPT)], own[None]])
+    fine = _fitted(thin, starts, indices, settings, _COARSE_SIGMA_M)
     inside = np.abs(fine[:, :2] - x_y).max(axis=1) < half_m + 2.0 * _COARSE_M
-    fine = fine[inside] if inside.any() else fine
-    found = _log_likelihood(window, fine, indices, settings, 0.0)
-    kept = _apart_from_each_other(fine, found, _KEPT)
-    share = np.exp(found[kept] - found[kept].max())
-    share /= share.sum()
-    return [
+    inside[-1] = True
+    return _ranked(window, fine[inside], indices, settings)
+
+
+def slide(
+    window: Window,
+    pose: Array,
+    indices: Mapping[LineKind, LineIndex],
+    settings: LocatorSettings,
+) -> tuple[list[Hypothesis], Hypothesis]:
+    """Return the places along the lane of a pose (3,) that the stretch allows, and the own one."""
+    at = np.arange(-SLIDE_M, SLIDE_M + 1.0, 2.0 * _COARSE_M)
+    starts = pose + at[:, None] * [np.cos(pose[2]), np.sin(pose[2]), 0.0]
+    thin = _thinned(window)
+    fine = _fitted(thin, np.concatenate([starts, pose[None]]), indices, settings, 0.5)
+    return _ranked(window, fine, indices, settings)
+
+
+def _ranked(
+    window: Window,
+    poses: Array,
+    indices: Mapping[LineKind, LineIndex],
+    settings: LocatorSettings,
+) -> tuple[list[Hypothesis], Hypothesis]:
+    """Return poses (n, 3) by evidence, without those in the place of a better one; and the last.
+
+    Pictures close to each other see the same errors of the map again: so much less they count.
+    """
+    length = float(np.hypot(*np.diff(window.motion[:, :2], axis=0).T).sum())
+    new = min(1.0, (length + INDEPENDENT_M) / (INDEPENDENT_M * len(window.time_s)))
+    found = new * _log_likelihood(window, poses, indices, settings, 0.0)
+    kept = _apart_from_each_other(poses, found, _KEPT)
+    share = np.exp(found - found[kept].max())
+    share /= share[kept].sum()
+    told = [
         Hypothesis((float(p[0]), float(p[1]), float(p[2])), float(e), float(w))
-        for p, e, w in zip(fine[kept], found[kept], share, strict=True)
+        for p, e, w in zip(poses, found, share, strict=True)
     ]
+    return [told[row] for row in kept], told[-1]
 
 
 def _thinned(window: Window, n_pictures: int = 10, n_points: int = 4) -> Window:
@@ -167,14 +198,15 @@ def _fitted(
     last: Array,
     indices: Mapping[LineKind, LineIndex],
     settings: LocatorSettings,
+    first_m: float,
 ) -> Array:
     """Return poses (n, 3) moved to where the window fits best nearby: damped Gauss-Newton.
 
-    The widths fall from round to round, as those of the particles do.
+    The widths fall from round to round, beginning with ``first_m`` more than the sigmas.
     """
     at = last.copy()
     for number in range(_ROUNDS):
-        wider_m = _COARSE_SIGMA_M * 0.4**number
+        wider_m = first_m * 0.4**number
         hessian = np.zeros((len(at), 3, 3)) + np.diag([0.05, 0.05, 30.0])
         slope = np.zeros((len(at), 3))
         poses = window.poses_from(at)[:, window.picture.astype(int)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final
 
@@ -15,7 +15,14 @@ from ssm_graph.base.frozen import Array, FrozenArrays, shaped
 from ssm_graph.base.units import DEGREE
 from ssm_graph.filters.rules.particles import moments
 from ssm_graph.systems.road_map.drive import Chassis, Drive, curve_groups, dead_reckoned
-from ssm_graph.systems.road_map.hypotheses import Hypothesis, apart, course_trials, search
+from ssm_graph.systems.road_map.hypotheses import (
+    ALONG_M,
+    Hypothesis,
+    apart,
+    course_trials,
+    search,
+    slide,
+)
 from ssm_graph.systems.road_map.locator import (
     BIAS,
     SCALE,
@@ -35,8 +42,10 @@ SENSOR_REACH_M: Final = 60.0
 """Beyond the square of the fix, what the camera can see."""
 CARRIED: Final = 0.05
 """A rival with more of the evidence makes the answer ambiguous."""
-INDEPENDENT_M: Final = 3.0
-"""Pictures closer to each other see the same errors of the map again."""
+LOST: Final = 4.0
+"""Log evidence by which another place must be better for the particles to be put there."""
+SLIDE_EVERY_M: Final = 8.0
+"""From one look along the lane to the next."""
 
 
 class Verdict(Enum):
@@ -66,7 +75,7 @@ class VerdictSettings:
     """Of the stretch that is laid on the map to find rivals."""
     again_after_m: float = 10.0
     """Between two looks at the rivals while the lane is not known ..."""
-    watch_m: float = 60.0
+    watch_m: float = 80.0
     """... and once it is."""
     misfit: float = 3.0
     """Loss of log evidence per curve beyond which nothing explains what was seen."""
@@ -122,6 +131,7 @@ class _Judge:
     verdict: Verdict = Verdict.AMBIGUOUS
     hypotheses: list[Hypothesis] = field(default_factory=list)
     next_m: float = 0.0
+    next_slide_m: float = 0.0
     misfit: float = 0.0
     first: tuple[float, float, Array] | None = None
 
@@ -204,6 +214,28 @@ class Localiser:
         is_due = locator.driven_m >= max(judge.next_m, judge.settings.least_driven_m)
         if is_due and (is_narrow or locator.driven_m > 3.0 * judge.settings.least_driven_m):
             self._judge(number)
+        elif judge.verdict is Verdict.CONVERGED and locator.driven_m >= judge.next_slide_m:
+            self._slide(number)
+
+    def _slide(self, number: int) -> None:
+        """Look along the lane: the particles may have lost the right place in it."""
+        self.judge.next_slide_m = self.locator.driven_m + SLIDE_EVERY_M
+        window, _ = self._stretch(number)
+        if window is not None:
+            mean = self.rows[-1][1]
+            found, own = slide(window, mean, self.indices, self.settings)
+            self._put(found, own)
+
+    def _put(self, found: list[Hypothesis], own: Hypothesis) -> None:
+        """Put particles where the evidence is, if there is next to none where they are.
+
+        Where the stretch says as much for their place as for another one, what they know from
+        before decides.
+        """
+        if own.log_evidence < found[0].log_evidence - LOST:
+            self.locator.particles = _spread_over(
+                found, self.locator.particles, self.settings, self.locator.rng
+            )
 
     def _keep(self, when: float) -> None:
         self.snapshots.append((when, self.locator.particles.states[:, :3].copy()))
@@ -240,12 +272,7 @@ class Localiser:
         fix = _fix_at(self.drive, when)
         spread = max(float(np.sqrt(cov[2, 2])), self.settings.yaw_sigma / 2.0)
         yaws = course_trials(float(mean[2]), min(spread, 10.0 * DEGREE))
-        found = search(
-            window, fix, self.half_m, yaws, self.indices, self.settings, mean[None, :3]
-        )
-        length = float(np.hypot(*np.diff(window.motion[:, :2], axis=0).T).sum())
-        temper = min(1.0, length / (INDEPENDENT_M * max(len(window.time_s) - 1, 1)))
-        found = _tempered(found, temper)
+        found, own = search(window, fix, self.half_m, yaws, self.indices, self.settings, mean)
         judge.hypotheses = found
         judge.misfit = -found[0].log_evidence / len(window.picture)
         across, _ = sigmas_of(mean, cov)
@@ -259,10 +286,8 @@ class Localiser:
             judge.next_m = driven_m + v.watch_m
             if judge.first is None and driven_m >= v.least_driven_m:
                 judge.first = (when, driven_m, mean)
-        if mine < 1.0 - CARRIED and judge.verdict is not Verdict.FAILED:
-            self.locator.particles = _spread_over(
-                found, self.locator.particles, self.settings, self.locator.rng
-            )
+        if judge.verdict is not Verdict.FAILED:
+            self._put(found, own)
 
     def _answer(self, cpu_ms: float) -> Located:
         judge, v = self.judge, self.judge.settings
@@ -347,16 +372,6 @@ def _fix_at(drive: Drive, when: float) -> Array:
     return drive.gnss.x_y[k]
 
 
-def _tempered(found: list[Hypothesis], temper: float) -> list[Hypothesis]:
-    evidence = np.array([h.log_evidence for h in found]) * temper
-    share = np.exp(evidence - evidence.max())
-    share /= share.sum()
-    return [
-        replace(h, log_evidence=float(e), share=float(w))
-        for h, e, w in zip(found, evidence, share, strict=True)
-    ]
-
-
 def _spread_over(
     found: list[Hypothesis],
     old: Particles,
@@ -372,7 +387,7 @@ def _spread_over(
     rows = rng.choice(len(likely), n - len(kept), p=share / share.sum())
     drawn = old.states[rng.choice(len(old.states), len(rows), p=old.weight)].copy()
     drawn[:, :3] = np.array([h.pose for h in likely])[rows]
-    along = 2.0 * rng.standard_normal(len(rows))
+    along = rng.uniform(-0.5 * ALONG_M, 0.5 * ALONG_M, len(rows))
     drawn[:, 0] += along * np.cos(drawn[:, 2]) + 0.2 * rng.standard_normal(len(rows))
     drawn[:, 1] += along * np.sin(drawn[:, 2]) + 0.2 * rng.standard_normal(len(rows))
     drawn[:, 2] += 0.5 * DEGREE * rng.standard_normal(len(rows))

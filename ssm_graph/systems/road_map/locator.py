@@ -35,6 +35,10 @@ class KindSettings:
     """So many independent points a curve is worth: its errors are common to its points."""
 
 
+INDEPENDENT_M: Final = 6.0
+"""Pictures closer to each other than this see the same errors of the map, and count less."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LocatorSettings:
     """Everything that can be chosen about the filter; tuned on routes 0 to 99 only."""
@@ -62,6 +66,9 @@ class LocatorSettings:
     scale_sigma: float = 0.01
     bias_sigma: float = 0.05 * DEGREE
     """rad/s"""
+    memory_s: float = 30.0
+    """Over which scale and bias stay what they are; without new draws of them they would be those
+    of the few particles that the first pictures left."""
     roughening: tuple[float, float, float] = (0.15, 0.15, 0.3 * DEGREE)
     """Sigma of what is added when particles are drawn anew: m, m, rad."""
     corridor_weight: float = 0.15
@@ -93,12 +100,17 @@ class Locator:
     settings: LocatorSettings = field(default_factory=LocatorSettings)
     n_pictures: int = 0
     driven_m: float = 0.0
+    _pictured_m: float = -INDEPENDENT_M
 
     def predict(self, way_m: float, turn: float, dt: float) -> None:
         """Move all particles by a step of the chassis: m, rad, s."""
         p, s = self.particles.states, self.settings
         n = len(p)
-        noise = self.rng.standard_normal((2, n))
+        noise = self.rng.standard_normal((4, n))
+        kept = float(np.exp(-dt / s.memory_s))
+        new = np.sqrt(1.0 - kept**2)
+        p[:, SCALE] = kept * p[:, SCALE] + new * s.scale_sigma * noise[2]
+        p[:, BIAS] = kept * p[:, BIAS] + new * s.bias_sigma * noise[3]
         way = way_m * (1.0 + p[:, SCALE]) + noise[0] * (s.way_sigma * abs(way_m) + s.way_floor_m)
         turned = turn - p[:, BIAS] * dt + noise[1] * s.turn_sigma * np.sqrt(dt / 0.1)
         middle = p[:, YAW] + 0.5 * turned
@@ -109,7 +121,9 @@ class Locator:
 
     def update(self, curves: Curves, rows: slice) -> None:
         """Weigh all particles by the curves of one picture, and draw them anew where few count."""
-        self.particles.log_weight += log_likelihood(
+        new = min(1.0, (self.driven_m - self._pictured_m) / INDEPENDENT_M)
+        self._pictured_m = self.driven_m
+        self.particles.log_weight += new * log_likelihood(
             self.particles.states, curves, rows, self.indices, self.settings, self.n_pictures
         )
         self.n_pictures += 1

@@ -34,11 +34,14 @@ _CLOSE_RAD: Final = 1e-4
 class RefinementSettings:
     """Noise of the window; distances in m, angles in rad."""
 
-    rounds: int = 12
+    rounds: int = 20
     slope_sigma: float = 4e-3
     """Of a detected curve."""
-    scatter_m: float = 0.03
-    """Of a point of a curve, and of the map's line there."""
+    scatter_m: float = 0.02
+    """Of a point of a curve."""
+    map_sigma_m: float = 0.04
+    """Of the map's line, and of a cubic laid along it: the same error for all pictures that see the
+    place, so that a point's share of it grows by how many those are."""
     way_sigma: float = 0.01
     """Relative, of the way between two pictures; the common scale is a state beside it."""
     way_floor_m: float = 0.01
@@ -98,7 +101,9 @@ class _Lines:
         self, window: Window, indices: Mapping[LineKind, LineIndex], settings: RefinementSettings
     ) -> None:
         self.window, self.indices, self.settings = window, indices, settings
+        s = settings
         self.of: NDArray[np.int64] = window.picture.astype(int)
+        self.scatter_m = float(np.hypot(s.scatter_m, s.map_sigma_m * np.sqrt(window.overlap)))
 
     def tie(self, poses: Array) -> None:
         """Find the lines nearest to all points."""
@@ -139,7 +144,7 @@ class _Lines:
         )
         block = np.concatenate([self.normals, found.error_D_pose[..., 2:]], axis=-1)
         x = w.points[..., 0]
-        variance = w.sigma_m[:, None] ** 2 + (s.slope_sigma * x) ** 2 + s.scatter_m**2
+        variance = w.sigma_m[:, None] ** 2 + (s.slope_sigma * x) ** 2 + self.scatter_m**2
         spread = np.zeros(x.shape)
         if covs is not None:
             spread = np.einsum("cmi,cij,cmj->cm", block, covs[self.of], block)
@@ -150,7 +155,7 @@ class _Lines:
             np.maximum(weight, 1e-6),
             offset=w.sigma_m,
             slope=s.slope_sigma,
-            scatter=s.scatter_m,
+            scatter=self.scatter_m,
         )
         root = np.linalg.cholesky(cov)
         both = np.linalg.solve(root, np.concatenate([found.error[..., None], block], axis=-1))
@@ -185,7 +190,7 @@ def refine(
         poses, extra = poses + moved, extra + step[-2:]
         covs = np.stack([cov[i : i + 3, i : i + 3] for i in range(0, 3 * len(poses), 3)])
         shift, turn = np.abs(moved[:, :2]).max(), np.abs(moved[:, 2]).max()
-        if shift < _CLOSE_M + 0.01 * np.sqrt(covs[-1, :2, :2].trace()) and turn < _CLOSE_RAD:
+        if shift < _CLOSE_M + 0.03 * np.sqrt(covs[-1, :2, :2].trace()) and turn < _CLOSE_RAD:
             has_settled = True
             break
     return Refined(

@@ -28,6 +28,14 @@ class Window(FrozenArrays):
     mark: Array = shaped("C")
     sigma_m: Array = shaped("C")
 
+    @property
+    def overlap(self) -> float:
+        """How many pictures see the same place: 1 or more, all where the vehicle stands."""
+        length = float(np.hypot(*np.diff(self.motion[:, :2], axis=0).T).sum())
+        seen = float(np.median(np.ptp(self.points[..., 0], axis=1)))
+        n = len(self.time_s)
+        return float(np.clip(n * seen / max(length, 1e-6), 1.0, n))
+
     def poses_from(self, last: Array) -> Array:
         """Return the poses (..., K, 3) of the pictures that end at the poses ``last`` (..., 3)."""
         end = self.motion[-1]
