@@ -211,7 +211,7 @@ def _add_marks(
     marks = sorted(lane.iterfind("roadMark"), key=lambda e: float(e.get("sOffset", "0")))
     starts = [float(mark.get("sOffset", "0")) for mark in marks]
     has_curb = False
-    for mark, first, last in zip(marks, starts, [*starts[1:], np.inf], strict=True):
+    for mark, first, last in zip(marks, starts, [*starts, np.inf][1:], strict=True):
         said = mark.get("type", "none")
         part = without_repeats(points[(s >= first - 1e-9) & (s <= last)])
         if said == "none" or len(part) < 2:
