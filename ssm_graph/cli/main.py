@@ -17,7 +17,7 @@ from ssm_graph.base.errors import (
     SolverError,
     SsmGraphError,
 )
-from ssm_graph.cli import compare, convert, online, simulate, smooth
+from ssm_graph.cli import compare, convert, locate, online, simulate, smooth
 from ssm_graph.cli import filter as filter_command
 from ssm_graph.cli.options import say
 from ssm_graph.cli.terminal import console_on, interrupt, occupy_closed_streams, signals_to
@@ -42,7 +42,7 @@ exit codes:
   1    a defect of this program
   2    a wrong option or setting, a missing extra
   3    the data of a mission cannot be used; the message says where and why
-  4    smooth or filter ended with a result that must not be trusted blindly (iteration limit,
+  4    locate: the lane is not known (AMBIGUOUS, FAILED); smooth or filter ended with a result that must not be trusted blindly (iteration limit,
        interrupted after the first iteration, run away, or the data contradict it); it is written
        all the same, and its status says so; online: ended in order, the last answer was not good;
        compare: some runs have no result, the table says why
@@ -72,7 +72,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=version("ssm-graph"))
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for module in (simulate, smooth, filter_command, online, compare, convert):
+    for module in (simulate, smooth, filter_command, online, compare, convert, locate):
         module.add_parser(commands, epilog=EPILOG)
     return parser
 
