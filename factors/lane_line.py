@@ -87,9 +87,7 @@ def lane_line_factor(
             f"{points.shape}, {feet.shape} and {normals.shape}"
         )
 
-    def error(
-        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
-    ) -> Array:
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
         at = values.atPose2(pose)
         found = line_residual(
             np.array([at.x(), at.y()]), at.theta(), point_b=points, foot=feet, normal=normals

@@ -40,9 +40,12 @@ def add_parser(commands: Any, *, epilog: str) -> None:
         epilog=epilog,
     )
     parser.add_argument("drive", type=Path, metavar="DRIVE", help="folder with drive.toml")
-    parser.add_argument("--method", choices=("annealed", "patent"), default="annealed",
-                        help="annealed particle filter, or the patent's method to the letter "
-                        "(default: annealed)")
+    parser.add_argument(
+        "--method",
+        choices=("annealed", "patent"),
+        default="annealed",
+        help="annealed particle filter, or the patent's method to the letter (default: annealed)",
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the results")
     parser.add_argument("--overwrite", action="store_true", help="write over earlier results")
     number_option(parser, "--seed", "N", "of the particles", 0, kind=int)
@@ -61,9 +64,13 @@ def _add_simulate(commands: Any, epilog: str) -> None:
         epilog=epilog,
     )
     parser.add_argument("map", type=Path, metavar="MAP", help="a map, or an Argoverse 2 log folder")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the drive")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="folder of the drive"
+    )
     parser.add_argument("--overwrite", action="store_true", help="write over an earlier drive")
-    parser.add_argument("--case", default="plain", help="plain, traffic or motorway (default: plain)")
+    parser.add_argument(
+        "--case", default="plain", help="plain, traffic or motorway (default: plain)"
+    )
     number_option(parser, "--seed", "N", "same seed, same drive", 0, kind=int)
     parser.set_defaults(run=run_simulate)
 
@@ -81,8 +88,9 @@ def _add_study(commands: Any, epilog: str) -> None:
     )
     parser.add_argument("maps", type=Path, nargs="+", metavar="MAP", help="maps or log folders")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="result folder")
-    parser.add_argument("--case", default="plain",
-                        help="plain, damaged, traffic or motorway (default: plain)")
+    parser.add_argument(
+        "--case", default="plain", help="plain, damaged, traffic or motorway (default: plain)"
+    )
     parser.add_argument("--methods", default="annealed", metavar="A,B", help=", ".join(METHODS))
     number_option(parser, "--first-seed", "N", "the first drive", 1000, kind=int)
     number_option(parser, "--seeds", "N", "drives on each map", 200, kind=int)
@@ -127,9 +135,7 @@ def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
     return found.verdict.has_lane
 
 
-def _run_patent(
-    arguments: argparse.Namespace, drive: Any, road_map: Any, console: Console
-) -> bool:
+def _run_patent(arguments: argparse.Namespace, drive: Any, road_map: Any, console: Console) -> bool:
     from ssm_graph.systems.road_map.patent import locate_by_patent
     from ssm_graph.systems.road_map.simulate import indices_of
 
@@ -145,8 +151,16 @@ def _run_patent(
     )
     if arguments.out is not None:
         arguments.out.mkdir(parents=True, exist_ok=True)
-        text = json.dumps({"method": "patent", "x_m": x, "y_m": y, "yaw_rad": yaw,
-                           "converged_s": found.converged_s if is_done else None}, indent=2)
+        text = json.dumps(
+            {
+                "method": "patent",
+                "x_m": x,
+                "y_m": y,
+                "yaw_rad": yaw,
+                "converged_s": found.converged_s if is_done else None,
+            },
+            indent=2,
+        )
         (arguments.out / "result.json").write_text(text + "\n", encoding="utf-8")
     return is_done
 
@@ -192,8 +206,9 @@ def run_study(arguments: argparse.Namespace, console: Console, errors: Console) 
             say(errors, f"{done} of {wanted} drives")
 
     rows = run_trials(trial, keys, ledger, n_jobs=arguments.jobs, on_progress=told)
-    lines = ["| " + " | ".join(cells) + " |" for cells in
-             (HEADER, ["---"] * len(HEADER), *summary(rows))]
+    lines = [
+        "| " + " | ".join(cells) + " |" for cells in (HEADER, ["---"] * len(HEADER), *summary(rows))
+    ]
     for line in lines:
         say(console, line)
     (arguments.out / f"{arguments.case}.md").write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -21,9 +21,7 @@ def av2_poses(path: Path, rate_hz: float = 10.0) -> Poses:
     feather = pyarrow_module("pyarrow.feather")
     try:
         table = feather.read_table(path)
-        t, qw, qx, qy, qz, x, y = (
-            np.asarray(table[name], dtype=np.float64) for name in _COLUMNS
-        )
+        t, qw, qx, qy, qz, x, y = (np.asarray(table[name], dtype=np.float64) for name in _COLUMNS)
     except (OSError, KeyError, ValueError) as error:
         raise DataError(f"{path}: expected poses of Argoverse 2, got {error}") from error
     time_s = (t - t[0]) * 1e-9

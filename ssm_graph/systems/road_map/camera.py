@@ -108,9 +108,7 @@ def _fitted(
     first = np.unique(bins[order], return_index=True)
     pick = order[first[1]]
     bx, by, bo, bi = x[pick], y[pick], owner[pick], first[0]
-    is_joined = (np.diff(bi) <= 2) & (
-        np.abs(np.diff(by)) < _GAP_M * np.maximum(np.diff(bx), 0.5)
-    )
+    is_joined = (np.diff(bi) <= 2) & (np.abs(np.diff(by)) < _GAP_M * np.maximum(np.diff(bx), 0.5))
     part = np.concatenate([[0], np.cumsum(~is_joined)])
     is_start = by < y_max
     if not is_start.any():

@@ -151,9 +151,7 @@ def curve_groups(curves: Curves) -> list[tuple[float, slice]]:
     time_s = curves.time_s
     first = np.flatnonzero(np.concatenate([[True], np.diff(time_s) > 0.0])) if len(time_s) else []
     bounds = [*map(int, first), len(time_s)]
-    return [
-        (float(time_s[a]), slice(a, b)) for a, b in zip(bounds[:-1], bounds[1:], strict=True)
-    ]
+    return [(float(time_s[a]), slice(a, b)) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
 
 
 def dead_reckoned(

@@ -65,7 +65,9 @@ def _particles(axes: Axes, drive: Drive, road_map: RoadMap, found: Located) -> N
     picked = np.unique(np.linspace(0, len(found.snapshots) - 1, len(_COLOURS)).astype(int))
     for colour, row in zip(_COLOURS, picked, strict=False):
         when, states = found.snapshots[row]
-        axes.plot(*states[:, :2].T, ".", color=colour, markersize=2.0, label=f"particles, {when:.1f} s")
+        axes.plot(
+            *states[:, :2].T, ".", color=colour, markersize=2.0, label=f"particles, {when:.1f} s"
+        )
     axes.plot(*drive.gnss.x_y.T, "x", color=REDUCED, markersize=4.0, label="GNSS")
     if drive.truth is not None:
         axes.plot(*drive.truth.x_y.T, color=REFERENCE, linewidth=1.0, label="truth")
@@ -105,8 +107,12 @@ def _hypotheses(axes: Axes, road_map: RoadMap, found: Located) -> None:
     for number, hypothesis in enumerate(told):
         _arrow(axes, np.array(hypothesis.pose), ESTIMATE if number == 0 else REDUCED, "")
         axes.annotate(
-            f"{100.0 * hypothesis.share:.1f} %", hypothesis.pose[:2], fontsize=6.5, color=INK,
-            xytext=(3, 3), textcoords="offset points",
+            f"{100.0 * hypothesis.share:.1f} %",
+            hypothesis.pose[:2],
+            fontsize=6.5,
+            color=INK,
+            xytext=(3, 3),
+            textcoords="offset points",
         )
     dress(axes, title="Places that the last stretch allows, with evidence", x="x (m)", y="y (m)")
 
@@ -116,8 +122,14 @@ def _errors(axes: Axes, drive: Drive, found: Located) -> None:
     sigmas = np.array([sigmas_of(p, c) for p, c in zip(track.pose, track.cov, strict=True)])
     names = ("across", "along")
     for column, (name, colour) in enumerate(zip(names, (ESTIMATE, REDUCED), strict=True)):
-        axes.plot(track.driven_m, 2.0 * sigmas[:, column], "--", color=colour, linewidth=0.9,
-                  label=f"2 sigma {name}")
+        axes.plot(
+            track.driven_m,
+            2.0 * sigmas[:, column],
+            "--",
+            color=colour,
+            linewidth=0.9,
+            label=f"2 sigma {name}",
+        )
         if drive.truth is not None:
             error = _error(drive.truth, found)[:, column]
             axes.plot(track.driven_m, np.abs(error), color=colour, label=f"error {name}")

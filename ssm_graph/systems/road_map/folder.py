@@ -47,7 +47,8 @@ SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
 """Keys of the sections; delays are how much too late the stamps are."""
 _DEGREES: Final = ("lat_deg", "lon_deg")
 GNSS: Final = TableSpec(
-    ("time_s",), ("x_m", "y_m", *_DEGREES, "sigma_m", "heading_deg"),
+    ("time_s",),
+    ("x_m", "y_m", *_DEGREES, "sigma_m", "heading_deg"),
     limits={"lat_deg": (-90.0, 90.0), "lon_deg": (-180.0, 180.0)},
 )
 CHASSIS: Final = TableSpec(("time_s", "speed_m_per_s", "yaw_rate_deg_per_s"))
@@ -197,7 +198,10 @@ def _columns(drive: Drive) -> dict[str, dict[str, Array]]:
     if t is not None:
         heading = _heading_deg(t.yaw)
         found["truth"] = {
-            "time_s": t.time_s, "x_m": t.x_y[:, 0], "y_m": t.x_y[:, 1], "heading_deg": heading
+            "time_s": t.time_s,
+            "x_m": t.x_y[:, 0],
+            "y_m": t.x_y[:, 1],
+            "heading_deg": heading,
         }
     return found
 

@@ -14,7 +14,7 @@ from ssm_graph.base.errors import DataError, SolverError
 from ssm_graph.base.frozen import Array, FrozenArrays, shaped
 from ssm_graph.base.units import DEGREE
 from ssm_graph.filters.rules.particles import moments
-from ssm_graph.systems.road_map.drive import Chassis, Drive, curve_groups, dead_reckoned
+from ssm_graph.systems.road_map.drive import Drive, curve_groups, dead_reckoned
 from ssm_graph.systems.road_map.hypotheses import (
     ALONG_M,
     Hypothesis,
@@ -160,9 +160,7 @@ class Localiser:
             indices = indices_of(road_map.within(fixes, self.half_m + SENSOR_REACH_M))
         self.indices = indices
         yaw, rng = _first_course(drive), np.random.default_rng([seed, 2])
-        particles = first_particles(
-            fixes[0], self.half_m, yaw, self.indices, self.settings, rng
-        )
+        particles = first_particles(fixes[0], self.half_m, yaw, self.indices, self.settings, rng)
         self.locator = Locator(self.indices, particles, rng, self.settings)
         t = drive.chassis.time_s
         self.reckoned = dead_reckoned(np.zeros(3), t, drive.chassis)
@@ -244,8 +242,7 @@ class Localiser:
         last = self.groups[number][0]
         first = max(0, number - 200)
         groups = [
-            g for g in self.groups[first : number + 1]
-            if g[0] > last - self.judge.settings.window_s
+            g for g in self.groups[first : number + 1] if g[0] > last - self.judge.settings.window_s
         ]
         return self._window(groups), groups
 

@@ -35,7 +35,7 @@ class KindSettings:
     """So many independent points a curve is worth: its errors are common to its points."""
 
 
-INDEPENDENT_M: Final = 6.0
+INDEPENDENT_M: Final = 15.0
 """Pictures closer to each other than this see the same errors of the map, and count less."""
 
 
@@ -181,8 +181,8 @@ def log_likelihood(
             near = cost < how.cap_sq
             total -= settings.wrong_mark / settings.n_points * (wrong & near).sum(axis=1)
         elif settings.corridor_weight > 0.0:
-            total -= (1.0 - fade) * settings.corridor_weight * _in_corridor(
-                states, curves, rows, index
+            total -= (
+                (1.0 - fade) * settings.corridor_weight * _in_corridor(states, curves, rows, index)
             )
     return total
 

@@ -215,7 +215,9 @@ def _on_own_lines(
     error, block = _line_rows(at, points, index)
     for _ in range(30):
         hessian = block.T @ block
-        step = np.linalg.solve(hessian + damping * np.diag(np.diag(hessian) + 1e-6), block.T @ error)
+        step = np.linalg.solve(
+            hessian + damping * np.diag(np.diag(hessian) + 1e-6), block.T @ error
+        )
         trial = at - step
         new_error, new_block = _line_rows(trial, points, index)
         if new_error @ new_error < error @ error:

@@ -39,7 +39,7 @@ class RefinementSettings:
     """Of a detected curve."""
     scatter_m: float = 0.02
     """Of a point of a curve."""
-    map_sigma_m: float = 0.04
+    map_sigma_m: float = 0.06
     """Of the map's line, and of a cubic laid along it: the same error for all pictures that see the
     place, so that a point's share of it grows by how many those are."""
     way_sigma: float = 0.01
@@ -307,4 +307,3 @@ def _leave_first(
     rest = slope[3:] - gain @ slope[:3]
     mean = np.concatenate([poses[1], extra]) - np.linalg.solve(information, rest)
     return Prior(mean, 0.5 * (information + information.T))
-

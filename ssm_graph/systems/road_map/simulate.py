@@ -62,7 +62,8 @@ def random_route(road_map: RoadMap, length_m: float, rng: np.random.Generator) -
             parts.append(road_map.lanes[name].centre())
             total += line_length(parts[-1])
             following = [
-                n for n in road_map.lanes[name].successors
+                n
+                for n in road_map.lanes[name].successors
                 if n in road_map.lanes and road_map.lanes[n].is_road
             ]
             if not following:

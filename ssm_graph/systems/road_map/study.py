@@ -12,6 +12,7 @@ import numpy as np
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
 from ssm_graph.evaluation.consistency import rate_with_interval
+from ssm_graph.study.ledger import ERROR, Key, Row
 from ssm_graph.systems.road_map.av2_log import MAP, POSES, av2_poses
 from ssm_graph.systems.road_map.camera import CameraModel
 from ssm_graph.systems.road_map.drive import Drive, Poses
@@ -29,7 +30,6 @@ from ssm_graph.systems.road_map.simulate import (
     random_route,
     simulate_drive,
 )
-from ssm_graph.study.ledger import ERROR, Key, Row
 
 LANE_M: Final = 1.75
 """Across: a vehicle nearer to where it is held to be is in that lane."""
@@ -80,9 +80,7 @@ def drive_of(
     if case != "damaged":
         return drive, true_map, indices, truth
     rng = np.random.default_rng([seed, 4])
-    worn = damaged(
-        true_map.within(truth.x_y, 150.0), rng, missing=0.05, shifted=0.02, by_m=0.5
-    )
+    worn = damaged(true_map.within(truth.x_y, 150.0), rng, missing=0.05, shifted=0.02, by_m=0.5)
     return drive, worn, indices_of(worn), truth
 
 

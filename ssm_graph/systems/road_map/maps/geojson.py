@@ -65,7 +65,10 @@ def _parts(feature: Mapping[str, Any]) -> Iterator[tuple[str, LineKind, Mark, Ar
     kind = str(said.get("kind", "")).replace("_", " ").lower()
     if kind not in {"boundary", "lane line"}:
         return
-    several = {"LineString": [shape.get("coordinates")], "MultiLineString": shape.get("coordinates")}
+    several = {
+        "LineString": [shape.get("coordinates")],
+        "MultiLineString": shape.get("coordinates"),
+    }
     mark = Mark.__members__.get(str(said.get("mark", "")).upper(), Mark.UNKNOWN)
     what = LineKind.BOUNDARY if kind == "boundary" else LineKind.LANE_LINE
     for points in several.get(str(shape.get("type")), []):

@@ -133,4 +133,6 @@ class LineIndex:
 
 def dense(lines: Sequence[RoadLine], spacing_m: float = 1.0) -> Array:
     """Return points (N, 2) all along lines, m."""
-    return np.concatenate([np.empty((0, 2)), *(resampled(line.points, spacing_m) for line in lines)])
+    return np.concatenate(
+        [np.empty((0, 2)), *(resampled(line.points, spacing_m) for line in lines)]
+    )

@@ -75,7 +75,9 @@ def _parsed(path: Path) -> _File:
                 if tags.get("type") == "lanelet":
                     sides = {
                         role: [
-                            m.attrib["ref"] for m in element.iterfind("member") if m.get("role") == role
+                            m.attrib["ref"]
+                            for m in element.iterfind("member")
+                            if m.get("role") == role
                         ]
                         for role in ("left", "right")
                     }

@@ -171,7 +171,9 @@ def _add_road(
             t, inner, last_road = middle.copy(), centre, None
             group = list(section.iterfind(f"{side}/lane"))
             for lane in sorted(group, key=lambda e: abs(int(e.attrib["id"]))):
-                t = t + sign * np.maximum(_Cubic.of(list(lane.iterfind("width")), "sOffset").at(s - start), 0.0)
+                t = t + sign * np.maximum(
+                    _Cubic.of(list(lane.iterfind("width")), "sOffset").at(s - start), 0.0
+                )
                 outer = at[:, :2] + t[:, None] * normal
                 has_curb = _add_marks(lane, name, s - start, outer, lines)
                 if lane.get("type") in _ROADWAY:
