@@ -42,6 +42,9 @@ SENSOR_REACH_M: Final = 60.0
 """Beyond the square of the fix, what the camera can see."""
 CARRIED: Final = 0.05
 """A rival with more of the evidence makes the answer ambiguous."""
+ALONG_INFLATION: Final = 1.5
+"""By which the particles' sigma along the road is too small, on routes 0 to 39: they take the
+errors of the map for what tells one place from another."""
 LOST: Final = 4.0
 """Log evidence by which another place must be better for the particles to be put there."""
 SLIDE_EVERY_M: Final = 8.0
@@ -70,7 +73,7 @@ class VerdictSettings:
     """Of the particles; more is no lane."""
     position_sigma_m: float = 6.0
     """Of the particles in any direction, before a first look at the rivals."""
-    least_driven_m: float = 20.0
+    least_driven_m: float = 12.0
     window_s: float = 6.0
     """Of the stretch that is laid on the map to find rivals."""
     again_after_m: float = 10.0
@@ -210,7 +213,7 @@ class Localiser:
         is_narrow = across < judge.settings.lateral_sigma_m
         is_narrow &= np.hypot(across, along) < judge.settings.position_sigma_m
         is_due = locator.driven_m >= max(judge.next_m, judge.settings.least_driven_m)
-        if is_due and (is_narrow or locator.driven_m > 3.0 * judge.settings.least_driven_m):
+        if is_due and (is_narrow or locator.driven_m > 5.0 * judge.settings.least_driven_m):
             self._judge(number)
         elif judge.verdict is Verdict.CONVERGED and locator.driven_m >= judge.next_slide_m:
             self._slide(number)
@@ -289,7 +292,9 @@ class Localiser:
     def _answer(self, cpu_ms: float) -> Located:
         judge, v = self.judge, self.judge.settings
         _, mean, cov, _, _ = self.rows[-1]
-        pose, sigmas = mean, (*sigmas_of(mean, cov), float(np.sqrt(cov[2, 2])))
+        across, along = sigmas_of(mean, cov)
+        along *= ALONG_INFLATION
+        pose, sigmas = mean, (across, along, float(np.sqrt(cov[2, 2])))
         refined, window, verdict = None, None, judge.verdict
         reason = ""
         if verdict is Verdict.CONVERGED:
@@ -299,6 +304,10 @@ class Localiser:
                 reason = str(error)
         if refined is not None:
             pose, sigmas = refined.poses[-1], refined.sigmas
+            if sigmas[1] > 0.5 * along:  # no bend in the window: the particles know more
+                _, ahead, _ = apart(pose, mean)
+                pose = pose + ahead * np.array([np.cos(pose[2]), np.sin(pose[2]), 0.0])
+                sigmas = (sigmas[0], along, sigmas[2])
         if verdict is Verdict.CONVERGED and sigmas[1] > v.along_sigma_m:
             verdict = Verdict.UNRESOLVED_ALONG
         first = judge.first or (np.nan, np.nan, np.full(3, np.nan))
@@ -330,7 +339,7 @@ class Localiser:
         cov = cov + floor
         if n == len(self.rows):
             cov = cov + np.diag([self.half_m**2 / 3.0, self.half_m**2 / 3.0, 0.0, 0.0, 0.0])
-        prior = Prior(mean, np.linalg.inv(cov))
+        prior = Prior(mean, np.linalg.inv(ALONG_INFLATION**2 * cov))
         start = window.poses_from(self.rows[-1][1])
         return refine(window, start, prior, self.indices, self.refinement), window
 

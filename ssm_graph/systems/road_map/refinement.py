@@ -26,6 +26,9 @@ from ssm_graph.systems.road_map.window import Window, in_plane
 
 _FAR_M: Final = 1.5
 """A point farther from every line of its kind is of none of them."""
+_SLANTED: Final = 0.3
+"""Sine of the angle to the vehicle below which a line says nothing of the place along it: what its
+small kinks would say is the map's error, the same in every picture."""
 _CLOSE_M: Final = 2e-4
 _CLOSE_RAD: Final = 1e-4
 
@@ -142,7 +145,10 @@ class _Lines:
             foot=self.feet,
             normal=self.normals,
         )
-        block = np.concatenate([self.normals, found.error_D_pose[..., 2:]], axis=-1)
+        forward = found.error_D_pose[..., :1]
+        ahead = np.stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])], axis=-1)[:, None]
+        said = np.where(np.abs(forward) < _SLANTED, self.normals - forward * ahead, self.normals)
+        block = np.concatenate([said, found.error_D_pose[..., 2:]], axis=-1)
         x = w.points[..., 0]
         variance = w.sigma_m[:, None] ** 2 + (s.slope_sigma * x) ** 2 + self.scatter_m**2
         spread = np.zeros(x.shape)

@@ -1,0 +1,249 @@
+"""Maps of all formats, the projection and the index: against closed forms and other libraries."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.systems.road_map.maps.geojson import read_geojson
+from ssm_graph.systems.road_map.maps.index import LineIndex
+from ssm_graph.systems.road_map.maps.opendrive import read_opendrive
+from ssm_graph.systems.road_map.maps.projection import TransverseMercator, utm
+from ssm_graph.systems.road_map.maps.read import read_map
+from ssm_graph.systems.road_map.maps.road_map import (
+    LineKind,
+    Mark,
+    RoadLine,
+    RoadMap,
+    line_length,
+    with_sides,
+)
+
+DATA = Path(os.environ.get("SSM_GRAPH_DATA", "../shared/data")) / "systems"
+
+
+def data(name: str) -> Path:
+    """Return a file of real data, or skip."""
+    path = DATA / name
+    if not path.exists():
+        pytest.skip(f"{path}: no real data there; set SSM_GRAPH_DATA")
+    return path
+
+
+def test_projection_there_and_back() -> None:
+    """A point a few degrees off the meridian comes back to less than a micrometre."""
+    plane = TransverseMercator(0.8, 0.1)
+    lat, lon = np.array([0.7, 0.8, 0.9]), np.array([0.08, 0.1, 0.13])
+    back = plane.inverse(plane.forward(lat, lon))
+    np.testing.assert_allclose(back, [lat, lon], atol=1e-13)
+
+
+def test_projection_is_utm() -> None:
+    """The example of the Wikipedia page on UTM: CN Tower, zone 17."""
+    lat, lon = np.radians(43.0 + 38.0 / 60 + 33.24 / 3600), -np.radians(79 + 23 / 60 + 13.7 / 3600)
+    np.testing.assert_allclose(utm(lat, lon).forward(lat, lon), [630084.0, 4833438.0], atol=1.0)
+
+
+def lines_of(rng: np.random.Generator) -> list[RoadLine]:
+    """Return twenty crooked lines within 100 m."""
+    return [
+        RoadLine(str(k), LineKind.BOUNDARY, rng.uniform(0, 100, 2) + rng.normal(0, 4, (6, 2)).cumsum(0))
+        for k in range(20)
+    ]
+
+
+def test_index_is_the_nearest_line() -> None:
+    """Against all pieces of all lines; only where two are as far may the other one be meant."""
+    rng = np.random.default_rng(0)
+    lines = lines_of(rng)
+    points = rng.uniform(-5, 105, (2000, 2))
+    best = np.full(len(points), np.inf)
+    for line in lines:
+        for a, b in zip(line.points[:-1], line.points[1:], strict=True):
+            share = np.clip((points - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
+            foot = a + share[:, None] * (b - a)
+            best = np.minimum(best, np.hypot(*(points - foot).T))
+    index = LineIndex(lines)
+    found = index.foot(points).distance
+    near = best < 12.0
+    excess = found[near] - best[near]
+    assert excess.min() > -1e-9
+    assert excess.max() < 0.75
+    assert np.quantile(excess, 0.9) < 1e-9
+    assert np.all(np.isinf(found[best > 16.0]))
+
+
+def test_index_far_off_the_map() -> None:
+    """A point a kilometre away is near no line, and costs no memory."""
+    index = LineIndex(lines_of(np.random.default_rng(1)))
+    assert np.isinf(index.foot(np.array([[1e4, -1e4]])).distance).all()
+
+
+def test_swapped_sides_are_put_right_and_told() -> None:
+    """A lane to the east has its left bound north; bounds that run against each other are turned."""
+    north = np.array([[0.0, 3.0], [10.0, 3.0]])
+    south = np.array([[0.0, 0.0], [10.0, 0.0]])
+    notes: list[str] = []
+    lane = with_sides("a", south, north, notes)
+    assert lane is not None
+    np.testing.assert_array_equal(lane.left, north)
+    turned = with_sides("b", north, south[::-1], notes)
+    assert turned is not None
+    np.testing.assert_array_equal(turned.right, south)
+    assert [note.split(":")[0] for note in notes] == ["lane a", "lane b"]
+
+
+def test_a_map_says_how_far_off_a_fix_is() -> None:
+    """Beyond the map the message has the distance; very far it names exchanged coordinates."""
+    road_map = RoadMap("m", (RoadLine("k", LineKind.BOUNDARY, [[0.0, 0.0], [100.0, 0.0]]),), {})
+    with pytest.raises(DataError, match="400 m off the map: take the map of that place"):
+        road_map.within(np.array([500.0, 0.0]), 50.0)
+    with pytest.raises(DataError, match="latitude and longitude exchanged"):
+        road_map.within(np.array([5e5, 0.0]), 50.0)
+    with pytest.raises(DataError, match="expected road boundaries or lane lines, got none"):
+        RoadMap("empty", (), {})
+
+
+def test_unknown_format_is_refused() -> None:
+    """By the end of the name."""
+    with pytest.raises(ConfigError, match=r"\.osm, \.xml"):
+        read_map(Path("road.shp"))
+
+
+def test_geojson(tmp_path: Path) -> None:
+    """Degrees become metres; exchanged coordinates are seen."""
+    line = {"type": "LineString", "coordinates": [[8.4, 49.0], [8.4, 49.001]]}
+    feature = {"properties": {"kind": "lane line", "mark": "dashed"}, "geometry": line}
+    path = tmp_path / "map.geojson"
+    path.write_text(json.dumps({"features": [feature]}))
+    found = read_geojson(path).lines[0]
+    assert (found.kind, found.mark) == (LineKind.LANE_LINE, Mark.DASHED)
+    assert line_length(found.points) == pytest.approx(111.2, abs=0.1)  # a thousandth of a degree
+    line["coordinates"] = [[8.4, 149.0], [8.4, 149.001]]
+    path.write_text(json.dumps({"features": [feature]}))
+    with pytest.raises(DataError, match="exchanged, or metres"):
+        read_geojson(path)
+
+
+ROAD = """<OpenDRIVE><road id="1" length="{length}" junction="-1" rule="{rule}"><planView>
+<geometry s="0" x="1" y="2" hdg="0.3" length="{length}">{shape}</geometry></planView>
+<lanes><laneOffset s="0" a="0.5" b="0" c="0" d="0"/><laneSection s="0">
+<center><lane id="0" type="none"><roadMark sOffset="0" type="broken"/></lane></center>
+<right><lane id="-1" type="driving"><width sOffset="0" a="3.5" b="0" c="0" d="0"/>
+<roadMark sOffset="0" type="solid"/></lane></right></laneSection></lanes></road></OpenDRIVE>"""
+
+
+def centre_of(tmp_path: Path, shape: str, length: float = 40.0, rule: str = "RHT") -> RoadMap:
+    """Return the map of one road."""
+    path = tmp_path / "road.xodr"
+    path.write_text(ROAD.format(length=length, shape=shape, rule=rule))
+    return read_opendrive(path)
+
+
+SHAPES = {
+    "line": ("<line/>", lambda s: 0.0 * s),
+    "arc": ('<arc curvature="0.02"/>', lambda s: 0.02 * s),
+    "right": ('<arc curvature="-0.02"/>', lambda s: -0.02 * s),
+    "spiral": ('<spiral curvStart="0.0" curvEnd="0.05"/>', lambda s: 0.5 * 0.05 / 40 * s**2),
+    "back": (
+        '<spiral curvStart="-0.04" curvEnd="0.01"/>',
+        lambda s: -0.04 * s + 0.5 * 0.05 / 40 * s**2,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_opendrive_lines_have_their_curvature(tmp_path: Path, name: str) -> None:
+    """The middle line, half a metre beside the reference, against the integrated heading."""
+    shape, turn = SHAPES[name]
+    found = centre_of(tmp_path, shape).lines[0].points
+    s = np.linspace(0.0, 40.0, 40001)
+    heading = 0.3 + turn(s)
+    step = s[1]
+    x = 1 + np.concatenate([[0], np.cumsum(np.cos(heading[:-1] + 0.5 * np.diff(heading))) * step])
+    y = 2 + np.concatenate([[0], np.cumsum(np.sin(heading[:-1] + 0.5 * np.diff(heading))) * step])
+    wanted = np.column_stack([x - 0.5 * np.sin(heading), y + 0.5 * np.cos(heading)])
+    np.testing.assert_allclose(found, wanted[::1000], atol=1e-4)
+
+
+def test_opendrive_cubics(tmp_path: Path) -> None:
+    """A paramPoly3 and a poly3 of the same parabola, the latter by its length."""
+    parametric = (
+        '<paramPoly3 pRange="normalized" aU="0" bU="40" cU="0" dU="0" aV="0" bV="0" cV="8" dV="0"/>'
+    )
+    same = '<poly3 a="0" b="0" c="0.005" d="0"/>'
+    one, other = (centre_of(tmp_path, shape).lines[0].points for shape in (parametric, same))
+    c, s = np.cos(0.3), np.sin(0.3)
+    at = np.linspace(0.0, 40.0, 41)
+    turn = np.arctan(0.01 * at)
+    local = np.column_stack([at - 0.5 * np.sin(turn), 0.005 * at**2 + 0.5 * np.cos(turn)])
+    np.testing.assert_allclose(one, [1.0, 2.0] + local @ [[c, s], [-s, c]], atol=1e-9)
+    u = np.linspace(0, 40, 20001)
+    end = np.interp(40.0, np.cumsum(np.hypot(np.diff(u), np.diff(0.005 * u**2))), u[1:])
+    turn = np.arctan(0.01 * end)
+    last = np.array([end - 0.5 * np.sin(turn), 0.005 * end**2 + 0.5 * np.cos(turn)])
+    wanted = [1.0 + c * last[0] - s * last[1], 2.0 + s * last[0] + c * last[1]]
+    np.testing.assert_allclose(other[-1], wanted, atol=1e-3)
+
+
+def test_opendrive_lanes_run_as_traffic_does(tmp_path: Path) -> None:
+    """The right lane goes with the reference line; where traffic keeps left it goes against it."""
+    for rule, sign in (("RHT", 1.0), ("LHT", -1.0)):
+        road_map = centre_of(tmp_path, "<line/>", rule=rule)
+        (lane,) = road_map.lanes.values()
+        course = lane.centre()[-1] - lane.centre()[0]
+        assert sign * (course @ [np.cos(0.3), np.sin(0.3)]) > 39.0
+        marks = {(line.kind, line.mark) for line in road_map.lines}
+        assert (LineKind.LANE_LINE, Mark.DASHED) in marks
+        assert (LineKind.BOUNDARY, Mark.UNKNOWN) in marks
+
+
+def test_lanelet2_agrees_with_the_library() -> None:
+    """Bounds of all lanelets within a centimetre of those of the reference implementation."""
+    lanelet2 = pytest.importorskip("lanelet2")
+    path = data("lanelet2/mapping_example.osm")
+    ours = read_map(path)
+    assert ours.projection is not None
+    lat, lon = np.degrees([ours.projection.lat0, ours.projection.lon0])
+    origin = lanelet2.io.Origin(float(lat), float(lon))
+    projector = lanelet2.projection.UtmProjector(origin)
+    theirs = lanelet2.io.load(str(path), projector)
+    zone = utm(ours.projection.lat0, ours.projection.lon0)
+    shift = zone.forward(ours.projection.lat0, ours.projection.lon0)
+    assert len(theirs.laneletLayer) == len(ours.lanes) == 371
+    for lanelet in theirs.laneletLayer:
+        lane = ours.lanes[str(lanelet.id)]
+        for bound, points in ((lanelet.leftBound, lane.left), (lanelet.rightBound, lane.right)):
+            x_y = zone.forward(*ours.projection.inverse(points)) - shift
+            np.testing.assert_allclose([(p.x, p.y) for p in bound], x_y, atol=1e-3)
+
+
+def test_commonroad_agrees_with_the_library() -> None:
+    """Bounds and successors of all lanelets of a motorway and a town."""
+    reader = pytest.importorskip("commonroad.common.file_reader")
+    for name in ("DEU_A9-3_1_T-1", "FRA_Anglet-1_1_T-1"):
+        path = data(f"commonroad/{name}.xml")
+        scenario, _ = reader.CommonRoadFileReader(str(path)).open()
+        ours = read_map(path)
+        lanelets = scenario.lanelet_network.lanelets
+        assert len(lanelets) == len(ours.lanes)
+        for lanelet in lanelets:
+            lane = ours.lanes[str(lanelet.lanelet_id)]
+            np.testing.assert_allclose(lanelet.left_vertices, lane.left, atol=1e-2)
+            np.testing.assert_allclose(lanelet.right_vertices, lane.right, atol=1e-2)
+            assert {str(s) for s in lanelet.successor} == set(lane.successors)
+
+
+def test_real_maps_are_read() -> None:
+    """Karlsruhe and an Argoverse 2 log: as many lanes and lines as the files hold."""
+    karlsruhe = read_map(data("lanelet2/mapping_example.osm"))
+    assert len(karlsruhe.of_kind(LineKind.LANE_LINE)) == 187
+    assert len(karlsruhe.of_kind(LineKind.BOUNDARY)) == 614
+    av2 = read_map(data("av2/3b3570b4-7b0b-3268-a571-b0889dbf40b6/map.json"))
+    assert len(av2.lanes) == 150
+    assert all(line_length(line.points) > 0.0 for line in av2.lines)
