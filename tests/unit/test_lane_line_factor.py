@@ -43,7 +43,7 @@ def test_jacobian(yaw: float) -> None:
 def test_points_on_their_lines_have_no_error() -> None:
     """A line along x at y = 2, seen from a pose that is turned by half a right angle."""
     c = np.sqrt(0.5)
-    point_b = np.array([[c, c], [3.0 * c, -c]])  # at (0, 1) and (2, 1) from the pose
+    point_b = np.array([[c, c], [3.0 * c, c]])  # at (0, 1) and (1, 2) from the pose
     found = line_residual(
         np.array([5.0, 1.0]),
         0.25 * np.pi,

@@ -33,7 +33,7 @@ _COARSE_SIGMA_M: Final = 1.2
 _KEPT: Final = 40
 SLIDE_M: Final = 24.0
 """How far along the lane a place is looked for anew."""
-_ROUNDS: Final = 6
+_ROUNDS: Final = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +44,8 @@ class Hypothesis:
     """x, y [m], yaw [rad]"""
     log_evidence: float
     """Of the stretch's curves, up to a constant."""
+    misfit: float = 0.0
+    """Loss of log likelihood of a curve, the mean over the stretch."""
     share: float = 1.0
     """Of the evidence of all places, 0 to 1."""
 
@@ -120,18 +122,19 @@ def _ranked(
     """
     length = float(np.hypot(*np.diff(window.motion[:, :2], axis=0).T).sum())
     new = min(1.0, (length + INDEPENDENT_M) / (INDEPENDENT_M * len(window.time_s)))
-    found = new * _log_likelihood(window, poses, indices, settings, 0.0)
+    whole = _log_likelihood(window, poses, indices, settings, 0.0)
+    found, misfit = new * whole, -whole / len(window.picture)
     kept = _apart_from_each_other(poses, found, _KEPT)
     share = np.exp(found - found[kept].max())
     share /= share[kept].sum()
     told = [
-        Hypothesis((float(p[0]), float(p[1]), float(p[2])), float(e), float(w))
-        for p, e, w in zip(poses, found, share, strict=True)
+        Hypothesis((float(p[0]), float(p[1]), float(p[2])), float(e), float(m), float(w))
+        for p, e, m, w in zip(poses, found, misfit, share, strict=True)
     ]
     return [told[row] for row in kept], told[-1]
 
 
-def _thinned(window: Window, n_pictures: int = 10, n_points: int = 4) -> Window:
+def _thinned(window: Window, n_pictures: int = 8, n_points: int = 4) -> Window:
     """Return the window with fewer pictures, the last among them, and fewer points a curve."""
     n = len(window.time_s)
     kept = np.unique(np.linspace(n - 1, 0, min(n, n_pictures)).astype(int))

@@ -47,7 +47,11 @@ ALONG_INFLATION: Final = 1.5
 errors of the map for what tells one place from another."""
 LOST: Final = 4.0
 """Log evidence by which another place must be better for the particles to be put there."""
-SLIDE_EVERY_M: Final = 8.0
+MOST_PICTURES: Final = 60
+"""Of a stretch, where the vehicle is slow."""
+OLD_SHARE: Final = 0.005
+"""Of the weight that stays with the particles as they were, when others are put elsewhere."""
+SLIDE_EVERY_M: Final = 15.0
 """From one look along the lane to the next."""
 
 
@@ -71,10 +75,8 @@ class VerdictSettings:
 
     lateral_sigma_m: float = 0.5
     """Of the particles; more is no lane."""
-    position_sigma_m: float = 6.0
-    """Of the particles in any direction, before a first look at the rivals."""
     least_driven_m: float = 12.0
-    window_s: float = 6.0
+    window_m: float = 45.0
     """Of the stretch that is laid on the map to find rivals."""
     again_after_m: float = 10.0
     """Between two looks at the rivals while the lane is not known ..."""
@@ -209,11 +211,7 @@ class Localiser:
         if len(self.rows) in (3, 10, 25) or len(self.rows) % 60 == 0:
             self._keep(when)
         judge = self.judge
-        across, along = sigmas_of(mean[:3], cov[:3, :3])
-        is_narrow = across < judge.settings.lateral_sigma_m
-        is_narrow &= np.hypot(across, along) < judge.settings.position_sigma_m
-        is_due = locator.driven_m >= max(judge.next_m, judge.settings.least_driven_m)
-        if is_due and (is_narrow or locator.driven_m > 5.0 * judge.settings.least_driven_m):
+        if locator.driven_m >= max(judge.next_m, judge.settings.least_driven_m):
             self._judge(number)
         elif judge.verdict is Verdict.CONVERGED and locator.driven_m >= judge.next_slide_m:
             self._slide(number)
@@ -234,19 +232,24 @@ class Localiser:
         before decides.
         """
         if own.log_evidence < found[0].log_evidence - LOST:
-            self.locator.particles = _spread_over(
-                found, self.locator.particles, self.settings, self.locator.rng
-            )
+            self._spread(found)
+
+    def _spread(self, found: list[Hypothesis]) -> None:
+        """Put particles about all places that the stretch allows."""
+        locator = self.locator
+        locator.particles = _spread_over(found, locator.particles, self.settings, locator.rng)
 
     def _keep(self, when: float) -> None:
         self.snapshots.append((when, self.locator.particles.states[:, :3].copy()))
 
     def _stretch(self, number: int) -> tuple[Window | None, list[tuple[float, slice]]]:
-        last = self.groups[number][0]
-        first = max(0, number - 200)
-        groups = [
-            g for g in self.groups[first : number + 1] if g[0] > last - self.judge.settings.window_s
-        ]
+        driven_m = self.locator.driven_m
+        row = len(self.rows) - 1
+        first = row
+        while first > 0 and self.rows[first - 1][3] >= driven_m - self.judge.settings.window_m:
+            first -= 1
+        n = min(row - first + 1, MOST_PICTURES)
+        groups = self.groups[number - n + 1 : number + 1]
         return self._window(groups), groups
 
     def _window(self, groups: list[tuple[float, slice]]) -> Window | None:
@@ -274,20 +277,27 @@ class Localiser:
         yaws = course_trials(float(mean[2]), min(spread, 10.0 * DEGREE))
         found, own = search(window, fix, self.half_m, yaws, self.indices, self.settings, mean)
         judge.hypotheses = found
-        judge.misfit = -found[0].log_evidence / len(window.picture)
-        across, _ = sigmas_of(mean, cov)
-        mine = sum(h.share for h in found if h.is_same_lane(mean))
+        judge.misfit = found[0].misfit
         if judge.misfit > v.misfit:
             judge.verdict = Verdict.FAILED
-        elif across > v.lateral_sigma_m or mine < 1.0 - CARRIED:
-            judge.verdict = Verdict.AMBIGUOUS
+            return
+        across, _ = sigmas_of(mean, cov)
+        is_known = _lane_share(found, np.array(found[0].pose)) > 1.0 - CARRIED
+        if across > v.lateral_sigma_m and is_known:
+            self._spread(found)  # the stretch as a whole knows the lane before the particles do
         else:
+            self._put(found, own)
+        p = self.locator.particles
+        self.extras[-1] = moments(p.states, p.weight, YAW)
+        mean, cov = self.extras[-1][0][:3], self.extras[-1][1][:3, :3]
+        self.rows[-1] = (when, mean, cov, driven_m, len(p.states))
+        across, _ = sigmas_of(mean, cov)
+        judge.verdict = Verdict.AMBIGUOUS
+        if across < v.lateral_sigma_m and _lane_share(found, mean) > 1.0 - CARRIED:
             judge.verdict = Verdict.CONVERGED
             judge.next_m = driven_m + v.watch_m
             if judge.first is None and driven_m >= v.least_driven_m:
                 judge.first = (when, driven_m, mean)
-        if judge.verdict is not Verdict.FAILED:
-            self._put(found, own)
 
     def _answer(self, cpu_ms: float) -> Located:
         judge, v = self.judge, self.judge.settings
@@ -339,7 +349,7 @@ class Localiser:
         cov = cov + floor
         if n == len(self.rows):
             cov = cov + np.diag([self.half_m**2 / 3.0, self.half_m**2 / 3.0, 0.0, 0.0, 0.0])
-        prior = Prior(mean, np.linalg.inv(ALONG_INFLATION**2 * cov))
+        prior = Prior(mean, np.linalg.inv(ALONG_INFLATION**2 * _without_chance(mean, cov)))
         start = window.poses_from(self.rows[-1][1])
         return refine(window, start, prior, self.indices, self.refinement), window
 
@@ -347,6 +357,11 @@ class Localiser:
 def locate(drive: Drive, road_map: RoadMap, **options: object) -> Located:
     """Return in which lane a drive ends, with a verdict; options are those of `Localiser`."""
     return Localiser(drive, road_map, **options).run()  # type: ignore[arg-type]
+
+
+def _lane_share(found: list[Hypothesis], pose: Array) -> float:
+    """Return which share of the evidence is for the lane of a pose (3,)."""
+    return sum(h.share for h in found if h.is_same_lane(pose))
 
 
 def square_of(drive: Drive) -> float:
@@ -363,6 +378,20 @@ def sigmas_of(pose: Array, cov: Array) -> tuple[float, float]:
         float(np.sqrt(across @ cov[:2, :2] @ across)),
         float(np.sqrt(along @ cov[:2, :2] @ along)),
     )
+
+
+def _without_chance(mean: Array, cov: Array) -> Array:
+    """Return a covariance (5, 5) of particles with what is along the pose tied to nothing else.
+
+    Few ancestors share all that is known along a road; how they happen to lie across it or turned
+    would, once that is known to centimetres, be taken for knowledge of the place along it.
+    """
+    c, s = np.cos(mean[2]), np.sin(mean[2])
+    turned = np.eye(5)
+    turned[:2, :2] = [[c, s], [-s, c]]
+    own = turned @ cov @ turned.T
+    own[0, 1:], own[1:, 0] = 0.0, 0.0
+    return np.asarray(turned.T @ own @ turned)
 
 
 def _first_course(drive: Drive) -> float | None:
@@ -397,7 +426,8 @@ def _spread_over(
     drawn[:, 0] += along * np.cos(drawn[:, 2]) + 0.2 * rng.standard_normal(len(rows))
     drawn[:, 1] += along * np.sin(drawn[:, 2]) + 0.2 * rng.standard_normal(len(rows))
     drawn[:, 2] += 0.5 * DEGREE * rng.standard_normal(len(rows))
-    return Particles(np.concatenate([kept, drawn]), np.zeros(n))
+    weight = np.repeat([OLD_SHARE / len(kept), (1.0 - OLD_SHARE) / len(drawn)], [len(kept), len(drawn)])
+    return Particles(np.concatenate([kept, drawn]), np.log(weight))
 
 
 def _track(rows: list[tuple[float, Array, Array, float, int]]) -> Track:

@@ -27,8 +27,9 @@ from ssm_graph.systems.road_map.window import Window, in_plane
 _FAR_M: Final = 1.5
 """A point farther from every line of its kind is of none of them."""
 _SLANTED: Final = 0.3
-"""Sine of the angle to the vehicle below which a line says nothing of the place along it: what its
-small kinks would say is the map's error, the same in every picture."""
+"""Sine of the angle to the last course below which a line says nothing of the place along it: what
+its small kinks would say is the map's error, the same in every picture. The direction is one for
+all pictures: each one's own would differ by their courses, and so say what no line says."""
 _CLOSE_M: Final = 2e-4
 _CLOSE_RAD: Final = 1e-4
 
@@ -42,7 +43,7 @@ class RefinementSettings:
     """Of a detected curve."""
     scatter_m: float = 0.02
     """Of a point of a curve."""
-    map_sigma_m: float = 0.06
+    map_sigma_m: float = 0.04
     """Of the map's line, and of a cubic laid along it: the same error for all pictures that see the
     place, so that a point's share of it grows by how many those are."""
     way_sigma: float = 0.01
@@ -145,8 +146,8 @@ class _Lines:
             foot=self.feet,
             normal=self.normals,
         )
-        forward = found.error_D_pose[..., :1]
-        ahead = np.stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])], axis=-1)[:, None]
+        ahead = np.array([np.cos(poses[-1, 2]), np.sin(poses[-1, 2])])
+        forward = (self.normals @ ahead)[..., None]
         said = np.where(np.abs(forward) < _SLANTED, self.normals - forward * ahead, self.normals)
         block = np.concatenate([said, found.error_D_pose[..., 2:]], axis=-1)
         x = w.points[..., 0]
