@@ -59,8 +59,8 @@ def _add_simulate(commands: Any, epilog: str) -> None:
         commands,
         "locate-simulate",
         summary="write a simulated drive over an HD map",
-        description="Drive a random route over a map (lanelet2 .osm, CommonRoad .xml, OpenDRIVE "
-        ".xodr), or the\nway of an Argoverse 2 log (its folder), and write what the vehicle records.",
+        description="Drive a random route over a map (lanelet2 .osm, CommonRoad .xml, OpenDRIVE\n"
+        ".xodr), or the way of an Argoverse 2 log, and write what the vehicle records.",
         epilog=epilog,
     )
     parser.add_argument("map", type=Path, metavar="MAP", help="a map, or an Argoverse 2 log folder")
@@ -174,7 +174,7 @@ def run_simulate(arguments: argparse.Namespace, console: Console, _: Console) ->
     if arguments.case == "damaged":
         raise ConfigError("--case damaged: the damage is to the map; damage the map file instead")
     check_is_free(arguments.out, may_overwrite=arguments.overwrite)
-    drive, _, _, _ = drive_of(str(arguments.map), arguments.case, arguments.seed)
+    drive = drive_of(str(arguments.map), arguments.case, arguments.seed)[0]
     file = arguments.map / MAP if arguments.map.is_dir() else arguments.map
     write_drive(arguments.out, drive, file)
     say(

@@ -88,6 +88,9 @@ def test_shapes_are_checked() -> None:
     """Feet and points that are not as many."""
     with pytest.raises(ValueError, match=r"one shape \(m, 2\)"):
         lane_line_factor(
-            0, point_b=np.ones((3, 2)), foot=np.ones((2, 2)), normal=np.ones((3, 2)),
+            0,
+            point_b=np.ones((3, 2)),
+            foot=np.ones((2, 2)),
+            normal=np.ones((3, 2)),
             covariance=np.eye(3),
         )

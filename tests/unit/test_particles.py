@@ -52,7 +52,9 @@ def test_mean_and_heaps_across_half_a_turn() -> None:
     """Courses about +-pi are one heap, and their mean is there, not at zero."""
     rng = np.random.default_rng(1)
     yaw = np.pi + 0.1 * rng.standard_normal(400)
-    states = np.column_stack([*0.3 * rng.standard_normal((2, 400)), (yaw + np.pi) % (2 * np.pi) - np.pi])
+    states = np.column_stack(
+        [*0.3 * rng.standard_normal((2, 400)), (yaw + np.pi) % (2 * np.pi) - np.pi]
+    )
     weight = np.full(400, 1 / 400)
     mean, cov = moments(states, weight, 2)
     assert abs(abs(mean[2]) - np.pi) < 0.02
@@ -65,7 +67,8 @@ def test_heaps_are_told_apart_and_weighed() -> None:
     """Two lanes, 70 and 30 %; the same place with the opposite course is a third."""
     rng = np.random.default_rng(2)
     blob = 0.2 * rng.standard_normal((300, 3)) * [1, 1, 0.2]
-    states = np.concatenate([blob, blob + [0, 3.5, 0], blob + [0, 0, np.pi]])
+    shifts = np.array([[0.0, 0.0, 0.0], [0.0, 3.5, 0.0], [0.0, 0.0, np.pi]])
+    states = np.concatenate([blob + shift for shift in shifts])
     weight = np.repeat([0.6, 0.3, 0.1], 300) / 300
     found = modes(states, weight, reach=REACH, angle=2)
     np.testing.assert_allclose([m.share for m in found], [0.6, 0.3, 0.1], atol=1e-9)

@@ -37,7 +37,7 @@ def effective_number(weight: Array) -> float:
 
 
 def systematic(weight: Array, n: int, rng: np.random.Generator) -> _Rows:
-    """Draw ``n`` rows by weights (N,), sum 1, with one random number: each within 1 of its share."""
+    """Draw ``n`` rows by weights (N,), sum 1, with one number: each within 1 of its share."""
     at = (rng.random() + np.arange(n)) / n
     return np.minimum(np.searchsorted(np.cumsum(weight), at), len(weight) - 1).astype(np.int64)
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array, FrozenArrays, optional_shaped, shaped
@@ -57,7 +59,7 @@ class Curves(FrozenArrays):
     mark: Array = shaped("N")
     """`Mark` of a lane line."""
 
-    def points(self, rows: Array | slice, n_points: int) -> Array:
+    def points(self, rows: NDArray[np.int64] | slice, n_points: int) -> Array:
         """Return points (rows, n_points, 2) evenly along x on some of the curves, m."""
         low, high = self.reach[rows].T
         x = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, n_points)
@@ -91,7 +93,6 @@ class Drive:
     chassis: Chassis
     curves: Curves
     truth: Poses | None = None
-    wheelbase_m: float = 2.8
     gnss_bias_m: float = 0.0
     """Half the side of the square within which fixes are off for minutes; 0 where sigma is all."""
 
@@ -142,16 +143,16 @@ def _check_curves(name: str, curves: Curves) -> None:
         if is_bad.any():
             row = int(np.argmax(is_bad))
             raise DataError(
-                f"{label}: row {row + 1} at {curves.time_s[row]:.3f} s: {text}; correct or delete it"
+                f"{label}: row {row + 1} at {curves.time_s[row]:.3f} s: {text}; delete it"
             )
 
 
 def curve_groups(curves: Curves) -> list[tuple[float, slice]]:
     """Return the times of the pictures with the rows of each."""
     time_s = curves.time_s
-    first = np.flatnonzero(np.concatenate([[True], np.diff(time_s) > 0.0])) if len(time_s) else []
+    first = np.flatnonzero(np.diff(time_s, prepend=-np.inf) > 0.0)
     bounds = [*map(int, first), len(time_s)]
-    return [(float(time_s[a]), slice(a, b)) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+    return [(float(time_s[a]), slice(a, b)) for a, b in pairwise(bounds)]
 
 
 def dead_reckoned(

@@ -1,4 +1,4 @@
-"""Figures of a located drive: particles on the map, the last picture laid on it, error and sigma."""
+"""Figures of a located drive: particles, the last picture on the map, rivals, error and sigma."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def _arrow(axes: Axes, pose: Array, colour: str, label: str) -> None:
 
 def _hypotheses(axes: Axes, road_map: RoadMap, found: Located) -> None:
     told = found.hypotheses[:8]
-    places = np.array([h.pose for h in told] or [found.pose])
+    places = np.array([h.pose for h in told] or [tuple(found.pose)])
     low, high = places[:, :2].min(axis=0) - 20.0, places[:, :2].max(axis=0) + 20.0
     _draw_map(axes, road_map, low, high)
     for number, hypothesis in enumerate(told):

@@ -143,7 +143,7 @@ def _thinned(window: Window, n_pictures: int = 8, n_points: int = 4) -> Window:
     return Window(
         window.time_s[kept],
         window.motion[kept],
-        np.searchsorted(kept, window.picture[mine]),
+        np.searchsorted(kept, window.picture[mine]).astype(float),
         window.points[mine][:, points],
         window.kind[mine],
         window.mark[mine],
@@ -238,7 +238,7 @@ def _fitted(
             error = np.where(counted > 0.0, found.error, 0.0)
             slope += np.einsum("ncm,ncmi->ni", counted * error, block)
         at = at - np.linalg.solve(hessian, slope[..., None])[..., 0]
-    return at
+    return np.asarray(at, dtype=np.float64)
 
 
 def course_trials(yaw: float, sigma: float) -> Array:

@@ -219,7 +219,7 @@ class Localiser:
     def _slide(self, number: int) -> None:
         """Look along the lane: the particles may have lost the right place in it."""
         self.judge.next_slide_m = self.locator.driven_m + SLIDE_EVERY_M
-        window, _ = self._stretch(number)
+        window = self._stretch(number)
         if window is not None:
             mean = self.rows[-1][1]
             found, own = slide(window, mean, self.indices, self.settings)
@@ -242,7 +242,7 @@ class Localiser:
     def _keep(self, when: float) -> None:
         self.snapshots.append((when, self.locator.particles.states[:, :3].copy()))
 
-    def _stretch(self, number: int) -> tuple[Window | None, list[tuple[float, slice]]]:
+    def _stretch(self, number: int) -> Window | None:
         driven_m = self.locator.driven_m
         row = len(self.rows) - 1
         first = row
@@ -250,7 +250,7 @@ class Localiser:
             first -= 1
         n = min(row - first + 1, MOST_PICTURES)
         groups = self.groups[number - n + 1 : number + 1]
-        return self._window(groups), groups
+        return self._window(groups)
 
     def _window(self, groups: list[tuple[float, slice]]) -> Window | None:
         mean = self.extras[-1][0]
@@ -266,7 +266,7 @@ class Localiser:
         """Look for rivals, judge, and put particles where the evidence is."""
         judge, v = self.judge, self.judge.settings
         number = min(number, len(self.groups) - 1)
-        window, groups = self._stretch(number)
+        window = self._stretch(number)
         when, mean, cov, driven_m, _ = self.rows[-1]
         judge.next_m = driven_m + v.again_after_m
         if window is None:
@@ -404,7 +404,7 @@ def _first_course(drive: Drive) -> float | None:
 def _fix_at(drive: Drive, when: float) -> Array:
     """Return the last fix before a time, carried on by dead reckoning, (2,) m."""
     k = max(0, int(np.searchsorted(drive.gnss.time_s, when, side="right")) - 1)
-    return drive.gnss.x_y[k]
+    return np.asarray(drive.gnss.x_y[k])
 
 
 def _spread_over(
@@ -426,7 +426,9 @@ def _spread_over(
     drawn[:, 0] += along * np.cos(drawn[:, 2]) + 0.2 * rng.standard_normal(len(rows))
     drawn[:, 1] += along * np.sin(drawn[:, 2]) + 0.2 * rng.standard_normal(len(rows))
     drawn[:, 2] += 0.5 * DEGREE * rng.standard_normal(len(rows))
-    weight = np.repeat([OLD_SHARE / len(kept), (1.0 - OLD_SHARE) / len(drawn)], [len(kept), len(drawn)])
+    weight = np.repeat(
+        [OLD_SHARE / len(kept), (1.0 - OLD_SHARE) / len(drawn)], [len(kept), len(drawn)]
+    )
     return Particles(np.concatenate([kept, drawn]), np.log(weight))
 
 

@@ -188,7 +188,7 @@ def log_likelihood(
 
 
 def _in_corridor(states: Array, curves: Curves, rows: slice, index: LineIndex) -> Array:
-    """Return how many points of the corridor that was seen free lie on a boundary: (n,), at most 10.
+    """Return how many points of the corridor seen free lie on a boundary: (n,), at most 10.
 
     The corridor is looked at along its middle, between the two boundaries seen.
     """

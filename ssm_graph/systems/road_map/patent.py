@@ -171,7 +171,7 @@ def _redrawn(
     """Put the worst share of the particles near the best share, drawn by their weights."""
     n = len(states)
     order = np.argsort(weight)
-    k = int(round(s.share * n))
+    k = round(s.share * n)
     worst, best = order[:k], order[-k:]
     p = weight[best] / weight[best].sum()
     drawn = states[rng.choice(best, k, p=p)]

@@ -26,7 +26,7 @@ from ssm_graph.systems.road_map.window import Window, in_plane
 
 _FAR_M: Final = 1.5
 """A point farther from every line of its kind is of none of them."""
-_SLANTED: Final = 0.3
+_SLANTED: Final = 0.1
 """Sine of the angle to the last course below which a line says nothing of the place along it: what
 its small kinks would say is the map's error, the same in every picture. The direction is one for
 all pictures: each one's own would differ by their courses, and so say what no line says."""

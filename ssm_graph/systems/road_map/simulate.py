@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -178,12 +177,3 @@ def damaged(
             line = replace(line, points=line.points + rng.choice([-by_m, by_m]) * normal)
         lines.append(line)
     return replace(road_map, lines=tuple(lines))
-
-
-def routes(road_map: RoadMap, seeds: Sequence[int], model: DriveModel) -> list[Poses]:
-    """Return a driven route for every seed."""
-    found = []
-    for seed in seeds:
-        rng = np.random.default_rng([seed, 0])
-        found.append(driven(random_route(road_map, model.length_m, rng), model, rng))
-    return found

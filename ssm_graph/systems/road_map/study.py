@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
@@ -213,11 +214,11 @@ def _cells(rows: Sequence[Row]) -> tuple[str, ...]:
     )
 
 
-def _percent(happened: Array) -> str:
-    return f"{100.0 * float(np.mean(happened)):.1f}" if len(happened) else "–"
+def _percent(happened: ArrayLike) -> str:
+    return f"{100.0 * float(np.mean(happened)):.1f}" if np.size(happened) else "–"
 
 
-def _rate(happened: Array) -> str:
+def _rate(happened: ArrayLike) -> str:
     rate = rate_with_interval(happened)
     return f"{100 * rate.value:.1f} ({100 * rate.low:.1f} to {100 * rate.high:.1f})"
 

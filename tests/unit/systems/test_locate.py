@@ -15,11 +15,13 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.cli.main import main
 from ssm_graph.systems.road_map.drive import Chassis, Curves, Drive, GnssFixes, dead_reckoned
 from ssm_graph.systems.road_map.folder import read_drive, write_drive
+from ssm_graph.systems.road_map.follow import follow
 from ssm_graph.systems.road_map.hypotheses import apart
-from ssm_graph.systems.road_map.locate import Located, Verdict, locate
+from ssm_graph.systems.road_map.locate import Located, Verdict, locate, sigmas_of
 from ssm_graph.systems.road_map.maps.road_map import Lane, LineKind, Mark, RoadLine, RoadMap
 from ssm_graph.systems.road_map.motion import motion_errors
 from ssm_graph.systems.road_map.patent import Normalisation, PatentSettings, locate_by_patent
+from ssm_graph.systems.road_map.refinement import Prior
 from ssm_graph.systems.road_map.simulate import (
     DriveModel,
     damaged,
@@ -58,7 +60,9 @@ def straight(length: float = 500.0) -> Array:
     return np.column_stack([np.arange(0.0, length), np.zeros(int(length))])
 
 
-def drive_on(centre: Array, lines: list[RoadLine], *, seed: int = 0, aside: float = -3.6) -> tuple[Drive, RoadMap]:
+def drive_on(
+    centre: Array, lines: list[RoadLine], *, seed: int = 0, aside: float = -3.6
+) -> tuple[Drive, RoadMap]:
     """Return a drive along the right lane of a road."""
     rng = np.random.default_rng(seed)
     model = DriveModel(length_m=110.0)
@@ -138,7 +142,9 @@ def test_map_errors_are_survived() -> None:
     drive, road_map, _ = on_the_bend()
     rng = np.random.default_rng(0)
     worn = damaged(road_map, rng, missing=0.0, shifted=1.0, by_m=0.5)
-    assert any(np.any(a.points != b.points) for a, b in zip(worn.lines, road_map.lines, strict=True))
+    assert any(
+        np.any(a.points != b.points) for a, b in zip(worn.lines, road_map.lines, strict=True)
+    )
     found = locate(drive, worn)
     assert abs(error(drive, found)[0]) < 0.6
 
@@ -213,8 +219,13 @@ def test_folder_there_and_back(tmp_path: Path) -> None:
 def curves_with(**changes: Array) -> Curves:
     """Return one curve with something wrong."""
     usual = {
-        "time_s": np.zeros(1), "kind": np.zeros(1), "side": np.ones(1), "cubic": np.zeros((1, 4)),
-        "reach": np.array([[0.0, 30.0]]), "sigma_m": np.ones(1), "mark": np.zeros(1),
+        "time_s": np.zeros(1),
+        "kind": np.zeros(1),
+        "side": np.ones(1),
+        "cubic": np.zeros((1, 4)),
+        "reach": np.array([[0.0, 30.0]]),
+        "sigma_m": np.ones(1),
+        "mark": np.zeros(1),
     }
     return Curves(**{**usual, **changes})
 
@@ -272,3 +283,23 @@ def test_a_lane_has_its_middle() -> None:
     """Between bounds of unequal length."""
     lane = Lane("a", [[0.0, 2.0], [10.0, 2.0]], [[0.0, 0.0], [5.0, 0.0], [10.0, 0.0]])
     np.testing.assert_allclose(lane.centre(5.0), [[0.0, 1.0], [5.0, 1.0], [10.0, 1.0]])
+
+
+def test_the_localiser_goes_on_from_a_known_lane() -> None:
+    """Along a winding road its errors stay within what it says, and centimetres across."""
+    drive, road_map, _ = on_the_bend()
+    assert drive.truth is not None
+    first_s = float(drive.curves.time_s[0])
+    start = drive.truth.at(np.array([first_s]))[0] + [0.3, -0.2, 0.01]
+    sigma = np.array([0.5, 0.5, 0.02, 0.01, 1e-3])
+    prior = Prior(np.array([*start, 0.0, 0.0]), np.diag(1.0 / sigma**2))
+    found = follow(drive, prior, first_s, indices_of(road_map))
+    true = drive.truth.at(found.time_s)
+    off = np.array([apart(t, p) for t, p in zip(true, found.pose, strict=True)])
+    assert np.abs(off[:, 0]).max() < 0.3
+    assert np.median(np.abs(off[20:, 0])) < 0.05
+    sigmas = np.array([sigmas_of(p, c) for p, c in zip(found.pose, found.cov, strict=True)])
+    assert np.mean(np.abs(off[:, 1]) < 3.0 * sigmas[:, 1]) > 0.9
+    assert np.all(np.linalg.eigvalsh(found.cov) > 0.0)
+    with pytest.raises(DataError, match="expected pictures from"):
+        follow(drive, prior, 1e6, indices_of(road_map))

@@ -65,10 +65,8 @@ def _parts(feature: Mapping[str, Any]) -> Iterator[tuple[str, LineKind, Mark, Ar
     kind = str(said.get("kind", "")).replace("_", " ").lower()
     if kind not in {"boundary", "lane line"}:
         return
-    several = {
-        "LineString": [shape.get("coordinates")],
-        "MultiLineString": shape.get("coordinates"),
-    }
+    points_of = shape.get("coordinates") or []
+    several = {"LineString": [points_of], "MultiLineString": points_of}
     mark = Mark.__members__.get(str(said.get("mark", "")).upper(), Mark.UNKNOWN)
     what = LineKind.BOUNDARY if kind == "boundary" else LineKind.LANE_LINE
     for points in several.get(str(shape.get("type")), []):

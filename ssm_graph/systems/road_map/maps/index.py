@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.systems.road_map.maps.road_map import RoadLine, resampled
+from ssm_graph.systems.road_map.maps.road_map import RoadLine
 
 CELL_M: Final = 0.5
 TILE: Final = 64
@@ -49,7 +49,7 @@ class LineIndex:
         far = np.full((1, 2), 1e12)  # the piece that is none
         self.start = np.concatenate([*a, far])
         """(S + 1, 2) m, first points of the pieces."""
-        self.step = np.concatenate([*b, far + [1.0, 0.0]]) - self.start
+        self.step = np.concatenate([*b, far + 1.0]) - self.start
         """(S + 1, 2) m, from first to last point."""
         self.line_of = np.repeat(np.arange(len(lines) + 1), [*map(len, a), 1])
         """(S + 1,) number of the line."""
@@ -111,7 +111,7 @@ class LineIndex:
             for row, column in missing:
                 self._make_tile(int(row), int(column))
             slot = self._slots[ti, tj]
-        return self._raster[slot, (i % TILE) * TILE + j % TILE].astype(np.int64)
+        return np.asarray(self._raster[slot, (i % TILE) * TILE + j % TILE], dtype=np.int64)
 
     def _make_tile(self, ti: int, tj: int) -> None:
         cells = (np.arange(TILE) + 0.5) * CELL_M
@@ -129,10 +129,3 @@ class LineIndex:
             self._raster[slot] = owner[near]
             self._n_tiles += 1
         self._slots[ti, tj] = slot
-
-
-def dense(lines: Sequence[RoadLine], spacing_m: float = 1.0) -> Array:
-    """Return points (N, 2) all along lines, m."""
-    return np.concatenate(
-        [np.empty((0, 2)), *(resampled(line.points, spacing_m) for line in lines)]
-    )

@@ -196,7 +196,8 @@ def _aligned(
 ) -> tuple[list[str], list[str]]:
     """Turn bounds so that they run along each other with the left one on the left.
 
-    The roles of a lanelet's bounds say in which direction it is driven; that of their nodes nothing.
+    The roles of a lanelet's bounds say in which direction it is driven, the order of their nodes
+    says nothing.
     """
     a, b = (np.array([points[node] for node in side]) for side in (left, right))
     same = np.hypot(*(a[0] - b[0])) + np.hypot(*(a[-1] - b[-1]))

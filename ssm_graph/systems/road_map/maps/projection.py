@@ -35,7 +35,6 @@ _BETA: Final = (
     4397 * _N**4 / 161280,
 )
 """Karney's eq. (36)."""
-UTM_SCALE: Final = 0.9996
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,13 +82,3 @@ class TransverseMercator:
         )
         zeta = plane + sum(a * np.sin(2 * k * plane) for k, a in enumerate(_ALPHA, 1))
         return self.scale * _RADIUS * zeta.imag, self.scale * _RADIUS * zeta.real
-
-
-def utm(lat: float, lon: float) -> TransverseMercator:
-    """Return the UTM zone of a place, rad; its x begins at 500 km, as usual."""
-    zone = math.floor((math.degrees(lon) + 180.0) / 6.0)
-    meridian = math.radians(6.0 * zone - 177.0)
-    south = 0.0 if lat >= 0.0 else None
-    if south is None:
-        raise ValueError("utm: expected a place north of the equator")
-    return TransverseMercator(0.0, meridian, UTM_SCALE, 500e3)

@@ -173,7 +173,7 @@ def without_repeats(points: Array) -> Array:
     if len(points) == 0:
         return points
     moves = np.any(np.diff(points, axis=0) != 0.0, axis=1)
-    return points[np.concatenate([[True], moves])]
+    return np.asarray(points[np.concatenate([[True], moves])])
 
 
 def unique_lines(lines: Sequence[RoadLine]) -> tuple[RoadLine, ...]:
