@@ -207,7 +207,7 @@ def _fitted(
 
     The widths fall from round to round, beginning with ``first_m`` more than the sigmas.
     """
-    at = last.copy()
+    at: Array = last.copy()
     for number in range(_ROUNDS):
         wider_m = first_m * 0.4**number
         hessian = np.zeros((len(at), 3, 3)) + np.diag([0.05, 0.05, 30.0])
@@ -237,8 +237,9 @@ def _fitted(
             hessian += np.einsum("ncm,ncmi,ncmj->nij", counted, block, block)
             error = np.where(counted > 0.0, found.error, 0.0)
             slope += np.einsum("ncm,ncmi->ni", counted * error, block)
-        at = at - np.linalg.solve(hessian, slope[..., None])[..., 0]
-    return np.asarray(at, dtype=np.float64)
+        step = np.linalg.solve(hessian, slope[..., None])[..., 0]
+        at = np.asarray(at - step, dtype=np.float64)
+    return at
 
 
 def course_trials(yaw: float, sigma: float) -> Array:

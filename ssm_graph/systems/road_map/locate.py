@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from enum import Enum
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -36,12 +35,16 @@ from ssm_graph.systems.road_map.maps.index import LineIndex
 from ssm_graph.systems.road_map.maps.road_map import LineKind, RoadMap
 from ssm_graph.systems.road_map.refinement import Prior, Refined, RefinementSettings, refine
 from ssm_graph.systems.road_map.simulate import indices_of
+from ssm_graph.systems.road_map.verdict import (
+    CARRIED,
+    Verdict,
+    VerdictSettings,
+    reason_of,
+)
 from ssm_graph.systems.road_map.window import Window, window_of
 
 SENSOR_REACH_M: Final = 60.0
 """Beyond the square of the fix, what the camera can see."""
-CARRIED: Final = 0.05
-"""A rival with more of the evidence makes the answer ambiguous."""
 ALONG_INFLATION: Final = 1.5
 """By which the particles' sigma along the road is too small, on routes 0 to 39: they take the
 errors of the map for what tells one place from another."""
@@ -53,40 +56,6 @@ OLD_SHARE: Final = 0.005
 """Of the weight that stays with the particles as they were, when others are put elsewhere."""
 SLIDE_EVERY_M: Final = 15.0
 """From one look along the lane to the next."""
-
-
-class Verdict(Enum):
-    """What can be said of the lane; the text is shown to the user."""
-
-    CONVERGED = "the lane is known, and the place along it"
-    UNRESOLVED_ALONG = "the lane is known, the place along it is not: the road looks alike there"
-    AMBIGUOUS = "more than one lane explains what was seen"
-    FAILED = "no lane explains what was seen"
-
-    @property
-    def has_lane(self) -> bool:
-        """Whether the lane is known."""
-        return self in (Verdict.CONVERGED, Verdict.UNRESOLVED_ALONG)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class VerdictSettings:
-    """When the lane is held to be known."""
-
-    lateral_sigma_m: float = 0.5
-    """Of the particles; more is no lane."""
-    least_driven_m: float = 12.0
-    window_m: float = 45.0
-    """Of the stretch that is laid on the map to find rivals."""
-    again_after_m: float = 10.0
-    """Between two looks at the rivals while the lane is not known ..."""
-    watch_m: float = 80.0
-    """... and once it is."""
-    misfit: float = 3.0
-    """Loss of log evidence per curve beyond which nothing explains what was seen."""
-    along_sigma_m: float = 4.0
-    """More is not resolved along the road."""
-    refined_pictures: int = 40
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,19 +97,6 @@ class Located:
     """Processor time of one update, its share of the search among it."""
 
 
-@dataclass(slots=True)
-class _Judge:
-    """What was found of rivals, and when the next look is due."""
-
-    settings: VerdictSettings
-    verdict: Verdict = Verdict.AMBIGUOUS
-    hypotheses: list[Hypothesis] = field(default_factory=list)
-    next_m: float = 0.0
-    next_slide_m: float = 0.0
-    misfit: float = 0.0
-    first: tuple[float, float, Array] | None = None
-
-
 class Localiser:
     """Follows one drive over one map; see `locate`."""
 
@@ -157,7 +113,10 @@ class Localiser:
     ) -> None:
         self.drive = drive
         self.settings = settings or LocatorSettings()
-        self.judge = _Judge(verdict or VerdictSettings())
+        self.when = verdict or VerdictSettings()
+        self.verdict, self.hypotheses = Verdict.AMBIGUOUS, list[Hypothesis]()
+        self.next_m = self.next_slide_m = 0.0
+        self.first: tuple[float, float, Array] | None = None
         self.refinement = refinement or RefinementSettings()
         self.half_m = square_of(drive)
         fixes = drive.gnss.x_y
@@ -210,15 +169,14 @@ class Localiser:
         self.extras.append((mean, cov))
         if len(self.rows) in (3, 10, 25) or len(self.rows) % 60 == 0:
             self._keep(when)
-        judge = self.judge
-        if locator.driven_m >= max(judge.next_m, judge.settings.least_driven_m):
+        if locator.driven_m >= max(self.next_m, self.when.least_driven_m):
             self._judge(number)
-        elif judge.verdict is Verdict.CONVERGED and locator.driven_m >= judge.next_slide_m:
+        elif self.verdict is Verdict.CONVERGED and locator.driven_m >= self.next_slide_m:
             self._slide(number)
 
     def _slide(self, number: int) -> None:
         """Look along the lane: the particles may have lost the right place in it."""
-        self.judge.next_slide_m = self.locator.driven_m + SLIDE_EVERY_M
+        self.next_slide_m = self.locator.driven_m + SLIDE_EVERY_M
         window = self._stretch(number)
         if window is not None:
             mean = self.rows[-1][1]
@@ -237,7 +195,7 @@ class Localiser:
     def _spread(self, found: list[Hypothesis]) -> None:
         """Put particles about all places that the stretch allows."""
         locator = self.locator
-        locator.particles = _spread_over(found, locator.particles, self.settings, locator.rng)
+        locator.put(_spread_over(found, locator.particles, self.settings, locator.rng))
 
     def _keep(self, when: float) -> None:
         self.snapshots.append((when, self.locator.particles.states[:, :3].copy()))
@@ -246,7 +204,7 @@ class Localiser:
         driven_m = self.locator.driven_m
         row = len(self.rows) - 1
         first = row
-        while first > 0 and self.rows[first - 1][3] >= driven_m - self.judge.settings.window_m:
+        while first > 0 and self.rows[first - 1][3] >= driven_m - self.when.window_m:
             first -= 1
         n = min(row - first + 1, MOST_PICTURES)
         groups = self.groups[number - n + 1 : number + 1]
@@ -264,22 +222,21 @@ class Localiser:
 
     def _judge(self, number: int) -> None:
         """Look for rivals, judge, and put particles where the evidence is."""
-        judge, v = self.judge, self.judge.settings
+        v = self.when
         number = min(number, len(self.groups) - 1)
         window = self._stretch(number)
         when, mean, cov, driven_m, _ = self.rows[-1]
-        judge.next_m = driven_m + v.again_after_m
+        self.next_m = driven_m + v.again_after_m
         if window is None:
-            judge.verdict = Verdict.FAILED if judge.first is None else judge.verdict
+            self.verdict = Verdict.FAILED if self.first is None else self.verdict
             return
         fix = _fix_at(self.drive, when)
         spread = max(float(np.sqrt(cov[2, 2])), self.settings.yaw_sigma / 2.0)
         yaws = course_trials(float(mean[2]), min(spread, 10.0 * DEGREE))
         found, own = search(window, fix, self.half_m, yaws, self.indices, self.settings, mean)
-        judge.hypotheses = found
-        judge.misfit = found[0].misfit
-        if judge.misfit > v.misfit:
-            judge.verdict = Verdict.FAILED
+        self.hypotheses = found
+        if found[0].misfit > v.misfit:
+            self.verdict = Verdict.FAILED
             return
         across, _ = sigmas_of(mean, cov)
         is_known = _lane_share(found, np.array(found[0].pose)) > 1.0 - CARRIED
@@ -292,20 +249,20 @@ class Localiser:
         mean, cov = self.extras[-1][0][:3], self.extras[-1][1][:3, :3]
         self.rows[-1] = (when, mean, cov, driven_m, len(p.states))
         across, _ = sigmas_of(mean, cov)
-        judge.verdict = Verdict.AMBIGUOUS
+        self.verdict = Verdict.AMBIGUOUS
         if across < v.lateral_sigma_m and _lane_share(found, mean) > 1.0 - CARRIED:
-            judge.verdict = Verdict.CONVERGED
-            judge.next_m = driven_m + v.watch_m
-            if judge.first is None and driven_m >= v.least_driven_m:
-                judge.first = (when, driven_m, mean)
+            self.verdict = Verdict.CONVERGED
+            self.next_m = driven_m + v.watch_m
+            if self.first is None and driven_m >= v.least_driven_m:
+                self.first = (when, driven_m, mean)
 
     def _answer(self, cpu_ms: float) -> Located:
-        judge, v = self.judge, self.judge.settings
+        v = self.when
         _, mean, cov, _, _ = self.rows[-1]
         across, along = sigmas_of(mean, cov)
         along *= ALONG_INFLATION
         pose, sigmas = mean, (across, along, float(np.sqrt(cov[2, 2])))
-        refined, window, verdict = None, None, judge.verdict
+        refined, window, verdict = None, None, self.verdict
         reason = ""
         if verdict is Verdict.CONVERGED:
             try:
@@ -320,13 +277,14 @@ class Localiser:
                 sigmas = (sigmas[0], along, sigmas[2])
         if verdict is Verdict.CONVERGED and sigmas[1] > v.along_sigma_m:
             verdict = Verdict.UNRESOLVED_ALONG
-        first = judge.first or (np.nan, np.nan, np.full(3, np.nan))
+        first = self.first or (np.nan, np.nan, np.full(3, np.nan))
         return Located(
             verdict,
-            _reason(verdict, judge, pose, sigmas) + (f"; {reason}" if reason else ""),
+            reason_of(verdict, self.hypotheses, v.misfit, pose, sigmas)
+            + (f"; {reason}" if reason else ""),
             np.array(pose),
             sigmas,
-            tuple(judge.hypotheses),
+            tuple(self.hypotheses),
             first[0] - float(self.drive.chassis.time_s[0]),
             first[1],
             first[2],
@@ -339,7 +297,7 @@ class Localiser:
 
     def _refine(self) -> tuple[Refined | None, Window | None]:
         """Lay the last pictures on the map as a graph, begun by the particles before them."""
-        n = min(self.judge.settings.refined_pictures, len(self.rows))
+        n = min(self.when.refined_pictures, len(self.rows))
         groups = self.groups[len(self.rows) - n : len(self.rows)]
         window = self._window(groups)
         if window is None:
@@ -349,7 +307,8 @@ class Localiser:
         cov = cov + floor
         if n == len(self.rows):
             cov = cov + np.diag([self.half_m**2 / 3.0, self.half_m**2 / 3.0, 0.0, 0.0, 0.0])
-        prior = Prior(mean, np.linalg.inv(ALONG_INFLATION**2 * _without_chance(mean, cov)))
+        cov = ALONG_INFLATION**2 * _without_chance(mean, cov)
+        prior = Prior(mean, np.asarray(np.linalg.inv(cov), dtype=np.float64))
         start = window.poses_from(self.rows[-1][1])
         return refine(window, start, prior, self.indices, self.refinement), window
 
@@ -440,29 +399,3 @@ def _track(rows: list[tuple[float, Array, Array, float, int]]) -> Track:
         np.array([row[3] for row in rows]),
         np.array([float(row[4]) for row in rows]),
     )
-
-
-def _reason(
-    verdict: Verdict, judge: _Judge, pose: Array, sigmas: tuple[float, float, float]
-) -> str:
-    if not judge.hypotheses:
-        return "no curve was seen in the last stretch, so nothing tells one lane from another"
-    best = judge.hypotheses[0]
-    if verdict is Verdict.FAILED:
-        return (
-            f"the best place explains the curves with a loss of {judge.misfit:.1f} each, expected "
-            f"below {judge.settings.misfit:.1f}: another place, an old map, or curves in other axes"
-        )
-    rival = next((h for h in judge.hypotheses if not h.is_same_lane(pose)), None)
-    told = ""
-    if rival is not None:
-        across, along, turn = apart(pose, np.array(rival.pose))
-        told = (
-            f"; rival {across:+.1f} m across, {along:+.1f} m along, turned {np.degrees(turn):+.0f} "
-            f"deg, with {100.0 * rival.share:.1f} % of the evidence"
-        )
-    if verdict is Verdict.UNRESOLVED_ALONG:
-        return f"sigma along the road {sigmas[1]:.1f} m, across {sigmas[0]:.2f} m{told}"
-    if verdict is Verdict.AMBIGUOUS:
-        return f"the best place has {100.0 * best.share:.0f} % of the evidence{told}"
-    return f"sigma across {sigmas[0]:.3f} m, along {sigmas[1]:.2f} m{told}"

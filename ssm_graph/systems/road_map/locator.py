@@ -123,13 +123,19 @@ class Locator:
         """Weigh all particles by the curves of one picture, and draw them anew where few count."""
         new = min(1.0, (self.driven_m - self._pictured_m) / INDEPENDENT_M)
         self._pictured_m = self.driven_m
-        self.particles.log_weight += new * log_likelihood(
+        found = log_likelihood(
             self.particles.states, curves, rows, self.indices, self.settings, self.n_pictures
         )
+        p = self.particles
+        self.particles = Particles(p.states, p.log_weight + new * found)
         self.n_pictures += 1
         weight = self.particles.weight
         if effective_number(weight) < 0.5 * len(weight):
             self._draw(weight)
+
+    def put(self, particles: Particles) -> None:
+        """Go on with other particles."""
+        self.particles = particles
 
     def _draw(self, weight: Array) -> None:
         s, p = self.settings, self.particles.states

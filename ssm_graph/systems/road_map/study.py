@@ -215,7 +215,8 @@ def _cells(rows: Sequence[Row]) -> tuple[str, ...]:
 
 
 def _percent(happened: ArrayLike) -> str:
-    return f"{100.0 * float(np.mean(happened)):.1f}" if np.size(happened) else "–"
+    values = np.asarray(happened, dtype=bool)
+    return f"{100.0 * float(np.mean(values)):.1f}" if values.size else "–"
 
 
 def _rate(happened: ArrayLike) -> str:

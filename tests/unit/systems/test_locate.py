@@ -17,7 +17,7 @@ from ssm_graph.systems.road_map.drive import Chassis, Curves, Drive, GnssFixes, 
 from ssm_graph.systems.road_map.folder import read_drive, write_drive
 from ssm_graph.systems.road_map.follow import follow
 from ssm_graph.systems.road_map.hypotheses import apart
-from ssm_graph.systems.road_map.locate import Located, Verdict, locate, sigmas_of
+from ssm_graph.systems.road_map.locate import Located, locate, sigmas_of
 from ssm_graph.systems.road_map.maps.road_map import Lane, LineKind, Mark, RoadLine, RoadMap
 from ssm_graph.systems.road_map.motion import motion_errors
 from ssm_graph.systems.road_map.patent import Normalisation, PatentSettings, locate_by_patent
@@ -29,12 +29,14 @@ from ssm_graph.systems.road_map.simulate import (
     indices_of,
     simulate_drive,
 )
+from ssm_graph.systems.road_map.verdict import Verdict
 
 
 def beside(centre: Array, offset: float) -> Array:
     """Return a line beside another one, to its left, m."""
     d = np.gradient(centre, axis=0)
-    return centre + offset * np.column_stack([-d[:, 1], d[:, 0]]) / np.hypot(*d.T)[:, None]
+    normal = np.column_stack([-d[:, 1], d[:, 0]]) / np.hypot(*d.T)[:, None]
+    return np.asarray(centre + offset * normal)
 
 
 def road(centre: Array, *, shift: float = 0.0, name: str = "") -> list[RoadLine]:
@@ -65,7 +67,7 @@ def drive_on(
 ) -> tuple[Drive, RoadMap]:
     """Return a drive along the right lane of a road."""
     rng = np.random.default_rng(seed)
-    model = DriveModel(length_m=110.0)
+    model = DriveModel(length_m=70.0)
     truth = driven(beside(centre, aside)[len(centre) // 4 :], model, rng)
     road_map = RoadMap("made up", tuple(lines), {})
     return simulate_drive("made up", truth, road_map, model, rng), road_map
@@ -106,10 +108,11 @@ def test_a_straight_road_is_unresolved_along() -> None:
     assert abs(along) < 3.0 * found.sigmas[1]
 
 
+@pytest.mark.slow
 def test_two_roads_alike_are_ambiguous() -> None:
     """A twin 16 m beside: the rival is named, with about half of the evidence."""
     twins = [*road(straight()), *road(straight(), shift=16.0, name="twin ")]
-    model = DriveModel(length_m=110.0, gnss_bias_m=0.1)
+    model = DriveModel(length_m=70.0, gnss_bias_m=0.1)
     truth = driven(beside(straight(), -3.6)[100:], model, np.random.default_rng(0))
     road_map = RoadMap("twins", tuple(twins), {})
     drive = simulate_drive("twins", truth, road_map, model, np.random.default_rng(1))
@@ -137,6 +140,7 @@ def test_the_wrong_map_fails() -> None:
     assert not found.verdict.has_lane
 
 
+@pytest.mark.slow
 def test_map_errors_are_survived() -> None:
     """Some boundaries missing or shifted by half a metre: still the right lane."""
     drive, road_map, _ = on_the_bend()
@@ -149,6 +153,7 @@ def test_map_errors_are_survived() -> None:
     assert abs(error(drive, found)[0]) < 0.6
 
 
+@pytest.mark.slow
 def test_without_a_course_all_are_searched() -> None:
     """A receiver that gives no course: found all the same, not backwards."""
     drive, road_map, _ = on_the_bend()
@@ -281,7 +286,8 @@ def test_motion_errors_are_found() -> None:
 
 def test_a_lane_has_its_middle() -> None:
     """Between bounds of unequal length."""
-    lane = Lane("a", [[0.0, 2.0], [10.0, 2.0]], [[0.0, 0.0], [5.0, 0.0], [10.0, 0.0]])
+    bounds = ([[0.0, 2.0], [10.0, 2.0]], [[0.0, 0.0], [5.0, 0.0], [10.0, 0.0]])
+    lane = Lane("a", *(np.array(bound) for bound in bounds))
     np.testing.assert_allclose(lane.centre(5.0), [[0.0, 1.0], [5.0, 1.0], [10.0, 1.0]])
 
 

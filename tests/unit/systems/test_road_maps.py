@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.base.frozen import Array
 from ssm_graph.systems.road_map.maps.geojson import read_geojson
 from ssm_graph.systems.road_map.maps.index import LineIndex
 from ssm_graph.systems.road_map.maps.opendrive import read_opendrive
@@ -108,7 +110,9 @@ def test_swapped_sides_are_put_right_and_told() -> None:
 
 def test_a_map_says_how_far_off_a_fix_is() -> None:
     """Beyond the map the message has the distance; very far it names exchanged coordinates."""
-    road_map = RoadMap("m", (RoadLine("k", LineKind.BOUNDARY, [[0.0, 0.0], [100.0, 0.0]]),), {})
+    road_map = RoadMap(
+        "m", (RoadLine("k", LineKind.BOUNDARY, np.array([[0.0, 0.0], [100.0, 0.0]])),), {}
+    )
     with pytest.raises(DataError, match="400 m off the map: take the map of that place"):
         road_map.within(np.array([500.0, 0.0]), 50.0)
     with pytest.raises(DataError, match="latitude and longitude exchanged"):
@@ -153,7 +157,7 @@ def centre_of(tmp_path: Path, shape: str, length: float = 40.0, rule: str = "RHT
     return read_opendrive(path)
 
 
-SHAPES = {
+SHAPES: dict[str, tuple[str, Callable[[Array], Array]]] = {
     "line": ("<line/>", lambda s: 0.0 * s),
     "arc": ('<arc curvature="0.02"/>', lambda s: 0.02 * s),
     "right": ('<arc curvature="-0.02"/>', lambda s: -0.02 * s),
