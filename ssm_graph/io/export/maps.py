@@ -100,15 +100,15 @@ def write_gpx(track: Track, path: Path) -> None:
     """Write a GPX 1.1 track with heights, and UTC where it is known."""
     root = Element("gpx", {"version": "1.1", "creator": "ssm-graph", "xmlns": GPX})
     of_track = SubElement(root, "trk")
-    SubElement(of_track, "name").text = track.name
-    SubElement(of_track, "desc").text = track.about
+    _say(of_track, "name", track.name)
+    _say(of_track, "desc", track.about)
     segment = SubElement(of_track, "trkseg")
     times = track.utc() if track.epoch_s is not None else None
     for i, (lon, lat, height) in enumerate(degrees(track).tolist()):
         point = SubElement(segment, "trkpt", {"lat": f"{lat:.9f}", "lon": f"{lon:.9f}"})
-        SubElement(point, "ele").text = f"{height:.3f}"
+        _say(point, "ele", f"{height:.3f}")
         if times is not None:
-            SubElement(point, "time").text = times[i]
+            _say(point, "time", times[i])
     path.write_bytes(_xml(root))
 
 
@@ -126,15 +126,15 @@ def write_kmz(track: Track, path: Path) -> None:
 def _kml(track: Track) -> bytes:
     root = Element("kml", {"xmlns": KML, "xmlns:gx": GX})
     document = SubElement(root, "Document")
-    SubElement(document, "name").text = track.name
-    SubElement(document, "description").text = track.about
+    _say(document, "name", track.name)
+    _say(document, "description", track.about)
     for name, color, width in (("track", _TRACK_COLOR, "3"), ("suspect", _SUSPECT_COLOR, "4")):
         line = SubElement(SubElement(document, "Style", {"id": name}), "LineStyle")
-        SubElement(line, "color").text = color
-        SubElement(line, "width").text = width
+        _say(line, "color", color)
+        _say(line, "width", width)
     filled = SubElement(document, "Style", {"id": "uncertainty"})
-    SubElement(SubElement(filled, "LineStyle"), "width").text = "1"
-    SubElement(SubElement(filled, "PolyStyle"), "color").text = "40d18b00"
+    _say(SubElement(filled, "LineStyle"), "width", "1")
+    _say(SubElement(filled, "PolyStyle"), "color", "40d18b00")
     points = degrees(track)
     for part in lines(points):
         _kml_line(document, track.name, "track", part)
@@ -150,27 +150,27 @@ def _kml(track: Track) -> bytes:
 
 def _kml_line(document: Element, name: str, style: str, points: Array) -> None:
     placemark = SubElement(document, "Placemark")
-    SubElement(placemark, "name").text = name
-    SubElement(placemark, "styleUrl").text = f"#{style}"
+    _say(placemark, "name", name)
+    _say(placemark, "styleUrl", f"#{style}")
     line = SubElement(placemark, "LineString")
-    SubElement(line, "altitudeMode").text = "clampToGround"
-    SubElement(line, "coordinates").text = _coordinates(points)
+    _say(line, "altitudeMode", "clampToGround")
+    _say(line, "coordinates", _coordinates(points))
 
 
 def _kml_times(document: Element, track: Track, points: Array) -> None:
     placemark = SubElement(document, "Placemark")
-    SubElement(placemark, "name").text = f"{track.name}, with times"
+    _say(placemark, "name", f"{track.name}, with times")
     times = SubElement(placemark, "gx:Track")
-    SubElement(times, "altitudeMode").text = "clampToGround"
+    _say(times, "altitudeMode", "clampToGround")
     for when in track.utc():
-        SubElement(times, "when").text = when
+        _say(times, "when", when)
     for lon, lat, height in points.tolist():
-        SubElement(times, "gx:coord").text = f"{lon:.9f} {lat:.9f} {height:.3f}"
+        _say(times, "gx:coord", f"{lon:.9f} {lat:.9f} {height:.3f}")
 
 
 def _kml_ellipses(document: Element, track: Track) -> None:
     folder = SubElement(document, "Folder")
-    SubElement(folder, "name").text = "3 sigma east and north"
+    _say(folder, "name", "3 sigma east and north")
     n_rows = len(track.time_s)
     frame, local, angle = track.frame, track.local_enu, np.linspace(0.0, 2.0 * np.pi, _CORNERS + 1)
     ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))])
@@ -180,20 +180,29 @@ def _kml_ellipses(document: Element, track: Track) -> None:
             continue
         lat, lon, _ = frame.geodetic_from_p_n(local[row] + 3.0 * ring * [sigma[0], sigma[1], 0.0])
         placemark = SubElement(folder, "Placemark")
-        SubElement(placemark, "name").text = f"{track.time_s[row]:.1f} s"
-        SubElement(placemark, "description").text = (
-            f"sigma east {sigma[0]:.2f} m, north {sigma[1]:.2f} m, up {sigma[2]:.2f} m; height "
-            f"{track.height[row]:.2f} m"
+        _say(placemark, "name", f"{track.time_s[row]:.1f} s")
+        _say(
+            placemark,
+            "description",
+            (
+                f"sigma east {sigma[0]:.2f} m, north {sigma[1]:.2f} m, up {sigma[2]:.2f} m; height "
+                f"{track.height[row]:.2f} m"
+            ),
         )
-        SubElement(placemark, "styleUrl").text = "#uncertainty"
+        _say(placemark, "styleUrl", "#uncertainty")
         boundary = SubElement(SubElement(placemark, "Polygon"), "outerBoundaryIs")
         of_ring = SubElement(boundary, "LinearRing")
         corners = np.column_stack([np.degrees(lon), np.degrees(lat), np.zeros(len(lat))])
-        SubElement(of_ring, "coordinates").text = _coordinates(corners)
+        _say(of_ring, "coordinates", _coordinates(corners))
 
 
 def _coordinates(points: Array) -> str:
     return " ".join(f"{lon:.9f},{lat:.9f},{height:.3f}" for lon, lat, height in points.tolist())
+
+
+def _say(parent: Element, tag: str, text: str) -> None:
+    element = SubElement(parent, tag)
+    element.text = text
 
 
 def _xml(root: Element) -> bytes:

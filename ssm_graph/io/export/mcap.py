@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
@@ -119,10 +120,14 @@ def _columns(track: Track) -> dict[str, Any]:
         "sigma_heading": np.degrees(track.attitude_sigma[:, 2]),
         "suspect": track.is_suspect,
     }
-    return {
-        name: np.asarray(np.where(np.isfinite(values), values.astype(object), None)).tolist()
-        for name, values in arrays.items()
-    }
+    return {name: [_known(row) for row in values.tolist()] for name, values in arrays.items()}
+
+
+def _known(value: Any) -> Any:
+    """Return a number or a list of them, None for what is not finite."""
+    if isinstance(value, list):
+        return [_known(part) for part in value]
+    return value if math.isfinite(value) else None
 
 
 def _messages(columns: dict[str, Any], i: int) -> dict[str, dict[str, Any]]:
