@@ -268,3 +268,12 @@ def test_trust(tmp_path: Path) -> None:
     lies, clean = done.rows("one beam"), done.rows("no fault")
     assert [row[1] for row in lies] == ["tactical"] * 2
     assert clean == []
+
+
+@pytest.mark.benchmark
+def test_road_map(tmp_path: Path) -> None:
+    """Two drives of each part have a row, and the same command does nothing again."""
+    data = os.environ.get("SSM_GRAPH_DATA", str(ROOT.parent / "shared" / "data"))
+    done = run("science.road_map", f"--share 0.001 --data {data}", "road_map", tmp_path)
+    assert done.code == 0
+    assert [row[3] for row in done.rows("mapping_example.osm")] == ["2"] * 6
