@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from benchmarks.report import ROOT, Option, Report, note, table
@@ -40,7 +41,7 @@ PARTS = (
     ("plain", KARLSRUHE, PATENT, 40),
 )
 """Case, maps, methods, drives on each map."""
-DATA = ROOT.parent / "shared" / "data"
+DATA = os.environ.get("SSM_GRAPH_DATA", str(ROOT.parent / "shared" / "data"))
 
 
 def main() -> None:
@@ -49,7 +50,7 @@ def main() -> None:
         __file__,
         "A lane found in a map",
         __doc__,
-        Option("--data", str(DATA), "folder of the real maps"),
+        Option("--data", DATA, "folder of the real maps"),
         Option("--share", 1.0, "of the drives"),
         Option("--jobs", 1, "processes"),
     )
