@@ -238,8 +238,8 @@ def _fitted(
             error = np.where(counted > 0.0, found.error, 0.0)
             slope += np.einsum("ncm,ncmi->ni", counted * error, block)
         step = np.linalg.solve(hessian, slope[..., None])[..., 0]
-        at = np.asarray(at - step, dtype=np.float64)
-    return at
+        at = at - step
+    return np.array(at, dtype=np.float64)
 
 
 def course_trials(yaw: float, sigma: float) -> Array:

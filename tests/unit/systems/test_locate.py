@@ -286,8 +286,8 @@ def test_motion_errors_are_found() -> None:
 
 def test_a_lane_has_its_middle() -> None:
     """Between bounds of unequal length."""
-    bounds = ([[0.0, 2.0], [10.0, 2.0]], [[0.0, 0.0], [5.0, 0.0], [10.0, 0.0]])
-    lane = Lane("a", *(np.array(bound) for bound in bounds))
+    left, right = np.array([[0.0, 2.0], [10.0, 2.0]]), np.array([[0, 0], [5, 0], [10, 0]], float)
+    lane = Lane("a", left, right)
     np.testing.assert_allclose(lane.centre(5.0), [[0.0, 1.0], [5.0, 1.0], [10.0, 1.0]])
 
 
