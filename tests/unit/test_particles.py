@@ -1,4 +1,4 @@
-"""The particle filter's law: drawing, number, heaps, angles."""
+"""The particle filter's law: drawing, number, angles."""
 
 from __future__ import annotations
 
@@ -8,13 +8,10 @@ import pytest
 from ssm_graph.filters.rules.particles import (
     effective_number,
     kld_number,
-    modes,
     moments,
     normalised,
     systematic,
 )
-
-REACH = np.array([1.0, 1.0, 0.2])
 
 
 def test_weights_do_not_depend_on_a_constant() -> None:
@@ -48,8 +45,8 @@ def test_kld_number() -> None:
         assert kld_number(cells) == pytest.approx(exact, rel=0.01)
 
 
-def test_mean_and_heaps_across_half_a_turn() -> None:
-    """Courses about +-pi are one heap, and their mean is there, not at zero."""
+def test_moments_across_half_a_turn() -> None:
+    """Courses about +-pi have their mean there, not at zero, and the spread they have."""
     rng = np.random.default_rng(1)
     yaw = np.pi + 0.1 * rng.standard_normal(400)
     states = np.column_stack(
@@ -59,17 +56,3 @@ def test_mean_and_heaps_across_half_a_turn() -> None:
     mean, cov = moments(states, weight, 2)
     assert abs(abs(mean[2]) - np.pi) < 0.02
     assert np.sqrt(cov[2, 2]) == pytest.approx(0.1, rel=0.15)
-    found = modes(states, weight, reach=REACH, angle=2)
-    assert found[0].share > 0.99
-
-
-def test_heaps_are_told_apart_and_weighed() -> None:
-    """Two lanes, 70 and 30 %; the same place with the opposite course is a third."""
-    rng = np.random.default_rng(2)
-    blob = 0.2 * rng.standard_normal((300, 3)) * [1, 1, 0.2]
-    shifts = np.array([[0.0, 0.0, 0.0], [0.0, 3.5, 0.0], [0.0, 0.0, np.pi]])
-    states = np.concatenate([blob + shift for shift in shifts])
-    weight = np.repeat([0.6, 0.3, 0.1], 300) / 300
-    found = modes(states, weight, reach=REACH, angle=2)
-    np.testing.assert_allclose([m.share for m in found], [0.6, 0.3, 0.1], atol=1e-9)
-    np.testing.assert_allclose(found[1].mean[:2], [0.0, 3.5], atol=0.1)

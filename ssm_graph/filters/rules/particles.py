@@ -1,18 +1,14 @@
-"""The law of a particle filter: weights, resampling, how many are needed, modes and their evidence.
+"""The law of a particle filter: weights, resampling, how many are needed, moments.
 
 Nothing here knows what a particle is a state of, but that one column may be an angle.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 from scipy.stats import norm
 
 from ssm_graph.base.frozen import Array
@@ -54,59 +50,6 @@ def kld_number(n_cells: int, error: float = KLD_ERROR, confidence: float = KLD_C
     a = 2.0 / (9.0 * k)
     z = float(norm.ppf(confidence))
     return int(np.ceil(k / (2.0 * error) * (1.0 - a + np.sqrt(a) * z) ** 3))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Mode:
-    """A heap of particles that hang together."""
-
-    rows: _Rows
-    """Which particles."""
-    share: float
-    """Of the evidence, 0 to 1."""
-    mean: Array
-    """(d,) weighted; of the angle the circular mean."""
-    cov: Array
-    """(d, d) about the mean."""
-
-
-def modes(states: Array, weight: Array, *, reach: Array, angle: int) -> list[Mode]:
-    """Return the heaps of particles (N, d), the one with most evidence first.
-
-    Particles are put into cells of the sizes ``reach`` (d,), infinite for columns that do not tell
-    heaps apart; cells that touch, also at a corner and across half a turn of column ``angle``, are
-    one heap.
-    """
-    told = np.flatnonzero(np.isfinite(reach))
-    size = reach[told]
-    turn = np.flatnonzero(told == angle)
-    cells_of_turn = np.zeros(len(told))
-    values = states[:, told].copy()
-    if turn.size:
-        n_turn = max(3, int(np.floor(2.0 * np.pi / size[turn[0]])))
-        size = size.copy()
-        size[turn[0]] = 2.0 * np.pi / n_turn
-        values[:, turn[0]] = np.mod(values[:, turn[0]], 2.0 * np.pi)
-        cells_of_turn[turn[0]] = n_turn
-    cells, cell_of = np.unique(
-        np.floor(values / size).astype(np.int64), axis=0, return_inverse=True
-    )
-    low = cells.min(axis=0)
-    # A tree wraps around the angle; along other columns its box is larger than all cells.
-    span = np.where(cells_of_turn > 0, cells_of_turn, np.ptp(cells, axis=0) + 3.0)
-    shifted = np.where(cells_of_turn > 0, np.mod(cells, np.maximum(cells_of_turn, 1)), cells - low)
-    tree = cKDTree(shifted.astype(float), boxsize=span)
-    pairs = tree.query_pairs(1.5, p=np.inf, output_type="ndarray")
-    n = len(cells)
-    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-    label = connected_components(graph, directed=False)[1][np.ravel(cell_of)]
-    found = [_mode(states, weight, np.flatnonzero(label == k), angle) for k in np.unique(label)]
-    return sorted(found, key=lambda mode: -mode.share)
-
-
-def _mode(states: Array, weight: Array, rows: _Rows, angle: int) -> Mode:
-    mean, cov = moments(states[rows], weight[rows], angle)
-    return Mode(rows, float(weight[rows].sum()), mean, cov)
 
 
 def moments(states: Array, weight: Array, angle: int) -> tuple[Array, Array]:

@@ -239,10 +239,10 @@ def _fitted(
             slope += np.einsum("ncm,ncmi->ni", counted * error, block)
         step = np.linalg.solve(hessian, slope[..., None])[..., 0]
         at = at - step
-    return np.array(at, dtype=np.float64)
+    return at
 
 
 def course_trials(yaw: float, sigma: float) -> Array:
     """Return the courses that a search tries: within two and a half sigma of one, rad."""
     n = max(1, int(np.ceil(2.5 * sigma / _COARSE_TURN)))
-    return yaw + _COARSE_TURN * np.arange(-n, n + 1)
+    return np.asarray(yaw + _COARSE_TURN * np.arange(-n, n + 1), dtype=np.float64)
