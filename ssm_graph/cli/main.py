@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from enum import IntEnum
 from importlib.metadata import version
+from typing import Final
 
 from rich.text import Text
 
@@ -17,7 +18,7 @@ from ssm_graph.base.errors import (
     SolverError,
     SsmGraphError,
 )
-from ssm_graph.cli import compare, convert, export, online, report, simulate, smooth
+from ssm_graph.cli import compare, convert, export, inspect, online, report, simulate, smooth
 from ssm_graph.cli import filter as filter_command
 from ssm_graph.cli.options import say
 from ssm_graph.cli.terminal import console_on, interrupt, occupy_closed_streams, signals_to
@@ -62,6 +63,13 @@ EXIT_CODES: tuple[tuple[type[SsmGraphError], ExitCode], ...] = (
 )
 
 
+COMMANDS: Final = (
+    *(simulate, smooth, filter_command, online, compare),
+    *(inspect, convert, export, report),
+)
+"""In the order of the help."""
+
+
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of all commands."""
     parser = argparse.ArgumentParser(
@@ -72,7 +80,17 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=version("ssm-graph"))
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for module in (simulate, smooth, filter_command, online, compare, convert, export, report):
+    for module in (
+        simulate,
+        smooth,
+        filter_command,
+        online,
+        compare,
+        inspect,
+        convert,
+        export,
+        report,
+    ):
         module.add_parser(commands, epilog=EPILOG)
     return parser
 
