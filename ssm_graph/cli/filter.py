@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any, Final
+from typing import Final
 
 from rich.console import Console
 
 from ssm_graph.base.errors import ConfigError
-from ssm_graph.cli.options import add_command, method_lines
+from ssm_graph.cli.options import method_lines
 from ssm_graph.cli.run_mission import add_mission_arguments, run_mission
 from ssm_graph.mission.estimate import Estimate
 from ssm_graph.mission.mission import Mission
@@ -22,15 +22,9 @@ does. Without [initial] the start is aligned as for smooth: the whole mission ha
 """
 
 
-def add_parser(commands: Any, *, epilog: str) -> None:
-    """Declare the command and its options."""
-    parser = add_command(
-        commands,
-        "filter",
-        summary="filter a mission folder, or smooth it with a fixed lag",
-        description=f"{DESCRIPTION}\nmethods:\n{method_lines(RECURSIVE)}",
-        epilog=epilog,
-    )
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare what the command is for and its options."""
+    parser.description = f"{DESCRIPTION}\nmethods:\n{method_lines(RECURSIVE)}"
     add_mission_arguments(parser)
     parser.add_argument(
         "--method",

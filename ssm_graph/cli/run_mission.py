@@ -11,7 +11,8 @@ from typing import Any
 from rich.console import Console
 
 from ssm_graph.base.errors import ConfigError, DataError
-from ssm_graph.cli.options import number_option, say
+from ssm_graph.cli.options import number_option
+from ssm_graph.cli.terminal import say
 from ssm_graph.evaluation.errors import Metrics, evaluate, reference_from_gnss, withhold_gnss
 from ssm_graph.io.mission_folder.folder import CALIBRATION_NAME, read_mission
 from ssm_graph.io.mission_folder.toml import read_mission_toml

@@ -10,7 +10,8 @@ import numpy as np
 from rich.console import Console
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.cli.options import add_command, add_mission_output, choice_option, say
+from ssm_graph.cli.options import add_mission_output, choice_option
+from ssm_graph.cli.terminal import say
 from ssm_graph.io.mission_folder.folder import write_mission
 from ssm_graph.io.results.place import check_is_free
 from ssm_graph.sensors.dvl import MOST_BEAMS
@@ -26,16 +27,10 @@ from ssm_graph.simulation import (
 )
 
 
-def add_parser(commands: Any, *, epilog: str) -> None:
-    """Declare the command and its options."""
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare what the command is for and its options."""
     scenarios = "\n".join(f"  {name:9}{s.description}" for name, s in SCENARIOS.items())
-    parser = add_command(
-        commands,
-        "simulate",
-        summary="write a simulated mission folder with truth as reference",
-        description=f"Simulate a mission.\n\nscenarios:\n{scenarios}",
-        epilog=epilog,
-    )
+    parser.description = f"Simulate a mission.\n\nscenarios:\n{scenarios}"
     parser.add_argument("scenario", metavar="SCENARIO", choices=list(SCENARIOS))
     usual = "(default: that of the scenario)"
     choice_option(parser, "--grade", Grade, f"grade of the inertial sensors {usual}")

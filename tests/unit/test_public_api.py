@@ -53,10 +53,13 @@ def test_an_unknown_name_is_refused() -> None:
         _ = sg.smoothe  # type: ignore[attr-defined]
 
 
-def test_to_import_costs_nothing() -> None:
-    """No heavy module is loaded before a name is asked for."""
-    code = "import sys, ssm_graph; print({'gtsam', 'scipy', 'matplotlib'} & set(sys.modules))"
-    assert run("-c", code).strip() == "set()"
+@pytest.mark.parametrize("start", ["import ssm_graph", "from ssm_graph.cli.main import main"])
+def test_to_import_costs_nothing(start: str) -> None:
+    """No heavy module is loaded before a name is asked for, or a command given."""
+    words = "[] if 'main' not in globals() else [main(['--help'])]"
+    loaded = "{'gtsam', 'numpy', 'scipy', 'matplotlib', 'rich'} & set(sys.modules)"
+    code = f"import atexit, sys\natexit.register(lambda: print({loaded}))\n{start}\n{words}"
+    assert run("-c", code).splitlines()[-1] == "set()"
 
 
 def test_the_package_runs_as_a_module() -> None:
