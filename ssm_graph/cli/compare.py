@@ -81,15 +81,16 @@ study file (TOML):
              sigma_m_per_s = 0.1, vertical_sigma_m_per_s = 0.01, correlation_s = 21600.0}
   water_track = {noise_m_per_s = 0.01, beams = [0, 1, 2, 3], every = 10}  # pings off the water:
                                      # without bottom lock, and every 10th (0: none) with it
-"""
+
+methods:
+""" + method_lines(FAMILIES)
 
 
 FIGURES_NAME: Final = "figures"
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
-    """Declare what the command is for and its options."""
-    parser.description = f"{DESCRIPTION}\nmethods:\n{method_lines(FAMILIES)}"
+    """Declare the command's options."""
     parser.add_argument(
         "inputs", type=Path, nargs="+", metavar="INPUT", help="a study file, or mission folders"
     )

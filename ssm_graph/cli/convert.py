@@ -43,8 +43,7 @@ imu and dvl have to be there. What messages do not say, noise, lever arms and mo
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
-    """Declare what the command is for and its options."""
-    parser.description = DESCRIPTION
+    """Declare the command's options."""
     parser.add_argument("log", type=Path, metavar="LOG", help="file or folder to convert")
     add_mission_output(parser)
     _add_ros_options(parser)

@@ -16,15 +16,16 @@ from ssm_graph.mission.problem import ProblemConfig
 from ssm_graph.report.terminal.progress import ProgressDisplay
 from ssm_graph.study.methods import DEFAULT_FILTER, RECURSIVE, filter_mission, parse_filter
 
-DESCRIPTION: Final = """\
+DESCRIPTION: Final = f"""\
 Filter a recorded mission; writes trajectory.csv, beams.csv, summary.json and figure.png as smooth
 does. Without [initial] the start is aligned as for smooth: the whole mission has its say in that.
-"""
+
+methods:
+{method_lines(RECURSIVE)}"""
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
-    """Declare what the command is for and its options."""
-    parser.description = f"{DESCRIPTION}\nmethods:\n{method_lines(RECURSIVE)}"
+    """Declare the command's options."""
     add_mission_arguments(parser)
     parser.add_argument(
         "--method",

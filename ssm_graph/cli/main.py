@@ -81,11 +81,16 @@ def build_parser(words: Sequence[str]) -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     given = next((word for word in words if not word.startswith("-")), None)
     for name, summary in COMMANDS.items():
+        module = import_module(f"ssm_graph.cli.{name}") if name == given else None
         command = commands.add_parser(
-            name, help=summary, epilog=EPILOG, formatter_class=parser.formatter_class
+            name,
+            help=summary,
+            description=module and module.DESCRIPTION,
+            epilog=EPILOG,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-        if name == given:
-            import_module(f"ssm_graph.cli.{name}").declare(command)
+        if module:
+            module.declare(command)
     return parser
 
 

@@ -77,8 +77,7 @@ MAX_RATE: Final = "inertial samples/s of one source, of other kinds a tenth; mor
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
-    """Declare what the command is for and its options."""
-    parser.description = DESCRIPTION
+    """Declare the command's options."""
     parser.add_argument(
         "vehicle",
         type=Path,

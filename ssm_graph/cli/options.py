@@ -6,13 +6,15 @@ import argparse
 from collections.abc import Callable, Mapping
 from enum import Enum
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from factors.kernels import KernelChoice
 from factors.similarity import Kernel
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.io.mission_folder.folder import TableFormat
-from ssm_graph.study.methods import Family
+
+if TYPE_CHECKING:
+    from ssm_graph.study.methods import Family
 
 
 def number_option(

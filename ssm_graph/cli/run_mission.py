@@ -21,7 +21,6 @@ from ssm_graph.io.results.tables import write_results
 from ssm_graph.mission.estimate import Estimate
 from ssm_graph.mission.mission import Mission, Reference
 from ssm_graph.mission.problem import ProblemConfig
-from ssm_graph.report.mission.figure import save_figure
 from ssm_graph.report.mission.summary import summary_table
 from ssm_graph.report.terminal.progress import ProgressDisplay
 from ssm_graph.sensors.gnss import GnssLog
@@ -72,6 +71,8 @@ def run_mission(
         estimate, reference, metrics = _compare(estimate, mission, withheld)
 
         def draw(path: Path) -> None:
+            from ssm_graph.report.mission.figure import save_figure
+
             save_figure(path, estimate, reference, title=mission.name)
 
         write_results(

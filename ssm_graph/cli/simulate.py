@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from rich.console import Console
@@ -26,11 +26,12 @@ from ssm_graph.simulation import (
     simulate,
 )
 
+_SCENARIOS = "\n".join(f"  {name:9}{s.description}" for name, s in SCENARIOS.items())
+DESCRIPTION: Final = f"Simulate a mission.\n\nscenarios:\n{_SCENARIOS}"
+
 
 def declare(parser: argparse.ArgumentParser) -> None:
-    """Declare what the command is for and its options."""
-    scenarios = "\n".join(f"  {name:9}{s.description}" for name, s in SCENARIOS.items())
-    parser.description = f"Simulate a mission.\n\nscenarios:\n{scenarios}"
+    """Declare the command's options."""
     parser.add_argument("scenario", metavar="SCENARIO", choices=list(SCENARIOS))
     usual = "(default: that of the scenario)"
     choice_option(parser, "--grade", Grade, f"grade of the inertial sensors {usual}")

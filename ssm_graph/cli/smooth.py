@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
+from typing import Any, Final
 
 from rich.console import Console
 
@@ -42,14 +42,16 @@ CHOICES = {
 """Kernels by name; the last two come with schedules of their own."""
 
 
+DESCRIPTION: Final = (
+    "Smooth a recorded mission; writes trajectory.csv, beams.csv, summary.json and "
+    "figure.png. Where mission.toml gives prior sigmas of mounting, scale, lever arms, clocks "
+    "or depth offset, these are calibrated: calibration.toml has the lines to put in place. "
+    "Where pings are off the water (column water_track), its current is estimated."
+)
+
+
 def declare(parser: argparse.ArgumentParser) -> None:
-    """Declare what the command is for and its options."""
-    parser.description = (
-        "Smooth a recorded mission; writes trajectory.csv, beams.csv, summary.json and "
-        "figure.png. Where mission.toml gives prior sigmas of mounting, scale, lever arms, clocks "
-        "or depth offset, these are calibrated: calibration.toml has the lines to put in place. "
-        "Where pings are off the water (column water_track), its current is estimated."
-    )
+    """Declare the command's options."""
     add_mission_arguments(parser)
     _add_kernel_options(parser)
     _add_loop_options(parser)

@@ -16,14 +16,15 @@ from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.evaluation.errors import evaluate
 from ssm_graph.mission.estimate import OUTLIER_WEIGHT, BeamTable, Estimate, Iteration, Status
-from ssm_graph.report import ProgressDisplay, save_figure, summary_table
-from ssm_graph.report.mission.figure import draw_figure
+from ssm_graph.report.mission.figure import draw_figure, save_figure
+from ssm_graph.report.mission.summary import summary_table
 from ssm_graph.report.style import (
     broken_at_gaps,
     thinned,
     thinned_outliers_first,
     time_axis,
 )
+from ssm_graph.report.terminal.progress import ProgressDisplay
 from tests.estimate_fixture import NOTES, calibrated, make_run, with_current, with_faults
 
 N_PANELS = 14
