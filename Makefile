@@ -6,6 +6,8 @@ BIN := $(VENV)/bin
 OUT ?= out
 # Small matrices: BLAS threads only get in each other's way.
 export OPENBLAS_NUM_THREADS ?= 1
+# Where an image sets it, every process would compile everything anew.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test test-slow test-benchmarks format check clean
 
