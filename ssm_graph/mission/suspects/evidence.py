@@ -36,6 +36,7 @@ from ssm_graph.mission.suspects.regression import (
     robust_residual,
     twice_walk_covariance,
     walk_covariance,
+    whitened,
     whitener,
 )
 from ssm_graph.mission.suspects.track import (
@@ -140,11 +141,11 @@ class VelocityPart:
         return cls(tuple(windows), np.repeat(np.arange(len(sizes)), sizes), begin_s)
 
     def _whitened(self, error_i: Array) -> Array:
-        """Return errors (P, 3, ...) in axes that do not turn, level and whitened, (n, ...)."""
+        """Return errors (P, 3) in axes that do not turn, level and whitened (n,)."""
         found = []
         for window in self.windows:
-            error = np.einsum("aj,nj...->an...", window.axes, error_i[window.rows])
-            found += [np.tensordot(W, e, 1) for W, e in zip(window.whiten, error, strict=True)]
+            error = window.axes @ error_i[window.rows].T
+            found += [W @ e for W, e in zip(window.whiten, error, strict=True)]
         return np.concatenate(found)
 
     def depends_on(self, of: Hypothesis) -> tuple[object, ...]:
@@ -251,11 +252,12 @@ class FixPart:
         assert logs.mission.gnss is not None
         arm = arm_of(logs, of, logs.mission.gnss.lever_arm_b, at_s)[0]
         way = track.at(track.way, at_s) + arm
-        y = self.whiten @ (self.swapped if of.is_swapped else self.fix)
-        columns = [way, np.ones_like(way), track.at(track.drift, at_s)]
+        fix = self.swapped if of.is_swapped else self.fix
+        columns = [fix, way, np.ones_like(way), track.at(track.drift, at_s)]
         if of.jump_s > self.time_s[0]:
-            columns.append((self.time_s < of.jump_s).astype(float))
-        X = self.whiten @ np.stack(columns, axis=1)
+            columns.append((self.time_s < of.jump_s).astype(complex))
+        made = whitened(self.whiten, np.stack(columns, axis=1))
+        y, X = made[:, 0], made[:, 1:]
         known = track.covers(at_s)
         residual, c = robust_residual(y, X, known)
         size = max(abs(c[0]), TINY)
