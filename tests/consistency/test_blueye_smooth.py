@@ -76,12 +76,10 @@ def test_a_kernel_alone_does_not_find_a_small_bias() -> None:
     assert sg.evaluate(alone.trajectory, reference).rmse_horizontal_m > 2.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "largest_rms"),
-    [
-        ("log_auto_square_2025-05-07_14_55_13", 0.88),
-        pytest.param("log_grid_01_05_scaled", 0.91, marks=pytest.mark.slow),
-    ],
+    [("log_auto_square_2025-05-07_14_55_13", 0.88), ("log_grid_01_05_scaled", 0.91)],
 )
 def test_a_small_bias_of_one_beam_for_long_is_found(name: str, largest_rms: float) -> None:
     """0.15 m/s for 40 s after GNSS has ended: that is taken off the beam, the others are kept.
