@@ -39,6 +39,8 @@ COMMANDS: Final = {
     "online": "navigate live from instruments on sockets, or replay a mission as if live",
     "compare": "compare methods on many simulated or recorded missions",
     "convert": "turn a maker's log or a ROS bag into a mission folder",
+    "export": "write a result for QGIS, Google Earth, evo, xarray, Foxglove, multibeam software",
+    "report": "write a page about a result, for a browser and for print",
 }
 """Summary of every command; the module of its name is loaded when it is the one that is given."""
 
