@@ -83,7 +83,7 @@ def build_parser(words: Sequence[str]) -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     given = next((word for word in words if not word.startswith("-")), None)
     for name, summary in COMMANDS.items():
-        module = import_module(f"ssm_graph.cli.{name}") if name == given else None
+        module = import_module(f"ssm_graph.cli.{name.replace('-', '_')}") if name == given else None
         command = commands.add_parser(
             name,
             help=summary,
