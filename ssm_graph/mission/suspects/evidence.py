@@ -30,6 +30,7 @@ from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.times import Indices, is_inside
 from ssm_graph.mission.suspects.hypothesis import NOTHING, Hypothesis
+from ssm_graph.mission.suspects.motion import Velocities
 from ssm_graph.mission.suspects.regression import (
     NEUTRAL,
     TINY,
@@ -197,6 +198,13 @@ def _blocks(time_s: Array, components: int = 1) -> tuple[Indices, Array]:
     return np.tile(block, components), time_s[begins]
 
 
+def _walk(pings: Velocities, axis: int, share: float) -> float:
+    """Return what a track of pings walks along a body axis, m^2/s; ``share`` of its speed."""
+    speed_sq = float(np.mean(np.sum(pings.v_b**2, axis=1)))
+    spacing_s = float(np.median(np.diff(pings.time_s)))
+    return float(pings.sigma[axis] ** 2 * spacing_s + share**2 * speed_sq)
+
+
 @dataclass(frozen=True, eq=False)
 class FixPart:
     """Position fixes against the track."""
@@ -224,15 +232,13 @@ class FixPart:
         fix = frame.p_n_from_geodetic(gnss.lat, gnss.lon, gnss.height)[used]
         swapped = _swapped(gnss.lat[used], gnss.lon[used])
         sigma = np.sqrt(np.mean(gnss.sigma_enu[used, :2] ** 2, axis=1))
-        pings = logs.velocities
-        speed_sq = float(np.mean(np.sum(pings.v_b**2, axis=1)))
-        walk = pings.sigma[0] ** 2 * float(np.median(np.diff(pings.time_s))) + WALK**2 * speed_sq
+        walk = _walk(logs.velocities, 0, WALK)
         drift = gnss.calibration.drift
         white = sigma * drift.white
         if drift.sigma:
             walk += 2.0 * drift.sigma**2 / drift.correlation_s
         covariance = np.diag(white**2)
-        covariance += track_covariance(time_s[used], pings, logs.mission.imu.noise, walk)
+        covariance += track_covariance(time_s[used], logs.velocities, logs.mission.imu.noise, walk)
         return cls(
             time_s[used],
             fix[:, 0] + 1j * fix[:, 1],
@@ -297,11 +303,7 @@ class DepthPart:
         if len(used) < FEWEST:
             return None
         time_s, pings = log.time_s[used], logs.velocities
-        speed_sq = float(np.mean(np.sum(pings.v_b**2, axis=1)))
-        walk = (
-            pings.sigma[2] ** 2 * float(np.median(np.diff(pings.time_s)))
-            + (WALK / 3.0) ** 2 * speed_sq
-        )
+        walk = _walk(pings, 2, WALK / 3.0)
         covariance = np.diag(np.full(len(used), log.sigma**2))
         covariance += track_covariance(time_s, pings, logs.mission.imu.noise, walk)
         return cls(time_s, log.depth[used], whitener(covariance), *_blocks(time_s))
