@@ -11,14 +11,16 @@ WORKERS := -n 2 --dist worksteal
 # Where an image sets it, every process would compile everything anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-slow test-benchmarks format check clean
+.PHONY: demo test test-fast test-slow test-benchmarks format check clean
 
 demo: $(VENV)/.installed  ## simulate the default mission with failing beams, smooth it, show table and figure
 	$(BIN)/ssm-graph simulate demo --overwrite --out $(OUT)/demo/mission
 	$(BIN)/ssm-graph smooth $(OUT)/demo/mission --out $(OUT)/demo/result
 	@echo "figure: $(OUT)/demo/result/figure.png"
 
-test: check  ## format, lint, types and the fast tests
+test: check test-fast  ## format, lint, types and the fast tests
+
+test-fast: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest $(WORKERS)
 
 test-slow: $(VENV)/.installed-dev  ## the tests that take minutes

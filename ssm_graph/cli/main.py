@@ -87,7 +87,7 @@ def build_parser(words: Sequence[str]) -> argparse.ArgumentParser:
         command = commands.add_parser(
             name,
             help=summary,
-            description=module and module.DESCRIPTION,
+            description=module.DESCRIPTION if module else None,
             epilog=EPILOG,
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
