@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from ssm_graph.cli.options import add_command, say
+from ssm_graph.cli.terminal import say
 
 DESCRIPTION = """\
 Say what is at a path, by its content: format; of every sensor rows, rate, jitter, gaps, repeats and
@@ -23,15 +23,8 @@ PATH is a mission folder, a ROS bag, a maker's log, an instrument's own output, 
 """
 
 
-def add_parser(commands: Any, *, epilog: str) -> None:
-    """Declare the command and its options."""
-    parser = add_command(
-        commands,
-        "inspect",
-        summary="say what is in a file, folder, bag or mission, and whether it can be smoothed",
-        description=DESCRIPTION,
-        epilog=epilog,
-    )
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
     parser.add_argument("path", type=Path, metavar="PATH", help="what to look at")
     parser.add_argument("--figure", type=Path, metavar="FILE", help="draw it: .png, .pdf or .svg")
     parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
