@@ -85,7 +85,6 @@ def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
 def _run_patent(
     arguments: argparse.Namespace, drive: Drive, road_map: RoadMap, console: Console
 ) -> bool:
-
     area = road_map.within(drive.gnss.x_y, 110.0)
     found = locate_by_patent(drive, indices_of(area), seed=arguments.seed)
     x, y, yaw = found.refined
