@@ -38,6 +38,7 @@ COMMANDS: Final = {
     "filter": "filter a mission folder, or smooth it with a fixed lag",
     "online": "navigate live from instruments on sockets, or replay a mission as if live",
     "compare": "compare methods on many simulated or recorded missions",
+    "inspect": "say what is in a file, folder, bag or mission, and whether it can be smoothed",
     "convert": "turn a maker's log or a ROS bag into a mission folder",
     "export": "write a result for QGIS, Google Earth, evo, xarray, Foxglove, multibeam software",
     "report": "write a page about a result, for a browser and for print",

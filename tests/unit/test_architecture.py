@@ -50,6 +50,7 @@ MAY_IMPORT = {
     | {"smoothers", "filters", "graph", "mission", "engine", "simulation", "evaluation"}
     | {"factors", "io"},
     "report": VALUES | {"evaluation"},
+    "inspection": VALUES | {"io", "live", "mission", "report"},
     **dict.fromkeys(SYSTEMS, OF_SYSTEMS),
 }
 """Rooms that each room may import, itself apart; the rest may import anything."""

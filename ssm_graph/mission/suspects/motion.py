@@ -184,6 +184,9 @@ class Velocities:
 
 
 def is_enough(mission: Mission) -> bool:
-    """Return whether there is anything to compare."""
-    imu = mission.imu
-    return len(imu.time_s) > 2 and bool(imu.time_s[-1] - imu.start_s > 2.0 * LEVEL_S)
+    """Return whether there is anything to compare: pings beside inertial data, if not far off."""
+    imu, pings_s = mission.imu, mission.dvl.time_s
+    if len(imu.time_s) < 3 or len(pings_s) == 0:
+        return False
+    begin_s, end_s = max(imu.start_s, pings_s[0]), min(imu.time_s[-1], pings_s[-1])
+    return bool(imu.time_s[-1] - imu.start_s > 2.0 * LEVEL_S and end_s > begin_s)
