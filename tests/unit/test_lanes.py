@@ -54,7 +54,7 @@ def guardian_of(smoother: FixedLagSmoother) -> tuple[Guardian, Lanes]:
 
 def drawn_rows(rng: np.random.Generator) -> Iterator[SensorRows]:
     """Yield what DVL and GNSS measure at the truth, but for what lasts: that is in the lanes."""
-    for name, share, first, scale in (("DVL", 0.5, 6, 200.0), ("GNSS", 0.02, 3, 2.0)):
+    for name, share, first, scale in (("DVL", 0.125, 6, 200.0), ("GNSS", 0.02, 3, 2.0)):
         H = np.zeros((3, 15))
         H[np.arange(3), first + np.arange(3)] = scale
         white = math.sqrt(1.0 - share) * rng.standard_normal(3)
@@ -211,8 +211,7 @@ def test_the_threshold_keeps_the_rate_that_was_asked_for() -> None:
     """Fewer false alerts are bought with larger separations; numbers that mean nothing refused."""
     guardian, _ = guardian_of(after("calm")[1])
     sensors = after("calm")[1]._course.newest.window.sensors  # type: ignore[union-attr]
-    noise = vehicle_of(calm().mission).imu_noise
-    rarer = Guardian(sensors, noise, IntegrityConfig(false_alerts_per_h=1e-6))
+    rarer = Guardian(sensors, IntegrityConfig(false_alerts_per_h=1e-6))
     assert rarer.judge.threshold > guardian.judge.threshold > 35.0
     for wrong in ({"false_alerts_per_h": 0.0}, {"missed_detection": 0.7}, {"protection_m": -1.0}):
         with pytest.raises(ConfigError, match=next(iter(wrong))):
