@@ -177,7 +177,9 @@ def _deceived(runs: Sequence[Run]) -> list[str]:
 
 def _levels(runs: Sequence[Run]) -> list[str]:
     """Return shares inside the protection levels, while GOOD and while not, and the level."""
-    inside = [[1.0 - n / max(of, 1) for n, of in zip(r.outside, r.looks, strict=True)] for r in runs]
+    inside = [
+        [1.0 - n / max(of, 1) for n, of in zip(r.outside, r.looks, strict=True)] for r in runs
+    ]
     looks, outside = (np.sum([getattr(r, x) for r in runs], axis=0) for x in ("looks", "outside"))
     good, other = (100.0 - 100.0 * outside / np.maximum(looks, 1)).tolist()
     worst = 100.0 * np.min(inside, axis=0)
@@ -204,7 +206,13 @@ def main() -> None:
     cells = [(label, grade) for label in labels for grade in args.grades.split(",")]
     cases = [
         (
-            *(args.out, label, grade, seed, label == REALISTIC or (args.realistic and label in LIVE)),
+            *(
+                args.out,
+                label,
+                grade,
+                seed,
+                label == REALISTIC or (args.realistic and label in LIVE),
+            ),
             DURATION_S if label in LIVE else args.clean_s,
         )
         for label, grade in cells
@@ -216,7 +224,9 @@ def main() -> None:
         own = runs[i * len(seeds) : (i + 1) * len(seeds)]
         rows[label in LIVE].append((line if label in LIVE else clean_line)(label, grade, own))
     kind = "realistic" if args.realistic else "simple"
-    about = f"Seeds {seeds.start} to {seeds.stop - 1}; lies on {kind} instruments, {DURATION_S:g} s."
+    about = (
+        f"Seeds {seeds.start} to {seeds.stop - 1}; lies on {kind} instruments, {DURATION_S:g} s."
+    )
     lies = table(HEADER, rows[True]) if rows[True] else []
     fair = table(CLEAN_HEADER, rows[False]) if rows[False] else []
     report.write([f"{about} Without a lie {args.clean_s:g} s.", "", LEGEND, *lies, "", *fair])
