@@ -266,17 +266,19 @@ LIVE = {
         "bottom that drifts at 0.04 to 0.1 m/s",
         "GNSS 2 to 5 m off, 60 to 150 s",
         "GNSS pulled at 2 to 6 cm/s",
-        "gyro about the vertical reads 0 for 20 s",
         "depth frozen, 60 to 150 s",
         "GNSS steps by 1.5 m",
         "scale of the DVL jumps by 2 to 5 %",
         "two opposite beams, ±0.03 to 0.08 m/s, 100 to 200 s",
     )
 } | {
+    "gyro about the vertical reads 0 for 20 s": Lie(gyro_stuck, (*INERTIAL, "inertial")),
     "depth drifts at 1 to 3 cm/s": Lie(depth_drifts_fast, ("depth",)),
     "GNSS frozen": Lie(fixes_frozen, ("GNSS",), with_gnss=True),
     "water taken for the bottom, 0.2 to 0.4 m/s": Lie(water_later, ("DVL",)),
-    "bias of the vertical gyro jumps by 0.02 to 0.1 deg/s": Lie(gyro_jumps, INERTIAL),
+    "bias of the vertical gyro jumps by 0.02 to 0.1 deg/s": Lie(
+        gyro_jumps, (*INERTIAL, "inertial")
+    ),
     "compass 8 to 20 deg off, 60 to 150 s": Lie(compass_off, ("compass",), with_compass=True),
 }
 """What the estimator on the vehicle is judged by: what begins while it goes."""

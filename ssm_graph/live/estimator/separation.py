@@ -293,7 +293,8 @@ class Judge:
             age_s, since_s = time_s - lanes.begun_s[lane], time_s - fixed_s
             step = self.detectable * float(np.min(found.sigma[lane, 0 if name == DVL else 1]))
             if name == DVL:
-                unseen = step * max(float(lanes.begun_s[held]) - fixed_s, 0.0) * HORIZONTAL
+                begun_s = float(lanes.begun_s[held]) if is_led_on else fixed_s
+                unseen = step * max(begun_s - fixed_s, 0.0) * HORIZONTAL
                 grown = bound[MEASURE] + step * age_s[:, None]
                 older = bound[MEASURE] + step * since_s * HORIZONTAL * (since_s > LENGTHS_S[-1])
             else:
