@@ -291,15 +291,17 @@ class Judge:
                 worst = np.maximum(worst, bound[held]) if is_led_on else worst
                 continue
             age_s, since_s = time_s - lanes.begun_s[lane], time_s - fixed_s
-            step = self.detectable * float(np.min(found.sigma[lane, 0 if name == DVL else 1]))
+            sigmas = self.detectable * found.sigma[lane, 0 if name == DVL else 1]
+            step = float(sigmas.min())
             if name == DVL:
                 begun_s = float(lanes.begun_s[held]) if is_led_on else fixed_s
                 unseen = step * max(begun_s - fixed_s, 0.0) * HORIZONTAL
                 grown = bound[MEASURE] + step * age_s[:, None]
                 older = bound[MEASURE] + step * since_s * HORIZONTAL * (since_s > LENGTHS_S[-1])
             else:
-                unseen = step * (VERTICAL if name == DEPTH else np.ones(2))
-                older = bound[MEASURE] + unseen
+                axis = VERTICAL if name == DEPTH else np.ones(2)
+                # A slow pull shows to the longest lane last.
+                unseen, older = float(sigmas.max()) * axis, bound[MEASURE] + step * axis
                 grown = np.tile(older, (len(lane), 1))
             if is_led_on:
                 worst = np.maximum(worst, bound[held] + unseen)
