@@ -135,8 +135,8 @@ ping interval and compared with the truth at its own time. Inside: share of the 
 at which the error is within three of its sigmas, of the worst axis, and mean of the nine; wanted
 {WANTED:.0%} or more. Outside: longest unbroken stretch of good health with any axis outside three
 sigmas. Beyond: how long the health was good with any axis beyond five. Level: the protection level;
-share of the good time that the position is inside it, horizontally and vertically. Memory: growth of the
-resident size from {WARM_H:g} h on, by least squares.
+share of the good time that the position is inside it, horizontally and vertically. Memory: growth
+of the resident size from {WARM_H:g} h on, by least squares.
 """
 
 
