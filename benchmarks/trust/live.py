@@ -1,7 +1,7 @@
 """Lies that last, on the vehicle: never GOOD for long while the answer is beyond its sigmas.
 
 ``python -m benchmarks.trust.live --keep`` (hours; a quick look is ``--seeds 2 --grades tactical``).
-Missions of 400 s, DVL 5 mm/s; what lies, when and by how much is drawn for every seed. What was run
+DVL 5 mm/s; what lies, when and by how much is drawn for every seed. What was run
 before, by the same code, is taken from ``--out``.
 """
 
@@ -177,14 +177,11 @@ def _deceived(runs: Sequence[Run]) -> list[str]:
 
 def _levels(runs: Sequence[Run]) -> list[str]:
     """Return shares inside the protection levels, while GOOD and while not, and the level."""
-    inside = [
-        [1.0 - n / max(of, 1) for n, of in zip(r.outside, r.looks, strict=True)] for r in runs
-    ]
-    looks, outside = (np.sum([getattr(r, x) for r in runs], axis=0) for x in ("looks", "outside"))
-    good, other = (100.0 - 100.0 * outside / np.maximum(looks, 1)).tolist()
-    worst = 100.0 * np.min(inside, axis=0)
+    looks, outside = np.array([run.looks for run in runs]), np.array([run.outside for run in runs])
+    inside = 100.0 * (1.0 - outside / np.maximum(looks, 1))
+    good, other = 100.0 * (1.0 - outside.sum(axis=0) / np.maximum(looks.sum(axis=0), 1))
     level = np.nanmedian([run.protection_m for run in runs])
-    return [f"{good:.2f}, {worst[0]:.2f}", f"{other:.2f}", number_text(float(level))]
+    return [f"{good:.2f}, {inside[:, 0].min():.2f}", f"{other:.2f}", number_text(float(level))]
 
 
 def main() -> None:
@@ -196,6 +193,7 @@ def main() -> None:
         Option("--grades", "navigation,tactical", "names with commas between them"),
         Option("--only", "", "lies, or missions without, whose names have this in them"),
         Option("--realistic", False, "lies on realistic instruments, as stated by their preset"),
+        Option("--lie-s", DURATION_S, "length of missions with a lie, s"),
         Option("--clean-s", 1200.0, "length of missions without a lie, s"),
         Option("--jobs", 1, "missions at a time"),
     )
@@ -204,29 +202,16 @@ def main() -> None:
     seeds = range(args.first_seed, args.first_seed + args.seeds)
     labels = [label for label in (*LIVE, CLEAN, REALISTIC) if args.only in label]
     cells = [(label, grade) for label in labels for grade in args.grades.split(",")]
-    cases = [
-        (
-            *(
-                args.out,
-                label,
-                grade,
-                seed,
-                label == REALISTIC or (args.realistic and label in LIVE),
-            ),
-            DURATION_S if label in LIVE else args.clean_s,
-        )
-        for label, grade in cells
-        for seed in seeds
-    ]
+    kinds = dict.fromkeys(LIVE, (args.realistic, args.lie_s))
+    kinds |= {CLEAN: (False, args.clean_s), REALISTIC: (True, args.clean_s)}
+    cases = [(args.out, *cell, seed, *kinds[cell[0]]) for cell in cells for seed in seeds]
     runs = side_by_side(run_once, cases, args.jobs)
     rows: dict[bool, list[list[str]]] = {True: [], False: []}
     for i, (label, grade) in enumerate(cells):
         own = runs[i * len(seeds) : (i + 1) * len(seeds)]
         rows[label in LIVE].append((line if label in LIVE else clean_line)(label, grade, own))
     kind = "realistic" if args.realistic else "simple"
-    about = (
-        f"Seeds {seeds.start} to {seeds.stop - 1}; lies on {kind} instruments, {DURATION_S:g} s."
-    )
+    about = f"Seeds {seeds.start} to {seeds[-1]}; lies on {kind} instruments, {args.lie_s:g} s."
     lies = table(HEADER, rows[True]) if rows[True] else []
     fair = table(CLEAN_HEADER, rows[False]) if rows[False] else []
     report.write([f"{about} Without a lie {args.clean_s:g} s.", "", LEGEND, *lies, "", *fair])
