@@ -215,7 +215,7 @@ def beyond_s(run: Soaked) -> float:
 def inside_level(run: Soaked) -> float:
     """Return the share of the good time that both errors of position are inside their levels."""
     off = np.column_stack([np.hypot(run.error[:, 0], run.error[:, 1]), np.abs(run.error[:, 2])])
-    is_inside = (off < run.protection).all(axis=1)
+    is_inside = np.asarray((off < run.protection).all(axis=1))
     return float(is_inside[run.is_good].mean()) if run.is_good.any() else 0.0
 
 

@@ -19,7 +19,7 @@ from benchmarks.online.stream import run_stream
 from benchmarks.processes import side_by_side
 from benchmarks.report import Option, Report, number_text, table
 from benchmarks.soak.stream import GOOD, errors_of, longest_run
-from benchmarks.trust.lies import INERTIAL, LIVE
+from benchmarks.trust.lies import LIVE
 from benchmarks.trust.run import BEYOND, CLEAN, DURATION_S, REALISTIC, mission_of
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.io.raw_log.rows import messages_of
@@ -71,7 +71,8 @@ def run(label: str, grade: str, seed: int, realistic: bool, duration_s: float = 
     sim = mission_of(
         *(grade, seed), with_gnss=with_gnss, realistic=realistic, aids=aids, duration_s=duration_s
     )
-    mission, begin_s, words = sim.mission, np.inf, INERTIAL
+    mission, begin_s = sim.mission, np.inf
+    words: tuple[str, ...] = ()
     if lie is not None:
         drawn, words = lie.draw(rng, duration_s), lie.named
         faults = drawn if isinstance(drawn, tuple) else (drawn,)
@@ -96,7 +97,7 @@ def run(label: str, grade: str, seed: int, realistic: bool, duration_s: float = 
         z=float(z[is_good].max(initial=0.0)),
         alert_s=_first(time_s[~is_good], begin_s),
         needed_s=_first(time_s[z > BEYOND], begin_s),
-        is_named=bool(re.search("|".join(words), said)),
+        is_named=any(word in said for word in words),
         good_before=_share(is_good[time_s < begin_s]),
         good=_share(is_good),
         looks=(int(is_good.sum()), int((~is_good).sum())),
@@ -194,13 +195,14 @@ def main() -> None:
         Option("--only", "", "lies, or missions without, whose names have this in them"),
         Option("--realistic", False, "lies on realistic instruments, as stated by their preset"),
         Option("--lie-s", DURATION_S, "length of missions with a lie, s"),
-        Option("--clean-s", 1200.0, "length of missions without a lie, s"),
+        Option("--clean-s", 1200.0, "length of missions without a lie, s; 0 for none"),
         Option("--jobs", 1, "missions at a time"),
     )
     args = report.args
     args.out.mkdir(parents=True, exist_ok=True)
     seeds = range(args.first_seed, args.first_seed + args.seeds)
-    labels = [label for label in (*LIVE, CLEAN, REALISTIC) if args.only in label]
+    clean = (CLEAN, REALISTIC) if args.clean_s > 0.0 else ()
+    labels = [label for label in (*LIVE, *clean) if args.only in label]
     cells = [(label, grade) for label in labels for grade in args.grades.split(",")]
     kinds = dict.fromkeys(LIVE, (args.realistic, args.lie_s))
     kinds |= {CLEAN: (False, args.clean_s), REALISTIC: (True, args.clean_s)}
@@ -214,7 +216,9 @@ def main() -> None:
     about = f"Seeds {seeds.start} to {seeds[-1]}; lies on {kind} instruments, {args.lie_s:g} s."
     lies = table(HEADER, rows[True]) if rows[True] else []
     fair = table(CLEAN_HEADER, rows[False]) if rows[False] else []
-    report.write([f"{about} Without a lie {args.clean_s:g} s.", "", LEGEND, *lies, "", *fair])
+    if fair:
+        about += f" Without a lie {args.clean_s:g} s."
+    report.write([about, "", LEGEND, *lies, "", *fair])
 
 
 if __name__ == "__main__":

@@ -143,7 +143,7 @@ class LaneBank:
         self._lasting: dict[str, slice] = {}
         shares, end = [], sensors.state_dim
         for name, suspect in SUSPECT_OF.items():
-            if name in dims and DRIFTS.get(name) not in sensors.extras:
+            if name in dims and DRIFTS.get(name, "") not in sensors.extras:
                 self._lasting[name] = slice(end, end + dims[name])
                 end += dims[name]
                 shares += [LASTING.get(suspect, LASTING_OF_OTHERS)] * dims[name]
