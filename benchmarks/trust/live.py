@@ -21,11 +21,11 @@ from benchmarks.report import Option, Report, number_text, table
 from benchmarks.soak.stream import GOOD, errors_of, longest_run
 from benchmarks.trust.lies import LIVE
 from benchmarks.trust.run import BEYOND, CLEAN, DURATION_S, REALISTIC, mission_of
+from ssm_graph.base.code_version import code_version
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator import FixedLagSmoother, IntegrityConfig
 from ssm_graph.simulation import AidSettings, CompassSettings, with_faults
-from ssm_graph.study.jobs import code_version
 
 LOOK_S = 1.0
 MOST_S = 10.0
