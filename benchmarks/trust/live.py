@@ -7,17 +7,13 @@ before, by the same code, is taken from ``--out``.
 
 from __future__ import annotations
 
-import json
-import re
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from benchmarks.online.stream import run_stream
-from benchmarks.processes import side_by_side
-from benchmarks.report import Option, Report, number_text, table
+from benchmarks.report import Option, Report, note, number_text, table
 from benchmarks.soak.stream import GOOD, errors_of, longest_run
 from benchmarks.trust.lies import LIVE
 from benchmarks.trust.run import BEYOND, CLEAN, DURATION_S, REALISTIC, mission_of
@@ -26,6 +22,7 @@ from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator import FixedLagSmoother, IntegrityConfig
 from ssm_graph.simulation import AidSettings, CompassSettings, with_faults
+from ssm_graph.study.ledger import Key, Ledger, Row, run_trials
 
 LOOK_S = 1.0
 MOST_S = 10.0
@@ -62,8 +59,9 @@ class Run(NamedTuple):
         return self.deceived_s <= MOST_S
 
 
-def run(label: str, grade: str, seed: int, realistic: bool, duration_s: float = DURATION_S) -> Run:
-    """Stream one mission with its lie."""
+def run(key: Key) -> Row:
+    """Stream one mission of a label, grade, seed, kind of instruments and length, s."""
+    label, grade, seed, realistic, duration_s = _settings(key)
     rng = np.random.default_rng([seed, *label.encode()])
     lie = LIVE.get(label)
     with_gnss = seed % 2 == 0 if lie is None or lie.with_gnss is None else lie.with_gnss
@@ -92,7 +90,7 @@ def run(label: str, grade: str, seed: int, realistic: bool, duration_s: float = 
     level = stream.answers.column("protection")
     is_outside = (off > level).any(axis=1)
     said = " ".join(event.text for event in stream.events if event.time_s >= begin_s)
-    return Run(
+    made = Run(
         deceived_s=longest_run(is_good & (z > BEYOND), LOOK_S)[0],
         z=float(z[is_good].max(initial=0.0)),
         alert_s=_first(time_s[~is_good], begin_s),
@@ -104,6 +102,12 @@ def run(label: str, grade: str, seed: int, realistic: bool, duration_s: float = 
         outside=(int((is_outside & is_good).sum()), int((is_outside & ~is_good).sum())),
         protection_m=float(np.median(level[is_good, 0])) if is_good.any() else np.nan,
     )
+    return made._asdict()
+
+
+def _settings(key: Key) -> tuple[str, str, int, bool, float]:
+    label, grade, seed, realistic, duration_s = key
+    return str(label), str(grade), int(seed), bool(realistic), float(duration_s)
 
 
 def _first(time_s: np.ndarray[Any, np.dtype[np.float64]], begin_s: float) -> float:
@@ -114,21 +118,6 @@ def _first(time_s: np.ndarray[Any, np.dtype[np.float64]], begin_s: float) -> flo
 
 def _share(is_true: np.ndarray[Any, np.dtype[np.bool_]]) -> float:
     return float(is_true.mean()) if len(is_true) else np.nan
-
-
-def run_once(
-    out: Path, label: str, grade: str, seed: int, realistic: bool, duration_s: float
-) -> Run:
-    """Return the run of a mission, kept in a folder as soon as it is done."""
-    key = [code_version(), label, grade, seed, realistic, duration_s]
-    file = out / (re.sub(r"[^\w.+-]+", "_", "_".join(map(str, key))) + ".json")
-    if not file.exists():
-        unfinished = file.with_suffix(".part")
-        made = run(label, grade, seed, realistic, duration_s)
-        unfinished.write_text(json.dumps(made._asdict()), encoding="utf-8")
-        unfinished.replace(file)
-    known = json.loads(file.read_text(encoding="utf-8"))
-    return Run(**known | {name: tuple(known[name]) for name in ("looks", "outside")})
 
 
 HEADER: tuple[str, ...] = ("what lies", "grade", f"GOOD beyond 5 sigma > {MOST_S:g} s")
@@ -185,6 +174,10 @@ def _levels(runs: Sequence[Run]) -> list[str]:
     return [f"{good:.2f}, {inside[:, 0].min():.2f}", f"{other:.2f}", number_text(float(level))]
 
 
+def _tell(number: int, of: int, key: Key) -> None:
+    note(f"{number} of {of}: {key} done")
+
+
 def main() -> None:
     """Run all missions and write the tables."""
     report = Report(
@@ -199,15 +192,16 @@ def main() -> None:
         Option("--jobs", 1, "missions at a time"),
     )
     args = report.args
-    args.out.mkdir(parents=True, exist_ok=True)
     seeds = range(args.first_seed, args.first_seed + args.seeds)
     clean = (CLEAN, REALISTIC) if args.clean_s > 0.0 else ()
     labels = [label for label in (*LIVE, *clean) if args.only in label]
     cells = [(label, grade) for label in labels for grade in args.grades.split(",")]
     kinds = dict.fromkeys(LIVE, (args.realistic, args.lie_s))
     kinds |= {CLEAN: (False, args.clean_s), REALISTIC: (True, args.clean_s)}
-    cases = [(args.out, *cell, seed, *kinds[cell[0]]) for cell in cells for seed in seeds]
-    runs = side_by_side(run_once, cases, args.jobs)
+    keys: list[Key] = [(*cell, seed, *kinds[cell[0]]) for cell in cells for seed in seeds]
+    ledger = Ledger(args.out / f"{code_version()}.jsonl", {"benchmark": "trust.live"})
+    made = run_trials(run, keys, ledger, n_jobs=args.jobs, on_progress=_tell)
+    runs = [Run(**made[key]) for key in keys]
     rows: dict[bool, list[list[str]]] = {True: [], False: []}
     for i, (label, grade) in enumerate(cells):
         own = runs[i * len(seeds) : (i + 1) * len(seeds)]
