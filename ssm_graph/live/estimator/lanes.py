@@ -61,6 +61,9 @@ DRIFTS: Final = {BEAMS: DVL_DRIFT, Fixes.name: GNSS_DRIFT, DepthMeans.name: DEPT
 """What a stated drift is called, by the name of the sensor's rows."""
 MISFIT_S: Final = 10.0
 """A misfit is forgotten within so much."""
+BEGUN_ANEW: Final = 1e4
+"""Misfit of a measure that was just begun anew: it fits whatever it was begun with, which may be
+what lies, and so refutes no lane until this is forgotten, about a minute."""
 LEAST_WEIGHT: Final = 1e-3
 MEMORY_S: Final = 10.0
 """Time constant of the low-passed innovation ratios."""
@@ -203,7 +206,7 @@ class LaneBank:
         is_nested = np.zeros(len(deviation))
         is_nested[MEASURE] = 1.0
         misfit = lanes.misfit.copy()
-        misfit[MEASURE] = 0.0
+        misfit[MEASURE] = BEGUN_ANEW
         lanes = lanes._replace(
             deviation=deviation, covariance=covariance, misfit=misfit, is_nested=is_nested
         )
