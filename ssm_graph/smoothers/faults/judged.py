@@ -129,10 +129,17 @@ class Fault:
     """By which that exceeds its charge"""
     rivals: tuple[Fault, ...] = ()
     """Others that explain the data as well"""
+    onsets: tuple[Fault, ...] = ()
+    """The same ramp from other times on, at which it may have begun"""
     sizes: Array | None = None
     """Of its numbers, taken off the rows already; None for what is new"""
     cost_m: float = 0.0
     """By how much the horizontal position moves between the explanations, m"""
+
+    @property
+    def is_allowed_for(self) -> bool:
+        """Whether it is too little to be a fault, but may be one."""
+        return self.hypothesis.is_usual and self.merit <= 0.0
 
     @property
     def n_constants(self) -> int:

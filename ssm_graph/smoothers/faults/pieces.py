@@ -71,8 +71,12 @@ def parts_of(faults: Iterable[Fault], piece: Piece, keyframe_s: Array) -> list[F
             constant, rate = np.split(sizes, 2)
             since = (keyframe_s[begin] - keyframe_s[fault.begin]) / TREND_S
             sizes = np.concatenate([constant + since * rate, rate])
-        rivals = tuple(parts_of(fault.rivals, piece, keyframe_s))
-        found.append(replace(fault, begin=begin, end=end, sizes=sizes, rivals=rivals))
+        rivals, onsets = (
+            tuple(parts_of(of, piece, keyframe_s)) for of in (fault.rivals, fault.onsets)
+        )
+        found.append(
+            replace(fault, begin=begin, end=end, sizes=sizes, rivals=rivals, onsets=onsets)
+        )
     return found
 
 

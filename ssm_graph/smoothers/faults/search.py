@@ -16,7 +16,13 @@ import numpy as np
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.stepwise import Steps
 from ssm_graph.smoothers.faults.columns import IMU, Channels
-from ssm_graph.smoothers.faults.hypotheses import Course, Hypothesis, hypotheses_of
+from ssm_graph.smoothers.faults.hypotheses import (
+    ALLOWED,
+    ALLOWED_M,
+    Course,
+    Hypothesis,
+    hypotheses_of,
+)
 from ssm_graph.smoothers.faults.judged import Candidate, Fault, Grid, Judge, Judged
 
 FINE_S = 1.0
@@ -33,6 +39,8 @@ JOLT = 22.0
 in 400 places is above it once in 50 missions."""
 INERTIAL_SHARE = 0.5
 """Of the merit of an inertial fault, from which on another sensor's is taken instead."""
+SAME_ONSET = 4.0
+"""Chi-square by which another onset of a ramp may be worse, two sigmas, and is freed, too."""
 SAME_STRETCH = 0.5
 SAME_ANSWER_SIGMAS = 1.0
 """Explanations whose answers are nowhere further apart are one."""
@@ -104,7 +112,7 @@ class Look:
         if first.chi_sq > HINT * first.hypothesis.charge(first.n_numbers()):
             hints.append(fault_of(first, left))
         if not hints:
-            return None
+            return allowed_in(left, self.hypotheses)
         fine = self._judge.on(self._grid(with_rivals(found), around=hints))
         yield self._work
         left = fine.with_freed(with_rivals(found))
@@ -112,8 +120,9 @@ class Look:
         yield self._work
         chosen = chosen_of(ranked)
         if chosen is None:
-            return None
+            return allowed_in(left, self.hypotheses)
         best = fault_of(chosen, left)
+        best = replace(best, onsets=onsets_of(best, left))
         rivals = rivals_of(best, ranked, left, margin=self._settings.margin)
         return (yield from self._against_steps(best, rivals, fine, found))
 
@@ -154,8 +163,12 @@ class Look:
             ranked = left.best_of(self.hypotheses, near=fault)
             yield self._work
             chosen = chosen_of(ranked)
-            if chosen is not None:
+            if chosen is None and fault.hypothesis.is_usual:
+                allowed = allowed_in(left, self.hypotheses)
+                kept.extend([] if allowed is None else [allowed])
+            elif chosen is not None:
                 best = fault_of(chosen, left)
+                best = replace(best, onsets=onsets_of(best, left))
                 rivals = rivals_of(best, ranked, left, margin=self._settings.margin)
                 kept.append((yield from self._against_steps(best, rivals, fine, others)))
         return kept
@@ -217,6 +230,22 @@ def chosen_of(ranked: Sequence[Candidate]) -> Candidate | None:
     return other if other.merit > INERTIAL_SHARE * best.merit else best
 
 
+def allowed_in(judged: Judged, hypotheses: Iterable[Hypothesis]) -> Fault | None:
+    """Return what healthy instruments, too, are a little off by, where the data hint at it."""
+    for one in hypotheses:
+        if not one.is_usual:
+            continue
+        chi_sq = judged.table(one)[0][:-1, -1]
+        begin = int(np.argmax(chi_sq))
+        if chi_sq[begin] > ALLOWED:
+            edges, sigma = judged.grid.edges, np.full_like(one.sigma, ALLOWED_M)
+            fault = Fault(
+                replace(one, sigma=sigma), int(edges[begin]), int(edges[-1]), float(chi_sq[begin])
+            )
+            return replace(fault, onsets=onsets_of(fault, judged))
+    return None
+
+
 def rivals_of(
     best: Fault, ranked: Sequence[Candidate], judged: Judged, *, margin: float
 ) -> list[Fault]:
@@ -229,7 +258,25 @@ def rivals_of(
     for one in found:
         if not is_part_of(one, best):
             by_sensor.setdefault((one.hypothesis.sensor, overlap(one, best) > SAME_STRETCH), one)
-    return list(by_sensor.values())
+    return [replace(one, onsets=onsets_of(one, judged)) for one in by_sensor.values()]
+
+
+def onsets_of(ramp: Fault, judged: Judged) -> tuple[Fault, ...]:
+    """Return a ramp with the first, the likeliest and the last onset that explain the data.
+
+    Only those a block or more away from others count; of what is no ramp there are none.
+    """
+    if ramp.hypothesis.course is not Course.RAMP:
+        return ()
+    grid = judged.grid
+    edge_s = np.append(grid.middle_s - 0.5 * grid.length_s, np.inf)
+    chi_sq = judged.table(ramp.hypothesis)[0][:, np.searchsorted(grid.edges, ramp.end)]
+    as_good = np.flatnonzero(chi_sq > chi_sq.max() - SAME_ONSET)
+    known = [int(np.searchsorted(grid.edges, ramp.begin))]
+    for at in (as_good[0], int(np.argmax(chi_sq)), as_good[-1]):
+        if np.min(np.abs(edge_s[known] - edge_s[at])) >= grid.block_s:
+            known.append(int(at))
+    return tuple(replace(ramp, begin=int(grid.edges[at])) for at in known[1:])
 
 
 def is_part_of(one: Fault, other: Fault) -> bool:
@@ -248,5 +295,9 @@ def overlap(one: Fault, other: Fault) -> float:
 
 
 def with_rivals(found: Iterable[Fault]) -> list[Fault]:
-    """Return all that is to be freed: what was found, each with its rivals behind it."""
-    return [one for fault in found for one in (fault, *fault.rivals)]
+    """Return all that is to be freed: what was found, each with its rivals behind it.
+
+    Behind a ramp comes the same from other times on.
+    """
+    each = (one for fault in found for one in (fault, *fault.rivals))
+    return [ramp for one in each for ramp in (one, *one.onsets)]
