@@ -211,8 +211,8 @@ def inertial_fit(rows: Array, solution: ChainSolution) -> InertialFit:
 
     Of the whitened errors most is taken up by the states: hardly anything else sees a keyframe's
     biases. With ``A_i d_i + A_j d_j = b + noise`` and the posterior covariance ``P`` of both
-    keyframes the expected square is ``15 - tr(A P A')``: what the chi-square of the interval has for
-    degrees of freedom.
+    keyframes the expected square is ``15 - tr(A P A')``: the degrees of freedom of the interval's
+    chi-square.
     """
     n = rows.shape[1]
     A_i, A_j = rows[:, :STATE_DIM, :STATE_DIM], rows[:, :STATE_DIM, n : n + STATE_DIM]

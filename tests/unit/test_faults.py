@@ -137,6 +137,23 @@ def test_what_cannot_be_decided_is_covered_and_said(grade: Grade) -> None:
     assert (estimate.status is Status.SUSPECT) == any(one.is_suspect for one in estimate.faults)
 
 
+@pytest.mark.parametrize(
+    ("rate", "treatment"), [(0.004, Treatment.FREED), (0.001, Treatment.ALLOWED)]
+)
+def test_a_slow_drift_of_depth_is_covered_whenever_it_began(
+    rate: float, treatment: Treatment
+) -> None:
+    """In mm/s: large enough to be told, and too small; neither makes a right answer suspect."""
+    sim = simulated(duration_s=200.0, dvl=QUIET, seed=3)
+    fault = Fault(sensor=Sensor.DEPTH, shape=FaultShape.RAMP, start_s=40.0, size=rate)
+    broken = with_faults(sim.mission, (fault,), truth=sim.truth_at)
+    estimate = smoothed(replace(sim, mission=broken.mission))
+    (found,) = estimate.faults
+    assert (found.sensor, found.treatment) == ("depth", treatment)
+    assert estimate.status is Status.CONVERGED
+    assert errors(estimate, sim)[1] < 4.0
+
+
 def test_nothing_is_found_with_realistic_instruments() -> None:
     """Slow noise, heavy tails, scale factors and misalignments are nobody's fault."""
     for seed in (1, 2):

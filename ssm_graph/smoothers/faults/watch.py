@@ -35,7 +35,7 @@ from ssm_graph.smoothers.faults.columns import (
 from ssm_graph.smoothers.faults.hypotheses import Course
 from ssm_graph.smoothers.faults.judged import Fault, Judge
 from ssm_graph.smoothers.faults.nuisances import Nuisances
-from ssm_graph.smoothers.faults.pieces import find_steps
+from ssm_graph.smoothers.faults.pieces import PieceSearch
 from ssm_graph.smoothers.faults.search import FaultSearch, with_rivals
 from ssm_graph.smoothers.faults.windows import noisier_than_stated
 
@@ -59,7 +59,7 @@ class FaultWatch:
 
     def __init__(self, problem: Problem, search: FaultSearch | None) -> None:
         """Take the problem as the smoother solves it; without a search nothing is ever found."""
-        self._problem, self._search = problem, search
+        self._problem, self._search = problem, None if search is None else PieceSearch(search)
         self._bare = None if search is None else GraphLinearizer(problem)
         self._found: list[Fault] = []
         self._gone: list[Fault] = []
@@ -102,7 +102,7 @@ class FaultWatch:
         channels = Channels(linear)
         judge = Judge(linear, channels, Nuisances(linear, channels))
         yield 0.02 * self._problem.n_keyframes
-        found = yield from find_steps(judge, channels, self._search, self._sized(states))
+        found = yield from self._search.find_steps(judge, channels, self._sized(states))
         is_same = same_faults(found, self._found, self._problem.keyframe_s)
         self._is_done = is_same or self._n_looks >= MOST_LOOKS
         if is_same:
