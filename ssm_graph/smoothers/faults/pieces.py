@@ -89,17 +89,28 @@ def parts_of(faults: Iterable[Fault], piece: Piece, keyframe_s: Array) -> list[F
         begin, end = max(fault.begin, piece.begin), min(fault.end, piece.end)
         if begin >= end:
             continue
-        sizes = fault.sizes
-        if sizes is not None and fault.hypothesis.course is Course.TREND:
+        hypothesis, sizes = fault.hypothesis, fault.sizes
+        if begin > fault.begin and hypothesis.course is Course.RAMP:
+            hypothesis = replace(hypothesis, course=Course.TREND)
+        if sizes is not None and hypothesis.course is Course.TREND:
             # The rate counts from the begin of the stretch on.
-            constant, rate = np.split(sizes, 2)
+            rate = sizes[-hypothesis.combined.shape[1] :]
+            constant = sizes[: -len(rate)] if len(sizes) > len(rate) else np.zeros_like(rate)
             since = (keyframe_s[begin] - keyframe_s[fault.begin]) / TREND_S
             sizes = np.concatenate([constant + since * rate, rate])
         rivals, onsets = (
             tuple(parts_of(of, piece, keyframe_s)) for of in (fault.rivals, fault.onsets)
         )
         found.append(
-            replace(fault, begin=begin, end=end, sizes=sizes, rivals=rivals, onsets=onsets)
+            replace(
+                fault,
+                hypothesis=hypothesis,
+                begin=begin,
+                end=end,
+                sizes=sizes,
+                rivals=rivals,
+                onsets=onsets,
+            )
         )
     return found
 
@@ -143,7 +154,8 @@ def joined(one: Fault, later: Fault, seam: int) -> Fault:
             first, second = (rival, same) if stronger is one else (same, rival)
             rival = joined(first, second, seam)
         rivals.append(rival)
-    return replace(stronger, begin=begin, end=end, rivals=tuple(rivals))
+    onsets = tuple(replace(ramp, end=end) for ramp in stronger.onsets if ramp.begin < end)
+    return replace(stronger, begin=begin, end=end, rivals=tuple(rivals), onsets=onsets)
 
 
 def _until(faults: Iterable[Fault], seam: int, piece_end: int) -> Iterator[Fault]:
@@ -170,6 +182,7 @@ def _same_of(faults: Iterable[Fault], other: Fault) -> Fault | None:
 
 def _is_same(one: Fault, other: Fault) -> bool:
     a, b = one.hypothesis, other.hypothesis
-    is_like = (a.channel, a.course) == (b.channel, b.course)
+    # Of a ramp that began in the piece before there is a trend here.
+    is_like = a.channel == b.channel and (a.course is b.course or (a.has_rate and b.has_rate))
     is_over_same = max(one.begin, other.begin) < min(one.end, other.end)
     return is_over_same and is_like and np.array_equal(a.combined, b.combined)

@@ -112,7 +112,7 @@ class Look:
         if first.chi_sq > HINT * first.hypothesis.charge(first.n_numbers()):
             hints.append(fault_of(first, left))
         if not hints:
-            return allowed_in(left, self.hypotheses)
+            return self._allowed_in(left)
         fine = self._judge.on(self._grid(with_rivals(found), around=hints))
         yield self._work
         left = fine.with_freed(with_rivals(found))
@@ -120,7 +120,7 @@ class Look:
         yield self._work
         chosen = chosen_of(ranked)
         if chosen is None:
-            return allowed_in(left, self.hypotheses)
+            return self._allowed_in(left)
         best = fault_of(chosen, left)
         best = replace(best, onsets=onsets_of(best, left))
         rivals = rivals_of(best, ranked, left, margin=self._settings.margin)
@@ -164,7 +164,7 @@ class Look:
             yield self._work
             chosen = chosen_of(ranked)
             if chosen is None and fault.hypothesis.is_usual:
-                allowed = allowed_in(left, self.hypotheses)
+                allowed = self._allowed_in(left)
                 kept.extend([] if allowed is None else [allowed])
             elif chosen is not None:
                 best = fault_of(chosen, left)
@@ -172,6 +172,23 @@ class Look:
                 rivals = rivals_of(best, ranked, left, margin=self._settings.margin)
                 kept.append((yield from self._against_steps(best, rivals, fine, others)))
         return kept
+
+    def _allowed_in(self, judged: Judged) -> Fault | None:
+        """Return what healthy instruments are a little off by, too, where the data hint at it.
+
+        It goes on to the end of the mission.
+        """
+        edges = judged.grid.edges
+        if edges[-1] < len(self._keyframe_s):
+            return None
+        for one in self.hypotheses:
+            chi_sq = judged.table(one)[0][:-1, -1] if one.is_usual else np.zeros(1)
+            begin = int(np.argmax(chi_sq))
+            if chi_sq[begin] > ALLOWED:
+                small = replace(one, sigma=np.full_like(one.sigma, ALLOWED_M))
+                fault = Fault(small, int(edges[begin]), int(edges[-1]), float(chi_sq[begin]))
+                return replace(fault, onsets=onsets_of(fault, judged))
+        return None
 
     def _touches(self, one: Fault, other: Fault) -> bool:
         """Return whether an edge of one is near an edge of the other."""
@@ -228,22 +245,6 @@ def chosen_of(ranked: Sequence[Candidate]) -> Candidate | None:
     others = (one for one in significant if one.hypothesis.channel != IMU)
     other = next(others, best)
     return other if other.merit > INERTIAL_SHARE * best.merit else best
-
-
-def allowed_in(judged: Judged, hypotheses: Iterable[Hypothesis]) -> Fault | None:
-    """Return what healthy instruments, too, are a little off by, where the data hint at it."""
-    for one in hypotheses:
-        if not one.is_usual:
-            continue
-        chi_sq = judged.table(one)[0][:-1, -1]
-        begin = int(np.argmax(chi_sq))
-        if chi_sq[begin] > ALLOWED:
-            edges, sigma = judged.grid.edges, np.full_like(one.sigma, ALLOWED_M)
-            fault = Fault(
-                replace(one, sigma=sigma), int(edges[begin]), int(edges[-1]), float(chi_sq[begin])
-            )
-            return replace(fault, onsets=onsets_of(fault, judged))
-    return None
 
 
 def rivals_of(

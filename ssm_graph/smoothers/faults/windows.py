@@ -20,8 +20,8 @@ WINDOW_S: Final = 60.0
 USUAL: Final = 2.0
 """Chi-square by its degrees of freedom that errors of healthy instruments may come to: vibration
 and quantisation of MEMS units make it 1.2 to 1.6 over a mission (`benchmarks/results/trust.md`)."""
-TAIL: Final = 1e-8
-"""Probability of a stretch's chi-square where it is as usual; of N windows there are N^2 / 2."""
+TAIL: Final = 1e-6
+"""Probability of a stretch's chi-square where it is as large as is usual."""
 MOST: Final = 3
 """Stretches that are named."""
 OTHERS: Final = "DVL or aids, whose lie the inertial data contradict"
