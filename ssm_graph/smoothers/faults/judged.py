@@ -43,6 +43,8 @@ class Grid(NamedTuple):
     """(N,) s"""
     block_s: float
     """Of a coarse block, s"""
+    origin_s: float = 0.0
+    """When the mission begins, from which on rates count, s"""
 
     @classmethod
     def of(
@@ -62,7 +64,9 @@ class Grid(NamedTuple):
         edges = np.unique(np.concatenate([[begin], inner, [end]]))
         last = np.append(keyframe_s, keyframe_s[-1])
         begin_s, end_s = last[edges[:-1]], last[edges[1:]]
-        return cls(edges, 0.5 * (begin_s + end_s), end_s - begin_s, block_s)
+        return cls(
+            edges, 0.5 * (begin_s + end_s), end_s - begin_s, block_s, float(keyframe_s[0])
+        )
 
     def coarse(self) -> tuple[NDArray[np.intp], Array]:
         """Return the first block of each coarse one (G,), and their middles, s."""
@@ -74,14 +78,14 @@ class Grid(NamedTuple):
 
     @property
     def begin_since(self) -> Array:
-        """(N,) what the rate of a trend counts where each block begins, from the first one on."""
+        """(N,) what the rate of a trend counts where each block begins, from the mission's begin on.
+        """
         return np.asarray(self.middle_since - 0.5 * self.length_s / TREND_S)
 
     @property
     def middle_since(self) -> Array:
         """(N,) the same in their middles."""
-        begin_s = self.middle_s[0] - 0.5 * self.length_s[0]
-        return np.asarray((self.middle_s - begin_s) / TREND_S)
+        return np.asarray((self.middle_s - self.origin_s) / TREND_S)
 
     @property
     def n_blocks(self) -> int:

@@ -156,7 +156,7 @@ class Look:
                 continue
             beside = [one for one in waiting if self._touches(one, fault)]
             others = [*kept, *(one for one in waiting if one not in beside)]
-            grid = self._grid(with_rivals([*others, *beside]), around=[fault])
+            grid = self._grid(with_rivals([*others, *beside, fault]), around=[fault])
             fine = self._judge.on(grid).restoring(with_rivals([fault, *beside]))
             yield self._work
             left = fine.with_freed(with_rivals(others))
@@ -182,10 +182,12 @@ class Look:
         if edges[-1] < len(self._keyframe_s):
             return None
         for one in self.hypotheses:
-            chi_sq = judged.table(one)[0][:-1, -1] if one.is_usual else np.zeros(1)
+            if not one.is_usual:
+                continue
+            small = replace(one, sigma=np.full_like(one.sigma, ALLOWED_M))
+            chi_sq = judged.table(small)[0][:-1, -1]
             begin = int(np.argmax(chi_sq))
             if chi_sq[begin] > ALLOWED:
-                small = replace(one, sigma=np.full_like(one.sigma, ALLOWED_M))
                 fault = Fault(small, int(edges[begin]), int(edges[-1]), float(chi_sq[begin]))
                 return replace(fault, onsets=onsets_of(fault, judged))
         return None
