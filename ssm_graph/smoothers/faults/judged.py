@@ -64,9 +64,7 @@ class Grid(NamedTuple):
         edges = np.unique(np.concatenate([[begin], inner, [end]]))
         last = np.append(keyframe_s, keyframe_s[-1])
         begin_s, end_s = last[edges[:-1]], last[edges[1:]]
-        return cls(
-            edges, 0.5 * (begin_s + end_s), end_s - begin_s, block_s, float(keyframe_s[0])
-        )
+        return cls(edges, 0.5 * (begin_s + end_s), end_s - begin_s, block_s, float(keyframe_s[0]))
 
     def coarse(self) -> tuple[NDArray[np.intp], Array]:
         """Return the first block of each coarse one (G,), and their middles, s."""
@@ -78,8 +76,7 @@ class Grid(NamedTuple):
 
     @property
     def begin_since(self) -> Array:
-        """(N,) what the rate of a trend counts where each block begins, from the mission's begin on.
-        """
+        """(N,) what the rate of a trend counts where each block begins, from the mission's begin on."""
         return np.asarray(self.middle_since - 0.5 * self.length_s / TREND_S)
 
     @property
