@@ -13,10 +13,10 @@ import pytest
 from ssm_graph.cli.main import ExitCode, build_parser, main
 from ssm_graph.cli.online import input_configs, output_configs, replay_speed
 from ssm_graph.io.mission_folder.folder import read_mission, write_mission
+from ssm_graph.io.nmea_sentences import checksum
 from ssm_graph.io.results.tables import read_results
 from ssm_graph.live.protocols.json_messages import JsonDecoder
 from ssm_graph.live.protocols.nmea import NmeaDecoder
-from ssm_graph.live.protocols.nmea_fields import checksum
 from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
 from ssm_graph.live.sockets.endpoints import Transport
 from ssm_graph.live.sockets.feed import Limits
@@ -36,7 +36,8 @@ def mission(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def parsed(*words: str) -> argparse.Namespace:
     """Return what the words mean."""
-    return build_parser().parse_args(["online", "v.toml", "--out", "r", *words])
+    line = ["online", "v.toml", "--out", "r", *words]
+    return build_parser(line).parse_args(line)
 
 
 def test_a_replay_is_a_run(
