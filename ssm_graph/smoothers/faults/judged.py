@@ -76,7 +76,7 @@ class Grid(NamedTuple):
 
     @property
     def begin_since(self) -> Array:
-        """(N,) what the rate of a trend counts where each block begins, from the mission's begin."""
+        """(N,) what a rate counts where each block begins, from the begin of the mission on."""
         return np.asarray(self.middle_since - 0.5 * self.length_s / TREND_S)
 
     @property
