@@ -138,12 +138,12 @@ def test_what_cannot_be_decided_is_covered_and_said(grade: Grade) -> None:
 
 
 @pytest.mark.parametrize(
-    ("rate", "treatment"), [(0.004, Treatment.FREED), (0.001, Treatment.ALLOWED)]
+    ("rate", "treatment"), [(0.004, Treatment.FREED), (0.0018, Treatment.ALLOWED)]
 )
 def test_a_slow_drift_of_depth_is_covered_whenever_it_began(
     rate: float, treatment: Treatment
 ) -> None:
-    """In mm/s: large enough to be told, and too small; neither makes a right answer suspect."""
+    """Rates in m/s, one to be told, one too small for that: right answers, and not suspect."""
     sim = simulated(duration_s=200.0, dvl=QUIET, seed=3)
     fault = Fault(sensor=Sensor.DEPTH, shape=FaultShape.RAMP, start_s=40.0, size=rate)
     broken = with_faults(sim.mission, (fault,), truth=sim.truth_at)
