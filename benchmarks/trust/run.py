@@ -17,6 +17,7 @@ from benchmarks.processes import side_by_side
 from benchmarks.report import Option, Report, number_text, table
 from benchmarks.trust.lies import LIES
 from ssm_graph import Estimate, Mission, SmootherConfig, SsmGraphError, evaluate, smooth
+from ssm_graph.mission.fault import Treatment
 from ssm_graph.simulation import (
     AidSettings,
     DvlSettings,
@@ -52,7 +53,7 @@ class Run(NamedTuple):
     is_named: bool
     """Whether the verdict names the sensor that lies, over a time that has to do with the lie"""
     n_blamed: int
-    """Faults that it found"""
+    """Faults that it found; what is only allowed for is none"""
     inside: tuple[float, ...]
     """Shares of the errors east, north and up inside 1, 2 and 3 sigma: nine numbers"""
     nees: float
@@ -151,7 +152,7 @@ def _judged(
         z=found.z,
         status=estimate.status.name,
         is_named=lie is not None and _names(estimate, *lie),
-        n_blamed=len(estimate.faults),
+        n_blamed=sum(one.treatment is not Treatment.ALLOWED for one in estimate.faults),
         inside=found.inside,
         nees=found.nees,
         seconds=seconds,

@@ -175,10 +175,12 @@ class Ahead(NamedTuple):
 
 
 class InertialFit(NamedTuple):
-    """Sum of squared whitened errors of the inertial data, and what it is if noise is as stated."""
+    """Squared whitened errors of the inertial data, and what they are if noise is as stated."""
 
-    chi_sq: float
-    dof: float
+    chi_sq: Array
+    """(K - 1,) of each interval"""
+    dof: Array
+    """(K - 1,)"""
 
 
 def inertial_fit(rows: Array, solution: ChainSolution) -> InertialFit:
@@ -186,16 +188,17 @@ def inertial_fit(rows: Array, solution: ChainSolution) -> InertialFit:
 
     Of the whitened errors most is taken up by the states: hardly anything else sees a keyframe's
     biases. With ``A_i d_i + A_j d_j = b + noise`` and the posterior covariance ``P`` of both
-    keyframes the expected square is ``15 - tr(A P A')``; the sum over all intervals is what the
-    chi-square of the inertial data has for degrees of freedom.
+    keyframes the expected square is ``15 - tr(A P A')``: the degrees of freedom of the interval's
+    chi-square.
     """
     n = rows.shape[1]
     A_i, A_j = rows[:, :STATE_DIM, :STATE_DIM], rows[:, :STATE_DIM, n : n + STATE_DIM]
     b, P = rows[:, :STATE_DIM, -1], solution.covariance(STATE_DIM)
-    explained = np.sum((A_i @ P[:-1]) * A_i) + np.sum((A_j @ P[1:]) * A_j)
-    explained += 2.0 * np.sum((A_i @ solution.neighbour_covariance(STATE_DIM)) * A_j)
+    taken_up = (A_i @ P[:-1]) * A_i + (A_j @ P[1:]) * A_j
+    taken_up += 2.0 * (A_i @ solution.neighbour_covariance(STATE_DIM)) * A_j
+    dof = b.shape[1] - np.sum(taken_up, axis=(1, 2))
     A_c, crossed = rows[:, :STATE_DIM, 2 * n : -1], solution.sensitivity[:, :STATE_DIM]
     if A_c.any():
         through = 2.0 * (A_i @ crossed[:-1] + A_j @ crossed[1:]) + A_c
-        explained += np.sum((through @ solution.constants_cov) * A_c)
-    return InertialFit(float(np.sum(b**2)), float(b.size - explained))
+        dof -= np.sum((through @ solution.constants_cov) * A_c, axis=(1, 2))
+    return InertialFit(np.sum(b**2, axis=1), dof)

@@ -14,6 +14,7 @@ class Treatment(Enum):
     LEFT_OUT = "left out there"
     FREED = "estimated and taken off there"
     COVERED = "the sigmas cover what it may have cost"
+    ALLOWED = "too little to decide, the sigmas allow for it"
     CHANGING = "estimated there, but it was another at each look"
     SAID = "counted as it is"
 

@@ -35,7 +35,7 @@ from ssm_graph.engine.states import States
 from ssm_graph.graph.beacon_start import ambiguous_beacons
 from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.first_values import FirstValues, first_values, first_values_steps
-from ssm_graph.graph.inertial_rows import inertial_fit
+from ssm_graph.graph.inertial_rows import InertialFit, inertial_fit
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.measurements import JudgedAid, aid_kernel, aid_table, doubts_of_aids, without
 from ssm_graph.mission.answer import trajectory_from_states
@@ -143,6 +143,7 @@ class Solved(NamedTuple):
     faults: tuple[DetectedFault, ...]
     aids_out: NDArray[np.bool_]
     """(A,) measurements of aids that are left out"""
+    inertial: InertialFit
 
     def again(self) -> FirstValues:
         """Return where another solution may start."""
@@ -188,7 +189,7 @@ class SsmSmoother:
         for adaptations in range(MAX_ADAPTATIONS + 1):
             solved = yield from self._solve_steps(problem, first, on_iteration)
             iterations += solved.iterations
-            noise = yield from noise_of_steps(solved, used)
+            noise = noise_of(solved, used)
             is_wanted = self.config.adapt_noise and solved.status is not Status.INTERRUPTED
             change = adaptation(noise) if is_wanted and adaptations < MAX_ADAPTATIONS else None
             if change is None:
@@ -249,10 +250,13 @@ class SsmSmoother:
                 break
             yield 0.007 * problem.n_keyframes
             weights = weights.after(this, faults)
-        found, kernel = problem.faults + faults.faults(this.states), weights.of_beams.wanted
+        inertial = inertial_fit(linearizer.inertial_rows(this.states), this.step)
+        yield 0.02 * problem.n_keyframes
+        found = problem.faults + faults.faults(this.states, inertial)
+        kernel = weights.of_beams.wanted
         notes = (*problem.notes, *(fault.sentence for fault in found), *_notes_of(first))
         ended = (linearizer, this, tuple(iterations), status)
-        return Solved(*ended, kernel, notes, first, found, faults.aids_out)
+        return Solved(*ended, kernel, notes, first, found, faults.aids_out, inertial)
 
     def _iterate(
         self,
@@ -386,16 +390,14 @@ class SsmSmoother:
         ]
 
 
-def noise_of_steps(solved: Solved, used: Array) -> Steps[NoiseFound]:
+def noise_of(solved: Solved, used: Array) -> NoiseFound:
     """Return what a solution says of the noise; ``used`` (B,) are its sigmas over the stated."""
     linearizer, last = solved.linearizer, solved.last
-    fit = inertial_fit(linearizer.inertial_rows(last.states), last.step)
-    yield 0.02 * linearizer.problem.n_keyframes
     return noise_found(
         linearizer.problem,
         error=last.beam_rows.error,
         variance=last.step.variance(linearizer.problem.beams.keyframe, last.beam_rows.jacobian),
         weights=last.weights,
-        inertial=fit,
+        inertial=solved.inertial,
         used=used,
     )

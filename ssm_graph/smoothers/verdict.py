@@ -188,8 +188,8 @@ def noise_found(
         beam_factor=factor * used,
         beam_dof=dof,
         beam_used=used,
-        inertial_chi_sq=inertial.chi_sq,
-        inertial_dof=inertial.dof,
+        inertial_chi_sq=float(np.sum(inertial.chi_sq)),
+        inertial_dof=float(np.sum(inertial.dof)),
     )
 
 

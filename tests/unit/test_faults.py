@@ -137,10 +137,34 @@ def test_what_cannot_be_decided_is_covered_and_said(grade: Grade) -> None:
     assert (estimate.status is Status.SUSPECT) == any(one.is_suspect for one in estimate.faults)
 
 
+@pytest.mark.parametrize(
+    ("rate", "treatment"), [(0.004, Treatment.FREED), (0.0018, Treatment.ALLOWED)]
+)
+def test_a_slow_drift_of_depth_is_covered_whenever_it_began(
+    rate: float, treatment: Treatment
+) -> None:
+    """Rates in m/s, one to be told, one too small for that: right answers, and not suspect."""
+    sim = simulated(duration_s=200.0, dvl=QUIET, seed=3)
+    fault = Fault(sensor=Sensor.DEPTH, shape=FaultShape.RAMP, start_s=40.0, size=rate)
+    broken = with_faults(sim.mission, (fault,), truth=sim.truth_at)
+    estimate = smoothed(replace(sim, mission=broken.mission))
+    (found,) = estimate.faults
+    assert (found.sensor, found.treatment) == ("depth", treatment)
+    assert estimate.status is Status.CONVERGED
+    assert errors(estimate, sim)[1] < 4.0
+
+
 def test_nothing_is_found_with_realistic_instruments() -> None:
-    """Slow noise, heavy tails, scale factors and misalignments are nobody's fault."""
+    """Slow noise, heavy tails, scale factors and misalignments are nobody's fault once stated."""
     for seed in (1, 2):
-        sim = simulated(duration_s=200.0, imu_rate_hz=50.0, gnss=FIXES, realistic=True, seed=seed)
+        sim = simulated(
+            duration_s=200.0,
+            imu_rate_hz=50.0,
+            gnss=FIXES,
+            realistic=True,
+            calibrates=True,
+            seed=seed,
+        )
         assert not smoothed(sim).faults
 
 

@@ -250,6 +250,13 @@ def test_gyros_of_another_scale(grade: Grade, scale: float, says: str) -> None:
     assert number(found.remedy) == pytest.approx(1.0 / scale, rel=0.01)
 
 
+def test_a_calibration_takes_care_of_the_gyros() -> None:
+    """A factor within four of the prior sigmas that the mission states for it."""
+    mission = healthy("survey", Grade.MEMS, 51)
+    asks = replace(mission.imu.calibration, gyro_scale_sigma=0.5)
+    assert not find_suspects(with_imu(mission, gyro_b=0.6 * mission.imu.gyro_b, calibration=asks))
+
+
 def test_a_gyro_of_the_other_sign() -> None:
     """About one axis."""
     mission = healthy("survey", Grade.TACTICAL, 52)

@@ -127,6 +127,7 @@ def scale_families(mission: Mission) -> Iterator[Family]:
         yield Family(
             *(name, turn, NEAR_SCALES, far, GYRO_LEAST),
             null=1.0,
+            cared=BOUND * mission.imu.calibration.gyro_scale_sigma,
             only_poor=len(axes) == 1,
             part="accelerometers",
         )

@@ -82,6 +82,7 @@ def search(mission: Mission) -> list[Found]:
         poor = evidence.poor(base)
         tried = [evidence.best_of(family, base, poor) for family in families]
         sure = [best for best in tried if best is not None and best.is_sure]
+        sure = [best for best in sure if not (best.is_far and _is_poor(evidence, best))]
         sure += _set_clocks(evidence, families, base, poor, sure)
         if not sure:
             break
@@ -93,6 +94,11 @@ def search(mission: Mission) -> list[Found]:
         base = best.hypothesis
         families = [family for family in families if family is not best.family]
     return found
+
+
+def _is_poor(evidence: Evidence, clock: Found) -> bool:
+    """Return whether logs still disagree with a clock put right by seconds: then it is another."""
+    return clock.family.part in evidence.poor(clock.hypothesis)
 
 
 def _set_clocks(
@@ -107,6 +113,8 @@ def _set_clocks(
             continue
         step = evidence.set_clock(family, base, SET_S)
         if step is None or not step.is_sure or step.gain < best + STEP_BETTER:
+            continue
+        if _is_poor(evidence, step):
             continue
         if family.clocks == ("gnss",):
             switch_s = step.hypothesis.gnss.switch_s

@@ -39,6 +39,10 @@ ROUNDS: Final = 9
 LEAST_STEP_S: Final = 0.7
 """By less no clock is set: they are set by whole seconds."""
 STEP_WIDTH_S: Final = 0.1
+FAR_S: Final = 2.0
+FAR_SHARE: Final = 0.25
+"""Of the loss of what it touches, the gain of a delay beyond :data:`FAR_S`: it spoils all of a
+comparison, while whole periods of the waves change little, and by chance to the better."""
 STEP_BETTER: Final = 15.0
 """Gain over one constant delay that a clock that was set needs: a second delay and a time."""
 JUMP_AS_GOOD: Final = 6.0
@@ -83,6 +87,8 @@ class Found:
     """The gain less that of the block that gains most"""
     by_part: dict[str, float]
     """Gain of each part"""
+    share: float = 1.0
+    """The gain, of the loss without it"""
     rivals: tuple[Found, ...] = ()
     """Others that explain the logs as well"""
 
@@ -91,8 +97,15 @@ class Found:
         """Whether it is beyond what errors of healthy instruments make."""
         off = abs(self.value - self.family.null)
         enough = self.gain > ENOUGH and self.without_best > WITHOUT_BEST
+        if self.is_far and self.share < FAR_SHARE:
+            return False
         least = LEAST_STEP_S if self.is_set else self.family.least
         return enough and off > max(least, SURE * self.sigma)
+
+    @property
+    def is_far(self) -> bool:
+        """Whether it is a clock that is off by seconds all the time."""
+        return bool(self.family.clocks) and not self.is_set and abs(self.value) > FAR_S
 
     @property
     def is_cared_for(self) -> bool:
@@ -222,6 +235,7 @@ class Evidence:
             sigma,
             hypothesis=family.make(base, value),
             gain=float(gains.sum()),
+            share=float(gains.sum() / blocks[null].sum()),
             without_best=float(gains.sum() - gains.max()),
             by_part={name: float((x[null] - x[at]).sum()) for name, x in by_part.items()},
         )

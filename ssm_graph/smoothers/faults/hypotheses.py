@@ -34,6 +34,11 @@ LEAST_PER_NUMBER = 2.0
 
 USUAL = -6.0
 """Handicap of a depth that drifts: tides, air pressure and warm-up make all of them do."""
+ALLOWED = 4.0
+"""Chi-square of such a drift from which on it is allowed for, though it is too little to be said.
+Of less no harm comes: the DVL's own vertical says by how much at most."""
+ALLOWED_M = 0.1
+"""Prior sigma of that in 100 s: 1 mm/s. A tide of 4 m runs at 0.3 mm/s, warm-up is faster."""
 RISING_M_PER_S = 0.05
 """Sigma of the vertical velocity of what is taken for the bottom: layers rise and sink slowly."""
 
@@ -75,6 +80,11 @@ class Hypothesis:
     def has_rate(self) -> bool:
         """Whether one of its numbers grows with time."""
         return self.course in (Course.TREND, Course.RAMP)
+
+    @property
+    def is_usual(self) -> bool:
+        """Whether healthy instruments of its kind are a little off in this way."""
+        return self.handicap < 0.0
 
     @property
     def n_numbers(self) -> int:

@@ -43,6 +43,8 @@ class Grid(NamedTuple):
     """(N,) s"""
     block_s: float
     """Of a coarse block, s"""
+    origin_s: float = 0.0
+    """When the mission begins, from which on rates count, s"""
 
     @classmethod
     def of(
@@ -62,7 +64,7 @@ class Grid(NamedTuple):
         edges = np.unique(np.concatenate([[begin], inner, [end]]))
         last = np.append(keyframe_s, keyframe_s[-1])
         begin_s, end_s = last[edges[:-1]], last[edges[1:]]
-        return cls(edges, 0.5 * (begin_s + end_s), end_s - begin_s, block_s)
+        return cls(edges, 0.5 * (begin_s + end_s), end_s - begin_s, block_s, float(keyframe_s[0]))
 
     def coarse(self) -> tuple[NDArray[np.intp], Array]:
         """Return the first block of each coarse one (G,), and their middles, s."""
@@ -74,14 +76,13 @@ class Grid(NamedTuple):
 
     @property
     def begin_since(self) -> Array:
-        """(N,) what the rate of a trend counts where each block begins, from the first one on."""
+        """(N,) what a rate counts where each block begins, from the begin of the mission on."""
         return np.asarray(self.middle_since - 0.5 * self.length_s / TREND_S)
 
     @property
     def middle_since(self) -> Array:
         """(N,) the same in their middles."""
-        begin_s = self.middle_s[0] - 0.5 * self.length_s[0]
-        return np.asarray((self.middle_s - begin_s) / TREND_S)
+        return np.asarray((self.middle_s - self.origin_s) / TREND_S)
 
     @property
     def n_blocks(self) -> int:
@@ -129,10 +130,17 @@ class Fault:
     """By which that exceeds its charge"""
     rivals: tuple[Fault, ...] = ()
     """Others that explain the data as well"""
+    onsets: tuple[Fault, ...] = ()
+    """The same ramp from other times on, at which it may have begun"""
     sizes: Array | None = None
     """Of its numbers, taken off the rows already; None for what is new"""
     cost_m: float = 0.0
     """By how much the horizontal position moves between the explanations, m"""
+
+    @property
+    def is_allowed_for(self) -> bool:
+        """Whether it is too little to be a fault, but may be one."""
+        return self.hypothesis.is_usual and self.merit <= 0.0
 
     @property
     def n_constants(self) -> int:

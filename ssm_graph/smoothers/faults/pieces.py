@@ -16,10 +16,11 @@ import numpy as np
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps
+from ssm_graph.engine.error_state import POSITION
 from ssm_graph.smoothers.faults.columns import TREND_S, Channels
 from ssm_graph.smoothers.faults.hypotheses import Course
 from ssm_graph.smoothers.faults.judged import Fault, Judge
-from ssm_graph.smoothers.faults.search import FaultSearch, Look
+from ssm_graph.smoothers.faults.search import SAME_ANSWER_SIGMAS, FaultSearch, Look
 
 
 class Piece(NamedTuple):
@@ -45,17 +46,40 @@ def pieces_of(keyframe_s: Array, piece_s: float) -> list[Piece]:
     return [Piece(*one) for one in zip(begin, ends, [0, *seam], strict=True)]
 
 
-def find_steps(
-    judge: Judge, channels: Channels, settings: FaultSearch, known: Sequence[Fault]
-) -> Steps[list[Fault]]:
-    """Return what is off anywhere in a mission: what was before, and what is new."""
-    keyframe_s = judge.linear.problem.keyframe_s
-    found: list[tuple[Piece, list[Fault]]] = []
-    for piece in pieces_of(keyframe_s, settings.piece_s):
-        look = Look(judge, channels, settings, (piece.begin, piece.end))
-        own = yield from look.find_steps(parts_of(known, piece, keyframe_s))
-        found.append((piece, own))
-    return joined_of(found)
+class PieceSearch:
+    """The search over all pieces, look after look."""
+
+    def __init__(self, settings: FaultSearch) -> None:
+        self._settings = settings
+        self._p_n: dict[Piece, Array] = {}
+        """(k, 3) where the vehicle was when a piece had nothing, m"""
+
+    def find_steps(
+        self, judge: Judge, channels: Channels, known: Sequence[Fault]
+    ) -> Steps[list[Fault]]:
+        """Return what is off anywhere in a mission: what was before, and what is new.
+
+        A piece that had nothing, and whose answer is still the same, is not searched again.
+        """
+        keyframe_s, p_n = judge.linear.problem.keyframe_s, judge.linear.states.p_n
+        variance = np.trace(judge.linear.solution.covariance_of(POSITION), axis1=1, axis2=2) / 3.0
+        found: list[tuple[Piece, list[Fault]]] = []
+        for piece in pieces_of(keyframe_s, self._settings.piece_s):
+            own, here = parts_of(known, piece, keyframe_s), slice(piece.begin, piece.end)
+            last = self._p_n.pop(piece, None)
+            if own or last is None or _has_moved(p_n[here] - last, variance[here]):
+                look = Look(judge, channels, self._settings, (piece.begin, piece.end))
+                own = yield from look.find_steps(own)
+                last = p_n[here]
+            if not own:
+                self._p_n[piece] = last
+            found.append((piece, own))
+        return joined_of(found)
+
+
+def _has_moved(by_n: Array, variance: Array) -> bool:
+    """Return whether positions have changed (k, 3), m, by more than what explains nothing else."""
+    return bool(np.any(np.sum(by_n**2, axis=1) > SAME_ANSWER_SIGMAS**2 * variance))
 
 
 def parts_of(faults: Iterable[Fault], piece: Piece, keyframe_s: Array) -> list[Fault]:
@@ -65,14 +89,29 @@ def parts_of(faults: Iterable[Fault], piece: Piece, keyframe_s: Array) -> list[F
         begin, end = max(fault.begin, piece.begin), min(fault.end, piece.end)
         if begin >= end:
             continue
-        sizes = fault.sizes
-        if sizes is not None and fault.hypothesis.course is Course.TREND:
+        hypothesis, sizes = fault.hypothesis, fault.sizes
+        if begin > fault.begin and hypothesis.course is Course.RAMP:
+            hypothesis = replace(hypothesis, course=Course.TREND)
+        if sizes is not None and hypothesis.course is Course.TREND:
             # The rate counts from the begin of the stretch on.
-            constant, rate = np.split(sizes, 2)
+            rate = sizes[-hypothesis.combined.shape[1] :]
+            constant = sizes[: -len(rate)] if len(sizes) > len(rate) else np.zeros_like(rate)
             since = (keyframe_s[begin] - keyframe_s[fault.begin]) / TREND_S
             sizes = np.concatenate([constant + since * rate, rate])
-        rivals = tuple(parts_of(fault.rivals, piece, keyframe_s))
-        found.append(replace(fault, begin=begin, end=end, sizes=sizes, rivals=rivals))
+        rivals, onsets = (
+            tuple(parts_of(of, piece, keyframe_s)) for of in (fault.rivals, fault.onsets)
+        )
+        found.append(
+            replace(
+                fault,
+                hypothesis=hypothesis,
+                begin=begin,
+                end=end,
+                sizes=sizes,
+                rivals=rivals,
+                onsets=onsets,
+            )
+        )
     return found
 
 
@@ -115,7 +154,8 @@ def joined(one: Fault, later: Fault, seam: int) -> Fault:
             first, second = (rival, same) if stronger is one else (same, rival)
             rival = joined(first, second, seam)
         rivals.append(rival)
-    return replace(stronger, begin=begin, end=end, rivals=tuple(rivals))
+    onsets = tuple(replace(ramp, end=end) for ramp in stronger.onsets if ramp.begin < end)
+    return replace(stronger, begin=begin, end=end, rivals=tuple(rivals), onsets=onsets)
 
 
 def _until(faults: Iterable[Fault], seam: int, piece_end: int) -> Iterator[Fault]:
@@ -142,6 +182,7 @@ def _same_of(faults: Iterable[Fault], other: Fault) -> Fault | None:
 
 def _is_same(one: Fault, other: Fault) -> bool:
     a, b = one.hypothesis, other.hypothesis
-    is_like = (a.channel, a.course) == (b.channel, b.course)
+    # Of a ramp that began in the piece before there is a trend here.
+    is_like = a.channel == b.channel and (a.course is b.course or (a.has_rate and b.has_rate))
     is_over_same = max(one.begin, other.begin) < min(one.end, other.end)
     return is_over_same and is_like and np.array_equal(a.combined, b.combined)

@@ -16,7 +16,13 @@ import numpy as np
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.stepwise import Steps
 from ssm_graph.smoothers.faults.columns import IMU, Channels
-from ssm_graph.smoothers.faults.hypotheses import Course, Hypothesis, hypotheses_of
+from ssm_graph.smoothers.faults.hypotheses import (
+    ALLOWED,
+    ALLOWED_M,
+    Course,
+    Hypothesis,
+    hypotheses_of,
+)
 from ssm_graph.smoothers.faults.judged import Candidate, Fault, Grid, Judge, Judged
 
 FINE_S = 1.0
@@ -33,6 +39,8 @@ JOLT = 22.0
 in 400 places is above it once in 50 missions."""
 INERTIAL_SHARE = 0.5
 """Of the merit of an inertial fault, from which on another sensor's is taken instead."""
+SAME_ONSET = 4.0
+"""Chi-square by which another onset of a ramp may be worse, two sigmas, and is freed, too."""
 SAME_STRETCH = 0.5
 SAME_ANSWER_SIGMAS = 1.0
 """Explanations whose answers are nowhere further apart are one."""
@@ -104,7 +112,7 @@ class Look:
         if first.chi_sq > HINT * first.hypothesis.charge(first.n_numbers()):
             hints.append(fault_of(first, left))
         if not hints:
-            return None
+            return self._allowed_in(left)
         fine = self._judge.on(self._grid(with_rivals(found), around=hints))
         yield self._work
         left = fine.with_freed(with_rivals(found))
@@ -112,8 +120,9 @@ class Look:
         yield self._work
         chosen = chosen_of(ranked)
         if chosen is None:
-            return None
+            return self._allowed_in(left)
         best = fault_of(chosen, left)
+        best = replace(best, onsets=onsets_of(best, left))
         rivals = rivals_of(best, ranked, left, margin=self._settings.margin)
         return (yield from self._against_steps(best, rivals, fine, found))
 
@@ -147,18 +156,41 @@ class Look:
                 continue
             beside = [one for one in waiting if self._touches(one, fault)]
             others = [*kept, *(one for one in waiting if one not in beside)]
-            grid = self._grid(with_rivals([*others, *beside]), around=[fault])
+            grid = self._grid(with_rivals([*others, *beside, fault]), around=[fault])
             fine = self._judge.on(grid).restoring(with_rivals([fault, *beside]))
             yield self._work
             left = fine.with_freed(with_rivals(others))
             ranked = left.best_of(self.hypotheses, near=fault)
             yield self._work
             chosen = chosen_of(ranked)
-            if chosen is not None:
+            if chosen is None and fault.hypothesis.is_usual:
+                allowed = self._allowed_in(left)
+                kept.extend([] if allowed is None else [allowed])
+            elif chosen is not None:
                 best = fault_of(chosen, left)
+                best = replace(best, onsets=onsets_of(best, left))
                 rivals = rivals_of(best, ranked, left, margin=self._settings.margin)
                 kept.append((yield from self._against_steps(best, rivals, fine, others)))
         return kept
+
+    def _allowed_in(self, judged: Judged) -> Fault | None:
+        """Return what healthy instruments are a little off by, too, where the data hint at it.
+
+        It goes on to the end of the mission.
+        """
+        edges = judged.grid.edges
+        if edges[-1] < len(self._keyframe_s):
+            return None
+        for one in self.hypotheses:
+            if not one.is_usual:
+                continue
+            small = replace(one, sigma=np.full_like(one.sigma, ALLOWED_M))
+            chi_sq = judged.table(small)[0][:-1, -1]
+            begin = int(np.argmax(chi_sq))
+            if chi_sq[begin] > ALLOWED:
+                fault = Fault(small, int(edges[begin]), int(edges[-1]), float(chi_sq[begin]))
+                return replace(fault, onsets=onsets_of(fault, judged))
+        return None
 
     def _touches(self, one: Fault, other: Fault) -> bool:
         """Return whether an edge of one is near an edge of the other."""
@@ -229,7 +261,25 @@ def rivals_of(
     for one in found:
         if not is_part_of(one, best):
             by_sensor.setdefault((one.hypothesis.sensor, overlap(one, best) > SAME_STRETCH), one)
-    return list(by_sensor.values())
+    return [replace(one, onsets=onsets_of(one, judged)) for one in by_sensor.values()]
+
+
+def onsets_of(ramp: Fault, judged: Judged) -> tuple[Fault, ...]:
+    """Return a ramp with the first, the likeliest and the last onset that explain the data.
+
+    Only those a block or more away from others count; of what is no ramp there are none.
+    """
+    if ramp.hypothesis.course is not Course.RAMP:
+        return ()
+    grid = judged.grid
+    edge_s = np.append(grid.middle_s - 0.5 * grid.length_s, np.inf)
+    chi_sq = judged.table(ramp.hypothesis)[0][:, np.searchsorted(grid.edges, ramp.end)]
+    as_good = np.flatnonzero(chi_sq > chi_sq.max() - SAME_ONSET)
+    known = [int(np.searchsorted(grid.edges, ramp.begin))]
+    for at in (as_good[0], int(np.argmax(chi_sq)), as_good[-1]):
+        if np.min(np.abs(edge_s[known] - edge_s[at])) >= grid.block_s:
+            known.append(int(at))
+    return tuple(replace(ramp, begin=int(grid.edges[at])) for at in known[1:])
 
 
 def is_part_of(one: Fault, other: Fault) -> bool:
@@ -248,5 +298,9 @@ def overlap(one: Fault, other: Fault) -> float:
 
 
 def with_rivals(found: Iterable[Fault]) -> list[Fault]:
-    """Return all that is to be freed: what was found, each with its rivals behind it."""
-    return [one for fault in found for one in (fault, *fault.rivals)]
+    """Return all that is to be freed: what was found, each with its rivals behind it.
+
+    Behind a ramp comes the same from other times on.
+    """
+    each = (one for fault in found for one in (fault, *fault.rivals))
+    return [ramp for one in each for ramp in (one, *one.onsets)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -16,6 +17,7 @@ from ssm_graph.engine.extras import Extras
 from ssm_graph.engine.reweighting import NEAR_SIGMAS
 from ssm_graph.engine.states import States
 from ssm_graph.graph.freed import Freed
+from ssm_graph.graph.inertial_rows import InertialFit
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.measurements import aids_of
 from ssm_graph.mission.fault import DetectedFault, Treatment
@@ -33,8 +35,9 @@ from ssm_graph.smoothers.faults.columns import (
 from ssm_graph.smoothers.faults.hypotheses import Course
 from ssm_graph.smoothers.faults.judged import Fault, Judge
 from ssm_graph.smoothers.faults.nuisances import Nuisances
-from ssm_graph.smoothers.faults.pieces import find_steps
+from ssm_graph.smoothers.faults.pieces import PieceSearch
 from ssm_graph.smoothers.faults.search import FaultSearch, with_rivals
+from ssm_graph.smoothers.faults.windows import noisier_than_stated
 
 MOST_LOOKS = 8
 """Looks after which the search ends whatever it finds."""
@@ -56,7 +59,7 @@ class FaultWatch:
 
     def __init__(self, problem: Problem, search: FaultSearch | None) -> None:
         """Take the problem as the smoother solves it; without a search nothing is ever found."""
-        self._problem, self._search = problem, search
+        self._problem, self._search = problem, None if search is None else PieceSearch(search)
         self._bare = None if search is None else GraphLinearizer(problem)
         self._found: list[Fault] = []
         self._gone: list[Fault] = []
@@ -99,7 +102,7 @@ class FaultWatch:
         channels = Channels(linear)
         judge = Judge(linear, channels, Nuisances(linear, channels))
         yield 0.02 * self._problem.n_keyframes
-        found = yield from find_steps(judge, channels, self._search, self._sized(states))
+        found = yield from self._search.find_steps(judge, channels, self._sized(states))
         is_same = same_faults(found, self._found, self._problem.keyframe_s)
         self._is_done = is_same or self._n_looks >= MOST_LOOKS
         if is_same:
@@ -123,15 +126,17 @@ class FaultWatch:
 
     def _sized(self, states: States) -> list[Fault]:
         """Return what was found with the sizes that the states give it."""
-        sizes = states.constants[self._problem.extras.n_constants :]
-        found, begin = [], 0
+        sizes = iter(states.constants[self._problem.extras.n_constants :].tolist())
+
+        def sized(one: Fault) -> Fault:
+            own = list(itertools.islice(sizes, one.n_constants))
+            onsets = tuple(sized(ramp) for ramp in one.onsets)
+            return replace(one, sizes=np.array(own) if own else None, onsets=onsets)
+
+        found = []
         for fault in self._found:
-            parts = []
-            for one in (fault, *fault.rivals):
-                count = one.n_constants
-                parts.append(replace(one, sizes=sizes[begin : begin + count] if count else None))
-                begin += count
-            found.append(replace(parts[0], rivals=tuple(parts[1:])))
+            first, *rivals = [sized(one) for one in (fault, *fault.rivals)]
+            found.append(replace(first, rivals=tuple(rivals)))
         return found
 
     def _freed(self, channels: Channels) -> Freed:
@@ -173,8 +178,10 @@ class FaultWatch:
                 aids_out[name] |= _inside(channels.aid_keyframe[name], fault)
         self.aids_out = np.concatenate([np.zeros(0, bool), *aids_out.values()])
 
-    def faults(self, states: States) -> tuple[DetectedFault, ...]:
-        """Return what was found, with the sizes that the answer gives it."""
+    def faults(self, states: States, inertial: InertialFit) -> tuple[DetectedFault, ...]:
+        """Return what was found, with the sizes that the answer gives it, and what is left over."""
+        if self._search is None:
+            return ()
         end_s = np.append(self._problem.keyframe_s, self._problem.keyframe_s[-1])
         found = []
         new = [(one.hypothesis, one.begin, one.end) for one in self._new]
@@ -186,6 +193,7 @@ class FaultWatch:
                 for one in fault.rivals
             ]
             treatment = Treatment.FREED if fault.n_constants else Treatment.LEFT_OUT
+            treatment = Treatment.ALLOWED if fault.is_allowed_for else treatment
             treatment = Treatment.COVERED if rivals else treatment
             if any(fault is one for one in self._gone):
                 treatment = Treatment.SAID
@@ -204,7 +212,7 @@ class FaultWatch:
                     cost_m=fault.cost_m,
                 )
             )
-        return tuple(found)
+        return (*found, *noisier_than_stated(inertial, self._problem.keyframe_s))
 
 
 def said(fault: Fault) -> str:
@@ -214,7 +222,8 @@ def said(fault: Fault) -> str:
         return "reads what nothing else agrees with"
     d, minute = hypothesis.combined.shape[1], 60.0 / TREND_S
     if hypothesis.course is Course.RAMP:
-        return f"from nothing on, and within each minute by {hypothesis.say(minute * sizes)}"
+        last = sum((ramp.sizes for ramp in fault.onsets if ramp.sizes is not None), sizes)
+        return f"from nothing on, and within each minute by {hypothesis.say(minute * last)}"
     text = hypothesis.say(sizes[:d])
     if hypothesis.course is Course.TREND:
         text += f", and within a minute more by {hypothesis.say(minute * sizes[d:])}"
@@ -222,7 +231,7 @@ def said(fault: Fault) -> str:
 
 
 def same_faults(some: Sequence[Fault], others: Sequence[Fault], keyframe_s: Array) -> bool:
-    """Return whether these are the same faults, to the second."""
+    """Return whether these are the same faults, to the second; but for other onsets of ramps."""
     time_s = np.append(keyframe_s, keyframe_s[-1])
 
     def keys(faults: Sequence[Fault]) -> list[tuple[str, str, str, float, float]]:
@@ -234,7 +243,8 @@ def same_faults(some: Sequence[Fault], others: Sequence[Fault], keyframe_s: Arra
                 round(float(time_s[f.begin])),
                 round(float(time_s[f.end])),
             )
-            for f in with_rivals(faults)
+            for fault in faults
+            for f in (fault, *fault.rivals)
         )
 
     return keys(some) == keys(others)
