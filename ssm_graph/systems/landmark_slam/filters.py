@@ -229,7 +229,7 @@ class MapFilter:
         weights = np.ones((runs, m))
         if isinstance(self._robust, Gate):
             weights = self._gated(nu, inner, slots, self._robust)
-        R = _spread(self.noise.observation, weights)
+        R = spread_over(self.noise.observation, weights)
         for _ in range(REVISIONS):
             found = self._evidence(nu, inner, inner + R, weights)
             revised = self.noise.revised(found)
@@ -241,7 +241,7 @@ class MapFilter:
                 weights = self._robust.weight(t, dim=2)
             elif revised is None:
                 break
-            R = _spread(self.noise.observation if revised is None else revised, weights)
+            R = spread_over(self.noise.observation if revised is None else revised, weights)
         return R, weights
 
     def _gated(self, nu: Array, inner: Array, slots: NDArray[np.intp], gate: Gate) -> Array:
@@ -368,7 +368,7 @@ def _blocks(matrices: Array) -> Array:
     return np.asarray(np.einsum("bmimj->bmij", split))
 
 
-def _spread(observation: Array, weights: Array) -> Array:
+def spread_over(observation: Array, weights: Array) -> Array:
     """Return (B, 2 m, 2 m) with the covariance (B, 2, 2) over each weight (B, m) on its diagonal."""
     runs, m = weights.shape
     R = np.zeros((runs, m, 2, m, 2))
