@@ -49,8 +49,13 @@ class SlamFilter(Protocol):
     def predict(self, control: Array) -> None:
         """Move by controls (B, c)."""
 
-    def update(self, ids: Sequence[int], observed: Array) -> Update:
-        """Take ranges and bearings (B, m, 2) of landmarks; those not seen before are added."""
+    def update(
+        self, ids: Sequence[int], observed: Array, scale: Array | None = None
+    ) -> Update:
+        """Take ranges and bearings (B, m, 2) of landmarks; those not seen before are added.
+
+        ``scale`` (m, 2) multiplies the sigmas of each; None: by 1.
+        """
 
     @property
     def pose(self) -> Array:
@@ -176,17 +181,24 @@ class MapFilter:
         self._mean[:, :POSE] = moved
         self._move(by_pose, by_noise @ self.noise.control @ by_noise.mT)
 
-    def update(self, ids: Sequence[int], observed: Array) -> Update:
-        """Take ranges and bearings (B, m, 2) of landmarks; those not seen before are added."""
+    def update(
+        self, ids: Sequence[int], observed: Array, scale: Array | None = None
+    ) -> Update:
+        """Take ranges and bearings (B, m, 2) of landmarks; those not seen before are added.
+
+        ``scale`` (m, 2) multiplies the sigmas of each; None: by 1.
+        """
         known = np.array([i for i, name in enumerate(ids) if name in self._slot], dtype=np.intp)
         new = [i for i, name in enumerate(ids) if name not in self._slot]
         told = observed - self.noise.mean[:, None, :]
         runs = len(observed)
         found = Update(np.zeros(runs), np.zeros(runs), np.zeros((runs, 0)), known)
         if len(known):
-            found = self._correct([ids[i] for i in known], told[:, known], known)
+            own = None if scale is None else scale[known]
+            found = self._correct([ids[i] for i in known], told[:, known], known, own)
         if new:
-            self._augment([ids[i] for i in new], told[:, new])
+            own = np.ones((len(new), 2)) if scale is None else scale[new]
+            self._augment([ids[i] for i in new], told[:, new], own)
         return found
 
     def predicted(self, ids: Sequence[int]) -> tuple[Array, Array]:
@@ -201,12 +213,14 @@ class MapFilter:
         first = POSE + 2 * np.array([self._slot[name] for name in ids], dtype=np.intp)
         return (first[:, None] + np.arange(2)).ravel()
 
-    def _correct(self, ids: Sequence[int], told: Array, known: NDArray[np.intp]) -> Update:
+    def _correct(
+        self, ids: Sequence[int], told: Array, known: NDArray[np.intp], scale: Array | None
+    ) -> Update:
         seen = self._seen(ids, told)
         nu = told.reshape(len(told), -1) - seen.predicted
         nu[:, 1::2] = half_turn(nu[:, 1::2])
         slots = np.array([self._slot[name] for name in ids])
-        R, weights = self._weighed(nu, seen.inner, slots)
+        R, weights = self._weighed(nu, seen.inner, slots, scale)
         S = seen.inner + R
         gain_nu = np.linalg.solve(S, nu[..., None])
         self._apply((seen.PHt @ gain_nu)[..., 0])
@@ -223,30 +237,36 @@ class MapFilter:
     def _places(self, ids: Sequence[int]) -> Array:
         return self._mean[:, self._states(ids)].reshape(len(self._mean), -1, 2)
 
-    def _weighed(self, nu: Array, inner: Array, slots: NDArray[np.intp]) -> tuple[Array, Array]:
+    def _weighed(
+        self, nu: Array, inner: Array, slots: NDArray[np.intp], scale: Array | None
+    ) -> tuple[Array, Array]:
         """Return the covariance (B, 2 m, 2 m) of the observations and the weight of each."""
         runs, m = len(nu), nu.shape[1] // 2
         weights = np.ones((runs, m))
         if isinstance(self._robust, Gate):
-            weights = self._gated(nu, inner, slots, self._robust)
-        R = spread_over(self.noise.observation, weights)
+            weights = self._gated(nu, inner, slots, self._robust, scale)
+        R = spread_over(self.noise.observation, weights, scale)
         for _ in range(REVISIONS):
             found = self._evidence(nu, inner, inner + R, weights)
             revised = self.noise.revised(found)
             if isinstance(self._robust, Kernel):
                 # Of residual and variance after the update, in stated sigmas.
                 squares = found.residual[..., :, None] * found.residual[..., None, :]
-                inverse = np.linalg.inv(self.noise.observation)
-                t = np.einsum("bij,bmji->bm", inverse, squares + found.after)
+                inverse = np.linalg.inv(_scaled(self.noise.observation, m, scale))
+                t = np.einsum("bmij,bmji->bm", inverse, squares + found.after)
                 weights = self._robust.weight(t, dim=2)
             elif revised is None:
                 break
-            R = spread_over(self.noise.observation if revised is None else revised, weights)
+            R = spread_over(
+                self.noise.observation if revised is None else revised, weights, scale
+            )
         return R, weights
 
-    def _gated(self, nu: Array, inner: Array, slots: NDArray[np.intp], gate: Gate) -> Array:
+    def _gated(
+        self, nu: Array, inner: Array, slots: NDArray[np.intp], gate: Gate, scale: Array | None
+    ) -> Array:
         runs, m = len(nu), len(slots)
-        own = _blocks(inner) + self.noise.observation[:, None]
+        own = _blocks(inner) + _scaled(self.noise.observation, m, scale)
         v = nu.reshape(runs, m, 2)
         nis = np.einsum("bmi,bmi->bm", v, np.linalg.solve(own, v[..., None])[..., 0])
         limit = float(chi2.ppf(gate.confidence, 2))
@@ -305,7 +325,7 @@ class MapFilter:
         self._mean[:, : self._n] += step
         self._mean[:, 2] = half_turn(self._mean[:, 2])
 
-    def _augment(self, ids: Sequence[int], told: Array) -> None:
+    def _augment(self, ids: Sequence[int], told: Array, scale: Array) -> None:
         """Add landmarks where they were seen."""
         heading = self._mean[:, None, 2] + told[..., 1]
         c, s = np.cos(heading), np.sin(heading)
@@ -315,7 +335,8 @@ class MapFilter:
         by_pose[..., 0, 0] = by_pose[..., 1, 1] = 1.0
         by_pose[..., 0, 2], by_pose[..., 1, 2] = -r * s, r * c
         by_told = np.stack([np.stack([c, -r * s], axis=-1), np.stack([s, r * c], axis=-1)], axis=-2)
-        noise = by_told @ self.noise.observation[:, None] @ by_told.mT
+        R = _scaled(self.noise.observation, len(ids), scale)
+        noise = by_told @ R @ by_told.mT
         self._append(ids, places, by_pose, noise)
 
     # ---- how the covariance is kept ----
@@ -368,10 +389,17 @@ def _blocks(matrices: Array) -> Array:
     return np.asarray(np.einsum("bmimj->bmij", split))
 
 
-def spread_over(observation: Array, weights: Array) -> Array:
+def _scaled(observation: Array, m: int, scale: Array | None) -> Array:
+    """Return the covariance (B, 2, 2) for each of m observations, its sigmas scaled by (m, 2)."""
+    each = np.repeat(observation[:, None], m, axis=1)
+    return each if scale is None else each * (scale[:, :, None] * scale[:, None, :])
+
+
+def spread_over(observation: Array, weights: Array, scale: Array | None = None) -> Array:
     """Return (B, 2 m, 2 m) with the covariance (B, 2, 2) over each weight (B, m) on its diagonal."""
     runs, m = weights.shape
     R = np.zeros((runs, m, 2, m, 2))
     at = np.arange(m)
-    R[:, at, :, at] = np.moveaxis(observation[:, None] / weights[..., None, None], 1, 0)
+    each = _scaled(observation, m, scale) / weights[..., None, None]
+    R[:, at, :, at] = np.moveaxis(each, 1, 0)
     return R.reshape(runs, 2 * m, 2 * m)

@@ -34,6 +34,7 @@ from ssm_graph.systems.landmark_slam.smoother import (
     Values,
     one_pass,
     smooth_landmarks,
+    with_drift,
 )
 from ssm_graph.systems.landmark_slam.weights import square_share
 
@@ -49,8 +50,6 @@ WEIGHTS_NEAR: Final = 0.2
 """Change of a weight in a pass below which medians are taken."""
 MEDIAN_SETTLED: Final = 0.05
 """Logarithm of the factor on a sigma at which medians have told what they can."""
-LARGEST_SHARE: Final = 0.8
-"""Of a row's variance that its fit is believed to have taken."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +58,11 @@ class NoiseSettings:
 
     rounds: int = 30
     """Solutions of the log at most."""
+    median_rounds: int = 8
+    """Of these, for the medians."""
+    learns_control: bool = True
+    """False keeps the noise of the motion as stated, and learns that of the observations alone.
+    Where errors of successive observations are alike, they would be told for noise of the motion."""
 
 
 class SigmaFound(NamedTuple):
@@ -90,7 +94,7 @@ def estimate_noise(
     smoother, limits = settings or SmootherSettings(), how or NoiseSettings()
     gated = replace(smoother, kernel=TruncatedKernel(GATE))
     state = _Rounds(problem, stated, first)
-    for _ in range(limits.rounds):
+    for _ in range(limits.median_rounds):
         found = state.go(smoother)
         if found.update_sigmas < 1.0 and found.weight_change < WEIGHTS_NEAR:
             ratio = np.sqrt(_median_ratio(found))
@@ -105,6 +109,8 @@ def estimate_noise(
             continue
         past.append(np.log(_variances(state.noise)))
         wanted = np.log(_variances(_maximised(problem, state.noise, found, gated)))
+        if not limits.learns_control:
+            wanted[: len(stated.control)] = past[-1][: len(stated.control)]
         wanted = past[-1] + np.clip(wanted - past[-1], -np.log(MOST_CHANGE), np.log(MOST_CHANGE))
         is_settled = bool(np.max(np.abs(wanted - past[-1])) < SETTLED_LOG)
         past.append(wanted)
@@ -123,7 +129,8 @@ class _Rounds:
     """Where the rounds have got."""
 
     def __init__(self, problem: SlamProblem, noise: SlamNoise, values: Values) -> None:
-        self._problem, self.noise, self.values = problem, noise, values
+        self._problem, self.noise = problem, noise
+        self.values = with_drift(problem, values)
         self.weights = np.ones(len(problem.keyframe))
         self._step_weights = np.ones(len(problem.control))
         self.count = 0
@@ -145,13 +152,14 @@ class _Rounds:
 def _median_ratio(found: Pass) -> Array:
     """Return by what the variances of range and bearing have to be multiplied to fit medians."""
     is_there = np.abs(found.rows.own).sum(axis=2) > 0.0
-    squares = found.rows.own_error**2
-    # A residual has the variance of the noise less what the fit has taken.
-    left = 1.0 - np.minimum(found.expected.own - squares, LARGEST_SHARE)
+    # Of a row whose fit has taken the share h of its variance, r^2 is (1 - h) chi-square and
+    # H P H' is h: so far that is what the median of their sum should be.
+    share = np.clip(found.expected.own - found.rows.own_error**2, 0.0, 1.0)
+    expected = (1.0 - share) * chi2.median(1) + share
     ratio = np.ones(2)
     for i in range(2):
         if is_there[:, i].any():
-            told = np.median((squares / left)[is_there[:, i], i]) / chi2.median(1)
+            told = np.median((found.expected.own / expected)[is_there[:, i], i])
             ratio[i] = np.clip(told, 1.0 / MOST_CHANGE**2, MOST_CHANGE**2)
     return ratio
 

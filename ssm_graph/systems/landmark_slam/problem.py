@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
@@ -37,6 +37,11 @@ class SlamProblem(ReadOnlyArrays):
     """(3,) pose of the first keyframe, m, m, rad: the frame of the map."""
     start_sigma: Array
     """(3,)"""
+    drift_sigma: Array = field(default_factory=lambda: np.zeros(0))
+    """(3,) of what odometry may be wrong by all along: share of the distance, share of the turn, rad/s
+    of turn. No rows: nothing."""
+    observation_scale: Array | None = None
+    """(M, 2) by which the sigmas of each observation are multiplied; None: by 1."""
 
     def __post_init__(self) -> None:
         n = len(self.time_s)
@@ -54,14 +59,34 @@ class SlamProblem(ReadOnlyArrays):
         """(K + 1,) where the observations of each keyframe begin, and M."""
         return np.searchsorted(self.keyframe, np.arange(len(self.time_s) + 1))
 
+    @property
+    def scales(self) -> Array:
+        """(M, 2) by which the sigmas of each observation are multiplied."""
+        if self.observation_scale is None:
+            return np.ones((len(self.keyframe), 2))
+        return self.observation_scale
+
+    def steps(self, drift: Array | None = None) -> Array:
+        """Return the increments (K - 1, 3) of odometry, put right by a drift (3,) or by none."""
+        q = len(self.motion.labels)
+        step = self.motion.increment(self.control, np.zeros((len(self.control), q)))
+        if drift is not None and len(drift):
+            step = step + (self.drift_slopes(step) @ drift[:, None])[..., 0]
+        return step
+
+    def drift_slopes(self, step: Array) -> Array:
+        """Return how increments (K - 1, 3) follow the drift, (K - 1, 3, 3)."""
+        slopes = np.zeros((len(step), 3, 3))
+        slopes[:, :2, 0] = step[:, :2]
+        slopes[:, 2, 1] = step[:, 2]
+        slopes[:, 2, 2] = np.diff(self.time_s)
+        return slopes
+
     def dead_reckoned(self) -> Array:
         """Return poses (K, 3) by odometry alone."""
         poses = np.empty((len(self.time_s), 3))
         poses[0] = self.start
-        steps = self.motion.increment(
-            self.control, np.zeros((len(self.control), len(self.motion.labels)))
-        )
-        for k, step in enumerate(steps):
+        for k, step in enumerate(self.steps()):
             poses[k + 1] = composed(poses[k], step)
         return poses
 
@@ -74,6 +99,9 @@ class SlamProblem(ReadOnlyArrays):
             keyframe=self.keyframe[kept],
             measured=self.measured[kept],
             names=names,
+            observation_scale=None
+            if self.observation_scale is None
+            else self.observation_scale[kept],
         )
 
 
@@ -124,4 +152,6 @@ class SlamEstimate(ReadOnlyArrays):
     """That was used."""
     status: SlamStatus
     n_iterations: int
+    drift: Array
+    """(3,) of the odometry, or no rows: see `SlamProblem.drift_sigma`."""
     notes: tuple[str, ...] = ()

@@ -54,6 +54,8 @@ class Values(NamedTuple):
     """(K, 3)"""
     landmarks: Array
     """(L, 2)"""
+    drift: Array = np.zeros(0)  # noqa: RUF012
+    """(3,) of the odometry, or no rows"""
 
 
 class Rows(NamedTuple):
@@ -63,6 +65,8 @@ class Rows(NamedTuple):
     """(K - 1, 3, 6) by the poses of both ends"""
     between_error: Array
     """(K - 1, 3)"""
+    between_drift: Array
+    """(K - 1, 3, c) by the drift of the odometry"""
     own: Array
     """(M, 2, 5) by pose and landmark; zero where nothing was measured"""
     own_error: Array
@@ -86,9 +90,7 @@ def linearised(problem: SlamProblem, noise: SlamNoise, values: Values) -> Rows:
     basis = problem.motion.basis(problem.control) * noise.control
     cov = basis @ basis.mT + RIGID**2 * np.eye(3)
     white = np.linalg.inv(np.linalg.cholesky(cov))
-    step = problem.motion.increment(
-        problem.control, np.zeros((len(problem.control), len(noise.control)))
-    )
+    step = problem.steps(values.drift)
     moved = between(pose[:-1], pose[1:])
     error = moved - step
     error[:, 2] = half_turn(error[:, 2])
@@ -99,11 +101,12 @@ def linearised(problem: SlamProblem, noise: SlamNoise, values: Values) -> Rows:
         pose[problem.keyframe], values.landmarks[problem.landmark], measured=problem.measured
     )
     is_there = np.isfinite(own.error)
-    scale = is_there / noise.observation
+    scale = is_there / (noise.observation * problem.scales)
     slopes = np.concatenate([own.error_D_pose, own.error_D_landmark], axis=2) * scale[..., None]
     return Rows(
         white @ np.concatenate([to_first, back], axis=2),
         (white @ error[..., None])[..., 0],
+        -white @ problem.drift_slopes(problem.steps())[..., : len(values.drift)],
         slopes,
         np.where(is_there, own.error, 0.0) * scale,
         is_there.sum(axis=1).astype(np.float64),
@@ -114,8 +117,8 @@ def eliminated(
     problem: SlamProblem, rows: Rows, weights: Array, step_weights: Array, values: Values
 ) -> ChainSolution:
     """Return the solution of the weighted linear problem."""
-    n_landmarks = len(values.landmarks)
-    size = 2 * n_landmarks
+    n_drift, places = len(values.drift), 2 * len(values.landmarks)
+    size = places + n_drift
     chain = Chain(3, size)
     own = np.zeros((*rows.own.shape[:2], 3 + size + 1))
     at = 3 + 2 * problem.landmark[:, None] + np.arange(2)
@@ -130,6 +133,7 @@ def eliminated(
     wide = np.zeros((len(rows.between), 3, 6 + size + 1))
     root = np.sqrt(step_weights)[:, None, None]
     wide[..., :6] = root * rows.between
+    wide[..., 6 + places : -1] = root * rows.between_drift
     wide[..., -1] = -root[..., 0] * rows.between_error
     prior = np.zeros((3, 3 + size + 1))
     prior[:, :3] = np.diag(1.0 / problem.start_sigma)
@@ -137,7 +141,11 @@ def eliminated(
     off[2] = half_turn(off[2])
     prior[:, -1] = off / problem.start_sigma
     chain.eliminate(prior, of_each, wide, begin=0)
-    return chain.solve(np.hstack([np.eye(size), np.zeros((size, 1))]) / FAR_M)
+    border = np.zeros((size, size + 1))
+    border[:places, :places] = np.eye(places) / FAR_M
+    border[places:, places:size] = np.diag(1.0 / problem.drift_sigma)
+    border[places:, -1] = -values.drift / problem.drift_sigma
+    return chain.solve(border)
 
 
 def marginals(problem: SlamProblem, rows: Rows, solution: ChainSolution) -> Marginals:
@@ -152,12 +160,17 @@ def marginals(problem: SlamProblem, rows: Rows, solution: ChainSolution) -> Marg
     inner += 2.0 * np.einsum("mri,mij,mrj->mr", pose, cross, place, optimize=True)
     own_cov = P[at[:, :, None], at[:, None]]
     inner += np.einsum("mri,mij,mrj->mr", place, own_cov, place, optimize=True)
-    both = np.empty((len(rows.between), 6, 6))
-    both[:, :3, :3], both[:, 3:, 3:] = pose_cov[:-1], pose_cov[1:]
-    both[:, :3, 3:] = through[:-1] @ solution.sensitivity[1:].mT
-    both[:, :3, 3:] -= solution.gain[:-1] @ solution.conditional[1:]
-    both[:, 3:, :3] = both[:, :3, 3:].mT
-    spread = rows.between @ both @ rows.between.mT
+    c = rows.between_drift.shape[2]
+    both = np.empty((len(rows.between), 6 + c, 6 + c))
+    both[:, :3, :3], both[:, 3:6, 3:6] = pose_cov[:-1], pose_cov[1:]
+    both[:, :3, 3:6] = through[:-1] @ solution.sensitivity[1:].mT
+    both[:, :3, 3:6] -= solution.gain[:-1] @ solution.conditional[1:]
+    both[:, 3:6, :3] = both[:, :3, 3:6].mT
+    own_drift = slice(P.shape[0] - c, None)
+    both[:, :3, 6:], both[:, 3:6, 6:] = through[:-1, :, own_drift], through[1:, :, own_drift]
+    both[:, 6:, :6], both[:, 6:, 6:] = both[:, :6, 6:].mT, P[own_drift, own_drift]
+    slopes = np.concatenate([rows.between, rows.between_drift], axis=2)
+    spread = slopes @ both @ slopes.mT
     e = rows.between_error
     return Marginals(rows.own_error**2 + inner, e[:, :, None] * e[:, None, :] + spread)
 
@@ -208,7 +221,13 @@ def one_pass(
 def _moved(values: Values, solution: ChainSolution, share: float) -> Values:
     pose = values.pose + share * solution.step
     pose[:, 2] = half_turn(pose[:, 2])
-    return Values(pose, values.landmarks + share * solution.constants_step.reshape(-1, 2))
+    places = values.landmarks.size
+    constants = share * solution.constants_step
+    return Values(
+        pose,
+        values.landmarks + constants[:places].reshape(-1, 2),
+        values.drift + constants[places:],
+    )
 
 
 def _cost(
@@ -218,7 +237,8 @@ def _cost(
     off[2] = half_turn(off[2])
     squares = weights @ np.sum(rows.own_error**2, axis=1)
     squares += step_weights @ np.sum(rows.between_error**2, axis=1)
-    return float(squares + np.sum((off / problem.start_sigma) ** 2))
+    prior = np.concatenate([off / problem.start_sigma, values.drift / problem.drift_sigma])
+    return float(squares + prior @ prior)
 
 
 def smooth_landmarks(
@@ -240,7 +260,7 @@ def smooth_landmarks(
     weights : (M,) of the first pass; ones if None.
     """
     how = settings or SmootherSettings()
-    values, is_settled, count = first, False, 0
+    values, is_settled, count = with_drift(problem, first), False, 0
     w = np.ones(len(problem.keyframe)) if weights is None else weights
     step_w = np.ones(len(problem.control))
     while not is_settled and count < how.max_iterations:
@@ -253,12 +273,17 @@ def smooth_landmarks(
     return estimate_of(problem, noise, found, status, count)
 
 
+def with_drift(problem: SlamProblem, values: Values) -> Values:
+    """Return values with a drift of the odometry where the problem has one."""
+    return values if len(values.drift) else values._replace(drift=np.zeros(len(problem.drift_sigma)))
+
+
 def estimate_of(
     problem: SlamProblem, noise: SlamNoise, found: Pass, status: SlamStatus, count: int
 ) -> SlamEstimate:
     """Return a pass as an answer."""
     L = len(found.values.landmarks)
-    P = found.solution.constants_cov.reshape(L, 2, L, 2)
+    P = found.solution.constants_cov[: 2 * L, : 2 * L].reshape(L, 2, L, 2)
     at = np.arange(L)
     seen = np.bincount(problem.landmark, minlength=L)
     once = [problem.names[i] for i in np.flatnonzero(seen == 1)]
@@ -274,5 +299,6 @@ def estimate_of(
         noise,
         status,
         count,
+        found.values.drift,
         note,
     )

@@ -247,7 +247,9 @@ def filtered_values(problem: SlamProblem, noise: SlamNoise, method: str = "ekf-w
             slam.predict(problem.control[k - 1][None])
         rows = [i for i in range(first[k], first[k + 1]) if is_whole[i]]
         if rows:
-            slam.update(problem.landmark[rows].tolist(), problem.measured[rows][None])
+            slam.update(
+                problem.landmark[rows].tolist(), problem.measured[rows][None], problem.scales[rows]
+            )
         pose[k] = slam.pose[0]
     assert isinstance(slam, MapFilter)
     places = np.zeros((len(problem.names), 2))

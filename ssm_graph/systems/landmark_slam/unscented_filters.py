@@ -85,11 +85,11 @@ class UnscentedFilter(MapFilter):
         )
         return Linear(found.mean, slopes, found.cov - slopes @ cov @ slopes.mT)
 
-    def _augment(self, ids: Sequence[int], told: Array) -> None:
+    def _augment(self, ids: Sequence[int], told: Array, scale: Array) -> None:
         """Add landmarks where they were seen, by the points of pose, range and bearing."""
         places, by_pose, noises = [], [], []
         for i in range(len(ids)):
-            mean, cov = self._with_noise(self.noise.observation)
+            mean, cov = self._with_noise(self.noise.observation * np.outer(scale[i], scale[i]))
             mean[:, POSE:] = told[:, i]
             found, slopes = self._transform(place_of_seen, mean, cov, np.subtract)
             own = slopes[..., :POSE]
