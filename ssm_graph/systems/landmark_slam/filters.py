@@ -49,9 +49,7 @@ class SlamFilter(Protocol):
     def predict(self, control: Array) -> None:
         """Move by controls (B, c)."""
 
-    def update(
-        self, ids: Sequence[int], observed: Array, scale: Array | None = None
-    ) -> Update:
+    def update(self, ids: Sequence[int], observed: Array, scale: Array | None = None) -> Update:
         """Take ranges and bearings (B, m, 2) of landmarks; those not seen before are added.
 
         ``scale`` (m, 2) multiplies the sigmas of each; None: by 1.
@@ -181,9 +179,7 @@ class MapFilter:
         self._mean[:, :POSE] = moved
         self._move(by_pose, by_noise @ self.noise.control @ by_noise.mT)
 
-    def update(
-        self, ids: Sequence[int], observed: Array, scale: Array | None = None
-    ) -> Update:
+    def update(self, ids: Sequence[int], observed: Array, scale: Array | None = None) -> Update:
         """Take ranges and bearings (B, m, 2) of landmarks; those not seen before are added.
 
         ``scale`` (m, 2) multiplies the sigmas of each; None: by 1.
@@ -257,9 +253,7 @@ class MapFilter:
                 weights = self._robust.weight(t, dim=2)
             elif revised is None:
                 break
-            R = spread_over(
-                self.noise.observation if revised is None else revised, weights, scale
-            )
+            R = spread_over(self.noise.observation if revised is None else revised, weights, scale)
         return R, weights
 
     def _gated(

@@ -74,7 +74,9 @@ def check_times(name: str, time_s: Array, *, may_repeat: bool) -> None:
     if len(time_s) < 2 and name != "seen_s":
         raise DataError(f"{name}: expected 2 rows or more, got {len(time_s)}; is the table empty?")
     if not np.all(np.isfinite(time_s)):
-        raise DataError(f"{name}: expected finite times, got NaN in row {_first(~np.isfinite(time_s))}")
+        raise DataError(
+            f"{name}: expected finite times, got NaN in row {_first(~np.isfinite(time_s))}"
+        )
     steps = np.diff(time_s)
     bad = steps < 0.0 if may_repeat else steps <= 0.0
     if bad.any():

@@ -82,7 +82,9 @@ FILTERS: Final[Mapping[str, FilterMethod]] = {
     "invariant-weighted": FilterMethod(
         "right-invariant filter with similarity weights", InvariantFilter, robust=LogKernel(5.0)
     ),
-    "ukf-told": FilterMethod("unscented filter that knows the noise", UnscentedFilter, is_told=True),
+    "ukf-told": FilterMethod(
+        "unscented filter that knows the noise", UnscentedFilter, is_told=True
+    ),
 }
 SMOOTHERS: Final[Mapping[str, str]] = {
     "smoother": "whole log, similarity weights, stated noise",

@@ -119,9 +119,7 @@ def estimate_noise(
             past = []
         state.noise = _noise_of(wanted, len(stated.control))
     told = _told(problem, stated, state.noise, found)
-    estimate = smooth_landmarks(
-        problem, state.noise, state.values, smoother, weights=state.weights
-    )
+    estimate = smooth_landmarks(problem, state.noise, state.values, smoother, weights=state.weights)
     return NoiseFound(estimate, told, state.count, is_settled)
 
 

@@ -83,7 +83,10 @@ class InvariantFilter(MapFilter):
         values = self._mean[:, : self._n]
         follows = np.zeros_like(values)
         follows[:, 0], follows[:, 1] = -values[:, 1], values[:, 0]
-        follows[:, POSE::2], follows[:, POSE + 1 :: 2] = -values[:, POSE + 1 :: 2], values[:, POSE::2]
+        follows[:, POSE::2], follows[:, POSE + 1 :: 2] = (
+            -values[:, POSE + 1 :: 2],
+            values[:, POSE::2],
+        )
         return follows[:, states]
 
     def _swing_pose(self, sign: float) -> None:

@@ -104,7 +104,9 @@ def read_graph(path: Path) -> tuple[SlamProblem, SlamNoise]:
             elif words[0] == "LANDMARK":
                 seen.append(cells[:4] + [cells[4]])
         except (ValueError, IndexError) as error:
-            raise DataError(f"{path}:{number}: expected ODOMETRY or LANDMARK, got {text!r}") from error
+            raise DataError(
+                f"{path}:{number}: expected ODOMETRY or LANDMARK, got {text!r}"
+            ) from error
     if not steps or not seen:
         raise DataError(f"{path}: expected rows ODOMETRY and LANDMARK, got none of one of them")
     moves, marks = np.array(steps), np.array(seen)

@@ -275,7 +275,9 @@ def smooth_landmarks(
 
 def with_drift(problem: SlamProblem, values: Values) -> Values:
     """Return values with a drift of the odometry where the problem has one."""
-    return values if len(values.drift) else values._replace(drift=np.zeros(len(problem.drift_sigma)))
+    return (
+        values if len(values.drift) else values._replace(drift=np.zeros(len(problem.drift_sigma)))
+    )
 
 
 def estimate_of(

@@ -22,6 +22,7 @@ from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.units import DEGREE
 from ssm_graph.study.ledger import Key, Row
+from ssm_graph.systems.landmark_slam.filtered import filtered, values_of
 from ssm_graph.systems.landmark_slam.filters import MapFilter
 from ssm_graph.systems.landmark_slam.methods import FILTERS, SMOOTHERS, check_method
 from ssm_graph.systems.landmark_slam.models import Bicycle
@@ -38,11 +39,13 @@ from ssm_graph.systems.landmark_slam.simulator import (
     simulate,
     true_sigmas,
 )
-from ssm_graph.systems.landmark_slam.smoother import SmootherSettings, Values, smooth_landmarks
+from ssm_graph.systems.landmark_slam.smoother import SmootherSettings, smooth_landmarks
 
 STUDY_CASES: Final = ("stated", "G1", "U1", "E1", "A1", "R3", "Q3")
 BATCH: Final = 25
 """Runs that go through a filter together."""
+FIRST: Final = "ekf-weighted"
+"""Filter at whose answer a smoother begins."""
 CURVE_POINTS: Final = 200
 FIRST_SEED: Final = 1000
 """Of those reported; settings were chosen on seeds below 100."""
@@ -168,7 +171,9 @@ def filtered_scores(path: Path, runs: Runs, case: NoiseCase, method: str) -> Sco
     truth = true_sigmas(Sigmas(), case)
     relative = np.hstack(ends) / np.concatenate([truth.control, truth.observation])
     error = _pose_error(poses, path)
-    return _scores(error, covs, np.array(map_error), nis / np.maximum(dof, 1.0), slam.n_repaired, relative)
+    return _scores(
+        error, covs, np.array(map_error), nis / np.maximum(dof, 1.0), slam.n_repaired, relative
+    )
 
 
 def _map_error(slam: Any, seen: Sequence[int], path: Path, count: int) -> Array:
@@ -228,35 +233,6 @@ def problem_of_run(path: Path, runs: Runs, run: int) -> tuple[SlamProblem, NDArr
     return problem, ids
 
 
-def filtered_values(problem: SlamProblem, noise: SlamNoise, method: str = "ekf-weighted") -> Values:
-    """Return where a smoother begins: the path and the map of a filter."""
-    slam = FILTERS[method].begin(
-        problem.motion,
-        noise.control,
-        noise.observation,
-        problem.start[None],
-        capacity=len(problem.names),
-        start_cov=np.diag(problem.start_sigma**2),
-    )
-    pose = np.empty((len(problem.time_s), 3))
-    pose[0] = problem.start
-    first = problem.first_of.tolist()
-    is_whole = np.isfinite(problem.measured).all(axis=1)
-    for k in range(len(pose)):
-        if k > 0:
-            slam.predict(problem.control[k - 1][None])
-        rows = [i for i in range(first[k], first[k + 1]) if is_whole[i]]
-        if rows:
-            slam.update(
-                problem.landmark[rows].tolist(), problem.measured[rows][None], problem.scales[rows]
-            )
-        pose[k] = slam.pose[0]
-    assert isinstance(slam, MapFilter)
-    places = np.zeros((len(problem.names), 2))
-    places[list(slam.ids)] = slam.landmarks()[0]
-    return Values(pose, places)
-
-
 def smoothed_scores(path: Path, runs: Runs, case: NoiseCase, method: str) -> Scores:
     """Smooth each run of a batch."""
     count, truth = runs.control.shape[1], true_sigmas(Sigmas(), case)
@@ -269,11 +245,15 @@ def smoothed_scores(path: Path, runs: Runs, case: NoiseCase, method: str) -> Sco
             gross = np.concatenate([mark[b] for mark in runs.is_gross])
             problem = problem.associated(np.where(gross, -1, problem.landmark), problem.names)
             settings = SmootherSettings(GaussianKernel())
-            answer = smooth_landmarks(problem, noise, filtered_values(problem, noise), settings)
+            answer = smooth_landmarks(
+                problem, noise, values_of(filtered(problem, noise, FIRST)), settings
+            )
         elif method == "smoother-em":
-            answer = estimate_noise(problem, noise, filtered_values(problem, noise)).estimate
+            answer = estimate_noise(
+                problem, noise, values_of(filtered(problem, noise, FIRST))
+            ).estimate
         else:
-            answer = smooth_landmarks(problem, noise, filtered_values(problem, noise))
+            answer = smooth_landmarks(problem, noise, values_of(filtered(problem, noise, FIRST)))
         errors.append(_pose_error(answer.pose[1:, None], path))
         covs.append(answer.pose_cov[1:, None])
         maps.append(np.linalg.norm(answer.landmarks - path.landmarks[ids], axis=1).mean())

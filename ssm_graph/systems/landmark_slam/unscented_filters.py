@@ -80,9 +80,7 @@ class UnscentedFilter(MapFilter):
         del told
         cov, width = self._block(states), len(states) - POSE
         difference = _angle_at(*range(1, width, 2), width=width)
-        found, slopes = self._transform(
-            observe_landmarks, self._mean[:, states], cov, difference
-        )
+        found, slopes = self._transform(observe_landmarks, self._mean[:, states], cov, difference)
         return Linear(found.mean, slopes, found.cov - slopes @ cov @ slopes.mT)
 
     def _augment(self, ids: Sequence[int], told: Array, scale: Array) -> None:
