@@ -26,7 +26,7 @@ Finished batches of runs are kept: interrupted and started again, only what is m
 
 files in DIR:
   trials.jsonl    finished batches; from here an interrupted study goes on
-  summary.md      what reproduces and what does not, in words; tables with intervals and paired tests
+  summary.md      what reproduces and what does not; tables with intervals and paired tests
   figures/*.png   figures 2 to 13 of the paper
 
 cases: stated, G1, U1, E1, A1, R3, Q3 (the study), gross10, gross30; docs/landmark-slam.md

@@ -1,9 +1,9 @@
 """Noise that a filter learns on its way: laws by which R and Q follow innovations and residuals.
 
-With the innovation ``d = z - h(x-)``, the residual ``e = z - h(x+)`` and ``H P H'`` before and after
-the update, an optimal filter has ``E[d d'] = H P- H' + R`` and ``E[e e'] = R - H P+ H'``. Noise of
-the control is scaled as a whole; that of observations is one covariance for all of a kind. Every
-law follows B runs at once.
+With the innovation ``d = z - h(x-)``, the residual ``e = z - h(x+)`` and ``H P H'`` before and
+after the update, an optimal filter has ``E[d d'] = H P- H' + R`` and ``E[e e'] = R - H P+ H'``.
+Noise of the control is scaled as a whole; that of observations is one covariance for all of a kind.
+Every law follows B runs at once.
 
 References
 ----------
@@ -159,9 +159,9 @@ class LiteralScaling(NoiseLaw):
     """Equations (9) to (16) of [3]_, of which the window is not told.
 
     ``R(k)`` is the covariance of the residuals in the window plus ``H P+ H'`` of the step; ``Q`` is
-    multiplied by ``sqrt(beta)`` at every step, ``beta = tr(C_d - R) / tr(H P- H')``. Observations of
-    all landmarks are pooled. Where ``beta`` is not positive ``Q`` stays; before the window is full
-    all stays.
+    multiplied by ``sqrt(beta)`` at every step, ``beta = tr(C_d - R) / tr(H P- H')``. Observations
+    of all landmarks are pooled. Where ``beta`` is not positive ``Q`` stays; before the window is
+    full all stays.
     """
 
     window: int = 30
@@ -204,7 +204,8 @@ class GuardedScaling(NoiseLaw):
 
     ``R`` is the mean of ``e e' + H P+ H'`` over the window, with the stated one as so many
     observations. ``Q`` moves only while the window's NIS lies outside its band, by a factor
-    ``sqrt(beta)``, ``beta = tr(R^-1 (C_d - R)) / tr(R^-1 H P- H')``, within limits; units do not mix.
+    ``beta = tr(R^-1 (C_d - R)) / tr(R^-1 H P- H')`` to the power of one over the window, within
+    limits; units do not mix.
     """
 
     window: int = 200

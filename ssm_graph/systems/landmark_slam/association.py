@@ -97,13 +97,14 @@ def associate(
         start_cov=np.diag(problem.start_sigma**2),
     )
     assert isinstance(slam, MapFilter)
+    moving = problem.with_drift_as_noise(noise)
     found = np.full(len(problem.keyframe), UNKNOWN, dtype=np.intp)
     pose = np.empty((len(problem.time_s), 3))
     waiting: list[_Provisional] = []
     first = problem.first_of.tolist()
     for k in range(len(pose)):
         if k > 0:
-            slam.predict(problem.control[k - 1][None])
+            slam.predict(moving.control[k - 1][None])
         rows = np.arange(first[k], first[k + 1])
         rows = rows[np.isfinite(problem.measured[rows]).all(axis=1)]
         if len(rows):
@@ -219,7 +220,7 @@ def _sighted(
 ) -> list[tuple[int, int]]:
     """Take what may be new; return the pairs of landmarks that join the map now."""
     waiting[:] = [one for one in waiting if k - one.last <= how.provisional_poses]
-    joined = []
+    joined: list[tuple[int, int]] = []
     if not fresh:
         return joined
     for row, place in zip(fresh, _places(slam, problem.measured[fresh]), strict=True):

@@ -23,6 +23,7 @@ def values_of(answer: SlamEstimate) -> Values:
 
 def filtered(problem: SlamProblem, noise: SlamNoise, method: str) -> SlamEstimate:
     """Return what a filter says at every pose, with its map at the end."""
+    moving = problem.with_drift_as_noise(noise)
     slam = FILTERS[method].begin(
         problem.motion,
         noise.control,
@@ -38,7 +39,7 @@ def filtered(problem: SlamProblem, noise: SlamNoise, method: str) -> SlamEstimat
     is_whole = np.isfinite(problem.measured).all(axis=1)
     for k in range(K):
         if k > 0:
-            slam.predict(problem.control[k - 1][None])
+            slam.predict(moving.control[k - 1][None])
         rows = [i for i in range(first[k], first[k + 1]) if is_whole[i]]
         if rows:
             names = problem.landmark[rows].tolist()

@@ -32,7 +32,7 @@ REVISIONS: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """A chi-square gate on each observation, which opens for a landmark that is refused for long."""
+    """A chi-square gate on each observation; it opens for a landmark that is refused for long."""
 
     confidence: float = 0.999
     """Share of good observations that pass; 13.8 for two rows."""
@@ -57,11 +57,11 @@ class SlamFilter(Protocol):
 
     @property
     def pose(self) -> Array:
-        """(B, 3) m, m, rad"""
+        """(B, 3) m, m, rad."""
 
     @property
     def pose_cov(self) -> Array:
-        """(B, 3, 3)"""
+        """(B, 3, 3)."""
 
     def landmark(self, name: int) -> tuple[Array, Array]:
         """Return place (B, 2) and covariance (B, 2, 2) of a landmark."""
@@ -141,12 +141,12 @@ class MapFilter:
 
     @property
     def pose(self) -> Array:
-        """(B, 3) m, m, rad"""
+        """(B, 3) m, m, rad."""
         return self._mean[:, :POSE]
 
     @property
     def pose_cov(self) -> Array:
-        """(B, 3, 3)"""
+        """(B, 3, 3)."""
         return self._block(np.arange(POSE))
 
     @property
@@ -156,12 +156,12 @@ class MapFilter:
 
     @property
     def mean(self) -> Array:
-        """(B, n)"""
+        """(B, n)."""
         return self._mean[:, : self._n]
 
     @property
     def cov(self) -> Array:
-        """(B, n, n)"""
+        """(B, n, n)."""
         return self._block(np.arange(self._n))
 
     def landmark(self, name: int) -> tuple[Array, Array]:
@@ -267,7 +267,7 @@ class MapFilter:
         is_far = nis > limit
         opens = is_far & (self._refused[:, slots] >= gate.reacquire)
         self._refused[:, slots] = np.where(is_far & ~opens, self._refused[:, slots] + 1, 0)
-        return np.where(opens, limit / nis, np.where(is_far, LEFT_OUT, 1.0))
+        return np.where(opens, limit / np.maximum(nis, limit), np.where(is_far, LEFT_OUT, 1.0))
 
     def _evidence(self, nu: Array, inner: Array, S: Array, weights: Array) -> Evidence:
         """Return what follows if the update is linear."""
@@ -356,7 +356,7 @@ class MapFilter:
         self._cov[:, : self._n, : self._n] -= half.mT @ half
 
     def _append(self, ids: Sequence[int], places: Array, by_pose: Array, noise: Array) -> None:
-        """Add landmarks (B, m, 2) with slopes (B, m, 2, 3) to the pose and own noise (B, m, 2, 2)."""
+        """Add landmarks (B, m, 2) with slopes (B, m, 2, 3) by the pose and noise (B, m, 2, 2)."""
         begin, m = self._n, len(ids)
         new = slice(begin, begin + 2 * m)
         slopes = by_pose.reshape(len(places), 2 * m, POSE)
@@ -390,7 +390,7 @@ def _scaled(observation: Array, m: int, scale: Array | None) -> Array:
 
 
 def spread_over(observation: Array, weights: Array, scale: Array | None = None) -> Array:
-    """Return (B, 2 m, 2 m) with the covariance (B, 2, 2) over each weight (B, m) on its diagonal."""
+    """Return (B, 2 m, 2 m): the covariance (B, 2, 2) over each weight (B, m) on the diagonal."""
     runs, m = weights.shape
     R = np.zeros((runs, m, 2, m, 2))
     at = np.arange(m)

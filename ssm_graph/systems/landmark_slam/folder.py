@@ -86,10 +86,10 @@ def read_landmark_folder(folder: Path) -> LandmarkLog:
     seen = _table(folder, read["observations"], OBSERVATIONS)
     truth = _table(folder, read["truth"], TRUTH) if "truth" in read else None
     noise, grows = _noise(read["odometry"], read["observations"])
-    side = odometry["side_speed_m_per_s"] if "side_speed_m_per_s" in odometry else 0.0
+    side = odometry.columns.get("side_speed_m_per_s", np.zeros(len(odometry)))
     return LandmarkLog(
         odometry.time_s,
-        np.column_stack([odometry["speed_m_per_s"], side + np.zeros(len(odometry))]),
+        np.column_stack([odometry["speed_m_per_s"], side]),
         odometry["turn_rate_deg_per_s"] * DEGREE,
         seen.time_s,
         np.column_stack([seen["range_m"], seen["bearing_deg"] * DEGREE]),

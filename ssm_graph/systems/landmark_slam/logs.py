@@ -47,7 +47,7 @@ class LandmarkLog(ReadOnlyArrays):
     landmark: NDArray[np.intp]
     """(M,) name of each, a number; `UNKNOWN` where it has none."""
     noise: SlamNoise
-    """Stated: forward, sideways [m/sqrt(s)], turn [rad/sqrt(s)]; range [m, or m a metre], bearing."""
+    """Forward, sideways [m/sqrt(s)], turn [rad/sqrt(s)]; range [m, or m a metre], bearing [rad]."""
     truth_s: Array
     """(T,)"""
     truth: Array
@@ -82,8 +82,8 @@ def check_times(name: str, time_s: Array, *, may_repeat: bool) -> None:
     if bad.any():
         row = int(np.argmax(bad)) + 1
         raise DataError(
-            f"{name}: time goes from {time_s[row - 1]:.3f} to {time_s[row]:.3f} s in row {row + 1}; "
-            "expected increasing times; sort the rows, or cut the log there"
+            f"{name}: time goes from {time_s[row - 1]:.3f} to {time_s[row]:.3f} s in row "
+            f"{row + 1}; expected increasing times; sort the rows, or cut the log there"
         )
 
 
@@ -96,8 +96,8 @@ def check_observations(seen: Array) -> None:
     if np.any(r <= 0.0) or np.isinf(seen).any():
         bad = (r <= 0.0) | np.isinf(seen).any(axis=1)
         raise DataError(
-            f"observations: row {_first(bad)}: expected a range above 0 m, got {r[np.argmax(bad)]}; "
-            "leave out what found nothing"
+            f"observations: row {_first(bad)}: expected a range above 0 m, got "
+            f"{r[np.argmax(bad)]}; leave out what found nothing"
         )
     bad = np.abs(b) > MOST_BEARING_RAD
     if bad.any():

@@ -2,8 +2,8 @@
 
 With the smoother's marginals every component has ``sigma^2 = mean of r^2 + H P H'`` over what is no
 outlier. Which these are cannot be told with sigmas that are far off: first the sigmas of the
-observations are made to fit the medians of their squares, with the weights of the kernel, which half
-of them may spoil. Then what lies within the gate counts in full, the rest not, for a weight in
+observations are made to fit the medians of their squares, with the weights of the kernel, which
+half of them may spoil. Then what lies within the gate counts in full, the rest not, for a weight in
 between would tell a small noise of odometry from the wrong spread. Rounds close in slowly where
 little is known, so their extrapolation is taken (SQUAREM).
 
@@ -62,7 +62,7 @@ class NoiseSettings:
     """Of these, for the medians."""
     learns_control: bool = True
     """False keeps the noise of the motion as stated, and learns that of the observations alone.
-    Where errors of successive observations are alike, they would be told for noise of the motion."""
+    Where errors of successive observations are alike, they would pass for noise of motion."""
 
 
 class SigmaFound(NamedTuple):

@@ -62,8 +62,8 @@ def _wrapped_rows(nu: Array) -> Array:
 class InvariantFilter(MapFilter):
     """The right-invariant extended filter: consistent under turns of the whole map.
 
-    Errors are kept as ``h = h^ + a``, ``p = R(a) p^ + V(a) b``, the same for every landmark, so that
-    a turn of everything is one state and gains no information from observations [1]_. The
+    Errors are kept as ``h = h^ + a``, ``p = R(a) p^ + V(a) b``, the same for every landmark, so
+    that a turn of everything is one state and gains no information from observations [1]_. The
     covariance of the state, `cov`, is that of the usual errors.
 
     References
@@ -79,7 +79,7 @@ class InvariantFilter(MapFilter):
         self._swing_pose(-1.0)
 
     def _swing(self, states: NDArray[np.intp]) -> Array:
-        """Return ``J p`` (B, a) of each state: how it follows a turn of everything; 1 of heading."""
+        """Return ``J p`` (B, a) of each state: how it follows a turn of everything."""
         values = self._mean[:, : self._n]
         follows = np.zeros_like(values)
         follows[:, 0], follows[:, 1] = -values[:, 1], values[:, 0]
@@ -138,7 +138,7 @@ class InvariantFilter(MapFilter):
         self._mean[:, 2] = half_turn(self._mean[:, 2] + a)
 
     def _append(self, ids: Sequence[int], places: Array, by_pose: Array, noise: Array) -> None:
-        """Add landmarks; their errors ``m - J m a`` begin as that of the pose, and their own noise."""
+        """Add landmarks: errors ``m - J m a`` begin as that of the pose, with own noise."""
         del by_pose
         slopes = np.zeros((*places.shape[:2], 2, POSE))
         slopes[..., 0, 0] = slopes[..., 1, 1] = 1.0

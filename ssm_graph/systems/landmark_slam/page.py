@@ -41,8 +41,8 @@ def study_page(plan: StudyPlan, cells: Cells, *, command: str) -> str:
         f"{plan.n_runs} runs of {plan.n_steps} steps a case, seeds {plan.first_seed} to "
         f"{plan.first_seed + plan.n_runs - 1}, one map; ssm-graph {code_version()}.",
         "",
-        "Means over runs with 95 % intervals (Student's t). Over ukf: ratio of mean position rms on "
-        "the same runs, bootstrap interval; p of Wilcoxon's signed-rank test of the same pairs, "
+        "Means over runs with 95 % intervals (Student's t). Over ukf: ratio of mean position rms "
+        "on the same runs, bootstrap interval; p of Wilcoxon's signed-rank test of the same pairs, "
         "corrected for the methods of the case. NEES/3 of the pose, mean over steps: 1 expected. "
         f"Warned: runs with more than 5 % of the steps outside {NEES_BAND[0]:.2f} to "
         f"{NEES_BAND[1]:.2f}. Sigmas found: at the end, of distance, steering, range, bearing; "
@@ -52,7 +52,7 @@ def study_page(plan: StudyPlan, cells: Cells, *, command: str) -> str:
     lines += ["## In words", "", *_words(plan, cells), ""]
     for case in plan.cases:
         lines += [f"## {case}: {CASES[case].about}", "", HEADER, "|" + " --- |" * 11]
-        lines += _rows(plan, cells, case) + [""]
+        lines += [*_rows(plan, cells, case), ""]
     lines += ["Methods: " + "; ".join(_about(m) for m in plan.methods) + "."]
     repaired = sum(cell.n_repaired for cell in cells.values())
     lines += ["", f"Covariances that had to be repaired for a Cholesky root, all runs: {repaired}."]

@@ -38,8 +38,8 @@ class SlamProblem(ReadOnlyArrays):
     start_sigma: Array
     """(3,)"""
     drift_sigma: Array = field(default_factory=lambda: np.zeros(0))
-    """(3,) of what odometry may be wrong by all along: share of the distance, share of the turn, rad/s
-    of turn. No rows: nothing."""
+    """(3,) of what `Odometry` may be wrong by all along: share of the distance, share of the turn,
+    rad/s of turn. No rows: nothing."""
     observation_scale: Array | None = None
     """(M, 2) by which the sigmas of each observation are multiplied; None: by 1."""
 
@@ -81,6 +81,15 @@ class SlamProblem(ReadOnlyArrays):
         slopes[:, 2, 1] = step[:, 2]
         slopes[:, 2, 2] = np.diff(self.time_s)
         return slopes
+
+    def with_drift_as_noise(self, noise: SlamNoise) -> SlamProblem:
+        """Return the same for who has no drift: what it may be is noise of each step."""
+        if not len(self.drift_sigma):
+            return self
+        slopes = self.drift_slopes(self.steps()) * self.drift_sigma
+        more = np.square(slopes).sum(axis=2) / np.square(noise.control)
+        scales = np.sqrt(np.square(self.control[:, 3:]) + more)
+        return replace(self, control=np.hstack([self.control[:, :3], scales]))
 
     def dead_reckoned(self) -> Array:
         """Return poses (K, 3) by odometry alone."""

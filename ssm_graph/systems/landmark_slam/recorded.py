@@ -4,8 +4,8 @@ References
 ----------
 .. [1] K. Y. K. Leung, Y. Halpern, T. D. Barfoot, H. H. T. Liu, "The UTIAS Multi-Robot Cooperative
    Localization and Mapping Dataset", International Journal of Robotics Research 30, 2011.
-.. [2] J. Guivant, E. Nebot, "Optimization of the Simultaneous Localization and Map-Building Algorithm
-   for Real-Time Implementation", IEEE Transactions on Robotics and Automation 17, 2001.
+.. [2] J. Guivant, E. Nebot, "Optimization of the Simultaneous Localization and Map-Building
+   Algorithm for Real-Time Implementation", IEEE Transactions on Robotics and Automation 17, 2001.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ VICTORIA_WHEEL: Final = (2.83, 0.76)
 
 
 def read_mrclam(folder: Path, robot: int) -> LandmarkLog:
-    """Return the log of one robot of a data set; observed robots and unknown bar codes are left out."""
+    """Return the log of one robot; observed robots and unknown bar codes are left out."""
     codes = _numbers(folder / "Barcodes.dat", 2)
     odometry = _numbers(folder / f"Robot{robot}_Odometry.dat", 3)
     seen = _numbers(folder / f"Robot{robot}_Measurement.dat", 4)
@@ -90,7 +90,9 @@ def read_graph(path: Path) -> tuple[SlamProblem, SlamNoise]:
     Sigmas are those of its first odometry row and, of landmarks, of the nearest there is in range
     and bearing: the text states x and y. Odometry that is not from one pose to the next is refused.
     """
-    steps, seen = [], []
+    steps: list[list[float]] = []
+    seen: list[list[float]] = []
+    pose_of: dict[int, int] = {}
     for number, text in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
         words = text.split()
         if not words:
@@ -98,11 +100,16 @@ def read_graph(path: Path) -> tuple[SlamProblem, SlamNoise]:
         try:
             cells = [float(word) for word in words[1:]]
             if words[0] == "ODOMETRY":
-                if int(cells[1]) != int(cells[0]) + 1 or int(cells[0]) != len(steps):
-                    raise DataError(f"{path}:{number}: expected odometry from pose to next pose")
-                steps.append(cells[2:5] + [cells[5], cells[8], cells[10]])
+                if pose_of and pose_of.get(int(cells[0])) != len(steps):
+                    raise DataError(
+                        f"{path}:{number}: expected odometry from the last pose, got one from "
+                        f"{cells[0]:g}; graphs of poses that meet again are not read"
+                    )
+                pose_of = pose_of or {int(cells[0]): 0}
+                pose_of[int(cells[1])] = len(steps) + 1
+                steps.append([*cells[2:5], cells[5], cells[8], cells[10]])
             elif words[0] == "LANDMARK":
-                seen.append(cells[:4] + [cells[4]])
+                seen.append(cells[:5])
         except (ValueError, IndexError) as error:
             raise DataError(
                 f"{path}:{number}: expected ODOMETRY or LANDMARK, got {text!r}"
@@ -110,7 +117,11 @@ def read_graph(path: Path) -> tuple[SlamProblem, SlamNoise]:
     if not steps or not seen:
         raise DataError(f"{path}: expected rows ODOMETRY and LANDMARK, got none of one of them")
     moves, marks = np.array(steps), np.array(seen)
-    keyframe, name = marks[:, 0].astype(np.intp), marks[:, 1].astype(np.intp)
+    strange = [int(key) for key in marks[:, 0] if int(key) not in pose_of]
+    if strange:
+        raise DataError(f"{path}: landmark seen from pose {strange[0]}, which no odometry reaches")
+    keyframe = np.array([pose_of[int(key)] for key in marks[:, 0]])
+    name = marks[:, 1].astype(np.intp)
     fresh = ~_repeated(marks[:, 0], name)
     order = np.flatnonzero(fresh)[np.argsort(keyframe[fresh], kind="stable")]
     names, landmark = np.unique(name[order], return_inverse=True)
@@ -135,7 +146,7 @@ def read_graph(path: Path) -> tuple[SlamProblem, SlamNoise]:
 
 
 def read_victoria_park(folder: Path) -> tuple[Array, Array, Array, Array]:
-    """Return times [s] and speed and steering (N, 2) of the raw log, and GPS times and places (G, 2).
+    """Return the raw log: times [s], speed and steering (N, 2), GPS times and places (G, 2).
 
     Speed [m/s] is of the middle of the rear axle, steering in rad; places in m, east and north.
     """

@@ -7,6 +7,7 @@ miss, residual and posterior variance, and noise is learnt from the same numbers
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -54,7 +55,7 @@ class Values(NamedTuple):
     """(K, 3)"""
     landmarks: Array
     """(L, 2)"""
-    drift: Array = np.zeros(0)  # noqa: RUF012
+    drift: Array = np.zeros(0)
     """(3,) of the odometry, or no rows"""
 
 
@@ -129,7 +130,7 @@ def eliminated(
     own[..., -1] = -root[..., 0] * rows.own_error
     first = 2 * problem.first_of
     flat = own.reshape(-1, own.shape[2])
-    of_each = [flat[a:b] for a, b in zip(first[:-1], first[1:], strict=True)]
+    of_each = [flat[a:b] for a, b in itertools.pairwise(first.tolist())]
     wide = np.zeros((len(rows.between), 3, 6 + size + 1))
     root = np.sqrt(step_weights)[:, None, None]
     wide[..., :6] = root * rows.between

@@ -40,7 +40,7 @@ class UnscentedFilter(MapFilter):
     """The unscented filter, by the points of pose and noise, and of pose and landmarks in view."""
 
     def __init__(self, *arguments: Any, spread: Spread | None = None, **more: Any) -> None:
-        """Begin as `MapFilter` does; ``spread`` is that of the points, ``kappa = 3 - n`` if None."""
+        """Begin as `MapFilter` does; ``spread`` is that of the points, `Spread` if None."""
         super().__init__(*arguments, **more)
         self._points = spread or Spread()
 

@@ -45,7 +45,7 @@ def square_share(kernel: Kernel, dim: int) -> float:
 
 
 def weights_of(kernel: Kernel, t: Array, dim: Array) -> Array:
-    """Return the weight of each measurement (M,) of ``dim`` (M,) rows with expected squares ``t``."""
+    """Return weights (M,) of measurements of ``dim`` (M,) rows with expected squares ``t``."""
     weights = np.ones_like(t)
     for size in np.unique(dim[dim > 0]).astype(int):
         c = information_scale(kernel, size)
