@@ -98,7 +98,7 @@ class StatedNoise(NoiseLaw):
 class _Sums(NamedTuple):
     """Of one step, over its observations: B runs."""
 
-    count: Array
+    number: Array
     residual: Array
     residual_sq: Array
     innovation_sq: Array
@@ -182,11 +182,11 @@ class _Literal(_Windowed):
         if not self._push(found):
             return
         total, now = self._window, self._steps[-1]
-        n = np.maximum(total.count, 1.0)[:, None, None]
+        n = np.maximum(total.number, 1.0)[:, None, None]
         mean = total.residual / n[..., 0]
         spread = total.residual_sq / n - mean[:, :, None] * mean[:, None, :]  # eq. (10)
-        n_now = np.maximum(now.count, 1.0)[:, None, None]
-        is_known = (total.count >= LEAST_WINDOW) & (now.count > 0)
+        n_now = np.maximum(now.number, 1.0)[:, None, None]
+        is_known = (total.number >= LEAST_WINDOW) & (now.number > 0)
         observation = spread + now.after / n_now  # eq. (11)
         self.observation = np.where(is_known[:, None, None], observation, self.observation)
         if not self._law.scales_q:
@@ -231,7 +231,7 @@ class _Guarded(_Windowed):
     def take(self, found: Evidence) -> None:
         law, is_full = self._law, self._push(found)
         total = self._window
-        prior, n = law.prior_count, total.count[:, None, None]
+        prior, n = law.prior_count, total.number[:, None, None]
         observation = (prior * self.stated_observation + total.residual_sq + total.after) / (
             prior + n
         )
@@ -283,8 +283,8 @@ class _SageHusa(Noise):
 
     def take(self, found: Evidence) -> None:
         new = _sums(found)
-        n = np.maximum(new.count, 1.0)[:, None, None]
-        g = np.where(new.count > 0, 1.0 / self._law.memory, 0.0)[:, None]
+        n = np.maximum(new.number, 1.0)[:, None, None]
+        g = np.where(new.number > 0, 1.0 / self._law.memory, 0.0)[:, None]
         if self._law.learns_mean:
             innovation = np.einsum("bm,bmi->bi", found.weights, found.innovation) / n[..., 0]
             self.mean = self.mean + g * innovation  # the innovation is free of the mean so far
@@ -326,7 +326,7 @@ class _Variational(Noise):
     def _belief(self, found: Evidence) -> tuple[Array, Array]:
         new, keep = _sums(found), self._law.forgetting
         squares = np.einsum("bii->bi", new.residual_sq + new.after)
-        shape = keep * self._shape + 0.5 * new.count[:, None]
+        shape = keep * self._shape + 0.5 * new.number[:, None]
         return shape, keep * self._scale + 0.5 * squares
 
     def revised(self, found: Evidence) -> Array | None:

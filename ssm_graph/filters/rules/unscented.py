@@ -69,7 +69,7 @@ def root_of(cov: Array) -> Root:
     First with a jitter on the diagonal, at last with eigenvalues floored at the largest jitter.
     """
     try:
-        return Root(np.linalg.cholesky(cov), 0)
+        return Root(np.asarray(np.linalg.cholesky(cov), dtype=np.float64), 0)
     except np.linalg.LinAlgError:
         pass
     shape = cov.shape
@@ -86,12 +86,13 @@ def _repaired(cov: Array) -> tuple[Array, bool]:
     largest = max(float(np.max(np.diagonal(cov))), np.finfo(float).tiny)
     for jitter in JITTER:
         try:
-            return np.linalg.cholesky(cov + jitter * largest * np.eye(len(cov))), jitter == 0.0
+            found = np.linalg.cholesky(cov + jitter * largest * np.eye(len(cov)))
+            return np.asarray(found, dtype=np.float64), jitter == 0.0
         except np.linalg.LinAlgError:
             continue
     values, vectors = np.linalg.eigh(cov)
     half = vectors * np.sqrt(np.maximum(values, JITTER[-1] * largest))
-    R = np.linalg.qr(half.T, mode="r")
+    R = np.asarray(np.linalg.qr(half.T, mode="r"))
     return np.asarray(R.T * np.sign(np.diagonal(R))), False
 
 

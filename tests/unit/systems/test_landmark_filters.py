@@ -22,7 +22,6 @@ from ssm_graph.systems.landmark_slam.methods import FILTERS
 from ssm_graph.systems.landmark_slam.models import Bicycle, Odometry, between, composed
 from ssm_graph.systems.landmark_slam.simulator import CASES, Path, Runs, Sigmas, World, simulate
 from ssm_graph.systems.landmark_slam.study import path_of
-from ssm_graph.systems.landmark_slam.unscented_filters import FullUnscentedFilter
 
 STEPS = 150
 START_COV = np.diag([0.05, 0.05, 0.02]) ** 2
@@ -118,7 +117,7 @@ def test_invariant_filter_learns_nothing_of_a_turn_of_everything() -> None:
     assert left["ekf"] < 0.9  # the usual one believes that it has learnt
 
 
-def test_gate_refuses_and_opens_again(path: Path, runs: Runs) -> None:
+def test_gate_refuses_and_opens_again(path: Path) -> None:
     """A gross observation is left out; one that stays is let in after enough refusals."""
     slam = FILTERS["ekf"].begin(
         Bicycle(),
