@@ -1,4 +1,4 @@
-"""Landmark SLAM: smoother and noise from the log on simulated runs, real logs against their truth."""
+"""Landmark SLAM: smoother and noise on simulated runs, real logs against their truth."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 from typing import Final, NamedTuple
 
@@ -62,13 +62,15 @@ class AssociationSettings:
     """Landmarks farther from where an observation would put its own are no candidates."""
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class _Provisional:
     """A landmark that may be none."""
 
     place: Array
-    rows: list[int] = field(default_factory=list)
-    last: int = 0
+    """(2,) where it was seen last; its error goes with that of the pose."""
+    rows: tuple[int, ...]
+    last: int
+    """Pose that saw it last."""
 
 
 class Associated(NamedTuple):
@@ -129,7 +131,7 @@ def _places(slam: MapFilter, measured: Array) -> Array:
     x, y, heading = slam.pose[0]
     angle = heading + measured[:, 1]
     ray = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return np.array([x, y]) + measured[:, :1] * ray
+    return np.asarray(np.array([x, y]) + measured[:, :1] * ray)
 
 
 def _paired(
@@ -227,16 +229,16 @@ def _sighted(
         reach = max(how.provisional_m, how.provisional_share * problem.measured[row, 0])
         away = [float(np.linalg.norm(one.place - place)) for one in waiting]
         if not away or min(away) > reach:
-            waiting.append(_Provisional(place, [row], k))
+            waiting.append(_Provisional(place, (row,), k))
             continue
-        one = waiting[int(np.argmin(away))]
-        one.rows.append(row)
-        one.place, one.last = place, k  # its error goes with that of the pose
+        one = waiting.pop(int(np.argmin(away)))
+        one = _Provisional(place, (*one.rows, row), k)
         if len(one.rows) >= how.sightings and len(slam.ids) + len(joined) < MOST_LANDMARKS:
             name = len(slam.ids) + len(joined)
-            found[one.rows] = name
+            found[list(one.rows)] = name
             joined.append((row, name))
-            waiting.remove(one)
+        else:
+            waiting.append(one)
     return joined
 
 

@@ -54,7 +54,7 @@ def save_study_figures(
         for number, method in MAP_FIGURES.items()
         if method in plan.methods
     ]
-    shown = [m for m in (*PAPER, "guarded", "ukf-told") if m in plan.methods]
+    shown: list[str] = [m for m in (*PAPER, "guarded", "ukf-told") if m in plan.methods]
     for first, case in CURVE_FIGURES.items():
         own = [m for m in shown if (case, m) in cells]
         for i, (name, label) in enumerate(QUANTITIES):
@@ -71,7 +71,7 @@ def _save_curves(
 ) -> FilePath:
     figure = new_figure(6.4, 3.2, title)
     looks = looks_of(curves)
-    time_s = (curve_steps(plan.n_steps) + 1) * World().step_s
+    time_s = np.asarray((curve_steps(plan.n_steps) + 1) * World().step_s, dtype=np.float64)
     panel = Panel(
         x="time, s",
         y=f"{label} ({plan.n_runs} runs)",

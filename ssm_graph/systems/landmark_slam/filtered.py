@@ -36,7 +36,7 @@ def filtered(problem: SlamProblem, noise: SlamNoise, method: str) -> SlamEstimat
     pose, cov = np.empty((K, 3)), np.empty((K, 3, 3))
     weights = np.ones(len(problem.keyframe))
     first = problem.first_of.tolist()
-    is_whole = np.isfinite(problem.measured).all(axis=1)
+    is_whole = np.all(np.isfinite(problem.measured), axis=1).tolist()
     for k in range(K):
         if k > 0:
             slam.predict(moving.control[k - 1][None])

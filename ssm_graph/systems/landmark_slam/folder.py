@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 import tomli_w
+from numpy.typing import NDArray
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
@@ -107,7 +108,7 @@ def _table(folder: Path, settings: Settings, spec: TableSpec) -> Table:
     return read_table(folder / name, name, spec)
 
 
-def _names(seen: Table) -> Array:
+def _names(seen: Table) -> NDArray[np.intp]:
     if "landmark" not in seen:
         return np.full(len(seen), UNKNOWN, dtype=np.intp)
     values = seen["landmark"]

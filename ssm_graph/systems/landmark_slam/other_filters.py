@@ -173,7 +173,7 @@ class SquareRootFilter(UnscentedFilter):
     def _keep(self, wide: Array) -> None:
         """Keep the root of ``wide wide'`` (B, n, more)."""
         n = wide.shape[1]
-        self._cov[:, :n, :n] = np.linalg.qr(wide.mT, mode="r").mT
+        self._cov[:, :n, :n] = np.asarray(np.linalg.qr(wide.mT, mode="r")).mT
 
     def _move(self, by_pose: Array, noise: Array) -> None:
         n = self._n

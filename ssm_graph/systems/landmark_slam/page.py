@@ -150,7 +150,8 @@ def _compared(method: str, ratio: Interval, p: float) -> str:
 
 
 def _claim(plan: StudyPlan, cells: Cells, cases: list[str]) -> str:
-    better, worse = [], []
+    better: list[str] = []
+    worse: list[str] = []
     for case in cases:
         p = _p_values(plan, cells, case)["naukf"]
         if p <= SIGNIFICANT_P:

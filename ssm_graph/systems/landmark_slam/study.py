@@ -220,7 +220,7 @@ def problem_of_run(path: Path, runs: Runs, run: int) -> tuple[SlamProblem, NDArr
     keyframe = np.repeat(np.arange(1, len(path.control) + 1), [len(v) for v in path.in_view])
     ids, landmark = np.unique(np.concatenate(path.in_view), return_inverse=True)
     problem = SlamProblem(
-        np.arange(len(path.pose)) * World().step_s,
+        np.asarray(np.arange(len(path.pose)) * World().step_s, dtype=np.float64),
         Bicycle(World().wheel_base_m),
         runs.control[:, run],
         keyframe,

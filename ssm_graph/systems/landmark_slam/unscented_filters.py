@@ -51,7 +51,7 @@ class UnscentedFilter(MapFilter):
         self.n_repaired += repaired
         found = unscented(function, mean, root, spread=self._points, difference=difference)
         # half' root^-1: the slopes of the best linear function through the points.
-        return found, np.linalg.solve(root.mT, found.half).mT
+        return found, np.asarray(np.linalg.solve(root.mT, found.half).mT)
 
     def _with_noise(self, cov: Array) -> tuple[Array, Array]:
         """Return mean and covariance of the pose and a noise of covariance (B, q, q)."""
@@ -159,4 +159,5 @@ class FullUnscentedFilter(UnscentedFilter):
         )
         PHt = np.empty((len(root), n, width))
         PHt[:, order] = root @ found.half
-        return Seen(found.mean, found.cov, PHt, order, np.linalg.solve(root.mT, found.half).mT)
+        slopes = np.asarray(np.linalg.solve(root.mT, found.half).mT)
+        return Seen(found.mean, found.cov, PHt, order, slopes)

@@ -6,6 +6,7 @@ import json
 import os
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -102,7 +103,8 @@ def change(log: LandmarkLog, name: str, row: int, value: float, column: int = 0)
     """Return a log with one number changed."""
     values: Array = getattr(log, name).copy()
     values[(row, column) if values.ndim == 2 else row] = value
-    return replace(log, **{name: values})
+    given: dict[str, Any] = {name: values}
+    return replace(log, **given)
 
 
 @pytest.mark.parametrize(
