@@ -17,7 +17,17 @@ from ssm_graph.base.errors import (
     SolverError,
     SsmGraphError,
 )
-from ssm_graph.cli import compare, convert, online, simulate, slam, slam_study, smooth
+from ssm_graph.cli import (
+    compare,
+    convert,
+    export,
+    online,
+    report,
+    simulate,
+    slam,
+    slam_study,
+    smooth,
+)
 from ssm_graph.cli import filter as filter_command
 from ssm_graph.cli.options import say
 from ssm_graph.cli.terminal import console_on, interrupt, occupy_closed_streams, signals_to
@@ -72,7 +82,8 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=version("ssm-graph"))
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for module in (simulate, smooth, filter_command, online, compare, convert, slam, slam_study):
+    navigation = (simulate, smooth, filter_command, online, compare, convert, export, report)
+    for module in (*navigation, slam, slam_study):
         module.add_parser(commands, epilog=EPILOG)
     return parser
 
