@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.systems.landmark_slam.filters import MapFilter
 from ssm_graph.systems.landmark_slam.methods import FILTERS
 from ssm_graph.systems.landmark_slam.problem import (
     SlamEstimate,
@@ -46,9 +45,8 @@ def filtered(problem: SlamProblem, noise: SlamNoise, method: str) -> SlamEstimat
             told = slam.update(names, problem.measured[rows][None], problem.scales[rows])
             weights[np.array(rows)[told.known]] = told.weights[0]
         pose[k], cov[k] = slam.pose[0], slam.pose_cov[0]
-    assert isinstance(slam, MapFilter)
     places, covs = np.full((L, 2), np.nan), np.full((L, 2, 2), np.nan)
-    for name in slam.ids:
+    for name in np.unique(problem.landmark[np.array(is_whole)]).tolist():
         place, place_cov = slam.landmark(name)
         places[name], covs[name] = place[0], place_cov[0]
     end = SlamNoise(*(_sigmas(x[0]) for x in (slam.noise.control, slam.noise.observation)))
