@@ -5,20 +5,19 @@ from __future__ import annotations
 import argparse
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from rich.console import Console
 
 from factors.kernels import KERNELS
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.cli.options import (
-    add_command,
     add_kernel_options,
     choice_option,
     kernel_of,
     number_option,
-    say,
 )
+from ssm_graph.cli.terminal import say
 from ssm_graph.io.results.place import check_result_place
 
 if TYPE_CHECKING:
@@ -56,15 +55,8 @@ class AssociationUsed(Enum):
     JOINT = "joint"
 
 
-def add_parser(commands: Any, *, epilog: str) -> None:
-    """Declare the command and its options."""
-    parser = add_command(
-        commands,
-        "slam",
-        summary="path and map from odometry and observed landmarks",
-        description=DESCRIPTION,
-        epilog=epilog,
-    )
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
     parser.add_argument("input", type=Path, metavar="INPUT", help="folder or graph")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="result folder")
     number_option(parser, "--robot", "N", "of a MRCLAM folder, 1 to 5", kind=int)

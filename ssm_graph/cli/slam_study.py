@@ -7,12 +7,13 @@ import os
 import shlex
 import sys
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from rich.console import Console
 
 from ssm_graph.cli.compare import FIGURES_NAME, StudyDisplay
-from ssm_graph.cli.options import add_command, number_option, say
+from ssm_graph.cli.options import number_option
+from ssm_graph.cli.terminal import say
 from ssm_graph.io.tables.append_file import write_through
 from ssm_graph.study.ledger import ERROR, Key, Ledger, run_trials
 from ssm_graph.study.runner import Progress
@@ -33,15 +34,8 @@ cases: stated, G1, U1, E1, A1, R3, Q3 (the study), gross10, gross30; docs/landma
 """
 
 
-def add_parser(commands: Any, *, epilog: str) -> None:
-    """Declare the command and its options."""
-    parser = add_command(
-        commands,
-        "slam-study",
-        summary="compare filters of landmark SLAM on simulated runs",
-        description=DESCRIPTION,
-        epilog=epilog,
-    )
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="result folder")
     parser.add_argument("--methods", metavar="A,B", help="methods (default: all filters)")
     parser.add_argument("--cases", metavar="A,B", help="cases (default: the seven of the study)")
