@@ -1,4 +1,5 @@
 """The command line.
 
-``ssm-graph simulate | smooth | filter | online | compare | inspect | convert | export | report``.
+``ssm-graph simulate | smooth | filter | online | compare | inspect | convert | export | report |
+slam | slam-study``.
 """
