@@ -197,7 +197,7 @@ def test_the_package_names_every_command(capsys: pytest.CaptureFixture[str]) -> 
     """In the order of the help."""
     with pytest.raises(SystemExit):
         main(["--help"])
-    shown = re.findall(r"^    ([\w-]+)  ", capsys.readouterr().out, flags=re.MULTILINE)
+    shown = re.findall(r"^    ([\w-]+)(?:  |$)", capsys.readouterr().out, flags=re.MULTILINE)
     named = re.findall(r"([\w-]+)(?: \||``)", cli.__doc__ or "")
     assert len(named) > 6
     assert named == shown
