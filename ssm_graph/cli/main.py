@@ -45,6 +45,8 @@ COMMANDS: Final = {
     "locate": "find the lane of a road vehicle in an HD map",
     "locate-simulate": "write a simulated drive over an HD map",
     "locate-study": "many simulated drives over HD maps, by several methods",
+    "slam": "path and map from odometry and observed landmarks",
+    "slam-study": "compare filters of landmark SLAM on simulated runs",
 }
 """Summary of every command; the module of its name is loaded when it is the one that is given."""
 

@@ -1,0 +1,57 @@
+"""A log through a filter, pose by pose: an answer of its own, and where a smoother begins."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ssm_graph.base.frozen import Array
+from ssm_graph.systems.landmark_slam.methods import FILTERS
+from ssm_graph.systems.landmark_slam.problem import (
+    SlamEstimate,
+    SlamNoise,
+    SlamProblem,
+    SlamStatus,
+)
+from ssm_graph.systems.landmark_slam.smoother import Values
+
+
+def values_of(answer: SlamEstimate) -> Values:
+    """Return where a smoother begins."""
+    return Values(answer.pose, np.nan_to_num(answer.landmarks))
+
+
+def filtered(problem: SlamProblem, noise: SlamNoise, method: str) -> SlamEstimate:
+    """Return what a filter says at every pose, with its map at the end."""
+    moving = problem.with_drift_as_noise(noise)
+    slam = FILTERS[method].begin(
+        problem.motion,
+        noise.control,
+        noise.observation,
+        problem.start[None],
+        capacity=len(problem.names),
+        start_cov=np.diag(problem.start_sigma**2),
+    )
+    K, L = len(problem.time_s), len(problem.names)
+    pose, cov = np.empty((K, 3)), np.empty((K, 3, 3))
+    weights = np.ones(len(problem.keyframe))
+    first = problem.first_of.tolist()
+    is_whole = np.all(np.isfinite(problem.measured), axis=1).tolist()
+    for k in range(K):
+        if k > 0:
+            slam.predict(moving.control[k - 1][None])
+        rows = [i for i in range(first[k], first[k + 1]) if is_whole[i]]
+        if rows:
+            names = problem.landmark[rows].tolist()
+            told = slam.update(names, problem.measured[rows][None], problem.scales[rows])
+            weights[np.array(rows)[told.known]] = told.weights[0]
+        pose[k], cov[k] = slam.pose[0], slam.pose_cov[0]
+    places, covs = np.full((L, 2), np.nan), np.full((L, 2, 2), np.nan)
+    for name in np.unique(problem.landmark[np.array(is_whole)]).tolist():
+        place, place_cov = slam.landmark(name)
+        places[name], covs[name] = place[0], place_cov[0]
+    end = SlamNoise(*(_sigmas(x[0]) for x in (slam.noise.control, slam.noise.observation)))
+    return SlamEstimate(pose, cov, places, covs, weights, end, SlamStatus.DONE, 1, np.zeros(0))
+
+
+def _sigmas(cov: Array) -> Array:
+    return np.asarray(np.sqrt(np.diagonal(cov)))

@@ -1,0 +1,166 @@
+"""A log of odometry and observed landmarks as every estimator here takes it, and an answer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.base.frozen import Array, ReadOnlyArrays
+from ssm_graph.systems.landmark_slam.models import Motion, composed
+
+UNKNOWN = -1
+"""Landmark of an observation that nobody has named."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SlamProblem(ReadOnlyArrays):
+    """K poses in a row, M observations of L landmarks."""
+
+    time_s: Array
+    """(K,) increasing"""
+    motion: Motion
+    control: Array
+    """(K - 1, c) from each pose to the next."""
+    keyframe: NDArray[np.intp]
+    """(M,) pose that saw it, ascending."""
+    landmark: NDArray[np.intp]
+    """(M,) 0 to L - 1; `UNKNOWN` where association has to find it."""
+    measured: Array
+    """(M, 2) range [m] and bearing [rad]; NaN where only the other was measured."""
+    names: tuple[str, ...]
+    """(L,) of the landmarks."""
+    start: Array
+    """(3,) pose of the first keyframe, m, m, rad: the frame of the map."""
+    start_sigma: Array
+    """(3,)"""
+    drift_sigma: Array = field(default_factory=lambda: np.zeros(0))
+    """(3,) of what `Odometry` may be wrong by all along: share of the distance, share of the turn,
+    rad/s of turn. No rows: nothing."""
+    observation_scale: Array | None = None
+    """(M, 2) by which the sigmas of each observation are multiplied; None: by 1."""
+
+    def __post_init__(self) -> None:
+        n = len(self.time_s)
+        for name, size in (("control", n - 1), ("landmark", len(self.keyframe))):
+            if len(getattr(self, name)) != size:
+                raise DataError(
+                    f"SlamProblem.{name}: expected {size} rows, got {len(getattr(self, name))}"
+                )
+        if np.any(np.diff(self.keyframe) < 0):
+            raise DataError("SlamProblem.keyframe: expected ascending poses; sort the observations")
+        ReadOnlyArrays.__post_init__(self)
+
+    @property
+    def first_of(self) -> NDArray[np.intp]:
+        """(K + 1,) where the observations of each keyframe begin, and M."""
+        return np.searchsorted(self.keyframe, np.arange(len(self.time_s) + 1))
+
+    @property
+    def scales(self) -> Array:
+        """(M, 2) by which the sigmas of each observation are multiplied."""
+        if self.observation_scale is None:
+            return np.ones((len(self.keyframe), 2))
+        return self.observation_scale
+
+    def steps(self, drift: Array | None = None) -> Array:
+        """Return the increments (K - 1, 3) of odometry, put right by a drift (3,) or by none."""
+        q = len(self.motion.labels)
+        step = self.motion.increment(self.control, np.zeros((len(self.control), q)))
+        if drift is not None and len(drift):
+            step = step + (self.drift_slopes(step) @ drift[:, None])[..., 0]
+        return step
+
+    def drift_slopes(self, step: Array) -> Array:
+        """Return how increments (K - 1, 3) follow the drift, (K - 1, 3, 3)."""
+        slopes = np.zeros((len(step), 3, 3))
+        slopes[:, :2, 0] = step[:, :2]
+        slopes[:, 2, 1] = step[:, 2]
+        slopes[:, 2, 2] = np.diff(self.time_s)
+        return slopes
+
+    def with_drift_as_noise(self, noise: SlamNoise) -> SlamProblem:
+        """Return the same for who has no drift: what it may be is noise of each step."""
+        if not len(self.drift_sigma):
+            return self
+        slopes = self.drift_slopes(self.steps()) * self.drift_sigma
+        more = np.square(slopes).sum(axis=2) / np.square(noise.control)
+        scales = np.sqrt(np.square(self.control[:, 3:]) + more)
+        return replace(self, control=np.hstack([self.control[:, :3], scales]))
+
+    def dead_reckoned(self) -> Array:
+        """Return poses (K, 3) by odometry alone."""
+        poses = np.empty((len(self.time_s), 3))
+        poses[0] = self.start
+        for k, step in enumerate(self.steps()):
+            poses[k + 1] = composed(poses[k], step)
+        return poses
+
+    def associated(self, landmark: NDArray[np.intp], names: tuple[str, ...]) -> SlamProblem:
+        """Return the same with other landmarks seen; observations of none (-1) are left out."""
+        kept = landmark >= 0
+        return replace(
+            self,
+            landmark=landmark[kept],
+            keyframe=self.keyframe[kept],
+            measured=self.measured[kept],
+            names=names,
+            observation_scale=None
+            if self.observation_scale is None
+            else self.observation_scale[kept],
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SlamNoise(ReadOnlyArrays):
+    """Standard deviations."""
+
+    control: Array
+    """(q,) of the components of the motion's noise, in its units."""
+    observation: Array
+    """(2,) range [m] and bearing [rad]"""
+
+    def __post_init__(self) -> None:
+        for name in ("control", "observation"):
+            value = np.array(getattr(self, name), dtype=np.float64)
+            if not np.all(np.isfinite(value) & (value > 0.0)):
+                raise ConfigError(
+                    f"{name}: expected sigmas above 0, got {value.tolist()}; state what the "
+                    "instrument is worth, or let it be estimated from a guess"
+                )
+            object.__setattr__(self, name, value)
+        ReadOnlyArrays.__post_init__(self)
+
+
+class SlamStatus(Enum):
+    """Why an estimator stopped."""
+
+    CONVERGED = "updates below 1e-2 of their sigmas, weights settled"
+    MAX_ITERATIONS = "iteration limit reached: look at the start, or at odometry that jumps"
+    DONE = "the whole log was filtered"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SlamEstimate(ReadOnlyArrays):
+    """Path and map with sigmas, and the weight of every observation."""
+
+    pose: Array
+    """(K, 3) m, m, rad"""
+    pose_cov: Array
+    """(K, 3, 3)"""
+    landmarks: Array
+    """(L, 2) m; NaN of one that was never placed"""
+    landmark_cov: Array
+    """(L, 2, 2)"""
+    weights: Array
+    """(M,)"""
+    noise: SlamNoise
+    """That was used."""
+    status: SlamStatus
+    n_iterations: int
+    drift: Array
+    """(3,) of the odometry, or no rows: see `SlamProblem.drift_sigma`."""
+    notes: tuple[str, ...] = ()

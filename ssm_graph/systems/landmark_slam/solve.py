@@ -1,0 +1,201 @@
+"""From an input to an answer: reading, association, filter or smoother, noise, figures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from factors.similarity import Kernel, LogKernel
+from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.report.style import new_figure, save
+from ssm_graph.systems.landmark_slam.association import (
+    Association,
+    AssociationErrors,
+    AssociationSettings,
+    associate,
+    association_errors,
+)
+from ssm_graph.systems.landmark_slam.figures import draw_map
+from ssm_graph.systems.landmark_slam.filtered import filtered, values_of
+from ssm_graph.systems.landmark_slam.folder import (
+    TOML_NAME,
+    read_landmark_folder,
+    write_answer,
+)
+from ssm_graph.systems.landmark_slam.logs import (
+    LandmarkLog,
+    LogScore,
+    problem_of_log,
+    score_of,
+    truth_at,
+)
+from ssm_graph.systems.landmark_slam.noise import NoiseSettings, SigmaFound, estimate_noise
+from ssm_graph.systems.landmark_slam.problem import (
+    UNKNOWN,
+    SlamEstimate,
+    SlamNoise,
+    SlamProblem,
+    SlamStatus,
+)
+from ssm_graph.systems.landmark_slam.recorded import read_graph, read_mrclam
+from ssm_graph.systems.landmark_slam.smoother import SmootherSettings, Values, smooth_landmarks
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What is done with a log."""
+
+    method: str = "smoother"
+    """Or a filter of `methods.FILTERS`."""
+    learns_observations: bool = False
+    """The sigmas of the observations are estimated, from the stated ones on."""
+    learns_control: bool = False
+    """Those of the odometry too."""
+    association: Association = Association.KNOWN
+    kernel: Kernel = LogKernel(5.0)
+    robot: int | None = None
+    """Of a MRCLAM folder."""
+
+
+class Solved(NamedTuple):
+    """An answer with all that is told of it."""
+
+    asked: Asked
+    problem: SlamProblem
+    answer: SlamEstimate
+    log: LandmarkLog | None
+    score: LogScore | None
+    sigmas: tuple[SigmaFound, ...]
+    errors: AssociationErrors | None
+    notes: tuple[str, ...]
+
+    @property
+    def is_good(self) -> bool:
+        """Whether it may be trusted as far as its own account goes."""
+        return self.answer.status is not SlamStatus.MAX_ITERATIONS
+
+    def lines(self) -> Iterator[str]:
+        """Yield what is said of it."""
+        answer, problem = self.answer, self.problem
+        yield (
+            f"{len(problem.time_s)} poses, {len(problem.names)} landmarks, "
+            f"{len(problem.keyframe)} observations, {int(np.sum(answer.weights < 0.5))} of them "
+            f"with less than half their weight; {answer.status.value}"
+        )
+        for found in self.sigmas:
+            low, high = found.found.low, found.found.high
+            yield (
+                f"noise of {found.label}: {found.found.value:.3g} ({low:.3g} to {high:.3g}), "
+                f"stated {found.stated:.3g}"
+            )
+        if self.errors is not None:
+            e = self.errors
+            yield (
+                f"association: {e.n_wrong} of {e.n} wrong, {e.n_left_out} left out, "
+                f"{e.n_split} landmarks there twice"
+            )
+        if self.score is not None:
+            s = self.score
+            yield (
+                f"against the truth: position rms {s.position_m:.3f} m and heading "
+                f"{s.heading_deg:.2f} deg in the frame of the start, {s.aligned_m:.3f} m aligned"
+            )
+
+    def summary(self) -> dict[str, Any]:
+        """Return it as it stands in ``summary.json``."""
+        answer, score = self.answer, self.score
+        return {
+            "method": self.asked.method,
+            "association": self.asked.association.name.lower(),
+            "kernel": str(self.asked.kernel),
+            "status": answer.status.name,
+            "reason": answer.status.value,
+            "iterations": answer.n_iterations,
+            "poses": len(self.problem.time_s),
+            "landmarks": len(self.problem.names),
+            "observations": len(self.problem.keyframe),
+            "noise_of": list((*self.problem.motion.labels, "range", "bearing, rad")),
+            "noise_used": [*answer.noise.control.tolist(), *answer.noise.observation.tolist()],
+            "odometry_wrong_by": answer.drift.tolist(),
+            "score": None if score is None else score._asdict(),
+            "association_errors": None if self.errors is None else self.errors._asdict(),
+            "notes": list(self.notes),
+        }
+
+
+def solve_input(path: Path, asked: Asked) -> Solved:
+    """Read an input and solve it."""
+    if path.is_file():
+        problem, noise = read_graph(path)
+        return solve(problem, noise, asked)
+    if (path / TOML_NAME).exists():
+        log = read_landmark_folder(path)
+    elif (path / "Barcodes.dat").exists():
+        if asked.robot is None:
+            raise ConfigError(f"--robot: {path} has several robots; expected a number, try 1")
+        log = read_mrclam(path, asked.robot)
+    else:
+        raise ConfigError(
+            f"{path}: expected a folder with {TOML_NAME} or MRCLAM's Barcodes.dat, or a graph file"
+        )
+    return solve(problem_of_log(log), log.noise, asked, log=log)
+
+
+def solve(
+    problem: SlamProblem, noise: SlamNoise, asked: Asked, *, log: LandmarkLog | None = None
+) -> Solved:
+    """Return the answer to a log; ``log`` is where it came from, with its truth."""
+    named, errors = problem, None
+    if asked.association is Association.KNOWN:
+        unnamed = int(np.sum(problem.landmark == UNKNOWN))
+        if unnamed == len(problem.landmark):
+            raise DataError(
+                "observations: none has a landmark; add the column, or ask for --association joint"
+            )
+        named = problem.associated(problem.landmark, problem.names)
+        first = None
+    else:
+        found = associate(problem, noise, AssociationSettings(asked.association))
+        named, first = found.problem, Values(found.pose, found.places)
+        if np.all(problem.landmark != UNKNOWN):
+            errors = association_errors(found.landmark, problem.landmark)
+    sigmas: tuple[SigmaFound, ...] = ()
+    if asked.method != "smoother":
+        answer = filtered(named, noise, asked.method)
+    else:
+        values = first or values_of(filtered(named, noise, "ekf-weighted"))
+        settings = SmootherSettings(asked.kernel)
+        if asked.learns_observations:
+            how = NoiseSettings(learns_control=asked.learns_control)
+            learnt = estimate_noise(named, noise, values, settings, how)
+            answer, sigmas = learnt.estimate, learnt.sigmas
+        else:
+            answer = smooth_landmarks(named, noise, values, settings)
+    has_truth = log is not None and len(log.truth_s) > 1
+    score = score_of(log, named, answer) if has_truth and log is not None else None
+    notes = (*(log.notes if log is not None else ()), *answer.notes)
+    return Solved(asked, named, answer, log, score, sigmas, errors, notes)
+
+
+def write_solved(folder: Path, solved: Solved) -> None:
+    """Write tables, summary and figure."""
+    problem, answer, log = solved.problem, solved.answer, solved.log
+    write_answer(folder, problem, answer, solved.summary())
+    true = None
+    if log is not None and len(log.truth_s) > 1:
+        truth, known = truth_at(log, problem.time_s)
+        true = np.where(known[:, None], truth, np.nan)
+    figure = new_figure(7.2, 5.4, f"{solved.asked.method}: path and map")
+    draw_map(
+        figure.subplots(),
+        path=answer.pose,
+        landmarks=answer.landmarks,
+        landmark_cov=answer.landmark_cov,
+        true_path=true,
+        labels=problem.names if len(problem.names) <= 40 else (),
+    )
+    save(figure, folder / "figure.png")
