@@ -26,8 +26,11 @@ from ssm_graph.filters.rules.ellipsoids import (
     sum_shape,
 )
 
-CUTS_BOX: Final = 1.0 - 1e-9
+CUTS_BOX: Final = 0.99
 """A box of less than so much of the ellipsoid's half-width cuts it."""
+PROJECTIONS: Final = 3
+HALVINGS: Final = 30
+NEWTON_STEPS: Final = 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,23 +68,31 @@ class Sets(ReadOnlyArrays):
         in_box = np.max(np.abs(x - self.middle) / self.half_widths, axis=-1) ** 2
         return np.maximum(self.ellipsoid.excess(x), in_box)
 
-    def clipped(self, points: Array) -> Array:
-        """Return points (..., n) moved into the sets: towards the middle of what is inside.
+    def nearest(self, points: Array) -> Array:
+        """Return the points of the sets next to some (..., n), in units of their half-widths.
 
-        The segment from a point to the ellipsoid's centre ends inside of it, and the box cuts last;
-        where the box takes it out of the ellipsoid again, a point of both is sought by halving.
+        Box and ellipsoid hold the state, so that each projection brings a point no further from
+        it; a few of them by turns end in both but for a little, which a segment to the middle
+        takes away.
         """
+        scale = self.ellipsoid.half_widths
+        Q = self.ellipsoid.shape / (scale[..., :, None] * scale[..., None, :])
+        size, axes = np.linalg.eigh(Q)
+        x = points
+        for _ in range(PROJECTIONS):
+            x = np.clip(x, self.low, self.high)
+            z = np.einsum("...ji,...j->...i", axes, (x - self.ellipsoid.center) / scale)
+            moved = np.einsum("...ij,...j->...i", axes, _onto(size, z)) * scale
+            x = moved + self.ellipsoid.center
         inside = np.clip(self.ellipsoid.center, self.low, self.high)
-        step = points - inside
-        share = np.ones(points.shape[:-1])
-        good = np.zeros(points.shape[:-1])
-        for _ in range(40):
-            holds = self.contains(inside + share[..., None] * step)
+        share, good = np.ones(x.shape[:-1]), np.zeros(x.shape[:-1])
+        for _ in range(HALVINGS):
+            holds = self.contains(inside + share[..., None] * (x - inside))
+            if np.all(holds & (share >= 1.0)):
+                return np.asarray(x)
             good = np.where(holds, share, good)
             share = np.where(holds, 0.5 * (share + 1.0), 0.5 * (share + good))
-            if np.all(holds & (share >= 1.0)):
-                break
-        return np.asarray(inside + good[..., None] * step)
+        return np.asarray(inside + good[..., None] * (x - inside))
 
     def __getitem__(self, index: object) -> Sets:
         """Return those of an index into the batch."""
@@ -211,6 +222,25 @@ def hull(pieces: Sequence[Sets]) -> tuple[Array, Array]:
         np.min([piece.low for piece in pieces], axis=0),
         np.max([piece.high for piece in pieces], axis=0),
     )
+
+
+def _onto(size: Array, z: Array) -> Array:
+    """Return the points next to z (..., n) of ``sum z^2 / size <= 1``, axes of an ellipsoid.
+
+    Newton's method for the multiplier m of ``sum size z^2 / (size + m)^2 = 1``, which comes up to
+    it from below.
+    """
+    m = np.zeros(z.shape[:-1])
+    for _ in range(NEWTON_STEPS):
+        down = size + m[..., None]
+        terms = size * z**2 / down**2
+        excess = terms.sum(axis=-1) - 1.0
+        if np.all(excess <= CERTAIN):
+            break
+        m = m + np.maximum(excess, 0.0) / (2.0 * (terms / down).sum(axis=-1) + 1e-300)
+    near = z * size / (size + m[..., None])
+    left = np.sqrt(np.sum(near**2 / size, axis=-1))
+    return np.asarray(near / np.maximum(left, 1.0)[..., None])
 
 
 def _box_of_strip(sets: Sets, row: Array, low: Array, high: Array) -> tuple[Array, Array]:
