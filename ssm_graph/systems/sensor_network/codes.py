@@ -21,6 +21,10 @@ from ssm_graph.base.frozen import Array
 
 Indices = NDArray[np.int64]
 MOST_BITS: Final = 32
+HEADING_BITS: Final = 12
+"""Of the index of a heading; a turn has so many steps, so that its residue says all there is."""
+HEADING_STEP: Final = 2.0 * math.pi / 2**HEADING_BITS
+"""rad"""
 TAG_BYTES: Final = (0, 4, 8)
 """Of an authentication tag; forging one of 4 bytes succeeds once in 2^32 attempts."""
 _LESS: Final = 1e-9
@@ -152,23 +156,25 @@ class Keystream:
         if self.tag_bytes not in TAG_BYTES:
             raise ConfigError(f"[code] tag_bytes: expected 0, 4 or 8, got {self.tag_bytes}")
 
-    def _numbers(self, node: int, step: int, count: int, bits: int) -> Indices:
+    def _numbers(self, node: int, step: int, bits: tuple[int, ...]) -> Indices:
         found: list[int] = []
         block = 0
-        while len(found) < count:
+        while len(found) < len(bits):
             text = b"stream" + node.to_bytes(2, "big") + step.to_bytes(8, "big")
             digest = hmac.digest(self.key, text + block.to_bytes(4, "big"), hashlib.sha256)
             found += [int.from_bytes(digest[i : i + 4], "big") for i in range(0, 32, 4)]
             block += 1
-        return np.array(found[:count], dtype=np.int64) % 2**bits
+        return np.array(found[: len(bits)], dtype=np.int64)
 
-    def hidden(self, index: Indices, *, node: int, step: int, bits: int) -> Indices:
-        """Return whole numbers (n,) from 0 to 2^bits - 1 as they are sent."""
-        return np.asarray((index + self._numbers(node, step, len(index), bits)) % 2**bits)
+    def hidden(self, index: Indices, *, node: int, step: int, bits: tuple[int, ...]) -> Indices:
+        """Return whole numbers (n,) from 0 to 2^bits - 1, of as many bits each, as they are sent."""
+        sizes = 2 ** np.array(bits, dtype=np.int64)
+        return np.asarray((index + self._numbers(node, step, bits)) % sizes)
 
-    def shown(self, sent: Indices, *, node: int, step: int, bits: int) -> Indices:
+    def shown(self, sent: Indices, *, node: int, step: int, bits: tuple[int, ...]) -> Indices:
         """Return what :meth:`hidden` was given."""
-        return np.asarray((sent - self._numbers(node, step, len(sent), bits)) % 2**bits)
+        sizes = 2 ** np.array(bits, dtype=np.int64)
+        return np.asarray((sent - self._numbers(node, step, bits)) % sizes)
 
     def tag(self, message: bytes) -> bytes:
         """Return the tag of a message as it is sent."""

@@ -14,7 +14,7 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.base.units import wrapped
 from ssm_graph.filters.rules.ellipsoids import Ellipsoids, Mask
 from ssm_graph.filters.rules.set_membership import Sets, led_on, measured, saturated, shared
-from ssm_graph.systems.sensor_network.codes import MOST_BITS, Indices, ResidueCode, UniformCode
+from ssm_graph.systems.sensor_network.codes import HEADING_STEP, MOST_BITS, Indices, ResidueCode, UniformCode
 from ssm_graph.systems.sensor_network.motion import HEADING, planar_image
 from ssm_graph.systems.sensor_network.setting import Setting, Share
 
@@ -163,7 +163,7 @@ class SetNodes:
             return
         setting = self.setting
         if axis == HEADING:
-            bound = setting.compass_bound or math.inf
+            bound = (setting.compass_bound or math.inf) + UniformCode(HEADING_STEP).error
             at, half = self.sets.middle[..., 2], self.sets.half_widths[..., 2]
             # A set of more than a turn less the bound says not which turn is meant.
             near = at + wrapped(value - at)

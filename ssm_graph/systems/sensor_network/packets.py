@@ -22,32 +22,34 @@ class NotAuthenticError(DataError):
 class PacketForm:
     """What all nodes agree on."""
 
-    count: int
-    """Indices in a packet."""
-    bits: int
-    """Of each, 1 to 32."""
+    bits: tuple[int, ...]
+    """Of each index, 1 to 32."""
     keystream: Keystream | None = None
+
+    @property
+    def _body_bytes(self) -> int:
+        return (sum(self.bits) + 7) // 8
 
     @property
     def n_bytes(self) -> int:
         """Of a packet."""
         tag = self.keystream.tag_bytes if self.keystream else 0
-        return HEADER_BYTES + (self.count * self.bits + 7) // 8 + tag
+        return HEADER_BYTES + self._body_bytes + tag
 
     def packed(self, node: int, step: int, index: Indices) -> bytes:
-        """Return a packet of whole numbers (count,) from 0 to 2^bits - 1."""
-        size = 2**self.bits
-        if index.shape != (self.count,) or np.any((index < 0) | (index >= size)):
+        """Return a packet of whole numbers, each from 0 to 2^bits - 1."""
+        sizes = 2 ** np.array(self.bits, dtype=np.int64)
+        if index.shape != sizes.shape or np.any((index < 0) | (index >= sizes)):
             raise DataError(
-                f"packet of node {node}, step {step}: expected {self.count} indices from 0 to "
-                f"{size - 1}, got {index.tolist()}"
+                f"packet of node {node}, step {step}: expected {len(self.bits)} indices of "
+                f"{self.bits} bits, got {index.tolist()}"
             )
         if self.keystream:
             index = self.keystream.hidden(index, node=node, step=step, bits=self.bits)
         number = 0
-        for one in index.tolist():
-            number = number << self.bits | one
-        body = number.to_bytes((self.count * self.bits + 7) // 8, "big")
+        for one, bits in zip(index.tolist(), self.bits, strict=True):
+            number = number << bits | one
+        body = number.to_bytes(self._body_bytes, "big")
         message = node.to_bytes(1, "big") + step.to_bytes(4, "big") + body
         return message + (self.keystream.tag(message) if self.keystream else b"")
 
@@ -68,9 +70,11 @@ class PacketForm:
                 )
         node, step = packet[0], int.from_bytes(packet[1:HEADER_BYTES], "big")
         number = int.from_bytes(packet[HEADER_BYTES:], "big")
-        mask = 2**self.bits - 1
-        shifts = range((self.count - 1) * self.bits, -1, -self.bits)
-        index = np.array([number >> shift & mask for shift in shifts], dtype=np.int64)
+        found = []
+        for bits in reversed(self.bits):
+            found.append(number & (2**bits - 1))
+            number >>= bits
+        index = np.array(found[::-1], dtype=np.int64)
         if self.keystream:
             index = self.keystream.shown(index, node=node, step=step, bits=self.bits)
         return node, step, index

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -266,6 +267,9 @@ def plain_words(result: NetworkResult) -> list[str]:
             f"{max(row.largest_excess for row in sets):.12f}, at most ±{width:.2f} m on average "
             "under the worst of the disturbances."
         )
+        widest = max(row.heading_half_width_rad for row in sets)
+        if widest >= math.pi:
+            lines.append(f"The heading is not observed: ±{widest:.1f} rad is more than a turn.")
     fall_1, fall_100 = (np.mean(falls(result.table_1[key])) for key in (1.0, 100.0))
     lines.append(
         f"Table 1: with a key of 1 the mean error falls by {fall_1:.2f}, with one of 100 by "

@@ -12,7 +12,7 @@ import numpy as np
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array, ReadOnlyArrays
 from ssm_graph.filters.rules.ellipsoids import Ellipsoids, Mask
-from ssm_graph.systems.sensor_network.codes import UniformCode
+from ssm_graph.systems.sensor_network.codes import HEADING_STEP, UniformCode
 from ssm_graph.systems.sensor_network.motion import planar_step
 from ssm_graph.systems.sensor_network.nodes import Alarm, SetNodes
 from ssm_graph.systems.sensor_network.patent import PatentNodes, PatentSettings
@@ -166,6 +166,7 @@ def run_sets(
         cpu += time.process_time() - begin
         values = world.measure(nodes.sets.ellipsoid.center)
         values[..., :2] = code.value(code.index(values[..., :2]))
+        values[..., 2] = HEADING_STEP * np.floor(values[..., 2] / HEADING_STEP + 0.5)
         comes, late = world.arrivals()
         begin = time.process_time()
         by_receiver = np.broadcast_to(values[:, None], (*comes.shape, 3))
