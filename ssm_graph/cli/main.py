@@ -17,7 +17,16 @@ from ssm_graph.base.errors import (
     SolverError,
     SsmGraphError,
 )
-from ssm_graph.cli import compare, convert, network, network_run, online, simulate, smooth
+from ssm_graph.cli import (
+    compare,
+    convert,
+    integrity,
+    network,
+    network_run,
+    online,
+    simulate,
+    smooth,
+)
 from ssm_graph.cli import filter as filter_command
 from ssm_graph.cli.options import say
 from ssm_graph.cli.terminal import console_on, interrupt, occupy_closed_streams, signals_to
@@ -72,8 +81,8 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=version("ssm-graph"))
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    commands_of = (simulate, smooth, filter_command, online, compare, convert, network, network_run)
-    for module in commands_of:
+    own = (simulate, smooth, filter_command, online, compare, convert)
+    for module in (*own, integrity, network, network_run):
         module.add_parser(commands, epilog=EPILOG)
     return parser
 

@@ -122,16 +122,18 @@ class _Blocks:
         self._noise, self._start = mission.imu.noise, start
         begin_s = max(start.time_s, mission.imu.start_s)
         self._edge_s, self._ends = _edges(mission, begin_s, own.block_s)
-        merged = merge_samples(mission.imu, self._edge_s, rate_hz=MERGE_HZ)
+        self._imu = mission.imu.calibration
+        imu = mission.imu.calibrated
+        merged = merge_samples(imu, self._edge_s, rate_hz=MERGE_HZ)
         self._dt = np.diff(self._edge_s)
         theta = merged.gyro_b * merged.dt[:, None]
-        self._turns = so3.exp(theta)
+        self._theta, self._turns = theta, so3.exp(theta)
         self._gains = so3.left_jacobian_times(theta, merged.accel_b * merged.dt[:, None])
         self._earth = so3.exp(-self._frame.omega_ie_n * self._dt[:, None])
         speed, sigma, beams_b = self._dvl.independent()
         self._speed, self._sigma, self._beams = speed, sigma, beams_b
         ping_s = np.clip(self._dvl.valid_s, self._edge_s[0], self._edge_s[-1])
-        arm = so3.cross(mean_gyro(mission.imu, ping_s), self._dvl.mount.lever_arm_b[None])
+        arm = so3.cross(mean_gyro(imu, ping_s), self._dvl.mount.lever_arm_b[None])
         self._arm_speed = np.einsum("nbi,ni->nb", beams_b, arm)
         at = np.searchsorted(self._edge_s, self._dvl.valid_s)
         self._ping = {int(a): n for n, a in enumerate(at) if 0 < a < len(self._edge_s)}
@@ -149,6 +151,11 @@ class _Blocks:
         more = mount.misalignment_sigma + mount.scale_sigma + mount.beam_scale_sigma
         more += mount.scale_walk_density * math.sqrt(span)
         self._share = self._own.speed_share + k * more
+        imu = self._imu
+        # Scale and axes of the gyros count with every turn, those of accelerometers with gravity.
+        self._gyro_share = k * (imu.gyro_scale_sigma + imu.gyro_misalignment_sigma)
+        self._gyro += 9.81 * k * imu.gyro_g_sensitivity_sigma
+        self._accel += 9.81 * k * (imu.accel_scale_sigma + imu.accel_misalignment_sigma)
         self._steady = self._own.velocity_m_per_s + k * mount.drift.sigma
         self._late_s = k * mount.time_offset_sigma_s
         self._arm_m = 2.0 * k * mount.lever_arm_sigma
@@ -171,6 +178,7 @@ class _Blocks:
         for n, dt in enumerate(self._dt):
             gain = R @ self._gains[n]
             R = self._earth[n] @ R @ self._turns[n]
+            block.turned += float(np.linalg.norm(self._theta[n]))
             coriolis = 2.0 * np.cross(self._frame.omega_ie_n, block.velocity)
             gain = gain + (self._g_n - coriolis) * dt
             self._lead_on(gain, float(dt))
@@ -253,7 +261,7 @@ class _Blocks:
         k, T = self._own.sigmas, block.span_s
         since = end_s - self._edge_s[0]
         angle = k * self._noise.gyro_density * math.sqrt(since)
-        turn = self._gyro * T
+        turn = self._gyro * T + self._gyro_share * block.turned
         scatter = k * math.sqrt(float(np.linalg.eigvalsh(block.covariance)[-1]))
         steady = self._steady * T + self._share * block.path + self._arm_m
         steady += self._late_s * block.changed + block.curved + block.bent + scatter + block.unseen
@@ -267,7 +275,8 @@ class _Blocks:
     def _levelled(self, R: Array, block: _Block) -> Array:
         """Turn the attitude to where the accelerometers' gain is the change of the velocity."""
         k = self._own.sigmas
-        self._tilt += self._gyro * block.span_s
+        drift = self._gyro * block.span_s + self._gyro_share * block.turned
+        self._tilt += drift
         if block.latest is None or block.first is None:
             return R
         T = block.span_s - block.since_first_s - block.open_s
@@ -278,7 +287,7 @@ class _Blocks:
         white = k * self._noise.accel_density * math.sqrt(T)
         changed = self._share * block.changed
         tilt = ((2.0 * single + changed + white) / T + self._accel) / g
-        tilt += self._gyro * block.span_s
+        tilt += drift
         if tilt >= self._tilt:
             return R
         self._tilt = tilt
@@ -337,7 +346,7 @@ class _Block:
         self.covariance = np.zeros((3, 3))
         self._pull: Array | None = None
         self.since_first_s = 0.0
-        self.span_s = self.path = self.climbed = self.changed = self.curved = 0.0
+        self.span_s = self.path = self.climbed = self.changed = self.curved = self.turned = 0.0
         self.unseen = self.open_s = self.closing = self.bent = 0.0
 
     def step(self, gain: Array, dt: float) -> Array:
