@@ -124,6 +124,7 @@ def _depths_hold(sim: SimulatedMission, mission: Mission, k: float) -> bool:
 def run(key: Key) -> Row:
     """Smooth one mission with its lie, and lead the set on beside it."""
     label, grade, seed, with_gnss = str(key[0]), str(key[1]), int(key[2]), bool(key[3])
+    smoothed = bool(key[4])
     sim = mission_of(grade, seed, with_gnss=with_gnss, realistic=False)
     mission = sim.mission
     if label != CLEAN:
@@ -135,11 +136,12 @@ def run(key: Key) -> Row:
     w = witness(mission, mission.initial, own)
     truth = sim.truth_at(w.time_s)
     holds = bool(holds_truth(mission, w, truth).all())
+    agreement, status, radius, sigma, error = "not smoothed", "", np.nan, np.nan, np.nan
     try:
-        estimate = smooth(mission)
+        estimate = smooth(mission) if smoothed else None
     except SsmGraphError:
-        agreement, status, radius, sigma, error = "no answer", "REFUSED", np.nan, np.nan, np.nan
-    else:
+        estimate, agreement, status = None, "no answer", "REFUSED"
+    if smoothed and estimate is not None:
         found = check_integrity(mission, estimate, own)
         p_n = mission.frame.p_n_from_geodetic(truth.lat, truth.lon, truth.height)
         agreement, status = found.agreement.name, estimate.status.name
@@ -168,6 +170,7 @@ def main() -> None:
         __doc__,
         Option("--seeds", 4, "missions of each lie"),
         Option("--clean", 8, "missions without a lie"),
+        Option("--smoothed", 1, "missions of each lie that are smoothed, too"),
         Option("--grade", "tactical", "of the inertial sensors"),
         Option("--jobs", 1, "processes"),
     )
@@ -177,7 +180,8 @@ def main() -> None:
         for i in range(a.clean if label == CLEAN else a.seeds):
             asked = None if label == CLEAN else LIES[label].with_gnss
             with_gnss = i % 2 == 0 if asked is None else asked
-            keys.append((label, a.grade, FIRST_SEED + i, int(with_gnss)))
+            smoothed = int(i < a.smoothed)
+            keys.append((label, a.grade, FIRST_SEED + i, int(with_gnss), smoothed))
     ledger = Ledger(Path(a.out) / "runs.jsonl", {"study": "integrity"})
     rows = run_trials(
         run, keys, ledger, n_jobs=a.jobs, on_progress=lambda n, of, key: note(f"{n}/{of} {key}")
@@ -217,9 +221,10 @@ def _page(rows: dict[Key, Row]) -> list[str]:
         inside = [bool(row["holds_truth"]) for row in group]
         alarm = [row["n_alarms"] > 0 for row in group]
         neither = sum(not i and not b for i, b in zip(inside, alarm, strict=True))
-        words = defaultdict(int)
+        words: dict[str, int] = defaultdict(int)
         for row in group:
-            words[row["agreement"].lower()] += 1
+            if row["agreement"] != "not smoothed":
+                words[row["agreement"].lower()] += 1
         medians = [
             f"{np.nanmedian([row[name] for row in group]):.2f}"
             if np.isfinite([row[name] for row in group]).any()

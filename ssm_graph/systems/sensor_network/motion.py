@@ -156,7 +156,7 @@ def lagrange_remainder(half_widths: ArrayLike, hessian: ArrayLike) -> Array:
     """Return by how much a function may leave its tangent over a box, (..., m).
 
     ``|f_l(c+e) - f_l(c) - J_l e| <= 1/2 sum_ij max|H_l,ij| b_i b_j`` (Lagrange), for functions
-    whose second derivatives are bounded by hand or by :func:`ssm_graph` users' intervals.
+    whose second derivatives are bounded by their user: by hand, or by intervals.
 
     Parameters
     ----------

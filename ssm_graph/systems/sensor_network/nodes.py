@@ -61,6 +61,10 @@ class _Moment:
     came: Mask
     """(R, N, N) whose set has come."""
 
+    def begin_from(self, predicted: Sets) -> None:
+        """Take another prediction, of a past that more was heard of."""
+        self.predicted = predicted
+
 
 class SetNodes:
     """All nodes of R runs side by side, or one node: the recursion that is worth its bound.
@@ -83,26 +87,38 @@ class SetNodes:
         """
         self.setting = setting
         shape = np.broadcast_to(setting.initial_variance * np.eye(3), (*center.shape, 3))
-        self.sets = Sets.of(Ellipsoids(center.copy(), shape.copy()), setting.floor)
+        self._sets = Sets.of(Ellipsoids(center.copy(), shape.copy()), setting.floor)
+        self._due: int | None = None  # the earliest step that something new was heard of
         self.k = 0
-        self.alarms: dict[Alarm, None] = {}
+        self._alarms: dict[Alarm, None] = {}
         self.n_ambiguous = 0
         """Residues that a set was too wide for; they were not used."""
-        self.is_sound = np.ones(center.shape[:2], bool)
-        """(R, N) whether no alarm was raised."""
         self._past: deque[_Moment] = deque(maxlen=memory + 1)
         self._nodes = np.arange(center.shape[1]) if nodes is None else nodes
         self._senders = _senders(setting.hears(), self._nodes)
         self._noise = np.asarray(setting.motion_bound)
 
+    @property
+    def sets(self) -> Sets:
+        """(R, N) by all that was heard until now."""
+        self._settle()
+        return self._sets
+
+    @property
+    def alarms(self) -> tuple[Alarm, ...]:
+        """All that were raised until now."""
+        self._settle()
+        return tuple(self._alarms)
+
     def lead_on(self, advance: Array, turn: Array) -> None:
         """Lead all sets on by a step: advance (..., 2) m, turn (...) rad."""
+        self._settle()
         self.k += 1
         self._predict(advance, turn)
-        runs, n = self.sets.low.shape[:2]
+        runs, n = self._sets.low.shape[:2]
         blank = np.full((runs, n, self.setting.n_nodes, 3), np.nan)
         came = np.zeros(blank.shape[:3], bool)
-        self._past.append(_Moment(self.k, self.sets, advance, turn, blank, None, came))
+        self._past.append(_Moment(self.k, self._sets, advance, turn, blank, None, came))
 
     def hear(self, k: int, values: Array) -> None:
         """Use measurements of step k that came now.
@@ -117,7 +133,7 @@ class SetNodes:
             return
         known = np.isfinite(moment.values)
         moment.values = np.where(known, moment.values, values)
-        self._again(moment)
+        self._due = k if self._due is None else min(k, self._due)
 
     def hear_sets(self, k: int, sent: Sets, came: Mask) -> None:
         """Use sets of all nodes as they were sent in step k; ``came`` (R, N, N) by receiver."""
@@ -126,23 +142,27 @@ class SetNodes:
             return
         moment.sent = sent
         moment.came = moment.came | came
-        self._again(moment)
+        self._due = k if self._due is None else min(k, self._due)
 
     def _moment(self, k: int) -> _Moment | None:
         return next((m for m in self._past if m.k == k), None)
 
-    def _again(self, moment: _Moment) -> None:
-        later = [m for m in self._past if m.k >= moment.k]
-        self.sets = moment.predicted
+    def _settle(self) -> None:
+        """Go once through all steps from the earliest that something new was heard of."""
+        if self._due is None:
+            return
+        later = [m for m in self._past if m.k >= (self._due or 0)]
+        self._due = None
+        self._sets = later[0].predicted
         for one in later:
-            if one is not moment:
+            if one is not later[0]:
                 self._predict(one.advance, one.turn)
-                one.predicted = self.sets
+                one.begin_from(self._sets)
             self._use(one)
 
     def _predict(self, advance: Array, turn: Array) -> None:
-        image = planar_image(self.sets, advance, turn, self._noise)
-        self.sets = saturated(led_on(self.sets, image), self.setting.saturation)
+        image = planar_image(self._sets, advance, turn, self._noise)
+        self._sets = saturated(led_on(self._sets, image), self.setting.saturation)
 
     def _use(self, moment: _Moment) -> None:
         for slot, senders in enumerate(self._senders.T):
@@ -154,8 +174,8 @@ class SetNodes:
         for senders in self._senders.T[1:]:
             came = _of(moment.came, senders) & (senders != self._nodes)
             if came.any():
-                kept, apart = shared(self.sets, moment.sent[:, senders])
-                self.sets = kept.where(came, self.sets)
+                kept, apart = shared(self._sets, moment.sent[:, senders])
+                self._sets = kept.where(came, self._sets)
                 self._tell(moment.k, senders, "set", apart & came)
 
     def _cut(self, k: int, senders: Indices, axis: int, value: Array, *, is_own: bool) -> None:
@@ -164,14 +184,14 @@ class SetNodes:
         setting = self.setting
         if axis == HEADING:
             bound = (setting.compass_bound or math.inf) + UniformCode(HEADING_STEP).error
-            at, half = self.sets.middle[..., 2], self.sets.half_widths[..., 2]
+            at, half = self._sets.middle[..., 2], self._sets.half_widths[..., 2]
             # A set of more than a turn less the bound says not which turn is meant.
             near = at + wrapped(value - at)
             value = np.where(half + bound < math.pi, near, np.nan)
         else:
             bound = setting.position_bound + UniformCode(setting.step).error
             value = value if is_own else self._told_apart(axis, value)
-        self.sets, missed = measured(self.sets, _AXES[axis], value, bound)
+        self._sets, missed = measured(self._sets, _AXES[axis], value, bound)
         self._tell(k, senders, WHAT[axis], missed)
 
     def _told_apart(self, axis: int, value: Array) -> Array:
@@ -183,7 +203,7 @@ class SetNodes:
         reach = setting.position_bound
         known = np.isfinite(value)
         residue = np.rint(np.where(known, value, 0.0) / code.step) % 2**code.bits
-        low, high = self.sets.low[..., axis] - reach, self.sets.high[..., axis] + reach
+        low, high = self._sets.low[..., axis] - reach, self._sets.high[..., axis] + reach
         told = code.value(residue, low, high)
         self.n_ambiguous += int(np.sum(known & ~np.isfinite(told)))
         return np.where(known, told, np.nan)
@@ -191,8 +211,7 @@ class SetNodes:
     def _tell(self, k: int, senders: Indices, what: str, missed: Mask) -> None:
         for run, i in zip(*np.nonzero(missed), strict=True):
             alarm = Alarm(k, int(run), int(self._nodes[i]) + 1, int(senders[i]) + 1, what)
-            self.alarms.setdefault(alarm)
-        self.is_sound &= ~missed
+            self._alarms.setdefault(alarm)
 
 
 def _senders(heard: Array, nodes: Indices) -> Indices:

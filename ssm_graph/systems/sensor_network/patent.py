@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 
 from ssm_graph.base.frozen import Array
+from ssm_graph.filters.rules.ellipsoids import checked_shape
 from ssm_graph.systems.sensor_network.motion import planar_step
 from ssm_graph.systems.sensor_network.setting import Setting
 
@@ -34,7 +35,7 @@ class Saturation(Enum):
     TESTED = "M where it cannot act, else as the patent does"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class PatentSettings:
     """What the recursion is free to choose; defaults are the patent's, or assumed where lost."""
 
@@ -44,8 +45,10 @@ class PatentSettings:
     saturation: Saturation = Saturation.TRACE
     consensus: float = 0.1
     """Gain eps_i [assumed]; weights a_ij are 1."""
-    Q_scale: float = 1.0
-    R_scale: float = 1.0
+    Q: Array | None = None
+    """(3, 3) bounding matrix of the motion's noise; None for the least multiple of the identity."""
+    R: Array | None = None
+    """(2, 2) that of the positions' noise."""
 
 
 def balanced(traces: Array) -> Array:
@@ -73,8 +76,9 @@ class PatentNodes:
         self.bound = setting.initial_variance * identity
         w, r = np.asarray(setting.motion_bound), setting.position_bound
         # The least multiple of the identity, as Q and R are lost: |w|^2 and |v|^2 at their corners.
-        self.Q = self.own.Q_scale * float(w @ w) * np.eye(3)
-        self.R = self.own.R_scale * 2.0 * r**2 * np.eye(2)
+        Q, R = float(w @ w) * np.eye(3), 2.0 * r**2 * np.eye(2)
+        self.Q = Q if self.own.Q is None else checked_shape("Q", self.own.Q)
+        self.R = R if self.own.R is None else checked_shape("R", self.own.R)
         self.E = 0.5 * setting.step**2 * np.eye(2)
         self.s_sq = float(np.sum(np.square(setting.saturation)))
 

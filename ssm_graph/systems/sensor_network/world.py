@@ -179,6 +179,7 @@ def run_sets(
         nodes.hear(k, np.where(now[..., None], by_receiver, np.nan))
         if setting.share is Share.ELLIPSOIDS:
             _exchange(nodes, k, comes, late, due)
+        nodes.sets.half_widths  # noqa: B018  (what was heard is used when it is asked for)
         cpu += time.process_time() - begin
         points.step(advance, turn, np.where(now[..., None], by_receiver, np.nan))
         rows.add(world.state, nodes, points)
@@ -219,7 +220,7 @@ class _Rows:
         arrays = {name: np.array(rows[last]) for name, rows in self._rows.items()}
         return Trial(
             **arrays,
-            alarms=tuple(nodes.alarms),
+            alarms=nodes.alarms,
             n_bits=setting.bits,
             n_ambiguous=nodes.n_ambiguous,
             cpu_s=cpu_s,
