@@ -1,7 +1,7 @@
 """Guaranteed bounds of a sensor network: containment, widths, alarms, codes, losses, cost.
 
-``python -m benchmarks.systems.sets --keep`` (ten minutes). Figures of the patent and Table 1 are made
-by ``ssm-graph network``.
+``python -m benchmarks.systems.sets --keep`` (ten minutes). Figures of the patent and Table 1 are
+made by ``ssm-graph network``.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ssm_graph.study.ledger import Key, Ledger, Row, run_trials
 from ssm_graph.systems.sensor_network.codes import Keystream, UniformCode, bits_for, residue_bits
 from ssm_graph.systems.sensor_network.nodes import SetNodes
 from ssm_graph.systems.sensor_network.packets import signed, unsigned
-from ssm_graph.systems.sensor_network.setting import COMPASS, PATENT, SETTINGS, Setting, Share
+from ssm_graph.systems.sensor_network.setting import COMPASS, PATENT, SETTINGS, Share
 from ssm_graph.systems.sensor_network.world import Disturbance, Trial, World, run_patent, run_sets
 
 SEED: Final = 1000
@@ -76,7 +76,7 @@ def lie(share: str, scale: float) -> Row:
 
 
 def wrong_key(runs: int) -> Row:
-    """Tell in how many networks a neighbour with another key is found within two steps, untagged."""
+    """Tell in how many networks another key of a neighbour is found in two steps, untagged."""
     setting = replace(COMPASS, share=Share.MEASUREMENTS, n_steps=2, bits=32)
     bits = (bits_for(30.0, setting.step),) * 2
     right, wrong = Keystream(b"k" * 16, 0), Keystream(b"w" * 16, 0)

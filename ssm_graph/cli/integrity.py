@@ -17,7 +17,7 @@ def add_parser(commands: Any, *, epilog: str) -> None:
         commands,
         "integrity",
         summary="a second witness of a smoothed mission: guaranteed bounds",
-        description="Smooth a recorded mission, and beside it lead on the set of all places that its "
+        description="Smooth a mission, and beside it lead on the set of all places that its "
         "inertial, DVL, depth, compass and fix bounds allow; bounds are so many of the stated "
         "sigmas. Either the answer is inside, and the truth within the distance that is told as "
         "long as every bound is true, or an alarm proves that one is false. Writes integrity.csv "

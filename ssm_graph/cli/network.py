@@ -67,7 +67,7 @@ def add_parser(commands: Any, *, epilog: str) -> None:
 
 
 def run(arguments: argparse.Namespace, console: Console, errors: Console) -> bool:
-    """Run the study, write its page, table and figures; good without a set that missed its truth."""
+    """Run the study, write page, table and figures; good if no set missed its truth."""
     from ssm_graph.io.results.place import check_result_place
     from ssm_graph.systems.sensor_network.study import (
         SET_FILTERS,

@@ -31,7 +31,7 @@ def add_parser(commands: Any, *, epilog: str) -> None:
         "--secret-file",
         type=Path,
         metavar="FILE",
-        help="packets are encrypted and signed with the bytes of this file, 16 or more (HMAC-SHA256)",
+        help="encrypt and sign packets with the bytes of this file, 16 or more (HMAC-SHA256)",
     )
     parser.add_argument(
         "--wrong-key",
@@ -43,7 +43,7 @@ def add_parser(commands: Any, *, epilog: str) -> None:
 
 
 def run(arguments: argparse.Namespace, console: Console, errors: Console) -> bool:
-    """Run all nodes and show their sets; good if every set held its truth and no alarm was raised."""
+    """Run all nodes and show their sets; good if each held its truth without an alarm."""
     from ssm_graph.systems.sensor_network.processes import Report, run_processes
     from ssm_graph.systems.sensor_network.study import read_network_study
 
@@ -64,8 +64,7 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     say(console, f"{'node':>4} {'east, m':>18} {'north, m':>18} {'heading, rad':>18}  packets")
     for node, report in sorted(last.items()):
         cells = [
-            f"{m:9.3f} ± {h:6.3f}"
-            for m, h in zip(report.middle, report.half_widths, strict=True)
+            f"{m:9.3f} ± {h:6.3f}" for m, h in zip(report.middle, report.half_widths, strict=True)
         ]
         tail = f"{report.n_heard} heard, {report.n_refused} refused, {report.n_bytes} bytes each"
         say(console, f"{node:>4} {' '.join(f'{cell:>18}' for cell in cells)}  {tail}")

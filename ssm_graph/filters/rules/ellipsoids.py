@@ -8,7 +8,7 @@ criterion here mixes them: sizes are volumes, and sums are weighed by the volume
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,7 +23,7 @@ ROUNDING: Final = 1e-12
 CERTAIN: Final = 1e-9
 """By how much of their widths sets have to be apart for it to be told from rounding."""
 SUM_ROUNDS: Final = 3
-"""Fixed-point rounds for the weights of a sum; any weights are valid, these only settle the size."""
+"""Fixed-point rounds for the weights of a sum; any are valid, these only settle the size."""
 TIGHTEST: Final = 1e-6
 """Half-width of a strip over that of the ellipsoid below which it counts as this wide, and by how
 much one cut may shrink a shape: thinner sets are made thicker, which loses no point."""
@@ -43,12 +43,12 @@ class Ellipsoids(ReadOnlyArrays):
     @property
     def n(self) -> int:
         """Dimension."""
-        return self.center.shape[-1]
+        return int(self.center.shape[-1])
 
     @property
     def half_widths(self) -> Array:
         """(..., n) of the smallest box around each."""
-        return np.sqrt(np.einsum("...ii->...i", self.shape))
+        return np.asarray(np.sqrt(np.einsum("...ii->...i", self.shape)))
 
     @property
     def log_volume(self) -> Array:
@@ -89,11 +89,12 @@ class Ellipsoids(ReadOnlyArrays):
         z /= np.linalg.norm(z, axis=-1, keepdims=True)
         if not on_surface:
             z *= rng.random((*z.shape[:-1], 1)) ** (1.0 / self.n)
-        return self.center + np.einsum("...ij,...j->...i", np.linalg.cholesky(self.shape), z)
+        root = np.linalg.cholesky(self.shape)
+        return np.asarray(self.center + np.einsum("...ij,...j->...i", root, z))
 
-    def __getitem__(self, index: object) -> Ellipsoids:
+    def __getitem__(self, index: Any) -> Ellipsoids:
         """Return those of an index into the batch."""
-        return Ellipsoids(self.center[index].copy(), self.shape[index].copy())  # type: ignore[index]
+        return Ellipsoids(self.center[index].copy(), self.shape[index].copy())
 
     def where(self, mask: Mask, other: Ellipsoids) -> Ellipsoids:
         """Return these where a mask (...) says so, and others elsewhere."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -66,7 +66,7 @@ class Sets(ReadOnlyArrays):
         """Return (...): at most 1 inside; the larger of ``e'P^-1e`` and the box's own, squared."""
         x = np.asarray(points, dtype=np.float64)
         in_box = np.max(np.abs(x - self.middle) / self.half_widths, axis=-1) ** 2
-        return np.maximum(self.ellipsoid.excess(x), in_box)
+        return np.asarray(np.maximum(self.ellipsoid.excess(x), in_box))
 
     def nearest(self, points: Array) -> Array:
         """Return the points of the sets next to some (..., n), in units of their half-widths.
@@ -94,12 +94,12 @@ class Sets(ReadOnlyArrays):
             share = np.where(holds, 0.5 * (share + 1.0), 0.5 * (share + good))
         return np.asarray(inside + good[..., None] * (x - inside))
 
-    def __getitem__(self, index: object) -> Sets:
+    def __getitem__(self, index: Any) -> Sets:
         """Return those of an index into the batch."""
         return Sets(
             self.ellipsoid[index],
-            self.low[index].copy(),  # type: ignore[index]
-            self.high[index].copy(),  # type: ignore[index]
+            self.low[index].copy(),
+            self.high[index].copy(),
             self.floor,
         )
 

@@ -1,8 +1,9 @@
 """From numbers to few bits and back, so that what rounding took is known: never a silent wrap.
 
-A value is sent as the whole number ``i = floor(y / step + 1/2)`` and read as ``i step``: at most half a
-step off, which the receiver adds to the bound. Plain codes have a range, beyond which they refuse;
-residue codes send ``i mod 2^bits`` and leave it to the receiver's own set to tell which i it was.
+A value is sent as the whole number ``i = floor(y / step + 1/2)`` and read as ``i step``: at most
+half a step off, which the receiver adds to the bound. Plain codes have a range, beyond which they
+refuse; residue codes send ``i mod 2^bits`` and leave it to the receiver's own set to tell which i
+it was.
 """
 
 from __future__ import annotations
@@ -65,7 +66,9 @@ class UniformCode:
         """Return whole numbers; one that needs more bits is refused, for a wrap would be a lie."""
         y = np.asarray(value, dtype=np.float64)
         if not np.isfinite(y).all():
-            raise DataError("measurement: expected finite numbers, got one that is not; leave it out")
+            raise DataError(
+                "measurement: expected finite numbers, got one that is not; leave it out"
+            )
         index = np.floor(y / self.step + 0.5)
         worst = float(np.max(np.abs(index), initial=0.0))
         if worst > self.most:
@@ -167,7 +170,7 @@ class Keystream:
         return np.array(found[: len(bits)], dtype=np.int64)
 
     def hidden(self, index: Indices, *, node: int, step: int, bits: tuple[int, ...]) -> Indices:
-        """Return whole numbers (n,) from 0 to 2^bits - 1, of as many bits each, as they are sent."""
+        """Return whole numbers (n,), each from 0 to 2^bits - 1, as they are sent."""
         sizes = 2 ** np.array(bits, dtype=np.int64)
         return np.asarray((index + self._numbers(node, step, bits)) % sizes)
 

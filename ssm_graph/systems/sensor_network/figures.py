@@ -105,9 +105,7 @@ def _intervals(setting: Setting, pair: tuple[int, int], seed: int) -> Figure:
                 Curve(k, error[:, i], _line(_COLORS[i], f"node {i + 1}, d = {d}", dash))
                 for i in _nodes(pair)
             ]
-        panels.append(
-            Panel(title=f"key {key:g}", x="step k", y="error", curves=curves, legend={})
-        )
+        panels.append(Panel(title=f"key {key:g}", x="step k", y="error", curves=curves, legend={}))
     panels[-1] = replace(panels[-1], legend={"loc": "upper left"})
     return _drawn("Error by the interval of the quantiser: it takes a key of 100", panels)
 

@@ -1,4 +1,4 @@
-"""The smoother's answer beside the set: inside, outside, or a proof that a stated bound is false."""
+"""The smoother's answer beside the set: inside, outside, or a proof that a bound is false."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ def planar_step(state: ArrayLike, advance: ArrayLike, turn: ArrayLike) -> Array:
         [
             x[..., 0] + cos * d[..., 0] - sin * d[..., 1],
             x[..., 1] + sin * d[..., 0] + cos * d[..., 1],
-            x[..., 2] + turn,
+            x[..., 2] + np.asarray(turn, dtype=np.float64),
         ],
         axis=-1,
     )
@@ -105,7 +105,7 @@ def planar_image(
     A[..., :2, 2] = (size * slope)[..., None] * across
     center = c + 0.0
     center[..., :2] += (0.5 * (1.0 + least) * size)[..., None] * along
-    center[..., 2] += turn
+    center[..., 2] += np.asarray(turn, dtype=np.float64)
     spans = np.zeros((*a.shape, 7, 3))
     spans[..., 0, :2] = (0.5 * (1.0 - least) * size)[..., None] * along
     spans[..., 1, :2] = (rest * size)[..., None] * across

@@ -14,9 +14,15 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.base.units import wrapped
 from ssm_graph.filters.rules.ellipsoids import Ellipsoids, Mask
 from ssm_graph.filters.rules.set_membership import Sets, led_on, measured, saturated, shared
-from ssm_graph.systems.sensor_network.codes import HEADING_STEP, MOST_BITS, Indices, ResidueCode, UniformCode
+from ssm_graph.systems.sensor_network.codes import (
+    HEADING_STEP,
+    MOST_BITS,
+    Indices,
+    ResidueCode,
+    UniformCode,
+)
 from ssm_graph.systems.sensor_network.motion import HEADING, planar_image
-from ssm_graph.systems.sensor_network.setting import Setting, Share
+from ssm_graph.systems.sensor_network.setting import Setting
 
 _AXES: Final = np.eye(3)
 WHAT: Final = ("east of the position", "north of the position", "heading")
@@ -75,7 +81,7 @@ class SetNodes:
     """
 
     def __init__(
-        self, setting: Setting, *, center: Array, memory: int = 0, nodes: Array | None = None
+        self, setting: Setting, *, center: Array, memory: int = 0, nodes: Indices | None = None
     ) -> None:
         """Start from E(center, P_0).
 

@@ -1,4 +1,4 @@
-"""The nodes as processes of their own that talk by UDP on this machine, in an acoustic modem's place."""
+"""Nodes as processes that talk by UDP on this machine, in the place of an acoustic modem."""
 
 from __future__ import annotations
 
@@ -150,9 +150,7 @@ def packed_values(form: PacketForm, setting: Setting, node: int, k: int, values:
     return form.packed(node, k, index)
 
 
-def unpacked_values(
-    form: PacketForm, setting: Setting, packet: bytes
-) -> tuple[int, int, Array]:
+def unpacked_values(form: PacketForm, setting: Setting, packet: bytes) -> tuple[int, int, Array]:
     """Return node, step and values (3,); NaN for what is not in it, residues as they came."""
     node, k, index = form.unpacked(packet)
     if node >= setting.n_nodes:

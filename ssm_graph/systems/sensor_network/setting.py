@@ -125,9 +125,7 @@ class Setting:
 
 
 PATENT: Final = Setting()
-QUIET: Final = replace(
-    PATENT, name="quiet", motion_bound=(0.05, 0.05, 0.02), position_bound=0.3
-)
+QUIET: Final = replace(PATENT, name="quiet", motion_bound=(0.05, 0.05, 0.02), position_bound=0.3)
 COMPASS: Final = replace(QUIET, name="compass", compass_bound=0.1)
 SETTINGS: Final = {
     one.name: one

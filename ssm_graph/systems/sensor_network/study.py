@@ -118,7 +118,7 @@ def _fields(part: Settings) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name, value in part.given().items():
         is_count = name in ("n_nodes", "n_steps", "bits")
-        found[name] = int(value) if is_count else value  # type: ignore[arg-type]
+        found[name] = int(value) if is_count else value
         if isinstance(value, np.ndarray):
             found[name] = tuple(float(x) for x in value)
     if "edges" in part:

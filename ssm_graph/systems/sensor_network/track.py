@@ -78,8 +78,8 @@ class Track(ReadOnlyArrays):
         bound = span * float(self.speed_bound[i]) + float(self.closing[i])
         return self.R_nb[at] @ arm_b, led, bound
 
-    def heading_at(self, i: int, time_s: float) -> float:
-        """Return the gyros' heading at a time within block i, rad."""
+    def heading_at(self, time_s: float) -> float:
+        """Return the gyros' heading at a time, rad."""
         at = min(int(np.searchsorted(self.edge_s, time_s)), len(self.edge_s) - 1)
         return float(roll_pitch_heading_from_R_lb(self.R_nb[at])[2])
 
@@ -280,7 +280,7 @@ class _Blocks:
         if block.latest is None or block.first is None:
             return R
         T = block.span_s - block.since_first_s - block.open_s
-        if T < 0.5 * self._own.block_s:
+        if 0.5 * self._own.block_s > T:
             return R
         g = float(np.linalg.norm(self._g_n))
         single = k * math.sqrt(float(np.linalg.eigvalsh(block.latest)[-1])) + self._steady

@@ -117,9 +117,7 @@ class Witness(ReadOnlyArrays):
         return np.column_stack([half[:, :2], up, half[:, 2]])
 
 
-def witness(
-    mission: Mission, start: InitialState, bounds: WitnessBounds | None = None
-) -> Witness:
+def witness(mission: Mission, start: InitialState, bounds: WitnessBounds | None = None) -> Witness:
     """Return the set of places that a mission's bounds allow, from a start on.
 
     Parameters
@@ -230,7 +228,7 @@ class _Walk:
         bound = k * (log.sigma + more) + float(self._track.noise_angle[i])
         if bound >= math.pi:
             return
-        nominal = self._track.heading_at(i, float(log.time_s[row]))
+        nominal = self._track.heading_at(float(log.time_s[row]))
         # Headings turn clockwise, the set's error anticlockwise.
         value = -float(wrapped(np.array(log.heading[row] + log.declination - nominal)))
         self._cut(i, "compass", 2, value, bound, "deg", math.degrees(1.0))
@@ -265,4 +263,3 @@ class _Walk:
             self._alarms.append(BoundAlarm(float(self._track.time_s[i]), "depth", by))
         else:
             self._up = (low, high)
-

@@ -1,4 +1,4 @@
-"""A robot, its disturbances within their bounds, and the nodes that watch it: trials of a network."""
+"""A robot, disturbances within their bounds, and nodes that watch it: trials of a network."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array, ReadOnlyArrays
 from ssm_graph.filters.rules.ellipsoids import Ellipsoids, Mask
-from ssm_graph.systems.sensor_network.codes import HEADING_STEP, UniformCode
+from ssm_graph.systems.sensor_network.codes import HEADING_STEP, Indices, UniformCode
 from ssm_graph.systems.sensor_network.motion import planar_step
 from ssm_graph.systems.sensor_network.nodes import Alarm, SetNodes
 from ssm_graph.systems.sensor_network.patent import PatentNodes, PatentSettings
@@ -87,7 +87,7 @@ def noise_at(
         2: np.array([np.sin(0.1 * k), np.sin(0.1 * k)]),
         1: np.array([np.sin(0.1 * k)]),
     }
-    return np.broadcast_to(bound * waves[len(bound)], shape)
+    return np.asarray(np.broadcast_to(bound * waves[len(bound)], shape))
 
 
 class World:
@@ -101,11 +101,15 @@ class World:
         start = Ellipsoids(np.zeros((runs, 3)), np.broadcast_to(P_0, (runs, 3, 3)).copy())
         self.state = start.sampled(self.rng, 1)[0] * 0.5
         # Each node begins somewhere of its own, from where the truth is within E(center, P_0).
-        around = Ellipsoids(np.zeros((runs, setting.n_nodes, 3)), 0.25 * P_0 * np.ones((1, 1, 1, 1)))
+        around = Ellipsoids(
+            np.zeros((runs, setting.n_nodes, 3)), 0.25 * P_0 * np.ones((1, 1, 1, 1))
+        )
         self.first = 0.999 * around.sampled(self.rng, 1)[0]
         excess = Ellipsoids(self.first, np.broadcast_to(P_0, (*self.first.shape, 3)).copy())
         if not excess.contains(self.state[:, None]).all():
-            raise DataError("initial state: expected inside E(center, P_0) of every node; it is not")
+            raise DataError(
+                "initial state: expected inside E(center, P_0) of every node; it is not"
+            )
         self.k = 0
 
     def move(self, out_of: Ellipsoids) -> tuple[Array, Array]:
@@ -116,9 +120,7 @@ class World:
         there = planar_step(self.state, advance[:, 0], turn[:, 0])
         first = out_of[:, 0]
         towards = np.linalg.solve(first.shape, (self.state - first.center)[..., None])[..., 0]
-        w = noise_at(
-            self.kind, k, np.asarray(setting.motion_bound), there.shape, self.rng, towards
-        )
+        w = noise_at(self.kind, k, np.asarray(setting.motion_bound), there.shape, self.rng, towards)
         levels = np.asarray(setting.saturation)
         self.state = np.clip(there + w, -levels, levels)
         self.k += 1
@@ -138,7 +140,7 @@ class World:
             values[..., 2] = self.state[:, None, 2] + u[..., 0]
         return values
 
-    def arrivals(self) -> tuple[Mask, Array]:
+    def arrivals(self) -> tuple[Mask, Indices]:
         """Return which packets come, by receiver and sender (R, N, N), and after how many steps."""
         setting = self.setting
         shape = (self.runs, setting.n_nodes, setting.n_nodes)
@@ -186,7 +188,7 @@ def run_sets(
     return rows.trial(nodes, setting, cpu)
 
 
-def _exchange(nodes: SetNodes, k: int, comes: Mask, late: Array, due: dict[int, list]) -> None:  # type: ignore[type-arg]
+def _exchange(nodes: SetNodes, k: int, comes: Mask, late: Indices, due: dict[int, list]) -> None:  # type: ignore[type-arg]
     for delay in range(nodes.setting.delay[1] + 1):
         due[k + delay].append((k, nodes.sets, comes & (late == delay)))
     for step, sent, mask in due.pop(k, []):
