@@ -204,8 +204,8 @@ def _page(rows: dict[Key, Row]) -> list[str]:
     rate = rate_with_interval(sound)
     lines = [
         f"{len(rows)} missions of {DURATION_S:.0f} s, {len(refused)} refused by the witness. "
-        "Bounds are five stated sigmas. A mission's bounds hold if every beam speed, fix and depth errs "
-        "within them, and beams on average over blocks of 10 s.",
+        "Bounds are five stated sigmas. A mission's bounds hold if every beam speed, fix and depth "
+        "errs within them, and beams on average over blocks of 10 s.",
         "",
         f"Where all bounds hold ({len(true)}): truth inside the set, or alarm, in {sum(sound)} "
         f"(a rate of {rate.low:.3f} or more, 97.5 %), false alarms in "

@@ -262,8 +262,8 @@ def _page(rows: dict[Key, Row]) -> list[str]:
     header = ["lost", "delay, steps", "half-width, m", "e'P⁻¹e", "outside", "ms per node and step"]
     lines += [*table(header, cells), "", "## A fleet of AUVs", ""]
     lines += [
-        "Four vehicles for ten minutes, two of them with fixes of ± 2.5 m every 30 s; DVL ± 2 cm/s, "
-        f"compass ± 2 deg, ranges ± 0.5 m, packets of {SET_BYTES} bytes. Half-widths of the two "
+        "Four vehicles for ten minutes, two of them with fixes of ± 2.5 m every 30 s; DVL "
+        f"± 2 cm/s, compass ± 2 deg, ranges ± 0.5 m, packets of {SET_BYTES} bytes. Half-widths of the two "
         "others at the end.",
         "",
     ]

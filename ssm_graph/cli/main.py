@@ -54,7 +54,8 @@ exit codes:
   4    smooth or filter ended with a result that must not be trusted blindly (iteration limit,
        interrupted after the first iteration, run away, or the data contradict it); it is written
        all the same, and its status says so; online: ended in order, the last answer was not good;
-       compare: some runs have no result, the table says why
+       compare: some runs have no result, the table says why; network, network-run: a set missed
+       its truth or gave an alarm; integrity: the answer left the set, or a bound is false
   5    smooth found no finite result, nothing is written; online: there never was an answer, what
        came is logged
   130  interrupted, nothing written; compare keeps finished runs and goes on when started again, and
