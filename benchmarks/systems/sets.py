@@ -263,8 +263,8 @@ def _page(rows: dict[Key, Row]) -> list[str]:
     lines += [*table(header, cells), "", "## A fleet of AUVs", ""]
     lines += [
         "Four vehicles for ten minutes, two of them with fixes of ± 2.5 m every 30 s; DVL "
-        f"± 2 cm/s, compass ± 2 deg, ranges ± 0.5 m, packets of {SET_BYTES} bytes. Half-widths of the two "
-        "others at the end.",
+        f"± 2 cm/s, compass ± 2 deg, ranges ± 0.5 m, packets of {SET_BYTES} bytes. Half-widths of "
+        "the two others at the end.",
         "",
     ]
     cells = [

@@ -20,10 +20,12 @@ from ssm_graph.base.errors import (
 from ssm_graph.cli import (
     compare,
     convert,
+    export,
     integrity,
     network,
     network_run,
     online,
+    report,
     simulate,
     smooth,
 )
@@ -82,7 +84,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=version("ssm-graph"))
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    own = (simulate, smooth, filter_command, online, compare, convert)
+    own = (simulate, smooth, filter_command, online, compare, convert, export, report)
     for module in (*own, integrity, network, network_run):
         module.add_parser(commands, epilog=EPILOG)
     return parser
