@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ssm_graph import Mission, SmootherConfig, smooth
+from ssm_graph import Estimate, Mission, SmootherConfig, smooth
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.mission.fault import Treatment
 from ssm_graph.simulation import (
@@ -49,6 +49,12 @@ def simulated() -> SimulatedMission:
             gnss=GnssSettings(windows=((0.0, END_S),)),
         )
     )
+
+
+@pytest.fixture(scope="module")
+def answer(simulated: SimulatedMission) -> Estimate:
+    """Return the smoother's answer without faults."""
+    return smooth(simulated.mission, SmootherConfig())
 
 
 def of(mission: Mission, bounds: WitnessBounds | None = None) -> Witness:
@@ -113,10 +119,11 @@ def test_outlying_beams_are_left_out_without_an_alarm(simulated: SimulatedMissio
     assert holds_truth(mission, w, simulated.truth_at(w.time_s)).all()
 
 
-def test_an_answer_is_inside_or_not(simulated: SimulatedMission, tmp_path: Path) -> None:
+def test_an_answer_is_inside_or_not(
+    simulated: SimulatedMission, answer: Estimate, tmp_path: Path
+) -> None:
     """The smoother's is, and its error within what is told; one that is led aside is not."""
-    mission = simulated.mission
-    estimate = smooth(mission, SmootherConfig())
+    mission, estimate = simulated.mission, answer
     found = check_integrity(mission, estimate)
     assert found.agreement is Agreement.INSIDE
     truth = simulated.truth_at(found.witness.time_s)
@@ -133,7 +140,9 @@ def test_an_answer_is_inside_or_not(simulated: SimulatedMission, tmp_path: Path)
     assert len(rows) == 1 + len(found.radius_m)
 
 
-def test_alarms_that_are_close_are_one_finding(simulated: SimulatedMission) -> None:
+def test_alarms_that_are_close_are_one_finding(
+    simulated: SimulatedMission, answer: Estimate
+) -> None:
     """With those whose bound may be the false one instead."""
     mission = broken(
         simulated,
@@ -143,7 +152,7 @@ def test_alarms_that_are_close_are_one_finding(simulated: SimulatedMission) -> N
         end_s=70.0,
         size=(0.0, 9.0, 0.0),
     )
-    found = check_integrity(mission, smooth(mission, SmootherConfig()))
+    found = check_integrity(mission, answer)
     assert found.agreement is Agreement.ALARM
     (fault,) = found.faults
     assert (fault.sensor, fault.treatment) == ("GNSS", Treatment.SAID)

@@ -58,8 +58,8 @@ def test_the_truth_is_inside(name: str, kind: Disturbance) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(SETTINGS))
 def test_the_truth_stays_inside_for_long(name: str) -> None:
-    """The adversary pushes it out of the first node's set for 500 steps."""
-    setting = replace(SETTINGS[name], n_steps=500, share=Share.ELLIPSOIDS)
+    """The adversary pushes it out of the first node's set for 250 steps."""
+    setting = replace(SETTINGS[name], n_steps=250, share=Share.ELLIPSOIDS)
     trial = run_sets(setting, Disturbance.ADVERSARY, runs=1, seed=4)
     assert 0.9 < trial.excess.max() <= 1.0 + 1e-9
     assert not trial.alarms
