@@ -65,7 +65,7 @@ class Trial(ReadOnlyArrays):
     @property
     def root_trace(self) -> Array:
         """(K, N) of the shape of the first run."""
-        return np.sqrt(np.einsum("...ii->...", self.shape))
+        return np.asarray(np.sqrt(np.einsum("...ii->...", self.shape)))
 
 
 def noise_at(
