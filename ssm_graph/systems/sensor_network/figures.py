@@ -118,8 +118,7 @@ def _plane(trial: Trial) -> Figure:
     for i in range(trial.center.shape[2]):
         for k in range(0, len(trial.truth), 5):
             root = np.linalg.cholesky(trial.shape[k, i, :2, :2])
-            # Drawn around the middle of the box, a hand's breadth from the ellipsoid's own centre.
-            x = trial.center[k, 0, i, :2] + circle @ root.T
+            x = trial.around[k, i, :2] + circle @ root.T
             curves.append(Curve(x[:, 0], x[:, 1], {"color": _COLORS[i % 4], "linewidth": 0.8}))
     panel = Panel(x="east, m", y="north, m", curves=curves)
     return _drawn("Sets in the plane, every fifth step, a colour a node", [panel], 6.0, 5.0)

@@ -46,7 +46,9 @@ class Trial(ReadOnlyArrays):
     log_volume: Array
     """(K, R, N)"""
     shape: Array
-    """(K, N, 3, 3) of the ellipsoids of the first run."""
+    """(K, N, 3, 3) of the ellipsoids of the first run,"""
+    around: Array
+    """(K, N, 3) and their own centres."""
     point: Array
     """(K, R, N, 3) the estimate: of a Kalman filter beside the set, moved into it."""
     ekf: Array
@@ -211,6 +213,7 @@ class _Rows:
             "excess": sets.excess(state[:, None]),
             "log_volume": sets.ellipsoid.log_volume,
             "shape": sets.ellipsoid.shape[0],
+            "around": sets.ellipsoid.center[0],
             "point": sets.nearest(points.center),
             "ekf": points.center,
         }
@@ -265,6 +268,7 @@ def run_patent(
             "excess": now.excess(world.state[:, None]),
             "log_volume": now.log_volume,
             "shape": now.shape[0],
+            "around": now.center[0],
             "point": now.center,
             "ekf": now.center,
         }
