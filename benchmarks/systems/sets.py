@@ -262,9 +262,9 @@ def _page(rows: dict[Key, Row]) -> list[str]:
     header = ["lost", "delay, steps", "half-width, m", "e'P⁻¹e", "outside", "ms per node and step"]
     lines += [*table(header, cells), "", "## A fleet of AUVs", ""]
     lines += [
-        "Three fleets of four vehicles for ten minutes, two of them with fixes of ± 2.5 m every 30 s; DVL "
-        f"± 2 cm/s, compass ± 2 deg, ranges ± 0.5 m, packets of {SET_BYTES} bytes. Half-widths of "
-        "the two others at the end.",
+        "Three fleets of four vehicles for ten minutes, two of them with fixes of ± 2.5 m every "
+        f"30 s; DVL ± 2 cm/s, compass ± 2 deg, ranges ± 0.5 m, packets of {SET_BYTES} bytes. "
+        "Half-widths of the two others at the end.",
         "",
     ]
     cells = [
