@@ -195,8 +195,8 @@ def _wider_page(rows: dict[Key, Row]) -> list[str]:
         f"{', '.join(f'{k:g}' for k in WIDER)} stated sigmas within which every reading errs. "
         f"There is one for {len(held)} of {len(rows)} missions (none for inertial data that lie).",
         "",
-        f"Truth inside throughout in {sum(sound)} of {len(held)} (a rate of {rate.low:.3f} or more, "
-        f"97.5 %), false alarms in {sum(row['alarms'] > 0 for row in held.values())}.",
+        f"Truth inside throughout in {sum(sound)} of {len(held)} (a rate of {rate.low:.3f} or "
+        f"more, 97.5 %), false alarms in {sum(row['alarms'] > 0 for row in held.values())}.",
         "",
     ]
     cells = [
