@@ -4,26 +4,23 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
-from ssm_graph.cli.options import add_command, number_option, say
+from ssm_graph.cli.options import number_option
+from ssm_graph.cli.terminal import say
+
+DESCRIPTION = """\
+Smooth a mission, and beside it lead on the set of all places that its inertial, DVL, depth, compass
+and fix bounds allow; bounds are so many of the stated sigmas. Either the answer is inside, and the
+truth within the distance that is told as long as every bound is true, or an alarm proves that one
+is false. Writes integrity.csv and integrity.json. Ends with 0 if the answer is inside and no alarm
+was raised.
+"""
 
 
-def add_parser(commands: Any, *, epilog: str) -> None:
-    """Declare the command and its options."""
-    parser = add_command(
-        commands,
-        "integrity",
-        summary="a second witness of a smoothed mission: guaranteed bounds",
-        description="Smooth a mission, and beside it lead on the set of all places that its "
-        "inertial, DVL, depth, compass and fix bounds allow; bounds are so many of the stated "
-        "sigmas. Either the answer is inside, and the truth within the distance that is told as "
-        "long as every bound is true, or an alarm proves that one is false. Writes integrity.csv "
-        "and integrity.json. Ends with 0 if the answer is inside and no alarm was raised.",
-        epilog=epilog,
-    )
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     parser.add_argument("mission", type=Path, metavar="MISSION", help="mission folder")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="result folder")
     number_option(parser, "--sigmas", "K", "bounds are so many stated sigmas", 5.0)

@@ -6,11 +6,10 @@ import argparse
 import shlex
 import sys
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
-from ssm_graph.cli.options import add_command, say
+from ssm_graph.cli.terminal import say
 
 DESCRIPTION = """\
 Run a network of nodes that watch one robot: the recursion of the patent beside sets that are worth
@@ -51,15 +50,8 @@ study file (TOML); everything but the name has the value of the setting that it 
 """
 
 
-def add_parser(commands: Any, *, epilog: str) -> None:
-    """Declare the command and its options."""
-    parser = add_command(
-        commands,
-        "network",
-        summary="guaranteed bounds of a sensor network",
-        description=DESCRIPTION,
-        epilog=epilog,
-    )
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     parser.add_argument("study", type=Path, metavar="STUDY.toml", help="what to run")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="result folder")
     parser.add_argument("--no-figures", action="store_true", help="draw no figures")

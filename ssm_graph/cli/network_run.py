@@ -10,20 +10,18 @@ from typing import Any
 from rich.console import Console
 
 from ssm_graph.base.errors import ConfigError
-from ssm_graph.cli.options import add_command, number_option, say
+from ssm_graph.cli.options import number_option
+from ssm_graph.cli.terminal import say
+
+DESCRIPTION = """\
+Start a process for every node of a study (see ssm-graph network --help), let them talk by UDP on
+this machine, and show their sets. Nodes share measurements; the study says how much is lost and of
+how many bits an index is.
+"""
 
 
-def add_parser(commands: Any, *, epilog: str) -> None:
-    """Declare the command and its options."""
-    parser = add_command(
-        commands,
-        "network-run",
-        summary="nodes of a network as processes, by UDP",
-        description="Start a process for every node of a study (see ssm-graph network --help), let "
-        "them talk by UDP on this machine, and show their sets. Nodes share measurements; the "
-        "study says how much is lost and of how many bits an index is.",
-        epilog=epilog,
-    )
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     parser.add_argument("study", type=Path, metavar="STUDY.toml", help="what to run")
     number_option(parser, "--period", "S", "seconds from step to step", 0.2)
     number_option(parser, "--seed", "N", "of the robot and its noise", 0, kind=int)
