@@ -29,7 +29,7 @@ TAKE_S = 60.0
 _PAGE_MB = os.sysconf("SC_PAGE_SIZE") / 1e6
 _VECTORS = ("velocity_enu", "roll_pitch_heading", "velocity_sigma_enu", "attitude_sigma")
 _COLUMNS = {"time_s": 1, **dict.fromkeys(("place", "position_sigma_enu", *_VECTORS), 3)}
-_COLUMNS |= dict.fromkeys(("health", "latency_s", "cpu_s", "newest_s"), 1)
+_COLUMNS |= dict.fromkeys(("health", "latency_s", "cpu_s", "newest_s"), 1) | {"protection": 2}
 _ENDS = np.cumsum(list(_COLUMNS.values())).tolist()
 _SLICES = {
     name: slice(end - width, end)
@@ -60,11 +60,12 @@ class Answers:
             *(n.time_s, n.lat, n.lon, n.height, *n.position_sigma_enu),
             *(x for name in _VECTORS for x in getattr(n, name)),
             *(HEALTHS.index(n.health), n.latency_s, cpu_s, newest_s),
+            *(n.protection_m, n.protection_up_m),
         )
         self._count += 1
 
     def column(self, name: str) -> Array:
-        """Return a column (N,) or (N, 3)."""
+        """Return a column (N,), (N, 2) or (N, 3); ``protection`` is horizontal and up, m."""
         found = self._rows[: self._count, _SLICES[name]]
         return found[:, 0] if found.shape[1] == 1 else found
 

@@ -134,8 +134,9 @@ at a time drawn from them. `all of these`: also without depth. The newest state 
 ping interval and compared with the truth at its own time. Inside: share of the time of good health
 at which the error is within three of its sigmas, of the worst axis, and mean of the nine; wanted
 {WANTED:.0%} or more. Outside: longest unbroken stretch of good health with any axis outside three
-sigmas. Beyond: how long the health was good with any axis beyond five. Memory: growth of the
-resident size from {WARM_H:g} h on, by least squares.
+sigmas. Beyond: how long the health was good with any axis beyond five. Level: the protection level;
+share of the good time that the position is inside it, horizontally and vertically. Memory: growth
+of the resident size from {WARM_H:g} h on, by least squares.
 """
 
 
@@ -146,20 +147,26 @@ def run_all(args: argparse.Namespace) -> list[Soaked]:
     """
     args.out.mkdir(parents=True, exist_ok=True)
     cases = [
-        (args.out, case, args.hours, args.seed + list(CASES).index(case), args.dvl_hz, args.grade)
+        (
+            *(args.out, case, args.hours, args.seed + list(CASES).index(case)),
+            *(args.dvl_hz, args.grade, args.realistic),
+        )
         for case in args.cases
     ]
     return side_by_side(soaked_once, cases, args.jobs, each_fresh=True)
 
 
-def soaked_once(out: Path, case: str, hours: float, seed: int, dvl_hz: float, grade: str) -> Soaked:
+def soaked_once(
+    out: Path, case: str, hours: float, seed: int, dvl_hz: float, grade: str, realistic: bool
+) -> Soaked:
     """Return the run of a case, kept in a folder as soon as it is done."""
     told = [code_version(), case, f"{hours=}", f"{seed=}", f"{dvl_hz=}", f"{grade=!s}"]
+    told += ["realistic"] if realistic else []
     file = out / (re.sub(r"[^\w.=+-]+", "_", "_".join(told)) + ".npz")
     if file.exists():
         with np.load(file) as kept:
             return Soaked.unpack(kept)
-    run = soak(case, hours=hours, seed=seed, dvl_hz=dvl_hz, grade=grade)
+    run = soak(case, hours=hours, seed=seed, dvl_hz=dvl_hz, grade=grade, realistic=realistic)
     unfinished = file.with_suffix(".part.npz")
     arrays: dict[str, Any] = run.pack()
     np.savez(unfinished, **arrays)
@@ -182,13 +189,14 @@ def goals(run: Soaked) -> list[str]:
         f"{100 * inside.mean():.2f} %",
         f"{outside_s:.0f} s{where}",
         f"{beyond_s(run):.0f} s",
+        f"{100 * inside_level(run):.2f} %",
         f"{growth:+.2f}",
         "yes" if is_met else "**no**",
     ]
 
 
 GOALS_HEADER = ["case", "inside, worst axis", "inside, mean", "longest outside"]
-GOALS_HEADER += ["beyond 5 sigmas", "MB/h", "goals met"]
+GOALS_HEADER += ["beyond 5 sigmas", "inside the level", "MB/h", "goals met"]
 
 
 def shares_inside(run: Soaked) -> Array:
@@ -202,6 +210,13 @@ def beyond_s(run: Soaked) -> float:
     """Return for how long the health was good while an axis was off by more than five sigmas, s."""
     is_far = ~(np.abs(run.error) <= 5.0 * run.sigma).all(axis=1)
     return float((run.is_good & is_far).sum()) * float(np.median(np.diff(run.time_s)))
+
+
+def inside_level(run: Soaked) -> float:
+    """Return the share of the good time that both errors of position are inside their levels."""
+    off = np.column_stack([np.hypot(run.error[:, 0], run.error[:, 1]), np.abs(run.error[:, 2])])
+    is_inside = np.asarray((off < run.protection).all(axis=1))
+    return float(is_inside[run.is_good].mean()) if run.is_good.any() else 0.0
 
 
 def growth_mb_per_h(run: Soaked) -> float:
@@ -270,12 +285,16 @@ def main() -> None:
         Option("--cases", list(CASES), "what goes wrong", CASES),
         Option("--grade", "NAVIGATION", "of sensors", [grade.name for grade in Grade]),
         Option("--seed", 0, "of the first case"),
+        Option("--realistic", False, "instruments err as those of the grade do, and state it"),
         Option("--jobs", 2, "processes"),
     )
     args = page.args
     os.environ["OPENBLAS_NUM_THREADS"] = "1"  # for the processes that are begun from here
     runs = run_all(args)
-    size = f"{args.hours:g} h of {{}} case, {args.dvl_hz:g} Hz DVL, {args.grade.lower()} grade"
+    kind = ", realistic instruments" if args.realistic else ""
+    size = (
+        f"{args.hours:g} h of {{}} case, {args.dvl_hz:g} Hz DVL, {args.grade.lower()} grade{kind}"
+    )
     page.write([f"{size.format('each')}.\n{LEGEND}", *report(runs)])
     for folder in page.places(RESULTS):
         save(draw(runs, size.format("every")), folder / "soak.png")

@@ -79,6 +79,8 @@ class Soaked(NamedTuple):
     """(N,) index into `HEALTHS`"""
     latency_s: Array
     """(N,) s, of the last keyframe"""
+    protection: Array
+    """(N, 2) m, horizontal and up"""
     events: dict[str, int]
     refused: dict[str, int]
     rss_s: Array
@@ -111,9 +113,12 @@ class Soaked(NamedTuple):
 
 
 def broken_mission(
-    case: Case, *, duration_s: float, seed: int, dvl_hz: float, grade: Grade
+    case: Case, *, duration_s: float, seed: int, dvl_hz: float, grade: Grade, realistic: bool
 ) -> tuple[Mission, Callable[[Array], Reference]]:
-    """Return the recorded stream of a case, and the truth at any times."""
+    """Return the recorded stream of a case, and the truth at any times.
+
+    ``realistic`` instruments err as those of the grade do, and the mission states it.
+    """
     starts = np.arange(0.0, duration_s, HOUR_S)
     losses = tuple(Loss(s + LOSS_S[0], s + LOSS_S[1]) for s in starts.tolist())
     config = scenario_config(
@@ -126,6 +131,8 @@ def broken_mission(
         outliers=sparse(case.outliers),
         losses=losses if case.losses else (),
         reference_rate_hz=0.1,
+        realistic=realistic,
+        calibrates=realistic,
     )
     mission = simulate(config).mission
     if case.stuck:
@@ -154,11 +161,18 @@ def _with_gaps(mission: Mission, seed: int) -> Mission:
     return replace(mission, imu=replace(imu, **columns))
 
 
-def soak(name: str, *, hours: float, seed: int, dvl_hz: float, grade: str) -> Soaked:
+def soak(
+    name: str, *, hours: float, seed: int, dvl_hz: float, grade: str, realistic: bool
+) -> Soaked:
     """Run a case from begin to end."""
     duration_s = hours * HOUR_S
     mission, truth = broken_mission(
-        CASES[name], duration_s=duration_s, seed=seed, dvl_hz=dvl_hz, grade=Grade[grade]
+        CASES[name],
+        duration_s=duration_s,
+        seed=seed,
+        dvl_hz=dvl_hz,
+        grade=Grade[grade],
+        realistic=realistic,
     )
     smoother = FixedLagSmoother(vehicle_of(mission))
     events: Counter[str] = Counter()
@@ -190,6 +204,7 @@ def soak(name: str, *, hours: float, seed: int, dvl_hz: float, grade: str) -> So
         sigma,
         run.answers.column("health").astype(np.intp),
         run.answers.column("latency_s"),
+        run.answers.column("protection"),
         dict(events),
         run.refused,
         run.rss_s,

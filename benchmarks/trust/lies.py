@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +30,8 @@ class Lie(NamedTuple):
     """Words of which the verdict has to use one, to name the right sensor"""
     with_gnss: bool | None = None
     """Whether the mission has fixes all the time; None for every other seed"""
+    with_compass: bool = False
+    """Whether it has a compass"""
 
 
 def _window(rng: Rng, end_s: float, shortest: float, longest: float) -> tuple[float, float]:
@@ -147,6 +150,16 @@ def fixes_late(rng: Rng, end_s: float) -> Fault:  # noqa: ARG001
     return _gnss(FaultShape.LATE, 0.0, size=1.0)
 
 
+def fixes_frozen(rng: Rng, end_s: float) -> Fault:
+    """Draw a receiver that stays where it was."""
+    return _gnss(FaultShape.STUCK, _onset(rng, end_s))
+
+
+def water_later(rng: Rng, end_s: float) -> Fault:
+    """Draw a current that pings are relative to from some time on."""
+    return replace(water(rng, end_s), start_s=_onset(rng, end_s))
+
+
 def _depth(shape: FaultShape, begin: float, end: float = math.inf, size: Size = ()) -> Fault:
     return Fault(sensor=Sensor.DEPTH, shape=shape, start_s=begin, end_s=end, size=size)
 
@@ -166,6 +179,18 @@ def depth_off(rng: Rng, end_s: float) -> Fault:
 def depth_frozen(rng: Rng, end_s: float) -> Fault:
     """Draw a depth that stays where it was."""
     return _depth(FaultShape.STUCK, *_window(rng, end_s, 60.0, 150.0))
+
+
+def depth_drifts_fast(rng: Rng, end_s: float) -> Fault:
+    """Draw a depth that drifts by centimetres a second from some time on."""
+    return _depth(FaultShape.RAMP, _onset(rng, end_s), size=float(rng.uniform(0.01, 0.03)))
+
+
+def compass_off(rng: Rng, end_s: float) -> Fault:
+    """Draw a compass beside iron for a minute or two."""
+    begin, end = _window(rng, end_s, 60.0, 150.0)
+    off = math.radians(float(rng.uniform(8.0, 20.0)) * rng.choice([-1.0, 1.0]))
+    return Fault(sensor=Sensor.COMPASS, start_s=begin, end_s=end, size=off)
 
 
 def _imu(sensor: Sensor, shape: FaultShape, *window: float, size: float | None = None) -> Fault:
@@ -201,6 +226,13 @@ def gyros_short(rng: Rng, end_s: float) -> Fault:  # noqa: ARG001
     return _imu(Sensor.GYROS, FaultShape.SCALE, size=0.6)
 
 
+def gyro_jumps(rng: Rng, end_s: float) -> Fault:
+    """Draw a gyro about the vertical whose bias jumps by 0.02 to 0.1 deg/s."""
+    size = math.radians(float(rng.uniform(0.02, 0.1)) * rng.choice([-1.0, 1.0]))
+    shape, start_s = FaultShape.CONSTANT, _onset(rng, end_s)
+    return Fault(sensor=Sensor.GYROS, shape=shape, start_s=start_s, size=size, axes=(2,))
+
+
 LIES = {
     "two opposite beams, ±0.03 to 0.08 m/s, 100 to 200 s": Lie(two_opposite, ("DVL",)),
     "two adjacent beams, 0.04 to 0.1 m/s, 60 to 150 s": Lie(two_beams, ("DVL",)),
@@ -227,3 +259,26 @@ LIES = {
     "inertial noise ten times the stated": Lie(imu_noisy, (*INERTIAL, "inertial")),
     "gyros read 0.60 of the turn": Lie(gyros_short, INERTIAL),
 }
+LIVE = {
+    label: LIES[label]
+    for label in (
+        "mounting turns by 2 to 6 deg",
+        "bottom that drifts at 0.04 to 0.1 m/s",
+        "GNSS 2 to 5 m off, 60 to 150 s",
+        "GNSS pulled at 2 to 6 cm/s",
+        "depth frozen, 60 to 150 s",
+        "GNSS steps by 1.5 m",
+        "scale of the DVL jumps by 2 to 5 %",
+        "two opposite beams, ±0.03 to 0.08 m/s, 100 to 200 s",
+    )
+} | {
+    "gyro about the vertical reads 0 for 20 s": Lie(gyro_stuck, (*INERTIAL, "inertial")),
+    "depth drifts at 1 to 3 cm/s": Lie(depth_drifts_fast, ("depth",)),
+    "GNSS frozen": Lie(fixes_frozen, ("GNSS",), with_gnss=True),
+    "water taken for the bottom, 0.2 to 0.4 m/s": Lie(water_later, ("DVL",)),
+    "bias of the vertical gyro jumps by 0.02 to 0.1 deg/s": Lie(
+        gyro_jumps, (*INERTIAL, "inertial")
+    ),
+    "compass 8 to 20 deg off, 60 to 150 s": Lie(compass_off, ("compass",), with_compass=True),
+}
+"""What the estimator on the vehicle is judged by: what begins while it goes."""

@@ -18,6 +18,7 @@ from benchmarks.report import Option, Report, number_text, table
 from benchmarks.trust.lies import LIES
 from ssm_graph import Estimate, Mission, SmootherConfig, SsmGraphError, evaluate, smooth
 from ssm_graph.simulation import (
+    AidSettings,
     DvlSettings,
     GnssSettings,
     Grade,
@@ -82,19 +83,28 @@ class Run(NamedTuple):
         return self.status == "CONVERGED" and self.z > BEYOND
 
 
-def mission_of(grade: str, seed: int, *, with_gnss: bool, realistic: bool) -> SimulatedMission:
+def mission_of(
+    grade: str,
+    seed: int,
+    *,
+    with_gnss: bool,
+    realistic: bool,
+    aids: AidSettings | None = None,
+    duration_s: float = DURATION_S,
+) -> SimulatedMission:
     """Simulate a survey or, each third seed, a spiral, of a place of its own."""
     rng = np.random.default_rng([seed, *b"trust"])
     route = SpiralRoute() if seed % 3 == 2 else SurveyRoute(line_m=float(rng.uniform(60.0, 200.0)))
     return simulate(
         SimulationConfig(
             route=route,
-            duration_s=DURATION_S,
+            duration_s=duration_s,
             lat=float(rng.uniform(-1.2, 1.2)),
             seed=seed,
             grade=Grade[grade.upper()],
             dvl=DvlSettings(noise=SIGMA_M_PER_S),
-            gnss=GnssSettings(windows=((0.0, DURATION_S),)) if with_gnss else None,
+            gnss=GnssSettings(windows=((0.0, duration_s),)) if with_gnss else None,
+            aids=aids or AidSettings(),
             realistic=realistic,
             calibrates=realistic,
         )

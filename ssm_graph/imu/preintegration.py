@@ -140,6 +140,7 @@ def preintegrate_steps(
     rate_hz: float,
     bias: Array | None = None,
     errors: Array | None = None,
+    frozen: Sequence[FrozenAxis] = (),
 ) -> Steps[InertialChain]:
     """Preintegrate the inertial data between keyframes.
 
@@ -152,13 +153,15 @@ def preintegrate_steps(
     bias : (6,) accelerometer and gyro bias about which to linearise, m/s^2 and rad/s.
     errors : (27,) of the sensors, see :mod:`factors.imu_errors`, that are taken off first, and that
         the increments follow; without them they do not.
+    frozen : axes that repeat themselves by what came before these samples; all that they have
+        missed is uncertain in the first interval.
     """
     source = None
     if errors is not None:
         source = ErrorSource(imu, keyframe_s, rate_hz, errors)
         imu = without_errors(imu, errors)
     gaps = imu_gaps(imu)
-    unseen = tuple(_unseen(imu, keyframe_s, gaps, frozen_axes(imu)))
+    unseen = tuple(_unseen(imu, keyframe_s, gaps, frozen_axes(imu), frozen))
     yield 3e-4 * len(imu.time_s)
     samples = yield from merge_samples_steps(bridged(imu, gaps), keyframe_s, rate_hz=rate_hz)
     bias = np.zeros(6) if bias is None else bias
@@ -306,34 +309,48 @@ def imu_gaps(imu: ImuLog) -> tuple[Array, Array]:
 
 
 def _unseen(
-    imu: ImuLog, keyframe_s: Array, gaps: tuple[Array, Array], frozen: Sequence[FrozenAxis]
+    imu: ImuLog,
+    keyframe_s: Array,
+    gaps: tuple[Array, Array],
+    frozen: Sequence[FrozenAxis],
+    missed: Sequence[FrozenAxis] = (),
 ) -> list[Unseen]:
     """Return what is not seen of each interval between keyframes.
 
-    That is its longest stretch of a gap, or of gyros or accelerometers that repeat themselves.
+    That is its longest stretch of a gap, or of gyros or accelerometers that repeat themselves; of
+    the first one also what others, ``missed``, have missed since before.
     """
     stretches: list[tuple[float, float, Array, Array]] = []
     for gap in zip(*gaps, strict=True):
         lively, pushed = _liveliness(imu, *gap)
         stretches.append((*gap, np.full(3, lively), np.full(3, pushed)))
-    for is_gyro, axis, begin, end in frozen:
-        # What an axis does meanwhile, a turn perhaps, need not resemble what it did before.
-        own = np.eye(3)[axis]
-        rate_and_force = (
-            (GAP_GYRO_RATE * own, 0.0 * own) if is_gyro else (0.0 * own, GAP_ACCEL * own)
-        )
-        stretches.append((begin, end, *rate_and_force))
+    stretches += [(axis.begin_s, axis.end_s, *_missing(axis)) for axis in frozen]
     unseen = [Unseen()] * (len(keyframe_s) - 1)
     for begin, end, rate, force in stretches:
         overlap = np.minimum(end, keyframe_s[1:]) - np.maximum(begin, keyframe_s[:-1])
         for k in np.flatnonzero(overlap > 0.0).tolist():
-            before = unseen[k] if unseen[k].gap_s else Unseen(0.0, (0.0,) * 3, (0.0,) * 3)
-            unseen[k] = Unseen(
-                max(float(overlap[k]), before.gap_s),
-                tuple(np.maximum(rate, before.rate).tolist()),
-                tuple(np.maximum(force, before.force).tolist()),
-            )
+            unseen[k] = _more_unseen(unseen[k], float(overlap[k]), rate, force)
+    for axis in missed:
+        unseen[0] = _more_unseen(unseen[0], axis.end_s - axis.begin_s, *_missing(axis))
     return unseen
+
+
+def _missing(axis: FrozenAxis) -> tuple[Array, Array]:
+    """Return by how much rate and force (3,) may be off while an axis repeats itself.
+
+    What it does meanwhile, a turn perhaps, need not resemble what it did before.
+    """
+    own = np.eye(3)[axis.axis]
+    return (GAP_GYRO_RATE * own, 0.0 * own) if axis.is_gyro else (0.0 * own, GAP_ACCEL * own)
+
+
+def _more_unseen(known: Unseen, gap_s: float, rate: Array, force: Array) -> Unseen:
+    before = known if known.gap_s else Unseen(0.0, (0.0,) * 3, (0.0,) * 3)
+    return Unseen(
+        max(gap_s, before.gap_s),
+        tuple(np.maximum(rate, before.rate).tolist()),
+        tuple(np.maximum(force, before.force).tolist()),
+    )
 
 
 def _liveliness(imu: ImuLog, begin: float, end: float) -> tuple[float, float]:

@@ -295,9 +295,8 @@ def without_frozen(mission: Mission) -> tuple[Mission, tuple[DetectedFault, ...]
         kept = _measured("depth", depth.time_s, depth.depth[:, None], found)
         depth = depth if kept.all() else depth.rows(kept)
     for axis in frozen_axes(mission.imu):
-        name, where = ("gyros", "about") if axis.is_gyro else ("accelerometers", "along")
-        what = f"one reading again and again {where} {'xyz'[axis.axis]}"
-        found.append(_repeating(name, what, axis.begin_s, axis.end_s, Treatment.COVERED))
+        name = "gyros" if axis.is_gyro else "accelerometers"
+        found.append(_repeating(name, str(axis), axis.begin_s, axis.end_s, Treatment.COVERED))
     return replace(mission, gnss=gnss, depth=depth), tuple(found)
 
 

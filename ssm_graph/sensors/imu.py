@@ -20,7 +20,7 @@ from ssm_graph.base.frozen import Array, FrozenArrays, Vector, shaped
 from ssm_graph.base.settings import FILE_KEY, Key, Settings, optional_key, sigma_key
 from ssm_graph.base.tables import Table
 from ssm_graph.base.units import DEG_PER_H, DEGREE, MICRO_G, PER_SQRT_H
-from ssm_graph.sensors.frozen import frozen_runs
+from ssm_graph.sensors.frozen import USUALLY_EQUAL, frozen_runs
 from ssm_graph.sensors.imu_calibration import CALIBRATED, ImuCalibration, calibration_keys
 from ssm_graph.sensors.instrument import XYZ, Column, Instrument, Lists
 from ssm_graph.sensors.messages import Message
@@ -114,6 +114,10 @@ class FrozenAxis(NamedTuple):
     begin_s: float
     end_s: float
 
+    def __str__(self) -> str:
+        where = "about" if self.is_gyro else "along"
+        return f"one reading again and again {where} {'xyz'[self.axis]}"
+
 
 FROZEN_S: Final = 1.0
 FROZEN_SAMPLES: Final = 20
@@ -129,6 +133,26 @@ def frozen_axes(log: ImuLog) -> list[FrozenAxis]:
             log.time_s, values[:, None], least_s=FROZEN_S, least_count=FROZEN_SAMPLES
         )
     ]
+
+
+def frozen_now(rows: Array) -> list[FrozenAxis]:
+    """Return the axes that give one reading for long up to the last of the rows (N, 7).
+
+    Rows are time, s, gyros, accelerometers. An axis whose readings were often equal before, or
+    always, is none of them: resolution makes them so, or rest.
+    """
+    last = rows[-1 - FROZEN_SAMPLES :, 1:]
+    if len(last) <= FROZEN_SAMPLES:
+        return []
+    found = []
+    for axis in np.flatnonzero((last == last[-1]).all(axis=0)).tolist():
+        changed = np.flatnonzero(np.diff(rows[:, 1 + axis]))
+        begin = int(changed[-1]) + 1 if len(changed) else 0
+        is_usual = begin - len(changed) >= USUALLY_EQUAL * begin
+        begin_s, end_s = float(rows[begin, 0]), float(rows[-1, 0])
+        if end_s - begin_s >= FROZEN_S and not is_usual:
+            found.append(FrozenAxis(axis < 3, axis % 3, begin_s, end_s))
+    return found
 
 
 class Stamp(Enum):

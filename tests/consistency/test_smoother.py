@@ -133,10 +133,10 @@ def test_fewer_beams_know_less() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("beams", LOST.values(), ids=LOST)
-def test_truth_stays_within_three_sigma_with_few_beams(beams: tuple[int, ...]) -> None:
+@pytest.mark.parametrize("name", ["two beams", "one beam", "no beam"])
+def test_truth_stays_within_three_sigma_with_few_beams(name: str) -> None:
     """3 min with few or no beams at tactical grade: at least 99 % of axes and epochs."""
-    inside = []
+    beams, inside = LOST[name], []
     for seed in range(20):
         losses = losses_of(beams, 60.0, 240.0)
         sim = simulated(duration_s=300.0, grade=Grade.TACTICAL, losses=losses, seed=300 + seed)

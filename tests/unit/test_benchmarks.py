@@ -268,3 +268,17 @@ def test_trust(tmp_path: Path) -> None:
     lies, clean = done.rows("one beam"), done.rows("no fault")
     assert [row[1] for row in lies] == ["tactical"] * 2
     assert clean == []
+
+
+@pytest.mark.benchmark
+def test_trust_live(tmp_path: Path) -> None:
+    """A slip is seen and named, and bounded; a second run takes what the first one made."""
+    options = "--seeds 1 --grades tactical --lie-s 30 --clean-s 0 --only mounting"
+    for _ in range(2):
+        done = run("trust.live", options, "live", tmp_path)
+        (kept,) = tmp_path.glob("*.jsonl")
+        assert len(kept.read_text(encoding="utf-8").splitlines()) == 2
+        (row,) = done.rows("mounting")
+        assert row[2] == "0 of 1"
+        assert row[7] == "1 of 1"
+        assert row[9].startswith("100.00")

@@ -14,7 +14,7 @@ from ssm_graph.mission.navigation import Health, Navigation
 from ssm_graph.sensors.depth import DepthReading
 from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.gnss import Fix
-from ssm_graph.sensors.imu import ImuSample
+from ssm_graph.sensors.imu import FrozenAxis, ImuSample, frozen_now
 from ssm_graph.sensors.messages import Message
 from tests.online_fixture import SHORT, messages, stream
 
@@ -140,6 +140,35 @@ def test_inertial_data_that_end_are_bad_at_once() -> None:
     health, reason = smoother.status()
     assert health is Health.BAD
     assert "no inertial data" in reason
+
+
+def test_a_gyro_that_repeats_itself_is_said_and_covered() -> None:
+    """Named within a second and a half, the turn since it began is unknown; sound data say none."""
+    given = [
+        replace(m, gyro_b=(*m.gyro_b[:2], 0.01)) if isinstance(m, ImuSample) and m.time_s > 9 else m
+        for m in messages()
+    ]
+    smoother = pushed([m for m in given if m.time_s < 9.8])
+    assert "again and again" not in smoother.status()[1]
+    smoother = pushed([m for m in given if m.time_s < 10.8])
+    health, reason = smoother.status()
+    assert health is Health.DEGRADED
+    assert "gyros give one reading again and again about z" in reason
+    newest = smoother.newest()
+    assert newest is not None
+    assert newest.attitude_sigma[2] > 1.1 * undisturbed().attitude_sigma[2]
+    assert frozen_now(np.zeros((200, 7))) == []
+
+
+def test_resolution_freezes_nothing() -> None:
+    """Readings in steps, as often equal before, are left alone; a stretch amid noise is not."""
+    rows = np.column_stack([0.01 * np.arange(1000), np.zeros((1000, 6))])
+    rows[:, 1:] = np.random.default_rng(3).standard_normal((1000, 6))
+    rows[850:, 3] = rows[850, 3]
+    assert frozen_now(rows) == [FrozenAxis(True, 2, rows[850, 0], rows[-1, 0])]
+    assert frozen_now(rows[:940]) == []
+    rows[:850, 3] = np.floor(np.arange(850) / 2)
+    assert frozen_now(rows) == []
 
 
 def test_a_late_sample_counts_at_once() -> None:

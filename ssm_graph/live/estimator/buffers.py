@@ -19,12 +19,14 @@ from ssm_graph.sensors.dvl import Ping, counted_sigma
 from ssm_graph.sensors.dvl_instrument import DVL
 from ssm_graph.sensors.dvl_readings import STUCK_PINGS, stuck_beams
 from ssm_graph.sensors.gnss import GNSS, GnssLog
-from ssm_graph.sensors.imu import IMU, ImuLog, ImuSample
+from ssm_graph.sensors.imu import IMU, FrozenAxis, ImuLog, ImuSample, frozen_now
 from ssm_graph.sensors.messages import Message
 from ssm_graph.sensors.registry import BY_LOG, BY_MESSAGE
 
 OFF_WATER: Final = -1
 """Column of a ping's row that is 1 off the water."""
+FROZEN_REACH_S: Final = 30.0
+"""An axis that has repeated itself for longer is not told from one that always did."""
 PERIOD_EVERY: Final = 100
 DEFAULT_PERIOD_S: Final = 0.01
 """Sampling interval of the inertial data before there are two samples."""
@@ -149,6 +151,10 @@ class Buffers:
         if not known.is_stated:
             return rows
         return np.column_stack([rows[:, 0], *known.taken_off(rows[:, 1:4], rows[:, 4:])])
+
+    def frozen_until(self, time_s: float) -> list[FrozenAxis]:
+        """Return the axes of the inertial sensors that repeat themselves up to a time."""
+        return frozen_now(self.imu.between(time_s - FROZEN_REACH_S, time_s))
 
     def mission(self, frame: LocalFrame, *, until_s: float = np.inf) -> Mission:
         """Return everything, or what is of a time ``until_s``, as a mission to align with."""

@@ -236,6 +236,7 @@ class Course:
             force=force,
             gap_s=float(np.max(np.diff(samples[:, 0], prepend=last.time_s), initial=0.0)),
             missing=1.0 - len(samples) / n_due if n_due > 0 else 0.0,
+            frozen=buffers.frozen_until(keyframe.time_s),
         )
 
     def _agree(self, measured: Measured) -> bool:

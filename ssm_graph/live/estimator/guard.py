@@ -23,7 +23,6 @@ from ssm_graph.live.estimator.separation import (
     unpack_contradictions,
 )
 from ssm_graph.mission.estimate import ProtectionTrack
-from ssm_graph.sensors.imu import ImuNoise
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors
 from ssm_graph.smoothers.window import Window
 
@@ -73,9 +72,9 @@ class Guarded(NamedTuple):
 class Guardian:
     """Makes one guard of the one before."""
 
-    def __init__(self, sensors: Sensors, noise: ImuNoise, config: IntegrityConfig) -> None:
+    def __init__(self, sensors: Sensors, config: IntegrityConfig) -> None:
         self._frame, self.config = sensors.frame, config
-        self.bank = LaneBank(sensors, noise)
+        self.bank = LaneBank(sensors)
         self.judge = Judge(self.bank, config)
 
     def begin(self, window: Window, known: Sequence[Mapping[str, Any]] = ()) -> Guard:

@@ -111,12 +111,18 @@ class KeyframeMaker:
         return self._buffers.imu_log(begin_s - LIVELY_S, end_s + half)
 
     def _integrate(self, imu: ImuLog, begin_s: float, end_s: float) -> InertialChain:
+        known = {axis[:2]: axis.end_s for axis in self._buffers.frozen_until(begin_s)}
+        frozen = [
+            axis._replace(begin_s=known.get(axis[:2], axis.begin_s))
+            for axis in self._buffers.frozen_until(end_s)
+        ]
         return preintegrate(
             imu,
             np.array([begin_s, end_s]),
             frame=self._frame,
             rate_hz=self._config.merge_rate_hz,
             errors=NONE if self._buffers.vehicle.imu_calibration.is_asked else None,
+            frozen=frozen,
         )
 
     def _beams(self, pings: Array, gyro_b: Array) -> Beams:

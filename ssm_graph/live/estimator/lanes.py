@@ -4,8 +4,8 @@ A lane begins with what all sensors say and goes on without one of them for 10, 
 each length take turns. What it says then owes nothing to what that sensor did since: a sensor that
 lies for long, or whose readings all lie alike, parts the lanes from the answer. That is solution
 separation. One more lane leaves nothing out and is the measure of the others: all have one model,
-in which noise that lasts is as large as it may be, and then the covariance of a separation is the
-difference of their covariances.
+that of the window with a share of the noise that lasts, and then the covariance of a separation is
+the difference of their covariances.
 
 All lanes are linear about the answer of the window, whose rows and weights they use, and are
 carried as deviations from it in arrays: a keyframe costs as much as a few small products.
@@ -18,20 +18,17 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from factors import so3
 from ssm_graph.base.frozen import Array
-from ssm_graph.engine.error_state import ACCEL_BIAS, GYRO_BIAS, ROTATION, STATE_DIM
 from ssm_graph.engine.states import States
-from ssm_graph.graph.aids.depth import DepthMeans
-from ssm_graph.graph.aids.gnss import Fixes
+from ssm_graph.graph.aids.depth import DEPTH_DRIFT, DepthMeans
+from ssm_graph.graph.aids.gnss import GNSS_DRIFT, Fixes
 from ssm_graph.graph.aids.heading import Headings
 from ssm_graph.graph.aids.magnetometer import MagneticFields
 from ssm_graph.graph.aids.ranges import Ranges
 from ssm_graph.graph.aids.usbl import UsblFixes
 from ssm_graph.graph.inertial_rows import InertialRows
-from ssm_graph.imu.preintegration import GRAVITY
+from ssm_graph.mission.calibration import DVL_DRIFT
 from ssm_graph.sensors.dvl import MOST_BEAMS
-from ssm_graph.sensors.imu import ImuNoise
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors
 from ssm_graph.smoothers.window import BEAMS, Window
 from ssm_graph.smoothers.window_aids import SensorRows
@@ -53,19 +50,20 @@ SUSPECT_OF: Final = {
 """What is left out together, by the name of the sensor's rows; others are never left out."""
 FIXES: Final = (Fixes.name, ACOUSTICS)
 """Those that tell where the vehicle is."""
-LASTING: Final = {DVL: 0.5, Fixes.name: 0.02}
-"""Share of a sensor's variance that may last, by suspect: it is a state of every lane."""
+LASTING: Final = {DVL: 0.125, Fixes.name: 0.02}
+"""Share of a sensor's variance that may last, by suspect: it is a state of every lane, unless the
+vehicle states a drift, which is a state of the window then. That of a DVL is what bottom tracks
+show (`simulation.instruments.BeamNoise`)."""
 LASTING_OF_OTHERS: Final = 0.25
 LASTING_S: Final = 20.0
 """Correlation time of what lasts."""
-TURN_S: Final = 10.0
-"""So long a turn goes on, over which the errors of the gyros' scales and axes add up."""
-INSTABILITY: Final = 0.4
-"""Share of their turn-on sigma by which the biases of inertial sensors wander,"""
-INSTABILITY_S: Final = 300.0
-"""within so much: an instability that data sheets state as the floor of the Allan deviation."""
+DRIFTS: Final = {BEAMS: DVL_DRIFT, Fixes.name: GNSS_DRIFT, DepthMeans.name: DEPTH_DRIFT}
+"""What a stated drift is called, by the name of the sensor's rows."""
 MISFIT_S: Final = 10.0
 """A misfit is forgotten within so much."""
+BEGUN_ANEW: Final = 1e4
+"""Misfit of a measure that was just begun anew: it fits whatever it was begun with, which may be
+what lies, and so refutes no lane until this is forgotten, about a minute."""
 LEAST_WEIGHT: Final = 1e-3
 MEMORY_S: Final = 10.0
 """Time constant of the low-passed innovation ratios."""
@@ -103,8 +101,6 @@ class Lanes(NamedTuple):
     """(S,) when each suspect was last heard, s"""
     ratio: Array
     """(S, 8) low-passed innovations in their sigmas, NaN where there are none"""
-    rate_b: Array
-    """(3,) rad/s, low-passed"""
 
     def pack(self) -> Iterator[tuple[str, Array]]:
         """Yield name and array of everything."""
@@ -131,7 +127,7 @@ _BY_LANE: Final = Lanes._fields[: Lanes._fields.index("last_s")]
 class LaneBank:
     """Which lanes a vehicle has, and how they go on from keyframe to keyframe."""
 
-    def __init__(self, sensors: Sensors, noise: ImuNoise) -> None:
+    def __init__(self, sensors: Sensors) -> None:
         named = [BEAMS, *sensors.aids]
         self.suspects = tuple(dict.fromkeys(s for n, s in SUSPECT_OF.items() if n in named))
         """What is left out, each in its turn"""
@@ -150,17 +146,13 @@ class LaneBank:
         self._lasting: dict[str, slice] = {}
         shares, end = [], sensors.state_dim
         for name, suspect in SUSPECT_OF.items():
-            if name in dims:
+            if name in dims and DRIFTS.get(name, "") not in sensors.extras:
                 self._lasting[name] = slice(end, end + dims[name])
                 end += dims[name]
                 shares += [LASTING.get(suspect, LASTING_OF_OTHERS)] * dims[name]
         self._share = np.array(shares)
         """Variance of what lasts, in that of the noise"""
         self._n = sensors.state_dim
-        bias_sigma = np.repeat([noise.accel_bias_sigma, noise.gyro_bias_sigma], 3)
-        self._wander = 2.0 * (INSTABILITY * bias_sigma) ** 2 / INSTABILITY_S
-        self._scale = noise.accel_bias_sigma / GRAVITY
-        """Errors of scales and axes are to gravity as the bias: 50 ppm, 500 ppm, 5000 ppm"""
 
     def lanes_of(self, suspect: int) -> range:
         """Return the lanes that leave a suspect out, that which is held last."""
@@ -189,7 +181,6 @@ class LaneBank:
             np.ones(L),
             np.full(S, -np.inf),
             np.full((S, MOST_BEAMS), np.nan),
-            np.zeros(3),
         )
 
     def led_on(self, lanes: Lanes, last: States, keyframe: Keyframe, window: Window) -> Lanes:
@@ -215,7 +206,7 @@ class LaneBank:
         is_nested = np.zeros(len(deviation))
         is_nested[MEASURE] = 1.0
         misfit = lanes.misfit.copy()
-        misfit[MEASURE] = 0.0
+        misfit[MEASURE] = BEGUN_ANEW
         lanes = lanes._replace(
             deviation=deviation, covariance=covariance, misfit=misfit, is_nested=is_nested
         )
@@ -231,17 +222,7 @@ class LaneBank:
         assert keyframe.inertial is not None
         interval, now = keyframe.inertial, window.newest_states
         ahead = self._inertial.predict(interval, last)
-        covariance = ahead.covariance(lanes.covariance)
-        # What the gyros are off in a turn lasts as long as the turn; waves come and go.
-        span_s = float(interval.span_s[0])
-        turn_b = so3.log(interval.delta_R)[0]
-        share = 1.0 - np.exp(-span_s / TURN_S)
-        rate_b = lanes.rate_b + share * (turn_b / span_s - lanes.rate_b)
-        lasting = float(rate_b @ rate_b) * span_s * TURN_S + float(turn_b @ turn_b)
-        turned = np.arange(STATE_DIM)[ROTATION]
-        covariance[:, turned, turned] += self._scale**2 * lasting
-        biases = np.r_[np.arange(STATE_DIM)[ACCEL_BIAS], np.arange(STATE_DIM)[GYRO_BIAS]]
-        covariance[:, biases, biases] += self._wander * span_s
+        covariance, span_s = ahead.covariance(lanes.covariance), float(interval.span_s[0])
         n, kept = self._n, np.exp(-span_s / LASTING_S)
         covariance[:, n:] *= kept
         covariance[:, :, n:] *= kept
@@ -253,9 +234,7 @@ class LaneBank:
         moved = off + ahead.deviation(lanes.deviation[:, :n])
         deviation = np.concatenate([moved, lanes.deviation[:, n:] * kept], axis=1)
         misfit = lanes.misfit * np.exp(-span_s / MISFIT_S)
-        return lanes._replace(
-            deviation=deviation, covariance=covariance, misfit=misfit, rate_b=rate_b
-        )
+        return lanes._replace(deviation=deviation, covariance=covariance, misfit=misfit)
 
     def _updated(self, lanes: Lanes, measured: Sequence[SensorRows], time_s: float) -> Lanes:
         suspect = [self._number(rows.sensor) for rows in measured]

@@ -24,8 +24,11 @@ from ssm_graph.live.estimator.lanes import DEPTH, DVL, FIXES, LENGTHS_S, MEASURE
 
 PARTS: Final = (VELOCITY, POSITION)
 UNITS: Final = ("m/s", "m")
-TEST_S: Final = 1.0
-"""What lanes say changes so slowly that of tests one in so long counts as another one."""
+TEST_S: Final = 10.0
+"""What lanes say changes so slowly, and those of one sensor say so much the same, that of the tests
+of each lane one in so long counts as another one. Of noise as stated, 4 h at navigation and at
+tactical grade, tests went above a level 3000 to 9000 times as often in an hour as one test would;
+this counts 10000."""
 UNASKED: Final = 0.01
 """Share of the measure's covariance added to that of a separation: what moves the answer by less
 than a tenth of its own sigma is not asked for."""
@@ -45,6 +48,9 @@ RIVAL: Final = 0.5
 """A sensor that explains so much of what the likeliest one explains is named beside it."""
 NEAR: Final = 25.0
 """And so is one whose chi-square is within so much."""
+HORIZONTAL: Final = np.array([1.0, 0.0])
+VERTICAL: Final = np.array([0.0, 1.0])
+"""Of the two protection levels"""
 INERTIAL: Final = "the inertial data"
 
 
@@ -264,7 +270,8 @@ class Judge:
 
         ``found`` are the separations of those that are not led on; ``R_up`` (3, 3) turns position
         in body axes to east, north, up; ``fixed_s`` is when the position was last known by itself,
-        s: by a fix, or where all began.
+        s: by a fix, or where all began. A lane that is led on began with what its sensor may have
+        done until then without being seen.
         """
         off = np.abs(lanes.deviation[:, POSITION] @ R_up.T)
         P = R_up @ lanes.covariance[:, POSITION, POSITION] @ R_up.T
@@ -279,23 +286,27 @@ class Judge:
         worst = bound[MEASURE].copy()
         for suspect, name in enumerate(self._bank.suspects):
             own, held = self._bank.lanes_of(suspect), int(self._bank.held[suspect])
-            if np.isfinite(lanes.begun_s[held]):
-                worst = np.maximum(worst, bound[held])
+            is_led_on = bool(np.isfinite(lanes.begun_s[held]))
             lane = np.array([i for i in own if i != held and lanes.n_out[i] > 0.0], dtype=np.intp)
             if len(lane) == 0:
+                worst = np.maximum(worst, bound[held]) if is_led_on else worst
                 continue
-            age_s = time_s - lanes.begun_s[lane]
+            age_s, since_s = time_s - lanes.begun_s[lane], time_s - fixed_s
+            sigmas = self.detectable * found.sigma[lane, 0 if name == DVL else 1]
+            step = float(sigmas.min())
             if name == DVL:
-                step = self.detectable * float(np.min(found.sigma[lane, 0]))
+                begun_s = float(lanes.begun_s[held]) if is_led_on else fixed_s
+                unseen = step * max(begun_s - fixed_s, 0.0) * HORIZONTAL
                 grown = bound[MEASURE] + step * age_s[:, None]
-                older = bound[MEASURE] + step * (time_s - fixed_s) * np.array([1.0, 0.0])
-                if time_s - fixed_s > LENGTHS_S[-1]:
-                    worst = np.maximum(worst, older)
+                older = bound[MEASURE] + step * since_s * HORIZONTAL * (since_s > LENGTHS_S[-1])
             else:
-                step = self.detectable * float(np.min(found.sigma[lane, 1]))
-                axis = np.array([0.0, 1.0]) if name == DEPTH else np.ones(2)
-                grown = np.tile(bound[MEASURE] + step * axis, (len(lane), 1))
-                worst = np.maximum(worst, grown[0])
+                axis = VERTICAL if name == DEPTH else np.ones(2)
+                # A slow pull shows to the longest lane last.
+                unseen, older = float(sigmas.max()) * axis, bound[MEASURE] + step * axis
+                grown = np.tile(older, (len(lane), 1))
+            if is_led_on:
+                worst = np.maximum(worst, bound[held] + unseen)
+            worst = np.maximum(worst, older)
             worst = np.maximum(worst, np.min([bound[lane], grown], axis=0).max(axis=0))
         return Protection(*worst.tolist())
 

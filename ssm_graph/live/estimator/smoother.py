@@ -161,7 +161,7 @@ class FixedLagSmoother:
         return True
 
     def _guardian(self, sensors: Sensors) -> Guardian:
-        return Guardian(sensors, self.vehicle.imu_noise, self.integrity)
+        return Guardian(sensors, self.integrity)
 
     def _maker(self) -> KeyframeMaker:
         assert self._frame is not None

@@ -7,6 +7,7 @@ if they had been punctual.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ from ssm_graph.graph.aids.gnss import Fixes
 from ssm_graph.live.estimator.guard import Guarded
 from ssm_graph.mission.answer import LARGEST_SPEED, LOW_WEIGHT, MISFIT, TRUSTED
 from ssm_graph.mission.navigation import Health
+from ssm_graph.sensors.imu import FrozenAxis
 from ssm_graph.smoothers.keyframe import Keyframe
 from ssm_graph.smoothers.track import Stretch
 from ssm_graph.smoothers.window import Window
@@ -107,6 +109,7 @@ def observe(
     force: float,
     gap_s: float,
     missing: float,
+    frozen: Sequence[FrozenAxis] = (),
 ) -> Watch:
     """Return what is remembered after one more keyframe, with which the window is settled.
 
@@ -117,6 +120,7 @@ def observe(
     force : mean specific force since the keyframe before, m/s^2.
     gap_s : longest time without an inertial sample since then.
     missing : share of the inertial samples that have not come since then.
+    frozen : axes of the inertial sensors that repeat themselves.
     """
     newest, time_s = window.newest, keyframe.time_s
     kept = window.keyframes[-1]
@@ -141,7 +145,7 @@ def observe(
         watch = watch._replace(last_aid_s=time_s)
     if watch.contradicted is not None:
         watch = watch._replace(contradicted=_still(watch.contradicted, window))
-    trouble = _trouble(watch, time_s, newest.states.v_n[0])
+    trouble = _repeating(frozen) or _trouble(watch, time_s, newest.states.v_n[0])
     if gap_s > GAP_S and not trouble:
         trouble = f"{gap_s:.1f} s of inertial data are missing: what was guessed has to prove right"
     elif missing > MOST_MISSING and not trouble:
@@ -205,6 +209,18 @@ def _still(was: Contradicted, window: Window) -> Contradicted | None:
     if since_s > 2.0 * PROBATION_S and off < 3.0 * sigma:
         return None
     return was._replace(reckoned_n=tuple(reckoned_n.tolist()))
+
+
+def _repeating(frozen: Sequence[FrozenAxis]) -> str:
+    """Say which axis gives one reading, if any."""
+    if not frozen:
+        return ""
+    axis = frozen[0]
+    name = "gyros" if axis.is_gyro else "accelerometers"
+    return (
+        f"the {name} give {axis}, since {axis.begin_s:.0f} s: look at the IMU and its link; "
+        "sigmas grow meanwhile"
+    )
 
 
 def _trouble(watch: Watch, time_s: float, v_n: Array) -> str:
