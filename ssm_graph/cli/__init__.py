@@ -1,5 +1,5 @@
 """The command line.
 
 ``ssm-graph simulate | smooth | filter | online | compare | inspect | convert | export | report |
-locate | locate-simulate | locate-study | slam | slam-study``.
+locate | locate-simulate | locate-study | slam | slam-study | integrity | network | network-run``.
 """

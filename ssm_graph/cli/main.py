@@ -47,6 +47,9 @@ COMMANDS: Final = {
     "locate-study": "many simulated drives over HD maps, by several methods",
     "slam": "path and map from odometry and observed landmarks",
     "slam-study": "compare filters of landmark SLAM on simulated runs",
+    "integrity": "a second witness of a smoothed mission: guaranteed bounds",
+    "network": "guaranteed bounds of a sensor network",
+    "network-run": "nodes of a network as processes, by UDP",
 }
 """Summary of every command; the module of its name is loaded when it is the one that is given."""
 
@@ -61,7 +64,8 @@ exit codes:
        smooth or filter ended with a result that must not be trusted blindly (iteration limit,
        interrupted after the first iteration, run away, or the data contradict it); it is written
        all the same, and its status says so; online: ended in order, the last answer was not good;
-       compare: some runs have no result, the table says why
+       compare: some runs have no result, the table says why; network, network-run: a set missed
+       its truth or gave an alarm; integrity: the answer left the set, or a bound is false
   5    smooth found no finite result, nothing is written; online: there never was an answer, what
        came is logged
   130  interrupted, nothing written; compare keeps finished runs and goes on when started again, and

@@ -1,0 +1,206 @@
+"""Figures of a study: those of the patent by its numbers, and what they do not show."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from ssm_graph.base.frozen import Array
+from ssm_graph.report import style
+from ssm_graph.report.style import Band, Curve, Panel
+from ssm_graph.systems.sensor_network.codes import residue_bits
+from ssm_graph.systems.sensor_network.setting import Setting, Share
+from ssm_graph.systems.sensor_network.study import INTERVALS, KEYS, NetworkStudy, table_1
+from ssm_graph.systems.sensor_network.world import Disturbance, Trial, run_patent, run_sets
+
+_COMPONENTS: Final = ("π, m", "τ, m", "θ, rad")
+_PAIRS: Final = ((0, 1), (2, 3))
+_COLORS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
+_STEPS: Final = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
+
+
+def save_network_figures(folder: Path, study: NetworkStudy) -> list[Path]:
+    """Draw and save all figures; ``figure_02.png`` to ``figure_11.png`` are those of the patent."""
+    folder.mkdir(parents=True, exist_ok=True)
+    setting, seed = study.setting, study.seed
+    trial = run_patent(setting, Disturbance.PATENT, seed=seed)
+    figures: dict[str, Figure] = {}
+    for axis in range(3):
+        for half, pair in enumerate(_PAIRS):
+            figures[f"figure_{2 + 2 * axis + half:02}"] = _states(trial, axis, pair)
+    figures["figure_08"], figures["figure_09"] = (_bounds(trial, pair) for pair in _PAIRS)
+    for half, pair in enumerate(_PAIRS):
+        figures[f"figure_{10 + half}"] = _intervals(setting, pair, seed)
+    shared = replace(setting, share=Share.MEASUREMENTS)
+    sets = run_sets(shared, Disturbance.UNIFORM, seed=seed)
+    figures["sets_in_the_plane"] = _plane(sets)
+    figures["tubes"] = _tubes(sets)
+    figures["error_against_bound"] = _errors(sets)
+    figures["bits_and_steps"] = _bits(setting, seed)
+    return [style.save(figure, folder / f"{name}.png") for name, figure in figures.items()]
+
+
+def _drawn(title: str, panels: Sequence[Panel], width: float = 3.6, height: float = 3.0) -> Figure:
+    figure = style.new_figure(width * len(panels), height, title)
+    axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    for one, panel in zip(axes, panels, strict=True):
+        style.draw_panel(one, panel)
+    return figure
+
+
+def _line(color: str, label: str, dash: style.Dash = "-") -> dict[str, object]:
+    return {"color": color, "label": label, "linestyle": dash, "linewidth": 1.1}
+
+
+def _nodes(pair: tuple[int, int]) -> list[int]:
+    return list(pair)
+
+
+def _states(trial: Trial, axis: int, pair: tuple[int, int]) -> Figure:
+    k = np.arange(1.0, len(trial.truth) + 1.0)
+    curves = [Curve(k, trial.truth[:, 0, axis], _line(style.INK, "state"))]
+    curves += [
+        Curve(k, trial.center[:, 0, i, axis], _line(_COLORS[i], f"node {i + 1}", style.DASHED))
+        for i in _nodes(pair)
+    ]
+    panel = Panel(x="step k", y=_COMPONENTS[axis], curves=curves, legend={"loc": "best"})
+    return _drawn(f"Component {axis + 1} and nodes {pair[0] + 1}, {pair[1] + 1}", [panel], 6.0)
+
+
+def _bounds(trial: Trial, pair: tuple[int, int]) -> Figure:
+    k = np.arange(1.0, len(trial.truth) + 1.0)
+    panels = [
+        Panel(
+            title=f"node {i + 1}",
+            x="step k",
+            y="error and bound",
+            curves=[
+                Curve(k, trial.error[:, 0, i], _line(_COLORS[i], "error")),
+                Curve(k, trial.root_trace[:, i], _line(style.INK, "root of the trace", "--")),
+            ],
+            is_log_y=True,
+            y_limits=(0.1, 300.0),
+            legend={"loc": "center right"},
+        )
+        for i in _nodes(pair)
+    ]
+    return _drawn("Error and bound of the patent: of any estimate the error would be below", panels)
+
+
+def _intervals(setting: Setting, pair: tuple[int, int], seed: int) -> Figure:
+    panels = []
+    for key in (1.0, 100.0):
+        curves = []
+        for d, dash in zip(INTERVALS, ("--", "-"), strict=True):
+            one = replace(setting, d=d, key=key)
+            error = run_patent(one, Disturbance.PATENT, seed=seed).error[:, 0]
+            k = np.arange(1.0, len(error) + 1.0)
+            curves += [
+                Curve(k, error[:, i], _line(_COLORS[i], f"node {i + 1}, d = {d}", dash))
+                for i in _nodes(pair)
+            ]
+        panels.append(Panel(title=f"key {key:g}", x="step k", y="error", curves=curves, legend={}))
+    panels[-1] = replace(panels[-1], legend={"loc": "upper left"})
+    return _drawn("Error by the interval of the quantiser: it takes a key of 100", panels)
+
+
+def _plane(trial: Trial) -> Figure:
+    way = Curve(trial.truth[:, 0, 0], trial.truth[:, 0, 1], _line(style.INK, "robot"))
+    curves = [way]
+    angle = np.linspace(0.0, 2.0 * math.pi, 60)
+    circle = np.column_stack([np.cos(angle), np.sin(angle)])
+    for i in range(trial.center.shape[2]):
+        for k in range(0, len(trial.truth), 5):
+            root = np.linalg.cholesky(trial.shape[k, i, :2, :2])
+            x = trial.around[k, i, :2] + circle @ root.T
+            curves.append(Curve(x[:, 0], x[:, 1], {"color": _COLORS[i % 4], "linewidth": 0.8}))
+    panel = Panel(x="east, m", y="north, m", curves=curves)
+    return _drawn("Sets in the plane, every fifth step, a colour a node", [panel], 6.0, 5.0)
+
+
+def _tubes(trial: Trial) -> Figure:
+    k = np.arange(1.0, len(trial.truth) + 1.0)
+    panels = []
+    for axis in range(3):
+        c, h = trial.center[:, 0, 0, axis], trial.half_widths[:, 0, 0, axis]
+        panels.append(
+            Panel(
+                x="step k",
+                y=_COMPONENTS[axis],
+                bands=[Band(k, c - h, c + h, {"color": style.BOUND, "alpha": 0.6})],
+                curves=[Curve(k, trial.truth[:, 0, axis], _line(style.INK, "state"))],
+            )
+        )
+    return _drawn("What node 1 knows for certain", panels)
+
+
+def _errors(trial: Trial) -> Figure:
+    k = np.arange(1.0, len(trial.truth) + 1.0)
+    panels = []
+    for axis in range(3):
+        error = trial.point[:, 0, 0, axis] - trial.truth[:, 0, axis]
+        low = trial.center[:, 0, 0, axis] - trial.half_widths[:, 0, 0, axis]
+        high = trial.center[:, 0, 0, axis] + trial.half_widths[:, 0, 0, axis]
+        most = np.maximum(high - trial.point[:, 0, 0, axis], trial.point[:, 0, 0, axis] - low)
+        curves = [
+            Curve(k, np.abs(error), _line(style.ESTIMATE, "error of the point")),
+            Curve(k, most, _line(style.INK, "bound", "--")),
+        ]
+        panels.append(Panel(x="step k", y=_COMPONENTS[axis], curves=curves, legend={"loc": "best"}))
+    return _drawn("Error of the point estimate against its bound, node 1", panels)
+
+
+def _bits(setting: Setting, seed: int) -> Figure:
+    steps = np.array(_STEPS)
+    half = np.array([_half_width(replace(setting, d=d, key=1.0), seed) for d in _STEPS])
+    bits = np.array(
+        [
+            residue_bits(2.0 * (h + setting.position_bound), d)
+            for h, d in zip(half, _STEPS, strict=True)
+        ],
+        dtype=np.float64,
+    )
+    found = table_1(setting, seed=seed)
+    mean = {d: np.array([np.mean(found[key][d]) for key in KEYS]) for d in INTERVALS}
+    marks = {"marker": "o", "markersize": 3.0}
+    panels = [
+        Panel(
+            title="bits against half-width",
+            x="half-width of the position, m",
+            y="bits of a residue",
+            curves=[Curve(half, bits, {**_line(style.ESTIMATE, ""), **marks})],
+        ),
+        Panel(
+            title="half-width against step",
+            x="step key · d, m",
+            y="half-width of the position, m",
+            curves=[Curve(steps, half, {**_line(style.ESTIMATE, ""), **marks})],
+            is_log_x=True,
+            x_limits=(0.008, 7.0),
+        ),
+        Panel(
+            title="the patent's error against its key",
+            x="key",
+            y="mean error",
+            curves=[
+                Curve(np.array(KEYS), mean[d], {**_line(color, f"d = {d}"), **marks})
+                for d, color in zip(INTERVALS, _COLORS, strict=False)
+            ],
+            is_log_x=True,
+            x_limits=(0.8, 300.0),
+            legend={"loc": "upper left"},
+        ),
+    ]
+    return _drawn("What bits, steps and keys cost", panels)
+
+
+def _half_width(setting: Setting, seed: int) -> float:
+    trial = run_sets(replace(setting, share=Share.MEASUREMENTS), Disturbance.UNIFORM, seed=seed)
+    half: Array = trial.half_widths[..., :2]
+    return float(half.mean())

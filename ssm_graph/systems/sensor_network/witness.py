@@ -1,0 +1,265 @@
+"""The set of one vehicle's places that its inertial, DVL, depth and fix bounds allow, by itself.
+
+A second witness beside the smoother: it shares no weight, no linearisation and no probability with
+it. Bounds are so many sigmas of what the mission states. In blocks of some seconds:
+
+- attitude: gyros, levelled by the accelerometers with the change of the DVL's velocity taken off;
+- velocity: an ellipsoid that accelerometers lead on and every beam cuts; a beam that misses it is
+  left out and counted;
+- place and heading: the planar sets of :mod:`.motion`, led on by what DVL velocities sum up to, cut
+  by fixes and compass; height: an interval, cut by depths.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from ssm_graph.base.earth import LocalFrame
+from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.base.frozen import Array, ReadOnlyArrays
+from ssm_graph.base.units import wrapped
+from ssm_graph.filters.rules.ellipsoids import Ellipsoids
+from ssm_graph.filters.rules.set_membership import Sets, led_on, measured
+from ssm_graph.mission.mission import InitialState, Mission
+from ssm_graph.sensors.compass import HeadingLog
+from ssm_graph.systems.sensor_network.motion import planar_image
+from ssm_graph.systems.sensor_network.track import Track, velocity_track
+
+_AXES: Final = np.eye(3)
+_RADIUS_M: Final = 6.37e6
+_FLOOR: Final = np.array([1e-3, 1e-3, 1e-6])
+"""m, m, rad: half-widths that no cut goes below."""
+UNKNOWN_M: Final = 1e5
+"""Half-width of a place that nothing is known of."""
+
+
+@dataclass(frozen=True, slots=True)
+class WitnessBounds:
+    """How far errors may go, in sigmas of what the mission states."""
+
+    sigmas: float = 5.0
+    """Of noise: a normal reading is beyond 5 once in two million."""
+    block_s: float = 10.0
+    """Over which noise averages out: sums of noise are within as many of their own sigmas."""
+    velocity_m_per_s: float = 0.002
+    """Of what is wrong with DVL velocities all the time, beside what the mission states."""
+    speed_share: float = 0.002
+    """The same as a share of the speed: scale and mounting."""
+    silence_s: float = 5.0
+    """Without a usable beam for so long, the alarm is given."""
+
+    def __post_init__(self) -> None:
+        for name in ("sigmas", "block_s", "silence_s"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
+                raise ConfigError(f"{name}: expected above 0, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True, slots=True)
+class BoundAlarm:
+    """A proof that not all of the stated bounds are true."""
+
+    time_s: float
+    sensor: str
+    """Whose reading missed the set: ``GNSS``, ``depth``, ``compass``, ``DVL``"""
+    by: str
+    """By how much of what."""
+
+    @property
+    def sentence(self) -> str:
+        """The alarm for people."""
+        return (
+            f"{self.sensor}, {self.time_s:.0f} s: {self.by}; a bound of this sensor or of the "
+            "motion before it is false; the set is led on without the reading"
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Witness(ReadOnlyArrays):
+    """What the bounds allow, at the ends of M blocks."""
+
+    time_s: Array
+    """(M,)"""
+    center: Array
+    """(M, 3) of the ellipsoids: east, north in the mission's frame [m], error of the heading that
+    the gyros led on from the start, anticlockwise [rad]"""
+    shape: Array
+    """(M, 3, 3)"""
+    low: Array
+    """(M, 3) of the boxes"""
+    high: Array
+    """(M, 3)"""
+    up_low: Array
+    """(M,) m, in the mission's frame"""
+    up_high: Array
+    heading: Array
+    """(M,) rad, clockwise from north, as the gyros led it on"""
+    alarms: tuple[BoundAlarm, ...]
+    n_beams: int
+    """Beam speeds that were used,"""
+    n_left_out: int
+    """and those that missed the set of velocities or their own ping."""
+
+    @property
+    def sets(self) -> Sets:
+        """(M,) as sets."""
+        e = Ellipsoids(self.center.copy(), self.shape.copy())
+        return Sets(e, self.low.copy(), self.high.copy(), _FLOOR.copy())
+
+    @property
+    def half_widths(self) -> Array:
+        """(M, 4) of east, north, up [m] and heading [rad]."""
+        half = 0.5 * (self.high - self.low)
+        up = 0.5 * (self.up_high - self.up_low)
+        return np.column_stack([half[:, :2], up, half[:, 2]])
+
+
+def witness(mission: Mission, start: InitialState, bounds: WitnessBounds | None = None) -> Witness:
+    """Return the set of places that a mission's bounds allow, from a start on.
+
+    Parameters
+    ----------
+    mission : with bottom track; depth, fixes and a compass are used where they are.
+    start : state with sigmas, of which ``bounds.sigmas`` are taken as bounds.
+
+    Raises
+    ------
+    DataError
+        Without pings off the ground after the start.
+    """
+    own = bounds or WitnessBounds()
+    if len(mission.dvl.of_ground().time_s) < 2:
+        raise DataError("witness: expected two pings off the ground or more, got fewer")
+    track = velocity_track(mission, start, own)
+    return _Walk(mission, start, own, track).go()
+
+
+class _Walk:
+    """Place, heading and height from block to block."""
+
+    def __init__(
+        self, mission: Mission, start: InitialState, own: WitnessBounds, track: Track
+    ) -> None:
+        self._mission, self._own, self._track = mission, own, track
+        self._frame: LocalFrame = mission.frame
+        k = own.sigmas
+        p_n = self._frame.p_n_from_geodetic(start.lat, start.lon, start.height)
+        sigma = start.position_sigma_enu
+        half = np.array(
+            [
+                max(k * sigma[0], _FLOOR[0]),
+                max(k * sigma[1], _FLOOR[1]),
+                max(k * float(start.attitude_sigma[2]), _FLOOR[2]),
+            ]
+        )
+        self._sets = Sets.of_box(np.array([p_n[0], p_n[1], 0.0]), half, _FLOOR)
+        self._up = (p_n[2] - k * sigma[2], p_n[2] + k * sigma[2])
+        self._alarms: list[BoundAlarm] = list(track.alarms)
+
+    def go(self) -> Witness:
+        track = self._track
+        rows = []
+        for i in range(len(track.time_s)):
+            self._lead_on(i)
+            self._fixes(i)
+            self._compass(i)
+            self._depths(i)
+            e = self._sets.ellipsoid
+            rows.append((e.center, e.shape, self._sets.low, self._sets.high, *self._up))
+        center, shape, low, high, up_low, up_high = (
+            np.array(column) for column in zip(*rows, strict=True)
+        )
+        return Witness(
+            track.time_s.copy(),
+            center,
+            shape,
+            low,
+            high,
+            up_low,
+            up_high,
+            track.heading.copy(),
+            tuple(sorted(self._alarms, key=lambda a: a.time_s)),
+            track.n_beams,
+            track.n_left_out,
+        )
+
+    def _lead_on(self, i: int) -> None:
+        track = self._track
+        d, bound = track.advance[i], track.advance_bound[i]
+        noise = np.array([0.0, 0.0, track.turn_bound[i]])
+        image = planar_image(self._sets, d[:2], np.zeros(()), noise, advance_bound=bound[:2])
+        self._sets = led_on(self._sets, image)
+        self._up = (self._up[0] + d[2] - bound[2], self._up[1] + d[2] + bound[2])
+
+    def _inside(self, time_s: Array, i: int) -> int | None:
+        """Return the last reading within block i, None without any."""
+        first = self._track.begin_s[i]
+        last = int(np.searchsorted(time_s, self._track.time_s[i], side="right")) - 1
+        return last if last >= 0 and time_s[last] > first else None
+
+    def _fixes(self, i: int) -> None:
+        gnss = self._mission.gnss
+        row = None if gnss is None else self._inside(gnss.valid_s, i)
+        if gnss is None or row is None:
+            return
+        k = self._own.sigmas
+        fix = self._frame.p_n_from_geodetic(gnss.lat[row], gnss.lon[row], gnss.height[row])
+        arm, led, led_bound = self._track.led_to_end(i, float(gnss.valid_s[row]), gnss.lever_arm_b)
+        turned = float(np.max(np.abs([self._sets.low[2], self._sets.high[2]])))
+        slack = turned * (float(np.linalg.norm(led)) + float(np.linalg.norm(arm))) + led_bound
+        drift = k * gnss.calibration.drift.sigma
+        for axis, name in ((0, "east"), (1, "north")):
+            bound = k * float(gnss.sigma_enu[row, axis]) + slack + drift
+            value = float(fix[axis] - arm[axis] + led[axis])
+            self._cut(i, "GNSS", axis, value, bound, f"m to the {name}", 1.0)
+
+    def _compass(self, i: int) -> None:
+        log = self._mission.aids.get(HeadingLog)
+        row = None if log is None else self._inside(log.time_s, i)
+        if log is None or row is None:
+            return
+        k, e = self._own.sigmas, log.errors
+        passed = float(log.time_s[row] - log.time_s[0])
+        often = e.one_cycle_sigma + e.two_cycle_sigma
+        more = e.offset_sigma + e.walk_sigma + e.rate_sigma * passed + math.sqrt(2.0) * often
+        bound = k * (log.sigma + more) + float(self._track.noise_angle[i])
+        if bound >= math.pi:
+            return
+        nominal = self._track.heading_at(float(log.time_s[row]))
+        # Headings turn clockwise, the set's error anticlockwise.
+        value = -float(wrapped(np.array(log.heading[row] + log.declination - nominal)))
+        self._cut(i, "compass", 2, value, bound, "deg", math.degrees(1.0))
+
+    def _cut(
+        self, i: int, sensor: str, axis: int, value: float, bound: float, unit: str, per: float
+    ) -> None:
+        low, high = float(self._sets.low[axis]), float(self._sets.high[axis])
+        self._sets, missed = measured(self._sets, _AXES[axis], np.array(value), np.array(bound))
+        if bool(missed):
+            off = max(low - value - bound, value - bound - high, 0.0) * per
+            by = f"{off:.2g} {unit} beyond what both bounds allow (±{bound * per:.2g})"
+            self._alarms.append(BoundAlarm(float(self._track.time_s[i]), sensor, by))
+
+    def _depths(self, i: int) -> None:
+        log = self._mission.depth
+        row = None if log is None else self._inside(log.time_s, i)
+        if log is None or row is None:
+            return
+        k = self._own.sigmas
+        arm, led, led_bound = self._track.led_to_end(i, float(log.time_s[row]), log.lever_arm_b)
+        x, y = np.maximum(np.abs(self._sets.low[:2]), np.abs(self._sets.high[:2]))
+        sagitta = (x**2 + y**2) / (2.0 * _RADIUS_M)
+        up = -float(log.true_depth[row]) - self._frame.height - float(arm[2] - led[2])
+        calibration = log.calibration
+        bound = k * (log.sigma + calibration.offset_sigma + calibration.drift.sigma)
+        bound += led_bound + 0.5 * sagitta
+        low = max(self._up[0], up - 0.5 * sagitta - bound)
+        high = min(self._up[1], up - 0.5 * sagitta + bound)
+        if low > high:
+            by = f"{low - high:.2g} m beyond what both bounds allow (±{bound:.2g})"
+            self._alarms.append(BoundAlarm(float(self._track.time_s[i]), "depth", by))
+        else:
+            self._up = (low, high)
