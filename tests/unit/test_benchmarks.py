@@ -288,6 +288,6 @@ def test_trust_live(tmp_path: Path) -> None:
 @pytest.mark.skipif(not (DATA / "systems").is_dir(), reason=f"no maps in {DATA / 'systems'}")
 def test_road_map(tmp_path: Path) -> None:
     """Two drives of each part have a row."""
-    done = run("science.road_map", f"--share 0.001 --data {DATA}", "road_map", tmp_path)
+    done = run("systems.road_map", f"--share 0.001 --data {DATA}", "road_map", tmp_path)
     assert done.code == 0
     assert [row[3] for row in done.rows("mapping_example.osm")] == ["2"] * 6

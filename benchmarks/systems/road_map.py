@@ -1,6 +1,6 @@
 """How often a vehicle's lane is found in a map, declared, and declared wrongly, on held-out drives.
 
-``python -m benchmarks.science.road_map --keep`` (an hour on one core; a quick look is ``--share
+``python -m benchmarks.systems.road_map --keep`` (an hour on one core; a quick look is ``--share
 0.02``). Drives that are done are kept in the folder of ``--out``: the same command goes on.
 """
 
