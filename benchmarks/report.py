@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ssm_graph.base.code_version import code_version
 from ssm_graph.evaluation.statistics import Interval, mean_with_interval, paired_ratio
-from ssm_graph.study.jobs import code_version
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"

@@ -22,6 +22,7 @@ from benchmarks.online.stream import HEALTHS
 from benchmarks.processes import side_by_side
 from benchmarks.report import RESULTS, Option, Report, note, rms, table
 from benchmarks.soak.stream import AXES, CASES, HOUR_S, Soaked, longest_run, soak
+from ssm_graph.base.code_version import code_version
 from ssm_graph.base.frozen import Array
 from ssm_graph.mission.navigation import Health
 from ssm_graph.report.style import (
@@ -36,7 +37,6 @@ from ssm_graph.report.style import (
     save,
 )
 from ssm_graph.simulation import Grade
-from ssm_graph.study.jobs import code_version
 
 COLORS = {
     Health.ALIGNING: "#BBBBBB",

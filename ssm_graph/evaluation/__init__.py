@@ -10,6 +10,12 @@ from ssm_graph.evaluation.comparison import (
     MethodResult,
     compare_methods,
 )
+from ssm_graph.evaluation.consistency import (
+    Consistency,
+    circular_mean,
+    consistency,
+    rate_with_interval,
+)
 from ssm_graph.evaluation.errors import (
     ErrorSeries,
     Metrics,
@@ -38,6 +44,7 @@ __all__ = [
     "ORACLE",
     "Cell",
     "Comparison",
+    "Consistency",
     "ErrorSeries",
     "Interval",
     "Measure",
@@ -46,7 +53,9 @@ __all__ = [
     "Paired",
     "SignedRank",
     "chi2_interval",
+    "circular_mean",
     "compare_methods",
+    "consistency",
     "error_series",
     "evaluate",
     "gap_limit_s",
@@ -55,6 +64,7 @@ __all__ = [
     "mean_with_interval",
     "paired_difference",
     "paired_ratio",
+    "rate_with_interval",
     "reference_from_gnss",
     "signed_rank",
     "withhold_gnss",

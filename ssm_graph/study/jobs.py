@@ -6,24 +6,20 @@ other's work with it; a cluster's workers need this package in the same version.
 
 from __future__ import annotations
 
-import hashlib
 import multiprocessing
 import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cache
-from importlib.metadata import version
 from itertools import groupby
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-import factors.similarity
+from ssm_graph.base.code_version import code_version
 from ssm_graph.base.errors import ConfigError, MissingExtraError, SsmGraphError
 from ssm_graph.base.frozen import Array
 from ssm_graph.simulation import Grade
@@ -155,29 +151,6 @@ def lost_job(job: Job, message: str) -> JobResult:
     return failed_job(job, message, status=LOST)
 
 
-_LEFT_OUT: Final = ("report", "cli")
-"""Parts of the package that no number of a study depends on."""
-
-
-@cache
-def code_version() -> str:
-    """Return the package version with a digest of all that a study's numbers depend on.
-
-    The version alone does not do: between releases the source changes. The versions of GTSAM,
-    NumPy and SciPy are part of the digest.
-    """
-    package, others = Path(__file__).parents[1], Path(factors.similarity.__file__).parent
-    sources = {p.relative_to(package).as_posix(): p for p in package.rglob("*.py")}
-    digest = hashlib.sha256()
-    for name in sorted(name for name in sources if name.split("/")[0] not in _LEFT_OUT):
-        digest.update(f"ssm_graph/{name}\0".encode() + sources[name].read_bytes())
-    for path in sorted(others.glob("*.py")):
-        digest.update(f"factors/{path.name}\0".encode() + path.read_bytes())
-    for name in ("gtsam", "numpy", "scipy"):
-        digest.update(f"{name} {version(name)}\0".encode())
-    return f"{version('ssm-graph')}+{digest.hexdigest()[:10]}"
-
-
 MAX_DEATHS: Final = 2
 """A single run that ends its process as often is given up."""
 MAX_DEATHS_IN_A_ROW: Final = 40
@@ -202,7 +175,7 @@ class JobProcesses:
         """Yield what comes of the jobs as it comes; closed early, the processes are ended."""
         waiting = list(jobs)
         deaths = _Deaths()
-        with _one_blas_thread():
+        with one_blas_thread():
             workers = [_Worker.start() for _ in range(min(self.n_processes, len(waiting)))]
             try:
                 while waiting or any(worker.job for worker in workers):
@@ -332,7 +305,7 @@ def _serve(pipe: Connection) -> None:
 
 
 @contextmanager
-def _one_blas_thread() -> Iterator[None]:
+def one_blas_thread() -> Iterator[None]:
     """Give new processes one thread each: they share the cores already, and results stay equal."""
     before = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, "1"))  # read when a process imports NumPy

@@ -10,12 +10,13 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final, cast
 
+from ssm_graph.base.code_version import code_version
 from ssm_graph.base.errors import DataError
 from ssm_graph.mission.estimate import Estimate
 from ssm_graph.mission.mission import Reference
 from ssm_graph.simulation import Grade, OutlierKind
 from ssm_graph.study.cells import Cell, Recording, Source
-from ssm_graph.study.jobs import Execute, Job, JobResult, RunKey, code_version, do_job
+from ssm_graph.study.jobs import Execute, Job, JobResult, RunKey, do_job
 from ssm_graph.study.methods import parse_method
 from ssm_graph.study.scenario import Study
 from ssm_graph.study.scoring import Row

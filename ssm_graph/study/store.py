@@ -24,6 +24,7 @@ from ssm_graph.io.tables.append_file import sync_path, write_through
 from ssm_graph.io.tables.files import TableFormat, pyarrow_module
 from ssm_graph.study.cells import digest
 from ssm_graph.study.jobs import JobResult, RunKey
+from ssm_graph.study.json_lines import line_of, object_of, with_nan, without_nan
 from ssm_graph.study.scoring import COLUMNS, COUNT_COLUMNS, LOST, SERIES_STEP_S, TEXT_COLUMNS, Row
 
 RUNS_NAME: Final = "runs.jsonl"
@@ -82,7 +83,7 @@ class StudyStore:
         (self.folder / SERIES_NAME).mkdir(parents=True, exist_ok=True)
         for old in (self.folder / SERIES_NAME).glob("*.npz"):
             old.unlink()
-        write_through(self.path, _line({"settings": self.settings}).encode())
+        write_through(self.path, line_of({"settings": self.settings}).encode())
 
     def __contains__(self, key: object) -> bool:
         return key in self._rows
@@ -97,12 +98,12 @@ class StudyStore:
         """Write what came of a job; it is on disk when this returns."""
         if result.series:
             self._write_series(result)  # first: a row without its series would never get it
-        rows = {key: _plain(row) for key, row in result.rows.items()}
+        rows = {key: without_nan(row) for key, row in result.rows.items()}
         with self.path.open("a", encoding="utf-8") as file:
-            file.writelines(_line({"key": list(key), **row}) for key, row in rows.items())
+            file.writelines(line_of({"key": list(key), **row}) for key, row in rows.items())
             file.flush()
             os.fsync(file.fileno())
-        self._rows |= {key: _row(row) for key, row in rows.items()}
+        self._rows |= {key: with_nan(row) for key, row in rows.items()}
 
     def _write_series(self, result: JobResult) -> None:
         job = result.job
@@ -169,7 +170,7 @@ class StudyStore:
                 continue
             kept.append(line)
             if values["status"] != LOST:  # another try may go better
-                self._rows[key] = _row(values)
+                self._rows[key] = with_nan(values)
         if bad:
             write_through(self.folder / DAMAGED_NAME, content)
             self.notes += tuple(f"{self.path}, {text}; that run is done again" for text in bad)
@@ -194,7 +195,7 @@ class StudyStore:
 
     def _settings_of(self, line: bytes) -> dict[str, Any]:
         try:
-            settings = _object_of(line).get("settings")
+            settings = object_of(line).get("settings")
             if isinstance(settings, dict):
                 return settings
         except (ValueError, RecursionError):
@@ -219,24 +220,9 @@ class StudyStore:
         )
 
 
-def _object_of(line: bytes) -> dict[str, Any]:
-    """Return a JSON object of finite numbers; raise :class:`ValueError` for all that is none."""
-    try:
-        values = json.loads(line.decode(), parse_constant=_no_constant)
-    except ValueError as error:
-        raise ValueError(f"expected a JSON object, got {shown(line)}") from error
-    if not isinstance(values, dict):
-        raise ValueError(f"expected a JSON object, got {shown(line)}")
-    return values
-
-
-def _no_constant(text: str) -> float:
-    raise ValueError(text)
-
-
 def _run_of(line: bytes) -> tuple[RunKey, dict[str, Any]]:
     """Return one finished run; raise :class:`ValueError` that says what it lacks."""
-    values = _object_of(line)
+    values = object_of(line)
     parts = values.pop("key", None)
     kinds = (str, str, int, str)
     is_key = isinstance(parts, list) and [type(part) for part in parts] == list(kinds)
@@ -291,22 +277,6 @@ def gather_series(
         time_s = SERIES_STEP_S * np.arange(runs.shape[1], dtype=np.float64)
         result[name] = Series(time_s, runs[..., 0], runs[..., 1], runs[..., 2])
     return result
-
-
-def _plain(row: Row) -> dict[str, Any]:
-    """Return values for JSON, None instead of NaN."""
-    return {
-        name: None if isinstance(value, float) and not math.isfinite(value) else value
-        for name, value in row.items()
-    }
-
-
-def _row(values: Mapping[str, Any]) -> Row:
-    return {name: math.nan if value is None else value for name, value in values.items()}
-
-
-def _line(values: dict[str, Any]) -> str:
-    return json.dumps(values, allow_nan=False) + "\n"
 
 
 def write_rows(path: Path, rows: Sequence[Row]) -> None:

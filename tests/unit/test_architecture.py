@@ -15,11 +15,26 @@ IDS = [str(path.relative_to(ROOT)) for path in MODULES]
 
 VALUES = {"base", "sensors", "mission.values"}
 """What every room may read: the foundation, instruments, missions and answers as frozen values."""
+SYSTEMS = sorted(
+    f"systems.{path.parent.name}" for path in (ROOT / "ssm_graph/systems").glob("*/__init__.py")
+)
+OF_SYSTEMS = VALUES | {
+    "factors",
+    "engine",
+    "imu",
+    "filters.rules",
+    "graph.aids",
+    "mission",
+    "graph",
+}
+OF_SYSTEMS |= {"smoothers", "io", "simulation", "evaluation", "study", "report"}
+"""A system takes what it needs of the house, but for what runs on the vehicle, and no system."""
 MAY_IMPORT = {
     "factors": set[str](),
     "base": set[str](),
     "sensors": {"base"},
     "imu": {"base", "sensors", "factors"},
+    "systems": set[str](),
     "engine": {"base", "factors"},
     "mission.values": {"base", "sensors"},
     "graph.aids": VALUES | {"engine", "imu", "factors"},
@@ -38,6 +53,7 @@ MAY_IMPORT = {
     | {"smoothers", "filters", "graph", "mission", "engine", "simulation", "evaluation"}
     | {"factors", "io"},
     "report": VALUES | {"evaluation"},
+    **dict.fromkeys(SYSTEMS, OF_SYSTEMS),
 }
 """Rooms that each room may import, itself apart; the rest may import anything."""
 MISSION_VALUES = {
