@@ -259,9 +259,15 @@ STORMS: Final = {
         280.0, 30.0, crowding(Place.IMU, 3, 0.1, bomb, 10.0),
         "nesting, digits and endless lines from three clients at the IMU's port; it calls anew",
     ),
-    "datagrams": Storm(320.0, 30.0, datagrams, datagrams.__doc__ or ""),
-    "strays": Storm(360.0, 30.0, strays, strays.__doc__ or ""),
-    "calls": Storm(400.0, 30.0, calls, calls.__doc__ or ""),
-    "hang-ups": Storm(440.0, 20.0, hang_ups, hang_ups.__doc__ or ""),
-    "repeats": Storm(480.0, 30.0, repeats, repeats.__doc__ or ""),
+    "datagrams": Storm(
+        320.0, 30.0, datagrams, "2000 random datagrams a second, 1 MB/s, where depth and GNSS come"
+    ),
+    "strays": Storm(
+        360.0, 30.0, strays, "twenty samples of another clock in one datagram, once a second"
+    ),
+    "calls": Storm(400.0, 30.0, calls, "all TCP ports are called and left 25 times a second"),
+    "hang-ups": Storm(
+        440.0, 20.0, hang_ups, "the DVL hangs up as soon as it is called; counted from the end on"
+    ),
+    "repeats": Storm(480.0, 30.0, repeats, "the last report of the DVL again, 500 times a second"),
 }  # fmt: skip

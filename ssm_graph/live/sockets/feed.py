@@ -56,8 +56,8 @@ class Limits:
     """Connections to one server."""
     connect_s: float = 5.0
     """Patience with a connection on its way."""
-    retry_s: tuple[float, float] = (0.5, 10.0)
-    """First and longest wait before the next attempt to connect."""
+    retry_s: tuple[float, float] = (0.5, 3.0)
+    """First and longest wait before the next attempt to connect: nobody is missed for 5 s."""
 
     def __post_init__(self) -> None:
         TokenBucket(rate_per_s=self.messages_per_s, burst=self.burst)
