@@ -28,9 +28,9 @@ from ssm_graph.sensors.compass import HeadingLog, HeadingReading
 from ssm_graph.sensors.magnetometer import MagneticReading, MagnetometerLog
 from ssm_graph.sensors.messages import Message
 from ssm_graph.sensors.standstill import RestLog, RestReading
+from ssm_graph.simulation import GnssSettings
 from ssm_graph.smoothers.fixed_lag import solve_fixed_lag
 from tests.aids_fixture import with_every_aid
-from tests.helpers import simulated
 from tests.rosbag_fixture import EPOCH_S, Ros, Sent, marine_bag, write_bag
 
 TOPICS = {section: f"/{section}" for section in AID_TYPES}
@@ -40,12 +40,12 @@ REST_S = np.array([3.0, 3.5, 4.0])
 @pytest.fixture(scope="module")
 def mission() -> Mission:
     """Return a mission with all of them, who is on board saying that it stands."""
-    found = with_every_aid(duration_s=12.0).mission
+    gnss = GnssSettings(windows=((0.0, 9.0),))
+    found = with_every_aid(duration_s=12.0, gnss=gnss).mission
     rest = RestLog(0.5, REST_S, np.full(3, np.nan))
-    gnss = simulated(duration_s=12.0).mission.gnss
     kinds = (UsblLog, RangeLog, HeadingLog, MagnetometerLog)
     aids = type(found.aids)(*(found.aids[kind] for kind in kinds), rest)
-    return replace(found, aids=aids, gnss=found.gnss or gnss)
+    return replace(found, aids=aids)
 
 
 def quaternion(heading: float) -> dict[str, float]:
