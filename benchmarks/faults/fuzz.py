@@ -1,6 +1,7 @@
 """Damaged traffic and damaged recordings: nothing may raise, grow, or let a bad number through.
 
-``python -m benchmarks.faults.fuzz --keep`` (some ten minutes, most of it for recordings); ``--bytes 200000`` is a quick look.
+``python -m benchmarks.faults.fuzz --keep`` (some ten minutes, most of them for recordings); a quick
+look is ``--bytes 200000``.
 Exit code 1 if anything failed.
 """
 
