@@ -33,6 +33,9 @@ from ssm_graph.evaluation.errors import withhold_gnss as withhold_gnss
 from ssm_graph.filters.navigation.named import FILTERS as FILTERS
 from ssm_graph.filters.navigation.named import filter_problems as filter_problems
 from ssm_graph.io.blueye.convert import convert_blueye as convert_blueye
+from ssm_graph.io.export.formats import export_track as export_track
+from ssm_graph.io.export.track import Track as Track
+from ssm_graph.io.export.track import track_of as track_of
 from ssm_graph.io.mission_folder.folder import read_mission as read_mission
 from ssm_graph.io.mission_folder.folder import write_mission as write_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle as read_vehicle

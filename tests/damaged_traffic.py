@@ -9,11 +9,11 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
+from ssm_graph.io.nmea_sentences import checksum
 from ssm_graph.live.protocols.decoder import MAX_REFUSALS, Decoder
 from ssm_graph.live.protocols.framing import MAX_LENGTH
 from ssm_graph.live.protocols.json_messages import JsonDecoder, encode_message
 from ssm_graph.live.protocols.nmea import NmeaDecoder
-from ssm_graph.live.protocols.nmea_fields import checksum
 from ssm_graph.live.protocols.waterlinked import BeamRule, WaterLinkedDecoder
 from ssm_graph.sensors.acoustic import AcousticRange, UsblFix
 from ssm_graph.sensors.compass import HeadingReading

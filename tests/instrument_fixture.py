@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from ssm_graph.live.protocols.nmea_fields import checksum
+from ssm_graph.io.nmea_sentences import checksum
 from ssm_graph.live.sockets.sockets import SocketHub
 from ssm_graph.mission.navigation import Event
 from ssm_graph.sensors.depth import DepthReading

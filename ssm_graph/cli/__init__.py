@@ -1,1 +1,4 @@
-"""The command line: ``ssm-graph simulate | smooth | filter | online | compare | convert``."""
+"""The command line.
+
+``ssm-graph simulate | smooth | filter | online | compare | convert | export | report``.
+"""

@@ -17,7 +17,7 @@ from ssm_graph.base.errors import (
     SolverError,
     SsmGraphError,
 )
-from ssm_graph.cli import compare, convert, online, simulate, smooth
+from ssm_graph.cli import compare, convert, export, online, report, simulate, smooth
 from ssm_graph.cli import filter as filter_command
 from ssm_graph.cli.options import say
 from ssm_graph.cli.terminal import console_on, interrupt, occupy_closed_streams, signals_to
@@ -72,7 +72,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=version("ssm-graph"))
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for module in (simulate, smooth, filter_command, online, compare, convert):
+    for module in (simulate, smooth, filter_command, online, compare, convert, export, report):
         module.add_parser(commands, epilog=EPILOG)
     return parser
 

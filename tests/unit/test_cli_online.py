@@ -13,10 +13,10 @@ import pytest
 from ssm_graph.cli.main import ExitCode, build_parser, main
 from ssm_graph.cli.online import input_configs, output_configs, replay_speed
 from ssm_graph.io.mission_folder.folder import read_mission, write_mission
+from ssm_graph.io.nmea_sentences import checksum
 from ssm_graph.io.results.tables import read_results
 from ssm_graph.live.protocols.json_messages import JsonDecoder
 from ssm_graph.live.protocols.nmea import NmeaDecoder
-from ssm_graph.live.protocols.nmea_fields import checksum
 from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
 from ssm_graph.live.sockets.endpoints import Transport
 from ssm_graph.live.sockets.feed import Limits

@@ -13,9 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ssm_graph.base.errors import ConfigError
+from ssm_graph.io.nmea_sentences import checksum
 from ssm_graph.live.protocols.decoder import Clock
 from ssm_graph.live.protocols.nmea import NmeaDecoder, NmeaOptions
-from ssm_graph.live.protocols.nmea_fields import DepthSentence, checksum
+from ssm_graph.live.protocols.nmea_fields import DepthSentence
 from ssm_graph.live.protocols.nmea_out import encode_gga, encode_hdt, encode_nmea, encode_vtg
 from ssm_graph.mission.navigation import Health, Navigation
 from ssm_graph.sensors.compass import HeadingReading

@@ -14,7 +14,7 @@ import pytest
 from ssm_graph.base.errors import DataError
 from ssm_graph.cli.main import ExitCode, main
 from ssm_graph.io.file_kind import kind_of
-from ssm_graph.live.protocols.nmea_fields import checksum
+from ssm_graph.io.nmea_sentences import checksum
 from ssm_graph.live.recorded.log import Recorded, read_recorded, write_tables
 from ssm_graph.sensors.compass import HeadingReading
 from ssm_graph.sensors.dvl import Ping

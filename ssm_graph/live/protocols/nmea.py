@@ -10,16 +10,15 @@ from typing import Final, NamedTuple
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Vector
+from ssm_graph.io.nmea_sentences import TALKER, checksum
 from ssm_graph.live.protocols.decoder import Clock, Decoder, RefusedError, Stamper, number, shown
 from ssm_graph.live.protocols.framing import SentenceFramer
 from ssm_graph.live.protocols.nmea_fields import (
     DEPTHS,
     HEADINGS,
     POSITIONS,
-    TALKER,
     DepthSentence,
     Position,
-    checksum,
     optional_number,
     split_sentence,
     utc_seconds,

@@ -8,10 +8,9 @@ from collections.abc import Callable
 from enum import Enum
 from typing import Final, NamedTuple, Protocol
 
+from ssm_graph.io.nmea_sentences import checksum
 from ssm_graph.live.protocols.decoder import RefusedError, number, shown
 
-TALKER: Final = "IN"
-"""Of integrated navigation: our own answers, and those of others."""
 PASCAL_PER_DBAR: Final = 1e4
 STANDARD_GRAVITY: Final = 9.80665
 """m/s^2"""
@@ -229,14 +228,6 @@ DEPTHS: Final[dict[str, Callable[[list[str], Water], float]]] = {
     "DBT": _dbt,
 }
 """Depth below the surface, m, from the fields of each of :class:`DepthSentence`."""
-
-
-def checksum(body: str) -> str:
-    """Return the two hexadecimal digits of a sentence, of what stands between ``$`` and ``*``."""
-    result = 0
-    for byte in body.encode("ascii"):
-        result ^= byte
-    return f"{result:02X}"
 
 
 def split_sentence(body: str) -> list[str]:

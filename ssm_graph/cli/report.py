@@ -1,0 +1,95 @@
+"""``ssm-graph report``: a result as one page for a browser and for print."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import webbrowser
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from rich.console import Console
+
+from ssm_graph.base.errors import DataError
+from ssm_graph.cli.options import add_command, say
+from ssm_graph.io.export.track import UNIX_FROM_S, UNIX_UNTIL_S, parse_epoch
+from ssm_graph.io.results.tables import AIDS_NAME, read_results
+
+PAGE_NAME: Final = "report.html"
+
+DESCRIPTION = """\
+Write one page about a result: the verdict in words first, the track with its uncertainty, height,
+speed and attitude with linked axes of time to zoom in, weights and innovations of all beams and
+aids, their whiteness, calibration, faults, what was assumed, versions and settings. The file holds
+all it shows: it opens without a network, on a phone too, and prints. Needs the extra 'report'.
+"""
+
+
+def add_parser(commands: Any, *, epilog: str) -> None:
+    """Declare the command and its options."""
+    parser = add_command(
+        commands,
+        "report",
+        summary="write a page about a result, for a browser and for print",
+        description=DESCRIPTION,
+        epilog=epilog,
+    )
+    parser.add_argument("result", type=Path, metavar="RESULT", help="folder of smooth or filter")
+    parser.add_argument(
+        "--out", type=Path, metavar="FILE", help=f"the page (default: RESULT/{PAGE_NAME})"
+    )
+    parser.add_argument(
+        "--epoch",
+        metavar="UTC",
+        help="UTC of time_s = 0, such as 2026-05-01T10:00:00Z, where times are no Unix time",
+    )
+    parser.add_argument("--open", action="store_true", help="open it in the browser at once")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
+    """Write the page."""
+    from ssm_graph.report.page.content import Content
+    from ssm_graph.report.page.page import write_page
+
+    results = read_results(arguments.result)
+    time_s = results.trajectory["time_s"]
+    if len(time_s) == 0:
+        raise DataError(f"{arguments.result}: trajectory.csv has no row: there is nothing to show")
+    is_unix = UNIX_FROM_S <= time_s[0] <= UNIX_UNTIL_S
+    epoch_s = None if arguments.epoch is None else parse_epoch(arguments.epoch)
+    content = Content(
+        trajectory=results.trajectory,
+        beams=results.beams,
+        summary=results.summary,
+        aids=_aids(arguments.result / AIDS_NAME),
+        protection={},
+        epoch_s=0.0 if is_unix else epoch_s,
+    )
+    path: Path = arguments.out or arguments.result / PAGE_NAME
+    now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    version = (results.summary.get("versions") or {}).get("ssm_graph")
+    write_page(content, path, footer=f"ssm-graph {version}; {arguments.result}; page of {now}")
+    say(console, f"{path}: {path.stat().st_size:,} bytes")
+    if arguments.open:
+        webbrowser.open(path.resolve().as_uri())
+    return True
+
+
+def _aids(path: Path) -> dict[str, Any]:
+    """Return the columns of ``aids.csv``, empty where there is none."""
+    if not path.exists():
+        return {}
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            rows = list(csv.DictReader(file))
+        words: dict[str, Any] = {
+            name: [row[name] for row in rows] for name in ("aid", "component", "unit")
+        }
+        for name in ("time_s", "innovation", "mahalanobis_sq", "weight"):
+            words[name] = np.array([float(row[name]) for row in rows])
+    except (OSError, KeyError, ValueError, TypeError) as error:
+        raise DataError(f"{path}: expected a table of aids: {error}; smooth again") from error
+    return words if rows else {}

@@ -1,0 +1,1 @@
+"""Results in the formats that other software reads; one file for every kin of formats."""

@@ -1,0 +1,318 @@
+"""The page's charts, as data and layout of plotly.js: what is drawn, with its units."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from typing import Any, Final
+
+import numpy as np
+
+from ssm_graph.base.frozen import Array
+from ssm_graph.report.page.content import Content
+from ssm_graph.report.style import (
+    EAST_NORTH_UP,
+    ESTIMATE,
+    GREY,
+    INK,
+    OUTLIER,
+    broken_at_gaps,
+    thinned,
+    thinned_outliers_first,
+)
+
+BEAM_COLORS: Final = (*EAST_NORTH_UP, "#CC79A7", "#56B4E9", "#E69F00", "#999933", "#332288")
+SUSPECT: Final = "#D55E00"
+MOST_ELLIPSES: Final = 60
+"""Of uncertainty on the track; more hide it."""
+MOST_LAGS: Final = 20
+BAND: Final = "rgba(0, 114, 178, 0.16)"
+
+
+@dataclass(frozen=True, slots=True)
+class Chart:
+    """One chart of the page."""
+
+    name: str
+    """Short, of letters: its place in the page."""
+    title: str
+    note: str
+    """What to see in it, one or two sentences."""
+    traces: Sequence[Mapping[str, Any]]
+    layout: Mapping[str, Any]
+    is_time: bool = True
+    """Whether its x axis is time, and goes with the others'."""
+
+
+def packed(values: Array) -> dict[str, str]:
+    """Return numbers as plotly.js reads them fastest: single precision, base 64."""
+    data = base64.b64encode(np.ascontiguousarray(values, "<f4").tobytes())
+    return {"dtype": "f4", "bdata": data.decode("ascii")}
+
+
+def line(x: Array, y: Array, name: str, color: str, **further: Any) -> dict[str, Any]:
+    """Return a line, broken at gaps and thinned to what a screen can show."""
+    x, y = broken_at_gaps(x, y)
+    kept = thinned(len(x))
+    style = {
+        "color": color,
+        "width": further.pop("width", 1.6),
+        "dash": further.pop("dash", "solid"),
+    }
+    trace = {"type": "scattergl" if len(kept) > 3000 else "scatter", "mode": "lines", "name": name}
+    return {**trace, "x": packed(x[kept]), "y": packed(y[kept]), "line": style, **further}
+
+
+def band(x: Array, low: Array, high: Array, name: str, color: str = BAND) -> list[dict[str, Any]]:
+    """Return what lies between two curves, as an area without outline."""
+    kept = thinned(len(x), 1500)
+    outline = np.r_[x[kept], x[kept][::-1]], np.r_[low[kept], high[kept][::-1]]
+    area = {"type": "scatter", "mode": "lines", "name": name, "fill": "toself", "fillcolor": color}
+    return [
+        {
+            **area,
+            "x": packed(outline[0]),
+            "y": packed(outline[1]),
+            "line": {"width": 0},
+            "hoverinfo": "skip",
+        }
+    ]
+
+
+def axes(x: str, y: str, **further: Any) -> dict[str, Any]:
+    """Return a layout with titles of both axes, units among them."""
+    layout: dict[str, Any] = {"xaxis": {"title": {"text": x}}, "yaxis": {"title": {"text": y}}}
+    for key, value in further.items():
+        layout[key] = {**layout.get(key, {}), **value} if isinstance(value, dict) else value
+    return layout
+
+
+MINUTES: Final = "minutes since start"
+
+
+def charts_of(content: Content) -> list[Chart]:
+    """Return all charts for which the result has data; axes of time show all of it at first."""
+    charts = [_track(content), *_series(content), *_beams(content), *_aids(content)]
+    whole = {"range": [0.0, float(content.since_min[-1])]}
+    return [
+        replace(chart, layout={**chart.layout, "xaxis": {**chart.layout["xaxis"], **whole}})
+        if chart.is_time
+        else chart
+        for chart in (*charts, *_whiteness(content))
+    ]
+
+
+def _track(content: Content) -> Chart:
+    """Return the map: local metres, equal scales, ellipses of three sigma."""
+    enu, rows = content.local_enu, content.trajectory
+    kept = thinned(len(enu))
+    hover = [
+        f"{_clock(content, t)}<br>height {h:.2f} m<br>sigma {s:.2f} m"
+        for t, h, s in zip(
+            rows["time_s"][kept].tolist(),
+            rows["height_m"][kept].tolist(),
+            content.horizontal_sigma_m[kept].tolist(),
+            strict=True,
+        )
+    ]
+    traces = [
+        _ellipses(content, enu),
+        {
+            **line(enu[kept, 0], enu[kept, 1], "track", ESTIMATE, width=2),
+            "text": hover,
+            "hovertemplate": "east %{x:.2f} m, north %{y:.2f} m<br>%{text}<extra></extra>",
+        },
+    ]
+    # Gaps in place are none of the track's: it is drawn as it is.
+    traces[1] |= {"x": packed(enu[kept, 0]), "y": packed(enu[kept, 1]), "type": "scatter"}
+    for number, rows_of in enumerate(_stretches(content.is_suspect)):
+        part = enu[rows_of]
+        doubtful = line(part[:, 0], part[:, 1], "suspect", SUSPECT, width=4)
+        doubtful |= {"x": packed(part[:, 0]), "y": packed(part[:, 1]), "showlegend": number == 0}
+        traces.append(doubtful)
+    for name, row, symbol in (("start", 0, "circle"), ("end", -1, "square")):
+        marker = {"size": 11, "symbol": symbol, "color": INK}
+        point = {"x": [float(enu[row, 0])], "y": [float(enu[row, 1])], "marker": marker}
+        traces.append({"type": "scatter", "mode": "markers", "name": name, **point})
+    layout = axes(
+        "east of the start, m",
+        "north of the start, m",
+        yaxis={"scaleanchor": "x", "scaleratio": 1},
+        height=520,
+    )
+    note = "Ellipses are three sigma. Where the answer is suspect the track is thick and vermilion."
+    return Chart("track", "Track", note, traces, layout, is_time=False)
+
+
+def _clock(content: Content, time_s: float) -> str:
+    """Return a time for people: minutes since start, and UTC where it is known."""
+    text = f"{(time_s - content.begin_s) / 60.0:.2f} min"
+    if content.epoch_s is None:
+        return text
+    when = datetime.fromtimestamp(time_s + content.epoch_s, UTC)
+    return f"{text}, {when.strftime('%H:%M:%S')} UTC"
+
+
+def _stretches(inside: Any) -> Iterator[slice]:
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], np.asarray(inside).astype(int), [0]])))
+    yield from (slice(int(begin), int(end)) for begin, end in edges.reshape(-1, 2))
+
+
+def _ellipses(content: Content, enu: Array) -> dict[str, Any]:
+    rows = thinned(len(enu), MOST_ELLIPSES)
+    angle = np.linspace(0.0, 2.0 * np.pi, 25)
+    sigma = np.column_stack([content.trajectory[f"sigma_{n}_m"][rows] for n in ("east", "north")])
+    circle = np.column_stack([np.cos(angle), np.sin(angle)])
+    rings = enu[rows, None, :2] + 3.0 * sigma[:, None, :] * circle
+    broken = np.concatenate([rings, np.full((len(rows), 1, 2), np.nan)], axis=1).reshape(-1, 2)
+    return {
+        "type": "scatter",
+        "mode": "lines",
+        "name": "3 sigma",
+        "x": packed(broken[:, 0]),
+        "y": packed(broken[:, 1]),
+        "line": {"width": 0.8, "color": "#9DB7CC"},
+        "hoverinfo": "skip",
+    }
+
+
+def _series(content: Content) -> Iterator[Chart]:
+    rows, t = content.trajectory, content.since_min
+    up, sigma_up = rows["height_m"], rows["sigma_up_m"]
+    traces = [
+        *band(t, up - 3 * sigma_up, up + 3 * sigma_up, "3 sigma"),
+        line(t, up, "height", ESTIMATE),
+    ]
+    yield Chart("height", "Height above the ellipsoid", "", traces, axes(MINUTES, "height, m"))
+    traces = [
+        line(t, 3.0 * rows[f"sigma_{name}_m"], f"3 sigma {name}", color)
+        for name, color in zip(("east", "north", "up"), EAST_NORTH_UP, strict=True)
+    ]
+    if content.protection:
+        at = content.minutes(content.protection["time_s"])
+        level = content.protection["protection_m"]
+        level = np.where(np.isfinite(level), level, np.nan)
+        traces.append(line(at, level, "protection level", INK, dash="dash"))
+    note = "How well the position is known: three sigma by axis."
+    log = {"type": "log"} if _decades(traces) > 2.0 else {"rangemode": "tozero"}
+    yield Chart("sigma", "Uncertainty", note, traces, axes(MINUTES, "3 sigma, m", yaxis=log))
+    east, north = rows["vel_east_m_per_s"], rows["vel_north_m_per_s"]
+    traces = [
+        line(t, np.hypot(east, north), "over ground", ESTIMATE),
+        line(t, rows["vel_up_m_per_s"], "upwards", EAST_NORTH_UP[2]),
+    ]
+    yield Chart("speed", "Speed", "", traces, axes(MINUTES, "m/s"))
+    traces = [
+        line(t, rows["roll_deg"], "roll", EAST_NORTH_UP[0]),
+        line(t, rows["pitch_deg"], "pitch", EAST_NORTH_UP[1]),
+    ]
+    yield Chart("attitude", "Roll and pitch", "", traces, axes(MINUTES, "degrees"))
+    heading = _unbroken(t, rows["heading_deg"])
+    traces = [line(*heading, "heading", EAST_NORTH_UP[0])]
+    layout = axes(MINUTES, "degrees from north", yaxis={"tickvals": [0, 90, 180, 270, 360]})
+    yield Chart("heading", "Heading", "", traces, layout)
+
+
+def _unbroken(t: Array, heading_deg: Array) -> tuple[Array, Array]:
+    """Return a heading with NaN where it passes north, so that no line runs across."""
+    at = np.flatnonzero(np.abs(np.diff(heading_deg)) > 180.0) + 1
+    return np.insert(t, at, t[at]), np.insert(heading_deg, at, np.nan)
+
+
+def _decades(traces: Sequence[Mapping[str, Any]]) -> float:
+    values = [np.frombuffer(base64.b64decode(tr["y"]["bdata"]), "<f4") for tr in traces]
+    known = np.concatenate(values)
+    known = known[np.isfinite(known) & (known > 0.0)]
+    return float(np.log10(known.max() / known.min())) if len(known) else 0.0
+
+
+def _beams(content: Content) -> Iterator[Chart]:
+    rows = content.beams
+    if len(rows["time_s"]) == 0:
+        return
+    t, weight, number = content.minutes(rows["time_s"]), rows["weight"], rows["beam"].astype(int)
+    innovation = rows["innovation_m_per_s"]
+    of_weight, of_innovation = [], []
+    for beam in np.unique(number):
+        mine = np.flatnonzero(number == beam)
+        kept = mine[thinned_outliers_first(weight[mine], 4000)]
+        look = {"color": BEAM_COLORS[(beam - 1) % len(BEAM_COLORS)], "size": 4}
+        common = {"type": "scattergl", "mode": "markers", "name": f"beam {beam}", "marker": look}
+        x = packed(t[kept])
+        of_weight.append({**common, "x": x, "y": packed(weight[kept])})
+        of_innovation.append({**common, "x": x, "y": packed(1e3 * innovation[kept])})
+    note = "1 is the weight of a measurement that is as noisy as stated; near 0 it is left out."
+    layout = axes(MINUTES, "weight", yaxis={"rangemode": "tozero"})
+    yield Chart("weights", "Weights of the DVL's beams", note, of_weight, layout)
+    note = "Measured minus what the answer expects. Gross ones may be far outside: zoom out."
+    limit = 1e3 * 8.0 * float(np.median(np.abs(innovation))) or 1.0
+    layout = axes(MINUTES, "mm/s", yaxis={"range": [-limit, limit]})
+    yield Chart("innovations", "Innovations of the DVL's beams", note, of_innovation, layout)
+
+
+def _aids(content: Content) -> Iterator[Chart]:
+    rows = content.aids
+    if not rows:
+        return
+    names = np.array(rows["aid"])
+    for aid in dict.fromkeys(rows["aid"]):
+        mine = np.flatnonzero(names == aid)
+        traces = []
+        components = np.array(rows["component"])[mine]
+        for i, component in enumerate(dict.fromkeys(components.tolist())):
+            of = mine[components == component]
+            of = of[thinned_outliers_first(rows["weight"][of], 4000)]
+            color = BEAM_COLORS[i % len(BEAM_COLORS)]
+            is_out = rows["weight"][of] < 0.05
+            look = {
+                "size": np.where(is_out, 8, 5).tolist(),
+                "symbol": np.where(is_out, "x", "circle").tolist(),
+                "color": np.where(is_out, OUTLIER, color).tolist(),
+            }
+            x, y = content.minutes(rows["time_s"][of]), rows["innovation"][of]
+            common = {"type": "scatter", "mode": "markers", "name": component, "marker": look}
+            traces.append({**common, "x": packed(x), "y": packed(y)})
+        unit = rows["unit"][int(mine[0])]
+        note = "Measured minus what the answer expects; a cross has a weight below 0.05."
+        title = f"Innovations of {aid}"
+        name = "aid" + "".join(filter(str.isalnum, aid))
+        yield Chart(name, title, note, traces, axes(MINUTES, str(unit)))
+
+
+def _whiteness(content: Content) -> Iterator[Chart]:
+    """Return autocorrelations of each beam's normalised innovations."""
+    rows = content.beams
+    traces, longest = [], 0
+    for beam in np.unique(rows["beam"]).astype(int):
+        mine = (rows["beam"] == beam) & (rows["weight"] > 0.05)
+        values = np.sign(rows["innovation_m_per_s"][mine]) * np.sqrt(rows["mahalanobis_sq"][mine])
+        if len(values) <= 5 * MOST_LAGS:
+            continue
+        longest = max(longest, len(values))
+        color = BEAM_COLORS[(beam - 1) % len(BEAM_COLORS)]
+        lags = np.arange(1, MOST_LAGS + 1)
+        trace = line(lags.astype(float), autocorrelation(values), f"beam {beam}", color)
+        traces.append({**trace, "mode": "lines+markers"})
+    if not traces:
+        return
+    bound = 1.96 / np.sqrt(longest)
+    ends = np.array([1.0, float(MOST_LAGS)])
+    for sign in (1.0, -1.0):
+        limit = line(ends, np.full(2, sign * bound), "95 % of white noise", GREY, dash="dash")
+        traces.append({**limit, "showlegend": sign > 0, "hoverinfo": "skip"})
+    note = (
+        "White innovations stay between the dashed lines, 19 of 20 times. What lies above for many "
+        "lags is an error that lasts: of mounting, scale, clock, or noise that is not white."
+    )
+    layout = axes("lag, pings", "autocorrelation", yaxis={"range": [-0.5, 1.0]})
+    yield Chart("whiteness", "Whiteness", note, traces, layout, is_time=False)
+
+
+def autocorrelation(values: Array) -> Array:
+    """Return the autocorrelation of a series, its mean taken off, at lags 1 to `MOST_LAGS`."""
+    centred = values - values.mean()
+    power = float(centred @ centred) or 1.0
+    lags = range(1, MOST_LAGS + 1)
+    return np.array([float(centred[lag:] @ centred[:-lag]) / power for lag in lags])
