@@ -80,22 +80,30 @@ def read_topics(
     """Return by role what the recording holds, and its frames; raises as `convert_rosbag`."""
     read, frames = {role: BagTopic(role) for role in REQUIRED_ROLES}, Frames()
     for item in read_rosbag(bag, topics, notes):
-        if item.role == TF_TOPIC:
-            frames.add(item.message)
-            continue
         topic = read.setdefault(item.role, BagTopic(item.role))
         if item.topic not in topic.names:
             topic.names.append(item.topic)
         topic.type_name = item.type_name
-        header = getattr(item.message, "header", None)
-        topic.frame_id = topic.frame_id or str(getattr(header, "frame_id", ""))
         topic.n_messages += 1
         try:
+            if item.role == TF_TOPIC:
+                frames.add(item.message)
+                continue
+            header = getattr(item.message, "header", None)
+            topic.frame_id = topic.frame_id or str(getattr(header, "frame_id", ""))
             row = _row(item, topic, options)
             topic.rows.extend(row)
             topic.received.extend([item.received_s] if row else [])
         except DataError as error:
             topic.refused.append(str(error))
+        except (AttributeError, TypeError, ValueError, IndexError) as error:
+            # the recording's own definition of the type is damaged, or of another package
+            topic.refused.append(f"no {item.type_name} as it is known: {error}")
+    transforms = read.pop(TF_TOPIC, None)
+    if transforms is not None and transforms.refused:
+        notes.append(
+            f"{transforms.name}: {len(transforms.refused)} refused: {transforms.refused[0]}"
+        )
     for role in REQUIRED_ROLES:
         topic = read[role]
         if len(topic.rows) < 2 * _width(role, options.n_beams):

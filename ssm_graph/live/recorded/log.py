@@ -254,7 +254,9 @@ def _nmea(data: bytes, options: NmeaOptions) -> Recorded:
     if math.isnan(dated):
         notes.append("No sentence states a date: time_s is UTC of the day.")
     if not messages:
-        notes.append(f"its sentences are {', '.join(sorted(kinds)[:12]) or 'none that begins with $'}")
+        notes.append(
+            f"its sentences are {', '.join(sorted(kinds)[:12]) or 'none that begins with $'}"
+        )
     if first is None and messages:
         return Recorded((), ("no sentence states a time, which depths and headings need",))
     return Recorded(tuple(messages), tuple(notes))
