@@ -42,7 +42,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     heading = np.degrees(sim().truth_at(yaw_s).roll_pitch_heading[:, 2]) + 40.0
     noise = np.random.default_rng(3).normal(0.0, 0.3, len(yaw_s))
     lines += [(t, local(t, h)) for t, h in zip(yaw_s, heading + noise, strict=True)]
-    text = "\n".join(line for _, line in sorted(lines, key=lambda one: one[0]))
+    text = "".join(f"{line}\n" for _, line in sorted(lines, key=lambda one: one[0]))
     (found / "dvl.json").write_text(text)
     return found
 
@@ -106,6 +106,7 @@ Change = Callable[[str], str]
         (lambda text: text.replace("position_local", "response"), "has no headings"),
         (lambda text: text.replace('"yaw": ', '"yaw": 1e-9, "x": '), "turn too little"),
         (lambda text: "\n".join(reversed(text.splitlines())), "set back"),
+        (lambda text: text + local(1e6, 5.0), "was the clock set amid it"),
     ],
 )
 def test_what_does_not_tell_is_refused(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -23,6 +24,8 @@ LEAST_ALIKE: Final = 0.8
 LEAST_EVIDENCE: Final = 10.0
 """Natural logarithm of how much more likely the best offset has to be than any other: lines of a
 survey repeat."""
+LONGEST_S: Final = 2.0 * 86_400.0
+_TINY: Final = 1e-9
 _APART_S: Final = 5.0
 """Another offset is further off than so long."""
 
@@ -46,6 +49,12 @@ def clock_offset(imu: ImuLog, time_s: Array, heading: Array) -> Offset:
     rate = -np.sum(imu.gyro_b * up_b, axis=1)
     turned = np.concatenate([[0.0], np.cumsum(rate * np.diff(imu.time_s, prepend=imu.start_s))])
     own_s = np.concatenate([[imu.start_s], imu.time_s])
+    for name, span_s in (("gyro", own_s[-1] - own_s[0]), ("headings", time_s[-1] - time_s[0])):
+        if span_s > LONGEST_S:
+            raise DataError(
+                f"the times of the {name} span {span_s / 86_400.0:.1f} days; expected one run of "
+                f"up to {LONGEST_S / 86_400.0:g}: was the clock set amid it? split the file there"
+            )
     own, other = _rates(own_s, turned), _rates(time_s, np.unwrap(heading))
     least = min(LEAST_OVERLAP_S, 0.5 * STEP_S * min(len(own), len(other)))
     for name, rates in (("gyro", own), ("headings", other)):
@@ -59,18 +68,18 @@ def clock_offset(imu: ImuLog, time_s: Array, heading: Array) -> Offset:
     away = np.abs(np.arange(len(alike)) - best) * STEP_S > _APART_S
     rival = float(np.max(alike[away], initial=0.0))
     n_free = overlap[best] * STEP_S / SPAN_S
-    evidence = 0.5 * n_free * float(np.log((1.0 - rival**2) / max(1.0 - alike[best] ** 2, 1e-9)))
+    unlike, other_unlike = (max(1.0 - x**2, _TINY) for x in (float(alike[best]), rival))
+    evidence = 0.5 * n_free * math.log(other_unlike / unlike)
     if alike[best] < LEAST_ALIKE or evidence < LEAST_EVIDENCE:
         raise DataError(
             f"the clocks cannot be told apart by turns: the rates are alike to {alike[best]:.3f} "
             f"at best, and to {rival:.3f} at another offset; expected {LEAST_ALIKE:g} and no other "
             "like it; are the files of one run? else state  --clock-offset SECONDS"
         )
-    near = alike[max(best - 1, 0) : best + 2]
-    curve = near[0] - 2.0 * near[1] + near[2] if len(near) == 3 else -1.0
-    shift = 0.5 * (near[0] - near[2]) / curve if len(near) == 3 else 0.0
-    lag_s = (best + shift - (len(other) - 1)) * STEP_S
-    sigma_s = STEP_S * float(np.sqrt((1.0 - alike[best] ** 2) / (n_free * -curve)))
+    before, at, behind = alike[np.clip([best - 1, best, best + 1], 0, len(alike) - 1)].tolist()
+    curve = min(before - 2.0 * at + behind, -_TINY)
+    lag_s = (best + 0.5 * (before - behind) / curve - (len(other) - 1)) * STEP_S
+    sigma_s = STEP_S * math.sqrt(unlike / (n_free * -curve))
     seconds = float(own_s[0] - time_s[0] + lag_s)
     return Offset(seconds, sigma_s, float(alike[best]), float(overlap[best] * STEP_S))
 
