@@ -360,9 +360,9 @@ def main() -> None:
     page = Report(__file__, "Soak at sockets", __doc__, Option("--minutes", 60.0, "of real time"))
     heard, events, n_messages, n_errors = soak(page.args.minutes)
     longest_s = max((s for _, _, s in heard.silences), default=math.inf)
-    late = [(at_s / 3600.0, mb) for at_s, mb in heard.rss if at_s >= WARM_S]
-    growth = float(np.polyfit(*np.array(late).T, 1)[0]) if len(late) > 10 else math.nan
-    sizes = [mb for _, mb in late] or [mb for _, mb in heard.rss]
+    late = np.array([(at_s / 3600.0, mb) for at_s, mb in heard.rss if at_s >= WARM_S])
+    growth = float(np.polyfit(late[:, 0], late[:, 1], 1)[0]) if len(late) > 10 else math.nan
+    sizes = [mb for at_s, mb in heard.rss if at_s >= WARM_S] or [mb for _, mb in heard.rss]
     is_met = longest_s <= LOCKED_OUT_S and not abs(growth) > FLAT_MB_PER_H and not n_errors
     told = ", ".join(f"{kind} {n}" for kind, n in sorted(events.items()))
     page.write([

@@ -104,9 +104,9 @@ class Subscription(NamedTuple):
 
 def subscriptions(parameters: Mapping[str, Any]) -> tuple[Subscription, ...]:
     """Return what to subscribe to; a type of messages that is not known is a ConfigError."""
-    for name, types in (("dvl_type", DVL_TYPES), ("heading_type", AID_TYPES["heading"])):
-        if parameters[name] not in types:
-            raise ConfigError(f"{name}: expected {' or '.join(types)}, got {parameters[name]!r}")
+    for name, known in (("dvl_type", DVL_TYPES), ("heading_type", AID_TYPES["heading"])):
+        if parameters[name] not in known:
+            raise ConfigError(f"{name}: expected {' or '.join(known)}, got {parameters[name]!r}")
     types = {
         "imu": IMU_TYPE,
         "dvl": parameters["dvl_type"],
