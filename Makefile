@@ -6,22 +6,28 @@ BIN := $(VENV)/bin
 OUT ?= out
 # Small matrices: BLAS threads only get in each other's way.
 export OPENBLAS_NUM_THREADS ?= 1
+# Each worker begins with a half of its own, so that what the tests of a file share is made once.
+WORKERS := -n 2 --dist worksteal
+# Where an image sets it, every process would compile everything anew.
+unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-slow test-benchmarks format check clean
+.PHONY: demo test test-fast test-slow test-benchmarks format check clean
 
 demo: $(VENV)/.installed  ## simulate the default mission with failing beams, smooth it, show table and figure
 	$(BIN)/ssm-graph simulate demo --overwrite --out $(OUT)/demo/mission
 	$(BIN)/ssm-graph smooth $(OUT)/demo/mission --out $(OUT)/demo/result
 	@echo "figure: $(OUT)/demo/result/figure.png"
 
-test: check  ## format, lint, types and the fast tests
-	$(BIN)/python -m pytest -n 2
+test: check test-fast  ## format, lint, types and the fast tests
+
+test-fast: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest $(WORKERS)
 
 test-slow: $(VENV)/.installed-dev  ## the tests that take minutes
-	$(BIN)/python -m pytest -n 2 -m slow
+	$(BIN)/python -m pytest $(WORKERS) -m slow
 
 test-benchmarks: $(VENV)/.installed-dev  ## every benchmark in its smallest form
-	$(BIN)/python -m pytest -n 2 -m benchmark
+	$(BIN)/python -m pytest $(WORKERS) -m benchmark
 
 check: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .

@@ -18,7 +18,8 @@ for kernel in kernels:
 
 print(f"{'kernel':14} {'horizontal rms, m':>18} {'iterations':>11}  status")
 for name, (mission, kernel) in runs.items():
-    estimate = sg.smooth(mission, sg.SmootherConfig(kernel=kernel))
+    smoother = sg.SsmSmoother(sg.SmootherConfig(kernel=kernel))
+    estimate = smoother.solve(sg.build_problem(mission))
     metrics = sg.evaluate(estimate.trajectory, truth)
     print(
         f"{name:14} {metrics.rmse_horizontal_m:18.3f} {len(estimate.iterations):11d}  "

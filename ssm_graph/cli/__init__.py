@@ -1,4 +1,4 @@
 """The command line.
 
-``ssm-graph simulate | smooth | filter | online | compare | convert | export | report``.
+``ssm-graph simulate | smooth | filter | online | compare | inspect | convert | export | report``.
 """

@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
@@ -17,12 +17,11 @@ from rich.progress import Progress as Bar
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.cli.options import (
-    add_command,
     method_lines,
     number_option,
-    say,
     table_format_option,
 )
+from ssm_graph.cli.terminal import say
 from ssm_graph.evaluation.comparison import compare_methods
 from ssm_graph.io.results.place import check_result_place
 from ssm_graph.io.tables.append_file import write_through
@@ -82,21 +81,16 @@ study file (TOML):
              sigma_m_per_s = 0.1, vertical_sigma_m_per_s = 0.01, correlation_s = 21600.0}
   water_track = {noise_m_per_s = 0.01, beams = [0, 1, 2, 3], every = 10}  # pings off the water:
                                      # without bottom lock, and every 10th (0: none) with it
-"""
+
+methods:
+""" + method_lines(FAMILIES)
 
 
 FIGURES_NAME: Final = "figures"
 
 
-def add_parser(commands: Any, *, epilog: str) -> None:
-    """Declare the command and its options."""
-    parser = add_command(
-        commands,
-        "compare",
-        summary="compare methods on many simulated or recorded missions",
-        description=f"{DESCRIPTION}\nmethods:\n{method_lines(FAMILIES)}",
-        epilog=epilog,
-    )
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
     parser.add_argument(
         "inputs", type=Path, nargs="+", metavar="INPUT", help="a study file, or mission folders"
     )

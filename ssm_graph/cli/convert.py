@@ -6,13 +6,13 @@ import argparse
 import math
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frames import BodyAxes
-from ssm_graph.cli.options import add_command, add_mission_output, choice_option, number_option, say
+from ssm_graph.cli.options import add_mission_output, choice_option, number_option
+from ssm_graph.cli.terminal import say
 from ssm_graph.io.blueye.convert import convert_blueye
 from ssm_graph.io.file_kind import is_mcap, kind_of
 from ssm_graph.io.mission_folder.folder import write_mission
@@ -46,15 +46,8 @@ has the section. What messages do not say, noise, lever arms and mounting, comes
 """
 
 
-def add_parser(commands: Any, *, epilog: str) -> None:
-    """Declare the command and its options."""
-    parser = add_command(
-        commands,
-        "convert",
-        summary="turn a maker's log or a ROS bag into a mission folder",
-        description=DESCRIPTION,
-        epilog=epilog,
-    )
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
     parser.add_argument(
         "log",
         type=Path,

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
 from ssm_graph.base.errors import ConfigError
-from ssm_graph.cli.options import add_command, say
+from ssm_graph.cli.terminal import say
 from ssm_graph.io.export.formats import FORMATS, export_track
 from ssm_graph.io.export.track import parse_epoch, track_of
 from ssm_graph.io.results.tables import read_results
@@ -26,15 +25,8 @@ needs UTC. In Python: ``sg.export_track(sg.track_of(sg.read_results("result")), 
 """
 
 
-def add_parser(commands: Any, *, epilog: str) -> None:
-    """Declare the command and its options."""
-    parser = add_command(
-        commands,
-        "export",
-        summary="write a result for QGIS, Google Earth, evo, xarray, Foxglove, multibeam software",
-        description=DESCRIPTION,
-        epilog=epilog,
-    )
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
     parser.add_argument("result", type=Path, metavar="RESULT", help="folder of smooth or filter")
     parser.add_argument(
         "--format",

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any, Final
+from typing import Final
 
 from rich.console import Console
 
 from ssm_graph.base.errors import ConfigError
-from ssm_graph.cli.options import add_command, method_lines
+from ssm_graph.cli.options import method_lines
 from ssm_graph.cli.run_mission import add_mission_arguments, run_mission
 from ssm_graph.mission.estimate import Estimate
 from ssm_graph.mission.mission import Mission
@@ -16,21 +16,16 @@ from ssm_graph.mission.problem import ProblemConfig
 from ssm_graph.report.terminal.progress import ProgressDisplay
 from ssm_graph.study.methods import DEFAULT_FILTER, RECURSIVE, filter_mission, parse_filter
 
-DESCRIPTION: Final = """\
+DESCRIPTION: Final = f"""\
 Filter a recorded mission; writes trajectory.csv, beams.csv, summary.json and figure.png as smooth
 does. Without [initial] the start is aligned as for smooth: the whole mission has its say in that.
-"""
+
+methods:
+{method_lines(RECURSIVE)}"""
 
 
-def add_parser(commands: Any, *, epilog: str) -> None:
-    """Declare the command and its options."""
-    parser = add_command(
-        commands,
-        "filter",
-        summary="filter a mission folder, or smooth it with a fixed lag",
-        description=f"{DESCRIPTION}\nmethods:\n{method_lines(RECURSIVE)}",
-        epilog=epilog,
-    )
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
     add_mission_arguments(parser)
     parser.add_argument(
         "--method",

@@ -6,9 +6,9 @@ import argparse
 import sys
 from collections.abc import Sequence
 from enum import IntEnum
+from importlib import import_module
 from importlib.metadata import version
-
-from rich.text import Text
+from typing import Final
 
 from ssm_graph.base.errors import (
     ConfigError,
@@ -17,10 +17,7 @@ from ssm_graph.base.errors import (
     SolverError,
     SsmGraphError,
 )
-from ssm_graph.cli import compare, convert, export, online, report, simulate, smooth
-from ssm_graph.cli import filter as filter_command
-from ssm_graph.cli.options import say
-from ssm_graph.cli.terminal import console_on, interrupt, occupy_closed_streams, signals_to
+from ssm_graph.cli.terminal import console_on, interrupt, occupy_closed_streams, say, signals_to
 
 
 class ExitCode(IntEnum):
@@ -34,6 +31,19 @@ class ExitCode(IntEnum):
     NO_RESULT = 5
     INTERRUPTED = 130
 
+
+COMMANDS: Final = {
+    "simulate": "write a simulated mission folder with truth as reference",
+    "smooth": "smooth a mission folder",
+    "filter": "filter a mission folder, or smooth it with a fixed lag",
+    "online": "navigate live from instruments on sockets, or replay a mission as if live",
+    "compare": "compare methods on many simulated or recorded missions",
+    "inspect": "say what is in a file, folder, bag or mission, and whether it can be smoothed",
+    "convert": "turn a maker's log or a ROS bag into a mission folder",
+    "export": "write a result for QGIS, Google Earth, evo, xarray, Foxglove, multibeam software",
+    "report": "write a page about a result, for a browser and for print",
+}
+"""Summary of every command; the module of its name is loaded when it is the one that is given."""
 
 EPILOG = """\
 exit codes:
@@ -62,8 +72,8 @@ EXIT_CODES: tuple[tuple[type[SsmGraphError], ExitCode], ...] = (
 )
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """Return the parser of all commands."""
+def build_parser(words: Sequence[str]) -> argparse.ArgumentParser:
+    """Return the parser of all commands; the one that the words name has its options declared."""
     parser = argparse.ArgumentParser(
         prog="ssm-graph",
         description="Inertial and DVL navigation with a similarity weight for every beam.",
@@ -72,21 +82,34 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=version("ssm-graph"))
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for module in (simulate, smooth, filter_command, online, compare, convert, export, report):
-        module.add_parser(commands, epilog=EPILOG)
+    given = next((word for word in words if not word.startswith("-")), None)
+    for name, summary in COMMANDS.items():
+        module = import_module(f"ssm_graph.cli.{name.replace('-', '_')}") if name == given else None
+        command = commands.add_parser(
+            name,
+            help=summary,
+            description=module.DESCRIPTION if module else None,
+            epilog=EPILOG,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        if module:
+            module.declare(command)
     return parser
 
 
 def main(words: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
     occupy_closed_streams()
-    arguments = build_parser().parse_args(words)
+    words = sys.argv[1:] if words is None else words
+    arguments = build_parser(words).parse_args(words)
     console, errors = console_on(sys.stdout), console_on(sys.stderr, is_stderr=True)
     try:
         with signals_to(interrupt):
             is_good = arguments.run(arguments, console, errors)
         code = ExitCode.GOOD if is_good else ExitCode.NOT_GOOD
     except SsmGraphError as error:
+        from rich.text import Text
+
         errors.print(Text.assemble(("error:", "bold red"), f" {error}"), soft_wrap=True)
         code = next(code for kind, code in EXIT_CODES if isinstance(error, kind))
     except OSError as error:

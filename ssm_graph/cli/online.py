@@ -19,14 +19,12 @@ from ssm_graph.base.errors import ConfigError, SolverError
 from ssm_graph.base.frames import BodyAxes
 from ssm_graph.base.frozen import Array
 from ssm_graph.cli.options import (
-    add_command,
     add_kernel_options,
     choice_option,
     kernel_of,
     number_option,
-    say,
 )
-from ssm_graph.cli.terminal import signals_to
+from ssm_graph.cli.terminal import say, signals_to
 from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle, vehicle_of
 from ssm_graph.io.raw_log.rows import messages_of
@@ -78,15 +76,8 @@ _INPUTS: Final = {
 MAX_RATE: Final = "inertial samples/s of one source, of other kinds a tenth; more are left out"
 
 
-def add_parser(commands: Any, *, epilog: str) -> None:
-    """Declare the command and its options."""
-    parser = add_command(
-        commands,
-        "online",
-        summary="navigate live from instruments on sockets, or replay a mission as if live",
-        description=DESCRIPTION,
-        epilog=epilog,
-    )
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
     parser.add_argument(
         "vehicle",
         type=Path,

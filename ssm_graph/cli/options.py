@@ -6,31 +6,15 @@ import argparse
 from collections.abc import Callable, Mapping
 from enum import Enum
 from pathlib import Path
-from typing import Any, Final
-
-from rich.console import Console
+from typing import TYPE_CHECKING, Any, Final
 
 from factors.kernels import KernelChoice
 from factors.similarity import Kernel
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.io.mission_folder.folder import TableFormat
-from ssm_graph.study.methods import Family
 
-
-def add_command(commands: Any, name: str, *, summary: str, description: str, epilog: str) -> Any:
-    """Return the parser of a new command, its text kept line by line."""
-    return commands.add_parser(
-        name,
-        help=summary,
-        description=description,
-        epilog=epilog,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-
-
-def say(console: Console, text: str) -> None:
-    """Print a text as it is, whatever it holds and however long it is."""
-    console.print(text, markup=False, highlight=False, soft_wrap=True)
+if TYPE_CHECKING:
+    from ssm_graph.study.methods import Family
 
 
 def number_option(

@@ -13,7 +13,7 @@ import numpy as np
 from rich.console import Console
 
 from ssm_graph.base.errors import DataError
-from ssm_graph.cli.options import add_command, say
+from ssm_graph.cli.terminal import say
 from ssm_graph.io.export.track import UNIX_FROM_S, UNIX_UNTIL_S, parse_epoch
 from ssm_graph.io.results.tables import AIDS_NAME, read_results
 
@@ -27,15 +27,8 @@ all it shows: it opens without a network, on a phone too, and prints. Needs the 
 """
 
 
-def add_parser(commands: Any, *, epilog: str) -> None:
-    """Declare the command and its options."""
-    parser = add_command(
-        commands,
-        "report",
-        summary="write a page about a result, for a browser and for print",
-        description=DESCRIPTION,
-        epilog=epilog,
-    )
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
     parser.add_argument("result", type=Path, metavar="RESULT", help="folder of smooth or filter")
     parser.add_argument(
         "--out", type=Path, metavar="FILE", help=f"the page (default: RESULT/{PAGE_NAME})"

@@ -11,7 +11,8 @@ from typing import Any
 from rich.console import Console
 
 from ssm_graph.base.errors import ConfigError, DataError
-from ssm_graph.cli.options import number_option, say
+from ssm_graph.cli.options import number_option
+from ssm_graph.cli.terminal import say
 from ssm_graph.evaluation.errors import Metrics, evaluate, reference_from_gnss, withhold_gnss
 from ssm_graph.io.mission_folder.folder import CALIBRATION_NAME, read_mission
 from ssm_graph.io.mission_folder.toml import read_mission_toml
@@ -20,7 +21,6 @@ from ssm_graph.io.results.tables import write_results
 from ssm_graph.mission.estimate import Estimate
 from ssm_graph.mission.mission import Mission, Reference
 from ssm_graph.mission.problem import ProblemConfig
-from ssm_graph.report.mission.figure import save_figure
 from ssm_graph.report.mission.summary import summary_table
 from ssm_graph.report.terminal.progress import ProgressDisplay
 from ssm_graph.sensors.gnss import GnssLog
@@ -71,6 +71,8 @@ def run_mission(
         estimate, reference, metrics = _compare(estimate, mission, withheld)
 
         def draw(path: Path) -> None:
+            from ssm_graph.report.mission.figure import save_figure
+
             save_figure(path, estimate, reference, title=mission.name)
 
         write_results(

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from rich.console import Console
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.cli.options import add_command, add_mission_output, choice_option, say
+from ssm_graph.cli.options import add_mission_output, choice_option
+from ssm_graph.cli.terminal import say
 from ssm_graph.io.mission_folder.folder import write_mission
 from ssm_graph.io.results.place import check_is_free
 from ssm_graph.sensors.dvl import MOST_BEAMS
@@ -25,17 +26,12 @@ from ssm_graph.simulation import (
     simulate,
 )
 
+_SCENARIOS = "\n".join(f"  {name:9}{s.description}" for name, s in SCENARIOS.items())
+DESCRIPTION: Final = f"Simulate a mission.\n\nscenarios:\n{_SCENARIOS}"
 
-def add_parser(commands: Any, *, epilog: str) -> None:
-    """Declare the command and its options."""
-    scenarios = "\n".join(f"  {name:9}{s.description}" for name, s in SCENARIOS.items())
-    parser = add_command(
-        commands,
-        "simulate",
-        summary="write a simulated mission folder with truth as reference",
-        description=f"Simulate a mission.\n\nscenarios:\n{scenarios}",
-        epilog=epilog,
-    )
+
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
     parser.add_argument("scenario", metavar="SCENARIO", choices=list(SCENARIOS))
     usual = "(default: that of the scenario)"
     choice_option(parser, "--grade", Grade, f"grade of the inertial sensors {usual}")

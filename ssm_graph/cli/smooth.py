@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
+from typing import Any, Final
 
 from rich.console import Console
 
@@ -11,7 +11,6 @@ from factors.kernels import KERNELS, GeneralKernel, KernelChoice, TruncatedKerne
 from factors.similarity import Kernel, Similarity
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.cli.options import (
-    add_command,
     add_kernel_options,
     choice_option,
     kernel_of,
@@ -43,18 +42,16 @@ CHOICES = {
 """Kernels by name; the last two come with schedules of their own."""
 
 
-def add_parser(commands: Any, *, epilog: str) -> None:
-    """Declare the command and its options."""
-    parser = add_command(
-        commands,
-        "smooth",
-        summary="smooth a mission folder",
-        description="Smooth a recorded mission; writes trajectory.csv, beams.csv, summary.json and "
-        "figure.png. Where mission.toml gives prior sigmas of mounting, scale, lever arms, clocks "
-        "or depth offset, these are calibrated: calibration.toml has the lines to put in place. "
-        "Where pings are off the water (column water_track), its current is estimated.",
-        epilog=epilog,
-    )
+DESCRIPTION: Final = (
+    "Smooth a recorded mission; writes trajectory.csv, beams.csv, summary.json and "
+    "figure.png. Where mission.toml gives prior sigmas of mounting, scale, lever arms, clocks "
+    "or depth offset, these are calibrated: calibration.toml has the lines to put in place. "
+    "Where pings are off the water (column water_track), its current is estimated."
+)
+
+
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
     add_mission_arguments(parser)
     _add_kernel_options(parser)
     _add_loop_options(parser)

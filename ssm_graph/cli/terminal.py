@@ -7,9 +7,10 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from typing import IO, Any, Final, TextIO, cast
+from typing import IO, TYPE_CHECKING, Any, Final, TextIO, cast
 
-from rich.console import Console
+if TYPE_CHECKING:
+    from rich.console import Console
 
 SIGNALS: Final = [
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
@@ -58,8 +59,15 @@ def console_on(stream: TextIO | None, *, is_stderr: bool = False) -> Console:
 
     Names and paths are shown as they are, brackets and colons too.
     """
+    from rich.console import Console
+
     file = None if stream is None else cast(IO[str], TolerantStream(stream))
     return Console(file=file, stderr=is_stderr, markup=False, emoji=False)
+
+
+def say(console: Console, text: str) -> None:
+    """Print a text as it is, whatever it holds and however long it is."""
+    console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 def occupy_closed_streams() -> None:

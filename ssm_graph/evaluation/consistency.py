@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import beta
+from scipy.special import betaincinv
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.units import wrapped
@@ -74,6 +74,6 @@ def rate_with_interval(happened: ArrayLike, confidence: float = 0.95) -> Interva
     if n == 0:
         raise DataError("rate_with_interval: there are no trials")
     tail = 0.5 * (1.0 - confidence)
-    low = float(beta.ppf(tail, k, n - k + 1)) if k > 0 else 0.0
-    high = float(beta.ppf(1.0 - tail, k + 1, n - k)) if k < n else 1.0
+    low = float(betaincinv(k, n - k + 1, tail)) if k > 0 else 0.0
+    high = float(betaincinv(k + 1, n - k, 1.0 - tail)) if k < n else 1.0
     return Interval(k / n, low, high)

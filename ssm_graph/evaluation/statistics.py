@@ -7,9 +7,8 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import chi2, wilcoxon
-from scipy.stats import t as student_t
 
+from ssm_graph.base import chi2
 from ssm_graph.base.errors import DataError
 
 SIGNIFICANT_P: Final = 0.05
@@ -81,7 +80,7 @@ def chi2_interval(dof: int, runs: int, confidence: float = 0.95) -> Interval:
     """
     if dof < 1 or runs < 1:
         raise DataError(f"chi2_interval: dof and runs must be 1 or more, got {dof} and {runs}")
-    low, high = chi2.ppf(_tails(confidence), df=runs * dof) / (runs * dof)
+    low, high = chi2.ppf(_tails(confidence), runs * dof) / (runs * dof)
     return Interval(value=1.0, low=float(low), high=float(high))
 
 
@@ -94,6 +93,8 @@ def mean_with_interval(samples: ArrayLike, confidence: float = 0.95) -> Interval
     mean = float(values.mean())
     if len(values) == 1:
         return Interval(value=mean, low=-np.inf, high=np.inf)
+    from scipy.stats import t as student_t
+
     error = float(values.std(ddof=1)) / np.sqrt(len(values))
     low, high = mean + error * student_t.ppf(_tails(confidence), df=len(values) - 1)
     return Interval(value=mean, low=float(low), high=float(high))
@@ -137,6 +138,8 @@ def signed_rank(differences: ArrayLike) -> SignedRank:
     Differences of exactly zero are left out, as Wilcoxon did: they say neither better nor worse.
     Fewer than six others can never give a ``p`` of 0.05 or less.
     """
+    from scipy.stats import wilcoxon
+
     values = _finite("differences", differences)
     values = values[values != 0.0]
     if len(values) == 0:

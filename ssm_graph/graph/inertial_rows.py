@@ -12,23 +12,20 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.imu_errors import NONE, SIZE
+from factors.imu_errors import SIZE
 from factors.inertial import Intervals, Predicted, predict, whitened_error, whitened_rows
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
-from ssm_graph.base.stepwise import finished
 from ssm_graph.engine.chain import ChainSolution
 from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.engine.extras import Extras
 from ssm_graph.engine.states import States
 from ssm_graph.imu.preintegration import (
-    following_errors_steps,
     gravity_between,
     gravity_gradient,
     gtsam_gravity,
 )
 from ssm_graph.mission.imu_variables import columns_of_errors, imu_errors
-from ssm_graph.mission.problem import Problem
 
 
 class InertialRows:
@@ -175,26 +172,6 @@ class Ahead(NamedTuple):
         if self.moved.transition.shape[2] == STATE_DIM:
             return np.s_[:STATE_DIM]
         return np.concatenate([np.arange(STATE_DIM), self.between._own])
-
-
-def imu_error_columns(problem: Problem, states: States) -> Array:
-    """Return how the whitened inertial rows follow all errors of the sensors, (K - 1, 15, 27).
-
-    They are those of :mod:`factors.imu_errors`, in its order, at the states (K, ...) and at the
-    values that they have there; whether or not they are variables of the problem.
-    """
-    chain, intervals = problem.chain, problem.chain.intervals
-    if chain.source is None:
-        intervals = finished(following_errors_steps(intervals, chain.samples, NONE, chain.bias))
-    rows = whitened_rows(
-        intervals,
-        states.take(np.s_[:-1]),
-        states.take(np.s_[1:]),
-        g_n=gravity_between(problem.frame, states.p_n),
-        gradient=gravity_gradient(problem.frame),
-        errors=imu_errors(problem.extras, states.walks[:-1], states.constants)[0],
-    )
-    return rows[:, :, 2 * STATE_DIM : -1]
 
 
 class InertialFit(NamedTuple):

@@ -11,9 +11,9 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from factors.similarity import Kernel, LogKernel, Similarity
+from ssm_graph.base import chi2
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.extras import Extras
 from ssm_graph.engine.states import States
@@ -278,7 +278,7 @@ def _doubt_run(one: JudgedAid, least_sigmas: float) -> str:
     runs = np.lib.stride_tricks.sliding_window_view(np.sum(one.error**2, axis=1), size)
     median = np.median(runs, axis=1)
     worst = int(np.argmax(median))
-    sigmas = np.sqrt(median[worst] / chi2.median(aid.dim))
+    sigmas = np.sqrt(median[worst] / chi2.ppf(0.5, aid.dim))
     if median[worst] <= chi2.isf(RUN_TAIL, aid.dim) or sigmas < least_sigmas:
         return ""
     return (

@@ -294,6 +294,12 @@ class Estimate(ShortRepr):
         """How often the data were gone through: in all, or on average over the keyframes."""
         return len(self.iterations) if self.iterations else self.keyframe_iterations
 
+    @property
+    def n_beams(self) -> int:
+        """How many beams the instrument has, as far as is told."""
+        told = 0 if self.noise is None else len(self.noise.beam_factor)
+        return max(told, int(np.max(self.beams.beam, initial=1.0)))
+
 
 def since_first_ping(trajectory: Trajectory) -> Trajectory:
     """Return the keyframes from the first beam speed on.

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, NullLocator
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.mission.estimate import OUTLIER_WEIGHT, BeamTable, Estimate
+from ssm_graph.mission.estimate import OUTLIER_WEIGHT, BeamTable
 from ssm_graph.report import style
 
 CLASSES: Final = (
@@ -27,12 +27,6 @@ class BeamPoints(NamedTuple):
     time_s: Array
     innovation: Array
     weight: Array
-
-
-def n_beams_of(estimate: Estimate) -> int:
-    """Return how many beams the instrument has, as far as an estimate tells."""
-    told = 0 if estimate.noise is None else len(estimate.noise.beam_factor)
-    return max(told, int(np.max(estimate.beams.beam, initial=1.0)))
 
 
 def points_of(beams: BeamTable, beam: int) -> BeamPoints:

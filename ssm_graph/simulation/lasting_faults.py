@@ -9,7 +9,6 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import butter, sosfilt, sosfilt_zi
 from scipy.spatial.transform import Rotation
 
 from ssm_graph.base.earth import R_el_from_lat_lon, ecef_from_geodetic, geodetic_from_ecef
@@ -262,6 +261,8 @@ def low_passed(reading: Array, cutoff_hz: float, rate_hz: float) -> Array:
     """
     if cutoff_hz >= 0.45 * rate_hz:
         return reading
+    from scipy.signal import butter, sosfilt, sosfilt_zi
+
     sections = butter(2, cutoff_hz, fs=rate_hz, output="sos")
     rest = sosfilt_zi(sections)[:, :, None] * reading[:1]
     return np.asarray(sosfilt(sections, reading, axis=0, zi=rest)[0])

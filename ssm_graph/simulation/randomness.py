@@ -10,7 +10,6 @@ import math
 from dataclasses import dataclass, fields
 
 import numpy as np
-from scipy.signal import lfilter
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.sensors.drift import Drift
@@ -109,6 +108,8 @@ def gauss_markov(unit: Array, time_s: Array, correlation_s: float) -> Array:
 
 def regular_gauss_markov(unit: Array, step_s: float, correlation_s: float) -> Array:
     """Return the same as :func:`gauss_markov` at regular times, to rounding, but fast."""
+    from scipy.signal import lfilter
+
     kept = np.exp(-step_s / correlation_s)
     drive = np.sqrt(1.0 - kept**2) * unit
     drive[:1] = unit[:1]

@@ -16,8 +16,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
 
+from ssm_graph.base import chi2
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.engine.extras import Extras
@@ -60,7 +60,7 @@ def _doubt_prior(prior: MarginalPrior, states: States) -> str:
         ("bias", whitened[9:STATE_DIM]),
     ):
         chi_sq = float(part @ part)
-        if chi2.sf(chi_sq, df=len(part)) < PRIOR_TAIL:
+        if chi2.sf(chi_sq, len(part)) < PRIOR_TAIL:
             return (
                 f"the initial {name} is contradicted by the data (chi-square {chi_sq:.0f} for "
                 f"{len(part)} degrees of freedom, largest {np.max(np.abs(part)):.0f} "
@@ -89,7 +89,7 @@ def _doubt_extras(extras: Extras, states: States) -> list[str]:
         whitened = np.atleast_2d(value / block.sigma)
         chi_sq = np.sum(whitened**2, axis=-1)
         worst = int(np.argmax(chi_sq))
-        if chi2.sf(float(chi_sq[worst]), df=len(block.sigma)) >= PRIOR_TAIL:
+        if chi2.sf(float(chi_sq[worst]), len(block.sigma)) >= PRIOR_TAIL:
             continue
         if is_current:
             speed = np.linalg.norm(np.atleast_2d(value)[worst])

@@ -18,7 +18,7 @@ from tests.helpers import assert_consistent, simulated
 from tests.window_fixture import SHORT
 
 pytestmark = pytest.mark.slow
-RUNS = 25
+RUNS = 15
 WINDOW_RUNS = 10
 PRIOR_M = (40.0, 40.0, 6.0)
 NEAR_M = (10.0, 10.0, 3.0)

@@ -56,14 +56,14 @@ def test_with_calibration_it_is_the_augmented_filter_for_twenty_seconds() -> Non
     "grade", [Grade.NAVIGATION, Grade.TACTICAL, Grade.INDUSTRIAL], ids=lambda grade: grade.name
 )
 def test_with_calibration_it_is_the_augmented_filter(grade: Grade, similarity: Similarity) -> None:
-    """Two minutes a grade."""
-    assert_the_same(miscalibrated(grade, 120.0), similarity)
+    """A minute a grade."""
+    assert_the_same(miscalibrated(grade, 60.0), similarity)
 
 
 @pytest.mark.slow
 def test_with_calibration_it_stays_the_augmented_filter() -> None:
-    """Twenty minutes at navigation grade."""
-    assert_the_same(miscalibrated(Grade.NAVIGATION, 1200.0))
+    """Five minutes at navigation grade."""
+    assert_the_same(miscalibrated(Grade.NAVIGATION, 300.0))
 
 
 @pytest.mark.slow

@@ -45,9 +45,10 @@ def test_whole_state_is_consistent(grade: Grade) -> None:
     """NEES of all 15 error states at the first, middle and last keyframe of clean missions.
 
     The kernel is gaussian, so the covariance has to be exact; random initial errors from the
-    stated sigmas; every epoch's mean over the seeds within its own chi-square interval.
+    stated sigmas; every epoch's mean over the seeds within its own chi-square interval. So are the
+    squared errors of velocity and angles at the end, each component in the sigma that is told.
     """
-    nees = []
+    nees, squares = [], []
     for seed in SEEDS:
         sim = simulated(duration_s=DURATION_S[grade], grade=grade, seed=seed)
         problem, estimate = solved(sim, GaussianKernel())
@@ -57,18 +58,6 @@ def test_whole_state_is_consistent(grade: Grade) -> None:
         errors = state_errors(states, true_states(problem, sim))
         epochs = (0, problem.n_keyframes // 2, -1)
         nees.append([errors[k] @ np.linalg.solve(P[k], errors[k]) for k in epochs])
-    for samples in np.array(nees).T:
-        assert_consistent(samples, dof=STATE_DIM)
-
-
-@pytest.mark.slow
-@each_grade
-def test_velocity_and_attitude_sigmas_are_consistent(grade: Grade) -> None:
-    """Of each component, over seeds, at the last keyframe: squared errors in stated sigmas."""
-    squares = []
-    for seed in SEEDS:
-        sim = simulated(duration_s=120.0, grade=grade, seed=100 + seed)
-        problem, estimate = solved(sim, GaussianKernel())
         trajectory, truth = estimate.trajectory, sim.truth_at(problem.keyframe_s[-1:])
         velocity = trajectory.velocity_enu[-1] - truth.velocity_enu[0]
         angles = trajectory.roll_pitch_heading[-1] - truth.roll_pitch_heading[0]
@@ -79,6 +68,8 @@ def test_velocity_and_attitude_sigmas_are_consistent(grade: Grade) -> None:
                 (angles / trajectory.attitude_sigma[-1]) ** 2,
             ]
         )
+    for samples in np.array(nees).T:
+        assert_consistent(samples, dof=STATE_DIM)
     for component in np.array(squares).T:
         assert_consistent(component, dof=1)
 
@@ -142,10 +133,10 @@ def test_fewer_beams_know_less() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("beams", LOST.values(), ids=LOST)
-def test_truth_stays_within_three_sigma_with_few_beams(beams: tuple[int, ...]) -> None:
+@pytest.mark.parametrize("name", ["two beams", "one beam", "no beam"])
+def test_truth_stays_within_three_sigma_with_few_beams(name: str) -> None:
     """3 min with few or no beams at tactical grade: at least 99 % of axes and epochs."""
-    inside = []
+    beams, inside = LOST[name], []
     for seed in range(20):
         losses = losses_of(beams, 60.0, 240.0)
         sim = simulated(duration_s=300.0, grade=Grade.TACTICAL, losses=losses, seed=300 + seed)
@@ -167,14 +158,14 @@ def test_truth_stays_within_three_sigma_with_few_beams(beams: tuple[int, ...]) -
 def test_robust_kernels_converge_over_minutes(
     kernel: Kernel, similarity: Similarity, grade: Grade
 ) -> None:
-    """4 min with sparse outliers in two beams at once, and with a programmed fault of 40 s."""
+    """160 s with sparse outliers in two beams at once, and with a programmed fault of 40 s."""
     fault = Fault(beams=(1,), start_s=80.0, end_s=120.0, offset_m_per_s=1.0)
     cases: list[dict[str, Any]] = [
         {"outliers": Outliers(OutlierKind.TWO_BEAMS, rate=0.1)},
         {"faults": (fault,)},
     ]
     for seed, changes in enumerate(cases):
-        sim = simulated(duration_s=240.0, grade=grade, seed=400 + seed, **changes)
+        sim = simulated(duration_s=160.0, grade=grade, seed=400 + seed, **changes)
         config = SmootherConfig(kernel=kernel, similarity=similarity)
         estimate = SsmSmoother(config).solve(build_problem(sim.mission))
         assert estimate.status is Status.CONVERGED, estimate.reason

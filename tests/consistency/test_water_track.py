@@ -25,8 +25,14 @@ CURRENT = CurrentSettings(sigma=0.4, vertical_sigma=0.03, correlation_s=1800.0)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("grade", [Grade.NAVIGATION, Grade.TACTICAL], ids=lambda g: g.name)
-@pytest.mark.parametrize("track", [WaterTrack(), WaterTrack(beams=(1, 2), every=5)], ids=str)
+@pytest.mark.parametrize(
+    ("grade", "track"),
+    [
+        (Grade.NAVIGATION, WaterTrack()),
+        (Grade.TACTICAL, WaterTrack(beams=(1, 2), every=5)),
+    ],
+    ids=["navigation, all beams", "tactical, two beams"],
+)
 def test_state_and_current_are_consistent(grade: Grade, track: WaterTrack) -> None:
     """NEES of all error states and of the current before, amid and after a bottom loss.
 

@@ -14,7 +14,6 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import finished
 from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.engine.states import NavigationStates, States
-from ssm_graph.graph.inertial_rows import imu_error_columns
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.imu.preintegration import (
     InertialChain,
@@ -22,7 +21,7 @@ from ssm_graph.imu.preintegration import (
     gravity_gradient,
     preintegrate,
 )
-from ssm_graph.mission.imu_variables import columns_of_errors, imu_columns
+from ssm_graph.mission.imu_variables import columns_of_errors
 from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.simulation import Grade
 from tests.helpers import simulated, true_states
@@ -230,20 +229,6 @@ def test_graph_rows_follow_the_variables(with_clock: bool) -> None:
 def lengths(problem: Problem) -> list[int]:
     """Return how many components each variable has."""
     return [len(block.sigma) for block in problem.extras.blocks]
-
-
-def test_columns_of_errors_that_are_no_variables() -> None:
-    """They are those of a problem whose variables they are, at errors of zero."""
-    sim = turning(duration_s=6.0, grade=Grade.MEMS)
-    plain = build_problem(sim.mission)
-    asked = build_problem(asking(sim.mission, SIGMAS[Grade.MEMS]))
-    states = true_states(plain, sim)
-    columns = imu_error_columns(plain, states)
-    assert columns.shape == (plain.n_keyframes - 1, STATE_DIM, SIZE)
-    own = states._replace(constants=np.zeros(asked.extras.n_constants))
-    border = GraphLinearizer(asked).inertial_rows(own)[:, :, 2 * STATE_DIM : -1]
-    np.testing.assert_array_equal(columns[:, :, imu_columns(asked.extras)], border)
-    np.testing.assert_array_equal(imu_error_columns(asked, own), columns)
 
 
 def test_gradient_of_gravity_is_still_there() -> None:

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from ssm_graph.base.frames import BodyAxes
 from ssm_graph.io.mission_folder.folder import read_mission, write_mission
 from ssm_graph.io.results.tables import read_results, write_results
-from ssm_graph.report import summary_table
+from ssm_graph.report.mission.summary import summary_table
 from tests import mission_fixture
 from tests.estimate_fixture import calibrated, make_run
 

@@ -13,7 +13,7 @@ import pytest
 
 from ssm_graph import cli
 from ssm_graph.base.errors import SsmGraphError
-from ssm_graph.cli.main import EXIT_CODES, ExitCode, main
+from ssm_graph.cli.main import COMMANDS, EXIT_CODES, ExitCode, main
 from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.io.results.tables import read_results
 
@@ -176,7 +176,7 @@ def test_bad_data_and_missing_folders_have_their_codes(
 
 def test_help_lists_the_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
     """They stand in the help of every command."""
-    for words in ([], ["simulate"], ["smooth"], ["filter"], ["online"], ["compare"], ["convert"]):
+    for words in ([], *([name] for name in COMMANDS)):
         with pytest.raises(SystemExit) as stop:
             main([*words, "--help"])
         assert stop.value.code == 0

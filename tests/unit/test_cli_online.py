@@ -36,7 +36,8 @@ def mission(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def parsed(*words: str) -> argparse.Namespace:
     """Return what the words mean."""
-    return build_parser().parse_args(["online", "v.toml", "--out", "r", *words])
+    line = ["online", "v.toml", "--out", "r", *words]
+    return build_parser(line).parse_args(line)
 
 
 def test_a_replay_is_a_run(

@@ -291,15 +291,14 @@ def test_settings_are_checked(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("grade", [Grade.NAVIGATION, Grade.TACTICAL])
 @pytest.mark.parametrize(
-    "fault",
+    ("fault", "grade"),
     [
-        Fault((1,), 200.0, 240.0, 0.15),
-        Fault((1,), 100.0, 400.0, 0.05, shape=FaultShape.DRIFT),
-        Fault((1,), 100.0, 600.0, shape=FaultShape.COVERED, share=0.3),
+        (Fault((1,), 200.0, 240.0, 0.15), Grade.TACTICAL),
+        (Fault((1,), 100.0, 400.0, 0.05, shape=FaultShape.DRIFT), Grade.NAVIGATION),
+        (Fault((1,), 100.0, 600.0, shape=FaultShape.COVERED, share=0.3), Grade.TACTICAL),
     ],
-    ids=lambda fault: fault.shape.name,
+    ids=["offset", "drift", "covered"],
 )
 def test_slow_faults_of_one_beam_cost_little(fault: Fault, grade: Grade) -> None:
     """As the oracle does, and no other beam is named."""

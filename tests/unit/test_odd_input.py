@@ -40,15 +40,17 @@ def test_paths_are_told_as_they_are(
     assert f"{folder / 's'}: " in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("name", ["$x^{$", "a$b$c", r"$\frac{1}{$", "x" * 300, "[/]", "a_b^c\\d{"])
-def test_names_of_missions_are_no_formulas(tmp_path: Path, name: str) -> None:
+def test_names_of_missions_are_no_formulas(tmp_path: Path) -> None:
     """On the figure, where a dollar used to begin one; a long one is cut."""
     estimate, reference = make_run(n=60)
-    figure = draw_figure(estimate, reference, title=name)
-    save(figure, tmp_path / "figure.png", dpi=40)
-    assert (tmp_path / "figure.png").stat().st_size > 1000
-    assert len(figure.get_suptitle()) < 100
-    assert figure.get_suptitle().startswith(name[:80])
+    for name in ("$x^{$", "a$b$c", r"$\frac{1}{$", "x" * 300, "[/]", "a_b^c\\d{"):
+        figure = draw_figure(estimate, reference, title=name)
+        assert len(figure.get_suptitle()) < 100
+        assert figure.get_suptitle().startswith(name[:80])
+        for axes in figure.axes:  # the name alone is drawn: laying out all panels takes long
+            axes.remove()
+        save(figure, tmp_path / "figure.png", dpi=40)
+        assert (tmp_path / "figure.png").stat().st_size > 1000
 
 
 def test_decades_are_written_without_formulas(tmp_path: Path) -> None:

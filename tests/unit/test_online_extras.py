@@ -48,6 +48,12 @@ def after(given: Sequence[Message], vehicle: Vehicle | None = None) -> FixedLagS
     return smoother
 
 
+@cache
+def at_the_end() -> FixedLagSmoother:
+    """Return the estimator after all messages, to look at."""
+    return after(stream()[1])
+
+
 def found(smoother: FixedLagSmoother) -> Calibration:
     """Return the calibration, which is asked for."""
     calibration = smoother.found().calibration
@@ -62,7 +68,7 @@ def values(smoother: FixedLagSmoother) -> Array:
 
 def test_it_finds_the_truth_and_what_fixed_lag_finds() -> None:
     """Within three sigmas of the truth, and a hundredth of what it is offline."""
-    smoother = after(stream()[1])
+    smoother = at_the_end()
     assert smoother.status()[0] is Health.GOOD
     calibration = found(smoother)
     for name, truth in TRUTH.items():
@@ -84,7 +90,7 @@ def test_late_pings_change_nothing() -> None:
     messages = stream()[1]
     due = [(m.time_s + (0.5 if isinstance(m, Ping) else 0.0), i) for i, m in enumerate(messages)]
     late = after([messages[i] for _, i in sorted(due)])
-    np.testing.assert_allclose(values(late), values(after(messages)), rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(values(late), values(at_the_end()), rtol=0.0, atol=1e-9)
 
 
 def test_a_restored_estimator_goes_on_as_the_one_that_was_kept() -> None:
@@ -109,7 +115,7 @@ def test_a_restored_estimator_goes_on_as_the_one_that_was_kept() -> None:
 @pytest.mark.parametrize("what", list(Doubted))
 def test_a_new_begin_keeps_what_was_found(what: Doubted) -> None:
     """Of the instruments, whatever of the vehicle's state is doubted."""
-    smoother = after(stream()[1])
+    smoother = at_the_end()
     course = smoother._course
     assert course is not None
     measured = course._maker.next_after(course.newest.time_s - 1.5)

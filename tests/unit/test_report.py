@@ -16,14 +16,16 @@ from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.evaluation.errors import evaluate
 from ssm_graph.mission.estimate import OUTLIER_WEIGHT, BeamTable, Estimate, Iteration, Status
-from ssm_graph.report import ProgressDisplay, save_figure, summary_table
-from ssm_graph.report.mission.figure import draw_figure
+from ssm_graph.report.mission.figure import draw_figure, save_figure
+from ssm_graph.report.mission.summary import summary_table
 from ssm_graph.report.style import (
     broken_at_gaps,
+    save,
     thinned,
     thinned_outliers_first,
     time_axis,
 )
+from ssm_graph.report.terminal.progress import ProgressDisplay
 from tests.estimate_fixture import NOTES, calibrated, make_run, with_current, with_faults
 
 N_PANELS = 14
@@ -81,7 +83,7 @@ def test_who_was_off_is_told_and_drawn(tmp_path: Path) -> None:
     assert (first.get_x(), first.get_width()) == pytest.approx((3.0, 2.0))
     assert first.get_facecolor() != second.get_facecolor()
     assert len(figure.axes) == N_PANELS + 1
-    save_figure(tmp_path / "figure.png", estimate, reference)
+    save(figure, tmp_path / "figure.png", dpi=40)
 
 
 def test_a_calibration_is_drawn_in_sigmas_before(tmp_path: Path) -> None:
@@ -98,7 +100,7 @@ def test_a_calibration_is_drawn_in_sigmas_before(tmp_path: Path) -> None:
     centres = [c.lines[0].get_ydata()[0] for c in panel.containers]  # type: ignore[attr-defined]
     np.testing.assert_allclose(centres[0], -0.02 / 0.03)
     assert len(figure.axes) == N_PANELS + 2
-    save_figure(tmp_path / "figure.png", estimate, reference)
+    save(figure, tmp_path / "figure.png", dpi=40)
 
 
 def test_table_tells_the_run() -> None:
@@ -224,7 +226,7 @@ def test_page_survives(tmp_path: Path, name: str) -> None:
     _, reference = make_run(n=30)
     draw_figure(degenerate(name))
     if name in ("one keyframe", "diverged"):  # to lay it out takes most of a second
-        save_figure(tmp_path / "page.png", degenerate(name), reference)
+        save(draw_figure(degenerate(name), reference), tmp_path / "page.png", dpi=40)
         assert [path.name for path in tmp_path.iterdir()] == ["page.png"]
 
 

@@ -14,8 +14,9 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2, norm
+from scipy.special import ndtri
 
+from ssm_graph.base import chi2
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import POSITION, VELOCITY
@@ -116,7 +117,7 @@ class Judge:
         self.threshold = float(chi2.isf(config.false_alerts_per_h / n_tests, 3))
         """Of the chi-square of a separation"""
         self._radius = float(np.sqrt(chi2.isf(config.missed_detection, 2)))
-        self._side = float(norm.isf(0.5 * config.missed_detection))
+        self._side = float(-ndtri(0.5 * config.missed_detection))
 
     @property
     def detectable(self) -> float:

@@ -30,12 +30,14 @@ from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.times import Indices, is_inside
 from ssm_graph.mission.suspects.hypothesis import NOTHING, Hypothesis
+from ssm_graph.mission.suspects.motion import Velocities
 from ssm_graph.mission.suspects.regression import (
     NEUTRAL,
     TINY,
     robust_residual,
     twice_walk_covariance,
     walk_covariance,
+    whitened,
     whitener,
 )
 from ssm_graph.mission.suspects.track import (
@@ -140,11 +142,11 @@ class VelocityPart:
         return cls(tuple(windows), np.repeat(np.arange(len(sizes)), sizes), begin_s)
 
     def _whitened(self, error_i: Array) -> Array:
-        """Return errors (P, 3, ...) in axes that do not turn, level and whitened, (n, ...)."""
+        """Return errors (P, 3) in axes that do not turn, level and whitened (n,)."""
         found = []
         for window in self.windows:
-            error = np.einsum("aj,nj...->an...", window.axes, error_i[window.rows])
-            found += [np.tensordot(W, e, 1) for W, e in zip(window.whiten, error, strict=True)]
+            error = window.axes @ error_i[window.rows].T
+            found += [W @ e for W, e in zip(window.whiten, error, strict=True)]
         return np.concatenate(found)
 
     def depends_on(self, of: Hypothesis) -> tuple[object, ...]:
@@ -196,6 +198,13 @@ def _blocks(time_s: Array, components: int = 1) -> tuple[Indices, Array]:
     return np.tile(block, components), time_s[begins]
 
 
+def _walk(pings: Velocities, axis: int, share: float) -> float:
+    """Return what a track of pings walks along a body axis, m^2/s; ``share`` of its speed."""
+    speed_sq = float(np.mean(np.sum(pings.v_b**2, axis=1)))
+    spacing_s = float(np.median(np.diff(pings.time_s)))
+    return float(pings.sigma[axis] ** 2 * spacing_s + share**2 * speed_sq)
+
+
 @dataclass(frozen=True, eq=False)
 class FixPart:
     """Position fixes against the track."""
@@ -223,15 +232,13 @@ class FixPart:
         fix = frame.p_n_from_geodetic(gnss.lat, gnss.lon, gnss.height)[used]
         swapped = _swapped(gnss.lat[used], gnss.lon[used])
         sigma = np.sqrt(np.mean(gnss.sigma_enu[used, :2] ** 2, axis=1))
-        pings = logs.velocities
-        speed_sq = float(np.mean(np.sum(pings.v_b**2, axis=1)))
-        walk = pings.sigma[0] ** 2 * float(np.median(np.diff(pings.time_s))) + WALK**2 * speed_sq
+        walk = _walk(logs.velocities, 0, WALK)
         drift = gnss.calibration.drift
         white = sigma * drift.white
         if drift.sigma:
             walk += 2.0 * drift.sigma**2 / drift.correlation_s
         covariance = np.diag(white**2)
-        covariance += track_covariance(time_s[used], pings, logs.mission.imu.noise, walk)
+        covariance += track_covariance(time_s[used], logs.velocities, logs.mission.imu.noise, walk)
         return cls(
             time_s[used],
             fix[:, 0] + 1j * fix[:, 1],
@@ -251,11 +258,12 @@ class FixPart:
         assert logs.mission.gnss is not None
         arm = arm_of(logs, of, logs.mission.gnss.lever_arm_b, at_s)[0]
         way = track.at(track.way, at_s) + arm
-        y = self.whiten @ (self.swapped if of.is_swapped else self.fix)
-        columns = [way, np.ones_like(way), track.at(track.drift, at_s)]
+        fix = self.swapped if of.is_swapped else self.fix
+        columns = [fix, way, np.ones_like(way), track.at(track.drift, at_s)]
         if of.jump_s > self.time_s[0]:
-            columns.append((self.time_s < of.jump_s).astype(float))
-        X = self.whiten @ np.stack(columns, axis=1)
+            columns.append((self.time_s < of.jump_s).astype(complex))
+        made = whitened(self.whiten, np.stack(columns, axis=1))
+        y, X = made[:, 0], made[:, 1:]
         known = track.covers(at_s)
         residual, c = robust_residual(y, X, known)
         size = max(abs(c[0]), TINY)
@@ -295,11 +303,7 @@ class DepthPart:
         if len(used) < FEWEST:
             return None
         time_s, pings = log.time_s[used], logs.velocities
-        speed_sq = float(np.mean(np.sum(pings.v_b**2, axis=1)))
-        walk = (
-            pings.sigma[2] ** 2 * float(np.median(np.diff(pings.time_s)))
-            + (WALK / 3.0) ** 2 * speed_sq
-        )
+        walk = _walk(pings, 2, WALK / 3.0)
         covariance = np.diag(np.full(len(used), log.sigma**2))
         covariance += track_covariance(time_s, pings, logs.mission.imu.noise, walk)
         return cls(time_s, log.depth[used], whitener(covariance), *_blocks(time_s))

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
+from factors.so3 import cross
 from ssm_graph.base.frozen import Array
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.start.measured import PARITY_GATE
@@ -55,25 +56,37 @@ class Inertial:
     """(N, 3) integral of the specific force, m/s."""
     gyro_b: Array
     """(N, 3) mean rate about each time, rad/s."""
+    turn_b: Array
+    """(N - 1, 3) turn from each time to the next, rad,"""
+    gain_b: Array
+    """(N - 1, 3) and integral of the specific force, m/s."""
 
     @classmethod
-    def of(cls, imu: ImuLog, gyro_scale: Array | float = 1.0) -> Inertial:
-        """Sum the inertial data up; the gyros are multiplied by ``gyro_scale``, (3,) or one."""
+    def of(cls, imu: ImuLog) -> Inertial:
+        """Sum the inertial data up."""
         edges = np.concatenate([[imu.start_s], imu.time_s])
         span = np.diff(edges)[:, None]
         step = max(STEP_S, float(np.median(span)))
         time_s = np.linspace(edges[0], edges[-1], int((edges[-1] - edges[0]) / step) + 2)
         turn_b, gain_b = (
             np.diff(_resampled(edges, np.cumsum(x * span, axis=0), time_s), axis=0)
-            for x in (imu.gyro_b * gyro_scale, imu.accel_b)
+            for x in (imu.gyro_b, imu.accel_b)
         )
+        return cls._summed(time_s, turn_b, gain_b)
+
+    def scaled(self, gyro_scale: Array) -> Inertial:
+        """Return the same with gyros that are multiplied by ``gyro_scale`` (3,)."""
+        return self._summed(self.time_s, self.turn_b * gyro_scale, self.gain_b)
+
+    @classmethod
+    def _summed(cls, time_s: Array, turn_b: Array, gain_b: Array) -> Inertial:
         turned = Rotation.from_rotvec(turn_b).as_quat()
         R_ib = Rotation.from_quat(_product(np.vstack([[0.0, 0.0, 0.0, 1.0], turned]))).as_matrix()
         gained = np.einsum("nij,nj->ni", 0.5 * (R_ib[:-1] + R_ib[1:]), gain_b)
         rate = turn_b / np.diff(time_s)[:, None]
         about = 0.5 * (np.vstack([rate[:1], rate]) + np.vstack([rate, rate[-1:]]))
-        zero = np.zeros((1, 3))
-        return cls(time_s, R_ib, np.concatenate([zero, np.cumsum(gained, axis=0)]), about)
+        gained_i = np.concatenate([np.zeros((1, 3)), np.cumsum(gained, axis=0)])
+        return cls(time_s, R_ib, gained_i, about, turn_b, gain_b)
 
     @cached_property
     def up_i(self) -> Array:
@@ -89,14 +102,30 @@ class Inertial:
         """(N, 3) two level axes that do not turn, the second a quarter turn anticlockwise."""
         first = self.R_ib[0, :, 0] - self.up_i * (self.up_i @ self.R_ib[0, :, 0])[:, None]
         first = first / np.linalg.norm(first, axis=1, keepdims=True)
-        return first, np.cross(self.up_i, first)
+        return first, cross(self.up_i, first)
+
+    def arm(self, lever_arm_b: Array) -> tuple[Array, Array]:
+        """Return a lever arm in the level axes, complex (N,), and its part upwards (N,), m."""
+        key = tuple(lever_arm_b.tolist())
+        if key not in self._arms:
+            arm_i = self.R_ib @ lever_arm_b
+            first, second, up = (
+                np.einsum("ni,ni->n", arm_i, axis) for axis in (*self.level_i, self.up_i)
+            )
+            self._arms[key] = first + 1j * second, up
+        return self._arms[key]
+
+    @cached_property
+    def _arms(self) -> dict[tuple[float, ...], tuple[Array, Array]]:
+        return {}
 
     def at(self, quantity: Array, time_s: Array) -> Array:
         """Return a quantity (N, ...) of the grid at any times (M, ...), held at the ends."""
         place = (np.asarray(time_s) - self.time_s[0]) / (self.time_s[1] - self.time_s[0])
         low = np.clip(place.astype(int), 0, len(self.time_s) - 2)
         share = np.clip(place - low, 0.0, 1.0).reshape(low.shape + (1,) * (quantity.ndim - 1))
-        return np.asarray(quantity[low] * (1.0 - share) + quantity[low + 1] * share)
+        first, second = quantity.take(low, axis=0), quantity.take(low + 1, axis=0)
+        return np.asarray(first * (1.0 - share) + second * share)
 
 
 def _resampled(edges: Array, total: Array, time_s: Array) -> Array:
@@ -150,11 +179,14 @@ class Velocities:
     def in_i(self, inertial: Inertial) -> Array:
         """Return the velocity of the body origin (P, 3) in the axes that do not turn, m/s."""
         R_ib = inertial.at(inertial.R_ib, self.time_s)
-        arm_b = np.cross(inertial.at(inertial.gyro_b, self.time_s), self.lever_arm_b)
+        arm_b = cross(inertial.at(inertial.gyro_b, self.time_s), self.lever_arm_b)
         return np.asarray(np.einsum("nij,nj->ni", R_ib, self.v_b - arm_b))
 
 
 def is_enough(mission: Mission) -> bool:
-    """Return whether there is anything to compare."""
-    imu = mission.imu
-    return len(imu.time_s) > 2 and bool(imu.time_s[-1] - imu.start_s > 2.0 * LEVEL_S)
+    """Return whether there is anything to compare: pings beside inertial data, if not far off."""
+    imu, pings_s = mission.imu, mission.dvl.time_s
+    if len(imu.time_s) < 3 or len(pings_s) == 0:
+        return False
+    begin_s, end_s = max(imu.start_s, pings_s[0]), min(imu.time_s[-1], pings_s[-1])
+    return bool(imu.time_s[-1] - imu.start_s > 2.0 * LEVEL_S and end_s > begin_s)

@@ -33,13 +33,14 @@ class Logs:
         """Take the logs of a mission."""
         self.mission = mission
         self.velocities = Velocities.of(mission.dvl)
+        self._as_read = Inertial.of(mission.imu)
         self._inertial: dict[tuple[float, float, float], Inertial] = {}
         self._tracks: dict[tuple[object, ...], Track] = {}
 
     def inertial(self, of: Hypothesis) -> Inertial:
         """Return the inertial data with the gyros of a hypothesis."""
         if of.gyro not in self._inertial:
-            self._inertial[of.gyro] = Inertial.of(self.mission.imu, np.array(of.gyro))
+            self._inertial[of.gyro] = self._as_read.scaled(np.array(of.gyro))
         return self._inertial[of.gyro]
 
     def pings(self, of: Hypothesis) -> Velocities:
@@ -123,7 +124,5 @@ class Track:
 def arm_of(logs: Logs, of: Hypothesis, lever_arm_b: Array, time_s: Array) -> tuple[Array, Array]:
     """Return a lever arm in the level axes, complex (n,), and its part upwards (n,), m."""
     inertial = logs.inertial(of)
-    arm_i = inertial.at(inertial.R_ib, time_s) @ lever_arm_b
-    first, second, up = (inertial.at(x, time_s) for x in (*inertial.level_i, inertial.up_i))
-    level = np.sum(arm_i * first, axis=1) + 1j * np.sum(arm_i * second, axis=1)
-    return level, np.sum(arm_i * up, axis=1)
+    level, up = (np.interp(time_s, inertial.time_s, x) for x in inertial.arm(lever_arm_b))
+    return level, up

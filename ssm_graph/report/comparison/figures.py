@@ -22,7 +22,6 @@ from ssm_graph.report.beams import (
     dots,
     draw_points,
     innovation_axis,
-    n_beams_of,
     points_of,
     top_of_weights,
 )
@@ -177,7 +176,7 @@ def draw_beam_weights(examples: Sequence[Example], looks: Mapping[str, Look]) ->
         return None
     main = next((m for m in PER_BEAM if m in told), next(iter(told)))
     shown = [PER_PING, main] if PER_PING in told and main != PER_PING else [main]
-    beams, n_beams = told[main].beams, n_beams_of(told[main])
+    beams, n_beams = told[main].beams, told[main].n_beams
     n_rows = (n_beams + 1) // 2
     start_s = float(beams.time_s.min())
     divisor, label = style.time_axis(beams.time_s)

@@ -31,7 +31,6 @@ from ssm_graph.report import style
 from ssm_graph.report.beams import (
     draw_points,
     innovation_axis,
-    n_beams_of,
     points_of,
     top_of_weights,
 )
@@ -334,7 +333,7 @@ def _reference_track(reference: Reference, frame: LocalFrame, time_s: Array) -> 
 
 def _draw_beams(figure: Figure, place: SubplotSpec, estimate: Estimate) -> None:
     """Draw innovations above weights, a column per beam, all on the same scales."""
-    beams, time_s, n_beams = estimate.beams, estimate.trajectory.time_s, n_beams_of(estimate)
+    beams, time_s, n_beams = estimate.beams, estimate.trajectory.time_s, estimate.n_beams
     divisor, label = style.time_axis(time_s)
     span = float(np.ptp(time_s)) / divisor or 1.0
     grid = place.subgridspec(2, n_beams, height_ratios=[1.35, 1.0])

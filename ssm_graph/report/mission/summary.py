@@ -21,7 +21,6 @@ from ssm_graph.mission.estimate import (
     path_length_m,
 )
 from ssm_graph.mission.fault import DetectedFault
-from ssm_graph.report.beams import n_beams_of
 
 STATUS_STYLE: Final = {
     Status.CONVERGED: "bold green",
@@ -72,7 +71,7 @@ def summary_table(estimate: Estimate, metrics: Metrics | None = None) -> Rendera
 
 def _overview(estimate: Estimate) -> Table:
     trajectory, beams = estimate.trajectory, estimate.beams
-    time_s, n_beams = trajectory.time_s, n_beams_of(estimate)
+    time_s, n_beams = trajectory.time_s, estimate.n_beams
     outlier = beams.weight < OUTLIER_WEIGHT
     share = f" ({100.0 * np.mean(outlier):.1f} %)" if len(outlier) else ""
     counts = [int(np.sum(outlier & (beams.beam == beam + 1))) for beam in range(n_beams)]

@@ -14,8 +14,8 @@ from enum import Enum
 from functools import cache, partial
 
 import numpy as np
-from scipy.stats import chi2
 
+from ssm_graph.base import chi2
 from ssm_graph.base.frozen import Array
 from ssm_graph.smoothers.faults.columns import (
     BEAM,

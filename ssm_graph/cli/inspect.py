@@ -1,0 +1,80 @@
+"""``ssm-graph inspect``: what is in a file, folder, bag or mission."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from ssm_graph.cli.terminal import say
+
+DESCRIPTION = """\
+Say what is at a path, by its content: format; of every sensor rows, rate, jitter, gaps, repeats and
+what it reads (gravity, turn rate, beams with a speed, ranges); what is odd; clocks, units and axes
+that the data contradict; and whether it can be smoothed, or what is missing.
+
+PATH is a mission folder, a ROS bag, a maker's log, an instrument's own output, or a table.
+"""
+
+
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
+    parser.add_argument("path", type=Path, metavar="PATH", help="what to look at")
+    parser.add_argument("--figure", type=Path, metavar="FILE", help="draw it: .png, .pdf or .svg")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace, console: Console, errors: Console) -> bool:
+    """Look, tell, and draw."""
+    from ssm_graph.inspection.look import inspect_path
+
+    found = inspect_path(arguments.path)
+    if arguments.json:
+        say(console, json.dumps(found.as_dict(), indent=2, allow_nan=False, ensure_ascii=False))
+    else:
+        _tell(found, console)
+    if arguments.figure is not None:
+        from ssm_graph.inspection.picture import save_picture
+
+        say(errors, f"figure: {save_picture(found, arguments.figure)}")
+    return found.can_be_smoothed
+
+
+def _tell(found: Any, console: Console) -> None:
+    say(console, f"{found.path}: {found.kind}")
+    if found.sensors:
+        table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+        table.add_column("sensor", style="bold")
+        for heading in ("rows", "from, s", "to, s", "rate, Hz", "jitter, ms", "gaps", "in gaps, s"):
+            table.add_column(heading, justify="right")
+        for one in found.sensors:
+            timing = one.timing
+            table.add_row(
+                one.name,
+                f"{timing.n}",
+                f"{timing.begin_s:.2f}",
+                f"{timing.end_s:.2f}",
+                f"{timing.rate_hz:.4g}",
+                f"{1e3 * timing.jitter_s:.2f}",
+                f"{timing.n_gaps}",
+                f"{timing.in_gaps_s:.1f}",
+            )
+        console.print(table)
+    for one in found.sensors:
+        for fact in one.facts:
+            say(console, f"  {one.name}: {fact}")
+        for odd in one.oddities:
+            console.print(Text(f"  {one.name}: {odd}", style="yellow"), soft_wrap=True)
+    for note in found.notes:
+        console.print(Text(f"note: {note}", style="yellow"), soft_wrap=True)
+    for suspect in found.suspects:
+        console.print(Text(f"suspect: {suspect}", style="bold red"), soft_wrap=True)
+    style = "bold green" if found.can_be_smoothed and not found.suspects else "bold red"
+    console.print(Text(f"verdict: {found.verdict}", style=style), soft_wrap=True)

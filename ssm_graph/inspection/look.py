@@ -1,0 +1,235 @@
+"""One look at whatever lies at a path: its format by content, its sensors, and a verdict."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from ssm_graph.base.errors import DataError, SsmGraphError
+from ssm_graph.base.frozen import Array
+from ssm_graph.inspection.sensors import SensorFound, sensors_of
+from ssm_graph.inspection.timing import timing_of
+from ssm_graph.io.blueye.convert import convert_blueye
+from ssm_graph.io.file_kind import is_mcap, kind_of
+from ssm_graph.io.mission_folder.folder import read_mission
+from ssm_graph.io.mission_folder.toml import TOML_NAME
+from ssm_graph.io.ros.convert import convert_rosbag
+from ssm_graph.io.ros.log import is_rosbag
+from ssm_graph.live.recorded.log import read_recorded
+from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.suspects.find import find_suspects
+from ssm_graph.mission.usable import require_usable
+
+TABLES: Final = (".csv", ".txt", ".tsv")
+LEAST_COLUMNS: Final = 2
+"""Of numbers, for a text to be a table."""
+LEAST_S: Final = 30.0
+"""Of a mission without a start: alignment needs about as much."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Inspection:
+    """What was found at a path."""
+
+    path: Path
+    kind: str
+    """Of what format it is, by its content."""
+    sensors: tuple[SensorFound, ...]
+    notes: tuple[str, ...]
+    """Of the reader: what it left out or assumed."""
+    suspects: tuple[str, ...]
+    """Clocks, units and axes that the data contradict."""
+    missing: tuple[str, ...]
+    """What stands between this and a trajectory, with what to do; empty if it can be smoothed."""
+    mission: Mission | None
+    """Where it could be read as one."""
+
+    @property
+    def can_be_smoothed(self) -> bool:
+        """Whether ``ssm-graph smooth`` will take it, as a mission folder or once converted."""
+        return self.mission is not None and not self.missing
+
+    @property
+    def verdict(self) -> str:
+        """One sentence."""
+        if not self.can_be_smoothed:
+            return "cannot be smoothed as it is: " + "; ".join(self.missing)
+        first = (
+            "can be smoothed" if is_mission_folder(self.path) else "can be converted, then smoothed"
+        )
+        if self.suspects:
+            return f"{first}, but look first at what is suspect"
+        return first
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all of it but the curves, for JSON."""
+        return {
+            "path": str(self.path),
+            "format": self.kind,
+            "can_be_smoothed": self.can_be_smoothed,
+            "verdict": self.verdict,
+            "missing": list(self.missing),
+            "suspects": list(self.suspects),
+            "notes": list(self.notes),
+            "sensors": [
+                {
+                    "name": one.name,
+                    "n": one.timing.n,
+                    **{
+                        name: value if math.isfinite(value) else None
+                        for name, value in (
+                            ("begin_s", one.timing.begin_s),
+                            ("end_s", one.timing.end_s),
+                            ("rate_hz", one.timing.rate_hz),
+                            ("jitter_s", one.timing.jitter_s),
+                        )
+                    },
+                    "n_gaps": one.timing.n_gaps,
+                    "in_gaps_s": one.timing.in_gaps_s,
+                    "n_repeats": one.timing.n_repeats,
+                    "n_back": one.timing.n_back,
+                    "facts": list(one.facts),
+                    "oddities": list(one.oddities),
+                }
+                for one in self.sensors
+            ],
+        }
+
+
+def is_mission_folder(path: Path) -> bool:
+    """Return whether a path is a mission folder, or its ``mission.toml``."""
+    return (path / TOML_NAME).is_file() or path.name == TOML_NAME
+
+
+def inspect_path(path: Path) -> Inspection:
+    """Look at a file, folder, bag or mission; what cannot be read is said, not raised.
+
+    Raises :class:`DataError` only where there is nothing at the path.
+    """
+    if not path.exists():
+        raise DataError(f"{path}: there is no such file or folder")
+    kind, read = _reader(path)
+    if read is None:
+        return _without_mission(path)
+    try:
+        mission = read(path)
+    except SsmGraphError as error:
+        return Inspection(path, kind, (), (), (), (str(error),), None)
+    return inspect_mission(mission, path, kind)
+
+
+def _reader(path: Path) -> tuple[str, Any]:
+    """Return the format of a path and what reads it as a mission, None for nothing."""
+    if is_mission_folder(path):
+        return "mission folder", lambda p: read_mission(p if p.is_dir() else p.parent)
+    if is_rosbag(path):
+        return "ROS bag", convert_rosbag
+    if path.is_file() and is_mcap(path):
+        return "Blueye X3 log (MCAP)", convert_blueye
+    return "", None
+
+
+def inspect_mission(mission: Mission, path: Path, kind: str = "mission") -> Inspection:
+    """Look at a mission that is read already."""
+    missing: list[str] = []
+    suspects: tuple[str, ...] = ()
+    try:
+        require_usable(mission)
+        suspects = tuple(fault.sentence for fault in find_suspects(mission))
+    except SsmGraphError as error:
+        missing.append(str(error))
+    missing += _missing(mission)
+    sensors = tuple(sensors_of(mission))
+    return Inspection(path, kind, sensors, mission.notes, suspects, tuple(missing), mission)
+
+
+def _missing(mission: Mission) -> Iterator[str]:
+    """Yield what a smoother would want of a mission and not find."""
+    span_s = float(mission.imu.time_s[-1] - mission.imu.start_s)
+    if not np.isfinite(mission.dvl.speed).any():
+        yield "no beam has a speed: without bottom lock there is nothing to aid the inertial data"
+    if mission.initial is None and span_s < LEAST_S:
+        yield (
+            f"{span_s:.0f} s of inertial data and no [initial]: give a start, or at least "
+            f"{LEAST_S:.0f} s to align with"
+        )
+    if mission.initial is None and mission.gnss is None and not mission.aids:
+        yield "neither a fix nor [initial] says where it begins: give [initial] in mission.toml"
+    overlap = min(mission.imu.time_s[-1], mission.dvl.time_s[-1]) - max(
+        mission.imu.start_s, mission.dvl.time_s[0]
+    )
+    if overlap <= 0.0:
+        yield (
+            f"IMU ({mission.imu.start_s:.1f} to {mission.imu.time_s[-1]:.1f} s) and DVL "
+            f"({mission.dvl.time_s[0]:.1f} to {mission.dvl.time_s[-1]:.1f} s) do not overlap: are "
+            "they on one clock?"
+        )
+
+
+def _without_mission(path: Path) -> Inspection:
+    """Return what a file of one instrument, a table or an unknown file is."""
+    if path.is_dir():
+        return Inspection(path, "folder", (), (), (), (kind_of(path),), None)
+    try:
+        recorded = read_recorded(path)
+    except SsmGraphError as error:
+        return Inspection(path, "instrument's own output", (), (), (), (str(error),), None)
+    if recorded is None:
+        return _table(path) or Inspection(path, "file", (), (), (), (kind_of(path),), None)
+    times: dict[str, list[float]] = {}
+    for message in recorded.messages:
+        times.setdefault(type(message).__name__, []).append(message.time_s)
+    sensors = tuple(
+        SensorFound(name, timing_of(np.array(of)), (), (), np.array(of), {})
+        for name, of in times.items()
+    )
+    kind = "instrument's own output: "
+    kind += ", ".join(f"{one.timing.n} {one.name}" for one in sensors)
+    missing = "it holds no inertial data; ssm-graph convert makes tables of it for a mission folder"
+    return Inspection(path, kind, sensors, recorded.notes, (), (missing,), None)
+
+
+def _table(path: Path) -> Inspection | None:
+    """Return what a table of numbers holds: columns with their range, and the rate of its time."""
+    if path.suffix.lower() not in TABLES:
+        return None
+    with path.open(encoding="utf-8", errors="replace", newline="") as file:
+        reader = csv.reader(file)
+        header = next(reader, [])
+        rows = [row for row in reader if len(row) == len(header)]
+    columns: dict[str, Array] = {}
+    for i, name in enumerate(header):
+        values = [row[i] for row in rows]
+        if Counter(map(_is_number, values))[True] > len(values) / 2:
+            columns[name] = np.array([float(v) if _is_number(v) else math.nan for v in values])
+    if len(columns) < LEAST_COLUMNS or any(map(_is_number, header)):
+        return None
+    times = [name for name in columns if "time" in name.lower() or name.lower() in ("t", "stamp")]
+    facts = tuple(
+        f"{name}: {np.nanmin(values):.6g} to {np.nanmax(values):.6g}"
+        for name, values in columns.items()
+    )
+    time_s = columns[times[0]] if times else np.zeros(0)
+    known = time_s[np.isfinite(time_s)]
+    found = SensorFound("table", timing_of(known), facts, (), known, {})
+    missing = (
+        "a table alone is no mission: put it into a folder with a mission.toml that names it "
+        "(docs/mission-folder.md)"
+    )
+    kind = f"table, {len(rows)} rows of {len(header)} columns"
+    return Inspection(path, kind, (found,), (), (), (missing,), None)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

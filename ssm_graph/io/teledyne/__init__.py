@@ -1,0 +1,1 @@
+"""Teledyne RD Instruments: PD0 ensembles."""
