@@ -15,11 +15,15 @@ from ssm_graph.live.protocols.framing import MAX_LENGTH
 from ssm_graph.live.protocols.json_messages import JsonDecoder, encode_message
 from ssm_graph.live.protocols.nmea import NmeaDecoder
 from ssm_graph.live.protocols.waterlinked import BeamRule, WaterLinkedDecoder
+from ssm_graph.sensors.acoustic import AcousticRange, UsblFix
+from ssm_graph.sensors.compass import HeadingReading
 from ssm_graph.sensors.depth import DepthReading
 from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.gnss import Fix
 from ssm_graph.sensors.imu import ImuSample
+from ssm_graph.sensors.magnetometer import MagneticReading
 from ssm_graph.sensors.messages import Message, bad_number
+from ssm_graph.sensors.standstill import RestReading
 
 START_S = 1_700_000_000.0
 MAX_HELD = MAX_LENGTH + 16
@@ -43,10 +47,20 @@ def json_traffic(rng: random.Random, time_s: float) -> bytes:
     elif kind < 0.85:
         sigma = None if kind < 0.8 else (0.01, 0.02, math.nan, 0.01)
         message = Ping(time_s, (a, math.nan if b > 1.0 else b, c, d), sigma, is_water=a > 1.0)
-    elif kind < 0.95:
+    elif kind < 0.9:
         message = DepthReading(time_s, 30.0 + a)
     else:
-        message = Fix(time_s, 1.0 + 1e-3 * a, 0.2 + 1e-3 * b, 40.0 + c, (0.5, 0.5, 1.0))
+        place = (time_s, 1.0 + 1e-3 * a, 0.2 + 1e-3 * b, 40.0 + c, (0.5, 0.5, 1.0))
+        message = rng.choice(
+            (
+                Fix(*place),
+                UsblFix(*place, abs(d)),
+                AcousticRange(time_s, 7.0, 100.0 + a),
+                HeadingReading(time_s, a),
+                MagneticReading(time_s, (1e-5 * a, 1e-5 * b, 4e-5)),
+                RestReading(time_s),
+            )
+        )
     return encode_message(message)
 
 

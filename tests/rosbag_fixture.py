@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import re
 import sqlite3
+from copy import deepcopy
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from rosbags import rosbag1
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -218,6 +220,25 @@ def write_bag(
         for item in sorted(sent, key=lambda item: item.nanoseconds):
             raw = ros.store.serialize_cdr(item.message, item.type_name)
             writer.write(connections[item.topic, item.type_name], item.nanoseconds, raw)
+    return path
+
+
+def ros1_bag(path: Path, mission: Mission, ros: Ros) -> Path:
+    """Write a bag of ROS 1."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg(LAYOUTS[MARINE][0], MARINE))
+    with rosbag1.Writer(path) as writer:
+        connections: dict[str, Any] = {}
+        for item in sorted(marine_bag(mission, ros), key=lambda one: one.nanoseconds):
+            if item.topic not in connections:
+                connections[item.topic] = writer.add_connection(
+                    item.topic, item.type_name, typestore=store
+                )
+            old = deepcopy(item.message)
+            stamp, frame = old.header.stamp, old.header.frame_id
+            old.header = store.types["std_msgs/msg/Header"](seq=0, stamp=stamp, frame_id=frame)
+            raw = store.serialize_ros1(old, item.type_name)
+            writer.write(connections[item.topic], item.nanoseconds, raw)
     return path
 
 

@@ -1,4 +1,4 @@
-"""A ROS 2 node around the live estimator: IMU, DVL, pressure and GNSS in, Odometry and fixes out.
+"""A ROS 2 node around the live estimator: IMU, DVL and aids in, Odometry and fixes out.
 
     python3 ssm_graph_node.py --ros-args -p vehicle:=vehicle.toml -p imu_topic:=/imu/data
 
@@ -31,6 +31,7 @@ from ssm_graph.base.frames import (
 )
 from ssm_graph.base.frozen import Array
 from ssm_graph.io.mission_folder.vehicle import read_vehicle
+from ssm_graph.io.ros.aids import AID_TYPES, aid_message
 from ssm_graph.io.ros.messages import (
     CONVERTERS,
     FIX_TYPE,
@@ -61,6 +62,12 @@ PARAMETERS: Final[Mapping[str, str | float | bool]] = {
     "dvl_type": MARINE_DVL_TYPE,
     "pressure_topic": "/pressure",
     "fix_topic": "/gps/fix",
+    "usbl_topic": "",
+    "ranges_topic": "",
+    "heading_topic": "",
+    "heading_type": AID_TYPES["heading"][0],
+    "magnetometer_topic": "",
+    "at_rest_topic": "",
     "body": BodyAxes.FLU.value,
     "beams_against": False,
     "water_density": SEA_WATER,
@@ -70,7 +77,8 @@ PARAMETERS: Final[Mapping[str, str | float | bool]] = {
     "body_frame": "base_link",
     "rate_hz": 10.0,
 }
-"""An empty topic is not subscribed to; numbers are written with a decimal point."""
+"""An empty topic is not subscribed to; numbers are written with a decimal point. What a further aid
+is, ``vehicle.toml`` says in the section of its name."""
 
 
 class Estimator(Protocol):
@@ -87,25 +95,36 @@ class Estimator(Protocol):
 
 
 class Subscription(NamedTuple):
-    """A topic and the type of its messages."""
+    """A topic, the type of its messages, and what makes them ours."""
 
     topic: str
     type_name: str
+    convert: Callable[[Any, float, RosOptions], Message | None]
 
 
 def subscriptions(parameters: Mapping[str, Any]) -> tuple[Subscription, ...]:
-    """Return what to subscribe to; a type of DVL message that is not known is a ConfigError."""
-    if parameters["dvl_type"] not in DVL_TYPES:
-        raise ConfigError(
-            f"dvl_type: expected {' or '.join(DVL_TYPES)}, got {parameters['dvl_type']!r}"
+    """Return what to subscribe to; a type of messages that is not known is a ConfigError."""
+    for name, known in (("dvl_type", DVL_TYPES), ("heading_type", AID_TYPES["heading"])):
+        if parameters[name] not in known:
+            raise ConfigError(f"{name}: expected {' or '.join(known)}, got {parameters[name]!r}")
+    types = {
+        "imu": IMU_TYPE,
+        "dvl": parameters["dvl_type"],
+        "pressure": PRESSURE_TYPE,
+        "fix": FIX_TYPE,
+    }
+    own = [
+        Subscription(parameters[f"{x}_topic"], kind, CONVERTERS[kind]) for x, kind in types.items()
+    ]
+    aids = [
+        Subscription(
+            parameters[f"{section}_topic"],
+            parameters.get(f"{section}_type", kinds[0]),
+            partial(aid_message, section),
         )
-    wanted = (
-        Subscription(parameters["imu_topic"], IMU_TYPE),
-        Subscription(parameters["dvl_topic"], parameters["dvl_type"]),
-        Subscription(parameters["pressure_topic"], PRESSURE_TYPE),
-        Subscription(parameters["fix_topic"], FIX_TYPE),
-    )
-    return tuple(one for one in wanted if one.topic)
+        for section, kinds in AID_TYPES.items()
+    ]
+    return tuple(one for one in (*own, *aids) if one.topic)
 
 
 def ros_options(parameters: Mapping[str, Any]) -> RosOptions:
@@ -184,24 +203,25 @@ class Bridge:
         self.options = ros_options(parameters)
         self.refused: dict[str, int] = {}
         self.published_s = -np.inf
-        for topic, type_name in subscriptions(parameters):
-            receive = partial(self.receive, topic, type_name)
-            node.create_subscription(message_class(type_name), topic, receive, quality)
+        for one in subscriptions(parameters):
+            receive = partial(self.receive, one)
+            node.create_subscription(message_class(one.type_name), one.topic, receive, quality)
         self.odometry = node.create_publisher(message_class(ODOMETRY_TYPE), "~/odometry", 10)
         self.fix = node.create_publisher(message_class(FIX_TYPE), "~/fix", 10)
         node.create_timer(1.0 / float(parameters["rate_hz"]), self.publish)
 
-    def receive(self, topic: str, type_name: str, message: Any) -> None:
+    def receive(self, wanted: Subscription, message: Any) -> None:
         """Convert one message and pass it on; the first that a topic has refused is logged."""
-        received_s = self.node.get_clock().now().nanoseconds / 1e9
+        received_s, topic = self.node.get_clock().now().nanoseconds / 1e9, wanted.topic
         try:
-            converted = CONVERTERS[type_name](message, received_s, self.options)
+            converted = wanted.convert(message, received_s, self.options)
         except DataError as error:
             self.refused[topic] = self.refused.get(topic, 0) + 1
             if self.refused[topic] == 1:
                 self.node.get_logger().warning(f"{topic}: {error}; further ones are only counted")
             return
-        self.estimator.push(converted)
+        if converted is not None:
+            self.estimator.push(converted)
 
     def publish(self) -> None:
         """Publish the newest answer, if it is new and may be used, and log what happened."""

@@ -22,6 +22,7 @@ from ssm_graph.io.ros.convert import convert_rosbag
 from ssm_graph.io.ros.log import ROLES, is_rosbag
 from ssm_graph.io.ros.messages import SEA_WATER, STANDARD_ATMOSPHERE, BeamSign, RosOptions
 from ssm_graph.live.recorded.log import Recorded, read_recorded, write_tables
+from ssm_graph.live.recorded.merge import merge_recordings
 from ssm_graph.mission.mission import Mission
 
 DESCRIPTION = f"""\
@@ -32,33 +33,50 @@ Convert a log. LOG is one of
   a Blueye X3 log  MCAP of the maker (extra 'blueye')
   an instrument's  Water Linked JSON (dvl.csv, heading.csv) or NMEA 0183 (gnss.csv, heading.csv):
   own output       tables for a mission folder, which a mission.toml and imu.csv make whole
+  several files    a table with the columns of imu.csv and recordings as above, with --vehicle: one
+                   mission on the clock of the IMU, the others moved by the turns they show
 
 Of a ROS bag, topics are found by their type:
 
-{chr(10).join(f"  {role:6} {' or '.join(types)}" for role, types in ROLES.items())}
+{chr(10).join(f"  {role:12} {' or '.join(types)}" for role, types in ROLES.items())}
 
-imu and dvl have to be there. What messages do not say, noise, lever arms and mounting, comes from
+imu and dvl have to be there; from usbl on they are read where --topic names them and the vehicle
+has the section. What messages do not say, noise, lever arms and mounting, comes from
 --vehicle, or is assumed; every assumption is printed as a note. More in docs/ros2.md.
 """
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
-    parser.add_argument("log", type=Path, metavar="LOG", help="file or folder to convert")
+    parser.add_argument(
+        "log",
+        type=Path,
+        metavar="LOG",
+        nargs="+",
+        help="file or folder to convert; several are merged: an imu.csv and recordings of others",
+    )
     add_mission_output(parser)
     _add_ros_options(parser)
     parser.set_defaults(run=run)
 
 
 def _add_ros_options(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("of ROS bags only")
-    group.add_argument(
+    several = parser.add_argument_group("of several logs")
+    number_option(
+        several,
+        "--clock-offset",
+        "SECONDS",
+        "what is added to the times of the recordings (default: found by turns)",
+        kind=_number,
+    )
+    parser.add_argument(
         "--vehicle",
         type=Path,
         metavar="FILE",
-        help="noise, lever arms, DVL mounting and beam directions: a mission.toml (its tables need "
-        "not exist) or a mission folder",
+        help="of ROS bags and several logs: noise, lever arms, DVL mounting and beam directions: a "
+        "mission.toml (its tables need not exist) or a mission folder",
     )
+    group = parser.add_argument_group("of ROS bags only")
     group.add_argument(
         "--topic",
         type=_topic,
@@ -96,37 +114,65 @@ ROS_OPTIONS = (
 def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
     """Convert and write."""
     check_is_free(arguments.out, may_overwrite=arguments.overwrite)
-    if arguments.log.exists() and arguments.out.resolve() == arguments.log.resolve():
-        raise ConfigError(f"--out: expected another folder than that of LOG, got {arguments.out}")
-    if is_rosbag(arguments.log):
-        return _write(_from_rosbag(arguments), arguments, console)
-    given = [name for name in ROS_OPTIONS if getattr(arguments, name) is not None]
-    if given:
-        raise ConfigError(
-            f"--{given[0].replace('_', '-')} is for ROS bags, and {arguments.log} is none: "
-            f"{kind_of(arguments.log)}"
-        )
-    if not arguments.log.exists():
-        raise DataError(f"{arguments.log}: there is no such file or folder")
-    if is_mcap(arguments.log):
-        return _write(convert_blueye(arguments.log), arguments, console)
-    recorded = None if arguments.log.is_dir() else read_recorded(arguments.log)
+    for log in arguments.log:
+        if log.exists() and arguments.out.resolve() == log.resolve():
+            raise ConfigError(f"--out: expected another folder than that of LOG: {arguments.out}")
+    if len(arguments.log) > 1:
+        return _merge(arguments, console)
+    (log,) = arguments.log
+    if arguments.clock_offset is not None:
+        raise ConfigError(f"--clock-offset is for several logs, got {log} alone")
+    if is_rosbag(log):
+        return _write(_from_rosbag(log, arguments), arguments, console)
+    _refuse_ros_options(log, arguments, ROS_OPTIONS)
+    if not log.exists():
+        raise DataError(f"{log}: there is no such file or folder")
+    if is_mcap(log):
+        return _write(convert_blueye(log), arguments, console)
+    recorded = None if log.is_dir() else read_recorded(log)
     if recorded is None:
-        raise DataError(f"{arguments.log}: {kind_of(arguments.log)}")
+        raise DataError(f"{log}: {kind_of(log)}")
     return _write_tables(recorded, arguments.out, console)
+
+
+def _refuse_ros_options(log: Path, arguments: argparse.Namespace, options: Iterable[str]) -> None:
+    for name in options:
+        if getattr(arguments, name) is not None:
+            raise ConfigError(
+                f"--{name.replace('_', '-')} is for ROS bags, and {log} is none: {kind_of(log)}"
+            )
+
+
+def _merge(arguments: argparse.Namespace, console: Console) -> bool:
+    """Write the mission of an IMU's table and recordings of other instruments."""
+    _refuse_ros_options(arguments.log[0], arguments, ROS_OPTIONS[1:])
+    if arguments.vehicle is None:
+        raise ConfigError("several logs: expected  --vehicle FILE  with noise, mounting and place")
+    vehicle, offset_s = read_vehicle(arguments.vehicle), arguments.clock_offset
+    for log in arguments.log:
+        if not log.is_file():
+            raise DataError(f"{log}: expected a file, of an IMU or of one instrument")
+    found = merge_recordings(arguments.log, arguments.out, vehicle=vehicle, offset_s=offset_s)
+    _say_mission(found.mission, arguments.out, console)
+    _say_notes(found.notes, console)
+    return True
 
 
 def _write(mission: Mission, arguments: argparse.Namespace, console: Console) -> bool:
     write_mission(arguments.out, mission, table_format=arguments.format)
+    _say_mission(mission, arguments.out, console)
+    _say_notes(mission.notes, console)
+    return True
+
+
+def _say_mission(mission: Mission, out: Path, console: Console) -> None:
     n_fixes = len(mission.gnss.time_s) if mission.gnss is not None else 0
     span_s = mission.imu.time_s[-1] - mission.imu.start_s
     say(
         console,
-        f"{arguments.out}: {span_s:.1f} s, {len(mission.imu.time_s)} inertial samples, "
+        f"{out}: {span_s:.1f} s, {len(mission.imu.time_s)} inertial samples, "
         f"{len(mission.dvl.time_s)} pings, {n_fixes} GNSS fixes",
     )
-    _say_notes(mission.notes, console)
-    return True
 
 
 def _write_tables(recorded: Recorded, out: Path, console: Console) -> bool:
@@ -142,7 +188,7 @@ def _say_notes(notes: Iterable[str], console: Console) -> None:
         console.print(f"note: {note}", style="yellow", highlight=False, markup=False)
 
 
-def _from_rosbag(arguments: argparse.Namespace) -> Mission:
+def _from_rosbag(log: Path, arguments: argparse.Namespace) -> Mission:
     defaults = RosOptions()
     density, atmosphere = arguments.water_density, arguments.atmosphere
     if density is not None and density <= 0.0:
@@ -159,7 +205,7 @@ def _from_rosbag(arguments: argparse.Namespace) -> Mission:
     for role, name in arguments.topic or ():
         topics.setdefault(role, []).append(name)
     vehicle = None if arguments.vehicle is None else read_vehicle(arguments.vehicle)
-    return convert_rosbag(arguments.log, vehicle=vehicle, topics=topics, options=options)
+    return convert_rosbag(log, vehicle=vehicle, topics=topics, options=options)
 
 
 def _topic(word: str) -> tuple[str, str]:

@@ -7,7 +7,7 @@ from typing import Final
 
 READ: Final = (
     "a ROS 2 bag (a folder, .mcap or .db3), a ROS 1 .bag, a Blueye X3 log, Water Linked JSON or "
-    "NMEA 0183"
+    "a table of its reports, or NMEA 0183"
 )
 _MCAP: Final = b"\x89MCAP0\r\n"
 _COMPRESSED: Final = "a compressed file: unpack it first"

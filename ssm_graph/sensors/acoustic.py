@@ -119,6 +119,8 @@ class RangeLog(FrozenArrays):
 class AcousticRange(Message):
     """One range to a beacon, one way."""
 
+    MAY_MISS: ClassVar[frozenset[str]] = frozenset({"sigma"})
+
     beacon: float
     """Its number."""
     range_m: float

@@ -14,6 +14,7 @@ from ssm_graph.sensors.imu import IMU
 from ssm_graph.sensors.instrument import Instrument
 from ssm_graph.sensors.magnetometer import MAGNETOMETER
 from ssm_graph.sensors.messages import Message
+from ssm_graph.sensors.standstill import AT_REST
 
 INSTRUMENTS: Final[tuple[Instrument, ...]] = (
     IMU,
@@ -24,6 +25,7 @@ INSTRUMENTS: Final[tuple[Instrument, ...]] = (
     RANGES,
     COMPASS,
     MAGNETOMETER,
+    AT_REST,
 )
 """In the order in which a folder has their tables, and a log counts them."""
 BY_SECTION: Final[Mapping[str, Instrument]] = {one.section: one for one in INSTRUMENTS}

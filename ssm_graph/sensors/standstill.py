@@ -1,4 +1,4 @@
-"""Times in which the vehicle did not go anywhere."""
+"""Times in which the vehicle did not go anywhere: stated afterwards, or told while it stands."""
 
 from __future__ import annotations
 
@@ -6,8 +6,13 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar, Final
 
+import numpy as np
+
 from ssm_graph.base.errors import DataError
-from ssm_graph.base.settings import Key, Settings, build
+from ssm_graph.base.frozen import Array, FrozenArrays, shaped
+from ssm_graph.base.settings import FILE_KEY, Key, Settings, build, sigma_key
+from ssm_graph.sensors.instrument import SMALLEST_SIGMA, Column, Instrument
+from ssm_graph.sensors.messages import Message
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,3 +62,52 @@ def check_during(
             f"{still.begin_s:z.3f} to {still.end_s:z.3f} s lies outside {label}, "
             f"{first_s:z.3f} to {last_s:z.3f} s; give times on the clock of the tables",
         )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RestLog(FrozenArrays):
+    """What somebody on board said while the vehicle stood still, reading by reading."""
+
+    SECTION: ClassVar[str] = "[at_rest]"
+
+    nominal_sigma: float
+    """m/s, of each component of the velocity, where a reading states none: it sways."""
+    time_s: Array = shaped("N")
+    """(N,) s, strictly increasing: the vehicle stands still now."""
+    sigma: Array = shaped("N")
+    """(N,) m/s; NaN for the nominal one."""
+
+    @property
+    def counted_sigma(self) -> Array:
+        """(N,) m/s, the nominal one where a reading states none."""
+        return np.where(np.isnan(self.sigma), self.nominal_sigma, self.sigma)
+
+
+@dataclass(frozen=True, slots=True)
+class RestReading(Message):
+    """Says that the vehicle stands still at its time: moored, on deck, on the bottom."""
+
+    MAY_MISS: ClassVar[frozenset[str]] = frozenset({"sigma"})
+
+    sigma: float = math.nan
+    """m/s, of each component of its velocity; NaN is the nominal one."""
+
+
+HOLDS_S: Final = 1.0
+"""A reading holds for so long: whoever says that the vehicle stands says it again and again."""
+_SIGMA: Final = Column(
+    "sigma",
+    "sigma_m_per_s",
+    limits=(SMALLEST_SIGMA, 10.0),
+    expected="expected a standard deviation above 0, up to 10 m/s",
+    told="sigma {:g} m/s, expected above 0, up to 10",
+    optional=True,
+)
+AT_REST: Final = Instrument(
+    "at_rest",
+    RestLog,
+    {"file": FILE_KEY, "noise_m_per_s": sigma_key("nominal_sigma", 10.0, "the unit is m/s")},
+    (_SIGMA,),
+    RestReading,
+    "s",
+)

@@ -148,6 +148,17 @@ def test_fuzz(tmp_path: Path) -> None:
 
 
 @pytest.mark.benchmark
+def test_soak_at_sockets(tmp_path: Path) -> None:
+    """Six seconds: everything reaches the estimator, and answers come."""
+    done = run("soak.sockets", "--minutes 0.1", "sockets", tmp_path)
+    ((_, _, *longest, worst, inside),) = done.rows("the rest of the time")
+    assert all(0.0 < first_number(cell) < 5.0 for cell in longest)
+    assert worst in {"GOOD", "DEGRADED", "BAD"}
+    assert inside
+    assert "Exceptions survived: 0." in done.page
+
+
+@pytest.mark.benchmark
 def test_soak(tmp_path: Path) -> None:
     """Half a minute of everything that goes wrong is inside its sigmas; what is done is kept."""
     options = "--hours 0.01 --cases depth 'all of these' --jobs 1"

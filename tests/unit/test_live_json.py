@@ -33,6 +33,7 @@ from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.sensors.magnetometer import MagneticReading
 from ssm_graph.sensors.messages import Message, bad_number
 from ssm_graph.sensors.registry import BY_MESSAGE
+from ssm_graph.sensors.standstill import RestReading
 from tests.helpers import STEADY
 
 NUMBER = st.floats(-1e9, 1e9)
@@ -67,7 +68,8 @@ MESSAGES = st.one_of(
         st.tuples(SIGMA, SIGMA, SIGMA),
         NUMBER,
     ),
-    st.builds(AcousticRange, NUMBER, NUMBER, NUMBER, BEAM_SIGMA),
+    st.builds(AcousticRange, NUMBER, NUMBER, NUMBER, st.one_of(BEAM_SIGMA, st.just(math.nan))),
+    st.builds(RestReading, NUMBER, st.one_of(BEAM_SIGMA, st.just(math.nan))),
     st.builds(HeadingReading, NUMBER, st.floats(-2.0 * math.pi, 2.0 * math.pi)),
 )
 LINES = {
@@ -81,6 +83,7 @@ LINES = {
     "ranges": '{"type": "ranges", "time_s": 5, "beacon": 4, "range_m": 130.5, "sigma_m": 0.3}',
     "heading": '{"type": "heading", "time_s": 6, "heading_deg": 90}',
     "magnetometer": '{"type": "magnetometer", "time_s": 7, "mag_ut": [20, -5, 44]}',
+    "at_rest": '{"type": "at_rest", "time_s": 8, "sigma_m_per_s": 0.1}',
 }
 
 
@@ -114,7 +117,7 @@ def test_all_kinds_of_message_have_a_schema() -> None:
 def test_lines_of_the_documentation() -> None:
     """Written by hand: integers are numbers, null is a missing beam, degrees become radians."""
     messages, refused = decode("\n".join([*LINES.values(), ""]).encode())
-    imu, ping, depth, fix, acoustic, reach, heading, magnetic = messages
+    imu, ping, depth, fix, acoustic, reach, heading, magnetic, rest = messages
     assert imu == ImuSample(1.0, (1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
     assert isinstance(ping, Ping)
     assert ping == Ping(1.5, (0.1, math.nan, -0.3, 0.4))
@@ -123,6 +126,7 @@ def test_lines_of_the_documentation() -> None:
     place = (math.radians(63.5), math.radians(-10.0), -40.0)
     assert acoustic == UsblFix(4.0, *place, (1.0, 2.0, 3.0), 1.5)
     assert reach == AcousticRange(5.0, 4.0, 130.5, 0.3)
+    assert rest == RestReading(8.0, 0.1)
     assert heading == HeadingReading(6.0, math.radians(90.0))
     assert isinstance(magnetic, MagneticReading)
     assert magnetic.field_b == pytest.approx((20e-6, -5e-6, 44e-6))

@@ -237,6 +237,19 @@ def test_no_time_no_ping() -> None:
     assert decoder.n_refused == 1
 
 
+def test_a_clock_that_agreed_is_believed_after_a_standstill() -> None:
+    """What waited while the process stood still is of the instrument's time, within an hour."""
+    decoder = WaterLinkedDecoder()
+    assert len(decoder.feed(line(report()), arrival_s=ARRIVAL_S)) == 1
+    for later_s, n_pings in ((0.5, 1), (-0.5, 0), (4e3, 0), (1.0, 1)):
+        stamp = int((ARRIVAL_S - 0.15 + later_s) * 1e6)
+        found = decoder.feed(line(report(time_of_validity=stamp)), arrival_s=math.nan)
+        assert len(found) == n_pings, later_s
+    decoder.feed(line(report(time_of_validity=5)), arrival_s=ARRIVAL_S)
+    stamp = int((ARRIVAL_S + 2.0) * 1e6)
+    assert decoder.feed(line(report(time_of_validity=stamp)), arrival_s=math.nan) == []
+
+
 def first_format(k: int, **changes: Any) -> dict[str, Any]:
     """Return a report of format ``json_v1``, which has no type and no clock."""
     fields = report(time=100.0 + k, format="json_v1", **changes)

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import json
 import random
+from collections import Counter
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
 
 from ssm_graph.live.estimator import ONLINE, FixedLagSmoother
 from ssm_graph.live.estimator.answers import Delayed
-from ssm_graph.live.estimator.course import FRESH_S, SPARSE_S
+from ssm_graph.live.estimator.course import FRESH_S, SPARSE_S, Course
 from ssm_graph.mission.navigation import Health, Navigation
 from ssm_graph.mission.problem import build_problem
+from ssm_graph.sensors.depth import DepthReading
 from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.gnss import Fix
 from ssm_graph.sensors.imu import ImuSample
@@ -117,6 +120,33 @@ def test_what_comes_late_by_more_than_is_kept_in_full_changes_nothing() -> None:
     assert_same(newest, ordered, sigmas=1e-8)
     for name in ("time_s", "lat", "velocity_enu", "velocity_sigma_enu", "weight"):
         np.testing.assert_allclose(joined(other, name), joined(delayed, name), rtol=0, atol=1e-9)
+
+
+def test_many_late_messages_have_a_step_made_anew_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A flood of old depths costs no more than one of them, and the answer is the same."""
+    made, step = Counter[float](), Course._step
+
+    def counting(self: Course, measured: Any) -> Any:
+        made[measured.time_s] += 1
+        return step(self, measured)
+
+    monkeypatch.setattr(Course, "_step", counting)
+    _, vehicle = stream()
+    given_s = messages()[-1].time_s
+    late = [m for m in messages() if isinstance(m, DepthReading) and m.time_s > given_s - 2.0]
+    flood = [replace(m, time_s=m.time_s + 1e-3 * k) for m in late for k in range(1, 30)]
+    given = sorted((*messages(), *flood), key=lambda m: m.time_s)
+    expected, _, _ = run(given, vehicle)
+    made.clear()
+    held = {id(m) for m in flood}
+    smoother = FixedLagSmoother(vehicle, SHORT)
+    for message in (*(m for m in messages() if id(m) not in held), *reversed(flood)):
+        smoother.push(message)
+    newest = smoother.newest()
+    assert newest is not None
+    assert max(made.values()) == 2
+    assert expected is not None
+    assert_same(newest, expected, sigmas=1e-8)
 
 
 def test_a_filter_takes_late_messages_and_restarts_as_well() -> None:

@@ -317,7 +317,7 @@ def test_a_log_from_before_acoustics_and_headings(tmp_path: Path) -> None:
     sizes = re.search(rb"@(.*?);", text)
     assert sizes is not None
     four = b",".join(sizes[1].split(b",")[:4])
-    assert sizes[1] == four + b",0,0,0,0"
+    assert sizes[1] == four + b",0,0,0,0,0"
     want = shown(replayed(tmp_path))
     arrivals.write_bytes(text.replace(sizes[1], four))
     assert shown(replayed(tmp_path)) == want == shown(messages)

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import random
-import re
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +23,6 @@ from ssm_graph.sensors.messages import bad_number
 from tests.damaged_traffic import block_of, damaged, targets
 
 DATA = Path(os.environ.get("SSM_GRAPH_DATA", Path(__file__).parents[2] / "../shared/data"))
-RECEIVERS = DATA / "gpsd"
-needs_receivers = pytest.mark.skipif(not RECEIVERS.is_dir(), reason=f"no logs in {RECEIVERS}")
 DAY_S = 1_750_809_600.0
 """25 June 2025."""
 
@@ -90,6 +86,47 @@ def test_reports_with_a_clock_keep_it(tmp_path: Path) -> None:
     back = "\n".join([lines[3], lines[0]])
     with pytest.raises(DataError, match=r"set back by 1\.5 s"):
         read(tmp_path / "back.json", back.encode())
+
+
+def as_table(rows: list[dict[str, Any]]) -> bytes:
+    """Return reports as a recorder writes them into a table, half a second apart."""
+    lines = []
+    for k, one in enumerate(rows):
+        cells: dict[str, Any] = {"timestamp": DAY_S + 0.5 * k}
+        cells |= {key: value for key, value in one.items() if key != "transducers"}
+        for i, beam in enumerate(one["transducers"]):
+            cells |= {f"transducers_{i}_{key}": value for key, value in beam.items()}
+        lines += [",".join(cells)] * (k == 0) + [",".join(map(str, cells.values()))]
+    return "\n".join(lines).encode()
+
+
+def test_reports_in_a_table(tmp_path: Path) -> None:
+    """Timed by their arrival; a torn row and one of another kind are told, the others stay."""
+    rows = reports(5, "json_v2")
+    found = read(tmp_path / "dvl.csv", as_table(rows))
+    pings = [one for one in found.messages if isinstance(one, Ping)]
+    assert [one.time_s - DAY_S for one in pings] == [0.0, 0.5, 1.0, 1.5, 2.0]
+    assert pings[2].speed == pytest.approx((0.002, 0.102, 0.202, 0.302))
+    assert found.notes == ()
+    data = as_table(rows).splitlines()
+    data[2] = data[2][:60]
+    data[4] = data[4].replace(b"True", b"perhaps")
+    found = read(tmp_path / "torn.csv", b"\n".join(data))
+    assert len(found.messages) == 3
+    assert any("beam_valid" in note or "velocity_valid" in note for note in found.notes)
+    with pytest.raises(DataError, match="not one report that is read"):
+        read(tmp_path / "none.csv", as_table(rows).replace(b"True", b"-"))
+
+
+def test_reports_out_of_order_are_sorted(tmp_path: Path) -> None:
+    """By less than a second: a receiver that goes over to another clock; none is lost."""
+    times = (10, 30, 20, 30)
+    one, *_ = reports(1, "json_v3")
+    lines = [json.dumps(one | {"time_of_validity": int((DAY_S + t / 100) * 1e6)}) for t in times]
+    found = read(tmp_path / "dvl.json", "\n".join(lines).encode())
+    assert [m.time_s - DAY_S for m in found.messages] == pytest.approx([0.1, 0.2, 0.3])
+    assert any("1 reports out of order" in note for note in found.notes)
+    assert any("1 reports of a time that an earlier one has" in note for note in found.notes)
 
 
 @pytest.mark.parametrize("n_beams", [3, 4])
@@ -167,50 +204,6 @@ def test_convert_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixtu
     log.unlink()
     assert main(words) == ExitCode.DATA
     assert "no such file" in capsys.readouterr().err
-
-
-def sound_fixes(data: bytes) -> int:
-    """Count the GGA of a recording with a right checksum and a measured fix, by themselves."""
-    count = 0
-    for body, given in re.findall(rb"\$([A-Z]{2}GGA,[ -~]*?)\*([0-9A-F]{2})", data):
-        quality = body.split(b",")[6]
-        count += checksum(body.decode()) == given.decode() and quality in b"1 2 3 4 5 9".split()
-    return count
-
-
-@needs_receivers
-@pytest.mark.parametrize(
-    ("name", "n_fixes"),
-    [
-        ("quectel-l76k-dual", 130),
-        ("ublox-zed-f9p_hpg1.11", 655),
-        ("skytraq-dgps", 96),
-        ("st-teseo-liv4f", 12),
-        ("saab-r4", 12),
-        ("unicore-um621", 16),
-    ],
-)
-def test_real_receivers_to_the_last_sentence(name: str, n_fixes: int) -> None:
-    """Every sound GGA is a fix, whatever stands between."""
-    log = RECEIVERS / f"{name}.log"
-    found = read_recorded(log)
-    assert found is not None
-    assert sum(isinstance(one, Fix) for one in found.messages) == n_fixes
-    assert sound_fixes(log.read_bytes()) == n_fixes
-
-
-@needs_receivers
-@pytest.mark.parametrize(
-    ("name", "n_fixes"), [("ait250", 34), ("sounder", 122), ("meinberg-gps164", 70)]
-)
-def test_real_receivers_without_gga(name: str, n_fixes: int) -> None:
-    """RMC and GLL: positions at the water's surface, to 100 m in height."""
-    found = read_recorded(RECEIVERS / f"{name}.log")
-    assert found is not None
-    fixes = [one for one in found.messages if isinstance(one, Fix)]
-    assert len(fixes) == n_fixes
-    assert {one.sigma_enu[2] for one in fixes} == {100.0}
-    assert all(math.isfinite(one.lat) for one in fixes)
 
 
 def test_pings_are_pings(tmp_path: Path) -> None:

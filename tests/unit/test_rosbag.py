@@ -438,6 +438,16 @@ def other_bytes(mission: Mission, ros: Ros, path: Path) -> Path:
     return forget_definitions(path)
 
 
+def other_definition(mission: Mission, ros: Ros, path: Path) -> Path:
+    """Damage the recording's own definition of a type: it has a field of another name."""
+    sent = imu_messages(mission, ros)[:9] + marine_messages(mission, ros)[:9]
+    bag = write_bag(path, ros, sent)
+    file = bag / f"{path.name}.mcap"
+    own, other = b"Vector3 angular_velocity", b"Vector3 angular_velocitx"
+    file.write_bytes(file.read_bytes().replace(own, other))
+    return bag
+
+
 def no_aids(mission: Mission, ros: Ros) -> list[Sent]:
     """Return IMU and DVL messages."""
     return imu_messages(mission, ros) + marine_messages(mission, ros)
@@ -458,6 +468,7 @@ def no_aids(mission: Mission, ros: Ros) -> list[Sent]:
         (no_files, DataError, "missing"),
         (bad_metadata, DataError, "YAML"),
         (other_bytes, DataError, "fit no known definition"),
+        (other_definition, DataError, "no sensor_msgs/msg/Imu as it is known"),
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )

@@ -23,11 +23,8 @@ from tests.helpers import simulated
 
 pytest.importorskip("rosbags", reason="needs the extra 'ros'")
 
-from rosbags import rosbag1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from ssm_graph.io.ros.log import LAYOUTS
 from ssm_graph.io.ros.mcap import McapFile, is_ros2_mcap
 from tests.rosbag_fixture import (
     EPOCH_S,
@@ -42,6 +39,7 @@ from tests.rosbag_fixture import (
     imu_messages,
     marine_bag,
     marine_messages,
+    ros1_bag,
     write_bag,
 )
 
@@ -237,25 +235,6 @@ def test_a_file_that_was_cut_off(mission: Mission, ros: Ros, tmp_path: Path) -> 
     got = convert_rosbag(file, options=ON_ELLIPSOID)
     assert 0.4 < len(got.imu.time_s) / len(mission.imu.time_s) < 0.6
     assert any(f"cut off: it ends amid a record at byte {footer}" in note for note in got.notes)
-
-
-def ros1_bag(path: Path, mission: Mission, ros: Ros) -> Path:
-    """Write a bag of ROS 1."""
-    store = get_typestore(Stores.ROS1_NOETIC)
-    store.register(get_types_from_msg(LAYOUTS[MARINE][0], MARINE))
-    with rosbag1.Writer(path) as writer:
-        connections: dict[str, Any] = {}
-        for item in sorted(marine_bag(mission, ros), key=lambda one: one.nanoseconds):
-            if item.topic not in connections:
-                connections[item.topic] = writer.add_connection(
-                    item.topic, item.type_name, typestore=store
-                )
-            old = deepcopy(item.message)
-            stamp, frame = old.header.stamp, old.header.frame_id
-            old.header = store.types["std_msgs/msg/Header"](seq=0, stamp=stamp, frame_id=frame)
-            raw = store.serialize_ros1(old, item.type_name)
-            writer.write(connections[item.topic], item.nanoseconds, raw)
-    return path
 
 
 def test_ros_1(mission: Mission, ros: Ros, tmp_path: Path) -> None:

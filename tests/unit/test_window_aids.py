@@ -12,10 +12,10 @@ from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator import ONLINE, FixedLagSmoother
 from ssm_graph.mission.estimate import AidTable, Estimate
-from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.mission import Aids, Mission
 from ssm_graph.mission.problem import build_problem
 from ssm_graph.sensors.compass import HeadingErrors
-from ssm_graph.sensors.standstill import Standstill
+from ssm_graph.sensors.standstill import HOLDS_S, RestLog, Standstill
 from ssm_graph.simulation import (
     AidSettings,
     CompassSettings,
@@ -162,3 +162,46 @@ def test_the_vehicle_is_aided_as_the_smoother_offline() -> None:
     for name in ("depth", "GNSS", "USBL", "range", "heading", "standstill", "magnetometer"):
         n_rows = sum(table.aid.count(name) for table in tables)
         assert n_rows == pytest.approx(table_of(offline).aid.count(name), abs=3)
+
+
+def told_at_rest() -> Mission:
+    """Return a mission that says that it stands for 2 s, with a sigma of its own at last."""
+    time_s = np.arange(4.0, 6.4, 0.3)
+    sigma = np.full(len(time_s), np.nan)
+    sigma[-1] = 0.3
+    return replace(
+        simulated(duration_s=12.0, seed=4).mission, aids=Aids(RestLog(0.5, time_s, sigma))
+    )
+
+
+def test_who_says_that_he_stands_is_believed_for_a_second() -> None:
+    """As a stated standstill, by batch and window; on the vehicle the answer is the same."""
+    mission = told_at_rest()
+    problem = build_problem(mission)
+    batch = SsmSmoother(SmootherConfig(tolerance=1e-7)).solve(problem)
+    table = table_of(batch)
+    is_rest = np.array(table.aid) == "standstill"
+    rest_s = np.unique(table.time_s[is_rest])
+    assert rest_s[0] >= 4.0
+    assert rest_s[-1] <= 6.3 + HOLDS_S
+    assert len(rest_s) >= 3
+    assert 0.0 < weights_of(table, "standstill").min() < 0.9  # the vehicle drifts at some 1 m/s
+    stills = (Standstill(rest_s[0], rest_s[-2], 0.5), Standstill(rest_s[-1], rest_s[-1] + 0.1, 0.3))
+    still = replace(mission, aids=Aids(*stills))
+    other = SsmSmoother(SmootherConfig(tolerance=1e-7)).solve(build_problem(still))
+    sigma = other.trajectory.velocity_sigma_enu
+    off = np.abs(batch.trajectory.velocity_enu - other.trajectory.velocity_enu)
+    assert np.max(off / sigma) < 1e-6
+    whole = solve_fixed_lag(problem, WHOLE).delayed
+    np.testing.assert_allclose(table_of(whole).weight, table.weight, rtol=0.0, atol=1e-5)
+    estimator = live(mission)
+    assert estimator._course is not None
+    newest, track = estimator._course.newest.window.newest, solve_fixed_lag(problem, ONLINE).newest
+    k = int(np.argmin(np.abs(track.trajectory.time_s - newest.time_s[0])))
+    answer = track.trajectory
+    p_n = problem.frame.p_n_from_geodetic(answer.lat[k], answer.lon[k], answer.height[k])
+    sigma = np.sqrt(np.diagonal(answer.position_cov_enu[k]))
+    assert np.all(np.abs(newest.states.p_n[0] - p_n) < 1e-3 * sigma)
+    rows = [part.aids for part in estimator.finish() if part.aids is not None]
+    found = {time_s for part in rows for time_s in part.time_s[np.array(part.aid) == "standstill"]}
+    np.testing.assert_allclose(sorted(found), rest_s, rtol=0.0, atol=1e-9)

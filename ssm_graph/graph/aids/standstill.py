@@ -1,4 +1,7 @@
-"""Times at rest: every keyframe within one stands still."""
+"""Times at rest: every keyframe within one stands still.
+
+Readings that say so under way hold for a second, and belong to the first keyframe after them.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +12,13 @@ import numpy as np
 
 from factors.standstill import standstill_residual
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.times import MIN_SPACING_S
+from ssm_graph.base.usable import require_fields
 from ssm_graph.engine.error_state import VELOCITY
 from ssm_graph.graph.aids.aid import Aid, Keyframes, Linearised, RowStates
 from ssm_graph.graph.aids.gnss import EAST_NORTH_UP
 from ssm_graph.mission.mission import Aids
-from ssm_graph.sensors.standstill import Standstill
+from ssm_graph.sensors.standstill import HOLDS_S, RestLog, Standstill
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,16 +36,28 @@ class Standstills(Aid):
     @classmethod
     def of(cls, aids: Aids, keyframes: Keyframes) -> Self | None:
         """Return the keyframes within standstills; where two overlap the stricter one counts."""
-        standstills = aids.all(Standstill)
-        if not standstills:
+        standstills, readings = aids.all(Standstill), aids.get(RestLog)
+        if not standstills and readings is None:
             return None
         time_s = keyframes.time_s
         sigma = np.full(len(time_s), np.inf)
+        if readings is not None:
+            at = np.searchsorted(time_s, readings.time_s - MIN_SPACING_S)
+            holds = (at < len(time_s)) & (readings.time_s > time_s[0] - MIN_SPACING_S)
+            holds[holds] = time_s[at[holds]] - readings.time_s[holds] <= HOLDS_S
+            np.minimum.at(sigma, at[holds], readings.counted_sigma[holds])
         for still in standstills:
             inside = (time_s >= still.begin_s) & (time_s <= still.end_s)
             sigma[inside] = np.minimum(sigma[inside], still.sigma)
         keyframe = np.flatnonzero(np.isfinite(sigma))
         return cls(keyframe, sigma[keyframe])
+
+    @classmethod
+    def require_usable(cls, aids: Aids) -> None:
+        """Refuse readings that are not finite, and times that do not increase."""
+        log = aids.get(RestLog)
+        if log is not None:
+            require_fields("aids.at_rest", log, increasing="time_s", positive="counted_sigma")
 
     @property
     def root_information(self) -> Array:

@@ -9,13 +9,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
-from ssm_graph.base.errors import DataError
+from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.io.mission_folder.assembly import mission_from
+from ssm_graph.io.ros.aids import AID_TYPES
 from ssm_graph.io.ros.beams import Beams, known_beams, proven_beams
 from ssm_graph.io.ros.clocks import ahead_of_recording, check_never_set, check_one_clock
 from ssm_graph.io.ros.frames import seats
@@ -33,6 +34,7 @@ from ssm_graph.sensors.depth import DEEPEST_M, DEPTH, DepthLog
 from ssm_graph.sensors.dvl import DvlLog, DvlMount, counted_sigma
 from ssm_graph.sensors.gnss import GnssLog
 from ssm_graph.sensors.imu import ImuLog, ImuNoise
+from ssm_graph.sensors.registry import BY_SECTION
 
 NOISE: Final = ImuNoise(
     gyro_density=1.2e-4,
@@ -72,13 +74,15 @@ def convert_rosbag(
     bag : folder of ``.mcap`` or ``.db3`` files, one of them, or a ``.bag`` of ROS 1.
     vehicle : noise, lever arms and mounting; its beam directions go before those of the messages.
     topics : by role (``imu``, ``dvl``, ``depth``, ``gnss``), where several could serve it; two of
-        the DVL where its pings off the water have a topic of their own.
+        the DVL where its pings off the water have a topic of their own. Further aids are read where
+        their topics are named, by section (``usbl``, ``ranges`` ...) of the vehicle.
     options : axes of the IMU, water, atmosphere; None for the defaults.
     """
     bag, options = Path(bag), RosOptions() if options is None else options
     if vehicle is not None:
         options = replace(options, n_beams=vehicle.mount.n_beams)
     tables, notes = {}, list[str]()
+    bare = _bare_aids(topics or {}, vehicle)
     read, frames = read_topics(bag, topics or {}, options, notes)
     read, some = _one_clock(bag, read, vehicle, options)
     notes += some
@@ -102,13 +106,31 @@ def convert_rosbag(
             gnss = replace(gnss, lever_arm_b=placed["gnss"].place)
         arm_b = placed["depth"].place if "depth" in placed else arm_b
     depth, some = _depth(bag, tables.get("depth"), gnss, vehicle, arm_b, options)
+    aids = [
+        BY_SECTION[role].log_of(tables[role], log)
+        for role, log in bare.items()
+        if len(tables.get(role, ()))
+    ]
     return mission_from(
-        [log for log in (imu, dvl, depth, gnss) if log is not None],
+        [log for log in (imu, dvl, depth, gnss, *aids) if log is not None],
         vehicle,
         source=bag,
         labels={role: f"{bag}: {topic.name}" for role, topic in read.items()},
         notes=[*notes, *some],
     )
+
+
+def _bare_aids(topics: Topics, vehicle: Vehicle | None) -> dict[str, Any]:
+    """Return by role what the vehicle says of the further aids that are asked for."""
+    known = {} if vehicle is None else {type(log): log for log in vehicle.aids}
+    wanted = [role for role in topics if role in AID_TYPES]
+    for role in wanted:
+        if BY_SECTION[role].log not in known:
+            raise ConfigError(
+                f"--topic {role}: expected a --vehicle with [{role}], which says how good it "
+                "is and where it sits; got none"
+            )
+    return {role: known[BY_SECTION[role].log] for role in wanted}
 
 
 def _one_clock(
@@ -119,7 +141,8 @@ def _one_clock(
     for role, topic in read.items():
         if len(topic.rows):
             stamp_s, received_s = topic.table(options.n_beams)[:, 0], np.array(topic.received)
-            check_never_set(f"{bag}: {topic.name}", stamp_s, received_s)
+            if role not in AID_TYPES:  # which come when they come
+                check_never_set(f"{bag}: {topic.name}", stamp_s, received_s)
             ahead[role] = (topic.name, ahead_of_recording(stamp_s, received_s))
     late = {}
     if vehicle is not None:

@@ -24,6 +24,7 @@ from ssm_graph.base.errors import (
     nearest_hint,
 )
 from ssm_graph.io.ros import messages as ros_messages
+from ssm_graph.io.ros.aids import AID_TYPES
 from ssm_graph.io.ros.frames import TF_TOPIC, TF_TYPE
 from ssm_graph.io.ros.mcap import McapFile, is_ros2_mcap, zstd_decompress
 from ssm_graph.sensors.dvl import MOST_BEAMS
@@ -37,8 +38,9 @@ ROLES: Final[Mapping[str, tuple[str, ...]]] = {
     ),
     "depth": (ros_messages.PRESSURE_TYPE,),
     "gnss": (ros_messages.FIX_TYPE,),
+    **AID_TYPES,
 }
-"""What a topic is for, and the message types that serve it."""
+"""What a topic is for, and the message types that serve it; further aids have to be named."""
 REQUIRED_ROLES: Final = ("imu", "dvl")
 
 _MARINE_DVL: Final = """
@@ -242,10 +244,15 @@ def _choose(
 ) -> dict[str, list[Any]]:
     """Return by role the connections to read, all of one topic; two tracks of a DVL of two."""
     chosen = {}
+    wanted = {
+        role: (names,) if isinstance(names, str) else tuple(names) for role, names in topics.items()
+    }
     for role, types in ROLES.items():
-        fitting = [connection for connection in connections if connection.msgtype in types]
-        names = topics.get(role, ())
-        names = (names,) if isinstance(names, str) else tuple(names)
+        names = wanted.get(role, ())
+        if role in AID_TYPES and not names:
+            continue
+        others = {name for other, some in wanted.items() if other != role for name in some}
+        fitting = [x for x in connections if x.msgtype in types and x.topic not in others]
         if names:
             fitting = [x for name in names for x in _named(bag, role, name, fitting, connections)]
         elif any(connection.msgcount for connection in fitting):

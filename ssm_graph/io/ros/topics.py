@@ -12,6 +12,7 @@ import numpy as np
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
+from ssm_graph.io.ros.aids import AID_TYPES, aid_message
 from ssm_graph.io.ros.beams import stated_beams
 from ssm_graph.io.ros.frames import TF_TOPIC, Frames
 from ssm_graph.io.ros.log import REQUIRED_ROLES, BagMessage, Topics, read_rosbag
@@ -24,6 +25,7 @@ from ssm_graph.io.ros.messages import (
     has_stated_sigma,
     imu_sample,
 )
+from ssm_graph.sensors.registry import BY_SECTION
 
 WATER_LATER_S: Final = 1e-3
 """A ping off the water that has the time of one off the ground is put so much later."""
@@ -40,8 +42,8 @@ class BagTopic:
     """Of the headers; empty where they have none."""
     rows: array[float] = field(default_factory=lambda: array("d"))
     """IMU: time, gyro, accelerometer; DVL: time, speeds, sigmas, ranges, velocity and covariance, 1
-    off the water; depth: time, depth, sigma; GNSS: time, latitude, longitude, height, sigmas. SI
-    units, FRD, NaN if unknown."""
+    off the water; depth: time, depth, sigma; GNSS: time, latitude, longitude, height, sigmas;
+    further aids: the numbers of their live messages. SI units, FRD, NaN if unknown."""
     received: array[float] = field(default_factory=lambda: array("d"))
     """Times of recording, s, of the rows."""
     n_messages: int = 0
@@ -67,6 +69,8 @@ class BagTopic:
 
 def _width(role: str, n_beams: int) -> int:
     """Return how many numbers a row has."""
+    if role in AID_TYPES:
+        return 1 + BY_SECTION[role].width(None)
     return {"imu": 7, "dvl": 1 + 3 * n_beams + 13, "depth": 3, "gnss": 7}[role]
 
 
@@ -76,20 +80,30 @@ def read_topics(
     """Return by role what the recording holds, and its frames; raises as `convert_rosbag`."""
     read, frames = {role: BagTopic(role) for role in REQUIRED_ROLES}, Frames()
     for item in read_rosbag(bag, topics, notes):
-        if item.role == TF_TOPIC:
-            frames.add(item.message)
-            continue
         topic = read.setdefault(item.role, BagTopic(item.role))
         if item.topic not in topic.names:
             topic.names.append(item.topic)
         topic.type_name = item.type_name
-        topic.frame_id = topic.frame_id or str(item.message.header.frame_id)
         topic.n_messages += 1
         try:
-            topic.rows.extend(_row(item, topic, options))
-            topic.received.append(item.received_s)
+            if item.role == TF_TOPIC:
+                frames.add(item.message)
+                continue
+            header = getattr(item.message, "header", None)
+            topic.frame_id = topic.frame_id or str(getattr(header, "frame_id", ""))
+            row = _row(item, topic, options)
+            topic.rows.extend(row)
+            topic.received.extend([item.received_s] if row else [])
         except DataError as error:
             topic.refused.append(str(error))
+        except (AttributeError, TypeError, ValueError, IndexError) as error:
+            # the recording's own definition of the type is damaged, or of another package
+            topic.refused.append(f"no {item.type_name} as it is known: {error}")
+    transforms = read.pop(TF_TOPIC, None)
+    if transforms is not None and transforms.refused:
+        notes.append(
+            f"{transforms.name}: {len(transforms.refused)} refused: {transforms.refused[0]}"
+        )
     for role in REQUIRED_ROLES:
         topic = read[role]
         if len(topic.rows) < 2 * _width(role, options.n_beams):
@@ -101,7 +115,10 @@ def read_topics(
 
 
 def _row(item: BagMessage, topic: BagTopic, options: RosOptions) -> Sequence[float]:
-    """Return the numbers of one message, time first."""
+    """Return the numbers of one message, time first; nothing where it says nothing."""
+    if item.role in AID_TYPES:
+        said = aid_message(item.role, item.message, item.received_s, options)
+        return () if said is None else BY_SECTION[item.role].numbers(said)
     if item.role == "imu":
         sample = imu_sample(item.message, item.received_s, options)
         return (sample.time_s, *sample.gyro_b, *sample.accel_b)
@@ -135,8 +152,12 @@ def in_order(topic: BagTopic, n_beams: int) -> tuple[Array, list[str]]:
     table = topic.table(n_beams)
     said = _part_tracks(table) if topic.role == "dvl" else []
     n_late = int(np.sum(np.diff(table[:, 0], prepend=-np.inf) < 0.0))
-    table = table[np.argsort(table[:, 0], kind="stable")]
-    again = np.diff(table[:, 0], prepend=-np.inf) == 0.0
+    parts = BY_SECTION[topic.role].row_key  # ranges to several beacons may have one time
+    keys = table[:, : 1 + len(parts)]
+    table = table[np.lexsort(keys.T[::-1])]
+    keys = table[:, : 1 + len(parts)]
+    again = np.all(keys == np.roll(keys, 1, axis=0), axis=1)
+    again[:1] = False
     before = np.roll(table, 1, axis=0)
     alike = np.all((table == before) | (np.isnan(table) & np.isnan(before)), axis=1)
     n_repeats, n_rivals = int(np.sum(again & alike)), int(np.sum(again & ~alike))

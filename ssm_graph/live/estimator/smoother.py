@@ -48,6 +48,9 @@ ONLINE: Final = FixedLagConfig(
 """What a vehicle can afford; `benchmarks/online/` compares it with windows solved to the end."""
 LONGEST_GAP_S: Final = 10.0
 """After a longer gap of the inertial data the attitude has to be found anew."""
+OWED_S: Final = 0.1
+"""Steps that late messages undo are made anew when they are asked for, or after so much data: of
+many late messages together each would else have the same steps made."""
 CATCH_UP_STEPS: Final = 1
 """Of the keyframes that came while an alignment was worked on so many are made in one push."""
 
@@ -82,7 +85,8 @@ class FixedLagSmoother:
         self._events = EventLog()
         self._intake = Intake(vehicle, self._events)
         self._starter = Starter(vehicle, self._problem_config, self._events)
-        self._course: Course | None = None
+        self._made: Course | None = None
+        self._owed_s: float | None = None
         self._frame = vehicle.frame
         self._tail: Tail | None = None
         self._latest_s = -np.inf
@@ -114,9 +118,10 @@ class FixedLagSmoother:
 
         ``newest_s`` is the time of the last inertial sample before it came, s.
         """
-        course, buffers = self._course, self._intake.buffers
+        course, buffers = self._made, self._intake.buffers
         is_sample = isinstance(message, ImuSample)
         if is_sample and self._is_gap(time_s, newest_s):
+            course = self._course
             buffers.drop_before(time_s)
             if course is None:
                 self._starter.begin_anew()
@@ -125,15 +130,38 @@ class FixedLagSmoother:
             return False
         if course is None:
             return self._start()
-        is_behind = self._tail is None
         undone = is_late and course.rewind(time_s - (REACH_S if is_sample else MIN_SPACING_S))
+        if undone and self._owed_s is None:
+            self._owed_s = buffers.imu.last_s
+        if self._owed_s is None:
+            return self._advance(course, is_sample=is_sample, is_late=is_late)
+        return buffers.imu.last_s - self._owed_s >= OWED_S and self._make_anew()
+
+    @property
+    def _course(self) -> Course | None:
+        """The steps, with those that late messages undid."""
+        self._make_anew()
+        return self._made
+
+    def _make_anew(self) -> bool:
+        """Make the steps that late messages undid, once for all of these; return whether any."""
+        if self._made is None or self._owed_s is None:
+            return False
+        self._owed_s = None
+        return self._advance(self._made, is_sample=False, is_late=True, undone=True)
+
+    def _advance(
+        self, course: Course, *, is_sample: bool, is_late: bool, undone: bool = False
+    ) -> bool:
+        """Make the steps that the data allow; return whether there were any."""
+        is_behind, buffers = self._tail is None, self._intake.buffers
         n_made = course.advance(
             is_sample=not (is_late or is_behind), at_most=CATCH_UP_STEPS if is_behind else np.inf
         )
         self._intake.horizon_s = course.horizon_s
         if is_astray(course.newest.watch):
             reason = f"fixes contradicted the position {ASTRAY_TIMES} times: wrong heading?"
-            self._lose(time_s, reason)
+            self._lose(buffers.imu.last_s, reason)
             return True
         if is_behind and n_made == CATCH_UP_STEPS:
             return True
@@ -157,7 +185,7 @@ class FixedLagSmoother:
         guardian = self._guardian(sensors)
         guard = guardian.begin(window, self._known)
         step = Step(window, Watch(), None, Reserve.of(window), guard)
-        self._course = self._course_from(step, guardian)
+        self._made = self._course_from(step, guardian)
         return True
 
     def _guardian(self, sensors: Sensors) -> Guardian:
@@ -180,7 +208,7 @@ class FixedLagSmoother:
         later steps follow from these, and so does the answer to every late message.
         Delayed states that have not been taken are not in it: take them first.
         """
-        intake = self._intake
+        intake, course = self._intake, self._course
         arrays = pack_buffers(intake.buffers)
         meta: dict[str, Any] = {
             "shift_s": intake.shift_s,
@@ -192,8 +220,8 @@ class FixedLagSmoother:
             "watch": None,
             "contradictions": self._known,
         }
-        if self._course is not None:
-            oldest, guardian = self._course.oldest, self._course.guardian
+        if course is not None:
+            oldest, guardian = course.oldest, course.guardian
             packed, meta["watch"] = pack_step(oldest)
             meta["contradictions"] = guardian.plain(oldest.guard)
             arrays |= packed | {f"guard_{name}": array for name, array in oldest.guard.pack()}
@@ -237,7 +265,7 @@ class FixedLagSmoother:
             guardian = smoother._guardian(sensors)
             guard = guardian.unpack(_part(arrays, "guard_"), smoother._known, window)
             step = Step(window, watch, left, reserve, guard)
-            smoother._course = course = smoother._course_from(step, guardian)
+            smoother._made = course = smoother._course_from(step, guardian)
             course.advance()
             intake.horizon_s = course.horizon_s
             smoother._tail = smoother._tail_of(course.newest)
@@ -252,12 +280,13 @@ class FixedLagSmoother:
 
     def _lose(self, time_s: float, reason: str) -> None:
         """Give the answer up, keep what was found, and align anew."""
-        assert self._course is not None
+        self._owed_s = None
+        assert self._made is not None
         text = f"{reason}; position and attitude have to be found anew"
         self._events.tell(time_s, Severity.ERROR, "lost", text)
-        self._finished += self._take(self._course, all_of_them=True)
-        self._known = self._course.guardian.plain(self._course.newest.guard)
-        self._course = self._tail = None
+        self._finished += self._take(self._made, all_of_them=True)
+        self._known = self._made.guardian.plain(self._made.newest.guard)
+        self._made = self._tail = None
         self._intake.horizon_s = time_s
         self._start_anew()
 
@@ -280,13 +309,14 @@ class FixedLagSmoother:
 
     def newest(self) -> Navigation | None:
         """Return the state at the last inertial sample, None before there is any."""
-        if self._course is None or self._tail is None:
+        course = self._course
+        if course is None or self._tail is None:
             return None
         assert self._frame is not None
         return answer(
             self._tail.newest(),
-            self._course.newest.watch,
-            self._course.guarded,
+            course.newest.watch,
+            course.guarded,
             self._frame,
             latest_s=self._latest_s,
             shift_s=self._intake.shift_s,
@@ -295,9 +325,8 @@ class FixedLagSmoother:
 
     def found(self) -> Found:
         """Return what is known by now beside the state of the vehicle."""
-        if self._course is None:
-            return Found()
-        return found_by(self._course.newest.window, begun_s=self._begun_s)
+        course = self._course
+        return Found() if course is None else found_by(course.newest.window, begun_s=self._begun_s)
 
     def status(self) -> tuple[Health, str]:
         """Return the health of the newest answer and one sentence, also before there is one."""
@@ -312,15 +341,17 @@ class FixedLagSmoother:
 
     def take_delayed(self) -> list[Delayed]:
         """Return the smoothed states that nothing will change any more, since the last call."""
+        course = self._course
         taken, self._finished = self._finished, []
-        return taken if self._course is None else taken + self._take(self._course)
+        return taken if course is None else taken + self._take(course)
 
     def finish(self) -> list[Delayed]:
         """Return all smoothed states that are left, and end."""
+        course = self._course
         taken, self._finished = self._finished, []
-        if self._course is not None:
-            taken += self._take(self._course, all_of_them=True)
-            self._course = self._tail = None
+        if course is not None:
+            taken += self._take(course, all_of_them=True)
+            self._made = self._tail = None
         return taken
 
     def _take(self, course: Course, *, all_of_them: bool = False) -> list[Delayed]:

@@ -18,6 +18,8 @@ from ssm_graph.sensors.messages import Message
 MAX_REFUSALS: Final = 20
 LARGEST_NUMBER: Final = 1e12
 """Whatever the unit, a larger number is damage."""
+_LONGEST_STANDSTILL_S: Final = 3600.0
+"""So much later than the last one that agreed may a stamp be whose arrival is not known."""
 _SHOWN: Final = 60
 _MAX_DIGITS: Final = 20
 _MAX_BRACKETS: Final = 200
@@ -64,7 +66,8 @@ class Stamper:
 
     A stamp that differs from the arrival by more than ``max_clock_error_s`` is not believed: the
     instrument's clock or the vehicle's is not set, and stamps of two clocks do not go together. It
-    is said once, when it begins.
+    is said once, when it begins. One whose arrival is not known is believed where those before it
+    were.
     """
 
     def __init__(
@@ -72,10 +75,14 @@ class Stamper:
     ) -> None:
         self._clock, self._max_error_s = clock, max_clock_error_s
         self._refusals, self._place, self._is_off = refusals, place, False
+        self._agreed_s = math.nan
 
     def stamp(self, instrument_s: float | None, arrival_s: float) -> float:
         """Return the time of a message, s; raise :class:`RefusedError` where there is none."""
         if not math.isfinite(arrival_s):
+            is_believed = self._clock is Clock.INSTRUMENT and not self._is_off
+            if is_believed and instrument_s is not None and self._is_soon(instrument_s):
+                return instrument_s
             raise RefusedError(
                 "the time of arrival is not known: it came while this process stood still, or the "
                 "vehicle's clock is broken"
@@ -91,7 +98,13 @@ class Stamper:
                 f"Clock.ARRIVAL"
             )
         self._is_off = is_off
+        if not is_off:
+            self._agreed_s = instrument_s
         return arrival_s if is_off else instrument_s
+
+    def _is_soon(self, stamp_s: float) -> bool:
+        """Return whether a stamp follows on the last one that agreed with its arrival."""
+        return 0.0 < stamp_s - self._agreed_s < _LONGEST_STANDSTILL_S
 
 
 class Decoder(ABC):

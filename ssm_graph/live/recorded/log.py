@@ -1,4 +1,4 @@
-"""Recorded output of one instrument, Water Linked JSON or NMEA 0183, as tables of a mission folder.
+"""Recorded output of one instrument, Water Linked or NMEA 0183, as tables of a mission folder.
 
 The decoders are those that listen to the instruments. The time of arrival, which a recording does
 not have, is made of what the reports say of time: the centre of the ping or the sum of the times
@@ -8,6 +8,7 @@ between reports of a DVL, date and time of day of a receiver.
 from __future__ import annotations
 
 import calendar
+import csv
 import math
 import re
 from collections import Counter
@@ -32,6 +33,7 @@ from ssm_graph.live.protocols.nmea_fields import (
     utc_seconds,
 )
 from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
+from ssm_graph.live.recorded.water_linked_table import SIGN, rows_of
 from ssm_graph.sensors.dvl import DvlMount, empty_dvl
 from ssm_graph.sensors.messages import Message
 from ssm_graph.sensors.registry import BY_MESSAGE
@@ -72,6 +74,8 @@ def read_recorded(log: Path, options: NmeaOptions | None = None) -> Recorded | N
     head = data[:_SNIFFED]
     if head.lstrip(b" \t\r\n\xef\xbb\xbf")[:1] in (b"{", b"[") and b'"' in head:
         found = _water_linked(data)
+    elif SIGN in head.partition(b"\n")[0]:
+        found = _water_linked_table(data)
     elif _SENTENCE.search(head):
         found = _nmea(data, options or NmeaOptions())
     else:
@@ -109,7 +113,8 @@ def _bare(message: Message) -> Any:
 def _in_order(log: Path, found: Recorded) -> Recorded:
     """Return the messages with increasing times in each table."""
     last: dict[type[Message], float] = {}
-    kept, n_late = [], 0
+    times = set[tuple[type[Message], float]]()
+    kept, n_late = list[Message](), 0
     for message in found.messages:
         before = last.get(type(message), -math.inf)
         if message.time_s < before - _SET_BACK_S:
@@ -117,13 +122,23 @@ def _in_order(log: Path, found: Recorded) -> Recorded:
                 f"{log}: the instrument's clock was set back by {before - message.time_s:.4g} s at "
                 f"{before:.3f} s; expected one clock: split the file there"
             )
-        if message.time_s <= before:
-            n_late += 1
+        if (type(message), message.time_s) in times:
             continue
-        last[type(message)] = message.time_s
+        times.add((type(message), message.time_s))
+        n_late += message.time_s < before
+        last[type(message)] = max(before, message.time_s)
         kept.append(message)
-    late = f"{n_late} reports whose time does not increase were left out."
-    return Recorded(tuple(kept), (*found.notes, *((late,) if n_late else ())))
+    n_twice = len(found.messages) - len(kept)
+    notes = [
+        text
+        for text, count in (
+            (f"{n_twice} reports of a time that an earlier one has were left out.", n_twice),
+            (f"{n_late} reports out of order were sorted by time.", n_late),
+        )
+        if count
+    ]
+    kept.sort(key=lambda message: message.time_s)
+    return Recorded(tuple(kept), (*found.notes, *notes))
 
 
 def _said(refusals: list[str], n_refused: int) -> list[str]:
@@ -146,7 +161,7 @@ def _water_linked(data: bytes) -> Recorded:
             has_clock = False
             if report != before:
                 time_s = max(time_s + 1e-3 * _number(report.get("time")), last_s + _SHORTEST_S)
-            before, last_s = report, time_s
+            before, last_s = report, max(time_s, last_s)
         messages += decoder.feed(text.encode() + b"\n", arrival_s=time_s)
     notes = _said([*torn, *decoder.take_refusals()], len(torn) + decoder.n_refused)
     if decoder.n_repeats:
@@ -157,6 +172,21 @@ def _water_linked(data: bytes) -> Recorded:
             "them, from the first one on or from the stamps of the dead reckoning beside them; add "
             "what makes it the vehicle's."
         )
+    return Recorded(tuple(messages), tuple(notes))
+
+
+def _water_linked_table(data: bytes) -> Recorded:
+    decoder = WaterLinkedDecoder(max_clock_error_s=_ANY_CLOCK_S)
+    messages: list[Message] = []
+    torn: list[str] = []
+    try:
+        for report, arrival_s in rows_of(data):
+            messages += decoder.feed(report, arrival_s=arrival_s)
+    except csv.Error as error:
+        torn.append(f"water linked: no table from there on: {error}")
+    notes = _said([*torn, *decoder.take_refusals()], len(torn) + decoder.n_refused)
+    if decoder.n_repeats:
+        notes.append(f"{decoder.n_repeats} reports came again and were left out.")
     return Recorded(tuple(messages), tuple(notes))
 
 
@@ -224,7 +254,9 @@ def _nmea(data: bytes, options: NmeaOptions) -> Recorded:
     if math.isnan(dated):
         notes.append("No sentence states a date: time_s is UTC of the day.")
     if not messages:
-        notes.append(f"its sentences are {', '.join(sorted(kinds)[:12]) or 'without checksum'}")
+        notes.append(
+            f"its sentences are {', '.join(sorted(kinds)[:12]) or 'none that begins with $'}"
+        )
     if first is None and messages:
         return Recorded((), ("no sentence states a time, which depths and headings need",))
     return Recorded(tuple(messages), tuple(notes))

@@ -28,7 +28,8 @@ STRANGER_S: Final = 1.0
 """A clock that is silent for so long may have been set."""
 MOST_STRANGERS: Final = 5000
 """Samples of another clock that may wait; with more the other clock is believed."""
-_AHEAD_S: Final = 0.1
+AHEAD_S: Final = 0.1
+"""Bytes for so long may come at once, s."""
 
 
 class Now(NamedTuple):
@@ -56,8 +57,8 @@ class Limits:
     """Connections to one server."""
     connect_s: float = 5.0
     """Patience with a connection on its way."""
-    retry_s: tuple[float, float] = (0.5, 10.0)
-    """First and longest wait before the next attempt to connect."""
+    retry_s: tuple[float, float] = (0.5, 3.0)
+    """First and longest wait before the next attempt to connect: nobody is missed for 5 s."""
 
     def __post_init__(self) -> None:
         TokenBucket(rate_per_s=self.messages_per_s, burst=self.burst)
@@ -211,7 +212,7 @@ class Feed:
 
     def is_over(self, now: Now) -> bool:
         """Return whether it has sent so many bytes that it has to wait."""
-        return self._free_s - now.steady_s > _AHEAD_S
+        return self._free_s - now.steady_s > AHEAD_S
 
     @property
     def silence(self) -> str:

@@ -18,14 +18,16 @@ from ssm_graph.live.sockets.endpoints import (
     received,
     resolve,
 )
-from ssm_graph.live.sockets.feed import Channel, Feed, Now
+from ssm_graph.live.sockets.feed import AHEAD_S, Channel, Feed, Now
 from ssm_graph.mission.navigation import Severity
 from ssm_graph.mission.run_status import LinkState, SourceStatus
 from ssm_graph.sensors.messages import Message
 
 YOUNG_S: Final = 2.0
 """A client that has sent no sound message for so long makes room for another one."""
-MAX_DATAGRAMS: Final = 64
+MAX_SENDERS: Final = 64
+"""Of datagrams, that are remembered while they have sent nothing for a while."""
+MAX_DATAGRAMS: Final = 512
 """Read of one source before the others have their turn."""
 
 
@@ -283,7 +285,11 @@ class TcpServerInput(Input):
 
 
 class UdpInput(Input):
-    """Datagrams; each ends what it holds, so that one that was cut off spoils no other."""
+    """Datagrams; each ends what it holds, so that one that was cut off spoils no other.
+
+    Of a sender that sends too much the rest is read and dropped: left unread it would fill the room
+    of the others.
+    """
 
     def __init__(self, feed: Feed, selector: selectors.BaseSelector, endpoint: Endpoint) -> None:
         super().__init__(feed, selector)
@@ -291,6 +297,7 @@ class UdpInput(Input):
         self.port = int(self._socket.getsockname()[1])
         self._channel: Channel | None = None
         self._is_silent = False
+        self._free_s: dict[str, float] = {}
 
     def on_ready(self, ready: socket.socket, now: Now) -> list[Message]:
         """Read what waits, so much of it."""
@@ -298,13 +305,15 @@ class UdpInput(Input):
         data, is_all = bytearray(), False
         for _ in range(MAX_DATAGRAMS):
             try:
-                datagram = ready.recv(CHUNK)
+                datagram, sender = ready.recvfrom(CHUNK)
             except (BlockingIOError, InterruptedError):
                 is_all = True
                 break
             except OSError as error:  # an ICMP message about something else
                 self.feed.tell("receive_failed", error.strerror or str(error), Severity.WARNING)
                 break
+            if self._is_too_much(str(sender), len(datagram), now):
+                continue
             data += datagram if datagram.endswith(b"\n") else datagram + b"\n"
             if len(data) >= CHUNK:
                 break
@@ -312,8 +321,20 @@ class UdpInput(Input):
         self._is_silent = self._is_silent and self.feed.is_silent(self._channel, now)
         if is_all:
             self._channel.catch_up()
-        self._pause_if_over(now)
         return messages
+
+    def _is_too_much(self, sender: str, n_bytes: int, now: Now) -> bool:
+        """Return whether a datagram of a sender is beyond what he may send, which is told."""
+        limit = self.feed.limits.bytes_per_s
+        free_s = max(self._free_s.get(sender, now.steady_s), now.steady_s) + n_bytes / limit
+        if free_s - now.steady_s > AHEAD_S + n_bytes / limit:
+            most = f"{sender}: expected at most {limit:g} bytes/s, got more; the rest is dropped"
+            self.feed.tell("byte_limited", most, Severity.WARNING)
+            return True
+        if len(self._free_s) >= MAX_SENDERS:
+            self._free_s = {who: s for who, s in self._free_s.items() if s > now.steady_s}
+        self._free_s[sender] = free_s
+        return False
 
     def tick(self, now: Now) -> list[Message]:
         """Say it where nothing comes any more."""

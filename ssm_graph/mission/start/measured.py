@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -15,7 +16,7 @@ from ssm_graph.imu.ping_motion import mean_gyro
 from ssm_graph.mission.mission import Mission
 from ssm_graph.sensors.acoustic import RangeLog, UsblLog
 from ssm_graph.sensors.gnss import GnssLog
-from ssm_graph.sensors.standstill import Standstill
+from ssm_graph.sensors.standstill import HOLDS_S, RestLog, Standstill
 
 PARITY_GATE = 5.0
 """Sigmas of the array's parity above which a ping is not used."""
@@ -48,9 +49,19 @@ class BodyVelocities:
 def body_velocities(mission: Mission) -> BodyVelocities:
     """Return the velocities of the pings, and zero while the mission stands still."""
     velocities = _of_pings(mission)
-    for still in mission.aids.all(Standstill):
+    for still in (*mission.aids.all(Standstill), *_told(mission.aids.get(RestLog))):
         velocities = _at_rest(velocities, still)
     return velocities
+
+
+def _told(log: RestLog | None) -> Iterator[Standstill]:
+    """Yield the times in which a vehicle said again and again that it stands still."""
+    if log is None or len(log.time_s) == 0:
+        return
+    parts = np.split(log.time_s, np.flatnonzero(np.diff(log.time_s) > HOLDS_S) + 1)
+    for part in parts:
+        if len(part) > 1:
+            yield Standstill(float(part[0]), float(part[-1]))
 
 
 def _at_rest(velocities: BodyVelocities, still: Standstill) -> BodyVelocities:

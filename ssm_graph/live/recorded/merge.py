@@ -1,0 +1,138 @@
+"""An IMU's table and recordings of other instruments, on one clock, as a mission folder."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from heapq import merge
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.base.frames import BodyAxes
+from ssm_graph.io.mission_folder.folder import read_mission
+from ssm_graph.io.raw_log.log import RawLog
+from ssm_graph.io.tables.files import read_table
+from ssm_graph.live.recorded.log import read_recorded
+from ssm_graph.live.recorded.turns import clock_offset
+from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.vehicle import Vehicle
+from ssm_graph.sensors.compass import HeadingReading
+from ssm_graph.sensors.imu import IMU, ImuLog
+from ssm_graph.sensors.instrument import read_columns
+from ssm_graph.sensors.messages import Message
+from ssm_graph.sensors.registry import BY_LOG, BY_MESSAGE
+
+TABLES: Final = (".csv", ".parquet")
+
+
+class Merged(NamedTuple):
+    """A mission that was written, and what was assumed."""
+
+    mission: Mission
+    notes: tuple[str, ...]
+
+
+def merge_recordings(
+    logs: Sequence[Path], out: Path, *, vehicle: Vehicle, offset_s: float | None = None
+) -> Merged:
+    """Write a mission folder of a table of inertial data and recordings of other instruments.
+
+    Each recording is moved onto the clock of the inertial data by ``offset_s``, s, or by the turns
+    that its headings show, where it has any.
+
+    Raises :class:`ConfigError`: not one table of inertial data. Raises :class:`DataError`: a file
+    cannot be read, or nothing tells how its clock stands to that of the inertial data.
+
+    Parameters
+    ----------
+    logs : one table with the columns of ``imu.csv``; the others as :func:`read_recorded` reads.
+    out : folder, made if it does not exist.
+    vehicle : of which the mission is.
+    offset_s : what is to be added to the times of the recordings, s; None to find it.
+    """
+    own = [log for log in logs if _is_inertial(log)]
+    if len(own) != 1:
+        raise ConfigError(
+            f"expected one table with the columns of imu.csv among the files, got {len(own)}: "
+            f"{', '.join(map(str, logs))}"
+        )
+    imu = _inertial(own[0], vehicle)
+    notes: list[str] = []
+    streams = [list(IMU.messages_of(imu))]
+    known = {BY_LOG[kind].section for kind in vehicle.bare_logs}
+    for log in logs:
+        if log is own[0]:
+            continue
+        found = read_recorded(log)
+        if found is None:
+            raise DataError(f"{log}: neither a table of inertial data nor a recording that is read")
+        shift_s, said = _shift(log, found.messages, imu, offset_s)
+        notes += [*(f"{log.name}: {note}" for note in found.notes), said]
+        streams += _on_clock(found.messages, shift_s, known)
+    with RawLog(out, vehicle) as raw:
+        for message in merge(*streams, key=lambda message: message.time_s):
+            raw.append(message)
+    mission = read_mission(out)
+    return Merged(mission, (*notes, *mission.notes))
+
+
+def _is_inertial(log: Path) -> bool:
+    if log.suffix not in TABLES or not log.is_file():
+        return False
+    with log.open("rb") as stream:
+        head = stream.readline()
+    return log.suffix == ".parquet" or b"gyro_x_rad_per_s" in head
+
+
+def _inertial(log: Path, vehicle: Vehicle) -> ImuLog:
+    """Return the samples of a table, in axes forward-right-down as a vehicle's messages are."""
+    bare = vehicle.bare_logs[ImuLog]
+    table = read_table(log, log.name, IMU.spec(bare))
+    IMU.check(table, bare, BodyAxes.FRD)
+    start_s = float(table.time_s[0] - np.median(np.diff(table.time_s)))
+    readings = read_columns(table, IMU.columns, BodyAxes.FRD)
+    found: ImuLog = replace(bare, start_s=start_s, time_s=table.time_s, **readings)
+    return found
+
+
+def _shift(
+    log: Path, messages: Sequence[Message], imu: ImuLog, stated_s: float | None
+) -> tuple[float, str]:
+    """Return what is to be added to the times of a recording, s, and how that was found."""
+    if stated_s is not None:
+        return stated_s, f"{log.name}: {stated_s:+g} s as stated, onto the clock of the IMU."
+    turns = [one for one in messages if isinstance(one, HeadingReading)]
+    if len(turns) > 1:
+        time_s = np.array([one.time_s for one in turns])
+        try:
+            found = clock_offset(imu, time_s, np.array([one.heading for one in turns]))
+        except DataError as error:
+            raise DataError(f"{log}: {error}") from None
+        return found.seconds, (
+            f"{log.name}: {found.seconds:+.3f} s onto the clock of the IMU, to "
+            f"{found.sigma_s:.3f} s, by {found.overlap_s:.0f} s of turns alike to "
+            f"{found.correlation:.3f}; what is left of it is estimated where the vehicle states "
+            "time_offset_sigma_s."
+        )
+    first_s, last_s = messages[0].time_s, messages[-1].time_s
+    if first_s < imu.time_s[-1] and last_s > imu.start_s:
+        return 0.0, f"{log.name}: it shows no turns; its times are taken for those of the IMU."
+    raise DataError(
+        f"{log}: its times, {first_s:.3f} to {last_s:.3f} s, are not those of the IMU, "
+        f"{imu.start_s:.3f} to {imu.time_s[-1]:.3f} s, and it has no headings whose turns would "
+        "tell how far they are apart; state  --clock-offset SECONDS"
+    )
+
+
+def _on_clock(messages: Sequence[Message], shift_s: float, known: set[str]) -> list[list[Message]]:
+    """Return the messages of each instrument that the vehicle has, moved."""
+    found: dict[type[Message], list[Message]] = {}
+    for message in messages:
+        if BY_MESSAGE[type(message)].section in known and math.isfinite(message.time_s):
+            moved = replace(message, time_s=message.time_s + shift_s)
+            found.setdefault(type(message), []).append(moved)
+    return list(found.values())

@@ -1,0 +1,137 @@
+"""Damaged recordings into what reads files: a refusal that says why, or finite numbers in order."""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from rosbags.rosbag2 import StoragePlugin
+
+from ssm_graph.base.errors import SsmGraphError
+from ssm_graph.io.mission_folder.vehicle import vehicle_of
+from ssm_graph.io.ros.convert import convert_rosbag
+from ssm_graph.io.ros.messages import RosOptions
+from ssm_graph.live.recorded.log import read_recorded
+from ssm_graph.mission.mission import Mission
+from ssm_graph.sensors.messages import Message, bad_number
+from ssm_graph.simulation import GnssSettings
+from tests.damaged_traffic import MAX_FAILURES, START_S, damaged, nmea_traffic, waterlinked_traffic
+from tests.helpers import simulated
+from tests.rosbag_fixture import Ros, marine_bag, ros1_bag, write_bag
+from tests.unit.test_recorded import as_table, reports
+
+SIZE: Final = 64 * 1024
+"""Of a recorded stream, bytes."""
+
+
+@dataclass
+class FileTarget:
+    """One kind of file, and what became of it."""
+
+    name: str
+    sound: bytes
+    read: Callable[[Path], int]
+    """Return how many rows there are; raise for what is wrong with them."""
+    suffix: str
+    fed: int = 0
+    files: int = 0
+    refused: int = 0
+    rows: int = 0
+    wall_s: float = 0.0
+    slowest_s: float = 0.0
+    failures: list[str] = field(default_factory=list)
+
+    def feed(self, folder: Path, rng: random.Random) -> None:
+        """Read the file, damaged."""
+        data = damaged(self.sound, rng) if rng.random() < 0.5 else _scratched(self.sound, rng)
+        path = folder / f"damaged{self.suffix}"
+        path.write_bytes(data)
+        begin = time.perf_counter()
+        try:
+            self.rows += self.read(path)
+        except SsmGraphError as error:
+            self.refused += 1
+            if not 10 < len(str(error)) < 2000:
+                self.failures.append(f"{self.name}: a refusal of {len(str(error))} letters")
+        except Exception as error:  # nothing else may come out
+            self.failures.append(f"{self.name}, file {self.files}: {type(error).__name__}: {error}")
+        spent_s = time.perf_counter() - begin
+        self.wall_s += spent_s
+        self.slowest_s = max(self.slowest_s, spent_s)
+        self.fed += len(data)
+        self.files += 1
+
+
+def _scratched(data: bytes, rng: random.Random) -> bytes:
+    """Return a file with one to four bytes altered: what checksums and lengths stand against."""
+    result = bytearray(data)
+    for _ in range(rng.randrange(1, 5)):
+        result[rng.randrange(len(result))] = rng.randrange(256)
+    return bytes(result)
+
+
+def run(target: FileTarget, folder: Path, n_bytes: int, rng: random.Random) -> None:
+    """Read damaged files of so many bytes together."""
+    while target.fed < n_bytes and len(target.failures) < MAX_FAILURES:
+        target.feed(folder, rng)
+
+
+def _recorded(path: Path) -> int:
+    found = read_recorded(path)
+    if found is None:
+        return 0
+    last: dict[type[Message], float] = {}
+    for message in found.messages:
+        name = bad_number(message)
+        if name is not None:
+            raise ValueError(f"{name} of {message} is not finite")
+        if not message.time_s > last.get(type(message), -np.inf):
+            raise ValueError(f"{message} is not after the one before")
+        last[type(message)] = message.time_s
+    return len(found.messages)
+
+
+def _bag_of(mission: Mission) -> Callable[[Path], int]:
+    vehicle = vehicle_of(mission)
+
+    def read(path: Path) -> int:
+        found = convert_rosbag(path, vehicle=vehicle, options=RosOptions(surface_height=0.0))
+        logs = [log for log in (found.imu, found.dvl, found.depth, found.gnss) if log is not None]
+        for log in logs:
+            if not (np.isfinite(log.time_s).all() and np.all(np.diff(log.time_s) > 0.0)):
+                raise ValueError(f"{type(log).__name__}: times do not increase")
+        if not np.isfinite([found.imu.gyro_b, found.imu.accel_b]).all():
+            raise ValueError("inertial data that are not finite")
+        return sum(len(log.time_s) for log in logs)
+
+    return read
+
+
+def _stream(traffic: Callable[[random.Random, float], bytes]) -> bytes:
+    rng, parts = random.Random(5), list[bytes]()
+    while sum(map(len, parts)) < SIZE:
+        parts.append(traffic(rng, START_S + 0.5 * len(parts)))
+    return b"".join(parts)
+
+
+def file_targets(folder: Path) -> list[FileTarget]:
+    """Return every kind of file; those that need a library to be written are written there."""
+    gnss = GnssSettings(windows=((0.0, 9.0),))
+    mission, ros = simulated(duration_s=10.0, gnss=gnss).mission, Ros()
+    sent, bag = marine_bag(mission, ros), _bag_of(mission)
+    mcap = write_bag(folder / "mcap", ros, sent) / "mcap.mcap"
+    db3 = write_bag(folder / "db3", ros, sent, StoragePlugin.SQLITE3) / "db3.db3"
+    old = ros1_bag(folder / "old.bag", mission, ros)
+    return [
+        FileTarget("Water Linked JSON", _stream(waterlinked_traffic), _recorded, ".json"),
+        FileTarget("Water Linked table", as_table(reports(200, "json_v2")), _recorded, ".csv"),
+        FileTarget("NMEA 0183", _stream(nmea_traffic), _recorded, ".nmea"),
+        FileTarget("ROS 2, MCAP", mcap.read_bytes(), bag, ".mcap"),
+        FileTarget("ROS 2, db3", db3.read_bytes(), bag, ".db3"),
+        FileTarget("ROS 1", old.read_bytes(), bag, ".bag"),
+    ]
