@@ -427,7 +427,7 @@ PHYSICS_CASES = cases(
             new_column("dvl.csv", "water_track", lambda k: "2" if k == 20 else "0"),
             "dvl.csv:22 | 'water_track' holds 2 | 1 for a ping off the water",
         ),
-        "Beam speeds with the opposite sign (PD0)": (
+        "Beam speeds with the opposite sign": (
             beams_against_depth,
             "dvl.csv | opposite to the change of depth.csv | positive when",
         ),

@@ -31,8 +31,9 @@ Convert a log. LOG is one of
   a ROS bag        ROS 2: the folder, with metadata.yaml or without, or a single .mcap or .db3 file;
                    ROS 1: a .bag (extra 'ros')
   a Blueye X3 log  MCAP of the maker (extra 'blueye')
-  an instrument's  Water Linked JSON (dvl.csv, heading.csv) or NMEA 0183 (gnss.csv, heading.csv):
-  own output       tables for a mission folder, which a mission.toml and imu.csv make whole
+  an instrument's  Water Linked or Teledyne PD0 (dvl.csv, heading.csv), NMEA 0183 (gnss.csv,
+  own output       heading.csv): tables for a mission folder, which mission.toml and imu.csv make
+                   whole
   several files    a table with the columns of imu.csv and recordings as above, with --vehicle: one
                    mission on the clock of the IMU, the others moved by the turns they show
 
@@ -185,7 +186,9 @@ def _write_tables(recorded: Recorded, out: Path, console: Console) -> bool:
 
 def _say_notes(notes: Iterable[str], console: Console) -> None:
     for note in notes:
-        console.print(f"note: {note}", style="yellow", highlight=False, markup=False)
+        console.print(
+            f"note: {note}", style="yellow", markup=False, highlight=False, soft_wrap=True
+        )
 
 
 def _from_rosbag(log: Path, arguments: argparse.Namespace) -> Mission:

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Final
 
 READ: Final = (
-    "a ROS 2 bag (a folder, .mcap or .db3), a ROS 1 .bag, a Blueye X3 log, Water Linked JSON or "
-    "a table of its reports, or NMEA 0183"
+    "a ROS 2 bag (a folder, .mcap or .db3), a ROS 1 .bag, a Blueye X3 log, Teledyne PD0, Water "
+    "Linked JSON or a table of its reports, or NMEA 0183"
 )
 _MCAP: Final = b"\x89MCAP0\r\n"
 _COMPRESSED: Final = "a compressed file: unpack it first"
@@ -20,7 +20,7 @@ _KINDS: Final = (
     (b"PK\x03\x04", f"{_COMPRESSED}, with  unzip"),
     (b"\xa3\x95\x80", "an ArduPilot DataFlash log: export its tables with  mavlogdump.py"),
     (b"ULog\x01\x12\x35", "a PX4 ULog: export its tables with  ulog2csv"),
-    (b"\x7f\x7f", "Teledyne PD0: export beam velocities as a table"),
+    (b"\x7f\x7f", "like Teledyne PD0, but its first ensemble is damaged"),
     (b"\xb5\x62", "binary of a u-blox receiver: have it write NMEA, or convert it"),
     (b"SQLite format 3\0", "an SQLite database: a ROS 2 bag has it under the name .db3"),
     (b"PAR1", "a Parquet table: put it into a mission folder"),

@@ -99,9 +99,9 @@ def test_other_files_are_named_by_their_content(
     assert found.kind == "table, 20 rows of 2 columns"
     assert found.sensors[0].timing.rate_hz == pytest.approx(2.0)
     assert found.sensors[0].facts[1] == "speed: 0 to 19"
-    pd0 = tmp_path / "a.bin"
-    pd0.write_bytes(b"\x7f\x7f" + bytes(40))
-    assert "Teledyne PD0" in inspect_path(pd0).verdict
+    unknown = tmp_path / "a.bin"
+    unknown.write_bytes(b"\x89HDF\r\n" + bytes(40))
+    assert "an HDF5 file" in inspect_path(unknown).verdict
     folder = tmp_path / "broken"
     folder.mkdir()
     (folder / "mission.toml").write_text("[imu\n")
@@ -110,4 +110,4 @@ def test_other_files_are_named_by_their_content(
     with pytest.raises(DataError, match="no such file"):
         inspect_path(tmp_path / "nothing")
     with pytest.raises(DataError, match="nothing to draw"):
-        save_picture(inspect_path(pd0), tmp_path / "x.png")
+        save_picture(inspect_path(unknown), tmp_path / "x.png")

@@ -13,6 +13,7 @@ import pytest
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
+from ssm_graph.cli.main import main
 from ssm_graph.io.teledyne.ensembles import find_ensembles
 from ssm_graph.io.teledyne.pd0 import is_pd0_file, read_pd0
 from ssm_graph.sensors.compass import HeadingReading
@@ -222,6 +223,28 @@ def test_the_signs_are_those_of_a_real_track() -> None:
         return float(np.sqrt(np.mean(np.sum((off - off.mean(axis=0)) ** 2, axis=1))))
 
     assert min(rms_m(float(np.radians(k))) for k in range(-180, 180)) < 2.0
+
+
+def test_a_recording_becomes_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """By the command, with what mission.toml has to say; inspect names it by its content."""
+    speeds = np.array([0.1, -0.2, 0.3, np.nan])
+    log = written(tmp_path, *(ensemble(k, speeds) for k in range(5)))
+    assert main(["convert", str(log), "--out", str(tmp_path / "m")]) == 0
+    shown = capsys.readouterr().out
+    assert "dvl.csv with 5 rows, heading.csv with 5 rows" in shown
+    assert "beam_vectors = [[0.00000, -0.50000, 0.86603]" in shown
+    row = (tmp_path / "m" / "dvl.csv").read_text().splitlines()[1].split(",")
+    assert [float(cell) for cell in row[1:4]] == [0.1, -0.2, 0.3]
+    assert main(["inspect", str(log)]) == 4
+    assert "Teledyne PD0, 5 ensembles, beam coordinates" in capsys.readouterr().out
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="no real PD0 files: set SSM_GRAPH_DATA")
+def test_a_ship_moves_along_its_forward_beam() -> None:
+    """Speeds are positive along the beam: of a ship under way beam 3 reads ahead, beam 4 astern."""
+    speed = np.array([ping.speed for ping in pings_of(REAL / "vmdas02_os.ENR")])
+    forward = (speed[:, 2] - speed[:, 3]) / (2.0 * np.sin(ANGLE))
+    assert np.nanmedian(forward) > 4.0
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="no real PD0 files: set SSM_GRAPH_DATA")

@@ -161,7 +161,7 @@ def test_marine_dvl_as_it_stands() -> None:
 
 
 def test_marine_sign_is_an_option() -> None:
-    """The package leaves the sign open; PD0 counts against the beam."""
+    """The package leaves the sign open: drivers count one way or the other."""
     against = RosOptions(beam_sign=BeamSign.AGAINST)
     assert ping(marine(), RECEIVED_S, against).speed == (-1.0, 2.0, -3.0, 4.0)
 

@@ -184,7 +184,7 @@ def test_body_axes(mission: Mission, ros: Ros, tmp_path: Path, axes: BodyAxes) -
 
 
 def test_the_published_velocity_shows_the_sign(mission: Mission, ros: Ros, tmp_path: Path) -> None:
-    """Speeds counted as PD0 does are turned, and it is said; stated so, they are turned anyway."""
+    """Speeds counted against the beam are turned, and it is said; stated so, they are anyway."""
     sent = imu_messages(mission, ros) + marine_messages(mission, ros, sign=-1.0)
     bag = write_bag(tmp_path / "against", ros, sent + aid_messages(mission, ros))
     for vehicle in (None, vehicle_of(mission)):

@@ -67,7 +67,7 @@ class BeamSign(Enum):
     """When a driver's beam speed is positive."""
 
     ALONG = "the instrument moves along the beam, away from its transducer"
-    AGAINST = "the instrument moves against the beam, as Teledyne's PD0 counts"
+    AGAINST = "the instrument moves against the beam"
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,6 +22,8 @@ import numpy as np
 from ssm_graph.base.errors import DataError
 from ssm_graph.io.raw_log.rows import RowKind
 from ssm_graph.io.tables.append_file import write_through
+from ssm_graph.io.teledyne.ensembles import is_pd0
+from ssm_graph.io.teledyne.pd0 import read_pd0
 from ssm_graph.live.protocols.decoder import RefusedError, parse_object
 from ssm_graph.live.protocols.framing import ObjectFramer, SentenceFramer
 from ssm_graph.live.protocols.nmea import MAX_SENTENCE, NmeaDecoder, NmeaOptions
@@ -72,7 +74,9 @@ def read_recorded(log: Path, options: NmeaOptions | None = None) -> Recorded | N
     except OSError as error:
         raise DataError(f"{log}: cannot be read: {error.strerror or error}") from error
     head = data[:_SNIFFED]
-    if head.lstrip(b" \t\r\n\xef\xbb\xbf")[:1] in (b"{", b"[") and b'"' in head:
+    if is_pd0(head):
+        found = _pd0(log)
+    elif head.lstrip(b" \t\r\n\xef\xbb\xbf")[:1] in (b"{", b"[") and b'"' in head:
         found = _water_linked(data)
     elif SIGN in head.partition(b"\n")[0]:
         found = _water_linked_table(data)
@@ -83,6 +87,11 @@ def read_recorded(log: Path, options: NmeaOptions | None = None) -> Recorded | N
     if not found.messages:
         raise DataError(f"{log}: not one report that is read; {'; '.join(found.notes) or 'empty'}")
     return _in_order(log, found)
+
+
+def _pd0(log: Path) -> Recorded:
+    found = read_pd0(log)
+    return Recorded(found.messages, (found.about, *found.notes))
 
 
 def write_tables(folder: Path, messages: Iterable[Message]) -> dict[str, int]:
