@@ -1,6 +1,6 @@
 """A vehicle finds its lane on a made-up road: simulate, locate, follow.
 
-Run it as ``python examples/06_find_the_lane.py``.
+Run it as ``python examples/07_find_the_lane.py``.
 """
 
 from __future__ import annotations
