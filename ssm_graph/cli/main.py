@@ -16,6 +16,7 @@ from ssm_graph.base.errors import (
     MissingExtraError,
     SolverError,
     SsmGraphError,
+    nearest_hint,
 )
 from ssm_graph.cli.terminal import console_on, interrupt, occupy_closed_streams, say, signals_to
 
@@ -111,7 +112,16 @@ def main(words: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
     occupy_closed_streams()
     words = sys.argv[1:] if words is None else words
-    arguments = build_parser(words).parse_args(words)
+    parser = build_parser(words)
+    if not words:
+        parser.print_help(sys.stderr)
+        return ExitCode.USAGE
+    if not words[0].startswith("-") and words[0] not in COMMANDS:
+        parser.exit(
+            ExitCode.USAGE,
+            f"error: {words[0]!r} is no command, {nearest_hint(words[0], COMMANDS)}\n",
+        )
+    arguments = parser.parse_args(words)
     console, errors = console_on(sys.stdout), console_on(sys.stderr, is_stderr=True)
     try:
         with signals_to(interrupt):

@@ -205,3 +205,14 @@ def test_the_package_names_every_command(capsys: pytest.CaptureFixture[str]) -> 
     named = re.findall(r"([\w-]+)(?: \||``)", cli.__doc__ or "")
     assert len(named) > 6
     assert named == shown
+
+
+def test_a_command_that_is_none(capsys: pytest.CaptureFixture[str]) -> None:
+    """The nearest one is named; without any all are listed."""
+    with pytest.raises(SystemExit) as stop:
+        main(["smoth", "m"])
+    assert stop.value.code == ExitCode.USAGE
+    assert "'smoth' is no command, did you mean 'smooth'?" in capsys.readouterr().err
+    assert main([]) == ExitCode.USAGE
+    shown = capsys.readouterr().err
+    assert all(f"    {name}" in shown for name in COMMANDS)
