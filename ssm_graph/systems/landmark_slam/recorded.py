@@ -1,4 +1,4 @@
-"""Readers of public logs: UTIAS MRCLAM and Victoria Park, raw and as a graph.
+"""Readers of public logs: UTIAS MRCLAM, and graphs in the text of GTSAM, such as Victoria Park.
 
 References
 ----------
@@ -15,7 +15,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.io import loadmat
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
@@ -27,8 +26,6 @@ MRCLAM_ROBOTS: Final = range(1, 6)
 """Subjects that are robots: they move, and are no landmarks."""
 MRCLAM_NOISE: Final = SlamNoise(np.array([0.02, 0.01, 0.04]), np.array([0.05, 0.02]))
 """A guess of such robots and cameras: from it the noise of a log is estimated."""
-VICTORIA_WHEEL: Final = (2.83, 0.76)
-"""m, m: wheel base and how far the encoder's wheel is from the middle of the rear axle."""
 
 
 def read_mrclam(folder: Path, robot: int) -> LandmarkLog:
@@ -143,21 +140,3 @@ def read_graph(path: Path) -> tuple[SlamProblem, SlamNoise]:
         np.full(3, 1e-3),
     )
     return problem, noise
-
-
-def read_victoria_park(folder: Path) -> tuple[Array, Array, Array, Array]:
-    """Return the raw log: times [s], speed and steering (N, 2), GPS times and places (G, 2).
-
-    Speed [m/s] is of the middle of the rear axle, steering in rad; places in m, east and north.
-    """
-    try:
-        drive, gps = loadmat(folder / "aa3_dr.mat"), loadmat(folder / "aa3_gpsx.mat")
-    except OSError as error:
-        raise DataError(f"{folder}: expected aa3_dr.mat and aa3_gpsx.mat; {error}") from error
-    steering, encoder = drive["steering"].ravel(), drive["speed"].ravel()
-    base, offset = VICTORIA_WHEEL
-    speed = encoder / (1.0 - np.tan(steering) * offset / base)
-    time_s = drive["time"].ravel().astype(np.float64) / 1000.0
-    fixes_s = gps["timeGps"].ravel().astype(np.float64) / 1000.0
-    places = np.column_stack([gps["Lo_m"].ravel(), gps["La_m"].ravel()])
-    return time_s, np.column_stack([speed, steering]), fixes_s, places
