@@ -42,6 +42,9 @@ class Outcome(NamedTuple):
 Fault = Callable[[Path, Path], Outcome]
 """From a mission and a new run folder."""
 
+FULL_AT: Final = 400_000
+"""Bytes of a file on a full disk: more than a checkpoint, less than the inertial table comes to."""
+
 
 def start(
     mission: Path, run: Path, *, largest_file: int | None = None, speed: str = "full"
@@ -130,8 +133,8 @@ def no_sound_checkpoint(mission: Path, run: Path) -> Outcome:
 
 
 def full_disk_for_a_while(mission: Path, run: Path) -> Outcome:
-    """No file may be larger than 250 kB until the run, at ten times its speed, has said so."""
-    process = start(mission, run, largest_file=250_000, speed="10")
+    """No file may be larger than 400 kB until the run, at ten times its speed, has said so."""
+    process = start(mission, run, largest_file=FULL_AT, speed="10")
     has_told = wait_for(process, lambda: "disk" in kinds(run))
     time.sleep(0.3)
     notes = [] if process.poll() is None else ["ended before there was room again"]
@@ -144,9 +147,9 @@ def full_disk_for_a_while(mission: Path, run: Path) -> Outcome:
 
 
 def full_disk_for_ever(mission: Path, run: Path) -> Outcome:
-    """No file may be larger than 250 kB to the end."""
+    """No file may be larger than 400 kB to the end."""
     begin_s = time.monotonic()
-    notes = ended(start(mission, run, largest_file=250_000))
+    notes = ended(start(mission, run, largest_file=FULL_AT))
     return _told(Outcome(run, notes, time.monotonic() - begin_s), "disk")
 
 
