@@ -38,7 +38,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
         "--out",
         type=Path,
         metavar="PATH",
-        help="file, or folder for several formats (default: RESULT/export/MISSION.SUFFIX)",
+        help="file, or folder for several formats (default: RESULT-export/MISSION.SUFFIX)",
     )
     parser.add_argument(
         "--epoch",
@@ -53,12 +53,13 @@ def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
     names = [name.strip() for name in arguments.format.split(",") if name.strip()]
     epoch_s = None if arguments.epoch is None else parse_epoch(arguments.epoch)
     track = track_of(read_results(arguments.result), epoch_s=epoch_s)
-    out: Path = arguments.out or arguments.result / "export"
+    result: Path = arguments.result.resolve()
+    out: Path = arguments.out or result.with_name(f"{result.name}-export")
     is_file = arguments.out is not None and len(names) == 1 and bool(out.suffix)
-    if is_file and out.resolve().parent == arguments.result.resolve():
+    if result in (out.resolve(), *out.resolve().parents):
         raise ConfigError(
-            f"--out: {out} would lie among the files of the result; give a folder within it, such "
-            f"as {arguments.result / 'export' / out.name}, or another place"
+            f"--out: {out} would lie in the result folder, whose files are one set; try "
+            f"{result.name}-export beside it"
         )
     stem = "".join(c if c.isalnum() or c in "-_." else "_" for c in track.name)[:80]
     for name in names:

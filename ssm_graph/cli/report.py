@@ -7,7 +7,7 @@ import csv
 import webbrowser
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -15,9 +15,8 @@ from rich.console import Console
 from ssm_graph.base.errors import DataError
 from ssm_graph.cli.terminal import say
 from ssm_graph.io.export.track import UNIX_FROM_S, UNIX_UNTIL_S, parse_epoch
+from ssm_graph.io.results.place import PAGE_NAME
 from ssm_graph.io.results.tables import AIDS_NAME, read_results
-
-PAGE_NAME: Final = "report.html"
 
 DESCRIPTION = """\
 Write one page about a result: the verdict in words first, the track with its uncertainty, height,

@@ -270,4 +270,6 @@ def test_the_command_writes_what_it_is_asked_for(
     before = own.read_bytes()
     assert main([*words, "--format", "csv", "--out", str(own)]) == 2
     assert own.read_bytes() == before
-    assert "among the files of the result" in capsys.readouterr().err
+    assert "would lie in the result folder" in capsys.readouterr().err
+    assert main([*words, "--format", "tum"]) == 0
+    assert list((tmp_path / "result-export").iterdir())

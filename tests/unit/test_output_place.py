@@ -35,11 +35,12 @@ def names(folder: Path) -> set[str]:
 
 
 def test_a_figure_goes_and_comes_with_its_tables(tmp_path: Path) -> None:
-    """A run without a figure leaves none of an earlier run beside its tables."""
+    """A run leaves no figure and no report of an earlier run beside its tables."""
     write(tmp_path, figure=b"first")
     assert (tmp_path / "figure.png").read_bytes() == b"first"
     write(tmp_path, figure=b"second")
     assert (tmp_path / "figure.png").read_bytes() == b"second"
+    (tmp_path / "report.html").write_text("of the second")
     write(tmp_path)
     assert names(tmp_path) == set(TABLES)
 

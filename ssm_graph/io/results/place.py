@@ -14,6 +14,8 @@ from ssm_graph.io.mission_folder.toml import TOML_NAME
 RUN_NAME: Final = "run.json"
 """Makes a folder that of a live run."""
 FIGURE_NAME: Final = "figure.png"
+PAGE_NAME: Final = "report.html"
+"""Of ``ssm-graph report``; new results make an old one untrue, and it goes."""
 LEAST_FREE: Final = 2**20
 """Bytes below which a disk is full."""
 _PROBE: Final = ".trajectory.csv.part-4194304"

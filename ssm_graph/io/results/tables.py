@@ -22,7 +22,7 @@ from ssm_graph.base.frames import BodyAxes
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.units import DEG_PER_H, MICRO_G
 from ssm_graph.io.mission_folder.folder import CALIBRATION_NAME, calibration_toml
-from ssm_graph.io.results.place import FIGURE_NAME, check_is_for_results
+from ssm_graph.io.results.place import FIGURE_NAME, PAGE_NAME, check_is_for_results
 from ssm_graph.io.results.summary import MetricsLike, build_summary
 from ssm_graph.io.tables import csv_tables
 from ssm_graph.io.tables.append_file import TORN_ROW, AppendFile, write_through
@@ -118,7 +118,7 @@ def write_results(
             figure = folder / f".{process}-{FIGURE_NAME}"
             parts = {FIGURE_NAME: figure, **parts}
             failure = _drawn(draw, figure)
-        for name in (SUMMARY_NAME, CALIBRATION_NAME, AIDS_NAME, FIGURE_NAME):
+        for name in (SUMMARY_NAME, CALIBRATION_NAME, AIDS_NAME, FIGURE_NAME, PAGE_NAME):
             (folder / name).unlink(missing_ok=True)
         for name, part in parts.items():
             if name != FIGURE_NAME or failure is None:
