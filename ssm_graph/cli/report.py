@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import csv
 import webbrowser
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 from rich.console import Console
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.cli.terminal import say
-from ssm_graph.io.export.track import UNIX_FROM_S, UNIX_UNTIL_S, parse_epoch
+from ssm_graph.io.export.track import epoch_of, parse_epoch
 from ssm_graph.io.results.place import PAGE_NAME
-from ssm_graph.io.results.tables import AIDS_NAME, read_results
+from ssm_graph.io.results.tables import read_aids, read_results
 
 DESCRIPTION = """\
 Write one page about a result: the verdict in words first, the track with its uncertainty, height,
@@ -47,18 +44,15 @@ def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
     from ssm_graph.report.page.page import write_page
 
     results = read_results(arguments.result)
-    time_s = results.trajectory["time_s"]
-    if len(time_s) == 0:
+    if len(results.trajectory["time_s"]) == 0:
         raise DataError(f"{arguments.result}: trajectory.csv has no row: there is nothing to show")
-    is_unix = UNIX_FROM_S <= time_s[0] <= UNIX_UNTIL_S
     epoch_s = None if arguments.epoch is None else parse_epoch(arguments.epoch)
     content = Content(
         trajectory=results.trajectory,
         beams=results.beams,
         summary=results.summary,
-        aids=_aids(arguments.result / AIDS_NAME),
-        protection={},
-        epoch_s=0.0 if is_unix else epoch_s,
+        aids=read_aids(arguments.result),
+        epoch_s=epoch_of(results, epoch_s),
     )
     path: Path = arguments.out or arguments.result / PAGE_NAME
     now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
@@ -68,20 +62,3 @@ def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
     if arguments.open:
         webbrowser.open(path.resolve().as_uri())
     return True
-
-
-def _aids(path: Path) -> dict[str, Any]:
-    """Return the columns of ``aids.csv``, empty where there is none."""
-    if not path.exists():
-        return {}
-    try:
-        with path.open(encoding="utf-8", newline="") as file:
-            rows = list(csv.DictReader(file))
-        words: dict[str, Any] = {
-            name: [row[name] for row in rows] for name in ("aid", "component", "unit")
-        }
-        for name in ("time_s", "innovation", "mahalanobis_sq", "weight"):
-            words[name] = np.array([float(row[name]) for row in rows])
-    except (OSError, KeyError, ValueError, TypeError) as error:
-        raise DataError(f"{path}: expected a table of aids: {error}; smooth again") from error
-    return words if rows else {}

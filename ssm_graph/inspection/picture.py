@@ -9,6 +9,7 @@ import numpy as np
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.inspection.look import Inspection
+from ssm_graph.inspection.timing import GAP_STEPS
 from ssm_graph.report import style
 
 MOST_CURVES: Final = 9
@@ -60,5 +61,5 @@ def _spoken(time_s: np.ndarray[tuple[int], np.dtype[np.float64]]) -> list[tuple[
     ordered = np.sort(time_s)
     steps = np.diff(ordered)
     usual = float(np.median(steps[steps > 0.0])) if np.any(steps > 0.0) else 1.0
-    cut = np.flatnonzero(steps > max(3.0 * usual, 1e-9)) + 1
+    cut = np.flatnonzero(steps > max(GAP_STEPS * usual, 1e-9)) + 1
     return [(float(part[0]), float(part[-1]) + usual) for part in np.split(ordered, cut)]

@@ -12,6 +12,7 @@ from factors.inertial import MovingState
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frames import phi_D_roll_pitch_heading, roll_pitch_heading_from_R_lb
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.runs import runs_of
 from ssm_graph.engine.error_state import POSITION, ROTATION, VELOCITY
 from ssm_graph.mission.calibration import taken_as_exact
 from ssm_graph.mission.estimate import BeamTable, Estimate, Status, Trajectory
@@ -130,11 +131,11 @@ def _doubt_stretches(problem: Problem, weights: Array) -> str:
     if len(pings) == 0:
         return ""
     is_bad = np.bincount(row, weights=weights < LOW_WEIGHT) > SUSPECT_SHARE * np.bincount(row)
-    edges = np.diff(np.concatenate([[0], is_bad.astype(int), [0]]))
-    begin_s = problem.keyframe_s[pings[np.flatnonzero(edges == 1)]]
-    end_s = problem.keyframe_s[pings[np.flatnonzero(edges == -1) - 1]]
-    if len(begin_s) == 0:
+    runs = np.array(runs_of(is_bad))
+    if len(runs) == 0:
         return ""
+    begin_s = problem.keyframe_s[pings[runs[:, 0]]]
+    end_s = problem.keyframe_s[pings[runs[:, 1] - 1]]
     longest = int(np.argmax(end_s - begin_s))
     if end_s[longest] - begin_s[longest] < SUSPECT_STRETCH_S:
         return ""

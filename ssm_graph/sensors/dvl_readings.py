@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.runs import runs_of
 from ssm_graph.base.tables import Table
 from ssm_graph.sensors.instrument import Column
 
@@ -84,8 +85,7 @@ def stuck_beams(speed: Array) -> NDArray[np.bool_]:
     has_changed = np.isfinite(speed[1:] - speed[:-1]) & ~repeats
     repeats &= has_changed.any(axis=1)[:, None]
     for beam in np.flatnonzero(repeats.sum(axis=0) >= STUCK_PINGS - 1):
-        edges = np.flatnonzero(np.diff(repeats[:, beam].astype(np.int8), prepend=0, append=0))
-        for begin, end in edges.reshape(-1, 2).tolist():
+        for begin, end in runs_of(repeats[:, beam]):
             if end - begin >= STUCK_PINGS - 1:
                 is_stuck[begin : end + 1, beam] = True
     return is_stuck
@@ -222,8 +222,7 @@ def _repeats(table: Table, speed: Array, is_water: Mask) -> list[str]:
 
 
 def _stuck(table: Table, speed: Array, is_stuck: Mask, beam: int) -> list[str]:
-    edges = np.flatnonzero(np.diff(is_stuck.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
-    begin, end = edges[np.argmax(edges[:, 1] - edges[:, 0])].tolist()
+    begin, end = max(runs_of(is_stuck), key=lambda run: run[1] - run[0])
     hint = " (a code for no bottom lock?)" if speed[begin] == 0.0 else ""
     return [
         f"{table.file.place(begin)}: beam {beam + 1} holds {speed[begin]:g}{hint} in "

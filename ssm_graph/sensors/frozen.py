@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.runs import runs_of
 
 USUALLY_EQUAL: Final = 0.2
 """Where more of the other successive readings are equal, resolution makes them so, or rest."""
@@ -24,10 +25,9 @@ def frozen_runs(
     least_s, least_count : so long, and so many times, one has to be repeated.
     """
     equal = np.all(values[1:] == values[:-1], axis=1)
-    edges = np.flatnonzero(np.diff(equal.astype(np.int8), prepend=0, append=0))
     runs = [
         (begin, end)
-        for begin, end in edges.reshape(-1, 2).tolist()
+        for begin, end in runs_of(equal)
         if end - begin >= least_count and time_s[end] - time_s[begin] >= least_s
     ]
     inside = sum(end - begin for begin, end in runs)

@@ -30,6 +30,15 @@ def _no_constant(text: str) -> float:
     raise ValueError(text)
 
 
+def differing(expected: Mapping[str, Any], found: Mapping[str, Any]) -> str:
+    """Return in which settings two studies differ, empty if in none."""
+    return "; ".join(
+        f"{name}: expected {expected.get(name)!r}, got {found.get(name)!r}"
+        for name in sorted(found.keys() | expected.keys())
+        if expected.get(name) != found.get(name)
+    )
+
+
 def without_nan(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return values for JSON, None instead of a number that is not finite."""
     return {

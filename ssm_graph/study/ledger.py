@@ -19,7 +19,7 @@ from ssm_graph.base.errors import ConfigError, SsmGraphError
 from ssm_graph.base.settings import shown
 from ssm_graph.io.tables.append_file import write_through
 from ssm_graph.study.jobs import one_blas_thread
-from ssm_graph.study.json_lines import line_of, object_of, with_nan, without_nan
+from ssm_graph.study.json_lines import differing, line_of, object_of, with_nan, without_nan
 
 Key = tuple[str | int | float, ...]
 Row = Mapping[str, Any]
@@ -93,15 +93,7 @@ class Ledger:
                 "start afresh to throw it away, or choose another folder"
             ) from error
         if found != self.settings:
-            names = sorted(
-                name
-                for name in {*found, *self.settings}
-                if found.get(name) != self.settings.get(name)
-            )
-            told = "; ".join(
-                f"{name}: expected {self.settings.get(name)!r}, got {found.get(name)!r}"
-                for name in names
-            )
+            told = differing(self.settings, found)
             raise ConfigError(
                 f"{self.path}: made with other settings ({told}); start afresh to throw it away, "
                 "or choose another folder"

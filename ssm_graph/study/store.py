@@ -24,7 +24,7 @@ from ssm_graph.io.tables.append_file import sync_path, write_through
 from ssm_graph.io.tables.files import TableFormat, pyarrow_module
 from ssm_graph.study.cells import digest
 from ssm_graph.study.jobs import JobResult, RunKey
-from ssm_graph.study.json_lines import line_of, object_of, with_nan, without_nan
+from ssm_graph.study.json_lines import differing, line_of, object_of, with_nan, without_nan
 from ssm_graph.study.scoring import COLUMNS, COUNT_COLUMNS, LOST, SERIES_STEP_S, TEXT_COLUMNS, Row
 
 RUNS_NAME: Final = "runs.jsonl"
@@ -209,13 +209,8 @@ class StudyStore:
     def _check(self, found: dict[str, Any]) -> None:
         if found == self.settings:
             return
-        differing = [
-            f"{name}: expected {self.settings.get(name)!r}, got {found.get(name)!r}"
-            for name in sorted(found.keys() | self.settings.keys())
-            if self.settings.get(name) != found.get(name)
-        ]
         raise ConfigError(
-            f"{self.path}: made with other settings ({'; '.join(differing)}); "
+            f"{self.path}: made with other settings ({differing(self.settings, found)}); "
             "use --fresh to throw it away, or another --out"
         )
 

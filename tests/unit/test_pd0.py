@@ -14,8 +14,8 @@ import pytest
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.cli.main import main
-from ssm_graph.io.teledyne.ensembles import find_ensembles
-from ssm_graph.io.teledyne.pd0 import is_pd0_file, read_pd0
+from ssm_graph.io.teledyne.ensembles import find_ensembles, is_pd0
+from ssm_graph.io.teledyne.pd0 import read_pd0
 from ssm_graph.sensors.compass import HeadingReading
 from ssm_graph.sensors.dvl import Ping
 
@@ -84,7 +84,7 @@ def test_beam_coordinates_are_taken_as_they_are(tmp_path: Path) -> None:
     speeds = np.array([0.1, -0.2, 0.3, np.nan])
     all_of = [ensemble(k, speeds, attitude_deg=(37.25, 0.0, 0.0)) for k in range(3)]
     path = written(tmp_path, *all_of, between=b"$GPGGA,1*00\r\n\x7f\x7f")
-    assert is_pd0_file(path)
+    assert is_pd0(path.read_bytes())
     found = read_pd0(path)
     assert found.about == "Teledyne PD0, 3 ensembles, beam coordinates, bottom track in 100 %"
     ping, heading = found.messages[2:4]

@@ -56,7 +56,7 @@ def content(**changes: Any) -> Content:
     summary |= {"kernel": "log(dof=5)", "reason": "GNSS, 100-160 s", "duration_s": 599.0}
     summary |= {"n_beams": 4 * N, "n_outliers": 40, "faults": [{**fault, "is_suspect": True}]}
     summary |= {"versions": {"gtsam": "4.3.0"}, "settings": {"tolerance": None}}
-    of = {"trajectory": rows, "beams": beams, "summary": summary, "aids": {}, "protection": {}}
+    of = {"trajectory": rows, "beams": beams, "summary": summary, "aids": {}}
     return Content(**{**of, "epoch_s": None, **changes})
 
 

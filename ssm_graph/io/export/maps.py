@@ -12,6 +12,7 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 import numpy as np
 
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.runs import runs_of
 from ssm_graph.io.export.track import Track
 
 KML: Final = "http://www.opengis.net/kml/2.2"
@@ -52,10 +53,7 @@ def lines(points: Array) -> list[Array]:
 
 def suspect_stretches(track: Track) -> Iterator[slice]:
     """Yield where the answer is doubtful, stretch by stretch of two rows at least."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], track.is_suspect.astype(int), [0]])))
-    for begin, end in edges.reshape(-1, 2):
-        if end - begin > 1:
-            yield slice(int(begin), int(end))
+    yield from (slice(begin, end) for begin, end in runs_of(track.is_suspect) if end - begin > 1)
 
 
 def _line_geometry(points: Array) -> dict[str, Any]:

@@ -114,19 +114,13 @@ def track_of(results: Results, *, epoch_s: float | None = None) -> Track:
                 f"{path}:{bad[0] + 2}: {name} is not finite; the run ended as "
                 f"{results.summary.get('status')}: smooth the mission again"
             )
-    is_unix = UNIX_FROM_S <= time_s[0] <= UNIX_UNTIL_S
-    if is_unix and epoch_s is not None:
-        raise ConfigError(
-            f"--epoch: the times of {path} begin at {time_s[0]:.3f} s, which is Unix time; leave "
-            "the option out"
-        )
     angles = np.radians(np.column_stack([rows[f"{n}_deg"] for n in ("roll", "pitch", "heading")]))
     sigmas = [rows[f"sigma_{name}_deg"] for name in ("roll", "pitch", "heading")]
     summary = results.summary
     return Track(
         name=str(summary.get("mission") or results.folder.name),
         about=f"{summary.get('method')}, {summary.get('status')}: {summary.get('reason')}",
-        epoch_s=0.0 if is_unix else epoch_s,
+        epoch_s=epoch_of(results, epoch_s),
         is_suspect=rows.get("suspect", np.zeros(len(time_s))) > 0.5,
         time_s=time_s,
         lat=np.radians(rows["lat_deg"]),
@@ -138,6 +132,22 @@ def track_of(results: Results, *, epoch_s: float | None = None) -> Track:
         velocity_sigma_enu=np.column_stack([rows[f"sigma_vel_{name}_m_per_s"] for name in _ENU]),
         attitude_sigma=np.radians(np.column_stack(sigmas)),
     )
+
+
+def epoch_of(results: Results, stated_s: float | None) -> float | None:
+    """Return the Unix time of ``time_s`` 0, s: the stated one, 0 where times are Unix time already.
+
+    Raises :class:`ConfigError` where both are the case.
+    """
+    begin_s = float(results.trajectory["time_s"][0])
+    if not UNIX_FROM_S <= begin_s <= UNIX_UNTIL_S:
+        return stated_s
+    if stated_s is not None:
+        raise ConfigError(
+            f"--epoch: the times of {results.folder / 'trajectory.csv'} begin at {begin_s:.3f} s, "
+            "which is Unix time; leave the option out"
+        )
+    return 0.0
 
 
 def parse_epoch(text: str) -> float:

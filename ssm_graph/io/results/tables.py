@@ -8,6 +8,7 @@ a contract: they only grow.
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 from collections.abc import Callable, Mapping
@@ -170,6 +171,27 @@ def read_results(folder: Path | str) -> Results:
         beams=_read_table(folder / BEAMS_NAME, BEAM_COLUMNS),
         summary=summary,
     )
+
+
+def read_aids(folder: Path) -> dict[str, Any]:
+    """Return the columns of ``aids.csv``, words as lists; empty where the run had no aids.
+
+    Raises :class:`DataError` for a table that is damaged.
+    """
+    path = folder / AIDS_NAME
+    if not path.exists():
+        return {}
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            rows = list(csv.DictReader(file))
+        words: dict[str, Any] = {
+            name: [row[name] for row in rows] for name in ("aid", "component", "unit")
+        }
+        for name in ("time_s", "innovation", "mahalanobis_sq", "weight"):
+            words[name] = np.array([float(row[name]) for row in rows])
+    except (OSError, KeyError, ValueError, TypeError) as error:
+        raise DataError(f"{path}: expected a table of aids: {error}; smooth again") from error
+    return words if rows else {}
 
 
 def trajectory_columns(trajectory: Trajectory) -> Columns:

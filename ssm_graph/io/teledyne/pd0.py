@@ -16,13 +16,11 @@ import numpy as np
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
-from ssm_graph.io.teledyne.ensembles import Ensemble, Setup, find_ensembles, is_pd0
+from ssm_graph.io.teledyne.ensembles import Ensemble, Setup, find_ensembles
 from ssm_graph.sensors.compass import HeadingReading
 from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.messages import Message
 
-SNIFFED: Final = 1 << 16
-"""Bytes at the begin in which an ensemble has to be."""
 _LARGEST: Final = 1 << 31
 _HEADING_MEASURED: Final = 0x10
 _AXES: Final = np.array([[0.0, -1.0], [0.0, 1.0], [1.0, 0.0], [-1.0, 0.0]])
@@ -39,15 +37,6 @@ class Pd0:
     """Pings and headings in order of time; times are Unix seconds of the instrument's clock."""
     notes: tuple[str, ...]
     """What was left out or assumed, and what mission.toml has to say, one sentence each."""
-
-
-def is_pd0_file(path: Path) -> bool:
-    """Return whether a file holds PD0 ensembles near its begin."""
-    try:
-        with path.open("rb") as stream:
-            return is_pd0(stream.read(SNIFFED))
-    except OSError:
-        return False
 
 
 def read_pd0(path: Path) -> Pd0:

@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.runs import runs_of
 from ssm_graph.report.page.content import Content
 from ssm_graph.report.style import (
     EAST_NORTH_UP,
@@ -127,8 +128,8 @@ def _track(content: Content) -> Chart:
     ]
     # Gaps in place are none of the track's: it is drawn as it is.
     traces[1] |= {"x": packed(enu[kept, 0]), "y": packed(enu[kept, 1]), "type": "scatter"}
-    for number, rows_of in enumerate(_stretches(content.is_suspect)):
-        part = enu[rows_of]
+    for number, (begin, end) in enumerate(runs_of(content.is_suspect)):
+        part = enu[begin:end]
         doubtful = line(part[:, 0], part[:, 1], "suspect", SUSPECT, width=4)
         doubtful |= {"x": packed(part[:, 0]), "y": packed(part[:, 1]), "showlegend": number == 0}
         traces.append(doubtful)
@@ -153,11 +154,6 @@ def _clock(content: Content, time_s: float) -> str:
         return text
     when = datetime.fromtimestamp(time_s + content.epoch_s, UTC)
     return f"{text}, {when.strftime('%H:%M:%S')} UTC"
-
-
-def _stretches(inside: Any) -> Iterator[slice]:
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], np.asarray(inside).astype(int), [0]])))
-    yield from (slice(int(begin), int(end)) for begin, end in edges.reshape(-1, 2))
 
 
 def _ellipses(content: Content, enu: Array) -> dict[str, Any]:
@@ -190,11 +186,6 @@ def _series(content: Content) -> Iterator[Chart]:
         line(t, 3.0 * rows[f"sigma_{name}_m"], f"3 sigma {name}", color)
         for name, color in zip(("east", "north", "up"), EAST_NORTH_UP, strict=True)
     ]
-    if content.protection:
-        at = content.minutes(content.protection["time_s"])
-        level = content.protection["protection_m"]
-        level = np.where(np.isfinite(level), level, np.nan)
-        traces.append(line(at, level, "protection level", INK, dash="dash"))
     note = "How well the position is known: three sigma by axis."
     log = {"type": "log"} if _decades(traces) > 2.0 else {"rangemode": "tozero"}
     yield Chart("sigma", "Uncertainty", note, traces, axes(MINUTES, "3 sigma, m", yaxis=log))

@@ -21,8 +21,6 @@ class Content:
     summary: Mapping[str, Any]
     aids: Mapping[str, Any]
     """Columns of ``aids.csv``, words as lists; empty where there is none."""
-    protection: Mapping[str, Array]
-    """Columns of ``protection.csv``, empty where the run was not live."""
     epoch_s: float | None
     """Unix time of ``time_s`` 0, s; None where nobody knows."""
 
