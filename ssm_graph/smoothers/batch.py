@@ -394,8 +394,7 @@ class SsmSmoother:
 
 
 def _posterior(problem: Problem, last: Pass) -> Posterior:
-    """Return what is known of the keyframes; calibrated errors of the inertial sensors count as
-    known between them."""
+    """Return what is known of the keyframes, with the errors found of the inertial sensors."""
     states, errors = last.states, None
     if len(columns_of_errors(problem.extras)):
         errors = np.atleast_2d(imu_errors(problem.extras, states.walks, states.constants)[0])

@@ -19,7 +19,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from typing import Final, NamedTuple
 
@@ -85,6 +85,7 @@ def answers_at(
     *,
     point: Point | None = None,
     wants_covariance: bool = False,
+    on_progress: Callable[[int, int, int], None] | None = None,
 ) -> Answers:
     """Return the states at any times within the keyframes.
 
@@ -96,6 +97,7 @@ def answers_at(
     point : of the vehicle; the inertial unit when left out. Velocity is that of the point, attitude
         that of its own axes.
     wants_covariance : whether the whole covariance is kept, not only sigmas.
+    on_progress : called with how many times are done, were before, and how many there are.
 
     Raises
     ------
@@ -113,6 +115,9 @@ def answers_at(
         own = trajectory_at(posterior.frame, at, states, covariance, n_beams=np.zeros(len(at)))
         full = covariance_at(posterior.frame, states, covariance) if wants_covariance else None
         parts.append((known.row, own, full))
+        if on_progress is not None:
+            done = sum(len(row) for row, _, _ in parts)
+            on_progress(done, done - len(known.row), len(time_s))
     order = np.argsort(np.concatenate([row for row, _, _ in parts]))
     columns = (f.name for f in fields(Trajectory))
     joined = (

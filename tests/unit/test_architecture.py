@@ -50,6 +50,7 @@ MAY_IMPORT = {
     | {"smoothers", "filters", "graph", "mission", "engine", "simulation", "evaluation"}
     | {"factors", "io"},
     "report": VALUES | {"evaluation"},
+    "result": VALUES | {"io", "smoothers", "evaluation", "report"},
     "inspection": VALUES | {"io", "live", "mission", "report"},
     **dict.fromkeys(SYSTEMS, OF_SYSTEMS),
 }
