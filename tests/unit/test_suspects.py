@@ -1,6 +1,6 @@
 """Clocks, units and axes are named one by one, with the line that mends them; healthy logs never.
 
-Thresholds were chosen on seeds 0 to 3; seeds 100 to 129 gave the rates in ``docs/method.md``. Here
+Thresholds were chosen on seeds 0 to 3; seeds 100 to 129 gave the rates in ``docs/method-details.md``. Here
 are others.
 """
 
