@@ -82,7 +82,7 @@ def from_above(centre: Point) -> list[str]:
     )
     parts.append(text((x - 40, y + 40), "z down", "small", "end"))
     corner = (x - 120.0, y + 118.0)
-    parts.append(arrow(corner, (corner[0], corner[1] - 70), "line", "north", (6.0, 4.0)))
+    parts.append(arrow(corner, (corner[0], corner[1] - 70), "line", "north", (-20.0, -8.0)))
     parts.append(arrow(corner, (corner[0] + 70, corner[1]), "line", "east"))
     parts.append(arrow(centre, (x, y - 100), "thin", ""))
     end = (x + 72 * math.sin(heading), y - 72 * math.cos(heading))
