@@ -129,8 +129,10 @@ def _parser(wanted: Collection[str]) -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name in COMMANDS:
         own = _subparser(parser.prog, name) if name in wanted else None
-        made = commands.add_parser(name, parents=[own] if own else [], add_help=own is None)
-        if own is not None:
+        if own is None:
+            commands.add_parser(name)  # named by its group above
+        else:
+            made = commands.add_parser(name, parents=[own], add_help=False, help=COMMANDS[name])
             made.description, made.epilog = own.description, own.epilog
             made.formatter_class, made._defaults = own.formatter_class, own._defaults
     return parser
