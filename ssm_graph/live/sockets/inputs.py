@@ -9,6 +9,7 @@ import socket
 from abc import ABC, abstractmethod
 from typing import Final
 
+from ssm_graph.live.sockets.clocks import Now
 from ssm_graph.live.sockets.endpoints import (
     CHUNK,
     Endpoint,
@@ -18,7 +19,7 @@ from ssm_graph.live.sockets.endpoints import (
     received,
     resolve,
 )
-from ssm_graph.live.sockets.feed import AHEAD_S, Channel, Feed, Now
+from ssm_graph.live.sockets.feed import AHEAD_S, Channel, Feed
 from ssm_graph.mission.navigation import Severity
 from ssm_graph.mission.run_status import LinkState, SourceStatus
 from ssm_graph.sensors.messages import Message

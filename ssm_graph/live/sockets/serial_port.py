@@ -13,8 +13,9 @@ from importlib import import_module
 from typing import Any, Final, cast
 
 from ssm_graph.base.errors import ConfigError
+from ssm_graph.live.sockets.clocks import Now
 from ssm_graph.live.sockets.endpoints import Endpoint
-from ssm_graph.live.sockets.feed import Channel, Feed, Now
+from ssm_graph.live.sockets.feed import Channel, Feed
 from ssm_graph.live.sockets.inputs import Input, Patience
 from ssm_graph.mission.navigation import Severity
 from ssm_graph.mission.run_status import LinkState, SourceStatus
