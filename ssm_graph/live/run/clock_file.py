@@ -8,6 +8,7 @@ time of the run whatever the vehicle's clock was set to between the two.
 from __future__ import annotations
 
 import contextlib
+import math
 from pathlib import Path
 from typing import Final
 
@@ -46,7 +47,8 @@ class ClockFile:
                 cells = line.decode("ascii", "replace").split(",")
                 if len(cells) == len(_HEAD.split(b",")) and cells[3] == self._boot:
                     with contextlib.suppress(ValueError):
-                        found = float(cells[0]) - float(cells[2])
+                        begun_s = float(cells[0]) - float(cells[2])
+                        found = begun_s if math.isfinite(begun_s) else found
         if found is None or not self._boot:
             return 0.0
         ahead_s = wall_s - (steady_s + found)

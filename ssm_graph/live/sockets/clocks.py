@@ -81,6 +81,8 @@ class RunClock:
         """By how much the vehicle's clock is ahead of the time of the run, s."""
         self.set_at_s = -math.inf
         """When it was set last, s on the steady clock."""
+        self.has_begun = False
+        """Whether a message has come; before, a clock that is set is the time of the run."""
         self._known: Now | None = None
         self.read()
 
@@ -101,8 +103,9 @@ class RunClock:
         step_s = (now.wall_s - known.wall_s) - (now.steady_s - known.steady_s)
         if not abs(step_s) > SET_S:
             return now, 0.0
-        self.set_by_s += step_s
-        self.set_at_s = now.steady_s
+        if self.has_begun:
+            self.set_by_s += step_s
+            self.set_at_s = now.steady_s
         return now, step_s
 
 
@@ -210,6 +213,7 @@ class StampClock:
 
     def _passed(self, message: Message, now: Now) -> Message:
         """Return a message of the known clock in the time of the run; remember it."""
+        self._clock.has_begun = True
         time_s = message.time_s - self._shift_s
         self._lag_s = self._run_s(now) - time_s
         self._lead_s = max(self._lead(now), -self._lag_s)
@@ -259,8 +263,10 @@ class StampClock:
 
 
 class StampClocks:
-    """The clocks of all sources: one of the inertial data, wherever they come from, and of every
-    other kind of message one for each source.
+    """The clocks of all sources.
+
+    One stamps the inertial data, wherever they come from; of every other kind of message each
+    source has one.
     """
 
     def __init__(self, clock: RunClock) -> None:

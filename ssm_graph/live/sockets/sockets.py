@@ -114,8 +114,9 @@ class SocketHub:
         ready = self._selector.select(max(0.0, timeout_s))
         now, step_s = self._clock.read()
         if step_s:
-            text = f"the vehicle's clock was set by {step_s:+.6g} s: the run goes on in its own "
-            text += "time, answers are stamped by the vehicle's clock"
+            text = f"the vehicle's clock was set by {step_s:+.6g} s"
+            if self._clock.has_begun:
+                text += ": the run goes on in its own time, answers are stamped by that clock"
             self._events.note("run", "clock_set", text, Severity.WARNING, burst=5)
             self._keep_clock(now)
         self._look_for_a_standstill(now, timeout_s)
