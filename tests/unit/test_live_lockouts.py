@@ -12,6 +12,7 @@ from ssm_graph.live.protocols.json_messages import JsonDecoder, encode_message
 from ssm_graph.live.protocols.nmea import NmeaDecoder
 from ssm_graph.live.sockets.clocks import STRANGER_S, RunClock, StampClock
 from ssm_graph.live.sockets.endpoints import LOOPBACK, Endpoint, Transport
+from ssm_graph.live.sockets.feed import Limits
 from ssm_graph.live.sockets.inputs import TcpServerInput, UdpInput
 from ssm_graph.live.sockets.outputs import MAX_CLIENTS, OutputFormat, TcpServerOutput
 from ssm_graph.live.sockets.sockets import InputConfig, OutputConfig, SocketHub
@@ -295,4 +296,27 @@ def test_what_came_while_the_process_was_stopped_is_not_stamped_now() -> None:
         sender.send(gga(later))
         receiver.until(lambda: receiver.messages)
         assert receiver.messages[0].time_s == pytest.approx(later.time_s, abs=1.0)
+        sender.close()
+
+
+def test_what_waited_while_the_process_was_stopped_is_not_too_much() -> None:
+    """A hundred samples a second for ten seconds, at once: all of them, from one who is counted."""
+    clock = Steady()
+    limits = Limits(messages_per_s=110.0, burst=20, bytes_per_s=3e4)
+    config = InputConfig("imu", Endpoint(Transport.UDP, LOOPBACK, 0), JsonDecoder, limits)
+    with SocketHub([config], steady_s=clock, wall_s=lambda: WALL_S + clock.now_s) as hub:
+        receiver = Receiver(hub)
+        receiver.poll()
+        sender = UdpSender(port_of(hub))
+        stamps = [clock.now_s + k * PERIOD_S for k in range(1001)]
+        sender.send(encode_message(sample(stamps[0])))
+        receiver.until(lambda: receiver.messages)
+        for begin in range(1, 1001, 100):
+            lines = (encode_message(sample(stamp)) for stamp in stamps[begin : begin + 100])
+            sender.send(b"".join(lines))
+        clock.now_s += 10.0
+        receiver.until(lambda: len(receiver.messages) == 1001)
+        assert [message.time_s for message in receiver.messages] == stamps
+        sender.send(b"".join(encode_message(sample(stamps[-1] + k)) for k in range(1, 200)))
+        receiver.until(lambda: "rate_limited" in receiver.kinds)  # and then as ever
         sender.close()

@@ -148,6 +148,11 @@ class Feed:
                 self.tell("clock_set", text, Severity.WARNING)
         return passed
 
+    def stood_still(self, span_s: float) -> None:
+        """Have what came within a time in which nobody listened, s, not be too much at once."""
+        for bucket in self._buckets.values():
+            bucket.grant(span_s)
+
     def idle(self, channel: Channel, now: Now) -> list[Message]:
         """Return what the decoder releases where nothing has come for a second."""
         return self.take(channel, b"", now) if now.steady_s - channel.fed_s >= IDLE_S else []
