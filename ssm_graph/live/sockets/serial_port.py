@@ -51,6 +51,7 @@ class SerialPort:
         control &= ~(termios.CSIZE | termios.PARENB | termios.CSTOPB)
         control &= ~getattr(termios, "CRTSCTS", 0)
         control |= termios.CS8 | termios.CREAD | termios.CLOCAL
+        special[termios.VMIN], special[termios.VTIME] = 1, 0  # reading nothing is its end
         return [inputs, 0, control, local, speed, speed, special]
 
     def fileno(self) -> int:
