@@ -25,6 +25,7 @@ from ssm_graph.base.settings import (
 from ssm_graph.base.tables import LARGEST_TIME_S, Order, Table
 from ssm_graph.base.units import DEGREE
 from ssm_graph.mission.mission import InitialState, Reference
+from ssm_graph.mission.point import POINT_KEYS, Point, point
 from ssm_graph.sensors.current import CURRENT_KEYS
 from ssm_graph.sensors.instrument import ENU, Column, Instrument
 from ssm_graph.sensors.place import PLACE_KEYS, POSITION, PositionInstrument
@@ -91,6 +92,7 @@ SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
 LISTS: Final[Mapping[str, Mapping[str, Key]]] = {
     **{name: keys for one in INSTRUMENTS for name, keys in one.lists.items()},
     "standstill": STANDSTILL_KEYS,
+    "point": POINT_KEYS,
 }
 """Sections that may come several times, ``[[beacon]]``."""
 REQUIRED_SECTIONS: Final = ("frames", *(one.section for one in INSTRUMENTS if one.is_required))
@@ -130,6 +132,18 @@ class MissionToml:
     def initial(self) -> InitialState | None:
         """Return the state that ``[initial]`` states."""
         return build(InitialState, self["initial"].given()) if "initial" in self else None
+
+    def points(self) -> dict[str, Point]:
+        """Return every point of the vehicle by name: ``[[point]]``, and instruments elsewhere."""
+        found = {}
+        for one in INSTRUMENTS:
+            bare = self.bare(one) if one.section in self else None
+            owner = getattr(bare, "mount", bare)
+            if owner is not None and hasattr(owner, "lever_arm_b"):
+                found[one.section] = Point(one.section, owner.lever_arm_b)
+        for settings in self.lists["point"]:
+            found[settings.text("name")] = point(settings)
+        return found
 
     def fault_of_no_place(self) -> ConfigError:
         """Return the error of a mission that may be anywhere on Earth."""
@@ -180,11 +194,11 @@ def _checked(raw: dict[str, Any], path: Path, may_miss: frozenset[str]) -> Missi
         order=top.choice("order", Order, Order.TIME),
         body=body,
         sections=sections,
-        lists={name: _read_list(name, raw.get(name, []), file) for name in LISTS},
+        lists={name: _read_list(name, raw.get(name, []), file, body) for name in LISTS},
     )
 
 
-def _read_list(name: str, raw: object, file: str) -> tuple[Settings, ...]:
+def _read_list(name: str, raw: object, file: str, axes: BodyAxes) -> tuple[Settings, ...]:
     """Read the sections ``[[name]]`` of a file."""
     if not isinstance(raw, list):
         raise ConfigError(
@@ -192,7 +206,7 @@ def _read_list(name: str, raw: object, file: str) -> tuple[Settings, ...]:
             f"{shown(raw)}; write double brackets"
         )
     return tuple(
-        read_settings(f"[[{name}]] {number}", item, known=LISTS[name], file=file)
+        read_settings(f"[[{name}]] {number}", item, known=LISTS[name], file=file, axes=axes)
         for number, item in enumerate(raw, start=1)
     )
 
