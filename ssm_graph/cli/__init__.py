@@ -1,5 +1,5 @@
 """The command line.
 
-``ssm-graph simulate | smooth | filter | online | compare | inspect | convert | export | report |
+``ssm-graph simulate | smooth | filter | online | compare | inspect | template | convert | export | report |
 locate | locate-simulate | locate-study | slam | slam-study | integrity | network | network-run``.
 """

@@ -14,6 +14,8 @@ from ssm_graph.base.frames import BodyAxes
 from ssm_graph.cli.options import add_mission_output, choice_option, number_option
 from ssm_graph.cli.terminal import say
 from ssm_graph.io.blueye.convert import convert_blueye
+from ssm_graph.io.columns.convert import convert_columns
+from ssm_graph.io.columns.map_file import read_map
 from ssm_graph.io.file_kind import is_mcap, kind_of
 from ssm_graph.io.mission_folder.folder import write_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle
@@ -34,6 +36,9 @@ Convert a log. LOG is one of
   an instrument's  Water Linked or Teledyne PD0 (dvl.csv, heading.csv), NMEA 0183 (gnss.csv,
   own output       heading.csv): tables for a mission folder, which mission.toml and imu.csv make
                    whole
+  tables of any    CSV, Parquet, MAT, HDF5 (extra 'columns'), with --map map.toml, which says what
+  columns          their columns are: ssm-graph template writes one to fill in, ssm-graph inspect
+                   FILE --draft-map drafts one of a table
   several files    a table with the columns of imu.csv and recordings as above, with --vehicle: one
                    mission on the clock of the IMU, the others moved by the turns they show
 
@@ -57,6 +62,12 @@ def declare(parser: argparse.ArgumentParser) -> None:
         help="file or folder to convert; several are merged: an imu.csv and recordings of others",
     )
     add_mission_output(parser)
+    parser.add_argument(
+        "--map",
+        type=Path,
+        metavar="FILE",
+        help="of tables of any columns: which is which, in what unit, sign and axes",
+    )
     _add_ros_options(parser)
     parser.set_defaults(run=run)
 
@@ -74,8 +85,8 @@ def _add_ros_options(parser: argparse.ArgumentParser) -> None:
         "--vehicle",
         type=Path,
         metavar="FILE",
-        help="of ROS bags and several logs: noise, lever arms, DVL mounting and beam directions: a "
-        "mission.toml (its tables need not exist) or a mission folder",
+        help="of ROS bags, several logs and tables of any columns: noise, lever arms, DVL mounting "
+        "and beam directions: a mission.toml (its tables need not exist) or a mission folder",
     )
     group = parser.add_argument_group("of ROS bags only")
     group.add_argument(
@@ -118,6 +129,8 @@ def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
     for log in arguments.log:
         if log.exists() and arguments.out.resolve() == log.resolve():
             raise ConfigError(f"--out: expected another folder than that of LOG: {arguments.out}")
+    if arguments.map is not None:
+        return _write(_from_columns(arguments), arguments, console)
     if len(arguments.log) > 1:
         return _merge(arguments, console)
     (log,) = arguments.log
@@ -157,6 +170,25 @@ def _merge(arguments: argparse.Namespace, console: Console) -> bool:
     _say_mission(found.mission, arguments.out, console)
     _say_notes(found.notes, console)
     return True
+
+
+def _from_columns(arguments: argparse.Namespace) -> Mission:
+    """Return the mission of tables of any columns."""
+    _refuse_ros_options(arguments.log[0], arguments, ROS_OPTIONS[1:])
+    if arguments.clock_offset is not None:
+        raise ConfigError("--clock-offset: of tables with a map, time has the key offset_s")
+    column_map = read_map(arguments.map)
+    path = arguments.vehicle or column_map.vehicle
+    if path is None:
+        raise ConfigError(
+            f'{arguments.map}: expected vehicle = "vehicle.toml", or  --vehicle FILE, with noise, '
+            "mounting and place"
+        )
+    for log in arguments.log:
+        if not log.is_file():
+            raise DataError(f"{log}: expected a file with columns")
+    vehicle = read_vehicle(path)
+    return convert_columns(arguments.log, column_map, vehicle, name=vehicle.name)
 
 
 def _write(mission: Mission, arguments: argparse.Namespace, console: Console) -> bool:

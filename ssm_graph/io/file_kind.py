@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
+CSV_ENDINGS: Final = (".csv", ".txt", ".tsv", ".dat")
 READ: Final = (
     "a ROS 2 bag (a folder, .mcap or .db3), a ROS 1 .bag, a Blueye X3 log, Teledyne PD0, Water "
     "Linked JSON or a table of its reports, or NMEA 0183"
@@ -23,8 +24,9 @@ _KINDS: Final = (
     (b"\x7f\x7f", "like Teledyne PD0, but its first ensemble is damaged"),
     (b"\xb5\x62", "binary of a u-blox receiver: have it write NMEA, or convert it"),
     (b"SQLite format 3\0", "an SQLite database: a ROS 2 bag has it under the name .db3"),
-    (b"PAR1", "a Parquet table: put it into a mission folder"),
-    (b"\x89HDF\r\n", "an HDF5 file"),
+    (b"PAR1", "a Parquet table: say what its columns are, with  --map"),
+    (b"\x89HDF\r\n", "an HDF5 file: say what its columns are, with  --map"),
+    (b"MATLAB", "a MAT file: say what its columns are, with  --map"),
 )
 
 
@@ -43,6 +45,11 @@ def kind_of(path: Path) -> str:
     for begin, what in _KINDS:
         if head.startswith(begin):
             return f"this is {what}; expected {READ}"
+    if path.suffix.lower() in CSV_ENDINGS:
+        return (
+            "a table or text of unknown columns: say what they are, with  --map  (ssm-graph "
+            f"template, ssm-graph inspect {path.name} --draft-map map.toml); else expected {READ}"
+        )
     if _is_mavlink(head):
         return f"this is a MAVLink telemetry log: export it with  mavlogdump.py; expected {READ}"
     if head.startswith(_MCAP):
