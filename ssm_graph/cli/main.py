@@ -40,6 +40,7 @@ COMMANDS: Final = {
     "online": "navigate live from instruments on sockets, or replay a mission as if live",
     "compare": "compare methods on many simulated or recorded missions",
     "inspect": "say what is in a file, folder, bag or mission, and whether it can be smoothed",
+    "instruments": "list the inertial units and DVLs whose figures are known by name",
     "template": "write map.toml and vehicle.toml to fill in, for tables of any columns",
     "convert": "turn a maker's log, a ROS bag or tables of any columns into a mission folder",
     "export": "write a result for QGIS, Google Earth, evo, xarray, Foxglove, multibeam software",
