@@ -13,6 +13,11 @@ from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frames import BodyAxes
 from ssm_graph.cli.options import add_mission_output, choice_option, number_option
 from ssm_graph.cli.terminal import say
+from ssm_graph.io.ardupilot.convert import (
+    ArduPilotOptions,
+    convert_ardupilot,
+    is_ardupilot,
+)
 from ssm_graph.io.blueye.convert import convert_blueye
 from ssm_graph.io.columns.convert import convert_columns
 from ssm_graph.io.columns.map_file import read_map
@@ -33,6 +38,8 @@ Convert a log. LOG is one of
   a ROS bag        ROS 2: the folder, with metadata.yaml or without, or a single .mcap or .db3 file;
                    ROS 1: a .bag (extra 'ros')
   a Blueye X3 log  MCAP of the maker (extra 'blueye')
+  an ArduPilot log dataflash .BIN, or telemetry .tlog (extra 'ardupilot'): IMU, GPS, barometer, and
+                   VISO, the movements that a DVL sends; --water-density, --surface-height
   an instrument's  Water Linked or Teledyne PD0 (dvl.csv, heading.csv), NMEA 0183 (gnss.csv,
   own output       heading.csv): tables for a mission folder, which mission.toml and imu.csv make
                    whole
@@ -85,10 +92,11 @@ def _add_ros_options(parser: argparse.ArgumentParser) -> None:
         "--vehicle",
         type=Path,
         metavar="FILE",
-        help="of ROS bags, several logs and tables of any columns: noise, lever arms, DVL mounting "
-        "and beam directions: a mission.toml (its tables need not exist) or a mission folder",
+        help="of ROS bags, ArduPilot logs, several logs and tables of any columns: noise, lever "
+        "arms, DVL mounting and beam directions: a mission.toml (its tables need not exist) or a "
+        "mission folder",
     )
-    group = parser.add_argument_group("of ROS bags only")
+    group = parser.add_argument_group("of ROS bags; water and its surface of ArduPilot logs too")
     group.add_argument(
         "--topic",
         type=_topic,
@@ -138,6 +146,8 @@ def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
         raise ConfigError(f"--clock-offset is for several logs, got {log} alone")
     if is_rosbag(log):
         return _write(_from_rosbag(log, arguments), arguments, console)
+    if log.is_file() and is_ardupilot(log):
+        return _write(_from_ardupilot(log, arguments), arguments, console)
     _refuse_ros_options(log, arguments, ROS_OPTIONS)
     if not log.exists():
         raise DataError(f"{log}: there is no such file or folder")
@@ -170,6 +180,22 @@ def _merge(arguments: argparse.Namespace, console: Console) -> bool:
     _say_mission(found.mission, arguments.out, console)
     _say_notes(found.notes, console)
     return True
+
+
+def _from_ardupilot(log: Path, arguments: argparse.Namespace) -> Mission:
+    own = ("vehicle", "water_density", "surface_height")
+    _refuse_ros_options(log, arguments, [name for name in ROS_OPTIONS if name not in own])
+    density = _density(arguments)
+    vehicle = None if arguments.vehicle is None else read_vehicle(arguments.vehicle)
+    options = ArduPilotOptions(density, arguments.surface_height)
+    return convert_ardupilot(log, vehicle=vehicle, options=options)
+
+
+def _density(arguments: argparse.Namespace) -> float | None:
+    density: float | None = arguments.water_density
+    if density is not None and density <= 0.0:
+        raise ConfigError(f"--water-density: expected a number above zero, got {density:g}")
+    return density
 
 
 def _from_columns(arguments: argparse.Namespace) -> Mission:
@@ -225,9 +251,7 @@ def _say_notes(notes: Iterable[str], console: Console) -> None:
 
 def _from_rosbag(log: Path, arguments: argparse.Namespace) -> Mission:
     defaults = RosOptions()
-    density, atmosphere = arguments.water_density, arguments.atmosphere
-    if density is not None and density <= 0.0:
-        raise ConfigError(f"--water-density: expected a number above zero, got {density:g}")
+    density, atmosphere = _density(arguments), arguments.atmosphere
     against = bool(arguments.beams_against)
     options = RosOptions(
         body=arguments.body or defaults.body,

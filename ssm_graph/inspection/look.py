@@ -15,6 +15,7 @@ from ssm_graph.base.errors import DataError, SsmGraphError
 from ssm_graph.base.frozen import Array
 from ssm_graph.inspection.sensors import SensorFound, sensors_of
 from ssm_graph.inspection.timing import timing_of
+from ssm_graph.io.ardupilot.convert import convert_ardupilot, is_ardupilot
 from ssm_graph.io.blueye.convert import convert_blueye
 from ssm_graph.io.columns.sources import ENDINGS, read_source
 from ssm_graph.io.file_kind import is_mcap, kind_of
@@ -130,6 +131,8 @@ def _reader(path: Path) -> tuple[str, Any]:
         return "ROS bag", convert_rosbag
     if path.is_file() and is_mcap(path):
         return "Blueye X3 log (MCAP)", convert_blueye
+    if path.is_file() and is_ardupilot(path):
+        return "ArduPilot log", convert_ardupilot
     return "", None
 
 
