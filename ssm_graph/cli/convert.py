@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
@@ -29,8 +30,10 @@ from ssm_graph.io.ros.convert import convert_rosbag
 from ssm_graph.io.ros.log import ROLES, is_rosbag
 from ssm_graph.io.ros.messages import SEA_WATER, STANDARD_ATMOSPHERE, BeamSign, RosOptions
 from ssm_graph.live.recorded.log import Recorded, read_recorded, write_tables
-from ssm_graph.live.recorded.merge import merge_recordings
+from ssm_graph.live.recorded.merge import Merged, merge_recordings, mission_of_recording
 from ssm_graph.mission.mission import Mission
+from ssm_graph.sensors.dvl import Ping
+from ssm_graph.sensors.messages import Message
 
 DESCRIPTION = f"""\
 Convert a log. LOG is one of
@@ -40,9 +43,10 @@ Convert a log. LOG is one of
   a Blueye X3 log  MCAP of the maker (extra 'blueye')
   an ArduPilot log dataflash .BIN, or telemetry .tlog (extra 'ardupilot'): IMU, GPS, barometer, and
                    VISO, the movements that a DVL sends; --water-density, --surface-height
-  an instrument's  Water Linked or Teledyne PD0 (dvl.csv, heading.csv), NMEA 0183 (gnss.csv,
-  own output       heading.csv): tables for a mission folder, which mission.toml and imu.csv make
-                   whole
+  an instrument's  Water Linked; Teledyne PD0, PD4, PD5, PD6; Nortek AD2CP (DVL, ADCP with bottom
+  own output       track) and Nucleus (dvl.csv, heading.csv, imu.csv of a Nucleus); NMEA 0183
+                   (gnss.csv, heading.csv): tables for a mission folder, which mission.toml and
+                   imu.csv make whole; of a Nucleus, with --vehicle, a mission
   tables of any    CSV, Parquet, MAT, HDF5 (extra 'columns'), with --map map.toml, which says what
   columns          their columns are: ssm-graph template writes one to fill in, ssm-graph inspect
                    FILE --draft-map drafts one of a table
@@ -120,8 +124,9 @@ def _add_ros_options(parser: argparse.ArgumentParser) -> None:
         "--beams-against",
         action="store_true",
         default=None,
-        help="the speeds of marine_acoustic_msgs are positive when the vehicle moves against the "
-        "beam (default: found by the velocity in the messages)",
+        help="the speeds are positive when the vehicle moves against the beam: of "
+        "marine_acoustic_msgs (default: found by the velocity in the messages) and of an "
+        "instrument's own output",
     )
 
 
@@ -148,15 +153,23 @@ def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
         return _write(_from_rosbag(log, arguments), arguments, console)
     if log.is_file() and is_ardupilot(log):
         return _write(_from_ardupilot(log, arguments), arguments, console)
-    _refuse_ros_options(log, arguments, ROS_OPTIONS)
+    own = ("vehicle", "beams_against")
+    _refuse_ros_options(log, arguments, [name for name in ROS_OPTIONS if name not in own])
     if not log.exists():
         raise DataError(f"{log}: there is no such file or folder")
     if is_mcap(log):
+        _refuse_ros_options(log, arguments, own)
         return _write(convert_blueye(log), arguments, console)
     recorded = None if log.is_dir() else read_recorded(log)
     if recorded is None:
         raise DataError(f"{log}: {kind_of(log)}")
-    return _write_tables(recorded, arguments.out, console)
+    if arguments.beams_against:
+        recorded = replace(recorded, messages=tuple(map(_turned, recorded.messages)))
+    if arguments.vehicle is None:
+        return _write_tables(recorded, arguments.out, console)
+    vehicle = read_vehicle(arguments.vehicle)
+    made = mission_of_recording(log, recorded, arguments.out, vehicle=vehicle)
+    return _said(made, arguments, console)
 
 
 def _refuse_ros_options(log: Path, arguments: argparse.Namespace, options: Iterable[str]) -> None:
@@ -177,6 +190,10 @@ def _merge(arguments: argparse.Namespace, console: Console) -> bool:
         if not log.is_file():
             raise DataError(f"{log}: expected a file, of an IMU or of one instrument")
     found = merge_recordings(arguments.log, arguments.out, vehicle=vehicle, offset_s=offset_s)
+    return _said(found, arguments, console)
+
+
+def _said(found: Merged, arguments: argparse.Namespace, console: Console) -> bool:
     _say_mission(found.mission, arguments.out, console)
     _say_notes(found.notes, console)
     return True
@@ -232,6 +249,13 @@ def _say_mission(mission: Mission, out: Path, console: Console) -> None:
         f"{out}: {span_s:.1f} s, {len(mission.imu.time_s)} inertial samples, "
         f"{len(mission.dvl.time_s)} pings, {n_fixes} GNSS fixes",
     )
+
+
+def _turned(message: Message) -> Message:
+    """Return a ping whose speeds count the other way."""
+    if not isinstance(message, Ping):
+        return message
+    return replace(message, speed=tuple(-speed for speed in message.speed))
 
 
 def _write_tables(recorded: Recorded, out: Path, console: Console) -> bool:

@@ -8,7 +8,8 @@ from typing import Final
 CSV_ENDINGS: Final = (".csv", ".txt", ".tsv", ".dat")
 READ: Final = (
     "a ROS 2 bag (a folder, .mcap or .db3), a ROS 1 .bag, a Blueye X3 log, an ArduPilot log, "
-    "Teledyne PD0, Water Linked JSON or a table of its reports, NMEA 0183, or tables with  --map"
+    "Teledyne PD0, PD4, PD5 or PD6, Nortek AD2CP or Nucleus, Water Linked JSON or a table of its "
+    "reports, NMEA 0183, or tables with  --map"
 )
 _MCAP: Final = b"\x89MCAP0\r\n"
 _COMPRESSED: Final = "a compressed file: unpack it first"
@@ -19,6 +20,7 @@ _KINDS: Final = (
     (b"\x1f\x8b", f"{_COMPRESSED}, with  gunzip"),
     (b"BZh", f"{_COMPRESSED}, with  bunzip2"),
     (b"PK\x03\x04", f"{_COMPRESSED}, with  unzip"),
+    (b"\xa3\x95\x80", "an ArduPilot DataFlash log"),
     (b"ULog\x01\x12\x35", "a PX4 ULog: export its tables with  ulog2csv"),
     (b"\x7f\x7f", "like Teledyne PD0, but its first ensemble is damaged"),
     (b"\xb5\x62", "binary of a u-blox receiver: have it write NMEA, or convert it"),
