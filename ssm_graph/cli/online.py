@@ -7,6 +7,7 @@ import contextlib
 import gc
 import math
 import signal
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -35,9 +36,11 @@ from ssm_graph.live.protocols.json_messages import JsonDecoder
 from ssm_graph.live.protocols.nmea import PRESSURE_SENTENCES, NmeaDecoder, NmeaOptions
 from ssm_graph.live.protocols.nmea_fields import DepthSentence
 from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
+from ssm_graph.live.run.clock_file import ClockFile
 from ssm_graph.live.run.replay_source import ReplaySource
 from ssm_graph.live.run.run_folder import RunFolder
 from ssm_graph.live.run.runner import Connections, Engine, RunEnd, Runner, RunnerConfig, StopReason
+from ssm_graph.live.sockets.clocks import boot_s
 from ssm_graph.live.sockets.endpoints import OUTPUTS, parse_endpoint
 from ssm_graph.live.sockets.feed import Limits
 from ssm_graph.live.sockets.outputs import OutputFormat, Publisher
@@ -125,7 +128,7 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
         runner = Runner(
             RunFolder(arguments.out, vehicle, _settings(lag, integrity)),
             engine_of(vehicle, lag, integrity),
-            _connector(stack, inputs, outputs, mission, speed),
+            _connector(stack, arguments.out, inputs, outputs, mission, speed),
             publisher=publisher,
             config=config,
             on_status=show,
@@ -200,15 +203,20 @@ def _settings(config: FixedLagConfig, integrity: IntegrityConfig) -> dict[str, A
 
 def _connector(
     stack: contextlib.ExitStack,
+    folder: Path,
     inputs: list[InputConfig],
     outputs: list[OutputConfig],
     mission: Mission | None,
     speed: float | None,
 ) -> Callable[[int], Connections]:
     def connect(n_messages: int) -> Connections:
-        hub = stack.enter_context(SocketHub(inputs, outputs))
         if mission is None:
+            clock = ClockFile(folder)
+            ahead_s = clock.set_by_s(time.time(), boot_s())
+            live = SocketHub(inputs, outputs, set_by_s=ahead_s, note_clock=clock.note)
+            hub = stack.enter_context(live)
             return Connections(hub, hub)
+        hub = stack.enter_context(SocketHub(outputs=outputs))
         source = ReplaySource(
             messages_of(mission),
             speed=speed,

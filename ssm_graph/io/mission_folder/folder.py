@@ -67,6 +67,7 @@ def read_mission(folder: Path | str) -> Mission:
     toml = read_mission_toml(Path(folder))
     bare = {one.section: toml.bare(one) for one in TABLES if one.section in toml}
     tables, notes = _read_tables(toml, bare)
+    notes = [*toml.notes, *notes]
     parts: dict[str, Part] = {}
     for one in TABLES:
         if one.section in tables:
