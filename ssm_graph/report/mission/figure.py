@@ -369,10 +369,12 @@ def _draw_beams(figure: Figure, place: SubplotSpec, estimate: Estimate) -> None:
         lower.append(weight)
     figure.align_ylabels([upper[0], lower[0]])
     linear = innovation_axis(upper[0], beams.innovation)
-    for axes in upper if linear is not None else ():
-        look = {"color": style.INK, "linewidth": 0.7, "alpha": 0.6, "dashes": (3, 3)}
-        axes.axhline(linear, label="innovations logarithmic beyond", **look)
-        axes.axhline(-linear, **look)
+    if linear is not None:
+        look: dict[str, Any] = {"color": style.INK, "linewidth": 0.7, "alpha": 0.6}
+        look |= {"dashes": (3, 3)}
+        for axes in upper:
+            axes.axhline(linear, label="innovations logarithmic beyond", **look)
+            axes.axhline(-linear, **look)
     handles, names = upper[0].get_legend_handles_labels()
     figure.legend(
         handles,
