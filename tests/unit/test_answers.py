@@ -161,8 +161,9 @@ def test_errors_and_coverage_hold_between_keyframes_and_at_a_lever_arm() -> None
         at_keyframes = np.sqrt(np.mean(square["keyframes", kind]))
         for where in ("between", "sonar"):
             assert np.sqrt(np.mean(square[where, kind])) < 1.05 * at_keyframes, (where, kind)
-            covered = np.mean(inside[where, kind])
-            assert covered > max(0.98, np.mean(inside["keyframes", kind]) - 0.005), (where, kind)
+            covered = float(np.mean(inside[where, kind]))
+            least = float(np.mean(inside["keyframes", kind])) - 0.005
+            assert covered > max(0.98, least), (where, kind)
 
 
 def test_the_arm_swings_with_the_turn() -> None:

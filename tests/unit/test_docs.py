@@ -12,7 +12,7 @@ import tomllib
 from collections.abc import Iterator
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -50,7 +50,7 @@ def blocks() -> Iterator[Block]:
 BLOCKS = list(blocks())
 
 
-def of_kind(*kinds: str) -> Any:
+def of_kind(*kinds: str) -> pytest.MarkDecorator:
     """Return the parameter of a test: the blocks of a kind."""
     chosen = [block for block in BLOCKS if block.kind in kinds]
     assert chosen
