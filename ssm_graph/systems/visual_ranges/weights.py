@@ -1,0 +1,63 @@
+"""How much a range counts: a similarity weight with the posterior variance, softer to one side.
+
+Walls, hulls and surfaces only ever lengthen a range, so that one which is too long is judged by a
+heavier tail than one which is too short. With ``e`` predicted minus measured::
+
+    t = (e^2 + H P H') / sigma^2,    weight = -2 f'(t)
+
+and ``f`` the log kernel with 1 degree of freedom where the range is too long (``e < 0``), 5 else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.similarity import Kernel, LogKernel, expected_mahalanobis_sq
+from ssm_graph.base.frozen import Array
+
+NLOS_WEIGHT: Final = 0.05
+"""Below it a range is told as not in line of sight."""
+SIGMA_OF_MEDIAN: Final = 1.4826
+"""A Gaussian's standard deviation over its median absolute value."""
+
+
+@dataclass(frozen=True, slots=True)
+class RangeKernel:
+    """The two kernels of a range's residual."""
+
+    longer: Kernel = LogKernel(1.0)
+    """Where the measured range is longer than the predicted one."""
+    shorter: Kernel = LogKernel(5.0)
+
+    def weight(self, error: Array, variance: Array | float, sigma: Array) -> Array:
+        """Return weights (...), each 1 where the residual is as expected.
+
+        Parameters
+        ----------
+        error : (...) m, predicted minus measured.
+        variance : (...) m^2, ``H P H'`` at the posterior; 0 gives the plain M-estimator.
+        sigma : (...) m
+        """
+        t = expected_mahalanobis_sq(error, np.asarray(variance, dtype=np.float64), sigma=sigma)
+        return np.where(error < 0.0, self.longer.weight(t), self.shorter.weight(t))
+
+    def deviance(self, error: Array, sigma: Array) -> Array:
+        """Return ``-2 (f(t) - f(0))`` (...) of the residual alone: t itself where it is small."""
+        t = np.square(error / sigma)
+        zero = np.zeros(1)
+        longer = self.longer.similarity(zero) - self.longer.similarity(t)
+        shorter = self.shorter.similarity(zero) - self.shorter.similarity(t)
+        return np.asarray(2.0 * np.where(error < 0.0, longer, shorter))
+
+
+SYMMETRIC: Final = RangeKernel(LogKernel(1.0), LogKernel(1.0))
+"""The same tail to both sides."""
+
+
+def robust_rms(error: NDArray[np.float64]) -> float:
+    """Return the standard deviation (m) that the middle of residuals has; NaN without any."""
+    return SIGMA_OF_MEDIAN * float(np.median(np.abs(error))) if error.size else float("nan")
