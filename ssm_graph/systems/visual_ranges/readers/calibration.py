@@ -132,11 +132,11 @@ def make_camera(
     return Camera(width, height, fx, fy, cx, cy, ours, coefficients)
 
 
-def _check(
-    where: str, width: int, height: int, fx: float, fy: float, cx: float, cy: float
-) -> None:
+def _check(where: str, width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> None:
     if width < 64 or height < 64:
-        raise DataError(f"{where}: expected images of 64 pixels a side or more, got {width} x {height}")
+        raise DataError(
+            f"{where}: expected images of 64 pixels a side or more, got {width} x {height}"
+        )
     if not (0.1 * width < fx < 20 * width and 0.5 < fy / fx < 2.0):
         raise DataError(
             f"{where}: focal lengths {fx:g}, {fy:g} cannot be those of images of {width} x {height} "
