@@ -71,13 +71,13 @@ class Ranges(ShortRepr):
 
     @property
     def n_anchors(self) -> int:
-        """J"""
+        """Anchors, known or not."""
         return len(self.names)
 
     @property
     def is_known(self) -> NDArray[np.bool_]:
         """(J,) whether an anchor's place is known."""
-        return np.isfinite(self.known_position).all(axis=1)
+        return np.asarray(np.isfinite(self.known_position).all(axis=1))
 
     def rows(self, kept: NDArray[np.bool_] | slice | Indices) -> Ranges:
         """Return some of the ranges, of the same anchors."""

@@ -7,13 +7,13 @@ and one division a pixel.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ssm_graph.base.frozen import Array
+from ssm_graph.systems.visual_ranges.camera import Camera
 from ssm_graph.systems.visual_ranges.world import Picture, Wall, World
 
 Image = NDArray[np.uint8]
@@ -23,26 +23,12 @@ NEAREST_M: Final = 0.05
 """Walls nearer than this are not drawn."""
 
 
-@dataclass(frozen=True, slots=True)
-class Lens:
-    """A pinhole camera without distortion, pixels; the centre of the first pixel is (0, 0)."""
-
-    width: int = 640
-    height: int = 480
-    focal: float = 460.0
-    """The same along rows and columns; the axis is in the middle of the image."""
-
-    @property
-    def centre(self) -> tuple[float, float]:
-        """Column and row of the axis."""
-        return 0.5 * (self.width - 1), 0.5 * (self.height - 1)
-
-
-def render(world: World, lens: Lens, R_wc: Array, p_w: Array) -> Picture:
+def render(world: World, lens: Camera, R_wc: Array, p_w: Array) -> Picture:
     """Return what a camera sees, grey (H, W) from 0 to 255, black where there is no wall.
 
     Parameters
     ----------
+    lens : its size, focal lengths and centre, pixels; the first pixel has its centre at (0, 0).
     R_wc : (3, 3) camera axes (x right, y down, z forward) in the world.
     p_w : (3,) place of the camera, m.
     """
@@ -57,7 +43,7 @@ def render(world: World, lens: Lens, R_wc: Array, p_w: Array) -> Picture:
     return grey
 
 
-def _window(wall: Wall, lens: Lens, R_wc: Array, p_w: Array) -> Window | None:
+def _window(wall: Wall, lens: Camera, R_wc: Array, p_w: Array) -> Window | None:
     """Return the part of the image that a wall can be in: its corners', cut before the camera."""
     along, up = wall.along_w * wall.size_m[0], wall.up_w * wall.size_m[1]
     corners = wall.corner_w + np.array([0 * along, along, along + up, up])
@@ -72,7 +58,7 @@ def _window(wall: Wall, lens: Lens, R_wc: Array, p_w: Array) -> Window | None:
     if not inside:
         return None
     cut = np.array(inside)
-    pixels = cut[:, :2] / cut[:, 2:] * lens.focal + lens.centre
+    pixels = cut[:, :2] / cut[:, 2:] * (lens.fx, lens.fy) + (lens.cx, lens.cy)
     low = np.clip(np.floor(pixels.min(axis=0)), 0, (lens.width, lens.height)).astype(int)
     high = np.clip(np.ceil(pixels.max(axis=0)) + 1, 0, (lens.width, lens.height)).astype(int)
     if (high <= low).any():
@@ -83,7 +69,7 @@ def _window(wall: Wall, lens: Lens, R_wc: Array, p_w: Array) -> Window | None:
 def _draw(
     world: World,
     wall: Wall,
-    lens: Lens,
+    lens: Camera,
     pose: tuple[Array, Array],
     window: Window,
     inverse_depth: Picture,
@@ -91,9 +77,8 @@ def _draw(
 ) -> None:
     """Draw a wall where it is nearer than what was drawn before."""
     R_wc, p_w = pose
-    cx, cy = lens.centre
-    x = ((np.arange(lens.width) - cx) / lens.focal).astype(np.float32)[window[1]]
-    y = ((np.arange(lens.height) - cy) / lens.focal).astype(np.float32)[window[0]]
+    x = ((np.arange(lens.width) - lens.cx) / lens.fx).astype(np.float32)[window[1]]
+    y = ((np.arange(lens.height) - lens.cy) / lens.fy).astype(np.float32)[window[0]]
     away = (wall.corner_w - p_w) @ wall.normal_w
     w_row = wall.normal_w @ R_wc / away
     offset = p_w - wall.corner_w
@@ -106,7 +91,7 @@ def _draw(
     old = inverse_depth[window]
     rows, columns = np.nonzero(w > old)
     nearer = w[rows, columns]
-    on = []
+    on: list[Picture] = []
     for axis, size in zip((wall.along_w, wall.up_w), wall.size_m, strict=True):
         place = plane(axis @ R_wc + (axis @ offset) * w_row)[rows, columns] / nearer
         inside = (place >= 0.0) & (place <= size)
@@ -120,7 +105,7 @@ def _draw(
     old[rows, columns] = nearer
     # A pixel's footprint, metres on the wall: wider where the wall is seen at a slant.
     slant = np.abs(away) * nearer / np.sqrt(1 + x[columns] ** 2 + y[rows] ** 2)
-    footprint = 1.0 / (nearer * lens.focal * np.sqrt(np.maximum(slant, 0.05)))
+    footprint = 1.0 / (nearer * lens.fx * np.sqrt(np.maximum(slant, 0.05)))
     grey[window][rows, columns] = _sampled(
         world.pictures[wall.picture], on[0] / world.texel_m, on[1] / world.texel_m,
         footprint / world.texel_m,

@@ -17,6 +17,8 @@ PILLAR_M: Final = (2.9, 3.25, 0.0, 0.5)
 """x from, to, y from, to"""
 RING_M: Final = (22.0, 12.0)
 """Sides of the corridors' centre line: 68 m about, 66 with its corners rounded."""
+LIFT_M: Final = ((-1.5, -1.5), (1.5, 1.5))
+"""Two corners of the shaft in the block."""
 CORRIDOR_M: Final = (2.4, 2.6)
 """Width and height."""
 REPEAT_M: Final = 12.8
@@ -53,14 +55,14 @@ class World:
     """Of each: levels, each half as fine as the one before, grey from 0 to 255; it repeats."""
     texel_m: float
     """Side of a picture's finest element."""
-    is_opaque: NDArray[np.bool_]
-    """(W,) whether a wall stands in the way of a radio."""
+    obstacles: tuple[Wall, ...]
+    """What stands in the way of radio waves, seen or hidden behind walls that let them through."""
 
     def is_blocked(self, from_w: Array, to_w: Array) -> NDArray[np.bool_]:
         """Return whether a wall stands between (N, 3) and (N, 3) or (3,), m."""
         start, way = from_w, to_w - from_w
         blocked = np.zeros(len(start), dtype=bool)
-        for wall in (w for w, opaque in zip(self.walls, self.is_opaque, strict=True) if opaque):
+        for wall in self.obstacles:
             falls = way @ wall.normal_w
             with np.errstate(divide="ignore", invalid="ignore"):
                 share = ((wall.corner_w - start) @ wall.normal_w) / falls
@@ -85,7 +87,7 @@ def _smooth_noise(rows: int, columns: int, cell: int, rng: np.random.Generator) 
 
 def picture(size_m: tuple[float, float], texel_m: float, rng: np.random.Generator) -> Picture:
     """Return a picture of clouds, boards and spots for a wall of ``size_m``, along and up."""
-    columns, rows = (max(int(round(size / texel_m)), 8) for size in size_m)
+    columns, rows = (max(round(size / texel_m), 8) for size in size_m)
     grey = np.full((rows, columns), 120.0, dtype=np.float32)
     for cell_m, contrast in ((1.2, 18.0), (0.3, 12.0), (0.08, 9.0)):
         cell = max(int(cell_m / texel_m), 1)
@@ -145,7 +147,7 @@ def room(seed: int, *, texel_m: float = 0.006) -> World:
     rng = np.random.default_rng((seed, 1))
     length, width, height = ROOM_M
     half = np.array([length / 2, width / 2, 0.0])
-    faces = _box(-half, half + [0, 0, height], inwards=True)
+    faces = _box(-half, half + np.array([0.0, 0.0, height]), inwards=True)
     n_walls = len(faces)
     x0, x1, y0, y1 = PILLAR_M
     for low, high in (
@@ -156,14 +158,14 @@ def room(seed: int, *, texel_m: float = 0.006) -> World:
         faces += _box(np.array(low), np.array(high), inwards=False)
     walls = [_wall(*face, number) for number, face in enumerate(faces)]
     pictures = [levels(picture(wall.size_m, texel_m, rng)) for wall in walls]
-    opaque = np.arange(len(walls)) >= n_walls
-    return World((*walls,), (*pictures,), texel_m, opaque)
+    return World((*walls,), (*pictures,), texel_m, (*walls[n_walls:],))
 
 
 def corridor(seed: int, *, texel_m: float = 0.006) -> World:
     """Return a ring of four corridors about a block; its walls repeat every 12.8 m.
 
-    The middle of the ring's floor is at the origin. The block stands in the way of radio waves.
+    The middle of the ring's floor is at the origin. A lift's shaft in the block stands in the way
+    of radio waves.
     """
     rng = np.random.default_rng((seed, 2))
     width, height = CORRIDOR_M
@@ -178,5 +180,6 @@ def corridor(seed: int, *, texel_m: float = 0.006) -> World:
     walls = [_wall(*face, 0) for face in outer[:4]]
     walls += [_wall(*face, number) for number, face in enumerate(outer[4:], 1)]
     walls += [_wall(*face, 0) for face in inner]
-    opaque = np.arange(len(walls)) >= len(outer)
-    return World((*walls,), (*pictures,), texel_m, opaque)
+    shaft = _box(np.array([*LIFT_M[0], 0.0]), np.array([*LIFT_M[1], height]), inwards=False)
+    hidden = [_wall(*face, 0) for face in shaft]
+    return World((*walls,), (*pictures,), texel_m, (*hidden,))
