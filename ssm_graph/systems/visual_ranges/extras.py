@@ -13,7 +13,7 @@ from ssm_graph.base.errors import MissingExtraError
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
-def opencv() -> Any:  # noqa: ANN401  (the module has no types)
+def opencv() -> Any:
     """Return OpenCV's module, or say how to install it."""
     try:
         return importlib.import_module("cv2")

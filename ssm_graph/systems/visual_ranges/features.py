@@ -1,0 +1,247 @@
+"""Corners on a grid, their descriptors, optical flow, and alignment of patches across views.
+
+Flow follows corners from image to image; :func:`align` then measures them against the image they
+were first seen in, through the affine change of the view, with gain and offset of the light: what
+flow has gathered of drift goes.
+
+References
+----------
+.. [1] J. Shi, C. Tomasi, "Good Features to Track", CVPR 1994.
+.. [2] J.-Y. Bouguet, "Pyramidal Implementation of the Lucas Kanade Feature Tracker", 2000.
+.. [3] E. Rublee, V. Rabaud, K. Konolige, G. Bradski, "ORB: an Efficient Alternative to SIFT or
+   SURF", ICCV 2011.
+.. [4] S. Baker, I. Matthews, "Lucas-Kanade 20 Years On", IJCV 56, 2004: inverse composition.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ssm_graph.systems.visual_ranges.extras import opencv
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+
+OCTAVE_FACTOR: Final = 1.2
+"""Scale from one octave to the next [3]_."""
+N_OCTAVES: Final = 8
+_BORDER: Final = 32
+_BLOCK: Final = 5
+_FLOW_WINDOW: Final = (15, 15)
+_FLOW_LEVELS: Final = 3
+_BACK_LEVELS: Final = 1
+_BACK_PIXELS: Final = 0.7
+_LEAST_EIGENVALUE: Final = 1e-4
+EDGE_PIXELS: Final = 8.0
+"""A corner nearer to the image's edge is dropped."""
+
+
+def corners(image: Image, wanted: int, occupied: Array, *, quality: float = 0.003) -> Array:
+    """Return corners (n, 2), the strongest of each free cell of a grid of ``wanted`` cells [1]_.
+
+    Cells that hold one of the pixels ``occupied`` (m, 2) stay as they are. A corner's smaller
+    eigenvalue is at least ``quality`` of the image's 99.5th percentile.
+    """
+    cv2 = opencv()
+    height, width = image.shape
+    cell = max(int(np.sqrt(height * width / wanted)), 8)
+    strength = cv2.cornerMinEigenVal(image, _BLOCK, ksize=3)
+    edge = int(EDGE_PIXELS) + 2
+    rows, columns = (height - 2 * edge) // cell, (width - 2 * edge) // cell
+    inside = strength[edge : edge + rows * cell, edge : edge + columns * cell]
+    cells = inside.reshape(rows, cell, columns, cell).transpose(0, 2, 1, 3)
+    cells = cells.reshape(rows * columns, cell * cell)
+    best = cells.argmax(axis=1)
+    found = np.take_along_axis(cells, best[:, None], axis=1)[:, 0]
+    top = np.partition(found, int(0.95 * found.size))[int(0.95 * found.size)]
+    free = found > max(quality * float(top), 1e-6)
+    if len(occupied):
+        at = ((occupied - edge) / cell).astype(np.int64)
+        at = at[((at >= 0) & (at < [columns, rows])).all(axis=1)]
+        free[at[:, 1] * columns + at[:, 0]] = False
+    which = np.flatnonzero(free)
+    x = edge + (which % columns) * cell + best[which] % cell
+    y = edge + (which // columns) * cell + best[which] // cell
+    found_px = np.stack([x, y], axis=1).astype(np.float64)
+    return found_px[_apart(found_px, found[which], occupied, 0.5 * cell)]
+
+
+def _apart(pixels: Array, strength: Array, occupied: Array, distance: float) -> Mask:
+    """Return which corners have no stronger one, and none of ``occupied``, within a distance."""
+    kept = np.ones(len(pixels), dtype=bool)
+    if len(pixels) == 0:
+        return kept
+    square = distance * distance
+    if len(occupied):
+        gap = ((pixels[:, None] - occupied[None]) ** 2).sum(axis=2)
+        kept &= gap.min(axis=1) > square
+    near = ((pixels[:, None] - pixels[None]) ** 2).sum(axis=2) < square
+    rank = np.empty(len(pixels), dtype=np.int64)
+    rank[np.argsort(-strength, kind="stable")] = np.arange(len(pixels))
+    stronger = rank[None, :] < rank[:, None]
+    return np.asarray(kept & ~(near & stronger).any(axis=1))
+
+
+@cache
+def _orb() -> Any:
+    return opencv().ORB_create(nlevels=N_OCTAVES, scaleFactor=OCTAVE_FACTOR, edgeThreshold=_BORDER)
+
+
+def descriptors(image: Image, pixels: Array, octave: NDArray[np.int64]) -> NDArray[np.uint8]:
+    """Return upright ORB descriptors (n, 32) of pixels (n, 2), each in its octave [3]_."""
+    cv2 = opencv()
+    if len(pixels) == 0:
+        return np.zeros((0, 32), dtype=np.uint8)
+    margin = int(_BORDER * OCTAVE_FACTOR**N_OCTAVES) + 2
+    padded = cv2.copyMakeBorder(image, margin, margin, margin, margin, cv2.BORDER_REFLECT_101)
+    order = np.argsort(octave, kind="stable")
+    points = [
+        cv2.KeyPoint(float(x) + margin, float(y) + margin, 31.0, 0.0, 0.0, int(o), i)
+        for i, (x, y), o in zip(order.tolist(), pixels[order], octave[order], strict=True)
+    ]
+    kept, found = _orb().compute(padded, points)
+    out = np.zeros((len(pixels), 32), dtype=np.uint8)
+    out[[point.class_id for point in kept]] = found
+    return out
+
+
+def flow(previous: Image, image: Image, pixels: Array, guess: Array) -> tuple[Array, Mask]:
+    """Return where pixels (n, 2) of one image are in the next, and which came back [2]_.
+
+    ``guess`` (n, 2) is where they are looked for first.
+    """
+    cv2 = opencv()
+    if len(pixels) == 0:
+        return np.zeros((0, 2)), np.zeros(0, dtype=bool)
+    start = pixels.astype(np.float32)
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
+    options = {
+        "winSize": _FLOW_WINDOW,
+        "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
+        "criteria": criteria,
+        "minEigThreshold": _LEAST_EIGENVALUE,
+    }
+    there, found, _ = cv2.calcOpticalFlowPyrLK(
+        previous, image, start, guess.astype(np.float32), maxLevel=_FLOW_LEVELS, **options
+    )
+    back, returned, _ = cv2.calcOpticalFlowPyrLK(
+        image, previous, there, start.copy(), maxLevel=_BACK_LEVELS, **options
+    )
+    height, width = image.shape
+    ok = (found[:, 0] == 1) & (returned[:, 0] == 1)
+    ok &= ((back - start) ** 2).sum(axis=1) < _BACK_PIXELS**2
+    low, high = EDGE_PIXELS, np.array([width, height]) - 1.0 - EDGE_PIXELS
+    ok &= ((there >= low) & (there <= high)).all(axis=1)
+    return there.astype(np.float64), ok
+
+
+class Aligned(NamedTuple):
+    """Where patches were found in another view."""
+
+    pixels: Array
+    """(n, 2)"""
+    likeness: Array
+    """(n,) correlation of the patches, gain and offset apart: 1 is the same; -1 where it failed."""
+
+
+_HALF: Final = 5
+_SIDE = np.arange(-_HALF, _HALF + 1.0)
+_PATCH = np.stack(np.meshgrid(_SIDE, _SIDE), axis=-1).reshape(-1, 2)  # (121, 2) of (x, y)
+_STEPS: Final = 12
+_SETTLED_PIXELS: Final = 0.01
+_FLAT: Final = 1e-3
+_LEAST_SPREAD: Final = 3.0  # grey levels
+
+
+def align(
+    sources: list[Image],
+    source: NDArray[np.int64],
+    pixels: Array,
+    affine: Array,
+    image: Image,
+    guess: Array,
+) -> Aligned:
+    """Return where patches of earlier images are in ``image``, by inverse composition [4]_.
+
+    Parameters
+    ----------
+    sources
+        Earlier images; ``source`` (n,) says which one each patch is cut from, around ``pixels``
+        (n, 2).
+    affine
+        (n, 2, 2) offsets in ``image`` to offsets in the source.
+    guess
+        (n, 2) where each is looked for in ``image``.
+    """
+    n = len(pixels)
+    patch, gradient = np.empty((n, len(_PATCH))), np.empty((n, len(_PATCH), 2))
+    usable = np.zeros(n, dtype=bool)
+    for index in np.unique(source):
+        mine = np.flatnonzero(source == index)
+        places = pixels[mine, None] + _PATCH @ affine[mine].transpose(0, 2, 1)
+        patch[mine], usable[mine] = _sampled(sources[index], places)
+        for axis in range(2):
+            step = 0.5 * affine[mine][:, None, :, axis]
+            ahead, _ = _sampled(sources[index], places + step)
+            behind, _ = _sampled(sources[index], places - step)
+            gradient[mine, :, axis] = ahead - behind
+    return _inverse_compositional(image, patch, gradient, guess, usable)
+
+
+def _inverse_compositional(
+    image: Image, patch: Array, gradient: Array, guess: Array, usable: Mask
+) -> Aligned:
+    """Return patches (n, m) found in the image by their gradients (n, m, 2)."""
+    patch = patch - patch.mean(axis=1, keepdims=True)
+    spread = np.sqrt((patch * patch).mean(axis=1))
+    gradient = gradient - gradient.mean(axis=1, keepdims=True)
+    hessian = np.einsum("nma,nmb->nab", gradient, gradient)
+    det = hessian[:, 0, 0] * hessian[:, 1, 1] - hessian[:, 0, 1] ** 2
+    trace = hessian[:, 0, 0] + hessian[:, 1, 1]
+    usable = usable & (spread > _LEAST_SPREAD) & (det > _FLAT * trace * trace)
+    at, likeness = guess.copy(), np.full(len(guess), -1.0)
+    going = np.flatnonzero(usable)
+    inverse = np.zeros_like(hessian)
+    inverse[going] = np.linalg.inv(hessian[going])
+    for _ in range(_STEPS):
+        if not going.size:
+            break
+        seen, inside = _sampled(image, at[going, None] + _PATCH)
+        seen = seen - seen.mean(axis=1, keepdims=True)
+        power = np.sqrt((seen * seen).mean(axis=1))
+        gain = spread[going] / np.maximum(power, 1e-9)
+        product = (seen * patch[going]).mean(axis=1)
+        likeness[going] = np.where(
+            inside & (power > 0.3 * spread[going]), product / (power * spread[going] + 1e-9), -1.0
+        )
+        error = seen * gain[:, None] - patch[going]
+        slope = np.einsum("nma,nm->na", gradient[going], error)
+        step = -np.einsum("nab,nb->na", inverse[going], slope)
+        length = np.sqrt((step * step).sum(axis=1))
+        step *= np.minimum(1.0, 2.0 / np.maximum(length, 1e-9))[:, None]
+        at[going] += step
+        likeness[going[~inside]] = -1.0
+        going = going[inside & (length > _SETTLED_PIXELS)]
+    likeness[going] = np.where(likeness[going] > 0.0, likeness[going], -1.0)
+    return Aligned(at, likeness)
+
+
+def _sampled(image: Image, places: Array) -> tuple[Array, Mask]:
+    """Return grey values (n, m) at places (n, m, 2), bilinear, and which rows lie all inside."""
+    height, width = image.shape
+    whole = np.floor(places).astype(np.int64)
+    rest = places - whole
+    x, y = whole[..., 0], whole[..., 1]
+    inside = ((x >= 0) & (y >= 0) & (x < width - 1) & (y < height - 1)).all(axis=-1)
+    at = np.clip(y, 0, height - 2) * width + np.clip(x, 0, width - 2)
+    grey = image.reshape(-1)
+    a, b = grey[at].astype(np.float64), grey[at + 1].astype(np.float64)
+    c, d = grey[at + width].astype(np.float64), grey[at + width + 1].astype(np.float64)
+    u, v = rest[..., 0], rest[..., 1]
+    upper, lower = a + u * (b - a), c + u * (d - c)
+    return upper + v * (lower - upper), inside
