@@ -48,6 +48,8 @@ COMMANDS: Final = {
     "locate-study": "many simulated drives over HD maps, by several methods",
     "slam": "path and map from odometry and observed landmarks",
     "slam-study": "compare filters of landmark SLAM on simulated runs",
+    "visual": "metric path, map and anchors from a camera and ranges",
+    "visual-simulate": "write a simulated recording of a camera and ranges",
     "integrity": "a second witness of a smoothed mission: guaranteed bounds",
     "network": "guaranteed bounds of a sensor network",
     "network-run": "nodes of a network as processes, by UDP",

@@ -21,7 +21,7 @@ DARK_LEVEL: Final = 8.0
 BRIGHT_LEVEL: Final = 247.0
 """Grey levels of 255, mean of a white frame."""
 FLAT_SHARPNESS: Final = 4.0
-"""Grey levels squared: variance of the Laplacian below which a frame has no corner to hold on to."""
+"""Grey levels squared, variance of the Laplacian: below it a frame has nothing to hold on to."""
 BLUR_RATIO: Final = 0.2
 """A frame is called blurred where its sharpness is below this share of the run's median."""
 _SHOWN: Final = 3

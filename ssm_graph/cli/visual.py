@@ -1,0 +1,3 @@
+"""``ssm-graph visual``: metric path, map and anchors from a camera and ranges."""
+
+DESCRIPTION = ""
