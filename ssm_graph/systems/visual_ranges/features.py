@@ -1,8 +1,4 @@
-"""Corners on a grid, their descriptors, optical flow, and alignment of patches across views.
-
-Flow follows corners from image to image; :func:`align` then measures them against the image they
-were first seen in, through the affine change of the view, with gain and offset of the light: what
-flow has gathered of drift goes.
+"""Corners on a grid, their descriptors, and optical flow from image to image.
 
 References
 ----------
@@ -10,7 +6,6 @@ References
 .. [2] J.-Y. Bouguet, "Pyramidal Implementation of the Lucas Kanade Feature Tracker", 2000.
 .. [3] E. Rublee, V. Rabaud, K. Konolige, G. Bradski, "ORB: an Efficient Alternative to SIFT or
    SURF", ICCV 2011.
-.. [4] S. Baker, I. Matthews, "Lucas-Kanade 20 Years On", IJCV 56, 2004: inverse composition.
 """
 
 from __future__ import annotations
@@ -45,7 +40,7 @@ def corners(image: Image, wanted: int, occupied: Array, *, quality: float = 0.00
     """Return corners (n, 2), the strongest of each free cell of a grid of ``wanted`` cells [1]_.
 
     Cells that hold one of the pixels ``occupied`` (m, 2) stay as they are. A corner's smaller
-    eigenvalue is at least ``quality`` of the image's 99.5th percentile.
+    eigenvalue is at least ``quality`` of the 95th percentile of all cells' best.
     """
     cv2 = opencv()
     height, width = image.shape
@@ -138,110 +133,3 @@ def flow(previous: Image, image: Image, pixels: Array, guess: Array) -> tuple[Ar
     low, high = EDGE_PIXELS, np.array([width, height]) - 1.0 - EDGE_PIXELS
     ok &= ((there >= low) & (there <= high)).all(axis=1)
     return there.astype(np.float64), ok
-
-
-class Aligned(NamedTuple):
-    """Where patches were found in another view."""
-
-    pixels: Array
-    """(n, 2)"""
-    likeness: Array
-    """(n,) correlation of the patches, gain and offset apart: 1 is the same; -1 where it failed."""
-
-
-_HALF: Final = 5
-_SIDE = np.arange(-_HALF, _HALF + 1.0)
-_PATCH = np.stack(np.meshgrid(_SIDE, _SIDE), axis=-1).reshape(-1, 2)  # (121, 2) of (x, y)
-_STEPS: Final = 12
-_SETTLED_PIXELS: Final = 0.01
-_FLAT: Final = 1e-3
-_LEAST_SPREAD: Final = 3.0  # grey levels
-
-
-def align(
-    sources: list[Image],
-    source: NDArray[np.int64],
-    pixels: Array,
-    affine: Array,
-    image: Image,
-    guess: Array,
-) -> Aligned:
-    """Return where patches of earlier images are in ``image``, by inverse composition [4]_.
-
-    Parameters
-    ----------
-    sources
-        Earlier images; ``source`` (n,) says which one each patch is cut from, around ``pixels``
-        (n, 2).
-    affine
-        (n, 2, 2) offsets in ``image`` to offsets in the source.
-    guess
-        (n, 2) where each is looked for in ``image``.
-    """
-    n = len(pixels)
-    patch, gradient = np.empty((n, len(_PATCH))), np.empty((n, len(_PATCH), 2))
-    usable = np.zeros(n, dtype=bool)
-    for index in np.unique(source):
-        mine = np.flatnonzero(source == index)
-        places = pixels[mine, None] + _PATCH @ affine[mine].transpose(0, 2, 1)
-        patch[mine], usable[mine] = _sampled(sources[index], places)
-        for axis in range(2):
-            step = 0.5 * affine[mine][:, None, :, axis]
-            ahead, _ = _sampled(sources[index], places + step)
-            behind, _ = _sampled(sources[index], places - step)
-            gradient[mine, :, axis] = ahead - behind
-    return _inverse_compositional(image, patch, gradient, guess, usable)
-
-
-def _inverse_compositional(
-    image: Image, patch: Array, gradient: Array, guess: Array, usable: Mask
-) -> Aligned:
-    """Return patches (n, m) found in the image by their gradients (n, m, 2)."""
-    patch = patch - patch.mean(axis=1, keepdims=True)
-    spread = np.sqrt((patch * patch).mean(axis=1))
-    gradient = gradient - gradient.mean(axis=1, keepdims=True)
-    hessian = np.einsum("nma,nmb->nab", gradient, gradient)
-    det = hessian[:, 0, 0] * hessian[:, 1, 1] - hessian[:, 0, 1] ** 2
-    trace = hessian[:, 0, 0] + hessian[:, 1, 1]
-    usable = usable & (spread > _LEAST_SPREAD) & (det > _FLAT * trace * trace)
-    at, likeness = guess.copy(), np.full(len(guess), -1.0)
-    going = np.flatnonzero(usable)
-    inverse = np.zeros_like(hessian)
-    inverse[going] = np.linalg.inv(hessian[going])
-    for _ in range(_STEPS):
-        if not going.size:
-            break
-        seen, inside = _sampled(image, at[going, None] + _PATCH)
-        seen = seen - seen.mean(axis=1, keepdims=True)
-        power = np.sqrt((seen * seen).mean(axis=1))
-        gain = spread[going] / np.maximum(power, 1e-9)
-        product = (seen * patch[going]).mean(axis=1)
-        likeness[going] = np.where(
-            inside & (power > 0.3 * spread[going]), product / (power * spread[going] + 1e-9), -1.0
-        )
-        error = seen * gain[:, None] - patch[going]
-        slope = np.einsum("nma,nm->na", gradient[going], error)
-        step = -np.einsum("nab,nb->na", inverse[going], slope)
-        length = np.sqrt((step * step).sum(axis=1))
-        step *= np.minimum(1.0, 2.0 / np.maximum(length, 1e-9))[:, None]
-        at[going] += step
-        likeness[going[~inside]] = -1.0
-        going = going[inside & (length > _SETTLED_PIXELS)]
-    likeness[going] = np.where(likeness[going] > 0.0, likeness[going], -1.0)
-    return Aligned(at, likeness)
-
-
-def _sampled(image: Image, places: Array) -> tuple[Array, Mask]:
-    """Return grey values (n, m) at places (n, m, 2), bilinear, and which rows lie all inside."""
-    height, width = image.shape
-    whole = np.floor(places).astype(np.int64)
-    rest = places - whole
-    x, y = whole[..., 0], whole[..., 1]
-    inside = ((x >= 0) & (y >= 0) & (x < width - 1) & (y < height - 1)).all(axis=-1)
-    at = np.clip(y, 0, height - 2) * width + np.clip(x, 0, width - 2)
-    grey = image.reshape(-1)
-    a, b = grey[at].astype(np.float64), grey[at + 1].astype(np.float64)
-    c, d = grey[at + width].astype(np.float64), grey[at + width + 1].astype(np.float64)
-    u, v = rest[..., 0], rest[..., 1]
-    upper, lower = a + u * (b - a), c + u * (d - c)
-    return upper + v * (lower - upper), inside

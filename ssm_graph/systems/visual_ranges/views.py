@@ -12,11 +12,10 @@ from ssm_graph.systems.visual_ranges.features import (
     EDGE_PIXELS,
     N_OCTAVES,
     OCTAVE_FACTOR,
-    Aligned,
     Image,
-    align,
 )
 from ssm_graph.systems.visual_ranges.geometry import Pose, in_camera
+from ssm_graph.systems.visual_ranges.patches import Aligned, align
 from ssm_graph.systems.visual_ranges.visual_map import VisualMap
 
 Array = NDArray[np.float64]
