@@ -53,6 +53,24 @@ class RangeKernel:
         shorter = self.shorter.similarity(zero) - self.shorter.similarity(t)
         return np.asarray(2.0 * np.where(error < 0.0, longer, shorter))
 
+    def inefficiency(self, error: Array, sigma: Array) -> float:
+        """Return by how much the inverse of the weighted information understates the variance.
+
+        Huber's ``E[psi^2] E[w] / E[psi']^2`` of the residuals (...) themselves, with ``psi`` the
+        weight times the whitened residual; at least 1.
+        """
+        if not error.size:
+            return 1.0
+        r = error / sigma
+        step = 1e-4
+
+        def psi(at: Array) -> Array:
+            return self.weight(at, 0.0, np.ones_like(at)) * at
+
+        slope = float(np.mean(psi(r + step) - psi(r - step))) / (2.0 * step)
+        weight = float(np.mean(self.weight(r, 0.0, np.ones_like(r))))
+        return max(float(np.mean(psi(r) ** 2)) * weight / max(slope, 0.1 * weight) ** 2, 1.0)
+
 
 SYMMETRIC: Final = RangeKernel(LogKernel(1.0), LogKernel(1.0))
 """The same tail to both sides."""
