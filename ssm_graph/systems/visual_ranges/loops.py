@@ -228,9 +228,8 @@ class LoopFinder:
 
 def bit_distances(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> NDArray[np.int32]:
     """Return how many bits differ (n, m) between descriptors (n, 32) and (m, 32)."""
-    cv2 = opencv()
-    found, _ = cv2.batchDistance(a, b, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=0)
-    return np.asarray(found)
+    signs_a, signs_b = (2.0 * np.unpackbits(x, axis=1).astype(np.float32) - 1.0 for x in (a, b))
+    return np.asarray((signs_a.shape[1] - signs_a @ signs_b.T) / 2.0).astype(np.int32)
 
 
 def mutual(distance: NDArray[np.int32], most: int, ratio: float = 1.0) -> tuple[Indices, Indices]:
