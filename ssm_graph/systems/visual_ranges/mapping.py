@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,9 @@ from ssm_graph.systems.visual_ranges.settings import VisualSettings
 from ssm_graph.systems.visual_ranges.tracking import Tracks, focal_scale
 from ssm_graph.systems.visual_ranges.views import aligned_rows, change_of_view, seen_from
 from ssm_graph.systems.visual_ranges.visual_map import DROPPED, VisualMap
+
+if TYPE_CHECKING:
+    from ssm_graph.systems.visual_ranges.ranging import Ranging
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -276,10 +279,12 @@ class Mapper:
             variance=world.rows["variance"][rows[order]],
         )  # fmt: skip
 
-    def adjust_local(self, k: int) -> None:
+    def adjust_local(self, k: int, ranging: Ranging | None = None) -> None:
         """Adjust the key frames and points around key frame ``k`` and cull."""
         window = self.window(k)
         problem = self.problem(window)
+        if ranging is not None:
+            problem = ranging.joined(problem, window, self._world.n_frames, is_free=False)
         steps = self._settings.local_steps
         hold = int((~problem.free).sum()) < 2
         found = adjust(problem, Effort(steps=steps, posterior_from=None, hold_scale=hold))

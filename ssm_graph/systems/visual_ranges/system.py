@@ -15,8 +15,11 @@ from ssm_graph.systems.visual_ranges.bundle import Effort, adjust
 from ssm_graph.systems.visual_ranges.features import Image, corners, flow
 from ssm_graph.systems.visual_ranges.geometry import Pose, refine_pose
 from ssm_graph.systems.visual_ranges.mapping import Mapper
+from ssm_graph.systems.visual_ranges.range_terms import FramePoses
+from ssm_graph.systems.visual_ranges.ranging import Ranging
 from ssm_graph.systems.visual_ranges.result import FrameState, VisualResult
 from ssm_graph.systems.visual_ranges.settings import VisualSettings
+from ssm_graph.systems.visual_ranges.start import StartRules
 from ssm_graph.systems.visual_ranges.tracking import Followed, Tracker, Tracks
 from ssm_graph.systems.visual_ranges.two_view import NoStart, two_view
 from ssm_graph.systems.visual_ranges.visual_map import VisualMap
@@ -59,6 +62,11 @@ class _Run:
         self.timing: dict[str, list[float]] = defaultdict(list)
         self.waiting: list[tuple[int, Array, Array]] = []
         self.first: tuple[int, Image, Array] | None = None
+        self.seen: dict[int, Tracks] = {}
+        ranges = sequence.ranges
+        self.ranging = None
+        if ranges is not None and len(ranges):
+            self.ranging = Ranging(ranges, np.array(sequence.lever_arm_m), StartRules())
 
     def finish(self, progress: Callable[[int, int], None]) -> VisualResult:
         """Go through all images and return the answer."""
@@ -72,7 +80,7 @@ class _Run:
                     self.follow(i, image)
             progress(i + 1, n)
         if self.settings.has_final_adjustment and self.world.n_frames > 2:
-            with self.timed("global adjustment"):
+            with self.timed("last adjustment"):
                 self.adjust_all()
         return self.answer()
 
@@ -152,7 +160,7 @@ class _Run:
         xy = self.camera.normalise(pixel[on])
         places = self.world.points["place"][point[on]]
         refined = refine_pose(self.world.pose(0), places, xy, self.tracker.whitening(len(xy)))
-        self.record(index, refined.pose, 0, int(on.sum()))
+        self.record(index, refined.pose, 0, int(on.sum()), Tracks(track, pixel))
 
     def follow(self, i: int, image: Image) -> None:
         """Track one image, and make it a key frame if it is time."""
@@ -163,7 +171,7 @@ class _Run:
             if self.state[i - 1] == FrameState.TRACKED:
                 self.note(i, f"lost: {found.n_points} points left")
             return
-        self.record(i, found.pose, self.tracker.reference, found.n_points)
+        self.record(i, found.pose, self.tracker.reference, found.n_points, found.tracks)
         if self.is_key_frame(i, found):
             with self.timed("mapping"):
                 self.make_key_frame(i, image, found)
@@ -199,32 +207,72 @@ class _Run:
             tracks = self.mapper.insert(image, i, time_s, found.pose, found.tracks)
         k = self.world.n_frames - 1
         self.n_tracked[i] = int((self.world.tracks["point"][tracks.track] >= 0).sum())
+        self.record(i, found.pose, k, int(self.n_tracked[i]), tracks)
+        if self.ranging is not None:
+            with self.timed("ranges"):
+                self.ask_ranges(i)
         with self.timed("local adjustment"):
-            self.mapper.adjust_local(k)
+            self.mapper.adjust_local(k, self.ranging)
         self.tracker.tracks = tracks
         self.tracker.set_pose(self.world.pose(k), k)
-        self.record(i, self.world.pose(k), k, int(self.n_tracked[i]))
+        self.record(i, self.world.pose(k), k, int(self.n_tracked[i]), tracks)
 
-    def record(self, i: int, pose: Pose, reference: int, n_points: int) -> None:
+    def ask_ranges(self, i: int, *, is_last: bool = False) -> None:
+        """Hang the ranges up to image ``i`` on the key frames, and see what they tell."""
+        assert self.ranging is not None
+        R, t = self.poses()
+        frames = FramePoses(
+            self.sequence.time_s[: i + 1], R[: i + 1], t[: i + 1], self.reference[: i + 1]
+        )
+        if self.ranging.renew(frames, self.world, is_last=is_last):
+            assert self.ranging.values is not None
+            self.note(i, f"scale started: {self.ranging.values.scale:.4g} m per map unit")
+
+    def record(
+        self, i: int, pose: Pose, reference: int, n_points: int, tracks: Tracks
+    ) -> None:
         """Keep a frame's pose relative to its key frame."""
         relative = pose.after(self.world.pose(reference).inverse())
         self.state[i], self.reference[i] = FrameState.TRACKED, reference
         self.relative_R[i], self.relative_t[i] = relative
         self.n_tracked[i] = n_points
+        self.seen[i] = tracks
 
     def note(self, i: int, text: str) -> None:
         """Keep what happened."""
         self.events.append(f"{self.sequence.time_s[i] - self.sequence.time_s[0]:.2f} s: {text}")
 
     def adjust_all(self) -> None:
-        """Adjust everything together."""
-        window = self.mapper.whole()
+        """Adjust everything together, then the pose of every frame to the points it saw."""
         steps = self.settings.global_steps
         effort = Effort(steps=steps, posterior_from=steps - 3, hold_scale=True)
-        self.mapper.take(window, adjust(self.mapper.problem(window), effort))
+        if self.ranging is not None:
+            self.ask_ranges(len(self.sequence.time_s) - 1, is_last=True)
+        window = self.mapper.whole()
+        problem = self.mapper.problem(window)
+        if self.ranging is not None:
+            problem = self.ranging.joined(problem, window, self.world.n_frames, is_free=True)
+        found = adjust(problem, effort)
+        self.mapper.take(window, found)
+        if self.ranging is not None:
+            self.ranging.take(problem, found)
+        self.refine_frames()
 
-    def answer(self) -> VisualResult:
-        """Return the result as it stands."""
+    def refine_frames(self) -> None:
+        """Find the pose of every frame anew from the final places of the points it saw."""
+        R, t = self.poses()
+        keys = set(self.world.frames["image"].tolist())
+        for i, tracks in self.seen.items():
+            point = self.world.tracks["point"][tracks.track]
+            on = point >= 0
+            if i in keys or on.sum() < self.settings.least_inliers:
+                continue
+            places, xy = self.world.points["place"][point[on]], self.camera.normalise(tracks.pixel[on])
+            refined = refine_pose(Pose(R[i], t[i]), places, xy, self.tracker.whitening(len(xy)))
+            self.record(i, refined.pose, int(self.reference[i]), int(self.n_tracked[i]), tracks)
+
+    def poses(self) -> tuple[Array, Array]:
+        """Return the poses of all frames (N, 3, 3), (N, 3) as the map stands; NaN without one."""
         world = self.world
         on = self.reference >= 0
         R, t = np.full_like(self.relative_R, np.nan), np.full_like(self.relative_t, np.nan)
@@ -232,9 +280,14 @@ class _Run:
         base_t = world.frames["t_cw"][self.reference[on]]
         R[on] = self.relative_R[on] @ base_R
         t[on] = np.einsum("nij,nj->ni", self.relative_R[on], base_t) + self.relative_t[on]
+        return R, t
+
+    def answer(self) -> VisualResult:
+        """Return the result as it stands."""
+        R, t = self.poses()
         return VisualResult(
             name=self.sequence.name, camera=self.camera, time_s=self.sequence.time_s,
             state=self.state, R_cw=R, t_cw=t, key_frame=self.reference, n_tracked=self.n_tracked,
-            map=world.snapshot(), events=tuple(self.events),
+            map=self.world.snapshot(), ranging=self.ranging, events=tuple(self.events),
             timing_s={part: np.array(values) for part, values in self.timing.items()},
         )  # fmt: skip
