@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final
 
@@ -19,7 +20,6 @@ from ssm_graph.systems.visual_ranges.range_terms import FramePoses
 from ssm_graph.systems.visual_ranges.ranging import Ranging
 from ssm_graph.systems.visual_ranges.result import FrameState, VisualResult
 from ssm_graph.systems.visual_ranges.settings import VisualSettings
-from ssm_graph.systems.visual_ranges.start import StartRules
 from ssm_graph.systems.visual_ranges.tracking import Followed, Tracker, Tracks
 from ssm_graph.systems.visual_ranges.two_view import NoStart, two_view
 from ssm_graph.systems.visual_ranges.visual_map import VisualMap
@@ -66,7 +66,9 @@ class _Run:
         ranges = sequence.ranges
         self.ranging = None
         if ranges is not None and len(ranges):
-            self.ranging = Ranging(ranges, np.array(sequence.lever_arm_m), StartRules())
+            self.ranging = Ranging(ranges, np.array(sequence.lever_arm_m))
+        self.pool = None if settings.is_deterministic else ThreadPoolExecutor(1)
+        self.job: tuple[Image, Tracks, Future[Tracks]] | None = None
 
     def finish(self, progress: Callable[[int, int], None]) -> VisualResult:
         """Go through all images and return the answer."""
@@ -79,9 +81,13 @@ class _Run:
                 else:
                     self.follow(i, image)
             progress(i + 1, n)
+        self.take_mapped(wait=True)
+        if self.pool is not None:
+            self.pool.shutdown()
         if self.settings.has_final_adjustment and self.world.n_frames > 2:
             with self.timed("last adjustment"):
                 self.adjust_all()
+                self.refine_frames()
         return self.answer()
 
     @contextmanager
@@ -164,17 +170,18 @@ class _Run:
 
     def follow(self, i: int, image: Image) -> None:
         """Track one image, and make it a key frame if it is time."""
+        self.take_mapped(wait=False)
         with self.timed("tracking"):
             found = self.tracker.follow(image)
         if found.pose is None:
+            self.take_mapped(wait=True)
             self.state[i] = FrameState.LOST
             if self.state[i - 1] == FrameState.TRACKED:
                 self.note(i, f"lost: {found.n_points} points left")
             return
         self.record(i, found.pose, self.tracker.reference, found.n_points, found.tracks)
-        if self.is_key_frame(i, found):
-            with self.timed("mapping"):
-                self.make_key_frame(i, image, found)
+        if self.job is None and self.is_key_frame(i, found):
+            self.make_key_frame(i, image, found)
 
     def is_key_frame(self, i: int, found: Followed) -> bool:
         """Return whether a tracked frame adds enough to the last key frame."""
@@ -200,33 +207,49 @@ class _Run:
         )
 
     def make_key_frame(self, i: int, image: Image, found: Followed) -> None:
-        """Insert a key frame, adjust around it, and go on from there."""
+        """Hand a key frame to the mapping, which runs beside or at once."""
         assert found.pose is not None
-        time_s = float(self.sequence.time_s[i])
-        with self.timed("insertion"):
-            tracks = self.mapper.insert(image, i, time_s, found.pose, found.tracks)
-        k = self.world.n_frames - 1
-        self.n_tracked[i] = int((self.world.tracks["point"][tracks.track] >= 0).sum())
-        self.record(i, found.pose, k, int(self.n_tracked[i]), tracks)
-        if self.ranging is not None:
-            with self.timed("ranges"):
-                self.ask_ranges(i)
-        with self.timed("local adjustment"):
-            self.mapper.adjust_local(k, self.ranging)
-        self.tracker.tracks = tracks
-        self.tracker.set_pose(self.world.pose(k), k)
-        self.record(i, self.world.pose(k), k, int(self.n_tracked[i]), tracks)
+        with self.world.lock:
+            k = self.world.add_frame(i, float(self.sequence.time_s[i]), found.pose, image)
+        self.tracker.set_pose(found.pose, k)
+        self.record(i, found.pose, k, found.n_points, found.tracks)
+        given = found.tracks
+        if self.pool is None:
+            self.tracker.renew(image, given, self.map_key_frame(k, i, given))
+        else:
+            self.job = (image, given, self.pool.submit(self.map_key_frame, k, i, given))
 
-    def ask_ranges(self, i: int, *, is_last: bool = False) -> None:
+    def take_mapped(self, *, wait: bool) -> None:
+        """Take over what the mapping beside has made, if it is done or is to be waited for."""
+        if self.job is not None and (wait or self.job[2].done()):
+            image, given, future = self.job
+            self.job = None
+            self.tracker.renew(image, given, future.result())
+
+    def map_key_frame(self, k: int, i: int, given: Tracks) -> Tracks:
+        """Fill key frame ``k`` of image ``i``, ask the ranges, adjust around it, look for loops."""
+        with self.timed("mapping"):
+            with self.timed("insertion"):
+                made = self.mapper.insert(k, given)
+            self.n_tracked[i] = int((self.world.tracks["point"][made.track] >= 0).sum())
+            if self.ranging is not None:
+                with self.timed("ranges"):
+                    self.ask_ranges(i)
+            with self.timed("local adjustment"):
+                self.mapper.adjust_local(k, self.ranging)
+        self.seen[i] = made
+        return made
+
+    def ask_ranges(self, i: int) -> None:
         """Hang the ranges up to image ``i`` on the key frames, and see what they tell."""
         assert self.ranging is not None
         R, t = self.poses()
         frames = FramePoses(
             self.sequence.time_s[: i + 1], R[: i + 1], t[: i + 1], self.reference[: i + 1]
         )
-        if self.ranging.renew(frames, self.world, is_last=is_last):
-            assert self.ranging.values is not None
-            self.note(i, f"scale started: {self.ranging.values.scale:.4g} m per map unit")
+        told = self.ranging.update(frames, self.world.frames["R_cw"], self.world.frames["t_cw"])
+        for text in told:
+            self.note(i, text)
 
     def record(
         self, i: int, pose: Pose, reference: int, n_points: int, tracks: Tracks
@@ -243,20 +266,17 @@ class _Run:
         self.events.append(f"{self.sequence.time_s[i] - self.sequence.time_s[0]:.2f} s: {text}")
 
     def adjust_all(self) -> None:
-        """Adjust everything together, then the pose of every frame to the points it saw."""
+        """Adjust everything together, ranges with all that they depend on."""
         steps = self.settings.global_steps
         effort = Effort(steps=steps, posterior_from=steps - 3, hold_scale=True)
         if self.ranging is not None:
-            self.ask_ranges(len(self.sequence.time_s) - 1, is_last=True)
+            self.ask_ranges(int(np.flatnonzero(self.reference >= 0)[-1]))
         window = self.mapper.whole()
-        problem = self.mapper.problem(window)
-        if self.ranging is not None:
-            problem = self.ranging.joined(problem, window, self.world.n_frames, is_free=True)
+        problem = self.mapper.problem(window, self.ranging, is_free=True)
         found = adjust(problem, effort)
         self.mapper.take(window, found)
-        if self.ranging is not None:
-            self.ranging.take(problem, found)
-        self.refine_frames()
+        if self.ranging is not None and problem.further is not None:
+            self.ranging.adopt(found.extra, found.extra_covariance, problem.further)
 
     def refine_frames(self) -> None:
         """Find the pose of every frame anew from the final places of the points it saw."""
@@ -288,6 +308,6 @@ class _Run:
         return VisualResult(
             name=self.sequence.name, camera=self.camera, time_s=self.sequence.time_s,
             state=self.state, R_cw=R, t_cw=t, key_frame=self.reference, n_tracked=self.n_tracked,
-            map=self.world.snapshot(), ranging=self.ranging, events=tuple(self.events),
+            map=self.world.snapshot(), ranging=None if self.ranging is None else self.ranging.result(), events=tuple(self.events),
             timing_s={part: np.array(values) for part, values in self.timing.items()},
         )  # fmt: skip
