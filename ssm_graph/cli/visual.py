@@ -141,12 +141,14 @@ def _without_ranges(sequence: Sequence) -> Sequence:
 
 
 def _followed(sequence: Sequence, arguments: argparse.Namespace, errors: Console) -> VisualResult:
+    from ssm_graph.systems.visual_ranges.loop_settings import LoopSettings
     from ssm_graph.systems.visual_ranges.settings import VisualSettings
     from ssm_graph.systems.visual_ranges.system import run as run_visual
 
     settings = VisualSettings(
         n_corners=arguments.corners,
         is_deterministic=not arguments.threads,
+        loops=LoopSettings(is_on=not arguments.no_loops),
     )
     columns = (
         TextColumn("{task.description}"),
@@ -189,8 +191,8 @@ def lines(result: VisualResult, found: Judged, off: Accuracy | None) -> list[str
     if found.verdict.has_scale:
         ranging = result.ranging
         told.append(
-            f"  scale {ranging.scale:.5g} m a map unit ± {100 * ranging.sigma_log_scale:.2f} %, known "
-            f"after {ranging.started_s - result.time_s[0]:.1f} s"
+            f"  scale {ranging.scale:.5g} m a map unit ± {100 * ranging.sigma_log_scale:.2f} %, "
+            f"known after {ranging.started_s - result.time_s[0]:.1f} s"
         )
         for anchor in ranging.anchors:
             place = ", ".join(f"{x:.2f}" for x in anchor.place_m)
