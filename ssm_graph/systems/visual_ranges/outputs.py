@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,7 +22,6 @@ Array = NDArray[np.float64]
 PATH_COLOUR: Final = (213, 94, 0)
 """Red, green, blue of the camera's path among the points of ``map.ply``."""
 ANCHOR_COLOUR: Final = (0, 114, 178)
-STEP_SIGMAS: Final = 3.0
 
 
 def metres(result: VisualResult) -> float:
@@ -98,8 +96,12 @@ def write_ply(path: Path, result: VisualResult, scale: float) -> None:
         anchors = anchors[np.isfinite(anchors).all(axis=1)]
         parts.append((anchors, np.zeros(len(anchors), dtype=np.int64), ANCHOR_COLOUR, 2))
     kind = np.dtype(
-        [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
-        + [("views", "<i4"), ("kind", "u1")]
+        [
+            *((name, "<f4") for name in "xyz"),
+            *((name, "u1") for name in ("red", "green", "blue")),
+            ("views", "<i4"),
+            ("kind", "u1"),
+        ]
     )
     vertices = []
     for places, views, colour, what in parts:
@@ -211,6 +213,3 @@ def _cell(value: float) -> str:
 
 def _write_text(path: Path, lines: list[str]) -> None:
     write_through(path, ("\n".join(lines) + "\n").encode())
-
-
-Summary = Mapping[str, Any]

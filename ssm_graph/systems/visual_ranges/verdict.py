@@ -95,8 +95,8 @@ def _losses(result: VisualResult) -> list[str]:
     if n_lost <= LOST_SHARE * len(after):
         return []
     return [
-        f"{n_lost} of {len(after)} images after the start have no pose ({100 * n_lost / len(after):.0f}"
-        " %): too dark, too fast, or nothing to see"
+        f"{n_lost} of {len(after)} images after the start have no pose "
+        f"({100 * n_lost / len(after):.0f} %): too dark, too fast, or nothing to see"
     ]
 
 
