@@ -21,6 +21,7 @@ Without it the only image topic is taken, and every topic of ``sensor_msgs/Range
 from __future__ import annotations
 
 import tomllib
+import weakref
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -189,6 +190,7 @@ class _Bag:
                 "was cut off, try  ros2 bag reindex,  or  rosbag reindex  for ROS 1"
             ) from error
 
+        weakref.finalize(self, self._reader.close)
         self._open: tuple[str, Iterator[Any], int] | None = None
         """Topic, messages still to come, and the earliest time that is among them."""
 
