@@ -28,7 +28,7 @@ CLOCK_S: Final = 0.020
 """Prior standard deviation of the ranges' clock."""
 BIAS_WALK_M: Final = 0.02
 """Random walk of a bias, m after one second: antennas that turn."""
-DRIFT: Final = 0.003
+DRIFT: Final = 0.002
 """Random walk of a visual path, its standard deviation at the end as a share of its length."""
 N_MODES: Final = 6
 """Of a random walk; they hold 97 % of its variance."""
@@ -305,16 +305,19 @@ class Solution(ReadOnlyArrays):
         return self.covariance[own, own]
 
 
-def solution(problem: Problem, start: Array, *, rounds: int = ROUNDS) -> Solution:
+def solution(
+    problem: Problem, start: Array, *, rounds: int = ROUNDS, is_near: bool = False
+) -> Solution:
     """Return the minimum near one set of unknowns (P,), weights with the posterior in them.
 
-    First a damped search by the residuals alone, then at most ``rounds`` reweightings with
-    ``H P H'`` of the posterior before; they end when no unknown moves by a thousandth of its sigma.
+    First a damped search by the residuals alone, where the start is not near already, then at most
+    ``rounds`` reweightings with ``H P H'`` of the posterior before; they end when no unknown moves
+    by a thousandth of its sigma.
     """
-    at = search(problem, start[None]).unknowns if rounds else start[None]
+    at = start[None] if is_near else search(problem, start[None]).unknowns
     information = np.diag(problem.prior_information())
     variance: Array = np.zeros((1, len(problem.places.range_m)))
-    for _ in range(max(rounds, 1)):
+    for _ in range(rounds):
         error, J = residuals(problem, at)
         normal, gradient = _normal(problem, at, error, J, variance=variance)
         covariance = np.linalg.inv(normal[0] + information)

@@ -12,7 +12,7 @@ further. Jacobians are of the left perturbation ``T_cw = Exp(rho, phi) T_cw``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -57,11 +57,6 @@ class RangeBlocks(NamedTuple):
     clock: Array
     """(M,) m/s"""
 
-    def stacked(self) -> Array:
-        """Return all blocks (M, 12): pose, scale, anchor, bias, clock."""
-        single = (self.scale[:, None], self.anchor, self.bias[:, None], self.clock[:, None])
-        return np.concatenate([self.pose, *single], axis=1)
-
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class RangeTerms(ReadOnlyArrays):
@@ -92,6 +87,10 @@ class RangeTerms(ReadOnlyArrays):
     def rows(self, kept: NDArray[np.bool_] | Indices) -> RangeTerms:
         """Return some of them."""
         return RangeTerms(*(getattr(self, name)[kept] for name in self.__dataclass_fields__))
+
+    def on(self, pose: Indices) -> RangeTerms:
+        """Return the same on key frames counted otherwise: (M,) of each."""
+        return replace(self, key_frame=pose)
 
     def linearise(
         self,
@@ -128,37 +127,6 @@ class RangeTerms(ReadOnlyArrays):
             bias=np.ones(len(self)),
             clock=np.einsum("mi,mi->m", u_c, s * self.velocity + self.lever_rate),
         )
-
-    def columns(self, key_column: Indices, *, scale: int, anchors: int, clock: int) -> Indices:
-        """Return the columns (M, 12) of `RangeBlocks.stacked` in a system of equations.
-
-        Parameters
-        ----------
-        key_column : (K,) first column of each key frame, -1 where it is held.
-        scale, clock : columns, -1 where held.
-        anchors : first column of anchor 0; each takes 4, place and bias; -1 where held.
-        """
-        first = key_column[self.key_frame]
-        pose = np.where(first[:, None] < 0, -1, first[:, None] + np.arange(6))
-        own = anchors + 4 * self.anchor[:, None] + np.arange(4)
-        own = own if anchors >= 0 else np.full_like(own, -1)
-        single = np.full((len(self), 1), scale), np.full((len(self), 1), clock)
-        return np.concatenate([pose, single[0], own, single[1]], axis=1).astype(np.intp)
-
-
-def posterior_variance(J: Array, columns: Indices, covariance: Array) -> Array:
-    """Return ``H P H'`` (M,) of rows with few entries.
-
-    Parameters
-    ----------
-    J : (M, n) entries.
-    columns : (M, n) their columns in ``covariance``, -1 for what is held.
-    covariance : (P, P)
-    """
-    held = np.where(columns < 0, 0.0, J)
-    at = np.maximum(columns, 0)
-    blocks = covariance[at[:, :, None], at[:, None, :]]
-    return np.asarray(np.einsum("mi,mij,mj->m", held, blocks, held))
 
 
 def hang(

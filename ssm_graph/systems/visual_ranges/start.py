@@ -17,6 +17,7 @@ import numpy as np
 from ssm_graph.base.frozen import Array, ShortRepr
 from ssm_graph.systems.visual_ranges.observability import Motion, Shape, advice, shape_of
 from ssm_graph.systems.visual_ranges.range_fit import (
+    BIAS_M,
     BIAS_WALK_M,
     DRIFT,
     Places,
@@ -25,7 +26,6 @@ from ssm_graph.systems.visual_ranges.range_fit import (
     problem_of,
     search,
     solution,
-    unknowns_of,
     with_sigma,
 )
 from ssm_graph.systems.visual_ranges.ranges import Indices
@@ -70,6 +70,9 @@ class StartRules:
     marked_share: float = 0.4
     """Of an anchor's ranges that may be not in line of sight."""
     drift: float = DRIFT
+    """Of a path before ranges hold it; see :data:`.range_fit.DRIFT`."""
+    ledger_drift: float = 0.001
+    """Of a path that its ranges hold."""
     bias_walk_m: float = BIAS_WALK_M
     kernel: RangeKernel = RangeKernel()
 
@@ -130,11 +133,11 @@ def find_start(
     )
     found = _candidates(problem)
     found, costs = _searched(problem, found)
-    best = _settled(problem, found[0])
-    problem = _widened(problem, best)
+    best = solution(problem, found[0])
+    problem = widened(problem, best)
     found, costs = _searched(problem, found)
     best = solution(problem, found[0])
-    rivals = [solution(problem, one) for one in found[1:] if one is not None]
+    rivals = [solution(problem, one) for one in found[1:]]
     apart = [rival for rival in rivals if _is_apart(best, rival)]
     gap = min((rival.cost - best.cost for rival in apart), default=np.inf)
     near = [rival for rival in apart if rival.cost - best.cost < rules.gap]
@@ -292,11 +295,7 @@ def _searched(problem: Problem, starts: list[Array]) -> tuple[list[Array], Array
     return [fit.unknowns[row] for row in order], fit.cost[order]
 
 
-def _settled(problem: Problem, unknowns: Array) -> Solution:
-    return solution(problem, unknowns)
-
-
-def _widened(problem: Problem, best: Solution) -> Problem:
+def widened(problem: Problem, best: Solution) -> Problem:
     """Return the problem with sigmas that are not below what each anchor's residuals show."""
     sigma = problem.places.sigma_m.copy()
     for j in range(problem.n_anchors):
@@ -392,6 +391,9 @@ def _contradictions(
         stated, seen = float(np.median(at.sigma_m[own])), robust_rms(best.error[own])
         if seen > rules.rms_sigmas * stated:
             told.append(f"residuals of anchor {name} are {seen:.2f} m, {stated:.2f} m were stated")
+        bias = float(best.biases[j])
+        if abs(bias) > 3.0 * BIAS_M:
+            told.append(f"the bias of anchor {name} would be {bias:.2f} m")
         marked = float(np.mean(best.error[own] < -4.0 * at.sigma_m[own]))
         if marked > rules.marked_share:
             told.append(f"{100.0 * marked:.0f} % of the ranges to anchor {name} are too long")
@@ -425,6 +427,22 @@ def _part(problem: Problem, kept: Array) -> Problem:
     )
 
 
-def start_unknowns(problem: Problem, found: Solution) -> Array:
-    """Return the unknowns (P,) of a problem at a solution of another, modes at zero."""
-    return unknowns_of(problem, found.scale, found.anchors, found.biases, found.clock_s)
+def later_anchor(
+    problem: Problem, log_scale: float, rules: StartRules
+) -> list[tuple[Array, Array, float]]:
+    """Return places of one anchor whose scale is known: unknowns (4,), covariance (4, 4), deviance.
+
+    Best first, only distinct ones, from the middle of the path as in `Problem`; the problem is of
+    this anchor alone and without modes.
+    """
+    found = _placed(problem, [], log_scale)
+    made = np.zeros((len(found), problem.n_unknowns))
+    made[:, 0] = log_scale
+    made[:, 2:] = [own for own, _ in found]
+    kept = [(row, cost) for row, (_, cost) in zip(made, found, strict=True)]
+    told = []
+    for row, cost in kept:
+        if cost > kept[0][1] + rules.gap:
+            break
+        told.append((row[2:], solution(problem, row, is_near=True).covariance[2:, 2:], cost))
+    return told
