@@ -15,9 +15,12 @@ from numpy.typing import NDArray
 from ssm_graph.systems.visual_ranges.bundle import Effort, adjust
 from ssm_graph.systems.visual_ranges.features import Image, corners, flow
 from ssm_graph.systems.visual_ranges.geometry import Pose, refine_pose
+from ssm_graph.systems.visual_ranges.loop_closing import close_loop
+from ssm_graph.systems.visual_ranges.loops import LoopFinder, judge_of
 from ssm_graph.systems.visual_ranges.mapping import Mapper
 from ssm_graph.systems.visual_ranges.range_terms import FramePoses
 from ssm_graph.systems.visual_ranges.ranging import Ranging
+from ssm_graph.systems.visual_ranges.relocalise import relocalise
 from ssm_graph.systems.visual_ranges.result import FrameState, VisualResult
 from ssm_graph.systems.visual_ranges.settings import VisualSettings
 from ssm_graph.systems.visual_ranges.tracking import Followed, Tracker, Tracks
@@ -30,6 +33,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _LEAST_CORNERS: Final = 100
+_NEW_SCALE: Final = 0.02
+"""Change of scale by a loop from which scale and anchors are found anew."""
 _HISTORY: Final = 60
 """Frames before the start whose poses are found afterwards."""
 
@@ -67,6 +72,7 @@ class _Run:
         self.ranging = None
         if ranges is not None and len(ranges):
             self.ranging = Ranging(ranges, np.array(sequence.lever_arm_m))
+        self.loops = LoopFinder(self.camera, settings.loops)
         self.pool = None if settings.is_deterministic else ThreadPoolExecutor(1)
         self.job: tuple[Image, Tracks, Future[Tracks]] | None = None
 
@@ -175,6 +181,8 @@ class _Run:
             found = self.tracker.follow(image)
         if found.pose is None:
             self.take_mapped(wait=True)
+            if self.find_again(i, image):
+                return
             self.state[i] = FrameState.LOST
             if self.state[i - 1] == FrameState.TRACKED:
                 self.note(i, f"lost: {found.n_points} points left")
@@ -182,6 +190,22 @@ class _Run:
         self.record(i, found.pose, self.tracker.reference, found.n_points, found.tracks)
         if self.job is None and self.is_key_frame(i, found):
             self.make_key_frame(i, image, found)
+
+    def find_again(self, i: int, image: Image) -> bool:
+        """Look for a lost camera in the map; return whether it was found."""
+        with self.timed("relocalisation"):
+            found = relocalise(
+                self.world, self.loops, self.camera, image, self.settings.n_corners
+            )
+        if found is None:
+            return False
+        with self.world.lock:
+            tracks = Tracks(self.world.new_tracks(len(found.points), found.points), found.pixel)
+        self.tracker.start(image, tracks, found.pose, found.key_frame)
+        self.tracker.depth = float(self.world.frames["depth"][found.key_frame])
+        self.record(i, found.pose, found.key_frame, len(found.points), tracks)
+        self.note(i, f"found again by {len(found.points)} points of key frame {found.key_frame}")
+        return True
 
     def is_key_frame(self, i: int, found: Followed) -> bool:
         """Return whether a tracked frame adds enough to the last key frame."""
@@ -237,8 +261,31 @@ class _Run:
                     self.ask_ranges(i)
             with self.timed("local adjustment"):
                 self.mapper.adjust_local(k, self.ranging)
+            if self.settings.loops.is_on:
+                with self.timed("loops"):
+                    self.close_loop(k, i)
         self.seen[i] = made
         return made
+
+    def close_loop(self, k: int, i: int) -> None:
+        """Look for a place seen before, and correct map, path and scale by it."""
+        match = self.loops.look(self.world, k, judge_of(self.ranging, self.world))
+        if match is None:
+            return
+        with self.world.lock:
+            closed = close_loop(self.world, match, self.camera)
+            grown = np.array([one.scale for one in closed.change])
+            on = self.reference >= 0
+            self.relative_t[on] *= grown[self.reference[on], None]
+            self.tracker.grow(float(grown[self.tracker.reference]))
+        self.note(
+            i,
+            f"loop closed with the key frame of {self.world.frames['time_s'][match.matched]:.1f} s: "
+            f"{self.loops.records[-1].why}; {closed.n_fused} points joined",
+        )
+        if self.ranging is not None and abs(np.log(match.correction.scale)) > _NEW_SCALE:
+            self.ranging.restart()
+        self.adjust_all(i)
 
     def ask_ranges(self, i: int) -> None:
         """Hang the ranges up to image ``i`` on the key frames, and see what they tell."""
@@ -265,12 +312,12 @@ class _Run:
         """Keep what happened."""
         self.events.append(f"{self.sequence.time_s[i] - self.sequence.time_s[0]:.2f} s: {text}")
 
-    def adjust_all(self) -> None:
-        """Adjust everything together, ranges with all that they depend on."""
+    def adjust_all(self, last: int | None = None) -> None:
+        """Adjust everything together, ranges up to image ``last`` with all they depend on."""
         steps = self.settings.global_steps
         effort = Effort(steps=steps, posterior_from=steps - 3, hold_scale=True)
         if self.ranging is not None:
-            self.ask_ranges(int(np.flatnonzero(self.reference >= 0)[-1]))
+            self.ask_ranges(int(np.flatnonzero(self.reference >= 0)[-1]) if last is None else last)
         window = self.mapper.whole()
         problem = self.mapper.problem(window, self.ranging, is_free=True)
         found = adjust(problem, effort)
@@ -308,6 +355,8 @@ class _Run:
         return VisualResult(
             name=self.sequence.name, camera=self.camera, time_s=self.sequence.time_s,
             state=self.state, R_cw=R, t_cw=t, key_frame=self.reference, n_tracked=self.n_tracked,
-            map=self.world.snapshot(), ranging=None if self.ranging is None else self.ranging.result(), events=tuple(self.events),
+            map=self.world.snapshot(),
+            ranging=None if self.ranging is None else self.ranging.result(),
+            loops=tuple(self.loops.records), events=tuple(self.events),
             timing_s={part: np.array(values) for part, values in self.timing.items()},
         )  # fmt: skip

@@ -91,6 +91,12 @@ class Tracker:
         self.reference = reference
         self.relative = pose.after(self._world.pose(reference).inverse())
 
+    def grow(self, scale: float) -> None:
+        """Follow a change of the map's scale around the reference key frame."""
+        self.relative = Pose(self.relative.R_cw, scale * self.relative.t_cw)
+        self.velocity = Pose(self.velocity.R_cw, scale * self.velocity.t_cw)
+        self.depth *= scale
+
     def start(self, image: Image, tracks: Tracks, pose: Pose, reference: int) -> None:
         """Begin anew at an image whose pose and tracks are known, at rest."""
         self.image, self.tracks = image, tracks
