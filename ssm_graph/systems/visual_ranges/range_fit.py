@@ -28,7 +28,7 @@ CLOCK_S: Final = 0.020
 """Prior standard deviation of the ranges' clock."""
 BIAS_WALK_M: Final = 0.02
 """Random walk of a bias, m after one second: antennas that turn."""
-DRIFT: Final = 0.003
+DRIFT: Final = 0.002
 """Random walk of a visual path, its standard deviation at the end as a share of its length."""
 N_MODES: Final = 6
 """Of a random walk; they hold 97 % of its variance."""

@@ -39,6 +39,8 @@ from ssm_graph.systems.visual_ranges.weights import NLOS_WEIGHT, robust_rms
 TRY_AGAIN: Final = 1.15
 """A start is tried again when so many times the ranges are there."""
 RECENT_S: Final = 10.0
+CHECK_AGAIN: Final = 1.5
+"""And all is searched again when so many times the ranges are there."""
 LEAST_RECENT: Final = 20
 SAME_PLACE_M: Final = 0.2
 DOUBTFUL_SHARE: Final = 0.6
@@ -138,12 +140,17 @@ class Ranging(ShortRepr):
         self.history: list[tuple[float, float, float]] = []
         self.started_s = float("nan")
         self.error, self.weight = np.full((2, len(ranges)), np.nan)
-        self._tried = 0
+        self._tried = self._checked = 0
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether the ranges contradict themselves."""
+        return self.start is not None and self.start.state is StartState.REFUSED
 
     @property
     def has_scale(self) -> bool:
         """Whether map units can be turned into metres."""
-        return self.found is not None
+        return self.found is not None and not self.is_refused
 
     @property
     def scale(self) -> float:
@@ -177,7 +184,7 @@ class Ranging(ShortRepr):
 
     def restart(self) -> None:
         """Forget scale and anchors: the map's scale has changed. The next update starts anew."""
-        self.found, self._tried = None, 0
+        self.found, self._tried, self._checked = None, 0, 0
         for own in self.anchors:
             own.state, own.alternatives = AnchorState.UNKNOWN, ()
 
@@ -191,7 +198,7 @@ class Ranging(ShortRepr):
         pose_of : (K,) index of each key frame among the problem's poses, -1 for the others.
         is_free : whether scale, clock, anchors and biases are adjusted with them.
         """
-        if self.found is None or self.terms is None:
+        if self.found is None or self.terms is None or self.is_refused:
             return None
         column = np.full(len(self.anchors), -1, dtype=np.intp)
         column[self.used] = np.arange(len(self.used))
@@ -233,7 +240,7 @@ class Ranging(ShortRepr):
         """Return all as it stands."""
         found = self.found
         state = StartState.WAITING if self.start is None else self.start.state
-        if found is not None:
+        if found is not None and not self.is_refused:
             states = [own.state for own in self.anchors]
             is_sharp = all(s is not AnchorState.AMBIGUOUS for s in states)
             state = StartState.READY if is_sharp else StartState.MIRROR
@@ -284,6 +291,7 @@ class Ranging(ShortRepr):
         self.start = find_start(own, names, self.rules, turned_rad=turned_rad)
         if not self.start.has_scale or self.start.solution is None:
             return []
+        self._checked = len(places.time_s)
         self.found, self.used = self.start.solution, [int(j) for j in eligible]
         self.started_s = float(places.time_s[-1])
         for i, j in enumerate(self.used):
@@ -313,33 +321,62 @@ class Ranging(ShortRepr):
         )
         before = self.found
         start = unknowns_of(problem, before.scale, before.anchors, before.biases, before.clock_s)
-        first = solution(problem, start, rounds=3, is_near=True)
-        problem = widened(problem, first)
-        self.found = solution(problem, first.unknowns, rounds=3, is_near=True)
+        problem = widened(problem, solution(problem, start, rounds=3))
+        self.found = solution(problem, start, rounds=3)
+        if len(places.time_s) > CHECK_AGAIN * self._checked:
+            self._checked = len(places.time_s)
+            told = self._check(own, problem)
+            self._rivals(problem)
+        else:
+            told = []
         assert self.terms is not None
         row = self.terms.row[kept]
         self.error[row], self.weight[row] = self.found.error, self.found.weight
-        return self._sharpened(problem, now)
+        return [*told, *self._sharpened(problem, now)]
+
+    def _check(self, own: Places, problem: Problem) -> list[str]:
+        """Search everywhere again, with all ranges of the anchors in use; take what is better."""
+        assert self.found is not None
+        names = tuple(self.anchors[j].name for j in self.used)
+        again = find_start(own, names, self.rules, turned_rad=np.inf)
+        was_refused, self.start = self.is_refused, again
+        if self.is_refused != was_refused:
+            what = "; ".join(again.reasons) if self.is_refused else "no contradiction any more"
+            told = [f"scale {'doubted' if self.is_refused else 'believed again'}: {what}"]
+        else:
+            told = []
+        best = again.solution
+        if best is None:
+            return told
+        other = unknowns_of(problem, best.scale, best.anchors, best.biases, best.clock_s)
+        fit = search(problem, np.array([self.found.unknowns, other]))
+        if fit.cost[1] < fit.cost[0] - self.rules.gap:
+            old = self.found.scale
+            self.found = solution(problem, fit.unknowns[1], is_near=True)
+            told.append(f"a better solution: {self.found.scale / old:.3f} times the scale before")
+        return told
+
+    def _rivals(self, problem: Problem) -> None:
+        """Try the other places of anchors that have some."""
+        for i, j in enumerate(self.used):
+            if self.anchors[j].alternatives:
+                self._against_rivals(problem, i)
 
     def _sharpened(self, problem: Problem, now: float) -> list[str]:
-        """Judge the anchors anew: rivals, sharpness, and whether the last ranges fit."""
+        """Judge the anchors anew: sharpness, and whether the last ranges fit."""
         assert self.found is not None
         told = []
         for i, j in enumerate(self.used):
             own, at = self.anchors[j], problem.places
             recent = (at.anchor == i) & (at.time_s > now - RECENT_S)
             marked = self.found.weight[recent] < NLOS_WEIGHT
-            old = own.state
+            is_sharp = not own.alternatives and self._is_sharp(i, at)
+            state = AnchorState.READY if is_sharp else AnchorState.AMBIGUOUS
             if recent.sum() >= LEAST_RECENT and float(np.mean(marked)) > DOUBTFUL_SHARE:
-                own.state = AnchorState.DOUBTFUL
-            elif own.alternatives or not self._is_sharp(i, at):
-                self._against_rivals(problem, i)
-                is_sharp = not own.alternatives and self._is_sharp(i, at)
-                own.state = AnchorState.READY if is_sharp else AnchorState.AMBIGUOUS
-            else:
-                own.state = AnchorState.READY
-            if own.state is not old:
-                told.append(f"anchor {own.name}: {own.state.value}")
+                state = AnchorState.DOUBTFUL
+            if own.state is not state:
+                told.append(f"anchor {own.name}: {state.value}")
+            own.state = state
         return told
 
     def _is_sharp(self, i: int, at: Places) -> bool:

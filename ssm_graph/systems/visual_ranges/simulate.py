@@ -27,7 +27,7 @@ SMALL_CAMERA: Final = Camera(320, 240, 230.0, 230.0, 159.5, 119.5)
 CORNER_M: Final = 1.0
 """Radius of the corridor path's corners."""
 ANCHORS: Final = {
-    "room": ((3.6, 0.9, 2.1), (-3.7, -2.0, 2.5), (-1.0, 2.8, 0.4)),
+    "room": ((3.7, 1.6, 2.2), (-3.7, -2.0, 2.5), (-1.0, 2.8, 0.4)),
     "corridor": ((-2.0, 7.0, 2.3), (10.0, -7.0, 0.5), (-11.9, -3.0, 1.5)),
 }
 """Places in the world, m; as many as are asked for."""

@@ -17,6 +17,7 @@ import numpy as np
 from ssm_graph.base.frozen import Array, ShortRepr
 from ssm_graph.systems.visual_ranges.observability import Motion, Shape, advice, shape_of
 from ssm_graph.systems.visual_ranges.range_fit import (
+    BIAS_M,
     BIAS_WALK_M,
     DRIFT,
     Places,
@@ -390,6 +391,9 @@ def _contradictions(
         stated, seen = float(np.median(at.sigma_m[own])), robust_rms(best.error[own])
         if seen > rules.rms_sigmas * stated:
             told.append(f"residuals of anchor {name} are {seen:.2f} m, {stated:.2f} m were stated")
+        bias = float(best.biases[j])
+        if abs(bias) > 3.0 * BIAS_M:
+            told.append(f"the bias of anchor {name} would be {bias:.2f} m")
         marked = float(np.mean(best.error[own] < -4.0 * at.sigma_m[own]))
         if marked > rules.marked_share:
             told.append(f"{100.0 * marked:.0f} % of the ranges to anchor {name} are too long")

@@ -13,7 +13,7 @@ from ssm_graph.base.frozen import Array
 Picture = NDArray[np.float32]
 
 ROOM_M: Final = (8.0, 6.0, 3.0)
-PILLAR_M: Final = (2.9, 3.25, 0.0, 0.5)
+PILLAR_M: Final = (2.6, 2.85, -0.1, 0.15)
 """x from, to, y from, to"""
 RING_M: Final = (22.0, 12.0)
 """Sides of the corridors' centre line: 68 m about, 66 with its corners rounded."""

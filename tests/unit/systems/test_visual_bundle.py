@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from factors import so3
 from ssm_graph.systems.visual_ranges import bundle_rows
 from ssm_graph.systems.visual_ranges.bundle import Effort, Problem, adjust, sorted_views
+from ssm_graph.systems.visual_ranges.geometry import pose_equations, pose_equations_numpy
 
 Array = NDArray[np.float64]
 SCALE = 400.0
@@ -167,3 +168,15 @@ def test_wrong_views_get_little_weight() -> None:
     off = np.abs(robust.t_cw - clean.t_cw).max()
     plain = adjust(spoiled, Effort(steps=30, dof=float("inf")))
     assert off < 0.2 * np.abs(plain.t_cw - clean.t_cw).max()
+
+
+def test_pose_equations_are_one() -> None:
+    """The compiled form of the pose's equations and NumPy's agree, points behind the camera too."""
+    p = made_problem(6)
+    rng = np.random.default_rng(0)
+    points = np.vstack([p.points, [[0.0, 0.0, -3.0]]])
+    xy, scale = rng.normal(0.0, 0.3, (len(points), 2)), np.full((len(points), 2), SCALE)
+    state = (p.R_cw[3], p.t_cw[3], points, xy, scale)
+    for one, other in zip(pose_equations(*state), pose_equations_numpy(*state), strict=True):
+        size = np.abs(other[np.isfinite(other)]).max()
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12 * size)
