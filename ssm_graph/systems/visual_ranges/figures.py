@@ -40,6 +40,8 @@ Array = NDArray[np.float64]
 
 ANCHOR_COLORS: Final = ("#009E73", "#CC79A7", "#D55E00", *OTHER_COLORS)
 MOST_POINTS: Final = 6000
+MOST_LINES: Final = 120
+"""Ways of points since the key frame before that are drawn on an image."""
 
 
 def write_figures(
@@ -245,7 +247,9 @@ def _image_figure(sequence: Sequence, result: VisualResult) -> Any:
         axes.plot(
             *pixels[mask].T, ".", color=colour, markersize=3.5, label=f"{label}: {mask.sum()}"
         )
-    axes.add_collection(LineCollection(_flow(result, k, rows), colors=REDUCED, linewidths=0.8))
+    axes.add_collection(
+        LineCollection(_flow(result, k, rows), colors=REDUCED, linewidths=0.7, alpha=0.6)
+    )
     axes.set_axis_off()
     axes.legend(
         fontsize=SMALL, loc="lower right", facecolor="white", labelcolor=INK, framealpha=0.9
@@ -261,4 +265,5 @@ def _flow(result: VisualResult, k: int, rows: NDArray[np.int64]) -> list[Array]:
     before = np.arange(world.first_row[k - 1], world.first_row[k])
     seen = {int(p): r for p, r in zip(world.point[before], before, strict=True) if p >= 0}
     pairs = [(seen[int(p)], r) for p, r in zip(world.point[rows], rows, strict=True) if p in seen]
+    pairs = [pairs[i] for i in thinned(len(pairs), MOST_LINES)]
     return [world.pixels[[a, b]].astype(np.float64) for a, b in pairs]

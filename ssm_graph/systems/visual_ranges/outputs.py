@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from ssm_graph.io.tables.append_file import write_through
 from ssm_graph.systems.visual_ranges.accuracy import Accuracy
+from ssm_graph.systems.visual_ranges.map_files import MAP_NAME, save_map
 from ssm_graph.systems.visual_ranges.ranging import RangingResult
 from ssm_graph.systems.visual_ranges.result import FrameState, VisualResult
 from ssm_graph.systems.visual_ranges.sequence import Sequence
@@ -57,6 +59,7 @@ def write_outputs(
         unit=np.array(unit),
     )
     write_ply(folder / "map.ply", result, scale)
+    save_map(folder / MAP_NAME, result)
     ranging: RangingResult | None = result.ranging
     if ranging is not None:
         _write_text(folder / "anchors.csv", _anchor_rows(ranging))
@@ -147,7 +150,7 @@ def summary_of(
         "path_length": length,
         "loops_taken": sum(loop.is_taken for loop in result.loops),
         "loops_refused": sum(not loop.is_taken for loop in result.loops),
-        "events": list(result.events),
+        "events": told_events(result.events),
         "notes": [*sequence.notes, *notes],
     }
     if ranging is not None:
@@ -168,6 +171,25 @@ def summary_of(
             "anchor_error_m": [_plain(x) for x in errors.anchor_m],
         }
     return found
+
+
+def told_events(events: tuple[str, ...]) -> list[str]:
+    """Return events, those that repeat the one before but for time and numbers told once."""
+    told: list[str] = []
+    kinds: list[str] = []
+    counts: list[int] = []
+    for event in events:
+        kind = re.sub(r"[\d.]+", "", event)
+        if kinds and kinds[-1] == kind:
+            counts[-1] += 1
+            continue
+        told.append(event)
+        kinds.append(kind)
+        counts.append(1)
+    return [
+        text if n == 1 else f"{text} (and {n - 1} times more)"
+        for text, n in zip(told, counts, strict=True)
+    ]
 
 
 def _plain(value: float) -> float | None:

@@ -14,7 +14,7 @@ from ssm_graph.base.code_version import code_version
 from ssm_graph.io.tables.append_file import write_through
 from ssm_graph.report.page.words import table
 from ssm_graph.systems.visual_ranges.accuracy import Accuracy
-from ssm_graph.systems.visual_ranges.outputs import metres
+from ssm_graph.systems.visual_ranges.outputs import metres, told_events
 from ssm_graph.systems.visual_ranges.ranging import RangingResult
 from ssm_graph.systems.visual_ranges.result import FrameState, VisualResult
 from ssm_graph.systems.visual_ranges.sequence import Sequence
@@ -82,9 +82,7 @@ def _picture(path: Path, title: str) -> str:
     return f'<img alt="{html.escape(title)}" src="data:image/png;base64,{data}">'
 
 
-def _head(
-    sequence: Sequence, result: VisualResult, judged: Judged, errors: Accuracy | None
-) -> str:
+def _head(sequence: Sequence, result: VisualResult, judged: Judged, errors: Accuracy | None) -> str:
     sign, style = ("✔", "good") if judged.verdict.is_good else ("⚠", "bad")
     reasons = "".join(f"<p>{html.escape(text)}</p>" for text in judged.reasons)
     if judged.advice:
@@ -138,7 +136,7 @@ def _sections(
     return [
         ("Anchors", _anchors(result.ranging, errors)),
         ("Loops", _loops(result)),
-        ("What happened", _list(result.events)),
+        ("What happened", _list(tuple(told_events(result.events)))),
         ("The recording", _list((*sequence.notes, *notes))),
         ("Time taken", _timing(result)),
     ]
