@@ -185,12 +185,16 @@ def _run_figure(sequence: Sequence, result: VisualResult) -> Any:
         result.map.time_s - begin, np.full(len(result.map.time_s), -12.0), "|", color=GREY,
         markersize=4, label="key frames",
     )  # fmt: skip
-    for is_taken, colour, label in ((True, REDUCED, "loop"), (False, OUTLIER, "loop refused")):
-        times = [loop.time_s - begin for loop in result.loops if loop.is_taken is is_taken]
-        for n, time in enumerate(times):
-            axes.axvline(time, color=colour, linewidth=0.8, label=label if n == 0 else None)
+    taken = [loop.time_s - begin for loop in result.loops if loop.is_taken]
+    for n, time in enumerate(taken):
+        axes.axvline(time, color=REDUCED, linewidth=1.2, label="loop closed" if n == 0 else None)
+    refused = [loop.time_s - begin for loop in result.loops if not loop.is_taken]
+    if refused:
+        level = np.full(len(refused), 1.05 * max(float(result.n_tracked.max()), 1.0))
+        axes.plot(refused, level, "x", color=OUTLIER, markersize=3, label="loop refused")
+    axes.set_ylim(top=1.25 * max(float(result.n_tracked.max()), 1.0))
     dress(axes, title="Points seen", x="time since the first image (s)", y="points")
-    legend(axes, loc="upper right", ncols=4)
+    legend(axes, loc="upper left", ncols=5)
     error, _ = reprojection_errors(result)
     size = np.linalg.norm(error, axis=1) if len(error) else np.zeros(1)
     top = max(float(np.percentile(size, 99)), 0.1)
@@ -216,10 +220,11 @@ def _draw_states(axes: Axes, ranging: RangingResult) -> None:
         with np.errstate(invalid="ignore"):
             sigma = float(np.sqrt(np.trace(anchor.covariance)))
         height = sigma if np.isfinite(sigma) else 0.0
-        axes.bar(n, height, color=ANCHOR_COLORS[n % len(ANCHOR_COLORS)])
+        axes.bar(n, height, width=0.5, color=ANCHOR_COLORS[n % len(ANCHOR_COLORS)])
+    axes.set_xlim(-0.8, max(len(ranging.anchors), 2) - 0.2)
     axes.set_xticks(range(len(ranging.anchors)))
     axes.set_xticklabels([f"{a.name}\n{a.state.name.lower()}" for a in ranging.anchors])
-    dress(axes, title="Anchors", y="sigma (m)")
+    dress(axes, title="Anchors", y="sigma of the place (m)")
 
 
 def _image_figure(sequence: Sequence, result: VisualResult) -> Any:

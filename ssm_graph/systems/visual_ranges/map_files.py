@@ -72,7 +72,7 @@ def load_map(path: Path) -> SavedMap:
     Raises :class:`DataError` for a file that is none, is damaged, or of another version.
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             meta: dict[str, Any] = json.loads(archive["meta"].tobytes())
             arrays = {spec.name: archive[spec.name] for spec in fields(MapSnapshot)}
     except (OSError, ValueError, KeyError, BadZipFile) as error:

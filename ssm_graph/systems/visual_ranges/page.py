@@ -20,6 +20,8 @@ from ssm_graph.systems.visual_ranges.result import FrameState, VisualResult
 from ssm_graph.systems.visual_ranges.sequence import Sequence
 from ssm_graph.systems.visual_ranges.verdict import Judged, reprojection_errors
 
+MOST_REFUSED: Final = 20
+"""Loops refused that are shown one by one."""
 _PAGE: Final = """\
 <!DOCTYPE html>
 <html lang="en">
@@ -181,6 +183,9 @@ def _loops(result: VisualResult) -> str:
     if not result.loops:
         return "<p>No place was seen again.</p>"
     begin = result.time_s[0]
+    taken = [loop for loop in result.loops if loop.is_taken]
+    refused = [loop for loop in result.loops if not loop.is_taken]
+    shown = sorted([*taken, *refused[:MOST_REFUSED]], key=lambda loop: loop.time_s)
     rows = [
         (
             f"{loop.time_s - begin:.1f}",
@@ -190,10 +195,12 @@ def _loops(result: VisualResult) -> str:
             f"{loop.scale:.3f}",
             f"{100 * loop.shift / max(loop.path, 1e-9):.1f} %",
         )
-        for loop in result.loops
+        for loop in shown
     ]
+    told = f"<p>{len(taken)} closed, {len(refused)} refused"
+    told += f", the first {MOST_REFUSED} shown.</p>" if len(refused) > MOST_REFUSED else ".</p>"
     header = ("time (s)", "", "why", "inliers of matches", "scale", "moves, of the path between")
-    return table(header, rows)
+    return told + table(header, rows)
 
 
 def _list(lines: tuple[str, ...]) -> str:
