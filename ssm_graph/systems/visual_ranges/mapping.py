@@ -103,35 +103,43 @@ class Mapper:
         return tracks.joined(new)
 
     def _measured(self, image: Image, pose: Pose, tracks: Tracks) -> Tracks:
-        """Return the tracks measured against the images they were first seen in."""
+        """Return the tracks measured against the images they were first seen in.
+
+        What has changed too much since is measured against the key frame before; what is like
+        neither is given up.
+        """
         world = self._world
         point = world.tracks["point"][tracks.track]
-        old = world.tracks["first"][tracks.track] >= 0
-        row = np.where(
-            point >= 0, world.points["row"][np.maximum(point, 0)],
-            world.tracks["first"][tracks.track],
-        )  # fmt: skip
-        row = np.maximum(row, 0)
-        frame = world.rows["frame"][row]
-        xy = world.rows["xy"][row]
-        R, t = world.frames["R_cw"][frame], world.frames["t_cw"][frame]
-        depth = world.frames["depth"][frame]
-        x_s = np.concatenate([xy, np.ones((len(xy), 1))], axis=1) * depth[:, None]
-        assumed = np.einsum("nji,nj->ni", R, x_s - t)
-        places = np.where(
-            (point >= 0)[:, None], world.points["place"][np.maximum(point, 0)], assumed
-        )
-        change = change_of_view(self._camera, world, row, places, pose)
-        on = np.flatnonzero(old & change.usable & (point != DROPPED))
-        found = aligned_rows(world, row[on], change.affine[on], image, tracks.pixel[on])
-        moved = np.linalg.norm(found.pixels - tracks.pixel[on], axis=1)
-        better = (found.likeness > _ALIKE) & (moved < _DRIFT_PIXELS)
-        pixel = tracks.pixel.copy()
-        pixel[on[better]] = found.pixels[better]
-        # A view that has changed much is no longer a standard: the newest row takes its place.
-        kept = point != DROPPED
-        kept[on[~better & (found.likeness < _UNLIKE)]] = False
+        first, last = world.tracks["first"][tracks.track], world.tracks["last"][tracks.track]
+        row = np.where(point >= 0, world.points["row"][np.maximum(point, 0)], first)
+        pixel, likeness = tracks.pixel.copy(), np.full(len(point), np.nan)
+        open_ = (point != DROPPED) & (first >= 0)
+        for source in (row, last):
+            on = np.flatnonzero(open_)
+            if not on.size:
+                break
+            places = self._assumed(source[on], point[on])
+            change = change_of_view(self._camera, world, source[on], places, pose)
+            on, affine = on[change.usable], change.affine[change.usable]
+            found = aligned_rows(world, source[on], affine, image, tracks.pixel[on])
+            moved = np.linalg.norm(found.pixels - tracks.pixel[on], axis=1)
+            likeness[on] = np.fmax(likeness[on], found.likeness)
+            better = (found.likeness > _ALIKE) & (moved < _DRIFT_PIXELS)
+            pixel[on[better]] = found.pixels[better]
+            open_[on[better]] = False
+        kept = (point != DROPPED) & ~(likeness < _UNLIKE)
         return Tracks(tracks.track, pixel).kept(kept)
+
+    def _assumed(self, rows: Indices, point: Indices) -> Array:
+        """Return the places of points; of what has none, that at its key frame's median depth."""
+        world = self._world
+        frame = world.rows["frame"][rows]
+        x_c = np.concatenate([world.rows["xy"][rows], np.ones((len(rows), 1))], axis=1)
+        x_c *= world.frames["depth"][frame][:, None]
+        R, t = world.frames["R_cw"][frame], world.frames["t_cw"][frame]
+        assumed = np.einsum("nji,nj->ni", R, x_c - t)
+        places = world.points["place"][np.maximum(point, 0)]
+        return np.where((point >= 0)[:, None], places, assumed)
 
     def _found_again(self, k: int, image: Image, pose: Pose, tracks: Tracks) -> Tracks:
         """Return new tracks of points of the local map that were not followed but are seen."""

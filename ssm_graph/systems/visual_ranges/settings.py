@@ -32,9 +32,9 @@ class VisualSettings:
     key_least_translation: float = 0.02
     """Of the median depth: standing still makes no key frame."""
     key_least_rotation_rad: float = np.deg2rad(3.0)
-    window: int = 10
+    window: int = 16
     """Key frames adjusted together after each new one."""
-    held: int = 12
+    held: int = 20
     """Further key frames that see the same points, held."""
     local_steps: int = 5
     global_steps: int = 12
