@@ -92,8 +92,8 @@ def main() -> None:
         on_progress=lambda done, n, key: note(f"{done} of {n}: {key[0]}, seed {key[1]}"),
     )
     lines = [
-        f"Seeds {seeds[0]} to {seeds[-1]}; images of 640 x 480 at 20 Hz, ranges at 10 Hz with sigma "
-        "0.08 m and a bias of 0.05 m, longer where something stands in the way. Deterministic mode, "
+        f"Seeds {seeds[0]} to {seeds[-1]}; images of 640 x 480 at 20 Hz, ranges at 10 Hz, sigma "
+        "0.08 m and a bias of 0.05 m, longer where something stands in the way. Deterministic, "
         "one thread. Medians over runs. A loop is true where both key frames were within 2 m.",
         "",
         *table(HEADER, [cells_of(c, [rows[c, s] for s in seeds]) for c in report.args.cases]),

@@ -91,6 +91,7 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     from ssm_graph.systems.visual_ranges.figures import write_figures
     from ssm_graph.systems.visual_ranges.outputs import write_outputs
     from ssm_graph.systems.visual_ranges.page import write_page
+    from ssm_graph.systems.visual_ranges.readers.images import WatchedImages
     from ssm_graph.systems.visual_ranges.readers.source import read_sequence
     from ssm_graph.systems.visual_ranges.verdict import judged
 
@@ -101,7 +102,8 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     for note in sequence.notes:
         say(errors, f"note: {note}")
     result = _followed(sequence, arguments, errors)
-    defects = getattr(sequence.images, "defects", tuple)()
+    watched = sequence.images
+    defects = watched.defects() if isinstance(watched, WatchedImages) else ()
     for note in defects:
         say(errors, f"note: {note}")
     found, off = judged(result), accuracy(sequence, result)
