@@ -15,6 +15,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from ssm_graph.systems.visual_ranges.extras import opencv
 
@@ -71,15 +72,15 @@ def _apart(pixels: Array, strength: Array, occupied: Array, distance: float) -> 
     kept = np.ones(len(pixels), dtype=bool)
     if len(pixels) == 0:
         return kept
-    square = distance * distance
     if len(occupied):
-        gap = ((pixels[:, None] - occupied[None]) ** 2).sum(axis=2)
-        kept &= gap.min(axis=1) > square
-    near = ((pixels[:, None] - pixels[None]) ** 2).sum(axis=2) < square
+        away, _ = cKDTree(occupied).query(pixels, distance_upper_bound=distance)
+        kept &= ~np.isfinite(away)
+    pairs = cKDTree(pixels).query_pairs(distance, output_type="ndarray")
     rank = np.empty(len(pixels), dtype=np.int64)
     rank[np.argsort(-strength, kind="stable")] = np.arange(len(pixels))
-    stronger = rank[None, :] < rank[:, None]
-    return np.asarray(kept & ~(near & stronger).any(axis=1))
+    weaker = np.where(rank[pairs[:, 0]] < rank[pairs[:, 1]], pairs[:, 1], pairs[:, 0])
+    kept[weaker] = False
+    return kept
 
 
 @cache

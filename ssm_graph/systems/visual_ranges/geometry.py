@@ -6,12 +6,13 @@ with ``xi = (translation, rotation)``.
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from factors import so3
+from ssm_graph.systems.visual_ranges.extras import compiled, numba_is_used
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -68,7 +69,7 @@ class Refined(NamedTuple):
 
 
 _POSE_STEPS: Final = 8
-_SETTLED: Final = 1e-7
+_SETTLED: Final = 1e-6
 DOF: Final = 5.0
 """Of the similarity weight of a reprojection."""
 
@@ -86,13 +87,7 @@ def refine_pose(pose: Pose, points: Array, xy: Array, scale: Array) -> Refined:
     """
     R, t = pose
     for _ in range(_POSE_STEPS):
-        error, jacobian, ahead = _reprojections(R, t, points, xy, scale)
-        square = (error * error).sum(axis=1)
-        weight = np.where(ahead, reprojection_weight(square), 0.0)
-        rows = jacobian.reshape(-1, 6)
-        weighted = rows * np.repeat(weight, 2)[:, None]
-        information = weighted.T @ rows
-        slope = weighted.T @ error.reshape(-1)
+        information, slope, _ = pose_equations(R, t, points, xy, scale)
         try:
             xi = -np.linalg.solve(information + 1e-9 * np.eye(6), slope)
         except np.linalg.LinAlgError:
@@ -100,9 +95,60 @@ def refine_pose(pose: Pose, points: Array, xy: Array, scale: Array) -> Refined:
         R, t = Pose(R, t).moved(xi)
         if np.abs(xi).max() < _SETTLED:
             break
+    information, _, square = pose_equations(R, t, points, xy, scale)
+    return Refined(Pose(R, t), information, square)
+
+
+def pose_equations(
+    R: Array, t: Array, points: Array, xy: Array, scale: Array
+) -> tuple[Array, Array, Array]:
+    """Return weighted information (6, 6), slope (6,) and squares (n,) of a pose's points."""
+    if numba_is_used():
+        information, slope, square = _pose_loop(R, t, points, xy, scale, DOF)
+        return information, slope, square
+    return pose_equations_numpy(R, t, points, xy, scale)
+
+
+def pose_equations_numpy(
+    R: Array, t: Array, points: Array, xy: Array, scale: Array
+) -> tuple[Array, Array, Array]:
+    """Return :func:`pose_equations` by NumPy."""
     error, jacobian, ahead = _reprojections(R, t, points, xy, scale)
     square = np.where(ahead, (error * error).sum(axis=1), np.inf)
-    return Refined(Pose(R, t), information, square)
+    weight = reprojection_weight(square)
+    rows = jacobian.reshape(-1, 6)
+    weighted = rows * np.repeat(weight, 2)[:, None]
+    return weighted.T @ rows, weighted.T @ error.reshape(-1), square
+
+
+@compiled
+def _pose_loop(  # pragma: no cover  (compiled)
+    R: Any, t: Any, points: Any, xy: Any, scale: Any, dof: float
+) -> Any:
+    information, slope, square = np.zeros((6, 6)), np.zeros(6), np.zeros(len(points))
+    J = np.zeros((2, 6))
+    for i in range(len(points)):
+        X = points[i]
+        z = R[2, 0] * X[0] + R[2, 1] * X[1] + R[2, 2] * X[2] + t[2]
+        if z <= 1e-6:
+            square[i] = np.inf
+            continue
+        f = 1.0 / z
+        u = (R[0, 0] * X[0] + R[0, 1] * X[1] + R[0, 2] * X[2] + t[0]) * f
+        v = (R[1, 0] * X[0] + R[1, 1] * X[1] + R[1, 2] * X[2] + t[1]) * f
+        a, b = scale[i, 0], scale[i, 1]
+        e0, e1 = (u - xy[i, 0]) * a, (v - xy[i, 1]) * b
+        square[i] = e0 * e0 + e1 * e1
+        w = (dof + 2.0) / (dof + square[i])
+        J[0, 0], J[0, 2] = f * a, -u * f * a
+        J[0, 3], J[0, 4], J[0, 5] = -u * v * a, (1.0 + u * u) * a, -v * a
+        J[1, 1], J[1, 2] = f * b, -v * f * b
+        J[1, 3], J[1, 4], J[1, 5] = (-1.0 - v * v) * b, u * v * b, u * b
+        for k in range(6):
+            slope[k] += w * (J[0, k] * e0 + J[1, k] * e1)
+            for m in range(6):
+                information[k, m] += w * (J[0, k] * J[0, m] + J[1, k] * J[1, m])
+    return information, slope, square
 
 
 def _reprojections(

@@ -18,6 +18,8 @@ from ssm_graph.systems.visual_ranges.binary_words import PlaceIndex
 from ssm_graph.systems.visual_ranges.camera import Camera
 from ssm_graph.systems.visual_ranges.extras import opencv
 from ssm_graph.systems.visual_ranges.geometry import Pose, in_camera, refine_pose
+from ssm_graph.systems.visual_ranges.loop_settings import LoopSettings
+from ssm_graph.systems.visual_ranges.ranging import AnchorState, Ranging
 from ssm_graph.systems.visual_ranges.similarity3 import Sim3
 from ssm_graph.systems.visual_ranges.visual_map import VisualMap
 
@@ -26,41 +28,12 @@ Indices = NDArray[np.int64]
 
 OCTAVE: Final = 1.2
 """Each octave of key points is coarser by it."""
+JUDGED_S: Final = 5.0
+"""Of the path before a loop, whose ranges judge it."""
+LEAST_JUDGES: Final = 10
+"""Ranges."""
 INLIER_SQUARE: Final = 9.21
 """Squared sigmas in two dimensions, 99 %."""
-
-
-@dataclass(frozen=True, slots=True)
-class LoopSettings:
-    """When two key frames are taken for one place."""
-
-    is_on: bool = True
-    least_gap: int = 20
-    """Key frames between the two."""
-    score_share: float = 0.45
-    """Of the best score among the neighbours: what a candidate must have."""
-    n_candidates: int = 3
-    most_bits: int = 55
-    """Of 256 that two descriptors of one corner may differ by."""
-    ratio: float = 0.9
-    """Of the best distance to the second best."""
-    least_matches: int = 20
-    least_inliers: int = 35
-    least_share: float = 0.35
-    """Inliers of all matches."""
-    agree_alone: int = 3
-    """Key frames in a row that have to find the same place, where no range can judge."""
-    agree_with_ranges: int = 2
-    range_limit_m: float = 0.35
-    range_limit_sigmas: float = 4.0
-    """Median of the ranges' errors after the loop: below the larger of the two."""
-    drift_alone: float = 0.10
-    """Share of the path between that the loop may correct, where no range can judge."""
-    drift_with_ranges: float = 0.30
-    scale_limit: float = 1.5
-    """Factor of scale that a loop may correct."""
-    rest: int = 5
-    """Key frames after a loop before the next."""
 
 
 class RangeJudgement(NamedTuple):
@@ -135,7 +108,7 @@ class LoopFinder:
         if not self.settings.is_on or k - self._last_taken < self.settings.rest:
             return None
         candidates = self._candidates(world, k)
-        groups = [(c, self._group(world, c)) for c in candidates]
+        groups = [(c, self.group_of(world, c)) for c in candidates]
         agreed = []
         for candidate, group in groups:
             before = [count for other, count in self._agreed if other & group]
@@ -170,11 +143,11 @@ class LoopFinder:
         if not self._index.is_ready or k < s.least_gap:
             return []
         scores = self._index.scores(world.rows["descriptor"][world.rows_of(k)])
-        shared = world.shared(k)
+        shared, valid = (x[: len(scores)] for x in (world.shared(k), world.frames["valid"]))
         near = np.flatnonzero((shared >= 30) & (np.arange(len(shared)) != k))
         near = near[near >= k - s.least_gap]
         reference = scores[near].max(initial=0.0)
-        is_open = (np.arange(len(scores)) <= k - s.least_gap) & world.frames["valid"]
+        is_open = (np.arange(len(scores)) <= k - s.least_gap) & valid
         is_open &= (shared < 15) & (scores > s.score_share * reference)
         found: list[int] = []
         for c in np.flatnonzero(is_open)[np.argsort(-scores[is_open], kind="stable")]:
@@ -183,7 +156,8 @@ class LoopFinder:
         return found[: s.n_candidates]
 
     @staticmethod
-    def _group(world: VisualMap, k: int) -> set[int]:
+    def group_of(world: VisualMap, k: int) -> set[int]:
+        """Return a key frame and the few that share most points with it."""
         shared = world.shared(k)
         best = np.argsort(-shared, kind="stable")[:6]
         return {k, *(int(other) for other in best if shared[other] >= 30)}
@@ -228,9 +202,8 @@ class LoopFinder:
 
 def bit_distances(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> NDArray[np.int32]:
     """Return how many bits differ (n, m) between descriptors (n, 32) and (m, 32)."""
-    cv2 = opencv()
-    found, _ = cv2.batchDistance(a, b, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=0)
-    return np.asarray(found)
+    signs_a, signs_b = (2.0 * np.unpackbits(x, axis=1).astype(np.float32) - 1.0 for x in (a, b))
+    return np.asarray((signs_a.shape[1] - signs_a @ signs_b.T) / 2.0).astype(np.int32)
 
 
 def mutual(distance: NDArray[np.int32], most: int, ratio: float = 1.0) -> tuple[Indices, Indices]:
@@ -252,41 +225,79 @@ def points_of(world: VisualMap, frames: list[int]) -> Indices:
     return np.asarray(points[world.points["valid"][points]])
 
 
+class Placed(NamedTuple):
+    """A camera among old points."""
+
+    pose: Pose
+    n_matches: int
+    """By descriptors alone, before geometry."""
+    seen: Indices
+    """(n,) which of its key points ..."""
+    points: Indices
+    """(n,) ... show which of the points; inliers all"""
+
+
+def place_camera(
+    xy: Array,
+    octave: Indices,
+    descriptors: NDArray[np.uint8],
+    places: Array,
+    known: NDArray[np.uint8],
+    camera: Camera,
+    s: LoopSettings,
+) -> Placed | None:
+    """Return the pose of a camera that sees some of the points, None where there are too few.
+
+    Parameters
+    ----------
+    xy : (n, 2) normalised key points; octave : (n,); descriptors : (n, 32).
+    places : (m, 3) points, map units; known : (m, 32) their descriptors.
+    """
+    if min(len(xy), len(places)) < s.least_matches:
+        return None
+    distance = bit_distances(descriptors, known)
+    left, right = mutual(distance, s.most_bits, s.ratio)
+    if len(left) < s.least_matches:
+        return None
+    focal = np.array([camera.fx, camera.fy])
+    scale = focal / (OCTAVE ** octave.astype(np.float64))[:, None]
+    pose = pose_of_points(places[right], xy[left], 3.0 / camera.fx)
+    if pose is None:
+        return None
+    refined = refine_pose(pose, places[right], xy[left], scale[left])
+    n_matches, n_in = len(left), int((refined.square < INLIER_SQUARE).sum())
+    if n_in < max(s.least_share * n_matches, s.least_matches // 2):
+        return None
+    left, right = _guided(refined.pose, places, xy, focal, distance)
+    if len(left) < s.least_inliers:
+        return None
+    refined = refine_pose(refined.pose, places[right], xy[left], scale[left])
+    is_in = refined.square < INLIER_SQUARE
+    if is_in.sum() < s.least_inliers:
+        return None
+    return Placed(refined.pose, n_matches, left[is_in], right[is_in])
+
+
 def match_place(
     world: VisualMap, k: int, candidate: int, group: list[int], camera: Camera, s: LoopSettings
 ) -> Match | None:
     """Return how key frame ``k`` stands among the points of a group of old key frames."""
     rows = np.arange(*world.rows_of(k).indices(world.rows.size))
     points = points_of(world, group)
-    if min(len(rows), len(points)) < s.least_matches:
-        return None
-    distance = bit_distances(
-        world.rows["descriptor"][rows], world.rows["descriptor"][world.points["row"][points]]
+    found = place_camera(
+        world.rows["xy"][rows],
+        world.rows["octave"][rows],
+        world.rows["descriptor"][rows],
+        world.points["place"][points],
+        world.rows["descriptor"][world.points["row"][points]],
+        camera,
+        s,
     )
-    left, right = mutual(distance, s.most_bits, s.ratio)
-    if len(left) < s.least_matches:
+    if found is None:
         return None
-    places, xy = world.points["place"][points], world.rows["xy"][rows]
-    sigma = OCTAVE ** world.rows["octave"][rows].astype(np.float64)
-    focal = np.array([camera.fx, camera.fy])
-    scale = focal / sigma[:, None]
-    pose = pose_of_points(places[right], xy[left], 3.0 / camera.fx)
-    if pose is None:
-        return None
-    refined = refine_pose(pose, places[right], xy[left], scale[left])
-    is_in = refined.square < INLIER_SQUARE
-    if is_in.sum() < s.least_share * len(left) or is_in.sum() < s.least_matches // 2:
-        return None
-    n_matches = len(left)
-    left, right = _guided(refined.pose, places, xy, focal, distance)
-    if len(left) < s.least_inliers:
-        return None
-    refined = refine_pose(refined.pose, places[right], xy[left], scale[left])
-    is_in = refined.square < INLIER_SQUARE
-    left, right = left[is_in], right[is_in]
-    if len(left) < s.least_inliers:
-        return None
-    return _with_scale(world, k, candidate, n_matches, refined.pose, rows[left], points[right])
+    return _with_scale(
+        world, k, candidate, found.n_matches, found.pose, rows[found.seen], points[found.points]
+    )
 
 
 def _guided(
@@ -348,27 +359,32 @@ def _with_scale(
     return Match(k, candidate, n_matches, correction, float(sigma), rows, points)
 
 
-def range_judgement(
-    correction: Sim3, antenna: Array, arm_m: Array, *, scale: float, anchor_m: Array,
-    bias_m: Array, range_m: Array, sigma_m: Array,
-) -> RangeJudgement | None:  # fmt: skip
-    """Return what ranges (M,) say to a correction of the path they were measured on.
-
-    Parameters
-    ----------
-    antenna : (M, 3) camera places at the times of the ranges, map units.
-    arm_m : (M, 3) camera to antenna, map axes, m.
-    scale : metres per unit of the old map.
-    anchor_m : (M, 3) place of the anchor of each range, metric map.
-    bias_m, range_m, sigma_m : (M,) m.
-    """
-    if len(range_m) < 5:
+def judge_of(ranging: Ranging | None, world: VisualMap) -> Judge | None:
+    """Return the judge that the ranges of the last seconds make; None where no anchor is placed."""
+    if ranging is None or ranging.found is None or ranging.terms is None:
         return None
+    found, used = ranging.found, ranging.used
+    column = np.full(len(ranging.anchors), -1, dtype=np.int64)
+    column[used] = np.arange(len(used))
+    column[[own.state is AnchorState.DOUBTFUL for own in ranging.anchors]] = -1
+    terms = ranging.terms
+    time_s = ranging.ranges.time_s[terms.row]
+    own = terms.rows((time_s > time_s[-1] - JUDGED_S) & (column[terms.anchor] >= 0))
+    if len(own) < LEAST_JUDGES:
+        return None
+    R, t = world.frames["R_cw"][own.key_frame], world.frames["t_cw"][own.key_frame]
+    place = np.einsum("mji,mj->mi", R, own.motion + found.clock_s * own.velocity - t)
+    arm = np.einsum("mji,mj->mi", R, own.lever)
+    anchor, bias = found.anchors[column[own.anchor]], found.biases[column[own.anchor]]
 
-    def median(place: Array, arm: Array) -> float:
-        computed = np.linalg.norm(scale * place + arm - anchor_m, axis=1) + bias_m
-        return float(np.median(np.abs(range_m - computed)))
+    def median(camera: Array, lever: Array) -> float:
+        computed = np.linalg.norm(found.scale * camera + lever - anchor, axis=1) + bias
+        return float(np.median(np.abs(computed - own.range_m)))
 
-    before = median(antenna, arm_m)
-    after = median(correction.apply(antenna), arm_m @ correction.R.T)
-    return RangeJudgement(before, after, float(np.median(sigma_m)), len(range_m))
+    sigma, before = float(np.median(own.sigma_m)), median(place, arm)
+
+    def judge(correction: Sim3, _: int) -> RangeJudgement:
+        after = median(correction.apply(place), arm @ correction.R.T)
+        return RangeJudgement(before, after, sigma, len(own))
+
+    return judge

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,9 @@ from ssm_graph.systems.visual_ranges.settings import VisualSettings
 from ssm_graph.systems.visual_ranges.tracking import Tracks, focal_scale
 from ssm_graph.systems.visual_ranges.views import aligned_rows, change_of_view, seen_from
 from ssm_graph.systems.visual_ranges.visual_map import DROPPED, VisualMap
+
+if TYPE_CHECKING:
+    from ssm_graph.systems.visual_ranges.ranging import Ranging
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -53,17 +56,15 @@ class Mapper:
     def __init__(self, camera: Camera, world: VisualMap, settings: VisualSettings) -> None:
         self._camera, self._world, self._settings = camera, world, settings
 
-    def insert(
-        self, image: Image, image_index: int, time_s: float, pose: Pose, tracks: Tracks
-    ) -> Tracks:
-        """Add a key frame with what was followed into it, and return what to follow from here."""
+    def insert(self, k: int, tracks: Tracks) -> Tracks:
+        """Fill a new key frame with what was followed into it; return what to follow from there."""
         world = self._world
-        k = world.add_frame(image_index, time_s, pose, image)
+        image, pose = world.images[k], world.pose(k)
         tracks = self._measured(image, pose, tracks)
         tracks = tracks.joined(self._found_again(k, image, pose, tracks))
         fresh = corners(image, self._settings.n_corners, tracks.pixel)
-        new = Tracks(world.new_tracks(len(fresh)), fresh)
-        tracks = tracks.joined(new)
+        with world.lock:
+            tracks = tracks.joined(Tracks(world.new_tracks(len(fresh)), fresh))
         self.add_rows(k, image, pose, tracks)
         self._make_points(k)
         return tracks
@@ -102,35 +103,43 @@ class Mapper:
         return tracks.joined(new)
 
     def _measured(self, image: Image, pose: Pose, tracks: Tracks) -> Tracks:
-        """Return the tracks measured against the images they were first seen in."""
+        """Return the tracks measured against the images they were first seen in.
+
+        What has changed too much since is measured against the key frame before; what is like
+        neither is given up.
+        """
         world = self._world
         point = world.tracks["point"][tracks.track]
-        old = world.tracks["first"][tracks.track] >= 0
-        row = np.where(
-            point >= 0, world.points["row"][np.maximum(point, 0)],
-            world.tracks["first"][tracks.track],
-        )  # fmt: skip
-        row = np.maximum(row, 0)
-        frame = world.rows["frame"][row]
-        xy = world.rows["xy"][row]
-        R, t = world.frames["R_cw"][frame], world.frames["t_cw"][frame]
-        depth = world.frames["depth"][frame]
-        x_s = np.concatenate([xy, np.ones((len(xy), 1))], axis=1) * depth[:, None]
-        assumed = np.einsum("nji,nj->ni", R, x_s - t)
-        places = np.where(
-            (point >= 0)[:, None], world.points["place"][np.maximum(point, 0)], assumed
-        )
-        change = change_of_view(self._camera, world, row, places, pose)
-        on = np.flatnonzero(old & change.usable & (point != DROPPED))
-        found = aligned_rows(world, row[on], change.affine[on], image, tracks.pixel[on])
-        moved = np.linalg.norm(found.pixels - tracks.pixel[on], axis=1)
-        better = (found.likeness > _ALIKE) & (moved < _DRIFT_PIXELS)
-        pixel = tracks.pixel.copy()
-        pixel[on[better]] = found.pixels[better]
-        # A view that has changed much is no longer a standard: the newest row takes its place.
-        kept = point != DROPPED
-        kept[on[~better & (found.likeness < _UNLIKE)]] = False
+        first, last = world.tracks["first"][tracks.track], world.tracks["last"][tracks.track]
+        row = np.where(point >= 0, world.points["row"][np.maximum(point, 0)], first)
+        pixel, likeness = tracks.pixel.copy(), np.full(len(point), np.nan)
+        open_ = (point != DROPPED) & (first >= 0)
+        for source in (row, last):
+            on = np.flatnonzero(open_)
+            if not on.size:
+                break
+            places = self._assumed(source[on], point[on])
+            change = change_of_view(self._camera, world, source[on], places, pose)
+            on, affine = on[change.usable], change.affine[change.usable]
+            found = aligned_rows(world, source[on], affine, image, tracks.pixel[on])
+            moved = np.linalg.norm(found.pixels - tracks.pixel[on], axis=1)
+            likeness[on] = np.fmax(likeness[on], found.likeness)
+            better = (found.likeness > _ALIKE) & (moved < _DRIFT_PIXELS)
+            pixel[on[better]] = found.pixels[better]
+            open_[on[better]] = False
+        kept = (point != DROPPED) & ~(likeness < _UNLIKE)
         return Tracks(tracks.track, pixel).kept(kept)
+
+    def _assumed(self, rows: Indices, point: Indices) -> Array:
+        """Return the places of points; of what has none, that at its key frame's median depth."""
+        world = self._world
+        frame = world.rows["frame"][rows]
+        x_c = np.concatenate([world.rows["xy"][rows], np.ones((len(rows), 1))], axis=1)
+        x_c *= world.frames["depth"][frame][:, None]
+        R, t = world.frames["R_cw"][frame], world.frames["t_cw"][frame]
+        assumed = np.einsum("nji,nj->ni", R, x_c - t)
+        places = world.points["place"][np.maximum(point, 0)]
+        return np.where((point >= 0)[:, None], places, assumed)
 
     def _found_again(self, k: int, image: Image, pose: Pose, tracks: Tracks) -> Tracks:
         """Return new tracks of points of the local map that were not followed but are seen."""
@@ -156,7 +165,8 @@ class Mapper:
             gap = ((pixel[:, None] - tracks.pixel[None]) ** 2).sum(axis=2)
             nearest = gap.argmin(axis=1)
             close = gap[np.arange(len(pixel)), nearest] < _SAME_PIXELS**2
-            self._join(chosen[close], tracks.track[nearest[close]])
+            with world.lock:
+                self._join(chosen[close], tracks.track[nearest[close]])
             chosen, pixel = chosen[~close], pixel[~close]
         apart = _first_of_each(pixel, _SAME_PIXELS)
         chosen, pixel = chosen[apart], pixel[apart]
@@ -165,6 +175,8 @@ class Mapper:
     def _join(self, points: Indices, track: Indices) -> None:
         """Say that tracks show points: those without a point get it, others are fused."""
         world = self._world
+        if not track.size:
+            return
         _, first = np.unique(track, return_index=True)
         points, track = points[first], track[first]
         own = world.tracks["point"][track]
@@ -213,7 +225,8 @@ class Mapper:
         for R, t, xy, row in ((R1, t1, xy1, first), (R2, t2, xy2, rows)):
             scale = focal_scale(self._camera, world.rows["octave"][row], sigma)
             good &= reprojection_square(R, t, made.points, xy, scale) < _NEW_POINT_SQUARE
-        points = world.add_points(track[good], made.points[good])
+        with world.lock:
+            points = world.add_points(track[good], made.points[good])
         image = world.images[k]
         at = np.round(world.rows["pixel"][rows[good]]).astype(np.int64)
         world.points["grey"][points] = image[at[:, 1], at[:, 0]]
@@ -251,8 +264,10 @@ class Mapper:
         rows = rows[count[point] >= 2]
         return Window(frames, n_free, rows, np.flatnonzero(count >= 2))
 
-    def problem(self, window: Window) -> Problem:
-        """Return the adjustment of a window."""
+    def problem(
+        self, window: Window, ranging: Ranging | None = None, *, is_free: bool = False
+    ) -> Problem:
+        """Return the adjustment of a window, with its ranges; ``is_free``: with their unknowns."""
         world = self._world
         frame_at = np.full(world.n_frames, -1)
         frame_at[window.frames] = np.arange(len(window.frames))
@@ -273,13 +288,14 @@ class Mapper:
         return Problem(
             world.frames["R_cw"][window.frames], world.frames["t_cw"][window.frames], free,
             world.points["place"][window.points], views,
-            variance=world.rows["variance"][rows[order]],
+            None if ranging is None else ranging.further(frame_at, is_free=is_free),
+            world.rows["variance"][rows[order]],
         )  # fmt: skip
 
-    def adjust_local(self, k: int) -> None:
+    def adjust_local(self, k: int, ranging: Ranging | None = None) -> None:
         """Adjust the key frames and points around key frame ``k`` and cull."""
         window = self.window(k)
-        problem = self.problem(window)
+        problem = self.problem(window, ranging)
         steps = self._settings.local_steps
         hold = int((~problem.free).sum()) < 2
         found = adjust(problem, Effort(steps=steps, posterior_from=None, hold_scale=hold))
@@ -287,6 +303,10 @@ class Mapper:
 
     def take(self, window: Window, found: Adjusted) -> None:
         """Put what an adjustment found in place, and cull what does not fit."""
+        with self._world.lock:
+            self._take(window, found)
+
+    def _take(self, window: Window, found: Adjusted) -> None:
         world = self._world
         world.set_poses(window.frames, found.R_cw, found.t_cw)
         known = np.isfinite(found.covariance[:, 0, 0])

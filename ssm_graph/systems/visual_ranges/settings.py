@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from ssm_graph.base.errors import ConfigError
+from ssm_graph.systems.visual_ranges.loop_settings import LoopSettings
 
 
 @dataclass(frozen=True)
@@ -31,9 +32,9 @@ class VisualSettings:
     key_least_translation: float = 0.02
     """Of the median depth: standing still makes no key frame."""
     key_least_rotation_rad: float = np.deg2rad(3.0)
-    window: int = 10
+    window: int = 16
     """Key frames adjusted together after each new one."""
-    held: int = 12
+    held: int = 20
     """Further key frames that see the same points, held."""
     local_steps: int = 5
     global_steps: int = 12
@@ -45,6 +46,9 @@ class VisualSettings:
     """Everything in one thread, in order; else mapping runs beside tracking."""
     has_final_adjustment: bool = True
     """Adjust all key frames and points together at the end."""
+
+    loops: LoopSettings = field(default_factory=LoopSettings)
+    """When a place is taken for one seen before."""
 
     def __post_init__(self) -> None:
         if self.n_corners < 100 or self.window < 3:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final
 
@@ -14,7 +15,12 @@ from numpy.typing import NDArray
 from ssm_graph.systems.visual_ranges.bundle import Effort, adjust
 from ssm_graph.systems.visual_ranges.features import Image, corners, flow
 from ssm_graph.systems.visual_ranges.geometry import Pose, refine_pose
+from ssm_graph.systems.visual_ranges.loop_closing import close_loop
+from ssm_graph.systems.visual_ranges.loops import LoopFinder, judge_of
 from ssm_graph.systems.visual_ranges.mapping import Mapper
+from ssm_graph.systems.visual_ranges.range_terms import FramePoses
+from ssm_graph.systems.visual_ranges.ranging import Ranging
+from ssm_graph.systems.visual_ranges.relocalise import relocalise
 from ssm_graph.systems.visual_ranges.result import FrameState, VisualResult
 from ssm_graph.systems.visual_ranges.settings import VisualSettings
 from ssm_graph.systems.visual_ranges.tracking import Followed, Tracker, Tracks
@@ -27,6 +33,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _LEAST_CORNERS: Final = 100
+_NEW_SCALE: Final = 0.02
+"""Change of scale by a loop from which scale and anchors are found anew."""
 _HISTORY: Final = 60
 """Frames before the start whose poses are found afterwards."""
 
@@ -59,6 +67,14 @@ class _Run:
         self.timing: dict[str, list[float]] = defaultdict(list)
         self.waiting: list[tuple[int, Array, Array]] = []
         self.first: tuple[int, Image, Array] | None = None
+        self.seen: dict[int, Tracks] = {}
+        ranges = sequence.ranges
+        self.ranging = None
+        if ranges is not None and len(ranges):
+            self.ranging = Ranging(ranges, np.array(sequence.lever_arm_m))
+        self.loops = LoopFinder(self.camera, settings.loops)
+        self.pool = None if settings.is_deterministic else ThreadPoolExecutor(1)
+        self.job: tuple[Image, Tracks, Future[Tracks]] | None = None
 
     def finish(self, progress: Callable[[int, int], None]) -> VisualResult:
         """Go through all images and return the answer."""
@@ -71,9 +87,13 @@ class _Run:
                 else:
                     self.follow(i, image)
             progress(i + 1, n)
+        self.take_mapped(wait=True)
+        if self.pool is not None:
+            self.pool.shutdown()
         if self.settings.has_final_adjustment and self.world.n_frames > 2:
-            with self.timed("global adjustment"):
+            with self.timed("last adjustment"):
                 self.adjust_all()
+                self.refine_frames()
         return self.answer()
 
     @contextmanager
@@ -152,21 +172,40 @@ class _Run:
         xy = self.camera.normalise(pixel[on])
         places = self.world.points["place"][point[on]]
         refined = refine_pose(self.world.pose(0), places, xy, self.tracker.whitening(len(xy)))
-        self.record(index, refined.pose, 0, int(on.sum()))
+        self.record(index, refined.pose, 0, int(on.sum()), Tracks(track, pixel))
 
     def follow(self, i: int, image: Image) -> None:
         """Track one image, and make it a key frame if it is time."""
+        self.take_mapped(wait=False)
         with self.timed("tracking"):
             found = self.tracker.follow(image)
         if found.pose is None:
+            self.take_mapped(wait=True)
+            if self.find_again(i, image):
+                return
             self.state[i] = FrameState.LOST
             if self.state[i - 1] == FrameState.TRACKED:
                 self.note(i, f"lost: {found.n_points} points left")
             return
-        self.record(i, found.pose, self.tracker.reference, found.n_points)
-        if self.is_key_frame(i, found):
-            with self.timed("mapping"):
-                self.make_key_frame(i, image, found)
+        self.record(i, found.pose, self.tracker.reference, found.n_points, found.tracks)
+        if self.job is None and self.is_key_frame(i, found):
+            self.make_key_frame(i, image, found)
+
+    def find_again(self, i: int, image: Image) -> bool:
+        """Look for a lost camera in the map; return whether it was found."""
+        with self.timed("relocalisation"):
+            found = relocalise(
+                self.world, self.loops, self.camera, image, self.settings.n_corners
+            )
+        if found is None:
+            return False
+        with self.world.lock:
+            tracks = Tracks(self.world.new_tracks(len(found.points), found.points), found.pixel)
+        self.tracker.start(image, tracks, found.pose, found.key_frame)
+        self.tracker.depth = float(self.world.frames["depth"][found.key_frame])
+        self.record(i, found.pose, found.key_frame, len(found.points), tracks)
+        self.note(i, f"found again by {len(found.points)} points of key frame {found.key_frame}")
+        return True
 
     def is_key_frame(self, i: int, found: Followed) -> bool:
         """Return whether a tracked frame adds enough to the last key frame."""
@@ -192,39 +231,115 @@ class _Run:
         )
 
     def make_key_frame(self, i: int, image: Image, found: Followed) -> None:
-        """Insert a key frame, adjust around it, and go on from there."""
+        """Hand a key frame to the mapping, which runs beside or at once."""
         assert found.pose is not None
-        time_s = float(self.sequence.time_s[i])
-        with self.timed("insertion"):
-            tracks = self.mapper.insert(image, i, time_s, found.pose, found.tracks)
-        k = self.world.n_frames - 1
-        self.n_tracked[i] = int((self.world.tracks["point"][tracks.track] >= 0).sum())
-        with self.timed("local adjustment"):
-            self.mapper.adjust_local(k)
-        self.tracker.tracks = tracks
-        self.tracker.set_pose(self.world.pose(k), k)
-        self.record(i, self.world.pose(k), k, int(self.n_tracked[i]))
+        with self.world.lock:
+            k = self.world.add_frame(i, float(self.sequence.time_s[i]), found.pose, image)
+        self.tracker.set_pose(found.pose, k)
+        self.record(i, found.pose, k, found.n_points, found.tracks)
+        given = found.tracks
+        if self.pool is None:
+            self.tracker.renew(image, given, self.map_key_frame(k, i, given))
+        else:
+            self.job = (image, given, self.pool.submit(self.map_key_frame, k, i, given))
 
-    def record(self, i: int, pose: Pose, reference: int, n_points: int) -> None:
+    def take_mapped(self, *, wait: bool) -> None:
+        """Take over what the mapping beside has made, if it is done or is to be waited for."""
+        if self.job is not None and (wait or self.job[2].done()):
+            image, given, future = self.job
+            self.job = None
+            self.tracker.renew(image, given, future.result())
+
+    def map_key_frame(self, k: int, i: int, given: Tracks) -> Tracks:
+        """Fill key frame ``k`` of image ``i``, ask the ranges, adjust around it, look for loops."""
+        with self.timed("mapping"):
+            with self.timed("insertion"):
+                made = self.mapper.insert(k, given)
+            self.n_tracked[i] = int((self.world.tracks["point"][made.track] >= 0).sum())
+            if self.ranging is not None:
+                with self.timed("ranges"):
+                    self.ask_ranges(i)
+            with self.timed("local adjustment"):
+                self.mapper.adjust_local(k, self.ranging)
+            if self.settings.loops.is_on:
+                with self.timed("loops"):
+                    self.close_loop(k, i)
+        self.seen[i] = made
+        return made
+
+    def close_loop(self, k: int, i: int) -> None:
+        """Look for a place seen before, and correct map, path and scale by it."""
+        match = self.loops.look(self.world, k, judge_of(self.ranging, self.world))
+        if match is None:
+            return
+        with self.world.lock:
+            closed = close_loop(self.world, match, self.camera)
+            grown = np.array([one.scale for one in closed.change])
+            on = self.reference >= 0
+            self.relative_t[on] *= grown[self.reference[on], None]
+            self.tracker.grow(float(grown[self.tracker.reference]))
+        self.note(
+            i,
+            f"loop closed with the key frame of {self.world.frames['time_s'][match.matched]:.1f} s: "
+            f"{self.loops.records[-1].why}; {closed.n_fused} points joined",
+        )
+        if self.ranging is not None and abs(np.log(match.correction.scale)) > _NEW_SCALE:
+            self.ranging.restart()
+        self.adjust_all(i)
+
+    def ask_ranges(self, i: int) -> None:
+        """Hang the ranges up to image ``i`` on the key frames, and see what they tell."""
+        assert self.ranging is not None
+        R, t = self.poses()
+        frames = FramePoses(
+            self.sequence.time_s[: i + 1], R[: i + 1], t[: i + 1], self.reference[: i + 1]
+        )
+        told = self.ranging.update(frames, self.world.frames["R_cw"], self.world.frames["t_cw"])
+        for text in told:
+            self.note(i, text)
+
+    def record(
+        self, i: int, pose: Pose, reference: int, n_points: int, tracks: Tracks
+    ) -> None:
         """Keep a frame's pose relative to its key frame."""
         relative = pose.after(self.world.pose(reference).inverse())
         self.state[i], self.reference[i] = FrameState.TRACKED, reference
         self.relative_R[i], self.relative_t[i] = relative
         self.n_tracked[i] = n_points
+        self.seen[i] = tracks
 
     def note(self, i: int, text: str) -> None:
         """Keep what happened."""
         self.events.append(f"{self.sequence.time_s[i] - self.sequence.time_s[0]:.2f} s: {text}")
 
-    def adjust_all(self) -> None:
-        """Adjust everything together."""
-        window = self.mapper.whole()
+    def adjust_all(self, last: int | None = None) -> None:
+        """Adjust everything together, ranges up to image ``last`` with all they depend on."""
         steps = self.settings.global_steps
         effort = Effort(steps=steps, posterior_from=steps - 3, hold_scale=True)
-        self.mapper.take(window, adjust(self.mapper.problem(window), effort))
+        if self.ranging is not None:
+            self.ask_ranges(int(np.flatnonzero(self.reference >= 0)[-1]) if last is None else last)
+        window = self.mapper.whole()
+        problem = self.mapper.problem(window, self.ranging, is_free=True)
+        found = adjust(problem, effort)
+        self.mapper.take(window, found)
+        if self.ranging is not None and problem.further is not None:
+            self.ranging.adopt(found.extra, found.extra_covariance, problem.further)
 
-    def answer(self) -> VisualResult:
-        """Return the result as it stands."""
+    def refine_frames(self) -> None:
+        """Find the pose of every frame anew from the final places of the points it saw."""
+        R, t = self.poses()
+        keys = set(self.world.frames["image"].tolist())
+        for i, tracks in self.seen.items():
+            point = self.world.tracks["point"][tracks.track]
+            on = point >= 0
+            if i in keys or on.sum() < self.settings.least_inliers:
+                continue
+            places, xy = self.world.points["place"][point[on]], self.camera.normalise(tracks.pixel[on])
+            refined = refine_pose(Pose(R[i], t[i]), places, xy, self.tracker.whitening(len(xy)))
+            self.record(i, refined.pose, int(self.reference[i]), int(self.n_tracked[i]), tracks)
+
+    def poses(self) -> tuple[Array, Array]:
+        """Return the poses of all frames (N, 3, 3), (N, 3) as the map stands; NaN without one."""
         world = self.world
         on = self.reference >= 0
         R, t = np.full_like(self.relative_R, np.nan), np.full_like(self.relative_t, np.nan)
@@ -232,9 +347,16 @@ class _Run:
         base_t = world.frames["t_cw"][self.reference[on]]
         R[on] = self.relative_R[on] @ base_R
         t[on] = np.einsum("nij,nj->ni", self.relative_R[on], base_t) + self.relative_t[on]
+        return R, t
+
+    def answer(self) -> VisualResult:
+        """Return the result as it stands."""
+        R, t = self.poses()
         return VisualResult(
             name=self.sequence.name, camera=self.camera, time_s=self.sequence.time_s,
             state=self.state, R_cw=R, t_cw=t, key_frame=self.reference, n_tracked=self.n_tracked,
-            map=world.snapshot(), events=tuple(self.events),
+            map=self.world.snapshot(),
+            ranging=None if self.ranging is None else self.ranging.result(),
+            loops=tuple(self.loops.records), events=tuple(self.events),
             timing_s={part: np.array(values) for part, values in self.timing.items()},
         )  # fmt: skip

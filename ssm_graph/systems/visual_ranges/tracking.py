@@ -91,6 +91,12 @@ class Tracker:
         self.reference = reference
         self.relative = pose.after(self._world.pose(reference).inverse())
 
+    def grow(self, scale: float) -> None:
+        """Follow a change of the map's scale around the reference key frame."""
+        self.relative = Pose(self.relative.R_cw, scale * self.relative.t_cw)
+        self.velocity = Pose(self.velocity.R_cw, scale * self.velocity.t_cw)
+        self.depth *= scale
+
     def start(self, image: Image, tracks: Tracks, pose: Pose, reference: int) -> None:
         """Begin anew at an image whose pose and tracks are known, at rest."""
         self.image, self.tracks = image, tracks
@@ -100,11 +106,12 @@ class Tracker:
     def follow(self, image: Image) -> Followed:
         """Return the pose of the next image; none when too little is left."""
         assert self.image is not None
-        before = self.pose()
-        point = self._world.tracks["point"][self.tracks.track]
-        alive = point != DROPPED
-        tracks, point = self.tracks.kept(alive), point[alive]
-        places = self._world.points["place"][np.maximum(point, 0)]
+        with self._world.lock:
+            before = self.pose()
+            point = self._world.tracks["point"][self.tracks.track]
+            alive = point != DROPPED
+            tracks, point = self.tracks.kept(alive), point[alive]
+            places = self._world.points["place"][np.maximum(point, 0)]
         predicted = self.velocity.after(before)
         answer = None
         for start in (predicted, before):
@@ -115,11 +122,41 @@ class Tracker:
                 break
         assert answer is not None
         if answer.pose is not None:
-            self.velocity = answer.pose.after(before.inverse())
-            self.set_pose(answer.pose, self.reference)
+            motion = answer.pose.after(before.inverse())
+            self.velocity, self.relative = motion, motion.after(self.relative)
             self.tracks, self.image = answer.tracks, image
             self.depth = answer.depth
         return answer
+
+    def renew(self, key_image: Image, given: Tracks, made: Tracks) -> None:
+        """Take over what a key frame's mapping made of the tracks it was given.
+
+        Corners measured anew move by as much here; what is new is followed from the key frame's
+        image to the newest one.
+        """
+        assert self.image is not None
+        with self._world.lock:
+            pose, key_pose = self.pose(), self._world.pose(self.reference)
+            point = self._world.tracks["point"][made.track]
+            places = self._world.points["place"][np.maximum(point, 0)]
+        size = int(max(made.track.max(initial=0), self.tracks.track.max(initial=0))) + 1
+        shift, is_made = np.zeros((size, 2)), np.zeros(size, dtype=bool)
+        is_given = np.zeros(size, dtype=bool)
+        shift[made.track], is_made[made.track] = made.pixel, True
+        is_given[given.track] = True
+        both = is_made[given.track]
+        shift[given.track[both]] -= given.pixel[both]
+        on = is_made[self.tracks.track]
+        old = self.tracks.kept(on)
+        fresh = ~is_given[made.track]
+        new = made.kept(fresh)
+        if self.image is key_image:
+            moved = new
+        else:
+            guess = self._guesses(new, point[fresh], places[fresh], key_pose, pose)
+            pixel, found = flow(key_image, self.image, new.pixel, guess)
+            moved = Tracks(new.track, pixel).kept(found)
+        self.tracks = Tracks(old.track, old.pixel + shift[old.track]).joined(moved)
 
     def _guesses(
         self, tracks: Tracks, point: Indices, places: Array, before: Pose, pose: Pose

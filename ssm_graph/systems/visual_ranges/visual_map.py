@@ -7,6 +7,7 @@ the parallax is enough. What is culled keeps its place and is marked.
 
 from __future__ import annotations
 
+import threading
 from typing import Any, Final
 
 import numpy as np
@@ -77,6 +78,8 @@ class VisualMap:
         )  # fmt: skip
         self.tracks = Columns(point=((), i8, NO_POINT), first=((), i8, -1), last=((), i8, -1))
         self.images: dict[int, Image] = {}
+        self.lock = threading.RLock()
+        """Held while places and poses change, and while a tracker reads them."""
 
     @property
     def n_frames(self) -> int:

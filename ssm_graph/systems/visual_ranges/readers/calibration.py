@@ -139,8 +139,8 @@ def _check(where: str, width: int, height: int, fx: float, fy: float, cx: float,
         )
     if not (0.1 * width < fx < 20 * width and 0.5 < fy / fx < 2.0):
         raise DataError(
-            f"{where}: focal lengths {fx:g}, {fy:g} cannot be those of images of {width} x {height} "
-            "pixels; they are in pixels, and scale with the images"
+            f"{where}: focal lengths {fx:g}, {fy:g} cannot be those of images of {width} x "
+            f"{height} pixels; they are in pixels, and scale with the images"
         )
     if not (-0.5 * width < cx < 1.5 * width and -0.5 * height < cy < 1.5 * height):
         raise DataError(

@@ -51,7 +51,7 @@ CAMERA_KEYS: Final[Mapping[str, Key]] = {
     "cx": optional_key("", -1e5, 1e5, "pixels"),
     "cy": optional_key("", -1e5, 1e5, "pixels"),
     "model": _TEXT,
-    "distortion": Key(shape=((0, 8),), low=-100.0, high=100.0, required=False),
+    "distortion": Key(shape=((1, 8),), low=-100.0, high=100.0, required=False),
 }
 IMAGE_KEYS: Final[Mapping[str, Key]] = {
     "folder": _TEXT,
@@ -125,6 +125,9 @@ def _sections(folder: Path) -> dict[str, Settings]:
         raise ConfigError(f"{folder}: expected a folder with {TOML_NAME}, found none") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: expected TOML in UTF-8; {error}") from error
+    camera = raw.get("camera")
+    if isinstance(camera, dict) and camera.get("distortion") == []:
+        del camera["distortion"]
     top = {key: value for key, value in raw.items() if key not in SECTIONS}
     read_settings("", top, known=TOP_KEYS, file=TOML_NAME)
     return {
@@ -248,13 +251,11 @@ def write_own_folder(folder: Path, sequence: Sequence) -> Iterator[int]:
             raise DataError(f"{path}: the image could not be encoded")
         path.write_bytes(png.tobytes())
         yield index
-    c = sequence.camera
+    names = ("width", "height", "fx", "fy", "cx", "cy", "model", "distortion")
+    values = {name: getattr(sequence.camera, name) for name in names}
     sections: dict[str, Any] = {
         "format": FORMAT,
-        "camera": {
-            **{k: getattr(c, k) for k in ("width", "height", "fx", "fy", "cx", "cy", "model")},
-            "distortion": list(c.distortion),
-        },
+        "camera": {**values, "distortion": list(sequence.camera.distortion)},
         "images": {"folder": "images", "times": "times.csv"},
     }
     _write_text(folder / "times.csv", "time_s", [f"{t:.9f}" for t in sequence.time_s])

@@ -12,7 +12,6 @@ from ssm_graph.systems.visual_ranges.readers.options import ReadOptions
 from ssm_graph.systems.visual_ranges.readers.own_folder import TOML_NAME, read_own_folder
 from ssm_graph.systems.visual_ranges.sequence import Sequence
 
-
 DEFAULTS: Final = ReadOptions()
 
 
