@@ -60,6 +60,8 @@ class Loop:
     key_frame: int
     matched: int
     """Key frame of the same place."""
+    matched_s: float
+    """Its time."""
     n_matches: int
     n_inliers: int
     scale: float
@@ -189,6 +191,7 @@ class LoopFinder:
             time_s,
             k,
             match.matched,
+            float(world.frames["time_s"][match.matched]),
             match.n_matches,
             len(match.rows),
             match.correction.scale,

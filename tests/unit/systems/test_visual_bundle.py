@@ -44,7 +44,10 @@ def made_problem(seed: int = 0, n_poses: int = 6, n_points: int = 60) -> Problem
 def gtsam_optimum(problem: Problem) -> tuple[gtsam.Values, float]:
     """Return GTSAM's minimum of the same problem and its cost."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    K, noise = gtsam.Cal3_S2(1.0, 1.0, 0.0, 0.0, 0.0), gtsam.noiseModel.Isotropic.Sigma(2, 1 / SCALE)
+    K, noise = (
+        gtsam.Cal3_S2(1.0, 1.0, 0.0, 0.0, 0.0),
+        gtsam.noiseModel.Isotropic.Sigma(2, 1 / SCALE),
+    )
     for k, (R, t) in enumerate(zip(problem.R_cw, problem.t_cw, strict=True)):
         pose = gtsam.Pose3(gtsam.Rot3(R), t).inverse()
         values.insert(gtsam.symbol("x", k), pose)
@@ -66,9 +69,7 @@ def gtsam_optimum(problem: Problem) -> tuple[gtsam.Values, float]:
 def test_the_optimum_is_gtsams() -> None:
     """Least squares: cost to 1e-6 relative, poses and points to 1e-6."""
     problem = made_problem()
-    found = adjust(
-        problem, Effort(steps=60, settled=1e-14, posterior_from=None, dof=float("inf"))
-    )
+    found = adjust(problem, Effort(steps=60, settled=1e-14, posterior_from=None, dof=float("inf")))
     wanted, cost = gtsam_optimum(problem)
     assert found.cost == pytest.approx(cost, rel=1e-6)
     for k in range(len(problem.R_cw)):

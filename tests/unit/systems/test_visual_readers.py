@@ -172,7 +172,7 @@ def test_ranges_that_cannot_be(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"share no time.*--start-s"):
         read_ranges(path, TIMES)
     path.write_text("time_s,anchor,range\n3.0,A,2100\n3.1,A,2200\n")
-    with pytest.raises(DataError, match="are they millimetres.*--range-unit mm"):
+    with pytest.raises(DataError, match=r"are they millimetres.*--range-unit mm"):
         read_ranges(path, TIMES)
     assert read_ranges(path, TIMES, unit="mm").range_m.tolist() == [2.1, 2.2]
     path.write_text("time_s,who,what\n3.0,A,2100\n")
@@ -287,7 +287,7 @@ def test_what_is_no_recording(tmp_path: Path) -> None:
     """Said with all that would be one."""
     with pytest.raises(DataError, match="no such file or folder"):
         read_sequence(tmp_path / "nothing")
-    with pytest.raises(DataError, match="expected visual.toml, mav0"):
+    with pytest.raises(DataError, match=r"expected visual.toml, mav0"):
         read_sequence(tmp_path)
 
 
