@@ -419,7 +419,7 @@ def _contradictions(
 
 
 def _half(problem: Problem, best: Solution) -> Solution:
-    return polished(problem, solution(problem, best.unknowns, rounds=20))
+    return polished(problem, best)
 
 
 def _part(problem: Problem, kept: Array) -> Problem:
