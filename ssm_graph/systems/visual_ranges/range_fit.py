@@ -20,7 +20,7 @@ import numpy as np
 from ssm_graph.base.frozen import Array, ReadOnlyArrays
 from ssm_graph.systems.visual_ranges.range_terms import CLOSEST_M, RangeTerms
 from ssm_graph.systems.visual_ranges.ranges import Indices
-from ssm_graph.systems.visual_ranges.weights import RangeKernel
+from ssm_graph.systems.visual_ranges.weights import POLISH, RangeKernel
 
 BIAS_M: Final = 0.15
 """Prior standard deviation of an anchor's bias."""
@@ -358,6 +358,15 @@ def _outwards(
         *each,
         cost,
     )
+
+
+def polished(problem: Problem, found: Solution) -> Solution:
+    """Return a minimum with what is far too long taken out of it: see :data:`.weights.POLISH`.
+
+    Its cost stays that of the kernel it was found by, so that minima can be compared.
+    """
+    last = solution(replace(problem, kernel=POLISH), found.unknowns, is_near=True, rounds=15)
+    return replace(last, cost=found.cost)
 
 
 def unknowns_of(

@@ -19,6 +19,7 @@ from ssm_graph.systems.visual_ranges.range_fit import (
     Problem,
     Solution,
     places_of,
+    polished,
     problem_of,
     search,
     solution,
@@ -322,7 +323,7 @@ class Ranging(ShortRepr):
         before = self.found
         start = unknowns_of(problem, before.scale, before.anchors, before.biases, before.clock_s)
         problem = widened(problem, solution(problem, start, rounds=3))
-        self.found = solution(problem, start, rounds=3)
+        self.found = polished(problem, solution(problem, start, rounds=3))
         if len(places.time_s) > CHECK_AGAIN * self._checked:
             self._checked = len(places.time_s)
             told = self._check(own, problem)

@@ -25,6 +25,7 @@ from ssm_graph.systems.visual_ranges.range_fit import (
     Solution,
     problem_of,
     search,
+    polished,
     solution,
     with_sigma,
 )
@@ -136,8 +137,8 @@ def find_start(
     best = solution(problem, found[0])
     problem = widened(problem, best)
     found, costs = _searched(problem, found)
-    best = solution(problem, found[0])
-    rivals = [solution(problem, one) for one in found[1:]]
+    best = polished(problem, solution(problem, found[0]))
+    rivals = [polished(problem, solution(problem, one)) for one in found[1:]]
     apart = [rival for rival in rivals if _is_apart(best, rival)]
     gap = min((rival.cost - best.cost for rival in apart), default=np.inf)
     near = [rival for rival in apart if rival.cost - best.cost < rules.gap]
@@ -300,7 +301,7 @@ def widened(problem: Problem, best: Solution) -> Problem:
     sigma = problem.places.sigma_m.copy()
     for j in range(problem.n_anchors):
         own = problem.places.anchor == j
-        sigma[own] = np.maximum(sigma[own], robust_rms(best.error[own]))
+        sigma[own] = np.fmax(sigma[own], robust_rms(best.error[own]))
     return with_sigma(problem, sigma)
 
 
@@ -398,7 +399,7 @@ def _contradictions(
         if marked > rules.marked_share:
             told.append(f"{100.0 * marked:.0f} % of the ranges to anchor {name} are too long")
     first = at.time_s < np.median(at.time_s)
-    halves = [solution(_part(problem, half), best.unknowns, rounds=20) for half in (first, ~first)]
+    halves = [_half(_part(problem, half), best) for half in (first, ~first)]
     apart = np.log(halves[0].scale / halves[1].scale)
     sigma = float(np.hypot(*(half.sigma_log_scale for half in halves)))
     if abs(apart) > 3.0 * sigma:
@@ -415,6 +416,10 @@ def _contradictions(
                 "second half: did it move, or is the antenna not calibrated?"
             )
     return told
+
+
+def _half(problem: Problem, best: Solution) -> Solution:
+    return polished(problem, best)
 
 
 def _part(problem: Problem, kept: Array) -> Problem:

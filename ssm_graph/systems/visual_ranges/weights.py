@@ -6,6 +6,8 @@ heavier tail than one which is too short. With ``e`` predicted minus measured::
     t = (e^2 + H P H') / sigma^2,    weight = -2 f'(t)
 
 and ``f`` the log kernel with 1 degree of freedom where the range is too long (``e < 0``), 5 else.
+Its pull on what is far out never ends, though, so that many such ranges still bend the answer; once
+a minimum is found it is polished by correntropy to the longer side, whose pull does end.
 """
 
 from __future__ import annotations
@@ -14,9 +16,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from factors.similarity import Kernel, LogKernel, expected_mahalanobis_sq
+from factors.similarity import ExpKernel, Kernel, LogKernel, expected_mahalanobis_sq
 from ssm_graph.base.frozen import Array
 
 NLOS_WEIGHT: Final = 0.05
@@ -72,10 +73,15 @@ class RangeKernel:
         return max(float(np.mean(psi(r) ** 2)) * weight / max(slope, 0.1 * weight) ** 2, 1.0)
 
 
-SYMMETRIC: Final = RangeKernel(LogKernel(1.0), LogKernel(1.0))
-"""The same tail to both sides."""
+POLISH: Final = RangeKernel(ExpKernel(2.0), LogKernel(5.0))
+"""For a minimum that is found: nothing pulls that is far too long."""
 
 
-def robust_rms(error: NDArray[np.float64]) -> float:
-    """Return the standard deviation (m) that the middle of residuals has; NaN without any."""
-    return SIGMA_OF_MEDIAN * float(np.median(np.abs(error))) if error.size else float("nan")
+def robust_rms(error: Array) -> float:
+    """Return the standard deviation (m) that errors have which are not lengthened; NaN without.
+
+    From the median of those that are too short, which walls do not touch; ``error`` (N,) is
+    predicted minus measured.
+    """
+    short = error[error > 0.0]
+    return SIGMA_OF_MEDIAN * float(np.median(short)) if short.size else float("nan")
