@@ -42,7 +42,7 @@ files in DIR:
   map.ply          points, path, anchors
   anchors.csv      places, sigmas, biases, states, other places that fit
   ranges.csv       every range with its error and weight; scale.csv over time
-  map.npz          the map, to go on from or to find a camera in
+  map.npz          the map, for --in-map
   result.json      verdict, reasons, notes, errors where there is a truth
   report.html      all of it in words, tables and figures
 
