@@ -17,7 +17,7 @@ from ssm_graph.base.earth import LocalFrame, normal_gravity
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frames import BodyAxes
 from ssm_graph.base.frozen import Array
-from ssm_graph.base.tables import Table, table_of
+from ssm_graph.base.tables import Table, TableFile, table_of
 from ssm_graph.io.mission_folder.motion import check_motion
 from ssm_graph.io.mission_folder.toml import TOML_NAME
 from ssm_graph.mission.mission import Aids, InitialState, Mission
@@ -49,7 +49,7 @@ def mission_from(
     vehicle: Vehicle | None,
     *,
     source: Path,
-    labels: Mapping[str, str],
+    labels: Mapping[str, str | TableFile],
     notes: Sequence[str] = (),
 ) -> Mission:
     """Return the mission of logs that were made of messages, checked as a folder's tables are.
@@ -64,14 +64,16 @@ def mission_from(
     vehicle : its frame is taken, its current, and its start where it lies within the inertial
         data; None where nothing is known beside the logs.
     source : the recording; the mission has its name.
-    labels : by section, what messages call the place that the readings came from.
+    labels : by section, what messages call the place that the readings came from; a file of which
+        messages name the row as well.
     notes : what the converter noticed, one sentence each; what the checks notice follows.
     """
     parts: dict[str, Part] = {}
     found = list(notes)
     for log in logs:
         one = BY_LOG[type(log)]
-        table = table_of(labels[one.section], one.table_of(log))
+        label, columns = labels[one.section], one.table_of(log)
+        table = table_of(label, columns) if isinstance(label, str) else Table(label, columns)
         found += one.check(table, log, BodyAxes.FRD)
         parts[one.section] = Part(one.cleaned(log), table)
     initial, some = _initial_within(parts["imu"].log, vehicle)
@@ -144,7 +146,8 @@ def _initial_within(imu: Any, vehicle: Vehicle | None) -> tuple[InitialState | N
     """Return the start of a vehicle file where it lies within the inertial data, else a note."""
     if vehicle is None or vehicle.initial is None:
         return None, []
-    if imu.start_s <= vehicle.initial.time_s <= imu.time_s[-1]:
+    step_s = float(np.median(np.diff(imu.time_s)))  # stamps of sums and dates are rounded
+    if imu.start_s - step_s <= vehicle.initial.time_s <= imu.time_s[-1]:
         return vehicle.initial, []
     return None, [
         f"[initial] of the vehicle file is for {vehicle.initial.time_s:.3f} s, outside the "

@@ -24,8 +24,11 @@ from ssm_graph.base.settings import (
 )
 from ssm_graph.base.tables import LARGEST_TIME_S, Order, Table
 from ssm_graph.base.units import DEGREE
+from ssm_graph.io.instruments import library as instruments
 from ssm_graph.mission.mission import InitialState, Reference
+from ssm_graph.mission.point import POINT_KEYS, Point, point
 from ssm_graph.sensors.current import CURRENT_KEYS
+from ssm_graph.sensors.imu import Stamp
 from ssm_graph.sensors.instrument import ENU, Column, Instrument
 from ssm_graph.sensors.place import PLACE_KEYS, POSITION, PositionInstrument
 from ssm_graph.sensors.registry import INSTRUMENTS
@@ -91,6 +94,7 @@ SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
 LISTS: Final[Mapping[str, Mapping[str, Key]]] = {
     **{name: keys for one in INSTRUMENTS for name, keys in one.lists.items()},
     "standstill": STANDSTILL_KEYS,
+    "point": POINT_KEYS,
 }
 """Sections that may come several times, ``[[beacon]]``."""
 REQUIRED_SECTIONS: Final = ("frames", *(one.section for one in INSTRUMENTS if one.is_required))
@@ -109,6 +113,8 @@ class MissionToml:
     sections: dict[str, Settings]
     lists: dict[str, tuple[Settings, ...]]
     """The sections that may come several times."""
+    notes: tuple[str, ...] = ()
+    """Where figures of instruments that it names come from, one sentence each."""
 
     def __getitem__(self, section: str) -> Settings:
         return self.sections[section]
@@ -130,6 +136,18 @@ class MissionToml:
     def initial(self) -> InitialState | None:
         """Return the state that ``[initial]`` states."""
         return build(InitialState, self["initial"].given()) if "initial" in self else None
+
+    def points(self) -> dict[str, Point]:
+        """Return every point of the vehicle by name: ``[[point]]``, and instruments elsewhere."""
+        found = {}
+        for one in INSTRUMENTS:
+            bare = self.bare(one) if one.section in self else None
+            owner = getattr(bare, "mount", bare)
+            if owner is not None and hasattr(owner, "lever_arm_b"):
+                found[one.section] = Point(one.section, owner.lever_arm_b)
+        for settings in self.lists["point"]:
+            found[settings.text("name")] = point(settings)
+        return found
 
     def fault_of_no_place(self) -> ConfigError:
         """Return the error of a mission that may be anywhere on Earth."""
@@ -163,6 +181,7 @@ def _checked(raw: dict[str, Any], path: Path, may_miss: frozenset[str]) -> Missi
     for name in REQUIRED_SECTIONS:
         if name not in raw:
             raise ConfigError(f"{file} [{name}]: the section is missing; every mission needs it")
+    raw, notes = _with_instruments(raw, file)
     frames = read_settings("frames", raw["frames"], known=SECTIONS["frames"], file=file)
     body = frames.choice("body", BodyAxes, BodyAxes.FRD)
     sections = {
@@ -180,11 +199,35 @@ def _checked(raw: dict[str, Any], path: Path, may_miss: frozenset[str]) -> Missi
         order=top.choice("order", Order, Order.TIME),
         body=body,
         sections=sections,
-        lists={name: _read_list(name, raw.get(name, []), file) for name in LISTS},
+        lists={name: _read_list(name, raw.get(name, []), file, body) for name in LISTS},
+        notes=notes,
     )
 
 
-def _read_list(name: str, raw: object, file: str) -> tuple[Settings, ...]:
+def _with_instruments(raw: dict[str, Any], file: str) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Return a file with the figures of the instruments that it names, and where they are from.
+
+    ``imu = "VN-100"`` above the sections stands for a section with that instrument and the usual
+    name of its table, whose stamps are the ends of intervals.
+    """
+    found, notes = dict(raw), []
+    for section in instruments.TABLES:
+        own = raw[section]
+        if isinstance(own, str):
+            own = {"file": f"{section}.csv", instruments.KEY: own}
+            own |= {"stamp": Stamp.END.value} if section == "imu" else {}
+        if not isinstance(own, dict):
+            continue
+        known = SECTIONS[section]
+        found[section], preset = instruments.with_preset(
+            section, own, file=file, is_required=lambda key, known=known: known[key].required
+        )
+        if preset is not None:
+            notes.append(f"[{section}] {preset.maker} {preset.name}: {preset.source}")
+    return found, tuple(notes)
+
+
+def _read_list(name: str, raw: object, file: str, axes: BodyAxes) -> tuple[Settings, ...]:
     """Read the sections ``[[name]]`` of a file."""
     if not isinstance(raw, list):
         raise ConfigError(
@@ -192,7 +235,7 @@ def _read_list(name: str, raw: object, file: str) -> tuple[Settings, ...]:
             f"{shown(raw)}; write double brackets"
         )
     return tuple(
-        read_settings(f"[[{name}]] {number}", item, known=LISTS[name], file=file)
+        read_settings(f"[[{name}]] {number}", item, known=LISTS[name], file=file, axes=axes)
         for number, item in enumerate(raw, start=1)
     )
 

@@ -98,6 +98,7 @@ class Feed:
         self._n_bytes = self._n_messages = self._n_refused = 0
         self._free_s = self._last_s = -math.inf
         self._rate_hz, self._marked_s, self._n_marked = 0.0, -math.inf, 0
+        self._altitude_m = math.nan
 
     def channel(self, now: Now) -> Channel:
         """Return the begin of a connection."""
@@ -124,6 +125,7 @@ class Feed:
             self.tell("message_refused", text, Severity.WARNING, burst=BURST)
         if decoder.n_sound > n_sound:
             channel.heard_s = now.steady_s
+            self._altitude_m = decoder.altitude_m
         return self._in_run_time(self._limited(messages, now), now)
 
     def _in_run_time(self, messages: list[Message], now: Now) -> list[Message]:
@@ -191,6 +193,7 @@ class Feed:
             n_reconnects=self.n_reconnects,
             rate_hz=self._rate_hz,
             age_s=now.steady_s - self._last_s,
+            altitude_m=self._altitude_m,
         )
 
     @property
