@@ -52,7 +52,8 @@ def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
     """Write every format that was asked for."""
     names = [name.strip() for name in arguments.format.split(",") if name.strip()]
     epoch_s = None if arguments.epoch is None else parse_epoch(arguments.epoch)
-    track = track_of(read_results(arguments.result), epoch_s=epoch_s)
+    results = read_results(arguments.result)
+    track = track_of(results, epoch_s=epoch_s)
     result: Path = arguments.result.resolve()
     out: Path = arguments.out or result.with_name(f"{result.name}-export")
     is_file = arguments.out is not None and len(names) == 1 and bool(out.suffix)
@@ -67,4 +68,6 @@ def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
         path = out if is_file else out / f"{stem}{suffix}"
         for written in export_track(track, name, path):
             say(console, f"{written}: {written.stat().st_size:,} bytes")
+    if results.summary.get("local_start"):
+        say(console, f"note: {results.summary['local_start']}")
     return True

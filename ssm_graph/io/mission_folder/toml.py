@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Final
@@ -25,7 +25,7 @@ from ssm_graph.base.settings import (
 from ssm_graph.base.tables import LARGEST_TIME_S, Order, Table
 from ssm_graph.base.units import DEGREE
 from ssm_graph.io.instruments import library as instruments
-from ssm_graph.mission.mission import InitialState, Reference
+from ssm_graph.mission.mission import InitialState, LocalStart, Reference
 from ssm_graph.sensors.current import CURRENT_KEYS
 from ssm_graph.sensors.imu import Stamp
 from ssm_graph.sensors.instrument import ENU, Column, Instrument
@@ -81,6 +81,13 @@ INITIAL_KEYS: Final[Mapping[str, Key]] = {
     "velocity_sigma_m_per_s": Key("velocity_sigma_enu", shape=(3,), positive=True, high=1e3),
     "attitude_sigma_deg": Key("attitude_sigma", shape=(3,), positive=True, high=360.0, unit=DEGREE),
 }
+LOCAL_KEYS: Final[Mapping[str, Key]] = {
+    "lat_deg": replace(PLACE_KEYS["lat_deg"], required=False),
+    "heading_deg": replace(INITIAL_KEYS["heading_deg"], required=False),
+    "heading_sigma_deg": Key(
+        "heading_sigma", positive=True, high=180.0, required=False, unit=DEGREE
+    ),
+}
 TABLES: Final = (*INSTRUMENTS, REFERENCE)
 """Everything that has a table, in the order in which tables are read."""
 SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
@@ -88,6 +95,7 @@ SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
     "origin": PLACE_KEYS,
     "current": CURRENT_KEYS,
     "initial": INITIAL_KEYS,
+    "local": LOCAL_KEYS,
     **{one.section: one.keys for one in TABLES},
 }
 LISTS: Final[Mapping[str, Mapping[str, Key]]] = {
@@ -95,6 +103,8 @@ LISTS: Final[Mapping[str, Mapping[str, Key]]] = {
     "standstill": STANDSTILL_KEYS,
 }
 """Sections that may come several times, ``[[beacon]]``."""
+_OF_PLACES: Final = ("origin", "initial", "gnss", "usbl", "reference")
+"""Sections of places on Earth, which no local start has."""
 REQUIRED_SECTIONS: Final = ("frames", *(one.section for one in INSTRUMENTS if one.is_required))
 
 
@@ -135,11 +145,27 @@ class MissionToml:
         """Return the state that ``[initial]`` states."""
         return build(InitialState, self["initial"].given()) if "initial" in self else None
 
+    def local(self) -> LocalStart | None:
+        """Return the start at zero that ``[local]`` states.
+
+        Raises :class:`ConfigError` beside a section that states a place on Earth.
+        """
+        if "local" not in self:
+            return None
+        others = [name for name in _OF_PLACES if name in self]
+        if others:
+            raise ConfigError(
+                f"{self.file} [local]: given together with [{others[0]}], which has places on "
+                "Earth; expected one of the two; [local] is for a tank or a pool without either"
+            )
+        return build(LocalStart, self["local"].given())
+
     def fault_of_no_place(self) -> ConfigError:
         """Return the error of a mission that may be anywhere on Earth."""
         return ConfigError(
             f"{self.file} [origin]: nothing says where on Earth the mission was; add [origin] with "
-            "lat_deg, lon_deg and height_m, or a [gnss] or [usbl] table, or [initial]"
+            "lat_deg, lon_deg and height_m, or a [gnss] or [usbl] table, or [initial]; "
+            "in a tank or a pool, [local]"
         )
 
 
