@@ -155,6 +155,8 @@ class Crash(BaseException):
 class Recorder:
     """Takes answers."""
 
+    set_by_s = 0.0
+
     def __init__(self, *forms: OutputFormat) -> None:
         self.forms = forms or tuple(OutputFormat)
         self.sent: list[tuple[OutputFormat, bytes]] = []

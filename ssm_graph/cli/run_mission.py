@@ -17,6 +17,7 @@ from ssm_graph.evaluation.errors import Metrics, evaluate, reference_from_gnss, 
 from ssm_graph.io.mission_folder.folder import CALIBRATION_NAME, read_mission
 from ssm_graph.io.mission_folder.toml import read_mission_toml
 from ssm_graph.io.results.place import check_result_place
+from ssm_graph.io.results.summary import input_fields
 from ssm_graph.io.results.tables import write_results
 from ssm_graph.mission.estimate import Estimate
 from ssm_graph.mission.mission import Mission, Reference
@@ -86,6 +87,7 @@ def run_mission(
                 "keyframe_interval_s": graph.keyframe_interval_s,
                 "gnss_until_s": arguments.gnss_until,
             },
+            inputs=input_fields(arguments.mission),
             axes=axes,
             draw=None if arguments.no_figure else draw,
         )

@@ -141,6 +141,7 @@ def preintegrate_steps(
     bias: Array | None = None,
     errors: Array | None = None,
     frozen: Sequence[FrozenAxis] = (),
+    cuts_gaps: bool = False,
 ) -> Steps[InertialChain]:
     """Preintegrate the inertial data between keyframes.
 
@@ -155,13 +156,14 @@ def preintegrate_steps(
         the increments follow; without them they do not.
     frozen : axes that repeat themselves by what came before these samples; all that they have
         missed is uncertain in the first interval.
+    cuts_gaps : the times cut gaps to pieces, which are off together, not each for itself.
     """
     source = None
     if errors is not None:
         source = ErrorSource(imu, keyframe_s, rate_hz, errors)
         imu = without_errors(imu, errors)
     gaps = imu_gaps(imu)
-    unseen = tuple(_unseen(imu, keyframe_s, gaps, frozen_axes(imu), frozen))
+    unseen = tuple(_unseen(imu, keyframe_s, gaps, frozen_axes(imu), frozen, cuts_gaps=cuts_gaps))
     yield 3e-4 * len(imu.time_s)
     samples = yield from merge_samples_steps(bridged(imu, gaps), keyframe_s, rate_hz=rate_hz)
     bias = np.zeros(6) if bias is None else bias
@@ -314,6 +316,8 @@ def _unseen(
     gaps: tuple[Array, Array],
     frozen: Sequence[FrozenAxis],
     missed: Sequence[FrozenAxis] = (),
+    *,
+    cuts_gaps: bool,
 ) -> list[Unseen]:
     """Return what is not seen of each interval between keyframes.
 
@@ -329,7 +333,9 @@ def _unseen(
     for begin, end, rate, force in stretches:
         overlap = np.minimum(end, keyframe_s[1:]) - np.maximum(begin, keyframe_s[:-1])
         for k in np.flatnonzero(overlap > 0.0).tolist():
-            unseen[k] = _more_unseen(unseen[k], float(overlap[k]), rate, force)
+            # Variances of pieces add up to that of what is off all the time.
+            more = np.sqrt((end - begin) / overlap[k]) if cuts_gaps else 1.0
+            unseen[k] = _more_unseen(unseen[k], float(overlap[k]), more * rate, more * force)
     for axis in missed:
         unseen[0] = _more_unseen(unseen[0], axis.end_s - axis.begin_s, *_missing(axis))
     return unseen

@@ -36,6 +36,7 @@ from ssm_graph.mission.mission import LocalStart, Mission
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.acoustic import RangeLog
 from ssm_graph.sensors.current import CURRENT_KEYS, CurrentModel
+from ssm_graph.sensors.imu import IMU, ImuLog
 from ssm_graph.sensors.instrument import Calibrated, Instrument
 from ssm_graph.sensors.place import PLACE_KEYS
 from ssm_graph.sensors.registry import INSTRUMENTS
@@ -94,13 +95,21 @@ def read_mission(folder: Path | str) -> Mission:
     )
 
 
+def read_imu(toml: MissionToml) -> ImuLog:
+    """Read the inertial data of a mission alone; raises as :func:`read_mission` does."""
+    bare = {IMU.section: toml.bare(IMU)}
+    table = _read_tables(toml, bare)[0][IMU.section]
+    log: ImuLog = IMU.filled(table, bare[IMU.section], toml[IMU.section], toml.body)
+    return log
+
+
 def _read_tables(toml: MissionToml, bare: dict[str, Any]) -> tuple[dict[str, Table], list[str]]:
     tables: dict[str, Table] = {}
     notes: list[str] = []
     read = read_table if toml.order is Order.TIME else read_arrival_table
     for one in TABLES:
         section = one.section
-        if section not in toml:
+        if section not in bare:
             continue
         label = toml[section].text("file")
         path = table_path(toml, section)

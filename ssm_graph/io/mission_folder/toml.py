@@ -26,6 +26,7 @@ from ssm_graph.base.tables import LARGEST_TIME_S, Order, Table
 from ssm_graph.base.units import DEGREE
 from ssm_graph.io.instruments import library as instruments
 from ssm_graph.mission.mission import InitialState, LocalStart, Reference
+from ssm_graph.mission.point import POINT_KEYS, Point, point
 from ssm_graph.sensors.current import CURRENT_KEYS
 from ssm_graph.sensors.imu import Stamp
 from ssm_graph.sensors.instrument import ENU, Column, Instrument
@@ -101,6 +102,7 @@ SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
 LISTS: Final[Mapping[str, Mapping[str, Key]]] = {
     **{name: keys for one in INSTRUMENTS for name, keys in one.lists.items()},
     "standstill": STANDSTILL_KEYS,
+    "point": POINT_KEYS,
 }
 """Sections that may come several times, ``[[beacon]]``."""
 _OF_PLACES: Final = ("origin", "initial", "gnss", "usbl", "reference")
@@ -160,6 +162,18 @@ class MissionToml:
             )
         return build(LocalStart, self["local"].given())
 
+    def points(self) -> dict[str, Point]:
+        """Return every point of the vehicle by name: ``[[point]]``, and instruments elsewhere."""
+        found = {}
+        for one in INSTRUMENTS:
+            bare = self.bare(one) if one.section in self else None
+            owner = getattr(bare, "mount", bare)
+            if owner is not None and hasattr(owner, "lever_arm_b"):
+                found[one.section] = Point(one.section, owner.lever_arm_b)
+        for settings in self.lists["point"]:
+            found[settings.text("name")] = point(settings)
+        return found
+
     def fault_of_no_place(self) -> ConfigError:
         """Return the error of a mission that may be anywhere on Earth."""
         return ConfigError(
@@ -211,7 +225,7 @@ def _checked(raw: dict[str, Any], path: Path, may_miss: frozenset[str]) -> Missi
         order=top.choice("order", Order, Order.TIME),
         body=body,
         sections=sections,
-        lists={name: _read_list(name, raw.get(name, []), file) for name in LISTS},
+        lists={name: _read_list(name, raw.get(name, []), file, body) for name in LISTS},
         notes=notes,
     )
 
@@ -239,7 +253,7 @@ def _with_instruments(raw: dict[str, Any], file: str) -> tuple[dict[str, Any], t
     return found, tuple(notes)
 
 
-def _read_list(name: str, raw: object, file: str) -> tuple[Settings, ...]:
+def _read_list(name: str, raw: object, file: str, axes: BodyAxes) -> tuple[Settings, ...]:
     """Read the sections ``[[name]]`` of a file."""
     if not isinstance(raw, list):
         raise ConfigError(
@@ -247,7 +261,7 @@ def _read_list(name: str, raw: object, file: str) -> tuple[Settings, ...]:
             f"{shown(raw)}; write double brackets"
         )
     return tuple(
-        read_settings(f"[[{name}]] {number}", item, known=LISTS[name], file=file)
+        read_settings(f"[[{name}]] {number}", item, known=LISTS[name], file=file, axes=axes)
         for number, item in enumerate(raw, start=1)
     )
 

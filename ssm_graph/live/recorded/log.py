@@ -8,6 +8,7 @@ between reports of a DVL, date and time of day of a receiver.
 from __future__ import annotations
 
 import calendar
+import codecs
 import csv
 import math
 import re
@@ -51,6 +52,8 @@ _SHORTEST_S: Final = 1e-3
 """From one report to the next."""
 _ANY_CLOCK_S: Final = 1e12
 _SENTENCE = re.compile(rb"[$!][A-Z]{2}[A-Z0-9]{2,},")
+_PYTHON: Final = {b"'": b'"', b"True": b"true", b"False": b"false", b"None": b"null"}
+_OF_PYTHON = re.compile(rb"'|\b(?:True|False|None)\b")
 _BINARY: Final[Sequence[tuple[Callable[[bytes], bool], Callable[[Path], Any]]]] = (
     (is_pd0, read_pd0),
     (is_nortek, read_nortek),
@@ -80,7 +83,7 @@ def read_recorded(log: Path, options: NmeaOptions | None = None) -> Recorded | N
     ``options`` are those of NMEA: what of its depths is the vehicle's, and the water's surface.
     """
     try:
-        data = log.read_bytes()
+        data = _in_utf8(log.read_bytes())
     except OSError as error:
         raise DataError(f"{log}: cannot be read: {error.strerror or error}") from error
     head = data[:_SNIFFED]
@@ -88,7 +91,9 @@ def read_recorded(log: Path, options: NmeaOptions | None = None) -> Recorded | N
     if binary is not None:
         read = binary(log)
         found = Recorded(read.messages, (read.about, *read.notes))
-    elif head.lstrip(b" \t\r\n\xef\xbb\xbf")[:1] in (b"{", b"[") and b'"' in head:
+    elif b"'transducers'" in head and b'"' not in head:  # as Python prints what it has parsed
+        found = _water_linked(_OF_PYTHON.sub(lambda found: _PYTHON[found[0]], data))
+    elif b'"transducers"' in head or (head.lstrip()[:1] in (b"{", b"[") and b'"' in head):
         found = _water_linked(data)
     elif SIGN in head.partition(b"\n")[0]:
         found = _water_linked_table(data)
@@ -99,6 +104,13 @@ def read_recorded(log: Path, options: NmeaOptions | None = None) -> Recorded | N
     if not found.messages:
         raise DataError(f"{log}: not one report that is read; {'; '.join(found.notes) or 'empty'}")
     return _in_order(log, found)
+
+
+def _in_utf8(data: bytes) -> bytes:
+    """Return a text that a shell or editor of Windows wrote as other programs do."""
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return data.decode("utf-16", "replace").encode()
+    return data.removeprefix(codecs.BOM_UTF8)
 
 
 def write_tables(folder: Path, messages: Iterable[Message]) -> dict[str, int]:
