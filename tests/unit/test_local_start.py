@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mission_fixture import TOML, write_example
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
@@ -20,6 +19,7 @@ from ssm_graph.mission.mission import LocalStart, Mission
 from ssm_graph.sensors.imu import ImuNoise
 from ssm_graph.simulation import Grade, scenario_config, simulate
 from ssm_graph.smoothers.mission import smooth
+from tests.mission_fixture import TOML, write_example
 
 
 @pytest.fixture(scope="module")

@@ -244,10 +244,8 @@ def _with_instruments(raw: dict[str, Any], file: str) -> tuple[dict[str, Any], t
             own |= {"stamp": Stamp.END.value} if section == "imu" else {}
         if not isinstance(own, dict):
             continue
-        known = SECTIONS[section]
-        found[section], preset = instruments.with_preset(
-            section, own, file=file, is_required=lambda key, known=known: known[key].required
-        )
+        required = {name for name, key in SECTIONS[section].items() if key.required}
+        found[section], preset = instruments.with_preset(section, own, file=file, required=required)
         if preset is not None:
             notes.append(f"[{section}] {preset.maker} {preset.name}: {preset.source}")
     return found, tuple(notes)
