@@ -62,8 +62,15 @@ def verdict(content: Content) -> str:
     return (
         f'<section class="verdict {style}"><p class="status"><span class="sign">{sign}</span> '
         f'{_text(status.replace("_", " "))}</p><p class="meaning">{_text(meaning)}</p>'
-        f'<p>{_text(summary.get("reason") or "")}</p></section><dl class="facts">{facts}</dl>'
+        f"<p>{_text(summary.get('reason') or '')}</p>"
+        f'{_local(summary)}</section><dl class="facts">{facts}</dl>'
     )
+
+
+def _local(summary: Mapping[str, Any]) -> str:
+    """Return what a start without a place on Earth means for the numbers of the page."""
+    said = summary.get("local_start")
+    return f"<p><strong>{_text(said)}.</strong></p>" if said else ""
 
 
 def _facts(content: Content) -> Iterable[tuple[str, str]]:
@@ -279,8 +286,8 @@ def _assumed(summary: Mapping[str, Any]) -> str:
     start = summary.get("start") or {}
     lines = []
     if start:
-        how = "is that of the mission file" if start.get("origin") == "mission" else "was aligned"
-        lines.append(f"The start {how}.")
+        how = {"mission": "is that of the mission file", "local": "is local, at zero"}
+        lines.append(f"The start {how.get(str(start.get('origin')), 'was aligned')}.")
     lines += [str(note) for note in summary.get("mission_notes") or ()]
     lines += [str(note) for note in summary.get("notes") or ()]
     items = "".join(f"<li>{_text(text)}</li>" for text in lines)
