@@ -1,9 +1,11 @@
 """What the lanes say of the answer: which sensors contradict it, and how far it may be off.
 
-A lane contradicts where its velocity or its position parts from that of the lane with all sensors
-by more than noise would at the stated rate of false alerts. A step shows only while a lane is there
-that began before it; so a contradiction is remembered, and the lane that found it is led on without
-its sensor, until that lane, by what is independent of the sensor, can say that the answer is right.
+A lane contradicts where its velocity or its position (that which forgot the bias of the gyros: or
+that) parts from that of the lane with all sensors by more than noise would at the stated rate of
+false alerts. A step shows only while a lane is there that began before it; so a contradiction is
+remembered, and the lane that found it first is led on without its sensor, until that lane, by what
+is independent of the sensor, can say that the answer is right. What parts by less is a suspicion:
+it lasts until that lane agrees, whatever it can tell.
 """
 
 from __future__ import annotations
@@ -19,11 +21,27 @@ from scipy.special import ndtri
 from ssm_graph.base import chi2
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
-from ssm_graph.engine.error_state import POSITION, VELOCITY
-from ssm_graph.live.estimator.lanes import DEPTH, DVL, FIXES, LENGTHS_S, MEASURE, LaneBank, Lanes
+from ssm_graph.engine.error_state import GYRO_BIAS, POSITION, VELOCITY
+from ssm_graph.live.estimator.lanes import (
+    DEPTH,
+    DVL,
+    FIXES,
+    INERTIAL,
+    LENGTHS_S,
+    MEASURE,
+    LaneBank,
+    Lanes,
+)
 
-PARTS: Final = (VELOCITY, POSITION)
-UNITS: Final = ("m/s", "m")
+PARTS: Final = (VELOCITY, POSITION, GYRO_BIAS)
+OF_ALL: Final = 2
+"""Parts in which every lane is compared; the others are for those that forget the gyros' bias."""
+SAID: Final = (
+    ("velocity", "m/s", 1.0),
+    ("position", "m", 1.0),
+    ("gyro bias", "deg/s", 180.0 / np.pi),
+)
+"""Name, unit and factor to it"""
 TEST_S: Final = 10.0
 """What lanes say changes so slowly, and those of one sensor say so much the same, that of the tests
 of each lane one in so long counts as another one. Of noise as stated, 4 h at navigation and at
@@ -33,7 +51,16 @@ UNASKED: Final = 0.01
 """Share of the measure's covariance added to that of a separation: what moves the answer by less
 than a tenth of its own sigma is not asked for."""
 AGREED_S: Final = 10.0
-"""A contradiction ends once the lane that is led on has agreed for so long."""
+"""A contradiction or suspicion ends once the lane that is led on has agreed for so long."""
+LEFT: Final = 0.5
+"""To end a contradiction that lane has to exclude, at the stated probability of a missed detection,
+that so much of what was found is left."""
+AT_EASE: Final = 0.05
+"""A suspicion ends where noise alone parts the lane by more in so many cases."""
+DOUBTED_S: Final = 30.0
+"""So long after an answer was begun anew a lane from before contradicts at `DOUBTFUL`."""
+DOUBTFUL: Final = 1e-3
+"""Probability of a false alert of such a lane: something is wrong for certain."""
 CONFIRMED: Final = 1.0 / 3.0
 """Share of its way at a false velocity by which the measure, held by fixes, parts from a lane."""
 CONFIRMED_S: Final = 40.0
@@ -51,7 +78,6 @@ NEAR: Final = 25.0
 HORIZONTAL: Final = np.array([1.0, 0.0])
 VERTICAL: Final = np.array([0.0, 1.0])
 """Of the two protection levels"""
-INERTIAL: Final = "the inertial data"
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +86,8 @@ class IntegrityConfig:
 
     false_alerts_per_h: float = 1e-3
     """Of all lanes together, while every sensor is as it is stated."""
+    suspicions_per_h: float = 0.3
+    """False ones, of all lanes together: each costs GOOD for a minute or so; none is remembered."""
     missed_detection: float = 1e-3
     """Probability that a fault moves the answer out of its protection level unseen."""
     protection_m: float = np.inf
@@ -68,7 +96,11 @@ class IntegrityConfig:
     """And for a vertical one below this, m."""
 
     def __post_init__(self) -> None:
-        for name, high in (("false_alerts_per_h", np.inf), ("missed_detection", 0.5)):
+        for name, high in (
+            ("false_alerts_per_h", np.inf),
+            ("suspicions_per_h", np.inf),
+            ("missed_detection", 0.5),
+        ):
             value = getattr(self, name)
             if not 0.0 < value < high:
                 raise ConfigError(f"{name}: expected a number in (0, {high}), got {value}")
@@ -85,13 +117,15 @@ class Contradiction(NamedTuple):
     last_s: float
     """When a lane last said so, s"""
     part: int
-    """0 in velocity, 1 in position"""
+    """0 in velocity, 1 in position, 2 in the gyros' bias"""
     size: float
-    """Largest so far, m/s or m"""
+    """Largest so far, m/s, m or rad/s"""
     evidence: float
     """By how much less of chi-square was left without it while it began"""
     agreed_s: float
     """Since when the lane that is led on agrees, s; infinite where it does not"""
+    is_certain: bool = True
+    """Whether it is more than a suspicion"""
 
 
 class Protection(NamedTuple):
@@ -104,14 +138,14 @@ class Protection(NamedTuple):
 
 
 class Separations(NamedTuple):
-    """Of L lanes from the measure, in velocity and in position."""
+    """Of L lanes from the measure, in velocity, position and bias of the gyros."""
 
     test: Array
-    """(L, 2) chi-square of 3 degrees of freedom; zero where a lane has left nothing out"""
+    """(L, 3) chi-square of 3 degrees of freedom; zero where a lane has left nothing out"""
     size: Array
-    """(L, 2) m/s and m"""
+    """(L, 3) m/s, m, rad/s"""
     sigma: Array
-    """(L, 2) in the most uncertain direction"""
+    """(L, 3) in the most uncertain direction"""
 
 
 class Judge:
@@ -119,9 +153,13 @@ class Judge:
 
     def __init__(self, bank: LaneBank, config: IntegrityConfig) -> None:
         self._bank, self.config = bank, config
-        n_tests = 3600.0 / TEST_S * len(PARTS) * (len(bank.suspect) - 1)
+        n_tests = 3600.0 / TEST_S * OF_ALL * (len(bank.suspect) - 1)
         self.threshold = float(chi2.isf(config.false_alerts_per_h / n_tests, 3))
         """Of the chi-square of a separation"""
+        self.suspicion = float(chi2.isf(min(config.suspicions_per_h / n_tests, AT_EASE), 3))
+        """And that of a suspicion"""
+        self._at_ease, self._doubtful = (float(chi2.isf(p, 3)) for p in (AT_EASE, DOUBTFUL))
+        self._is_inertial = bank.suspect == bank.suspects.index(INERTIAL)
         self._radius = float(np.sqrt(chi2.isf(config.missed_detection, 2)))
         self._side = float(-ndtri(0.5 * config.missed_detection))
 
@@ -144,6 +182,7 @@ class Judge:
             size[:, k] = np.linalg.norm(off, axis=1)
             sigma[:, k] = np.sqrt(np.linalg.eigvalsh(D)[:, -1])
         test[(lanes.n_out == 0.0) | ~np.isfinite(lanes.begun_s) | self.is_refuted(lanes)] = 0.0
+        test[~self._is_inertial, OF_ALL:] = 0.0
         return Separations(test, size, sigma)
 
     def is_refuted(self, lanes: Lanes) -> NDArray[np.bool_]:
@@ -167,18 +206,22 @@ class Judge:
             own = self._bank.lanes_of(suspect)
             test = found.test[own.start : own.stop]
             row, part = (int(i) for i in np.unravel_index(np.argmax(test), test.shape))
-            lane, held = own.start + row, int(self._bank.held[suspect])
-            if test[row, part] > self.threshold:
-                before = kept.get(suspect)
-                if lane != held:
+            lane, held, was = own.start + row, int(self._bank.held[suspect]), kept.get(suspect)
+            limit = self._limit(lanes, suspect, lane, time_s)
+            is_certain = bool(test[row, part] > limit)
+            if is_certain or test[row, part] > self.suspicion:
+                if was is None:
                     lanes = lanes.with_copy(held, lane)
-                size = float(found.size[lane, part])
-                if before is None:
-                    before = Contradiction(suspect, time_s, time_s, part, size, -np.inf, np.inf)
-                largest = max(before.size, float(found.size[lane, before.part]))
-                kept[suspect] = before._replace(last_s=time_s, size=largest, agreed_s=np.inf)
-            elif suspect in kept:
-                still = self._still(kept[suspect], lanes, found, time_s)
+                if was is None or (is_certain and not was.is_certain):
+                    was = Contradiction(suspect, time_s, time_s, part, 0.0, -np.inf, np.inf, False)
+                kept[suspect] = was._replace(
+                    last_s=time_s,
+                    size=max(was.size, float(found.size[lane, was.part])),
+                    agreed_s=np.inf,
+                    is_certain=was.is_certain or is_certain,
+                )
+            elif was is not None:
+                still = self._still(was, lanes, found, time_s)
                 if still is None:
                     del kept[suspect]
                     begun_s = lanes.begun_s.copy()
@@ -187,6 +230,12 @@ class Judge:
                 else:
                     kept[suspect] = still
         return lanes, tuple(self._weighed(one, lanes, time_s) for one in kept.values())
+
+    def _limit(self, lanes: Lanes, suspect: int, lane: int, time_s: float) -> float:
+        """Return above which chi-square a lane contradicts."""
+        doubted_s = float(lanes.doubted_s[suspect])
+        is_doubted = time_s - doubted_s < DOUBTED_S and lanes.begun_s[lane] < doubted_s
+        return self._doubtful if is_doubted else self.threshold
 
     def _weighed(self, one: Contradiction, lanes: Lanes, time_s: float) -> Contradiction:
         """Return a contradiction with the evidence of its first seconds."""
@@ -201,9 +250,12 @@ class Judge:
         own = int(self._bank.held[was.suspect]), was.part
         if self.is_refuted(lanes)[own[0]]:
             return None
-        is_out = bool(found.size[own] + self.detectable * found.sigma[own] <= was.size)
-        if self._bank.suspects[was.suspect] == DVL and was.part == 0:
-            is_out |= self._is_confirmed(was, lanes, found, time_s)
+        if was.is_certain:
+            is_out = bool(found.size[own] + self._side * found.sigma[own] <= LEFT * was.size)
+            if self._bank.suspects[was.suspect] == DVL and was.part == 0:
+                is_out |= self._is_confirmed(was, lanes, found, time_s)
+        else:
+            is_out = bool(found.test[own[0]].max() < self._at_ease)
         agreed_s = min(was.agreed_s, time_s) if is_out else np.inf
         return None if time_s - agreed_s > AGREED_S else was._replace(agreed_s=agreed_s)
 
@@ -237,8 +289,10 @@ class Judge:
     def blamed(self, known: tuple[Contradiction, ...]) -> list[Contradiction]:
         """Return those without which what the others say fits, the clearest first.
 
-        What contradicts long after the first one does so since the answer has followed that.
+        What contradicts long after the first one does so since the answer has followed that; what
+        is certain counts before what is suspected.
         """
+        known = tuple(one for one in known if one.is_certain) or known
         first_s = min((one.since_s for one in known), default=0.0)
         rest = [one for one in known if one.since_s - first_s < TOGETHER_S]
         order = sorted(rest, key=lambda one: -one.evidence)
@@ -254,14 +308,18 @@ class Judge:
         names, first = self._bank.suspects, blamed[0]
         said = [names[one.suspect] for one in blamed]
         has_fixes = lanes.n_fixes[self._bank.held[blamed[0].suspect]] > 0.0
-        if DVL in said and not (has_fixes and len(known) == 1):
+        if DVL in said and INERTIAL not in said and not (has_fixes and len(known) == 1):
             said.append(INERTIAL)
-        return (
-            f"{' or '.join(said)}: without {names[first.suspect]} the "
-            f"{('velocity', 'position')[first.part]} has been another by {first.size:.2g} "
-            f"{UNITS[first.part]} since {first.since_s:.0f} s, and nothing independent has shown "
-            "since that the answer is right"
+        name, unit, factor = SAID[first.part]
+        is_inertial = names[first.suspect] == INERTIAL
+        without = "the gyro bias of before" if is_inertial else names[first.suspect]
+        text = (
+            f"{' or '.join(said)}: without {without} the {name} has been another by "
+            f"{factor * first.size:.2g} {unit} since {first.since_s:.0f} s, "
         )
+        if not first.is_certain:
+            return text + "which noise alone would hardly do"
+        return text + "and nothing independent has shown since that the answer is right"
 
     def protection(
         self, lanes: Lanes, found: Separations, R_up: Array, *, time_s: float, fixed_s: float
