@@ -230,12 +230,13 @@ class LaneBank:
         """Return the lanes at a keyframe where a window was begun anew.
 
         ``doubted`` are the suspects that contradicted the answer, or may have bent it. Lanes
-        without these, and those that are led on, know what was before and stay; the others begin
-        with what the window says now, as the measure does.
+        without these, or that of them which is led on, know what was before and stay; the others
+        begin with what the window says now, as the measure does.
         """
         lanes = self._predicted(lanes, last, keyframe, window)
         own = [s for s, name in enumerate(self.suspects) if name in doubted]
-        stays = np.isin(self.suspect, own)
+        is_led_on = np.isfinite(lanes.begun_s[self.held])
+        stays = np.isin(self.suspect, [s for s in own if not is_led_on[s]])
         stays[self.held] = True
         deviation, covariance = lanes.deviation.copy(), lanes.covariance.copy()
         deviation[MEASURE] = 0.0
@@ -349,6 +350,17 @@ class LaneBank:
             ratio[s, at] = before + share * (own / sigma - before)
             last_s[s] = time_s
         return lanes._replace(last_s=last_s, ratio=ratio)
+
+    def let_go(self, lanes: Lanes, suspect: int, others: Sequence[int], time_s: float) -> Lanes:
+        """Return the lanes without that which was led on for a suspect.
+
+        All lanes of ``others``, which had followed what it did, begin anew.
+        """
+        which = np.isin(self.suspect, others)
+        lanes = self._begun(lanes, which, time_s - self._stagger_s)
+        begun_s = lanes.begun_s.copy()
+        begun_s[self.held[[suspect, *others]]] = np.inf
+        return lanes._replace(begun_s=begun_s)
 
     def _begun_anew(self, lanes: Lanes, time_s: float) -> Lanes:
         """Return the lanes with those begun anew whose time is over."""

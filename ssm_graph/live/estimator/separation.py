@@ -52,11 +52,8 @@ UNASKED: Final = 0.01
 than a tenth of its own sigma is not asked for."""
 AGREED_S: Final = 10.0
 """A contradiction or suspicion ends once the lane that is led on has agreed for so long."""
-LEFT: Final = 0.5
-"""To end a contradiction that lane has to exclude, at the stated probability of a missed detection,
-that so much of what was found is left."""
 AT_EASE: Final = 0.05
-"""A suspicion ends where noise alone parts the lane by more in so many cases."""
+"""It agrees where noise alone would part it by more in so many cases."""
 DOUBTED_S: Final = 30.0
 """So long after an answer was begun anew a lane from before contradicts at `DOUBTFUL`."""
 DOUBTFUL: Final = 1e-3
@@ -201,8 +198,10 @@ class Judge:
         time_s: float,
     ) -> tuple[Lanes, tuple[Contradiction, ...]]:
         """Return the contradictions after one more keyframe, and the lanes with those led on."""
-        kept = {one.suspect: one for one in known}
+        kept, over = {one.suspect: one for one in known}, set[int]()
         for suspect in range(len(self._bank.suspects)):
+            if suspect in over:
+                continue
             own = self._bank.lanes_of(suspect)
             test = found.test[own.start : own.stop]
             row, part = (int(i) for i in np.unravel_index(np.argmax(test), test.shape))
@@ -223,13 +222,26 @@ class Judge:
             elif was is not None:
                 still = self._still(was, lanes, found, time_s)
                 if still is None:
-                    del kept[suspect]
-                    begun_s = lanes.begun_s.copy()
-                    begun_s[held] = np.inf
-                    lanes = lanes._replace(begun_s=begun_s)
+                    others = self._consequences(was, known)
+                    over |= {suspect, *others}
+                    kept = {s: one for s, one in kept.items() if s not in over}
+                    lanes = self._bank.let_go(lanes, suspect, others, time_s)
                 else:
                     kept[suspect] = still
         return lanes, tuple(self._weighed(one, lanes, time_s) for one in kept.values())
+
+    def _consequences(self, was: Contradiction, known: tuple[Contradiction, ...]) -> list[int]:
+        """Return the suspects whose contradiction ends with that of another one.
+
+        They began after it and were not blamed. The lanes of the inertial data had followed the
+        DVL, and that a lane without DVL agrees speaks for these data as well.
+        """
+        names, blamed = self._bank.suspects, {one.suspect for one in self.blamed(known)}
+        if was.suspect not in blamed:
+            return []
+        spared = {names.index(INERTIAL)} if names[was.suspect] == DVL else set()
+        later = [one.suspect for one in known if one.since_s > was.since_s]
+        return [suspect for suspect in later if suspect not in blamed - spared]
 
     def _limit(self, lanes: Lanes, suspect: int, lane: int, time_s: float) -> float:
         """Return above which chi-square a lane contradicts."""
@@ -250,12 +262,11 @@ class Judge:
         own = int(self._bank.held[was.suspect]), was.part
         if self.is_refuted(lanes)[own[0]]:
             return None
+        is_out = bool(found.test[own[0]].max() < self._at_ease)
         if was.is_certain:
-            is_out = bool(found.size[own] + self._side * found.sigma[own] <= LEFT * was.size)
+            is_out &= bool(found.size[own] + self._side * found.sigma[own] <= was.size)
             if self._bank.suspects[was.suspect] == DVL and was.part == 0:
                 is_out |= self._is_confirmed(was, lanes, found, time_s)
-        else:
-            is_out = bool(found.test[own[0]].max() < self._at_ease)
         agreed_s = min(was.agreed_s, time_s) if is_out else np.inf
         return None if time_s - agreed_s > AGREED_S else was._replace(agreed_s=agreed_s)
 
