@@ -50,7 +50,7 @@ this counts 10000."""
 UNASKED: Final = 0.01
 """Share of the measure's covariance added to that of a separation: what moves the answer by less
 than a tenth of its own sigma is not asked for."""
-AGREED_S: Final = 10.0
+AGREED_S: Final = 8.0
 """A contradiction or suspicion ends once the lane that is led on has agreed for so long."""
 AT_EASE: Final = 0.05
 """It agrees where noise alone would part it by more in so many cases."""
@@ -65,7 +65,7 @@ CONFIRMED_S: Final = 40.0
 FITS: Final = 0.75
 """Misfit of the measure, in thresholds, below which it fits all that is measured."""
 WEIGHED_S: Final = 5.0
-"""Evidence is taken while a contradiction is so young."""
+"""Evidence and size are taken while a contradiction is so young."""
 TOGETHER_S: Final = 10.0
 """Contradictions that begin within so much compete for the blame."""
 RIVAL: Final = 0.5
@@ -116,7 +116,7 @@ class Contradiction(NamedTuple):
     part: int
     """0 in velocity, 1 in position, 2 in the gyros' bias"""
     size: float
-    """Largest so far, m/s, m or rad/s"""
+    """Largest while it began: later the answer is bent by what it followed; m/s, m or rad/s"""
     evidence: float
     """By how much less of chi-square was left without it while it began"""
     agreed_s: float
@@ -213,9 +213,10 @@ class Judge:
                     lanes = lanes.with_copy(held, lane)
                 if was is None or (is_certain and not was.is_certain):
                     was = Contradiction(suspect, time_s, time_s, part, 0.0, -np.inf, np.inf, False)
+                largest = max(was.size, float(found.size[lane, was.part]))
                 kept[suspect] = was._replace(
                     last_s=time_s,
-                    size=max(was.size, float(found.size[lane, was.part])),
+                    size=largest if time_s - was.since_s <= WEIGHED_S else was.size,
                     agreed_s=np.inf,
                     is_certain=was.is_certain or is_certain,
                 )
