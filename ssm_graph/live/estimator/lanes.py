@@ -164,7 +164,8 @@ class LaneBank:
         self._first, self.held = np.append(1, ends[:-1] + 1), ends
         """(S,) the first lane of each suspect, and that which is led on once it contradicts"""
         self._forgets = self.suspect == self.suspects.index(INERTIAL)
-        self._fixes = [k for k, name in enumerate(self.suspects) if name in FIXES]
+        self._is_fix = np.array([*(name in FIXES for name in self.suspects), False])
+        """(S + 1,) the last for rows that are never left out"""
         self._inertial = InertialRows(sensors.frame, sensors.extras)
         dims = {BEAMS: sensors.beams.n_beams, **{k: aid.dim for k, aid in sensors.aids.items()}}
         self._lasting: dict[str, slice] = {}
@@ -299,7 +300,7 @@ class LaneBank:
         deviation = lanes.deviation + (PHt @ solved[..., -1:])[..., 0]
         P = P - PHt @ solved[..., :-1]
         surplus = np.sum(innovation * solved[..., -1] - counts_in, axis=1)
-        is_fix = np.isin(of_row, self._fixes)
+        is_fix = self._is_fix[of_row]
         return lanes._replace(
             deviation=deviation,
             covariance=0.5 * (P + P.mT),
@@ -345,7 +346,8 @@ class LaneBank:
             own, sigma, at, begin = innovation[begin:end], sigmas[begin:end], rows.component, end
             if s < 0:
                 continue
-            before = np.nan_to_num(ratio[s, at])
+            before = ratio[s, at]
+            before[np.isnan(before)] = 0.0
             share = -np.expm1(-min(time_s - float(last_s[s]), MEMORY_S) / MEMORY_S)
             ratio[s, at] = before + share * (own / sigma - before)
             last_s[s] = time_s

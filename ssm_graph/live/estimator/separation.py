@@ -47,6 +47,9 @@ TEST_S: Final = 10.0
 of each lane one in so long counts as another one. Of noise as stated, 4 h at navigation and at
 tactical grade, tests went above a level 3000 to 9000 times as often in an hour as one test would;
 this counts 10000."""
+BIAS_TEST_S: Final = 40.0
+"""The same for a bias of the gyros, which other sensors tell so much more slowly: in 22 minutes
+without a fault at both grades the tests of four lanes went as high as those of 120 do."""
 UNASKED: Final = 0.01
 """Share of the measure's covariance added to that of a separation: what moves the answer by less
 than a tenth of its own sigma is not asked for."""
@@ -83,7 +86,7 @@ class IntegrityConfig:
 
     false_alerts_per_h: float = 1e-3
     """Of all lanes together, while every sensor is as it is stated."""
-    suspicions_per_h: float = 0.3
+    suspicions_per_h: float = 0.5
     """False ones, of all lanes together: each costs GOOD for a minute or so; none is remembered."""
     missed_detection: float = 1e-3
     """Probability that a fault moves the answer out of its protection level unseen."""
@@ -150,13 +153,20 @@ class Judge:
 
     def __init__(self, bank: LaneBank, config: IntegrityConfig) -> None:
         self._bank, self.config = bank, config
-        n_tests = 3600.0 / TEST_S * OF_ALL * (len(bank.suspect) - 1)
-        self.threshold = float(chi2.isf(config.false_alerts_per_h / n_tests, 3))
-        """Of the chi-square of a separation"""
-        self.suspicion = float(chi2.isf(min(config.suspicions_per_h / n_tests, AT_EASE), 3))
-        """And that of a suspicion"""
-        self._at_ease, self._doubtful = (float(chi2.isf(p, 3)) for p in (AT_EASE, DOUBTFUL))
         self._is_inertial = bank.suspect == bank.suspects.index(INERTIAL)
+        n_tests = np.array(
+            [
+                *[3600.0 / TEST_S * OF_ALL * (len(bank.suspect) - 1)] * OF_ALL,
+                3600.0 / BIAS_TEST_S * (self._is_inertial.sum() - 1),
+            ]
+        )
+        self.thresholds, self.suspicions = (
+            np.array([chi2.isf(min(0.5 * rate / n, AT_EASE), 3) for n in n_tests])
+            for rate in (config.false_alerts_per_h, config.suspicions_per_h)
+        )
+        """(3,) of the chi-square of a separation, by part; half the rate is for the gyros' bias"""
+        self.threshold = float(self.thresholds[0])
+        self._at_ease, self._doubtful = (float(chi2.isf(p, 3)) for p in (AT_EASE, DOUBTFUL))
         self._radius = float(np.sqrt(chi2.isf(config.missed_detection, 2)))
         self._side = float(-ndtri(0.5 * config.missed_detection))
 
@@ -176,7 +186,7 @@ class Judge:
             D[MEASURE] = of_measure
             off = lanes.deviation[:, part] - lanes.deviation[MEASURE, part]
             test[:, k] = np.sum(off * np.linalg.solve(D, off[..., None])[..., 0], axis=1)
-            size[:, k] = np.linalg.norm(off, axis=1)
+            size[:, k] = np.sqrt(np.sum(off * off, axis=1))
             sigma[:, k] = np.sqrt(np.linalg.eigvalsh(D)[:, -1])
         test[(lanes.n_out == 0.0) | ~np.isfinite(lanes.begun_s) | self.is_refuted(lanes)] = 0.0
         test[~self._is_inertial, OF_ALL:] = 0.0
@@ -204,11 +214,12 @@ class Judge:
                 continue
             own = self._bank.lanes_of(suspect)
             test = found.test[own.start : own.stop]
-            row, part = (int(i) for i in np.unravel_index(np.argmax(test), test.shape))
+            highest = np.argmax(test / self.thresholds)
+            row, part = (int(i) for i in np.unravel_index(highest, test.shape))
             lane, held, was = own.start + row, int(self._bank.held[suspect]), kept.get(suspect)
             limit = self._limit(lanes, suspect, lane, time_s)
-            is_certain = bool(test[row, part] > limit)
-            if is_certain or test[row, part] > self.suspicion:
+            is_certain = bool(test[row, part] > min(limit, self.thresholds[part]))
+            if is_certain or test[row, part] > self.suspicions[part]:
                 if was is None:
                     lanes = lanes.with_copy(held, lane)
                 if was is None or (is_certain and not was.is_certain):
@@ -245,10 +256,10 @@ class Judge:
         return [suspect for suspect in later if suspect not in blamed - spared]
 
     def _limit(self, lanes: Lanes, suspect: int, lane: int, time_s: float) -> float:
-        """Return above which chi-square a lane contradicts."""
+        """Return above which chi-square a lane contradicts an answer that was begun anew."""
         doubted_s = float(lanes.doubted_s[suspect])
         is_doubted = time_s - doubted_s < DOUBTED_S and lanes.begun_s[lane] < doubted_s
-        return self._doubtful if is_doubted else self.threshold
+        return self._doubtful if is_doubted else np.inf
 
     def _weighed(self, one: Contradiction, lanes: Lanes, time_s: float) -> Contradiction:
         """Return a contradiction with the evidence of its first seconds."""
@@ -345,19 +356,16 @@ class Judge:
         """
         off = np.abs(lanes.deviation[:, POSITION] @ R_up.T)
         P = R_up @ lanes.covariance[:, POSITION, POSITION] @ R_up.T
-        level = np.sqrt(np.linalg.eigvalsh(P[:, :2, :2])[:, -1])
-        bound = np.stack(
-            [
-                np.linalg.norm(off[:, :2], axis=1) + self._radius * level,
-                off[:, 2] + self._side * np.sqrt(P[:, 2, 2]),
-            ],
-            axis=1,
-        )
+        east, north = P[:, 0, 0], P[:, 1, 1]
+        level = np.sqrt(0.5 * (east + north) + np.hypot(0.5 * (east - north), P[:, 0, 1]))
+        bound = np.empty((len(off), 2))
+        bound[:, 0] = np.hypot(off[:, 0], off[:, 1]) + self._radius * level
+        bound[:, 1] = off[:, 2] + self._side * np.sqrt(P[:, 2, 2])
         worst = bound[MEASURE].copy()
         for suspect, name in enumerate(self._bank.suspects):
             own, held = self._bank.lanes_of(suspect), int(self._bank.held[suspect])
             is_led_on = bool(np.isfinite(lanes.begun_s[held]))
-            lane = np.array([i for i in own if i != held and lanes.n_out[i] > 0.0], dtype=np.intp)
+            lane = own.start + np.flatnonzero(lanes.n_out[own.start : held] > 0.0)
             if len(lane) == 0:
                 worst = np.maximum(worst, bound[held]) if is_led_on else worst
                 continue
@@ -373,11 +381,11 @@ class Judge:
                 axis = VERTICAL if name == DEPTH else np.ones(2)
                 # A slow pull shows to the longest lane last.
                 unseen, older = float(sigmas.max()) * axis, bound[MEASURE] + step * axis
-                grown = np.tile(older, (len(lane), 1))
+                grown = older
             if is_led_on:
                 worst = np.maximum(worst, bound[held] + unseen)
             worst = np.maximum(worst, older)
-            worst = np.maximum(worst, np.min([bound[lane], grown], axis=0).max(axis=0))
+            worst = np.maximum(worst, np.minimum(bound[lane], grown).max(axis=0))
         return Protection(*worst.tolist())
 
 
