@@ -156,9 +156,9 @@ class FaultWatch:
             beams=_columns(faults, on_array, beams.keyframe, time_s),
             between=_columns(faults, on_imu, keyframes, time_s),
             aids={
-                name: _columns(faults, {name: root}, channels.aid_keyframe[name], time_s)
-                for name, root in channels.aids.items()
-                if any(one.hypothesis.channel == name for one in faults)
+                name: _columns(faults, on_aid, channels.aid_keyframe[name], time_s)
+                for name, on_aid in channels.of_aids()
+                if any(one.hypothesis.channel in on_aid for one in faults)
             },
         )
 
