@@ -101,7 +101,12 @@ class Hypothesis:
 
     def charge(self, n_numbers: int) -> float:
         """Return the chi-square that hypotheses are compared beyond: each number has its price."""
-        return chi_sq_at(self.tail, n_numbers) + PER_NUMBER * (n_numbers - 1) + self.handicap - self.odds
+        return (
+            chi_sq_at(self.tail, n_numbers)
+            + PER_NUMBER * (n_numbers - 1)
+            + self.handicap
+            - self.odds
+        )
 
     def least(self, n_numbers: int) -> float:
         """Return the chi-square from which on so many numbers are no chance."""

@@ -22,7 +22,8 @@ from ssm_graph.smoothers.faults.hypotheses import (
     Course,
     Hypothesis,
 )
-from ssm_graph.smoothers.faults.nuisances import WIDER, WIDTHS, Nuisances
+from ssm_graph.smoothers.faults.nuisances import WIDER, WIDTHS, Nuisances, Priors
+from ssm_graph.smoothers.faults.unstated import Unstated, unstated_of
 
 LEAST_FORCE = 10.0
 """m/s^2, of a jump: it is no larger."""
@@ -170,6 +171,18 @@ class Judge:
 
     def fit(self, grid: Grid, faults: Sequence[Fault]) -> None:
         """Let the nuisances be as wide as the data ask for, once faults are freed."""
+        priors, score, among = self._of_nuisances(grid, faults)
+        self.widths = priors.fitted(score, among, choices=WIDER if faults else WIDTHS)
+
+    def unstated(self, grid: Grid, faults: Sequence[Fault]) -> Unstated | None:
+        """Return what instruments err in beyond what they state, once faults are freed."""
+        priors, score, among = self._of_nuisances(grid, faults)
+        prior, width = priors.information(self.widths), priors.width(self.widths)
+        n_coarse = len(grid.coarse()[0])
+        return unstated_of(self._nuisances, width, score, among, prior, n_coarse)
+
+    def _of_nuisances(self, grid: Grid, faults: Sequence[Fault]) -> tuple[Priors, Array, Array]:
+        """Return their priors, scores and information among themselves, once faults are freed."""
         evidence, width = self._whole(grid), self.channels.width
         for fault in faults:
             combined, prior = combined_of(fault, grid, self.channels)
@@ -178,9 +191,7 @@ class Judge:
             evidence = evidence.freed(padded, prior)
         priors = self._nuisances.priors(*grid.coarse())
         crossed = priors.crossed(evidence, width)
-        self.widths = priors.fitted(
-            crossed.score, priors.among(crossed, width), choices=WIDER if faults else WIDTHS
-        )
+        return priors, crossed.score, priors.among(crossed, width)
 
     def on(self, grid: Grid) -> Judged:
         """Return the evidence on a grid, with nothing freed but the nuisances."""
