@@ -37,8 +37,9 @@ from ssm_graph.simulation import (
 from ssm_graph.simulation.faults import Sensor
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
 from ssm_graph.smoothers.faults.columns import KERNEL, beside_median, calibration_columns
+from ssm_graph.smoothers.faults.grid import Grid
 from ssm_graph.smoothers.faults.hypotheses import Course, Hypothesis
-from ssm_graph.smoothers.faults.judged import Grid, Judged
+from ssm_graph.smoothers.faults.judged import Judged
 from ssm_graph.smoothers.faults.search import FaultSearch
 from tests.aids_fixture import with_every_aid
 from tests.helpers import simulated, with_initial

@@ -16,6 +16,7 @@ import numpy as np
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.stepwise import Steps
 from ssm_graph.smoothers.faults.columns import IMU, Channels
+from ssm_graph.smoothers.faults.grid import Grid
 from ssm_graph.smoothers.faults.hypotheses import (
     ALLOWED,
     ALLOWED_M,
@@ -23,7 +24,7 @@ from ssm_graph.smoothers.faults.hypotheses import (
     Hypothesis,
     hypotheses_of,
 )
-from ssm_graph.smoothers.faults.judged import Candidate, Fault, Grid, Judge, Judged
+from ssm_graph.smoothers.faults.judged import Candidate, Fault, Judge, Judged
 from ssm_graph.smoothers.faults.unstated import Unstated
 
 FINE_S = 1.0

@@ -35,8 +35,17 @@ from ssm_graph.smoothers.faults.nuisances import (
 
 DEVIATIONS: Final = 6.0
 """Of the chi-square above its mean where nothing is unstated, to be no chance,"""
-BY_MEAN: Final = 2.0
-"""and by that mean: low-pass filters and vibration make it 1.9 at MEMS grade."""
+USUAL: Final = 2.0
+"""and by that mean: low-pass filters and vibration make it 1.9 at MEMS grade,"""
+BY_MEAN: Final = {DVL: 4.0}
+"""and of beams a stated drift, alike along all axes, leaves as much."""
+HINT: Final = 1.5
+"""Deviations from which on others are allowed for, too, once one is sure: who states nothing of one
+instrument states nothing of the next;"""
+SEEN: Final = 3.0
+"""or this mean of their chi-square: without, the data could not show how small they are."""
+AS_LIKELY: Final = 2.0
+"""Logarithm of the likelihood, two deviations."""
 WIDER: Final = 2.0
 """Prior sigma by what data sheets of the grade have."""
 BIASES: Final = {
@@ -49,7 +58,7 @@ DRIFTS: Final = {
     "depth": "drift_sigma_m",
 }
 """Keys of ``mission.toml`` that state what wanders."""
-SCALES: Final = np.geomspace(1.0 / 64.0, 4.0, 17)
+SCALES: Final = np.geomspace(1.0 / 64.0, 2.0, 15)
 """Of the sigma of biases that wander, which may be likeliest."""
 
 
@@ -139,7 +148,7 @@ class _Test:
     mean: float
     deviation: float
     scale: float
-    """Of their prior sigma, the likeliest"""
+    """Of their prior sigma, the largest one that is as likely as any"""
 
     @classmethod
     def of(cls, own: NDArray[np.intp], score: Array, among: Array, prior: Array) -> _Test:
@@ -159,12 +168,17 @@ class _Test:
             half = np.linalg.solve(root, left)
             size = np.sum(np.log(np.diagonal(root))) + len(own) * np.log(scale)
             likely.append(0.5 * float(half @ half) - float(size))
-        return cls(chi_sq, mean, spread, float(SCALES[int(np.argmax(likely))]))
+        widest = np.flatnonzero(np.array(likely) > max(likely) - AS_LIKELY)[-1]
+        return cls(chi_sq, mean, spread, float(SCALES[widest]))
 
     @property
-    def is_significant(self) -> bool:
-        """Whether they are."""
-        return self.chi_sq > max(self.mean + DEVIATIONS * self.deviation, BY_MEAN * self.mean)
+    def deviations(self) -> float:
+        """By which the chi-square is above its mean."""
+        return (self.chi_sq - self.mean) / max(self.deviation, 1e-9)
+
+    def is_sure(self, by_mean: float) -> bool:
+        """Whether they are, as such, with at least so many times its mean."""
+        return self.deviations > DEVIATIONS and self.chi_sq > by_mean * self.mean
 
 
 def unstated_of(
@@ -179,15 +193,21 @@ def unstated_of(
     score, among, prior : (m,), (m, m) and (m, m): what the data say of them, and their priors.
     n_coarse : blocks that each of those that change slowly has.
     """
-    slow, known = [], {}
-    for name, own in nuisances.groups(n_coarse).items():
-        test = _Test.of(own, score, among, prior)
-        if test.is_significant:
-            known[name] = test.chi_sq, test.mean
-            if name != ERRORS:
-                slow.append(nuisances.slow(name).times(float(width[own[0]]) * test.scale))
-    if not known:
+    groups = nuisances.groups(n_coarse)
+    tests = {name: _Test.of(own, score, among, prior) for name, own in groups.items()}
+    if not any(test.is_sure(BY_MEAN.get(name, USUAL)) for name, test in tests.items()):
         return None
+    more = {
+        name: test
+        for name, test in tests.items()
+        if test.deviations > HINT or (test.mean > SEEN and name != ERRORS)
+    }
+    known = {name: (test.chi_sq, test.mean) for name, test in more.items()}
+    slow = [
+        nuisances.slow(name).times(float(width[groups[name][0]]) * test.scale)
+        for name, test in more.items()
+        if name != ERRORS
+    ]
     n = 27 if ERRORS in known else 0
     sigma, columns = nuisances.imu_sigma[:n], nuisances.imu_columns[..., :n]
     return Unstated(tuple(slow), sigma, columns, known)
