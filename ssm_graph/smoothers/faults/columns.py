@@ -106,8 +106,9 @@ def noisier_than_others(whitened: Array, beam: NDArray[np.intp]) -> Array:
     beam : (M,) from 0.
     """
     n = int(beam.max(initial=-1)) + 1
-    each = [whitened[beam == b][:, None] for b in range(n)]
-    variance = np.array([np.mean(np.minimum(_squares_beside_median(x), REACH_SQ)) for x in each])
+    each = [_squares_beside_median(whitened[beam == b][:, None]) for b in range(n)]
+    each = [x[x < REACH_SQ] for x in each]  # gross errors are weighed away one by one
+    variance = np.array([np.mean(x) if len(x) else 0.0 for x in each])
     count = np.array([len(x) for x in each])
     factor = np.ones(n)
     for b in range(n if n > 2 else 0):
