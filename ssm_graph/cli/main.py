@@ -57,6 +57,8 @@ COMMANDS: Final = {
     "locate-study": "many simulated drives over HD maps, by several methods",
     "slam": "path and map from odometry and observed landmarks",
     "slam-study": "compare filters of landmark SLAM on simulated runs",
+    "visual": "metric path, map and anchors from a camera and ranges",
+    "visual-simulate": "write a simulated recording of a camera and ranges",
     "integrity": "a second witness of a smoothed mission: guaranteed bounds",
     "network": "guaranteed bounds of a sensor network",
     "network-run": "nodes of a network as processes, by UDP",
@@ -81,14 +83,14 @@ exit codes:
   1    a defect of this program
   2    a wrong option or setting, a missing extra
   3    the data of a mission cannot be used; the message says where and why
-  4    locate: the lane is not known;
+  4    locate: the lane is not known; visual: no scale, or one that has to be doubted;
        smooth or filter ended with a result that must not be trusted blindly (iteration limit,
        interrupted after the first iteration, run away, or the data contradict it); it is written
        all the same, and its status says so; online: ended in order, the last answer was not good;
        compare: some runs have no result, the table says why; network, network-run: a set missed
        its truth or gave an alarm; integrity: the answer left the set, or a bound is false
-  5    smooth found no finite result, nothing is written; online: there never was an answer, what
-       came is logged
+  5    smooth found no finite result, visual could not start a map: nothing is written; online:
+       there never was an answer, what came is logged
   130  interrupted, nothing written; compare keeps finished runs and goes on when started again, and
        so does online; it ends in order at the first SIGINT, SIGTERM or SIGHUP, like this at a
        second SIGINT or SIGTERM

@@ -125,7 +125,9 @@ def test_commands_have_these_options(block: Block, capsys: pytest.CaptureFixture
             continue
         if program == "ssm-graph":
             try:
-                build_parser(words).parse_args(words)
+                given = build_parser(words).parse_args(words)
+                for method in str(getattr(given, "methods", getattr(given, "method", ""))).split(","):
+                    assert method.partition(":")[0] in {*FAMILIES, "", "None"}, method
             except SystemExit:
                 pytest.fail(f"{words}: {capsys.readouterr().err}")
         elif program == "make":

@@ -64,8 +64,14 @@ def verdict(content: Content) -> str:
     return (
         f'<section class="verdict {style}"><p class="status"><span class="sign">{sign}</span> '
         f'{_text(status.replace("_", " "))}</p><p class="meaning">{_text(meaning)}</p>'
-        f'<p>{_text(reason)}</p></section><dl class="facts">{facts}</dl>'
+        f'<p>{_text(reason)}</p>{_local(summary)}</section><dl class="facts">{facts}</dl>'
     )
+
+
+def _local(summary: Mapping[str, Any]) -> str:
+    """Return what a start without a place on Earth means for the numbers of the page."""
+    said = summary.get("local_start")
+    return f"<p><strong>{_text(said)}.</strong></p>" if said else ""
 
 
 def _facts(content: Content) -> Iterable[tuple[str, str]]:
@@ -282,8 +288,8 @@ def _assumed(content: Content) -> str:
     start = summary.get("start") or {}
     lines = []
     if start:
-        how = "is that of the mission file" if start.get("origin") == "mission" else "was aligned"
-        lines.append(f"The start {how}.")
+        how = {"mission": "is that of the mission file", "local": "is local, at zero"}
+        lines.append(f"The start {how.get(str(start.get('origin')), 'was aligned')}.")
     notes = [*(summary.get("mission_notes") or ()), *(summary.get("notes") or ())]
     lines += [clocked(str(note), content.begin_s, content.epoch_s) for note in notes]
     items = "".join(f"<li>{_text(text)}</li>" for text in lines)
