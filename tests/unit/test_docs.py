@@ -55,8 +55,18 @@ def of_kind(*kinds: str) -> pytest.MarkDecorator:
     """Return the parameter of a test: the blocks of a kind."""
     chosen = [block for block in BLOCKS if block.kind in kinds]
     assert chosen
-    names = [f"{block.page}:{block.line}" for block in chosen]
-    return pytest.mark.parametrize("block", chosen, ids=names)
+    return pytest.mark.parametrize(
+        "block",
+        [
+            pytest.param(
+                block,
+                id=f"{block.page}:{block.line}",
+                # Drawing takes seconds.
+                marks=[pytest.mark.slow] if "figure.p" in block.text and block.kind else [],
+            )
+            for block in chosen
+        ],
+    )
 
 
 def test_every_block_has_a_kind_that_is_tested() -> None:
