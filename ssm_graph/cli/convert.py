@@ -215,13 +215,21 @@ def _density(arguments: argparse.Namespace) -> float | None:
     return density
 
 
+def _vehicle_path(arguments: argparse.Namespace) -> Path | None:
+    """Return the file of the vehicle: as an option says, else as the map does."""
+    stated: Path | None = arguments.vehicle
+    if stated is not None or arguments.map is None:
+        return stated
+    return read_map(arguments.map).vehicle
+
+
 def _from_columns(arguments: argparse.Namespace) -> Mission:
     """Return the mission of tables of any columns."""
     _refuse_ros_options(arguments.log[0], arguments, ROS_OPTIONS[1:])
     if arguments.clock_offset is not None:
         raise ConfigError("--clock-offset: of tables with a map, time has the key offset_s")
     column_map = read_map(arguments.map)
-    path = arguments.vehicle or column_map.vehicle
+    path = _vehicle_path(arguments)
     if path is None:
         raise ConfigError(
             f'{arguments.map}: expected vehicle = "vehicle.toml", or  --vehicle FILE, with noise, '
@@ -230,7 +238,6 @@ def _from_columns(arguments: argparse.Namespace) -> Mission:
     for log in arguments.log:
         if not log.is_file():
             raise DataError(f"{log}: expected a file with columns")
-    arguments.vehicle = path
     vehicle = read_vehicle(path)
     return convert_columns(arguments.log, column_map, vehicle, name=vehicle.name)
 
@@ -250,8 +257,9 @@ def _say_mission(mission: Mission, arguments: argparse.Namespace, console: Conso
         f"{arguments.out}: {span_s:.1f} s, {len(mission.imu.time_s)} inertial samples, "
         f"{len(mission.dvl.time_s)} pings, {n_fixes} GNSS fixes",
     )
-    if arguments.vehicle is not None:
-        _say_notes(instrument_notes(arguments.vehicle), console)
+    path = _vehicle_path(arguments)
+    if path is not None:
+        _say_notes(instrument_notes(path), console)
 
 
 def _turned(message: Message) -> Message:
