@@ -24,7 +24,7 @@ from ssm_graph.io.columns.convert import convert_columns
 from ssm_graph.io.columns.map_file import read_map
 from ssm_graph.io.file_kind import is_mcap, kind_of
 from ssm_graph.io.mission_folder.folder import write_mission
-from ssm_graph.io.mission_folder.vehicle import read_vehicle
+from ssm_graph.io.mission_folder.vehicle import instrument_notes, read_vehicle
 from ssm_graph.io.results.place import check_is_free
 from ssm_graph.io.ros.convert import convert_rosbag
 from ssm_graph.io.ros.log import ROLES, is_rosbag
@@ -194,7 +194,7 @@ def _merge(arguments: argparse.Namespace, console: Console) -> bool:
 
 
 def _said(found: Merged, arguments: argparse.Namespace, console: Console) -> bool:
-    _say_mission(found.mission, arguments.out, console)
+    _say_mission(found.mission, arguments, console)
     _say_notes(found.notes, console)
     return True
 
@@ -215,13 +215,21 @@ def _density(arguments: argparse.Namespace) -> float | None:
     return density
 
 
+def _vehicle_path(arguments: argparse.Namespace) -> Path | None:
+    """Return the file of the vehicle: as an option says, else as the map does."""
+    stated: Path | None = arguments.vehicle
+    if stated is not None or arguments.map is None:
+        return stated
+    return read_map(arguments.map).vehicle
+
+
 def _from_columns(arguments: argparse.Namespace) -> Mission:
     """Return the mission of tables of any columns."""
     _refuse_ros_options(arguments.log[0], arguments, ROS_OPTIONS[1:])
     if arguments.clock_offset is not None:
         raise ConfigError("--clock-offset: of tables with a map, time has the key offset_s")
     column_map = read_map(arguments.map)
-    path = arguments.vehicle or column_map.vehicle
+    path = _vehicle_path(arguments)
     if path is None:
         raise ConfigError(
             f'{arguments.map}: expected vehicle = "vehicle.toml", or  --vehicle FILE, with noise, '
@@ -236,19 +244,22 @@ def _from_columns(arguments: argparse.Namespace) -> Mission:
 
 def _write(mission: Mission, arguments: argparse.Namespace, console: Console) -> bool:
     write_mission(arguments.out, mission, table_format=arguments.format)
-    _say_mission(mission, arguments.out, console)
+    _say_mission(mission, arguments, console)
     _say_notes(mission.notes, console)
     return True
 
 
-def _say_mission(mission: Mission, out: Path, console: Console) -> None:
+def _say_mission(mission: Mission, arguments: argparse.Namespace, console: Console) -> None:
     n_fixes = len(mission.gnss.time_s) if mission.gnss is not None else 0
     span_s = mission.imu.time_s[-1] - mission.imu.start_s
     say(
         console,
-        f"{out}: {span_s:.1f} s, {len(mission.imu.time_s)} inertial samples, "
+        f"{arguments.out}: {span_s:.1f} s, {len(mission.imu.time_s)} inertial samples, "
         f"{len(mission.dvl.time_s)} pings, {n_fixes} GNSS fixes",
     )
+    path = _vehicle_path(arguments)
+    if path is not None:
+        _say_notes(instrument_notes(path), console)
 
 
 def _turned(message: Message) -> Message:

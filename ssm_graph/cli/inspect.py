@@ -32,7 +32,8 @@ def declare(parser: argparse.ArgumentParser) -> None:
         "--draft-map",
         type=Path,
         metavar="FILE",
-        help="of a table: draft the map of its columns that ssm-graph convert --map reads",
+        help="of a table, or a folder of tables: draft the map of their columns that ssm-graph "
+        "convert --map reads",
     )
     parser.set_defaults(run=run)
 
@@ -56,13 +57,17 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
 
 
 def _draft(path: Path, out: Path, errors: Console) -> None:
-    from ssm_graph.base.errors import ConfigError
+    from ssm_graph.base.errors import ConfigError, DataError
     from ssm_graph.io.columns.draft import draft_map
-    from ssm_graph.io.columns.sources import read_source
+    from ssm_graph.io.columns.sources import ENDINGS, read_source
 
     if out.exists():
         raise ConfigError(f"--draft-map: {out} is there already; give another name")
-    drafted = draft_map(read_source(path))
+    inside = sorted(path.iterdir()) if path.is_dir() else [path]
+    tables = [one for one in inside if not path.is_dir() or one.suffix.lower() in ENDINGS]
+    if not tables:
+        raise DataError(f"{path}: no table ({', '.join(ENDINGS)}) to draft a map of")
+    drafted = draft_map(*map(read_source, tables))
     out.write_text(drafted.text, encoding="utf-8")
     what = ", ".join(f"[{name}]" for name in drafted.found) or "no section"
     say(errors, f"{out}: {what} drafted of {path}; look at every line")

@@ -68,7 +68,7 @@ COMMANDS: Final = {
 """Summary of every command; the module of its name is loaded when it is the one that is given."""
 
 GROUPS: Final = {
-    "a log, and what is in it": ("inspect", "convert", "template", "instruments", "simulate"),
+    "a log, and what is in it": ("inspect", "template", "convert", "instruments", "simulate"),
     "an answer": ("smooth", "filter", "online"),
     "what comes of it": ("report", "export", "compare", "integrity"),
     "landmark SLAM": ("slam", "slam-study"),

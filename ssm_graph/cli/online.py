@@ -340,11 +340,15 @@ def add_integrity(parser: argparse.ArgumentParser) -> None:
 
 def integrity_of(arguments: argparse.Namespace) -> IntegrityConfig:
     """Return what was asked for."""
-    asked = (arguments.protection, arguments.protection_up)
+    flat, up = (
+        math.inf if level is None else level
+        for level in (arguments.protection, arguments.protection_up)
+    )
     return IntegrityConfig(
-        arguments.false_alerts,
-        arguments.missed_detection,
-        *(math.inf if level is None else level for level in asked),
+        false_alerts_per_h=arguments.false_alerts,
+        missed_detection=arguments.missed_detection,
+        protection_m=flat,
+        protection_up_m=up,
     )
 
 

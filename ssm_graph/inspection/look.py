@@ -17,6 +17,9 @@ from ssm_graph.inspection.sensors import SensorFound, sensors_of
 from ssm_graph.inspection.timing import timing_of
 from ssm_graph.io.ardupilot.convert import convert_ardupilot, is_ardupilot
 from ssm_graph.io.blueye.convert import convert_blueye
+from ssm_graph.io.columns.convert import times
+from ssm_graph.io.columns.draft import guess_time
+from ssm_graph.io.columns.map_file import Times
 from ssm_graph.io.columns.sources import ENDINGS, read_source
 from ssm_graph.io.file_kind import is_mcap, kind_of
 from ssm_graph.io.mission_folder.folder import read_mission
@@ -214,13 +217,15 @@ def _table(path: Path) -> Inspection | None:
             values = source.numbers(name, "inspect")
             if np.isfinite(values).any():
                 columns[name] = values
-    times = [name for name in columns if "time" in name.lower() or name.lower() in ("t", "stamp")]
     facts = tuple(
         f"{name}: {np.nanmin(values):.6g} to {np.nanmax(values):.6g}"
         for name, values in columns.items()
     )
-    time_s = columns[times[0]] if times else np.zeros(0)
-    known = time_s[np.isfinite(time_s)]
+    known = np.zeros(0)
+    with contextlib.suppress(SsmGraphError):  # no time, or no package that knows its unit
+        guess = guess_time(source)
+        time_s = times(Times("", guess.columns, (guess.unit,), 0.0), source)
+        known = time_s[np.isfinite(time_s)]
     found = SensorFound("table", timing_of(known), facts, (), known, {})
     missing = (
         "a table alone is no mission: --draft-map map.toml says what its columns may be, and "

@@ -39,6 +39,13 @@ def is_mcap(path: Path) -> bool:
 def kind_of(path: Path) -> str:
     """Return a sentence that says what a file is, as far as it shows, and what is read."""
     if path.is_dir():
+        n_tables = sum(one.suffix.lower() in CSV_ENDINGS for one in path.iterdir())
+        if n_tables:
+            return (
+                f"a folder of {n_tables} tables: say what their columns are, with  --map  "
+                f"(ssm-graph template, ssm-graph inspect {path} --draft-map map.toml); else "
+                f"expected {READ}"
+            )
         return f"a folder without .mcap or .db3 files; expected {READ}"
     head = _head(path)
     if not head:

@@ -410,9 +410,16 @@ def test_a_draft_of_own_columns_converts(mission: Mission, tmp_path: Path) -> No
     assert tomllib.loads(dvl.text)["dvl"]["beam"]["unit"] == "mm/s"
     gnss = draft_map(read_source(tmp_path / "gps.csv"))
     assert tomllib.loads(gnss.text)["gnss"]["lat"]["unit"] == "1e-7 deg"
-    both = imu.text + "".join(dvl.text.partition("\n[dvl]")[1:])
-    both = both.replace("# [dvl]", "#").replace('"beam', '"-beam')
-    (tmp_path / "map.toml").write_text(both.replace("vehicle.toml", "mission.toml"))
+    tables = tmp_path / "tables"
+    tables.mkdir()
+    for file in files:
+        (tables / file.name).write_bytes(file.read_bytes())
+    drafted_map = tmp_path / "map.toml"
+    assert main(["inspect", str(tables), "--draft-map", str(drafted_map)]) == 4  # no mission yet
+    both = drafted_map.read_text()
+    assert list(tomllib.loads(both))[2:] == ["imu", "dvl", "gnss"]
+    both = both.replace('"beam', '"-beam').replace("vehicle.toml", "mission.toml")
+    drafted_map.write_text(both)
     found = convert_columns(
         files, read_map(tmp_path / "map.toml"), read_vehicle(tmp_path / "mission.toml"), name="x"
     )

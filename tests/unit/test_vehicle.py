@@ -15,7 +15,7 @@ from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle, vehicle_of, write_vehicle
 from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator.buffers import Buffers
-from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.mission import LocalStart, Mission
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.current import CurrentModel
 from ssm_graph.sensors.depth import DepthReading
@@ -151,8 +151,14 @@ def test_every_field_is_written(tmp_path: Path) -> None:
     )
     write_vehicle(tmp_path, vehicle)
     got = read_vehicle(tmp_path)
-    assert len(fields(Vehicle)) == 12
-    assert all(getattr(got, spec.name) is not None for spec in fields(Vehicle))
+    assert len(fields(Vehicle)) == 13
+    others = [spec.name for spec in fields(Vehicle) if spec.name != "local"]  # in place of a place
+    assert all(getattr(got, name) is not None for name in others)
+    nowhere = replace(
+        vehicle, frame=LocalStart().frame, initial=None, local=LocalStart(heading=1.0)
+    )
+    write_vehicle(tmp_path, nowhere)
+    assert read_vehicle(tmp_path).local == nowhere.local
     assert (got.water_sigma, got.current) == (vehicle.water_sigma, vehicle.current)
     assert got.imu_calibration.gyro_scale_error is not None
     np.testing.assert_allclose(got.imu_calibration.gyro_scale_error, 1e-3)

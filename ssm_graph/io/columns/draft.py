@@ -33,7 +33,7 @@ _SCALARS: Final = {
     "pressure": r"(^|_)press(ure)?($|_)",
     "lat": r"(^|_)lat(itude)?($|_)",
     "lon": r"(^|_)(lon|lng|longitude)($|_)",
-    "height": r"(^|_)(height|altitude|alt|hgt|hmsl)($|_)",
+    "height": r"(^|_)(height|altitude|alt|hgt|hmsl|h)($|_)",
     "heading": r"(^|_)(heading|hdg|compass)($|_)",
 }
 _NAMED_UNITS: Final = (
@@ -56,6 +56,9 @@ _FAR: Final = 3.0
 _RATES_HZ: Final = (0.05, 5000.0)
 
 
+_SECTIONS: Final = ("imu", "dvl", "depth", "gnss", "heading")
+
+
 class Guess(NamedTuple):
     """One line of the map, and why."""
 
@@ -76,39 +79,49 @@ class Drafted(NamedTuple):
     """Sections."""
 
 
-def draft_map(source: Source) -> Drafted:
-    """Return a ``map.toml`` for a file of columns.
+def draft_map(*sources: Source) -> Drafted:
+    """Return a ``map.toml`` for files of columns; of a section, the first file that has it counts.
 
-    Raises :class:`DataError` where no column is a time.
+    Raises :class:`DataError` where no column of a file is a time.
     """
-    plain = {_plain(name): name for name in source.columns}
-    time = _time(source, plain)
-    sections = {
-        "imu": _imu(source, plain),
-        "dvl": _dvl(source, plain),
-        "depth": _scalars(source, plain, ("depth",)) or _scalars(source, plain, ("pressure",)),
-        "gnss": _scalars(source, plain, ("lat", "lon", "height")),
-        "heading": _scalars(source, plain, ("heading",)),
-    }
-    if len(sections["gnss"]) < 2:
-        sections["gnss"] = []
+    found: dict[str, tuple[Source, list[Guess]]] = {}
+    for source in sources:
+        for name, guesses in _sections(source).items():
+            if guesses:
+                found.setdefault(name, (source, guesses))
+    labels = ", ".join(source.label for source in sources)
     lines = [
-        f"# Drafted of {source.label} by the names of its columns and the sizes of their numbers:",
+        f"# Drafted of {labels} by the names of columns and the sizes of their numbers:",
         "# look at every line. ssm-graph template writes a map with all keys explained.",
         "format = 1",
         'vehicle = "vehicle.toml"',
     ]
-    for name, guesses in sections.items():
-        if not guesses:
-            if name in ("imu", "dvl"):
-                lines += ["", f"# [{name}]: no columns of it here, and a mission needs it"]
-            continue
-        lines += ["", f"[{name}]", f"file = {_quoted(source.label)}", *_lines([time, *guesses])]
-        if name == "gnss":
-            if len(guesses) < 3:
+    for name in _SECTIONS:
+        if name in found:
+            source, guesses = found[name]
+            lines += ["", f"[{name}]", f"file = {_quoted(source.label)}", *_lines(guesses)]
+        elif name in ("imu", "dvl"):
+            lines += ["", f"# [{name}]: no columns of it here, and a mission needs it"]
+        if name == "gnss" and name in found:
+            if "height" not in {guess.key for guess in found[name][1]}:
                 lines.append("height = { value = 0.0 }                  # no column of it")
             lines.append('sigma = { values = [2.0, 2.0, 4.0], unit = "m" }   # assumed')
-    return Drafted("\n".join(lines) + "\n", tuple(n for n, g in sections.items() if g))
+    return Drafted("\n".join(lines) + "\n", tuple(name for name in _SECTIONS if name in found))
+
+
+def _sections(source: Source) -> dict[str, list[Guess]]:
+    """Return what a file may hold, each with its time; nothing where there is nothing."""
+    plain = {_plain(name): name for name in source.columns}
+    place = _scalars(source, plain, ("lat", "lon", "height"))
+    found = {
+        "imu": _imu(source, plain),
+        "dvl": _dvl(source, plain),
+        "depth": _scalars(source, plain, ("depth",)) or _scalars(source, plain, ("pressure",)),
+        "gnss": place if {"lat", "lon"} <= {guess.key for guess in place} else [],
+        "heading": _scalars(source, plain, ("heading",)),
+    }
+    time = guess_time(source)
+    return {name: [time, *guesses] if guesses else [] for name, guesses in found.items()}
 
 
 def _lines(guesses: list[Guess]) -> Iterator[str]:
@@ -140,7 +153,9 @@ def _numbers(source: Source, name: str) -> NDArray[np.float64]:
     return values[np.isfinite(values)]
 
 
-def _time(source: Source, plain: dict[str, str]) -> Guess:
+def guess_time(source: Source) -> Guess:
+    """Return the column of the times and its unit; raise :class:`DataError` where there is none."""
+    plain = {_plain(name): name for name in source.columns}
     for short, name in plain.items():
         if not _TIME.search(short):
             continue

@@ -21,6 +21,7 @@ from ssm_graph.io.mission_folder.toml import (
     FORMAT,
     INITIAL_KEYS,
     LOCAL_KEYS,
+    OF_PLACES,
     REFERENCE,
     REQUIRED_SECTIONS,
     TABLES,
@@ -209,6 +210,8 @@ def settings_of(
     elif source.frame is not None:
         settings["origin"] = written(source.frame, PLACE_KEYS)
     for one in INSTRUMENTS:
+        if source.local is not None and one.section in OF_PLACES:
+            continue  # a receiver that a vehicle may have, where there is nothing to receive
         if one.log in logs:
             keys = one.settings_of(logs[one.log])
             settings[one.section] = {"file": f"{one.section}{suffix}", **keys}

@@ -105,7 +105,7 @@ LISTS: Final[Mapping[str, Mapping[str, Key]]] = {
     "point": POINT_KEYS,
 }
 """Sections that may come several times, ``[[beacon]]``."""
-_OF_PLACES: Final = ("origin", "initial", "gnss", "usbl", "reference")
+OF_PLACES: Final = ("origin", "initial", "gnss", "usbl", "reference")
 """Sections of places on Earth, which no local start has."""
 REQUIRED_SECTIONS: Final = ("frames", *(one.section for one in INSTRUMENTS if one.is_required))
 
@@ -154,7 +154,7 @@ class MissionToml:
         """
         if "local" not in self:
             return None
-        others = [name for name in _OF_PLACES if name in self]
+        others = [name for name in OF_PLACES if name in self]
         if others:
             raise ConfigError(
                 f"{self.file} [local]: given together with [{others[0]}], which has places on "

@@ -65,6 +65,12 @@ def read_vehicle(path: Path | str) -> Vehicle:
     )
 
 
+def instrument_notes(path: Path | str) -> tuple[str, ...]:
+    """Return where the figures of the instruments that a vehicle file names are from."""
+    path = Path(path)
+    return read_vehicle_toml(path / TOML_NAME if path.is_dir() else path).notes
+
+
 def vehicle_of(mission: Mission) -> Vehicle:
     """Return the vehicle of a recorded mission; its beam sigma is the median of those recorded.
 
