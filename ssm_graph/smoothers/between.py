@@ -136,7 +136,7 @@ def even_times(posterior: Posterior, rate_hz: float) -> Array:
         raise DataError(f"--rate: expected 0.001 to 10000 Hz, got {rate_hz:g}")
     begin_s, end_s = posterior.time_s[0], posterior.time_s[-1]
     count = int((end_s - begin_s) * rate_hz + 1e-6) + 1
-    return np.minimum(begin_s + np.arange(count) / rate_hz, end_s)
+    return np.asarray(np.minimum(begin_s + np.arange(count) / rate_hz, end_s))
 
 
 def _check(posterior: Posterior, imu: ImuLog, time_s: Array) -> None:
@@ -287,11 +287,9 @@ class _Carried(NamedTuple):
         count : (I,) how many pieces it has.
         """
         n, dim = len(measured.span_s), STATE_DIM
-        made = cls(
-            *(np.empty((n, *column.shape[1:])) for column in states),
-            *(np.empty((n, dim, dim)) for _ in range(4)),
-            np.empty((len(keyframe), dim)),
-        )
+        columns = [np.empty((n, *column.shape[1:])) for column in states]
+        columns += [np.empty((n, dim, dim)) for _ in range(4)]
+        made = cls._make([*columns, np.empty((len(keyframe), dim))])
         middle_n = 0.5 * (states.p_n[keyframe] + states.p_n[keyframe + 1])
         gravity = gtsam_gravity(posterior.frame, middle_n)
         gradient = gravity_gradient(posterior.frame)

@@ -50,7 +50,7 @@ KINDS = ("position", "velocity", "attitude")
 
 
 @cache
-def simulated(seed: int = 11, duration_s: float = 60.0) -> SimulatedMission:
+def simulated(seed: int = 11, duration_s: float = 40.0) -> SimulatedMission:
     """Return a mission in waves, with outliers."""
     config = scenario_config(
         "demo",
@@ -63,7 +63,7 @@ def simulated(seed: int = 11, duration_s: float = 60.0) -> SimulatedMission:
 
 
 @cache
-def solved(seed: int = 11, duration_s: float = 60.0) -> Estimate:
+def solved(seed: int = 11, duration_s: float = 40.0) -> Estimate:
     """Return its answer."""
     return smooth(simulated(seed, duration_s).mission, SmootherConfig())
 
@@ -140,7 +140,7 @@ def test_errors_and_coverage_hold_between_keyframes_and_at_a_lever_arm() -> None
     """At 7 Hz, and 3 m away on a tilted mount, the truth is as near and as well covered."""
     square: dict[tuple[str, str], list[float]] = {}
     inside: dict[tuple[str, str], list[float]] = {}
-    for seed in range(201, 205):
+    for seed in range(201, 204):
         sim, estimate = simulated(seed, 200.0), solved(seed, 200.0)
         posterior, imu = estimate.posterior, sim.mission.imu
         assert posterior is not None
@@ -161,8 +161,9 @@ def test_errors_and_coverage_hold_between_keyframes_and_at_a_lever_arm() -> None
         at_keyframes = np.sqrt(np.mean(square["keyframes", kind]))
         for where in ("between", "sonar"):
             assert np.sqrt(np.mean(square[where, kind])) < 1.05 * at_keyframes, (where, kind)
-            covered = np.mean(inside[where, kind])
-            assert covered > max(0.98, np.mean(inside["keyframes", kind]) - 0.005), (where, kind)
+            covered = float(np.mean(inside[where, kind]))
+            least = float(np.mean(inside["keyframes", kind])) - 0.005
+            assert covered > max(0.98, least), (where, kind)
 
 
 def test_the_arm_swings_with_the_turn() -> None:
@@ -179,15 +180,15 @@ def test_inside_a_gap_less_is_known() -> None:
     """Two seconds without inertial data: the sigma of velocity grows to the middle, and covers."""
     sim = simulated()
     imu = sim.mission.imu
-    kept = (imu.time_s <= 30.0) | (imu.time_s > 32.0)
+    kept = (imu.time_s <= 20.0) | (imu.time_s > 22.0)
     some = ImuLog(imu.start_s, imu.noise, imu.time_s[kept], imu.gyro_b[kept], imu.accel_b[kept])
     estimate = smooth(replace(sim.mission, imu=some), SmootherConfig())
     assert estimate.posterior is not None
-    time_s = np.arange(27.05, 35.0, 0.1)
+    time_s = np.arange(17.05, 25.0, 0.1)
     found = answers_at(estimate.posterior, some, time_s).trajectory
-    in_gap = (time_s > 30.3) & (time_s < 30.7)
+    in_gap = (time_s > 20.3) & (time_s < 20.7)
     sigma = found.velocity_sigma_enu[:, :2]
-    assert sigma[in_gap].min() > 2.0 * sigma[time_s < 29.5].max()
+    assert sigma[in_gap].min() > 2.0 * sigma[time_s < 19.5].max()
     for kind, (off, own) in errors(found, sim.truth_at(time_s), sim).items():
         assert np.mean(np.abs(off) < 3.0 * own) > 0.97, kind
 
@@ -361,14 +362,20 @@ def test_a_result_opens_as_tables(folders: tuple[Path, Path]) -> None:
     assert "CONVERGED" in repr(result)
 
 
-def test_a_result_is_redrawn_and_rescored(folders: tuple[Path, Path], tmp_path: Path) -> None:
-    """The estimate that is read scores as the one that was written, and draws in vectors."""
+@pytest.mark.slow
+def test_a_result_is_redrawn(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    """From the folder alone, as vectors."""
+    result = sg.Result(folders[1])
+    result.redraw(tmp_path / "figure.pdf", result.reference)
+    assert (tmp_path / "figure.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_a_result_is_rescored(folders: tuple[Path, Path]) -> None:
+    """The estimate that is read scores as the one that was written."""
     result = sg.Result(folders[1])
     again = result.rescore()
     for name in ("rmse_horizontal_m", "nees_position", "rmse_heading_deg"):
         assert again.summary_fields()[name] == pytest.approx(result.summary[name], rel=1e-4), name
-    result.redraw(tmp_path / "figure.pdf", result.reference)
-    assert (tmp_path / "figure.pdf").read_bytes().startswith(b"%PDF")
     assert result.estimate.aids is not None
     assert (
         result.estimate.aids.counts()["depth"][0]

@@ -12,15 +12,16 @@ import tomllib
 from collections.abc import Iterator
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 import ssm_graph as sg
-from ssm_graph.cli.main import build_parser, main
+from ssm_graph.cli.main import COMMANDS, build_parser, main
 from ssm_graph.io.mission_folder.toml import LISTS, SECTIONS
 from ssm_graph.live.protocols.json_messages import decode_message
+from ssm_graph.study.methods import FAMILIES
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([*(ROOT / "docs").glob("*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"])
@@ -50,12 +51,22 @@ def blocks() -> Iterator[Block]:
 BLOCKS = list(blocks())
 
 
-def of_kind(*kinds: str) -> Any:
+def of_kind(*kinds: str) -> pytest.MarkDecorator:
     """Return the parameter of a test: the blocks of a kind."""
     chosen = [block for block in BLOCKS if block.kind in kinds]
     assert chosen
-    names = [f"{block.page}:{block.line}" for block in chosen]
-    return pytest.mark.parametrize("block", chosen, ids=names)
+    return pytest.mark.parametrize(
+        "block",
+        [
+            pytest.param(
+                block,
+                id=f"{block.page}:{block.line}",
+                # Drawing takes seconds.
+                marks=[pytest.mark.slow] if "figure.p" in block.text and block.kind else [],
+            )
+            for block in chosen
+        ],
+    )
 
 
 def test_every_block_has_a_kind_that_is_tested() -> None:
@@ -119,11 +130,16 @@ def test_commands_have_these_options(block: Block, capsys: pytest.CaptureFixture
     targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.M)
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     for program, *words in commands(block.text):
-        if words == ["--version"]:
+        if words == ["--version"] or words[-1:] == ["--help"]:
+            assert program == "ssm-graph"
+            assert words[0].startswith("--") or words[0] in COMMANDS
             continue
         if program == "ssm-graph":
             try:
-                build_parser(words).parse_args(words)
+                given = build_parser(words).parse_args(words)
+                asked = getattr(given, "methods", None) or getattr(given, "method", None) or ""
+                for method in asked.split(",") if isinstance(asked, str) else ():
+                    assert method.partition(":")[0] in {*FAMILIES, ""}, method
             except SystemExit:
                 pytest.fail(f"{words}: {capsys.readouterr().err}")
         elif program == "make":
@@ -167,7 +183,7 @@ def test_the_first_mission_goes_as_written(tmp_path: Path, monkeypatch: pytest.M
         if block.kind == "python":
             exec(compile(block.text, "first-mission.md", "exec"), {})
         for program, *words in commands(block.text) if block.kind == "sh" else ():
-            if program == "ssm-graph" and words != ["--version"]:
+            if program == "ssm-graph" and words[-1] not in ("--version", "--help"):
                 assert main(words) == 0, words
     assert (tmp_path / "first/result/report.html").stat().st_size > 1_000_000
     assert len(list((tmp_path / "first/result-export").iterdir())) == 3

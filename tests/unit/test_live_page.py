@@ -168,7 +168,7 @@ def test_addresses() -> None:
     assert parse_page_address(":8080") == ("127.0.0.1", 8080)
     assert parse_page_address("[::1]:81") == ("::1", 81)
     with pytest.raises(ConfigError, match="expected HOST:PORT"):
-        parse_page_address("8080")
+        parse_page_address("localhost:http")
     with LivePage("127.0.0.1", 0) as page, pytest.raises(ConfigError, match="give another"):
         LivePage("127.0.0.1", page.port)
 

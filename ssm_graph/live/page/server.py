@@ -172,8 +172,8 @@ class LivePage:
         }
 
     def _navigation_fields(self, navigation: Navigation | None) -> dict[str, Any]:
-        names = ("time_s", "lat_deg", "lon_deg", "roll_deg", "pitch_deg", "heading_deg")
-        names += ("sigma_up_m", "sigma_heading_deg", "protection_m", "since_aid_s")
+        names = ["time_s", "lat_deg", "lon_deg", "roll_deg", "pitch_deg", "heading_deg"]
+        names += ["sigma_up_m", "sigma_heading_deg", "protection_m", "since_aid_s"]
         own = ("depth_m", "speed_m_per_s", "course_deg", "sigma_m", "bottom_lock")
         if navigation is None:
             nothing: dict[str, Any] = dict.fromkeys((*names, *own))
@@ -246,7 +246,7 @@ class _Server(ThreadingHTTPServer):
         self._room = threading.BoundedSemaphore(MOST_CONNECTIONS)
         self.browsers = threading.BoundedSemaphore(MOST_BROWSERS)
         super().__init__((host, port), _Handler)
-        self.is_private = ipaddress.ip_address(self.server_address[0]).is_loopback
+        self.is_private = ipaddress.ip_address(str(self.server_address[0])).is_loopback
 
     def process_request(self, request: Any, client_address: Any) -> None:
         if not self._room.acquire(blocking=False):
