@@ -279,15 +279,16 @@ class Reader:
             self._lines = stream.readlines()
 
 
-def test_instruments_on_sockets(tmp_path: Path) -> None:
+def test_instruments_on_sockets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A50 over TCP, GNSS and depth as NMEA, IMU as JSON: the answer is where the vehicle is."""
+    monkeypatch.setattr("ssm_graph.live.sockets.sockets.STANDSTILL_S", 2.0 * SPEED)
     mission, begin_s = make_mission(), time.monotonic() + 0.5
     vehicle, a50 = vehicle_of(mission), A50()
 
     def wall_s() -> float:
         return (time.monotonic() - begin_s) * SPEED
 
-    limits = Limits(retry_s=(0.02, 0.1))
+    limits = Limits(retry_s=(0.02, 0.1), stall_s=10.0 * SPEED, connect_s=5.0 * SPEED)
     nothing = Endpoint(Transport.UDP, LOOPBACK, 0)
     inputs = [
         InputConfig(

@@ -224,6 +224,23 @@ def test_an_instrument_with_a_clock_of_its_own_does_not_follow(
     np.testing.assert_allclose(sifted.passed, before + after, rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("off_s", [0.5, -0.5, 3.0, -3.0])
+@pytest.mark.parametrize("follows", [True, False])
+def test_a_clock_that_is_set_while_nothing_comes_in_time(off_s: float, *, follows: bool) -> None:
+    """On a computer that is overloaded: delays of up to a second hide what is ahead for a while."""
+    sifted = Sifted(is_steady=False)
+    rng = np.random.default_rng(0)
+    sent = [100.0 + 0.5 * k for k in range(120)]
+    arrived = np.maximum.accumulate(np.add(sent, 0.1 + rng.choice([0.0, 0.4, 1.0], len(sent))))
+    for k, (time_s, come_s) in enumerate(zip(sent, arrived.tolist(), strict=True)):
+        sifted.set_by_s = off_s * (k >= 40)
+        sifted.give([time_s + off_s * (follows and k >= 40)], come_s)
+    assert not sifted.refused
+    late = np.subtract(sifted.passed, sent)
+    np.testing.assert_allclose(late[:40], 0.0, atol=1e-6)
+    np.testing.assert_allclose(late[80:], 0.0, atol=1e-6)
+
+
 def test_a_stamp_from_before_its_clock_is_known_to_be_set() -> None:
     """The clock is set between a look at it and the reading of what is stamped by it."""
     sifted = Sifted()

@@ -37,7 +37,8 @@ STRANGER_S: Final = 1.0
 """A clock that is silent for so long may have been set."""
 SILENT_TIMES: Final = 3.0
 """And for so many of its usual intervals."""
-LONGEST_INTERVAL_S: Final = 5.0
+LONGEST_INTERVAL_S: Final = 1.5
+"""No clock is waited for longer than three of these."""
 MOST_STRANGERS: Final = 5000
 """Messages of another clock that may wait; with more the other clock is believed."""
 FOLLOWS_S: Final = 10.0
@@ -144,6 +145,11 @@ class StampClock:
         self._strangers: list[Message] = []
         self._stranger_s = self._met_s = 0.0
         self._found_s = 0.0
+        self._others_s: tuple[float, ...] = ()
+        self._set_at_s = -math.inf
+        self._leads_s: dict[float, float] = {}
+        """Where the vehicle's clock was set: what stamps may be ahead by, and how far ahead of
+        their arrival that would have them at most, s"""
 
     def sift(self, message: Message, now: Now) -> Sifted:
         """Return what may pass, in the time of the run, and what was refused."""
@@ -155,6 +161,9 @@ class StampClock:
             messages, self._strangers = [*self._strangers, message], []
         for message in messages:
             shift_s = self._shift_of(message.time_s, now)
+            if not self._is_steady and not self._is_known(message.time_s - shift_s, now):
+                fitting = (x for x in self._others_s if self._is_known(message.time_s - x, now))
+                shift_s = next(fitting, shift_s)  # delays had hidden that it is this one
             if self._is_known(message.time_s - shift_s, now):
                 refused += self._strangers
                 self._strangers = []
@@ -173,9 +182,31 @@ class StampClock:
         shift_s, set_by_s = self._shift_s, self._clock.set_by_s
         if math.isnan(self._stamp_s):  # of this clock, or of one that never followed it
             return min(set_by_s, 0.0, key=lambda s: abs(stamp_s - s - self._run_s(now)))
-        if shift_s == set_by_s or now.steady_s - self._clock.set_at_s > FOLLOWS_S:
+        if self._set_at_s != self._clock.set_at_s:
+            self._set_at_s = self._clock.set_at_s
+            self._leads_s = dict.fromkeys((*self._leads_s, shift_s, set_by_s), -math.inf)
+        if not self._leads_s:
             return shift_s
-        return min(shift_s, set_by_s, key=lambda s: self._misfit_s(stamp_s - s, now))
+        if not self._is_following(now):
+            return self._settled()
+        if not self._is_steady and now.steady_s - self._set_at_s > 0.5 * FOLLOWS_S:
+            for one, lead_s in self._leads_s.items():  # none is on its way from before any more
+                self._leads_s[one] = max(lead_s, stamp_s - one - self._run_s(now))
+        return min(self._leads_s, key=lambda one: self._misfit_s(stamp_s - one, now))
+
+    def _is_following(self, now: Now) -> bool:
+        """Return whether the vehicle's clock was set so lately that stamps may begin to follow."""
+        return now.steady_s - self._clock.set_at_s <= FOLLOWS_S
+
+    def _settled(self) -> float:
+        """Return what stamps are ahead by for good, s: delays pass, the least of them recurs."""
+        heard = {one: lead_s for one, lead_s in self._leads_s.items() if lead_s > -math.inf}
+        self._shift_s = min(
+            heard, key=lambda one: abs(heard[one] - self._lead_s), default=self._shift_s
+        )
+        self._others_s = tuple(one for one in heard if one != self._shift_s)
+        self._leads_s = {}
+        return self._shift_s
 
     def _misfit_s(self, time_s: float, now: Now) -> float:
         """Return how far a time is from what the messages before it make expected, s."""
@@ -193,7 +224,7 @@ class StampClock:
             return True
         ahead_s = time_s - self._run_s(now) - AHEAD_S
         if not self._is_steady:
-            return not ahead_s > max(self._lead(now), 0.0)
+            return self._is_following(now) or not ahead_s > max(self._lead(now), 0.0)
         is_ahead = ahead_s > self._lead(now)
         step_s = time_s - self._stamp_s
         off_s = step_s - (now.steady_s - self._heard_s)
@@ -220,7 +251,8 @@ class StampClock:
         self._clock.begin()
         time_s = message.time_s - self._shift_s
         self._lag_s = self._run_s(now) - time_s
-        self._lead_s = max(self._lead(now), -self._lag_s)
+        if self._is_steady or not self._is_following(now):
+            self._lead_s = max(self._lead(now), -self._lag_s)
         if not math.isnan(self._stamp_s):
             since_s = min(now.steady_s - self._heard_s, LONGEST_INTERVAL_S)
             self._interval_s = max(since_s, 0.9 * self._interval_s)
