@@ -46,7 +46,7 @@ SURFACING: Final = Stage(duration_s=200.0, gnss=((0.0, 60.0), (110.0, 200.0)))
 GNSS_ALL: Final = Stage(gnss=((0.0, 1e9),))
 HARMLESS: Final = Rule(is_harmless=True, good_after_s=2.0)
 PROVEN_S: Final = 13.0
-"""Good again where a contradiction has to end first: the answer is begun anew within 3 s, and a lane
+"""Good again where a contradiction has to end: the answer is begun anew within 3 s, and a lane
 without the sensor has to agree with it for 8 s."""
 TOLD: Final = Health.DEGRADED
 FOLLOWED: Final = Rule(Health.BAD, 15.0, None, told="recovered")

@@ -17,7 +17,7 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.live.estimator import ONLINE, FixedLagSmoother, IntegrityConfig
 from ssm_graph.live.estimator.guard import Guardian
-from ssm_graph.live.estimator.lanes import MEASURE, Lanes
+from ssm_graph.live.estimator.lanes import INERTIAL, MEASURE, Lanes
 from ssm_graph.live.estimator.separation import AGREED_S, UNASKED, Contradiction
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.navigation import Health
@@ -185,7 +185,7 @@ def held_off(lanes: Lanes, guardian: Guardian, off_m: float, sigma: float) -> La
 
 
 def test_only_a_lane_that_could_tell_ends_a_contradiction() -> None:
-    """One that has become uncertain agrees with everything, and does not count; ten seconds do."""
+    """One that has become uncertain agrees with everything, and does not count; 8 s do."""
     guardian, lanes = guardian_of(after("calm")[1])
 
     def judged(
@@ -207,6 +207,71 @@ def test_only_a_lane_that_could_tell_ends_a_contradiction() -> None:
     agreed, known = judged(0.0, 0.1, known, 212.5)
     assert known == ()
     assert np.isinf(agreed.begun_s[guardian.bank.held]).all()
+
+
+def test_a_suspicion_ends_with_any_lane_that_agrees() -> None:
+    """It is said, becomes a contradiction where there is more, and is not remembered otherwise."""
+    guardian, lanes = guardian_of(after("calm")[1])
+
+    def judged(
+        off_m: float, sigma: float, known: tuple[Contradiction, ...], time_s: float
+    ) -> tuple[Contradiction, ...]:
+        now = held_off(lanes, guardian, off_m, sigma)
+        return guardian.judge.judged(now, guardian.judge.separations(now), known, time_s)[1]
+
+    (one,) = suspected = judged(0.55, 0.1, (), 100.0)
+    assert not one.is_certain
+    assert "noise alone would hardly" in guardian.judge.sentence(lanes, suspected)
+    (more,) = judged(3.0, 0.1, suspected, 103.0)
+    assert more.is_certain
+    assert more.since_s == pytest.approx(103.0)
+    for k in range(int(AGREED_S) + 2):
+        suspected = judged(0.0, 10.0, suspected, 104.0 + k)
+    assert suspected == ()
+
+
+def test_a_jump_of_the_gyros_bias_is_found_by_lanes_that_forgot_it() -> None:
+    """Theirs are the only ones that are compared in it; the inertial data are named."""
+    guardian, lanes = guardian_of(after("calm")[1])
+    bank, judge = guardian.bank, guardian.judge
+    forgets = bank.suspect == bank.suspects.index(INERTIAL)
+    bias = lanes.covariance[:, 14, 14]
+    assert bias[forgets].max() > 3.0 * bias[~forgets].max()
+    deviation = lanes.deviation.copy()
+    deviation[1:, 14] = lanes.deviation[MEASURE, 14] + 8.0 * np.sqrt(bias[1:])
+    now = lanes._replace(deviation=deviation, n_out=np.ones(len(bias)))
+    _, known = judge.judged(now, judge.separations(now), (), 100.0)
+    assert [bank.suspects[one.suspect] for one in known] == [INERTIAL]
+    assert judge.sentence(now, known).startswith("the inertial data: without the gyro bias")
+
+
+def test_what_the_window_refuses_pulls_at_no_lane() -> None:
+    """A row of no weight, a million sigmas off, moves nothing by a thousandth of a sigma."""
+    guardian, lanes = guardian_of(after("calm")[1])
+    H = np.zeros((1, 15))
+    H[0, 8] = 200.0
+    refused = SensorRows("DVL", np.array([1e6]), H, np.zeros(1), np.zeros(1, dtype=np.intp))
+    moved = guardian.bank._updated(lanes, [refused], 100.0).deviation - lanes.deviation
+    sigma = np.sqrt(np.diagonal(lanes.covariance, axis1=1, axis2=2))
+    assert np.abs(moved / sigma)[:, :15].max() < 1e-3
+
+
+def test_what_only_followed_ends_with_what_it_followed() -> None:
+    """The inertial data named after a DVL that is shown to be right; not those named before it."""
+    guardian, lanes = guardian_of(after("calm")[1])
+    names = guardian.bank.suspects
+    for inertial_s, is_left in ((101.0, False), (99.0, True)):
+        known = (
+            Contradiction(names.index("DVL"), 100.0, 101.0, 0, 5.0, 100.0, 110.0),
+            Contradiction(names.index(INERTIAL), inertial_s, 110.0, 2, 0.01, 90.0, np.inf),
+        )
+        begun_s = lanes.begun_s.copy()
+        begun_s[guardian.bank.held[[one.suspect for one in known]]] = 90.0
+        quiet = lanes._replace(begun_s=begun_s, deviation=np.zeros_like(lanes.deviation))
+        found = guardian.judge.separations(quiet)
+        found.sigma[:, 2] = 1.0
+        _, left = guardian.judge.judged(quiet, found, known, 110.0 + AGREED_S + 1.0)
+        assert [names[one.suspect] for one in left] == [INERTIAL] * is_left
 
 
 def test_the_threshold_keeps_the_rate_that_was_asked_for() -> None:
