@@ -145,6 +145,7 @@ def preintegrate_steps(
     bias: Array | None = None,
     errors: Array | None = None,
     frozen: Sequence[FrozenAxis] = (),
+    cuts_gaps: bool = False,
 ) -> Steps[InertialChain]:
     """Preintegrate the inertial data between keyframes.
 
@@ -159,13 +160,14 @@ def preintegrate_steps(
         the increments follow; without them they do not.
     frozen : axes that repeat themselves by what came before these samples; all that they have
         missed is uncertain in the first interval.
+    cuts_gaps : the times cut gaps to pieces, which are off together, not each for itself.
     """
     source = None
     if errors is not None:
         source = ErrorSource(imu, keyframe_s, rate_hz, errors)
         imu = without_errors(imu, errors)
     gaps, repeating = imu_gaps(imu), frozen_axes(imu)
-    unseen = tuple(_unseen(imu, keyframe_s, gaps, repeating, frozen))
+    unseen = tuple(_unseen(imu, keyframe_s, gaps, repeating, frozen, cuts_gaps=cuts_gaps))
     imu = thawed(imu, repeating)
     yield 3e-4 * len(imu.time_s)
     samples = yield from merge_samples_steps(bridged(imu, gaps), keyframe_s, rate_hz=rate_hz)
@@ -319,6 +321,8 @@ def _unseen(
     gaps: tuple[Array, Array],
     frozen: Sequence[FrozenAxis],
     missed: Sequence[FrozenAxis] = (),
+    *,
+    cuts_gaps: bool,
 ) -> list[Unseen]:
     """Return what is not seen of each interval between keyframes.
 
@@ -336,10 +340,12 @@ def _unseen(
         overlap = np.minimum(end, keyframe_s[1:]) - np.maximum(begin, keyframe_s[:-1])
         for k in np.flatnonzero(overlap > 0.0).tolist():
             own_s = float(overlap[k])
-            # Intervals count as independent, but a turn is the same in those that follow.
-            lasts = max(min(end - begin, TURN_S) / own_s, 1.0) if number >= n_gaps else 1.0
-            turn = rate * np.sqrt([1.0, 1.0, lasts])
-            unseen[k] = _more_unseen(unseen[k], own_s, turn, force)
+            # Variances of pieces add up to that of what is off all the time; and while intervals
+            # count as independent, a turn is the same in those that follow.
+            whole = (end - begin) / own_s if cuts_gaps else 1.0
+            lasts = whole if number < n_gaps else max(min(end - begin, TURN_S) / own_s, 1.0)
+            turn, push = rate * np.sqrt([whole, whole, lasts]), force * np.sqrt(whole)
+            unseen[k] = _more_unseen(unseen[k], own_s, turn, push)
     for axis in missed:
         unseen[0] = _more_unseen(unseen[0], axis.end_s - axis.begin_s, *_missing(axis))
     return unseen

@@ -41,6 +41,8 @@ from ssm_graph.graph.measurements import JudgedAid, aid_kernel, aid_table, doubt
 from ssm_graph.mission.answer import trajectory_from_states
 from ssm_graph.mission.estimate import BeamTable, Estimate, Iteration, NoiseFound, Status
 from ssm_graph.mission.fault import DetectedFault
+from ssm_graph.mission.imu_variables import columns_of_errors, imu_errors
+from ssm_graph.mission.posterior import Posterior
 from ssm_graph.mission.problem import Problem, with_white_noise
 from ssm_graph.smoothers.descent import descend_steps
 from ssm_graph.smoothers.faults.nuisances import DVL
@@ -390,6 +392,7 @@ class SsmSmoother:
                 last.states.walks,
                 last.step.covariance_of(slice(STATE_DIM, None)),
             ),
+            posterior=_posterior(problem, last),
         )
 
     def _doubts(self, solved: Solved, judged: list[JudgedAid]) -> list[str]:
@@ -407,6 +410,21 @@ class SsmSmoother:
                 last.step.end_covariance(STATE_DIM),
             ),
         ]
+
+
+def _posterior(problem: Problem, last: Pass) -> Posterior:
+    """Return what is known of the keyframes, with the errors found of the inertial sensors."""
+    states, errors = last.states, None
+    if len(columns_of_errors(problem.extras)):
+        errors = np.atleast_2d(imu_errors(problem.extras, states.walks, states.constants)[0])
+    return Posterior(
+        problem.frame,
+        problem.keyframe_s,
+        *states[:4],
+        last.step.covariance(STATE_DIM),
+        last.step.neighbour_covariance(STATE_DIM),
+        errors,
+    )
 
 
 def noise_of(solved: Solved, used: Array) -> NoiseFound:

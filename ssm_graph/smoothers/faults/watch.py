@@ -25,6 +25,7 @@ from ssm_graph.mission.problem import Problem
 from ssm_graph.smoothers.faults.columns import (
     BEAM,
     BOTTOM,
+    CLOCK,
     IMU,
     MOUNTING,
     SCALE,
@@ -231,6 +232,7 @@ class FaultWatch:
                     treatment=treatment,
                     rivals=tuple(rivals),
                     cost_m=fault.cost_m,
+                    late_s=late_of(fault),
                 )
             )
         if self._unstated is not None:
@@ -238,6 +240,12 @@ class FaultWatch:
             span_s = float(end_s[0]), float(end_s[-1])
             found.extend(self._unstated.faults(states.constants[n:], *span_s))
         return (*found, *noisier_than_stated(inertial, self._problem.keyframe_s))
+
+
+def late_of(fault: Fault) -> float | None:
+    """Return the delay of a clock, s, None of what is none."""
+    is_clock = fault.hypothesis.channel.endswith(CLOCK) and fault.sizes is not None
+    return float(fault.sizes[0]) if is_clock and fault.sizes is not None else None
 
 
 def said(fault: Fault) -> str:

@@ -1,0 +1,383 @@
+"""Scale, anchors and biases from ranges along a path: damped least squares, a weight each.
+
+With the camera's place ``p`` (map units, from the middle of the path), the lever arm ``l`` in map
+axes (m), scale ``s``, anchor ``a`` (m, from the same middle), bias ``b`` and clock ``c`` (s)::
+
+    e = |s (p + c v + D z) + l + c l' - a| + b + B y - range
+
+``D z`` is what the path may have drifted by and ``B y`` how a bias may have walked: both are random
+walks, as few of their Karhunen-Loeve modes as matter, with coefficients of unit variance. They are
+estimated and thrown away, so that what remains has an honest covariance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from ssm_graph.base.frozen import Array, ReadOnlyArrays
+from ssm_graph.systems.visual_ranges.range_terms import CLOSEST_M, RangeTerms
+from ssm_graph.systems.visual_ranges.ranges import Indices
+from ssm_graph.systems.visual_ranges.weights import POLISH, RangeKernel
+
+BIAS_M: Final = 0.15
+"""Prior standard deviation of an anchor's bias."""
+CLOCK_S: Final = 0.020
+"""Prior standard deviation of the ranges' clock."""
+BIAS_WALK_M: Final = 0.02
+"""Random walk of a bias, m after one second: antennas that turn."""
+DRIFT: Final = 0.002
+"""Random walk of a visual path, its standard deviation at the end as a share of its length."""
+N_MODES: Final = 6
+"""Of a random walk; they hold 97 % of its variance."""
+LOG_SCALE: Final = 3.0
+ANCHOR_M: Final = 1e3
+"""Prior standard deviations that only keep finite what is not observable."""
+ROUNDS: Final = 60
+SETTLED: Final = 1e-7
+"""Relative change of the cost at which a search ends."""
+SPACING_M: Final = 0.02
+"""Standard deviation of the distance between two anchors whose places are known."""
+
+
+class Places(NamedTuple):
+    """Where the antenna was at each range, as vision has it, in map axes."""
+
+    camera: Array
+    """(M, 3) map units"""
+    velocity: Array
+    """(M, 3) map units/s"""
+    lever: Array
+    """(M, 3) m"""
+    lever_rate: Array
+    """(M, 3) m/s"""
+    anchor: Indices
+    """(M,)"""
+    range_m: Array
+    """(M,)"""
+    sigma_m: Array
+    """(M,)"""
+    time_s: Array
+    """(M,)"""
+
+    def rows(self, kept: Indices) -> Places:
+        """Return some of them."""
+        return Places(*(column[kept] for column in self))
+
+
+def places_of(terms: RangeTerms, R_cw: Array, t_cw: Array, time_s: Array) -> Places:
+    """Return the places of ranges that hang on key frames; ``time_s`` (all ranges,) their times."""
+    R_wc = np.swapaxes(R_cw[terms.key_frame], 1, 2)
+
+    def turned(vector: Array) -> Array:
+        return np.asarray(np.einsum("mij,mj->mi", R_wc, vector))
+
+    return Places(
+        turned(terms.motion - t_cw[terms.key_frame]),
+        turned(terms.velocity),
+        turned(terms.lever),
+        turned(terms.lever_rate),
+        terms.anchor,
+        terms.range_m,
+        terms.sigma_m,
+        time_s[terms.row],
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Problem(ReadOnlyArrays):
+    """Ranges, and what is assumed beside them.
+
+    Unknowns are log s, clock, for each anchor its place and bias, then the modes.
+    """
+
+    places: Places
+    n_anchors: int
+    middle: Array
+    """(3,) of the path, map units; what `Places` holds is from there"""
+    drift: Array
+    """(M, D) map units for each coefficient, the same for three axes"""
+    walk: Array
+    """(M, W) m for each coefficient of each anchor's bias"""
+    kernel: RangeKernel
+    spacing: tuple[tuple[int, int, float], ...] = ()
+    """Pairs of anchors and the distance between them, m"""
+
+    @property
+    def n_core(self) -> int:
+        """Unknowns that are asked for."""
+        return 2 + 4 * self.n_anchors
+
+    @property
+    def n_unknowns(self) -> int:
+        """With the modes."""
+        drift, walk = self.drift.shape[1], self.walk.shape[1]
+        return self.n_core + 3 * drift + self.n_anchors * walk
+
+    def prior_information(self) -> Array:
+        """Return its diagonal (P,)."""
+        anchor = np.array([ANCHOR_M, ANCHOR_M, ANCHOR_M, BIAS_M])
+        sigma = np.concatenate([[LOG_SCALE, CLOCK_S], np.tile(anchor, self.n_anchors)])
+        return np.concatenate([sigma**-2, np.ones(self.n_unknowns - self.n_core)])
+
+
+def problem_of(
+    places: Places,
+    n_anchors: int,
+    kernel: RangeKernel,
+    *,
+    drift: float = DRIFT,
+    bias_walk_m: float = BIAS_WALK_M,
+    spacing: tuple[tuple[int, int, float], ...] = (),
+) -> Problem:
+    """Return the problem of ranges in order of time, with modes of drift and walk as asked for."""
+    middle = places.camera.mean(axis=0) if len(places.camera) else np.zeros(3)
+    step = np.linalg.norm(np.diff(places.camera, axis=0), axis=1)
+    gone = np.concatenate([[0.0], np.cumsum(step)])[: len(places.camera)]
+    length = float(gone[-1]) if len(gone) else 0.0
+    time = places.time_s - places.time_s[0] if len(places.time_s) else places.time_s
+    lasts = float(time[-1]) if len(time) else 0.0
+    none = np.zeros((len(places.camera), 0))
+    return Problem(
+        places._replace(camera=places.camera - middle),
+        n_anchors,
+        middle,
+        drift * length * _modes(gone / max(length, 1e-12)) if drift > 0.0 else none,
+        bias_walk_m * np.sqrt(lasts) * _modes(time / max(lasts, 1e-12)) if bias_walk_m else none,
+        kernel,
+        spacing,
+    )
+
+
+def _modes(share: Array) -> Array:
+    """Return modes (M, N_MODES) of a Wiener process of unit variance at its end."""
+    order = (np.arange(N_MODES) + 0.5) * np.pi
+    return np.asarray(np.sqrt(2.0) * np.sin(share[:, None] * order) / order)
+
+
+def residuals(problem: Problem, unknowns: Array) -> tuple[Array, Array]:
+    """Return errors (S, M), m, and their Jacobian (S, M, P) at sets of unknowns (S, P)."""
+    at, n_sets = problem.places, len(unknowns)
+    n, n_anchors, core = len(at.range_m), problem.n_anchors, problem.n_core
+    s = np.exp(unknowns[:, 0])[:, None, None]
+    clock = unknowns[:, 1, None, None]
+    own = unknowns[:, 2:core].reshape(n_sets, n_anchors, 4)[:, at.anchor]
+    n_drift, n_walk = problem.drift.shape[1], problem.walk.shape[1]
+    z = unknowns[:, core : core + 3 * n_drift].reshape(n_sets, n_drift, 3)
+    y = unknowns[:, core + 3 * n_drift :].reshape(n_sets, n_anchors, n_walk)[:, at.anchor]
+    camera = at.camera + clock * at.velocity + problem.drift @ z
+    line = s * camera + at.lever + clock * at.lever_rate - own[..., :3]
+    distance = np.linalg.norm(line, axis=2)
+    u = line / np.maximum(distance, CLOSEST_M)[..., None]
+    walked = np.einsum("mw,smw->sm", problem.walk, y)
+    error = distance + own[..., 3] + walked - at.range_m
+    J = np.zeros((n_sets, n, problem.n_unknowns))
+    J[:, :, 0] = s[..., 0] * np.einsum("smi,smi->sm", u, camera)
+    J[:, :, 1] = np.einsum("smi,smi->sm", u, s * at.velocity + at.lever_rate)
+    along = (2 + 4 * at.anchor)[:, None] + np.arange(4)
+    J[:, np.arange(n)[:, None], along] = np.concatenate([-u, np.ones((n_sets, n, 1))], axis=2)
+    drift = s[..., None] * problem.drift[:, :, None] * u[:, :, None, :]
+    J[:, :, core : core + 3 * n_drift] = drift.reshape(n_sets, n, 3 * n_drift)
+    if n_walk:
+        first = core + 3 * n_drift + n_walk * at.anchor
+        J[:, np.arange(n)[:, None], first[:, None] + np.arange(n_walk)] = problem.walk
+    return error, J
+
+
+class Fit(NamedTuple):
+    """Where a search ended."""
+
+    unknowns: Array
+    """(S, P)"""
+    cost: Array
+    """(S,) deviance of the ranges and the priors: minus twice a log likelihood"""
+
+
+def search(problem: Problem, starts: Array, *, held: Indices | None = None) -> Fit:
+    """Return where damped robust searches from (S, P) end; all go side by side.
+
+    ``held`` are columns that keep their value.
+    """
+    information = problem.prior_information()
+    at = starts.copy()
+    error, J = residuals(problem, at)
+    cost = _cost(problem, at, error)
+    damping = np.full(len(at), 1e-2)
+    eye = np.eye(problem.n_unknowns)
+    for _ in range(ROUNDS):
+        normal, gradient = _normal(problem, at, error, J, variance=0.0)
+        normal[:, np.arange(len(information)), np.arange(len(information))] += information
+        gradient += information * at
+        if held is not None:
+            normal[:, held, :] = normal[:, :, held] = 0.0
+            normal[:, held, held] = 1.0
+            gradient[:, held] = 0.0
+        scaled = normal * (1.0 + damping[:, None, None] * eye)
+        step = -np.linalg.solve(scaled, gradient[..., None])[..., 0]
+        step[:, 0] = np.clip(step[:, 0], -0.5, 0.5)
+        tried = at + step
+        new_error, new_J = residuals(problem, tried)
+        new_cost = _cost(problem, tried, new_error)
+        better = new_cost <= cost
+        gain = np.where(better, cost - new_cost, 0.0)
+        at = np.where(better[:, None], tried, at)
+        error = np.where(better[:, None], new_error, error)
+        J = np.where(better[:, None, None], new_J, J)
+        cost = np.where(better, new_cost, cost)
+        settled = (better & (gain < SETTLED * (1.0 + cost))) | (damping > 1e8)
+        damping = np.clip(np.where(better, damping / 10.0, damping * 10.0), 1e-12, 1e9)
+        if settled.all():
+            break
+    return Fit(at, cost)
+
+
+def _cost(problem: Problem, at: Array, error: Array) -> Array:
+    deviance = problem.kernel.deviance(error, problem.places.sigma_m).sum(axis=1)
+    apart = _spacing(problem, at)[0]
+    spaced = np.square(apart / SPACING_M).sum(axis=1)
+    return np.asarray(deviance + spaced + (problem.prior_information() * at**2).sum(axis=1))
+
+
+def _spacing(problem: Problem, at: Array) -> tuple[Array, Array]:
+    """Return errors (S, C) of the distances between anchors, m, and their Jacobian (S, C, P)."""
+    count = len(problem.spacing)
+    error, J = np.zeros((len(at), count)), np.zeros((len(at), count, problem.n_unknowns))
+    for row, (i, j, wanted) in enumerate(problem.spacing):
+        first, second = 2 + 4 * i, 2 + 4 * j
+        line = at[:, first : first + 3] - at[:, second : second + 3]
+        distance = np.linalg.norm(line, axis=1)
+        error[:, row] = distance - wanted
+        u = line / np.maximum(distance, CLOSEST_M)[:, None]
+        J[:, row, first : first + 3], J[:, row, second : second + 3] = u, -u
+    return error, J
+
+
+def _normal(
+    problem: Problem, at: Array, error: Array, J: Array, *, variance: Array | float
+) -> tuple[Array, Array]:
+    """Return information (S, P, P) of the measurements and gradients (S, P), without priors."""
+    sigma = problem.places.sigma_m
+    weighted = problem.kernel.weight(error, variance, sigma) / sigma**2
+    J_w = np.swapaxes(J * weighted[..., None], 1, 2)
+    normal, gradient = J_w @ J, (J_w @ error[..., None])[..., 0]
+    if problem.spacing:
+        apart, J_apart = _spacing(problem, at)
+        J_apart_t = np.swapaxes(J_apart, 1, 2) / SPACING_M**2
+        normal = normal + J_apart_t @ J_apart
+        gradient = gradient + (J_apart_t @ apart[..., None])[..., 0]
+    return normal, gradient
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Solution(ReadOnlyArrays):
+    """Scale, anchors, biases and clock, with what they rest on."""
+
+    scale: float
+    """Metres a map unit."""
+    clock_s: float
+    anchors: Array
+    """(J, 3) m, map axes, from the map's origin"""
+    biases: Array
+    """(J,) m"""
+    covariance: Array
+    """(2 + 4 J, 2 + 4 J) of log s, clock, and for each anchor place and bias"""
+    unknowns: Array
+    """(P,) as the search has them, with the modes"""
+    error: Array
+    """(M,) of the ranges, m, with the modes"""
+    variance: Array
+    """(M,) ``H P H'``, m^2"""
+    weight: Array
+    """(M,)"""
+    cost: float
+    """Deviance of ranges and priors."""
+
+    @property
+    def sigma_log_scale(self) -> float:
+        """Relative standard deviation of the scale."""
+        return float(np.sqrt(self.covariance[0, 0]))
+
+    def anchor_covariance(self, j: int) -> Array:
+        """Return that of an anchor's place (3, 3), m^2."""
+        own = slice(2 + 4 * j, 5 + 4 * j)
+        return self.covariance[own, own]
+
+
+def solution(
+    problem: Problem, start: Array, *, rounds: int = ROUNDS, is_near: bool = False
+) -> Solution:
+    """Return the minimum near one set of unknowns (P,), weights with the posterior in them.
+
+    First a damped search by the residuals alone, where the start is not near already, then at most
+    ``rounds`` reweightings with ``H P H'`` of the posterior before; they end when no unknown moves
+    by a thousandth of its sigma.
+    """
+    at = start[None] if is_near else search(problem, start[None]).unknowns
+    information = np.diag(problem.prior_information())
+    variance: Array = np.zeros((1, len(problem.places.range_m)))
+    for _ in range(rounds):
+        error, J = residuals(problem, at)
+        normal, gradient = _normal(problem, at, error, J, variance=variance)
+        covariance = np.linalg.inv(normal[0] + information)
+        variance = np.einsum("mi,ij,mj->m", J[0], covariance, J[0])[None]
+        step = -covariance @ (gradient[0] + information @ at[0])
+        step[0] = np.clip(step[0], -0.2, 0.2)
+        at = at + step
+        if float(np.max(np.abs(step) / np.sqrt(covariance.diagonal()))) < 1e-3:
+            break
+    error, J = residuals(problem, at)
+    weight = problem.kernel.weight(error, variance, problem.places.sigma_m)
+    covariance = covariance * problem.kernel.inefficiency(error, problem.places.sigma_m)
+    cost = float(_cost(problem, at, error)[0])
+    return _outwards(problem, at[0], covariance, (error[0], variance[0], weight[0]), cost)
+
+
+def _outwards(
+    problem: Problem,
+    unknowns: Array,
+    covariance: Array,
+    each: tuple[Array, Array, Array],
+    cost: float,
+) -> Solution:
+    """Return a solution with anchors from the map's origin instead of the middle of the path."""
+    core, n_anchors = problem.n_core, problem.n_anchors
+    scale = float(np.exp(unknowns[0]))
+    own = unknowns[2:core].reshape(n_anchors, 4)
+    shift = np.eye(core)
+    for j in range(n_anchors):
+        shift[2 + 4 * j : 5 + 4 * j, 0] = scale * problem.middle
+    return Solution(
+        scale,
+        float(unknowns[1]),
+        own[:, :3] + scale * problem.middle,
+        own[:, 3].copy(),
+        shift @ covariance[:core, :core] @ shift.T,
+        unknowns.copy(),
+        *each,
+        cost,
+    )
+
+
+def polished(problem: Problem, found: Solution) -> Solution:
+    """Return a minimum with what is far too long taken out of it: see :data:`.weights.POLISH`.
+
+    Its cost stays that of the kernel it was found by, so that minima can be compared.
+    """
+    last = solution(replace(problem, kernel=POLISH), found.unknowns, is_near=True, rounds=15)
+    return replace(last, cost=found.cost)
+
+
+def unknowns_of(
+    problem: Problem, scale: float, anchors: Array, biases: Array, clock_s: float = 0.0
+) -> Array:
+    """Return unknowns (P,) of a solution, modes at zero."""
+    own = np.column_stack([anchors - scale * problem.middle, biases]).ravel()
+    modes = np.zeros(problem.n_unknowns - problem.n_core)
+    return np.concatenate([[np.log(scale), clock_s], own, modes])
+
+
+def with_sigma(problem: Problem, sigma_m: Array) -> Problem:
+    """Return the problem with other standard deviations (M,) of its ranges."""
+    return replace(problem, places=problem.places._replace(sigma_m=sigma_m))

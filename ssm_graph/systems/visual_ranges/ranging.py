@@ -1,0 +1,490 @@
+"""Scale and anchors while a run goes on: started, kept up from all ranges, doubted, found moved.
+
+The map stays in its own units; the scale is a variable. It and the anchors come from all ranges so
+far at their present places, never from those of a window alone, with which an anchor runs away.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Final
+
+import numpy as np
+
+from ssm_graph.base.frozen import Array, ReadOnlyArrays, ShortRepr
+from ssm_graph.systems.visual_ranges.bundle_ranges import BundleRanges
+from ssm_graph.systems.visual_ranges.range_fit import (
+    Places,
+    Problem,
+    Solution,
+    places_of,
+    polished,
+    problem_of,
+    search,
+    solution,
+    unknowns_of,
+)
+from ssm_graph.systems.visual_ranges.range_terms import FramePoses, RangeTerms, hang
+from ssm_graph.systems.visual_ranges.ranges import Indices, Ranges
+from ssm_graph.systems.visual_ranges.start import (
+    Start,
+    StartRules,
+    StartState,
+    find_start,
+    later_anchor,
+    widened,
+)
+from ssm_graph.systems.visual_ranges.weights import NLOS_WEIGHT, robust_rms
+
+TRY_AGAIN: Final = 1.15
+"""A start is tried again when so many times the ranges are there."""
+RECENT_S: Final = 10.0
+CHECK_AGAIN: Final = 1.5
+"""And all is searched again when so many times the ranges are there."""
+LEAST_RECENT: Final = 20
+SAME_PLACE_M: Final = 0.2
+DOUBTFUL_SHARE: Final = 0.6
+"""Of the last 10 s of an anchor's ranges, with next to no weight."""
+
+
+class AnchorState(Enum):
+    """How far an anchor is known."""
+
+    UNKNOWN = "not placed yet"
+    AMBIGUOUS = "other places fit as well, or it is not sharp"
+    READY = "known"
+    DOUBTFUL = "its last ranges contradict its place: hidden, or moved"
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Anchor(ReadOnlyArrays):
+    """An anchor as it stands."""
+
+    name: str
+    state: AnchorState
+    place_m: Array
+    """(3,) map axes, m; NaN while unknown"""
+    covariance: Array
+    """(3, 3) m^2"""
+    bias_m: float
+    bias_sigma_m: float
+    alternatives_m: Array
+    """(n, 3) places that fit as well"""
+    n_ranges: int
+    nlos_share: float
+    """Of its ranges, with a weight below 0.05."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class RangingResult(ReadOnlyArrays):
+    """Scale, anchors and what became of every range."""
+
+    state: StartState
+    scale: float
+    """Metres a map unit; NaN without."""
+    sigma_log_scale: float
+    clock_s: float
+    """Time of a measurement less its stamp."""
+    clock_sigma_s: float
+    anchors: tuple[Anchor, ...]
+    error_m: Array
+    """(M,) predicted minus measured, m; NaN where not used"""
+    weight: Array
+    """(M,) NaN where not used"""
+    anchor_of: Indices
+    """(M,) index of each range's anchor among `anchors`; one that moved is two"""
+    scale_history: Array
+    """(H, 3) time s, scale, its relative sigma"""
+    reasons: tuple[str, ...]
+    """Why scale or anchors are not ready."""
+    advice: str
+    started_s: float
+    """Time at which the scale was ready; NaN before."""
+
+    @property
+    def has_scale(self) -> bool:
+        """Whether map units can be turned into metres."""
+        return self.state in (StartState.READY, StartState.MIRROR)
+
+
+@dataclass(slots=True)
+class _Own:
+    """What is kept of an anchor."""
+
+    name: str
+    state: AnchorState = AnchorState.UNKNOWN
+    alternatives: tuple[tuple[Array, float], ...] = ()
+    """Places (3,) m, and biases."""
+
+
+class Ranging(ShortRepr):
+    """The ranges of a run."""
+
+    def __init__(self, ranges: Ranges, lever_arm_m: Array, rules: StartRules | None = None) -> None:
+        """Take all ranges of the run; only those before the newest frame are used.
+
+        Parameters
+        ----------
+        lever_arm_m : (3,) camera to antenna, camera axes.
+        """
+        self.ranges, self.lever_arm_m = ranges, np.asarray(lever_arm_m, dtype=np.float64)
+        self.rules = StartRules() if rules is None else rules
+        self.anchor: Indices = ranges.anchor.copy()
+        self.anchors = [_Own(name) for name in ranges.names]
+        self.start: Start | None = None
+        self.found: Solution | None = None
+        self.used: list[int] = []
+        self.terms: RangeTerms | None = None
+        self.history: list[tuple[float, float, float]] = []
+        self.started_s = float("nan")
+        self.error, self.weight = np.full((2, len(ranges)), np.nan)
+        self._tried = self._checked = 0
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether the ranges contradict themselves."""
+        return self.start is not None and self.start.state is StartState.REFUSED
+
+    @property
+    def has_scale(self) -> bool:
+        """Whether map units can be turned into metres."""
+        return self.found is not None and not self.is_refused
+
+    @property
+    def scale(self) -> float:
+        """Metres a map unit; NaN without."""
+        return self.found.scale if self.found is not None else float("nan")
+
+    def update(self, frames: FramePoses, R_cw: Array, t_cw: Array) -> list[str]:
+        """Take the poses as they stand, start or go on, and return what happened, in words.
+
+        Parameters
+        ----------
+        frames : all frames so far.
+        R_cw, t_cw : (K, 3, 3) and (K, 3) of the key frames.
+        """
+        self.terms = hang(self.ranges, frames, R_cw, t_cw, lever_arm_m=self.lever_arm_m)
+        self.terms = replace(self.terms, anchor=self.anchor[self.terms.row])
+        if not len(self.terms):
+            return []
+        places = places_of(self.terms, R_cw, t_cw, self.ranges.time_s)
+        now = float(places.time_s[-1])
+        if self.found is None:
+            if len(places.time_s) < TRY_AGAIN * self._tried:
+                return []
+            self._tried = len(places.time_s)
+            told = self._start(places, _turned(R_cw))
+        else:
+            told = [*self._go_on(places, now), *self._later(places, now)]
+        if self.found is not None:
+            self.history.append((now, self.found.scale, self.found.sigma_log_scale))
+        return told
+
+    def restart(self) -> None:
+        """Forget scale and anchors: the map's scale has changed. The next update starts anew."""
+        self.found, self._tried, self._checked = None, 0, 0
+        for own in self.anchors:
+            own.state, own.alternatives = AnchorState.UNKNOWN, ()
+
+    def further(
+        self, pose_of: Indices, *, is_free: bool = False, least_weight: float = 0.0
+    ) -> BundleRanges | None:
+        """Return the ranges of some key frames as terms of their adjustment; None without scale.
+
+        Parameters
+        ----------
+        pose_of : (K,) index of each key frame among the problem's poses, -1 for the others.
+        is_free : whether scale, clock, anchors and biases are adjusted with them.
+        """
+        if self.found is None or self.terms is None or self.is_refused:
+            return None
+        column = np.full(len(self.anchors), -1, dtype=np.intp)
+        column[self.used] = np.arange(len(self.used))
+        doubtful = [own.state is AnchorState.DOUBTFUL for own in self.anchors]
+        column[doubtful] = -1
+        known = pose_of[np.minimum(self.terms.key_frame, len(pose_of) - 1)]
+        known = np.where(self.terms.key_frame < len(pose_of), known, -1)
+        kept = (known >= 0) & (column[self.terms.anchor] >= 0)
+        if least_weight > 0.0:
+            kept &= np.nan_to_num(self.weight[self.terms.row], nan=1.0) >= least_weight
+        if not kept.any():
+            return None
+        own = self.terms.rows(kept)
+        return BundleRanges(
+            replace(own, anchor=column[own.anchor]),
+            known[kept],
+            self.found.scale,
+            self.found.clock_s,
+            self.found.anchors,
+            self.found.biases,
+            self.rules.kernel,
+            is_free,
+        )
+
+    def adopt(self, extra: Array, covariance: Array, further: BundleRanges) -> None:
+        """Take over what an adjustment with free scale and anchors found, (E,) and (E, E)."""
+        assert self.found is not None
+        own = extra[2:].reshape(-1, 4)
+        self.found = replace(
+            self.found,
+            scale=further.scale * float(np.exp(extra[0])),
+            clock_s=further.clock_s + float(extra[1]),
+            anchors=further.anchors + own[:, :3],
+            biases=further.biases + own[:, 3],
+            covariance=covariance.copy(),
+        )
+
+    def result(self) -> RangingResult:
+        """Return all as it stands."""
+        found = self.found
+        state = StartState.WAITING if self.start is None else self.start.state
+        if found is not None and not self.is_refused:
+            states = [own.state for own in self.anchors]
+            is_sharp = all(s is not AnchorState.AMBIGUOUS for s in states)
+            state = StartState.READY if is_sharp else StartState.MIRROR
+        return RangingResult(
+            state,
+            self.scale,
+            found.sigma_log_scale if found is not None else float("nan"),
+            found.clock_s if found is not None else 0.0,
+            float(np.sqrt(found.covariance[1, 1])) if found is not None else float("nan"),
+            tuple(self._shown(j) for j in range(len(self.anchors))),
+            self.error.copy(),
+            self.weight.copy(),
+            self.anchor.copy(),
+            np.array(self.history).reshape(-1, 3),
+            () if self.start is None else self.start.reasons,
+            "" if self.start is None else self.start.advice,
+            self.started_s,
+        )
+
+    def _shown(self, j: int) -> Anchor:
+        own, found = self.anchors[j], self.found
+        weight = self.weight[(self.anchor == j) & np.isfinite(self.weight)]
+        place, covariance, bias, sigma = np.full(3, np.nan), np.full((3, 3), np.nan), 0.0, np.nan
+        if found is not None and j in self.used:
+            i = self.used.index(j)
+            place, covariance = found.anchors[i].copy(), found.anchor_covariance(i).copy()
+            bias, sigma = (
+                float(found.biases[i]),
+                float(np.sqrt(found.covariance[5 + 4 * i, 5 + 4 * i])),
+            )
+        return Anchor(
+            own.name,
+            own.state,
+            place,
+            covariance,
+            bias,
+            float(sigma),
+            np.array([where for where, _ in own.alternatives]).reshape(-1, 3),
+            int((self.anchor == j).sum()),
+            float(np.mean(weight < NLOS_WEIGHT)) if len(weight) else float("nan"),
+        )
+
+    def _start(self, places: Places, turned_rad: float) -> list[str]:
+        """Try to find scale and the anchors that have ranges enough."""
+        counts = np.bincount(places.anchor, minlength=len(self.anchors))
+        eligible = np.flatnonzero(counts >= self.rules.least_ranges)
+        if not len(eligible):
+            eligible = np.array([int(np.argmax(counts))])
+        own, _ = _of(places, eligible)
+        names = tuple(self.anchors[j].name for j in eligible)
+        self.start = find_start(own, names, self.rules, turned_rad=turned_rad)
+        if not self.start.has_scale or self.start.solution is None:
+            return []
+        self._checked = len(places.time_s)
+        self.found, self.used = self.start.solution, [int(j) for j in eligible]
+        self.started_s = float(places.time_s[-1])
+        for i, j in enumerate(self.used):
+            is_ready = self.start.anchor_ready[i]
+            self.anchors[j].state = AnchorState.READY if is_ready else AnchorState.AMBIGUOUS
+            self.anchors[j].alternatives = tuple(
+                (one.anchors[i].copy(), float(one.biases[i])) for one in self.start.alternatives
+            )
+        self._go_on(places, self.started_s)
+        found = self.found
+        return [
+            f"scale {found.scale:.4g} m a map unit, known to {100 * found.sigma_log_scale:.1f} %; "
+            + ", ".join(f"anchor {self.anchors[j].name} {self.anchors[j].state.name.lower()}"
+                        for j in self.used)
+        ]  # fmt: skip
+
+    def _go_on(self, places: Places, now: float) -> list[str]:
+        """Take up all ranges of the anchors in use."""
+        assert self.found is not None
+        own, kept = _of(places, np.array(self.used))
+        problem = problem_of(
+            own,
+            len(self.used),
+            self.rules.kernel,
+            drift=self.rules.ledger_drift,
+            bias_walk_m=self.rules.bias_walk_m,
+        )
+        before = self.found
+        start = unknowns_of(problem, before.scale, before.anchors, before.biases, before.clock_s)
+        problem = widened(problem, solution(problem, start, rounds=3))
+        self.found = polished(problem, solution(problem, start, rounds=3))
+        if len(places.time_s) > CHECK_AGAIN * self._checked:
+            self._checked = len(places.time_s)
+            told = self._check(own, problem)
+            self._rivals(problem)
+        else:
+            told = []
+        assert self.terms is not None
+        row = self.terms.row[kept]
+        self.error[row], self.weight[row] = self.found.error, self.found.weight
+        return [*told, *self._sharpened(problem, now)]
+
+    def _check(self, own: Places, problem: Problem) -> list[str]:
+        """Search everywhere again, with all ranges of the anchors in use; take what is better."""
+        assert self.found is not None
+        names = tuple(self.anchors[j].name for j in self.used)
+        again = find_start(own, names, self.rules, turned_rad=np.inf)
+        was_refused, self.start = self.is_refused, again
+        if self.is_refused != was_refused:
+            what = "; ".join(again.reasons) if self.is_refused else "no contradiction any more"
+            told = [f"scale {'doubted' if self.is_refused else 'believed again'}: {what}"]
+        else:
+            told = []
+        best = again.solution
+        if best is None:
+            return told
+        other = unknowns_of(problem, best.scale, best.anchors, best.biases, best.clock_s)
+        fit = search(problem, np.array([self.found.unknowns, other]))
+        if fit.cost[1] < fit.cost[0] - self.rules.gap:
+            old = self.found.scale
+            self.found = solution(problem, fit.unknowns[1], is_near=True)
+            told.append(f"a better solution: {self.found.scale / old:.3f} times the scale before")
+        return told
+
+    def _rivals(self, problem: Problem) -> None:
+        """Try the other places of anchors that have some."""
+        for i, j in enumerate(self.used):
+            if self.anchors[j].alternatives:
+                self._against_rivals(problem, i)
+
+    def _sharpened(self, problem: Problem, now: float) -> list[str]:
+        """Judge the anchors anew: sharpness, and whether the last ranges fit."""
+        assert self.found is not None
+        told = []
+        for i, j in enumerate(self.used):
+            own, at = self.anchors[j], problem.places
+            recent = (at.anchor == i) & (at.time_s > now - RECENT_S)
+            marked = self.found.weight[recent] < NLOS_WEIGHT
+            is_sharp = not own.alternatives and self._is_sharp(i, at)
+            state = AnchorState.READY if is_sharp else AnchorState.AMBIGUOUS
+            if recent.sum() >= LEAST_RECENT and float(np.mean(marked)) > DOUBTFUL_SHARE:
+                state = AnchorState.DOUBTFUL
+            if own.state is not state:
+                told.append(f"anchor {own.name}: {state.value}")
+            own.state = state
+        return told
+
+    def _is_sharp(self, i: int, at: Places) -> bool:
+        assert self.found is not None
+        sigma = float(np.sqrt(np.trace(self.found.anchor_covariance(i))))
+        median = float(np.median(at.range_m[at.anchor == i]))
+        return sigma <= max(self.rules.anchor_sigma_m, self.rules.anchor_sigma_share * median)
+
+    def _against_rivals(self, problem: Problem, i: int) -> None:
+        """Try an anchor's other places, take the best, and keep those that are as good."""
+        assert self.found is not None
+        found, own = self.found, self.anchors[self.used[i]]
+        starts = [found.unknowns]
+        for place, bias in own.alternatives:
+            anchors, biases = found.anchors.copy(), found.biases.copy()
+            anchors[i], biases[i] = place, bias
+            starts.append(unknowns_of(problem, found.scale, anchors, biases, found.clock_s))
+        fit = search(problem, np.array(starts))
+        best = int(np.argmin(fit.cost))
+        if best and fit.cost[best] < fit.cost[0] - self.rules.gap:
+            self.found = found = solution(problem, fit.unknowns[best], is_near=True)
+        least, kept = float(fit.cost.min()), []
+        for unknowns, cost in zip(fit.unknowns, fit.cost, strict=True):
+            one = unknowns[2 + 4 * i : 6 + 4 * i]
+            place = one[:3] + np.exp(unknowns[0]) * problem.middle
+            apart = float(np.linalg.norm(place - found.anchors[i])) > SAME_PLACE_M
+            if apart and cost < least + self.rules.gap:
+                kept.append((place, float(one[3])))
+        own.alternatives = (*kept,)
+
+    def _later(self, places: Places, now: float) -> list[str]:
+        """Place anchors that have ranges enough by now, and anew those that seem to have moved."""
+        told = []
+        for j in range(len(self.anchors)):
+            own, unused = self.anchors[j], j not in self.used
+            is_lost = own.state is AnchorState.DOUBTFUL
+            mine = places.anchor == j
+            if is_lost:
+                mine = mine & (places.time_s > now - RECENT_S)
+            rows = np.flatnonzero(mine)
+            if not (unused or is_lost) or len(rows) < self.rules.least_ranges:
+                continue
+            if float(np.ptp(places.time_s[rows])) < self.rules.least_s:
+                continue
+            placed = self._placed(places.rows(rows))
+            if placed is None:
+                continue
+            told.append(self._take(j, *placed, now, moved=is_lost))
+        return told
+
+    def _placed(self, own: Places) -> tuple[Array, float, Array] | None:
+        """Return place, bias and covariance (4, 4) of an anchor, if its ranges tell them."""
+        assert self.found is not None
+        own = own._replace(anchor=np.zeros(len(own.anchor), dtype=np.intp))
+        problem = problem_of(own, 1, self.rules.kernel, drift=0.0, bias_walk_m=0.0)
+        found = later_anchor(problem, float(np.log(self.found.scale)), self.rules)
+        where, covariance, _ = found[0]
+        limit = self.rules.anchor_sigma_share * float(np.median(own.range_m))
+        limit = max(self.rules.anchor_sigma_m, limit)
+        if len(found) > 1 or float(np.sqrt(np.trace(covariance[:3, :3]))) > limit:
+            return None
+        place = where[:3] + self.found.scale * problem.middle
+        line = self.found.scale * own.camera + own.lever - place
+        error = np.linalg.norm(line, axis=1) + where[3] - own.range_m
+        if robust_rms(error) > self.rules.rms_sigmas * float(np.median(own.sigma_m)):
+            return None
+        return place, float(where[3]), covariance
+
+    def _take(
+        self, j: int, place: Array, bias: float, covariance: Array, now: float, *, moved: bool
+    ) -> str:
+        """Take an anchor into use; one that moved becomes another from the recent ranges on."""
+        assert self.found is not None and self.terms is not None
+        name = self.anchors[j].name
+        if moved:
+            since = now - RECENT_S
+            recent = (self.anchor == j) & (self.ranges.time_s > since)
+            self.anchors.append(_Own(f"{name} from {since:.1f} s"))
+            self.anchor[recent] = len(self.anchors) - 1
+            j = len(self.anchors) - 1
+        self.anchors[j].state = AnchorState.READY
+        self.used.append(j)
+        found = self.found
+        n = len(found.covariance)
+        wider = np.zeros((n + 4, n + 4))
+        wider[:n, :n], wider[n:, n:] = found.covariance, covariance
+        self.found = replace(
+            found,
+            anchors=np.vstack([found.anchors, place]),
+            biases=np.append(found.biases, bias),
+            covariance=wider,
+        )
+        return f"anchor {name} " + ("has moved: placed anew" if moved else "placed")
+
+
+def _of(places: Places, anchors: Indices) -> tuple[Places, Indices]:
+    """Return the places of some anchors, counted anew, and their rows."""
+    column = np.full(int(places.anchor.max(initial=0)) + 1, -1, dtype=np.intp)
+    inside = anchors[anchors < len(column)]
+    column[inside] = np.flatnonzero(anchors < len(column))
+    kept = np.flatnonzero(column[places.anchor] >= 0)
+    own = places.rows(kept)
+    return own._replace(anchor=column[own.anchor]), kept
+
+
+def _turned(R_cw: Array) -> float:
+    """Return the largest angle from the first camera's axes, rad."""
+    cosine = (np.einsum("kij,ij->k", R_cw, R_cw[0]) - 1.0) / 2.0
+    return float(np.arccos(np.clip(cosine.min(initial=1.0), -1.0, 1.0)))

@@ -1,0 +1,69 @@
+"""What a run works on: a camera, its images one by one, ranges, and the true path where known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ssm_graph.base.frozen import Array, FrozenArrays, ShortRepr, shaped
+
+if TYPE_CHECKING:
+    from ssm_graph.systems.visual_ranges.camera import Camera
+    from ssm_graph.systems.visual_ranges.ranges import Ranges
+
+Image = NDArray[np.uint8]
+"""Grey image (H, W)."""
+ImageOf = Callable[[int], Image]
+"""The image of an index; one that cannot be decoded comes back black, as a covered lens would."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class PathTruth(FrozenArrays):
+    """The true path of the camera in some world frame."""
+
+    time_s: Array = shaped("N")
+    position_m: Array = shaped("N", 3)
+    """The camera's centre, m."""
+    quaternion: Array = shaped("N", 4)
+    """Camera axes (x right, y down, z ahead) to world axes, in the order x, y, z, w of TUM files."""
+
+
+class HasDefects(Protocol):
+    """Images that say what was wrong with them."""
+
+    def defects(self) -> tuple[str, ...]:
+        """Return what was found in the images read so far, one sentence each."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sequence(ShortRepr):
+    """One recording; images are read when they are asked for."""
+
+    name: str
+    camera: Camera
+    time_s: Array
+    """Time of each image, s, strictly increasing (K,), on the clock of the ranges."""
+    images: ImageOf = field(repr=False)
+    """Image of an index 0 .. K-1, grey (H, W) of the camera's size."""
+    ranges: Ranges
+    """May be of length 0: the map then stays without scale."""
+    lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """From the camera's centre to the antenna, camera axes, m."""
+    truth: PathTruth | None = None
+    anchor_truth_m: Array | None = None
+    """True places of the anchors in the world frame of ``truth`` (J, 3), m, NaN where unknown."""
+    notes: tuple[str, ...] = ()
+    """What the reader found and did, one sentence each, with file and line where there is one."""
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    @property
+    def duration_s(self) -> float:
+        """From the first image to the last, s."""
+        return float(self.time_s[-1] - self.time_s[0]) if len(self.time_s) else 0.0

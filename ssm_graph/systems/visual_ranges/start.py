@@ -1,0 +1,453 @@
+"""Scale and anchors from nothing: searches from many places, and tests before any is believed.
+
+Least squares would sit among the ranges that are too long, and its covariance would not tell of
+another solution. So all searches are robust from the beginning, the distinct minima are kept, and
+a scale counts as ready only where it is sharp, has no rival, fits its ranges and is the same from
+the first half of them as from the second.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Final
+
+import numpy as np
+
+from ssm_graph.base.frozen import Array, ShortRepr
+from ssm_graph.systems.visual_ranges.observability import Motion, Shape, advice, shape_of
+from ssm_graph.systems.visual_ranges.range_fit import (
+    BIAS_M,
+    BIAS_WALK_M,
+    DRIFT,
+    Places,
+    Problem,
+    Solution,
+    polished,
+    problem_of,
+    search,
+    solution,
+    with_sigma,
+)
+from ssm_graph.systems.visual_ranges.ranges import Indices
+from ssm_graph.systems.visual_ranges.weights import RangeKernel, robust_rms
+
+DIRECTIONS: Final = 12
+SCALES: Final = 4
+"""Searches start in as many directions, at as many scales."""
+MOST_ROWS: Final = 250
+"""Ranges of an anchor that the searches take, spread over all."""
+MOST_MINIMA: Final = 6
+TWO_SIDED_3_SIGMA: Final = {1: 9.0, 3: 14.16}
+"""Chi-square quantiles of 0.9973 by dimension."""
+
+
+class StartState(Enum):
+    """What has become of scale and anchor."""
+
+    WAITING = "too few ranges yet"
+    AMBIGUOUS = "several solutions, or none that is sharp"
+    MIRROR = "scale ready; an anchor has other places that fit as well"
+    READY = "scale and anchors ready"
+    REFUSED = "the ranges contradict themselves"
+
+
+@dataclass(frozen=True, slots=True)
+class StartRules:
+    """When a start is believed."""
+
+    least_ranges: int = 40
+    """Of an anchor."""
+    least_s: float = 5.0
+    scale_sigma: float = 0.04
+    """Relative standard deviation of the scale."""
+    anchor_sigma_m: float = 0.5
+    anchor_sigma_share: float = 0.06
+    """Of the median range; the larger of both counts."""
+    gap: float = 9.0
+    """Deviance by which the next distinct minimum is worse."""
+    rms_sigmas: float = 2.0
+    """Robust rms of the residuals in stated sigmas."""
+    marked_share: float = 0.4
+    """Of an anchor's ranges that may be not in line of sight."""
+    drift: float = DRIFT
+    """Of a path before ranges hold it; see :data:`.range_fit.DRIFT`."""
+    ledger_drift: float = 0.001
+    """Of a path that its ranges hold."""
+    bias_walk_m: float = BIAS_WALK_M
+    kernel: RangeKernel = RangeKernel()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Start(ShortRepr):
+    """The outcome of a start."""
+
+    state: StartState
+    solution: Solution | None
+    """The best minimum, ready or not."""
+    alternatives: tuple[Solution, ...]
+    """Other minima that explain the ranges as well."""
+    gap: float
+    """Deviance of the next distinct minimum less that of the best; infinite without one."""
+    shape: Shape | None
+    reasons: tuple[str, ...]
+    """Why it is not ready, a sentence each."""
+    advice: str
+    anchor_ready: tuple[bool, ...]
+    """(J,) whether each anchor is sharp and has no rival."""
+
+    @property
+    def has_scale(self) -> bool:
+        """Whether map units can be turned into metres."""
+        return self.state in (StartState.READY, StartState.MIRROR)
+
+
+def find_start(
+    places: Places,
+    names: tuple[str, ...],
+    rules: StartRules | None = None,
+    *,
+    turned_rad: float = 0.0,
+    spacing: tuple[tuple[int, int, float], ...] = (),
+) -> Start:
+    """Return scale and anchors, as far as ranges tell.
+
+    Parameters
+    ----------
+    places : of the ranges, in order of time; all anchors have some.
+    names : (J,) of the anchors.
+    turned_rad : largest angle between two of the camera's axes so far.
+    spacing : pairs of anchors and their distances, m, where known.
+    """
+    rules = StartRules() if rules is None else rules
+    early = _too_early(places, names, rules, turned_rad)
+    if early is not None:
+        return early
+    picked = _picked(places, len(names))
+    problem = problem_of(
+        picked,
+        len(names),
+        rules.kernel,
+        drift=rules.drift,
+        bias_walk_m=rules.bias_walk_m,
+        spacing=spacing,
+    )
+    found = _candidates(problem)
+    found, costs = _searched(problem, found)
+    best = solution(problem, found[0])
+    problem = widened(problem, best)
+    found, costs = _searched(problem, found)
+    best = polished(problem, solution(problem, found[0]))
+    rivals = [polished(problem, solution(problem, one)) for one in found[1:]]
+    apart = [rival for rival in rivals if _is_apart(best, rival)]
+    gap = min((rival.cost - best.cost for rival in apart), default=np.inf)
+    near = [rival for rival in apart if rival.cost - best.cost < rules.gap]
+    return _judged(problem, names, rules, best, near, gap, turned_rad)
+
+
+def _too_early(
+    places: Places, names: tuple[str, ...], rules: StartRules, turned_rad: float
+) -> Start | None:
+    fewest = int(np.bincount(places.anchor, minlength=len(names)).min()) if names else 0
+    lasts = float(np.ptp(places.time_s)) if len(places.time_s) else 0.0
+    if fewest < rules.least_ranges or lasts < rules.least_s:
+        reason = (
+            f"{fewest} ranges over {lasts:.1f} s, {rules.least_ranges} over "
+            f"{rules.least_s:g} s are needed"
+        )
+        none = (False,) * len(names)
+        return Start(StartState.WAITING, None, (), np.inf, None, (reason,), "wait", none)
+    shape = shape_of(places.camera, scale=1.0, sigma_m=0.0, turned_rad=turned_rad)
+    if shape.motion in (Motion.STILL, Motion.ROTATION):
+        told = advice(shape, scale=1.0, name=names[0])
+        reasons = (f"the path so far: {shape.motion.value}",)
+        none = (False,) * len(names)
+        return Start(StartState.AMBIGUOUS, None, (), 0.0, shape, reasons, told, none)
+    return None
+
+
+def _picked(places: Places, n_anchors: int) -> Places:
+    """Return at most so many ranges of each anchor, spread over all, in order of time."""
+    kept: list[Indices] = []
+    for j in range(n_anchors):
+        own = np.flatnonzero(places.anchor == j)
+        take = np.linspace(0, len(own) - 1, min(len(own), MOST_ROWS)).round().astype(np.intp)
+        kept.append(own[take])
+    return places.rows(np.sort(np.concatenate(kept)))
+
+
+def _directions(n: int) -> Array:
+    """Return unit vectors (n, 3) spread over the sphere."""
+    height = 1.0 - 2.0 * (np.arange(n) + 0.5) / n
+    angle = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(n)
+    ring = np.sqrt(1.0 - height**2)
+    return np.stack([ring * np.cos(angle), ring * np.sin(angle), height], axis=1)
+
+
+def _alone(problem: Problem, j: int) -> Problem:
+    """Return the problem of one anchor, without modes."""
+    own = np.flatnonzero(problem.places.anchor == j)
+    places = problem.places.rows(own)
+    places = places._replace(anchor=np.zeros(len(own), dtype=np.intp))
+    none = np.zeros((len(own), 0))
+    return replace(problem, places=places, n_anchors=1, drift=none, walk=none, spacing=())
+
+
+def _starts(problem: Problem) -> Array:
+    """Return unknowns (S, 6) of one anchor from which searches begin."""
+    at = problem.places
+    extent = 2.0 * float(np.sqrt(np.mean(np.sum(at.camera**2, axis=1))))
+    low, middle, high = np.percentile(at.range_m, (5.0, 50.0, 95.0))
+    # No range changes by more than the way; and the way is seldom longer than a range.
+    least = np.log(max(high - low, 0.02 * middle) / extent / 2.0)
+    most = max(np.log(2.0 * middle / extent), least + 1.0)
+    directions = _directions(DIRECTIONS)
+    made = np.zeros((SCALES, DIRECTIONS, 6))
+    made[..., 0] = np.linspace(least, most, SCALES)[:, None]
+    made[..., 2:5] = middle * directions
+    linear = _linear(problem)
+    rows = made.reshape(-1, 6)
+    return rows if linear is None else np.vstack([linear, rows])
+
+
+def _linear(problem: Problem) -> Array | None:
+    """Return the solution (6,) of the squared ranges, linear in s^2, s a and |a|^2."""
+    at = problem.places
+    rows = np.column_stack([np.sum(at.camera**2, 1), -2.0 * at.camera, np.ones(len(at.camera))])
+    found = np.linalg.lstsq(rows, at.range_m**2, rcond=1e-6)[0]
+    if not found[0] > 0.0:
+        return None
+    s = float(np.sqrt(found[0]))
+    return np.array([np.log(s), 0.0, *(found[1:4] / s), 0.0])
+
+
+def _distinct(unknowns: Array, costs: Array, limit: float) -> list[Array]:
+    """Return minima (6,) of one anchor that are apart, best first, down to a limit of the cost."""
+    kept: list[Array] = []
+    for row in np.argsort(costs):
+        if costs[row] > costs.min() + limit or len(kept) == MOST_MINIMA:
+            break
+        one = unknowns[row]
+        reach = 0.1 + 0.03 * float(np.linalg.norm(one[2:5]))
+        if all(
+            abs(one[0] - old[0]) > 0.03 or float(np.linalg.norm(one[2:5] - old[2:5])) > reach
+            for old in kept
+        ):
+            kept.append(one)
+    return kept
+
+
+def _candidates(problem: Problem) -> list[Array]:
+    """Return unknowns (P,) of all anchors together, one set for each candidate of the scale.
+
+    For each scale that one of the anchors finds alone, all anchors are placed anew; then, at the
+    best of them, each anchor's other places are tried.
+    """
+    alone = [_alone(problem, j) for j in range(problem.n_anchors)]
+    minima = []
+    for one in alone:
+        fit = search(one, _starts(one))
+        minima.append(_distinct(fit.unknowns, fit.cost, 60.0))
+    log_scales: list[float] = []
+    for each in minima:
+        for one_minimum in each:
+            if all(abs(one_minimum[0] - old) > 0.03 for old in log_scales):
+                log_scales.append(float(one_minimum[0]))
+    joint = []
+    for log_scale in log_scales[: 2 * MOST_MINIMA]:
+        options = [_placed(one, each, log_scale) for one, each in zip(alone, minima, strict=True)]
+        total = sum(cost for (_, cost), *_ in options)
+        joint.append((total, log_scale, options))
+    joint.sort(key=lambda item: item[0])
+    sets = [_joined(problem, scale, [own[0][0] for own in options]) for _, scale, options in joint]
+    _, scale, options = joint[0]
+    for j, own in enumerate(options):
+        for other, _ in own[1:]:
+            chosen = [each[0][0] for each in options]
+            chosen[j] = other
+            sets.append(_joined(problem, scale, chosen))
+    return sets
+
+
+def _placed(one: Problem, minima: list[Array], log_scale: float) -> list[tuple[Array, float]]:
+    """Return an anchor's distinct places and biases (4,) at a scale, with their cost, best first."""
+    middle = float(np.median(one.places.range_m))
+    starts = np.zeros((DIRECTIONS + len(minima), 6))
+    starts[:DIRECTIONS, 2:5] = middle * _directions(DIRECTIONS)
+    starts[DIRECTIONS:] = minima
+    starts[:, 0] = log_scale
+    fit = search(one, starts, held=np.array([0, 1]))
+    kept = _distinct(fit.unknowns, fit.cost, 60.0)[:3]
+    costs = [float(fit.cost[np.flatnonzero((fit.unknowns == row).all(axis=1))[0]]) for row in kept]
+    return [(row[2:], cost) for row, cost in zip(kept, costs, strict=True)]
+
+
+def _joined(problem: Problem, log_scale: float, own: list[Array]) -> Array:
+    made = np.zeros(problem.n_unknowns)
+    made[0] = log_scale
+    made[2 : problem.n_core] = np.concatenate(own)
+    return made
+
+
+def _searched(problem: Problem, starts: list[Array]) -> tuple[list[Array], Array]:
+    """Return where searches with all modes end, best first, with their costs."""
+    fit = search(problem, np.array(starts))
+    order = np.argsort(fit.cost)
+    return [fit.unknowns[row] for row in order], fit.cost[order]
+
+
+def widened(problem: Problem, best: Solution) -> Problem:
+    """Return the problem with sigmas that are not below what each anchor's residuals show."""
+    sigma = problem.places.sigma_m.copy()
+    for j in range(problem.n_anchors):
+        own = problem.places.anchor == j
+        sigma[own] = np.fmax(sigma[own], robust_rms(best.error[own]))
+    return with_sigma(problem, sigma)
+
+
+def _is_apart(best: Solution, rival: Solution) -> bool:
+    """Return whether two minima differ by more than their sigmas."""
+    if abs(np.log(rival.scale / best.scale)) > 3.0 * best.sigma_log_scale:
+        return True
+    return any(_moved(best, rival, j) for j in range(len(best.anchors)))
+
+
+def _moved(best: Solution, rival: Solution, j: int) -> bool:
+    way = rival.anchors[j] - best.anchors[j]
+    square = float(way @ np.linalg.solve(best.anchor_covariance(j), way))
+    return square > TWO_SIDED_3_SIGMA[3] and float(np.linalg.norm(way)) > 0.2
+
+
+def _judged(
+    problem: Problem,
+    names: tuple[str, ...],
+    rules: StartRules,
+    best: Solution,
+    near: list[Solution],
+    gap: float,
+    turned_rad: float,
+) -> Start:
+    at = problem.places
+    n_anchors = len(names)
+    reasons: list[str] = []
+    if best.sigma_log_scale > rules.scale_sigma:
+        reasons.append(
+            f"scale known to {100.0 * best.sigma_log_scale:.1f} %, "
+            f"{100.0 * rules.scale_sigma:g} % are needed"
+        )
+    others = [one for one in near if not _same_scale(best, one, rules)]
+    if others:
+        told = ", ".join(f"{one.scale / best.scale:.2f}" for one in others)
+        reasons.append(f"other scales fit as well: {told} times this one (gap {gap:.1f})")
+    scale_is_sharp = not reasons
+    ready = []
+    for j, name in enumerate(names):
+        sigma = float(np.sqrt(np.trace(best.anchor_covariance(j))))
+        median = float(np.median(at.range_m[at.anchor == j]))
+        limit = max(rules.anchor_sigma_m, rules.anchor_sigma_share * median)
+        rivals = [one for one in near if _moved(best, one, j)]
+        if sigma > limit:
+            reasons.append(f"anchor {name} known to {sigma:.2f} m, {limit:.2f} m are needed")
+        elif rivals:
+            way = max(float(np.linalg.norm(one.anchors[j] - best.anchors[j])) for one in rivals)
+            reasons.append(f"anchor {name} may as well be {way:.1f} m from there (gap {gap:.1f})")
+        ready.append(sigma <= limit and not rivals)
+    against = _contradictions(problem, names, rules, best)
+    shape = shape_of(
+        problem.places.camera,
+        scale=best.scale,
+        sigma_m=float(np.median(at.sigma_m)),
+        turned_rad=turned_rad,
+        anchor=best.anchors[0] - best.scale * problem.middle,
+        range_m=at.range_m[at.anchor == 0],
+    )
+    if against:
+        state = StartState.REFUSED
+    elif not scale_is_sharp or (n_anchors == 1 and shape.motion.leaves_scale):
+        state = StartState.AMBIGUOUS
+    else:
+        state = StartState.READY if all(ready) else StartState.MIRROR
+    if state is StartState.READY:
+        shape = shape._replace(motion=Motion.GENERAL)
+    weakest = np.linalg.eigh(best.anchor_covariance(0))[1][:, -1]
+    told = "" if state is StartState.READY else advice(
+        shape, scale=best.scale, name=names[0], weakest=weakest
+    )  # fmt: skip
+    return Start(state, best, (*near,), gap, shape, (*reasons, *against), told, (*ready,))
+
+
+def _same_scale(best: Solution, other: Solution, rules: StartRules) -> bool:
+    return abs(np.log(other.scale / best.scale)) < max(
+        3.0 * best.sigma_log_scale, 0.5 * rules.scale_sigma
+    )
+
+
+def _contradictions(
+    problem: Problem, names: tuple[str, ...], rules: StartRules, best: Solution
+) -> list[str]:
+    """Return what speaks against the ranges themselves."""
+    at, told = problem.places, []
+    for j, name in enumerate(names):
+        own = at.anchor == j
+        stated, seen = float(np.median(at.sigma_m[own])), robust_rms(best.error[own])
+        if seen > rules.rms_sigmas * stated:
+            told.append(f"residuals of anchor {name} are {seen:.2f} m, {stated:.2f} m were stated")
+        bias = float(best.biases[j])
+        if abs(bias) > 3.0 * BIAS_M:
+            told.append(f"the bias of anchor {name} would be {bias:.2f} m")
+        marked = float(np.mean(best.error[own] < -4.0 * at.sigma_m[own]))
+        if marked > rules.marked_share:
+            told.append(f"{100.0 * marked:.0f} % of the ranges to anchor {name} are too long")
+    first = at.time_s < np.median(at.time_s)
+    halves = [_half(_part(problem, half), best) for half in (first, ~first)]
+    apart = np.log(halves[0].scale / halves[1].scale)
+    sigma = float(np.hypot(*(half.sigma_log_scale for half in halves)))
+    if abs(apart) > 3.0 * sigma:
+        told.append(
+            f"the scales of the first and second half differ by {100.0 * abs(apart):.1f} %, "
+            f"{abs(apart) / sigma:.1f} sigma"
+        )
+    for j, name in enumerate(names):
+        way = halves[0].anchors[j] - halves[1].anchors[j]
+        both = halves[0].anchor_covariance(j) + halves[1].anchor_covariance(j)
+        if float(way @ np.linalg.solve(both, way)) > TWO_SIDED_3_SIGMA[3]:
+            told.append(
+                f"anchor {name} moves by {np.linalg.norm(way):.2f} m between the first and the "
+                "second half: did it move, or is the antenna not calibrated?"
+            )
+    return told
+
+
+def _half(problem: Problem, best: Solution) -> Solution:
+    return polished(problem, best)
+
+
+def _part(problem: Problem, kept: Array) -> Problem:
+    rows = np.flatnonzero(kept)
+    return replace(
+        problem,
+        places=problem.places.rows(rows),
+        drift=problem.drift[rows],
+        walk=problem.walk[rows],
+    )
+
+
+def later_anchor(
+    problem: Problem, log_scale: float, rules: StartRules
+) -> list[tuple[Array, Array, float]]:
+    """Return places of one anchor whose scale is known: unknowns (4,), covariance (4, 4), deviance.
+
+    Best first, only distinct ones, from the middle of the path as in `Problem`; the problem is of
+    this anchor alone and without modes.
+    """
+    found = _placed(problem, [], log_scale)
+    made = np.zeros((len(found), problem.n_unknowns))
+    made[:, 0] = log_scale
+    made[:, 2:] = [own for own, _ in found]
+    kept = [(row, cost) for row, (_, cost) in zip(made, found, strict=True)]
+    told = []
+    for row, cost in kept:
+        if cost > kept[0][1] + rules.gap:
+            break
+        told.append((row[2:], solution(problem, row, is_near=True).covariance[2:, 2:], cost))
+    return told
