@@ -121,7 +121,7 @@ class _State(NamedTuple):
     extra: Array
 
 
-def adjust(problem: Problem, effort: Effort = Effort()) -> Adjusted:
+def adjust(problem: Problem, effort: Effort = Effort()) -> Adjusted:  # noqa: B008
     """Return the adjusted problem."""
     return _Adjustment(problem, effort).run()
 
@@ -209,7 +209,9 @@ class _Adjustment:
         matrix[np.diag_indices(n)] += 1e-9
         return reduced, matrix, slope
 
-    def _step(self, state: _State, weight: Array, further_weight: Array, damping: float) -> _State:
+    def _step(
+        self, state: _State, weight: Array, further_weight: Array, damping: float
+    ) -> _State:
         reduced, matrix, slope = self._system(state, weight, further_weight, damping)
         try:
             step = -linalg.cho_solve(linalg.cho_factor(matrix, check_finite=False), slope)
@@ -302,7 +304,9 @@ class _Adjustment:
         block = self.column[rows.pose]
         at = np.where(block >= 0, block, 0)[:, None] * 6 + np.arange(6)
         by_pose = rows.by_pose * (block >= 0)[:, None]
-        extra = np.broadcast_to(self.n_poses + np.arange(self.n_extra), (len(block), self.n_extra))
+        extra = np.broadcast_to(
+            self.n_poses + np.arange(self.n_extra), (len(block), self.n_extra)
+        )
         columns = np.concatenate([at, extra], axis=1) if self.n_poses else extra
         J = np.concatenate([by_pose, rows.by_extra], axis=1) if self.n_poses else rows.by_extra
         parts = covariance[columns[:, :, None], columns[:, None, :]]

@@ -67,29 +67,30 @@ def errors_numpy(R_cw: Array, t_cw: Array, points: Array, views: Views) -> Array
 
 
 def reduced(
-    R_cw: Array,
-    t_cw: Array,
-    points: Array,
-    views: Views,
-    weight: Array,
-    column: Indices,
+    R_cw: Array, t_cw: Array, points: Array, views: Views, weight: Array, column: Indices,
     damping: float,
 ) -> Reduced:
     """Return the weighted normal equations, damped by a share of their diagonal, and reduced."""
     n_free = int(column.max(initial=-1)) + 1
     if numba_is_used():
-        return Reduced(*_reduced_loop(R_cw, t_cw, points, *views, weight, column, n_free, damping))
+        return Reduced(
+            *_reduced_loop(R_cw, t_cw, points, *views, weight, column, n_free, damping)
+        )
     return reduced_numpy(R_cw, t_cw, points, views, weight, column, damping)
 
 
-def jacobians(R_cw: Array, t_cw: Array, points: Array, views: Views) -> tuple[Array, Array, Array]:
+def jacobians(
+    R_cw: Array, t_cw: Array, points: Array, views: Views
+) -> tuple[Array, Array, Array]:
     """Return whitened errors (n, 2), their Jacobians by pose (n, 2, 6) and by point (n, 2, 3)."""
     R = R_cw[views.pose]
     x_c = np.einsum("nij,nj->ni", R, points[views.point]) + t_cw[views.pose]
     ahead = x_c[:, 2] > 1e-6
     inverse = 1.0 / np.where(ahead, x_c[:, 2], 1.0)
     u, v = x_c[:, 0] * inverse, x_c[:, 1] * inverse
-    error = np.where(ahead[:, None], (np.stack([u, v], axis=1) - views.xy) * views.scale, 1e3)
+    error = np.where(
+        ahead[:, None], (np.stack([u, v], axis=1) - views.xy) * views.scale, 1e3
+    )
     by_pose = np.zeros((len(u), 2, 6))
     by_pose[:, 0, 0] = by_pose[:, 1, 1] = inverse
     by_pose[:, 0, 2], by_pose[:, 1, 2] = -u * inverse, -v * inverse
@@ -100,12 +101,7 @@ def jacobians(R_cw: Array, t_cw: Array, points: Array, views: Views) -> tuple[Ar
 
 
 def reduced_numpy(
-    R_cw: Array,
-    t_cw: Array,
-    points: Array,
-    views: Views,
-    weight: Array,
-    column: Indices,
+    R_cw: Array, t_cw: Array, points: Array, views: Views, weight: Array, column: Indices,
     damping: float,
 ) -> Reduced:
     """Return :func:`reduced` by NumPy and a sparse product."""
@@ -119,8 +115,7 @@ def reduced_numpy(
     matrix = np.zeros((n_free, n_free, 6, 6))
     slope = np.zeros((n_free, 6))
     np.add.at(
-        matrix,
-        (block[moving], block[moving]),
+        matrix, (block[moving], block[moving]),
         np.einsum("nka,nkb->nab", weighted, by_pose)[moving],
     )
     np.add.at(slope, block[moving], np.einsum("nka,nk->na", weighted, error)[moving])
@@ -201,18 +196,8 @@ def _one_view(  # pragma: no cover  (compiled)
 
 @compiled
 def _reduced_loop(  # pragma: no cover  (compiled)
-    R_cw: Any,
-    t_cw: Any,
-    points: Any,
-    first: Any,
-    point: Any,
-    pose: Any,
-    xy: Any,
-    scale: Any,
-    weight: Any,
-    column: Any,
-    n_free: int,
-    damping: float,
+    R_cw: Any, t_cw: Any, points: Any, first: Any, point: Any, pose: Any, xy: Any, scale: Any,
+    weight: Any, column: Any, n_free: int, damping: float,
 ) -> Any:
     n, n_points = len(point), len(points)
     matrix, slope = np.zeros((6 * n_free, 6 * n_free)), np.zeros(6 * n_free)
@@ -261,9 +246,7 @@ def _reduced_loop(  # pragma: no cover  (compiled)
             for a in range(6):
                 for b in range(3):
                     Y[a, b] = (
-                        cross[o, a, 0] * I[0, b]
-                        + cross[o, a, 1] * I[1, b]
-                        + cross[o, a, 2] * I[2, b]
+                        cross[o, a, 0] * I[0, b] + cross[o, a, 1] * I[1, b] + cross[o, a, 2] * I[2, b]
                     )
                 slope[6 * c + a] -= (
                     Y[a, 0] * point_slope[i, 0]
@@ -297,12 +280,7 @@ def point_steps(system: Reduced, views: Views, column: Indices, step: Array) -> 
 
 
 def variances(
-    R_cw: Array,
-    t_cw: Array,
-    points: Array,
-    views: Views,
-    system: Reduced,
-    column: Indices,
+    R_cw: Array, t_cw: Array, points: Array, views: Views, system: Reduced, column: Indices,
     covariance: Array,
 ) -> Array:
     """Return the variance (n,) of each whitened reprojection's prediction, mean of both axes.
@@ -320,12 +298,7 @@ def variances(
 
 
 def variances_numpy(
-    R_cw: Array,
-    t_cw: Array,
-    points: Array,
-    views: Views,
-    system: Reduced,
-    column: Indices,
+    R_cw: Array, t_cw: Array, points: Array, views: Views, system: Reduced, column: Indices,
     covariance: Array,
 ) -> Array:
     """Return :func:`variances` by NumPy, a point at a time in pairs of its observations."""
@@ -336,9 +309,8 @@ def variances_numpy(
     count = np.diff(views.first)
     left = np.repeat(np.arange(len(views.point)), count[views.point])
     begin = np.repeat(views.first[views.point], count[views.point])
-    along = np.arange(len(left)) - np.repeat(
-        np.cumsum(count[views.point]) - count[views.point], count[views.point]
-    )
+    along = np.arange(len(left)) - np.repeat(np.cumsum(count[views.point]) - count[views.point],
+                                             count[views.point])
     right = begin + along
     both = (block[left] >= 0) & (block[right] >= 0)
     left, right = left[both], right[both]
@@ -361,18 +333,8 @@ def variances_numpy(
 
 @compiled
 def _variances_loop(  # pragma: no cover  (compiled)
-    R_cw: Any,
-    t_cw: Any,
-    points: Any,
-    first: Any,
-    point: Any,
-    pose: Any,
-    xy: Any,
-    scale: Any,
-    column: Any,
-    inverse: Any,
-    cross: Any,
-    covariance: Any,
+    R_cw: Any, t_cw: Any, points: Any, first: Any, point: Any, pose: Any, xy: Any, scale: Any,
+    column: Any, inverse: Any, cross: Any, covariance: Any,
 ) -> Any:
     n = len(point)
     out = np.zeros(n)

@@ -274,7 +274,9 @@ class Mapper:
         point_at = np.full(world.points.size, -1)
         point_at[window.points] = np.arange(len(window.points))
         rows = window.rows
-        scale = focal_scale(self._camera, world.rows["octave"][rows], self._settings.pixel_sigma)
+        scale = focal_scale(
+            self._camera, world.rows["octave"][rows], self._settings.pixel_sigma
+        )
         views = sorted_views(
             frame_at[world.rows["frame"][rows]], point_at[world.rows["point"][rows]],
             world.rows["xy"][rows], scale, len(window.points),

@@ -23,9 +23,9 @@ from ssm_graph.systems.visual_ranges.range_fit import (
     Places,
     Problem,
     Solution,
-    polished,
     problem_of,
     search,
+    polished,
     solution,
     with_sigma,
 )

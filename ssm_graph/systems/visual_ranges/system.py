@@ -194,7 +194,9 @@ class _Run:
     def find_again(self, i: int, image: Image) -> bool:
         """Look for a lost camera in the map; return whether it was found."""
         with self.timed("relocalisation"):
-            found = relocalise(self.world, self.loops, self.camera, image, self.settings.n_corners)
+            found = relocalise(
+                self.world, self.loops, self.camera, image, self.settings.n_corners
+            )
         if found is None:
             return False
         with self.world.lock:
@@ -214,7 +216,9 @@ class _Run:
         translation = float(np.linalg.norm(self.tracker.relative.centre)) / self.tracker.depth
         if translation < s.key_least_translation and rotation < s.key_least_rotation_rad:
             return False
-        since = float(self.sequence.time_s[i] - self.world.frames["time_s"][self.tracker.reference])
+        since = float(
+            self.sequence.time_s[i] - self.world.frames["time_s"][self.tracker.reference]
+        )
         few = found.n_points < max(
             s.key_share * self.n_tracked[self.world.frames["image"][self.tracker.reference]],
             s.key_least_points,
@@ -294,7 +298,9 @@ class _Run:
         for text in told:
             self.note(i, text)
 
-    def record(self, i: int, pose: Pose, reference: int, n_points: int, tracks: Tracks) -> None:
+    def record(
+        self, i: int, pose: Pose, reference: int, n_points: int, tracks: Tracks
+    ) -> None:
         """Keep a frame's pose relative to its key frame."""
         relative = pose.after(self.world.pose(reference).inverse())
         self.state[i], self.reference[i] = FrameState.TRACKED, reference
@@ -328,10 +334,7 @@ class _Run:
             on = point >= 0
             if i in keys or on.sum() < self.settings.least_inliers:
                 continue
-            places, xy = (
-                self.world.points["place"][point[on]],
-                self.camera.normalise(tracks.pixel[on]),
-            )
+            places, xy = self.world.points["place"][point[on]], self.camera.normalise(tracks.pixel[on])
             refined = refine_pose(Pose(R[i], t[i]), places, xy, self.tracker.whitening(len(xy)))
             self.record(i, refined.pose, int(self.reference[i]), int(self.n_tracked[i]), tracks)
 
