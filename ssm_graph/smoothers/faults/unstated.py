@@ -119,14 +119,16 @@ class Unstated:
                 lines.append(f"{key} = {slow.walk / OF_INSTABILITY / unit:.2g}")
                 continue
             white = np.sqrt(max(1.0 - slow.share**2, 0.1))
-            key, unit = DRIFTS.get(slow.name, ("", ""))
+            key, shown = DRIFTS.get(slow.name, ("", ""))
             remedy = "state larger sigmas"
             if key:
                 remedy = (
                     f"[{slow.name.lower()}] {key} = {slow.sigma:.2g}, "
                     f"drift_correlation_s = {slow.correlation_s:g}, drift_white_share = {white:.2g}"
                 )
-            said = f"errs alike for {slow.correlation_s:g} s or so, by {slow.sigma:.2g}{unit}"
+            chi_sq, mean = self.chi_sq[slow.name]
+            errs = "errs" if chi_sq > mean else "may err"
+            said = f"{errs} alike for {slow.correlation_s:g} s or so, by {slow.sigma:.2g}{shown}"
             yield found(slow.name, [slow.name], f"{said}, more than mission.toml states", remedy)
         if len(sizes):
             imu.append(ERRORS)
