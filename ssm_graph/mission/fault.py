@@ -52,6 +52,8 @@ class DetectedFault(ShortRepr):
     """By how much the horizontal position moves, at most, between the explanations, m."""
     remedy: str = ""
     """What to look at, or the line of ``mission.toml`` that mends it."""
+    late_s: float | None = None
+    """How late its stamps are, s, if that is what is off."""
 
     @property
     def is_decided(self) -> bool:

@@ -367,11 +367,23 @@ def test_the_answer_says_it_first() -> None:
     """The status is SUSPECT, the sentence stands first, the fault is among the estimate's."""
     mission = healthy("survey", Grade.TACTICAL, 46)
     assert mission.gnss is not None
-    late = replace(mission, gnss=replace(mission.gnss, time_s=mission.gnss.time_s + 1.0))
+    late = replace(mission, gnss=replace(mission.gnss, time_s=mission.gnss.time_s + 5.0))
     estimate = sg.smooth(late)
     assert estimate.status is sg.Status.SUSPECT
     assert estimate.reason.startswith(estimate.faults[0].sentence)
     assert estimate.faults[0].sensor == "GNSS"
+
+
+def test_a_clock_that_is_taken_off_is_said_once() -> None:
+    """Fixes a second late: the line that mends it, of an answer that is right."""
+    mission = healthy("survey", Grade.TACTICAL, 46)
+    assert mission.gnss is not None
+    late = replace(mission, gnss=replace(mission.gnss, time_s=mission.gnss.time_s + 1.0))
+    estimate = sg.smooth(late)
+    assert estimate.status is sg.Status.CONVERGED
+    (found,) = (one for one in estimate.faults if one.late_s is not None)
+    assert (found.sensor, found.treatment) == ("GNSS", Treatment.FREED)
+    assert found.remedy.startswith("[gnss] time_offset_s = ")
 
 
 def test_a_solver_that_fails_says_it_too(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Final
 
 from ssm_graph.mission.estimate import Estimate, Status
-from ssm_graph.mission.fault import DetectedFault
+from ssm_graph.mission.fault import DetectedFault, Treatment
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.suspects.families import SET_S, clock_families, scale_families
 from ssm_graph.mission.suspects.hypothesis import NOTHING, Delay, Hypothesis
@@ -29,6 +29,12 @@ from ssm_graph.mission.suspects.search import (
 
 MOST: Final = 3
 """Suspects of one mission; with more, nothing is known."""
+
+
+TAKEN_OFF_S: Final = 2.0
+"""A longer delay is no linear function of the speed in a turn."""
+SAME_DELAY_S: Final = 0.2
+AT_ENDS_S: Final = 2.0
 
 
 AS_GOOD: Final = 10.0
@@ -61,7 +67,16 @@ def find_suspects(mission: Mission) -> tuple[DetectedFault, ...]:
 
 
 def with_suspects(estimate: Estimate, suspects: tuple[DetectedFault, ...]) -> Estimate:
-    """Return an estimate that says what is suspect, first of all."""
+    """Return an estimate that says what is suspect, first of all.
+
+    A clock that the estimate has taken off by as much is none any more: its line stays.
+    """
+    known = [one for one in suspects if _is_taken_off(one, estimate)]
+    suspects = tuple(one for one in suspects if one not in known)
+    if known:
+        done = tuple(replace(one, treatment=Treatment.FREED) for one in known)
+        others = (one for one in estimate.faults if not any(_is_same(one, own) for own in known))
+        estimate = replace(estimate, faults=(*done, *others))
     if not suspects:
         return estimate
     unsettled = [] if estimate.status is Status.CONVERGED else [estimate.reason]
@@ -71,6 +86,20 @@ def with_suspects(estimate: Estimate, suspects: tuple[DetectedFault, ...]) -> Es
         reason="; ".join([*(suspect.sentence for suspect in suspects), *unsettled]),
         faults=(*suspects, *estimate.faults),
     )
+
+
+def _is_taken_off(suspect: DetectedFault, estimate: Estimate) -> bool:
+    return any(one.is_decided and _is_same(one, suspect) for one in estimate.faults)
+
+
+def _is_same(one: DetectedFault, suspect: DetectedFault) -> bool:
+    """Return whether a clock is taken off all the time, by what the logs alone say."""
+    if one.late_s is None or suspect.late_s is None or one.treatment is not Treatment.FREED:
+        return False
+    is_whole = one.begin_s <= suspect.begin_s + AT_ENDS_S and one.end_s >= suspect.end_s - AT_ENDS_S
+    is_small = abs(suspect.late_s) <= TAKEN_OFF_S
+    is_like = abs(one.late_s - suspect.late_s) <= SAME_DELAY_S
+    return one.sensor == suspect.sensor and is_whole and is_small and is_like
 
 
 def search(mission: Mission) -> list[Found]:

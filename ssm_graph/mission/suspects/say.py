@@ -72,6 +72,7 @@ def said(found: Found, mission: Mission, order: tuple[int, ...] | None = None) -
             f"{sensor_of(rival)}, {_words(rival, mission, order)[0]}" for rival in found.rivals
         ),
         remedy=remedy,
+        late_s=found.value if found.family.clocks and not found.is_set else None,
     )
 
 

@@ -274,7 +274,7 @@ class Channels:
     def dim_of(self, name: str) -> int:
         """Return how many numbers a channel has."""
         own = self.of(name).columns
-        return own.stop - own.start
+        return int(own.stop - own.start)
 
     @property
     def beam_noise(self) -> Array:

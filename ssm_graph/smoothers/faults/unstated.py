@@ -53,11 +53,11 @@ BIASES: Final = {
     GYROS: ("gyro_bias_instability_deg_per_h", DEG_PER_H),
 }
 DRIFTS: Final = {
-    DVL: "drift_sigma_m_per_s",
-    "GNSS": "drift_sigma_m",
-    "depth": "drift_sigma_m",
+    DVL: ("drift_sigma_m_per_s", " m/s"),
+    "GNSS": ("drift_sigma_m", " m"),
+    "depth": ("drift_sigma_m", " m"),
 }
-"""Keys of ``mission.toml`` that state what wanders."""
+"""Keys of ``mission.toml`` that state what wanders, and units."""
 SCALES: Final = np.geomspace(1.0 / 64.0, 2.0, 15)
 """Of the sigma of biases that wander, which may be likeliest."""
 
@@ -119,14 +119,16 @@ class Unstated:
                 lines.append(f"{key} = {slow.walk / OF_INSTABILITY / unit:.2g}")
                 continue
             white = np.sqrt(max(1.0 - slow.share**2, 0.1))
-            key = DRIFTS.get(slow.name)
+            key, shown = DRIFTS.get(slow.name, ("", ""))
             remedy = "state larger sigmas"
-            if key is not None:
+            if key:
                 remedy = (
                     f"[{slow.name.lower()}] {key} = {slow.sigma:.2g}, "
                     f"drift_correlation_s = {slow.correlation_s:g}, drift_white_share = {white:.2g}"
                 )
-            said = f"errs alike for {slow.correlation_s:g} s or so, by {slow.sigma:.2g}"
+            chi_sq, mean = self.chi_sq[slow.name]
+            errs = "errs" if chi_sq > mean else "may err"
+            said = f"{errs} alike for {slow.correlation_s:g} s or so, by {slow.sigma:.2g}{shown}"
             yield found(slow.name, [slow.name], f"{said}, more than mission.toml states", remedy)
         if len(sizes):
             imu.append(ERRORS)

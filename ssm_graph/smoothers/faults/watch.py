@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from factors.similarity import WEIGHT_FLOOR
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps
+from ssm_graph.engine.chain import ChainSolution
 from ssm_graph.engine.extras import Extras
 from ssm_graph.engine.reweighting import NEAR_SIGMAS
 from ssm_graph.engine.states import States
 from ssm_graph.graph.freed import Freed
-from ssm_graph.graph.inertial_rows import InertialFit
+from ssm_graph.graph.inertial_rows import InertialFit, inertial_fit
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.measurements import aids_of
 from ssm_graph.mission.fault import DetectedFault, Treatment
@@ -25,6 +26,7 @@ from ssm_graph.mission.problem import Problem
 from ssm_graph.smoothers.faults.columns import (
     BEAM,
     BOTTOM,
+    CLOCK,
     IMU,
     MOUNTING,
     SCALE,
@@ -69,6 +71,8 @@ class FaultWatch:
         """what it found, if the search ended without settling"""
         self._unstated: Unstated | None = None
         """What instruments were found to err in beyond what they state"""
+        self._contradicted: list[DetectedFault] = []
+        """What the inertial data contradicted before that was allowed for"""
         self._is_statement_judged = False
         self._beams_out = np.zeros(len(problem.beams.speed), bool)
         self.aids_out = np.zeros(sum(len(aid) for aid in aids_of(problem)), bool)
@@ -84,12 +88,17 @@ class FaultWatch:
         return np.where(self.aids_out, WEIGHT_FLOOR, weights)
 
     def look_steps(
-        self, linearizer: GraphLinearizer, states: States, *, update_sigmas: float
+        self,
+        linearizer: GraphLinearizer,
+        states: States,
+        step: ChainSolution,
+        *,
+        update_sigmas: float,
     ) -> Steps[Changed | None]:
         """Search once the solution is near; return what has changed, None for nothing.
 
         What is found is freed; then it is searched again at what the solution has become, until
-        nothing changes any more. ``linearizer`` is that of the pass.
+        nothing changes any more. ``linearizer`` and ``step`` are those of the pass.
         """
         if self._is_done or self._bare is None or self._search is None:
             return None
@@ -113,6 +122,8 @@ class FaultWatch:
             self._unstated = self._search.unstated(judge, channels, self._sized(states))
             if self._unstated is not None:
                 is_same = False
+                fit = inertial_fit(linearizer.inertial_rows(states), step)
+                self._contradicted = noisier_than_stated(fit, self._problem.keyframe_s)
                 chain = self._unstated.widened(self._problem.chain)
                 self._problem = replace(self._problem, chain=chain)
                 self._bare = GraphLinearizer(self._problem)
@@ -231,13 +242,25 @@ class FaultWatch:
                     treatment=treatment,
                     rivals=tuple(rivals),
                     cost_m=fault.cost_m,
+                    late_s=late_of(fault),
                 )
             )
         if self._unstated is not None:
             n = len(states.constants) - len(self._unstated.errors_sigma)
             span_s = float(end_s[0]), float(end_s[-1])
             found.extend(self._unstated.faults(states.constants[n:], *span_s))
-        return (*found, *noisier_than_stated(inertial, self._problem.keyframe_s))
+        left = noisier_than_stated(inertial, self._problem.keyframe_s)
+        lines = [one.remedy for one in found if one.treatment is Treatment.WIDENED]
+        before = [
+            replace(one, remedy="; ".join([*lines, one.remedy])) for one in self._contradicted
+        ]
+        return (*found, *(left or before))
+
+
+def late_of(fault: Fault) -> float | None:
+    """Return the delay of a clock, s, None of what is none."""
+    is_clock = fault.hypothesis.channel.endswith(CLOCK) and fault.sizes is not None
+    return float(fault.sizes[0]) if is_clock and fault.sizes is not None else None
 
 
 def said(fault: Fault) -> str:
