@@ -88,11 +88,11 @@ def read_starloc(folder: Path, antenna: int | None = None) -> StarLocRun:
     places = _anchors(folder, rows)
     names = [str(int(x)) for x in rows["to_id"]]
     ranges = screened_ranges(rows["time_s"], names, rows["range"], source=f"{folder.name}/uwb.csv")
-    error = np.interp(ranges.time_s, rows["time_s"], rows["range"] - rows["gt_range"])
+    over = np.interp(ranges.time_s, rows["time_s"], rows["range"] - rows["gt_range"])
     for j, name in enumerate(ranges.names):
         mine = rows["to_id"].astype(int) == int(name)
         kept = ranges.anchor == j
-        error[kept] = (rows["range"] - rows["gt_range"])[mine][
+        over[kept] = (rows["range"] - rows["gt_range"])[mine][
             np.searchsorted(rows["time_s"][mine], ranges.time_s[kept])
         ]
     return StarLocRun(
@@ -102,7 +102,7 @@ def read_starloc(folder: Path, antenna: int | None = None) -> StarLocRun:
         lever,
         _path(uwb, R_cr, t_cr),
         np.array([places.get(name, np.full(3, np.nan)) for name in ranges.names]),
-        error,
+        over,
         tags["time_s"],
         tags["apriltag_id"].astype(np.int64),
         np.column_stack([tags["left_u"], tags["left_v"]]),
