@@ -6,8 +6,8 @@ far at their present places, never from those of a window alone, with which an a
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Final
+from dataclasses import replace
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from ssm_graph.systems.visual_ranges.range_fit import (
     solution,
     unknowns_of,
 )
+from ssm_graph.systems.visual_ranges.range_rows import largest_turn, of_anchors, plain_errors
 from ssm_graph.systems.visual_ranges.range_terms import FramePoses, RangeTerms, hang
 from ssm_graph.systems.visual_ranges.ranges import Indices, Ranges
 from ssm_graph.systems.visual_ranges.ranging_result import Anchor, AnchorState, RangingResult
@@ -41,23 +42,24 @@ __all__ = ["Anchor", "AnchorState", "Ranging", "RangingResult"]
 
 TRY_AGAIN: Final = 1.15
 """A start is tried again when so many times the ranges are there."""
-RECENT_S: Final = 10.0
+RECENT_S: Final = 5.0
 CHECK_AGAIN: Final = 1.5
 """And all is searched again when so many times the ranges are there."""
 LEAST_RECENT: Final = 20
 SAME_PLACE_M: Final = 0.2
 DOUBTFUL_SHARE: Final = 0.6
-"""Of the last 10 s of an anchor's ranges, with next to no weight."""
+"""Of the last 5 s of an anchor's ranges, with next to no weight."""
 
 
-@dataclass(slots=True)
-class _Own:
+class _Own(NamedTuple):
     """What is kept of an anchor."""
 
     name: str
     state: AnchorState = AnchorState.UNKNOWN
     alternatives: tuple[tuple[Array, float], ...] = ()
     """Places (3,) m, and biases."""
+    lost_s: float = np.inf
+    """From then on its ranges fit no more, and are left out."""
 
 
 class Ranging(ShortRepr):
@@ -116,7 +118,7 @@ class Ranging(ShortRepr):
             if len(places.time_s) < TRY_AGAIN * self._tried:
                 return []
             self._tried = len(places.time_s)
-            told = self._start(places, _turned(R_cw))
+            told = self._start(places, largest_turn(R_cw))
         else:
             told = [*self._go_on(places, now), *self._later(places)]
         if self.found is not None:
@@ -126,8 +128,7 @@ class Ranging(ShortRepr):
     def restart(self) -> None:
         """Forget scale and anchors: the map's scale has changed. The next update starts anew."""
         self.found, self._tried, self._checked = None, 0, 0
-        for own in self.anchors:
-            own.state, own.alternatives = AnchorState.UNKNOWN, ()
+        self.anchors = [_Own(own.name) for own in self.anchors]
 
     def further(
         self, pose_of: Indices, *, is_free: bool = False, least_weight: float = 0.0
@@ -230,7 +231,7 @@ class Ranging(ShortRepr):
         eligible = np.flatnonzero(counts >= self.rules.least_ranges)
         if not len(eligible):
             eligible = np.array([int(np.argmax(counts))])
-        own, _ = _of(places, eligible)
+        own, _ = of_anchors(places, eligible)
         names = tuple(self.anchors[j].name for j in eligible)
         self.start = find_start(own, names, self.rules, turned_rad=turned_rad)
         if not self.start.has_scale or self.start.solution is None:
@@ -240,9 +241,12 @@ class Ranging(ShortRepr):
         self.started_s = float(places.time_s[-1])
         for i, j in enumerate(self.used):
             is_ready = self.start.anchor_ready[i]
-            self.anchors[j].state = AnchorState.READY if is_ready else AnchorState.AMBIGUOUS
-            self.anchors[j].alternatives = tuple(
-                (one.anchors[i].copy(), float(one.biases[i])) for one in self.start.alternatives
+            self._set(
+                j,
+                state=AnchorState.READY if is_ready else AnchorState.AMBIGUOUS,
+                alternatives=tuple(
+                    (one.anchors[i].copy(), float(one.biases[i])) for one in self.start.alternatives
+                ),
             )
         self._go_on(places, self.started_s)
         found = self.found
@@ -252,10 +256,16 @@ class Ranging(ShortRepr):
                         for j in self.used)
         ]  # fmt: skip
 
+    def _set(self, j: int, **changed: Any) -> None:
+        self.anchors[j] = self.anchors[j]._replace(**changed)
+
     def _go_on(self, places: Places, now: float) -> list[str]:
         """Take up all ranges of the anchors in use."""
         assert self.found is not None
-        own, kept = _of(places, np.array(self.used))
+        everything, kept = of_anchors(places, np.array(self.used))
+        lost_s = np.array([self.anchors[j].lost_s for j in self.used])
+        fits = np.flatnonzero(everything.time_s < lost_s[everything.anchor])
+        own = everything.rows(fits)
         problem = problem_of(
             own,
             len(self.used),
@@ -275,8 +285,9 @@ class Ranging(ShortRepr):
             told = []
         assert self.terms is not None
         row = self.terms.row[kept]
-        self.error[row], self.weight[row] = self.found.error, self.found.weight
-        return [*told, *self._sharpened(problem, now)]
+        self.error[row], self.weight[row] = plain_errors(everything, self.found)
+        self.error[row[fits]], self.weight[row[fits]] = self.found.error, self.found.weight
+        return [*told, *self._sharpened(everything, self.weight[row], now)]
 
     def _check(self, own: Places, problem: Problem) -> list[str]:
         """Search everywhere again, with all ranges of the anchors in use; take what is better."""
@@ -306,21 +317,21 @@ class Ranging(ShortRepr):
             if self.anchors[j].alternatives:
                 self._against_rivals(problem, i)
 
-    def _sharpened(self, problem: Problem, now: float) -> list[str]:
+    def _sharpened(self, at: Places, weight: Array, now: float) -> list[str]:
         """Judge the anchors anew: sharpness, and whether the last ranges fit."""
-        assert self.found is not None
         told = []
         for i, j in enumerate(self.used):
-            own, at = self.anchors[j], problem.places
+            own = self.anchors[j]
             recent = (at.anchor == i) & (at.time_s > now - RECENT_S)
-            marked = self.found.weight[recent] < NLOS_WEIGHT
             is_sharp = not own.alternatives and self._is_sharp(i, at)
             state = AnchorState.READY if is_sharp else AnchorState.AMBIGUOUS
+            lost_s = np.inf
+            marked = weight[recent] < NLOS_WEIGHT
             if recent.sum() >= LEAST_RECENT and float(np.mean(marked)) > DOUBTFUL_SHARE:
-                state = AnchorState.DOUBTFUL
+                state, lost_s = AnchorState.DOUBTFUL, min(own.lost_s, self._lost_since(j))
             if own.state is not state:
                 told.append(f"anchor {own.name}: {state.value}")
-            own.state = state
+            self._set(j, state=state, lost_s=lost_s)
         return told
 
     def _is_sharp(self, i: int, at: Places) -> bool:
@@ -349,7 +360,7 @@ class Ranging(ShortRepr):
             apart = float(np.linalg.norm(place - found.anchors[i])) > SAME_PLACE_M
             if apart and cost < least + self.rules.gap:
                 kept.append((place, float(one[3])))
-        own.alternatives = (*kept,)
+        self._set(self.used[i], alternatives=(*kept,))
 
     def _later(self, places: Places) -> list[str]:
         """Place anchors that have ranges enough by now, and anew those that seem to have moved."""
@@ -358,7 +369,7 @@ class Ranging(ShortRepr):
             own, unused = self.anchors[j], j not in self.used
             is_lost = own.state is AnchorState.DOUBTFUL
             mine = places.anchor == j
-            since = self._lost_since(j) if is_lost else -np.inf
+            since = own.lost_s if is_lost else -np.inf
             mine = mine & (places.time_s >= since)
             rows = np.flatnonzero(mine)
             if not (unused or is_lost) or len(rows) < self.rules.least_ranges:
@@ -404,9 +415,9 @@ class Ranging(ShortRepr):
             recent = (self.anchor == j) & (self.ranges.time_s >= since)
             self.anchors.append(_Own(f"{name} from {since:.1f} s"))
             self.anchor[recent] = len(self.anchors) - 1
-            self.anchors[j].state = AnchorState.READY
+            self._set(j, state=AnchorState.READY, lost_s=np.inf)
             j = len(self.anchors) - 1
-        self.anchors[j].state = AnchorState.READY
+        self._set(j, state=AnchorState.READY)
         self.used.append(j)
         found = self.found
         n = len(found.covariance)
@@ -419,19 +430,3 @@ class Ranging(ShortRepr):
             covariance=wider,
         )
         return f"anchor {name} " + ("has moved: placed anew" if moved else "placed")
-
-
-def _of(places: Places, anchors: Indices) -> tuple[Places, Indices]:
-    """Return the places of some anchors, counted anew, and their rows."""
-    column = np.full(int(places.anchor.max(initial=0)) + 1, -1, dtype=np.intp)
-    inside = anchors[anchors < len(column)]
-    column[inside] = np.flatnonzero(anchors < len(column))
-    kept = np.flatnonzero(column[places.anchor] >= 0)
-    own = places.rows(kept)
-    return own._replace(anchor=column[own.anchor]), kept
-
-
-def _turned(R_cw: Array) -> float:
-    """Return the largest angle from the first camera's axes, rad."""
-    cosine = (np.einsum("kij,ij->k", R_cw, R_cw[0]) - 1.0) / 2.0
-    return float(np.arccos(np.clip(cosine.min(initial=1.0), -1.0, 1.0)))

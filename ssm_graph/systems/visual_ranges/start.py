@@ -272,7 +272,7 @@ def _placed(one: Problem, minima: list[Array], log_scale: float) -> list[tuple[A
     middle = float(np.median(one.places.range_m))
     starts = np.zeros((DIRECTIONS + len(minima), 6))
     starts[:DIRECTIONS, 2:5] = middle * _directions(DIRECTIONS)
-    starts[DIRECTIONS:] = minima
+    starts[DIRECTIONS:] = np.array(minima).reshape(-1, 6)
     starts[:, 0] = log_scale
     fit = search(one, starts, held=np.array([0, 1]))
     kept = _distinct(fit.unknowns, fit.cost, 60.0)[:3]
@@ -337,18 +337,8 @@ def _judged(
         told = ", ".join(f"{one.scale / best.scale:.2f}" for one in others)
         reasons.append(f"other scales fit as well: {told} times this one (gap {gap:.1f})")
     scale_is_sharp = not reasons
-    ready = []
-    for j, name in enumerate(names):
-        sigma = float(np.sqrt(np.trace(best.anchor_covariance(j))))
-        median = float(np.median(at.range_m[at.anchor == j]))
-        limit = max(rules.anchor_sigma_m, rules.anchor_sigma_share * median)
-        rivals = [one for one in near if _moved(best, one, j)]
-        if sigma > limit:
-            reasons.append(f"anchor {name} known to {sigma:.2f} m, {limit:.2f} m are needed")
-        elif rivals:
-            way = max(float(np.linalg.norm(one.anchors[j] - best.anchors[j])) for one in rivals)
-            reasons.append(f"anchor {name} may as well be {way:.1f} m from there (gap {gap:.1f})")
-        ready.append(sigma <= limit and not rivals)
+    ready, doubts = _sharp_anchors(problem, names, rules, best, near, gap)
+    reasons += doubts
     against = contradictions(
         problem,
         names,
@@ -379,6 +369,30 @@ def _judged(
         shape, scale=best.scale, name=names[0], weakest=weakest
     )  # fmt: skip
     return Start(state, best, (*near,), gap, shape, (*reasons, *against), told, (*ready,))
+
+
+def _sharp_anchors(
+    problem: Problem,
+    names: tuple[str, ...],
+    rules: StartRules,
+    best: Solution,
+    near: list[Solution],
+    gap: float,
+) -> tuple[list[bool], list[str]]:
+    """Return which anchors are sharp and without a rival, and what the others lack."""
+    at, ready, doubts = problem.places, [], []
+    for j, name in enumerate(names):
+        sigma = float(np.sqrt(np.trace(best.anchor_covariance(j))))
+        median = float(np.median(at.range_m[at.anchor == j]))
+        limit = max(rules.anchor_sigma_m, rules.anchor_sigma_share * median)
+        rivals = [one for one in near if _moved(best, one, j)]
+        if sigma > limit:
+            doubts.append(f"anchor {name} known to {sigma:.2f} m, {limit:.2f} m are needed")
+        elif rivals:
+            way = max(float(np.linalg.norm(one.anchors[j] - best.anchors[j])) for one in rivals)
+            doubts.append(f"anchor {name} may as well be {way:.1f} m from there (gap {gap:.1f})")
+        ready.append(sigma <= limit and not rivals)
+    return ready, doubts
 
 
 def _same_scale(best: Solution, other: Solution, rules: StartRules) -> bool:
