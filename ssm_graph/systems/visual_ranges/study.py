@@ -85,9 +85,10 @@ def case_of(name: str) -> Case:
 
 
 def trial(key: Key) -> Row:
-    """Do one run; the key is the name of a case and a seed."""
+    """Do one run; the key is the name of a case, a seed, and how long, s (0: as the case says)."""
     case = case_of(str(key[0]))
-    sequence = simulate(replace(case.run, seed=int(key[1]))).sequence
+    duration_s = float(key[2]) or case.run.duration_s
+    sequence = simulate(replace(case.run, seed=int(key[1]), duration_s=duration_s)).sequence
     if not case.has_ranges:
         sequence = replace(sequence, ranges=screened_ranges([], [], []))
     images = [sequence.images(k) for k in range(len(sequence))]  # rendering is not timed
