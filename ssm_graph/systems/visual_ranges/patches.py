@@ -205,11 +205,9 @@ def _align_loop(  # pragma: no cover  (compiled)
         spread = np.sqrt((patch * patch).mean())
         gradient[:, 0] -= gradient[:, 0].mean()
         gradient[:, 1] -= gradient[:, 1].mean()
-        xx, xy, yy = 0.0, 0.0, 0.0
-        for m in range(size):
-            xx += gradient[m, 0] * gradient[m, 0]
-            xy += gradient[m, 0] * gradient[m, 1]
-            yy += gradient[m, 1] * gradient[m, 1]
+        xx = (gradient[:, 0] * gradient[:, 0]).sum()
+        xy = (gradient[:, 0] * gradient[:, 1]).sum()
+        yy = (gradient[:, 1] * gradient[:, 1]).sum()
         det, trace = xx * yy - xy * xy, xx + yy
         if not (spread > _LEAST_SPREAD and det > _FLAT * trace * trace):
             continue
