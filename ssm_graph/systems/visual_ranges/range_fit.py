@@ -330,8 +330,29 @@ def solution(
     error, J = residuals(problem, at)
     weight = problem.kernel.weight(error, variance, problem.places.sigma_m)
     covariance = covariance * problem.kernel.inefficiency(error, problem.places.sigma_m)
+    covariance = covariance * _repeated(problem, weight[0] * error[0])
     cost = float(_cost(problem, at, error)[0])
     return _outwards(problem, at[0], covariance, (error[0], variance[0], weight[0]), cost)
+
+
+def _repeated(problem: Problem, pull: Array) -> float:
+    """Return how many ranges in a row say the same: 1 plus twice the sum of autocorrelations.
+
+    ``pull`` (M,) are weighted errors. The largest of all anchors; the sum ends at the first lag
+    that is negative, or within two of its own sigmas of zero.
+    """
+    most = 1.0
+    for j in range(problem.n_anchors):
+        own = pull[problem.places.anchor == j]
+        n, square = len(own), float(own @ own)
+        total = 1.0
+        for lag in range(1, n // 4):
+            part = float(own[lag:] @ own[:-lag]) / square if square > 0.0 else 0.0
+            if part < 2.0 / np.sqrt(n):
+                break
+            total += 2.0 * part
+        most = max(most, total)
+    return most
 
 
 def _outwards(

@@ -38,6 +38,8 @@ SCALES: Final = 4
 MOST_ROWS: Final = 250
 """Ranges of an anchor that the searches take, spread over all."""
 MOST_MINIMA: Final = 6
+OPEN_SHAPES: Final = (Motion.PLANE, Motion.LINE, Motion.LINE_THROUGH_ANCHOR)
+"""Leave the anchor open, but not the scale."""
 TWO_SIDED_3_SIGMA: Final = {1: 9.0, 3: 14.16}
 """Chi-square quantiles of 0.9973 by dimension."""
 
@@ -133,12 +135,10 @@ def find_start(
         spacing=spacing,
     )
     found = _candidates(problem)
-    found, costs = _searched(problem, found)
-    best = solution(problem, found[0])
-    problem = widened(problem, best)
-    found, costs = _searched(problem, found)
-    best = polished(problem, solution(problem, found[0]))
-    rivals = [polished(problem, solution(problem, one)) for one in found[1:]]
+    problem = widened(problem, solution(problem, _best_first(problem, found)[0]))
+    ends = [solution(problem, one) for one in _best_first(problem, found)]
+    ends.sort(key=lambda one: one.cost)
+    best, *rivals = (polished(problem, one) for one in ends)
     apart = [rival for rival in rivals if _is_apart(best, rival)]
     gap = min((rival.cost - best.cost for rival in apart), default=np.inf)
     near = [rival for rival in apart if rival.cost - best.cost < rules.gap]
@@ -289,11 +289,10 @@ def _joined(problem: Problem, log_scale: float, own: list[Array]) -> Array:
     return made
 
 
-def _searched(problem: Problem, starts: list[Array]) -> tuple[list[Array], Array]:
-    """Return where searches with all modes end, best first, with their costs."""
+def _best_first(problem: Problem, starts: list[Array]) -> list[Array]:
+    """Return where searches with all modes end, the best first."""
     fit = search(problem, np.array(starts))
-    order = np.argsort(fit.cost)
-    return [fit.unknowns[row] for row in order], fit.cost[order]
+    return [fit.unknowns[row] for row in np.argsort(fit.cost)]
 
 
 def widened(problem: Problem, best: Solution) -> Problem:
@@ -361,9 +360,11 @@ def _judged(
         anchor=best.anchors[0] - best.scale * problem.middle,
         range_m=at.range_m[at.anchor == 0],
     )
+    # An anchor that is not sharp though the path is in all directions: something else is wrong.
+    is_explained = any(ready) or near or shape.motion in OPEN_SHAPES
     if against:
         state = StartState.REFUSED
-    elif not scale_is_sharp or (n_anchors == 1 and shape.motion.leaves_scale):
+    elif not (scale_is_sharp and is_explained) or (n_anchors == 1 and shape.motion.leaves_scale):
         state = StartState.AMBIGUOUS
     else:
         state = StartState.READY if all(ready) else StartState.MIRROR
