@@ -157,7 +157,10 @@ def main() -> None:
     report.places()
     ledger = Ledger(asked.out / "trials.jsonl", {"benchmark": "visual_starts"})
     lines = [*walks(ledger, seeds[: asked.walks], asked.jobs), ""]
-    lines += [f"Motions of 3 m, 200 ranges of 8 cm, drift {100 * SHAPE_DRIFT:.1f} % of the way.", ""]
+    lines += [
+        f"Motions of 3 m, 200 ranges of 8 cm, drift {100 * SHAPE_DRIFT:.1f} % of the way.",
+        "",
+    ]
     lines += [*shapes(ledger, seeds[: asked.shapes], asked.jobs), ""]
     if (DATA / "starloc").is_dir():
         lines += starloc(DATA / "starloc")

@@ -68,6 +68,8 @@ class Loop:
     """By which the new part of the map has to grow."""
     shift: float
     """How far the key frame moves, map units."""
+    apart: float
+    """Between the two cameras, as the loop has it, map units."""
     path: float
     """Walked between the two, map units."""
     judgement: RangeJudgement | None
@@ -196,6 +198,7 @@ class LoopFinder:
             len(match.rows),
             match.correction.scale,
             shift,
+            float(np.linalg.norm(match.correction.apply(centres[k]) - centres[match.matched])),
             path,
             found,
             not why,
