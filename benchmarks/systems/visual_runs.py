@@ -96,7 +96,8 @@ def main() -> None:
     lines = [
         f"Seeds {seeds[0]} to {seeds[-1]}; images of 640 x 480 at 20 Hz, ranges at 10 Hz, sigma "
         "0.08 m and a bias of 0.05 m, longer where something stands in the way. Deterministic, "
-        "one thread. Medians over runs. A loop is false where it puts two cameras 1 m or more too near or far.",
+        "one thread. Medians over runs. A loop is false where it puts two cameras 1 m or more too "
+        "near or too far.",
         "",
         *table(
             HEADER, [cells_of(c, [rows[c, s, duration] for s in seeds]) for c in report.args.cases]
