@@ -249,9 +249,9 @@ class _Adjustment:
             return
         across = np.zeros((free, 6, E))
         np.add.at(across, block[on], weighted[on, :, None] * rows.by_extra[on, None, :])
-        across = across.reshape(P, E)
-        matrix[:P, P:] += across
-        matrix[P:, :P] += across.T
+        flat = across.reshape(P, E)
+        matrix[:P, P:] += flat
+        matrix[P:, :P] += flat.T
         matrix[P:, P:] += (rows.by_extra * weight[:, None]).T @ rows.by_extra + further.prior
         slope[P:] += (rows.by_extra * weight[:, None]).T @ rows.error
         slope[P:] += further.prior @ further.prior_error(state.extra)

@@ -135,7 +135,7 @@ def reduced_numpy(
     diagonal = np.arange(3)
     own[:, diagonal, diagonal] *= 1.0 + damping
     own[:, diagonal, diagonal] += 1e-9
-    inverse = np.linalg.inv(own)
+    inverse: Array = np.asarray(np.linalg.inv(own), dtype=np.float64)
     across = cross[moving]
     rows = (block[moving, None] * 6 + np.arange(6))[:, :, None]
     columns = (views.point[moving, None] * 3 + diagonal)[:, None, :]
@@ -164,7 +164,7 @@ def point_steps(system: Reduced, views: Views, column: Indices, step: Array) -> 
     )
     pushed = np.einsum("nab,na->nb", system.cross, moved)
     summed = np.add.reduceat(pushed, views.first[:-1], axis=0) if len(pushed) else pushed
-    return -np.einsum("pab,pb->pa", system.inverse, system.point_slope + summed)
+    return np.asarray(-np.einsum("pab,pb->pa", system.inverse, system.point_slope + summed))
 
 
 def variances(
@@ -227,4 +227,4 @@ def variances_numpy(
     total = np.einsum("nka,nab,nkb->n", by_pose, own, by_pose)
     total += np.einsum("nka,nab,nkb->n", by_point, point_cov, by_point)
     total += 2.0 * np.einsum("nka,nab,nkb->n", by_pose, pose_point, by_point)
-    return 0.5 * total
+    return np.asarray(0.5 * total)

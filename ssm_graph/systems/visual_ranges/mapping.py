@@ -291,8 +291,7 @@ class Mapper:
         problem = self.problem(window, ranging)
         steps = self._settings.local_steps
         hold = int((~problem.free).sum()) < 2
-        # The posterior comes at the end: for the covariances, and for the weights of the next time.
-        found = adjust(problem, Effort(steps=steps, posterior_from=steps, hold_scale=hold))
+        found = adjust(problem, Effort(steps=steps, posterior_from=None, hold_scale=hold))
         self.take(window, found)
 
     def take(self, window: Window, found: Adjusted) -> None:

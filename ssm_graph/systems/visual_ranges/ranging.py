@@ -121,9 +121,7 @@ class _Own:
 class Ranging(ShortRepr):
     """The ranges of a run."""
 
-    def __init__(
-        self, ranges: Ranges, lever_arm_m: Array, rules: StartRules | None = None
-    ) -> None:
+    def __init__(self, ranges: Ranges, lever_arm_m: Array, rules: StartRules | None = None) -> None:
         """Take all ranges of the run; only those before the newest frame are used.
 
         Parameters
@@ -268,7 +266,10 @@ class Ranging(ShortRepr):
         if found is not None and j in self.used:
             i = self.used.index(j)
             place, covariance = found.anchors[i].copy(), found.anchor_covariance(i).copy()
-            bias, sigma = float(found.biases[i]), float(np.sqrt(found.covariance[5 + 4 * i, 5 + 4 * i]))
+            bias, sigma = (
+                float(found.biases[i]),
+                float(np.sqrt(found.covariance[5 + 4 * i, 5 + 4 * i])),
+            )
         return Anchor(
             own.name,
             own.state,
