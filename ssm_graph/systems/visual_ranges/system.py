@@ -96,6 +96,7 @@ class _Run:
         if self.settings.has_final_adjustment and self.world.n_frames > 2:
             with self.timed("last adjustment"):
                 self.adjust_all()
+                self.follow_back()
                 self.refine_frames()
         return self.answer()
 
@@ -321,6 +322,22 @@ class _Run:
         self.mapper.take(window, found)
         if self.ranging is not None and isinstance(problem.further, BundleRanges):
             self.ranging.adopt(found.extra, found.extra_covariance, problem.further)
+
+    def follow_back(self) -> None:
+        """Track what lies before the start, or before the camera was found again, backwards."""
+        R, t = self.poses()
+        is_open = self.state != FrameState.TRACKED
+        for j in (np.flatnonzero(is_open[:-1] & ~is_open[1:]) + 1).tolist():
+            k = int(self.reference[j])
+            self.tracker.start(self.sequence.images(j), self.seen[j], Pose(R[j], t[j]), k)
+            self.tracker.depth = float(self.world.frames["depth"][k])
+            for i in range(j - 1, -1, -1):
+                if not is_open[i]:
+                    break
+                found = self.tracker.follow(self.sequence.images(i))
+                if found.pose is None:
+                    break
+                self.record(i, found.pose, k, found.n_points, found.tracks)
 
     def refine_frames(self) -> None:
         """Find the pose of every frame anew from the final places of the points it saw."""
