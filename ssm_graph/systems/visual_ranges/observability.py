@@ -97,7 +97,7 @@ def shape_of(
             return Shape(motion, spread, axes, float(np.hypot(third, on_circle)))
         return Shape(Motion.PLANE, spread, axes, third)
     on_sphere = _off_sphere(centred)
-    if on_sphere < near / 4.0:
+    if on_sphere < near / 2.0:
         return Shape(Motion.SPHERE, spread, axes, on_sphere)
     return Shape(Motion.GENERAL, spread, axes, min(third, on_sphere))
 

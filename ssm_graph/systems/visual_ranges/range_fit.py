@@ -38,6 +38,8 @@ ANCHOR_M: Final = 1e3
 ROUNDS: Final = 60
 SETTLED: Final = 1e-7
 """Relative change of the cost at which a search ends."""
+STEP_DEVIANCE: Final = 0.5
+"""By which a reweighting may raise the deviance, which is not quite what it lowers."""
 SPACING_M: Final = 0.02
 """Standard deviation of the distance between two anchors whose places are known."""
 
@@ -323,9 +325,9 @@ def solution(
         covariance = np.linalg.inv(normal[0] + information)
         variance = np.einsum("mi,ij,mj->m", J[0], covariance, J[0])[None]
         step = -covariance @ (gradient[0] + information @ at[0])
-        step[0] = np.clip(step[0], -0.2, 0.2)
-        at = at + step
-        if float(np.max(np.abs(step) / np.sqrt(covariance.diagonal()))) < 1e-3:
+        moved = _kept_step(problem, at, step)
+        at = at + moved
+        if float(np.max(np.abs(moved) / np.sqrt(covariance.diagonal()))) < 1e-3:
             break
     error, J = residuals(problem, at)
     weight = problem.kernel.weight(error, variance, problem.places.sigma_m)
@@ -379,6 +381,20 @@ def _outwards(
         *each,
         cost,
     )
+
+
+def _kept_step(problem: Problem, at: Array, step: Array) -> Array:
+    """Return a step (P,), or a part of it, that does not leave the minimum; zero if none.
+
+    Along what is not observable a full step may go anywhere.
+    """
+    shares = np.array([1.0, 0.3, 0.1, 0.03])
+    tried = np.vstack([at, at + shares[:, None] * step])
+    cost = _cost(problem, tried, residuals(problem, tried)[0])
+    for share, new in zip(shares, cost[1:], strict=True):
+        if new < cost[0] + STEP_DEVIANCE:
+            return np.asarray(share * step)
+    return np.zeros_like(step)
 
 
 def polished(problem: Problem, found: Solution) -> Solution:
