@@ -156,6 +156,7 @@ class Recorder:
     """Takes answers."""
 
     set_by_s = 0.0
+    is_behind = False
 
     def __init__(self, *forms: OutputFormat) -> None:
         self.forms = forms or tuple(OutputFormat)

@@ -12,6 +12,7 @@ from ssm_graph.base.errors import ConfigError
 from ssm_graph.cli.answers import add_answer_arguments, asked_track
 from ssm_graph.cli.terminal import say
 from ssm_graph.io.export.formats import FORMATS, export_track
+from ssm_graph.io.results.tables import read_results
 
 DESCRIPTION = f"""\
 Write the trajectory of a result folder in other formats:
@@ -85,3 +86,6 @@ def export(
         path = out if is_whole else out / f"{stem}{asked.suffix}{suffix}"
         for written in export_track(asked.track, name, path):
             say(console, f"{written}: {written.stat().st_size:,} bytes")
+    said = read_results(result).summary.get("local_start")
+    if said:
+        say(console, f"note: {said}")

@@ -160,8 +160,12 @@ def _missing(mission: Mission) -> Iterator[str]:
             f"{span_s:.0f} s of inertial data and no [initial]: give a start, or at least "
             f"{LEAST_S:.0f} s to align with"
         )
-    if mission.initial is None and mission.gnss is None and not mission.aids:
-        yield "neither a fix nor [initial] says where it begins: give [initial] in mission.toml"
+    has_start = mission.initial is not None or mission.local is not None
+    if not has_start and mission.gnss is None and not mission.aids:
+        yield (
+            "neither a fix nor [initial] says where it begins: give [initial] in mission.toml, or "
+            "[local] for a tank or a pool"
+        )
     overlap = min(mission.imu.time_s[-1], mission.dvl.time_s[-1]) - max(
         mission.imu.start_s, mission.dvl.time_s[0]
     )

@@ -288,6 +288,7 @@ def writes_of(tree: ast.Module) -> Iterator[tuple[int, str]]:
 
 
 MAY_WRITE = {
+    "ssm_graph/cli/completion.py": {"action.complete"},
     "ssm_graph/io/raw_log/log.py": {"row.is_in_table"},
     "ssm_graph/io/ros/topics.py": {"topic.n_unstated", "topic.beams_d"},
     "ssm_graph/io/tables/checkpoint.py": {"archive.comment"},

@@ -70,7 +70,7 @@ def velocities(m: Mission) -> tuple[Array, Array]:
         m.dvl.mount.parity(m.dvl.speed, m.dvl.sigma) < 5
     )
     v_b = np.linalg.lstsq(m.dvl.mount.beams_b, m.dvl.speed[whole].T)[0].T
-    return m.dvl.time_s[whole], v_b
+    return m.dvl.time_s[whole], np.asarray(v_b, np.float64)
 
 
 def dataflash(m: Mission) -> bytes:

@@ -39,7 +39,7 @@ def mission() -> Mission:
     found = simulate(replace(scenario_config("demo"), duration_s=40.0)).mission
     assert found.gnss is not None
     even = replace(found.gnss, sigma_enu=np.full_like(found.gnss.sigma_enu, 2.0))
-    whole = np.isfinite(found.dvl.speed).all(axis=1)
+    whole = np.asarray(np.isfinite(found.dvl.speed).all(axis=1))
     speed = np.where(whole[:, None], found.dvl.speed, np.nan)
     dvl = replace(found.dvl, speed=speed)
     return replace(found, reference=None, gnss=even, dvl=dvl)

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mission_fixture import TOML, write_example
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.cli.main import main
 from ssm_graph.io.instruments.library import _DVL_FIGURES, _IMU_KEYS, preset, presets
 from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.io.mission_folder.toml import SECTIONS
+from tests.mission_fixture import TOML, write_example
 
 NOISE = """gyro_random_walk_deg_per_sqrt_h = 0.05
 accel_random_walk_ug_per_sqrt_hz = 50.0

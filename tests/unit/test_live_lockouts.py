@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import socket
 from contextlib import ExitStack
 
@@ -14,11 +15,12 @@ from ssm_graph.live.sockets.clocks import STRANGER_S, RunClock, StampClock
 from ssm_graph.live.sockets.endpoints import LOOPBACK, Endpoint, Transport
 from ssm_graph.live.sockets.feed import Limits
 from ssm_graph.live.sockets.inputs import TcpServerInput, UdpInput
-from ssm_graph.live.sockets.outputs import MAX_CLIENTS, OutputFormat, TcpServerOutput
+from ssm_graph.live.sockets.outputs import MAX_CLIENTS, OutputFormat, Publisher, TcpServerOutput
 from ssm_graph.live.sockets.sockets import InputConfig, OutputConfig, SocketHub
 from ssm_graph.sensors.gnss import Fix
 from ssm_graph.sensors.imu import ImuSample
 from tests.instrument_fixture import Receiver, UdpSender, gga
+from tests.live_fixture import Recorder, a_navigation
 
 WALL_S = 1_700_000_000.0
 PERIOD_S = 0.01
@@ -299,6 +301,14 @@ def test_what_came_while_the_process_was_stopped_is_not_stamped_now() -> None:
         sender.close()
 
 
+def answered(hub: SocketHub) -> str:
+    """Return the health of a good answer as it is sent."""
+    recorder = Recorder()
+    recorder.is_behind = hub.is_behind
+    Publisher().send(recorder, OutputFormat.JSON, a_navigation(0.0))
+    return str(json.loads(recorder.sent[0][1])["health"])
+
+
 def test_what_waited_while_the_process_was_stopped_is_not_too_much() -> None:
     """A hundred samples a second for ten seconds, at once: all of them, from one who is counted."""
     clock = Steady()
@@ -315,7 +325,11 @@ def test_what_waited_while_the_process_was_stopped_is_not_too_much() -> None:
             lines = (encode_message(sample(stamp)) for stamp in stamps[begin : begin + 100])
             sender.send(b"".join(lines))
         clock.now_s += 10.0
-        receiver.until(lambda: len(receiver.messages) == 1001)
+        healths = set[tuple[bool, str]]()
+        receiver._after_poll = lambda: healths.add((hub.is_behind, answered(hub)))
+        receiver.until(lambda: len(receiver.messages) == 1001 and not hub.is_behind)
+        receiver._after_poll = lambda: None
+        assert healths == {(True, "DEGRADED"), (False, "GOOD")}
         assert [message.time_s for message in receiver.messages] == stamps
         sender.send(b"".join(encode_message(sample(stamps[-1] + k)) for k in range(1, 200)))
         receiver.until(lambda: "rate_limited" in receiver.kinds)  # and then as ever

@@ -46,7 +46,7 @@ def test_the_time_of_a_run_goes_on(by_s: float) -> None:
     clocks.set_by_s = 7.0
     assert run.read()[1] == pytest.approx(7.0)
     assert run.time_s == clocks.wall_s()  # nothing has come: it may be right now
-    run.has_begun = True
+    run.begin()
     clocks.set_by_s = 7.0 + by_s
     _, step_s = run.read()
     assert step_s == pytest.approx(by_s)

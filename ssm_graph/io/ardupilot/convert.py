@@ -169,7 +169,8 @@ def _seconds(columns: Columns) -> Array:
 
 def _later(time_s: Array) -> NDArray[np.bool_]:
     """Return the times (N,) that are later than all before them."""
-    return np.r_[True, time_s[1:] > np.maximum.accumulate(time_s)[:-1]]
+    later: NDArray[np.bool_] = np.r_[True, time_s[1:] > np.maximum.accumulate(time_s)[:-1]]
+    return later
 
 
 def _clock(log: Path, messages: Mapping[str, Columns]) -> tuple[float, list[str]]:

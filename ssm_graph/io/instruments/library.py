@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Set
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cache
@@ -116,9 +116,9 @@ def presets() -> tuple[Preset, ...]:
     for section, table in TABLES.items():
         text = (files("ssm_graph.io.instruments") / table).read_text("utf-8")
         for name, raw in tomllib.loads(text).items():
-            texts = {key: raw.pop(key) for key in _TEXTS}
-            lists = {key: tuple(raw.pop(key, ())) for key in ("published", "aliases")}
-            found.append(Preset(name=name, section=section, figures=raw, **texts, **lists))
+            known = {key: raw.pop(key) for key in _TEXTS}
+            known |= {key: tuple(raw.pop(key, ())) for key in ("published", "aliases")}
+            found.append(Preset(name=name, section=section, figures=raw, **known))
     return tuple(found)
 
 
@@ -152,12 +152,12 @@ def _plain(name: str) -> str:
 
 
 def with_preset(
-    section: str, raw: Mapping[str, Any], *, file: str, is_required: Callable[[str], bool]
+    section: str, raw: Mapping[str, Any], *, file: str, required: Set[str]
 ) -> tuple[dict[str, Any], Preset | None]:
     """Return a section with the figures of the instrument that it names; its own keys win.
 
     Raises :class:`ConfigError` for an unknown instrument, and for a key that its sheet does not
-    give and the section has to: ``is_required`` tells which those are.
+    give and the section has to: ``required`` are those.
     """
     own = dict(raw)
     name = own.pop(KEY, None)
@@ -172,7 +172,7 @@ def with_preset(
         keys = {key: value for key, value in keys.items() if key not in _DVL_FIGURES[:2]}
     merged = {**keys, **own}
     asked = (key for key, _ in _IMU_KEYS.values()) if section == "imu" else _ASKED_OF_DVL
-    missing = [key for key in dict.fromkeys(asked) if is_required(key) and key not in merged]
+    missing = [key for key in dict.fromkeys(asked) if key in required and key not in merged]
     if section == "dvl" and "beam_vectors" not in own:
         missing = [*[key for key in _DVL_FIGURES[:2] if key not in merged], *missing]
     if missing:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Final
@@ -25,7 +25,7 @@ from ssm_graph.base.settings import (
 from ssm_graph.base.tables import LARGEST_TIME_S, Order, Table
 from ssm_graph.base.units import DEGREE
 from ssm_graph.io.instruments import library as instruments
-from ssm_graph.mission.mission import InitialState, Reference
+from ssm_graph.mission.mission import InitialState, LocalStart, Reference
 from ssm_graph.mission.point import POINT_KEYS, Point, point
 from ssm_graph.sensors.current import CURRENT_KEYS
 from ssm_graph.sensors.imu import Stamp
@@ -82,6 +82,13 @@ INITIAL_KEYS: Final[Mapping[str, Key]] = {
     "velocity_sigma_m_per_s": Key("velocity_sigma_enu", shape=(3,), positive=True, high=1e3),
     "attitude_sigma_deg": Key("attitude_sigma", shape=(3,), positive=True, high=360.0, unit=DEGREE),
 }
+LOCAL_KEYS: Final[Mapping[str, Key]] = {
+    "lat_deg": replace(PLACE_KEYS["lat_deg"], required=False),
+    "heading_deg": replace(INITIAL_KEYS["heading_deg"], required=False),
+    "heading_sigma_deg": Key(
+        "heading_sigma", positive=True, high=180.0, required=False, unit=DEGREE
+    ),
+}
 TABLES: Final = (*INSTRUMENTS, REFERENCE)
 """Everything that has a table, in the order in which tables are read."""
 SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
@@ -89,6 +96,7 @@ SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
     "origin": PLACE_KEYS,
     "current": CURRENT_KEYS,
     "initial": INITIAL_KEYS,
+    "local": LOCAL_KEYS,
     **{one.section: one.keys for one in TABLES},
 }
 LISTS: Final[Mapping[str, Mapping[str, Key]]] = {
@@ -97,6 +105,8 @@ LISTS: Final[Mapping[str, Mapping[str, Key]]] = {
     "point": POINT_KEYS,
 }
 """Sections that may come several times, ``[[beacon]]``."""
+_OF_PLACES: Final = ("origin", "initial", "gnss", "usbl", "reference")
+"""Sections of places on Earth, which no local start has."""
 REQUIRED_SECTIONS: Final = ("frames", *(one.section for one in INSTRUMENTS if one.is_required))
 
 
@@ -137,6 +147,21 @@ class MissionToml:
         """Return the state that ``[initial]`` states."""
         return build(InitialState, self["initial"].given()) if "initial" in self else None
 
+    def local(self) -> LocalStart | None:
+        """Return the start at zero that ``[local]`` states.
+
+        Raises :class:`ConfigError` beside a section that states a place on Earth.
+        """
+        if "local" not in self:
+            return None
+        others = [name for name in _OF_PLACES if name in self]
+        if others:
+            raise ConfigError(
+                f"{self.file} [local]: given together with [{others[0]}], which has places on "
+                "Earth; expected one of the two; [local] is for a tank or a pool without either"
+            )
+        return build(LocalStart, self["local"].given())
+
     def points(self) -> dict[str, Point]:
         """Return every point of the vehicle by name: ``[[point]]``, and instruments elsewhere."""
         found = {}
@@ -153,7 +178,8 @@ class MissionToml:
         """Return the error of a mission that may be anywhere on Earth."""
         return ConfigError(
             f"{self.file} [origin]: nothing says where on Earth the mission was; add [origin] with "
-            "lat_deg, lon_deg and height_m, or a [gnss] or [usbl] table, or [initial]"
+            "lat_deg, lon_deg and height_m, or a [gnss] or [usbl] table, or [initial]; "
+            "in a tank or a pool, [local]"
         )
 
 
@@ -218,10 +244,8 @@ def _with_instruments(raw: dict[str, Any], file: str) -> tuple[dict[str, Any], t
             own |= {"stamp": Stamp.END.value} if section == "imu" else {}
         if not isinstance(own, dict):
             continue
-        known = SECTIONS[section]
-        found[section], preset = instruments.with_preset(
-            section, own, file=file, is_required=lambda key, known=known: known[key].required
-        )
+        required = {name for name, key in SECTIONS[section].items() if key.required}
+        found[section], preset = instruments.with_preset(section, own, file=file, required=required)
         if preset is not None:
             notes.append(f"[{section}] {preset.maker} {preset.name}: {preset.source}")
     return found, tuple(notes)

@@ -75,7 +75,7 @@ def _when(data: memoryview, at: int) -> float | None:
         date = datetime(1900 + year, 1 + month, day, hour, minute, second, tzinfo=UTC)
     except ValueError:
         return None
-    return date.timestamp() + 1e-4 * of_100_us
+    return float(date.timestamp() + 1e-4 * of_100_us)
 
 
 def _where(valid: int, first: int, values: Array) -> Array:

@@ -76,8 +76,9 @@ def build_summary(
         "start": {
             **written(estimate.start, INITIAL_KEYS),
             "heading_deg": np.rad2deg(estimate.start.heading) % 360.0,
-            "origin": "mission" if mission.initial is not None else "alignment",
+            "origin": _start_origin(mission),
         },
+        **({} if mission.local is None else {"local_start": mission.local.sentence}),
         "calibration": calibration_fields(estimate.calibration),
         "noise": _noise(estimate),
         **({"aids": _aids(estimate.aids)} if estimate.aids is not None else {}),
@@ -94,6 +95,13 @@ def build_summary(
         "versions": versions(),
     }
     return {key: as_json(value) for key, value in summary.items()}
+
+
+def _start_origin(mission: Mission) -> str:
+    """Return where a start is from, in a word."""
+    if mission.initial is not None:
+        return "mission"
+    return "alignment" if mission.local is None else "local"
 
 
 def input_fields(folder: Path) -> dict[str, Any]:

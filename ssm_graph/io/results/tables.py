@@ -70,6 +70,7 @@ def write_results(
     inputs: Mapping[str, Any] | None = None,
     axes: BodyAxes = BodyAxes.FRD,
     draw: Callable[[Path], None] | None = None,
+    figure_name: str = FIGURE_NAME,
 ) -> None:
     """Write one estimate as a result folder.
 
@@ -87,6 +88,7 @@ def write_results(
     inputs : the mission folder and the SHA-256 of its files, of :func:`input_fields`.
     axes : body axes of the mission's file, for the lever arms of ``calibration.toml``.
     draw : saves the figure at a path; none is written unless given.
+    figure_name : one of :data:`ssm_graph.io.results.place.FIGURES`.
 
     Raises
     ------
@@ -124,13 +126,13 @@ def write_results(
             write_through(parts[name], inside)
         failure = None
         if draw is not None:
-            figure = folder / f".{process}-{FIGURE_NAME}"
-            parts = {FIGURE_NAME: figure, **parts}
+            figure = folder / f".{process}-{figure_name}"
+            parts = {figure_name: figure, **parts}
             failure = _drawn(draw, figure)
         for name in (SUMMARY_NAME, CALIBRATION_NAME, AIDS_NAME, STATES_NAME, *DRAWN):
             (folder / name).unlink(missing_ok=True)
         for name, part in parts.items():
-            if name != FIGURE_NAME or failure is None:
+            if name != figure_name or failure is None:
                 part.replace(folder / name)
     except OSError as error:
         raise DataError(f"{folder}: cannot write results: {error.strerror or error}") from error
@@ -200,6 +202,21 @@ def read_aids(folder: Path) -> dict[str, Any]:
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise DataError(f"{path}: expected a table of aids: {error}; smooth again") from error
     return words if rows else {}
+
+
+def read_protection(folder: Path) -> dict[str, Array]:
+    """Return the columns of ``protection.csv``, infinite where nothing bounds; empty without it.
+
+    Raises :class:`DataError` for a table that is damaged.
+    """
+    path = folder / PROTECTION_NAME
+    if not path.exists():
+        return {}
+    try:
+        rows = np.genfromtxt(path, delimiter=",", names=True)
+        return {name: np.atleast_1d(rows[name]) for name in PROTECTION_COLUMNS}
+    except (OSError, ValueError, IndexError, TypeError) as error:
+        raise DataError(f"{path}: expected a table of protection levels: {error}") from error
 
 
 def trajectory_columns(trajectory: Trajectory) -> Columns:

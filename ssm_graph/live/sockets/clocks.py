@@ -86,6 +86,10 @@ class RunClock:
         self._known: Now | None = None
         self.read()
 
+    def begin(self) -> None:
+        """Take note that a message has come."""
+        self.has_begun = True
+
     @property
     def time_s(self) -> float:
         """The time of the run, s."""
@@ -213,7 +217,7 @@ class StampClock:
 
     def _passed(self, message: Message, now: Now) -> Message:
         """Return a message of the known clock in the time of the run; remember it."""
-        self._clock.has_begun = True
+        self._clock.begin()
         time_s = message.time_s - self._shift_s
         self._lag_s = self._run_s(now) - time_s
         self._lead_s = max(self._lead(now), -self._lag_s)

@@ -83,6 +83,11 @@ class Input(ABC):
         """Return how it is doing."""
 
     @property
+    def is_behind(self) -> bool:
+        """Whether what came while this process stood still is not read to its end."""
+        return any(channel.is_stale for channel in self._reading.values())
+
+    @property
     def n_held(self) -> int:
         """Bytes held of messages that are not complete."""
         return sum(channel.decoder.n_held for channel in self._reading.values())

@@ -105,6 +105,11 @@ class SocketHub:
         return self._clock.set_by_s if self.inputs else 0.0
 
     @property
+    def is_behind(self) -> bool:
+        """Whether what came while this process stood still is not read to its end."""
+        return any(source.is_behind for source in self.inputs)
+
+    @property
     def elapsed_s(self) -> float:
         """Since the begin, s."""
         return self._steady_s() - self._begin_s
