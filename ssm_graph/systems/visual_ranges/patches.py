@@ -231,9 +231,7 @@ def _align_loop(  # pragma: no cover  (compiled)
                 product += seen[m] * patch[m]
             power = np.sqrt(power / size)
             product /= size
-            alike = -1.0
-            if power > 0.3 * spread:
-                alike = product / (power * spread + 1e-9)
+            alike = product / (power * spread + 1e-9) if power > 0.3 * spread else -1.0
             gain = spread / max(power, 1e-9)
             slope_x, slope_y = 0.0, 0.0
             for m in range(size):
