@@ -11,7 +11,7 @@ WORKERS := -n 2 --dist worksteal
 # Where an image sets it, every process would compile everything anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-fast test-slow test-benchmarks format check clean
+.PHONY: demo test test-fast test-slow test-benchmarks docs format check clean
 
 demo: $(VENV)/.installed  ## simulate the default mission with failing beams, smooth it, show table and figure
 	$(BIN)/ssm-graph simulate demo --overwrite --out $(OUT)/demo/mission
@@ -28,6 +28,10 @@ test-slow: $(VENV)/.installed-dev  ## the tests that take minutes
 
 test-benchmarks: $(VENV)/.installed-dev  ## every benchmark in its smallest form
 	$(BIN)/python -m pytest $(WORKERS) -m benchmark
+
+docs: $(VENV)/.installed-dev  ## the documentation as a site, out/site/index.html; no network is needed
+	$(BIN)/python -m mkdocs build --strict --quiet --site-dir $(OUT)/site
+	@echo "site: $(OUT)/site/index.html"
 
 check: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .

@@ -64,6 +64,8 @@ from ssm_graph.mission.navigation import Event as Event
 from ssm_graph.mission.navigation import Health as Health
 from ssm_graph.mission.navigation import Navigation as Navigation
 from ssm_graph.mission.navigation import Severity as Severity
+from ssm_graph.mission.point import Point as Point
+from ssm_graph.mission.posterior import Posterior as Posterior
 from ssm_graph.mission.problem import Problem as Problem
 from ssm_graph.mission.problem import ProblemConfig as ProblemConfig
 from ssm_graph.mission.problem import build_problem as build_problem
@@ -72,6 +74,7 @@ from ssm_graph.mission.start.alignment import align as align
 from ssm_graph.mission.vehicle import Vehicle as Vehicle
 from ssm_graph.report.mission.figure import save_figure as save_figure
 from ssm_graph.report.mission.summary import summary_table as summary_table
+from ssm_graph.result import Result as Result
 from ssm_graph.sensors.acoustic import Beacon as Beacon
 from ssm_graph.sensors.acoustic import RangeLog as RangeLog
 from ssm_graph.sensors.acoustic import UsblLog as UsblLog
@@ -133,6 +136,8 @@ from ssm_graph.simulation import scenario_config as scenario_config
 from ssm_graph.simulation import simulate as simulate
 from ssm_graph.simulation import with_faults as with_faults
 from ssm_graph.smoothers.batch import SsmSmoother as SsmSmoother
+from ssm_graph.smoothers.between import Answers as Answers
+from ssm_graph.smoothers.between import answers_at as answers_at
 from ssm_graph.smoothers.faults.search import FaultSearch as FaultSearch
 from ssm_graph.smoothers.fixed_lag import FixedLagConfig as FixedLagConfig
 from ssm_graph.smoothers.fixed_lag import solve_fixed_lag as solve_fixed_lag

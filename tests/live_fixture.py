@@ -155,6 +155,9 @@ class Crash(BaseException):
 class Recorder:
     """Takes answers."""
 
+    set_by_s = 0.0
+    is_behind = False
+
     def __init__(self, *forms: OutputFormat) -> None:
         self.forms = forms or tuple(OutputFormat)
         self.sent: list[tuple[OutputFormat, bytes]] = []

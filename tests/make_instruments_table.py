@@ -34,8 +34,8 @@ How much of them is read. *Sound* is counted by a script of its own: reports of 
 from the one before, or, of a receiver, sentences with a right checksum and a position, of the first
 kind that the file has of GGA, GNS, RMC, GLL. *Live* is what the decoder of `ssm-graph online` makes
 of the bytes, 256 at a time; *convert* is what `ssm-graph convert` writes. Without GGA a live run
-waits 5 s for it. The files are of a Water Linked A50 (a vehicle in a basin, May and August 2021,
-December 2021 as a table) and of [gpsd's collection](https://gitlab.com/gpsd/gpsd/-/tree/master/test/daemon);
+waits 5 s for it, and then reads what has come meanwhile. The files are of a Water Linked A50 (a
+vehicle in a basin, May and August 2021, December 2021 as a table) and of [gpsd's collection](https://gitlab.com/gpsd/gpsd/-/tree/master/test/daemon);
 they are not part of this project.
 
 This page is made by `python -m tests.make_instruments_table`; `tests/unit/test_instruments_page.py`
@@ -59,15 +59,10 @@ class Recording(NamedTuple):
     said: str
 
     @property
-    def n_least(self) -> int:
-        """How many live has to read at least: without GGA it waits for it, 5 s of two a second."""
-        return self.n_sound if self.what in ("reports", "GGA", "") else self.n_sound - 10
-
-    @property
     def is_whole(self) -> bool:
         """Whether it is read to the last sound report."""
         is_table = self.name.endswith(".csv")
-        return self.n_convert >= self.n_sound and (is_table or self.n_live >= self.n_least)
+        return self.n_convert >= self.n_sound and (is_table or self.n_live >= self.n_sound)
 
 
 def has_position(kind: bytes, fields: list[bytes]) -> bool:

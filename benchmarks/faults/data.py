@@ -45,6 +45,9 @@ SURFACING: Final = Stage(duration_s=200.0, gnss=((0.0, 60.0), (110.0, 200.0)))
 """GNSS comes back."""
 GNSS_ALL: Final = Stage(gnss=((0.0, 1e9),))
 HARMLESS: Final = Rule(is_harmless=True, good_after_s=2.0)
+PROVEN_S: Final = 13.0
+"""Good again where a contradiction has to end first: the answer is begun anew within 3 s, and a lane
+without the sensor has to agree with it for 8 s."""
 TOLD: Final = Health.DEGRADED
 FOLLOWED: Final = Rule(Health.BAD, 15.0, None, told="recovered")
 
@@ -160,16 +163,16 @@ def _dvl() -> list[Case]:
             Rule(), begin_s + 30.0, long,
         ),
         row(
-            "two opposite beams off", "+1 m/s on 1, −1 on 3", offset(1, 0, -1, 0),
-            Rule(), begin_s + 30.0, long,
+            "two opposite beams off", "+1 m/s on 1, −1 on 3; fixes from 110 s on",
+            offset(1, 0, -1, 0), Rule(good_after_s=90.0), begin_s + 30.0, SURFACING,
         ),
         row(
             "water track", "current 0.5 m/s to the east", water_track((0.5, 0.0, 0.0)),
-            Rule(), begin_s + 20.0,
+            Rule(good_after_s=PROVEN_S), begin_s + 20.0,
         ),
         row(
             "water track, slow", "current 0.15 m/s to the north", water_track((0.0, 0.15, 0.0)),
-            Rule(), begin_s + 20.0,
+            Rule(good_after_s=PROVEN_S), begin_s + 20.0,
         ),
         row(
             "40 % outliers", "each beam, ±0.5 to 3 m/s", outliers(0.4, (0.5, 3.0)),

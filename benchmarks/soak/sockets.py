@@ -46,11 +46,16 @@ from ssm_graph.simulation import SimulatedMission, simulate
 CYCLE_S: Final = 600.0
 """Each storm blows once in it."""
 JUMPS: Final = (0.5, -0.5, 3.0, -3.0, 30.0, -30.0)
-"""By how much the clock of vehicle and instruments is set, s, one in each cycle."""
-JUMP_AT_S: Final = 540.0
-"""Within the cycle."""
+"""By how much the clock of vehicle and instruments is set, s, one after the other in each cycle."""
+JUMP_AT_S: Final = 520.0
+"""The first one within the cycle."""
+JUMP_EVERY_S: Final = 13.0
+BEGINS_S: Final = 10.0
+"""So long from the start of the processes to the first sample."""
 AFTER_S: Final = 10.0
 """What comes so long after a storm is told with it."""
+UNDER_WAY_S: Final = 1.0
+"""Answers are no longer on their way."""
 LOCKED_OUT_S: Final = 5.0
 FLAT_MB_PER_H: Final = 1.0
 LEGEND: Final = f"""\
@@ -59,7 +64,7 @@ port, depth and GNSS come as datagrams, a Water Linked DVL (2 Hz) is called, ans
 clients. Every {CYCLE_S / 60:g} minutes each storm blows once. Silences: the longest time in which
 nothing of an instrument reached the estimator, or no answer the sound client, in seconds, from the
 begin of the storm to {AFTER_S:g} s after it. Inside: share of the answers of good health whose
-horizontal error is within three of their sigmas.
+horizontal error is within three of their sigmas, and the largest of these errors.
 """
 WARM_S: Final = 600.0
 """Memory counts from then on: each storm has filled its buffers once."""
@@ -77,8 +82,8 @@ class Clock:
 
     def set_by_s(self, elapsed_s: float) -> float:
         """Return by how much it has been set so far, s."""
-        n_jumps = math.floor((elapsed_s - JUMP_AT_S) / CYCLE_S) + 1
-        return sum(JUMPS[k % len(JUMPS)] for k in range(n_jumps))
+        within_s = elapsed_s % CYCLE_S - JUMP_AT_S
+        return sum(by for k, by in enumerate(JUMPS) if within_s >= k * JUMP_EVERY_S)
 
     def wall_s(self) -> float:
         """Return Unix time, s."""
@@ -126,10 +131,10 @@ class Ear:
         return messages
 
 
-def navigate(line: Connection, folder: Path, vehicle: Vehicle, dvl_port: int) -> None:
+def navigate(line: Connection, folder: Path, vehicle: Vehicle, dvl_port: int, clock: Clock) -> None:
     """Run the live estimator behind sockets, in a process of its own.
 
-    It tells its ports, is told the clock, and tells what it hears once a second.
+    It tells its ports, and what it hears once a second.
     """
     server, datagrams = (
         Endpoint(kind, LOOPBACK, 0) for kind in (Transport.TCP_SERVER, Transport.UDP)
@@ -140,11 +145,9 @@ def navigate(line: Connection, folder: Path, vehicle: Vehicle, dvl_port: int) ->
         InputConfig("messages", datagrams, JsonDecoder),
     ]
     outputs = [OutputConfig(form, server) for form in OutputFormat]
-    clock = Clock(time.monotonic())
-    with SocketHub(inputs, outputs, wall_s=lambda: clock.wall_s()) as hub:
+    with SocketHub(inputs, outputs, wall_s=clock.wall_s) as hub:
         links = (*hub.inputs[1:], *hub.outputs)
         line.send([link.port for link in links])  # type: ignore[attr-defined]
-        clock = line.recv()
         connections = Connections(Ear(hub, clock, line), hub)
         end = Runner(
             RunFolder(folder, vehicle, {}),
@@ -238,8 +241,13 @@ class Hour:
             self.heard.answers.append((now_s, Health[fields["health"]], off))
 
     def _off(self, fields: dict[str, float], now_s: float) -> float:
-        """Return how far an answer is off the truth of its time, horizontally, in its sigmas."""
-        true_s = fields["time_s"] - EPOCH_S - self._clock.set_by_s(now_s)
+        """Return how far an answer is off the truth of its time, horizontally, in its sigmas.
+
+        One that was on its way when the clock was set is stamped by the clock before.
+        """
+        own_s = (self._clock.set_by_s(now_s), self._clock.set_by_s(now_s - UNDER_WAY_S))
+        of_clocks = (fields["time_s"] - EPOCH_S - set_by_s for set_by_s in own_s)
+        true_s = min(of_clocks, key=lambda true_s: abs(now_s - true_s))
         truth = self._sim.truth_at(np.array([true_s]))
         east = math.radians(fields["lon_deg"]) - float(truth.lon[0])
         north = math.radians(fields["lat_deg"]) - float(truth.lat[0])
@@ -280,15 +288,13 @@ def soak(minutes: float) -> Outcome:
     vehicle = replace(vehicle, initial=replace(vehicle.initial, time_s=EPOCH_S))
     context = multiprocessing.get_context("spawn")
     line, far_end = context.Pipe()
-    dvl = Dvl()
+    dvl, clock = Dvl(), Clock(time.monotonic() + BEGINS_S)
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place) / "run"
-        child = context.Process(target=navigate, args=(far_end, folder, vehicle, dvl.port))
+        child = context.Process(target=navigate, args=(far_end, folder, vehicle, dvl.port, clock))
         child.start()
         assert child.pid is not None
         shore = Shore(dvl, dict(zip(Place, line.recv(), strict=True)))
-        clock = Clock(time.monotonic())
-        line.send(clock)
         try:
             heard = Hour(sim, clock, shore, line).run(child.pid, duration_s)
             line.send("over")
@@ -323,13 +329,17 @@ JUMP: Final = "the clock is set"
 def spans() -> dict[str, tuple[float, float]]:
     """Return begin and end of each storm within the cycle, with what comes of it later."""
     found = {name: (x.begin_s, x.begin_s + x.length_s + AFTER_S) for name, x in STORMS.items()}
-    return {**found, JUMP: (JUMP_AT_S, CYCLE_S)}
+    last_s = JUMP_AT_S + JUMP_EVERY_S * (len(JUMPS) - 1)
+    return {**found, JUMP: (JUMP_AT_S, last_s + AFTER_S)}
 
 
 def rows(heard: Heard) -> list[list[str]]:
     """Return the table: of each storm the longest silences, s, and what the answers were worth."""
     about = {name: storm.about for name, storm in STORMS.items()}
-    about[JUMP] = f"of vehicle and instruments, by {', '.join(f'{x:+g}' for x in JUMPS)} s in turn"
+    about[JUMP] = (
+        f"of vehicle and instruments, by {', '.join(f'{x:+g}' for x in JUMPS)} s, one "
+        f"{JUMP_EVERY_S:g} s after the other"
+    )
     found = []
     for name, span in [*spans().items(), (QUIET, None)]:
 
@@ -347,10 +357,11 @@ def rows(heard: Heard) -> list[list[str]]:
         ]
         answers = [(health, off) for at_s, health, off in heard.answers if is_in(at_s)]
         worst = max((x for x, _ in answers), key=list(WORSE).index, default=None)
-        good = [off < INSIDE for health, off in answers if health is Health.GOOD]
+        good = [off for health, off in answers if health is Health.GOOD]
+        inside = f"{100 * np.mean(np.less(good, INSIDE)):.1f} %, {max(good):.1f} σ" if good else "–"
         found.append([
             name, about.get(name, ""), *(f"{s:.1f}" for s in longest),
-            worst.name if worst else "–", f"{100 * np.mean(good):.1f} %" if good else "–",
+            worst.name if worst else "–", inside,
         ])  # fmt: skip
     return found
 

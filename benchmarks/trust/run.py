@@ -17,7 +17,6 @@ from benchmarks.processes import side_by_side
 from benchmarks.report import Option, Report, number_text, table
 from benchmarks.trust.lies import LIES
 from ssm_graph import Estimate, Mission, SmootherConfig, SsmGraphError, evaluate, smooth
-from ssm_graph.mission.fault import Treatment
 from ssm_graph.simulation import (
     AidSettings,
     DvlSettings,
@@ -152,7 +151,7 @@ def _judged(
         z=found.z,
         status=estimate.status.name,
         is_named=lie is not None and _names(estimate, *lie),
-        n_blamed=sum(one.treatment is not Treatment.ALLOWED for one in estimate.faults),
+        n_blamed=sum(one.treatment.is_blame for one in estimate.faults),
         inside=found.inside,
         nees=found.nees,
         seconds=seconds,

@@ -1,6 +1,6 @@
 """The command line.
 
-``ssm-graph simulate | smooth | filter | online | compare | inspect | convert | export | report |
-locate | locate-simulate | locate-study | slam | slam-study | visual | visual-simulate | integrity |
-network | network-run``.
+``ssm-graph simulate | smooth | filter | online | compare | inspect | instruments | template |
+convert | export | report | locate | locate-simulate | locate-study | slam | slam-study | visual |
+visual-simulate | integrity | network | network-run``.
 """

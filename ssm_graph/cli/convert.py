@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
@@ -13,7 +14,14 @@ from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frames import BodyAxes
 from ssm_graph.cli.options import add_mission_output, choice_option, number_option
 from ssm_graph.cli.terminal import say
+from ssm_graph.io.ardupilot.convert import (
+    ArduPilotOptions,
+    convert_ardupilot,
+    is_ardupilot,
+)
 from ssm_graph.io.blueye.convert import convert_blueye
+from ssm_graph.io.columns.convert import convert_columns
+from ssm_graph.io.columns.map_file import read_map
 from ssm_graph.io.file_kind import is_mcap, kind_of
 from ssm_graph.io.mission_folder.folder import write_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle
@@ -22,8 +30,10 @@ from ssm_graph.io.ros.convert import convert_rosbag
 from ssm_graph.io.ros.log import ROLES, is_rosbag
 from ssm_graph.io.ros.messages import SEA_WATER, STANDARD_ATMOSPHERE, BeamSign, RosOptions
 from ssm_graph.live.recorded.log import Recorded, read_recorded, write_tables
-from ssm_graph.live.recorded.merge import merge_recordings
+from ssm_graph.live.recorded.merge import Merged, merge_recordings, mission_of_recording
 from ssm_graph.mission.mission import Mission
+from ssm_graph.sensors.dvl import Ping
+from ssm_graph.sensors.messages import Message
 
 DESCRIPTION = f"""\
 Convert a log. LOG is one of
@@ -31,9 +41,15 @@ Convert a log. LOG is one of
   a ROS bag        ROS 2: the folder, with metadata.yaml or without, or a single .mcap or .db3 file;
                    ROS 1: a .bag (extra 'ros')
   a Blueye X3 log  MCAP of the maker (extra 'blueye')
-  an instrument's  Water Linked or Teledyne PD0 (dvl.csv, heading.csv), NMEA 0183 (gnss.csv,
-  own output       heading.csv): tables for a mission folder, which mission.toml and imu.csv make
-                   whole
+  an ArduPilot log dataflash .BIN, or telemetry .tlog (extra 'ardupilot'): IMU, GPS, barometer, and
+                   VISO, the movements that a DVL sends; --water-density, --surface-height
+  an instrument's  Water Linked; Teledyne PD0, PD4, PD5, PD6; Nortek AD2CP (DVL, ADCP with bottom
+  own output       track) and Nucleus (dvl.csv, heading.csv, imu.csv of a Nucleus); NMEA 0183
+                   (gnss.csv, heading.csv): tables for a mission folder, which mission.toml and
+                   imu.csv make whole; of a Nucleus, with --vehicle, a mission
+  tables of any    CSV, Parquet, MAT, HDF5 (extra 'columns'), with --map map.toml, which says what
+  columns          their columns are: ssm-graph template writes one to fill in, ssm-graph inspect
+                   FILE --draft-map drafts one of a table
   several files    a table with the columns of imu.csv and recordings as above, with --vehicle: one
                    mission on the clock of the IMU, the others moved by the turns they show
 
@@ -57,6 +73,12 @@ def declare(parser: argparse.ArgumentParser) -> None:
         help="file or folder to convert; several are merged: an imu.csv and recordings of others",
     )
     add_mission_output(parser)
+    parser.add_argument(
+        "--map",
+        type=Path,
+        metavar="FILE",
+        help="of tables of any columns: which is which, in what unit, sign and axes",
+    )
     _add_ros_options(parser)
     parser.set_defaults(run=run)
 
@@ -74,10 +96,11 @@ def _add_ros_options(parser: argparse.ArgumentParser) -> None:
         "--vehicle",
         type=Path,
         metavar="FILE",
-        help="of ROS bags and several logs: noise, lever arms, DVL mounting and beam directions: a "
-        "mission.toml (its tables need not exist) or a mission folder",
+        help="of ROS bags, ArduPilot logs, several logs and tables of any columns: noise, lever "
+        "arms, DVL mounting and beam directions: a mission.toml (its tables need not exist) or a "
+        "mission folder",
     )
-    group = parser.add_argument_group("of ROS bags only")
+    group = parser.add_argument_group("of ROS bags; water and its surface of ArduPilot logs too")
     group.add_argument(
         "--topic",
         type=_topic,
@@ -101,8 +124,9 @@ def _add_ros_options(parser: argparse.ArgumentParser) -> None:
         "--beams-against",
         action="store_true",
         default=None,
-        help="the speeds of marine_acoustic_msgs are positive when the vehicle moves against the "
-        "beam (default: found by the velocity in the messages)",
+        help="the speeds are positive when the vehicle moves against the beam: of "
+        "marine_acoustic_msgs (default: found by the velocity in the messages) and of an "
+        "instrument's own output",
     )
 
 
@@ -118,6 +142,8 @@ def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
     for log in arguments.log:
         if log.exists() and arguments.out.resolve() == log.resolve():
             raise ConfigError(f"--out: expected another folder than that of LOG: {arguments.out}")
+    if arguments.map is not None:
+        return _write(_from_columns(arguments), arguments, console)
     if len(arguments.log) > 1:
         return _merge(arguments, console)
     (log,) = arguments.log
@@ -125,15 +151,25 @@ def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
         raise ConfigError(f"--clock-offset is for several logs, got {log} alone")
     if is_rosbag(log):
         return _write(_from_rosbag(log, arguments), arguments, console)
-    _refuse_ros_options(log, arguments, ROS_OPTIONS)
+    if log.is_file() and is_ardupilot(log):
+        return _write(_from_ardupilot(log, arguments), arguments, console)
+    own = ("vehicle", "beams_against")
+    _refuse_ros_options(log, arguments, [name for name in ROS_OPTIONS if name not in own])
     if not log.exists():
         raise DataError(f"{log}: there is no such file or folder")
     if is_mcap(log):
+        _refuse_ros_options(log, arguments, own)
         return _write(convert_blueye(log), arguments, console)
     recorded = None if log.is_dir() else read_recorded(log)
     if recorded is None:
         raise DataError(f"{log}: {kind_of(log)}")
-    return _write_tables(recorded, arguments.out, console)
+    if arguments.beams_against:
+        recorded = replace(recorded, messages=tuple(map(_turned, recorded.messages)))
+    if arguments.vehicle is None:
+        return _write_tables(recorded, arguments.out, console)
+    vehicle = read_vehicle(arguments.vehicle)
+    made = mission_of_recording(log, recorded, arguments.out, vehicle=vehicle)
+    return _said(made, arguments, console)
 
 
 def _refuse_ros_options(log: Path, arguments: argparse.Namespace, options: Iterable[str]) -> None:
@@ -154,9 +190,48 @@ def _merge(arguments: argparse.Namespace, console: Console) -> bool:
         if not log.is_file():
             raise DataError(f"{log}: expected a file, of an IMU or of one instrument")
     found = merge_recordings(arguments.log, arguments.out, vehicle=vehicle, offset_s=offset_s)
+    return _said(found, arguments, console)
+
+
+def _said(found: Merged, arguments: argparse.Namespace, console: Console) -> bool:
     _say_mission(found.mission, arguments.out, console)
     _say_notes(found.notes, console)
     return True
+
+
+def _from_ardupilot(log: Path, arguments: argparse.Namespace) -> Mission:
+    own = ("vehicle", "water_density", "surface_height")
+    _refuse_ros_options(log, arguments, [name for name in ROS_OPTIONS if name not in own])
+    density = _density(arguments)
+    vehicle = None if arguments.vehicle is None else read_vehicle(arguments.vehicle)
+    options = ArduPilotOptions(density, arguments.surface_height)
+    return convert_ardupilot(log, vehicle=vehicle, options=options)
+
+
+def _density(arguments: argparse.Namespace) -> float | None:
+    density: float | None = arguments.water_density
+    if density is not None and density <= 0.0:
+        raise ConfigError(f"--water-density: expected a number above zero, got {density:g}")
+    return density
+
+
+def _from_columns(arguments: argparse.Namespace) -> Mission:
+    """Return the mission of tables of any columns."""
+    _refuse_ros_options(arguments.log[0], arguments, ROS_OPTIONS[1:])
+    if arguments.clock_offset is not None:
+        raise ConfigError("--clock-offset: of tables with a map, time has the key offset_s")
+    column_map = read_map(arguments.map)
+    path = arguments.vehicle or column_map.vehicle
+    if path is None:
+        raise ConfigError(
+            f'{arguments.map}: expected vehicle = "vehicle.toml", or  --vehicle FILE, with noise, '
+            "mounting and place"
+        )
+    for log in arguments.log:
+        if not log.is_file():
+            raise DataError(f"{log}: expected a file with columns")
+    vehicle = read_vehicle(path)
+    return convert_columns(arguments.log, column_map, vehicle, name=vehicle.name)
 
 
 def _write(mission: Mission, arguments: argparse.Namespace, console: Console) -> bool:
@@ -176,6 +251,13 @@ def _say_mission(mission: Mission, out: Path, console: Console) -> None:
     )
 
 
+def _turned(message: Message) -> Message:
+    """Return a ping whose speeds count the other way."""
+    if not isinstance(message, Ping):
+        return message
+    return replace(message, speed=tuple(-speed for speed in message.speed))
+
+
 def _write_tables(recorded: Recorded, out: Path, console: Console) -> bool:
     written = write_tables(out, recorded.messages)
     rows = ", ".join(f"{name} with {count} rows" for name, count in written.items())
@@ -193,9 +275,7 @@ def _say_notes(notes: Iterable[str], console: Console) -> None:
 
 def _from_rosbag(log: Path, arguments: argparse.Namespace) -> Mission:
     defaults = RosOptions()
-    density, atmosphere = arguments.water_density, arguments.atmosphere
-    if density is not None and density <= 0.0:
-        raise ConfigError(f"--water-density: expected a number above zero, got {density:g}")
+    density, atmosphere = _density(arguments), arguments.atmosphere
     against = bool(arguments.beams_against)
     options = RosOptions(
         body=arguments.body or defaults.body,

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
 
 from ssm_graph.base.errors import ConfigError
+from ssm_graph.cli.answers import add_answer_arguments, asked_track
 from ssm_graph.cli.terminal import say
 from ssm_graph.io.export.formats import FORMATS, export_track
-from ssm_graph.io.export.track import parse_epoch, track_of
 from ssm_graph.io.results.tables import read_results
 
 DESCRIPTION = f"""\
@@ -18,8 +19,8 @@ Write the trajectory of a result folder in other formats:
 
 {chr(10).join(f"  {name:11} {form.suffix:9} {form.about}" for name, form in FORMATS.items())}
 
-Positions are those of the inertial unit, heights above the WGS-84 ellipsoid, local metres along
-east, north and up of the first position. Body axes of tum, kitti, csv and mcap are forward, left,
+Heights are above the WGS-84 ellipsoid, local metres along east, north and up of the first position,
+UTM metres in its zone. Body axes of tum, kitti, csv and mcap are forward, left,
 up (REP 103). Times from 2001 on are taken for Unix time; of other clocks say --epoch where a format
 needs UTC. In Python: ``sg.export_track(sg.track_of(sg.read_results("result")), "kml", path)``.
 """
@@ -40,31 +41,51 @@ def declare(parser: argparse.ArgumentParser) -> None:
         metavar="PATH",
         help="file, or folder for several formats (default: RESULT-export/MISSION.SUFFIX)",
     )
-    parser.add_argument(
-        "--epoch",
-        metavar="UTC",
-        help="UTC of time_s = 0, such as 2026-05-01T10:00:00Z, where times are no Unix time",
-    )
+    add_answer_arguments(parser, afterwards=True)
     parser.set_defaults(run=run)
 
 
-def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
+def run(arguments: argparse.Namespace, console: Console, errors: Console) -> bool:
     """Write every format that was asked for."""
     names = [name.strip() for name in arguments.format.split(",") if name.strip()]
-    epoch_s = None if arguments.epoch is None else parse_epoch(arguments.epoch)
-    track = track_of(read_results(arguments.result), epoch_s=epoch_s)
     result: Path = arguments.result.resolve()
-    out: Path = arguments.out or result.with_name(f"{result.name}-export")
-    is_file = arguments.out is not None and len(names) == 1 and bool(out.suffix)
+    out: Path = arguments.out or exports_of(result)
     if result in (out.resolve(), *out.resolve().parents):
         raise ConfigError(
             f"--out: {out} would lie in the result folder, whose files are one set; try "
-            f"{result.name}-export beside it"
+            f"{exports_of(result).name} beside it"
         )
-    stem = "".join(c if c.isalnum() or c in "-_." else "_" for c in track.name)[:80]
+    is_file = arguments.out is not None
+    export(arguments, result, names, out, console, errors, is_file=is_file)
+    return True
+
+
+def exports_of(result: Path) -> Path:
+    """Return the folder beside a result where its exports go."""
+    return result.with_name(f"{result.name}-export")
+
+
+def export(
+    arguments: argparse.Namespace,
+    result: Path,
+    names: Sequence[str],
+    out: Path,
+    console: Console,
+    errors: Console,
+    *,
+    is_file: bool = False,
+) -> None:
+    """Write the track that was asked for in formats; ``out`` may be a file where there is one."""
+    asked = asked_track(arguments, result, errors)
+    for note in asked.notes:
+        say(console, note)
+    stem = "".join(c if c.isalnum() or c in "-_." else "_" for c in asked.track.name)[:80]
     for name in names:
         suffix = FORMATS[name].suffix if name in FORMATS else ""
-        path = out if is_file else out / f"{stem}{suffix}"
-        for written in export_track(track, name, path):
+        is_whole = is_file and len(names) == 1 and bool(out.suffix)
+        path = out if is_whole else out / f"{stem}{asked.suffix}{suffix}"
+        for written in export_track(asked.track, name, path):
             say(console, f"{written}: {written.stat().st_size:,} bytes")
-    return True
+    said = read_results(result).summary.get("local_start")
+    if said:
+        say(console, f"note: {said}")

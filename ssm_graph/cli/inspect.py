@@ -28,6 +28,12 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("path", type=Path, metavar="PATH", help="what to look at")
     parser.add_argument("--figure", type=Path, metavar="FILE", help="draw it: .png, .pdf or .svg")
     parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
+    parser.add_argument(
+        "--draft-map",
+        type=Path,
+        metavar="FILE",
+        help="of a table: draft the map of its columns that ssm-graph convert --map reads",
+    )
     parser.set_defaults(run=run)
 
 
@@ -36,6 +42,8 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     from ssm_graph.inspection.look import inspect_path
 
     found = inspect_path(arguments.path)
+    if arguments.draft_map is not None:
+        _draft(arguments.path, arguments.draft_map, errors)
     if arguments.json:
         say(console, json.dumps(found.as_dict(), indent=2, allow_nan=False, ensure_ascii=False))
     else:
@@ -45,6 +53,19 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
 
         say(errors, f"figure: {save_picture(found, arguments.figure)}")
     return found.can_be_smoothed
+
+
+def _draft(path: Path, out: Path, errors: Console) -> None:
+    from ssm_graph.base.errors import ConfigError
+    from ssm_graph.io.columns.draft import draft_map
+    from ssm_graph.io.columns.sources import read_source
+
+    if out.exists():
+        raise ConfigError(f"--draft-map: {out} is there already; give another name")
+    drafted = draft_map(read_source(path))
+    out.write_text(drafted.text, encoding="utf-8")
+    what = ", ".join(f"[{name}]" for name in drafted.found) or "no section"
+    say(errors, f"{out}: {what} drafted of {path}; look at every line")
 
 
 def _tell(found: Any, console: Console) -> None:

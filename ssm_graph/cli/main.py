@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from enum import IntEnum
 from importlib import import_module
 from importlib.metadata import version
@@ -18,7 +18,14 @@ from ssm_graph.base.errors import (
     SsmGraphError,
     nearest_hint,
 )
-from ssm_graph.cli.terminal import console_on, interrupt, occupy_closed_streams, say, signals_to
+from ssm_graph.cli.terminal import (
+    console_on,
+    interrupt,
+    occupy_closed_streams,
+    say,
+    signals_to,
+    silent,
+)
 
 
 class ExitCode(IntEnum):
@@ -40,7 +47,9 @@ COMMANDS: Final = {
     "online": "navigate live from instruments on sockets, or replay a mission as if live",
     "compare": "compare methods on many simulated or recorded missions",
     "inspect": "say what is in a file, folder, bag or mission, and whether it can be smoothed",
-    "convert": "turn a maker's log or a ROS bag into a mission folder",
+    "instruments": "list the inertial units and DVLs whose figures are known by name",
+    "template": "write map.toml and vehicle.toml to fill in, for tables of any columns",
+    "convert": "turn a maker's log, a ROS bag or tables of any columns into a mission folder",
     "export": "write a result for QGIS, Google Earth, evo, xarray, Foxglove, multibeam software",
     "report": "write a page about a result, for a browser and for print",
     "locate": "find the lane of a road vehicle in an HD map",
@@ -53,10 +62,21 @@ COMMANDS: Final = {
     "integrity": "a second witness of a smoothed mission: guaranteed bounds",
     "network": "guaranteed bounds of a sensor network",
     "network-run": "nodes of a network as processes, by UDP",
+    "help": "help about a command, or about exit codes",
+    "completion": "let a shell complete commands and options",
 }
 """Summary of every command; the module of its name is loaded when it is the one that is given."""
 
-EPILOG = """\
+GROUPS: Final = {
+    "a log, and what is in it": ("inspect", "convert", "simulate"),
+    "an answer": ("smooth", "filter", "online"),
+    "what comes of it": ("report", "export", "compare", "integrity"),
+    "landmark SLAM": ("slam", "slam-study"),
+    "a start from a map": ("locate", "locate-simulate", "locate-study"),
+    "guaranteed bounds in a network": ("network", "network-run"),
+}
+"""Commands by what they are for; those of no group stand at the end."""
+EXIT_CODE_HELP: Final = """\
 exit codes:
   0    done; for smooth and filter: converged; for online: ended in order, the last answer good;
        for compare: every run has a result
@@ -75,6 +95,8 @@ exit codes:
        so does online; it ends in order at the first SIGINT, SIGTERM or SIGHUP, like this at a
        second SIGINT or SIGTERM
 """
+SEE_CODES: Final = "exit codes: ssm-graph help codes"
+QUIET: Final = "say nothing but errors; what --json prints is printed"
 
 EXIT_CODES: tuple[tuple[type[SsmGraphError], ExitCode], ...] = (
     (ConfigError, ExitCode.USAGE),
@@ -87,27 +109,61 @@ EXIT_CODES: tuple[tuple[type[SsmGraphError], ExitCode], ...] = (
 
 def build_parser(words: Sequence[str]) -> argparse.ArgumentParser:
     """Return the parser of all commands; the one that the words name has its options declared."""
+    return _parser({next((word for word in words if not word.startswith("-")), "")})
+
+
+def whole_parser() -> argparse.ArgumentParser:
+    """Return the parser of all commands, each with its options; loads all of them."""
+    return _parser(set(COMMANDS))
+
+
+def command_parser(name: str) -> argparse.ArgumentParser:
+    """Return the parser of one command."""
+    return _subparser(_parser(set()).prog, name)
+
+
+def _parser(wanted: Collection[str]) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="ssm-graph",
         description="Inertial and DVL navigation with a similarity weight for every beam.",
-        epilog=EPILOG,
+        epilog=f"{_grouped()}\n{SEE_CODES}\nhelp about a command: ssm-graph COMMAND --help",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=version("ssm-graph"))
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    given = next((word for word in words if not word.startswith("-")), None)
-    for name, summary in COMMANDS.items():
-        module = import_module(f"ssm_graph.cli.{name.replace('-', '_')}") if name == given else None
-        command = commands.add_parser(
-            name,
-            help=summary,
-            description=module.DESCRIPTION if module else None,
-            epilog=EPILOG,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-        if module:
-            module.declare(command)
+    for name in COMMANDS:
+        own = _subparser(parser.prog, name) if name in wanted else None
+        if own is None:
+            commands.add_parser(name)  # named by its group above
+        else:
+            made = commands.add_parser(name, parents=[own], add_help=False, help=COMMANDS[name])
+            made.description, made.epilog = own.description, own.epilog
+            made.formatter_class, made._defaults = own.formatter_class, own._defaults
     return parser
+
+
+def _subparser(program: str, name: str) -> argparse.ArgumentParser:
+    """Return the parser of a command, its module loaded."""
+    module = import_module(f"ssm_graph.cli.{name.replace('-', '_')}")
+    parser = argparse.ArgumentParser(
+        prog=f"{program} {name}",
+        description=module.DESCRIPTION,
+        epilog=SEE_CODES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    module.declare(parser)
+    parser.add_argument("--quiet", action="store_true", help=QUIET)
+    return parser
+
+
+def _grouped() -> str:
+    """Return the commands by groups, one a line."""
+    named = [name for names in GROUPS.values() for name in names]
+    rest = tuple(name for name in COMMANDS if name not in named)
+    lines = []
+    for title, names in {**GROUPS, "more": rest}.items():
+        lines += [f"{title}:", *(f"  {name:16} {COMMANDS[name]}" for name in names), ""]
+    return "\n".join(lines)
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -125,9 +181,11 @@ def main(words: Sequence[str] | None = None) -> int:
         )
     arguments = parser.parse_args(words)
     console, errors = console_on(sys.stdout), console_on(sys.stderr, is_stderr=True)
+    shown = console if getattr(arguments, "json", False) or not arguments.quiet else silent()
+    told = silent() if arguments.quiet else errors
     try:
         with signals_to(interrupt):
-            is_good = arguments.run(arguments, console, errors)
+            is_good = arguments.run(arguments, shown, told)
         code = ExitCode.GOOD if is_good else ExitCode.NOT_GOOD
     except SsmGraphError as error:
         from rich.text import Text

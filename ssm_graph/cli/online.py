@@ -7,6 +7,7 @@ import contextlib
 import gc
 import math
 import signal
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -29,20 +30,24 @@ from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle, vehicle_of
 from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator import ONLINE, FixedLagSmoother, IntegrityConfig
+from ssm_graph.live.page.server import LivePage, parse_page_address
 from ssm_graph.live.protocols.decoder import Clock, Decoder
 from ssm_graph.live.protocols.json_messages import JsonDecoder
 from ssm_graph.live.protocols.nmea import PRESSURE_SENTENCES, NmeaDecoder, NmeaOptions
 from ssm_graph.live.protocols.nmea_fields import DepthSentence
 from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
+from ssm_graph.live.run.clock_file import ClockFile
 from ssm_graph.live.run.replay_source import ReplaySource
 from ssm_graph.live.run.run_folder import RunFolder
 from ssm_graph.live.run.runner import Connections, Engine, RunEnd, Runner, RunnerConfig, StopReason
+from ssm_graph.live.sockets.clocks import boot_s
 from ssm_graph.live.sockets.endpoints import OUTPUTS, parse_endpoint
 from ssm_graph.live.sockets.feed import Limits
 from ssm_graph.live.sockets.outputs import OutputFormat, Publisher
 from ssm_graph.live.sockets.sockets import InputConfig, OutputConfig, SocketHub
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.navigation import Health
+from ssm_graph.mission.run_status import RunStatus
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.report.mission.summary import calibration_table
 from ssm_graph.report.terminal.status_page import StatusPage
@@ -113,11 +118,17 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     mission = None if arguments.replay is None else read_mission(arguments.replay)
     vehicle = _vehicle(arguments.vehicle, mission)
     with contextlib.ExitStack() as stack:
-        show = stack.enter_context(StatusPage(errors))
+        show: Callable[[RunStatus], None] = stack.enter_context(StatusPage(errors))
+        if arguments.page is not None:
+            height_m = arguments.surface_height
+            host, port = parse_page_address(arguments.page)
+            page = stack.enter_context(LivePage(host, port, surface_height_m=height_m))
+            say(errors, f"page: {page.address}")
+            show = both(show, page)
         runner = Runner(
             RunFolder(arguments.out, vehicle, _settings(lag, integrity)),
             engine_of(vehicle, lag, integrity),
-            _connector(stack, inputs, outputs, mission, speed),
+            _connector(stack, arguments.out, inputs, outputs, mission, speed),
             publisher=publisher,
             config=config,
             on_status=show,
@@ -126,6 +137,18 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
         pass_over_imports()
         end = runner.run()
     return _report(end, arguments.out, console)
+
+
+def both(
+    first: Callable[[RunStatus], None], second: Callable[[RunStatus], None]
+) -> Callable[[RunStatus], None]:
+    """Return what shows a status at two places."""
+
+    def show(status: RunStatus) -> None:
+        first(status)
+        second(status)
+
+    return show
 
 
 def pass_over_imports() -> None:
@@ -180,15 +203,20 @@ def _settings(config: FixedLagConfig, integrity: IntegrityConfig) -> dict[str, A
 
 def _connector(
     stack: contextlib.ExitStack,
+    folder: Path,
     inputs: list[InputConfig],
     outputs: list[OutputConfig],
     mission: Mission | None,
     speed: float | None,
 ) -> Callable[[int], Connections]:
     def connect(n_messages: int) -> Connections:
-        hub = stack.enter_context(SocketHub(inputs, outputs))
         if mission is None:
+            clock = ClockFile(folder)
+            ahead_s = clock.set_by_s(time.time(), boot_s())
+            live = SocketHub(inputs, outputs, set_by_s=ahead_s, note_clock=clock.note)
+            hub = stack.enter_context(live)
             return Connections(hub, hub)
+        hub = stack.enter_context(SocketHub(outputs=outputs))
         source = ReplaySource(
             messages_of(mission),
             speed=speed,
@@ -280,6 +308,12 @@ def add_connections(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--nmea", action="append", metavar="ADDRESS", help="answers as GGA, VTG, HDT; repeatable"
+    )
+    group.add_argument(
+        "--page",
+        metavar="HOST:PORT",
+        help="a page for browsers on this computer, such as 127.0.0.1:8080; another host lets "
+        "others look on",
     )
 
 

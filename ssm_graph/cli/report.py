@@ -13,7 +13,7 @@ from ssm_graph.base.errors import DataError
 from ssm_graph.cli.terminal import say
 from ssm_graph.io.export.track import epoch_of, parse_epoch
 from ssm_graph.io.results.place import PAGE_NAME
-from ssm_graph.io.results.tables import read_aids, read_results
+from ssm_graph.io.results.tables import read_aids, read_protection, read_results
 
 DESCRIPTION = """\
 Write one page about a result: the verdict in words first, the track with its uncertainty, height,
@@ -53,6 +53,7 @@ def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
         summary=results.summary,
         aids=read_aids(arguments.result),
         epoch_s=epoch_of(results, epoch_s),
+        protection=read_protection(arguments.result),
     )
     path: Path = arguments.out or arguments.result / PAGE_NAME
     now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")

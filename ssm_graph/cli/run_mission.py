@@ -16,7 +16,8 @@ from ssm_graph.cli.terminal import say
 from ssm_graph.evaluation.errors import Metrics, evaluate, reference_from_gnss, withhold_gnss
 from ssm_graph.io.mission_folder.folder import CALIBRATION_NAME, read_mission
 from ssm_graph.io.mission_folder.toml import read_mission_toml
-from ssm_graph.io.results.place import check_result_place
+from ssm_graph.io.results.place import FIGURES, check_result_place
+from ssm_graph.io.results.summary import input_fields
 from ssm_graph.io.results.tables import write_results
 from ssm_graph.mission.estimate import Estimate
 from ssm_graph.mission.mission import Mission, Reference
@@ -40,7 +41,10 @@ def add_mission_arguments(parser: argparse.ArgumentParser) -> None:
     number_option(parser, "--keyframe-interval", "SECONDS", apart, graph.keyframe_interval_s)
     until = "use GNSS only so long from the begin of the inertial data; the rest becomes the "
     number_option(parser, "--gnss-until", "SECONDS", until + "reference")
-    parser.add_argument("--no-figure", action="store_true", help="write no figure.png")
+    parser.add_argument(
+        "--figure", choices=FIGURES, default="png", help="of the figure (default: png)"
+    )
+    parser.add_argument("--no-figure", action="store_true", help="write no figure")
 
 
 def run_mission(
@@ -86,8 +90,10 @@ def run_mission(
                 "keyframe_interval_s": graph.keyframe_interval_s,
                 "gnss_until_s": arguments.gnss_until,
             },
+            inputs=input_fields(arguments.mission),
             axes=axes,
             draw=None if arguments.no_figure else draw,
+            figure_name=FIGURES[arguments.figure],
         )
     console.print(summary_table(estimate, metrics))
     say(console, f"results in {arguments.out}")

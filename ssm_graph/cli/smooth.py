@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import Any, Final
 
 from rich.console import Console
@@ -10,6 +11,8 @@ from rich.console import Console
 from factors.kernels import KERNELS, GeneralKernel, KernelChoice, TruncatedKernel
 from factors.similarity import Kernel, Similarity
 from ssm_graph.base.errors import ConfigError
+from ssm_graph.cli.answers import add_answer_arguments, asks, read_times
+from ssm_graph.cli.export import export, exports_of
 from ssm_graph.cli.options import (
     add_kernel_options,
     choice_option,
@@ -55,6 +58,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     add_mission_arguments(parser)
     _add_kernel_options(parser)
     _add_loop_options(parser)
+    add_answer_arguments(parser, afterwards=False)
     parser.set_defaults(run=run)
 
 
@@ -98,7 +102,13 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     def solve(mission: Mission, graph: ProblemConfig, show: ProgressDisplay) -> Estimate:
         return smooth(mission, loop, problem_config=graph, on_iteration=show, on_stage=show.stage)
 
-    return run_mission(arguments, console, errors, solve, _settings(loop))
+    if arguments.at is not None:
+        read_times(arguments.at, 0.0)  # what cannot be read is said before the work
+    is_good = run_mission(arguments, console, errors, solve, _settings(loop))
+    if asks(arguments):
+        result: Path = arguments.out.resolve()
+        export(arguments, result, ["csv"], exports_of(result), console, errors)
+    return is_good
 
 
 def loop_from(arguments: argparse.Namespace) -> SmootherConfig:

@@ -65,6 +65,13 @@ def console_on(stream: TextIO | None, *, is_stderr: bool = False) -> Console:
     return Console(file=file, stderr=is_stderr, markup=False, emoji=False)
 
 
+def silent() -> Console:
+    """Return a console that shows nothing."""
+    from rich.console import Console
+
+    return Console(quiet=True)
+
+
 def say(console: Console, text: str) -> None:
     """Print a text as it is, whatever it holds and however long it is."""
     console.print(text, markup=False, highlight=False, soft_wrap=True)

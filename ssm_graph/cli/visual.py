@@ -42,9 +42,12 @@ files in DIR:
   map.ply          points, path, anchors
   anchors.csv      places, sigmas, biases, states, other places that fit
   ranges.csv       every range with its error and weight; scale.csv over time
-  map.npz          the map, to go on from or to find a camera in
+  map.npz          the map, for --in-map
   result.json      verdict, reasons, notes, errors where there is a truth
   report.html      all of it in words, tables and figures
+
+With --in-map, only trajectory.tum: where in an earlier map each image was taken. The exit code is
+0 where the map is in metres and more than half of the images were found, 4 else.
 """
 
 
@@ -77,6 +80,9 @@ def declare(parser: argparse.ArgumentParser) -> None:
     number_option(parser, "--start-s", "S", "time of the first image on the clock of the ranges")
     number_option(parser, "--first", "N", "first image that is used", 0, kind=int)
     number_option(parser, "--count", "N", "images that are used, all without it", kind=int)
+    parser.add_argument(
+        "--in-map", type=Path, metavar="FILE", help="find each image in a map.npz, make no new map"
+    )
     number_option(parser, "--corners", "N", "followed at a time", 700, kind=int)
     parser.add_argument("--no-loops", action="store_true", help="do not close loops")
     parser.add_argument(
@@ -91,6 +97,7 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     from ssm_graph.systems.visual_ranges.figures import write_figures
     from ssm_graph.systems.visual_ranges.outputs import write_outputs
     from ssm_graph.systems.visual_ranges.page import write_page
+    from ssm_graph.systems.visual_ranges.readers.images import WatchedImages
     from ssm_graph.systems.visual_ranges.readers.source import read_sequence
     from ssm_graph.systems.visual_ranges.verdict import judged
 
@@ -100,8 +107,11 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
         sequence = _without_ranges(sequence)
     for note in sequence.notes:
         say(errors, f"note: {note}")
+    if arguments.in_map is not None:
+        return _found_in_map(sequence, arguments, console, errors)
     result = _followed(sequence, arguments, errors)
-    defects = getattr(sequence.images, "defects", tuple)()
+    watched = sequence.images
+    defects = watched.defects() if isinstance(watched, WatchedImages) else ()
     for note in defects:
         say(errors, f"note: {note}")
     found, off = judged(result), accuracy(sequence, result)
@@ -172,6 +182,47 @@ def _followed(sequence: Sequence, arguments: argparse.Namespace, errors: Console
             "before it turns, and see texture"
         )
     return result
+
+
+def _found_in_map(
+    sequence: Sequence, arguments: argparse.Namespace, console: Console, errors: Console
+) -> bool:
+    """Look for every image in a map of an earlier run, and write where it was taken."""
+    import numpy as np
+
+    from ssm_graph.systems.visual_ranges.map_files import MapLocator, load_map
+    from ssm_graph.systems.visual_ranges.outputs import write_tum
+
+    saved = load_map(arguments.in_map)
+    locator, found = MapLocator(saved, sequence.camera), []
+    columns = (TextColumn("image {task.completed} of {task.total}"), BarColumn())
+    with Progress(*columns, console=errors, transient=True) as progress:
+        task = progress.add_task("", total=len(sequence))
+        for index in range(len(sequence)):
+            one = locator.locate(sequence.images(index))
+            if one is not None:
+                found.append((sequence.time_s[index], one.pose))
+            progress.advance(task)
+    if not found:
+        raise SolverError(
+            f"{sequence.name}: none of {len(sequence)} images shows a place of {arguments.in_map}; "
+            "is it that of another place, or is the light another?"
+        )
+    has_scale = bool(np.isfinite(saved.scale))
+    scale, unit = (saved.scale, "m") if has_scale else (1.0, "map units")
+    path = arguments.out / "trajectory.tum"
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    write_tum(
+        path,
+        f"# time_s x y z qx qy qz qw  ({unit}; camera to map of {arguments.in_map.name})",
+        np.array([time for time, _ in found]),
+        np.stack([pose.R_cw for _, pose in found]),
+        scale * np.stack([pose.t_cw for _, pose in found]),
+    )
+    share = len(found) / len(sequence)
+    say(console, f"{len(found)} of {len(sequence)} images found in {arguments.in_map} ({unit})")
+    say(console, f"results in {path}")
+    return has_scale and share > 0.5
 
 
 def lines(result: VisualResult, found: Judged, off: Accuracy | None) -> list[str]:

@@ -29,6 +29,10 @@ GAP_GYRO_RATE = 0.2
 """rad/s, 1 sigma of the unseen body rate inside a gap of the inertial data."""
 GAP_ACCEL = 1.0
 """m/s^2, 1 sigma of the unseen specific force inside a gap of the inertial data."""
+TURN_S = 5.0
+"""An unseen turn about the body's vertical goes on at its rate for as long as this."""
+THAW_S = 2.0
+"""Before and after a stretch in which an axis repeats itself, what says how it went on there."""
 GRAVITY = 9.8
 """m/s^2"""
 GRADIENT_REACH = 1000.0
@@ -141,6 +145,7 @@ def preintegrate_steps(
     bias: Array | None = None,
     errors: Array | None = None,
     frozen: Sequence[FrozenAxis] = (),
+    cuts_gaps: bool = False,
 ) -> Steps[InertialChain]:
     """Preintegrate the inertial data between keyframes.
 
@@ -155,13 +160,15 @@ def preintegrate_steps(
         the increments follow; without them they do not.
     frozen : axes that repeat themselves by what came before these samples; all that they have
         missed is uncertain in the first interval.
+    cuts_gaps : the times cut gaps to pieces, which are off together, not each for itself.
     """
     source = None
     if errors is not None:
         source = ErrorSource(imu, keyframe_s, rate_hz, errors)
         imu = without_errors(imu, errors)
-    gaps = imu_gaps(imu)
-    unseen = tuple(_unseen(imu, keyframe_s, gaps, frozen_axes(imu), frozen))
+    gaps, repeating = imu_gaps(imu), frozen_axes(imu)
+    unseen = tuple(_unseen(imu, keyframe_s, gaps, repeating, frozen, cuts_gaps=cuts_gaps))
+    imu = thawed(imu, repeating)
     yield 3e-4 * len(imu.time_s)
     samples = yield from merge_samples_steps(bridged(imu, gaps), keyframe_s, rate_hz=rate_hz)
     bias = np.zeros(6) if bias is None else bias
@@ -314,6 +321,8 @@ def _unseen(
     gaps: tuple[Array, Array],
     frozen: Sequence[FrozenAxis],
     missed: Sequence[FrozenAxis] = (),
+    *,
+    cuts_gaps: bool,
 ) -> list[Unseen]:
     """Return what is not seen of each interval between keyframes.
 
@@ -324,12 +333,19 @@ def _unseen(
     for gap in zip(*gaps, strict=True):
         lively, pushed = _liveliness(imu, *gap)
         stretches.append((*gap, np.full(3, lively), np.full(3, pushed)))
+    n_gaps = len(stretches)
     stretches += [(axis.begin_s, axis.end_s, *_missing(axis)) for axis in frozen]
     unseen = [Unseen()] * (len(keyframe_s) - 1)
-    for begin, end, rate, force in stretches:
+    for number, (begin, end, rate, force) in enumerate(stretches):
         overlap = np.minimum(end, keyframe_s[1:]) - np.maximum(begin, keyframe_s[:-1])
         for k in np.flatnonzero(overlap > 0.0).tolist():
-            unseen[k] = _more_unseen(unseen[k], float(overlap[k]), rate, force)
+            own_s = float(overlap[k])
+            # Variances of pieces add up to that of what is off all the time; and while intervals
+            # count as independent, a turn is the same in those that follow.
+            whole = (end - begin) / own_s if cuts_gaps else 1.0
+            lasts = whole if number < n_gaps else max(min(end - begin, TURN_S) / own_s, 1.0)
+            turn, push = rate * np.sqrt([whole, whole, lasts]), force * np.sqrt(whole)
+            unseen[k] = _more_unseen(unseen[k], own_s, turn, push)
     for axis in missed:
         unseen[0] = _more_unseen(unseen[0], axis.end_s - axis.begin_s, *_missing(axis))
     return unseen
@@ -382,4 +398,23 @@ def bridged(imu: ImuLog, gaps: tuple[Array, Array]) -> ImuLog:
     columns = {name: getattr(imu, name).copy() for name in ("gyro_b", "accel_b")}
     for name, column in columns.items():
         column[k] = 0.5 * (getattr(imu, name)[k - 1] + getattr(imu, name)[k])
+    return replace(imu, **columns)
+
+
+def thawed(imu: ImuLog, frozen: Sequence[FrozenAxis]) -> ImuLog:
+    """Return the log with axes that repeat themselves led from what they were before to after.
+
+    One reading says less of ten seconds than the means about them do, and in a turn it goes on
+    until half a circle is made up for the other way round.
+    """
+    columns = {name: getattr(imu, name).copy() for name in ("gyro_b", "accel_b")} if frozen else {}
+    time_s = imu.time_s
+    for axis in frozen:
+        values = columns["gyro_b" if axis.is_gyro else "accel_b"][:, axis.axis]
+        first, before = np.searchsorted(time_s, [axis.begin_s, axis.begin_s - THAW_S])
+        last, after = np.searchsorted(time_s, [axis.end_s, axis.end_s + THAW_S], side="right")
+        ends = [own.mean() for own in (values[before:first], values[last:after]) if len(own)]
+        if ends:
+            span_s = [axis.begin_s, axis.end_s]
+            values[first:last] = np.interp(time_s[first:last], span_s, [ends[0], ends[-1]])
     return replace(imu, **columns)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import csv
+import contextlib
 import math
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,9 @@ from ssm_graph.base.errors import DataError, SsmGraphError
 from ssm_graph.base.frozen import Array
 from ssm_graph.inspection.sensors import SensorFound, sensors_of
 from ssm_graph.inspection.timing import timing_of
+from ssm_graph.io.ardupilot.convert import convert_ardupilot, is_ardupilot
 from ssm_graph.io.blueye.convert import convert_blueye
+from ssm_graph.io.columns.sources import ENDINGS, read_source
 from ssm_graph.io.file_kind import is_mcap, kind_of
 from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.io.mission_folder.toml import TOML_NAME
@@ -27,9 +28,6 @@ from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.suspects.find import find_suspects
 from ssm_graph.mission.usable import require_usable
 
-TABLES: Final = (".csv", ".txt", ".tsv")
-LEAST_COLUMNS: Final = 2
-"""Of numbers, for a text to be a table."""
 LEAST_S: Final = 30.0
 """Of a mission without a start: alignment needs about as much."""
 
@@ -133,6 +131,8 @@ def _reader(path: Path) -> tuple[str, Any]:
         return "ROS bag", convert_rosbag
     if path.is_file() and is_mcap(path):
         return "Blueye X3 log (MCAP)", convert_blueye
+    if path.is_file() and is_ardupilot(path):
+        return "ArduPilot log", convert_ardupilot
     return "", None
 
 
@@ -160,8 +160,12 @@ def _missing(mission: Mission) -> Iterator[str]:
             f"{span_s:.0f} s of inertial data and no [initial]: give a start, or at least "
             f"{LEAST_S:.0f} s to align with"
         )
-    if mission.initial is None and mission.gnss is None and not mission.aids:
-        yield "neither a fix nor [initial] says where it begins: give [initial] in mission.toml"
+    has_start = mission.initial is not None or mission.local is not None
+    if not has_start and mission.gnss is None and not mission.aids:
+        yield (
+            "neither a fix nor [initial] says where it begins: give [initial] in mission.toml, or "
+            "[local] for a tank or a pool"
+        )
     overlap = min(mission.imu.time_s[-1], mission.dvl.time_s[-1]) - max(
         mission.imu.start_s, mission.dvl.time_s[0]
     )
@@ -198,19 +202,18 @@ def _without_mission(path: Path) -> Inspection:
 
 def _table(path: Path) -> Inspection | None:
     """Return what a table of numbers holds: columns with their range, and the rate of its time."""
-    if path.suffix.lower() not in TABLES:
+    if path.suffix.lower() not in ENDINGS:
         return None
-    with path.open(encoding="utf-8", errors="replace", newline="") as file:
-        reader = csv.reader(file)
-        header = next(reader, [])
-        rows = [row for row in reader if len(row) == len(header)]
+    try:
+        source = read_source(path)
+    except SsmGraphError as error:
+        return Inspection(path, "table", (), (), (), (str(error),), None)
     columns: dict[str, Array] = {}
-    for i, name in enumerate(header):
-        values = [row[i] for row in rows]
-        if Counter(map(_is_number, values))[True] > len(values) / 2:
-            columns[name] = np.array([float(v) if _is_number(v) else math.nan for v in values])
-    if len(columns) < LEAST_COLUMNS or any(map(_is_number, header)):
-        return None
+    for name in source.columns:
+        with contextlib.suppress(DataError):
+            values = source.numbers(name, "inspect")
+            if np.isfinite(values).any():
+                columns[name] = values
     times = [name for name in columns if "time" in name.lower() or name.lower() in ("t", "stamp")]
     facts = tuple(
         f"{name}: {np.nanmin(values):.6g} to {np.nanmax(values):.6g}"
@@ -220,16 +223,10 @@ def _table(path: Path) -> Inspection | None:
     known = time_s[np.isfinite(time_s)]
     found = SensorFound("table", timing_of(known), facts, (), known, {})
     missing = (
-        "a table alone is no mission: put it into a folder with a mission.toml that names it "
-        "(docs/mission-folder.md)"
+        "a table alone is no mission: --draft-map map.toml says what its columns may be, and "
+        "ssm-graph convert --map makes a mission of it; or put it into a folder with a "
+        "mission.toml that names it (docs/mission-folder.md)"
     )
-    kind = f"table, {len(rows)} rows of {len(header)} columns"
+    n_rows = max((len(values) for values in source.columns.values()), default=0)
+    kind = f"table, {n_rows} rows of {len(source.columns)} columns"
     return Inspection(path, kind, (found,), (), (), (missing,), None)
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True

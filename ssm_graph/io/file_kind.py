@@ -5,9 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
+CSV_ENDINGS: Final = (".csv", ".txt", ".tsv", ".dat")
 READ: Final = (
-    "a ROS 2 bag (a folder, .mcap or .db3), a ROS 1 .bag, a Blueye X3 log, Teledyne PD0, Water "
-    "Linked JSON or a table of its reports, or NMEA 0183"
+    "a ROS 2 bag (a folder, .mcap or .db3), a ROS 1 .bag, a Blueye X3 log, an ArduPilot log, "
+    "Teledyne PD0, PD4, PD5 or PD6, Nortek AD2CP or Nucleus, Water Linked JSON or a table of its "
+    "reports, NMEA 0183, or tables with  --map"
 )
 _MCAP: Final = b"\x89MCAP0\r\n"
 _COMPRESSED: Final = "a compressed file: unpack it first"
@@ -18,13 +20,14 @@ _KINDS: Final = (
     (b"\x1f\x8b", f"{_COMPRESSED}, with  gunzip"),
     (b"BZh", f"{_COMPRESSED}, with  bunzip2"),
     (b"PK\x03\x04", f"{_COMPRESSED}, with  unzip"),
-    (b"\xa3\x95\x80", "an ArduPilot DataFlash log: export its tables with  mavlogdump.py"),
+    (b"\xa3\x95\x80", "an ArduPilot DataFlash log"),
     (b"ULog\x01\x12\x35", "a PX4 ULog: export its tables with  ulog2csv"),
     (b"\x7f\x7f", "like Teledyne PD0, but its first ensemble is damaged"),
     (b"\xb5\x62", "binary of a u-blox receiver: have it write NMEA, or convert it"),
     (b"SQLite format 3\0", "an SQLite database: a ROS 2 bag has it under the name .db3"),
-    (b"PAR1", "a Parquet table: put it into a mission folder"),
-    (b"\x89HDF\r\n", "an HDF5 file"),
+    (b"PAR1", "a Parquet table: say what its columns are, with  --map"),
+    (b"\x89HDF\r\n", "an HDF5 file: say what its columns are, with  --map"),
+    (b"MATLAB", "a MAT file: say what its columns are, with  --map"),
 )
 
 
@@ -43,16 +46,21 @@ def kind_of(path: Path) -> str:
     for begin, what in _KINDS:
         if head.startswith(begin):
             return f"this is {what}; expected {READ}"
+    if path.suffix.lower() in CSV_ENDINGS:
+        return (
+            "a table or text of unknown columns: say what they are, with  --map  (ssm-graph "
+            f"template, ssm-graph inspect {path.name} --draft-map map.toml); else expected {READ}"
+        )
     if _is_mavlink(head):
-        return f"this is a MAVLink telemetry log: export it with  mavlogdump.py; expected {READ}"
+        return f"this is MAVLink without the times of a .tlog; expected {READ}"
     if head.startswith(_MCAP):
         return f"MCAP without messages of ROS 2; expected {READ}"
     return f"of no known kind, it begins with {head[:12]!r}; expected {READ}"
 
 
 def _is_mavlink(head: bytes) -> bool:
-    """Return whether eight bytes of time stand before a frame, or frames stand alone."""
-    return head[8:9] in (b"\xfd", b"\xfe") or head[:1] in (b"\xfd", b"\xfe")
+    """Return whether frames stand alone."""
+    return head[:1] in (b"\xfd", b"\xfe")
 
 
 def _head(path: Path) -> bytes:

@@ -51,6 +51,20 @@ def trajectory_at(
     )
 
 
+def covariance_at(frame: LocalFrame, states: MovingState, covariance: Array) -> Array:
+    """Return the covariance (K, 9, 9) of what a trajectory has, from that of the error state.
+
+    Its order is position and velocity along east, north, up, then roll, pitch, heading.
+    """
+    R_ln = np.swapaxes(frame.R_nl_at(states.p_n), 1, 2)
+    R_lb = R_ln @ states.R_nb
+    roll, pitch, _ = roll_pitch_heading_from_R_lb(R_lb)
+    J = np.zeros((len(R_lb), 9, covariance.shape[-1]))
+    J[:, :3, POSITION], J[:, 3:6, VELOCITY] = R_lb, R_ln
+    J[:, 6:, ROTATION] = np.linalg.inv(phi_D_roll_pitch_heading(roll, pitch))
+    return _turned(J, covariance)
+
+
 def _turned(J: Array, covariance: Array) -> Array:
     return np.asarray(J @ covariance @ np.swapaxes(J, 1, 2))
 

@@ -13,6 +13,7 @@ from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array, FrozenArrays, ShortRepr, shaped
 from ssm_graph.mission.fault import DetectedFault
 from ssm_graph.mission.mission import InitialState
+from ssm_graph.mission.posterior import Posterior
 
 OUTLIER_WEIGHT = 0.05
 """Beams that end below this weight are called outliers."""
@@ -288,6 +289,8 @@ class Estimate(ShortRepr):
     """What was found of the water's current; None without pings off the water."""
     faults: tuple[DetectedFault, ...] = ()
     """Sensors that were off for long, in the order of their begins."""
+    posterior: Posterior | None = None
+    """For answers between keyframes; of smoothers of the whole mission."""
 
     @property
     def n_iterations(self) -> float:

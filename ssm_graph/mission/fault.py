@@ -15,8 +15,14 @@ class Treatment(Enum):
     FREED = "estimated and taken off there"
     COVERED = "the sigmas cover what it may have cost"
     ALLOWED = "too little to decide, the sigmas allow for it"
+    WIDENED = "the sigmas allow for it"
     CHANGING = "estimated there, but it was another at each look"
     SAID = "counted as it is"
+
+    @property
+    def is_blame(self) -> bool:
+        """Whether a sensor is said not to be sound, or not to be what it is taken for."""
+        return self not in (Treatment.ALLOWED, Treatment.WIDENED)
 
     @property
     def is_harmless(self) -> bool:

@@ -6,6 +6,7 @@ north, up at the vehicle.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol, TypeVar
@@ -119,6 +120,46 @@ class InitialState(FrozenArrays):
     """(3,) rad, roll, pitch, heading"""
 
 
+@dataclass(frozen=True, slots=True)
+class LocalStart:
+    """A start at zero where no place on Earth is known: a tank, a pool, a dock.
+
+    The axes of the answer are those of the stated heading; without one, and where neither compass
+    nor gyros find north, the vehicle looks along "north" when it starts.
+    """
+
+    lat: float = math.radians(45.0)
+    """rad, for gravity and the turn of the Earth only."""
+    heading: float = math.nan
+    """rad, clockwise from the "north" of the answer; NaN for one that is not known."""
+    heading_sigma: float = math.radians(1.0)
+    """rad, of a stated heading."""
+
+    @property
+    def is_heading_known(self) -> bool:
+        """Whether it is stated."""
+        return not math.isnan(self.heading)
+
+    @property
+    def frame(self) -> LocalFrame:
+        """Navigation frame of the answer; its place on Earth is made up."""
+        return LocalFrame(self.lat, 0.0, 0.0)
+
+    @property
+    def sentence(self) -> str:
+        """What it means for every number, for people."""
+        heading = (
+            f"the heading at the start is stated, {math.degrees(self.heading) % 360.0:.1f} deg"
+            if self.is_heading_known
+            else "no heading is stated: unless a compass or the gyros find north, zero is where "
+            "the vehicle looked when it started"
+        )
+        return (
+            f"local start: positions are metres from the start, at zero; {heading}; latitudes and "
+            "longitudes are no place on Earth"
+        )
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Reference(FrozenArrays):
     """An outside trajectory, only ever compared with; NaN where a quantity is unknown."""
@@ -153,6 +194,8 @@ class Mission(ShortRepr):
     """What else the smoothers are aided by."""
     initial: InitialState | None = None
     reference: Reference | None = None
+    local: LocalStart | None = None
+    """A start at zero, where no place on Earth is known; None where one is."""
     current: CurrentModel | None = None
     """Of the water, where pings are off it; None for one that is not stated."""
     notes: tuple[str, ...] = ()

@@ -45,6 +45,8 @@ class SourceStatus:
     """Messages passed on in the last whole second."""
     age_s: float = math.inf
     """Since the last message; infinite before the first."""
+    altitude_m: float = math.nan
+    """Above the ground, by its last report, m; NaN where it does not say."""
 
 
 @dataclass(frozen=True, slots=True)

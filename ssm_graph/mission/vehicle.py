@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from ssm_graph.base.earth import LocalFrame
-from ssm_graph.mission.mission import NO_AIDS, Aids, InitialState
+from ssm_graph.mission.mission import NO_AIDS, Aids, InitialState, LocalStart
 from ssm_graph.sensors.current import CurrentModel
 from ssm_graph.sensors.depth import DepthLog
 from ssm_graph.sensors.dvl import DvlMount, empty_dvl
@@ -47,6 +47,8 @@ class Vehicle:
     """Navigation frame; None takes the first fix."""
     initial: InitialState | None = None
     """None lets the estimator align itself."""
+    local: LocalStart | None = None
+    """A start at zero where no place on Earth is known; None where one is."""
     imu_calibration: ImuCalibration = ImuCalibration()
     """Of what inertial messages read."""
 

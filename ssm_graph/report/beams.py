@@ -55,11 +55,14 @@ def top_of_weights(*tables: BeamTable) -> float:
     return 1.06 * max(float(np.nanmax(table.weight, initial=1.0)) for table in tables)
 
 
-def innovation_axis(axes: Axes, innovation: Array) -> None:
-    """Scale linearly over the normal noise and logarithmically beyond, where outliers are."""
+def innovation_axis(axes: Axes, innovation: Array) -> float | None:
+    """Scale linearly over the normal noise and logarithmically beyond, where outliers are.
+
+    Returns where the one becomes the other, None where there is nothing to scale.
+    """
     size = np.abs(innovation[np.isfinite(innovation)])
     if len(size) == 0:
-        return
+        return None
     noise = 1.4826 * float(np.median(size)) or 1e-3
     linear = 5.0 * noise
     largest = 1.5 * max(float(size.max()), linear)
@@ -72,3 +75,4 @@ def innovation_axis(axes: Axes, innovation: Array) -> None:
     axes.set_yticks([*(-tick for tick in reversed(ticks)), 0.0, *ticks])
     axes.yaxis.set_minor_locator(NullLocator())
     axes.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}".replace("-", "−")))
+    return linear

@@ -41,8 +41,11 @@ from ssm_graph.graph.measurements import JudgedAid, aid_kernel, aid_table, doubt
 from ssm_graph.mission.answer import trajectory_from_states
 from ssm_graph.mission.estimate import BeamTable, Estimate, Iteration, NoiseFound, Status
 from ssm_graph.mission.fault import DetectedFault
+from ssm_graph.mission.imu_variables import columns_of_errors, imu_errors
+from ssm_graph.mission.posterior import Posterior
 from ssm_graph.mission.problem import Problem, with_white_noise
 from ssm_graph.smoothers.descent import descend_steps
+from ssm_graph.smoothers.faults.nuisances import DVL
 from ssm_graph.smoothers.faults.watch import FaultWatch
 from ssm_graph.smoothers.settings import WARM_KERNEL, SmootherConfig
 from ssm_graph.smoothers.track import calibration_of, current_of, undetermined
@@ -50,6 +53,7 @@ from ssm_graph.smoothers.verdict import (
     MAX_ADAPTATIONS,
     adaptation,
     contradictions,
+    efficiency,
     noise_found,
     noise_notes,
     with_sigmas,
@@ -250,6 +254,8 @@ class SsmSmoother:
                 break
             yield 0.007 * problem.n_keyframes
             weights = weights.after(this, faults)
+        if self.config.fault_search is not None:
+            this = yield from self._with_sigmas_steps(linearizer, this, weights, faults)
         inertial = inertial_fit(linearizer.inertial_rows(this.states), this.step)
         yield 0.02 * problem.n_keyframes
         found = problem.faults + faults.faults(this.states, inertial)
@@ -257,6 +263,21 @@ class SsmSmoother:
         notes = (*problem.notes, *(fault.sentence for fault in found), *_notes_of(first))
         ended = (linearizer, this, tuple(iterations), status)
         return Solved(*ended, kernel, notes, first, found, faults.aids_out, inertial)
+
+    def _with_sigmas_steps(
+        self, linearizer: GraphLinearizer, last: Pass, used: Weights, faults: FaultWatch
+    ) -> Steps[Pass]:
+        """Return the last pass with the covariance that its residuals ask for."""
+        kernel, aids, known = used.of_beams.kernel, linearizer.weighted, np.ones(len(used.aids))
+        beams = efficiency(last.mahalanobis_sq, last.weights, kernel) / faults.inflation_of(DVL)
+        for aid in aids.all:
+            own = aids.of(aid, last.aid_mahalanobis_sq), aids.of(aid, last.aid_weights)
+            says = efficiency(*own, used.of_aids.kernel, dim=aid.dim)
+            aids.of(aid, known)[:] = says / faults.inflation_of(aid.name)
+        step = yield from linearizer.solve_steps(
+            last.states, last.beam_rows, beams * last.weights, known * last.aid_weights
+        )
+        return last._replace(step=step)
 
     def _iterate(
         self,
@@ -371,6 +392,7 @@ class SsmSmoother:
                 last.states.walks,
                 last.step.covariance_of(slice(STATE_DIM, None)),
             ),
+            posterior=_posterior(problem, last),
         )
 
     def _doubts(self, solved: Solved, judged: list[JudgedAid]) -> list[str]:
@@ -388,6 +410,21 @@ class SsmSmoother:
                 last.step.end_covariance(STATE_DIM),
             ),
         ]
+
+
+def _posterior(problem: Problem, last: Pass) -> Posterior:
+    """Return what is known of the keyframes, with the errors found of the inertial sensors."""
+    states, errors = last.states, None
+    if len(columns_of_errors(problem.extras)):
+        errors = np.atleast_2d(imu_errors(problem.extras, states.walks, states.constants)[0])
+    return Posterior(
+        problem.frame,
+        problem.keyframe_s,
+        *states[:4],
+        last.step.covariance(STATE_DIM),
+        last.step.neighbour_covariance(STATE_DIM),
+        errors,
+    )
 
 
 def noise_of(solved: Solved, used: Array) -> NoiseFound:

@@ -17,6 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from factors.similarity import WEIGHT_FLOOR, Kernel
 from ssm_graph.base import chi2
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import STATE_DIM
@@ -126,6 +127,11 @@ per cent."""
 ADAPTED = 0.02
 """Adaptation ends when all sigmas agree with the estimate by this share."""
 MAX_ADAPTATIONS = 8
+BEND = 1e-4
+"""Share of ``t`` over which the slope of a weight is taken."""
+FEWEST_TO_JUDGE = 100
+"""Components below which nothing is said of the efficiency of a kernel."""
+LEAST_EFFICIENCY = 0.5
 LARGEST_CHANGE = 3.0
 """Factor by which one adaptation changes a sigma at most."""
 
@@ -163,6 +169,37 @@ def _scale_sq(square: Array) -> float:
         if abs(scale_sq - last) < 1e-6 * last:
             break
     return scale_sq
+
+
+def efficiency(t: Array, weights: Array, kernel: Kernel, *, dim: int = 1) -> float:
+    """Return by how much more measurements say than the sum of their weights makes of them.
+
+    A kernel's answer has the covariance ``A^-1 B A^-1`` with ``A`` the mean slope of the influence
+    ``weight error`` and ``B`` its mean square [1]_; the inverse sum of the weights is another one.
+    Under normal noise the log kernel knows 0.91 of what its weights claim, under that of a
+    Workhorse, Student's with 4.3 degrees of freedom, 1.25. Errors smaller than stated say nothing:
+    they are counted as if they were as large.
+
+    Parameters
+    ----------
+    t : (M,) squared Mahalanobis lengths.
+    weights : (M,) those at the floor do not count.
+    kernel : that made these of those.
+    dim : of the measurements.
+
+    References
+    ----------
+    .. [1] P. J. Huber, E. M. Ronchetti, "Robust Statistics", 2nd ed., Wiley, 2009, section 6.3.
+    """
+    t = t[weights > WEIGHT_FLOOR]
+    if len(t) * dim < FEWEST_TO_JUDGE:
+        return 1.0
+    t = t * max(dim / float(np.mean(t)), 1.0)
+    w = kernel.weight(t, dim=dim)
+    bend = (kernel.weight(t * (1.0 + BEND), dim=dim) - w) / BEND
+    slope = float(np.mean(w + 2.0 * bend / dim))
+    square = float(np.mean(w**2 * t)) / dim * float(np.mean(w))
+    return float(np.clip(slope * abs(slope) / square, LEAST_EFFICIENCY, 1.0 / LEAST_EFFICIENCY))
 
 
 def noise_found(

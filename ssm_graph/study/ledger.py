@@ -86,8 +86,8 @@ class Ledger:
         whole, _, torn = content.rpartition(b"\n")
         header, *lines = whole.split(b"\n")
         try:
-            found = object_of(header)["settings"]
-        except (ValueError, KeyError, RecursionError) as error:
+            found = dict(object_of(header)["settings"])
+        except (ValueError, TypeError, KeyError, RecursionError) as error:
             raise ConfigError(
                 f"{self.path}, line 1: expected the settings of a study, got {shown(header)}; "
                 "start afresh to throw it away, or choose another folder"
@@ -102,7 +102,7 @@ class Ledger:
         for number, line in enumerate(lines, 2):
             try:
                 values = object_of(line)
-                key, row = tuple(values["key"]), dict(values["row"])
+                key, row = _key_of(values["key"]), dict(values["row"])
             except (ValueError, TypeError, KeyError, RecursionError):
                 self.notes += (f"{self.path}, line {number}: damaged; that trial is done again",)
                 continue
@@ -114,6 +114,13 @@ class Ledger:
             part = self.path.with_suffix(".part")
             write_through(part, b"\n".join(kept) + b"\n")
             part.replace(self.path)
+
+
+def _key_of(value: object) -> Key:
+    """Return a trial's key as it was written; raise :class:`TypeError` for what is none."""
+    if not (isinstance(value, list) and all(isinstance(x, str | int | float) for x in value)):
+        raise TypeError
+    return tuple(value)
 
 
 def run_trials(

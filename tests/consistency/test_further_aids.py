@@ -36,14 +36,13 @@ def nees(estimate: Estimate, truth: dict[str, Array]) -> float:
     return float(error @ np.linalg.solve(calibration.covariance[np.ix_(kept, kept)], error))
 
 
-@pytest.mark.parametrize("rate", [0.0, 0.1])
-def test_unknown_beacons_lie_where_their_sigmas_say(rate: float) -> None:
-    """Stated with errors drawn from the prior, with and without echoes."""
+def test_unknown_beacons_lie_where_their_sigmas_say() -> None:
+    """Stated with errors drawn from the prior, one range of ten an echo."""
     found = []
     for seed in range(RUNS):
         off = np.random.default_rng([seed, 7]).standard_normal(3) * PRIOR_M
         beacon = BeaconSettings(7, (90.0, -60.0, -50.0), (off[0], off[1], off[2]), PRIOR_M)
-        aids = ranging(beacon, rate=rate, interval_s=2.0)
+        aids = ranging(beacon, rate=0.1, interval_s=2.0)
         sim = simulated(duration_s=200.0, route=ROUTE, aids=aids, seed=seed)
         estimate = SsmSmoother().solve(build_problem(sim.mission))
         found.append(nees(estimate, {"beacon_7": -off}))

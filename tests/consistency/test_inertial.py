@@ -88,11 +88,7 @@ def test_ten_minutes(rate_hz: float, merge_hz: float | None) -> None:
     ("lat_deg", "rate_hz", "merge_hz", "vertical_limit"),
     [
         (80.0, 20.0, RAW, 0.5),
-        (80.0, 100.0, RAW, 0.05),
         (80.0, 100.0, 20.0, 0.05),
-        (80.0, 200.0, RAW, 0.05),
-        (80.0, 200.0, 20.0, 0.05),
-        (45.7, 100.0, 20.0, 0.05),
         (0.0, 20.0, RAW, 0.5),
         (-60.0, 200.0, 20.0, 0.05),
     ],
@@ -108,14 +104,13 @@ def test_one_hour_over_7_km(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("lat_deg", [45.7, 80.0])
-def test_the_smoother_agrees_over_an_hour(lat_deg: float) -> None:
+def test_the_smoother_agrees_over_an_hour() -> None:
     """With nothing measured the batch solution is the dead reckoning itself, and better.
 
     Its gravity is that of the path it ends with. The forward pass has that of the predicted path,
     and what heave makes of the difference grows with the height's own instability.
     """
-    sim = unaided(duration_s=3600.0, lat_deg=lat_deg, rate_hz=100.0)
+    sim = unaided(duration_s=3600.0, lat_deg=80.0, rate_hz=100.0)
     problem = problem_of(sim, merge_hz=20.0)
     first = first_values(problem, kernel=LogKernel())
     estimate = SsmSmoother().solve(problem)

@@ -299,7 +299,7 @@ def test_instruments_on_sockets(tmp_path: Path) -> None:
     ]
     serving = Endpoint(Transport.TCP_SERVER, LOOPBACK, 0)
     outputs = [OutputConfig(form, serving) for form in OutputFormat]
-    with SocketHub(inputs, outputs, wall_s=wall_s) as hub:
+    with SocketHub(inputs, outputs, wall_s=wall_s, steady_s=wall_s) as hub:
         ship = Ship(hub, a50, wall_s)
         readers = [
             Reader(output.port) for output in hub.outputs if isinstance(output, TcpServerOutput)

@@ -50,6 +50,7 @@ MAY_IMPORT = {
     | {"smoothers", "filters", "graph", "mission", "engine", "simulation", "evaluation"}
     | {"factors", "io"},
     "report": VALUES | {"evaluation"},
+    "result": VALUES | {"io", "smoothers", "evaluation", "report"},
     "inspection": VALUES | {"io", "live", "mission", "report"},
     **dict.fromkeys(SYSTEMS, OF_SYSTEMS),
 }
@@ -58,6 +59,7 @@ MISSION_VALUES = {
     f"ssm_graph.mission.{name}"
     for name in ("mission", "vehicle", "fault", "estimate", "navigation", "run_status", "events")
 }
+MISSION_VALUES |= {"ssm_graph.mission.point", "ssm_graph.mission.posterior"}
 TOP = {"", "cli", "__main__"}
 """The package's own namespace and its command line stand above everything."""
 MAY_PRINT = {"cli", "report"}
@@ -286,6 +288,7 @@ def writes_of(tree: ast.Module) -> Iterator[tuple[int, str]]:
 
 
 MAY_WRITE = {
+    "ssm_graph/cli/completion.py": {"action.complete"},
     "ssm_graph/io/raw_log/log.py": {"row.is_in_table"},
     "ssm_graph/io/ros/topics.py": {"topic.n_unstated", "topic.beams_d"},
     "ssm_graph/io/tables/checkpoint.py": {"archive.comment"},

@@ -37,8 +37,9 @@ from ssm_graph.simulation import (
 from ssm_graph.simulation.faults import Sensor
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
 from ssm_graph.smoothers.faults.columns import KERNEL, beside_median, calibration_columns
+from ssm_graph.smoothers.faults.grid import Grid
 from ssm_graph.smoothers.faults.hypotheses import Course, Hypothesis
-from ssm_graph.smoothers.faults.judged import Grid, Judged
+from ssm_graph.smoothers.faults.judged import Judged
 from ssm_graph.smoothers.faults.search import FaultSearch
 from tests.aids_fixture import with_every_aid
 from tests.helpers import simulated, with_initial
@@ -94,6 +95,10 @@ LIES = {
             size=(0.0, 0.1, 0.0),
             shape=FaultShape.RAMP,
         ),
+        "GNSS",
+    ),
+    "late fixes": (
+        Fault(sensor=Sensor.GNSS, shape=FaultShape.LATE, size=1.0),
         "GNSS",
     ),
     "a depth that is off": (
@@ -166,6 +171,32 @@ def test_nothing_is_found_with_realistic_instruments() -> None:
             seed=seed,
         )
         assert not smoothed(sim).faults
+
+
+def test_what_instruments_do_not_state_is_named_and_allowed_for() -> None:
+    """Realistic ones that state white noise alone: what to write is right to a factor of two."""
+    sim = simulated(
+        duration_s=200.0, imu_rate_hz=50.0, dvl=QUIET, gnss=FIXES, realistic=True, seed=1
+    )
+    estimate = smoothed(sim)
+    assert {one.treatment for one in estimate.faults} == {Treatment.WIDENED}
+    (imu,) = (one for one in estimate.faults if one.sensor == "IMU")
+    stated = float(imu.remedy.split("accel_bias_instability_ug = ")[1].split(",")[0])
+    assert 5.0 <= stated <= 20.0  # 10 is true
+    assert estimate.status is Status.CONVERGED
+    assert errors(estimate, sim)[1] < 5.0
+
+
+def test_a_beam_noisier_than_the_others_is_named() -> None:
+    """Three in ten of its pings two to five sigmas high, which each by itself may be."""
+    sim = simulated(duration_s=200.0, dvl=QUIET, seed=3)
+    fault = Fault((2,), shape=FaultShape.SPIKES, share=0.3, size=(2.0, 5.0))
+    broken = with_faults(sim.mission, (fault,), truth=sim.truth_at)
+    estimate = smoothed(replace(sim, mission=broken.mission))
+    (found,) = estimate.faults
+    assert found.sensor == "DVL beam 3"
+    assert "times as much as the others" in found.what
+    assert errors(estimate, sim)[1] < 5.0
 
 
 def test_the_search_goes_with_calibration() -> None:

@@ -66,6 +66,33 @@ def test_damage_is_named_and_done_again(tmp_path: Path) -> None:
     assert len(Ledger(path, {})) == 4
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        b'{"key": [["x"], 1], "row": {}}',
+        b'{"key": {"x": 1}, "row": {}}',
+        b'{"key": "xy", "row": {}}',
+        b'{"key": [null], "row": {}}',
+        b'{"key": ["x"], "row": [1]}',
+        b'{"key": ["x"], "row": {"v": NaN}}',
+        b'{"key": ["x"], "row": ' + b"[" * 100_000,
+        b"\0" * 100,
+        b"\xff",
+        b"",
+    ],
+)
+def test_no_row_is_a_trial(tmp_path: Path, line: bytes) -> None:
+    """It is named and done again; the others stay."""
+    path = tmp_path / "trials.jsonl"
+    run_trials(square, KEYS, Ledger(path, {}))
+    lines = path.read_bytes().split(b"\n")
+    lines[2] = line
+    path.write_bytes(b"\n".join(lines))
+    ledger = Ledger(path, {})
+    assert [note.partition(", ")[2][:6] for note in ledger.notes] == ["line 3"]
+    assert len(ledger) == len(KEYS) - 1
+
+
 def test_other_settings_are_refused(tmp_path: Path) -> None:
     """Rows of other settings are not mixed in; a fresh start throws them away."""
     path = tmp_path / "trials.jsonl"
@@ -73,8 +100,9 @@ def test_other_settings_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="window: expected 200, got 30"):
         Ledger(path, {"window": 200})
     assert len(Ledger(path, {"window": 200}, fresh=True)) == 0
-    path.write_bytes(b"\x00\x01")
-    with pytest.raises(ConfigError, match="line 1"):
-        Ledger(path, {})
+    for head in (b"\x00\x01", b'{"settings": 3}\n'):
+        path.write_bytes(head)
+        with pytest.raises(ConfigError, match="line 1"):
+            Ledger(path, {})
     with pytest.raises(ConfigError, match="file that can be written"):
         Ledger(tmp_path, {})

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import json
 import socket
 from contextlib import ExitStack
 
+import numpy as np
 import pytest
 
 from ssm_graph.live.protocols.json_messages import JsonDecoder, encode_message
 from ssm_graph.live.protocols.nmea import NmeaDecoder
+from ssm_graph.live.sockets.clocks import STRANGER_S, RunClock, StampClock
 from ssm_graph.live.sockets.endpoints import LOOPBACK, Endpoint, Transport
-from ssm_graph.live.sockets.feed import STRANGER_S, SampleClock
+from ssm_graph.live.sockets.feed import Limits
 from ssm_graph.live.sockets.inputs import TcpServerInput, UdpInput
-from ssm_graph.live.sockets.outputs import MAX_CLIENTS, OutputFormat, TcpServerOutput
+from ssm_graph.live.sockets.outputs import MAX_CLIENTS, OutputFormat, Publisher, TcpServerOutput
 from ssm_graph.live.sockets.sockets import InputConfig, OutputConfig, SocketHub
 from ssm_graph.sensors.gnss import Fix
 from ssm_graph.sensors.imu import ImuSample
-from ssm_graph.sensors.messages import Message
 from tests.instrument_fixture import Receiver, UdpSender, gga
+from tests.live_fixture import Recorder, a_navigation
 
 WALL_S = 1_700_000_000.0
 PERIOD_S = 0.01
@@ -119,17 +122,24 @@ def test_readers_that_do_nothing_block_no_output() -> None:
 
 
 class Sifted:
-    """What a clock lets pass of samples at times of arrival."""
+    """What a clock lets pass of messages at times of arrival."""
 
-    def __init__(self) -> None:
-        self.clock, self.passed, self.refused = SampleClock(), list[float](), list[float]()
+    def __init__(self, *, is_steady: bool = True) -> None:
+        self.steady, self.set_by_s = Steady(), 0.0
+        self._run = RunClock(lambda: self.steady.now_s + self.set_by_s, self.steady)
+        self.clock = StampClock(self._run, is_steady=is_steady)
+        self.passed, self.refused = list[float](), list[float]()
+        self.set_by = list[float]()
 
     def give(self, stamps: list[float], steady_s: float) -> None:
-        """Have samples arrive together."""
-        messages: list[Message] = [sample(stamp) for stamp in stamps]
-        passed, refused = self.clock.sift(messages, steady_s)
-        self.passed += [message.time_s for message in passed]
-        self.refused += [message.time_s for message in refused]
+        """Have messages arrive together."""
+        self.steady.now_s = steady_s
+        now, _ = self._run.read()
+        for stamp in stamps:
+            passed, refused, set_by_s = self.clock.sift(sample(stamp), now)
+            self.passed += [message.time_s for message in passed]
+            self.refused += [message.time_s for message in refused]
+            self.set_by += [set_by_s] if set_by_s else []
 
     def run(self, begin_s: float, end_s: float, *, offset_s: float = 0.0) -> list[float]:
         """Have a clock tick for a while."""
@@ -171,14 +181,80 @@ def test_strays_in_a_datagram_are_counted_and_told() -> None:
         sender.close()
 
 
-@pytest.mark.parametrize("off_s", [3600.0, -3600.0])
-def test_a_clock_that_was_set_is_believed_after_a_second(off_s: float) -> None:
-    """And not a sample is lost on the way."""
+@pytest.mark.parametrize("off_s", [3600.0, -3600.0, 3.0, 0.5, -0.5])
+def test_the_clock_of_an_instrument_that_was_set(off_s: float) -> None:
+    """It is believed after a second; not a sample is lost, and time goes on as it did."""
     sifted = Sifted()
     before = sifted.run(100.0, 102.0)
-    after = sifted.run(102.0, 104.0, offset_s=off_s)
-    assert sifted.passed == before + after
+    sifted.run(102.0, 104.0, offset_s=off_s)
     assert not sifted.refused
+    after = [102.0 + k * PERIOD_S for k in range(200)]
+    np.testing.assert_allclose(sifted.passed, before + after, rtol=0, atol=1e-6)
+    assert sifted.set_by == [pytest.approx(off_s, abs=1e-6)]
+
+
+@pytest.mark.parametrize("off_s", [30.0, -30.0, 3.0, -3.0, 0.5, -0.5, 0.06, -0.06, 1e8])
+@pytest.mark.parametrize("is_steady", [True, False])
+def test_the_clock_of_the_vehicle_is_set(off_s: float, *, is_steady: bool) -> None:
+    """What follows it is known at once, in the time of the run, with samples on their way too."""
+    sifted = Sifted(is_steady=is_steady)
+    before = sifted.run(100.0, 102.0)
+    sifted.give([102.0], 102.03)  # on its way when the clock was set
+    sifted.set_by_s = off_s
+    sifted.give([102.01], 102.03)
+    sifted.run(102.02, 104.0, offset_s=off_s)
+    after = [102.0 + k * PERIOD_S for k in range(200)]
+    np.testing.assert_allclose(sifted.passed, before + after, rtol=0, atol=1e-6)
+    assert not sifted.refused
+    assert not sifted.set_by
+
+
+@pytest.mark.parametrize("off_s", [30.0, -30.0, 3.0, -3.0, 0.5, -0.5])
+@pytest.mark.parametrize("is_steady", [True, False])
+def test_an_instrument_with_a_clock_of_its_own_does_not_follow(
+    off_s: float, *, is_steady: bool
+) -> None:
+    """A receiver that knows UTC while the vehicle's clock is set, and comes late now and then."""
+    sifted = Sifted(is_steady=is_steady)
+    before = sifted.run(100.0, 102.0)
+    sifted.set_by_s = off_s
+    after = [102.0 + k * PERIOD_S for k in range(2000)]
+    for stamp in after:
+        sifted.give([stamp], max(stamp, 110.2) if 110.0 < stamp < 110.2 else stamp)
+    np.testing.assert_allclose(sifted.passed, before + after, rtol=0, atol=1e-6)
+
+
+def test_a_stamp_from_before_its_clock_is_known_to_be_set() -> None:
+    """The clock is set between a look at it and the reading of what is stamped by it."""
+    sifted = Sifted()
+    before = sifted.run(100.0, 102.0)
+    sifted.give([132.0], 102.0)
+    sifted.set_by_s = 30.0
+    sifted.give([132.01], 102.01)
+    np.testing.assert_allclose(sifted.passed, [*before, 102.0, 102.01], rtol=0, atol=1e-6)
+    assert not sifted.refused
+
+
+@pytest.mark.parametrize("off_s", [0.5, 3.0])
+def test_pings_of_a_clock_that_was_set_forward(off_s: float) -> None:
+    """Nothing comes before it was measured; a stray is refused, a clock that stays is followed."""
+    sifted = Sifted(is_steady=False)
+    sent = [100.0 + 0.5 * k for k in range(40)]
+    for k, time_s in enumerate(sent):
+        stray = [time_s + off_s] if k == 10 else []
+        late_s = 0.1 if k % 3 else 0.12
+        sifted.give([time_s + off_s * (k >= 20), *stray], time_s + late_s)
+    assert sifted.refused == [sent[10] + off_s]
+    np.testing.assert_allclose(sifted.passed, sent, rtol=0, atol=0.03)
+    assert sifted.set_by == [pytest.approx(off_s, abs=0.03)]
+
+
+def test_a_clock_that_is_right_at_last() -> None:
+    """An instrument that began before its clock was set is taken at its word from then on."""
+    sifted = Sifted()
+    sifted.run(100.0, 102.0, offset_s=-1e9)
+    after = sifted.run(102.0, 104.0)
+    assert sifted.passed[-len(after) :] == after
 
 
 def test_two_clocks_at_once_never_take_turns() -> None:
@@ -222,4 +298,39 @@ def test_what_came_while_the_process_was_stopped_is_not_stamped_now() -> None:
         sender.send(gga(later))
         receiver.until(lambda: receiver.messages)
         assert receiver.messages[0].time_s == pytest.approx(later.time_s, abs=1.0)
+        sender.close()
+
+
+def answered(hub: SocketHub) -> str:
+    """Return the health of a good answer as it is sent."""
+    recorder = Recorder()
+    recorder.is_behind = hub.is_behind
+    Publisher().send(recorder, OutputFormat.JSON, a_navigation(0.0))
+    return str(json.loads(recorder.sent[0][1])["health"])
+
+
+def test_what_waited_while_the_process_was_stopped_is_not_too_much() -> None:
+    """A hundred samples a second for ten seconds, at once: all of them, from one who is counted."""
+    clock = Steady()
+    limits = Limits(messages_per_s=110.0, burst=20, bytes_per_s=3e4)
+    config = InputConfig("imu", Endpoint(Transport.UDP, LOOPBACK, 0), JsonDecoder, limits)
+    with SocketHub([config], steady_s=clock, wall_s=lambda: WALL_S + clock.now_s) as hub:
+        receiver = Receiver(hub)
+        receiver.poll()
+        sender = UdpSender(port_of(hub))
+        stamps = [clock.now_s + k * PERIOD_S for k in range(1001)]
+        sender.send(encode_message(sample(stamps[0])))
+        receiver.until(lambda: receiver.messages)
+        for begin in range(1, 1001, 100):
+            lines = (encode_message(sample(stamp)) for stamp in stamps[begin : begin + 100])
+            sender.send(b"".join(lines))
+        clock.now_s += 10.0
+        healths = set[tuple[bool, str]]()
+        receiver._after_poll = lambda: healths.add((hub.is_behind, answered(hub)))
+        receiver.until(lambda: len(receiver.messages) == 1001 and not hub.is_behind)
+        receiver._after_poll = lambda: None
+        assert healths == {(True, "DEGRADED"), (False, "GOOD")}
+        assert [message.time_s for message in receiver.messages] == stamps
+        sender.send(b"".join(encode_message(sample(stamps[-1] + k)) for k in range(1, 200)))
+        receiver.until(lambda: "rate_limited" in receiver.kinds)  # and then as ever
         sender.close()

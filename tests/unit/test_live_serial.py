@@ -70,8 +70,12 @@ def test_addresses_of_ports() -> None:
 def test_bytes_come_as_they_are(line: tuple[int, int]) -> None:
     """Control characters and line ends too, at the speed that was asked for; nothing is echoed."""
     ours, theirs = line
+    left = termios.tcgetattr(theirs)
+    left[6][termios.VMIN] = 0  # by another program that had the port before
+    termios.tcsetattr(theirs, termios.TCSANOW, left)
     with SocketHub([at(os.ttyname(theirs), 4800)], []) as hub:
         assert poll(hub) == []
+        assert termios.tcgetattr(theirs)[6][termios.VMIN] in (1, b"\x01")
         os.write(ours, b"\x03\x11\x13\x04" + DEPTH + pips(DepthReading(0.0, 21.0)))
         assert len(poll(hub)) == 2
         assert hub.source_status()[0].state is LinkState.CONNECTED

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import socket
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import pairwise
@@ -34,7 +35,7 @@ from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.gnss import Fix
 from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.sensors.messages import Message
-from tests.instrument_fixture import A50, Receiver, UdpSender, gga, pips, report
+from tests.instrument_fixture import A50, DEADLINE_S, Receiver, UdpSender, gga, pips, report
 
 WALL_S = 1_700_000_000.0
 IMU = ImuSample(12.0, (0.01, 0.0, 0.0), (0.0, 0.0, -9.8))
@@ -43,7 +44,7 @@ QUICK = Limits(retry_s=(0.02, 0.1), stall_s=60.0)
 
 def a_ping(k: int = 0) -> Ping:
     """Return a ping just taken; each has speeds of its own."""
-    return Ping(WALL_S - 0.125 + k / 8.0, (0.1 + k / 64.0, -0.2, math.nan, 0.25))
+    return Ping(WALL_S - 0.125 + k / 64.0, (0.1 + k / 64.0, -0.2, math.nan, 0.25))
 
 
 class FakeTime:
@@ -59,6 +60,12 @@ class FakeTime:
     def wall_s(self) -> float:
         """Return Unix time."""
         return WALL_S + self.now_s - 100.0
+
+
+def clock_from(begin_s: float = WALL_S) -> Callable[[], float]:
+    """Return the clock of a computer that nobody sets, s."""
+    ahead_s = begin_s - time.monotonic()
+    return lambda: time.monotonic() + ahead_s
 
 
 def pass_time(clock: FakeTime, receiver: Receiver, span_s: float) -> None:
@@ -99,7 +106,7 @@ def port_of(hub: SocketHub, index: int = 0) -> int:
 def dvl() -> Iterator[tuple[A50, Receiver]]:
     """Return a DVL and a hub that is connected with it."""
     a50 = A50()
-    with SocketHub([dvl_at(a50.port)], wall_s=lambda: WALL_S) as hub:
+    with SocketHub([dvl_at(a50.port)], wall_s=clock_from()) as hub:
         receiver = Receiver(hub)
         a50._on_idle = receiver.poll
         a50.accept()
@@ -238,7 +245,9 @@ def test_patience_grows_and_starts_again_after_data() -> None:
     a50, clock = A50(), FakeTime()
     a50.vanish()
     times: list[float] = []
-    with SocketHub([dvl_at(a50.port, Limits())], steady_s=clock.steady_s) as hub:
+    with SocketHub(
+        [dvl_at(a50.port, Limits())], steady_s=clock.steady_s, wall_s=clock.wall_s
+    ) as hub:
         state = LinkState.WAITING
         while len(times) < 8:
             hub.poll(0.0)
@@ -288,7 +297,7 @@ def test_a_call_that_nobody_answers_is_given_up(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(
         "ssm_graph.live.sockets.inputs.selectors.EVENT_WRITE", 1
     )  # a new socket can always be written
-    with SocketHub([dvl_at(9)], steady_s=clock.steady_s) as hub:
+    with SocketHub([dvl_at(9)], steady_s=clock.steady_s, wall_s=clock.wall_s) as hub:
         receiver = Receiver(hub)
         hub.inputs[0].on_ready = lambda *_: []  # type: ignore[method-assign]
         receiver.poll()
@@ -302,7 +311,7 @@ def test_a_server_takes_a_few_clients_and_drops_silent_ones() -> None:
     """Half open connections of a rebooted sender must not lock it out."""
     clock = FakeTime()
     config = listening(Transport.TCP_SERVER, limits=Limits(max_clients=2, stall_s=10.0))
-    with SocketHub([config], steady_s=clock.steady_s) as hub:
+    with SocketHub([config], steady_s=clock.steady_s, wall_s=clock.wall_s) as hub:
         receiver = Receiver(hub)
         address = (LOOPBACK, port_of(hub))
         with socket.create_connection(address) as one, socket.create_connection(address) as two:
@@ -375,7 +384,7 @@ def test_a_flood_harms_nobody_else_and_is_said() -> None:
     ]
     flood = encode_message(IMU) * 500
     n_sent, duration_s, step_s = 0, 3.0, 0.01
-    with SocketHub(configs, steady_s=clock.steady_s) as hub:
+    with SocketHub(configs, steady_s=clock.steady_s, wall_s=clock.wall_s) as hub:
         hub.poll(0.0)
         attacker = socket.create_connection((LOOPBACK, port_of(hub)))
         attacker.setblocking(False)
@@ -414,7 +423,9 @@ def test_a_storm_of_datagrams_takes_nothing_of_another_sender() -> None:
     clock, n = FakeTime(), 40
     limits = Limits(bytes_per_s=1e4)
     with (
-        SocketHub([listening(Transport.UDP, limits=limits)], steady_s=clock.steady_s) as hub,
+        SocketHub(
+            [listening(Transport.UDP, limits=limits)], steady_s=clock.steady_s, wall_s=clock.wall_s
+        ) as hub,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as storm,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sound,
     ):
@@ -490,13 +501,15 @@ def test_depth_by_arrival(*, is_nmea: bool) -> None:
     """A sensor without a clock is stamped when it comes."""
     make: Callable[[], Decoder] = NmeaDecoder if is_nmea else JsonDecoder
     reading = DepthReading(WALL_S, 12.5)
-    with SocketHub([listening(Transport.UDP, "depth", make=make)], wall_s=lambda: WALL_S) as hub:
+    with SocketHub([listening(Transport.UDP, "depth", make=make)], wall_s=clock_from()) as hub:
         receiver = Receiver(hub)
         receiver.poll()
         sender = UdpSender(port_of(hub))
         sender.send(pips(reading) if is_nmea else encode_message(reading))
         receiver.until(lambda: receiver.messages)
-        assert receiver.messages == [reading]
+        assert isinstance(found := receiver.messages[0], DepthReading)
+        assert found.time_s == pytest.approx(WALL_S, abs=DEADLINE_S)
+        assert found.depth == reading.depth
         sender.close()
 
 
@@ -506,13 +519,13 @@ def test_a_dvl_by_arrival() -> None:
     config = InputConfig(
         "dvl", tcp(a50.port), lambda: WaterLinkedDecoder(clock=Clock.ARRIVAL), QUICK
     )
-    with SocketHub([config], wall_s=lambda: 50.0) as hub:
+    with SocketHub([config], wall_s=clock_from(50.0)) as hub:
         receiver = Receiver(hub)
         a50._on_idle = receiver.poll
         a50.accept()
         a50.send(a_ping())
         receiver.until(lambda: receiver.messages)
-        assert receiver.messages[0].time_s == 50.0
+        assert receiver.messages[0].time_s == pytest.approx(50.0, abs=DEADLINE_S)
     a50.vanish()
 
 
@@ -618,13 +631,17 @@ def test_ipv6_works_where_there_is_any() -> None:
 def test_a_flood_of_one_kind_leaves_the_others_of_its_socket_alone() -> None:
     """Of a hundred depths with each inertial sample the most are left out, of those none."""
     clock = FakeTime()
-    with SocketHub([listening(Transport.UDP, "messages")], steady_s=clock.steady_s) as hub:
+    with SocketHub(
+        [listening(Transport.UDP, "messages")], steady_s=clock.steady_s, wall_s=clock.wall_s
+    ) as hub:
         hub.poll(0.0)
         sender = UdpSender(port_of(hub))
         messages: list[Message] = []
         for k in range(200):
-            depths = [encode_message(DepthReading(k + 1e-3 * n, 5.0)) for n in range(100)]
-            sender.send(encode_message(replace(IMU, time_s=float(k))))
+            depths = [
+                encode_message(DepthReading(WALL_S + 0.01 * k + 1e-5 * n, 5.0)) for n in range(100)
+            ]
+            sender.send(encode_message(replace(IMU, time_s=WALL_S + 0.01 * k)))
             for begin in range(0, 100, 20):
                 sender.send(b"".join(depths[begin : begin + 20]))
             messages += hub.poll(0.0)
@@ -633,6 +650,6 @@ def test_a_flood_of_one_kind_leaves_the_others_of_its_socket_alone() -> None:
             messages += hub.poll(0.005)
         sender.close()
     samples = [m.time_s for m in messages if isinstance(m, ImuSample)]
-    assert samples == [float(k) for k in range(200)]
+    assert samples == [WALL_S + 0.01 * k for k in range(200)]
     n_depths = len(messages) - len(samples)
     assert 200.0 * 2.0 <= n_depths <= 200.0 * 2.0 + 400 + 1

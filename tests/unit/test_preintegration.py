@@ -7,6 +7,7 @@ import math
 import gtsam
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from ssm_graph.base.earth import EARTH_RATE, LocalFrame
 from ssm_graph.base.frozen import Array
@@ -109,6 +110,21 @@ def test_gaps_are_found_and_only_their_intervals_inflated() -> None:
     assert angle_sigma[1] == pytest.approx(0.02 * GAP_GYRO_RATE, rel=1e-2)
     assert angle_sigma[2] == pytest.approx(0.03 * GAP_GYRO_RATE, rel=1e-2)
     assert angle_sigma[3] == pytest.approx(plain[3], rel=1e-3)
+
+
+def test_an_axis_that_repeats_itself_is_led_on() -> None:
+    """A gyro stuck in a turn that ends meanwhile: by both sides, and a turn's rate lasts."""
+    rng, time_s = np.random.default_rng(0), np.arange(1, 2001) / 100.0
+    gyro_b = 1e-3 * rng.standard_normal((2000, 3))
+    gyro_b[time_s < 8.0, 2] += 0.4
+    gyro_b[700:1300, 2] = gyro_b[700, 2]
+    accel_b = np.tile([0.0, 0.0, -9.8], (2000, 1)) + 1e-3 * rng.standard_normal((2000, 3))
+    log = ImuLog(0.0, NOISE, time_s, gyro_b, accel_b)
+    chain = preintegrate(log, np.arange(0.0, 21.0), frame=FRAME, rate_hz=20.0)
+    turned = Rotation.from_matrix(chain.intervals.delta_R).as_rotvec()[7:13, 2]
+    assert float(np.sum(turned)) == pytest.approx(0.4 * 6.0 / 2.0, rel=0.05)
+    sigma = float(np.sqrt(np.sum(chain.intervals.covariance[7:13, 2, 2])))
+    assert sigma == pytest.approx(GAP_GYRO_RATE * math.sqrt(5.0 * 6.0), rel=0.05)
 
 
 def test_a_gap_in_waves_is_bridged_within_what_is_covered() -> None:

@@ -23,6 +23,7 @@ WANTED = {
     *("CurrentModel", "HuberKernel", "CauchyKernel", "DcsKernel", "GemanMcClureKernel"),
     *("convert_blueye", "convert_rosbag", "simulate", "SimulationConfig", "filter", "smooth"),
     *("read_vehicle", "read_study", "run_study", "compare_methods", "withhold_gnss"),
+    *("Result", "Point", "Answers", "answers_at"),
 }
 
 

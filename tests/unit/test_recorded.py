@@ -74,6 +74,32 @@ def test_reports_without_a_clock_are_timed_by_their_sum(tmp_path: Path) -> None:
     assert "no clock" in found.notes[1]
 
 
+@pytest.mark.parametrize("written", ["utf-16", "utf-8-sig", "repr", "log", "comment", "array"])
+def test_reports_as_people_record_them(tmp_path: Path, written: str) -> None:
+    """By a shell of Windows, by print() of Python, after times and words of a logger."""
+    found = reports(5, "json_v3")
+    lines = [json.dumps(one) for one in found]
+    texts = {
+        "repr": "".join(f"{one!r}\n" for one in found),
+        "log": "".join(f"2021-05-28 12:00:00,123 INFO dvl {line}\n" for line in lines),
+        "comment": "# basin, 28 May\n" + "\n".join(lines),
+        "array": f"[{','.join(lines)}]",
+    }
+    coding = written if written.startswith("utf") else "utf-8"
+    data = texts.get(written, "\r\n".join(lines)).encode(coding)
+    expected = read(tmp_path / "plain", "\n".join(lines).encode()).messages
+    assert read(tmp_path / "dvl", data).messages == expected
+    assert len(expected) == 5
+
+
+def test_a_receiver_recorded_on_windows(tmp_path: Path) -> None:
+    """Sixteen bits a letter, as a shell of Windows writes them."""
+    text = nmea(*(f"GPGGA,12000{k}.00,6326.0,N,01024.0,E,1,8,1.0,20,M,40,M,," for k in range(5)))
+    found = read(tmp_path / "gnss", text.decode().encode("utf-16"))
+    assert found.messages == read(tmp_path / "plain", text).messages
+    assert len(found.messages) == 5
+
+
 def test_reports_with_a_clock_keep_it(tmp_path: Path) -> None:
     """The centre of the ping; the yaw of the dead reckoning beside it; a torn report is told."""
     lines = [json.dumps(one) for one in reports(4, "json_v3")]

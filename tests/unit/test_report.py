@@ -162,7 +162,13 @@ def test_page_shows_errors_with_a_reference() -> None:
     figure = draw_figure(estimate, reference, title="lawn-mower")
     found = panels(figure)
     assert {"Track", "Position error", "Velocity error", "Heading error", "Beam 4"} <= set(found)
-    assert found["Track"] == ["reference", "estimate", "beam weight < 0.05", "start", "end"]
+    assert found["Track"] == [
+        "reference",
+        "estimate",
+        "beam weight < 0.05 (60 pings)",
+        "start",
+        "end",
+    ]
     assert len(figure.axes) == N_PANELS
     for axes in figure.axes:
         for label in (axes.get_xlabel(), axes.get_ylabel()):

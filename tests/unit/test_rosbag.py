@@ -16,11 +16,12 @@ import pytest
 from ssm_graph.base.errors import ConfigError, DataError, MissingExtraError
 from ssm_graph.base.frames import BodyAxes
 from ssm_graph.cli.main import ExitCode, main
+from ssm_graph.io.instruments.assumed import BEAM_SIGMA, NOISE
 from ssm_graph.io.mission_folder.folder import read_mission, write_mission
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.io.ros import log as rosbag_log
 from ssm_graph.io.ros.beams import WATER_LINKED_BEAMS, proven_beams
-from ssm_graph.io.ros.convert import BEAM_SIGMA, NOISE, convert_rosbag
+from ssm_graph.io.ros.convert import convert_rosbag
 from ssm_graph.io.ros.log import LAYOUTS, is_rosbag
 from ssm_graph.io.ros.messages import BeamSign, RosOptions
 from ssm_graph.io.ros.topics import WATER_LATER_S

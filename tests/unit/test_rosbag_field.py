@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import random
+import shutil
+import sqlite3
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import replace
@@ -218,6 +221,45 @@ def test_a_recorder_that_was_killed(
         (folder / "metadata.yaml").write_text("  - run_9.mcap\n  - run_10.mcap\n  - run_11.mcap\n")
         with pytest.raises(DataError, match=r"run_11\.mcap is missing"):
             convert_rosbag(folder)
+
+
+@pytest.mark.parametrize("shape", ["killed", "with metadata", "file"])
+def test_messages_that_a_killed_recorder_left_in_a_journal(
+    mission: Mission, ros: Ros, tmp_path: Path, shape: str
+) -> None:
+    """Half of them are in the log beside the database alone; the recording stays as it is."""
+    bag = write_bag(tmp_path / "run", ros, marine_bag(mission, ros), StoragePlugin.SQLITE3)
+    killed = tmp_path / "killed"
+    with contextlib.closing(sqlite3.connect(bag / "run.db3")) as database:
+        rows = database.execute("SELECT * FROM messages").fetchall()
+        database.execute("DELETE FROM messages")
+        database.commit()
+        database.execute("PRAGMA journal_mode=WAL")
+        database.execute("PRAGMA wal_autocheckpoint=0")
+        for part in (rows[: len(rows) // 2], rows[len(rows) // 2 :]):
+            database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+            database.executemany("INSERT INTO messages VALUES (?, ?, ?, ?)", part)
+            database.commit()
+        shutil.copytree(bag, killed)
+    if shape == "killed":
+        (killed / "metadata.yaml").unlink()
+    before = {path.name: path.read_bytes() for path in killed.iterdir()}
+    got = convert_rosbag(killed / "run.db3" if shape == "file" else killed, options=ON_ELLIPSOID)
+    assert_same(got, mission)
+    assert any("run.db3-wal: what a recorder" in note for note in got.notes)
+    assert {path.name: path.read_bytes() for path in killed.iterdir()} == before
+
+
+def test_no_pressure_is_no_reading(mission: Mission, ros: Ros, tmp_path: Path) -> None:
+    """A sensor that is not ready says 0 Pa, which is nowhere on Earth."""
+    sent = deepcopy(marine_bag(mission, ros))
+    pressures = [item.message for item in sent if item.type_name == PRESSURE]
+    for message in pressures[:4]:
+        message.fluid_pressure = 0.0
+    got = convert_rosbag(write_bag(tmp_path / "bag", ros, sent), options=ON_ELLIPSOID)
+    assert got.depth is not None
+    assert len(got.depth.time_s) == len(pressures) - 4
+    assert any("4 refused (FluidPressure" in note for note in got.notes)
 
 
 def test_a_file_that_was_cut_off(mission: Mission, ros: Ros, tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """Clocks, units and axes are named one by one, with the line that mends them; healthy logs never.
 
-Thresholds were chosen on seeds 0 to 3; seeds 100 to 129 gave the rates in ``docs/method.md``. Here
-are others.
+Thresholds were chosen on seeds 0 to 3; seeds 100 to 129 gave the rates in
+``docs/method-details.md``. Here are others.
 """
 
 from __future__ import annotations

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from functools import cache
 from typing import Any
 
@@ -18,7 +19,7 @@ from ssm_graph.mission.answer import SUSPECT_STRETCH_S
 from ssm_graph.mission.estimate import Status
 from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.simulation import DiveRoute, GnssSettings, Grade, SimulatedMission, TransitRoute
-from ssm_graph.smoothers.verdict import contradictions
+from ssm_graph.smoothers.verdict import contradictions, efficiency
 from tests.helpers import outcome, simulated, true_states, with_imu, with_initial
 
 
@@ -43,10 +44,34 @@ def doubts_at(problem: Problem, states: States, *, weights: Array | None = None)
     return [*contradictions(linearizer, states, rows, weights), *doubts_of_aids(judged)]
 
 
+def workhorse(rng: np.random.Generator, n: int) -> Array:
+    """Return noise with the tails of a Workhorse's error velocity, of variance 1."""
+    return np.asarray(rng.standard_t(4.3, n) * np.sqrt(1.0 - 2.0 / 4.3))
+
+
 def moved(states: States, **changes: Array) -> States:
     """Return states with some arrays changed."""
     arrays: dict[str, Any] = {name: getattr(states, name) for name in states._fields}
     return States.of(**(arrays | changes))
+
+
+@pytest.mark.parametrize(
+    ("noise", "expected"),
+    [(lambda rng, n: rng.standard_normal(n), 0.908), (workhorse, 1.256)],
+    ids=["normal", "Student"],
+)
+def test_the_efficiency_of_a_kernel(noise: Callable[..., Array], expected: float) -> None:
+    """The spread of the mean that the log kernel makes of a hundred readings, and by quadrature."""
+    rng, kernel = np.random.default_rng(0), LogKernel()
+    errors = noise(rng, 400_000)
+    t = errors**2
+    assert efficiency(t, kernel.weight(t), kernel) == pytest.approx(expected, rel=0.02)
+    sets, mean = errors.reshape(4000, 100), np.zeros(4000)
+    for _ in range(30):
+        weights = kernel.weight((sets - mean[:, None]) ** 2)
+        mean = np.sum(weights * sets, axis=1) / np.sum(weights, axis=1)
+    claimed = 1.0 / np.sum(weights, axis=1)
+    assert np.mean(mean**2) == pytest.approx(np.mean(claimed) / expected, rel=0.07)
 
 
 @pytest.mark.parametrize("grade", Grade, ids=lambda grade: grade.name)

@@ -191,6 +191,13 @@ class Aid(Table, ABC):
     def measured(self, at: RowStates) -> Linearised:
         """Linearise the measurements at their states."""
 
+    def rate(self, at: RowStates) -> Array | None:  # noqa: ARG002
+        """Return by what (M, d) its measurements grow in a second, None where clocks say little.
+
+        Their errors, predicted minus measured, grow by as much in each second that they are late.
+        """
+        return None
+
     def led_along(self, before: RowStates | None, at: RowStates) -> Self:  # noqa: ARG002
         """Return the same after states of the keyframes before and of their own, if they follow.
 

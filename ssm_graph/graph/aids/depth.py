@@ -164,6 +164,18 @@ class DepthMeans(Aid):
         """(M,) always the same."""
         return ["depth"] * len(self)
 
+    def rate(self, at: RowStates) -> Array:
+        """Return how fast the sensor rises (M, 1), m/s: its errors are those of its height."""
+        track = height_track(
+            self.frame,
+            R_nb=at.R_nb,
+            p_n=at.p_n,
+            v_n=at.v_n,
+            gyro_b=self.gyro_b,
+            lever_arm_b=self.lever_arm_b,
+        )
+        return track.climb[:, None]
+
     def led_along(self, before: RowStates | None, at: RowStates) -> Self:
         """Return the same with the rises along another track, and the plane that is level there."""
         states = [at] if before is None else [at, before]

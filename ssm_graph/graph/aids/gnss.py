@@ -82,6 +82,11 @@ class Fixes(Aid):
         """(3 M,) axes."""
         return [*EAST_NORTH_UP] * len(self)
 
+    def rate(self, at: RowStates) -> Array:
+        """Return the velocity (M, 3) of the antenna, m/s."""
+        swing_b = np.cross(self.gyro_b - at.bias[..., 3:], self.lever_arm_b)
+        return np.asarray(at.v_n + (at.R_nb @ swing_b[..., None])[..., 0])
+
     def measured(self, at: RowStates) -> Linearised:
         """Linearise fixes: three components each."""
         extras = at.extras

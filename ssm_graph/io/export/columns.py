@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.units import DEGREE
 from ssm_graph.io.export.track import Track
 from ssm_graph.io.tables.files import pyarrow_module
 
@@ -43,6 +44,8 @@ def wide_columns(track: Track) -> dict[str, Array | list[str]]:
         "lon_deg": np.degrees(track.lon),
         "height_m": track.height,
         **{f"{name}_m": local[:, i] for i, name in enumerate(_ENU)},
+        "utm_easting_m": track.utm.easting,
+        "utm_northing_m": track.utm.northing,
         **{f"vel_{name}_m_per_s": track.velocity_enu[:, i] for i, name in enumerate(_ENU)},
         **{f"{name}_deg": degrees[:, i] for i, name in enumerate(angles)},
         **{f"q{name}": q[:, i] for i, name in enumerate("xyzw")},
@@ -52,7 +55,21 @@ def wide_columns(track: Track) -> dict[str, Array | list[str]]:
         f"sigma_vel_{name}_m_per_s": track.velocity_sigma_enu[:, i] for i, name in enumerate(_ENU)
     }
     columns |= {f"sigma_{name}_deg": sigmas[:, i] for i, name in enumerate(angles)}
-    return columns | {"suspect": track.is_suspect.astype(np.float64)}
+    return columns | _covariances(track) | {"suspect": track.is_suspect.astype(np.float64)}
+
+
+def _covariances(track: Track) -> dict[str, Array | list[str]]:
+    """Return the covariances of every two of nine numbers, where they were asked for."""
+    if track.covariance is None:
+        return {}
+    unit = np.repeat([1.0, 1.0, DEGREE], 3)
+    names = [f"{name}_m" for name in _ENU] + [f"vel_{name}_m_per_s" for name in _ENU]
+    names += [f"{name}_deg" for name in ("roll", "pitch", "heading")]
+    return {
+        f"cov_{names[i]}_{names[j]}": track.covariance[:, i, j] / (unit[i] * unit[j])
+        for i in range(9)
+        for j in range(i)
+    }
 
 
 def write_csv(track: Track, path: Path) -> None:
@@ -68,6 +85,6 @@ def write_parquet(track: Track, path: Path) -> None:
     """Write the same table as Parquet, with names and units in its metadata."""
     arrow: Any = pyarrow_module("pyarrow")
     table = arrow.table(wide_columns(track)).replace_schema_metadata(
-        {"mission": track.name, "about": track.about}
+        {"mission": track.name, "about": track.about, "utm": track.utm.name}
     )
     pyarrow_module("pyarrow.parquet").write_table(table, path)

@@ -49,7 +49,7 @@ _FORMATS: Final = {
 FORMATS: Final = MappingProxyType({name: Format(*of) for name, of in _FORMATS.items()})
 
 
-def export_track(track: Track, form: str, path: Path) -> list[Path]:
+def export_track(track: Track, form: str, path: Path | str) -> list[Path]:
     """Write a track in a format; return the files, which take their places when all are whole.
 
     Raises :class:`ConfigError` for an unknown format, an epoch that is missing or a file over the
@@ -57,6 +57,7 @@ def export_track(track: Track, form: str, path: Path) -> list[Path]:
     """
     if form not in FORMATS:
         raise ConfigError(f"--format: {form!r} is not known, {nearest_hint(form, FORMATS)}")
+    path = Path(path)
     part = path.parent / f".part-{os.getpid()}"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frames import R_lb_from_roll_pitch_heading
-from ssm_graph.base.frozen import Array, FrozenArrays, shaped
+from ssm_graph.base.frozen import Array, FrozenArrays, optional_shaped, shaped
+from ssm_graph.base.projection import Utm, utm
 from ssm_graph.io.results.tables import Results
 
 UNIX_FROM_S: Final = 1.0e9
@@ -53,6 +54,12 @@ class Track(FrozenArrays):
     """(N, 3) m/s"""
     attitude_sigma: Array = shaped("N", 3)
     """(N, 3) rad, of roll, pitch and heading"""
+    covariance: Array | None = optional_shaped("N", 9, 9)
+    """(N, 9, 9) of position and velocity along east, north, up, and roll, pitch, heading; SI units;
+    None if it was not asked for"""
+
+    origin: LocalFrame | None = None
+    """Of local metres; None for the first position."""
 
     @property
     def unix_s(self) -> Array:
@@ -67,8 +74,9 @@ class Track(FrozenArrays):
 
     @property
     def frame(self) -> LocalFrame:
-        """East, north, up at the first position."""
-        return LocalFrame(float(self.lat[0]), float(self.lon[0]), float(self.height[0]))
+        """East, north, up at the origin."""
+        first = (float(column[0]) for column in (self.lat, self.lon, self.height))
+        return self.origin or LocalFrame(*first)
 
     @property
     def local_enu(self) -> Array:
@@ -84,6 +92,11 @@ class Track(FrozenArrays):
         turn = R_lb_from_roll_pitch_heading(*self.roll_pitch_heading.T) @ FRD_FROM_FLU
         return np.asarray(Rotation.from_matrix(turn).as_quat(canonical=True))
 
+    @property
+    def utm(self) -> Utm:
+        """Easting and northing, all in the zone of the origin."""
+        return utm(self.lat, self.lon, of=(self.frame.lat, self.frame.lon))
+
     def utc(self) -> list[str]:
         """Return ISO 8601 times of UTC with milliseconds."""
         return [
@@ -92,13 +105,21 @@ class Track(FrozenArrays):
         ]
 
 
-def track_of(results: Results, *, epoch_s: float | None = None) -> Track:
+def track_of(
+    results: Results,
+    *,
+    epoch_s: float | None = None,
+    covariance: Array | None = None,
+    origin: LocalFrame | None = None,
+) -> Track:
     """Return the trajectory of a result folder.
 
     Parameters
     ----------
     results : as `read_results` returns them.
     epoch_s : Unix time of ``time_s`` 0, s; if None, times of 2001 and later are Unix time already.
+    covariance : (N, 9, 9) of every row, see :class:`Track`.
+    origin : of local metres and of the UTM zone; the first position when left out.
 
     Raises :class:`DataError` for a trajectory without a row or with a value that is not finite, and
     :class:`ConfigError` for an epoch beside times that are Unix time.
@@ -131,6 +152,8 @@ def track_of(results: Results, *, epoch_s: float | None = None) -> Track:
         position_sigma_enu=np.column_stack([rows[f"sigma_{name}_m"] for name in _ENU]),
         velocity_sigma_enu=np.column_stack([rows[f"sigma_vel_{name}_m_per_s"] for name in _ENU]),
         attitude_sigma=np.radians(np.column_stack(sigmas)),
+        covariance=covariance,
+        origin=origin,
     )
 
 
@@ -150,7 +173,7 @@ def epoch_of(results: Results, stated_s: float | None) -> float | None:
     return 0.0
 
 
-def parse_epoch(text: str) -> float:
+def parse_epoch(text: str, where: str = "--epoch") -> float:
     """Return Unix seconds of an ISO 8601 time with its zone, or of a number of Unix seconds.
 
     Raises :class:`ConfigError`.
@@ -165,7 +188,7 @@ def parse_epoch(text: str) -> float:
         when = None
     if when is None or when.tzinfo is None:
         raise ConfigError(
-            f"--epoch: expected an ISO time with its zone, such as 2026-05-01T10:00:00Z, or Unix "
+            f"{where}: expected an ISO time with its zone, such as 2026-05-01T10:00:00Z, or Unix "
             f"seconds, got {text!r}"
         )
     return when.timestamp()

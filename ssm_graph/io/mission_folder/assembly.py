@@ -6,6 +6,7 @@ each other: clocks, positions, gravity, and the motion that they tell of.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,15 +14,17 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from ssm_graph.base.earth import LocalFrame, normal_gravity
+from ssm_graph.base.earth import EARTH_RATE, LocalFrame, normal_gravity
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frames import BodyAxes
 from ssm_graph.base.frozen import Array
-from ssm_graph.base.tables import Table, table_of
+from ssm_graph.base.tables import Table, TableFile, table_of
+from ssm_graph.base.units import DEG_PER_H
 from ssm_graph.io.mission_folder.motion import check_motion
 from ssm_graph.io.mission_folder.toml import TOML_NAME
-from ssm_graph.mission.mission import Aids, InitialState, Mission
+from ssm_graph.mission.mission import Aids, InitialState, LocalStart, Mission
 from ssm_graph.mission.vehicle import Vehicle
+from ssm_graph.sensors.compass import HeadingLog
 from ssm_graph.sensors.current import CurrentModel
 from ssm_graph.sensors.gnss import GnssLog
 from ssm_graph.sensors.registry import BY_LOG, INSTRUMENTS
@@ -33,6 +36,8 @@ _FASTEST: Final = 5.0
 _EDGE_S: Final = 1.0
 _GRAVITY_SHARE: Final = 0.005
 _UNITS: Final = ((1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds"))
+_FINDS_NORTH: Final = math.radians(10.0)
+"""Gyros whose bias is less than this share of the Earth's turn find a safe heading."""
 _OWN_FIELDS = ("imu", "dvl", "depth", "gnss")
 """Sections that are fields of a mission; the others are among its aids."""
 
@@ -49,7 +54,7 @@ def mission_from(
     vehicle: Vehicle | None,
     *,
     source: Path,
-    labels: Mapping[str, str],
+    labels: Mapping[str, str | TableFile],
     notes: Sequence[str] = (),
 ) -> Mission:
     """Return the mission of logs that were made of messages, checked as a folder's tables are.
@@ -64,29 +69,36 @@ def mission_from(
     vehicle : its frame is taken, its current, and its start where it lies within the inertial
         data; None where nothing is known beside the logs.
     source : the recording; the mission has its name.
-    labels : by section, what messages call the place that the readings came from.
+    labels : by section, what messages call the place that the readings came from; a file of which
+        messages name the row as well.
     notes : what the converter noticed, one sentence each; what the checks notice follows.
     """
     parts: dict[str, Part] = {}
     found = list(notes)
     for log in logs:
         one = BY_LOG[type(log)]
-        table = table_of(labels[one.section], one.table_of(log))
+        label, columns = labels[one.section], one.table_of(log)
+        table = table_of(label, columns) if isinstance(label, str) else Table(label, columns)
         found += one.check(table, log, BodyAxes.FRD)
         parts[one.section] = Part(one.cleaned(log), table)
     initial, some = _initial_within(parts["imu"].log, vehicle)
-    stated = None if vehicle is None else vehicle.frame
+    local = None if vehicle is None else vehicle.local
+    if local is not None and {"gnss", "usbl"} & set(parts):
+        local = None
+        found.append("[local] of the vehicle file is not used: the log has fixes.")
+    stated = None if vehicle is None or vehicle.local not in (None, local) else vehicle.frame
     frame = first_frame(stated, parts, None)
     if frame is None:
         raise ConfigError(
             f"{source}: nothing says where on Earth the recording was made: it holds no usable "
-            "fix; give  --vehicle FILE  with [origin]"
+            "fix; give  --vehicle FILE  with [origin], or [local] for a tank or a pool"
         )
     return assembled(
         source.stem,
         parts,
         frame=frame,
         has_origin=stated is not None,
+        local=local,
         initial=initial,
         current=None if vehicle is None else vehicle.current,
         notes=[*found, *some],
@@ -101,6 +113,7 @@ def assembled(
     has_origin: bool,
     standstills: Sequence[Standstill] = (),
     initial: InitialState | None,
+    local: LocalStart | None = None,
     current: CurrentModel | None,
     notes: Sequence[str],
 ) -> Mission:
@@ -113,11 +126,34 @@ def assembled(
         frame=frame,
         aids=Aids(*aids, *standstills),
         initial=initial,
+        local=local,
         current=current,
         **own,
     )
+    if local is not None:
+        mission, said = _without_north(mission, local)
+        notes = [*notes, local.sentence, *said]
     tables = {section: part.table for section, part in parts.items()}
     return replace(mission, notes=(*notes, *_check(mission, tables, has_origin=has_origin)))
+
+
+def _without_north(mission: Mission, local: LocalStart) -> tuple[Mission, list[str]]:
+    """Return a mission whose gyros count as the turn of the Earth where its direction is unknown.
+
+    Gyros that find north by themselves, and a compass, tell it.
+    """
+    turn = EARTH_RATE * math.cos(local.lat)
+    sigma = mission.imu.noise.gyro_bias_sigma
+    if local.is_heading_known or mission.aids.get(HeadingLog) is not None:
+        return mission, []
+    if sigma < _FINDS_NORTH * turn or sigma >= 2.0 * turn:
+        return mission, []
+    noise = replace(mission.imu.noise, gyro_bias_sigma=2.0 * turn)
+    said = (
+        f"the turn of the Earth, of unknown direction, counts as a gyro bias of "
+        f"{2.0 * turn / DEG_PER_H:.0f} deg/h"
+    )
+    return replace(mission, imu=replace(mission.imu, noise=noise)), [said]
 
 
 def first_frame(
@@ -144,7 +180,8 @@ def _initial_within(imu: Any, vehicle: Vehicle | None) -> tuple[InitialState | N
     """Return the start of a vehicle file where it lies within the inertial data, else a note."""
     if vehicle is None or vehicle.initial is None:
         return None, []
-    if imu.start_s <= vehicle.initial.time_s <= imu.time_s[-1]:
+    step_s = float(np.median(np.diff(imu.time_s)))  # stamps of sums and dates are rounded
+    if imu.start_s - step_s <= vehicle.initial.time_s <= imu.time_s[-1]:
         return vehicle.initial, []
     return None, [
         f"[initial] of the vehicle file is for {vehicle.initial.time_s:.3f} s, outside the "

@@ -20,6 +20,7 @@ from ssm_graph.io.mission_folder.assembly import Part, assembled, first_frame
 from ssm_graph.io.mission_folder.toml import (
     FORMAT,
     INITIAL_KEYS,
+    LOCAL_KEYS,
     REFERENCE,
     REQUIRED_SECTIONS,
     TABLES,
@@ -31,10 +32,11 @@ from ssm_graph.io.mission_folder.toml import (
 from ssm_graph.io.tables.append_file import write_through
 from ssm_graph.io.tables.files import TableFormat, read_arrival_table, read_table, write_table
 from ssm_graph.mission.estimate import CalibratedValue, Calibration, Determined
-from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.mission import LocalStart, Mission
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.acoustic import RangeLog
 from ssm_graph.sensors.current import CURRENT_KEYS, CurrentModel
+from ssm_graph.sensors.imu import IMU, ImuLog
 from ssm_graph.sensors.instrument import Calibrated, Instrument
 from ssm_graph.sensors.place import PLACE_KEYS
 from ssm_graph.sensors.registry import INSTRUMENTS
@@ -66,6 +68,7 @@ def read_mission(folder: Path | str) -> Mission:
     toml = read_mission_toml(Path(folder))
     bare = {one.section: toml.bare(one) for one in TABLES if one.section in toml}
     tables, notes = _read_tables(toml, bare)
+    notes = [*toml.notes, *notes]
     parts: dict[str, Part] = {}
     for one in TABLES:
         if one.section in tables:
@@ -74,20 +77,30 @@ def read_mission(folder: Path | str) -> Mission:
             log = one.filled(table, own, toml[one.section], toml.body)
             parts[one.section] = Part(log, table)
     notes += _lists_without_section(toml)
-    initial = toml.initial()
-    frame = first_frame(toml.frame("origin"), parts, initial)
+    initial, local = toml.initial(), toml.local()
+    stated = toml.frame("origin") if local is None else local.frame
+    frame = first_frame(stated, parts, initial)
     if frame is None:
         raise toml.fault_of_no_place()
     return assembled(
         toml.name,
         parts,
         frame=frame,
-        has_origin="origin" in toml,
+        has_origin=stated is not None,
+        local=local,
         standstills=_standstills(toml, parts["imu"].table),
         initial=initial,
         current=build(CurrentModel, toml["current"].given()) if "current" in toml else None,
         notes=notes,
     )
+
+
+def read_imu(toml: MissionToml) -> ImuLog:
+    """Read the inertial data of a mission alone; raises as :func:`read_mission` does."""
+    bare = {IMU.section: toml.bare(IMU)}
+    table = _read_tables(toml, bare)[0][IMU.section]
+    log: ImuLog = IMU.filled(table, bare[IMU.section], toml[IMU.section], toml.body)
+    return log
 
 
 def _read_tables(toml: MissionToml, bare: dict[str, Any]) -> tuple[dict[str, Table], list[str]]:
@@ -96,7 +109,7 @@ def _read_tables(toml: MissionToml, bare: dict[str, Any]) -> tuple[dict[str, Tab
     read = read_table if toml.order is Order.TIME else read_arrival_table
     for one in TABLES:
         section = one.section
-        if section not in toml:
+        if section not in bare:
             continue
         label = toml[section].text("file")
         path = table_path(toml, section)
@@ -191,7 +204,9 @@ def settings_of(
     """
     settings: dict[str, Any] = {"format": FORMAT, "name": source.name, **more}
     settings["frames"] = {"body": BodyAxes.FRD.value}
-    if source.frame is not None:
+    if source.local is not None:
+        settings["local"] = _local_settings(source.local)
+    elif source.frame is not None:
         settings["origin"] = written(source.frame, PLACE_KEYS)
     for one in INSTRUMENTS:
         if one.log in logs:
@@ -203,6 +218,12 @@ def settings_of(
     if source.initial is not None:
         settings["initial"] = written(source.initial, INITIAL_KEYS)
     return settings
+
+
+def _local_settings(local: LocalStart) -> dict[str, Any]:
+    """Return ``[local]``; a heading that is not known is no number."""
+    keys = LOCAL_KEYS if local.is_heading_known else {"lat_deg": LOCAL_KEYS["lat_deg"]}
+    return written(local, keys)
 
 
 def mission_tables(mission: Mission) -> dict[str, dict[str, Array]]:

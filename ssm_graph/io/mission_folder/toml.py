@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Final
@@ -24,8 +24,11 @@ from ssm_graph.base.settings import (
 )
 from ssm_graph.base.tables import LARGEST_TIME_S, Order, Table
 from ssm_graph.base.units import DEGREE
-from ssm_graph.mission.mission import InitialState, Reference
+from ssm_graph.io.instruments import library as instruments
+from ssm_graph.mission.mission import InitialState, LocalStart, Reference
+from ssm_graph.mission.point import POINT_KEYS, Point, point
 from ssm_graph.sensors.current import CURRENT_KEYS
+from ssm_graph.sensors.imu import Stamp
 from ssm_graph.sensors.instrument import ENU, Column, Instrument
 from ssm_graph.sensors.place import PLACE_KEYS, POSITION, PositionInstrument
 from ssm_graph.sensors.registry import INSTRUMENTS
@@ -79,6 +82,13 @@ INITIAL_KEYS: Final[Mapping[str, Key]] = {
     "velocity_sigma_m_per_s": Key("velocity_sigma_enu", shape=(3,), positive=True, high=1e3),
     "attitude_sigma_deg": Key("attitude_sigma", shape=(3,), positive=True, high=360.0, unit=DEGREE),
 }
+LOCAL_KEYS: Final[Mapping[str, Key]] = {
+    "lat_deg": replace(PLACE_KEYS["lat_deg"], required=False),
+    "heading_deg": replace(INITIAL_KEYS["heading_deg"], required=False),
+    "heading_sigma_deg": Key(
+        "heading_sigma", positive=True, high=180.0, required=False, unit=DEGREE
+    ),
+}
 TABLES: Final = (*INSTRUMENTS, REFERENCE)
 """Everything that has a table, in the order in which tables are read."""
 SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
@@ -86,13 +96,17 @@ SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
     "origin": PLACE_KEYS,
     "current": CURRENT_KEYS,
     "initial": INITIAL_KEYS,
+    "local": LOCAL_KEYS,
     **{one.section: one.keys for one in TABLES},
 }
 LISTS: Final[Mapping[str, Mapping[str, Key]]] = {
     **{name: keys for one in INSTRUMENTS for name, keys in one.lists.items()},
     "standstill": STANDSTILL_KEYS,
+    "point": POINT_KEYS,
 }
 """Sections that may come several times, ``[[beacon]]``."""
+_OF_PLACES: Final = ("origin", "initial", "gnss", "usbl", "reference")
+"""Sections of places on Earth, which no local start has."""
 REQUIRED_SECTIONS: Final = ("frames", *(one.section for one in INSTRUMENTS if one.is_required))
 
 
@@ -109,6 +123,8 @@ class MissionToml:
     sections: dict[str, Settings]
     lists: dict[str, tuple[Settings, ...]]
     """The sections that may come several times."""
+    notes: tuple[str, ...] = ()
+    """Where figures of instruments that it names come from, one sentence each."""
 
     def __getitem__(self, section: str) -> Settings:
         return self.sections[section]
@@ -131,11 +147,39 @@ class MissionToml:
         """Return the state that ``[initial]`` states."""
         return build(InitialState, self["initial"].given()) if "initial" in self else None
 
+    def local(self) -> LocalStart | None:
+        """Return the start at zero that ``[local]`` states.
+
+        Raises :class:`ConfigError` beside a section that states a place on Earth.
+        """
+        if "local" not in self:
+            return None
+        others = [name for name in _OF_PLACES if name in self]
+        if others:
+            raise ConfigError(
+                f"{self.file} [local]: given together with [{others[0]}], which has places on "
+                "Earth; expected one of the two; [local] is for a tank or a pool without either"
+            )
+        return build(LocalStart, self["local"].given())
+
+    def points(self) -> dict[str, Point]:
+        """Return every point of the vehicle by name: ``[[point]]``, and instruments elsewhere."""
+        found = {}
+        for one in INSTRUMENTS:
+            bare = self.bare(one) if one.section in self else None
+            owner = getattr(bare, "mount", bare)
+            if owner is not None and hasattr(owner, "lever_arm_b"):
+                found[one.section] = Point(one.section, owner.lever_arm_b)
+        for settings in self.lists["point"]:
+            found[settings.text("name")] = point(settings)
+        return found
+
     def fault_of_no_place(self) -> ConfigError:
         """Return the error of a mission that may be anywhere on Earth."""
         return ConfigError(
             f"{self.file} [origin]: nothing says where on Earth the mission was; add [origin] with "
-            "lat_deg, lon_deg and height_m, or a [gnss] or [usbl] table, or [initial]"
+            "lat_deg, lon_deg and height_m, or a [gnss] or [usbl] table, or [initial]; "
+            "in a tank or a pool, [local]"
         )
 
 
@@ -163,6 +207,7 @@ def _checked(raw: dict[str, Any], path: Path, may_miss: frozenset[str]) -> Missi
     for name in REQUIRED_SECTIONS:
         if name not in raw:
             raise ConfigError(f"{file} [{name}]: the section is missing; every mission needs it")
+    raw, notes = _with_instruments(raw, file)
     frames = read_settings("frames", raw["frames"], known=SECTIONS["frames"], file=file)
     body = frames.choice("body", BodyAxes, BodyAxes.FRD)
     sections = {
@@ -180,11 +225,33 @@ def _checked(raw: dict[str, Any], path: Path, may_miss: frozenset[str]) -> Missi
         order=top.choice("order", Order, Order.TIME),
         body=body,
         sections=sections,
-        lists={name: _read_list(name, raw.get(name, []), file) for name in LISTS},
+        lists={name: _read_list(name, raw.get(name, []), file, body) for name in LISTS},
+        notes=notes,
     )
 
 
-def _read_list(name: str, raw: object, file: str) -> tuple[Settings, ...]:
+def _with_instruments(raw: dict[str, Any], file: str) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Return a file with the figures of the instruments that it names, and where they are from.
+
+    ``imu = "VN-100"`` above the sections stands for a section with that instrument and the usual
+    name of its table, whose stamps are the ends of intervals.
+    """
+    found, notes = dict(raw), []
+    for section in instruments.TABLES:
+        own = raw[section]
+        if isinstance(own, str):
+            own = {"file": f"{section}.csv", instruments.KEY: own}
+            own |= {"stamp": Stamp.END.value} if section == "imu" else {}
+        if not isinstance(own, dict):
+            continue
+        required = {name for name, key in SECTIONS[section].items() if key.required}
+        found[section], preset = instruments.with_preset(section, own, file=file, required=required)
+        if preset is not None:
+            notes.append(f"[{section}] {preset.maker} {preset.name}: {preset.source}")
+    return found, tuple(notes)
+
+
+def _read_list(name: str, raw: object, file: str, axes: BodyAxes) -> tuple[Settings, ...]:
     """Read the sections ``[[name]]`` of a file."""
     if not isinstance(raw, list):
         raise ConfigError(
@@ -192,7 +259,7 @@ def _read_list(name: str, raw: object, file: str) -> tuple[Settings, ...]:
             f"{shown(raw)}; write double brackets"
         )
     return tuple(
-        read_settings(f"[[{name}]] {number}", item, known=LISTS[name], file=file)
+        read_settings(f"[[{name}]] {number}", item, known=LISTS[name], file=file, axes=axes)
         for number, item in enumerate(raw, start=1)
     )
 

@@ -41,7 +41,8 @@ def read_vehicle(path: Path | str) -> Vehicle:
     """
     path = Path(path)
     toml = read_vehicle_toml(path / TOML_NAME if path.is_dir() else path)
-    frame = toml.frame("origin") or toml.frame("initial")
+    local = toml.local()
+    frame = toml.frame("origin") or toml.frame("initial") if local is None else local.frame
     if frame is None and "gnss" not in toml:
         raise toml.fault_of_no_place()
     bare = {one.section: toml.bare(one) for one in INSTRUMENTS if one.section in toml}
@@ -59,6 +60,7 @@ def read_vehicle(path: Path | str) -> Vehicle:
         aids=Aids(*bare.values(), *map(standstill, toml.lists["standstill"])),
         frame=frame,
         initial=toml.initial(),
+        local=local,
         imu_calibration=imu.calibration,
     )
 
@@ -86,6 +88,7 @@ def vehicle_of(mission: Mission) -> Vehicle:
         aids=Aids(*aids),
         frame=mission.frame,
         initial=mission.initial,
+        local=mission.local,
         imu_calibration=mission.imu.calibration,
     )
 

@@ -16,6 +16,9 @@ RUN_NAME: Final = "run.json"
 FIGURE_NAME: Final = "figure.png"
 PAGE_NAME: Final = "report.html"
 """Of ``ssm-graph report``; new results make an old one untrue, and it goes."""
+FIGURES: Final = {kind: f"figure.{kind}" for kind in ("png", "pdf", "svg")}
+DRAWN: Final = (*FIGURES.values(), PAGE_NAME)
+"""What earlier results may have left, which new ones make untrue."""
 LEAST_FREE: Final = 2**20
 """Bytes below which a disk is full."""
 _PROBE: Final = ".trajectory.csv.part-4194304"

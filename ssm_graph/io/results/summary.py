@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import hashlib
 import platform
 from collections.abc import Mapping, Sequence
 from enum import Enum
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any, Final, Protocol
 
 import numpy as np
 
 from ssm_graph.base.settings import written
-from ssm_graph.io.mission_folder.toml import INITIAL_KEYS
+from ssm_graph.io.mission_folder.toml import (
+    INITIAL_KEYS,
+    TABLES,
+    TOML_NAME,
+    read_mission_toml,
+)
 from ssm_graph.mission.estimate import (
     OUTLIER_WEIGHT,
     AidTable,
@@ -69,8 +76,9 @@ def build_summary(
         "start": {
             **written(estimate.start, INITIAL_KEYS),
             "heading_deg": np.rad2deg(estimate.start.heading) % 360.0,
-            "origin": "mission" if mission.initial is not None else "alignment",
+            "origin": _start_origin(mission),
         },
+        **({} if mission.local is None else {"local_start": mission.local.sentence}),
         "calibration": calibration_fields(estimate.calibration),
         "noise": _noise(estimate),
         **({"aids": _aids(estimate.aids)} if estimate.aids is not None else {}),
@@ -87,6 +95,27 @@ def build_summary(
         "versions": versions(),
     }
     return {key: as_json(value) for key, value in summary.items()}
+
+
+def _start_origin(mission: Mission) -> str:
+    """Return where a start is from, in a word."""
+    if mission.initial is not None:
+        return "mission"
+    return "alignment" if mission.local is None else "local"
+
+
+def input_fields(folder: Path) -> dict[str, Any]:
+    """Return where a mission is, and the SHA-256 of every file that ``mission.toml`` names."""
+    toml = read_mission_toml(folder)
+    names = [toml[one.section].text("file") for one in TABLES if one.section in toml]
+    files = [TOML_NAME, *(name for name in dict.fromkeys(names) if (folder / name).is_file())]
+    return {"folder": str(folder.resolve()), "sha256": {n: sha256(folder / n) for n in files}}
+
+
+def sha256(path: Path) -> str:
+    """Return the SHA-256 of a file, in hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def versions() -> dict[str, str | None]:

@@ -23,7 +23,8 @@ from ssm_graph.base.frames import BodyAxes
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.units import DEG_PER_H, MICRO_G
 from ssm_graph.io.mission_folder.folder import CALIBRATION_NAME, calibration_toml
-from ssm_graph.io.results.place import FIGURE_NAME, PAGE_NAME, check_is_for_results
+from ssm_graph.io.results.place import DRAWN, FIGURE_NAME, check_is_for_results
+from ssm_graph.io.results.states import STATES_NAME, states_bytes
 from ssm_graph.io.results.summary import MetricsLike, build_summary
 from ssm_graph.io.tables import csv_tables
 from ssm_graph.io.tables.append_file import TORN_ROW, AppendFile, write_through
@@ -66,8 +67,10 @@ def write_results(
     mission: Mission,
     metrics: MetricsLike | None,
     settings: Mapping[str, Any],
+    inputs: Mapping[str, Any] | None = None,
     axes: BodyAxes = BodyAxes.FRD,
     draw: Callable[[Path], None] | None = None,
+    figure_name: str = FIGURE_NAME,
 ) -> None:
     """Write one estimate as a result folder.
 
@@ -82,8 +85,10 @@ def write_results(
     mission : what it was found from; its name, notes and the origin of the start are noted.
     metrics : comparison with the reference, if there is one.
     settings : of the estimator, noted as they are; units belong into the keys.
+    inputs : the mission folder and the SHA-256 of its files, of :func:`input_fields`.
     axes : body axes of the mission's file, for the lever arms of ``calibration.toml``.
     draw : saves the figure at a path; none is written unless given.
+    figure_name : one of :data:`ssm_graph.io.results.place.FIGURES`.
 
     Raises
     ------
@@ -95,34 +100,39 @@ def write_results(
     folder = Path(folder)
     check_is_for_results(folder)
     summary = build_summary(estimate, mission=mission, metrics=metrics, settings=settings)
+    if inputs:
+        summary["inputs"] = inputs
     content = {
         TRAJECTORY_NAME: format_table(
             trajectory_columns(estimate.trajectory)
             | current_columns(estimate.current)
             | suspect_column(estimate)
-        ),
-        BEAMS_NAME: format_table(beam_columns(estimate.beams)),
+        ).encode(),
+        BEAMS_NAME: format_table(beam_columns(estimate.beams)).encode(),
     }
     if estimate.aids is not None:
-        content[AIDS_NAME] = format_aids(estimate.aids)
+        content[AIDS_NAME] = format_aids(estimate.aids).encode()
     if estimate.calibration is not None:
-        content[CALIBRATION_NAME] = calibration_toml(mission, estimate.calibration, axes=axes)
-    content[SUMMARY_NAME] = _summary_text(summary)
+        lines = calibration_toml(mission, estimate.calibration, axes=axes)
+        content[CALIBRATION_NAME] = lines.encode()
+    if estimate.posterior is not None:
+        content[STATES_NAME] = states_bytes(estimate.posterior)
+    content[SUMMARY_NAME] = _summary_text(summary).encode()
     process = os.getpid()
     parts = {name: folder / f".{name}.part-{process}" for name in content}
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name, text in content.items():
-            write_through(parts[name], text.encode())
+        for name, inside in content.items():
+            write_through(parts[name], inside)
         failure = None
         if draw is not None:
-            figure = folder / f".{process}-{FIGURE_NAME}"
-            parts = {FIGURE_NAME: figure, **parts}
+            figure = folder / f".{process}-{figure_name}"
+            parts = {figure_name: figure, **parts}
             failure = _drawn(draw, figure)
-        for name in (SUMMARY_NAME, CALIBRATION_NAME, AIDS_NAME, FIGURE_NAME, PAGE_NAME):
+        for name in (SUMMARY_NAME, CALIBRATION_NAME, AIDS_NAME, STATES_NAME, *DRAWN):
             (folder / name).unlink(missing_ok=True)
         for name, part in parts.items():
-            if name != FIGURE_NAME or failure is None:
+            if name != figure_name or failure is None:
                 part.replace(folder / name)
     except OSError as error:
         raise DataError(f"{folder}: cannot write results: {error.strerror or error}") from error
@@ -192,6 +202,21 @@ def read_aids(folder: Path) -> dict[str, Any]:
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise DataError(f"{path}: expected a table of aids: {error}; smooth again") from error
     return words if rows else {}
+
+
+def read_protection(folder: Path) -> dict[str, Array]:
+    """Return the columns of ``protection.csv``, infinite where nothing bounds; empty without it.
+
+    Raises :class:`DataError` for a table that is damaged.
+    """
+    path = folder / PROTECTION_NAME
+    if not path.exists():
+        return {}
+    try:
+        rows = np.genfromtxt(path, delimiter=",", names=True)
+        return {name: np.atleast_1d(rows[name]) for name in PROTECTION_COLUMNS}
+    except (OSError, ValueError, IndexError, TypeError) as error:
+        raise DataError(f"{path}: expected a table of protection levels: {error}") from error
 
 
 def trajectory_columns(trajectory: Trajectory) -> Columns:

@@ -15,6 +15,7 @@ import numpy as np
 
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
+from ssm_graph.io.instruments.assumed import BEAM_SIGMA, DEPTH_SIGMA, NOISE
 from ssm_graph.io.mission_folder.assembly import mission_from
 from ssm_graph.io.ros.aids import AID_TYPES
 from ssm_graph.io.ros.beams import Beams, known_beams, proven_beams
@@ -33,22 +34,8 @@ from ssm_graph.mission.vehicle import GNSS_AT_ORIGIN, Vehicle
 from ssm_graph.sensors.depth import DEEPEST_M, DEPTH, DepthLog
 from ssm_graph.sensors.dvl import DvlLog, DvlMount, counted_sigma
 from ssm_graph.sensors.gnss import GnssLog
-from ssm_graph.sensors.imu import ImuLog, ImuNoise
+from ssm_graph.sensors.imu import ImuLog
 from ssm_graph.sensors.registry import BY_SECTION
-
-NOISE: Final = ImuNoise(
-    gyro_density=1.2e-4,
-    accel_density=1.5e-3,
-    gyro_bias_sigma=4.8e-4,
-    accel_bias_sigma=0.05,
-    gyro_bias_density=2.4e-6,
-    accel_bias_density=1.6e-4,
-)
-"""A consumer MEMS unit: 100 deg/h, 0.4 deg/sqrt(h), 5 mg."""
-BEAM_SIGMA: Final = 0.02
-"""m/s"""
-DEPTH_SIGMA: Final = 0.1
-"""m"""
 
 _ABOVE_WATER_M: Final = 2.0
 

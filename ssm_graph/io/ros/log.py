@@ -10,6 +10,9 @@ from __future__ import annotations
 
 import contextlib
 import re
+import shutil
+import sqlite3
+import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from importlib import import_module
@@ -102,6 +105,8 @@ LAYOUTS: Final[Mapping[str, tuple[str, ...]]] = {
 _ROS1_MAGIC: Final = b"#ROSBAG V2.0"
 _REINDEX: Final = "ros2 bag reindex"
 _ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
+_JOURNALS: Final = ("-wal", "-journal")
+"""What SQLite has beside a database while it is written."""
 _NAMED_FILE = re.compile(r"^\s*-\s+[\"']?(?:\S*/)?([^/\s\"']+\.mcap)[\"']?\s*$", re.MULTILINE)
 """A file in the list of ``metadata.yaml``."""
 Topics = Mapping[str, str | Sequence[str]]
@@ -170,7 +175,8 @@ def read_rosbag(bag: Path, topics: Topics, notes: list[str] | None = None) -> It
     notes = [] if notes is None else notes
     try:
         with contextlib.ExitStack() as stack:
-            readers = [stack.enter_context(reader) for reader in _readers(bag, notes)]
+            readers = _readers(_with_journals(bag, stack, notes), notes)
+            readers = [stack.enter_context(reader) for reader in readers]
             connections = _merged(readers)
             broken = [x.cut_off for x in readers if isinstance(x, McapFile) and x.cut_off]
             if broken and not connections:
@@ -197,6 +203,32 @@ def read_rosbag(bag: Path, topics: Topics, notes: list[str] | None = None) -> It
             f"{bag}: not a complete recording of {kind} ({type(error).__name__}: {error}); if it "
             f"was cut off, try  {remedy}"
         ) from error
+
+
+def _with_journals(bag: Path, stack: contextlib.ExitStack, notes: list[str]) -> Path:
+    """Return a recording whose databases hold all that was written; the bag itself where they do.
+
+    A recorder that was killed leaves its last messages in a journal beside the database, which who
+    reads that alone does not see. They are joined in a copy: a recording is not written to.
+    """
+    databases = _files(bag, "db3") if bag.is_dir() else [bag] if bag.suffix == ".db3" else []
+    journals = [path.with_name(path.name + end) for path in databases for end in _JOURNALS]
+    journals = [path for path in journals if path.is_file() and path.stat().st_size]
+    if not journals:
+        return bag
+    copy = Path(stack.enter_context(tempfile.TemporaryDirectory())) / bag.name
+    folder = copy if bag.is_dir() else copy.parent
+    folder.mkdir(exist_ok=True)
+    others = [bag / "metadata.yaml"] if (bag / "metadata.yaml").is_file() else []
+    for path in (*databases, *journals, *others):
+        shutil.copyfile(path, folder / path.name)
+    for path in databases:
+        with contextlib.closing(sqlite3.connect(folder / path.name)) as database:
+            database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+            database.execute("PRAGMA journal_mode=DELETE")
+    names = ", ".join(path.name for path in journals)
+    notes.append(f"{names}: what a recorder that was killed left there was read too.")
+    return copy
 
 
 def _readers(bag: Path, notes: list[str]) -> list[Any]:

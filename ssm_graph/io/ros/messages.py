@@ -167,8 +167,16 @@ def depth_reading(message: Any, received_s: float, options: RosOptions = DEFAULT
     With ``weight_density`` the density of the water times standard gravity::
 
         depth = (fluid_pressure - atmosphere) / weight_density - surface_height
+
+    Raises :class:`DataError` for an absolute pressure that is not above 0, which is no reading.
     """
-    below = (_finite(message, "fluid_pressure") - options.atmosphere) / options.weight_density
+    pressure = _finite(message, "fluid_pressure")
+    if options.atmosphere > 0.0 >= pressure:
+        raise DataError(
+            f"FluidPressure: expected an absolute pressure in Pa, got {pressure:g}; for a sensor "
+            "that reads 0 at the surface give  --atmosphere 0"
+        )
+    below = (pressure - options.atmosphere) / options.weight_density
     return DepthReading(stamp_s(message, received_s), below - (options.surface_height or 0.0))
 
 

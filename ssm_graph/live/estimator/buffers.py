@@ -170,6 +170,7 @@ class Buffers:
             depth if depth is not None and len(depth.time_s) else None,
             gnss,
             aids,
+            local=vehicle.local,
             current=vehicle.current,
         )
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections import deque
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -188,24 +189,29 @@ class Course:
             reserve = reserve.renewed(window)
         if watch.trouble_s == keyframe.time_s and watch.trouble != last.watch.trouble:
             self._events.tell(keyframe.time_s, Severity.WARNING, "doubt", watch.trouble)
-        guard = self._guarded(keyframe, window, is_anew=False)
+        guard = self._guarded(keyframe, window)
         return Step(window, watch, left, reserve, guard)
 
-    def _guarded(self, keyframe: Keyframe, window: Window, *, is_anew: bool) -> Guard:
+    def _guarded(
+        self, keyframe: Keyframe, window: Window, doubted: Sequence[str] | None = None
+    ) -> Guard:
         """Return the guard at the next keyframe, and tell what is found to contradict."""
         last = self.newest
         state = last.window.newest_states
-        guard = self.guardian.led_on(last.guard, state, keyframe, window, is_anew=is_anew)
-        known = {one.suspect for one in last.guard.contradictions}
-        now = {one.suspect for one in guard.contradictions}
-        for suspect in sorted(now - known):
-            text = self.guardian.sentence(guard)
-            kind = f"contradicted_{self.guardian.bank.suspects[suspect]}".replace(" ", "_")
-            self._events.tell(keyframe.time_s, Severity.WARNING, kind, text)
-        for suspect in sorted(known - now):
-            name = self.guardian.bank.suspects[suspect]
-            text = f"the answer agrees again with what is independent of {name}"
-            self._events.tell(keyframe.time_s, Severity.INFO, "contradiction_ended", text)
+        guard = self.guardian.led_on(last.guard, state, keyframe, window, doubted=doubted)
+        known = {one.suspect: one.is_certain for one in last.guard.contradictions}
+        now = {one.suspect: one.is_certain for one in guard.contradictions}
+        names = self.guardian.bank.suspects
+        for suspect, is_certain in now.items():
+            if is_certain > known.get(suspect, False) or suspect not in known:
+                text = self.guardian.sentence(guard)
+                kind = f"{'contradicted' if is_certain else 'suspected'}_{names[suspect]}"
+                severity = Severity.WARNING if is_certain else Severity.INFO
+                self._events.tell(keyframe.time_s, severity, kind.replace(" ", "_"), text)
+        for suspect in sorted(known.keys() - now.keys()):
+            text = f"the answer agrees again with what is independent of {names[suspect]}"
+            kind = "contradiction_ended" if known[suspect] else "suspicion_ended"
+            self._events.tell(keyframe.time_s, Severity.INFO, kind, text)
         return guard
 
     def _anew(self, keyframe: Keyframe, doubt: Doubt, reserve: Reserve) -> Step:
@@ -218,7 +224,7 @@ class Course:
         if doubt.what not in (Doubted.ANSWER, Doubted.VELOCITY):
             reserve = Reserve.of(window)
         watch = watch_after(last.watch, window, last.window.newest, doubt)
-        guard = self._guarded(keyframe, window, is_anew=True)
+        guard = self._guarded(keyframe, window, doubt.what.suspects)
         return Step(window, watch, last.window.all, reserve, guard)
 
     def _observed(self, keyframe: Keyframe, window: Window, *, parity: bool) -> Watch:

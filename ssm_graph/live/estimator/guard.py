@@ -86,15 +86,23 @@ class Guardian:
         return self._guard(lanes, found, contradictions, window, time_s, np.zeros((0, 3)))
 
     def led_on(
-        self, guard: Guard, last: States, keyframe: Keyframe, window: Window, *, is_anew: bool
+        self,
+        guard: Guard,
+        last: States,
+        keyframe: Keyframe,
+        window: Window,
+        *,
+        doubted: Sequence[str] | None = None,
     ) -> Guard:
         """Return the guard at the next keyframe, with which the window is settled.
 
-        ``last`` (1, ...) is the newest state of the window before; ``is_anew`` whether the window
-        was begun anew there.
+        ``last`` (1, ...) is the newest state of the window before; ``doubted`` are those suspects
+        that made it begin anew there, None where it goes on.
         """
-        step = self.bank.after_doubt if is_anew else self.bank.led_on
-        lanes = step(guard.lanes, last, keyframe, window)
+        if doubted is None:
+            lanes = self.bank.led_on(guard.lanes, last, keyframe, window)
+        else:
+            lanes = self.bank.after_doubt(guard.lanes, last, keyframe, window, doubted)
         is_fixed = any(SUSPECT_OF.get(name) in FIXES for name in window.keyframes[-1].aids)
         found = self.judge.separations(lanes)
         lanes, known = self.judge.judged(lanes, found, guard.contradictions, keyframe.time_s)
@@ -157,7 +165,7 @@ class Guardian:
         self, arrays: Mapping[str, Array], known: Sequence[Mapping[str, Any]], window: Window
     ) -> Guard:
         """Return the guard that was packed; one that begins where there is none."""
-        if "levels" not in arrays:
+        if "levels" not in arrays or len(arrays["begun_s"]) != len(self.bank.suspect):
             return self.begin(window, known)
         contradictions = unpack_contradictions(known, self.bank.suspects)
         levels = arrays["levels"]

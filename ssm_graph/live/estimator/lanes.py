@@ -7,18 +7,26 @@ separation. One more lane leaves nothing out and is the measure of the others: a
 that of the window with a share of the noise that lasts, and then the covariance of a separation is
 the difference of their covariances.
 
+Inertial data cannot be left out, for all else hangs on them. Their lanes forget the bias of the
+gyros where they begin, for 60 or 240 s: a bias that has jumped since is found anew from what the
+other sensors say of turns and accelerations, and parts them from the measure, which knows it from
+before.
+
 All lanes are linear about the answer of the window, whose rows and weights they use, and are
 carried as deviations from it in arrays: a keyframe costs as much as a few small products.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import GYRO_BIAS
 from ssm_graph.engine.states import States
 from ssm_graph.graph.aids.depth import DEPTH_DRIFT, DepthMeans
 from ssm_graph.graph.aids.gnss import GNSS_DRIFT, Fixes
@@ -35,7 +43,13 @@ from ssm_graph.smoothers.window_aids import SensorRows
 
 LENGTHS_S: Final = (10.0, 60.0, 240.0)
 """So long a lane leaves its sensor out; two of each, half of it apart."""
+INERTIAL_S: Final = LENGTHS_S[1:]
+"""And those that forget the bias of the gyros: 10 s of other sensors say little of one."""
+FORGOTTEN_BIAS: Final = math.radians(0.1)
+"""rad/s, sigma of what the bias of a gyro may have jumped by; from ten times as much on others
+find it within seconds."""
 DVL, DEPTH = "DVL", "depth"
+INERTIAL: Final = "the inertial data"
 ACOUSTICS: Final = "acoustic fixes"
 COMPASS: Final = "compass"
 SUSPECT_OF: Final = {
@@ -64,7 +78,9 @@ MISFIT_S: Final = 10.0
 BEGUN_ANEW: Final = 1e4
 """Misfit of a measure that was just begun anew: it fits whatever it was begun with, which may be
 what lies, and so refutes no lane until this is forgotten, about a minute."""
-LEAST_WEIGHT: Final = 1e-3
+LEAST_WEIGHT: Final = 1e-9
+"""What the window refuses must not pull at lanes either: a row a thousand sigmas off, of a weight
+of 1e-3, would do so by thirty of them at every ping."""
 MEMORY_S: Final = 10.0
 """Time constant of the low-passed innovation ratios."""
 DOUBT_FACTOR: Final = 2.0
@@ -101,6 +117,8 @@ class Lanes(NamedTuple):
     """(S,) when each suspect was last heard, s"""
     ratio: Array
     """(S, 8) low-passed innovations in their sigmas, NaN where there are none"""
+    doubted_s: Array
+    """(S,) when the answer was last begun anew because each suspect contradicted it, s"""
 
     def pack(self) -> Iterator[tuple[str, Array]]:
         """Yield name and array of everything."""
@@ -129,18 +147,25 @@ class LaneBank:
 
     def __init__(self, sensors: Sensors) -> None:
         named = [BEAMS, *sensors.aids]
-        self.suspects = tuple(dict.fromkeys(s for n, s in SUSPECT_OF.items() if n in named))
+        heard = dict.fromkeys(s for n, s in SUSPECT_OF.items() if n in named)
+        self.suspects = (*heard, INERTIAL)
         """What is left out, each in its turn"""
-        n, each = len(self.suspects), np.repeat(LENGTHS_S, 2)
-        self.suspect = np.concatenate([[-1], np.repeat(np.arange(n), len(each) + 1)])
+        lengths = [np.repeat(INERTIAL_S if s == INERTIAL else LENGTHS_S, 2) for s in self.suspects]
+        ends = np.cumsum([len(each) + 1 for each in lengths])
+        self.suspect = np.concatenate(
+            [[-1], *(np.full(len(each) + 1, s) for s, each in enumerate(lengths))]
+        )
         """(L,) which of them each lane leaves out, -1 for none"""
-        self.length_s = np.concatenate([[np.inf], np.tile(np.append(each, np.inf), n)])
+        self.length_s = np.concatenate([[np.inf], *(np.append(each, np.inf) for each in lengths)])
         """(L,) how long; infinite for the measure, and for a lane that is held"""
-        stagger = np.append(np.tile([0.0, 0.5], len(LENGTHS_S)) * each, 0.0)
-        self._stagger_s = np.concatenate([[0.0], np.tile(stagger, n)])
-        self.held = 1 + np.arange(n) * (len(each) + 1) + len(each)
-        """(S,) the lane of each suspect that is led on once it contradicts"""
-        self._fixes = [k for k, name in enumerate(self.suspects) if name in FIXES]
+        self._stagger_s = np.concatenate(
+            [[0.0], *(np.append(each * np.resize([0.0, 0.5], len(each)), 0.0) for each in lengths)]
+        )
+        self._first, self.held = np.append(1, ends[:-1] + 1), ends
+        """(S,) the first lane of each suspect, and that which is led on once it contradicts"""
+        self._forgets = self.suspect == self.suspects.index(INERTIAL)
+        self._is_fix = np.array([*(name in FIXES for name in self.suspects), False])
+        """(S + 1,) the last for rows that are never left out"""
         self._inertial = InertialRows(sensors.frame, sensors.extras)
         dims = {BEAMS: sensors.beams.n_beams, **{k: aid.dim for k, aid in sensors.aids.items()}}
         self._lasting: dict[str, slice] = {}
@@ -156,8 +181,7 @@ class LaneBank:
 
     def lanes_of(self, suspect: int) -> range:
         """Return the lanes that leave a suspect out, that which is held last."""
-        held = int(self.held[suspect])
-        return range(held - 2 * len(LENGTHS_S), held + 1)
+        return range(int(self._first[suspect]), int(self.held[suspect]) + 1)
 
     def begin(self, window: Window, led_on: Sequence[int] = ()) -> Lanes:
         """Return the lanes that begin with the newest state of a window.
@@ -170,7 +194,7 @@ class LaneBank:
         begun_s = time_s - self._stagger_s
         begun_s[self.held] = np.inf
         begun_s[self.held[list(led_on)]] = time_s
-        return Lanes(
+        lanes = Lanes(
             np.zeros((L, len(covariance))),
             np.tile(covariance, (L, 1, 1)),
             begun_s,
@@ -181,7 +205,9 @@ class LaneBank:
             np.ones(L),
             np.full(S, -np.inf),
             np.full((S, MOST_BEAMS), np.nan),
+            np.full(S, -np.inf),
         )
+        return self._begun(lanes, np.ones(L, dtype=np.bool_), begun_s)
 
     def led_on(self, lanes: Lanes, last: States, keyframe: Keyframe, window: Window) -> Lanes:
         """Return the lanes at the next keyframe, with which the window is settled.
@@ -194,23 +220,40 @@ class LaneBank:
             lanes = self._updated(lanes, measured, keyframe.time_s)
         return self._begun_anew(lanes, keyframe.time_s)
 
-    def after_doubt(self, lanes: Lanes, last: States, keyframe: Keyframe, window: Window) -> Lanes:
+    def after_doubt(
+        self,
+        lanes: Lanes,
+        last: States,
+        keyframe: Keyframe,
+        window: Window,
+        doubted: Sequence[str],
+    ) -> Lanes:
         """Return the lanes at a keyframe where a window was begun anew.
 
-        They are what they were; the measure is what the window says.
+        ``doubted`` are the suspects that contradicted the answer, or may have bent it. Lanes
+        without these, or that of them which is led on, know what was before and stay; the others
+        begin with what the window says now, as the measure does.
         """
         lanes = self._predicted(lanes, last, keyframe, window)
+        own = [s for s, name in enumerate(self.suspects) if name in doubted]
+        is_led_on = np.isfinite(lanes.begun_s[self.held])
+        stays = np.isin(self.suspect, [s for s in own if not is_led_on[s]])
+        stays[self.held] = True
         deviation, covariance = lanes.deviation.copy(), lanes.covariance.copy()
         deviation[MEASURE] = 0.0
         covariance[MEASURE] = self._beside(window.newest_covariance)
-        is_nested = np.zeros(len(deviation))
-        is_nested[MEASURE] = 1.0
+        doubted_s = lanes.doubted_s.copy()
+        doubted_s[own] = keyframe.time_s
+        lanes = lanes._replace(
+            deviation=deviation,
+            covariance=covariance,
+            is_nested=np.zeros(len(deviation)),
+            doubted_s=doubted_s,
+        )
+        lanes = self._begun(lanes, ~stays, keyframe.time_s - self._stagger_s)
         misfit = lanes.misfit.copy()
         misfit[MEASURE] = BEGUN_ANEW
-        lanes = lanes._replace(
-            deviation=deviation, covariance=covariance, misfit=misfit, is_nested=is_nested
-        )
-        return self._begun_anew(lanes, keyframe.time_s)
+        return self._begun_anew(lanes._replace(misfit=misfit), keyframe.time_s)
 
     def _beside(self, covariance: Array) -> Array:
         """Return a covariance (n, n) with that of what lasts beside it."""
@@ -257,7 +300,7 @@ class LaneBank:
         deviation = lanes.deviation + (PHt @ solved[..., -1:])[..., 0]
         P = P - PHt @ solved[..., :-1]
         surplus = np.sum(innovation * solved[..., -1] - counts_in, axis=1)
-        is_fix = np.isin(of_row, self._fixes)
+        is_fix = self._is_fix[of_row]
         return lanes._replace(
             deviation=deviation,
             covariance=0.5 * (P + P.mT),
@@ -303,26 +346,43 @@ class LaneBank:
             own, sigma, at, begin = innovation[begin:end], sigmas[begin:end], rows.component, end
             if s < 0:
                 continue
-            before = np.nan_to_num(ratio[s, at])
+            before = ratio[s, at]
+            before[np.isnan(before)] = 0.0
             share = -np.expm1(-min(time_s - float(last_s[s]), MEMORY_S) / MEMORY_S)
             ratio[s, at] = before + share * (own / sigma - before)
             last_s[s] = time_s
         return lanes._replace(last_s=last_s, ratio=ratio)
 
+    def let_go(self, lanes: Lanes, suspect: int, others: Sequence[int], time_s: float) -> Lanes:
+        """Return the lanes without that which was led on for a suspect.
+
+        All lanes of ``others``, which had followed what it did, begin anew.
+        """
+        which = np.isin(self.suspect, others)
+        lanes = self._begun(lanes, which, time_s - self._stagger_s)
+        begun_s = lanes.begun_s.copy()
+        begun_s[self.held[[suspect, *others]]] = np.inf
+        return lanes._replace(begun_s=begun_s)
+
     def _begun_anew(self, lanes: Lanes, time_s: float) -> Lanes:
         """Return the lanes with those begun anew whose time is over."""
         is_over = time_s - lanes.begun_s > self.length_s
-        if not is_over.any():
-            return lanes
+        return self._begun(lanes, is_over, time_s) if is_over.any() else lanes
+
+    def _begun(self, lanes: Lanes, which: NDArray[np.bool_], begun_s: Array | float) -> Lanes:
+        """Return the lanes with some (L,) begun with what the measure says."""
         deviation, covariance = lanes.deviation.copy(), lanes.covariance.copy()
-        deviation[is_over], covariance[is_over] = deviation[MEASURE], covariance[MEASURE]
-        nothing = {n: np.where(is_over, 0.0, getattr(lanes, n)) for n in _COUNTS}
+        deviation[which], covariance[which] = deviation[MEASURE], covariance[MEASURE]
+        forget, own = np.flatnonzero(which & self._forgets), np.arange(*GYRO_BIAS.indices(self._n))
+        covariance[np.ix_(forget, own, own)] += FORGOTTEN_BIAS**2 * np.eye(len(own))
+        counts = {name: np.where(which, 0.0, getattr(lanes, name)) for name in _COUNTS}
+        counts["n_out"][forget] = 1.0
         return lanes._replace(
             deviation=deviation,
             covariance=covariance,
-            begun_s=np.where(is_over, time_s, lanes.begun_s),
-            is_nested=np.where(is_over, 1.0, lanes.is_nested),
-            **nothing,
+            begun_s=np.where(which, begun_s, lanes.begun_s),
+            is_nested=np.where(which, 1.0, lanes.is_nested),
+            **counts,
         )
 
 

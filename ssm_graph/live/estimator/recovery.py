@@ -19,6 +19,7 @@ from ssm_graph.engine.states import States
 from ssm_graph.graph.aids.depth import DepthMeans
 from ssm_graph.graph.aids.gnss import Fixes
 from ssm_graph.graph.inertial_rows import InertialRows
+from ssm_graph.live.estimator.lanes import DEPTH, DVL, FIXES
 from ssm_graph.live.estimator.watch import (
     FEW,
     TORN_PINGS,
@@ -72,6 +73,13 @@ class Doubted(Enum):
     VELOCITY = "everything since it was sound, and what the inertial data made of the velocity"
     POSITION = "position"
     HEIGHT = "height"
+
+    @property
+    def suspects(self) -> tuple[str, ...]:
+        """Whose readings contradicted the answer, or may have bent it."""
+        if self is Doubted.POSITION:
+            return FIXES
+        return (DEPTH,) if self is Doubted.HEIGHT else (DVL,)
 
 
 class Doubt(NamedTuple):

@@ -1,9 +1,11 @@
 """What the lanes say of the answer: which sensors contradict it, and how far it may be off.
 
-A lane contradicts where its velocity or its position parts from that of the lane with all sensors
-by more than noise would at the stated rate of false alerts. A step shows only while a lane is there
-that began before it; so a contradiction is remembered, and the lane that found it is led on without
-its sensor, until that lane, by what is independent of the sensor, can say that the answer is right.
+A lane contradicts where its velocity or its position (that which forgot the bias of the gyros: or
+that) parts from that of the lane with all sensors by more than noise would at the stated rate of
+false alerts. A step shows only while a lane is there that began before it; so a contradiction is
+remembered, and the lane that found it first is led on without its sensor, until that lane, by what
+is independent of the sensor, can say that the answer is right. What parts by less is a suspicion:
+it lasts until that lane agrees, whatever it can tell.
 """
 
 from __future__ import annotations
@@ -19,21 +21,46 @@ from scipy.special import ndtri
 from ssm_graph.base import chi2
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
-from ssm_graph.engine.error_state import POSITION, VELOCITY
-from ssm_graph.live.estimator.lanes import DEPTH, DVL, FIXES, LENGTHS_S, MEASURE, LaneBank, Lanes
+from ssm_graph.engine.error_state import GYRO_BIAS, POSITION, VELOCITY
+from ssm_graph.live.estimator.lanes import (
+    DEPTH,
+    DVL,
+    FIXES,
+    INERTIAL,
+    LENGTHS_S,
+    MEASURE,
+    LaneBank,
+    Lanes,
+)
 
-PARTS: Final = (VELOCITY, POSITION)
-UNITS: Final = ("m/s", "m")
+PARTS: Final = (VELOCITY, POSITION, GYRO_BIAS)
+OF_ALL: Final = 2
+"""Parts in which every lane is compared; the others are for those that forget the gyros' bias."""
+SAID: Final = (
+    ("velocity", "m/s", 1.0),
+    ("position", "m", 1.0),
+    ("gyro bias", "deg/s", 180.0 / np.pi),
+)
+"""Name, unit and factor to it"""
 TEST_S: Final = 10.0
 """What lanes say changes so slowly, and those of one sensor say so much the same, that of the tests
 of each lane one in so long counts as another one. Of noise as stated, 4 h at navigation and at
 tactical grade, tests went above a level 3000 to 9000 times as often in an hour as one test would;
 this counts 10000."""
+BIAS_TEST_S: Final = 40.0
+"""The same for a bias of the gyros, which other sensors tell so much more slowly: in 22 minutes
+without a fault at both grades the tests of four lanes went as high as those of 120 do."""
 UNASKED: Final = 0.01
 """Share of the measure's covariance added to that of a separation: what moves the answer by less
 than a tenth of its own sigma is not asked for."""
-AGREED_S: Final = 10.0
-"""A contradiction ends once the lane that is led on has agreed for so long."""
+AGREED_S: Final = 8.0
+"""A contradiction or suspicion ends once the lane that is led on has agreed for so long."""
+AT_EASE: Final = 0.05
+"""It agrees where noise alone would part it by more in so many cases."""
+DOUBTED_S: Final = 30.0
+"""So long after an answer was begun anew a lane from before contradicts at `DOUBTFUL`."""
+DOUBTFUL: Final = 1e-3
+"""Probability of a false alert of such a lane: something is wrong for certain."""
 CONFIRMED: Final = 1.0 / 3.0
 """Share of its way at a false velocity by which the measure, held by fixes, parts from a lane."""
 CONFIRMED_S: Final = 40.0
@@ -41,7 +68,7 @@ CONFIRMED_S: Final = 40.0
 FITS: Final = 0.75
 """Misfit of the measure, in thresholds, below which it fits all that is measured."""
 WEIGHED_S: Final = 5.0
-"""Evidence is taken while a contradiction is so young."""
+"""Evidence and size are taken while a contradiction is so young."""
 TOGETHER_S: Final = 10.0
 """Contradictions that begin within so much compete for the blame."""
 RIVAL: Final = 0.5
@@ -51,7 +78,6 @@ NEAR: Final = 25.0
 HORIZONTAL: Final = np.array([1.0, 0.0])
 VERTICAL: Final = np.array([0.0, 1.0])
 """Of the two protection levels"""
-INERTIAL: Final = "the inertial data"
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +86,8 @@ class IntegrityConfig:
 
     false_alerts_per_h: float = 1e-3
     """Of all lanes together, while every sensor is as it is stated."""
+    suspicions_per_h: float = 0.5
+    """False ones, of all lanes together: each costs GOOD for a minute or so; none is remembered."""
     missed_detection: float = 1e-3
     """Probability that a fault moves the answer out of its protection level unseen."""
     protection_m: float = np.inf
@@ -68,7 +96,11 @@ class IntegrityConfig:
     """And for a vertical one below this, m."""
 
     def __post_init__(self) -> None:
-        for name, high in (("false_alerts_per_h", np.inf), ("missed_detection", 0.5)):
+        for name, high in (
+            ("false_alerts_per_h", np.inf),
+            ("suspicions_per_h", np.inf),
+            ("missed_detection", 0.5),
+        ):
             value = getattr(self, name)
             if not 0.0 < value < high:
                 raise ConfigError(f"{name}: expected a number in (0, {high}), got {value}")
@@ -85,13 +117,15 @@ class Contradiction(NamedTuple):
     last_s: float
     """When a lane last said so, s"""
     part: int
-    """0 in velocity, 1 in position"""
+    """0 in velocity, 1 in position, 2 in the gyros' bias"""
     size: float
-    """Largest so far, m/s or m"""
+    """Largest while it began: later the answer is bent by what it followed; m/s, m or rad/s"""
     evidence: float
     """By how much less of chi-square was left without it while it began"""
     agreed_s: float
     """Since when the lane that is led on agrees, s; infinite where it does not"""
+    is_certain: bool = True
+    """Whether it is more than a suspicion"""
 
 
 class Protection(NamedTuple):
@@ -104,14 +138,14 @@ class Protection(NamedTuple):
 
 
 class Separations(NamedTuple):
-    """Of L lanes from the measure, in velocity and in position."""
+    """Of L lanes from the measure, in velocity, position and bias of the gyros."""
 
     test: Array
-    """(L, 2) chi-square of 3 degrees of freedom; zero where a lane has left nothing out"""
+    """(L, 3) chi-square of 3 degrees of freedom; zero where a lane has left nothing out"""
     size: Array
-    """(L, 2) m/s and m"""
+    """(L, 3) m/s, m, rad/s"""
     sigma: Array
-    """(L, 2) in the most uncertain direction"""
+    """(L, 3) in the most uncertain direction"""
 
 
 class Judge:
@@ -119,9 +153,20 @@ class Judge:
 
     def __init__(self, bank: LaneBank, config: IntegrityConfig) -> None:
         self._bank, self.config = bank, config
-        n_tests = 3600.0 / TEST_S * len(PARTS) * (len(bank.suspect) - 1)
-        self.threshold = float(chi2.isf(config.false_alerts_per_h / n_tests, 3))
-        """Of the chi-square of a separation"""
+        self._is_inertial = bank.suspect == bank.suspects.index(INERTIAL)
+        n_tests = np.array(
+            [
+                *[3600.0 / TEST_S * OF_ALL * (len(bank.suspect) - 1)] * OF_ALL,
+                3600.0 / BIAS_TEST_S * (self._is_inertial.sum() - 1),
+            ]
+        )
+        self.thresholds, self.suspicions = (
+            np.array([chi2.isf(min(0.5 * rate / n, AT_EASE), 3) for n in n_tests])
+            for rate in (config.false_alerts_per_h, config.suspicions_per_h)
+        )
+        """(3,) of the chi-square of a separation, by part; half the rate is for the gyros' bias"""
+        self.threshold = float(self.thresholds[0])
+        self._at_ease, self._doubtful = (float(chi2.isf(p, 3)) for p in (AT_EASE, DOUBTFUL))
         self._radius = float(np.sqrt(chi2.isf(config.missed_detection, 2)))
         self._side = float(-ndtri(0.5 * config.missed_detection))
 
@@ -141,9 +186,10 @@ class Judge:
             D[MEASURE] = of_measure
             off = lanes.deviation[:, part] - lanes.deviation[MEASURE, part]
             test[:, k] = np.sum(off * np.linalg.solve(D, off[..., None])[..., 0], axis=1)
-            size[:, k] = np.linalg.norm(off, axis=1)
+            size[:, k] = np.sqrt(np.sum(off * off, axis=1))
             sigma[:, k] = np.sqrt(np.linalg.eigvalsh(D)[:, -1])
         test[(lanes.n_out == 0.0) | ~np.isfinite(lanes.begun_s) | self.is_refuted(lanes)] = 0.0
+        test[~self._is_inertial, OF_ALL:] = 0.0
         return Separations(test, size, sigma)
 
     def is_refuted(self, lanes: Lanes) -> NDArray[np.bool_]:
@@ -162,31 +208,58 @@ class Judge:
         time_s: float,
     ) -> tuple[Lanes, tuple[Contradiction, ...]]:
         """Return the contradictions after one more keyframe, and the lanes with those led on."""
-        kept = {one.suspect: one for one in known}
+        kept, over = {one.suspect: one for one in known}, set[int]()
         for suspect in range(len(self._bank.suspects)):
+            if suspect in over:
+                continue
             own = self._bank.lanes_of(suspect)
             test = found.test[own.start : own.stop]
-            row, part = (int(i) for i in np.unravel_index(np.argmax(test), test.shape))
-            lane, held = own.start + row, int(self._bank.held[suspect])
-            if test[row, part] > self.threshold:
-                before = kept.get(suspect)
-                if lane != held:
+            highest = np.argmax(test / self.thresholds)
+            row, part = (int(i) for i in np.unravel_index(highest, test.shape))
+            lane, held, was = own.start + row, int(self._bank.held[suspect]), kept.get(suspect)
+            limit = self._limit(lanes, suspect, lane, time_s)
+            is_certain = bool(test[row, part] > min(limit, self.thresholds[part]))
+            if is_certain or test[row, part] > self.suspicions[part]:
+                if was is None:
                     lanes = lanes.with_copy(held, lane)
-                size = float(found.size[lane, part])
-                if before is None:
-                    before = Contradiction(suspect, time_s, time_s, part, size, -np.inf, np.inf)
-                largest = max(before.size, float(found.size[lane, before.part]))
-                kept[suspect] = before._replace(last_s=time_s, size=largest, agreed_s=np.inf)
-            elif suspect in kept:
-                still = self._still(kept[suspect], lanes, found, time_s)
+                if was is None or (is_certain and not was.is_certain):
+                    was = Contradiction(suspect, time_s, time_s, part, 0.0, -np.inf, np.inf, False)
+                largest = max(was.size, float(found.size[lane, was.part]))
+                kept[suspect] = was._replace(
+                    last_s=time_s,
+                    size=largest if time_s - was.since_s <= WEIGHED_S else was.size,
+                    agreed_s=np.inf,
+                    is_certain=was.is_certain or is_certain,
+                )
+            elif was is not None:
+                still = self._still(was, lanes, found, time_s)
                 if still is None:
-                    del kept[suspect]
-                    begun_s = lanes.begun_s.copy()
-                    begun_s[held] = np.inf
-                    lanes = lanes._replace(begun_s=begun_s)
+                    others = self._consequences(was, known)
+                    over |= {suspect, *others}
+                    kept = {s: one for s, one in kept.items() if s not in over}
+                    lanes = self._bank.let_go(lanes, suspect, others, time_s)
                 else:
                     kept[suspect] = still
         return lanes, tuple(self._weighed(one, lanes, time_s) for one in kept.values())
+
+    def _consequences(self, was: Contradiction, known: tuple[Contradiction, ...]) -> list[int]:
+        """Return the suspects whose contradiction ends with that of another one.
+
+        They began after it and were not blamed. The lanes of the inertial data had followed the
+        DVL, and that a lane without DVL agrees speaks for these data as well.
+        """
+        names, blamed = self._bank.suspects, {one.suspect for one in self.blamed(known)}
+        if was.suspect not in blamed:
+            return []
+        spared = {names.index(INERTIAL)} if names[was.suspect] == DVL else set()
+        later = [one.suspect for one in known if one.since_s > was.since_s]
+        return [suspect for suspect in later if suspect not in blamed - spared]
+
+    def _limit(self, lanes: Lanes, suspect: int, lane: int, time_s: float) -> float:
+        """Return above which chi-square a lane contradicts an answer that was begun anew."""
+        doubted_s = float(lanes.doubted_s[suspect])
+        is_doubted = time_s - doubted_s < DOUBTED_S and lanes.begun_s[lane] < doubted_s
+        return self._doubtful if is_doubted else np.inf
 
     def _weighed(self, one: Contradiction, lanes: Lanes, time_s: float) -> Contradiction:
         """Return a contradiction with the evidence of its first seconds."""
@@ -201,9 +274,11 @@ class Judge:
         own = int(self._bank.held[was.suspect]), was.part
         if self.is_refuted(lanes)[own[0]]:
             return None
-        is_out = bool(found.size[own] + self.detectable * found.sigma[own] <= was.size)
-        if self._bank.suspects[was.suspect] == DVL and was.part == 0:
-            is_out |= self._is_confirmed(was, lanes, found, time_s)
+        is_out = bool(found.test[own[0]].max() < self._at_ease)
+        if was.is_certain:
+            is_out &= bool(found.size[own] + self._side * found.sigma[own] <= was.size)
+            if self._bank.suspects[was.suspect] == DVL and was.part == 0:
+                is_out |= self._is_confirmed(was, lanes, found, time_s)
         agreed_s = min(was.agreed_s, time_s) if is_out else np.inf
         return None if time_s - agreed_s > AGREED_S else was._replace(agreed_s=agreed_s)
 
@@ -237,8 +312,10 @@ class Judge:
     def blamed(self, known: tuple[Contradiction, ...]) -> list[Contradiction]:
         """Return those without which what the others say fits, the clearest first.
 
-        What contradicts long after the first one does so since the answer has followed that.
+        What contradicts long after the first one does so since the answer has followed that; what
+        is certain counts before what is suspected.
         """
+        known = tuple(one for one in known if one.is_certain) or known
         first_s = min((one.since_s for one in known), default=0.0)
         rest = [one for one in known if one.since_s - first_s < TOGETHER_S]
         order = sorted(rest, key=lambda one: -one.evidence)
@@ -254,14 +331,18 @@ class Judge:
         names, first = self._bank.suspects, blamed[0]
         said = [names[one.suspect] for one in blamed]
         has_fixes = lanes.n_fixes[self._bank.held[blamed[0].suspect]] > 0.0
-        if DVL in said and not (has_fixes and len(known) == 1):
+        if DVL in said and INERTIAL not in said and not (has_fixes and len(known) == 1):
             said.append(INERTIAL)
-        return (
-            f"{' or '.join(said)}: without {names[first.suspect]} the "
-            f"{('velocity', 'position')[first.part]} has been another by {first.size:.2g} "
-            f"{UNITS[first.part]} since {first.since_s:.0f} s, and nothing independent has shown "
-            "since that the answer is right"
+        name, unit, factor = SAID[first.part]
+        is_inertial = names[first.suspect] == INERTIAL
+        without = "the gyro bias of before" if is_inertial else names[first.suspect]
+        text = (
+            f"{' or '.join(said)}: without {without} the {name} has been another by "
+            f"{factor * first.size:.2g} {unit} since {first.since_s:.0f} s, "
         )
+        if not first.is_certain:
+            return text + "which noise alone would hardly do"
+        return text + "and nothing independent has shown since that the answer is right"
 
     def protection(
         self, lanes: Lanes, found: Separations, R_up: Array, *, time_s: float, fixed_s: float
@@ -275,19 +356,16 @@ class Judge:
         """
         off = np.abs(lanes.deviation[:, POSITION] @ R_up.T)
         P = R_up @ lanes.covariance[:, POSITION, POSITION] @ R_up.T
-        level = np.sqrt(np.linalg.eigvalsh(P[:, :2, :2])[:, -1])
-        bound = np.stack(
-            [
-                np.linalg.norm(off[:, :2], axis=1) + self._radius * level,
-                off[:, 2] + self._side * np.sqrt(P[:, 2, 2]),
-            ],
-            axis=1,
-        )
+        east, north = P[:, 0, 0], P[:, 1, 1]
+        level = np.sqrt(0.5 * (east + north) + np.hypot(0.5 * (east - north), P[:, 0, 1]))
+        bound = np.empty((len(off), 2))
+        bound[:, 0] = np.hypot(off[:, 0], off[:, 1]) + self._radius * level
+        bound[:, 1] = off[:, 2] + self._side * np.sqrt(P[:, 2, 2])
         worst = bound[MEASURE].copy()
         for suspect, name in enumerate(self._bank.suspects):
             own, held = self._bank.lanes_of(suspect), int(self._bank.held[suspect])
             is_led_on = bool(np.isfinite(lanes.begun_s[held]))
-            lane = np.array([i for i in own if i != held and lanes.n_out[i] > 0.0], dtype=np.intp)
+            lane = own.start + np.flatnonzero(lanes.n_out[own.start : held] > 0.0)
             if len(lane) == 0:
                 worst = np.maximum(worst, bound[held]) if is_led_on else worst
                 continue
@@ -303,11 +381,11 @@ class Judge:
                 axis = VERTICAL if name == DEPTH else np.ones(2)
                 # A slow pull shows to the longest lane last.
                 unseen, older = float(sigmas.max()) * axis, bound[MEASURE] + step * axis
-                grown = np.tile(older, (len(lane), 1))
+                grown = older
             if is_led_on:
                 worst = np.maximum(worst, bound[held] + unseen)
             worst = np.maximum(worst, older)
-            worst = np.maximum(worst, np.min([bound[lane], grown], axis=0).max(axis=0))
+            worst = np.maximum(worst, np.minimum(bound[lane], grown).max(axis=0))
         return Protection(*worst.tolist())
 
 

@@ -118,6 +118,8 @@ class Decoder(ABC):
         self._refusals = Refusals()
         self.n_sound = 0
         """Texts so far that were what this protocol says, whether or not of use here."""
+        self.altitude_m = math.nan
+        """Of the instrument above the ground by its last word, m; NaN where it does not say."""
 
     @property
     def n_held(self) -> int:

@@ -200,11 +200,16 @@ class TokenBucket:
         self._rate_per_s, self._burst, self._tokens = rate_per_s, float(burst), float(burst)
         self._last_s: float | None = None
 
+    def grant(self, span_s: float) -> None:
+        """Admit at once, besides, what may come in such a time, s, in which nobody asked."""
+        self._tokens += self._rate_per_s * span_s
+
     def admit(self, now_s: float) -> bool:
         """Return whether one more message may pass at ``now_s``; a clock set back fills nothing."""
         if math.isfinite(now_s):
             elapsed_s = max(0.0, now_s - (now_s if self._last_s is None else self._last_s))
-            self._tokens = min(self._burst, self._tokens + elapsed_s * self._rate_per_s)
+            filled = min(self._burst, self._tokens + elapsed_s * self._rate_per_s)
+            self._tokens = max(self._tokens, filled)
             self._last_s = now_s
         if self._tokens < 1.0:
             self.n_refused += 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final, NamedTuple
@@ -44,6 +45,8 @@ ASSUMED_HDOP: Final = 2.0
 HEIGHT_SIGMA_M: Final = 100.0
 """Of a height that is not above the ellipsoid, or none: the geoid is up to 107 m away from it."""
 _MAX_KINDS: Final = 8
+_MOST_WAITING: Final = 200
+"""Positions of one sentence: those of PREFERRED_S, at the rates of any receiver."""
 _FEW_LETTERS: Final = 16
 """Shorter printable pieces are of binary frames that a line end within cuts up."""
 _LIKE_SENTENCE = re.compile(r"[$!]?[A-Z]{2}[A-Z0-9]{2,8},")
@@ -109,20 +112,22 @@ class _Preference:
 
     def __init__(self, order: Iterable[str]) -> None:
         self._order = list(order)
-        self._kind = self._order[0]
-        self._heard_s = math.nan
+        self._begun_s = math.nan
+        self._heard_s: dict[str, float] = {}
+
+    def may_take(self, kind: str) -> bool:
+        """Return whether a sentence is one of those of which one is read."""
+        return kind in self._order
 
     def takes(self, kind: str, arrival_s: float) -> bool:
         """Return whether a sentence is read, and take note that it came."""
         if kind not in self._order:
             return False
-        is_old = not 0.0 <= arrival_s - self._heard_s < PREFERRED_S
-        is_first = math.isnan(self._heard_s)
-        if self._order.index(kind) > self._order.index(self._kind) and (is_first or not is_old):
-            self._heard_s = arrival_s if is_first else self._heard_s
-            return False
-        self._kind, self._heard_s = kind, arrival_s
-        return True
+        self._begun_s = arrival_s if math.isnan(self._begun_s) else self._begun_s
+        self._heard_s[kind] = arrival_s
+        before = self._order[: self._order.index(kind)]
+        since_s = [arrival_s - self._heard_s.get(other, self._begun_s) for other in before]
+        return not any(0.0 <= s < PREFERRED_S for s in since_s)
 
 
 class NmeaDecoder(Decoder):
@@ -155,6 +160,7 @@ class NmeaDecoder(Decoder):
             for kinds in (POSITIONS, HEADINGS)
         )
         self._has_fix = True
+        self._waiting: dict[str, deque[_Pending]] = {}
         self._pending: _Pending | None = None
         self._last_utc, self._last_kind = "", ""
         self._gst: tuple[str, Vector] | None = None
@@ -256,8 +262,9 @@ class NmeaDecoder(Decoder):
 
     def _on_position(self, kind: str, fields: list[str], arrival_s: float) -> list[Message]:
         if not self._positions.takes(kind, arrival_s):
+            self._have_wait(kind, fields, arrival_s)
             return []
-        before = self._release(None)
+        before = self._release(None) + self._waited(kind)
         try:
             pending = self._position(kind, fields, arrival_s)
         except RefusedError as error:
@@ -273,6 +280,25 @@ class NmeaDecoder(Decoder):
             self._gst_follows = False
             return before + self._release(self._gst[1])
         return before + ([] if self._gst_follows else self._release(None))
+
+    def _have_wait(self, kind: str, fields: list[str], arrival_s: float) -> None:
+        """Keep a position while it is not known whether a sentence that says more comes."""
+        try:
+            place = POSITIONS[kind](fields) if self._positions.may_take(kind) else None
+            if place is not None and place.utc != self._last_utc:
+                time_s = self._stamper.stamp(utc_seconds(place.utc, arrival_s), arrival_s)
+                waiting = self._waiting.setdefault(kind, deque(maxlen=_MOST_WAITING))
+                waiting.append(_Pending(kind, time_s, arrival_s, place))
+        except RefusedError:  # which is told where it is read
+            return
+
+    def _waited(self, kind: str) -> list[Message]:
+        """Return the fixes of a sentence that is read from now on; the others are not needed."""
+        waiting, fixes = self._waiting.get(kind, ()), list[Message]()
+        for self._pending in waiting:
+            fixes += self._release(None)
+        self._waiting.clear()
+        return fixes
 
     def _on_gst(self, fields: list[str]) -> list[Message]:
         if len(fields) < 8:

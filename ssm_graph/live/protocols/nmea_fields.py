@@ -20,7 +20,8 @@ _MEASURED: Final = frozenset("ADFPR")
 _QUALITIES: Final = frozenset("123459")
 _NO_FIX: Final = frozenset({"", "0"})
 _NUMBER = re.compile(r"[+-]?(?:\d{1,12}(?:\.\d{0,12})?|\.\d{1,12})", re.ASCII)
-_ANGLE = re.compile(r"(\d{2,3})(\d{2}(?:\.\d{0,12})?)", re.ASCII)
+_ANGLE = re.compile(r"(\d{0,3})(\d{2}(?:\.\d{0,12})?)", re.ASCII)
+"""Some do not write zeros before the degrees."""
 _TIME = re.compile(r"(\d{2})(\d{2})(\d{2}(?:\.\d{0,9})?)", re.ASCII)
 _CHECKSUM = re.compile(r"[0-9A-Fa-f]{2}", re.ASCII)
 
@@ -94,7 +95,7 @@ def _with_height(fields: list[str], *, separation: str) -> Position:
 def _rmc(fields: list[str]) -> Position | None:
     if len(fields) < 9:
         raise RefusedError(f"expected 12 fields, got {len(fields)}")
-    modes = fields[11] if len(fields) > 11 else "A"  # which NMEA before 2.3 does not have
+    modes = _mode(fields, 11)
     is_fix = fields[1] == "A" and _is_measured(modes)
     return Position(fields[0], *_place(fields[2:6])) if is_fix else None
 
@@ -102,9 +103,14 @@ def _rmc(fields: list[str]) -> Position | None:
 def _gll(fields: list[str]) -> Position | None:
     if len(fields) < 6:
         raise RefusedError(f"expected 7 fields, got {len(fields)}")
-    modes = fields[6] if len(fields) > 6 else "A"
+    modes = _mode(fields, 6)
     is_fix = fields[5] == "A" and _is_measured(modes)
     return Position(fields[4], *_place(fields[:4])) if is_fix else None
+
+
+def _mode(fields: list[str], at: int) -> str:
+    """Return the mode of a fix; where it is left out, as before NMEA 2.3, the status alone says."""
+    return (fields[at] if len(fields) > at else "") or "A"
 
 
 def _is_measured(modes: str) -> bool:
@@ -265,7 +271,9 @@ def angle(field: str, side: str, sides: str, *, limit_deg: float) -> float:
         raise RefusedError(
             f"expected an angle as dddmm.mmm,{sides[0]}, got {shown(field)},{shown(side)}"
         )
-    degrees = number(float(found[1]) + float(found[2]) / 60.0, key="angle, deg", high=limit_deg)
+    degrees = number(
+        float(found[1] or 0) + float(found[2]) / 60.0, key="angle, deg", high=limit_deg
+    )
     return math.radians(degrees if side == sides[0] else -degrees)
 
 

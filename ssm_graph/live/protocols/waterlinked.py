@@ -126,6 +126,9 @@ class WaterLinkedDecoder(Decoder):
     def _ping(self, report: dict[str, Any], arrival_s: float, *, is_water: bool) -> Ping:
         beams = _transducers(report)
         counts = self._counts(report, beams)
+        if not is_water:
+            altitude_m = number(report.get("altitude", -1.0), key="altitude")
+            self.altitude_m = altitude_m if altitude_m > 0.0 else math.nan
         speed = tuple(
             float(x["velocity"]) if counts and x["beam_valid"] else math.nan for x in beams
         )

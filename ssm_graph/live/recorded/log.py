@@ -8,11 +8,12 @@ between reports of a DVL, date and time of day of a receiver.
 from __future__ import annotations
 
 import calendar
+import codecs
 import csv
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -20,10 +21,13 @@ from typing import Any, Final
 import numpy as np
 
 from ssm_graph.base.errors import DataError
+from ssm_graph.io.nortek.nortek import read_nortek
+from ssm_graph.io.nortek.packets import is_nortek
 from ssm_graph.io.raw_log.rows import RowKind
 from ssm_graph.io.tables.append_file import write_through
 from ssm_graph.io.teledyne.ensembles import is_pd0
 from ssm_graph.io.teledyne.pd0 import read_pd0
+from ssm_graph.io.teledyne.short_formats import is_pd6, is_pd45, read_pd6, read_pd45
 from ssm_graph.live.protocols.decoder import RefusedError, parse_object
 from ssm_graph.live.protocols.framing import ObjectFramer, SentenceFramer
 from ssm_graph.live.protocols.nmea import MAX_SENTENCE, NmeaDecoder, NmeaOptions
@@ -48,6 +52,15 @@ _SHORTEST_S: Final = 1e-3
 """From one report to the next."""
 _ANY_CLOCK_S: Final = 1e12
 _SENTENCE = re.compile(rb"[$!][A-Z]{2}[A-Z0-9]{2,},")
+_PYTHON: Final = {b"'": b'"', b"True": b"true", b"False": b"false", b"None": b"null"}
+_OF_PYTHON = re.compile(rb"'|\b(?:True|False|None)\b")
+_BINARY: Final[Sequence[tuple[Callable[[bytes], bool], Callable[[Path], Any]]]] = (
+    (is_pd0, read_pd0),
+    (is_nortek, read_nortek),
+    (is_pd45, read_pd45),
+    (is_pd6, read_pd6),
+)
+"""Makers' own formats: by the first bytes whether a file is of one, and what reads it."""
 _UNIX_S: Final = 1e9
 """A larger number of seconds is Unix time."""
 
@@ -70,13 +83,17 @@ def read_recorded(log: Path, options: NmeaOptions | None = None) -> Recorded | N
     ``options`` are those of NMEA: what of its depths is the vehicle's, and the water's surface.
     """
     try:
-        data = log.read_bytes()
+        data = _in_utf8(log.read_bytes())
     except OSError as error:
         raise DataError(f"{log}: cannot be read: {error.strerror or error}") from error
     head = data[:_SNIFFED]
-    if is_pd0(head):
-        found = _pd0(log)
-    elif head.lstrip(b" \t\r\n\xef\xbb\xbf")[:1] in (b"{", b"[") and b'"' in head:
+    binary = next((read for is_it, read in _BINARY if is_it(head)), None)
+    if binary is not None:
+        read = binary(log)
+        found = Recorded(read.messages, (read.about, *read.notes))
+    elif b"'transducers'" in head and b'"' not in head:  # as Python prints what it has parsed
+        found = _water_linked(_OF_PYTHON.sub(lambda found: _PYTHON[found[0]], data))
+    elif b'"transducers"' in head or (head.lstrip()[:1] in (b"{", b"[") and b'"' in head):
         found = _water_linked(data)
     elif SIGN in head.partition(b"\n")[0]:
         found = _water_linked_table(data)
@@ -89,9 +106,11 @@ def read_recorded(log: Path, options: NmeaOptions | None = None) -> Recorded | N
     return _in_order(log, found)
 
 
-def _pd0(log: Path) -> Recorded:
-    found = read_pd0(log)
-    return Recorded(found.messages, (found.about, *found.notes))
+def _in_utf8(data: bytes) -> bytes:
+    """Return a text that a shell or editor of Windows wrote as other programs do."""
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return data.decode("utf-16", "replace").encode()
+    return data.removeprefix(codecs.BOM_UTF8)
 
 
 def write_tables(folder: Path, messages: Iterable[Message]) -> dict[str, int]:

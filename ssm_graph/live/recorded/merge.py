@@ -16,12 +16,12 @@ from ssm_graph.base.frames import BodyAxes
 from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.io.raw_log.log import RawLog
 from ssm_graph.io.tables.files import read_table
-from ssm_graph.live.recorded.log import read_recorded
+from ssm_graph.live.recorded.log import Recorded, read_recorded
 from ssm_graph.live.recorded.turns import clock_offset
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.compass import HeadingReading
-from ssm_graph.sensors.imu import IMU, ImuLog
+from ssm_graph.sensors.imu import IMU, ImuLog, ImuSample
 from ssm_graph.sensors.instrument import read_columns
 from ssm_graph.sensors.messages import Message
 from ssm_graph.sensors.registry import BY_LOG, BY_MESSAGE
@@ -73,11 +73,30 @@ def merge_recordings(
         shift_s, said = _shift(log, found.messages, imu, offset_s)
         notes += [*(f"{log.name}: {note}" for note in found.notes), said]
         streams += _on_clock(found.messages, shift_s, known)
+    mission = _written(streams, out, vehicle)
+    return Merged(mission, (*notes, *mission.notes))
+
+
+def mission_of_recording(log: Path, found: Recorded, out: Path, *, vehicle: Vehicle) -> Merged:
+    """Write a mission folder of one recording that holds inertial data as well.
+
+    Raises :class:`ConfigError` where it does not.
+    """
+    if not any(isinstance(message, ImuSample) for message in found.messages):
+        raise ConfigError(
+            f"{log}: --vehicle makes a mission of a recording with inertial data, and this has "
+            "none: give the table of an IMU beside it"
+        )
+    known = {BY_LOG[kind].section for kind in vehicle.bare_logs}
+    mission = _written(_on_clock(found.messages, 0.0, known), out, vehicle)
+    return Merged(mission, (*found.notes, *mission.notes))
+
+
+def _written(streams: Sequence[Sequence[Message]], out: Path, vehicle: Vehicle) -> Mission:
     with RawLog(out, vehicle) as raw:
         for message in merge(*streams, key=lambda message: message.time_s):
             raw.append(message)
-    mission = read_mission(out)
-    return Merged(mission, (*notes, *mission.notes))
+    return read_mission(out)
 
 
 def _is_inertial(log: Path) -> bool:

@@ -7,6 +7,7 @@
 ``protection.csv``     protection levels at their times, as they were known then
 ``events.jsonl``       what happened, a line of JSON each
 ``checkpoint.npz``     the estimator, and the sizes of the files above at that moment
+``clock.csv``          by how much the vehicle's clock was set (`clock_file.ClockFile`)
 ``summary.json``       how it ended; not there while it goes on
 ``run.json``           settings; a run is gone on with the same ones only
 ``lock``               held by the process that writes here

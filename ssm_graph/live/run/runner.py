@@ -376,7 +376,9 @@ class Runner:
         self._write_delayed(self._estimator.finish)
         self._events.note("run", "ended", reason.value, Severity.INFO)
         self._take_events()
-        notes = tuple(self.folder.settle())
+        local = self.folder.vehicle.local
+        said = () if local is None else (local.sentence,)
+        notes = (*said, *self.folder.settle())
         end = RunEnd(reason, navigation, found, self._n_messages, self._events.n_errors, notes)
         assert self.folder.results is not None
         self.folder.results.finish(summary_of(self.folder, end))
@@ -425,6 +427,7 @@ def summary_of(folder: RunFolder, end: RunEnd) -> dict[str, Any]:
         "n_messages": end.n_messages,
         "raw_log": LOG_NAME,
         "newest": None if navigation is None else navigation_fields(navigation),
+        **({} if folder.vehicle.local is None else {"local_start": folder.vehicle.local.sentence}),
         "settings": folder.settings,
         "calibration": calibration_fields(end.found.calibration),
         "current": current_fields(end.found.current),

@@ -18,6 +18,8 @@ from ssm_graph.base.errors import ConfigError, nearest_hint
 from ssm_graph.mission.navigation import Severity
 
 LOOPBACK: Final = "127.0.0.1"
+WAITING: Final = 4 * 2**20
+"""Bytes of datagrams that may wait while this process stands still, as far as the system allows."""
 CHUNK: Final = 65536
 """Bytes that are read of one socket before the others have their turn."""
 _ACCEPT_PAUSE_S: Final = 1.0
@@ -124,7 +126,9 @@ def bound(endpoint: Endpoint) -> socket.socket:
     try:
         if found.family == socket.AF_INET6:  # [::] is not to be IPv4 as well
             sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
-        if not is_udp:
+        if is_udp:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, WAITING)
+        else:
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         sock.setblocking(False)
         sock.bind(found.address)

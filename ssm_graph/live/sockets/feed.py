@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.live.protocols.decoder import Decoder
 from ssm_graph.live.protocols.framing import TokenBucket
+from ssm_graph.live.sockets.clocks import Now, StampClocks, called
 from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.navigation import Severity
 from ssm_graph.mission.run_status import LinkState, SourceStatus
@@ -22,23 +23,8 @@ OTHERS_SHARE: Final = 0.1
 """Of the rate of inertial samples, what each other kind of message may come at."""
 BURST: Final = 5
 """Refusals of one source that may be told at once: their texts differ."""
-SAME_CLOCK_S: Final = 2.5
-"""Stamps of one clock may be so far from what was expected: delays of a link."""
-STRANGER_S: Final = 1.0
-"""A clock that is silent for so long may have been set."""
-MOST_STRANGERS: Final = 5000
-"""Samples of another clock that may wait; with more the other clock is believed."""
 AHEAD_S: Final = 0.1
 """Bytes for so long may come at once, s."""
-
-
-class Now(NamedTuple):
-    """One moment on both clocks."""
-
-    wall_s: float
-    """The vehicle's clock, which stamps arrivals."""
-    steady_s: float
-    """A clock that is never set, for rates and patience."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,66 +74,6 @@ class Channel:
         self.is_stale = False
 
 
-class SampleClock:
-    """The clock of the inertial data of all sources: remembered, and a stranger is refused.
-
-    A sample is of the known clock where it goes on from the last one, or where its stamp is as far
-    from the time of arrival as the last one's. Samples of another clock wait; they are let in, all
-    of them, once they have come for a second in which the known clock was silent (it was set, or
-    the instrument was exchanged), and refused where it is heard again before.
-    """
-
-    def __init__(self) -> None:
-        self._stamp_s = self._heard_s = math.nan
-        self._strangers: list[ImuSample] = []
-        self._stranger_s = 0.0
-
-    def sift(
-        self, messages: list[Message], steady_s: float
-    ) -> tuple[list[Message], list[ImuSample]]:
-        """Return what may pass, and what was refused."""
-        passed: list[Message] = []
-        refused: list[ImuSample] = []
-        for message in messages:
-            if not isinstance(message, ImuSample):
-                passed.append(message)
-            elif self._is_known(message.time_s, steady_s):
-                refused += self._strangers
-                self._strangers = []
-                self._stamp_s, self._heard_s = message.time_s, steady_s
-                passed.append(message)
-            else:
-                refused += self._meet(message, steady_s, passed)
-        return passed, refused
-
-    def off_s(self, sample: ImuSample) -> float:
-        """Return how far a stamp is from the last one of the known clock, s."""
-        return sample.time_s - self._stamp_s
-
-    def _is_known(self, stamp_s: float, steady_s: float) -> bool:
-        if math.isnan(self._stamp_s):
-            return True
-        step_s = stamp_s - self._stamp_s
-        off_s = step_s - (steady_s - self._heard_s)
-        return min(abs(step_s), abs(off_s)) <= SAME_CLOCK_S
-
-    def _meet(self, sample: ImuSample, steady_s: float, passed: list[Message]) -> list[ImuSample]:
-        """Have a stranger wait, or let all of them in; return those of a third clock."""
-        third: list[ImuSample] = []
-        waiting = self._strangers
-        if waiting and abs(sample.time_s - waiting[-1].time_s) > SAME_CLOCK_S:
-            third, self._strangers = waiting, []
-        if not self._strangers:
-            self._stranger_s = steady_s
-        self._strangers.append(sample)
-        since_s = max(self._heard_s, self._stranger_s)
-        if steady_s - since_s >= STRANGER_S or len(self._strangers) > MOST_STRANGERS:
-            passed += self._strangers
-            self._strangers = []
-            self._stamp_s, self._heard_s = sample.time_s, steady_s
-        return third
-
-
 class Feed:
     """One source: bytes to messages, limited and counted.
 
@@ -162,16 +88,17 @@ class Feed:
         *,
         limits: Limits,
         events: EventLog,
-        clock: SampleClock,
+        clocks: StampClocks,
     ) -> None:
         self.name, self.address, self.limits = name, address, limits
-        self._clock = clock
+        self._clocks = clocks
         self.n_reconnects = 0
         self._make_decoder, self._events = make_decoder, events
         self._buckets: dict[type[Message], TokenBucket] = {}
         self._n_bytes = self._n_messages = self._n_refused = 0
         self._free_s = self._last_s = -math.inf
         self._rate_hz, self._marked_s, self._n_marked = 0.0, -math.inf, 0
+        self._altitude_m = math.nan
 
     def channel(self, now: Now) -> Channel:
         """Return the begin of a connection."""
@@ -198,13 +125,35 @@ class Feed:
             self.tell("message_refused", text, Severity.WARNING, burst=BURST)
         if decoder.n_sound > n_sound:
             channel.heard_s = now.steady_s
-        kept, strangers = self._clock.sift(self._limited(messages, now), now.steady_s)
-        if strangers:
-            self._n_refused += len(strangers)
-            text = f"{len(strangers)} inertial samples of another clock, stamped "
-            text += f"{self._clock.off_s(strangers[0]):+.6g} s off those that go on: refused"
-            self.tell("clock_refused", text, Severity.WARNING)
-        return kept
+            self._altitude_m = decoder.altitude_m
+        return self._in_run_time(self._limited(messages, now), now)
+
+    def _in_run_time(self, messages: list[Message], now: Now) -> list[Message]:
+        """Return messages in the time of the run, without those of strange clocks, which is told.
+
+        Messages that waited come with the one that lets them in.
+        """
+        passed: list[Message] = []
+        for message in messages:
+            clock = self._clocks.of(self.name, message)
+            sifted = clock.sift(message, now)
+            passed += sifted.passed
+            if sifted.refused:
+                off_s = clock.off_s(sifted.refused[0])
+                self._n_refused += len(sifted.refused)
+                text = f"{len(sifted.refused)} {called(message)} of another clock, stamped "
+                text += f"{off_s:+.6g} s off those that go on: refused"
+                self.tell("clock_refused", text, Severity.WARNING)
+            if sifted.set_by_s:
+                text = f"the clock of {called(message)} was set by {sifted.set_by_s:+.6g} s: they "
+                text += "go on as before"
+                self.tell("clock_set", text, Severity.WARNING)
+        return passed
+
+    def stood_still(self, span_s: float) -> None:
+        """Have what came within a time in which nobody listened, s, not be too much at once."""
+        for bucket in self._buckets.values():
+            bucket.grant(span_s)
 
     def idle(self, channel: Channel, now: Now) -> list[Message]:
         """Return what the decoder releases where nothing has come for a second."""
@@ -244,6 +193,7 @@ class Feed:
             n_reconnects=self.n_reconnects,
             rate_hz=self._rate_hz,
             age_s=now.steady_s - self._last_s,
+            altitude_m=self._altitude_m,
         )
 
     @property

@@ -9,6 +9,7 @@ import socket
 from abc import ABC, abstractmethod
 from typing import Final
 
+from ssm_graph.live.sockets.clocks import Now
 from ssm_graph.live.sockets.endpoints import (
     CHUNK,
     Endpoint,
@@ -18,7 +19,7 @@ from ssm_graph.live.sockets.endpoints import (
     received,
     resolve,
 )
-from ssm_graph.live.sockets.feed import AHEAD_S, Channel, Feed, Now
+from ssm_graph.live.sockets.feed import AHEAD_S, Channel, Feed
 from ssm_graph.mission.navigation import Severity
 from ssm_graph.mission.run_status import LinkState, SourceStatus
 from ssm_graph.sensors.messages import Message
@@ -54,6 +55,7 @@ class Input(ABC):
 
     def stood_still(self, span_s: float) -> None:
         """Have nobody pay for the time in which this process did not listen."""
+        self.feed.stood_still(span_s)
         for channel in self._reading.values():
             channel.stand_still(span_s)
 
@@ -79,6 +81,11 @@ class Input(ABC):
     @abstractmethod
     def status(self, now: Now) -> SourceStatus:
         """Return how it is doing."""
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether what came while this process stood still is not read to its end."""
+        return any(channel.is_stale for channel in self._reading.values())
 
     @property
     def n_held(self) -> int:
@@ -298,6 +305,7 @@ class UdpInput(Input):
         self._channel: Channel | None = None
         self._is_silent = False
         self._free_s: dict[str, float] = {}
+        self._behind_s = 0.0
 
     def on_ready(self, ready: socket.socket, now: Now) -> list[Message]:
         """Read what waits, so much of it."""
@@ -321,12 +329,19 @@ class UdpInput(Input):
         self._is_silent = self._is_silent and self.feed.is_silent(self._channel, now)
         if is_all:
             self._channel.catch_up()
+            self._behind_s = 0.0
         return messages
+
+    def stood_still(self, span_s: float) -> None:
+        """Have nobody pay for the time in which this process did not listen."""
+        super().stood_still(span_s)
+        self._behind_s += span_s
 
     def _is_too_much(self, sender: str, n_bytes: int, now: Now) -> bool:
         """Return whether a datagram of a sender is beyond what he may send, which is told."""
         limit = self.feed.limits.bytes_per_s
-        free_s = max(self._free_s.get(sender, now.steady_s), now.steady_s) + n_bytes / limit
+        heard_s = now.steady_s - self._behind_s
+        free_s = max(self._free_s.get(sender, heard_s), heard_s) + n_bytes / limit
         if free_s - now.steady_s > AHEAD_S + n_bytes / limit:
             most = f"{sender}: expected at most {limit:g} bytes/s, got more; the rest is dropped"
             self.feed.tell("byte_limited", most, Severity.WARNING)

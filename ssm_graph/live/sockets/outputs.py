@@ -8,16 +8,17 @@ from __future__ import annotations
 import selectors
 import socket
 from abc import ABC, abstractmethod
+from dataclasses import replace
 from enum import Enum
 from typing import Final, Protocol
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.live.protocols.json_messages import encode_navigation
 from ssm_graph.live.protocols.nmea_out import encode_nmea
+from ssm_graph.live.sockets.clocks import Now
 from ssm_graph.live.sockets.endpoints import Endpoint, Listener, let_go, received, resolve
-from ssm_graph.live.sockets.feed import Now
 from ssm_graph.mission.events import EventLog
-from ssm_graph.mission.navigation import Navigation, Severity
+from ssm_graph.mission.navigation import Health, Navigation, Severity
 from ssm_graph.mission.run_status import OutputStatus
 
 MAX_CLIENTS: Final = 8
@@ -25,6 +26,11 @@ MAX_WAITING: Final = 64 * 1024
 """Bytes that wait for a client, besides as many in the system; one who is slower is dropped."""
 STAY_S: Final = 2.0
 """Nobody makes room for another client before."""
+BEHIND: Final = (
+    "this process stood still and works through what came meanwhile: the answer is of the time "
+    "that it is stamped with"
+)
+BEHIND_CONFIDENCE: Final = 0.45
 _ROUNDING: Final = 1e-6
 """Of a period: sampling times are not exact."""
 
@@ -198,6 +204,10 @@ class TcpServerOutput(Output):
 class Outlet(Protocol):
     """Takes answers as bytes, in the forms that somebody wants, and says how they are doing."""
 
+    @property
+    def set_by_s(self) -> float: ...  # noqa: D102
+    @property
+    def is_behind(self) -> bool: ...  # noqa: D102
     def wants(self, form: OutputFormat) -> bool: ...  # noqa: D102
     def send(self, form: OutputFormat, data: bytes) -> None: ...  # noqa: D102
     def output_status(self) -> tuple[OutputStatus, ...]: ...  # noqa: D102
@@ -224,7 +234,7 @@ class Every:
 class Publisher:
     """Sends the newest answer, in every form that somebody listens to.
 
-    JSON lines and NMEA sentences go at most so often, by the vehicle's clock.
+    JSON lines and NMEA sentences go at most so often, in the time of the run.
     """
 
     def __init__(
@@ -246,7 +256,13 @@ class Publisher:
         ]
 
     def send(self, outlet: Outlet, form: OutputFormat, navigation: Navigation) -> None:
-        """Send one answer in one form."""
+        """Send one answer in one form, stamped by the vehicle's clock; it is not good if old."""
+        if outlet.is_behind and navigation.health is Health.GOOD:
+            navigation = replace(
+                navigation, health=Health.DEGRADED, reason=BEHIND, confidence=BEHIND_CONFIDENCE
+            )
+        if outlet.set_by_s:
+            navigation = replace(navigation, time_s=navigation.time_s + outlet.set_by_s)
         if form is OutputFormat.JSON:
             outlet.send(form, encode_navigation(navigation))
         else:

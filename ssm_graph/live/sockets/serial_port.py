@@ -13,8 +13,9 @@ from importlib import import_module
 from typing import Any, Final, cast
 
 from ssm_graph.base.errors import ConfigError
+from ssm_graph.live.sockets.clocks import Now
 from ssm_graph.live.sockets.endpoints import Endpoint
-from ssm_graph.live.sockets.feed import Channel, Feed, Now
+from ssm_graph.live.sockets.feed import Channel, Feed
 from ssm_graph.live.sockets.inputs import Input, Patience
 from ssm_graph.mission.navigation import Severity
 from ssm_graph.mission.run_status import LinkState, SourceStatus
@@ -50,6 +51,7 @@ class SerialPort:
         control &= ~(termios.CSIZE | termios.PARENB | termios.CSTOPB)
         control &= ~getattr(termios, "CRTSCTS", 0)
         control |= termios.CS8 | termios.CREAD | termios.CLOCAL
+        special[termios.VMIN], special[termios.VTIME] = 1, 0  # reading nothing is its end
         return [inputs, 0, control, local, speed, speed, special]
 
     def fileno(self) -> int:

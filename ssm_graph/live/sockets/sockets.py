@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from typing import Final, Self
 
 from ssm_graph.live.protocols.decoder import Decoder
+from ssm_graph.live.sockets.clocks import Now, RunClock, StampClocks, boot_s
 from ssm_graph.live.sockets.endpoints import Endpoint, Transport
-from ssm_graph.live.sockets.feed import Feed, Limits, Now, SampleClock
+from ssm_graph.live.sockets.feed import Feed, Limits
 from ssm_graph.live.sockets.inputs import Input, TcpClientInput, TcpServerInput, UdpInput
 from ssm_graph.live.sockets.outputs import Output, OutputFormat, TcpServerOutput, UdpOutput
 from ssm_graph.live.sockets.serial_port import SerialInput
@@ -47,7 +48,11 @@ class SocketHub:
     Raises :class:`ConfigError` for an unknown host, and for an address where nothing can listen.
 
     Connections are made on the way, again and again if need be. ``wall_s`` is the vehicle's clock,
-    which stamps arrivals; ``steady_s`` one that is never set, for rates and patience.
+    which stamps arrivals; ``steady_s`` one that is never set, for rates and patience. Messages are
+    in the time of the run, which goes on where the vehicle's clock is set; ``set_by_s`` is by how
+    much that was set in earlier processes of the run. ``note_clock`` remembers that: it is told the
+    time of the run, how far the vehicle's clock is ahead of it, and the steady clock, all in s, at
+    the begin and where the clock was set, and returns why it could not.
     """
 
     is_finished = False
@@ -59,15 +64,20 @@ class SocketHub:
         outputs: Sequence[OutputConfig] = (),
         *,
         wall_s: Callable[[], float] = time.time,
-        steady_s: Callable[[], float] = time.monotonic,
+        steady_s: Callable[[], float] = boot_s,
+        set_by_s: float = 0.0,
+        note_clock: Callable[[float, float, float], str | None] | None = None,
     ) -> None:
-        self._wall_s, self._steady_s = wall_s, steady_s
+        self._steady_s = steady_s
         self._begin_s = self._polled_s = steady_s()
-        self._clock = SampleClock()
-        self._events = EventLog(wall_s, steady_s)
+        self._clock = RunClock(wall_s, steady_s, set_by_s)
+        self._note_clock = note_clock
+        self._stamps = StampClocks(self._clock)
+        self._events = EventLog(lambda: self.time_s, steady_s)
         self._selector = selectors.DefaultSelector()
         self.inputs: list[Input] = []
         self.outputs: list[Output] = []
+        self._keep_clock(Now(wall_s(), steady_s()))
         try:
             for wanted in inputs:
                 self.inputs.append(self._input(wanted))
@@ -83,8 +93,21 @@ class SocketHub:
 
     @property
     def time_s(self) -> float:
-        """The vehicle's clock, s."""
-        return self._wall_s()
+        """The time of the run: the vehicle's clock, less what it has been set by since, s."""
+        return self._clock.time_s
+
+    @property
+    def set_by_s(self) -> float:
+        """By how much the vehicle's clock has been set since the run began, s.
+
+        0 where there are no sources: what is replayed has a time of its own.
+        """
+        return self._clock.set_by_s if self.inputs else 0.0
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether what came while this process stood still is not read to its end."""
+        return any(source.is_behind for source in self.inputs)
 
     @property
     def elapsed_s(self) -> float:
@@ -94,7 +117,13 @@ class SocketHub:
     def poll(self, timeout_s: float) -> list[Message]:
         """Wait until something comes, no longer than this; return what messages it completes."""
         ready = self._selector.select(max(0.0, timeout_s))
-        now = Now(self._wall_s(), self._steady_s())
+        now, step_s = self._clock.read()
+        if step_s:
+            text = f"the vehicle's clock was set by {step_s:+.6g} s"
+            if self._clock.has_begun:
+                text += ": the run goes on in its own time, answers are stamped by that clock"
+            self._events.note("run", "clock_set", text, Severity.WARNING, burst=5)
+            self._keep_clock(now)
         self._look_for_a_standstill(now, timeout_s)
         messages: list[Message] = []
         for key, mask in ready:
@@ -110,6 +139,14 @@ class SocketHub:
             with self._events.surviving(link.name, "socket_failed"):
                 messages += link.tick(now) or []  # outputs have none
         return messages
+
+    def _keep_clock(self, now: Now) -> None:
+        """Have it remembered how far the vehicle's clock is ahead of the time of the run."""
+        if self._note_clock is not None:
+            set_by_s = self._clock.set_by_s
+            problem = self._note_clock(now.wall_s - set_by_s, set_by_s, now.steady_s)
+            if problem is not None:
+                self._events.note("disk", "disk", problem, Severity.ERROR)
 
     def _look_for_a_standstill(self, now: Now, timeout_s: float) -> None:
         """Notice where this process was stopped: what waits came at times that nobody knows."""
@@ -147,7 +184,7 @@ class SocketHub:
 
     def source_status(self) -> tuple[SourceStatus, ...]:
         """Return how the sources are doing."""
-        now = Now(self._wall_s(), self._steady_s())
+        now = Now(self.time_s + self.set_by_s, self._steady_s())
         return tuple(source.status(now) for source in self.inputs)
 
     def output_status(self) -> tuple[OutputStatus, ...]:
@@ -174,7 +211,7 @@ class SocketHub:
             config.make_decoder,
             limits=config.limits,
             events=self._events,
-            clock=self._clock,
+            clocks=self._stamps,
         )
         kinds: dict[Transport, type[TcpClientInput | TcpServerInput | UdpInput | SerialInput]] = {
             Transport.TCP_CLIENT: TcpClientInput,

@@ -27,13 +27,14 @@ from ssm_graph.base.frames import (
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps, at_once
 from ssm_graph.imu.increments import merge_samples_steps
-from ssm_graph.mission.mission import InitialState, Mission
+from ssm_graph.mission.mission import InitialState, LocalStart, Mission
 from ssm_graph.mission.start.heading import (
     HeadingFit,
     heading_from_compass_steps,
     heading_from_track_steps,
 )
 from ssm_graph.mission.start.measured import (
+    LOCAL,
     MIN_WINDOW_S,
     BodyVelocities,
     StartFixes,
@@ -50,6 +51,8 @@ CAUTION = 3.0
 """The data that align are used again by the smoother: their sigmas enter its prior this much
 larger, so that counting them twice adds little."""
 MAX_WINDOW_S = 300.0
+LOCAL_HEADING_SIGMA = math.radians(0.1)
+"""Of a heading that is zero by definition."""
 COMPASS_FLOOR = math.radians(0.5)
 """No gyrocompass heading is trusted further: a bad ping in the window costs that much."""
 TURN_BUDGET = math.radians(0.5)
@@ -87,7 +90,10 @@ def align_steps(mission: Mission) -> Steps[Alignment]:
     compass = _compass_sigma(mission.imu, turned, mission.frame.lat)
     track = yield from heading_from_track_steps(mission, fixes, R_lb, velocities)
     magnetic = yield from heading_from_compass_steps(mission, start_s, R_lb, window_s=window_s)
-    heading, method = _choose_heading(R_lb, compass, track, magnetic, fixes.source)
+    if mission.local is None:
+        heading, method = _choose_heading(R_lb, compass, track, magnetic, fixes.source)
+    else:
+        heading, method = _local_heading(mission.local, R_lb, compass, magnetic)
     level = _level_sigma(mission.imu, turned)
     roll, pitch, _ = roll_pitch_heading_from_R_lb(R_lb)
     starts = [
@@ -221,6 +227,21 @@ def _choose_heading(
     return fit, (
         f"heading {math.degrees(fit.heading) % 360.0:.2f} deg from {source}, sigma "
         f"{math.degrees(fit.sigma):.2f} deg"
+    )
+
+
+def _local_heading(
+    local: LocalStart, R_lb: Array, compass: float, magnetic: HeadingFit
+) -> tuple[HeadingFit, str]:
+    """Return the heading of a start without a place: stated, found, or zero by definition."""
+    if local.is_heading_known:
+        fit = HeadingFit(local.heading, local.heading_sigma / CAUTION)
+        return fit, f"heading {math.degrees(local.heading) % 360.0:.2f} deg as [local] states"
+    if min(compass, magnetic.sigma) <= SAFE_HEADING_SIGMA:
+        none = HeadingFit(0.0, math.inf)
+        return _choose_heading(R_lb, compass, none, magnetic, LOCAL)
+    return HeadingFit(0.0, LOCAL_HEADING_SIGMA), (
+        "heading not known: zero is where the vehicle looked at the start, which need not be north"
     )
 
 

@@ -100,6 +100,9 @@ def _of_pings(mission: Mission) -> BodyVelocities:
 
 
 ACOUSTIC: Final = "USBL"
+LOCAL: Final = "the local start at zero"
+LOCAL_SIGMA_M: Final = 0.01
+"""Of a position that is zero by definition; none, but for numerics."""
 MIN_WINDOW_S: Final = 10.0
 """Inertial data that have to follow the first fix, to align with."""
 NEAR_S: Final = 60.0
@@ -152,6 +155,8 @@ def start_fixes(mission: Mission, velocities: BodyVelocities) -> StartFixes:
     DataError
         If no inertial data follow the first fix.
     """
+    if mission.local is not None:
+        return _at_zero(mission)
     every = _all_fixes(mission)
     usable = [used for fixes in every if (used := _usable(mission, fixes, velocities)) is not None]
     if usable:
@@ -163,6 +168,23 @@ def start_fixes(mission: Mission, velocities: BodyVelocities) -> StartFixes:
         f"alignment: expected a position fix at least {MIN_WINDOW_S:.0f} s before the end of the "
         f"inertial data at {mission.imu.time_s[-1]:.3f} s, got fixes of {said}; check the clocks "
         "or add [initial]"
+    )
+
+
+def _at_zero(mission: Mission) -> StartFixes:
+    """Return the one "fix" of a local start: zero when the inertial data begin, as deep as told."""
+    start_s = mission.imu.start_s
+    up, sigma_up = 0.0, LOCAL_SIGMA_M
+    if mission.depth is not None and len(mission.depth.time_s):
+        first = mission.depth.time_s < mission.depth.time_s[0] + REACH_S
+        up = -float(np.median(mission.depth.true_depth[first]))
+        sigma_up = max(mission.depth.sigma, 0.1)
+    return StartFixes(
+        LOCAL,
+        np.array([start_s]),
+        np.array([[0.0, 0.0, up]]),
+        np.array([[LOCAL_SIGMA_M, LOCAL_SIGMA_M, sigma_up]]),
+        np.zeros(3),
     )
 
 

@@ -39,7 +39,7 @@ def find_suspects(mission: Mission) -> tuple[DetectedFault, ...]:
     """Return clocks, scales, units and axes that the logs of a mission contradict.
 
     Nothing is said of a mission whose logs are short or say little: a straight run has no turn to
-    compare. The rate of false alarms is in ``docs/method.md``.
+    compare. The rate of false alarms is in ``docs/method-details.md``.
     """
     plain = tuple(of_gravity(mission))
     if plain or not is_enough(mission):

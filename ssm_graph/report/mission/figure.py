@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.gridspec import SubplotSpec
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
 
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import DataError
@@ -41,8 +42,8 @@ PAGE_DPI = 170
 AXES_NAMES = ("east", "north", "up")
 MAX_TITLE: Final = 80
 """Letters of a heading that fit the page."""
-MAX_MARKS: Final = 200
-"""Rejected pings that are marked; more would hide the track."""
+MARKS_ACROSS: Final = 18
+"""Cells across the track, in each of which one rejected ping is marked; more would bury it."""
 WIDE_BEAMS: Final = 4
 """So many panels have room for a full time axis side by side."""
 LEVEL_LABELS: Final = 6
@@ -304,12 +305,13 @@ def _draw_track(axes: Axes, estimate: Estimate, reference: Reference | None) -> 
     kept = style.thinned(len(p_n))
     curves.append(Curve(p_n[kept, 0], p_n[kept, 1], look))
     rejected = np.unique(estimate.beams.time_s[estimate.beams.weight < OUTLIER_WEIGHT])
-    rejected = rejected[style.thinned(len(rejected), MAX_MARKS)]
     if len(rejected):
-        at = [np.interp(rejected, path.time_s, column) for column in p_n.T]
-        look = {"marker": "x", "markersize": 3.2, "markeredgewidth": 0.8, "color": style.OUTLIER}
-        look |= {"linestyle": "", "label": f"beam weight < {OUTLIER_WEIGHT:g}"}
-        curves.append(Curve(at[0], at[1], look))
+        at = np.column_stack([np.interp(rejected, path.time_s, column) for column in p_n.T])
+        at = at[_apart(at, p_n)]
+        look = {"marker": "x", "markersize": 3.0, "markeredgewidth": 0.7, "color": style.OUTLIER}
+        look |= {"linestyle": "", "alpha": 0.7}
+        look |= {"label": f"beam weight < {OUTLIER_WEIGHT:g} ({len(rejected)} pings)"}
+        curves.append(Curve(at[:, 0], at[:, 1], look))
     for place, marker, face, label in ((0, "o", style.INK, "start"), (-1, "s", "white", "end")):
         look = {"marker": marker, "color": style.INK, "markersize": 5.5, "markerfacecolor": face}
         look |= {"linestyle": "", "label": label}
@@ -320,6 +322,13 @@ def _draw_track(axes: Axes, estimate: Estimate, reference: Reference | None) -> 
     style.draw_panel(axes, Panel(title="Track", x=x, y=y, curves=curves, legend=below))
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.06)
+
+
+def _apart(marks: Array, track: Array) -> NDArray[np.intp]:
+    """Return which marks (M, 2) to show, one in each of the cells that the track's extent has."""
+    extent = float(np.nanmax(np.ptp(track, axis=0), initial=0.0)) or 1.0
+    cells = np.floor(marks / extent * MARKS_ACROSS)
+    return np.unique(cells, axis=0, return_index=True)[1]
 
 
 def _reference_track(reference: Reference, frame: LocalFrame, time_s: Array) -> Array:
@@ -359,7 +368,11 @@ def _draw_beams(figure: Figure, place: SubplotSpec, estimate: Estimate) -> None:
         upper.append(innovation)
         lower.append(weight)
     figure.align_ylabels([upper[0], lower[0]])
-    innovation_axis(upper[0], beams.innovation)
+    linear = innovation_axis(upper[0], beams.innovation)
+    for axes in upper if linear is not None else ():
+        look = {"color": style.INK, "linewidth": 0.7, "alpha": 0.6, "dashes": (3, 3)}
+        axes.axhline(linear, label="innovations logarithmic beyond", **look)
+        axes.axhline(-linear, **look)
     handles, names = upper[0].get_legend_handles_labels()
     figure.legend(
         handles,

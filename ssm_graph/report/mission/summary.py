@@ -21,6 +21,7 @@ from ssm_graph.mission.estimate import (
     path_length_m,
 )
 from ssm_graph.mission.fault import DetectedFault
+from ssm_graph.report.clock import clocked
 
 STATUS_STYLE: Final = {
     Status.CONVERGED: "bold green",
@@ -65,7 +66,9 @@ def summary_table(estimate: Estimate, metrics: Metrics | None = None) -> Rendera
         parts.append(_table("Further aids", counts, header=header))
     if estimate.faults:
         parts.append(_faults(estimate.faults))
-    parts.extend(Text(f"note: {note}", style="yellow") for note in estimate.notes)
+    begin_s = estimate.trajectory.time_s[:1]
+    notes = [clocked(note, *begin_s.tolist()) for note in estimate.notes]
+    parts.extend(Text(f"note: {note}", style="yellow") for note in notes)
     return Group(*parts)
 
 

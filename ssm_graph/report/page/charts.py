@@ -187,6 +187,13 @@ def _series(content: Content) -> Iterator[Chart]:
         for name, color in zip(("east", "north", "up"), EAST_NORTH_UP, strict=True)
     ]
     note = "How well the position is known: three sigma by axis."
+    if content.protection:
+        of = content.protection
+        level = np.where(np.isfinite(of["protection_m"]), of["protection_m"], np.nan)
+        style = {"width": 2, "dash": "dash"}
+        then = content.minutes(of["time_s"])
+        traces.append(line(then, level, "protection level", INK, **style))
+        note += " The protection level bounds the horizontal error even if one sensor lies."
     log = {"type": "log"} if _decades(traces) > 2.0 else {"rangemode": "tozero"}
     yield Chart("sigma", "Uncertainty", note, traces, axes(MINUTES, "3 sigma, m", yaxis=log))
     east, north = rows["vel_east_m_per_s"], rows["vel_north_m_per_s"]

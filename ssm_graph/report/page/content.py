@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,8 @@ class Content:
     """Columns of ``aids.csv``, words as lists; empty where there is none."""
     epoch_s: float | None
     """Unix time of ``time_s`` 0, s; None where nobody knows."""
+    protection: Mapping[str, Array] = field(default_factory=dict)
+    """Columns of ``protection.csv``, which live runs have; empty for others."""
 
     @property
     def begin_s(self) -> float:

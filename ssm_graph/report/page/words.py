@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from ssm_graph.report.clock import clocked
 from ssm_graph.report.page.content import Content
 
 VERDICTS: Final = {
@@ -55,6 +56,7 @@ def verdict(content: Content) -> str:
     summary = content.summary
     status = str(summary.get("status"))
     sign, style, meaning = VERDICTS.get(status, ("?", "bad", "The status is not known."))
+    reason = clocked(str(summary.get("reason") or ""), content.begin_s, content.epoch_s)
     facts = "".join(
         f"<div><dt>{_text(name)}</dt><dd>{_text(value)}</dd></div>"
         for name, value in _facts(content)
@@ -62,8 +64,14 @@ def verdict(content: Content) -> str:
     return (
         f'<section class="verdict {style}"><p class="status"><span class="sign">{sign}</span> '
         f'{_text(status.replace("_", " "))}</p><p class="meaning">{_text(meaning)}</p>'
-        f'<p>{_text(summary.get("reason") or "")}</p></section><dl class="facts">{facts}</dl>'
+        f'<p>{_text(reason)}</p>{_local(summary)}</section><dl class="facts">{facts}</dl>'
     )
+
+
+def _local(summary: Mapping[str, Any]) -> str:
+    """Return what a start without a place on Earth means for the numbers of the page."""
+    said = summary.get("local_start")
+    return f"<p><strong>{_text(said)}.</strong></p>" if said else ""
 
 
 def _facts(content: Content) -> Iterable[tuple[str, str]]:
@@ -101,7 +109,7 @@ def sections(content: Content) -> list[tuple[str, str]]:
         ("Against the reference", _reference(content.summary)),
         ("Calibration", _calibration(content.summary)),
         ("Position uncertainty for surveys", _survey(content)),
-        ("Start, assumptions and notes", _assumed(content.summary)),
+        ("Start, assumptions and notes", _assumed(content)),
         ("Settings and versions", _settings(content.summary)),
     ]
     return [(title, text) for title, text in found if text]
@@ -275,14 +283,15 @@ def _survey(content: Content) -> str:
     )
 
 
-def _assumed(summary: Mapping[str, Any]) -> str:
+def _assumed(content: Content) -> str:
+    summary = content.summary
     start = summary.get("start") or {}
     lines = []
     if start:
-        how = "is that of the mission file" if start.get("origin") == "mission" else "was aligned"
-        lines.append(f"The start {how}.")
-    lines += [str(note) for note in summary.get("mission_notes") or ()]
-    lines += [str(note) for note in summary.get("notes") or ()]
+        how = {"mission": "is that of the mission file", "local": "is local, at zero"}
+        lines.append(f"The start {how.get(str(start.get('origin')), 'was aligned')}.")
+    notes = [*(summary.get("mission_notes") or ()), *(summary.get("notes") or ())]
+    lines += [clocked(str(note), content.begin_s, content.epoch_s) for note in notes]
     items = "".join(f"<li>{_text(text)}</li>" for text in lines)
     return f"<ul>{items}</ul>" if items else ""
 
@@ -291,6 +300,11 @@ def _settings(summary: Mapping[str, Any]) -> str:
     rows = [*(summary.get("settings") or {}).items()]
     versions: Mapping[str, Any] = summary.get("versions") or {}
     rows += [(f"version of {name}", text) for name, text in versions.items()]
+    inputs: Mapping[str, Any] = summary.get("inputs") or {}
+    if inputs:
+        rows.append(("mission folder", inputs.get("folder")))
+    for name, digest in (inputs.get("sha256") or {}).items():
+        rows.append((f"SHA-256 of {name}", digest))
     return table(("", ""), [(name, "" if value is None else value) for name, value in rows])
 
 

@@ -88,10 +88,18 @@ class ProgressDisplay:
 
     def keyframe(self, index: int, total: int) -> None:
         """Show that this many keyframes are done."""
+        self._done(index, index - 1, total, "keyframe")
+
+    def rows(self, done: int, before: int, total: int) -> None:
+        """Show that so many of the rows of a stage are done, and were before."""
+        self._done(done, before, total, "row")
+
+    def _done(self, done: int, before: int, total: int, what: str) -> None:
         if self._is_live and self._task is not None:
-            self._progress.update(self._task, total=total, completed=index, state=f"{index}")
-        elif not self._is_live and index * N_PLAIN // total > (index - 1) * N_PLAIN // total:
-            self._print(f"keyframe {index} of {total}")
+            state = f"{100 * done // total} %"
+            self._progress.update(self._task, total=total, completed=done, state=state)
+        elif not self._is_live and done * N_PLAIN // total > before * N_PLAIN // total:
+            self._print(f"{what} {done} of {total}, {100 * done // total} %")
 
     def _flush(self) -> None:
         if self._unprinted is not None:

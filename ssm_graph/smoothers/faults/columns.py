@@ -7,7 +7,7 @@ data. Hypotheses are sums of these over stretches (:mod:`ssm_graph.smoothers.fau
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -24,6 +24,7 @@ from ssm_graph.engine.states import States
 from ssm_graph.graph.aids.aid import Aid
 from ssm_graph.graph.beam_rows import BeamRows, WaterRows
 from ssm_graph.graph.linearize import GraphLinearizer
+from ssm_graph.graph.measurements import states_at
 from ssm_graph.mission.problem import Problem
 
 BEAM: Final = "beam"
@@ -31,6 +32,8 @@ BOTTOM: Final = "bottom"
 SCALE: Final = "scale"
 MOUNTING: Final = "mounting"
 IMU: Final = "IMU"
+CLOCK: Final = " clock"
+"""Behind the name of an aid: its stamps are late, by a second."""
 
 TREND_S = 100.0
 """s, in which the rate of a trend is counted here."""
@@ -40,6 +43,12 @@ KERNEL = LogKernel()
 and what lasts must not be weighed away."""
 MEDIAN_OF = 7
 """Successive readings of one beam, or of one component of an aid."""
+REACH_SQ = 25.0
+"""Square of the sigmas up to which a reading counts for the noise of its beam."""
+NOISIER = 1.6
+"""Variance by that of the others, from which on a beam is noisier than these,"""
+NOISIER_DEVIATIONS = 5.0
+"""if by as many of its deviations: of four readings of 1 / n in the square, for a tail."""
 BESIDE_MEDIAN = 0.925
 """Variance of a Gaussian reading less the median of seven, of which it is one."""
 
@@ -74,14 +83,41 @@ def spike_weights(whitened: Array) -> Array:
     What sticks out is measured by what is usual here: sigmas stated too small would make faults of
     noise. So weights are below one throughout where readings scatter more than stated.
     """
-    off = beside_median(whitened) / np.sqrt(BESIDE_MEDIAN)
-    square, dim = np.sum(off**2, axis=1), whitened.shape[1]
+    square, dim = _squares_beside_median(whitened), whitened.shape[1]
     excess = 1.0
     for _ in range(4):
         weights = KERNEL.weight(square / excess, dim=dim)
         mean = float(np.sum(weights * square) / max(np.sum(weights) * dim, 1.0))
         excess = max(mean, 1.0)
     return np.asarray(weights / excess)
+
+
+def _squares_beside_median(whitened: Array) -> Array:
+    off = beside_median(whitened) / np.sqrt(BESIDE_MEDIAN)
+    return np.asarray(np.sum(off**2, axis=1))
+
+
+def noisier_than_others(whitened: Array, beam: NDArray[np.intp]) -> Array:
+    """Return the sigma of each beam by that of the others, 1.0 where it is no more than chance.
+
+    Parameters
+    ----------
+    whitened : (M,) what beams miss, in their stated sigmas.
+    beam : (M,) from 0.
+    """
+    n = int(beam.max(initial=-1)) + 1
+    each = [_squares_beside_median(whitened[beam == b][:, None]) for b in range(n)]
+    each = [x[x < REACH_SQ] for x in each]  # gross errors are weighed away one by one
+    variance = np.array([np.mean(x) if len(x) else 0.0 for x in each])
+    count = np.array([len(x) for x in each])
+    factor = np.ones(n)
+    for b in range(n if n > 2 else 0):
+        others = np.delete(variance, b)
+        ratio = variance[b] / max(float(np.median(others)), 1e-12)
+        chance = NOISIER_DEVIATIONS * np.sqrt(4.0 / max(count[b], 1))
+        if ratio > NOISIER and np.log(ratio) > chance and variance[b] > 1.0:
+            factor[b] = np.sqrt(ratio)
+    return factor
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,6 +127,8 @@ class Linear:
     states: States
     """With nothing freed"""
     beam_weights: Array
+    beam_noise: Array
+    """(B,) sigma of each beam by that of the others; 1.0 for one of its kind"""
     aids: tuple[Aid, ...]
     aid_weights: Mapping[str, Array]
     solution: ChainSolution
@@ -173,6 +211,7 @@ def linear_of_steps(
     return Linear(
         states=states,
         beam_weights=beam_weights,
+        beam_noise=noisier_than_others(beams.error / problem.beams.sigma, problem.beams.beam),
         aids=weighted.all,
         aid_weights={aid.name: weighted.of(aid, weights) for aid in weighted.all},
         solution=solution,
@@ -202,6 +241,9 @@ class Channels:
         sizes = {BEAM: beams.n_beams, BOTTOM: 3, SCALE: 1, MOUNTING: 3}
         sizes |= {aid.name: aid.dim for aid in linear.aids if len(aid)}
         sizes[IMU] = 6
+        self.clocks = self._clocks()
+        """(M, d, 1) what a second of delay does to the whitened measurements, by their names"""
+        sizes |= dict.fromkeys(self.clocks, 1)
         dims = {aid.name: aid.dim for aid in linear.aids if len(aid)}
         widths = [*sizes.values(), *dims.values()]
         slices = [
@@ -222,6 +264,22 @@ class Channels:
     def of(self, name: str) -> Channel:
         """Return a channel by its name."""
         return next(channel for channel in self.all if channel.name == name)
+
+    def of_aids(self) -> Iterator[tuple[str, dict[str, Array]]]:
+        """Yield each aid with the columns (M, d, c) on its whitened rows, by their channels."""
+        for name, root in self.aids.items():
+            clock = name + CLOCK
+            yield name, {name: root} | ({clock: self.clocks[clock]} if clock in self.clocks else {})
+
+    def dim_of(self, name: str) -> int:
+        """Return how many numbers a channel has."""
+        own = self.of(name).columns
+        return own.stop - own.start
+
+    @property
+    def beam_noise(self) -> Array:
+        """(B,) the sigma of each beam by that of the others; 1.0 for one of its kind."""
+        return self._linear.beam_noise
 
     @property
     def beams_d(self) -> Array:
@@ -255,6 +313,16 @@ class Channels:
         begin, end = slice(ACCEL_BIAS.start, STATE_DIM), slice(n + ACCEL_BIAS.start, n + STATE_DIM)
         return np.asarray(rows[:, :STATE_DIM, begin] + rows[:, :STATE_DIM, end])
 
+    def _clocks(self) -> dict[str, Array]:
+        """Return the columns of the clocks of aids that move fast enough to tell."""
+        linear, found = self._linear, {}
+        for aid in linear.aids:
+            at = states_at(linear.states, aid.keyframe, linear.problem.extras)
+            rate = aid.rate(at) if len(aid) else None
+            if rate is not None:
+                found[aid.name + CLOCK] = -aid.root_information @ rate[..., None]
+        return found
+
     def _columns(self) -> Columns:
         linear = self._linear
         scale = np.sqrt(linear.beam_weights) / linear.problem.beams.sigma
@@ -262,11 +330,14 @@ class Channels:
         for aid in linear.aids:
             own = np.zeros((len(aid), aid.dim, self.width))
             if len(aid):
-                root = np.sqrt(linear.aid_weights[aid.name])[:, None, None] * aid.root_information
+                root, clock = self.aids[aid.name], aid.name + CLOCK
                 channel = self.of(aid.name)
                 own[:, :, channel.columns] = root
                 since = (keyframe_s[aid.keyframe] - keyframe_s[0]) / TREND_S
                 own[:, :, channel.rates] = root * since[:, None, None]
+                if clock in self.clocks:
+                    own[:, :, self.of(clock).columns] = self.clocks[clock]
+                own *= np.sqrt(linear.aid_weights[aid.name])[:, None, None]
             rows.append(own.reshape(-1, self.width))
         between = np.zeros((*linear.between.missed.shape, self.width))
         between[:, :STATE_DIM, self.of(IMU).columns] = self.between

@@ -20,6 +20,7 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.smoothers.faults.columns import (
     BEAM,
     BOTTOM,
+    CLOCK,
     IMU,
     MOUNTING,
     SCALE,
@@ -39,6 +40,11 @@ ALLOWED = 4.0
 Of less no harm comes: the DVL's own vertical says by how much at most."""
 ALLOWED_M = 0.1
 """Prior sigma of that in 100 s: 1 mm/s. A tide of 4 m runs at 0.3 mm/s, warm-up is faster."""
+NOISY = 24.0
+"""Chi-square that a beam noisier than the others needs less: whatever makes it so, weak echoes or
+a foul transducer, seldom has a mean of zero. Over the whole mission it is freed in any case."""
+LATEST_S = 10.0
+"""Prior sigma of a delay."""
 RISING_M_PER_S = 0.05
 """Sigma of the vertical velocity of what is taken for the bottom: layers rise and sink slowly."""
 
@@ -73,6 +79,8 @@ class Hypothesis:
     course: Course = Course.CONSTANT
     handicap: float = 0.0
     """Chi-square by which it has to be better than others."""
+    odds: float = 0.0
+    """By which it needs less, for the sensor shows besides that it is not sound"""
     tail: float = 2e-7
     """Probability of one stretch's chi-square where nothing is off"""
 
@@ -93,12 +101,17 @@ class Hypothesis:
 
     def charge(self, n_numbers: int) -> float:
         """Return the chi-square that hypotheses are compared beyond: each number has its price."""
-        return chi_sq_at(self.tail, n_numbers) + PER_NUMBER * (n_numbers - 1) + self.handicap
+        return (
+            chi_sq_at(self.tail, n_numbers)
+            + PER_NUMBER * (n_numbers - 1)
+            + self.handicap
+            - self.odds
+        )
 
     def least(self, n_numbers: int) -> float:
         """Return the chi-square from which on so many numbers are no chance."""
         more = LEAST_PER_NUMBER * (n_numbers - 1) if self.course is Course.ANYTHING else 0.0
-        return chi_sq_at(self.tail, n_numbers) + more + self.handicap
+        return chi_sq_at(self.tail, n_numbers) + more + self.handicap - self.odds
 
 
 @cache
@@ -111,9 +124,11 @@ def hypotheses_of(channels: Channels, *, significance: float) -> tuple[Hypothesi
     """Return all hypotheses of a mission; ``significance`` in sigmas of one number."""
     tail = float(chi2.sf(significance**2, 1))
     found = [*_of_beams(channels), *_of_the_array(channels), *_of_inertial()]
-    for channel in channels.all:
-        if channel.name not in (BEAM, BOTTOM, SCALE, MOUNTING, IMU):
-            found.extend(of_aid(channel.name, channel.columns.stop - channel.columns.start))
+    for name in channels.aids:
+        found.extend(of_aid(name, channels.dim_of(name)))
+    for clock in channels.clocks:
+        sensor = clock.removesuffix(CLOCK)
+        found.append(Hypothesis(sensor, clock, np.eye(1), np.full(1, LATEST_S), _late))
     return tuple(replace(one, tail=tail) for one in found)
 
 
@@ -122,7 +137,8 @@ def _of_beams(channels: Channels) -> Iterator[Hypothesis]:
     n_beams = len(unit)
     for beam in range(n_beams):
         one = Hypothesis(f"DVL beam {beam + 1}", BEAM, unit[:, [beam]], np.full(1, 3.0), _speeds)
-        yield one
+        noise = float(channels.beam_noise[beam])
+        yield one if noise == 1.0 else replace(one, say=partial(_noisy, noise), odds=NOISY)
         yield replace(one, course=Course.TREND)
         yield replace(one, course=Course.ANYTHING)
     for a, b in itertools.combinations(range(n_beams), 2):
@@ -171,6 +187,14 @@ AIDS = {
     "heading": ("rad", 1.0),
 }
 """Unit and prior sigma of what an aid is off by."""
+
+
+def _noisy(factor: float, s: Array) -> str:
+    return f"errs {factor:.1f} times as much as the others, and by {_speeds(s)} on average"
+
+
+def _late(s: Array) -> str:
+    return f"its stamps are {abs(s[0]):.2f} s {'late' if s[0] > 0.0 else 'early'}"
 
 
 def _pair(sign: float, s: Array) -> str:

@@ -14,7 +14,8 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps
 from ssm_graph.engine.error_state import POSITION
 from ssm_graph.engine.evidence import ChainEvidence, Columns, Evidence
-from ssm_graph.smoothers.faults.columns import IMU, TREND_S, Channels, Linear
+from ssm_graph.smoothers.faults.columns import IMU, Channels, Linear
+from ssm_graph.smoothers.faults.grid import Grid
 from ssm_graph.smoothers.faults.hypotheses import (
     AT_AN_END,
     LEAST_PER_NUMBER,
@@ -22,7 +23,8 @@ from ssm_graph.smoothers.faults.hypotheses import (
     Course,
     Hypothesis,
 )
-from ssm_graph.smoothers.faults.nuisances import WIDER, WIDTHS, Nuisances
+from ssm_graph.smoothers.faults.nuisances import WIDER, WIDTHS, Nuisances, Priors
+from ssm_graph.smoothers.faults.unstated import Unstated, unstated_of
 
 LEAST_FORCE = 10.0
 """m/s^2, of a jump: it is no larger."""
@@ -30,64 +32,6 @@ MEDIAN_OF_THREE = 2.366
 """Of a chi-square with three degrees of freedom."""
 WORTH = 15.0
 """Chi-square of a constant from which on a sensor may be off by anything."""
-
-
-class Grid(NamedTuple):
-    """Blocks of keyframes, whose edges are where stretches begin and end."""
-
-    edges: NDArray[np.intp]
-    """(N + 1) keyframes, the last one after the mission's end"""
-    middle_s: Array
-    """(N,) s"""
-    length_s: Array
-    """(N,) s"""
-    block_s: float
-    """Of a coarse block, s"""
-    origin_s: float = 0.0
-    """When the mission begins, from which on rates count, s"""
-
-    @classmethod
-    def of(
-        cls,
-        keyframe_s: Array,
-        edges_s: Iterable[float],
-        *,
-        block_s: float = 10.0,
-        piece: tuple[int, int] | None = None,
-    ) -> Grid:
-        """Return the blocks between some times, s, and the ends of the mission, or of a piece.
-
-        A piece is its first keyframe and the first one after it.
-        """
-        begin, end = piece or (0, len(keyframe_s))
-        inner = np.searchsorted(keyframe_s, np.array(sorted(edges_s))).clip(begin, end)
-        edges = np.unique(np.concatenate([[begin], inner, [end]]))
-        last = np.append(keyframe_s, keyframe_s[-1])
-        begin_s, end_s = last[edges[:-1]], last[edges[1:]]
-        return cls(edges, 0.5 * (begin_s + end_s), end_s - begin_s, block_s, float(keyframe_s[0]))
-
-    def coarse(self) -> tuple[NDArray[np.intp], Array]:
-        """Return the first block of each coarse one (G,), and their middles, s."""
-        begin_s = self.middle_s - 0.5 * self.length_s
-        number = np.floor((self.middle_s - begin_s[0]) / self.block_s)
-        first = np.flatnonzero(np.diff(number, prepend=-1.0))
-        ends_s = np.append(begin_s[first[1:]], begin_s[-1] + self.length_s[-1])
-        return first, 0.5 * (begin_s[first] + ends_s)
-
-    @property
-    def begin_since(self) -> Array:
-        """(N,) what a rate counts where each block begins, from the begin of the mission on."""
-        return np.asarray(self.middle_since - 0.5 * self.length_s / TREND_S)
-
-    @property
-    def middle_since(self) -> Array:
-        """(N,) the same in their middles."""
-        return np.asarray((self.middle_s - self.origin_s) / TREND_S)
-
-    @property
-    def n_blocks(self) -> int:
-        """How many there are."""
-        return len(self.middle_s)
 
 
 class Candidate(NamedTuple):
@@ -170,6 +114,18 @@ class Judge:
 
     def fit(self, grid: Grid, faults: Sequence[Fault]) -> None:
         """Let the nuisances be as wide as the data ask for, once faults are freed."""
+        priors, score, among = self._of_nuisances(grid, faults)
+        self.widths = priors.fitted(score, among, choices=WIDER if faults else WIDTHS)
+
+    def unstated(self, grid: Grid, faults: Sequence[Fault]) -> Unstated | None:
+        """Return what instruments err in beyond what they state, once faults are freed."""
+        priors, score, among = self._of_nuisances(grid, faults)
+        prior, width = priors.information(self.widths), priors.width(self.widths)
+        n_coarse = len(grid.coarse()[0])
+        return unstated_of(self._nuisances, width, score, among, prior, n_coarse)
+
+    def _of_nuisances(self, grid: Grid, faults: Sequence[Fault]) -> tuple[Priors, Array, Array]:
+        """Return their priors, scores and information among themselves, once faults are freed."""
         evidence, width = self._whole(grid), self.channels.width
         for fault in faults:
             combined, prior = combined_of(fault, grid, self.channels)
@@ -178,9 +134,7 @@ class Judge:
             evidence = evidence.freed(padded, prior)
         priors = self._nuisances.priors(*grid.coarse())
         crossed = priors.crossed(evidence, width)
-        self.widths = priors.fitted(
-            crossed.score, priors.among(crossed, width), choices=WIDER if faults else WIDTHS
-        )
+        return priors, crossed.score, priors.among(crossed, width)
 
     def on(self, grid: Grid) -> Judged:
         """Return the evidence on a grid, with nothing freed but the nuisances."""

@@ -8,6 +8,8 @@ noise alone all of these pass for faults. How wide they are the data say.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, solve_triangular
@@ -32,6 +34,7 @@ CLEARLY = 3.0
 """Logarithm of the likelihood by which narrower ones have to be better: a ratio of 20."""
 
 
+DVL, ACCELEROMETERS, GYROS, ERRORS = "DVL", "accelerometers", "gyros", "errors of the IMU"
 BEAMS_GROUP, AIDS_GROUP, IMU_GROUP = range(3)
 WIDTHS = (0.5, 1.0)
 """Of what the sizes above say, how much there may be; the data choose."""
@@ -39,14 +42,73 @@ WIDER = (0.5, 1.0, 2.0, 4.0)
 """The same once faults are freed, which otherwise pass for noise."""
 
 
+class Slow(NamedTuple):
+    """What an instrument errs in slowly."""
+
+    name: str
+    sigma: float
+    """SI"""
+    correlation_s: float
+    share: float = 0.0
+    """Sigma by that of a reading, which is white otherwise"""
+    spacing_s: float = np.inf
+    """Of the readings"""
+
+    def times(self, scale: float) -> Slow:
+        """Return the same of another size."""
+        return self._replace(sigma=scale * self.sigma, share=scale * self.share)
+
+    @property
+    def walk(self) -> float:
+        """Random walk that goes as far within the time of correlation, SI/sqrt(s)."""
+        return float(self.sigma * np.sqrt(2.0 / self.correlation_s))
+
+    @property
+    def inflation(self) -> float:
+        """By how much larger the variance of a mean of many readings is than white noise says."""
+        alike = max(2.0 * self.correlation_s / self.spacing_s - 1.0, 0.0)
+        return 1.0 + self.share**2 * alike
+
+
 class Nuisances:
     """Those of one linearised mission."""
 
     def __init__(self, linear: Linear, channels: Channels) -> None:
         self._linear, self._channels = linear, channels
+        self.imu_columns = _imu_columns(linear, channels)
+        """(K - 1, 15, 27) what errors of the inertial sensors do to whitened rows"""
+        self.imu_sigma = _imu_sigmas(linear.problem)
+        """(27,) of data sheets of the grade"""
         self.shared, self._is_own, self._own_score = self._shared()
         """Columns over the whole mission, of unit prior variance"""
         self._wandering = self._wander()
+
+    def groups(self, n_coarse: int) -> dict[str, NDArray[np.intp]]:
+        """Return which of the nuisances of so many coarse blocks belong to which instrument.
+
+        Those of the whole mission that are not stated are :data:`ERRORS`.
+        """
+        names = [name for name, *_ in self._wandering]
+        of_block = np.repeat(names, n_coarse)
+        found = {name: np.flatnonzero(of_block == name) for name in dict.fromkeys(names)}
+        return found | {ERRORS: len(of_block) + np.flatnonzero(~self._is_own)}
+
+    def slow(self, name: str) -> Slow:
+        """Return what an instrument errs in slowly, at its widest."""
+        problem, channels = self._linear.problem, self._channels
+        sigma, correlation_s = next((s, t) for own, _, s, t, _ in self._wandering if own == name)
+        if name in (ACCELEROMETERS, GYROS):
+            return Slow(name, sigma, correlation_s)
+        if name == DVL:
+            share, keyframe = SLOW_BEAM[0], np.unique(problem.beams.keyframe)
+            D = channels.beams_d
+            if np.linalg.matrix_rank(D) == 3:  # of a velocity along each axis of the instrument
+                sigma *= float(np.sqrt(np.trace(np.linalg.inv(D.T @ D)) / 3.0))
+        else:
+            share, keyframe = SLOW_AIDS.get(name, SLOW_AID)[0], channels.aid_keyframe[name]
+        time_s = problem.keyframe_s[keyframe]
+        spacing_s = float(np.ptp(time_s)) / max(len(time_s) - 1, 1)
+        return Slow(name, sigma, correlation_s, share, spacing_s)
 
     @property
     def score(self) -> Array:
@@ -64,7 +126,7 @@ class Nuisances:
         apart_s = np.abs(middle_s[:, None] - middle_s[None, :])
         of_time: dict[float, Array] = {}
         columns, parts = [], []
-        for column, sigma, correlation_s, group in self._wandering:
+        for _, column, sigma, correlation_s, group in self._wandering:
             if correlation_s not in of_time:
                 covariance = np.exp(-apart_s / correlation_s) + 1e-6 * np.eye(len(middle_s))
                 of_time[correlation_s] = np.asarray(np.linalg.inv(covariance))
@@ -72,15 +134,15 @@ class Nuisances:
             parts.append((of_time[correlation_s] / sigma**2, group))
         return Priors(coarse, np.array(columns), parts, self._is_own)
 
-    def _wander(self) -> list[tuple[int, float, float, int]]:
-        """Return column, sigma, time of correlation (s) and group of each."""
+    def _wander(self) -> list[tuple[str, int, float, float, int]]:
+        """Return instrument, column, sigma, time of correlation (s) and group of each."""
         problem, channels, beams = self._linear.problem, self._channels, self._linear.problem.beams
         found = []
         for beam in np.unique(beams.beam).tolist():
             share, correlation_s = SLOW_BEAM
             sigma = share * float(np.median(beams.sigma[beams.beam == beam]))
             found.append(
-                (channels.of(BEAM).columns.start + beam, sigma, correlation_s, BEAMS_GROUP)
+                (DVL, channels.of(BEAM).columns.start + beam, sigma, correlation_s, BEAMS_GROUP)
             )
         for aid in self._linear.aids:
             if len(aid) == 0:
@@ -91,20 +153,21 @@ class Nuisances:
             for i, root in enumerate(np.median(roots, axis=0).tolist()):
                 # A depth is the mean of some readings, whose slow part it has in full.
                 sigma = aid.sigma if isinstance(aid, DepthMeans) else 1.0 / root
-                found.append((first + i, share * sigma, correlation_s, AIDS_GROUP))
+                found.append((aid.name, first + i, share * sigma, correlation_s, AIDS_GROUP))
         share, correlation_s = SLOW_BIAS
         first = channels.of(IMU).columns.start
         for i, sigma in enumerate(problem.imu_noise_bias_sigma.tolist()):
-            found.append((first + i, share * sigma, correlation_s, IMU_GROUP))
+            name = ACCELEROMETERS if i < 3 else GYROS
+            found.append((name, first + i, share * sigma, correlation_s, IMU_GROUP))
         return found
 
     def _shared(self) -> tuple[Columns, NDArray[np.bool_], Array]:
         """Return columns of unit prior variance, which are the problem's own, and its score."""
         linear, problem = self._linear, self._linear.problem
         own_sigma = problem.extras.sigma[problem.extras.n_walks :]
-        sigma = _imu_sigmas(problem)
+        sigma = self.imu_sigma
         between = np.zeros((*linear.between.missed.shape, len(sigma)))
-        between[:, :STATE_DIM] = _imu_columns(linear, self._channels) * sigma
+        between[:, :STATE_DIM] = self.imu_columns * sigma
         columns = Columns(
             np.hstack(
                 [linear.constants.own * own_sigma, np.zeros((len(linear.own.missed), len(sigma)))]
@@ -153,6 +216,12 @@ class Priors:
         shared = np.where(self._is_own, 1.0, widths[IMU_GROUP] ** -2)
         parts = (part / widths[g] ** 2 for part, g in self._parts)
         return np.asarray(block_diag(*parts, np.diag(shared)))
+
+    def width(self, widths: tuple[float, ...]) -> Array:
+        """Return how wide each is (m,), by what it is at its widest."""
+        shared = np.where(self._is_own, 1.0, widths[IMU_GROUP])
+        each = [np.full(len(part), widths[group]) for part, group in self._parts]
+        return np.concatenate([*each, shared])
 
     def log_det(self, widths: tuple[float, ...]) -> float:
         """Return the logarithm of its determinant, but for what no width changes."""

@@ -21,6 +21,7 @@ from ssm_graph.smoothers.faults.columns import TREND_S, Channels
 from ssm_graph.smoothers.faults.hypotheses import Course
 from ssm_graph.smoothers.faults.judged import Fault, Judge
 from ssm_graph.smoothers.faults.search import SAME_ANSWER_SIGMAS, FaultSearch, Look
+from ssm_graph.smoothers.faults.unstated import Unstated
 
 
 class Piece(NamedTuple):
@@ -75,6 +76,13 @@ class PieceSearch:
                 self._p_n[piece] = last
             found.append((piece, own))
         return joined_of(found)
+
+    def unstated(self, judge: Judge, channels: Channels, known: Sequence[Fault]) -> Unstated | None:
+        """Return what the first piece says of what instruments do not state: it is so in all."""
+        keyframe_s = judge.linear.problem.keyframe_s
+        piece = pieces_of(keyframe_s, self._settings.piece_s)[0]
+        look = Look(judge, channels, self._settings, (piece.begin, piece.end))
+        return look.unstated(parts_of(known, piece, keyframe_s))
 
 
 def _has_moved(by_n: Array, variance: Array) -> bool:

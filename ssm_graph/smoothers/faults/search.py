@@ -16,6 +16,7 @@ import numpy as np
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.stepwise import Steps
 from ssm_graph.smoothers.faults.columns import IMU, Channels
+from ssm_graph.smoothers.faults.grid import Grid
 from ssm_graph.smoothers.faults.hypotheses import (
     ALLOWED,
     ALLOWED_M,
@@ -23,7 +24,8 @@ from ssm_graph.smoothers.faults.hypotheses import (
     Hypothesis,
     hypotheses_of,
 )
-from ssm_graph.smoothers.faults.judged import Candidate, Fault, Grid, Judge, Judged
+from ssm_graph.smoothers.faults.judged import Candidate, Fault, Judge, Judged
+from ssm_graph.smoothers.faults.unstated import Unstated
 
 FINE_S = 1.0
 """s, to which edges are refined."""
@@ -85,6 +87,10 @@ class Look:
         self._first_s, self._last_s = self._keyframe_s[[piece[0], piece[1] - 1]].tolist()
         self._work = 0.2 * (piece[1] - piece[0])
         self.hypotheses = hypotheses_of(channels, significance=settings.significance)
+
+    def unstated(self, known: Sequence[Fault]) -> Unstated | None:
+        """Return what instruments err in beyond what they state, beside what was found."""
+        return self._judge.unstated(self._grid(with_rivals(known)), with_rivals(known))
 
     def find_steps(self, known: Sequence[Fault]) -> Steps[list[Fault]]:
         """Return what is off: what was before, as it competes now, and what is new."""

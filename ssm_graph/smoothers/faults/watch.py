@@ -37,6 +37,7 @@ from ssm_graph.smoothers.faults.judged import Fault, Judge
 from ssm_graph.smoothers.faults.nuisances import Nuisances
 from ssm_graph.smoothers.faults.pieces import PieceSearch
 from ssm_graph.smoothers.faults.search import FaultSearch, with_rivals
+from ssm_graph.smoothers.faults.unstated import WIDER, Unstated
 from ssm_graph.smoothers.faults.windows import noisier_than_stated
 
 MOST_LOOKS = 8
@@ -66,6 +67,9 @@ class FaultWatch:
         """What the last of all looks let go, and"""
         self._new: list[Fault] = []
         """what it found, if the search ended without settling"""
+        self._unstated: Unstated | None = None
+        """What instruments were found to err in beyond what they state"""
+        self._is_statement_judged = False
         self._beams_out = np.zeros(len(problem.beams.speed), bool)
         self.aids_out = np.zeros(sum(len(aid) for aid in aids_of(problem)), bool)
         """(A,) measurements of aids that may have read anything"""
@@ -104,6 +108,14 @@ class FaultWatch:
         yield 0.02 * self._problem.n_keyframes
         found = yield from self._search.find_steps(judge, channels, self._sized(states))
         is_same = same_faults(found, self._found, self._problem.keyframe_s)
+        if is_same and not self._is_statement_judged:
+            self._is_statement_judged = True
+            self._unstated = self._search.unstated(judge, channels, self._sized(states))
+            if self._unstated is not None:
+                is_same = False
+                chain = self._unstated.widened(self._problem.chain)
+                self._problem = replace(self._problem, chain=chain)
+                self._bare = GraphLinearizer(self._problem)
         self._is_done = is_same or self._n_looks >= MOST_LOOKS
         if is_same:
             return None
@@ -123,6 +135,10 @@ class FaultWatch:
             self.leave_out(linear.beam_weights),
             self.leave_aids_out(np.concatenate([np.zeros(0), *linear.aid_weights.values()])),
         )
+
+    def inflation_of(self, name: str) -> float:
+        """Return by how much readings of the DVL, or of an aid, say less than white noise would."""
+        return 1.0 if self._unstated is None else self._unstated.inflation_of(name)
 
     def _sized(self, states: States) -> list[Fault]:
         """Return what was found with the sizes that the states give it."""
@@ -149,16 +165,21 @@ class FaultWatch:
         }
         on_imu = {IMU: channels.between}
         keyframes = np.arange(len(channels.between))
+        sigmas = [np.resize(one.hypothesis.sigma, one.n_constants) for one in faults]
+        between = [_columns(faults, on_imu, keyframes, time_s)]
+        n_more, imu = 0, self._unstated
+        if imu is not None:
+            n_more = len(imu.errors_sigma)
+            sigmas.append(WIDER * imu.errors_sigma)
+            between.append(imu.errors_columns)
         return Freed(
-            sigma=np.concatenate(
-                [np.zeros(0), *(np.resize(one.hypothesis.sigma, one.n_constants) for one in faults)]
-            ),
-            beams=_columns(faults, on_array, beams.keyframe, time_s),
-            between=_columns(faults, on_imu, keyframes, time_s),
+            sigma=np.concatenate([np.zeros(0), *sigmas]),
+            beams=_behind(_columns(faults, on_array, beams.keyframe, time_s), n_more),
+            between=np.concatenate(between, axis=-1),
             aids={
-                name: _columns(faults, {name: root}, channels.aid_keyframe[name], time_s)
-                for name, root in channels.aids.items()
-                if any(one.hypothesis.channel == name for one in faults)
+                name: _behind(_columns(faults, on_aid, channels.aid_keyframe[name], time_s), n_more)
+                for name, on_aid in channels.of_aids()
+                if any(one.hypothesis.channel in on_aid for one in faults)
             },
         )
 
@@ -212,6 +233,10 @@ class FaultWatch:
                     cost_m=fault.cost_m,
                 )
             )
+        if self._unstated is not None:
+            n = len(states.constants) - len(self._unstated.errors_sigma)
+            span_s = float(end_s[0]), float(end_s[-1])
+            found.extend(self._unstated.faults(states.constants[n:], *span_s))
         return (*found, *noisier_than_stated(inertial, self._problem.keyframe_s))
 
 
@@ -255,6 +280,11 @@ def beside(some: Sequence[Fault], others: Sequence[Fault], keyframe_s: Array) ->
     return [
         one for one in some if not any(same_faults([one], [other], keyframe_s) for other in others)
     ]
+
+
+def _behind(columns: Array, n_more: int) -> Array:
+    """Return columns (N, ..., F) with as many more behind them that do nothing."""
+    return np.concatenate([columns, np.zeros((*columns.shape[:-1], n_more))], axis=-1)
 
 
 def _inside(keyframe: NDArray[np.intp], fault: Fault) -> NDArray[np.bool_]:

@@ -10,8 +10,8 @@ import numpy as np
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.projection import TransverseMercator
 from ssm_graph.systems.road_map.drive import Chassis, GnssFixes, Poses
-from ssm_graph.systems.road_map.maps.projection import TransverseMercator
 
 RECEIVERS: Final = ("ublox", "qcom")
 _A: Final = 6378137.0

@@ -25,7 +25,7 @@ Indices = NDArray[np.int64]
 BRANCHES: Final = 10
 DEPTH: Final = 3
 ROUNDS: Final = 6
-MOST_TRAINED: Final = 20_000
+MOST_TRAINED: Final = 10_000
 """Descriptors that a tree is grown from at most."""
 FIRST_FRAMES: Final = 20
 """Key frames of the first tree: a loop is not looked for before."""
@@ -35,7 +35,7 @@ GROWTH: Final = 3.0
 def hamming(a: Descriptors, b: Descriptors) -> NDArray[np.int64]:
     """Return how many bits differ, broadcast over (..., 32)."""
     words_a, words_b = (np.ascontiguousarray(x).view(np.uint64) for x in (a, b))
-    return np.bitwise_count(words_a ^ words_b).sum(axis=-1, dtype=np.int64)
+    return np.asarray(np.bitwise_count(words_a ^ words_b).sum(axis=-1, dtype=np.int64))
 
 
 class WordTree:
@@ -136,7 +136,8 @@ class PlaceIndex:
             return np.zeros(len(self._kept))
         bag = self._bag(self._count(descriptors)[None])[0]
         shared = np.flatnonzero(bag)
-        return np.minimum(self._bags[:, shared], bag[shared]).sum(axis=1, dtype=np.float64)
+        common = np.minimum(self._bags[:, shared], bag[shared])
+        return np.asarray(common.sum(axis=1, dtype=np.float64))
 
     def _count(self, descriptors: Descriptors) -> NDArray[np.float32]:
         assert self._tree is not None

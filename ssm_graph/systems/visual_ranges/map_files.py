@@ -62,7 +62,7 @@ def save_map(path: Path, result: VisualResult) -> None:
     arrays = {spec.name: getattr(result.map, spec.name) for spec in fields(MapSnapshot)}
     buffer = io.BytesIO()
     text = np.frombuffer(json.dumps(meta).encode(), dtype=np.uint8)
-    np.savez_compressed(buffer, meta=text, **arrays)  # type: ignore[arg-type]
+    np.savez_compressed(buffer, meta=text, **arrays)
     write_through(path, buffer.getvalue())
 
 

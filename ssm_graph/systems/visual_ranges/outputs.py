@@ -88,6 +88,7 @@ def write_ply(path: Path, result: VisualResult, scale: float) -> None:
     """Write points (grey, with how many key frames see each), the path, and ready anchors."""
     world = result.map
     kept = world.points_views >= 2
+    parts: list[tuple[Array, NDArray[np.int64], tuple[int, int, int] | None, int]]
     parts = [(world.points[kept] * scale, world.points_views[kept], None, 0)]
     grey = world.points_grey[kept]
     place = result.position

@@ -170,8 +170,8 @@ def _anchors(ranging: RangingResult | None, errors: Accuracy | None) -> str:
                 "; ".join(_triple(place) for place in a.alternatives_m),
             )
         )
-    header = ("anchor", "state", "x, y, z (m)", "sigma (m)", "bias (m)", "ranges", "not believed")
-    header = (*header, "median error (m)", "robust rms (m)", "off the truth (m)", "other places")
+    header = ["anchor", "state", "x, y, z (m)", "sigma (m)", "bias (m)", "ranges", "not believed"]
+    header += ["median error (m)", "robust rms (m)", "off the truth (m)", "other places"]
     return table(header, rows)
 
 

@@ -12,10 +12,10 @@ import pytest
 
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.projection import TransverseMercator
 from ssm_graph.systems.road_map.maps.geojson import read_geojson
 from ssm_graph.systems.road_map.maps.index import LineIndex
 from ssm_graph.systems.road_map.maps.opendrive import read_opendrive
-from ssm_graph.systems.road_map.maps.projection import TransverseMercator
 from ssm_graph.systems.road_map.maps.read import read_map
 from ssm_graph.systems.road_map.maps.road_map import (
     LineKind,

@@ -52,7 +52,7 @@ def laps(
     ring.
     """
     rng = np.random.default_rng(4)
-    n_walls, n_frames = 3000, int(N_LAP * turns)
+    n_walls, n_frames = 1500, int(N_LAP * turns)
     angle = rng.uniform(0.0, 2.0 * np.pi, n_walls)
     radius = RADIUS + rng.uniform(3.0, 6.0, n_walls)
     looks = rng.integers(0, 256, (n_walls, 32), dtype=np.uint8)
@@ -69,7 +69,8 @@ def laps(
     step = Rotation.from_matrix(all_drift.R).as_rotvec()
     share = np.arange(n_frames) / (n_frames - 1)
     number: dict[tuple[int, int], int] = {}
-    rows, points = [], []
+    points: list[Array] = []
+    rows = []
     R_cw, t_cw = np.empty((n_frames, 3, 3)), np.empty((n_frames, 3))
     for k in range(n_frames):
         drift = Sim3(
@@ -91,7 +92,7 @@ def laps(
     counts = np.array([len(which) for _, _, which in rows])
     point = np.concatenate([which for _, _, which in rows])
     snapshot = MapSnapshot(
-        image=np.arange(n_frames), time_s=np.arange(n_frames) * 0.5, R_cw=R_cw, t_cw=t_cw,
+        image=np.arange(n_frames), time_s=np.linspace(0, 20, n_frames), R_cw=R_cw, t_cw=t_cw,
         covariance=np.full((n_frames, 6, 6), np.nan), points=np.array(points),
         points_views=np.bincount(point, minlength=len(points)),
         points_grey=np.zeros(len(points), np.uint8),
@@ -107,7 +108,7 @@ def laps(
 
 def centres(world: VisualMap) -> Array:
     """Return the places of all key frames."""
-    return -np.einsum("kji,kj->ki", world.frames["R_cw"], world.frames["t_cw"])
+    return np.asarray(-np.einsum("kji,kj->ki", world.frames["R_cw"], world.frames["t_cw"]))
 
 
 def off(world: VisualMap, true: Array) -> float:
@@ -158,8 +159,8 @@ def test_words_know_a_place_again() -> None:
     scores = index.scores(noisy(places[7], rng))
     assert scores.argmax() == 7
     assert scores[7] > 1.4 * np.sort(scores)[-2]
-    both = [WordTree(np.concatenate(places[:5])).words(places[3]) for _ in range(2)]
-    np.testing.assert_array_equal(*both)
+    one, two = (WordTree(np.concatenate(places[:5])).words(places[3]) for _ in range(2))
+    np.testing.assert_array_equal(one, two)
 
 
 def test_a_loop_is_found_and_takes_the_drift_back() -> None:

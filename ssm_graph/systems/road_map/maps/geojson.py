@@ -12,7 +12,7 @@ import numpy as np
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
-from ssm_graph.systems.road_map.maps.projection import TransverseMercator
+from ssm_graph.base.projection import TransverseMercator
 from ssm_graph.systems.road_map.maps.road_map import (
     LineKind,
     Mark,

@@ -210,7 +210,7 @@ class _Bag:
                 f"{self.path}: {told}; name one in {MAPPING_NAME}: image_topic = "
                 f'"{found[0] if found else "/cam0/image_raw"}"'
             )
-        return found[0]
+        return str(found[0])
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
         """Yield time of recording, ns, and message of a topic."""
@@ -347,7 +347,7 @@ def pixels_of(message: Any) -> NDArray[Any] | None:
     pixels = pixels.reshape(message.height, row)[:, : message.width * channels]
     if channels > 1:
         pixels = pixels.reshape(message.height, message.width, channels)
-    return pixels[..., [2, 1, 0]] if order == "rgb" else pixels
+    return np.asarray(pixels[..., [2, 1, 0]] if order == "rgb" else pixels)
 
 
 def _camera(bag: _Bag, options: ReadOptions, images: WatchedImages) -> Camera:
@@ -364,4 +364,6 @@ def _camera(bag: _Bag, options: ReadOptions, images: WatchedImages) -> Camera:
     distortion = np.asarray(getattr(info, "d", getattr(info, "D", []))).tolist()
     own_size = int(info.width) or size[0], int(info.height) or size[1]
     where = f"{bag.path}: camera info"
-    return make_camera(where, own_size, matrix[[0, 4, 2, 5]], info.distortion_model, distortion)
+    return make_camera(
+        where, own_size, matrix[[0, 4, 2, 5]].tolist(), info.distortion_model, distortion
+    )

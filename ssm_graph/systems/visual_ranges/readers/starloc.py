@@ -45,7 +45,7 @@ class StarLocRun(ShortRepr):
     """Of the left camera."""
     anchor_truth_m: Array
     """(J, 3) m, world"""
-    nlos_error_m: Array
+    error_m: Array
     """(M,) range less the true one, m"""
     tag_time_s: Array
     """(n,)"""
@@ -88,13 +88,11 @@ def read_starloc(folder: Path, antenna: int | None = None) -> StarLocRun:
     places = _anchors(folder, rows)
     names = [str(int(x)) for x in rows["to_id"]]
     ranges = screened_ranges(rows["time_s"], names, rows["range"], source=f"{folder.name}/uwb.csv")
-    over = np.interp(ranges.time_s, rows["time_s"], rows["range"] - rows["gt_range"])
+    wrong = np.empty(len(ranges))
     for j, name in enumerate(ranges.names):
-        mine = rows["to_id"].astype(int) == int(name)
-        kept = ranges.anchor == j
-        over[kept] = (rows["range"] - rows["gt_range"])[mine][
-            np.searchsorted(rows["time_s"][mine], ranges.time_s[kept])
-        ]
+        mine, kept = rows["to_id"].astype(int) == int(name), ranges.anchor == j
+        at = np.searchsorted(rows["time_s"][mine], ranges.time_s[kept])
+        wrong[kept] = (rows["range"] - rows["gt_range"])[mine][at]
     return StarLocRun(
         folder.name,
         make_camera(str(folder / "calib.json"), SIZE, k),
@@ -102,7 +100,7 @@ def read_starloc(folder: Path, antenna: int | None = None) -> StarLocRun:
         lever,
         _path(uwb, R_cr, t_cr),
         np.array([places.get(name, np.full(3, np.nan)) for name in ranges.names]),
-        over,
+        wrong,
         tags["time_s"],
         tags["apriltag_id"].astype(np.int64),
         np.column_stack([tags["left_u"], tags["left_v"]]),

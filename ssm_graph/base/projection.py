@@ -8,19 +8,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ssm_graph.base.earth import ECCENTRICITY_SQ, FLATTENING, SEMI_MAJOR_AXIS
 from ssm_graph.base.frozen import Array
 
-_A: Final = 6378137.0
-"""m, WGS 84"""
-_F: Final = 1.0 / 298.257223563
-_N: Final = _F / (2.0 - _F)
-_E: Final = math.sqrt(_F * (2.0 - _F))
-_RADIUS: Final = _A / (1.0 + _N) * (1.0 + _N**2 / 4.0 + _N**4 / 64.0)
+_N: Final = FLATTENING / (2.0 - FLATTENING)
+_E: Final = math.sqrt(ECCENTRICITY_SQ)
+_RADIUS: Final = SEMI_MAJOR_AXIS / (1.0 + _N) * (1.0 + _N**2 / 4.0 + _N**4 / 64.0)
 _ALPHA: Final = (
     _N / 2 - 2 * _N**2 / 3 + 5 * _N**3 / 16 + 41 * _N**4 / 180,
     13 * _N**2 / 48 - 3 * _N**3 / 5 + 557 * _N**4 / 1440,
@@ -82,3 +80,39 @@ class TransverseMercator:
         )
         zeta = plane + sum(a * np.sin(2 * k * plane) for k, a in enumerate(_ALPHA, 1))
         return self.scale * _RADIUS * zeta.imag, self.scale * _RADIUS * zeta.real
+
+
+class Utm(NamedTuple):
+    """Positions on the Universal Transverse Mercator grid, all in one zone."""
+
+    zone: int
+    """1 to 60"""
+    is_north: bool
+    easting: Array
+    """(N,) m"""
+    northing: Array
+    """(N,) m, with 10,000 km added in the south"""
+
+    @property
+    def name(self) -> str:
+        """``UTM 33N, EPSG:32633``."""
+        half, base = ("N", 32600) if self.is_north else ("S", 32700)
+        return f"UTM {self.zone}{half}, EPSG:{base + self.zone}"
+
+
+def utm(lat: Array, lon: Array, *, of: tuple[float, float]) -> Utm:
+    """Return positions (N,), rad, in the zone of one, ``of`` (latitude and longitude, rad).
+
+    North of 56 degrees the zones of Norway and Svalbard are wider or narrower than six degrees.
+    """
+    first_lat = math.degrees(of[0])
+    first_lon = (math.degrees(of[1]) + 180.0) % 360.0 - 180.0
+    zone = int((first_lon + 180.0) // 6.0) + 1
+    if 56.0 <= first_lat < 64.0 and 3.0 <= first_lon < 12.0:
+        zone = 32
+    if 72.0 <= first_lat <= 84.0 and 0.0 <= first_lon < 42.0:
+        zone = 31 + 2 * int((first_lon + 3.0) // 12.0)
+    is_north = first_lat >= 0.0
+    plane = TransverseMercator(0.0, math.radians(6.0 * zone - 183.0), 0.9996, 500e3)
+    easting, northing = plane.forward(lat, lon).T
+    return Utm(zone, is_north, easting, northing if is_north else northing + 10e6)

@@ -1,0 +1,38 @@
+"""``ssm-graph help``: what a command does, and what it ends with."""
+
+from __future__ import annotations
+
+import argparse
+
+from rich.console import Console
+
+from ssm_graph.base.errors import ConfigError, nearest_hint
+from ssm_graph.cli.terminal import say
+
+CODES = "codes"
+DESCRIPTION = """\
+Show the help of a command, or with 'codes' what commands end with.
+"""
+
+
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
+    parser.add_argument("topic", nargs="?", metavar="COMMAND|codes", help="what about")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
+    """Show it."""
+    from ssm_graph.cli.main import COMMANDS, EXIT_CODE_HELP, build_parser, command_parser
+
+    topic: str | None = arguments.topic
+    if topic is None:
+        say(console, build_parser(()).format_help())
+    elif topic == CODES:
+        say(console, EXIT_CODE_HELP)
+    elif topic in COMMANDS:
+        say(console, command_parser(topic).format_help())
+    else:
+        hint = nearest_hint(topic, [*COMMANDS, CODES])
+        raise ConfigError(f"help: {topic!r} is no command, {hint}")
+    return True

@@ -1,0 +1,1 @@
+"""What makers publish of inertial units and DVLs, by name."""

@@ -1,0 +1,1 @@
+"""Nortek: AD2CP files of DVLs and ADCPs with bottom track, and the packets of a Nucleus."""

@@ -1,0 +1,293 @@
+"""Clocks that are set while a run goes on: its own time never is, and stamps are brought to it.
+
+The vehicle's clock (Unix time) may be set under a running program, and so may that of an
+instrument. A steady clock tells the two from a time in which nothing came: what is stamped half a
+minute later than the message before, and arrives a hundredth of a second after it, was stamped by a
+clock that was set.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Final, NamedTuple
+
+from ssm_graph.sensors.imu import ImuSample
+from ssm_graph.sensors.messages import Message
+from ssm_graph.sensors.registry import BY_MESSAGE
+
+SET_S: Final = 0.02
+"""A step of the vehicle's clock that is smaller is no matter; a slewed clock makes none."""
+PREEMPTED_S: Final = 0.005
+"""Two clocks that were read further apart than this are not compared."""
+SAME_CLOCK_S: Final = 2.5
+"""Stamps of one clock may be so far behind what was expected: delays of a link."""
+FOLLOWED_S: Final = 0.1
+"""A stamp so soon after the last one is of the same clock, whenever it comes."""
+BACK_S: Final = 0.4
+"""Inertial samples may come so much out of order."""
+AHEAD_S: Final = 0.2
+"""Nothing comes before it was measured: stamps further ahead of their arrival than all before them
+are of a clock that was set."""
+LEAD_DECAY: Final = 1e-3
+"""s/s, how fast it is forgotten how little messages were delayed: clocks drift by less."""
+STRANGER_S: Final = 1.0
+"""A clock that is silent for so long may have been set."""
+SILENT_TIMES: Final = 3.0
+"""And for so many of its usual intervals."""
+LONGEST_INTERVAL_S: Final = 5.0
+MOST_STRANGERS: Final = 5000
+"""Messages of another clock that may wait; with more the other clock is believed."""
+FOLLOWS_S: Final = 10.0
+"""So long after the vehicle's clock was set stamps may begin to follow it."""
+RIGHT_S: Final = 5.0
+"""An instrument's clock that is further off that of the vehicle was never set."""
+
+
+class Now(NamedTuple):
+    """One moment on both clocks."""
+
+    wall_s: float
+    """The vehicle's clock, which stamps arrivals."""
+    steady_s: float
+    """A clock that is never set, for rates and patience."""
+
+
+def boot_s() -> float:
+    """Return a time that is never set and goes on while the computer sleeps, s."""
+    return time.clock_gettime(_BOOT)
+
+
+_BOOT: Final[int] = getattr(time, "CLOCK_BOOTTIME", getattr(time, "CLOCK_MONOTONIC", 1))
+
+
+class RunClock:
+    """The time of a run: the vehicle's clock at the begin, whatever that is set to later.
+
+    Parameters
+    ----------
+    wall_s : the vehicle's clock.
+    steady_s : one that is never set.
+    set_by_s : by how much the vehicle's clock has been set since the run began, s.
+    """
+
+    def __init__(
+        self, wall_s: Callable[[], float], steady_s: Callable[[], float], set_by_s: float = 0.0
+    ) -> None:
+        self._wall_s, self._steady_s = wall_s, steady_s
+        self.set_by_s = set_by_s
+        """By how much the vehicle's clock is ahead of the time of the run, s."""
+        self.set_at_s = -math.inf
+        """When it was set last, s on the steady clock."""
+        self.has_begun = False
+        """Whether a message has come; before, a clock that is set is the time of the run."""
+        self._known: Now | None = None
+        self.read()
+
+    def begin(self) -> None:
+        """Take note that a message has come."""
+        self.has_begun = True
+
+    @property
+    def time_s(self) -> float:
+        """The time of the run, s."""
+        return self._wall_s() - self.set_by_s
+
+    def read(self) -> tuple[Now, float]:
+        """Return both clocks, and by how much the vehicle's was set since the last call, s."""
+        before_s = self._steady_s()
+        now = Now(self._wall_s(), self._steady_s())
+        if now.steady_s - before_s > PREEMPTED_S:
+            return now, 0.0
+        known, self._known = self._known, now
+        if known is None:
+            return now, 0.0
+        step_s = (now.wall_s - known.wall_s) - (now.steady_s - known.steady_s)
+        if not abs(step_s) > SET_S:
+            return now, 0.0
+        if self.has_begun:
+            self.set_by_s += step_s
+            self.set_at_s = now.steady_s
+        return now, step_s
+
+
+class Sifted(NamedTuple):
+    """What a clock makes of messages that have arrived."""
+
+    passed: list[Message]
+    """In the time of the run."""
+    refused: list[Message]
+    """Of another clock, as they were stamped."""
+    set_by_s: float
+    """By how much the clock that stamps them was found to have been set, s; 0 where it was not."""
+
+
+class StampClock:
+    """The clock that stamps one kind of message: followed where it is set, strangers are refused.
+
+    A message is of the known clock where its stamp goes on from the last one, or is as far from its
+    arrival as others were. Those of another clock wait. They are let in, all of them, once they
+    have come for a second in which the known clock was silent (it was set, or the instrument was
+    exchanged), and refused where it is heard again before. Where the vehicle's own clock was set,
+    what follows it is known at once.
+    """
+
+    def __init__(self, clock: RunClock, *, is_steady: bool) -> None:
+        """``is_steady`` says that messages follow each other in order, as inertial samples do."""
+        self._clock, self._is_steady = clock, is_steady
+        self._shift_s = clock.set_by_s
+        self._stamp_s = self._heard_s = math.nan
+        self._lag_s, self._lead_s = 0.0, -math.inf
+        self._interval_s, self._period_s = 0.0, 0.0
+        self._strangers: list[Message] = []
+        self._stranger_s = self._met_s = 0.0
+        self._found_s = 0.0
+
+    def sift(self, message: Message, now: Now) -> Sifted:
+        """Return what may pass, in the time of the run, and what was refused."""
+        passed: list[Message] = []
+        refused: list[Message] = []
+        messages = [message]
+        self._found_s = 0.0
+        if self._strangers and self._clock.set_at_s > self._met_s:  # they came before it was known
+            messages, self._strangers = [*self._strangers, message], []
+        for message in messages:
+            shift_s = self._shift_of(message.time_s, now)
+            if self._is_known(message.time_s - shift_s, now):
+                refused += self._strangers
+                self._strangers = []
+                self._shift_s = shift_s
+                passed.append(self._passed(message, now))
+            else:
+                refused += self._meet(message, now, passed)
+        return Sifted(passed, refused, self._found_s)
+
+    def off_s(self, message: Message) -> float:
+        """Return how far a stamp is from the last one of the known clock, s."""
+        return message.time_s - self._shift_s - self._stamp_s
+
+    def _shift_of(self, stamp_s: float, now: Now) -> float:
+        """Return what a stamp is ahead of the time of the run by, s: as before, or newly set."""
+        shift_s, set_by_s = self._shift_s, self._clock.set_by_s
+        if math.isnan(self._stamp_s):  # of this clock, or of one that never followed it
+            return min(set_by_s, 0.0, key=lambda s: abs(stamp_s - s - self._run_s(now)))
+        if shift_s == set_by_s or now.steady_s - self._clock.set_at_s > FOLLOWS_S:
+            return shift_s
+        return min(shift_s, set_by_s, key=lambda s: self._misfit_s(stamp_s - s, now))
+
+    def _misfit_s(self, time_s: float, now: Now) -> float:
+        """Return how far a time is from what the messages before it make expected, s."""
+        late_s = self._run_s(now) - time_s - self._lag_s
+        if not self._is_steady:
+            return abs(late_s)
+        step_s = time_s - self._stamp_s - self._period_s
+        return min(abs(step_s), abs(step_s - (now.steady_s - self._heard_s)))
+
+    def _run_s(self, now: Now) -> float:
+        return now.wall_s - self._clock.set_by_s
+
+    def _is_known(self, time_s: float, now: Now) -> bool:
+        if math.isnan(self._stamp_s):
+            return True
+        ahead_s = time_s - self._run_s(now) - AHEAD_S
+        if not self._is_steady:
+            return not ahead_s > max(self._lead(now), 0.0)
+        is_ahead = ahead_s > self._lead(now)
+        step_s = time_s - self._stamp_s
+        off_s = step_s - (now.steady_s - self._heard_s)
+        if self._strangers and abs(self._off_strangers_s(time_s, now)) < abs(off_s):
+            return False
+        is_near = min(abs(step_s), abs(off_s)) <= SAME_CLOCK_S
+        if -BACK_S < step_s <= FOLLOWED_S:
+            return True
+        return step_s > 0.0 and is_near and not is_ahead
+
+    def _off_strangers_s(self, time_s: float, now: Now) -> float:
+        """Return how far a time is from what would follow on the last stranger's, s."""
+        step_s = time_s - (self._strangers[-1].time_s - self._shift_s)
+        return step_s - (now.steady_s - self._met_s)
+
+    def _lead(self, now: Now) -> float:
+        """Return how far ahead of its arrival a stamp has been lately, s."""
+        if math.isnan(self._heard_s):
+            return self._lead_s
+        return self._lead_s - LEAD_DECAY * (now.steady_s - self._heard_s)
+
+    def _passed(self, message: Message, now: Now) -> Message:
+        """Return a message of the known clock in the time of the run; remember it."""
+        self._clock.begin()
+        time_s = message.time_s - self._shift_s
+        self._lag_s = self._run_s(now) - time_s
+        self._lead_s = max(self._lead(now), -self._lag_s)
+        if not math.isnan(self._stamp_s):
+            since_s = min(now.steady_s - self._heard_s, LONGEST_INTERVAL_S)
+            self._interval_s = max(since_s, 0.9 * self._interval_s)
+            step_s = time_s - self._stamp_s
+            self._period_s = step_s if 0.0 < step_s <= FOLLOWED_S else self._period_s
+        self._stamp_s, self._heard_s = time_s, now.steady_s
+        return replace(message, time_s=time_s) if self._shift_s else message
+
+    def _meet(self, message: Message, now: Now, passed: list[Message]) -> list[Message]:
+        """Have a stranger wait, or let all of them in; return those of a third clock."""
+        third: list[Message] = []
+        waiting = self._strangers
+        if waiting and abs(message.time_s - waiting[-1].time_s) > SAME_CLOCK_S + self._interval_s:
+            third, self._strangers = waiting, []
+        if not self._strangers:
+            self._stranger_s = now.steady_s
+        self._strangers.append(message)
+        self._met_s = now.steady_s
+        since_s = now.steady_s - max(self._heard_s, self._stranger_s)
+        is_silent = since_s >= max(STRANGER_S, SILENT_TIMES * self._interval_s)
+        if is_silent or len(self._strangers) > MOST_STRANGERS:
+            waiting, self._strangers = self._strangers, []
+            self._believe(waiting[0].time_s, now)
+            passed += [self._passed(one, now) for one in waiting]
+        return third
+
+    def _believe(self, first_s: float, now: Now) -> None:
+        """Take a stranger's clock for the known one, which was set: time goes on as it did."""
+        gap_s = self._stranger_s - self._heard_s
+        was_s = self._shift_s
+        lag_s = self._lag_s if self._is_steady else -self._lead(now)
+        come_s = self._run_s(now) - (now.steady_s - self._stranger_s)
+        was_right = abs(self._lag_s) < RIGHT_S
+        if not was_right and abs(come_s - (first_s - self._clock.set_by_s)) < RIGHT_S:
+            self._shift_s = self._clock.set_by_s  # it is right at last
+        elif self._is_steady:
+            period_s = self._period_s or gap_s
+            n_periods = max(1, round(gap_s / period_s)) if period_s else 1
+            self._shift_s = first_s - (self._stamp_s + n_periods * period_s)
+        else:
+            self._shift_s = first_s - (come_s - lag_s)
+        self._found_s = self._shift_s - was_s
+        self._lead_s = -math.inf
+
+
+class StampClocks:
+    """The clocks of all sources.
+
+    One stamps the inertial data, wherever they come from; of every other kind of message each
+    source has one.
+    """
+
+    def __init__(self, clock: RunClock) -> None:
+        self._clock = clock
+        self._clocks: dict[tuple[str, type[Message]], StampClock] = {}
+
+    def of(self, source: str, message: Message) -> StampClock:
+        """Return the clock that stamps a message of a source."""
+        is_steady = isinstance(message, ImuSample)
+        key = "" if is_steady else source, type(message)
+        if key not in self._clocks:
+            self._clocks[key] = StampClock(self._clock, is_steady=is_steady)
+        return self._clocks[key]
+
+
+def called(message: Message) -> str:
+    """Return how messages of an instrument are called."""
+    if isinstance(message, ImuSample):
+        return "inertial samples"
+    return f"{BY_MESSAGE[type(message)].section} messages"
