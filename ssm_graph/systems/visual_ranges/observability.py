@@ -1,9 +1,9 @@
 """What a path lets ranges tell of scale and anchors, and how to move so that they tell more.
 
-Squared ranges are linear in ``s^2``, ``s a`` and ``|a|^2`` with rows ``(|c|^2, c, 1)`` of the places
-``c``; these lose rank exactly where all places lie on a common plane or sphere. So a line leaves a
-circle of anchors, a plane a mirror, a sphere exchanges the distance of the anchor with its own
-radius, and a circle in a plane, being on both, leaves a whole family of scales.
+Squared ranges are linear in ``s^2``, ``s a`` and ``|a|^2`` with rows ``(|c|^2, c, 1)`` of the
+places ``c``; these lose rank exactly where all places lie on a common plane or sphere. So a line
+leaves a circle of anchors, a plane a mirror, a sphere exchanges the distance of the anchor with its
+own radius, and a circle in a plane, being on both, leaves a whole family of scales.
 """
 
 from __future__ import annotations

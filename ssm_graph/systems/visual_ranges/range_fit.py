@@ -66,7 +66,7 @@ class Places(NamedTuple):
 
     def rows(self, kept: Indices) -> Places:
         """Return some of them."""
-        return Places(*(column[kept] for column in self))
+        return Places._make(column[kept] for column in self)
 
 
 def places_of(terms: RangeTerms, R_cw: Array, t_cw: Array, time_s: Array) -> Places:
@@ -116,7 +116,7 @@ class Problem(ReadOnlyArrays):
     def n_unknowns(self) -> int:
         """With the modes."""
         drift, walk = self.drift.shape[1], self.walk.shape[1]
-        return self.n_core + 3 * drift + self.n_anchors * walk
+        return int(self.n_core + 3 * drift + self.n_anchors * walk)
 
     def prior_information(self) -> Array:
         """Return its diagonal (P,)."""

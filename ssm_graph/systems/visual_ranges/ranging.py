@@ -7,12 +7,11 @@ far at their present places, never from those of a window alone, with which an a
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from enum import Enum
 from typing import Final
 
 import numpy as np
 
-from ssm_graph.base.frozen import Array, ReadOnlyArrays, ShortRepr
+from ssm_graph.base.frozen import Array, ShortRepr
 from ssm_graph.systems.visual_ranges.bundle_ranges import BundleRanges
 from ssm_graph.systems.visual_ranges.range_fit import (
     Places,
@@ -27,6 +26,7 @@ from ssm_graph.systems.visual_ranges.range_fit import (
 )
 from ssm_graph.systems.visual_ranges.range_terms import FramePoses, RangeTerms, hang
 from ssm_graph.systems.visual_ranges.ranges import Indices, Ranges
+from ssm_graph.systems.visual_ranges.ranging_result import Anchor, AnchorState, RangingResult
 from ssm_graph.systems.visual_ranges.start import (
     Start,
     StartRules,
@@ -37,6 +37,8 @@ from ssm_graph.systems.visual_ranges.start import (
 )
 from ssm_graph.systems.visual_ranges.weights import NLOS_WEIGHT, robust_rms
 
+__all__ = ["Anchor", "AnchorState", "Ranging", "RangingResult"]
+
 TRY_AGAIN: Final = 1.15
 """A start is tried again when so many times the ranges are there."""
 RECENT_S: Final = 10.0
@@ -46,66 +48,6 @@ LEAST_RECENT: Final = 20
 SAME_PLACE_M: Final = 0.2
 DOUBTFUL_SHARE: Final = 0.6
 """Of the last 10 s of an anchor's ranges, with next to no weight."""
-
-
-class AnchorState(Enum):
-    """How far an anchor is known."""
-
-    UNKNOWN = "not placed yet"
-    AMBIGUOUS = "other places fit as well, or it is not sharp"
-    READY = "known"
-    DOUBTFUL = "its last ranges contradict its place: hidden, or moved"
-
-
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Anchor(ReadOnlyArrays):
-    """An anchor as it stands."""
-
-    name: str
-    state: AnchorState
-    place_m: Array
-    """(3,) map axes, m; NaN while unknown"""
-    covariance: Array
-    """(3, 3) m^2"""
-    bias_m: float
-    bias_sigma_m: float
-    alternatives_m: Array
-    """(n, 3) places that fit as well"""
-    n_ranges: int
-    nlos_share: float
-    """Of its ranges, with a weight below 0.05."""
-
-
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
-class RangingResult(ReadOnlyArrays):
-    """Scale, anchors and what became of every range."""
-
-    state: StartState
-    scale: float
-    """Metres a map unit; NaN without."""
-    sigma_log_scale: float
-    clock_s: float
-    """Time of a measurement less its stamp."""
-    clock_sigma_s: float
-    anchors: tuple[Anchor, ...]
-    error_m: Array
-    """(M,) predicted minus measured, m; NaN where not used"""
-    weight: Array
-    """(M,) NaN where not used"""
-    anchor_of: Indices
-    """(M,) index of each range's anchor among `anchors`; one that moved is two"""
-    scale_history: Array
-    """(H, 3) time s, scale, its relative sigma"""
-    reasons: tuple[str, ...]
-    """Why scale or anchors are not ready."""
-    advice: str
-    started_s: float
-    """Time at which the scale was ready; NaN before."""
-
-    @property
-    def has_scale(self) -> bool:
-        """Whether map units can be turned into metres."""
-        return self.state in (StartState.READY, StartState.MIRROR)
 
 
 @dataclass(slots=True)
@@ -176,7 +118,7 @@ class Ranging(ShortRepr):
             self._tried = len(places.time_s)
             told = self._start(places, _turned(R_cw))
         else:
-            told = [*self._go_on(places, now), *self._later(places, now)]
+            told = [*self._go_on(places, now), *self._later(places)]
         if self.found is not None:
             self.history.append((now, self.found.scale, self.found.sigma_log_scale))
         return told
@@ -409,15 +351,15 @@ class Ranging(ShortRepr):
                 kept.append((place, float(one[3])))
         own.alternatives = (*kept,)
 
-    def _later(self, places: Places, now: float) -> list[str]:
+    def _later(self, places: Places) -> list[str]:
         """Place anchors that have ranges enough by now, and anew those that seem to have moved."""
         told = []
         for j in range(len(self.anchors)):
             own, unused = self.anchors[j], j not in self.used
             is_lost = own.state is AnchorState.DOUBTFUL
             mine = places.anchor == j
-            if is_lost:
-                mine = mine & (places.time_s > now - RECENT_S)
+            since = self._lost_since(j) if is_lost else -np.inf
+            mine = mine & (places.time_s >= since)
             rows = np.flatnonzero(mine)
             if not (unused or is_lost) or len(rows) < self.rules.least_ranges:
                 continue
@@ -426,8 +368,14 @@ class Ranging(ShortRepr):
             placed = self._placed(places.rows(rows))
             if placed is None:
                 continue
-            told.append(self._take(j, *placed, now, moved=is_lost))
+            told.append(self._take(j, *placed, since))
         return told
+
+    def _lost_since(self, j: int) -> float:
+        """Return the time from which an anchor's ranges fit no more: most of them, none before."""
+        own = np.flatnonzero((self.anchor == j) & np.isfinite(self.weight))
+        over = (self.weight[own] < NLOS_WEIGHT) - 0.5
+        return float(self.ranges.time_s[own[int(np.argmax(np.cumsum(over[::-1])[::-1]))]])
 
     def _placed(self, own: Places) -> tuple[Array, float, Array] | None:
         """Return place, bias and covariance (4, 4) of an anchor, if its ranges tell them."""
@@ -447,17 +395,16 @@ class Ranging(ShortRepr):
             return None
         return place, float(where[3]), covariance
 
-    def _take(
-        self, j: int, place: Array, bias: float, covariance: Array, now: float, *, moved: bool
-    ) -> str:
-        """Take an anchor into use; one that moved becomes another from the recent ranges on."""
-        assert self.found is not None and self.terms is not None
+    def _take(self, j: int, place: Array, bias: float, covariance: Array, since: float) -> str:
+        """Take an anchor into use; one that moved becomes another from some time on."""
+        assert self.found is not None
         name = self.anchors[j].name
+        moved = bool(np.isfinite(since))
         if moved:
-            since = now - RECENT_S
-            recent = (self.anchor == j) & (self.ranges.time_s > since)
+            recent = (self.anchor == j) & (self.ranges.time_s >= since)
             self.anchors.append(_Own(f"{name} from {since:.1f} s"))
             self.anchor[recent] = len(self.anchors) - 1
+            self.anchors[j].state = AnchorState.READY
             j = len(self.anchors) - 1
         self.anchors[j].state = AnchorState.READY
         self.used.append(j)

@@ -15,17 +15,17 @@ from typing import Final
 import numpy as np
 
 from ssm_graph.base.frozen import Array, ShortRepr
+from ssm_graph.systems.visual_ranges.contradictions import SQUARE_OF_3_SIGMA, contradictions
 from ssm_graph.systems.visual_ranges.observability import Motion, Shape, advice, shape_of
 from ssm_graph.systems.visual_ranges.range_fit import (
-    BIAS_M,
     BIAS_WALK_M,
     DRIFT,
     Places,
     Problem,
     Solution,
+    polished,
     problem_of,
     search,
-    polished,
     solution,
     with_sigma,
 )
@@ -40,8 +40,6 @@ MOST_ROWS: Final = 250
 MOST_MINIMA: Final = 6
 OPEN_SHAPES: Final = (Motion.PLANE, Motion.LINE, Motion.LINE_THROUGH_ANCHOR)
 """Leave the anchor open, but not the scale."""
-TWO_SIDED_3_SIGMA: Final = {1: 9.0, 3: 14.16}
-"""Chi-square quantiles of 0.9973 by dimension."""
 
 
 class StartState(Enum):
@@ -270,7 +268,7 @@ def _candidates(problem: Problem) -> list[Array]:
 
 
 def _placed(one: Problem, minima: list[Array], log_scale: float) -> list[tuple[Array, float]]:
-    """Return an anchor's distinct places and biases (4,) at a scale, with their cost, best first."""
+    """Return an anchor's distinct places and biases (4,) at a scale, with costs, best first."""
     middle = float(np.median(one.places.range_m))
     starts = np.zeros((DIRECTIONS + len(minima), 6))
     starts[:DIRECTIONS, 2:5] = middle * _directions(DIRECTIONS)
@@ -314,7 +312,7 @@ def _is_apart(best: Solution, rival: Solution) -> bool:
 def _moved(best: Solution, rival: Solution, j: int) -> bool:
     way = rival.anchors[j] - best.anchors[j]
     square = float(way @ np.linalg.solve(best.anchor_covariance(j), way))
-    return square > TWO_SIDED_3_SIGMA[3] and float(np.linalg.norm(way)) > 0.2
+    return bool(square > SQUARE_OF_3_SIGMA and float(np.linalg.norm(way)) > 0.2)
 
 
 def _judged(
@@ -351,7 +349,13 @@ def _judged(
             way = max(float(np.linalg.norm(one.anchors[j] - best.anchors[j])) for one in rivals)
             reasons.append(f"anchor {name} may as well be {way:.1f} m from there (gap {gap:.1f})")
         ready.append(sigma <= limit and not rivals)
-    against = _contradictions(problem, names, rules, best)
+    against = contradictions(
+        problem,
+        names,
+        best,
+        rms_sigmas=rules.rms_sigmas,
+        marked_share=rules.marked_share,
+    )
     shape = shape_of(
         problem.places.camera,
         scale=best.scale,
@@ -378,59 +382,8 @@ def _judged(
 
 
 def _same_scale(best: Solution, other: Solution, rules: StartRules) -> bool:
-    return abs(np.log(other.scale / best.scale)) < max(
-        3.0 * best.sigma_log_scale, 0.5 * rules.scale_sigma
-    )
-
-
-def _contradictions(
-    problem: Problem, names: tuple[str, ...], rules: StartRules, best: Solution
-) -> list[str]:
-    """Return what speaks against the ranges themselves."""
-    at, told = problem.places, []
-    for j, name in enumerate(names):
-        own = at.anchor == j
-        stated, seen = float(np.median(at.sigma_m[own])), robust_rms(best.error[own])
-        if seen > rules.rms_sigmas * stated:
-            told.append(f"residuals of anchor {name} are {seen:.2f} m, {stated:.2f} m were stated")
-        bias = float(best.biases[j])
-        if abs(bias) > 3.0 * BIAS_M:
-            told.append(f"the bias of anchor {name} would be {bias:.2f} m")
-        marked = float(np.mean(best.error[own] < -4.0 * at.sigma_m[own]))
-        if marked > rules.marked_share:
-            told.append(f"{100.0 * marked:.0f} % of the ranges to anchor {name} are too long")
-    first = at.time_s < np.median(at.time_s)
-    halves = [_half(_part(problem, half), best) for half in (first, ~first)]
-    apart = np.log(halves[0].scale / halves[1].scale)
-    sigma = float(np.hypot(*(half.sigma_log_scale for half in halves)))
-    if abs(apart) > 3.0 * sigma:
-        told.append(
-            f"the scales of the first and second half differ by {100.0 * abs(apart):.1f} %, "
-            f"{abs(apart) / sigma:.1f} sigma"
-        )
-    for j, name in enumerate(names):
-        way = halves[0].anchors[j] - halves[1].anchors[j]
-        both = halves[0].anchor_covariance(j) + halves[1].anchor_covariance(j)
-        if float(way @ np.linalg.solve(both, way)) > TWO_SIDED_3_SIGMA[3]:
-            told.append(
-                f"anchor {name} moves by {np.linalg.norm(way):.2f} m between the first and the "
-                "second half: did it move, or is the antenna not calibrated?"
-            )
-    return told
-
-
-def _half(problem: Problem, best: Solution) -> Solution:
-    return polished(problem, best)
-
-
-def _part(problem: Problem, kept: Array) -> Problem:
-    rows = np.flatnonzero(kept)
-    return replace(
-        problem,
-        places=problem.places.rows(rows),
-        drift=problem.drift[rows],
-        walk=problem.walk[rows],
-    )
+    limit = max(3.0 * best.sigma_log_scale, 0.5 * rules.scale_sigma)
+    return bool(abs(np.log(other.scale / best.scale)) < limit)
 
 
 def later_anchor(
