@@ -75,9 +75,9 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
         arguments.duration_s,
         arguments.rate_hz,
         arguments.anchors,
-        SMALL_CAMERA if arguments.small else CAMERA,
-        ranges,
-        ImageFaults(covered_s=tuple(arguments.covered_s or (0.0, 0.0))),
+        camera=SMALL_CAMERA if arguments.small else CAMERA,
+        ranges=ranges,
+        images=ImageFaults(covered_s=tuple(arguments.covered_s or (0.0, 0.0))),
     )
     simulated = simulate(asked)
     sequence = simulated.sequence

@@ -302,3 +302,13 @@ def test_road_map(tmp_path: Path) -> None:
     done = run("systems.road_map", f"--share 0.001 --data {DATA}", "road_map", tmp_path)
     assert done.code == 0
     assert [row[3] for row in done.rows("mapping_example.osm")] == ["2"] * 6
+
+
+@pytest.mark.benchmark
+def test_visual_runs(tmp_path: Path) -> None:
+    """One short run has a row with a verdict, and every image a pose or a reason."""
+    options = "--cases room-mono-small --runs 1 --duration 6"
+    done = run("systems.visual_runs", options, "visual_runs", tmp_path)
+    assert done.code == 0
+    ((_, runs, verdicts, *_),) = done.rows("room, no ranges, 320 x 240")
+    assert (runs, verdicts) == ("1 of 1", "1 NO_SCALE")

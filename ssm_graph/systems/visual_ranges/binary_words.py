@@ -25,7 +25,7 @@ Indices = NDArray[np.int64]
 BRANCHES: Final = 10
 DEPTH: Final = 3
 ROUNDS: Final = 6
-MOST_TRAINED: Final = 20_000
+MOST_TRAINED: Final = 10_000
 """Descriptors that a tree is grown from at most."""
 FIRST_FRAMES: Final = 20
 """Key frames of the first tree: a loop is not looked for before."""

@@ -41,9 +41,13 @@ class FurtherRows(NamedTuple):
 class FurtherTerms(Protocol):
     """Terms of poses and of variables of their own (scale, anchors, biases, clock)."""
 
-    n_extra: int
-    prior: Array
-    """(E, E) information of the variables' prior"""
+    @property
+    def n_extra(self) -> int:
+        """Number of variables E."""
+
+    @property
+    def prior(self) -> Array:
+        """Information (E, E) of the variables' prior."""
 
     def rows(self, R_cw: Array, t_cw: Array, extra: Array) -> FurtherRows:
         """Return whitened rows at poses (K, ...) and a change (E,) of the variables from now."""
@@ -121,7 +125,7 @@ class _State(NamedTuple):
     extra: Array
 
 
-def adjust(problem: Problem, effort: Effort = Effort()) -> Adjusted:  # noqa: B008
+def adjust(problem: Problem, effort: Effort = Effort()) -> Adjusted:
     """Return the adjusted problem."""
     return _Adjustment(problem, effort).run()
 
@@ -209,9 +213,7 @@ class _Adjustment:
         matrix[np.diag_indices(n)] += 1e-9
         return reduced, matrix, slope
 
-    def _step(
-        self, state: _State, weight: Array, further_weight: Array, damping: float
-    ) -> _State:
+    def _step(self, state: _State, weight: Array, further_weight: Array, damping: float) -> _State:
         reduced, matrix, slope = self._system(state, weight, further_weight, damping)
         try:
             step = -linalg.cho_solve(linalg.cho_factor(matrix, check_finite=False), slope)
@@ -247,9 +249,9 @@ class _Adjustment:
             return
         across = np.zeros((free, 6, E))
         np.add.at(across, block[on], weighted[on, :, None] * rows.by_extra[on, None, :])
-        across = across.reshape(P, E)
-        matrix[:P, P:] += across
-        matrix[P:, :P] += across.T
+        flat = across.reshape(P, E)
+        matrix[:P, P:] += flat
+        matrix[P:, :P] += flat.T
         matrix[P:, P:] += (rows.by_extra * weight[:, None]).T @ rows.by_extra + further.prior
         slope[P:] += (rows.by_extra * weight[:, None]).T @ rows.error
         slope[P:] += further.prior @ further.prior_error(state.extra)
@@ -304,9 +306,7 @@ class _Adjustment:
         block = self.column[rows.pose]
         at = np.where(block >= 0, block, 0)[:, None] * 6 + np.arange(6)
         by_pose = rows.by_pose * (block >= 0)[:, None]
-        extra = np.broadcast_to(
-            self.n_poses + np.arange(self.n_extra), (len(block), self.n_extra)
-        )
+        extra = np.broadcast_to(self.n_poses + np.arange(self.n_extra), (len(block), self.n_extra))
         columns = np.concatenate([at, extra], axis=1) if self.n_poses else extra
         J = np.concatenate([by_pose, rows.by_extra], axis=1) if self.n_poses else rows.by_extra
         parts = covariance[columns[:, :, None], columns[:, None, :]]

@@ -46,7 +46,7 @@ class BundleRanges:
 
     @property
     def prior(self) -> Array:
-        """(E, E) information of the variables' prior"""
+        """(E, E) information of the variables' prior."""
         if not self.is_free:
             return np.zeros((0, 0))
         own = [FREE_ANCHOR_M, FREE_ANCHOR_M, FREE_ANCHOR_M, BIAS_M] * len(self.anchors)

@@ -89,7 +89,9 @@ def refine_pose(pose: Pose, points: Array, xy: Array, scale: Array) -> Refined:
     for _ in range(_POSE_STEPS):
         information, slope, _ = pose_equations(R, t, points, xy, scale)
         try:
-            xi = -np.linalg.solve(information + 1e-9 * np.eye(6), slope)
+            xi: Array = np.asarray(
+                -np.linalg.solve(information + 1e-9 * np.eye(6), slope), dtype=np.float64
+            )
         except np.linalg.LinAlgError:
             break
         R, t = Pose(R, t).moved(xi)

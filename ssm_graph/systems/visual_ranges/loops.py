@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from ssm_graph.systems.visual_ranges.binary_words import PlaceIndex
 from ssm_graph.systems.visual_ranges.camera import Camera
@@ -28,6 +29,11 @@ Indices = NDArray[np.int64]
 
 OCTAVE: Final = 1.2
 """Each octave of key points is coarser by it."""
+GUIDED_PX: Final = 8.0
+"""From where a point should be, within which its key point is looked for ..."""
+GUIDED_BITS: Final = 60
+"""... that differs by fewer bits."""
+NEIGHBOURS: Final = 6
 JUDGED_S: Final = 5.0
 """Of the path before a loop, whose ranges judge it."""
 LEAST_JUDGES: Final = 10
@@ -68,6 +74,8 @@ class Loop:
     """By which the new part of the map has to grow."""
     shift: float
     """How far the key frame moves, map units."""
+    apart: float
+    """Between the two cameras, as the loop has it, map units."""
     path: float
     """Walked between the two, map units."""
     judgement: RangeJudgement | None
@@ -196,6 +204,7 @@ class LoopFinder:
             len(match.rows),
             match.correction.scale,
             shift,
+            float(np.linalg.norm(match.correction.apply(centres[k]) - centres[match.matched])),
             path,
             found,
             not why,
@@ -213,11 +222,12 @@ def mutual(distance: NDArray[np.int32], most: int, ratio: float = 1.0) -> tuple[
     """Return the pairs (row, column) that are each other's best, clearly so, and below ``most``."""
     if min(distance.shape) < 2:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-    two = np.partition(distance, 1, axis=1)[:, :2]
-    best = distance.argmin(axis=1)
-    back = distance.argmin(axis=0)
     rows = np.arange(len(distance))
-    is_good = (back[best] == rows) & (two[:, 0] < most) & (two[:, 0] <= ratio * two[:, 1])
+    best, back = distance.argmin(axis=1), distance.argmin(axis=0)
+    least = distance[rows, best]
+    others = distance.copy()
+    others[rows, best] = np.iinfo(others.dtype).max
+    is_good = (back[best] == rows) & (least < most) & (least <= ratio * others.min(axis=1))
     return rows[is_good], best[is_good].astype(np.int64)
 
 
@@ -310,9 +320,20 @@ def _guided(
     x_c = in_camera(pose, places)
     ahead = x_c[:, 2] > 1e-6
     seen = x_c[:, :2] / np.where(ahead, x_c[:, 2], 1.0)[:, None]
-    away = np.linalg.norm((xy[:, None] - seen[None]) * focal, axis=2)
-    cost = np.where((away < 8.0) & ahead, distance, 999).astype(np.int32)
-    return mutual(cost, 60)
+    seen[~ahead] = 1e6
+    tree = cKDTree(xy * focal)
+    _, near = tree.query(seen * focal, k=NEIGHBOURS, distance_upper_bound=GUIDED_PX)
+    column = np.arange(len(places))
+    cost = np.where(
+        near < len(xy), distance[np.minimum(near, len(xy) - 1), column[:, None]], GUIDED_BITS
+    )
+    which = cost.argmin(axis=1)
+    row, cost = near[column, which], cost[column, which]
+    kept = np.flatnonzero(cost < GUIDED_BITS)
+    kept = kept[np.argsort(cost[kept], kind="stable")]
+    _, first = np.unique(row[kept], return_index=True)  # of several points, the most alike
+    kept = kept[first]
+    return row[kept], kept
 
 
 def pose_of_points(places: Array, xy: Array, most: float, n_rounds: int = 300) -> Pose | None:

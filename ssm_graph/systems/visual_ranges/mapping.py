@@ -1,4 +1,4 @@
-"""From key frame to key frame: corners measured anew, points made, found again, adjusted, culled."""
+"""From key frame to key frame: corners measured, points made, found again, adjusted, culled."""
 
 from __future__ import annotations
 
@@ -105,29 +105,24 @@ class Mapper:
     def _measured(self, image: Image, pose: Pose, tracks: Tracks) -> Tracks:
         """Return the tracks measured against the images they were first seen in.
 
-        What has changed too much since is measured against the key frame before; what is like
-        neither is given up.
+        What is not like it any more is given up; what has changed too much to compare stays.
         """
         world = self._world
         point = world.tracks["point"][tracks.track]
-        first, last = world.tracks["first"][tracks.track], world.tracks["last"][tracks.track]
+        first = world.tracks["first"][tracks.track]
         row = np.where(point >= 0, world.points["row"][np.maximum(point, 0)], first)
-        pixel, likeness = tracks.pixel.copy(), np.full(len(point), np.nan)
-        open_ = (point != DROPPED) & (first >= 0)
-        for source in (row, last):
-            on = np.flatnonzero(open_)
-            if not on.size:
-                break
-            places = self._assumed(source[on], point[on])
-            change = change_of_view(self._camera, world, source[on], places, pose)
-            on, affine = on[change.usable], change.affine[change.usable]
-            found = aligned_rows(world, source[on], affine, image, tracks.pixel[on])
-            moved = np.linalg.norm(found.pixels - tracks.pixel[on], axis=1)
-            likeness[on] = np.fmax(likeness[on], found.likeness)
-            better = (found.likeness > _ALIKE) & (moved < _DRIFT_PIXELS)
-            pixel[on[better]] = found.pixels[better]
-            open_[on[better]] = False
-        kept = (point != DROPPED) & ~(likeness < _UNLIKE)
+        on = np.flatnonzero((point != DROPPED) & (first >= 0))
+        change = change_of_view(
+            self._camera, world, row[on], self._assumed(row[on], point[on]), pose
+        )
+        on, affine = on[change.usable], change.affine[change.usable]
+        found = aligned_rows(world, row[on], affine, image, tracks.pixel[on])
+        moved = np.linalg.norm(found.pixels - tracks.pixel[on], axis=1)
+        better = (found.likeness > _ALIKE) & (moved < _DRIFT_PIXELS)
+        pixel = tracks.pixel.copy()
+        pixel[on[better]] = found.pixels[better]
+        kept = point != DROPPED
+        kept[on[~better & (found.likeness < _UNLIKE)]] = False
         return Tracks(tracks.track, pixel).kept(kept)
 
     def _assumed(self, rows: Indices, point: Indices) -> Array:
@@ -274,9 +269,7 @@ class Mapper:
         point_at = np.full(world.points.size, -1)
         point_at[window.points] = np.arange(len(window.points))
         rows = window.rows
-        scale = focal_scale(
-            self._camera, world.rows["octave"][rows], self._settings.pixel_sigma
-        )
+        scale = focal_scale(self._camera, world.rows["octave"][rows], self._settings.pixel_sigma)
         views = sorted_views(
             frame_at[world.rows["frame"][rows]], point_at[world.rows["point"][rows]],
             world.rows["xy"][rows], scale, len(window.points),

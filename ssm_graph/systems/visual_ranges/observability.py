@@ -1,9 +1,9 @@
 """What a path lets ranges tell of scale and anchors, and how to move so that they tell more.
 
-Squared ranges are linear in ``s^2``, ``s a`` and ``|a|^2`` with rows ``(|c|^2, c, 1)`` of the places
-``c``; these lose rank exactly where all places lie on a common plane or sphere. So a line leaves a
-circle of anchors, a plane a mirror, a sphere exchanges the distance of the anchor with its own
-radius, and a circle in a plane, being on both, leaves a whole family of scales.
+Squared ranges are linear in ``s^2``, ``s a`` and ``|a|^2`` with rows ``(|c|^2, c, 1)`` of the
+places ``c``; these lose rank exactly where all places lie on a common plane or sphere. So a line
+leaves a circle of anchors, a plane a mirror, a sphere exchanges the distance of the anchor with its
+own radius, and a circle in a plane, being on both, leaves a whole family of scales.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def shape_of(
             return Shape(motion, spread, axes, float(np.hypot(third, on_circle)))
         return Shape(Motion.PLANE, spread, axes, third)
     on_sphere = _off_sphere(centred)
-    if on_sphere < near / 4.0:
+    if on_sphere < near / 2.0:
         return Shape(Motion.SPHERE, spread, axes, on_sphere)
     return Shape(Motion.GENERAL, spread, axes, min(third, on_sphere))
 

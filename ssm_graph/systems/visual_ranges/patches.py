@@ -205,11 +205,9 @@ def _align_loop(  # pragma: no cover  (compiled)
         spread = np.sqrt((patch * patch).mean())
         gradient[:, 0] -= gradient[:, 0].mean()
         gradient[:, 1] -= gradient[:, 1].mean()
-        xx, xy, yy = 0.0, 0.0, 0.0
-        for m in range(size):
-            xx += gradient[m, 0] * gradient[m, 0]
-            xy += gradient[m, 0] * gradient[m, 1]
-            yy += gradient[m, 1] * gradient[m, 1]
+        xx = (gradient[:, 0] * gradient[:, 0]).sum()
+        xy = (gradient[:, 0] * gradient[:, 1]).sum()
+        yy = (gradient[:, 1] * gradient[:, 1]).sum()
         det, trace = xx * yy - xy * xy, xx + yy
         if not (spread > _LEAST_SPREAD and det > _FLAT * trace * trace):
             continue
@@ -233,9 +231,7 @@ def _align_loop(  # pragma: no cover  (compiled)
                 product += seen[m] * patch[m]
             power = np.sqrt(power / size)
             product /= size
-            alike = -1.0
-            if power > 0.3 * spread:
-                alike = product / (power * spread + 1e-9)
+            alike = product / (power * spread + 1e-9) if power > 0.3 * spread else -1.0
             gain = spread / max(power, 1e-9)
             slope_x, slope_y = 0.0, 0.0
             for m in range(size):

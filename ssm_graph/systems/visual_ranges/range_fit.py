@@ -38,6 +38,8 @@ ANCHOR_M: Final = 1e3
 ROUNDS: Final = 60
 SETTLED: Final = 1e-7
 """Relative change of the cost at which a search ends."""
+STEP_DEVIANCE: Final = 0.5
+"""By which a reweighting may raise the deviance, which is not quite what it lowers."""
 SPACING_M: Final = 0.02
 """Standard deviation of the distance between two anchors whose places are known."""
 
@@ -64,7 +66,7 @@ class Places(NamedTuple):
 
     def rows(self, kept: Indices) -> Places:
         """Return some of them."""
-        return Places(*(column[kept] for column in self))
+        return Places._make(column[kept] for column in self)
 
 
 def places_of(terms: RangeTerms, R_cw: Array, t_cw: Array, time_s: Array) -> Places:
@@ -114,7 +116,7 @@ class Problem(ReadOnlyArrays):
     def n_unknowns(self) -> int:
         """With the modes."""
         drift, walk = self.drift.shape[1], self.walk.shape[1]
-        return self.n_core + 3 * drift + self.n_anchors * walk
+        return int(self.n_core + 3 * drift + self.n_anchors * walk)
 
     def prior_information(self) -> Array:
         """Return its diagonal (P,)."""
@@ -323,15 +325,36 @@ def solution(
         covariance = np.linalg.inv(normal[0] + information)
         variance = np.einsum("mi,ij,mj->m", J[0], covariance, J[0])[None]
         step = -covariance @ (gradient[0] + information @ at[0])
-        step[0] = np.clip(step[0], -0.2, 0.2)
-        at = at + step
-        if float(np.max(np.abs(step) / np.sqrt(covariance.diagonal()))) < 1e-3:
+        moved = _kept_step(problem, at, step)
+        at = at + moved
+        if float(np.max(np.abs(moved) / np.sqrt(covariance.diagonal()))) < 1e-3:
             break
     error, J = residuals(problem, at)
     weight = problem.kernel.weight(error, variance, problem.places.sigma_m)
     covariance = covariance * problem.kernel.inefficiency(error, problem.places.sigma_m)
+    covariance = covariance * _repeated(problem, weight[0] * error[0])
     cost = float(_cost(problem, at, error)[0])
     return _outwards(problem, at[0], covariance, (error[0], variance[0], weight[0]), cost)
+
+
+def _repeated(problem: Problem, pull: Array) -> float:
+    """Return how many ranges in a row say the same: 1 plus twice the sum of autocorrelations.
+
+    ``pull`` (M,) are weighted errors. The largest of all anchors; the sum ends at the first lag
+    that is negative, or within two of its own sigmas of zero.
+    """
+    most = 1.0
+    for j in range(problem.n_anchors):
+        own = pull[problem.places.anchor == j]
+        n, square = len(own), float(own @ own)
+        total = 1.0
+        for lag in range(1, n // 4):
+            part = float(own[lag:] @ own[:-lag]) / square if square > 0.0 else 0.0
+            if part < 2.0 / np.sqrt(n):
+                break
+            total += 2.0 * part
+        most = max(most, total)
+    return most
 
 
 def _outwards(
@@ -358,6 +381,20 @@ def _outwards(
         *each,
         cost,
     )
+
+
+def _kept_step(problem: Problem, at: Array, step: Array) -> Array:
+    """Return a step (P,), or a part of it, that does not leave the minimum; zero if none.
+
+    Along what is not observable a full step may go anywhere.
+    """
+    shares = np.array([1.0, 0.3, 0.1, 0.03])
+    tried = np.vstack([at, at + shares[:, None] * step])
+    cost = _cost(problem, tried, residuals(problem, tried)[0])
+    for share, new in zip(shares, cost[1:], strict=True):
+        if new < cost[0] + STEP_DEVIANCE:
+            return np.asarray(share * step)
+    return np.zeros_like(step)
 
 
 def polished(problem: Problem, found: Solution) -> Solution:

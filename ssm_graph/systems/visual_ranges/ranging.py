@@ -6,13 +6,12 @@ far at their present places, never from those of a window alone, with which an a
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from enum import Enum
-from typing import Final
+from dataclasses import replace
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from ssm_graph.base.frozen import Array, ReadOnlyArrays, ShortRepr
+from ssm_graph.base.frozen import Array, ShortRepr
 from ssm_graph.systems.visual_ranges.bundle_ranges import BundleRanges
 from ssm_graph.systems.visual_ranges.range_fit import (
     Places,
@@ -25,8 +24,10 @@ from ssm_graph.systems.visual_ranges.range_fit import (
     solution,
     unknowns_of,
 )
+from ssm_graph.systems.visual_ranges.range_rows import largest_turn, of_anchors, plain_errors
 from ssm_graph.systems.visual_ranges.range_terms import FramePoses, RangeTerms, hang
 from ssm_graph.systems.visual_ranges.ranges import Indices, Ranges
+from ssm_graph.systems.visual_ranges.ranging_result import Anchor, AnchorState, RangingResult
 from ssm_graph.systems.visual_ranges.start import (
     Start,
     StartRules,
@@ -37,93 +38,34 @@ from ssm_graph.systems.visual_ranges.start import (
 )
 from ssm_graph.systems.visual_ranges.weights import NLOS_WEIGHT, robust_rms
 
+__all__ = ["Anchor", "AnchorState", "Ranging", "RangingResult"]
+
 TRY_AGAIN: Final = 1.15
 """A start is tried again when so many times the ranges are there."""
-RECENT_S: Final = 10.0
+RECENT_S: Final = 5.0
 CHECK_AGAIN: Final = 1.5
 """And all is searched again when so many times the ranges are there."""
 LEAST_RECENT: Final = 20
 SAME_PLACE_M: Final = 0.2
 DOUBTFUL_SHARE: Final = 0.6
-"""Of the last 10 s of an anchor's ranges, with next to no weight."""
+"""Of the last 5 s of an anchor's ranges, with next to no weight."""
 
 
-class AnchorState(Enum):
-    """How far an anchor is known."""
-
-    UNKNOWN = "not placed yet"
-    AMBIGUOUS = "other places fit as well, or it is not sharp"
-    READY = "known"
-    DOUBTFUL = "its last ranges contradict its place: hidden, or moved"
-
-
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Anchor(ReadOnlyArrays):
-    """An anchor as it stands."""
-
-    name: str
-    state: AnchorState
-    place_m: Array
-    """(3,) map axes, m; NaN while unknown"""
-    covariance: Array
-    """(3, 3) m^2"""
-    bias_m: float
-    bias_sigma_m: float
-    alternatives_m: Array
-    """(n, 3) places that fit as well"""
-    n_ranges: int
-    nlos_share: float
-    """Of its ranges, with a weight below 0.05."""
-
-
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
-class RangingResult(ReadOnlyArrays):
-    """Scale, anchors and what became of every range."""
-
-    state: StartState
-    scale: float
-    """Metres a map unit; NaN without."""
-    sigma_log_scale: float
-    clock_s: float
-    """Time of a measurement less its stamp."""
-    clock_sigma_s: float
-    anchors: tuple[Anchor, ...]
-    error_m: Array
-    """(M,) predicted minus measured, m; NaN where not used"""
-    weight: Array
-    """(M,) NaN where not used"""
-    anchor_of: Indices
-    """(M,) index of each range's anchor among `anchors`; one that moved is two"""
-    scale_history: Array
-    """(H, 3) time s, scale, its relative sigma"""
-    reasons: tuple[str, ...]
-    """Why scale or anchors are not ready."""
-    advice: str
-    started_s: float
-    """Time at which the scale was ready; NaN before."""
-
-    @property
-    def has_scale(self) -> bool:
-        """Whether map units can be turned into metres."""
-        return self.state in (StartState.READY, StartState.MIRROR)
-
-
-@dataclass(slots=True)
-class _Own:
+class _Own(NamedTuple):
     """What is kept of an anchor."""
 
     name: str
     state: AnchorState = AnchorState.UNKNOWN
     alternatives: tuple[tuple[Array, float], ...] = ()
     """Places (3,) m, and biases."""
+    lost_s: float = np.inf
+    """From then on its ranges fit no more, and are left out."""
 
 
 class Ranging(ShortRepr):
     """The ranges of a run."""
 
-    def __init__(
-        self, ranges: Ranges, lever_arm_m: Array, rules: StartRules | None = None
-    ) -> None:
+    def __init__(self, ranges: Ranges, lever_arm_m: Array, rules: StartRules | None = None) -> None:
         """Take all ranges of the run; only those before the newest frame are used.
 
         Parameters
@@ -176,9 +118,9 @@ class Ranging(ShortRepr):
             if len(places.time_s) < TRY_AGAIN * self._tried:
                 return []
             self._tried = len(places.time_s)
-            told = self._start(places, _turned(R_cw))
+            told = self._start(places, largest_turn(R_cw))
         else:
-            told = [*self._go_on(places, now), *self._later(places, now)]
+            told = [*self._go_on(places, now), *self._later(places)]
         if self.found is not None:
             self.history.append((now, self.found.scale, self.found.sigma_log_scale))
         return told
@@ -186,8 +128,7 @@ class Ranging(ShortRepr):
     def restart(self) -> None:
         """Forget scale and anchors: the map's scale has changed. The next update starts anew."""
         self.found, self._tried, self._checked = None, 0, 0
-        for own in self.anchors:
-            own.state, own.alternatives = AnchorState.UNKNOWN, ()
+        self.anchors = [_Own(own.name) for own in self.anchors]
 
     def further(
         self, pose_of: Indices, *, is_free: bool = False, least_weight: float = 0.0
@@ -268,7 +209,10 @@ class Ranging(ShortRepr):
         if found is not None and j in self.used:
             i = self.used.index(j)
             place, covariance = found.anchors[i].copy(), found.anchor_covariance(i).copy()
-            bias, sigma = float(found.biases[i]), float(np.sqrt(found.covariance[5 + 4 * i, 5 + 4 * i]))
+            bias, sigma = (
+                float(found.biases[i]),
+                float(np.sqrt(found.covariance[5 + 4 * i, 5 + 4 * i])),
+            )
         return Anchor(
             own.name,
             own.state,
@@ -287,7 +231,7 @@ class Ranging(ShortRepr):
         eligible = np.flatnonzero(counts >= self.rules.least_ranges)
         if not len(eligible):
             eligible = np.array([int(np.argmax(counts))])
-        own, _ = _of(places, eligible)
+        own, _ = of_anchors(places, eligible)
         names = tuple(self.anchors[j].name for j in eligible)
         self.start = find_start(own, names, self.rules, turned_rad=turned_rad)
         if not self.start.has_scale or self.start.solution is None:
@@ -297,9 +241,12 @@ class Ranging(ShortRepr):
         self.started_s = float(places.time_s[-1])
         for i, j in enumerate(self.used):
             is_ready = self.start.anchor_ready[i]
-            self.anchors[j].state = AnchorState.READY if is_ready else AnchorState.AMBIGUOUS
-            self.anchors[j].alternatives = tuple(
-                (one.anchors[i].copy(), float(one.biases[i])) for one in self.start.alternatives
+            self._set(
+                j,
+                state=AnchorState.READY if is_ready else AnchorState.AMBIGUOUS,
+                alternatives=tuple(
+                    (one.anchors[i].copy(), float(one.biases[i])) for one in self.start.alternatives
+                ),
             )
         self._go_on(places, self.started_s)
         found = self.found
@@ -309,10 +256,16 @@ class Ranging(ShortRepr):
                         for j in self.used)
         ]  # fmt: skip
 
+    def _set(self, j: int, **changed: Any) -> None:
+        self.anchors[j] = self.anchors[j]._replace(**changed)
+
     def _go_on(self, places: Places, now: float) -> list[str]:
         """Take up all ranges of the anchors in use."""
         assert self.found is not None
-        own, kept = _of(places, np.array(self.used))
+        everything, kept = of_anchors(places, np.array(self.used))
+        lost_s = np.array([self.anchors[j].lost_s for j in self.used])
+        fits = np.flatnonzero(everything.time_s < lost_s[everything.anchor])
+        own = everything.rows(fits)
         problem = problem_of(
             own,
             len(self.used),
@@ -332,8 +285,9 @@ class Ranging(ShortRepr):
             told = []
         assert self.terms is not None
         row = self.terms.row[kept]
-        self.error[row], self.weight[row] = self.found.error, self.found.weight
-        return [*told, *self._sharpened(problem, now)]
+        self.error[row], self.weight[row] = plain_errors(everything, self.found)
+        self.error[row[fits]], self.weight[row[fits]] = self.found.error, self.found.weight
+        return [*told, *self._sharpened(everything, self.weight[row], now)]
 
     def _check(self, own: Places, problem: Problem) -> list[str]:
         """Search everywhere again, with all ranges of the anchors in use; take what is better."""
@@ -363,21 +317,21 @@ class Ranging(ShortRepr):
             if self.anchors[j].alternatives:
                 self._against_rivals(problem, i)
 
-    def _sharpened(self, problem: Problem, now: float) -> list[str]:
+    def _sharpened(self, at: Places, weight: Array, now: float) -> list[str]:
         """Judge the anchors anew: sharpness, and whether the last ranges fit."""
-        assert self.found is not None
         told = []
         for i, j in enumerate(self.used):
-            own, at = self.anchors[j], problem.places
+            own = self.anchors[j]
             recent = (at.anchor == i) & (at.time_s > now - RECENT_S)
-            marked = self.found.weight[recent] < NLOS_WEIGHT
             is_sharp = not own.alternatives and self._is_sharp(i, at)
             state = AnchorState.READY if is_sharp else AnchorState.AMBIGUOUS
+            lost_s = np.inf
+            marked = weight[recent] < NLOS_WEIGHT
             if recent.sum() >= LEAST_RECENT and float(np.mean(marked)) > DOUBTFUL_SHARE:
-                state = AnchorState.DOUBTFUL
+                state, lost_s = AnchorState.DOUBTFUL, min(own.lost_s, self._lost_since(j))
             if own.state is not state:
                 told.append(f"anchor {own.name}: {state.value}")
-            own.state = state
+            self._set(j, state=state, lost_s=lost_s)
         return told
 
     def _is_sharp(self, i: int, at: Places) -> bool:
@@ -406,17 +360,17 @@ class Ranging(ShortRepr):
             apart = float(np.linalg.norm(place - found.anchors[i])) > SAME_PLACE_M
             if apart and cost < least + self.rules.gap:
                 kept.append((place, float(one[3])))
-        own.alternatives = (*kept,)
+        self._set(self.used[i], alternatives=(*kept,))
 
-    def _later(self, places: Places, now: float) -> list[str]:
+    def _later(self, places: Places) -> list[str]:
         """Place anchors that have ranges enough by now, and anew those that seem to have moved."""
         told = []
         for j in range(len(self.anchors)):
             own, unused = self.anchors[j], j not in self.used
             is_lost = own.state is AnchorState.DOUBTFUL
             mine = places.anchor == j
-            if is_lost:
-                mine = mine & (places.time_s > now - RECENT_S)
+            since = own.lost_s if is_lost else -np.inf
+            mine = mine & (places.time_s >= since)
             rows = np.flatnonzero(mine)
             if not (unused or is_lost) or len(rows) < self.rules.least_ranges:
                 continue
@@ -425,8 +379,14 @@ class Ranging(ShortRepr):
             placed = self._placed(places.rows(rows))
             if placed is None:
                 continue
-            told.append(self._take(j, *placed, now, moved=is_lost))
+            told.append(self._take(j, *placed, since))
         return told
+
+    def _lost_since(self, j: int) -> float:
+        """Return the time from which an anchor's ranges fit no more: most of them, none before."""
+        own = np.flatnonzero((self.anchor == j) & np.isfinite(self.weight))
+        over = (self.weight[own] < NLOS_WEIGHT) - 0.5
+        return float(self.ranges.time_s[own[int(np.argmax(np.cumsum(over[::-1])[::-1]))]])
 
     def _placed(self, own: Places) -> tuple[Array, float, Array] | None:
         """Return place, bias and covariance (4, 4) of an anchor, if its ranges tell them."""
@@ -446,19 +406,18 @@ class Ranging(ShortRepr):
             return None
         return place, float(where[3]), covariance
 
-    def _take(
-        self, j: int, place: Array, bias: float, covariance: Array, now: float, *, moved: bool
-    ) -> str:
-        """Take an anchor into use; one that moved becomes another from the recent ranges on."""
-        assert self.found is not None and self.terms is not None
+    def _take(self, j: int, place: Array, bias: float, covariance: Array, since: float) -> str:
+        """Take an anchor into use; one that moved becomes another from some time on."""
+        assert self.found is not None
         name = self.anchors[j].name
+        moved = bool(np.isfinite(since))
         if moved:
-            since = now - RECENT_S
-            recent = (self.anchor == j) & (self.ranges.time_s > since)
+            recent = (self.anchor == j) & (self.ranges.time_s >= since)
             self.anchors.append(_Own(f"{name} from {since:.1f} s"))
             self.anchor[recent] = len(self.anchors) - 1
+            self._set(j, state=AnchorState.READY, lost_s=np.inf)
             j = len(self.anchors) - 1
-        self.anchors[j].state = AnchorState.READY
+        self._set(j, state=AnchorState.READY)
         self.used.append(j)
         found = self.found
         n = len(found.covariance)
@@ -471,19 +430,3 @@ class Ranging(ShortRepr):
             covariance=wider,
         )
         return f"anchor {name} " + ("has moved: placed anew" if moved else "placed")
-
-
-def _of(places: Places, anchors: Indices) -> tuple[Places, Indices]:
-    """Return the places of some anchors, counted anew, and their rows."""
-    column = np.full(int(places.anchor.max(initial=0)) + 1, -1, dtype=np.intp)
-    inside = anchors[anchors < len(column)]
-    column[inside] = np.flatnonzero(anchors < len(column))
-    kept = np.flatnonzero(column[places.anchor] >= 0)
-    own = places.rows(kept)
-    return own._replace(anchor=column[own.anchor]), kept
-
-
-def _turned(R_cw: Array) -> float:
-    """Return the largest angle from the first camera's axes, rad."""
-    cosine = (np.einsum("kij,ij->k", R_cw, R_cw[0]) - 1.0) / 2.0
-    return float(np.arccos(np.clip(cosine.min(initial=1.0), -1.0, 1.0)))

@@ -99,4 +99,4 @@ class VisualResult(ReadOnlyArrays):
     @property
     def position(self) -> Array:
         """Camera places (N, 3) in the map, map units; NaN without a pose."""
-        return -np.einsum("nji,nj->ni", self.R_cw, self.t_cw)
+        return np.asarray(-np.einsum("nji,nj->ni", self.R_cw, self.t_cw))

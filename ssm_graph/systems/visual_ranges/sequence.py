@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,15 +29,7 @@ class PathTruth(FrozenArrays):
     position_m: Array = shaped("N", 3)
     """The camera's centre, m."""
     quaternion: Array = shaped("N", 4)
-    """Camera axes (x right, y down, z ahead) to world axes, in the order x, y, z, w of TUM files."""
-
-
-class HasDefects(Protocol):
-    """Images that say what was wrong with them."""
-
-    def defects(self) -> tuple[str, ...]:
-        """Return what was found in the images read so far, one sentence each."""
-        ...
+    """Camera axes (x right, y down, z ahead) to world axes, in TUM's order x, y, z, w."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,7 +16,7 @@ class VisualSettings:
 
     n_corners: int = 700
     """Corners followed at a time, one a cell of a grid."""
-    pixel_sigma: float = 0.5
+    pixel_sigma: float = 0.3
     """Pixels, of a corner's place in its octave."""
     start_flow_share: float = 0.028
     """Median flow, share of the image's width, below which a start waits (18 pixels of 640)."""

@@ -88,6 +88,8 @@ class Run:
     """Of images."""
     n_anchors: int = 1
     camera: Camera = CAMERA
+    texel_m: float = 0.006
+    """Fineness of the walls' pictures; a coarser one is made sooner."""
     ranges: RangeFaults = RangeFaults()
     images: ImageFaults = ImageFaults()
 
@@ -118,7 +120,7 @@ class Simulated(ShortRepr):
 
 def simulate(run: Run) -> Simulated:
     """Return a run; its images are rendered when they are asked for."""
-    world = (room if run.world == "room" else corridor)(run.seed)
+    world = (room if run.world == "room" else corridor)(run.seed, texel_m=run.texel_m)
     path = room_path(run.seed) if run.world == "room" else corridor_path(run.seed)
     rng = np.random.default_rng((run.seed, 3))
     time_s = np.arange(int(run.duration_s * run.rate_hz) + 1) / run.rate_hz

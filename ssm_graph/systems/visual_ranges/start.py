@@ -15,17 +15,17 @@ from typing import Final
 import numpy as np
 
 from ssm_graph.base.frozen import Array, ShortRepr
+from ssm_graph.systems.visual_ranges.contradictions import SQUARE_OF_3_SIGMA, contradictions
 from ssm_graph.systems.visual_ranges.observability import Motion, Shape, advice, shape_of
 from ssm_graph.systems.visual_ranges.range_fit import (
-    BIAS_M,
     BIAS_WALK_M,
     DRIFT,
     Places,
     Problem,
     Solution,
+    polished,
     problem_of,
     search,
-    polished,
     solution,
     with_sigma,
 )
@@ -38,8 +38,8 @@ SCALES: Final = 4
 MOST_ROWS: Final = 250
 """Ranges of an anchor that the searches take, spread over all."""
 MOST_MINIMA: Final = 6
-TWO_SIDED_3_SIGMA: Final = {1: 9.0, 3: 14.16}
-"""Chi-square quantiles of 0.9973 by dimension."""
+OPEN_SHAPES: Final = (Motion.PLANE, Motion.LINE, Motion.LINE_THROUGH_ANCHOR)
+"""Leave the anchor open, but not the scale."""
 
 
 class StartState(Enum):
@@ -133,12 +133,10 @@ def find_start(
         spacing=spacing,
     )
     found = _candidates(problem)
-    found, costs = _searched(problem, found)
-    best = solution(problem, found[0])
-    problem = widened(problem, best)
-    found, costs = _searched(problem, found)
-    best = polished(problem, solution(problem, found[0]))
-    rivals = [polished(problem, solution(problem, one)) for one in found[1:]]
+    problem = widened(problem, solution(problem, _best_first(problem, found)[0]))
+    ends = [solution(problem, one) for one in _best_first(problem, found)]
+    ends.sort(key=lambda one: one.cost)
+    best, *rivals = (polished(problem, one) for one in ends)
     apart = [rival for rival in rivals if _is_apart(best, rival)]
     gap = min((rival.cost - best.cost for rival in apart), default=np.inf)
     near = [rival for rival in apart if rival.cost - best.cost < rules.gap]
@@ -270,11 +268,11 @@ def _candidates(problem: Problem) -> list[Array]:
 
 
 def _placed(one: Problem, minima: list[Array], log_scale: float) -> list[tuple[Array, float]]:
-    """Return an anchor's distinct places and biases (4,) at a scale, with their cost, best first."""
+    """Return an anchor's distinct places and biases (4,) at a scale, with costs, best first."""
     middle = float(np.median(one.places.range_m))
     starts = np.zeros((DIRECTIONS + len(minima), 6))
     starts[:DIRECTIONS, 2:5] = middle * _directions(DIRECTIONS)
-    starts[DIRECTIONS:] = minima
+    starts[DIRECTIONS:] = np.array(minima).reshape(-1, 6)
     starts[:, 0] = log_scale
     fit = search(one, starts, held=np.array([0, 1]))
     kept = _distinct(fit.unknowns, fit.cost, 60.0)[:3]
@@ -289,11 +287,10 @@ def _joined(problem: Problem, log_scale: float, own: list[Array]) -> Array:
     return made
 
 
-def _searched(problem: Problem, starts: list[Array]) -> tuple[list[Array], Array]:
-    """Return where searches with all modes end, best first, with their costs."""
+def _best_first(problem: Problem, starts: list[Array]) -> list[Array]:
+    """Return where searches with all modes end, the best first."""
     fit = search(problem, np.array(starts))
-    order = np.argsort(fit.cost)
-    return [fit.unknowns[row] for row in order], fit.cost[order]
+    return [fit.unknowns[row] for row in np.argsort(fit.cost)]
 
 
 def widened(problem: Problem, best: Solution) -> Problem:
@@ -315,7 +312,7 @@ def _is_apart(best: Solution, rival: Solution) -> bool:
 def _moved(best: Solution, rival: Solution, j: int) -> bool:
     way = rival.anchors[j] - best.anchors[j]
     square = float(way @ np.linalg.solve(best.anchor_covariance(j), way))
-    return square > TWO_SIDED_3_SIGMA[3] and float(np.linalg.norm(way)) > 0.2
+    return bool(square > SQUARE_OF_3_SIGMA and float(np.linalg.norm(way)) > 0.2)
 
 
 def _judged(
@@ -340,19 +337,15 @@ def _judged(
         told = ", ".join(f"{one.scale / best.scale:.2f}" for one in others)
         reasons.append(f"other scales fit as well: {told} times this one (gap {gap:.1f})")
     scale_is_sharp = not reasons
-    ready = []
-    for j, name in enumerate(names):
-        sigma = float(np.sqrt(np.trace(best.anchor_covariance(j))))
-        median = float(np.median(at.range_m[at.anchor == j]))
-        limit = max(rules.anchor_sigma_m, rules.anchor_sigma_share * median)
-        rivals = [one for one in near if _moved(best, one, j)]
-        if sigma > limit:
-            reasons.append(f"anchor {name} known to {sigma:.2f} m, {limit:.2f} m are needed")
-        elif rivals:
-            way = max(float(np.linalg.norm(one.anchors[j] - best.anchors[j])) for one in rivals)
-            reasons.append(f"anchor {name} may as well be {way:.1f} m from there (gap {gap:.1f})")
-        ready.append(sigma <= limit and not rivals)
-    against = _contradictions(problem, names, rules, best)
+    ready, doubts = _sharp_anchors(problem, names, rules, best, near, gap)
+    reasons += doubts
+    against = contradictions(
+        problem,
+        names,
+        best,
+        rms_sigmas=rules.rms_sigmas,
+        marked_share=rules.marked_share,
+    )
     shape = shape_of(
         problem.places.camera,
         scale=best.scale,
@@ -361,9 +354,11 @@ def _judged(
         anchor=best.anchors[0] - best.scale * problem.middle,
         range_m=at.range_m[at.anchor == 0],
     )
+    # An anchor that is not sharp though the path is in all directions: something else is wrong.
+    is_explained = any(ready) or near or shape.motion in OPEN_SHAPES
     if against:
         state = StartState.REFUSED
-    elif not scale_is_sharp or (n_anchors == 1 and shape.motion.leaves_scale):
+    elif not (scale_is_sharp and is_explained) or (n_anchors == 1 and shape.motion.leaves_scale):
         state = StartState.AMBIGUOUS
     else:
         state = StartState.READY if all(ready) else StartState.MIRROR
@@ -376,60 +371,33 @@ def _judged(
     return Start(state, best, (*near,), gap, shape, (*reasons, *against), told, (*ready,))
 
 
+def _sharp_anchors(
+    problem: Problem,
+    names: tuple[str, ...],
+    rules: StartRules,
+    best: Solution,
+    near: list[Solution],
+    gap: float,
+) -> tuple[list[bool], list[str]]:
+    """Return which anchors are sharp and without a rival, and what the others lack."""
+    at, ready, doubts = problem.places, [], []
+    for j, name in enumerate(names):
+        sigma = float(np.sqrt(np.trace(best.anchor_covariance(j))))
+        median = float(np.median(at.range_m[at.anchor == j]))
+        limit = max(rules.anchor_sigma_m, rules.anchor_sigma_share * median)
+        rivals = [one for one in near if _moved(best, one, j)]
+        if sigma > limit:
+            doubts.append(f"anchor {name} known to {sigma:.2f} m, {limit:.2f} m are needed")
+        elif rivals:
+            way = max(float(np.linalg.norm(one.anchors[j] - best.anchors[j])) for one in rivals)
+            doubts.append(f"anchor {name} may as well be {way:.1f} m from there (gap {gap:.1f})")
+        ready.append(sigma <= limit and not rivals)
+    return ready, doubts
+
+
 def _same_scale(best: Solution, other: Solution, rules: StartRules) -> bool:
-    return abs(np.log(other.scale / best.scale)) < max(
-        3.0 * best.sigma_log_scale, 0.5 * rules.scale_sigma
-    )
-
-
-def _contradictions(
-    problem: Problem, names: tuple[str, ...], rules: StartRules, best: Solution
-) -> list[str]:
-    """Return what speaks against the ranges themselves."""
-    at, told = problem.places, []
-    for j, name in enumerate(names):
-        own = at.anchor == j
-        stated, seen = float(np.median(at.sigma_m[own])), robust_rms(best.error[own])
-        if seen > rules.rms_sigmas * stated:
-            told.append(f"residuals of anchor {name} are {seen:.2f} m, {stated:.2f} m were stated")
-        bias = float(best.biases[j])
-        if abs(bias) > 3.0 * BIAS_M:
-            told.append(f"the bias of anchor {name} would be {bias:.2f} m")
-        marked = float(np.mean(best.error[own] < -4.0 * at.sigma_m[own]))
-        if marked > rules.marked_share:
-            told.append(f"{100.0 * marked:.0f} % of the ranges to anchor {name} are too long")
-    first = at.time_s < np.median(at.time_s)
-    halves = [_half(_part(problem, half), best) for half in (first, ~first)]
-    apart = np.log(halves[0].scale / halves[1].scale)
-    sigma = float(np.hypot(*(half.sigma_log_scale for half in halves)))
-    if abs(apart) > 3.0 * sigma:
-        told.append(
-            f"the scales of the first and second half differ by {100.0 * abs(apart):.1f} %, "
-            f"{abs(apart) / sigma:.1f} sigma"
-        )
-    for j, name in enumerate(names):
-        way = halves[0].anchors[j] - halves[1].anchors[j]
-        both = halves[0].anchor_covariance(j) + halves[1].anchor_covariance(j)
-        if float(way @ np.linalg.solve(both, way)) > TWO_SIDED_3_SIGMA[3]:
-            told.append(
-                f"anchor {name} moves by {np.linalg.norm(way):.2f} m between the first and the "
-                "second half: did it move, or is the antenna not calibrated?"
-            )
-    return told
-
-
-def _half(problem: Problem, best: Solution) -> Solution:
-    return polished(problem, best)
-
-
-def _part(problem: Problem, kept: Array) -> Problem:
-    rows = np.flatnonzero(kept)
-    return replace(
-        problem,
-        places=problem.places.rows(rows),
-        drift=problem.drift[rows],
-        walk=problem.walk[rows],
-    )
+    limit = max(3.0 * best.sigma_log_scale, 0.5 * rules.scale_sigma)
+    return bool(abs(np.log(other.scale / best.scale)) < limit)
 
 
 def later_anchor(

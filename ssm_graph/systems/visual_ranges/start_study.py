@@ -9,11 +9,14 @@ from __future__ import annotations
 from typing import Any, Final
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from factors.so3 import exp
 from ssm_graph.base.frozen import Array
 from ssm_graph.study.ledger import Key
-from ssm_graph.systems.visual_ranges.range_fit import Places
+from ssm_graph.systems.visual_ranges.range_fit import Places, places_of
+from ssm_graph.systems.visual_ranges.range_terms import FramePoses, hang
+from ssm_graph.systems.visual_ranges.readers.starloc import StarLocRun
 from ssm_graph.systems.visual_ranges.simulate import (
     RangeFaults,
     Run,
@@ -176,3 +179,20 @@ def scored(start: Start, unit_m: float, anchors: Array) -> dict[str, Any]:
         )
     )
     return row
+
+
+def starloc_trial(run: StarLocRun, names: tuple[str, ...]) -> dict[str, Any]:
+    """Return how a start on the true path of a real run, in map units, went with some anchors."""
+    truth, ranges = run.truth, run.ranges
+    kept = np.flatnonzero(np.isin(ranges.anchor, [ranges.names.index(name) for name in names]))
+    order = [ranges.names.index(name) for name in names]
+    R_cw = np.swapaxes(Rotation.from_quat(truth.quaternion).as_matrix(), 1, 2)
+    t_cw = -np.einsum("nij,nj->ni", R_cw, truth.position_m / UNIT_M)
+    frames = FramePoses(truth.time_s, R_cw, t_cw, np.arange(len(R_cw)))
+    terms = hang(ranges.rows(kept), frames, R_cw, t_cw, lever_arm_m=run.lever_arm_m)
+    places = places_of(terms, R_cw, t_cw, ranges.time_s[kept])
+    column = np.full(ranges.n_anchors, -1, dtype=np.intp)
+    column[order] = np.arange(len(order))
+    places = places._replace(anchor=column[places.anchor])
+    start = find_start(places, names, turned_rad=1.0)
+    return scored(start, UNIT_M, run.anchor_truth_m[order])

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssm_graph.systems.visual_ranges.bundle import Effort, adjust
+from ssm_graph.systems.visual_ranges.bundle_ranges import BundleRanges
 from ssm_graph.systems.visual_ranges.features import Image, corners, flow
 from ssm_graph.systems.visual_ranges.geometry import Pose, refine_pose
 from ssm_graph.systems.visual_ranges.loop_closing import close_loop
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
     from ssm_graph.systems.visual_ranges.sequence import Sequence
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
 _LEAST_CORNERS: Final = 100
 _NEW_SCALE: Final = 0.02
@@ -65,7 +68,7 @@ class _Run:
         self.n_tracked = np.zeros(n, dtype=np.int64)
         self.events: list[str] = []
         self.timing: dict[str, list[float]] = defaultdict(list)
-        self.waiting: list[tuple[int, Array, Array]] = []
+        self.waiting: list[tuple[int, Array, Indices]] = []
         self.first: tuple[int, Image, Array] | None = None
         self.seen: dict[int, Tracks] = {}
         ranges = sequence.ranges
@@ -93,6 +96,7 @@ class _Run:
         if self.settings.has_final_adjustment and self.world.n_frames > 2:
             with self.timed("last adjustment"):
                 self.adjust_all()
+                self.follow_back()
                 self.refine_frames()
         return self.answer()
 
@@ -139,7 +143,7 @@ class _Run:
         self.waiting = [(i, found, np.arange(len(found)))]
 
     def begin_map(
-        self, i: int, image: Image, pose: Pose, points: Array, good: Array, which: Array
+        self, i: int, image: Image, pose: Pose, points: Array, good: Mask, which: Indices
     ) -> None:
         """Make the first two key frames, and the poses of the frames before and between."""
         assert self.first is not None
@@ -163,7 +167,7 @@ class _Run:
             self.pose_before(index, seen, track[tracks])
         self.note(i, f"map started with {len(on)} points")
 
-    def pose_before(self, index: int, pixel: Array, track: Array) -> None:
+    def pose_before(self, index: int, pixel: Array, track: Indices) -> None:
         """Find the pose of a frame from before the start, from the points it saw."""
         point = self.world.tracks["point"][track]
         on = point >= 0
@@ -194,9 +198,7 @@ class _Run:
     def find_again(self, i: int, image: Image) -> bool:
         """Look for a lost camera in the map; return whether it was found."""
         with self.timed("relocalisation"):
-            found = relocalise(
-                self.world, self.loops, self.camera, image, self.settings.n_corners
-            )
+            found = relocalise(self.world, self.loops, self.camera, image, self.settings.n_corners)
         if found is None:
             return False
         with self.world.lock:
@@ -216,9 +218,7 @@ class _Run:
         translation = float(np.linalg.norm(self.tracker.relative.centre)) / self.tracker.depth
         if translation < s.key_least_translation and rotation < s.key_least_rotation_rad:
             return False
-        since = float(
-            self.sequence.time_s[i] - self.world.frames["time_s"][self.tracker.reference]
-        )
+        since = float(self.sequence.time_s[i] - self.world.frames["time_s"][self.tracker.reference])
         few = found.n_points < max(
             s.key_share * self.n_tracked[self.world.frames["image"][self.tracker.reference]],
             s.key_least_points,
@@ -280,7 +280,7 @@ class _Run:
             self.tracker.grow(float(grown[self.tracker.reference]))
         self.note(
             i,
-            f"loop closed with the key frame of {self.world.frames['time_s'][match.matched]:.1f} s: "
+            f"loop closed with {self.world.frames['time_s'][match.matched]:.1f} s: "
             f"{self.loops.records[-1].why}; {closed.n_fused} points joined",
         )
         if self.ranging is not None and abs(np.log(match.correction.scale)) > _NEW_SCALE:
@@ -298,9 +298,7 @@ class _Run:
         for text in told:
             self.note(i, text)
 
-    def record(
-        self, i: int, pose: Pose, reference: int, n_points: int, tracks: Tracks
-    ) -> None:
+    def record(self, i: int, pose: Pose, reference: int, n_points: int, tracks: Tracks) -> None:
         """Keep a frame's pose relative to its key frame."""
         relative = pose.after(self.world.pose(reference).inverse())
         self.state[i], self.reference[i] = FrameState.TRACKED, reference
@@ -322,8 +320,24 @@ class _Run:
         problem = self.mapper.problem(window, self.ranging, is_free=True)
         found = adjust(problem, effort)
         self.mapper.take(window, found)
-        if self.ranging is not None and problem.further is not None:
+        if self.ranging is not None and isinstance(problem.further, BundleRanges):
             self.ranging.adopt(found.extra, found.extra_covariance, problem.further)
+
+    def follow_back(self) -> None:
+        """Track what lies before the start, or before the camera was found again, backwards."""
+        R, t = self.poses()
+        is_open = self.state != FrameState.TRACKED
+        for j in (np.flatnonzero(is_open[:-1] & ~is_open[1:]) + 1).tolist():
+            k = int(self.reference[j])
+            self.tracker.start(self.sequence.images(j), self.seen[j], Pose(R[j], t[j]), k)
+            self.tracker.depth = float(self.world.frames["depth"][k])
+            for i in range(j - 1, -1, -1):
+                if not is_open[i]:
+                    break
+                found = self.tracker.follow(self.sequence.images(i))
+                if found.pose is None:
+                    break
+                self.record(i, found.pose, k, found.n_points, found.tracks)
 
     def refine_frames(self) -> None:
         """Find the pose of every frame anew from the final places of the points it saw."""
@@ -334,7 +348,10 @@ class _Run:
             on = point >= 0
             if i in keys or on.sum() < self.settings.least_inliers:
                 continue
-            places, xy = self.world.points["place"][point[on]], self.camera.normalise(tracks.pixel[on])
+            places, xy = (
+                self.world.points["place"][point[on]],
+                self.camera.normalise(tracks.pixel[on]),
+            )
             refined = refine_pose(Pose(R[i], t[i]), places, xy, self.tracker.whitening(len(xy)))
             self.record(i, refined.pose, int(self.reference[i]), int(self.n_tracked[i]), tracks)
 

@@ -15,7 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssm_graph.systems.visual_ranges.extras import opencv
-from ssm_graph.systems.visual_ranges.geometry import Pose, reprojection_square, triangulate
+from ssm_graph.systems.visual_ranges.geometry import (
+    Pose,
+    Triangulated,
+    reprojection_square,
+    triangulate,
+)
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -51,7 +56,7 @@ def two_view(xy1: Array, xy2: Array, focal: float) -> Start | NoStart:
     """Return the start from matched normalised coordinates (n, 2), focal length in pixels."""
     if len(xy1) < LEAST_MATCHES:
         return NoStart(f"{len(xy1)} matches, {LEAST_MATCHES} needed")
-    found = []
+    found: list[tuple[int, int, Pose, Triangulated, Mask]] = []
     for R, t in _hypotheses(xy1, xy2, focal):
         made = triangulate(np.eye(3), np.zeros(3), R, t, xy1, xy2)
         scale = np.full((len(xy1), 2), focal / _REPROJECTION_PIXELS)

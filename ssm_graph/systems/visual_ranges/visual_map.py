@@ -61,9 +61,15 @@ class VisualMap:
     def __init__(self) -> None:
         f8, i8 = np.float64, np.int64
         self.frames = Columns(
-            image=((), i8, -1), time_s=((), f8, np.nan), R_cw=((3, 3), f8, 0.0),
-            t_cw=((3,), f8, 0.0), first_row=((), i8, 0), last_row=((), i8, 0),
-            valid=((), bool, True), covariance=((6, 6), f8, np.nan), depth=((), f8, 1.0),
+            image=((), i8, -1),
+            time_s=((), f8, np.nan),
+            R_cw=((3, 3), f8, 0.0),
+            t_cw=((3,), f8, 0.0),
+            first_row=((), i8, 0),
+            last_row=((), i8, 0),
+            valid=((), bool, True),
+            covariance=((6, 6), f8, np.nan),
+            depth=((), f8, 1.0),
         )
         self.rows = Columns(
             frame=((), i8, -1), pixel=((2,), f8, 0.0), xy=((2,), f8, 0.0), octave=((), i8, 0),
@@ -105,7 +111,13 @@ class VisualMap:
         return int(k)
 
     def add_rows(
-        self, k: int, track: Indices, *, pixel: Array, xy: Array, octave: Indices,
+        self,
+        k: int,
+        track: Indices,
+        *,
+        pixel: Array,
+        xy: Array,
+        octave: Indices,
         descriptor: NDArray[np.uint8],
     ) -> Indices:
         """Add key points of the newest key frame, each the next of its track."""  # fmt: skip

@@ -95,7 +95,7 @@ def test_loops_and_numpy_are_one() -> None:
     for name, one, other in zip(a._fields, a, b, strict=True):
         size = np.abs(other).max()
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-10 * size, err_msg=name)
-    covariance = np.linalg.inv(b.matrix)
+    covariance: Array = np.asarray(np.linalg.inv(b.matrix), dtype=np.float64)
     np.testing.assert_allclose(
         bundle_rows.variances(*state, a, column, covariance),
         bundle_rows.variances_numpy(*state, b, column, covariance),
@@ -141,7 +141,7 @@ def dense_variances(p: Problem) -> Array:
         J[o, :, n_pose + 3 * i : n_pose + 3 * i + 3] = by_point[o]
     rows = J.reshape(2 * n, -1)
     P = np.linalg.inv(rows.T @ rows)
-    return 0.5 * np.einsum("nka,ab,nkb->n", J, P, J)
+    return np.asarray(0.5 * np.einsum("nka,ab,nkb->n", J, P, J))
 
 
 def test_posterior_variances_are_those_of_the_whole_inverse() -> None:
@@ -150,7 +150,8 @@ def test_posterior_variances_are_those_of_the_whole_inverse() -> None:
     column = np.where(p.free, np.cumsum(p.free) - 1, -1)
     state = (p.R_cw, p.t_cw, p.points, p.views)
     system = bundle_rows.reduced(*state, np.ones(len(p.views.point)), column, 0.0)
-    found = bundle_rows.variances(*state, system, column, np.linalg.inv(system.matrix))
+    covariance: Array = np.asarray(np.linalg.inv(system.matrix), dtype=np.float64)
+    found = bundle_rows.variances(*state, system, column, covariance)
     np.testing.assert_allclose(found, dense_variances(p), rtol=1e-5)
 
 

@@ -85,7 +85,7 @@ def read_starloc(folder: Path, antenna: int | None = None) -> StarLocRun:
     p_wr = np.column_stack([rows[x] for x in _POSE[:3]])
     at = np.column_stack([rows[f"tag_pos_{x}"] for x in "xyz"])
     lever = R_cr @ np.median(R_wr.inv().apply(at - p_wr), axis=0) + t_cr
-    places = _anchors(folder, rows["to_id"])
+    places = _anchors(folder, rows)
     names = [str(int(x)) for x in rows["to_id"]]
     ranges = screened_ranges(rows["time_s"], names, rows["range"], source=f"{folder.name}/uwb.csv")
     wrong = np.empty(len(ranges))
@@ -173,12 +173,28 @@ def _version(folder: Path) -> str:
     return str(found[0])
 
 
-def _anchors(folder: Path, used: Array) -> dict[str, Array]:
-    """Return the true places (3,) of the anchors by name."""
-    table = _table(folder.parent / "mocap" / f"uwb_markers_{_version(folder)}.csv")
-    rows = zip(table["id"], table["x"], table["y"], table["z"], strict=True)
-    wanted = {int(x) for x in used}
-    return {str(int(i)): np.array([x, y, z]) for i, x, y, z in rows if int(i) in wanted}
+def _anchors(folder: Path, rows: dict[str, Array]) -> dict[str, Array]:
+    """Return the true places (3,) of the anchors by name, of the survey that fits the true ranges.
+
+    ``landmarks`` of ``dataset_params.json`` is that of the tags: the runs with v1 of it have the
+    anchors of v2.
+    """
+    at = np.column_stack([rows[f"tag_pos_{x}"] for x in "xyz"])
+    found: list[tuple[float, dict[str, Array]]] = []
+    for path in sorted((folder.parent / "mocap").glob("uwb_markers_*.csv")):
+        table = _table(path)
+        places = {
+            int(i): np.array([x, y, z])
+            for i, x, y, z in zip(table["id"], table["x"], table["y"], table["z"], strict=True)
+        }
+        heard = np.isin(rows["to_id"].astype(int), [*places])
+        if not heard.any():
+            continue
+        anchor = np.array([places[int(i)] for i in rows["to_id"][heard]])
+        off = np.abs(np.linalg.norm(at[heard] - anchor, axis=1) - rows["gt_range"][heard])
+        missing = 1.0 - float(np.mean(heard))
+        found.append((float(np.median(off)) + missing, {str(i): p for i, p in places.items()}))
+    return min(found, key=lambda one: one[0])[1] if found else {}
 
 
 def _tags(folder: Path) -> dict[int, Array]:

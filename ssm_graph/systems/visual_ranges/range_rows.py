@@ -1,0 +1,35 @@
+"""Rows of ranges along a path: those of some anchors, and how far they are off."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ssm_graph.base.frozen import Array
+from ssm_graph.systems.visual_ranges.range_fit import Places, Solution
+from ssm_graph.systems.visual_ranges.ranges import Indices
+from ssm_graph.systems.visual_ranges.weights import POLISH
+
+
+def plain_errors(at: Places, found: Solution) -> tuple[Array, Array]:
+    """Return errors (M,), m, and weights (M,) of ranges at a solution, without modes."""
+    camera = at.camera + found.clock_s * at.velocity
+    line = found.scale * camera + at.lever + found.clock_s * at.lever_rate
+    error = np.linalg.norm(line - found.anchors[at.anchor], axis=1) + found.biases[at.anchor]
+    error = error - at.range_m
+    return error, POLISH.weight(error, 0.0, at.sigma_m)
+
+
+def of_anchors(places: Places, anchors: Indices) -> tuple[Places, Indices]:
+    """Return the places of some anchors, counted anew, and their rows."""
+    column = np.full(int(places.anchor.max(initial=0)) + 1, -1, dtype=np.intp)
+    inside = anchors[anchors < len(column)]
+    column[inside] = np.flatnonzero(anchors < len(column))
+    kept = np.flatnonzero(column[places.anchor] >= 0)
+    own = places.rows(kept)
+    return own._replace(anchor=column[own.anchor]), kept
+
+
+def largest_turn(R_cw: Array) -> float:
+    """Return the largest angle from the first camera's axes, rad."""
+    cosine = (np.einsum("kij,ij->k", R_cw, R_cw[0]) - 1.0) / 2.0
+    return float(np.arccos(np.clip(cosine.min(initial=1.0), -1.0, 1.0)))

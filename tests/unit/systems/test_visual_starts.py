@@ -1,0 +1,200 @@
+"""Scale and anchors from ranges: Jacobians, what a motion leaves open, NLOS, moved anchors."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from factors.so3 import exp
+from ssm_graph.base.frozen import Array
+from ssm_graph.systems.visual_ranges.bundle_ranges import BundleRanges
+from ssm_graph.systems.visual_ranges.range_fit import Places, problem_of, residuals
+from ssm_graph.systems.visual_ranges.range_terms import FramePoses, RangeTerms, hang
+from ssm_graph.systems.visual_ranges.ranges import Ranges
+from ssm_graph.systems.visual_ranges.ranging import Ranging
+from ssm_graph.systems.visual_ranges.ranging_result import AnchorState
+from ssm_graph.systems.visual_ranges.readers.starloc import read_starloc
+from ssm_graph.systems.visual_ranges.simulate import RangeFaults, Run, simulate
+from ssm_graph.systems.visual_ranges.start_study import (
+    UNIT_M,
+    shape_trial,
+    starloc_trial,
+    walk_trial,
+)
+from ssm_graph.systems.visual_ranges.weights import RangeKernel
+
+STARLOC = Path(os.environ.get("SSM_GRAPH_DATA", "../shared/data")) / "systems/starloc"
+STEP = 1e-6
+
+
+def random_terms(rng: np.random.Generator, n: int = 30) -> RangeTerms:
+    """Return ranges of two anchors on four key frames."""
+    a, b, c, d = rng.normal(size=(4, n, 3))
+    index = np.arange(n)
+    return RangeTerms(
+        index, index % 4, index % 2, a, b, c, d, rng.uniform(1.0, 5.0, n), np.full(n, 0.1)
+    )
+
+
+def test_terms_of_a_bundle_have_the_right_derivatives() -> None:
+    """Of poses under the left perturbation, and of all variables that ranges bring."""
+    rng = np.random.default_rng(0)
+    terms = random_terms(rng)
+    R, t = exp(rng.normal(size=(4, 3))), rng.normal(size=(4, 3))
+    ours = BundleRanges(
+        terms, terms.key_frame, 1.7, 0.1, 3.0 * rng.normal(size=(2, 3)), rng.normal(size=2),
+        RangeKernel(), is_free=True,
+    )  # fmt: skip
+    zero = np.zeros(ours.n_extra)
+    found = ours.rows(R, t, zero)
+    for k in range(6):
+        change = []
+        for sign in (STEP, -STEP):
+            xi = sign * np.eye(6)[k]
+            turn = exp(xi[3:])
+            change.append(ours.rows(turn @ R, t @ turn.T + xi[:3], zero).error)
+        np.testing.assert_allclose(
+            (change[0] - change[1]) / (2 * STEP), found.by_pose[:, k], atol=1e-7
+        )
+    for k, axis in enumerate(np.eye(ours.n_extra)):
+        change = [ours.rows(R, t, sign * axis).error for sign in (STEP, -STEP)]
+        np.testing.assert_allclose(
+            (change[0] - change[1]) / (2 * STEP), found.by_extra[:, k], atol=1e-7
+        )
+
+
+def test_the_fit_has_the_right_derivatives() -> None:
+    """With modes of drift and walk, of two anchors, side by side at two sets of unknowns."""
+    rng = np.random.default_rng(1)
+    n = 24
+    a, b, c, d = rng.normal(size=(4, n, 3))
+    time = np.sort(rng.uniform(0.0, 30.0, n))
+    places = Places(a, b, c, d, np.arange(n) % 2, rng.uniform(1, 5, n), np.full(n, 0.1), time)
+    problem = problem_of(places, 2, RangeKernel(), drift=0.05, bias_walk_m=0.1)
+    at = 0.3 * rng.normal(size=(2, problem.n_unknowns))
+    _, J = residuals(problem, at)
+    for k, axis in enumerate(np.eye(problem.n_unknowns)):
+        change = [residuals(problem, at + sign * axis)[0] for sign in (STEP, -STEP)]
+        np.testing.assert_allclose((change[0] - change[1]) / (2 * STEP), J[:, :, k], atol=1e-7)
+
+
+def true_run(run: Run, ranges: Ranges | None = None) -> tuple[Ranging, FramePoses, Array]:
+    """Return the ranging of a simulated run, its true poses in map units, and its anchors."""
+    sequence = simulate(run).sequence
+    assert sequence.truth is not None
+    assert sequence.anchor_truth_m is not None
+    R_cw = np.swapaxes(Rotation.from_quat(sequence.truth.quaternion).as_matrix(), 1, 2)
+    t_cw = -np.einsum("nij,nj->ni", R_cw, sequence.truth.position_m / UNIT_M)
+    frames = FramePoses(sequence.time_s, R_cw, t_cw, np.arange(len(R_cw)) // 5)
+    ranging = Ranging(ranges or sequence.ranges, np.array(sequence.lever_arm_m))
+    return ranging, frames, sequence.anchor_truth_m
+
+
+def until(ranging: Ranging, frames: FramePoses, end_s: float) -> list[str]:
+    """Take all frames up to a time; every fifth is a key frame."""
+    n = int(np.searchsorted(frames.time_s, end_s))
+    part = FramePoses._make(column[:n] for column in frames)
+    return ranging.update(part, frames.R_cw[:n:5], frames.t_cw[:n:5])
+
+
+def test_hung_ranges_fit_the_true_path() -> None:
+    """With lever arm and clock: what is left is the noise."""
+    arm = (0.2, -0.1, 0.3)
+    faults = RangeFaults(sigma_m=1e-6, bias_m=0.0, occlusion=False, lever_arm_m=arm, clock_s=0.05)
+    ranging, frames, anchors = true_run(
+        Run("room", 3, 8.0, n_anchors=2, texel_m=0.05, ranges=faults)
+    )
+    R, t = frames.R_cw[::5], frames.t_cw[::5]
+    terms = hang(ranging.ranges, frames, R, t, lever_arm_m=np.array(arm))
+    assert len(terms) > 140
+    found = terms.linearise(R, t, UNIT_M, anchors=anchors, biases=np.zeros(2), clock_s=-0.05)
+    assert float(np.abs(found.error).max()) < 2e-3
+    off = terms.linearise(R, t, UNIT_M, anchors=anchors, biases=np.zeros(2))
+    assert float(np.abs(off.error).max()) > 2e-2
+
+
+@pytest.mark.parametrize(
+    ("shape", "state", "motion"),
+    [
+        ("standing still", "AMBIGUOUS", "STILL"),
+        ("turning only", "AMBIGUOUS", "ROTATION"),
+        pytest.param("line", "AMBIGUOUS", "LINE", marks=pytest.mark.slow),
+        ("plane curve", "MIRROR", "PLANE"),
+        pytest.param("circle", "AMBIGUOUS", "CIRCLE", marks=pytest.mark.slow),
+        ("sphere", "AMBIGUOUS", "SPHERE"),
+        ("helix", "READY", "GENERAL"),
+    ],
+)
+def test_what_a_motion_leaves_open(shape: str, state: str, motion: str) -> None:
+    """Named, and the truth is among the solutions where there are finitely many."""
+    row = shape_trial((shape, 0.001, 0))
+    assert (row["state"], row["motion"]) == (state, motion)
+    if shape in ("plane curve", "sphere", "helix"):
+        assert row["truth_listed"]
+        assert row["n_alternatives"] == (0 if shape == "helix" else 1)
+
+
+@pytest.mark.slow
+def test_ranges_in_bursts_do_not_bend_the_scale() -> None:
+    """A third is too long: the scale is within its sigma, and most of them end without weight."""
+    row = walk_trial(("room", 30, 1, 0.3, 0.002, 1001))
+    assert row["state"] == "READY"
+    assert abs(row["scale_percent"]) < 3.0 * row["sigma_percent"] < 9.0
+
+
+@pytest.mark.slow
+def test_contradicting_ranges_are_refused() -> None:
+    """An anchor that stood elsewhere during the second half."""
+    run = Run("room", 4, 24.0, texel_m=0.05, ranges=RangeFaults(occlusion=False))
+    ranging, frames, _ = true_run(run)
+    old = ranging.ranges
+    longer = old.range_m + np.where(old.time_s > 12.0, 1.0, 0.0)
+    moved = Ranges(old.time_s, old.anchor, longer, old.sigma_m, old.names, old.known_position)
+    ranging, frames, _ = true_run(run, moved)
+    until(ranging, frames, 24.0)
+    result = ranging.result()
+    assert not result.has_scale
+    assert result.reasons
+
+
+@pytest.mark.slow
+def test_an_anchor_that_moved_becomes_another() -> None:
+    """The scale stays, the new place is found, the old one is kept for its own time."""
+    run = Run("room", 3, 44.0, n_anchors=2, texel_m=0.05, ranges=RangeFaults(occlusion=False))
+    ranging, frames, anchors = true_run(run)
+    old = ranging.ranges
+    far = np.array([-3.0, 2.0, 0.5])
+    path = -np.einsum("nji,nj->ni", frames.R_cw, frames.t_cw) * UNIT_M
+    at = np.stack([np.interp(old.time_s, frames.time_s, path[:, i]) for i in range(3)], axis=1)
+    shift = np.linalg.norm(at - far, axis=1) - np.linalg.norm(at - anchors[1], axis=1)
+    has_moved = (old.anchor == 1) & (old.time_s > 30.0)
+    changed = old.range_m + np.where(has_moved, shift, 0.0)
+    ranges = Ranges(old.time_s, old.anchor, changed, old.sigma_m, old.names, old.known_position)
+    ranging, frames, _ = true_run(run, ranges)
+    for end in (20.0, 30.0, 35.0, 38.0, 44.0):
+        until(ranging, frames, end)
+    result = ranging.result()
+    assert result.has_scale
+    assert abs(result.scale / UNIT_M - 1.0) < min(0.03, 3.0 * result.sigma_log_scale)
+    first, before, after = result.anchors
+    assert first.state is AnchorState.READY
+    assert np.linalg.norm(before.place_m - anchors[1]) < 0.5
+    assert np.linalg.norm(after.place_m - far) < 0.5
+    assert after.name.startswith("A1 from 3")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not STARLOC.is_dir(), reason="no STAR-loc under SSM_GRAPH_DATA")
+def test_real_radios() -> None:
+    """One anchor of a real run gives the scale; radios that are not calibrated are refused."""
+    run = read_starloc(STARLOC / "loop-3d_s5")
+    row = starloc_trial(run, ("4",))
+    assert row["state"] == "READY"
+    assert abs(row["scale_percent"]) < min(1.5, 3.0 * row["sigma_percent"])
+    assert row["anchor_m"][0] < 0.5
+    bad = starloc_trial(read_starloc(STARLOC / "loop-2d-fast_s1"), ("7",))
+    assert bad["state"] in ("AMBIGUOUS", "REFUSED")
