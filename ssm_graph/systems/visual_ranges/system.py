@@ -324,18 +324,22 @@ class _Run:
             self.ranging.adopt(found.extra, found.extra_covariance, problem.further)
 
     def follow_back(self) -> None:
-        """Track what lies before the start, or before the camera was found again, backwards."""
+        """Track what lies before the start, or before the camera was found again, backwards.
+
+        No key frames are made on this way: it ends where the next one would be.
+        """
         R, t = self.poses()
         is_open = self.state != FrameState.TRACKED
         for j in (np.flatnonzero(is_open[:-1] & ~is_open[1:]) + 1).tolist():
             k = int(self.reference[j])
             self.tracker.start(self.sequence.images(j), self.seen[j], Pose(R[j], t[j]), k)
+            few = self.settings.key_share * self.n_tracked[j]
             self.tracker.depth = float(self.world.frames["depth"][k])
             for i in range(j - 1, -1, -1):
                 if not is_open[i]:
                     break
                 found = self.tracker.follow(self.sequence.images(i))
-                if found.pose is None:
+                if found.pose is None or found.n_points < few:
                     break
                 self.record(i, found.pose, k, found.n_points, found.tracks)
 
