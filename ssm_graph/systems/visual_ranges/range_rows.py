@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 from ssm_graph.base.frozen import Array
@@ -33,3 +35,14 @@ def largest_turn(R_cw: Array) -> float:
     """Return the largest angle from the first camera's axes, rad."""
     cosine = (np.einsum("kij,ij->k", R_cw, R_cw[0]) - 1.0) / 2.0
     return float(np.arccos(np.clip(cosine.min(initial=1.0), -1.0, 1.0)))
+
+
+def known_spacing(known_position: Array, anchors: Indices) -> tuple[tuple[int, int, float], ...]:
+    """Return pairs among some anchors whose places are known (J, 3), and their distance, m.
+
+    The map's own axes are unknown, so that of a surveyed place only what is relative counts.
+    """
+    own = [known_position[j] if j < len(known_position) else np.full(3, np.nan) for j in anchors]
+    pairs = itertools.combinations(range(len(own)), 2)
+    apart = [(i, j, float(np.linalg.norm(own[i] - own[j]))) for i, j in pairs]
+    return tuple(pair for pair in apart if np.isfinite(pair[2]))

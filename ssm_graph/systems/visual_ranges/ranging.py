@@ -24,7 +24,12 @@ from ssm_graph.systems.visual_ranges.range_fit import (
     solution,
     unknowns_of,
 )
-from ssm_graph.systems.visual_ranges.range_rows import largest_turn, of_anchors, plain_errors
+from ssm_graph.systems.visual_ranges.range_rows import (
+    known_spacing,
+    largest_turn,
+    of_anchors,
+    plain_errors,
+)
 from ssm_graph.systems.visual_ranges.range_terms import FramePoses, RangeTerms, hang
 from ssm_graph.systems.visual_ranges.ranges import Indices, Ranges
 from ssm_graph.systems.visual_ranges.ranging_result import Anchor, AnchorState, RangingResult
@@ -233,7 +238,13 @@ class Ranging(ShortRepr):
             eligible = np.array([int(np.argmax(counts))])
         own, _ = of_anchors(places, eligible)
         names = tuple(self.anchors[j].name for j in eligible)
-        self.start = find_start(own, names, self.rules, turned_rad=turned_rad)
+        self.start = find_start(
+            own,
+            names,
+            self.rules,
+            turned_rad=turned_rad,
+            spacing=known_spacing(self.ranges.known_position, eligible),
+        )
         if not self.start.has_scale or self.start.solution is None:
             return []
         self._checked = len(places.time_s)
@@ -272,6 +283,7 @@ class Ranging(ShortRepr):
             self.rules.kernel,
             drift=self.rules.ledger_drift,
             bias_walk_m=self.rules.bias_walk_m,
+            spacing=known_spacing(self.ranges.known_position, np.array(self.used)),
         )
         before = self.found
         start = unknowns_of(problem, before.scale, before.anchors, before.biases, before.clock_s)
@@ -293,7 +305,7 @@ class Ranging(ShortRepr):
         """Search everywhere again, with all ranges of the anchors in use; take what is better."""
         assert self.found is not None
         names = tuple(self.anchors[j].name for j in self.used)
-        again = find_start(own, names, self.rules, turned_rad=np.inf)
+        again = find_start(own, names, self.rules, turned_rad=np.inf, spacing=problem.spacing)
         was_refused, self.start = self.is_refused, again
         if self.is_refused != was_refused:
             what = "; ".join(again.reasons) if self.is_refused else "no contradiction any more"

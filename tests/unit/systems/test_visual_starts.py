@@ -12,7 +12,14 @@ from scipy.spatial.transform import Rotation
 from factors.so3 import exp
 from ssm_graph.base.frozen import Array
 from ssm_graph.systems.visual_ranges.bundle_ranges import BundleRanges
-from ssm_graph.systems.visual_ranges.range_fit import Places, problem_of, residuals
+from ssm_graph.systems.visual_ranges.range_fit import (
+    Places,
+    problem_of,
+    residuals,
+    solution,
+    unknowns_of,
+)
+from ssm_graph.systems.visual_ranges.range_rows import known_spacing
 from ssm_graph.systems.visual_ranges.range_terms import FramePoses, RangeTerms, hang
 from ssm_graph.systems.visual_ranges.ranges import Ranges
 from ssm_graph.systems.visual_ranges.ranging import Ranging
@@ -80,6 +87,29 @@ def test_the_fit_has_the_right_derivatives() -> None:
     for k, axis in enumerate(np.eye(problem.n_unknowns)):
         change = [residuals(problem, at + sign * axis)[0] for sign in (STEP, -STEP)]
         np.testing.assert_allclose((change[0] - change[1]) / (2 * STEP), J[:, :, k], atol=1e-7)
+
+
+def test_the_distance_of_surveyed_anchors_is_kept() -> None:
+    """Ranges of 0.3 m alone leave it open; no place of the survey itself is used."""
+    rng = np.random.default_rng(3)
+    time = np.linspace(0.0, 20.0, 120)
+    camera = np.cumsum(0.2 * rng.normal(size=(120, 3)), axis=0)
+    anchors, which = np.array([[4.0, 1.0, 2.0], [-3.0, 2.0, -1.0]]), np.arange(120) % 2
+    measured = np.linalg.norm(2.0 * camera - anchors[which], axis=1) + 0.3 * rng.normal(size=120)
+    zero = np.zeros_like(camera)
+    places = Places(camera, zero, zero, zero, which, measured, np.full(120, 0.3), time)
+    wanted = float(np.linalg.norm(anchors[0] - anchors[1]))
+    known = np.vstack([anchors + 100.0, np.full(3, np.nan)])
+    spacing = known_spacing(known, np.array([0, 1, 2]))
+    ((first, second, apart),) = spacing
+    assert (first, second) == (0, 1)
+    assert apart == pytest.approx(wanted)
+    off = []
+    for own in (spacing, ()):
+        problem = problem_of(places, 2, RangeKernel(), drift=0.0, bias_walk_m=0.0, spacing=own)
+        found = solution(problem, unknowns_of(problem, 2.0, anchors, np.zeros(2)))
+        off.append(abs(float(np.linalg.norm(found.anchors[0] - found.anchors[1])) - wanted))
+    assert off[0] < 0.02 < off[1]
 
 
 def true_run(run: Run, ranges: Ranges | None = None) -> tuple[Ranging, FramePoses, Array]:
