@@ -162,7 +162,6 @@ class _Run:
         mapper.set_depth(k)
         fresh = mapper.fill(k, image, Tracks(track[which], pixel))
         self.tracker.start(image, fresh, world.pose(k), k)
-        self.tracker.depth = float(world.frames["depth"][k])
         for index, seen, tracks in self.waiting:
             self.pose_before(index, seen, track[tracks])
         self.note(i, f"map started with {len(on)} points")
@@ -204,7 +203,6 @@ class _Run:
         with self.world.lock:
             tracks = Tracks(self.world.new_tracks(len(found.points), found.points), found.pixel)
         self.tracker.start(image, tracks, found.pose, found.key_frame)
-        self.tracker.depth = float(self.world.frames["depth"][found.key_frame])
         self.record(i, found.pose, found.key_frame, len(found.points), tracks)
         self.note(i, f"found again by {len(found.points)} points of key frame {found.key_frame}")
         return True
@@ -334,7 +332,6 @@ class _Run:
             k = int(self.reference[j])
             self.tracker.start(self.sequence.images(j), self.seen[j], Pose(R[j], t[j]), k)
             few = self.settings.key_share * self.n_tracked[j]
-            self.tracker.depth = float(self.world.frames["depth"][k])
             for i in range(j - 1, -1, -1):
                 if not is_open[i]:
                     break

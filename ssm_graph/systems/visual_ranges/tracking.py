@@ -102,6 +102,7 @@ class Tracker:
         self.image, self.tracks = image, tracks
         self.velocity = Pose(np.eye(3), np.zeros(3))
         self.set_pose(pose, reference)
+        self.depth = float(self._world.frames["depth"][reference])
 
     def follow(self, image: Image) -> Followed:
         """Return the pose of the next image; none when too little is left."""
