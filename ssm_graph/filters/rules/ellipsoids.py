@@ -69,14 +69,6 @@ class Ellipsoids(ReadOnlyArrays):
         row = np.asarray(h, dtype=np.float64)
         return np.asarray(np.sqrt(np.einsum("...i,...ij,...j->...", row, self.shape, row)))
 
-    def mapped(self, A: Array, center: Array | None = None) -> Ellipsoids:
-        """Return the image under x -> A x, A (..., m, n) of full rank; a projection is one.
-
-        With ``center`` the map is x -> center + A (x - c).
-        """
-        at = np.einsum("...ij,...j->...i", A, self.center) if center is None else center
-        return Ellipsoids(at, symmetric(A @ self.shape @ np.swapaxes(A, -1, -2)))
-
     def projected(self, components: list[int]) -> Ellipsoids:
         """Return the shadow on some components, exactly."""
         return Ellipsoids(

@@ -23,7 +23,6 @@ _LATEST_US: Final = 4_000_000_000_000_000
 """Unix microseconds of 2096."""
 _EARLIEST_US: Final = 1_000_000_000_000_000
 _MG: Final = 9.80665e-3
-_US: Final = 1e6
 
 _Read = Callable[[Any], tuple[float, ...]]
 MESSAGES: Final[Mapping[str, tuple[str, tuple[str, ...], _Read]]] = {

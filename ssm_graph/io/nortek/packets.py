@@ -16,8 +16,6 @@ import numpy as np
 SYNC: Final = 0xA5
 _START: Final = 0xB58C
 _SHORT, _LONG = 10, 12
-AD2CP_FAMILIES: Final = (0x10, 0x11, 0x16)
-"""Of DVLs and of ADCPs such as the Signature."""
 NUCLEUS_FAMILY: Final = 0x20
 
 

@@ -33,8 +33,6 @@ _AXES: Final = np.eye(3)
 _RADIUS_M: Final = 6.37e6
 _FLOOR: Final = np.array([1e-3, 1e-3, 1e-6])
 """m, m, rad: half-widths that no cut goes below."""
-UNKNOWN_M: Final = 1e5
-"""Half-width of a place that nothing is known of."""
 
 
 @dataclass(frozen=True, slots=True)

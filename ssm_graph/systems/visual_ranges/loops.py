@@ -153,11 +153,11 @@ class LoopFinder:
         if not self._index.is_ready or k < s.least_gap:
             return []
         scores = self._index.scores(world.rows["descriptor"][world.rows_of(k)])
-        shared, valid = (x[: len(scores)] for x in (world.shared(k), world.frames["valid"]))
+        shared = world.shared(k)[: len(scores)]
         near = np.flatnonzero((shared >= 30) & (np.arange(len(shared)) != k))
         near = near[near >= k - s.least_gap]
         reference = scores[near].max(initial=0.0)
-        is_open = (np.arange(len(scores)) <= k - s.least_gap) & valid
+        is_open = np.arange(len(scores)) <= k - s.least_gap
         is_open &= (shared < 15) & (scores > s.score_share * reference)
         found: list[int] = []
         for c in np.flatnonzero(is_open)[np.argsort(-scores[is_open], kind="stable")]:

@@ -248,7 +248,7 @@ class Mapper:
 
     def whole(self) -> Window:
         """Return the whole map, its first key frame held."""
-        frames = np.flatnonzero(self._world.frames["valid"])
+        frames = np.arange(self._world.n_frames)
         order = np.concatenate([frames[1:], frames[:1]])
         return self._closed(order, len(frames) - 1, self._world.observations(frames))
 

@@ -50,11 +50,9 @@ def relocalise(
     octave = np.zeros(len(pixel), dtype=np.int64)
     own = descriptors(image, pixel, octave)
     xy = camera.normalise(pixel)
-    valid = np.flatnonzero(world.frames["valid"])
-    tried = dict.fromkeys([*finder.alike(own, N_CANDIDATES), *valid[-RECENT:].tolist()])
+    recent = range(max(world.n_frames - RECENT, 0), world.n_frames)
+    tried = dict.fromkeys([*finder.alike(own, N_CANDIDATES), *recent])
     for k in tried:
-        if not world.frames["valid"][k]:
-            continue
         points = points_of(world, sorted(finder.group_of(world, k)))
         found = place_camera(
             xy,

@@ -67,7 +67,6 @@ class VisualMap:
             t_cw=((3,), f8, 0.0),
             first_row=((), i8, 0),
             last_row=((), i8, 0),
-            valid=((), bool, True),
             covariance=((6, 6), f8, np.nan),
             depth=((), f8, 1.0),
         )
@@ -176,7 +175,7 @@ class VisualMap:
         seen = np.flatnonzero(point >= 0)
         seen = seen[points[point[seen]]]
         count = np.bincount(self.rows["frame"][seen], minlength=self.n_frames)
-        return np.asarray(np.where(self.frames["valid"], count, 0))
+        return np.asarray(count)
 
     def drop_rows(self, rows: Indices) -> None:
         """Take observations from their points; their tracks end."""
@@ -228,16 +227,9 @@ class VisualMap:
             point[rows[~double]], minlength=self.points.size
         )[points]
 
-    def cull_frame(self, k: int) -> None:
-        """Take a key frame out: its observations go, its pose and tracks' chains stay."""
-        rows = self.observations(np.array([k]))
-        np.subtract.at(self.points["views"], self.rows["point"][rows], 1)
-        self.rows["point"][rows] = NO_POINT
-        self.frames["valid"][k] = False
-
     def snapshot(self) -> MapSnapshot:
-        """Return what stands, culled key frames left out."""
-        kept = np.flatnonzero(self.frames["valid"])
+        """Return what stands."""
+        kept = np.arange(self.n_frames)
         rows = [np.arange(*self.rows_of(int(k)).indices(self.rows.size)) for k in kept]
         index = np.concatenate(rows) if rows else np.zeros(0, dtype=np.int64)
         first = np.concatenate([[0], np.cumsum([len(r) for r in rows])]).astype(np.int64)
