@@ -298,9 +298,10 @@ def main() -> None:
     report.write(_page(rows[True], rows[False], seeds))
 
 
-def _page(lies: Iterable[Sequence[str]], fair: Iterable[Sequence[str]], seeds: range) -> list[str]:
+def _page(lies: Sequence[list[str]], fair: Sequence[list[str]], seeds: range) -> list[str]:
     about = f"Seeds {seeds.start} to {seeds.stop - 1}; missions of {DURATION_S:g} s."
-    return [about, "", LEGEND, *table(HEADER, lies), "", *table(CLEAN_HEADER, fair)]
+    shown = [table(head, rows) for head, rows in ((HEADER, lies), (CLEAN_HEADER, fair)) if rows]
+    return [about, "", LEGEND, *("\n".join((*lines, "")) for lines in shown)]
 
 
 if __name__ == "__main__":
