@@ -37,7 +37,16 @@ from ssm_graph.sensors.dvl import DvlLog, DvlMount
 from ssm_graph.sensors.gnss import GnssLog
 from ssm_graph.sensors.imu import ImuLog
 
-WANTED: Final = ("IMU", "BARO", "BAR2", "GPS", "GPA", "VISO", "PARM")
+FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
+    "IMU": ("TimeUS", "GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ"),
+    "BARO": ("TimeUS", "Press"),
+    "BAR2": ("TimeUS", "Press"),
+    "GPS": ("TimeUS", "Status", "Lat", "Lng", "Alt", "HDop"),
+    "GPA": ("TimeUS", "VAcc", "HAcc"),
+    "VISO": ("TimeUS", "dt", "PosDX", "PosDY", "PosDZ", "conf"),
+    "PARM": ("Value",),
+}
+"""Messages that are read, and the numbers that each has to have."""
 SEA_WATER: Final = 1025.0
 """kg/m^3"""
 GRAVITY: Final = 9.80665
@@ -138,12 +147,19 @@ def _read(log: Path) -> tuple[dict[str, Columns], list[str]]:
     except OSError as error:
         raise DataError(f"{log}: cannot be read: {error.strerror or error}") from error
     if is_dataflash(data[:16]):
-        found = read_dataflash(data, WANTED)
+        found = read_dataflash(data, FIELDS)
         messages, skipped = dict(found.messages), found.n_skipped
         about = f"ArduPilot dataflash log, {found.n_records} records"
     else:
         messages, skipped = read_telemetry(data)
         about = "MAVLink telemetry log; the rates are those of the radio"
+    for name, columns in messages.items():
+        for field in FIELDS[name]:
+            if field not in columns or columns[field].dtype.kind not in "iuf":
+                raise DataError(
+                    f"{log}: message {name} has no number {field!r}, it has {', '.join(columns)}; "
+                    "expected a log of ArduPilot 3.6 or later"
+                )
     notes = [about, *([f"{skipped} bytes of no sound record left out"] if skipped else [])]
     return messages, notes
 

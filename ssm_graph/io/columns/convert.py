@@ -139,6 +139,11 @@ def times(wanted: Times, source: Source) -> Array:
             # 1e-9 is not exact, 1e9 is: times of many digits are divided.
             values = source.numbers(name, wanted.place)
             part = values / (1.0 / factor) if factor < 1.0 else values * factor
+        if total is not None and len(part) != len(total):
+            raise DataError(
+                f"{wanted.place}: column {name!r} of {source.label} has {len(part)} rows, the one "
+                f"before {len(total)}; expected as many"
+            )
         total = part if total is None else total + part
     assert total is not None
     return total + wanted.offset_s
@@ -148,10 +153,11 @@ def _dates(source: Source, name: str, place: str) -> Array:
     """Return Unix seconds (N,) of dates; those without a zone are UTC."""
     cells = source.column(name, place)
     if not isinstance(cells, list) and cells.dtype.kind == "M":
-        return np.asarray(cells.astype("datetime64[ns]").astype(np.int64) / 1e9)
+        unix_s = cells.astype("datetime64[ns]").astype(np.int64) / 1e9
+        return np.where(np.isnat(cells), np.nan, unix_s)
     found = np.full(len(cells), np.nan)
     for row, cell in enumerate(cells):
-        text = cell.decode() if isinstance(cell, bytes) else str(cell)
+        text = cell.decode("utf-8", "replace") if isinstance(cell, bytes) else str(cell)
         if not text:
             continue
         try:
@@ -188,7 +194,9 @@ def _columns(
         n_rows = len(times(section.times, source))
         cells = np.tile(np.array(quantity.values), (n_rows, 1))
     else:
-        cells = np.column_stack([_signed(source, c, quantity) for c in quantity.columns])
+        cells = _side_by_side(
+            quantity, source, [_signed(source, c, quantity) for c in quantity.columns]
+        )
     cells = cells * factor
     cells[~_valid(quantity, source, cells.shape)] = np.nan
     if quantity.axes is not BodyAxes.FRD:
@@ -238,7 +246,22 @@ def _valid(quantity: Quantity, source: Source, shape: tuple[int, ...]) -> Any:
             f"{quantity.place} valid: expected one column or {shape[1]}, got {len(quantity.valid)}"
         )
     flags = [np.nan_to_num(source.numbers(name, quantity.place)) for name in quantity.valid]
-    return np.broadcast_to(np.column_stack(flags) != 0.0, shape)
+    together = _side_by_side(quantity, source, flags, n_rows=shape[0])
+    return np.broadcast_to(together != 0.0, shape)
+
+
+def _side_by_side(
+    quantity: Quantity, source: Source, columns: Sequence[Array], n_rows: int | None = None
+) -> Array:
+    """Return columns as one array (N, columns); raise where they are not of one length."""
+    counts = {len(values) for values in columns} | ({n_rows} if n_rows is not None else set())
+    if len(counts) > 1:
+        raise DataError(
+            f"{quantity.place}: its columns of {source.label} have "
+            f"{' and '.join(map(str, sorted(counts)))} rows; expected as many of each; are they of "
+            "one sensor?"
+        )
+    return np.column_stack(columns)
 
 
 def _depth_of(pressure: Array, given: Mapping[str, float]) -> Array:

@@ -82,13 +82,15 @@ class Drafted(NamedTuple):
 def draft_map(*sources: Source) -> Drafted:
     """Return a ``map.toml`` for files of columns; of a section, the first file that has it counts.
 
-    Raises :class:`DataError` where no column of a file is a time.
+    Raises :class:`DataError` where readings of a file have no column that is a time.
     """
     found: dict[str, tuple[Source, list[Guess]]] = {}
     for source in sources:
         for name, guesses in _sections(source).items():
-            if guesses:
-                found.setdefault(name, (source, guesses))
+            found.setdefault(name, (source, guesses))
+    if not found:
+        for source in sources:
+            guess_time(source)  # which says what is missing
     labels = ", ".join(source.label for source in sources)
     lines = [
         f"# Drafted of {labels} by the names of columns and the sizes of their numbers:",
@@ -110,7 +112,7 @@ def draft_map(*sources: Source) -> Drafted:
 
 
 def _sections(source: Source) -> dict[str, list[Guess]]:
-    """Return what a file may hold, each with its time; nothing where there is nothing."""
+    """Return what a file may hold, each with its time."""
     plain = {_plain(name): name for name in source.columns}
     place = _scalars(source, plain, ("lat", "lon", "height"))
     found = {
@@ -120,8 +122,9 @@ def _sections(source: Source) -> dict[str, list[Guess]]:
         "gnss": place if {"lat", "lon"} <= {guess.key for guess in place} else [],
         "heading": _scalars(source, plain, ("heading",)),
     }
-    time = guess_time(source)
-    return {name: [time, *guesses] if guesses else [] for name, guesses in found.items()}
+    found = {name: guesses for name, guesses in found.items() if guesses}
+    time = [guess_time(source)] if found else []
+    return {name: [*time, *guesses] for name, guesses in found.items()}
 
 
 def _lines(guesses: list[Guess]) -> Iterator[str]:

@@ -31,6 +31,8 @@ from ssm_graph.mission.run_status import RunStatus
 MOST_BROWSERS: Final = 8
 MOST_CONNECTIONS: Final = 32
 """Those that ask, too; more are hung up on."""
+CLOSES_S: Final = 0.1
+"""The end of a run waits for the page no longer."""
 PATIENCE_S: Final = 5.0
 """A browser that takes or says nothing for so long is hung up on."""
 MOST_POINTS: Final = 4000
@@ -93,8 +95,7 @@ class LivePage:
             ) from error
         self.port: int = self._server.server_address[1]
         self.address = f"http://{f'[{host}]' if ':' in host else host}:{self.port}/"
-        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
-        self._thread.start()
+        threading.Thread(target=self._server.serve_forever, args=(CLOSES_S,), daemon=True).start()
 
     def __enter__(self) -> LivePage:
         return self
