@@ -136,8 +136,8 @@ def read_times(path: Path, epoch_s: float | None) -> Array:
     Raises :class:`DataError` naming the line.
     """
     try:
-        rows = [row for row in csv.reader(path.read_text(encoding="utf-8-sig").splitlines())]
-    except (OSError, ValueError) as error:
+        rows = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
+    except (OSError, ValueError, csv.Error) as error:
         raise DataError(f"{path}: cannot be read: {error}") from error
     numbered = [(i, row) for i, row in enumerate(rows, 1) if row and not row[0].startswith("#")]
     if not numbered:

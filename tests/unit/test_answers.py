@@ -275,6 +275,9 @@ def test_other_inertial_data_are_refused(
     words = ["export", str(result), "--format", "csv", "--rate", "2", "--mission", str(tmp_path)]
     assert main(words) == 2
     assert "is not the file that this result was made of" in capsys.readouterr().err
+    (tmp_path / "imu.csv").unlink()
+    assert main(words) == 2
+    assert "there is no file 'imu.csv'" in capsys.readouterr().err
 
 
 def test_files_of_times(tmp_path: Path) -> None:
@@ -288,6 +291,7 @@ def test_files_of_times(tmp_path: Path) -> None:
         ("name,when\na,1\n", r"t\.txt:1: expected a column time_s or utc"),
         ("1\nsoon\n", r"t\.txt:2: expected"),
         ("", "found none"),
+        ('"' + "1" * 200_000, "cannot be read: field larger"),
     ):
         path.write_text(text)
         with pytest.raises(DataError, match=message):
@@ -360,6 +364,11 @@ def test_a_result_opens_as_tables(folders: tuple[Path, Path]) -> None:
     assert len(frame) == 101
     assert len(repr(result)) < 160
     assert "CONVERGED" in repr(result)
+    for times in ([1.0, np.nan], [np.nan], [2.0, 1.0], 1.0):
+        with pytest.raises(DataError, match="expected one or more numbers in a row"):
+            result.answers(times)
+    with pytest.raises(ConfigError, match="time_s or rate_hz, got both"):
+        result.answers([1.0], rate_hz=2.0)
 
 
 @pytest.mark.slow
