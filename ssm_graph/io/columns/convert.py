@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from ssm_graph.base.tables import (
     check_finite,
     check_increasing,
 )
+from ssm_graph.base.units import STANDARD_GRAVITY
 from ssm_graph.io.columns.map_file import (
     INSTEAD,
     PRESSURE_KEYS,
@@ -39,9 +40,6 @@ from ssm_graph.sensors.dvl import counted_sigma
 from ssm_graph.sensors.imu import interval_ends
 from ssm_graph.sensors.instrument import Instrument, read_columns
 from ssm_graph.sensors.registry import BY_LOG, BY_SECTION
-
-GRAVITY: Final = 9.80665
-"""m/s^2, that makes a depth of a pressure."""
 
 
 def convert_columns(
@@ -268,7 +266,9 @@ def _depth_of(pressure: Array, given: Mapping[str, float]) -> Array:
     """Return minus the height of a sensor, m, of its pressure, Pa."""
     told = {**PRESSURE_KEYS, SURFACE_KEY: 0.0, **given}
     over = pressure - told["atmosphere_pa"]
-    return np.asarray(over / (told["water_density_kg_per_m3"] * GRAVITY) - told[SURFACE_KEY])
+    return np.asarray(
+        over / (told["water_density_kg_per_m3"] * STANDARD_GRAVITY) - told[SURFACE_KEY]
+    )
 
 
 def _kept(

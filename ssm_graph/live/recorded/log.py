@@ -24,6 +24,7 @@ from ssm_graph.base.errors import DataError
 from ssm_graph.io.nortek.nortek import read_nortek
 from ssm_graph.io.nortek.packets import is_nortek
 from ssm_graph.io.raw_log.rows import RowKind
+from ssm_graph.io.recording import whole
 from ssm_graph.io.tables.append_file import write_through
 from ssm_graph.io.teledyne.ensembles import is_pd0
 from ssm_graph.io.teledyne.pd0 import read_pd0
@@ -82,10 +83,7 @@ def read_recorded(log: Path, options: NmeaOptions | None = None) -> Recorded | N
 
     ``options`` are those of NMEA: what of its depths is the vehicle's, and the water's surface.
     """
-    try:
-        data = _in_utf8(log.read_bytes())
-    except OSError as error:
-        raise DataError(f"{log}: cannot be read: {error.strerror or error}") from error
+    data = _in_utf8(whole(log))
     head = data[:_SNIFFED]
     binary = next((read for is_it, read in _BINARY if is_it(head)), None)
     if binary is not None:
