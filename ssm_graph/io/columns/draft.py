@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssm_graph.base.errors import DataError
+from ssm_graph.base.times import UNIX_FROM_S, UNIX_UNTIL_S
 from ssm_graph.io.columns.sources import Source
 from ssm_graph.sensors.imu import FASTEST_TURN, FORCE_UNITS
 
@@ -49,8 +50,6 @@ _NAMED_UNITS: Final = (
 )
 _UNITS_AS_PINT: Final = {"pa": "Pa", "hpa": "hPa", "kpa": "kPa", "ut": "uT", "nt": "nT"}
 _TIME_UNITS: Final = (("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9))
-_UNIX: Final = (1e9, 4e9)
-"""Seconds from 2001 to 2096."""
 _FAR: Final = 3.0
 """Times the largest other number."""
 _RATES_HZ: Final = (0.05, 5000.0)
@@ -169,7 +168,7 @@ def guess_time(source: Source) -> Guess:
         if named in dict(_TIME_UNITS):
             return Guess("time", (name,), named, "by its name")
         for unit, size in _TIME_UNITS:
-            if _UNIX[0] < np.median(values) / size < _UNIX[1]:
+            if UNIX_FROM_S < np.median(values) / size < UNIX_UNTIL_S:
                 return Guess("time", (name,), unit, "Unix time by its size")
         step = float(np.median(np.diff(np.unique(values)))) if len(values) > 1 else 1.0
         fits = [u for u, size in _TIME_UNITS if _RATES_HZ[0] <= size / step <= _RATES_HZ[1]]

@@ -21,6 +21,7 @@ from typing import Any, Final
 import numpy as np
 
 from ssm_graph.base.errors import DataError
+from ssm_graph.base.times import UNIX_FROM_S
 from ssm_graph.io.nortek.nortek import read_nortek
 from ssm_graph.io.nortek.packets import is_nortek
 from ssm_graph.io.raw_log.rows import RowKind
@@ -62,8 +63,6 @@ _BINARY: Final[Sequence[tuple[Callable[[bytes], bool], Callable[[Path], Any]]]] 
     (is_pd6, read_pd6),
 )
 """Makers' own formats: by the first bytes whether a file is of one, and what reads it."""
-_UNIX_S: Final = 1e9
-"""A larger number of seconds is Unix time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,7 +231,7 @@ def _unix(report: Mapping[str, Any], time_s: float) -> float:
     """Return the Unix time that a report states, or the one before."""
     for key, unit in (("time_of_validity", 1e-6), ("ts", 1.0)):
         value = report.get(key)
-        if isinstance(value, (int, float)) and value * unit > _UNIX_S:
+        if isinstance(value, (int, float)) and value * unit > UNIX_FROM_S:
             return float(value) * unit
     return time_s
 
