@@ -72,13 +72,16 @@ def read_pd45(path: Path) -> Recording:
             "(command EX00xxx or EX01xxx)"
         )
     messages: list[Message] = []
-    last, day_s, known = -np.inf, 0.0, 0
+    last, day_s, known, n_repeats = -np.inf, 0.0, 0, 0
     for body in found:
         hour, minute, second, hundredths = body[35:39]
         time_s = day_s + 3600.0 * hour + 60.0 * minute + second + hundredths / 100.0
         if time_s < last - _HALF_DAY_S:  # past midnight
             day_s, time_s = day_s + _DAY_S, time_s + _DAY_S
-        if time_s <= last:
+        if time_s == last:
+            n_repeats += 1
+            continue
+        if time_s < last:
             raise DataError(
                 f"{path}: the clock goes from {last:.2f} to {time_s:.2f} s of the day; expected "
                 "increasing times: split the file there"
@@ -100,6 +103,8 @@ def read_pd45(path: Path) -> Recording:
         if coordinates == _BEAM
         else _AXES
     )
+    if n_repeats:
+        notes.append(f"{n_repeats} reports of a time that an earlier one has were left out")
     if n_bytes < len(data):
         notes.append(f"{len(data) - n_bytes} bytes of no sound ensemble left out")
     about = (
