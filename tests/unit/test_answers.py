@@ -330,6 +330,9 @@ lever_arm_sigma_m = 0.1
     np.testing.assert_array_equal(points["camera"].lever_arm_b, [1.0, -2.0, -3.0])
     np.testing.assert_allclose(points["camera"].mounting, [0.0, -math.pi / 2, 0.0])
     np.testing.assert_array_equal(points["dvl"].lever_arm_b, [0.2, -0.5, -0.1])
+    path.write_text(text.replace('"camera"', '"dvl"'))
+    with pytest.raises(ConfigError, match=r"\[\[point\]\] 1 name: there is another 'dvl'"):
+        read_vehicle_toml(path).points()
     path.write_text(text.replace("lever_arm_sigma_m", "lever_arm_sigma"))
     with pytest.raises(ConfigError, match=r"\[\[point\]\] 1 lever_arm_sigma: unknown key"):
         read_vehicle_toml(path)
