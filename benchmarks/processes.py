@@ -12,6 +12,11 @@ from benchmarks.report import note
 T = TypeVar("T")
 
 
+def tell(number: int, of: int, what: object) -> None:
+    """Say that one of many is done."""
+    note(f"{number} of {of}: {what} done")
+
+
 def side_by_side(
     task: Callable[..., T], cases: Iterable[tuple[Any, ...]], jobs: int, *, each_fresh: bool = False
 ) -> list[T]:
@@ -25,7 +30,7 @@ def side_by_side(
         futures = {pool.submit(task, *case): case for case in cases}
         for number, future in enumerate(as_completed(futures), start=1):
             future.result()
-            note(f"{number} of {len(futures)}: {futures[future]} done")
+            tell(number, len(futures), futures[future])
         return [future.result() for future in futures]
 
 

@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.online.stream import run_stream
-from benchmarks.report import Option, Report, note, number_text, table
+from benchmarks.processes import tell
+from benchmarks.report import Option, Report, number_text, table
 from benchmarks.soak.stream import GOOD, errors_of, longest_run
 from benchmarks.trust.lies import LIVE
 from benchmarks.trust.run import BEYOND, CLEAN, DURATION_S, REALISTIC, mission_of
@@ -174,10 +175,6 @@ def _levels(runs: Sequence[Run]) -> list[str]:
     return [f"{good:.2f}, {inside[:, 0].min():.2f}", f"{other:.2f}", number_text(float(level))]
 
 
-def _tell(number: int, of: int, key: Key) -> None:
-    note(f"{number} of {of}: {key} done")
-
-
 def main() -> None:
     """Run all missions and write the tables."""
     report = Report(
@@ -200,7 +197,7 @@ def main() -> None:
     kinds |= {CLEAN: (False, args.clean_s), REALISTIC: (True, args.clean_s)}
     keys: list[Key] = [(*cell, seed, *kinds[cell[0]]) for cell in cells for seed in seeds]
     ledger = Ledger(args.out / f"{code_version()}.jsonl", {"benchmark": "trust.live"})
-    made = run_trials(run, keys, ledger, n_jobs=args.jobs, on_progress=_tell)
+    made = run_trials(run, keys, ledger, n_jobs=args.jobs, on_progress=tell)
     runs = [Run(**made[key]) for key in keys]
     rows: dict[bool, list[list[str]]] = {True: [], False: []}
     for i, (label, grade) in enumerate(cells):

@@ -1,6 +1,7 @@
 """Lies that last, or that sensors share: the answer is right, or the status says that it is not.
 
-``python -m benchmarks.trust.run --keep`` (hours; a quick look is ``--seeds 2 --grades tactical``).
+``python -m benchmarks.trust.run --keep`` (hours; a quick look is ``--seeds 2 --grades tactical``;
+the same command again does what is missing).
 Missions of 400 s, DVL 5 mm/s; what lies, when and by how much is drawn for every seed.
 """
 
@@ -13,10 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.processes import side_by_side
+from benchmarks.processes import tell
 from benchmarks.report import Option, Report, number_text, table
 from benchmarks.trust.lies import LIES
 from ssm_graph import Estimate, Mission, SmootherConfig, SsmGraphError, evaluate, smooth
+from ssm_graph.base.code_version import code_version
 from ssm_graph.simulation import (
     AidSettings,
     DvlSettings,
@@ -29,6 +31,7 @@ from ssm_graph.simulation import (
     simulate,
     with_faults,
 )
+from ssm_graph.study.ledger import Key, Ledger, Row, run_trials
 
 DURATION_S = 400.0
 SIGMA_M_PER_S = 0.005
@@ -111,8 +114,19 @@ def mission_of(
     )
 
 
-def run(label: str, grade: str, seed: int, realistic: bool) -> Run:
-    """Smooth one mission with its lie, and as the oracle."""
+def run(key: Key) -> Row:
+    """Smooth one mission (label, grade, seed, is realistic) with its lie, and as the oracle."""
+    label, grade, seed, realistic = str(key[0]), str(key[1]), int(key[2]), bool(key[3])
+    row = _run(label, grade, seed, realistic)._asdict()
+    return row | {f"inside {i}": share for i, share in enumerate(row.pop("inside"))}
+
+
+def _of(row: Row) -> Run:
+    inside = tuple(row[f"inside {i}"] for i in range(3 * len(SHARES)))
+    return Run(inside=inside, **{name: row[name] for name in Run._fields if name != "inside"})
+
+
+def _run(label: str, grade: str, seed: int, realistic: bool) -> Run:
     rng = np.random.default_rng([seed, *label.encode()])
     lie = LIES.get(label)
     with_gnss = seed % 2 == 0 if lie is None or lie.with_gnss is None else lie.with_gnss
@@ -261,7 +275,7 @@ def main() -> None:
         Option("--first-seed", 20_000, "where they begin"),
         Option("--grades", "navigation,tactical", "names with commas between them"),
         Option("--clean-grades", "navigation,tactical,mems", "of missions without a fault"),
-        Option("--only", "", "lies whose names have this in them"),
+        Option("--only", "", "lies, or missions without, whose names have this in them"),
         Option("--realistic", False, "lies on realistic instruments, too"),
         Option("--jobs", 2, "missions at a time"),
     )
@@ -269,12 +283,14 @@ def main() -> None:
     seeds = range(args.first_seed, args.first_seed + args.seeds)
     labels = [label for label in LIES if args.only in label]
     lies = [(label, grade) for label in labels for grade in args.grades.split(",")]
-    fair = [(x, grade) for x in (CLEAN, REALISTIC) for grade in args.clean_grades.split(",")]
-    fair = [] if args.only else fair
+    sound = [label for label in (CLEAN, REALISTIC) if args.only in label]
+    fair = [(label, grade) for label in sound for grade in args.clean_grades.split(",")]
     cells = [(*cell, args.realistic) for cell in lies]
     cells += [(label, grade, label == REALISTIC) for label, grade in fair]
-    cases = [(label, grade, seed, real) for label, grade, real in cells for seed in seeds]
-    runs = side_by_side(run, cases, args.jobs)
+    cases: list[Key] = [(*cell[:2], seed, cell[2]) for cell in cells for seed in seeds]
+    ledger = Ledger(args.out / f"{code_version()}.jsonl", {"benchmark": "trust.run"})
+    made = run_trials(run, cases, ledger, n_jobs=args.jobs, on_progress=tell)
+    runs = [_of(made[key]) for key in cases]
     rows: dict[bool, list[list[str]]] = {True: [], False: []}
     for i, (label, grade, _) in enumerate(cells):
         own = runs[i * len(seeds) : (i + 1) * len(seeds)]
@@ -282,9 +298,10 @@ def main() -> None:
     report.write(_page(rows[True], rows[False], seeds))
 
 
-def _page(lies: Iterable[Sequence[str]], fair: Iterable[Sequence[str]], seeds: range) -> list[str]:
+def _page(lies: Sequence[list[str]], fair: Sequence[list[str]], seeds: range) -> list[str]:
     about = f"Seeds {seeds.start} to {seeds.stop - 1}; missions of {DURATION_S:g} s."
-    return [about, "", LEGEND, *table(HEADER, lies), "", *table(CLEAN_HEADER, fair)]
+    shown = [table(head, rows) for head, rows in ((HEADER, lies), (CLEAN_HEADER, fair)) if rows]
+    return [about, "", LEGEND, *("\n".join((*lines, "")) for lines in shown)]
 
 
 if __name__ == "__main__":
