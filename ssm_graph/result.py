@@ -20,7 +20,7 @@ from ssm_graph.evaluation.errors import Metrics, evaluate, reference_from_gnss, 
 from ssm_graph.io.export.columns import wide_columns
 from ssm_graph.io.export.track import Track, epoch_of, parse_epoch, track_of
 from ssm_graph.io.mission_folder.folder import read_imu, read_mission
-from ssm_graph.io.mission_folder.toml import read_mission_toml
+from ssm_graph.io.mission_folder.toml import read_mission_toml, table_path
 from ssm_graph.io.results.states import STATES_NAME, read_states
 from ssm_graph.io.results.summary import sha256
 from ssm_graph.io.results.tables import read_aids, read_results, trajectory_columns
@@ -110,11 +110,12 @@ class Result:
                 f"--mission: expected the mission folder of this result, got {str(folder)!r}, "
                 "which is none; say where it is"
             )
-        name = read_mission_toml(folder)["imu"].text("file")
-        stated = (inputs.get("sha256") or {}).get(name)
-        if stated is not None and sha256(folder / name) != stated:
+        toml = read_mission_toml(folder)
+        path = table_path(toml, "imu")
+        stated = (inputs.get("sha256") or {}).get(toml["imu"].text("file"))
+        if path is not None and stated is not None and sha256(path) != stated:
             raise ConfigError(
-                f"--mission: {folder / name} is not the file that this result was made of (its "
+                f"--mission: {path} is not the file that this result was made of (its "
                 "SHA-256 differs); give the mission as it was, or smooth it again"
             )
         return folder
@@ -166,9 +167,14 @@ class Result:
         covariance : whether the whole covariance is returned, too.
         on_progress : called with how many are done, were done before, and how many there are.
         """
-        times = self.posterior.time_s if time_s is None else np.asarray(time_s, np.float64)
+        if time_s is not None and rate_hz is not None:
+            raise ConfigError(
+                "answers: expected time_s or rate_hz, got both; leave one of them out"
+            )
         if rate_hz is not None:
             times = even_times(self.posterior, rate_hz)
+        else:
+            times = self.posterior.time_s if time_s is None else np.asarray(time_s, np.float64)
         return answers_at(
             self.posterior,
             self._imu,

@@ -30,6 +30,7 @@ from ssm_graph.base.frames import (
     phi_D_roll_pitch_heading,
 )
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.units import SEA_WATER, STANDARD_ATMOSPHERE
 from ssm_graph.io.mission_folder.vehicle import read_vehicle
 from ssm_graph.io.ros.aids import AID_TYPES, aid_message
 from ssm_graph.io.ros.messages import (
@@ -38,8 +39,6 @@ from ssm_graph.io.ros.messages import (
     IMU_TYPE,
     MARINE_DVL_TYPE,
     PRESSURE_TYPE,
-    SEA_WATER,
-    STANDARD_ATMOSPHERE,
     WATER_LINKED_TYPE,
     BeamSign,
     RosOptions,

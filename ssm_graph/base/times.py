@@ -9,6 +9,8 @@ from ssm_graph.base.frozen import Array
 
 MIN_SPACING_S = 1e-3
 """Times closer than this share a keyframe."""
+UNIX_FROM_S, UNIX_UNTIL_S = 1.0e9, 4.1e9
+"""September 2001 and the year 2099: times between them are Unix time, others begin near zero."""
 
 Indices = NDArray[np.intp]
 

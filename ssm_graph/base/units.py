@@ -16,6 +16,12 @@ MICRO_G: Final = 9.80665e-6
 """m/s^2"""
 PER_SQRT_H: Final = 1.0 / 60.0
 """1/sqrt(s)"""
+STANDARD_GRAVITY: Final = 9.80665
+"""m/s^2, of an accelerometer that counts in g, and of pressures that are depths"""
+STANDARD_ATMOSPHERE: Final = 101_325.0
+"""Pa"""
+SEA_WATER: Final = 1025.0
+"""kg/m^3, where nothing is said of the water"""
 
 
 def in_unit(value: float, unit: float) -> float:

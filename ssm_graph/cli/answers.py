@@ -21,8 +21,9 @@ from ssm_graph.report.terminal.progress import ProgressDisplay
 ABOUT = """\
 Answers are at the keyframes and of the inertial unit, unless asked for at the times of a file
 (--at), at a rate (--rate), or at a point of the vehicle (--point): an instrument's section of
-mission.toml, or the name of a [[point]] there, with its lever arm and mounting. Between keyframes
-the inertial data of the mission say how the vehicle moved; sigmas hold there as at keyframes."""
+mission.toml with its lever arm, along the axes of the vehicle, or the name of a [[point]] there,
+with its lever arm and mounting. Between keyframes the inertial data of the mission say how the
+vehicle moved; sigmas hold there as at keyframes."""
 
 
 def add_answer_arguments(parser: argparse.ArgumentParser, *, afterwards: bool) -> None:
@@ -136,8 +137,8 @@ def read_times(path: Path, epoch_s: float | None) -> Array:
     Raises :class:`DataError` naming the line.
     """
     try:
-        rows = [row for row in csv.reader(path.read_text(encoding="utf-8-sig").splitlines())]
-    except (OSError, ValueError) as error:
+        rows = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
+    except (OSError, ValueError, csv.Error) as error:
         raise DataError(f"{path}: cannot be read: {error}") from error
     numbered = [(i, row) for i, row in enumerate(rows, 1) if row and not row[0].startswith("#")]
     if not numbered:

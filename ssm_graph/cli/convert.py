@@ -12,6 +12,7 @@ from rich.console import Console
 
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frames import BodyAxes
+from ssm_graph.base.units import SEA_WATER, STANDARD_ATMOSPHERE
 from ssm_graph.cli.options import add_mission_output, choice_option, number_option
 from ssm_graph.cli.terminal import say
 from ssm_graph.io.ardupilot.convert import (
@@ -28,7 +29,7 @@ from ssm_graph.io.mission_folder.vehicle import instrument_notes, read_vehicle
 from ssm_graph.io.results.place import check_is_free
 from ssm_graph.io.ros.convert import convert_rosbag
 from ssm_graph.io.ros.log import ROLES, is_rosbag
-from ssm_graph.io.ros.messages import SEA_WATER, STANDARD_ATMOSPHERE, BeamSign, RosOptions
+from ssm_graph.io.ros.messages import BeamSign, RosOptions
 from ssm_graph.live.recorded.log import Recorded, read_recorded, write_tables
 from ssm_graph.live.recorded.merge import Merged, merge_recordings, mission_of_recording
 from ssm_graph.mission.mission import Mission

@@ -6,8 +6,8 @@ import re
 from datetime import UTC, datetime
 from typing import Final
 
-FIRST_UNIX_S: Final = 1.0e9
-"""September 2001: later times are Unix time."""
+from ssm_graph.base.times import UNIX_FROM_S, UNIX_UNTIL_S
+
 _TIME: Final = r"(\d+(?:\.\d+)?)"
 _WHEN: Final = re.compile(
     rf"\b(?:at|from|since) {_TIME} s\b(?: to {_TIME} s\b)?|(?<=, ){_TIME}-{_TIME} s(?=,)"
@@ -29,7 +29,8 @@ def clocked(sentence: str, begin_s: float = 0.0, epoch_s: float | None = None) -
         times = [float(text) for text in found.groups() if text is not None]
         minutes = " to ".join(f"{(time_s - begin_s) / 60.0:.1f}" for time_s in times)
         words = f"{found[0]} ({minutes} min"
-        known_s = 0.0 if begin_s > FIRST_UNIX_S and epoch_s is None else epoch_s
+        is_unix = epoch_s is None and UNIX_FROM_S <= begin_s <= UNIX_UNTIL_S
+        known_s = 0.0 if is_unix else epoch_s
         if known_s is not None:
             stamps = (datetime.fromtimestamp(known_s + t, UTC) for t in times)
             words += f", {' to '.join(f'{stamp:%H:%M:%S}' for stamp in stamps)} UTC"

@@ -141,8 +141,12 @@ def even_times(posterior: Posterior, rate_hz: float) -> Array:
 
 def _check(posterior: Posterior, imu: ImuLog, time_s: Array) -> None:
     begin_s, end_s = posterior.time_s[0], posterior.time_s[-1]
-    if len(time_s) == 0 or np.any(np.diff(time_s) <= 0.0):
-        raise DataError("times of answers: expected one or more, each later than the one before")
+    is_row = time_s.ndim == 1 and len(time_s) > 0 and np.isfinite(time_s).all()
+    if not (is_row and np.all(np.diff(time_s) > 0.0)):
+        raise DataError(
+            "times of answers: expected one or more numbers in a row, each later than the one "
+            "before; sort them with numpy.unique"
+        )
     if time_s[0] < begin_s - NEAR_S or time_s[-1] > end_s + NEAR_S:
         raise DataError(
             f"times of answers: expected {begin_s:.3f} to {end_s:.3f} s, as far as the keyframes "

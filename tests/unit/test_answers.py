@@ -275,6 +275,9 @@ def test_other_inertial_data_are_refused(
     words = ["export", str(result), "--format", "csv", "--rate", "2", "--mission", str(tmp_path)]
     assert main(words) == 2
     assert "is not the file that this result was made of" in capsys.readouterr().err
+    (tmp_path / "imu.csv").unlink()
+    assert main(words) == 2
+    assert "there is no file 'imu.csv'" in capsys.readouterr().err
 
 
 def test_files_of_times(tmp_path: Path) -> None:
@@ -288,6 +291,7 @@ def test_files_of_times(tmp_path: Path) -> None:
         ("name,when\na,1\n", r"t\.txt:1: expected a column time_s or utc"),
         ("1\nsoon\n", r"t\.txt:2: expected"),
         ("", "found none"),
+        ('"' + "1" * 200_000, "cannot be read: field larger"),
     ):
         path.write_text(text)
         with pytest.raises(DataError, match=message):
@@ -326,6 +330,9 @@ lever_arm_sigma_m = 0.1
     np.testing.assert_array_equal(points["camera"].lever_arm_b, [1.0, -2.0, -3.0])
     np.testing.assert_allclose(points["camera"].mounting, [0.0, -math.pi / 2, 0.0])
     np.testing.assert_array_equal(points["dvl"].lever_arm_b, [0.2, -0.5, -0.1])
+    path.write_text(text.replace('"camera"', '"dvl"'))
+    with pytest.raises(ConfigError, match=r"\[\[point\]\] 1 name: there is another 'dvl'"):
+        read_vehicle_toml(path).points()
     path.write_text(text.replace("lever_arm_sigma_m", "lever_arm_sigma"))
     with pytest.raises(ConfigError, match=r"\[\[point\]\] 1 lever_arm_sigma: unknown key"):
         read_vehicle_toml(path)
@@ -360,6 +367,11 @@ def test_a_result_opens_as_tables(folders: tuple[Path, Path]) -> None:
     assert len(frame) == 101
     assert len(repr(result)) < 160
     assert "CONVERGED" in repr(result)
+    for times in ([1.0, np.nan], [np.nan], [2.0, 1.0], 1.0):
+        with pytest.raises(DataError, match="expected one or more numbers in a row"):
+            result.answers(times)
+    with pytest.raises(ConfigError, match="time_s or rate_hz, got both"):
+        result.answers([1.0], rate_hz=2.0)
 
 
 @pytest.mark.slow

@@ -232,3 +232,19 @@ def test_other_bytes_are_none(tmp_path: Path) -> None:
     heads: Iterable[bytes] = (b"time_s,x\n", b"\xfd\x00\x00" + bytes(20), b"")
     for head in heads:
         assert not is_ardupilot(_file(tmp_path, head))
+
+
+def test_formats_that_are_not_those_of_ardupilot(tmp_path: Path) -> None:
+    """Fields under other names are said; a format without names, and one of formats, count not."""
+    size = 3 + struct.calcsize("<If")
+    old = struct.pack("<BB4s16s64s", 66, size, b"IMU", b"If", b"TimeMS,GyrX")
+    rows = b"".join(b"\xa3\x95\x42" + struct.pack("<If", k, 0.0) for k in range(3))
+    visual = record("VISO", 1, *[0.1] * 8)
+    log = _file(tmp_path, formats() + b"\xa3\x95\x80" + old + rows + visual)
+    with pytest.raises(DataError, match="message IMU has no number 'TimeUS', it has TimeMS, GyrX"):
+        convert_ardupilot(log)
+    for kind, labels in ((66, b"A,"), (128, b"A,B")):
+        strange = struct.pack("<BB4s16s64s", kind, size, b"IMU", b"If", labels)
+        found = read_dataflash(formats() + b"\xa3\x95\x80" + strange + visual, ["IMU", "VISO"])
+        assert found.n_records == len(FORMATS) + 3
+        assert len(found.messages["VISO"]["dt"]) == 1

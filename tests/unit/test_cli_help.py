@@ -74,6 +74,12 @@ def test_bash_completes(capfd: pytest.CaptureFixture[str]) -> None:
             "(0.5 to 1.0 min, 10:00:30 to 10:01:00 UTC): look",
         ),
         ("none at 60 s", 0.0, 1777629600.0, "none at 60 s (1.0 min, 10:01:00 UTC)"),
+        (
+            "none at 2e12 s, from 2000000000060 s",
+            2e12,
+            None,
+            "none at 2e12 s, from 2000000000060 s (1.0 min)",
+        ),
         ("gaps of 2.0 s, sigma 3.0 m", 0.0, None, "gaps of 2.0 s, sigma 3.0 m"),
     ],
 )

@@ -11,14 +11,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.cli.main import main
-from ssm_graph.io.columns.convert import convert_columns
+from ssm_graph.io.columns.convert import convert_columns, times
 from ssm_graph.io.columns.draft import draft_map
-from ssm_graph.io.columns.map_file import ColumnMap, read_map
-from ssm_graph.io.columns.sources import read_source
+from ssm_graph.io.columns.map_file import ColumnMap, Times, read_map
+from ssm_graph.io.columns.sources import Source, read_source
 from ssm_graph.io.columns.units import factor_to
 from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle, vehicle_of, write_vehicle
@@ -291,6 +292,8 @@ def test_units_of_the_world() -> None:
         factor_to("mm", "m/s", place="m [dvl]")
     with pytest.raises(ConfigError, match="'knobs' is no unit"):
         factor_to("knobs", "m/s", place="m")
+    with pytest.raises(ConfigError, match="'0 s' is no unit"):
+        factor_to("0 s", "s", place="m")
 
 
 MAP = (
@@ -439,3 +442,49 @@ def test_templates_are_valid(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert vehicle.mount.n_beams == 4
     assert main(["template", "--out", str(tmp_path)]) == 2
     assert "is there already" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ('"gz"]', '"short"]', "gyro: its columns of imu.mat have 2 and 4 rows"),
+        (
+            '["gx", "gy", "gz"]',
+            '{ columns = ["gx", "gy", "gz"], valid = "short" }',
+            "have 2 and 4 rows",
+        ),
+        ('time = "t"', 'time = { columns = ["t", "short"], units = ["s", "s"] }', "has 2 rows"),
+    ],
+)
+def test_columns_of_several_lengths_are_refused(small: Path, old: str, new: str, told: str) -> None:
+    """Times, readings and what says whether they count: never stretched, never a broken program."""
+    (small / "map.toml").write_text(MAP.replace("imu.csv", "imu.mat").replace(old, new, 1))
+    whole = {name: np.arange(4.0) for name in ("t", "gx", "gy", "gz", "ax", "ay", "az")}
+    savemat(small / "imu.mat", whole | {"short": np.arange(2.0)})
+    files = [small / "imu.mat", small / "dvl.csv"]
+    with pytest.raises(DataError, match=told):
+        convert_columns(files, read_map(small / "map.toml"), read_vehicle(small), name="x")
+
+
+def test_dates_that_are_missing_are_none() -> None:
+    """An empty cell of a Parquet table is no time of the year 1677."""
+    dates = np.array(["2026-05-01T10:00:00", "NaT"], "datetime64[us]")
+    found = times(Times("map time", ("t",), ("iso",), 0.0), Source("a.parquet", {"t": dates}))
+    np.testing.assert_array_equal(found, [UNIX, np.nan])
+
+
+def test_files_that_only_say_that_they_are_tables(tmp_path: Path) -> None:
+    """A quotation mark that is never closed; a matrix of a terabyte that was never written."""
+    path = tmp_path / "a.csv"
+    path.write_text('t,x\n0,"1' + "\n1" * 200_000)
+    with pytest.raises(DataError, match="quotation mark not closed"):
+        read_source(path)
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["t"] = np.arange(3.0)
+        file.create_dataset("frames", (1000, 480, 640), "u1")
+    assert list(read_source(tmp_path / "a.h5").columns) == ["t"]
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        file.create_dataset("x", (2**40,), "f8", chunks=(1024,))
+    with pytest.raises(DataError, match="expected columns of at most 2 GiB"):
+        read_source(tmp_path / "a.h5")

@@ -143,6 +143,9 @@ def test_rate_limit_admits_the_burst_and_then_the_rate() -> None:
     assert not bucket.admit(0.0)
     assert not bucket.admit(math.nan)
     assert bucket.admit(0.1)
+    bucket.grant(1.0)
+    bucket.catch_up()
+    assert sum(bucket.admit(0.1) for _ in range(20)) == 5
     with pytest.raises(ConfigError, match="rate above 0"):
         TokenBucket(rate_per_s=math.inf, burst=5)
 

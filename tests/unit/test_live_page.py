@@ -26,8 +26,10 @@ from ssm_graph.mission.run_status import LinkState, RunStatus, SourceStatus
 from tests.browser import BROWSER, Browser
 
 
-def status(k: int = 0, *, health: Health = Health.GOOD, **more: Any) -> RunStatus:
-    """Return how a run goes after ``k`` s eastwards at 1.5 m/s."""
+def status(
+    k: int = 0, *, health: Health = Health.GOOD, age_s: float = 0.1, **more: Any
+) -> RunStatus:
+    """Return how a run goes after ``k`` s eastwards at 1.5 m/s; ``age_s`` is that of its DVL."""
     navigation = Navigation(
         time_s=float(k),
         lat=0.8,
@@ -49,7 +51,7 @@ def status(k: int = 0, *, health: Health = Health.GOOD, **more: Any) -> RunStatu
         beam_weights=np.array([1.0, 0.02, np.nan, 0.6]),
         protection_m=math.inf if health is Health.BAD else 4.0,
     )
-    source = SourceStatus("dvl", "tcp://a:1", LinkState.CONNECTED, altitude_m=7.5)
+    source = SourceStatus("dvl", "tcp://a:1", LinkState.CONNECTED, age_s=age_s, altitude_m=7.5)
     event = Event(1.0, Severity.WARNING, "bottom_lost", "no bottom <b>lock</b>")
     return RunStatus(
         "rov",
@@ -98,9 +100,10 @@ def test_what_a_browser_is_told(page: LivePage) -> None:
     assert now["sigma_m"] == pytest.approx(math.sqrt((0.09 + 0.16) / 2.0))
     assert now["protection_m"] == 4.0
     assert now["beam_weights"] == [1.0, 0.02, None, 0.6]
-    page(status(3, health=Health.BAD))
+    page(status(3, health=Health.BAD, age_s=60.0))
     name, now = next(told)
     assert (now["health"], now["protection_m"], now["point"][7]) == ("BAD", None, 1)
+    assert now["altitude_m"] is None  # of a minute ago
 
 
 def test_before_the_first_answer(page: LivePage) -> None:
@@ -154,10 +157,18 @@ def test_it_serves_so_many(page: LivePage) -> None:
 
 
 @pytest.mark.parametrize(
-    ("host", "path", "code"), [("evil.example:80", "/", 403), ("localhost:80", "/etc", 404)]
+    ("host", "path", "code"),
+    [
+        ("evil.example:80", "/", 403),
+        ("", "/", 403),
+        ("localhost:80", "/etc", 404),
+        ("Localhost", "/etc", 404),
+        ("127.0.0.1", "/etc", 404),
+        ("[::1]", "/etc", 404),
+    ],
 )
 def test_others_are_refused(page: LivePage, host: str, path: str, code: int) -> None:
-    """A stranger's name for this computer, and what is not there."""
+    """A stranger's name for this computer, and what is not there; port 80 goes without saying."""
     request = urllib.request.Request(page.address.rstrip("/") + path, headers={"Host": host})
     with pytest.raises(urllib.error.HTTPError, match=str(code)):
         urllib.request.urlopen(request, timeout=10)
@@ -169,6 +180,8 @@ def test_addresses() -> None:
     assert parse_page_address("[::1]:81") == ("::1", 81)
     with pytest.raises(ConfigError, match="expected HOST:PORT"):
         parse_page_address("localhost:http")
+    with pytest.raises(ConfigError, match="give another"):
+        LivePage("a..b", 8080)
     with LivePage("127.0.0.1", 0) as page, pytest.raises(ConfigError, match="give another"):
         LivePage("127.0.0.1", page.port)
 

@@ -70,6 +70,9 @@ def test_other_coordinates(tmp_path: Path) -> None:
             read_pd45(_file(tmp_path, ensemble(0, [1] * 4, coordinates=coordinates)))
     with pytest.raises(DataError, match="2 different formats or coordinates"):
         read_pd45(_file(tmp_path, one[0] + ensemble(5, [1] * 4)))
+    twice = read_pd45(_file(tmp_path, 2 * ensemble(5, [1] * 4)))
+    assert len(twice.messages) == 1
+    assert any("1 reports of a time that an earlier one has" in note for note in twice.notes)
     with pytest.raises(DataError, match="the clock goes from"):
         read_pd45(_file(tmp_path, ensemble(5, [1] * 4) + ensemble(3, [1] * 4)))
 

@@ -26,10 +26,12 @@ from numpy.typing import NDArray
 
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.units import SEA_WATER, STANDARD_ATMOSPHERE, STANDARD_GRAVITY
 from ssm_graph.io.ardupilot.dataflash import Columns, is_dataflash, read_dataflash
 from ssm_graph.io.ardupilot.telemetry import is_telemetry, read_telemetry
 from ssm_graph.io.instruments.assumed import BEAM_SIGMA, DEPTH_SIGMA, NOISE
 from ssm_graph.io.mission_folder.assembly import mission_from
+from ssm_graph.io.recording import whole
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.vehicle import GNSS_AT_ORIGIN, Vehicle
 from ssm_graph.sensors.depth import DepthLog
@@ -37,14 +39,16 @@ from ssm_graph.sensors.dvl import DvlLog, DvlMount
 from ssm_graph.sensors.gnss import GnssLog
 from ssm_graph.sensors.imu import ImuLog
 
-WANTED: Final = ("IMU", "BARO", "BAR2", "GPS", "GPA", "VISO", "PARM")
-SEA_WATER: Final = 1025.0
-"""kg/m^3"""
-GRAVITY: Final = 9.80665
-"""m/s^2, that makes a depth of a pressure."""
-STANDARD_ATMOSPHERE: Final = 101_325.0
-"""Pa"""
-_LARGEST: Final = 1 << 31
+FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
+    "IMU": ("TimeUS", "GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ"),
+    "BARO": ("TimeUS", "Press"),
+    "BAR2": ("TimeUS", "Press"),
+    "GPS": ("TimeUS", "Status", "Lat", "Lng", "Alt", "HDop"),
+    "GPA": ("TimeUS", "VAcc", "HAcc"),
+    "VISO": ("TimeUS", "dt", "PosDX", "PosDY", "PosDZ", "conf"),
+    "PARM": ("Value",),
+}
+"""Messages that are read, and the numbers that each has to have."""
 _DRY_PA: Final = 1000.0
 """A pressure that changes less under way is that of the air."""
 _FIX_3D: Final = 3
@@ -131,19 +135,21 @@ def convert_ardupilot(
 
 
 def _read(log: Path) -> tuple[dict[str, Columns], list[str]]:
-    try:
-        if log.stat().st_size > _LARGEST:
-            raise DataError(f"{log}: larger than 2 GiB: split it")
-        data = log.read_bytes()
-    except OSError as error:
-        raise DataError(f"{log}: cannot be read: {error.strerror or error}") from error
+    data = whole(log)
     if is_dataflash(data[:16]):
-        found = read_dataflash(data, WANTED)
+        found = read_dataflash(data, FIELDS)
         messages, skipped = dict(found.messages), found.n_skipped
         about = f"ArduPilot dataflash log, {found.n_records} records"
     else:
         messages, skipped = read_telemetry(data)
         about = "MAVLink telemetry log; the rates are those of the radio"
+    for name, columns in messages.items():
+        for field in FIELDS[name]:
+            if field not in columns or columns[field].dtype.kind not in "iuf":
+                raise DataError(
+                    f"{log}: message {name} has no number {field!r}, it has {', '.join(columns)}; "
+                    "expected a log of ArduPilot 3.6 or later"
+                )
     notes = [about, *([f"{skipped} bytes of no sound record left out"] if skipped else [])]
     return messages, notes
 
@@ -330,7 +336,7 @@ def _depth(
     kept = _later(time_s)
     empty = np.zeros(0)
     log = bare or DepthLog(DEPTH_SIGMA, time_s=empty, depth=empty, lever_arm_b=np.zeros(3))
-    depth = (pressure - surface_pa) / (density * GRAVITY) - surface_m
+    depth = (pressure - surface_pa) / (density * STANDARD_GRAVITY) - surface_m
     note = (
         f"BARO: barometer {number}, {surface_pa:.0f} Pa at the surface, {density:.0f} kg/m^3; the "
         f"surface is taken to be {surface_m:.2f} m above the ellipsoid."

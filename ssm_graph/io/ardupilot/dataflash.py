@@ -112,7 +112,9 @@ def _format(fields: bytes) -> tuple[int, _Format] | None:
         for part in (fields[2:6], fields[6:22], fields[22:86])
     )
     columns = labels.split(",") if labels else []
-    if len(columns) != len(codes) or any(code not in _CODES for code in codes):
+    if kind == _FMT or len(columns) != len(codes) or "" in columns:
+        return None
+    if any(code not in _CODES for code in codes):
         return None
     try:
         dtype = np.dtype([(c, _CODES[k][0]) for c, k in zip(columns, codes, strict=True)])
@@ -125,10 +127,8 @@ def _format(fields: bytes) -> tuple[int, _Format] | None:
 
 
 def _columns(data: bytes, format_: _Format, starts: list[int]) -> Columns:
-    raw = np.frombuffer(data, np.uint8)
     size = format_.dtype.itemsize
-    rows = raw[np.array(starts)[:, None] + np.arange(size)]
-    records = np.ascontiguousarray(rows).view(format_.dtype)[:, 0]
+    records = np.frombuffer(b"".join(data[at : at + size] for at in starts), format_.dtype)
     return {
         name: records[name] if scale == 1.0 else records[name] * scale
         for name, scale in format_.scales.items()

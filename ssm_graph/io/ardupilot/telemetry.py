@@ -16,13 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssm_graph.base.errors import MissingExtraError
+from ssm_graph.base.units import STANDARD_GRAVITY
 from ssm_graph.io.ardupilot.dataflash import Columns
 
 _HEADS: Final = (0xFD, 0xFE)
 _LATEST_US: Final = 4_000_000_000_000_000
 """Unix microseconds of 2096."""
 _EARLIEST_US: Final = 1_000_000_000_000_000
-_MG: Final = 9.80665e-3
+_MG: Final = 1e-3 * STANDARD_GRAVITY
 
 _Read = Callable[[Any], tuple[float, ...]]
 MESSAGES: Final[Mapping[str, tuple[str, tuple[str, ...], _Read]]] = {

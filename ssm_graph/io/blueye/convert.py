@@ -33,6 +33,7 @@ from scipy.ndimage import median_filter, uniform_filter1d
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frames import wrap_to_pi
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.units import STANDARD_GRAVITY
 from ssm_graph.io.blueye import vehicle as x3
 from ssm_graph.io.blueye.log import GNSS_SENSOR_ID, BlueyeTables, read_blueye_tables
 from ssm_graph.io.mission_folder.assembly import mission_from
@@ -51,8 +52,6 @@ LABELS: Final = {
     "heading": "PositionEstimateTel of the DVL",
 }
 """What messages call the source of each instrument's readings."""
-STANDARD_GRAVITY: Final = 9.80665
-"""m/s^2, of an accelerometer that counts in g."""
 
 CLOCK_WINDOW: Final = 5
 """IMU values; odd."""

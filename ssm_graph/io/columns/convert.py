@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from ssm_graph.base.tables import (
     check_finite,
     check_increasing,
 )
+from ssm_graph.base.units import STANDARD_GRAVITY
 from ssm_graph.io.columns.map_file import (
     INSTEAD,
     PRESSURE_KEYS,
@@ -39,9 +40,6 @@ from ssm_graph.sensors.dvl import counted_sigma
 from ssm_graph.sensors.imu import interval_ends
 from ssm_graph.sensors.instrument import Instrument, read_columns
 from ssm_graph.sensors.registry import BY_LOG, BY_SECTION
-
-GRAVITY: Final = 9.80665
-"""m/s^2, that makes a depth of a pressure."""
 
 
 def convert_columns(
@@ -139,6 +137,11 @@ def times(wanted: Times, source: Source) -> Array:
             # 1e-9 is not exact, 1e9 is: times of many digits are divided.
             values = source.numbers(name, wanted.place)
             part = values / (1.0 / factor) if factor < 1.0 else values * factor
+        if total is not None and len(part) != len(total):
+            raise DataError(
+                f"{wanted.place}: column {name!r} of {source.label} has {len(part)} rows, the one "
+                f"before {len(total)}; expected as many"
+            )
         total = part if total is None else total + part
     assert total is not None
     return total + wanted.offset_s
@@ -148,10 +151,11 @@ def _dates(source: Source, name: str, place: str) -> Array:
     """Return Unix seconds (N,) of dates; those without a zone are UTC."""
     cells = source.column(name, place)
     if not isinstance(cells, list) and cells.dtype.kind == "M":
-        return np.asarray(cells.astype("datetime64[ns]").astype(np.int64) / 1e9)
+        unix_s = cells.astype("datetime64[ns]").astype(np.int64) / 1e9
+        return np.where(np.isnat(cells), np.nan, unix_s)
     found = np.full(len(cells), np.nan)
     for row, cell in enumerate(cells):
-        text = cell.decode() if isinstance(cell, bytes) else str(cell)
+        text = cell.decode("utf-8", "replace") if isinstance(cell, bytes) else str(cell)
         if not text:
             continue
         try:
@@ -188,7 +192,9 @@ def _columns(
         n_rows = len(times(section.times, source))
         cells = np.tile(np.array(quantity.values), (n_rows, 1))
     else:
-        cells = np.column_stack([_signed(source, c, quantity) for c in quantity.columns])
+        cells = _side_by_side(
+            quantity, source, [_signed(source, c, quantity) for c in quantity.columns]
+        )
     cells = cells * factor
     cells[~_valid(quantity, source, cells.shape)] = np.nan
     if quantity.axes is not BodyAxes.FRD:
@@ -238,14 +244,31 @@ def _valid(quantity: Quantity, source: Source, shape: tuple[int, ...]) -> Any:
             f"{quantity.place} valid: expected one column or {shape[1]}, got {len(quantity.valid)}"
         )
     flags = [np.nan_to_num(source.numbers(name, quantity.place)) for name in quantity.valid]
-    return np.broadcast_to(np.column_stack(flags) != 0.0, shape)
+    together = _side_by_side(quantity, source, flags, n_rows=shape[0])
+    return np.broadcast_to(together != 0.0, shape)
+
+
+def _side_by_side(
+    quantity: Quantity, source: Source, columns: Sequence[Array], n_rows: int | None = None
+) -> Array:
+    """Return columns as one array (N, columns); raise where they are not of one length."""
+    counts = {len(values) for values in columns} | ({n_rows} if n_rows is not None else set())
+    if len(counts) > 1:
+        raise DataError(
+            f"{quantity.place}: its columns of {source.label} have "
+            f"{' and '.join(map(str, sorted(counts)))} rows; expected as many of each; are they of "
+            "one sensor?"
+        )
+    return np.column_stack(columns)
 
 
 def _depth_of(pressure: Array, given: Mapping[str, float]) -> Array:
     """Return minus the height of a sensor, m, of its pressure, Pa."""
     told = {**PRESSURE_KEYS, SURFACE_KEY: 0.0, **given}
     over = pressure - told["atmosphere_pa"]
-    return np.asarray(over / (told["water_density_kg_per_m3"] * GRAVITY) - told[SURFACE_KEY])
+    return np.asarray(
+        over / (told["water_density_kg_per_m3"] * STANDARD_GRAVITY) - told[SURFACE_KEY]
+    )
 
 
 def _kept(

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssm_graph.base.errors import DataError
+from ssm_graph.base.times import UNIX_FROM_S, UNIX_UNTIL_S
 from ssm_graph.io.columns.sources import Source
 from ssm_graph.sensors.imu import FASTEST_TURN, FORCE_UNITS
 
@@ -49,8 +50,6 @@ _NAMED_UNITS: Final = (
 )
 _UNITS_AS_PINT: Final = {"pa": "Pa", "hpa": "hPa", "kpa": "kPa", "ut": "uT", "nt": "nT"}
 _TIME_UNITS: Final = (("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9))
-_UNIX: Final = (1e9, 4e9)
-"""Seconds from 2001 to 2096."""
 _FAR: Final = 3.0
 """Times the largest other number."""
 _RATES_HZ: Final = (0.05, 5000.0)
@@ -82,13 +81,15 @@ class Drafted(NamedTuple):
 def draft_map(*sources: Source) -> Drafted:
     """Return a ``map.toml`` for files of columns; of a section, the first file that has it counts.
 
-    Raises :class:`DataError` where no column of a file is a time.
+    Raises :class:`DataError` where readings of a file have no column that is a time.
     """
     found: dict[str, tuple[Source, list[Guess]]] = {}
     for source in sources:
         for name, guesses in _sections(source).items():
-            if guesses:
-                found.setdefault(name, (source, guesses))
+            found.setdefault(name, (source, guesses))
+    if not found:
+        for source in sources:
+            guess_time(source)  # which says what is missing
     labels = ", ".join(source.label for source in sources)
     lines = [
         f"# Drafted of {labels} by the names of columns and the sizes of their numbers:",
@@ -110,7 +111,7 @@ def draft_map(*sources: Source) -> Drafted:
 
 
 def _sections(source: Source) -> dict[str, list[Guess]]:
-    """Return what a file may hold, each with its time; nothing where there is nothing."""
+    """Return what a file may hold, each with its time."""
     plain = {_plain(name): name for name in source.columns}
     place = _scalars(source, plain, ("lat", "lon", "height"))
     found = {
@@ -120,8 +121,9 @@ def _sections(source: Source) -> dict[str, list[Guess]]:
         "gnss": place if {"lat", "lon"} <= {guess.key for guess in place} else [],
         "heading": _scalars(source, plain, ("heading",)),
     }
-    time = guess_time(source)
-    return {name: [time, *guesses] if guesses else [] for name, guesses in found.items()}
+    found = {name: guesses for name, guesses in found.items() if guesses}
+    time = [guess_time(source)] if found else []
+    return {name: [*time, *guesses] for name, guesses in found.items()}
 
 
 def _lines(guesses: list[Guess]) -> Iterator[str]:
@@ -166,7 +168,7 @@ def guess_time(source: Source) -> Guess:
         if named in dict(_TIME_UNITS):
             return Guess("time", (name,), named, "by its name")
         for unit, size in _TIME_UNITS:
-            if _UNIX[0] < np.median(values) / size < _UNIX[1]:
+            if UNIX_FROM_S < np.median(values) / size < UNIX_UNTIL_S:
                 return Guess("time", (name,), unit, "Unix time by its size")
         step = float(np.median(np.diff(np.unique(values)))) if len(values) > 1 else 1.0
         fits = [u for u, size in _TIME_UNITS if _RATES_HZ[0] <= size / step <= _RATES_HZ[1]]

@@ -13,6 +13,7 @@ from typing import Any, Final, NamedTuple
 from ssm_graph.base.errors import ConfigError, nearest_hint
 from ssm_graph.base.frames import BodyAxes
 from ssm_graph.base.settings import read_settings_file, shown
+from ssm_graph.base.units import SEA_WATER, STANDARD_ATMOSPHERE
 from ssm_graph.sensors.imu import Stamp
 from ssm_graph.sensors.instrument import Column
 from ssm_graph.sensors.registry import INSTRUMENTS
@@ -67,7 +68,10 @@ QUANTITIES: Final[Mapping[str, Mapping[str, Wanted]]] = {
 """By section and name: those of the columns of its table, ``gyro`` of ``gyro_{}_rad_per_s``."""
 INSTEAD: Final = {"dvl": ("velocity", "m/s"), "depth": ("pressure", PASCAL)}
 """What a section may have in the place of its first quantity."""
-PRESSURE_KEYS: Final = {"water_density_kg_per_m3": 1025.0, "atmosphere_pa": 101_325.0}
+PRESSURE_KEYS: Final = {
+    "water_density_kg_per_m3": SEA_WATER,
+    "atmosphere_pa": STANDARD_ATMOSPHERE,
+}
 """Of a depth by pressure, with what is the case without: sea water, an absolute pressure."""
 SURFACE_KEY: Final = "surface_height_m"
 

@@ -25,6 +25,8 @@ ENDINGS: Final = (*CSV_ENDINGS, ".parquet", ".mat", ".h5", ".hdf5")
 _DELIMITERS: Final = ",;\t"
 _WIDEST: Final = 64
 """Columns of a matrix; a longer side is its rows."""
+_LARGEST: Final = 1 << 31
+"""Bytes of one matrix of HDF5, whose file states its size whatever is in it."""
 _MARKS: Final = ("#", "%", "//")
 """Begin a line of remarks, or a header."""
 
@@ -103,6 +105,10 @@ def read_source(path: Path) -> Source:
             return Source(path.name, _hdf5(path))
     except OSError as error:
         raise DataError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except csv.Error as error:
+        raise DataError(
+            f"{path}: expected a table of columns, got: {error}; is a quotation mark not closed?"
+        ) from error
     raise DataError(
         f"{path}: expected a table that ends in {', '.join(ENDINGS)}, got {path.suffix!r}"
     )
@@ -229,8 +235,16 @@ def _hdf5(path: Path) -> dict[str, Any]:
     found: dict[str, Any] = {}
 
     def visit(name: str, item: Any) -> None:
-        if not isinstance(item, h5py.Dataset) or name.startswith("#") or not item.shape:
+        if not isinstance(item, h5py.Dataset) or name.startswith("#"):
             return
+        shape = item.shape or (1, 1, 1)
+        if len(shape) > 2 or (len(shape) == 2 and min(shape) > _WIDEST):
+            return  # images and the like are no columns, and never read
+        if item.nbytes > _LARGEST:
+            raise DataError(
+                f"{path}: {name} states {item.nbytes} bytes; expected columns of at most 2 GiB: "
+                "write the file without it"
+            )
         if item.dtype.names:  # a table of named fields
             for key in item.dtype.names:
                 found.update(_split(f"{name}/{key}", np.asarray(item[key])))
@@ -240,7 +254,7 @@ def _hdf5(path: Path) -> dict[str, Any]:
     try:
         with h5py.File(path) as file:
             file.visititems(visit)
-    except (OSError, RuntimeError, KeyError) as error:
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
         raise DataError(f"{path}: expected an HDF5 file, got: {error}") from error
     return found
 

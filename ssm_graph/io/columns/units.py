@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from functools import cache
 from importlib import import_module
@@ -37,7 +38,10 @@ def factor_to(unit: str, wanted: str, *, place: str) -> float:
     registry, pint = _registry()
     try:
         quantity = registry.Quantity(1.0, "") * registry.parse_expression(words)
-        return float(quantity.to(wanted.replace("^", "**")).magnitude)
+        factor = float(quantity.to(wanted.replace("^", "**")).magnitude)
+        if not (math.isfinite(factor) and factor != 0.0):
+            raise ValueError(f"it is {factor:g} {wanted}")
+        return factor
     except pint.DimensionalityError:
         raise ConfigError(f"{place}: expected a unit like {wanted}, got {unit!r}") from None
     except Exception as error:  # pint's parser raises what Python's does

@@ -15,12 +15,9 @@ from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frames import R_lb_from_roll_pitch_heading
 from ssm_graph.base.frozen import Array, FrozenArrays, optional_shaped, shaped
 from ssm_graph.base.projection import Utm, utm
+from ssm_graph.base.times import UNIX_FROM_S, UNIX_UNTIL_S
 from ssm_graph.io.results.tables import Results
 
-UNIX_FROM_S: Final = 1.0e9
-"""September 2001: times from here on are Unix time, those of other clocks begin near zero."""
-UNIX_UNTIL_S: Final = 4.1e9
-"""The year 2099."""
 FRD_FROM_FLU: Final = np.diag([1.0, -1.0, -1.0])
 _ENU: Final = ("east", "north", "up")
 

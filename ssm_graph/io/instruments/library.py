@@ -18,14 +18,13 @@ from typing import Any, Final
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.settings import shown
-from ssm_graph.base.units import in_unit
+from ssm_graph.base.units import STANDARD_GRAVITY, in_unit
 
 KEY: Final = "instrument"
 """Of the sections ``[imu]`` and ``[dvl]``."""
 TABLES: Final[Mapping[str, str]] = {"imu": "imus.toml", "dvl": "dvls.toml"}
 _TEXTS: Final = ("maker", "sheet", "basis")
-_STANDARD_GRAVITY: Final = 9.80665
-_UG_OF_WALK: Final = 1e6 / (60.0 * _STANDARD_GRAVITY)
+_UG_OF_WALK: Final = 1e6 / (60.0 * STANDARD_GRAVITY)
 """ug/sqrt(Hz) of one m/s/sqrt(h)."""
 
 _IMU_KEYS: Final[Mapping[str, tuple[str, float]]] = {

@@ -171,7 +171,10 @@ class MissionToml:
             if owner is not None and hasattr(owner, "lever_arm_b"):
                 found[one.section] = Point(one.section, owner.lever_arm_b)
         for settings in self.lists["point"]:
-            found[settings.text("name")] = point(settings)
+            name = settings.text("name")
+            if name in found:
+                raise settings.fault("name", f"there is another {name!r}; expected one of its own")
+            found[name] = point(settings)
         return found
 
     def fault_of_no_place(self) -> ConfigError:

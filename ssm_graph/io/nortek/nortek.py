@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -13,12 +12,12 @@ from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.io.nortek.packets import NUCLEUS_FAMILY, Packet, find_packets
 from ssm_graph.io.nortek.reports import Report, nucleus_heading, nucleus_imu, report_of
+from ssm_graph.io.recording import Recording, whole
 from ssm_graph.sensors.compass import HeadingReading
 from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.imu import FORCE_RANGE, ImuSample
 from ssm_graph.sensors.messages import Message
 
-_LARGEST: Final = 1 << 31
 _FEWEST_FITTED: Final = 10
 _WORST_FIT: Final = 0.02
 """m/s, of beams by the velocity made of them: a unit whose axes are known fits to millimetres."""
@@ -27,17 +26,7 @@ _TURNING: Final = 0.01
 _DEGREES: Final = 180.0 / np.pi
 
 
-@dataclass(frozen=True, slots=True)
-class Nortek:
-    """A recording as messages of a mission folder."""
-
-    about: str
-    messages: tuple[Message, ...]
-    """In order of time."""
-    notes: tuple[str, ...]
-
-
-def read_nortek(path: Path) -> Nortek:
+def read_nortek(path: Path) -> Recording:
     """Return the pings, headings and inertial samples of a recording.
 
     A speed is taken to be positive where the instrument moves along the beam.
@@ -45,12 +34,7 @@ def read_nortek(path: Path) -> Nortek:
     Raises :class:`DataError` for a file without sound bottom track in beam coordinates, one of
     several instruments, and a clock that goes back.
     """
-    try:
-        if path.stat().st_size > _LARGEST:
-            raise DataError(f"{path}: larger than 2 GiB: split it, for example by time")
-        data = path.read_bytes()
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read: {error.strerror or error}") from error
+    data = whole(path)
     found = find_packets(data)
     reports, notes = _reports(path, found.packets)
     with_speed = sum(bool(np.isfinite(report.speed).any()) for report in reports)
@@ -76,7 +60,7 @@ def read_nortek(path: Path) -> Nortek:
         for r in reports
     ]
     every: list[Message] = [*pings, *headings, *samples]
-    return Nortek(about, tuple(sorted(every, key=lambda m: m.time_s)), (*notes, *said))
+    return Recording(about, tuple(sorted(every, key=lambda m: m.time_s)), (*notes, *said))
 
 
 def _sigma(sigma: Array) -> tuple[float, ...] | None:

@@ -29,7 +29,7 @@ from typing import Any, Final, NamedTuple
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frames import BodyAxes, turned
 from ssm_graph.base.frozen import Vector
-from ssm_graph.base.units import wrapped
+from ssm_graph.base.units import SEA_WATER, STANDARD_ATMOSPHERE, STANDARD_GRAVITY, wrapped
 from ssm_graph.sensors.depth import DepthReading
 from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.gnss import Fix
@@ -46,12 +46,6 @@ TWIST_TYPE: Final = "geometry_msgs/msg/TwistWithCovarianceStamped"
 PRESSURE_TYPE: Final = "sensor_msgs/msg/FluidPressure"
 FIX_TYPE: Final = "sensor_msgs/msg/NavSatFix"
 
-STANDARD_GRAVITY: Final = 9.80665
-"""m/s^2"""
-STANDARD_ATMOSPHERE: Final = 101_325.0
-"""Pa"""
-SEA_WATER: Final = 1025.0
-"""kg/m^3"""
 FIX_SIGMA: Final = (5.0, 5.0, 10.0)
 """m east, north, up, of a fix that does not say how good it is."""
 

@@ -8,7 +8,6 @@ the instrument itself turned by. A ping that was made of three beams cannot be r
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -16,41 +15,23 @@ import numpy as np
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
+from ssm_graph.io.recording import Recording, whole
 from ssm_graph.io.teledyne.ensembles import Ensemble, Setup, find_ensembles
 from ssm_graph.sensors.compass import HeadingReading
 from ssm_graph.sensors.dvl import Ping
-from ssm_graph.sensors.messages import Message
 
-_LARGEST: Final = 1 << 31
 _HEADING_MEASURED: Final = 0x10
 _AXES: Final = np.array([[0.0, -1.0], [0.0, 1.0], [1.0, 0.0], [-1.0, 0.0]])
 """Forward and right of beams 1 to 4 of a unit that looks down with beam 3 forward."""
 
 
-@dataclass(frozen=True, slots=True)
-class Pd0:
-    """A recording as messages of a mission folder."""
-
-    about: str
-    """Ensembles, coordinates, share with bottom track."""
-    messages: tuple[Message, ...]
-    """Pings and headings in order of time; times are Unix seconds of the instrument's clock."""
-    notes: tuple[str, ...]
-    """What was left out or assumed, and what mission.toml has to say, one sentence each."""
-
-
-def read_pd0(path: Path) -> Pd0:
+def read_pd0(path: Path) -> Recording:
     """Return the pings of a PD0 recording.
 
     Raises :class:`DataError` for a file without a sound ensemble, without bottom track, of an
     instrument that looks up, or whose beams cannot be restored; and where settings change amid it.
     """
-    try:
-        if path.stat().st_size > _LARGEST:
-            raise DataError(f"{path}: larger than 2 GiB: split it, for example by time")
-        data = path.read_bytes()
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read: {error.strerror or error}") from error
+    data = whole(path)
     found = find_ensembles(data)
     if not found.ensembles:
         raise DataError(
@@ -87,7 +68,7 @@ def read_pd0(path: Path) -> Pd0:
             "their beams cannot be restored"
         )
     messages = sorted([*pings, *headings], key=lambda message: message.time_s)
-    return Pd0(about, tuple(messages), tuple(notes))
+    return Recording(about, tuple(messages), tuple(notes))
 
 
 def _one_setup(path: Path, ensembles: list[Ensemble]) -> Setup:

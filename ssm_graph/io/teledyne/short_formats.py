@@ -13,7 +13,6 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
@@ -21,6 +20,7 @@ from typing import Final
 import numpy as np
 
 from ssm_graph.base.errors import DataError
+from ssm_graph.io.recording import Recording, whole
 from ssm_graph.sensors.compass import HeadingReading
 from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.messages import Message
@@ -40,15 +40,6 @@ _AXES: Final = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Shorts:
-    """A recording as messages of a mission folder."""
-
-    about: str
-    messages: tuple[Message, ...]
-    notes: tuple[str, ...]
-
-
 def is_pd45(head: bytes) -> bool:
     """Return whether the first bytes of a file hold a sound PD4 or PD5."""
     return next(_ensembles(head), None) is not None
@@ -59,12 +50,12 @@ def is_pd6(head: bytes) -> bool:
     return len({match[1] for match in _SENTENCE.finditer(head)} & {b"TS", b"BI"}) == 2
 
 
-def read_pd45(path: Path) -> Shorts:
+def read_pd45(path: Path) -> Recording:
     """Return the pings of PD4 or PD5; times are seconds of the first day, they have no date.
 
     Raises :class:`DataError` for ship and earth coordinates and for settings that change.
     """
-    data = path.read_bytes()
+    data = whole(path)
     found = list(_ensembles(data))
     if not found:
         raise DataError(f"{path}: no sound PD4 or PD5; was it transferred as text?")
@@ -81,13 +72,16 @@ def read_pd45(path: Path) -> Shorts:
             "(command EX00xxx or EX01xxx)"
         )
     messages: list[Message] = []
-    last, day_s, known = -np.inf, 0.0, 0
+    last, day_s, known, n_repeats = -np.inf, 0.0, 0, 0
     for body in found:
         hour, minute, second, hundredths = body[35:39]
         time_s = day_s + 3600.0 * hour + 60.0 * minute + second + hundredths / 100.0
         if time_s < last - _HALF_DAY_S:  # past midnight
             day_s, time_s = day_s + _DAY_S, time_s + _DAY_S
-        if time_s <= last:
+        if time_s == last:
+            n_repeats += 1
+            continue
+        if time_s < last:
             raise DataError(
                 f"{path}: the clock goes from {last:.2f} to {time_s:.2f} s of the day; expected "
                 "increasing times: split the file there"
@@ -109,6 +103,8 @@ def read_pd45(path: Path) -> Shorts:
         if coordinates == _BEAM
         else _AXES
     )
+    if n_repeats:
+        notes.append(f"{n_repeats} reports of a time that an earlier one has were left out")
     if n_bytes < len(data):
         notes.append(f"{len(data) - n_bytes} bytes of no sound ensemble left out")
     about = (
@@ -116,7 +112,7 @@ def read_pd45(path: Path) -> Shorts:
         f"{'beam' if coordinates == _BEAM else 'instrument'} coordinates, bottom track in "
         f"{100.0 * known / len(found):.0f} %"
     )
-    return Shorts(about, tuple(messages), tuple(notes))
+    return Recording(about, tuple(messages), tuple(notes))
 
 
 def _ensembles(data: bytes) -> Iterator[bytes]:
@@ -136,7 +132,7 @@ def _ensembles(data: bytes) -> Iterator[bytes]:
         at = data.find(_SIGN, at + (size if is_sound else 1))
 
 
-def read_pd6(path: Path) -> Shorts:
+def read_pd6(path: Path) -> Recording:
     """Return the velocities of PD6 in axes of the instrument, and its headings.
 
     Raises :class:`DataError` for a recording without ``BI``, and a clock that goes back.
@@ -144,7 +140,7 @@ def read_pd6(path: Path) -> Shorts:
     messages: list[Message] = []
     kinds: Counter[str] = Counter()
     heading, time_s, last, n_bad, n_torn = float("nan"), float("nan"), -np.inf, 0, 0
-    for match in _SENTENCE.finditer(path.read_bytes()):
+    for match in _SENTENCE.finditer(whole(path)):
         kind = match[1].decode()
         fields = [field.strip() for field in match[2].decode("ascii", "replace").split(",")]
         kinds[kind] += 1
@@ -183,7 +179,7 @@ def read_pd6(path: Path) -> Shorts:
     notes = ["times are those of the instrument's clock, taken for UTC", _AXES]
     if n_torn:
         notes.append(f"{n_torn} torn sentences left out")
-    return Shorts(about, tuple(messages), tuple(notes))
+    return Recording(about, tuple(messages), tuple(notes))
 
 
 def _instant(text: str) -> float:

@@ -16,6 +16,7 @@ import socket
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
+from socketserver import TCPServer
 from typing import Any, Final
 
 import numpy as np
@@ -30,13 +31,19 @@ from ssm_graph.mission.run_status import RunStatus
 MOST_BROWSERS: Final = 8
 MOST_CONNECTIONS: Final = 32
 """Those that ask, too; more are hung up on."""
+CLOSES_S: Final = 0.1
+"""The end of a run waits for the page no longer."""
 PATIENCE_S: Final = 5.0
 """A browser that takes or says nothing for so long is hung up on."""
 MOST_POINTS: Final = 4000
 """Of the track; then every second goes."""
+ALTITUDE_S: Final = 5.0
+"""An altitude of a source that has been silent for longer is not shown."""
 SLOWEST: Final = 0.03
 """m/s, below which there is no course."""
 _ADDRESS: Final = re.compile(r"(?:(?P<host>\[[0-9a-fA-F:.]+\]|[A-Za-z0-9_.-]*):)?(?P<port>\d{1,5})")
+_PORT: Final = re.compile(r":\d*$")
+"""Of the header ``Host``, which leaves out the usual one."""
 _HEADERS: Final = {
     "Cache-Control": "no-store",
     "X-Content-Type-Options": "nosniff",
@@ -81,15 +88,14 @@ class LivePage:
         self._frame: LocalFrame | None = None
         try:
             self._server = _Server(host, port, self)
-        except OSError as error:
+        except (OSError, UnicodeError) as error:  # which the name of a host may be no text for
+            why = getattr(error, "strerror", None) or error
             raise ConfigError(
-                f"--page: cannot listen at {host}:{port}: {error.strerror or error}; give another "
-                "address"
+                f"--page: cannot listen at {host}:{port}: {why}; give another address"
             ) from error
         self.port: int = self._server.server_address[1]
         self.address = f"http://{f'[{host}]' if ':' in host else host}:{self.port}/"
-        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
-        self._thread.start()
+        threading.Thread(target=self._server.serve_forever, args=(CLOSES_S,), daemon=True).start()
 
     def __enter__(self) -> LivePage:
         return self
@@ -129,8 +135,8 @@ class LivePage:
 
     def _fields(self, status: RunStatus) -> dict[str, Any]:
         """Return what the page shows, in the units of its words."""
-        altitudes = [source.altitude_m for source in status.sources]
-        altitude_m = next((x for x in altitudes if math.isfinite(x)), None)
+        heard = [source.altitude_m for source in status.sources if source.age_s <= ALTITUDE_S]
+        altitude_m = next((x for x in heard if math.isfinite(x)), None)
         own = self._navigation_fields(status.navigation)
         point = None
         if status.navigation is not None:
@@ -248,11 +254,19 @@ class _Server(ThreadingHTTPServer):
         super().__init__((host, port), _Handler)
         self.is_private = ipaddress.ip_address(str(self.server_address[0])).is_loopback
 
+    def server_bind(self) -> None:
+        """Bind without asking for the name of this computer, which takes long where none tells."""
+        TCPServer.server_bind(self)
+
     def process_request(self, request: Any, client_address: Any) -> None:
         if not self._room.acquire(blocking=False):
             self.shutdown_request(request)
             return
-        super().process_request(request, client_address)
+        try:
+            super().process_request(request, client_address)
+        except RuntimeError:  # there is no thread to be had
+            self._room.release()
+            raise
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
         try:
@@ -289,8 +303,8 @@ class _Handler(BaseHTTPRequestHandler):
         """
         if not self.server.is_private:
             return True
-        host = (self.headers.get("Host") or "").rpartition(":")[0].strip("[]")
-        if host == "localhost":
+        host = _PORT.sub("", self.headers.get("Host") or "").strip("[]")
+        if host.lower() == "localhost":
             return True
         with contextlib.suppress(ValueError):
             return ipaddress.ip_address(host).is_loopback

@@ -204,6 +204,10 @@ class TokenBucket:
         """Admit at once, besides, what may come in such a time, s, in which nobody asked."""
         self._tokens += self._rate_per_s * span_s
 
+    def catch_up(self) -> None:
+        """Admit no more at once than ever: what came in that time has passed."""
+        self._tokens = min(self._tokens, self._burst)
+
     def admit(self, now_s: float) -> bool:
         """Return whether one more message may pass at ``now_s``; a clock set back fills nothing."""
         if math.isfinite(now_s):

@@ -11,6 +11,7 @@ from typing import Final, NamedTuple
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Vector
+from ssm_graph.base.units import SEA_WATER
 from ssm_graph.io.nmea_sentences import TALKER, checksum
 from ssm_graph.live.protocols.decoder import Clock, Decoder, RefusedError, Stamper, number, shown
 from ssm_graph.live.protocols.framing import SentenceFramer
@@ -73,7 +74,7 @@ class NmeaOptions:
     """What is taken for vehicle depth; all others are ignored."""
     air_pressure_dbar: float = 10.1325
     """Subtracted from every pressure; 0 for a sensor that is tared or sealed at the surface."""
-    water_density_kg_per_m3: float = 1025.0
+    water_density_kg_per_m3: float = SEA_WATER
     """Mean over the column above the sensor."""
     surface_height_m: float = 0.0
     """Ellipsoidal height of the water's surface: depth messages count from the ellipsoid, and

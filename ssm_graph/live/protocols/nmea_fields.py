@@ -8,12 +8,11 @@ from collections.abc import Callable
 from enum import Enum
 from typing import Final, NamedTuple, Protocol
 
+from ssm_graph.base.units import STANDARD_GRAVITY
 from ssm_graph.io.nmea_sentences import checksum
 from ssm_graph.live.protocols.decoder import RefusedError, number, shown
 
 PASCAL_PER_DBAR: Final = 1e4
-STANDARD_GRAVITY: Final = 9.80665
-"""m/s^2"""
 DAY_S: Final = 86400.0
 _MEASURED: Final = frozenset("ADFPR")
 """Modes of a measured fix: autonomous, differential, float and fixed RTK, precise."""

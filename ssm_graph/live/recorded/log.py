@@ -21,9 +21,11 @@ from typing import Any, Final
 import numpy as np
 
 from ssm_graph.base.errors import DataError
+from ssm_graph.base.times import UNIX_FROM_S
 from ssm_graph.io.nortek.nortek import read_nortek
 from ssm_graph.io.nortek.packets import is_nortek
 from ssm_graph.io.raw_log.rows import RowKind
+from ssm_graph.io.recording import whole
 from ssm_graph.io.tables.append_file import write_through
 from ssm_graph.io.teledyne.ensembles import is_pd0
 from ssm_graph.io.teledyne.pd0 import read_pd0
@@ -61,8 +63,6 @@ _BINARY: Final[Sequence[tuple[Callable[[bytes], bool], Callable[[Path], Any]]]] 
     (is_pd6, read_pd6),
 )
 """Makers' own formats: by the first bytes whether a file is of one, and what reads it."""
-_UNIX_S: Final = 1e9
-"""A larger number of seconds is Unix time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,10 +82,7 @@ def read_recorded(log: Path, options: NmeaOptions | None = None) -> Recorded | N
 
     ``options`` are those of NMEA: what of its depths is the vehicle's, and the water's surface.
     """
-    try:
-        data = _in_utf8(log.read_bytes())
-    except OSError as error:
-        raise DataError(f"{log}: cannot be read: {error.strerror or error}") from error
+    data = _in_utf8(whole(log))
     head = data[:_SNIFFED]
     binary = next((read for is_it, read in _BINARY if is_it(head)), None)
     if binary is not None:
@@ -234,7 +231,7 @@ def _unix(report: Mapping[str, Any], time_s: float) -> float:
     """Return the Unix time that a report states, or the one before."""
     for key, unit in (("time_of_validity", 1e-6), ("ts", 1.0)):
         value = report.get(key)
-        if isinstance(value, (int, float)) and value * unit > _UNIX_S:
+        if isinstance(value, (int, float)) and value * unit > UNIX_FROM_S:
             return float(value) * unit
     return time_s
 

@@ -155,6 +155,11 @@ class Feed:
         for bucket in self._buckets.values():
             bucket.grant(span_s)
 
+    def catch_up(self) -> None:
+        """Have what comes from now on be limited as ever."""
+        for bucket in self._buckets.values():
+            bucket.catch_up()
+
     def idle(self, channel: Channel, now: Now) -> list[Message]:
         """Return what the decoder releases where nothing has come for a second."""
         return self.take(channel, b"", now) if now.steady_s - channel.fed_s >= IDLE_S else []

@@ -72,6 +72,8 @@ class Input(ABC):
             messages += self.feed.idle(channel, now)
             if not self._is_paused and self.feed.is_silent(channel, now):
                 messages += self._lose(sock, now, self.feed.silence)
+        if not self.is_behind:
+            self.feed.catch_up()
         return messages
 
     @abstractmethod

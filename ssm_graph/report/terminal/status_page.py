@@ -14,6 +14,7 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
+from ssm_graph.base.times import UNIX_FROM_S, UNIX_UNTIL_S
 from ssm_graph.mission.estimate import Found
 from ssm_graph.mission.navigation import Event, Health, Navigation, Severity
 from ssm_graph.mission.run_status import Latency, RunStatus
@@ -36,8 +37,6 @@ N_EVENTS: Final = 5
 LASTING: Final = (0.5, 1.0)
 """Low-passed innovations, in sigmas, from which on they are shown in yellow and in red."""
 _NONE: Final = "–"
-_FIRST_UNIX_S: Final = 1e9
-"""Later times are Unix time, shown as time of day."""
 
 
 class StatusPage:
@@ -226,7 +225,7 @@ def _refused(n: int) -> Text:
 
 def _event(event: Event) -> Text:
     when = f"{event.time_s:.1f} s"
-    if event.time_s > _FIRST_UNIX_S:
+    if UNIX_FROM_S <= event.time_s <= UNIX_UNTIL_S:
         when = time.strftime("%H:%M:%S", time.gmtime(event.time_s))
     style = SEVERITY_STYLE[event.severity]
     return Text(f"{when}  {event.text}", style, no_wrap=True, overflow="ellipsis")
