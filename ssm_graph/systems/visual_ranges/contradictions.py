@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ssm_graph.base.frozen import Array
 from ssm_graph.systems.visual_ranges.range_fit import BIAS_M, Problem, Solution, polished
 from ssm_graph.systems.visual_ranges.weights import robust_rms
 
@@ -17,36 +18,63 @@ SQUARE_OF_3_SIGMA: Final = 14.16
 """Quantile of 0.9973 of chi-square with three degrees of freedom."""
 
 
-def contradictions(
+def misfits(
     problem: Problem,
     names: tuple[str, ...],
-    best: Solution,
+    found: Solution,
     *,
+    stated_m: Array,
     rms_sigmas: float,
     marked_share: float,
 ) -> list[str]:
-    """Return what speaks against the ranges themselves, a sentence each.
+    """Return what a solution's own ranges say against it, a sentence each.
 
     Parameters
     ----------
     names : (J,) of the anchors.
+    stated_m : (M,) standard deviations as stated; the problem's may have been widened.
     rms_sigmas : up to which residuals may be wider than stated.
     marked_share : of an anchor's ranges that may be too long.
     """
     at, told = problem.places, []
     for j, name in enumerate(names):
         own = at.anchor == j
-        stated, seen = float(np.median(at.sigma_m[own])), robust_rms(best.error[own])
+        stated, seen = float(np.median(stated_m[own])), robust_rms(found.error[own])
         if seen > rms_sigmas * stated:
             told.append(f"residuals of anchor {name} are {seen:.2f} m, {stated:.2f} m were stated")
-        bias = float(best.biases[j])
+        bias = float(found.biases[j])
         if abs(bias) > 3.0 * BIAS_M:
             told.append(f"the bias of anchor {name} would be {bias:.2f} m")
-        marked = float(np.mean(best.error[own] < -4.0 * at.sigma_m[own]))
+        marked = float(np.mean(found.error[own] < -4.0 * at.sigma_m[own]))
         if marked > marked_share:
             told.append(f"{100.0 * marked:.0f} % of the ranges to anchor {name} are too long")
+    return told
+
+
+def contradictions(
+    problem: Problem,
+    names: tuple[str, ...],
+    best: Solution,
+    *,
+    stated_m: Array,
+    rms_sigmas: float,
+    marked_share: float,
+) -> list[str]:
+    """Return what speaks against the ranges themselves, a sentence each.
+
+    To :func:`misfits`, which see for the parameters, come halves that disagree.
+    """
+    told = misfits(
+        problem,
+        names,
+        best,
+        stated_m=stated_m,
+        rms_sigmas=rms_sigmas,
+        marked_share=marked_share,
+    )
+    at = problem.places
     first = at.time_s < np.median(at.time_s)
-    halves = [_half(_part(problem, half), best) for half in (first, ~first)]
+    halves = [polished(_part(problem, half), best) for half in (first, ~first)]
     apart = np.log(halves[0].scale / halves[1].scale)
     sigma = float(np.hypot(halves[0].sigma_log_scale, halves[1].sigma_log_scale))
     if abs(apart) > 3.0 * sigma:
@@ -63,10 +91,6 @@ def contradictions(
                 "second half: did it move, or is the antenna not calibrated?"
             )
     return told
-
-
-def _half(problem: Problem, best: Solution) -> Solution:
-    return polished(problem, best)
 
 
 def _part(problem: Problem, kept: Mask) -> Problem:

@@ -41,7 +41,7 @@ from ssm_graph.systems.visual_ranges.start import (
     later_anchor,
     widened,
 )
-from ssm_graph.systems.visual_ranges.weights import NLOS_WEIGHT, robust_rms
+from ssm_graph.systems.visual_ranges.weights import NLOS_WEIGHT, POLISH, robust_rms
 
 __all__ = ["Anchor", "AnchorState", "Ranging", "RangingResult"]
 
@@ -166,7 +166,7 @@ class Ranging(ShortRepr):
             self.found.clock_s,
             self.found.anchors,
             self.found.biases,
-            self.rules.kernel,
+            POLISH,  # what is far too long would bend biases and anchors otherwise
             is_free,
         )
 

@@ -15,7 +15,11 @@ from typing import Final
 import numpy as np
 
 from ssm_graph.base.frozen import Array, ShortRepr
-from ssm_graph.systems.visual_ranges.contradictions import SQUARE_OF_3_SIGMA, contradictions
+from ssm_graph.systems.visual_ranges.contradictions import (
+    SQUARE_OF_3_SIGMA,
+    contradictions,
+    misfits,
+)
 from ssm_graph.systems.visual_ranges.observability import Motion, Shape, advice, shape_of
 from ssm_graph.systems.visual_ranges.range_fit import (
     BIAS_WALK_M,
@@ -37,7 +41,12 @@ SCALES: Final = 4
 """Searches start in as many directions, at as many scales."""
 MOST_ROWS: Final = 250
 """Ranges of an anchor that the searches take, spread over all."""
-MOST_MINIMA: Final = 6
+MOST_MINIMA: Final = 8
+MOST_DEVIANCE: Final = 250.0
+"""By which a minimum may be worse than the best one and still be looked at."""
+RIVAL_SHARE: Final = 0.5
+"""A rival is one while it needs no more of an anchor's ranges to be too long: how many are is not
+known beforehand, so that the deviance alone, which counts them, does not decide."""
 OPEN_SHAPES: Final = (Motion.PLANE, Motion.LINE, Motion.LINE_THROUGH_ANCHOR)
 """Leave the anchor open, but not the scale."""
 
@@ -133,14 +142,27 @@ def find_start(
         spacing=spacing,
     )
     found = _candidates(problem)
+    stated_m = problem.places.sigma_m
     problem = widened(problem, solution(problem, _best_first(problem, found)[0]))
     ends = [solution(problem, one) for one in _best_first(problem, found)]
     ends.sort(key=lambda one: one.cost)
     best, *rivals = (polished(problem, one) for one in ends)
     apart = [rival for rival in rivals if _is_apart(best, rival)]
     gap = min((rival.cost - best.cost for rival in apart), default=np.inf)
-    near = [rival for rival in apart if rival.cost - best.cost < rules.gap]
-    return _judged(problem, names, rules, best, near, gap, turned_rad)
+    near = [
+        rival
+        for rival in apart
+        if rival.cost - best.cost < rules.gap
+        or not misfits(
+            problem,
+            names,
+            rival,
+            stated_m=stated_m,
+            rms_sigmas=rules.rms_sigmas,
+            marked_share=RIVAL_SHARE,
+        )
+    ]
+    return _judged(problem, names, rules, best, near, gap, turned_rad, stated_m)
 
 
 def _too_early(
@@ -245,7 +267,7 @@ def _candidates(problem: Problem) -> list[Array]:
     minima = []
     for one in alone:
         fit = search(one, _starts(one))
-        minima.append(_distinct(fit.unknowns, fit.cost, 60.0))
+        minima.append(_distinct(fit.unknowns, fit.cost, MOST_DEVIANCE))
     log_scales: list[float] = []
     for each in minima:
         for one_minimum in each:
@@ -275,7 +297,7 @@ def _placed(one: Problem, minima: list[Array], log_scale: float) -> list[tuple[A
     starts[DIRECTIONS:] = np.array(minima).reshape(-1, 6)
     starts[:, 0] = log_scale
     fit = search(one, starts, held=np.array([0, 1]))
-    kept = _distinct(fit.unknowns, fit.cost, 60.0)[:3]
+    kept = _distinct(fit.unknowns, fit.cost, MOST_DEVIANCE)[:3]
     costs = [float(fit.cost[np.flatnonzero((fit.unknowns == row).all(axis=1))[0]]) for row in kept]
     return [(row[2:], cost) for row, cost in zip(kept, costs, strict=True)]
 
@@ -323,6 +345,7 @@ def _judged(
     near: list[Solution],
     gap: float,
     turned_rad: float,
+    stated_m: Array,
 ) -> Start:
     at = problem.places
     n_anchors = len(names)
@@ -343,6 +366,7 @@ def _judged(
         problem,
         names,
         best,
+        stated_m=stated_m,
         rms_sigmas=rules.rms_sigmas,
         marked_share=rules.marked_share,
     )
