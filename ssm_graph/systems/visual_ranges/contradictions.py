@@ -18,39 +18,6 @@ SQUARE_OF_3_SIGMA: Final = 14.16
 """Quantile of 0.9973 of chi-square with three degrees of freedom."""
 
 
-def misfits(
-    problem: Problem,
-    names: tuple[str, ...],
-    found: Solution,
-    *,
-    stated_m: Array,
-    rms_sigmas: float,
-    marked_share: float,
-) -> list[str]:
-    """Return what a solution's own ranges say against it, a sentence each.
-
-    Parameters
-    ----------
-    names : (J,) of the anchors.
-    stated_m : (M,) standard deviations as stated; the problem's may have been widened.
-    rms_sigmas : up to which residuals may be wider than stated.
-    marked_share : of an anchor's ranges that may be too long.
-    """
-    at, told = problem.places, []
-    for j, name in enumerate(names):
-        own = at.anchor == j
-        stated, seen = float(np.median(stated_m[own])), robust_rms(found.error[own])
-        if seen > rms_sigmas * stated:
-            told.append(f"residuals of anchor {name} are {seen:.2f} m, {stated:.2f} m were stated")
-        bias = float(found.biases[j])
-        if abs(bias) > 3.0 * BIAS_M:
-            told.append(f"the bias of anchor {name} would be {bias:.2f} m")
-        marked = float(np.mean(found.error[own] < -4.0 * at.sigma_m[own]))
-        if marked > marked_share:
-            told.append(f"{100.0 * marked:.0f} % of the ranges to anchor {name} are too long")
-    return told
-
-
 def contradictions(
     problem: Problem,
     names: tuple[str, ...],
@@ -62,17 +29,25 @@ def contradictions(
 ) -> list[str]:
     """Return what speaks against the ranges themselves, a sentence each.
 
-    To :func:`misfits`, which see for the parameters, come halves that disagree.
+    Parameters
+    ----------
+    names : (J,) of the anchors.
+    stated_m : (M,) standard deviations as stated; the problem's may have been widened.
+    rms_sigmas : up to which residuals may be wider than stated.
+    marked_share : of an anchor's ranges that may be too long.
     """
-    told = misfits(
-        problem,
-        names,
-        best,
-        stated_m=stated_m,
-        rms_sigmas=rms_sigmas,
-        marked_share=marked_share,
-    )
-    at = problem.places
+    at, told = problem.places, []
+    for j, name in enumerate(names):
+        own = at.anchor == j
+        stated, seen = float(np.median(stated_m[own])), robust_rms(best.error[own])
+        if seen > rms_sigmas * stated:
+            told.append(f"residuals of anchor {name} are {seen:.2f} m, {stated:.2f} m were stated")
+        bias = float(best.biases[j])
+        if abs(bias) > 3.0 * BIAS_M:
+            told.append(f"the bias of anchor {name} would be {bias:.2f} m")
+        marked = float(np.mean(best.error[own] < -4.0 * at.sigma_m[own]))
+        if marked > marked_share:
+            told.append(f"{100.0 * marked:.0f} % of the ranges to anchor {name} are too long")
     first = at.time_s < np.median(at.time_s)
     halves = [polished(_part(problem, half), best) for half in (first, ~first)]
     apart = np.log(halves[0].scale / halves[1].scale)

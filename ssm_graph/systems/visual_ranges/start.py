@@ -15,11 +15,7 @@ from typing import Final
 import numpy as np
 
 from ssm_graph.base.frozen import Array, ShortRepr
-from ssm_graph.systems.visual_ranges.contradictions import (
-    SQUARE_OF_3_SIGMA,
-    contradictions,
-    misfits,
-)
+from ssm_graph.systems.visual_ranges.contradictions import SQUARE_OF_3_SIGMA, contradictions
 from ssm_graph.systems.visual_ranges.observability import Motion, Shape, advice, shape_of
 from ssm_graph.systems.visual_ranges.range_fit import (
     BIAS_WALK_M,
@@ -34,19 +30,14 @@ from ssm_graph.systems.visual_ranges.range_fit import (
     with_sigma,
 )
 from ssm_graph.systems.visual_ranges.ranges import Indices
-from ssm_graph.systems.visual_ranges.weights import RangeKernel, robust_rms
+from ssm_graph.systems.visual_ranges.weights import NLOS_WEIGHT, RangeKernel, robust_rms
 
 DIRECTIONS: Final = 12
 SCALES: Final = 4
 """Searches start in as many directions, at as many scales."""
 MOST_ROWS: Final = 250
 """Ranges of an anchor that the searches take, spread over all."""
-MOST_MINIMA: Final = 8
-MOST_DEVIANCE: Final = 250.0
-"""By which a minimum may be worse than the best one and still be looked at."""
-RIVAL_SHARE: Final = 0.5
-"""A rival is one while it needs no more of an anchor's ranges to be too long: how many are is not
-known beforehand, so that the deviance alone, which counts them, does not decide."""
+MOST_MINIMA: Final = 6
 OPEN_SHAPES: Final = (Motion.PLANE, Motion.LINE, Motion.LINE_THROUGH_ANCHOR)
 """Leave the anchor open, but not the scale."""
 
@@ -56,9 +47,15 @@ class StartState(Enum):
 
     WAITING = "too few ranges yet"
     AMBIGUOUS = "several solutions, or none that is sharp"
+    COARSE = "scale known roughly: used, but not to be relied on yet"
     MIRROR = "scale ready; an anchor has other places that fit as well"
     READY = "scale and anchors ready"
     REFUSED = "the ranges contradict themselves"
+
+    @property
+    def has_scale(self) -> bool:
+        """Whether map units can be turned into metres."""
+        return self in (StartState.READY, StartState.MIRROR, StartState.COARSE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +66,9 @@ class StartRules:
     """Of an anchor."""
     least_s: float = 5.0
     scale_sigma: float = 0.04
-    """Relative standard deviation of the scale."""
+    """Relative standard deviation of the scale from which it is used."""
+    ready_sigma: float = 0.05 / 3.0
+    """And from which it is called ready: at 3 sigma it is right to 5 %."""
     anchor_sigma_m: float = 0.5
     anchor_sigma_share: float = 0.06
     """Of the median range; the larger of both counts."""
@@ -85,6 +84,13 @@ class StartRules:
     """Of a path that its ranges hold."""
     bias_walk_m: float = BIAS_WALK_M
     kernel: RangeKernel = RangeKernel()
+
+    def coarse(self, sigma_log_scale: float) -> str:
+        """Say what a scale lacks to be ready."""
+        return (
+            f"scale known to {100.0 * sigma_log_scale:.1f} %, {100.0 * self.ready_sigma:.1f} % are "
+            "needed to rely on it"
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,7 +114,7 @@ class Start(ShortRepr):
     @property
     def has_scale(self) -> bool:
         """Whether map units can be turned into metres."""
-        return self.state in (StartState.READY, StartState.MIRROR)
+        return self.state.has_scale
 
 
 def find_start(
@@ -149,19 +155,7 @@ def find_start(
     best, *rivals = (polished(problem, one) for one in ends)
     apart = [rival for rival in rivals if _is_apart(best, rival)]
     gap = min((rival.cost - best.cost for rival in apart), default=np.inf)
-    near = [
-        rival
-        for rival in apart
-        if rival.cost - best.cost < rules.gap
-        or not misfits(
-            problem,
-            names,
-            rival,
-            stated_m=stated_m,
-            rms_sigmas=rules.rms_sigmas,
-            marked_share=RIVAL_SHARE,
-        )
-    ]
+    near = [rival for rival in apart if rival.cost - best.cost < rules.gap]
     return _judged(problem, names, rules, best, near, gap, turned_rad, stated_m)
 
 
@@ -267,7 +261,7 @@ def _candidates(problem: Problem) -> list[Array]:
     minima = []
     for one in alone:
         fit = search(one, _starts(one))
-        minima.append(_distinct(fit.unknowns, fit.cost, MOST_DEVIANCE))
+        minima.append(_distinct(fit.unknowns, fit.cost, 60.0))
     log_scales: list[float] = []
     for each in minima:
         for one_minimum in each:
@@ -297,7 +291,7 @@ def _placed(one: Problem, minima: list[Array], log_scale: float) -> list[tuple[A
     starts[DIRECTIONS:] = np.array(minima).reshape(-1, 6)
     starts[:, 0] = log_scale
     fit = search(one, starts, held=np.array([0, 1]))
-    kept = _distinct(fit.unknowns, fit.cost, MOST_DEVIANCE)[:3]
+    kept = _distinct(fit.unknowns, fit.cost, 60.0)[:3]
     costs = [float(fit.cost[np.flatnonzero((fit.unknowns == row).all(axis=1))[0]]) for row in kept]
     return [(row[2:], cost) for row, cost in zip(kept, costs, strict=True)]
 
@@ -375,8 +369,7 @@ def _judged(
         scale=best.scale,
         sigma_m=float(np.median(at.sigma_m)),
         turned_rad=turned_rad,
-        anchor=best.anchors[0] - best.scale * problem.middle,
-        range_m=at.range_m[at.anchor == 0],
+        range_m=np.where((at.anchor == 0) & (best.weight > NLOS_WEIGHT), at.range_m, np.nan),
     )
     # An anchor that is not sharp though the path is in all directions: something else is wrong.
     is_explained = any(ready) or near or shape.motion in OPEN_SHAPES
@@ -384,6 +377,9 @@ def _judged(
         state = StartState.REFUSED
     elif not (scale_is_sharp and is_explained) or (n_anchors == 1 and shape.motion.leaves_scale):
         state = StartState.AMBIGUOUS
+    elif best.sigma_log_scale > rules.ready_sigma:
+        state = StartState.COARSE
+        reasons.append(rules.coarse(best.sigma_log_scale))
     else:
         state = StartState.READY if all(ready) else StartState.MIRROR
     if state is StartState.READY:

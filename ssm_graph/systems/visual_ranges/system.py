@@ -191,7 +191,7 @@ class _Run:
             if self.state[i - 1] == FrameState.TRACKED:
                 self.note(i, f"lost: {found.n_points} points left")
             return
-        # Relative to its key frame as it was tracked: the mapping beside may have moved the map since.
+        # From its key frame as it was tracked: the mapping beside may have moved the map since.
         relative, unit = self.tracker.relative, self.tracker.unit
         self.keep(i, relative, unit, self.tracker.reference)
         self.n_tracked[i], self.seen[i] = found.n_points, found.tracks
