@@ -37,6 +37,8 @@ WALKS: tuple[tuple[str | int | float, ...], ...] = (
 """World, seconds, anchors, share of ranges not in line of sight, drift."""
 SHAPE_DRIFT = 0.001
 READY = ("READY", "MIRROR")
+BELIEVED = (*READY, "COARSE")
+"""A coarse scale is used, but not called ready."""
 NAMED = {
     "standing still": (Motion.STILL,),
     "turning only": (Motion.ROTATION,),

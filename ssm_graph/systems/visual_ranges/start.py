@@ -38,6 +38,8 @@ SCALES: Final = 4
 MOST_ROWS: Final = 250
 """Ranges of an anchor that the searches take, spread over all."""
 MOST_MINIMA: Final = 6
+HOPELESS: Final = 60.0
+"""Deviance by which a minimum is so much worse than the best that it is left."""
 OPEN_SHAPES: Final = (Motion.PLANE, Motion.LINE, Motion.LINE_THROUGH_ANCHOR)
 """Leave the anchor open, but not the scale."""
 
@@ -147,10 +149,10 @@ def find_start(
         bias_walk_m=rules.bias_walk_m,
         spacing=spacing,
     )
-    found = _candidates(problem)
+    found = _ends(problem, _candidates(problem))
     stated_m = problem.places.sigma_m
-    problem = widened(problem, solution(problem, _best_first(problem, found)[0]))
-    ends = [solution(problem, one) for one in _best_first(problem, found)]
+    problem = widened(problem, solution(problem, found[0]))
+    ends = [solution(problem, one) for one in _ends(problem, found)]
     ends.sort(key=lambda one: one.cost)
     best, *rivals = (polished(problem, one) for one in ends)
     apart = [rival for rival in rivals if _is_apart(best, rival)]
@@ -261,7 +263,7 @@ def _candidates(problem: Problem) -> list[Array]:
     minima = []
     for one in alone:
         fit = search(one, _starts(one))
-        minima.append(_distinct(fit.unknowns, fit.cost, 60.0))
+        minima.append(_distinct(fit.unknowns, fit.cost, HOPELESS))
     log_scales: list[float] = []
     for each in minima:
         for one_minimum in each:
@@ -291,7 +293,7 @@ def _placed(one: Problem, minima: list[Array], log_scale: float) -> list[tuple[A
     starts[DIRECTIONS:] = np.array(minima).reshape(-1, 6)
     starts[:, 0] = log_scale
     fit = search(one, starts, held=np.array([0, 1]))
-    kept = _distinct(fit.unknowns, fit.cost, 60.0)[:3]
+    kept = _distinct(fit.unknowns, fit.cost, HOPELESS)[:3]
     costs = [float(fit.cost[np.flatnonzero((fit.unknowns == row).all(axis=1))[0]]) for row in kept]
     return [(row[2:], cost) for row, cost in zip(kept, costs, strict=True)]
 
@@ -303,10 +305,19 @@ def _joined(problem: Problem, log_scale: float, own: list[Array]) -> Array:
     return made
 
 
-def _best_first(problem: Problem, starts: list[Array]) -> list[Array]:
-    """Return where searches with all modes end, the best first."""
+def _ends(problem: Problem, starts: list[Array]) -> list[Array]:
+    """Return where searches with all modes end, the best first, each once."""
     fit = search(problem, np.array(starts))
-    return [fit.unknowns[row] for row in np.argsort(fit.cost)]
+    own = fit.unknowns[:, 2 : problem.n_core].reshape(len(starts), -1, 4)[:, :, :3]
+    kept: list[int] = []
+    for row in np.argsort(fit.cost):
+        if fit.cost[row] > fit.cost.min() + HOPELESS:
+            break
+        same = np.abs(fit.unknowns[kept, 0] - fit.unknowns[row, 0]) < 0.003
+        same &= np.abs(own[kept] - own[row]).max(axis=(1, 2), initial=0.0) < 0.02
+        if not same.any():
+            kept.append(int(row))
+    return list(fit.unknowns[kept])
 
 
 def widened(problem: Problem, best: Solution) -> Problem:

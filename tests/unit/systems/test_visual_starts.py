@@ -153,10 +153,13 @@ def test_hung_ranges_fit_the_true_path() -> None:
         ("standing still", "AMBIGUOUS", "STILL"),
         ("turning only", "AMBIGUOUS", "ROTATION"),
         pytest.param("line", "AMBIGUOUS", "LINE", marks=pytest.mark.slow),
-        ("plane curve", "MIRROR", "PLANE"),
+        pytest.param(
+            "line through the anchor", "AMBIGUOUS", "LINE_THROUGH_ANCHOR", marks=pytest.mark.slow
+        ),
+        ("plane curve", "COARSE", "PLANE"),
         pytest.param("circle", "AMBIGUOUS", "CIRCLE", marks=pytest.mark.slow),
         ("sphere", "AMBIGUOUS", "SPHERE"),
-        ("helix", "READY", "GENERAL"),
+        ("helix", "COARSE", "GENERAL"),
     ],
 )
 def test_what_a_motion_leaves_open(shape: str, state: str, motion: str) -> None:
@@ -226,5 +229,6 @@ def test_real_radios() -> None:
     assert row["state"] == "READY"
     assert abs(row["scale_percent"]) < min(1.5, 3.0 * row["sigma_percent"])
     assert row["anchor_m"][0] < 0.5
-    bad = starloc_trial(read_starloc(STARLOC / "loop-2d-fast_s1"), ("7",))
-    assert bad["state"] in ("AMBIGUOUS", "REFUSED")
+    bad = read_starloc(STARLOC / "loop-2d-fast_s1")
+    for names in (("7",), bad.ranges.names):
+        assert starloc_trial(bad, names)["state"] not in ("READY", "MIRROR")
