@@ -1,6 +1,6 @@
 """The command line.
 
-``ssm-graph simulate | smooth | filter | online | compare | inspect | instruments | template |
-convert | export | report | locate | locate-simulate | locate-study | slam | slam-study | visual |
-visual-simulate | integrity | network | network-run``.
+``ssm-graph inspect | template | convert | instruments | simulate | smooth | filter | online |
+report | export | compare | integrity | slam | slam-study | locate | locate-simulate |
+locate-study | network | network-run | visual | visual-simulate | help | completion``.
 """

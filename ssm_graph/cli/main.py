@@ -74,6 +74,7 @@ GROUPS: Final = {
     "landmark SLAM": ("slam", "slam-study"),
     "a start from a map": ("locate", "locate-simulate", "locate-study"),
     "guaranteed bounds in a network": ("network", "network-run"),
+    "camera and ranges": ("visual", "visual-simulate"),
 }
 """Commands by what they are for; those of no group stand at the end."""
 EXIT_CODE_HELP: Final = """\

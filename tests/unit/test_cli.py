@@ -201,7 +201,7 @@ def test_the_package_names_every_command(capsys: pytest.CaptureFixture[str]) -> 
     """In the order of the help."""
     with pytest.raises(SystemExit):
         main(["--help"])
-    shown = re.findall(r"^    ([\w-]+)(?:  |$)", capsys.readouterr().out, flags=re.MULTILINE)
+    shown = re.findall(r"^  ([a-z][a-z-]*)  +\w", capsys.readouterr().out, flags=re.MULTILINE)
     named = re.findall(r"([\w-]+)(?: \||``)", cli.__doc__ or "")
     assert len(named) > 6
     assert named == shown
@@ -215,4 +215,4 @@ def test_a_command_that_is_none(capsys: pytest.CaptureFixture[str]) -> None:
     assert "'smoth' is no command, did you mean 'smooth'?" in capsys.readouterr().err
     assert main([]) == ExitCode.USAGE
     shown = capsys.readouterr().err
-    assert all(f"    {name}" in shown for name in COMMANDS)
+    assert all(f"  {name} " in shown for name in COMMANDS)

@@ -60,7 +60,7 @@ def test_the_result_folder_is_that_of_smooth(
     assert main(words if is_drawn else [*words, "--no-figure"]) == ExitCode.GOOD
     shown = capsys.readouterr()
     assert "a keyframe" in shown.out
-    assert re.search(r"keyframe (\d+) of \1\n", shown.err)
+    assert re.search(r"keyframe (\d+) of \1, 100 %\n", shown.err)
     summary = summary_of(tmp_path)
     assert summary["status"] == "CONVERGED"
     assert summary["settings"]["method"] == method  # type: ignore[index]

@@ -228,7 +228,7 @@ def fields_of(estimate: Estimate) -> dict[str, Any]:
     flat: dict[str, Any] = {}
     for spec in dataclasses.fields(estimate):
         value = getattr(estimate, spec.name)
-        if spec.name in ("trajectory", "beams", "start", "noise", "aids"):
+        if spec.name in ("trajectory", "beams", "start", "noise", "aids", "posterior"):
             for inner in dataclasses.fields(value):
                 flat[f"{spec.name}.{inner.name}"] = getattr(value, inner.name)
         elif spec.name != "wall_s":
