@@ -155,16 +155,16 @@ def test_hung_ranges_fit_the_true_path() -> None:
 def test_all_places_of_an_anchor_judge_a_loop() -> None:
     """The one that speaks best for it; an anchor without a place does not."""
     rng = np.random.default_rng(5)
-    zero, index = np.zeros((40, 3)), np.arange(40)
+    zero, index, time = np.zeros((40, 3)), np.arange(40), np.linspace(0.0, 3.9, 40)
     motion, place = rng.normal(size=(40, 3)), np.array([3.0, 1.0, 2.0])
     far = np.linalg.norm(UNIT_M * motion - place, axis=1)
-    ranges = Ranges(0.1 * index, 0 * index, far, np.full(40, 0.1), ("A",), np.full((1, 3), np.nan))
+    ranges = Ranges(time, 0 * index, far, np.full(40, 0.1), ("A",), np.full((1, 3), np.nan))
     ranging = Ranging(ranges, np.zeros(3))
     ranging.terms = RangeTerms(index, 0 * index, 0 * index, motion, zero, zero, zero, far, far)
     world = VisualMap()
     world.add_frame(0, 0.0, Pose(np.eye(3), np.zeros(3)), np.zeros((2, 2), np.uint8))
     problem = problem_of(
-        Places(motion, zero, zero, zero, 0 * index, far, np.full(40, 0.1), 0.1 * index),
+        Places(motion, zero, zero, zero, 0 * index, far, np.full(40, 0.1), time),
         1, RangeKernel(), drift=0.0, bias_walk_m=0.0,
     )  # fmt: skip
     ranging.found, ranging.used = (
