@@ -115,7 +115,7 @@ class Start(ShortRepr):
 
     @property
     def has_scale(self) -> bool:
-        """Whether map units can be turned into metres."""
+        """See :attr:`StartState.has_scale`."""
         return self.state.has_scale
 
 
@@ -368,13 +368,9 @@ def _judged(
     ready, doubts = _sharp_anchors(problem, names, rules, best, near, gap)
     reasons += doubts
     against = contradictions(
-        problem,
-        names,
-        best,
-        stated_m=stated_m,
-        rms_sigmas=rules.rms_sigmas,
+        problem, names, best, stated_m=stated_m, rms_sigmas=rules.rms_sigmas,
         marked_share=rules.marked_share,
-    )
+    )  # fmt: skip
     shape = shape_of(
         problem.places.camera,
         scale=best.scale,
