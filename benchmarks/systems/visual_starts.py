@@ -57,24 +57,30 @@ def walks(ledger: Ledger, seeds: Sequence[int], jobs: int) -> Iterator[str]:
     """Yield the table of walks and the rate of true sigmas over all of them."""
     keys: list[Key] = [(*case, seed) for case in WALKS for seed in seeds]
     done = run_trials(walk_trial, keys, ledger, n_jobs=jobs)
-    rows, inside = [], []
+    rows: list[tuple[str, ...]] = []
+    inside: tuple[list[bool], list[bool]] = ([], [])
     for case in WALKS:
         trials = [done[(*case, seed)] for seed in seeds]
         ready = [row for row in trials if row["state"] in READY]
+        coarse = [row for row in trials if row["state"] == "COARSE"]
         error = np.array([row["scale_percent"] for row in ready])
         sigma = np.array([row["sigma_percent"] for row in ready])
-        away = np.abs(100.0 * np.log1p(error / 100.0)) / sigma
-        inside += [bool(x) for x in away <= 3.0]
+        for kind, found in zip(inside, (ready, coarse), strict=True):
+            kind += [
+                100.0 * abs(np.log1p(row["scale_percent"] / 100.0)) <= 3.0 * row["sigma_percent"]
+                for row in found
+            ]
         anchors = [
             x for row in ready for x, k in zip(row["anchor_m"], row["anchor_ready"], strict=True)
             if k
         ]  # fmt: skip
         rows.append(
             (
-                f"{case[0]}, {case[1]} s, {case[2]} anchors",
+                f"{case[0]}, {case[1]} s, {case[2]} anchor{'s' if case[2] != 1 else ''}",
                 f"{100 * float(case[3]):.0f} %",
                 f"{100 * float(case[4]):.1f} %",
                 f"{len(ready)} of {len(trials)}",
+                str(len(coarse)),
                 number_text(rms(error)) if len(error) else "–",
                 number_text(np.abs(error).max(initial=0.0)),
                 number_text(float(sigma.mean())) if len(sigma) else "–",
@@ -82,14 +88,25 @@ def walks(ledger: Ledger, seeds: Sequence[int], jobs: int) -> Iterator[str]:
                 str(int((np.abs(error) > 5.0).sum())),
             )
         )
-    header = ("walk", "NLOS", "drift", "scale ready", "scale rms, %", "worst, %", "sigma, %")
-    yield from table((*header, "anchor median, m", "ready and off by 5 %"), rows)
-    rate = rate_with_interval(inside)
-    yield ""
-    yield (
-        f"Truth within 3 sigma in {100 * rate.value:.1f} % ({100 * rate.low:.1f} to "
-        f"{100 * rate.high:.1f}) of {len(inside)} scales called ready."
+    header = (
+        "walk",
+        "NLOS",
+        "drift",
+        "scale ready",
+        "coarse",
+        "scale rms, %",
+        "worst, %",
+        "sigma, %",
     )
+    yield from table((*header, "anchor median, m", "ready and off by 5 %"), rows)
+    yield ""
+    for what, kind in zip(("ready", "coarse"), inside, strict=True):
+        if kind:
+            rate = rate_with_interval(kind)
+            yield (
+                f"Truth within 3 sigma in {100 * rate.value:.1f} % ({100 * rate.low:.1f} to "
+                f"{100 * rate.high:.1f}) of {len(kind)} scales called {what}."
+            )
 
 
 def shapes(ledger: Ledger, seeds: Sequence[int], jobs: int) -> Iterator[str]:
@@ -104,7 +121,7 @@ def shapes(ledger: Ledger, seeds: Sequence[int], jobs: int) -> Iterator[str]:
         for row in trials:
             states[row["state"]] = states.get(row["state"], 0) + 1
         listed = [bool(row["truth_listed"]) for row in trials if "truth_listed" in row]
-        ready = [row for row in trials if row["state"] in READY]
+        ready = [row for row in trials if row["state"] in (*READY, "COARSE")]
         scale = [abs(row["scale_percent"]) for row in ready]
         rows.append(
             (
@@ -164,6 +181,8 @@ def main() -> None:
     lines += [*shapes(ledger, seeds[: asked.shapes], asked.jobs), ""]
     if (DATA / "starloc").is_dir():
         lines += starloc(DATA / "starloc")
+    else:
+        lines.append(f"STAR-loc is not in {DATA}: set SSM_GRAPH_DATA to have its runs here.")
     report.write(lines)
 
 

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ssm_graph.base.frozen import Array
 from ssm_graph.systems.visual_ranges.range_fit import BIAS_M, Problem, Solution, polished
 from ssm_graph.systems.visual_ranges.weights import robust_rms
 
@@ -22,6 +23,7 @@ def contradictions(
     names: tuple[str, ...],
     best: Solution,
     *,
+    stated_m: Array,
     rms_sigmas: float,
     marked_share: float,
 ) -> list[str]:
@@ -30,13 +32,14 @@ def contradictions(
     Parameters
     ----------
     names : (J,) of the anchors.
+    stated_m : (M,) standard deviations as stated; the problem's may have been widened.
     rms_sigmas : up to which residuals may be wider than stated.
     marked_share : of an anchor's ranges that may be too long.
     """
     at, told = problem.places, []
     for j, name in enumerate(names):
         own = at.anchor == j
-        stated, seen = float(np.median(at.sigma_m[own])), robust_rms(best.error[own])
+        stated, seen = float(np.median(stated_m[own])), robust_rms(best.error[own])
         if seen > rms_sigmas * stated:
             told.append(f"residuals of anchor {name} are {seen:.2f} m, {stated:.2f} m were stated")
         bias = float(best.biases[j])
@@ -46,7 +49,7 @@ def contradictions(
         if marked > marked_share:
             told.append(f"{100.0 * marked:.0f} % of the ranges to anchor {name} are too long")
     first = at.time_s < np.median(at.time_s)
-    halves = [_half(_part(problem, half), best) for half in (first, ~first)]
+    halves = [polished(_part(problem, half), best) for half in (first, ~first)]
     apart = np.log(halves[0].scale / halves[1].scale)
     sigma = float(np.hypot(halves[0].sigma_log_scale, halves[1].sigma_log_scale))
     if abs(apart) > 3.0 * sigma:
@@ -63,10 +66,6 @@ def contradictions(
                 "second half: did it move, or is the antenna not calibrated?"
             )
     return told
-
-
-def _half(problem: Problem, best: Solution) -> Solution:
-    return polished(problem, best)
 
 
 def _part(problem: Problem, kept: Mask) -> Problem:

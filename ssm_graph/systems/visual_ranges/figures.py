@@ -192,9 +192,9 @@ def _run_figure(sequence: Sequence, result: VisualResult) -> Any:
     if refused:
         level = np.full(len(refused), 1.05 * max(float(result.n_tracked.max()), 1.0))
         axes.plot(refused, level, "x", color=OUTLIER, markersize=3, label="loop refused")
-    axes.set_ylim(top=1.25 * max(float(result.n_tracked.max()), 1.0))
+    axes.set_ylim(top=1.12 * max(float(result.n_tracked.max()), 1.0))
     dress(axes, title="Points seen", x="time since the first image (s)", y="points")
-    legend(axes, loc="upper left", ncols=5)
+    legend(axes, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=5, borderaxespad=0.2)
     error, _ = reprojection_errors(result)
     size = np.linalg.norm(error, axis=1) if len(error) else np.zeros(1)
     top = max(float(np.percentile(size, 99)), 0.1)

@@ -57,7 +57,8 @@ def close_loop(world: VisualMap, match: Match, camera: Camera) -> Closed:
     centre = scale[:, None] * np.einsum("kij,kj->ki", R, centre) + t
     R_cw = np.einsum("kij,klj->kil", world.frames["R_cw"], R)
     world.set_poses(np.arange(world.n_frames), R_cw, -np.einsum("kij,kj->ki", R_cw, centre))
-    world.frames["depth"][:] = scale * world.frames["depth"]
+    world.frames["depth"][:] *= scale
+    world.frames["grown"][:] *= scale
     return Closed(change, _fused(world, match, camera))
 
 

@@ -55,7 +55,7 @@ class RangeJudgement(NamedTuple):
 
 
 Judge = Callable[[Sim3, int], RangeJudgement | None]
-"""Of the correction (drifted map to old map) and the key frame; None where no anchor is ready."""
+"""Of the correction (drifted map to old map) and the key frame; None where no anchor is placed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -384,31 +384,47 @@ def _with_scale(
 
 
 def judge_of(ranging: Ranging | None, world: VisualMap) -> Judge | None:
-    """Return the judge that the ranges of the last seconds make; None where no anchor is placed."""
-    if ranging is None or ranging.found is None or ranging.terms is None:
-        return None
-    found, used = ranging.found, ranging.used
-    column = np.full(len(ranging.anchors), -1, dtype=np.int64)
-    column[used] = np.arange(len(used))
-    column[[own.state is AnchorState.DOUBTFUL for own in ranging.anchors]] = -1
-    terms = ranging.terms
-    time_s = ranging.ranges.time_s[terms.row]
-    own = terms.rows((time_s > time_s[-1] - JUDGED_S) & (column[terms.anchor] >= 0))
-    if len(own) < LEAST_JUDGES:
-        return None
-    R, t = world.frames["R_cw"][own.key_frame], world.frames["t_cw"][own.key_frame]
-    place = np.einsum("mji,mj->mi", R, own.motion + found.clock_s * own.velocity - t)
-    arm = np.einsum("mji,mj->mi", R, own.lever)
-    anchor, bias = found.anchors[column[own.anchor]], found.biases[column[own.anchor]]
+    """Return the judge that the ranges of the last seconds make; None where no anchor is placed.
 
-    def median(camera: Array, lever: Array) -> float:
-        computed = np.linalg.norm(found.scale * camera + lever - anchor, axis=1) + bias
-        return float(np.median(np.abs(computed - own.range_m)))
+    Of an anchor with several places that one judges which speaks best for the loop; an anchor that
+    is not sharp, or doubtful, does not judge.
+    """
+    if ranging is None or not ranging.has_scale or ranging.terms is None:
+        return None
+    assert ranging.found is not None
+    found, terms = ranging.found, ranging.terms
+    recent = ranging.ranges.time_s[terms.row]
+    recent = recent > recent[-1] - JUDGED_S
+    rows, places = [], []
+    for i, j in enumerate(ranging.used):
+        own = ranging.anchors[j]
+        is_open = own.state is AnchorState.AMBIGUOUS and len(own.alternatives) > 0
+        if own.state is AnchorState.READY or is_open:
+            rows.append(terms.rows(recent & (terms.anchor == j)))
+            places.append([(found.anchors[i], float(found.biases[i])), *own.alternatives])
+    n_ranges = sum(len(each) for each in rows)
+    if n_ranges < LEAST_JUDGES:
+        return None
 
-    sigma, before = float(np.median(own.sigma_m)), median(place, arm)
+    def median(correction: Sim3) -> float:
+        """Return the median size of the errors with the path carried along."""
+        sizes = []
+        for own, options in zip(rows, places, strict=True):
+            R, t = world.frames["R_cw"][own.key_frame], world.frames["t_cw"][own.key_frame]
+            place = np.einsum("mji,mj->mi", R, own.motion + found.clock_s * own.velocity - t)
+            arm = np.einsum("mji,mj->mi", R, own.lever) @ correction.R.T
+            antenna = found.scale * correction.apply(place) + arm
+            errors = [
+                np.abs(np.linalg.norm(antenna - anchor, axis=1) + bias - own.range_m)
+                for anchor, bias in options
+            ]
+            sizes.append(min(errors, key=lambda one: float(np.median(one)) if len(one) else 0.0))
+        return float(np.median(np.concatenate(sizes)))
+
+    sigma = float(np.median(np.concatenate([own.sigma_m for own in rows])))
+    before = median(Sim3(np.eye(3), np.zeros(3), 1.0))
 
     def judge(correction: Sim3, _: int) -> RangeJudgement:
-        after = median(correction.apply(place), arm @ correction.R.T)
-        return RangeJudgement(before, after, sigma, len(own))
+        return RangeJudgement(before, median(correction), sigma, n_ranges)
 
     return judge

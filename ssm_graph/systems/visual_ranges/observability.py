@@ -22,6 +22,8 @@ NEAR_SHAPE: Final = 0.02
 """A path is on a shape where its distance from it is less than such a share of its spread."""
 NEAR_SIGMAS: Final = 0.5
 """Or less than so many sigmas of a range."""
+BEND_SIGMAS: Final = 3.0
+"""Up to which a bend of the ranges is none."""
 
 
 class Motion(Enum):
@@ -65,7 +67,6 @@ def shape_of(
     scale: float,
     sigma_m: float,
     turned_rad: float = 0.0,
-    anchor: Array | None = None,
     range_m: Array | None = None,
 ) -> Shape:
     """Return the simplest shape that a path is on.
@@ -76,8 +77,7 @@ def shape_of(
     scale : metres a map unit, as far as known.
     sigma_m : of a range; what is off a shape by less than half of it is on it.
     turned_rad : largest angle between two of the camera's axes.
-    anchor : (3,) m, where it seems to be.
-    range_m : (N,) ranges to it.
+    range_m : (N,) to one anchor, NaN where of another one or not in line of sight.
     """
     centred = path - path.mean(axis=0)
     _, singular, axes = np.linalg.svd(centred, full_matrices=False)
@@ -88,11 +88,11 @@ def shape_of(
         return Shape(motion, spread, axes, first)
     near = max(NEAR_SHAPE * first, NEAR_SIGMAS * sigma_m / scale)
     if second < near:
-        return Shape(_line(path, axes[0], scale, anchor), spread, axes, second)
+        return Shape(_line(centred @ axes[0], range_m, sigma_m), spread, axes, second)
     on_circle = _off_sphere(centred @ axes[:2].T)
     if third < near:
         if on_circle < near:
-            still = range_m is not None and float(np.std(range_m)) < 3.0 * sigma_m
+            still = range_m is not None and float(np.nanstd(range_m)) < 3.0 * sigma_m
             motion = Motion.CIRCLE_ABOUT_ANCHOR if still else Motion.CIRCLE
             return Shape(motion, spread, axes, float(np.hypot(third, on_circle)))
         return Shape(Motion.PLANE, spread, axes, third)
@@ -102,13 +102,15 @@ def shape_of(
     return Shape(Motion.GENERAL, spread, axes, min(third, on_sphere))
 
 
-def _line(path: Array, along: Array, scale: float, anchor: Array | None) -> Motion:
-    if anchor is None:
+def _line(along: Array, range_m: Array | None, sigma_m: float) -> Motion:
+    """Return whether ranges (N,) bend along a line: they do not where it leads to the anchor."""
+    if range_m is None:
         return Motion.LINE
-    to = anchor - scale * path.mean(axis=0)
-    aside = float(np.linalg.norm(to - (to @ along) * along))
-    is_near = aside < 0.15 * float(np.linalg.norm(to))
-    return Motion.LINE_THROUGH_ANCHOR if is_near else Motion.LINE
+    known = np.isfinite(range_m)
+    rows = np.vander(along[known] / max(float(np.abs(along).max()), 1e-12), 3)
+    inverse = np.linalg.pinv(rows)
+    bend, sigma = float(inverse[0] @ range_m[known]), sigma_m * float(np.linalg.norm(inverse[0]))
+    return Motion.LINE_THROUGH_ANCHOR if abs(bend) < BEND_SIGMAS * sigma else Motion.LINE
 
 
 def _off_sphere(places: Array) -> float:

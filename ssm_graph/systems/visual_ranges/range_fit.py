@@ -323,7 +323,7 @@ def solution(
         error, J = residuals(problem, at)
         normal, gradient = _normal(problem, at, error, J, variance=variance)
         covariance = np.linalg.inv(normal[0] + information)
-        variance = np.einsum("mi,ij,mj->m", J[0], covariance, J[0])[None]
+        variance = ((J[0] @ covariance) * J[0]).sum(axis=1)[None]
         step = -covariance @ (gradient[0] + information @ at[0])
         moved = _kept_step(problem, at, step)
         at = at + moved

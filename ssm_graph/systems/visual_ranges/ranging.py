@@ -41,7 +41,7 @@ from ssm_graph.systems.visual_ranges.start import (
     later_anchor,
     widened,
 )
-from ssm_graph.systems.visual_ranges.weights import NLOS_WEIGHT, robust_rms
+from ssm_graph.systems.visual_ranges.weights import NLOS_WEIGHT, POLISH, robust_rms
 
 __all__ = ["Anchor", "AnchorState", "Ranging", "RangingResult"]
 
@@ -166,7 +166,7 @@ class Ranging(ShortRepr):
             self.found.clock_s,
             self.found.anchors,
             self.found.biases,
-            self.rules.kernel,
+            POLISH,  # what is far too long would bend biases and anchors otherwise
             is_free,
         )
 
@@ -191,6 +191,8 @@ class Ranging(ShortRepr):
             states = [own.state for own in self.anchors]
             is_sharp = all(s is not AnchorState.AMBIGUOUS for s in states)
             state = StartState.READY if is_sharp else StartState.MIRROR
+            if found.sigma_log_scale > self.rules.ready_sigma:
+                state = StartState.COARSE
         return RangingResult(
             state,
             self.scale,
@@ -262,7 +264,8 @@ class Ranging(ShortRepr):
         self._go_on(places, self.started_s)
         found = self.found
         return [
-            f"scale {found.scale:.4g} m a map unit, known to {100 * found.sigma_log_scale:.1f} %; "
+            f"scale {found.scale:.4g} m a map unit, known to {100 * found.sigma_log_scale:.1f} % "
+            f"({self.start.state.name.lower()}); "
             + ", ".join(f"anchor {self.anchors[j].name} {self.anchors[j].state.name.lower()}"
                         for j in self.used)
         ]  # fmt: skip

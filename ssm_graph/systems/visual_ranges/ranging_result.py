@@ -67,4 +67,4 @@ class RangingResult(ReadOnlyArrays):
     @property
     def has_scale(self) -> bool:
         """Whether map units can be turned into metres."""
-        return self.state in (StartState.READY, StartState.MIRROR)
+        return self.state.has_scale

@@ -30,7 +30,7 @@ from ssm_graph.systems.visual_ranges.range_fit import (
     with_sigma,
 )
 from ssm_graph.systems.visual_ranges.ranges import Indices
-from ssm_graph.systems.visual_ranges.weights import RangeKernel, robust_rms
+from ssm_graph.systems.visual_ranges.weights import NLOS_WEIGHT, RangeKernel, robust_rms
 
 DIRECTIONS: Final = 12
 SCALES: Final = 4
@@ -38,6 +38,8 @@ SCALES: Final = 4
 MOST_ROWS: Final = 250
 """Ranges of an anchor that the searches take, spread over all."""
 MOST_MINIMA: Final = 6
+HOPELESS: Final = 60.0
+"""Deviance by which a minimum is so much worse than the best that it is left."""
 OPEN_SHAPES: Final = (Motion.PLANE, Motion.LINE, Motion.LINE_THROUGH_ANCHOR)
 """Leave the anchor open, but not the scale."""
 
@@ -47,9 +49,15 @@ class StartState(Enum):
 
     WAITING = "too few ranges yet"
     AMBIGUOUS = "several solutions, or none that is sharp"
+    COARSE = "scale known roughly: used, but not to be relied on yet"
     MIRROR = "scale ready; an anchor has other places that fit as well"
     READY = "scale and anchors ready"
     REFUSED = "the ranges contradict themselves"
+
+    @property
+    def has_scale(self) -> bool:
+        """Whether map units can be turned into metres."""
+        return self in (StartState.READY, StartState.MIRROR, StartState.COARSE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +68,9 @@ class StartRules:
     """Of an anchor."""
     least_s: float = 5.0
     scale_sigma: float = 0.04
-    """Relative standard deviation of the scale."""
+    """Relative standard deviation of the scale from which it is used."""
+    ready_sigma: float = 0.05 / 3.0
+    """And from which it is called ready: at 3 sigma it is right to 5 %."""
     anchor_sigma_m: float = 0.5
     anchor_sigma_share: float = 0.06
     """Of the median range; the larger of both counts."""
@@ -76,6 +86,13 @@ class StartRules:
     """Of a path that its ranges hold."""
     bias_walk_m: float = BIAS_WALK_M
     kernel: RangeKernel = RangeKernel()
+
+    def coarse(self, sigma_log_scale: float) -> str:
+        """Say what a scale lacks to be ready."""
+        return (
+            f"scale known to {100.0 * sigma_log_scale:.1f} %, {100.0 * self.ready_sigma:.1f} % are "
+            "needed to rely on it"
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,8 +115,8 @@ class Start(ShortRepr):
 
     @property
     def has_scale(self) -> bool:
-        """Whether map units can be turned into metres."""
-        return self.state in (StartState.READY, StartState.MIRROR)
+        """See :attr:`StartState.has_scale`."""
+        return self.state.has_scale
 
 
 def find_start(
@@ -132,15 +149,16 @@ def find_start(
         bias_walk_m=rules.bias_walk_m,
         spacing=spacing,
     )
-    found = _candidates(problem)
-    problem = widened(problem, solution(problem, _best_first(problem, found)[0]))
-    ends = [solution(problem, one) for one in _best_first(problem, found)]
+    found = _ends(problem, _candidates(problem))
+    stated_m = problem.places.sigma_m
+    problem = widened(problem, solution(problem, found[0]))
+    ends = [solution(problem, one) for one in _ends(problem, found)]
     ends.sort(key=lambda one: one.cost)
     best, *rivals = (polished(problem, one) for one in ends)
     apart = [rival for rival in rivals if _is_apart(best, rival)]
     gap = min((rival.cost - best.cost for rival in apart), default=np.inf)
     near = [rival for rival in apart if rival.cost - best.cost < rules.gap]
-    return _judged(problem, names, rules, best, near, gap, turned_rad)
+    return _judged(problem, names, rules, best, near, gap, turned_rad, stated_m)
 
 
 def _too_early(
@@ -245,7 +263,7 @@ def _candidates(problem: Problem) -> list[Array]:
     minima = []
     for one in alone:
         fit = search(one, _starts(one))
-        minima.append(_distinct(fit.unknowns, fit.cost, 60.0))
+        minima.append(_distinct(fit.unknowns, fit.cost, HOPELESS))
     log_scales: list[float] = []
     for each in minima:
         for one_minimum in each:
@@ -275,7 +293,7 @@ def _placed(one: Problem, minima: list[Array], log_scale: float) -> list[tuple[A
     starts[DIRECTIONS:] = np.array(minima).reshape(-1, 6)
     starts[:, 0] = log_scale
     fit = search(one, starts, held=np.array([0, 1]))
-    kept = _distinct(fit.unknowns, fit.cost, 60.0)[:3]
+    kept = _distinct(fit.unknowns, fit.cost, HOPELESS)[:3]
     costs = [float(fit.cost[np.flatnonzero((fit.unknowns == row).all(axis=1))[0]]) for row in kept]
     return [(row[2:], cost) for row, cost in zip(kept, costs, strict=True)]
 
@@ -287,10 +305,19 @@ def _joined(problem: Problem, log_scale: float, own: list[Array]) -> Array:
     return made
 
 
-def _best_first(problem: Problem, starts: list[Array]) -> list[Array]:
-    """Return where searches with all modes end, the best first."""
+def _ends(problem: Problem, starts: list[Array]) -> list[Array]:
+    """Return where searches with all modes end, the best first, each once."""
     fit = search(problem, np.array(starts))
-    return [fit.unknowns[row] for row in np.argsort(fit.cost)]
+    own = fit.unknowns[:, 2 : problem.n_core].reshape(len(starts), -1, 4)[:, :, :3]
+    kept: list[int] = []
+    for row in np.argsort(fit.cost):
+        if fit.cost[row] > fit.cost.min() + HOPELESS:
+            break
+        same = np.abs(fit.unknowns[kept, 0] - fit.unknowns[row, 0]) < 0.003
+        same &= np.abs(own[kept] - own[row]).max(axis=(1, 2), initial=0.0) < 0.02
+        if not same.any():
+            kept.append(int(row))
+    return list(fit.unknowns[kept])
 
 
 def widened(problem: Problem, best: Solution) -> Problem:
@@ -323,6 +350,7 @@ def _judged(
     near: list[Solution],
     gap: float,
     turned_rad: float,
+    stated_m: Array,
 ) -> Start:
     at = problem.places
     n_anchors = len(names)
@@ -340,19 +368,15 @@ def _judged(
     ready, doubts = _sharp_anchors(problem, names, rules, best, near, gap)
     reasons += doubts
     against = contradictions(
-        problem,
-        names,
-        best,
-        rms_sigmas=rules.rms_sigmas,
+        problem, names, best, stated_m=stated_m, rms_sigmas=rules.rms_sigmas,
         marked_share=rules.marked_share,
-    )
+    )  # fmt: skip
     shape = shape_of(
         problem.places.camera,
         scale=best.scale,
         sigma_m=float(np.median(at.sigma_m)),
         turned_rad=turned_rad,
-        anchor=best.anchors[0] - best.scale * problem.middle,
-        range_m=at.range_m[at.anchor == 0],
+        range_m=np.where((at.anchor == 0) & (best.weight > NLOS_WEIGHT), at.range_m, np.nan),
     )
     # An anchor that is not sharp though the path is in all directions: something else is wrong.
     is_explained = any(ready) or near or shape.motion in OPEN_SHAPES
@@ -360,6 +384,9 @@ def _judged(
         state = StartState.REFUSED
     elif not (scale_is_sharp and is_explained) or (n_anchors == 1 and shape.motion.leaves_scale):
         state = StartState.AMBIGUOUS
+    elif best.sigma_log_scale > rules.ready_sigma:
+        state = StartState.COARSE
+        reasons.append(rules.coarse(best.sigma_log_scale))
     else:
         state = StartState.READY if all(ready) else StartState.MIRROR
     if state is StartState.READY:

@@ -65,6 +65,7 @@ class _Run:
         self.state = np.full(n, FrameState.WAITING, dtype=np.int64)
         self.reference = np.full(n, -1, dtype=np.int64)
         self.relative_R, self.relative_t = np.full((n, 3, 3), np.nan), np.full((n, 3), np.nan)
+        self.unit = np.ones(n)
         self.n_tracked = np.zeros(n, dtype=np.int64)
         self.events: list[str] = []
         self.timing: dict[str, list[float]] = defaultdict(list)
@@ -190,7 +191,10 @@ class _Run:
             if self.state[i - 1] == FrameState.TRACKED:
                 self.note(i, f"lost: {found.n_points} points left")
             return
-        self.record(i, found.pose, self.tracker.reference, found.n_points, found.tracks)
+        # From its key frame as it was tracked: the mapping beside may have moved the map since.
+        relative, unit = self.tracker.relative, self.tracker.unit
+        self.keep(i, relative, unit, self.tracker.reference)
+        self.n_tracked[i], self.seen[i] = found.n_points, found.tracks
         if self.job is None and self.is_key_frame(i, found):
             self.make_key_frame(i, image, found)
 
@@ -272,10 +276,6 @@ class _Run:
             return
         with self.world.lock:
             closed = close_loop(self.world, match, self.camera)
-            grown = np.array([one.scale for one in closed.change])
-            on = self.reference >= 0
-            self.relative_t[on] *= grown[self.reference[on], None]
-            self.tracker.grow(float(grown[self.tracker.reference]))
         self.note(
             i,
             f"loop closed with {self.world.frames['time_s'][match.matched]:.1f} s: "
@@ -299,10 +299,13 @@ class _Run:
     def record(self, i: int, pose: Pose, reference: int, n_points: int, tracks: Tracks) -> None:
         """Keep a frame's pose relative to its key frame."""
         relative = pose.after(self.world.pose(reference).inverse())
-        self.state[i], self.reference[i] = FrameState.TRACKED, reference
+        self.keep(i, relative, float(self.world.frames["grown"][reference]), reference)
+        self.n_tracked[i], self.seen[i] = n_points, tracks
+
+    def keep(self, i: int, relative: Pose, unit: float, reference: int) -> None:
+        """Keep a pose from that of a key frame around which the map had grown by ``unit``."""
+        self.state[i], self.reference[i], self.unit[i] = FrameState.TRACKED, reference, unit
         self.relative_R[i], self.relative_t[i] = relative
-        self.n_tracked[i] = n_points
-        self.seen[i] = tracks
 
     def note(self, i: int, text: str) -> None:
         """Keep what happened."""
@@ -364,7 +367,9 @@ class _Run:
         base_R = world.frames["R_cw"][self.reference[on]]
         base_t = world.frames["t_cw"][self.reference[on]]
         R[on] = self.relative_R[on] @ base_R
-        t[on] = np.einsum("nij,nj->ni", self.relative_R[on], base_t) + self.relative_t[on]
+        grown = world.frames["grown"][self.reference[on]] / self.unit[on]
+        t[on] = np.einsum("nij,nj->ni", self.relative_R[on], base_t)
+        t[on] += grown[:, None] * self.relative_t[on]
         return R, t
 
     def answer(self) -> VisualResult:

@@ -74,6 +74,9 @@ class Tracker:
         """newest pose from that of the reference key frame"""
         self.velocity = Pose(np.eye(3), np.zeros(3))
         self.depth = 1.0
+        self.unit = 1.0
+        """of relative, velocity and depth: by how much the map around the reference key frame had
+        grown when they were found; the mapping beside never touches them"""
 
     def whitening(self, n: int) -> Array:
         """Return one over the sigma of ``n`` tracked corners, in normalised coordinates."""
@@ -83,16 +86,19 @@ class Tracker:
         return focal_scale(self._camera, octave, self._settings.pixel_sigma)
 
     def pose(self) -> Pose:
-        """Return the newest pose, the map as it stands."""
+        """Return the newest pose, in the map as it was when it was caught up with."""
         return self.relative.after(self._world.pose(self.reference))
 
     def set_pose(self, pose: Pose, reference: int) -> None:
         """Hang the newest pose on a key frame."""
         self.reference = reference
         self.relative = pose.after(self._world.pose(reference).inverse())
+        self.unit = float(self._world.frames["grown"][reference])
 
-    def grow(self, scale: float) -> None:
+    def _catch_up(self) -> None:
         """Follow a change of the map's scale around the reference key frame."""
+        unit = float(self._world.frames["grown"][self.reference])
+        scale, self.unit = unit / self.unit, unit
         self.relative = Pose(self.relative.R_cw, scale * self.relative.t_cw)
         self.velocity = Pose(self.velocity.R_cw, scale * self.velocity.t_cw)
         self.depth *= scale
@@ -108,7 +114,8 @@ class Tracker:
         """Return the pose of the next image; none when too little is left."""
         assert self.image is not None
         with self._world.lock:
-            before = self.pose()
+            self._catch_up()
+            before, key_pose = self.pose(), self._world.pose(self.reference)
             point = self._world.tracks["point"][self.tracks.track]
             alive = point != DROPPED
             tracks, point = self.tracks.kept(alive), point[alive]
@@ -123,8 +130,8 @@ class Tracker:
                 break
         assert answer is not None
         if answer.pose is not None:
-            motion = answer.pose.after(before.inverse())
-            self.velocity, self.relative = motion, motion.after(self.relative)
+            self.velocity = answer.pose.after(before.inverse())
+            self.relative = answer.pose.after(key_pose.inverse())
             self.tracks, self.image = answer.tracks, image
             self.depth = answer.depth
         return answer
@@ -137,6 +144,7 @@ class Tracker:
         """
         assert self.image is not None
         with self._world.lock:
+            self._catch_up()
             pose, key_pose = self.pose(), self._world.pose(self.reference)
             point = self._world.tracks["point"][made.track]
             places = self._world.points["place"][np.maximum(point, 0)]

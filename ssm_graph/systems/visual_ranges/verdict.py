@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ssm_graph.systems.visual_ranges.ranging import AnchorState, RangingResult
 from ssm_graph.systems.visual_ranges.result import FrameState, MapSnapshot, VisualResult
-from ssm_graph.systems.visual_ranges.start import StartState
+from ssm_graph.systems.visual_ranges.start import StartRules, StartState
 
 Array = NDArray[np.float64]
 
@@ -72,6 +72,8 @@ def judged(result: VisualResult) -> Judged:
             f"anchor {', '.join(doubtful)}: most of its last ranges contradict its place: it is "
             "hidden, or was moved"
         )
+    if ranging.state is StartState.COARSE:
+        faults.append(StartRules().coarse(ranging.sigma_log_scale))
     open_ones = [a.name for a in ranging.anchors if a.state is AnchorState.AMBIGUOUS]
     told = []
     if open_ones:

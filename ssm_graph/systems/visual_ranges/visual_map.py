@@ -69,6 +69,7 @@ class VisualMap:
             last_row=((), i8, 0),
             covariance=((6, 6), f8, np.nan),
             depth=((), f8, 1.0),
+            grown=((), f8, 1.0),
         )
         self.rows = Columns(
             frame=((), i8, -1), pixel=((2,), f8, 0.0), xy=((2,), f8, 0.0), octave=((), i8, 0),

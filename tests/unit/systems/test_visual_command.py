@@ -75,7 +75,7 @@ def made(*, blur_px: float = 0.0, bent: float = 0.0) -> tuple[Sequence, VisualRe
 
 def ranging(anchor: AnchorState, state: StartState) -> RangingResult:
     """Return scale and an anchor in a state."""
-    has_scale = state in (StartState.READY, StartState.MIRROR)
+    has_scale = state.has_scale
     mirror = ANCHOR[None] * [1, -1, 1] if anchor is AnchorState.AMBIGUOUS else np.zeros((0, 3))
     place = ANCHOR.copy() if has_scale else np.full(3, np.nan)
     one = Anchor("A", anchor, place, 0.01 * np.eye(3), 0.05, 0.02, mirror, N, 0.1)
@@ -92,6 +92,7 @@ def ranging(anchor: AnchorState, state: StartState) -> RangingResult:
         (AnchorState.READY, StartState.READY, Verdict.READY, True),
         (AnchorState.AMBIGUOUS, StartState.MIRROR, Verdict.MIRROR, True),
         (AnchorState.DOUBTFUL, StartState.READY, Verdict.DOUBTFUL, False),
+        (AnchorState.READY, StartState.COARSE, Verdict.DOUBTFUL, False),
         (AnchorState.UNKNOWN, StartState.AMBIGUOUS, Verdict.AMBIGUOUS, False),
         (AnchorState.UNKNOWN, StartState.REFUSED, Verdict.AMBIGUOUS, False),
     ],

@@ -9,15 +9,20 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from ssm_graph.systems.visual_ranges import tracking
 from ssm_graph.systems.visual_ranges.accuracy import accuracy
 from ssm_graph.systems.visual_ranges.features import corners
+from ssm_graph.systems.visual_ranges.geometry import Pose
 from ssm_graph.systems.visual_ranges.patches import align, align_numpy
 from ssm_graph.systems.visual_ranges.result import FrameState, VisualResult
 from ssm_graph.systems.visual_ranges.sequence import Sequence
 from ssm_graph.systems.visual_ranges.settings import VisualSettings
 from ssm_graph.systems.visual_ranges.simulate import SMALL_CAMERA, Run, simulate
 from ssm_graph.systems.visual_ranges.system import run
+from ssm_graph.systems.visual_ranges.tracking import Tracker, Tracks
+from ssm_graph.systems.visual_ranges.visual_map import VisualMap
 
+Array = NDArray[np.float64]
 SETTINGS = VisualSettings(n_corners=250)
 
 
@@ -73,6 +78,39 @@ def test_mapping_beside_tracking() -> None:
     assert found is not None
     assert (result.state == FrameState.TRACKED).all()
     assert found.similar_m < 0.015
+
+
+def test_a_loop_that_is_closed_meanwhile_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The map doubles while an image is tracked: the next pose is that in the doubled map."""
+    rng = np.random.default_rng(0)
+    places = rng.uniform([-1.0, -0.7, 2.0], [1.0, 0.7, 4.0], (120, 3))
+    still, black = Pose(np.eye(3), np.zeros(3)), np.zeros((240, 320), np.uint8)
+    world = VisualMap()
+    world.add_frame(0, 0.0, still, black)
+    pixel = SMALL_CAMERA.project(places)
+    track = world.new_tracks(120)
+    world.add_rows(
+        0, track, pixel=pixel, xy=SMALL_CAMERA.normalise(pixel), octave=np.zeros(120, np.int64),
+        descriptor=np.zeros((120, 32), np.uint8),
+    )  # fmt: skip
+    world.add_points(track, places)
+    tracker = Tracker(SMALL_CAMERA, world, SETTINGS)
+    tracker.start(black, Tracks(track, pixel), still, 0)
+    step = np.array([0.02, 0.01, -0.03])
+    for n in (1, 2, 3):
+
+        def seen(*_: object, n: int = n) -> tuple[Array, NDArray[np.bool_]]:
+            if n == 2:
+                world.points["place"][:] *= 2.0
+                world.frames["grown"][:] *= 2.0
+            return SMALL_CAMERA.project(places + n * step), np.ones(120, dtype=bool)
+
+        monkeypatch.setattr(tracking, "flow", seen)
+        assert tracker.follow(black).pose is not None
+        np.testing.assert_allclose(
+            tracker.relative.t_cw, n * step * (2.0 if n == 3 else 1.0), atol=1e-6
+        )
+        assert tracker.unit == (2.0 if n == 3 else 1.0)
 
 
 @pytest.mark.slow
