@@ -45,7 +45,7 @@ from ssm_graph.sensors.messages import Message
 from tests.instrument_fixture import A50, UdpSender, free_port, gga, pips
 from tests.mission_fixture import LENGTH_S, make_mission
 
-SPEED = 10.0
+SPEED = 5.0
 """So many times as fast as the vehicle."""
 ROOT = Path(__file__).parents[2]
 PATIENCE_S = 60.0
@@ -170,10 +170,11 @@ def test_sigterm_ends_in_order_and_the_run_goes_on_later(mission: Path, tmp_path
     assert np.all(np.diff([answer["time_s"] for answer in answers]) > 0.0)
     summary = read_results(run).summary
     assert summary["ended"] == "it was asked to stop"
-    assert 0 < summary["n_messages"] < 1300
+    n_messages = len(list(messages_of(make_mission())))
+    assert 0 < summary["n_messages"] < n_messages
     code, said = finish(*words, "--speed", "full")
     assert code == ExitCode.GOOD, said
-    assert read_results(run).summary["n_messages"] == len(list(messages_of(make_mission())))
+    assert read_results(run).summary["n_messages"] == n_messages
 
 
 def test_what_is_asked_for_and_cannot_be(mission: Path, tmp_path: Path) -> None:
