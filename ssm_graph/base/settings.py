@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import stat
+import tomllib
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, fields
 from enum import Enum
@@ -305,6 +306,18 @@ def read_settings_file(path: Path) -> bytes:
                 f"{line.count(b'.')}; write lists of numbers on several lines"
             )
     return content
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Return what a TOML file that people write says.
+
+    Raises :class:`ConfigError` as :func:`read_settings_file` does and for what is no TOML in UTF-8,
+    :class:`OSError` where it cannot be read.
+    """
+    try:
+        return tomllib.loads(read_settings_file(path).decode("utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: expected TOML in UTF-8; {error}") from error
 
 
 def _plain(value: Any) -> Any:

@@ -11,33 +11,14 @@ from pathlib import Path
 from ssm_graph.base.errors import DataError, MissingExtraError
 from ssm_graph.report.page.charts import charts_of
 from ssm_graph.report.page.content import Content
+from ssm_graph.report.page.frame import frame, numbered
 from ssm_graph.report.page.words import sections, verdict
 
-_PAGE = """\
-<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title>
-<style>
-{css}</style>
-</head>
-<body>
-<main>
-<h1>{title}</h1>
-{verdict}
-<nav>{links}</nav>
-{charts}
-{sections}
-<footer>{footer}</footer>
-</main>
+_SCRIPTS = """\
 <script id="charts" type="application/json">{data}</script>
 <script>{library}</script>
 <script>
 {script}</script>
-</body>
-</html>
 """
 
 
@@ -57,15 +38,10 @@ def page_of(content: Content, *, footer: str) -> str:
         raise MissingExtraError("plotly", extra="report", purpose="a report page") from error
     charts = charts_of(content)
     told = sections(content)
-    own = files("ssm_graph.report.page")
     places = "\n".join(
         f'<h2 id="{chart.name}-title">{html.escape(chart.title)}</h2>'
         f'<p class="note">{html.escape(chart.note)}</p><div class="chart" id="{chart.name}"></div>'
         for chart in charts
-    )
-    texts = "\n".join(
-        f'<h2 id="part{number}">{html.escape(title)}</h2>\n{text}'
-        for number, (title, text) in enumerate(told)
     )
     links = [(f"{chart.name}-title", chart.title) for chart in charts]
     links += [(f"part{number}", title) for number, (title, _) in enumerate(told)]
@@ -73,18 +49,19 @@ def page_of(content: Content, *, footer: str) -> str:
         chart.name: {"traces": chart.traces, "layout": chart.layout, "is_time": chart.is_time}
         for chart in charts
     }
-    return _PAGE.format(
-        title=html.escape(f"{content.summary.get('mission')}: navigation report"),
-        css=(own / "page.css").read_text(encoding="utf-8"),
-        verdict=verdict(content),
-        links=" ".join(f'<a href="#{name}">{html.escape(title)}</a>' for name, title in links),
-        charts=places,
-        sections=texts,
-        footer=html.escape(footer),
+    scripts = _SCRIPTS.format(
         # A text of the mission must not end the script that it stands in.
         data=json.dumps(data, allow_nan=False).replace("</", "<\\/"),
         library=get_plotlyjs(),
-        script=(own / "page.js").read_text(encoding="utf-8"),
+        script=(files("ssm_graph.report.page") / "page.js").read_text(encoding="utf-8"),
+    )
+    return frame(
+        f"{content.summary.get('mission')}: navigation report",
+        head=verdict(content),
+        links=links,
+        body=f"{places}\n{numbered(told)}",
+        footer=footer,
+        scripts=scripts,
     )
 
 

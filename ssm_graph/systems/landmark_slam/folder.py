@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -20,7 +19,7 @@ from ssm_graph.base.settings import (
     Settings,
     number_key,
     read_settings,
-    read_settings_file,
+    read_toml,
 )
 from ssm_graph.base.tables import Table, TableSpec
 from ssm_graph.base.units import DEGREE
@@ -71,11 +70,9 @@ def read_landmark_folder(folder: Path) -> LandmarkLog:
     """
     path = folder / TOML_NAME
     try:
-        raw = tomllib.loads(read_settings_file(path).decode("utf-8"))
+        raw = read_toml(path)
     except FileNotFoundError:
         raise ConfigError(f"{folder}: expected a folder with {TOML_NAME}, found none") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: expected TOML in UTF-8; {error}") from error
     top = {key: value for key, value in raw.items() if key not in SECTIONS}
     read_settings("", top, known=TOP_KEYS, file=TOML_NAME)
     read = {

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import html
-from importlib.resources import files
 from pathlib import Path
 from typing import Final
 
@@ -12,6 +11,7 @@ import numpy as np
 
 from ssm_graph.base.code_version import code_version
 from ssm_graph.io.tables.append_file import write_through
+from ssm_graph.report.page.frame import frame, numbered
 from ssm_graph.report.page.words import table
 from ssm_graph.systems.visual_ranges.accuracy import Accuracy
 from ssm_graph.systems.visual_ranges.outputs import metres, told_events
@@ -22,28 +22,6 @@ from ssm_graph.systems.visual_ranges.verdict import Judged, reprojection_errors
 
 MOST_REFUSED: Final = 20
 """Loops refused that are shown one by one."""
-_PAGE: Final = """\
-<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title>
-<style>
-{css}img {{ max-width: 100%; }}
-</style>
-</head>
-<body>
-<main>
-<h1>{title}</h1>
-{head}
-<nav>{links}</nav>
-{body}
-<footer>{footer}</footer>
-</main>
-</body>
-</html>
-"""
 
 
 def write_page(
@@ -61,20 +39,13 @@ def write_page(
         for name, title, note in figures
     ]
     parts += [(title, text) for title, text in _sections(sequence, result, errors, notes) if text]
-    body = "\n".join(
-        f'<h2 id="part{n}">{html.escape(title)}</h2>\n{text}'
-        for n, (title, text) in enumerate(parts)
-    )
-    links = " ".join(
-        f'<a href="#part{n}">{html.escape(title)}</a>' for n, (title, _) in enumerate(parts)
-    )
-    text = _PAGE.format(
-        title=html.escape(f"{result.name}: camera and ranges"),
-        css=(files("ssm_graph.report.page") / "page.css").read_text(encoding="utf-8"),
+    text = frame(
+        f"{result.name}: camera and ranges",
         head=_head(sequence, result, judged, errors),
-        links=links,
-        body=body,
-        footer=html.escape(f"ssm-graph {code_version()}, ssm-graph visual"),
+        links=[(f"part{n}", title) for n, (title, _) in enumerate(parts)],
+        body=numbered(parts),
+        footer=f"ssm-graph {code_version()}, ssm-graph visual",
+        css="img { max-width: 100%; }\n",
     )
     write_through(path, text.encode())
 

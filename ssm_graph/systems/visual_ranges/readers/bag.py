@@ -20,7 +20,6 @@ Without it the only image topic is taken, and every topic of ``sensor_msgs/Range
 
 from __future__ import annotations
 
-import tomllib
 import weakref
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -33,7 +32,7 @@ from numpy.typing import NDArray
 
 from ssm_graph.base.errors import ConfigError, DataError, MissingExtraError, nearest_hint
 from ssm_graph.base.frozen import Array
-from ssm_graph.base.settings import Key, read_settings, read_settings_file
+from ssm_graph.base.settings import Key, read_settings, read_toml
 from ssm_graph.systems.visual_ranges.camera import Camera
 from ssm_graph.systems.visual_ranges.extras import opencv
 from ssm_graph.systems.visual_ranges.ranges import Ranges, screened_ranges
@@ -109,10 +108,7 @@ def read_mapping(path: Path) -> BagMapping:
 
     Raises :class:`ConfigError` with the key that is wrong.
     """
-    try:
-        raw = tomllib.loads(read_settings_file(path).decode("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: expected TOML in UTF-8; {error}") from error
+    raw = read_toml(path)
     listed, texts = raw.pop("ranges", []), raw.pop("definitions", [])
     top = read_settings("", raw, known=TOP_KEYS, file=path.name)
     topics = []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -20,7 +19,7 @@ from ssm_graph.base.settings import (
     number_key,
     optional_key,
     read_settings,
-    read_settings_file,
+    read_toml,
 )
 from ssm_graph.io.tables.append_file import write_through
 from ssm_graph.systems.visual_ranges.camera import Camera
@@ -120,11 +119,9 @@ def read_own_folder(folder: Path, options: ReadOptions) -> Sequence:
 def _sections(folder: Path) -> dict[str, Settings]:
     path = folder / TOML_NAME
     try:
-        raw = tomllib.loads(read_settings_file(path).decode("utf-8"))
+        raw = read_toml(path)
     except FileNotFoundError:
         raise ConfigError(f"{folder}: expected a folder with {TOML_NAME}, found none") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: expected TOML in UTF-8; {error}") from error
     camera = raw.get("camera")
     if isinstance(camera, dict) and camera.get("distortion") == []:
         del camera["distortion"]
