@@ -20,7 +20,7 @@ from ssm_graph.systems.landmark_slam.association import (
     association_errors,
 )
 from ssm_graph.systems.landmark_slam.figures import draw_map
-from ssm_graph.systems.landmark_slam.filtered import filtered, values_of
+from ssm_graph.systems.landmark_slam.filtered import filtered, first_values
 from ssm_graph.systems.landmark_slam.folder import (
     TOML_NAME,
     read_landmark_folder,
@@ -167,7 +167,7 @@ def solve(
     if asked.method != "smoother":
         answer = filtered(named, noise, asked.method)
     else:
-        values = first or values_of(filtered(named, noise, "ekf-weighted"))
+        values = first or first_values(named, noise)
         settings = SmootherSettings(asked.kernel)
         if asked.learns_observations:
             how = NoiseSettings(learns_control=asked.learns_control)

@@ -22,7 +22,7 @@ from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.units import DEGREE
 from ssm_graph.study.ledger import Key, Row
-from ssm_graph.systems.landmark_slam.filtered import filtered, values_of
+from ssm_graph.systems.landmark_slam.filtered import filtered, first_values
 from ssm_graph.systems.landmark_slam.filters import MapFilter
 from ssm_graph.systems.landmark_slam.methods import FILTERS, SMOOTHERS, check_method
 from ssm_graph.systems.landmark_slam.models import Bicycle
@@ -246,14 +246,14 @@ def smoothed_scores(path: Path, runs: Runs, case: NoiseCase, method: str) -> Sco
             problem = problem.associated(np.where(gross, -1, problem.landmark), problem.names)
             settings = SmootherSettings(GaussianKernel())
             answer = smooth_landmarks(
-                problem, noise, values_of(filtered(problem, noise, FIRST)), settings
+                problem, noise, first_values(problem, noise), settings
             )
         elif method == "smoother-em":
             answer = estimate_noise(
-                problem, noise, values_of(filtered(problem, noise, FIRST))
+                problem, noise, first_values(problem, noise)
             ).estimate
         else:
-            answer = smooth_landmarks(problem, noise, values_of(filtered(problem, noise, FIRST)))
+            answer = smooth_landmarks(problem, noise, first_values(problem, noise))
         errors.append(_pose_error(answer.pose[1:, None], path))
         covs.append(answer.pose_cov[1:, None])
         maps.append(np.linalg.norm(answer.landmarks - path.landmarks[ids], axis=1).mean())
