@@ -24,7 +24,13 @@ from ssm_graph.base.units import DEGREE
 from ssm_graph.study.ledger import Key, Row
 from ssm_graph.systems.landmark_slam.filtered import filtered, first_values
 from ssm_graph.systems.landmark_slam.filters import MapFilter
-from ssm_graph.systems.landmark_slam.methods import FILTERS, SMOOTHERS, check_method
+from ssm_graph.systems.landmark_slam.graphs import graph_of_problem
+from ssm_graph.systems.landmark_slam.incremental import (
+    LAG_S,
+    IncrementalSettings,
+    smooth_incrementally,
+)
+from ssm_graph.systems.landmark_slam.methods import INCREMENTAL, FILTERS, SMOOTHERS, check_method
 from ssm_graph.systems.landmark_slam.models import Bicycle
 from ssm_graph.systems.landmark_slam.noise import estimate_noise
 from ssm_graph.systems.landmark_slam.problem import SlamNoise, SlamProblem
@@ -245,13 +251,13 @@ def smoothed_scores(path: Path, runs: Runs, case: NoiseCase, method: str) -> Sco
             gross = np.concatenate([mark[b] for mark in runs.is_gross])
             problem = problem.associated(np.where(gross, -1, problem.landmark), problem.names)
             settings = SmootherSettings(GaussianKernel())
-            answer = smooth_landmarks(
-                problem, noise, first_values(problem, noise), settings
-            )
+            answer = smooth_landmarks(problem, noise, first_values(problem, noise), settings)
         elif method == "smoother-em":
-            answer = estimate_noise(
-                problem, noise, first_values(problem, noise)
-            ).estimate
+            answer = estimate_noise(problem, noise, first_values(problem, noise)).estimate
+        elif method in INCREMENTAL:
+            lag_s = LAG_S if method == "fixed-lag" else None
+            graph, how = graph_of_problem(problem, noise), IncrementalSettings(lag_s=lag_s)
+            answer = smooth_incrementally(graph, how).estimate
         else:
             answer = smooth_landmarks(problem, noise, first_values(problem, noise))
         errors.append(_pose_error(answer.pose[1:, None], path))
