@@ -1,4 +1,4 @@
-"""Readers of public logs: UTIAS MRCLAM, and graphs in the text of GTSAM, such as Victoria Park.
+"""Readers of public logs: UTIAS MRCLAM, Victoria Park, and graphs in the text of GTSAM.
 
 References
 ----------
@@ -15,6 +15,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.io import loadmat
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
@@ -140,3 +141,67 @@ def read_graph(path: Path) -> tuple[SlamProblem, SlamNoise]:
         np.full(3, 1e-3),
     )
     return problem, noise
+
+
+VICTORIA_GRAPH: Final = "gtsam_victoria_park.txt"
+VICTORIA_ODOMETRY: Final = "aa3_dr.mat"
+VICTORIA_GPS: Final = "aa3_gpsx.mat"
+WHEEL_TO_CENTRE_M: Final = 0.76
+"""From the middle of the rear axle to the wheel whose speed is measured (`info.txt` of the set)."""
+WHEEL_BASE_M: Final = 2.83
+POSE_APART_S: Final = 0.025
+"""A step of its odometry: poses of the graph where the vehicle stood follow one another by it."""
+DISTANCE_SHARE: Final = 0.01
+"""By which the graph's way and that of the odometry may differ."""
+
+
+def read_victoria_park(folder: Path) -> LandmarkLog:
+    """Return the raw log: all speeds and steering angles, the graph's observations, GPS as truth.
+
+    The graph tells no times. Its odometry is that of the log, put together between scans of the
+    laser: times follow from the way travelled. GPS knows no heading, so that the frame of the start
+    is not that of the truth: only what is aligned can be compared.
+    """
+    told = _arrays(folder / VICTORIA_ODOMETRY, "time", "speed", "steering")
+    time_s, speed, steering = told["time"] / 1e3, told["speed"], told["steering"]
+    gps = _arrays(folder / VICTORIA_GPS, "timeGps", "Lo_m", "La_m")
+    problem, noise = read_graph(folder / VICTORIA_GRAPH)
+    forward = speed / (1.0 - np.tan(steering) * WHEEL_TO_CENTRE_M / WHEEL_BASE_M)
+    way = np.append(0.0, np.cumsum(np.abs(forward[:-1]) * np.diff(time_s)))
+    own = np.append(0.0, np.cumsum(np.hypot(problem.control[:, 0], problem.control[:, 1])))
+    if abs(own[-1] / way[-1] - 1.0) > DISTANCE_SHARE:
+        raise DataError(
+            f"{folder}: expected a graph of the same drive, got {own[-1]:.0f} m in "
+            f"{VICTORIA_GRAPH} and {way[-1]:.0f} m in {VICTORIA_ODOMETRY}; is one of them cut?"
+        )
+    moved = np.append(True, np.diff(way) > 0.0)
+    pose_s = np.interp(own * (way[-1] / own[-1]), way[moved], time_s[moved])
+    # No two poses at one time: where it stood, each a step after the one before.
+    steps = POSE_APART_S * np.arange(len(pose_s))
+    pose_s = np.maximum.accumulate(pose_s - steps) + steps
+    typical = float(np.sqrt(np.mean(np.diff(pose_s))))
+    gps_s = gps["timeGps"] / 1e3
+    fresh = np.append(True, np.diff(gps_s) > 0.0)
+    truth = np.column_stack([gps["Lo_m"], gps["La_m"], np.full(len(gps_s), np.nan)])
+    return LandmarkLog(
+        time_s - time_s[0],
+        np.column_stack([forward, np.zeros(len(forward))]),
+        forward * np.tan(steering) / WHEEL_BASE_M,
+        pose_s[problem.keyframe] - time_s[0],
+        problem.measured,
+        np.array(problem.names).astype(np.intp)[problem.landmark],
+        SlamNoise(noise.control / typical, noise.observation),
+        gps_s[fresh] - time_s[0],
+        truth[fresh],
+        notes=("the truth is GPS, without a heading: of the errors only the aligned one counts",),
+    )
+
+
+def _arrays(path: Path, *names: str) -> dict[str, Array]:
+    try:
+        told = loadmat(path)
+        return {name: np.asarray(told[name], dtype=np.float64).ravel() for name in names}
+    except (OSError, ValueError, KeyError) as error:
+        raise DataError(
+            f"{path}: expected MATLAB's arrays {', '.join(names)}, got {error}; fetch the set anew"
+        ) from error

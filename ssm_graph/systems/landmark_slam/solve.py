@@ -53,7 +53,12 @@ from ssm_graph.systems.landmark_slam.problem import (
     SlamProblem,
     SlamStatus,
 )
-from ssm_graph.systems.landmark_slam.recorded import read_graph, read_mrclam
+from ssm_graph.systems.landmark_slam.recorded import (
+    VICTORIA_ODOMETRY,
+    read_graph,
+    read_mrclam,
+    read_victoria_park,
+)
 from ssm_graph.systems.landmark_slam.smoother import SmootherSettings, Values, smooth_landmarks
 
 NO_TRUTH: Final = np.zeros((0, 3))
@@ -157,9 +162,12 @@ def solve_input(path: Path, asked: Asked) -> Solved:
         if asked.robot is None:
             raise ConfigError(f"--robot: {path} has several robots; expected a number, try 1")
         log = read_mrclam(path, asked.robot)
+    elif (path / VICTORIA_ODOMETRY).exists():
+        log = read_victoria_park(path)
     else:
         raise ConfigError(
-            f"{path}: expected a folder with {TOML_NAME} or MRCLAM's Barcodes.dat, or a graph file"
+            f"{path}: expected a folder with {TOML_NAME}, MRCLAM's Barcodes.dat or Victoria Park's "
+            f"{VICTORIA_ODOMETRY}, or a graph file"
         )
     problem = problem_of_log(log)
     truth, known = truth_at(log, problem.time_s)
