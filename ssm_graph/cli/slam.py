@@ -104,12 +104,13 @@ def asked_of(arguments: argparse.Namespace) -> Asked:
     method = check_method(arguments.method)
     if method not in (*FILTERS, *INCREMENTAL, "smoother"):
         raise ConfigError(
-            f"--method: expected smoother, isam2, fixed-lag or a filter, got {method}; try smoother "
-            "with --noise all"
+            f"--method: expected smoother, isam2, fixed-lag or a filter, got {method}; try "
+            "smoother with --noise all"
         )
     if arguments.lag is not None and (method != "fixed-lag" or not arguments.lag > 0.0):
         raise ConfigError(
-            f"--lag {arguments.lag:g}: expected seconds above 0 with --method fixed-lag, got {method}"
+            f"--lag {arguments.lag:g}: expected seconds above 0, with --method fixed-lag, got "
+            f"{method}"
         )
     noise: NoiseUsed = arguments.noise
     if method != "smoother" and noise is not NoiseUsed.STATED:

@@ -84,7 +84,7 @@ class SlamGraph(ReadOnlyArrays):
 
 
 def graph_of_problem(problem: SlamProblem, noise: SlamNoise) -> SlamGraph:
-    """Return a log as a graph; what its odometry may be wrong by all along is noise of each step."""
+    """Return a log as a graph; what its odometry may be wrong by all along is noise of steps."""
     moving = problem.with_drift_as_noise(noise)
     root = moving.motion.basis(moving.control) * noise.control
     k = np.arange(len(moving.control))
@@ -104,7 +104,7 @@ def graph_of_problem(problem: SlamProblem, noise: SlamNoise) -> SlamGraph:
 
 
 def problem_of_graph(graph: SlamGraph) -> tuple[SlamProblem, SlamNoise]:
-    """Return a graph but for its closures as a log: each step's and each observation's own noise."""
+    """Return a graph but for its closures as a log, each step with a noise of its own."""
     odometry = np.flatnonzero(~graph.is_closure)
     order = odometry[np.argsort(graph.pairs[odometry, 1])]
     unit = graph.typical_sigma

@@ -332,8 +332,8 @@ def smooth_incrementally(
         landmark_cov[i] = smoother.landmark_covariance(i)
     notes = [
         f"CPU time of a pose: {1e3 * np.median(took):.1f} ms in the median, "
-        f"{1e3 * np.quantile(took, 0.95):.1f} ms at 95 %, {1e3 * took.max():.0f} ms at most; of the "
-        f"end: {closing:.1f} s"
+        f"{1e3 * np.quantile(took, 0.95):.1f} ms at 95 %, {1e3 * took.max():.0f} ms at most; of "
+        f"the end: {closing:.1f} s"
     ]
     if smoother.too_old:
         notes.append(f"closures to poses that the lag had dropped, left out: {smoother.too_old}")

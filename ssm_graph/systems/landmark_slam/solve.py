@@ -182,8 +182,8 @@ def solve_graph(graph: SlamGraph, notes: tuple[str, ...], asked: Asked) -> Solve
         return solve(problem, noise, asked, truth=graph.truth, notes=notes)
     if asked.method not in ("smoother", *INCREMENTAL):
         raise ConfigError(
-            f"--method {asked.method}: expected isam2 or fixed-lag for a graph whose places are met "
-            "again; filters take a log"
+            f"--method {asked.method}: expected isam2 or fixed-lag for a graph whose places are "
+            "met again; filters take a log"
         )
     if asked.learns_observations or asked.association is not Association.KNOWN:
         raise ConfigError(
