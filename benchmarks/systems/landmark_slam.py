@@ -121,7 +121,7 @@ def victoria(folder: Path) -> Iterator[str]:
                     str(len(solved.problem.time_s)),
                     f"{time.process_time() - began:.1f}",
                     "no truth" if score is None else f"{score.aligned_m:.2f}",
-                    *solved.answer.notes[:1] or ("",),
+                    "; ".join(solved.answer.notes),
                 )
             )
     yield ""
