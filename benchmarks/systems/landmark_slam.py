@@ -97,7 +97,7 @@ def _told(robot: str, name: str, solved: Solved, began: float) -> tuple[str, ...
         name,
         f"{score.position_m:.3f}",
         f"{score.aligned_m:.3f}",
-        f"{score.heading_deg:.1f}",
+        "none" if score.heading_deg is None else f"{score.heading_deg:.1f}",
         "names known" if errors is None else f"{errors.n_wrong}, {errors.n_left_out} of {errors.n}",
         f"{time.process_time() - began:.1f}",
     )

@@ -51,7 +51,7 @@ class _Read:
     relations: list[tuple[str, str, Array, Array]] = field(default_factory=list)
     seen: list[tuple[str, str, Array, Array]] = field(default_factory=list)
     """Pose, landmark, range and bearing, sigmas"""
-    ignored: int = 0
+    ignored: list[str] = field(default_factory=list)
 
 
 def read_pose_graph(path: Path, *, robot: int | None = None) -> tuple[SlamGraph, tuple[str, ...]]:
@@ -118,9 +118,9 @@ def _take(read: _Read, word: str, cells: Sequence[str], suffix: str) -> None:
         if r <= 0.0 or min(sigmas) <= 0.0:
             raise ValueError(f"{word}: expected a range and sigmas above 0")
         read.seen.append((rest[0], rest[1], np.array([r, bearing]), np.array(sigmas[::-1])))
-    elif word == "FIX" or word in _IGNORED:
-        read.ignored += word != "FIX"
-    else:
+    elif word in _IGNORED:
+        read.ignored.append(word)
+    elif word != "FIX":
         raise ValueError(f"expected {_KNOWN}")
 
 
@@ -186,7 +186,6 @@ def _graph(
             own = _reversed(step, cov) if turned_round else (step, cov)
             steps.append(own[0])
             covs.append(own[1])
-    strange = [b for a, b, _, _ in read.seen if a in index and b in index]
     kept = [row for row in read.seen if row[0] in index and row[1] not in index]
     if is_pyfg:  # of another robot's poses the places are not known
         kept = [row for row in kept if row[1] in read.landmarks]
@@ -197,7 +196,7 @@ def _graph(
     has_times = np.isfinite(known[:, 0]).all() and np.all(np.diff(known[:, 0]) > 0.0)
     start = known[0, 1:] if np.isfinite(known[0, 1:]).all() else np.zeros(3)
     has_truth = is_pyfg and np.isfinite(known[:, 1:]).all()
-    left_out = read.ignored + len(strange) + len(read.seen) - len(kept) - len(strange)
+    left_out = len(read.ignored) + len(read.seen) - len(kept)
     notes = (f"{path.name}: {left_out} rows of other things left out",) if left_out else ()
     graph = SlamGraph(
         known[:, 0] - known[0, 0] if has_times else np.arange(len(ordered), dtype=np.float64),

@@ -201,7 +201,8 @@ class LogScore(NamedTuple):
 
     position_m: float
     """Root mean square in the frame of the start."""
-    heading_deg: float
+    heading_deg: float | None
+    """None where the truth knows no heading."""
     aligned_m: float
     """Root mean square after the best turn and shift of the whole path."""
     nees: float
@@ -222,7 +223,7 @@ def score_of(truth: Array, known: NDArray[np.bool_], answer: SlamEstimate) -> Lo
     nees = np.einsum("ki,ki->k", error, np.linalg.solve(cov, error[..., None])[..., 0]) / 2.0
     return LogScore(
         float(np.sqrt(np.mean(np.sum(error**2, axis=1)))),
-        float(np.degrees(np.sqrt(np.nanmean(turn**2)))),
+        float(np.degrees(np.sqrt(np.nanmean(turn**2)))) if np.isfinite(turn).any() else None,
         float(np.sqrt(np.mean(np.sum(left**2, axis=1)))),
         float(np.median(nees)),
         int(known.sum()),

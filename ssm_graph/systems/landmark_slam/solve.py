@@ -122,9 +122,10 @@ class Solved(NamedTuple):
             )
         if self.score is not None:
             s = self.score
+            heading = "" if s.heading_deg is None else f" and heading {s.heading_deg:.2f} deg"
             yield (
-                f"against the truth: position rms {s.position_m:.3f} m and heading "
-                f"{s.heading_deg:.2f} deg in the frame of the start, {s.aligned_m:.3f} m aligned"
+                f"against the truth: position rms {s.position_m:.3f} m{heading} in the frame of "
+                f"the start, {s.aligned_m:.3f} m aligned"
             )
 
     def summary(self) -> dict[str, Any]:

@@ -23,7 +23,11 @@ from ssm_graph.systems.landmark_slam.association import (
 from ssm_graph.systems.landmark_slam.folder import read_landmark_folder, write_landmark_folder
 from ssm_graph.systems.landmark_slam.logs import LandmarkLog, aligned, problem_of_log
 from ssm_graph.systems.landmark_slam.problem import UNKNOWN, SlamNoise
-from ssm_graph.systems.landmark_slam.recorded import read_graph
+from ssm_graph.systems.landmark_slam.recorded import (
+    VICTORIA_GRAPH,
+    read_graph,
+    read_victoria_park,
+)
 
 DATA = Path(os.environ.get("SSM_GRAPH_DATA", "/nowhere")) / "systems"
 PLACES = np.array([[3.0, 2.0], [-2.0, 4.0], [1.0, 6.0], [5.0, 5.0], [-1.0, -1.5]])
@@ -84,6 +88,31 @@ def test_the_command_solves_a_folder(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert rows[:, 1:3] == pytest.approx(PLACES, abs=0.1)
     assert (tmp_path / "out/figure.png").stat().st_size > 10_000
     assert "position rms" in capsys.readouterr().out
+
+
+def test_a_truth_without_headings(tmp_path: Path) -> None:
+    """GPS: the aligned error counts, and nothing is said of headings."""
+    log = log_of()
+    truth = log.truth.copy()
+    truth[:, 2] = np.nan
+    write_landmark_folder(tmp_path / "log", replace(log, truth=truth))
+    assert main(["slam", str(tmp_path / "log"), "--out", str(tmp_path / "out")]) == 0
+    score = json.loads((tmp_path / "out/summary.json").read_text())["score"]
+    assert score["heading_deg"] is None
+    assert score["aligned_m"] < 0.05
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="SSM_GRAPH_DATA has no systems")
+def test_victoria_park_has_times() -> None:
+    """The graph's way is that of the raw log: its turns come out at the times found by the way."""
+    log = read_victoria_park(DATA / "victoria_park")
+    assert len(log.odometry_s) == 61_945
+    graph, _ = read_graph(DATA / "victoria_park" / VICTORIA_GRAPH)
+    problem = problem_of_log(log)
+    seen = np.unique(graph.keyframe)
+    assert len(problem.time_s) == pytest.approx(len(seen), abs=5)
+    theirs = np.append(0.0, np.cumsum(graph.control[:, 2]))[seen[[0, -1]]]
+    assert problem.control[:, 2].sum() == pytest.approx(theirs[1] - theirs[0], abs=0.01)
 
 
 @pytest.mark.parametrize("kind", [Association.NEAREST, Association.JOINT])
