@@ -11,9 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from factors.so3 import cross, left_jacobian_solve, left_jacobian_times
+from factors import so3
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps, finished
@@ -92,8 +91,8 @@ def merge_samples_steps(imu: ImuLog, keyframe_s: Array, *, rate_hz: float) -> St
     yield 3e-4 * len(sample)
     first = _group_starts(piece_edges, keyframe_s, rate_hz)
     scale = h**3 / 12.0
-    theta = omega * h + scale * cross(omega, omega_slope)
-    v = force * h + scale * (cross(omega, force_slope) + cross(force, omega_slope))
+    theta = omega * h + scale * so3.cross(omega, omega_slope)
+    v = force * h + scale * (so3.cross(omega, force_slope) + so3.cross(force, omega_slope))
     yield 5e-4 * len(sample)
     theta, v = yield from _merge_steps(theta, v, first)
     dt = np.add.reduceat(h[:, 0], first)
@@ -148,14 +147,14 @@ def _merge_steps(theta: Array, v: Array, first: NDArray[np.intp]) -> Steps[tuple
     constant specific force along with a constant rate would need to give the same velocity change.
     """
     size = np.diff(np.append(first, len(theta)))
-    own_gain = left_jacobian_times(theta, v)
+    turn, gain = so3.exp(theta), so3.left_jacobian_times(theta, v)
     yield 3e-4 * len(theta)
-    turned, gained = Rotation.from_rotvec(theta[first]), own_gain[first]
+    turned, gained = turn[first], gain[first]
     for step in range(1, int(size.max())):
-        has_piece = (step < size)[:, None]
-        piece = np.minimum(first + step, len(theta) - 1)
-        gained += turned.apply(own_gain[piece] * has_piece)
-        turned = turned * Rotation.from_rotvec(theta[piece] * has_piece)
-        yield 3e-4 * len(first)
-    theta_all = turned.as_rotvec()
-    return theta_all, left_jacobian_solve(theta_all, gained)
+        longer = np.flatnonzero(step < size)
+        piece = first[longer] + step
+        gained[longer] += so3.times(turned[longer], gain[piece])
+        turned[longer] = turned[longer] @ turn[piece]
+        yield 3e-4 * len(longer)
+    theta_all = so3.log(turned)
+    return theta_all, so3.left_jacobian_solve(theta_all, gained)
