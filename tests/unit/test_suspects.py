@@ -7,11 +7,9 @@ Thresholds were chosen on seeds 0 to 3; seeds 100 to 129 gave the rates in
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +18,6 @@ import pytest
 import ssm_graph as sg
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
-from ssm_graph.io.blueye.convert import convert_blueye
 from ssm_graph.mission.fault import DetectedFault, Treatment
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.suspects.find import find_suspects, with_suspects
@@ -45,11 +42,8 @@ from ssm_graph.simulation.routes import (
     SurveyRoute,
     TransitRoute,
 )
+from tests.blueye_fixture import DIVE, GRID, SQUARE, converted, needs_logs
 
-RUNS = (
-    Path(os.environ.get("SSM_GRAPH_DATA", Path(__file__).parents[2].parent / "shared" / "data"))
-    / "blueye_x3"
-)
 DURATION_S, SMOOTHED_S = 300.0, 150.0
 SURFACE = DepthProfile(0.5, 0.5)
 ROUTES: dict[str, Route] = {
@@ -149,9 +143,7 @@ def test_other_lies_accuse_no_clock() -> None:
         assert not find_suspects(healthy("survey", Grade.TACTICAL, 44, fault))
 
 
-@pytest.mark.parametrize(
-    ("grade", "late_s"), [(Grade.MEMS, 0.3), (Grade.TACTICAL, 3.0)]
-)
+@pytest.mark.parametrize(("grade", "late_s"), [(Grade.MEMS, 0.3), (Grade.TACTICAL, 3.0)])
 def test_a_late_dvl(grade: Grade, late_s: float) -> None:
     """Waves make it plain to a hundredth of a second, and three seconds are half a wave's."""
     mission = healthy("diving survey", grade, 45)
@@ -405,20 +397,13 @@ def test_an_answer_without_suspects_is_left_alone() -> None:
     assert with_suspects(estimate, ()) is estimate
 
 
-@pytest.mark.skipif(not RUNS.is_dir(), reason=f"no real logs in {RUNS}")
-@pytest.mark.parametrize(
-    "name",
-    [
-        "log_auto_square_2025-05-07_14_55_13",
-        "log_dive_2min_2025-05-07_15_06_13",
-        "log_grid_01_05_scaled",
-    ],
-)
+@needs_logs
+@pytest.mark.parametrize("name", [SQUARE, DIVE, GRID])
 def test_real_logs(name: str) -> None:
     """As recorded nobody is accused; gyros that read 0.60 of the turn are."""
-    mission = convert_blueye(RUNS / f"{name}.mcap")
+    mission = converted(name)
     assert not find_suspects(mission)
-    if "grid" in name:
+    if name == GRID:
         found = only(with_imu(mission, gyro_b=0.6 * mission.imu.gyro_b))
         assert found.what.startswith("read 0.60 of the turn")
         assert number(found.remedy) == pytest.approx(1.0 / 0.6, rel=0.01)
