@@ -232,7 +232,7 @@ def test_a_late_compass() -> None:
 )
 def test_gyros_of_another_scale(grade: Grade, scale: float, says: str) -> None:
     """The factor, from accelerometers against DVL and the course of the fixes."""
-    mission = healthy("survey", grade, 46)
+    mission = healthy("survey", grade, 51)
     found = only(with_imu(mission, gyro_b=mission.imu.gyro_b * scale))
     assert found.sensor == "gyros"
     assert found.what.startswith(says)
