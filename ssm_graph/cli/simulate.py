@@ -26,7 +26,7 @@ from ssm_graph.simulation import (
     simulate,
 )
 
-_SCENARIOS = "\n".join(f"  {name:9}{s.description}" for name, s in SCENARIOS.items())
+_SCENARIOS = "\n".join(f"  {name:12}{s.description}" for name, s in SCENARIOS.items())
 DESCRIPTION: Final = f"Simulate a mission.\n\nscenarios:\n{_SCENARIOS}"
 
 
