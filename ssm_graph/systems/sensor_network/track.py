@@ -61,22 +61,25 @@ class Track(ReadOnlyArrays):
     """(M,) m/s, of the mean velocity over a block"""
     closing: Array
     """(M,) m, largest correction of the way between two pings, by the second of them"""
+    tilt_bound: Array
+    """(M,) rad, of the levelled attitude during a block"""
     alarms: tuple[BoundAlarm, ...]
     n_beams: int
     n_left_out: int
 
-    def led_to_end(self, i: int, time_s: float, arm_b: Array) -> tuple[Array, Array, float]:
-        """Return lever arm (3,) at a time, and the way (3,) from then to the end of block i, m.
+    def led_to_end(self, i: int, time_s: Array, arm_b: Array) -> tuple[Array, Array, Array]:
+        """Return lever arms (n, 3) at times (n,), and the ways (n, 3) from then to the end of
+        block i, m.
 
-        The third is a bound of the error of the way.
+        The third (n,) bounds the error of the ways.
         """
-        at = min(int(np.searchsorted(self.edge_s, time_s)), len(self.edge_s) - 1)
+        at = np.minimum(np.searchsorted(self.edge_s, time_s), len(self.edge_s) - 1)
         end = int(np.searchsorted(self.edge_s, self.time_s[i]))
-        passed = [float(np.interp(time_s, self.edge_s, axis)) for axis in self.way.T]
-        led = self.way[end] - np.array(passed)
-        span = float(self.time_s[i]) - time_s
-        bound = span * float(self.speed_bound[i]) + float(self.closing[i])
-        return self.R_nb[at] @ arm_b, led, bound
+        begin = int(np.searchsorted(self.edge_s, self.begin_s[i]))
+        edge_s, way = self.edge_s[begin : end + 1], self.way[begin : end + 1]
+        passed = np.column_stack([np.interp(time_s, edge_s, axis) for axis in way.T])
+        bound = (self.time_s[i] - time_s) * self.speed_bound[i] + self.closing[i]
+        return self.R_nb[at] @ arm_b, way[-1] - passed, bound
 
     def heading_at(self, time_s: float) -> float:
         """Return the gyros' heading at a time, rad."""
@@ -144,19 +147,23 @@ class _Blocks:
         self._prepare_bounds()
 
     def _prepare_bounds(self) -> None:
-        k, noise, mount = self._own.sigmas, self._noise, self._dvl.mount
+        k, noise, mount = self._own.of("DVL"), self._noise, self._dvl.mount
+        k_gyro, k_accel = self._own.of("gyros"), self._own.of("accelerometers")
         span = float(self._edge_s[-1] - self._edge_s[0])
-        self._gyro = k * (noise.gyro_bias_sigma + noise.gyro_bias_walk * math.sqrt(span))
-        self._accel = k * (noise.accel_bias_sigma + noise.accel_bias_walk * math.sqrt(span))
+        self._gyro = k_gyro * (noise.gyro_bias_sigma + noise.gyro_bias_walk * math.sqrt(span))
+        self._accel = k_accel * (noise.accel_bias_sigma + noise.accel_bias_walk * math.sqrt(span))
         more = mount.misalignment_sigma + mount.scale_sigma + mount.beam_scale_sigma
         more += mount.scale_walk_density * math.sqrt(span)
-        self._share = self._own.speed_share + k * more
+        wider = self._own.times.get("DVL", 1.0)
+        self._share = self._own.speed_share * wider + k * more
         imu = self._imu
         # Scale and axes of the gyros count with every turn, those of accelerometers with gravity.
-        self._gyro_share = k * (imu.gyro_scale_sigma + imu.gyro_misalignment_sigma)
-        self._gyro += 9.81 * k * imu.gyro_g_sensitivity_sigma
-        self._accel += 9.81 * k * (imu.accel_scale_sigma + imu.accel_misalignment_sigma)
-        self._steady = self._own.velocity_m_per_s + k * mount.drift.sigma
+        self._gyro_share = k_gyro * (imu.gyro_scale_sigma + imu.gyro_misalignment_sigma)
+        self._gyro += 9.81 * k_gyro * imu.gyro_g_sensitivity_sigma
+        self._accel += 9.81 * k_accel * (imu.accel_scale_sigma + imu.accel_misalignment_sigma)
+        self._steady = self._own.velocity_m_per_s * wider + k * mount.drift.sigma
+        self._gyro_noise = k_gyro * noise.gyro_density
+        self._accel_noise = k_accel * noise.accel_density
         self._late_s = k * mount.time_offset_sigma_s
         self._arm_m = 2.0 * k * mount.lever_arm_sigma
 
@@ -167,6 +174,7 @@ class _Blocks:
         self._g_n = self._frame.g_n_at(p_n)
         R = R_nl @ R_lb_from_roll_pitch_heading(start.roll, start.pitch, start.heading)
         self._tilt = k * float(np.max(start.attitude_sigma[:2]))
+        self._heading = k * float(start.attitude_sigma[2])
         half = np.maximum(k * start.velocity_sigma_enu, _FLOOR_M_PER_S)
         self._set = around_box(R_nl @ start.velocity_enu, half)
         self._alarms: list[BoundAlarm] = []
@@ -181,32 +189,42 @@ class _Blocks:
             block.turned += float(np.linalg.norm(self._theta[n]))
             coriolis = 2.0 * np.cross(self._frame.omega_ie_n, block.velocity)
             gain = gain + (self._g_n - coriolis) * dt
-            self._lead_on(gain, float(dt))
             way.append(way[-1] + block.step(gain, float(dt)))
-            found = self._ping_at(n + 1, R, float(dt))
-            force = 9.81 * (self._tilt + self._gyro * block.span_s) + self._accel
+            tilt = self._tilt + self._drift(block)
+            force = 9.81 * tilt + self._accel
+            self._lead_on(gain, float(dt), force)
+            found = self._ping_at(n + 1, R, float(dt), tilt)
             if found is not None:
                 way[-1] = way[-1] + block.close(*found, force)
             if self._ends[n + 1]:
                 block.leave_open(self._set)
                 blocks.append(self._finished(block, float(self._edge_s[n + 1])))
                 R = self._levelled(R, block)
+                self._g_n = self._frame.g_n_at(p_n + way[-1])
                 block = _Block(block.velocity)
             rotations.append(R)
         return self._track(np.array(way), np.array(rotations), blocks)
 
-    def _lead_on(self, gain: Array, dt: float) -> None:
-        """Lead the set of velocities on by what the accelerometers gained (3,)."""
-        force = 9.81 * self._tilt + self._accel
-        white = self._own.sigmas * self._noise.accel_density * math.sqrt(dt)
+    def _drift(self, block: _Block) -> float:
+        """Return by how much the attitude of a block may have tilted by now, rad.
+
+        A heading that is off takes what the Earth turns about another axis.
+        """
+        earth = float(np.linalg.norm(self._frame.omega_ie_n[:2])) * min(self._heading, 2.0)
+        steady = (self._gyro + earth) * block.span_s + self._gyro_share * block.turned
+        return steady + self._gyro_noise * math.sqrt(block.span_s)
+
+    def _lead_on(self, gain: Array, dt: float, force: float) -> None:
+        """Lead the set of velocities on by what the accelerometers gained (3,), off by a force."""
+        white = self._accel_noise * math.sqrt(dt)
         half = (force * dt + white) * np.eye(3)
         parts = np.concatenate([self._set.shape[None], segments(half)])
         self._set = Ellipsoids(self._set.center + gain, sum_shape(parts))
 
-    def _ping_at(self, edge: int, R: Array, dt: float) -> tuple[Array, Array] | None:
+    def _ping_at(self, edge: int, R: Array, dt: float, tilt: float) -> tuple[Array, Array] | None:
         """Cut the set by a ping's beams; return the velocity (3,) and its covariance (3, 3)."""
         n = self._ping.get(edge)
-        used = [] if n is None else self._usable(n, R)
+        used = [] if n is None else self._usable(n, R, tilt)
         if n is None or len(used) < 3:
             self._silence(edge, dt)
             return None
@@ -216,12 +234,12 @@ class _Blocks:
         weighted = (self._speed[n] - self._arm_speed[n])[used] / np.square(self._sigma[n][used])
         return np.asarray(C @ (H.T @ weighted)), C
 
-    def _usable(self, n: int, R: Array) -> list[int]:
+    def _usable(self, n: int, R: Array, tilt: float) -> list[int]:
         """Return the beams of ping n that miss neither each other nor the set; they cut it."""
         read = self._speed[n] - self._arm_speed[n]
         speed = float(np.linalg.norm(self._set.center))
-        bound = self._own.sigmas * self._sigma[n] + self._steady
-        bound = bound + (self._share + self._tilt) * speed
+        bound = self._own.of("DVL") * self._sigma[n] + self._steady
+        bound = bound + (self._share + tilt) * speed
         rows = self._beams[n] @ R.T
         off = np.abs(read - rows @ self._set.center)
         left = [int(b) for b in np.flatnonzero(np.isfinite(read))]
@@ -258,24 +276,24 @@ class _Blocks:
 
     def _finished(self, block: _Block, end_s: float) -> _Row:
         """Return way, its bounds, turn, noise of the heading and mean speed's bound of a block."""
-        k, T = self._own.sigmas, block.span_s
+        k, T = self._own.of("DVL"), block.span_s
         since = end_s - self._edge_s[0]
-        angle = k * self._noise.gyro_density * math.sqrt(since)
+        angle = self._gyro_noise * math.sqrt(since)
         turn = self._gyro * T + self._gyro_share * block.turned
-        scatter = k * math.sqrt(float(np.linalg.eigvalsh(block.covariance)[-1]))
+        scatter = k * _worst_sigma(block.covariance)
         steady = self._steady * T + self._share * block.path + self._arm_m
         steady += self._late_s * block.changed + block.curved + block.bent + scatter + block.unseen
-        tilt = self._tilt + turn
+        tilt = self._tilt + self._drift(block)
         level = steady + block.path * (0.5 * tilt**2 + angle + turn) + block.climbed * tilt
         up = steady + block.path * tilt
         bound = np.array([level, level, up])
-        speed = float(level / max(T, 1e-9))
-        return _Row(block.way, bound, turn, angle, end_s, speed, block.closing)
+        self._heading += turn
+        speed = float(max(level, up) / max(T, 1e-9))
+        return _Row(block.way, bound, turn, angle, end_s, speed, block.closing, tilt)
 
     def _levelled(self, R: Array, block: _Block) -> Array:
         """Turn the attitude to where the accelerometers' gain is the change of the velocity."""
-        k = self._own.sigmas
-        drift = self._gyro * block.span_s + self._gyro_share * block.turned
+        drift = self._drift(block)
         self._tilt += drift
         if block.latest is None or block.first is None:
             return R
@@ -283,10 +301,10 @@ class _Blocks:
         if 0.5 * self._own.block_s > T:
             return R
         g = float(np.linalg.norm(self._g_n))
-        single = k * math.sqrt(float(np.linalg.eigvalsh(block.latest)[-1])) + self._steady
-        white = k * self._noise.accel_density * math.sqrt(T)
+        ends = self._own.of("DVL") * (_worst_sigma(block.latest) + _worst_sigma(block.earliest))
+        white = self._accel_noise * math.sqrt(T)
         changed = self._share * block.changed
-        tilt = ((2.0 * single + changed + white) / T + self._accel) / g
+        tilt = ((ends + 2.0 * self._steady + changed + white) / T + self._accel) / g
         tilt += drift
         if tilt >= self._tilt:
             return R
@@ -300,7 +318,7 @@ class _Blocks:
         rotations: Array,
         blocks: list[_Row],
     ) -> Track:
-        advance, bound, turn, angle, end_s, speed, closing = (
+        advance, bound, turn, angle, end_s, speed, closing, tilt = (
             np.array(column) for column in zip(*blocks, strict=True)
         )
         at = np.searchsorted(self._edge_s, end_s)
@@ -317,6 +335,7 @@ class _Blocks:
             rotations,
             speed,
             closing,
+            tilt,
             tuple(self._alarms),
             self._n_beams,
             self._n_left_out,
@@ -333,6 +352,11 @@ class _Row(NamedTuple):
     end_s: float
     speed: float
     closing: float
+    tilt: float
+
+
+def _worst_sigma(covariance: Array) -> float:
+    return math.sqrt(float(np.linalg.eigvalsh(covariance)[-1]))
 
 
 class _Block:
@@ -343,7 +367,7 @@ class _Block:
         self.first: Array | None = None
         self.latest: Array | None = None
         self.way, self.gain, self.gain_to_ping = np.zeros(3), np.zeros(3), np.zeros(3)
-        self.covariance = np.zeros((3, 3))
+        self.covariance, self.earliest = np.zeros((3, 3)), np.zeros((3, 3))
         self._pull: Array | None = None
         self.since_first_s = 0.0
         self.span_s = self.path = self.climbed = self.changed = self.curved = self.turned = 0.0
@@ -375,7 +399,7 @@ class _Block:
         self.bent += 0.25 * force * self.open_s**2
         self.closing = max(self.closing, float(np.linalg.norm(bend)))
         if self.first is None:
-            self.first, self.gain = velocity, np.zeros(3)
+            self.first, self.earliest, self.gain = velocity, covariance, np.zeros(3)
             self.since_first_s = self.span_s
         self.gain_to_ping = self.gain
         self.latest, self.last, self.velocity, self.open_s = covariance, velocity, velocity, 0.0
