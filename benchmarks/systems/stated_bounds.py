@@ -75,7 +75,10 @@ def _beams(sim: SimulatedMission, mission: Mission, own: WitnessBounds, edges: A
     omega = mean_gyro(sim.mission.imu, dvl.valid_s)
     v_b = np.einsum("nji,nj->ni", R, v_n) + so3.cross(omega, dvl.mount.lever_arm_b[None])
     off = dvl.speed - v_b @ dvl.mount.beams_b.T
-    share = own.speed_share * np.linalg.norm(v_b, axis=1)
+    # Shares are of the speed that is read: of zeros there is none.
+    read = np.linalg.norm(np.where(np.isfinite(dvl.speed), dvl.speed, 0.0), axis=1)
+    fit = read / np.linalg.norm(dvl.mount.beams_b, 2)
+    share = own.speed_share * np.minimum(np.linalg.norm(v_b, axis=1), fit)
     steady = np.repeat(wider * (own.velocity_m_per_s + share)[:, None], off.shape[1], axis=1)
     return _largest(off, own.of("DVL") * dvl.sigma, steady, dvl.valid_s, edges)
 

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 GAP_S: Final = 0.5
 """Longest interval that is integrated in one step where no ping comes."""
+LATEST_END_S: Final = 2.0
+"""A block waits no longer for a ping to end at."""
 MERGE_HZ: Final = 1e-3
 """Merges all samples of an interval into one."""
 _FLOOR_M_PER_S: Final = 1e-4
@@ -87,101 +89,79 @@ class Track(ReadOnlyArrays):
         return float(roll_pitch_heading_from_R_lb(self.R_nb[at])[2])
 
 
-def velocity_track(mission: Mission, start: InitialState, own: WitnessBounds) -> Track:
-    """Return the blocks of a mission from a start on; see :mod:`.witness` for what is done."""
-    return _Blocks(mission, start, own).go()
+class Edges(NamedTuple):
+    """Times to step to."""
+
+    time_s: Array
+    """(K,) the first is where the walk stands"""
+    is_end: NDArray[np.bool_]
+    """(K,) which of them end a block"""
 
 
-def _edges(mission: Mission, begin_s: float, block_s: float) -> tuple[Array, NDArray[np.bool_]]:
-    """Return times to step to, and which of them end a block."""
-    imu, pings = mission.imu, mission.dvl.of_ground().valid_s
-    end_s = float(imu.time_s[-1])
-    last = min(end_s, float(pings[-1]) + block_s)
-    ends = np.arange(begin_s + block_s, last, block_s)
-    ends = np.append(ends[:-1], last) if len(ends) else np.array([last])
-    inside = pings[(pings > begin_s) & (pings <= last)]
-    # A block ends at a ping where there is one, or the way to the next would be half known.
-    ends = np.unique([_next(inside, end, last) for end in ends])
+def block_edges(pings_s: Array, begin_s: float, ends_s: Array, last_s: float) -> Edges:
+    """Return the edges of blocks that ought to end at some times (M,), from ``begin_s`` on.
+
+    A block ends at a ping where there is one, or the way to the next would be half known.
+    """
+    ends = np.unique([_next(pings_s, end, last_s) for end in ends_s])
+    last = float(ends[-1])
+    inside = pings_s[(pings_s > begin_s) & (pings_s <= last)]
     fill = np.arange(begin_s, last, GAP_S)
     near = np.searchsorted(inside, fill)
     before = fill - np.append(-np.inf, inside)[near]
     behind = np.append(inside, np.inf)[near] - fill
     fill = fill[np.minimum(before, behind) > 0.5 * GAP_S]
     edge_s = np.unique(np.concatenate([[begin_s], inside, fill, ends]))
-    return edge_s, np.isin(edge_s, ends)
+    return Edges(edge_s, np.isin(edge_s, ends))
+
+
+def mission_edges(mission: Mission, begin_s: float, block_s: float) -> Edges:
+    """Return the edges of all blocks of a mission from a time on."""
+    pings_s = mission.dvl.of_ground().valid_s
+    last = min(float(mission.imu.time_s[-1]), float(pings_s[-1]) + block_s)
+    ends = np.arange(begin_s + block_s, last, block_s)
+    ends = np.append(ends[:-1], last) if len(ends) else np.array([last])
+    return block_edges(pings_s[pings_s > begin_s], begin_s, ends, last)
 
 
 def _next(pings: Array, end_s: float, last_s: float) -> float:
     at = int(np.searchsorted(pings, end_s - 1e-6))
-    return float(pings[at]) if at < len(pings) and pings[at] - end_s < 2.0 else min(end_s, last_s)
+    near = at < len(pings) and pings[at] - end_s < LATEST_END_S
+    return float(pings[at]) if near else min(end_s, last_s)
 
 
-class _Blocks:
-    """The walk from edge to edge."""
+class VelocityWalk:
+    """The walk from edge to edge; see :mod:`.witness` for what is done.
+
+    It takes a mission as a whole, or piece by piece as it comes.
+    """
 
     def __init__(self, mission: Mission, start: InitialState, own: WitnessBounds) -> None:
         self._own, self._frame = own, mission.frame
-        self._dvl = mission.dvl.of_ground()
-        self._noise, self._start = mission.imu.noise, start
-        begin_s = max(start.time_s, mission.imu.start_s)
-        self._edge_s, self._ends = _edges(mission, begin_s, own.block_s)
-        self._imu = mission.imu.calibration
-        imu = mission.imu.calibrated
-        merged = merge_samples(imu, self._edge_s, rate_hz=MERGE_HZ)
-        self._dt = np.diff(self._edge_s)
-        theta = merged.gyro_b * merged.dt[:, None]
-        self._theta, self._turns = theta, so3.exp(theta)
-        self._gains = so3.left_jacobian_times(theta, merged.accel_b * merged.dt[:, None])
-        self._earth = so3.exp(-self._frame.omega_ie_n * self._dt[:, None])
-        speed, sigma, beams_b = self._dvl.independent()
-        self._speed, self._sigma, self._beams = speed, sigma, beams_b
-        ping_s = np.clip(self._dvl.valid_s, self._edge_s[0], self._edge_s[-1])
-        arm = so3.cross(mean_gyro(imu, ping_s), self._dvl.mount.lever_arm_b[None])
-        self._arm_speed = np.einsum("nbi,ni->nb", beams_b, arm)
-        at = np.searchsorted(self._edge_s, self._dvl.valid_s)
-        self._ping = {int(a): n for n, a in enumerate(at) if 0 < a < len(self._edge_s)}
-        mount = self._dvl.mount
-        self._null = None
-        if mount.n_beams > 3 and self._dvl.covariance is None:
-            self._null = np.linalg.svd(mount.beams_b.T)[2][3:]
-        self._prepare_bounds()
-
-    def _prepare_bounds(self) -> None:
-        k, noise, mount = self._own.of("DVL"), self._noise, self._dvl.mount
-        k_gyro, k_accel = self._own.of("gyros"), self._own.of("accelerometers")
-        span = float(self._edge_s[-1] - self._edge_s[0])
-        self._gyro = k_gyro * (noise.gyro_bias_sigma + noise.gyro_bias_walk * math.sqrt(span))
-        self._accel = k_accel * (noise.accel_bias_sigma + noise.accel_bias_walk * math.sqrt(span))
-        more = mount.misalignment_sigma + mount.scale_sigma + mount.beam_scale_sigma
-        more += mount.scale_walk_density * math.sqrt(span)
-        wider = self._own.times.get("DVL", 1.0)
-        self._share = self._own.speed_share * wider + k * more
-        imu = self._imu
-        # Scale and axes of the gyros count with every turn, those of accelerometers with gravity.
-        self._gyro_share = k_gyro * (imu.gyro_scale_sigma + imu.gyro_misalignment_sigma)
-        self._gyro += 9.81 * k_gyro * imu.gyro_g_sensitivity_sigma
-        self._accel += 9.81 * k_accel * (imu.accel_scale_sigma + imu.accel_misalignment_sigma)
-        self._steady = self._own.velocity_m_per_s * wider + k * mount.drift.sigma
-        self._gyro_noise = k_gyro * noise.gyro_density
-        self._accel_noise = k_accel * noise.accel_density
-        self._late_s = k * mount.time_offset_sigma_s
-        self._arm_m = 2.0 * k * mount.lever_arm_sigma
-
-    def go(self) -> Track:
-        start, k = self._start, self._own.sigmas
-        p_n = self._frame.p_n_from_geodetic(start.lat, start.lon, start.height)
-        R_nl = self._frame.R_nl_at(p_n)
-        self._g_n = self._frame.g_n_at(p_n)
-        R = R_nl @ R_lb_from_roll_pitch_heading(start.roll, start.pitch, start.heading)
+        self._noise, self._imu = mission.imu.noise, mission.imu.calibration
+        self._mount = mission.dvl.mount
+        self.begin_s = max(start.time_s, mission.imu.start_s)
+        k = own.sigmas
+        self._place = self._frame.p_n_from_geodetic(start.lat, start.lon, start.height)
+        R_nl = self._frame.R_nl_at(self._place)
+        self._g_n = self._frame.g_n_at(self._place)
+        self._R = R_nl @ R_lb_from_roll_pitch_heading(start.roll, start.pitch, start.heading)
         self._tilt = k * float(np.max(start.attitude_sigma[:2]))
         self._heading = k * float(start.attitude_sigma[2])
         half = np.maximum(k * start.velocity_sigma_enu, _FLOOR_M_PER_S)
         self._set = around_box(R_nl @ start.velocity_enu, half)
+        self._velocity = self._set.center
+        self._silent_s, self._is_silent = 0.0, False
+
+    def follow(self, mission: Mission, edges: Edges) -> Track:
+        """Return the blocks of a piece of a mission, whose first edge is where the last ended."""
+        self._take(mission, edges)
         self._alarms: list[BoundAlarm] = []
         self._n_beams = self._n_left_out = 0
-        self._silent_s, self._is_silent = 0.0, False
-        way, rotations = [np.zeros(3)], [R]
-        block = _Block(self._set.center)
+        self._prepare_bounds(self._end_of_block(0))
+        R, way, rotations = self._R, [np.zeros(3)], [self._R]
+        begun = self._place
+        block = _Block(self._velocity)
         blocks: list[_Row] = []
         for n, dt in enumerate(self._dt):
             gain = R @ self._gains[n]
@@ -200,10 +180,62 @@ class _Blocks:
                 block.leave_open(self._set)
                 blocks.append(self._finished(block, float(self._edge_s[n + 1])))
                 R = self._levelled(R, block)
-                self._g_n = self._frame.g_n_at(p_n + way[-1])
+                self._place = begun + way[-1]
+                self._g_n = self._frame.g_n_at(self._place)
+                self._prepare_bounds(self._end_of_block(n + 1))
                 block = _Block(block.velocity)
             rotations.append(R)
+        self._R, self._velocity = R, block.velocity
         return self._track(np.array(way), np.array(rotations), blocks)
+
+    def _take(self, mission: Mission, edges: Edges) -> None:
+        """Merge the inertial data of a piece, and find its pings at its edges."""
+        self._edge_s, self._ends = edges
+        dvl = mission.dvl.of_ground()
+        imu = mission.imu.calibrated
+        merged = merge_samples(imu, self._edge_s, rate_hz=MERGE_HZ)
+        self._dt = np.diff(self._edge_s)
+        theta = merged.gyro_b * merged.dt[:, None]
+        self._theta, self._turns = theta, so3.exp(theta)
+        self._gains = so3.left_jacobian_times(theta, merged.accel_b * merged.dt[:, None])
+        self._earth = so3.exp(-self._frame.omega_ie_n * self._dt[:, None])
+        speed, sigma, beams_b = dvl.independent()
+        self._speed, self._sigma, self._beams = speed, sigma, beams_b
+        ping_s = np.clip(dvl.valid_s, self._edge_s[0], self._edge_s[-1])
+        arm = so3.cross(mean_gyro(imu, ping_s), dvl.mount.lever_arm_b[None])
+        self._arm_speed = np.einsum("nbi,ni->nb", beams_b, arm)
+        at = np.searchsorted(self._edge_s, dvl.valid_s)
+        self._ping = {int(a): n for n, a in enumerate(at) if 0 < a < len(self._edge_s)}
+        self._null = None
+        if dvl.mount.n_beams > 3 and dvl.covariance is None:
+            self._null = np.linalg.svd(dvl.mount.beams_b.T)[2][3:]
+
+    def _end_of_block(self, edge: int) -> float:
+        """Return how long after the begin the block ends that an edge is the begin of, s."""
+        ends = self._edge_s[edge + 1 :][self._ends[edge + 1 :]]
+        return float((ends[0] if len(ends) else self._edge_s[-1]) - self.begin_s)
+
+    def _prepare_bounds(self, since_s: float) -> None:
+        """Set what bounds the errors up to so long after the begin."""
+        k, noise, mount = self._own.of("DVL"), self._noise, self._mount
+        k_gyro, k_accel = self._own.of("gyros"), self._own.of("accelerometers")
+        root = math.sqrt(since_s)
+        self._gyro = k_gyro * (noise.gyro_bias_sigma + noise.gyro_bias_walk * root)
+        self._accel = k_accel * (noise.accel_bias_sigma + noise.accel_bias_walk * root)
+        more = mount.misalignment_sigma + mount.scale_sigma + mount.beam_scale_sigma
+        more += mount.scale_walk_density * root
+        wider = self._own.times.get("DVL", 1.0)
+        self._share = self._own.speed_share * wider + k * more
+        imu = self._imu
+        # Scale and axes of the gyros count with every turn, those of accelerometers with gravity.
+        self._gyro_share = k_gyro * (imu.gyro_scale_sigma + imu.gyro_misalignment_sigma)
+        self._gyro += 9.81 * k_gyro * imu.gyro_g_sensitivity_sigma
+        self._accel += 9.81 * k_accel * (imu.accel_scale_sigma + imu.accel_misalignment_sigma)
+        self._steady = self._own.velocity_m_per_s * wider + k * mount.drift.sigma
+        self._gyro_noise = k_gyro * noise.gyro_density
+        self._accel_noise = k_accel * noise.accel_density
+        self._late_s = k * mount.time_offset_sigma_s
+        self._arm_m = 2.0 * k * mount.lever_arm_sigma
 
     def _drift(self, block: _Block) -> float:
         """Return by how much the attitude of a block may have tilted by now, rad.
@@ -277,7 +309,7 @@ class _Blocks:
     def _finished(self, block: _Block, end_s: float) -> _Row:
         """Return way, its bounds, turn, noise of the heading and mean speed's bound of a block."""
         k, T = self._own.of("DVL"), block.span_s
-        since = end_s - self._edge_s[0]
+        since = end_s - self.begin_s
         angle = self._gyro_noise * math.sqrt(since)
         turn = self._gyro * T + self._gyro_share * block.turned
         scatter = k * _worst_sigma(block.covariance)

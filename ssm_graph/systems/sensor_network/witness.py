@@ -29,7 +29,7 @@ from ssm_graph.filters.rules.set_membership import Sets, led_on, measured
 from ssm_graph.mission.mission import InitialState, Mission
 from ssm_graph.sensors.compass import HeadingLog
 from ssm_graph.systems.sensor_network.motion import planar_image
-from ssm_graph.systems.sensor_network.track import Track, velocity_track
+from ssm_graph.systems.sensor_network.track import Track, VelocityWalk, mission_edges
 
 _AXES: Final = np.eye(3)
 _RADIUS_M: Final = 6.37e6
@@ -150,20 +150,19 @@ def witness(mission: Mission, start: InitialState, bounds: WitnessBounds | None 
     own = bounds or WitnessBounds()
     if len(mission.dvl.of_ground().time_s) < 2:
         raise DataError("witness: expected two pings off the ground or more, got fewer")
-    track = velocity_track(mission, start, own)
-    return _Walk(mission, start, own, track).go()
+    walk = VelocityWalk(mission, start, own)
+    edges = mission_edges(mission, walk.begin_s, own.block_s)
+    return PlaceWalk(mission.frame, start, own).follow(mission, walk.follow(mission, edges))
 
 
-class _Walk:
-    """Place, heading and height from block to block."""
+class PlaceWalk:
+    """Place, heading and height from block to block, of a whole mission or piece by piece."""
 
-    def __init__(
-        self, mission: Mission, start: InitialState, own: WitnessBounds, track: Track
-    ) -> None:
-        self._mission, self._own, self._track = mission, own, track
-        self._frame: LocalFrame = mission.frame
+    def __init__(self, frame: LocalFrame, start: InitialState, own: WitnessBounds) -> None:
+        self._own, self._frame = own, frame
+        self._first_heading_s: float | None = None
         k = own.sigmas
-        p_n = self._frame.p_n_from_geodetic(start.lat, start.lon, start.height)
+        p_n = frame.p_n_from_geodetic(start.lat, start.lon, start.height)
         sigma = start.position_sigma_enu
         half = np.array(
             [
@@ -174,10 +173,11 @@ class _Walk:
         )
         self._sets = Sets.of_box(np.array([p_n[0], p_n[1], 0.0]), half, _FLOOR)
         self._up = (p_n[2] - k * sigma[2], p_n[2] + k * sigma[2])
-        self._alarms: list[BoundAlarm] = list(track.alarms)
 
-    def go(self) -> Witness:
-        track = self._track
+    def follow(self, mission: Mission, track: Track) -> Witness:
+        """Return the sets at the ends of a track's blocks; the next track goes on from there."""
+        self._mission, self._track = mission, track
+        self._alarms: list[BoundAlarm] = list(track.alarms)
         rows = []
         for i in range(len(track.time_s)):
             self._lead_on(i)
@@ -245,7 +245,9 @@ class _Walk:
         if log is None or len(rows) == 0:
             return
         row, k, e = rows[-1], self._own.of("compass"), log.errors
-        passed = float(log.time_s[row] - log.time_s[0])
+        if self._first_heading_s is None:
+            self._first_heading_s = float(log.time_s[0])
+        passed = float(log.time_s[row]) - self._first_heading_s
         often = e.one_cycle_sigma + e.two_cycle_sigma
         more = e.offset_sigma + e.walk_sigma + e.rate_sigma * passed + math.sqrt(2.0) * often
         bound = k * (log.sigma + more) + float(self._track.noise_angle[i])
