@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from factors import so3
 from ssm_graph.base.frames import R_lb_from_roll_pitch_heading, roll_pitch_heading_from_R_lb
 from ssm_graph.base.frozen import Array, ReadOnlyArrays
+from ssm_graph.base.stepwise import Steps, at_once
 from ssm_graph.filters.rules.ellipsoids import (
     Ellipsoids,
     around_box,
@@ -22,6 +23,7 @@ from ssm_graph.filters.rules.ellipsoids import (
 from ssm_graph.imu.increments import merge_samples
 from ssm_graph.imu.ping_motion import mean_gyro
 from ssm_graph.mission.mission import InitialState, Mission
+from ssm_graph.systems.sensor_network.block import Block, BlockRow, worst_sigma
 
 if TYPE_CHECKING:
     from ssm_graph.systems.sensor_network.witness import BoundAlarm, WitnessBounds
@@ -152,8 +154,10 @@ class VelocityWalk:
         self._set = around_box(R_nl @ start.velocity_enu, half)
         self._velocity = self._set.center
         self._silent_s, self._is_silent = 0.0, False
+        self._coriolis = 2.0 * so3.skew(self._frame.omega_ie_n)
+        self._gained, self._pushed, self._open_s = np.zeros(3), 0.0, 0.0
 
-    def follow(self, mission: Mission, edges: Edges) -> Track:
+    def follow_steps(self, mission: Mission, edges: Edges) -> Steps[Track]:
         """Return the blocks of a piece of a mission, whose first edge is where the last ended."""
         self._take(mission, edges)
         self._alarms: list[BoundAlarm] = []
@@ -161,32 +165,36 @@ class VelocityWalk:
         self._prepare_bounds(self._end_of_block(0))
         R, way, rotations = self._R, [np.zeros(3)], [self._R]
         begun = self._place
-        block = _Block(self._velocity)
-        blocks: list[_Row] = []
+        block = Block(self._velocity)
+        blocks: list[BlockRow] = []
         for n, dt in enumerate(self._dt):
             gain = R @ self._gains[n]
             R = self._earth[n] @ R @ self._turns[n]
             block.turned += float(np.linalg.norm(self._theta[n]))
-            coriolis = 2.0 * np.cross(self._frame.omega_ie_n, block.velocity)
-            gain = gain + (self._g_n - coriolis) * dt
+            gain = gain + (self._g_n - self._coriolis @ block.velocity) * dt
             way.append(way[-1] + block.step(gain, float(dt)))
             tilt = self._tilt + self._drift(block)
             force = 9.81 * tilt + self._accel
-            self._lead_on(gain, float(dt), force)
+            self._gained, self._open_s = self._gained + gain, self._open_s + float(dt)
+            self._pushed += force * float(dt)
             found = self._ping_at(n + 1, R, float(dt), tilt)
             if found is not None:
                 way[-1] = way[-1] + block.close(*found, force)
             if self._ends[n + 1]:
+                self._lead_on()
                 block.leave_open(self._set)
                 blocks.append(self._finished(block, float(self._edge_s[n + 1])))
                 R = self._levelled(R, block)
                 self._place = begun + way[-1]
                 self._g_n = self._frame.g_n_at(self._place)
                 self._prepare_bounds(self._end_of_block(n + 1))
-                block = _Block(block.velocity)
+                block = Block(block.velocity)
             rotations.append(R)
+            yield 1.0
         self._R, self._velocity = R, block.velocity
         return self._track(np.array(way), np.array(rotations), blocks)
+
+    follow = at_once(follow_steps)
 
     def _take(self, mission: Mission, edges: Edges) -> None:
         """Merge the inertial data of a piece, and find its pings at its edges."""
@@ -237,7 +245,7 @@ class VelocityWalk:
         self._late_s = k * mount.time_offset_sigma_s
         self._arm_m = 2.0 * k * mount.lever_arm_sigma
 
-    def _drift(self, block: _Block) -> float:
+    def _drift(self, block: Block) -> float:
         """Return by how much the attitude of a block may have tilted by now, rad.
 
         A heading that is off takes what the Earth turns about another axis.
@@ -246,16 +254,20 @@ class VelocityWalk:
         steady = (self._gyro + earth) * block.span_s + self._gyro_share * block.turned
         return steady + self._gyro_noise * math.sqrt(block.span_s)
 
-    def _lead_on(self, gain: Array, dt: float, force: float) -> None:
-        """Lead the set of velocities on by what the accelerometers gained (3,), off by a force."""
-        white = self._accel_noise * math.sqrt(dt)
-        half = (force * dt + white) * np.eye(3)
-        parts = np.concatenate([self._set.shape[None], segments(half)])
-        self._set = Ellipsoids(self._set.center + gain, sum_shape(parts))
+    def _lead_on(self) -> None:
+        """Lead the set of velocities on by what the accelerometers have gained since they were."""
+        if self._open_s == 0.0:
+            return
+        half = self._pushed + self._accel_noise * math.sqrt(self._open_s)
+        parts = np.concatenate([self._set.shape[None], segments(half * np.eye(3))])
+        self._set = Ellipsoids(self._set.center + self._gained, sum_shape(parts))
+        self._gained, self._pushed, self._open_s = np.zeros(3), 0.0, 0.0
 
     def _ping_at(self, edge: int, R: Array, dt: float, tilt: float) -> tuple[Array, Array] | None:
         """Cut the set by a ping's beams; return the velocity (3,) and its covariance (3, 3)."""
         n = self._ping.get(edge)
+        if n is not None:
+            self._lead_on()
         used = [] if n is None else self._usable(n, R, tilt)
         if n is None or len(used) < 3:
             self._silence(edge, dt)
@@ -306,13 +318,13 @@ class VelocityWalk:
             by = f"for {self._silent_s:.0f} s its beams miss what inertial data allow"
             self._alarms.append(BoundAlarm(float(self._edge_s[edge]), "DVL", by))
 
-    def _finished(self, block: _Block, end_s: float) -> _Row:
+    def _finished(self, block: Block, end_s: float) -> BlockRow:
         """Return way, its bounds, turn, noise of the heading and mean speed's bound of a block."""
         k, T = self._own.of("DVL"), block.span_s
         since = end_s - self.begin_s
         angle = self._gyro_noise * math.sqrt(since)
         turn = self._gyro * T + self._gyro_share * block.turned
-        scatter = k * _worst_sigma(block.covariance)
+        scatter = k * worst_sigma(block.covariance)
         steady = self._steady * T + self._share * block.path + self._arm_m
         steady += self._late_s * block.changed + block.curved + block.bent + scatter + block.unseen
         tilt = self._tilt + self._drift(block)
@@ -321,9 +333,9 @@ class VelocityWalk:
         bound = np.array([level, level, up])
         self._heading += turn
         speed = float(max(level, up) / max(T, 1e-9))
-        return _Row(block.way, bound, turn, angle, end_s, speed, block.closing, tilt)
+        return BlockRow(block.way, bound, turn, angle, end_s, speed, block.closing, tilt)
 
-    def _levelled(self, R: Array, block: _Block) -> Array:
+    def _levelled(self, R: Array, block: Block) -> Array:
         """Turn the attitude to where the accelerometers' gain is the change of the velocity."""
         drift = self._drift(block)
         self._tilt += drift
@@ -333,7 +345,7 @@ class VelocityWalk:
         if 0.5 * self._own.block_s > T:
             return R
         g = float(np.linalg.norm(self._g_n))
-        ends = self._own.of("DVL") * (_worst_sigma(block.latest) + _worst_sigma(block.earliest))
+        ends = self._own.of("DVL") * (worst_sigma(block.latest) + worst_sigma(block.earliest))
         white = self._accel_noise * math.sqrt(T)
         changed = self._share * block.changed
         tilt = ((ends + 2.0 * self._steady + changed + white) / T + self._accel) / g
@@ -348,7 +360,7 @@ class VelocityWalk:
         self,
         way: Array,
         rotations: Array,
-        blocks: list[_Row],
+        blocks: list[BlockRow],
     ) -> Track:
         advance, bound, turn, angle, end_s, speed, closing, tilt = (
             np.array(column) for column in zip(*blocks, strict=True)
@@ -372,73 +384,3 @@ class VelocityWalk:
             self._n_beams,
             self._n_left_out,
         )
-
-
-class _Row(NamedTuple):
-    """What is left of a block; the order is that of the track's fields."""
-
-    way: Array
-    bound: Array
-    turn: float
-    angle: float
-    end_s: float
-    speed: float
-    closing: float
-    tilt: float
-
-
-def _worst_sigma(covariance: Array) -> float:
-    return math.sqrt(float(np.linalg.eigvalsh(covariance)[-1]))
-
-
-class _Block:
-    """Sums over a block: from ping to ping by inertial data, bent so that both ends fit."""
-
-    def __init__(self, velocity: Array) -> None:
-        self.velocity = self.last = velocity
-        self.first: Array | None = None
-        self.latest: Array | None = None
-        self.way, self.gain, self.gain_to_ping = np.zeros(3), np.zeros(3), np.zeros(3)
-        self.covariance, self.earliest = np.zeros((3, 3)), np.zeros((3, 3))
-        self._pull: Array | None = None
-        self.since_first_s = 0.0
-        self.span_s = self.path = self.climbed = self.changed = self.curved = self.turned = 0.0
-        self.unseen = self.open_s = self.closing = self.bent = 0.0
-
-    def step(self, gain: Array, dt: float) -> Array:
-        """Add an interval of so much gain (3,) of velocity and return its way (3,)."""
-        middle = self.velocity + 0.5 * gain
-        self.velocity = self.velocity + gain
-        self.way, self.gain = self.way + middle * dt, self.gain + gain
-        self.path += float(np.linalg.norm(middle)) * dt
-        self.climbed += abs(float(middle[2])) * dt
-        self.changed += float(np.linalg.norm(gain))
-        if self._pull is not None:  # what the acceleration changes by bends the way within a step
-            self.curved += 0.125 * float(np.linalg.norm(gain - self._pull * dt)) * dt
-        self._pull = gain / dt
-        self.span_s, self.open_s = self.span_s + dt, self.open_s + dt
-        return np.asarray(middle * dt)
-
-    def close(self, velocity: Array, covariance: Array, force: float) -> Array:
-        """Bend the way since the last ping to the velocity of this one; return the correction.
-
-        ``force`` bounds the error of the acceleration, m/s^2: between two known velocities it
-        takes the way at most ``force T^2 / 4`` aside.
-        """
-        bend = 0.5 * (velocity - self.velocity) * self.open_s
-        self.way = self.way + bend
-        self.covariance += covariance * self.open_s**2
-        self.bent += 0.25 * force * self.open_s**2
-        self.closing = max(self.closing, float(np.linalg.norm(bend)))
-        if self.first is None:
-            self.first, self.earliest, self.gain = velocity, covariance, np.zeros(3)
-            self.since_first_s = self.span_s
-        self.gain_to_ping = self.gain
-        self.latest, self.last, self.velocity, self.open_s = covariance, velocity, velocity, 0.0
-        return np.asarray(bend)
-
-    def leave_open(self, velocities: Ellipsoids) -> None:
-        """Bound what is not known since the last ping, by the set of velocities."""
-        if self.open_s > 0.0:
-            off = np.max(np.abs(self.velocity - velocities.center) + velocities.half_widths)
-            self.unseen = float(off) * self.open_s
