@@ -108,12 +108,10 @@ def block_edges(pings_s: Array, begin_s: float, ends_s: Array, last_s: float) ->
     ends = np.unique([_next(pings_s, end, last_s) for end in ends_s])
     last = float(ends[-1])
     inside = pings_s[(pings_s > begin_s) & (pings_s <= last)]
-    fill = np.arange(begin_s, last, GAP_S)
-    near = np.searchsorted(inside, fill)
-    before = fill - np.append(-np.inf, inside)[near]
-    behind = np.append(inside, np.inf)[near] - fill
-    fill = fill[np.minimum(before, behind) > 0.5 * GAP_S]
-    edge_s = np.unique(np.concatenate([[begin_s], inside, fill, ends]))
+    known = np.unique(np.concatenate([[begin_s], inside, ends]))
+    parts = np.maximum(np.ceil(np.diff(known) / GAP_S - 1e-6).astype(int), 1)
+    fill = [np.linspace(a, b, n + 1) for a, b, n in zip(known, known[1:], parts, strict=False)]
+    edge_s = np.unique(np.concatenate([known, *(one[1:-1] for one in fill)]))
     return Edges(edge_s, np.isin(edge_s, ends))
 
 

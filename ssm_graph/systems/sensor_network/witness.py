@@ -159,7 +159,7 @@ class PlaceWalk:
     """Place, heading and height from block to block, of a whole mission or piece by piece."""
 
     def __init__(self, frame: LocalFrame, start: InitialState, own: WitnessBounds) -> None:
-        self._own, self._frame = own, frame
+        self._own, self.frame = own, frame
         self._first_heading_s: float | None = None
         k = own.sigmas
         p_n = frame.p_n_from_geodetic(start.lat, start.lon, start.height)
@@ -223,7 +223,7 @@ class PlaceWalk:
         if gnss is None or len(rows) == 0:
             return
         k, track = self._own.of("GNSS"), self._track
-        fix = self._frame.p_n_from_geodetic(gnss.lat[rows], gnss.lon[rows], gnss.height[rows])
+        fix = self.frame.p_n_from_geodetic(gnss.lat[rows], gnss.lon[rows], gnss.height[rows])
         arm, led, led_bound = track.led_to_end(i, gnss.valid_s[rows], gnss.lever_arm_b)
         arm_m = float(np.linalg.norm(gnss.lever_arm_b))
         turned = float(np.max(np.abs([self._sets.low[2], self._sets.high[2]])))
@@ -280,7 +280,7 @@ class PlaceWalk:
         arm, led, led_bound = track.led_to_end(i, log.time_s[rows], log.lever_arm_b)
         x, y = np.maximum(np.abs(self._sets.low[:2]), np.abs(self._sets.high[:2]))
         sagitta = float(x**2 + y**2) / (2.0 * _RADIUS_M)
-        up = -log.true_depth[rows] - self._frame.height - (arm - led)[:, 2] - 0.5 * sagitta
+        up = -log.true_depth[rows] - self.frame.height - (arm - led)[:, 2] - 0.5 * sagitta
         slack = led_bound + k * (calibration.offset_sigma + calibration.drift.sigma) + 0.5 * sagitta
         slack += float(np.linalg.norm(log.lever_arm_b) * track.tilt_bound[i])
         white = np.broadcast_to(k * log.sigma, up.shape)
