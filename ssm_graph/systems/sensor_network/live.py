@@ -147,15 +147,13 @@ class Witnessed:
         return self.estimator.checkpoint()
 
     def _step(self, now_s: float) -> None:
-        answers = self._answers
-        if not answers or now_s - answers[-1][0] >= ANSWER_EVERY_S:
+        if self._is_answer_due(now_s):
             answer = self.estimator.newest()
             if answer is None:
                 return
             at_s = answer.time_s + self.estimator.shift_s
-            if answers and at_s <= answers[-1][0]:
-                return
-            answers.append((at_s, answer))
+            if not self._answers or at_s > self._answers[-1][0]:
+                self._answers.append((at_s, answer))
             if self._walks is None:
                 self._begin(at_s, answer)
         if self._work is None:
@@ -166,6 +164,21 @@ class Witnessed:
             except StopIteration as end:
                 self._work = None
                 self._judge(end.value)
+
+    def _is_answer_due(self, now_s: float) -> bool:
+        """Return whether an answer is to be kept: where the set begins, and about a block's end."""
+        if self._walks is None:
+            return True
+        to_go_s = self._end_s - now_s
+        last_s = self._answers[-1][0] if self._answers else -np.inf
+        is_near = -LATEST_END_S - ANSWER_EVERY_S < to_go_s < 2.0 * ANSWER_EVERY_S
+        return is_near and now_s - last_s >= ANSWER_EVERY_S
+
+    @property
+    def _end_s(self) -> float:
+        """When the block that is waited for ought to end, s."""
+        assert self._walks is not None
+        return self._walks[0].begin_s + (self._n_blocks + 1) * self.bounds.block_s
 
     def _begin(self, at_s: float, answer: Navigation) -> None:
         """Begin a set with an answer; all that is taken of it is here."""
@@ -191,8 +204,7 @@ class Witnessed:
         """Return the work on the next block, if all of it has come."""
         if self._walks is None:
             return None
-        velocity = self._walks[0]
-        end_s = velocity.begin_s + (self._n_blocks + 1) * self.bounds.block_s
+        end_s = self._end_s
         if now_s < end_s + LATEST_END_S + LATE_S + MARGIN_S:
             return None
         mission = self.estimator.received(self._begin_s - MARGIN_S, end_s + LATEST_END_S + MARGIN_S)

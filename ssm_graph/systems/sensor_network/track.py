@@ -20,7 +20,7 @@ from ssm_graph.filters.rules.ellipsoids import (
     segments,
     sum_shape,
 )
-from ssm_graph.imu.increments import merge_samples
+from ssm_graph.imu.increments import merge_samples_steps
 from ssm_graph.imu.ping_motion import mean_gyro
 from ssm_graph.mission.mission import InitialState, Mission
 from ssm_graph.systems.sensor_network.block import Block, BlockRow, worst_sigma
@@ -157,7 +157,7 @@ class VelocityWalk:
 
     def follow_steps(self, mission: Mission, edges: Edges) -> Steps[Track]:
         """Return the blocks of a piece of a mission, whose first edge is where the last ended."""
-        self._take(mission, edges)
+        yield from self._take_steps(mission, edges)
         self._alarms: list[BoundAlarm] = []
         self._n_beams = self._n_left_out = 0
         self._prepare_bounds(self._end_of_block(0))
@@ -194,12 +194,12 @@ class VelocityWalk:
 
     follow = at_once(follow_steps)
 
-    def _take(self, mission: Mission, edges: Edges) -> None:
+    def _take_steps(self, mission: Mission, edges: Edges) -> Steps[None]:
         """Merge the inertial data of a piece, and find its pings at its edges."""
         self._edge_s, self._ends = edges
         dvl = mission.dvl.of_ground()
         imu = mission.imu.calibrated
-        merged = merge_samples(imu, self._edge_s, rate_hz=MERGE_HZ)
+        merged = yield from merge_samples_steps(imu, self._edge_s, rate_hz=MERGE_HZ)
         self._dt = np.diff(self._edge_s)
         theta = merged.gyro_b * merged.dt[:, None]
         self._theta, self._turns = theta, so3.exp(theta)
