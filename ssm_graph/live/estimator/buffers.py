@@ -156,16 +156,18 @@ class Buffers:
         """Return the axes of the inertial sensors that repeat themselves up to a time."""
         return frozen_now(self.imu.between(time_s - FROZEN_REACH_S, time_s))
 
-    def mission(self, frame: LocalFrame, *, until_s: float = np.inf) -> Mission:
-        """Return everything, or what is of a time ``until_s``, as a mission to align with."""
+    def mission(
+        self, frame: LocalFrame, *, begin_s: float = -np.inf, until_s: float = np.inf
+    ) -> Mission:
+        """Return everything, or what is from ``begin_s`` to ``until_s``, as a mission."""
         vehicle = self.vehicle
-        dvl = DVL.log_of(self.pings_between(-np.inf, until_s), self._bare[DVL.section])
-        gnss, depth, aids = self.logs_between(-np.inf, until_s)
+        dvl = DVL.log_of(self.pings_between(begin_s, until_s), self._bare[DVL.section])
+        gnss, depth, aids = self.logs_between(begin_s, until_s)
         end_s = min(self.imu.last_s, until_s)
         return Mission(
             vehicle.name,
             frame,
-            self.imu_log(-np.inf, end_s, margin=0),
+            self.imu_log(begin_s, end_s, margin=0),
             dvl,
             depth if depth is not None and len(depth.time_s) else None,
             gnss,

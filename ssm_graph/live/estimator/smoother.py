@@ -27,6 +27,7 @@ from ssm_graph.live.estimator.tail import Tail
 from ssm_graph.live.estimator.watch import Contradicted, Watch
 from ssm_graph.mission.estimate import Found
 from ssm_graph.mission.events import EventLog
+from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.navigation import Event, Health, Navigation, Severity
 from ssm_graph.mission.problem import ProblemConfig
 from ssm_graph.mission.vehicle import Vehicle
@@ -99,6 +100,20 @@ class FixedLagSmoother:
     def counts(self) -> dict[str, int]:
         """How many messages were refused, by sensor and reason."""
         return dict(self._intake.counts)
+
+    @property
+    def shift_s(self) -> float:
+        """Added to the vehicle's clock since it was set back, s: the clock of the states."""
+        return self._intake.shift_s
+
+    def received(self, begin_s: float, end_s: float) -> Mission | None:
+        """Return what was accepted between two times of the states' clock, and is still kept.
+
+        Beside the readings of the lag there is nothing; None before there is a place on Earth.
+        """
+        if self._frame is None:
+            return None
+        return self._intake.buffers.mission(self._frame, begin_s=begin_s, until_s=end_s)
 
     def push(self, message: Message) -> None:
         """Take one message; nothing that it may hold raises."""
