@@ -190,6 +190,8 @@ class TerrainLog(FrozenArrays):
     """(3,) body origin to instrument, m."""
     way_m: Array = shaped("N")
     """(N,) gone since the ping before, by the beams' own speeds, m."""
+    within_m: float = np.nan
+    """The mission began within so much of its stated start, m; NaN where its sigma says it."""
 
     @property
     def cell_factor(self) -> Array:
@@ -218,7 +220,9 @@ class TerrainLog(FrozenArrays):
         return max(float(self.way_m.sum()) / span_s if span_s > 0.0 else 0.0, 0.05)
 
 
-def terrain_log(grid: SeabedGrid, dvl: DvlLog, errors: MapErrors) -> TerrainLog:
+def terrain_log(
+    grid: SeabedGrid, dvl: DvlLog, errors: MapErrors, *, within_m: float = np.nan
+) -> TerrainLog:
     """Return the ranges of a DVL off the ground to be compared with a map.
 
     Raises :class:`DataError` where there are none.
@@ -226,8 +230,8 @@ def terrain_log(grid: SeabedGrid, dvl: DvlLog, errors: MapErrors) -> TerrainLog:
     dvl = dvl.of_ground()
     if dvl.range_m is None or not np.isfinite(dvl.range_m).any():
         raise DataError(
-            "dvl: there is no range along a beam, which a map is compared with; expected columns "
-            f"range1_m to range{dvl.mount.n_beams}_m in the DVL's table"
+            "[map]: the DVL has no range along a beam, which a map is compared with; expected "
+            f"columns range1_m to range{dvl.mount.n_beams}_m in its table"
         )
     mount = dvl.mount
     speed = np.nan_to_num(dvl.speed) @ np.linalg.pinv(mount.beams_b).T
@@ -243,4 +247,5 @@ def terrain_log(grid: SeabedGrid, dvl: DvlLog, errors: MapErrors) -> TerrainLog:
         beams_b=mount.beams_d @ mount.R_bd.T,
         lever_arm_b=mount.lever_arm_b,
         way_m=np.diff(total, prepend=0.0),
+        within_m=within_m,
     )

@@ -39,6 +39,11 @@ class Verdict(Enum):
     UNRESOLVED = "the seabed says too little of the place"
     FAILED = "no place on the map explains the ranges"
 
+    @property
+    def is_known(self) -> bool:
+        """Whether the place may be used."""
+        return self is Verdict.CONVERGED
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VerdictSettings:

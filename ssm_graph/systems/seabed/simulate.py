@@ -11,7 +11,7 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.mission.mission import InitialState, Mission
 from ssm_graph.sensors.depth import DepthLog
 from ssm_graph.sensors.drift import Drift
-from ssm_graph.sensors.seabed import MapErrors, SeabedGrid
+from ssm_graph.sensors.seabed import MapErrors, SeabedGrid, terrain_log
 from ssm_graph.simulation import SimulationConfig, SurveyRoute, checked, simulate
 from ssm_graph.simulation.routes import DepthProfile
 from ssm_graph.systems.seabed.terrain import (
@@ -126,3 +126,11 @@ def _in_doubt(mission: Mission, start_m: float, rng: np.random.Generator) -> Ini
     return replace(
         initial, lat=float(lat), lon=float(lon), height=float(height), position_sigma_enu=sigma
     )
+
+
+def mission_with_map(dive: SimulatedDive) -> Mission:
+    """Return the mission of a dive with its map, and within what it began."""
+    start_m = dive.settings.start_m
+    within_m = start_m if start_m > 0.0 else np.nan
+    log = terrain_log(dive.map, dive.mission.dvl, dive.errors, within_m=within_m)
+    return replace(dive.mission, aids=dive.mission.aids.having(log))
