@@ -15,6 +15,8 @@ from ssm_graph.sensors.dvl import DvlLog
 
 _LEAST_WAY_M: Final = 0.05
 """A vehicle that hardly moves sees the same cell again: its pings count no less than this way."""
+_MET_AGAIN: Final = 2.0
+"""What beams ahead met, beams astern meet again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +36,17 @@ class MapErrors:
     """Of a range, beside ..."""
     range_noise_share: float = 0.005
     """... this share of it."""
+
+    def cell_factor(self, cell_m: float, way_m: Array) -> Array:
+        """Return by how much the variance of a cell counts more: several pings meet the same one.
+
+        ``way_m`` (...) is the way since the ping before.
+        """
+        return np.maximum(1.0, _MET_AGAIN * cell_m / np.maximum(way_m, _LEAST_WAY_M))
+
+    def smooth_factor(self, way_m: Array) -> Array:
+        """Return the same of the map's smooth errors, where nothing models them."""
+        return np.maximum(1.0, 2.0 * self.smooth_m / np.maximum(way_m, _LEAST_WAY_M))
 
     def range_sigma(self, range_m: Array) -> Array:
         """Return the standard deviations of ranges, m."""
@@ -192,11 +205,6 @@ class TerrainLog(FrozenArrays):
     """(N,) gone since the ping before, by the beams' own speeds, m."""
     within_m: float = np.nan
     """The mission began within so much of its stated start, m; NaN where its sigma says it."""
-
-    @property
-    def cell_factor(self) -> Array:
-        """(N,) by how much the variance of a cell counts more: several pings see the same one."""
-        return np.maximum(1.0, self.grid.cell_m / np.maximum(self.way_m, _LEAST_WAY_M))
 
     @property
     def smooth_sigmas(self) -> tuple[float, float]:

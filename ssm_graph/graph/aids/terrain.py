@@ -40,7 +40,7 @@ class TerrainRanges(Aid):
     range_sigma: Array
     """(M,) m"""
     cell_factor: Array
-    """(M,) by how much the variance of a cell counts more: several pings see the same one"""
+    """(M,) by how much the variance of a cell counts more: several pings meet the same one"""
     apart: Array
     """(M, B - 1) how the beam's own part of what is off follows from that of all beams' differences"""
     sigma: Array
@@ -62,7 +62,7 @@ class TerrainRanges(Aid):
         row, beam = np.nonzero(np.isfinite(log.range_m[inside]))
         range_m = log.range_m[inside][row, beam]
         range_sigma = log.errors.range_sigma(range_m)
-        factor = log.cell_factor[inside][row]
+        factor = log.errors.cell_factor(log.grid.cell_m, log.way_m[inside])[row]
         return cls(
             keyframe=at[row],
             beam=beam,

@@ -130,11 +130,11 @@ def counted(grid: SeabedGrid, errors: MapErrors, track: Track, row: int) -> Coun
     Errors that last along the way, those of a cell and of the map's smooth part, are the same for
     so many pings; with d the way since the last one::
 
-        share = s^2 / (range^2 + cell^2 max(1, cell_m / d) + smooth^2 max(1, 2 smooth_m / d))
+        share = s^2 / (range^2 + cell^2 max(1, 2 cell_m / d) + smooth^2 max(1, 2 smooth_m / d))
     """
-    way = max(float(track.way_m[row]), 0.05)
+    way = track.way_m[row]
     of_range = np.square(track.sigma[row])
     cell, smooth = errors.sigma_m**2, errors.smooth_sigma_m**2
-    longer = cell * max(1.0, grid.cell_m / way) + smooth * max(1.0, 2.0 * errors.smooth_m / way)
+    longer = cell * errors.cell_factor(grid.cell_m, way) + smooth * errors.smooth_factor(way)
     total = of_range + cell + smooth
     return Counted(np.sqrt(total), total / (of_range + longer))
