@@ -67,9 +67,17 @@ def with_map(mission: Mission, settings: Settings, folder: Path) -> Mission:
 
 
 def with_map_file(mission: Mission, path: Path) -> Mission:
-    """Return a mission with the map of a file, whose errors are those that are usual."""
-    settings = Settings("map", {"file": path.name}, "--map", MAP_KEYS)
-    return with_map(mission, settings, path.parent)
+    """Return a mission with the map of a file, in the place of that which it has.
+
+    What is stated of that one holds for this one, too; without any, errors are the usual ones.
+    """
+    before = mission.aids.get(TerrainLog)
+    grid = read_seabed(path, frame_for(mission))
+    errors, within = MapErrors(), np.nan
+    if before is not None:
+        errors, within = before.errors, before.within_m
+    log = terrain_log(grid, mission.dvl, errors, within_m=within)
+    return replace(mission, aids=mission.aids.having(log))
 
 
 def frame_for(mission: Mission, crs: str = "") -> LocalFrame | None:

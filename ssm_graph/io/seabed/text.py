@@ -80,8 +80,8 @@ def write_ascii_grid(path: Path, grid: SeabedGrid, values: Array) -> None:
     """Write values (R, C) of a grid, all digits, in the plane of its frame (``crs = "local"``)."""
     n_y, n_x = values.shape
     lines = [
-        *(f"ncols {n_x}", f"nrows {n_y}", f"xllcenter {grid.x0_m!r}", f"yllcenter {grid.y0_m!r}"),
-        *(f"cellsize {grid.cell_m!r}", "NODATA_value -9999"),
+        *(f"ncols {n_x}", f"nrows {n_y}", f"xllcenter {float(grid.x0_m)!r}", f"yllcenter {float(grid.y0_m)!r}"),
+        *(f"cellsize {float(grid.cell_m)!r}", "NODATA_value -9999"),
     ]
     shown = np.where(np.isfinite(values), values, -9999.0)[::-1].tolist()
     lines += [" ".join(map(repr, row)) for row in shown]

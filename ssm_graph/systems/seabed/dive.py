@@ -176,10 +176,9 @@ def _with_start(
         lat, lon, height = frame.geodetic_from_p_n(place)
     sigma = np.maximum(CAUTION * np.sqrt(np.diag(located.cov)[:2]), _LEAST_M)
     start = mission.initial or dead.start
-    known = math.isfinite(track.doubt.yaw)
     heading, attitude_sigma = start.heading, start.attitude_sigma.copy()
     velocity = start.velocity_enu.copy()
-    if not known:
+    if not math.isfinite(track.doubt.yaw):
         heading = float(t.roll_pitch_heading[0, 2] + turn) % (2.0 * math.pi)
         attitude_sigma[2] = max(CAUTION * float(np.sqrt(located.cov[2, 2])), math.radians(0.5))
         velocity[:2] = [c * velocity[0] + s * velocity[1], c * velocity[1] - s * velocity[0]]
@@ -196,4 +195,7 @@ def _with_start(
         velocity_sigma_enu=start.velocity_sigma_enu,
         attitude_sigma=attitude_sigma,
     )
-    return replace(mission, frame=frame, local=None, initial=initial)
+    known_log = replace(log, within_m=np.nan)
+    return replace(
+        mission, frame=frame, local=None, initial=initial, aids=mission.aids.having(known_log)
+    )

@@ -88,7 +88,8 @@ def _particles(axes: Axes, grid: SeabedGrid, found: Located, truth: Array | None
     for colour, row in zip(_COLOURS, picked, strict=False):
         when, states = found.snapshots[row]
         label = f"particles, {when:.0f} s"
-        axes.plot(*states.T, ".", color=colour, markersize=1.6, label=label, zorder=2)
+        axes.plot(*states.T, ".", color=colour, markersize=1.6, zorder=2)
+        axes.plot([], [], ".", color=colour, markersize=8.0, label=label)
     turn = np.linspace(0.0, 2.0 * np.pi, 100)
     x, y = found.middle[:, None] + found.radius_m * np.stack([np.cos(turn), np.sin(turn)])
     axes.plot(x, y, "--", color=INK, linewidth=0.8, label="searched", zorder=3)
@@ -106,7 +107,7 @@ def _places(axes: Axes, grid: SeabedGrid, found: Located, truth: Array | None) -
         colour = ESTIMATE if number == 0 else REDUCED
         axes.plot(*h.pose[:2], "o", color=colour, markersize=5.0 if number == 0 else 3.5, zorder=5)
         axes.annotate(
-            f"{100.0 * h.share:.2g} %",
+            _percent(h.share),
             h.pose[:2],
             fontsize=6.5,
             color=INK,
@@ -119,6 +120,10 @@ def _places(axes: Axes, grid: SeabedGrid, found: Located, truth: Array | None) -
         axes.plot(*truth.T, "--", color=REFERENCE, linewidth=1.0, label="truth")
     dress(axes, title="Places of the start, with evidence", x="east (m)", y="north (m)")
     legend(axes, loc="best")
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.1f} %" if share >= 1e-3 else "< 0.1 %"
 
 
 def _profile(axes: Axes, log: TerrainLog, track: Track, found: Located) -> None:

@@ -235,10 +235,8 @@ def _judge(
     ways = way_from(track, np.array([h.pose for h in found[:likely]]))
     if len(found) > 1:
         rival = np.array(found[1].pose) - np.array(found[0].pose)
-        told += (
-            f"; rival {rival[0]:+.0f} m east, {rival[1]:+.0f} m north with "
-            f"{100.0 * shares[1]:.2g} %"
-        )
+        share = f"{100.0 * shares[1]:.1f} %" if shares[1] >= 1e-3 else "below 0.1 %"
+        told += f"; rival {rival[0]:+.0f} m east, {rival[1]:+.0f} m north with {share}"
     x, y = ways[0].T
     on_map = float(np.isfinite(grid.height_at(x, y)).mean())
     if on_map < judged.least_on_map:

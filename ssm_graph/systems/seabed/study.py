@@ -11,11 +11,12 @@ import numpy as np
 from ssm_graph.base.frozen import Array
 from ssm_graph.evaluation.consistency import rate_with_interval
 from ssm_graph.evaluation.errors import evaluate
-from ssm_graph.simulation import Grade
+from ssm_graph.mission.problem import ProblemConfig
+from ssm_graph.simulation import Grade, SimulationConfig
 from ssm_graph.smoothers.mission import smooth
 from ssm_graph.smoothers.settings import SmootherConfig
 from ssm_graph.study.ledger import ERROR, Key, Row
-from ssm_graph.systems.seabed.dive import find_start, smooth_dive, without_map
+from ssm_graph.systems.seabed.dive import find_start, without_map
 from ssm_graph.systems.seabed.locate import Located, Verdict
 from ssm_graph.systems.seabed.simulate import (
     DIVE,
@@ -36,16 +37,27 @@ TERRAINS: Final[Mapping[str, TerrainSettings]] = {
 FIRST_HELD_OUT: Final = 1000
 """Settings were chosen on seeds below 100 only."""
 IMU_HZ: Final = 50.0
+PING_S: Final = 2.0
+GRAPH: Final = ProblemConfig(keyframe_interval_s=PING_S)
 SMOOTHED: Final = 5
 """Of so many dives one is smoothed on the map as well."""
 
 
 def dive_of(terrain: str, grade: str, seed: int, duration_s: float = 600.0) -> SimulatedDive:
     """Return a dive of the study; the same key gives the same one."""
-    mission = replace(
-        DIVE, seed=seed, grade=Grade[grade], imu_rate_hz=IMU_HZ, duration_s=duration_s
-    )
+    mission = _mission(grade, seed, duration_s)
     return simulate_dive(DiveSettings(mission=mission, terrain=TERRAINS[terrain]))
+
+
+def _mission(grade: str, seed: int, duration_s: float) -> SimulationConfig:
+    return replace(
+        DIVE,
+        seed=seed,
+        grade=Grade[grade],
+        imu_rate_hz=IMU_HZ,
+        duration_s=duration_s,
+        dvl=replace(DIVE.dvl, rate_hz=1.0 / PING_S),
+    )
 
 
 def trial(key: Key) -> Row:
@@ -53,7 +65,7 @@ def trial(key: Key) -> Row:
     terrain, grade, seed = str(key[0]), str(key[1]), int(key[2])
     dive = dive_of(terrain, grade, seed)
     mission = mission_with_map(dive)
-    found = find_start(mission)
+    found = find_start(mission, problem_config=GRAPH)
     located = found.located
     assert located is not None
     truth = _truth(dive, located.track.time_s[[0, -1]])
@@ -69,7 +81,7 @@ def trial(key: Key) -> Row:
         "cpu_s": located.cpu_s,
     }
     if located.verdict is Verdict.CONVERGED and seed % SMOOTHED == 0:
-        estimate = smooth(found.mission, SmootherConfig())
+        estimate = smooth(found.mission, SmootherConfig(), problem_config=GRAPH)
         assert mission.reference is not None
         scored = evaluate(estimate.trajectory, mission.reference)
         row |= {
@@ -108,15 +120,12 @@ def drift_trial(key: Key) -> Row:
     """Do one long mission whose start is known: with the map and without."""
     terrain, grade, seed, hours = str(key[0]), str(key[1]), int(key[2]), float(key[3])
     terrain_settings = replace(TERRAINS[terrain], side_m=6000.0)
-    mission = replace(
-        DIVE, seed=seed, grade=Grade[grade], imu_rate_hz=IMU_HZ, duration_s=3600.0 * hours
-    )
+    mission = _mission(grade, seed, 3600.0 * hours)
     dive = simulate_dive(DiveSettings(mission=mission, terrain=terrain_settings, start_m=0.0))
     known = mission_with_map(dive)
     row: dict[str, Any] = {}
     for name, one in (("with", known), ("without", without_map(known))):
-        estimate = smooth_dive(one).estimate if name == "with" else smooth(one, SmootherConfig())
-        assert estimate is not None
+        estimate = smooth(one, SmootherConfig(), problem_config=GRAPH)
         assert one.reference is not None
         scored = evaluate(estimate.trajectory, one.reference)
         row |= {
