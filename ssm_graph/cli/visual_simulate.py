@@ -55,10 +55,10 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
         CAMERA,
         SMALL_CAMERA,
         ImageFaults,
-        RangeFaults,
-        Run,
+            Run,
         simulate,
     )
+    from ssm_graph.systems.visual_ranges.simulated_ranges import RangeFaults
 
     check_is_free(arguments.out, may_overwrite=arguments.overwrite)
     ranges = RangeFaults(

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from ssm_graph.base.errors import ConfigError, nearest_hint
 from ssm_graph.base.frozen import Array, ShortRepr
 from ssm_graph.systems.visual_ranges.camera import Camera
-from ssm_graph.systems.visual_ranges.ranges import Ranges, screened_ranges
 from ssm_graph.systems.visual_ranges.render import Image, render
 from ssm_graph.systems.visual_ranges.sequence import PathTruth, Sequence
+from ssm_graph.systems.visual_ranges.simulated_ranges import RangeFaults, simulated_ranges
 from ssm_graph.systems.visual_ranges.world import RING_M, World, corridor, room
 
 CAMERA: Final = Camera(640, 480, 460.0, 460.0, 319.5, 239.5)
@@ -31,36 +31,7 @@ ANCHORS: Final = {
     "corridor": ((-2.0, 7.0, 2.3), (10.0, -7.0, 0.5), (-11.9, -3.0, 1.5)),
 }
 """Places in the world, m; as many as are asked for."""
-EXCESS_M: Final = 0.3
-EXCESS_MEAN_M: Final = 0.8
-"""A range that is not in line of sight is too long by the one, and an exponential of the other."""
-BURST_S: Final = 1.0
-
 Places = Callable[[Array], Array]
-
-
-@dataclass(frozen=True, slots=True)
-class RangeFaults:
-    """How ranges are measured, and what is wrong with them."""
-
-    rate_hz: float = 10.0
-    """Of each anchor; their times are spread and jitter by a fifth of the period."""
-    sigma_m: float = 0.08
-    bias_m: float = 0.05
-    """Of all anchors."""
-    bias_walk_m: float = 0.0
-    """Random walk of each anchor's bias, m after one second."""
-    nlos_share: float = 0.0
-    """Of ranges, in bursts of a second, too long by 0.3 m and an exponential of 0.8 m."""
-    occlusion: bool = True
-    """Whether walls in the way make ranges too long in the same manner."""
-    clock_s: float = 0.0
-    """The stamps of the ranges less the time of the measurement."""
-    lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Camera to antenna, camera axes."""
-    silent_s: tuple[float, float] = (0.0, 0.0)
-    """Without any range from, to."""
-    lost_share: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +97,13 @@ def simulate(run: Run) -> Simulated:
     time_s = np.arange(int(run.duration_s * run.rate_hz) + 1) / run.rate_hz
     time_s = time_s[(rng.uniform(size=len(time_s)) >= run.images.dropped_share)]
     anchors = np.array(ANCHORS[run.world][: run.n_anchors], dtype=float).reshape(-1, 3)
-    ranges, is_nlos, bias = _ranges(run, world, path, anchors)
+
+    def antenna(time: Array) -> Array:
+        return path.place(time) + axes(path, time) @ np.array(run.ranges.lever_arm_m)
+
+    ranges, is_nlos, bias = simulated_ranges(
+        run.ranges, antenna, anchors, (0.0, run.duration_s), run.seed, world.is_blocked
+    )
     R_wc, p_w = axes(path, time_s), path.place(time_s)
 
     def image(index: int) -> Image:
@@ -231,53 +208,6 @@ def _rounded(along_m: Array, behind_m: float, ahead_m: float) -> tuple[Array, Ar
     shift = np.linspace(behind_m, ahead_m, 13)
     lines, yaws = zip(*(_ring(along_m + part) for part in shift), strict=True)
     return np.mean(lines, axis=0), np.mean(yaws, axis=0)
-
-
-def _ranges(
-    run: Run, world: World, path: Path, anchors: Array
-) -> tuple[Ranges, NDArray[np.bool_], Array]:
-    """Return ranges, whether they are too long, and their biases."""
-    asked, rng = run.ranges, np.random.default_rng((run.seed, 6))
-    columns: list[tuple[Array, Array, NDArray[np.bool_], Array]] = []
-    for j, anchor in enumerate(anchors):
-        n, period = int(run.duration_s * asked.rate_hz), 1.0 / asked.rate_hz
-        time = (np.arange(n) + j / len(anchors) + rng.uniform(0.0, 0.2, n)) * period
-        antenna = path.place(time) + axes(path, time) @ np.array(asked.lever_arm_m)
-        distance = np.linalg.norm(antenna - anchor, axis=1)
-        nlos = _bursts(time, asked.nlos_share, rng)
-        if asked.occlusion:
-            nlos |= world.is_blocked(antenna, np.broadcast_to(anchor, antenna.shape))
-        bias = asked.bias_m + asked.bias_walk_m * np.sqrt(period) * np.cumsum(rng.normal(size=n))
-        noise = asked.sigma_m * rng.standard_normal(n)
-        excess = EXCESS_M + rng.exponential(EXCESS_MEAN_M, n)
-        measured = distance + bias + noise + np.where(nlos, excess, 0.0)
-        heard = (rng.uniform(size=n) >= asked.lost_share) & (measured > 0.0)
-        heard &= (time < asked.silent_s[0]) | (time >= asked.silent_s[1])
-        columns.append((time[heard], measured[heard], nlos[heard], bias[heard]))
-    names = [f"A{j}" for j, column in enumerate(columns) for _ in column[0]]
-    if not columns:
-        columns = [(np.zeros(0), np.zeros(0), np.zeros(0, dtype=bool), np.zeros(0))]
-    time, measured, nlos, bias = (np.concatenate(c) for c in zip(*columns, strict=True))
-    order = np.argsort(time, kind="stable")
-    ranges = screened_ranges(
-        time[order] + asked.clock_s,
-        [names[i] for i in order],
-        measured[order],
-        np.full(len(order), asked.sigma_m),
-        source=run.world,
-    )
-    return ranges, nlos[order], bias[order]
-
-
-def _bursts(time_s: Array, share: float, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Return which times fall into bursts of a second that cover a share of all seconds."""
-    if not len(time_s):
-        return np.zeros(0, dtype=bool)
-    second = (time_s / BURST_S).astype(int)
-    n = second.max() + 1
-    chosen = np.zeros(n, dtype=bool)
-    chosen[rng.permutation(n)[: round(share * n)]] = True
-    return np.asarray(chosen[second])
 
 
 def _image(run: Run, world: World, time_s: float, R_wc: Array, p_w: Array) -> Image:

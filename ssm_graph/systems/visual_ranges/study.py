@@ -1,10 +1,15 @@
-"""Whole runs over rendered worlds: how far path, scale and anchors are off, and which loops lie."""
+"""Whole runs: how far path, scale and anchors are off, and which loops lie.
+
+Over rendered worlds, and over real images with ranges that are simulated along their true path.
+"""
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -14,16 +19,12 @@ from ssm_graph.study.ledger import Key, Row
 from ssm_graph.systems.visual_ranges.accuracy import accuracy, true_places
 from ssm_graph.systems.visual_ranges.loop_settings import LoopSettings
 from ssm_graph.systems.visual_ranges.ranges import screened_ranges
+from ssm_graph.systems.visual_ranges.readers.source import read_sequence
 from ssm_graph.systems.visual_ranges.result import FrameState, VisualResult
 from ssm_graph.systems.visual_ranges.sequence import Sequence
 from ssm_graph.systems.visual_ranges.settings import VisualSettings
-from ssm_graph.systems.visual_ranges.simulate import (
-    SMALL_CAMERA,
-    ImageFaults,
-    RangeFaults,
-    Run,
-    simulate,
-)
+from ssm_graph.systems.visual_ranges.simulate import SMALL_CAMERA, ImageFaults, Run, simulate
+from ssm_graph.systems.visual_ranges.simulated_ranges import RangeFaults, with_simulated_ranges
 from ssm_graph.systems.visual_ranges.system import run
 from ssm_graph.systems.visual_ranges.verdict import judged
 
@@ -43,7 +44,35 @@ class Case:
     has_loops: bool = True
 
 
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """Real images with simulated ranges, anchors placed by the seed."""
+
+    about: str
+    folder: str
+    """Below ``systems`` of the folder that ``SSM_GRAPH_DATA`` names."""
+    n_anchors: int
+    """0: no ranges"""
+    away_m: tuple[float, float]
+    """Least and largest distance of an anchor from the middle of the path, level."""
+    height_m: tuple[float, float]
+    """The same upwards; cameras are level at first, so up is -y."""
+
+
 NLOS: Final = RangeFaults(nlos_share=0.3)
+_KITCHEN: Final = ("kitchen", (1.5, 3.0), (0.5, 1.5))
+_KITTI: Final = ("kitti07", (30.0, 60.0), (4.0, 8.0))
+RECORDED: Final[Mapping[str, Recorded]] = {
+    f"{name}-{n}" if n else f"{name}-mono": Recorded(
+        f"{words}, {('no ranges', 'one anchor', '', 'three anchors')[n]}", place[0], n, *place[1:]
+    )
+    for name, words, place in (
+        ("kitchen", "7-Scenes kitchen", _KITCHEN),
+        ("kitti", "KITTI 07", _KITTI),
+    )
+    for n in (0, 1, 3)
+}
+"""By name."""
 CASES: Final[Mapping[str, Case]] = {
     "room": Case("room, one anchor", Run("room")),
     "room-mono": Case("room, no ranges", Run("room"), has_ranges=False),
@@ -86,18 +115,43 @@ def case_of(name: str) -> Case:
 
 def trial(key: Key) -> Row:
     """Do one run; the key is the name of a case, a seed, and how long, s (0: as the case says)."""
-    case = case_of(str(key[0]))
-    duration_s = float(key[2]) or case.run.duration_s
-    sequence = simulate(replace(case.run, seed=int(key[1]), duration_s=duration_s)).sequence
-    if not case.has_ranges:
-        sequence = replace(sequence, ranges=screened_ranges([], [], []))
+    name, seed, duration_s = str(key[0]), int(key[1]), float(key[2])
+    if name in RECORDED:
+        sequence, has_loops = recorded(RECORDED[name], seed, duration_s), True
+    else:
+        case = case_of(name)
+        asked = replace(case.run, seed=seed, duration_s=duration_s or case.run.duration_s)
+        sequence, has_loops = simulate(asked).sequence, case.has_loops
+        if not case.has_ranges:
+            sequence = replace(sequence, ranges=screened_ranges([], [], []))
     images = [sequence.images(k) for k in range(len(sequence))]  # rendering is not timed
     sequence = replace(sequence, images=lambda k: images[k])
-    settings = VisualSettings(loops=LoopSettings(is_on=case.has_loops))
+    settings = VisualSettings(loops=LoopSettings(is_on=has_loops))
     begin = time.process_time()
     result = run(sequence, settings)
     cpu_s = time.process_time() - begin
     return {**_errors(sequence, result), **_loops(sequence, result), "cpu_s": cpu_s}
+
+
+def data_folder() -> Path:
+    """Return the folder of the systems' data, from ``SSM_GRAPH_DATA``."""
+    return Path(os.environ.get("SSM_GRAPH_DATA", "../shared/data")) / "systems"
+
+
+def recorded(case: Recorded, seed: int, duration_s: float = 0.0) -> Sequence:
+    """Return a recording with ranges to anchors that a seed places; 0 s: all of it."""
+    sequence = read_sequence(data_folder() / case.folder)
+    assert sequence.truth is not None
+    rng, path = np.random.default_rng((seed, 14)), sequence.truth.position_m
+    turn = rng.uniform(0.0, 2.0 * np.pi, case.n_anchors)
+    away, up = rng.uniform(*case.away_m, turn.shape), rng.uniform(*case.height_m, turn.shape)
+    middle = 0.5 * (path.min(axis=0) + path.max(axis=0))
+    anchors = middle + np.stack([away * np.cos(turn), -up, away * np.sin(turn)], axis=1)
+    sequence = with_simulated_ranges(sequence, anchors, seed)
+    if not duration_s:
+        return sequence
+    kept = sequence.time_s < sequence.time_s[0] + duration_s
+    return replace(sequence, time_s=sequence.time_s[kept])
 
 
 def _errors(sequence: Sequence, result: VisualResult) -> dict[str, Any]:

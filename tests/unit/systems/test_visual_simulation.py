@@ -11,12 +11,12 @@ from ssm_graph.systems.visual_ranges.render import render
 from ssm_graph.systems.visual_ranges.simulate import (
     SMALL_CAMERA,
     ImageFaults,
-    RangeFaults,
     Run,
     axes,
     room_path,
     simulate,
 )
+from ssm_graph.systems.visual_ranges.simulated_ranges import RangeFaults
 from ssm_graph.systems.visual_ranges.world import REPEAT_M, corridor, room
 
 TEXEL_M = 0.03

@@ -29,7 +29,8 @@ from ssm_graph.systems.visual_ranges.ranging import Ranging
 from ssm_graph.systems.visual_ranges.ranging_result import AnchorState
 from ssm_graph.systems.visual_ranges.readers.starloc import read_starloc
 from ssm_graph.systems.visual_ranges.similarity3 import IDENTITY
-from ssm_graph.systems.visual_ranges.simulate import RangeFaults, Run, simulate
+from ssm_graph.systems.visual_ranges.simulate import Run, simulate
+from ssm_graph.systems.visual_ranges.simulated_ranges import RangeFaults
 from ssm_graph.systems.visual_ranges.start_study import (
     UNIT_M,
     shape_trial,
