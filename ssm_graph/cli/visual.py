@@ -227,6 +227,8 @@ def _found_in_map(
 
 def lines(result: VisualResult, found: Judged, off: Accuracy | None) -> list[str]:
     """Return the verdict and what it rests on, one line each."""
+    import numpy as np
+
     from ssm_graph.systems.visual_ranges.result import FrameState
 
     told = [f"{found.verdict.name}: {found.verdict.value}"]
@@ -252,6 +254,15 @@ def lines(result: VisualResult, found: Judged, off: Accuracy | None) -> list[str
                 f"{anchor.bias_m:+.2f} m; {100 * anchor.nlos_share:.0f} % of {anchor.n_ranges} "
                 "ranges not believed"
             )
+        own = ranging.vehicle
+        if own is not None:
+            down = ", ".join(f"{x:.3f}" for x in own.down)
+            told.append(f"  down is {down} in the map, by the vehicle's own sensors")
+            if np.isfinite(own.range_unit):
+                told.append(
+                    f"  ranges are {own.range_unit:.4f} ± {own.range_unit_sigma:.4f} times what "
+                    "these sensors say: the sound speed's share"
+                )
     if off is not None and found.verdict.has_scale:
         anchors = ", ".join(f"{x:.3f}" for x in off.anchor_m)
         told.append(

@@ -88,6 +88,8 @@ class Ranging(ShortRepr):
         self.history: list[tuple[float, float, float]] = []
         self.started_s = float("nan")
         self.error, self.weight = np.full((2, len(ranges)), np.nan)
+        self.scale_prior: tuple[float, float] | None = None
+        """Mean and standard deviation of log s, where something else knows it"""
         self._tried = self._checked = 0
 
     @property
@@ -246,6 +248,7 @@ class Ranging(ShortRepr):
             self.rules,
             turned_rad=turned_rad,
             spacing=known_spacing(self.ranges.known_position, eligible),
+            scale_prior=self.scale_prior,
         )
         if not self.start.has_scale or self.start.solution is None:
             return []
@@ -287,6 +290,7 @@ class Ranging(ShortRepr):
             drift=self.rules.ledger_drift,
             bias_walk_m=self.rules.bias_walk_m,
             spacing=known_spacing(self.ranges.known_position, np.array(self.used)),
+            scale_prior=self.scale_prior,
         )
         before = self.found
         start = unknowns_of(problem, before.scale, before.anchors, before.biases, before.clock_s)
@@ -308,7 +312,10 @@ class Ranging(ShortRepr):
         """Search everywhere again, with all ranges of the anchors in use; take what is better."""
         assert self.found is not None
         names = tuple(self.anchors[j].name for j in self.used)
-        again = find_start(own, names, self.rules, turned_rad=np.inf, spacing=problem.spacing)
+        again = find_start(
+            own, names, self.rules, turned_rad=np.inf, spacing=problem.spacing,
+            scale_prior=self.scale_prior,
+        )  # fmt: skip
         was_refused, self.start = self.is_refused, again
         if self.is_refused != was_refused:
             what = "; ".join(again.reasons) if self.is_refused else "no contradiction any more"

@@ -24,7 +24,8 @@ EXCESS_M: Final = 0.3
 EXCESS_MEAN_M: Final = 0.8
 """A range that is not in line of sight is too long by the one, and an exponential of the other."""
 BURST_S: Final = 1.0
-
+ASSUMED_SOUND_SPEED: Final = 1500.0
+"""m/s"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +50,10 @@ class RangeFaults:
     silent_s: tuple[float, float] = (0.0, 0.0)
     """Without any range from, to."""
     lost_share: float = 0.0
+    sound_speed_m_per_s: float = 0.0
+    """True one, of an acoustic range: two-way, stamped when the reply comes; 0 for radio."""
+    assumed_sound_speed_m_per_s: float = ASSUMED_SOUND_SPEED
+    """By which times become ranges."""
 
 
 def simulated_ranges(
@@ -75,6 +80,9 @@ def simulated_ranges(
         time = (np.arange(n) + j / len(anchors) + rng.uniform(0.0, 0.2, n)) * period
         place = antenna(begin_s + time)
         distance = np.linalg.norm(place - anchor, axis=1)
+        if asked.sound_speed_m_per_s:
+            distance = _two_ways(asked, antenna, anchor, begin_s + time)
+            time = time + 2.0 * distance / asked.assumed_sound_speed_m_per_s
         nlos = _bursts(time, asked.nlos_share, rng)
         if asked.occlusion and is_blocked is not None:
             nlos |= is_blocked(place, np.broadcast_to(anchor, place.shape))
@@ -98,6 +106,21 @@ def simulated_ranges(
         source="simulated ranges",
     )
     return ranges, nlos[order], bias[order]
+
+
+def _two_ways(
+    asked: RangeFaults, antenna: Callable[[Array], Array], anchor: Array, ping_s: Array
+) -> Array:
+    """Return half of both legs (n,) of pings at times (n,), m by the assumed sound speed.
+
+    The reply reaches the antenna where it is by then, found by iteration.
+    """
+    out = np.linalg.norm(antenna(ping_s) - anchor, axis=1)
+    back = out.copy()
+    for _ in range(4):
+        comes = ping_s + (out + back) / asked.sound_speed_m_per_s
+        back = np.linalg.norm(antenna(comes) - anchor, axis=1)
+    return 0.5 * (out + back) * asked.assumed_sound_speed_m_per_s / asked.sound_speed_m_per_s
 
 
 def with_simulated_ranges(
