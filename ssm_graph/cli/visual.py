@@ -38,6 +38,7 @@ The answer is one of
 
 files in DIR:
   trajectory.tum   camera to map of all images, keyframes.tum of the key frames: evo reads them
+  as_it_came.csv   the pose of each image as first given out, written at once: there when killed
   covariance.npz   6 x 6 of each key frame
   map.ply          points, path, anchors
   anchors.csv      places, sigmas, biases, states, other places that fit
@@ -152,6 +153,7 @@ def _without_ranges(sequence: Sequence) -> Sequence:
 
 def _followed(sequence: Sequence, arguments: argparse.Namespace, errors: Console) -> VisualResult:
     from ssm_graph.systems.visual_ranges.loop_settings import LoopSettings
+    from ssm_graph.systems.visual_ranges.path_file import PathAsItComes
     from ssm_graph.systems.visual_ranges.settings import VisualSettings
     from ssm_graph.systems.visual_ranges.system import run as run_visual
 
@@ -174,7 +176,10 @@ def _followed(sequence: Sequence, arguments: argparse.Namespace, errors: Console
             if done == total:
                 progress.update(task, description="adjusting everything")
 
-        result = run_visual(sequence, settings, progress=show)
+        with PathAsItComes(arguments.out) as path:
+            result = run_visual(sequence, settings, progress=show, on_frame=path.append)
+    if path.failure:
+        say(errors, f"note: {path.path}: {path.failure}; what came later is not in it")
     if not len(result.map.time_s):
         told = "; ".join(result.events[-3:]) or "no image had corners enough"
         raise SolverError(

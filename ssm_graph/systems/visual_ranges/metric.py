@@ -190,7 +190,9 @@ class Metric(ShortRepr):
         is_known = self.has_scale
         factor = self.scale / told.scale if is_known and told.has_scale else 1.0
         state = told.state
-        if self.is_aided and not told.has_scale and state is not StartState.REFUSED:
+        if self.is_aided and not told.has_scale:
+            if state is StartState.REFUSED:
+                reasons = (f"{state.value}, and are not used", *reasons)
             state = StartState.MIRROR if len(self.ranging.ranges) else StartState.READY
         if is_known and state.has_scale and sigma > self.rules.ready_sigma:
             state = StartState.COARSE

@@ -306,6 +306,8 @@ class Solution(ReadOnlyArrays):
     """(M,)"""
     cost: float
     """Deviance of ranges and priors."""
+    drift_square: float = 1.0
+    """Mean square of the path's modes, what is open of them included: 1 as expected."""
 
     @property
     def sigma_log_scale(self) -> float:
@@ -342,10 +344,13 @@ def solution(
             break
     error, J = residuals(problem, at)
     weight = problem.kernel.weight(error, variance, problem.places.sigma_m)
+    modes = slice(problem.n_core, problem.n_core + 3 * problem.drift.shape[1])
+    square = at[0, modes] ** 2 + covariance.diagonal()[modes]
     covariance = covariance * problem.kernel.inefficiency(error, problem.places.sigma_m)
     covariance = covariance * _repeated(problem, weight[0] * error[0])
     cost = float(_cost(problem, at, error)[0])
-    return _outwards(problem, at[0], covariance, (error[0], variance[0], weight[0]), cost)
+    found = _outwards(problem, at[0], covariance, (error[0], variance[0], weight[0]), cost)
+    return replace(found, drift_square=float(square.mean())) if square.size else found
 
 
 def _repeated(problem: Problem, pull: Array) -> float:

@@ -173,16 +173,21 @@ class Ranging(ShortRepr):
         )
 
     def adopt(self, extra: Array, covariance: Array, further: BundleRanges) -> None:
-        """Take over what an adjustment with free scale and anchors found, (E,) and (E, E)."""
+        """Take over what an adjustment with free scale and anchors found, (E,) and (E, E).
+
+        It takes vision for as good as its pixels; what a path may have drifted by is only in the
+        covariance from before, below which that of the scale does not fall.
+        """
         assert self.found is not None
         own = extra[2:].reshape(-1, 4)
+        wider = max(1.0, float(self.found.covariance[0, 0] / covariance[0, 0]))
         self.found = replace(
             self.found,
             scale=further.scale * float(np.exp(extra[0])),
             clock_s=further.clock_s + float(extra[1]),
             anchors=further.anchors + own[:, :3],
             biases=further.biases + own[:, 3],
-            covariance=covariance.copy(),
+            covariance=wider * covariance,
         )
 
     def result(self) -> RangingResult:

@@ -32,7 +32,7 @@ CORNER_M: Final = 1.0
 ANCHORS: Final = {
     "room": ((3.7, 1.6, 2.2), (-3.7, -2.0, 2.5), (-1.0, 2.8, 0.4)),
     "corridor": ((-2.0, 7.0, 2.3), (10.0, -7.0, 0.5), (-11.9, -3.0, 1.5)),
-    "bottom": ((9.0, -7.0, 0.6), (-10.0, 6.0, 0.4), (1.0, 8.5, 0.5)),
+    "bottom": ((9.0, -7.0, 1.8), (-10.0, 6.0, 1.6), (1.0, 8.5, 1.9)),
 }
 """Places in the world, m; as many as are asked for."""
 Places = Callable[[Array], Array]

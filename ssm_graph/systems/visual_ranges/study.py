@@ -23,13 +23,21 @@ from ssm_graph.systems.visual_ranges.readers.source import read_sequence
 from ssm_graph.systems.visual_ranges.result import FrameState, VisualResult
 from ssm_graph.systems.visual_ranges.sequence import Sequence
 from ssm_graph.systems.visual_ranges.settings import VisualSettings
-from ssm_graph.systems.visual_ranges.simulate import SMALL_CAMERA, ImageFaults, Run, simulate
+from ssm_graph.systems.visual_ranges.simulate import (
+    SMALL_CAMERA,
+    ImageFaults,
+    Run,
+    simulate,
+    under_water,
+)
 from ssm_graph.systems.visual_ranges.simulated_ranges import RangeFaults, with_simulated_ranges
 from ssm_graph.systems.visual_ranges.system import run
 from ssm_graph.systems.visual_ranges.verdict import judged
 
 FIRST_FRESH: Final = 1000
 """Seeds below it are for choosing, from it on for reports."""
+SMALL_CORNERS: Final = 350
+"""Corners followed in a quarter of the pixels."""
 SAME_PLACE_M: Final = 1.0
 """Error of the distance between two cameras from which a loop is false; walls repeat by 12.8 m."""
 
@@ -84,6 +92,17 @@ CASES: Final[Mapping[str, Case]] = {
     "room-silent": Case(
         "room, one anchor, no ranges for 20 s", Run("room", ranges=RangeFaults(silent_s=(25, 45)))
     ),
+    "room-carried": Case(
+        "room, one anchor, carried elsewhere under a covered lens for 12 s",
+        Run("room", images=ImageFaults(covered_s=(30.0, 42.0))),
+    ),
+    "room-dropped": Case(
+        "room, one anchor, 30 % of the images dropped",
+        Run("room", images=ImageFaults(dropped_share=0.3)),
+    ),
+    "room-clock": Case(
+        "room, one anchor, ranges stamped 50 ms late", Run("room", ranges=RangeFaults(clock_s=0.05))
+    ),
     "corridor": Case("corridor, one anchor", Run("corridor", duration_s=63.0)),
     "corridor-mono": Case(
         "corridor, no ranges", Run("corridor", duration_s=63.0), has_ranges=False
@@ -94,6 +113,11 @@ CASES: Final[Mapping[str, Case]] = {
     "corridor-nlos": Case(
         "corridor, three anchors, 30 % NLOS",
         Run("corridor", duration_s=63.0, n_anchors=3, ranges=NLOS),
+    ),
+    "bottom": Case("under water, depth and dead reckoning", under_water(0)),
+    "bottom-bare": Case("under water, ranges alone", under_water(0, vehicle=None)),
+    "bottom-silent": Case(
+        "under water, depth and dead reckoning, no ranges", under_water(0), has_ranges=False
     ),
 }
 """By name; a name that ends in ``-small`` is the same in a quarter of the pixels."""
@@ -126,7 +150,8 @@ def trial(key: Key) -> Row:
             sequence = replace(sequence, ranges=screened_ranges([], [], []))
     images = [sequence.images(k) for k in range(len(sequence))]  # rendering is not timed
     sequence = replace(sequence, images=lambda k: images[k])
-    settings = VisualSettings(loops=LoopSettings(is_on=has_loops))
+    n_corners = SMALL_CORNERS if name.endswith("-small") else VisualSettings().n_corners
+    settings = VisualSettings(n_corners=n_corners, loops=LoopSettings(is_on=has_loops))
     begin = time.process_time()
     result = run(sequence, settings)
     cpu_s = time.process_time() - begin
@@ -174,6 +199,7 @@ def _errors(sequence: Sequence, result: VisualResult) -> dict[str, Any]:
     if result.ranging is not None:
         row["started_s"] = float(result.ranging.started_s - result.time_s[0])
         row["scale_sigma"] = float(result.ranging.sigma_log_scale)
+        row["clock_s"] = float(result.ranging.clock_s)
     return row
 
 

@@ -21,7 +21,7 @@ from ssm_graph.systems.visual_ranges.mapping import Mapper
 from ssm_graph.systems.visual_ranges.metric import Metric
 from ssm_graph.systems.visual_ranges.range_terms import FramePoses
 from ssm_graph.systems.visual_ranges.relocalise import relocalise
-from ssm_graph.systems.visual_ranges.result import FrameState, VisualResult
+from ssm_graph.systems.visual_ranges.result import FrameNow, FrameState, VisualResult
 from ssm_graph.systems.visual_ranges.settings import VisualSettings
 from ssm_graph.systems.visual_ranges.tracking import Followed, Tracker, Tracks
 from ssm_graph.systems.visual_ranges.two_view import NoStart, two_view
@@ -46,9 +46,13 @@ def run(
     settings: VisualSettings = VisualSettings(),  # noqa: B008
     *,
     progress: Callable[[int, int], None] = lambda done, total: None,  # noqa: ARG005
+    on_frame: Callable[[FrameNow], None] | None = None,
 ) -> VisualResult:
-    """Return the path and the map of a sequence."""
-    return _Run(sequence, settings).finish(progress)
+    """Return the path and the map of a sequence.
+
+    ``on_frame`` is called with every image that has a pose, as it is known then.
+    """
+    return _Run(sequence, settings).finish(progress, on_frame)
 
 
 class _Run:
@@ -79,7 +83,11 @@ class _Run:
         self.pool = None if settings.is_deterministic else ThreadPoolExecutor(1)
         self.job: tuple[Image, Tracks, Future[Tracks]] | None = None
 
-    def finish(self, progress: Callable[[int, int], None]) -> VisualResult:
+    def finish(
+        self,
+        progress: Callable[[int, int], None],
+        on_frame: Callable[[FrameNow], None] | None = None,
+    ) -> VisualResult:
         """Go through all images and return the answer."""
         n = len(self.sequence.time_s)
         for i in range(n):
@@ -89,6 +97,8 @@ class _Run:
                     self.try_start(i, image)
                 else:
                     self.follow(i, image)
+            if on_frame is not None and self.state[i] == FrameState.TRACKED:
+                on_frame(self.now(i))
             progress(i + 1, n)
         self.take_mapped(wait=True)
         if self.pool is not None:
@@ -99,6 +109,15 @@ class _Run:
                 self.follow_back()
                 self.refine_frames()
         return self.answer()
+
+    def now(self, i: int) -> FrameNow:
+        """Return the pose of the newest image as it is known now."""
+        k = int(self.reference[i])
+        with self.world.lock:
+            base, grown = self.world.pose(k), float(self.world.frames["grown"][k])
+        pose = Pose(self.relative_R[i], grown / self.unit[i] * self.relative_t[i]).after(base)
+        scale = self.metric.scale if self.metric is not None else float("nan")
+        return FrameNow(float(self.sequence.time_s[i]), pose.R_cw, pose.t_cw, scale)
 
     @contextmanager
     def timed(self, part: str) -> Iterator[None]:
