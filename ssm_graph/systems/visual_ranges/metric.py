@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ssm_graph.base.frozen import Array, ShortRepr
+from ssm_graph.base.frozen import Array
 from ssm_graph.systems.visual_ranges.bundle import FurtherTerms
 from ssm_graph.systems.visual_ranges.bundle_metric import BundleMetric
 from ssm_graph.systems.visual_ranges.bundle_ranges import BundleRanges
@@ -36,7 +36,7 @@ LEAST_LINK: Final = 1e-4
 """Two scales are never held nearer to each other than this: it is what the bundle can resolve."""
 
 
-class Metric(ShortRepr):
+class Metric:
     """Scale, anchors and vertical of a run."""
 
     def __init__(

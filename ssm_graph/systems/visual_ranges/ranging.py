@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from ssm_graph.base.frozen import Array, ShortRepr
+from ssm_graph.base.frozen import Array
 from ssm_graph.systems.visual_ranges.bundle_ranges import BundleRanges
 from ssm_graph.systems.visual_ranges.range_fit import (
     Places,
@@ -67,7 +67,7 @@ class _Own(NamedTuple):
     """From then on its ranges fit no more, and are left out."""
 
 
-class Ranging(ShortRepr):
+class Ranging:
     """The ranges of a run."""
 
     def __init__(self, ranges: Ranges, lever_arm_m: Array, rules: StartRules | None = None) -> None:
