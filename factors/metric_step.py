@@ -102,7 +102,7 @@ def metric_step_factor(
     def evaluate(
         this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
     ) -> Array:
-        one, two = (values.atSimilarity3(key) for key in this.keys())
+        one, two = (values.atSimilarity3(key) for key in this)
         R_1, R_2 = one.rotation().matrix(), two.rotation().matrix()
         way = R_1.T @ (two.scale() * two.translation() - one.scale() * one.translation())
         if jacobians is not None:

@@ -1,7 +1,7 @@
 """Whole runs of camera and ranges: rendered worlds, and real images with simulated ranges.
 
-Real images are 7-Scenes kitchen and KITTI 07 of ``$SSM_GRAPH_DATA/systems``; the visual front end was
-chosen on these two, their ranges and anchors are new with every seed.
+Real images are 7-Scenes kitchen and KITTI 07 of ``$SSM_GRAPH_DATA/systems``; the visual front end
+was chosen on these two, their ranges and anchors are new with every seed.
 
 ``python -m benchmarks.systems.visual_runs --keep`` (some minutes a run on one core; a quick look is
 ``--cases room-small --runs 1 --duration 12``). Runs that are done are kept in the folder of
@@ -83,7 +83,9 @@ def main() -> None:
         "Camera and ranges: whole runs",
         __doc__,
         Option(
-            "--cases", [*CASES, *RECORDED], "cases; with -small at the end in a quarter of the pixels"
+            "--cases",
+            [*CASES, *RECORDED],
+            "cases; with -small at the end in a quarter of the pixels",
         ),
         Option("--runs", 5, "of each case"),
         Option("--first-seed", FIRST_FRESH, "the first seed"),

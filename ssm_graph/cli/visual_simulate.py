@@ -17,10 +17,13 @@ if TYPE_CHECKING:
     from ssm_graph.systems.visual_ranges.simulate import Run
 
 DESCRIPTION: Final = """\
-Render the images of a camera that is carried through a room or a corridor with repeating walls, or
-by a vehicle over a bottom in murky water with depth, dead reckoning and acoustic ranges once a second
-(images at 10 Hz; --range-rate-hz, --sigma-m, --rate-hz and --clock-s do not apply); simulate ranges to anchors with all their faults, and write both as a folder for ssm-graph visual:
+Render the images of a camera that is carried through a room or a corridor with repeating walls,
+simulate ranges to anchors with all their faults, and write both as a folder for ssm-graph visual:
 visual.toml, images, times.csv, ranges.csv, and the truth.
+
+In the world `bottom` a vehicle carries it over boulders in murky water, with depth, dead reckoning
+and two-way acoustic ranges once a second (sigma 0.1 m) by a sound speed that is 1 % off; images
+come at 10 Hz. The options of rates, sigma and clock are not for it.
 """
 
 
@@ -104,9 +107,7 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     return _written(arguments, asked, console, errors)
 
 
-def _written(
-    arguments: argparse.Namespace, asked: Run, console: Console, errors: Console
-) -> bool:
+def _written(arguments: argparse.Namespace, asked: Run, console: Console, errors: Console) -> bool:
     from ssm_graph.systems.visual_ranges.readers.own_folder import write_own_folder
     from ssm_graph.systems.visual_ranges.simulate import simulate
 

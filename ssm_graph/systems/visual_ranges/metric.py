@@ -94,9 +94,7 @@ class Metric:
             return float(np.exp(self.state.log_scale))
         return self.ranging.scale
 
-    def update(
-        self, frames: FramePoses, R_cw: Array, t_cw: Array, time_s: Array
-    ) -> list[str]:
+    def update(self, frames: FramePoses, R_cw: Array, t_cw: Array, time_s: Array) -> list[str]:
         """Take the poses as they stand, start or go on, and return what happened, in words.
 
         Parameters

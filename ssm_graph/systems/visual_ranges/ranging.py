@@ -25,8 +25,10 @@ from ssm_graph.systems.visual_ranges.range_fit import (
     unknowns_of,
 )
 from ssm_graph.systems.visual_ranges.range_rows import (
+    is_sharp,
     known_spacing,
     largest_turn,
+    lost_since,
     of_anchors,
     plain_errors,
 )
@@ -39,9 +41,9 @@ from ssm_graph.systems.visual_ranges.start import (
     StartState,
     find_start,
     later_anchor,
-    widened,
 )
 from ssm_graph.systems.visual_ranges.weights import NLOS_WEIGHT, POLISH, robust_rms
+from ssm_graph.systems.visual_ranges.widening import widened
 
 __all__ = ["Anchor", "AnchorState", "Ranging", "RangingResult"]
 
@@ -88,8 +90,7 @@ class Ranging:
         self.history: list[tuple[float, float, float]] = []
         self.started_s = float("nan")
         self.error, self.weight = np.full((2, len(ranges)), np.nan)
-        self.scale_prior: tuple[float, float] | None = None
-        """Mean and standard deviation of log s, where something else knows it"""
+        self.scale_prior: tuple[float, float] | None = None  # of log s, where something knows it
         self._tried = self._checked = 0
 
     @property
@@ -175,8 +176,7 @@ class Ranging:
     def adopt(self, extra: Array, covariance: Array, further: BundleRanges) -> None:
         """Take over what an adjustment with free scale and anchors found, (E,) and (E, E).
 
-        It takes vision for as good as its pixels; what a path may have drifted by is only in the
-        covariance from before, below which that of the scale does not fall.
+        It trusts pixels; what a path may drift by is in the covariance from before alone.
         """
         assert self.found is not None
         own = extra[2:].reshape(-1, 4)
@@ -195,9 +195,8 @@ class Ranging:
         found = self.found
         state = StartState.WAITING if self.start is None else self.start.state
         if found is not None and not self.is_refused:
-            states = [own.state for own in self.anchors]
-            is_sharp = all(s is not AnchorState.AMBIGUOUS for s in states)
-            state = StartState.READY if is_sharp else StartState.MIRROR
+            is_open = any(own.state is AnchorState.AMBIGUOUS for own in self.anchors)
+            state = StartState.MIRROR if is_open else StartState.READY
             if found.sigma_log_scale > self.rules.ready_sigma:
                 state = StartState.COARSE
         return RangingResult(
@@ -346,26 +345,24 @@ class Ranging:
 
     def _sharpened(self, at: Places, weight: Array, now: float) -> list[str]:
         """Judge the anchors anew: sharpness, and whether the last ranges fit."""
+        assert self.found is not None
         told = []
         for i, j in enumerate(self.used):
             own = self.anchors[j]
             recent = (at.anchor == i) & (at.time_s > now - RECENT_S)
-            is_sharp = not own.alternatives and self._is_sharp(i, at)
-            state = AnchorState.READY if is_sharp else AnchorState.AMBIGUOUS
+            sharp = not own.alternatives and is_sharp(self.found, self.rules, at, i)
+            state = AnchorState.READY if sharp else AnchorState.AMBIGUOUS
             lost_s = np.inf
             marked = weight[recent] < NLOS_WEIGHT
             if recent.sum() >= LEAST_RECENT and float(np.mean(marked)) > DOUBTFUL_SHARE:
-                state, lost_s = AnchorState.DOUBTFUL, min(own.lost_s, self._lost_since(j))
+                state, lost_s = (
+                    AnchorState.DOUBTFUL,
+                    min(own.lost_s, lost_since(self.ranges.time_s, self.anchor == j, self.weight)),
+                )
             if own.state is not state:
                 told.append(f"anchor {own.name}: {state.value}")
             self._set(j, state=state, lost_s=lost_s)
         return told
-
-    def _is_sharp(self, i: int, at: Places) -> bool:
-        assert self.found is not None
-        sigma = float(np.sqrt(np.trace(self.found.anchor_covariance(i))))
-        median = float(np.median(at.range_m[at.anchor == i]))
-        return sigma <= max(self.rules.anchor_sigma_m, self.rules.anchor_sigma_share * median)
 
     def _against_rivals(self, problem: Problem, i: int) -> None:
         """Try an anchor's other places, take the best, and keep those that are as good."""
@@ -408,12 +405,6 @@ class Ranging:
                 continue
             told.append(self._take(j, *placed, since))
         return told
-
-    def _lost_since(self, j: int) -> float:
-        """Return the time from which an anchor's ranges fit no more: most of them, none before."""
-        own = np.flatnonzero((self.anchor == j) & np.isfinite(self.weight))
-        over = (self.weight[own] < NLOS_WEIGHT) - 0.5
-        return float(self.ranges.time_s[own[int(np.argmax(np.cumsum(over[::-1])[::-1]))]])
 
     def _placed(self, own: Places) -> tuple[Array, float, Array] | None:
         """Return place, bias and covariance (4, 4) of an anchor, if its ranges tell them."""

@@ -142,7 +142,10 @@ def simulate(run: Run) -> Simulated:
 
 
 def under_water(
-    seed: int, duration_s: float = 60.0, *, vehicle: VehicleFaults | None = VehicleFaults()  # noqa: B008
+    seed: int,
+    duration_s: float = 60.0,
+    *,
+    vehicle: VehicleFaults | None = VehicleFaults(),  # noqa: B008
 ) -> Run:
     """Return a vehicle over the bottom: murky water, snow, acoustic ranges once a second.
 
@@ -287,7 +290,9 @@ def _snow(grey: Picture, flakes: int, rng: np.random.Generator) -> None:
     rows, columns = grey.shape
     for _ in range(flakes):
         row, column, radius = rng.integers(rows), rng.integers(columns), int(rng.integers(1, 4))
-        around = np.s_[max(row - radius, 0) : row + radius + 1, max(column - radius, 0) : column + radius + 1]
+        around = np.s_[
+            max(row - radius, 0) : row + radius + 1, max(column - radius, 0) : column + radius + 1
+        ]
         grey[around] = np.maximum(grey[around], rng.uniform(140.0, 230.0))
 
 

@@ -124,7 +124,10 @@ def _two_ways(
 
 
 def with_simulated_ranges(
-    sequence: Sequence, anchors: Array, seed: int, asked: RangeFaults = RangeFaults()  # noqa: B008
+    sequence: Sequence,
+    anchors: Array,
+    seed: int,
+    asked: RangeFaults = RangeFaults(),
 ) -> Sequence:
     """Return a real recording with ranges simulated along its true path, which replace its own.
 
@@ -146,9 +149,7 @@ def with_simulated_ranges(
 
     span = float(truth.time_s[0]), float(truth.time_s[-1])
     ranges, _, _ = simulated_ranges(asked, antenna, anchors, span, seed)
-    return replace(
-        sequence, ranges=ranges, anchor_truth_m=anchors, lever_arm_m=asked.lever_arm_m
-    )
+    return replace(sequence, ranges=ranges, anchor_truth_m=anchors, lever_arm_m=asked.lever_arm_m)
 
 
 def _bursts(time_s: Array, share: float, rng: np.random.Generator) -> NDArray[np.bool_]:

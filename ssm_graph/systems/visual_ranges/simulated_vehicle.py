@@ -1,7 +1,7 @@
 """Depth and dead reckoning of a simulated vehicle that carries the camera, with their errors.
 
-Nothing of it is shared with the estimator: increments of the true path in the camera's axes, wrong by
-scale and noise, are added up along an attitude that wanders.
+Nothing of it is shared with the estimator: increments of the true path in the camera's axes, wrong
+by scale and noise, are added up along an attitude that wanders.
 """
 
 from __future__ import annotations

@@ -27,10 +27,10 @@ from ssm_graph.systems.visual_ranges.range_fit import (
     problem_of,
     search,
     solution,
-    with_sigma,
 )
 from ssm_graph.systems.visual_ranges.ranges import Indices
-from ssm_graph.systems.visual_ranges.weights import NLOS_WEIGHT, RangeKernel, robust_rms
+from ssm_graph.systems.visual_ranges.weights import NLOS_WEIGHT, RangeKernel
+from ssm_graph.systems.visual_ranges.widening import widened
 
 DIRECTIONS: Final = 12
 SCALES: Final = 4
@@ -38,9 +38,6 @@ SCALES: Final = 4
 MOST_ROWS: Final = 250
 """Ranges of an anchor that the searches take, spread over all."""
 MOST_MINIMA: Final = 6
-WIDENINGS: Final = 8
-WIDER: Final = 1.1
-"""Mean square of the path's modes from which its drift is taken to be more than assumed."""
 HOPELESS: Final = 60.0
 """Deviance by which a minimum is so much worse than the best that it is left."""
 OPEN_SHAPES: Final = (Motion.PLANE, Motion.LINE, Motion.LINE_THROUGH_ANCHOR)
@@ -324,26 +321,6 @@ def _ends(problem: Problem, starts: list[Array]) -> list[Array]:
         if not same.any():
             kept.append(int(row))
     return list(fit.unknowns[kept])
-
-
-def widened(problem: Problem, best: Solution) -> Problem:
-    """Return the problem with sigmas that are not below what each anchor's residuals show.
-
-    Nor is the drift of the path below what its modes show: a map may be bent by more than images
-    tell, by a lens or a shutter that is not as assumed. That is the expectation maximisation of
-    their variance, from what was assumed upwards.
-    """
-    sigma = problem.places.sigma_m.copy()
-    for j in range(problem.n_anchors):
-        own = problem.places.anchor == j
-        sigma[own] = np.fmax(sigma[own], robust_rms(best.error[own]))
-    problem = with_sigma(problem, sigma)
-    for _ in range(WIDENINGS):
-        if best.drift_square < WIDER:
-            break
-        problem = replace(problem, drift=np.sqrt(best.drift_square) * problem.drift)
-        best = solution(problem, best.unknowns, is_near=True, rounds=15)
-    return problem
 
 
 def _is_apart(best: Solution, rival: Solution) -> bool:

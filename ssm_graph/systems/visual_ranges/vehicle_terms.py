@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from factors.metric_step import metric_step_residual
 from factors.similarity import LogKernel
-from factors.so3 import exp, skew
+from factors.so3 import skew
 from ssm_graph.base.frozen import Array, ReadOnlyArrays
 from ssm_graph.systems.visual_ranges.vehicle import DeadReckoning, Depths, Vehicle, inside
 
@@ -92,7 +92,11 @@ class VehicleTerms(ReadOnlyArrays):
 
     def on(self, pose_of: Indices) -> VehicleTerms:
         """Return what bears on some key frames alone, counted anew; ``pose_of`` (K,), -1: not."""
-        depth, vertical, step = pose_of[self.depth_of], pose_of[self.vertical_of], pose_of[self.step_of]
+        depth, vertical, step = (
+            pose_of[self.depth_of],
+            pose_of[self.vertical_of],
+            pose_of[self.step_of],
+        )
         d, v, b = depth >= 0, vertical >= 0, (step >= 0).all(axis=1)
         return replace(
             self,
@@ -147,7 +151,9 @@ class VehicleTerms(ReadOnlyArrays):
         by_extra = np.zeros((3 * len(i), N_EXTRA))
         by_extra[:, 0] = found.step_D_log_scale.ravel()
 
-        def whitened(error: Array, first: Array, second: Array, sigma: Array, e: Array) -> MetricRows:
+        def whitened(
+            error: Array, first: Array, second: Array, sigma: Array, e: Array
+        ) -> MetricRows:
             white = np.repeat(1.0 / sigma, 3)
             column = white[:, None]
             return MetricRows(
@@ -281,26 +287,25 @@ def metric_state(terms: VehicleTerms, R_cw: Array, t_cw: Array) -> MetricState |
 
 def _settled(terms: VehicleTerms, R_cw: Array, t_cw: Array, state: MetricState) -> MetricState:
     prior, variance = np.diag(FREE**-2.0), np.zeros(len(terms))
-    covariance, repeats = np.eye(N_EXTRA), 1.0
     for _ in range(ROUNDS):
         rows = terms.rows(R_cw, t_cw, state)
         J, weight = rows.by_extra, terms.weights(rows.error, variance)
         covariance = np.linalg.inv((J * weight[:, None]).T @ J + prior)
         variance = np.einsum("ma,ab,mb->m", J, covariance, J)
-        step = np.clip(-covariance @ (J.T @ (weight * rows.error)), -0.5, 0.5)
-        step[3] = float((-covariance @ (J.T @ (weight * rows.error)))[3])
+        step = -covariance @ (J.T @ (weight * rows.error))
+        step[:3] = np.clip(step[:3], -0.5, 0.5)
         state = state.moved(step)
-        # As a map drifts, scores of neighbouring key frames agree: batches of them tell by how much.
-        score = (J[:, 0] * weight * rows.error) * np.sqrt(covariance[0, 0])
-        repeats = _repeats(score, rows.first)
+        # As a map drifts, neighbouring key frames pull the same way: batches tell by how much.
+        pull = J[:, 0] * weight * rows.error * np.sqrt(covariance[0, 0])
         if float(np.max(np.abs(step) / np.sqrt(covariance.diagonal()))) < 1e-3:
             break
+    repeats = _repeats(pull, rows.first)
     return replace(state, covariance=covariance * repeats)
 
 
-def _repeats(score: Array, frame: Indices) -> float:
-    """Return the variance of the scores' sum by eight batches over the one of independent ones."""
-    if not len(score) or frame.max() < 32:
+def _repeats(pull: Array, frame: Indices) -> float:
+    """Return the variance of the sum of all pulls, by eight batches, over that expected."""
+    if not len(pull) or frame.max() < 32:
         return 1.0
-    batch = np.bincount(frame * 8 // (int(frame.max()) + 1), score, minlength=8)
+    batch = np.bincount(frame * 8 // (int(frame.max()) + 1), pull, minlength=8)
     return max(float(batch @ batch), 1.0)

@@ -1,6 +1,4 @@
-"""Worlds of textured walls: a room with a pillar, a ring of corridors whose walls repeat, and a
-bottom under water with boulders.
-"""
+"""Worlds of textured walls: a room, a ring of corridors that repeat, a bottom under water."""
 
 from __future__ import annotations
 
@@ -201,7 +199,10 @@ def bottom(seed: int, *, texel_m: float = 0.012) -> World:
     for _ in range(BOULDERS):
         low = np.array([*(rng.uniform(-0.85, 0.85, 2) * half[:2]), 0.0])
         size = np.array([*rng.uniform(0.5, 1.6, 2), rng.uniform(0.25, 1.2)])
-        faces += [*_box(low, low + size, inwards=False)[:4], _box(low, low + size, inwards=False)[5]]
+        faces += [
+            *_box(low, low + size, inwards=False)[:4],
+            _box(low, low + size, inwards=False)[5],
+        ]
     walls = [_wall(*face, number) for number, face in enumerate(faces)]
     pictures = [levels(picture(wall.size_m, texel_m, rng)) for wall in walls]
     return World((*walls,), (*pictures,), texel_m, (*walls[1:],))

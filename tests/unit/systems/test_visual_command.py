@@ -13,9 +13,9 @@ from ssm_graph.cli.main import main
 from ssm_graph.systems.visual_ranges.accuracy import accuracy
 from ssm_graph.systems.visual_ranges.camera import Camera
 from ssm_graph.systems.visual_ranges.outputs import told_events, write_outputs
+from ssm_graph.systems.visual_ranges.path_file import PathAsItComes
 from ssm_graph.systems.visual_ranges.ranges import screened_ranges
 from ssm_graph.systems.visual_ranges.ranging import Anchor, AnchorState, RangingResult
-from ssm_graph.systems.visual_ranges.path_file import PathAsItComes
 from ssm_graph.systems.visual_ranges.result import FrameNow, FrameState, MapSnapshot, VisualResult
 from ssm_graph.systems.visual_ranges.sequence import PathTruth, Sequence
 from ssm_graph.systems.visual_ranges.similarity3 import Sim3
@@ -149,9 +149,7 @@ def test_files_of_an_answer(tmp_path: Path) -> None:
     assert summary["against_truth"]["anchor_error_m"] == [pytest.approx(0.3)]
 
 
-def test_the_path_is_in_its_file_at_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_path_is_in_its_file_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A run that is killed leaves what it had; a full disc ends the file, not the run."""
     turn = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     with PathAsItComes(tmp_path / "new") as path:

@@ -18,6 +18,7 @@ from ssm_graph.systems.visual_ranges.bundle_metric import BundleMetric
 from ssm_graph.systems.visual_ranges.metric import Metric
 from ssm_graph.systems.visual_ranges.range_terms import FramePoses
 from ssm_graph.systems.visual_ranges.ranges import at_the_anchor, screened_ranges
+from ssm_graph.systems.visual_ranges.readers.options import ReadOptions
 from ssm_graph.systems.visual_ranges.readers.own_folder import read_own_folder, write_own_folder
 from ssm_graph.systems.visual_ranges.simulate import (
     SMALL_CAMERA,
@@ -49,7 +50,7 @@ def path_of(seed: int, n: int = 80, step_s: float = 0.5) -> tuple[Array, Array, 
 
 def map_of(seed: int, n: int = 80) -> tuple[Array, Array, Array, Vehicle]:
     """Return times, world to camera poses of a perfect map, and what the vehicle measures."""
-    time, R_wc, p_w, centre = path_of(seed, n)
+    time, R_wc, _p_w, centre = path_of(seed, n)
     R_cw = np.swapaxes(R_wc, 1, 2) @ R_wc[0]
     t_cw = -np.einsum("kij,kj->ki", R_cw, centre)
     faults = VehicleFaults(scale_share=1e-9)
@@ -66,6 +67,7 @@ def moved(R: Array, t: Array, xi: Array) -> tuple[Array, Array]:
 
 
 def test_rows_have_the_jacobians_of_their_differences() -> None:
+    """By both poses, scale, vertical and depth of the origin."""
     time, R, t, own = map_of(2, 6)
     terms = hung(own, time)
     assert (len(terms.depth_of), len(terms.vertical_of), len(terms.step_of)) == (6, 6, 5)
@@ -95,6 +97,7 @@ def test_rows_have_the_jacobians_of_their_differences() -> None:
 
 
 def test_a_step_of_a_graph_of_similarities_has_the_jacobian_of_its_difference() -> None:
+    """By turn, step and scale of both nodes."""
     rng, h = np.random.default_rng(3), 1e-6
     turn, shift = exp(rng.standard_normal((2, 3))), rng.standard_normal((2, 3))
     nodes = [gtsam.Similarity3(gtsam.Rot3(turn[i]), shift[i], 0.8 + 0.5 * i) for i in (0, 1)]
@@ -118,6 +121,7 @@ def test_a_step_of_a_graph_of_similarities_has_the_jacobian_of_its_difference() 
 
 @pytest.mark.parametrize("which", ["both", "depth", "dead reckoning"])
 def test_the_vehicle_tells_scale_and_vertical_without_any_range(which: str) -> None:
+    """Within 4 sigma, and sharp: by steps to half a per cent, by depth to two."""
     for seed in (1, 2, 3):
         time, R, t, own = map_of(seed, 120)
         kept = replace(
@@ -135,17 +139,28 @@ def test_the_vehicle_tells_scale_and_vertical_without_any_range(which: str) -> N
 
 
 def test_depths_along_a_level_path_tell_nothing() -> None:
+    """And the sigma says so."""
     time, R, t, own = map_of(1, 60)
     assert own.depths is not None
     centre = -np.einsum("kji,kj->ki", R, t)
     up = path_of(1)[1][0][2]
     flat = centre - np.outer(centre @ up, up)
-    level = replace(own, dead_reckoning=None, depths=replace(own.depths, depth_m=0 * own.depths.time_s + 3.0 + 0.03 * np.random.default_rng(1).standard_normal(len(own.depths.time_s))))
+    level = replace(
+        own,
+        dead_reckoning=None,
+        depths=replace(
+            own.depths,
+            depth_m=0 * own.depths.time_s
+            + 3.0
+            + 0.03 * np.random.default_rng(1).standard_normal(len(own.depths.time_s)),
+        ),
+    )
     found = metric_state(hung(level, time), R, -np.einsum("kij,kj->ki", R, flat))
     assert found is None or np.sqrt(found.covariance[0, 0]) > 0.04
 
 
 def test_gross_steps_lose_their_weight_and_do_not_bend_the_scale() -> None:
+    """Ten steps without bottom lock, twice too long."""
     time, R, t, own = map_of(4, 120)
     terms = hung(own, time)
     step = terms.step_m.copy()
@@ -178,7 +193,12 @@ def test_dead_reckoning_holds_the_scale_of_an_adjustment() -> None:
     views = sorted_views(np.array(pose), point_at, np.array(xy), scale, len(used))
     shrunk = 1.0 - 0.02 * np.arange(12)
     bent = centre[0] + np.cumsum(np.diff(centre, axis=0, prepend=centre[:1]) * shrunk[:, None], 0)
-    state = MetricState(float(np.log(UNIT_M)), -path_of(5)[1][0][2], float(own.depths.depth_m[0]) if own.depths else 0.0, np.eye(4))
+    state = MetricState(
+        float(np.log(UNIT_M)),
+        -path_of(5)[1][0][2],
+        float(own.depths.depth_m[0]) if own.depths else 0.0,
+        np.eye(4),
+    )
     terms = BundleMetric(None, hung(own, time), state, 1e-3)
     start = -np.einsum("kij,kj->ki", R, bent)
     free = np.arange(12) > 0
@@ -244,14 +264,17 @@ def test_two_way_ranges_are_those_of_the_middle_of_both_legs() -> None:
 
 
 def test_a_run_under_water_is_written_and_read_as_it_is(tmp_path: Path) -> None:
+    """Depth, dead reckoning and how well the sound speed is known; two-way ranges are moved."""
     asked = replace(under_water(3, 1.0), camera=SMALL_CAMERA, texel_m=0.1, n_anchors=2)
     sequence = simulate(asked).sequence
     sequence = replace(sequence, time_s=sequence.time_s[:3])
     assert len([*write_own_folder(tmp_path, sequence)]) == 3
-    back = read_own_folder(tmp_path, _options())
+    back = read_own_folder(tmp_path, ReadOptions())
     one, two = sequence.vehicle, back.vehicle
-    assert one.depths is not None and two.depths is not None
-    assert one.dead_reckoning is not None and two.dead_reckoning is not None
+    assert one.depths is not None
+    assert two.depths is not None
+    assert one.dead_reckoning is not None
+    assert two.dead_reckoning is not None
     np.testing.assert_allclose(two.depths.depth_m, one.depths.depth_m, atol=1e-8)
     for name in ("position_m", "step_m", "turn_rad", "tilt_rad", "scale_share"):
         wanted = getattr(one.dead_reckoning, name)
@@ -264,21 +287,16 @@ def test_a_run_under_water_is_written_and_read_as_it_is(tmp_path: Path) -> None:
     toml = tmp_path / "visual.toml"
     text = toml.read_text()
     toml.write_text(text.replace("[ranges]\n", '[ranges]\ntravel = "two-way"\n'))
-    shifted = read_own_folder(tmp_path, _options()).ranges
+    shifted = read_own_folder(tmp_path, ReadOptions()).ranges
     early = back.ranges.time_s - back.ranges.range_m / 1500.0
     np.testing.assert_allclose(shifted.time_s, np.sort(early), atol=1e-9)
     toml.write_text(text.replace("[ranges]\n", '[ranges]\ntravel = "both"\n'))
     with pytest.raises(ConfigError, match="two-way"):
-        read_own_folder(tmp_path, _options())
-
-
-def _options():  # noqa: ANN202
-    from ssm_graph.systems.visual_ranges.readers.options import ReadOptions
-
-    return ReadOptions()
+        read_own_folder(tmp_path, ReadOptions())
 
 
 def test_nothing_measured_gives_no_terms() -> None:
+    """A camera in the hand."""
     terms = hung(Vehicle(), np.arange(5.0))
     assert isinstance(terms, VehicleTerms)
     assert len(terms) == 0
