@@ -138,7 +138,7 @@ def _noise(cells: Sequence[str], order: Sequence[tuple[int, int]], is_cov: bool)
     for (i, j), value in zip(order, _numbers(cells, len(order)), strict=True):
         matrix[i, j] = matrix[j, i] = value
     np.linalg.cholesky(matrix)
-    return matrix if is_cov else np.linalg.inv(matrix)
+    return np.asarray(matrix if is_cov else np.linalg.inv(matrix))
 
 
 def _polar(xy: Array, cov: Array) -> tuple[Array, Array]:

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import gtsam
 import numpy as np
@@ -225,7 +225,7 @@ class IncrementalSmoother:
         self,
         factors: gtsam.NonlinearFactorGraph,
         values: gtsam.Values,
-        stamps: dict[int, float],
+        stamps: dict[Any, float],
         added: list[int],
         removed: list[int],
     ) -> None:
