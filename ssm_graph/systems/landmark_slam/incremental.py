@@ -114,8 +114,8 @@ class IncrementalSmoother:
         seen_whole = np.zeros(L, dtype=bool)
         seen_whole[graph.seen[self._dim[E:] == 2, 1]] = True
         self._places = self.landmarks if seen_whole.all() else _far_places(graph)
-        if lag < FOREVER_S or not seen_whole.all():  # what is marginalised, or far, has few digits
-            parameters.setFactorization("QR")
+        # By QR: what is marginalised, far, or rigid has too few digits for Cholesky.
+        parameters.setFactorization("QR")
         self._solver = gtsam.IncrementalFixedLagSmoother(lag, parameters)
         self._waiting: dict[int, list[int]] = {}
         self._first, self._count = 0, 0
