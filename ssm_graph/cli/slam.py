@@ -98,8 +98,9 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
 def asked_of(arguments: argparse.Namespace) -> Asked:
     """Return what the options ask for."""
     from ssm_graph.systems.landmark_slam.association import Association
+    from ssm_graph.systems.landmark_slam.incremental import LAG_S
     from ssm_graph.systems.landmark_slam.methods import FILTERS, INCREMENTAL, check_method
-    from ssm_graph.systems.landmark_slam.solve import LAG_S, Asked
+    from ssm_graph.systems.landmark_slam.solve import Asked
 
     method = check_method(arguments.method)
     if method not in (*FILTERS, *INCREMENTAL, "smoother"):

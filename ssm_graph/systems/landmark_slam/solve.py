@@ -252,7 +252,7 @@ def _solved(
     errors: AssociationErrors | None = None,
     notes: tuple[str, ...] = (),
 ) -> Solved:
-    known = np.isfinite(truth[:, :2]).all(axis=1)
+    known = np.asarray(np.isfinite(truth[:, :2]).all(axis=1))
     score = score_of(truth, known, answer) if known.any() else None
     return Solved(asked, problem, answer, truth, score, sigmas, errors, notes)
 
