@@ -20,6 +20,10 @@ what it reads (gravity, turn rate, beams with a speed, ranges); what is odd; clo
 that the data contradict; and whether it can be smoothed, or what is missing.
 
 PATH is a mission folder, a ROS bag, a maker's log, an instrument's own output, or a table.
+
+examples:
+  ssm-graph inspect dive.bag --figure dive.png
+  ssm-graph inspect logs --draft-map map.toml        # a folder of tables of any columns
 """
 
 

@@ -61,7 +61,7 @@ def add_mission_output(parser: argparse.ArgumentParser) -> None:
     table_format_option(parser)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="mission folder")
     parser.add_argument(
-        "--overwrite", action="store_true", help="write also where files are, over those"
+        "--overwrite", action="store_true", help="write over files that are there"
     )
 
 
