@@ -165,7 +165,7 @@ class _ForwardPass:
         here = States.of(*(column[None] for column in self._state))
         if self.extras:
             here = here._replace(walks=self.extras.walks[None], constants=self.extras.constants)
-        ahead = self.inertial.predict(interval, here, g_n=self._g_n)
+        ahead = self.inertial.predict(interval, here, g_n=self._g_n[None])
         self.P = ahead.covariance(self.P)
         if self.extras:
             self.extras.keep(ahead.states.walks[0], self.extras.constants)

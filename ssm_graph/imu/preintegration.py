@@ -17,6 +17,7 @@ from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array, Vector
 from ssm_graph.base.progress import told
 from ssm_graph.base.stepwise import Steps, at_once, finished
+from ssm_graph.base.times import usual_interval
 from ssm_graph.imu.increments import MergedSamples, merge_samples_steps
 from ssm_graph.sensors.imu import FrozenAxis, ImuLog, ImuNoise, frozen_axes
 
@@ -313,7 +314,7 @@ def imu_gaps(imu: ImuLog) -> tuple[Array, Array]:
     """Return begin and end of every gap: an interval far longer than the usual one, s."""
     edges = np.concatenate([[imu.start_s], imu.time_s])
     spacing = np.diff(edges)
-    is_gap = spacing > max(0.1, 5.0 * float(np.median(spacing)))
+    is_gap = spacing > max(0.1, 5.0 * usual_interval(edges))
     return edges[:-1][is_gap], edges[1:][is_gap]
 
 
