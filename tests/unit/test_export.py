@@ -122,13 +122,13 @@ def test_ape_of_evo_is_our_error(tmp_path: Path) -> None:
     theirs = ape.get_statistic(metrics.StatisticsType.rmse)
     of_tracks = ("time_s", "lat", "lon", "height", "velocity_enu", "roll_pitch_heading")
     zeros = np.zeros((N, 3))
-    found = evaluate(
-        Trajectory(
-            *(getattr(moved, name) for name in of_tracks),
-            *(zeros, zeros, np.tile(np.eye(3), (N, 1, 1)), zeros, zeros, k),
-        ),
-        Reference(*(getattr(truth, name) for name in of_tracks)),
-    )
+    columns = {name: getattr(moved, name) for name in of_tracks}
+    zeros = np.zeros((N, 3))
+    unknown = ("gyro_bias", "accel_bias", "velocity_sigma_enu", "attitude_sigma")
+    cov = np.tile(np.eye(3), (N, 1, 1))
+    columns |= {**dict.fromkeys(unknown, zeros), "position_cov_enu": cov, "n_beams": zeros[:, 0]}
+    reference = Reference(**{name: getattr(truth, name) for name in of_tracks})
+    found = evaluate(Trajectory(**columns), reference)
     ours = math.hypot(found.rmse_horizontal_m, found.rmse_vertical_m)
     assert theirs == pytest.approx(ours, rel=1e-4)
     assert ours > 0.2
