@@ -165,7 +165,7 @@ class Guardian:
         self, arrays: Mapping[str, Array], known: Sequence[Mapping[str, Any]], window: Window
     ) -> Guard:
         """Return the guard that was packed; one that begins where there is none."""
-        if "levels" not in arrays or len(arrays["begun_s"]) != len(self.bank.suspect):
+        if "jump_score" not in arrays or len(arrays["begun_s"]) != len(self.bank.suspect):
             return self.begin(window, known)
         contradictions = unpack_contradictions(known, self.bank.suspects)
         levels = arrays["levels"]

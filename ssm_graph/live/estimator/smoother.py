@@ -300,6 +300,7 @@ class FixedLagSmoother:
         assert self._frame is not None
         newest, noise = step.window.newest, self.vehicle.imu_noise
         keyframe, covariance = step.window.keyframes[-1], newest.covariance[0]
+        covariance = covariance + step.guard.lanes.jumps.unexcluded(len(covariance))
         sensors = step.window.sensors
         tail = Tail(keyframe, newest.states, covariance, noise=noise, sensors=sensors)
         buffers, imu = self._intake.buffers, self._intake.buffers.imu
