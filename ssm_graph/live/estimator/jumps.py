@@ -30,7 +30,8 @@ JUMP: Final = math.radians(0.1)
 find it within seconds."""
 PER_H: Final = 0.5
 """Jumps of an axis, as many as there may be false suspicions of all sensors in an hour: far above
-what sound gyros do, so that sigmas cover one before it is certain."""
+what sound gyros do, so that sigmas cover one before it is certain. Hence only what the data add to
+these odds counts: a jump that they say nothing of adds nothing."""
 MOST: Final = 500.0
 """Logarithm of the largest odds."""
 AXES: Final = 3
@@ -99,8 +100,7 @@ class Jumps(NamedTuple):
         """Return the covariance (n, n) that they add to that of the first components."""
         variance = 1.0 / (self.information + JUMP**-2)
         size = variance * self.score
-        odds = PER_H / 3600.0 * SPACING_S * np.exp(np.minimum(0.5 * size * self.score, MOST))
-        odds[np.repeat(np.isnan(self.begun_s), AXES)] = 0.0
+        odds = PER_H / 3600.0 * SPACING_S * np.expm1(np.minimum(0.5 * size * self.score, MOST))
         share = odds / (1.0 + odds.sum())
         moved = self.moved[:, :n] * np.sqrt(share * (size**2 + variance))[:, None]
         return np.asarray(moved.T @ moved)
