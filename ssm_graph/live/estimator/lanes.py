@@ -126,7 +126,8 @@ class Lanes(NamedTuple):
     @classmethod
     def unpack(cls, arrays: Mapping[str, Array]) -> Lanes:
         """Return the lanes that were packed."""
-        return cls(*(arrays[name] for name in cls._fields[:-1]), Jumps.unpack(arrays))
+        own: dict[str, Any] = {name: arrays[name] for name in cls._fields[:-1]}
+        return cls(**own, jumps=Jumps.unpack(arrays))
 
     def with_copy(self, into: int, of: int) -> Lanes:
         """Return the lanes with one of them as another one is."""
@@ -383,7 +384,9 @@ class LaneBank:
         deviation[which], covariance[which] = deviation[MEASURE], covariance[MEASURE]
         forget, own = np.flatnonzero(which & self._forgets), np.arange(*GYRO_BIAS.indices(self._n))
         covariance[np.ix_(forget, own, own)] += JUMP**2 * np.eye(len(own))
-        counts = {name: np.where(which, 0.0, getattr(lanes, name)) for name in _COUNTS}
+        counts: dict[str, Any] = {
+            name: np.where(which, 0.0, getattr(lanes, name)) for name in _COUNTS
+        }
         counts["n_out"][forget] = 1.0
         return lanes._replace(
             deviation=deviation,
