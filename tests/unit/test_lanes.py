@@ -285,15 +285,15 @@ def test_the_threshold_keeps_the_rate_that_was_asked_for() -> None:
             IntegrityConfig(**wrong)
 
 
-LIE_S = 100.0
+LIE_S = 180.0
 
 
 @cache
 def until_the_lie(
     grade: Grade,
 ) -> tuple[SimulatedMission, list[Look], tuple[dict[str, Array], dict[str, Any]]]:
-    """Return a mission, what is said of it before the lie, and the checkpoint then."""
-    sim = survey(grade, 100, duration_s=220.0)
+    """Return five minutes, what is said of the three before the lie, and the checkpoint then."""
+    sim = survey(grade, 100, duration_s=300.0)
     found, smoother = looks(sim.mission, sim, end_s=LIE_S)
     smoother.take_delayed()
     return sim, found, smoother.checkpoint()
