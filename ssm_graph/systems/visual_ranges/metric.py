@@ -151,9 +151,10 @@ class Metric:
         if isinstance(further, BundleMetric):
             assert self.state is not None
             own, ranges = further.n_ranges, further.ranges
-            self.state = replace(
-                further.state.moved(extra[own:]), covariance=covariance[own:, own:].copy()
-            )
+            found = covariance[own:, own:]
+            # As for ranges: no sharper than the path allowed before.
+            wider = max(1.0, float(self.state.covariance[0, 0] / found[0, 0]))
+            self.state = replace(further.state.moved(extra[own:]), covariance=wider * found)
             extra, covariance = extra[:own], covariance[:own, :own]
         if isinstance(ranges, BundleRanges):
             self.ranging.adopt(extra, covariance, ranges)
