@@ -27,7 +27,9 @@ INTRO = """\
 
 What somebody or something does with files at the doors of the command line, and to files of a live
 run or of a study, what is said about it, and what it costs. Beside it:
-[malformed missions](malformed-input.md), [faults of instruments, sockets and processes](../benchmarks/results/faults.md), [damaged bytes](../benchmarks/results/fuzz.md).
+[malformed missions](malformed-input.md),
+[faults of instruments, sockets and processes](../benchmarks/results/faults.md),
+[damaged bytes](../benchmarks/results/fuzz.md).
 
 This page is made by `python -m tests.make_attacks_table`; the same attacks are in
 `tests/unit/test_doors.py`, `test_run_files.py`, `test_study_damage.py`, `test_cli_terminal.py` and
