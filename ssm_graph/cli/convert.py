@@ -24,7 +24,7 @@ from ssm_graph.io.ardupilot.convert import (
 from ssm_graph.io.blueye.convert import convert_blueye
 from ssm_graph.io.columns.convert import convert_columns
 from ssm_graph.io.columns.map_file import read_map
-from ssm_graph.io.file_kind import is_mcap, kind_of
+from ssm_graph.io.file_kind import check_is_file, is_mcap, kind_of
 from ssm_graph.io.mission_folder.folder import write_mission
 from ssm_graph.io.mission_folder.vehicle import instrument_notes, read_vehicle
 from ssm_graph.io.results.place import check_is_free
@@ -150,6 +150,7 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     write = partial(_write, arguments=arguments, console=console, errors=errors)
     check_is_free(arguments.out, may_overwrite=arguments.overwrite)
     for log in arguments.log:
+        check_is_file(log)
         if log.exists() and arguments.out.resolve() == log.resolve():
             raise ConfigError(f"--out: expected another folder than that of LOG: {arguments.out}")
     if arguments.map is not None:

@@ -15,6 +15,7 @@ from rich.text import Text
 
 from ssm_graph.base.times import UNIX_FROM_S, UNIX_UNTIL_S
 from ssm_graph.cli.terminal import say
+from ssm_graph.io.file_kind import check_is_file
 
 DESCRIPTION = """\
 Say what is at a path, by its content: format; of every sensor rows, rate, jitter, gaps, repeats and
@@ -48,6 +49,7 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     """Look, tell, and draw."""
     from ssm_graph.inspection.look import inspect_path
 
+    check_is_file(arguments.path)
     found = inspect_path(arguments.path)
     if arguments.draft_map is not None:
         _draft(arguments.path, arguments.draft_map, errors)

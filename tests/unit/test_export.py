@@ -65,7 +65,12 @@ def results(*, lon_deg: float = 7.0, begin_s: float = 0.0) -> Results:
 @pytest.fixture
 def result_folder(tmp_path: Path) -> Path:
     """Return that result as a folder."""
-    folder, of = tmp_path / "result", results()
+    return write_result(tmp_path / "result")
+
+
+def write_result(folder: Path) -> Path:
+    """Write that result; return its folder."""
+    of = results()
     folder.mkdir()
     filler = np.zeros(N)
     columns = {name: (of.trajectory.get(name, filler), "%.17g") for name in TRAJECTORY_COLUMNS}
