@@ -28,7 +28,9 @@ def read_geotiff(path: Path) -> Raster:
             tags: Any = getattr(image, "tag_v2", {})
             values = np.array(image, dtype=np.float64)
     except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
-        raise DataError(f"{path.name}: expected a TIFF of one band of numbers, got {error}") from error
+        raise DataError(
+            f"{path.name}: expected a TIFF of one band of numbers, got {error}"
+        ) from error
     if values.ndim != 2:
         raise DataError(
             f"{path.name}: expected one band of heights, got {values.shape[-1]}, which is a picture"
@@ -40,7 +42,9 @@ def read_geotiff(path: Path) -> Raster:
     keys = _keys(tags)
     middle = 0.0 if keys.get(_RASTER) == _PIXEL_IS_POINT else 0.5
     n_y, n_x = values.shape
-    code = next((keys[k] for k in (_PROJECTED, _GEOGRAPHIC) if 0 < keys.get(k, 0) < _USER_DEFINED), 0)
+    code = next(
+        (keys[k] for k in (_PROJECTED, _GEOGRAPHIC) if 0 < keys.get(k, 0) < _USER_DEFINED), 0
+    )
     return Raster(
         path.name,
         f"EPSG:{code}" if code else "",
@@ -59,7 +63,9 @@ def _place(tags: Any, path: Path) -> tuple[float, float, float, float]:
         m = tags[_MATRIX]
         if m[1] == 0.0 and m[4] == 0.0:
             return m[0], -m[5], m[3], m[7]
-        raise DataError(f"{path.name}: the raster is turned; warp it to the north first, by gdalwarp")
+        raise DataError(
+            f"{path.name}: the raster is turned; warp it to the north first, by gdalwarp"
+        )
     raise DataError(
         f"{path.name}: the TIFF does not say where it is (no GeoTIFF tags); expected a GeoTIFF, as "
         "gdal_translate -of GTiff  writes"

@@ -69,7 +69,9 @@ def seabed(
     side = (np.arange(n) - 0.5 * (n - 1)) * settings.cell_m
     plane = side[None, :] * settings.slope[0] + side[:, None] * settings.slope[1]
     height = -settings.depth_m - plane + rough - rough.mean()
-    return SeabedGrid("seabed", frame, middle[0] + side[0], middle[1] + side[0], settings.cell_m, height)
+    return SeabedGrid(
+        "seabed", frame, middle[0] + side[0], middle[1] + side[0], settings.cell_m, height
+    )
 
 
 def surveyed(
@@ -87,14 +89,18 @@ def surveyed(
     rows = (y - truth.y0_m) / truth.cell_m
     columns = (x - truth.x0_m) / truth.cell_m
     height = map_coordinates(truth.height, np.meshgrid(rows, columns, indexing="ij"), order=1)
-    exact = replace(truth, x0_m=float(x[0]), y0_m=float(y[0]), cell_m=settings.cell_m, height=height)
+    exact = replace(
+        truth, x0_m=float(x[0]), y0_m=float(y[0]), cell_m=settings.cell_m, height=height
+    )
     at_x, at_y = rng.uniform(x[2], x[-3], 4000), rng.uniform(y[2], y[-3], 4000)
     between = exact.surface_at(at_x, at_y).height - truth.height_at(at_x, at_y)
     height = height + e.sigma_m * rng.standard_normal(height.shape)
     height += e.bias_sigma_m * rng.standard_normal()
     if e.smooth_sigma_m > 0.0:
         # White noise under a Gaussian of width w is alike as exp(-d^2 / 4 w^2): 1/e at 2 w.
-        smooth = gaussian_filter(rng.standard_normal(height.shape), 0.5 * e.smooth_m / settings.cell_m)
+        smooth = gaussian_filter(
+            rng.standard_normal(height.shape), 0.5 * e.smooth_m / settings.cell_m
+        )
         height += e.smooth_sigma_m / smooth.std() * smooth
     stated = replace(e, sigma_m=float(np.hypot(e.sigma_m, between.std())))
     return replace(exact, name="map", height=height), stated
