@@ -53,9 +53,8 @@ def main() -> None:
         for name in ("with", "without")
     ]
     lines = [
-        f"Dives of 10 minutes at 1.5 m/s and 40 m, ground at 80 m, DVL of {1.0 / PING_S:g} Hz, 2 % of its "
-        "ranges "
-        "gross; the stated start is off by up to 300 m. "
+        f"Dives of 10 minutes at 1.5 m/s and 40 m, ground at 80 m, DVL of {1.0 / PING_S:g} Hz, 2 % "
+        "of its ranges gross; the stated start is off by up to 300 m. "
         f"Seeds from {FIRST_HELD_OUT} on; settings "
         "were chosen on seeds below 100 only. Rates with exact 95 % intervals. *Within 3 sigma*: "
         "declared, and within the ellipse that leaves out 0.27 %; *wrong*: declared and outside "

@@ -270,9 +270,7 @@ LOST_M = 100.0
 """Less well known than this, a start is on no slope of a seabed that could lead it anywhere."""
 
 
-def _without_lost_map(
-    mission: Mission, start: InitialState
-) -> tuple[Mission, tuple[str, ...]]:
+def _without_lost_map(mission: Mission, start: InitialState) -> tuple[Mission, tuple[str, ...]]:
     """Return the mission without a map on which its place has yet to be found, and a note."""
     log = mission.aids.get(TerrainLog)
     if log is None:

@@ -87,7 +87,9 @@ def test_rows_of_the_aid() -> None:
 
     found = aid.measured(at(np.zeros(19)))
     steps = STEP * np.eye(19)
-    numeric = [(aid.measured(at(d)).error - aid.measured(at(-d)).error) / (2.0 * STEP) for d in steps]
+    numeric = [
+        (aid.measured(at(d)).error - aid.measured(at(-d)).error) / (2.0 * STEP) for d in steps
+    ]
     np.testing.assert_allclose(found.jacobian, np.stack(numeric, axis=-1), atol=2e-5)
     # The end of the second beam of the second ping, above the map there, less what the map is off.
     end_n = beam_ends(R_NB, P_N, end_b=log.lever_arm_b + 58.0 * BEAMS_B[1])

@@ -118,7 +118,7 @@ def write_utm(path: Path) -> None:
     ],
 )
 def test_heights_of_every_format(name: str, write, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
-    """Within 2 cm at places between the cells, above the ellipsoid, the datum taken into account."""
+    """Within 2 cm between the cells, above the ellipsoid, the datum taken into account."""
     write(tmp_path / name)
     grid = read_seabed(tmp_path / name, FRAME, datum_m=20.0)
     rng = np.random.default_rng(1)

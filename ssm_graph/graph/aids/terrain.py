@@ -42,7 +42,7 @@ class TerrainRanges(Aid):
     cell_factor: Array
     """(M,) by how much the variance of a cell counts more: several pings meet the same one"""
     apart: Array
-    """(M, B - 1) how the beam's own part of what is off follows from that of all beams' differences"""
+    """(M, B - 1) what of the beams' differences is each one's own part of what the map is off by"""
     sigma: Array
     """(M,) m, of the height, where the states last were"""
     grid: SeabedGrid
@@ -105,9 +105,7 @@ class TerrainRanges(Aid):
         """Refuse times that do not increase, and a geometry that is not finite."""
         log = aids.get(TerrainLog)
         if log is not None:
-            require_fields(
-                "aids.map", log, increasing="time_s", finite="beams_b lever_arm_b way_m"
-            )
+            require_fields("aids.map", log, increasing="time_s", finite="beams_b lever_arm_b way_m")
 
     @property
     def root_information(self) -> Array:
@@ -129,9 +127,7 @@ class TerrainRanges(Aid):
 
     def measured(self, at: RowStates) -> Linearised:
         """Linearise ranges: one component each; one that ends off the map says nothing."""
-        above, grows, known = above_seabed(
-            self.grid, beam_ends(at.R_nb, at.p_n, end_b=self.end_b)
-        )
+        above, grows, known = above_seabed(self.grid, beam_ends(at.R_nb, at.p_n, end_b=self.end_b))
         found = at.value(MAP_APART, self.apart.shape[-1])
         bias = at.value(MAP_BIAS, 1) + at.value(MAP_SMOOTH, 1)
         residual = terrain_residual(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,13 +23,20 @@ def read_geotiff(path: Path) -> Raster:
     """Read the first band; raise :class:`DataError` for one that has no place."""
     from PIL import Image, UnidentifiedImageError
 
-    Image.MAX_IMAGE_PIXELS = None
     try:
-        with Image.open(path) as image:
+        with warnings.catch_warnings(), Image.open(path) as image:
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             tags: Any = getattr(image, "tag_v2", {})
             values = np.array(image, dtype=np.float64)
+    except Image.DecompressionBombError as error:
+        raise DataError(
+            f"{path.name}: expected a map of at most 179 million cells, got more; cut out the "
+            "mission's place, with  gdalwarp -te"
+        ) from error
     except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
-        raise DataError(f"{path.name}: expected a TIFF of one band of numbers, got {error}") from error
+        raise DataError(
+            f"{path.name}: expected a TIFF of one band of numbers, got {error}"
+        ) from error
     if values.ndim != 2:
         raise DataError(
             f"{path.name}: expected one band of heights, got {values.shape[-1]}, which is a picture"
@@ -40,7 +48,9 @@ def read_geotiff(path: Path) -> Raster:
     keys = _keys(tags)
     middle = 0.0 if keys.get(_RASTER) == _PIXEL_IS_POINT else 0.5
     n_y, n_x = values.shape
-    code = next((keys[k] for k in (_PROJECTED, _GEOGRAPHIC) if 0 < keys.get(k, 0) < _USER_DEFINED), 0)
+    code = next(
+        (keys[k] for k in (_PROJECTED, _GEOGRAPHIC) if 0 < keys.get(k, 0) < _USER_DEFINED), 0
+    )
     return Raster(
         path.name,
         f"EPSG:{code}" if code else "",
@@ -59,7 +69,9 @@ def _place(tags: Any, path: Path) -> tuple[float, float, float, float]:
         m = tags[_MATRIX]
         if m[1] == 0.0 and m[4] == 0.0:
             return m[0], -m[5], m[3], m[7]
-        raise DataError(f"{path.name}: the raster is turned; warp it to the north first, by gdalwarp")
+        raise DataError(
+            f"{path.name}: the raster is turned; warp it to the north first, by gdalwarp"
+        )
     raise DataError(
         f"{path.name}: the TIFF does not say where it is (no GeoTIFF tags); expected a GeoTIFF, as "
         "gdal_translate -of GTiff  writes"

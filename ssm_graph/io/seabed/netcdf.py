@@ -64,7 +64,11 @@ def _of_hdf(path: Path) -> Variables:
     found = {}
     with h5py.File(path, "r") as file:
         for name, variable in file.items():
-            if isinstance(variable, h5py.Dataset) and variable.dtype.kind in "iuf" and variable.shape:
+            if (
+                isinstance(variable, h5py.Dataset)
+                and variable.dtype.kind in "iuf"
+                and variable.shape
+            ):
                 attributes = {k: _plain(v) for k, v in variable.attrs.items()}
                 found[name] = _scaled(np.asarray(variable[()]), attributes), attributes
     return found
@@ -79,7 +83,9 @@ def _of_classic(path: Path) -> Variables:
                     attributes = {k: _plain(v) for k, v in variable._attributes.items()}
                     found[name] = _scaled(np.asarray(variable[:]), attributes), attributes
     except (TypeError, ValueError, IndexError, KeyError) as error:
-        raise DataError(f"{path.name}: expected NetCDF, got {error}; is the file cut off?") from error
+        raise DataError(
+            f"{path.name}: expected NetCDF, got {error}; is the file cut off?"
+        ) from error
     return found
 
 

@@ -30,7 +30,9 @@ MAP_KEYS: Final = {
     "smooth_sigma_m": optional_key("smooth_sigma_m", 0.0, 1000.0, _METRES),
     "smooth_m": sigma_key("smooth_m", 1e6, _METRES, required=False),
     "bias_sigma_m": optional_key("bias_sigma_m", 0.0, 1000.0, _METRES),
-    "bias_correlation_s": sigma_key("bias_correlation_s", 1e9, "the unit is seconds", required=False),
+    "bias_correlation_s": sigma_key(
+        "bias_correlation_s", 1e9, "the unit is seconds", required=False
+    ),
     "range_noise_m": sigma_key("range_noise_m", 100.0, _METRES, required=False),
     "range_noise_share": optional_key("range_noise_share", 0.0, 1.0, _SHARE),
 }

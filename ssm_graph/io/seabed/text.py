@@ -80,7 +80,12 @@ def write_ascii_grid(path: Path, grid: SeabedGrid, values: Array) -> None:
     """Write values (R, C) of a grid, all digits, in the plane of its frame (``crs = "local"``)."""
     n_y, n_x = values.shape
     lines = [
-        *(f"ncols {n_x}", f"nrows {n_y}", f"xllcenter {float(grid.x0_m)!r}", f"yllcenter {float(grid.y0_m)!r}"),
+        *(
+            f"ncols {n_x}",
+            f"nrows {n_y}",
+            f"xllcenter {float(grid.x0_m)!r}",
+            f"yllcenter {float(grid.y0_m)!r}",
+        ),
         *(f"cellsize {float(grid.cell_m)!r}", "NODATA_value -9999"),
     ]
     shown = np.where(np.isfinite(values), values, -9999.0)[::-1].tolist()
@@ -144,7 +149,9 @@ def _columns(words: list[str], path: Path, line: int) -> dict[str, int]:
 def _gridded(name: str, x: Array, y: Array, z: Array, sigma: Array | None) -> Raster:
     """Return soundings as a raster: as they lie, or averaged in cells where they lie anyhow."""
     steps = [_step(x), _step(y)]
-    shape = [round(np.ptp(a) / s) + 1 if s > 0.0 else 0 for a, s in zip((y, x), steps[::-1], strict=True)]
+    shape = [
+        round(np.ptp(a) / s) + 1 if s > 0.0 else 0 for a, s in zip((y, x), steps[::-1], strict=True)
+    ]
     is_raster = all(n > 3 for n in shape) and len(x) >= _REGULAR * shape[0] * shape[1]
     if is_raster:
         column, row = np.rint((x - x.min()) / steps[0]), np.rint((y - y.min()) / steps[1])

@@ -64,7 +64,9 @@ def _chart(axes: Axes, grid: SeabedGrid, low: Array, high: Array) -> None:
     y = np.linspace(low[1], high[1], 240)
     depth = -grid.height_at(*np.meshgrid(x, y))
     if np.isfinite(depth).any():
-        image = axes.pcolormesh(x, y, depth, cmap="Blues", shading="auto", rasterized=True, zorder=0)
+        image = axes.pcolormesh(
+            x, y, depth, cmap="Blues", shading="auto", rasterized=True, zorder=0
+        )
         axes.figure.colorbar(image, ax=axes, label="depth (m)", shrink=0.85)
         if np.nanmax(depth) - np.nanmin(depth) > 0.5:
             axes.contour(x, y, depth, 12, colors=GREY, linewidths=0.4, zorder=1)
@@ -140,7 +142,9 @@ def _profile(axes: Axes, log: TerrainLog, track: Track, found: Located) -> None:
         axes.plot(since, met[:, beam], ".", color=ESTIMATE, markersize=1.8, label=label)
     off = np.abs(met - mapped) > 3.0 * np.sqrt(stiff.sigma_sq)
     rows, beams = np.nonzero(off)
-    axes.plot(since[rows], met[rows, beams], "x", color=OUTLIER, markersize=4.0, label="beyond 3 sigma")
+    axes.plot(
+        since[rows], met[rows, beams], "x", color=OUTLIER, markersize=4.0, label="beyond 3 sigma"
+    )
     low, high = np.nanmin(mapped), np.nanmax(mapped)
     axes.set_ylim(high + 0.25 * (high - low) + 1.0, low - 0.25 * (high - low) - 1.0)
     dress(axes, title="Seabed met by the beams, from the best place", x="time (s)", y="depth (m)")
@@ -150,7 +154,9 @@ def _profile(axes: Axes, log: TerrainLog, track: Track, found: Located) -> None:
 def _errors(axes: Axes, found: Located, truth: Array | None) -> None:
     t = found.track
     sigma = np.sqrt(np.linalg.eigvalsh(t.cov)[:, -1])
-    axes.plot(t.time_s, 3.0 * sigma, "--", color=ESTIMATE, linewidth=0.9, label="3 sigma, particles")
+    axes.plot(
+        t.time_s, 3.0 * sigma, "--", color=ESTIMATE, linewidth=0.9, label="3 sigma, particles"
+    )
     if truth is not None:
         error = np.hypot(*(t.x_y - truth).T)
         axes.plot(t.time_s, error, color=ESTIMATE, label="error, particles")

@@ -127,13 +127,9 @@ def locate(
     locator = Locator(grid, errors, track.doubt, particles, grain_m, slope, rng, settings)
     followed, snapshots = _follow(locator, track)
     own = _begins(locator.particles, track)
-    found, fit = search(
-        grid, errors, track, middle=middle, radius_m=radius_m, slope=slope, own=own
-    )
+    found, fit = search(grid, errors, track, middle=middle, radius_m=radius_m, slope=slope, own=own)
     judged = judged or VerdictSettings()
-    verdict, reason = _judge(
-        grid, errors, track, found, fit, followed, judged, middle, radius_m
-    )
+    verdict, reason = _judge(grid, errors, track, found, fit, followed, judged, middle, radius_m)
     return Located(
         verdict=verdict,
         reason=reason,

@@ -61,7 +61,9 @@ def write_located(folder: Path, mission: Mission, dive: Dive) -> None:
             {
                 "x_m": h.pose[0],
                 "y_m": h.pose[1],
-                **dict(zip(("lat_deg", "lon_deg"), _degrees(grid, np.array(h.pose[:2])), strict=True)),
+                **dict(
+                    zip(("lat_deg", "lon_deg"), _degrees(grid, np.array(h.pose[:2])), strict=True)
+                ),
                 "heading_error_deg": float(np.degrees(h.pose[2])),
                 "share": h.share,
                 "log_evidence": h.log_evidence,

@@ -69,7 +69,9 @@ class Stiff:
         seen = [counted(grid, errors, part, row) for row in range(len(part.time_s))]
         heard = np.isfinite(part.ends[..., 2])
         share = np.where(heard, np.array([s.share for s in seen]), 0.0)
-        return cls(grid, errors, part, share, np.where(heard, np.array([s.sigma for s in seen]), 1.0) ** 2)
+        return cls(
+            grid, errors, part, share, np.where(heard, np.array([s.sigma for s in seen]), 1.0) ** 2
+        )
 
     def ends_at(self, at: Array) -> tuple[Array, Array]:
         """Return where beams end (n, K, B, 2) from places (n, 4), and the vehicle (n, K, 2), m."""
@@ -143,9 +145,7 @@ class Stiff:
         misfit = -log_likelihood / max(float(self.share.sum()), 1e-9)
         return Fit(at, information, evidence, misfit, bias)
 
-    def _normal_equations(
-        self, at: Array, wider_m: float
-    ) -> tuple[Array, Array, Array, Array]:
+    def _normal_equations(self, at: Array, wider_m: float) -> tuple[Array, Array, Array, Array]:
         """Return information (n, 5, 5), slope (n, 5), log likelihood and bias (n,) at places."""
         ends, vehicle = self.ends_at(at)
         surface = self.grid.surface_at(ends[..., 0], ends[..., 1])
@@ -219,7 +219,9 @@ def search(
         gap = np.hypot(*np.moveaxis(vehicle[others] - vehicle[best], -1, 0))
         return np.asarray((gap[:, 0] < SAME_M) & (gap[:, -1] < SAME_M))
 
-    kept = [row for row in apart_from_each_other(evidence, is_same, _KEPT) if np.isfinite(evidence[row])]
+    kept = [
+        row for row in apart_from_each_other(evidence, is_same, _KEPT) if np.isfinite(evidence[row])
+    ]
     every = told(fit.at, evidence, fit.misfit, kept)
     return [every[row] for row in kept], Fit(*(column[kept] for column in fit))
 

@@ -68,7 +68,9 @@ def simulate_dive(settings: DiveSettings) -> SimulatedDive:
     terrain = seabed(settings.terrain, mission.frame, middle, np.random.default_rng([seed, 1]))
     chart, stated = surveyed(terrain, settings.survey, np.random.default_rng([seed, 2]))
     rpy = truth.roll_pitch_heading
-    R_nb = mission.frame.R_nl_at(p_n) @ R_lb_from_roll_pitch_heading(rpy[:, 0], rpy[:, 1], rpy[:, 2])
+    R_nb = mission.frame.R_nl_at(p_n) @ R_lb_from_roll_pitch_heading(
+        rpy[:, 0], rpy[:, 1], rpy[:, 2]
+    )
     ranges = _ranges(mission, terrain, p_n, R_nb)
     rng = np.random.default_rng([seed, 3])
     errors = settings.survey.errors

@@ -18,9 +18,10 @@ _REACH_M = 0.25
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TerrainSettings(checked.Settings):
-    """A seabed: a plane and on it a Gaussian field with the spectrum of J. A. Goff and T. H. Jordan.
+    """A seabed: a plane and on it a Gaussian field with the spectrum of Goff and Jordan.
 
-    "Stochastic modeling of seafloor morphology", J. Geophys. Res. 93, 1988: the power of a
+    J. A. Goff, T. H. Jordan, "Stochastic modeling of seafloor morphology", J. Geophys. Res. 93,
+    1988: the power of a
     wavenumber k falls as ``(k^2 + k0^2)^-(H + 1)`` with the Hurst number H, which is 0.7 to 1 on
     real seafloors, and ``k0 = 2 pi / corner_m``.
     """
@@ -69,7 +70,9 @@ def seabed(
     side = (np.arange(n) - 0.5 * (n - 1)) * settings.cell_m
     plane = side[None, :] * settings.slope[0] + side[:, None] * settings.slope[1]
     height = -settings.depth_m - plane + rough - rough.mean()
-    return SeabedGrid("seabed", frame, middle[0] + side[0], middle[1] + side[0], settings.cell_m, height)
+    return SeabedGrid(
+        "seabed", frame, middle[0] + side[0], middle[1] + side[0], settings.cell_m, height
+    )
 
 
 def surveyed(
@@ -87,14 +90,18 @@ def surveyed(
     rows = (y - truth.y0_m) / truth.cell_m
     columns = (x - truth.x0_m) / truth.cell_m
     height = map_coordinates(truth.height, np.meshgrid(rows, columns, indexing="ij"), order=1)
-    exact = replace(truth, x0_m=float(x[0]), y0_m=float(y[0]), cell_m=settings.cell_m, height=height)
+    exact = replace(
+        truth, x0_m=float(x[0]), y0_m=float(y[0]), cell_m=settings.cell_m, height=height
+    )
     at_x, at_y = rng.uniform(x[2], x[-3], 4000), rng.uniform(y[2], y[-3], 4000)
     between = exact.surface_at(at_x, at_y).height - truth.height_at(at_x, at_y)
     height = height + e.sigma_m * rng.standard_normal(height.shape)
     height += e.bias_sigma_m * rng.standard_normal()
     if e.smooth_sigma_m > 0.0:
         # White noise under a Gaussian of width w is alike as exp(-d^2 / 4 w^2): 1/e at 2 w.
-        smooth = gaussian_filter(rng.standard_normal(height.shape), 0.5 * e.smooth_m / settings.cell_m)
+        smooth = gaussian_filter(
+            rng.standard_normal(height.shape), 0.5 * e.smooth_m / settings.cell_m
+        )
         height += e.smooth_sigma_m / smooth.std() * smooth
     stated = replace(e, sigma_m=float(np.hypot(e.sigma_m, between.std())))
     return replace(exact, name="map", height=height), stated

@@ -56,10 +56,12 @@ def ground(settings: TerrainSettings, seed: int = 0) -> tuple[SeabedGrid, Seabed
 
 
 def dived(truth: SeabedGrid, doubt: Doubt = DOUBT) -> tuple[Track, Array]:
-    """Return a dead-reckoned dive of 500 m that began elsewhere, turned by 2 degrees; and its way."""
+    """Return a dead-reckoned dive of 500 m from elsewhere, turned by 2 degrees; and its way."""
     s = np.arange(0.0, 500.0, 3.0)
     way = np.column_stack([-150.0 + 0.6 * s, -100.0 + 60.0 * np.sin(s / 90.0)])
-    from_n = np.broadcast_to(np.column_stack([way, np.full(len(s), -40.0)])[:, None], (len(s), 4, 3))
+    from_n = np.broadcast_to(
+        np.column_stack([way, np.full(len(s), -40.0)])[:, None], (len(s), 4, 3)
+    )
     along = np.broadcast_to(BEAMS, from_n.shape)
     ends = met(truth, from_n, along, 200.0)[..., None] * along
     turn = np.full(len(s), -np.radians(2.0))
@@ -86,14 +88,14 @@ def test_rays_meet_a_plane_where_it_is() -> None:
     """Within a centimetre of the closed form; none meets what is too far or beyond the edge."""
     x, y = np.meshgrid(np.arange(-300.0, 301.0, 5.0), np.arange(-300.0, 301.0, 5.0))
     flat = LocalFrame(0.8, 0.2, 0.0)
-    lat, lon, height = flat.geodetic_from_p_n(np.stack([x, y, -70.0 + 0.1 * x - 0.2 * y], axis=-1))
+    _, _, height = flat.geodetic_from_p_n(np.stack([x, y, -70.0 + 0.1 * x - 0.2 * y], axis=-1))
     plane = SeabedGrid("plane", flat, -300.0, -300.0, 5.0, height)
     from_n = np.broadcast_to([10.0, 20.0, -30.0], BEAMS.shape)
     # z0 + r uz = -70 + 0.1 (x0 + r ux) - 0.2 (y0 + r uy)
     want = (-70.0 + 1.0 - 4.0 + 30.0) / (BEAMS @ [-0.1, 0.2, 1.0])
     np.testing.assert_allclose(met(plane, from_n, BEAMS, 200.0), want, atol=0.01)
     assert np.isnan(met(plane, from_n, BEAMS, 40.0)).all()
-    assert np.isnan(met(plane, from_n + [285.0, 0.0, 0.0], BEAMS, 200.0)[:2]).all()
+    assert np.isnan(met(plane, from_n + np.array([285.0, 0.0, 0.0]), BEAMS, 200.0)[:2]).all()
 
 
 def test_grid_between_its_cells() -> None:
@@ -116,7 +118,10 @@ def test_grid_between_its_cells() -> None:
 def test_seabed_has_the_relief_and_spectrum_that_are_asked_for() -> None:
     """Power of short waves falls as k^-(2 H + 2): here by 3.8 decades a decade."""
     grid = seabed(
-        replace(ROUGH, side_m=4000.0, slope=(0.0, 0.0)), FRAME, np.zeros(2), np.random.default_rng(1)
+        replace(ROUGH, side_m=4000.0, slope=(0.0, 0.0)),
+        FRAME,
+        np.zeros(2),
+        np.random.default_rng(1),
     )
     assert grid.height.std() == pytest.approx(6.0, rel=0.2)
     window = np.hanning(len(grid.height))
@@ -231,9 +236,9 @@ def test_map_in_a_folder(tmp_path: Path) -> None:
     toml = tmp_path / "mission.toml"
     text = toml.read_text()
     for old, new, said in (
-        ("values = \"heights\"", "values = \"up\"", "[map] values"),
-        ("file = \"seabed.asc\"", "file = \"seabad.asc\"", "there is no such map"),
-        ("crs = \"local\"", "crs = \"EPSG:3857\"", "UTM zone"),
+        ('values = "heights"', 'values = "up"', "[map] values"),
+        ('file = "seabed.asc"', 'file = "seabad.asc"', "there is no such map"),
+        ('crs = "local"', 'crs = "EPSG:3857"', "UTM zone"),
         ("within_m = 100.0", "within_m = -3.0", "[map] within_m"),
     ):
         toml.write_text(text.replace(old, new))
@@ -244,7 +249,9 @@ def test_map_in_a_folder(tmp_path: Path) -> None:
 def test_ranges_are_needed() -> None:
     """A DVL without ranges has nothing to compare."""
     dive = short_dive()
-    silent = replace(dive, mission=replace(dive.mission, dvl=replace(dive.mission.dvl, range_m=None)))
+    silent = replace(
+        dive, mission=replace(dive.mission, dvl=replace(dive.mission.dvl, range_m=None))
+    )
     with pytest.raises(DataError, match="range1_m"):
         mission_with_map(silent)
 
