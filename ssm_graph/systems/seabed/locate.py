@@ -86,7 +86,7 @@ class Located:
     track: ParticleTrack
     snapshots: tuple[tuple[float, Array], ...]
     """Particles (n, 2), m, at a few times, s"""
-    ends: Array
+    way: Array
     """(N, 2) the vehicle's way from the best place, m"""
     middle: Array
     radius_m: float
@@ -138,7 +138,7 @@ def locate(
         bias_m=float(fit.bias[0]),
         track=followed,
         snapshots=snapshots,
-        ends=way_from(track, np.array(found[0].pose)[None])[0],
+        way=way_from(track, np.array(found[0].pose)[None])[0],
         middle=middle,
         radius_m=radius_m,
         cpu_s=time.process_time() - begin_s,

@@ -14,7 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.filters.rules.hypotheses import Hypothesis, apart_from_each_other, told
+from ssm_graph.filters.rules.hypotheses import (
+    Hypothesis,
+    Same,
+    apart_from_each_other,
+    told,
+)
 from ssm_graph.sensors.seabed import MapErrors, SeabedGrid
 from ssm_graph.systems.seabed.locator import KERNEL, OFF_MAP, turned
 from ssm_graph.systems.seabed.track import Track, counted
@@ -32,6 +37,8 @@ _POINTS: Final = 2_000_000
 _ROUNDS: Final = 12
 _FIRST_M: Final = 15.0
 """A fit begins as if the map were blurred by so much, and halves it from round to round."""
+_ANY_TURN: Final = 12.0 / (2.0 * np.pi) ** 2
+"""1/rad^2, of an angle of which nothing is known"""
 _WIDEST: Final = 2.5
 """Sigmas of the heading's turn and drift that are tried."""
 
@@ -164,8 +171,10 @@ class Stiff:
         information = np.einsum("nkb,nkbi,nkbj->nij", counts, rows, rows)
         gradient = np.einsum("nkb,nkbi->ni", counts * left, rows)
         doubt = self.track.doubt
+        # A turn that is not known at all is somewhere in the circle.
+        turn = max(doubt.yaw**-2, _ANY_TURN)
         own = [1e-8, 1e-8, doubt.yaw**-2, doubt.rate**-2, max(self.errors.bias_sigma_m, 0.01) ** -2]
-        information += np.diag(own)
+        information += np.diag([*own[:2], turn, *own[3:]])
         gradient += np.column_stack([np.zeros((len(at), 2)), at[:, 2:], np.zeros(len(at))]) * own
         gradient[:, 4] += own[4] * bias
         t = np.where(known, np.square(left) / self.sigma_sq, OFF_MAP)
@@ -253,7 +262,9 @@ def _trials(sigma: float, step: float) -> Array:
     return np.zeros(1) if n <= 0 else np.linspace(-_WIDEST * sigma, _WIDEST * sigma, 2 * n + 1)
 
 
-def _same_begin(at: Array):  # type: ignore[no-untyped-def]
+def _same_begin(at: Array) -> Same:
+    """Return what says which places (n, 4) begin together."""
+
     def is_same(best: int, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
         gap = np.hypot(*(at[rows, :2] - at[best, :2]).T)
         return np.asarray(gap < 1.6 * _COARSE_M)

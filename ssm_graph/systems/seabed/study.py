@@ -75,7 +75,7 @@ def trial(key: Key) -> Row:
         "reason": located.reason,
         "begin_m": float(np.hypot(*off)),
         "begin_sigmas": float(np.sqrt(off @ np.linalg.solve(located.cov[:2, :2], off))),
-        "end_m": float(np.hypot(*(located.ends[-1] - truth[1]))),
+        "end_m": float(np.hypot(*(located.way[-1] - truth[1]))),
         "particles_m": float(np.hypot(*(located.track.x_y[-1] - truth[1]))),
         "particles_s": settled_s(located),
         "cpu_s": located.cpu_s,
