@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Final, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factors.terrain_range import beam_ends, terrain_residual
 from ssm_graph.base.frozen import Array
@@ -152,7 +153,7 @@ def differences(n_beams: int) -> Array:
     return np.linalg.svd(np.ones((1, n_beams)))[2][1:].T
 
 
-def above_seabed(grid: SeabedGrid, point_n: Array) -> tuple[Array, Array, Array]:
+def above_seabed(grid: SeabedGrid, point_n: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Return how high points (..., 3) are above the map, how that grows, and where it is known."""
     lat, lon, height = grid.frame.geodetic_from_p_n(point_n)
     surface = grid.surface_at(point_n[..., 0], point_n[..., 1])

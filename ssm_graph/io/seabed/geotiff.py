@@ -54,8 +54,8 @@ def read_geotiff(path: Path) -> Raster:
     return Raster(
         path.name,
         f"EPSG:{code}" if code else "",
-        west + dx * (np.arange(n_x) + middle),
-        north - dy * (np.arange(n_y)[::-1] + middle),
+        np.asarray(west + dx * (np.arange(n_x) + middle)),
+        np.asarray(north - dy * (np.arange(n_y)[::-1] + middle)),
         values[::-1],
     )
 

@@ -110,7 +110,7 @@ def _places(axes: Axes, grid: SeabedGrid, found: Located, truth: Array | None) -
         axes.plot(*h.pose[:2], "o", color=colour, markersize=5.0 if number == 0 else 3.5, zorder=5)
         axes.annotate(
             _percent(h.share),
-            h.pose[:2],
+            (h.pose[0], h.pose[1]),
             fontsize=6.5,
             color=INK,
             xytext=(4, 3),

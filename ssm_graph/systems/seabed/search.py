@@ -21,8 +21,8 @@ from ssm_graph.filters.rules.hypotheses import (
     told,
 )
 from ssm_graph.sensors.seabed import MapErrors, SeabedGrid
-from ssm_graph.systems.seabed.locator import KERNEL, OFF_MAP, turned
-from ssm_graph.systems.seabed.track import Track, counted
+from ssm_graph.systems.seabed.locator import KERNEL, OFF_MAP
+from ssm_graph.systems.seabed.track import Track, counted, turned, turns_of, way_from
 
 SAME_M: Final = 12.0
 """Places closer to each other at the begin and at the end are one."""
@@ -72,7 +72,7 @@ class Stiff:
     def of(cls, grid: SeabedGrid, errors: MapErrors, track: Track, n_pings: int) -> Stiff:
         """Return a track, thinned to so many pings."""
         n = len(track.time_s)
-        part = track.rows(np.unique(np.linspace(0, n - 1, min(n, n_pings)).astype(int)))
+        part = track.part(np.unique(np.linspace(0, n - 1, min(n, n_pings)).astype(int)))
         seen = [counted(grid, errors, part, row) for row in range(len(part.time_s))]
         heard = np.isfinite(part.ends[..., 2])
         share = np.where(heard, np.array([s.share for s in seen]), 0.0)
@@ -82,19 +82,14 @@ class Stiff:
 
     def ends_at(self, at: Array) -> tuple[Array, Array]:
         """Return where beams end (n, K, B, 2) from places (n, 4), and the vehicle (n, K, 2), m."""
-        since = self.track.time_s - self.track.time_s[0]
-        yaw = at[:, 2, None] + at[:, 3, None] * since
-        middle = 0.5 * (yaw[:, 1:] + yaw[:, :-1])
-        steps = turned(np.diff(self.track.x_y, axis=0), middle)
-        way = np.concatenate([np.zeros((len(at), 1, 2)), np.cumsum(steps, axis=1)], axis=1)
-        vehicle = at[:, None, :2] + way
+        vehicle, yaw = way_from(self.track, at), turns_of(self.track, at)
         ends = np.nan_to_num(self.track.ends[..., :2])
         return vehicle[:, :, None] + turned(ends, yaw[:, :, None]), vehicle
 
     @property
     def heights(self) -> Array:
         """(K, B) at which beams end above the ellipsoid, m; 0 where there is none."""
-        return np.nan_to_num(self.track.height[:, None] + self.track.ends[..., 2])
+        return np.asarray(np.nan_to_num(self.track.height[:, None] + self.track.ends[..., 2]))
 
     def _bias(self, error: Array, weight: Array) -> Array:
         """Return what the map is too low by (n,), from errors and information (n, K, B)."""
@@ -212,7 +207,7 @@ def search(
     """
     whole = Stiff.of(grid, errors, track, _FINE_PINGS)
     since = track.time_s - track.time_s[0]
-    first = Stiff.of(grid, errors, track.rows(since <= _COARSE_S), _COARSE_PINGS)
+    first = Stiff.of(grid, errors, track.part(since <= _COARSE_S), _COARSE_PINGS)
     at = _everywhere(first, middle, radius_m)
     value = first.coarse(at, slope * _COARSE_M)
     rows = apart_from_each_other(value, _same_begin(at), _KEPT)

@@ -38,6 +38,8 @@ FIRST_HELD_OUT: Final = 1000
 """Settings were chosen on seeds below 100 only."""
 IMU_HZ: Final = 50.0
 PING_S: Final = 2.0
+LONG_PING_S: Final = 4.0
+"""Of dives, and of long missions"""
 GRAPH: Final = ProblemConfig(keyframe_interval_s=PING_S)
 SMOOTHED: Final = 5
 """Of so many dives one is smoothed on the map as well."""
@@ -45,18 +47,18 @@ SMOOTHED: Final = 5
 
 def dive_of(terrain: str, grade: str, seed: int, duration_s: float = 600.0) -> SimulatedDive:
     """Return a dive of the study; the same key gives the same one."""
-    mission = _mission(grade, seed, duration_s)
+    mission = _mission(grade, seed, duration_s, PING_S)
     return simulate_dive(DiveSettings(mission=mission, terrain=TERRAINS[terrain]))
 
 
-def _mission(grade: str, seed: int, duration_s: float) -> SimulationConfig:
+def _mission(grade: str, seed: int, duration_s: float, ping_s: float) -> SimulationConfig:
     return replace(
         DIVE,
         seed=seed,
         grade=Grade[grade],
         imu_rate_hz=IMU_HZ,
         duration_s=duration_s,
-        dvl=replace(DIVE.dvl, rate_hz=1.0 / PING_S),
+        dvl=replace(DIVE.dvl, rate_hz=1.0 / ping_s),
     )
 
 
@@ -120,12 +122,13 @@ def drift_trial(key: Key) -> Row:
     """Do one long mission whose start is known: with the map and without."""
     terrain, grade, seed, hours = str(key[0]), str(key[1]), int(key[2]), float(key[3])
     terrain_settings = replace(TERRAINS[terrain], side_m=6000.0)
-    mission = _mission(grade, seed, 3600.0 * hours)
+    mission = _mission(grade, seed, 3600.0 * hours, LONG_PING_S)
     dive = simulate_dive(DiveSettings(mission=mission, terrain=terrain_settings, start_m=0.0))
     known = mission_with_map(dive)
     row: dict[str, Any] = {}
     for name, one in (("with", known), ("without", without_map(known))):
-        estimate = smooth(one, SmootherConfig(), problem_config=GRAPH)
+        graph = ProblemConfig(keyframe_interval_s=LONG_PING_S)
+        estimate = smooth(one, SmootherConfig(), problem_config=graph)
         assert one.reference is not None
         scored = evaluate(estimate.trajectory, one.reference)
         row |= {

@@ -22,7 +22,6 @@ from ssm_graph.simulation import Grade
 from ssm_graph.smoothers.settings import SmootherConfig
 from ssm_graph.systems.seabed.dive import find_start, is_in_doubt, smooth_dive, without_map
 from ssm_graph.systems.seabed.locate import Located, Verdict, locate
-from ssm_graph.systems.seabed.locator import turned
 from ssm_graph.systems.seabed.simulate import (
     DIVE,
     DiveSettings,
@@ -39,7 +38,7 @@ from ssm_graph.systems.seabed.terrain import (
     seabed,
     surveyed,
 )
-from ssm_graph.systems.seabed.track import Doubt, Track
+from ssm_graph.systems.seabed.track import Doubt, Track, turned
 
 FRAME = LocalFrame(0.8, 0.2, 0.0)
 BEAMS = np.array([[1, 1, -1.7], [1, -1, -1.7], [-1, -1, -1.7], [-1, 1, -1.7]])
@@ -170,7 +169,7 @@ def test_flat_ground_is_said_to_be_flat() -> None:
     for settings in (FLAT, replace(FLAT, slope=(0.03, -0.04))):
         truth, chart, errors = ground(settings)
         track, way = dived(truth)
-        found = found_on(chart, errors, track.rows(slice(0, None, 5)), way[0] + [60.0, -80.0])
+        found = found_on(chart, errors, track.part(slice(0, None, 5)), way[0] + [60.0, -80.0])
         assert found.verdict is Verdict.UNRESOLVED
         assert found.reason.startswith("flat: unresolved")
 
