@@ -39,7 +39,7 @@ def main() -> None:
         for name in ("with", "without")
     ]
     lines = [
-        f"Survey lines of {report.args.hours:g} h at 1.5 m/s and 40 m over rough ground at 80 m, DVL "
+        f"Survey lines of {report.args.hours:g} h at 1.5 m/s, 40 m deep over ground at 80 m, DVL "
         f"of {1.0 / LONG_PING_S:g} Hz, start known as the grade knows it. The error is that of the "
         "smoother, horizontal.",
         "",
