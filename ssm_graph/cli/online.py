@@ -127,7 +127,7 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
             show = both(show, page)
         runner = Runner(
             RunFolder(arguments.out, vehicle, _settings(lag, integrity)),
-            engine_of(vehicle, lag, integrity),
+            _witnessed(engine_of(vehicle, lag, integrity), arguments, lag.lag_s),
             _connector(stack, arguments.out, inputs, outputs, mission, speed),
             publisher=publisher,
             config=config,
@@ -166,6 +166,22 @@ def engine_of(
         return FixedLagSmoother.restore(vehicle, config, arrays, meta, integrity=integrity)
 
     return Engine(lambda: FixedLagSmoother(vehicle, config, integrity=integrity), restore)
+
+
+def _witnessed(engine: Engine, arguments: argparse.Namespace, lag_s: float) -> Engine:
+    """Return an engine whose estimators have a witness beside them, if it was asked for."""
+    if not arguments.witness:
+        return engine
+    from ssm_graph.systems.sensor_network.live import Witnessed
+    from ssm_graph.systems.sensor_network.witness import WitnessBounds
+
+    bounds = WitnessBounds(sigmas=arguments.witness_sigmas)
+    Witnessed(engine.new(), bounds, lag_s=lag_s)  # refuses a lag that is too short before the run
+
+    def beside(estimator: Any) -> Witnessed:
+        return Witnessed(estimator, bounds, lag_s=lag_s)
+
+    return Engine(lambda: beside(engine.new()), lambda *packed: beside(engine.restore(*packed)))
 
 
 def _check_sources(arguments: argparse.Namespace, inputs: list[InputConfig]) -> None:
@@ -223,6 +239,7 @@ def _connector(
             skip=n_messages,
             name=mission.name,
             end_s=float(mission.imu.time_s[-1]),
+            altitude=(mission.dvl.valid_s, mission.dvl.altitude()),
             wait=hub.wait,
         )
         return Connections(source, hub)
@@ -335,6 +352,16 @@ def add_integrity(parser: argparse.ArgumentParser) -> None:
         "P",
         "probability that an unseen fault moves the answer out of its protection level",
         usual.missed_detection,
+    )
+
+
+    group.add_argument(
+        "--witness",
+        action="store_true",
+        help="lead a set of guaranteed bounds on beside the answer: a second witness, docs/network.md",
+    )
+    number_option(
+        group, "--witness-sigmas", "K", "its bounds are so many of the stated sigmas", 5.0
     )
 
 

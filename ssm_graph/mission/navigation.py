@@ -86,3 +86,10 @@ class Navigation(FrozenArrays):
     innovation_ratios: Mapping[str, float] = field(default_factory=dict)
     """By sensor: its low-passed innovation in sigmas, root mean square of its components. An error
     that lasts shows here long before it is out of any gate; noise alone is near 0.2."""
+    witness_m: float = math.inf
+    """How far the truth may be from the answer, level, as long as the bounds of a witness beside it
+    are true; infinite without one, or once they were contradicted."""
+    witness_up_m: float = math.inf
+    """The same of the height."""
+    witness_s: float = math.nan
+    """When that was so, s on the vehicle's clock: a witness goes by blocks of some seconds."""

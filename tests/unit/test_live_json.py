@@ -259,6 +259,9 @@ def test_an_answer_speaks_as_the_trajectory_table() -> None:
         "latency_s",
         "protection_m",
         "protection_up_m",
+        "witness_m",
+        "witness_up_m",
+        "witness_s",
         "innovation_ratios",
     }
     assert fields["accel_bias_x_ug"] == pytest.approx(1e-3 / MICRO_G)

@@ -177,13 +177,13 @@ def cut_by_strip(
     n = sets.n
     if n < 2:
         raise DataError(f"cut_by_strip: expected two components or more, got {n}; intervals do")
-    row = np.broadcast_to(np.asarray(h, dtype=np.float64), sets.center.shape)
-    Ph = np.einsum("...ij,...j->...i", sets.shape, row)
-    root = np.sqrt(np.einsum("...i,...i->...", row, Ph))
-    at = np.einsum("...i,...i->...", row, sets.center)
+    row, P = np.asarray(h, dtype=np.float64), sets.shape
+    Ph = (P @ row[..., None])[..., 0]
+    root = np.sqrt((row * Ph).sum(axis=-1))
+    at = (row * sets.center).sum(axis=-1)
     below, above = (np.asarray(low) - at) / root, (np.asarray(high) - at) / root
     misses = (below > 1.0 + CERTAIN) | (above < -1.0 - CERTAIN)
-    below, above = np.clip(below, -1.0, 1.0), np.clip(above, -1.0, 1.0)
+    below, above = below.clip(-1.0, 1.0), above.clip(-1.0, 1.0)
     e, r = 0.5 * (above + below), 0.5 * (above - below)
     r = np.maximum(r, np.maximum(np.asarray(floor) / root, TIGHTEST))
     rest = 1.0 - r**2 - e**2
@@ -192,14 +192,15 @@ def cut_by_strip(
     q = s - 1.0
     unit = Ph / root[..., None]
     delta = np.maximum(1.0 + q * r**2 - q * e**2 / s, TIGHTEST)
-    unit = Ph / root[..., None]
     # P - (q/s) u u', as a sum of squares (Joseph): no digit is lost where the strip is thin.
-    rest_of = np.eye(n) - (q / (s * root))[..., None, None] * unit[..., :, None] * row[..., None, :]
-    shape = rest_of @ sets.shape @ np.swapaxes(rest_of, -1, -2)
-    shape += (q / s**2)[..., None, None] * unit[..., :, None] * unit[..., None, :]
-    center = sets.center + (q * e / s)[..., None] * unit
-    cut = Ellipsoids(center, symmetric(delta[..., None, None] * shape))
-    return cut.where(s > 1.0, sets), misses
+    column = (q / (s * root))[..., None] * unit
+    rest_of = np.eye(n) - column[..., :, None] * row[..., None, :]
+    shape = rest_of @ P @ np.swapaxes(rest_of, -1, -2)
+    thin = (np.sqrt(q) / s)[..., None] * unit
+    shape = delta[..., None, None] * (shape + thin[..., :, None] * thin[..., None, :])
+    cut = Ellipsoids(sets.center + (q * e / s)[..., None] * unit, symmetric(shape))
+    is_cut = s > 1.0
+    return (cut if is_cut.all() else cut.where(is_cut, sets)), misses
 
 
 def intersected(first: Ellipsoids, second: Ellipsoids) -> tuple[Ellipsoids, Mask]:

@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.units import wrapped
@@ -91,7 +91,7 @@ def kld_number(n_cells: int, error: float = KLD_ERROR, confidence: float = KLD_C
         return 1
     k = n_cells - 1
     a = 2.0 / (9.0 * k)
-    z = float(norm.ppf(confidence))
+    z = float(ndtri(confidence))
     return int(np.ceil(k / (2.0 * error) * (1.0 - a + np.sqrt(a) * z) ** 3))
 
 

@@ -38,7 +38,6 @@ from ssm_graph.mission.mission import LocalStart, Mission
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.acoustic import RangeLog
 from ssm_graph.sensors.current import CURRENT_KEYS, CurrentModel
-from ssm_graph.sensors.imu import IMU, ImuLog
 from ssm_graph.sensors.instrument import Calibrated, Instrument
 from ssm_graph.sensors.place import PLACE_KEYS
 from ssm_graph.sensors.registry import INSTRUMENTS
@@ -99,12 +98,15 @@ def read_mission(folder: Path | str) -> Mission:
     return with_map(mission, toml["map"], toml.folder) if "map" in toml else mission
 
 
-def read_imu(toml: MissionToml) -> ImuLog:
-    """Read the inertial data of a mission alone; raises as :func:`read_mission` does."""
-    bare = {IMU.section: toml.bare(IMU)}
-    table = _read_tables(toml, bare)[0][IMU.section]
-    log: ImuLog = IMU.filled(table, bare[IMU.section], toml[IMU.section], toml.body)
-    return log
+def read_log(toml: MissionToml, one: Instrument) -> Any:
+    """Read one log of a mission alone; None where it has none; raises as :func:`read_mission`."""
+    if one.section not in toml:
+        return None
+    bare = {one.section: toml.bare(one)}
+    table = _read_tables(toml, bare)[0].get(one.section)
+    if table is None:
+        return None
+    return one.filled(table, bare[one.section], toml[one.section], toml.body)
 
 
 def _read_tables(toml: MissionToml, bare: dict[str, Any]) -> tuple[dict[str, Table], list[str]]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
-from ssm_graph.base.times import MIN_SPACING_S
+from ssm_graph.base.times import MIN_SPACING_S, usual_interval
 from ssm_graph.graph.aids import AIDS
 from ssm_graph.live.estimator.rows import TimedRows
 from ssm_graph.mission.mission import Aids, Mission
@@ -130,7 +130,7 @@ class Buffers:
         if self._n_imu % PERIOD_EVERY == 0 or self._n_imu < PERIOD_EVERY:
             times = self.imu.all[-2 * PERIOD_EVERY :, 0]
             if len(times) > 1:
-                self._period_s = float(np.median(np.diff(times)))
+                self._period_s = usual_interval(times)
                 if len(times) > PERIOD_EVERY:
                     self.shortest_period_s = min(self.shortest_period_s, self._period_s)
         return self._period_s
@@ -156,16 +156,18 @@ class Buffers:
         """Return the axes of the inertial sensors that repeat themselves up to a time."""
         return frozen_now(self.imu.between(time_s - FROZEN_REACH_S, time_s))
 
-    def mission(self, frame: LocalFrame, *, until_s: float = np.inf) -> Mission:
-        """Return everything, or what is of a time ``until_s``, as a mission to align with."""
+    def mission(
+        self, frame: LocalFrame, *, begin_s: float = -np.inf, until_s: float = np.inf
+    ) -> Mission:
+        """Return everything, or what is from ``begin_s`` to ``until_s``, as a mission."""
         vehicle = self.vehicle
-        dvl = DVL.log_of(self.pings_between(-np.inf, until_s), self._bare[DVL.section])
-        gnss, depth, aids = self.logs_between(-np.inf, until_s)
+        dvl = DVL.log_of(self.pings_between(begin_s, until_s), self._bare[DVL.section])
+        gnss, depth, aids = self.logs_between(begin_s, until_s)
         end_s = min(self.imu.last_s, until_s)
         return Mission(
             vehicle.name,
             frame,
-            self.imu_log(-np.inf, end_s, margin=0),
+            self.imu_log(begin_s, end_s, margin=0),
             dvl,
             depth if depth is not None and len(depth.time_s) else None,
             gnss,

@@ -27,6 +27,7 @@ from ssm_graph.live.estimator.tail import Tail
 from ssm_graph.live.estimator.watch import Contradicted, Watch
 from ssm_graph.mission.estimate import Found
 from ssm_graph.mission.events import EventLog
+from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.navigation import Event, Health, Navigation, Severity
 from ssm_graph.mission.problem import ProblemConfig
 from ssm_graph.mission.vehicle import Vehicle
@@ -40,7 +41,7 @@ ONLINE: Final = FixedLagConfig(
     max_iterations=3,
     tolerance=0.02,
     relinearise_sigmas=0.1,
-    relinearise_turn=5e-4,
+    relinearise_turn=2e-3,
     reweigh=0.02,
     gate_sigmas=6.0,
     first_estimates=True,
@@ -99,6 +100,20 @@ class FixedLagSmoother:
     def counts(self) -> dict[str, int]:
         """How many messages were refused, by sensor and reason."""
         return dict(self._intake.counts)
+
+    @property
+    def shift_s(self) -> float:
+        """Added to the vehicle's clock since it was set back, s: the clock of the states."""
+        return self._intake.shift_s
+
+    def received(self, begin_s: float, end_s: float) -> Mission | None:
+        """Return what was accepted between two times of the states' clock, and is still kept.
+
+        Beside the readings of the lag there is nothing; None before there is a place on Earth.
+        """
+        if self._frame is None:
+            return None
+        return self._intake.buffers.mission(self._frame, begin_s=begin_s, until_s=end_s)
 
     def push(self, message: Message) -> None:
         """Take one message; nothing that it may hold raises."""
@@ -298,10 +313,15 @@ class FixedLagSmoother:
 
     def _tail_of(self, step: Step) -> Tail:
         assert self._frame is not None
-        newest, noise = step.window.newest, self.vehicle.imu_noise
-        keyframe, covariance = step.window.keyframes[-1], newest.covariance[0]
-        sensors = step.window.sensors
-        tail = Tail(keyframe, newest.states, covariance, noise=noise, sensors=sensors)
+        window = step.window
+        tail = Tail(
+            window.keyframes[-1],
+            window.newest_states,
+            window.newest_covariance,
+            noise=self.vehicle.imu_noise,
+            frame=self._frame,
+            inertial=window.inertial,
+        )
         buffers, imu = self._intake.buffers, self._intake.buffers.imu
         first = max(imu.index(step.time_s, after=True) - 1, 0)
         tail.add(buffers.inertial(imu.all[first:]))

@@ -57,6 +57,8 @@ class FleetSetting:
     loss: float = 0.3
     false_range: float = 1.0
     """By which ranges err more than their bound says: above 1 it is a lie."""
+    at_corners: bool = False
+    """Whether every error is at one end of its bound or the other, instead of uniform within."""
 
     def __post_init__(self) -> None:
         if self.n_vehicles < 2 or self.slot < 1 or self.n_steps < 1:
@@ -154,7 +156,13 @@ class FleetTrial(ReadOnlyArrays):
 
     truth: Array
     """(K, N, 3) m, m, rad"""
-    half_widths: Array
+    center: Array
+    """(K, N, 3) of the ellipsoids"""
+    shape: Array
+    """(K, N, 3, 3)"""
+    low: Array
+    """(K, N, 3) of the boxes"""
+    high: Array
     """(K, N, 3)"""
     excess: Array
     """(K, N) of the truth, at most 1 inside"""
@@ -162,15 +170,23 @@ class FleetTrial(ReadOnlyArrays):
     alarms: tuple[tuple[int, int, str], ...]
     """Step, vehicle (from 1) and what missed its set"""
 
+    @property
+    def half_widths(self) -> Array:
+        """(K, N, 3)"""
+        return 0.5 * (self.high - self.low)
+
 
 def run_fleet(setting: FleetSetting, *, seed: int = 0, hears: bool = True) -> FleetTrial:
-    """Run a fleet whose errors are uniform within their bounds; ``hears`` or each by itself."""
+    """Run a fleet whose errors stay within their bounds; ``hears`` or each by itself."""
     fleet = _Fleet(setting, seed)
     rows: dict[str, list[Array]] = defaultdict(list)
     for k in range(1, setting.n_steps + 1):
         fleet.step(k, hears=hears)
         rows["truth"].append(fleet.state.copy())
-        rows["half_widths"].append(fleet.sets.half_widths)
+        rows["center"].append(fleet.sets.ellipsoid.center)
+        rows["shape"].append(fleet.sets.ellipsoid.shape)
+        rows["low"].append(fleet.sets.low)
+        rows["high"].append(fleet.sets.high)
         rows["excess"].append(fleet.sets.excess(fleet.state))
     arrays = {name: np.array(values) for name, values in rows.items()}
     return FleetTrial(**arrays, n_heard=fleet.n_heard, alarms=tuple(fleet.alarms))
@@ -190,7 +206,8 @@ class _Fleet:
         self.alarms: list[tuple[int, int, str]] = []
 
     def _draw(self, shape: tuple[int, ...]) -> Array:
-        return self.rng.uniform(-1.0, 1.0, shape)
+        errors = self.rng.uniform(-1.0, 1.0, shape)
+        return np.sign(errors) if self.own.at_corners else errors
 
     def step(self, k: int, *, hears: bool) -> None:
         """Move all vehicles by a second and let them use what they know of it."""

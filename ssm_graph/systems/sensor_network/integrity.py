@@ -8,7 +8,7 @@ import json
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -122,26 +122,43 @@ def check_integrity(
     trajectory = estimate.trajectory
     p_n = mission.frame.p_n_from_geodetic(trajectory.lat, trajectory.lon, trajectory.height)
     answer = np.column_stack([np.interp(w.time_s, trajectory.time_s, x) for x in p_n.T])
-    plane = w.center[:, :2], w.shape[:, :2, :2]
-    e = answer[:, :2] - plane[0]
-    in_ellipse = np.einsum("mi,mi->m", e, np.linalg.solve(plane[1], e[..., None])[..., 0])
-    middle, half = 0.5 * (w.high + w.low)[:, :2], 0.5 * (w.high - w.low)[:, :2]
-    in_box = np.max(np.abs(answer[:, :2] - middle) / half, axis=1) ** 2
-    excess = np.maximum(in_ellipse, in_box)
-    by_ellipse = np.linalg.norm(e, axis=1) + np.sqrt(np.linalg.eigvalsh(plane[1])[:, -1])
-    corner = np.maximum(w.high[:, :2] - answer[:, :2], answer[:, :2] - w.low[:, :2])
-    by_box = np.linalg.norm(corner, axis=1)
-    up = answer[:, 2]
-    up_inside = (up >= w.up_low) & (up <= w.up_high)
+    found = against(w, answer)
     worst = np.sqrt(np.linalg.eigvalsh(trajectory.position_cov_enu[:, :2, :2])[:, -1])
     return Integrity(
         witness=w,
         answer_n=answer,
-        excess=excess,
-        is_inside=(excess <= 1.0) & up_inside,
-        radius_m=np.minimum(by_ellipse, by_box),
-        up_m=np.maximum(w.up_high - up, up - w.up_low),
+        excess=found.excess,
+        is_inside=found.is_inside,
+        radius_m=found.radius_m,
+        up_m=found.up_m,
         sigma_radius_m=PROTECTION_SIGMAS * np.interp(w.time_s, trajectory.time_s, worst),
+    )
+
+
+class Against(NamedTuple):
+    """Answers beside the sets of M blocks; see :class:`Integrity`."""
+
+    excess: Array
+    is_inside: Mask
+    radius_m: Array
+    up_m: Array
+
+
+def against(w: Witness, answer_n: Array) -> Against:
+    """Return how answers (M, 3) stand to the sets, m in the mission's frame."""
+    center, shape = w.center[:, :2], w.shape[:, :2, :2]
+    e, up = answer_n[:, :2] - center, answer_n[:, 2]
+    in_ellipse = np.einsum("mi,mi->m", e, np.linalg.solve(shape, e[..., None])[..., 0])
+    middle, half = 0.5 * (w.high + w.low)[:, :2], 0.5 * (w.high - w.low)[:, :2]
+    in_box = np.max(np.abs(answer_n[:, :2] - middle) / half, axis=1) ** 2
+    excess = np.maximum(in_ellipse, in_box)
+    by_ellipse = np.linalg.norm(e, axis=1) + np.sqrt(np.linalg.eigvalsh(shape)[:, -1])
+    corner = np.maximum(w.high[:, :2] - answer_n[:, :2], answer_n[:, :2] - w.low[:, :2])
+    return Against(
+        excess,
+        (excess <= 1.0) & (up >= w.up_low) & (up <= w.up_high),
+        np.minimum(by_ellipse, np.linalg.norm(corner, axis=1)),
+        np.maximum(w.up_high - up, up - w.up_low),
     )
 
 

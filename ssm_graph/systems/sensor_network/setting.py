@@ -5,14 +5,18 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Final
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array, Vector
+from ssm_graph.base.settings import read_toml
 from ssm_graph.systems.sensor_network.codes import require_step
 
+KINDS: Final = ("network", "fleet")
+"""Of a study."""
 FLOOR_SHARE: Final = 1e-3
 """Of the least bound: the half-width below which no cut makes a set thinner."""
 RING: Final = ((1, 2), (1, 4), (2, 1), (2, 3), (3, 2), (3, 4), (4, 3), (4, 1))
@@ -138,3 +142,15 @@ SETTINGS: Final = {
     )
 }
 """By name: the patent's noise; less of it; with a compass; where walls clip; in steps of 1 m."""
+
+
+def read_study(path: Path) -> dict[str, Any]:
+    """Return what a study file says; its ``kind`` is ``network`` where it says none."""
+    try:
+        raw = read_toml(path)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from error
+    kind = raw.setdefault("kind", "network")
+    if kind not in KINDS:
+        raise ConfigError(f"{path}: kind: expected one of {', '.join(KINDS)}, got {kind!r}")
+    return raw

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import math
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,11 +13,11 @@ from typing import Any, Final
 import numpy as np
 
 from ssm_graph.base.errors import ConfigError, nearest_hint
-from ssm_graph.base.settings import Key, Settings, number_key, read_settings, read_settings_file
+from ssm_graph.base.settings import Key, Settings, number_key, read_settings
 from ssm_graph.io.tables.append_file import write_through
 from ssm_graph.systems.sensor_network.codes import bits_for
 from ssm_graph.systems.sensor_network.patent import Parameters, PatentSettings, Saturation
-from ssm_graph.systems.sensor_network.setting import SETTINGS, Setting, Share
+from ssm_graph.systems.sensor_network.setting import SETTINGS, Setting, Share, read_study
 from ssm_graph.systems.sensor_network.world import Disturbance, Trial, run_patent, run_sets
 
 KEYS: Final = (1.0, 5.0, 20.0, 50.0, 100.0, 200.0)
@@ -41,6 +40,7 @@ SET_FILTERS: Final = {
 }
 _TOP: Final = {
     "name": Key(shape=None),
+    "kind": Key(shape=None, required=False),
     "base": Key(shape=None, required=False),
     "runs": number_key("", 1, 1000, "it is a count", required=False),
     "seed": number_key("", 0, 2**31, "it is a count", required=False),
@@ -87,12 +87,7 @@ class NetworkStudy:
 
 def read_network_study(path: Path) -> NetworkStudy:
     """Read a study file; what it does not say is as in the setting that it is based on."""
-    try:
-        raw = tomllib.loads(read_settings_file(path).decode())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: expected valid TOML, got: {error}") from error
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from error
+    raw = read_study(path)
     sections = {name: raw.pop(name) for name in ("setting", "network", "code") if name in raw}
     top = read_settings("", raw, known=_TOP, file=str(path))
     base = top.text("base") if "base" in top else "patent"

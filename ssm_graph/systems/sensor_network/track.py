@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from factors import so3
 from ssm_graph.base.frames import R_lb_from_roll_pitch_heading, roll_pitch_heading_from_R_lb
 from ssm_graph.base.frozen import Array, ReadOnlyArrays
+from ssm_graph.base.stepwise import Steps, at_once
 from ssm_graph.filters.rules.ellipsoids import (
     Ellipsoids,
     around_box,
@@ -19,15 +20,18 @@ from ssm_graph.filters.rules.ellipsoids import (
     segments,
     sum_shape,
 )
-from ssm_graph.imu.increments import merge_samples
+from ssm_graph.imu.increments import merge_samples_steps
 from ssm_graph.imu.ping_motion import mean_gyro
 from ssm_graph.mission.mission import InitialState, Mission
+from ssm_graph.systems.sensor_network.block import Block, BlockRow, worst_sigma
 
 if TYPE_CHECKING:
     from ssm_graph.systems.sensor_network.witness import BoundAlarm, WitnessBounds
 
 GAP_S: Final = 0.5
 """Longest interval that is integrated in one step where no ping comes."""
+LATEST_END_S: Final = 2.0
+"""A block waits no longer for a ping to end at."""
 MERGE_HZ: Final = 1e-3
 """Merges all samples of an interval into one."""
 _FLOOR_M_PER_S: Final = 1e-4
@@ -61,22 +65,25 @@ class Track(ReadOnlyArrays):
     """(M,) m/s, of the mean velocity over a block"""
     closing: Array
     """(M,) m, largest correction of the way between two pings, by the second of them"""
+    tilt_bound: Array
+    """(M,) rad, of the levelled attitude during a block"""
     alarms: tuple[BoundAlarm, ...]
     n_beams: int
     n_left_out: int
 
-    def led_to_end(self, i: int, time_s: float, arm_b: Array) -> tuple[Array, Array, float]:
-        """Return lever arm (3,) at a time, and the way (3,) from then to the end of block i, m.
+    def led_to_end(self, i: int, time_s: Array, arm_b: Array) -> tuple[Array, Array, Array]:
+        """Return lever arms (n, 3) at times (n,), and the ways (n, 3) from then to the end of
+        block i, m.
 
-        The third is a bound of the error of the way.
+        The third (n,) bounds the error of the ways.
         """
-        at = min(int(np.searchsorted(self.edge_s, time_s)), len(self.edge_s) - 1)
+        at = np.minimum(np.searchsorted(self.edge_s, time_s), len(self.edge_s) - 1)
         end = int(np.searchsorted(self.edge_s, self.time_s[i]))
-        passed = [float(np.interp(time_s, self.edge_s, axis)) for axis in self.way.T]
-        led = self.way[end] - np.array(passed)
-        span = float(self.time_s[i]) - time_s
-        bound = span * float(self.speed_bound[i]) + float(self.closing[i])
-        return self.R_nb[at] @ arm_b, led, bound
+        begin = int(np.searchsorted(self.edge_s, self.begin_s[i]))
+        edge_s, way = self.edge_s[begin : end + 1], self.way[begin : end + 1]
+        passed = np.column_stack([np.interp(time_s, edge_s, axis) for axis in way.T])
+        bound = (self.time_s[i] - time_s) * self.speed_bound[i] + self.closing[i]
+        return self.R_nb[at] @ arm_b, way[-1] - passed, bound
 
     def heading_at(self, time_s: float) -> float:
         """Return the gyros' heading at a time, rad."""
@@ -84,129 +91,182 @@ class Track(ReadOnlyArrays):
         return float(roll_pitch_heading_from_R_lb(self.R_nb[at])[2])
 
 
-def velocity_track(mission: Mission, start: InitialState, own: WitnessBounds) -> Track:
-    """Return the blocks of a mission from a start on; see :mod:`.witness` for what is done."""
-    return _Blocks(mission, start, own).go()
+class Edges(NamedTuple):
+    """Times to step to."""
+
+    time_s: Array
+    """(K,) the first is where the walk stands"""
+    is_end: NDArray[np.bool_]
+    """(K,) which of them end a block"""
 
 
-def _edges(mission: Mission, begin_s: float, block_s: float) -> tuple[Array, NDArray[np.bool_]]:
-    """Return times to step to, and which of them end a block."""
-    imu, pings = mission.imu, mission.dvl.of_ground().valid_s
-    end_s = float(imu.time_s[-1])
-    last = min(end_s, float(pings[-1]) + block_s)
+def block_edges(pings_s: Array, begin_s: float, ends_s: Array, last_s: float) -> Edges:
+    """Return the edges of blocks that ought to end at some times (M,), from ``begin_s`` on.
+
+    A block ends at a ping where there is one, or the way to the next would be half known.
+    """
+    ends = np.unique([_next(pings_s, end, last_s) for end in ends_s])
+    last = float(ends[-1])
+    inside = pings_s[(pings_s > begin_s) & (pings_s <= last)]
+    known = np.unique(np.concatenate([[begin_s], inside, ends]))
+    parts = np.maximum(np.ceil(np.diff(known) / GAP_S - 1e-6).astype(int), 1)
+    fill = [np.linspace(a, b, n + 1) for a, b, n in zip(known, known[1:], parts, strict=False)]
+    edge_s = np.unique(np.concatenate([known, *(one[1:-1] for one in fill)]))
+    return Edges(edge_s, np.isin(edge_s, ends))
+
+
+def mission_edges(mission: Mission, begin_s: float, block_s: float) -> Edges:
+    """Return the edges of all blocks of a mission from a time on."""
+    pings_s = mission.dvl.of_ground().valid_s
+    last = min(float(mission.imu.time_s[-1]), float(pings_s[-1]) + block_s)
     ends = np.arange(begin_s + block_s, last, block_s)
     ends = np.append(ends[:-1], last) if len(ends) else np.array([last])
-    inside = pings[(pings > begin_s) & (pings <= last)]
-    # A block ends at a ping where there is one, or the way to the next would be half known.
-    ends = np.unique([_next(inside, end, last) for end in ends])
-    fill = np.arange(begin_s, last, GAP_S)
-    near = np.searchsorted(inside, fill)
-    before = fill - np.append(-np.inf, inside)[near]
-    behind = np.append(inside, np.inf)[near] - fill
-    fill = fill[np.minimum(before, behind) > 0.5 * GAP_S]
-    edge_s = np.unique(np.concatenate([[begin_s], inside, fill, ends]))
-    return edge_s, np.isin(edge_s, ends)
+    return block_edges(pings_s[pings_s > begin_s], begin_s, ends, last)
 
 
 def _next(pings: Array, end_s: float, last_s: float) -> float:
     at = int(np.searchsorted(pings, end_s - 1e-6))
-    return float(pings[at]) if at < len(pings) and pings[at] - end_s < 2.0 else min(end_s, last_s)
+    near = at < len(pings) and pings[at] - end_s < LATEST_END_S
+    return float(pings[at]) if near else min(end_s, last_s)
 
 
-class _Blocks:
-    """The walk from edge to edge."""
+class VelocityWalk:
+    """The walk from edge to edge; see :mod:`.witness` for what is done.
+
+    It takes a mission as a whole, or piece by piece as it comes.
+    """
 
     def __init__(self, mission: Mission, start: InitialState, own: WitnessBounds) -> None:
         self._own, self._frame = own, mission.frame
-        self._dvl = mission.dvl.of_ground()
-        self._noise, self._start = mission.imu.noise, start
-        begin_s = max(start.time_s, mission.imu.start_s)
-        self._edge_s, self._ends = _edges(mission, begin_s, own.block_s)
-        self._imu = mission.imu.calibration
+        self._noise, self._imu = mission.imu.noise, mission.imu.calibration
+        self._mount = mission.dvl.mount
+        self.begin_s = max(start.time_s, mission.imu.start_s)
+        k = own.sigmas
+        self._place = self._frame.p_n_from_geodetic(start.lat, start.lon, start.height)
+        R_nl = self._frame.R_nl_at(self._place)
+        self._g_n = self._frame.g_n_at(self._place)
+        self._R = R_nl @ R_lb_from_roll_pitch_heading(start.roll, start.pitch, start.heading)
+        self._tilt = k * float(np.max(start.attitude_sigma[:2]))
+        self._heading = k * float(start.attitude_sigma[2])
+        half = np.maximum(k * start.velocity_sigma_enu, _FLOOR_M_PER_S)
+        self._set = around_box(R_nl @ start.velocity_enu, half)
+        self._velocity = self._set.center
+        self._silent_s, self._is_silent = 0.0, False
+        self._coriolis = 2.0 * so3.skew(self._frame.omega_ie_n)
+        self._gained, self._pushed, self._open_s = np.zeros(3), 0.0, 0.0
+
+    def follow_steps(self, mission: Mission, edges: Edges) -> Steps[Track]:
+        """Return the blocks of a piece of a mission, whose first edge is where the last ended."""
+        yield from self._take_steps(mission, edges)
+        self._alarms: list[BoundAlarm] = []
+        self._n_beams = self._n_left_out = 0
+        self._prepare_bounds(self._end_of_block(0))
+        R, way, rotations = self._R, [np.zeros(3)], [self._R]
+        begun = self._place
+        block = Block(self._velocity)
+        blocks: list[BlockRow] = []
+        for n, dt in enumerate(self._dt):
+            gain = R @ self._gains[n]
+            R = self._earth[n] @ R @ self._turns[n]
+            block.turned += float(np.linalg.norm(self._theta[n]))
+            gain = gain + (self._g_n - self._coriolis @ block.velocity) * dt
+            way.append(way[-1] + block.step(gain, float(dt)))
+            tilt = self._tilt + self._drift(block)
+            force = 9.81 * tilt + self._accel
+            self._gained, self._open_s = self._gained + gain, self._open_s + float(dt)
+            self._pushed += force * float(dt)
+            found = self._ping_at(n + 1, R, float(dt), tilt)
+            if found is not None:
+                way[-1] = way[-1] + block.close(*found, force)
+            if self._ends[n + 1]:
+                self._lead_on()
+                block.leave_open(self._set)
+                blocks.append(self._finished(block, float(self._edge_s[n + 1])))
+                R = self._levelled(R, block)
+                self._place = begun + way[-1]
+                self._g_n = self._frame.g_n_at(self._place)
+                self._prepare_bounds(self._end_of_block(n + 1))
+                block = Block(block.velocity)
+            rotations.append(R)
+            yield 1.0
+        self._R, self._velocity = R, block.velocity
+        return self._track(np.array(way), np.array(rotations), blocks)
+
+    follow = at_once(follow_steps)
+
+    def _take_steps(self, mission: Mission, edges: Edges) -> Steps[None]:
+        """Merge the inertial data of a piece, and find its pings at its edges."""
+        self._edge_s, self._ends = edges
+        dvl = mission.dvl.of_ground()
         imu = mission.imu.calibrated
-        merged = merge_samples(imu, self._edge_s, rate_hz=MERGE_HZ)
+        merged = yield from merge_samples_steps(imu, self._edge_s, rate_hz=MERGE_HZ)
         self._dt = np.diff(self._edge_s)
         theta = merged.gyro_b * merged.dt[:, None]
         self._theta, self._turns = theta, so3.exp(theta)
         self._gains = so3.left_jacobian_times(theta, merged.accel_b * merged.dt[:, None])
         self._earth = so3.exp(-self._frame.omega_ie_n * self._dt[:, None])
-        speed, sigma, beams_b = self._dvl.independent()
+        speed, sigma, beams_b = dvl.independent()
         self._speed, self._sigma, self._beams = speed, sigma, beams_b
-        ping_s = np.clip(self._dvl.valid_s, self._edge_s[0], self._edge_s[-1])
-        arm = so3.cross(mean_gyro(imu, ping_s), self._dvl.mount.lever_arm_b[None])
+        ping_s = np.clip(dvl.valid_s, self._edge_s[0], self._edge_s[-1])
+        arm = so3.cross(mean_gyro(imu, ping_s), dvl.mount.lever_arm_b[None])
         self._arm_speed = np.einsum("nbi,ni->nb", beams_b, arm)
-        at = np.searchsorted(self._edge_s, self._dvl.valid_s)
+        at = np.searchsorted(self._edge_s, dvl.valid_s)
         self._ping = {int(a): n for n, a in enumerate(at) if 0 < a < len(self._edge_s)}
-        mount = self._dvl.mount
         self._null = None
-        if mount.n_beams > 3 and self._dvl.covariance is None:
-            self._null = np.linalg.svd(mount.beams_b.T)[2][3:]
-        self._prepare_bounds()
+        if dvl.mount.n_beams > 3 and dvl.covariance is None:
+            self._null = np.linalg.svd(dvl.mount.beams_b.T)[2][3:]
 
-    def _prepare_bounds(self) -> None:
-        k, noise, mount = self._own.sigmas, self._noise, self._dvl.mount
-        span = float(self._edge_s[-1] - self._edge_s[0])
-        self._gyro = k * (noise.gyro_bias_sigma + noise.gyro_bias_walk * math.sqrt(span))
-        self._accel = k * (noise.accel_bias_sigma + noise.accel_bias_walk * math.sqrt(span))
+    def _end_of_block(self, edge: int) -> float:
+        """Return how long after the begin the block ends that an edge is the begin of, s."""
+        ends = self._edge_s[edge + 1 :][self._ends[edge + 1 :]]
+        return float((ends[0] if len(ends) else self._edge_s[-1]) - self.begin_s)
+
+    def _prepare_bounds(self, since_s: float) -> None:
+        """Set what bounds the errors up to so long after the begin."""
+        k, noise, mount = self._own.of("DVL"), self._noise, self._mount
+        k_gyro, k_accel = self._own.of("gyros"), self._own.of("accelerometers")
+        root = math.sqrt(since_s)
+        self._gyro = k_gyro * (noise.gyro_bias_sigma + noise.gyro_bias_walk * root)
+        self._accel = k_accel * (noise.accel_bias_sigma + noise.accel_bias_walk * root)
         more = mount.misalignment_sigma + mount.scale_sigma + mount.beam_scale_sigma
-        more += mount.scale_walk_density * math.sqrt(span)
-        self._share = self._own.speed_share + k * more
+        more += mount.scale_walk_density * root
+        wider = self._own.times.get("DVL", 1.0)
+        self._share = self._own.speed_share * wider + k * more
         imu = self._imu
         # Scale and axes of the gyros count with every turn, those of accelerometers with gravity.
-        self._gyro_share = k * (imu.gyro_scale_sigma + imu.gyro_misalignment_sigma)
-        self._gyro += 9.81 * k * imu.gyro_g_sensitivity_sigma
-        self._accel += 9.81 * k * (imu.accel_scale_sigma + imu.accel_misalignment_sigma)
-        self._steady = self._own.velocity_m_per_s + k * mount.drift.sigma
+        self._gyro_share = k_gyro * (imu.gyro_scale_sigma + imu.gyro_misalignment_sigma)
+        self._gyro += 9.81 * k_gyro * imu.gyro_g_sensitivity_sigma
+        self._accel += 9.81 * k_accel * (imu.accel_scale_sigma + imu.accel_misalignment_sigma)
+        self._steady = self._own.velocity_m_per_s * wider + k * mount.drift.sigma
+        self._gyro_noise = k_gyro * noise.gyro_density
+        self._accel_noise = k_accel * noise.accel_density
         self._late_s = k * mount.time_offset_sigma_s
         self._arm_m = 2.0 * k * mount.lever_arm_sigma
 
-    def go(self) -> Track:
-        start, k = self._start, self._own.sigmas
-        p_n = self._frame.p_n_from_geodetic(start.lat, start.lon, start.height)
-        R_nl = self._frame.R_nl_at(p_n)
-        self._g_n = self._frame.g_n_at(p_n)
-        R = R_nl @ R_lb_from_roll_pitch_heading(start.roll, start.pitch, start.heading)
-        self._tilt = k * float(np.max(start.attitude_sigma[:2]))
-        half = np.maximum(k * start.velocity_sigma_enu, _FLOOR_M_PER_S)
-        self._set = around_box(R_nl @ start.velocity_enu, half)
-        self._alarms: list[BoundAlarm] = []
-        self._n_beams = self._n_left_out = 0
-        self._silent_s, self._is_silent = 0.0, False
-        way, rotations = [np.zeros(3)], [R]
-        block = _Block(self._set.center)
-        blocks: list[_Row] = []
-        for n, dt in enumerate(self._dt):
-            gain = R @ self._gains[n]
-            R = self._earth[n] @ R @ self._turns[n]
-            block.turned += float(np.linalg.norm(self._theta[n]))
-            coriolis = 2.0 * np.cross(self._frame.omega_ie_n, block.velocity)
-            gain = gain + (self._g_n - coriolis) * dt
-            self._lead_on(gain, float(dt))
-            way.append(way[-1] + block.step(gain, float(dt)))
-            found = self._ping_at(n + 1, R, float(dt))
-            force = 9.81 * (self._tilt + self._gyro * block.span_s) + self._accel
-            if found is not None:
-                way[-1] = way[-1] + block.close(*found, force)
-            if self._ends[n + 1]:
-                block.leave_open(self._set)
-                blocks.append(self._finished(block, float(self._edge_s[n + 1])))
-                R = self._levelled(R, block)
-                block = _Block(block.velocity)
-            rotations.append(R)
-        return self._track(np.array(way), np.array(rotations), blocks)
+    def _drift(self, block: Block) -> float:
+        """Return by how much the attitude of a block may have tilted by now, rad.
 
-    def _lead_on(self, gain: Array, dt: float) -> None:
-        """Lead the set of velocities on by what the accelerometers gained (3,)."""
-        force = 9.81 * self._tilt + self._accel
-        white = self._own.sigmas * self._noise.accel_density * math.sqrt(dt)
-        half = (force * dt + white) * np.eye(3)
-        parts = np.concatenate([self._set.shape[None], segments(half)])
-        self._set = Ellipsoids(self._set.center + gain, sum_shape(parts))
+        A heading that is off takes what the Earth turns about another axis.
+        """
+        earth = float(np.linalg.norm(self._frame.omega_ie_n[:2])) * min(self._heading, 2.0)
+        steady = (self._gyro + earth) * block.span_s + self._gyro_share * block.turned
+        return steady + self._gyro_noise * math.sqrt(block.span_s)
 
-    def _ping_at(self, edge: int, R: Array, dt: float) -> tuple[Array, Array] | None:
+    def _lead_on(self) -> None:
+        """Lead the set of velocities on by what the accelerometers have gained since they were."""
+        if self._open_s == 0.0:
+            return
+        half = self._pushed + self._accel_noise * math.sqrt(self._open_s)
+        parts = np.concatenate([self._set.shape[None], segments(half * np.eye(3))])
+        self._set = Ellipsoids(self._set.center + self._gained, sum_shape(parts))
+        self._gained, self._pushed, self._open_s = np.zeros(3), 0.0, 0.0
+
+    def _ping_at(self, edge: int, R: Array, dt: float, tilt: float) -> tuple[Array, Array] | None:
         """Cut the set by a ping's beams; return the velocity (3,) and its covariance (3, 3)."""
         n = self._ping.get(edge)
-        used = [] if n is None else self._usable(n, R)
+        if n is not None:
+            self._lead_on()
+        used = [] if n is None else self._usable(n, R, tilt)
         if n is None or len(used) < 3:
             self._silence(edge, dt)
             return None
@@ -216,12 +276,12 @@ class _Blocks:
         weighted = (self._speed[n] - self._arm_speed[n])[used] / np.square(self._sigma[n][used])
         return np.asarray(C @ (H.T @ weighted)), C
 
-    def _usable(self, n: int, R: Array) -> list[int]:
+    def _usable(self, n: int, R: Array, tilt: float) -> list[int]:
         """Return the beams of ping n that miss neither each other nor the set; they cut it."""
         read = self._speed[n] - self._arm_speed[n]
         speed = float(np.linalg.norm(self._set.center))
-        bound = self._own.sigmas * self._sigma[n] + self._steady
-        bound = bound + (self._share + self._tilt) * speed
+        bound = self._own.of("DVL") * self._sigma[n] + self._steady
+        bound = bound + (self._share + tilt) * speed
         rows = self._beams[n] @ R.T
         off = np.abs(read - rows @ self._set.center)
         left = [int(b) for b in np.flatnonzero(np.isfinite(read))]
@@ -256,26 +316,26 @@ class _Blocks:
             by = f"for {self._silent_s:.0f} s its beams miss what inertial data allow"
             self._alarms.append(BoundAlarm(float(self._edge_s[edge]), "DVL", by))
 
-    def _finished(self, block: _Block, end_s: float) -> _Row:
+    def _finished(self, block: Block, end_s: float) -> BlockRow:
         """Return way, its bounds, turn, noise of the heading and mean speed's bound of a block."""
-        k, T = self._own.sigmas, block.span_s
-        since = end_s - self._edge_s[0]
-        angle = k * self._noise.gyro_density * math.sqrt(since)
+        k, T = self._own.of("DVL"), block.span_s
+        since = end_s - self.begin_s
+        angle = self._gyro_noise * math.sqrt(since)
         turn = self._gyro * T + self._gyro_share * block.turned
-        scatter = k * math.sqrt(float(np.linalg.eigvalsh(block.covariance)[-1]))
+        scatter = k * worst_sigma(block.covariance)
         steady = self._steady * T + self._share * block.path + self._arm_m
         steady += self._late_s * block.changed + block.curved + block.bent + scatter + block.unseen
-        tilt = self._tilt + turn
+        tilt = self._tilt + self._drift(block)
         level = steady + block.path * (0.5 * tilt**2 + angle + turn) + block.climbed * tilt
         up = steady + block.path * tilt
         bound = np.array([level, level, up])
-        speed = float(level / max(T, 1e-9))
-        return _Row(block.way, bound, turn, angle, end_s, speed, block.closing)
+        self._heading += turn
+        speed = float(max(level, up) / max(T, 1e-9))
+        return BlockRow(block.way, bound, turn, angle, end_s, speed, block.closing, tilt)
 
-    def _levelled(self, R: Array, block: _Block) -> Array:
+    def _levelled(self, R: Array, block: Block) -> Array:
         """Turn the attitude to where the accelerometers' gain is the change of the velocity."""
-        k = self._own.sigmas
-        drift = self._gyro * block.span_s + self._gyro_share * block.turned
+        drift = self._drift(block)
         self._tilt += drift
         if block.latest is None or block.first is None:
             return R
@@ -283,10 +343,10 @@ class _Blocks:
         if 0.5 * self._own.block_s > T:
             return R
         g = float(np.linalg.norm(self._g_n))
-        single = k * math.sqrt(float(np.linalg.eigvalsh(block.latest)[-1])) + self._steady
-        white = k * self._noise.accel_density * math.sqrt(T)
+        ends = self._own.of("DVL") * (worst_sigma(block.latest) + worst_sigma(block.earliest))
+        white = self._accel_noise * math.sqrt(T)
         changed = self._share * block.changed
-        tilt = ((2.0 * single + changed + white) / T + self._accel) / g
+        tilt = ((ends + 2.0 * self._steady + changed + white) / T + self._accel) / g
         tilt += drift
         if tilt >= self._tilt:
             return R
@@ -298,9 +358,9 @@ class _Blocks:
         self,
         way: Array,
         rotations: Array,
-        blocks: list[_Row],
+        blocks: list[BlockRow],
     ) -> Track:
-        advance, bound, turn, angle, end_s, speed, closing = (
+        advance, bound, turn, angle, end_s, speed, closing, tilt = (
             np.array(column) for column in zip(*blocks, strict=True)
         )
         at = np.searchsorted(self._edge_s, end_s)
@@ -317,72 +377,8 @@ class _Blocks:
             rotations,
             speed,
             closing,
+            tilt,
             tuple(self._alarms),
             self._n_beams,
             self._n_left_out,
         )
-
-
-class _Row(NamedTuple):
-    """What is left of a block; the order is that of the track's fields."""
-
-    way: Array
-    bound: Array
-    turn: float
-    angle: float
-    end_s: float
-    speed: float
-    closing: float
-
-
-class _Block:
-    """Sums over a block: from ping to ping by inertial data, bent so that both ends fit."""
-
-    def __init__(self, velocity: Array) -> None:
-        self.velocity = self.last = velocity
-        self.first: Array | None = None
-        self.latest: Array | None = None
-        self.way, self.gain, self.gain_to_ping = np.zeros(3), np.zeros(3), np.zeros(3)
-        self.covariance = np.zeros((3, 3))
-        self._pull: Array | None = None
-        self.since_first_s = 0.0
-        self.span_s = self.path = self.climbed = self.changed = self.curved = self.turned = 0.0
-        self.unseen = self.open_s = self.closing = self.bent = 0.0
-
-    def step(self, gain: Array, dt: float) -> Array:
-        """Add an interval of so much gain (3,) of velocity and return its way (3,)."""
-        middle = self.velocity + 0.5 * gain
-        self.velocity = self.velocity + gain
-        self.way, self.gain = self.way + middle * dt, self.gain + gain
-        self.path += float(np.linalg.norm(middle)) * dt
-        self.climbed += abs(float(middle[2])) * dt
-        self.changed += float(np.linalg.norm(gain))
-        if self._pull is not None:  # what the acceleration changes by bends the way within a step
-            self.curved += 0.125 * float(np.linalg.norm(gain - self._pull * dt)) * dt
-        self._pull = gain / dt
-        self.span_s, self.open_s = self.span_s + dt, self.open_s + dt
-        return np.asarray(middle * dt)
-
-    def close(self, velocity: Array, covariance: Array, force: float) -> Array:
-        """Bend the way since the last ping to the velocity of this one; return the correction.
-
-        ``force`` bounds the error of the acceleration, m/s^2: between two known velocities it
-        takes the way at most ``force T^2 / 4`` aside.
-        """
-        bend = 0.5 * (velocity - self.velocity) * self.open_s
-        self.way = self.way + bend
-        self.covariance += covariance * self.open_s**2
-        self.bent += 0.25 * force * self.open_s**2
-        self.closing = max(self.closing, float(np.linalg.norm(bend)))
-        if self.first is None:
-            self.first, self.gain = velocity, np.zeros(3)
-            self.since_first_s = self.span_s
-        self.gain_to_ping = self.gain
-        self.latest, self.last, self.velocity, self.open_s = covariance, velocity, velocity, 0.0
-        return np.asarray(bend)
-
-    def leave_open(self, velocities: Ellipsoids) -> None:
-        """Bound what is not known since the last ping, by the set of velocities."""
-        if self.open_s > 0.0:
-            off = np.max(np.abs(self.velocity - velocities.center) + velocities.half_widths)
-            self.unseen = float(off) * self.open_s

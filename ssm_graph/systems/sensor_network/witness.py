@@ -13,10 +13,12 @@ it. Bounds are so many sigmas of what the mission states. In blocks of some seco
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import ConfigError, DataError
@@ -27,30 +29,47 @@ from ssm_graph.filters.rules.set_membership import Sets, led_on, measured
 from ssm_graph.mission.mission import InitialState, Mission
 from ssm_graph.sensors.compass import HeadingLog
 from ssm_graph.systems.sensor_network.motion import planar_image
-from ssm_graph.systems.sensor_network.track import Track, velocity_track
+from ssm_graph.systems.sensor_network.track import Track, VelocityWalk, mission_edges
 
 _AXES: Final = np.eye(3)
 _RADIUS_M: Final = 6.37e6
 _FLOOR: Final = np.array([1e-3, 1e-3, 1e-6])
 """m, m, rad: half-widths that no cut goes below."""
+BOUNDED: Final = ("DVL", "GNSS", "depth", "compass", "gyros", "accelerometers")
+"""Whose bounds may be stated apart."""
 
 
 @dataclass(frozen=True, slots=True)
 class WitnessBounds:
-    """How far errors may go, in sigmas of what the mission states."""
+    """How far errors may go, in sigmas of what the mission states.
+
+    The bound of a vector is one of its length: so many of the sigma of its largest component.
+    """
 
     sigmas: float = 5.0
     """Of noise: a normal reading is beyond 5 once in two million."""
     block_s: float = 10.0
-    """Over which noise averages out: sums of noise are within as many of their own sigmas."""
+    """Over which noise averages out: the mean of n readings is within as many of its own sigmas.
+    What does not average out is the drift that the mission states."""
     velocity_m_per_s: float = 0.002
     """Of what is wrong with DVL velocities all the time, beside what the mission states."""
     speed_share: float = 0.002
     """The same as a share of the speed: scale and mounting."""
     silence_s: float = 5.0
     """Without a usable beam for so long, the alarm is given."""
+    times: Mapping[str, float] = field(default_factory=dict)
+    """By how much the bounds of a sensor of `BOUNDED` are wider than those, where they are."""
+
+    def of(self, sensor: str) -> float:
+        """Return how many sigmas bound a sensor of `BOUNDED`."""
+        return self.sigmas * self.times.get(sensor, 1.0)
 
     def __post_init__(self) -> None:
+        for sensor, times in self.times.items():
+            if sensor not in BOUNDED:
+                raise ConfigError(f"times: expected one of {', '.join(BOUNDED)}, got {sensor!r}")
+            if not (math.isfinite(times) and times > 0.0):
+                raise ConfigError(f"times of {sensor}: expected above 0, got {times}")
         for name in ("sigmas", "block_s", "silence_s"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
                 raise ConfigError(f"{name}: expected above 0, got {getattr(self, name)}")
@@ -131,20 +150,19 @@ def witness(mission: Mission, start: InitialState, bounds: WitnessBounds | None 
     own = bounds or WitnessBounds()
     if len(mission.dvl.of_ground().time_s) < 2:
         raise DataError("witness: expected two pings off the ground or more, got fewer")
-    track = velocity_track(mission, start, own)
-    return _Walk(mission, start, own, track).go()
+    walk = VelocityWalk(mission, start, own)
+    edges = mission_edges(mission, walk.begin_s, own.block_s)
+    return PlaceWalk(mission.frame, start, own).follow(mission, walk.follow(mission, edges))
 
 
-class _Walk:
-    """Place, heading and height from block to block."""
+class PlaceWalk:
+    """Place, heading and height from block to block, of a whole mission or piece by piece."""
 
-    def __init__(
-        self, mission: Mission, start: InitialState, own: WitnessBounds, track: Track
-    ) -> None:
-        self._mission, self._own, self._track = mission, own, track
-        self._frame: LocalFrame = mission.frame
+    def __init__(self, frame: LocalFrame, start: InitialState, own: WitnessBounds) -> None:
+        self._own, self.frame = own, frame
+        self._first_heading_s: float | None = None
         k = own.sigmas
-        p_n = self._frame.p_n_from_geodetic(start.lat, start.lon, start.height)
+        p_n = frame.p_n_from_geodetic(start.lat, start.lon, start.height)
         sigma = start.position_sigma_enu
         half = np.array(
             [
@@ -155,10 +173,11 @@ class _Walk:
         )
         self._sets = Sets.of_box(np.array([p_n[0], p_n[1], 0.0]), half, _FLOOR)
         self._up = (p_n[2] - k * sigma[2], p_n[2] + k * sigma[2])
-        self._alarms: list[BoundAlarm] = list(track.alarms)
 
-    def go(self) -> Witness:
-        track = self._track
+    def follow(self, mission: Mission, track: Track) -> Witness:
+        """Return the sets at the ends of a track's blocks; the next track goes on from there."""
+        self._mission, self._track = mission, track
+        self._alarms: list[BoundAlarm] = list(track.alarms)
         rows = []
         for i in range(len(track.time_s)):
             self._lead_on(i)
@@ -192,35 +211,43 @@ class _Walk:
         self._sets = led_on(self._sets, image)
         self._up = (self._up[0] + d[2] - bound[2], self._up[1] + d[2] + bound[2])
 
-    def _inside(self, time_s: Array, i: int) -> int | None:
-        """Return the last reading within block i, None without any."""
-        first = self._track.begin_s[i]
-        last = int(np.searchsorted(time_s, self._track.time_s[i], side="right")) - 1
-        return last if last >= 0 and time_s[last] > first else None
+    def _inside(self, time_s: Array, i: int) -> NDArray[np.intp]:
+        """Return the readings within block i."""
+        first, last = self._track.begin_s[i], self._track.time_s[i]
+        return np.arange(*np.searchsorted(time_s, [first, last], side="right"))
 
     def _fixes(self, i: int) -> None:
+        """Cut by the last fix of a block, and by the mean of all, whose noise averages out."""
         gnss = self._mission.gnss
-        row = None if gnss is None else self._inside(gnss.valid_s, i)
-        if gnss is None or row is None:
+        rows = self._inside(gnss.valid_s, i) if gnss else []
+        if gnss is None or len(rows) == 0:
             return
-        k = self._own.sigmas
-        fix = self._frame.p_n_from_geodetic(gnss.lat[row], gnss.lon[row], gnss.height[row])
-        arm, led, led_bound = self._track.led_to_end(i, float(gnss.valid_s[row]), gnss.lever_arm_b)
+        k, track = self._own.of("GNSS"), self._track
+        fix = self.frame.p_n_from_geodetic(gnss.lat[rows], gnss.lon[rows], gnss.height[rows])
+        arm, led, led_bound = track.led_to_end(i, gnss.valid_s[rows], gnss.lever_arm_b)
+        arm_m = float(np.linalg.norm(gnss.lever_arm_b))
         turned = float(np.max(np.abs([self._sets.low[2], self._sets.high[2]])))
-        slack = turned * (float(np.linalg.norm(led)) + float(np.linalg.norm(arm))) + led_bound
-        drift = k * gnss.calibration.drift.sigma
+        slack = turned * (np.linalg.norm(led, axis=1) + arm_m) + led_bound
+        slack += arm_m * float(track.noise_angle[i] + track.tilt_bound[i])
+        slack += k * gnss.calibration.drift.sigma
+        values, white = fix - arm + led, k * gnss.sigma_enu[rows]
         for axis, name in ((0, "east"), (1, "north")):
-            bound = k * float(gnss.sigma_enu[row, axis]) + slack + drift
-            value = float(fix[axis] - arm[axis] + led[axis])
-            self._cut(i, "GNSS", axis, value, bound, f"m to the {name}", 1.0)
+            unit = f"m to the {name}"
+            bound = float(white[-1, axis] + slack[-1])
+            held = self._cut(i, "GNSS", axis, float(values[-1, axis]), bound, unit, 1.0)
+            if held and len(rows) > 1:
+                bound = _of_mean(white[:, axis]) + float(slack.mean())
+                self._cut(i, "GNSS", axis, float(values[:, axis].mean()), bound, unit, 1.0)
 
     def _compass(self, i: int) -> None:
         log = self._mission.aids.get(HeadingLog)
-        row = None if log is None else self._inside(log.time_s, i)
-        if log is None or row is None:
+        rows = self._inside(log.time_s, i) if log else []
+        if log is None or len(rows) == 0:
             return
-        k, e = self._own.sigmas, log.errors
-        passed = float(log.time_s[row] - log.time_s[0])
+        row, k, e = rows[-1], self._own.of("compass"), log.errors
+        if self._first_heading_s is None:
+            self._first_heading_s = float(log.time_s[0])
+        passed = float(log.time_s[row]) - self._first_heading_s
         often = e.one_cycle_sigma + e.two_cycle_sigma
         more = e.offset_sigma + e.walk_sigma + e.rate_sigma * passed + math.sqrt(2.0) * often
         bound = k * (log.sigma + more) + float(self._track.noise_angle[i])
@@ -233,31 +260,44 @@ class _Walk:
 
     def _cut(
         self, i: int, sensor: str, axis: int, value: float, bound: float, unit: str, per: float
-    ) -> None:
+    ) -> bool:
+        """Cut the set by a reading; return whether the two have something in common."""
         low, high = float(self._sets.low[axis]), float(self._sets.high[axis])
         self._sets, missed = measured(self._sets, _AXES[axis], np.array(value), np.array(bound))
         if bool(missed):
             off = max(low - value - bound, value - bound - high, 0.0) * per
             by = f"{off:.2g} {unit} beyond what both bounds allow (±{bound * per:.2g})"
             self._alarms.append(BoundAlarm(float(self._track.time_s[i]), sensor, by))
+        return not missed
 
     def _depths(self, i: int) -> None:
-        log = self._mission.depth
-        row = None if log is None else self._inside(log.time_s, i)
-        if log is None or row is None:
+        """Cut by the last depth of a block, and by the mean of all."""
+        log, track = self._mission.depth, self._track
+        rows = self._inside(log.time_s, i) if log else []
+        if log is None or len(rows) == 0:
             return
-        k = self._own.sigmas
-        arm, led, led_bound = self._track.led_to_end(i, float(log.time_s[row]), log.lever_arm_b)
+        k, calibration = self._own.of("depth"), log.calibration
+        arm, led, led_bound = track.led_to_end(i, log.time_s[rows], log.lever_arm_b)
         x, y = np.maximum(np.abs(self._sets.low[:2]), np.abs(self._sets.high[:2]))
-        sagitta = (x**2 + y**2) / (2.0 * _RADIUS_M)
-        up = -float(log.true_depth[row]) - self._frame.height - float(arm[2] - led[2])
-        calibration = log.calibration
-        bound = k * (log.sigma + calibration.offset_sigma + calibration.drift.sigma)
-        bound += led_bound + 0.5 * sagitta
-        low = max(self._up[0], up - 0.5 * sagitta - bound)
-        high = min(self._up[1], up - 0.5 * sagitta + bound)
+        sagitta = float(x**2 + y**2) / (2.0 * _RADIUS_M)
+        up = -log.true_depth[rows] - self.frame.height - (arm - led)[:, 2] - 0.5 * sagitta
+        slack = led_bound + k * (calibration.offset_sigma + calibration.drift.sigma) + 0.5 * sagitta
+        slack += float(np.linalg.norm(log.lever_arm_b) * track.tilt_bound[i])
+        white = np.broadcast_to(k * log.sigma, up.shape)
+        if self._cut_up(i, float(up[-1]), float(white[-1] + slack[-1])) and len(rows) > 1:
+            self._cut_up(i, float(up.mean()), _of_mean(white) + float(slack.mean()))
+
+    def _cut_up(self, i: int, up: float, bound: float) -> bool:
+        """Cut the interval of heights; return whether something is left."""
+        low, high = max(self._up[0], up - bound), min(self._up[1], up + bound)
         if low > high:
             by = f"{low - high:.2g} m beyond what both bounds allow (±{bound:.2g})"
             self._alarms.append(BoundAlarm(float(self._track.time_s[i]), "depth", by))
-        else:
-            self._up = (low, high)
+            return False
+        self._up = (low, high)
+        return True
+
+
+def _of_mean(white: Array) -> float:
+    """Return the bound of a mean whose readings (n,) have independent errors of such bounds."""
+    return float(np.linalg.norm(white) / len(white))

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.cli.main import main
 from ssm_graph.filters.rules.ellipsoids import Ellipsoids
 from ssm_graph.systems.sensor_network.fleet import (
     SET_BYTES,
@@ -15,6 +18,7 @@ from ssm_graph.systems.sensor_network.fleet import (
     run_fleet,
     unpacked_set,
 )
+from ssm_graph.systems.sensor_network.fleet_study import read_fleet_study
 
 N = 1500
 
@@ -84,3 +88,50 @@ def test_a_fleet_of_one_is_refused() -> None:
         FleetSetting(n_vehicles=1)
     with pytest.raises(ConfigError, match="below 1, got 1"):
         FleetSetting(loss=1.0)
+
+
+SHORT = """
+name = "short"
+kind = "fleet"
+runs = 1
+seed = 3
+[fleet]
+n_steps = 30
+fix_every_s = 6
+[links]
+slot_s = 3
+loss = 0.2
+"""
+
+
+def test_the_command_writes_page_table_and_figure(tmp_path: Path) -> None:
+    """From file to results, errors at the corners of their bounds among them."""
+    path, out = tmp_path / "fleet.toml", tmp_path / "out"
+    path.write_text(SHORT)
+    assert main(["network", str(path), "--out", str(out)]) == 0
+    rows = [line.split(",") for line in (out / "table.csv").read_text().splitlines()]
+    column = {name: i for i, name in enumerate(rows[0])}
+    assert [row[:2] for row in rows[1:]] == [
+        [errors, heard] for errors in ("uniform", "corners") for heard in ("nothing", "ranges")
+    ]
+    excess = [float(row[column["largest_excess"]]) for row in rows[1:]]
+    assert 0.99 < max(excess[2:]) <= 1.0 + 1e-9
+    assert "outside in 0 of 480 checks" in (out / "summary.md").read_text()
+    assert (out / "figures" / "fleet.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('kind = "fleet"', 'kind = "flee"', "kind: expected one of network, fleet, got 'flee'"),
+        ("slot_s = 3", "slots = 3", "did you mean 'slot_s'"),
+        ("loss = 0.2", "loss = 1.2", "loss: expected"),
+        ("n_steps = 30", "n_vehicles = 1", "n_vehicles: expected"),
+    ],
+)
+def test_bad_studies_are_refused(old: str, new: str, said: str, tmp_path: Path) -> None:
+    """With the file, what was expected and what came."""
+    path = tmp_path / "bad.toml"
+    path.write_text(SHORT.replace(old, new))
+    with pytest.raises(ConfigError, match=f"bad.toml.*{said}"):
+        read_fleet_study(path)
