@@ -173,7 +173,7 @@ HEADER: Final = (
 
 def is_found(row: Row) -> bool:
     """Whether a dive's start was declared, and is within three of its sigmas (in the plane)."""
-    return row["verdict"] == Verdict.CONVERGED.name and row["begin_sigmas"] <= PLANE_3_SIGMA
+    return bool(row["verdict"] == Verdict.CONVERGED.name and row["begin_sigmas"] <= PLANE_3_SIGMA)
 
 
 PLANE_3_SIGMA: Final = 3.44
@@ -182,7 +182,7 @@ PLANE_3_SIGMA: Final = 3.44
 
 def is_wrong(row: Row) -> bool:
     """Whether a start was declared that is none: farther off than three sigmas."""
-    return row["verdict"] == Verdict.CONVERGED.name and not is_found(row)
+    return bool(row["verdict"] == Verdict.CONVERGED.name and not is_found(row))
 
 
 def summary(rows: Mapping[Key, Row]) -> list[tuple[str, ...]]:
@@ -200,7 +200,7 @@ def _line(terrain: str, grade: str, rows: Sequence[Row]) -> tuple[str, ...]:
 
     def share(happened: list[bool]) -> str:
         found = rate_with_interval(happened)
-        return f"{100.0 * found.rate:.1f} % ({100.0 * found.low:.1f} to {100.0 * found.high:.1f})"
+        return f"{100.0 * found.value:.1f} % ({100.0 * found.low:.1f} to {100.0 * found.high:.1f})"
 
     def number(values: list[float], q: float) -> str:
         values = [v for v in values if np.isfinite(v)]

@@ -29,6 +29,7 @@ from ssm_graph.systems.seabed.simulate import (
     mission_with_map,
     simulate_dive,
 )
+from ssm_graph.systems.seabed.study import keys_of, summary
 from ssm_graph.systems.seabed.terrain import (
     FLAT,
     ROUGH,
@@ -293,3 +294,18 @@ def test_flat_ground_leaves_the_answer_without_the_map() -> None:
     assert not found.estimate.status.is_good
     assert "flat: unresolved" in found.estimate.reason
     assert without_map(mission).aids.get(TerrainLog) is None
+
+
+def test_summary_of_a_study() -> None:
+    """A declared start outside its three sigmas is wrong; grades take turns in the keys."""
+    base = {"begin_m": 1.0, "particles_s": 90.0, "cpu_s": 2.0, "verdict": "CONVERGED"}
+    sigmas = {0: 1.0, 1: 3.4, 2: 3.5}
+    rows = {("rough", "MEMS", seed): {**base, "begin_sigmas": s} for seed, s in sigmas.items()}
+    rows["rough", "MEMS", 3] = {**base, "begin_sigmas": 90.0, "verdict": "UNRESOLVED"}
+    one, every = summary(rows)
+    assert one[1:4] == ("mems", "4", "3")
+    assert one[4].startswith("50.0 %")
+    assert one[5].startswith("25.0 %")
+    assert every[1] == "all"
+    keys = keys_of(4)
+    assert [key[1] for key in keys if key[0] == "rough"] == [grade.name for grade in Grade]
