@@ -354,6 +354,7 @@ def add_integrity(parser: argparse.ArgumentParser) -> None:
         usual.missed_detection,
     )
 
+
     group.add_argument(
         "--witness",
         action="store_true",

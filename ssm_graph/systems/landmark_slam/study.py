@@ -22,7 +22,7 @@ from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.units import DEGREE
 from ssm_graph.study.ledger import Key, Row
-from ssm_graph.systems.landmark_slam.filtered import first_values
+from ssm_graph.systems.landmark_slam.filtered import filtered, first_values
 from ssm_graph.systems.landmark_slam.filters import MapFilter
 from ssm_graph.systems.landmark_slam.graphs import graph_of_problem
 from ssm_graph.systems.landmark_slam.incremental import (
@@ -30,7 +30,7 @@ from ssm_graph.systems.landmark_slam.incremental import (
     IncrementalSettings,
     smooth_incrementally,
 )
-from ssm_graph.systems.landmark_slam.methods import FILTERS, INCREMENTAL, SMOOTHERS, check_method
+from ssm_graph.systems.landmark_slam.methods import INCREMENTAL, FILTERS, SMOOTHERS, check_method
 from ssm_graph.systems.landmark_slam.models import Bicycle
 from ssm_graph.systems.landmark_slam.noise import estimate_noise
 from ssm_graph.systems.landmark_slam.problem import SlamNoise, SlamProblem
