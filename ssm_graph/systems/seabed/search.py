@@ -89,7 +89,8 @@ class Stiff:
     @property
     def heights(self) -> Array:
         """(K, B) at which beams end above the ellipsoid, m; 0 where there is none."""
-        return np.asarray(np.nan_to_num(self.track.height[:, None] + self.track.ends[..., 2]))
+        found: Array = np.nan_to_num(self.track.height[:, None] + self.track.ends[..., 2])
+        return found
 
     def _bias(self, error: Array, weight: Array) -> Array:
         """Return what the map is too low by (n,), from errors and information (n, K, B)."""
