@@ -63,6 +63,12 @@ Of a ROS bag, topics are found by their type:
 imu and dvl have to be there; from usbl on they are read where --topic names them and the vehicle
 has the section. What messages do not say, noise, lever arms and mounting, comes from
 --vehicle, or is assumed; every assumption is printed as a note. More in docs/ros2.md.
+
+examples:
+  ssm-graph convert dive.bag --vehicle vehicle.toml --topic dvl=/dvl/data --out MISSION
+  ssm-graph convert 00000042.BIN --out MISSION
+  ssm-graph convert --map map.toml imu.csv dvl.csv gps.csv --out MISSION
+  ssm-graph convert imu.csv survey.PD0 --vehicle vehicle.toml --out MISSION
 """
 
 

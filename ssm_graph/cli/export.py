@@ -23,6 +23,11 @@ Heights are above the WGS-84 ellipsoid, local metres along east, north and up of
 UTM metres in its zone. Body axes of tum, kitti, csv and mcap are forward, left,
 up (REP 103). Times from 2001 on are taken for Unix time; of other clocks say --epoch where a format
 needs UTC. In Python: ``sg.export_track(sg.track_of(sg.read_results("result")), "kml", path)``.
+
+examples:
+  ssm-graph export RESULT --format kml,geopackage,csv
+  ssm-graph export RESULT --format sbet --rate 100 --epoch 2026-05-01T10:00:00Z
+  ssm-graph export RESULT --format csv --at photos.csv --point camera
 """
 
 

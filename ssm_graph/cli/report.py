@@ -23,9 +23,13 @@ if TYPE_CHECKING:
 
 DESCRIPTION = """\
 Write one page about a result: the verdict in words first, the track with its uncertainty, height,
-speed and attitude with linked axes of time to zoom in, weights and innovations of all beams and
-aids, their whiteness, calibration, faults, what was assumed, versions and settings. The file holds
-all it shows: it opens without a network, on a phone too, and prints. Needs the extra 'report'.
+altitude, speed and attitude with linked axes of time to zoom in, errors against a reference where
+there is one, weights and innovations of all beams and aids, their whiteness, calibration, faults,
+what was assumed, versions and settings. The file holds all it shows: it opens without a network, on
+a phone too, and prints. Needs the extra 'report'.
+
+example:
+  ssm-graph report RESULT --open
 """
 
 

@@ -60,7 +60,9 @@ def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
     parser.add_argument("input", type=Path, metavar="INPUT", help="folder or graph")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="result folder")
-    number_option(parser, "--robot", "N", "of a MRCLAM folder, 1 to 5, or of a PyFG file, 1 is A", kind=int)
+    number_option(
+        parser, "--robot", "N", "of a MRCLAM folder, 1 to 5, or of a PyFG file, 1 is A", kind=int
+    )
     parser.add_argument(
         "--method",
         default="smoother",

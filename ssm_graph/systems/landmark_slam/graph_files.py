@@ -72,7 +72,9 @@ def read_pose_graph(path: Path, *, robot: int | None = None) -> tuple[SlamGraph,
         try:
             _take(read, words[0], words[1:], path.suffix)
         except (ValueError, IndexError, np.linalg.LinAlgError) as error:
-            raise DataError(f"{path}:{number}: {_complaint(words[0], error)}; got {text!r}") from None
+            raise DataError(
+                f"{path}:{number}: {_complaint(words[0], error)}; got {text!r}"
+            ) from None
     return _graph(path, read, robot if is_pyfg else None, is_pyfg)
 
 

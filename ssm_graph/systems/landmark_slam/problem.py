@@ -150,7 +150,9 @@ class SlamProblem(ReadOnlyArrays):
         left = np.clip(np.searchsorted(kept, k, side="right") - 1, 0, len(kept) - 2)
         begin, end = kept[left], kept[left + 1]
         found = composed(pose[left], between(by_odometry[begin], by_odometry))
-        missed = pose[left + 1] - composed(pose[left], between(by_odometry[begin], by_odometry[end]))
+        missed = pose[left + 1] - composed(
+            pose[left], between(by_odometry[begin], by_odometry[end])
+        )
         missed[:, 2] = half_turn(missed[:, 2])
         found += ((k - begin) / (end - begin))[:, None] * missed
         found[:, 2] = half_turn(found[:, 2])

@@ -116,9 +116,7 @@ class Witnessed:
         )
         if said.outside and told.health is Health.GOOD:
             confidence = min(told.confidence, 0.4)
-            return replace(
-                told, health=Health.DEGRADED, reason=said.outside, confidence=confidence
-            )
+            return replace(told, health=Health.DEGRADED, reason=said.outside, confidence=confidence)
         return told
 
     def found(self) -> Found:

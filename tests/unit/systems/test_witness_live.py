@@ -209,12 +209,12 @@ def test_over_a_gap_of_inertial_data_it_begins_anew(simulated: SimulatedMission)
     """No bound holds over it."""
     imu = simulated.mission.imu
     kept = (imu.time_s < 15.0) | (imu.time_s > 16.5)
-    gap = replace(
-        imu, time_s=imu.time_s[kept], gyro_b=imu.gyro_b[kept], accel_b=imu.accel_b[kept]
-    )
+    gap = replace(imu, time_s=imu.time_s[kept], gyro_b=imu.gyro_b[kept], accel_b=imu.accel_b[kept])
     live = Witnessed(TruthTeller(simulated))
     told = [m for m in messages_of(simulated.mission) if not isinstance(m, ImuSample)]
-    samples = [m for m in messages_of(replace(simulated.mission, imu=gap)) if isinstance(m, ImuSample)]
+    samples = [
+        m for m in messages_of(replace(simulated.mission, imu=gap)) if isinstance(m, ImuSample)
+    ]
     for message in sorted(told + samples, key=lambda m: m.time_s):
         live.push(message)
     kinds = [event.kind for event in live.take_events()]
