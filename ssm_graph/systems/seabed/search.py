@@ -95,7 +95,7 @@ class Stiff:
     def _bias(self, error: Array, weight: Array) -> Array:
         """Return what the map is too low by (n,), from errors and information (n, K, B)."""
         prior = 1.0 / max(self.errors.bias_sigma_m, 0.01) ** 2
-        return (weight * error).sum(axis=(1, 2)) / (prior + weight.sum(axis=(1, 2)))
+        return np.asarray((weight * error).sum(axis=(1, 2)) / (prior + weight.sum(axis=(1, 2))))
 
     def _robust_bias(self, error: Array, sigma_sq: Array, share: Array) -> tuple[Array, Array]:
         """Return the bias (n,) and similarity weights (n, K, B) that agree with each other."""

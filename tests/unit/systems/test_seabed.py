@@ -20,6 +20,7 @@ from ssm_graph.mission.mission import LocalStart
 from ssm_graph.sensors.seabed import MapErrors, SeabedGrid, TerrainLog
 from ssm_graph.simulation import Grade
 from ssm_graph.smoothers.settings import SmootherConfig
+from ssm_graph.study.ledger import Key, Row
 from ssm_graph.systems.seabed.dive import find_start, is_in_doubt, smooth_dive, without_map
 from ssm_graph.systems.seabed.locate import Located, Verdict, locate
 from ssm_graph.systems.seabed.simulate import (
@@ -300,7 +301,9 @@ def test_summary_of_a_study() -> None:
     """A declared start outside its three sigmas is wrong; grades take turns in the keys."""
     base = {"begin_m": 1.0, "particles_s": 90.0, "cpu_s": 2.0, "verdict": "CONVERGED"}
     sigmas = {0: 1.0, 1: 3.4, 2: 3.5}
-    rows = {("rough", "MEMS", seed): {**base, "begin_sigmas": s} for seed, s in sigmas.items()}
+    rows: dict[Key, Row] = {
+        ("rough", "MEMS", seed): {**base, "begin_sigmas": s} for seed, s in sigmas.items()
+    }
     rows["rough", "MEMS", 3] = {**base, "begin_sigmas": 90.0, "verdict": "UNRESOLVED"}
     one, every = summary(rows)
     assert one[1:4] == ("mems", "4", "3")
