@@ -89,7 +89,8 @@ exit codes:
   1    a defect of this program
   2    a wrong option or setting, a missing extra
   3    the data of a mission cannot be used; the message says where and why
-  4    locate: the lane is not known; seabed: the place is not known; visual: no scale, or one that has to be doubted;
+  4    locate: the lane is not known; seabed: the place is not known; visual: no scale, or one that
+       has to be doubted;
        smooth or filter ended with a result that must not be trusted blindly (iteration limit,
        interrupted after the first iteration, run away, or the data contradict it); it is written
        all the same, and its status says so; online: ended in order, the last answer was not good;

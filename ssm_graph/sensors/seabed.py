@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import ClassVar, Final, NamedTuple, Self
+from dataclasses import dataclass
+from typing import ClassVar, Final, NamedTuple
 
 import numpy as np
 from scipy.ndimage import map_coordinates
@@ -143,10 +143,6 @@ class SeabedGrid(FrozenArrays):
         slope_x = ((part * along_x[..., None, :]).sum(-1) * of_y).sum(-1) / self.cell_m
         slope_y = (over_x * along_y).sum(-1) / self.cell_m
         return Surface((over_x * of_y).sum(-1), np.stack([slope_x, slope_y], axis=-1))
-
-    def moved(self, frame: LocalFrame) -> Self:
-        """Return the same raster as one about another origin, for a start without a place."""
-        return replace(self, frame=frame)
 
     def relief(self, x_y: Array, half_m: float) -> float:
         """Return the standard deviation of the heights within a square, its plane taken off, m."""

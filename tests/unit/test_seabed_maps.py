@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.projection import utm
+from ssm_graph.io.seabed.raster import plane_of
 from ssm_graph.io.seabed.read import read_seabed
 
 LAT, LON = np.radians(59.3), np.radians(17.8)
@@ -97,8 +99,6 @@ def write_utm(path: Path) -> None:
     middle = utm(np.array([LAT]), np.array([LON]), of=(float(LAT), float(LON)))
     east = float(middle.easting[0]) + np.arange(-35, 36) * 10.0
     north = float(middle.northing[0]) + np.arange(-32, 33) * 10.0
-    from ssm_graph.io.seabed.raster import plane_of
-
     assert middle.zone == 33
     lat, lon = plane_of("EPSG:32633", "").inverse(*np.meshgrid(east, north))
     values = -depth_at(np.degrees(lat), np.degrees(lon))
@@ -117,8 +117,8 @@ def write_utm(path: Path) -> None:
         ("utm.tif", write_utm),
     ],
 )
-def test_heights_of_every_format(name: str, write, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
-    """Within 2 cm at places between the cells, above the ellipsoid, the datum taken into account."""
+def test_heights_of_every_format(name: str, write: Callable[[Path], None], tmp_path: Path) -> None:
+    """Within 2 cm between the cells, above the ellipsoid, the datum taken into account."""
     write(tmp_path / name)
     grid = read_seabed(tmp_path / name, FRAME, datum_m=20.0)
     rng = np.random.default_rng(1)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Final, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factors.terrain_range import beam_ends, terrain_residual
 from ssm_graph.base.frozen import Array
@@ -42,7 +43,7 @@ class TerrainRanges(Aid):
     cell_factor: Array
     """(M,) by how much the variance of a cell counts more: several pings meet the same one"""
     apart: Array
-    """(M, B - 1) how the beam's own part of what is off follows from that of all beams' differences"""
+    """(M, B - 1) what of the beams' differences is each one's own part of what the map is off by"""
     sigma: Array
     """(M,) m, of the height, where the states last were"""
     grid: SeabedGrid
@@ -152,7 +153,7 @@ def differences(n_beams: int) -> Array:
     return np.linalg.svd(np.ones((1, n_beams)))[2][1:].T
 
 
-def above_seabed(grid: SeabedGrid, point_n: Array) -> tuple[Array, Array, Array]:
+def above_seabed(grid: SeabedGrid, point_n: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Return how high points (..., 3) are above the map, how that grows, and where it is known."""
     lat, lon, height = grid.frame.geodetic_from_p_n(point_n)
     surface = grid.surface_at(point_n[..., 0], point_n[..., 1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,11 +23,16 @@ def read_geotiff(path: Path) -> Raster:
     """Read the first band; raise :class:`DataError` for one that has no place."""
     from PIL import Image, UnidentifiedImageError
 
-    Image.MAX_IMAGE_PIXELS = None
     try:
-        with Image.open(path) as image:
+        with warnings.catch_warnings(), Image.open(path) as image:
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             tags: Any = getattr(image, "tag_v2", {})
             values = np.array(image, dtype=np.float64)
+    except Image.DecompressionBombError as error:
+        raise DataError(
+            f"{path.name}: expected a map of at most 179 million cells, got more; cut out the "
+            "mission's place, with  gdalwarp -te"
+        ) from error
     except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
         raise DataError(
             f"{path.name}: expected a TIFF of one band of numbers, got {error}"
@@ -48,8 +54,8 @@ def read_geotiff(path: Path) -> Raster:
     return Raster(
         path.name,
         f"EPSG:{code}" if code else "",
-        west + dx * (np.arange(n_x) + middle),
-        north - dy * (np.arange(n_y)[::-1] + middle),
+        np.asarray(west + dx * (np.arange(n_x) + middle)),
+        np.asarray(north - dy * (np.arange(n_y)[::-1] + middle)),
         values[::-1],
     )
 

@@ -58,9 +58,7 @@ def _of_hdf(path: Path) -> Variables:
     try:
         import h5py
     except ImportError as error:
-        raise MissingExtraError(
-            f"{path.name}: NetCDF 4 needs h5py; install it by  pip install 'ssm-graph[map]'"
-        ) from error
+        raise MissingExtraError("h5py", extra="map", purpose=f"{path.name}, NetCDF 4,") from error
     found = {}
     with h5py.File(path, "r") as file:
         for name, variable in file.items():

@@ -66,7 +66,13 @@ def read_ascii_grid(path: Path) -> Raster:
     values = np.where(values == header.get("nodata_value", -9999.0), np.nan, values)
     west = header.get("xllcenter", header.get("xllcorner", 0.0) + 0.5 * dx)
     south = header.get("yllcenter", header.get("yllcorner", 0.0) + 0.5 * dy)
-    return Raster(path.name, "", west + dx * np.arange(n_x), south + dy * np.arange(n_y), values)
+    return Raster(
+        path.name,
+        "",
+        np.asarray(west + dx * np.arange(n_x)),
+        np.asarray(south + dy * np.arange(n_y)),
+        values,
+    )
 
 
 def _number(word: str, path: Path, line: int) -> float:
@@ -100,7 +106,8 @@ def read_xyz(path: Path) -> Raster:
     names; they are parted by blanks, commas, semicolons or tabs.
     """
     columns = {"x": 0, "y": 1, "z": 2, "sigma": 3}
-    rows, named = [], False
+    rows: list[list[float]] = []
+    named = False
     for number, line in enumerate(path.read_text("utf-8-sig", errors="replace").split("\n"), 1):
         words = line.replace(",", " ").replace(";", " ").split()
         if not words or words[0].startswith("#"):

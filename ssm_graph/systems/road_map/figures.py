@@ -108,7 +108,7 @@ def _hypotheses(axes: Axes, road_map: RoadMap, found: Located) -> None:
         _arrow(axes, np.array(hypothesis.pose), ESTIMATE if number == 0 else REDUCED, "")
         axes.annotate(
             f"{100.0 * hypothesis.share:.1f} %",
-            hypothesis.pose[:2],
+            (hypothesis.pose[0], hypothesis.pose[1]),
             fontsize=6.5,
             color=INK,
             xytext=(3, 3),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -108,13 +107,15 @@ def smooth_dive(
     """
     located: Located | None = None
     track: Track | None = None
-    more: dict[str, Callable[..., None] | ProblemConfig | None] = {
-        "problem_config": problem_config,
-        "on_iteration": on_iteration,
-        "on_stage": on_stage,
-    }
     if is_in_doubt(mission):
-        found = find_start(mission, config=config, seed=seed, **more)  # type: ignore[arg-type]
+        found = find_start(
+            mission,
+            config=config,
+            problem_config=problem_config,
+            on_iteration=on_iteration,
+            on_stage=on_stage,
+            seed=seed,
+        )
         located, track = found.located, found.track
         assert located is not None
         said = f"seabed: {located.verdict.name}: {located.reason}"
@@ -124,7 +125,13 @@ def smooth_dive(
             estimate = replace(found.estimate, status=Status.SUSPECT, reason=reason)
             return Dive(located, track, mission, estimate)
         mission = replace(found.mission, notes=(*mission.notes, said))
-    estimate = smooth(mission, config, **more)  # type: ignore[arg-type]
+    estimate = smooth(
+        mission,
+        config,
+        problem_config=problem_config,
+        on_iteration=on_iteration,
+        on_stage=on_stage,
+    )
     return Dive(located, track, mission, estimate)
 
 

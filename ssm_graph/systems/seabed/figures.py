@@ -85,7 +85,7 @@ def _window(places: list[Array], margin_m: float) -> tuple[Array, Array]:
 
 def _particles(axes: Axes, grid: SeabedGrid, found: Located, truth: Array | None) -> None:
     circle = found.middle + np.array([[-1.0, -1.0], [1.0, 1.0]]) * found.radius_m
-    _chart(axes, grid, *_window([found.ends, circle], 0.3 * _MARGIN_M))
+    _chart(axes, grid, *_window([found.way, circle], 0.3 * _MARGIN_M))
     picked = np.unique(np.linspace(0, len(found.snapshots) - 1, len(_COLOURS)).astype(int))
     for colour, row in zip(_COLOURS, picked, strict=False):
         when, states = found.snapshots[row]
@@ -104,20 +104,20 @@ def _particles(axes: Axes, grid: SeabedGrid, found: Located, truth: Array | None
 def _places(axes: Axes, grid: SeabedGrid, found: Located, truth: Array | None) -> None:
     told = found.hypotheses[:8]
     starts = np.array([h.pose[:2] for h in told])
-    _chart(axes, grid, *_window([found.ends, starts], _MARGIN_M))
+    _chart(axes, grid, *_window([found.way, starts], _MARGIN_M))
     for number, h in enumerate(told):
         colour = ESTIMATE if number == 0 else REDUCED
         axes.plot(*h.pose[:2], "o", color=colour, markersize=5.0 if number == 0 else 3.5, zorder=5)
         axes.annotate(
             _percent(h.share),
-            h.pose[:2],
+            (h.pose[0], h.pose[1]),
             fontsize=6.5,
             color=INK,
             xytext=(4, 3),
             textcoords="offset points",
             zorder=6,
         )
-    axes.plot(*found.ends.T, color=ESTIMATE, linewidth=1.4, label="way from the best place")
+    axes.plot(*found.way.T, color=ESTIMATE, linewidth=1.4, label="way from the best place")
     if truth is not None:
         axes.plot(*truth.T, "--", color=REFERENCE, linewidth=1.0, label="truth")
     dress(axes, title="Places of the start, with evidence", x="east (m)", y="north (m)")
@@ -160,7 +160,7 @@ def _errors(axes: Axes, found: Located, truth: Array | None) -> None:
     if truth is not None:
         error = np.hypot(*(t.x_y - truth).T)
         axes.plot(t.time_s, error, color=ESTIMATE, label="error, particles")
-        best = np.hypot(*(found.ends - truth).T)
+        best = np.hypot(*(found.way - truth).T)
         axes.plot(t.time_s, best, color=REFERENCE, label="error of the way from the best place")
     axes.set_yscale("log")
     dress(axes, title="Error and sigma", x="time (s)", y="m")

@@ -19,10 +19,9 @@ from ssm_graph.systems.seabed.locator import (
     Locator,
     LocatorSettings,
     first_particles,
-    turned,
 )
 from ssm_graph.systems.seabed.search import SAME_M, Fit, search
-from ssm_graph.systems.seabed.track import Track
+from ssm_graph.systems.seabed.track import Track, way_from
 
 _SPACING_M: Final = 2.0
 """Pings closer to each other are passed over: the next one sees the same."""
@@ -86,7 +85,7 @@ class Located:
     track: ParticleTrack
     snapshots: tuple[tuple[float, Array], ...]
     """Particles (n, 2), m, at a few times, s"""
-    ends: Array
+    way: Array
     """(N, 2) the vehicle's way from the best place, m"""
     middle: Array
     radius_m: float
@@ -138,7 +137,7 @@ def locate(
         bias_m=float(fit.bias[0]),
         track=followed,
         snapshots=snapshots,
-        ends=way_from(track, np.array(found[0].pose)[None])[0],
+        way=way_from(track, np.array(found[0].pose)[None])[0],
         middle=middle,
         radius_m=radius_m,
         cpu_s=time.process_time() - begin_s,
@@ -149,7 +148,7 @@ def _spaced(track: Track) -> Track:
     """Return the pings that are some way apart, the first and the last among them."""
     cell = np.floor(np.cumsum(track.way_m) / _SPACING_M)
     kept = np.flatnonzero(np.diff(cell, prepend=-1.0) > 0)
-    return track.rows(np.union1d(kept, [0, len(track.time_s) - 1]))
+    return track.part(np.union1d(kept, [0, len(track.time_s) - 1]))
 
 
 def _typical_slope(grid: SeabedGrid, middle: Array, half_m: float) -> float:
@@ -200,15 +199,6 @@ def _begins(particles: Particles, track: Track) -> Array:
     at[:, 2] = p[rows, YAW] - at[:, 3] * span_s
     at[:, :2] = p[rows, :2] - way_from(track, at)[:, -1]
     return at
-
-
-def way_from(track: Track, at: Array) -> Array:
-    """Return the ways (n, N, 2) from places (n, 4) at the first ping, m."""
-    since = track.time_s - track.time_s[0]
-    yaw = at[:, 2, None] + at[:, 3, None] * since
-    steps = turned(np.diff(track.x_y, axis=0), 0.5 * (yaw[:, 1:] + yaw[:, :-1]))
-    way = np.concatenate([np.zeros((len(at), 1, 2)), np.cumsum(steps, axis=1)], axis=1)
-    return np.asarray(at[:, None, :2] + way)
 
 
 def _judge(

@@ -12,7 +12,7 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.base.units import DEGREE
 from ssm_graph.filters.rules.particles import Particles, drawn_anew
 from ssm_graph.sensors.seabed import MapErrors, SeabedGrid
-from ssm_graph.systems.seabed.track import Counted, Doubt, Track, counted
+from ssm_graph.systems.seabed.track import Counted, Doubt, Track, counted, turned
 
 X, Y, YAW, RATE, UP, UP_VAR = range(6)
 """Columns of a particle: m, m, rad and rad/s by which the dead reckoning's heading is too small and
@@ -118,13 +118,6 @@ class Locator:
         total = (share * KERNEL.similarity(t) + lost).sum(axis=1)
         total -= 0.5 * ((bias - mean) ** 2 / variance + np.log(variance * information))[:, 0]
         return np.asarray(total)
-
-
-def turned(x_y: Array, yaw: Array) -> Array:
-    """Return vectors (..., 2), east and north, turned clockwise by angles (...), rad."""
-    c, s = np.cos(yaw), np.sin(yaw)
-    east, north = x_y[..., 0], x_y[..., 1]
-    return np.stack([c * east + s * north, c * north - s * east], axis=-1)
 
 
 def first_particles(

@@ -14,10 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.filters.rules.hypotheses import Hypothesis, apart_from_each_other, told
+from ssm_graph.filters.rules.hypotheses import (
+    Hypothesis,
+    Same,
+    apart_from_each_other,
+    told,
+)
 from ssm_graph.sensors.seabed import MapErrors, SeabedGrid
-from ssm_graph.systems.seabed.locator import KERNEL, OFF_MAP, turned
-from ssm_graph.systems.seabed.track import Track, counted
+from ssm_graph.systems.seabed.locator import KERNEL, OFF_MAP
+from ssm_graph.systems.seabed.track import Track, counted, turned, turns_of, way_from
 
 SAME_M: Final = 12.0
 """Places closer to each other at the begin and at the end are one."""
@@ -32,6 +37,8 @@ _POINTS: Final = 2_000_000
 _ROUNDS: Final = 12
 _FIRST_M: Final = 15.0
 """A fit begins as if the map were blurred by so much, and halves it from round to round."""
+_ANY_TURN: Final = 12.0 / (2.0 * np.pi) ** 2
+"""1/rad^2, of an angle of which nothing is known"""
 _WIDEST: Final = 2.5
 """Sigmas of the heading's turn and drift that are tried."""
 
@@ -65,7 +72,7 @@ class Stiff:
     def of(cls, grid: SeabedGrid, errors: MapErrors, track: Track, n_pings: int) -> Stiff:
         """Return a track, thinned to so many pings."""
         n = len(track.time_s)
-        part = track.rows(np.unique(np.linspace(0, n - 1, min(n, n_pings)).astype(int)))
+        part = track.part(np.unique(np.linspace(0, n - 1, min(n, n_pings)).astype(int)))
         seen = [counted(grid, errors, part, row) for row in range(len(part.time_s))]
         heard = np.isfinite(part.ends[..., 2])
         share = np.where(heard, np.array([s.share for s in seen]), 0.0)
@@ -75,24 +82,20 @@ class Stiff:
 
     def ends_at(self, at: Array) -> tuple[Array, Array]:
         """Return where beams end (n, K, B, 2) from places (n, 4), and the vehicle (n, K, 2), m."""
-        since = self.track.time_s - self.track.time_s[0]
-        yaw = at[:, 2, None] + at[:, 3, None] * since
-        middle = 0.5 * (yaw[:, 1:] + yaw[:, :-1])
-        steps = turned(np.diff(self.track.x_y, axis=0), middle)
-        way = np.concatenate([np.zeros((len(at), 1, 2)), np.cumsum(steps, axis=1)], axis=1)
-        vehicle = at[:, None, :2] + way
+        vehicle, yaw = way_from(self.track, at), turns_of(self.track, at)
         ends = np.nan_to_num(self.track.ends[..., :2])
         return vehicle[:, :, None] + turned(ends, yaw[:, :, None]), vehicle
 
     @property
     def heights(self) -> Array:
         """(K, B) at which beams end above the ellipsoid, m; 0 where there is none."""
-        return np.nan_to_num(self.track.height[:, None] + self.track.ends[..., 2])
+        found: Array = np.nan_to_num(self.track.height[:, None] + self.track.ends[..., 2])
+        return found
 
     def _bias(self, error: Array, weight: Array) -> Array:
         """Return what the map is too low by (n,), from errors and information (n, K, B)."""
         prior = 1.0 / max(self.errors.bias_sigma_m, 0.01) ** 2
-        return (weight * error).sum(axis=(1, 2)) / (prior + weight.sum(axis=(1, 2)))
+        return np.asarray((weight * error).sum(axis=(1, 2)) / (prior + weight.sum(axis=(1, 2))))
 
     def _robust_bias(self, error: Array, sigma_sq: Array, share: Array) -> tuple[Array, Array]:
         """Return the bias (n,) and similarity weights (n, K, B) that agree with each other."""
@@ -164,8 +167,10 @@ class Stiff:
         information = np.einsum("nkb,nkbi,nkbj->nij", counts, rows, rows)
         gradient = np.einsum("nkb,nkbi->ni", counts * left, rows)
         doubt = self.track.doubt
+        # A turn that is not known at all is somewhere in the circle.
+        turn = max(doubt.yaw**-2, _ANY_TURN)
         own = [1e-8, 1e-8, doubt.yaw**-2, doubt.rate**-2, max(self.errors.bias_sigma_m, 0.01) ** -2]
-        information += np.diag(own)
+        information += np.diag([*own[:2], turn, *own[3:]])
         gradient += np.column_stack([np.zeros((len(at), 2)), at[:, 2:], np.zeros(len(at))]) * own
         gradient[:, 4] += own[4] * bias
         t = np.where(known, np.square(left) / self.sigma_sq, OFF_MAP)
@@ -203,7 +208,7 @@ def search(
     """
     whole = Stiff.of(grid, errors, track, _FINE_PINGS)
     since = track.time_s - track.time_s[0]
-    first = Stiff.of(grid, errors, track.rows(since <= _COARSE_S), _COARSE_PINGS)
+    first = Stiff.of(grid, errors, track.part(since <= _COARSE_S), _COARSE_PINGS)
     at = _everywhere(first, middle, radius_m)
     value = first.coarse(at, slope * _COARSE_M)
     rows = apart_from_each_other(value, _same_begin(at), _KEPT)
@@ -253,7 +258,9 @@ def _trials(sigma: float, step: float) -> Array:
     return np.zeros(1) if n <= 0 else np.linspace(-_WIDEST * sigma, _WIDEST * sigma, 2 * n + 1)
 
 
-def _same_begin(at: Array):  # type: ignore[no-untyped-def]
+def _same_begin(at: Array) -> Same:
+    """Return what says which places (n, 4) begin together."""
+
     def is_same(best: int, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
         gap = np.hypot(*(at[rows, :2] - at[best, :2]).T)
         return np.asarray(gap < 1.6 * _COARSE_M)

@@ -38,6 +38,8 @@ FIRST_HELD_OUT: Final = 1000
 """Settings were chosen on seeds below 100 only."""
 IMU_HZ: Final = 50.0
 PING_S: Final = 2.0
+LONG_PING_S: Final = 4.0
+"""Of dives, and of long missions"""
 GRAPH: Final = ProblemConfig(keyframe_interval_s=PING_S)
 SMOOTHED: Final = 5
 """Of so many dives one is smoothed on the map as well."""
@@ -45,18 +47,18 @@ SMOOTHED: Final = 5
 
 def dive_of(terrain: str, grade: str, seed: int, duration_s: float = 600.0) -> SimulatedDive:
     """Return a dive of the study; the same key gives the same one."""
-    mission = _mission(grade, seed, duration_s)
+    mission = _mission(grade, seed, duration_s, PING_S)
     return simulate_dive(DiveSettings(mission=mission, terrain=TERRAINS[terrain]))
 
 
-def _mission(grade: str, seed: int, duration_s: float) -> SimulationConfig:
+def _mission(grade: str, seed: int, duration_s: float, ping_s: float) -> SimulationConfig:
     return replace(
         DIVE,
         seed=seed,
         grade=Grade[grade],
         imu_rate_hz=IMU_HZ,
         duration_s=duration_s,
-        dvl=replace(DIVE.dvl, rate_hz=1.0 / PING_S),
+        dvl=replace(DIVE.dvl, rate_hz=1.0 / ping_s),
     )
 
 
@@ -75,7 +77,7 @@ def trial(key: Key) -> Row:
         "reason": located.reason,
         "begin_m": float(np.hypot(*off)),
         "begin_sigmas": float(np.sqrt(off @ np.linalg.solve(located.cov[:2, :2], off))),
-        "end_m": float(np.hypot(*(located.ends[-1] - truth[1]))),
+        "end_m": float(np.hypot(*(located.way[-1] - truth[1]))),
         "particles_m": float(np.hypot(*(located.track.x_y[-1] - truth[1]))),
         "particles_s": settled_s(located),
         "cpu_s": located.cpu_s,
@@ -120,12 +122,13 @@ def drift_trial(key: Key) -> Row:
     """Do one long mission whose start is known: with the map and without."""
     terrain, grade, seed, hours = str(key[0]), str(key[1]), int(key[2]), float(key[3])
     terrain_settings = replace(TERRAINS[terrain], side_m=6000.0)
-    mission = _mission(grade, seed, 3600.0 * hours)
+    mission = _mission(grade, seed, 3600.0 * hours, LONG_PING_S)
     dive = simulate_dive(DiveSettings(mission=mission, terrain=terrain_settings, start_m=0.0))
     known = mission_with_map(dive)
     row: dict[str, Any] = {}
     for name, one in (("with", known), ("without", without_map(known))):
-        estimate = smooth(one, SmootherConfig(), problem_config=GRAPH)
+        graph = ProblemConfig(keyframe_interval_s=LONG_PING_S)
+        estimate = smooth(one, SmootherConfig(), problem_config=graph)
         assert one.reference is not None
         scored = evaluate(estimate.trajectory, one.reference)
         row |= {
@@ -170,7 +173,7 @@ HEADER: Final = (
 
 def is_found(row: Row) -> bool:
     """Whether a dive's start was declared, and is within three of its sigmas (in the plane)."""
-    return row["verdict"] == Verdict.CONVERGED.name and row["begin_sigmas"] <= PLANE_3_SIGMA
+    return bool(row["verdict"] == Verdict.CONVERGED.name and row["begin_sigmas"] <= PLANE_3_SIGMA)
 
 
 PLANE_3_SIGMA: Final = 3.44
@@ -179,7 +182,7 @@ PLANE_3_SIGMA: Final = 3.44
 
 def is_wrong(row: Row) -> bool:
     """Whether a start was declared that is none: farther off than three sigmas."""
-    return row["verdict"] == Verdict.CONVERGED.name and not is_found(row)
+    return bool(row["verdict"] == Verdict.CONVERGED.name and not is_found(row))
 
 
 def summary(rows: Mapping[Key, Row]) -> list[tuple[str, ...]]:
@@ -197,7 +200,7 @@ def _line(terrain: str, grade: str, rows: Sequence[Row]) -> tuple[str, ...]:
 
     def share(happened: list[bool]) -> str:
         found = rate_with_interval(happened)
-        return f"{100.0 * found.rate:.1f} % ({100.0 * found.low:.1f} to {100.0 * found.high:.1f})"
+        return f"{100.0 * found.value:.1f} % ({100.0 * found.low:.1f} to {100.0 * found.high:.1f})"
 
     def number(values: list[float], q: float) -> str:
         values = [v for v in values if np.isfinite(v)]

@@ -18,9 +18,10 @@ _REACH_M = 0.25
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TerrainSettings(checked.Settings):
-    """A seabed: a plane and on it a Gaussian field with the spectrum of J. A. Goff and T. H. Jordan.
+    """A seabed: a plane and on it a Gaussian field with the spectrum of Goff and Jordan.
 
-    "Stochastic modeling of seafloor morphology", J. Geophys. Res. 93, 1988: the power of a
+    J. A. Goff, T. H. Jordan, "Stochastic modeling of seafloor morphology", J. Geophys. Res. 93,
+    1988: the power of a
     wavenumber k falls as ``(k^2 + k0^2)^-(H + 1)`` with the Hurst number H, which is 0.7 to 1 on
     real seafloors, and ``k0 = 2 pi / corner_m``.
     """
@@ -124,15 +125,14 @@ def met(truth: SeabedGrid, from_n: Array, along_n: Array, longest_m: float) -> A
     for far in np.arange(0.5 * truth.cell_m, longest_m, 0.5 * truth.cell_m):
         if not is_open.any():
             break
-        is_above = above(np.full(shape, far))
-        hit = is_open & (is_above <= 0.0)
-        high[hit] = far
-        low[is_open & (is_above > 0.0)] = far
-        is_open &= is_above > 0.0  # beyond the edge nothing is: NaN ends the ray
+        there = above(np.full(shape, far))
+        high[is_open & (there <= 0.0)] = far
+        low[is_open & (there > 0.0)] = far
+        is_open &= there > 0.0  # beyond the edge nothing is: NaN ends the ray
     while np.nanmax(high - low, initial=0.0) > _REACH_M:
         middle = 0.5 * (low + high)
-        is_above = above(middle) > 0.0
-        low, high = np.where(is_above, middle, low), np.where(is_above, high, middle)
+        higher = above(middle) > 0.0
+        low, high = np.where(higher, middle, low), np.where(higher, high, middle)
     at_low, at_high = above(low), above(high)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(low + (high - low) * at_low / (at_low - at_high))

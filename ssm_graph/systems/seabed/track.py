@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import DataError
@@ -51,7 +52,7 @@ class Track(FrozenArrays):
     way_m: Array = shaped("N")
     """(N,) since the ping before, m"""
 
-    def rows(self, kept: slice | Array) -> Track:
+    def part(self, kept: slice | NDArray[Any]) -> Track:
         """Return some of the pings; the ways between them are added up."""
         total = np.cumsum(self.way_m)[kept]
         columns = {n: getattr(self, n)[kept] for n in ("time_s", "x_y", "height", "ends", "sigma")}
@@ -113,6 +114,29 @@ _SCALE: Final = 0.003
 """Of a DVL whose scale was not calibrated."""
 _WALK: Final = 0.05
 """m/sqrt(s): beams of 0.02 m/s at some pings a second, and more than that of a good DVL."""
+
+
+def turned(x_y: Array, yaw: Array) -> Array:
+    """Return vectors (..., 2), east and north, turned clockwise by angles (...), rad."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    east, north = x_y[..., 0], x_y[..., 1]
+    return np.stack([c * east + s * north, c * north - s * east], axis=-1)
+
+
+def way_from(track: Track, at: Array) -> Array:
+    """Return the ways (n, N, 2) of the vehicle from places (n, 4) at the first ping, m.
+
+    A place is x and y, and by how much the heading is to be turned there and every second more.
+    """
+    yaw = turns_of(track, at)
+    steps = turned(np.diff(track.x_y, axis=0), 0.5 * (yaw[:, 1:] + yaw[:, :-1]))
+    way = np.concatenate([np.zeros((len(at), 1, 2)), np.cumsum(steps, axis=1)], axis=1)
+    return np.asarray(at[:, None, :2] + way)
+
+
+def turns_of(track: Track, at: Array) -> Array:
+    """Return by how much headings are to be turned (n, N) from places (n, 4), rad."""
+    return np.asarray(at[:, 2, None] + at[:, 3, None] * (track.time_s - track.time_s[0]))
 
 
 class Counted(NamedTuple):

@@ -124,7 +124,7 @@ def test_two_roads_alike_are_ambiguous() -> None:
     assert "rival" in found.reason
 
 
-def error_of(pose: tuple[float, float, float], drive: Drive) -> float:
+def error_of(pose: tuple[float, ...], drive: Drive) -> float:
     """Return how far across a pose is."""
     assert drive.truth is not None
     return apart(drive.truth.at(drive.curves.time_s[-1:])[0], np.array(pose))[0]

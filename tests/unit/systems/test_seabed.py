@@ -20,9 +20,9 @@ from ssm_graph.mission.mission import LocalStart
 from ssm_graph.sensors.seabed import MapErrors, SeabedGrid, TerrainLog
 from ssm_graph.simulation import Grade
 from ssm_graph.smoothers.settings import SmootherConfig
+from ssm_graph.study.ledger import Key, Row
 from ssm_graph.systems.seabed.dive import find_start, is_in_doubt, smooth_dive, without_map
 from ssm_graph.systems.seabed.locate import Located, Verdict, locate
-from ssm_graph.systems.seabed.locator import turned
 from ssm_graph.systems.seabed.simulate import (
     DIVE,
     DiveSettings,
@@ -30,6 +30,7 @@ from ssm_graph.systems.seabed.simulate import (
     mission_with_map,
     simulate_dive,
 )
+from ssm_graph.systems.seabed.study import keys_of, summary
 from ssm_graph.systems.seabed.terrain import (
     FLAT,
     ROUGH,
@@ -39,7 +40,7 @@ from ssm_graph.systems.seabed.terrain import (
     seabed,
     surveyed,
 )
-from ssm_graph.systems.seabed.track import Doubt, Track
+from ssm_graph.systems.seabed.track import Doubt, Track, turned
 
 FRAME = LocalFrame(0.8, 0.2, 0.0)
 BEAMS = np.array([[1, 1, -1.7], [1, -1, -1.7], [-1, -1, -1.7], [-1, 1, -1.7]])
@@ -56,7 +57,7 @@ def ground(settings: TerrainSettings, seed: int = 0) -> tuple[SeabedGrid, Seabed
 
 
 def dived(truth: SeabedGrid, doubt: Doubt = DOUBT) -> tuple[Track, Array]:
-    """Return a dead-reckoned dive of 500 m that began elsewhere, turned by 2 degrees; and its way."""
+    """Return a dead-reckoned dive of 500 m from elsewhere, turned by 2 degrees; and its way."""
     s = np.arange(0.0, 500.0, 3.0)
     way = np.column_stack([-150.0 + 0.6 * s, -100.0 + 60.0 * np.sin(s / 90.0)])
     from_n = np.broadcast_to(
@@ -88,14 +89,14 @@ def test_rays_meet_a_plane_where_it_is() -> None:
     """Within a centimetre of the closed form; none meets what is too far or beyond the edge."""
     x, y = np.meshgrid(np.arange(-300.0, 301.0, 5.0), np.arange(-300.0, 301.0, 5.0))
     flat = LocalFrame(0.8, 0.2, 0.0)
-    lat, lon, height = flat.geodetic_from_p_n(np.stack([x, y, -70.0 + 0.1 * x - 0.2 * y], axis=-1))
+    _, _, height = flat.geodetic_from_p_n(np.stack([x, y, -70.0 + 0.1 * x - 0.2 * y], axis=-1))
     plane = SeabedGrid("plane", flat, -300.0, -300.0, 5.0, height)
     from_n = np.broadcast_to([10.0, 20.0, -30.0], BEAMS.shape)
     # z0 + r uz = -70 + 0.1 (x0 + r ux) - 0.2 (y0 + r uy)
     want = (-70.0 + 1.0 - 4.0 + 30.0) / (BEAMS @ [-0.1, 0.2, 1.0])
     np.testing.assert_allclose(met(plane, from_n, BEAMS, 200.0), want, atol=0.01)
     assert np.isnan(met(plane, from_n, BEAMS, 40.0)).all()
-    assert np.isnan(met(plane, from_n + [285.0, 0.0, 0.0], BEAMS, 200.0)[:2]).all()
+    assert np.isnan(met(plane, from_n + np.array([285.0, 0.0, 0.0]), BEAMS, 200.0)[:2]).all()
 
 
 def test_grid_between_its_cells() -> None:
@@ -170,7 +171,7 @@ def test_flat_ground_is_said_to_be_flat() -> None:
     for settings in (FLAT, replace(FLAT, slope=(0.03, -0.04))):
         truth, chart, errors = ground(settings)
         track, way = dived(truth)
-        found = found_on(chart, errors, track.rows(slice(0, None, 5)), way[0] + [60.0, -80.0])
+        found = found_on(chart, errors, track.part(slice(0, None, 5)), way[0] + [60.0, -80.0])
         assert found.verdict is Verdict.UNRESOLVED
         assert found.reason.startswith("flat: unresolved")
 
@@ -294,3 +295,20 @@ def test_flat_ground_leaves_the_answer_without_the_map() -> None:
     assert not found.estimate.status.is_good
     assert "flat: unresolved" in found.estimate.reason
     assert without_map(mission).aids.get(TerrainLog) is None
+
+
+def test_summary_of_a_study() -> None:
+    """A declared start outside its three sigmas is wrong; grades take turns in the keys."""
+    base = {"begin_m": 1.0, "particles_s": 90.0, "cpu_s": 2.0, "verdict": "CONVERGED"}
+    sigmas = {0: 1.0, 1: 3.4, 2: 3.5}
+    rows: dict[Key, Row] = {
+        ("rough", "MEMS", seed): {**base, "begin_sigmas": s} for seed, s in sigmas.items()
+    }
+    rows["rough", "MEMS", 3] = {**base, "begin_sigmas": 90.0, "verdict": "UNRESOLVED"}
+    one, every = summary(rows)
+    assert one[1:4] == ("mems", "4", "3")
+    assert one[4].startswith("50.0 %")
+    assert one[5].startswith("25.0 %")
+    assert every[1] == "all"
+    keys = keys_of(4)
+    assert [key[1] for key in keys if key[0] == "rough"] == [grade.name for grade in Grade]
