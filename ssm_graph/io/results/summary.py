@@ -12,6 +12,7 @@ from typing import Any, Final, Protocol
 
 import numpy as np
 
+from ssm_graph.base.errors import DataError
 from ssm_graph.base.settings import written
 from ssm_graph.io.mission_folder.toml import (
     INITIAL_KEYS,
@@ -227,3 +228,26 @@ def _final(trajectory: Trajectory) -> dict[str, Any]:
         "velocity_sigma_m_per_s": trajectory.velocity_sigma_enu[-1],
         "attitude_sigma_deg": np.rad2deg(trajectory.attitude_sigma[-1]),
     }
+
+
+_KINDS: Final[Mapping[str, type]] = {
+    **dict.fromkeys(("final", "start", "calibration", "noise", "aids", "current"), dict),
+    **dict.fromkeys(("inside_3_sigma", "settings", "versions", "inputs"), dict),
+    **dict.fromkeys(("faults", "history", "notes", "mission_notes"), list),
+    **dict.fromkeys(("duration_s", "total_path_length_m", "rmse_horizontal_m"), float),
+    **dict.fromkeys(("n_beams", "n_outliers"), int),
+}
+"""Of what a summary says, where it says it."""
+_CALLED: Final = {dict: "an object", list: "a list", float: "a number", int: "a whole number"}
+
+
+def check_summary(summary: Mapping[str, Any], path: Path) -> None:
+    """Raise :class:`DataError` where a summary that was read says something of another kind."""
+    for name, kind in _KINDS.items():
+        value = summary.get(name)
+        is_whole = kind is float and isinstance(value, int)
+        if value is not None and not isinstance(value, kind) and not is_whole:
+            raise DataError(
+                f"{path}: key {name!r}: expected {_CALLED[kind]}, got {str(value)[:40]!r}; was it "
+                "edited?"
+            )

@@ -26,7 +26,7 @@ from ssm_graph.base.units import DEG_PER_H, MICRO_G
 from ssm_graph.io.mission_folder.folder import CALIBRATION_NAME, calibration_toml
 from ssm_graph.io.results.place import DRAWN, FIGURE_NAME, SUMMARY_NAME, check_is_for_results
 from ssm_graph.io.results.states import STATES_NAME, states_bytes
-from ssm_graph.io.results.summary import MetricsLike, build_summary
+from ssm_graph.io.results.summary import MetricsLike, build_summary, check_summary
 from ssm_graph.io.tables import csv_tables
 from ssm_graph.io.tables.append_file import TORN_ROW, AppendFile, write_through
 from ssm_graph.mission.estimate import (
@@ -43,15 +43,6 @@ TRAJECTORY_NAME: Final = "trajectory.csv"
 BEAMS_NAME: Final = "beams.csv"
 PROTECTION_NAME: Final = "protection.csv"
 AIDS_NAME: Final = "aids.csv"
-_KINDS: Final[Mapping[str, type]] = {
-    **dict.fromkeys(("final", "start", "calibration", "noise", "aids", "current"), dict),
-    **dict.fromkeys(("inside_3_sigma", "settings", "versions", "inputs"), dict),
-    **dict.fromkeys(("faults", "history", "notes", "mission_notes"), list),
-    **dict.fromkeys(("duration_s", "total_path_length_m", "rmse_horizontal_m"), float),
-    **dict.fromkeys(("n_beams", "n_outliers"), int),
-}
-"""Of what a summary says, where it says it."""
-_CALLED: Final = {dict: "an object", list: "a list", float: "a number", int: "a whole number"}
 Columns = dict[str, tuple[Array, str]]
 """Values of every column and the format of a cell."""
 
@@ -184,14 +175,7 @@ def read_results(folder: Path | str) -> Results:
         raise DataError(f"{folder / SUMMARY_NAME}: expected valid JSON: {error}") from error
     if not isinstance(summary, dict):
         raise DataError(f"{folder / SUMMARY_NAME}: expected a JSON object at the top")
-    for name, kind in _KINDS.items():
-        value = summary.get(name)
-        is_whole = kind is float and isinstance(value, int)
-        if value is not None and not isinstance(value, kind) and not is_whole:
-            raise DataError(
-                f"{folder / SUMMARY_NAME}: key {name!r}: expected {_CALLED[kind]}, got "
-                f"{str(value)[:40]!r}; was it edited?"
-            )
+    check_summary(summary, folder / SUMMARY_NAME)
     return Results(
         folder=folder,
         trajectory=_read_table(folder / TRAJECTORY_NAME, TRAJECTORY_COLUMNS),

@@ -246,8 +246,8 @@ class StampClock:
         if self._is_steady:
             if now.steady_s - self._clock.set_at_s > FOLLOWS_S:
                 self._others_s = ()
-            shifts = (self._shift_s, *self._others_s)
-            return min(shifts, key=lambda one: self._misfit(stamp_s - one, now))
+            known = (self._shift_s, *self._others_s)
+            return min(known, key=lambda one: self._misfit(stamp_s - one, now))
         if self._is_known(stamp_s - self._shift_s, now):
             return self._shift_s
         fitting = (x for x in self._others_s if self._is_known(stamp_s - x, now))
