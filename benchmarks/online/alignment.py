@@ -19,7 +19,7 @@ from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator import FixedLagSmoother
 from ssm_graph.live.estimator.intake import Intake
-from ssm_graph.live.estimator.smoother import pack_buffers
+from ssm_graph.live.estimator.packing import pack_buffers
 from ssm_graph.live.estimator.start import MOST_MS, SHARE
 from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.navigation import Health

@@ -3,28 +3,32 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import astuple, replace
 from typing import Any, Final, Self
 
 import numpy as np
 
-from factors.inertial import Intervals
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.times import MIN_SPACING_S
-from ssm_graph.engine.states import States
 from ssm_graph.live.estimator.answers import Delayed, answer, delayed_of, found_by
-from ssm_graph.live.estimator.buffers import Buffers
 from ssm_graph.live.estimator.course import REACH_S, Course, Step
 from ssm_graph.live.estimator.guard import Guardian
 from ssm_graph.live.estimator.intake import Intake
 from ssm_graph.live.estimator.keyframes import KeyframeMaker
+from ssm_graph.live.estimator.packing import (
+    pack_buffers,
+    pack_step,
+    part_of,
+    unpack_buffers,
+    unpack_step,
+)
 from ssm_graph.live.estimator.recovery import ASTRAY_TIMES, Reserve, is_astray
 from ssm_graph.live.estimator.separation import IntegrityConfig
 from ssm_graph.live.estimator.start import Starter, not_calibrated, sensors_of_vehicle
 from ssm_graph.live.estimator.tail import Tail
-from ssm_graph.live.estimator.watch import Contradicted, Watch
+from ssm_graph.live.estimator.watch import Watch
 from ssm_graph.mission.estimate import Found
 from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.mission import Mission
@@ -34,7 +38,6 @@ from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.sensors.messages import Message
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors
-from ssm_graph.smoothers.track import Stretch, pack_judged, unpack_judged
 from ssm_graph.smoothers.window import FixedLagConfig, Window
 
 ONLINE: Final = FixedLagConfig(
@@ -278,7 +281,7 @@ class FixedLagSmoother:
             packed = arrays, meta["watch"], sensors, smoother.config
             window, watch, left, reserve = unpack_step(*packed, inertial)
             guardian = smoother._guardian(sensors)
-            guard = guardian.unpack(_part(arrays, "guard_"), smoother._known, window)
+            guard = guardian.unpack(part_of(arrays, "guard_"), smoother._known, window)
             step = Step(window, watch, left, reserve, guard)
             smoother._made = course = smoother._course_from(step, guardian)
             course.advance()
@@ -382,75 +385,3 @@ class FixedLagSmoother:
             for settled in course.take_settled(all_of_them=all_of_them)
             if len(settled.stretch.time_s)
         ]
-
-
-def pack_buffers(buffers: Buffers) -> dict[str, Array]:
-    """Return all rows that were received and kept."""
-    return {f"rows_{section}": rows.all.copy() for section, rows in buffers.rows.items()}
-
-
-def unpack_buffers(arrays: Mapping[str, Array], buffers: Buffers) -> None:
-    """Fill empty buffers."""
-    for section, rows in buffers.rows.items():
-        for row in arrays[f"rows_{section}"]:
-            rows.add(row)
-
-
-def pack_step(step: Step) -> tuple[dict[str, Array], dict[str, Any]]:
-    """Return arrays of the window and of what left it, and the plain numbers of the watch."""
-    arrays = {f"window_{name}": array for name, array in step.window.pack().items()}
-    if step.left is not None:
-        states = {f"states_{k}": v for k, v in step.left.states._asdict().items()}
-        others = {k: v for k, v in step.left._asdict().items() if k not in ("states", "aids")}
-        aids = dict(pack_judged(step.left.aids))
-        arrays |= {f"left_{name}": array for name, array in {**states, **others, **aids}.items()}
-    arrays |= {f"reserve_{name}": array for name, array in step.reserve.pack()}
-    return arrays, {name: _plain(value) for name, value in step.watch._asdict().items()}
-
-
-def unpack_step(
-    arrays: Mapping[str, Array],
-    watch: Mapping[str, Any],
-    sensors: Sensors,
-    config: FixedLagConfig,
-    inertial: Callable[[float, float], Intervals],
-) -> tuple[Window, Watch, Stretch | None, Reserve]:
-    """Return the step that was packed; ``inertial`` is that of the keyframes' maker."""
-    window = Window.unpack(_part(arrays, "window_"), sensors, config, inertial)
-    reserve = Reserve.unpack(_part(arrays, "reserve_"))
-    return window, _watch(watch), _left(_part(arrays, "left_"), sensors), reserve
-
-
-def _part(arrays: Mapping[str, Array], prefix: str) -> dict[str, Array]:
-    return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
-
-
-def _watch(plain: Mapping[str, Any]) -> Watch:
-    numbers: dict[str, Any] = {
-        name: float(value) if isinstance(value, str) and name != "trouble" else value
-        for name, value in plain.items()
-    }
-    numbers["beam_weights"] = tuple(float(weight) for weight in plain["beam_weights"])
-    numbers["moved"] = tuple(plain["moved"])
-    if plain["contradicted"] is not None:
-        since_s, text, reckoned_n, sigma = plain["contradicted"]
-        numbers["contradicted"] = Contradicted(since_s, text, tuple(reckoned_n), sigma)
-    return Watch(**numbers)
-
-
-def _left(arrays: Mapping[str, Array], sensors: Sensors) -> Stretch | None:
-    """Return what had left the window with the step."""
-    if "time_s" not in arrays:
-        return None
-    states = States(*(arrays[f"states_{name}"] for name in States._fields))
-    aids = unpack_judged(arrays, sensors.aids, prefix="")
-    others: dict[str, Any] = {n: arrays[n] for n in Stretch._fields if n not in ("states", "aids")}
-    others["beam"] = others["beam"].astype(np.intp)
-    return Stretch(states=states, aids=aids, **others)
-
-
-def _plain(value: Any) -> Any:
-    """Return a number that JSON can hold: infinite ones and NaN as text."""
-    if isinstance(value, tuple):
-        return [_plain(v) for v in value]
-    return str(value) if isinstance(value, float) and not np.isfinite(value) else value
