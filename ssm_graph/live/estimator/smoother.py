@@ -107,13 +107,9 @@ class FixedLagSmoother:
         return self._intake.shift_s
 
     def received(self, begin_s: float, end_s: float) -> Mission | None:
-        """Return what was accepted between two times of the states' clock, and is still kept.
-
-        Beside the readings of the lag there is nothing; None before there is a place on Earth.
-        """
-        if self._frame is None:
-            return None
-        return self._intake.buffers.mission(self._frame, begin_s=begin_s, until_s=end_s)
+        """Return what is kept of between two times of the states, None before there is a frame."""
+        frame, kept = self._frame, self._intake.buffers
+        return None if frame is None else kept.mission(frame, begin_s=begin_s, until_s=end_s)
 
     def push(self, message: Message) -> None:
         """Take one message; nothing that it may hold raises."""

@@ -72,10 +72,9 @@ class Track(ReadOnlyArrays):
     n_left_out: int
 
     def led_to_end(self, i: int, time_s: Array, arm_b: Array) -> tuple[Array, Array, Array]:
-        """Return lever arms (n, 3) at times (n,), and the ways (n, 3) from then to the end of
-        block i, m.
+        """Return lever arms (n, 3) at times (n,), and the ways from then to the end of block i.
 
-        The third (n,) bounds the error of the ways.
+        The ways (n, 3) are in m; the third (n,) bounds their error.
         """
         at = np.minimum(np.searchsorted(self.edge_s, time_s), len(self.edge_s) - 1)
         end = int(np.searchsorted(self.edge_s, self.time_s[i]))

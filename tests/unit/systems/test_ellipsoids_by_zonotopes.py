@@ -88,7 +88,9 @@ def test_what_is_left_of_a_box_stays_inside(case: int) -> None:
             return
         ours, exact = cut, left
         spans = rng.standard_normal((2, N)) * 0.3
-        ours = Ellipsoids(ours.center, sum_shape(np.concatenate([ours.shape[None], segments(spans)])))
+        ours = Ellipsoids(
+            ours.center, sum_shape(np.concatenate([ours.shape[None], segments(spans)]))
+        )
         exact = zonoopt.minkowski_sum(exact, zonoopt.Zono(csc_matrix(spans.T), np.zeros(N)))
         share = inside(exact, ours, rng)
         if share is None:
