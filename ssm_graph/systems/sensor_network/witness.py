@@ -35,6 +35,7 @@ _AXES: Final = np.eye(3)
 _RADIUS_M: Final = 6.37e6
 _FLOOR: Final = np.array([1e-3, 1e-3, 1e-6])
 """m, m, rad: half-widths that no cut goes below."""
+_NOTHING: Final = np.arange(0)
 BOUNDED: Final = ("DVL", "GNSS", "depth", "compass", "gyros", "accelerometers")
 """Whose bounds may be stated apart."""
 
@@ -219,7 +220,7 @@ class PlaceWalk:
     def _fixes(self, i: int) -> None:
         """Cut by the last fix of a block, and by the mean of all, whose noise averages out."""
         gnss = self._mission.gnss
-        rows = self._inside(gnss.valid_s, i) if gnss else []
+        rows = self._inside(gnss.valid_s, i) if gnss else _NOTHING
         if gnss is None or len(rows) == 0:
             return
         k, track = self._own.of("GNSS"), self._track
@@ -241,7 +242,7 @@ class PlaceWalk:
 
     def _compass(self, i: int) -> None:
         log = self._mission.aids.get(HeadingLog)
-        rows = self._inside(log.time_s, i) if log else []
+        rows = self._inside(log.time_s, i) if log else _NOTHING
         if log is None or len(rows) == 0:
             return
         row, k, e = rows[-1], self._own.of("compass"), log.errors
@@ -273,7 +274,7 @@ class PlaceWalk:
     def _depths(self, i: int) -> None:
         """Cut by the last depth of a block, and by the mean of all."""
         log, track = self._mission.depth, self._track
-        rows = self._inside(log.time_s, i) if log else []
+        rows = self._inside(log.time_s, i) if log else _NOTHING
         if log is None or len(rows) == 0:
             return
         k, calibration = self._own.of("depth"), log.calibration
