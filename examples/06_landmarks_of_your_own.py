@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ssm_graph.systems.landmark_slam.filtered import filtered, values_of
+from ssm_graph.systems.landmark_slam.filtered import filtered, first_values
 from ssm_graph.systems.landmark_slam.noise import estimate_noise
 from ssm_graph.systems.landmark_slam.problem import SlamNoise
 from ssm_graph.systems.landmark_slam.simulator import CASES, Sigmas, World, simulate
@@ -25,8 +25,9 @@ def main() -> None:
     stated = SlamNoise(Sigmas().control, Sigmas().observation)
 
     online = filtered(problem, stated, "ekf-weighted")
-    smoothed = smooth_landmarks(problem, stated, values_of(online))
-    learnt = estimate_noise(problem, stated, values_of(online))
+    first = first_values(problem, stated)
+    smoothed = smooth_landmarks(problem, stated, first)
+    learnt = estimate_noise(problem, stated, first)
     for name, answer in (("filter", online), ("smoother", smoothed), ("learnt", learnt.estimate)):
         error = np.linalg.norm(answer.pose[:, :2] - path.pose[:, :2], axis=1)
         places = np.linalg.norm(answer.landmarks - path.landmarks[ids], axis=1)

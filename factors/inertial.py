@@ -210,11 +210,11 @@ class Predicted(NamedTuple):
 
     def noise(self, m: Intervals) -> Array:
         """Return the covariance (I, 15, 15) that the intervals add to that carried here."""
-        R_nb, noise = self.state.R_nb, m.covariance.copy()
+        R_nb = self.state.R_nb
+        noise = np.tile(m.covariance, (len(R_nb) // len(m.covariance), 1, 1))
         noise[:, _VELOCITY] = R_nb @ noise[:, _VELOCITY]
         noise[:, :, _VELOCITY] = noise[:, :, _VELOCITY] @ R_nb.mT
-        back = self.at_end.reshape(-1, 6, 3)
-        back = np.concatenate([R_nb.mT @ back[:, :3], back[:, 3:]], axis=1)
+        back = np.concatenate([R_nb.mT @ self.at_end[:, 0], self.at_end[:, 1]], axis=1)
         # What the noise moves moves gravity.
         half = np.zeros_like(noise)
         half[:, 3:9] = back @ noise[:, _POSITION]
@@ -268,7 +268,7 @@ def predict(
 
     Parameters
     ----------
-    m : I intervals.
+    m : I intervals; or one, for I states at its begin.
     begin : the states at their begin.
     g_n : (I, 3) m/s^2, gravity without the centrifugal term.
     gradient : (3, 3) 1/s^2, how gravity changes with position. It is that of the middle between

@@ -13,14 +13,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ssm_graph.base.errors import ConfigError, DataError, MissingExtraError, nearest_hint
+from ssm_graph.base.frames import rotation_zyx
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.times import nearest
 from ssm_graph.base.units import DEG_PER_H, DEGREE, MICRO_G
 from ssm_graph.evaluation.errors import Metrics, evaluate, reference_from_gnss, withhold_gnss
 from ssm_graph.io.export.columns import wide_columns
 from ssm_graph.io.export.track import Track, epoch_of, parse_epoch, track_of
-from ssm_graph.io.mission_folder.folder import read_imu, read_mission
-from ssm_graph.io.mission_folder.toml import read_mission_toml, table_path
+from ssm_graph.io.mission_folder.folder import read_log, read_mission
+from ssm_graph.io.mission_folder.toml import REFERENCE, read_mission_toml, table_path
 from ssm_graph.io.results.states import STATES_NAME, read_states
 from ssm_graph.io.results.summary import sha256
 from ssm_graph.io.results.tables import read_aids, read_results, trajectory_columns
@@ -39,7 +40,9 @@ from ssm_graph.mission.fault import DetectedFault, Treatment
 from ssm_graph.mission.mission import InitialState, Mission, Reference
 from ssm_graph.mission.point import Point
 from ssm_graph.mission.posterior import Posterior
-from ssm_graph.sensors.imu import ImuLog
+from ssm_graph.sensors.dvl import DvlLog
+from ssm_graph.sensors.dvl_instrument import DVL
+from ssm_graph.sensors.imu import IMU, ImuLog
 from ssm_graph.smoothers.between import Answers, answers_at, even_times
 
 _ENU: Final = ("east", "north", "up")
@@ -127,7 +130,8 @@ class Result:
 
     @cached_property
     def _imu(self) -> ImuLog:
-        return read_imu(read_mission_toml(self.mission_folder))
+        log: ImuLog = read_log(read_mission_toml(self.mission_folder), IMU)
+        return log
 
     @cached_property
     def posterior(self) -> Posterior:
@@ -139,9 +143,21 @@ class Result:
         """The reference of the mission, or the fixes that were withheld; None without either."""
         until_s = (self.summary.get("settings") or {}).get("gnss_until_s")
         if until_s is None:
-            return self.mission.reference
+            found: Reference | None = read_log(read_mission_toml(self.mission_folder), REFERENCE)
+            return found
         _, withheld = withhold_gnss(self.mission, float(until_s))
         return reference_from_gnss(withheld, self.estimate.trajectory)
+
+    @cached_property
+    def altitude(self) -> tuple[Array, Array]:
+        """Times (N,), s, and the DVL's heights over the bottom (N,), m; NaN where no beam says."""
+        log: DvlLog | None = read_log(read_mission_toml(self.mission_folder), DVL)
+        if log is None or log.range_m is None:
+            return np.zeros(0), np.zeros(0)
+        rows = self.tables.trajectory
+        at = nearest(rows["time_s"], log.valid_s)
+        roll, pitch, heading = (np.radians(rows[f"{name}_deg"][at]) for name in _RPH)
+        return log.valid_s, log.altitude(rotation_zyx(heading, pitch, roll))
 
     @property
     def points(self) -> dict[str, Point]:

@@ -70,6 +70,15 @@ class Browser:
             assert time.monotonic() < until, f"{expression} did not become true"
             time.sleep(0.05)
 
+    def measure(self) -> None:
+        """Begin to count how long the page keeps the processor."""
+        self._call("Performance.enable", timeDomain="threadTicks")
+
+    def busy_s(self) -> float:
+        """Return how long it did, s of processor time."""
+        metrics = self._call("Performance.getMetrics")["metrics"]
+        return next(of["value"] for of in metrics if of["name"] == "TaskDuration")
+
     def resize(self, width: int, height: int) -> None:
         """Make the page so large, as on a phone."""
         self._call(

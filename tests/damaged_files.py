@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +14,7 @@ import numpy as np
 from rosbags.rosbag2 import StoragePlugin
 
 from ssm_graph.base.errors import SsmGraphError
+from ssm_graph.io.ardupilot.convert import convert_ardupilot
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.io.ros.convert import convert_rosbag
 from ssm_graph.io.ros.messages import RosOptions
@@ -23,7 +25,12 @@ from ssm_graph.simulation import GnssSettings
 from tests.damaged_traffic import MAX_FAILURES, START_S, damaged, nmea_traffic, waterlinked_traffic
 from tests.helpers import simulated
 from tests.rosbag_fixture import Ros, marine_bag, ros1_bag, write_bag
+from tests.unit.test_ardupilot import dataflash, tlog
+from tests.unit.test_nortek import adcp, dvl, nucleus_log, velocities
+from tests.unit.test_pd0 import ensemble as pd0
 from tests.unit.test_recorded import as_table, reports
+from tests.unit.test_short_formats import ensemble as pd45
+from tests.unit.test_short_formats import sentences as pd6
 
 SIZE: Final = 64 * 1024
 """Of a recorded stream, bytes."""
@@ -53,7 +60,9 @@ class FileTarget:
         path.write_bytes(data)
         begin = time.perf_counter()
         try:
-            self.rows += self.read(path)
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")
+                self.rows += self.read(path)
         except SsmGraphError as error:
             self.refused += 1
             if not 10 < len(str(error)) < 2000:
@@ -96,20 +105,20 @@ def _recorded(path: Path) -> int:
     return len(found.messages)
 
 
+def _rows(found: Mission) -> int:
+    logs = [log for log in (found.imu, found.dvl, found.depth, found.gnss) if log is not None]
+    for log in logs:
+        if not (np.isfinite(log.time_s).all() and np.all(np.diff(log.time_s) > 0.0)):
+            raise ValueError(f"{type(log).__name__}: times do not increase")
+    if not np.isfinite([found.imu.gyro_b, found.imu.accel_b]).all():
+        raise ValueError("inertial data that are not finite")
+    return sum(len(log.time_s) for log in logs)
+
+
 def _bag_of(mission: Mission) -> Callable[[Path], int]:
     vehicle = vehicle_of(mission)
-
-    def read(path: Path) -> int:
-        found = convert_rosbag(path, vehicle=vehicle, options=RosOptions(surface_height=0.0))
-        logs = [log for log in (found.imu, found.dvl, found.depth, found.gnss) if log is not None]
-        for log in logs:
-            if not (np.isfinite(log.time_s).all() and np.all(np.diff(log.time_s) > 0.0)):
-                raise ValueError(f"{type(log).__name__}: times do not increase")
-        if not np.isfinite([found.imu.gyro_b, found.imu.accel_b]).all():
-            raise ValueError("inertial data that are not finite")
-        return sum(len(log.time_s) for log in logs)
-
-    return read
+    options = RosOptions(surface_height=0.0)
+    return lambda path: _rows(convert_rosbag(path, vehicle=vehicle, options=options))
 
 
 def _stream(traffic: Callable[[random.Random, float], bytes]) -> bytes:
@@ -134,4 +143,30 @@ def file_targets(folder: Path) -> list[FileTarget]:
         FileTarget("ROS 2, MCAP", mcap.read_bytes(), bag, ".mcap"),
         FileTarget("ROS 2, db3", db3.read_bytes(), bag, ".db3"),
         FileTarget("ROS 1", old.read_bytes(), bag, ".bag"),
+        *_makers(),
+    ]
+
+
+def _makers() -> list[FileTarget]:
+    """Return the makers' own formats; of ArduPilot 20 s, as its readers take a whole mission."""
+    v = velocities(240)
+    beams = np.array([0.5, 0.1, -0.2, 0.3])
+    ad2cp = [dvl(k, v[k], is_long=k % 2 == 0) for k in range(60)]
+    ad2cp += [adcp(60 + k, [100, -200, 300, -400]) for k in range(60)]
+    pd4, pd5 = (
+        [pd45(k, [k, -k, 5, 6], is_pd5=is_pd5) for k in range(60)] for is_pd5 in (False, True)
+    )
+    flight = simulated(
+        duration_s=20.0, imu_rate_hz=100.0, gnss=GnssSettings(windows=((0.0, 20.0),))
+    ).mission
+    ardupilot: Callable[[Path], int] = lambda path: _rows(convert_ardupilot(path))  # noqa: E731
+    return [
+        FileTarget("Teledyne PD0", b"".join(pd0(k, beams) for k in range(120)), _recorded, ".pd0"),
+        FileTarget("Teledyne PD4", b"".join(pd4), _recorded, ".pd4"),
+        FileTarget("Teledyne PD5", b"".join(pd5), _recorded, ".pd5"),
+        FileTarget("Teledyne PD6", b"".join(pd6(k % 60, k) for k in range(60)), _recorded, ".pd6"),
+        FileTarget("Nortek AD2CP", b"".join(ad2cp), _recorded, ".ad2cp"),
+        FileTarget("Nortek Nucleus", nucleus_log(), _recorded, ".nucleus"),
+        FileTarget("ArduPilot dataflash", dataflash(flight), ardupilot, ".BIN"),
+        FileTarget("ArduPilot telemetry", tlog(flight), ardupilot, ".tlog"),
     ]

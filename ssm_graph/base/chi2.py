@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtrc, chdtri, gammaincinv
 
@@ -14,6 +15,12 @@ from scipy.special import chdtrc, chdtri, gammaincinv
 def sf(chi_sq: ArrayLike, dof: ArrayLike) -> Any:
     """Return the probability of more than ``chi_sq``."""
     return chdtrc(dof, chi_sq)
+
+
+def logsf(chi_sq: ArrayLike, dof: ArrayLike) -> Any:
+    """Return the logarithm of :func:`sf`; to the last bit above the median."""
+    with np.errstate(divide="ignore"):
+        return np.log(chdtrc(dof, chi_sq))
 
 
 def isf(tail: ArrayLike, dof: ArrayLike) -> Any:

@@ -6,8 +6,11 @@ metres, leading axes broadcast.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,35 +55,50 @@ def geodetic_from_ecef(p_e: Array) -> tuple[Array, Array, Array]:
     ellipsoid to satellite heights, the poles included.
     """
     p_e = np.asarray(p_e, float)
-    x, y, z = p_e[..., 0], p_e[..., 1], p_e[..., 2]
-    horizontal = np.hypot(x, y)
+    if p_e.size == 3:  # one position: a twentieth of the time, for the filters ask at every ping
+        x, y, z = p_e.ravel().tolist()
+        one = _geodetic_from_ecef(x, y, z, math)
+        lat, lon, height = (np.full(p_e.shape[:-1], value) for value in one)
+        return lat, lon, height
+    return _geodetic_from_ecef(p_e[..., 0], p_e[..., 1], p_e[..., 2], np)
+
+
+def _geodetic_from_ecef(x: Any, y: Any, z: Any, functions: ModuleType) -> tuple[Any, Any, Any]:
+    """Return ``lat, lon, height`` by the functions of ``math`` or of NumPy."""
+    sin, cos, atan2 = functions.sin, functions.cos, functions.atan2
+    horizontal = functions.hypot(x, y)
     semi_minor = SEMI_MAJOR_AXIS * (1.0 - FLATTENING)
     second_ecc_sq = ECCENTRICITY_SQ / (1.0 - ECCENTRICITY_SQ)
-    beta = np.arctan2(z * SEMI_MAJOR_AXIS, horizontal * semi_minor)
+    beta = atan2(z * SEMI_MAJOR_AXIS, horizontal * semi_minor)
     for _ in range(3):
-        lat = np.arctan2(
-            z + second_ecc_sq * semi_minor * np.sin(beta) ** 3,
-            horizontal - ECCENTRICITY_SQ * SEMI_MAJOR_AXIS * np.cos(beta) ** 3,
+        lat = atan2(
+            z + second_ecc_sq * semi_minor * sin(beta) ** 3,
+            horizontal - ECCENTRICITY_SQ * SEMI_MAJOR_AXIS * cos(beta) ** 3,
         )
-        beta = np.arctan2((1.0 - FLATTENING) * np.sin(lat), np.cos(lat))
-    sin_lat, cos_lat = np.sin(lat), np.cos(lat)
-    surface = SEMI_MAJOR_AXIS * np.sqrt(1.0 - ECCENTRICITY_SQ * sin_lat**2)
-    return lat, np.arctan2(y, x), horizontal * cos_lat + z * sin_lat - surface
+        beta = atan2((1.0 - FLATTENING) * sin(lat), cos(lat))
+    sin_lat, cos_lat = sin(lat), cos(lat)
+    surface = SEMI_MAJOR_AXIS * functions.sqrt(1.0 - ECCENTRICITY_SQ * sin_lat**2)
+    return lat, atan2(y, x), horizontal * cos_lat + z * sin_lat - surface
 
 
 def R_el_from_lat_lon(lat: Array | float, lon: Array | float) -> Array:
     """Return rotations (..., 3, 3) from local east-north-up axes to Earth-fixed axes."""
-    lat, lon = np.broadcast_arrays(np.asarray(lat, float), np.asarray(lon, float))
     sin_lat, cos_lat, sin_lon, cos_lon = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)
-    east = np.stack([-sin_lon, cos_lon, np.zeros_like(lat)], axis=-1)
-    north = np.stack([-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat], axis=-1)
-    return np.stack([east, north, _up_e(lat, lon)], axis=-1)
+    R_el = np.zeros((*np.broadcast_shapes(np.shape(lat), np.shape(lon)), 3, 3))
+    R_el[..., 0, 0], R_el[..., 1, 0] = -sin_lon, cos_lon
+    R_el[..., 0, 1], R_el[..., 1, 1] = -sin_lat * cos_lon, -sin_lat * sin_lon
+    R_el[..., 2, 1] = cos_lat
+    R_el[..., 2] = _up_e(lat, lon)
+    return R_el
 
 
-def _up_e(lat: Array, lon: Array) -> Array:
+def _up_e(lat: Array | float, lon: Array | float) -> Array:
     """Return the normal (..., 3) of the ellipsoid in Earth-fixed axes."""
     cos_lat = np.cos(lat)
-    return np.stack([cos_lat * np.cos(lon), cos_lat * np.sin(lon), np.sin(lat)], axis=-1)
+    up_e = np.empty((*np.broadcast_shapes(np.shape(lat), np.shape(lon)), 3))
+    up_e[..., 0], up_e[..., 1] = cos_lat * np.cos(lon), cos_lat * np.sin(lon)
+    up_e[..., 2] = np.sin(lat)
+    return up_e
 
 
 def normal_gravity(lat: Array | float, height: Array | float) -> Array:

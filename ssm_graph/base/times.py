@@ -15,6 +15,13 @@ UNIX_FROM_S, UNIX_UNTIL_S = 1.0e9, 4.1e9
 Indices = NDArray[np.intp]
 
 
+def usual_interval(time_s: Array) -> float:
+    """Return the median of the intervals between times (N,) that rise, two or more."""
+    spacing = np.sort(time_s[1:] - time_s[:-1])  # an eighth of `numpy.median`'s time, where few
+    middle = len(spacing) // 2
+    return float(0.5 * (spacing[middle] + spacing[len(spacing) - 1 - middle]))
+
+
 def is_inside(time_s: Array, start_s: float, end_s: float) -> NDArray[np.bool_]:
     """Return which times lie in the span, but for rounding."""
     return (time_s > start_s - MIN_SPACING_S) & (time_s < end_s + MIN_SPACING_S)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -33,6 +34,7 @@ from ssm_graph.io.ros.messages import BeamSign, RosOptions
 from ssm_graph.live.recorded.log import Recorded, read_recorded, write_tables
 from ssm_graph.live.recorded.merge import Merged, merge_recordings, mission_of_recording
 from ssm_graph.mission.mission import Mission
+from ssm_graph.report.terminal.progress import ProgressDisplay
 from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.messages import Message
 
@@ -137,31 +139,34 @@ ROS_OPTIONS = (
 )
 
 
-def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
+def run(arguments: argparse.Namespace, console: Console, errors: Console) -> bool:
     """Convert and write."""
+    write = partial(_write, arguments=arguments, console=console, errors=errors)
     check_is_free(arguments.out, may_overwrite=arguments.overwrite)
     for log in arguments.log:
         if log.exists() and arguments.out.resolve() == log.resolve():
             raise ConfigError(f"--out: expected another folder than that of LOG: {arguments.out}")
     if arguments.map is not None:
-        return _write(_from_columns(arguments), arguments, console)
+        return write(lambda: _from_columns(arguments))
     if len(arguments.log) > 1:
-        return _merge(arguments, console)
+        return _merge(arguments, console, errors)
     (log,) = arguments.log
     if arguments.clock_offset is not None:
         raise ConfigError(f"--clock-offset is for several logs, got {log} alone")
     if is_rosbag(log):
-        return _write(_from_rosbag(log, arguments), arguments, console)
+        return write(lambda: _from_rosbag(log, arguments))
     if log.is_file() and is_ardupilot(log):
-        return _write(_from_ardupilot(log, arguments), arguments, console)
+        return write(lambda: _from_ardupilot(log, arguments))
     own = ("vehicle", "beams_against")
     _refuse_ros_options(log, arguments, [name for name in ROS_OPTIONS if name not in own])
     if not log.exists():
         raise DataError(f"{log}: there is no such file or folder")
     if is_mcap(log):
         _refuse_ros_options(log, arguments, own)
-        return _write(convert_blueye(log), arguments, console)
-    recorded = None if log.is_dir() else read_recorded(log)
+        return write(lambda: convert_blueye(log))
+    with ProgressDisplay(errors) as show:
+        show.stage(f"reading {log}")
+        recorded = None if log.is_dir() else read_recorded(log)
     if recorded is None:
         raise DataError(f"{log}: {kind_of(log)}")
     if arguments.beams_against:
@@ -181,7 +186,7 @@ def _refuse_ros_options(log: Path, arguments: argparse.Namespace, options: Itera
             )
 
 
-def _merge(arguments: argparse.Namespace, console: Console) -> bool:
+def _merge(arguments: argparse.Namespace, console: Console, errors: Console) -> bool:
     """Write the mission of an IMU's table and recordings of other instruments."""
     _refuse_ros_options(arguments.log[0], arguments, ROS_OPTIONS[1:])
     if arguments.vehicle is None:
@@ -190,7 +195,9 @@ def _merge(arguments: argparse.Namespace, console: Console) -> bool:
     for log in arguments.log:
         if not log.is_file():
             raise DataError(f"{log}: expected a file, of an IMU or of one instrument")
-    found = merge_recordings(arguments.log, arguments.out, vehicle=vehicle, offset_s=offset_s)
+    with ProgressDisplay(errors) as show:
+        show.stage("reading and joining the logs")
+        found = merge_recordings(arguments.log, arguments.out, vehicle=vehicle, offset_s=offset_s)
     return _said(found, arguments, console)
 
 
@@ -243,8 +250,18 @@ def _from_columns(arguments: argparse.Namespace) -> Mission:
     return convert_columns(arguments.log, column_map, vehicle, name=vehicle.name)
 
 
-def _write(mission: Mission, arguments: argparse.Namespace, console: Console) -> bool:
-    write_mission(arguments.out, mission, table_format=arguments.format)
+def _write(
+    read: Callable[[], Mission],
+    *,
+    arguments: argparse.Namespace,
+    console: Console,
+    errors: Console,
+) -> bool:
+    with ProgressDisplay(errors) as show:
+        show.stage(f"reading {', '.join(map(str, arguments.log))}")
+        mission = read()
+        show.stage("writing the mission")
+        write_mission(arguments.out, mission, table_format=arguments.format)
     _say_mission(mission, arguments, console)
     _say_notes(mission.notes, console)
     return True

@@ -19,9 +19,9 @@ from ssm_graph.systems.road_map.motion import motion_errors
 DESCRIPTION: Final = """\
 Turn a segment of comma2k19 into a folder that ssm-graph locate reads. SEGMENT is a folder with the
 arrays of one segment as .npy files, the data set's own tree with underscores for slashes
-(processed_log_CAN_speed_t.npy). Speed, yaw rate, fixes of one receiver and the reference come of it;
-what a camera sees does not: --curves names the table of a lane detector (docs/road-map.md has its
-columns, times from the begin of the segment). It also says what the drive tells of its own
+(processed_log_CAN_speed_t.npy). Speed, yaw rate, fixes of one receiver and the reference come of
+it; what a camera sees does not: --curves names the table of a lane detector (docs/road-map.md has
+its columns, times from the begin of the segment). It also says what the drive tells of its own
 instruments: scale of the speed, bias of the yaw rate, delay of the fixes.
 """
 

@@ -56,6 +56,8 @@ COMMANDS: Final = {
     "locate-convert": "turn a segment of comma2k19 into a drive's folder",
     "locate-simulate": "write a simulated drive over an HD map",
     "locate-study": "many simulated drives over HD maps, by several methods",
+    "seabed": "find where a mission began on a map of the seabed",
+    "seabed-simulate": "write a simulated mission over a seabed, with its map",
     "slam": "path and map from odometry and observed landmarks",
     "slam-study": "compare filters of landmark SLAM on simulated runs",
     "visual": "metric path, map and anchors from a camera and ranges",
@@ -73,7 +75,10 @@ GROUPS: Final = {
     "an answer": ("smooth", "filter", "online"),
     "what comes of it": ("report", "export", "compare", "integrity"),
     "landmark SLAM": ("slam", "slam-study"),
-    "a start from a map": ("locate", "locate-convert", "locate-simulate", "locate-study"),
+    "a start from a map": (
+        *("locate", "locate-convert", "locate-simulate", "locate-study"),
+        *("seabed", "seabed-simulate"),
+    ),
     "guaranteed bounds in a network": ("network", "network-run"),
     "camera and ranges": ("visual", "visual-simulate"),
 }
@@ -85,7 +90,7 @@ exit codes:
   1    a defect of this program
   2    a wrong option or setting, a missing extra
   3    the data of a mission cannot be used; the message says where and why
-  4    locate: the lane is not known; visual: no scale, or one that has to be doubted;
+  4    locate: the lane is not known; seabed: the place is not known; visual: no scale, or one that has to be doubted;
        smooth or filter ended with a result that must not be trusted blindly (iteration limit,
        interrupted after the first iteration, run away, or the data contradict it); it is written
        all the same, and its status says so; online: ended in order, the last answer was not good;

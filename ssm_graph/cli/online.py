@@ -224,6 +224,7 @@ def _connector(
             skip=n_messages,
             name=mission.name,
             end_s=float(mission.imu.time_s[-1]),
+            altitude=(mission.dvl.valid_s, mission.dvl.altitude()),
             wait=hub.wait,
         )
         return Connections(source, hub)

@@ -6,14 +6,20 @@ import argparse
 import webbrowser
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from ssm_graph.base.errors import DataError
+from ssm_graph.base.errors import DataError, SsmGraphError
 from ssm_graph.cli.terminal import say
-from ssm_graph.io.export.track import epoch_of, parse_epoch
 from ssm_graph.io.results.place import PAGE_NAME
-from ssm_graph.io.results.tables import read_aids, read_protection, read_results
+from ssm_graph.io.results.tables import read_aids, read_protection
+from ssm_graph.report.terminal.progress import ProgressDisplay
+
+if TYPE_CHECKING:
+    from ssm_graph.base.frozen import Array
+    from ssm_graph.evaluation.errors import ErrorSeries
+    from ssm_graph.result import Result
 
 DESCRIPTION = """\
 Write one page about a result: the verdict in words first, the track with its uncertainty, height,
@@ -34,32 +40,61 @@ def declare(parser: argparse.ArgumentParser) -> None:
         metavar="UTC",
         help="UTC of time_s = 0, such as 2026-05-01T10:00:00Z, where times are no Unix time",
     )
+    parser.add_argument(
+        "--mission",
+        type=Path,
+        metavar="DIR",
+        help="the mission folder, where it is no longer where the result was made of it: altitude "
+        "and errors against the reference come from there",
+    )
     parser.add_argument("--open", action="store_true", help="open it in the browser at once")
     parser.set_defaults(run=run)
 
 
-def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
+def run(arguments: argparse.Namespace, console: Console, errors: Console) -> bool:
     """Write the page."""
     from ssm_graph.report.page.content import Content
     from ssm_graph.report.page.page import write_page
+    from ssm_graph.result import Result
 
-    results = read_results(arguments.result)
+    result = Result(arguments.result, mission=arguments.mission, epoch=arguments.epoch)
+    results = result.tables
     if len(results.trajectory["time_s"]) == 0:
         raise DataError(f"{arguments.result}: trajectory.csv has no row: there is nothing to show")
-    epoch_s = None if arguments.epoch is None else parse_epoch(arguments.epoch)
-    content = Content(
-        trajectory=results.trajectory,
-        beams=results.beams,
-        summary=results.summary,
-        aids=read_aids(arguments.result),
-        epoch_s=epoch_of(results, epoch_s),
-        protection=read_protection(arguments.result),
-    )
+    with ProgressDisplay(errors) as show:
+        show.stage("reading the mission")
+        altitude, of_errors, note = _of_mission(result)
+        show.stage("drawing")
+        content = Content(
+            trajectory=results.trajectory,
+            beams=results.beams,
+            summary=results.summary,
+            aids=read_aids(arguments.result),
+            epoch_s=result.epoch_s,
+            protection=read_protection(arguments.result),
+            altitude=altitude,
+            errors=of_errors,
+        )
     path: Path = arguments.out or arguments.result / PAGE_NAME
     now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     version = (results.summary.get("versions") or {}).get("ssm_graph")
     write_page(content, path, footer=f"ssm-graph {version}; {arguments.result}; page of {now}")
     say(console, f"{path}: {path.stat().st_size:,} bytes")
+    if note:
+        say(console, f"note: {note}")
     if arguments.open:
         webbrowser.open(path.resolve().as_uri())
     return True
+
+
+def _of_mission(result: Result) -> tuple[tuple[Array, Array] | None, ErrorSeries | None, str]:
+    """Return altitude, errors against the reference, and why there are none where that is so."""
+    from ssm_graph.evaluation.errors import error_series
+
+    try:
+        altitude, reference = result.altitude, result.reference
+        if reference is None:
+            return altitude, None, ""
+        return altitude, error_series(result.estimate.trajectory, reference), ""
+    except SsmGraphError as error:
+        return None, None, f"a page without altitude and errors: {error}"

@@ -77,6 +77,7 @@ def run_mission(
         def draw(path: Path) -> None:
             from ssm_graph.report.mission.figure import save_figure
 
+            show.stage("drawing the figure")
             save_figure(path, estimate, reference, title=mission.name)
 
         write_results(

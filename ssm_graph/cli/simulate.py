@@ -14,6 +14,7 @@ from ssm_graph.cli.options import add_mission_output, choice_option
 from ssm_graph.cli.terminal import say
 from ssm_graph.io.mission_folder.folder import write_mission
 from ssm_graph.io.results.place import check_is_free
+from ssm_graph.report.terminal.progress import ProgressDisplay
 from ssm_graph.sensors.dvl import MOST_BEAMS
 from ssm_graph.simulation import (
     SCENARIOS,
@@ -26,7 +27,7 @@ from ssm_graph.simulation import (
     simulate,
 )
 
-_SCENARIOS = "\n".join(f"  {name:9}{s.description}" for name, s in SCENARIOS.items())
+_SCENARIOS = "\n".join(f"  {name:12}{s.description}" for name, s in SCENARIOS.items())
 DESCRIPTION: Final = f"Simulate a mission.\n\nscenarios:\n{_SCENARIOS}"
 
 
@@ -65,7 +66,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(run=run)
 
 
-def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
+def run(arguments: argparse.Namespace, console: Console, errors: Console) -> bool:
     """Simulate and write."""
     check_is_free(arguments.out, may_overwrite=arguments.overwrite)
     usual = scenario_config(arguments.scenario)
@@ -83,8 +84,11 @@ def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
         rate = usual.outliers.rate if arguments.rate is None else arguments.rate
         told["outliers"] = Outliers(arguments.outliers or usual.outliers.kind, rate)
     changes = {name: value for name, value in told.items() if value is not None}
-    simulated = simulate(scenario_config(arguments.scenario, **changes))
-    write_mission(arguments.out, simulated.mission, table_format=arguments.format)
+    with ProgressDisplay(errors) as show:
+        show.stage("simulating")
+        simulated = simulate(scenario_config(arguments.scenario, **changes))
+        show.stage("writing the mission")
+        write_mission(arguments.out, simulated.mission, table_format=arguments.format)
     mission = simulated.mission
     say(
         console,

@@ -28,7 +28,8 @@ Solve a log of odometry and observed landmarks in the plane: where the vehicle w
 landmarks are, with sigmas, and how much each observation counts.
 
 INPUT is a folder with landmarks.toml (docs/landmark-slam.md), a folder of the UTIAS MRCLAM data
-(with --robot), or a text graph of ODOMETRY and LANDMARK rows (Victoria Park in GTSAM's examples).
+(with --robot), or a graph: .g2o, .graph or .toro (TORO), .pyfg, or text with ODOMETRY and LANDMARK
+rows (Victoria Park in GTSAM's examples). Relations of poses that meet again are weighed too.
 
 files in DIR:
   path.csv        pose and sigmas wherever something was seen
@@ -59,13 +60,18 @@ def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
     parser.add_argument("input", type=Path, metavar="INPUT", help="folder or graph")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="result folder")
-    number_option(parser, "--robot", "N", "of a MRCLAM folder, 1 to 5", kind=int)
+    number_option(
+        parser, "--robot", "N", "of a MRCLAM folder, 1 to 5, or of a PyFG file, 1 is A", kind=int
+    )
     parser.add_argument(
         "--method",
         default="smoother",
         metavar="NAME",
-        help="smoother, or a filter of slam-study, such as ekf-weighted (default: smoother)",
+        help="smoother (of the whole log), isam2 or fixed-lag (pose by pose), or a filter of "
+        "slam-study, such as ekf-weighted (default: smoother)",
     )
+    text = "of --method fixed-lag: older poses are dropped (default: 20)"
+    number_option(parser, "--lag", "S", text)
     text = "stated, or estimated from the log: those of the observations, or all (default: stated)"
     choice_option(parser, "--noise", NoiseUsed, text, NoiseUsed.STATED)
     text = "landmarks by their names, by the nearest in a gate, or jointly (default: known)"
@@ -92,13 +98,18 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
 def asked_of(arguments: argparse.Namespace) -> Asked:
     """Return what the options ask for."""
     from ssm_graph.systems.landmark_slam.association import Association
-    from ssm_graph.systems.landmark_slam.methods import FILTERS, check_method
-    from ssm_graph.systems.landmark_slam.solve import Asked
+    from ssm_graph.systems.landmark_slam.methods import FILTERS, INCREMENTAL, check_method
+    from ssm_graph.systems.landmark_slam.solve import LAG_S, Asked
 
     method = check_method(arguments.method)
-    if method not in FILTERS and method != "smoother":
+    if method not in (*FILTERS, *INCREMENTAL, "smoother"):
         raise ConfigError(
-            f"--method: expected smoother or a filter, got {method}; try smoother with --noise all"
+            f"--method: expected smoother, isam2, fixed-lag or a filter, got {method}; try smoother "
+            "with --noise all"
+        )
+    if arguments.lag is not None and (method != "fixed-lag" or not arguments.lag > 0.0):
+        raise ConfigError(
+            f"--lag {arguments.lag:g}: expected seconds above 0 with --method fixed-lag, got {method}"
         )
     noise: NoiseUsed = arguments.noise
     if method != "smoother" and noise is not NoiseUsed.STATED:
@@ -110,4 +121,5 @@ def asked_of(arguments: argparse.Namespace) -> Asked:
         association=Association[arguments.association.name],
         kernel=kernel_of(arguments, KERNELS),
         robot=arguments.robot,
+        lag_s=LAG_S if arguments.lag is None else arguments.lag,
     )

@@ -21,10 +21,12 @@ from ssm_graph.cli.options import (
 )
 from ssm_graph.cli.run_mission import add_mission_arguments, run_mission
 from ssm_graph.engine.reweighting import GncStart, Graduation
+from ssm_graph.io.seabed.section import with_map_file
 from ssm_graph.mission.estimate import Estimate
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.problem import ProblemConfig
 from ssm_graph.report.terminal.progress import ProgressDisplay
+from ssm_graph.sensors.seabed import TerrainLog
 from ssm_graph.smoothers.faults.search import FaultSearch
 from ssm_graph.smoothers.mission import smooth
 from ssm_graph.smoothers.settings import SmootherConfig
@@ -49,13 +51,21 @@ DESCRIPTION: Final = (
     "Smooth a recorded mission; writes trajectory.csv, beams.csv, summary.json and "
     "figure.png. Where mission.toml gives prior sigmas of mounting, scale, lever arms, clocks "
     "or depth offset, these are calibrated: calibration.toml has the lines to put in place. "
-    "Where pings are off the water (column water_track), its current is estimated."
+    "Where pings are off the water (column water_track), its current is estimated. With a map of "
+    "the seabed, a start in doubt is looked for on it, and the map keeps the answer from drifting."
 )
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
     add_mission_arguments(parser)
+    parser.add_argument(
+        "--map",
+        type=Path,
+        metavar="FILE",
+        help="map of the seabed (GeoTIFF, NetCDF, ESRI ASCII grid, XYZ) that the DVL's ranges are "
+        "compared with; [map] in mission.toml states what it is off by (default: that of [map])",
+    )
     _add_kernel_options(parser)
     _add_loop_options(parser)
     add_answer_arguments(parser, afterwards=False)
@@ -100,7 +110,19 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     loop = loop_from(arguments)
 
     def solve(mission: Mission, graph: ProblemConfig, show: ProgressDisplay) -> Estimate:
-        return smooth(mission, loop, problem_config=graph, on_iteration=show, on_stage=show.stage)
+        if arguments.map is not None:
+            mission = with_map_file(mission, arguments.map)
+        if mission.aids.get(TerrainLog) is None:
+            return smooth(
+                mission, loop, problem_config=graph, on_iteration=show, on_stage=show.stage
+            )
+        from ssm_graph.systems.seabed.dive import smooth_dive
+
+        dive = smooth_dive(
+            mission, loop, problem_config=graph, on_iteration=show, on_stage=show.stage
+        )
+        assert dive.estimate is not None
+        return dive.estimate
 
     if arguments.at is not None:
         read_times(arguments.at, 0.0)  # what cannot be read is said before the work

@@ -38,6 +38,7 @@ The answer is one of
 
 files in DIR:
   trajectory.tum   camera to map of all images, keyframes.tum of the key frames: evo reads them
+  as_it_came.csv   the pose of each image as first given out, written at once: there when killed
   covariance.npz   6 x 6 of each key frame
   map.ply          points, path, anchors
   anchors.csv      places, sigmas, biases, states, other places that fit
@@ -152,6 +153,7 @@ def _without_ranges(sequence: Sequence) -> Sequence:
 
 def _followed(sequence: Sequence, arguments: argparse.Namespace, errors: Console) -> VisualResult:
     from ssm_graph.systems.visual_ranges.loop_settings import LoopSettings
+    from ssm_graph.systems.visual_ranges.path_file import PathAsItComes
     from ssm_graph.systems.visual_ranges.settings import VisualSettings
     from ssm_graph.systems.visual_ranges.system import run as run_visual
 
@@ -174,7 +176,10 @@ def _followed(sequence: Sequence, arguments: argparse.Namespace, errors: Console
             if done == total:
                 progress.update(task, description="adjusting everything")
 
-        result = run_visual(sequence, settings, progress=show)
+        with PathAsItComes(arguments.out) as path:
+            result = run_visual(sequence, settings, progress=show, on_frame=path.append)
+    if path.failure:
+        say(errors, f"note: {path.path}: {path.failure}; what came later is not in it")
     if not len(result.map.time_s):
         told = "; ".join(result.events[-3:]) or "no image had corners enough"
         raise SolverError(
@@ -227,6 +232,8 @@ def _found_in_map(
 
 def lines(result: VisualResult, found: Judged, off: Accuracy | None) -> list[str]:
     """Return the verdict and what it rests on, one line each."""
+    import numpy as np
+
     from ssm_graph.systems.visual_ranges.result import FrameState
 
     told = [f"{found.verdict.name}: {found.verdict.value}"]
@@ -252,6 +259,15 @@ def lines(result: VisualResult, found: Judged, off: Accuracy | None) -> list[str
                 f"{anchor.bias_m:+.2f} m; {100 * anchor.nlos_share:.0f} % of {anchor.n_ranges} "
                 "ranges not believed"
             )
+        own = ranging.vehicle
+        if own is not None:
+            down = ", ".join(f"{x:.3f}" for x in own.down)
+            told.append(f"  down is {down} in the map, by the vehicle's own sensors")
+            if np.isfinite(own.range_unit):
+                told.append(
+                    f"  ranges are {own.range_unit:.4f} ± {own.range_unit_sigma:.4f} times what "
+                    "these sensors say: the sound speed's share"
+                )
     if off is not None and found.verdict.has_scale:
         anchors = ", ".join(f"{x:.3f}" for x in off.anchor_m)
         told.append(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -13,16 +13,23 @@ from ssm_graph.cli.options import number_option
 from ssm_graph.cli.terminal import say
 from ssm_graph.io.results.place import check_is_free
 
+if TYPE_CHECKING:
+    from ssm_graph.systems.visual_ranges.simulate import Run
+
 DESCRIPTION: Final = """\
 Render the images of a camera that is carried through a room or a corridor with repeating walls,
 simulate ranges to anchors with all their faults, and write both as a folder for ssm-graph visual:
 visual.toml, images, times.csv, ranges.csv, and the truth.
+
+In the world `bottom` a vehicle carries it over boulders in murky water, with depth, dead reckoning
+and two-way acoustic ranges once a second (sigma 0.1 m) by a sound speed that is 1 % off; images
+come at 10 Hz. The options of rates, sigma and clock are not for it.
 """
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
-    parser.add_argument("world", metavar="WORLD", help="room or corridor")
+    parser.add_argument("world", metavar="WORLD", help="room, corridor, or bottom (under water)")
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="folder of the recording"
     )
@@ -50,15 +57,16 @@ def declare(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace, console: Console, errors: Console) -> bool:
     """Simulate and write."""
-    from ssm_graph.systems.visual_ranges.readers.own_folder import write_own_folder
+    from dataclasses import replace
+
     from ssm_graph.systems.visual_ranges.simulate import (
         CAMERA,
         SMALL_CAMERA,
         ImageFaults,
-        RangeFaults,
         Run,
-        simulate,
+        under_water,
     )
+    from ssm_graph.systems.visual_ranges.simulated_ranges import RangeFaults
 
     check_is_free(arguments.out, may_overwrite=arguments.overwrite)
     ranges = RangeFaults(
@@ -69,6 +77,23 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
         clock_s=arguments.clock_s,
         silent_s=tuple(arguments.silent_s or (0.0, 0.0)),
     )
+    if arguments.world == "bottom":
+        asked = replace(
+            under_water(arguments.seed, arguments.duration_s),
+            n_anchors=arguments.anchors,
+            camera=SMALL_CAMERA if arguments.small else CAMERA,
+            images=ImageFaults(covered_s=tuple(arguments.covered_s or (0.0, 0.0))),
+        )
+        asked = replace(
+            asked,
+            ranges=replace(
+                asked.ranges,
+                bias_m=arguments.bias_m,
+                nlos_share=arguments.nlos,
+                silent_s=tuple(arguments.silent_s or (0.0, 0.0)),
+            ),
+        )
+        return _written(arguments, asked, console, errors)
     asked = Run(
         arguments.world,
         arguments.seed,
@@ -79,6 +104,13 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
         ranges=ranges,
         images=ImageFaults(covered_s=tuple(arguments.covered_s or (0.0, 0.0))),
     )
+    return _written(arguments, asked, console, errors)
+
+
+def _written(arguments: argparse.Namespace, asked: Run, console: Console, errors: Console) -> bool:
+    from ssm_graph.systems.visual_ranges.readers.own_folder import write_own_folder
+    from ssm_graph.systems.visual_ranges.simulate import simulate
+
     simulated = simulate(asked)
     sequence = simulated.sequence
     columns = (TextColumn("images"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())

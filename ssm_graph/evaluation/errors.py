@@ -8,7 +8,6 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import PchipInterpolator
 
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import ConfigError, DataError
@@ -207,6 +206,8 @@ def _interpolate_column(time_s: Array, known_s: Array, samples: Array) -> Array:
         if end - begin == 1:
             result[inside] = samples[begin]
         elif np.any(inside):
+            from scipy.interpolate import PchipInterpolator  # costly to import
+
             # Relative times: in Unix seconds the cubic's coefficients would lose digits.
             curve = PchipInterpolator(known_s[begin:end] - first, samples[begin:end])
             result[inside] = curve(np.clip(time_s[inside], first, last) - first)

@@ -15,6 +15,7 @@ import numpy as np
 from factors.similarity import Kernel
 from ssm_graph.base.errors import SolverError
 from ssm_graph.base.frozen import Array, ShortRepr
+from ssm_graph.base.progress import told
 from ssm_graph.base.stepwise import Steps, finished
 from ssm_graph.engine.error_state import POSITION, ROTATION, STATE_DIM, VELOCITY
 from ssm_graph.engine.extras import Extras
@@ -141,7 +142,7 @@ class _ForwardPass:
         problem = self.problem
         first_row = np.searchsorted(problem.beams.keyframe, np.arange(problem.n_keyframes + 1))
         history: list[tuple[Array, ...]] = []
-        for k in range(problem.n_keyframes):
+        for k in told(range(problem.n_keyframes), problem.n_keyframes):
             if k > 0:
                 self.before = self._here
                 self._predict(k - 1)
@@ -164,7 +165,7 @@ class _ForwardPass:
         here = States.of(*(column[None] for column in self._state))
         if self.extras:
             here = here._replace(walks=self.extras.walks[None], constants=self.extras.constants)
-        ahead = self.inertial.predict(interval, here, g_n=self._g_n)
+        ahead = self.inertial.predict(interval, here, g_n=self._g_n[None])
         self.P = ahead.covariance(self.P)
         if self.extras:
             self.extras.keep(ahead.states.walks[0], self.extras.constants)

@@ -44,7 +44,8 @@ class InertialRows:
 
         Columns are those of the keyframe before, of the one after, and of C constants.
         """
-        begin, (errors, slope) = states.take(np.s_[:-1]), self._errors(states.take(np.s_[:-1]))
+        begin = states.take(np.s_[:-1])
+        errors, slope = self.sensor_errors(begin)
         pairs = whitened_rows(
             self._seen(intervals),
             begin,
@@ -64,7 +65,7 @@ class InertialRows:
             begin,
             states.take(np.s_[1:]),
             g_n=gravity_between(self._frame, states.p_n),
-            errors=self._errors(begin)[0],
+            errors=self.sensor_errors(begin)[0],
         )
         if self._extras.n_walks == 0:
             return inertial
@@ -73,14 +74,14 @@ class InertialRows:
         return np.concatenate([inertial, walked], axis=1)
 
     def predict(self, interval: Intervals, last: States, *, g_n: Array | None = None) -> Ahead:
-        """Return the state at the end of an interval (1, ...) from that at its begin (1, ...).
+        """Return states (B, ...) at the end of an interval from those at its begin (B, ...).
 
-        ``g_n`` (3,) is gravity between them, m/s^2; that of the frame when left out.
+        ``g_n`` (B, 3) is gravity between them, m/s^2; that of the frame when left out.
         """
-        interval, (errors, slope) = self._seen(interval), self._errors(last)
+        interval, (errors, slope) = self._seen(interval), self.sensor_errors(last)
         if g_n is None:
-            g_n = gtsam_gravity(self._frame, last.p_n[0] + 0.5 * interval.span_s * last.v_n[0])
-        moved = predict(interval, last, g_n=g_n[None], gradient=self._gradient, errors=errors)
+            g_n = gtsam_gravity(self._frame, last.p_n + 0.5 * interval.span_s * last.v_n)
+        moved = predict(interval, last, g_n=g_n, gradient=self._gradient, errors=errors)
         transition = _by_variables(moved.transition, slope, from_column=STATE_DIM)
         moved = moved._replace(transition=transition)
         walks = last.walks
@@ -93,7 +94,7 @@ class InertialRows:
         """Return intervals without columns of errors that are no variables here."""
         return intervals if len(self._own) else intervals.without_errors(intervals.errors)
 
-    def _errors(self, begin: States) -> tuple[Array | None, Array | None]:
+    def sensor_errors(self, begin: States) -> tuple[Array | None, Array | None]:
         """Return errors of what is read (I, 27), or (27,) of all, and their slope; None if none."""
         if len(self._own) == 0:
             return None, None
@@ -131,7 +132,7 @@ class Ahead(NamedTuple):
     """A keyframe as the inertial data alone know it from the one before."""
 
     states: States
-    """(1, ...)"""
+    """(B, ...)"""
     interval: Intervals
     moved: Predicted
     between: InertialRows
@@ -142,14 +143,19 @@ class Ahead(NamedTuple):
         return self.between._with_walks(self.moved.rows(self.interval), self.interval, walks)
 
     def covariance(self, before: Array) -> Array:
-        """Return the covariance (..., n + C, n + C) here from that at the keyframe before."""
-        F, Q = self.moved.transition[0], self.moved.noise(self.interval)[0]
+        """Return covariances (..., n + C, n + C) here from those at the keyframe before.
+
+        Of one state, or of B states those (B, n + C, n + C) of each.
+        """
+        F, Q = self.moved.transition, self.moved.noise(self.interval)
+        if len(F) == 1:
+            F, Q = F[0], Q[0]
         if before.shape[-1] == STATE_DIM:
-            return np.asarray(F @ before @ F.T + Q)
+            return np.asarray(F @ before @ F.mT + Q)
         carried = before.copy()
         seen = self._seen
         carried[..., :STATE_DIM, :] = F @ before[..., seen, :]
-        carried[..., :STATE_DIM] = carried[..., seen] @ F.T
+        carried[..., :STATE_DIM] = carried[..., seen] @ F.mT
         carried[..., :STATE_DIM, :STATE_DIM] += Q
         if self.between._extras.n_walks == 0:
             return carried

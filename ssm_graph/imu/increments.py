@@ -11,9 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from factors.so3 import cross, left_jacobian_solve, left_jacobian_times
+from factors import so3
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps, finished
@@ -80,18 +79,20 @@ def merge_samples_steps(imu: ImuLog, keyframe_s: Array, *, rate_hz: float) -> St
     piece_edges, sample = _cut(edges, keyframe_s)
     yield 3e-4 * len(sample)
     h = np.diff(piece_edges)[:, None]
-    omega, force = imu.gyro_b[sample], imu.accel_b[sample]
-    omega_slope, force_slope = (_slopes(edges, rate)[sample] for rate in (imu.gyro_b, imu.accel_b))
+    rates = np.concatenate([imu.gyro_b, imu.accel_b], axis=1)
+    slopes = _slopes(edges, rates)[sample]
     # The mean over a piece differs from that over its whole sample by the slope.
     mid = 0.5 * (edges[sample] + edges[sample + 1])
     shift = (piece_edges[:-1] + 0.5 * h[:, 0] - mid)[:, None]
-    omega, force = omega + omega_slope * shift, force + force_slope * shift
+    means = rates[sample] + slopes * shift
+    omega, force = means[:, :3], means[:, 3:]
+    omega_slope, force_slope = slopes[:, :3], slopes[:, 3:]
 
     yield 3e-4 * len(sample)
     first = _group_starts(piece_edges, keyframe_s, rate_hz)
     scale = h**3 / 12.0
-    theta = omega * h + scale * cross(omega, omega_slope)
-    v = force * h + scale * (cross(omega, force_slope) + cross(force, omega_slope))
+    theta = omega * h + scale * so3.cross(omega, omega_slope)
+    v = force * h + scale * (so3.cross(omega, force_slope) + so3.cross(force, omega_slope))
     yield 5e-4 * len(sample)
     theta, v = yield from _merge_steps(theta, v, first)
     dt = np.add.reduceat(h[:, 0], first)
@@ -110,10 +111,18 @@ def _cut(edges: Array, cuts: Array) -> tuple[Array, NDArray[np.intp]]:
 
 
 def _slopes(edges: Array, rate: Array) -> Array:
-    """Return the time derivative of a rate at the middle of each sample, from its neighbours."""
+    """Return the time derivative (N, d) of rates at the middle of each sample.
+
+    That of the parabola through three of them; at both ends of the line through two.
+    """
     if len(rate) < 2:
         return np.zeros_like(rate)
-    return np.asarray(np.gradient(rate, 0.5 * (edges[:-1] + edges[1:]), axis=0))
+    middle = 0.5 * (edges[:-1] + edges[1:])
+    span = np.diff(middle)[:, None]
+    steep = np.diff(rate, axis=0) / span
+    before, after = span[:-1], span[1:]
+    inner = (after * steep[:-1] + before * steep[1:]) / (before + after)
+    return np.concatenate([steep[:1], inner, steep[-1:]])
 
 
 def _group_starts(piece_edges: Array, keyframe_s: Array, rate_hz: float) -> NDArray[np.intp]:
@@ -138,14 +147,14 @@ def _merge_steps(theta: Array, v: Array, first: NDArray[np.intp]) -> Steps[tuple
     constant specific force along with a constant rate would need to give the same velocity change.
     """
     size = np.diff(np.append(first, len(theta)))
-    turned = Rotation.from_rotvec(theta[first])
-    gained = left_jacobian_times(theta[first], v[first])
+    turn, gain = so3.exp(theta), so3.left_jacobian_times(theta, v)
+    yield 3e-4 * len(theta)
+    turned, gained = turn[first], gain[first]
     for step in range(1, int(size.max())):
-        has_piece = (step < size)[:, None]
-        piece = np.minimum(first + step, len(theta) - 1)
-        theta_k, v_k = theta[piece] * has_piece, v[piece] * has_piece
-        gained += turned.apply(left_jacobian_times(theta_k, v_k))
-        turned = turned * Rotation.from_rotvec(theta_k)
-        yield 5e-4 * len(first)
-    theta_all = turned.as_rotvec()
-    return theta_all, left_jacobian_solve(theta_all, gained)
+        longer = np.flatnonzero(step < size)
+        piece = first[longer] + step
+        gained[longer] += so3.times(turned[longer], gain[piece])
+        turned[longer] = turned[longer] @ turn[piece]
+        yield 3e-4 * len(longer)
+    theta_all = so3.log(turned)
+    return theta_all, so3.left_jacobian_solve(theta_all, gained)

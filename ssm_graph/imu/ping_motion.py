@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from factors import so3
 from factors.dvl_calibration import Motion
 from ssm_graph.base.frozen import Array
-from ssm_graph.base.times import Indices, last_readings
+from ssm_graph.base.times import Indices, last_readings, usual_interval
 from ssm_graph.sensors.imu import ImuLog
 
 PING_WINDOW_S = 0.1
@@ -22,7 +22,7 @@ def mean_gyro(imu: ImuLog, time_s: Array) -> Array:
     Near the ends of the data the window shrinks, to no less than one sample.
     """
     edges, angle = _angles(imu)
-    sample = float(np.median(np.diff(edges)))
+    sample = usual_interval(edges)
     room = np.minimum(time_s - edges[0], edges[-1] - time_s)
     half = np.clip(room, 0.5 * sample, 0.5 * max(PING_WINDOW_S, sample))
     centre = np.clip(time_s, edges[0] + half, edges[-1] - half)
@@ -76,7 +76,7 @@ class MotionBefore:
         spans = np.diff(self._edges)[:, None]
         readings = np.hstack([imu.gyro_b, imu.accel_b])
         self._integral = np.concatenate([np.zeros((1, 6)), np.cumsum(readings * spans, axis=0)])
-        self._sample_s = float(np.median(spans))
+        self._sample_s = usual_interval(self._edges)
         self._half_s = 0.5 * max(PING_WINDOW_S, self._sample_s)
 
     def at(self, late_s: float, pings: slice | NDArray[np.intp] = np.s_[:]) -> Motion:

@@ -15,7 +15,9 @@ from factors.imu_errors import increment_jacobians, taken_off
 from factors.inertial import Intervals
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array, Vector
+from ssm_graph.base.progress import told
 from ssm_graph.base.stepwise import Steps, at_once, finished
+from ssm_graph.base.times import usual_interval
 from ssm_graph.imu.increments import MergedSamples, merge_samples_steps
 from ssm_graph.sensors.imu import FrozenAxis, ImuLog, ImuNoise, frozen_axes
 
@@ -235,7 +237,8 @@ def _integrate_steps(
     about = gtsam.imuBias.ConstantBias(bias[:3], bias[3:])
     measurements = []
     samples = list(zip(merged.accel_b, merged.gyro_b, merged.dt.tolist(), strict=True))
-    for interval_params, (begin, end) in zip(params, pairwise(merged.first.tolist()), strict=True):
+    intervals = zip(params, pairwise(merged.first.tolist()), strict=True)
+    for interval_params, (begin, end) in told(intervals, len(params)):
         measured = Preintegrated(interval_params, about)
         for sample in samples[begin:end]:
             measured.integrateMeasurement(*sample)
@@ -311,7 +314,7 @@ def imu_gaps(imu: ImuLog) -> tuple[Array, Array]:
     """Return begin and end of every gap: an interval far longer than the usual one, s."""
     edges = np.concatenate([[imu.start_s], imu.time_s])
     spacing = np.diff(edges)
-    is_gap = spacing > max(0.1, 5.0 * float(np.median(spacing)))
+    is_gap = spacing > max(0.1, 5.0 * usual_interval(edges))
     return edges[:-1][is_gap], edges[1:][is_gap]
 
 

@@ -6,6 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ssm_graph.base.errors import DataError
 from ssm_graph.sensors.messages import Message
 
@@ -32,3 +35,16 @@ def whole(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise DataError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+def running_sums(data: bytes, width: int = 1, offset: int = 0) -> NDArray[np.uint16]:
+    """Return the sums of the first 0, 1, 2 ... numbers of ``width`` bytes, modulo 65536.
+
+    What lies between two places sums up to their difference, so that a file full of begins of long
+    packets costs no more than one of packets.
+    """
+    count = max(0, (len(data) - offset) // width)
+    numbers = np.frombuffer(data, f"<u{width}", count=count, offset=offset if count else 0)
+    sums = np.zeros(count + 1, np.uint16)
+    np.cumsum(numbers, dtype=np.uint16, out=sums[1:])
+    return sums

@@ -75,9 +75,9 @@ class AidTable(FrozenArrays):
     """
 
     aid: tuple[str, ...]
-    """(N,) depth, GNSS, USBL, range, heading, magnetometer or standstill"""
+    """(N,) depth, GNSS, USBL, range, heading, magnetometer, standstill or seabed"""
     component: tuple[str, ...]
-    """(N,) depth, east, north, up, heading, x, y, z, or the beacon of a range"""
+    """(N,) depth, east, north, up, heading, x, y, z, the beacon of a range, or a beam"""
     unit: tuple[str, ...]
     """(N,) of the innovation: m, rad or m/s"""
     time_s: Array = shaped("N")

@@ -32,13 +32,14 @@ from ssm_graph.mission.calibration import (
     needs_motion,
 )
 from ssm_graph.mission.fault import DetectedFault, Treatment
-from ssm_graph.mission.mission import InitialState, Mission
+from ssm_graph.mission.mission import Aids, InitialState, Mission
 from ssm_graph.mission.timeline import Timeline, build_timeline
 from ssm_graph.mission.usable import require_usable
 from ssm_graph.sensors.dvl import DvlMount
 from ssm_graph.sensors.dvl_readings import stuck_beams
 from ssm_graph.sensors.frozen import frozen_runs
 from ssm_graph.sensors.imu import ImuLog, frozen_axes
+from ssm_graph.sensors.seabed import TerrainLog
 
 SHORTEST_INTERVAL_S = 0.01
 NO_EXTRAS = Extras()
@@ -177,6 +178,7 @@ def build_problem_steps(
             "mission.toml: no [initial], and no start was given; expected one of them; "
             "let align(mission) find the start"
         )
+    mission, lost_note = _without_lost_map(mission, start)
     timeline = build_timeline(mission, start_s=start.time_s, interval_s=config.keyframe_interval_s)
     extras = extras_of(mission)
     chain = yield from preintegrate_steps(
@@ -200,7 +202,13 @@ def build_problem_steps(
         imu_noise_bias_sigma=np.repeat([noise.accel_bias_sigma, noise.gyro_bias_sigma], 3),
         extras=extras,
         aids=tuple(aid for aid in aids if aid is not None),
-        notes=(*timeline.notes, *_gap_note(mission.imu), *stuck_note, *current_note(mission)),
+        notes=(
+            *timeline.notes,
+            *_gap_note(mission.imu),
+            *stuck_note,
+            *lost_note,
+            *current_note(mission),
+        ),
         faults=frozen,
     )
 
@@ -256,6 +264,26 @@ def with_white_noise(problem: Problem) -> Problem:
     if depths is not None and DEPTH_DRIFT in problem.extras:
         depths = replace(depths, sigma=depths.sigma * depths.white_share, white_share=1.0)
     return replace(problem, beams=beams, fixes=fixes, depths=depths)
+
+
+LOST_M = 100.0
+"""Less well known than this, a start is on no slope of a seabed that could lead it anywhere."""
+
+
+def _without_lost_map(mission: Mission, start: InitialState) -> tuple[Mission, tuple[str, ...]]:
+    """Return the mission without a map on which its place has yet to be found, and a note."""
+    log = mission.aids.get(TerrainLog)
+    if log is None:
+        return mission, ()
+    sigma = float(start.position_sigma_enu[:2].max())
+    if mission.local is None and not np.isfinite(log.within_m) and sigma < LOST_M:
+        return mission, ()
+    note = (
+        "the map of the seabed is left out: where on it the mission began is not known; "
+        "ssm-graph smooth and ssm-graph seabed look for it"
+    )
+    others = (aid for aid in mission.aids if aid is not log)
+    return replace(mission, aids=Aids(*others)), (note,)
 
 
 def _without_stuck_beams(mission: Mission) -> tuple[Mission, tuple[str, ...]]:

@@ -195,6 +195,23 @@ def thinned(n: int, limit: int = MAX_POINTS) -> NDArray[np.intp]:
     return np.unique(np.linspace(0, n - 1, limit).astype(np.intp))
 
 
+def thinned_to_extremes(values: Array, limit: int = MAX_POINTS) -> NDArray[np.intp]:
+    """Return about ``limit`` indices of a curve (N,): the lowest and highest of each stretch.
+
+    A spike of one row stays; so do all NaN, where the curve breaks.
+    """
+    if len(values) <= limit:
+        return np.arange(len(values))
+    width = -(-len(values) // (limit // 2))
+    padded = np.r_[values, np.full(-len(values) % width, np.nan)].reshape(-1, width)
+    is_nan = np.isnan(padded)
+    first = width * np.arange(len(padded))
+    low = first + np.argmin(np.where(is_nan, np.inf, padded), axis=1)
+    high = first + np.argmax(np.where(is_nan, -np.inf, padded), axis=1)
+    ends = [0, len(values) - 1]
+    return np.unique(np.r_[ends, low, high, np.flatnonzero(np.isnan(values))])
+
+
 def thinned_outliers_first(weight: Array, limit: int = MAX_POINTS) -> NDArray[np.intp]:
     """Return at most ``limit`` indices in order: of those below `REDUCED_WEIGHT` up to a half.
 

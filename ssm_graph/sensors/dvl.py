@@ -177,6 +177,24 @@ class DvlLog(FrozenArrays):
         beams_b[whole] = turned @ self.mount.beams_b
         return speed, sigma, beams_b
 
+    def altitude(self, R_nb: Array | None = None) -> Array:
+        """Return the height of the instrument over the bottom (N,), m; NaN where no beam says.
+
+        It is the mean over the beams with a range; of water track it is none.
+
+        Parameters
+        ----------
+        R_nb : (N, 3, 3) attitudes at the pings, third axis down; level when left out.
+        """
+        if self.range_m is None:
+            return np.full(len(self.time_s), np.nan)
+        beams_b = self.mount.beams_d @ self.mount.R_bd.T
+        down = beams_b[:, 2] if R_nb is None else R_nb[:, 2] @ beams_b.T
+        heights = np.where(self.is_water[:, None], np.nan, self.range_m * down)
+        known = np.isfinite(heights)
+        count = np.where(known.any(axis=1), known.sum(axis=1), np.nan)
+        return np.asarray(np.where(known, heights, 0.0).sum(axis=1) / count)
+
     @property
     def valid_s(self) -> Array:
         """(N,) when the pings were taken: stamps less the mount's time offset, s."""

@@ -126,6 +126,8 @@ FROZEN_SAMPLES: Final = 20
 
 def frozen_axes(log: ImuLog) -> list[FrozenAxis]:
     """Return where an axis repeats one reading, in the order of axes, gyros first."""
+    if len(log.time_s) <= FROZEN_SAMPLES or log.time_s[-1] - log.time_s[0] < FROZEN_S:
+        return []
     return [
         FrozenAxis(axis < 3, axis % 3, float(log.time_s[begin]), float(log.time_s[end]))
         for axis, values in enumerate(np.hstack([log.gyro_b, log.accel_b]).T)

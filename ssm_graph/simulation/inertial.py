@@ -14,6 +14,7 @@ from numpy.polynomial.legendre import leggauss
 
 from ssm_graph.base.earth import R_el_from_lat_lon, ecef_from_geodetic, geodetic_from_ecef
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.progress import told
 from ssm_graph.mission.mission import InitialState, Reference
 from ssm_graph.sensors.imu import ImuNoise
 from ssm_graph.simulation.randomness import Streams
@@ -156,7 +157,7 @@ def averaged_imu(
     nodes, weights = leggauss(n_nodes)
     fractions, weights = 0.5 * (nodes + 1.0), 0.5 * weights
     gyro_b, accel_b = np.empty((n_samples, 3)), np.empty((n_samples, 3))
-    for begin in range(0, n_samples, _CHUNK):
+    for begin in told(range(0, n_samples, _CHUNK), -(-n_samples // _CHUNK)):
         end = min(begin + _CHUNK, n_samples)
         time_s = (np.arange(begin, end) + fractions[:, None]) / rate_hz - late_s
         motion = trajectory.at(time_s)

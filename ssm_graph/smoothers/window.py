@@ -20,6 +20,7 @@ from ssm_graph.engine.marginal_prior import moved_chart
 from ssm_graph.engine.reweighting import Anderson
 from ssm_graph.engine.states import States
 from ssm_graph.graph.first_weights import met_weights, updated_trust
+from ssm_graph.graph.inertial_rows import Ahead, InertialRows
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors
 from ssm_graph.smoothers.track import Stretch
 from ssm_graph.smoothers.window_aids import SensorRows
@@ -46,7 +47,8 @@ class FixedLagConfig:
     """And only if its attitude has moved by so many rad, or its velocity by a hundred times as many
     m/s: what is less bends nothing, however certain."""
     reweigh: float = 1e-9
-    """A beam's weight, in a window of several keyframes, is renewed once it is off by so much."""
+    """A weight, in a window of several keyframes, is renewed once that may move the answer, or its
+    sigmas, by so many posterior sigmas; those of all later keyframes are renewed with it."""
     gate_sigmas: float = np.inf
     """A depth or GNSS fix further than this from what is predicted gets no weight, and keeps none:
     a height that little is known of would follow many of them, however far off."""
@@ -103,6 +105,8 @@ class Window:
         self._covariance = start.covariance[None]
         self._innovation = -self._graph.error
         self._weights, self._t = np.ones(len(self._innovation)), np.zeros(len(self._innovation))
+        self._known: tuple[States, Array, States] | None = None
+        """Where the newest keyframe was linearised, by which step it was moved, and where to"""
 
     def successor(self) -> Self:
         """Return a window that goes its own way from here, at full speed; this one rests, small.
@@ -128,7 +132,7 @@ class Window:
     ) -> Self:
         """Return the window that was packed; ``inertial`` gives the data between two times."""
         window = cls.__new__(cls)
-        window.config = config
+        window.config, window._known = config, None
         window._graph = WindowGraph.unpack(arrays, sensors, inertial)
         for name in _PACKED:
             setattr(window, f"_{name}", arrays[name])
@@ -143,6 +147,16 @@ class Window:
     def sensors(self) -> Sensors:
         """What is the same at all keyframes."""
         return self._graph.sensors
+
+    @property
+    def ahead(self) -> Ahead | None:
+        """Where the inertial data led to the newest keyframe; None where it is the first."""
+        return self._graph.ahead
+
+    @property
+    def inertial(self) -> InertialRows:
+        """The model of the inertial data between keyframes."""
+        return self._graph.inertial
 
     @property
     def trust(self) -> Array:
@@ -162,7 +176,10 @@ class Window:
     @property
     def newest_states(self) -> States:
         """The estimate (1, ...) of the newest keyframe."""
-        return self._graph.at.take(np.s_[-1:]).moved(self._step[-1:])
+        at, step = self._graph.at, self._step
+        if self._known is None or self._known[0] is not at or self._known[1] is not step:
+            self._known = (at, step, at.take(np.s_[-1:]).moved(step[-1:]))
+        return self._known[2]
 
     @property
     def newest_covariance(self) -> Array:
@@ -210,9 +227,10 @@ class Window:
         """Predict a new keyframe, marginalise what the lag leaves behind, and return that."""
         oldest_s = keyframe.time_s - self.config.lag_s - MIN_SPACING_S
         leaving = sum(known.time_s < oldest_s for known in self.keyframes)
-        left, last = self._stretch(0, leaving), self.states.take(np.s_[-1:])
-        newest = self.newest
-        self._trust = updated_trust(self._trust, newest.beam, newest.weight)
+        left, last = self._stretch(0, leaving), self.newest_states
+        pinged = slice(int(self._graph.first_row[-2]), None)
+        beam, weight = self._graph.beams.beam[pinged], self._weights[pinged]
+        self._trust = updated_trust(self._trust, beam, weight)
         if leaving == len(self.keyframes):
             # Of a window that goes as a whole, the posterior of its end is all that counts.
             self._graph.keep_posterior(last)
@@ -272,15 +290,13 @@ class Window:
 
     def predicted(self, keyframe: Keyframe) -> tuple[States, Array]:
         """Return where the inertial data lead from the newest keyframe, with the covariance."""
-        last = self.states.take(np.s_[-1:])
-        ahead = self._graph.inertial.predict(inertial_data([keyframe]), last)
+        ahead = self._graph.inertial.predict(inertial_data([keyframe]), self.newest_states)
         return ahead.states, ahead.covariance(self._covariance[-1])
 
     def require_sane(self) -> None:
         """Raise :class:`SolverError` for a newest state that no vehicle can have."""
-        newest = self.newest
-        speed = float(np.linalg.norm(newest.states.v_n[0]))
-        if not (speed < RUNAWAY_SPEED and np.all(np.isfinite(newest.covariance))):
+        speed = float(np.linalg.norm(self.newest_states.v_n[0]))
+        if not (speed < RUNAWAY_SPEED and np.all(np.isfinite(self.newest_covariance))):
             raise SolverError(f"the answer ran away, {speed:.3g} m/s")
 
     def iterate_steps(self) -> Steps[int]:
@@ -300,7 +316,7 @@ class Window:
         for number in range(1, config.max_iterations + 1):
             update = self._solve()
             self._relinearise()
-            self._judge()
+            pull = self._judge()
             if _largest(update, self._covariance) < tolerance:
                 break
             yield 0.8 + 0.1 * n_keyframes
@@ -311,7 +327,9 @@ class Window:
                     used = np.concatenate([self._weights, self._graph.aids.weights])
                     anderson = Anderson.after(anderson, used, settled)
                     settled = anderson.weights
-                self._renew(settled)
+                self._renew(settled, pull)
+                if self._graph.is_eliminated:
+                    break  # nothing has changed, another pass would find the same
         return number
 
     def _reweigh(self) -> int:
@@ -319,11 +337,11 @@ class Window:
         config, chain = self.config, self._graph.chain
         for number in range(1, config.max_iterations + 1):
             update = self._solve()
-            self._judge()
+            pull = self._judge()
             if _largest(update, self._covariance) < config.tolerance:
                 break
             if number < config.max_iterations:
-                self._renew(self._settled())
+                self._renew(self._settled(), pull)
         J = moved_chart(self._step[0])
         self._covariance = J @ self._covariance @ J.T
         chain.move(J)
@@ -356,37 +374,39 @@ class Window:
             self._step = self._step.copy()
             self._step[begin:end] = 0.0
 
-    def _renew(self, settled: Array) -> None:
-        """Take the weights that have changed enough."""
-        threshold = 0.0 if len(self.keyframes) == 1 else self.config.reweigh
-        n_beams = len(self._weights)
-        of_beams, graph = settled[:n_beams], self._graph
-        changed = np.abs(of_beams - self._weights) > threshold
-        if changed.any():
-            self._weights = np.where(changed, of_beams, self._weights)
-            row = np.argmax(changed)
-            graph.changed_from(int(np.searchsorted(graph.first_row, row, side="right")) - 1)
-        first = graph.aids.renew(settled[n_beams:], threshold=threshold)
-        if first is not None:
-            graph.changed_from(first)
+    def _renew(self, settled: Array, pull: Array) -> None:
+        """Take the weights from the first keyframe on where one has changed enough."""
+        n_beams, graph, config = len(self._weights), self._graph, self.config
+        used = np.concatenate([self._weights, graph.aids.weights])
+        first = 0
+        if len(self.keyframes) > 1:
+            keyframe = np.concatenate([graph.keyframe_of_row, graph.aids.keyframe_of_weight])
+            changed = np.abs(settled - used) * pull > config.reweigh
+            first = int(keyframe[changed].min(initial=len(self.keyframes)))
+            settled = np.where(keyframe >= first, settled, used)
+        self._weights = settled[:n_beams]
+        graph.aids.renew(settled[n_beams:])
+        graph.changed_from(first)
 
     def _settled(self) -> Array:
         """Return the weights that all beams, then all aids, are found to have."""
         kernel = self.config.kernel
         return np.concatenate([kernel.weight(self._t), self._graph.aids.settled(kernel)])
 
-    def _judge(self) -> None:
-        """Find the ``t`` of all measurements at the present solution."""
-        self._t = self._mahalanobis_sq()
-        self._graph.aids.judge(self._step, self._covariance, self.config.similarity)
+    def _judge(self) -> Array:
+        """Find the ``t`` of all measurements at the present solution.
 
-    def _mahalanobis_sq(self) -> Array:
+        Returns how many posterior sigmas the answer, or its sigmas, would move if their weights,
+        the beams' first, changed by one.
+        """
         graph = self._graph
-        keyframe, seen = graph.keyframe_of_row, graph.seen_by_beams
+        keyframe, seen, sigma = graph.keyframe_of_row, graph.seen_by_beams, graph.beams.sigma
         H = graph.jacobian[:, seen]
         error = graph.error + (H * self._step[:, seen][keyframe]).sum(axis=1)
-        spread = np.zeros(len(H))
-        if self.config.similarity is Similarity.EXPECTED:
-            covariance = self._covariance[:, seen[:, None], seen]
-            spread = ((H[:, None, :] @ covariance[keyframe])[:, 0] * H).sum(axis=1)
-        return expected_mahalanobis_sq(error, spread, sigma=graph.beams.sigma)
+        covariance = self._covariance[:, seen[:, None], seen]
+        spread = ((H[:, None, :] @ covariance[keyframe])[:, 0] * H).sum(axis=1)
+        is_plain = self.config.similarity is Similarity.PLAIN
+        counted = np.zeros(len(error)) if is_plain else spread
+        self._t = expected_mahalanobis_sq(error, counted, sigma=sigma)
+        of_aids = graph.aids.judge(self._step, self._covariance, self.config.similarity)
+        return np.concatenate([np.sqrt(self._t * spread) / sigma, of_aids])

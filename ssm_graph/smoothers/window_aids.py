@@ -221,15 +221,23 @@ class WindowAids:
             begin += count
         return True
 
-    def judge(self, step: Array, covariance: Array, similarity: Similarity) -> None:
-        """Find the ``t`` of all measurements with weights at a solution (K, n), (K, n, n)."""
+    def judge(self, step: Array, covariance: Array, similarity: Similarity) -> Array:
+        """Find the ``t`` of all measurements with weights at a solution (K, n), (K, n, n).
+
+        Returns (M,) how many posterior sigmas each would move the answer if its weight changed by
+        one.
+        """
+        pulls = [np.zeros(0)]
         for name in self._weighted:
             one = self._all[name]
             J, k = one.jacobian, one.aid.keyframe
-            square = self._errors(one, step) ** 2
+            t = np.sum(self._errors(one, step) ** 2, axis=-1)
+            spread = ((J @ covariance[k]) * J).sum(axis=(-2, -1))
             if similarity is Similarity.EXPECTED:
-                square = square + ((J @ covariance[k]) * J).sum(axis=-1)
-            self._all[name] = one._replace(t=square.sum(axis=-1))
+                t = t + spread
+            self._all[name] = one._replace(t=t)
+            pulls.append(np.sqrt(t * spread))
+        return np.concatenate(pulls)
 
     @staticmethod
     def _errors(one: _Measured, step: Array) -> Array:
@@ -246,18 +254,20 @@ class WindowAids:
             )
         return np.concatenate(settled)
 
-    def renew(self, settled: Array, *, threshold: float) -> int | None:
-        """Take the weights (M,) that differ by more; return the first keyframe that has one."""
-        first, begin = [], 0
+    @property
+    def keyframe_of_weight(self) -> Indices:
+        """(M,) where all measurements that have a weight stand."""
+        own = [self._all[name].aid.keyframe for name in self._weighted]
+        return np.concatenate([np.zeros(0, np.intp), *own])
+
+    def renew(self, weights: Array) -> None:
+        """Take weights (M,)."""
+        begin = 0
         for name in self._weighted:
             one = self._all[name]
-            own = settled[begin : begin + len(one.weight)]
+            own = weights[begin : begin + len(one.weight)]
             begin += len(one.weight)
-            changed = np.abs(own - one.weight) > threshold
-            if changed.any():
-                first.append(int(one.aid.keyframe[np.argmax(changed)]))
-                self._all[name] = one._replace(weight=np.where(changed, own, one.weight))
-        return min(first, default=None)
+            self._all[name] = one._replace(weight=own)
 
     def judged(self, begin: int, end: int, time_s: Array, step: Array) -> dict[str, JudgedAid]:
         """Return what became of the weighted measurements of successive keyframes.

@@ -20,7 +20,7 @@ from ssm_graph.engine.extras import Extras
 from ssm_graph.engine.marginal_prior import MarginalPrior, prior_at_start, prior_on
 from ssm_graph.engine.states import States
 from ssm_graph.graph.beam_rows import BeamRows, CalibratedBeams, linearize_beams
-from ssm_graph.graph.inertial_rows import InertialRows
+from ssm_graph.graph.inertial_rows import Ahead, InertialRows
 from ssm_graph.mission.problem import Beams
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors
 from ssm_graph.smoothers.window_aids import WindowAids, row_states
@@ -83,6 +83,8 @@ class WindowGraph:
         self.error, self.jacobian = np.zeros(0), np.zeros((0, n))
         """Of the beams, (M,) in m/s and (M, n)"""
         self.inertial = InertialRows(sensors.frame, sensors.extras)
+        self.ahead: Ahead | None = None
+        """Where the inertial data led to the newest keyframe, None of the first"""
         self.chain = Chain(n)
         self.prior: MarginalPrior = prior_at_start(start)
         self._between: list[Array] = []
@@ -155,6 +157,11 @@ class WindowGraph:
         graph._linearise_beams(0, len(keyframes))
         return graph
 
+    @property
+    def is_eliminated(self) -> bool:
+        """Whether the chain is up to date."""
+        return self._stale == len(self.keyframes)
+
     def changed_from(self, keyframe: int) -> None:
         """Have the chain eliminated again from a keyframe on."""
         self._stale = min(self._stale, keyframe)
@@ -162,7 +169,7 @@ class WindowGraph:
     def append(self, keyframe: Keyframe, last: States) -> None:
         """Add a keyframe where the inertial data lead from ``last`` (1, ...), the newest one."""
         interval = inertial_data([keyframe])
-        ahead = self.inertial.predict(interval, last)
+        self.ahead = ahead = self.inertial.predict(interval, last)
         predicted, at = ahead.states, self.at.take(np.s_[-1:])
         self.at = self.at.followed_by(predicted)
         if at.is_same(last):
@@ -221,9 +228,9 @@ class WindowGraph:
 
     def eliminate(self, weights: Array) -> None:
         """Bring the chain up to date from the first keyframe that has changed."""
-        begin = self._stale
-        if begin == len(self.keyframes):
+        if self.is_eliminated:
             return
+        begin = self._stale
         row, n_keyframes = self.first_row[begin], len(self.keyframes)
         of_beams = np.empty((len(self.error) - row, self.state_dim + 1))
         of_beams[:, :-1] = self.jacobian[row:]

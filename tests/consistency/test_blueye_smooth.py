@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,18 +12,16 @@ from numpy.typing import NDArray
 
 import ssm_graph as sg
 from ssm_graph.evaluation.errors import error_series, withhold_gnss
-from ssm_graph.io.blueye.convert import convert_blueye
 from ssm_graph.sensors.gnss import GnssLog
+from tests.blueye_fixture import DIVE, GRID, SQUARE, converted, needs_logs
 
-DATA = Path(os.environ.get("SSM_GRAPH_DATA", Path(__file__).parents[2].parent / "shared" / "data"))
-RUNS = DATA / "blueye_x3"
-pytestmark = pytest.mark.skipif(not RUNS.is_dir(), reason=f"no real logs in {RUNS}")
+pytestmark = needs_logs
 
 
 @cache
 def withheld_after(name: str, until_s: float) -> tuple[sg.Mission, GnssLog]:
     """Return a run whose GNSS ends, and the fixes after that."""
-    return withhold_gnss(convert_blueye(RUNS / f"{name}.mcap"), until_s)
+    return withhold_gnss(converted(name), until_s)
 
 
 @cache
@@ -33,12 +30,29 @@ def as_recorded(name: str, until_s: float) -> sg.Estimate:
     return sg.smooth(withheld_after(name, until_s)[0])
 
 
+def begin_of(mission: sg.Mission, length_s: float) -> sg.Mission:
+    """Return the first seconds of a run."""
+    end_s = mission.imu.start_s + length_s
+
+    def cut(log: Any) -> Any:
+        return log.rows(log.time_s < end_s)
+
+    return replace(
+        mission,
+        imu=cut(mission.imu),
+        dvl=cut(mission.dvl),
+        depth=cut(mission.depth),
+        gnss=cut(mission.gnss),
+        aids=sg.Aids(*map(cut, mission.aids)),
+    )
+
+
 @pytest.mark.parametrize(
     ("name", "until_s", "largest_rms"),
     [
         # 1 % of the path; drafts and filters of others had 1.2 to 2.8 m. Seen: 0.81 and 0.56 m.
-        ("log_auto_square_2025-05-07_14_55_13", 70.0, 0.88),
-        pytest.param("log_grid_01_05_scaled", 70.0, 0.91, marks=pytest.mark.slow),
+        (SQUARE, 70.0, 0.88),
+        pytest.param(GRID, 70.0, 0.91, marks=pytest.mark.slow),
     ],
 )
 def test_surface_runs(name: str, until_s: float, largest_rms: float) -> None:
@@ -69,7 +83,7 @@ def with_a_small_bias(mission: sg.Mission) -> tuple[sg.Mission, NDArray[np.bool_
 @pytest.mark.slow
 def test_a_kernel_alone_does_not_find_a_small_bias() -> None:
     """What the next test is for: without the search the error grows beyond 2 m."""
-    name = "log_auto_square_2025-05-07_14_55_13"
+    name = SQUARE
     mission, withheld = withheld_after(name, 70.0)
     alone = sg.smooth(with_a_small_bias(mission)[0], sg.SmootherConfig())
     reference = sg.reference_from_gnss(withheld, alone.trajectory)
@@ -79,7 +93,7 @@ def test_a_kernel_alone_does_not_find_a_small_bias() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "largest_rms"),
-    [("log_auto_square_2025-05-07_14_55_13", 0.88), ("log_grid_01_05_scaled", 0.91)],
+    [(SQUARE, 0.88), (GRID, 0.91)],
 )
 def test_a_small_bias_of_one_beam_for_long_is_found(name: str, largest_rms: float) -> None:
     """0.15 m/s for 40 s after GNSS has ended: that is taken off the beam, the others are kept.
@@ -101,10 +115,8 @@ def test_a_small_bias_of_one_beam_for_long_is_found(name: str, largest_rms: floa
 
 @pytest.mark.slow
 def test_the_dive_says_that_its_heading_is_hardly_observable() -> None:
-    """It moves by 1.6 m before GNSS is lost."""
-    name = "log_dive_2min_2025-05-07_15_06_13"
-    mission, _ = withheld_after(name, 30.0)
-    estimate = sg.smooth(mission)
+    """It moves by 1.6 m before GNSS is lost; half a minute after that nothing has shown it."""
+    estimate = sg.smooth(begin_of(withheld_after(DIVE, 30.0)[0], 60.0))
     assert "hardly observable" in estimate.reason + " ".join(estimate.notes)
     assert np.degrees(estimate.trajectory.attitude_sigma[0, 2]) > 3.0
 
@@ -115,7 +127,7 @@ def test_a_long_fault_of_one_beam_does_not_fool_the_start() -> None:
     The log kernel leaves a beam of residual r a pull of 6 sigma^2 / r: with 0.02 m/s of white noise
     1 mm/s on the velocity, with 0.06 m/s, where the drift is not modelled, 7 mm/s.
     """
-    name = "log_auto_square_2025-05-07_14_55_13"
+    name = SQUARE
     mission, withheld = withheld_after(name, 70.0)
     elapsed = mission.dvl.time_s - mission.dvl.time_s[0]
     speed = mission.dvl.speed.copy()

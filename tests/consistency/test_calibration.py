@@ -15,7 +15,7 @@ RUNS = 8
 @pytest.mark.slow
 def test_what_is_wrong_is_found() -> None:
     """Turns and GNSS at the surface: nearly all within 3 sigma, all eight together consistent."""
-    runs: list[Run] = [turns(seed, LogKernel(), 0.1) for seed in range(RUNS)]
+    runs: list[Run] = [turns(seed, LogKernel(), 0.1, duration_s=240.0) for seed in range(RUNS)]
     assert all(run.status == "CONVERGED" for run in runs)
     error = np.array([run.error for run in runs])
     assert np.mean(np.abs(error) < 3.0) > 0.97

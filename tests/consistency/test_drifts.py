@@ -21,7 +21,7 @@ from ssm_graph.simulation import (
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
 from tests.helpers import assert_consistent, drifting, simulated
 
-RUNS = 12
+RUNS, UNTOLD = 12, range(3)
 SPEED, PLACE = (0.02, 20.0), (0.5, 60.0)
 """Sigma in m/s and m, and correlation time in s, of the drifts of DVL and fixes."""
 START = StartSigmas(position=5.0, velocity=0.1, roll_pitch=0.001, heading=0.02)
@@ -66,7 +66,8 @@ def test_sigmas_hold_with_slow_errors() -> None:
     for seed in range(RUNS):
         sim = drifted(seed)
         told.append(nees(sim, drifting(sim.mission, Drift(*SPEED), Drift(*PLACE))))
-        untold.append(nees(sim, sim.mission))
+        if seed in UNTOLD:
+            untold.append(nees(sim, sim.mission))
     for samples in np.array(told).T:
         assert_consistent(samples, dof=2)
     assert np.all(np.mean(untold, axis=0)[[0, 1, 3]] > 10.0)

@@ -43,7 +43,7 @@ def test_unknown_beacons_lie_where_their_sigmas_say() -> None:
         off = np.random.default_rng([seed, 7]).standard_normal(3) * PRIOR_M
         beacon = BeaconSettings(7, (90.0, -60.0, -50.0), (off[0], off[1], off[2]), PRIOR_M)
         aids = ranging(beacon, rate=0.1, interval_s=2.0)
-        sim = simulated(duration_s=200.0, route=ROUTE, aids=aids, seed=seed)
+        sim = simulated(duration_s=120.0, route=ROUTE, aids=aids, seed=seed)
         estimate = SsmSmoother().solve(build_problem(sim.mission))
         found.append(nees(estimate, {"beacon_7": -off}))
     # On clean data the log kernel's errors have 1.1 times the variance that it claims.
@@ -55,7 +55,7 @@ def test_errors_of_a_compass_lie_where_their_sigmas_say() -> None:
     names = ("heading_offset", "heading_one_cycle", "heading_two_cycle", "heading_rate")
     found = []
     for seed in range(RUNS):
-        sim = simulated(duration_s=200.0, route=ROUTE, aids=compass(), seed=seed)
+        sim = simulated(duration_s=120.0, route=ROUTE, aids=compass(), seed=seed)
         estimate = SsmSmoother().solve(build_problem(sim.mission))
         truth = np.split(sim.aids.heading_errors, [1, 3, 5])
         found.append(nees(estimate, dict(zip(names, truth, strict=True))))
@@ -70,7 +70,7 @@ def test_a_window_finds_them_where_its_sigmas_say() -> None:
         off = np.random.default_rng([seed, 7]).standard_normal(3) * NEAR_M
         beacon = BeaconSettings(7, (90.0, -60.0, -50.0), (off[0], off[1], off[2]), NEAR_M)
         aids = replace(compass(rate_hz=1.0), ranging=ranging(beacon, interval_s=2.0).ranging)
-        sim = simulated(duration_s=100.0, route=ROUTE, aids=aids, seed=seed)
+        sim = simulated(duration_s=60.0, route=ROUTE, aids=aids, seed=seed)
         estimate = solve_fixed_lag(build_problem(sim.mission), SHORT).newest
         beacons.append(nees(estimate, {"beacon_7": -off}))
         truth = np.split(sim.aids.heading_errors, [1, 3, 5])

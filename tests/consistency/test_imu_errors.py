@@ -55,7 +55,7 @@ def test_errors_in_a_window_over_seeds() -> None:
     """With a lag of 8 s, at the end of the mission, at MEMS grade."""
     found = []
     for seed in range(RUNS):
-        off = distorted(Grade.MEMS, 50 + seed, gnss=FIXES, duration_s=60.0)
+        off = distorted(Grade.MEMS, 50 + seed, gnss=FIXES, duration_s=30.0)
         problem = build_problem(asking(off.mission, SIGMAS[Grade.MEMS]))
         found.append(squared(solve_fixed_lag(problem, SHORT).newest, off.errors))
     assert_consistent(np.array(found), dof=27)

@@ -62,17 +62,3 @@ def test_state_and_current_are_consistent(grade: Grade, track: WaterTrack) -> No
         assert_consistent(samples, dof=STATE_DIM)
     for samples in np.array(current_nees).T:
         assert_consistent(samples, dof=3)
-
-
-def test_few_runs_are_consistent_by_and_large() -> None:
-    """The same without waiting: three runs, the current in the middle of the loss."""
-    nees = []
-    for seed in range(3):
-        sim = in_current(seed=seed, current=CURRENT)
-        problem = build_problem(sim.mission)
-        estimate = SsmSmoother(SmootherConfig(kernel=GaussianKernel())).solve(problem)
-        assert estimate.current is not None
-        k = problem.n_keyframes // 2
-        error = current_errors(estimate, sim)[k]
-        nees.append(error @ np.linalg.solve(estimate.current.covariance_enu[k], error))
-    assert_consistent(np.array(nees), dof=3)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.base.frames import rotation_zyx
 from ssm_graph.base.frozen import Array
 from ssm_graph.io.mission_folder.assembly import mission_from
 from ssm_graph.io.mission_folder.folder import read_mission, write_mission
@@ -134,6 +135,22 @@ def test_a_velocity_counts_along_the_axes_of_its_covariance(tmp_path: Path) -> N
         np.testing.assert_array_equal(rows.sigma[rows.ping == ping], sigma[ping])
     np.testing.assert_array_equal(sigma[4], got.sigma[4])
     np.testing.assert_array_equal(beams_b[4], read)
+
+
+def test_ranges_tell_the_altitude() -> None:
+    """Over a level bottom 12 m below, in any attitude, and of a beam alone; none of water."""
+    mission = with_beams(directions(4))
+    log, n = mission.dvl, len(mission.dvl.time_s)
+    k = np.arange(n)
+    R_nb = rotation_zyx(0.1 * k, 0.2 * np.sin(k), 0.3 * np.cos(k))
+    beams_n = R_nb @ (log.mount.R_bd @ log.mount.beams_d.T)
+    ranges = 12.0 / beams_n[:, 2]
+    ranges[1, 1:] = np.nan
+    ranges[2] = np.nan
+    water = np.where(k == 3, 1.0, 0.0)
+    found = replace(log, range_m=ranges, water_track=water).altitude(R_nb)
+    np.testing.assert_allclose(found, np.where((k == 2) | (k == 3), np.nan, 12.0))
+    assert np.isnan(replace(log, range_m=None).altitude()).all()
 
 
 def test_what_is_no_covariance_is_refused(tmp_path: Path) -> None:

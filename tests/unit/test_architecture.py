@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator
 from functools import cache
 from pathlib import Path
 
@@ -76,6 +76,12 @@ def parse(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"), str(path))
 
 
+@cache
+def nodes_of(path: Path) -> tuple[ast.AST, ...]:
+    """Return all nodes of a module."""
+    return tuple(ast.walk(parse(path)))
+
+
 def name_of(path: Path) -> str:
     """Return a module's path from the root on, as offenders are listed."""
     return path.relative_to(ROOT).as_posix()
@@ -98,10 +104,10 @@ def part_of(module: str) -> str:
     return pair if pair in MAY_IMPORT else rest[0] if rest else ""
 
 
-def imported_modules(tree: ast.Module, *, module: str, is_package: bool) -> Iterator[str]:
-    """Yield the dotted names that a module imports, wherever in it."""
+def imported_modules(nodes: Iterable[ast.AST], *, module: str, is_package: bool) -> Iterator[str]:
+    """Yield the dotted names that a module of these nodes imports, wherever in it."""
     package = module.split(".") if is_package else module.split(".")[:-1]
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -115,7 +121,7 @@ def imported_modules(tree: ast.Module, *, module: str, is_package: bool) -> Iter
 def imports_of(path: Path) -> set[str]:
     """Return the dotted names that a file imports."""
     name = dotted_name(path)
-    return set(imported_modules(parse(path), module=name, is_package=path.stem == "__init__"))
+    return set(imported_modules(nodes_of(path), module=name, is_package=path.stem == "__init__"))
 
 
 def own_parts(path: Path) -> set[str]:
@@ -161,7 +167,7 @@ def test_missions_of_files_and_logs_are_made_through_one_door() -> None:
         str(path.relative_to(ROOT / "ssm_graph" / "io"))
         for path in MODULES
         if part_of(dotted_name(path)) == "io"
-        for node in ast.walk(parse(path))
+        for node in nodes_of(path)
         if isinstance(node, ast.Call)
         and isinstance(node.func, ast.Name)
         and node.func.id == "Mission"
@@ -180,7 +186,9 @@ def f():
     from factors import dvl_beam
 """
     found = set(
-        imported_modules(ast.parse(source), module="ssm_graph.evaluation.x", is_package=False)
+        imported_modules(
+            ast.walk(ast.parse(source)), module="ssm_graph.evaluation.x", is_package=False
+        )
     )
     assert found == {
         "ssm_graph.io.results.tables",
@@ -221,7 +229,7 @@ def test_functions_are_small() -> None:
     assert not [
         f"{name_of(path)}:{node.lineno} {node.name}, {code_lines(node)} lines"
         for path in MODULES
-        for node in ast.walk(parse(path))
+        for node in nodes_of(path)
         if isinstance(node, Function) and code_lines(node) > MAX_FUNCTION_LINES
     ]
 
@@ -232,36 +240,41 @@ def test_only_the_border_prints() -> None:
         f"{name_of(path)}:{node.lineno}"
         for path in MODULES
         if part_of(dotted_name(path)) not in MAY_PRINT
-        for node in ast.walk(parse(path))
+        for node in nodes_of(path)
         if isinstance(node, ast.Call)
         and isinstance(node.func, ast.Name)
         and node.func.id == "print"
     ]
 
 
-def names_of_own_values(function: Function) -> set[str]:
-    """Return the names that a function binds to what it has just made, and so may fill in.
+def names_of_own_values(nodes: Iterable[ast.AST]) -> set[str]:
+    """Return the names that a function of these nodes binds to what it made and so may fill in.
 
     That is the result of a call, of ``copy.copy`` or ``cls.__new__`` for example; what a parameter,
     a loop or an attribute names belongs to somebody else.
     """
     return {
         target.id
-        for node in ast.walk(function)
+        for node in nodes
         if isinstance(node, ast.Assign) and isinstance(node.value, ast.Call)
         for target in node.targets
         if isinstance(target, ast.Name)
     }
 
 
-def writes_of(tree: ast.Module) -> Iterator[tuple[int, str]]:
+def writes_of(nodes: Collection[ast.AST]) -> Iterator[tuple[int, str]]:
     """Yield line and text of every write to a value that the writer did not make itself."""
-    functions = [node for node in ast.walk(tree) if isinstance(node, Function)]
-    inside = {id(node): f for f in functions for node in ast.walk(f)}
-    own_of = {f: {"self", "cls"} | names_of_own_values(f) for f in functions}
-    for node in ast.walk(tree):
-        function = inside.get(id(node))
-        own = own_of[function] if function else {"self", "cls"}
+    inside: dict[int, Function] = {}
+    own_of = {}
+    for function in (node for node in nodes if isinstance(node, Function)):
+        within = tuple(ast.walk(function))
+        inside |= dict.fromkeys(map(id, within), function)
+        own_of[function] = {"self", "cls"} | names_of_own_values(within)
+    for node in nodes:
+        if not isinstance(node, ast.Assign | ast.AugAssign | ast.AnnAssign | ast.Call):
+            continue
+        writer = inside.get(id(node))
+        own = own_of[writer] if writer else {"self", "cls"}
         targets: list[ast.expr] = []
         if isinstance(node, ast.Assign):
             targets = node.targets
@@ -276,8 +289,10 @@ def writes_of(tree: ast.Module) -> Iterator[tuple[int, str]]:
                 if not is_own:
                     yield part.lineno, ast.unparse(part)
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            if node.func.attr not in {"__setattr__", "setflags"}:
+                continue  # to write out every call takes seconds
             called = ast.unparse(node.func)
-            is_first = function is not None and function.name == "__post_init__"
+            is_first = writer is not None and writer.name == "__post_init__"
             if called == "object.__setattr__" and not is_first:
                 yield node.lineno, called
             if called.endswith(".setflags") and any(
@@ -315,7 +330,7 @@ def test_nobody_writes_what_another_made() -> None:
     assert not [
         f"{name_of(path)}:{line} {text}"
         for path in MODULES
-        for line, text in writes_of(parse(path))
+        for line, text in writes_of(nodes_of(path))
         if text not in MAY_WRITE.get(name_of(path), set())
     ]
 
@@ -334,7 +349,13 @@ class A:
         problem.p_n.setflags(write=True)
         problem.n += 1
 """
-    assert sorted(line for line, _ in writes_of(ast.parse(source))) == [7, 8, 9, 10, 11]
+    assert sorted(line for line, _ in writes_of(tuple(ast.walk(ast.parse(source))))) == [
+        7,
+        8,
+        9,
+        10,
+        11,
+    ]
 
 
 UNITS = {"m", "m/s", "m/s^2", "rad", "rad/s", "s", "Hz", "deg", "m/sqrt(s)", "rad^2"}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -10,24 +9,9 @@ import pytest
 
 from ssm_graph.base.errors import DataError, MissingExtraError
 from ssm_graph.io.blueye.convert import GAP_S, convert_blueye, smooth_arrivals
-from ssm_graph.io.blueye.log import TOPICS, read_blueye_tables
-from ssm_graph.mission.mission import Mission
+from ssm_graph.io.blueye.log import TOPICS
 from ssm_graph.sensors.compass import HeadingLog
-
-ROOT = Path(__file__).parents[2]
-LOGS = Path(os.environ.get("SSM_GRAPH_DATA", ROOT / "../shared/data")) / "blueye_x3"
-SQUARE = "log_auto_square_2025-05-07_14_55_13"
-DIVE = "log_dive_2min_2025-05-07_15_06_13"
-GRID = "log_grid_01_05_scaled"
-
-needs_logs = pytest.mark.skipif(not LOGS.is_dir(), reason=f"no Blueye logs in {LOGS}")
-
-
-@pytest.fixture(scope="module")
-def missions() -> dict[str, Mission]:
-    """Return all three runs, converted once."""
-    pytest.importorskip("mcap_protobuf", reason="needs the extra 'blueye'")
-    return {name: convert_blueye(LOGS / f"{name}.mcap") for name in (SQUARE, DIVE, GRID)}
+from tests.blueye_fixture import DIVE, GRID, LOGS, SQUARE, converted, needs_logs, tables
 
 
 @needs_logs
@@ -40,7 +24,6 @@ def missions() -> dict[str, Mission]:
     ],
 )
 def test_spans_and_rates(
-    missions: dict[str, Mission],
     name: str,
     duration: float,
     imu_rate: float,
@@ -48,7 +31,7 @@ def test_spans_and_rates(
     n_fixes: int,
 ) -> None:
     """Repeats are gone: what is left comes at the instruments' own rates."""
-    mission = missions[name]
+    mission = converted(name)
     assert mission.gnss is not None
     span = mission.imu.time_s[-1] - mission.imu.start_s
     assert span == pytest.approx(duration, abs=0.1)
@@ -62,10 +45,10 @@ def test_spans_and_rates(
 
 @needs_logs
 @pytest.mark.parametrize("name", [SQUARE, DIVE, GRID])
-def test_beams_fit_the_published_velocity(missions: dict[str, Mission], name: str) -> None:
+def test_beams_fit_the_published_velocity(name: str) -> None:
     """Sign, order and directions of the beams: residuals of 3 to 6 mm/s, outliers left out."""
-    mount = missions[name].dvl.mount
-    table = read_blueye_tables(LOGS / f"{name}.mcap").dvl
+    mount = converted(name).dvl.mount
+    table = tables(name).dvl
     speed, valid, velocity = table[:, 4:8], table[:, 8:12], table[:, 16:19]
     good = np.all(valid > 0.0, axis=1) & (np.abs(velocity).max(axis=1) > 0.0)
     residual = speed[good] - velocity[good] @ mount.beams_d.T
@@ -76,19 +59,19 @@ def test_beams_fit_the_published_velocity(missions: dict[str, Mission], name: st
 
 @needs_logs
 @pytest.mark.parametrize(("name", "norm"), [(SQUARE, 9.831), (DIVE, 9.832), (GRID, 9.726)])
-def test_specific_force_points_up(missions: dict[str, Mission], name: str, norm: float) -> None:
+def test_specific_force_points_up(name: str, norm: float) -> None:
     """Both units of the logs end in m/s^2, forward-right-down."""
-    accel = missions[name].imu.accel_b
+    accel = converted(name).imu.accel_b
     assert np.linalg.norm(accel, axis=1).mean() == pytest.approx(norm, abs=2e-3)
     np.testing.assert_allclose(accel.mean(axis=0), [0.0, 0.0, -norm], atol=0.65)
-    assert np.abs(missions[name].imu.gyro_b).max() < 1.0
+    assert np.abs(converted(name).imu.gyro_b).max() < 1.0
 
 
 @needs_logs
 @pytest.mark.parametrize("name", [SQUARE, DIVE, GRID])
-def test_clocks_are_strict_and_even(missions: dict[str, Mission], name: str) -> None:
+def test_clocks_are_strict_and_even(name: str) -> None:
     """No step backwards, and most of the arrival jitter gone."""
-    mission = missions[name]
+    mission = converted(name)
     assert mission.gnss is not None
     assert mission.depth is not None
     for time_s in (mission.dvl.time_s, mission.depth.time_s, mission.gnss.time_s):
@@ -102,9 +85,9 @@ def test_clocks_are_strict_and_even(missions: dict[str, Mission], name: str) -> 
 
 
 @needs_logs
-def test_gnss_ends_at_the_dive(missions: dict[str, Mission]) -> None:
+def test_gnss_ends_at_the_dive() -> None:
     """Fixes exist before and after the dive, the bad ones dropped, heights from depth."""
-    mission = missions[DIVE]
+    mission = converted(DIVE)
     gnss, depth = mission.gnss, mission.depth
     assert gnss is not None
     assert depth is not None
@@ -120,11 +103,9 @@ def test_gnss_ends_at_the_dive(missions: dict[str, Mission]) -> None:
 
 @needs_logs
 @pytest.mark.parametrize(("name", "n_jumps"), [(SQUARE, 0), (DIVE, 1), (GRID, 0)])
-def test_the_heading_of_the_dvl_turns_as_the_gyros_do(
-    missions: dict[str, Mission], name: str, n_jumps: int
-) -> None:
+def test_the_heading_of_the_dvl_turns_as_the_gyros_do(name: str, n_jumps: int) -> None:
     """To 2 degrees rms in two to four minutes, with up to 2000 of turns; a reset is bridged."""
-    mission = missions[name]
+    mission = converted(name)
     imu, log = mission.imu, mission.aids.get(HeadingLog)
     assert log is not None
     angle = np.cumsum(imu.gyro_b[:, 2] * np.diff(imu.time_s, prepend=imu.start_s))
@@ -134,9 +115,9 @@ def test_the_heading_of_the_dvl_turns_as_the_gyros_do(
 
 
 @needs_logs
-def test_turning_and_moving_agree_with_gnss(missions: dict[str, Mission]) -> None:
+def test_turning_and_moving_agree_with_gnss() -> None:
     """Gyro z, beams and fixes describe one track: dead reckoning fits to a metre."""
-    mission = missions[GRID]
+    mission = converted(GRID)
     imu, dvl, gnss = mission.imu, mission.dvl, mission.gnss
     assert gnss is not None
     angle = np.cumsum(imu.gyro_b[:, 2] * np.diff(imu.time_s, prepend=imu.start_s))
@@ -159,15 +140,13 @@ def test_turning_and_moving_agree_with_gnss(missions: dict[str, Mission]) -> Non
 @needs_logs
 def test_reports_off_the_water_are_marked(monkeypatch: pytest.MonkeyPatch) -> None:
     """No log at hand has any: some reports of one are given the flag."""
-    pytest.importorskip("mcap_protobuf", reason="needs the extra 'blueye'")
-    log = LOGS / f"{DIVE}.mcap"
-    tables, ground = read_blueye_tables(log), convert_blueye(log).dvl
-    flagged = tables.dvl.copy()
+    ground, logged = converted(DIVE).dvl, tables(DIVE)
+    flagged = logged.dvl.copy()
     flagged[len(flagged) // 2 :, 2] = 1.0
     monkeypatch.setattr(
-        "ssm_graph.io.blueye.convert.read_blueye_tables", lambda _: tables._replace(dvl=flagged)
+        "ssm_graph.io.blueye.convert.read_blueye_tables", lambda _: logged._replace(dvl=flagged)
     )
-    mission = convert_blueye(log)
+    mission = convert_blueye(LOGS / f"{DIVE}.mcap")
     assert ground.water_track is None
     n_water = int(mission.dvl.is_water.sum())
     assert n_water == pytest.approx(len(ground.time_s) / 2, rel=0.1)

@@ -354,6 +354,32 @@ def test_a_map_that_does_not_fit_is_refused(small: Path, old: str, new: str, tol
         _converted(small)
 
 
+def test_a_map_has_a_reference(small: Path, mission: Mission) -> None:
+    """With units of its own; what it does not say is unknown, and it needs no vehicle section."""
+    gnss = mission.gnss
+    assert gnss is not None
+    lat, lon = np.degrees(gnss.lat), np.degrees(gnss.lon)
+    zeros = np.zeros_like(lat)
+    track = {"ms": 1e3 * gnss.time_s, "lat": lat, "lon": lon, "h": gnss.height, "v": zeros + 2.0}
+    _csv(small / "rtk.csv", {**track, "none": zeros})
+    section = """
+[reference]
+file = "rtk.csv"
+time = { column = "ms", unit = "ms" }
+lat = "lat"
+lon = "lon"
+height = "h"
+velocity = { columns = ["v", "none", "none"], unit = "knot" }
+"""
+    (small / "map.toml").write_text(MAP + section)
+    found = _converted(small).reference
+    assert found is not None
+    np.testing.assert_allclose(found.time_s, gnss.time_s)
+    np.testing.assert_allclose(found.lat, gnss.lat)
+    np.testing.assert_allclose(found.velocity_enu[:, 0], 2.0 * 1852.0 / 3600.0)
+    assert np.isnan(found.roll_pitch_heading).all()
+
+
 def _broken(path: Path, line: int, change: Callable[[str], str]) -> None:
     lines = path.read_text().splitlines()
     lines[line - 1] = change(lines[line - 1])

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from ssm_graph.base.errors import ConfigError, DataError
@@ -479,10 +480,13 @@ def test_a_replay_keeps_the_pace() -> None:
 def test_a_replay_at_full_speed_gives_one_sample_at_a_time() -> None:
     """So that answers do not depend on how fast the computer is; earlier messages are left out."""
     messages = some_messages(40)
-    source = ReplaySource(messages, skip=10)
+    altitude = np.array([0.5, 1.0]), np.array([7.0, np.nan])
+    source = ReplaySource(messages, skip=10, altitude=altitude)
     got: list[Message] = []
     while not source.is_finished:
         batch = source.poll(1.0)
+        heard = source.source_status()[0].altitude_m
+        assert heard == 7.0 if source.time_s >= 0.5 else np.isnan(heard)
         assert sum(isinstance(message, ImuSample) for message in batch) <= 1
         assert isinstance(batch[0], ImuSample) or not got
         got += batch

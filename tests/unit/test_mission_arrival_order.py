@@ -239,7 +239,7 @@ def test_parquet_in_order_of_arrival(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=300, suppress_health_check=[HealthCheck.too_slow])
 @given(
     st.lists(
         st.one_of(byte_damage(), line_damage(), cell_damage(), scale_damage()),

@@ -204,7 +204,7 @@ def assert_refused_or_sound(files: Mapping[str, bytes]) -> None:
     assert_sound(mission)
 
 
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=100, suppress_health_check=[HealthCheck.too_slow])
 @given(
     st.lists(
         st.one_of(byte_damage(), line_damage(), cell_damage(), scale_damage(), toml_damage()),

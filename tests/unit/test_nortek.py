@@ -218,3 +218,10 @@ def test_a_clock_that_goes_back_and_two_instruments(tmp_path: Path) -> None:
     found = read_recorded(torn)
     assert found is not None
     assert "1 damaged packets left out" in found.notes
+
+
+def test_begins_of_long_packets_cost_no_more_than_packets() -> None:
+    """Each of twenty thousand sound headers names data up to the end of the file, and is torn."""
+    head = struct.pack("<BBBBIH", 0xA5, 12, 0x1B, 0x16, 600_000, 1)
+    found = find_packets((head + struct.pack("<H", checksum(head))) * 20_000 + b"\1" * 600_000)
+    assert (len(found.packets), found.n_damaged) == (0, 20_000)

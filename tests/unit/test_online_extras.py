@@ -122,7 +122,7 @@ def test_a_new_begin_keeps_what_was_found(what: Doubted) -> None:
     assert measured is not None
     step = next(s for s in reversed(course._steps) if s.time_s < measured.time_s - 0.1)
     keyframe = course._maker.make(measured, last_s=step.time_s)
-    kept = step.reserve.older.led_on(keyframe, course._inertial)
+    kept = step.reserve.led_on(keyframe, step.window.inertial).older
     begun = reanchored(step.window, keyframe, kept, what).newest
     at = step.window.sensors.extras.columns(DVL_SCALE).start
     sigma = float(np.sqrt(begun.covariance[0, at, at]))

@@ -179,6 +179,13 @@ def test_every_truncation_and_any_damage_leaves_the_sound_ensembles(tmp_path: Pa
     assert "1 damaged ensembles left out" in read_pd0(path).notes
 
 
+def test_begins_of_long_ensembles_cost_no_more_than_ensembles() -> None:
+    """Each of twenty thousand plausible headers names 64 kB that have another checksum."""
+    head = b"\x7f\x7f" + struct.pack("<HBBHH", 65_000, 0, 2, 10, 40)
+    found = find_ensembles(head * 20_000)
+    assert (found.ensembles, found.n_damaged) == ((), 20_000)
+
+
 @pytest.mark.skipif(not REAL.is_dir(), reason="no real PD0 files: set SSM_GRAPH_DATA")
 def test_the_signs_are_those_of_a_real_track() -> None:
     """A RiverPro's own GNSS: dead reckoning by beams and compass stays within 2 m rms of it.

@@ -150,7 +150,7 @@ def test_any_message_becomes_a_row_and_back(message: Message) -> None:
     assert repr(got) == repr(message)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.lists(MESSAGES, max_size=8), st.integers(0, 8))
 def test_any_messages_are_replayed(messages: list[Message], n_before: int) -> None:
     """In the order in which they came, from any checkpoint on, whatever the times say."""

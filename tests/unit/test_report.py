@@ -14,6 +14,7 @@ from rich.console import Console, RenderableType
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.progress import told
 from ssm_graph.evaluation.errors import evaluate
 from ssm_graph.mission.estimate import OUTLIER_WEIGHT, BeamTable, Estimate, Iteration, Status
 from ssm_graph.report.mission.figure import draw_figure, save_figure
@@ -316,3 +317,19 @@ def test_progress_on_a_terminal_leaves_nothing() -> None:
     assert "\x1b[" in text
     assert "3 of at most 50: update 3.3 sigma" in text
     assert text.rstrip().endswith("\x1b[2K")
+
+
+def test_shares_of_long_work_are_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In steps of a fifth, and only of what takes long; a second piece counts for itself."""
+    now = [0.0]
+    monkeypatch.setattr("ssm_graph.report.terminal.progress.time.monotonic", lambda: now[0])
+    stream = io.StringIO()
+    assert list(told(range(3), 3)) == [0, 1, 2]  # nobody listens
+    with ProgressDisplay(Console(file=stream, width=200)) as show:
+        show.stage("reading")
+        for seconds in (0.01, 0.1):
+            for _ in told(["abcd"] * 128, 512, size=len):
+                now[0] += seconds
+    first, *shares = stream.getvalue().splitlines()
+    assert first == "reading"
+    assert shares == [f"reading: {share}%" for share in (20, 41, 61, 81)]

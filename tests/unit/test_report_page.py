@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import json
 import re
-import shutil
 import subprocess
 from collections.abc import Mapping
 from html.parser import HTMLParser
@@ -15,14 +14,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ssm_graph.report.page.charts import MOST_LAGS, autocorrelation, charts_of
+from ssm_graph.evaluation.errors import ErrorSeries
+from ssm_graph.report.page.charts import MOST_LAGS, autocorrelation, charts_of, line
 from ssm_graph.report.page.content import Content
 from ssm_graph.report.page.words import sections, verdict
 
 pytest.importorskip("plotly", reason="extra 'report' is not installed")
 from ssm_graph.report.page.page import page_of, write_page
+from tests.browser import BROWSER, Browser
 
-BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 N = 600
 
 
@@ -40,6 +40,7 @@ def content(**changes: Any) -> Content:
     for name in ("east", "north", "up"):
         rows[f"sigma_{name}_m"] = 0.2 + 0.001 * k
         rows[f"vel_{name}_m_per_s"] = np.full(N, 0.4)
+    rows |= {f"sigma_{name}_deg": np.full(N, 0.1) for name in ("roll", "pitch", "heading")}
     rows |= {"roll_deg": k % 5, "pitch_deg": k % 3, "heading_deg": (3.0 * k) % 360.0}
     beam = np.tile([1.0, 2.0, 3.0, 4.0], N)
     weight = np.where((beam == 2) & (np.repeat(k, 4) >= 300) & (np.repeat(k, 4) < 340), 0.01, 1.0)
@@ -121,7 +122,17 @@ def test_the_verdict_comes_first_and_in_words() -> None:
 
 def test_charts_show_the_tables() -> None:
     """Curves are the columns, in minutes since the first row, and break where north is passed."""
-    charts = {chart.name: chart for chart in charts_of(content())}
+    rows, of = content().trajectory, np.arange(3.0 * N).reshape(N, 3)
+    errors = ErrorSeries(rows["time_s"], *[of] * 7, nees_position=of[:, 0])
+    further: dict[str, Any] = {"altitude": (rows["time_s"][5:], of[5:, 0]), "errors": errors}
+    charts = {chart.name: chart for chart in charts_of(content(**further))}
+    np.testing.assert_allclose(values(charts["altitude"].traces[0], "y"), of[5:, 0])
+    north, above, below = charts["errors"].traces[3:6]
+    np.testing.assert_allclose(values(north, "y"), of[:, 1])
+    np.testing.assert_allclose(values(above, "y"), 3.0 * np.sqrt(2.0) * of[:, 1], rtol=1e-6)
+    np.testing.assert_array_equal(values(below, "y"), -values(above, "y"))
+    crosses = [t for t in charts["weights"].traces if t["marker"]["symbol"] == "x"]
+    assert [len(values(trace, "x")) for trace in crosses] == [0, 40, 0, 0]
     height = charts["height"].traces[-1]
     np.testing.assert_allclose(values(height, "x"), np.arange(N) / 60.0, rtol=1e-6)
     np.testing.assert_allclose(values(height, "y"), content().trajectory["height_m"], rtol=1e-6)
@@ -140,6 +151,18 @@ def test_autocorrelation_is_what_it_says() -> None:
     found = autocorrelation(np.sin(0.3 * t))
     np.testing.assert_allclose(found, np.cos(0.3 * np.arange(1, MOST_LAGS + 1)), atol=0.01)
     assert not autocorrelation(np.full(50, 3.0)).any()
+
+
+def test_a_long_mission_keeps_its_spikes() -> None:
+    """Of four hours at 1 Hz the one bad row is drawn, and the gaps."""
+    k = np.arange(14400.0)
+    values_of = np.where(k == 7777.0, 5.0, np.sin(k / 500.0))
+    drawn = line(np.where(k > 9000.0, k + 60.0, k), values_of, "", "black")
+    y = values(drawn, "y")
+    assert len(y) <= 5003
+    assert np.nanmax(y) == 5.0
+    assert np.isnan(y).sum() == 1
+    assert values(drawn, "x")[[0, -1]].tolist() == [0.0, 14459.0]
 
 
 PROBE = """
@@ -181,3 +204,22 @@ def test_a_browser_draws_zooms_and_hovers(tmp_path: Path, width: int) -> None:
     assert seen.pop("wide") <= 0
     assert seen == {"range": [2, 3], "hover": 1, "drawings": True, "errors": []}
     assert not [text for text in done.stderr.splitlines() if "CONSOLE" in text and "rror" in text]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(BROWSER is None, reason="no chromium or chrome on this machine")
+def test_four_hours_open_in_three_seconds(tmp_path: Path) -> None:
+    """Of processor time of the page, until the first charts stand."""
+    long = content()
+    repeated = {name: np.tile(column, 24) for name, column in long.trajectory.items()}
+    beams = {name: np.tile(column, 24) for name, column in long.beams.items()}
+    repeated["time_s"] = np.arange(24.0 * N)
+    beams["time_s"] = np.repeat(repeated["time_s"], 4)
+    path = tmp_path / "report.html"
+    write_page(content(trajectory=repeated, beams=beams), path, footer="made by a test")
+    with Browser(tmp_path / "profile") as browser:
+        browser.measure()
+        browser.open(path.as_uri())
+        browser.wait_for("document.querySelectorAll('#height .main-svg').length > 0")
+        assert browser.busy_s() < 3.0
+        assert browser.errors == []

@@ -7,6 +7,7 @@ import pytest
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.states import States
+from ssm_graph.graph.inertial_rows import InertialRows
 from ssm_graph.imu.preintegration import GAP_ACCEL, GAP_GYRO_RATE, GRAVITY
 from ssm_graph.live.estimator import FixedLagSmoother
 from ssm_graph.live.estimator.start import sensors_of_vehicle
@@ -31,7 +32,14 @@ def a_tail() -> Tail:
     walks = np.zeros((1, n - 15))
     states = States(R_nb[None], np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 6)), walks)
     keyframe = Keyframe(0.0, sensors.beams)
-    return Tail(keyframe, states, TILT * np.eye(n), noise=vehicle.imu_noise, sensors=sensors)
+    return Tail(
+        keyframe,
+        states,
+        TILT * np.eye(n),
+        noise=vehicle.imu_noise,
+        frame=frame,
+        inertial=InertialRows(frame, sensors.extras),
+    )
 
 
 def samples(*spans: tuple[float, float], yaw_rate: float = 0.0) -> Array:

@@ -5,11 +5,12 @@ Nothing here knows what a particle is a state of, but that one column may be an 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.stats import norm
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import ndtri
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.units import wrapped
@@ -25,6 +26,48 @@ def normalised(log_weight: Array) -> Array:
     """Return weights (N,) that sum to 1 from their logarithms, whatever is added to all of them."""
     weight = np.exp(log_weight - log_weight.max())
     return np.asarray(weight / weight.sum())
+
+
+@dataclass(slots=True)
+class Particles:
+    """Particles (n, d) with the logarithms of their weights (n,)."""
+
+    states: Array
+    log_weight: Array
+
+    @property
+    def weight(self) -> Array:
+        """Weights (n,), sum 1."""
+        return normalised(self.log_weight)
+
+
+def drawn_anew(
+    particles: Particles,
+    *,
+    cell: Array,
+    roughening: ArrayLike,
+    least: int,
+    rng: np.random.Generator,
+) -> Particles:
+    """Return particles drawn by their weights where fewer than half of them count, else the same.
+
+    Parameters
+    ----------
+    particles : (n, d)
+    cell : (c,) size of the cells, in the first columns, that tell how many are needed.
+    roughening : (r,) sigma of what is added to the first columns of those that are drawn.
+    least : so many at least.
+    """
+    weight, states = particles.weight, particles.states
+    if effective_number(weight) >= 0.5 * len(weight):
+        return particles
+    cells = np.floor(states[:, : len(cell)] / cell).astype(np.int64)
+    n_cells = len(np.unique(cells[weight > 0.01 * weight.max()], axis=0))
+    n = min(max(kld_number(n_cells), least), len(states))
+    drawn = states[systematic(weight, n, rng)]
+    sigma = np.asarray(roughening)
+    drawn[:, : len(sigma)] += rng.standard_normal((n, len(sigma))) * sigma
+    return Particles(drawn, np.zeros(n))
 
 
 def effective_number(weight: Array) -> float:
@@ -48,7 +91,7 @@ def kld_number(n_cells: int, error: float = KLD_ERROR, confidence: float = KLD_C
         return 1
     k = n_cells - 1
     a = 2.0 / (9.0 * k)
-    z = float(norm.ppf(confidence))
+    z = float(ndtri(confidence))
     return int(np.ceil(k / (2.0 * error) * (1.0 - a + np.sqrt(a) * z) ** 3))
 
 

@@ -9,6 +9,14 @@ from ssm_graph.graph.aids.heading import Headings
 from ssm_graph.graph.aids.magnetometer import MagneticFields
 from ssm_graph.graph.aids.ranges import Ranges
 from ssm_graph.graph.aids.standstill import Standstills
+from ssm_graph.graph.aids.terrain import TerrainRanges
 from ssm_graph.graph.aids.usbl import UsblFixes
 
-AIDS: Final[tuple[type[Aid], ...]] = (UsblFixes, Ranges, Headings, Standstills, MagneticFields)
+AIDS: Final[tuple[type[Aid], ...]] = (
+    UsblFixes,
+    Ranges,
+    Headings,
+    Standstills,
+    MagneticFields,
+    TerrainRanges,
+)

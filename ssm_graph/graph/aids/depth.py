@@ -58,7 +58,7 @@ class Depths(ReadOnlyArrays):
             keyframe=keyframe[agrees],
             time_s=log.time_s[used],
             depth=log.true_depth[used],
-            gyro_b=mean_gyro(imu, keyframe_s),
+            gyro_b=mean_gyro(imu, keyframe_s) if len(used) else np.zeros((len(keyframe_s), 3)),
             sigma=log.sigma,
             lever_arm_b=log.lever_arm_b,
             white_share=log.calibration.drift.white,

@@ -60,15 +60,17 @@ class Fixes(Aid):
         imu: ImuLog,
     ) -> Self:
         """Return some rows (F,) of a log of positions, valid at times (F,), at keyframes (F,)."""
+        if len(rows) == 0:
+            none = np.zeros((0, 3))
+            return cls(keyframe, none, np.zeros((0, 3, 3)), none, log.lever_arm_b)
         place_n = frame.p_n_from_geodetic(log.lat[rows], log.lon[rows], log.height[rows])
-        place_n = place_n.reshape(len(rows), 3)
         R_nl = frame.R_nl_at(place_n)
         covariance_l = log.sigma_enu[rows][:, :, None] ** 2 * np.eye(3)
         return cls(
             keyframe=keyframe,
             position_n=place_n,
             covariance_n=np.asarray(R_nl @ covariance_l @ np.swapaxes(R_nl, 1, 2)),
-            gyro_b=mean_gyro(imu, time_s) if len(rows) else np.zeros((0, 3)),
+            gyro_b=mean_gyro(imu, time_s),
             lever_arm_b=log.lever_arm_b,
         )
 

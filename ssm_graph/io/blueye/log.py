@@ -60,28 +60,35 @@ def read_blueye_tables(log: Path) -> BlueyeTables:
     if not all(np.isfinite(rows[name]).all() for name in ("imu", "depth", "gnss")):
         raise DataError(f"{log}: IMU, depth or GNSS hold values that are not finite")
     return BlueyeTables(
-        imu=np.array(rows["imu"]),
-        witness=np.array(rows["witness"]).reshape(-1, 7),
-        dvl=np.array(rows["dvl"]),
-        depth=np.array(rows["depth"]),
-        yaw_rate=np.array(rows["yaw_rate"]).reshape(-1, 2),
-        gnss=np.array(rows["gnss"]).reshape(-1, 4),
-        dvl_heading=np.array(rows["dvl_heading"]).reshape(-1, 2),
+        imu=_by_time(rows["imu"], 7),
+        witness=_by_time(rows["witness"], 7),
+        dvl=_by_time(rows["dvl"], 19),
+        depth=_by_time(rows["depth"], 2),
+        yaw_rate=_by_time(rows["yaw_rate"], 2),
+        gnss=_by_time(rows["gnss"], 4),
+        dvl_heading=_by_time(rows["dvl_heading"], 2),
     )
 
 
+def _by_time(rows: list[tuple[float, ...]], n_columns: int) -> Array:
+    table = np.array(rows, dtype=float).reshape(-1, n_columns)
+    return np.asarray(table[np.argsort(table[:, 0], kind="stable")])
+
+
 def _messages(log: Path) -> Iterator[tuple[str, float, Any]]:
-    """Yield topic, arrival time in s and decoded message; all failures become DataError."""
+    """Yield topic, arrival time in s and decoded message, in the order of the file.
+
+    All failures become DataError.
+    """
     try:
-        from mcap.reader import make_reader
+        from mcap.reader import NonSeekingReader, SeekingReader
         from mcap_protobuf.decoder import DecoderFactory
     except ImportError as error:
         name = "mcap-protobuf-support"
         raise MissingExtraError(name, extra="blueye", purpose="reading Blueye logs") from error
     try:
         with log.open("rb") as stream:
-            reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-            summary = reader.get_summary()
+            summary = SeekingReader(stream).get_summary()
             found = {channel.topic for channel in summary.channels.values()} if summary else set()
             missing = [topic for topic in TOPICS if topic not in found]
             if missing:
@@ -89,7 +96,13 @@ def _messages(log: Path) -> Iterator[tuple[str, float, Any]]:
                     f"{log}: expected the topics of a Blueye X3 log, {', '.join(missing)} missing; "
                     f"found: {', '.join(sorted(found)) or 'none'}"
                 )
-            for _, channel, raw, message in reader.iter_decoded_messages(topics=(*TOPICS, WITNESS)):
+            stream.seek(0)
+            reader = NonSeekingReader(stream, decoder_factories=[DecoderFactory()])
+            wanted = (*TOPICS, WITNESS)
+            # By the library's queue the order of times takes as long as all else.
+            for _, channel, raw, message in reader.iter_decoded_messages(
+                topics=wanted, log_time_order=False
+            ):
                 yield channel.topic, raw.log_time * 1e-9, message
     except OSError as error:
         raise DataError(f"{log}: cannot be read: {error.strerror or error}") from error

@@ -34,7 +34,8 @@ from ssm_graph.io.columns.map_file import (
 from ssm_graph.io.columns.sources import Source, read_source
 from ssm_graph.io.columns.units import ISO, factor_to
 from ssm_graph.io.mission_folder.assembly import mission_from
-from ssm_graph.mission.mission import Mission
+from ssm_graph.io.mission_folder.toml import REFERENCE
+from ssm_graph.mission.mission import Mission, Reference
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.dvl import counted_sigma
 from ssm_graph.sensors.imu import interval_ends
@@ -60,6 +61,7 @@ def convert_columns(
     """
     sources: dict[Path, Source] = {}
     bare = {BY_LOG[kind].section: log for kind, log in vehicle.bare_logs.items()}
+    bare[REFERENCE.section] = Reference(**REFERENCE.empty())
     logs: list[Any] = []
     labels: dict[str, str | TableFile] = {}
     notes: list[str] = []
@@ -83,7 +85,7 @@ def _log(
     section: MapSection, source: Source, bare: Any, vehicle: Vehicle
 ) -> tuple[Any, TableFile, list[str]]:
     """Return the log of a section, where its rows stand, and what was left out."""
-    one = BY_SECTION[section.name]
+    one = REFERENCE if section.name == REFERENCE.section else BY_SECTION[section.name]
     columns = {TIME: times(section.times, source)}
     for name, quantity in section.quantities.items():
         columns |= _columns(section, name, quantity, source, one, bare)

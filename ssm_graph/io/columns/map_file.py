@@ -14,9 +14,9 @@ from ssm_graph.base.errors import ConfigError, nearest_hint
 from ssm_graph.base.frames import BodyAxes
 from ssm_graph.base.settings import read_settings_file, shown
 from ssm_graph.base.units import SEA_WATER, STANDARD_ATMOSPHERE
+from ssm_graph.io.mission_folder.toml import TABLES
 from ssm_graph.sensors.imu import Stamp
 from ssm_graph.sensors.instrument import Column
-from ssm_graph.sensors.registry import INSTRUMENTS
 
 FORMAT: Final = 1
 _UNITS: Final = {
@@ -29,6 +29,8 @@ _UNITS: Final = {
     "s": "s",
 }
 """Unit of a column of a mission folder, by the end of its name."""
+_OWN_NAMES: Final = {"vel_{}_m_per_s": ("velocity", "m/s"), "{}_deg": ("attitude", "deg")}
+"""Name and unit of columns that have to be called otherwise than in their table."""
 _SUFFIX: Final = re.compile(rf"(.+?)_({'|'.join(_UNITS)})")
 PASCAL: Final = "Pa"
 _OF_SECTION: Final = frozenset({"file", "time", "only_changes"})
@@ -52,6 +54,8 @@ class Wanted(NamedTuple):
 
 
 def _name_and_unit(column: Column) -> tuple[str, str]:
+    if column.pattern in _OWN_NAMES:
+        return _OWN_NAMES[column.pattern]
     key = column.pattern.replace("{}_", "_").strip("_").replace("__", "_")
     found = _SUFFIX.fullmatch(key)
     return (found[1], _UNITS[found[2]]) if found else (key, "")
@@ -63,7 +67,7 @@ QUANTITIES: Final[Mapping[str, Mapping[str, Wanted]]] = {
         for column in one.columns
         for name, unit in (_name_and_unit(column),)
     }
-    for one in INSTRUMENTS
+    for one in TABLES
 }
 """By section and name: those of the columns of its table, ``gyro`` of ``gyro_{}_rad_per_s``."""
 INSTEAD: Final = {"dvl": ("velocity", "m/s"), "depth": ("pressure", PASCAL)}

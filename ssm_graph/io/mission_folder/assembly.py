@@ -21,8 +21,8 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.base.tables import Table, TableFile, table_of
 from ssm_graph.base.units import DEG_PER_H
 from ssm_graph.io.mission_folder.motion import check_motion
-from ssm_graph.io.mission_folder.toml import TOML_NAME
-from ssm_graph.mission.mission import Aids, InitialState, LocalStart, Mission
+from ssm_graph.io.mission_folder.toml import REFERENCE, TOML_NAME
+from ssm_graph.mission.mission import Aids, InitialState, LocalStart, Mission, Reference
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.compass import HeadingLog
 from ssm_graph.sensors.current import CurrentModel
@@ -65,7 +65,8 @@ def mission_from(
 
     Parameters
     ----------
-    logs : of instruments of the registry, forward-right-down, SI units; IMU and DVL at least.
+    logs : of instruments of the registry, forward-right-down, SI units; IMU and DVL at least; and a
+        reference where there is one.
     vehicle : its frame is taken, its current, and its start where it lies within the inertial
         data; None where nothing is known beside the logs.
     source : the recording; the mission has its name.
@@ -76,7 +77,7 @@ def mission_from(
     parts: dict[str, Part] = {}
     found = list(notes)
     for log in logs:
-        one = BY_LOG[type(log)]
+        one = REFERENCE if isinstance(log, Reference) else BY_LOG[type(log)]
         label, columns = labels[one.section], one.table_of(log)
         table = table_of(label, columns) if isinstance(label, str) else Table(label, columns)
         found += one.check(table, log, BodyAxes.FRD)

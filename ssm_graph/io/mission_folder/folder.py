@@ -30,6 +30,7 @@ from ssm_graph.io.mission_folder.toml import (
     read_mission_toml,
     table_path,
 )
+from ssm_graph.io.seabed.section import map_settings, with_map, write_map
 from ssm_graph.io.tables.append_file import write_through
 from ssm_graph.io.tables.files import TableFormat, read_arrival_table, read_table, write_table
 from ssm_graph.mission.estimate import CalibratedValue, Calibration, Determined
@@ -37,10 +38,10 @@ from ssm_graph.mission.mission import LocalStart, Mission
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.acoustic import RangeLog
 from ssm_graph.sensors.current import CURRENT_KEYS, CurrentModel
-from ssm_graph.sensors.imu import IMU, ImuLog
 from ssm_graph.sensors.instrument import Calibrated, Instrument
 from ssm_graph.sensors.place import PLACE_KEYS
 from ssm_graph.sensors.registry import INSTRUMENTS
+from ssm_graph.sensors.seabed import TerrainLog
 from ssm_graph.sensors.standstill import STANDSTILL_KEYS, Standstill, check_during, standstill
 
 __all__ = ["TableFormat", "read_mission", "write_mission"]
@@ -83,7 +84,7 @@ def read_mission(folder: Path | str) -> Mission:
     frame = first_frame(stated, parts, initial)
     if frame is None:
         raise toml.fault_of_no_place()
-    return assembled(
+    mission = assembled(
         toml.name,
         parts,
         frame=frame,
@@ -94,14 +95,18 @@ def read_mission(folder: Path | str) -> Mission:
         current=build(CurrentModel, toml["current"].given()) if "current" in toml else None,
         notes=notes,
     )
+    return with_map(mission, toml["map"], toml.folder) if "map" in toml else mission
 
 
-def read_imu(toml: MissionToml) -> ImuLog:
-    """Read the inertial data of a mission alone; raises as :func:`read_mission` does."""
-    bare = {IMU.section: toml.bare(IMU)}
-    table = _read_tables(toml, bare)[0][IMU.section]
-    log: ImuLog = IMU.filled(table, bare[IMU.section], toml[IMU.section], toml.body)
-    return log
+def read_log(toml: MissionToml, one: Instrument) -> Any:
+    """Read one log of a mission alone; None where it has none; raises as :func:`read_mission`."""
+    if one.section not in toml:
+        return None
+    bare = {one.section: toml.bare(one)}
+    table = _read_tables(toml, bare)[0].get(one.section)
+    if table is None:
+        return None
+    return one.filled(table, bare[one.section], toml[one.section], toml.body)
 
 
 def _read_tables(toml: MissionToml, bare: dict[str, Any]) -> tuple[dict[str, Table], list[str]]:
@@ -170,6 +175,9 @@ def write_mission(
         path = folder / settings[section]["file"]
         parts[path] = path.with_name(f"{path.stem}.part{path.suffix}")
         write_table(parts[path], columns)
+    terrain = mission.aids.get(TerrainLog)
+    if terrain is not None:
+        write_map(folder, terrain)
     toml_part = write_toml_part(folder, settings)
     (folder / TOML_NAME).unlink(missing_ok=True)
     for path, part in parts.items():
@@ -191,6 +199,9 @@ def mission_settings(mission: Mission, table_format: TableFormat) -> dict[str, A
     stills = [written(still, STANDSTILL_KEYS) for still in mission.aids.all(Standstill)]
     if stills:
         settings["standstill"] = stills
+    terrain = mission.aids.get(TerrainLog)
+    if terrain is not None:
+        settings["map"] = map_settings(terrain)
     if mission.reference is not None:
         settings["reference"] = {"file": f"reference{suffix}"}
     return settings

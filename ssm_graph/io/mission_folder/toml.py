@@ -25,6 +25,7 @@ from ssm_graph.base.settings import (
 from ssm_graph.base.tables import LARGEST_TIME_S, Order, Table
 from ssm_graph.base.units import DEGREE
 from ssm_graph.io.instruments import library as instruments
+from ssm_graph.io.seabed.section import MAP_KEYS
 from ssm_graph.mission.mission import InitialState, LocalStart, Reference
 from ssm_graph.mission.point import POINT_KEYS, Point, point
 from ssm_graph.sensors.current import CURRENT_KEYS
@@ -97,6 +98,7 @@ SECTIONS: Final[Mapping[str, Mapping[str, Key]]] = {
     "current": CURRENT_KEYS,
     "initial": INITIAL_KEYS,
     "local": LOCAL_KEYS,
+    "map": MAP_KEYS,
     **{one.section: one.keys for one in TABLES},
 }
 LISTS: Final[Mapping[str, Mapping[str, Key]]] = {

@@ -20,6 +20,7 @@ from ssm_graph.sensors.depth import DEPTH
 from ssm_graph.sensors.dvl import nominal_sigma, sigma_off_water
 from ssm_graph.sensors.gnss import GNSS
 from ssm_graph.sensors.registry import BY_LOG, INSTRUMENTS
+from ssm_graph.sensors.seabed import TerrainLog
 from ssm_graph.sensors.standstill import Standstill, standstill
 
 
@@ -81,6 +82,7 @@ def vehicle_of(mission: Mission) -> Vehicle:
     aids = (
         log if isinstance(log, Standstill) else BY_LOG[type(log)].without_rows(log)
         for log in mission.aids
+        if not isinstance(log, TerrainLog)
     )
     return Vehicle(
         name=mission.name,

@@ -163,6 +163,7 @@ def _samples(
 
 def _unit_of_rates(table: Array, turned: Array) -> float:
     """Return rad/s of one unit of the gyros; 0 where the heading (M, 2) does not tell."""
+    turned = turned[np.unique(turned[:, 0], return_index=True)[1]] if len(turned) else turned
     if len(turned) < _FEWEST_FITTED:
         return 0.0
     heading = np.unwrap(np.radians(turned[:, 1]))

@@ -26,6 +26,7 @@ from ssm_graph.base.errors import (
     SsmGraphError,
     nearest_hint,
 )
+from ssm_graph.base.progress import told
 from ssm_graph.io.ros import messages as ros_messages
 from ssm_graph.io.ros.aids import AID_TYPES
 from ssm_graph.io.ros.frames import TF_TOPIC, TF_TYPE
@@ -348,7 +349,8 @@ def _messages(bag: Path, reader: Any, chosen: Mapping[str, Sequence[Any]]) -> It
     wanted = [one for one in reader.connections if (one.topic, one.msgtype) in roles]
     if not wanted:
         return
-    for connection, nanoseconds, raw in reader.messages(connections=wanted):
+    items = told(reader.messages(connections=wanted), sum(one.msgcount for one in wanted))
+    for connection, nanoseconds, raw in items:
         topic, type_name = connection.topic, connection.msgtype
         data = zstd_decompress(raw) if bytes(raw[:4]) == _ZSTD_MAGIC else raw
         if topic not in decoders:

@@ -16,6 +16,7 @@ import numpy as np
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.progress import told
 from ssm_graph.base.tables import TableFile
 
 NUMBER = re.compile(
@@ -29,6 +30,7 @@ _SIGNATURES = {
     b"\x1f\x8b": "gzip data",
 }
 _TAIL_LINES = 100
+_ROWS = 16384
 _SHOWN = 40
 
 
@@ -116,7 +118,8 @@ def read_csv_values(file: CsvFile, names: Sequence[str], *, blank: frozenset[str
         if next(file.lines(), None) is not None:
             with file.open() as stream:
                 stream.readline()
-                values = np.loadtxt(stream, delimiter=",", comments=None, ndmin=2)
+                lines = told(stream, file.path.stat().st_size, size=len)
+                values = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2)
             if values.shape[1] == len(names):
                 return np.asarray(values, dtype=np.float64)
     except UnicodeDecodeError as error:
@@ -153,8 +156,8 @@ def write_csv(path: Path, columns: dict[str, Array]) -> None:
     values = np.column_stack(list(columns.values()))
     with path.open("w", encoding="utf-8", newline="\n") as stream:
         stream.write(",".join(columns) + "\n")
-        for start in range(0, len(values), 65536):
-            rows = values[start : start + 65536].tolist()
+        for start in told(range(0, len(values), _ROWS), -(-len(values) // _ROWS)):
+            rows = values[start : start + _ROWS].tolist()
             stream.writelines(",".join(map(repr, row)) + "\n" for row in rows)
 
 

@@ -12,8 +12,10 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ssm_graph.base.frozen import Array
+from ssm_graph.io.recording import running_sums
 
 _HEADER: Final = b"\x7f\x7f"
 _FIXED, _VARIABLE, _BOTTOM = 0x0000, 0x0080, 0x0600
@@ -78,9 +80,10 @@ class Found:
 def find_ensembles(data: bytes) -> Found:
     """Return the ensembles of a recording in order; NMEA and anything else between is skipped."""
     found: list[Ensemble] = []
+    sums = running_sums(data)
     n_damaged, used, at = 0, 0, data.find(_HEADER)
     while at >= 0:
-        size = _sound_size(data, at)
+        size = _sound_size(data, at, sums)
         ensemble = _ensemble(memoryview(data)[at : at + size]) if size else None
         if ensemble is not None:
             found.append(ensemble)
@@ -115,7 +118,7 @@ def _is_plausible(data: bytes, at: int) -> bool:
     return rises and offsets[0] == _LEAST + 2 * n_types and offsets[-1] < size
 
 
-def _sound_size(data: bytes, at: int) -> int:
+def _sound_size(data: bytes, at: int, sums: NDArray[np.uint16]) -> int:
     """Return the length of an ensemble without its checksum; 0 where that is wrong."""
     if not _is_plausible(data, at):
         return 0
@@ -123,7 +126,7 @@ def _sound_size(data: bytes, at: int) -> int:
     if len(data) < at + size + 2:
         return 0
     (told,) = struct.unpack_from("<H", data, at + size)
-    return size if sum(data[at : at + size]) & 0xFFFF == told else 0
+    return size if (int(sums[at + size]) - int(sums[at])) & 0xFFFF == told else 0
 
 
 def _ensemble(data: memoryview) -> Ensemble | None:

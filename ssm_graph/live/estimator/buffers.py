@@ -9,7 +9,7 @@ import numpy as np
 
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
-from ssm_graph.base.times import MIN_SPACING_S
+from ssm_graph.base.times import MIN_SPACING_S, usual_interval
 from ssm_graph.graph.aids import AIDS
 from ssm_graph.live.estimator.rows import TimedRows
 from ssm_graph.mission.mission import Aids, Mission
@@ -130,7 +130,7 @@ class Buffers:
         if self._n_imu % PERIOD_EVERY == 0 or self._n_imu < PERIOD_EVERY:
             times = self.imu.all[-2 * PERIOD_EVERY :, 0]
             if len(times) > 1:
-                self._period_s = float(np.median(np.diff(times)))
+                self._period_s = usual_interval(times)
                 if len(times) > PERIOD_EVERY:
                     self.shortest_period_s = min(self.shortest_period_s, self._period_s)
         return self._period_s

@@ -15,7 +15,6 @@ import numpy as np
 
 from ssm_graph.base.errors import SolverError
 from ssm_graph.engine.error_state import VELOCITY
-from ssm_graph.graph.inertial_rows import InertialRows
 from ssm_graph.live.estimator.buffers import Buffers, Measured
 from ssm_graph.live.estimator.guard import Guard, Guarded, Guardian, protection_at
 from ssm_graph.live.estimator.keyframes import KeyframeMaker
@@ -85,8 +84,6 @@ class Course:
         self.guardian = guardian
         self._steps = deque([first])
         self._maker, self._buffers, self._events = maker, buffers, events
-        sensors = first.window.sensors
-        self._inertial = InertialRows(sensors.frame, sensors.extras)
         self._settled: list[Settled] = []
 
     @property
@@ -174,7 +171,8 @@ class Course:
         sigma = last.window.newest_sigma
         if len(keyframe.beams) == 0 and np.linalg.norm(sigma[VELOCITY]) > ANY_SPEED:
             keyframe = keyframe.no_faster_than(ANY_SPEED)
-        window, reserve = last.window.successor(), last.reserve.led_on(keyframe, self._inertial)
+        window = last.window.successor()
+        reserve = last.reserve.led_on(keyframe, window.inertial)
         doubt = doubt_of(last.watch, sigma, keyframe)
         if doubt is not None:
             return self._anew(keyframe, doubt, reserve)

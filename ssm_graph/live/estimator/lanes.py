@@ -34,7 +34,6 @@ from ssm_graph.graph.aids.heading import Headings
 from ssm_graph.graph.aids.magnetometer import MagneticFields
 from ssm_graph.graph.aids.ranges import Ranges
 from ssm_graph.graph.aids.usbl import UsblFixes
-from ssm_graph.graph.inertial_rows import InertialRows
 from ssm_graph.mission.calibration import DVL_DRIFT
 from ssm_graph.sensors.dvl import MOST_BEAMS
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors
@@ -166,7 +165,6 @@ class LaneBank:
         self._forgets = self.suspect == self.suspects.index(INERTIAL)
         self._is_fix = np.array([*(name in FIXES for name in self.suspects), False])
         """(S + 1,) the last for rows that are never left out"""
-        self._inertial = InertialRows(sensors.frame, sensors.extras)
         dims = {BEAMS: sensors.beams.n_beams, **{k: aid.dim for k, aid in sensors.aids.items()}}
         self._lasting: dict[str, slice] = {}
         shares, end = [], sensors.state_dim
@@ -264,7 +262,7 @@ class LaneBank:
     def _predicted(self, lanes: Lanes, last: States, keyframe: Keyframe, window: Window) -> Lanes:
         assert keyframe.inertial is not None
         interval, now = keyframe.inertial, window.newest_states
-        ahead = self._inertial.predict(interval, last)
+        ahead = window.ahead or window.inertial.predict(interval, last)
         covariance, span_s = ahead.covariance(lanes.covariance), float(interval.span_s[0])
         n, kept = self._n, np.exp(-span_s / LASTING_S)
         covariance[:, n:] *= kept

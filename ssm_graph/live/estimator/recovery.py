@@ -266,16 +266,13 @@ class Kept(NamedTuple):
         """The state (1, ...) now."""
         return States(self.R_nb, self.p_n, self.v_n, self.bias, self.extra)
 
-    def led_on(self, keyframe: Keyframe, inertial: InertialRows) -> Kept:
-        """Return the answer at the next keyframe."""
-        assert keyframe.inertial is not None
-        ahead = inertial.predict(keyframe.inertial, self.states)
-        covariance = ahead.covariance(self.covariance)
+    def at(self, time_s: float, states: States, covariance: Array) -> Kept:
+        """Return the answer that is led on to states (1, ...) with their covariance (n, n)."""
         names = ("R_nb", "p_n", "v_n", "bias", "extra")
-        now: dict[str, Any] = dict(zip(names, ahead.states, strict=False))
+        now: dict[str, Any] = dict(zip(names, states, strict=False))
         led = self._replace(**now, covariance=covariance)
         is_lost = np.trace(covariance[VELOCITY, VELOCITY]) > (LOST_FACTOR * SPEED_SIGMA) ** 2
-        return led.without_velocity(keyframe.time_s) if is_lost else led
+        return led.without_velocity(time_s) if is_lost else led
 
     def without_velocity(self, time_s: float) -> Kept:
         """Return the answer with the velocity, and the place, that any vehicle can have by now."""
@@ -300,7 +297,15 @@ class Reserve(NamedTuple):
 
     def led_on(self, keyframe: Keyframe, inertial: InertialRows) -> Reserve:
         """Return both answers at the next keyframe."""
-        return Reserve(*(kept.led_on(keyframe, inertial) for kept in self))
+        assert keyframe.inertial is not None
+        states = self.older.states.followed_by(self.younger.states)
+        ahead = inertial.predict(keyframe.inertial, states)
+        covariances = ahead.covariance(np.stack([kept.covariance for kept in self]))
+        led = (
+            kept.at(keyframe.time_s, ahead.states.take(np.s_[k : k + 1]), covariances[k])
+            for k, kept in enumerate(self)
+        )
+        return Reserve(*led)
 
     def renewed(self, window: Window) -> Reserve:
         """Return the reserve with the newest, sound answer of a window taken in, if it is time."""

@@ -41,7 +41,7 @@ ONLINE: Final = FixedLagConfig(
     max_iterations=3,
     tolerance=0.02,
     relinearise_sigmas=0.1,
-    relinearise_turn=5e-4,
+    relinearise_turn=2e-3,
     reweigh=0.02,
     gate_sigmas=6.0,
     first_estimates=True,
@@ -309,10 +309,15 @@ class FixedLagSmoother:
 
     def _tail_of(self, step: Step) -> Tail:
         assert self._frame is not None
-        newest, noise = step.window.newest, self.vehicle.imu_noise
-        keyframe, covariance = step.window.keyframes[-1], newest.covariance[0]
-        sensors = step.window.sensors
-        tail = Tail(keyframe, newest.states, covariance, noise=noise, sensors=sensors)
+        window = step.window
+        tail = Tail(
+            window.keyframes[-1],
+            window.newest_states,
+            window.newest_covariance,
+            noise=self.vehicle.imu_noise,
+            frame=self._frame,
+            inertial=window.inertial,
+        )
         buffers, imu = self._intake.buffers, self._intake.buffers.imu
         first = max(imu.index(step.time_s, after=True) - 1, 0)
         tail.add(buffers.inertial(imu.all[first:]))

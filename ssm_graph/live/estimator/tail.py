@@ -8,13 +8,13 @@ import gtsam
 import numpy as np
 
 from factors.imu_errors import taken_off
+from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.states import States
 from ssm_graph.graph.inertial_rows import InertialRows
 from ssm_graph.imu.preintegration import Preintegrated, Unseen, imu_params, intervals_of
-from ssm_graph.mission.imu_variables import imu_errors
 from ssm_graph.sensors.imu import ImuNoise
-from ssm_graph.smoothers.keyframe import Keyframe, Sensors
+from ssm_graph.smoothers.keyframe import Keyframe
 
 LONGEST_S = 0.1
 """A longer step from sample to sample is a gap of the inertial data."""
@@ -40,10 +40,10 @@ class Tail:
         covariance: Array,
         *,
         noise: ImuNoise,
-        sensors: Sensors,
+        frame: LocalFrame,
+        inertial: InertialRows,
     ) -> None:
         """Begin at a keyframe with its states (1, ...) and covariance (n, n)."""
-        frame, self._no_beams = sensors.frame, sensors.beams
         self._begin_s = self._end_s = keyframe.time_s
         self._states, self._covariance = states, covariance
         self._noise, self._frame = noise, frame
@@ -52,15 +52,15 @@ class Tail:
         bias = gtsam.imuBias.ConstantBias(states.bias[0, :3], states.bias[0, 3:])
         params = imu_params(noise, g_n=np.zeros(3), frame=frame)
         self._measured = Preintegrated(params, bias)
-        self._rows = InertialRows(frame, sensors.extras)
-        self._errors, _ = imu_errors(sensors.extras, states.walks[0], states.constants)
+        self._inertial = inertial
+        self._errors, _ = inertial.sensor_errors(states)
 
     def add(self, samples: Array) -> None:
         """Integrate samples (N, 7): end of the interval s, gyro rad/s, specific force m/s^2.
 
         Of the sensors' errors what is known is taken off, what the keyframe has found is not.
         """
-        if self._errors.any():
+        if self._errors is not None:
             found = taken_off(self._errors, samples[:, 1:4], samples[:, 4:])
             samples = np.column_stack([samples[:, 0], *found])
         for time_s, *row in samples.tolist():
@@ -86,7 +86,7 @@ class Tail:
         if self._end_s <= self._begin_s:
             return Newest(self._begin_s, self._states, self._covariance)
         begun = self._covariance + self._unseen() if self._gap_s else self._covariance
-        ahead = self._rows.predict(intervals_of([self._measured], self._frame), self._states)
+        ahead = self._inertial.predict(intervals_of([self._measured], self._frame), self._states)
         return Newest(self._end_s, ahead.states, ahead.covariance(begun))
 
     def _unseen(self) -> Array:

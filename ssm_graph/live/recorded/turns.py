@@ -6,7 +6,6 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.signal import fftconvolve
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
@@ -104,6 +103,8 @@ def _rates(time_s: Array, angle: Array) -> Array:
 
 def _alike(own: Array, other: Array, least: int) -> tuple[Array, Array]:
     """Return the correlation at every offset with enough in common, and how many that are."""
+    from scipy.signal import fftconvolve  # costly to import
+
     flipped = other[::-1]
     overlap = np.round(fftconvolve(np.ones(len(own)), np.ones(len(other))))
     both = fftconvolve(own, flipped)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
 from typing import Final
 
+import numpy as np
+
 from ssm_graph.base.errors import ConfigError
+from ssm_graph.base.frozen import Array
 from ssm_graph.mission.navigation import Event
 from ssm_graph.mission.run_status import LinkState, SourceStatus
 from ssm_graph.sensors.imu import ImuSample
@@ -15,6 +19,8 @@ from ssm_graph.sensors.messages import Message
 
 MOST: Final = 1000
 """Messages of one poll."""
+RECENT_S: Final = 5.0
+"""An older height over the bottom is none."""
 _ROUNDING_S = 1e-6
 
 
@@ -28,6 +34,7 @@ class ReplaySource:
     skip : how many were given to an earlier process of the same run.
     name : for people.
     end_s : time of the last message, for the progress.
+    altitude : times (N,), s, and heights over the bottom then (N,), m, for people.
     wait : waits so many seconds, and looks after what else there is.
     steady_s : a clock that is never set.
     """
@@ -40,6 +47,7 @@ class ReplaySource:
         skip: int = 0,
         name: str = "mission",
         end_s: float = float("nan"),
+        altitude: tuple[Array, Array] | None = None,
         wait: Callable[[float], None] = time.sleep,
         steady_s: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -48,6 +56,7 @@ class ReplaySource:
         self._messages: Iterator[Message] = islice(iter(messages), skip, None)
         self._speed, self._name, self._end_s = speed, name, end_s
         self._wait, self._steady_s = wait, steady_s
+        self._altitude_s, self._altitude_m = altitude or (np.zeros(0), np.zeros(0))
         self._next = next(self._messages, None)
         self._n_messages = 0
         self._begin_s = self.time_s = 0.0 if self._next is None else self._next.time_s
@@ -92,8 +101,22 @@ class ReplaySource:
         address = "as fast as it goes" if self._speed is None else f"speed {self._speed:g}"
         if self._end_s > self._begin_s:
             address += f", {100.0 * self.elapsed_s / (self._end_s - self._begin_s):.0f} % done"
-        status = SourceStatus(self._name, address, state, n_messages=self._n_messages, age_s=0.0)
+        status = SourceStatus(
+            self._name,
+            address,
+            state,
+            n_messages=self._n_messages,
+            age_s=0.0,
+            altitude_m=self._altitude_now(),
+        )
         return (status,)
+
+    def _altitude_now(self) -> float:
+        """Return the newest height over the bottom that is not old, m; else NaN."""
+        begin = np.searchsorted(self._altitude_s, self.time_s - RECENT_S)
+        end = np.searchsorted(self._altitude_s, self.time_s, side="right")
+        known = self._altitude_m[begin:end][np.isfinite(self._altitude_m[begin:end])]
+        return float(known[-1]) if len(known) else math.nan
 
     def _take(self, is_due: Callable[[Message], bool]) -> list[Message]:
         taken: list[Message] = []

@@ -10,10 +10,12 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Final, NamedTuple
 
+from ssm_graph.live.sockets.doubt import Arrival, Doubt, Lags, Setting
 from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.sensors.messages import Message
 from ssm_graph.sensors.registry import BY_MESSAGE
@@ -42,7 +44,9 @@ LONGEST_INTERVAL_S: Final = 1.5
 MOST_STRANGERS: Final = 5000
 """Messages of another clock that may wait; with more the other clock is believed."""
 FOLLOWS_S: Final = 10.0
-"""So long after the vehicle's clock was set stamps may begin to follow it."""
+"""So long after the vehicle's clock was set inertial samples may begin to follow it."""
+N_SETTINGS: Final = 32
+"""So often a clock is set before an instrument that is silent is taken to follow the last."""
 RIGHT_S: Final = 5.0
 """An instrument's clock that is further off that of the vehicle was never set."""
 
@@ -82,14 +86,24 @@ class RunClock:
         """By how much the vehicle's clock is ahead of the time of the run, s."""
         self.set_at_s = -math.inf
         """When it was set last, s on the steady clock."""
+        self.unread_s = 0.0
+        """For how long nobody had looked when it was read last, s."""
+        self.n_set = 0
+        """How often it was set."""
+        self._settings: deque[Setting] = deque(maxlen=N_SETTINGS)
         self.has_begun = False
         """Whether a message has come; before, a clock that is set is the time of the run."""
         self._known: Now | None = None
+        self._read_s = steady_s()
         self.read()
 
     def begin(self) -> None:
         """Take note that a message has come."""
         self.has_begun = True
+
+    def settings(self, n_known: int) -> list[Setting]:
+        """Return how it was set since it had been so many times."""
+        return list(self._settings)[-(self.n_set - n_known) :] if self.n_set > n_known else []
 
     @property
     def time_s(self) -> float:
@@ -100,6 +114,7 @@ class RunClock:
         """Return both clocks, and by how much the vehicle's was set since the last call, s."""
         before_s = self._steady_s()
         now = Now(self._wall_s(), self._steady_s())
+        self.unread_s, self._read_s = now.steady_s - self._read_s, now.steady_s
         if now.steady_s - before_s > PREEMPTED_S:
             return now, 0.0
         known, self._known = self._known, now
@@ -111,6 +126,10 @@ class RunClock:
         if self.has_begun:
             self.set_by_s += step_s
             self.set_at_s = now.steady_s
+            self.n_set += 1
+            end_s = now.wall_s - self.set_by_s
+            begin_s = end_s - (now.steady_s - known.steady_s)
+            self._settings.append(Setting(begin_s, end_s, self.set_by_s))
         return now, step_s
 
 
@@ -121,6 +140,8 @@ class Sifted(NamedTuple):
     """In the time of the run."""
     refused: list[Message]
     """Of another clock, as they were stamped."""
+    untold: list[Message]
+    """Which waited in vain to be told how their stamps are to be read."""
     set_by_s: float
     """By how much the clock that stamps them was found to have been set, s; 0 where it was not."""
 
@@ -132,7 +153,8 @@ class StampClock:
     arrival as others were. Those of another clock wait. They are let in, all of them, once they
     have come for a second in which the known clock was silent (it was set, or the instrument was
     exchanged), and refused where it is heard again before. Where the vehicle's own clock was set,
-    what follows it is known at once.
+    inertial samples that follow it are known at once, for they follow each other; others wait until
+    it is told whether they do.
     """
 
     def __init__(self, clock: RunClock, *, is_steady: bool) -> None:
@@ -145,11 +167,11 @@ class StampClock:
         self._strangers: list[Message] = []
         self._stranger_s = self._met_s = 0.0
         self._found_s = 0.0
+        self._n_set = clock.n_set
         self._others_s: tuple[float, ...] = ()
-        self._set_at_s = -math.inf
-        self._leads_s: dict[float, float] = {}
-        """Where the vehicle's clock was set: what stamps may be ahead by, and how far ahead of
-        their arrival that would have them at most, s"""
+        """What stamps may be ahead by as well, s."""
+        self._lags = Lags()
+        self._doubt: Doubt | None = None
 
     def sift(self, message: Message, now: Now) -> Sifted:
         """Return what may pass, in the time of the run, and what was refused."""
@@ -157,75 +179,104 @@ class StampClock:
         refused: list[Message] = []
         messages = [message]
         self._found_s = 0.0
-        if self._strangers and self._clock.set_at_s > self._met_s:  # they came before it was known
+        if self._strangers and self._clock.set_at_s >= self._met_s:  # they came before it was known
             messages, self._strangers = [*self._strangers, message], []
-        for message in messages:
-            shift_s = self._shift_of(message.time_s, now)
-            if not self._is_steady and not self._is_known(message.time_s - shift_s, now):
-                fitting = (x for x in self._others_s if self._is_known(message.time_s - x, now))
-                shift_s = next(fitting, shift_s)  # delays had hidden that it is this one
-            if self._is_known(message.time_s - shift_s, now):
+        self._follow(now)
+        for one in messages:
+            if self._doubt is not None:
+                if not self._doubt.wait(one, self._arrival(now), ahead_s=self._ahead_s(now)):
+                    refused += self._meet(one, now, passed)
+                continue
+            shift_s = self._shift_of(one.time_s, now)
+            if self._is_known(one.time_s - shift_s, now):
                 refused += self._strangers
                 self._strangers = []
                 self._shift_s = shift_s
-                passed.append(self._passed(message, now))
+                passed.append(self._passed(one, now))
             else:
-                refused += self._meet(message, now, passed)
-        return Sifted(passed, refused, self._found_s)
+                refused += self._meet(one, now, passed)
+        settled, untold = self.settle(now)
+        return Sifted([*settled, *passed], refused, untold, self._found_s)
+
+    def settle(self, now: Now) -> tuple[list[Message], list[Message]]:
+        """Return messages that waited: those whose stamps can be read by now, and the too late."""
+        if self._doubt is None:
+            return [], []
+        told = self._doubt.tell(self._run_s(now))
+        if told is None:
+            return [], self._doubt.give_up(self._run_s(now))
+        self._doubt = None
+        self._shift_s = told.shift_s
+        self._others_s = () if told.other_s is None else (told.other_s,)
+        for message in told.messages:
+            self._remember(message.time_s, now)
+        return told.messages, []
 
     def off_s(self, message: Message) -> float:
         """Return how far a stamp is from the last one of the known clock, s."""
         return message.time_s - self._shift_s - self._stamp_s
 
+    def _follow(self, now: Now) -> None:
+        """Take note of how the vehicle's clock was set since the last message."""
+        settings = self._clock.settings(self._n_set)
+        self._n_set = self._clock.n_set
+        if math.isnan(self._stamp_s):
+            return
+        if self._is_steady:
+            was_s = [self._shift_s, *(setting.set_by_s for setting in settings)]
+            self._others_s = (*self._others_s, *was_s) if settings else self._others_s
+            return
+        for setting in settings:
+            if self._doubt is None and abs(setting.set_by_s - self._shift_s) > SET_S:
+                self._doubt = Doubt(
+                    self._shift_s,
+                    self._stamp_s,
+                    self._period_s,
+                    lags=self._lags,
+                    least_s=-self._lead(now),
+                )
+            if self._doubt is not None:
+                self._doubt.set(setting)
+
     def _shift_of(self, stamp_s: float, now: Now) -> float:
         """Return what a stamp is ahead of the time of the run by, s: as before, or newly set."""
-        shift_s, set_by_s = self._shift_s, self._clock.set_by_s
         if math.isnan(self._stamp_s):  # of this clock, or of one that never followed it
-            return min(set_by_s, 0.0, key=lambda s: abs(stamp_s - s - self._run_s(now)))
-        if self._set_at_s != self._clock.set_at_s:
-            self._set_at_s = self._clock.set_at_s
-            self._leads_s = dict.fromkeys((*self._leads_s, shift_s, set_by_s), -math.inf)
-        if not self._leads_s:
-            return shift_s
-        if not self._is_following(now):
-            return self._settled()
-        if not self._is_steady and now.steady_s - self._set_at_s > 0.5 * FOLLOWS_S:
-            for one, lead_s in self._leads_s.items():  # none is on its way from before any more
-                self._leads_s[one] = max(lead_s, stamp_s - one - self._run_s(now))
-        return min(self._leads_s, key=lambda one: self._misfit_s(stamp_s - one, now))
+            shifts = (self._clock.set_by_s, 0.0)
+            return min(shifts, key=lambda s: abs(stamp_s - s - self._run_s(now)))
+        if self._is_steady:
+            if now.steady_s - self._clock.set_at_s > FOLLOWS_S:
+                self._others_s = ()
+            shifts = (self._shift_s, *self._others_s)
+            return min(shifts, key=lambda one: self._misfit(stamp_s - one, now))
+        if self._is_known(stamp_s - self._shift_s, now):
+            return self._shift_s
+        fitting = (x for x in self._others_s if self._is_known(stamp_s - x, now))
+        return next(fitting, self._shift_s)  # delays had hidden that it is this one
 
-    def _is_following(self, now: Now) -> bool:
-        """Return whether the vehicle's clock was set so lately that stamps may begin to follow."""
-        return now.steady_s - self._clock.set_at_s <= FOLLOWS_S
+    def _misfit(self, time_s: float, now: Now) -> tuple[bool, float]:
+        """Return whether and how far an inertial sample does not follow on the last one, s.
 
-    def _settled(self) -> float:
-        """Return what stamps are ahead by for good, s: delays pass, the least of them recurs."""
-        heard = {one: lead_s for one, lead_s in self._leads_s.items() if lead_s > -math.inf}
-        self._shift_s = min(
-            heard, key=lambda one: abs(heard[one] - self._lead_s), default=self._shift_s
-        )
-        self._others_s = tuple(one for one in heard if one != self._shift_s)
-        self._leads_s = {}
-        return self._shift_s
-
-    def _misfit_s(self, time_s: float, now: Now) -> float:
-        """Return how far a time is from what the messages before it make expected, s."""
-        late_s = self._run_s(now) - time_s - self._lag_s
-        if not self._is_steady:
-            return abs(late_s)
+        One that follows at once does, whatever was on its way between the two.
+        """
         step_s = time_s - self._stamp_s - self._period_s
-        return min(abs(step_s), abs(step_s - (now.steady_s - self._heard_s)))
+        if abs(step_s) <= FOLLOWED_S:
+            return False, abs(step_s)
+        return True, min(abs(step_s), abs(step_s - (now.steady_s - self._heard_s)))
 
     def _run_s(self, now: Now) -> float:
         return now.wall_s - self._clock.set_by_s
 
+    def _arrival(self, now: Now) -> Arrival:
+        run_s = self._run_s(now)
+        return Arrival(run_s - self._clock.unread_s, run_s)
+
     def _is_known(self, time_s: float, now: Now) -> bool:
         if math.isnan(self._stamp_s):
             return True
-        ahead_s = time_s - self._run_s(now) - AHEAD_S
+        ahead_s = time_s - self._run_s(now)
         if not self._is_steady:
-            return self._is_following(now) or not ahead_s > max(self._lead(now), 0.0)
-        is_ahead = ahead_s > self._lead(now)
+            return not ahead_s > self._ahead_s(now)
+        is_ahead = ahead_s > AHEAD_S + self._lead(now)
         step_s = time_s - self._stamp_s
         off_s = step_s - (now.steady_s - self._heard_s)
         if self._strangers and abs(self._off_strangers_s(time_s, now)) < abs(off_s):
@@ -240,6 +291,10 @@ class StampClock:
         step_s = time_s - (self._strangers[-1].time_s - self._shift_s)
         return step_s - (now.steady_s - self._met_s)
 
+    def _ahead_s(self, now: Now) -> float:
+        """Return how far ahead of its arrival a stamp of no inertial sample may be, s."""
+        return AHEAD_S + max(self._lead(now), 0.0)
+
     def _lead(self, now: Now) -> float:
         """Return how far ahead of its arrival a stamp has been lately, s."""
         if math.isnan(self._heard_s):
@@ -251,15 +306,20 @@ class StampClock:
         self._clock.begin()
         time_s = message.time_s - self._shift_s
         self._lag_s = self._run_s(now) - time_s
-        if self._is_steady or not self._is_following(now):
-            self._lead_s = max(self._lead(now), -self._lag_s)
+        self._lead_s = max(self._lead(now), -self._lag_s)
+        self._lags.add(time_s, self._arrival(now))
+        self._remember(time_s, now)
+        return replace(message, time_s=time_s) if self._shift_s else message
+
+    def _remember(self, time_s: float, now: Now) -> None:
+        """Take a time for that of the last message."""
         if not math.isnan(self._stamp_s):
             since_s = min(now.steady_s - self._heard_s, LONGEST_INTERVAL_S)
             self._interval_s = max(since_s, 0.9 * self._interval_s)
             step_s = time_s - self._stamp_s
-            self._period_s = step_s if 0.0 < step_s <= FOLLOWED_S else self._period_s
+            longest_s = FOLLOWED_S if self._is_steady else math.inf
+            self._period_s = step_s if 0.0 < step_s <= longest_s else self._period_s
         self._stamp_s, self._heard_s = time_s, now.steady_s
-        return replace(message, time_s=time_s) if self._shift_s else message
 
     def _meet(self, message: Message, now: Now, passed: list[Message]) -> list[Message]:
         """Have a stranger wait, or let all of them in; return those of a third clock."""
@@ -316,6 +376,11 @@ class StampClocks:
         if key not in self._clocks:
             self._clocks[key] = StampClock(self._clock, is_steady=is_steady)
         return self._clocks[key]
+
+    def settle(self, source: str, now: Now) -> tuple[list[Message], list[Message]]:
+        """Return what waited of a source, as :meth:`StampClock.settle` does."""
+        found = [clock.settle(now) for (of, _), clock in self._clocks.items() if of == source]
+        return [m for passed, _ in found for m in passed], [m for _, late in found for m in late]
 
 
 def called(message: Message) -> str:

@@ -11,6 +11,7 @@ from ssm_graph.base.errors import ConfigError
 from ssm_graph.live.protocols.decoder import Decoder
 from ssm_graph.live.protocols.framing import TokenBucket
 from ssm_graph.live.sockets.clocks import Now, StampClocks, called
+from ssm_graph.live.sockets.doubt import DOUBT_S
 from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.navigation import Severity
 from ssm_graph.mission.run_status import LinkState, SourceStatus
@@ -133,11 +134,12 @@ class Feed:
 
         Messages that waited come with the one that lets them in.
         """
-        passed: list[Message] = []
+        passed, untold = self._clocks.settle(self.name, now)
         for message in messages:
             clock = self._clocks.of(self.name, message)
             sifted = clock.sift(message, now)
             passed += sifted.passed
+            untold += sifted.untold
             if sifted.refused:
                 off_s = clock.off_s(sifted.refused[0])
                 self._n_refused += len(sifted.refused)
@@ -148,6 +150,11 @@ class Feed:
                 text = f"the clock of {called(message)} was set by {sifted.set_by_s:+.6g} s: they "
                 text += "go on as before"
                 self.tell("clock_set", text, Severity.WARNING)
+        if untold:
+            self._n_refused += len(untold)
+            text = f"{len(untold)} {called(untold[0])} refused: the vehicle's clock was set, and "
+            text += f"delays left open for {DOUBT_S:g} s whether their stamps follow it"
+            self.tell("clock_refused", text, Severity.WARNING)
         return passed
 
     def stood_still(self, span_s: float) -> None:

@@ -129,7 +129,8 @@ def _last_keyframe(estimate: Estimate) -> RenderableType:
     if len(trajectory.time_s) == 0:
         return Text("no keyframes", style="red")
     variance = np.maximum(np.diagonal(trajectory.position_cov_enu[-1]), 0.0)
-    angles = np.rad2deg(trajectory.roll_pitch_heading[-1]) % np.array([np.inf, np.inf, 360.0])
+    angles = np.rad2deg(trajectory.roll_pitch_heading[-1])
+    angles[2] %= 360.0
     rows = (
         ("sigma of position east, north, up, m", *np.sqrt(variance)),
         ("sigma of velocity east, north, up, m/s", *trajectory.velocity_sigma_enu[-1]),

@@ -12,6 +12,7 @@ import numpy as np
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.runs import runs_of
+from ssm_graph.mission.estimate import OUTLIER_WEIGHT
 from ssm_graph.report.page.content import Content
 from ssm_graph.report.style import (
     EAST_NORTH_UP,
@@ -22,12 +23,15 @@ from ssm_graph.report.style import (
     broken_at_gaps,
     thinned,
     thinned_outliers_first,
+    thinned_to_extremes,
 )
 
 BEAM_COLORS: Final = (*EAST_NORTH_UP, "#CC79A7", "#56B4E9", "#E69F00", "#999933", "#332288")
 SUSPECT: Final = "#D55E00"
 MOST_ELLIPSES: Final = 60
 """Of uncertainty on the track; more hide it."""
+MOST_IN_SVG: Final = 1000
+"""Markers of a beam that are drawn without WebGL, which is slow where it is not of a card."""
 MOST_LAGS: Final = 20
 BAND: Final = "rgba(0, 114, 178, 0.16)"
 
@@ -54,15 +58,16 @@ def packed(values: Array) -> dict[str, str]:
 
 
 def line(x: Array, y: Array, name: str, color: str, **further: Any) -> dict[str, Any]:
-    """Return a line, broken at gaps and thinned to what a screen can show."""
+    """Return a line, broken at gaps and thinned to what a screen can show, spikes left in."""
     x, y = broken_at_gaps(x, y)
-    kept = thinned(len(x))
+    kept = thinned_to_extremes(y)
     style = {
         "color": color,
         "width": further.pop("width", 1.6),
         "dash": further.pop("dash", "solid"),
     }
-    trace = {"type": "scattergl" if len(kept) > 3000 else "scatter", "mode": "lines", "name": name}
+    # Not by WebGL: where a machine has none but in software, that takes longer than all else.
+    trace = {"type": "scatter", "mode": "lines", "name": name}
     return {**trace, "x": packed(x[kept]), "y": packed(y[kept]), "line": style, **further}
 
 
@@ -127,7 +132,7 @@ def _track(content: Content) -> Chart:
         },
     ]
     # Gaps in place are none of the track's: it is drawn as it is.
-    traces[1] |= {"x": packed(enu[kept, 0]), "y": packed(enu[kept, 1]), "type": "scatter"}
+    traces[1] |= {"x": packed(enu[kept, 0]), "y": packed(enu[kept, 1])}
     for number, (begin, end) in enumerate(runs_of(content.is_suspect)):
         part = enu[begin:end]
         doubtful = line(part[:, 0], part[:, 1], "suspect", SUSPECT, width=4)
@@ -182,6 +187,12 @@ def _series(content: Content) -> Iterator[Chart]:
         line(t, up, "height", ESTIMATE),
     ]
     yield Chart("height", "Height above the ellipsoid", "", traces, axes(MINUTES, "height, m"))
+    if content.altitude is not None and np.isfinite(content.altitude[1]).any():
+        time_s, altitude = content.altitude
+        traces = [line(content.minutes(time_s), altitude, "altitude", ESTIMATE)]
+        layout = axes(MINUTES, "m", yaxis={"rangemode": "tozero"})
+        note = "Of the DVL, by the ranges of its beams; where it breaks no beam met the bottom."
+        yield Chart("altitude", "Altitude over the bottom", note, traces, layout)
     traces = [
         line(t, 3.0 * rows[f"sigma_{name}_m"], f"3 sigma {name}", color)
         for name, color in zip(("east", "north", "up"), EAST_NORTH_UP, strict=True)
@@ -194,8 +205,9 @@ def _series(content: Content) -> Iterator[Chart]:
         then = content.minutes(of["time_s"])
         traces.append(line(then, level, "protection level", INK, **style))
         note += " The protection level bounds the horizontal error even if one sensor lies."
-    log = {"type": "log"} if _decades(traces) > 2.0 else {"rangemode": "tozero"}
-    yield Chart("sigma", "Uncertainty", note, traces, axes(MINUTES, "3 sigma, m", yaxis=log))
+    layout = axes(MINUTES, "3 sigma, m", yaxis=_scale(traces))
+    yield Chart("sigma", "Uncertainty of position", note, traces, layout)
+    yield from _errors(content)
     east, north = rows["vel_east_m_per_s"], rows["vel_north_m_per_s"]
     traces = [
         line(t, np.hypot(east, north), "over ground", ESTIMATE),
@@ -211,6 +223,34 @@ def _series(content: Content) -> Iterator[Chart]:
     traces = [line(*heading, "heading", EAST_NORTH_UP[0])]
     layout = axes(MINUTES, "degrees from north", yaxis={"tickvals": [0, 90, 180, 270, 360]})
     yield Chart("heading", "Heading", "", traces, layout)
+    traces = [
+        line(t, 3.0 * rows[f"sigma_{name}_deg"], f"3 sigma {name}", color)
+        for name, color in zip(("roll", "pitch", "heading"), EAST_NORTH_UP, strict=True)
+    ]
+    layout = axes(MINUTES, "3 sigma, degrees", yaxis=_scale(traces))
+    yield Chart("attitude-sigma", "Uncertainty of attitude", "", traces, layout)
+
+
+def _errors(content: Content) -> Iterator[Chart]:
+    """Return errors by axis against the reference, inside three of their sigmas or not."""
+    of = content.errors
+    if of is None or not np.isfinite(of.position_enu).any():
+        return
+    t, traces = content.minutes(of.time_s), []
+    sigma = 3.0 * np.hypot(of.position_sigma_enu, of.reference_sigma_enu)
+    for i, (name, color) in enumerate(zip(("east", "north", "up"), EAST_NORTH_UP, strict=True)):
+        bound = {"width": 0.8, "dash": "dot", "legendgroup": name, "hoverinfo": "skip"}
+        traces.append(line(t, of.position_enu[:, i], name, color, legendgroup=name))
+        for sign in (1.0, -1.0):
+            traces.append(line(t, sign * sigma[:, i], "", color, showlegend=False, **bound))
+    note = "Estimate minus reference; dotted are three sigma of both. Click a name to hide it."
+    layout = axes(MINUTES, "error, m")
+    yield Chart("errors", "Errors against the reference", note, traces, layout)
+
+
+def _scale(traces: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """Return an axis for sigmas: of decades where they differ by more than two."""
+    return {"type": "log"} if _decades(traces) > 2.0 else {"rangemode": "tozero"}
 
 
 def _unbroken(t: Array, heading_deg: Array) -> tuple[Array, Array]:
@@ -236,15 +276,25 @@ def _beams(content: Content) -> Iterator[Chart]:
     for beam in np.unique(number):
         mine = np.flatnonzero(number == beam)
         kept = mine[thinned_outliers_first(weight[mine], 4000)]
-        look = {"color": BEAM_COLORS[(beam - 1) % len(BEAM_COLORS)], "size": 4}
-        common = {"type": "scattergl", "mode": "markers", "name": f"beam {beam}", "marker": look}
-        x = packed(t[kept])
-        of_weight.append({**common, "x": x, "y": packed(weight[kept])})
-        of_innovation.append({**common, "x": x, "y": packed(1e3 * innovation[kept])})
-    note = "1 is the weight of a measurement that is as noisy as stated; near 0 it is left out."
-    layout = axes(MINUTES, "weight", yaxis={"rangemode": "tozero"})
+        is_out = weight[kept] < OUTLIER_WEIGHT
+        for some, symbol, size in ((kept[~is_out], "circle", 4), (kept[is_out], "x", 7)):
+            look = {"color": BEAM_COLORS[(beam - 1) % len(BEAM_COLORS)], "size": size}
+            common = {
+                "type": "scattergl" if len(kept) > MOST_IN_SVG else "scatter",
+                "mode": "markers",
+                "name": f"beam {beam}",
+                "legendgroup": f"beam {beam}",
+                "showlegend": symbol == "circle",
+                "marker": {**look, "symbol": symbol},
+                "x": packed(t[some]),
+            }
+            of_weight.append({**common, "y": packed(weight[some])})
+            of_innovation.append({**common, "y": packed(1e3 * innovation[some])})
+    note = "1 is the weight of a measurement that is as noisy as stated; a cross is left out."
+    top = 1.05 * float(np.max(weight, initial=1.0))
+    layout = axes(MINUTES, "weight", yaxis={"range": [-0.06, top]})
     yield Chart("weights", "Weights of the DVL's beams", note, of_weight, layout)
-    note = "Measured minus what the answer expects. Gross ones may be far outside: zoom out."
+    note = "Measured minus what the answer expects. Crosses may be far outside: zoom out."
     limit = 1e3 * 8.0 * float(np.median(np.abs(innovation))) or 1.0
     layout = axes(MINUTES, "mm/s", yaxis={"range": [-limit, limit]})
     yield Chart("innovations", "Innovations of the DVL's beams", note, of_innovation, layout)
@@ -263,7 +313,7 @@ def _aids(content: Content) -> Iterator[Chart]:
             of = mine[components == component]
             of = of[thinned_outliers_first(rows["weight"][of], 4000)]
             color = BEAM_COLORS[i % len(BEAM_COLORS)]
-            is_out = rows["weight"][of] < 0.05
+            is_out = rows["weight"][of] < OUTLIER_WEIGHT
             look = {
                 "size": np.where(is_out, 8, 5).tolist(),
                 "symbol": np.where(is_out, "x", "circle").tolist(),
@@ -284,7 +334,7 @@ def _whiteness(content: Content) -> Iterator[Chart]:
     rows = content.beams
     traces, longest = [], 0
     for beam in np.unique(rows["beam"]).astype(int):
-        mine = (rows["beam"] == beam) & (rows["weight"] > 0.05)
+        mine = (rows["beam"] == beam) & (rows["weight"] >= OUTLIER_WEIGHT)
         values = np.sign(rows["innovation_m_per_s"][mine]) * np.sqrt(rows["mahalanobis_sq"][mine])
         if len(values) <= 5 * MOST_LAGS:
             continue

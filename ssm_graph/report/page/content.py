@@ -10,6 +10,7 @@ import numpy as np
 
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
+from ssm_graph.evaluation.errors import ErrorSeries
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,6 +26,10 @@ class Content:
     """Unix time of ``time_s`` 0, s; None where nobody knows."""
     protection: Mapping[str, Array] = field(default_factory=dict)
     """Columns of ``protection.csv``, which live runs have; empty for others."""
+    altitude: tuple[Array, Array] | None = None
+    """Times (P,), s, and heights over the bottom (P,), m; None where nothing says."""
+    errors: ErrorSeries | None = None
+    """Against the mission's reference; None without one."""
 
     @property
     def begin_s(self) -> float:

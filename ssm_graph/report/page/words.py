@@ -84,8 +84,8 @@ def _facts(content: Content) -> Iterable[tuple[str, str]]:
     yield "path length", f"{summary.get('total_path_length_m') or 0.0:.0f} m"
     known = sigma[np.isfinite(sigma)]
     if len(known):
-        yield "position at the end, 95 %", f"{R95 * sigma[-1]:.2f} m"
-        yield "position at the worst, 95 %", f"{R95 * known.max():.2f} m"
+        yield "position at the end, 95\u00a0%", f"{R95 * sigma[-1]:.2f} m"
+        yield "position at the worst, 95\u00a0%", f"{R95 * known.max():.2f} m"
     n_beams, n_out = summary.get("n_beams") or 0, summary.get("n_outliers") or 0
     if n_beams:
         yield "beam speeds left out", f"{n_out} of {n_beams} ({100.0 * n_out / n_beams:.1f} %)"

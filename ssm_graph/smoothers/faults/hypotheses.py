@@ -184,6 +184,7 @@ AIDS = {
     "USBL": ("m", 1e3),
     "depth": ("m", 1e2),
     "range": ("m", 1e3),
+    "seabed": ("m", 1e2),
     "heading": ("rad", 1.0),
 }
 """Unit and prior sigma of what an aid is off by."""

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
-from scipy.stats import chi2
 
+from ssm_graph.base import chi2
 from ssm_graph.base.frozen import Array
 from ssm_graph.graph.inertial_rows import InertialFit
 from ssm_graph.mission.fault import DetectedFault, Treatment

@@ -12,12 +12,16 @@ from ssm_graph.systems.landmark_slam.problem import (
     SlamProblem,
     SlamStatus,
 )
+from ssm_graph.systems.landmark_slam.range_starts import placed
 from ssm_graph.systems.landmark_slam.smoother import Values
 
 
-def values_of(answer: SlamEstimate) -> Values:
-    """Return where a smoother begins."""
-    return Values(answer.pose, np.nan_to_num(answer.landmarks))
+def first_values(problem: SlamProblem, noise: SlamNoise) -> Values:
+    """Return where a smoother begins: by a filter with weights, at the poses that saw something."""
+    short, its_noise, kept = problem.with_drift_as_noise(noise).condensed(noise)
+    answer = filtered(short, its_noise, "ekf-weighted")
+    places = placed(short, its_noise.observation, answer.pose, answer.landmarks)
+    return Values(problem.expanded(answer.pose, kept), np.nan_to_num(places))
 
 
 def filtered(problem: SlamProblem, noise: SlamNoise, method: str) -> SlamEstimate:

@@ -209,11 +209,10 @@ class LogScore(NamedTuple):
     n_poses: int
 
 
-def score_of(log: LandmarkLog, problem: SlamProblem, answer: SlamEstimate) -> LogScore:
-    """Return how far an answer is from the truth."""
-    truth, known = truth_at(log, problem.time_s)
+def score_of(truth: Array, known: NDArray[np.bool_], answer: SlamEstimate) -> LogScore:
+    """Return how far an answer is from a truth (K, 3) where it is known (K,)."""
     if not known.any():
-        raise DataError("score_of: the log has no truth at its poses")
+        raise DataError("score_of: expected a truth at the poses, got none; is its clock the same?")
     path, true = answer.pose[known], truth[known]
     error = path[:, :2] - true[:, :2]
     turn = half_turn(path[:, 2] - true[:, 2])

@@ -89,8 +89,12 @@ FILTERS: Final[Mapping[str, FilterMethod]] = {
 SMOOTHERS: Final[Mapping[str, str]] = {
     "smoother": "whole log, similarity weights, stated noise",
     "smoother-em": "whole log, similarity weights, noise from the log",
+    "isam2": "pose by pose with nothing dropped, similarity weights, stated noise",
+    "fixed-lag": "pose by pose, those older than the lag dropped, similarity weights, stated noise",
     "smoother-oracle": "whole log, least squares, told noise and gross observations",
 }
+INCREMENTAL: Final = ("isam2", "fixed-lag")
+"""Smoothers that take a log as it comes."""
 PAPER: Final = ("ekf", "ukf", "naukf")
 DEFAULT_STUDY: Final = (
     *PAPER,

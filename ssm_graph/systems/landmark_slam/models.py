@@ -127,3 +127,26 @@ class Odometry(Motion):
 
     def basis(self, control: Array) -> Array:  # noqa: D102
         return np.asarray(control[..., 3:, None] * np.eye(3))
+
+
+@final
+@dataclass(frozen=True, slots=True)
+class Increments(Motion):
+    """Increments with a covariance each: of graphs, or of several steps put together.
+
+    The control (..., 12) is the increment [m, m, rad] and, row by row, the root (3, 3) by which
+    noise of unit size comes to it.
+    """
+
+    labels = ("first root", "second root", "third root")
+
+    def increment(self, control: Array, noise: Array) -> Array:  # noqa: D102
+        return np.asarray(control[..., :3] + (self.basis(control) @ noise[..., None])[..., 0])
+
+    def basis(self, control: Array) -> Array:  # noqa: D102
+        return np.asarray(control[..., 3:].reshape(*control.shape[:-1], 3, 3))
+
+
+def increments_of(step: Array, cov: Array) -> Array:
+    """Return controls (N, 12) of `Increments` from steps (N, 3) and covariances (N, 3, 3)."""
+    return np.hstack([step, np.linalg.cholesky(cov).reshape(len(step), 9)])

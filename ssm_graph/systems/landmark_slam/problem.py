@@ -8,9 +8,17 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.bearing_range import half_turn
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array, ReadOnlyArrays
-from ssm_graph.systems.landmark_slam.models import Motion, composed
+from ssm_graph.systems.landmark_slam.models import (
+    Increments,
+    Motion,
+    between,
+    composed,
+    increments_of,
+    turned,
+)
 
 UNKNOWN = -1
 """Landmark of an observation that nobody has named."""
@@ -89,7 +97,8 @@ class SlamProblem(ReadOnlyArrays):
         slopes = self.drift_slopes(self.steps()) * self.drift_sigma
         more = np.square(slopes).sum(axis=2) / np.square(noise.control)
         scales = np.sqrt(np.square(self.control[:, 3:]) + more)
-        return replace(self, control=np.hstack([self.control[:, :3], scales]))
+        control = np.hstack([self.control[:, :3], scales])
+        return replace(self, control=control, drift_sigma=np.zeros(0))
 
     def dead_reckoned(self) -> Array:
         """Return poses (K, 3) by odometry alone."""
@@ -98,6 +107,56 @@ class SlamProblem(ReadOnlyArrays):
         for k, step in enumerate(self.steps()):
             poses[k + 1] = composed(poses[k], step)
         return poses
+
+    def condensed(self, noise: SlamNoise) -> tuple[SlamProblem, SlamNoise, NDArray[np.intp]]:
+        """Return the log with those poses alone that saw something, the first and the last.
+
+        Also its noise, and which poses these are. Increments between are put together as they would
+        be eliminated: the same to second order of their noise.
+        """
+        kept = np.unique(np.concatenate([[0], self.keyframe, [len(self.time_s) - 1]]))
+        if len(kept) == len(self.time_s):
+            return self, noise, kept
+        poses, k = self.dead_reckoned(), np.arange(len(self.control))
+        left = np.searchsorted(kept, k, side="right") - 1
+        begin, end = poses[kept[left]], poses[kept[left + 1]]
+        # What a step misses goes to the axes of the first pose; its turn turns what comes after.
+        onto = turned(poses[:-1, 2] - begin[:, 2])
+        c, s = np.cos(begin[:, 2]), np.sin(begin[:, 2])
+        rest = end[:, :2] - poses[1:, :2]
+        onto[:, 0, 2] = s * rest[:, 0] - c * rest[:, 1]
+        onto[:, 1, 2] = c * rest[:, 0] + s * rest[:, 1]
+        root = onto @ (self.motion.basis(self.control) * noise.control)
+        cov = np.add.reduceat(root @ root.mT, kept[:-1]) + 1e-18 * np.eye(3)
+        steps = between(poses[kept[:-1]], poses[kept[1:]])
+        steps[:, 2] = np.add.reduceat(self.steps()[:, 2], kept[:-1])
+        short = replace(
+            self,
+            time_s=self.time_s[kept],
+            motion=Increments(),
+            control=increments_of(steps, cov),
+            keyframe=np.searchsorted(kept, self.keyframe),
+        )
+        return short, SlamNoise(np.ones(3), noise.observation), kept
+
+    def expanded(self, pose: Array, kept: NDArray[np.intp]) -> Array:
+        """Return all poses (K, 3) from those of the condensed log.
+
+        What odometry misses by from one to the next is spread evenly over the poses between.
+        """
+        if len(kept) == len(self.time_s):
+            return pose
+        by_odometry, k = self.dead_reckoned(), np.arange(len(self.time_s))
+        left = np.clip(np.searchsorted(kept, k, side="right") - 1, 0, len(kept) - 2)
+        begin, end = kept[left], kept[left + 1]
+        found = composed(pose[left], between(by_odometry[begin], by_odometry))
+        missed = pose[left + 1] - composed(
+            pose[left], between(by_odometry[begin], by_odometry[end])
+        )
+        missed[:, 2] = half_turn(missed[:, 2])
+        found += ((k - begin) / (end - begin))[:, None] * missed
+        found[:, 2] = half_turn(found[:, 2])
+        return np.asarray(found)
 
     def associated(self, landmark: NDArray[np.intp], names: tuple[str, ...]) -> SlamProblem:
         """Return the same with other landmarks seen; observations of none (-1) are left out."""

@@ -34,6 +34,8 @@ FAR_M: Final = 1e4
 SETTLED: Final = 1e-2
 """Sigmas by which the last update moves anything at most."""
 SETTLED_WEIGHT: Final = 1e-2
+ROUGH: Final = 5.0
+"""Times these, where the whole log follows."""
 HALVINGS: Final = 12
 
 
@@ -83,6 +85,8 @@ class Marginals(NamedTuple):
     """(M, 2) residual^2 + H P H'"""
     between: Array
     """(K - 1, 3, 3) residual residual' + H P H'"""
+    pose_cov: Array
+    """(K, 3, 3)"""
 
 
 def linearised(problem: SlamProblem, noise: SlamNoise, values: Values) -> Rows:
@@ -153,7 +157,8 @@ def marginals(problem: SlamProblem, rows: Rows, solution: ChainSolution) -> Marg
     """Return expected squares of all whitened rows."""
     k, at = problem.keyframe, 2 * problem.landmark[:, None] + np.arange(2)
     P = solution.constants_cov
-    through = solution.sensitivity @ P
+    # One product of matrices: of each pose by itself it takes three times as long.
+    through = (solution.sensitivity.reshape(-1, len(P)) @ P).reshape(solution.sensitivity.shape)
     pose_cov = solution.conditional + through @ solution.sensitivity.mT
     cross = through[k[:, None, None], np.arange(3)[:, None], at[:, None]]
     pose, place = rows.own[..., :3], rows.own[..., 3:]
@@ -173,7 +178,8 @@ def marginals(problem: SlamProblem, rows: Rows, solution: ChainSolution) -> Marg
     slopes = np.concatenate([rows.between, rows.between_drift], axis=2)
     spread = slopes @ both @ slopes.mT
     e = rows.between_error
-    return Marginals(rows.own_error**2 + inner, e[:, :, None] * e[:, None, :] + spread)
+    squares = e[:, :, None] * e[:, None, :]
+    return Marginals(rows.own_error**2 + inner, squares + spread, pose_cov)
 
 
 class Pass(NamedTuple):
@@ -212,7 +218,8 @@ def one_pass(
     new = weights_of(settings.kernel, expected.own.sum(axis=1), rows.n_rows)
     t = np.einsum("kii->k", expected.between)
     new_step = weights_of(settings.odometry_kernel, t, np.full(len(t), 3))
-    sigma = solution.sigma
+    own_var = np.einsum("kii->ki", expected.pose_cov).ravel()
+    sigma = np.sqrt(np.concatenate([own_var, np.diagonal(solution.constants_cov)]))
     steps = np.concatenate([solution.step.ravel(), solution.constants_step])
     change = float(np.max(np.abs(new - weights), initial=0.0))
     update = float(np.max(np.abs(steps) / sigma, initial=0.0))
@@ -261,17 +268,50 @@ def smooth_landmarks(
     weights : (M,) of the first pass; ones if None.
     """
     how = settings or SmootherSettings()
-    values, is_settled, count = with_drift(problem, first), False, 0
+    values = with_drift(problem, first)
     w = np.ones(len(problem.keyframe)) if weights is None else weights
-    step_w = np.ones(len(problem.control))
-    while not is_settled and count < how.max_iterations:
-        found = one_pass(problem, noise, how, values, w, step_w)
-        values, w, step_w, count = found.values, found.weights, found.step_weights, count + 1
-        is_settled = found.update_sigmas < SETTLED and found.weight_change < SETTLED_WEIGHT
-    if not np.all(np.isfinite(values.pose)):
+    short, its_noise, kept = problem.condensed(noise)
+    if short is not problem:  # most of the way with fewer poses
+        begin = values._replace(pose=values.pose[kept])
+        found, _, _ = _settled(short, its_noise, how, begin, w, limit=ROUGH)
+        values = found.values._replace(pose=problem.expanded(found.values.pose, kept))
+        w = found.weights
+    found, is_settled, count = _settled(problem, noise, how, values, w)
+    if not np.all(np.isfinite(found.values.pose)):
         raise SolverError("smooth_landmarks: no finite solution; look at sigmas and first values")
     status = SlamStatus.CONVERGED if is_settled else SlamStatus.MAX_ITERATIONS
     return estimate_of(problem, noise, found, status, count)
+
+
+def _settled(
+    problem: SlamProblem,
+    noise: SlamNoise,
+    how: SmootherSettings,
+    values: Values,
+    w: Array,
+    *,
+    limit: float = 1.0,
+) -> tuple[Pass, bool, int]:
+    """Return the last pass, whether it settled, and how many there were."""
+    step_w, is_settled, count = np.ones(len(problem.control)), False, 0
+    change = np.zeros(len(w))
+    while not is_settled and count < how.max_iterations:
+        found = one_pass(problem, noise, how, values, w, step_w)
+        before, change = change, found.weights - w
+        values, step_w, count = found.values, found.step_weights, count + 1
+        w = found.weights if found.update_sigmas > 1.0 else _ahead(found.weights, before, change)
+        is_settled = found.update_sigmas < limit * SETTLED
+        is_settled &= found.weight_change < limit * SETTLED_WEIGHT
+    return found, is_settled, count
+
+
+def _ahead(weights: Array, before: Array, change: Array) -> Array:
+    """Return where weights (M,) are bound for, if their changes go on to shrink by one ratio."""
+    ratio = float(before @ change) / max(float(before @ before), 1e-300)
+    if not 0.1 < ratio < 0.8:
+        return weights
+    told = weights + ratio / (1.0 - ratio) * change
+    return np.clip(told, 0.5 * weights, np.maximum(weights, 1.5 * weights))
 
 
 def with_drift(problem: SlamProblem, values: Values) -> Values:
@@ -295,7 +335,7 @@ def estimate_of(
     )
     return SlamEstimate(
         found.values.pose,
-        found.solution.covariance(3),
+        found.expected.pose_cov,
         found.values.landmarks,
         P[at, :, at],
         found.weights,

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from factors.similarity import Kernel, LogKernel
 from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.base.frozen import Array
 from ssm_graph.report.style import new_figure, save
 from ssm_graph.systems.landmark_slam.association import (
     Association,
@@ -20,19 +21,30 @@ from ssm_graph.systems.landmark_slam.association import (
     association_errors,
 )
 from ssm_graph.systems.landmark_slam.figures import draw_map
-from ssm_graph.systems.landmark_slam.filtered import filtered, values_of
+from ssm_graph.systems.landmark_slam.filtered import filtered, first_values
 from ssm_graph.systems.landmark_slam.folder import (
     TOML_NAME,
     read_landmark_folder,
     write_answer,
 )
+from ssm_graph.systems.landmark_slam.graph_files import SUFFIXES, read_pose_graph
+from ssm_graph.systems.landmark_slam.graphs import (
+    SlamGraph,
+    graph_of_problem,
+    problem_of_graph,
+)
+from ssm_graph.systems.landmark_slam.incremental import (
+    LAG_S,
+    IncrementalSettings,
+    smooth_incrementally,
+)
 from ssm_graph.systems.landmark_slam.logs import (
-    LandmarkLog,
     LogScore,
     problem_of_log,
     score_of,
     truth_at,
 )
+from ssm_graph.systems.landmark_slam.methods import INCREMENTAL
 from ssm_graph.systems.landmark_slam.noise import NoiseSettings, SigmaFound, estimate_noise
 from ssm_graph.systems.landmark_slam.problem import (
     UNKNOWN,
@@ -44,13 +56,15 @@ from ssm_graph.systems.landmark_slam.problem import (
 from ssm_graph.systems.landmark_slam.recorded import read_graph, read_mrclam
 from ssm_graph.systems.landmark_slam.smoother import SmootherSettings, Values, smooth_landmarks
 
+NO_TRUTH: Final = np.zeros((0, 3))
+
 
 @dataclass(frozen=True, slots=True)
 class Asked:
     """What is done with a log."""
 
     method: str = "smoother"
-    """Or a filter of `methods.FILTERS`."""
+    """Or `methods.INCREMENTAL`, or a filter of `methods.FILTERS`."""
     learns_observations: bool = False
     """The sigmas of the observations are estimated, from the stated ones on."""
     learns_control: bool = False
@@ -58,7 +72,9 @@ class Asked:
     association: Association = Association.KNOWN
     kernel: Kernel = LogKernel(5.0)
     robot: int | None = None
-    """Of a MRCLAM folder."""
+    """Of a MRCLAM folder or a PyFG file."""
+    lag_s: float = LAG_S
+    """Of the method fixed-lag."""
 
 
 class Solved(NamedTuple):
@@ -67,7 +83,8 @@ class Solved(NamedTuple):
     asked: Asked
     problem: SlamProblem
     answer: SlamEstimate
-    log: LandmarkLog | None
+    truth: Array
+    """(K, 3), NaN where there is none; no rows without any"""
     score: LogScore | None
     sigmas: tuple[SigmaFound, ...]
     errors: AssociationErrors | None
@@ -129,6 +146,8 @@ class Solved(NamedTuple):
 
 def solve_input(path: Path, asked: Asked) -> Solved:
     """Read an input and solve it."""
+    if path.suffix in SUFFIXES and path.is_file():
+        return solve_graph(*read_pose_graph(path, robot=asked.robot), asked)
     if path.is_file():
         problem, noise = read_graph(path)
         return solve(problem, noise, asked)
@@ -142,13 +161,44 @@ def solve_input(path: Path, asked: Asked) -> Solved:
         raise ConfigError(
             f"{path}: expected a folder with {TOML_NAME} or MRCLAM's Barcodes.dat, or a graph file"
         )
-    return solve(problem_of_log(log), log.noise, asked, log=log)
+    problem = problem_of_log(log)
+    truth, known = truth_at(log, problem.time_s)
+    truth = np.where(known[:, None], truth, np.nan) if len(log.truth_s) > 1 else np.zeros((0, 3))
+    return solve(problem, log.noise, asked, truth=truth, notes=log.notes)
+
+
+def solve_graph(graph: SlamGraph, notes: tuple[str, ...], asked: Asked) -> Solved:
+    """Return the answer to a graph of a file; with closures by GTSAM, else as a log."""
+    problem, noise = problem_of_graph(graph)
+    if not graph.is_closure.any():
+        return solve(problem, noise, asked, truth=graph.truth, notes=notes)
+    if asked.method not in ("smoother", *INCREMENTAL):
+        raise ConfigError(
+            f"--method {asked.method}: expected isam2 or fixed-lag for a graph whose places are met "
+            "again; filters take a log"
+        )
+    if asked.learns_observations or asked.association is not Association.KNOWN:
+        raise ConfigError(
+            "--noise, --association: expected stated and known for a graph whose places are met "
+            "again; leave them out"
+        )
+    lag_s = asked.lag_s if asked.method == "fixed-lag" else None
+    found = smooth_incrementally(graph, IncrementalSettings(asked.kernel, lag_s=lag_s))
+    w = found.closure_weights
+    told = f"{len(w)} closures, {int(np.sum(w < 0.5))} of them with less than half their weight"
+    notes = (*notes, told, *found.estimate.notes)
+    return _solved(asked, problem, found.estimate, graph.truth, notes=notes)
 
 
 def solve(
-    problem: SlamProblem, noise: SlamNoise, asked: Asked, *, log: LandmarkLog | None = None
+    problem: SlamProblem,
+    noise: SlamNoise,
+    asked: Asked,
+    *,
+    truth: Array = NO_TRUTH,
+    notes: tuple[str, ...] = (),
 ) -> Solved:
-    """Return the answer to a log; ``log`` is where it came from, with its truth."""
+    """Return the answer to a log with a truth (K, 3), NaN where there is none, or none at all."""
     named, errors = problem, None
     if asked.association is Association.KNOWN:
         unnamed = int(np.sum(problem.landmark == UNKNOWN))
@@ -164,38 +214,51 @@ def solve(
         if np.all(problem.landmark != UNKNOWN):
             errors = association_errors(found.landmark, problem.landmark)
     sigmas: tuple[SigmaFound, ...] = ()
-    if asked.method != "smoother":
+    if asked.method in INCREMENTAL:
+        lag_s = asked.lag_s if asked.method == "fixed-lag" else None
+        how = IncrementalSettings(asked.kernel, lag_s=lag_s)
+        answer = smooth_incrementally(graph_of_problem(named, noise), how).estimate
+    elif asked.method != "smoother":
         answer = filtered(named, noise, asked.method)
     else:
-        values = first or values_of(filtered(named, noise, "ekf-weighted"))
+        values = first or first_values(named, noise)
         settings = SmootherSettings(asked.kernel)
         if asked.learns_observations:
-            how = NoiseSettings(learns_control=asked.learns_control)
-            learnt = estimate_noise(named, noise, values, settings, how)
+            learning = NoiseSettings(learns_control=asked.learns_control)
+            learnt = estimate_noise(named, noise, values, settings, learning)
             answer, sigmas = learnt.estimate, learnt.sigmas
         else:
             answer = smooth_landmarks(named, noise, values, settings)
-    has_truth = log is not None and len(log.truth_s) > 1
-    score = score_of(log, named, answer) if has_truth and log is not None else None
-    notes = (*(log.notes if log is not None else ()), *answer.notes)
-    return Solved(asked, named, answer, log, score, sigmas, errors, notes)
+    notes = (*notes, *answer.notes)
+    return _solved(asked, named, answer, truth, sigmas=sigmas, errors=errors, notes=notes)
+
+
+def _solved(
+    asked: Asked,
+    problem: SlamProblem,
+    answer: SlamEstimate,
+    truth: Array,
+    *,
+    sigmas: tuple[SigmaFound, ...] = (),
+    errors: AssociationErrors | None = None,
+    notes: tuple[str, ...] = (),
+) -> Solved:
+    known = np.isfinite(truth[:, :2]).all(axis=1)
+    score = score_of(truth, known, answer) if known.any() else None
+    return Solved(asked, problem, answer, truth, score, sigmas, errors, notes)
 
 
 def write_solved(folder: Path, solved: Solved) -> None:
     """Write tables, summary and figure."""
-    problem, answer, log = solved.problem, solved.answer, solved.log
+    problem, answer = solved.problem, solved.answer
     write_answer(folder, problem, answer, solved.summary())
-    true = None
-    if log is not None and len(log.truth_s) > 1:
-        truth, known = truth_at(log, problem.time_s)
-        true = np.where(known[:, None], truth, np.nan)
     figure = new_figure(7.2, 5.4, f"{solved.asked.method}: path and map")
     draw_map(
         figure.subplots(),
         path=answer.pose,
         landmarks=answer.landmarks,
         landmark_cov=answer.landmark_cov,
-        true_path=true,
+        true_path=solved.truth if len(solved.truth) else None,
         labels=problem.names if len(problem.names) <= 40 else (),
     )
     save(figure, folder / "figure.png")

@@ -22,9 +22,15 @@ from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.units import DEGREE
 from ssm_graph.study.ledger import Key, Row
-from ssm_graph.systems.landmark_slam.filtered import filtered, values_of
+from ssm_graph.systems.landmark_slam.filtered import filtered, first_values
 from ssm_graph.systems.landmark_slam.filters import MapFilter
-from ssm_graph.systems.landmark_slam.methods import FILTERS, SMOOTHERS, check_method
+from ssm_graph.systems.landmark_slam.graphs import graph_of_problem
+from ssm_graph.systems.landmark_slam.incremental import (
+    LAG_S,
+    IncrementalSettings,
+    smooth_incrementally,
+)
+from ssm_graph.systems.landmark_slam.methods import INCREMENTAL, FILTERS, SMOOTHERS, check_method
 from ssm_graph.systems.landmark_slam.models import Bicycle
 from ssm_graph.systems.landmark_slam.noise import estimate_noise
 from ssm_graph.systems.landmark_slam.problem import SlamNoise, SlamProblem
@@ -245,15 +251,15 @@ def smoothed_scores(path: Path, runs: Runs, case: NoiseCase, method: str) -> Sco
             gross = np.concatenate([mark[b] for mark in runs.is_gross])
             problem = problem.associated(np.where(gross, -1, problem.landmark), problem.names)
             settings = SmootherSettings(GaussianKernel())
-            answer = smooth_landmarks(
-                problem, noise, values_of(filtered(problem, noise, FIRST)), settings
-            )
+            answer = smooth_landmarks(problem, noise, first_values(problem, noise), settings)
         elif method == "smoother-em":
-            answer = estimate_noise(
-                problem, noise, values_of(filtered(problem, noise, FIRST))
-            ).estimate
+            answer = estimate_noise(problem, noise, first_values(problem, noise)).estimate
+        elif method in INCREMENTAL:
+            lag_s = LAG_S if method == "fixed-lag" else None
+            graph, how = graph_of_problem(problem, noise), IncrementalSettings(lag_s=lag_s)
+            answer = smooth_incrementally(graph, how).estimate
         else:
-            answer = smooth_landmarks(problem, noise, values_of(filtered(problem, noise, FIRST)))
+            answer = smooth_landmarks(problem, noise, first_values(problem, noise))
         errors.append(_pose_error(answer.pose[1:, None], path))
         covs.append(answer.pose_cov[1:, None])
         maps.append(np.linalg.norm(answer.landmarks - path.landmarks[ids], axis=1).mean())

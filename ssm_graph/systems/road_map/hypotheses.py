@@ -8,14 +8,15 @@ itself says is possible does not depend on which particles are left.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factors.lane_line import line_residual
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.units import DEGREE, wrapped
+from ssm_graph.filters.rules.hypotheses import Hypothesis, apart_from_each_other, told
 from ssm_graph.systems.road_map.locator import INDEPENDENT_M, LocatorSettings
 from ssm_graph.systems.road_map.maps.index import LineIndex
 from ssm_graph.systems.road_map.maps.road_map import LineKind, Mark
@@ -36,23 +37,10 @@ SLIDE_M: Final = 24.0
 _ROUNDS: Final = 5
 
 
-@dataclass(frozen=True, slots=True)
-class Hypothesis:
-    """A place where the last picture could have been taken."""
-
-    pose: tuple[float, float, float]
-    """x, y [m], yaw [rad]"""
-    log_evidence: float
-    """Of the stretch's curves, up to a constant."""
-    misfit: float = 0.0
-    """Loss of log likelihood of a curve, the mean over the stretch."""
-    share: float = 1.0
-    """Of the evidence of all places, 0 to 1."""
-
-    def is_same_lane(self, pose: Array) -> bool:
-        """Whether another pose is within the same lane, wherever along it."""
-        across, _, turn = apart(np.array(self.pose), pose)
-        return abs(across) < LATERAL_M and abs(turn) < TURN
+def is_same_lane(hypothesis: Hypothesis, pose: Array) -> bool:
+    """Whether a pose is within the lane of a hypothesis, wherever along it."""
+    across, _, turn = apart(np.array(hypothesis.pose), pose)
+    return abs(across) < LATERAL_M and abs(turn) < TURN
 
 
 def apart(pose: Array, other: Array) -> tuple[float, float, float]:
@@ -125,13 +113,8 @@ def _ranked(
     whole = _log_likelihood(window, poses, indices, settings, 0.0)
     found, misfit = new * whole, -whole / len(window.picture)
     kept = _apart_from_each_other(poses, found, _KEPT)
-    share = np.exp(found - found[kept].max())
-    share /= share[kept].sum()
-    told = [
-        Hypothesis((float(p[0]), float(p[1]), float(p[2])), float(e), float(m), float(w))
-        for p, e, m, w in zip(poses, found, misfit, share, strict=True)
-    ]
-    return [told[row] for row in kept], told[-1]
+    every = told(poses, found, misfit, kept)
+    return [every[row] for row in kept], every[-1]
 
 
 def _thinned(window: Window, n_pictures: int = 8, n_points: int = 4) -> Window:
@@ -183,17 +166,15 @@ def _log_likelihood(
 
 def _apart_from_each_other(poses: Array, value: Array, most: int) -> list[int]:
     """Return rows of the best poses (n, 3), none in the place of a better one."""
-    kept: list[int] = []
-    left = np.argsort(-value)[: 40 * most]
-    while left.size and len(kept) < most:
-        best = left[0]
-        kept.append(int(best))
-        d = poses[left, :2] - poses[best, :2]
+
+    def is_same(best: int, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
+        d = poses[rows, :2] - poses[best, :2]
         c, s = np.cos(poses[best, 2]), np.sin(poses[best, 2])
         across, along = np.abs(c * d[:, 1] - s * d[:, 0]), np.abs(c * d[:, 0] + s * d[:, 1])
-        turn = np.abs(wrapped(poses[left, 2] - poses[best, 2]))
-        left = left[~((across < LATERAL_M) & (along < ALONG_M) & (turn < TURN))]
-    return kept
+        turn = np.abs(wrapped(poses[rows, 2] - poses[best, 2]))
+        return np.asarray((across < LATERAL_M) & (along < ALONG_M) & (turn < TURN))
+
+    return apart_from_each_other(value, is_same, most)
 
 
 def _fitted(

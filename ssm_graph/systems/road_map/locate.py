@@ -12,13 +12,14 @@ import numpy as np
 from ssm_graph.base.errors import DataError, SolverError
 from ssm_graph.base.frozen import Array, FrozenArrays, shaped
 from ssm_graph.base.units import DEGREE
-from ssm_graph.filters.rules.particles import moments
+from ssm_graph.filters.rules.hypotheses import CARRIED, Hypothesis
+from ssm_graph.filters.rules.particles import Particles, moments
 from ssm_graph.systems.road_map.drive import Drive, curve_groups, dead_reckoned
 from ssm_graph.systems.road_map.hypotheses import (
     ALONG_M,
-    Hypothesis,
     apart,
     course_trials,
+    is_same_lane,
     search,
     slide,
 )
@@ -28,7 +29,6 @@ from ssm_graph.systems.road_map.locator import (
     YAW,
     Locator,
     LocatorSettings,
-    Particles,
     first_particles,
 )
 from ssm_graph.systems.road_map.maps.index import LineIndex
@@ -36,7 +36,6 @@ from ssm_graph.systems.road_map.maps.road_map import LineKind, RoadMap
 from ssm_graph.systems.road_map.refinement import Prior, Refined, RefinementSettings, refine
 from ssm_graph.systems.road_map.simulate import indices_of
 from ssm_graph.systems.road_map.verdict import (
-    CARRIED,
     Verdict,
     VerdictSettings,
     reason_of,
@@ -320,7 +319,7 @@ def locate(drive: Drive, road_map: RoadMap, **options: object) -> Located:
 
 def _lane_share(found: list[Hypothesis], pose: Array) -> float:
     """Return which share of the evidence is for the lane of a pose (3,)."""
-    return sum(h.share for h in found if h.is_same_lane(pose))
+    return sum(h.share for h in found if is_same_lane(h, pose))
 
 
 def square_of(drive: Drive) -> float:

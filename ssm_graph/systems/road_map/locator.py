@@ -10,7 +10,7 @@ import numpy as np
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.units import DEGREE, wrapped
-from ssm_graph.filters.rules.particles import effective_number, kld_number, normalised, systematic
+from ssm_graph.filters.rules.particles import Particles, drawn_anew
 from ssm_graph.systems.road_map.drive import Curves
 from ssm_graph.systems.road_map.maps.index import LineIndex
 from ssm_graph.systems.road_map.maps.road_map import LineKind, Mark
@@ -78,19 +78,6 @@ class LocatorSettings:
 
 
 @dataclass(slots=True)
-class Particles:
-    """Particles (n, 5) with the logarithms of their weights (n,)."""
-
-    states: Array
-    log_weight: Array
-
-    @property
-    def weight(self) -> Array:
-        """Weights (n,), sum 1."""
-        return normalised(self.log_weight)
-
-
-@dataclass(slots=True)
 class Locator:
     """The filter on its way: predict with the chassis, update with pictures."""
 
@@ -126,26 +113,19 @@ class Locator:
         found = log_likelihood(
             self.particles.states, curves, rows, self.indices, self.settings, self.n_pictures
         )
-        p = self.particles
-        self.particles = Particles(p.states, p.log_weight + new * found)
+        p, s = self.particles, self.settings
         self.n_pictures += 1
-        weight = self.particles.weight
-        if effective_number(weight) < 0.5 * len(weight):
-            self._draw(weight)
+        self.particles = drawn_anew(
+            Particles(p.states, p.log_weight + new * found),
+            cell=CELL,
+            roughening=s.roughening,
+            least=s.least,
+            rng=self.rng,
+        )
 
     def put(self, particles: Particles) -> None:
         """Go on with other particles."""
         self.particles = particles
-
-    def _draw(self, weight: Array) -> None:
-        s, p = self.settings, self.particles.states
-        cells = np.floor(p[:, :3] / CELL).astype(np.int64)
-        n_cells = len(np.unique(cells[weight > 0.01 * weight.max()], axis=0))
-        n = int(np.clip(kld_number(n_cells), s.least, len(p)))
-        rows = systematic(weight, n, self.rng)
-        drawn = p[rows]
-        drawn[:, :3] += self.rng.standard_normal((n, 3)) * s.roughening
-        self.particles = Particles(drawn, np.zeros(n))
 
 
 def log_likelihood(

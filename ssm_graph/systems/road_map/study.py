@@ -17,7 +17,7 @@ from ssm_graph.study.ledger import ERROR, Key, Row
 from ssm_graph.systems.road_map.av2_log import MAP, POSES, av2_poses
 from ssm_graph.systems.road_map.camera import CameraModel
 from ssm_graph.systems.road_map.drive import Drive, Poses
-from ssm_graph.systems.road_map.hypotheses import apart
+from ssm_graph.systems.road_map.hypotheses import apart, is_same_lane
 from ssm_graph.systems.road_map.locate import locate
 from ssm_graph.systems.road_map.maps.index import LineIndex
 from ssm_graph.systems.road_map.maps.read import read_map
@@ -131,7 +131,7 @@ def _annealed(
     if np.isfinite(found.first_fix_s):
         then = truth.at(np.array([found.first_fix_s + drive.chassis.time_s[0]]))[0]
         first = apart(then, found.first_fix)[0]
-    rival = [h.share for h in found.hypotheses if not h.is_same_lane(found.pose)]
+    rival = [h.share for h in found.hypotheses if not is_same_lane(h, found.pose)]
     return {
         "across_m": across,
         "along_m": along,

@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Final
 
 import numpy as np
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.systems.road_map.hypotheses import Hypothesis, apart
-
-CARRIED: Final = 0.05
-"""A rival with more of the evidence makes the answer ambiguous."""
+from ssm_graph.filters.rules.hypotheses import Hypothesis
+from ssm_graph.systems.road_map.hypotheses import apart, is_same_lane
 
 
 class Verdict(Enum):
@@ -66,7 +63,7 @@ def reason_of(
             f"the best place explains the curves with a loss of {best.misfit:.1f} each, expected "
             f"below {most_misfit:.1f}: another place, an old map, or curves in other axes"
         )
-    rival = next((h for h in hypotheses if not h.is_same_lane(pose)), None)
+    rival = next((h for h in hypotheses if not is_same_lane(h, pose)), None)
     told = ""
     if rival is not None:
         across, along, turn = apart(pose, np.array(rival.pose))

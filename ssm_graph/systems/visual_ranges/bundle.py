@@ -26,7 +26,7 @@ Mask = NDArray[np.bool_]
 
 
 class FurtherRows(NamedTuple):
-    """Whitened scalar rows, each of one pose and of the further variables."""
+    """Whitened scalar rows, each of one pose or two and of the further variables."""
 
     error: Array
     """(M,)"""
@@ -36,6 +36,10 @@ class FurtherRows(NamedTuple):
     """(M, 6)"""
     by_extra: Array
     """(M, E)"""
+    second: Indices | None = None
+    """(M,) other pose that each hangs on, -1 for none; None: no row has one"""
+    by_second: Array | None = None
+    """(M, 6)"""
 
 
 class FurtherTerms(Protocol):
@@ -234,21 +238,27 @@ class _Adjustment:
         self, further: FurtherTerms, state: _State, weight: Array, matrix: Array, slope: Array
     ) -> None:
         rows = further.rows(state.R_cw, state.t_cw, state.extra)
-        free, P, E = self.n_poses // 6, self.n_poses, self.n_extra
-        block = self.column[rows.pose]
-        on = block >= 0
-        weighted = rows.by_pose * weight[:, None]
-        own = np.zeros((free, 6, 6))
-        np.add.at(own, block[on], weighted[on, :, None] * rows.by_pose[on, None, :])
-        for k in np.unique(block[on]):
-            matrix[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] += own[k]
-        pull = np.zeros((free, 6))
-        np.add.at(pull, block[on], (weighted * rows.error[:, None])[on])
+        P, E = self.n_poses, self.n_extra
+        system = np.zeros((P // 6, 6, P // 6, 6))
+        across, pull = np.zeros((P // 6, 6, E)), np.zeros((P // 6, 6))
+        ends = [(self.column[rows.pose], rows.by_pose)]
+        if rows.second is not None and rows.by_second is not None:
+            column = np.where(rows.second >= 0, self.column[rows.second], -1)
+            ends.append((column, rows.by_second))
+        for block, by_pose in ends:
+            on = block >= 0
+            weighted = by_pose[on] * weight[on, None]
+            np.add.at(pull, block[on], weighted * rows.error[on, None])
+            np.add.at(across, block[on], weighted[:, :, None] * rows.by_extra[on, None, :])
+            for other, by_other in ends:
+                both = on & (other >= 0)
+                products = (by_pose[both] * weight[both, None])[:, :, None] * by_other[both, None]
+                # Indices apart by a slice: their axis comes first.
+                np.add.at(system, (block[both], slice(None), other[both]), products)
+        matrix[:P, :P] += system.reshape(P, P)
         slope[:P] += pull.reshape(-1)
         if not E:
             return
-        across = np.zeros((free, 6, E))
-        np.add.at(across, block[on], weighted[on, :, None] * rows.by_extra[on, None, :])
         flat = across.reshape(P, E)
         matrix[:P, P:] += flat
         matrix[P:, :P] += flat.T
@@ -303,14 +313,20 @@ class _Adjustment:
 
     def _variance_of(self, further: FurtherTerms, state: _State, covariance: Array) -> Array:
         rows = further.rows(state.R_cw, state.t_cw, state.extra)
-        block = self.column[rows.pose]
-        at = np.where(block >= 0, block, 0)[:, None] * 6 + np.arange(6)
-        by_pose = rows.by_pose * (block >= 0)[:, None]
-        extra = np.broadcast_to(self.n_poses + np.arange(self.n_extra), (len(block), self.n_extra))
-        columns = np.concatenate([at, extra], axis=1) if self.n_poses else extra
-        J = np.concatenate([by_pose, rows.by_extra], axis=1) if self.n_poses else rows.by_extra
-        parts = covariance[columns[:, :, None], columns[:, None, :]]
-        return np.asarray(np.einsum("ma,mab,mb->m", J, parts, J))
+        ends = [(rows.pose, rows.by_pose)]
+        if rows.second is not None and rows.by_second is not None:
+            ends.append((rows.second, rows.by_second))
+        columns, parts = [], []
+        if self.n_poses:
+            for pose, by_pose in ends:
+                block = np.where(pose >= 0, self.column[pose], -1)
+                columns.append(np.maximum(block, 0)[:, None] * 6 + np.arange(6))
+                parts.append(by_pose * (block >= 0)[:, None])
+        extra = self.n_poses + np.arange(self.n_extra)
+        columns.append(np.broadcast_to(extra, (len(rows.error), self.n_extra)))
+        column, J = np.concatenate(columns, axis=1), np.concatenate([*parts, rows.by_extra], axis=1)
+        shared = covariance[column[:, :, None], column[:, None, :]]
+        return np.asarray(np.einsum("ma,mab,mb->m", J, shared, J))
 
     def _answer(self, state: _State, error: Array) -> Adjusted:
         if self.effort.posterior_from is not None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.metric_step import metric_step_factor
 from ssm_graph.systems.visual_ranges.camera import Camera
 from ssm_graph.systems.visual_ranges.geometry import in_camera
 from ssm_graph.systems.visual_ranges.loops import Match, bit_distances, mutual, points_of
@@ -32,6 +34,17 @@ NEAR_PX: Final = 6.0
 ALIKE_BITS: Final = 50
 
 
+class Step(NamedTuple):
+    """Dead reckoning between two key frames; see :func:`factors.metric_step.metric_step_factor`."""
+
+    first: int
+    second: int
+    step: Array
+    """(3,) axes of the first, map units"""
+    sigma: float
+    weight: float
+
+
 class Closed(NamedTuple):
     """What closing did."""
 
@@ -41,12 +54,16 @@ class Closed(NamedTuple):
     """Points that were there twice."""
 
 
-def close_loop(world: VisualMap, match: Match, camera: Camera) -> Closed:
+def close_loop(
+    world: VisualMap, match: Match, camera: Camera, steps: Sequence[Step] = ()
+) -> Closed:
     """Spread the correction over all key frames since the match; points go with their key frame.
+
+    ``steps`` of dead reckoning hold the map's scale meanwhile.
 
     Poses and points of ``world`` are changed; a bundle adjustment over all should follow.
     """
-    change = _optimised(world, match)
+    change = _optimised(world, match, steps)
     R = np.stack([one.R for one in change])
     t = np.stack([one.t for one in change])
     scale = np.array([one.scale for one in change])
@@ -62,7 +79,7 @@ def close_loop(world: VisualMap, match: Match, camera: Camera) -> Closed:
     return Closed(change, _fused(world, match, camera))
 
 
-def _optimised(world: VisualMap, match: Match) -> list[Sim3]:
+def _optimised(world: VisualMap, match: Match, steps: Sequence[Step]) -> list[Sim3]:
     """Return by key frame the similarity from where it is to where the graph puts it."""
     n = world.n_frames
     poses = [world.pose(k).inverse() for k in range(n)]
@@ -78,6 +95,9 @@ def _optimised(world: VisualMap, match: Match) -> list[Sim3]:
             model = _model(TURN_SIGMA, sigma, SCALE_SIGMA, step)
             between = nodes[i].between(nodes[i + step])
             graph.add(gtsam.BetweenFactorSimilarity3(i, i + step, between, model))
+    for one in steps:
+        keys = (one.first, one.second)
+        graph.add(metric_step_factor(keys, sigma=one.sigma, step=one.step, weight=one.weight))
     q, m = match.key_frame, match.matched
     c = match.correction
     wanted = c.apply(poses[q].t_cw)

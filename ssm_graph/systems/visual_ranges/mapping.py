@@ -17,7 +17,7 @@ from ssm_graph.systems.visual_ranges.views import aligned_rows, change_of_view, 
 from ssm_graph.systems.visual_ranges.visual_map import DROPPED, VisualMap
 
 if TYPE_CHECKING:
-    from ssm_graph.systems.visual_ranges.ranging import Ranging
+    from ssm_graph.systems.visual_ranges.metric import Metric
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -260,7 +260,7 @@ class Mapper:
         return Window(frames, n_free, rows, np.flatnonzero(count >= 2))
 
     def problem(
-        self, window: Window, ranging: Ranging | None = None, *, is_free: bool = False
+        self, window: Window, metric: Metric | None = None, *, is_free: bool = False
     ) -> Problem:
         """Return the adjustment of a window, with its ranges; ``is_free``: with their unknowns."""
         world = self._world
@@ -281,14 +281,14 @@ class Mapper:
         return Problem(
             world.frames["R_cw"][window.frames], world.frames["t_cw"][window.frames], free,
             world.points["place"][window.points], views,
-            None if ranging is None else ranging.further(frame_at, is_free=is_free),
+            None if metric is None else metric.further(frame_at, is_free=is_free),
             world.rows["variance"][rows[order]],
         )  # fmt: skip
 
-    def adjust_local(self, k: int, ranging: Ranging | None = None) -> None:
+    def adjust_local(self, k: int, metric: Metric | None = None) -> None:
         """Adjust the key frames and points around key frame ``k`` and cull."""
         window = self.window(k)
-        problem = self.problem(window, ranging)
+        problem = self.problem(window, metric)
         steps = self._settings.local_steps
         hold = int((~problem.free).sum()) < 2
         found = adjust(problem, Effort(steps=steps, posterior_from=None, hold_scale=hold))

@@ -163,6 +163,17 @@ def summary_of(
             "clock_s": _plain(ranging.clock_s),
             "clock_sigma_s": _plain(ranging.clock_sigma_s),
         }
+        if ranging.vehicle is not None:
+            own = ranging.vehicle
+            found["vehicle"] = {
+                "down_map_axes": own.down.tolist(),
+                "down_sigma_rad": _plain(float(np.sqrt(np.trace(own.down_covariance)))),
+                "depth_of_origin_m": _plain(own.depth_m),
+                "m_per_map_unit": _plain(own.scale),
+                "relative_sigma": _plain(own.sigma_log_scale),
+                "range_unit_m": _plain(own.range_unit),
+                "range_unit_sigma": _plain(own.range_unit_sigma),
+            }
     if errors is not None:
         found["against_truth"] = {
             "n_frames": errors.n_frames,

@@ -106,6 +106,8 @@ class Problem(ReadOnlyArrays):
     kernel: RangeKernel
     spacing: tuple[tuple[int, int, float], ...] = ()
     """Pairs of anchors and the distance between them, m"""
+    scale_prior: tuple[float, float] = (0.0, LOG_SCALE)
+    """Mean and standard deviation of log s, from what else knows it"""
 
     @property
     def n_core(self) -> int:
@@ -121,8 +123,14 @@ class Problem(ReadOnlyArrays):
     def prior_information(self) -> Array:
         """Return its diagonal (P,)."""
         anchor = np.array([ANCHOR_M, ANCHOR_M, ANCHOR_M, BIAS_M])
-        sigma = np.concatenate([[LOG_SCALE, CLOCK_S], np.tile(anchor, self.n_anchors)])
+        sigma = np.concatenate([[self.scale_prior[1], CLOCK_S], np.tile(anchor, self.n_anchors)])
         return np.concatenate([sigma**-2, np.ones(self.n_unknowns - self.n_core)])
+
+    def off_prior(self, unknowns: Array) -> Array:
+        """Return unknowns (..., P) less their prior's mean."""
+        off = unknowns.copy()
+        off[..., 0] -= self.scale_prior[0]
+        return off
 
 
 def problem_of(
@@ -133,6 +141,7 @@ def problem_of(
     drift: float = DRIFT,
     bias_walk_m: float = BIAS_WALK_M,
     spacing: tuple[tuple[int, int, float], ...] = (),
+    scale_prior: tuple[float, float] | None = None,
 ) -> Problem:
     """Return the problem of ranges in order of time, with modes of drift and walk as asked for."""
     middle = places.camera.mean(axis=0) if len(places.camera) else np.zeros(3)
@@ -150,6 +159,7 @@ def problem_of(
         bias_walk_m * np.sqrt(lasts) * _modes(time / max(lasts, 1e-12)) if bias_walk_m else none,
         kernel,
         spacing,
+        scale_prior or (0.0, LOG_SCALE),
     )
 
 
@@ -211,7 +221,7 @@ def search(problem: Problem, starts: Array, *, held: Indices | None = None) -> F
     for _ in range(ROUNDS):
         normal, gradient = _normal(problem, at, error, J, variance=0.0)
         normal[:, np.arange(len(information)), np.arange(len(information))] += information
-        gradient += information * at
+        gradient += information * problem.off_prior(at)
         if held is not None:
             normal[:, held, :] = normal[:, :, held] = 0.0
             normal[:, held, held] = 1.0
@@ -239,7 +249,8 @@ def _cost(problem: Problem, at: Array, error: Array) -> Array:
     deviance = problem.kernel.deviance(error, problem.places.sigma_m).sum(axis=1)
     apart = _spacing(problem, at)[0]
     spaced = np.square(apart / SPACING_M).sum(axis=1)
-    return np.asarray(deviance + spaced + (problem.prior_information() * at**2).sum(axis=1))
+    off = problem.off_prior(at)
+    return np.asarray(deviance + spaced + (problem.prior_information() * off**2).sum(axis=1))
 
 
 def _spacing(problem: Problem, at: Array) -> tuple[Array, Array]:
@@ -295,6 +306,8 @@ class Solution(ReadOnlyArrays):
     """(M,)"""
     cost: float
     """Deviance of ranges and priors."""
+    drift_square: float = 1.0
+    """Mean square of the path's modes, what is open of them included: 1 as expected."""
 
     @property
     def sigma_log_scale(self) -> float:
@@ -324,17 +337,20 @@ def solution(
         normal, gradient = _normal(problem, at, error, J, variance=variance)
         covariance = np.linalg.inv(normal[0] + information)
         variance = ((J[0] @ covariance) * J[0]).sum(axis=1)[None]
-        step = -covariance @ (gradient[0] + information @ at[0])
+        step = -covariance @ (gradient[0] + information @ problem.off_prior(at[0]))
         moved = _kept_step(problem, at, step)
         at = at + moved
         if float(np.max(np.abs(moved) / np.sqrt(covariance.diagonal()))) < 1e-3:
             break
     error, J = residuals(problem, at)
     weight = problem.kernel.weight(error, variance, problem.places.sigma_m)
+    modes = slice(problem.n_core, problem.n_core + 3 * problem.drift.shape[1])
+    square = at[0, modes] ** 2 + covariance.diagonal()[modes]
     covariance = covariance * problem.kernel.inefficiency(error, problem.places.sigma_m)
     covariance = covariance * _repeated(problem, weight[0] * error[0])
     cost = float(_cost(problem, at, error)[0])
-    return _outwards(problem, at[0], covariance, (error[0], variance[0], weight[0]), cost)
+    found = _outwards(problem, at[0], covariance, (error[0], variance[0], weight[0]), cost)
+    return replace(found, drift_square=float(square.mean())) if square.size else found
 
 
 def _repeated(problem: Problem, pull: Array) -> float:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.systems.visual_ranges.range_fit import Places, Solution
 from ssm_graph.systems.visual_ranges.ranges import Indices
-from ssm_graph.systems.visual_ranges.weights import POLISH
+from ssm_graph.systems.visual_ranges.start import StartRules
+from ssm_graph.systems.visual_ranges.weights import NLOS_WEIGHT, POLISH
 
 
 def plain_errors(at: Places, found: Solution) -> tuple[Array, Array]:
@@ -19,6 +21,20 @@ def plain_errors(at: Places, found: Solution) -> tuple[Array, Array]:
     error = np.linalg.norm(line - found.anchors[at.anchor], axis=1) + found.biases[at.anchor]
     error = error - at.range_m
     return error, POLISH.weight(error, 0.0, at.sigma_m)
+
+
+def is_sharp(found: Solution, rules: StartRules, at: Places, i: int) -> bool:
+    """Return whether the place of anchor ``i`` is known as well as the rules ask for."""
+    sigma = float(np.sqrt(np.trace(found.anchor_covariance(i))))
+    median = float(np.median(at.range_m[at.anchor == i]))
+    return sigma <= max(rules.anchor_sigma_m, rules.anchor_sigma_share * median)
+
+
+def lost_since(time_s: Array, is_own: NDArray[np.bool_], weight: Array) -> float:
+    """Return the time from which an anchor's ranges fit no more: most of them, none before."""
+    own = np.flatnonzero(is_own & np.isfinite(weight))
+    over = (weight[own] < NLOS_WEIGHT) - 0.5
+    return float(time_s[own[int(np.argmax(np.cumsum(over[::-1])[::-1]))]])
 
 
 def of_anchors(places: Places, anchors: Indices) -> tuple[Places, Indices]:

@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from ssm_graph.base.frozen import Array, ShortRepr
+from ssm_graph.base.frozen import Array
 from ssm_graph.systems.visual_ranges.bundle_ranges import BundleRanges
 from ssm_graph.systems.visual_ranges.range_fit import (
     Places,
@@ -25,8 +25,10 @@ from ssm_graph.systems.visual_ranges.range_fit import (
     unknowns_of,
 )
 from ssm_graph.systems.visual_ranges.range_rows import (
+    is_sharp,
     known_spacing,
     largest_turn,
+    lost_since,
     of_anchors,
     plain_errors,
 )
@@ -39,9 +41,9 @@ from ssm_graph.systems.visual_ranges.start import (
     StartState,
     find_start,
     later_anchor,
-    widened,
 )
 from ssm_graph.systems.visual_ranges.weights import NLOS_WEIGHT, POLISH, robust_rms
+from ssm_graph.systems.visual_ranges.widening import widened
 
 __all__ = ["Anchor", "AnchorState", "Ranging", "RangingResult"]
 
@@ -67,7 +69,7 @@ class _Own(NamedTuple):
     """From then on its ranges fit no more, and are left out."""
 
 
-class Ranging(ShortRepr):
+class Ranging:
     """The ranges of a run."""
 
     def __init__(self, ranges: Ranges, lever_arm_m: Array, rules: StartRules | None = None) -> None:
@@ -88,6 +90,7 @@ class Ranging(ShortRepr):
         self.history: list[tuple[float, float, float]] = []
         self.started_s = float("nan")
         self.error, self.weight = np.full((2, len(ranges)), np.nan)
+        self.scale_prior: tuple[float, float] | None = None  # of log s, where something knows it
         self._tried = self._checked = 0
 
     @property
@@ -171,16 +174,20 @@ class Ranging(ShortRepr):
         )
 
     def adopt(self, extra: Array, covariance: Array, further: BundleRanges) -> None:
-        """Take over what an adjustment with free scale and anchors found, (E,) and (E, E)."""
+        """Take over what an adjustment with free scale and anchors found, (E,) and (E, E).
+
+        It trusts pixels; what a path may drift by is in the covariance from before alone.
+        """
         assert self.found is not None
         own = extra[2:].reshape(-1, 4)
+        wider = max(1.0, float(self.found.covariance[0, 0] / covariance[0, 0]))
         self.found = replace(
             self.found,
             scale=further.scale * float(np.exp(extra[0])),
             clock_s=further.clock_s + float(extra[1]),
             anchors=further.anchors + own[:, :3],
             biases=further.biases + own[:, 3],
-            covariance=covariance.copy(),
+            covariance=wider * covariance,
         )
 
     def result(self) -> RangingResult:
@@ -188,9 +195,8 @@ class Ranging(ShortRepr):
         found = self.found
         state = StartState.WAITING if self.start is None else self.start.state
         if found is not None and not self.is_refused:
-            states = [own.state for own in self.anchors]
-            is_sharp = all(s is not AnchorState.AMBIGUOUS for s in states)
-            state = StartState.READY if is_sharp else StartState.MIRROR
+            is_open = any(own.state is AnchorState.AMBIGUOUS for own in self.anchors)
+            state = StartState.MIRROR if is_open else StartState.READY
             if found.sigma_log_scale > self.rules.ready_sigma:
                 state = StartState.COARSE
         return RangingResult(
@@ -246,6 +252,7 @@ class Ranging(ShortRepr):
             self.rules,
             turned_rad=turned_rad,
             spacing=known_spacing(self.ranges.known_position, eligible),
+            scale_prior=self.scale_prior,
         )
         if not self.start.has_scale or self.start.solution is None:
             return []
@@ -287,6 +294,7 @@ class Ranging(ShortRepr):
             drift=self.rules.ledger_drift,
             bias_walk_m=self.rules.bias_walk_m,
             spacing=known_spacing(self.ranges.known_position, np.array(self.used)),
+            scale_prior=self.scale_prior,
         )
         before = self.found
         start = unknowns_of(problem, before.scale, before.anchors, before.biases, before.clock_s)
@@ -308,7 +316,10 @@ class Ranging(ShortRepr):
         """Search everywhere again, with all ranges of the anchors in use; take what is better."""
         assert self.found is not None
         names = tuple(self.anchors[j].name for j in self.used)
-        again = find_start(own, names, self.rules, turned_rad=np.inf, spacing=problem.spacing)
+        again = find_start(
+            own, names, self.rules, turned_rad=np.inf, spacing=problem.spacing,
+            scale_prior=self.scale_prior,
+        )  # fmt: skip
         was_refused, self.start = self.is_refused, again
         if self.is_refused != was_refused:
             what = "; ".join(again.reasons) if self.is_refused else "no contradiction any more"
@@ -334,26 +345,24 @@ class Ranging(ShortRepr):
 
     def _sharpened(self, at: Places, weight: Array, now: float) -> list[str]:
         """Judge the anchors anew: sharpness, and whether the last ranges fit."""
+        assert self.found is not None
         told = []
         for i, j in enumerate(self.used):
             own = self.anchors[j]
             recent = (at.anchor == i) & (at.time_s > now - RECENT_S)
-            is_sharp = not own.alternatives and self._is_sharp(i, at)
-            state = AnchorState.READY if is_sharp else AnchorState.AMBIGUOUS
+            sharp = not own.alternatives and is_sharp(self.found, self.rules, at, i)
+            state = AnchorState.READY if sharp else AnchorState.AMBIGUOUS
             lost_s = np.inf
             marked = weight[recent] < NLOS_WEIGHT
             if recent.sum() >= LEAST_RECENT and float(np.mean(marked)) > DOUBTFUL_SHARE:
-                state, lost_s = AnchorState.DOUBTFUL, min(own.lost_s, self._lost_since(j))
+                state, lost_s = (
+                    AnchorState.DOUBTFUL,
+                    min(own.lost_s, lost_since(self.ranges.time_s, self.anchor == j, self.weight)),
+                )
             if own.state is not state:
                 told.append(f"anchor {own.name}: {state.value}")
             self._set(j, state=state, lost_s=lost_s)
         return told
-
-    def _is_sharp(self, i: int, at: Places) -> bool:
-        assert self.found is not None
-        sigma = float(np.sqrt(np.trace(self.found.anchor_covariance(i))))
-        median = float(np.median(at.range_m[at.anchor == i]))
-        return sigma <= max(self.rules.anchor_sigma_m, self.rules.anchor_sigma_share * median)
 
     def _against_rivals(self, problem: Problem, i: int) -> None:
         """Try an anchor's other places, take the best, and keep those that are as good."""
@@ -396,12 +405,6 @@ class Ranging(ShortRepr):
                 continue
             told.append(self._take(j, *placed, since))
         return told
-
-    def _lost_since(self, j: int) -> float:
-        """Return the time from which an anchor's ranges fit no more: most of them, none before."""
-        own = np.flatnonzero((self.anchor == j) & np.isfinite(self.weight))
-        over = (self.weight[own] < NLOS_WEIGHT) - 0.5
-        return float(self.ranges.time_s[own[int(np.argmax(np.cumsum(over[::-1])[::-1]))]])
 
     def _placed(self, own: Places) -> tuple[Array, float, Array] | None:
         """Return place, bias and covariance (4, 4) of an anchor, if its ranges tell them."""

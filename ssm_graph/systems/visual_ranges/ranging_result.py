@@ -39,6 +39,24 @@ class Anchor(ReadOnlyArrays):
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
+class VehicleResult(ReadOnlyArrays):
+    """What the vehicle's own sensors tell of the map."""
+
+    down: Array
+    """(3,) unit vector, map axes"""
+    down_covariance: Array
+    """(2, 2) rad^2, across it"""
+    depth_m: float
+    """Of the map's origin; 0 without a depth sensor."""
+    scale: float
+    """Metres a map unit by them alone."""
+    sigma_log_scale: float
+    range_unit: float
+    """Unit of the ranges in metres: assumed over true sound speed; NaN without ranges."""
+    range_unit_sigma: float
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class RangingResult(ReadOnlyArrays):
     """Scale, anchors and what became of every range."""
 
@@ -63,6 +81,8 @@ class RangingResult(ReadOnlyArrays):
     advice: str
     started_s: float
     """Time at which the scale was ready; NaN before."""
+    vehicle: VehicleResult | None = None
+    """None where it told no scale."""
 
     @property
     def has_scale(self) -> bool:

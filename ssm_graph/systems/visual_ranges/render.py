@@ -7,7 +7,7 @@ and one division a pixel.
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +23,22 @@ NEAREST_M: Final = 0.05
 """Walls nearer than this are not drawn."""
 
 
-def render(world: World, lens: Camera, R_wc: Array, p_w: Array) -> Picture:
+class Water(NamedTuple):
+    """What lies between the camera and what it sees."""
+
+    attenuation_per_m: float
+    veil: float
+    """Grey of the water itself, which is all that is left far off."""
+    flakes: int
+    """Of marine snow in an image."""
+
+
+def render(
+    world: World, lens: Camera, R_wc: Array, p_w: Array, water: Water | None = None
+) -> Picture:
     """Return what a camera sees, grey (H, W) from 0 to 255, black where there is no wall.
+
+    In water what is far off fades into its veil; snow is not drawn here.
 
     Parameters
     ----------
@@ -40,7 +54,12 @@ def render(world: World, lens: Camera, R_wc: Array, p_w: Array) -> Picture:
         window = _window(wall, lens, R_wc, p_w)
         if window is not None:
             _draw(world, wall, lens, (R_wc, p_w), window, inverse_depth, grey)
-    return grey
+    if water is not None:
+        x = (np.arange(lens.width, dtype=np.float32) - lens.cx) / lens.fx
+        y = (np.arange(lens.height, dtype=np.float32) - lens.cy) / lens.fy
+        away = np.sqrt(1.0 + x[None] ** 2 + y[:, None] ** 2) / inverse_depth
+        grey = water.veil + (grey - water.veil) * np.exp(-water.attenuation_per_m * away)
+    return np.asarray(grey, dtype=np.float32)
 
 
 def _window(wall: Wall, lens: Camera, R_wc: Array, p_w: Array) -> Window | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,18 @@ class FrameState(IntEnum):
     TRACKED = 1
     LOST = 2
     """Without a pose."""
+
+
+class FrameNow(NamedTuple):
+    """The pose of an image as it was first given out."""
+
+    time_s: float
+    R_cw: Array
+    """(3, 3)"""
+    t_cw: Array
+    """(3,) map units"""
+    scale: float
+    """Metres a map unit as known then; NaN before"""
 
 
 @dataclass(frozen=True, repr=False)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssm_graph.base.frozen import Array, FrozenArrays, ShortRepr, shaped
+from ssm_graph.systems.visual_ranges.vehicle import Vehicle
 
 if TYPE_CHECKING:
     from ssm_graph.systems.visual_ranges.camera import Camera
@@ -49,6 +50,8 @@ class Sequence(ShortRepr):
     truth: PathTruth | None = None
     anchor_truth_m: Array | None = None
     """True places of the anchors in the world frame of ``truth`` (J, 3), m, NaN where unknown."""
+    vehicle: Vehicle = Vehicle()
+    """Depth and dead reckoning of what carries the camera."""
     notes: tuple[str, ...] = ()
     """What the reader found and did, one sentence each, with file and line where there is one."""
 

@@ -16,10 +16,13 @@ from numpy.typing import NDArray
 from ssm_graph.base.errors import ConfigError, nearest_hint
 from ssm_graph.base.frozen import Array, ShortRepr
 from ssm_graph.systems.visual_ranges.camera import Camera
-from ssm_graph.systems.visual_ranges.ranges import Ranges, screened_ranges
-from ssm_graph.systems.visual_ranges.render import Image, render
+from ssm_graph.systems.visual_ranges.ranges import at_the_anchor
+from ssm_graph.systems.visual_ranges.render import Image, Water, render
 from ssm_graph.systems.visual_ranges.sequence import PathTruth, Sequence
-from ssm_graph.systems.visual_ranges.world import RING_M, World, corridor, room
+from ssm_graph.systems.visual_ranges.simulated_ranges import RangeFaults, simulated_ranges
+from ssm_graph.systems.visual_ranges.simulated_vehicle import VehicleFaults, simulated_vehicle
+from ssm_graph.systems.visual_ranges.vehicle import Vehicle
+from ssm_graph.systems.visual_ranges.world import RING_M, Picture, World, bottom, corridor, room
 
 CAMERA: Final = Camera(640, 480, 460.0, 460.0, 319.5, 239.5)
 SMALL_CAMERA: Final = Camera(320, 240, 230.0, 230.0, 159.5, 119.5)
@@ -29,38 +32,10 @@ CORNER_M: Final = 1.0
 ANCHORS: Final = {
     "room": ((3.7, 1.6, 2.2), (-3.7, -2.0, 2.5), (-1.0, 2.8, 0.4)),
     "corridor": ((-2.0, 7.0, 2.3), (10.0, -7.0, 0.5), (-11.9, -3.0, 1.5)),
+    "bottom": ((9.0, -7.0, 1.8), (-10.0, 6.0, 1.6), (1.0, 8.5, 1.9)),
 }
 """Places in the world, m; as many as are asked for."""
-EXCESS_M: Final = 0.3
-EXCESS_MEAN_M: Final = 0.8
-"""A range that is not in line of sight is too long by the one, and an exponential of the other."""
-BURST_S: Final = 1.0
-
 Places = Callable[[Array], Array]
-
-
-@dataclass(frozen=True, slots=True)
-class RangeFaults:
-    """How ranges are measured, and what is wrong with them."""
-
-    rate_hz: float = 10.0
-    """Of each anchor; their times are spread and jitter by a fifth of the period."""
-    sigma_m: float = 0.08
-    bias_m: float = 0.05
-    """Of all anchors."""
-    bias_walk_m: float = 0.0
-    """Random walk of each anchor's bias, m after one second."""
-    nlos_share: float = 0.0
-    """Of ranges, in bursts of a second, too long by 0.3 m and an exponential of 0.8 m."""
-    occlusion: bool = True
-    """Whether walls in the way make ranges too long in the same manner."""
-    clock_s: float = 0.0
-    """The stamps of the ranges less the time of the measurement."""
-    lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Camera to antenna, camera axes."""
-    silent_s: tuple[float, float] = (0.0, 0.0)
-    """Without any range from, to."""
-    lost_share: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +56,7 @@ class Run:
     """What to simulate."""
 
     world: str = "room"
-    """``room`` or ``corridor``"""
+    """``room``, ``corridor`` or ``bottom``"""
     seed: int = 0
     duration_s: float = 60.0
     rate_hz: float = 20.0
@@ -92,6 +67,11 @@ class Run:
     """Fineness of the walls' pictures; a coarser one is made sooner."""
     ranges: RangeFaults = RangeFaults()
     images: ImageFaults = ImageFaults()
+    water: Water | None = None
+    vehicle: VehicleFaults | None = None
+    """What carries the camera; None: a hand."""
+    range_scale_share: float = 0.0
+    """Standard deviation of the sound speed, a share, as told to the estimator."""
 
     def __post_init__(self) -> None:
         if self.world not in ANCHORS:
@@ -120,14 +100,29 @@ class Simulated(ShortRepr):
 
 def simulate(run: Run) -> Simulated:
     """Return a run; its images are rendered when they are asked for."""
-    world = (room if run.world == "room" else corridor)(run.seed, texel_m=run.texel_m)
-    path = room_path(run.seed) if run.world == "room" else corridor_path(run.seed)
+    make_world, make_path = WORLDS[run.world]
+    world, path = make_world(run.seed, texel_m=run.texel_m), make_path(run.seed)
     rng = np.random.default_rng((run.seed, 3))
     time_s = np.arange(int(run.duration_s * run.rate_hz) + 1) / run.rate_hz
     time_s = time_s[(rng.uniform(size=len(time_s)) >= run.images.dropped_share)]
     anchors = np.array(ANCHORS[run.world][: run.n_anchors], dtype=float).reshape(-1, 3)
-    ranges, is_nlos, bias = _ranges(run, world, path, anchors)
+
+    def antenna(time: Array) -> Array:
+        return path.place(time) + axes(path, time) @ np.array(run.ranges.lever_arm_m)
+
+    ranges, is_nlos, bias = simulated_ranges(
+        run.ranges, antenna, anchors, (0.0, run.duration_s), run.seed, world.is_blocked
+    )
+    if run.ranges.sound_speed_m_per_s and len(ranges):
+        ranges, order = at_the_anchor(ranges, run.ranges.assumed_sound_speed_m_per_s)
+        is_nlos, bias = is_nlos[order], bias[order]
     R_wc, p_w = axes(path, time_s), path.place(time_s)
+    vehicle = Vehicle(range_scale_share=run.range_scale_share)
+    if run.vehicle is not None:
+        when = np.arange(int(run.duration_s * run.vehicle.rate_hz) + 2) / run.vehicle.rate_hz
+        vehicle = simulated_vehicle(
+            run.vehicle, when, axes(path, when), path.place(when), run.seed, run.range_scale_share
+        )
 
     def image(index: int) -> Image:
         return _image(run, world, float(time_s[index]), R_wc[index], p_w[index])
@@ -141,8 +136,26 @@ def simulate(run: Run) -> Simulated:
         lever_arm_m=run.ranges.lever_arm_m,
         truth=PathTruth(time_s, p_w, _quaternions(R_wc)),
         anchor_truth_m=anchors,
+        vehicle=vehicle,
     )
     return Simulated(sequence, is_nlos, bias)
+
+
+def under_water(
+    seed: int,
+    duration_s: float = 60.0,
+    *,
+    vehicle: VehicleFaults | None = VehicleFaults(),  # noqa: B008
+) -> Run:
+    """Return a vehicle over the bottom: murky water, snow, acoustic ranges once a second.
+
+    The sound speed is 1485 m/s, ranges are computed with 1500, known to 1 %.
+    """
+    ranges = RangeFaults(rate_hz=1.0, sigma_m=0.1, sound_speed_m_per_s=1485.0)
+    return Run(
+        "bottom", seed, duration_s, 10.0, texel_m=0.012, ranges=ranges,
+        water=Water(0.15, 60.0, 40), vehicle=vehicle, range_scale_share=0.01,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,6 +194,23 @@ def room_path(seed: int) -> Path:
     return Path(place, heading)
 
 
+def bottom_path(seed: int) -> Path:
+    """Return a survey 2 to 4 m above the bottom at up to 0.9 m/s, looking down ahead."""
+    rng = np.random.default_rng((seed, 17))
+    a, b, c, d, e = rng.uniform(0.0, 2.0 * np.pi, 5)
+
+    def place(t: Array) -> Array:
+        x = 7.0 * np.sin(2.0 * np.pi * t / 60.0 + a)
+        y = 4.5 * np.sin(2.0 * np.pi * t / 41.0 + b)
+        return np.stack([x, y, 3.0 + 0.6 * np.sin(2.0 * np.pi * t / 19.0 + c)], 1)
+
+    def heading(t: Array) -> Array:
+        yaw = d + 0.6 * np.sin(2.0 * np.pi * t / 37.0 + e)
+        return np.stack([yaw, -1.0 + 0.07 * np.sin(2.0 * np.pi * t / 7.0 + b)], 1)
+
+    return Path(place, heading)
+
+
 def corridor_path(seed: int) -> Path:
     """Return a walk round the ring at 1.3 m/s, swaying, looking ahead: 82 m in 63 s."""
     rng = np.random.default_rng((seed, 5))
@@ -202,6 +232,14 @@ def corridor_path(seed: int) -> Path:
         return np.stack([yaw, 0.05 * np.sin(2.0 * np.pi * t / 3.7)], 1)
 
     return Path(place, heading)
+
+
+WORLDS: Final = {
+    "room": (room, room_path),
+    "corridor": (corridor, corridor_path),
+    "bottom": (bottom, bottom_path),
+}
+"""World and path by name."""
 
 
 def _ring(along_m: Array) -> tuple[Array, Array]:
@@ -233,63 +271,29 @@ def _rounded(along_m: Array, behind_m: float, ahead_m: float) -> tuple[Array, Ar
     return np.mean(lines, axis=0), np.mean(yaws, axis=0)
 
 
-def _ranges(
-    run: Run, world: World, path: Path, anchors: Array
-) -> tuple[Ranges, NDArray[np.bool_], Array]:
-    """Return ranges, whether they are too long, and their biases."""
-    asked, rng = run.ranges, np.random.default_rng((run.seed, 6))
-    columns: list[tuple[Array, Array, NDArray[np.bool_], Array]] = []
-    for j, anchor in enumerate(anchors):
-        n, period = int(run.duration_s * asked.rate_hz), 1.0 / asked.rate_hz
-        time = (np.arange(n) + j / len(anchors) + rng.uniform(0.0, 0.2, n)) * period
-        antenna = path.place(time) + axes(path, time) @ np.array(asked.lever_arm_m)
-        distance = np.linalg.norm(antenna - anchor, axis=1)
-        nlos = _bursts(time, asked.nlos_share, rng)
-        if asked.occlusion:
-            nlos |= world.is_blocked(antenna, np.broadcast_to(anchor, antenna.shape))
-        bias = asked.bias_m + asked.bias_walk_m * np.sqrt(period) * np.cumsum(rng.normal(size=n))
-        noise = asked.sigma_m * rng.standard_normal(n)
-        excess = EXCESS_M + rng.exponential(EXCESS_MEAN_M, n)
-        measured = distance + bias + noise + np.where(nlos, excess, 0.0)
-        heard = (rng.uniform(size=n) >= asked.lost_share) & (measured > 0.0)
-        heard &= (time < asked.silent_s[0]) | (time >= asked.silent_s[1])
-        columns.append((time[heard], measured[heard], nlos[heard], bias[heard]))
-    names = [f"A{j}" for j, column in enumerate(columns) for _ in column[0]]
-    if not columns:
-        columns = [(np.zeros(0), np.zeros(0), np.zeros(0, dtype=bool), np.zeros(0))]
-    time, measured, nlos, bias = (np.concatenate(c) for c in zip(*columns, strict=True))
-    order = np.argsort(time, kind="stable")
-    ranges = screened_ranges(
-        time[order] + asked.clock_s,
-        [names[i] for i in order],
-        measured[order],
-        np.full(len(order), asked.sigma_m),
-        source=run.world,
-    )
-    return ranges, nlos[order], bias[order]
-
-
-def _bursts(time_s: Array, share: float, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Return which times fall into bursts of a second that cover a share of all seconds."""
-    if not len(time_s):
-        return np.zeros(0, dtype=bool)
-    second = (time_s / BURST_S).astype(int)
-    n = second.max() + 1
-    chosen = np.zeros(n, dtype=bool)
-    chosen[rng.permutation(n)[: round(share * n)]] = True
-    return np.asarray(chosen[second])
-
-
 def _image(run: Run, world: World, time_s: float, R_wc: Array, p_w: Array) -> Image:
     faults = run.images
     rng = np.random.default_rng((run.seed, 7, round(1e6 * time_s)))
-    grey = render(world, run.camera, R_wc, p_w)
+    grey = render(world, run.camera, R_wc, p_w, run.water)
+    if run.water is not None:
+        _snow(grey, run.water.flakes, rng)
     if faults.covered_s[0] <= time_s < faults.covered_s[1]:
         grey = np.zeros_like(grey)
     gain = 1.0 + faults.gain_drift * np.sin(2.0 * np.pi * time_s / 17.0)
     noise = rng.standard_normal(grey.shape, dtype=np.float32)
     shown: Image = np.clip(gain * grey + faults.noise * noise + 0.5, 0.0, 255.0).astype(np.uint8)
     return shown
+
+
+def _snow(grey: Picture, flakes: int, rng: np.random.Generator) -> None:
+    """Draw bright flakes that are elsewhere in every image: nothing that could be followed."""
+    rows, columns = grey.shape
+    for _ in range(flakes):
+        row, column, radius = rng.integers(rows), rng.integers(columns), int(rng.integers(1, 4))
+        around = np.s_[
+            max(row - radius, 0) : row + radius + 1, max(column - radius, 0) : column + radius + 1
+        ]
+        grey[around] = np.maximum(grey[around], rng.uniform(140.0, 230.0))
 
 
 def _quaternions(R: Array) -> Array:

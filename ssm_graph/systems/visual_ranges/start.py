@@ -27,10 +27,10 @@ from ssm_graph.systems.visual_ranges.range_fit import (
     problem_of,
     search,
     solution,
-    with_sigma,
 )
 from ssm_graph.systems.visual_ranges.ranges import Indices
-from ssm_graph.systems.visual_ranges.weights import NLOS_WEIGHT, RangeKernel, robust_rms
+from ssm_graph.systems.visual_ranges.weights import NLOS_WEIGHT, RangeKernel
+from ssm_graph.systems.visual_ranges.widening import widened
 
 DIRECTIONS: Final = 12
 SCALES: Final = 4
@@ -126,6 +126,7 @@ def find_start(
     *,
     turned_rad: float = 0.0,
     spacing: tuple[tuple[int, int, float], ...] = (),
+    scale_prior: tuple[float, float] | None = None,
 ) -> Start:
     """Return scale and anchors, as far as ranges tell.
 
@@ -135,6 +136,7 @@ def find_start(
     names : (J,) of the anchors.
     turned_rad : largest angle between two of the camera's axes so far.
     spacing : pairs of anchors and their distances, m, where known.
+    scale_prior : mean and standard deviation of log s, where something else knows it.
     """
     rules = StartRules() if rules is None else rules
     early = _too_early(places, names, rules, turned_rad)
@@ -148,6 +150,7 @@ def find_start(
         drift=rules.drift,
         bias_walk_m=rules.bias_walk_m,
         spacing=spacing,
+        scale_prior=scale_prior,
     )
     found = _ends(problem, _candidates(problem))
     stated_m = problem.places.sigma_m
@@ -320,15 +323,6 @@ def _ends(problem: Problem, starts: list[Array]) -> list[Array]:
     return list(fit.unknowns[kept])
 
 
-def widened(problem: Problem, best: Solution) -> Problem:
-    """Return the problem with sigmas that are not below what each anchor's residuals show."""
-    sigma = problem.places.sigma_m.copy()
-    for j in range(problem.n_anchors):
-        own = problem.places.anchor == j
-        sigma[own] = np.fmax(sigma[own], robust_rms(best.error[own]))
-    return with_sigma(problem, sigma)
-
-
 def _is_apart(best: Solution, rival: Solution) -> bool:
     """Return whether two minima differ by more than their sigmas."""
     if abs(np.log(rival.scale / best.scale)) > 3.0 * best.sigma_log_scale:
@@ -380,9 +374,10 @@ def _judged(
     )
     # An anchor that is not sharp though the path is in all directions: something else is wrong.
     is_explained = any(ready) or near or shape.motion in OPEN_SHAPES
+    leaves_scale = shape.motion.leaves_scale and problem.scale_prior[1] > rules.scale_sigma
     if against:
         state = StartState.REFUSED
-    elif not (scale_is_sharp and is_explained) or (n_anchors == 1 and shape.motion.leaves_scale):
+    elif not (scale_is_sharp and is_explained) or (leaves_scale and n_anchors == 1):
         state = StartState.AMBIGUOUS
     elif best.sigma_log_scale > rules.ready_sigma:
         state = StartState.COARSE

@@ -18,12 +18,12 @@ from ssm_graph.systems.visual_ranges.range_fit import Places, places_of
 from ssm_graph.systems.visual_ranges.range_terms import FramePoses, hang
 from ssm_graph.systems.visual_ranges.readers.starloc import StarLocRun
 from ssm_graph.systems.visual_ranges.simulate import (
-    RangeFaults,
     Run,
     corridor_path,
     room_path,
     simulate,
 )
+from ssm_graph.systems.visual_ranges.simulated_ranges import RangeFaults
 from ssm_graph.systems.visual_ranges.start import Start, find_start
 
 UNIT_M: Final = 2.5

@@ -1,10 +1,15 @@
-"""Whole runs over rendered worlds: how far path, scale and anchors are off, and which loops lie."""
+"""Whole runs: how far path, scale and anchors are off, and which loops lie.
+
+Over rendered worlds, and over real images with ranges that are simulated along their true path.
+"""
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -14,21 +19,25 @@ from ssm_graph.study.ledger import Key, Row
 from ssm_graph.systems.visual_ranges.accuracy import accuracy, true_places
 from ssm_graph.systems.visual_ranges.loop_settings import LoopSettings
 from ssm_graph.systems.visual_ranges.ranges import screened_ranges
+from ssm_graph.systems.visual_ranges.readers.source import read_sequence
 from ssm_graph.systems.visual_ranges.result import FrameState, VisualResult
 from ssm_graph.systems.visual_ranges.sequence import Sequence
 from ssm_graph.systems.visual_ranges.settings import VisualSettings
 from ssm_graph.systems.visual_ranges.simulate import (
     SMALL_CAMERA,
     ImageFaults,
-    RangeFaults,
     Run,
     simulate,
+    under_water,
 )
+from ssm_graph.systems.visual_ranges.simulated_ranges import RangeFaults, with_simulated_ranges
 from ssm_graph.systems.visual_ranges.system import run
 from ssm_graph.systems.visual_ranges.verdict import judged
 
 FIRST_FRESH: Final = 1000
 """Seeds below it are for choosing, from it on for reports."""
+SMALL_CORNERS: Final = 350
+"""Corners followed in a quarter of the pixels."""
 SAME_PLACE_M: Final = 1.0
 """Error of the distance between two cameras from which a loop is false; walls repeat by 12.8 m."""
 
@@ -43,7 +52,35 @@ class Case:
     has_loops: bool = True
 
 
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """Real images with simulated ranges, anchors placed by the seed."""
+
+    about: str
+    folder: str
+    """Below ``systems`` of the folder that ``SSM_GRAPH_DATA`` names."""
+    n_anchors: int
+    """0: no ranges"""
+    away_m: tuple[float, float]
+    """Least and largest distance of an anchor from the middle of the path, level."""
+    height_m: tuple[float, float]
+    """The same upwards; cameras are level at first, so up is -y."""
+
+
 NLOS: Final = RangeFaults(nlos_share=0.3)
+_KITCHEN: Final = ("kitchen", (1.5, 3.0), (0.5, 1.5))
+_KITTI: Final = ("kitti07", (30.0, 60.0), (4.0, 8.0))
+RECORDED: Final[Mapping[str, Recorded]] = {
+    f"{name}-{n}" if n else f"{name}-mono": Recorded(
+        f"{words}, {('no ranges', 'one anchor', '', 'three anchors')[n]}", place[0], n, *place[1:]
+    )
+    for name, words, place in (
+        ("kitchen", "7-Scenes kitchen", _KITCHEN),
+        ("kitti", "KITTI 07", _KITTI),
+    )
+    for n in (0, 1, 3)
+}
+"""By name."""
 CASES: Final[Mapping[str, Case]] = {
     "room": Case("room, one anchor", Run("room")),
     "room-mono": Case("room, no ranges", Run("room"), has_ranges=False),
@@ -55,6 +92,17 @@ CASES: Final[Mapping[str, Case]] = {
     "room-silent": Case(
         "room, one anchor, no ranges for 20 s", Run("room", ranges=RangeFaults(silent_s=(25, 45)))
     ),
+    "room-carried": Case(
+        "room, one anchor, carried elsewhere under a covered lens for 12 s",
+        Run("room", images=ImageFaults(covered_s=(30.0, 42.0))),
+    ),
+    "room-dropped": Case(
+        "room, one anchor, 30 % of the images dropped",
+        Run("room", images=ImageFaults(dropped_share=0.3)),
+    ),
+    "room-clock": Case(
+        "room, one anchor, ranges stamped 50 ms late", Run("room", ranges=RangeFaults(clock_s=0.05))
+    ),
     "corridor": Case("corridor, one anchor", Run("corridor", duration_s=63.0)),
     "corridor-mono": Case(
         "corridor, no ranges", Run("corridor", duration_s=63.0), has_ranges=False
@@ -65,6 +113,11 @@ CASES: Final[Mapping[str, Case]] = {
     "corridor-nlos": Case(
         "corridor, three anchors, 30 % NLOS",
         Run("corridor", duration_s=63.0, n_anchors=3, ranges=NLOS),
+    ),
+    "bottom": Case("under water, depth and dead reckoning", under_water(0)),
+    "bottom-bare": Case("under water, ranges alone", under_water(0, vehicle=None)),
+    "bottom-silent": Case(
+        "under water, depth and dead reckoning, no ranges", under_water(0), has_ranges=False
     ),
 }
 """By name; a name that ends in ``-small`` is the same in a quarter of the pixels."""
@@ -86,18 +139,44 @@ def case_of(name: str) -> Case:
 
 def trial(key: Key) -> Row:
     """Do one run; the key is the name of a case, a seed, and how long, s (0: as the case says)."""
-    case = case_of(str(key[0]))
-    duration_s = float(key[2]) or case.run.duration_s
-    sequence = simulate(replace(case.run, seed=int(key[1]), duration_s=duration_s)).sequence
-    if not case.has_ranges:
-        sequence = replace(sequence, ranges=screened_ranges([], [], []))
+    name, seed, duration_s = str(key[0]), int(key[1]), float(key[2])
+    if name in RECORDED:
+        sequence, has_loops = recorded(RECORDED[name], seed, duration_s), True
+    else:
+        case = case_of(name)
+        asked = replace(case.run, seed=seed, duration_s=duration_s or case.run.duration_s)
+        sequence, has_loops = simulate(asked).sequence, case.has_loops
+        if not case.has_ranges:
+            sequence = replace(sequence, ranges=screened_ranges([], [], []))
     images = [sequence.images(k) for k in range(len(sequence))]  # rendering is not timed
     sequence = replace(sequence, images=lambda k: images[k])
-    settings = VisualSettings(loops=LoopSettings(is_on=case.has_loops))
+    n_corners = SMALL_CORNERS if name.endswith("-small") else VisualSettings().n_corners
+    settings = VisualSettings(n_corners=n_corners, loops=LoopSettings(is_on=has_loops))
     begin = time.process_time()
     result = run(sequence, settings)
     cpu_s = time.process_time() - begin
     return {**_errors(sequence, result), **_loops(sequence, result), "cpu_s": cpu_s}
+
+
+def data_folder() -> Path:
+    """Return the folder of the systems' data, from ``SSM_GRAPH_DATA``."""
+    return Path(os.environ.get("SSM_GRAPH_DATA", "../shared/data")) / "systems"
+
+
+def recorded(case: Recorded, seed: int, duration_s: float = 0.0) -> Sequence:
+    """Return a recording with ranges to anchors that a seed places; 0 s: all of it."""
+    sequence = read_sequence(data_folder() / case.folder)
+    assert sequence.truth is not None
+    rng, path = np.random.default_rng((seed, 14)), sequence.truth.position_m
+    turn = rng.uniform(0.0, 2.0 * np.pi, case.n_anchors)
+    away, up = rng.uniform(*case.away_m, turn.shape), rng.uniform(*case.height_m, turn.shape)
+    middle = 0.5 * (path.min(axis=0) + path.max(axis=0))
+    anchors = middle + np.stack([away * np.cos(turn), -up, away * np.sin(turn)], axis=1)
+    sequence = with_simulated_ranges(sequence, anchors, seed)
+    if not duration_s:
+        return sequence
+    kept = sequence.time_s < sequence.time_s[0] + duration_s
+    return replace(sequence, time_s=sequence.time_s[kept])
 
 
 def _errors(sequence: Sequence, result: VisualResult) -> dict[str, Any]:
@@ -120,6 +199,7 @@ def _errors(sequence: Sequence, result: VisualResult) -> dict[str, Any]:
     if result.ranging is not None:
         row["started_s"] = float(result.ranging.started_s - result.time_s[0])
         row["scale_sigma"] = float(result.ranging.sigma_log_scale)
+        row["clock_s"] = float(result.ranging.clock_s)
     return row
 
 

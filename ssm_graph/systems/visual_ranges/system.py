@@ -13,16 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssm_graph.systems.visual_ranges.bundle import Effort, adjust
-from ssm_graph.systems.visual_ranges.bundle_ranges import BundleRanges
 from ssm_graph.systems.visual_ranges.features import Image, corners, flow
 from ssm_graph.systems.visual_ranges.geometry import Pose, refine_pose
 from ssm_graph.systems.visual_ranges.loop_closing import close_loop
 from ssm_graph.systems.visual_ranges.loops import LoopFinder, judge_of
 from ssm_graph.systems.visual_ranges.mapping import Mapper
+from ssm_graph.systems.visual_ranges.metric import Metric
 from ssm_graph.systems.visual_ranges.range_terms import FramePoses
-from ssm_graph.systems.visual_ranges.ranging import Ranging
 from ssm_graph.systems.visual_ranges.relocalise import relocalise
-from ssm_graph.systems.visual_ranges.result import FrameState, VisualResult
+from ssm_graph.systems.visual_ranges.result import FrameNow, FrameState, VisualResult
 from ssm_graph.systems.visual_ranges.settings import VisualSettings
 from ssm_graph.systems.visual_ranges.tracking import Followed, Tracker, Tracks
 from ssm_graph.systems.visual_ranges.two_view import NoStart, two_view
@@ -47,9 +46,13 @@ def run(
     settings: VisualSettings = VisualSettings(),  # noqa: B008
     *,
     progress: Callable[[int, int], None] = lambda done, total: None,  # noqa: ARG005
+    on_frame: Callable[[FrameNow], None] | None = None,
 ) -> VisualResult:
-    """Return the path and the map of a sequence."""
-    return _Run(sequence, settings).finish(progress)
+    """Return the path and the map of a sequence.
+
+    ``on_frame`` is called with every image that has a pose, as it is known then.
+    """
+    return _Run(sequence, settings).finish(progress, on_frame)
 
 
 class _Run:
@@ -72,15 +75,19 @@ class _Run:
         self.waiting: list[tuple[int, Array, Indices]] = []
         self.first: tuple[int, Image, Array] | None = None
         self.seen: dict[int, Tracks] = {}
-        ranges = sequence.ranges
-        self.ranging = None
-        if ranges is not None and len(ranges):
-            self.ranging = Ranging(ranges, np.array(sequence.lever_arm_m))
+        self.metric = None
+        if len(sequence.ranges) or sequence.vehicle.has_aids:
+            lever = np.array(sequence.lever_arm_m)
+            self.metric = Metric(sequence.ranges, lever, sequence.vehicle)
         self.loops = LoopFinder(self.camera, settings.loops)
         self.pool = None if settings.is_deterministic else ThreadPoolExecutor(1)
         self.job: tuple[Image, Tracks, Future[Tracks]] | None = None
 
-    def finish(self, progress: Callable[[int, int], None]) -> VisualResult:
+    def finish(
+        self,
+        progress: Callable[[int, int], None],
+        on_frame: Callable[[FrameNow], None] | None = None,
+    ) -> VisualResult:
         """Go through all images and return the answer."""
         n = len(self.sequence.time_s)
         for i in range(n):
@@ -90,6 +97,8 @@ class _Run:
                     self.try_start(i, image)
                 else:
                     self.follow(i, image)
+            if on_frame is not None and self.state[i] == FrameState.TRACKED:
+                on_frame(self.now(i))
             progress(i + 1, n)
         self.take_mapped(wait=True)
         if self.pool is not None:
@@ -100,6 +109,15 @@ class _Run:
                 self.follow_back()
                 self.refine_frames()
         return self.answer()
+
+    def now(self, i: int) -> FrameNow:
+        """Return the pose of the newest image as it is known now."""
+        k = int(self.reference[i])
+        with self.world.lock:
+            base, grown = self.world.pose(k), float(self.world.frames["grown"][k])
+        pose = Pose(self.relative_R[i], grown / self.unit[i] * self.relative_t[i]).after(base)
+        scale = self.metric.scale if self.metric is not None else float("nan")
+        return FrameNow(float(self.sequence.time_s[i]), pose.R_cw, pose.t_cw, scale)
 
     @contextmanager
     def timed(self, part: str) -> Iterator[None]:
@@ -195,7 +213,11 @@ class _Run:
         relative, unit = self.tracker.relative, self.tracker.unit
         self.keep(i, relative, unit, self.tracker.reference)
         self.n_tracked[i], self.seen[i] = found.n_points, found.tracks
-        if self.job is None and self.is_key_frame(i, found):
+        if self.is_key_frame(i, found):
+            if self.job is not None:
+                # Without it the map would thin out wherever images come faster than it is made.
+                self.take_mapped(wait=True)
+                found.pose, found.tracks = self.tracker.pose(), self.tracker.tracks
             self.make_key_frame(i, image, found)
 
     def find_again(self, i: int, image: Image) -> bool:
@@ -258,11 +280,11 @@ class _Run:
             with self.timed("insertion"):
                 made = self.mapper.insert(k, given)
             self.n_tracked[i] = int((self.world.tracks["point"][made.track] >= 0).sum())
-            if self.ranging is not None:
+            if self.metric is not None:
                 with self.timed("ranges"):
                     self.ask_ranges(i)
             with self.timed("local adjustment"):
-                self.mapper.adjust_local(k, self.ranging)
+                self.mapper.adjust_local(k, self.metric)
             if self.settings.loops.is_on:
                 with self.timed("loops"):
                     self.close_loop(k, i)
@@ -271,28 +293,32 @@ class _Run:
 
     def close_loop(self, k: int, i: int) -> None:
         """Look for a place seen before, and correct map, path and scale by it."""
-        match = self.loops.look(self.world, k, judge_of(self.ranging, self.world))
+        judge = None if self.metric is None else judge_of(self.metric.ranging, self.world)
+        match = self.loops.look(self.world, k, judge)
         if match is None:
             return
         with self.world.lock:
-            closed = close_loop(self.world, match, self.camera)
+            keys = self.world.frames
+            steps = [] if self.metric is None else self.metric.steps(keys["R_cw"], keys["t_cw"])
+            closed = close_loop(self.world, match, self.camera, steps)
         self.note(
             i,
             f"loop closed with {self.world.frames['time_s'][match.matched]:.1f} s: "
             f"{self.loops.records[-1].why}; {closed.n_fused} points joined",
         )
-        if self.ranging is not None and abs(np.log(match.correction.scale)) > _NEW_SCALE:
-            self.ranging.restart()
+        if self.metric is not None and abs(np.log(match.correction.scale)) > _NEW_SCALE:
+            self.metric.restart()
         self.adjust_all(i)
 
     def ask_ranges(self, i: int) -> None:
         """Hang the ranges up to image ``i`` on the key frames, and see what they tell."""
-        assert self.ranging is not None
+        assert self.metric is not None
         R, t = self.poses()
         frames = FramePoses(
             self.sequence.time_s[: i + 1], R[: i + 1], t[: i + 1], self.reference[: i + 1]
         )
-        told = self.ranging.update(frames, self.world.frames["R_cw"], self.world.frames["t_cw"])
+        keys = self.world.frames
+        told = self.metric.update(frames, keys["R_cw"], keys["t_cw"], keys["time_s"])
         for text in told:
             self.note(i, text)
 
@@ -315,14 +341,14 @@ class _Run:
         """Adjust everything together, ranges up to image ``last`` with all they depend on."""
         steps = self.settings.global_steps
         effort = Effort(steps=steps, posterior_from=steps - 3, hold_scale=True)
-        if self.ranging is not None:
+        if self.metric is not None:
             self.ask_ranges(int(np.flatnonzero(self.reference >= 0)[-1]) if last is None else last)
         window = self.mapper.whole()
-        problem = self.mapper.problem(window, self.ranging, is_free=True)
+        problem = self.mapper.problem(window, self.metric, is_free=True)
         found = adjust(problem, effort)
         self.mapper.take(window, found)
-        if self.ranging is not None and isinstance(problem.further, BundleRanges):
-            self.ranging.adopt(found.extra, found.extra_covariance, problem.further)
+        if self.metric is not None and problem.further is not None:
+            self.metric.adopt(found.extra, found.extra_covariance, problem.further)
 
     def follow_back(self) -> None:
         """Track what lies before the start, or before the camera was found again, backwards.
@@ -379,7 +405,7 @@ class _Run:
             name=self.sequence.name, camera=self.camera, time_s=self.sequence.time_s,
             state=self.state, R_cw=R, t_cw=t, key_frame=self.reference, n_tracked=self.n_tracked,
             map=self.world.snapshot(),
-            ranging=None if self.ranging is None else self.ranging.result(),
+            ranging=None if self.metric is None else self.metric.result(),
             loops=tuple(self.loops.records), events=tuple(self.events),
             timing_s={part: np.array(values) for part, values in self.timing.items()},
         )  # fmt: skip

@@ -57,7 +57,7 @@ def judged(result: VisualResult) -> Judged:
     """Return what a result is worth."""
     faults = [*_losses(result), *_calibration(result)]
     ranging: RangingResult | None = result.ranging
-    if ranging is None or not len(ranging.weight):
+    if ranging is None or not (len(ranging.weight) or ranging.has_scale):
         return Judged(
             Verdict.NO_SCALE,
             tuple(faults),

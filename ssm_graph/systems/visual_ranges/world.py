@@ -1,4 +1,4 @@
-"""Worlds of textured walls: a room with a pillar, and a ring of corridors whose walls repeat."""
+"""Worlds of textured walls: a room, a ring of corridors that repeat, a bottom under water."""
 
 from __future__ import annotations
 
@@ -21,6 +21,9 @@ LIFT_M: Final = ((-1.5, -1.5), (1.5, 1.5))
 """Two corners of the shaft in the block."""
 CORRIDOR_M: Final = (2.4, 2.6)
 """Width and height."""
+BOTTOM_M: Final = (26.0, 20.0)
+"""Sides of the bottom."""
+BOULDERS: Final = 14
 REPEAT_M: Final = 12.8
 """The walls of the corridor look the same again after it: a trap for whoever closes loops."""
 
@@ -183,3 +186,23 @@ def corridor(seed: int, *, texel_m: float = 0.006) -> World:
     shaft = _box(np.array([*LIFT_M[0], 0.0]), np.array([*LIFT_M[1], height]), inwards=False)
     hidden = [_wall(*face, 0) for face in shaft]
     return World((*walls,), (*pictures,), texel_m, (*hidden,))
+
+
+def bottom(seed: int, *, texel_m: float = 0.012) -> World:
+    """Return a flat bottom of 26 x 20 m, its middle at the origin, with boulders up to 1.2 m high.
+
+    Nothing but boulders stands in the way of sound.
+    """
+    rng = np.random.default_rng((seed, 15))
+    half = np.array([BOTTOM_M[0] / 2, BOTTOM_M[1] / 2, 0.0])
+    faces = [_box(-half, half + np.array([0.0, 0.0, 1.0]), inwards=True)[4]]
+    for _ in range(BOULDERS):
+        low = np.array([*(rng.uniform(-0.85, 0.85, 2) * half[:2]), 0.0])
+        size = np.array([*rng.uniform(0.5, 1.6, 2), rng.uniform(0.25, 1.2)])
+        faces += [
+            *_box(low, low + size, inwards=False)[:4],
+            _box(low, low + size, inwards=False)[5],
+        ]
+    walls = [_wall(*face, number) for number, face in enumerate(faces)]
+    pictures = [levels(picture(wall.size_m, texel_m, rng)) for wall in walls]
+    return World((*walls,), (*pictures,), texel_m, (*walls[1:],))

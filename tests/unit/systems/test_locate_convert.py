@@ -115,5 +115,5 @@ def test_a_segment_that_lacks_an_array_is_refused(segment: Path, tmp_path: Path)
     """By the name of its file."""
     (segment / "processed_log_IMU_gyro_t.npy").unlink()
     road_map = read_map(a_map(tmp_path / "map.geojson"))
-    with pytest.raises(DataError, match="processed_log_IMU_gyro_t.npy"):
+    with pytest.raises(DataError, match=r"processed_log_IMU_gyro_t\.npy"):
         drive_of_comma2k19(segment, road_map)

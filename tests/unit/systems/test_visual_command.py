@@ -13,9 +13,10 @@ from ssm_graph.cli.main import main
 from ssm_graph.systems.visual_ranges.accuracy import accuracy
 from ssm_graph.systems.visual_ranges.camera import Camera
 from ssm_graph.systems.visual_ranges.outputs import told_events, write_outputs
+from ssm_graph.systems.visual_ranges.path_file import PathAsItComes
 from ssm_graph.systems.visual_ranges.ranges import screened_ranges
 from ssm_graph.systems.visual_ranges.ranging import Anchor, AnchorState, RangingResult
-from ssm_graph.systems.visual_ranges.result import FrameState, MapSnapshot, VisualResult
+from ssm_graph.systems.visual_ranges.result import FrameNow, FrameState, MapSnapshot, VisualResult
 from ssm_graph.systems.visual_ranges.sequence import PathTruth, Sequence
 from ssm_graph.systems.visual_ranges.similarity3 import Sim3
 from ssm_graph.systems.visual_ranges.start import StartState
@@ -148,6 +149,27 @@ def test_files_of_an_answer(tmp_path: Path) -> None:
     assert summary["against_truth"]["anchor_error_m"] == [pytest.approx(0.3)]
 
 
+def test_the_path_is_in_its_file_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run that is killed leaves what it had; a full disc ends the file, not the run."""
+    turn = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    with PathAsItComes(tmp_path / "new") as path:
+        path.append(FrameNow(1.5, turn, np.array([1.0, 2.0, 3.0]), float("nan")))
+        row = np.loadtxt(path.path, delimiter=",", skiprows=1)  # while it is open
+        np.testing.assert_allclose(row[:4], [1.5, 2.0, -1.0, -3.0], atol=1e-8)
+        np.testing.assert_allclose(np.abs(row[4:8]), np.array([0, 0, 1, 1]) / np.sqrt(2), atol=1e-8)
+        assert np.isnan(row[8])
+
+        def full(*_: object) -> int:
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr("os.write", full)
+        for _ in range(2):
+            path.append(FrameNow(1.6, turn, np.zeros(3), 2.0))
+        assert path.failure == "No space left on device"
+        monkeypatch.undo()
+    assert len(path.path.read_text().splitlines()) == 2
+
+
 def test_events_that_repeat_are_told_once() -> None:
     """Numbers and times apart."""
     events = ("0.1 s: no start: 3 and 5", "0.2 s: no start: 4 and 4", "0.3 s: started")
@@ -195,6 +217,11 @@ def test_simulated_and_found(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     off = json.loads((tmp_path / "out" / "result.json").read_text())["against_truth"]
     assert off["metric_rms_m"] < 0.03
     assert abs(off["scale_error"]) < 0.02
+    rows = np.loadtxt(tmp_path / "out" / "as_it_came.csv", delimiter=",", skiprows=1)
+    final = np.loadtxt(tmp_path / "out" / "trajectory.tum")
+    assert len(rows) > 0.8 * len(final)
+    at = np.searchsorted(final[:, 0], rows[-1, 0] - 1e-6)
+    assert np.linalg.norm(rows[-1, 8] * rows[-1, 1:4] - final[at, 1:4]) < 0.1
     page = (tmp_path / "out" / "report.html").read_text()
     assert page.count("data:image/png;base64") == 4
     assert "in metres" in page

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.systems.visual_ranges.ranges import Ranges, screened_ranges
 from ssm_graph.systems.visual_ranges.render import render
+from ssm_graph.systems.visual_ranges.sequence import PathTruth, Sequence
 from ssm_graph.systems.visual_ranges.simulate import (
     SMALL_CAMERA,
     ImageFaults,
-    RangeFaults,
     Run,
     axes,
     room_path,
     simulate,
 )
+from ssm_graph.systems.visual_ranges.simulated_ranges import RangeFaults, with_simulated_ranges
 from ssm_graph.systems.visual_ranges.world import REPEAT_M, corridor, room
 
 TEXEL_M = 0.03
@@ -55,6 +59,31 @@ def test_the_corridor_looks_the_same_again() -> None:
     middle = np.s_[100:140, 140:180]
     assert np.abs(here[middle] - again[middle]).max() < 2.0
     assert np.abs(here[middle] - elsewhere[middle]).mean() > 10.0
+
+
+def test_ranges_along_a_recorded_path_are_distances_of_their_own_times() -> None:
+    """Between the poses of the truth as well, with the lever arm turned along."""
+    time = np.arange(0.0, 6.0, 0.1)
+    path = room_path(2)
+    R_wc, p_w = axes(path, time), path.place(time)
+    truth = PathTruth(time + 5.0, p_w, Rotation.from_matrix(R_wc).as_quat())
+    none = screened_ranges([], [], [])
+    made = Sequence(
+        "made", SMALL_CAMERA, time + 5.0, lambda _: np.zeros((240, 320), np.uint8), none
+    )
+    faults = RangeFaults(sigma_m=1e-9, bias_m=0.0, lever_arm_m=(0.3, 0.0, -0.2))
+    anchors = np.array([[3.0, 1.0, 2.0], [-2.0, 2.0, 0.5]])
+    found = with_simulated_ranges(replace(made, truth=truth), anchors, 1, faults)
+    assert found.lever_arm_m == faults.lever_arm_m
+    at = found.ranges.time_s
+    assert at.min() >= 5.0
+    assert at.max() < 11.1
+    antenna = path.place(at - 5.0) + axes(path, at - 5.0) @ np.array(faults.lever_arm_m)
+    inside = at < time[-1] + 5.0
+    distance = np.linalg.norm(antenna - anchors[found.ranges.anchor], axis=1)
+    assert np.abs(distance - found.ranges.range_m)[inside].max() < 2e-3
+    with pytest.raises(DataError, match="true path"):
+        with_simulated_ranges(made, anchors, 1)
 
 
 def test_walls_in_the_way_lengthen_ranges() -> None:

@@ -29,7 +29,8 @@ from ssm_graph.systems.visual_ranges.ranging import Ranging
 from ssm_graph.systems.visual_ranges.ranging_result import AnchorState
 from ssm_graph.systems.visual_ranges.readers.starloc import read_starloc
 from ssm_graph.systems.visual_ranges.similarity3 import IDENTITY
-from ssm_graph.systems.visual_ranges.simulate import RangeFaults, Run, simulate
+from ssm_graph.systems.visual_ranges.simulate import Run, simulate
+from ssm_graph.systems.visual_ranges.simulated_ranges import RangeFaults
 from ssm_graph.systems.visual_ranges.start_study import (
     UNIT_M,
     shape_trial,
@@ -218,6 +219,53 @@ def test_ranges_in_bursts_do_not_bend_the_scale() -> None:
     row = walk_trial(("room", 30, 1, 0.3, 0.002, 1001))
     assert row["state"] == "READY"
     assert abs(row["scale_percent"]) < 3.0 * row["sigma_percent"] < 9.0
+
+
+@pytest.mark.slow
+def test_a_clock_that_is_off_is_found() -> None:
+    """Stamps 50 ms late, 2.5 sigma of the prior, told to 5 ms by a walk of half a minute."""
+    faults = RangeFaults(occlusion=False, clock_s=0.05)
+    ranging, frames, _ = true_run(Run("room", 6, 60.0, n_anchors=3, texel_m=0.05, ranges=faults))
+    for end in (20.0, 40.0, 60.0):
+        until(ranging, frames, end)
+    result = ranging.result()
+    assert result.has_scale
+    assert abs(result.clock_s + 0.05) < 0.005
+    assert abs(result.scale / UNIT_M - 1.0) < 3.0 * result.sigma_log_scale
+
+
+@pytest.mark.slow
+def test_a_path_that_drifts_more_than_assumed_widens_the_scale() -> None:
+    """Ten times the drift: the ranges show it, and a scale that is 4 % off is not called ready."""
+    calm = walk_trial(("room", 30, 3, 0.0, 0.002, 2))
+    bent = walk_trial(("room", 30, 3, 0.0, 0.02, 2))
+    assert calm["state"] == "READY"
+    assert abs(calm["scale_percent"]) < 3.0 * calm["sigma_percent"]
+    assert abs(bent["scale_percent"]) < 3.0 * bent["sigma_percent"]
+    assert bent["state"] == "COARSE"
+    assert bent["sigma_percent"] > 1.5 * calm["sigma_percent"]
+
+
+def test_an_adjustment_is_not_sharper_than_the_path_allows() -> None:
+    """It trusts pixels; what the path may drift by is in the covariance from before."""
+    rng = np.random.default_rng(7)
+    zero, index, time = np.zeros((60, 3)), np.zeros(60, dtype=np.intp), np.linspace(0.0, 5.9, 60)
+    motion, place = rng.normal(size=(60, 3)), np.array([3.0, 1.0, 2.0])
+    far, sigma = np.linalg.norm(UNIT_M * motion - place, axis=1), np.full(60, 0.1)
+    ranges = Ranges(time, index, far, sigma, ("A",), np.full((1, 3), np.nan))
+    ranging = Ranging(ranges, np.zeros(3))
+    problem = problem_of(
+        Places(motion, zero, zero, zero, index, far, sigma, time), 1, RangeKernel(), drift=0.01
+    )
+    start = unknowns_of(problem, UNIT_M, place[None], np.zeros(1))
+    ranging.found, ranging.used = solution(problem, start), [0]
+    ranging.terms = RangeTerms(index, index, index, motion, zero, zero, zero, far, sigma)
+    before, further = ranging.found.covariance, ranging.further(np.zeros(1, int), is_free=True)
+    assert further is not None
+    ranging.adopt(np.zeros(further.n_extra), 1e-4 * before, further)
+    np.testing.assert_allclose(ranging.found.covariance, before, rtol=1e-9)
+    ranging.adopt(np.zeros(further.n_extra), 4.0 * before, further)
+    np.testing.assert_allclose(ranging.found.covariance, 4.0 * before, rtol=1e-9)
 
 
 @pytest.mark.slow

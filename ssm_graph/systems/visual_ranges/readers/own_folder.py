@@ -24,7 +24,7 @@ from ssm_graph.base.settings import (
 from ssm_graph.io.tables.append_file import write_through
 from ssm_graph.systems.visual_ranges.camera import Camera
 from ssm_graph.systems.visual_ranges.extras import opencv
-from ssm_graph.systems.visual_ranges.ranges import Ranges, screened_ranges
+from ssm_graph.systems.visual_ranges.ranges import Ranges, at_the_anchor, screened_ranges
 from ssm_graph.systems.visual_ranges.readers.calibration import make_camera, read_camera
 from ssm_graph.systems.visual_ranges.readers.images import (
     VideoFrames,
@@ -36,6 +36,12 @@ from ssm_graph.systems.visual_ranges.readers.options import ReadOptions, Vector
 from ssm_graph.systems.visual_ranges.readers.range_text import read_ranges
 from ssm_graph.systems.visual_ranges.readers.times import increasing
 from ssm_graph.systems.visual_ranges.readers.truth import number_rows, read_tum_path
+from ssm_graph.systems.visual_ranges.readers.vehicle_files import (
+    DEPTH_KEYS,
+    RECKONING_KEYS,
+    read_vehicle,
+    write_vehicle,
+)
 from ssm_graph.systems.visual_ranges.sequence import Sequence
 
 TOML_NAME: Final = "visual.toml"
@@ -69,6 +75,9 @@ RANGE_KEYS: Final[Mapping[str, Key]] = {
         shape=(3,), low=-10.0, high=10.0, required=False, hint="camera to antenna, metres"
     ),
     "anchors": _TEXT,
+    "travel": _TEXT,
+    "sound_speed_m_per_s": optional_key("", 1000.0, 2000.0, "1500 in the sea"),
+    "sound_speed_sigma_m_per_s": optional_key("", 0.01, 200.0, "15 is one per cent"),
 }
 TRUTH_KEYS: Final[Mapping[str, Key]] = {"path": FILE_KEY, "anchors": _TEXT}
 TOP_KEYS: Final[Mapping[str, Key]] = {"format": number_key("", FORMAT, FORMAT)}
@@ -77,7 +86,11 @@ SECTIONS: Final = {
     "images": IMAGE_KEYS,
     "ranges": RANGE_KEYS,
     "truth": TRUTH_KEYS,
+    "depth": DEPTH_KEYS,
+    "dead_reckoning": RECKONING_KEYS,
 }
+SOUND_SPEED: Final = 1500.0
+"""m/s, where the file does not say."""
 
 
 def read_own_folder(folder: Path, options: ReadOptions) -> Sequence:
@@ -95,6 +108,7 @@ def read_own_folder(folder: Path, options: ReadOptions) -> Sequence:
             f"calibration is for {camera.width} x {camera.height}; scale one of them"
         )
     ranges, lever = _ranges(folder, sections.get("ranges"), options, time_s)
+    ranges, share = _acoustic(ranges, sections.get("ranges"))
     truth, places = None, None
     if "truth" in sections:
         truth = read_tum_path(folder / sections["truth"].text("path"))
@@ -112,6 +126,7 @@ def read_own_folder(folder: Path, options: ReadOptions) -> Sequence:
         options.lever_arm_m or lever,
         truth,
         places,
+        read_vehicle(folder, sections, share),
         (*notes, *ranges.notes),
     )
 
@@ -214,6 +229,22 @@ def _ranges(
     return ranges, (float(lever[0]), float(lever[1]), float(lever[2]))
 
 
+def _acoustic(ranges: Ranges, settings: Settings | None) -> tuple[Ranges, float]:
+    """Return the ranges at the times of the sound at the anchor, and how well its speed is known.
+
+    The latter is a share; 0 for radio, for which nothing changes.
+    """
+    if settings is None:
+        return ranges, 0.0
+    speed = settings.number("sound_speed_m_per_s") or SOUND_SPEED
+    share = settings.number("sound_speed_sigma_m_per_s") / speed
+    if "travel" not in settings:
+        return ranges, share
+    if settings.text("travel") != "two-way":
+        raise settings.fault("travel", f"expected two-way, got {settings.text('travel')!r}")
+    return at_the_anchor(ranges, speed)[0], share
+
+
 def read_places(path: Path) -> dict[str, Array]:
     """Return the places (3,) of anchors by name from a table name, x, y, z in metres."""
     found: dict[str, Array] = {}
@@ -259,6 +290,9 @@ def write_own_folder(folder: Path, sequence: Sequence) -> Iterator[int]:
     ranges = sequence.ranges
     if len(ranges):
         sections["ranges"] = {"file": "ranges.csv", "lever_arm_m": list(sequence.lever_arm_m)}
+        share = sequence.vehicle.range_scale_share
+        if share:
+            sections["ranges"]["sound_speed_sigma_m_per_s"] = share * SOUND_SPEED
         columns = (ranges.time_s, ranges.anchor, ranges.range_m, ranges.sigma_m)
         rows = [
             f"{t:.9f},{ranges.names[j]},{r:.6f},{s:.6f}"
@@ -268,6 +302,7 @@ def write_own_folder(folder: Path, sequence: Sequence) -> Iterator[int]:
     if ranges.is_known.any():
         sections["ranges"]["anchors"] = "known_anchors.csv"
         _write_places(folder / "known_anchors.csv", ranges.names, ranges.known_position)
+    sections |= write_vehicle(folder, sequence.vehicle)
     if sequence.truth is not None:
         sections["truth"] = {"path": "truth.tum"}
         t = sequence.truth

@@ -1,0 +1,1 @@
+"""Maps of the seabed in the formats that surveys and data centres give."""
