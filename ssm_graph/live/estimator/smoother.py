@@ -15,7 +15,6 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.base.times import MIN_SPACING_S
 from ssm_graph.engine.states import States
 from ssm_graph.live.estimator.answers import Delayed, answer, delayed_of, found_by
-from ssm_graph.live.estimator.buffers import Buffers
 from ssm_graph.live.estimator.course import REACH_S, Course, Step
 from ssm_graph.live.estimator.guard import Guardian
 from ssm_graph.live.estimator.intake import Intake
@@ -220,7 +219,7 @@ class FixedLagSmoother:
         Delayed states that have not been taken are not in it: take them first.
         """
         intake, course = self._intake, self._course
-        arrays = pack_buffers(intake.buffers)
+        arrays = intake.buffers.pack()
         meta: dict[str, Any] = {
             "shift_s": intake.shift_s,
             "counts": dict(intake.counts),
@@ -257,7 +256,7 @@ class FixedLagSmoother:
         intake = smoother._intake
         intake.shift_s = float(meta["shift_s"])
         intake.counts.update(meta["counts"])
-        unpack_buffers(arrays, intake.buffers)
+        intake.buffers.unpack(arrays)
         smoother._latest_s = intake.buffers.imu.last_s
         smoother._begun_s = meta["begun_s"]
         smoother._known = list(meta.get("contradictions", ()))
@@ -378,18 +377,6 @@ class FixedLagSmoother:
             for settled in course.take_settled(all_of_them=all_of_them)
             if len(settled.stretch.time_s)
         ]
-
-
-def pack_buffers(buffers: Buffers) -> dict[str, Array]:
-    """Return all rows that were received and kept."""
-    return {f"rows_{section}": rows.all.copy() for section, rows in buffers.rows.items()}
-
-
-def unpack_buffers(arrays: Mapping[str, Array], buffers: Buffers) -> None:
-    """Fill empty buffers."""
-    for section, rows in buffers.rows.items():
-        for row in arrays[f"rows_{section}"]:
-            rows.add(row)
 
 
 def pack_step(step: Step) -> tuple[dict[str, Array], dict[str, Any]]:

@@ -171,7 +171,9 @@ class VelocityWalk:
             gain = gain + (self._g_n - self._coriolis @ block.velocity) * dt
             way.append(way[-1] + block.step(gain, float(dt)))
             tilt = self._tilt + self._drift(block)
-            force = 9.81 * tilt + self._accel
+            # A heading that turns away takes the velocity with it.
+            swing = self._gyro + self._gyro_share * float(np.linalg.norm(self._theta[n])) / dt
+            force = 9.81 * tilt + self._accel + swing * float(np.linalg.norm(block.velocity))
             self._gained, self._open_s = self._gained + gain, self._open_s + float(dt)
             self._pushed += force * float(dt)
             found = self._ping_at(n + 1, R, float(dt), tilt)
@@ -344,7 +346,8 @@ class VelocityWalk:
         g = float(np.linalg.norm(self._g_n))
         ends = self._own.of("DVL") * (worst_sigma(block.latest) + worst_sigma(block.earliest))
         white = self._accel_noise * math.sqrt(T)
-        changed = self._share * block.changed
+        speeds = float(np.linalg.norm(block.first) + np.linalg.norm(block.last))
+        changed = self._share * block.changed + drift * (speeds + block.changed)
         tilt = ((ends + 2.0 * self._steady + changed + white) / T + self._accel) / g
         tilt += drift
         if tilt >= self._tilt:

@@ -115,6 +115,8 @@ class Witness(ReadOnlyArrays):
     up_high: Array
     heading: Array
     """(M,) rad, clockwise from north, as the gyros led it on"""
+    noise_angle: Array
+    """(M,) rad: what the noise of the gyros has made of the heading at most, beside the sets"""
     alarms: tuple[BoundAlarm, ...]
     n_beams: int
     """Beam speeds that were used,"""
@@ -132,7 +134,7 @@ class Witness(ReadOnlyArrays):
         """(M, 4) of east, north, up [m] and heading [rad]."""
         half = 0.5 * (self.high - self.low)
         up = 0.5 * (self.up_high - self.up_low)
-        return np.column_stack([half[:, :2], up, half[:, 2]])
+        return np.column_stack([half[:, :2], up, half[:, 2] + self.noise_angle])
 
 
 def witness(mission: Mission, start: InitialState, bounds: WitnessBounds | None = None) -> Witness:
@@ -199,6 +201,7 @@ class PlaceWalk:
             up_low,
             up_high,
             track.heading.copy(),
+            track.noise_angle.copy(),
             tuple(sorted(self._alarms, key=lambda a: a.time_s)),
             track.n_beams,
             track.n_left_out,
