@@ -322,11 +322,12 @@ class VelocityWalk:
         k, T = self._own.of("DVL"), block.span_s
         since = end_s - self.begin_s
         angle = self._gyro_noise * math.sqrt(since)
-        turn = self._gyro * T + self._gyro_share * block.turned
+        tilt = self._tilt + self._drift(block)
+        # Levelling by up to twice the tilt turns about the vertical by a product of two tilts.
+        turn = self._gyro * T + self._gyro_share * block.turned + tilt**2
         scatter = k * worst_sigma(block.covariance)
         steady = self._steady * T + self._share * block.path + self._arm_m
         steady += self._late_s * block.changed + block.curved + block.bent + scatter + block.unseen
-        tilt = self._tilt + self._drift(block)
         level = steady + block.path * (0.5 * tilt**2 + angle + turn) + block.climbed * tilt
         up = steady + block.path * tilt
         bound = np.array([level, level, up])
