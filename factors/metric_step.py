@@ -102,7 +102,8 @@ def metric_step_factor(
     def evaluate(
         this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
     ) -> Array:
-        one, two = (values.atSimilarity3(key) for key in this)
+        first, second = this.keys()
+        one, two = values.atSimilarity3(first), values.atSimilarity3(second)
         R_1, R_2 = one.rotation().matrix(), two.rotation().matrix()
         way = R_1.T @ (two.scale() * two.translation() - one.scale() * one.translation())
         if jacobians is not None:

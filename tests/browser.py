@@ -77,7 +77,7 @@ class Browser:
     def busy_s(self) -> float:
         """Return how long it did, s of processor time."""
         metrics = self._call("Performance.getMetrics")["metrics"]
-        return next(of["value"] for of in metrics if of["name"] == "TaskDuration")
+        return float(next(of["value"] for of in metrics if of["name"] == "TaskDuration"))
 
     def resize(self, width: int, height: int) -> None:
         """Make the page so large, as on a phone."""

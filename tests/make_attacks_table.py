@@ -16,6 +16,7 @@ from ssm_graph.base.errors import SsmGraphError
 from ssm_graph.live.run.run_folder import CheckpointWriter
 from ssm_graph.study.store import StudyStore
 from tests.live_fixture import Crash, ListSource, some_messages
+from tests.unit.test_doors import DOORS, at_door
 from tests.unit.test_run_files import Meddled, altered, content, run
 from tests.unit.test_study_damage import HEADS, N_RUNS, ROWS, SERIES
 from tests.unit.test_study_store import SETTINGS, a_result
@@ -24,12 +25,14 @@ DOC = Path(__file__).parents[1] / "docs" / "attacks.md"
 INTRO = """\
 # Attacks on files
 
-What somebody or something does to files of a live run or of a study, what is said about it, and
-what it costs. Beside it: [malformed missions](malformed-input.md), [faults of instruments, sockets
-and processes](../benchmarks/results/faults.md), [damaged bytes](../benchmarks/results/fuzz.md).
+What somebody or something does with files at the doors of the command line, and to files of a live
+run or of a study, what is said about it, and what it costs. Beside it:
+[malformed missions](malformed-input.md),
+[faults of instruments, sockets and processes](../benchmarks/results/faults.md),
+[damaged bytes](../benchmarks/results/fuzz.md).
 
 This page is made by `python -m tests.make_attacks_table`; the same attacks are in
-`tests/unit/test_run_files.py`, `test_study_damage.py`, `test_cli_terminal.py` and
+`tests/unit/test_doors.py`, `test_run_files.py`, `test_study_damage.py`, `test_cli_terminal.py` and
 `test_output_place.py`.
 """
 Act = Callable[[Path], object]
@@ -174,6 +177,8 @@ def in_store(damage: Act, folder: Path) -> tuple[str, str]:
 
 def rows() -> Iterator[tuple[str, str, Callable[[Path], tuple[str, str]]]]:
     """Yield heading, attack, and what does it in a folder."""
+    for title, door in DOORS.items():
+        yield "At the doors", title, lambda f, a=door: at_door(a, f)  # type: ignore[misc]
     for title, act in AT_REST.items():
         yield "A live run at its restart", title, lambda f, a=act: at_rest(a, f)  # type: ignore[misc]
     for title, act in UNDER_WAY.items():

@@ -36,9 +36,9 @@ def message_of(case: Malformed, folder: Path) -> str:
     raise AssertionError(f"{case.title}: the mission was read without an error")
 
 
-def row_of(case: Malformed, folder: Path) -> str:
+def row_of(case: Malformed, message: str) -> str:
     """Return one row of the page."""
-    text = message_of(case, folder).replace("|", "\\|").replace("`", "'")
+    text = message.replace("|", "\\|").replace("`", "'")
     return f"| {case.title} | `{text}` |\n"
 
 
@@ -54,7 +54,7 @@ def make_page() -> str:
         page += f"\n## {heading}\n\n{HEAD}"
         for case in cases:
             with tempfile.TemporaryDirectory() as folder:
-                page += row_of(case, Path(folder))
+                page += row_of(case, message_of(case, Path(folder)))
     return page
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -81,12 +82,21 @@ file = "reference.csv"
 
 def write_example(folder: Path, *, suffix: str = ".csv") -> Path:
     """Write the mission as a user would: angles of the beams, few digits; return ``folder``."""
-    for name, columns in mission_tables(make_mission()).items():
-        digits = {"lat_deg": 9, "lon_deg": 9}
-        rounded = {key: np.round(v, digits.get(key, 6)) for key, v in columns.items()}
-        write_table(folder / f"{name}{suffix}", rounded)
-    (folder / "mission.toml").write_text(TOML.replace(".csv", suffix), encoding="utf-8")
+    for name, content in _example_files(suffix).items():
+        (folder / name).write_bytes(content)
     return folder
+
+
+@cache
+def _example_files(suffix: str) -> dict[str, bytes]:
+    with TemporaryDirectory() as made:
+        folder = Path(made)
+        for name, columns in mission_tables(make_mission()).items():
+            digits = {"lat_deg": 9, "lon_deg": 9}
+            rounded = {key: np.round(v, digits.get(key, 6)) for key, v in columns.items()}
+            write_table(folder / f"{name}{suffix}", rounded)
+        (folder / "mission.toml").write_text(TOML.replace(".csv", suffix), encoding="utf-8")
+        return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 @cache

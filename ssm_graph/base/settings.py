@@ -5,6 +5,7 @@ One declaration checks a section, builds a frozen value of it, and writes the se
 
 from __future__ import annotations
 
+import json
 import math
 import stat
 import tomllib
@@ -315,9 +316,17 @@ def read_toml(path: Path) -> dict[str, Any]:
     :class:`OSError` where it cannot be read.
     """
     try:
-        return tomllib.loads(read_settings_file(path).decode("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        return tomllib.loads(read_settings_file(path).decode("utf-8-sig"))
+    except (ValueError, RecursionError) as error:  # of TOML, Unicode, digits and brackets
         raise ConfigError(f"{path}: expected TOML in UTF-8; {error}") from error
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Return what JSON says; raise :class:`ValueError` for what is none, or nests too deep."""
+    try:
+        return json.loads(text)
+    except RecursionError as error:
+        raise ValueError(f"expected JSON, got brackets that nest too deep: {error}") from error
 
 
 def _plain(value: Any) -> Any:

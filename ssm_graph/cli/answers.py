@@ -14,6 +14,7 @@ from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.cli.options import number_option
 from ssm_graph.io.export.track import Track, parse_epoch, track_of
+from ssm_graph.io.file_kind import check_is_file
 from ssm_graph.io.results.tables import read_results
 from ssm_graph.mission.posterior import Posterior
 from ssm_graph.report.terminal.progress import ProgressDisplay
@@ -115,7 +116,7 @@ def _times(
     if not inside.any():
         raise DataError(
             f"{arguments.at}: expected times from {begin_s:.3f} to {end_s:.3f} s, got "
-            f"{time_s.min():.3f} to {time_s.max():.3f} s; is it another clock?"
+            f"{time_s.min():.13g} to {time_s.max():.13g} s; is it another clock?"
         )
     notes: tuple[str, ...] = ()
     if not inside.all():
@@ -136,6 +137,7 @@ def read_times(path: Path, epoch_s: float | None) -> Array:
 
     Raises :class:`DataError` naming the line.
     """
+    check_is_file(path)
     try:
         rows = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
     except (OSError, ValueError, csv.Error) as error:

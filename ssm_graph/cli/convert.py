@@ -24,7 +24,7 @@ from ssm_graph.io.ardupilot.convert import (
 from ssm_graph.io.blueye.convert import convert_blueye
 from ssm_graph.io.columns.convert import convert_columns
 from ssm_graph.io.columns.map_file import read_map
-from ssm_graph.io.file_kind import is_mcap, kind_of
+from ssm_graph.io.file_kind import check_is_file, is_mcap, kind_of
 from ssm_graph.io.mission_folder.folder import write_mission
 from ssm_graph.io.mission_folder.vehicle import instrument_notes, read_vehicle
 from ssm_graph.io.results.place import check_is_free
@@ -63,6 +63,12 @@ Of a ROS bag, topics are found by their type:
 imu and dvl have to be there; from usbl on they are read where --topic names them and the vehicle
 has the section. What messages do not say, noise, lever arms and mounting, comes from
 --vehicle, or is assumed; every assumption is printed as a note. More in docs/ros2.md.
+
+examples:
+  ssm-graph convert dive.bag --vehicle vehicle.toml --topic dvl=/dvl/data --out MISSION
+  ssm-graph convert 00000042.BIN --out MISSION
+  ssm-graph convert --map map.toml imu.csv dvl.csv gps.csv --out MISSION
+  ssm-graph convert imu.csv survey.PD0 --vehicle vehicle.toml --out MISSION
 """
 
 
@@ -144,6 +150,7 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     write = partial(_write, arguments=arguments, console=console, errors=errors)
     check_is_free(arguments.out, may_overwrite=arguments.overwrite)
     for log in arguments.log:
+        check_is_file(log)
         if log.exists() and arguments.out.resolve() == log.resolve():
             raise ConfigError(f"--out: expected another folder than that of LOG: {arguments.out}")
     if arguments.map is not None:

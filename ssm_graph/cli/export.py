@@ -12,6 +12,7 @@ from ssm_graph.base.errors import ConfigError
 from ssm_graph.cli.answers import add_answer_arguments, asked_track
 from ssm_graph.cli.terminal import say
 from ssm_graph.io.export.formats import FORMATS, export_track
+from ssm_graph.io.results.place import check_output_file
 from ssm_graph.io.results.tables import read_results
 
 DESCRIPTION = f"""\
@@ -23,6 +24,11 @@ Heights are above the WGS-84 ellipsoid, local metres along east, north and up of
 UTM metres in its zone. Body axes of tum, kitti, csv and mcap are forward, left,
 up (REP 103). Times from 2001 on are taken for Unix time; of other clocks say --epoch where a format
 needs UTC. In Python: ``sg.export_track(sg.track_of(sg.read_results("result")), "kml", path)``.
+
+examples:
+  ssm-graph export RESULT --format kml,geopackage,csv
+  ssm-graph export RESULT --format sbet --rate 100 --epoch 2026-05-01T10:00:00Z
+  ssm-graph export RESULT --format csv --at photos.csv --point camera
 """
 
 
@@ -84,6 +90,7 @@ def export(
         suffix = FORMATS[name].suffix if name in FORMATS else ""
         is_whole = is_file and len(names) == 1 and bool(out.suffix)
         path = out if is_whole else out / f"{stem}{asked.suffix}{suffix}"
+        check_output_file(path, *([arguments.at] if arguments.at else []))
         for written in export_track(asked.track, name, path):
             say(console, f"{written}: {written.stat().st_size:,} bytes")
     said = read_results(result).summary.get("local_start")

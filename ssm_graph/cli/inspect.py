@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from ssm_graph.base.times import UNIX_FROM_S, UNIX_UNTIL_S
 from ssm_graph.cli.terminal import say
+from ssm_graph.io.file_kind import check_is_file
 
 DESCRIPTION = """\
 Say what is at a path, by its content: format; of every sensor rows, rate, jitter, gaps, repeats and
@@ -20,6 +23,10 @@ what it reads (gravity, turn rate, beams with a speed, ranges); what is odd; clo
 that the data contradict; and whether it can be smoothed, or what is missing.
 
 PATH is a mission folder, a ROS bag, a maker's log, an instrument's own output, or a table.
+
+examples:
+  ssm-graph inspect dive.bag --figure dive.png
+  ssm-graph inspect logs --draft-map map.toml        # a folder of tables of any columns
 """
 
 
@@ -42,6 +49,7 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     """Look, tell, and draw."""
     from ssm_graph.inspection.look import inspect_path
 
+    check_is_file(arguments.path)
     found = inspect_path(arguments.path)
     if arguments.draft_map is not None:
         _draft(arguments.path, arguments.draft_map, errors)
@@ -78,15 +86,18 @@ def _tell(found: Any, console: Console) -> None:
     if found.sensors:
         table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
         table.add_column("sensor", style="bold")
-        for heading in ("rows", "from, s", "to, s", "rate, Hz", "jitter, ms", "gaps", "in gaps, s"):
+        begin_s = found.sensors[0].timing.begin_s
+        clock = "UTC" if UNIX_FROM_S <= begin_s <= UNIX_UNTIL_S else "s"
+        headings = ("rows", f"from, {clock}", f"to, {clock}", "rate, Hz", "jitter, ms", "gaps")
+        for heading in (*headings, "in gaps, s"):
             table.add_column(heading, justify="right")
         for one in found.sensors:
             timing = one.timing
             table.add_row(
                 one.name,
                 f"{timing.n}",
-                f"{timing.begin_s:.2f}",
-                f"{timing.end_s:.2f}",
+                _when(timing.begin_s),
+                _when(timing.end_s),
                 f"{timing.rate_hz:.4g}",
                 f"{1e3 * timing.jitter_s:.2f}",
                 f"{timing.n_gaps}",
@@ -104,3 +115,10 @@ def _tell(found: Any, console: Console) -> None:
         console.print(Text(f"suspect: {suspect}", style="bold red"), soft_wrap=True)
     style = "bold green" if found.can_be_smoothed and not found.suspects else "bold red"
     console.print(Text(f"verdict: {found.verdict}", style=style), soft_wrap=True)
+
+
+def _when(time_s: float) -> str:
+    """Return a time of the log, s; of a clock that is Unix time, UTC."""
+    if not UNIX_FROM_S <= time_s <= UNIX_UNTIL_S:
+        return f"{time_s:.2f}"
+    return f"{datetime.fromtimestamp(round(time_s), UTC):%H:%M:%S}"

@@ -69,6 +69,11 @@ addresses:
   serial:///dev/PORT?baud=BAUD  a serial port, 8 data bits, no parity; opened again if need be
 What listens, listens to this computer only (127.0.0.1) unless HOST names another interface.
 
+examples:
+  ssm-graph online VEHICLE.toml --out RUN --dvl tcp://192.168.194.95:16171 --imu udp://:9001 \\
+            --gnss udp://:10110 --publish udp://127.0.0.1:9100 --page 127.0.0.1:8080
+  ssm-graph online --replay MISSION --speed 10 --page 127.0.0.1:8080 --out RUN
+
 what is understood and written: docs/live-protocols.md; how to run it: docs/online.md
 """
 _INPUTS: Final = {

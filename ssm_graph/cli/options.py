@@ -60,9 +60,7 @@ def add_mission_output(parser: argparse.ArgumentParser) -> None:
     """Add where and in which format a mission folder is written."""
     table_format_option(parser)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="mission folder")
-    parser.add_argument(
-        "--overwrite", action="store_true", help="write also where files are, over those"
-    )
+    parser.add_argument("--overwrite", action="store_true", help="write over files that are there")
 
 
 def table_format_option(parser: argparse.ArgumentParser) -> None:

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from ssm_graph.base.errors import DataError, SsmGraphError
+from ssm_graph.base.errors import SsmGraphError
 from ssm_graph.cli.terminal import say
-from ssm_graph.io.results.place import PAGE_NAME
+from ssm_graph.io.export.track import check_rows
+from ssm_graph.io.results.place import PAGE_NAME, check_output_file
 from ssm_graph.io.results.tables import read_aids, read_protection
 from ssm_graph.report.terminal.progress import ProgressDisplay
 
@@ -23,9 +24,13 @@ if TYPE_CHECKING:
 
 DESCRIPTION = """\
 Write one page about a result: the verdict in words first, the track with its uncertainty, height,
-speed and attitude with linked axes of time to zoom in, weights and innovations of all beams and
-aids, their whiteness, calibration, faults, what was assumed, versions and settings. The file holds
-all it shows: it opens without a network, on a phone too, and prints. Needs the extra 'report'.
+altitude, speed and attitude with linked axes of time to zoom in, errors against a reference where
+there is one, weights and innovations of all beams and aids, their whiteness, calibration, faults,
+what was assumed, versions and settings. The file holds all it shows: it opens without a network, on
+a phone too, and prints. Needs the extra 'report'.
+
+example:
+  ssm-graph report RESULT --open
 """
 
 
@@ -59,8 +64,9 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
 
     result = Result(arguments.result, mission=arguments.mission, epoch=arguments.epoch)
     results = result.tables
-    if len(results.trajectory["time_s"]) == 0:
-        raise DataError(f"{arguments.result}: trajectory.csv has no row: there is nothing to show")
+    check_rows(results)
+    path: Path = arguments.out or arguments.result / PAGE_NAME
+    check_output_file(path)
     with ProgressDisplay(errors) as show:
         show.stage("reading the mission")
         altitude, of_errors, note = _of_mission(result)
@@ -75,7 +81,6 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
             altitude=altitude,
             errors=of_errors,
         )
-    path: Path = arguments.out or arguments.result / PAGE_NAME
     now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     version = (results.summary.get("versions") or {}).get("ssm_graph")
     write_page(content, path, footer=f"ssm-graph {version}; {arguments.result}; page of {now}")

@@ -47,13 +47,18 @@ CHOICES = {
 """Kernels by name; the last two come with schedules of their own."""
 
 
-DESCRIPTION: Final = (
-    "Smooth a recorded mission; writes trajectory.csv, beams.csv, summary.json and "
-    "figure.png. Where mission.toml gives prior sigmas of mounting, scale, lever arms, clocks "
-    "or depth offset, these are calibrated: calibration.toml has the lines to put in place. "
-    "Where pings are off the water (column water_track), its current is estimated. With a map of "
-    "the seabed, a start in doubt is looked for on it, and the map keeps the answer from drifting."
-)
+DESCRIPTION: Final = """\
+Smooth a recorded mission; writes trajectory.csv, beams.csv, summary.json and figure.png. Where
+mission.toml gives prior sigmas of mounting, scale, lever arms, clocks or depth offset, these are
+calibrated: calibration.toml has the lines to put in place. Where pings are off the water (column
+water_track), its current is estimated. With a map of the seabed, a start in doubt is looked for on
+it, and the map keeps the answer from drifting.
+
+examples:
+  ssm-graph smooth MISSION --out RESULT
+  ssm-graph smooth MISSION --out RESULT --gnss-until 70           # what fixes withheld say of it
+  ssm-graph smooth MISSION --out RESULT --rate 100 --point camera # answers at 100 Hz, elsewhere
+"""
 
 
 def declare(parser: argparse.ArgumentParser) -> None:

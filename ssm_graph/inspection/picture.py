@@ -22,6 +22,8 @@ def save_picture(found: Inspection, path: Path) -> Path:
 
     Raises :class:`DataError` where nothing has a time, or the file cannot be written.
     """
+    if path.suffix not in (".png", ".pdf", ".svg"):
+        raise DataError(f"{path}: expected a figure that ends in .png, .pdf or .svg")
     sensors = [one for one in found.sensors if one.timing.n > 1]
     if not sensors:
         raise DataError(f"{found.path}: no sensor with times was found: there is nothing to draw")

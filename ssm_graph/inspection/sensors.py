@@ -62,8 +62,8 @@ def _of_timing(timing: Timing) -> Iterator[str]:
         longest = max(length for _, length in timing.gaps)
         begin = next(begin for begin, length in timing.gaps if length == longest)
         yield (
-            f"{timing.n_gaps} gaps, {timing.in_gaps_s:.1f} s in all; the longest {longest:.2f} s "
-            f"from {begin:.1f} s on"
+            f"{timing.n_gaps} gap{'s' * (timing.n_gaps > 1)}, {timing.in_gaps_s:.1f} s in all; the "
+            f"longest {longest:.2f} s from {begin:.1f} s on"
         )
     if timing.n_repeats or timing.n_back:
         yield f"{timing.n_repeats} times stand twice, {timing.n_back} go back"

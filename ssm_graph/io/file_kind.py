@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
+from ssm_graph.base.errors import DataError
+
 CSV_ENDINGS: Final = (".csv", ".txt", ".tsv", ".dat")
 READ: Final = (
     "a ROS 2 bag (a folder, .mcap or .db3), a ROS 1 .bag, a Blueye X3 log, an ArduPilot log, "
@@ -29,6 +31,12 @@ _KINDS: Final = (
     (b"\x89HDF\r\n", "an HDF5 file: say what its columns are, with  --map"),
     (b"MATLAB", "a MAT file: say what its columns are, with  --map"),
 )
+
+
+def check_is_file(path: Path) -> None:
+    """Raise :class:`DataError` for what never ends: pipes, devices, sockets."""
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise DataError(f"{path}: expected a file or a folder, got a pipe or a device")
 
 
 def is_mcap(path: Path) -> bool:

@@ -19,7 +19,7 @@ import numpy as np
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
-from ssm_graph.base.settings import shown
+from ssm_graph.base.settings import parse_json, shown
 from ssm_graph.io.tables.append_file import sync_path, write_through
 from ssm_graph.io.tables.files import TableFormat, pyarrow_module
 from ssm_graph.study.cells import digest
@@ -244,7 +244,7 @@ def _samples_of(path: Path) -> dict[RunKey, Array]:
     """Return the errors over time (T, 3) of the runs of one file; raise where it is damaged."""
     found: dict[RunKey, Array] = {}
     with path.open("rb") as stream, np.load(stream) as file:
-        header = json.loads(str(file["header"]))
+        header = parse_json(str(file["header"]))
         for i, method in enumerate(header["methods"]):
             samples = file[f"m{i}"].astype(np.float64)
             if samples.ndim != 3 or samples.shape[2] != 3 or not samples.shape[1]:

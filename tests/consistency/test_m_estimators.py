@@ -17,7 +17,7 @@ from ssm_graph.simulation import Fault, Grade, OutlierKind, Outliers, SimulatedM
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
 from tests.helpers import simulated
 
-SEEDS = range(500, 503)
+SEEDS = range(500, 502)
 DURATION_S = 160.0
 CASES: dict[str, dict[str, Any]] = {
     "sparse": {"outliers": Outliers(OutlierKind.SPARSE, rate=0.1)},

@@ -140,9 +140,10 @@ def test_a_velocity_counts_along_the_axes_of_its_covariance(tmp_path: Path) -> N
 def test_ranges_tell_the_altitude() -> None:
     """Over a level bottom 12 m below, in any attitude, and of a beam alone; none of water."""
     mission = with_beams(directions(4))
-    log, n = mission.dvl, len(mission.dvl.time_s)
-    k = np.arange(n)
-    R_nb = rotation_zyx(0.1 * k, 0.2 * np.sin(k), 0.3 * np.cos(k))
+    log = mission.dvl
+    k = np.arange(len(log.time_s), dtype=np.float64)
+    pitch, roll = np.asarray(0.2 * np.sin(k)), np.asarray(0.3 * np.cos(k))
+    R_nb = rotation_zyx(0.1 * k, pitch, roll)
     beams_n = R_nb @ (log.mount.R_bd @ log.mount.beams_d.T)
     ranges = 12.0 / beams_n[:, 2]
     ranges[1, 1:] = np.nan

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.cli.main import main
+from ssm_graph.evaluation.errors import evaluate
 from ssm_graph.io.export.formats import FORMATS, export_track
 from ssm_graph.io.export.maps import GX, KML, degrees, lines
 from ssm_graph.io.export.sbet import gps_seconds_of_week
@@ -31,6 +32,8 @@ from ssm_graph.io.results.tables import (
     Results,
     format_table,
 )
+from ssm_graph.mission.estimate import Trajectory
+from ssm_graph.mission.mission import Reference
 
 EPOCH = "2026-05-01T10:00:00Z"
 EPOCH_S = 1777629600.0
@@ -62,7 +65,12 @@ def results(*, lon_deg: float = 7.0, begin_s: float = 0.0) -> Results:
 @pytest.fixture
 def result_folder(tmp_path: Path) -> Path:
     """Return that result as a folder."""
-    folder, of = tmp_path / "result", results()
+    return write_result(tmp_path / "result")
+
+
+def write_result(folder: Path) -> Path:
+    """Write that result; return its folder."""
+    of = results()
     folder.mkdir()
     filler = np.zeros(N)
     columns = {name: (of.trajectory.get(name, filler), "%.17g") for name in TRAJECTORY_COLUMNS}
@@ -100,6 +108,35 @@ def test_tum_and_kitti_hold_the_same_poses(tmp_path: Path) -> None:
     assert up[2] > 0.9
     # 2e-5 degrees of longitude at 60 degrees north.
     np.testing.assert_allclose(np.diff(tum[:, 1]), 1.1158, atol=2e-4)
+
+
+def test_ape_of_evo_is_our_error(tmp_path: Path) -> None:
+    """Of the exported track against an exported reference, as ``rescore`` has it."""
+    metrics = pytest.importorskip("evo.core.metrics")
+    files = pytest.importorskip("evo.tools.file_interface")
+    off, k = results(), np.arange(N)
+    off.trajectory["lat_deg"] += 2e-6 * np.sin(k)
+    off.trajectory["lon_deg"] += 3e-6 * np.cos(k)
+    off.trajectory["height_m"] += 0.3 * np.sin(2.0 * k)
+    truth, moved = track(), track_of(off, epoch_s=EPOCH_S, origin=track().frame)
+    paths = [tmp_path / "truth.tum", tmp_path / "moved.tum"]
+    for path, one in zip(paths, (truth, moved), strict=True):
+        export_track(one, "tum", path)
+    ape = metrics.APE(metrics.PoseRelation.translation_part)
+    ape.process_data(tuple(map(files.read_tum_trajectory_file, paths)))
+    theirs = ape.get_statistic(metrics.StatisticsType.rmse)
+    of_tracks = ("time_s", "lat", "lon", "height", "velocity_enu", "roll_pitch_heading")
+    zeros = np.zeros((N, 3))
+    columns = {name: getattr(moved, name) for name in of_tracks}
+    zeros = np.zeros((N, 3))
+    unknown = ("gyro_bias", "accel_bias", "velocity_sigma_enu", "attitude_sigma")
+    cov = np.tile(np.eye(3), (N, 1, 1))
+    columns |= {**dict.fromkeys(unknown, zeros), "position_cov_enu": cov, "n_beams": zeros[:, 0]}
+    reference = Reference(**{name: getattr(truth, name) for name in of_tracks})
+    found = evaluate(Trajectory(**columns), reference)
+    ours = math.hypot(found.rmse_horizontal_m, found.rmse_vertical_m)
+    assert theirs == pytest.approx(ours, rel=1e-4)
+    assert ours > 0.2
 
 
 def test_the_wide_table_loses_nothing(tmp_path: Path) -> None:
@@ -185,6 +222,25 @@ def test_geopackage_has_a_line_and_points(tmp_path: Path) -> None:
         point, sigma = base.execute("SELECT geom, sigma_up_m FROM keyframes").fetchall()[-1]
         assert struct.unpack_from("<ddd", point, 13) == tuple(degrees(track())[-1])
         assert sigma == track().position_sigma_enu[-1, 2]
+
+
+def test_gdal_and_a_cf_checker_take_the_files(tmp_path: Path) -> None:
+    """Layers, reference system and the numbers themselves, read by the libraries of others."""
+    gdal = pytest.importorskip("pyogrio")
+    for form in ("geopackage", "geojson", "kml", "gpx"):
+        layers = gdal.list_layers(written(tmp_path, form))
+        assert len(layers) >= 1
+    path = written(tmp_path, "geopackage")
+    info = gdal.read_info(path, layer="keyframes")
+    assert (info["features"], info["crs"]) == (N, "EPSG:4326")
+    west, _, east, _ = info["total_bounds"]
+    assert (west, east) == (degrees(track())[0, 0], degrees(track())[-1, 0])
+    runner = pytest.importorskip("compliance_checker.runner")
+    runner.CheckSuite.load_all_available_checkers()
+    words = {"criteria": "strict", "verbose": 0, "output_filename": str(tmp_path / "said.txt")}
+    netcdf = str(written(tmp_path, "netcdf"))
+    passed, broke = runner.ComplianceChecker.run_checker(netcdf, ["cf:1.11"], **words)
+    assert (passed, broke) == (True, False), (tmp_path / "said.txt").read_text()
 
 
 def test_sbet_goes_round(tmp_path: Path) -> None:

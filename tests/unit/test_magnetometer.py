@@ -96,7 +96,7 @@ def test_headings_lie_where_their_sigmas_say() -> None:
     """Over seeds, at the last epoch; of the first ten, nearer to the truth than without."""
     aided, sigmas, alone = [], [], []
     for seed in range(40):
-        sim = simulated(duration_s=200.0, grade=Grade.MEMS, aids=magnetometer(), seed=seed)
+        sim = simulated(duration_s=120.0, grade=Grade.MEMS, aids=magnetometer(), seed=seed)
         error, sigma = last_heading(sim, sim.mission)
         aided.append(error)
         sigmas.append(sigma)

@@ -123,7 +123,7 @@ def test_the_verdict_comes_first_and_in_words() -> None:
 def test_charts_show_the_tables() -> None:
     """Curves are the columns, in minutes since the first row, and break where north is passed."""
     rows, of = content().trajectory, np.arange(3.0 * N).reshape(N, 3)
-    errors = ErrorSeries(rows["time_s"], *[of] * 7, nees_position=of[:, 0])
+    errors = ErrorSeries(rows["time_s"], of, of, of, of, of, of, of, of[:, 0])
     further: dict[str, Any] = {"altitude": (rows["time_s"][5:], of[5:, 0]), "errors": errors}
     charts = {chart.name: chart for chart in charts_of(content(**further))}
     np.testing.assert_allclose(values(charts["altitude"].traces[0], "y"), of[5:, 0])

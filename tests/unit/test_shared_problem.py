@@ -21,8 +21,8 @@ from tests.helpers import simulated
 
 @cache
 def two_hypotheses() -> tuple[Problem, Problem]:
-    """Return 300 m to somewhere, and the same run with a start that heads elsewhere."""
-    sim = simulated(duration_s=30.0, imu_rate_hz=20.0, route=TransitRoute(speed=10.0))
+    """Return 600 m to somewhere, and the same run with a start that heads elsewhere."""
+    sim = simulated(duration_s=60.0, imu_rate_hz=20.0, route=TransitRoute(speed=10.0))
     problem = build_problem(sim.mission)
     other = replace(problem, start=replace(problem.start, heading=problem.start.heading + 1.0))
     assert other.chain is problem.chain

@@ -110,7 +110,7 @@ def _messages(log: Path) -> Iterator[tuple[str, float, Any]]:
         raise
     except Exception as error:  # of mcap, protobuf, lz4 or zstd: damage raises many kinds
         raise DataError(
-            f"{log}: not a complete MCAP file of a Blueye X3 ({type(error).__name__}: {error}); "
+            f"{log}: not a complete MCAP file ({type(error).__name__}: {error}); "
             "if the recording was cut off, try  mcap recover"
         ) from error
 

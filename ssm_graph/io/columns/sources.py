@@ -7,6 +7,7 @@ deeper in a file has a path, ``nav/imu/gyro``; of a matrix each column has a num
 
 from __future__ import annotations
 
+import codecs
 import csv
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -116,7 +117,9 @@ def read_source(path: Path) -> Source:
 
 def _csv(path: Path) -> Source:
     """Read a text whose header is its first line of several words that are no numbers."""
-    text = path.read_bytes().decode("utf-8-sig", errors="replace")
+    data = path.read_bytes()
+    is_wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))  # a shell of Windows
+    text = data.decode("utf-16" if is_wide else "utf-8-sig", errors="replace")
     if "\0" in text[:4096]:
         raise DataError(f"{path.name}: expected a text of columns, got bytes that are none")
     lines = text.splitlines()
@@ -126,8 +129,14 @@ def _csv(path: Path) -> Source:
     _check_names(path, at + 1, names)
     rows, numbers = [], []
     reader = csv.reader(lines[at + 1 :], delimiter=delimiter, skipinitialspace=True)
+    number = at + 1
     for row in reader:
-        number = at + 1 + reader.line_num
+        before, number = number, at + 1 + reader.line_num
+        if number > before + 1:
+            raise DataError(
+                f"{path.name}:{before + 1}: a quotation mark opens and the line does not end it; "
+                "correct or delete the line"
+            )
         if not any(row) or row[0].startswith(_MARKS):
             continue
         if len(row) != len(names):

@@ -19,6 +19,11 @@ _PREFIXES: Final = {None: "", "m": "1e-3 *", "u": "1e-6 *", "µ": "1e-6 *", "μ"
 _PREFIXES_OF_FIELD: Final = {**_PREFIXES, "n": "1e-9 *"}
 
 
+_LONGEST: Final = 200
+_POWERS: Final = re.compile(r"(\*\*|\^)\s*[^\s*/^)]*?(\d\d|\*\*|\^|\()")
+"""Powers of powers or of more than one digit, which take for ever to reckon."""
+
+
 def factor_to(unit: str, wanted: str, *, place: str) -> float:
     """Return what a number in ``unit`` is multiplied by to be one in ``wanted``.
 
@@ -37,6 +42,8 @@ def factor_to(unit: str, wanted: str, *, place: str) -> float:
         words = _OF_FIELD.sub(lambda m: f"({_PREFIXES_OF_FIELD[m[1]]} 1e-4 * tesla)", words)
     registry, pint = _registry()
     try:
+        if len(words) > _LONGEST or _POWERS.search(words):
+            raise ValueError("too long, or too high a power")
         quantity = registry.Quantity(1.0, "") * registry.parse_expression(words)
         factor = float(quantity.to(wanted.replace("^", "**")).magnitude)
         if not (math.isfinite(factor) and factor != 0.0):

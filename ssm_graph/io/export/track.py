@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Final
@@ -20,6 +21,10 @@ from ssm_graph.io.results.tables import Results
 
 FRD_FROM_FLU: Final = np.diag([1.0, -1.0, -1.0])
 _ENU: Final = ("east", "north", "up")
+
+
+_LATEST_S: Final = 253_370_764_800.0
+"""Unix time of the year 9999."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,7 +72,13 @@ class Track(FrozenArrays):
                 f"{self.time_s[0]:g} s, which is no Unix time; try --epoch 2026-05-01T10:00:00Z, "
                 "the UTC of time_s = 0"
             )
-        return self.time_s + self.epoch_s
+        unix_s = self.time_s + self.epoch_s
+        if not (unix_s[0] >= 0.0 and unix_s[-1] < _LATEST_S):
+            raise ConfigError(
+                f"--epoch: expected times within the years 1970 to 9998, got {unix_s[0]:.6g} to "
+                f"{unix_s[-1]:.6g} s after 1970"
+            )
+        return unix_s
 
     @property
     def frame(self) -> LocalFrame:
@@ -121,17 +132,9 @@ def track_of(
     Raises :class:`DataError` for a trajectory without a row or with a value that is not finite, and
     :class:`ConfigError` for an epoch beside times that are Unix time.
     """
-    rows, path = results.trajectory, results.folder / "trajectory.csv"
+    check_rows(results)
+    rows = results.trajectory
     time_s = rows["time_s"]
-    if len(time_s) == 0:
-        raise DataError(f"{path}: expected at least one row, found none")
-    for name, values in rows.items():
-        bad = np.flatnonzero(~np.isfinite(values))
-        if len(bad) and not name.startswith(("sigma_", "current_", "gyro_", "accel_")):
-            raise DataError(
-                f"{path}:{bad[0] + 2}: {name} is not finite; the run ended as "
-                f"{results.summary.get('status')}: smooth the mission again"
-            )
     angles = np.radians(np.column_stack([rows[f"{n}_deg"] for n in ("roll", "pitch", "heading")]))
     sigmas = [rows[f"sigma_{name}_deg"] for name in ("roll", "pitch", "heading")]
     summary = results.summary
@@ -152,6 +155,20 @@ def track_of(
         covariance=covariance,
         origin=origin,
     )
+
+
+def check_rows(results: Results) -> None:
+    """Raise :class:`DataError` for a trajectory without a row or with a state that is no number."""
+    path = results.folder / "trajectory.csv"
+    if len(results.trajectory["time_s"]) == 0:
+        raise DataError(f"{path}: expected at least one row, found none")
+    for name, values in results.trajectory.items():
+        bad = np.flatnonzero(~np.isfinite(values))
+        if len(bad) and not name.startswith(("sigma_", "current_", "gyro_", "accel_")):
+            raise DataError(
+                f"{path}:{bad[0] + 2}: {name} is not finite; the run ended as "
+                f"{results.summary.get('status')}: smooth the mission again"
+            )
 
 
 def epoch_of(results: Results, stated_s: float | None) -> float | None:
@@ -175,10 +192,13 @@ def parse_epoch(text: str, where: str = "--epoch") -> float:
 
     Raises :class:`ConfigError`.
     """
-    try:
-        return float(text)
-    except ValueError:
-        pass
+    with contextlib.suppress(ValueError):
+        epoch_s = float(text)
+        if not 0.0 <= epoch_s < _LATEST_S:
+            raise ConfigError(
+                f"{where}: expected Unix seconds of the years 1970 to 9998, got {epoch_s:g}"
+            )
+        return epoch_s
     try:
         when = datetime.fromisoformat(text)
     except ValueError:

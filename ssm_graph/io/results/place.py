@@ -13,12 +13,15 @@ from ssm_graph.io.mission_folder.toml import TOML_NAME
 
 RUN_NAME: Final = "run.json"
 """Makes a folder that of a live run."""
+SUMMARY_NAME: Final = "summary.json"
 FIGURE_NAME: Final = "figure.png"
 PAGE_NAME: Final = "report.html"
 """Of ``ssm-graph report``; new results make an old one untrue, and it goes."""
 FIGURES: Final = {kind: f"figure.{kind}" for kind in ("png", "pdf", "svg")}
 DRAWN: Final = (*FIGURES.values(), PAGE_NAME)
 """What earlier results may have left, which new ones make untrue."""
+_OF_SETS: Final = (".csv", ".parquet", ".toml", ".json", ".jsonl", ".npz")
+"""Of tables and settings that belong together."""
 LEAST_FREE: Final = 2**20
 """Bytes below which a disk is full."""
 _PROBE: Final = ".trajectory.csv.part-4194304"
@@ -35,6 +38,26 @@ def check_is_for_results(folder: Path) -> None:
             raise ConfigError(
                 f"{str(folder)!r}: expected a folder for results, got that of {what} ({name}); "
                 "give another folder, or one within it"
+            )
+
+
+def check_output_file(path: Path, *sources: Path) -> None:
+    """Refuse a file for output over one that was read, or over one of a mission, run or result.
+
+    Raises :class:`ConfigError`.
+    """
+    if not path.exists():
+        return
+    for source in sources:
+        if source.exists() and path.samefile(source):
+            raise ConfigError(f"--out: {path} is what is read; give another name")
+    folder = path.resolve().parent
+    sets = ((TOML_NAME, "a mission"), (RUN_NAME, "a live run"), (SUMMARY_NAME, "a result"))
+    for name, what in sets:
+        if path.suffix in _OF_SETS and (folder / name).exists():
+            raise ConfigError(
+                f"--out: {path} is there already, a file of {what} ({name} is beside it); give "
+                "another name"
             )
 
 

@@ -50,7 +50,8 @@ def read_states(folder: Path) -> Posterior:
     if not path.is_file():
         raise DataError(
             f"{path}: there is none: answers between keyframes and at other points need the result "
-            "of ssm-graph smooth, of this version or later; smooth the mission again"
+            "of ssm-graph smooth, of this version or later; smooth the mission again; "
+            "of a filter's take its own times and place, without --at, --rate, --point, --covariance"
         )
     try:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as stored:

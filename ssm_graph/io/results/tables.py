@@ -21,9 +21,10 @@ import numpy as np
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frames import BodyAxes
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.settings import parse_json
 from ssm_graph.base.units import DEG_PER_H, MICRO_G
 from ssm_graph.io.mission_folder.folder import CALIBRATION_NAME, calibration_toml
-from ssm_graph.io.results.place import DRAWN, FIGURE_NAME, check_is_for_results
+from ssm_graph.io.results.place import DRAWN, FIGURE_NAME, SUMMARY_NAME, check_is_for_results
 from ssm_graph.io.results.states import STATES_NAME, states_bytes
 from ssm_graph.io.results.summary import MetricsLike, build_summary
 from ssm_graph.io.tables import csv_tables
@@ -42,7 +43,15 @@ TRAJECTORY_NAME: Final = "trajectory.csv"
 BEAMS_NAME: Final = "beams.csv"
 PROTECTION_NAME: Final = "protection.csv"
 AIDS_NAME: Final = "aids.csv"
-SUMMARY_NAME: Final = "summary.json"
+_KINDS: Final[Mapping[str, type]] = {
+    **dict.fromkeys(("final", "start", "calibration", "noise", "aids", "current"), dict),
+    **dict.fromkeys(("inside_3_sigma", "settings", "versions", "inputs"), dict),
+    **dict.fromkeys(("faults", "history", "notes", "mission_notes"), list),
+    **dict.fromkeys(("duration_s", "total_path_length_m", "rmse_horizontal_m"), float),
+    **dict.fromkeys(("n_beams", "n_outliers"), int),
+}
+"""Of what a summary says, where it says it."""
+_CALLED: Final = {dict: "an object", list: "a list", float: "a number", int: "a whole number"}
 Columns = dict[str, tuple[Array, str]]
 """Values of every column and the format of a cell."""
 
@@ -170,11 +179,19 @@ def read_results(folder: Path | str) -> Results:
             "was the run interrupted? Run it again"
         )
     try:
-        summary = json.loads((folder / SUMMARY_NAME).read_text(encoding="utf-8"))
+        summary = parse_json((folder / SUMMARY_NAME).read_text(encoding="utf-8"))
     except (ValueError, OSError) as error:
         raise DataError(f"{folder / SUMMARY_NAME}: expected valid JSON: {error}") from error
     if not isinstance(summary, dict):
         raise DataError(f"{folder / SUMMARY_NAME}: expected a JSON object at the top")
+    for name, kind in _KINDS.items():
+        value = summary.get(name)
+        is_whole = kind is float and isinstance(value, int)
+        if value is not None and not isinstance(value, kind) and not is_whole:
+            raise DataError(
+                f"{folder / SUMMARY_NAME}: key {name!r}: expected {_CALLED[kind]}, got "
+                f"{str(value)[:40]!r}; was it edited?"
+            )
     return Results(
         folder=folder,
         trajectory=_read_table(folder / TRAJECTORY_NAME, TRAJECTORY_COLUMNS),

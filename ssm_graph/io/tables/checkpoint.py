@@ -21,6 +21,7 @@ import numpy as np
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.settings import parse_json
 from ssm_graph.io.tables.append_file import sync_path, write_through
 
 JSON = None | bool | int | float | str | list["JSON"] | dict[str, "JSON"]
@@ -83,7 +84,7 @@ def read_checkpoint(path: Path) -> tuple[dict[str, Array], dict[str, JSON]]:
         arrays = {
             name.removeprefix(_ARRAY): members[name] for name in members if name.startswith(_ARRAY)
         }
-        return arrays, json.loads(members[_META].tobytes())
+        return arrays, parse_json(members[_META].tobytes())
 
 
 def newest_checkpoint(folder: Path, *, name: str = CHECKPOINT_NAME) -> Checkpoint | None:

@@ -159,6 +159,8 @@ def read_pd6(path: Path) -> Recording:
                 if is_good is None:
                     raise ValueError(fields[4])
                 raw = [float(v) for v in fields[:3]]
+                if not np.isfinite(raw).all():
+                    raise ValueError(fields)
                 n_bad += not is_good
                 speed = tuple(v / 1000.0 if is_good and v != _BAD else np.nan for v in raw)
                 if time_s > last:

@@ -42,6 +42,10 @@ class Guard(NamedTuple):
     levels: Array
     """(K, 3) time, s, and protection levels, m, of all keyframes that have not settled"""
 
+    def covering(self, covariance: Array) -> Array:
+        """Return the covariance (n, n) of an answer with what jumps may have moved it by."""
+        return covariance + self.lanes.jumps.unexcluded(len(covariance))
+
     def pack(self) -> Iterator[tuple[str, Array]]:
         """Yield name and array of all but the contradictions."""
         yield from self.lanes.pack()
@@ -165,7 +169,7 @@ class Guardian:
         self, arrays: Mapping[str, Array], known: Sequence[Mapping[str, Any]], window: Window
     ) -> Guard:
         """Return the guard that was packed; one that begins where there is none."""
-        if "levels" not in arrays or len(arrays["begun_s"]) != len(self.bank.suspect):
+        if "jump_score" not in arrays or len(arrays["begun_s"]) != len(self.bank.suspect):
             return self.begin(window, known)
         contradictions = unpack_contradictions(known, self.bank.suspects)
         levels = arrays["levels"]

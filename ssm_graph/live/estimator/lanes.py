@@ -18,7 +18,6 @@ carried as deviations from it in arrays: a keyframe costs as much as a few small
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
@@ -34,6 +33,7 @@ from ssm_graph.graph.aids.heading import Headings
 from ssm_graph.graph.aids.magnetometer import MagneticFields
 from ssm_graph.graph.aids.ranges import Ranges
 from ssm_graph.graph.aids.usbl import UsblFixes
+from ssm_graph.live.estimator.jumps import JUMP, Jumps
 from ssm_graph.mission.calibration import DVL_DRIFT
 from ssm_graph.sensors.dvl import MOST_BEAMS
 from ssm_graph.smoothers.keyframe import Keyframe, Sensors
@@ -44,9 +44,6 @@ LENGTHS_S: Final = (10.0, 60.0, 240.0)
 """So long a lane leaves its sensor out; two of each, half of it apart."""
 INERTIAL_S: Final = LENGTHS_S[1:]
 """And those that forget the bias of the gyros: 10 s of other sensors say little of one."""
-FORGOTTEN_BIAS: Final = math.radians(0.1)
-"""rad/s, sigma of what the bias of a gyro may have jumped by; from ten times as much on others
-find it within seconds."""
 DVL, DEPTH = "DVL", "depth"
 INERTIAL: Final = "the inertial data"
 ACOUSTICS: Final = "acoustic fixes"
@@ -118,15 +115,19 @@ class Lanes(NamedTuple):
     """(S, 8) low-passed innovations in their sigmas, NaN where there are none"""
     doubted_s: Array
     """(S,) when the answer was last begun anew because each suspect contradicted it, s"""
+    jumps: Jumps
+    """Those of the gyros' bias that may have been"""
 
     def pack(self) -> Iterator[tuple[str, Array]]:
         """Yield name and array of everything."""
-        yield from self._asdict().items()
+        yield from zip(self._fields[:-1], self[:-1], strict=True)
+        yield from self.jumps.pack()
 
     @classmethod
     def unpack(cls, arrays: Mapping[str, Array]) -> Lanes:
         """Return the lanes that were packed."""
-        return cls(*(arrays[name] for name in cls._fields))
+        own: dict[str, Any] = {name: arrays[name] for name in cls._fields[:-1]}
+        return cls(**own, jumps=Jumps.unpack(arrays))
 
     def with_copy(self, into: int, of: int) -> Lanes:
         """Return the lanes with one of them as another one is."""
@@ -204,6 +205,7 @@ class LaneBank:
             np.full(S, -np.inf),
             np.full((S, MOST_BEAMS), np.nan),
             np.full(S, -np.inf),
+            Jumps.none(len(covariance)).with_next(time_s),
         )
         return self._begun(lanes, np.ones(L, dtype=np.bool_), begun_s)
 
@@ -247,6 +249,7 @@ class LaneBank:
             covariance=covariance,
             is_nested=np.zeros(len(deviation)),
             doubted_s=doubted_s,
+            jumps=Jumps.none(len(covariance[MEASURE])).with_next(keyframe.time_s),
         )
         lanes = self._begun(lanes, ~stays, keyframe.time_s - self._stagger_s)
         misfit = lanes.misfit.copy()
@@ -274,8 +277,14 @@ class LaneBank:
         off = np.append(off, ahead.states.walks[0] - now.walks[0])
         moved = off + ahead.deviation(lanes.deviation[:, :n])
         deviation = np.concatenate([moved, lanes.deviation[:, n:] * kept], axis=1)
-        misfit = lanes.misfit * np.exp(-span_s / MISFIT_S)
-        return lanes._replace(deviation=deviation, covariance=covariance, misfit=misfit)
+        by_jump = lanes.jumps.moved
+        by_jump = np.concatenate([ahead.deviation(by_jump[:, :n]), by_jump[:, n:] * kept], axis=1)
+        return lanes._replace(
+            deviation=deviation,
+            covariance=covariance,
+            misfit=lanes.misfit * np.exp(-span_s / MISFIT_S),
+            jumps=lanes.jumps._replace(moved=by_jump).with_next(keyframe.time_s),
+        )
 
     def _updated(self, lanes: Lanes, measured: Sequence[SensorRows], time_s: float) -> Lanes:
         suspect = [self._number(rows.sensor) for rows in measured]
@@ -287,7 +296,7 @@ class LaneBank:
         innovation = -np.concatenate([rows.error for rows in measured]) - lanes.deviation @ H.T
         lanes = self._with_ratios(lanes, measured, suspect, innovation[MEASURE], H, time_s)
         counts_in = (of_row != self.suspect[:, None]) | (of_row < 0)
-        H = H * counts_in[..., None]
+        H_all, H = H, H * counts_in[..., None]
         innovation = innovation * counts_in
         P = lanes.covariance
         PHt = P @ H.mT
@@ -299,6 +308,7 @@ class LaneBank:
         P = P - PHt @ solved[..., :-1]
         surplus = np.sum(innovation * solved[..., -1] - counts_in, axis=1)
         is_fix = self._is_fix[of_row]
+        of_measure = np.linalg.inv(S[MEASURE]), solved[MEASURE, :, -1], solved[MEASURE, :, :-1].T
         return lanes._replace(
             deviation=deviation,
             covariance=0.5 * (P + P.mT),
@@ -306,6 +316,7 @@ class LaneBank:
             n_fixes=lanes.n_fixes + np.sum(counts_in & is_fix, axis=1),
             evidence=lanes.evidence + surplus[MEASURE] - surplus,
             misfit=np.maximum(lanes.misfit + surplus, 0.0),
+            jumps=lanes.jumps.updated(H_all, *of_measure),
         )
 
     def _number(self, sensor: str) -> int:
@@ -372,8 +383,10 @@ class LaneBank:
         deviation, covariance = lanes.deviation.copy(), lanes.covariance.copy()
         deviation[which], covariance[which] = deviation[MEASURE], covariance[MEASURE]
         forget, own = np.flatnonzero(which & self._forgets), np.arange(*GYRO_BIAS.indices(self._n))
-        covariance[np.ix_(forget, own, own)] += FORGOTTEN_BIAS**2 * np.eye(len(own))
-        counts = {name: np.where(which, 0.0, getattr(lanes, name)) for name in _COUNTS}
+        covariance[np.ix_(forget, own, own)] += JUMP**2 * np.eye(len(own))
+        counts: dict[str, Any] = {
+            name: np.where(which, 0.0, getattr(lanes, name)) for name in _COUNTS
+        }
         counts["n_out"][forget] = 1.0
         return lanes._replace(
             deviation=deviation,

@@ -312,7 +312,7 @@ class FixedLagSmoother:
         tail = Tail(
             window.keyframes[-1],
             window.newest_states,
-            window.newest_covariance,
+            step.guard.covering(window.newest_covariance),
             noise=self.vehicle.imu_noise,
             frame=self._frame,
             inertial=window.inertial,

@@ -32,6 +32,7 @@ import numpy as np
 
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.settings import parse_json
 from ssm_graph.io.mission_folder.toml import TOML_NAME
 from ssm_graph.io.mission_folder.vehicle import check_same_vehicle
 from ssm_graph.io.raw_log.log import RawLog
@@ -285,7 +286,7 @@ class RunFolder:
         path = self.path / RUN_NAME
         if path.exists():
             try:
-                found = json.loads(path.read_text(encoding="utf-8"))
+                found = parse_json(path.read_text(encoding="utf-8"))
             except (OSError, ValueError) as error:
                 raise DataError(
                     f"{path}: expected the settings of a run: {error}; bring it back, or give "

@@ -47,6 +47,7 @@ def summary_table(estimate: Estimate, metrics: Metrics | None = None) -> Rendera
     Every row is headed by its unit. Without a reference the comparison is left out; the last
     rows give three numbers each, whose order the heading names.
     """
+    begin_s = float(next(iter(estimate.trajectory.time_s), 0.0))
     parts: list[RenderableType] = [_overview(estimate), _last_keyframe(estimate)]
     if metrics is not None:
         parts.append(_comparison(metrics))
@@ -65,9 +66,8 @@ def summary_table(estimate: Estimate, metrics: Metrics | None = None) -> Rendera
         counts = [(name, *map(str, count)) for name, count in estimate.aids.counts().items()]
         parts.append(_table("Further aids", counts, header=header))
     if estimate.faults:
-        parts.append(_faults(estimate.faults))
-    begin_s = estimate.trajectory.time_s[:1]
-    notes = [clocked(note, *begin_s.tolist()) for note in estimate.notes]
+        parts.append(_faults(estimate.faults, begin_s))
+    notes = [clocked(note, begin_s) for note in estimate.notes]
     parts.extend(Text(f"note: {note}", style="yellow") for note in notes)
     return Group(*parts)
 
@@ -99,7 +99,7 @@ def _overview(estimate: Estimate) -> Table:
     return table
 
 
-def _faults(faults: Sequence[DetectedFault]) -> Table:
+def _faults(faults: Sequence[DetectedFault], begin_s: float) -> Table:
     """Return who was off, when and how, red where the answer may be wrong for it."""
     table = Table(
         title="Sensors that were off",
@@ -108,7 +108,7 @@ def _faults(faults: Sequence[DetectedFault]) -> Table:
         box=box.SIMPLE_HEAD,
         pad_edge=False,
     )
-    for heading in ("sensor", "from - to, s", "what", "what became of it"):
+    for heading in ("sensor", "s since start", "what", "what became of it"):
         table.add_column(heading, overflow="fold")
     for fault in faults:
         treatment = fault.treatment.value
@@ -116,7 +116,7 @@ def _faults(faults: Sequence[DetectedFault]) -> Table:
             treatment += f"; or it is {' or '.join(fault.rivals)}"
         table.add_row(
             Text(fault.sensor, style="bold red" if fault.is_suspect else "yellow"),
-            f"{fault.begin_s:.0f} - {fault.end_s:.0f}",
+            f"{fault.begin_s - begin_s:.0f} - {fault.end_s - begin_s:.0f}",
             fault.what,
             treatment,
         )

@@ -49,6 +49,8 @@ class Chart:
     layout: Mapping[str, Any]
     is_time: bool = True
     """Whether its x axis is time, and goes with the others'."""
+    height: int = 300
+    """Pixels of the page."""
 
 
 def packed(values: Array) -> dict[str, str]:
@@ -146,10 +148,9 @@ def _track(content: Content) -> Chart:
         "east of the start, m",
         "north of the start, m",
         yaxis={"scaleanchor": "x", "scaleratio": 1},
-        height=520,
     )
     note = "Ellipses are three sigma. Where the answer is suspect the track is thick and vermilion."
-    return Chart("track", "Track", note, traces, layout, is_time=False)
+    return Chart("track", "Track", note, traces, layout, is_time=False, height=520)
 
 
 def _clock(content: Content, time_s: float) -> str:

@@ -2,7 +2,7 @@
 const charts = JSON.parse(document.getElementById("charts").textContent);
 const options = { responsive: true, displaylogo: false, modeBarButtonsToRemove: ["lasso2d", "select2d"] };
 const base = {
-  margin: { l: 64, r: 12, t: 30, b: 44 }, height: 300, hovermode: "closest",
+  margin: { l: 64, r: 12, t: 30, b: 44 }, hovermode: "closest",
   legend: { orientation: "h", y: 1.02, yanchor: "bottom", x: 0 },
   font: { family: "system-ui, 'Segoe UI', 'Liberation Sans', sans-serif", size: 13, color: "#1f2a33" },
   paper_bgcolor: "#ffffff", plot_bgcolor: "#ffffff",

@@ -40,7 +40,8 @@ def page_of(content: Content, *, footer: str) -> str:
     told = sections(content)
     places = "\n".join(
         f'<h2 id="{chart.name}-title">{html.escape(chart.title)}</h2>'
-        f'<p class="note">{html.escape(chart.note)}</p><div class="chart" id="{chart.name}"></div>'
+        f'<p class="note">{html.escape(chart.note)}</p>'
+        f'<div class="chart" id="{chart.name}" style="height: {chart.height}px"></div>'
         for chart in charts
     )
     links = [(f"{chart.name}-title", chart.title) for chart in charts]

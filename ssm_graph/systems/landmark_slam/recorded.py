@@ -90,7 +90,11 @@ def read_graph(path: Path) -> tuple[SlamProblem, SlamNoise]:
     steps: list[list[float]] = []
     seen: list[list[float]] = []
     pose_of: dict[int, int] = {}
-    for number, text in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: expected a text graph, got bytes that are none") from error
+    for number, text in enumerate(lines, 1):
         words = text.split()
         if not words:
             continue

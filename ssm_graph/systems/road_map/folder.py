@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -19,7 +18,7 @@ from ssm_graph.base.settings import (
     Settings,
     number_key,
     read_settings,
-    read_settings_file,
+    read_toml,
 )
 from ssm_graph.base.tables import Table, TableSpec
 from ssm_graph.base.units import DEGREE, wrapped
@@ -70,14 +69,12 @@ def read_drive(folder: Path) -> tuple[Drive, RoadMap]:
     """
     path = folder / FILE_NAME
     try:
-        raw = tomllib.loads(read_settings_file(path).decode("utf-8"))
+        raw = read_toml(path)
     except FileNotFoundError as error:
         raise ConfigError(
             f"{folder}: expected a folder with {FILE_NAME}, found none; "
             "ssm-graph locate-simulate writes one"
         ) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: {error}") from error
     sections = _sections(raw, str(path))
     road_map = read_map(folder / sections["map"].text("file"))
     tables = {

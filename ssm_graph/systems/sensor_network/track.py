@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import so3
+from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frames import R_lb_from_roll_pitch_heading, roll_pitch_heading_from_R_lb
 from ssm_graph.base.frozen import Array, ReadOnlyArrays
 from ssm_graph.base.stepwise import Steps, at_once
@@ -34,6 +35,7 @@ LATEST_END_S: Final = 2.0
 """A block waits no longer for a ping to end at."""
 MERGE_HZ: Final = 1e-3
 """Merges all samples of an interval into one."""
+_MOST_BLOCKS: Final = 100_000
 _FLOOR_M_PER_S: Final = 1e-4
 
 
@@ -118,6 +120,11 @@ def mission_edges(mission: Mission, begin_s: float, block_s: float) -> Edges:
     """Return the edges of all blocks of a mission from a time on."""
     pings_s = mission.dvl.of_ground().valid_s
     last = min(float(mission.imu.time_s[-1]), float(pings_s[-1]) + block_s)
+    if (last - begin_s) / block_s > _MOST_BLOCKS:
+        raise ConfigError(
+            f"block_s: expected at most {_MOST_BLOCKS} blocks in {last - begin_s:.6g} s, got "
+            f"blocks of {block_s:g} s; try 10"
+        )
     ends = np.arange(begin_s + block_s, last, block_s)
     ends = np.append(ends[:-1], last) if len(ends) else np.array([last])
     return block_edges(pings_s[pings_s > begin_s], begin_s, ends, last)

@@ -239,7 +239,7 @@ class _Adjustment:
     ) -> None:
         rows = further.rows(state.R_cw, state.t_cw, state.extra)
         P, E = self.n_poses, self.n_extra
-        system = np.zeros((P // 6, 6, P // 6, 6))
+        system = np.zeros((P // 6, P // 6, 6, 6))
         across, pull = np.zeros((P // 6, 6, E)), np.zeros((P // 6, 6))
         ends = [(self.column[rows.pose], rows.by_pose)]
         if rows.second is not None and rows.by_second is not None:
@@ -253,9 +253,8 @@ class _Adjustment:
             for other, by_other in ends:
                 both = on & (other >= 0)
                 products = (by_pose[both] * weight[both, None])[:, :, None] * by_other[both, None]
-                # Indices apart by a slice: their axis comes first.
-                np.add.at(system, (block[both], slice(None), other[both]), products)
-        matrix[:P, :P] += system.reshape(P, P)
+                np.add.at(system, (block[both], other[both]), products)
+        matrix[:P, :P] += system.transpose(0, 2, 1, 3).reshape(P, P)
         slope[:P] += pull.reshape(-1)
         if not E:
             return

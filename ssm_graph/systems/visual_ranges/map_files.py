@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import ShortRepr
+from ssm_graph.base.settings import parse_json
 from ssm_graph.io.tables.append_file import write_through
 from ssm_graph.systems.visual_ranges.camera import Camera
 from ssm_graph.systems.visual_ranges.loops import LoopFinder
@@ -73,7 +74,7 @@ def load_map(path: Path) -> SavedMap:
     """
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            meta: dict[str, Any] = json.loads(archive["meta"].tobytes())
+            meta: dict[str, Any] = parse_json(archive["meta"].tobytes())
             arrays = {spec.name: archive[spec.name] for spec in fields(MapSnapshot)}
     except (OSError, ValueError, KeyError, BadZipFile) as error:
         raise DataError(

@@ -102,13 +102,13 @@ class Metric:
         frames : all frames so far.
         R_cw, t_cw, time_s : (K, 3, 3), (K, 3) and (K,) of the key frames.
         """
-        told = []
+        told, prior = [], None
         if self.vehicle.has_aids:
             self.terms, was_aided = hung(self.vehicle, time_s), self.is_aided
             self.state = metric_state(self.terms, R_cw, t_cw)
             if self.is_aided:
                 assert self.state is not None
-                self.ranging.scale_prior = (self.state.log_scale, self._prior_sigma())
+                prior = (self.state.log_scale, self._prior_sigma())
                 if not np.isfinite(self.started_s):
                     self.started_s = float(time_s[-1])
             if self.is_aided and not was_aided:
@@ -116,7 +116,7 @@ class Metric:
                     f"scale {self.scale:.4g} m a map unit by the vehicle's own sensors, known to "
                     f"{100.0 * self._own_sigma:.1f} %"
                 )
-        told += self.ranging.update(frames, R_cw, t_cw)
+        told += self.ranging.update(frames, R_cw, t_cw, prior)
         if self.has_scale:
             sigma = min(self._own_sigma if self.is_aided else np.inf, self._range_sigma)
             self._history.append((float(time_s[-1]), self.scale, sigma))
@@ -128,7 +128,7 @@ class Metric:
 
     def restart(self) -> None:
         """Forget scale and anchors: the map's scale has changed. The next update starts anew."""
-        self.state, self.ranging.scale_prior = None, None
+        self.state = None
         self.ranging.restart()
 
     def further(self, pose_of: Indices, *, is_free: bool = False) -> FurtherTerms | None:
@@ -151,9 +151,10 @@ class Metric:
         if isinstance(further, BundleMetric):
             assert self.state is not None
             own, ranges = further.n_ranges, further.ranges
-            self.state = replace(
-                further.state.moved(extra[own:]), covariance=covariance[own:, own:].copy()
-            )
+            found = covariance[own:, own:]
+            # As for ranges: no sharper than the path allowed before.
+            wider = max(1.0, float(self.state.covariance[0, 0] / found[0, 0]))
+            self.state = replace(further.state.moved(extra[own:]), covariance=wider * found)
             extra, covariance = extra[:own], covariance[:own, :own]
         if isinstance(ranges, BundleRanges):
             self.ranging.adopt(extra, covariance, ranges)

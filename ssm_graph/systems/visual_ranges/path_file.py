@@ -19,15 +19,13 @@ HEAD: Final = b"time_s,x,y,z,qx,qy,qz,qw,m_per_map_unit\n"
 class PathAsItComes:
     """Poses of the camera in map units, camera to map, with the scale as it was known then.
 
-    Where the disc is full the run goes on, and ``failure`` says so.
+    The file is there from the first row on. Where the disc is full the run goes on, and
+    ``failure`` says so.
     """
 
     def __init__(self, folder: Path) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
         self.path, self.failure = folder / NAME, ""
-        self.path.unlink(missing_ok=True)
-        self._file = AppendFile(self.path, ending=b"\n")
-        self._file.append(HEAD)
+        self._file: AppendFile | None = None
 
     def append(self, now: FrameNow) -> None:
         """Write one row."""
@@ -37,9 +35,18 @@ class PathAsItComes:
         turn = Rotation.from_matrix(now.R_cw.T).as_quat()
         row = np.concatenate([[now.time_s], centre, turn, [now.scale]])
         try:
+            if self._file is None:
+                self._file = self._begun()
             self._file.append((",".join(f"{x:.9g}" for x in row) + "\n").encode())
         except OSError as error:
             self.failure = error.strerror or str(error)
+
+    def _begun(self) -> AppendFile:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self.path.unlink(missing_ok=True)
+        file = AppendFile(self.path, ending=b"\n")
+        file.append(HEAD)
+        return file
 
     def __enter__(self) -> Self:
         return self
@@ -50,4 +57,5 @@ class PathAsItComes:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._file.close()
+        if self._file is not None:
+            self._file.close()

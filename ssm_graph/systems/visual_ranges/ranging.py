@@ -47,6 +47,7 @@ from ssm_graph.systems.visual_ranges.widening import widened
 
 __all__ = ["Anchor", "AnchorState", "Ranging", "RangingResult"]
 
+ScalePrior = tuple[float, float] | None
 TRY_AGAIN: Final = 1.15
 """A start is tried again when so many times the ranges are there."""
 RECENT_S: Final = 5.0
@@ -90,7 +91,7 @@ class Ranging:
         self.history: list[tuple[float, float, float]] = []
         self.started_s = float("nan")
         self.error, self.weight = np.full((2, len(ranges)), np.nan)
-        self.scale_prior: tuple[float, float] | None = None  # of log s, where something knows it
+        self._scale_prior: ScalePrior = None
         self._tried = self._checked = 0
 
     @property
@@ -108,14 +109,18 @@ class Ranging:
         """Metres a map unit; NaN without."""
         return self.found.scale if self.found is not None else float("nan")
 
-    def update(self, frames: FramePoses, R_cw: Array, t_cw: Array) -> list[str]:
+    def update(
+        self, frames: FramePoses, R_cw: Array, t_cw: Array, scale_prior: ScalePrior = None
+    ) -> list[str]:
         """Take the poses as they stand, start or go on, and return what happened, in words.
 
         Parameters
         ----------
         frames : all frames so far.
         R_cw, t_cw : (K, 3, 3) and (K, 3) of the key frames.
+        scale_prior : mean and standard deviation of log s, where something else knows it.
         """
+        self._scale_prior = scale_prior
         self.terms = hang(self.ranges, frames, R_cw, t_cw, lever_arm_m=self.lever_arm_m)
         self.terms = replace(self.terms, anchor=self.anchor[self.terms.row])
         if not len(self.terms):
@@ -138,9 +143,7 @@ class Ranging:
         self.found, self._tried, self._checked = None, 0, 0
         self.anchors = [_Own(own.name) for own in self.anchors]
 
-    def further(
-        self, pose_of: Indices, *, is_free: bool = False, least_weight: float = 0.0
-    ) -> BundleRanges | None:
+    def further(self, pose_of: Indices, *, is_free: bool = False) -> BundleRanges | None:
         """Return the ranges of some key frames as terms of their adjustment; None without scale.
 
         Parameters
@@ -157,8 +160,6 @@ class Ranging:
         known = pose_of[np.minimum(self.terms.key_frame, len(pose_of) - 1)]
         known = np.where(self.terms.key_frame < len(pose_of), known, -1)
         kept = (known >= 0) & (column[self.terms.anchor] >= 0)
-        if least_weight > 0.0:
-            kept &= np.nan_to_num(self.weight[self.terms.row], nan=1.0) >= least_weight
         if not kept.any():
             return None
         own = self.terms.rows(kept)
@@ -252,7 +253,7 @@ class Ranging:
             self.rules,
             turned_rad=turned_rad,
             spacing=known_spacing(self.ranges.known_position, eligible),
-            scale_prior=self.scale_prior,
+            scale_prior=self._scale_prior,
         )
         if not self.start.has_scale or self.start.solution is None:
             return []
@@ -294,18 +295,17 @@ class Ranging:
             drift=self.rules.ledger_drift,
             bias_walk_m=self.rules.bias_walk_m,
             spacing=known_spacing(self.ranges.known_position, np.array(self.used)),
-            scale_prior=self.scale_prior,
+            scale_prior=self._scale_prior,
         )
         before = self.found
         start = unknowns_of(problem, before.scale, before.anchors, before.biases, before.clock_s)
         problem = widened(problem, solution(problem, start, rounds=3))
         self.found = polished(problem, solution(problem, start, rounds=3))
+        told: list[str] = []
         if len(places.time_s) > CHECK_AGAIN * self._checked:
             self._checked = len(places.time_s)
             told = self._check(own, problem)
             self._rivals(problem)
-        else:
-            told = []
         assert self.terms is not None
         row = self.terms.row[kept]
         self.error[row], self.weight[row] = plain_errors(everything, self.found)
@@ -318,15 +318,13 @@ class Ranging:
         names = tuple(self.anchors[j].name for j in self.used)
         again = find_start(
             own, names, self.rules, turned_rad=np.inf, spacing=problem.spacing,
-            scale_prior=self.scale_prior,
+            scale_prior=self._scale_prior,
         )  # fmt: skip
         was_refused, self.start = self.is_refused, again
+        told, best = [], again.solution
         if self.is_refused != was_refused:
             what = "; ".join(again.reasons) if self.is_refused else "no contradiction any more"
             told = [f"scale {'doubted' if self.is_refused else 'believed again'}: {what}"]
-        else:
-            told = []
-        best = again.solution
         if best is None:
             return told
         other = unknowns_of(problem, best.scale, best.anchors, best.biases, best.clock_s)

@@ -50,10 +50,10 @@ class Sequence(ShortRepr):
     truth: PathTruth | None = None
     anchor_truth_m: Array | None = None
     """True places of the anchors in the world frame of ``truth`` (J, 3), m, NaN where unknown."""
-    vehicle: Vehicle = Vehicle()
-    """Depth and dead reckoning of what carries the camera."""
     notes: tuple[str, ...] = ()
     """What the reader found and did, one sentence each, with file and line where there is one."""
+    vehicle: Vehicle = Vehicle()
+    """Depth and dead reckoning of what carries the camera."""
 
     def __len__(self) -> int:
         return len(self.time_s)

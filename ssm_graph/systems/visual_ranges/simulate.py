@@ -108,7 +108,8 @@ def simulate(run: Run) -> Simulated:
     anchors = np.array(ANCHORS[run.world][: run.n_anchors], dtype=float).reshape(-1, 3)
 
     def antenna(time: Array) -> Array:
-        return path.place(time) + axes(path, time) @ np.array(run.ranges.lever_arm_m)
+        turned = axes(path, time) @ np.array(run.ranges.lever_arm_m)
+        return np.asarray(path.place(time) + turned)
 
     ranges, is_nlos, bias = simulated_ranges(
         run.ranges, antenna, anchors, (0.0, run.duration_s), run.seed, world.is_blocked

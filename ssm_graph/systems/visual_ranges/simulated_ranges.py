@@ -120,7 +120,8 @@ def _two_ways(
     for _ in range(4):
         comes = ping_s + (out + back) / asked.sound_speed_m_per_s
         back = np.linalg.norm(antenna(comes) - anchor, axis=1)
-    return 0.5 * (out + back) * asked.assumed_sound_speed_m_per_s / asked.sound_speed_m_per_s
+    ratio = asked.assumed_sound_speed_m_per_s / asked.sound_speed_m_per_s
+    return np.asarray(0.5 * (out + back) * ratio)
 
 
 def with_simulated_ranges(

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array, FrozenArrays, ShortRepr, shaped
@@ -81,7 +82,7 @@ class Vehicle(ShortRepr):
         return self.depths is not None or self.dead_reckoning is not None
 
 
-def inside(time_s: Array, at_s: Array) -> tuple[Array, Array]:
+def inside(time_s: Array, at_s: Array) -> tuple[NDArray[np.int64], Array]:
     """Return rows before (M,) and shares (M,) of times between two readings; NaN in gaps, outside.
 
     Parameters
@@ -90,6 +91,7 @@ def inside(time_s: Array, at_s: Array) -> tuple[Array, Array]:
     at_s : (M,)
     """
     row = np.clip(np.searchsorted(time_s, at_s, side="right") - 1, 0, len(time_s) - 2)
+    row = row.astype(np.int64)
     span = time_s[row + 1] - time_s[row]
     share = (at_s - time_s[row]) / span
     known = (share >= -1e-9) & (share <= 1.0 + 1e-9) & (span <= LONGEST_GAP_S)

@@ -177,7 +177,7 @@ class VehicleTerms(ReadOnlyArrays):
             return np.zeros(0)
         first = np.concatenate([[0], np.cumsum(sizes)[:-1]])
         t = np.add.reduceat(error**2 + variance, first)
-        return np.repeat(KERNEL.weight(t, dim=sizes), sizes)
+        return np.repeat(KERNEL.weight(t, dim=sizes.astype(np.float64)), sizes)
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -217,7 +217,7 @@ def hung(vehicle: Vehicle, time_s: Array) -> VehicleTerms:
         at, share = inside(depth.time_s, time_s)
     d = np.flatnonzero(np.isfinite(share))
     read = depth.depth_m
-    depth_m = (1.0 - share[d]) * read[at[d]] + share[d] * read[at[d] + 1] if len(d) else share[d]
+    depth_m = (1.0 - share[d]) * read[at[d]] + share[d] * read[at[d] + 1]
     known, position, R_nc = _reckoned(vehicle.dead_reckoning, time_s)
     reckoning = vehicle.dead_reckoning
     pair = np.flatnonzero(np.diff(known) == 1)
@@ -300,7 +300,7 @@ def _settled(terms: VehicleTerms, R_cw: Array, t_cw: Array, state: MetricState) 
         if float(np.max(np.abs(step) / np.sqrt(covariance.diagonal()))) < 1e-3:
             break
     repeats = _repeats(pull, rows.first)
-    return replace(state, covariance=covariance * repeats)
+    return replace(state, covariance=np.asarray(covariance * repeats, dtype=np.float64))
 
 
 def _repeats(pull: Array, frame: Indices) -> float:

@@ -10,12 +10,16 @@ import numpy as np
 import pytest
 
 from ssm_graph.cli.main import main
+from ssm_graph.cli.visual import lines
 from ssm_graph.systems.visual_ranges.accuracy import accuracy
 from ssm_graph.systems.visual_ranges.camera import Camera
+from ssm_graph.systems.visual_ranges.figures import write_figures
 from ssm_graph.systems.visual_ranges.outputs import told_events, write_outputs
+from ssm_graph.systems.visual_ranges.page import write_page
 from ssm_graph.systems.visual_ranges.path_file import PathAsItComes
 from ssm_graph.systems.visual_ranges.ranges import screened_ranges
 from ssm_graph.systems.visual_ranges.ranging import Anchor, AnchorState, RangingResult
+from ssm_graph.systems.visual_ranges.ranging_result import VehicleResult
 from ssm_graph.systems.visual_ranges.result import FrameNow, FrameState, MapSnapshot, VisualResult
 from ssm_graph.systems.visual_ranges.sequence import PathTruth, Sequence
 from ssm_graph.systems.visual_ranges.similarity3 import Sim3
@@ -149,6 +153,31 @@ def test_files_of_an_answer(tmp_path: Path) -> None:
     assert summary["against_truth"]["anchor_error_m"] == [pytest.approx(0.3)]
 
 
+def test_an_answer_by_the_vehicle_alone(tmp_path: Path) -> None:
+    """Without any range: metres, READY, and the vertical in the files."""
+    sequence, result = made()
+    none, own = np.zeros(0), result.ranging
+    told = VehicleResult(
+        np.array([0.0, 0.8, 0.6]), 1e-6 * np.eye(2), 3.0, SCALE, 0.004, np.nan, np.nan
+    )
+    own = replace(
+        own, anchors=(), error_m=none, weight=none, anchor_of=np.zeros(0, np.intp), vehicle=told
+    )
+    result = replace(result, ranging=own)
+    sequence = replace(sequence, ranges=screened_ranges([], [], []), anchor_truth_m=None)
+    found, off = judged(result), accuracy(sequence, result)
+    assert found.verdict is Verdict.READY
+    assert off is not None
+    assert off.metric_m < 1e-6
+    write_outputs(tmp_path, sequence, result, found, off, ())
+    figures = write_figures(tmp_path, sequence, result, found, off)
+    write_page(tmp_path / "report.html", sequence, result, found, off, figures, ())
+    answer = json.loads((tmp_path / "result.json").read_text())
+    assert answer["vehicle"]["down_map_axes"] == [0.0, 0.8, 0.6]
+    assert answer["vehicle"]["range_unit_m"] is None
+    assert any("down is 0.000, 0.800, 0.600" in line for line in lines(result, found, off))
+
+
 def test_the_path_is_in_its_file_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A run that is killed leaves what it had; a full disc ends the file, not the run."""
     turn = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -182,7 +211,7 @@ def test_input_that_cannot_be_used(tmp_path: Path, capsys: pytest.CaptureFixture
     assert main(["visual", str(tmp_path / "none"), "--out", out]) == 3
     assert "there is no such file or folder" in capsys.readouterr().err
     assert main(["visual-simulate", "kitchen", "--out", out]) == 2
-    assert "world 'kitchen': known are: corridor, room" in capsys.readouterr().err
+    assert "world 'kitchen': known are: bottom, corridor, room" in capsys.readouterr().err
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "visual.toml").write_text("format = 1\n[camera]\n[images]\n")
     assert main(["visual", str(tmp_path / "run"), "--out", out]) == 2

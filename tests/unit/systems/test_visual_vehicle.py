@@ -43,7 +43,7 @@ UNIT_M = 1.7
 
 def path_of(seed: int, n: int = 80, step_s: float = 0.5) -> tuple[Array, Array, Array, Array]:
     """Return times, true poses (R_wc, p_w), and the map's places in units of 1.7 m."""
-    path, time = bottom_path(seed), np.arange(n) * step_s
+    path, time = bottom_path(seed), (np.arange(n) * step_s).astype(np.float64)
     R_wc, p_w = axes(path, time), path.place(time)
     return time, R_wc, p_w, (p_w - p_w[0]) @ R_wc[0] / UNIT_M
 

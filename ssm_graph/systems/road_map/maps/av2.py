@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.settings import parse_json
 from ssm_graph.systems.road_map.maps.road_map import (
     Lane,
     LineKind,
@@ -35,7 +35,7 @@ def read_av2(path: Path) -> RoadMap:
     The plane is that of the city. Edges that drivable areas share are no boundaries.
     """
     try:
-        found = json.loads(path.read_bytes())
+        found = parse_json(path.read_bytes())
         segments = found["lane_segments"].values()
         areas = [_points(area["area_boundary"]) for area in found["drivable_areas"].values()]
         notes: list[str] = []

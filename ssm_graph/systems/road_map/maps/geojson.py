@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.projection import TransverseMercator
+from ssm_graph.base.settings import parse_json
 from ssm_graph.systems.road_map.maps.road_map import (
     LineKind,
     Mark,
@@ -31,7 +31,7 @@ def read_geojson(path: Path) -> RoadMap:
     file says ``"plane": true``.
     """
     try:
-        found = json.loads(path.read_bytes())
+        found = parse_json(path.read_bytes())
         parts = [part for feature in found["features"] for part in _parts(feature)]
         is_plane = bool(found.get("plane", False))
     except (ValueError, KeyError, TypeError, AttributeError) as error:

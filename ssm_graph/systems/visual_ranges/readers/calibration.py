@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Final
 import numpy as np
 
 from ssm_graph.base.errors import DataError
+from ssm_graph.base.settings import parse_json
 from ssm_graph.systems.visual_ranges.camera import N_COEFFICIENTS, Camera
 
 Scalar = float | str | list[float]
@@ -202,9 +202,9 @@ def _of_yaml(path: Path, found: dict[str, Scalar], size: tuple[int, int] | None)
 
 def _of_json(path: Path, text: str, size: tuple[int, int] | None) -> Camera:
     try:
-        found = json.loads(text)
+        found = parse_json(text)
         k = [float(found[name]) for name in ("fu", "fv", "cu", "cv")]
-    except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"{path}: expected JSON with fu, fv, cu, cv: {error}") from error
     return make_camera(str(path), size, k)
 

@@ -126,8 +126,8 @@ def read_own_folder(folder: Path, options: ReadOptions) -> Sequence:
         options.lever_arm_m or lever,
         truth,
         places,
-        read_vehicle(folder, sections, share),
         (*notes, *ranges.notes),
+        read_vehicle(folder, sections, share),
     )
 
 

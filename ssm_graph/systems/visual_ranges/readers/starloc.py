@@ -9,7 +9,6 @@ References
 from __future__ import annotations
 
 import csv
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -20,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array, ShortRepr
+from ssm_graph.base.settings import parse_json
 from ssm_graph.systems.visual_ranges.camera import Camera
 from ssm_graph.systems.visual_ranges.ranges import Ranges, screened_ranges
 from ssm_graph.systems.visual_ranges.readers.calibration import make_camera
@@ -154,8 +154,8 @@ def _table(path: Path) -> dict[str, Array]:
 
 def _json(path: Path) -> dict[str, float]:
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, json.JSONDecodeError) as error:
+        found = parse_json(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
         raise DataError(f"{path}: cannot be read: {error}") from error
     return dict(found)
 
@@ -164,8 +164,8 @@ def _version(folder: Path) -> str:
     """Return which survey of the arena belongs to a run."""
     path = folder.parent / "dataset_params.json"
     try:
-        runs = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, json.JSONDecodeError) as error:
+        runs = parse_json(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
         raise DataError(f"{path}: cannot be read: {error}") from error
     found = [run["landmarks"] for run in runs if run["name"] == folder.name]
     if not found:

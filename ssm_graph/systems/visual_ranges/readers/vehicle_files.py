@@ -25,15 +25,20 @@ from ssm_graph.systems.visual_ranges.vehicle import (
 )
 
 _DEG: Final = np.pi / 180.0
-_PLACE: Final = {"shape": (3,), "low": -20.0, "high": 20.0, "required": False}
+
+
+def _arm(hint: str) -> Key:
+    return Key(shape=(3,), low=-20.0, high=20.0, required=False, hint=f"{hint}, metres")
+
+
 DEPTH_KEYS: Final[Mapping[str, Key]] = {
     "file": FILE_KEY,
     "sigma_m": optional_key("", 1e-4, 100.0, "0.05 is a pressure sensor"),
-    "lever_arm_m": Key(**_PLACE, hint="camera to sensor, camera axes, metres"),
+    "lever_arm_m": _arm("camera to sensor, camera axes"),
 }
 RECKONING_KEYS: Final[Mapping[str, Key]] = {
     "file": FILE_KEY,
-    "camera_m": Key(**_PLACE, hint="vehicle to camera, vehicle axes, metres"),
+    "camera_m": _arm("vehicle to camera, vehicle axes"),
     "camera_axes": Key(
         shape=(9,), low=-1.0, high=1.0, required=False,
         hint="rotation matrix, camera to vehicle axes, row by row",
