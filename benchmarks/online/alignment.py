@@ -19,7 +19,6 @@ from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator import FixedLagSmoother
 from ssm_graph.live.estimator.intake import Intake
-from ssm_graph.live.estimator.packing import pack_buffers
 from ssm_graph.live.estimator.start import MOST_MS, SHARE
 from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.navigation import Health
@@ -59,7 +58,7 @@ def begun_with(messages: Sequence[Message], vehicle: Vehicle) -> FixedLagSmoothe
     for message in messages:
         intake.accept(message)
     arrays, meta = FixedLagSmoother(vehicle).checkpoint()
-    return FixedLagSmoother.restore(vehicle, None, arrays | pack_buffers(intake.buffers), meta)
+    return FixedLagSmoother.restore(vehicle, None, arrays | intake.buffers.pack(), meta)
 
 
 def measured(data_s: float) -> Load:

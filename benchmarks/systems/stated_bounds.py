@@ -80,7 +80,20 @@ def _beams(sim: SimulatedMission, mission: Mission, own: WitnessBounds, edges: A
     fit = read / np.linalg.norm(dvl.mount.beams_b, 2)
     share = own.speed_share * np.minimum(np.linalg.norm(v_b, axis=1), fit)
     steady = np.repeat(wider * (own.velocity_m_per_s + share)[:, None], off.shape[1], axis=1)
-    return _largest(off, own.of("DVL") * dvl.sigma, steady, dvl.valid_s, edges)
+    k = own.of("DVL")
+    largest = float(np.nanmax(np.abs(off) / (k * dvl.sigma + steady)))
+    whole = np.flatnonzero(np.isfinite(off).all(axis=1))
+    # Of a ping's velocity, all beams together: what a block's mean is taken of.
+    B = dvl.mount.beams_b
+    v_off = np.einsum("nij,nj->ni", R[whole], off[whole] @ np.linalg.pinv(B).T)
+    sigma = float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(B.T @ B))[-1]))
+    block = np.searchsorted(edges, dvl.valid_s[whole], side="left")
+    for one in np.unique(block):
+        rows = np.flatnonzero(block == one)
+        white = k * sigma * float(dvl.sigma[whole[rows]].max()) / np.sqrt(len(rows))
+        mean = float(np.linalg.norm(v_off[rows].mean(axis=0)))
+        largest = max(largest, mean / (white + float(steady[whole[rows]].mean())))
+    return largest
 
 
 def _inertial(

@@ -53,6 +53,7 @@ COMMANDS: Final = {
     "export": "write a result for QGIS, Google Earth, evo, xarray, Foxglove, multibeam software",
     "report": "write a page about a result, for a browser and for print",
     "locate": "find the lane of a road vehicle in an HD map",
+    "locate-convert": "turn a segment of comma2k19 into a drive's folder",
     "locate-simulate": "write a simulated drive over an HD map",
     "locate-study": "many simulated drives over HD maps, by several methods",
     "seabed": "find where a mission began on a map of the seabed",
@@ -75,7 +76,7 @@ GROUPS: Final = {
     "what comes of it": ("report", "export", "compare", "integrity"),
     "landmark SLAM": ("slam", "slam-study"),
     "a start from a map": (
-        *("locate", "locate-simulate", "locate-study"),
+        *("locate", "locate-convert", "locate-simulate", "locate-study"),
         *("seabed", "seabed-simulate"),
     ),
     "guaranteed bounds in a network": ("network", "network-run"),

@@ -26,6 +26,7 @@ from ssm_graph.cli.options import (
     number_option,
 )
 from ssm_graph.cli.terminal import say, signals_to
+from ssm_graph.cli.witness import add_witness, witnessed
 from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle, vehicle_of
 from ssm_graph.io.raw_log.rows import messages_of
@@ -132,7 +133,7 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
             show = both(show, page)
         runner = Runner(
             RunFolder(arguments.out, vehicle, _settings(lag, integrity)),
-            _witnessed(engine_of(vehicle, lag, integrity), arguments, lag.lag_s),
+            witnessed(engine_of(vehicle, lag, integrity), arguments, lag.lag_s),
             _connector(stack, arguments.out, inputs, outputs, mission, speed),
             publisher=publisher,
             config=config,
@@ -171,22 +172,6 @@ def engine_of(
         return FixedLagSmoother.restore(vehicle, config, arrays, meta, integrity=integrity)
 
     return Engine(lambda: FixedLagSmoother(vehicle, config, integrity=integrity), restore)
-
-
-def _witnessed(engine: Engine, arguments: argparse.Namespace, lag_s: float) -> Engine:
-    """Return an engine whose estimators have a witness beside them, if it was asked for."""
-    if not arguments.witness:
-        return engine
-    from ssm_graph.systems.sensor_network.live import Witnessed
-    from ssm_graph.systems.sensor_network.witness import WitnessBounds
-
-    bounds = WitnessBounds(sigmas=arguments.witness_sigmas)
-    Witnessed(engine.new(), bounds, lag_s=lag_s)  # refuses a lag that is too short before the run
-
-    def beside(estimator: Any) -> Witnessed:
-        return Witnessed(estimator, bounds, lag_s=lag_s)
-
-    return Engine(lambda: beside(engine.new()), lambda *packed: beside(engine.restore(*packed)))
 
 
 def _check_sources(arguments: argparse.Namespace, inputs: list[InputConfig]) -> None:
@@ -358,15 +343,7 @@ def add_integrity(parser: argparse.ArgumentParser) -> None:
         "probability that an unseen fault moves the answer out of its protection level",
         usual.missed_detection,
     )
-
-    group.add_argument(
-        "--witness",
-        action="store_true",
-        help="lead a set of guaranteed bounds on beside the answer: a second witness, docs/network.md",
-    )
-    number_option(
-        group, "--witness-sigmas", "K", "its bounds are so many of the stated sigmas", 5.0
-    )
+    add_witness(group)
 
 
 def integrity_of(arguments: argparse.Namespace) -> IntegrityConfig:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
@@ -115,6 +116,16 @@ class Buffers:
         unused = np.isinf(sigma) | is_stuck[here]
         speed[unused], sigma[unused] = np.nan, self.vehicle.beam_sigma
         return counting
+
+    def pack(self) -> dict[str, Array]:
+        """Return all rows that were received and kept."""
+        return {f"rows_{section}": rows.all.copy() for section, rows in self.rows.items()}
+
+    def unpack(self, arrays: Mapping[str, Array]) -> None:
+        """Fill empty buffers with what was packed."""
+        for section, rows in self.rows.items():
+            for row in arrays[f"rows_{section}"]:
+                rows.add(row)
 
     def drop_before(self, time_s: float) -> None:
         """Forget what is older than a time, but for the pings that tell whether a beam is stuck."""

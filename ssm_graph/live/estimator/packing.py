@@ -10,25 +10,12 @@ import numpy as np
 from factors.inertial import Intervals
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.states import States
-from ssm_graph.live.estimator.buffers import Buffers
 from ssm_graph.live.estimator.course import Step
 from ssm_graph.live.estimator.recovery import Reserve
 from ssm_graph.live.estimator.watch import Contradicted, Watch
 from ssm_graph.smoothers.keyframe import Sensors
 from ssm_graph.smoothers.track import Stretch, pack_judged, unpack_judged
 from ssm_graph.smoothers.window import FixedLagConfig, Window
-
-
-def pack_buffers(buffers: Buffers) -> dict[str, Array]:
-    """Return all rows that were received and kept."""
-    return {f"rows_{section}": rows.all.copy() for section, rows in buffers.rows.items()}
-
-
-def unpack_buffers(arrays: Mapping[str, Array], buffers: Buffers) -> None:
-    """Fill empty buffers."""
-    for section, rows in buffers.rows.items():
-        for row in arrays[f"rows_{section}"]:
-            rows.add(row)
 
 
 def pack_step(step: Step) -> tuple[dict[str, Array], dict[str, Any]]:

@@ -18,10 +18,8 @@ from ssm_graph.live.estimator.guard import Guardian
 from ssm_graph.live.estimator.intake import Intake
 from ssm_graph.live.estimator.keyframes import KeyframeMaker
 from ssm_graph.live.estimator.packing import (
-    pack_buffers,
     pack_step,
     part_of,
-    unpack_buffers,
     unpack_step,
 )
 from ssm_graph.live.estimator.recovery import ASTRAY_TIMES, Reserve, is_astray
@@ -110,13 +108,9 @@ class FixedLagSmoother:
         return self._intake.shift_s
 
     def received(self, begin_s: float, end_s: float) -> Mission | None:
-        """Return what was accepted between two times of the states' clock, and is still kept.
-
-        Beside the readings of the lag there is nothing; None before there is a place on Earth.
-        """
-        if self._frame is None:
-            return None
-        return self._intake.buffers.mission(self._frame, begin_s=begin_s, until_s=end_s)
+        """Return what is kept of between two times of the states, None before there is a frame."""
+        frame, kept = self._frame, self._intake.buffers
+        return None if frame is None else kept.mission(frame, begin_s=begin_s, until_s=end_s)
 
     def push(self, message: Message) -> None:
         """Take one message; nothing that it may hold raises."""
@@ -227,7 +221,7 @@ class FixedLagSmoother:
         Delayed states that have not been taken are not in it: take them first.
         """
         intake, course = self._intake, self._course
-        arrays = pack_buffers(intake.buffers)
+        arrays = intake.buffers.pack()
         meta: dict[str, Any] = {
             "shift_s": intake.shift_s,
             "counts": dict(intake.counts),
@@ -264,7 +258,7 @@ class FixedLagSmoother:
         intake = smoother._intake
         intake.shift_s = float(meta["shift_s"])
         intake.counts.update(meta["counts"])
-        unpack_buffers(arrays, intake.buffers)
+        intake.buffers.unpack(arrays)
         smoother._latest_s = intake.buffers.imu.last_s
         smoother._begun_s = meta["begun_s"]
         smoother._known = list(meta.get("contradictions", ()))

@@ -11,12 +11,16 @@ import numpy as np
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.projection import TransverseMercator
-from ssm_graph.systems.road_map.drive import Chassis, GnssFixes, Poses
+from ssm_graph.systems.road_map.drive import Chassis, Curves, Drive, GnssFixes, Poses
+from ssm_graph.systems.road_map.maps.road_map import RoadMap
 
 RECEIVERS: Final = ("ublox", "qcom")
 _A: Final = 6378137.0
 """m, WGS 84"""
 _E_SQ: Final = 6.69437999014e-3
+_NONE: Final = np.zeros(0)
+NO_CURVES: Final = Curves(_NONE, _NONE, _NONE, np.zeros((0, 4)), np.zeros((0, 2)), _NONE, _NONE)
+"""Of a drive whose camera was not looked at."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,6 +60,40 @@ def read_comma2k19(folder: Path) -> Comma2k19:
         t, values = _of(folder, f"processed_log_GNSS_live_gnss_{name}")
         gnss[name] = _fixes(t - began, values, projection)
     return Comma2k19(chassis, gnss, truth, projection)
+
+
+def drive_of_comma2k19(
+    folder: Path, road_map: RoadMap, *, receiver: str = "ublox", curves: Curves | None = None
+) -> Drive:
+    """Return a segment as a drive in the plane of a map.
+
+    Parameters
+    ----------
+    receiver : of `RECEIVERS`, whose fixes are taken.
+    curves : what a lane detector saw, times from the begin of the segment; none by default.
+    """
+    segment = read_comma2k19(folder)
+    plane = road_map.projection
+    if plane is None:
+        raise DataError(
+            f"{road_map.name}: expected a map that knows its place on Earth (lanelet2, GeoJSON in "
+            "degrees), got one in a plane of its own"
+        )
+
+    def moved(x_y: Array) -> Array:
+        return plane.forward(*segment.projection.inverse(x_y))
+
+    fixes, truth = segment.gnss[receiver], segment.truth
+    ahead = moved(truth.x_y + np.column_stack([np.cos(truth.yaw), np.sin(truth.yaw)]))
+    way = ahead - moved(truth.x_y)
+    yaw = np.unwrap(np.arctan2(way[:, 1], way[:, 0]))
+    return Drive(
+        folder.name,
+        GnssFixes(fixes.time_s, moved(fixes.x_y), fixes.sigma_m),
+        segment.chassis,
+        curves or NO_CURVES,
+        Poses(truth.time_s, moved(truth.x_y), yaw),
+    )
 
 
 def _of(folder: Path, stem: str) -> tuple[Array, Array]:

@@ -94,6 +94,11 @@ def read_drive(folder: Path) -> tuple[Drive, RoadMap]:
     return Drive(name, gnss, chassis, curves, truth, gnss_bias_m=bias_m), road_map
 
 
+def read_curves(path: Path) -> Curves:
+    """Return the table of a lane detector, ``curves.csv`` of a drive."""
+    return _curves(read_table(path, path.name, CURVES), 0.0)
+
+
 def _sections(raw: Mapping[str, Any], file: str) -> dict[str, Settings]:
     for name in raw:
         if name != "name" and name not in SECTIONS:

@@ -172,7 +172,7 @@ class FleetTrial(ReadOnlyArrays):
 
     @property
     def half_widths(self) -> Array:
-        """(K, N, 3)"""
+        """(K, N, 3) of the boxes: m, m, rad."""
         return 0.5 * (self.high - self.low)
 
 

@@ -27,6 +27,8 @@ from ssm_graph.systems.sensor_network.witness import (
 
 PROTECTION_SIGMAS: Final = 5.0
 """Of the smoother, beside which the width of the set is told."""
+NOISE_STEPS: Final = 41
+"""Headings that are tried for a truth whose gyro noise is not known."""
 APART_S: Final = 60.0
 """Alarms of a sensor that are closer than this are one finding."""
 RIVALS: Final = {
@@ -167,7 +169,12 @@ def holds_truth(mission: Mission, w: Witness, truth: Reference) -> Mask:
     p_n = mission.frame.p_n_from_geodetic(truth.lat, truth.lon, truth.height)
     off = -(truth.roll_pitch_heading[:, 2] - w.heading)
     psi = np.remainder(off + np.pi, 2.0 * np.pi) - np.pi
-    in_plane = w.sets.excess(np.column_stack([p_n[:, :2], psi])) <= 1.0 + 1e-9
+    # The sets are of the heading without the noise of the gyros, which may be anything within it.
+    share = np.linspace(-1.0, 1.0, NOISE_STEPS)[:, None]
+    drawn = psi + share * w.noise_angle
+    place = np.broadcast_to(p_n[:, :2], (*drawn.shape, 2))
+    excess = w.sets.excess(np.concatenate([place, drawn[..., None]], axis=-1))
+    in_plane = excess.min(axis=0) <= 1.0 + 1e-9
     return np.asarray(in_plane & (p_n[:, 2] >= w.up_low) & (p_n[:, 2] <= w.up_high))
 
 

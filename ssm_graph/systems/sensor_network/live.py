@@ -62,6 +62,24 @@ class Said(NamedTuple):
     """A sentence if the answer was outside the set, else empty."""
 
 
+def start_of(answer: Navigation, time_s: float) -> InitialState:
+    """Return an answer as the start of a set, with its sigmas; all that a witness takes of it."""
+    roll, pitch, heading = (float(angle) for angle in answer.roll_pitch_heading)
+    return InitialState(
+        time_s,
+        answer.lat,
+        answer.lon,
+        answer.height,
+        roll,
+        pitch,
+        heading,
+        velocity_enu=answer.velocity_enu.copy(),
+        position_sigma_enu=answer.position_sigma_enu.copy(),
+        velocity_sigma_enu=answer.velocity_sigma_enu.copy(),
+        attitude_sigma=answer.attitude_sigma.copy(),
+    )
+
+
 class Witnessed:
     """An estimator with a witness beside it; used as the estimator itself.
 
@@ -179,21 +197,11 @@ class Witnessed:
         return self._walks[0].begin_s + (self._n_blocks + 1) * self.bounds.block_s
 
     def _begin(self, at_s: float, answer: Navigation) -> None:
-        """Begin a set with an answer; all that is taken of it is here."""
+        """Begin a set with an answer."""
         mission = self.estimator.received(at_s - MARGIN_S, np.inf)
         if mission is None:
             return
-        start = InitialState(
-            at_s,
-            answer.lat,
-            answer.lon,
-            answer.height,
-            *(float(angle) for angle in answer.roll_pitch_heading),
-            velocity_enu=answer.velocity_enu.copy(),
-            position_sigma_enu=answer.position_sigma_enu.copy(),
-            velocity_sigma_enu=answer.velocity_sigma_enu.copy(),
-            attitude_sigma=answer.attitude_sigma.copy(),
-        )
+        start = start_of(answer, at_s)
         velocity = VelocityWalk(mission, start, self.bounds)
         self._walks = velocity, PlaceWalk(mission.frame, start, self.bounds)
         self._begin_s, self._n_blocks = velocity.begin_s, 0

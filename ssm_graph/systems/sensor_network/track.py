@@ -74,10 +74,9 @@ class Track(ReadOnlyArrays):
     n_left_out: int
 
     def led_to_end(self, i: int, time_s: Array, arm_b: Array) -> tuple[Array, Array, Array]:
-        """Return lever arms (n, 3) at times (n,), and the ways (n, 3) from then to the end of
-        block i, m.
+        """Return lever arms (n, 3) at times (n,), and the ways from then to the end of block i.
 
-        The third (n,) bounds the error of the ways.
+        The ways (n, 3) are in m; the third (n,) bounds their error.
         """
         at = np.minimum(np.searchsorted(self.edge_s, time_s), len(self.edge_s) - 1)
         end = int(np.searchsorted(self.edge_s, self.time_s[i]))
@@ -179,7 +178,9 @@ class VelocityWalk:
             gain = gain + (self._g_n - self._coriolis @ block.velocity) * dt
             way.append(way[-1] + block.step(gain, float(dt)))
             tilt = self._tilt + self._drift(block)
-            force = 9.81 * tilt + self._accel
+            # A heading that turns away takes the velocity with it.
+            swing = self._gyro + self._gyro_share * float(np.linalg.norm(self._theta[n])) / dt
+            force = 9.81 * tilt + self._accel + swing * float(np.linalg.norm(block.velocity))
             self._gained, self._open_s = self._gained + gain, self._open_s + float(dt)
             self._pushed += force * float(dt)
             found = self._ping_at(n + 1, R, float(dt), tilt)
@@ -328,11 +329,12 @@ class VelocityWalk:
         k, T = self._own.of("DVL"), block.span_s
         since = end_s - self.begin_s
         angle = self._gyro_noise * math.sqrt(since)
-        turn = self._gyro * T + self._gyro_share * block.turned
+        tilt = self._tilt + self._drift(block)
+        # Levelling by up to twice the tilt turns about the vertical by a product of two tilts.
+        turn = self._gyro * T + self._gyro_share * block.turned + tilt**2
         scatter = k * worst_sigma(block.covariance)
         steady = self._steady * T + self._share * block.path + self._arm_m
         steady += self._late_s * block.changed + block.curved + block.bent + scatter + block.unseen
-        tilt = self._tilt + self._drift(block)
         level = steady + block.path * (0.5 * tilt**2 + angle + turn) + block.climbed * tilt
         up = steady + block.path * tilt
         bound = np.array([level, level, up])
@@ -352,7 +354,8 @@ class VelocityWalk:
         g = float(np.linalg.norm(self._g_n))
         ends = self._own.of("DVL") * (worst_sigma(block.latest) + worst_sigma(block.earliest))
         white = self._accel_noise * math.sqrt(T)
-        changed = self._share * block.changed
+        speeds = float(np.linalg.norm(block.first) + np.linalg.norm(block.last))
+        changed = self._share * block.changed + drift * (speeds + block.changed)
         tilt = ((ends + 2.0 * self._steady + changed + white) / T + self._accel) / g
         tilt += drift
         if tilt >= self._tilt:

@@ -35,6 +35,7 @@ _AXES: Final = np.eye(3)
 _RADIUS_M: Final = 6.37e6
 _FLOOR: Final = np.array([1e-3, 1e-3, 1e-6])
 """m, m, rad: half-widths that no cut goes below."""
+_NOTHING: Final = np.arange(0)
 BOUNDED: Final = ("DVL", "GNSS", "depth", "compass", "gyros", "accelerometers")
 """Whose bounds may be stated apart."""
 
@@ -114,6 +115,8 @@ class Witness(ReadOnlyArrays):
     up_high: Array
     heading: Array
     """(M,) rad, clockwise from north, as the gyros led it on"""
+    noise_angle: Array
+    """(M,) rad: what the noise of the gyros has made of the heading at most, beside the sets"""
     alarms: tuple[BoundAlarm, ...]
     n_beams: int
     """Beam speeds that were used,"""
@@ -131,7 +134,7 @@ class Witness(ReadOnlyArrays):
         """(M, 4) of east, north, up [m] and heading [rad]."""
         half = 0.5 * (self.high - self.low)
         up = 0.5 * (self.up_high - self.up_low)
-        return np.column_stack([half[:, :2], up, half[:, 2]])
+        return np.column_stack([half[:, :2], up, half[:, 2] + self.noise_angle])
 
 
 def witness(mission: Mission, start: InitialState, bounds: WitnessBounds | None = None) -> Witness:
@@ -198,6 +201,7 @@ class PlaceWalk:
             up_low,
             up_high,
             track.heading.copy(),
+            track.noise_angle.copy(),
             tuple(sorted(self._alarms, key=lambda a: a.time_s)),
             track.n_beams,
             track.n_left_out,
@@ -219,7 +223,7 @@ class PlaceWalk:
     def _fixes(self, i: int) -> None:
         """Cut by the last fix of a block, and by the mean of all, whose noise averages out."""
         gnss = self._mission.gnss
-        rows = self._inside(gnss.valid_s, i) if gnss else []
+        rows = self._inside(gnss.valid_s, i) if gnss else _NOTHING
         if gnss is None or len(rows) == 0:
             return
         k, track = self._own.of("GNSS"), self._track
@@ -241,7 +245,7 @@ class PlaceWalk:
 
     def _compass(self, i: int) -> None:
         log = self._mission.aids.get(HeadingLog)
-        rows = self._inside(log.time_s, i) if log else []
+        rows = self._inside(log.time_s, i) if log else _NOTHING
         if log is None or len(rows) == 0:
             return
         row, k, e = rows[-1], self._own.of("compass"), log.errors
@@ -273,7 +277,7 @@ class PlaceWalk:
     def _depths(self, i: int) -> None:
         """Cut by the last depth of a block, and by the mean of all."""
         log, track = self._mission.depth, self._track
-        rows = self._inside(log.time_s, i) if log else []
+        rows = self._inside(log.time_s, i) if log else _NOTHING
         if log is None or len(rows) == 0:
             return
         k, calibration = self._own.of("depth"), log.calibration

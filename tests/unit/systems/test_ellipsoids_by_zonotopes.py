@@ -61,12 +61,12 @@ def drawn(rng: np.random.Generator) -> Ellipsoids:
 
 def inside(exact: Any, ours: Ellipsoids, rng: np.random.Generator) -> float | None:
     """Return how far an exact set reaches at most, ours 1, in some directions; None if empty."""
-    shares = []
+    shares: list[float] = []
     for direction in rng.standard_normal((5, N)):
         most = reach(exact, direction)
         if most is None:
             return None
-        shares.append((most - direction @ ours.center) / float(ours.extent(direction)))
+        shares.append(float((most - direction @ ours.center) / ours.extent(direction)))
     return max(shares)
 
 

@@ -17,7 +17,7 @@ from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator import ONLINE, FixedLagSmoother
 from ssm_graph.live.estimator.buffers import Buffers
 from ssm_graph.mission.estimate import Found
-from ssm_graph.mission.mission import InitialState, Mission
+from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.navigation import Event, Health, Navigation
 from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.sensors.messages import Message
@@ -34,7 +34,7 @@ from ssm_graph.simulation import (
     simulate,
     with_faults,
 )
-from ssm_graph.systems.sensor_network.live import Witnessed
+from ssm_graph.systems.sensor_network.live import Witnessed, start_of
 from ssm_graph.systems.sensor_network.witness import WitnessBounds, witness
 from tests.live_fixture import a_navigation
 
@@ -140,18 +140,7 @@ def test_block_by_block_it_comes_to_the_sets_of_the_whole(simulated: SimulatedMi
         live.push(message)
         first = first or live.newest()
     assert first is not None
-    start = InitialState(
-        first.time_s,
-        first.lat,
-        first.lon,
-        first.height,
-        *first.roll_pitch_heading.tolist(),
-        velocity_enu=first.velocity_enu,
-        position_sigma_enu=first.position_sigma_enu,
-        velocity_sigma_enu=first.velocity_sigma_enu,
-        attitude_sigma=first.attitude_sigma,
-    )
-    whole = witness(mission, start)
+    whole = witness(mission, start_of(first, first.time_s))
     assert live.last is not None
     assert live.last.time_s[0] == whole.time_s[1] > 20.0
     np.testing.assert_allclose(live.last.half_widths[0], whole.half_widths[1], rtol=1e-6)
@@ -211,11 +200,13 @@ def test_over_a_gap_of_inertial_data_it_begins_anew(simulated: SimulatedMission)
     kept = (imu.time_s < 15.0) | (imu.time_s > 16.5)
     gap = replace(imu, time_s=imu.time_s[kept], gyro_b=imu.gyro_b[kept], accel_b=imu.accel_b[kept])
     live = Witnessed(TruthTeller(simulated))
-    told = [m for m in messages_of(simulated.mission) if not isinstance(m, ImuSample)]
-    samples = [
+    told: list[Message] = [
+        m for m in messages_of(simulated.mission) if not isinstance(m, ImuSample)
+    ]
+    told += [
         m for m in messages_of(replace(simulated.mission, imu=gap)) if isinstance(m, ImuSample)
     ]
-    for message in sorted(told + samples, key=lambda m: m.time_s):
+    for message in sorted(told, key=lambda m: m.time_s):
         live.push(message)
     kinds = [event.kind for event in live.take_events()]
     assert kinds == ["witness_begun_anew"]
