@@ -92,8 +92,8 @@ def mapped(unit: str = "rad/s", table: str | bytes = TABLE) -> Door:
 
     def act(folder: Path) -> list[str | Path]:
         text = MAP.replace("UNIT", unit)
-        named = ["convert", "--map", put(folder / "map.toml", text)]
-        return [*named, put(folder / "table.csv", table), "--out", folder / "out"]
+        by_map, read = put(folder / "map.toml", text), put(folder / "table.csv", table)
+        return ["convert", "--map", by_map, read, "--out", folder / "out"]
 
     return act
 

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from ssm_graph.base.errors import DataError
+from ssm_graph.io.results.place import SUMMARY_NAME
 from ssm_graph.io.results.tables import (
     BEAMS_NAME,
     PROTECTION_NAME,
-    SUMMARY_NAME,
     TRAJECTORY_NAME,
     GrowingResults,
 )

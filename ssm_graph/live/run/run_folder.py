@@ -37,12 +37,11 @@ from ssm_graph.io.mission_folder.toml import TOML_NAME
 from ssm_graph.io.mission_folder.vehicle import check_same_vehicle
 from ssm_graph.io.raw_log.log import RawLog
 from ssm_graph.io.raw_log.rows import ALWAYS, ARRIVALS, replay
-from ssm_graph.io.results.place import RUN_NAME
+from ssm_graph.io.results.place import RUN_NAME, SUMMARY_NAME
 from ssm_graph.io.results.summary import as_json
 from ssm_graph.io.results.tables import (
     BEAMS_NAME,
     PROTECTION_NAME,
-    SUMMARY_NAME,
     TRAJECTORY_NAME,
     GrowingResults,
 )
