@@ -281,7 +281,7 @@ def test_bits() -> None:
         ('name = "x"\n[network]\ndelay_steps = [3, 1]', "least and largest"),
         ('name = "x"\ndisturbances = "storm"', "unknown 'storm'"),
         ('name = "x"\n[setting]\nspeed = 1.0', "did you mean 'speed_m'"),
-        ("name = ", "valid TOML"),
+        ("name = ", "expected TOML"),
     ],
 )
 def test_bad_studies_are_refused(text: str, said: str, tmp_path: Path) -> None:
