@@ -47,6 +47,8 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     from ssm_graph.systems.seabed.dive import find_start
     from ssm_graph.systems.seabed.results import place_of, write_located
 
+    if arguments.seed < 0:
+        raise ConfigError(f"--seed: expected a whole number from 0, got {arguments.seed}")
     if arguments.out is not None:
         check_is_free(arguments.out, may_overwrite=arguments.overwrite)
     mission = read_mission(arguments.mission)
