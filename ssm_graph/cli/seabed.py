@@ -35,7 +35,12 @@ With --out it writes result.json (verdict, place, sigmas, hypotheses), particles
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
     parser.add_argument("mission", type=Path, metavar="MISSION", help="mission folder")
-    parser.add_argument("--map", type=Path, metavar="FILE", help="map (default: that of [map])")
+    parser.add_argument(
+        "--map",
+        type=Path,
+        metavar="FILE",
+        help="map that says where it is (default: that of [map])",
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the results")
     parser.add_argument("--overwrite", action="store_true", help="write over earlier results")
     number_option(parser, "--seed", "N", "of the particles", 0, kind=int)

@@ -37,8 +37,8 @@ def read_netcdf(path: Path) -> Raster:
     values, attributes = found[z]
     if columns.ndim != 1 or rows.ndim != 1:
         raise DataError(
-            f"{path.name}: expected {x} and {y} of one dimension each, got a grid that is turned or "
-            "curved; warp it first, with  gdalwarp -t_srs EPSG:4326"
+            f"{path.name}: expected {x} and {y} of one dimension each, got a grid that is turned "
+            "or curved; warp it first, with  gdalwarp -t_srs EPSG:4326"
         )
     if values.shape != (len(rows), len(columns)):
         raise DataError(

@@ -44,7 +44,9 @@ def read_ascii_grid(path: Path) -> Raster:
     if "cellsize" not in header and not {"dx", "dy"} <= header.keys():
         missing.add("cellsize")
     missing |= {
-        f"{axis}llcorner" for axis in "xy" if not {f"{axis}llcorner", f"{axis}llcenter"} & set(header)
+        f"{axis}llcorner"
+        for axis in "xy"
+        if not {f"{axis}llcorner", f"{axis}llcenter"} & set(header)
     }
     if missing:
         raise DataError(
