@@ -139,6 +139,13 @@ class Settings:
         """Return a number in the unit of the file; an optional one that is not given is zero."""
         return float(self.values.get(key, 0.0))
 
+    def count(self, key: str) -> int:
+        """Return a whole number; an optional one that is not given is zero."""
+        value = self.number(key)
+        if not value.is_integer():
+            raise self.fault(key, f"expected a whole number, got {value:g}")
+        return int(value)
+
     def array(self, key: str) -> Array:
         """Return a list as an array, in the unit of the file."""
         return np.array(self.values[key], dtype=np.float64)

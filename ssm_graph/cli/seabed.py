@@ -35,7 +35,12 @@ With --out it writes result.json (verdict, place, sigmas, hypotheses), particles
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
     parser.add_argument("mission", type=Path, metavar="MISSION", help="mission folder")
-    parser.add_argument("--map", type=Path, metavar="FILE", help="map (default: that of [map])")
+    parser.add_argument(
+        "--map",
+        type=Path,
+        metavar="FILE",
+        help="map that says where it is (default: that of [map])",
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the results")
     parser.add_argument("--overwrite", action="store_true", help="write over earlier results")
     number_option(parser, "--seed", "N", "of the particles", 0, kind=int)
@@ -47,6 +52,8 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     from ssm_graph.systems.seabed.dive import find_start
     from ssm_graph.systems.seabed.results import place_of, write_located
 
+    if arguments.seed < 0:
+        raise ConfigError(f"--seed: expected a whole number from 0, got {arguments.seed}")
     if arguments.out is not None:
         check_is_free(arguments.out, may_overwrite=arguments.overwrite)
     mission = read_mission(arguments.mission)

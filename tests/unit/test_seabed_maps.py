@@ -147,6 +147,25 @@ def test_soundings_without_a_raster(tmp_path: Path) -> None:
     assert np.isnan(found[2])
 
 
+def test_decimal_commas(tmp_path: Path) -> None:
+    """Where semicolons part the columns, commas are those of decimals."""
+    path = tmp_path / "m.csv"
+    rows = (f"{5 * i},0;{5 * j},0;-4{i},5" for i in range(5) for j in range(5))
+    path.write_text("x;y;z\n" + "\n".join(rows) + "\n")
+    grid = read_seabed(path, FRAME, crs="local")
+    np.testing.assert_array_equal(grid.height[0], [-40.5, -41.5, -42.5, -43.5, -44.5])
+
+
+def test_sigmas_lie_where_the_heights_do(tmp_path: Path) -> None:
+    """A raster of sigmas that is as large, but beside the map, is refused."""
+    own, sigma = tmp_path / "m.asc", tmp_path / "sigma.asc"
+    head, rows = "ncols 4\nnrows 4\nyllcorner 0\ncellsize 5\n", "1 2 3 4\n" * 4
+    own.write_text("xllcorner 0\n" + head + rows)
+    sigma.write_text("xllcorner 40\n" + head + rows)
+    with pytest.raises(DataError, match=r"sigma\.asc.*8 cells beside it"):
+        read_seabed(own, FRAME, crs="local", sigma=sigma)
+
+
 def test_what_no_map_is(tmp_path: Path) -> None:
     """Each with file, place and what to try."""
     path = tmp_path / "m.asc"
@@ -156,6 +175,10 @@ def test_what_no_map_is(tmp_path: Path) -> None:
         ("1 2 3\n" * 30, "line 1: expected a header"),
         (head + "1 2 3 4\n" * 3, "16 in all, got 12"),
         (head + rows[:-2] + "x\n", "line 9: expected a number, got 'x'"),
+        (head.replace("ncols 4", "ncols inf") + rows, "ncols: expected a count, got inf"),
+        (head.replace("xllcorner 0\n", "") + rows, "line 5: expected a header with xllcorner"),
+        (head.replace("cellsize 5", "cellsize nan") + rows, "steps from nan to nan"),
+        (head + "-9999 " * 16, "no cell has a height"),
     ):
         path.write_text(text)
         with pytest.raises(DataError, match=said):
@@ -171,11 +194,32 @@ def test_what_no_map_is(tmp_path: Path) -> None:
     xyz.write_text("0 0 1\n0 1\n")
     with pytest.raises(DataError, match="line 2: expected x, y and z"):
         read_seabed(xyz, FRAME)
+    for text, said in (
+        ("".join(f"{i} {i} {-i}\n" for i in range(20)), "got them on a line"),
+        ("0 0 1\nnan 1 1\n", "line 2: expected a place, got 'nan 1 1'"),
+    ):
+        xyz.write_text(text)
+        with pytest.raises(DataError, match=said):
+            read_seabed(xyz, FRAME)
     tif = tmp_path / "m.tif"
     Image.fromarray(np.zeros((8, 8), np.float32)).save(tif)
     with pytest.raises(DataError, match="does not say where it is"):
         read_seabed(tif, FRAME)
+    keys, tie = (1, 1, 0, 2, 2048, 0, 1, 4326, 3072, 0, 1, 32767), (0.0,) * 6 + (10.0, 10.0)
+    geotiff(tif, DEPTH, keys, tie)
+    with pytest.raises(ConfigError, match="does not say what its coordinates are"):
+        read_seabed(tif, FRAME)  # projected by rules of its own, from degrees that it names
     nc = tmp_path / "m.nc"
+    with netcdf_file(nc, "w") as file:
+        for name, size in (("lon", 5), ("lat", 4)):
+            file.createDimension(name, size)
+        for name in ("lon", "lat", "depth"):
+            file.createVariable(name, "f8", ("lat", "lon"))[:] = 1.0
+    with pytest.raises(DataError, match="turned or curved"):
+        read_seabed(nc, FRAME)
+    nc.write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(40))
+    with pytest.raises(DataError, match=r"m\.nc: expected NetCDF"):
+        read_seabed(nc, FRAME)
     with netcdf_file(nc, "w") as file:
         file.createDimension("time", 3)
         file.createVariable("time", "f8", ("time",))[:] = 0.0

@@ -24,8 +24,8 @@ def read_geotiff(path: Path) -> Raster:
     from PIL import Image, UnidentifiedImageError
 
     try:
-        with warnings.catch_warnings(), Image.open(path) as image:
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        # Of a size that is allowed, and of damage that is told below.
+        with warnings.catch_warnings(action="ignore"), Image.open(path) as image:
             tags: Any = getattr(image, "tag_v2", {})
             values = np.array(image, dtype=np.float64)
     except Image.DecompressionBombError as error:
@@ -44,16 +44,22 @@ def read_geotiff(path: Path) -> Raster:
     dx, dy, west, north = _place(tags, path)
     no_data = str(tags.get(_NO_DATA, "")).strip("\x00 ")
     if no_data:
-        values = np.where(np.isclose(values, float(no_data), rtol=1e-6), np.nan, values)
+        try:
+            missing = float(no_data)
+        except ValueError:
+            raise DataError(
+                f"{path.name}: expected a number that stands for no data, got {no_data[:40]!r}; "
+                "state one, with  gdal_edit.py -a_nodata"
+            ) from None
+        values = np.where(np.isclose(values, missing, rtol=1e-6), np.nan, values)
     keys = _keys(tags)
     middle = 0.0 if keys.get(_RASTER) == _PIXEL_IS_POINT else 0.5
     n_y, n_x = values.shape
-    code = next(
-        (keys[k] for k in (_PROJECTED, _GEOGRAPHIC) if 0 < keys.get(k, 0) < _USER_DEFINED), 0
-    )
+    # A projected raster names the degrees that it was projected from as well.
+    code = keys.get(_PROJECTED, keys.get(_GEOGRAPHIC, 0))
     return Raster(
         path.name,
-        f"EPSG:{code}" if code else "",
+        f"EPSG:{code}" if 0 < code < _USER_DEFINED else "",
         np.asarray(west + dx * (np.arange(n_x) + middle)),
         np.asarray(north - dy * (np.arange(n_y)[::-1] + middle)),
         values[::-1],
@@ -62,11 +68,11 @@ def read_geotiff(path: Path) -> Raster:
 
 def _place(tags: Any, path: Path) -> tuple[float, float, float, float]:
     """Return steps to the east and south, and the place of the north-western corner."""
-    if _SCALE in tags and _TIE in tags:
-        (dx, dy), tie = tags[_SCALE][:2], tags[_TIE]
+    scale, tie, m = (np.ravel(tags.get(tag, ())).tolist() for tag in (_SCALE, _TIE, _MATRIX))
+    if len(scale) >= 2 and len(tie) >= 5:
+        dx, dy = scale[:2]
         return dx, dy, tie[3] - tie[0] * dx, tie[4] + tie[1] * dy
-    if _MATRIX in tags:
-        m = tags[_MATRIX]
+    if len(m) >= 8:
         if m[1] == 0.0 and m[4] == 0.0:
             return m[0], -m[5], m[3], m[7]
         raise DataError(

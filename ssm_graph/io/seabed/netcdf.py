@@ -35,6 +35,11 @@ def read_netcdf(path: Path) -> Raster:
         )
     columns, rows = found[x][0], found[y][0]
     values, attributes = found[z]
+    if columns.ndim != 1 or rows.ndim != 1:
+        raise DataError(
+            f"{path.name}: expected {x} and {y} of one dimension each, got a grid that is turned "
+            "or curved; warp it first, with  gdalwarp -t_srs EPSG:4326"
+        )
     if values.shape != (len(rows), len(columns)):
         raise DataError(
             f"{path.name}: expected {z} over rows {y} and columns {x}, {len(rows)} by "
@@ -60,15 +65,18 @@ def _of_hdf(path: Path) -> Variables:
     except ImportError as error:
         raise MissingExtraError("h5py", extra="map", purpose=f"{path.name}, NetCDF 4,") from error
     found = {}
-    with h5py.File(path, "r") as file:
-        for name, variable in file.items():
-            if (
-                isinstance(variable, h5py.Dataset)
-                and variable.dtype.kind in "iuf"
-                and variable.shape
-            ):
-                attributes = {k: _plain(v) for k, v in variable.attrs.items()}
-                found[name] = _scaled(np.asarray(variable[()]), attributes), attributes
+    try:
+        with h5py.File(path, "r") as file:
+            for name, variable in file.items():
+                if (
+                    isinstance(variable, h5py.Dataset)
+                    and variable.dtype.kind in "iuf"
+                    and variable.shape
+                ):
+                    attributes = {k: _plain(v) for k, v in variable.attrs.items()}
+                    found[name] = _scaled(np.asarray(variable[()]), attributes), attributes
+    except (OSError, RuntimeError, KeyError, ValueError) as error:
+        raise _damaged(path, error) from error
     return found
 
 
@@ -81,10 +89,12 @@ def _of_classic(path: Path) -> Variables:
                     attributes = {k: _plain(v) for k, v in variable._attributes.items()}
                     found[name] = _scaled(np.asarray(variable[:]), attributes), attributes
     except (TypeError, ValueError, IndexError, KeyError) as error:
-        raise DataError(
-            f"{path.name}: expected NetCDF, got {error}; is the file cut off?"
-        ) from error
+        raise _damaged(path, error) from error
     return found
+
+
+def _damaged(path: Path, error: Exception) -> DataError:
+    return DataError(f"{path.name}: expected NetCDF, got {error}; is the file cut off?")
 
 
 def _plain(value: Any) -> Any:

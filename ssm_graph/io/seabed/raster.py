@@ -102,11 +102,14 @@ class Raster(FrozenArrays):
         super(Raster, self).__post_init__()
         for axis, at in (("columns", self.x), ("rows", self.y)):
             step = np.diff(at)
-            if len(at) < 4 or step.min() <= 0.0 or np.ptp(step) > 0.01 * step.mean():
+            if len(at) < 4:
+                raise DataError(f"{self.name}: expected at least 4 {axis}, got {len(at)}")
+            low, high = float(step.min()), float(step.max())
+            # Written so that what is not a number is refused as well.
+            if not (low > 0.0 and high - low <= 0.01 * step.mean()):
                 raise DataError(
-                    f"{self.name}: expected at least 4 {axis}, evenly spaced, got {len(at)} with "
-                    f"steps from {step.min(initial=0.0):.6g} to {step.max(initial=0.0):.6g}; grid "
-                    "the soundings again"
+                    f"{self.name}: expected {axis} that increase by even steps, got steps from "
+                    f"{low:.6g} to {high:.6g}; grid the soundings again"
                 )
 
 
@@ -124,28 +127,25 @@ def grid_of(
     *,
     is_down: bool,
     datum_m: float,
-    around: tuple[float, float, float] | None = None,
 ) -> SeabedGrid:
-    """Return a raster as heights about a navigation frame.
+    """Return a raster as heights about a navigation frame, up to 30 km from its origin each way.
 
     Parameters
     ----------
     is_down : whether its values are depths, positive down.
     datum_m : height of its zero above the ellipsoid, m.
-    around : x, y and half a side of the square of the frame's plane that is wanted, m; a square
-        of 30 km each way about the origin without.
 
     Raises :class:`DataError` where the raster lies elsewhere.
     """
     height = datum_m + (-raster.values if is_down else raster.values)
     if plane.is_local:
-        step = float(raster.x[1] - raster.x[0])
-        if abs(float(raster.y[1] - raster.y[0]) - step) < 1e-6 * step:
+        step, step_y = (float(np.ptp(at)) / (len(at) - 1) for at in (raster.x, raster.y))
+        if abs(step_y - step) < 1e-6 * step:
             return SeabedGrid(
                 *(raster.name, frame, float(raster.x[0]), float(raster.y[0]), step, height),
                 raster.sigma,
             )
-    x_m, y_m, cell = _wanted(raster, plane, frame, around or (0.0, 0.0, FARTHEST_M))
+    x_m, y_m, cell = _wanted(raster, plane, frame)
     row, column = _rows_and_columns(raster, plane, frame, x_m, y_m, float(np.nanmedian(height)))
     found = _interpolated(height, row, column)
     if not np.isfinite(found).any():
@@ -157,9 +157,7 @@ def grid_of(
     return SeabedGrid(raster.name, frame, float(x_m[0]), float(y_m[0]), cell, found, sigma)
 
 
-def _wanted(
-    raster: Raster, plane: Plane, frame: LocalFrame, around: tuple[float, float, float]
-) -> tuple[Array, Array, float]:
+def _wanted(raster: Raster, plane: Plane, frame: LocalFrame) -> tuple[Array, Array, float]:
     """Return columns and rows of the raster that is made, and its cell, m."""
     if plane.is_local:
         x_edge, y_edge = raster.x[[0, -1]], raster.y[[0, -1]]
@@ -181,14 +179,13 @@ def _wanted(
         middle = p_n[10:12, 10:12].reshape(-1, 3)
         steps = np.linalg.norm(middle[1:3] - middle[0], axis=1) * 20.0
         cell = float(min(steps[0] / (len(raster.x) - 1), steps[1] / (len(raster.y) - 1)))
-    x, y, half = around
-    low = np.maximum([x_edge[0], y_edge[0]], [x - half, y - half])
-    high = np.minimum([x_edge[1], y_edge[1]], [x + half, y + half])
+    low = np.maximum([x_edge[0], y_edge[0]], -FARTHEST_M)
+    high = np.minimum([x_edge[1], y_edge[1]], FARTHEST_M)
     if np.any(high - low < 3.0 * cell):
         raise DataError(
             f"{raster.name}: the map covers {x_edge[0]:.0f} to {x_edge[1]:.0f} m east and "
             f"{y_edge[0]:.0f} to {y_edge[1]:.0f} m north of the mission's origin; expected it to "
-            f"cover the square of {half:.0f} m about {x:.0f} m east, {y:.0f} m north"
+            f"lie within {FARTHEST_M:.0f} m"
         )
     cell = max(cell, math.sqrt(float(np.prod(high - low)) / MOST_CELLS))
     return np.arange(low[0], high[0], cell), np.arange(low[1], high[1], cell), cell

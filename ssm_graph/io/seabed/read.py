@@ -11,6 +11,7 @@ import numpy as np
 
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.base.frozen import Array
 from ssm_graph.io.seabed.geotiff import read_geotiff
 from ssm_graph.io.seabed.netcdf import read_netcdf
 from ssm_graph.io.seabed.raster import GEOGRAPHIC, Plane, Raster, frame_of, grid_of, plane_of
@@ -49,7 +50,6 @@ def read_seabed(
     is_down: bool | None = None,
     datum_m: float = 0.0,
     sigma: Path | None = None,
-    around: tuple[float, float, float] | None = None,
 ) -> SeabedGrid:
     """Read a map about a navigation frame, or about its own middle.
 
@@ -61,9 +61,10 @@ def read_seabed(
     is_down : whether its values are depths; None for what the file says, or else their sign.
     datum_m : height of its zero above the ellipsoid, m.
     sigma : a map of the same raster with standard deviations, m.
-    around : x, y and half a side of the square that is wanted, m.
     """
     raster = read_raster(path)
+    if not np.isfinite(raster.values).any():
+        raise DataError(f"{path.name}: no cell has a height; is the no-data value right?")
     if sigma is not None:
         other = read_raster(sigma)
         if other.values.shape != raster.values.shape:
@@ -71,6 +72,12 @@ def read_seabed(
                 f"{sigma.name}: expected the raster of {path.name}, "
                 f"{' by '.join(map(str, raster.values.shape))}, got "
                 f"{' by '.join(map(str, other.values.shape))}"
+            )
+        off = max(_cells_off(raster.x, other.x), _cells_off(raster.y, other.y))
+        if off > 0.5:
+            raise DataError(
+                f"{sigma.name}: expected the raster of {path.name}, got one that lies up to "
+                f"{off:.3g} cells beside it"
             )
         raster = replace(raster, sigma=other.values)
     plane = _plane(raster, crs)
@@ -88,8 +95,11 @@ def read_seabed(
         frame or frame_of(raster, plane),
         is_down=down,
         datum_m=datum_m,
-        around=around,
     )
+
+
+def _cells_off(at: Array, other: Array) -> float:
+    return float(np.abs(other - at).max() / (at[1] - at[0]))
 
 
 def _plane(raster: Raster, crs: str) -> Plane:
@@ -104,7 +114,8 @@ def _plane(raster: Raster, crs: str) -> Plane:
         else:
             raise ConfigError(
                 f"{raster.name}: the file does not say what its coordinates are, x {west:.6g} to "
-                f"{east:.6g}, y {south:.6g} to {north:.6g}; give crs, such as EPSG:32633, or local "
-                "for metres east and north of the mission's origin"
+                f"{east:.6g}, y {south:.6g} to {north:.6g}; give crs in "
+                "[map] of mission.toml, such as EPSG:32633, or local for metres east and north of "
+                "the mission's origin"
             )
     return plane_of(named, raster.name)

@@ -71,7 +71,8 @@ def with_map(mission: Mission, settings: Settings, folder: Path) -> Mission:
 def with_map_file(mission: Mission, path: Path) -> Mission:
     """Return a mission with the map of a file, in the place of that which it has.
 
-    What is stated of that one holds for this one, too; without any, errors are the usual ones.
+    The errors and ``within_m`` that are stated of that one hold for this one, too; its ``crs``,
+    ``values`` and ``datum_m`` do not: the file has to say them. Without any, errors are the usual.
     """
     before = mission.aids.get(TerrainLog)
     grid = read_seabed(path, frame_for(mission))

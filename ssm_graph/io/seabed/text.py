@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator
-from scipy.spatial import cKDTree
+from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
@@ -42,11 +43,19 @@ def read_ascii_grid(path: Path) -> Raster:
     missing = {"ncols", "nrows"} - header.keys()
     if "cellsize" not in header and not {"dx", "dy"} <= header.keys():
         missing.add("cellsize")
+    missing |= {
+        f"{axis}llcorner"
+        for axis in "xy"
+        if not {f"{axis}llcorner", f"{axis}llcenter"} & set(header)
+    }
     if missing:
         raise DataError(
             f"{path.name}, line {first + 1}: expected a header with {', '.join(sorted(missing))}, "
             "as ESRI ASCII grids have; an XYZ file ends with .xyz"
         )
+    for name in ("ncols", "nrows"):
+        if not (header[name] >= 1.0 and header[name].is_integer()):
+            raise DataError(f"{path.name}: {name}: expected a count, got {header[name]:g}")
     n_x, n_y = int(header["ncols"]), int(header["nrows"])
     dx = header.get("cellsize", header.get("dx", 0.0))
     dy = header.get("cellsize", header.get("dy", 0.0))
@@ -64,8 +73,12 @@ def read_ascii_grid(path: Path) -> Raster:
                 _number(word, path, number)
         raise
     values = np.where(values == header.get("nodata_value", -9999.0), np.nan, values)
-    west = header.get("xllcenter", header.get("xllcorner", 0.0) + 0.5 * dx)
-    south = header.get("yllcenter", header.get("yllcorner", 0.0) + 0.5 * dy)
+    west, south = (
+        header[f"{axis}llcenter"]
+        if f"{axis}llcenter" in header
+        else header[f"{axis}llcorner"] + 0.5 * step
+        for axis, step in (("x", dx), ("y", dy))
+    )
     return Raster(
         path.name,
         "",
@@ -109,7 +122,9 @@ def read_xyz(path: Path) -> Raster:
     rows: list[list[float]] = []
     named = False
     for number, line in enumerate(path.read_text("utf-8-sig", errors="replace").split("\n"), 1):
-        words = line.replace(",", " ").replace(";", " ").split()
+        # Where semicolons part the numbers, commas are those of decimals.
+        parted = line.replace(",", ".").replace(";", " ") if ";" in line else line.replace(",", " ")
+        words = parted.split()
         if not words or words[0].startswith("#"):
             continue
         if not rows and not named and not _is_number(words[0]):
@@ -120,6 +135,8 @@ def read_xyz(path: Path) -> Raster:
                 f"{path.name}, line {number}: expected x, y and z, got {len(words)} numbers"
             )
         rows.append([_number(word, path, number) for word in words])
+        if not all(math.isfinite(rows[-1][columns[axis]]) for axis in "xy"):
+            raise DataError(f"{path.name}, line {number}: expected a place, got {line[:40]!r}")
     width = min(map(len, rows), default=0)
     if len(rows) < 16:
         raise DataError(f"{path.name}: expected at least 16 soundings, got {len(rows)}")
@@ -154,7 +171,7 @@ def _columns(words: list[str], path: Path, line: int) -> dict[str, int]:
 
 
 def _gridded(name: str, x: Array, y: Array, z: Array, sigma: Array | None) -> Raster:
-    """Return soundings as a raster: as they lie, or averaged in cells where they lie anyhow."""
+    """Return soundings as a raster: as they lie, or joined by triangles where they lie anyhow."""
     steps = [_step(x), _step(y)]
     shape = [
         round(np.ptp(a) / s) + 1 if s > 0.0 else 0 for a, s in zip((y, x), steps[::-1], strict=True)
@@ -167,7 +184,7 @@ def _gridded(name: str, x: Array, y: Array, z: Array, sigma: Array | None) -> Ra
             and np.abs(row * steps[1] + y.min() - y).max() < 0.05 * steps[1]
         )
     if not is_raster:
-        return _averaged(name, x, y, z, sigma)
+        return _triangulated(name, x, y, z, sigma)
     at = row.astype(int), column.astype(int)
     values = np.full(shape, np.nan)
     values[at] = z
@@ -187,17 +204,21 @@ def _step(at: Array) -> float:
     return float(gaps.min()) if len(gaps) else 0.0
 
 
-def _averaged(name: str, x: Array, y: Array, z: Array, sigma: Array | None) -> Raster:
+def _triangulated(name: str, x: Array, y: Array, z: Array, sigma: Array | None) -> Raster:
     """Return a raster with about one sounding a cell, small holes bridged by triangles."""
+    on_line = DataError(f"{name}: expected soundings over an area, got them on a line")
     cell = float(np.sqrt(np.ptp(x) * np.ptp(y) / len(x)))
     if not cell > 0.0:
-        raise DataError(f"{name}: expected soundings over an area, got them on a line")
+        raise on_line
+    try:
+        triangles = Delaunay(np.column_stack([x, y]))
+    except QhullError as error:
+        raise on_line from error
     columns = np.arange(x.min(), x.max() + cell, cell)
     rows = np.arange(y.min(), y.max() + cell, cell)
-    points = np.column_stack([x, y])
     at = np.stack(np.meshgrid(columns, rows), axis=-1)
-    distance, _ = cKDTree(points).query(at.reshape(-1, 2))
+    distance, _ = cKDTree(triangles.points).query(at.reshape(-1, 2))
     far = distance.reshape(at.shape[:2]) > _FILLED_CELLS * cell
-    values = np.where(far, np.nan, LinearNDInterpolator(points, z)(at))
-    own = None if sigma is None else np.asarray(LinearNDInterpolator(points, sigma)(at))
+    values = np.where(far, np.nan, LinearNDInterpolator(triangles, z)(at))
+    own = None if sigma is None else np.asarray(LinearNDInterpolator(triangles, sigma)(at))
     return Raster(name, "", columns, rows, values, own)

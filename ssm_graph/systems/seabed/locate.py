@@ -233,8 +233,8 @@ def _judge(
     if found[0].misfit > judged.misfit:
         return Verdict.FAILED, (
             f"the best place explains the ranges with a loss of {found[0].misfit:.1f} each, "
-            f"expected below {judged.misfit:.1f}: another place, an old map, a datum that is not "
-            "stated, or a sigma that is too small"
+            f"expected below {judged.misfit:.1f}: a start more than {radius_m:.0f} m from where it "
+            "is said to be, an old map, a datum that is not stated, or a sigma that is too small"
         )
     if sigma > judged.resolved_m or likely > judged.few:
         relief = grid.relief(middle, radius_m)

@@ -122,12 +122,10 @@ def _in_doubt(mission: Mission, start_m: float, rng: np.random.Generator) -> Ini
     turn = rng.uniform(0.0, 2.0 * np.pi)
     p_n = mission.frame.p_n_from_geodetic(initial.lat, initial.lon, initial.height)
     p_n = p_n + off * np.array([np.cos(turn), np.sin(turn), 0.0])
-    lat, lon, height = mission.frame.geodetic_from_p_n(p_n)
+    lat, lon, _ = mission.frame.geodetic_from_p_n(p_n)
     # The sigma of each axis of an even circle is half its radius.
     sigma = np.array([0.5 * start_m, 0.5 * start_m, initial.position_sigma_enu[2]])
-    return replace(
-        initial, lat=float(lat), lon=float(lon), height=float(height), position_sigma_enu=sigma
-    )
+    return replace(initial, lat=float(lat), lon=float(lon), position_sigma_enu=sigma)
 
 
 def mission_with_map(dive: SimulatedDive) -> Mission:

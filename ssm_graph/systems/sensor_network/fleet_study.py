@@ -121,13 +121,13 @@ def read_fleet_study(path: Path) -> FleetStudy:
         for name in sections[section]:
             field, unit = _FIELDS.get(name, (name, 1.0))
             value = part.number(name) * unit
-            found[field] = int(value) if field in _COUNTS else value
+            found[field] = part.count(name) if field in _COUNTS else value
     try:
         setting = FleetSetting(**found)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
-    runs = int(top.number("runs")) if "runs" in top else 5
-    return FleetStudy(top.text("name"), setting, runs, int(top.number("seed")))
+    runs = top.count("runs") if "runs" in top else 5
+    return FleetStudy(top.text("name"), setting, runs, top.count("seed"))
 
 
 def run_fleet_study(study: FleetStudy, tell: Callable[[str], None] = lambda _: None) -> FleetResult:

@@ -105,15 +105,15 @@ def read_network_study(path: Path) -> NetworkStudy:
     kinds = tuple(Disturbance)
     if "disturbances" in top:
         kinds = tuple(_disturbance(top, word) for word in top.text("disturbances").split(","))
-    runs = int(top.number("runs")) if "runs" in top else 20
-    return NetworkStudy(setting, kinds, runs, int(top.number("seed")))
+    runs = top.count("runs") if "runs" in top else 20
+    return NetworkStudy(setting, kinds, runs, top.count("seed"))
 
 
 def _fields(part: Settings) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name, value in part.given().items():
         is_count = name in ("n_nodes", "n_steps", "bits")
-        found[name] = int(value) if is_count else value
+        found[name] = part.count(name) if is_count else value
         if isinstance(value, np.ndarray):
             found[name] = tuple(float(x) for x in value)
     if "edges" in part:

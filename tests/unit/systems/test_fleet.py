@@ -127,6 +127,7 @@ def test_the_command_writes_page_table_and_figure(tmp_path: Path) -> None:
         ("slot_s = 3", "slots = 3", "did you mean 'slot_s'"),
         ("loss = 0.2", "loss = 1.2", "loss: expected"),
         ("n_steps = 30", "n_vehicles = 1", "n_vehicles: expected"),
+        ("n_steps = 30", "n_vehicles = 2.5", "n_vehicles: expected a whole number, got 2.5"),
     ],
 )
 def test_bad_studies_are_refused(old: str, new: str, said: str, tmp_path: Path) -> None:

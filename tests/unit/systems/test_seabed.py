@@ -203,7 +203,7 @@ def test_a_map_of_another_place_fails() -> None:
     track, way = dived(truth)
     found = found_on(other, errors, track, way[0])
     assert found.verdict is Verdict.FAILED
-    assert "another place" in found.reason
+    assert "a start more than 150 m from where it is said to be" in found.reason
 
 
 def test_rivals_apart_from_each_other() -> None:

@@ -282,6 +282,7 @@ def test_bits() -> None:
         ('name = "x"\ndisturbances = "storm"', "unknown 'storm'"),
         ('name = "x"\n[setting]\nspeed = 1.0', "did you mean 'speed_m'"),
         ("name = ", "expected TOML"),
+        ('name = "x"\nruns = 2.5', "runs: expected a whole number, got 2.5"),
     ],
 )
 def test_bad_studies_are_refused(text: str, said: str, tmp_path: Path) -> None:
