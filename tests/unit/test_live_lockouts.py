@@ -273,7 +273,7 @@ def test_pings_of_a_clock_that_was_set_forward(off_s: float) -> None:
 
 
 def test_both_clocks_are_set_at_once() -> None:
-    """The instrument's is followed, and whether it follows the vehicle's is no question any more."""
+    """The instrument's is followed; whether it follows the vehicle's is no question any more."""
     sifted = Sifted(is_steady=False)
     sent = [100.0 + 0.5 * k for k in range(40)]
     for k, time_s in enumerate(sent):
