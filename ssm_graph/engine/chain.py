@@ -195,12 +195,16 @@ class Chain:
     def solve_steps(self, border: Array | None = None) -> Steps[ChainSolution]:
         """Make :meth:`solve` in steps."""
         answers, conditional = self._answers.copy(), self._own.copy()
-        dot = np.dot
-        for k in range(len(answers) - 2, -1, -1):
-            M = self._gain[k]
-            answers[k] -= dot(M, answers[k + 1])
-            conditional[k] += dot(dot(M, conditional[k + 1]), M.T)
-            yield 0.008
+        dot, add, subtract = np.dot, np.add, np.subtract
+        led, half, whole = np.empty(answers.shape[1:]), *np.empty((2, self._n, self._n))
+        answer, covariance = answers[-1], conditional[-1]
+        before = (column[-2::-1] for column in (self._gain, self._gain.mT, answers, conditional))
+        # Into arrays that are there already: most of the time is that of small arrays made.
+        for M, M_T, own_answer, own_covariance in zip(*before, strict=True):
+            subtract(own_answer, dot(M, answer, led), own_answer)
+            add(own_covariance, dot(dot(M, covariance, half), M_T, whole), own_covariance)
+            answer, covariance = own_answer, own_covariance
+            yield 0.007
         constants_step, constants_cov = self._solve_border(border)
         sensitivity = answers[:, :, :-1]
         step = answers[:, :, -1] + sensitivity @ constants_step

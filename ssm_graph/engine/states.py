@@ -123,10 +123,6 @@ class States(NamedTuple):
         constants = self.constants if constants_step is None else self.constants + constants_step
         return States(*own, walks=self.walks + step[:, STATE_DIM:], constants=constants)
 
-    def is_same(self, other: States) -> bool:
-        """Return whether these are the other states, to the last bit."""
-        return all(np.array_equal(a, b) for a, b in zip(self, other, strict=True))
-
     def take(self, keyframes: NDArray[np.intp] | slice) -> States:
         """Return the states of some keyframes."""
         return States(

@@ -246,7 +246,7 @@ class Window:
 
     def _append(self, keyframe: Keyframe, last: States) -> None:
         graph, n_rows = self._graph, len(self._weights)
-        graph.append(keyframe, last)
+        graph.append(keyframe, last, self._step[-1])
         n_new = len(graph.error) - n_rows
         self._step = np.concatenate([self._step, np.zeros((1, graph.state_dim))])
         self._covariance = np.concatenate([self._covariance, self._covariance[-1:]])

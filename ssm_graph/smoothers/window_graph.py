@@ -17,7 +17,7 @@ from ssm_graph.base.times import Indices
 from ssm_graph.engine.chain import Chain
 from ssm_graph.engine.error_state import GYRO_BIAS, ROTATION, STATE_DIM, VELOCITY, InitialMoments
 from ssm_graph.engine.extras import Extras
-from ssm_graph.engine.marginal_prior import MarginalPrior, prior_at_start, prior_on
+from ssm_graph.engine.marginal_prior import MarginalPrior, moved_chart, prior_at_start, prior_on
 from ssm_graph.engine.states import States
 from ssm_graph.graph.beam_rows import BeamRows, CalibratedBeams, linearize_beams
 from ssm_graph.graph.inertial_rows import Ahead, InertialRows
@@ -166,16 +166,19 @@ class WindowGraph:
         """Have the chain eliminated again from a keyframe on."""
         self._stale = min(self._stale, keyframe)
 
-    def append(self, keyframe: Keyframe, last: States) -> None:
-        """Add a keyframe where the inertial data lead from ``last`` (1, ...), the newest one."""
-        interval = inertial_data([keyframe])
-        self.ahead = ahead = self.inertial.predict(interval, last)
-        predicted, at = ahead.states, self.at.take(np.s_[-1:])
-        self.at = self.at.followed_by(predicted)
-        if at.is_same(last):
-            self._between += list(ahead.rows(last))
-        else:
-            self._between += list(self.inertial.rows(interval, self.at.take(np.s_[-2:])))
+    def append(self, keyframe: Keyframe, last: States, step: Array) -> None:
+        """Add a keyframe where the inertial data lead from ``last`` (1, ...), the newest one.
+
+        ``step`` (n,) is by how much that lies off where it is linearised.
+        """
+        self.ahead = ahead = self.inertial.predict(inertial_data([keyframe]), last)
+        self.at = self.at.followed_by(ahead.states)
+        (rows,) = ahead.rows(last)
+        if step.any():  # to the errors of the keyframe before about where it is linearised
+            n = len(step)
+            rows[:, :n] = rows[:, :n] @ moved_chart(step)
+            rows[:, -1] += rows[:, :n] @ step
+        self._between.append(rows)
         self.changed_from(len(self.keyframes) - 1)
         self._measure(keyframe, last)
 
