@@ -177,7 +177,7 @@ def in_store(damage: Act, folder: Path) -> tuple[str, str]:
 
 def rows() -> Iterator[tuple[str, str, Callable[[Path], tuple[str, str]]]]:
     """Yield heading, attack, and what does it in a folder."""
-    for title, door in DOORS.items():
+    for title, (_, door) in DOORS.items():
         yield "At the doors", title, lambda f, a=door: at_door(a, f)  # type: ignore[misc]
     for title, act in AT_REST.items():
         yield "A live run at its restart", title, lambda f, a=act: at_rest(a, f)  # type: ignore[misc]

@@ -58,6 +58,8 @@ def declare(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace, console: Console, errors: Console) -> bool:
     """Write the page."""
+    path: Path = arguments.out or arguments.result / PAGE_NAME
+    check_output_file(path)
     from ssm_graph.report.page.content import Content
     from ssm_graph.report.page.page import write_page
     from ssm_graph.result import Result
@@ -65,8 +67,6 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     result = Result(arguments.result, mission=arguments.mission, epoch=arguments.epoch)
     results = result.tables
     check_rows(results)
-    path: Path = arguments.out or arguments.result / PAGE_NAME
-    check_output_file(path)
     with ProgressDisplay(errors) as show:
         show.stage("reading the mission")
         altitude, of_errors, note = _of_mission(result)

@@ -272,6 +272,38 @@ def test_pings_of_a_clock_that_was_set_forward(off_s: float) -> None:
     assert sifted.set_by == [pytest.approx(off_s, abs=0.03)]
 
 
+def test_both_clocks_are_set_at_once() -> None:
+    """The instrument's is followed; whether it follows the vehicle's is no question any more."""
+    sifted = Sifted(is_steady=False)
+    sent = [100.0 + 0.5 * k for k in range(40)]
+    for k, time_s in enumerate(sent):
+        sifted.set_by_s = 3.0 * (k >= 20)
+        sifted.give([time_s + 50.0 * (k >= 20)], time_s + 0.1)
+        if k > 24:
+            assert len(sifted.passed) == k + 1  # none waits
+    np.testing.assert_allclose(sifted.passed, sent, rtol=0, atol=0.03)
+    assert sifted.set_by == [pytest.approx(50.0, abs=0.03)]
+
+
+def test_strays_are_refused_while_others_wait_to_be_read() -> None:
+    """What waits is no silence of the known clock."""
+    sifted = Sifted(is_steady=False)
+    rng = np.random.default_rng(0)
+    sent = [100.0 + 0.7 * k for k in range(60)]
+    late_s = 0.1 + rng.choice([0.0, 0.4, 1.0], len(sent))
+    arrived = np.maximum.accumulate(np.add(sent, late_s)).tolist()
+    strays = []
+    for k, (time_s, come_s) in enumerate(zip(sent, arrived, strict=True)):
+        sifted.set_by_s = 0.5 * (k >= 40)
+        sifted.give([time_s], come_s)
+        if 40 <= k < 48:
+            strays.append(time_s + 300.0)
+            sifted.give(strays[-1:], come_s + 0.01)
+    assert sifted.refused == strays
+    np.testing.assert_allclose(sorted(sifted.passed + sifted.untold), sent, rtol=0, atol=1e-6)
+    assert not sifted.set_by
+
+
 def test_a_clock_that_is_right_at_last() -> None:
     """An instrument that began before its clock was set is taken at its word from then on."""
     sifted = Sifted()

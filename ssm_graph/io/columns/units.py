@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import Any, Final
 
 from ssm_graph.base.errors import ConfigError, MissingExtraError
+from ssm_graph.base.settings import shown
 
 ISO: Final = "iso"
 """The unit of times that are written as dates."""
@@ -17,10 +18,10 @@ _OF_GRAVITY: Final = re.compile(r"(?<![A-Za-z_])(m|u|µ|μ)?(g|G|gee)(?![A-Za-z_
 _OF_FIELD: Final = re.compile(r"(?<![A-Za-z_])(m|u|n|µ|μ)?(gauss|Gauss|Gs|G)(?![A-Za-z_0-9])")
 _PREFIXES: Final = {None: "", "m": "1e-3 *", "u": "1e-6 *", "µ": "1e-6 *", "μ": "1e-6 *"}
 _PREFIXES_OF_FIELD: Final = {**_PREFIXES, "n": "1e-9 *"}
-
-
 _LONGEST: Final = 200
-_POWERS: Final = re.compile(r"(\*\*|\^)\s*[^\s*/^)]*?(\d\d|\*\*|\^|\()")
+_POWER: Final = re.compile(r"\s*(?:\*\*|\^)\s*")
+_MOST_POWERS: Final = 4
+_POWERS: Final = re.compile(r"\^[^\s*/^)]*?(\d\d|\^|\()")
 """Powers of powers or of more than one digit, which take for ever to reckon."""
 
 
@@ -42,7 +43,9 @@ def factor_to(unit: str, wanted: str, *, place: str) -> float:
         words = _OF_FIELD.sub(lambda m: f"({_PREFIXES_OF_FIELD[m[1]]} 1e-4 * tesla)", words)
     registry, pint = _registry()
     try:
-        if len(words) > _LONGEST or _POWERS.search(words):
+        powers = _POWER.sub("^", words)
+        is_high = _POWERS.search(powers) or powers.count("^") > _MOST_POWERS
+        if len(words) > _LONGEST or is_high:
             raise ValueError("too long, or too high a power")
         quantity = registry.Quantity(1.0, "") * registry.parse_expression(words)
         factor = float(quantity.to(wanted.replace("^", "**")).magnitude)
@@ -52,9 +55,9 @@ def factor_to(unit: str, wanted: str, *, place: str) -> float:
     except pint.DimensionalityError:
         raise ConfigError(f"{place}: expected a unit like {wanted}, got {unit!r}") from None
     except Exception as error:  # pint's parser raises what Python's does
-        text = " ".join(str(error).split())[:100]
+        text = " ".join(str(error).split())[:100] or type(error).__name__
         raise ConfigError(
-            f"{place}: {unit!r} is no unit ({text}); expected one like {wanted}"
+            f"{place}: {shown(unit)} is no unit ({text}); expected one like {wanted}"
         ) from None
 
 

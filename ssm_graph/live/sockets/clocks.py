@@ -15,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Final, NamedTuple
 
-from ssm_graph.live.sockets.doubt import Arrival, Doubt, Lags, Setting
+from ssm_graph.live.sockets.doubt import Arrival, Doubt, Lags, Setting, Told
 from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.sensors.messages import Message
 from ssm_graph.sensors.registry import BY_MESSAGE
@@ -184,7 +184,11 @@ class StampClock:
         self._follow(now)
         for one in messages:
             if self._doubt is not None:
-                if not self._doubt.wait(one, self._arrival(now), ahead_s=self._ahead_s(now)):
+                if self._doubt.wait(one, self._arrival(now), ahead_s=self._ahead_s(now)):
+                    self._heard_s = now.steady_s
+                    refused += self._strangers
+                    self._strangers = []
+                else:
                     refused += self._meet(one, now, passed)
                 continue
             shift_s = self._shift_of(one.time_s, now)
@@ -205,12 +209,16 @@ class StampClock:
         told = self._doubt.tell(self._run_s(now))
         if told is None:
             return [], self._doubt.give_up(self._run_s(now))
+        return self._heed(told, now), []
+
+    def _heed(self, told: Told, now: Now) -> list[Message]:
+        """Read stamps as is told from now on; return what waited for that."""
         self._doubt = None
         self._shift_s = told.shift_s
         self._others_s = () if told.other_s is None else (told.other_s,)
         for message in told.messages:
             self._remember(message.time_s, now)
-        return told.messages, []
+        return told.messages
 
     def off_s(self, message: Message) -> float:
         """Return how far a stamp is from the last one of the known clock, s."""
@@ -223,8 +231,9 @@ class StampClock:
         if math.isnan(self._stamp_s):
             return
         if self._is_steady:
-            was_s = [self._shift_s, *(setting.set_by_s for setting in settings)]
-            self._others_s = (*self._others_s, *was_s) if settings else self._others_s
+            if settings:
+                was_s = [self._shift_s, *(setting.set_by_s for setting in settings)]
+                self._others_s = (*self._others_s, *was_s)[-N_SETTINGS:]
             return
         for setting in settings:
             if self._doubt is None and abs(setting.set_by_s - self._shift_s) > SET_S:
@@ -335,6 +344,8 @@ class StampClock:
         is_silent = since_s >= max(STRANGER_S, SILENT_TIMES * self._interval_s)
         if is_silent or len(self._strangers) > MOST_STRANGERS:
             waiting, self._strangers = self._strangers, []
+            if self._doubt is not None:  # of a clock that is no more
+                passed += self._heed(self._doubt.likelier(), now)
             self._believe(waiting[0].time_s, now)
             passed += [self._passed(one, now) for one in waiting]
         return third

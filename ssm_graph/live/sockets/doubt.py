@@ -179,13 +179,21 @@ class Doubt:
         patience_s = max(DOUBT_S, GUESS_AFTER * min(off_s, 0.5))
         if not is_sure and not now_s - self._begun_s > patience_s:
             return None
-        readings = (self._own, self._following)
-        wrong, right = readings if following > own else readings[::-1]
+        told = self._read_as(self._following if following > own else self._own)
+        return told._replace(other_s=None) if is_sure else told
+
+    def likelier(self) -> Told:
+        """Return what seems true so far, where nothing more will come to tell it."""
+        own, following = (self._probability(x) for x in (self._own, self._following))
+        return self._read_as(self._following if following > own else self._own)
+
+    def _read_as(self, right: _Reading) -> Told:
+        wrong = self._own if right is self._following else self._following
         messages = [
             replace(message, time_s=time_s)
             for (_, message), time_s in zip(self._waiting, right.times_s, strict=True)
         ]
-        return Told(messages, right.shift_s, None if is_sure else wrong.shift_s)
+        return Told(messages, right.shift_s, wrong.shift_s)
 
     def give_up(self, now_s: float) -> list[Message]:
         """Return those that have waited too long to be of any use."""
