@@ -253,6 +253,9 @@ def lines(result: VisualResult, found: Judged, off: Accuracy | None) -> list[str
             f"known after {ranging.started_s - result.time_s[0]:.1f} s"
         )
         for anchor in ranging.anchors:
+            if not np.isfinite(anchor.place_m).all():
+                told.append(f"  anchor {anchor.name}: not placed")
+                continue
             place = ", ".join(f"{x:.2f}" for x in anchor.place_m)
             told.append(
                 f"  anchor {anchor.name} ({anchor.state.name.lower()}) at {place} m; bias "

@@ -19,9 +19,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
-from scipy.stats import chi2
 
 from factors.bearing_range import half_turn
+from ssm_graph.base import chi2
 from ssm_graph.base.frozen import Array
 from ssm_graph.systems.landmark_slam.filters import MapFilter
 from ssm_graph.systems.landmark_slam.methods import FILTERS

@@ -13,10 +13,10 @@ from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from factors.bearing_range import half_turn, range_bearing, range_bearing_slopes
 from factors.similarity import Kernel
+from ssm_graph.base import chi2
 from ssm_graph.base.frozen import Array
 from ssm_graph.filters.rules.noise_adaptive import Evidence, Noise
 from ssm_graph.filters.rules.unscented import root_of

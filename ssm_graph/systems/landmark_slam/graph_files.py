@@ -98,6 +98,8 @@ def _take(read: _Read, word: str, cells: Sequence[str], suffix: str) -> None:
         read.landmarks[rest[0]] = tuple(_numbers(rest[1:], 2))
     elif word in ("EDGE_SE2", "EDGE2"):
         step = _numbers(rest[2:], 3)
+        if rest[0] == rest[1]:
+            raise ValueError(f"{word}: expected two poses, and this is one with itself")
         cov = _noise(rest[5:], _UPPER if is_pyfg or suffix == ".g2o" else _TORO, is_pyfg)
         onto = turned(step[2])  # stated in the axes of the end
         read.relations.append((rest[0], rest[1], step, onto @ cov @ onto.T))
@@ -125,7 +127,10 @@ def _take(read: _Read, word: str, cells: Sequence[str], suffix: str) -> None:
 
 
 def _numbers(cells: Sequence[str], count: int) -> Array:
-    values = np.array([float(cells[i]) for i in range(count)])
+    try:
+        values = np.array([float(cells[i]) for i in range(count)])
+    except ValueError:
+        raise ValueError("expected numbers") from None
     if not np.all(np.isfinite(values)):
         raise ValueError("expected finite numbers")
     return values
@@ -169,14 +174,15 @@ def _graph(
         raise DataError(f"{path}: expected relations of poses (EDGE_SE2 or EDGE2), got none")
     letters = sorted({name[0] for name in names if name[0].isalpha()})
     if is_pyfg and letters:
-        which = (robot or 1) - 1
+        which = 0 if robot is None else robot - 1
         if not 0 <= which < len(letters):
             raise DataError(f"{path}: --robot: expected 1 to {len(letters)}, got {robot}")
         names = {name for name in names if name[0] == letters[which]}
     try:
         ordered = sorted(names, key=lambda name: int(name.lstrip(_LETTERS)))
     except ValueError:
-        raise DataError(f"{path}: expected poses by number, got {sorted(names)[0]!r}") from None
+        odd = next(name for name in sorted(names) if not name.lstrip(_LETTERS).isdigit())
+        raise DataError(f"{path}: expected poses by number, got {odd!r}") from None
     index = {name: k for k, name in enumerate(ordered)}
     pairs, steps, covs = [], [], []
     for a, b, step, cov in read.relations:

@@ -99,12 +99,13 @@ class IncrementalSmoother:
         self._lag_s = lag
         E, M, K, L = len(graph.pairs), len(graph.seen), len(graph.time_s), len(graph.names)
         self._is_closure = graph.is_closure
+        self._is_weighed = np.append(self._is_closure, np.ones(M, dtype=bool))
         order = np.argsort(graph.pairs[:, 1], kind="stable")
         self._pairs_of = np.split(order, np.searchsorted(graph.pairs[order, 1], np.arange(1, K)))
         self._seen_of = np.split(np.arange(M), np.searchsorted(graph.seen[:, 0], np.arange(1, K)))
         # Closures first, observations after: what has a weight has one index.
         self._n_pairs = E
-        self.weights = np.ones(E + M)
+        self.weights = np.ones(E + M)  # zero of what is not taken
         self._dim = np.append(np.full(E, 3), np.isfinite(graph.measured).sum(axis=1))
         self._spread = np.zeros(E + M)
         self._slot = np.full(E + M, -1, dtype=np.intp)
@@ -135,6 +136,7 @@ class IncrementalSmoother:
         for e in self._pairs_of[k].tolist():
             if graph.pairs[e, 0] < self._first:
                 self.too_old += 1
+                self.weights[e] = 0.0
                 continue
             if not self._is_closure[e]:
                 self.pose[k] = composed(self.pose[k - 1], graph.step[e])
@@ -142,6 +144,7 @@ class IncrementalSmoother:
             added.append(e)
         values.insert(pose_key(k), gtsam.Pose2(*self.pose[k].tolist()))
         for m in self._placed(k, values, factors, added):
+            self.weights[self._n_pairs + m] = 1.0
             factors.add(seen_factor(graph, m))
             added.append(self._n_pairs + m)
         self._count = k + 1
@@ -152,7 +155,8 @@ class IncrementalSmoother:
         self._first = leaving
         self._update(factors, values, stamps, added, [])
         self._slot[self._last_of < leaving] = -1
-        self._take_spreads([i for i in added if self._has_weight(i) and self._slot[i] >= 0])
+        new = np.array([i for i in added if i >= 0], dtype=np.intp)
+        self._take_spreads(new[self._is_weighed[new] & (self._slot[new] >= 0)])
         for _ in range(self._how.rounds):
             if self._reweigh(self._how.weight_change) == 0.0:
                 break
@@ -160,17 +164,13 @@ class IncrementalSmoother:
     def close(self) -> tuple[bool, int]:
         """Let all weights settle with variances of the whole; return whether, and the rounds."""
         for count in range(1, self._how.closing_rounds + 1):
-            weighed = np.flatnonzero(self._slot >= 0)
-            self._take_spreads([i for i in weighed.tolist() if self._has_weight(i)])
+            self._take_spreads(np.flatnonzero(self._is_weighed & (self._slot >= 0)))
             change = self._reweigh(0.0)
             for _ in range(2):  # as far as iSAM2 goes by itself
                 self._update(gtsam.NonlinearFactorGraph(), gtsam.Values(), {}, [], [])
             if change < SETTLED_WEIGHT:
                 return True, count
         return False, self._how.closing_rounds
-
-    def _has_weight(self, i: int) -> bool:
-        return i >= self._n_pairs or (i >= 0 and bool(self._is_closure[i]))
 
     def _leaving(self, k: int) -> int:
         """Return the first pose that stays once ``k`` is there; keep what is known of the rest."""
@@ -208,6 +208,7 @@ class IncrementalSmoother:
                     self.landmarks[i] = self.pose[k, :2] + r * ray
                 elif np.isnan(self._places[i, 0]):  # until range and bearing are known
                     self._waiting.setdefault(i, []).append(m)
+                    self.weights[self._n_pairs + m] = 0.0
                     continue
                 else:
                     self.landmarks[i] = self._places[i]
@@ -231,6 +232,7 @@ class IncrementalSmoother:
     ) -> None:
         try:
             self._solver.update(factors, values, stamps, removed)
+            found = self._solver.calculateEstimate()
         except RuntimeError as error:
             raise SolverError(
                 f"iSAM2 at pose {self._count - 1}: {str(error).strip().splitlines()[0]}; look for "
@@ -241,16 +243,15 @@ class IncrementalSmoother:
             for i, slot in zip(added, slots, strict=False):
                 if i >= 0:
                     self._slot[i] = slot
-        found = self._solver.calculateEstimate()
         self.pose[self._first : self._count] = gtsam.utilities.extractPose2(found)
         placed = np.isfinite(self.landmarks[:, 0])
         if placed.any():
             self.landmarks[placed] = gtsam.utilities.extractPoint2(found)
 
-    def _take_spreads(self, which: list[int]) -> None:
+    def _take_spreads(self, which: NDArray[np.intp]) -> None:
         """Take anew the posterior variances of some closures and observations, in sigmas."""
         graph, solver = self._graph, self._solver.getISAM2()
-        for i in which:
+        for i in which.tolist():
             if i < self._n_pairs:
                 a, b = graph.pairs[i].tolist()
                 keys, turns = [pose_key(a), pose_key(b)], [turned(self.pose[x, 2]) for x in (a, b)]
@@ -269,8 +270,7 @@ class IncrementalSmoother:
     def _reweigh(self, least: float) -> float:
         """Give new weights where they have changed by more; return the largest change."""
         graph, E = self._graph, self._n_pairs
-        active = np.flatnonzero(self._slot >= 0)
-        active = active[(active >= E) | self._is_closure[np.minimum(active, E - 1)]]
+        active = np.flatnonzero(self._is_weighed & (self._slot >= 0))
         if len(active) == 0:
             return 0.0
         pairs, seen = active[active < E], active[active >= E] - E

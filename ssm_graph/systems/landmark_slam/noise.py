@@ -21,9 +21,9 @@ from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
 
 from factors.kernels import TruncatedKernel
+from ssm_graph.base import chi2
 from ssm_graph.base.frozen import Array
 from ssm_graph.evaluation.statistics import Interval
 from ssm_graph.systems.landmark_slam.problem import SlamEstimate, SlamNoise, SlamProblem
@@ -153,7 +153,7 @@ def _median_ratio(found: Pass) -> Array:
     # Of a row whose fit has taken the share h of its variance, r^2 is (1 - h) chi-square and
     # H P H' is h: so far that is what the median of their sum should be.
     share = np.clip(found.expected.own - found.rows.own_error**2, 0.0, 1.0)
-    expected = (1.0 - share) * chi2.median(1) + share
+    expected = (1.0 - share) * chi2.ppf(0.5, 1) + share
     ratio = np.ones(2)
     for i in range(2):
         if is_there[:, i].any():

@@ -152,6 +152,8 @@ class Solved(NamedTuple):
 
 def solve_input(path: Path, asked: Asked) -> Solved:
     """Read an input and solve it."""
+    if asked.robot is not None and path.is_file() and path.suffix != ".pyfg":
+        raise ConfigError(f"--robot: expected with a MRCLAM folder or a PyFG file, got {path.name}")
     if path.suffix in SUFFIXES and path.is_file():
         return solve_graph(*read_pose_graph(path, robot=asked.robot), asked)
     if path.is_file():
@@ -179,6 +181,16 @@ def solve_input(path: Path, asked: Asked) -> Solved:
 def solve_graph(graph: SlamGraph, notes: tuple[str, ...], asked: Asked) -> Solved:
     """Return the answer to a graph of a file; with closures by GTSAM, else as a log."""
     problem, noise = problem_of_graph(graph)
+    if not (graph.is_closure.any() or len(graph.seen)):
+        raise DataError(
+            "; ".join(
+                (
+                    *notes,
+                    "expected landmarks that are seen, or places that are met again, got odometry "
+                    "alone; has a landmark the number of a pose",
+                )
+            )
+        )
     if not graph.is_closure.any():
         return solve(problem, noise, asked, truth=graph.truth, notes=notes)
     if asked.method not in ("smoother", *INCREMENTAL):

@@ -14,10 +14,10 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from factors.bearing_range import half_turn
 from factors.similarity import GaussianKernel
+from ssm_graph.base import chi2
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.units import DEGREE

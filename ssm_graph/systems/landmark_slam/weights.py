@@ -13,9 +13,9 @@ from typing import Final
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.stats import chi2
 
 from factors.similarity import GaussianKernel, Kernel
+from ssm_graph.base import chi2
 from ssm_graph.base.frozen import Array
 
 _QUANTILES: Final = (np.arange(4000) + 0.5) / 4000.0

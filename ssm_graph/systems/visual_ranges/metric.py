@@ -59,8 +59,7 @@ class Metric:
         self.state: MetricState | None = None
         self.started_s = float("nan")
         self._history: list[tuple[float, float, float]] = []
-        reckoning = vehicle.dead_reckoning
-        self._own_share = 0.0 if reckoning is None else reckoning.scale_share
+        self._own_share = vehicle.scale_share
         self.link = max(float(np.hypot(self._own_share, vehicle.range_scale_share)), LEAST_LINK)
 
     @property
@@ -191,9 +190,11 @@ class Metric:
         state = told.state
         if self.is_aided and not told.has_scale:
             if state is StartState.REFUSED:
-                reasons = (f"{state.value}, and are not used", *reasons)
-            state = StartState.MIRROR if len(self.ranging.ranges) else StartState.READY
-        if is_known and state.has_scale and sigma > self.rules.ready_sigma:
+                state = StartState.WITHOUT_RANGES
+            else:
+                state = StartState.MIRROR if len(self.ranging.ranges) else StartState.READY
+        is_judged = state.has_scale and state is not StartState.WITHOUT_RANGES
+        if is_known and is_judged and sigma > self.rules.ready_sigma:
             state = StartState.COARSE
         elif self.is_aided and state is StartState.COARSE:
             sharp = all(not len(a.alternatives_m) for a in told.anchors)

@@ -53,11 +53,14 @@ class StartState(Enum):
     MIRROR = "scale ready; an anchor has other places that fit as well"
     READY = "scale and anchors ready"
     REFUSED = "the ranges contradict themselves"
+    WITHOUT_RANGES = (
+        "scale by the vehicle alone: the ranges contradict themselves, and are not used"
+    )
 
     @property
     def has_scale(self) -> bool:
         """Whether map units can be turned into metres."""
-        return self in (StartState.READY, StartState.MIRROR, StartState.COARSE)
+        return self not in (StartState.WAITING, StartState.AMBIGUOUS, StartState.REFUSED)
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,6 +13,9 @@ from ssm_graph.base.frozen import Array, FrozenArrays, ShortRepr, shaped
 
 DEPTH_SIGMA_M: Final = 0.05
 """Of a pressure sensor, with what waves and trim do to it."""
+DEPTH_SHARE: Final = 0.003
+"""Of a depth: from pressure by a density of water known to 3 kg/m^3. Where fresh water may have
+been read as sea water, 0.03."""
 STEP_M: Final = 0.01
 """Standard deviation of what a DVL and a gyro are off by after one second, m: 600 kHz near the
 bottom, grades from tactical on; it grows as the root of time."""
@@ -36,6 +39,8 @@ class Depths(FrozenArrays):
     sigma_m: float = DEPTH_SIGMA_M
     lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """From the camera's centre to the sensor, camera axes."""
+    scale_share: float = DEPTH_SHARE
+    """Of the depth; counts where depth alone tells the scale."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -75,6 +80,12 @@ class Vehicle(ShortRepr):
         for what, log in (("depths", self.depths), ("dead reckoning", self.dead_reckoning)):
             if log is not None and (len(log.time_s) < 2 or np.any(np.diff(log.time_s) <= 0.0)):
                 raise DataError(f"{what}: expected two or more times that rise")
+
+    @property
+    def scale_share(self) -> float:
+        """Standard deviation of the unit of what tells the scale, a share; 0 for nothing."""
+        own = self.depths if self.dead_reckoning is None else self.dead_reckoning
+        return 0.0 if own is None else own.scale_share
 
     @property
     def has_aids(self) -> bool:

@@ -72,6 +72,8 @@ def judged(result: VisualResult) -> Judged:
             f"anchor {', '.join(doubtful)}: most of its last ranges contradict its place: it is "
             "hidden, or was moved"
         )
+    if ranging.state is StartState.WITHOUT_RANGES:
+        faults += [ranging.state.value, *ranging.reasons]
     if ranging.state is StartState.COARSE:
         faults.append(StartRules().coarse(ranging.sigma_log_scale))
     open_ones = [a.name for a in ranging.anchors if a.state is AnchorState.AMBIGUOUS]

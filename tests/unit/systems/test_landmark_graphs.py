@@ -151,6 +151,9 @@ def test_a_gross_closure_loses_its_weight(tmp_path: Path) -> None:
         ("EDGE_SE2 0 1 1 0 0.5 100 5 0 80 0", "a.g2o:1: EDGE_SE2: expected more numbers"),
         ("EDGE_SE2 0 1 1 0 0.5 100 5 0 -80 0 900", "positive definite"),
         ("EDGE_SE2 0 1 1 0 nan 100 5 0 80 0 900", "expected finite numbers"),
+        ("EDGE_SE2 0 1 one 0 1 100 5 0 80 0 900", "expected numbers; got"),
+        ("EDGE_SE2 1 1 1 0 0.5 100 5 0 80 0 900", "this is one with itself"),
+        ("EDGE_SE2 0 b 1 0 0.5 100 5 0 80 0 900", "expected poses by number, got 'b'"),
         ("EDGE_SE2 0 2 1 0 0.5 100 5 0 80 0 900", "no odometry from pose|tied to the one before"),
         ("EDGE_SE3:QUAT 0 1 1 0 0", "expected a graph in the plane"),
         ("ODOMETRY 0 1", "expected VERTEX_SE2"),
@@ -214,3 +217,39 @@ def test_a_graph_without_closures_is_a_log(tmp_path: Path) -> None:
     assert again.step_cov == pytest.approx(graph.step_cov, abs=2e-8)
     assert again.step == pytest.approx(graph.step[[0, 1, 2]])
     assert again.sigma == pytest.approx(graph.sigma)
+
+
+def test_a_graph_that_tells_nothing_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Odometry alone; sigmas beyond what numbers hold."""
+    path, out = tmp_path / "a.g2o", str(tmp_path / "out")
+    path.write_text("EDGE_SE2 0 1 1 0 0.5 100 5 0 80 0 900\nEDGE_SE2_XY 0 1 2 1 25 0 25\n")
+    assert main(["slam", str(path), "--out", out]) == 3
+    assert "got odometry alone; has a landmark the number of a pose" in capsys.readouterr().err
+    assert main(["slam", str(path), "--robot", "2", "--out", out]) == 2
+    rigid = "1e300 0 0 1e300 0 1e300"
+    path.write_text(f"EDGE_SE2 0 1 1 0 0 {rigid}\nEDGE_SE2 1 0 1 0 0 1 0 0 1 0 1\n")
+    assert main(["slam", str(path), "--out", out]) == 5
+    assert "iSAM2 at pose 1" in capsys.readouterr().err
+
+
+def test_what_is_not_taken_has_no_weight() -> None:
+    """One pose alone; a closure to a pose that the lag has dropped."""
+    problem, _ = small(np.random.default_rng(0))
+    here = problem.keyframe == 0
+    one = replace(
+        problem, time_s=problem.time_s[:1], control=problem.control[:0],
+        keyframe=problem.keyframe[here], landmark=problem.landmark[here],
+        measured=problem.measured[here],
+    )  # fmt: skip
+    assert taken(one, NOISE, GaussianKernel()).estimate.pose[0] == pytest.approx(one.start)
+    graph = graph_of_problem(problem, NOISE)
+    last = len(graph.time_s) - 1
+    closed = replace(
+        graph, pairs=np.vstack([graph.pairs, [0, last]]), step=np.vstack([graph.step, np.zeros(3)]),
+        step_cov=np.concatenate([graph.step_cov, np.eye(3)[None]]),
+    )  # fmt: skip
+    found = smooth_incrementally(closed, IncrementalSettings(lag_s=5.0))
+    assert found.closure_weights.tolist() == [0.0]
+    assert "the lag had dropped, left out: 1" in found.estimate.notes[-1]

@@ -176,6 +176,10 @@ def test_an_answer_by_the_vehicle_alone(tmp_path: Path) -> None:
     assert answer["vehicle"]["down_map_axes"] == [0.0, 0.8, 0.6]
     assert answer["vehicle"]["range_unit_m"] is None
     assert any("down is 0.000, 0.800, 0.600" in line for line in lines(result, found, off))
+    own = replace(own, state=StartState.WITHOUT_RANGES, reasons=("residuals of A",))
+    found = judged(replace(result, ranging=own))
+    assert found.verdict is Verdict.DOUBTFUL
+    assert found.reasons == (StartState.WITHOUT_RANGES.value, "residuals of A")
 
 
 def test_the_path_is_in_its_file_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

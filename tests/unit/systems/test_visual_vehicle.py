@@ -243,6 +243,37 @@ def test_sound_speed_is_told_apart_from_the_scale_by_dead_reckoning_alone() -> N
     assert np.linalg.norm(result.anchors[0].place_m - true) < 0.4
 
 
+def test_ranges_that_contradict_themselves_are_left_out_and_told() -> None:
+    """The vehicle's scale is right without them, and yet the answer is not called sound."""
+    time, R, t, own = map_of(6, 160)
+    path, made = bottom_path(6), []
+    faults = RangeFaults(rate_hz=4.0, sigma_m=0.05, bias_m=0.0, sound_speed_m_per_s=1500.0)
+    for anchor in ([9.0, -7.0, 0.6], [-9.0, 17.0, 0.6]):
+        raw, _, _ = simulated_ranges(
+            faults, path.place, np.array([anchor]), (0.0, float(time[-1])), 6
+        )
+        made.append(at_the_anchor(raw, 1500.0)[0])
+    half = np.searchsorted(made[0].time_s, time[-1] / 2.0)
+    both = [made[0].range_m[:half], made[1].range_m[half : len(made[0])]]
+    metric = Metric(replace(made[0], range_m=np.concatenate(both)), np.zeros(3), own)
+    metric.update(frames_of(time, R, t), R, t, time)
+    result = metric.result()
+    assert result.state is StartState.WITHOUT_RANGES
+    assert abs(result.scale / UNIT_M - 1.0) < 0.005
+
+
+def test_a_depth_is_known_no_better_than_the_density_of_water() -> None:
+    """Fresh water read as sea water: the scale by depth alone is 2.5 % off, within its sigma."""
+    time, R, t, own = map_of(1, 120)
+    assert own.depths is not None
+    salty = replace(own.depths, depth_m=own.depths.depth_m / 1.025, scale_share=0.03)
+    metric = Metric(screened_ranges([], [], []), np.zeros(3), Vehicle(salty))
+    metric.update(frames_of(time, R, t), R, t, time)
+    result = metric.result()
+    assert result.state is StartState.COARSE
+    assert 0.01 < 1.0 - result.scale / UNIT_M < 1.5 * result.sigma_log_scale
+
+
 def test_two_way_ranges_are_those_of_the_middle_of_both_legs() -> None:
     """The vehicle moves between ping and reply; half of both legs is the range in between."""
     faults = RangeFaults(

@@ -14,6 +14,7 @@ from ssm_graph.base.settings import FILE_KEY, Key, Settings, optional_key
 from ssm_graph.io.tables.append_file import write_through
 from ssm_graph.systems.visual_ranges.readers.truth import number_rows, read_tum_path
 from ssm_graph.systems.visual_ranges.vehicle import (
+    DEPTH_SHARE,
     DEPTH_SIGMA_M,
     SCALE_SHARE,
     STEP_M,
@@ -35,6 +36,7 @@ DEPTH_KEYS: Final[Mapping[str, Key]] = {
     "file": FILE_KEY,
     "sigma_m": optional_key("", 1e-4, 100.0, "0.05 is a pressure sensor"),
     "lever_arm_m": _arm("camera to sensor, camera axes"),
+    "scale_percent": optional_key("", 1e-4, 20.0, "of depth; 3 if the water's salinity is unknown"),
 }
 RECKONING_KEYS: Final[Mapping[str, Key]] = {
     "file": FILE_KEY,
@@ -63,7 +65,8 @@ def read_vehicle(folder: Path, sections: Mapping[str, Settings], range_share: fl
         rows = number_rows(folder / own.text("file"), (2,))
         x, y, z = own.array("lever_arm_m").tolist() if "lever_arm_m" in own else (0.0, 0.0, 0.0)
         sigma_m = own.number("sigma_m") or DEPTH_SIGMA_M
-        depths = Depths(rows[:, 0], rows[:, 1], sigma_m, (x, y, z))
+        share = own.number("scale_percent") / 100.0 or DEPTH_SHARE
+        depths = Depths(rows[:, 0], rows[:, 1], sigma_m, (x, y, z), share)
     if "dead_reckoning" in sections:
         reckoning = _reckoning(folder, sections["dead_reckoning"])
     return Vehicle(depths, reckoning, range_share)
@@ -96,6 +99,7 @@ def write_vehicle(folder: Path, vehicle: Vehicle) -> dict[str, Any]:
             "file": "depth.csv",
             "sigma_m": depths.sigma_m,
             "lever_arm_m": list(depths.lever_arm_m),
+            "scale_percent": 100.0 * depths.scale_share,
         }
         _write(folder / "depth.csv", "time_s,depth_m", [depths.time_s, depths.depth_m], ",")
     if reckoning is not None:
