@@ -123,16 +123,20 @@ DOORS: dict[str, tuple[str, Door]] = {
         ],
     ),
     "`report --out` over the trajectory": (
-        *(TAKEN, lambda f: ["report", f / "result", "--out", f / "result" / "trajectory.csv"]),
+        TAKEN,
+        lambda f: ["report", f / "result", "--out", f / "result" / "trajectory.csv"],
     ),
     "`inspect --draft-map` over the table": (
-        *(TAKEN, lambda f: ["inspect", put(f / "t.csv", TABLE), "--draft-map", f / "t.csv"]),
+        TAKEN,
+        lambda f: ["inspect", put(f / "t.csv", TABLE), "--draft-map", f / "t.csv"],
     ),
     "`inspect --figure` over a table": (
-        *(".png", lambda f: ["inspect", put(f / "t.csv", TABLE), "--figure", f / "t.csv"]),
+        ".png",
+        lambda f: ["inspect", put(f / "t.csv", TABLE), "--figure", f / "t.csv"],
     ),
     "`template` over a map that was filled in": (
-        *(TAKEN, lambda f: ["template", "--out", put(f / "x" / "map.toml", MAP).parent]),
+        TAKEN,
+        lambda f: ["template", "--out", put(f / "x" / "map.toml", MAP).parent],
     ),
     "`export --epoch` of the year 9999": (
         *("expected times within", export("--epoch", "9999-12-31T23:59:59Z", form="gpx")),
@@ -146,7 +150,8 @@ DOORS: dict[str, tuple[str, Door]] = {
     "`export --at` of 1e308 s": ("got 1e+308", at("1e308\n")),
     "`export --at` of bytes": ("at.csv", at(b"\xff\xfe\x00\x01")),
     "`export --at` a pipe": (
-        *("a pipe or a device", lambda f: [*export()(f), "--at", pipe(f / "at.csv")]),
+        "a pipe or a device",
+        lambda f: [*export()(f), "--at", pipe(f / "at.csv")],
     ),
     "`export --at` a folder": ("mission: ", export("--at", "@mission")),
     "`summary.json` that nests 100 000 deep": ("too deep", damaged("summary.json", DEEP)),
@@ -175,7 +180,8 @@ DOORS: dict[str, tuple[str, Door]] = {
     "a graph of bytes in `slam`": ("a text graph", opened("slam", "graph.txt", bytes(range(256)))),
     "`inspect` of a pipe": ("a pipe", lambda f: ["inspect", pipe(f / "log.csv")]),
     "`convert` of a pipe": (
-        *("a pipe", lambda f: ["convert", pipe(f / "log.nmea"), "--out", f / "out"]),
+        "a pipe",
+        lambda f: ["convert", pipe(f / "log.nmea"), "--out", f / "out"],
     ),
     "`inspect /dev/zero`": ("a pipe or a device", lambda _: ["inspect", "/dev/zero"]),
     "`convert --map`: a unit that takes for ever": (NO_UNIT, mapped("9**9**9**9 rad/s")),
