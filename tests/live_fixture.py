@@ -128,6 +128,10 @@ class ListSource:
         """Whether all were given."""
         return self._n_given >= len(self._messages)
 
+    def rest(self) -> list[Message]:
+        """Return what waits at the end: nothing."""
+        return []
+
     def poll(self, timeout_s: float) -> list[Message]:  # noqa: ARG002
         """Return the next ones."""
         if self._crash_after is not None and self._n_given >= self._crash_after:

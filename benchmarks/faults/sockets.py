@@ -331,6 +331,10 @@ class Voyage:
         """The vehicle's clock, s."""
         return EPOCH_S + self.elapsed_s
 
+    def rest(self) -> list[Message]:
+        """Return what waits at the end."""
+        return self.vessel.hub.rest()
+
     def poll(self, timeout_s: float) -> list[Message]:
         """Send all messages up to the next inertial sample and receive what comes of it."""
         del timeout_s

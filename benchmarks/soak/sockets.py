@@ -116,6 +116,10 @@ class Ear:
         """Since the begin, s."""
         return self._clock.elapsed_s()
 
+    def rest(self) -> list[Message]:
+        """Return what waits at the end."""
+        return self._hub.rest()
+
     def poll(self, timeout_s: float) -> list[Message]:
         """Return what has come; tell of it once a second."""
         messages = self._hub.poll(timeout_s)

@@ -11,7 +11,7 @@ import pytest
 
 from ssm_graph.live.protocols.json_messages import JsonDecoder, encode_message
 from ssm_graph.live.protocols.nmea import NmeaDecoder
-from ssm_graph.live.sockets.clocks import STRANGER_S, RunClock, StampClock
+from ssm_graph.live.sockets.clocks import STRANGER_S, Now, RunClock, StampClock
 from ssm_graph.live.sockets.endpoints import LOOPBACK, Endpoint, Transport
 from ssm_graph.live.sockets.feed import Limits
 from ssm_graph.live.sockets.inputs import TcpServerInput, UdpInput
@@ -144,6 +144,11 @@ class Sifted:
             self.passed += [message.time_s for message in passed]
             self.refused += [message.time_s for message in refused]
             self.set_by += [set_by_s] if set_by_s else []
+
+    @property
+    def now(self) -> Now:
+        """What the time is."""
+        return self._run.read()[0]
 
     def run(self, begin_s: float, end_s: float, *, offset_s: float = 0.0) -> list[float]:
         """Have a clock tick for a while."""
@@ -283,6 +288,22 @@ def test_both_clocks_are_set_at_once() -> None:
             assert len(sifted.passed) == k + 1  # none waits
     np.testing.assert_allclose(sifted.passed, sent, rtol=0, atol=0.03)
     assert sifted.set_by == [pytest.approx(50.0, abs=0.03)]
+
+
+def test_what_waits_to_be_read_is_not_lost_at_the_end() -> None:
+    """Nothing more will come to tell it: read as is likelier, once."""
+    sifted = Sifted(is_steady=False)
+    for k in range(44):
+        time_s = 100.0 + 0.7 * k
+        sifted.set_by_s = 0.5 * (k >= 40)
+        sifted.give([time_s], time_s + (1.1 if k % 2 else 0.1))
+    n_waiting = 44 - len(sifted.passed)
+    assert 0 < n_waiting <= 4
+    rest = sifted.clock.rest(sifted.now)
+    np.testing.assert_allclose(
+        [message.time_s for message in rest], 100.0 + 0.7 * np.arange(44 - n_waiting, 44), atol=1e-6
+    )
+    assert sifted.clock.rest(sifted.now) == []
 
 
 def test_strays_are_refused_while_others_wait_to_be_read() -> None:

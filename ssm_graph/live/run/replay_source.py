@@ -72,6 +72,10 @@ class ReplaySource:
         """Time of the mission since the first message of this process, s."""
         return self.time_s - self._begin_s
 
+    def rest(self) -> list[Message]:
+        """Return what waited until the end: nothing does."""
+        return []
+
     def poll(self, timeout_s: float) -> list[Message]:
         """Return the messages whose time has come; wait for the next where there are none.
 

@@ -13,6 +13,7 @@ from typing import Any, Final, NamedTuple, Protocol
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
+from ssm_graph.io.raw_log.log import RawLog
 from ssm_graph.io.results.summary import as_json, calibration_fields, current_fields, versions
 from ssm_graph.live.protocols.json_messages import navigation_fields
 from ssm_graph.live.run.run_folder import LOG_NAME, Resumed, RunFolder
@@ -116,6 +117,7 @@ class Source(Protocol):
     @property
     def elapsed_s(self) -> float: ...  # noqa: D102
     def poll(self, timeout_s: float) -> list[Message]: ...  # noqa: D102
+    def rest(self) -> list[Message]: ...  # noqa: D102
     def take_events(self) -> Sequence[Event]: ...  # noqa: D102
     def source_status(self) -> tuple[SourceStatus, ...]: ...  # noqa: D102
 
@@ -200,17 +202,22 @@ class Runner:
             while (reason := self._reason(source)) is None:
                 messages = source.poll(POLL_S)
                 begin_s = self._steady_s()
-                for message in messages:
-                    with self._events.surviving("raw log", "log_failed"):
-                        log.append(message)
-                    self._push(message)
+                self._take(messages, log)
                 if messages:
                     self._publish(outlet, source.time_s)
                     self._latencies.append(self._steady_s() - begin_s)
                 self._keep(source)
+            self._take(source.rest(), log)
             return self._end(reason)
         finally:
             self.folder.close()
+
+    def _take(self, messages: Sequence[Message], log: RawLog) -> None:
+        """Log messages, then use them."""
+        for message in messages:
+            with self._events.surviving("raw log", "log_failed"):
+                log.append(message)
+            self._push(message)
 
     def _reason(self, source: Source) -> StopReason | None:
         if self._n_failures > MOST_FAILURES:

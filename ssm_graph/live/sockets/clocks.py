@@ -211,6 +211,10 @@ class StampClock:
             return [], self._doubt.give_up(self._run_s(now))
         return self._heed(told, now), []
 
+    def rest(self, now: Now) -> list[Message]:
+        """Return messages that still wait, their stamps read as is likelier: nothing more comes."""
+        return [] if self._doubt is None else self._heed(self._doubt.likelier(), now)
+
     def _heed(self, told: Told, now: Now) -> list[Message]:
         """Read stamps as is told from now on; return what waited for that."""
         self._doubt = None
@@ -392,6 +396,10 @@ class StampClocks:
         """Return what waited of a source, as :meth:`StampClock.settle` does."""
         found = [clock.settle(now) for (of, _), clock in self._clocks.items() if of == source]
         return [m for passed, _ in found for m in passed], [m for _, late in found for m in late]
+
+    def rest(self, now: Now) -> list[Message]:
+        """Return what waits of all sources, as :meth:`StampClock.rest` does."""
+        return [message for clock in self._clocks.values() for message in clock.rest(now)]
 
 
 def called(message: Message) -> str:

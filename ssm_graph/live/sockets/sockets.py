@@ -140,6 +140,10 @@ class SocketHub:
                 messages += link.tick(now) or []  # outputs have none
         return messages
 
+    def rest(self) -> list[Message]:
+        """Return what waited until the end to be told how its stamps are to be read."""
+        return self._stamps.rest(self._clock.read()[0])
+
     def _keep_clock(self, now: Now) -> None:
         """Have it remembered how far the vehicle's clock is ahead of the time of the run."""
         if self._note_clock is not None:
