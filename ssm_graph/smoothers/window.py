@@ -235,6 +235,7 @@ class Window:
             # Of a window that goes as a whole, the posterior of its end is all that counts.
             self._graph.keep_posterior(last)
             self._keep_newest(keyframes=1, rows=0)
+            self._step = np.zeros_like(self._step)  # it is linearised where it is now
             leaving = 1
         self._append(keyframe, last)
         if leaving:
