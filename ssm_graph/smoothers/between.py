@@ -30,7 +30,7 @@ from factors.inertial import Intervals, predict
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frames import rotation_zyx
 from ssm_graph.base.frozen import Array, ShortRepr
-from ssm_graph.base.times import Indices
+from ssm_graph.base.times import Indices, usual_interval
 from ssm_graph.engine.error_state import GYRO_BIAS, POSITION, ROTATION, STATE_DIM, VELOCITY
 from ssm_graph.engine.states import NavigationStates
 from ssm_graph.imu.ping_motion import PING_WINDOW_S, mean_gyro
@@ -351,7 +351,7 @@ def _at_point(
     T[:, VELOCITY, GYRO_BIAS] = states.R_nb @ L
     T[:, range(9, 15), range(9, 15)] = 1.0
     covariance = T @ known.covariance @ T.mT
-    window_s = max(PING_WINDOW_S, float(np.median(np.diff(imu.time_s))))
+    window_s = max(PING_WINDOW_S, usual_interval(imu.time_s))
     swung = states.R_nb @ L
     covariance[:, VELOCITY, VELOCITY] += (imu.noise.gyro_density**2 / window_s) * (swung @ swung.mT)
     turned = states.R_nb @ so3.skew(rate_b)

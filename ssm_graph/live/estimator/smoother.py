@@ -17,11 +17,7 @@ from ssm_graph.live.estimator.course import REACH_S, Course, Step
 from ssm_graph.live.estimator.guard import Guardian
 from ssm_graph.live.estimator.intake import Intake
 from ssm_graph.live.estimator.keyframes import KeyframeMaker
-from ssm_graph.live.estimator.packing import (
-    pack_step,
-    part_of,
-    unpack_step,
-)
+from ssm_graph.live.estimator.packing import pack_step, part_of, unpack_step
 from ssm_graph.live.estimator.recovery import ASTRAY_TIMES, Reserve, is_astray
 from ssm_graph.live.estimator.separation import IntegrityConfig
 from ssm_graph.live.estimator.start import Starter, not_calibrated, sensors_of_vehicle
