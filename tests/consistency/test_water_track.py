@@ -20,7 +20,7 @@ from tests.helpers import (
 )
 from tests.water_fixture import current_errors, in_current
 
-SEEDS = range(15)
+SEEDS = range(10)
 CURRENT = CurrentSettings(sigma=0.4, vertical_sigma=0.03, correlation_s=1800.0)
 
 
