@@ -13,7 +13,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.lane_line import line_residual
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.units import DEGREE, wrapped
 from ssm_graph.filters.rules.hypotheses import Hypothesis, apart_from_each_other, told
@@ -68,13 +67,13 @@ def search(
     own : (3,) pose that is tried as well, the mean of the particles.
     """
     side = np.arange(-half_m, half_m + 0.5 * _COARSE_M, _COARSE_M)
-    gx, gy, gyaw = np.meshgrid(x_y[0] + side, x_y[1] + side, yaws, indexing="ij")
-    grid = np.column_stack([gx.ravel(), gy.ravel(), gyaw.ravel()])
-    near = np.zeros(len(grid), dtype=bool)
+    places = np.stack(np.meshgrid(*(x_y[:, None] + side), indexing="ij"), axis=-1).reshape(-1, 2)
+    near = np.zeros(len(places), dtype=bool)
     for index in indices.values():
-        distance, _ = index.nearest(grid[:, 0], grid[:, 1])
+        distance, _ = index.nearest(places[:, 0], places[:, 1])
         near |= distance < index.reach_m
-    grid = grid[near] if near.any() else grid
+    places = places[near] if near.any() else places
+    grid = np.column_stack([np.repeat(places, len(yaws), axis=0), np.tile(yaws, len(places))])
     thin = _thinned(window)
     coarse = _log_likelihood(_thinned(window, 6, 3), grid, indices, settings, _COARSE_SIGMA_M)
     starts = np.concatenate([grid[_apart_from_each_other(grid, coarse, _KEPT)], own[None]])
@@ -199,25 +198,18 @@ def _fitted(
             if not mine.any():
                 continue
             how = settings.line if kind is LineKind.LANE_LINE else settings.boundary
-            pose = poses[:, mine, None]
-            points = window.points[mine]
-            x_y = np.stack(in_plane(pose, points), axis=-1)
-            foot = index.foot(x_y)
-            step = index.step[foot.segment]
-            normal = np.stack([-step[..., 1], step[..., 0]], axis=-1)
-            normal /= np.hypot(step[..., 0], step[..., 1])[..., None]
-            found = line_residual(
-                pose[..., :2], pose[..., 2], point_b=points, foot=foot.x_y, normal=normal
-            )
+            x, y = in_plane(poses[:, mine, None], window.points[mine])
+            foot = index.foot(np.stack([x, y], axis=-1))
+            nx, ny = np.moveaxis(index.normal[foot.segment], -1, 0)
+            error = nx * (x - foot.x_y[..., 0]) + ny * (y - foot.x_y[..., 1])
             sigma = how.sigma_m + wider_m
             counted = (foot.distance < np.sqrt(how.cap_sq) * sigma) / sigma**2
             # In world axes, and turned about the last picture's position.
-            arm = x_y - at[:, None, None, :2]
-            turn = normal[..., 1] * arm[..., 0] - normal[..., 0] * arm[..., 1]
-            block = np.concatenate([normal, turn[..., None]], axis=-1)
-            hessian += np.einsum("ncm,ncmi,ncmj->nij", counted, block, block)
-            error = np.where(counted > 0.0, found.error, 0.0)
-            slope += np.einsum("ncm,ncmi->ni", counted * error, block)
+            turn = ny * (x - at[:, 0, None, None]) - nx * (y - at[:, 1, None, None])
+            block = np.stack([nx, ny, turn], axis=-1).reshape(len(at), -1, 3)
+            said = (block * counted.reshape(len(at), -1, 1)).swapaxes(1, 2)
+            hessian += said @ block
+            slope += (said @ error.reshape(len(at), -1, 1))[..., 0]
         step = np.linalg.solve(hessian, slope[..., None])[..., 0]
         at = at - step
     return at

@@ -55,6 +55,8 @@ OLD_SHARE: Final = 0.005
 """Of the weight that stays with the particles as they were, when others are put elsewhere."""
 SLIDE_EVERY_M: Final = 15.0
 """From one look along the lane to the next."""
+AGAIN_PICTURES: Final = 5
+"""So many pictures at least from one look to the next: at 25 m/s a few metres are one picture."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,6 +117,7 @@ class Localiser:
         self.when = verdict or VerdictSettings()
         self.verdict, self.hypotheses = Verdict.AMBIGUOUS, list[Hypothesis]()
         self.next_m = self.next_slide_m = 0.0
+        self.next_row = 0
         self.first: tuple[float, float, Array] | None = None
         self.refinement = refinement or RefinementSettings()
         self.half_m = square_of(drive)
@@ -168,6 +171,8 @@ class Localiser:
         self.extras.append((mean, cov))
         if len(self.rows) in (3, 10, 25) or len(self.rows) % 60 == 0:
             self._keep(when)
+        if len(self.rows) < self.next_row:
+            return
         if locator.driven_m >= max(self.next_m, self.when.least_driven_m):
             self._judge(number)
         elif self.verdict is Verdict.CONVERGED and locator.driven_m >= self.next_slide_m:
@@ -176,6 +181,7 @@ class Localiser:
     def _slide(self, number: int) -> None:
         """Look along the lane: the particles may have lost the right place in it."""
         self.next_slide_m = self.locator.driven_m + SLIDE_EVERY_M
+        self.next_row = len(self.rows) + AGAIN_PICTURES
         window = self._stretch(number)
         if window is not None:
             mean = self.rows[-1][1]
@@ -226,6 +232,7 @@ class Localiser:
         window = self._stretch(number)
         when, mean, cov, driven_m, _ = self.rows[-1]
         self.next_m = driven_m + v.again_after_m
+        self.next_row = len(self.rows) + AGAIN_PICTURES
         if window is None:
             self.verdict = Verdict.FAILED if self.first is None else self.verdict
             return

@@ -122,9 +122,7 @@ class _Lines:
             if not mine.any():
                 continue
             foot = index.foot(x_y[mine])
-            step = index.step[foot.segment]
-            normal = np.stack([-step[..., 1], step[..., 0]], axis=-1)
-            self.normals[mine] = normal / np.hypot(step[..., 0], step[..., 1])[..., None]
+            self.normals[mine] = index.normal[foot.segment]
             self.feet[mine] = foot.x_y
             trust = (foot.distance < _FAR_M).astype(float)
             off = np.abs(np.sum(self.normals[mine] * (x_y[mine] - foot.x_y), axis=-1))
