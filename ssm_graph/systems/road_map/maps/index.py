@@ -57,7 +57,9 @@ class LineIndex:
         self.mark = np.array([*(int(line.mark) for line in lines), 0])[self.line_of]
         """(S + 1,) how the piece is painted."""
         length_sq = np.maximum(np.einsum("ij,ij->i", self.step, self.step), 1e-12)
-        self.normal = np.column_stack([-self.step[:, 1], self.step[:, 0]]) / np.sqrt(length_sq)[:, None]
+        self.normal = (
+            np.column_stack([-self.step[:, 1], self.step[:, 0]]) / np.sqrt(length_sq)[:, None]
+        )
         """(S + 1, 2) unit vector to the left of the piece."""
         self._piece = np.column_stack([self.start, self.step, self.step / length_sq[:, None]])
         self._make_tree()
