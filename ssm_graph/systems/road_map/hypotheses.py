@@ -34,12 +34,17 @@ _KEPT: Final = 40
 SLIDE_M: Final = 24.0
 """How far along the lane a place is looked for anew."""
 _ROUNDS: Final = 5
+ALONG_STEP_M: Final = 2.0
+"""Between the places along a lane that are compared with each other."""
+_HELD: Final = 1e6
+"""1/m^2, along the course of a place that stays where it is along its lane."""
 
 
 def is_same_lane(hypothesis: Hypothesis, pose: Array) -> bool:
     """Whether a pose is within the lane of a hypothesis, wherever along it."""
-    across, _, turn = apart(np.array(hypothesis.pose), pose)
-    return abs(across) < LATERAL_M and abs(turn) < TURN
+    across, along, turn = apart(np.array(hypothesis.pose), pose)
+    # A lane that turns on the way there is an arc.
+    return abs(across - along * np.tan(0.5 * turn)) < LATERAL_M and abs(turn) < TURN
 
 
 def apart(pose: Array, other: Array) -> tuple[float, float, float]:
@@ -97,6 +102,44 @@ def slide(
     return _ranked(window, fine, indices, settings)
 
 
+def along_lane(
+    window: Window,
+    pose: Array,
+    x_y: Array,
+    half_m: float,
+    indices: Mapping[LineKind, LineIndex],
+    settings: LocatorSettings,
+) -> tuple[Array, Array]:
+    """Return places (n, 3) all along the lane of a pose (3,), and the log evidence (n,) of each.
+
+    They are ``ALONG_STEP_M`` apart, as far as the square about a point (2,) reaches; each is moved
+    across and turned to where the stretch fits best there.
+    """
+    thin = _thinned(window)
+    ends, found = np.stack([pose, pose]), [pose]
+    goes_on = np.ones(2, dtype=bool)
+    step = ALONG_STEP_M * np.array([1.0, -1.0])
+    for _ in range(int(np.ceil(2.0 * half_m / ALONG_STEP_M))):
+        moved = ends + step[:, None] * np.column_stack(
+            [np.cos(ends[:, 2]), np.sin(ends[:, 2]), np.zeros(2)]
+        )
+        fitted = _fitted(thin, moved, indices, settings, 0.5, is_held=True)
+        across = np.hypot(*(fitted - moved)[:, :2].T)
+        goes_on &= (across < LATERAL_M) & (np.abs(fitted[:, :2] - x_y).max(axis=1) < half_m)
+        if not goes_on.any():
+            break
+        ends = fitted
+        found += list(ends[goes_on])
+    poses = np.array(found)
+    return poses, _independent(window) * _log_likelihood(window, poses, indices, settings, 0.0)
+
+
+def _independent(window: Window) -> float:
+    """Return which share of its pictures a window is worth: close ones see the same errors."""
+    length = float(np.hypot(*np.diff(window.motion[:, :2], axis=0).T).sum())
+    return min(1.0, (length + INDEPENDENT_M) / (INDEPENDENT_M * len(window.time_s)))
+
+
 def _ranked(
     window: Window,
     poses: Array,
@@ -107,8 +150,7 @@ def _ranked(
 
     Pictures close to each other see the same errors of the map again: so much less they count.
     """
-    length = float(np.hypot(*np.diff(window.motion[:, :2], axis=0).T).sum())
-    new = min(1.0, (length + INDEPENDENT_M) / (INDEPENDENT_M * len(window.time_s)))
+    new = _independent(window)
     whole = _log_likelihood(window, poses, indices, settings, 0.0)
     found, misfit = new * whole, -whole / len(window.picture)
     kept = _apart_from_each_other(poses, found, _KEPT)
@@ -182,15 +224,21 @@ def _fitted(
     indices: Mapping[LineKind, LineIndex],
     settings: LocatorSettings,
     first_m: float,
+    *,
+    is_held: bool = False,
 ) -> Array:
     """Return poses (n, 3) moved to where the window fits best nearby: damped Gauss-Newton.
 
-    The widths fall from round to round, beginning with ``first_m`` more than the sigmas.
+    The widths fall from round to round, beginning with ``first_m`` more than the sigmas. Those that
+    are held move across their course only, and turn.
     """
     at: Array = last.copy()
     for number in range(_ROUNDS):
         wider_m = first_m * 0.4**number
         hessian = np.zeros((len(at), 3, 3)) + np.diag([0.05, 0.05, 30.0])
+        if is_held:
+            ahead = np.column_stack([np.cos(at[:, 2]), np.sin(at[:, 2])])
+            hessian[:, :2, :2] += _HELD * ahead[:, :, None] * ahead[:, None]
         slope = np.zeros((len(at), 3))
         poses = window.poses_from(at)[:, window.picture.astype(int)]
         for kind, index in indices.items():

@@ -11,13 +11,14 @@ import numpy as np
 
 from ssm_graph.base.errors import DataError, SolverError
 from ssm_graph.base.frozen import Array, FrozenArrays, shaped
-from ssm_graph.base.units import DEGREE
+from ssm_graph.base.units import DEGREE, wrapped
 from ssm_graph.filters.rules.hypotheses import CARRIED, Hypothesis
-from ssm_graph.filters.rules.particles import Particles, moments
+from ssm_graph.filters.rules.particles import Particles, moments, normalised, systematic
 from ssm_graph.systems.road_map.drive import Drive, curve_groups, dead_reckoned
 from ssm_graph.systems.road_map.hypotheses import (
     ALONG_M,
-    apart,
+    ALONG_STEP_M,
+    along_lane,
     course_trials,
     is_same_lane,
     search,
@@ -33,7 +34,13 @@ from ssm_graph.systems.road_map.locator import (
 )
 from ssm_graph.systems.road_map.maps.index import LineIndex
 from ssm_graph.systems.road_map.maps.road_map import LineKind, RoadMap
-from ssm_graph.systems.road_map.refinement import Prior, Refined, RefinementSettings, refine
+from ssm_graph.systems.road_map.refinement import (
+    Prior,
+    Refined,
+    RefinementSettings,
+    refine,
+    sigmas_of,
+)
 from ssm_graph.systems.road_map.simulate import indices_of
 from ssm_graph.systems.road_map.verdict import (
     Verdict,
@@ -125,8 +132,10 @@ class Localiser:
         if indices is None:
             indices = indices_of(road_map.within(fixes, self.half_m + SENSOR_REACH_M))
         self.indices = indices
-        yaw, rng = _first_course(drive), np.random.default_rng([seed, 2])
-        particles = first_particles(fixes[0], self.half_m, yaw, self.indices, self.settings, rng)
+        self.course, rng = _first_course(drive), np.random.default_rng([seed, 2])
+        particles = first_particles(
+            fixes[0], self.half_m, self.course, self.indices, self.settings, rng
+        )
         self.locator = Locator(self.indices, particles, rng, self.settings)
         t = drive.chassis.time_s
         self.reckoned = dead_reckoned(np.zeros(3), t, drive.chassis)
@@ -200,7 +209,30 @@ class Localiser:
     def _spread(self, found: list[Hypothesis]) -> None:
         """Put particles about all places that the stretch allows."""
         locator = self.locator
-        locator.put(_spread_over(found, locator.particles, self.settings, locator.rng))
+        likely = [h for h in found if h.share > 1e-3]
+        share = np.array([h.share for h in likely])
+        share = np.maximum(share / share.sum(), 0.05)
+        at = np.array([h.pose for h in likely])
+        locator.put(_spread_over(at, share, ALONG_M, locator.particles, self.settings, locator.rng))
+
+    def _lay_along(self, window: Window, fix: Array) -> None:
+        """Lay particles anew along the lane, by the evidence of all that was seen.
+
+        Few of the first particles were in the right lane: what they say of the place along it is
+        how they happened to lie.
+        """
+        best = np.array(self.hypotheses[0].pose)
+        at, value = along_lane(window, best, fix, self.half_m, self.indices, self.settings)
+        if self.course is not None:
+            since = self.reckoned[0, 2] - self._reckoned_at(self.rows[-1][0])[2]
+            off = wrapped(at[:, 2] + since - self.course) / self.settings.yaw_sigma
+            value = value - 0.5 * off**2
+        locator = self.locator
+        locator.put(
+            _spread_over(
+                at, normalised(value), ALONG_STEP_M, locator.particles, self.settings, locator.rng
+            )
+        )
 
     def _keep(self, when: float) -> None:
         self.snapshots.append((when, self.locator.particles.states[:, :3].copy()))
@@ -236,7 +268,7 @@ class Localiser:
         if window is None:
             self.verdict = Verdict.FAILED if self.first is None else self.verdict
             return
-        fix = _fix_at(self.drive, when)
+        fix = self._fix_at(when, float(mean[2]))
         spread = max(float(np.sqrt(cov[2, 2])), self.settings.yaw_sigma / 2.0)
         yaws = course_trials(float(mean[2]), min(spread, 10.0 * DEGREE))
         found, own = search(window, fix, self.half_m, yaws, self.indices, self.settings, mean)
@@ -261,6 +293,20 @@ class Localiser:
             self.next_m = driven_m + v.watch_m
             if self.first is None and driven_m >= v.least_driven_m:
                 self.first = (when, driven_m, mean)
+                self._lay_along(window, fix)
+
+    def _fix_at(self, when: float, yaw: float) -> Array:
+        """Return the last fix before a time, carried on by dead reckoning to a course, (2,) m."""
+        k = max(0, int(np.searchsorted(self.drive.gnss.time_s, when, side="right")) - 1)
+        now = self._reckoned_at(when)
+        c, s = np.cos(yaw - now[2]), np.sin(yaw - now[2])
+        gone = (now - self._reckoned_at(float(self.drive.gnss.time_s[k])))[:2]
+        return np.asarray(self.drive.gnss.x_y[k] + np.array([[c, -s], [s, c]]) @ gone)
+
+    def _reckoned_at(self, when: float) -> Array:
+        """Return the dead-reckoned pose (3,) of the chassis row at a time or after it."""
+        row = int(np.searchsorted(self.drive.chassis.time_s, when - 1e-6))
+        return np.asarray(self.reckoned[min(row, len(self.reckoned) - 1)])
 
     def _answer(self, cpu_ms: float) -> Located:
         v = self.when
@@ -278,9 +324,9 @@ class Localiser:
         if refined is not None:
             pose, sigmas = refined.poses[-1], refined.sigmas
             if sigmas[1] > 0.5 * along:  # no bend in the window: the particles know more
-                _, ahead, _ = apart(pose, mean)
-                pose = pose + ahead * np.array([np.cos(pose[2]), np.sin(pose[2]), 0.0])
-                sigmas = (sigmas[0], along, sigmas[2])
+                pose = pose.copy()
+                pose[:2] += (mean - pose)[:2] @ refined.ahead * refined.ahead
+                sigmas = refined.with_along(along)
         if verdict is Verdict.CONVERGED and sigmas[1] > v.along_sigma_m:
             verdict = Verdict.UNRESOLVED_ALONG
         first = self.first or (np.nan, np.nan, np.full(3, np.nan))
@@ -335,16 +381,6 @@ def square_of(drive: Drive) -> float:
     return drive.gnss_bias_m + noise
 
 
-def sigmas_of(pose: Array, cov: Array) -> tuple[float, float]:
-    """Return the standard deviations across and along a pose (3,) from its covariance, m."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    along, across = np.array([c, s]), np.array([-s, c])
-    return (
-        float(np.sqrt(across @ cov[:2, :2] @ across)),
-        float(np.sqrt(along @ cov[:2, :2] @ along)),
-    )
-
-
 def _without_chance(mean: Array, cov: Array) -> Array:
     """Return a covariance (5, 5) of particles with what is along the pose tied to nothing else.
 
@@ -366,28 +402,24 @@ def _first_course(drive: Drive) -> float | None:
     return float(yaw[0])
 
 
-def _fix_at(drive: Drive, when: float) -> Array:
-    """Return the last fix before a time, carried on by dead reckoning, (2,) m."""
-    k = max(0, int(np.searchsorted(drive.gnss.time_s, when, side="right")) - 1)
-    return np.asarray(drive.gnss.x_y[k])
-
-
 def _spread_over(
-    found: list[Hypothesis],
+    at: Array,
+    share: Array,
+    reach_m: float,
     old: Particles,
     settings: LocatorSettings,
     rng: np.random.Generator,
 ) -> Particles:
-    """Return particles about all places with evidence, in proportion; some of the old ones stay."""
+    """Return particles about places (n, 3) by their shares; some of the old ones stay.
+
+    ``reach_m`` is the length along the course over which those of a place are laid.
+    """
     n = settings.most
     kept = old.states[rng.choice(len(old.states), n // 5, p=old.weight)]
-    likely = [h for h in found if h.share > 1e-3]
-    share = np.array([h.share for h in likely])
-    share = np.maximum(share / share.sum(), 0.05)
-    rows = rng.choice(len(likely), n - len(kept), p=share / share.sum())
+    rows = systematic(share / share.sum(), n - len(kept), rng)
     drawn = old.states[rng.choice(len(old.states), len(rows), p=old.weight)].copy()
-    drawn[:, :3] = np.array([h.pose for h in likely])[rows]
-    along = rng.uniform(-0.5 * ALONG_M, 0.5 * ALONG_M, len(rows))
+    drawn[:, :3] = at[rows]
+    along = rng.uniform(-0.5 * reach_m, 0.5 * reach_m, len(rows))
     drawn[:, 0] += along * np.cos(drawn[:, 2]) + 0.2 * rng.standard_normal(len(rows))
     drawn[:, 1] += along * np.sin(drawn[:, 2]) + 0.2 * rng.standard_normal(len(rows))
     drawn[:, 2] += 0.5 * DEGREE * rng.standard_normal(len(rows))
