@@ -8,6 +8,7 @@ itself says is possible does not depend on which particles are left.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -84,6 +85,9 @@ def search(
     starts = np.concatenate([grid[_apart_from_each_other(grid, coarse, _KEPT)], own[None]])
     fine = _fitted(thin, starts, indices, settings, _COARSE_SIGMA_M)
     inside = np.abs(fine[:, :2] - x_y).max(axis=1) < half_m + 2.0 * _COARSE_M
+    if inside.any() and not inside[-1]:  # the fix says that it is not there
+        found, last = _ranked(window, fine[inside], indices, settings)
+        return found, replace(last, log_evidence=-np.inf)
     inside[-1] = True
     return _ranked(window, fine[inside], indices, settings)
 

@@ -13,11 +13,13 @@ from ssm_graph.base.errors import DataError, SolverError
 from ssm_graph.base.frozen import Array, FrozenArrays, shaped
 from ssm_graph.base.units import DEGREE, wrapped
 from ssm_graph.filters.rules.hypotheses import CARRIED, Hypothesis
-from ssm_graph.filters.rules.particles import Particles, moments, normalised, systematic
+from ssm_graph.filters.rules.particles import moments, normalised
 from ssm_graph.systems.road_map.drive import Drive, curve_groups, dead_reckoned
 from ssm_graph.systems.road_map.hypotheses import (
     ALONG_M,
     ALONG_STEP_M,
+    LATERAL_M,
+    TURN,
     along_lane,
     course_trials,
     is_same_lane,
@@ -31,6 +33,7 @@ from ssm_graph.systems.road_map.locator import (
     Locator,
     LocatorSettings,
     first_particles,
+    spread_over,
 )
 from ssm_graph.systems.road_map.maps.index import LineIndex
 from ssm_graph.systems.road_map.maps.road_map import LineKind, RoadMap
@@ -58,8 +61,6 @@ LOST: Final = 4.0
 """Log evidence by which another place must be better for the particles to be put there."""
 MOST_PICTURES: Final = 60
 """Of a stretch, where the vehicle is slow."""
-OLD_SHARE: Final = 0.005
-"""Of the weight that stays with the particles as they were, when others are put elsewhere."""
 SLIDE_EVERY_M: Final = 15.0
 """From one look along the lane to the next."""
 AGAIN_PICTURES: Final = 5
@@ -124,7 +125,7 @@ class Localiser:
         self.when = verdict or VerdictSettings()
         self.verdict, self.hypotheses = Verdict.AMBIGUOUS, list[Hypothesis]()
         self.next_m = self.next_slide_m = 0.0
-        self.next_row = 0
+        self.next_row = self.put_row = 0
         self.first: tuple[float, float, Array] | None = None
         self.refinement = refinement or RefinementSettings()
         self.half_m = square_of(drive)
@@ -209,11 +210,11 @@ class Localiser:
     def _spread(self, found: list[Hypothesis]) -> None:
         """Put particles about all places that the stretch allows."""
         locator = self.locator
+        self.put_row = len(self.rows)
         likely = [h for h in found if h.share > 1e-3]
         share = np.array([h.share for h in likely])
-        share = np.maximum(share / share.sum(), 0.05)
         at = np.array([h.pose for h in likely])
-        locator.put(_spread_over(at, share, ALONG_M, locator.particles, self.settings, locator.rng))
+        locator.put(spread_over(at, share, ALONG_M, locator.particles, self.settings, locator.rng))
 
     def _lay_along(self, window: Window, fix: Array) -> None:
         """Lay particles anew along the lane, by the evidence of all that was seen.
@@ -229,7 +230,7 @@ class Localiser:
             value = value - 0.5 * off**2
         locator = self.locator
         locator.put(
-            _spread_over(
+            spread_over(
                 at, normalised(value), ALONG_STEP_M, locator.particles, self.settings, locator.rng
             )
         )
@@ -276,9 +277,9 @@ class Localiser:
         if found[0].misfit > v.misfit:
             self.verdict = Verdict.FAILED
             return
-        across, _ = sigmas_of(mean, cov)
-        is_known = _lane_share(found, np.array(found[0].pose)) > 1.0 - CARRIED
-        if across > v.lateral_sigma_m and is_known:
+        best = np.array(found[0].pose)
+        is_known = _lane_share(found, best) > 1.0 - CARRIED
+        if is_known and self._in_lane(best) < 1.0 - CARRIED:
             self._spread(found)  # the stretch as a whole knows the lane before the particles do
         else:
             self._put(found, own)
@@ -286,14 +287,21 @@ class Localiser:
         self.extras[-1] = moments(p.states, p.weight, YAW)
         mean, cov = self.extras[-1][0][:3], self.extras[-1][1][:3, :3]
         self.rows[-1] = (when, mean, cov, driven_m, len(p.states))
-        across, _ = sigmas_of(mean, cov)
         self.verdict = Verdict.AMBIGUOUS
-        if across < v.lateral_sigma_m and _lane_share(found, mean) > 1.0 - CARRIED:
+        if min(self._in_lane(mean), _lane_share(found, mean)) > 1.0 - CARRIED:
             self.verdict = Verdict.CONVERGED
             self.next_m = driven_m + v.watch_m
             if self.first is None and driven_m >= v.least_driven_m:
                 self.first = (when, driven_m, mean)
                 self._lay_along(window, fix)
+
+    def _in_lane(self, pose: Array) -> float:
+        """Return which share of the particles is in the lane of a pose (3,)."""
+        p = self.locator.particles
+        off, turn = p.states[:, :2] - pose[:2], wrapped(p.states[:, YAW] - pose[2])
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        across = off @ [-s, c] - off @ [c, s] * np.tan(0.5 * turn)
+        return float(p.weight[(np.abs(across) < LATERAL_M) & (np.abs(turn) < TURN)].sum())
 
     def _fix_at(self, when: float, yaw: float) -> Array:
         """Return the last fix before a time, carried on by dead reckoning to a course, (2,) m."""
@@ -323,7 +331,9 @@ class Localiser:
                 reason = str(error)
         if refined is not None:
             pose, sigmas = refined.poses[-1], refined.sigmas
-            if sigmas[1] > 0.5 * along:  # no bend in the window: the particles know more
+            off = abs(float((mean - pose)[:2] @ refined.ahead))
+            # No bend in the window, and the particles know more; or what it took for one is none.
+            if sigmas[1] > 0.5 * along or off > 3.0 * np.hypot(along, sigmas[1]):
                 pose = pose.copy()
                 pose[:2] += (mean - pose)[:2] @ refined.ahead * refined.ahead
                 sigmas = refined.with_along(along)
@@ -354,7 +364,11 @@ class Localiser:
         window = self._window(groups)
         if window is None:
             return None, None
-        mean, cov = self.extras[len(self.rows) - n]
+        first = len(self.rows) - n
+        mean, cov = self.extras[first]
+        if first < self.put_row:  # the particles were elsewhere then
+            mean, cov = self.extras[-1][0].copy(), 4.0 * self.extras[-1][1]
+            mean[:3] = window.poses_from(mean[:3])[0]
         floor = np.diag([0.05, 0.05, 0.2 * DEGREE, 1e-3, 1e-5]) ** 2
         cov = cov + floor
         if n == len(self.rows):
@@ -400,33 +414,6 @@ def _first_course(drive: Drive) -> float | None:
     if yaw is None or not np.isfinite(yaw[0]):
         return None
     return float(yaw[0])
-
-
-def _spread_over(
-    at: Array,
-    share: Array,
-    reach_m: float,
-    old: Particles,
-    settings: LocatorSettings,
-    rng: np.random.Generator,
-) -> Particles:
-    """Return particles about places (n, 3) by their shares; some of the old ones stay.
-
-    ``reach_m`` is the length along the course over which those of a place are laid.
-    """
-    n = settings.most
-    kept = old.states[rng.choice(len(old.states), n // 5, p=old.weight)]
-    rows = systematic(share / share.sum(), n - len(kept), rng)
-    drawn = old.states[rng.choice(len(old.states), len(rows), p=old.weight)].copy()
-    drawn[:, :3] = at[rows]
-    along = rng.uniform(-0.5 * reach_m, 0.5 * reach_m, len(rows))
-    drawn[:, 0] += along * np.cos(drawn[:, 2]) + 0.2 * rng.standard_normal(len(rows))
-    drawn[:, 1] += along * np.sin(drawn[:, 2]) + 0.2 * rng.standard_normal(len(rows))
-    drawn[:, 2] += 0.5 * DEGREE * rng.standard_normal(len(rows))
-    weight = np.repeat(
-        [OLD_SHARE / len(kept), (1.0 - OLD_SHARE) / len(drawn)], [len(kept), len(drawn)]
-    )
-    return Particles(np.concatenate([kept, drawn]), np.log(weight))
 
 
 def _track(rows: list[tuple[float, Array, Array, float, int]]) -> Track:

@@ -27,8 +27,8 @@ from ssm_graph.systems.road_map.window import Window, in_plane
 _FAR_M: Final = 1.5
 """A point farther from every line of its kind is of none of them."""
 _SLANTED: Final = 0.1
-"""Sine of the angle between a line and the way that its points go when the window is moved along the
-road, below which it says nothing of the place along it: what small kinks would say is the map's
+"""Sine of the angle between a line and the way that its points go when the window is moved along
+the road, below which it says nothing of the place along it: what small kinks would say is the map's
 error, the same in every picture. The road is an arc over the window, so that the move is one of a
 stiff piece: moves of each picture for itself would differ by the chassis, and so say what no line
 says."""
@@ -36,6 +36,9 @@ _SAME_WAY: Final = 0.9
 """Cosine to the course beyond which a line runs along the road and not across it."""
 _LEAST_ARC_M: Final = 30.0
 """A shorter stretch of lines has no bend that could be told from kinks."""
+_BEND_M: Final = 0.15
+"""By how much, along the road, what a bend says is off in all pictures alike: its line in the map,
+and the cubic that is laid along it; measured on seeds below 100."""
 _CLOSE_M: Final = 2e-4
 _CLOSE_RAD: Final = 1e-4
 
@@ -254,13 +257,20 @@ def refine(
         poses,
         float(extra[0]),
         float(extra[1]),
-        covs if covs is not None else np.zeros((len(poses), 3, 3)),
+        _with_bends(covs, lines.ahead) if covs is not None else np.zeros((len(poses), 3, 3)),
         weight,
         lines.feet,
         has_settled,
         lines.ahead,
         _leave_first(window, lines, poses, extra, prior, s, covs),
     )
+
+
+def _with_bends(covs: Array, ahead: Array) -> Array:
+    """Return covariances (K, 3, 3) with what bends are off by along the road."""
+    found = covs.copy()
+    found[:, :2, :2] += _BEND_M**2 * np.outer(ahead, ahead)
+    return found
 
 
 def _system(
