@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.units import DEGREE, wrapped
 from ssm_graph.filters.rules.hypotheses import Hypothesis, apart_from_each_other, told
+from ssm_graph.filters.rules.particles import normalised
 from ssm_graph.systems.road_map.locator import INDEPENDENT_M, LocatorSettings
 from ssm_graph.systems.road_map.maps.index import LineIndex
 from ssm_graph.systems.road_map.maps.road_map import LineKind, Mark
@@ -28,6 +29,8 @@ TURN: Final = 20.0 * DEGREE
 """... if they face the same way."""
 ALONG_M: Final = 8.0
 """Places of one lane farther apart along the road are told apart all the same."""
+_ALONG_LEAST_M: Final = 1.0
+"""No place along a lane is held to be better known than so, when places are compared."""
 _COARSE_M: Final = 2.0
 _COARSE_TURN: Final = 2.5 * DEGREE
 _COARSE_SIGMA_M: Final = 1.2
@@ -46,6 +49,23 @@ def is_same_lane(hypothesis: Hypothesis, pose: Array) -> bool:
     across, along, turn = apart(np.array(hypothesis.pose), pose)
     # A lane that turns on the way there is an arc.
     return abs(across - along * np.tan(0.5 * turn)) < LATERAL_M and abs(turn) < TURN
+
+
+def known_along(found: list[Hypothesis], pose: Array, along_m: float) -> list[Hypothesis]:
+    """Return places by evidence where those in the lane of a pose (3,) are known along it as well.
+
+    A stretch of straight road allows them all alike; ``along_m`` is the sigma of what was known
+    of the place along it before.
+    """
+    mine = np.array([is_same_lane(h, pose) for h in found])
+    along = np.array([apart(pose, np.array(h.pose))[1] for h in found])
+    loss = np.where(mine, 0.5 * np.square(along / max(along_m, _ALONG_LEAST_M)), 0.0)
+    value = np.array([h.log_evidence for h in found]) - loss
+    if mine.any():
+        value[mine] += loss[mine].min()
+    share = normalised(value)
+    order = np.argsort(-value, kind="stable")
+    return [replace(found[i], log_evidence=float(value[i]), share=float(share[i])) for i in order]
 
 
 def apart(pose: Array, other: Array) -> tuple[float, float, float]:

@@ -23,6 +23,7 @@ from ssm_graph.systems.road_map.hypotheses import (
     along_lane,
     course_trials,
     is_same_lane,
+    known_along,
     search,
     slide,
 )
@@ -337,16 +338,18 @@ class Localiser:
                 pose = pose.copy()
                 pose[:2] += (mean - pose)[:2] @ refined.ahead * refined.ahead
                 sigmas = refined.with_along(along)
-        if verdict is Verdict.CONVERGED and sigmas[1] > v.along_sigma_m:
+        hypotheses = known_along(self.hypotheses, pose, sigmas[1]) if self.hypotheses else []
+        is_shared = len(hypotheses) > 1 and hypotheses[1].share > CARRIED
+        if verdict is Verdict.CONVERGED and (sigmas[1] > v.along_sigma_m or is_shared):
             verdict = Verdict.UNRESOLVED_ALONG
         first = self.first or (np.nan, np.nan, np.full(3, np.nan))
         return Located(
             verdict,
-            reason_of(verdict, self.hypotheses, v.misfit, pose, sigmas)
+            reason_of(verdict, hypotheses, v.misfit, pose, sigmas)
             + (f"; {reason}" if reason else ""),
             np.array(pose),
             sigmas,
-            tuple(self.hypotheses),
+            tuple(hypotheses),
             first[0] - float(self.drive.chassis.time_s[0]),
             first[1],
             first[2],
