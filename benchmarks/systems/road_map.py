@@ -44,6 +44,7 @@ PARTS = (
     ("plain", TOWNS, ("annealed",), 25),
     ("short", JUNCTIONS, ("annealed",), 25),
     ("left-hand", KARLSRUHE + TOWNS, ("annealed",), 15),
+    ("no course", KARLSRUHE + TOWNS, ("annealed",), 15),
     ("damaged", TOWNS, ("annealed",), 15),
     ("plain", KARLSRUHE, PATENT, 20),
 )
@@ -65,7 +66,7 @@ def main() -> None:
     cells: list[tuple[str, ...]] = []
     first = report.args.first_seed
     for case, maps, methods, n in PARTS:
-        ledger = Ledger(report.args.out / f"{case}.jsonl", settings_of(case))
+        ledger = Ledger(report.args.out / f"{case.replace(' ', '_')}.jsonl", settings_of(case))
         paths = [Path(report.args.data) / "systems" / name for name in maps]
         count = max(2, round(n * report.args.share))
         seeds = range(first, first + count)

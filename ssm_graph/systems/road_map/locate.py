@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -38,6 +38,7 @@ from ssm_graph.systems.road_map.locator import (
 )
 from ssm_graph.systems.road_map.maps.index import LineIndex
 from ssm_graph.systems.road_map.maps.road_map import LineKind, RoadMap
+from ssm_graph.systems.road_map.motion import first_course
 from ssm_graph.systems.road_map.refinement import (
     Prior,
     Refined,
@@ -127,21 +128,27 @@ class Localiser:
         self.verdict, self.hypotheses = Verdict.AMBIGUOUS, list[Hypothesis]()
         self.next_m = self.next_slide_m = 0.0
         self.next_row = self.put_row = 0
+        self.before_m = 0.0
         self.first: tuple[float, float, Array] | None = None
         self.refinement = refinement or RefinementSettings()
         self.half_m = square_of(drive)
-        fixes = drive.gnss.x_y
+        fixes, fixes_s = drive.gnss.x_y, drive.gnss.time_s
         if indices is None:
             indices = indices_of(road_map.within(fixes, self.half_m + SENSOR_REACH_M))
         self.indices = indices
-        self.course, rng = _first_course(drive), np.random.default_rng([seed, 2])
+        begin = first_course(drive)
+        self.course, self.begin_s = begin.yaw, float(fixes_s[begin.fix]) if begin.fix else -np.inf
+        if begin.yaw is not None:
+            spread = max(self.settings.yaw_sigma, begin.sigma)
+            self.settings = replace(self.settings, yaw_sigma=spread)
+        rng = np.random.default_rng([seed, 2])
         particles = first_particles(
-            fixes[0], self.half_m, self.course, self.indices, self.settings, rng
+            fixes[begin.fix], self.half_m, self.course, self.indices, self.settings, rng
         )
         self.locator = Locator(self.indices, particles, rng, self.settings)
         t = drive.chassis.time_s
         self.reckoned = dead_reckoned(np.zeros(3), t, drive.chassis)
-        self.groups = curve_groups(drive.curves)
+        self.groups = [g for g in curve_groups(drive.curves) if g[0] >= self.begin_s]
         self.snapshots: list[tuple[float, Array]] = []
         self.rows: list[tuple[float, Array, Array, float, int]] = []
         self.extras: list[tuple[Array, Array]] = []
@@ -153,8 +160,10 @@ class Localiser:
         way = np.hypot(*np.diff(self.reckoned[:, :2], axis=0).T)
         way *= np.sign(0.5 * (self.drive.chassis.speed[1:] + self.drive.chassis.speed[:-1]))
         turn = np.diff(self.reckoned[:, 2])
-        self._keep(float(t[0]))
-        for k in range(1, len(t)):
+        begin = int(np.searchsorted(t, self.begin_s))
+        self.before_m = float(np.abs(way[:begin]).sum())
+        self._keep(float(t[begin]))
+        for k in range(begin + 1, len(t)):
             while n_done < len(self.groups) and self.groups[n_done][0] < t[k]:
                 self._picture(n_done)
                 n_done += 1
@@ -226,7 +235,8 @@ class Localiser:
         best = np.array(self.hypotheses[0].pose)
         at, value = along_lane(window, best, fix, self.half_m, self.indices, self.settings)
         if self.course is not None:
-            since = self.reckoned[0, 2] - self._reckoned_at(self.rows[-1][0])[2]
+            began, now = self._reckoned_at(self.begin_s), self._reckoned_at(self.rows[-1][0])
+            since = began[2] - now[2]
             off = wrapped(at[:, 2] + since - self.course) / self.settings.yaw_sigma
             value = value - 0.5 * off**2
         locator = self.locator
@@ -351,7 +361,7 @@ class Localiser:
             sigmas,
             tuple(hypotheses),
             first[0] - float(self.drive.chassis.time_s[0]),
-            first[1],
+            self.before_m + first[1],
             first[2],
             _track(self.rows),
             refined,
@@ -410,13 +420,6 @@ def _without_chance(mean: Array, cov: Array) -> Array:
     own = turned @ cov @ turned.T
     own[0, 1:], own[1:, 0] = 0.0, 0.0
     return np.asarray(turned.T @ own @ turned)
-
-
-def _first_course(drive: Drive) -> float | None:
-    yaw = drive.gnss.yaw
-    if yaw is None or not np.isfinite(yaw[0]):
-        return None
-    return float(yaw[0])
 
 
 def _track(rows: list[tuple[float, Array, Array, float, int]]) -> Track:

@@ -145,7 +145,6 @@ class _Lines:
                 continue
             foot = index.foot(x_y[mine])
             self.normals[mine] = index.normal[foot.segment]
-            self.feet[mine] = foot.x_y
             trust = (foot.distance < _FAR_M).astype(float)
             off = np.abs(np.sum(self.normals[mine] * (x_y[mine] - foot.x_y), axis=-1))
             trust[foot.distance > off + 0.05] = 0.0  # beyond the end of a line
@@ -154,6 +153,7 @@ class _Lines:
                 wrong = (seen != Mark.UNKNOWN) & (there != Mark.UNKNOWN) & (seen != there)
                 trust = np.where(wrong, trust * self.settings.wrong_mark, trust)
             self.trust[mine] = trust
+            self.feet[mine] = np.where(trust[..., None] > 0.0, foot.x_y, x_y[mine])
         self.ahead, self.bend = self._road(poses)
 
     def _road(self, poses: Array) -> tuple[Array, float]:
@@ -203,6 +203,7 @@ class _Lines:
         slant = np.where(np.abs(slant) < _SLANTED, slant, 0.0)
         said = self.normals - slant[..., None] * own[:, None]
         block = np.concatenate([said, found.error_D_pose[..., 2:]], axis=-1)
+        block *= (self.trust > 0.0)[..., None]  # a point on no line says nothing
         x = w.points[..., 0]
         variance = w.sigma_m[:, None] ** 2 + (s.slope_sigma * x) ** 2 + self.scatter_m**2
         spread = np.zeros(x.shape)
@@ -218,7 +219,8 @@ class _Lines:
             scatter=self.scatter_m,
         )
         root = np.linalg.cholesky(cov)
-        both = np.linalg.solve(root, np.concatenate([found.error[..., None], block], axis=-1))
+        error = np.where(self.trust > 0.0, found.error, 0.0)
+        both = np.linalg.solve(root, np.concatenate([error[..., None], block], axis=-1))
         return both[..., 0], both[..., 1:], weight
 
 

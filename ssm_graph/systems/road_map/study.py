@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
@@ -45,6 +46,7 @@ CASES: Final[Mapping[str, str]] = {
     "motorway": "400 m at 25 m/s",
     "short": "80 m at 8 m/s, for maps of one junction",
     "left-hand": "as plain, the map seen in a mirror",
+    "no course": "as plain, by a receiver that gives no course",
 }
 FIRST_HELD_OUT: Final = 1000
 """Seeds from here on have chosen nothing; those below 100 have."""
@@ -91,6 +93,8 @@ def drive_of(
         truth = driven(random_route(true_map, model.length_m, rng), model, rng)
     name = f"{Path(path).name} {case} {seed}"
     drive = simulate_drive(name, truth, indices, model, np.random.default_rng([seed, 1]))
+    if case == "no course":
+        drive = replace(drive, gnss=replace(drive.gnss, yaw=None))
     if case != "damaged":
         return drive, true_map, indices, truth
     rng = np.random.default_rng([seed, 4])

@@ -104,8 +104,7 @@ class LineIndex:
         dx, dy = x - piece[..., 0], y - piece[..., 1]
         share = dx * piece[..., 4]
         share += dy * piece[..., 5]
-        np.maximum(share, 0.0, out=share)
-        np.minimum(share, 1.0, out=share)
+        share = np.minimum(np.maximum(share, 0.0), 1.0)
         dx -= share * sx
         dy -= share * sy
         return dx, dy
@@ -127,10 +126,8 @@ class LineIndex:
     @staticmethod
     def _cell(x: Array, low: float, n_tiles: int) -> NDArray[np.int64]:
         """Return the cells of coordinates (...), those beyond the raster in its outermost ones."""
-        at = (x - low) * (1.0 / CELL_M)
-        np.fmax(at, 0.0, out=at)  # NaN as well
-        np.minimum(at, n_tiles * TILE - 1.0, out=at)
-        return at.astype(np.int64)
+        at = np.fmax((x - low) * (1.0 / CELL_M), 0.0)  # NaN as well
+        return np.asarray(np.minimum(at, n_tiles * TILE - 1.0), dtype=np.int64)
 
     def _make_tile(self, ti: int, tj: int) -> None:
         cells = (np.arange(TILE) + 0.5) * CELL_M
