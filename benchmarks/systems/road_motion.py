@@ -109,7 +109,7 @@ def _error(segment: Comma2k19, *, scale: float, bias: float) -> Array:
     turn = np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))
     start = np.array([*seen[0], turn])
     track = dead_reckoned(start, time_s, segment.chassis, scale=scale, bias=bias)
-    return np.hypot(*(track[1:, :2] - t.at(time_s[1:])[:, :2]).T)
+    return np.asarray(np.hypot(*(track[1:, :2] - t.at(time_s[1:])[:, :2]).T))
 
 
 if __name__ == "__main__":

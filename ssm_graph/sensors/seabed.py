@@ -151,7 +151,7 @@ class SeabedGrid(FrozenArrays):
         Bilinear between the cells it is 0 from where :meth:`surface_at` ends.
         """
         known = binary_erosion(np.isfinite(self.height), np.ones((3, 3)), iterations=2)
-        return known.astype(np.float64)
+        return np.asarray(known, dtype=np.float64)
 
     def relief(self, x_y: Array, half_m: float) -> float:
         """Return the standard deviation of the heights within a square, its plane taken off, m."""

@@ -23,8 +23,9 @@ from ssm_graph.report.style import (
     new_figure,
 )
 from ssm_graph.systems.road_map.drive import Drive, Poses
-from ssm_graph.systems.road_map.locate import Located, sigmas_of
+from ssm_graph.systems.road_map.locate import Located
 from ssm_graph.systems.road_map.maps.road_map import LineKind, Mark, RoadMap
+from ssm_graph.systems.road_map.refinement import sigmas_of
 from ssm_graph.systems.road_map.window import in_plane
 
 _MARGIN_M: Final = 25.0

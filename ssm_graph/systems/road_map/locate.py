@@ -39,6 +39,7 @@ from ssm_graph.systems.road_map.locator import (
 from ssm_graph.systems.road_map.maps.index import LineIndex
 from ssm_graph.systems.road_map.maps.road_map import LineKind, RoadMap
 from ssm_graph.systems.road_map.motion import first_course
+from ssm_graph.systems.road_map.plausible import require_plausible
 from ssm_graph.systems.road_map.refinement import (
     Prior,
     Refined,
@@ -136,6 +137,7 @@ class Localiser:
         if indices is None:
             indices = indices_of(road_map.within(fixes, self.half_m + SENSOR_REACH_M))
         self.indices = indices
+        require_plausible(drive)
         begin = first_course(drive)
         self.course, self.begin_s = begin.yaw, float(fixes_s[begin.fix]) if begin.fix else -np.inf
         if begin.yaw is not None:
@@ -173,8 +175,8 @@ class Localiser:
             n_done += 1
         if not self.rows:
             raise DataError(
-                f"{self.drive.name} curves: none within the times of the chassis, {t[0]:.3f} to "
-                f"{t[-1]:.3f} s; are the clocks the same?"
+                f"{self.drive.name} curves: none from {self.begin_s:.3f} s on, when the fixes tell "
+                "the course; give a heading in [gnss], or a longer drive"
             )
         self._judge(len(self.rows) - 1)
         cpu_ms = 1e3 * (time.process_time() - began) / len(self.rows)

@@ -55,16 +55,25 @@ def first_course(drive: Drive) -> FirstCourse:
     if len(inside) < 2:
         return FirstCourse(0, None, np.inf)
     way = dead_reckoned(np.zeros(3), gnss.time_s[inside], drive.chassis)
-    of_bias = drive.gnss_bias_m**2 / 3.0
+    noise = noise_of(drive)
     for n in range(2, len(inside) + 1):
         a = way[:n, :2] - way[:n, :2].mean(axis=0)
         b = gnss.x_y[inside[:n]] - gnss.x_y[inside[:n]].mean(axis=0)
-        noise = np.sqrt(max(float(gnss.sigma_m[inside[0]]) ** 2 - of_bias, _LEAST_NOISE_M**2))
         sigma = noise / max(float(np.sqrt(np.square(a).sum())), 1e-9)
         if sigma < TOLD:
-            turn = np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))
-            return FirstCourse(int(inside[n - 1]), float(way[n - 1, 2] + turn), sigma)
+            return FirstCourse(int(inside[n - 1]), float(way[n - 1, 2]) + turn_between(a, b), sigma)
     return FirstCourse(0, None, np.inf)
+
+
+def noise_of(drive: Drive) -> float:
+    """Return the sigma of fixes from one to the next, without what they are off by in common, m."""
+    of_bias = drive.gnss_bias_m**2 / 3.0
+    return float(np.sqrt(max(float(drive.gnss.sigma_m[0]) ** 2 - of_bias, _LEAST_NOISE_M**2)))
+
+
+def turn_between(a: Array, b: Array) -> float:
+    """Return by which angle points (N, 2) about their mean are to be turned onto others, rad."""
+    return float(np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,7 +147,7 @@ def _first_guess(chassis: Chassis, began: float, time_s: Array, x_y: Array) -> A
     """Return the six numbers with the way turned onto the fixes as a whole."""
     track = dead_reckoned(np.zeros(3), np.concatenate([[began], time_s]), chassis)[1:, :2]
     a, b = track - track.mean(axis=0), x_y - x_y.mean(axis=0)
-    yaw = np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))
+    yaw = turn_between(a, b)
     c, s = np.cos(yaw), np.sin(yaw)
     x, y = x_y.mean(axis=0) - np.array([[c, -s], [s, c]]) @ track.mean(axis=0)
     return np.array([x, y, yaw, 0.0, 0.0, 0.0])

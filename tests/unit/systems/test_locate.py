@@ -19,11 +19,11 @@ from ssm_graph.systems.road_map.drive import Chassis, Curves, Drive, GnssFixes, 
 from ssm_graph.systems.road_map.folder import read_drive, write_drive
 from ssm_graph.systems.road_map.follow import follow
 from ssm_graph.systems.road_map.hypotheses import apart, is_same_lane, known_along
-from ssm_graph.systems.road_map.locate import Located, locate, sigmas_of
+from ssm_graph.systems.road_map.locate import Located, locate
 from ssm_graph.systems.road_map.maps.road_map import Lane, LineKind, Mark, RoadLine, RoadMap
 from ssm_graph.systems.road_map.motion import first_course, motion_errors
 from ssm_graph.systems.road_map.patent import Normalisation, PatentSettings, locate_by_patent
-from ssm_graph.systems.road_map.refinement import Prior
+from ssm_graph.systems.road_map.refinement import Prior, sigmas_of
 from ssm_graph.systems.road_map.simulate import (
     DriveModel,
     damaged,
@@ -316,8 +316,31 @@ def test_bad_times_are_named() -> None:
         replace(drive, chassis=gap)
     k = drive.curves
     late = Curves(k.time_s + 1e4, k.kind, k.side, k.cubic, k.reach, k.sigma_m, k.mark)
-    with pytest.raises(DataError, match="are the clocks the same"):
+    with pytest.raises(DataError, match="curves: none within the times"):
         locate(replace(drive, curves=late), road_map)
+    some = replace(k, time_s=k.time_s + 3.0)
+    with pytest.raises(DataError, match="% of them are not within the times"):
+        locate(replace(drive, curves=some), road_map)
+    fixes = replace(drive.gnss, time_s=drive.gnss.time_s + 1e3)
+    with pytest.raises(DataError, match="gnss: no fix within the times"):
+        locate(replace(drive, gnss=fixes), road_map)
+
+
+@pytest.mark.parametrize(
+    ("log", "change", "message"),
+    [
+        ("chassis", {"speed": 3.6}, "its way spreads over"),
+        ("curves", {"side": -1.0}, "lie on the other side than they say"),
+        ("gnss", {"yaw": -1.0}, "the heading is [-+][0-9]+ deg off"),
+    ],
+)
+def test_other_units_and_sides_are_named(log: str, change: dict[str, float], message: str) -> None:
+    """km/h, curves whose sides are exchanged, courses that count from east."""
+    drive, road_map, _ = on_the_bend()
+    (name, factor), own = next(iter(change.items())), getattr(drive, log)
+    values = getattr(own, name) * factor + (2.0 if name == "yaw" else 0.0)
+    with pytest.raises(DataError, match=message):
+        locate(replace(drive, **{log: replace(own, **{name: values})}), road_map)
 
 
 def test_motion_errors_are_found() -> None:

@@ -99,7 +99,7 @@ def _edges(areas: Sequence[Array]) -> list[RoadLine]:
 def is_inside(points: Array, polygon: Array) -> NDArray[np.bool_]:
     """Return which points (N, 2) lie in a polygon (M, 2), by the even-odd rule."""
     low, high = polygon.min(axis=0), polygon.max(axis=0)
-    found = np.all((points >= low) & (points <= high), axis=1)
+    found: NDArray[np.bool_] = np.all((points >= low) & (points <= high), axis=1)
     x, y = points[found, None, 0], points[found, None, 1]
     x0, y0 = polygon.T
     x1, y1 = np.roll(polygon, -1, axis=0).T

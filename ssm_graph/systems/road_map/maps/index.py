@@ -121,7 +121,8 @@ class LineIndex:
                 self._make_tile(*divmod(int(number), n_columns))
             slot = self._slots.ravel().take(tile)
         inside = ((i & (TILE - 1)) << _BITS) + (j & (TILE - 1))
-        return self._raster.ravel().take((slot << (2 * _BITS)) + inside)
+        found: NDArray[np.int64] = self._raster.ravel().take((slot << (2 * _BITS)) + inside)
+        return found
 
     @staticmethod
     def _cell(x: Array, low: float, n_tiles: int) -> NDArray[np.int64]:
