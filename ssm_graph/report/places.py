@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 from matplotlib.axes import Axes
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.report.style import INK
+
+_SHOWN_SHARE: Final = 1e-3
+"""Shares below would be 0.0 %, and lie over each other."""
 
 
 def draw_snapshots(
@@ -30,9 +34,11 @@ def draw_snapshots(
 
 
 def write_share(axes: Axes, pose: Sequence[float], share: float) -> None:
-    """Write beside a place, x and y first, its share of the evidence."""
+    """Write beside a place, x and y first, its share of the evidence; nothing beside none."""
+    if share < _SHOWN_SHARE:
+        return
     axes.annotate(
-        f"{100.0 * share:.1f} %" if share >= 1e-3 else "< 0.1 %",
+        f"{100.0 * share:.1f} %",
         (pose[0], pose[1]),
         fontsize=6.5,
         color=INK,
