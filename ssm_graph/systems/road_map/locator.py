@@ -247,6 +247,8 @@ def first_particles(
         if len(x) * n_yaw <= settings.most * (1 if yaw is not None else 12) or cell > half_m:
             break
         cell *= 1.1
+    several = max(1, int(np.ceil(settings.least / max(1, len(x) * n_yaw))))  # a good receiver
+    x, y = np.repeat(x, several), np.repeat(y, several)
     n = len(x) * n_yaw
     states = np.zeros((n, 5))
     states[:, X], states[:, Y] = np.repeat(x, n_yaw), np.repeat(y, n_yaw)
