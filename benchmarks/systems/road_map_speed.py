@@ -6,7 +6,6 @@ Karlsruhe one side by side, written to the folder of ``--out`` and taken away af
 
 from __future__ import annotations
 
-import os
 import re
 import resource
 import time
@@ -14,13 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.report import ROOT, Option, Report, table
+from benchmarks.report import Option, Report, table
+from benchmarks.systems.road_map import DATA
 from ssm_graph.systems.road_map.locate import Localiser, locate
 from ssm_graph.systems.road_map.maps.read import read_map
 from ssm_graph.systems.road_map.simulate import indices_of
 from ssm_graph.systems.road_map.study import drive_of
 
-DATA = os.environ.get("SSM_GRAPH_DATA", str(ROOT.parent / "shared" / "data"))
 KARLSRUHE = "lanelet2/mapping_example.osm"
 DRIVES = (
     (KARLSRUHE, "plain"),

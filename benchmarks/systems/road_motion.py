@@ -7,19 +7,18 @@ chassis and one receiver alone; the reference judges.
 from __future__ import annotations
 
 import math
-import os
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.report import ROOT, Option, Report, table
+from benchmarks.report import Option, Report, table
+from benchmarks.systems.road_map import DATA
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.systems.road_map.comma2k19 import Comma2k19, read_comma2k19
 from ssm_graph.systems.road_map.drive import GnssFixes, dead_reckoned
 from ssm_graph.systems.road_map.motion import MotionErrors, motion_errors
 
-DATA = os.environ.get("SSM_GRAPH_DATA", str(ROOT.parent / "shared" / "data"))
 REFERENCE_SIGMA_M = 0.3
 """Of the reference poses, as they are used in place of fixes."""
 HEADER = (

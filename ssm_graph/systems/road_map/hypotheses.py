@@ -155,7 +155,20 @@ def along_lane(
         ends = fitted
         found += list(ends[goes_on])
     poses = np.array(found)
-    return poses, _independent(window) * _log_likelihood(window, poses, indices, settings, 0.0)
+    return poses, evidence_of(window, poses, indices, settings)
+
+
+def evidence_of(
+    window: Window,
+    poses: Array,
+    indices: Mapping[LineKind, LineIndex],
+    settings: LocatorSettings,
+) -> Array:
+    """Return the log evidence (n,) of poses (n, 3) of the last picture, up to a constant.
+
+    Pictures close to each other see the same errors of the map again: so much less they count.
+    """
+    return _independent(window) * _log_likelihood(window, poses, indices, settings, 0.0)
 
 
 def _independent(window: Window) -> float:

@@ -22,6 +22,7 @@ from ssm_graph.systems.road_map.hypotheses import (
     TURN,
     along_lane,
     course_trials,
+    evidence_of,
     is_same_lane,
     known_along,
     search,
@@ -343,13 +344,7 @@ class Localiser:
             except SolverError as error:
                 reason = str(error)
         if refined is not None:
-            pose, sigmas = refined.poses[-1], refined.sigmas
-            off = abs(float((mean - pose)[:2] @ refined.ahead))
-            # No bend in the window, and the particles know more; or what it took for one is none.
-            if sigmas[1] > 0.5 * along or off > 3.0 * np.hypot(along, sigmas[1]):
-                pose = pose.copy()
-                pose[:2] += (mean - pose)[:2] @ refined.ahead * refined.ahead
-                sigmas = refined.with_along(along)
+            pose, sigmas = self._joined(refined, mean, along)
         hypotheses = known_along(self.hypotheses, pose, sigmas[1]) if self.hypotheses else []
         is_shared = len(hypotheses) > 1 and hypotheses[1].share > CARRIED
         if verdict is Verdict.CONVERGED and (sigmas[1] > v.along_sigma_m or is_shared):
@@ -371,6 +366,26 @@ class Localiser:
             tuple(self.snapshots),
             cpu_ms,
         )
+
+    def _joined(
+        self, refined: Refined, mean: Array, along: float
+    ) -> tuple[Array, tuple[float, float, float]]:
+        """Return the refined pose (3,) and sigmas, or along the road what the particles know.
+
+        That counts where the window has no bend; where both cannot be right the stretch decides.
+        """
+        pose, sigmas = refined.poses[-1], refined.sigmas
+        shift = float((mean - pose)[:2] @ refined.ahead)
+        moved = pose + shift * np.array([*refined.ahead, 0.0])
+        is_moved = sigmas[1] > 0.5 * along
+        if abs(shift) > 3.0 * np.hypot(along, sigmas[1]):
+            window = self._stretch(len(self.rows) - 1)
+            assert window is not None
+            found = evidence_of(window, np.stack([pose, moved]), self.indices, self.settings)
+            better = float(found[0] - found[1])
+            is_moved = better < LOST
+            along = along if abs(better) > LOST else float(np.hypot(along, 0.5 * shift))
+        return (moved, refined.with_along(along)) if is_moved else (pose, sigmas)
 
     def _refine(self) -> tuple[Refined | None, Window | None]:
         """Lay the last pictures on the map as a graph, begun by the particles before them."""
