@@ -15,7 +15,7 @@ _LEFT_OUT: Final = 0.1
 """Share of the pictures that may be taken while the chassis is not recorded."""
 _LEAST_FIXES: Final = 5
 _CLEAR: Final = 5.0
-"""A way that is longer than so many sigmas of the fixes' noise is told by them."""
+"""Sigmas of the fixes' noise that tell a way; its length, beyond what fixes are off by as well."""
 _FACTOR: Final = 1.3
 """No wheel is so far from its size; km/h for m/s is 3.6."""
 _TURNED: Final = 60.0 * DEGREE
@@ -69,12 +69,15 @@ def _require_one_way(drive: Drive) -> None:
     a, b = (x - x.mean(axis=0) for x in (way[:, :2], gnss.x_y[inside]))
     length, seen = (float(np.sqrt(np.square(x).sum(axis=1).mean())) for x in (a, b))
     noise = noise_of(drive)
+    is_other = not 1.0 / _FACTOR < (length + noise) / (seen + noise) < _FACTOR
+    if is_other and abs(length - seen) > _CLEAR * noise + drive.gnss_bias_m:
+        raise DataError(
+            f"{drive.name} chassis: its way spreads over {length:.0f} m, that of the fixes over "
+            f"{seen:.0f} m; expected the same; is the speed in m/s, the yaw rate in deg/s "
+            "anticlockwise, are x and y metres?"
+        )
     if min(length, seen) < _CLEAR * noise:
-        if max(length, seen) > 4.0 * _CLEAR * noise:
-            raise _other_length(drive, length, seen)
         return
-    if not 1.0 / _FACTOR < length / seen < _FACTOR:
-        raise _other_length(drive, length, seen)
     if gnss.yaw is None:
         return
     off = wrapped(gnss.yaw[inside] - way[:, 2] - turn_between(a, b))
@@ -85,11 +88,3 @@ def _require_one_way(drive: Drive) -> None:
             "(anticlockwise) the way that the fixes go; expected the course over ground, degrees "
             "clockwise from north; leave the column out, and the way tells it"
         )
-
-
-def _other_length(drive: Drive, length: float, seen: float) -> DataError:
-    return DataError(
-        f"{drive.name} chassis: its way spreads over {length:.0f} m, that of the fixes over "
-        f"{seen:.0f} m; expected the same; is the speed in m/s, the yaw rate in deg/s "
-        "anticlockwise, are x and y metres?"
-    )
