@@ -46,9 +46,19 @@ _HELD: Final = 1e6
 
 def is_same_lane(hypothesis: Hypothesis, pose: Array) -> bool:
     """Whether a pose is within the lane of a hypothesis, wherever along it."""
-    across, along, turn = apart(np.array(hypothesis.pose), pose)
-    # A lane that turns on the way there is an arc.
-    return abs(across - along * np.tan(0.5 * turn)) < LATERAL_M and abs(turn) < TURN
+    here = np.array(hypothesis.pose)
+    return abs(aside(here, pose)) < LATERAL_M and abs(apart(here, pose)[2]) < TURN
+
+
+def aside(pose: Array, other: Array) -> float:
+    """Return how far ``other`` is beside the lane of a pose (3,), an arc between courses, m."""
+    across, along, turn = apart(pose, other)
+    return across - along * float(np.tan(0.5 * turn))
+
+
+def lane_share(found: list[Hypothesis], pose: Array) -> float:
+    """Return which share of the evidence is for the lane of a pose (3,)."""
+    return sum(h.share for h in found if is_same_lane(h, pose))
 
 
 def known_along(found: list[Hypothesis], pose: Array, along_m: float) -> list[Hypothesis]:

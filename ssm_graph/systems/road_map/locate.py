@@ -25,6 +25,7 @@ from ssm_graph.systems.road_map.hypotheses import (
     evidence_of,
     is_same_lane,
     known_along,
+    lane_share,
     search,
     slide,
 )
@@ -292,7 +293,7 @@ class Localiser:
             self.verdict = Verdict.FAILED
             return
         best = np.array(found[0].pose)
-        is_known = _lane_share(found, best) > 1.0 - CARRIED
+        is_known = lane_share(found, best) > 1.0 - CARRIED
         if is_known and self._in_lane(best) < 1.0 - CARRIED:
             self._spread(found)  # the stretch as a whole knows the lane before the particles do
         else:
@@ -302,11 +303,14 @@ class Localiser:
         mean, cov = self.extras[-1][0][:3], self.extras[-1][1][:3, :3]
         self.rows[-1] = (when, mean, cov, driven_m, len(p.states))
         self.verdict = Verdict.AMBIGUOUS
-        if min(self._in_lane(mean), _lane_share(found, mean)) > 1.0 - CARRIED:
+        if min(self._in_lane(mean), lane_share(found, mean)) > 1.0 - CARRIED:
             self.verdict = Verdict.CONVERGED
             self.next_m = driven_m + v.watch_m
             if self.first is None and driven_m >= v.least_driven_m:
-                self.first = (when, driven_m, mean)
+                lane = [np.array(h.pose) for h in found if is_same_lane(h, mean)]
+                # The mean of particles along a bend is beside it.
+                on_it = min(lane, key=lambda pose: float(np.hypot(*(pose - mean)[:2])))
+                self.first = (when, driven_m, on_it)
                 self._lay_along(window, fix)
 
     def _in_lane(self, pose: Array) -> float:
@@ -412,11 +416,6 @@ class Localiser:
 def locate(drive: Drive, road_map: RoadMap, **options: object) -> Located:
     """Return in which lane a drive ends, with a verdict; options are those of `Localiser`."""
     return Localiser(drive, road_map, **options).run()  # type: ignore[arg-type]
-
-
-def _lane_share(found: list[Hypothesis], pose: Array) -> float:
-    """Return which share of the evidence is for the lane of a pose (3,)."""
-    return sum(h.share for h in found if is_same_lane(h, pose))
 
 
 def square_of(drive: Drive) -> float:

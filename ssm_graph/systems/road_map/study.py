@@ -18,7 +18,7 @@ from ssm_graph.study.ledger import ERROR, Key, Row
 from ssm_graph.systems.road_map.av2_log import MAP, POSES, av2_poses
 from ssm_graph.systems.road_map.camera import CameraModel
 from ssm_graph.systems.road_map.drive import Drive, Poses
-from ssm_graph.systems.road_map.hypotheses import apart, is_same_lane
+from ssm_graph.systems.road_map.hypotheses import apart, aside, is_same_lane
 from ssm_graph.systems.road_map.locate import locate
 from ssm_graph.systems.road_map.maps.index import LineIndex
 from ssm_graph.systems.road_map.maps.read import read_map
@@ -147,7 +147,7 @@ def _annealed(
     first = np.nan
     if np.isfinite(found.first_fix_s):
         then = truth.at(np.array([found.first_fix_s + drive.chassis.time_s[0]]))[0]
-        first = apart(then, found.first_fix)[0]
+        first = aside(then, found.first_fix)
     beside = aside_of_lines(last, indices) - aside_of_lines(found.pose, indices)[:, None]
     in_lane = float(np.abs(beside).min()) if beside.size else np.nan
     rival = [h.share for h in found.hypotheses if not is_same_lane(h, found.pose)]
