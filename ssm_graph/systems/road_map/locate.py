@@ -350,9 +350,11 @@ class Localiser:
         if refined is not None:
             pose, sigmas = self._joined(refined, mean, along)
         hypotheses = known_along(self.hypotheses, pose, sigmas[1]) if self.hypotheses else []
-        is_shared = len(hypotheses) > 1 and hypotheses[1].share > CARRIED
-        if verdict is Verdict.CONVERGED and (sigmas[1] > v.along_sigma_m or is_shared):
-            verdict = Verdict.UNRESOLVED_ALONG
+        if verdict is Verdict.CONVERGED:
+            if lane_share(hypotheses, pose) < 1.0 - CARRIED:
+                verdict = Verdict.AMBIGUOUS
+            elif sigmas[1] > v.along_sigma_m or sum(h.share > CARRIED for h in hypotheses) > 1:
+                verdict = Verdict.UNRESOLVED_ALONG
         first = self.first or (np.nan, np.nan, np.full(3, np.nan))
         return Located(
             verdict,
