@@ -70,9 +70,10 @@ print(
     f"followed for {np.ptp(way.time_s):.0f} s: {np.sqrt(np.mean(np.square(off))):.3f} m rms across"
 )
 
-# A curve of the last picture as a factor of a graph of your own, on its Pose2.
-index, pose = indices[LineKind.LANE_LINE], way.pose[-1]
-row = np.flatnonzero(drive.curves.kind == LineKind.LANE_LINE)[-1:]
+# A lane line of a picture half-way as a factor of a graph of your own, on its Pose2.
+index, lines = indices[LineKind.LANE_LINE], drive.curves.kind == LineKind.LANE_LINE
+row = np.flatnonzero(lines & (drive.curves.time_s >= way.time_s[len(way.time_s) // 2]))[:1]
+pose = way.pose[np.searchsorted(way.time_s, drive.curves.time_s[row[0]])]
 point_b = drive.curves.points(row, 8)[0]
 c, s = np.cos(pose[2]), np.sin(pose[2])
 foot = index.foot(pose[:2] + point_b @ np.array([[c, s], [-s, c]]))
@@ -88,4 +89,4 @@ graph.add(
         covariance=spread,
     )
 )
-print(f"a lane line of the last picture as a GTSAM factor: error {graph.error(values):.2f}")
+print(f"a lane line as a GTSAM factor: error {graph.error(values):.2f}")
