@@ -26,8 +26,9 @@ def main() -> None:
         Option("--grades", ["MEMS", "TACTICAL"], "of the inertial sensors"),
         Option("--hours", 2.0, "length of a mission"),
         Option("--missions", 1, "of each grade"),
+        Option("--first-seed", FIRST_HELD_OUT, "of the missions"),
     )
-    seeds = range(FIRST_HELD_OUT, FIRST_HELD_OUT + report.args.missions)
+    seeds = range(report.args.first_seed, report.args.first_seed + report.args.missions)
     keys: list[Key] = [
         ("rough", g, s, report.args.hours) for g in report.args.grades for s in seeds
     ]

@@ -14,6 +14,7 @@ from ssm_graph.cli.options import number_option
 from ssm_graph.cli.terminal import say
 from ssm_graph.study.ledger import ERROR, Ledger, run_trials
 from ssm_graph.systems.road_map.study import (
+    CASES,
     HEADER,
     METHODS,
     keys_of,
@@ -33,9 +34,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
     parser.add_argument("maps", type=Path, nargs="+", metavar="MAP", help="maps or log folders")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="result folder")
-    parser.add_argument(
-        "--case", default="plain", help="plain, damaged, traffic or motorway (default: plain)"
-    )
+    parser.add_argument("--case", default="plain", help=f"{', '.join(CASES)} (default: plain)")
     parser.add_argument("--methods", default="annealed", metavar="A,B", help=", ".join(METHODS))
     number_option(parser, "--first-seed", "N", "the first drive", 1000, kind=int)
     number_option(parser, "--seeds", "N", "drives on each map", 200, kind=int)

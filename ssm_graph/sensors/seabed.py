@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Final, NamedTuple
 
 import numpy as np
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import binary_erosion, map_coordinates
 
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import DataError
@@ -110,16 +110,17 @@ class SeabedGrid(FrozenArrays):
 
     def height_at(self, x: Array, y: Array) -> Array:
         """Return heights (...) between four cells each, bilinear; NaN off the map."""
-        return self._between(self.height, x, y)
+        return self.between(self.height, x, y)
 
     def sigma_at(self, x: Array, y: Array, errors: MapErrors) -> Array:
         """Return the standard deviations (...) of single cells; that of the errors off the map."""
         if self.sigma is None:
             return np.full(np.shape(x), errors.sigma_m)
-        found = self._between(self.sigma, x, y)
+        found = self.between(self.sigma, x, y)
         return np.where(np.isfinite(found), found, errors.sigma_m)
 
-    def _between(self, values: Array, x: Array, y: Array) -> Array:
+    def between(self, values: Array, x: Array, y: Array) -> Array:
+        """Return values (R, C) of the cells at points (...), bilinear; NaN off the map."""
         rows, columns = self._cells(x, y)
         found = map_coordinates(values, [rows, columns], order=1, mode="constant", cval=np.nan)
         return np.asarray(found, dtype=np.float64)
@@ -143,6 +144,14 @@ class SeabedGrid(FrozenArrays):
         slope_x = ((part * along_x[..., None, :]).sum(-1) * of_y).sum(-1) / self.cell_m
         slope_y = (over_x * along_y).sum(-1) / self.cell_m
         return Surface((over_x * of_y).sum(-1), np.stack([slope_x, slope_y], axis=-1))
+
+    def inside(self) -> Array:
+        """Return 1 for cells (R, C) whose heights and slopes are known all about, and 0 for others.
+
+        Bilinear between the cells it is 0 from where :meth:`surface_at` ends.
+        """
+        known = binary_erosion(np.isfinite(self.height), np.ones((3, 3)), iterations=2)
+        return np.asarray(known, dtype=np.float64)
 
     def relief(self, x_y: Array, half_m: float) -> float:
         """Return the standard deviation of the heights within a square, its plane taken off, m."""

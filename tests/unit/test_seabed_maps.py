@@ -37,11 +37,14 @@ DEPTH = depth_at(*np.meshgrid(LATS, LONS, indexing="ij"))
 
 
 def geotiff(path: Path, values: Array, keys: tuple[int, ...], tie: tuple[float, ...]) -> None:
-    """Write a GeoTIFF, rows from the north."""
+    """Write a GeoTIFF, rows from the north; a tie of sixteen is a transformation."""
     tags = TiffImagePlugin.ImageFileDirectory_v2()
-    tags.tagtype[33550] = tags.tagtype[33922] = 12
+    tags.tagtype[33550] = tags.tagtype[33922] = tags.tagtype[34264] = 12
     tags.tagtype[34735] = 3
-    tags[33550], tags[33922], tags[34735] = (*tie[6:], 0.0), tie[:6], keys
+    if len(tie) == 16:
+        tags[34264], tags[34735] = tie, keys
+    else:
+        tags[33550], tags[33922], tags[34735] = (*tie[6:], 0.0), tie[:6], keys
     tags.tagtype[42113] = 2
     tags[42113] = "-9999"
     Image.fromarray(values[::-1].astype(np.float32)).save(path, tiffinfo=tags)
@@ -94,6 +97,22 @@ def write_xyz(path: Path) -> None:
     path.write_text("lon,lat,depth,sigma\n" + "\n".join(lines) + "\n")
 
 
+def write_south_up(path: Path) -> None:
+    """GeoTIFF whose rows begin in the south, with a hole that nothing names."""
+    values = np.where(np.arange(DEPTH.size).reshape(DEPTH.shape) == 0, 1e35, -DEPTH)
+    place = (2e-4, 0, 0, LONS[0] - 1e-4, 0, 1e-4, 0, LATS[0] - 0.5e-4, *(0.0,) * 7, 1.0)
+    geotiff(path, values[::-1], (1, 1, 0, 2, 1025, 0, 1, 1, 2048, 0, 1, 4326), place)
+
+
+def write_turned(path: Path) -> None:
+    """NetCDF 3 over longitude and latitude at one time; depths that are heights."""
+    with netcdf_file(path, "w") as file:
+        for name, values in (("time", np.zeros(1)), ("lon", LONS), ("lat", LATS)):
+            file.createDimension(name, len(values))
+            file.createVariable(name, "f8", (name,))[:] = values
+        file.createVariable("depth", "f4", ("time", "lon", "lat"))[:] = -DEPTH.T[None]
+
+
 def write_utm(path: Path) -> None:
     """GeoTIFF in UTM, the pixel a point."""
     middle = utm(np.array([LAT]), np.array([LON]), of=(float(LAT), float(LON)))
@@ -115,6 +134,8 @@ def write_utm(path: Path) -> None:
         ("map.asc", write_asc),
         ("map.xyz", write_xyz),
         ("utm.tif", write_utm),
+        ("south_up.tif", write_south_up),
+        ("turned.nc", write_turned),
     ],
 )
 def test_heights_of_every_format(name: str, write: Callable[[Path], None], tmp_path: Path) -> None:
@@ -164,6 +185,18 @@ def test_sigmas_lie_where_the_heights_do(tmp_path: Path) -> None:
     sigma.write_text("xllcorner 40\n" + head + rows)
     with pytest.raises(DataError, match=r"sigma\.asc.*8 cells beside it"):
         read_seabed(own, FRAME, crs="local", sigma=sigma)
+
+
+def test_land_and_water_need_a_word(tmp_path: Path) -> None:
+    """Values of both signs are heights or depths; what stands for none is no height of either."""
+    path = tmp_path / "m.xyz"
+    at = [(i, j) for i in range(6) for j in range(6)]
+    path.write_text("".join(f"{10 * i} {10 * j} {9999 if i == j else i - 2}\n" for i, j in at))
+    with pytest.raises(ConfigError, match="50 % of the values are above zero"):
+        read_seabed(path, FRAME, crs="local")
+    grid = read_seabed(path, FRAME, crs="local", is_down=True)
+    assert np.isnan(np.diag(grid.height)).all()
+    assert grid.height[0, 5] == -3.0
 
 
 def test_what_no_map_is(tmp_path: Path) -> None:

@@ -36,6 +36,11 @@ class Hypothesis:
     share: float = 1.0
     """Of the evidence of all places, 0 to 1."""
 
+    @property
+    def evidence(self) -> dict[str, float]:
+        """Share and log evidence by name, for files."""
+        return {"share": self.share, "log_evidence": self.log_evidence}
+
 
 def apart_from_each_other(value: Array, is_same: Same, most: int) -> list[int]:
     """Return rows of the best values (n,), none in the place of a better one."""

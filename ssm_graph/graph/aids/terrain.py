@@ -28,7 +28,7 @@ MAP_APART: Final = "map_apart"
 class TerrainRanges(Aid):
     """Ranges along beams at their keyframes, linearised against the map at every state anew."""
 
-    SHARED = frozenset({"grid", "errors"})
+    SHARED = frozenset({"grid", "errors", "inside"})
     name = "seabed"
     unit = "m"
     hint = "look at the map's datum, its place and its sigma"
@@ -48,6 +48,8 @@ class TerrainRanges(Aid):
     """(M,) m, of the height, where the states last were"""
     grid: SeabedGrid
     errors: MapErrors
+    inside: Array
+    """(R, C) of the grid's cells: how much a range counts there; falls to 0 towards its edges"""
 
     @classmethod
     def of(cls, aids: Aids, keyframes: Keyframes) -> Self | None:
@@ -74,6 +76,7 @@ class TerrainRanges(Aid):
             sigma=np.hypot(range_sigma, log.errors.sigma_m * np.sqrt(factor)),
             grid=log.grid,
             errors=log.errors,
+            inside=log.grid.inside(),
         )
 
     @classmethod
@@ -127,8 +130,13 @@ class TerrainRanges(Aid):
         return replace(self, sigma=np.hypot(self.range_sigma, cell * np.sqrt(self.cell_factor)))
 
     def measured(self, at: RowStates) -> Linearised:
-        """Linearise ranges: one component each; one that ends off the map says nothing."""
-        above, grows, known = above_seabed(self.grid, beam_ends(at.R_nb, at.p_n, end_b=self.end_b))
+        """Linearise ranges: one component each; one that ends off the map says nothing.
+
+        Towards an edge of the map they say less and less: a range that says all or nothing by where
+        the last step put its end would not let the steps settle.
+        """
+        end_n = beam_ends(at.R_nb, at.p_n, end_b=self.end_b)
+        above, grows, known = above_seabed(self.grid, end_n)
         found = at.value(MAP_APART, self.apart.shape[-1])
         bias = at.value(MAP_BIAS, 1) + at.value(MAP_SMOOTH, 1)
         residual = terrain_residual(
@@ -144,8 +152,9 @@ class TerrainRanges(Aid):
         own = residual.error_D_bias[..., None]
         blocks = {MAP_BIAS: own, MAP_SMOOTH: own, MAP_APART: own * self.apart}
         at.extras.fill(jacobian[..., 0, :], blocks)
-        jacobian[~known] = 0.0
-        return Linearised(np.where(known, residual.error, 0.0)[..., None], jacobian)
+        counts = np.where(known, self.grid.between(self.inside, end_n[..., 0], end_n[..., 1]), 0.0)
+        jacobian *= counts[..., None, None]
+        return Linearised((counts * residual.error)[..., None], jacobian)
 
 
 def differences(n_beams: int) -> Array:

@@ -52,6 +52,8 @@ def read_geotiff(path: Path) -> Raster:
                 "state one, with  gdal_edit.py -a_nodata"
             ) from None
         values = np.where(np.isclose(values, missing, rtol=1e-6), np.nan, values)
+    if dy < 0.0:  # rows to the north: the first one is the southernmost
+        dy, north, values = -dy, north - dy * len(values), values[::-1]
     keys = _keys(tags)
     middle = 0.0 if keys.get(_RASTER) == _PIXEL_IS_POINT else 0.5
     n_y, n_x = values.shape

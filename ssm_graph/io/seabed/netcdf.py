@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,6 +16,8 @@ from ssm_graph.io.seabed.raster import GEOGRAPHIC, Raster
 _X: Final = ("lon", "longitude", "x", "easting")
 _Y: Final = ("lat", "latitude", "y", "northing")
 _UP: Final = ("elevation", "z", "height", "topo", "altitude", "band1")
+_EITHER: Final = ("z", "band1")
+"""Names of heights and of depths: the sign of the values tells."""
 _DOWN: Final = ("depth", "bathymetry_depth")
 _HDF: Final = b"\x89HDF"
 
@@ -34,7 +36,11 @@ def read_netcdf(path: Path) -> Raster:
             f"{', '.join(sorted(found)) or 'none'}"
         )
     columns, rows = found[x][0], found[y][0]
-    values, attributes = found[z]
+    values, attributes, axes = found[z]
+    values = values.reshape([n for n in values.shape if n > 1])  # one time, one level
+    axes = [name for name in axes if name in (x, y)]
+    if axes == [x, y] and values.shape == (len(columns), len(rows)):
+        values = values.T
     if columns.ndim != 1 or rows.ndim != 1:
         raise DataError(
             f"{path.name}: expected {x} and {y} of one dimension each, got a grid that is turned "
@@ -49,14 +55,19 @@ def read_netcdf(path: Path) -> Raster:
         columns, values = columns[::-1], values[:, ::-1]
     if rows[0] > rows[-1]:
         rows, values = rows[::-1], values[::-1]
-    positive = attributes.get("positive", "")
-    is_down = z.lower() in _DOWN if positive not in ("up", "down") else positive == "down"
+    positive = str(attributes.get("positive", "")).lower()
+    if positive in ("up", "down"):
+        is_down: bool | None = positive == "down"
+    elif z.lower() in _DOWN:
+        is_down = not np.all(values[np.isfinite(values)] < 0.0)  # heights by the name of depths
+    else:
+        is_down = None if z.lower() in _EITHER else False
     crs = GEOGRAPHIC if x.lower() in _X[:2] else ""
     return Raster(path.name, crs, columns, rows, values, is_down=is_down)
 
 
-Variables = Mapping[str, tuple[Array, Mapping[str, Any]]]
-"""Numbers by name, scaled, NaN where there are none, with their attributes."""
+Variables = Mapping[str, tuple[Array, Mapping[str, Any], Sequence[str]]]
+"""Numbers by name, scaled, NaN where there are none, with attributes and names of the axes."""
 
 
 def _of_hdf(path: Path) -> Variables:
@@ -74,10 +85,17 @@ def _of_hdf(path: Path) -> Variables:
                     and variable.shape
                 ):
                     attributes = {k: _plain(v) for k, v in variable.attrs.items()}
-                    found[name] = _scaled(np.asarray(variable[()]), attributes), attributes
+                    axes = [_axis(dimension) for dimension in variable.dims]
+                    numbers = _scaled(np.asarray(variable[()]), attributes)
+                    found[name] = numbers, attributes, axes
     except (OSError, RuntimeError, KeyError, ValueError) as error:
         raise _damaged(path, error) from error
     return found
+
+
+def _axis(dimension: Any) -> str:
+    """Return the name of the scale of a dimension; empty where there is none."""
+    return str(dimension[0].name).lstrip("/") if len(dimension) else ""
 
 
 def _of_classic(path: Path) -> Variables:
@@ -87,7 +105,8 @@ def _of_classic(path: Path) -> Variables:
             for name, variable in file.variables.items():
                 if variable.shape:
                     attributes = {k: _plain(v) for k, v in variable._attributes.items()}
-                    found[name] = _scaled(np.asarray(variable[:]), attributes), attributes
+                    numbers = _scaled(np.asarray(variable[:]), attributes)
+                    found[name] = numbers, attributes, list(variable.dimensions)
     except (TypeError, ValueError, IndexError, KeyError) as error:
         raise _damaged(path, error) from error
     return found

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from ssm_graph.base.frozen import Array
+from ssm_graph.report.places import box_around, draw_snapshots, write_share
 from ssm_graph.report.style import (
     DPI,
     ESTIMATE,
@@ -22,8 +23,9 @@ from ssm_graph.report.style import (
     new_figure,
 )
 from ssm_graph.systems.road_map.drive import Drive, Poses
-from ssm_graph.systems.road_map.locate import Located, sigmas_of
+from ssm_graph.systems.road_map.locate import Located
 from ssm_graph.systems.road_map.maps.road_map import LineKind, Mark, RoadMap
+from ssm_graph.systems.road_map.refinement import sigmas_of
 from ssm_graph.systems.road_map.window import in_plane
 
 _MARGIN_M: Final = 25.0
@@ -59,15 +61,9 @@ def _particles(axes: Axes, drive: Drive, road_map: RoadMap, found: Located) -> N
     places = [found.track.pose[:, :2], drive.gnss.x_y]
     if drive.truth is not None:
         places.append(drive.truth.x_y)
-    low = np.min([p.min(axis=0) for p in places], axis=0) - _MARGIN_M
-    high = np.max([p.max(axis=0) for p in places], axis=0) + _MARGIN_M
+    low, high = box_around(places, _MARGIN_M)
     _draw_map(axes, road_map, low, high)
-    picked = np.unique(np.linspace(0, len(found.snapshots) - 1, len(_COLOURS)).astype(int))
-    for colour, row in zip(_COLOURS, picked, strict=False):
-        when, states = found.snapshots[row]
-        axes.plot(
-            *states[:, :2].T, ".", color=colour, markersize=2.0, label=f"particles, {when:.1f} s"
-        )
+    draw_snapshots(axes, found.snapshots, _COLOURS, digits=1)
     axes.plot(*drive.gnss.x_y.T, "x", color=REDUCED, markersize=4.0, label="GNSS")
     if drive.truth is not None:
         axes.plot(*drive.truth.x_y.T, color=REFERENCE, linewidth=1.0, label="truth")
@@ -102,18 +98,11 @@ def _arrow(axes: Axes, pose: Array, colour: str, label: str) -> None:
 def _hypotheses(axes: Axes, road_map: RoadMap, found: Located) -> None:
     told = found.hypotheses[:8]
     places = np.array([h.pose for h in told] or [tuple(found.pose)])
-    low, high = places[:, :2].min(axis=0) - 20.0, places[:, :2].max(axis=0) + 20.0
+    low, high = box_around([places[:, :2]], 20.0)
     _draw_map(axes, road_map, low, high)
     for number, hypothesis in enumerate(told):
         _arrow(axes, np.array(hypothesis.pose), ESTIMATE if number == 0 else REDUCED, "")
-        axes.annotate(
-            f"{100.0 * hypothesis.share:.1f} %",
-            (hypothesis.pose[0], hypothesis.pose[1]),
-            fontsize=6.5,
-            color=INK,
-            xytext=(3, 3),
-            textcoords="offset points",
-        )
+        write_share(axes, hypothesis.pose, hypothesis.share)
     dress(axes, title="Places that the last stretch allows, with evidence", x="x (m)", y="y (m)")
 
 

@@ -8,15 +8,16 @@ itself says is possible does not depend on which particles are left.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.lane_line import line_residual
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.units import DEGREE, wrapped
 from ssm_graph.filters.rules.hypotheses import Hypothesis, apart_from_each_other, told
+from ssm_graph.filters.rules.particles import normalised
 from ssm_graph.systems.road_map.locator import INDEPENDENT_M, LocatorSettings
 from ssm_graph.systems.road_map.maps.index import LineIndex
 from ssm_graph.systems.road_map.maps.road_map import LineKind, Mark
@@ -28,6 +29,8 @@ TURN: Final = 20.0 * DEGREE
 """... if they face the same way."""
 ALONG_M: Final = 8.0
 """Places of one lane farther apart along the road are told apart all the same."""
+_ALONG_LEAST_M: Final = 1.0
+"""No place along a lane is held to be better known than so, when places are compared."""
 _COARSE_M: Final = 2.0
 _COARSE_TURN: Final = 2.5 * DEGREE
 _COARSE_SIGMA_M: Final = 1.2
@@ -35,12 +38,44 @@ _KEPT: Final = 40
 SLIDE_M: Final = 24.0
 """How far along the lane a place is looked for anew."""
 _ROUNDS: Final = 5
+ALONG_STEP_M: Final = 2.0
+"""Between the places along a lane that are compared with each other."""
+_HELD: Final = 1e6
+"""1/m^2, along the course of a place that stays where it is along its lane."""
 
 
 def is_same_lane(hypothesis: Hypothesis, pose: Array) -> bool:
     """Whether a pose is within the lane of a hypothesis, wherever along it."""
-    across, _, turn = apart(np.array(hypothesis.pose), pose)
-    return abs(across) < LATERAL_M and abs(turn) < TURN
+    here = np.array(hypothesis.pose)
+    return abs(aside(here, pose)) < LATERAL_M and abs(apart(here, pose)[2]) < TURN
+
+
+def aside(pose: Array, other: Array) -> float:
+    """Return how far ``other`` is beside the lane of a pose (3,), an arc between courses, m."""
+    across, along, turn = apart(pose, other)
+    return across - along * float(np.tan(0.5 * turn))
+
+
+def lane_share(found: list[Hypothesis], pose: Array) -> float:
+    """Return which share of the evidence is for the lane of a pose (3,)."""
+    return sum(h.share for h in found if is_same_lane(h, pose))
+
+
+def known_along(found: list[Hypothesis], pose: Array, along_m: float) -> list[Hypothesis]:
+    """Return places by evidence where those in the lane of a pose (3,) are known along it as well.
+
+    A stretch of straight road allows them all alike; ``along_m`` is the sigma of what was known
+    of the place along it before.
+    """
+    mine = np.array([is_same_lane(h, pose) for h in found])
+    along = np.array([apart(pose, np.array(h.pose))[1] for h in found])
+    loss = np.where(mine, 0.5 * np.square(along / max(along_m, _ALONG_LEAST_M)), 0.0)
+    value = np.array([h.log_evidence for h in found]) - loss
+    if mine.any():
+        value[mine] += loss[mine].min()
+    share = normalised(value)
+    order = np.argsort(-value, kind="stable")
+    return [replace(found[i], log_evidence=float(value[i]), share=float(share[i])) for i in order]
 
 
 def apart(pose: Array, other: Array) -> tuple[float, float, float]:
@@ -68,18 +103,21 @@ def search(
     own : (3,) pose that is tried as well, the mean of the particles.
     """
     side = np.arange(-half_m, half_m + 0.5 * _COARSE_M, _COARSE_M)
-    gx, gy, gyaw = np.meshgrid(x_y[0] + side, x_y[1] + side, yaws, indexing="ij")
-    grid = np.column_stack([gx.ravel(), gy.ravel(), gyaw.ravel()])
-    near = np.zeros(len(grid), dtype=bool)
+    places = np.stack(np.meshgrid(*(x_y[:, None] + side), indexing="ij"), axis=-1).reshape(-1, 2)
+    near = np.zeros(len(places), dtype=bool)
     for index in indices.values():
-        distance, _ = index.nearest(grid[:, 0], grid[:, 1])
+        distance, _ = index.nearest(places[:, 0], places[:, 1])
         near |= distance < index.reach_m
-    grid = grid[near] if near.any() else grid
+    places = places[near] if near.any() else places
+    grid = np.column_stack([np.repeat(places, len(yaws), axis=0), np.tile(yaws, len(places))])
     thin = _thinned(window)
     coarse = _log_likelihood(_thinned(window, 6, 3), grid, indices, settings, _COARSE_SIGMA_M)
     starts = np.concatenate([grid[_apart_from_each_other(grid, coarse, _KEPT)], own[None]])
     fine = _fitted(thin, starts, indices, settings, _COARSE_SIGMA_M)
     inside = np.abs(fine[:, :2] - x_y).max(axis=1) < half_m + 2.0 * _COARSE_M
+    if inside.any() and not inside[-1]:  # the fix says that it is not there
+        found, last = _ranked(window, fine[inside], indices, settings)
+        return found, replace(last, log_evidence=-np.inf)
     inside[-1] = True
     return _ranked(window, fine[inside], indices, settings)
 
@@ -98,6 +136,57 @@ def slide(
     return _ranked(window, fine, indices, settings)
 
 
+def along_lane(
+    window: Window,
+    pose: Array,
+    x_y: Array,
+    half_m: float,
+    indices: Mapping[LineKind, LineIndex],
+    settings: LocatorSettings,
+) -> tuple[Array, Array]:
+    """Return places (n, 3) all along the lane of a pose (3,), and the log evidence (n,) of each.
+
+    They are ``ALONG_STEP_M`` apart, as far as the square about a point (2,) reaches; each is moved
+    across and turned to where the stretch fits best there.
+    """
+    thin = _thinned(window)
+    ends, found = np.stack([pose, pose]), [pose]
+    goes_on = np.ones(2, dtype=bool)
+    step = ALONG_STEP_M * np.array([1.0, -1.0])
+    for _ in range(int(np.ceil(2.0 * half_m / ALONG_STEP_M))):
+        moved = ends + step[:, None] * np.column_stack(
+            [np.cos(ends[:, 2]), np.sin(ends[:, 2]), np.zeros(2)]
+        )
+        fitted = _fitted(thin, moved, indices, settings, 0.5, is_held=True)
+        across = np.hypot(*(fitted - moved)[:, :2].T)
+        goes_on &= (across < LATERAL_M) & (np.abs(fitted[:, :2] - x_y).max(axis=1) < half_m)
+        if not goes_on.any():
+            break
+        ends = fitted
+        found += list(ends[goes_on])
+    poses = np.array(found)
+    return poses, evidence_of(window, poses, indices, settings)
+
+
+def evidence_of(
+    window: Window,
+    poses: Array,
+    indices: Mapping[LineKind, LineIndex],
+    settings: LocatorSettings,
+) -> Array:
+    """Return the log evidence (n,) of poses (n, 3) of the last picture, up to a constant.
+
+    Pictures close to each other see the same errors of the map again: so much less they count.
+    """
+    return _independent(window) * _log_likelihood(window, poses, indices, settings, 0.0)
+
+
+def _independent(window: Window) -> float:
+    """Return which share of its pictures a window is worth: close ones see the same errors."""
+    length = float(np.hypot(*np.diff(window.motion[:, :2], axis=0).T).sum())
+    return min(1.0, (length + INDEPENDENT_M) / (INDEPENDENT_M * len(window.time_s)))
+
+
 def _ranked(
     window: Window,
     poses: Array,
@@ -108,8 +197,7 @@ def _ranked(
 
     Pictures close to each other see the same errors of the map again: so much less they count.
     """
-    length = float(np.hypot(*np.diff(window.motion[:, :2], axis=0).T).sum())
-    new = min(1.0, (length + INDEPENDENT_M) / (INDEPENDENT_M * len(window.time_s)))
+    new = _independent(window)
     whole = _log_likelihood(window, poses, indices, settings, 0.0)
     found, misfit = new * whole, -whole / len(window.picture)
     kept = _apart_from_each_other(poses, found, _KEPT)
@@ -183,15 +271,21 @@ def _fitted(
     indices: Mapping[LineKind, LineIndex],
     settings: LocatorSettings,
     first_m: float,
+    *,
+    is_held: bool = False,
 ) -> Array:
     """Return poses (n, 3) moved to where the window fits best nearby: damped Gauss-Newton.
 
-    The widths fall from round to round, beginning with ``first_m`` more than the sigmas.
+    The widths fall from round to round, beginning with ``first_m`` more than the sigmas. Those that
+    are held move across their course only, and turn.
     """
     at: Array = last.copy()
     for number in range(_ROUNDS):
         wider_m = first_m * 0.4**number
         hessian = np.zeros((len(at), 3, 3)) + np.diag([0.05, 0.05, 30.0])
+        if is_held:
+            ahead = np.column_stack([np.cos(at[:, 2]), np.sin(at[:, 2])])
+            hessian[:, :2, :2] += _HELD * ahead[:, :, None] * ahead[:, None]
         slope = np.zeros((len(at), 3))
         poses = window.poses_from(at)[:, window.picture.astype(int)]
         for kind, index in indices.items():
@@ -199,25 +293,18 @@ def _fitted(
             if not mine.any():
                 continue
             how = settings.line if kind is LineKind.LANE_LINE else settings.boundary
-            pose = poses[:, mine, None]
-            points = window.points[mine]
-            x_y = np.stack(in_plane(pose, points), axis=-1)
-            foot = index.foot(x_y)
-            step = index.step[foot.segment]
-            normal = np.stack([-step[..., 1], step[..., 0]], axis=-1)
-            normal /= np.hypot(step[..., 0], step[..., 1])[..., None]
-            found = line_residual(
-                pose[..., :2], pose[..., 2], point_b=points, foot=foot.x_y, normal=normal
-            )
+            x, y = in_plane(poses[:, mine, None], window.points[mine])
+            foot = index.foot(np.stack([x, y], axis=-1))
+            nx, ny = np.moveaxis(index.normal[foot.segment], -1, 0)
+            error = nx * (x - foot.x_y[..., 0]) + ny * (y - foot.x_y[..., 1])
             sigma = how.sigma_m + wider_m
             counted = (foot.distance < np.sqrt(how.cap_sq) * sigma) / sigma**2
             # In world axes, and turned about the last picture's position.
-            arm = x_y - at[:, None, None, :2]
-            turn = normal[..., 1] * arm[..., 0] - normal[..., 0] * arm[..., 1]
-            block = np.concatenate([normal, turn[..., None]], axis=-1)
-            hessian += np.einsum("ncm,ncmi,ncmj->nij", counted, block, block)
-            error = np.where(counted > 0.0, found.error, 0.0)
-            slope += np.einsum("ncm,ncmi->ni", counted * error, block)
+            turn = ny * (x - at[:, 0, None, None]) - nx * (y - at[:, 1, None, None])
+            block = np.stack([nx, ny, turn], axis=-1).reshape(len(at), -1, 3)
+            said = (block * counted.reshape(len(at), -1, 1)).swapaxes(1, 2)
+            hessian += said @ block
+            slope += (said @ error.reshape(len(at), -1, 1))[..., 0]
         step = np.linalg.solve(hessian, slope[..., None])[..., 0]
         at = at - step
     return at

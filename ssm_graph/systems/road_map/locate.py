@@ -4,22 +4,28 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
 from ssm_graph.base.errors import DataError, SolverError
 from ssm_graph.base.frozen import Array, FrozenArrays, shaped
-from ssm_graph.base.units import DEGREE
+from ssm_graph.base.units import DEGREE, wrapped
 from ssm_graph.filters.rules.hypotheses import CARRIED, Hypothesis
-from ssm_graph.filters.rules.particles import Particles, moments
+from ssm_graph.filters.rules.particles import moments, normalised
 from ssm_graph.systems.road_map.drive import Drive, curve_groups, dead_reckoned
 from ssm_graph.systems.road_map.hypotheses import (
     ALONG_M,
-    apart,
+    ALONG_STEP_M,
+    LATERAL_M,
+    TURN,
+    along_lane,
     course_trials,
+    evidence_of,
     is_same_lane,
+    known_along,
+    lane_share,
     search,
     slide,
 )
@@ -30,10 +36,19 @@ from ssm_graph.systems.road_map.locator import (
     Locator,
     LocatorSettings,
     first_particles,
+    spread_over,
 )
 from ssm_graph.systems.road_map.maps.index import LineIndex
 from ssm_graph.systems.road_map.maps.road_map import LineKind, RoadMap
-from ssm_graph.systems.road_map.refinement import Prior, Refined, RefinementSettings, refine
+from ssm_graph.systems.road_map.motion import first_course
+from ssm_graph.systems.road_map.plausible import require_plausible
+from ssm_graph.systems.road_map.refinement import (
+    Prior,
+    Refined,
+    RefinementSettings,
+    refine,
+    sigmas_of,
+)
 from ssm_graph.systems.road_map.simulate import indices_of
 from ssm_graph.systems.road_map.verdict import (
     Verdict,
@@ -51,10 +66,10 @@ LOST: Final = 4.0
 """Log evidence by which another place must be better for the particles to be put there."""
 MOST_PICTURES: Final = 60
 """Of a stretch, where the vehicle is slow."""
-OLD_SHARE: Final = 0.005
-"""Of the weight that stays with the particles as they were, when others are put elsewhere."""
 SLIDE_EVERY_M: Final = 15.0
 """From one look along the lane to the next."""
+AGAIN_PICTURES: Final = 5
+"""So many pictures at least from one look to the next: at 25 m/s a few metres are one picture."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,19 +130,29 @@ class Localiser:
         self.when = verdict or VerdictSettings()
         self.verdict, self.hypotheses = Verdict.AMBIGUOUS, list[Hypothesis]()
         self.next_m = self.next_slide_m = 0.0
+        self.next_row = self.put_row = 0
+        self.before_m = 0.0
         self.first: tuple[float, float, Array] | None = None
         self.refinement = refinement or RefinementSettings()
         self.half_m = square_of(drive)
-        fixes = drive.gnss.x_y
+        fixes, fixes_s = drive.gnss.x_y, drive.gnss.time_s
         if indices is None:
             indices = indices_of(road_map.within(fixes, self.half_m + SENSOR_REACH_M))
         self.indices = indices
-        yaw, rng = _first_course(drive), np.random.default_rng([seed, 2])
-        particles = first_particles(fixes[0], self.half_m, yaw, self.indices, self.settings, rng)
+        require_plausible(drive)
+        begin = first_course(drive)
+        self.course, self.begin_s = begin.yaw, float(fixes_s[begin.fix]) if begin.fix else -np.inf
+        if begin.yaw is not None:
+            spread = max(self.settings.yaw_sigma, begin.sigma)
+            self.settings = replace(self.settings, yaw_sigma=spread)
+        rng = np.random.default_rng([seed, 2])
+        particles = first_particles(
+            fixes[begin.fix], self.half_m, self.course, self.indices, self.settings, rng
+        )
         self.locator = Locator(self.indices, particles, rng, self.settings)
         t = drive.chassis.time_s
         self.reckoned = dead_reckoned(np.zeros(3), t, drive.chassis)
-        self.groups = curve_groups(drive.curves)
+        self.groups = [g for g in curve_groups(drive.curves) if g[0] >= self.begin_s]
         self.snapshots: list[tuple[float, Array]] = []
         self.rows: list[tuple[float, Array, Array, float, int]] = []
         self.extras: list[tuple[Array, Array]] = []
@@ -139,8 +164,10 @@ class Localiser:
         way = np.hypot(*np.diff(self.reckoned[:, :2], axis=0).T)
         way *= np.sign(0.5 * (self.drive.chassis.speed[1:] + self.drive.chassis.speed[:-1]))
         turn = np.diff(self.reckoned[:, 2])
-        self._keep(float(t[0]))
-        for k in range(1, len(t)):
+        begin = int(np.searchsorted(t, self.begin_s))
+        self.before_m = float(np.abs(way[:begin]).sum())
+        self._keep(float(t[begin]))
+        for k in range(begin + 1, len(t)):
             while n_done < len(self.groups) and self.groups[n_done][0] < t[k]:
                 self._picture(n_done)
                 n_done += 1
@@ -150,8 +177,8 @@ class Localiser:
             n_done += 1
         if not self.rows:
             raise DataError(
-                f"{self.drive.name} curves: none within the times of the chassis, {t[0]:.3f} to "
-                f"{t[-1]:.3f} s; are the clocks the same?"
+                f"{self.drive.name} curves: none from {self.begin_s:.3f} s on, when the fixes tell "
+                "the course; give a heading in [gnss], or a longer drive"
             )
         self._judge(len(self.rows) - 1)
         cpu_ms = 1e3 * (time.process_time() - began) / len(self.rows)
@@ -168,6 +195,8 @@ class Localiser:
         self.extras.append((mean, cov))
         if len(self.rows) in (3, 10, 25) or len(self.rows) % 60 == 0:
             self._keep(when)
+        if len(self.rows) < self.next_row:
+            return
         if locator.driven_m >= max(self.next_m, self.when.least_driven_m):
             self._judge(number)
         elif self.verdict is Verdict.CONVERGED and locator.driven_m >= self.next_slide_m:
@@ -176,6 +205,7 @@ class Localiser:
     def _slide(self, number: int) -> None:
         """Look along the lane: the particles may have lost the right place in it."""
         self.next_slide_m = self.locator.driven_m + SLIDE_EVERY_M
+        self.next_row = len(self.rows) + AGAIN_PICTURES
         window = self._stretch(number)
         if window is not None:
             mean = self.rows[-1][1]
@@ -194,7 +224,31 @@ class Localiser:
     def _spread(self, found: list[Hypothesis]) -> None:
         """Put particles about all places that the stretch allows."""
         locator = self.locator
-        locator.put(_spread_over(found, locator.particles, self.settings, locator.rng))
+        self.put_row = len(self.rows)
+        likely = [h for h in found if h.share > 1e-3]
+        share = np.array([h.share for h in likely])
+        at = np.array([h.pose for h in likely])
+        locator.put(spread_over(at, share, ALONG_M, locator.particles, self.settings, locator.rng))
+
+    def _lay_along(self, window: Window, fix: Array) -> None:
+        """Lay particles anew along the lane, by the evidence of all that was seen.
+
+        Few of the first particles were in the right lane: what they say of the place along it is
+        how they happened to lie.
+        """
+        best = np.array(self.hypotheses[0].pose)
+        at, value = along_lane(window, best, fix, self.half_m, self.indices, self.settings)
+        if self.course is not None:
+            began, now = self._reckoned_at(self.begin_s), self._reckoned_at(self.rows[-1][0])
+            since = began[2] - now[2]
+            off = wrapped(at[:, 2] + since - self.course) / self.settings.yaw_sigma
+            value = value - 0.5 * off**2
+        locator = self.locator
+        locator.put(
+            spread_over(
+                at, normalised(value), ALONG_STEP_M, locator.particles, self.settings, locator.rng
+            )
+        )
 
     def _keep(self, when: float) -> None:
         self.snapshots.append((when, self.locator.particles.states[:, :3].copy()))
@@ -226,10 +280,11 @@ class Localiser:
         window = self._stretch(number)
         when, mean, cov, driven_m, _ = self.rows[-1]
         self.next_m = driven_m + v.again_after_m
+        self.next_row = len(self.rows) + AGAIN_PICTURES
         if window is None:
             self.verdict = Verdict.FAILED if self.first is None else self.verdict
             return
-        fix = _fix_at(self.drive, when)
+        fix = self._fix_at(when, float(mean[2]))
         spread = max(float(np.sqrt(cov[2, 2])), self.settings.yaw_sigma / 2.0)
         yaws = course_trials(float(mean[2]), min(spread, 10.0 * DEGREE))
         found, own = search(window, fix, self.half_m, yaws, self.indices, self.settings, mean)
@@ -237,9 +292,9 @@ class Localiser:
         if found[0].misfit > v.misfit:
             self.verdict = Verdict.FAILED
             return
-        across, _ = sigmas_of(mean, cov)
-        is_known = _lane_share(found, np.array(found[0].pose)) > 1.0 - CARRIED
-        if across > v.lateral_sigma_m and is_known:
+        best = np.array(found[0].pose)
+        is_known = lane_share(found, best) > 1.0 - CARRIED
+        if is_known and self._in_lane(best) < 1.0 - CARRIED:
             self._spread(found)  # the stretch as a whole knows the lane before the particles do
         else:
             self._put(found, own)
@@ -247,13 +302,37 @@ class Localiser:
         self.extras[-1] = moments(p.states, p.weight, YAW)
         mean, cov = self.extras[-1][0][:3], self.extras[-1][1][:3, :3]
         self.rows[-1] = (when, mean, cov, driven_m, len(p.states))
-        across, _ = sigmas_of(mean, cov)
         self.verdict = Verdict.AMBIGUOUS
-        if across < v.lateral_sigma_m and _lane_share(found, mean) > 1.0 - CARRIED:
+        if min(self._in_lane(mean), lane_share(found, mean)) > 1.0 - CARRIED:
             self.verdict = Verdict.CONVERGED
             self.next_m = driven_m + v.watch_m
             if self.first is None and driven_m >= v.least_driven_m:
-                self.first = (when, driven_m, mean)
+                lane = [np.array(h.pose) for h in found if is_same_lane(h, mean)]
+                # The mean of particles along a bend is beside it.
+                on_it = min(lane, key=lambda pose: float(np.hypot(*(pose - mean)[:2])))
+                self.first = (when, driven_m, on_it)
+                self._lay_along(window, fix)
+
+    def _in_lane(self, pose: Array) -> float:
+        """Return which share of the particles is in the lane of a pose (3,)."""
+        p = self.locator.particles
+        off, turn = p.states[:, :2] - pose[:2], wrapped(p.states[:, YAW] - pose[2])
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        across = off @ [-s, c] - off @ [c, s] * np.tan(0.5 * turn)
+        return float(p.weight[(np.abs(across) < LATERAL_M) & (np.abs(turn) < TURN)].sum())
+
+    def _fix_at(self, when: float, yaw: float) -> Array:
+        """Return the last fix before a time, carried on by dead reckoning to a course, (2,) m."""
+        k = max(0, int(np.searchsorted(self.drive.gnss.time_s, when, side="right")) - 1)
+        now = self._reckoned_at(when)
+        c, s = np.cos(yaw - now[2]), np.sin(yaw - now[2])
+        gone = (now - self._reckoned_at(float(self.drive.gnss.time_s[k])))[:2]
+        return np.asarray(self.drive.gnss.x_y[k] + np.array([[c, -s], [s, c]]) @ gone)
+
+    def _reckoned_at(self, when: float) -> Array:
+        """Return the dead-reckoned pose (3,) of the chassis row at a time or after it."""
+        row = int(np.searchsorted(self.drive.chassis.time_s, when - 1e-6))
+        return np.asarray(self.reckoned[min(row, len(self.reckoned) - 1)])
 
     def _answer(self, cpu_ms: float) -> Located:
         v = self.when
@@ -269,23 +348,23 @@ class Localiser:
             except SolverError as error:
                 reason = str(error)
         if refined is not None:
-            pose, sigmas = refined.poses[-1], refined.sigmas
-            if sigmas[1] > 0.5 * along:  # no bend in the window: the particles know more
-                _, ahead, _ = apart(pose, mean)
-                pose = pose + ahead * np.array([np.cos(pose[2]), np.sin(pose[2]), 0.0])
-                sigmas = (sigmas[0], along, sigmas[2])
-        if verdict is Verdict.CONVERGED and sigmas[1] > v.along_sigma_m:
-            verdict = Verdict.UNRESOLVED_ALONG
+            pose, sigmas = self._joined(refined, mean, along)
+        hypotheses = known_along(self.hypotheses, pose, sigmas[1]) if self.hypotheses else []
+        if verdict is Verdict.CONVERGED:
+            if lane_share(hypotheses, pose) < 1.0 - CARRIED:
+                verdict = Verdict.AMBIGUOUS
+            elif sigmas[1] > v.along_sigma_m or sum(h.share > CARRIED for h in hypotheses) > 1:
+                verdict = Verdict.UNRESOLVED_ALONG
         first = self.first or (np.nan, np.nan, np.full(3, np.nan))
         return Located(
             verdict,
-            reason_of(verdict, self.hypotheses, v.misfit, pose, sigmas)
+            reason_of(verdict, hypotheses, v.misfit, pose, sigmas)
             + (f"; {reason}" if reason else ""),
             np.array(pose),
             sigmas,
-            tuple(self.hypotheses),
+            tuple(hypotheses),
             first[0] - float(self.drive.chassis.time_s[0]),
-            first[1],
+            self.before_m + first[1],
             first[2],
             _track(self.rows),
             refined,
@@ -294,6 +373,26 @@ class Localiser:
             cpu_ms,
         )
 
+    def _joined(
+        self, refined: Refined, mean: Array, along: float
+    ) -> tuple[Array, tuple[float, float, float]]:
+        """Return the refined pose (3,) and sigmas, or along the road what the particles know.
+
+        That counts where the window has no bend; where both cannot be right the stretch decides.
+        """
+        pose, sigmas = refined.poses[-1], refined.sigmas
+        shift = float((mean - pose)[:2] @ refined.ahead)
+        moved = pose + shift * np.array([*refined.ahead, 0.0])
+        is_moved = sigmas[1] > 0.5 * along
+        if abs(shift) > 3.0 * np.hypot(along, sigmas[1]):
+            window = self._stretch(len(self.rows) - 1)
+            assert window is not None
+            found = evidence_of(window, np.stack([pose, moved]), self.indices, self.settings)
+            better = float(found[0] - found[1])
+            is_moved = better < LOST
+            along = along if abs(better) > LOST else float(np.hypot(along, 0.5 * shift))
+        return (moved, refined.with_along(along)) if is_moved else (pose, sigmas)
+
     def _refine(self) -> tuple[Refined | None, Window | None]:
         """Lay the last pictures on the map as a graph, begun by the particles before them."""
         n = min(self.when.refined_pictures, len(self.rows))
@@ -301,7 +400,11 @@ class Localiser:
         window = self._window(groups)
         if window is None:
             return None, None
-        mean, cov = self.extras[len(self.rows) - n]
+        first = len(self.rows) - n
+        mean, cov = self.extras[first]
+        if first < self.put_row:  # the particles were elsewhere then
+            mean, cov = self.extras[-1][0].copy(), 4.0 * self.extras[-1][1]
+            mean[:3] = window.poses_from(mean[:3])[0]
         floor = np.diag([0.05, 0.05, 0.2 * DEGREE, 1e-3, 1e-5]) ** 2
         cov = cov + floor
         if n == len(self.rows):
@@ -317,25 +420,10 @@ def locate(drive: Drive, road_map: RoadMap, **options: object) -> Located:
     return Localiser(drive, road_map, **options).run()  # type: ignore[arg-type]
 
 
-def _lane_share(found: list[Hypothesis], pose: Array) -> float:
-    """Return which share of the evidence is for the lane of a pose (3,)."""
-    return sum(h.share for h in found if is_same_lane(h, pose))
-
-
 def square_of(drive: Drive) -> float:
     """Return half the side of the square about a fix in which the vehicle is, m."""
     noise = 3.0 * float(drive.gnss.sigma_m[0]) if drive.gnss_bias_m == 0.0 else 2.0
     return drive.gnss_bias_m + noise
-
-
-def sigmas_of(pose: Array, cov: Array) -> tuple[float, float]:
-    """Return the standard deviations across and along a pose (3,) from its covariance, m."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    along, across = np.array([c, s]), np.array([-s, c])
-    return (
-        float(np.sqrt(across @ cov[:2, :2] @ across)),
-        float(np.sqrt(along @ cov[:2, :2] @ along)),
-    )
 
 
 def _without_chance(mean: Array, cov: Array) -> Array:
@@ -350,44 +438,6 @@ def _without_chance(mean: Array, cov: Array) -> Array:
     own = turned @ cov @ turned.T
     own[0, 1:], own[1:, 0] = 0.0, 0.0
     return np.asarray(turned.T @ own @ turned)
-
-
-def _first_course(drive: Drive) -> float | None:
-    yaw = drive.gnss.yaw
-    if yaw is None or not np.isfinite(yaw[0]):
-        return None
-    return float(yaw[0])
-
-
-def _fix_at(drive: Drive, when: float) -> Array:
-    """Return the last fix before a time, carried on by dead reckoning, (2,) m."""
-    k = max(0, int(np.searchsorted(drive.gnss.time_s, when, side="right")) - 1)
-    return np.asarray(drive.gnss.x_y[k])
-
-
-def _spread_over(
-    found: list[Hypothesis],
-    old: Particles,
-    settings: LocatorSettings,
-    rng: np.random.Generator,
-) -> Particles:
-    """Return particles about all places with evidence, in proportion; some of the old ones stay."""
-    n = settings.most
-    kept = old.states[rng.choice(len(old.states), n // 5, p=old.weight)]
-    likely = [h for h in found if h.share > 1e-3]
-    share = np.array([h.share for h in likely])
-    share = np.maximum(share / share.sum(), 0.05)
-    rows = rng.choice(len(likely), n - len(kept), p=share / share.sum())
-    drawn = old.states[rng.choice(len(old.states), len(rows), p=old.weight)].copy()
-    drawn[:, :3] = np.array([h.pose for h in likely])[rows]
-    along = rng.uniform(-0.5 * ALONG_M, 0.5 * ALONG_M, len(rows))
-    drawn[:, 0] += along * np.cos(drawn[:, 2]) + 0.2 * rng.standard_normal(len(rows))
-    drawn[:, 1] += along * np.sin(drawn[:, 2]) + 0.2 * rng.standard_normal(len(rows))
-    drawn[:, 2] += 0.5 * DEGREE * rng.standard_normal(len(rows))
-    weight = np.repeat(
-        [OLD_SHARE / len(kept), (1.0 - OLD_SHARE) / len(drawn)], [len(kept), len(drawn)]
-    )
-    return Particles(np.concatenate([kept, drawn]), np.log(weight))
 
 
 def _track(rows: list[tuple[float, Array, Array, float, int]]) -> Track:

@@ -8,9 +8,10 @@ from typing import Final
 
 import numpy as np
 
+from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.units import DEGREE, wrapped
-from ssm_graph.filters.rules.particles import Particles, drawn_anew
+from ssm_graph.filters.rules.particles import Particles, drawn_anew, systematic
 from ssm_graph.systems.road_map.drive import Curves
 from ssm_graph.systems.road_map.maps.index import LineIndex
 from ssm_graph.systems.road_map.maps.road_map import LineKind, Mark
@@ -35,6 +36,11 @@ class KindSettings:
     """So many independent points a curve is worth: its errors are common to its points."""
 
 
+OLD_SHARE: Final = 0.005
+"""Of the weight that stays with the particles as they were, when others are put elsewhere."""
+LEAST_SHARE: Final = 0.05
+"""Of the particles that are put at a place, however small its share of the evidence; their weights
+make up for it."""
 INDEPENDENT_M: Final = 15.0
 """Pictures closer to each other than this see the same errors of the map, and count less."""
 
@@ -43,8 +49,8 @@ INDEPENDENT_M: Final = 15.0
 class LocatorSettings:
     """Everything that can be chosen about the filter; tuned on routes 0 to 99 only."""
 
-    boundary: KindSettings = KindSettings(0.5, 2.0, 16.0)
-    line: KindSettings = KindSettings(0.3, 1.2, 9.0)
+    boundary: KindSettings = KindSettings(0.5, 2.0, 6.0)
+    line: KindSettings = KindSettings(0.3, 1.2, 6.0)
     annealing: float = 8.0
     """Pictures over which the widths fall by a factor e."""
     n_points: int = 8
@@ -217,9 +223,17 @@ def first_particles(
 ) -> Particles:
     """Return particles on a grid over the square about a fix, where lines are near.
 
-    Without a course (None) they look everywhere.
+    Without a course (None) they look everywhere. Raises :class:`DataError` where there are none.
     """
     cell = settings.cell_m
+    nearest_m = min(float(index.tree.query(x_y)[0]) for index in indices.values())
+    if nearest_m > half_m + settings.off_road_m:
+        raise DataError(
+            f"gnss: the first fix, ({x_y[0]:.1f}, {x_y[1]:.1f}), is {nearest_m:.0f} m from every "
+            f"boundary and lane line of the map; expected one within {half_m:.0f} m, by which "
+            f"fixes are off, and {settings.off_road_m:.0f} m: another map, or a larger bias_m in "
+            "[gnss]"
+        )
     while True:
         side = np.arange(-half_m, half_m + 0.5 * cell, cell)
         gx, gy = np.meshgrid(x_y[0] + side, x_y[1] + side, indexing="ij")
@@ -233,6 +247,8 @@ def first_particles(
         if len(x) * n_yaw <= settings.most * (1 if yaw is not None else 12) or cell > half_m:
             break
         cell *= 1.1
+    several = max(1, int(np.ceil(settings.least / max(1, len(x) * n_yaw))))  # a good receiver
+    x, y = np.repeat(x, several), np.repeat(y, several)
     n = len(x) * n_yaw
     states = np.zeros((n, 5))
     states[:, X], states[:, Y] = np.repeat(x, n_yaw), np.repeat(y, n_yaw)
@@ -246,3 +262,33 @@ def first_particles(
     states[:, BIAS] = settings.bias_sigma * rng.standard_normal(n)
     states[:, YAW] = wrapped(states[:, YAW])
     return Particles(states, np.zeros(n))
+
+
+def spread_over(
+    at: Array,
+    share: Array,
+    reach_m: float,
+    old: Particles,
+    settings: LocatorSettings,
+    rng: np.random.Generator,
+) -> Particles:
+    """Return particles about places (n, 3) by their shares; some of the old ones stay.
+
+    ``reach_m`` is the length along the course over which those of a place are laid.
+    """
+    n = settings.most
+    kept = old.states[rng.choice(len(old.states), n // 5, p=old.weight)]
+    share = share / share.sum()
+    of_number = np.maximum(share, min(LEAST_SHARE, 0.5 / len(share)))
+    of_number = of_number / of_number.sum()
+    rows = systematic(of_number, n - len(kept), rng)
+    drawn = old.states[rng.choice(len(old.states), len(rows), p=old.weight)].copy()
+    drawn[:, :3] = at[rows]
+    along = rng.uniform(-0.5 * reach_m, 0.5 * reach_m, len(rows))
+    drawn[:, 0] += along * np.cos(drawn[:, 2]) + 0.2 * rng.standard_normal(len(rows))
+    drawn[:, 1] += along * np.sin(drawn[:, 2]) + 0.2 * rng.standard_normal(len(rows))
+    drawn[:, 2] += 0.5 * DEGREE * rng.standard_normal(len(rows))
+    weight = (share / of_number)[rows]
+    weight *= (1.0 - OLD_SHARE) / weight.sum()
+    weight = np.concatenate([np.full(len(kept), OLD_SHARE / len(kept)), weight])
+    return Particles(np.concatenate([kept, drawn]), np.log(np.maximum(weight, 1e-300)))

@@ -8,7 +8,7 @@ beginning's pose by least squares with a weight for every fix.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -16,12 +16,64 @@ from factors.similarity import Kernel, LogKernel, expected_mahalanobis_sq
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array, ReadOnlyArrays
 from ssm_graph.base.units import DEGREE
-from ssm_graph.systems.road_map.drive import Chassis, GnssFixes, dead_reckoned
+from ssm_graph.systems.road_map.drive import Chassis, Drive, GnssFixes, dead_reckoned
 
 LEAST_FIXES: Final = 8
 PRIOR: Final = np.array([np.inf, np.inf, np.inf, 0.05, 1.0 * DEGREE, 0.5])
 """Sigma of x, y, yaw (nothing is known), scale, bias [rad/s], delay [s] beforehand."""
 _STEP: Final = np.array([1e-3, 1e-3, 1e-6, 1e-6, 1e-7, 1e-4])
+
+
+_LEAST_NOISE_M: Final = 0.5
+"""From fix to fix, of any receiver."""
+TOLD: Final = 10.0 * DEGREE
+"""A course is told by fixes once its sigma is below this."""
+
+
+class FirstCourse(NamedTuple):
+    """A course over ground to begin with."""
+
+    fix: int
+    """Number of the fix by which it is known, from 0."""
+    yaw: float | None
+    """rad, at that fix; None where neither the receiver nor the way tells it"""
+    sigma: float
+    """rad; 0 where the receiver gives it"""
+
+
+def first_course(drive: Drive) -> FirstCourse:
+    """Return the first course of a drive: the receiver's, or that which its way tells.
+
+    Fixes are off by much, but alike: as the vehicle goes, their way turns onto the dead-reckoned
+    one, by the rotation that is best for all of them.
+    """
+    gnss = drive.gnss
+    if gnss.yaw is not None and np.isfinite(gnss.yaw[0]):
+        return FirstCourse(0, float(gnss.yaw[0]), 0.0)
+    t = drive.chassis.time_s
+    inside = np.flatnonzero((gnss.time_s >= t[0]) & (gnss.time_s <= t[-1]))
+    if len(inside) < 2:
+        return FirstCourse(0, None, np.inf)
+    way = dead_reckoned(np.zeros(3), gnss.time_s[inside], drive.chassis)
+    noise = noise_of(drive)
+    for n in range(2, len(inside) + 1):
+        a = way[:n, :2] - way[:n, :2].mean(axis=0)
+        b = gnss.x_y[inside[:n]] - gnss.x_y[inside[:n]].mean(axis=0)
+        sigma = noise / max(float(np.sqrt(np.square(a).sum())), 1e-9)
+        if sigma < TOLD:
+            return FirstCourse(int(inside[n - 1]), float(way[n - 1, 2]) + turn_between(a, b), sigma)
+    return FirstCourse(0, None, np.inf)
+
+
+def noise_of(drive: Drive) -> float:
+    """Return the sigma of fixes from one to the next, without what they are off by in common, m."""
+    of_bias = drive.gnss_bias_m**2 / 3.0
+    return float(np.sqrt(max(float(drive.gnss.sigma_m[0]) ** 2 - of_bias, _LEAST_NOISE_M**2)))
+
+
+def turn_between(a: Array, b: Array) -> float:
+    """Return by which angle points (N, 2) about their mean are to be turned onto others, rad."""
+    return float(np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,7 +147,7 @@ def _first_guess(chassis: Chassis, began: float, time_s: Array, x_y: Array) -> A
     """Return the six numbers with the way turned onto the fixes as a whole."""
     track = dead_reckoned(np.zeros(3), np.concatenate([[began], time_s]), chassis)[1:, :2]
     a, b = track - track.mean(axis=0), x_y - x_y.mean(axis=0)
-    yaw = np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))
+    yaw = turn_between(a, b)
     c, s = np.cos(yaw), np.sin(yaw)
     x, y = x_y.mean(axis=0) - np.array([[c, -s], [s, c]]) @ track.mean(axis=0)
     return np.array([x, y, yaw, 0.0, 0.0, 0.0])

@@ -232,9 +232,7 @@ def _on_own_lines(
 def _line_rows(at: Array, points: Array, index: LineIndex) -> tuple[Array, Array]:
     x_y = np.stack(in_plane(at, points), axis=-1)
     foot = index.foot(x_y)
-    step = index.step[foot.segment]
-    normal = np.stack([-step[..., 1], step[..., 0]], axis=-1)
-    normal /= np.hypot(step[..., 0], step[..., 1])[..., None]
+    normal = index.normal[foot.segment]
     found = line_residual(at[:2], at[2], point_b=points, foot=foot.x_y, normal=normal)
     block = np.concatenate([normal, found.error_D_pose[..., 2:]], axis=-1)
     near = foot.distance < 2.0

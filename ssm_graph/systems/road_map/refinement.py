@@ -27,9 +27,18 @@ from ssm_graph.systems.road_map.window import Window, in_plane
 _FAR_M: Final = 1.5
 """A point farther from every line of its kind is of none of them."""
 _SLANTED: Final = 0.1
-"""Sine of the angle to the last course below which a line says nothing of the place along it: what
-its small kinks would say is the map's error, the same in every picture. The direction is one for
-all pictures: each one's own would differ by their courses, and so say what no line says."""
+"""Sine of the angle between a line and the way that its points go when the window is moved along
+the road, below which it says nothing of the place along it: what small kinks would say is the map's
+error, the same in every picture. The road is an arc over the window, so that the move is one of a
+stiff piece: moves of each picture for itself would differ by the chassis, and so say what no line
+says."""
+_SAME_WAY: Final = 0.9
+"""Cosine to the course beyond which a line runs along the road and not across it."""
+_LEAST_ARC_M: Final = 30.0
+"""A shorter stretch of lines has no bend that could be told from kinks."""
+_BEND_M: Final = 0.15
+"""By how much, along the road, what a bend says is off in all pictures alike: its line in the map,
+and the cubic that is laid along it; measured on seeds below 100."""
 _CLOSE_M: Final = 2e-4
 _CLOSE_RAD: Final = 1e-4
 
@@ -82,20 +91,33 @@ class Refined(ReadOnlyArrays):
     feet: Array
     """(C, m, 2) m, where each point lies on the map."""
     has_settled: bool
+    ahead: Array
+    """(2,) of length 1, along the road at the last pose."""
     next_prior: Prior | None = None
     """Of the second pose, the first one being left behind."""
 
     @property
     def sigmas(self) -> tuple[float, float, float]:
         """Across and along the last pose [m], and its yaw [rad]."""
-        yaw, cov = self.poses[-1, 2], self.covs[-1]
-        c, s = np.cos(yaw), np.sin(yaw)
-        along, across = np.array([c, s]), np.array([-s, c])
-        return (
-            float(np.sqrt(across @ cov[:2, :2] @ across)),
-            float(np.sqrt(along @ cov[:2, :2] @ along)),
-            float(np.sqrt(cov[2, 2])),
-        )
+        cov = self.covs[-1]
+        return *sigmas_of(self.poses[-1], cov), float(np.sqrt(cov[2, 2]))
+
+    def with_along(self, along_m: float) -> tuple[float, float, float]:
+        """Return the same sigmas where the place along the road is known so well by other means."""
+        across = np.array([-self.ahead[1], self.ahead[0]])
+        variance = float(across @ self.covs[-1][:2, :2] @ across)
+        cov = variance * np.outer(across, across) + along_m**2 * np.outer(self.ahead, self.ahead)
+        return *sigmas_of(self.poses[-1], cov), self.sigmas[2]
+
+
+def sigmas_of(pose: Array, cov: Array) -> tuple[float, float]:
+    """Return the standard deviations across and along a pose (3,) from its covariance, m."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    along, across = np.array([c, s]), np.array([-s, c])
+    return (
+        float(np.sqrt(across @ cov[:2, :2] @ across)),
+        float(np.sqrt(along @ cov[:2, :2] @ along)),
+    )
 
 
 class _Lines:
@@ -122,10 +144,7 @@ class _Lines:
             if not mine.any():
                 continue
             foot = index.foot(x_y[mine])
-            step = index.step[foot.segment]
-            normal = np.stack([-step[..., 1], step[..., 0]], axis=-1)
-            self.normals[mine] = normal / np.hypot(step[..., 0], step[..., 1])[..., None]
-            self.feet[mine] = foot.x_y
+            self.normals[mine] = index.normal[foot.segment]
             trust = (foot.distance < _FAR_M).astype(float)
             off = np.abs(np.sum(self.normals[mine] * (x_y[mine] - foot.x_y), axis=-1))
             trust[foot.distance > off + 0.05] = 0.0  # beyond the end of a line
@@ -134,6 +153,37 @@ class _Lines:
                 wrong = (seen != Mark.UNKNOWN) & (there != Mark.UNKNOWN) & (seen != there)
                 trust = np.where(wrong, trust * self.settings.wrong_mark, trust)
             self.trust[mine] = trust
+            self.feet[mine] = np.where(trust[..., None] > 0.0, foot.x_y, x_y[mine])
+        self.ahead, self.bend = self._road(poses)
+
+    def _road(self, poses: Array) -> tuple[Array, float]:
+        """Return the road's direction (2,) at the last pose and its bend, 1/m, anticlockwise.
+
+        A straight line is laid through the directions of the lines over the way; without lines the
+        road runs along the course.
+        """
+        way = np.hypot(*np.diff(poses[:, :2], axis=0).T)
+        s = np.concatenate([[0.0], np.cumsum(way)]) - way.sum()
+        turn = wrapped(poses[:, 2] - poses[-1, 2])
+        c, sn = np.cos(poses[self.of, 2])[:, None], np.sin(poses[self.of, 2])[:, None]
+        forward = self.normals[..., 1] * c - self.normals[..., 0] * sn
+        left = -self.normals[..., 0] * c - self.normals[..., 1] * sn
+        use = (self.trust > 0.0) & (np.abs(forward) > _SAME_WAY)
+        angle = (np.arctan(left / np.where(use, forward, 1.0)) + turn[self.of][:, None])[use]
+        at = (s[self.of][:, None] + self.window.points[..., 0])[use]
+        bend, beside = 0.0, 0.0
+        if len(at):
+            middle, mean = at.mean(), angle.mean()
+            if np.ptp(at) > _LEAST_ARC_M:
+                bend = float((at - middle) @ (angle - mean) / np.square(at - middle).sum())
+            beside = float(mean - bend * middle)
+        yaw = poses[-1, 2] + beside
+        return np.array([np.cos(yaw), np.sin(yaw)]), bend
+
+    def _moved_along(self, x_y: Array, last: Array) -> Array:
+        """Return how points (..., 2) go when all is moved along the road by 1 m."""
+        off = x_y - last
+        return self.ahead + self.bend * np.stack([-off[..., 1], off[..., 0]], axis=-1)
 
     def rows(self, poses: Array, covs: Array | None) -> tuple[Array, Array, Array]:
         """Return whitened errors (C, m), blocks (C, m, 3) in plane axes, and weights (C, m)."""
@@ -146,10 +196,14 @@ class _Lines:
             foot=self.feet,
             normal=self.normals,
         )
-        ahead = np.array([np.cos(poses[-1, 2]), np.sin(poses[-1, 2])])
-        forward = (self.normals @ ahead)[..., None]
-        said = np.where(np.abs(forward) < _SLANTED, self.normals - forward * ahead, self.normals)
+        last = poses[-1, :2]
+        slant = np.sum(self.normals * self._moved_along(self.feet, last), axis=-1)
+        own = self._moved_along(pose[:, :2], last)
+        own /= np.maximum(np.square(own).sum(axis=-1, keepdims=True), 0.1)
+        slant = np.where(np.abs(slant) < _SLANTED, slant, 0.0)
+        said = self.normals - slant[..., None] * own[:, None]
         block = np.concatenate([said, found.error_D_pose[..., 2:]], axis=-1)
+        block *= (self.trust > 0.0)[..., None]  # a point on no line says nothing
         x = w.points[..., 0]
         variance = w.sigma_m[:, None] ** 2 + (s.slope_sigma * x) ** 2 + self.scatter_m**2
         spread = np.zeros(x.shape)
@@ -165,7 +219,8 @@ class _Lines:
             scatter=self.scatter_m,
         )
         root = np.linalg.cholesky(cov)
-        both = np.linalg.solve(root, np.concatenate([found.error[..., None], block], axis=-1))
+        error = np.where(self.trust > 0.0, found.error, 0.0)
+        both = np.linalg.solve(root, np.concatenate([error[..., None], block], axis=-1))
         return both[..., 0], both[..., 1:], weight
 
 
@@ -204,12 +259,20 @@ def refine(
         poses,
         float(extra[0]),
         float(extra[1]),
-        covs if covs is not None else np.zeros((len(poses), 3, 3)),
+        _with_bends(covs, lines.ahead) if covs is not None else np.zeros((len(poses), 3, 3)),
         weight,
         lines.feet,
         has_settled,
+        lines.ahead,
         _leave_first(window, lines, poses, extra, prior, s, covs),
     )
+
+
+def _with_bends(covs: Array, ahead: Array) -> Array:
+    """Return covariances (K, 3, 3) with what bends are off by along the road."""
+    found = covs.copy()
+    found[:, :2, :2] += _BEND_M**2 * np.outer(ahead, ahead)
+    return found
 
 
 def _system(

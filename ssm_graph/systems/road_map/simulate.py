@@ -177,3 +177,14 @@ def damaged(
             line = replace(line, points=line.points + rng.choice([-by_m, by_m]) * normal)
         lines.append(line)
     return replace(road_map, lines=tuple(lines))
+
+
+def mirrored(road_map: RoadMap) -> RoadMap:
+    """Return the map with north and south exchanged: traffic keeps to the other side."""
+    turn = np.array([1.0, -1.0])
+    lanes = {
+        name: replace(lane, left=lane.right * turn, right=lane.left * turn)
+        for name, lane in road_map.lanes.items()
+    }
+    lines = tuple(replace(line, points=line.points * turn) for line in road_map.lines)
+    return replace(road_map, lines=lines, lanes=lanes, projection=None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
@@ -17,7 +18,7 @@ from ssm_graph.study.ledger import ERROR, Key, Row
 from ssm_graph.systems.road_map.av2_log import MAP, POSES, av2_poses
 from ssm_graph.systems.road_map.camera import CameraModel
 from ssm_graph.systems.road_map.drive import Drive, Poses
-from ssm_graph.systems.road_map.hypotheses import apart, is_same_lane
+from ssm_graph.systems.road_map.hypotheses import apart, aside, is_same_lane
 from ssm_graph.systems.road_map.locate import locate
 from ssm_graph.systems.road_map.maps.index import LineIndex
 from ssm_graph.systems.road_map.maps.read import read_map
@@ -28,10 +29,13 @@ from ssm_graph.systems.road_map.simulate import (
     damaged,
     driven,
     indices_of,
+    mirrored,
     random_route,
     simulate_drive,
 )
 
+BESIDE_M: Final = 4.0
+"""Lines farther from a vehicle are not those of its lane."""
 LANE_M: Final = 1.75
 """Across: a vehicle nearer to where it is held to be is in that lane."""
 METHODS: Final = ("annealed", "patent", "patent-min-max", "patent-sum")
@@ -40,6 +44,9 @@ CASES: Final[Mapping[str, str]] = {
     "damaged": "5 % of the boundaries missing in the map, 2 % shifted by 0.5 m",
     "traffic": "30 % of the pictures occluded beyond 8 to 20 m, 3 % of the curves false",
     "motorway": "400 m at 25 m/s",
+    "short": "80 m at 8 m/s, for maps of one junction",
+    "left-hand": "as plain, the map seen in a mirror",
+    "no course": "as plain, by a receiver that gives no course",
 }
 FIRST_HELD_OUT: Final = 1000
 """Seeds from here on have chosen nothing; those below 100 have."""
@@ -51,16 +58,22 @@ def model_of(case: str) -> DriveModel:
         raise ConfigError(f"--case: expected one of {', '.join(CASES)}, got {case!r}")
     if case == "motorway":
         return DriveModel(length_m=400.0, speed=25.0)
+    if case == "short":
+        return DriveModel(length_m=80.0)
     if case == "traffic":
         return DriveModel(camera=CameraModel(p_occluded=0.3, p_false=0.03))
     return DriveModel()
 
 
 @lru_cache(maxsize=4)
-def _map_of(path: str) -> tuple[RoadMap, dict[LineKind, LineIndex], Poses | None]:
+def _map_of(
+    path: str, *, is_mirrored: bool = False
+) -> tuple[RoadMap, dict[LineKind, LineIndex], Poses | None]:
     folder = Path(path)
     is_log = folder.is_dir()
     road_map = read_map(folder / MAP if is_log else folder)
+    if is_mirrored:
+        road_map = mirrored(road_map)
     return road_map, indices_of(road_map), av2_poses(folder / POSES) if is_log else None
 
 
@@ -71,13 +84,17 @@ def drive_of(
 
     ``path`` is a map, or the folder of an Argoverse 2 log, whose way is then driven.
     """
-    true_map, indices, truth = _map_of(path)
+    true_map, indices, truth = _map_of(path, is_mirrored=case == "left-hand")
     model = model_of(case)
+    if truth is not None and case == "left-hand":
+        truth = Poses(truth.time_s, truth.x_y * [1.0, -1.0], -truth.yaw)
     if truth is None:
         rng = np.random.default_rng([seed, 0])
         truth = driven(random_route(true_map, model.length_m, rng), model, rng)
     name = f"{Path(path).name} {case} {seed}"
     drive = simulate_drive(name, truth, indices, model, np.random.default_rng([seed, 1]))
+    if case == "no course":
+        drive = replace(drive, gnss=replace(drive.gnss, yaw=None))
     if case != "damaged":
         return drive, true_map, indices, truth
     rng = np.random.default_rng([seed, 4])
@@ -130,13 +147,16 @@ def _annealed(
     first = np.nan
     if np.isfinite(found.first_fix_s):
         then = truth.at(np.array([found.first_fix_s + drive.chassis.time_s[0]]))[0]
-        first = apart(then, found.first_fix)[0]
+        first = aside(then, found.first_fix)
+    beside = aside_of_lines(last, indices) - aside_of_lines(found.pose, indices)[:, None]
+    in_lane = float(np.abs(beside).min()) if beside.size else np.nan
     rival = [h.share for h in found.hypotheses if not is_same_lane(h, found.pose)]
     return {
         "across_m": across,
         "along_m": along,
         "yaw_deg": float(np.degrees(turn)),
         "refined_across_m": across if found.refined is not None else np.nan,
+        "in_lane_m": in_lane if found.refined is not None else np.nan,
         "sigma_across_m": found.sigmas[0],
         "sigma_along_m": found.sigmas[1],
         "sigma_yaw_deg": float(np.degrees(found.sigmas[2])),
@@ -148,6 +168,26 @@ def _annealed(
         "rival": max(rival, default=0.0),
         "cpu_ms": found.cpu_ms,
     }
+
+
+def aside_of_lines(pose: Array, indices: Mapping[LineKind, LineIndex]) -> Array:
+    """Return how far a pose (3,) lies to the left of lines that run beside it, (n,) m.
+
+    Of lane lines where there are some, else of boundaries: what a vehicle keeps while it drives
+    along, however far along it is held to be.
+    """
+    found = {}
+    index = indices.get(LineKind.LANE_LINE, indices.get(LineKind.BOUNDARY))
+    assert index is not None
+    for point in index.tree.query_ball_point(pose[:2], BESIDE_M):
+        piece = int(index.owner[point])
+        off = pose[:2] - index.start[piece]
+        share = off @ index.step[piece] / np.square(index.step[piece]).sum()
+        normal = index.normal[piece]
+        turn = np.cos(pose[2]) * normal[1] - np.sin(pose[2]) * normal[0]
+        if 0.0 <= share <= 1.0 and abs(turn) > 0.9:
+            found[piece] = float(np.sign(turn) * (normal @ off))
+    return np.array(list(found.values()))
 
 
 HEADER: Final = (
@@ -162,6 +202,7 @@ HEADER: Final = (
     "first fix, s",
     "first fix, m",
     "across, m, median / 90 %",
+    "in the lane, m, median / 90 %",
     "along, m, median / 90 %",
     "within 2 sigma across, along, %",
     "yaw, deg, median",
@@ -207,6 +248,7 @@ def _cells(rows: Sequence[Row]) -> tuple[str, ...]:
         _quantiles(_column(good, "first_s"), (0.5,), 1),
         _quantiles(_column(good, "first_m"), (0.5,), 0),
         _quantiles(fine, (0.5, 0.9), 3),
+        _quantiles(_column(good, "in_lane_m")[is_right], (0.5, 0.9), 3),
         _quantiles(along[is_right], (0.5, 0.9), 2),
         ", ".join(within) or "–",
         _quantiles(np.abs(_column(good, "yaw_deg"))[is_right], (0.5,), 3),

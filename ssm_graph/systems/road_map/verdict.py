@@ -31,12 +31,10 @@ class Verdict(Enum):
 class VerdictSettings:
     """When the lane is held to be known."""
 
-    lateral_sigma_m: float = 0.5
-    """Of the particles; more is no lane."""
     least_driven_m: float = 12.0
     window_m: float = 45.0
     """Of the stretch that is laid on the map to find rivals."""
-    again_after_m: float = 10.0
+    again_after_m: float = 5.0
     """Between two looks at the rivals while the lane is not known ..."""
     watch_m: float = 80.0
     """... and once it is."""

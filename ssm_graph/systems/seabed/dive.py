@@ -28,6 +28,8 @@ CAUTION: Final = 5.0
 """The ranges that find a start are used again by the smoother: its prior is wider by so much."""
 _LEAST_M: Final = 3.0
 """No start on a map is handed on as better known."""
+_LEAST_MET: Final = 0.5
+"""Of the ranges; where fewer end on the map, that is said."""
 _FINDS_NORTH: Final = math.radians(10.0)
 """Gyros whose bias is below this share of the Earth's turn find a safe heading."""
 
@@ -132,7 +134,35 @@ def smooth_dive(
         on_iteration=on_iteration,
         on_stage=on_stage,
     )
-    return Dive(located, track, mission, estimate)
+    return Dive(located, track, mission, _told(mission, estimate))
+
+
+def _told(mission: Mission, estimate: Estimate) -> Estimate:
+    """Return an answer that says where the map of its mission said nothing."""
+    log = mission.aids[TerrainLog]
+    t = track_of(estimate, log, mission.frame)
+    x, y = np.moveaxis(t.x_y[:, None] + t.ends[..., :2], -1, 0)
+    heard = np.isfinite(x)
+    counts = log.grid.between(log.grid.inside(), x[heard], y[heard])
+    n_met, n = int(np.count_nonzero(counts > 0.0)), int(heard.sum())
+    if n_met >= _LEAST_MET * n:
+        return estimate
+    said = f"[map]: {n_met} of {n} ranges end on the map"
+    if n_met > 0:
+        said += "; beyond it the mission is as without one"
+        return replace(estimate, notes=(*estimate.notes, said))
+    west, east, south, north = log.grid.extent
+    off = np.maximum(np.maximum([west, south] - t.x_y, t.x_y - [east, north]), 0.0)
+    far_m = float(np.hypot(*off.T).min())
+    said += ", and the answer is as without one: "
+    said += (
+        f"the way keeps {far_m:.0f} m off it; is it the right map, its crs, and the start?"
+        if far_m > 0.0
+        else "its cells have no heights there"
+    )
+    if not estimate.status.is_good:
+        return replace(estimate, reason=f"{estimate.reason}; {said}")
+    return replace(estimate, status=Status.SUSPECT, reason=said)
 
 
 def _is_heading_known(mission: Mission) -> bool:

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.mission.mission import Mission
+from ssm_graph.report.places import box_around, draw_snapshots, write_share
 from ssm_graph.report.style import (
     DPI,
     ESTIMATE,
@@ -76,8 +77,7 @@ def _chart(axes: Axes, grid: SeabedGrid, low: Array, high: Array) -> None:
 
 
 def _window(places: list[Array], margin_m: float) -> tuple[Array, Array]:
-    low = np.min([p.min(axis=0) for p in places], axis=0) - margin_m
-    high = np.max([p.max(axis=0) for p in places], axis=0) + margin_m
+    low, high = box_around(places, margin_m)
     half = 0.5 * float((high - low).max())
     middle = 0.5 * (low + high)
     return middle - half, middle + half
@@ -86,12 +86,7 @@ def _window(places: list[Array], margin_m: float) -> tuple[Array, Array]:
 def _particles(axes: Axes, grid: SeabedGrid, found: Located, truth: Array | None) -> None:
     circle = found.middle + np.array([[-1.0, -1.0], [1.0, 1.0]]) * found.radius_m
     _chart(axes, grid, *_window([found.way, circle], 0.3 * _MARGIN_M))
-    picked = np.unique(np.linspace(0, len(found.snapshots) - 1, len(_COLOURS)).astype(int))
-    for colour, row in zip(_COLOURS, picked, strict=False):
-        when, states = found.snapshots[row]
-        label = f"particles, {when:.0f} s"
-        axes.plot(*states.T, ".", color=colour, markersize=1.6, zorder=2)
-        axes.plot([], [], ".", color=colour, markersize=8.0, label=label)
+    draw_snapshots(axes, found.snapshots, _COLOURS, digits=0)
     turn = np.linspace(0.0, 2.0 * np.pi, 100)
     x, y = found.middle[:, None] + found.radius_m * np.stack([np.cos(turn), np.sin(turn)])
     axes.plot(x, y, "--", color=INK, linewidth=0.8, label="searched", zorder=3)
@@ -108,24 +103,12 @@ def _places(axes: Axes, grid: SeabedGrid, found: Located, truth: Array | None) -
     for number, h in enumerate(told):
         colour = ESTIMATE if number == 0 else REDUCED
         axes.plot(*h.pose[:2], "o", color=colour, markersize=5.0 if number == 0 else 3.5, zorder=5)
-        axes.annotate(
-            _percent(h.share),
-            (h.pose[0], h.pose[1]),
-            fontsize=6.5,
-            color=INK,
-            xytext=(4, 3),
-            textcoords="offset points",
-            zorder=6,
-        )
+        write_share(axes, h.pose, h.share)
     axes.plot(*found.way.T, color=ESTIMATE, linewidth=1.4, label="way from the best place")
     if truth is not None:
         axes.plot(*truth.T, "--", color=REFERENCE, linewidth=1.0, label="truth")
     dress(axes, title="Places of the start, with evidence", x="east (m)", y="north (m)")
     legend(axes, loc="best")
-
-
-def _percent(share: float) -> str:
-    return f"{100.0 * share:.1f} %" if share >= 1e-3 else "< 0.1 %"
 
 
 def _profile(axes: Axes, log: TerrainLog, track: Track, found: Located) -> None:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.io.tables.files import write_table
+from ssm_graph.io.results.found_place import covariance_columns, write_found
 from ssm_graph.mission.mission import Mission
 from ssm_graph.sensors.seabed import SeabedGrid, TerrainLog
 from ssm_graph.systems.seabed.dive import Dive
@@ -48,40 +46,28 @@ def write_located(folder: Path, mission: Mission, dive: Dive) -> None:
     """Write an answer into a folder."""
     found = dive.located
     assert found is not None
-    folder.mkdir(parents=True, exist_ok=True)
     grid = mission.aids[TerrainLog].grid
-    result: dict[str, Any] = {
+    result = {
         "verdict": found.verdict.name,
         "reason": found.reason,
         **place_of(mission, found),
         "map_too_low_m": found.bias_m,
         "searched_radius_m": found.radius_m,
         "processor_s": found.cpu_s,
-        "hypotheses": [
-            {
-                "x_m": h.pose[0],
-                "y_m": h.pose[1],
-                **dict(
-                    zip(("lat_deg", "lon_deg"), _degrees(grid, np.array(h.pose[:2])), strict=True)
-                ),
-                "heading_error_deg": float(np.degrees(h.pose[2])),
-                "share": h.share,
-                "log_evidence": h.log_evidence,
-            }
-            for h in found.hypotheses[:20]
-        ],
     }
-    text = json.dumps(result, indent=2, allow_nan=False)
-    (folder / "result.json").write_text(text + "\n", encoding="utf-8")
+    rivals = []
+    for h in found.hypotheses:
+        lat, lon = _degrees(grid, np.array(h.pose[:2]))
+        place = {"x_m": h.pose[0], "y_m": h.pose[1], "lat_deg": lat, "lon_deg": lon}
+        turn = {"heading_error_deg": float(np.degrees(h.pose[2]))}
+        rivals.append({**place, **turn, **h.evidence})
     t = found.track
     columns = {
         "time_s": t.time_s,
         "x_m": t.x_y[:, 0],
         "y_m": t.x_y[:, 1],
-        "cov_xx": t.cov[:, 0, 0],
-        "cov_xy": t.cov[:, 0, 1],
-        "cov_yy": t.cov[:, 1, 1],
+        **covariance_columns(t.cov, ("x", "y")),
         "n_particles": t.n_particles,
     }
-    write_table(folder / "particles.csv", columns)
+    write_found(folder, result, rivals, "particles.csv", columns)
     seabed_figure(folder / "seabed.png", mission, dive)

@@ -12,6 +12,7 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.evaluation.consistency import rate_with_interval
 from ssm_graph.evaluation.errors import evaluate
 from ssm_graph.mission.problem import ProblemConfig
+from ssm_graph.sensors.seabed import MapErrors
 from ssm_graph.simulation import Grade, SimulationConfig
 from ssm_graph.smoothers.mission import smooth
 from ssm_graph.smoothers.settings import SmootherConfig
@@ -25,15 +26,28 @@ from ssm_graph.systems.seabed.simulate import (
     mission_with_map,
     simulate_dive,
 )
-from ssm_graph.systems.seabed.terrain import FLAT, ROUGH, TerrainSettings
+from ssm_graph.systems.seabed.terrain import FLAT, ROUGH, SurveySettings, TerrainSettings
 
 TERRAINS: Final[Mapping[str, TerrainSettings]] = {
     "rough": ROUGH,
     "gentle": replace(ROUGH, relief_m=2.0),
+    "fractal": replace(ROUGH, relief_m=4.0, corner_m=1500.0, hurst=0.6),
+    "ripples": replace(ROUGH, relief_m=1.5, corner_m=120.0, hurst=1.0),
+    "hillside": replace(ROUGH, relief_m=4.0, corner_m=800.0, slope=(0.12, -0.08)),
+    "poor map": ROUGH,
     "flat": FLAT,
     "slope": replace(FLAT, slope=(0.03, -0.04)),
 }
-"""By name: 6 m and 2 m of relief, flat ground, and a plane of 5 percent."""
+"""By name: 6 m and 2 m of relief; long and short waves with another spectrum; a slope of 14 percent
+with hills on it; the rough ground again, of which there is a poor map; flat ground, and a plane of
+5 percent."""
+_POOR: Final = SurveySettings(
+    cell_m=25.0,
+    errors=MapErrors(sigma_m=0.5, smooth_sigma_m=0.8, smooth_m=300.0, bias_sigma_m=2.0),
+    tide_m=2.0,
+)
+SURVEYS: Final[Mapping[str, SurveySettings]] = {"poor map": _POOR}
+"""Of those seabeds whose map is not the usual one: cells of 25 m, a tide of 2 m."""
 FIRST_HELD_OUT: Final = 1000
 """Settings were chosen on seeds below 100 only."""
 IMU_HZ: Final = 50.0
@@ -48,7 +62,8 @@ SMOOTHED: Final = 5
 def dive_of(terrain: str, grade: str, seed: int, duration_s: float = 600.0) -> SimulatedDive:
     """Return a dive of the study; the same key gives the same one."""
     mission = _mission(grade, seed, duration_s, PING_S)
-    return simulate_dive(DiveSettings(mission=mission, terrain=TERRAINS[terrain]))
+    survey = SURVEYS.get(terrain, SurveySettings())
+    return simulate_dive(DiveSettings(mission=mission, terrain=TERRAINS[terrain], survey=survey))
 
 
 def _mission(grade: str, seed: int, duration_s: float, ping_s: float) -> SimulationConfig:
@@ -148,7 +163,7 @@ def _truth(dive: SimulatedDive, time_s: Array) -> Array:
     return np.asarray(dive.map.frame.p_n_from_geodetic(lat, lon, height)[:, :2])
 
 
-def keys_of(n_rough: int) -> list[Key]:
+def keys_of(n_rough: int, first_seed: int = FIRST_HELD_OUT) -> list[Key]:
     """Return the keys of so many dives over rough ground, and of a tenth each over the others.
 
     Grades take turns, and a study that is cut short has some of all.
@@ -156,10 +171,10 @@ def keys_of(n_rough: int) -> list[Key]:
     grades = [grade.name for grade in Grade]
     keys: list[Key] = []
     for number in range(n_rough):
-        seed, grade = FIRST_HELD_OUT + number, grades[number % len(grades)]
+        seed, grade = first_seed + number, grades[number % len(grades)]
         keys.append(("rough", grade, seed))
         if number % 10 == 0:
-            others = ("flat", "gentle", "slope")
+            others = (name for name in TERRAINS if name != "rough")
             keys += [(name, grades[number // 10 % len(grades)], seed) for name in others]
     return keys
 

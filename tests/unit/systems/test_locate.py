@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -13,15 +14,16 @@ import pytest
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.cli.main import main
+from ssm_graph.filters.rules.hypotheses import Hypothesis
 from ssm_graph.systems.road_map.drive import Chassis, Curves, Drive, GnssFixes, dead_reckoned
 from ssm_graph.systems.road_map.folder import read_drive, write_drive
 from ssm_graph.systems.road_map.follow import follow
-from ssm_graph.systems.road_map.hypotheses import apart
-from ssm_graph.systems.road_map.locate import Located, locate, sigmas_of
+from ssm_graph.systems.road_map.hypotheses import apart, is_same_lane, known_along
+from ssm_graph.systems.road_map.locate import Located, locate
 from ssm_graph.systems.road_map.maps.road_map import Lane, LineKind, Mark, RoadLine, RoadMap
-from ssm_graph.systems.road_map.motion import motion_errors
+from ssm_graph.systems.road_map.motion import first_course, motion_errors
 from ssm_graph.systems.road_map.patent import Normalisation, PatentSettings, locate_by_patent
-from ssm_graph.systems.road_map.refinement import Prior
+from ssm_graph.systems.road_map.refinement import Prior, sigmas_of
 from ssm_graph.systems.road_map.simulate import (
     DriveModel,
     damaged,
@@ -98,14 +100,66 @@ def test_bends_tell_the_lane_and_the_place() -> None:
     assert found.track.n_particles[-1] < found.track.n_particles[0]
 
 
-def test_a_straight_road_is_unresolved_along() -> None:
+def arc() -> Array:
+    """Return the middle of a road of 200 m radius, 500 m."""
+    turn = np.arange(0.0, 500.0) / 200.0
+    return 200.0 * np.column_stack([np.sin(turn), 1.0 - np.cos(turn)])
+
+
+@pytest.mark.parametrize("shape", [straight, arc])
+def test_a_road_that_looks_alike_is_unresolved_along(shape: Callable[[], Array]) -> None:
     """The lane is right, and the sigma along is not below what is not known."""
-    drive, road_map = drive_on(straight(), road(straight()))
+    drive, road_map = drive_on(shape(), road(shape()))
     found = locate(drive, road_map)
     across, along, _ = error(drive, found)
     assert found.verdict is Verdict.UNRESOLVED_ALONG
     assert abs(across) < 0.2
     assert abs(along) < 3.0 * found.sigmas[1]
+
+
+def test_places_along_a_bend_are_one_lane() -> None:
+    """Chords of an arc lead across; a place in the next lane is another one all the same."""
+    here = Hypothesis((0.0, 0.0, 0.0), 0.0)
+    turn = 0.25
+    ahead, left = np.sin(turn), 1.0 - np.cos(turn)
+    assert is_same_lane(here, np.array([150.0 * ahead, 150.0 * left, turn]))
+    inside = np.array([146.5 * ahead, 3.5 + 146.5 * left, turn])
+    assert not is_same_lane(here, inside)
+    rivals = [here, Hypothesis((20.0, 0.0, 0.0), 0.0), Hypothesis((0.0, 3.5, 0.0), -8.0)]
+    known = known_along(rivals, np.array([19.0, 0.0, 0.0]), 4.0)
+    assert known[0].pose == (20.0, 0.0, 0.0)
+    assert known[0].share > 0.95
+    assert sum(h.share for h in known) == pytest.approx(1.0)
+
+
+def test_a_kerb_that_the_map_lacks_is_no_failure() -> None:
+    """Half of the curves lie on no line, the others on theirs."""
+    drive, road_map, _ = on_the_bend()
+    found = locate(drive, replace(road_map, lines=road_map.lines[1:]))
+    assert found.verdict.has_lane
+    assert abs(error(drive, found)[0]) < 0.2
+
+
+def test_the_way_tells_a_course_that_the_receiver_does_not() -> None:
+    """Within three of its sigmas, from the fix on by which it is known."""
+    drive, _, _ = on_the_bend()
+    assert drive.truth is not None
+    begin = first_course(replace(drive, gnss=replace(drive.gnss, yaw=None)))
+    assert begin.fix > 0
+    assert begin.yaw is not None
+    truth = drive.truth.at(drive.gnss.time_s[[begin.fix]])[0]
+    assert abs(np.angle(np.exp(1j * (begin.yaw - truth[2])))) < 3.0 * begin.sigma
+    standing = replace(drive.chassis, speed=np.zeros_like(drive.chassis.speed))
+    still = replace(drive, chassis=standing, gnss=replace(drive.gnss, yaw=None))
+    assert first_course(still).yaw is None
+
+
+def test_a_fix_far_from_every_road_is_named() -> None:
+    """With how far, and what to try."""
+    drive, road_map, _ = on_the_bend()
+    far = replace(drive, gnss=replace(drive.gnss, x_y=drive.gnss.x_y + np.array([0.0, 95.0])))
+    with pytest.raises(DataError, match=r"is \d+ m from every boundary and lane line"):
+        locate(far, road_map)
 
 
 @pytest.mark.slow
@@ -153,8 +207,7 @@ def test_map_errors_are_survived() -> None:
     assert abs(error(drive, found)[0]) < 0.6
 
 
-@pytest.mark.slow
-def test_without_a_course_all_are_searched() -> None:
+def test_without_a_course_the_way_tells_it() -> None:
     """A receiver that gives no course: found all the same, not backwards."""
     drive, road_map, _ = on_the_bend()
     g = drive.gnss
@@ -263,8 +316,31 @@ def test_bad_times_are_named() -> None:
         replace(drive, chassis=gap)
     k = drive.curves
     late = Curves(k.time_s + 1e4, k.kind, k.side, k.cubic, k.reach, k.sigma_m, k.mark)
-    with pytest.raises(DataError, match="are the clocks the same"):
+    with pytest.raises(DataError, match="curves: none within the times"):
         locate(replace(drive, curves=late), road_map)
+    some = replace(k, time_s=k.time_s + 3.0)
+    with pytest.raises(DataError, match="% of them are not within the times"):
+        locate(replace(drive, curves=some), road_map)
+    fixes = replace(drive.gnss, time_s=drive.gnss.time_s + 1e3)
+    with pytest.raises(DataError, match="gnss: no fix within the times"):
+        locate(replace(drive, gnss=fixes), road_map)
+
+
+@pytest.mark.parametrize(
+    ("log", "change", "message"),
+    [
+        ("chassis", {"speed": 3.6}, "its way spreads over"),
+        ("curves", {"side": -1.0}, "lie on the other side than they say"),
+        ("gnss", {"yaw": -1.0}, "the heading is [-+][0-9]+ deg off"),
+    ],
+)
+def test_other_units_and_sides_are_named(log: str, change: dict[str, float], message: str) -> None:
+    """km/h, curves whose sides are exchanged, courses that count from east."""
+    drive, road_map, _ = on_the_bend()
+    (name, factor), own = next(iter(change.items())), getattr(drive, log)
+    values = getattr(own, name) * factor + (2.0 if name == "yaw" else 0.0)
+    with pytest.raises(DataError, match=message):
+        locate(replace(drive, **{log: replace(own, **{name: values})}), road_map)
 
 
 def test_motion_errors_are_found() -> None:

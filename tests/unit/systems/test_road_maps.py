@@ -121,6 +121,27 @@ def test_a_map_says_how_far_off_a_fix_is() -> None:
         RoadMap("empty", (), {})
 
 
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("m.xodr", '<OpenDRIVE><road id="7" length="9"><lanes><laneSection s="0"/></lanes></road>'
+         "</OpenDRIVE>", "road 7 without a geometry"),
+        ("m.xodr", "<OpenDRIVE><road", "expected OpenDRIVE, got ParseError"),
+        ("m.osm", '<osm><node id="1"/></osm>', "expected nodes with lat and lon"),
+        ("m.osm", '<osm><node id="1" lat="120" lon="49"/></osm>', "longitude exchanged"),
+        ("m.osm", "<osm/>", "expected an OSM file with nodes"),
+        ("m.xml", "<commonRoad/>", "expected lanelets"),
+        ("m.json", "[1, 2]", "expected a map of Argoverse 2"),
+        ("m.geojson", "{}", "expected a collection of GeoJSON lines"),
+    ],
+)  # fmt: skip
+def test_what_no_map_is(name: str, text: str, message: str, tmp_path: Path) -> None:
+    """Each is refused with the file and what was expected of it."""
+    (tmp_path / name).write_text(text)
+    with pytest.raises(DataError, match=rf"{name}.*{message}"):
+        read_map(tmp_path / name)
+
+
 def test_unknown_format_is_refused() -> None:
     """By the end of the name."""
     with pytest.raises(ConfigError, match=r"\.osm, \.xml"):

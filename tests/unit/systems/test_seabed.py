@@ -16,7 +16,9 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.cli.main import ExitCode, main
 from ssm_graph.filters.rules.hypotheses import apart_from_each_other, told
 from ssm_graph.io.mission_folder.folder import read_mission, write_mission
+from ssm_graph.mission.estimate import Estimate, Status
 from ssm_graph.mission.mission import LocalStart
+from ssm_graph.mission.problem import ProblemConfig
 from ssm_graph.sensors.seabed import MapErrors, SeabedGrid, TerrainLog
 from ssm_graph.simulation import Grade
 from ssm_graph.smoothers.settings import SmootherConfig
@@ -245,6 +247,31 @@ def test_map_in_a_folder(tmp_path: Path) -> None:
         toml.write_text(text.replace(old, new))
         with pytest.raises(ConfigError, match=said.replace("[", r"\[")):
             read_mission(tmp_path)
+
+
+def test_a_map_that_says_nothing_is_told() -> None:
+    """A known start: a map of elsewhere makes the answer suspect, half a map is a note."""
+    mission = replace(DIVE, grade=Grade.MEMS, imu_rate_hz=20.0, duration_s=40.0)
+    mission = replace(mission, dvl=replace(mission.dvl, rate_hz=0.25))
+    terrain = replace(ROUGH, side_m=600.0)
+    dive = simulate_dive(DiveSettings(mission=mission, terrain=terrain, start_m=0.0))
+    known = mission_with_map(dive)
+    log = known.aids[TerrainLog]
+    graph, loop = ProblemConfig(keyframe_interval_s=4.0), SmootherConfig(fault_search=None)
+
+    def answer(east_m: float) -> Estimate:
+        moved = replace(log, grid=replace(log.grid, x0_m=log.grid.x0_m + east_m))
+        one = replace(known, aids=known.aids.having(moved))
+        found = smooth_dive(one, loop, problem_config=graph).estimate
+        assert found is not None
+        return found
+
+    assert not any("[map]" in note for note in answer(0.0).notes)
+    off = answer(5000.0)
+    assert off.status is Status.SUSPECT
+    assert "[map]: 0 of 40 ranges end on the map" in off.reason
+    assert "is it the right map" in off.reason
+    assert any("ranges end on the map; beyond it" in note for note in answer(300.0).notes)
 
 
 def test_ranges_are_needed() -> None:

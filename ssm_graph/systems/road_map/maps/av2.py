@@ -18,7 +18,9 @@ from ssm_graph.systems.road_map.maps.road_map import (
     Mark,
     RoadLine,
     RoadMap,
+    boxes_of,
     resampled,
+    touching,
     unique_lines,
     with_sides,
     without_repeats,
@@ -76,16 +78,17 @@ def _marks(segment: Mapping[str, Any]) -> list[RoadLine]:
 
 
 def _edges(areas: Sequence[Array]) -> list[RoadLine]:
-    lines = []
+    lines, boxes = [], boxes_of(areas)
     for number, area in enumerate(areas):
         ring = resampled(np.concatenate([area, area[:1]]), _STEP_M)
         d = np.diff(ring, axis=0)
         normal = np.column_stack([-d[:, 1], d[:, 0]]) / np.hypot(*d.T)[:, None]
         middle = 0.5 * (ring[1:] + ring[:-1])
         is_covered = np.zeros(len(middle), dtype=bool)
-        for other in (areas[i] for i in range(len(areas)) if i != number):
-            for side in (-_OUTSIDE_M, _OUTSIDE_M):
-                is_covered |= is_inside(middle + side * normal, other)
+        box = boxes[number]
+        for other in touching(boxes, box[:2] - _OUTSIDE_M, box[2:] + _OUTSIDE_M):
+            for side in (-_OUTSIDE_M, _OUTSIDE_M) if other != number else ():
+                is_covered |= is_inside(middle + side * normal, areas[other])
         bounds = np.flatnonzero(np.diff(np.concatenate([[True], is_covered, [True]]).astype(int)))
         for first, last in zip(bounds[::2], bounds[1::2], strict=True):
             points = ring[first : last + 1]
@@ -95,10 +98,13 @@ def _edges(areas: Sequence[Array]) -> list[RoadLine]:
 
 def is_inside(points: Array, polygon: Array) -> NDArray[np.bool_]:
     """Return which points (N, 2) lie in a polygon (M, 2), by the even-odd rule."""
-    x, y = points[:, None, 0], points[:, None, 1]
+    low, high = polygon.min(axis=0), polygon.max(axis=0)
+    found: NDArray[np.bool_] = np.all((points >= low) & (points <= high), axis=1)
+    x, y = points[found, None, 0], points[found, None, 1]
     x0, y0 = polygon.T
     x1, y1 = np.roll(polygon, -1, axis=0).T
     crosses = (y0 > y) != (y1 > y)
     with np.errstate(divide="ignore", invalid="ignore"):
         is_left = x < x0 + (y - y0) / (y1 - y0) * (x1 - x0)
-    return np.asarray(np.count_nonzero(crosses & is_left, axis=1) % 2 == 1)
+    found[found] = np.count_nonzero(crosses & is_left, axis=1) % 2 == 1
+    return found

@@ -19,7 +19,8 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.systems.road_map.maps.road_map import RoadLine
 
 CELL_M: Final = 0.5
-TILE: Final = 64
+_BITS: Final = 6
+TILE: Final = 1 << _BITS
 """Cells along a tile."""
 SPACING_M: Final = 0.5
 """Between points of the lines from which the raster is made."""
@@ -55,63 +56,79 @@ class LineIndex:
         """(S + 1,) number of the line."""
         self.mark = np.array([*(int(line.mark) for line in lines), 0])[self.line_of]
         """(S + 1,) how the piece is painted."""
-        self._per_length_sq = 1.0 / np.maximum(np.einsum("ij,ij->i", self.step, self.step), 1e-12)
+        length_sq = np.maximum(np.einsum("ij,ij->i", self.step, self.step), 1e-12)
+        self.normal = (
+            np.column_stack([-self.step[:, 1], self.step[:, 0]]) / np.sqrt(length_sq)[:, None]
+        )
+        """(S + 1, 2) unit vector to the left of the piece."""
+        self._piece = np.column_stack([self.start, self.step, self.step / length_sq[:, None]])
         self._make_tree()
         low, high = self.start[:-1].min(axis=0), self.start[:-1].max(axis=0)
         self._low = low - reach_m - 2.0 * CELL_M * TILE
         n = np.ceil((high + reach_m + 2.0 * CELL_M * TILE - self._low) / (CELL_M * TILE))
-        self._slots = np.full(n.astype(int) + 1, -1, dtype=np.int32)
-        self._raster = np.full((8, TILE * TILE), len(self.start) - 1, dtype=np.int32)
+        self._slots = np.full(n.astype(int) + 1, -1, dtype=np.int64)
+        self._raster = np.full((8, TILE * TILE), len(self.start) - 1, dtype=np.int64)
         self._n_tiles = 1  # the first stays empty: beyond the map
         self._slots[[0, -1], :] = 0
         self._slots[:, [0, -1]] = 0
 
     def _make_tree(self) -> None:
-        points, owner = [], []
-        for segment, (start, step) in enumerate(zip(self.start[:-1], self.step[:-1], strict=True)):
-            n = max(1, int(np.ceil(np.hypot(*step) / SPACING_M)))
-            share = (np.arange(n) + 0.5) / n
-            points.append(start + share[:, None] * step)
-            owner.append(np.full(n, segment))
-        self.points = np.concatenate([*points, np.empty((0, 2))])
-        """(P, 2) m, points all along the lines."""
-        self.owner = np.concatenate([*owner, np.empty(0, dtype=int)]).astype(np.int64)
+        step = self.step[:-1]
+        n = np.maximum(1, np.ceil(np.hypot(*step.T) / SPACING_M).astype(np.int64))
+        self.owner = np.repeat(np.arange(len(n)), n)
         """(P,) the piece of each point."""
+        number = np.arange(len(self.owner)) - np.repeat(np.cumsum(n) - n, n)
+        share = (number + 0.5) / n[self.owner]
+        self.points = self.start[self.owner] + share[:, None] * step[self.owner]
+        """(P, 2) m, points all along the lines."""
         self.tree = cKDTree(self.points)
 
     def nearest(self, x: Array, y: Array) -> tuple[Array, NDArray[np.int64]]:
         """Return distance, m, and piece of the nearest line to points (...)."""
         segment = self.segment_at(x, y)
-        start, step = self.start[segment], self.step[segment]
-        dx, dy = x - start[..., 0], y - start[..., 1]
-        sx, sy = step[..., 0], step[..., 1]
-        share = np.clip((dx * sx + dy * sy) * self._per_length_sq[segment], 0.0, 1.0)
-        dx -= share * sx
-        dy -= share * sy
+        dx, dy = self._off(x, y, segment)
         return np.sqrt(dx * dx + dy * dy), segment
 
     def foot(self, x_y: Array) -> Foot:
         """Return the nearest places on lines to points (..., 2), m."""
-        distance, segment = self.nearest(x_y[..., 0], x_y[..., 1])
-        start, step = self.start[segment], self.step[segment]
-        along = np.einsum("...i,...i->...", x_y - start, step) * self._per_length_sq[segment]
-        foot = start + np.clip(along, 0.0, 1.0)[..., None] * step
+        segment = self.segment_at(x_y[..., 0], x_y[..., 1])
+        dx, dy = self._off(x_y[..., 0], x_y[..., 1], segment)
         is_none = segment == len(self.start) - 1
-        return Foot(np.where(is_none, np.inf, distance), segment, foot)
+        distance = np.where(is_none, np.inf, np.sqrt(dx * dx + dy * dy))
+        return Foot(distance, segment, x_y - np.stack([dx, dy], axis=-1))
+
+    def _off(self, x: Array, y: Array, segment: NDArray[np.int64]) -> tuple[Array, Array]:
+        """Return from their feet on pieces to points (...), m along x and y."""
+        piece = self._piece.take(segment, axis=0)
+        sx, sy = piece[..., 2], piece[..., 3]
+        dx, dy = x - piece[..., 0], y - piece[..., 1]
+        share = dx * piece[..., 4]
+        share += dy * piece[..., 5]
+        share = np.minimum(np.maximum(share, 0.0), 1.0)
+        dx -= share * sx
+        dy -= share * sy
+        return dx, dy
 
     def segment_at(self, x: Array, y: Array) -> NDArray[np.int64]:
         """Return the piece of the nearest line to points (...)."""
-        i = np.floor((x - self._low[0]) * (1.0 / CELL_M)).astype(np.int64)
-        j = np.floor((y - self._low[1]) * (1.0 / CELL_M)).astype(np.int64)
-        ti = np.clip(i // TILE, 0, self._slots.shape[0] - 1)
-        tj = np.clip(j // TILE, 0, self._slots.shape[1] - 1)
-        slot = self._slots[ti, tj]
-        if slot.min() < 0:
-            missing = np.unique(np.stack([ti[slot < 0], tj[slot < 0]], axis=-1), axis=0)
-            for row, column in missing:
-                self._make_tile(int(row), int(column))
-            slot = self._slots[ti, tj]
-        return np.asarray(self._raster[slot, (i % TILE) * TILE + j % TILE], dtype=np.int64)
+        n_rows, n_columns = self._slots.shape
+        i = self._cell(x, self._low[0], n_rows)
+        j = self._cell(y, self._low[1], n_columns)
+        tile = (i >> _BITS) * n_columns + (j >> _BITS)
+        slot = self._slots.ravel().take(tile)
+        if slot.min(initial=0) < 0:
+            for number in np.unique(tile[slot < 0]):
+                self._make_tile(*divmod(int(number), n_columns))
+            slot = self._slots.ravel().take(tile)
+        inside = ((i & (TILE - 1)) << _BITS) + (j & (TILE - 1))
+        found: NDArray[np.int64] = self._raster.ravel().take((slot << (2 * _BITS)) + inside)
+        return found
+
+    @staticmethod
+    def _cell(x: Array, low: float, n_tiles: int) -> NDArray[np.int64]:
+        """Return the cells of coordinates (...), those beyond the raster in its outermost ones."""
+        at = np.fmax((x - low) * (1.0 / CELL_M), 0.0)  # NaN as well
+        return np.asarray(np.minimum(at, n_tiles * TILE - 1.0), dtype=np.int64)
 
     def _make_tile(self, ti: int, tj: int) -> None:
         cells = (np.arange(TILE) + 0.5) * CELL_M

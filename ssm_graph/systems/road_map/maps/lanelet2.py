@@ -51,7 +51,7 @@ def read_lanelet2(path: Path) -> RoadMap:
     if not file.nodes:
         raise DataError(f"{path}: expected an OSM file with nodes, got none")
     notes: list[str] = []
-    projection, x_y = _plane(file)
+    projection, x_y = _plane(path, file)
     points = {name: x_y[row] for name, row in file.nodes.items()}
     lines, n_lost = _lines(file, points)
     if n_lost:
@@ -104,15 +104,19 @@ def _tags(element: ElementTree.Element) -> dict[str, str]:
     return {tag.attrib["k"]: tag.attrib["v"] for tag in element.iterfind("tag")}
 
 
-def _plane(file: _File) -> tuple[TransverseMercator | None, Array]:
+def _plane(path: Path, file: _File) -> tuple[TransverseMercator | None, Array]:
     if len(file.local) == len(file.nodes):
         return None, np.array(file.local)
     lat, lon = np.radians(np.array(file.lat_lon)).T
+    if not (np.isfinite(lat).any() and np.isfinite(lon).any()):
+        raise DataError(
+            f"{path}: expected nodes with lat and lon, or all with local_x and local_y, got none"
+        )
     middle = [0.5 * (float(np.nanmin(a)) + float(np.nanmax(a))) for a in (lat, lon)]
     if abs(middle[0]) > 0.5 * math.pi:
         raise DataError(
-            f"the latitude of the map's middle is {math.degrees(middle[0]):.3f} deg: latitude and "
-            "longitude exchanged?"
+            f"{path}: the latitude of the map's middle is {math.degrees(middle[0]):.3f} deg: "
+            "latitude and longitude exchanged?"
         )
     projection = TransverseMercator(middle[0], middle[1])
     return projection, projection.forward(lat, lon)

@@ -43,9 +43,10 @@ def read_opendrive(path: Path, step_m: float = STEP_M) -> RoadMap:
         lanes: dict[str, Lane] = {}
         for road in root.iterfind("road"):
             _add_road(road, step_m, lines, lanes)
+        joined = _joined(lanes)
     except (ElementTree.ParseError, KeyError, ValueError) as error:
         raise DataError(f"{path}: expected OpenDRIVE, got {error!r}") from error
-    return RoadMap(path.name, tuple(lines), _joined(lanes))
+    return RoadMap(path.name, tuple(lines), joined)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +75,8 @@ class _Cubic:
 def reference_line(road: ElementTree.Element, s: Array) -> Array:
     """Return x, y [m] and heading [rad] (N, 3) of a road's reference line at lengths (N,), m."""
     pieces = list(road.iterfind("planView/geometry"))
+    if not pieces:
+        raise ValueError(f"road {road.get('id', '')} without a geometry in its planView")
     begin = np.array([float(piece.attrib["s"]) for piece in pieces])
     which = np.clip(np.searchsorted(begin, s, side="right") - 1, 0, len(begin) - 1)
     found = np.empty((len(s), 3))

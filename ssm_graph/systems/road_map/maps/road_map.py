@@ -63,6 +63,7 @@ class Lane(FrozenArrays):
         return 0.5 * (_at_share(self.left, share) + _at_share(self.right, share))
 
 
+_SIDES: Final = ("left", "right")
 FAR_M: Final = 2000.0
 """A fix so far off the map is one of another map."""
 
@@ -80,6 +81,10 @@ class RoadMap:
     """What was mended on the way."""
     bounds: tuple[float, float, float, float] = field(init=False)
     """Least x, least y, largest x, largest y of the lines, m."""
+    _line_boxes: Array = field(init=False, repr=False)
+    """(L, 4) the same of each line ..."""
+    _lane_boxes: Array = field(init=False, repr=False)
+    """... and of both bounds of each lane."""
 
     def __post_init__(self) -> None:
         if not self.lines:
@@ -87,11 +92,15 @@ class RoadMap:
                 f"{self.name}: expected road boundaries or lane lines, got none; is it a map of "
                 "roads with their edges, in one of the formats that are read?"
             )
-        low = np.min([line.points.min(axis=0) for line in self.lines], axis=0)
-        high = np.max([line.points.max(axis=0) for line in self.lines], axis=0)
-        if not np.all(np.isfinite([*low, *high])):
+        boxes = boxes_of([line.points for line in self.lines])
+        if not np.all(np.isfinite(boxes)):
             raise DataError(f"{self.name}: expected finite coordinates, got NaN or infinity")
+        low, high = boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)
         object.__setattr__(self, "bounds", (*map(float, low), *map(float, high)))
+        object.__setattr__(self, "_line_boxes", boxes)
+        left, right = (boxes_of([getattr(x, side) for x in self.lanes.values()]) for side in _SIDES)
+        both = np.minimum(left[:, :2], right[:, :2]), np.maximum(left[:, 2:], right[:, 2:])
+        object.__setattr__(self, "_lane_boxes", np.column_stack(both))
 
     def of_kind(self, kind: LineKind) -> tuple[RoadLine, ...]:
         """Return the lines of one kind."""
@@ -104,14 +113,11 @@ class RoadMap:
         """
         points = np.reshape(x_y, (-1, 2))
         low, high = points.min(axis=0) - reach_m, points.max(axis=0) + reach_m
-        lines = tuple(line for line in self.lines if _touches(line.points, low, high))
+        lines = tuple(self.lines[i] for i in touching(self._line_boxes, low, high))
         if not lines:
             raise DataError(f"{self.name}: {self._off(points.mean(axis=0), reach_m)}")
-        lanes = {
-            name: lane
-            for name, lane in self.lanes.items()
-            if _touches(lane.left, low, high) or _touches(lane.right, low, high)
-        }
+        every = list(self.lanes.items())
+        lanes = dict(every[i] for i in touching(self._lane_boxes, low, high))
         return replace(self, lines=lines, lanes=lanes)
 
     def _off(self, x_y: Array, reach_m: float) -> str:
@@ -127,6 +133,22 @@ class RoadMap:
         if off < FAR_M:
             return text + ": take the map of that place"
         return text + ": latitude and longitude exchanged, or another projection?"
+
+
+def boxes_of(lines: Sequence[Array]) -> Array:
+    """Return least x, least y, largest x, largest y of lines (N, 2): (L, 4), m."""
+    if not lines:
+        return np.empty((0, 4))
+    first = np.cumsum([0, *map(len, lines[:-1])])
+    points = np.concatenate(lines)
+    low, high = (f.reduceat(points, first) for f in (np.minimum, np.maximum))
+    return np.column_stack([low, high])
+
+
+def touching(boxes: Array, low: Array, high: Array) -> list[int]:
+    """Return which boxes (L, 4) have something in common with the one from low to high."""
+    is_near = np.all(boxes[:, 2:] >= low, axis=1) & np.all(boxes[:, :2] <= high, axis=1)
+    return np.flatnonzero(is_near).tolist()
 
 
 def line_length(points: Array) -> float:
@@ -165,7 +187,7 @@ def with_sides(
 def signed_area(polygon: Array) -> float:
     """Return the area of a polygon (N, 2), m^2, positive where it runs anticlockwise."""
     x, y = polygon[:, 0] - polygon[0, 0], polygon[:, 1] - polygon[0, 1]
-    return float(0.5 * (x @ np.roll(y, -1) - y @ np.roll(x, -1)))
+    return float(0.5 * (x[:-1] @ y[1:] - x[1:] @ y[:-1]))  # the last corner leads to zero
 
 
 def without_repeats(points: Array) -> Array:
@@ -185,10 +207,6 @@ def unique_lines(lines: Sequence[RoadLine]) -> tuple[RoadLine, ...]:
         if key not in found or found[key].mark is Mark.UNKNOWN:
             found[key] = line
     return tuple(found.values())
-
-
-def _touches(points: Array, low: Array, high: Array) -> bool:
-    return bool(np.all(points.max(axis=0) >= low) and np.all(points.min(axis=0) <= high))
 
 
 def _at_share(points: Array, share: Array) -> Array:
