@@ -30,6 +30,8 @@ LATE_S: Final = 2.0
 """What comes later than this after the end of a block is not used by the witness."""
 MARGIN_S: Final = 1.0
 """Of inertial data before and after a block, for means about its pings."""
+_DONE_S: Final = LATEST_END_S + LATE_S + MARGIN_S
+"""After the end of a block that was waited for, all of it has come."""
 ANSWER_EVERY_S: Final = 0.5
 """Answers are kept so often, to be compared at the end of a block."""
 LONGEST_GAP_S: Final = 0.5
@@ -106,6 +108,7 @@ class Witnessed:
 
     def _begin_anew(self) -> None:
         self._walks: tuple[VelocityWalk, PlaceWalk] | None = None
+        self._idle_until_s = -np.inf
         self._work: Steps[Witness] | None = None
         self._said: Said | None = None
         self._alarmed: dict[str, tuple[float, float]] = {}
@@ -163,7 +166,9 @@ class Witnessed:
         return self.estimator.checkpoint()
 
     def _step(self, now_s: float) -> None:
-        if self._is_answer_due(now_s):
+        if self._work is None and now_s < self._idle_until_s:
+            return
+        if self._walks is None or now_s >= self._answer_due_s:
             answer = self.estimator.newest()
             if answer is None:
                 return
@@ -180,15 +185,15 @@ class Witnessed:
             except StopIteration as end:
                 self._work = None
                 self._judge(end.value)
+        if self._walks is not None:
+            self._idle_until_s = min(self._answer_due_s, self._end_s + _DONE_S)
 
-    def _is_answer_due(self, now_s: float) -> bool:
-        """Return whether an answer is to be kept: where the set begins, and about a block's end."""
-        if self._walks is None:
-            return True
-        to_go_s = self._end_s - now_s
+    @property
+    def _answer_due_s(self) -> float:
+        """When an answer is to be kept next, for the end of a block; infinite where none is."""
         last_s = self._answers[-1][0] if self._answers else -np.inf
-        is_near = -LATEST_END_S - ANSWER_EVERY_S < to_go_s < 2.0 * ANSWER_EVERY_S
-        return is_near and now_s - last_s >= ANSWER_EVERY_S
+        due_s = max(last_s + ANSWER_EVERY_S, self._end_s - 2.0 * ANSWER_EVERY_S)
+        return due_s if due_s < self._end_s + LATEST_END_S + ANSWER_EVERY_S else np.inf
 
     @property
     def _end_s(self) -> float:
@@ -211,7 +216,7 @@ class Witnessed:
         if self._walks is None:
             return None
         end_s = self._end_s
-        if now_s < end_s + LATEST_END_S + LATE_S + MARGIN_S:
+        if now_s < end_s + _DONE_S:
             return None
         mission = self.estimator.received(self._begin_s - MARGIN_S, end_s + LATEST_END_S + MARGIN_S)
         assert mission is not None

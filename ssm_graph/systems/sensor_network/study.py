@@ -117,9 +117,9 @@ def _fields(part: Settings) -> dict[str, Any]:
         if isinstance(value, np.ndarray):
             found[name] = tuple(float(x) for x in value)
     if "edges" in part:
-        found["edges"] = tuple((int(i), int(j)) for i, j in part.values["edges"])
+        found["edges"] = tuple((int(i), int(j)) for i, j in part.counts("edges"))
     if "delay_steps" in part:
-        low, high = part.values["delay_steps"]
+        low, high = part.counts("delay_steps")
         found["delay"] = (int(low), int(high))
     return found
 
@@ -241,11 +241,17 @@ def plain_words(result: NetworkResult) -> list[str]:
     if own:
         width = max(row.position_half_width_m for row in own)
         heading = max(row.heading_half_width_rad for row in own)
+        missed, checks = sum(row.n_outside for row in own), sum(row.n_checks for row in own)
+        held = f"was violated in {missed} of" if missed else "held in"
+        is_vacuous = heading >= s[2]
+        verdict = (
+            ": of the heading, and so of its trace, it is vacuous, and that errors are below the "
+            "trace (figures 8 and 9) is true of any estimate"
+        )
         lines.append(
-            f"The patent's bound held in {sum(row.n_checks for row in own)} checks. It says "
-            f"±{width:.1f} m and ±{heading:.0f} rad, where the walls alone say ±{trivial:.0f} m "
-            f"and ±{s[2]:.0f} rad: of the heading, and so of its trace, it is vacuous, and that "
-            "errors are below the trace (figures 8 and 9) is true of any estimate."
+            f"The patent's bound {held} {checks} checks. It says ±{width:.1f} m and "
+            f"±{heading:.0f} rad, where the walls alone say ±{trivial:.0f} m and ±{s[2]:.0f} rad"
+            f"{verdict if is_vacuous else ''}."
         )
     outside = sum(row.n_outside for row in tested)
     if outside:

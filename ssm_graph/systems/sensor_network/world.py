@@ -12,6 +12,7 @@ import numpy as np
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array, ReadOnlyArrays
 from ssm_graph.filters.rules.ellipsoids import Ellipsoids, Mask
+from ssm_graph.filters.rules.set_membership import Sets
 from ssm_graph.systems.sensor_network.codes import HEADING_STEP, Indices, UniformCode
 from ssm_graph.systems.sensor_network.motion import planar_step
 from ssm_graph.systems.sensor_network.nodes import Alarm, SetNodes
@@ -160,6 +161,7 @@ def run_sets(
     points = PointNodes(setting, center=world.first, is_corner=kind is not Disturbance.UNIFORM)
     code, rows = UniformCode(setting.step), _Rows(keep)
     due: dict[int, list[tuple[int, Array, Mask]]] = defaultdict(list)
+    due_sets: dict[int, list[tuple[int, Sets, Mask]]] = defaultdict(list)
     me = np.eye(setting.n_nodes, dtype=bool)
     cpu = 0.0
     for k in range(1, setting.n_steps + 1):
@@ -182,7 +184,7 @@ def run_sets(
             nodes.hear(step, np.where(mask[..., None], one, np.nan))
         nodes.hear(k, np.where(now[..., None], by_receiver, np.nan))
         if setting.share is Share.ELLIPSOIDS:
-            _exchange(nodes, k, comes, late, due)
+            _exchange(nodes, k, comes, late, due_sets)
         nodes.sets.half_widths  # noqa: B018  (what was heard is used when it is asked for)
         cpu += time.process_time() - begin
         points.step(advance, turn, np.where(now[..., None], by_receiver, np.nan))
@@ -190,7 +192,13 @@ def run_sets(
     return rows.trial(nodes, setting, cpu)
 
 
-def _exchange(nodes: SetNodes, k: int, comes: Mask, late: Indices, due: dict[int, list]) -> None:  # type: ignore[type-arg]
+def _exchange(
+    nodes: SetNodes,
+    k: int,
+    comes: Mask,
+    late: Indices,
+    due: dict[int, list[tuple[int, Sets, Mask]]],
+) -> None:
     for delay in range(nodes.setting.delay[1] + 1):
         due[k + delay].append((k, nodes.sets, comes & (late == delay)))
     for step, sent, mask in due.pop(k, []):
