@@ -31,11 +31,13 @@ def save_network_figures(folder: Path, study: NetworkStudy) -> list[Path]:
     setting, seed = study.setting, study.seed
     trial = run_patent(setting, Disturbance.PATENT, seed=seed)
     figures: dict[str, Figure] = {}
-    for axis in range(3):
-        for half, pair in enumerate(_PAIRS):
+    for half, both in enumerate(_PAIRS):
+        pair = [i for i in both if i < setting.n_nodes]
+        if not pair:
+            continue
+        for axis in range(3):
             figures[f"figure_{2 + 2 * axis + half:02}"] = _states(trial, axis, pair)
-    figures["figure_08"], figures["figure_09"] = (_bounds(trial, pair) for pair in _PAIRS)
-    for half, pair in enumerate(_PAIRS):
+        figures[f"figure_{8 + half:02}"] = _bounds(trial, pair)
         figures[f"figure_{10 + half}"] = _intervals(setting, pair, seed)
     shared = replace(setting, share=Share.MEASUREMENTS)
     sets = run_sets(shared, Disturbance.UNIFORM, seed=seed)
@@ -58,22 +60,19 @@ def _line(color: str, label: str, dash: style.Dash = "-") -> dict[str, object]:
     return {"color": color, "label": label, "linestyle": dash, "linewidth": 1.1}
 
 
-def _nodes(pair: tuple[int, int]) -> list[int]:
-    return list(pair)
-
-
-def _states(trial: Trial, axis: int, pair: tuple[int, int]) -> Figure:
+def _states(trial: Trial, axis: int, pair: Sequence[int]) -> Figure:
     k = np.arange(1.0, len(trial.truth) + 1.0)
     curves = [Curve(k, trial.truth[:, 0, axis], _line(style.INK, "state"))]
     curves += [
         Curve(k, trial.center[:, 0, i, axis], _line(_COLORS[i], f"node {i + 1}", style.DASHED))
-        for i in _nodes(pair)
+        for i in pair
     ]
     panel = Panel(x="step k", y=_COMPONENTS[axis], curves=curves, legend={"loc": "best"})
-    return _drawn(f"Component {axis + 1} and nodes {pair[0] + 1}, {pair[1] + 1}", [panel], 6.0)
+    names = ", ".join(str(i + 1) for i in pair)
+    return _drawn(f"Component {axis + 1} and nodes {names}", [panel], 6.0)
 
 
-def _bounds(trial: Trial, pair: tuple[int, int]) -> Figure:
+def _bounds(trial: Trial, pair: Sequence[int]) -> Figure:
     k = np.arange(1.0, len(trial.truth) + 1.0)
     panels = [
         Panel(
@@ -88,12 +87,12 @@ def _bounds(trial: Trial, pair: tuple[int, int]) -> Figure:
             y_limits=(0.1, 300.0),
             legend={"loc": "center right"},
         )
-        for i in _nodes(pair)
+        for i in pair
     ]
     return _drawn("Error and bound of the patent: of any estimate the error would be below", panels)
 
 
-def _intervals(setting: Setting, pair: tuple[int, int], seed: int) -> Figure:
+def _intervals(setting: Setting, pair: Sequence[int], seed: int) -> Figure:
     panels = []
     for key in (1.0, 100.0):
         curves = []
@@ -103,7 +102,7 @@ def _intervals(setting: Setting, pair: tuple[int, int], seed: int) -> Figure:
             k = np.arange(1.0, len(error) + 1.0)
             curves += [
                 Curve(k, error[:, i], _line(_COLORS[i], f"node {i + 1}, d = {d}", dash))
-                for i in _nodes(pair)
+                for i in pair
             ]
         panels.append(Panel(title=f"key {key:g}", x="step k", y="error", curves=curves, legend={}))
     panels[-1] = replace(panels[-1], legend={"loc": "upper left"})

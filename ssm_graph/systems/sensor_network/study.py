@@ -304,7 +304,13 @@ def summary(result: NetworkResult, *, command: str) -> str:
         f"{row.n_outside} of {row.n_checks} | {row.n_alarms} | {row.ms_per_node_step:.2f} |"
         for row in result.rows
     ]
-    lines += ["", "## Table 1", "", "Mean error of the patent's filter, nodes 1 to 4.", ""]
+    lines += [
+        "",
+        "## Table 1",
+        "",
+        f"Mean error of the patent's filter, nodes 1 to {setting.n_nodes}.",
+        "",
+    ]
     lines += ["| key | d = 0.05 | d = 0.01 | fall |", "|---|---|---|---|"]
     for key, by_interval in result.table_1.items():
         cells = [" ".join(f"{x:.2f}" for x in by_interval[d]) for d in INTERVALS]

@@ -30,6 +30,7 @@ class Disturbance(Enum):
     UNIFORM = "uniform in the box"
     CORNER = "random corners of the box"
     ADVERSARY = "the corner that takes the truth furthest out of the first node's set"
+    SEARCH = "random corners; the half of the runs that came furthest out is led on twice"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,7 +81,7 @@ def noise_at(
     """
     if kind is Disturbance.UNIFORM:
         return np.asarray(bound * rng.uniform(-1.0, 1.0, shape))
-    if kind is Disturbance.CORNER:
+    if kind in (Disturbance.CORNER, Disturbance.SEARCH):
         return np.asarray(bound * rng.choice([-1.0, 1.0], shape))
     if kind is Disturbance.ADVERSARY:
         free = np.where(towards == 0.0, rng.choice([-1.0, 1.0], shape), np.sign(towards))
@@ -143,6 +144,10 @@ class World:
             values[..., 2] = self.state[:, None, 2] + u[..., 0]
         return values
 
+    def go_on_with(self, runs: Indices) -> None:
+        """Lead some of the runs on, in the places of all."""
+        self.state = self.state[runs]
+
     def arrivals(self) -> tuple[Mask, Indices]:
         """Return which packets come, by receiver and sender (R, N, N), and after how many steps."""
         setting = self.setting
@@ -189,7 +194,23 @@ def run_sets(
         cpu += time.process_time() - begin
         points.step(advance, turn, np.where(now[..., None], by_receiver, np.nan))
         rows.add(world.state, nodes, points)
+        if kind is Disturbance.SEARCH:
+            best = furthest(nodes.sets.ellipsoid, world.state)
+            world.go_on_with(best)
+            nodes.go_on_with(best)
+            points.go_on_with(best)
+            for waiting in due.values():
+                waiting[:] = [(step, one[best], mask[best]) for step, one, mask in waiting]
+            for late_sets in due_sets.values():
+                late_sets[:] = [(step, one[best], mask[best]) for step, one, mask in late_sets]
     return rows.trial(nodes, setting, cpu)
+
+
+def furthest(sets: Ellipsoids, state: Array) -> Indices:
+    """Return which runs (R,) a search goes on with, from sets (R, N) and the truth (R, 3)."""
+    far = sets.excess(state[:, None]).max(axis=1)
+    kept = np.argsort(-far, kind="stable")[: (len(far) + 1) // 2]
+    return np.asarray(np.concatenate([kept, kept])[: len(far)], dtype=np.int64)
 
 
 def _exchange(
@@ -268,12 +289,16 @@ def run_patent(
         begin = time.process_time()
         nodes.hear(code.value(code.index(values)))
         cpu += time.process_time() - begin
-        now = Ellipsoids(nodes.center.copy(), nodes.bound.copy())
+        now, state = Ellipsoids(nodes.center.copy(), nodes.bound.copy()), world.state
+        if kind is Disturbance.SEARCH:
+            best = furthest(now, state)
+            world.go_on_with(best)
+            nodes.go_on_with(best)
         found = {
-            "truth": world.state,
+            "truth": state,
             "center": now.center,
             "half_widths": now.half_widths,
-            "excess": now.excess(world.state[:, None]),
+            "excess": now.excess(state[:, None]),
             "log_volume": now.log_volume,
             "shape": now.shape[0],
             "around": now.center[0],
