@@ -273,7 +273,7 @@ def plain_words(result: NetworkResult) -> list[str]:
             lines.append(f"The heading is not observed: ±{widest:.1f} rad is more than a turn.")
     fall_1, fall_100 = (np.mean(falls(result.table_1[key])) for key in (1.0, 100.0))
     lines.append(
-        f"Table 1: with a key of 1 the mean error falls by {fall_1:.2f}, with one of 100 by "
+        f"Table 1: with a key of 1 the mean error falls by {fall_1:z.2f}, with one of 100 by "
         f"{fall_100:.2f}; the patent claims {', '.join(map(str, CLAIMED))} and its key is lost. "
         "The key only makes the steps of the quantiser larger: it costs accuracy, one known pair "
         "of value and index reveals it, and it is no encryption."
@@ -314,7 +314,7 @@ def summary(result: NetworkResult, *, command: str) -> str:
     lines += ["| key | d = 0.05 | d = 0.01 | fall |", "|---|---|---|---|"]
     for key, by_interval in result.table_1.items():
         cells = [" ".join(f"{x:.2f}" for x in by_interval[d]) for d in INTERVALS]
-        fall = " ".join(f"{x:.2f}" for x in falls(by_interval))
+        fall = " ".join(f"{x:z.2f}" for x in falls(by_interval))
         lines.append(f"| {key:g} | {cells[0]} | {cells[1]} | {fall} |")
     return "\n".join(lines) + "\n"
 
