@@ -7,6 +7,7 @@ message: no message is held up by more than that.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -21,6 +22,7 @@ from ssm_graph.mission.estimate import Found
 from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.mission import InitialState, Mission
 from ssm_graph.mission.navigation import Event, Health, Navigation, Severity
+from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.sensors.messages import Message
 from ssm_graph.systems.sensor_network.integrity import APART_S, RIVALS, against
 from ssm_graph.systems.sensor_network.track import LATEST_END_S, Edges, VelocityWalk, block_edges
@@ -115,8 +117,13 @@ class Witnessed:
         self._answers: deque[tuple[float, Navigation]] = deque()
 
     def push(self, message: Message) -> None:
-        """Let the estimator take a message, and the witness make a step of its own."""
+        """Let the estimator take a message, and the witness make a step of its own.
+
+        Its time is that of the inertial data; the other clocks may be ahead.
+        """
         self.estimator.push(message)
+        if not (isinstance(message, ImuSample) and math.isfinite(message.time_s)):
+            return
         now_s = message.time_s + self.estimator.shift_s
         try:
             self._step(now_s)
@@ -221,6 +228,8 @@ class Witnessed:
         mission = self.estimator.received(self._begin_s - MARGIN_S, end_s + LATEST_END_S + MARGIN_S)
         assert mission is not None
         stamps = mission.imu.time_s
+        if stamps[-1] < end_s + LATEST_END_S and not self._is_known_until(end_s + LATEST_END_S):
+            return None  # the sample that told the time was refused
         stamps = stamps[(stamps >= self._begin_s - MARGIN_S) & (stamps <= end_s + LATEST_END_S)]
         if len(stamps) < 2 or np.max(np.diff(stamps)) > LONGEST_GAP_S:
             text = f"inertial data are missing before {end_s:.0f} s: the set begins anew"
@@ -232,6 +241,11 @@ class Witnessed:
         edges = block_edges(pings, self._begin_s, np.array([end_s]), end_s)
         self._begin_s, self._n_blocks = float(edges.time_s[-1]), self._n_blocks + 1
         return _block_steps(*self._walks, mission, edges)
+
+    def _is_known_until(self, time_s: float) -> bool:
+        """Return whether the estimator has come to a time; if so, what is missing is lost."""
+        answer = self.estimator.newest()
+        return answer is not None and answer.time_s + self.estimator.shift_s >= time_s
 
     def _judge(self, w: Witness) -> None:
         """Compare the answer of then with the set at the end of a block, and tell alarms."""

@@ -12,19 +12,7 @@ import pytest
 from ssm_graph import Estimate, Mission, SmootherConfig, smooth
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.mission.fault import Treatment
-from ssm_graph.simulation import (
-    DvlSettings,
-    Fault,
-    FaultShape,
-    GnssSettings,
-    Grade,
-    Sensor,
-    SimulatedMission,
-    SimulationConfig,
-    SurveyRoute,
-    simulate,
-    with_faults,
-)
+from ssm_graph.simulation import Fault, FaultShape, Sensor, SimulatedMission, with_faults
 from ssm_graph.systems.sensor_network.integrity import (
     Agreement,
     check_integrity,
@@ -32,6 +20,7 @@ from ssm_graph.systems.sensor_network.integrity import (
     write_integrity,
 )
 from ssm_graph.systems.sensor_network.witness import Witness, WitnessBounds, witness
+from tests.witness_fixture import a_survey
 
 END_S = 80.0
 
@@ -39,16 +28,7 @@ END_S = 80.0
 @pytest.fixture(scope="module")
 def simulated() -> SimulatedMission:
     """Return a survey with fixes and depth, without faults."""
-    return simulate(
-        SimulationConfig(
-            route=SurveyRoute(line_m=40.0),
-            duration_s=END_S,
-            seed=21,
-            grade=Grade.TACTICAL,
-            dvl=DvlSettings(noise=0.005),
-            gnss=GnssSettings(windows=((0.0, END_S),)),
-        )
-    )
+    return a_survey(seed=21, end_s=END_S)
 
 
 @pytest.fixture(scope="module")
