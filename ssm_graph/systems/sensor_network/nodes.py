@@ -73,9 +73,15 @@ class _Moment:
 
     def of_runs(self, runs: Indices) -> _Moment:
         """Return the same of some of the runs."""
-        sent = None if self.sent is None else self.sent[runs]
-        arrays = (one[runs] for one in (self.advance, self.turn, self.values))
-        return _Moment(self.k, self.predicted[runs], *arrays, sent, self.came[runs])
+        return _Moment(
+            self.k,
+            self.predicted[runs],
+            self.advance[runs],
+            self.turn[runs],
+            self.values[runs],
+            None if self.sent is None else self.sent[runs],
+            self.came[runs],
+        )
 
 
 class SetNodes:
