@@ -137,19 +137,18 @@ def border_of(center: Array, shape: Array, low: Array, high: Array) -> tuple[Arr
 
 
 def _plane(trial: Trial) -> Figure:
-    truth = trial.truth[:, 0, :2]
-    shown = range(0, len(truth), 5)
+    east, north = trial.truth[:, 0, 0], trial.truth[:, 0, 1]
+    shown = range(0, len(east), 5)
     dots = {"color": style.INK, "linestyle": "", "marker": "o", "markersize": 2.5}
     curves = [curve for k in shown for curve in _borders(trial, k, is_named=k == 0)]
-    curves.append(Curve(*truth.T, _line(style.INK, "robot")))
-    curves.append(Curve(*truth[shown].T, {**dots, "label": "at those steps"}))
+    curves.append(Curve(east, north, _line(style.INK, "robot")))
+    curves.append(Curve(east[shown], north[shown], {**dots, "label": "at those steps"}))
     last = shown[-1]
-    near = [*_borders(trial, last, is_named=False), Curve(*truth[last : last + 1].T, dots)]
-    labels = {"x": "east, m", "y": "north, m"}
-    panels = [
-        Panel(title="every fifth step", curves=curves, legend={"loc": "best"}, **labels),
-        Panel(title=f"step {last + 1} from near", curves=near, **labels),
-    ]
+    near = [*_borders(trial, last, is_named=False), Curve(east[[last]], north[[last]], dots)]
+    whole = Panel(
+        title="every fifth step", x="east, m", y="north, m", curves=curves, legend={"loc": "best"}
+    )
+    panels = [whole, replace(whole, title=f"step {last + 1} from near", curves=near, legend={})]
     figure = _drawn("Sets in the plane", panels, 4.6, 4.6)
     for axes in figure.axes:
         axes.set_aspect("equal", adjustable="datalim")

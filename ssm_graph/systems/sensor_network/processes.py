@@ -159,9 +159,10 @@ def _heard(pipes: dict[Any, int], period_s: float) -> list[tuple[Any, Report | N
     What a node says that it ended of is raised, and so is silence.
     """
     found: list[tuple[Any, Report | None]] = []
-    for pipe in wait(list(pipes), timeout=PATIENCE_S + period_s):
+    ready: list[Any] = wait(list(pipes), timeout=PATIENCE_S + period_s)
+    for pipe in ready:
         try:
-            said = pipe.recv()  # type: ignore[union-attr]
+            said = pipe.recv()
         except (EOFError, OSError):
             said = None
         if isinstance(said, str):

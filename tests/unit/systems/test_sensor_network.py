@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -152,10 +153,9 @@ def test_what_is_too_late_changes_nothing() -> None:
 def test_loss_and_delay_keep_the_truth_inside(share: Share) -> None:
     """The sets are wider for it, and that is all."""
     setting = replace(COMPASS, share=share, n_steps=12)
-    lossy = replace(setting, loss=0.3, delay=(1, 5))
-    alone = replace(setting, share=Share.NONE)
+    lossy, deaf = replace(setting, loss=0.3, delay=(1, 5)), replace(setting, share=Share.NONE)
     whole, trial, alone = (
-        run_sets(one, Disturbance.UNIFORM, runs=2, seed=9) for one in (setting, lossy, alone)
+        run_sets(one, Disturbance.UNIFORM, runs=2, seed=9) for one in (setting, lossy, deaf)
     )
     assert trial.excess.max() <= 1.0 + 1e-9
     assert not trial.alarms
@@ -325,7 +325,7 @@ def test_bad_studies_are_refused(text: str, said: str, tmp_path: Path) -> None:
         ("bits", 64),
     ],
 )
-def test_settings_that_bound_nothing_are_refused(field: str, value: object) -> None:
+def test_settings_that_bound_nothing_are_refused(field: str, value: Any) -> None:
     """From Python, where no file is checked."""
     with pytest.raises(ConfigError, match=f"{field}: expected"):
         replace(PATENT, **{field: value})
