@@ -26,7 +26,13 @@ from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.sensors.messages import Message
 from ssm_graph.systems.sensor_network.integrity import APART_S, RIVALS, against
 from ssm_graph.systems.sensor_network.track import LATEST_END_S, Edges, VelocityWalk, block_edges
-from ssm_graph.systems.sensor_network.witness import BoundAlarm, PlaceWalk, Witness, WitnessBounds
+from ssm_graph.systems.sensor_network.witness import (
+    LONGEST_GAP_S,
+    BoundAlarm,
+    PlaceWalk,
+    Witness,
+    WitnessBounds,
+)
 
 LATE_S: Final = 2.0
 """What comes later than this after the end of a block is not used by the witness."""
@@ -36,8 +42,6 @@ _DONE_S: Final = LATEST_END_S + LATE_S + MARGIN_S
 """After the end of a block that was waited for, all of it has come."""
 ANSWER_EVERY_S: Final = 0.5
 """Answers are kept so often, to be compared at the end of a block."""
-LONGEST_GAP_S: Final = 0.5
-"""Over longer gaps of inertial data no bound holds: the set begins anew."""
 
 
 class Watched(Protocol):

@@ -140,6 +140,24 @@ def test_alarms_that_are_close_are_one_finding(
     assert fault.end_s - fault.begin_s > 15.0
 
 
+def test_over_a_gap_of_inertial_data_the_set_begins_anew(
+    simulated: SimulatedMission, answer: Estimate
+) -> None:
+    """Nothing bounds what happens in it: an alarm would prove nothing."""
+    imu = simulated.mission.imu
+    kept = (imu.time_s < 33.7) | (imu.time_s > 38.7)
+    gap = replace(imu, time_s=imu.time_s[kept], gyro_b=imu.gyro_b[kept], accel_b=imu.accel_b[kept])
+    mission = replace(simulated.mission, imu=gap)
+    with pytest.raises(DataError, match=r"missing from 33\.69\d to 38\.71\d s"):
+        of(mission)
+    found = check_integrity(mission, answer)
+    assert found.agreement is Agreement.INSIDE
+    assert "missing after 34 s" in found.reason
+    w = found.witness
+    assert not np.any((w.time_s > 33.7) & (w.time_s < 38.7))
+    assert holds_truth(mission, w, simulated.truth_at(w.time_s)).all()
+
+
 def test_what_cannot_be_used_is_refused(simulated: SimulatedMission) -> None:
     """No pings; bounds that are none."""
     mission = simulated.mission
