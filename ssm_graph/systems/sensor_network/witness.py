@@ -76,6 +76,9 @@ class WitnessBounds:
         for name in ("sigmas", "block_s", "silence_s"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
                 raise ConfigError(f"{name}: expected above 0, got {getattr(self, name)}")
+        for name in ("velocity_m_per_s", "speed_share"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
+                raise ConfigError(f"{name}: expected 0 or more, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -168,3 +168,5 @@ def test_what_cannot_be_used_is_refused(simulated: SimulatedMission) -> None:
         of(replace(mission, dvl=none))
     with pytest.raises(ConfigError, match="sigmas: expected above 0"):
         WitnessBounds(sigmas=0.0)
+    with pytest.raises(ConfigError, match="speed_share: expected 0 or more, got nan"):
+        WitnessBounds(speed_share=np.nan)
