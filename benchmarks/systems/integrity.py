@@ -6,6 +6,7 @@ of ``benchmarks.trust``, on seeds of their own.
 
 from __future__ import annotations
 
+import time
 from collections import defaultdict
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -25,8 +26,8 @@ from ssm_graph.systems.sensor_network.integrity import Agreement, check_integrit
 from ssm_graph.systems.sensor_network.witness import WitnessBounds, witness
 
 CLEAN = "no fault"
-FIRST_SEED = 300
-"""Bounds and rules were chosen on seeds 0 to 2; earlier pages are of 100 to 103."""
+FIRST_SEED = 500
+"""Bounds and rules were chosen on seeds 0 to 2, and mended upon 100 to 103 and 300 to 303."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,8 @@ class Outcome:
     """With bounds that are true: those of `false_bounds` wider by their factor"""
     wide_alarm: str
     wide_half_width_m: float
+    ms_per_ping: float
+    """Of processor time, of the set by itself"""
     agreement: str = "not smoothed"
     radius_m: float = np.nan
     """Guaranteed for the answer at the end"""
@@ -70,7 +73,9 @@ def run(key: Key) -> Row:
     sim, mission = _mission(label, grade, seed, with_gnss=with_gnss)
     own = WitnessBounds()
     assert mission.initial is not None
+    begin = time.process_time()
     w = witness(mission, mission.initial, own)
+    ms = 1e3 * (time.process_time() - begin) / len(mission.dvl.time_s)
     truth = sim.truth_at(w.time_s)
     over = over_bounds(sim, mission, own, w.time_s)
     holds = bool(holds_truth(mission, w, truth).all())
@@ -84,6 +89,7 @@ def run(key: Key) -> Row:
             bool(holds_truth(mission, wide, truth).all()),
             wide.alarms[0].sentence if wide.alarms else "",
             float(np.max(wide.half_widths[-1, :2])),
+            ms,
         )
     )
     if not key[4] and (holds or w.alarms):
@@ -109,6 +115,7 @@ def main() -> None:
         __doc__,
         Option("--seeds", 4, "missions of each lie"),
         Option("--clean", 4, "missions without a lie"),
+        Option("--first-seed", FIRST_SEED, "of the missions of each lie"),
         Option("--smoothed", 1, "missions of each lie that are smoothed in any case"),
         Option("--grade", "tactical", "of the inertial sensors"),
         Option("--jobs", 1, "processes"),
@@ -119,7 +126,7 @@ def main() -> None:
         for i in range(a.clean if label == CLEAN else a.seeds):
             asked = None if label == CLEAN else LIES[label].with_gnss
             with_gnss = i % 2 == 0 if asked is None else asked
-            keys.append((label, a.grade, FIRST_SEED + i, int(with_gnss), int(i < a.smoothed)))
+            keys.append((label, a.grade, a.first_seed + i, int(with_gnss), int(i < a.smoothed)))
     ledger = Ledger(Path(a.out) / "runs.jsonl", {"study": "integrity of stated bounds"})
     rows = run_trials(
         run, keys, ledger, n_jobs=a.jobs, on_progress=lambda n, of, key: note(f"{n}/{of} {key}")
@@ -164,7 +171,9 @@ def _page(rows: dict[Key, Row]) -> list[str]:
         "",
         "Widths are medians at the end, of missions with fixes and without: without fixes, five "
         "sigma of the stated heading of the start make nearly all of the width. Error at most and "
-        "5 sigma are of the missions that were smoothed.",
+        "5 sigma are of the missions that were smoothed. Leading the set on took "
+        f"{np.median([row['ms_per_ping'] for row in good.values()]):.2f} ms of processor a ping "
+        "(median).",
         "",
         "## Missions whose truth was outside without an alarm",
         "",

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Final, TypeVar, cast, get_type_hints
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ssm_graph.base.errors import ConfigError, nearest_hint
 from ssm_graph.base.frames import BodyAxes, matrix_to_frd, to_frd
@@ -81,10 +82,10 @@ class Key:
         numbers = _numbers(value, self.shape)
         if numbers is None or not all(math.isfinite(number) for number in numbers):
             return "type"
-        low_ok = all(x > 0.0 for x in numbers) if self.positive else min(numbers) >= self.low
+        low_ok = all(x > 0.0 if self.positive else x >= self.low for x in numbers)
         if self.positive or self.low == 0.0:  # its square has to be told from zero
             low_ok = low_ok and not any(0.0 < x < LEAST_SIZE for x in numbers)
-        return "" if low_ok and max(numbers) <= self.high else "range"
+        return "" if low_ok and all(x <= self.high for x in numbers) else "range"
 
 
 def sigma_key(field: str, high: float, hint: str = "", **more: Any) -> Key:
@@ -145,6 +146,13 @@ class Settings:
         if not value.is_integer():
             raise self.fault(key, f"expected a whole number, got {value:g}")
         return int(value)
+
+    def counts(self, key: str) -> NDArray[np.int64]:
+        """Return a list, or lists of a list, of whole numbers."""
+        values = self.array(key)
+        if np.any(values != np.floor(values)):
+            raise self.fault(key, f"expected whole numbers, got {shown(self.values[key])}")
+        return values.astype(np.int64)
 
     def array(self, key: str) -> Array:
         """Return a list as an array, in the unit of the file."""

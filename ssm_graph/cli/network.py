@@ -27,7 +27,7 @@ study file (TOML); everything but the name has the value of the setting that it 
   base = "patent"                     # also: quiet, compass, walls, coarse
   runs = 20
   seed = 0
-  disturbances = "patent, uniform, corner, adversary"
+  disturbances = "patent, uniform, corner, adversary, search"
   [setting]
   n_nodes = 4
   n_steps = 40

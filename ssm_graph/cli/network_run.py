@@ -42,23 +42,31 @@ def declare(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace, console: Console, errors: Console) -> bool:
     """Run all nodes and show their sets; good if each held its truth without an alarm."""
-    from ssm_graph.systems.sensor_network.processes import Report, run_processes
+    from ssm_graph.systems.sensor_network.processes import Ended, Report, run_processes
     from ssm_graph.systems.sensor_network.study import read_network_study
 
     setting = read_network_study(arguments.study).setting
     secrets = _secrets(arguments, setting.n_nodes)
     last: dict[int, Report] = {}
-    n_outside = 0
+    ended: list[Ended] = []
+    n_outside = n_checks = 0
     for report in run_processes(
         setting, period_s=arguments.period, seed=arguments.seed, secrets=secrets
     ):
+        if isinstance(report, Ended):
+            ended.append(report)
+            say(errors, f"node {report.node}, after step {report.k}: {report.reason}")
+            continue
         new = report.alarms[len(last[report.node].alarms) :] if report.node in last else ()
         for alarm in new or (() if report.node in last else report.alarms):
             say(errors, f"alarm: {alarm}")
         last[report.node] = report
-        n_outside += not report.holds_truth
-        if len(last) == setting.n_nodes and {one.k for one in last.values()} == {report.k}:
-            say(console, _line(last))
+        n_checks, n_outside = n_checks + 1, n_outside + (not report.holds_truth)
+        gone = {one.node for one in ended}
+        going = {node: one for node, one in last.items() if node not in gone}
+        is_whole = len(going) == setting.n_nodes - len(gone)
+        if is_whole and {one.k for one in going.values()} == {report.k}:
+            say(console, _line(going))
     say(console, f"{'node':>4} {'east, m':>18} {'north, m':>18} {'heading, rad':>18}  packets")
     for node, report in sorted(last.items()):
         cells = [
@@ -66,9 +74,9 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
         ]
         tail = f"{report.n_heard} heard, {report.n_refused} refused, {report.n_bytes} bytes each"
         say(console, f"{node:>4} {' '.join(f'{cell:>18}' for cell in cells)}  {tail}")
-    n = setting.n_nodes * setting.n_steps
-    say(console, f"the truth was inside {n - n_outside} of {n} times")
-    return n_outside == 0 and not any(report.alarms for report in last.values())
+    say(console, f"the truth was inside {n_checks - n_outside} of {n_checks} times")
+    is_quiet = not any(report.alarms for report in last.values())
+    return n_outside == 0 and is_quiet and not ended
 
 
 def _line(last: dict[int, Any]) -> str:
@@ -82,7 +90,12 @@ def _secrets(arguments: argparse.Namespace, n_nodes: int) -> tuple[bytes | None,
         if arguments.wrong_key is not None:
             raise ConfigError("--wrong-key: expected with --secret-file; give that, too")
         return None
-    key = arguments.secret_file.read_bytes().strip()
+    try:
+        key = arguments.secret_file.read_bytes().strip()
+    except OSError as error:
+        raise ConfigError(
+            f"--secret-file {arguments.secret_file}: cannot be read: {error.strerror or error}"
+        ) from error
     keys = [key] * n_nodes
     if arguments.wrong_key is not None:
         if not 1 <= arguments.wrong_key <= n_nodes:

@@ -159,6 +159,15 @@ class Keystream:
         if self.tag_bytes not in TAG_BYTES:
             raise ConfigError(f"[code] tag_bytes: expected 0, 4 or 8, got {self.tag_bytes}")
 
+    def of_session(self, session: bytes) -> Keystream:
+        """Return the keystream of one session, whose bytes need not be secret, but be new.
+
+        Steps begin at 1 in every session: by one key for all, two of them would have the same
+        numbers, and packets of one would be authentic in the next.
+        """
+        key = hmac.digest(self.key, b"session" + session, hashlib.sha256)
+        return Keystream(key, self.tag_bytes)
+
     def _numbers(self, node: int, step: int, bits: tuple[int, ...]) -> Indices:
         found: list[int] = []
         block = 0

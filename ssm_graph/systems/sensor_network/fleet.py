@@ -114,8 +114,10 @@ def packed_set(node: int, step: int, place: Ellipsoids, depth: tuple[float, floa
     axes = np.ceil(sigma / AXIS_STEP_M).astype(int)
     while np.linalg.eigvalsh(_shape(axes, rho) - P)[0] < 0.0:
         axes = np.maximum(axes + 1, np.ceil(1.02 * axes).astype(int))
-    low, high = math.floor(depth[0] / DEPTH_STEP_M), math.ceil(depth[1] / DEPTH_STEP_M)
-    if np.any(np.abs(center) >= 2**23) or np.any(axes >= 2**16) or not 0 <= low <= high < 2**16:
+    # Nothing is above the water.
+    low, high = (max(depth[0], 0.0), max(depth[1], 0.0))
+    top, bottom = math.floor(low / DEPTH_STEP_M), math.ceil(high / DEPTH_STEP_M)
+    if np.any(np.abs(center) >= 2**23) or np.any(axes >= 2**16) or not top <= bottom < 2**16:
         raise DataError(
             f"packet of vehicle {node + 1}, step {step}: its set does not fit {SET_BYTES} bytes: "
             f"centre {place.center}, half-widths {sigma}, depths {depth}"
@@ -127,8 +129,8 @@ def packed_set(node: int, step: int, place: Ellipsoids, depth: tuple[float, floa
             *(int(x).to_bytes(3, "big", signed=True) for x in center),
             *(int(x).to_bytes(2, "big") for x in axes),
             rho.to_bytes(1, "big", signed=True),
-            low.to_bytes(2, "big"),
-            high.to_bytes(2, "big"),
+            top.to_bytes(2, "big"),
+            bottom.to_bytes(2, "big"),
         ]
     )
 
@@ -167,6 +169,8 @@ class FleetTrial(ReadOnlyArrays):
     excess: Array
     """(K, N) of the truth, at most 1 inside"""
     n_heard: int
+    n_unsent: int
+    """Packets that a set was too wide or too far away for"""
     alarms: tuple[tuple[int, int, str], ...]
     """Step, vehicle (from 1) and what missed its set"""
 
@@ -189,7 +193,9 @@ def run_fleet(setting: FleetSetting, *, seed: int = 0, hears: bool = True) -> Fl
         rows["high"].append(fleet.sets.high)
         rows["excess"].append(fleet.sets.excess(fleet.state))
     arrays = {name: np.array(values) for name, values in rows.items()}
-    return FleetTrial(**arrays, n_heard=fleet.n_heard, alarms=tuple(fleet.alarms))
+    return FleetTrial(
+        **arrays, n_heard=fleet.n_heard, n_unsent=fleet.n_unsent, alarms=tuple(fleet.alarms)
+    )
 
 
 class _Fleet:
@@ -202,7 +208,7 @@ class _Fleet:
         self.sets = Sets.of_box(center, np.broadcast_to(half, center.shape), _FLOOR)
         self.state = center + half * self._draw(center.shape)
         self.depth = 20.0 + 10.0 * self.rng.random(n)
-        self.n_heard = 0
+        self.n_heard = self.n_unsent = 0
         self.alarms: list[tuple[int, int, str]] = []
 
     def _draw(self, shape: tuple[int, ...]) -> Array:
@@ -240,12 +246,16 @@ class _Fleet:
         read = self.depth + own.depth_bound_m * self._draw((n,))
         low, high = read - own.depth_bound_m, read + own.depth_bound_m
         place = self.sets.ellipsoid[speaker].projected([0, 1])
-        packet = packed_set(speaker, k, place, (float(low[speaker]), float(high[speaker])))
         offset = self.state[:, :2] - self.state[speaker, :2]
         true = np.sqrt(np.sum(offset**2, axis=1) + (self.depth - self.depth[speaker]) ** 2)
         ranges = true + own.false_range * own.range_bound_m * self._draw((n,))
         heard: Mask = (self.rng.random(n) >= own.loss) & (np.arange(n) != speaker)
-        if not hears or not heard.any():
+        if not hears:
+            return
+        try:
+            packet = packed_set(speaker, k, place, (float(low[speaker]), float(high[speaker])))
+        except DataError:  # who knows that little of itself has nothing to say
+            self.n_unsent += 1
             return
         self.n_heard += int(heard.sum())
         _, _, other, (top, bottom) = unpacked_set(packet)

@@ -10,11 +10,11 @@ import numpy as np
 from ssm_graph.base.frozen import Array
 from ssm_graph.report import style
 from ssm_graph.report.style import Curve, Panel
+from ssm_graph.systems.sensor_network.figures import border_of
 from ssm_graph.systems.sensor_network.fleet import FleetTrial
 from ssm_graph.systems.sensor_network.fleet_study import FleetResult
 
 _COLORS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-_CIRCLE: Final = np.linspace(0.0, 2.0 * np.pi, 73)
 
 
 def save_fleet_figure(folder: Path, result: FleetResult) -> Path:
@@ -34,16 +34,9 @@ def _line(color: str, label: str, dash: style.Dash) -> dict[str, object]:
 
 
 def _edge(trial: FleetTrial, vehicle: int) -> tuple[Array, Array]:
-    """Return the border of a vehicle's set of places at the end, east and north, m.
-
-    The ellipse is cut by the box coordinate by coordinate, which loses nothing of both.
-    """
-    root = np.linalg.cholesky(trial.shape[-1, vehicle, :2, :2])
-    ring = np.stack([np.cos(_CIRCLE), np.sin(_CIRCLE)])
-    border = trial.center[-1, vehicle, :2, None] + root @ ring
-    low, high = (box[-1, vehicle, :2, None] for box in (trial.low, trial.high))
-    east, north = np.clip(border, low, high)
-    return east, north
+    """Return the border of a vehicle's set of places at the end, east and north, m."""
+    sets = (trial.center, trial.shape, trial.low, trial.high)
+    return border_of(*(one[-1, vehicle] for one in sets))
 
 
 def _map(result: FleetResult) -> Panel:
@@ -60,6 +53,10 @@ def _map(result: FleetResult) -> Panel:
         ):
             options = {**_line(color, label if first else "", dash), "linewidth": 1.6}
             curves.append(Curve(*_edge(trial, i), options))
+        dot = {"color": style.INK, "linestyle": "", "marker": "o", "markersize": 3.0}
+        curves.append(
+            Curve(track[-1:, 0], track[-1:, 1], {**dot, "label": "true end" if first else ""})
+        )
     return Panel(
         title="ways and sets", x="east, m", y="north, m", curves=curves, legend={"loc": "best"}
     )
@@ -78,7 +75,7 @@ def _widths(result: FleetResult) -> Panel:
             half = trial.half_widths[:, i, :2].mean(axis=1)
             curves.append(Curve(k, half, _line(color, label, dash)))
     return Panel(
-        title="half-widths; dotted by itself",
+        title="half-widths; dashed by itself",
         x="time, s",
         y="mean of east and north, m",
         curves=curves,

@@ -92,6 +92,8 @@ class FleetRow:
     n_outside: int
     n_checks: int
     n_packets_heard: int
+    n_unsent: int
+    """Packets that a set was too wide or too far away for"""
     n_alarms: int
 
 
@@ -162,7 +164,8 @@ def _row(setting: FleetSetting, errors: str, heard: str, trials: list[FleetTrial
         float(excess.max()),
         int(np.sum(excess > 1.0 + 1e-9)),
         excess.size,
-        sum(trial.n_heard for trial in trials) if heard == "ranges" else 0,
+        sum(trial.n_heard for trial in trials),
+        sum(trial.n_unsent for trial in trials),
         sum(len(trial.alarms) for trial in trials),
     )
 
@@ -180,6 +183,9 @@ def fleet_words(result: FleetResult) -> list[str]:
         f"±{together.half_width_m:.1f} m by ranges: a packet of {SET_BYTES} bytes every "
         f"{setting.slot} s, {setting.loss:.0%} of them lost.",
     ]
+    unsent = sum(row.n_unsent for row in result.rows)
+    if unsent:
+        lines.append(f"{unsent} packets were not sent: a set was too wide or far for their bytes.")
     if result.first_alarm:
         lines.append(f"Alarm, so a bound is false: {result.first_alarm}.")
     return lines

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -15,13 +15,16 @@ import numpy as np
 from ssm_graph.base.frozen import Array, ReadOnlyArrays
 from ssm_graph.filters.rules.ellipsoids import Mask
 from ssm_graph.io.tables.append_file import write_through
-from ssm_graph.mission.estimate import Estimate
+from ssm_graph.mission.estimate import Estimate, Trajectory
 from ssm_graph.mission.fault import DetectedFault, Treatment
-from ssm_graph.mission.mission import Mission, Reference
+from ssm_graph.mission.mission import InitialState, Mission, Reference
+from ssm_graph.sensors.imu import ImuLog
 from ssm_graph.systems.sensor_network.witness import (
+    LONGEST_GAP_S,
     BoundAlarm,
     Witness,
     WitnessBounds,
+    joined,
     witness,
 )
 
@@ -65,6 +68,8 @@ class Integrity(ReadOnlyArrays):
     """(M,) the same of the height"""
     sigma_radius_m: Array
     """(M,) `PROTECTION_SIGMAS` of the answer's own, along its worst level direction"""
+    ends_s: tuple[float, ...] = ()
+    """Where sets ended at gaps of the inertial data; after each a new one began with the answer"""
 
     @property
     def agreement(self) -> Agreement:
@@ -87,6 +92,17 @@ class Integrity(ReadOnlyArrays):
         return (
             f"{text}; at the end the truth is within {self.radius_m[-1]:.3g} m of it if the bounds "
             f"are true, {PROTECTION_SIGMAS:g} of its sigmas are {self.sigma_radius_m[-1]:.2g} m"
+            f"{self._anew}"
+        )
+
+    @property
+    def _anew(self) -> str:
+        if not self.ends_s:
+            return ""
+        times = ", ".join(f"{at:.0f}" for at in self.ends_s)
+        return (
+            f"; inertial data are missing after {times} s, where the set began anew with the "
+            "answer, which is trusted there"
         )
 
     @property
@@ -119,9 +135,17 @@ class Integrity(ReadOnlyArrays):
 def check_integrity(
     mission: Mission, estimate: Estimate, bounds: WitnessBounds | None = None
 ) -> Integrity:
-    """Return a smoother's answer beside the set of its mission's bounds, from its own start on."""
-    w = witness(mission, estimate.start, bounds)
+    """Return a smoother's answer beside the set of its mission's bounds, from its own start on.
+
+    Where inertial data are missing for more than `LONGEST_GAP_S`, the set begins anew with the
+    answer of then.
+    """
     trajectory = estimate.trajectory
+    parts = [
+        witness(replace(mission, imu=imu), start, bounds)
+        for imu, start in _pieces(mission.imu, estimate)
+    ]
+    w = joined(parts)
     p_n = mission.frame.p_n_from_geodetic(trajectory.lat, trajectory.lon, trajectory.height)
     answer = np.column_stack([np.interp(w.time_s, trajectory.time_s, x) for x in p_n.T])
     found = against(w, answer)
@@ -134,6 +158,50 @@ def check_integrity(
         radius_m=found.radius_m,
         up_m=found.up_m,
         sigma_radius_m=PROTECTION_SIGMAS * np.interp(w.time_s, trajectory.time_s, worst),
+        ends_s=tuple(float(part.time_s[-1]) for part in parts[:-1]),
+    )
+
+
+def _pieces(imu: ImuLog, estimate: Estimate) -> list[tuple[ImuLog, InitialState]]:
+    """Return the inertial data between their gaps, with the answer where each piece begins."""
+    t, trajectory, start = imu.time_s, estimate.trajectory, estimate.start
+    ends = [*(np.flatnonzero(np.diff(t) > LONGEST_GAP_S) + 1), len(t)]
+    found: list[tuple[ImuLog, InitialState]] = []
+    for first, last in zip([0, *ends], ends, strict=False):
+        if t[last - 1] <= start.time_s:
+            continue
+        log, at = imu, start
+        if len(ends) > 1:  # the first sample after a gap is the mean over it, or of nobody knows
+            begun = first + 1 if first else 0
+            begin_s = float(t[first]) if first else imu.start_s
+            rows = {name: getattr(imu, name)[begun:last] for name in ("gyro_b", "accel_b")}
+            log = replace(imu, start_s=begin_s, time_s=t[begun:last], **rows)
+        if found or (first and t[first] > start.time_s):
+            later = np.flatnonzero(
+                (trajectory.time_s >= t[first]) & (trajectory.time_s < t[last - 1])
+            )
+            if len(later) == 0:
+                continue
+            at = _state_of(trajectory, int(later[0]))
+        found.append((log, at))
+    return found
+
+
+def _state_of(trajectory: Trajectory, i: int) -> InitialState:
+    """Return an answer as the start of a set, with its sigmas."""
+    roll, pitch, heading = (float(angle) for angle in trajectory.roll_pitch_heading[i])
+    return InitialState(
+        float(trajectory.time_s[i]),
+        float(trajectory.lat[i]),
+        float(trajectory.lon[i]),
+        float(trajectory.height[i]),
+        roll,
+        pitch,
+        heading,
+        velocity_enu=trajectory.velocity_enu[i].copy(),
+        position_sigma_enu=np.sqrt(np.diag(trajectory.position_cov_enu[i])),
+        velocity_sigma_enu=trajectory.velocity_sigma_enu[i].copy(),
+        attitude_sigma=trajectory.attitude_sigma[i].copy(),
     )
 
 
@@ -206,6 +274,7 @@ def write_integrity(folder: Path, integrity: Integrity) -> None:
         "reason": integrity.reason,
         "alarms": [alarm.sentence for alarm in w.alarms],
         "findings": [fault.sentence for fault in integrity.faults],
+        "set_ended_s": list(integrity.ends_s),
         "beam_speeds_used": w.n_beams,
         "beam_speeds_left_out": w.n_left_out,
     }

@@ -7,6 +7,7 @@ message: no message is held up by more than that.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -21,19 +22,26 @@ from ssm_graph.mission.estimate import Found
 from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.mission import InitialState, Mission
 from ssm_graph.mission.navigation import Event, Health, Navigation, Severity
+from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.sensors.messages import Message
 from ssm_graph.systems.sensor_network.integrity import APART_S, RIVALS, against
 from ssm_graph.systems.sensor_network.track import LATEST_END_S, Edges, VelocityWalk, block_edges
-from ssm_graph.systems.sensor_network.witness import BoundAlarm, PlaceWalk, Witness, WitnessBounds
+from ssm_graph.systems.sensor_network.witness import (
+    LONGEST_GAP_S,
+    BoundAlarm,
+    PlaceWalk,
+    Witness,
+    WitnessBounds,
+)
 
 LATE_S: Final = 2.0
 """What comes later than this after the end of a block is not used by the witness."""
 MARGIN_S: Final = 1.0
 """Of inertial data before and after a block, for means about its pings."""
+_DONE_S: Final = LATEST_END_S + LATE_S + MARGIN_S
+"""After the end of a block that was waited for, all of it has come."""
 ANSWER_EVERY_S: Final = 0.5
 """Answers are kept so often, to be compared at the end of a block."""
-LONGEST_GAP_S: Final = 0.5
-"""Over longer gaps of inertial data no bound holds: the set begins anew."""
 
 
 class Watched(Protocol):
@@ -106,14 +114,20 @@ class Witnessed:
 
     def _begin_anew(self) -> None:
         self._walks: tuple[VelocityWalk, PlaceWalk] | None = None
+        self._idle_until_s = -np.inf
         self._work: Steps[Witness] | None = None
         self._said: Said | None = None
         self._alarmed: dict[str, tuple[float, float]] = {}
         self._answers: deque[tuple[float, Navigation]] = deque()
 
     def push(self, message: Message) -> None:
-        """Let the estimator take a message, and the witness make a step of its own."""
+        """Let the estimator take a message, and the witness make a step of its own.
+
+        Its time is that of the inertial data; the other clocks may be ahead.
+        """
         self.estimator.push(message)
+        if not (isinstance(message, ImuSample) and math.isfinite(message.time_s)):
+            return
         now_s = message.time_s + self.estimator.shift_s
         try:
             self._step(now_s)
@@ -163,7 +177,9 @@ class Witnessed:
         return self.estimator.checkpoint()
 
     def _step(self, now_s: float) -> None:
-        if self._is_answer_due(now_s):
+        if self._work is None and now_s < self._idle_until_s:
+            return
+        if self._walks is None or now_s >= self._answer_due_s:
             answer = self.estimator.newest()
             if answer is None:
                 return
@@ -180,15 +196,15 @@ class Witnessed:
             except StopIteration as end:
                 self._work = None
                 self._judge(end.value)
+        if self._walks is not None:
+            self._idle_until_s = min(self._answer_due_s, self._end_s + _DONE_S)
 
-    def _is_answer_due(self, now_s: float) -> bool:
-        """Return whether an answer is to be kept: where the set begins, and about a block's end."""
-        if self._walks is None:
-            return True
-        to_go_s = self._end_s - now_s
+    @property
+    def _answer_due_s(self) -> float:
+        """When an answer is to be kept next, for the end of a block; infinite where none is."""
         last_s = self._answers[-1][0] if self._answers else -np.inf
-        is_near = -LATEST_END_S - ANSWER_EVERY_S < to_go_s < 2.0 * ANSWER_EVERY_S
-        return is_near and now_s - last_s >= ANSWER_EVERY_S
+        due_s = max(last_s + ANSWER_EVERY_S, self._end_s - 2.0 * ANSWER_EVERY_S)
+        return due_s if due_s < self._end_s + LATEST_END_S + ANSWER_EVERY_S else np.inf
 
     @property
     def _end_s(self) -> float:
@@ -211,11 +227,13 @@ class Witnessed:
         if self._walks is None:
             return None
         end_s = self._end_s
-        if now_s < end_s + LATEST_END_S + LATE_S + MARGIN_S:
+        if now_s < end_s + _DONE_S:
             return None
         mission = self.estimator.received(self._begin_s - MARGIN_S, end_s + LATEST_END_S + MARGIN_S)
         assert mission is not None
         stamps = mission.imu.time_s
+        if stamps[-1] < end_s + LATEST_END_S and not self._is_known_until(end_s + LATEST_END_S):
+            return None  # the sample that told the time was refused
         stamps = stamps[(stamps >= self._begin_s - MARGIN_S) & (stamps <= end_s + LATEST_END_S)]
         if len(stamps) < 2 or np.max(np.diff(stamps)) > LONGEST_GAP_S:
             text = f"inertial data are missing before {end_s:.0f} s: the set begins anew"
@@ -227,6 +245,11 @@ class Witnessed:
         edges = block_edges(pings, self._begin_s, np.array([end_s]), end_s)
         self._begin_s, self._n_blocks = float(edges.time_s[-1]), self._n_blocks + 1
         return _block_steps(*self._walks, mission, edges)
+
+    def _is_known_until(self, time_s: float) -> bool:
+        """Return whether the estimator has come to a time; if so, what is missing is lost."""
+        answer = self.estimator.newest()
+        return answer is not None and answer.time_s + self.estimator.shift_s >= time_s
 
     def _judge(self, w: Witness) -> None:
         """Compare the answer of then with the set at the end of a block, and tell alarms."""

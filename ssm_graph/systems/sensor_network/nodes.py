@@ -71,6 +71,18 @@ class _Moment:
         """Take another prediction, of a past that more was heard of."""
         self.predicted = predicted
 
+    def of_runs(self, runs: Indices) -> _Moment:
+        """Return the same of some of the runs."""
+        return _Moment(
+            self.k,
+            self.predicted[runs],
+            self.advance[runs],
+            self.turn[runs],
+            self.values[runs],
+            None if self.sent is None else self.sent[runs],
+            self.came[runs],
+        )
+
 
 class SetNodes:
     """All nodes of R runs side by side, or one node: the recursion that is worth its bound.
@@ -149,6 +161,12 @@ class SetNodes:
         moment.sent = sent
         moment.came = moment.came | came
         self._due = k if self._due is None else min(k, self._due)
+
+    def go_on_with(self, runs: Indices) -> None:
+        """Lead some of the runs on, in the places of all; alarms keep the places they had."""
+        self._sets = self.sets[runs]
+        past = [moment.of_runs(runs) for moment in self._past]
+        self._past = deque(past, maxlen=self._past.maxlen)
 
     def _moment(self, k: int) -> _Moment | None:
         return next((m for m in self._past if m.k == k), None)

@@ -15,6 +15,7 @@ import numpy as np
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.filters.rules.ellipsoids import checked_shape
+from ssm_graph.systems.sensor_network.codes import Indices
 from ssm_graph.systems.sensor_network.motion import planar_step
 from ssm_graph.systems.sensor_network.setting import Setting
 
@@ -81,6 +82,10 @@ class PatentNodes:
         self.R = R if self.own.R is None else checked_shape("R", self.own.R)
         self.E = 0.5 * setting.step**2 * np.eye(2)
         self.s_sq = float(np.sum(np.square(setting.saturation)))
+
+    def go_on_with(self, runs: Indices) -> None:
+        """Lead some of the runs on, in the places of all."""
+        self.center, self.bound = self.center[runs], self.bound[runs]
 
     def _weights(self, *traces: Array) -> Array:
         stack = np.stack(np.broadcast_arrays(*traces), axis=-1)

@@ -9,6 +9,7 @@ import numpy as np
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.units import wrapped
+from ssm_graph.systems.sensor_network.codes import Indices
 from ssm_graph.systems.sensor_network.motion import planar_step
 from ssm_graph.systems.sensor_network.setting import Setting
 
@@ -32,6 +33,10 @@ class PointNodes:
         angle = setting.compass_bound or 1.0
         position = share * setting.position_bound**2 + setting.step**2 / 12.0
         self.R = np.array([position, position, share * angle**2])
+
+    def go_on_with(self, runs: Indices) -> None:
+        """Lead some of the runs on, in the places of all."""
+        self.center, self.covariance = self.center[runs], self.covariance[runs]
 
     def step(self, advance: Array, turn: Array, values: Array) -> None:
         """Predict, and use what came in time: values (R, N, senders, 3), NaN for none."""

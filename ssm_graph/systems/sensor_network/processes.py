@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
+import signal
 import socket
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from queue import Empty
+from multiprocessing.connection import Connection, wait
 from typing import Any, Final
 
 import numpy as np
@@ -29,10 +31,13 @@ from ssm_graph.systems.sensor_network.world import Disturbance, World
 HOST: Final = "127.0.0.1"
 LEAST_MEMORY: Final = 3
 """Steps that a packet may be late here, where nothing but the machine delays it."""
+EARLY: Final = 1
+"""Steps that a sender may be ahead; its packet waits for the step to begin here."""
 START_S: Final = 0.2
 """From the last process that is there to the first step."""
 PATIENCE_S: Final = 60.0
 """For processes to be there, and beyond a period for their reports."""
+SESSION_BYTES: Final = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,11 +53,22 @@ class Report:
     n_heard: int
     """Packets by now,"""
     n_refused: int
-    """and those of another key, another length or beyond memory."""
+    """and those of another key, another length, no such node, or of a step too early or late."""
     alarms: tuple[str, ...]
     """Raised by now."""
     n_bytes: int
     """Of a packet."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """A process that ended before its last step; the others go on, as if its packets were lost."""
+
+    node: int
+    """From 1."""
+    k: int
+    """Its last step that was reported."""
+    reason: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +81,8 @@ class Run:
     ports: tuple[int, ...]
     secrets: tuple[bytes | None, ...]
     """By node; all the same unless one has a wrong key."""
+    session: bytes
+    """New in every run, so that no packet of an earlier one is authentic in it."""
 
 
 def run_processes(
@@ -73,33 +91,44 @@ def run_processes(
     period_s: float = 0.2,
     seed: int = 0,
     secrets: tuple[bytes | None, ...] | None = None,
-) -> Iterator[Report]:
-    """Start a process a node, yield what they report, and end them.
+) -> Iterator[Report | Ended]:
+    """Start a process a node, yield what they report or that one ended, and end them.
 
     Nodes share measurements; what is lost is lost by the sender, at the rate of the setting.
     Each watches the same robot, drawn from the seed, in the place of its own sensors.
     """
     if not 0.01 <= period_s <= 60.0:
         raise ConfigError(f"--period: expected 0.01 to 60 s, got {period_s:g}")
+    if seed < 0:
+        raise ConfigError(f"--seed: expected 0 or more, got {seed}")
     setting = replace(setting, share=Share.MEASUREMENTS)
-    context = multiprocessing.get_context("spawn")
-    reports = context.Queue()
-    # Of the clock time.monotonic, which the machine's processes share; zero until all are there.
-    begin_s = context.Value("d", 0.0)
     keys = secrets or (None,) * setting.n_nodes
-    run = Run(setting, period_s, seed, _free_ports(setting.n_nodes), keys)
-    processes = [
-        context.Process(target=_node, args=(run, i, reports, begin_s), daemon=True)
-        for i in range(setting.n_nodes)
-    ]
+    for key in keys:
+        packet_form(setting, key, b"")  # what is refused is refused before any process is there
+    session = os.urandom(SESSION_BYTES)
+    run = Run(setting, period_s, seed, _free_ports(setting.n_nodes), keys, session)
+    context = multiprocessing.get_context("spawn")
+    # Of the clock time.monotonic, which the machine's processes share; zero until all are there.
+    begin_s = context.Value("d", 0.0, lock=False)
+    processes: list[Any] = []
+    pipes: dict[Any, int] = {}
     try:
-        for process in processes:
+        for i in range(setting.n_nodes):
+            # A pipe each: one that is killed takes no lock with it.
+            own, theirs = context.Pipe(duplex=False)
+            process = context.Process(
+                target=_node, args=(run, i, theirs, begin_s), name=f"node {i + 1}", daemon=True
+            )
             process.start()
-        for _ in processes:
-            _next(reports, processes, period_s)
+            theirs.close()
+            processes.append(process)
+            pipes[own] = i
+        waiting = dict(pipes)
+        while waiting:
+            for pipe, _ in _heard(waiting, period_s):
+                waiting.pop(pipe)
         begin_s.value = time.monotonic() + START_S
-        for _ in range(setting.n_nodes * setting.n_steps):
-            yield _next(reports, processes, period_s)
+        yield from _reports(pipes, processes, run)
     finally:
         for process in processes:
             process.join(timeout=1.0)
@@ -107,20 +136,45 @@ def run_processes(
                 process.terminate()
 
 
-def _next(reports: Any, processes: list[Any], period_s: float) -> Any:
-    """Return what a node says next; what one ended of is raised."""
-    for _ in range(int(PATIENCE_S + period_s)):
+def _reports(pipes: dict[Any, int], processes: list[Any], run: Run) -> Iterator[Report | Ended]:
+    """Yield what nodes report until the last has ended."""
+    last = [0] * len(processes)
+    while pipes:
+        for pipe, report in _heard(pipes, run.period_s):
+            if report is not None:
+                last[report.node - 1] = report.k
+                yield report
+                continue
+            i = pipes.pop(pipe)
+            if last[i] < run.setting.n_steps:
+                processes[i].join(timeout=PATIENCE_S)
+                code = processes[i].exitcode
+                how = f"by signal {-code}" if code and code < 0 else f"with code {code}"
+                yield Ended(i + 1, last[i], f"its process ended {how}")
+
+
+def _heard(pipes: dict[Any, int], period_s: float) -> list[tuple[Any, Report | None]]:
+    """Return what has come by which pipe; None where nothing will any more.
+
+    What a node says that it ended of is raised, and so is silence.
+    """
+    found: list[tuple[Any, Report | None]] = []
+    ready: list[Any] = wait(list(pipes), timeout=PATIENCE_S + period_s)
+    for pipe in ready:
         try:
-            said = reports.get(timeout=1.0)
-        except Empty:
-            if any(one.exitcode not in (None, 0) for one in processes):
-                break
-            continue
+            said = pipe.recv()
+        except (EOFError, OSError):
+            said = None
         if isinstance(said, str):
             raise SsmGraphError(said)
-        return said
-    dead = [i + 1 for i, one in enumerate(processes) if one.exitcode not in (None, 0)]
-    raise SsmGraphError(f"network-run: no report from nodes {dead or 'any'}; try again")
+        found.append((pipe, said))
+    if not found:
+        silent = ", ".join(str(i + 1) for i in sorted(pipes.values()))
+        raise SsmGraphError(
+            f"network-run: no report from nodes {silent} for {PATIENCE_S + period_s:.0f} s; is "
+            "the machine busy? try a longer --period"
+        )
+    return found
 
 
 def _free_ports(count: int) -> tuple[int, ...]:
@@ -134,10 +188,11 @@ def _free_ports(count: int) -> tuple[int, ...]:
             one.close()
 
 
-def packet_form(setting: Setting, secret: bytes | None) -> PacketForm:
+def packet_form(setting: Setting, secret: bytes | None, session: bytes) -> PacketForm:
     """Return the packets of a setting: two positions, and a heading where there is a compass."""
     heading = (HEADING_BITS,) if setting.compass_bound is not None else ()
-    return PacketForm((setting.bits,) * 2 + heading, Keystream(secret) if secret else None)
+    keystream = None if secret is None else Keystream(secret).of_session(session)
+    return PacketForm((setting.bits,) * 2 + heading, keystream)
 
 
 def packed_values(form: PacketForm, setting: Setting, node: int, k: int, values: Array) -> bytes:
@@ -163,30 +218,34 @@ def unpacked_values(form: PacketForm, setting: Setting, packet: bytes) -> tuple[
     return node, k, values
 
 
-def _node(run: Run, i: int, reports: Any, begin_s: Any) -> None:
+def _node(run: Run, i: int, reports: Connection, begin_s: Any) -> None:
     """Be node i, from 0, until all steps are done."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # of a terminal: who started all ends all
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as own:
             own.bind((HOST, run.ports[i]))
             node = _Node(run, i, own, reports)
-            reports.put(None)
+            reports.send(None)
             while not begin_s.value:
                 time.sleep(0.01)
             node.go(begin_s.value)
+    except BrokenPipeError:
+        return  # nobody listens any more
     except (SsmGraphError, OSError) as error:
-        reports.put(f"node {i + 1}: {error}")
+        reports.send(f"node {i + 1}: {error}")
 
 
 class _Node:
-    def __init__(self, run: Run, i: int, own: socket.socket, reports: Any) -> None:
+    def __init__(self, run: Run, i: int, own: socket.socket, reports: Connection) -> None:
         self._run, self._i, self._socket, self._reports = run, i, own, reports
         setting = run.setting
         self._world = World(setting, Disturbance.UNIFORM, 1, run.seed)
-        memory = max(setting.delay[1], LEAST_MEMORY)
-        self._sets = SetNodes(
-            setting, center=self._world.first[:, i : i + 1], memory=memory, nodes=np.array([i])
-        )
-        self._form = packet_form(setting, run.secrets[i])
+        self._memory = max(setting.delay[1], LEAST_MEMORY)
+        center, nodes = self._world.first[:, i : i + 1], np.array([i])
+        self._sets = SetNodes(setting, center=center, memory=self._memory, nodes=nodes)
+        self._early: dict[tuple[int, int], Array] = {}
+        """Values by step and sender."""
+        self._form = packet_form(setting, run.secrets[i], run.session)
         self._to = [run.ports[a - 1] for a, b in setting.edges if b == i + 1]
         self._rng = np.random.default_rng([run.seed, i, *b"loss"])
         self._n_heard = self._n_refused = 0
@@ -208,6 +267,9 @@ class _Node:
                 HEADING_STEP * np.floor(mine[2] / HEADING_STEP + 0.5),
             )
             self._hear(k, self._i, read)
+            for (step, sender), values in self._early.items():
+                self._hear(step, sender, values)
+            self._early.clear()
             for port in self._to:
                 if self._rng.random() >= setting.loss:
                     self._socket.sendto(packet, (HOST, port))
@@ -231,11 +293,14 @@ class _Node:
             except DataError:
                 self._n_refused += 1
                 continue
-            if k > self._sets.k:  # of a node whose clock is ahead by a little
+            if not max(self._sets.k - self._memory, 1) <= k <= self._sets.k + EARLY:
                 self._n_refused += 1
                 continue
             self._n_heard += 1
-            self._hear(k, sender, values)
+            if k > self._sets.k:
+                self._early[k, sender] = values
+            else:
+                self._hear(k, sender, values)
 
     def _report(self, k: int) -> None:
         now = self._sets.sets
@@ -243,7 +308,7 @@ class _Node:
         b, c, d = (float(v) for v in now.half_widths[0, 0])
         holds = bool(now.excess(self._world.state[:, None])[0, 0] <= 1.0 + 1e-9)
         alarms = tuple(alarm.sentence for alarm in self._sets.alarms)
-        self._reports.put(
+        self._reports.send(
             Report(
                 self._i + 1,
                 k,

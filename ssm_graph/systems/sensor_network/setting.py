@@ -13,10 +13,18 @@ import numpy as np
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array, Vector
 from ssm_graph.base.settings import read_toml
-from ssm_graph.systems.sensor_network.codes import require_step
+from ssm_graph.systems.sensor_network.codes import MOST_BITS, require_step
 
 KINDS: Final = ("network", "fleet")
 """Of a study."""
+_ABOVE_ZERO: Final = {
+    "saturation": 3,
+    "motion_bound": 3,
+    "position_bound": 1,
+    "initial_variance": 1,
+    "true_scale": 1,
+}
+"""What has to be positive and finite, and of how many numbers it is."""
 FLOOR_SHARE: Final = 1e-3
 """Of the least bound: the half-width below which no cut makes a set thinner."""
 RING: Final = ((1, 2), (1, 4), (2, 1), (2, 3), (3, 2), (3, 4), (4, 3), (4, 1))
@@ -74,9 +82,14 @@ class Setting:
         require_step(self.d)
         if not (math.isfinite(self.key) and self.key > 0.0):
             raise ConfigError(f"[code] key: expected a number above 0, got {self.key}; try 1.0")
-        for name in ("saturation", "motion_bound", "position_bound", "initial_variance"):
-            if not np.all(np.asarray(getattr(self, name)) > 0.0):
-                raise ConfigError(f"[setting] {name}: expected above 0, got {getattr(self, name)}")
+        require_step(self.step)
+        for name, n in _ABOVE_ZERO.items():
+            value = np.asarray(getattr(self, name), dtype=np.float64)
+            if value.size != n or not np.all((value > 0.0) & np.isfinite(value)):
+                text = f"expected {f'{n} numbers' if n > 1 else 'a number'} above 0"
+                raise ConfigError(f"[setting] {name}: {text}, got {getattr(self, name)}")
+        if not 1 <= self.bits <= MOST_BITS:
+            raise ConfigError(f"[code] bits: expected 1 to {MOST_BITS}, got {self.bits}")
         if self.compass_bound is not None and not 0.0 < self.compass_bound < math.pi:
             raise ConfigError(
                 f"[setting] compass_bound: expected between 0 and pi rad, got {self.compass_bound}"

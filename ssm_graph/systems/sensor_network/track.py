@@ -118,8 +118,10 @@ def block_edges(pings_s: Array, begin_s: float, ends_s: Array, last_s: float) ->
 
 def mission_edges(mission: Mission, begin_s: float, block_s: float) -> Edges:
     """Return the edges of all blocks of a mission from a time on."""
+    last = float(mission.imu.time_s[-1])
     pings_s = mission.dvl.of_ground().valid_s
-    last = min(float(mission.imu.time_s[-1]), float(pings_s[-1]) + block_s)
+    pings_s = pings_s[pings_s <= last]
+    last = min(last, float(pings_s[-1] if len(pings_s) else begin_s) + block_s)
     if (last - begin_s) / block_s > _MOST_BLOCKS:
         raise ConfigError(
             f"block_s: expected at most {_MOST_BLOCKS} blocks in {last - begin_s:.6g} s, got "

@@ -13,9 +13,9 @@ it. Bounds are so many sigmas of what the mission states. In blocks of some seco
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,8 @@ _RADIUS_M: Final = 6.37e6
 _FLOOR: Final = np.array([1e-3, 1e-3, 1e-6])
 """m, m, rad: half-widths that no cut goes below."""
 _NOTHING: Final = np.arange(0)
+LONGEST_GAP_S: Final = 0.5
+"""Of inertial data: over more nothing bounds the motion. It is what a step may be at most."""
 BOUNDED: Final = ("DVL", "GNSS", "depth", "compass", "gyros", "accelerometers")
 """Whose bounds may be stated apart."""
 
@@ -74,6 +76,9 @@ class WitnessBounds:
         for name in ("sigmas", "block_s", "silence_s"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
                 raise ConfigError(f"{name}: expected above 0, got {getattr(self, name)}")
+        for name in ("velocity_m_per_s", "speed_share"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
+                raise ConfigError(f"{name}: expected 0 or more, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,14 +153,35 @@ def witness(mission: Mission, start: InitialState, bounds: WitnessBounds | None 
     Raises
     ------
     DataError
-        Without pings off the ground after the start.
+        Without pings off the ground after the start, or where inertial data are missing for more
+        than `LONGEST_GAP_S`.
     """
     own = bounds or WitnessBounds()
     if len(mission.dvl.of_ground().time_s) < 2:
         raise DataError("witness: expected two pings off the ground or more, got fewer")
+    stamps = mission.imu.time_s[mission.imu.time_s >= start.time_s]
+    for at in np.flatnonzero(np.diff(stamps) > LONGEST_GAP_S):
+        raise DataError(
+            f"witness: inertial data are missing from {stamps[at]:.3f} to {stamps[at + 1]:.3f} s; "
+            f"over more than {LONGEST_GAP_S:g} s no bound holds; check_integrity begins anew there"
+        )
     walk = VelocityWalk(mission, start, own)
     edges = mission_edges(mission, walk.begin_s, own.block_s)
     return PlaceWalk(mission.frame, start, own).follow(mission, walk.follow(mission, edges))
+
+
+def joined(parts: Sequence[Witness]) -> Witness:
+    """Return sets that follow each other as one."""
+    if len(parts) == 1:
+        return parts[0]
+    found: dict[str, Any] = {}
+    for name in Witness.__slots__:
+        values = [getattr(part, name) for part in parts]
+        if isinstance(values[0], np.ndarray):
+            found[name] = np.concatenate(values)
+        else:
+            found[name] = sum(values[1:], start=values[0])
+    return Witness(**found)
 
 
 class PlaceWalk:

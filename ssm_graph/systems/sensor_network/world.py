@@ -12,6 +12,7 @@ import numpy as np
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array, ReadOnlyArrays
 from ssm_graph.filters.rules.ellipsoids import Ellipsoids, Mask
+from ssm_graph.filters.rules.set_membership import Sets
 from ssm_graph.systems.sensor_network.codes import HEADING_STEP, Indices, UniformCode
 from ssm_graph.systems.sensor_network.motion import planar_step
 from ssm_graph.systems.sensor_network.nodes import Alarm, SetNodes
@@ -29,6 +30,7 @@ class Disturbance(Enum):
     UNIFORM = "uniform in the box"
     CORNER = "random corners of the box"
     ADVERSARY = "the corner that takes the truth furthest out of the first node's set"
+    SEARCH = "random corners; the half of the runs that came furthest out is led on twice"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,7 +81,7 @@ def noise_at(
     """
     if kind is Disturbance.UNIFORM:
         return np.asarray(bound * rng.uniform(-1.0, 1.0, shape))
-    if kind is Disturbance.CORNER:
+    if kind in (Disturbance.CORNER, Disturbance.SEARCH):
         return np.asarray(bound * rng.choice([-1.0, 1.0], shape))
     if kind is Disturbance.ADVERSARY:
         free = np.where(towards == 0.0, rng.choice([-1.0, 1.0], shape), np.sign(towards))
@@ -142,6 +144,10 @@ class World:
             values[..., 2] = self.state[:, None, 2] + u[..., 0]
         return values
 
+    def go_on_with(self, runs: Indices) -> None:
+        """Lead some of the runs on, in the places of all."""
+        self.state = self.state[runs]
+
     def arrivals(self) -> tuple[Mask, Indices]:
         """Return which packets come, by receiver and sender (R, N, N), and after how many steps."""
         setting = self.setting
@@ -160,6 +166,7 @@ def run_sets(
     points = PointNodes(setting, center=world.first, is_corner=kind is not Disturbance.UNIFORM)
     code, rows = UniformCode(setting.step), _Rows(keep)
     due: dict[int, list[tuple[int, Array, Mask]]] = defaultdict(list)
+    due_sets: dict[int, list[tuple[int, Sets, Mask]]] = defaultdict(list)
     me = np.eye(setting.n_nodes, dtype=bool)
     cpu = 0.0
     for k in range(1, setting.n_steps + 1):
@@ -182,15 +189,37 @@ def run_sets(
             nodes.hear(step, np.where(mask[..., None], one, np.nan))
         nodes.hear(k, np.where(now[..., None], by_receiver, np.nan))
         if setting.share is Share.ELLIPSOIDS:
-            _exchange(nodes, k, comes, late, due)
+            _exchange(nodes, k, comes, late, due_sets)
         nodes.sets.half_widths  # noqa: B018  (what was heard is used when it is asked for)
         cpu += time.process_time() - begin
         points.step(advance, turn, np.where(now[..., None], by_receiver, np.nan))
         rows.add(world.state, nodes, points)
+        if kind is Disturbance.SEARCH:
+            best = furthest(nodes.sets.ellipsoid, world.state)
+            world.go_on_with(best)
+            nodes.go_on_with(best)
+            points.go_on_with(best)
+            for waiting in due.values():
+                waiting[:] = [(step, one[best], mask[best]) for step, one, mask in waiting]
+            for late_sets in due_sets.values():
+                late_sets[:] = [(step, one[best], mask[best]) for step, one, mask in late_sets]
     return rows.trial(nodes, setting, cpu)
 
 
-def _exchange(nodes: SetNodes, k: int, comes: Mask, late: Indices, due: dict[int, list]) -> None:  # type: ignore[type-arg]
+def furthest(sets: Ellipsoids, state: Array) -> Indices:
+    """Return which runs (R,) a search goes on with, from sets (R, N) and the truth (R, 3)."""
+    far = sets.excess(state[:, None]).max(axis=1)
+    kept = np.argsort(-far, kind="stable")[: (len(far) + 1) // 2]
+    return np.asarray(np.concatenate([kept, kept])[: len(far)], dtype=np.int64)
+
+
+def _exchange(
+    nodes: SetNodes,
+    k: int,
+    comes: Mask,
+    late: Indices,
+    due: dict[int, list[tuple[int, Sets, Mask]]],
+) -> None:
     for delay in range(nodes.setting.delay[1] + 1):
         due[k + delay].append((k, nodes.sets, comes & (late == delay)))
     for step, sent, mask in due.pop(k, []):
@@ -260,12 +289,16 @@ def run_patent(
         begin = time.process_time()
         nodes.hear(code.value(code.index(values)))
         cpu += time.process_time() - begin
-        now = Ellipsoids(nodes.center.copy(), nodes.bound.copy())
+        now, state = Ellipsoids(nodes.center.copy(), nodes.bound.copy()), world.state
+        if kind is Disturbance.SEARCH:
+            best = furthest(now, state)
+            world.go_on_with(best)
+            nodes.go_on_with(best)
         found = {
-            "truth": world.state,
+            "truth": state,
             "center": now.center,
             "half_widths": now.half_widths,
-            "excess": now.excess(world.state[:, None]),
+            "excess": now.excess(state[:, None]),
             "log_volume": now.log_volume,
             "shape": now.shape[0],
             "around": now.center[0],

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -220,6 +223,22 @@ def test_bad_shapes_are_refused(shape: Array, expected: str) -> None:
     """With the name of what they are."""
     with pytest.raises(DataError, match=f"P_0.*{expected}"):
         checked_shape("P_0", shape)
+
+
+def test_every_inequality_of_the_page_has_its_tests() -> None:
+    """What docs/network.md names is there."""
+    here = Path(__file__).parent
+    rows = [
+        line
+        for line in (here.parents[2] / "docs" / "network.md").read_text("utf-8").splitlines()
+        if line.startswith("| **")
+    ]
+    tests = "".join(path.read_text("utf-8") for path in here.glob("test_*.py"))
+    named = [re.findall(r"`(?:\.\.\.)?(\w*_\w+)`", row.split(" | ")[-1]) for row in rows]
+    assert len(rows) >= 20
+    for row, names in zip(rows, named, strict=True):
+        assert names, row
+        assert not [name for name in names if f"{name}(" not in tests], row
 
 
 def test_one_component_is_no_ellipsoid() -> None:

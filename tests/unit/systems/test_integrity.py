@@ -12,19 +12,7 @@ import pytest
 from ssm_graph import Estimate, Mission, SmootherConfig, smooth
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.mission.fault import Treatment
-from ssm_graph.simulation import (
-    DvlSettings,
-    Fault,
-    FaultShape,
-    GnssSettings,
-    Grade,
-    Sensor,
-    SimulatedMission,
-    SimulationConfig,
-    SurveyRoute,
-    simulate,
-    with_faults,
-)
+from ssm_graph.simulation import Fault, FaultShape, Sensor, SimulatedMission, with_faults
 from ssm_graph.systems.sensor_network.integrity import (
     Agreement,
     check_integrity,
@@ -32,6 +20,7 @@ from ssm_graph.systems.sensor_network.integrity import (
     write_integrity,
 )
 from ssm_graph.systems.sensor_network.witness import Witness, WitnessBounds, witness
+from tests.witness_fixture import a_survey
 
 END_S = 80.0
 
@@ -39,16 +28,7 @@ END_S = 80.0
 @pytest.fixture(scope="module")
 def simulated() -> SimulatedMission:
     """Return a survey with fixes and depth, without faults."""
-    return simulate(
-        SimulationConfig(
-            route=SurveyRoute(line_m=40.0),
-            duration_s=END_S,
-            seed=21,
-            grade=Grade.TACTICAL,
-            dvl=DvlSettings(noise=0.005),
-            gnss=GnssSettings(windows=((0.0, END_S),)),
-        )
-    )
+    return a_survey(seed=21, end_s=END_S)
 
 
 @pytest.fixture(scope="module")
@@ -160,6 +140,24 @@ def test_alarms_that_are_close_are_one_finding(
     assert fault.end_s - fault.begin_s > 15.0
 
 
+def test_over_a_gap_of_inertial_data_the_set_begins_anew(
+    simulated: SimulatedMission, answer: Estimate
+) -> None:
+    """Nothing bounds what happens in it: an alarm would prove nothing."""
+    imu = simulated.mission.imu
+    kept = (imu.time_s < 33.7) | (imu.time_s > 38.7)
+    gap = replace(imu, time_s=imu.time_s[kept], gyro_b=imu.gyro_b[kept], accel_b=imu.accel_b[kept])
+    mission = replace(simulated.mission, imu=gap)
+    with pytest.raises(DataError, match=r"missing from 33\.69\d to 38\.71\d s"):
+        of(mission)
+    found = check_integrity(mission, answer)
+    assert found.agreement is Agreement.INSIDE
+    assert "missing after 34 s" in found.reason
+    w = found.witness
+    assert not np.any((w.time_s > 33.7) & (w.time_s < 38.7))
+    assert holds_truth(mission, w, simulated.truth_at(w.time_s)).all()
+
+
 def test_what_cannot_be_used_is_refused(simulated: SimulatedMission) -> None:
     """No pings; bounds that are none."""
     mission = simulated.mission
@@ -170,3 +168,5 @@ def test_what_cannot_be_used_is_refused(simulated: SimulatedMission) -> None:
         of(replace(mission, dvl=none))
     with pytest.raises(ConfigError, match="sigmas: expected above 0"):
         WitnessBounds(sigmas=0.0)
+    with pytest.raises(ConfigError, match="speed_share: expected 0 or more, got nan"):
+        WitnessBounds(speed_share=np.nan)

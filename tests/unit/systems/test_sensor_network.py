@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import multiprocessing
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,7 +33,7 @@ from ssm_graph.systems.sensor_network.patent import (
     Saturation,
     balanced,
 )
-from ssm_graph.systems.sensor_network.processes import run_processes
+from ssm_graph.systems.sensor_network.processes import Ended, run_processes
 from ssm_graph.systems.sensor_network.setting import (
     COMPASS,
     PATENT,
@@ -39,7 +41,14 @@ from ssm_graph.systems.sensor_network.setting import (
     Setting,
     Share,
 )
-from ssm_graph.systems.sensor_network.study import read_network_study, table_1
+from ssm_graph.systems.sensor_network.study import (
+    NetworkResult,
+    NetworkStudy,
+    Row,
+    plain_words,
+    read_network_study,
+    table_1,
+)
 from ssm_graph.systems.sensor_network.world import Disturbance, World, run_patent, run_sets
 
 KEY = b"sixteen bytes ok"
@@ -140,14 +149,14 @@ def test_what_is_too_late_changes_nothing() -> None:
     assert nodes.sets is before
 
 
-def test_loss_and_delay_keep_the_truth_inside() -> None:
+@pytest.mark.parametrize("share", [Share.MEASUREMENTS, Share.ELLIPSOIDS])
+def test_loss_and_delay_keep_the_truth_inside(share: Share) -> None:
     """The sets are wider for it, and that is all."""
-    lossy = replace(COMPASS, share=Share.MEASUREMENTS, loss=0.3, delay=(1, 5), n_steps=12)
-    trial = run_sets(lossy, Disturbance.UNIFORM, runs=2, seed=9)
-    whole = run_sets(
-        replace(COMPASS, share=Share.MEASUREMENTS, n_steps=12), Disturbance.UNIFORM, runs=2, seed=9
+    setting = replace(COMPASS, share=share, n_steps=12)
+    lossy, deaf = replace(setting, loss=0.3, delay=(1, 5)), replace(setting, share=Share.NONE)
+    whole, trial, alone = (
+        run_sets(one, Disturbance.UNIFORM, runs=2, seed=9) for one in (setting, lossy, deaf)
     )
-    alone = run_sets(replace(COMPASS, n_steps=12), Disturbance.UNIFORM, runs=2, seed=9)
     assert trial.excess.max() <= 1.0 + 1e-9
     assert not trial.alarms
     widths = [one.half_widths[..., :2].mean() for one in (whole, trial, alone)]
@@ -216,6 +225,16 @@ def test_a_packet_of_another_key_is_refused_and_hides_what_it_says() -> None:
         form.packed(1, 5, np.array([2**13, 0]))
 
 
+def test_a_packet_of_an_earlier_session_is_refused() -> None:
+    """Recorded with the very key, and sent again when the steps begin anew."""
+    key = Keystream(KEY)
+    first, second = (PacketForm((13,), key.of_session(bytes([n]))) for n in (1, 2))
+    packet = first.packed(1, 5, np.array([100]))
+    assert first.unpacked(packet)[2].tolist() == [100]
+    with pytest.raises(NotAuthenticError):
+        second.unpacked(packet)
+
+
 def test_parameters_of_the_patent_are_valid_and_least() -> None:
     """``sum 1/c <= 1`` is Lemma 2's condition; the trace is ``(sum sqrt tr)^2``."""
     traces = np.random.default_rng(4).uniform(0.1, 9.0, (50, 4))
@@ -277,6 +296,9 @@ def test_bits() -> None:
         ('name = "x"\n[network]\nedges = [[1, 1]]', "two different nodes"),
         ('name = "x"\n[network]\nedges = [[1, 9]]', "got \\(1, 9\\)"),
         ('name = "x"\n[setting]\nsaturation = [1.0, 0.0, 1.0]', "saturation: expected"),
+        ('name = "x"\n[network]\nedges = [[1.5, 2]]', "edges: expected whole numbers"),
+        ('name = "x"\n[network]\ndelay_steps = [0.5, 2]', "delay_steps: expected whole"),
+        ('name = "x"\n[code]\nd = 1e-200\nkey = 1e-200', "step: expected a number above 0"),
         ('name = "x"\n[network]\nloss = 1.5', "loss: expected"),
         ('name = "x"\n[network]\ndelay_steps = [3, 1]', "least and largest"),
         ('name = "x"\ndisturbances = "storm"', "unknown 'storm'"),
@@ -291,6 +313,41 @@ def test_bad_studies_are_refused(text: str, said: str, tmp_path: Path) -> None:
     path.write_text(text)
     with pytest.raises(ConfigError, match=f"bad.toml.*{said}"):
         read_network_study(path)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("position_bound", np.inf),
+        ("motion_bound", (0.1, np.nan, 0.1)),
+        ("saturation", (1.0, 2.0)),
+        ("true_scale", -1.0),
+        ("bits", 64),
+    ],
+)
+def test_settings_that_bound_nothing_are_refused(field: str, value: Any) -> None:
+    """From Python, where no file is checked."""
+    with pytest.raises(ConfigError, match=f"{field}: expected"):
+        replace(PATENT, **{field: value})
+
+
+def test_nodes_may_all_be_deaf(tmp_path: Path) -> None:
+    """An empty list of edges is a list."""
+    path = tmp_path / "deaf.toml"
+    path.write_text('name = "x"\n[network]\nedges = []')
+    assert read_network_study(path).setting.deaf == (1, 2, 3, 4)
+
+
+@pytest.mark.parametrize(("heading_rad", "is_vacuous"), [(78.0, True), (18.0, False)])
+def test_a_bound_inside_the_walls_is_not_called_vacuous(
+    heading_rad: float, is_vacuous: bool
+) -> None:
+    """The walls of the heading are at ± 20 rad; which of the two it is, the numbers say."""
+    row = Row("patent", "uniform", 1.0, 1.0, 1.0, 10.0, heading_rad, 0.5, 0, 12, 0, 1.0)
+    nothing = {key: {0.05: (1.0,), 0.01: (1.0,)} for key in (1.0, 100.0)}
+    words = plain_words(NetworkResult(NetworkStudy(PATENT), (row,), nothing))[0]
+    assert "held in 12 checks" in words
+    assert ("vacuous" in words) is is_vacuous
 
 
 def test_a_secret_that_is_short_is_refused() -> None:
@@ -321,11 +378,24 @@ def test_the_command_writes_page_and_table(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_nodes_as_processes_hold_the_truth_and_refuse_another_key() -> None:
-    """By UDP on this machine, encrypted; node 2 has another key and stays alone."""
-    setting = replace(COMPASS, n_steps=4, d=0.1, bits=8)
-    secrets = (KEY, KEY[::-1], KEY, KEY)
-    last = {r.node: r for r in run_processes(setting, period_s=0.5, seed=11, secrets=secrets)}
+    """By UDP on this machine, encrypted; node 2 has another key and stays alone.
+
+    Node 3 is killed on the way: it is told, and the others go on.
+    """
+    setting = replace(COMPASS, n_steps=5, d=0.1, bits=8)
+    secrets, last, ended = (KEY, KEY[::-1], KEY, KEY), {}, []
+    for said in run_processes(setting, period_s=0.5, seed=11, secrets=secrets):
+        if isinstance(said, Ended):
+            ended.append(said)
+            continue
+        last[said.node] = said
+        if said.node == 3 and said.k == 2:
+            (victim,) = (p for p in multiprocessing.active_children() if p.name == "node 3")
+            victim.kill()
     assert all(report.holds_truth for report in last.values())
     assert last[2].n_heard == 0
     assert last[1].n_refused > 0
     assert last[4].n_heard > 0
+    assert [(one.node, one.reason) for one in ended] == [(3, "its process ended by signal 9")]
+    assert {last[node].k for node in (1, 2, 4)} == {5}
+    assert last[3].k < 5

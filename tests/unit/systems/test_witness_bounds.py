@@ -11,18 +11,11 @@ import pytest
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
 from ssm_graph.mission.mission import Mission
-from ssm_graph.simulation import (
-    DvlSettings,
-    GnssSettings,
-    Grade,
-    SimulatedMission,
-    SimulationConfig,
-    SurveyRoute,
-    simulate,
-)
+from ssm_graph.simulation import SimulatedMission
 from ssm_graph.systems.sensor_network.block import Block
 from ssm_graph.systems.sensor_network.integrity import holds_truth
 from ssm_graph.systems.sensor_network.witness import WitnessBounds, witness
+from tests.witness_fixture import a_survey
 
 END_S = 80.0
 EARTH_M = 6.37e6
@@ -31,17 +24,7 @@ EARTH_M = 6.37e6
 @pytest.fixture(scope="module")
 def simulated() -> SimulatedMission:
     """Return a survey with depth and, for its second half, fixes."""
-    return simulate(
-        SimulationConfig(
-            route=SurveyRoute(line_m=30.0),
-            duration_s=END_S,
-            seed=41,
-            grade=Grade.TACTICAL,
-            dvl=DvlSettings(noise=0.005),
-            gnss=GnssSettings(windows=((40.0, END_S),)),
-            imu_rate_hz=50.0,
-        )
-    )
+    return a_survey(seed=41, end_s=END_S, imu_rate_hz=50.0, line_m=30.0, fixes_from_s=40.0)
 
 
 def led(gains: Array, dt: float) -> Block:

@@ -21,22 +21,11 @@ from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.navigation import Event, Health, Navigation
 from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.sensors.messages import Message
-from ssm_graph.simulation import (
-    DvlSettings,
-    Fault,
-    FaultShape,
-    GnssSettings,
-    Grade,
-    Sensor,
-    SimulatedMission,
-    SimulationConfig,
-    SurveyRoute,
-    simulate,
-    with_faults,
-)
+from ssm_graph.simulation import Fault, FaultShape, Sensor, SimulatedMission, with_faults
 from ssm_graph.systems.sensor_network.live import Witnessed, start_of
 from ssm_graph.systems.sensor_network.witness import WitnessBounds, witness
 from tests.live_fixture import a_navigation
+from tests.witness_fixture import a_survey
 
 END_S = 62.0
 EARTH_M = 6.37e6
@@ -45,17 +34,7 @@ EARTH_M = 6.37e6
 @pytest.fixture(scope="module")
 def simulated() -> SimulatedMission:
     """Return a survey with fixes and depth."""
-    return simulate(
-        SimulationConfig(
-            route=SurveyRoute(line_m=40.0),
-            duration_s=END_S,
-            seed=31,
-            grade=Grade.TACTICAL,
-            dvl=DvlSettings(noise=0.005),
-            gnss=GnssSettings(windows=((0.0, END_S),)),
-            imu_rate_hz=50.0,
-        )
-    )
+    return a_survey(seed=31, end_s=END_S, imu_rate_hz=50.0)
 
 
 class TruthTeller:
@@ -73,8 +52,9 @@ class TruthTeller:
         return self._buffers.mission(frame, begin_s=begin_s, until_s=end_s)
 
     def push(self, message: Message) -> None:
-        """Take a message."""
-        self._buffers.add(message)
+        """Take a message, but none that is stamped beyond the end, or not at all."""
+        if message.time_s <= END_S:
+            self._buffers.add(message)
 
     def newest(self) -> Navigation | None:
         """Return the truth at the last inertial sample."""
@@ -160,6 +140,23 @@ def test_the_true_answer_is_within_what_is_told(simulated: SimulatedMission) -> 
     assert len(judged) >= 5
     assert all(0.3 < answer.witness_m < 4.0 for answer in judged)
     assert not live.take_events()
+
+
+def test_stamps_of_nowhere_begin_no_block_early(simulated: SimulatedMission) -> None:
+    """A sample or a fix of another time, or of none: the estimator refuses it, nothing is told."""
+    told: list[Message] = []
+    for message in messages_of(simulated.mission):
+        if len(told) % 997 == 0:
+            told += [replace(message, time_s=t) for t in (math.nan, message.time_s + 1000.0)]
+        told.append(message)
+    live, plain = (Witnessed(TruthTeller(simulated)) for _ in range(2))
+    for message in told:
+        live.push(message)
+    run(plain, simulated.mission)
+    assert not live.take_events()
+    assert live.last is not None
+    assert plain.last is not None
+    assert np.array_equal(live.last.shape, plain.last.shape)
 
 
 def test_an_alarm_names_sensor_and_time_and_voids_the_promise(simulated: SimulatedMission) -> None:
