@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import ClassVar, Final, NamedTuple
 
 import numpy as np
-from scipy.ndimage import map_coordinates
 
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import DataError
@@ -120,6 +119,8 @@ class SeabedGrid(FrozenArrays):
         return np.where(np.isfinite(found), found, errors.sigma_m)
 
     def _between(self, values: Array, x: Array, y: Array) -> Array:
+        from scipy.ndimage import map_coordinates
+
         rows, columns = self._cells(x, y)
         found = map_coordinates(values, [rows, columns], order=1, mode="constant", cval=np.nan)
         return np.asarray(found, dtype=np.float64)
