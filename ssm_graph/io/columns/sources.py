@@ -133,7 +133,7 @@ def _csv(path: Path) -> Source:
     heads = csv.reader([head], delimiter=delimiter, skipinitialspace=True)
     names = [name.strip() for name in next(heads)]
     _check_names(path, at + 1, names)
-    rows, numbers = [], []
+    rows, numbers = list[list[str]](), list[int]()
     reader = csv.reader(lines[at + 1 :], delimiter=delimiter, skipinitialspace=True)
     number = at + 1
     for row in told(reader, len(lines) - at):
