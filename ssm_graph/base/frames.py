@@ -12,7 +12,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 
@@ -68,6 +67,8 @@ def turned(vector: tuple[float, float, float], axes: BodyAxes) -> tuple[float, f
 
 def rotation_zyx(yaw: Array | float, pitch: Array | float, roll: Array | float) -> Array:
     """Return ``Rz(yaw) Ry(pitch) Rx(roll)``, (..., 3, 3), radians."""
+    from scipy.spatial.transform import Rotation
+
     angles = np.stack(np.broadcast_arrays(yaw, pitch, roll), axis=-1).astype(float)
     matrix = Rotation.from_euler("ZYX", angles.reshape(-1, 3)).as_matrix()
     return np.asarray(matrix).reshape(*angles.shape, 3)

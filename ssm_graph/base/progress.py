@@ -46,6 +46,19 @@ def told(
     return pieces if listener is None or total <= 0.0 else _telling(pieces, total, size, listener)
 
 
+def teller(total: float) -> Callable[[float], None]:
+    """Return what takes how much of a total is done, for loops over no row of pieces."""
+    listener, due = _listener.get(), 0.0
+
+    def tell(done: float) -> None:
+        nonlocal due
+        if listener is not None and total > 0.0 and done >= due:
+            listener(min(1.0, done / total))
+            due = done + _STEP * total
+
+    return tell
+
+
 def _telling(
     pieces: Iterable[T],
     total: float,

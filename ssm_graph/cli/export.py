@@ -14,6 +14,7 @@ from ssm_graph.cli.terminal import say
 from ssm_graph.io.export.formats import FORMATS, export_track
 from ssm_graph.io.results.place import check_output_file
 from ssm_graph.io.results.tables import read_results
+from ssm_graph.report.terminal.progress import ProgressDisplay
 
 DESCRIPTION = f"""\
 Write the trajectory of a result folder in other formats:
@@ -91,7 +92,10 @@ def export(
         is_whole = is_file and len(names) == 1 and bool(out.suffix)
         path = out if is_whole else out / f"{stem}{asked.suffix}{suffix}"
         check_output_file(path, *([arguments.at] if arguments.at else []))
-        for written in export_track(asked.track, name, path):
+        with ProgressDisplay(errors) as show:
+            show.stage(f"writing {path}")
+            files = export_track(asked.track, name, path)
+        for written in files:
             say(console, f"{written}: {written.stat().st_size:,} bytes")
     said = read_results(result).summary.get("local_start")
     if said:

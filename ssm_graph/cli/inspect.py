@@ -16,6 +16,7 @@ from rich.text import Text
 from ssm_graph.base.times import UNIX_FROM_S, UNIX_UNTIL_S
 from ssm_graph.cli.terminal import say
 from ssm_graph.io.file_kind import check_is_file
+from ssm_graph.report.terminal.progress import ProgressDisplay
 
 DESCRIPTION = """\
 Say what is at a path, by its content: format; of every sensor rows, rate, jitter, gaps, repeats and
@@ -50,7 +51,9 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     from ssm_graph.inspection.look import inspect_path
 
     check_is_file(arguments.path)
-    found = inspect_path(arguments.path)
+    with ProgressDisplay(errors) as show:
+        show.stage(f"reading {arguments.path}")
+        found = inspect_path(arguments.path)
     if arguments.draft_map is not None:
         _draft(arguments.path, arguments.draft_map, errors)
     if arguments.json:
@@ -75,7 +78,9 @@ def _draft(path: Path, out: Path, errors: Console) -> None:
     tables = [one for one in inside if not path.is_dir() or one.suffix.lower() in ENDINGS]
     if not tables:
         raise DataError(f"{path}: no table ({', '.join(ENDINGS)}) to draft a map of")
-    drafted = draft_map(*map(read_source, tables))
+    with ProgressDisplay(errors) as show:
+        show.stage(f"drafting a map of {path}")
+        drafted = draft_map(*map(read_source, tables))
     out.write_text(drafted.text, encoding="utf-8")
     what = ", ".join(f"[{name}]" for name in drafted.found) or "no section"
     say(errors, f"{out}: {what} drafted of {path}; look at every line")

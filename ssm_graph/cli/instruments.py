@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ssm_graph.cli.terminal import say
-from ssm_graph.io.instruments.library import KEY, Preset, preset, presets
+from ssm_graph.io.instruments.library import KEY, Preset, asked_for, preset, presets
 
 DESCRIPTION = f"""\
 List the instruments whose noise, bias, scale and geometry are known by name, with the data sheet
@@ -75,7 +75,9 @@ def _show(one: Preset, console: Console) -> None:
     say(console, f"{one.maker} {one.name}: {one.source}")
     for name, value in one.figures.items():
         say(console, f"  {name} = {value}")
-    if not one.figures:
-        say(console, "  no figures: all are asked for")
+    from ssm_graph.io.mission_folder.toml import required_keys
+
+    if missing := asked_for(one.section, one.keys, required_keys(one.section)):
+        say(console, f"  no source gives, so state beside it: {', '.join(missing)}")
     say(console, f"\n[{one.section}]\n{KEY} = {json.dumps(one.name)}\n# which stands for")
     say(console, tomli_w.dumps(one.keys).rstrip())

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 from factors.kernels import KernelChoice
 from factors.similarity import Kernel
 from ssm_graph.base.errors import ConfigError
-from ssm_graph.io.mission_folder.folder import TableFormat
+from ssm_graph.io.tables.files import TableFormat
 
 if TYPE_CHECKING:
     from ssm_graph.study.methods import Family

@@ -47,8 +47,12 @@ def declare(parser: argparse.ArgumentParser) -> None:
         help="DVL of so many beams around (of five one looks down), or one that gives a velocity: "
         "three beams along its axes (default: 4)",
     )
-    parser.add_argument("--duration", type=float, metavar="SECONDS", help="length of the mission")
-    parser.add_argument("--imu-rate", type=float, metavar="HZ", help="inertial samples per second")
+    parser.add_argument(
+        "--duration", type=float, metavar="SECONDS", help=f"length of the mission {usual}"
+    )
+    parser.add_argument(
+        "--imu-rate", type=float, metavar="HZ", help=f"inertial samples per second {usual}"
+    )
     parser.add_argument(
         "--realistic",
         action="store_true",

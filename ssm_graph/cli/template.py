@@ -27,7 +27,13 @@ ssm-graph inspect FILE.csv --draft-map map.toml drafts a map of a table's own co
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
-    parser.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="(default: here)")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path(),
+        metavar="DIR",
+        help="folder of the files (default: the current one)",
+    )
     parser.add_argument("--overwrite", action="store_true", help="write over files of these names")
     parser.set_defaults(run=run)
 

@@ -14,7 +14,6 @@ from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frames import BodyAxes
@@ -288,6 +287,8 @@ class _Dvl(Instrument):
 
 def _turned_further(log: DvlLog, _: float | Array, off: Array) -> Array:
     """Return roll, pitch and yaw of an instrument that is turned about its own axes, radians."""
+    from scipy.spatial.transform import Rotation
+
     return rpy_from_R_bd(log.mount.R_bd @ Rotation.from_rotvec(off).as_matrix())
 
 

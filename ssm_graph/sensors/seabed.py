@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import ClassVar, Final, NamedTuple
 
 import numpy as np
-from scipy.ndimage import binary_erosion, map_coordinates
 
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import DataError
@@ -121,6 +120,8 @@ class SeabedGrid(FrozenArrays):
 
     def between(self, values: Array, x: Array, y: Array) -> Array:
         """Return values (R, C) of the cells at points (...), bilinear; NaN off the map."""
+        from scipy.ndimage import map_coordinates
+
         rows, columns = self._cells(x, y)
         found = map_coordinates(values, [rows, columns], order=1, mode="constant", cval=np.nan)
         return np.asarray(found, dtype=np.float64)
@@ -150,6 +151,8 @@ class SeabedGrid(FrozenArrays):
 
         Bilinear between the cells it is 0 from where :meth:`surface_at` ends.
         """
+        from scipy.ndimage import binary_erosion
+
         known = binary_erosion(np.isfinite(self.height), np.ones((3, 3)), iterations=2)
         return np.asarray(known, dtype=np.float64)
 

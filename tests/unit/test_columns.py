@@ -459,6 +459,43 @@ def test_a_draft_of_own_columns_converts(mission: Mission, tmp_path: Path) -> No
         draft_map(nameless)
 
 
+def test_times_in_several_columns_are_drafted(tmp_path: Path) -> None:
+    """Seconds and nanoseconds, date and time of the day, GPS week and milliseconds: one instant."""
+    at = 1_777_629_600.25 + 0.5 * np.arange(4.0)
+    gps = at - 315_964_800.0 + 18.0
+    clock = [f"10:00:{t - 1_777_629_600.0:05.2f}" for t in at]
+    ways: dict[str, dict[str, Any]] = {
+        "ros": {"stamp_sec": np.floor(at), "stamp_nanosec": np.round(1e9 * (at % 1.0))},
+        "date": {"Date": ["2026-05-01"] * 4, "Time": clock},
+        "week": {"GPS Week": gps // 604_800.0, "iTOW [ms]": 1e3 * (gps % 604_800.0)},
+        "when": {"Date": [f"2026-05-01T{text}Z" for text in clock]},
+    }
+    for name, columns in ways.items():
+        path = tmp_path / f"{name}.csv"
+        _csv(path, {**columns, "depth_m": [1.0, 2.0, 3.0, 4.0], "mood": [7] * 4}, between=";")
+        text = draft_map(read_source(path)).text
+        assert f"# not drafted, of {name}.csv: mood\n" in text
+        of = tomllib.loads(text)["depth"]["time"]
+        names = tuple(of.get("columns") or [of["column"]])
+        units = tuple(of.get("units") or [of["unit"]])
+        wanted = Times("map.toml [depth] time", names, units, float(of.get("offset_s", 0.0)))
+        np.testing.assert_allclose(times(wanted, read_source(path)), at, atol=1e-6)
+
+
+def test_tables_of_other_loggers(tmp_path: Path) -> None:
+    """Bars, runs of blanks, a row of units below the header."""
+    for text in (
+        "t|p\n0.5|1.0\n1.0|2.0\n",
+        " t   p\n 0.5  1.0 \n1.0 2.0\n",
+        "t,p\ns,bar\n0.5,1\n1,2\n",
+    ):
+        path = tmp_path / "other.csv"
+        path.write_text(text)
+        found = read_source(path)
+        assert found.numbers("t", "x").tolist() == [0.5, 1.0]
+        assert found.numbers("p", "x").tolist() == [1.0, 2.0]
+
+
 def test_templates_are_valid(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Both are read as they are, and never written over what was filled in."""
     assert main(["template", "--out", str(tmp_path)]) == 0

@@ -224,6 +224,22 @@ def test_geopackage_has_a_line_and_points(tmp_path: Path) -> None:
         assert sigma == track().position_sigma_enu[-1, 2]
 
 
+def test_kml_and_geojson_are_valid(tmp_path: Path) -> None:
+    """By the schemata of OGC and Google, and by a library of RFC 7946."""
+    validator = pytest.importorskip("fastkml.validator")
+    geojson = pytest.importorskip("geojson")
+    path = written(tmp_path, "kml")
+    assert validator.validate(file_to_validate=path)
+    path.write_text(
+        path.read_text().replace("<name>", "<nome>", 1).replace("</name>", "</nome>", 1)
+    )
+    with pytest.raises(AssertionError):  # else it sees nothing
+        validator.validate(file_to_validate=path)
+    over = geojson.loads(written(tmp_path, "geojson", track(lon_deg=180.0 - 1e-4)).read_text())
+    assert over.is_valid, over.errors()
+    assert over.features[0].geometry.type == "MultiLineString"
+
+
 def test_gdal_and_a_cf_checker_take_the_files(tmp_path: Path) -> None:
     """Layers, reference system and the numbers themselves, read by the libraries of others."""
     gdal = pytest.importorskip("pyogrio")

@@ -49,6 +49,10 @@ def test_sheet_units_become_those_of_the_mission() -> None:
     stim = preset("imu", "STIM300", place="x").keys
     assert stim["accel_random_walk_ug_per_sqrt_hz"] == pytest.approx(0.07 / 60.0 / 9.80665e-6)
     dvl = preset("dvl", "DVL1000", place="x").keys
+    phins = preset("imu", "PHINS", place="x").keys
+    east = np.radians(phins["gyro_bias_deg_per_h"] / 3600.0)  # turns a gyrocompass at the equator
+    assert np.degrees(east / 7.292115e-5) == pytest.approx(0.01, rel=1e-3)
+    assert np.degrees(1e-6 * phins["accel_bias_ug"]) == pytest.approx(0.01, rel=1e-3)
     beams = np.sin(np.radians(25.0)) * np.array([1.0, -1.0])  # forward parts of opposite beams
     forward = dvl["beam_noise_m_per_s"] * np.sqrt(2.0) / (beams[0] - beams[1])
     assert forward == pytest.approx(0.008, rel=2e-3)
@@ -112,6 +116,9 @@ def test_the_command_lists_and_shows(capsys: pytest.CaptureFixture[str]) -> None
     assert all(one.name in out for one in presets())
     assert main(["instruments", "stim 300"]) == 0
     assert "gyro_random_walk_deg_per_sqrt_h = 0.15" in capsys.readouterr().out
+    assert main(["instruments", "phins"]) == 0
+    told = capsys.readouterr().out
+    assert "gyro_random_walk_deg_per_sqrt_h, accel_random_walk_ug_per_sqrt_hz\n" in told
     assert main(["instruments", "A50", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)[0]["keys"]["beam_janus_deg"] == 22.5
     assert main(["instruments", "DLV1000"]) == 2

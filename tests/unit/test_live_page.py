@@ -104,6 +104,12 @@ def test_what_a_browser_is_told(page: LivePage) -> None:
     name, now = next(told)
     assert (now["health"], now["protection_m"], now["point"][7]) == ("BAD", None, 1)
     assert now["altitude_m"] is None  # of a minute ago
+    turns = [(e["time_s"], e["severity"], e["text"]) for e in now["events"]]
+    assert turns[0] == (0.0, "INFO", "GOOD: all agree")
+    assert turns[1:] == [
+        (1.0, "WARNING", "no bottom <b>lock</b>"),
+        (3.0, "ERROR", "BAD: fixes are off"),
+    ]
 
 
 def test_before_the_first_answer(page: LivePage) -> None:

@@ -123,11 +123,12 @@ def test_the_verdict_comes_first_and_in_words() -> None:
 def test_charts_show_the_tables() -> None:
     """Curves are the columns, in minutes since the first row, and break where north is passed."""
     rows, of = content().trajectory, np.arange(3.0 * N).reshape(N, 3)
-    errors = ErrorSeries(rows["time_s"], of, of, of, of, of, of, of, of[:, 0])
+    no_height = of * [1.0, 1.0, np.nan]
+    errors = ErrorSeries(rows["time_s"], no_height, of, of, of, of, of, of, of[:, 0])
     further: dict[str, Any] = {"altitude": (rows["time_s"][5:], of[5:, 0]), "errors": errors}
     charts = {chart.name: chart for chart in charts_of(content(**further))}
     np.testing.assert_allclose(values(charts["altitude"].traces[0], "y"), of[5:, 0])
-    north, above, below = charts["errors"].traces[3:6]
+    north, above, below = charts["errors"].traces[3:]  # the reference has no heights
     np.testing.assert_allclose(values(north, "y"), of[:, 1])
     np.testing.assert_allclose(values(above, "y"), 3.0 * np.sqrt(2.0) * of[:, 1], rtol=1e-6)
     np.testing.assert_array_equal(values(below, "y"), -values(above, "y"))
@@ -177,8 +178,15 @@ window.addEventListener("load", async () => {
   Plotly.Fx.hover("height", [{ curveNumber: 1, pointNumber: 150 }]);
   const hover = document.querySelectorAll("#height .hoverlayer .hovertext").length;
   const wide = document.documentElement.scrollWidth - window.innerWidth;
+  const width = () => document.querySelector("#speed .main-svg").clientWidth;
+  const before = width();
+  window.dispatchEvent(new Event("beforeprint"));
+  const paper = width();
+  window.dispatchEvent(new Event("afterprint"));
+  await new Promise((done) => setTimeout(done, 300));
+  const restored = width() === before;
   const drawings = document.querySelectorAll(".chart .main-svg").length > 8;
-  const seen = { range, hover, wide, drawings, errors: told };
+  const seen = { range, hover, wide, drawings, paper, restored, errors: told };
   document.body.setAttribute("data-probe", JSON.stringify(seen));
 });
 </script></body>"""
@@ -188,7 +196,7 @@ window.addEventListener("load", async () => {
 @pytest.mark.skipif(BROWSER is None, reason="no chromium or chrome on this machine")
 @pytest.mark.parametrize("width", [1200, 390])
 def test_a_browser_draws_zooms_and_hovers(tmp_path: Path, width: int) -> None:
-    """No error, linked axes, a label under the pointer, and nothing wider than a phone."""
+    """No error, linked axes, a label under the pointer, paper, and nothing wider than a phone."""
     path = tmp_path / "report.html"
     write_page(content(), path, footer="made by a test")
     path.write_text(path.read_text(encoding="utf-8").replace("</body>", PROBE), encoding="utf-8")
@@ -202,7 +210,9 @@ def test_a_browser_draws_zooms_and_hovers(tmp_path: Path, width: int) -> None:
     assert found, done.stderr[-2000:]
     seen = json.loads(found[1].replace("&quot;", '"'))
     assert seen.pop("wide") <= 0
-    assert seen == {"range": [2, 3], "hover": 1, "drawings": True, "errors": []}
+    assert seen.pop("paper") == 690  # between the margins of A4, 703 pixels, and of letter
+    drawn = {"range": [2, 3], "hover": 1, "drawings": True, "restored": True}
+    assert seen == {**drawn, "errors": []}
     assert not [text for text in done.stderr.splitlines() if "CONSOLE" in text and "rror" in text]
 
 

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.times import GPS_EPOCH_S, WEEK_S, gps_ahead_s
 from ssm_graph.base.units import SEA_WATER, STANDARD_ATMOSPHERE, STANDARD_GRAVITY
 from ssm_graph.io.ardupilot.dataflash import Columns, is_dataflash, read_dataflash
 from ssm_graph.io.ardupilot.telemetry import is_telemetry, read_telemetry
@@ -56,10 +57,6 @@ _UP_SIGMA: Final = 10.0
 """m, of heights above the sea where the geoid is not known."""
 _SIGMA_OF_HDOP: Final = 2.5
 """m, of a fix of HDOP 1 whose accuracy is not told."""
-_GPS_UNIX_S: Final = 315_964_800.0
-_LEAP_S: Final = 18.0
-"""GPS time less UTC, since 2017."""
-_WEEK_S: Final = 604_800.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +186,8 @@ def _clock(log: Path, messages: Mapping[str, Columns]) -> tuple[float, list[str]
     good = (gps["Status"] >= _FIX_3D) & (gps["GWk"] > 0)
     if not good.any():
         return 0.0, ["Times are seconds since the start of the vehicle: no fix tells the date."]
-    unix_s = _GPS_UNIX_S + gps["GWk"] * _WEEK_S + gps["GMS"] / 1e3 - _LEAP_S
+    unix_s = GPS_EPOCH_S + gps["GWk"] * WEEK_S + gps["GMS"] / 1e3
+    unix_s -= gps_ahead_s(unix_s)
     offset_s = float(np.median((unix_s - _seconds(gps))[good]))
     return offset_s, [
         f"Times are UTC: {offset_s:.3f} s after the vehicle's own, by its receiver, whose reports "

@@ -13,6 +13,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ssm_graph.base.progress import teller
+
 MAGIC: Final = b"\xa3\x95"
 _FMT: Final = 0x80
 _FMT_SIZE: Final = 89
@@ -76,7 +78,10 @@ def read_dataflash(data: bytes, wanted: Iterable[str]) -> Dataflash:
     sizes: dict[int, int] = {_FMT: _FMT_SIZE}
     places: dict[int, list[int]] = {}
     at, n_records, n_skipped, end = 0, 0, 0, len(data)
+    tell = teller(end)
     while at + 3 <= end:
+        if not n_records & 0xFFF:
+            tell(at)
         kind = data[at + 2]
         size = sizes.get(kind, 0)
         is_sound = data[at] == MAGIC[0] and data[at + 1] == MAGIC[1] and size > 0

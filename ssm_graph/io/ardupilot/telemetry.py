@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssm_graph.base.errors import MissingExtraError
+from ssm_graph.base.progress import teller
 from ssm_graph.base.units import STANDARD_GRAVITY
 from ssm_graph.io.ardupilot.dataflash import Columns
 
@@ -77,9 +78,10 @@ def read_telemetry(data: bytes) -> tuple[dict[str, Columns], int]:
     parser = dialect.MAVLink(None)
     parser.robust_parsing = True
     rows: dict[str, list[tuple[float, ...]]] = {}
-    at, skipped = 0, 0
+    at, skipped, tell = 0, 0, teller(len(data))
     while at + 9 <= len(data):
         size = _frame_size(data, at + 8)
+        tell(at)
         message = None
         if is_telemetry(data[at : at + 9]) and size and at + 8 + size <= len(data):
             try:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from ssm_graph.base.errors import DataError, MissingExtraError
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.progress import told
 from ssm_graph.io.blueye.vehicle import BEAM_AZIMUTH
 
 PREFIX: Final = "blueye.protocol."
@@ -100,9 +101,8 @@ def _messages(log: Path) -> Iterator[tuple[str, float, Any]]:
             reader = NonSeekingReader(stream, decoder_factories=[DecoderFactory()])
             wanted = (*TOPICS, WITNESS)
             # By the library's queue the order of times takes as long as all else.
-            for _, channel, raw, message in reader.iter_decoded_messages(
-                topics=wanted, log_time_order=False
-            ):
+            decoded = reader.iter_decoded_messages(topics=wanted, log_time_order=False)
+            for _, channel, raw, message in told(decoded, _count(summary, wanted)):
                 yield channel.topic, raw.log_time * 1e-9, message
     except OSError as error:
         raise DataError(f"{log}: cannot be read: {error.strerror or error}") from error
@@ -113,6 +113,13 @@ def _messages(log: Path) -> Iterator[tuple[str, float, Any]]:
             f"{log}: not a complete MCAP file ({type(error).__name__}: {error}); "
             "if the recording was cut off, try  mcap recover"
         ) from error
+
+
+def _count(summary: Any, topics: Collection[str]) -> float:
+    """Return how many messages of some topics the end of a file promises; 0 where it does not."""
+    counts = summary.statistics.channel_message_counts if summary.statistics else {}
+    of = {number for number, channel in summary.channels.items() if channel.topic in topics}
+    return float(sum(count for number, count in counts.items() if number in of))
 
 
 def _append(rows: dict[str, list[tuple[float, ...]]], topic: str, time: float, msg: Any) -> None:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -41,6 +42,8 @@ from ssm_graph.sensors.dvl import counted_sigma
 from ssm_graph.sensors.imu import interval_ends
 from ssm_graph.sensors.instrument import Instrument, read_columns
 from ssm_graph.sensors.registry import BY_LOG, BY_SECTION
+
+_OF_DAY: Final = re.compile(r"(\d{1,2}):(\d{2}):(\d{2}(?:[.,]\d*)?)")
 
 
 def convert_columns(
@@ -150,7 +153,7 @@ def times(wanted: Times, source: Source) -> Array:
 
 
 def _dates(source: Source, name: str, place: str) -> Array:
-    """Return Unix seconds (N,) of dates; those without a zone are UTC."""
+    """Return Unix seconds (N,) of dates, those without a zone are UTC; seconds of times of day."""
     cells = source.column(name, place)
     if not isinstance(cells, list) and cells.dtype.kind == "M":
         unix_s = cells.astype("datetime64[ns]").astype(np.int64) / 1e9
@@ -160,12 +163,18 @@ def _dates(source: Source, name: str, place: str) -> Array:
         text = cell.decode("utf-8", "replace") if isinstance(cell, bytes) else str(cell)
         if not text:
             continue
+        if clock := _OF_DAY.fullmatch(text.strip()):
+            hours, minutes, seconds = clock.groups()
+            found[row] = (
+                3600.0 * int(hours) + 60.0 * int(minutes) + float(seconds.replace(",", "."))
+            )
+            continue
         try:
             date = datetime.fromisoformat(text.strip().replace("/", "-"))
         except ValueError:
             raise DataError(
                 f"{source.place(row)}: column {name!r} holds {text!r}; expected a time like "
-                "2026-05-01T10:00:00.125Z"
+                "2026-05-01T10:00:00.125Z, or date and time of the day in a column each"
             ) from None
         found[row] = (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
     return found

@@ -10,11 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssm_graph.base.errors import DataError
-from ssm_graph.base.times import UNIX_FROM_S, UNIX_UNTIL_S
+from ssm_graph.base.times import GPS_EPOCH_S, UNIX_FROM_S, UNIX_UNTIL_S, WEEK_S, gps_ahead_s
 from ssm_graph.io.columns.sources import Source
 from ssm_graph.sensors.imu import FASTEST_TURN, FORCE_UNITS
 
 _TIME: Final = re.compile(r"(^|_)(time|timestamp|stamp|t|utc|epoch|datetime|date_time)($|_)")
+_DATE: Final = re.compile(r"(^|_)(date|when|day_time)($|_)")
+"""Times where the cells are no numbers."""
+_SECONDS: Final = re.compile(r"(?:^|.*_)(?:secs?|seconds)")
+_NANOSECONDS: Final = re.compile(r"(?:^|.*_)(?:nsecs?|nanosecs?|nanoseconds|ns)")
+_WEEK: Final = re.compile(r"(?:^|.*_)(?:week|wn|wno|gps_?week)(?:_?(?:number|no))?")
+_OF_WEEK: Final = re.compile(
+    r"(?:^|.*_)(?:i?tow|sow|seconds_of_week|time_of_week|gps_?tow|ms)(_.*)?"
+)
 _AXES: Final = "xyz"
 _ANY: Final = r"(?:^|.*_)"
 _VECTORS: Final = {
@@ -24,7 +32,7 @@ _VECTORS: Final = {
     "velocity": rf"{_ANY}(?:vel|velocity|v|bt_vel|dvl)",
 }
 _BEAM: Final = re.compile(
-    r"(?:^|.*_)(?:b|beam|bm|vel_beam|beam_vel|transducers?|vel)_?(\d)(?:_.*)?"
+    r"(?:^|.*_)(?:b|v|beam|bm|vel_beam|beam_vel|transducers?|vel)_?(\d)(?:_.*)?"
 )
 _RANGE: Final = re.compile(
     r"(?:^|.*_)(?:r|range|rng|dist|distance|alt|altitude)_?(?:beam_?)?(\d).*"
@@ -55,6 +63,8 @@ _FAR: Final = 3.0
 _RATES_HZ: Final = (0.05, 5000.0)
 
 
+_MOST_NAMED: Final = 20
+"""Columns that a remark names."""
 _SECTIONS: Final = ("imu", "dvl", "depth", "gnss", "heading")
 
 
@@ -68,6 +78,9 @@ class Guess(NamedTuple):
     axes: str = ""
     missing: float | None = None
     """A code that stands for no reading."""
+    units: tuple[str, ...] = ()
+    """Of each column, where they are added up."""
+    offset_s: float = 0.0
 
 
 class Drafted(NamedTuple):
@@ -107,7 +120,28 @@ def draft_map(*sources: Source) -> Drafted:
             if "height" not in {guess.key for guess in found[name][1]}:
                 lines.append("height = { value = 0.0 }                  # no column of it")
             lines.append('sigma = { values = [2.0, 2.0, 4.0], unit = "m" }   # assumed')
-    return Drafted("\n".join(lines) + "\n", tuple(name for name in _SECTIONS if name in found))
+    lines += ["", *_left_over(sources, found)]
+    return Drafted(
+        "\n".join(lines).rstrip() + "\n", tuple(name for name in _SECTIONS if name in found)
+    )
+
+
+def _left_over(
+    sources: tuple[Source, ...], found: dict[str, tuple[Source, list[Guess]]]
+) -> Iterator[str]:
+    """Yield remarks on columns that no section has."""
+    for source in sources:
+        used = {
+            name
+            for of, guesses in found.values()
+            if of is source
+            for guess in guesses
+            for name in guess.columns
+        }
+        left = [name for name in source.columns if name not in used]
+        if left:
+            more = ", ..." if len(left) > _MOST_NAMED else ""
+            yield f"# not drafted, of {source.label}: {', '.join(left[:_MOST_NAMED])}{more}"
 
 
 def _sections(source: Source) -> dict[str, list[Guess]]:
@@ -131,6 +165,10 @@ def _lines(guesses: list[Guess]) -> Iterator[str]:
         names = [_quoted(name) for name in guess.columns]
         which = f"column = {names[0]}" if len(names) == 1 else f"columns = [{', '.join(names)}]"
         unit = f", unit = {_quoted(guess.unit)}" if guess.unit else ""
+        if guess.units:
+            unit = f", units = [{', '.join(map(_quoted, guess.units))}]"
+        if guess.offset_s:
+            unit += f", offset_s = {guess.offset_s:.0f}"
         axes = f", axes = {_quoted(guess.axes)}" if guess.axes else ""
         code = "" if guess.missing is None else f", missing = {guess.missing:g}"
         yield f"{guess.key} = {{ {which}{unit}{axes}{code} }}  # {guess.why}"
@@ -158,10 +196,14 @@ def _numbers(source: Source, name: str) -> NDArray[np.float64]:
 def guess_time(source: Source) -> Guess:
     """Return the column of the times and its unit; raise :class:`DataError` where there is none."""
     plain = {_plain(name): name for name in source.columns}
+    added_up = _added_times(source, plain), _of_dates(source, plain), *_of_gps_week(source, plain)
+    for added in added_up:
+        if added is not None:
+            return added
     for short, name in plain.items():
-        if not _TIME.search(short):
-            continue
         values = _numbers(source, name)
+        if not _TIME.search(short) and not (_DATE.search(short) and not len(values)):
+            continue
         if not len(values):
             return Guess("time", (name,), "iso", "dates, UTC where they have no zone")
         named = _named_unit(short)
@@ -179,6 +221,46 @@ def guess_time(source: Source) -> Guess:
         f"{', '.join(list(source.columns)[:12])}; name it in a map of your own "
         "(ssm-graph template)"
     )
+
+
+def _added_times(source: Source, plain: dict[str, str]) -> Guess | None:
+    """Return seconds and nanoseconds in columns of their own, as ROS has them."""
+    whole, parts = (
+        [name for short, name in plain.items() if pattern.fullmatch(short)]
+        for pattern in (_SECONDS, _NANOSECONDS)
+    )
+    if len(whole) != 1 or len(parts) != 1:
+        return None
+    below = _numbers(source, parts[0])
+    if not len(below) or below.min() < 0.0 or below.max() >= 1e9:
+        return None
+    return Guess("time", (whole[0], parts[0]), "", "added up", units=("s", "ns"))
+
+
+def _of_dates(source: Source, plain: dict[str, str]) -> Guess | None:
+    """Return dates and times of the day in columns of their own."""
+    texts = [(short, name) for short, name in plain.items() if not len(_numbers(source, name))]
+    dates = [name for short, name in texts if _DATE.search(short) and not _TIME.search(short)]
+    hours = [name for short, name in texts if _TIME.search(short) and not _DATE.search(short)]
+    if len(dates) != 1 or len(hours) != 1:
+        return None
+    return Guess("time", (dates[0], hours[0]), "", "dates are UTC", units=("iso", "iso"))
+
+
+def _of_gps_week(source: Source, plain: dict[str, str]) -> Iterator[Guess]:
+    """Yield GPS weeks and the time of the week, in seconds or milliseconds, to Unix time."""
+    for short, week in plain.items():
+        weeks = _numbers(source, week) if _WEEK.fullmatch(short) else np.zeros(0)
+        if not len(weeks) or not (weeks % 1.0 == 0.0).all() or np.ptp(weeks) > 1.0:
+            continue
+        for other, name in plain.items():
+            within = _numbers(source, name) if _OF_WEEK.fullmatch(other) else np.zeros(0)
+            if name != week and len(within) == len(weeks):
+                unit = "ms" if within.max() > WEEK_S else "s"
+                begin_s = GPS_EPOCH_S + WEEK_S * float(weeks.max())
+                offset_s = GPS_EPOCH_S - float(gps_ahead_s(begin_s))
+                why = "of the GPS week, to UTC"
+                yield Guess("time", (week, name), "", why, units=("week", unit), offset_s=offset_s)
 
 
 def _named_unit(short: str) -> str:
@@ -231,6 +313,7 @@ def _vector(source: Source, plain: dict[str, str], key: str) -> Guess | None:
     if key == "gyro":
         top = float(np.percentile(length, 99.0))
         unit = "deg/s" if top > FASTEST_TURN else "rad/s"
+        unit = "deg/h" if top > np.degrees(FASTEST_TURN) else unit
         why = f"99 % of the rates are below {top:.3g}"
         if named in ("deg/s", "rad/s"):
             return Guess(key, names, named, "unit by the name; axes as those of accel")
@@ -308,13 +391,14 @@ def _scalars(source: Source, plain: dict[str, str], keys: tuple[str, ...]) -> li
 
 
 def _scalar(key: str, name: str, named: str, values: NDArray[np.float64]) -> Guess:
-    top = float(np.max(np.abs(values)))
+    top, doubt = float(np.max(np.abs(values))), ""
     if key in ("lat", "lon"):
-        unit = "1e-7 deg" if top > 1e5 else "deg"
+        unit = named if named in ("deg", "rad") else "1e-7 deg" if top > 1e5 else "deg"
+        doubt = ": could be radians" if not named and top <= np.pi else ""
     elif key == "pressure":
         unit = named or ("Pa" if top > 5e4 else "mbar" if top > 500.0 else "bar")
     elif key == "heading":
         unit = named or ("deg" if top > 6.3 else "rad")
     else:
         unit = named or "m"
-    return Guess(key, (name,), unit, f"{values.min():.6g} to {values.max():.6g}")
+    return Guess(key, (name,), unit, f"{values.min():.6g} to {values.max():.6g}{doubt}")

@@ -19,11 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssm_graph.base.errors import DataError, MissingExtraError, nearest_hint
+from ssm_graph.base.progress import told
 from ssm_graph.io.file_kind import CSV_ENDINGS
 from ssm_graph.io.tables.files import pyarrow_module
 
 ENDINGS: Final = (*CSV_ENDINGS, ".parquet", ".mat", ".h5", ".hdf5")
-_DELIMITERS: Final = ",;\t"
+_DELIMITERS: Final = ",;\t|"
+_BLANK: Final = " "
+"""Any number of them, where none of the above is there."""
 _WIDEST: Final = 64
 """Columns of a matrix; a longer side is its rows."""
 _LARGEST: Final = 1 << 31
@@ -124,13 +127,16 @@ def _csv(path: Path) -> Source:
         raise DataError(f"{path.name}: expected a text of columns, got bytes that are none")
     lines = text.splitlines()
     at, delimiter = _header(path, lines)
+    if delimiter == _BLANK:
+        lines = [line.strip() for line in lines]
     head = lines[at].lstrip("".join({c for mark in _MARKS for c in mark}))
-    names = [name.strip() for name in next(csv.reader([head], delimiter=delimiter))]
+    heads = csv.reader([head], delimiter=delimiter, skipinitialspace=True)
+    names = [name.strip() for name in next(heads)]
     _check_names(path, at + 1, names)
-    rows, numbers = [], []
+    rows, numbers = list[list[str]](), list[int]()
     reader = csv.reader(lines[at + 1 :], delimiter=delimiter, skipinitialspace=True)
     number = at + 1
-    for row in reader:
+    for row in told(reader, len(lines) - at):
         before, number = number, at + 1 + reader.line_num
         if number > before + 1:
             raise DataError(
@@ -146,6 +152,8 @@ def _csv(path: Path) -> Source:
                 f"{path.name}:{number}: {len(row)} cells, expected {len(names)} as in the header "
                 f"of line {at + 1}; correct or delete the line"
             )
+        if len(rows) == 1 and _is_of_units(rows[0], row):
+            rows, numbers = [], []
         rows.append(row)
         numbers.append(number)
     if not rows:
@@ -161,16 +169,25 @@ def _csv(path: Path) -> Source:
 def _header(path: Path, lines: list[str]) -> tuple[int, str]:
     """Return the line of the header and what stands between its names."""
     for at, line in enumerate(lines[:200]):
-        for delimiter in sorted(_DELIMITERS, key=line.count, reverse=True):
-            words = [word.strip() for word in line.strip("#%/ ").split(delimiter)]
-            below = next((b for b in lines[at + 1 :] if b.strip() and not b.startswith(_MARKS)), "")
-            is_like = below.count(delimiter) == line.count(delimiter)
+        below = next((b for b in lines[at + 1 :] if b.strip() and not b.startswith(_MARKS)), "")
+        for delimiter in (*sorted(_DELIMITERS, key=line.count, reverse=True), _BLANK):
+            between = None if delimiter == _BLANK else delimiter
+            words = [word.strip() for word in line.strip("#%/ ").split(between)]
+            is_like = len(below.split(between)) == len(line.split(between))
             if len(words) > 1 and is_like and not any(map(_is_number, words)):
                 return at, delimiter
     raise DataError(
-        f"{path.name}: no line of names above rows of numbers, with one of comma, semicolon, tab "
-        "between them; add a header"
+        f"{path.name}: no line of names above rows of numbers, with one of comma, semicolon, tab, "
+        "bar or blanks between them; add a header"
     )
+
+
+def _is_of_units(first: list[str], second: list[str]) -> bool:
+    """Return whether a row below the header names units, as the next one has numbers."""
+    counts = [
+        sum(_is_number(cell.strip().replace(",", ".")) for cell in row) for row in (first, second)
+    ]
+    return counts[0] == 0 and 2 * counts[1] > len(second) and all(cell.strip() for cell in first)
 
 
 def _check_names(path: Path, line: int, names: list[str]) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.progress import told
 from ssm_graph.base.units import DEGREE
 from ssm_graph.io.export.track import Track
 from ssm_graph.io.tables.files import pyarrow_module
@@ -78,7 +79,8 @@ def write_csv(track: Track, path: Path) -> None:
     cells = [c if isinstance(c, list) else [repr(v) for v in c.tolist()] for c in columns.values()]
     with path.open("w", encoding="utf-8") as file:
         file.write(",".join(columns) + "\n")
-        file.writelines(",".join(row) + "\n" for row in zip(*cells, strict=True))
+        rows = told(zip(*cells, strict=True), len(track.time_s))
+        file.writelines(",".join(row) + "\n" for row in rows)
 
 
 def write_parquet(track: Track, path: Path) -> None:

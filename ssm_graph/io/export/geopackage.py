@@ -16,6 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.progress import told
 from ssm_graph.io.export.columns import wide_columns
 from ssm_graph.io.export.maps import degrees, lines
 from ssm_graph.io.export.track import Track
@@ -90,7 +91,7 @@ def write_geopackage(track: Track, path: Path) -> None:
         marks = ", ".join("?" * (len(kinds) + 1))
         values = [of if isinstance(of, list) else _without_nan(of) for of in columns.values()]
         geometries = [_geometry(struct.pack("<BIddd", 1, _POINT_Z, *p)) for p in points.tolist()]
-        rows = zip(geometries, *values, strict=True)
+        rows = told(zip(geometries, *values, strict=True), len(geometries))
         base.executemany(f"INSERT INTO keyframes ({named}) VALUES ({marks})", rows)
 
 

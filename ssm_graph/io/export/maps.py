@@ -12,6 +12,7 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 import numpy as np
 
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.progress import told
 from ssm_graph.base.runs import runs_of
 from ssm_graph.io.export.track import Track
 
@@ -102,7 +103,7 @@ def write_gpx(track: Track, path: Path) -> None:
     _say(of_track, "desc", track.about)
     segment = SubElement(of_track, "trkseg")
     times = track.utc() if track.epoch_s is not None else None
-    for i, (lon, lat, height) in enumerate(degrees(track).tolist()):
+    for i, (lon, lat, height) in told(enumerate(degrees(track).tolist()), len(track.lat)):
         point = SubElement(segment, "trkpt", {"lat": f"{lat:.9f}", "lon": f"{lon:.9f}"})
         _say(point, "ele", f"{height:.3f}")
         if times is not None:
@@ -162,7 +163,7 @@ def _kml_times(document: Element, track: Track, points: Array) -> None:
     _say(times, "altitudeMode", "clampToGround")
     for when in track.utc():
         _say(times, "when", when)
-    for lon, lat, height in points.tolist():
+    for lon, lat, height in told(points.tolist(), len(points)):
         _say(times, "gx:coord", f"{lon:.9f} {lat:.9f} {height:.3f}")
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssm_graph.base.errors import MissingExtraError
+from ssm_graph.base.progress import told
 from ssm_graph.io.export.track import Track
 
 _NUMBER: Final = {"type": "number"}
@@ -93,7 +94,7 @@ def write_mcap(track: Track, path: Path) -> None:
             )
             for topic, (name, schema) in _SCHEMAS.items()
         }
-        for i, when in enumerate(time_ns.tolist()):
+        for i, when in told(enumerate(time_ns.tolist()), len(time_ns)):
             stamp = {"sec": when // 10**9, "nsec": when % 10**9}
             for topic, content in _messages(columns, i).items():
                 data = json.dumps({"timestamp": stamp, **content}).encode()

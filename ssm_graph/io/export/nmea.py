@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ssm_graph.base.progress import told
 from ssm_graph.io.export.track import Track
 from ssm_graph.io.nmea_sentences import gga, hdt, vtg
 
@@ -19,5 +20,5 @@ def write_nmea(track: Track, path: Path) -> None:
     with path.open("w", encoding="ascii", newline="") as file:
         file.writelines(
             gga(time_s, (lat, lon, height)) + vtg((velocity[0], velocity[1])) + hdt(heading)
-            for time_s, lat, lon, height, velocity, heading in rows
+            for time_s, lat, lon, height, velocity, heading in told(rows, len(track.time_s))
         )

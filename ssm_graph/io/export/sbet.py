@@ -12,19 +12,11 @@ import numpy as np
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.times import GPS_EPOCH_S, WEEK_S, gps_ahead_s
 from ssm_graph.io.export.track import Track
 
-_GPS_EPOCH: Final = 315_964_800.0
-"""Unix time of 1980-01-06T00:00:00Z, s."""
-_WEEK: Final = 604_800.0
-_LEAP: Final = (
-    (1_136_073_600.0, 14.0),  # 2006
-    (1_230_768_000.0, 15.0),  # 2009
-    (1_341_100_800.0, 16.0),  # July 2012
-    (1_435_708_800.0, 17.0),  # July 2015
-    (1_483_228_800.0, 18.0),  # 2017
-)
-"""Unix time from which GPS time is ahead of UTC by as many seconds (IERS Bulletin C)."""
+_FROM_S: Final = 1_136_073_600.0
+"""Unix time of 2006: an earlier time is a wrong epoch rather than a mission."""
 
 
 def gps_seconds_of_week(unix_s: Array) -> Array:
@@ -32,14 +24,12 @@ def gps_seconds_of_week(unix_s: Array) -> Array:
 
     Raises :class:`ConfigError` before 2006.
     """
-    if unix_s[0] < _LEAP[0][0]:
+    if unix_s[0] < _FROM_S:
         raise ConfigError(
             f"--epoch: expected a time of 2006 or later for GPS time, got Unix time {unix_s[0]:.0f}"
         )
-    ahead = np.array([seconds for _, seconds in _LEAP])
-    since = np.searchsorted([begin for begin, _ in _LEAP], unix_s, side="right") - 1
-    gps_s = unix_s - _GPS_EPOCH + ahead[since]
-    return np.asarray(gps_s - _WEEK * np.floor(gps_s[0] / _WEEK))
+    gps_s = unix_s - GPS_EPOCH_S + gps_ahead_s(unix_s)
+    return np.asarray(gps_s - WEEK_S * np.floor(gps_s[0] / WEEK_S))
 
 
 def write_sbet(track: Track, path: Path) -> None:

@@ -9,7 +9,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import ConfigError, DataError
@@ -97,6 +96,8 @@ class Track(FrozenArrays):
 
         East, north, up are those at each position: of a mission's size they are those of `frame`.
         """
+        from scipy.spatial.transform import Rotation
+
         turn = R_lb_from_roll_pitch_heading(*self.roll_pitch_heading.T) @ FRD_FROM_FLU
         return np.asarray(Rotation.from_matrix(turn).as_quat(canonical=True))
 

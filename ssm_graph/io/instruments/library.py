@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 import re
 import tomllib
-from collections.abc import Mapping, Set
+from collections.abc import Collection, Mapping, Set
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cache
 from importlib.resources import files
 from typing import Any, Final
 
+from ssm_graph.base.earth import EARTH_RATE
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.settings import shown
 from ssm_graph.base.units import STANDARD_GRAVITY, in_unit
@@ -27,6 +28,12 @@ _TEXTS: Final = ("maker", "sheet", "basis")
 _UG_OF_WALK: Final = 1e6 / (60.0 * STANDARD_GRAVITY)
 """ug/sqrt(Hz) of one m/s/sqrt(h)."""
 
+_BIAS_OF_HEADING: Final = round(3600.0 * EARTH_RATE, 4)
+"""deg/h: a gyro that is off by ``b`` to the east turns a heading found by gyrocompassing by
+``b / (Omega cos(latitude))``, so that a sheet's degree times the secant of latitude is this."""
+_UG_OF_TILT: Final = round(1e6 * math.radians(1.0))
+"""ug of a degree: an accelerometer that is off by ``b`` tilts the level by ``b / g``."""
+
 _IMU_KEYS: Final[Mapping[str, tuple[str, float]]] = {
     "gyro_random_walk_deg_per_sqrt_h": ("gyro_random_walk_deg_per_sqrt_h", 1.0),
     "gyro_noise_deg_per_s_per_sqrt_hz": ("gyro_random_walk_deg_per_sqrt_h", 60.0),
@@ -34,12 +41,14 @@ _IMU_KEYS: Final[Mapping[str, tuple[str, float]]] = {
     "gyro_in_run_deg_per_h": ("gyro_bias_instability_deg_per_h", 1.0),
     "gyro_bias_deg_per_h": ("gyro_bias_deg_per_h", 1.0),
     "gyro_bias_deg_per_s": ("gyro_bias_deg_per_h", 3600.0),
+    "heading_deg_sec_latitude": ("gyro_bias_deg_per_h", _BIAS_OF_HEADING),
     "gyro_scale_ppm": ("gyro_scale_sigma_ppm", 1.0),
     "gyro_g_sensitivity_deg_per_s_per_g": ("gyro_g_sensitivity_sigma_deg_per_h_per_g", 3600.0),
     "accel_noise_ug_per_sqrt_hz": ("accel_random_walk_ug_per_sqrt_hz", 1.0),
     "accel_random_walk_m_per_s_per_sqrt_h": ("accel_random_walk_ug_per_sqrt_hz", _UG_OF_WALK),
     "accel_in_run_ug": ("accel_bias_instability_ug", 1.0),
     "accel_bias_mg": ("accel_bias_ug", 1000.0),
+    "roll_pitch_deg": ("accel_bias_ug", _UG_OF_TILT),
     "accel_scale_ppm": ("accel_scale_sigma_ppm", 1.0),
 }
 """By figure of a sheet, the key of ``[imu]`` and what the figure is multiplied by."""
@@ -170,10 +179,7 @@ def with_preset(
     if "beam_vectors" in own:  # say the same otherwise
         keys = {key: value for key, value in keys.items() if key not in _DVL_FIGURES[:2]}
     merged = {**keys, **own}
-    asked = (key for key, _ in _IMU_KEYS.values()) if section == "imu" else _ASKED_OF_DVL
-    missing = [key for key in dict.fromkeys(asked) if key in required and key not in merged]
-    if section == "dvl" and "beam_vectors" not in own:
-        missing = [*[key for key in _DVL_FIGURES[:2] if key not in merged], *missing]
+    missing = asked_for(section, merged, required)
     if missing:
         raise ConfigError(
             f"{file} [{section}] {missing[0]}: expected beside {KEY} = {found.name!r}, of which no "
@@ -181,6 +187,15 @@ def with_preset(
             "rest)"
         )
     return merged, found
+
+
+def asked_for(section: str, known: Collection[str], required: Set[str]) -> list[str]:
+    """Return what a section needs of an instrument's keys beside those that are ``known``."""
+    asked = (key for key, _ in _IMU_KEYS.values()) if section == "imu" else _ASKED_OF_DVL
+    missing = [key for key in dict.fromkeys(asked) if key in required and key not in known]
+    if section == "dvl" and "beam_vectors" not in known:
+        missing = [*[key for key in _DVL_FIGURES[:2] if key not in known], *missing]
+    return missing
 
 
 _ASKED_OF_DVL: Final = ("beam_noise_m_per_s",)

@@ -235,6 +235,11 @@ def _checked(raw: dict[str, Any], path: Path, may_miss: frozenset[str]) -> Missi
     )
 
 
+def required_keys(section: str) -> frozenset[str]:
+    """Return the keys that a section of the file has to have."""
+    return frozenset(name for name, key in SECTIONS[section].items() if key.required)
+
+
 def _with_instruments(raw: dict[str, Any], file: str) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Return a file with the figures of the instruments that it names, and where they are from.
 
@@ -249,7 +254,7 @@ def _with_instruments(raw: dict[str, Any], file: str) -> tuple[dict[str, Any], t
             own |= {"stamp": Stamp.END.value} if section == "imu" else {}
         if not isinstance(own, dict):
             continue
-        required = {name for name, key in SECTIONS[section].items() if key.required}
+        required = required_keys(section)
         found[section], preset = instruments.with_preset(section, own, file=file, required=required)
         if preset is not None:
             notes.append(f"[{section}] {preset.maker} {preset.name}: {preset.source}")

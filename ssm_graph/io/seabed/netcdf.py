@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from scipy.io import netcdf_file
 
 from ssm_graph.base.errors import DataError, MissingExtraError
 from ssm_graph.base.frozen import Array
@@ -99,6 +98,8 @@ def _axis(dimension: Any) -> str:
 
 
 def _of_classic(path: Path) -> Variables:
+    from scipy.io import netcdf_file
+
     found = {}
     try:
         with netcdf_file(path, "r", mmap=False) as file:

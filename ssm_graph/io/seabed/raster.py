@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import ConfigError, DataError
@@ -211,6 +210,8 @@ def _rows_and_columns(
 
 def _interpolated(values: Array, row: Array, column: Array) -> Array:
     """Return values between cells by cubic splines; NaN beside a cell that has none."""
+    from scipy.ndimage import distance_transform_edt, map_coordinates
+
     missing = ~np.isfinite(values)
     if missing.any():
         nearest = distance_transform_edt(missing, return_distances=False, return_indices=True)

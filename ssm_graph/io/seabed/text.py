@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from scipy.interpolate import LinearNDInterpolator
-from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
@@ -206,6 +204,9 @@ def _step(at: Array) -> float:
 
 def _triangulated(name: str, x: Array, y: Array, z: Array, sigma: Array | None) -> Raster:
     """Return a raster with about one sounding a cell, small holes bridged by triangles."""
+    from scipy.interpolate import LinearNDInterpolator
+    from scipy.spatial import Delaunay, QhullError, cKDTree
+
     on_line = DataError(f"{name}: expected soundings over an area, got them on a line")
     cell = float(np.sqrt(np.ptp(x) * np.ptp(y) / len(x)))
     if not cell > 0.0:

@@ -14,6 +14,7 @@ import math
 import re
 import socket
 import threading
+from collections import deque
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from socketserver import TCPServer
@@ -25,7 +26,7 @@ from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.live.protocols.json_messages import navigation_fields
 from ssm_graph.live.sockets.endpoints import LOOPBACK
-from ssm_graph.mission.navigation import Health, Navigation
+from ssm_graph.mission.navigation import Event, Health, Navigation, Severity
 from ssm_graph.mission.run_status import RunStatus
 
 MOST_BROWSERS: Final = 8
@@ -41,6 +42,10 @@ ALTITUDE_S: Final = 5.0
 """An altitude of a source that has been silent for longer is not shown."""
 SLOWEST: Final = 0.03
 """m/s, below which there is no course."""
+MOST_TURNS: Final = 20
+"""Of the verdict, beside the events of the run: what a watch looks back on."""
+_TURNED: Final = {Health.GOOD: Severity.INFO, Health.BAD: Severity.ERROR}
+"""How much a verdict matters that begins; the others warn."""
 _ADDRESS: Final = re.compile(r"(?:(?P<host>\[[0-9a-fA-F:.]+\]|[A-Za-z0-9_.-]*):)?(?P<port>\d{1,5})")
 _PORT: Final = re.compile(r":\d*$")
 """Of the header ``Host``, which leaves out the usual one."""
@@ -86,6 +91,8 @@ class LivePage:
         self._points: list[list[Any]] = []
         self._stride, self._n_seen = 1, 0
         self._frame: LocalFrame | None = None
+        self._health: Health | None = None
+        self._turns: deque[Event] = deque(maxlen=MOST_TURNS)
         try:
             self._server = _Server(host, port, self)
         except (OSError, UnicodeError) as error:  # which the name of a host may be no text for
@@ -105,6 +112,7 @@ class LivePage:
 
     def __call__(self, status: RunStatus) -> None:
         """Take how it goes now; never waits for a browser."""
+        self._note_turn(status.navigation)
         fields = self._fields(status)
         text = json.dumps(fields, allow_nan=False).encode()
         with self._changed:
@@ -120,6 +128,15 @@ class LivePage:
             self._changed.notify_all()
         self._server.shutdown()
         self._server.server_close()
+
+    def _note_turn(self, navigation: Navigation | None) -> None:
+        """Remember when the verdict became another, and why."""
+        if navigation is None or navigation.health is self._health:
+            return
+        self._health = navigation.health
+        severity = _TURNED.get(self._health, Severity.WARNING)
+        text = f"{self._health.name}: {navigation.reason}"
+        self._turns.append(Event(navigation.time_s, severity, "verdict", text))
 
     def _keep(self, point: list[Any] | None) -> None:
         self._n_seen += 1
@@ -158,7 +175,7 @@ class LivePage:
             "checkpoint_age_s": _finite(status.checkpoint_age_s),
             "events": [
                 {"time_s": _finite(e.time_s), "severity": e.severity.name, "text": e.text}
-                for e in status.events
+                for e in sorted((*status.events, *self._turns), key=_begun_s)
             ],
             "sources": [
                 {
@@ -207,6 +224,10 @@ class LivePage:
             self._frame = LocalFrame(*at)
         east, north, _ = self._frame.p_n_from_geodetic(*map(np.asarray, at)).tolist()
         return east, north
+
+
+def _begun_s(event: Event) -> float:
+    return event.time_s if math.isfinite(event.time_s) else -math.inf
 
 
 class _Events:

@@ -21,6 +21,7 @@ from typing import Any, Final
 import numpy as np
 
 from ssm_graph.base.errors import DataError
+from ssm_graph.base.progress import told
 from ssm_graph.base.times import UNIX_FROM_S
 from ssm_graph.io.nortek.nortek import read_nortek
 from ssm_graph.io.nortek.packets import is_nortek
@@ -179,7 +180,7 @@ def _water_linked(data: bytes) -> Recorded:
     framer = ObjectFramer(torn.append)
     messages: list[Message] = []
     time_s, last_s, before, has_clock = 0.0, -math.inf, dict[str, Any](), True
-    for text in framer.feed(data + b"\n"):
+    for text in told(framer.feed(data + b"\n"), len(data), size=len):
         report = _object(text)
         time_s = _unix(report, time_s)
         if "time_of_validity" not in report and "transducers" in report:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -240,6 +241,8 @@ def _errors(content: Content) -> Iterator[Chart]:
     t, traces = content.minutes(of.time_s), []
     sigma = 3.0 * np.hypot(of.position_sigma_enu, of.reference_sigma_enu)
     for i, (name, color) in enumerate(zip(("east", "north", "up"), EAST_NORTH_UP, strict=True)):
+        if not np.isfinite(of.position_enu[:, i]).any():
+            continue  # the reference says nothing of it
         bound = {"width": 0.8, "dash": "dot", "legendgroup": name, "hoverinfo": "skip"}
         traces.append(line(t, of.position_enu[:, i], name, color, legendgroup=name))
         for sign in (1.0, -1.0):
@@ -249,9 +252,14 @@ def _errors(content: Content) -> Iterator[Chart]:
     yield Chart("errors", "Errors against the reference", note, traces, layout)
 
 
-def _scale(traces: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+def _scale(traces: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return an axis for sigmas: of decades where they differ by more than two."""
-    return {"type": "log"} if _decades(traces) > 2.0 else {"rangemode": "tozero"}
+    low, high = _reach(traces)
+    if high <= 100.0 * low:
+        return {"rangemode": "tozero"}
+    ends = math.floor(math.log10(low)), math.ceil(math.log10(high))
+    ticks = [10.0**decade for decade in range(ends[0] - 1, ends[1] + 2)]
+    return {"type": "log", "tickvals": ticks, "ticktext": [f"{tick:g}" for tick in ticks]}
 
 
 def _unbroken(t: Array, heading_deg: Array) -> tuple[Array, Array]:
@@ -260,11 +268,12 @@ def _unbroken(t: Array, heading_deg: Array) -> tuple[Array, Array]:
     return np.insert(t, at, t[at]), np.insert(heading_deg, at, np.nan)
 
 
-def _decades(traces: Sequence[Mapping[str, Any]]) -> float:
+def _reach(traces: Sequence[Mapping[str, Any]]) -> tuple[float, float]:
+    """Return the smallest and the largest of all values above zero; ones if there is none."""
     values = [np.frombuffer(base64.b64decode(tr["y"]["bdata"]), "<f4") for tr in traces]
     known = np.concatenate(values)
     known = known[np.isfinite(known) & (known > 0.0)]
-    return float(np.log10(known.max() / known.min())) if len(known) else 0.0
+    return (float(known.min()), float(known.max())) if len(known) else (1.0, 1.0)
 
 
 def _beams(content: Content) -> Iterator[Chart]:

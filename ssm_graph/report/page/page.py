@@ -47,7 +47,12 @@ def page_of(content: Content, *, footer: str) -> str:
     links = [(f"{chart.name}-title", chart.title) for chart in charts]
     links += [(f"part{number}", title) for number, (title, _) in enumerate(told)]
     data = {
-        chart.name: {"traces": chart.traces, "layout": chart.layout, "is_time": chart.is_time}
+        chart.name: {
+            "traces": chart.traces,
+            "layout": chart.layout,
+            "is_time": chart.is_time,
+            "height": chart.height,
+        }
         for chart in charts
     }
     scripts = _SCRIPTS.format(

@@ -290,7 +290,7 @@ def _assumed(content: Content) -> str:
     if start:
         how = {"mission": "is that of the mission file", "local": "is local, at zero"}
         lines.append(f"The start {how.get(str(start.get('origin')), 'was aligned')}.")
-    notes = [*(summary.get("mission_notes") or ()), *(summary.get("notes") or ())]
+    notes = dict.fromkeys([*(summary.get("mission_notes") or ()), *(summary.get("notes") or ())])
     lines += [clocked(str(note), content.begin_s, content.epoch_s) for note in notes]
     items = "".join(f"<li>{_text(text)}</li>" for text in lines)
     return f"<ul>{items}</ul>" if items else ""
