@@ -54,6 +54,7 @@ from ssm_graph.smoothers.verdict import (
     adaptation,
     contradictions,
     efficiency,
+    most_by_noise,
     noise_found,
     noise_notes,
     with_sigmas,
@@ -269,10 +270,13 @@ class SsmSmoother:
     ) -> Steps[Pass]:
         """Return the last pass with the covariance that its residuals ask for."""
         kernel, aids, known = used.of_beams.kernel, linearizer.weighted, np.ones(len(used.aids))
-        beams = efficiency(last.mahalanobis_sq, last.weights, kernel) / faults.inflation_of(DVL)
+        t, weights, keyframe_s = last.mahalanobis_sq, last.weights, linearizer.problem.keyframe_s
+        most = most_by_noise(t, weights, keyframe_s[linearizer.problem.beams.keyframe])
+        beams = np.minimum(efficiency(t, weights, kernel), most) / faults.inflation_of(DVL)
         for aid in aids.all:
             own = aids.of(aid, last.aid_mahalanobis_sq), aids.of(aid, last.aid_weights)
-            says = efficiency(*own, used.of_aids.kernel, dim=aid.dim)
+            most = most_by_noise(*own, keyframe_s[aid.keyframe], dim=aid.dim)
+            says = np.minimum(efficiency(*own, used.of_aids.kernel, dim=aid.dim), most)
             aids.of(aid, known)[:] = says / faults.inflation_of(aid.name)
         step = yield from linearizer.solve_steps(
             last.states, last.beam_rows, beams * last.weights, known * last.aid_weights

@@ -36,7 +36,12 @@ from ssm_graph.simulation import (
 )
 from ssm_graph.simulation.faults import Sensor
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
-from ssm_graph.smoothers.faults.columns import KERNEL, beside_median, calibration_columns
+from ssm_graph.smoothers.faults.columns import (
+    KERNEL,
+    beside_median,
+    calibration_columns,
+    noisier_than_others,
+)
 from ssm_graph.smoothers.faults.grid import Grid
 from ssm_graph.smoothers.faults.hypotheses import Course, Hypothesis
 from ssm_graph.smoothers.faults.judged import Judged
@@ -328,6 +333,16 @@ def test_what_the_last_look_changes_is_said(monkeypatch: pytest.MonkeyPatch) -> 
     assert estimate.status is Status.SUSPECT
     assert [one.treatment for one in estimate.faults] == [Treatment.CHANGING]
     assert estimate.reason.startswith("depth, ")
+
+
+def test_beams_without_a_speed_are_compared_with_none() -> None:
+    """Of two that have some none is the noisy one; of none at all none either."""
+    rng = np.random.default_rng(0)
+    beam = np.repeat([0, 2], 500)
+    whitened = np.where(beam == 2, 5.0, 1.0) * rng.standard_normal(1000)
+    for n in (0, 1000):
+        factor = noisier_than_others(whitened[:n], beam[:n], n_beams=4)
+        np.testing.assert_array_equal(factor, 1.0)
 
 
 def test_what_stands_out_is_apart_from_what_lasts() -> None:

@@ -393,8 +393,26 @@ def test_a_solver_that_fails_says_it_too(monkeypatch: pytest.MonkeyPatch) -> Non
 
 def test_an_answer_without_suspects_is_left_alone() -> None:
     """To the same object."""
-    estimate = sg.smooth(healthy("hover", Grade.NAVIGATION, 41, duration_s=SMOOTHED_S))
-    assert with_suspects(estimate, ()) is estimate
+    mission = healthy("hover", Grade.NAVIGATION, 41, duration_s=SMOOTHED_S)
+    estimate = sg.smooth(mission)
+    assert with_suspects(estimate, (), mission) is estimate
+
+
+def test_what_lies_for_a_while_makes_no_suspect_of_another() -> None:
+    """Two beams that are off for 80 s make a scale of the depths: not of an answer without them."""
+    mission = healthy(
+        *("diving survey", Grade.TACTICAL, 80, Fault((0, 3), 110.0, 190.0, 0.1)),
+        gnss=None,
+        duration_s=200.0,
+    )
+    suspects = find_suspects(mission)
+    assert [one.sensor for one in suspects] == ["depth"]
+    estimate = sg.smooth(mission)
+    assert estimate.status is sg.Status.CONVERGED
+    blamed = [one for one in estimate.faults if one.treatment.is_blame]
+    assert {one.sensor.split()[0] for one in blamed} == {"DVL"}
+    blind = with_suspects(replace(estimate, faults=()), suspects, mission)
+    assert blind.status is sg.Status.SUSPECT
 
 
 @needs_logs

@@ -39,7 +39,7 @@ def noisier_than_stated(fit: InertialFit, keyframe_s: Array) -> list[DetectedFau
     chi_sq, dof = (np.add.reduceat(x, first) for x in (fit.chi_sq, fit.dof))
     found = []
     for begin, end in _stretches(chi_sq, dof):
-        total, expected = float(chi_sq[begin:end].sum()), float(dof[begin:end].sum())
+        total, expected = float(chi_sq[begin:end].sum()), max(float(dof[begin:end].sum()), 1.0)
         is_noise = 2 * (end - begin) > len(first)
         found.append(
             DetectedFault(
@@ -64,7 +64,7 @@ def _stretches(chi_sq: Array, dof: Array) -> Iterator[tuple[int, int]]:
     begin, end = np.triu_indices(n + 1, 1)
     sums = [np.concatenate([[0.0], np.cumsum(x)]) for x in (chi_sq, dof)]
     total, expected = (x[end] - x[begin] for x in sums)
-    # Of degrees of freedom that other sensors leave hardly any of there is nothing to be said.
+    # Where other sensors leave no degree of freedom there is nothing to be said.
     likely = chi2.logsf(total / USUAL, np.maximum(expected, 1.0))
     for _ in range(MOST):
         least = int(np.argmin(likely))
