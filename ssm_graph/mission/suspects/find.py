@@ -107,21 +107,19 @@ def _is_all_the_time(suspect: DetectedFault, estimate: Estimate, mission: Missio
     """Return whether the logs contradict a sensor without what another was off by for a while.
 
     Clocks, scales and axes are off all the time. A sound sensor seems to be so where another one
-    that it is compared with lies; an answer that has settled has that one by itself.
+    that it is compared with lies, which the answer finds by itself.
     """
     own = _instrument(suspect.sensor)
     others = [
         one
         for one in estimate.faults
-        if one.treatment.is_harmless and one.treatment.is_blame and one.is_decided
-        if _instrument(one.sensor) != own
+        if one.treatment.is_blame and one.is_decided and _instrument(one.sensor) != own
     ]
-    if estimate.status is not Status.CONVERGED or not others:
+    if not others:
         return True
     rest = _without(mission, others)
-    if len(rest.dvl.time_s) < REST * len(mission.dvl.time_s):
-        return True
-    return any(_instrument(one.sensor) == own for one in find_suspects(rest))
+    is_little = len(rest.dvl.time_s) < REST * len(mission.dvl.time_s)
+    return is_little or any(_instrument(one.sensor) == own for one in find_suspects(rest))
 
 
 def _instrument(sensor: str) -> str:
