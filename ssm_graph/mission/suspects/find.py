@@ -42,7 +42,7 @@ SAME_DELAY_S: Final = 0.2
 AT_ENDS_S: Final = 2.0
 
 
-REST: Final = 0.5
+REST: Final = 0.3
 """Share of the pings that has to be left for a second look, beside what was off for a while."""
 INERTIAL: Final = "IMU"
 OF_IMU: Final = frozenset({"gyros", "gyro", "accelerometers", "accelerometer"})
