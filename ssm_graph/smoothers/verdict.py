@@ -132,9 +132,6 @@ BEND = 1e-4
 FEWEST_TO_JUDGE = 100
 """Components below which nothing is said of the efficiency of a kernel."""
 LEAST_EFFICIENCY = 0.5
-NOTABLE_SQUARE = 2.0
-"""Of hundred readings by what is stated, from which on they are noisier: six deviations of it."""
-LEAST_SHARE = 1e-3
 LARGEST_CHANGE = 3.0
 """Factor by which one adaptation changes a sigma at most."""
 
@@ -203,31 +200,6 @@ def efficiency(t: Array, weights: Array, kernel: Kernel, *, dim: int = 1) -> flo
     slope = float(np.mean(w + 2.0 * bend / dim))
     square = float(np.mean(w**2 * t)) / dim * float(np.mean(w))
     return float(np.clip(slope * abs(slope) / square, LEAST_EFFICIENCY, 1.0 / LEAST_EFFICIENCY))
-
-
-def most_by_noise(t: Array, weights: Array, time_s: Array, *, dim: int = 1) -> Array:
-    """Return the share (M,) of its weight that each measurement says at most, for its noise.
-
-    A weight lets go of what sticks out; where most readings do, it leaves them more than the
-    inverse of their variance, which medians of successive ones tell. Infinite where they err no
-    more than stated.
-
-    Parameters
-    ----------
-    t : (M,) squared Mahalanobis lengths.
-    weights : (M,) those at the floor do not count.
-    time_s : (M,)
-    dim : of the measurements.
-    """
-    counts = np.flatnonzero(weights > WEIGHT_FLOOR)
-    most, counts = np.full(len(t), np.inf), counts[np.argsort(time_s[counts], kind="stable")]
-    for own in np.array_split(counts, max(len(counts) // FEWEST_TO_JUDGE, 1)):
-        if len(own) * dim < FEWEST:
-            continue
-        scale_sq = float(np.median(t[own]) / chi2.isf(0.5, dim))
-        if scale_sq > NOTABLE_SQUARE:
-            most[own] = max(1.0 / (scale_sq * float(np.mean(weights[own]))), LEAST_SHARE)
-    return most
 
 
 def noise_found(

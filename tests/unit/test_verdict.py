@@ -19,7 +19,8 @@ from ssm_graph.mission.answer import SUSPECT_STRETCH_S
 from ssm_graph.mission.estimate import Status
 from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.simulation import DiveRoute, GnssSettings, Grade, SimulatedMission, TransitRoute
-from ssm_graph.smoothers.verdict import contradictions, efficiency, most_by_noise
+from ssm_graph.smoothers.faults.windows import most_by_noise
+from ssm_graph.smoothers.verdict import contradictions, efficiency
 from tests.helpers import outcome, simulated, true_states, with_imu, with_initial
 
 
