@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.similarity import WEIGHT_FLOOR, Kernel, Similarity, expected_mahalanobis_sq
+from factors.similarity import Kernel, Similarity, expected_mahalanobis_sq
 from ssm_graph.base.errors import SolverError
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps, at_once
@@ -44,7 +44,7 @@ from ssm_graph.mission.problem import Problem, with_white_noise
 from ssm_graph.smoothers.descent import descend_steps
 from ssm_graph.smoothers.faults.nuisances import DVL
 from ssm_graph.smoothers.faults.watch import FaultWatch
-from ssm_graph.smoothers.faults.windows import Counts, disagreeing, informative, readings_of
+from ssm_graph.smoothers.faults.windows import disagreeing, informative, readings_of
 from ssm_graph.smoothers.settings import WARM_KERNEL, SmootherConfig
 from ssm_graph.smoothers.track import calibration_of, current_of, undetermined
 from ssm_graph.smoothers.verdict import (
@@ -283,8 +283,9 @@ class SsmSmoother:
         step = yield from linearizer.solve_steps(
             last.states, last.beam_rows, beams * last.weights, known * last.aid_weights
         )
-        counts = Counts(last.weights > WEIGHT_FLOOR, last.aid_weights > WEIGHT_FLOOR)
-        readings = readings_of(linearizer, last.states, last.beam_rows.error, counts)
+        readings = readings_of(
+            linearizer, last.states, last.beam_rows.error, last.weights, last.aid_weights
+        )
         left = [one for one in found if one is not None]
         return last._replace(step=step), [*left, *disagreeing(readings, keyframe_s)]
 

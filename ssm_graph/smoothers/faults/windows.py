@@ -12,7 +12,6 @@ from collections.abc import Iterable, Iterator
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factors.similarity import WEIGHT_FLOOR, Kernel
 from ssm_graph.base import chi2
@@ -101,15 +100,6 @@ def _stretches(chi_sq: Array, dof: Array) -> Iterator[tuple[int, int]]:
         likely = np.where((begin < end[least]) & (end > begin[least]), 0.0, likely)
 
 
-class Counts(NamedTuple):
-    """Which measurements count for something."""
-
-    beams: NDArray[np.bool_]
-    """(M,)"""
-    aids: NDArray[np.bool_]
-    """(A,)"""
-
-
 class Readings(NamedTuple):
     """What an answer leaves of one beam, or of one component of an aid."""
 
@@ -123,16 +113,20 @@ class Readings(NamedTuple):
 
 
 def readings_of(
-    linearizer: GraphLinearizer, states: States, beam_error: Array, counts: Counts
+    linearizer: GraphLinearizer,
+    states: States,
+    beam_error: Array,
+    weights: Array,
+    aid_weights: Array,
 ) -> Iterator[Readings]:
     """Yield what the states leave of all readings that count.
 
-    ``beam_error`` (M,) is in m/s.
+    ``beam_error`` (M,) is in m/s; the weights are (M,) of beams, and (A,).
     """
     problem, weighted = linearizer.problem, linearizer.weighted
     beams, time_s = problem.beams, problem.keyframe_s
     for beam in range(beams.n_beams):
-        own = (beams.beam == beam) & counts.beams
+        own = (beams.beam == beam) & (weights > WEIGHT_FLOOR)
         error = (beam_error / beams.sigma)[own]
         yield Readings(
             f"DVL beam {beam + 1}", time_s[beams.keyframe[own]], error, SLOW_BEAM[0] ** 2
@@ -140,7 +134,8 @@ def readings_of(
     for aid in weighted.all:
         if aid.name not in WHITE or len(aid) == 0:
             continue
-        error, used = weighted.whitened(aid, states).error, weighted.of(aid, counts.aids)
+        error = weighted.whitened(aid, states).error
+        used = weighted.of(aid, aid_weights) > WEIGHT_FLOOR
         labels, slow = np.array(aid.labels), SLOW_AIDS.get(aid.name, SLOW_AID)[0] ** 2
         if isinstance(aid, DepthMeans):  # the slow part is no less in a mean
             slow *= aid.sigma**2 * float(np.median(aid.root_information)) ** 2
