@@ -17,7 +17,7 @@ from benchmarks.processes import tell
 from benchmarks.report import Option, Report, number_text, table
 from benchmarks.soak.stream import GOOD, errors_of, longest_run
 from benchmarks.trust.lies import LIVE
-from benchmarks.trust.run import BEYOND, CLEAN, DURATION_S, REALISTIC, mission_of
+from benchmarks.trust.run import BEYOND, DURATION_S, mission_of
 from ssm_graph.base.code_version import code_version
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.io.raw_log.rows import messages_of
@@ -25,6 +25,7 @@ from ssm_graph.live.estimator import FixedLagSmoother, IntegrityConfig
 from ssm_graph.simulation import AidSettings, CompassSettings, with_faults
 from ssm_graph.study.ledger import Key, Ledger, Row, run_trials
 
+CLEAN, REALISTIC = "no fault", "no fault, realistic instruments, as stated by their preset"
 LOOK_S = 1.0
 MOST_S = 10.0
 """So long an answer may be GOOD and beyond 5 sigma."""

@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.processes import tell
 from benchmarks.report import Option, Report, number_text, table
 from benchmarks.trust.lies import LIES
-from ssm_graph import Estimate, Mission, SmootherConfig, SsmGraphError, evaluate, smooth
+from ssm_graph import Estimate, SsmGraphError, evaluate, smooth
 from ssm_graph.base.code_version import code_version
 from ssm_graph.simulation import (
     AidSettings,
@@ -39,7 +39,6 @@ AS_GOOD = 1.2
 """Ratio to the oracle up to which an answer is right."""
 BEYOND = 5.0
 """Sigmas of an error that its sigma does not cover."""
-CLEAN, REALISTIC = "no fault", "no fault, realistic instruments, as stated by their preset"
 SHARES = (1.0, 2.0, 3.0)
 """Sigmas inside which errors are counted."""
 
@@ -54,16 +53,7 @@ class Run(NamedTuple):
     status: str
     is_named: bool
     """Whether the verdict names the sensor that lies, over a time that has to do with the lie"""
-    n_blamed: int
-    """Faults that it found; what is only allowed for is none"""
-    inside: tuple[float, ...]
-    """Shares of the errors east, north and up inside 1, 2 and 3 sigma: nine numbers"""
-    nees: float
     seconds: float
-    plain_seconds: float
-    """Without the search for faults; NaN where it was not tried"""
-    plain_ratio: float
-    """Horizontal rms with the search over that without it"""
 
     @property
     def is_right(self) -> bool:
@@ -117,66 +107,30 @@ def mission_of(
 def run(key: Key) -> Row:
     """Smooth one mission (label, grade, seed, is realistic) with its lie, and as the oracle."""
     label, grade, seed, realistic = str(key[0]), str(key[1]), int(key[2]), bool(key[3])
-    row = _run(label, grade, seed, realistic)._asdict()
-    return row | {f"inside {i}": share for i, share in enumerate(row.pop("inside"))}
-
-
-def _of(row: Row) -> Run:
-    inside = tuple(row[f"inside {i}"] for i in range(3 * len(SHARES)))
-    return Run(inside=inside, **{name: row[name] for name in Run._fields if name != "inside"})
-
-
-def _run(label: str, grade: str, seed: int, realistic: bool) -> Run:
     rng = np.random.default_rng([seed, *label.encode()])
-    lie = LIES.get(label)
-    with_gnss = seed % 2 == 0 if lie is None or lie.with_gnss is None else lie.with_gnss
+    lie = LIES[label]
+    with_gnss = seed % 2 == 0 if lie.with_gnss is None else lie.with_gnss
     sim = mission_of(grade, seed, with_gnss=with_gnss, realistic=realistic)
-    if lie is None:
-        return _judged(sim, sim.mission, sim.mission, None)
     drawn = lie.draw(rng, DURATION_S)
     faults = drawn if isinstance(drawn, tuple) else (drawn,)
     broken = with_faults(sim.mission, faults, truth=sim.truth_at, seed=seed)
-    begin, end = min(f.start_s for f in faults), max(min(f.end_s, DURATION_S) for f in faults)
-    return _judged(sim, broken.mission, broken.told(sim.mission), (lie.named, begin, end))
-
-
-def _judged(
-    sim: SimulatedMission,
-    mission: Mission,
-    told: Mission,
-    lie: tuple[tuple[str, ...], float, float] | None,
-) -> Run:
+    span_s = min(f.start_s for f in faults), max(min(f.end_s, DURATION_S) for f in faults)
     begin = time.process_time()
     try:
-        estimate = smooth(mission)
+        estimate = smooth(broken.mission)
     except SsmGraphError as error:
-        return _refused(str(error), lie)
+        is_named = bool(re.search("|".join(lie.named), str(error)))
+        return Run(np.inf, np.inf, "REFUSED", is_named, np.nan)._asdict()
     seconds = time.process_time() - begin
-    found = _errors(sim, estimate)
-    oracle = found if told is mission else _errors(sim, smooth(told))
-    plain_seconds = plain_ratio = np.nan
-    if lie is None:
-        begin = time.process_time()
-        plain = smooth(mission, SmootherConfig())
-        plain_seconds = time.process_time() - begin
-        plain_ratio = found.rms_m[0] / _errors(sim, plain).rms_m[0]
+    found = errors_of(sim, estimate)
+    oracle = errors_of(sim, smooth(broken.told(sim.mission)))
     return Run(
         ratio=max(np.divide(found.rms_m, oracle.rms_m)),
         z=found.z,
         status=estimate.status.name,
-        is_named=lie is not None and _names(estimate, *lie),
-        n_blamed=sum(one.treatment.is_blame for one in estimate.faults),
-        inside=found.inside,
-        nees=found.nees,
+        is_named=_names(estimate, lie.named, *span_s),
         seconds=seconds,
-        plain_seconds=plain_seconds,
-        plain_ratio=plain_ratio,
-    )
-
-
-def _refused(said: str, lie: tuple[tuple[str, ...], float, float] | None) -> Run:
-    is_named = lie is not None and bool(re.search("|".join(lie[0]), said))
-    return Run(np.inf, np.inf, "REFUSED", is_named, 0, (np.nan,) * 9, *(np.nan,) * 4)
+    )._asdict()
 
 
 def _names(estimate: Estimate, words: Sequence[str], begin_s: float, end_s: float) -> bool:
@@ -189,22 +143,29 @@ def _names(estimate: Estimate, words: Sequence[str], begin_s: float, end_s: floa
     return not estimate.status.is_good and bool(pattern.search(estimate.reason))
 
 
-class _Errors(NamedTuple):
+class Errors(NamedTuple):
+    """Of the positions of an answer, against the truth."""
+
     rms_m: tuple[float, float]
     """Horizontal, vertical"""
     z: float
     inside: tuple[float, ...]
+    """Shares of the errors east, north and up inside :data:`SHARES`"""
     nees: float
+    sigma_m: float
+    """Horizontal, root of the mean square"""
 
 
-def _errors(sim: SimulatedMission, estimate: Estimate) -> _Errors:
+def errors_of(sim: SimulatedMission, estimate: Estimate) -> Errors:
+    """Return the errors of an answer at its keyframes."""
     trajectory = estimate.trajectory
     metrics = evaluate(trajectory, sim.truth_at(trajectory.time_s))
     series = metrics.errors
     z = np.abs(series.position_enu) / series.position_sigma_enu
     inside = tuple(float(x) for s in SHARES for x in np.mean(z < s, axis=0))
     rms_m = metrics.rmse_horizontal_m, metrics.rmse_vertical_m
-    return _Errors(rms_m, float(z.max()), inside, metrics.nees_position)
+    sigma_m = float(np.sqrt(np.mean(series.position_sigma_enu[:, :2] ** 2)))
+    return Errors(rms_m, float(z.max()), inside, metrics.nees_position, sigma_m)
 
 
 HEADER: tuple[str, ...] = (
@@ -228,15 +189,6 @@ vertical, whichever is larger. Right: up to {AS_GOOD}. Said: not CONVERGED, and 
 is among those named. Covered: no error beyond {BEYOND:g} of its sigmas, and the sensor is named.
 z: largest error of a position in its own sigma.
 """
-CLEAN_HEADER: tuple[str, ...] = (
-    "mission",
-    "grade",
-    "not CONVERGED",
-    "sensors blamed",
-    "missions with blame",
-)
-CLEAN_HEADER += ("inside 1 sigma E/N/U, %", "inside 2 sigma, %", "inside 3 sigma, %", "NEES / 3")
-CLEAN_HEADER += ("rms with search / without", "time with search / without")
 
 
 def line(label: str, grade: str, runs: Sequence[Run]) -> list[str]:
@@ -254,19 +206,6 @@ def line(label: str, grade: str, runs: Sequence[Run]) -> list[str]:
     ]
 
 
-def clean_line(label: str, grade: str, runs: Sequence[Run]) -> list[str]:
-    """Return one row of the table of missions without a lie."""
-    inside = 100.0 * np.mean([run.inside for run in runs], axis=0)
-    return [
-        *(label, grade, f"{sum(run.status != 'CONVERGED' for run in runs)} of {len(runs)}"),
-        *(str(sum(run.n_blamed for run in runs)), str(sum(run.n_blamed > 0 for run in runs))),
-        *(" / ".join(f"{x:.1f}" for x in part) for part in np.split(inside, 3)),
-        f"{np.mean([run.nees for run in runs]):.2f}",
-        f"{np.mean([run.plain_ratio for run in runs]):.3f}",
-        f"{sum(run.seconds for run in runs) / sum(run.plain_seconds for run in runs):.2f}",
-    ]
-
-
 def main() -> None:
     """Run all missions and write the tables."""
     report = Report(
@@ -274,34 +213,23 @@ def main() -> None:
         Option("--seeds", 30, "missions of each kind"),
         Option("--first-seed", 20_000, "where they begin"),
         Option("--grades", "navigation,tactical", "names with commas between them"),
-        Option("--clean-grades", "navigation,tactical,mems", "of missions without a fault"),
-        Option("--only", "", "lies, or missions without, whose names have this in them"),
+        Option("--only", "", "lies whose names have this in them"),
         Option("--realistic", False, "lies on realistic instruments, too"),
         Option("--jobs", 2, "missions at a time"),
     )
     args = report.args
     seeds = range(args.first_seed, args.first_seed + args.seeds)
     labels = [label for label in LIES if args.only in label]
-    lies = [(label, grade) for label in labels for grade in args.grades.split(",")]
-    sound = [label for label in (CLEAN, REALISTIC) if args.only in label]
-    fair = [(label, grade) for label in sound for grade in args.clean_grades.split(",")]
-    cells = [(*cell, args.realistic) for cell in lies]
-    cells += [(label, grade, label == REALISTIC) for label, grade in fair]
-    cases: list[Key] = [(*cell[:2], seed, cell[2]) for cell in cells for seed in seeds]
+    cells = [(label, grade) for label in labels for grade in args.grades.split(",")]
+    cases: list[Key] = [(*cell, seed, args.realistic) for cell in cells for seed in seeds]
     ledger = Ledger(args.out / f"{code_version()}.jsonl", {"benchmark": "trust.run"})
     made = run_trials(run, cases, ledger, n_jobs=args.jobs, on_progress=tell)
-    runs = [_of(made[key]) for key in cases]
-    rows: dict[bool, list[list[str]]] = {True: [], False: []}
-    for i, (label, grade, _) in enumerate(cells):
-        own = runs[i * len(seeds) : (i + 1) * len(seeds)]
-        rows[label in LIES].append((line if label in LIES else clean_line)(label, grade, own))
-    report.write(_page(rows[True], rows[False], seeds))
-
-
-def _page(lies: Sequence[list[str]], fair: Sequence[list[str]], seeds: range) -> list[str]:
+    runs = [Run(**made[key]) for key in cases]
+    rows = [
+        line(*cell, runs[i * len(seeds) : (i + 1) * len(seeds)]) for i, cell in enumerate(cells)
+    ]
     about = f"Seeds {seeds.start} to {seeds.stop - 1}; missions of {DURATION_S:g} s."
-    shown = [table(head, rows) for head, rows in ((HEADER, lies), (CLEAN_HEADER, fair)) if rows]
-    return [about, "", LEGEND, *("\n".join((*lines, "")) for lines in shown)]
+    report.write([about, "", LEGEND, *table(HEADER, rows)])
 
 
 if __name__ == "__main__":

@@ -27,10 +27,7 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps, at_once
 from ssm_graph.engine.chain import ChainSolution
 from ssm_graph.engine.error_state import STATE_DIM
-from ssm_graph.engine.reweighting import (
-    Schedule,
-    WarmSchedule,
-)
+from ssm_graph.engine.reweighting import Schedule, WarmSchedule
 from ssm_graph.engine.states import States
 from ssm_graph.graph.beacon_start import ambiguous_beacons
 from ssm_graph.graph.beam_rows import BeamRows
@@ -47,13 +44,13 @@ from ssm_graph.mission.problem import Problem, with_white_noise
 from ssm_graph.smoothers.descent import descend_steps
 from ssm_graph.smoothers.faults.nuisances import DVL
 from ssm_graph.smoothers.faults.watch import FaultWatch
+from ssm_graph.smoothers.faults.windows import disagreeing, informative, readings_of
 from ssm_graph.smoothers.settings import WARM_KERNEL, SmootherConfig
 from ssm_graph.smoothers.track import calibration_of, current_of, undetermined
 from ssm_graph.smoothers.verdict import (
     MAX_ADAPTATIONS,
     adaptation,
     contradictions,
-    efficiency,
     noise_found,
     noise_notes,
     with_sigmas,
@@ -254,11 +251,12 @@ class SsmSmoother:
                 break
             yield 0.007 * problem.n_keyframes
             weights = weights.after(this, faults)
+        left: list[DetectedFault] = []
         if self.config.fault_search is not None:
-            this = yield from self._with_sigmas_steps(linearizer, this, weights, faults)
+            this, left = yield from self._with_sigmas_steps(linearizer, this, weights, faults)
         inertial = inertial_fit(linearizer.inertial_rows(this.states), this.step)
         yield 0.02 * problem.n_keyframes
-        found = problem.faults + faults.faults(this.states, inertial)
+        found = (*problem.faults, *faults.faults(this.states, inertial), *left)
         kernel = weights.of_beams.wanted
         notes = (*problem.notes, *(fault.sentence for fault in found), *_notes_of(first))
         ended = (linearizer, this, tuple(iterations), status)
@@ -266,18 +264,30 @@ class SsmSmoother:
 
     def _with_sigmas_steps(
         self, linearizer: GraphLinearizer, last: Pass, used: Weights, faults: FaultWatch
-    ) -> Steps[Pass]:
-        """Return the last pass with the covariance that its residuals ask for."""
-        kernel, aids, known = used.of_beams.kernel, linearizer.weighted, np.ones(len(used.aids))
-        beams = efficiency(last.mahalanobis_sq, last.weights, kernel) / faults.inflation_of(DVL)
+    ) -> Steps[tuple[Pass, list[DetectedFault]]]:
+        """Return the last pass with the covariance that its residuals ask for, and what they say.
+
+        Who errs more than stated, at random or for long.
+        """
+        problem, aids, known = linearizer.problem, linearizer.weighted, np.ones(len(used.aids))
+        t, weights, keyframe_s = last.mahalanobis_sq, last.weights, problem.keyframe_s
+        beams_s = keyframe_s[problem.beams.keyframe]
+        says, *found = informative(DVL, t, weights, beams_s, used.of_beams.kernel)
+        beams = says / faults.inflation_of(DVL)
         for aid in aids.all:
             own = aids.of(aid, last.aid_mahalanobis_sq), aids.of(aid, last.aid_weights)
-            says = efficiency(*own, used.of_aids.kernel, dim=aid.dim)
+            of = keyframe_s[aid.keyframe], used.of_aids.kernel
+            says, noise = informative(aid.name, *own, *of, dim=aid.dim)
             aids.of(aid, known)[:] = says / faults.inflation_of(aid.name)
+            found.append(noise)
         step = yield from linearizer.solve_steps(
             last.states, last.beam_rows, beams * last.weights, known * last.aid_weights
         )
-        return last._replace(step=step)
+        readings = readings_of(
+            linearizer, last.states, last.beam_rows.error, last.weights, last.aid_weights
+        )
+        left = [one for one in found if one is not None]
+        return last._replace(step=step), [*left, *disagreeing(readings, keyframe_s)]
 
     def _iterate(
         self,

@@ -107,7 +107,7 @@ def smooth(
         on_stage=on_stage,
     )
     try:
-        return with_suspects(finished(steps), suspects)
+        return with_suspects(finished(steps), suspects, mission)
     except SolverError as error:
         said = [suspect.sentence for suspect in suspects]
         raise SolverError("; ".join([*said, str(error)])) from error

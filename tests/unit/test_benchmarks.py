@@ -273,12 +273,22 @@ def test_golden_vectors(tmp_path: Path) -> None:
 
 @pytest.mark.benchmark
 def test_trust(tmp_path: Path) -> None:
-    """A row for each lie and grade; clean missions are called good."""
-    options = "--seeds 1 --jobs 1 --grades tactical --only 'one beam' --clean-grades tactical"
+    """A row for each lie and grade."""
+    options = "--seeds 1 --jobs 1 --grades tactical --only 'one beam'"
     done = run("trust.run", options, "trust", tmp_path)
-    lies, clean = done.rows("one beam"), done.rows("no fault")
-    assert [row[1] for row in lies] == ["tactical"] * 2
-    assert clean == []
+    assert [row[1] for row in done.rows("one beam")] == ["tactical"] * 2
+
+
+@pytest.mark.benchmark
+def test_sound_missions(tmp_path: Path) -> None:
+    """Nothing is accused; weights cost something, and little, where noise is as stated."""
+    done = run("trust.sound", "--seeds 2 --jobs 1 --grades tactical", "sound", tmp_path)
+    for row in [*done.rows("realistic"), *done.rows("plain")]:
+        assert row[1:3] == ["tactical", "2"]
+        assert row[3].startswith("0 (")
+        assert row[4].startswith("0 (")
+    (price,) = done.rows("tactical")
+    assert 1.0 < float(price[3]) < 1.06
 
 
 @pytest.mark.benchmark

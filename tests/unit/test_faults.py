@@ -35,12 +35,19 @@ from ssm_graph.simulation import (
     with_faults,
 )
 from ssm_graph.simulation.faults import Sensor
+from ssm_graph.simulation.randomness import gauss_markov
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
-from ssm_graph.smoothers.faults.columns import KERNEL, beside_median, calibration_columns
+from ssm_graph.smoothers.faults.columns import (
+    KERNEL,
+    beside_median,
+    calibration_columns,
+    noisier_than_others,
+)
 from ssm_graph.smoothers.faults.grid import Grid
 from ssm_graph.smoothers.faults.hypotheses import Course, Hypothesis
 from ssm_graph.smoothers.faults.judged import Judged
 from ssm_graph.smoothers.faults.search import FaultSearch
+from ssm_graph.smoothers.faults.windows import Readings, disagreeing
 from tests.aids_fixture import with_every_aid
 from tests.helpers import simulated, with_initial
 
@@ -328,6 +335,36 @@ def test_what_the_last_look_changes_is_said(monkeypatch: pytest.MonkeyPatch) -> 
     assert estimate.status is Status.SUSPECT
     assert [one.treatment for one in estimate.faults] == [Treatment.CHANGING]
     assert estimate.reason.startswith("depth, ")
+
+
+def test_beams_without_a_speed_are_compared_with_none() -> None:
+    """Of two that have some none is the noisy one; of none at all none either."""
+    rng = np.random.default_rng(0)
+    beam = np.repeat([0, 2], 500)
+    whitened = np.where(beam == 2, 5.0, 1.0) * rng.standard_normal(1000)
+    for n in (0, 1000):
+        factor = noisier_than_others(whitened[:n], beam[:n], n_beams=4)
+        np.testing.assert_array_equal(factor, 1.0)
+
+
+def test_residuals_that_last_are_said() -> None:
+    """A slow half of the noise and wild readings are nobody's; a wave of two sigmas is."""
+    rng, time_s = np.random.default_rng(0), np.arange(400.0)
+    white = rng.standard_normal((2, 400))
+    slow = gauss_markov(rng.standard_normal((400, 1)), time_s, 20.0)[:, 0]
+    wild = white[0] + 50.0 * (rng.random(400) < 0.1)
+    sound = [
+        Readings("DVL beam 1", time_s, np.sqrt(0.5) * white[0] + np.sqrt(0.49) * slow, 0.49),
+        Readings("GNSS", time_s, wild, 0.25),
+        Readings("USBL", time_s[:20], 5.0 + white[0, :20], 0.25),
+    ]
+    assert disagreeing(sound, time_s) == []
+    wave = 2.0 * np.sin(time_s / 30.0) * (time_s >= 120.0)
+    (found,) = disagreeing([*sound, Readings("range", time_s, white[1] + wave, 0.25)], time_s)
+    assert (found.sensor, found.treatment) == ("range", Treatment.SAID)
+    assert found.begin_s == pytest.approx(120.0, abs=60.0)
+    assert found.end_s == pytest.approx(399.0, abs=60.0)
+    assert found.rivals
 
 
 def test_what_stands_out_is_apart_from_what_lasts() -> None:

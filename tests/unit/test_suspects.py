@@ -43,6 +43,7 @@ from ssm_graph.simulation.routes import (
     TransitRoute,
 )
 from tests.blueye_fixture import DIVE, GRID, SQUARE, converted, needs_logs
+from tests.helpers import simulated
 
 DURATION_S, SMOOTHED_S = 300.0, 150.0
 SURFACE = DepthProfile(0.5, 0.5)
@@ -393,8 +394,25 @@ def test_a_solver_that_fails_says_it_too(monkeypatch: pytest.MonkeyPatch) -> Non
 
 def test_an_answer_without_suspects_is_left_alone() -> None:
     """To the same object."""
-    estimate = sg.smooth(healthy("hover", Grade.NAVIGATION, 41, duration_s=SMOOTHED_S))
-    assert with_suspects(estimate, ()) is estimate
+    mission = healthy("hover", Grade.NAVIGATION, 41, duration_s=SMOOTHED_S)
+    estimate = sg.smooth(mission)
+    assert with_suspects(estimate, (), mission) is estimate
+
+
+def test_what_lies_for_a_while_makes_no_suspect_of_another() -> None:
+    """Two beams that are off for 80 s make a scale of the depths: not of an answer without them."""
+    mission = healthy(
+        *("diving survey", Grade.TACTICAL, 80, Fault((0, 3), 110.0, 190.0, 0.1)),
+        gnss=None,
+        duration_s=200.0,
+    )
+    suspects = find_suspects(mission)
+    assert [one.sensor for one in suspects] == ["depth"]
+    found = DetectedFault("DVL beams 1 and 4", "+0.1 m/s", 110.0, 190.0, 1e3, 1, Treatment.FREED)
+    estimate = replace(sg.smooth(simulated().mission), faults=(found,))
+    assert with_suspects(estimate, suspects, mission) is estimate
+    blind = with_suspects(replace(estimate, faults=()), suspects, mission)
+    assert blind.status is sg.Status.SUSPECT
 
 
 @needs_logs

@@ -19,6 +19,7 @@ from ssm_graph.mission.answer import SUSPECT_STRETCH_S
 from ssm_graph.mission.estimate import Status
 from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.simulation import DiveRoute, GnssSettings, Grade, SimulatedMission, TransitRoute
+from ssm_graph.smoothers.faults.windows import most_by_noise
 from ssm_graph.smoothers.verdict import contradictions, efficiency
 from tests.helpers import outcome, simulated, true_states, with_imu, with_initial
 
@@ -53,6 +54,18 @@ def moved(states: States, **changes: Array) -> States:
     """Return states with some arrays changed."""
     arrays: dict[str, Any] = {name: getattr(states, name) for name in states._fields}
     return States.of(**(arrays | changes))
+
+
+def test_readings_far_noisier_than_stated_say_no_more_than_their_variance() -> None:
+    """Four times the noise for a third of the time: a sixteenth there, elsewhere no bound."""
+    rng, kernel = np.random.default_rng(0), LogKernel()
+    is_noisy = np.arange(3000) // 1000 == 1
+    t = (np.where(is_noisy, 4.0, 1.0) * rng.standard_normal(3000)) ** 2
+    weights = kernel.weight(t)
+    most = most_by_noise(t, weights, np.arange(3000.0))
+    assert np.isinf(most[~is_noisy]).all()
+    assert np.mean((most * weights)[is_noisy]) == pytest.approx(1.0 / 16.0, rel=0.1)
+    assert np.isinf(most_by_noise(t[1000:1010], weights[1000:1010], np.arange(10.0))).all()
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
-from typing import ClassVar, NamedTuple, Self, final
+from typing import ClassVar, Final, NamedTuple, Self, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,9 @@ from ssm_graph.engine.extras import Extra, Extras
 from ssm_graph.mission.mission import Aids
 from ssm_graph.sensors.drift import Drift
 from ssm_graph.sensors.imu import ImuLog
+
+OF_SIZE: Final = " scale"
+"""Behind the name of an aid: it reads too much by a share of what it measures."""
 
 Rows = slice | NDArray[np.intp] | NDArray[np.bool_]
 
@@ -197,6 +200,13 @@ class Aid(Table, ABC):
         Their errors, predicted minus measured, grow by as much in each second that they are late.
         """
         return None
+
+    def own_errors(self) -> Mapping[str, Array]:
+        """Return what (M, d) a unit of each error of its own adds to what it measures, by name.
+
+        A name stands behind that of the aid; :data:`OF_SIZE` is a share of the measurement.
+        """
+        return {}
 
     def led_along(self, before: RowStates | None, at: RowStates) -> Self:  # noqa: ARG002
         """Return the same after states of the keyframes before and of their own, if they follow.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Self
 
@@ -14,7 +15,7 @@ from ssm_graph.base.times import Indices, is_inside, nearest
 from ssm_graph.base.usable import require_fields, require_finite, require_positive
 from ssm_graph.engine.error_state import POSITION, ROTATION
 from ssm_graph.engine.extras import Extra
-from ssm_graph.graph.aids.aid import Aid, Keyframes, Linearised, RowStates
+from ssm_graph.graph.aids.aid import OF_SIZE, Aid, Keyframes, Linearised, RowStates
 from ssm_graph.mission.mission import Aids
 from ssm_graph.sensors.acoustic import RangeLog
 
@@ -135,6 +136,15 @@ class Ranges(Aid):
             place_n = self.beacon_n[i] + (self.R_nl[i] @ off[..., None])[..., 0]
             places = np.where((self.beacon == i)[..., None], place_n, places)
         return places
+
+    def own_errors(self) -> Mapping[str, Array]:
+        """Return a wrong speed of sound, and each beacon's delay where there are some, (M, 1)."""
+        found = {OF_SIZE: self.range_m[:, None]}
+        heard = np.unique(self.beacon)
+        for beacon in heard if len(heard) > 1 else ():
+            name = f" to beacon {self.number[beacon]}"
+            found[name] = (self.beacon == beacon).astype(float)[:, None]
+        return found
 
     def measured(self, at: RowStates) -> Linearised:
         """Linearise ranges: one component each."""

@@ -5,6 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
+import numpy as np
+
+from ssm_graph.base.frozen import Array
+from ssm_graph.base.times import is_inside
 from ssm_graph.mission.estimate import Estimate, Status
 from ssm_graph.mission.fault import DetectedFault, Treatment
 from ssm_graph.mission.mission import Mission
@@ -18,6 +22,7 @@ from ssm_graph.mission.suspects.plain import (
     order_by_parity,
     reordered,
 )
+from ssm_graph.mission.suspects.regression import Mask
 from ssm_graph.mission.suspects.say import said, said_order
 from ssm_graph.mission.suspects.search import (
     JUMP_AS_GOOD,
@@ -36,6 +41,12 @@ TAKEN_OFF_S: Final = 2.0
 SAME_DELAY_S: Final = 0.2
 AT_ENDS_S: Final = 2.0
 
+
+REST: Final = 0.3
+"""Share of the pings that has to be left for a second look, beside what was off for a while."""
+INERTIAL: Final = "IMU"
+OF_IMU: Final = frozenset({"gyros", "gyro", "accelerometers", "accelerometer"})
+"""First words of what people call it by its parts."""
 
 AS_GOOD: Final = 10.0
 """Less gain by so much is as good an explanation."""
@@ -66,11 +77,15 @@ def find_suspects(mission: Mission) -> tuple[DetectedFault, ...]:
     return tuple(faults)
 
 
-def with_suspects(estimate: Estimate, suspects: tuple[DetectedFault, ...]) -> Estimate:
+def with_suspects(
+    estimate: Estimate, suspects: tuple[DetectedFault, ...], mission: Mission
+) -> Estimate:
     """Return an estimate that says what is suspect, first of all.
 
-    A clock that the estimate has taken off by as much is none any more: its line stays.
+    A clock that the estimate has taken off by as much is none any more: its line stays. What the
+    logs of ``mission`` contradict only while another instrument was off is none either.
     """
+    suspects = tuple(one for one in suspects if _is_all_the_time(one, estimate, mission))
     known = [one for one in suspects if _is_taken_off(one, estimate)]
     suspects = tuple(one for one in suspects if one not in known)
     if known:
@@ -86,6 +101,47 @@ def with_suspects(estimate: Estimate, suspects: tuple[DetectedFault, ...]) -> Es
         reason="; ".join([*(suspect.sentence for suspect in suspects), *unsettled]),
         faults=(*suspects, *estimate.faults),
     )
+
+
+def _is_all_the_time(suspect: DetectedFault, estimate: Estimate, mission: Mission) -> bool:
+    """Return whether the logs contradict a sensor without what another was off by for a while.
+
+    Clocks, scales and axes are off all the time. A sound sensor seems to be so where another one
+    that it is compared with lies, which the answer finds by itself.
+    """
+    own = _instrument(suspect.sensor)
+    others = [
+        one
+        for one in estimate.faults
+        if one.treatment.is_blame and one.is_decided and _instrument(one.sensor) != own
+    ]
+    if not others:
+        return True
+    rest = _without(mission, others)
+    is_little = len(rest.dvl.time_s) < REST * len(mission.dvl.time_s)
+    return is_little or any(_instrument(one.sensor) == own for one in find_suspects(rest))
+
+
+def _instrument(sensor: str) -> str:
+    first = sensor.split()[0]
+    return INERTIAL if first in OF_IMU else first
+
+
+def _without(mission: Mission, faults: list[DetectedFault]) -> Mission:
+    """Return a mission without the readings that faults befell; of inertial ones without pings."""
+
+    def is_sound(time_s: Array, *instruments: str) -> Mask:
+        sound = np.ones(len(time_s), bool)
+        for one in faults:
+            if _instrument(one.sensor) in instruments:
+                sound &= ~is_inside(time_s, one.begin_s, one.end_s)
+        return sound
+
+    dvl, gnss, depth = mission.dvl, mission.gnss, mission.depth
+    dvl = dvl.rows(is_sound(dvl.time_s, "DVL", INERTIAL))
+    gnss = None if gnss is None else gnss.rows(is_sound(gnss.time_s, "GNSS"))
+    depth = None if depth is None else depth.rows(is_sound(depth.time_s, "depth"))
+    return replace(mission, dvl=dvl, gnss=gnss, depth=depth)
 
 
 def _is_taken_off(suspect: DetectedFault, estimate: Estimate) -> bool:

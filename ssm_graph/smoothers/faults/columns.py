@@ -64,6 +64,14 @@ class Channel(NamedTuple):
     on; without, a rate goes in steps from block to block"""
 
 
+class Mode(NamedTuple):
+    """A way of one number in which an aid may be off."""
+
+    aid: str
+    columns: Array
+    """(M, d, 1) what a unit of it does to the whitened measurements"""
+
+
 def beside_median(values: Array) -> Array:
     """Return readings (N, ...) less their running median, the ends mirrored.
 
@@ -97,24 +105,26 @@ def _squares_beside_median(whitened: Array) -> Array:
     return np.asarray(np.sum(off**2, axis=1))
 
 
-def noisier_than_others(whitened: Array, beam: NDArray[np.intp]) -> Array:
+def noisier_than_others(whitened: Array, beam: NDArray[np.intp], *, n_beams: int) -> Array:
     """Return the sigma of each beam by that of the others, 1.0 where it is no more than chance.
 
     Parameters
     ----------
     whitened : (M,) what beams miss, in their stated sigmas.
     beam : (M,) from 0.
+    n_beams : of the instrument; some may have no speed at all.
     """
-    n = int(beam.max(initial=-1)) + 1
-    each = [_squares_beside_median(whitened[beam == b][:, None]) for b in range(n)]
+    each = [_squares_beside_median(whitened[beam == b][:, None]) for b in range(n_beams)]
     each = [x[x < REACH_SQ] for x in each]  # gross errors are weighed away one by one
     variance = np.array([np.mean(x) if len(x) else 0.0 for x in each])
     count = np.array([len(x) for x in each])
-    factor = np.ones(n)
-    for b in range(n if n > 2 else 0):
-        others = np.delete(variance, b)
+    factor = np.ones(n_beams)
+    for b in np.flatnonzero(count).tolist():
+        others = np.delete(variance, b)[np.delete(count, b) > 0]
+        if len(others) < 2:
+            break
         ratio = variance[b] / max(float(np.median(others)), 1e-12)
-        chance = NOISIER_DEVIATIONS * np.sqrt(4.0 / max(count[b], 1))
+        chance = NOISIER_DEVIATIONS * np.sqrt(4.0 / count[b])
         if ratio > NOISIER and np.log(ratio) > chance and variance[b] > 1.0:
             factor[b] = np.sqrt(ratio)
     return factor
@@ -211,7 +221,9 @@ def linear_of_steps(
     return Linear(
         states=states,
         beam_weights=beam_weights,
-        beam_noise=noisier_than_others(beams.error / problem.beams.sigma, problem.beams.beam),
+        beam_noise=noisier_than_others(
+            beams.error / problem.beams.sigma, problem.beams.beam, n_beams=problem.beams.n_beams
+        ),
         aids=weighted.all,
         aid_weights={aid.name: weighted.of(aid, weights) for aid in weighted.all},
         solution=solution,
@@ -241,9 +253,9 @@ class Channels:
         sizes = {BEAM: beams.n_beams, BOTTOM: 3, SCALE: 1, MOUNTING: 3}
         sizes |= {aid.name: aid.dim for aid in linear.aids if len(aid)}
         sizes[IMU] = 6
-        self.clocks = self._clocks()
-        """(M, d, 1) what a second of delay does to the whitened measurements, by their names"""
-        sizes |= dict.fromkeys(self.clocks, 1)
+        self.modes = dict(self._modes())
+        """Ways of one number in which an aid may be off besides, by the names of their channels"""
+        sizes |= dict.fromkeys(self.modes, 1)
         dims = {aid.name: aid.dim for aid in linear.aids if len(aid)}
         widths = [*sizes.values(), *dims.values()]
         slices = [
@@ -268,8 +280,8 @@ class Channels:
     def of_aids(self) -> Iterator[tuple[str, dict[str, Array]]]:
         """Yield each aid with the columns (M, d, c) on its whitened rows, by their channels."""
         for name, root in self.aids.items():
-            clock = name + CLOCK
-            yield name, {name: root} | ({clock: self.clocks[clock]} if clock in self.clocks else {})
+            own = {of: mode.columns for of, mode in self.modes.items() if mode.aid == name}
+            yield name, {name: root} | own
 
     def dim_of(self, name: str) -> int:
         """Return how many numbers a channel has."""
@@ -313,15 +325,16 @@ class Channels:
         begin, end = slice(ACCEL_BIAS.start, STATE_DIM), slice(n + ACCEL_BIAS.start, n + STATE_DIM)
         return np.asarray(rows[:, :STATE_DIM, begin] + rows[:, :STATE_DIM, end])
 
-    def _clocks(self) -> dict[str, Array]:
-        """Return the columns of the clocks of aids that move fast enough to tell."""
-        linear, found = self._linear, {}
+    def _modes(self) -> Iterator[tuple[str, Mode]]:
+        """Yield clocks of aids that move fast enough to tell, and what aids may err in besides."""
+        linear = self._linear
         for aid in linear.aids:
-            at = states_at(linear.states, aid.keyframe, linear.problem.extras)
-            rate = aid.rate(at) if len(aid) else None
-            if rate is not None:
-                found[aid.name + CLOCK] = -aid.root_information @ rate[..., None]
-        return found
+            if len(aid) == 0:
+                continue
+            rate = aid.rate(states_at(linear.states, aid.keyframe, linear.problem.extras))
+            off = {} if rate is None else {CLOCK: -rate}
+            for name, size in (off | dict(aid.own_errors())).items():
+                yield aid.name + name, Mode(aid.name, aid.root_information @ size[..., None])
 
     def _columns(self) -> Columns:
         linear = self._linear
@@ -330,13 +343,14 @@ class Channels:
         for aid in linear.aids:
             own = np.zeros((len(aid), aid.dim, self.width))
             if len(aid):
-                root, clock = self.aids[aid.name], aid.name + CLOCK
+                root = self.aids[aid.name]
                 channel = self.of(aid.name)
                 own[:, :, channel.columns] = root
                 since = (keyframe_s[aid.keyframe] - keyframe_s[0]) / TREND_S
                 own[:, :, channel.rates] = root * since[:, None, None]
-                if clock in self.clocks:
-                    own[:, :, self.of(clock).columns] = self.clocks[clock]
+                for name, mode in self.modes.items():
+                    if mode.aid == aid.name:
+                        own[:, :, self.of(name).columns] = mode.columns
                 own *= np.sqrt(linear.aid_weights[aid.name])[:, None, None]
             rows.append(own.reshape(-1, self.width))
         between = np.zeros((*linear.between.missed.shape, self.width))

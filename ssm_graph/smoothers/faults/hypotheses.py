@@ -17,6 +17,7 @@ import numpy as np
 
 from ssm_graph.base import chi2
 from ssm_graph.base.frozen import Array
+from ssm_graph.graph.aids.aid import OF_SIZE
 from ssm_graph.smoothers.faults.columns import (
     BEAM,
     BOTTOM,
@@ -126,9 +127,9 @@ def hypotheses_of(channels: Channels, *, significance: float) -> tuple[Hypothesi
     found = [*_of_beams(channels), *_of_the_array(channels), *_of_inertial()]
     for name in channels.aids:
         found.extend(of_aid(name, channels.dim_of(name)))
-    for clock in channels.clocks:
-        sensor = clock.removesuffix(CLOCK)
-        found.append(Hypothesis(sensor, clock, np.eye(1), np.full(1, LATEST_S), _late))
+    for channel, mode in channels.modes.items():
+        sigma, say = _of_mode(mode.aid, channel.removeprefix(mode.aid))
+        found.append(Hypothesis(mode.aid, channel, np.eye(1), np.full(1, sigma), say))
     return tuple(replace(one, tail=tail) for one in found)
 
 
@@ -159,7 +160,7 @@ def _of_the_array(channels: Channels) -> Iterator[Hypothesis]:
     yield Hypothesis("DVL", BOTTOM, np.eye(3), np.array([3.0, 3.0, RISING_M_PER_S]), _bottom)
     if len(channels.beams_d) >= 3:
         yield Hypothesis("DVL", BEAM, channels.beams_d, np.full(3, 3.0), _axes)
-    yield Hypothesis("DVL", SCALE, np.eye(1), np.full(1, 1.0), _scale)
+    yield Hypothesis("DVL", SCALE, np.eye(1), np.full(1, 1.0), partial(_share, "speed"))
     yield Hypothesis("DVL", MOUNTING, np.eye(3), np.full(3, 1.0), _turn)
 
 
@@ -177,6 +178,16 @@ def of_aid(name: str, dim: int) -> Iterator[Hypothesis]:
     for course in Course:
         is_usual = name == "depth" and course is Course.RAMP
         yield replace(one, course=course, handicap=USUAL if is_usual else 0.0)
+
+
+def _of_mode(aid: str, name: str) -> tuple[float, Callable[[Array], str]]:
+    """Return the prior sigma of a way in which an aid may be off, and words for its size."""
+    if name == CLOCK:
+        return LATEST_S, _late
+    if name == OF_SIZE:
+        return 1.0, partial(_share, "distance")
+    unit, size = AIDS[aid]
+    return size, lambda s: f"{name.strip()} {s[0]:+.3g} {unit}"
 
 
 AIDS = {
@@ -219,8 +230,8 @@ def _axes(s: Array) -> str:
     return f"its velocity is off by {s[0]:+.3f}, {s[1]:+.3f}, {s[2]:+.3f} m/s along its axes"
 
 
-def _scale(s: Array) -> str:
-    return f"reads {1.0 + s[0]:.4f} of the speed"
+def _share(of: str, s: Array) -> str:
+    return f"reads {1.0 + s[0]:.4f} of the {of}"
 
 
 def _turn(s: Array) -> str:

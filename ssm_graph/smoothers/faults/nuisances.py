@@ -17,8 +17,11 @@ from scipy.linalg import block_diag, solve_triangular
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import STATE_DIM
 from ssm_graph.engine.evidence import Columns, Evidence
-from ssm_graph.graph.aids.depth import DepthMeans
+from ssm_graph.graph.aids.depth import DEPTH_DRIFT, DepthMeans
+from ssm_graph.graph.aids.gnss import GNSS_DRIFT
 from ssm_graph.imu.increments import MergedSamples
+from ssm_graph.mission.calibration import DVL_DRIFT
+from ssm_graph.mission.imu_variables import imu_columns
 from ssm_graph.mission.problem import Problem
 from ssm_graph.smoothers.faults.columns import BEAM, IMU, Channels, Linear
 
@@ -92,6 +95,21 @@ class Nuisances:
         of_block = np.repeat(names, n_coarse)
         found = {name: np.flatnonzero(of_block == name) for name in dict.fromkeys(names)}
         return found | {ERRORS: len(of_block) + np.flatnonzero(~self._is_own)}
+
+    @property
+    def stated(self) -> frozenset[str]:
+        """Of which instruments the mission states what they err in slowly."""
+        problem = self._linear.problem
+        extras, noise = problem.extras, problem.chain.noise
+        is_stated = {
+            DVL: DVL_DRIFT in extras,
+            "GNSS": GNSS_DRIFT in extras,
+            "depth": DEPTH_DRIFT in extras,
+            ACCELEROMETERS: noise.accel_bias_instability > 0.0,
+            GYROS: noise.gyro_bias_instability > 0.0,
+            ERRORS: len(imu_columns(extras)) > 0,
+        }
+        return frozenset(name for name, stated in is_stated.items() if stated)
 
     def slow(self, name: str) -> Slow:
         """Return what an instrument errs in slowly, at its widest."""

@@ -41,7 +41,7 @@ BY_MEAN: Final = {DVL: 4.0}
 """and of beams a stated drift, alike along all axes, leaves as much."""
 HINT: Final = 1.5
 """Deviations from which on others are allowed for, too, once one is sure: who states nothing of one
-instrument states nothing of the next;"""
+instrument states nothing of the next, but for those of which something is stated;"""
 SEEN: Final = 3.0
 """or this mean of their chi-square: without, the data could not show how small they are."""
 AS_LIKELY: Final = 2.0
@@ -196,13 +196,14 @@ def unstated_of(
     n_coarse : blocks that each of those that change slowly has.
     """
     groups = nuisances.groups(n_coarse)
+    stated = nuisances.stated
     tests = {name: _Test.of(own, score, among, prior) for name, own in groups.items()}
     if not any(test.is_sure(BY_MEAN.get(name, USUAL)) for name, test in tests.items()):
         return None
     more = {
         name: test
         for name, test in tests.items()
-        if test.deviations > HINT or (test.mean > SEEN and name != ERRORS)
+        if test.is_sure(BY_MEAN.get(name, USUAL)) or (name not in stated and _hints(name, test))
     }
     known = {name: (test.chi_sq, test.mean) for name, test in more.items()}
     slow = [
@@ -213,6 +214,10 @@ def unstated_of(
     n = 27 if ERRORS in known else 0
     sigma, columns = nuisances.imu_sigma[:n], nuisances.imu_columns[..., :n]
     return Unstated(tuple(slow), sigma, columns, known)
+
+
+def _hints(name: str, test: _Test) -> bool:
+    return test.deviations > HINT or (test.mean > SEEN and name != ERRORS)
 
 
 def _kinds(numbers: Array) -> dict[str, Array]:

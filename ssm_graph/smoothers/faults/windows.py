@@ -1,20 +1,28 @@
-"""Whether the inertial data fit an answer as well as their noise says, in windows of a mission.
+"""Whether all data fit an answer as well as their noise says, in windows of a mission.
 
 What the search finds is freed before; what is left is noise, or what no hypothesis describes. The
-inertial data pay for all of it: whatever bends the answer bends it against them.
+inertial data pay for all of it: whatever bends the answer bends it against them. Of beams and aids
+successive residuals tell both apart: noise is new in each, what no hypothesis describes lasts.
+Their means and trends tell nothing, for the answer follows these.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Final
+from collections.abc import Iterable, Iterator
+from typing import Final, NamedTuple
 
 import numpy as np
 
+from factors.similarity import WEIGHT_FLOOR, Kernel
 from ssm_graph.base import chi2
 from ssm_graph.base.frozen import Array
+from ssm_graph.engine.states import States
+from ssm_graph.graph.aids.depth import DepthMeans
 from ssm_graph.graph.inertial_rows import InertialFit
+from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.mission.fault import DetectedFault, Treatment
+from ssm_graph.smoothers.faults.nuisances import SLOW_AID, SLOW_AIDS, SLOW_BEAM
+from ssm_graph.smoothers.verdict import efficiency
 
 WINDOW_S: Final = 60.0
 USUAL: Final = 2.0
@@ -26,6 +34,24 @@ TAIL: Final = 1e-6
 MOST: Final = 3
 """Stretches that are named."""
 OTHERS: Final = "DVL or aids, whose lie the inertial data contradict"
+CLIP: Final = 3.0
+"""Sigmas that a residual counts for at most: single bad readings are nobody's lasting fault."""
+SAFE: Final = 2.0
+"""By the variance of what healthy instruments err in slowly."""
+DEVIATIONS: Final = 6.0
+"""Of the sum of products of successive residuals beyond that, and"""
+LEAST: Final = 0.5
+"""what their mean has to be beyond it, in the square of a reading's sigma."""
+WHITE: Final = ("GNSS", "USBL", "range", "depth")
+"""Aids whose errors are new in each reading, but for a part; iron and maps err alike for long."""
+CONTRADICTING: Final = "what it is compared with"
+GROUP: Final = 100
+"""Successive readings whose median tells their noise,"""
+FEWEST: Final = 30
+"""the fewest that do,"""
+NOTABLE_SQUARE: Final = 2.0
+"""and their variance by that stated, from which on they are noisier: six deviations of it."""
+LEAST_SHARE: Final = 1e-3
 
 
 def noisier_than_stated(fit: InertialFit, keyframe_s: Array) -> list[DetectedFault]:
@@ -39,7 +65,7 @@ def noisier_than_stated(fit: InertialFit, keyframe_s: Array) -> list[DetectedFau
     chi_sq, dof = (np.add.reduceat(x, first) for x in (fit.chi_sq, fit.dof))
     found = []
     for begin, end in _stretches(chi_sq, dof):
-        total, expected = float(chi_sq[begin:end].sum()), float(dof[begin:end].sum())
+        total, expected = float(chi_sq[begin:end].sum()), max(float(dof[begin:end].sum()), 1.0)
         is_noise = 2 * (end - begin) > len(first)
         found.append(
             DetectedFault(
@@ -64,7 +90,7 @@ def _stretches(chi_sq: Array, dof: Array) -> Iterator[tuple[int, int]]:
     begin, end = np.triu_indices(n + 1, 1)
     sums = [np.concatenate([[0.0], np.cumsum(x)]) for x in (chi_sq, dof)]
     total, expected = (x[end] - x[begin] for x in sums)
-    # Of degrees of freedom that other sensors leave hardly any of there is nothing to be said.
+    # Where other sensors leave no degree of freedom there is nothing to be said.
     likely = chi2.logsf(total / USUAL, np.maximum(expected, 1.0))
     for _ in range(MOST):
         least = int(np.argmin(likely))
@@ -72,3 +98,148 @@ def _stretches(chi_sq: Array, dof: Array) -> Iterator[tuple[int, int]]:
             return
         yield int(begin[least]), int(end[least])
         likely = np.where((begin < end[least]) & (end > begin[least]), 0.0, likely)
+
+
+class Readings(NamedTuple):
+    """What an answer leaves of one beam, or of one component of an aid."""
+
+    sensor: str
+    time_s: Array
+    """(n,)"""
+    error: Array
+    """(n,) in stated sigmas"""
+    slow: float
+    """Variance of what healthy ones err in slowly, in that of a reading"""
+
+
+def readings_of(
+    linearizer: GraphLinearizer,
+    states: States,
+    beam_error: Array,
+    weights: Array,
+    aid_weights: Array,
+) -> Iterator[Readings]:
+    """Yield what the states leave of all readings that count.
+
+    ``beam_error`` (M,) is in m/s; the weights are (M,) of beams, and (A,).
+    """
+    problem, weighted = linearizer.problem, linearizer.weighted
+    beams, time_s = problem.beams, problem.keyframe_s
+    for beam in range(beams.n_beams):
+        own = (beams.beam == beam) & (weights > WEIGHT_FLOOR)
+        error = (beam_error / beams.sigma)[own]
+        yield Readings(
+            f"DVL beam {beam + 1}", time_s[beams.keyframe[own]], error, SLOW_BEAM[0] ** 2
+        )
+    for aid in weighted.all:
+        if aid.name not in WHITE or len(aid) == 0:
+            continue
+        error = weighted.whitened(aid, states).error
+        used = weighted.of(aid, aid_weights) > WEIGHT_FLOOR
+        labels, slow = np.array(aid.labels), SLOW_AIDS.get(aid.name, SLOW_AID)[0] ** 2
+        if isinstance(aid, DepthMeans):  # the slow part is no less in a mean
+            slow *= aid.sigma**2 * float(np.median(aid.root_information)) ** 2
+        for axis, of_axis in enumerate(labels.reshape(len(aid), aid.dim).T):
+            for label in np.unique(of_axis):
+                own = used & (of_axis == label)
+                yield Readings(aid.name, time_s[aid.keyframe[own]], error[own, axis], slow)
+
+
+def disagreeing(readings: Iterable[Readings], keyframe_s: Array) -> list[DetectedFault]:
+    """Return the whole windows over which sensors disagree with an answer, time and again.
+
+    Of each sensor one stretch, the surest.
+    """
+    found: dict[str, DetectedFault] = {}
+    for one in readings:
+        if len(one.error) < FEWEST:
+            continue
+        error, usual = np.clip(one.error, -CLIP, CLIP), SAFE * one.slow
+        product = error[1:] * error[:-1] - usual
+        begin_s = np.arange(keyframe_s[0], keyframe_s[-1], WINDOW_S)
+        window = np.searchsorted(begin_s, one.time_s[1:], side="right") - 1
+        total, count = (
+            np.bincount(window, x, len(begin_s)) for x in (product, np.ones(len(window)))
+        )
+        begin, end = np.triu_indices(len(begin_s) + 1, 1)
+        sums = [np.concatenate([[0.0], np.cumsum(x)]) for x in (total, count)]
+        more, n = (x[end] - x[begin] for x in sums)
+        sigmas = more / np.sqrt(np.maximum(n, 1.0)) / (1.0 + usual)
+        sigmas[more < LEAST * n] = 0.0
+        best = int(np.argmax(sigmas))
+        if sigmas[best] <= DEVIATIONS:
+            continue
+        chi_sq, size = float(sigmas[best]) ** 2, np.sqrt(more[best] / n[best] + usual)
+        ends_s = np.append(begin_s, keyframe_s[-1])
+        if one.sensor not in found or chi_sq > found[one.sensor].chi_sq:
+            found[one.sensor] = DetectedFault(
+                sensor=one.sensor,
+                what=f"disagrees with the answer by {size:.1f} of its sigmas for long",
+                begin_s=float(ends_s[begin[best]]),
+                end_s=float(ends_s[end[best]]),
+                chi_sq=chi_sq,
+                dof=1,
+                treatment=Treatment.SAID,
+                rivals=(CONTRADICTING,),
+                remedy="look at its place, mounting and units, and at those of the others",
+            )
+    return list(found.values())
+
+
+def informative(
+    sensor: str, t: Array, weights: Array, time_s: Array, kernel: Kernel, *, dim: int = 1
+) -> tuple[Array, DetectedFault | None]:
+    """Return how much each measurement says (M,), by its weight, and whether a sensor is noisy.
+
+    Parameters
+    ----------
+    sensor : its name.
+    t, weights, time_s : (M,) squared Mahalanobis lengths, what the kernel made of these, s.
+    kernel : that of the weights.
+    dim : of the measurements.
+    """
+    most = most_by_noise(t, weights, time_s, dim=dim)
+    says = np.minimum(efficiency(t, weights, kernel, dim=dim), most)
+    return says, _noisy(sensor, t, most, time_s, dim=dim)
+
+
+def _noisy(sensor: str, t: Array, most: Array, time_s: Array, *, dim: int) -> DetectedFault | None:
+    own = np.isfinite(most)
+    if not own.any():
+        return None
+    factor = float(np.sqrt(np.median(t[own]) / chi2.isf(0.5, dim)))
+    return DetectedFault(
+        sensor=sensor,
+        what=f"errs {factor:.1f} times as much as stated, at random",
+        begin_s=float(time_s[own].min()),
+        end_s=float(time_s[own].max()),
+        chi_sq=float(np.sum(t[own])),
+        dof=int(own.sum()) * dim,
+        treatment=Treatment.WIDENED,
+        remedy="state larger sigmas",
+    )
+
+
+def most_by_noise(t: Array, weights: Array, time_s: Array, *, dim: int = 1) -> Array:
+    """Return the share (M,) of its weight that each measurement says at most, for its noise.
+
+    A weight lets go of what sticks out; where most readings do, it leaves them more than the
+    inverse of their variance, which medians of successive ones tell. Infinite where they err no
+    more than stated.
+
+    Parameters
+    ----------
+    t : (M,) squared Mahalanobis lengths.
+    weights : (M,) those at the floor do not count.
+    time_s : (M,)
+    dim : of the measurements.
+    """
+    counts = np.flatnonzero(weights > WEIGHT_FLOOR)
+    most, counts = np.full(len(t), np.inf), counts[np.argsort(time_s[counts], kind="stable")]
+    for own in np.array_split(counts, max(len(counts) // GROUP, 1)):
+        if len(own) * dim < FEWEST:
+            continue
+        scale_sq = float(np.median(t[own]) / chi2.isf(0.5, dim))
+        if scale_sq > NOTABLE_SQUARE:
+            most[own] = max(1.0 / (scale_sq * float(np.mean(weights[own]))), LEAST_SHARE)
+    return most
