@@ -13,7 +13,7 @@ from typing import Any
 from unittest.mock import patch
 
 from ssm_graph.base.errors import SsmGraphError
-from ssm_graph.live.run.run_folder import CheckpointWriter
+from ssm_graph.live.run.disk import CheckpointWriter
 from ssm_graph.study.store import StudyStore
 from tests.live_fixture import Crash, ListSource, some_messages
 from tests.unit.test_doors import DOORS, at_door

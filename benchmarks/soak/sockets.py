@@ -40,7 +40,7 @@ from ssm_graph.mission.navigation import Health
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.imu import ImuSample
-from ssm_graph.sensors.messages import Message
+from ssm_graph.sensors.messages import Message, Readings
 from ssm_graph.simulation import SimulatedMission, simulate
 
 CYCLE_S: Final = 600.0
@@ -116,9 +116,9 @@ class Ear:
         """Since the begin, s."""
         return self._clock.elapsed_s()
 
-    def rest(self) -> list[Message]:
-        """Return what waits at the end."""
-        return self._hub.rest()
+    def waiting(self) -> list[Readings]:
+        """Return what has come and waits."""
+        return self._hub.waiting()
 
     def poll(self, timeout_s: float) -> list[Message]:
         """Return what has come; tell of it once a second."""

@@ -147,6 +147,14 @@ class Decoder(ABC):
             self.n_sound += self.n_refused == n_before
         return messages + self._overdue(arrival_s)
 
+    def waiting(self) -> list[Message]:
+        """Return complete messages that wait for others; most protocols have none."""
+        return []
+
+    def take_waiting(self) -> list[Message]:
+        """Return them for good: nothing more will come."""
+        return []
+
     def take_refusals(self) -> list[str]:
         """Return what was refused since the last call, a sentence each, and forget it."""
         return self._refusals.take()

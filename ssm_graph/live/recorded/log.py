@@ -24,7 +24,7 @@ from ssm_graph.base.errors import DataError
 from ssm_graph.base.times import UNIX_FROM_S
 from ssm_graph.io.nortek.nortek import read_nortek
 from ssm_graph.io.nortek.packets import is_nortek
-from ssm_graph.io.raw_log.rows import RowKind
+from ssm_graph.io.raw_log.kinds import RowKind
 from ssm_graph.io.recording import whole
 from ssm_graph.io.tables.append_file import write_through
 from ssm_graph.io.teledyne.ensembles import is_pd0
