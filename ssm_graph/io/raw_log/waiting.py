@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from ssm_graph.io.raw_log.kinds import RowKind
+from ssm_graph.io.tables.append_file import free_name
 from ssm_graph.sensors.messages import Message, Readings
 
 WAITING: Final = "waiting"
@@ -47,6 +48,8 @@ class WaitingFile:
         if content == self._content and self.problem is None:
             return
         try:
+            if self._path.is_dir():
+                self._path.rename(free_name(self._path))
             if content:
                 part = self._path.with_suffix(".part")
                 part.write_bytes(content)
