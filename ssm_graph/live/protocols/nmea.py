@@ -135,7 +135,7 @@ class NmeaDecoder(Decoder):
     """Positions (with GST) to fixes, pressures to depths, headings; other sentences are ignored.
 
     Of GGA, GNS, RMC and GLL the first that comes is read, of HDT, THS, PASHR and HDG too; ``only``
-    names one of each that alone is read, whatever comes. ``height`` is that above the geoid plus
+    names those that are read, whatever comes. ``height`` is that above the geoid plus
     the geoid's separation: above the ellipsoid. Sigmas are those of a GST of the same time of day,
     before or after its position, else from HDOP. A position that is estimated, typed in or
     simulated (quality 6, 7, 8) is refused: dead reckoning is no measurement, it might be our own.
