@@ -219,7 +219,8 @@ class RawLog:
             parts.append(f"rows that wait in memory for the disk: {n_rows} ({self._reason})")
         if self._n_lost:
             parts.append(f"rows lost because {self._max_waiting} waited already: {self._n_lost}")
-        parts += [file.problem for file in (*self._files(), self._held) if file.problem]
+        problems = (*(file.problem for file in self._files()), self._held.problem)
+        parts += [problem for problem in problems if problem]
         if self._sync_failure:
             parts.append(f"the disk does not confirm what it was given ({self._sync_failure})")
         return f"raw log: {'; '.join(parts)}" if parts else None
