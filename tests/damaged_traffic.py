@@ -136,10 +136,11 @@ class Target:
 
     def feed(self, chunk: bytes, arrival_s: float) -> list[Message]:
         """Feed one chunk and check all that must hold after it."""
-        messages: list[Message] = []
+        messages, held = list[Message](), list[Message]()
         start = time.perf_counter()
         try:
             messages = self.decoder.feed(chunk, arrival_s=arrival_s)
+            held = self.decoder.waiting()
         except Exception as error:
             self.fail(f"raised {error!r}", chunk)
         spent_s = time.perf_counter() - start
@@ -151,7 +152,7 @@ class Target:
         self.most_held = max(self.most_held, self.decoder.n_held)
         if self.decoder.n_held > MAX_HELD:
             self.fail(f"holds {self.decoder.n_held} bytes", chunk)
-        for message in messages:
+        for message in (*messages, *held):
             if (name := bad_number(message)) is not None:
                 self.fail(f"{name} of {message} is not finite", chunk)
         return messages

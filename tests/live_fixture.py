@@ -26,7 +26,7 @@ from ssm_graph.mission.run_status import LinkState, OutputStatus, SourceStatus
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.imu import ImuSample
-from ssm_graph.sensors.messages import Message
+from ssm_graph.sensors.messages import Message, Readings
 from tests.mission_fixture import make_mission
 
 LAG = 3
@@ -128,8 +128,8 @@ class ListSource:
         """Whether all were given."""
         return self._n_given >= len(self._messages)
 
-    def rest(self) -> list[Message]:
-        """Return what waits at the end: nothing."""
+    def waiting(self) -> list[Readings]:
+        """Return what has come and waits: nothing."""
         return []
 
     def poll(self, timeout_s: float) -> list[Message]:  # noqa: ARG002

@@ -13,7 +13,7 @@ from typing import Any
 from unittest.mock import patch
 
 from ssm_graph.base.errors import SsmGraphError
-from ssm_graph.live.run.run_folder import CheckpointWriter
+from ssm_graph.live.run.disk import CheckpointWriter
 from ssm_graph.study.store import StudyStore
 from tests.live_fixture import Crash, ListSource, some_messages
 from tests.unit.test_doors import DOORS, at_door
@@ -88,6 +88,8 @@ AT_REST: dict[str, Act] = {
     "`log/imu.csv` with other columns": written("log/imu.csv", b"time_s,x\n1.0,2.0\n"),
     "`log/arrivals` gone": gone("log/arrivals"),
     "`log/arrivals` of zeros": written("log/arrivals", bytes(300)),
+    "`log/waiting` of noise": written("log/waiting", bytes(range(256)) * 9),
+    "`log/waiting` a folder": replaced("log/waiting", os.mkdir),
     "`run.json` gone": gone("run.json"),
     "`run.json` cut off": cut("run.json"),
     "`run.json` of another run": written("run.json", b'{"format": 1}'),

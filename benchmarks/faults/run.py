@@ -1,13 +1,15 @@
 """Faults injected into missions, one a row: what happens, what is lost, how it comes back.
 
 ``python -m benchmarks.faults.run --keep`` (some minutes on two cores); ``--only clock`` runs the
-rows whose name has that word. Exit code 1 if a row fails.
+rows whose name has that word. A row that is done is kept in ``--out``, in a file of the code's
+version, and the same command goes on. Exit code 1 if a row fails.
 """
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
 from benchmarks.faults.case import (
     BEGIN_S,
@@ -29,9 +31,11 @@ from benchmarks.faults.case import (
 from benchmarks.faults.data import data_cases
 from benchmarks.faults.process import PROCESS_ROWS, run_process_row
 from benchmarks.faults.transforms import untouched
-from benchmarks.processes import side_by_side
+from benchmarks.processes import tell
 from benchmarks.report import Option, Report, table
+from ssm_graph.base.code_version import code_version
 from ssm_graph.mission.navigation import Health
+from ssm_graph.study.ledger import Key, Ledger, run_trials
 
 PROCESS = """\
 Kills and disks: `ssm-graph online` replays 40 s as fast as it goes, a checkpoint every 3 s; the
@@ -50,14 +54,15 @@ from its begin where it never ends. The shares are those of position, velocity a
 """
 
 
-def run_row(name: str) -> Row:
+def run_row(key: Key) -> dict[str, Any]:
     """Run the case of this name; a numerical warning counts as an exception."""
+    (name,) = key
     if name in PROCESS_ROWS:
-        return run_process_row(name)
+        return run_process_row(str(name))._asdict()
     case = next(case for case in data_cases() if case.name == name)
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
-        return judge(case, run_case(case))
+        return judge(case, run_case(case))._asdict()
 
 
 def summary(data: Sequence[Row], process: Sequence[Row]) -> str:
@@ -96,7 +101,10 @@ def main() -> int:
     )
     every = [case.name for case in data_cases()], PROCESS_ROWS
     of_data, of_process = ([x for x in names if report.args.only in x] for names in every)
-    rows = side_by_side(run_row, [(x,) for x in (*of_data, *of_process)], report.args.jobs)
+    ledger = Ledger(report.args.out / f"{code_version()}.jsonl", {"benchmark": "faults.run"})
+    keys: list[Key] = [(name,) for name in (*of_data, *of_process)]
+    found = run_trials(run_row, keys, ledger, n_jobs=report.args.jobs, on_progress=tell)
+    rows = [Row(tuple(found[key]["cells"]), tuple(found[key]["faults"])) for key in keys]
     report.write(lines_of(rows[: len(of_data)], rows[len(of_data) :]))
     return 0 if all(row.has_passed for row in rows) else 1
 

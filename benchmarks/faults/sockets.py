@@ -50,7 +50,7 @@ from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.depth import DepthLog, DepthReading
 from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.imu import ImuSample
-from ssm_graph.sensors.messages import Message
+from ssm_graph.sensors.messages import Message, Readings
 from ssm_graph.simulation import DepthSettings, simulate
 
 BEGIN_S: Final = 25.0
@@ -331,9 +331,9 @@ class Voyage:
         """The vehicle's clock, s."""
         return EPOCH_S + self.elapsed_s
 
-    def rest(self) -> list[Message]:
-        """Return what waits at the end."""
-        return self.vessel.hub.rest()
+    def waiting(self) -> list[Readings]:
+        """Return what has come and waits."""
+        return self.vessel.hub.waiting()
 
     def poll(self, timeout_s: float) -> list[Message]:
         """Send all messages up to the next inertial sample and receive what comes of it."""

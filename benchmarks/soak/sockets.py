@@ -40,7 +40,7 @@ from ssm_graph.mission.navigation import Health
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.imu import ImuSample
-from ssm_graph.sensors.messages import Message
+from ssm_graph.sensors.messages import Message, Readings
 from ssm_graph.simulation import SimulatedMission, simulate
 
 CYCLE_S: Final = 600.0
@@ -54,8 +54,6 @@ BEGINS_S: Final = 10.0
 """So long from the start of the processes to the first sample."""
 AFTER_S: Final = 10.0
 """What comes so long after a storm is told with it."""
-UNDER_WAY_S: Final = 1.0
-"""Answers are no longer on their way."""
 LOCKED_OUT_S: Final = 5.0
 FLAT_MB_PER_H: Final = 1.0
 LEGEND: Final = f"""\
@@ -116,9 +114,9 @@ class Ear:
         """Since the begin, s."""
         return self._clock.elapsed_s()
 
-    def rest(self) -> list[Message]:
-        """Return what waits at the end."""
-        return self._hub.rest()
+    def waiting(self) -> list[Readings]:
+        """Return what has come and waits."""
+        return self._hub.waiting()
 
     def poll(self, timeout_s: float) -> list[Message]:
         """Return what has come; tell of it once a second."""
@@ -241,17 +239,12 @@ class Hour:
         self._answered_s = now_s
         if is_new:
             fields = json.loads(lines[-1])
-            off = self._off(fields, now_s)
+            off = self._off(fields)
             self.heard.answers.append((now_s, Health[fields["health"]], off))
 
-    def _off(self, fields: dict[str, float], now_s: float) -> float:
-        """Return how far an answer is off the truth of its time, horizontally, in its sigmas.
-
-        One that was on its way when the clock was set is stamped by the clock before.
-        """
-        own_s = (self._clock.set_by_s(now_s), self._clock.set_by_s(now_s - UNDER_WAY_S))
-        of_clocks = (fields["time_s"] - EPOCH_S - set_by_s for set_by_s in own_s)
-        true_s = min(of_clocks, key=lambda true_s: abs(now_s - true_s))
+    def _off(self, fields: dict[str, float]) -> float:
+        """Return how far an answer is off the truth of its time, horizontally, in its sigmas."""
+        true_s = fields["time_s"] - EPOCH_S - fields["clock_set_by_s"]
         truth = self._sim.truth_at(np.array([true_s]))
         east = math.radians(fields["lon_deg"]) - float(truth.lon[0])
         north = math.radians(fields["lat_deg"]) - float(truth.lat[0])

@@ -6,8 +6,20 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 
 
+def printable(text: str) -> str:
+    """Return a text with all that is no print or line end as escapes: it may come out of a file."""
+    if text.isprintable():
+        return text
+    escaped = (x if x.isprintable() or x == "\n" else ascii(x)[1:-1] for x in text)
+    return "".join(escaped)
+
+
 class SsmGraphError(Exception):
     """Base of all errors that this package raises on purpose."""
+
+    def __str__(self) -> str:
+        """Return the message; names and texts out of files cannot steer a terminal with it."""
+        return printable(super().__str__())
 
 
 class ConfigError(SsmGraphError):

@@ -9,6 +9,8 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import IO, TYPE_CHECKING, Any, Final, TextIO, cast
 
+from ssm_graph.base.errors import printable
+
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -57,12 +59,21 @@ class TolerantStream:
 def console_on(stream: TextIO | None, *, is_stderr: bool = False) -> Console:
     """Return a console on a standard stream; None for one that was closed before the start.
 
-    Names and paths are shown as they are, brackets and colons too.
+    Names and paths are shown as they are, brackets and colons too; control characters of theirs,
+    which would steer the terminal, as escapes.
     """
-    from rich.console import Console
+    from rich.console import Console, ConsoleOptions, RenderableType
+    from rich.segment import Segment
+
+    class PlainConsole(Console):
+        def render(
+            self, renderable: RenderableType, options: ConsoleOptions | None = None
+        ) -> Iterator[Segment]:
+            for text, style, control in super().render(renderable, options):
+                yield Segment(text if control else printable(text), style, control)
 
     file = None if stream is None else cast(IO[str], TolerantStream(stream))
-    return Console(file=file, stderr=is_stderr, markup=False, emoji=False)
+    return PlainConsole(file=file, stderr=is_stderr, markup=False, emoji=False)
 
 
 def silent() -> Console:

@@ -329,11 +329,13 @@ class CalibratedBeams:
 def _share_of_motion(
     whole: Array, first: Array, second: Array, third: Array, *, ratio: float
 ) -> float:
-    """Return how much of the squares of ``whole`` is motion, 0 if it is little.
+    """Return how much of the squares of ``whole`` is motion, 0 if it is little or there is none.
 
     ``first``, ``second`` and ``third`` are the same in three successive parts of the ping, with
     ``ratio`` times the variance of noise in each.
     """
+    if whole.size == 0:
+        return 0.0
     noise = float(np.mean((first - 2.0 * second + third) ** 2)) / (6.0 * ratio)
     power = float(np.mean(whole**2))
     share = 1.0 - noise / power if power > 0.0 else 0.0

@@ -148,6 +148,7 @@ def preintegrate_steps(
     errors: Array | None = None,
     frozen: Sequence[FrozenAxis] = (),
     cuts_gaps: bool = False,
+    unseen_s: float = 0.0,
 ) -> Steps[InertialChain]:
     """Preintegrate the inertial data between keyframes.
 
@@ -163,13 +164,19 @@ def preintegrate_steps(
     frozen : axes that repeat themselves by what came before these samples; all that they have
         missed is uncertain in the first interval.
     cuts_gaps : the times cut gaps to pieces, which are off together, not each for itself.
+    unseen_s : of the first interval, where many samples are missing here and there: how long of a
+        step between two nothing is seen of, s. What is taken for it is late by that, all the time.
     """
     source = None
     if errors is not None:
         source = ErrorSource(imu, keyframe_s, rate_hz, errors)
         imu = without_errors(imu, errors)
     gaps, repeating = imu_gaps(imu), frozen_axes(imu)
-    unseen = tuple(_unseen(imu, keyframe_s, gaps, repeating, frozen, cuts_gaps=cuts_gaps))
+    motions = _unseen(imu, keyframe_s, gaps, repeating, frozen, cuts_gaps=cuts_gaps)
+    if unseen_s > 0.0:
+        every = np.ones(3)
+        motions[0] = _more_unseen(motions[0], unseen_s, GAP_GYRO_RATE * every, GAP_ACCEL * every)
+    unseen = tuple(motions)
     imu = thawed(imu, repeating)
     yield 3e-4 * len(imu.time_s)
     samples = yield from merge_samples_steps(bridged(imu, gaps), keyframe_s, rate_hz=rate_hz)

@@ -169,10 +169,12 @@ def _missing(mission: Mission) -> Iterator[str]:
             "neither a fix nor [initial] says where it begins: give [initial] in mission.toml, or "
             "[local] for a tank or a pool"
         )
+    if len(mission.dvl.time_s) == 0:
+        return
     overlap = min(mission.imu.time_s[-1], mission.dvl.time_s[-1]) - max(
         mission.imu.start_s, mission.dvl.time_s[0]
     )
-    if overlap <= 0.0:
+    if overlap < 0.0:
         yield (
             f"IMU ({mission.imu.start_s:.1f} to {mission.imu.time_s[-1]:.1f} s) and DVL "
             f"({mission.dvl.time_s[0]:.1f} to {mission.dvl.time_s[-1]:.1f} s) do not overlap: are "

@@ -45,7 +45,7 @@ def sensors_of(mission: Mission) -> Iterator[SensorFound]:
         if not hasattr(log, "time_s"):
             continue
         time_s = np.asarray(log.time_s)
-        look = _LOOKS.get(kind, _plain)
+        look = _LOOKS.get(kind, _plain) if len(time_s) else _nothing
         facts, oddities, curves = look(log, mission)
         timing = timing_of(time_s)
         name = _NAMES.get(kind, kind.__name__.removesuffix("Log"))
@@ -148,6 +148,10 @@ def _usbl(log: UsblLog, _: Mission) -> Found:
 
 def _ranges(log: RangeLog, _: Mission) -> Found:
     return (f"ranges to {len(np.unique(log.beacon))} beacons",), (), {"range, m": log.range_m}
+
+
+def _nothing(_log: Any, _: Mission) -> Found:
+    return ("no rows",), (), {}
 
 
 def _plain(_log: Any, _: Mission) -> Found:

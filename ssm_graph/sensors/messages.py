@@ -18,6 +18,9 @@ class Message:
     """As stamped, s on the vehicle's clock."""
 
 
+Readings = tuple[Message, ...]
+"""A message in each way that its stamp can be read, the likeliest first."""
+
 _FIELDS: Final[dict[type, tuple[str, ...]]] = {}
 
 

@@ -208,6 +208,23 @@ DOORS: dict[str, tuple[str, Door]] = {
             *("online", "--replay", f / "mission", "--out", f / "run", "--page", "127.0.0.1")
         ],
     ),
+    "a key of `mission.toml` that steers a terminal": (
+        r"\x1b]0;x\x07\x1b[2J: unknown key",
+        opened(
+            "smooth",
+            "mission.toml",
+            b'format = 1\n"\\u001b]0;x\\u0007\\u001b[2J" = 1\n',
+            within=True,
+        ),
+    ),
+    "a report's key that steers a terminal": (
+        r"known are: \x1b[2J",
+        opened("convert", "dvl.json", b'{"\\u001b[2J": 1, "transducers": []}\n' * 9),
+    ),
+    "a column's name that steers a terminal": (
+        r"known are: \x1b[2J",
+        mapped(table=TABLE.replace("gx", "\x1b[2J", 1)),
+    ),
 }
 """What has to be said, and the act."""
 
@@ -260,6 +277,7 @@ def at_door(act: Door, folder: Path) -> tuple[str, str]:
     said = re.search(r"(error: .*|verdict: .*)", words)
     assert code in {2, 3, 4}, words
     assert said is not None, words
+    assert "\x1b" not in words
     return said[1], f"**changed** {lost}" if lost else "nothing, untouched"
 
 

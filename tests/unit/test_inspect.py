@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +20,8 @@ from ssm_graph.io.mission_folder.folder import write_mission
 from ssm_graph.mission.mission import Mission
 from ssm_graph.sensors.gnss import GnssLog
 from ssm_graph.simulation import scenario_config, simulate
+from ssm_graph.smoothers.mission import smooth
+from tests.mission_fixture import make_mission
 
 
 @pytest.fixture(scope="module")
@@ -72,6 +75,21 @@ def test_what_is_missing_is_said(mission: Mission) -> None:
     turned = replace(mission.imu, accel_b=mission.imu.accel_b[:, [2, 1, 0]])
     found = inspect_mission(replace(mission, imu=turned), path)
     assert any("gravity lies along x" in odd for odd in found.sensors[0].oddities)
+
+
+@pytest.mark.parametrize("n_rows", [0, 1])
+@pytest.mark.parametrize("name", ["dvl", "depth", "gnss"])
+def test_tables_of_one_row_or_none(name: str, n_rows: int) -> None:
+    """Are looked at, and smoothed, as any other."""
+    mission = make_mission()
+    log = getattr(mission, name)
+    few = replace(mission, **{name: log.rows(np.arange(len(log.time_s)) < n_rows)})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = inspect_mission(few, Path("mission"))
+        smooth(few)
+    assert found.can_be_smoothed == (name != "dvl" or n_rows == 1)
+    assert any(one.facts == ("no rows",) for one in found.sensors) == (n_rows == 0)
 
 
 def test_gaps_and_frozen_readings_are_odd(mission: Mission) -> None:

@@ -534,6 +534,22 @@ def test_tag_blocks() -> None:
     assert "tag block checksum" in decoder.take_refusals()[0]
 
 
+def test_what_is_held_can_be_had_before_its_time() -> None:
+    """A fix that waits for its GST, and positions that wait for a sentence that says more."""
+    decoder = NmeaDecoder()
+    decoder.feed(sentence(GGA) + sentence(GST), arrival_s=NOON_S)
+    rmc = "GPRMC,12000{}.00,A,6326.0000,N,01024.0000,E,0.0,0.0,141123,,,A"
+    given = decoder.feed(sentence(GGA.replace("120000", "120001")), arrival_s=NOON_S + 1.0)
+    given += decoder.feed(sentence(rmc.format(1)), arrival_s=NOON_S + 1.0)  # of the same moment
+    assert not given
+    assert [message.time_s - NOON_S for message in decoder.waiting()] == [1.0]
+    given = decoder.feed(sentence(rmc.format(2)), arrival_s=NOON_S + 2.0)
+    assert [message.time_s - NOON_S for message in given] == [1.0]
+    for held in (decoder.waiting, decoder.waiting, decoder.take_waiting):
+        assert [message.time_s - NOON_S for message in held()] == [2.0]
+    assert decoder.waiting() == decoder.take_waiting() == []
+
+
 def test_a_listener_that_reads_nothing_says_what_comes() -> None:
     """After ten seconds, once, until something is read."""
     decoder = NmeaDecoder()

@@ -258,12 +258,14 @@ def first_format(k: int, **changes: Any) -> dict[str, Any]:
 
 
 def test_the_first_format_has_no_type() -> None:
-    """It is a velocity all the same; a later format without a type is damaged."""
+    """It is a velocity all the same; one that might be a water track is damaged without a type."""
     pings, refused = read(*(first_format(k) for k in range(5)))
     assert len(pings) == 5
     assert not refused
     assert pings[0].speed == pytest.approx((-0.2, -0.1, 0.0, 0.1))
-    assert "key 'type' is missing" in read(first_format(0) | {"format": "json_v3"})[1][0]
+    assert len(read(first_format(0) | {"format": "json_v3.1"})[0]) == 1
+    for later in ({"format": "json_v3.2"}, {"format": 7}):
+        assert "key 'type' is missing" in read(first_format(0) | later)[1][0]
 
 
 def test_water_track_of_software_2_7() -> None:

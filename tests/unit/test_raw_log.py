@@ -28,8 +28,10 @@ from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.io.raw_log import log as raw_log
 from ssm_graph.io.raw_log import rows as raw_rows
+from ssm_graph.io.raw_log.kinds import row_kinds
 from ssm_graph.io.raw_log.log import RawLog, replay
-from ssm_graph.io.raw_log.rows import ALWAYS, messages_of, row_kinds
+from ssm_graph.io.raw_log.rows import ALWAYS, messages_of
+from ssm_graph.io.raw_log.waiting import WAITING
 from ssm_graph.sensors.acoustic import AcousticRange
 from ssm_graph.sensors.depth import DepthReading
 from ssm_graph.sensors.dvl import Ping
@@ -286,6 +288,56 @@ def test_killed_at_every_byte_of_the_last_rows(
         assert sorted(shown(got[:-3])) == sorted(shown(want))
         assert shown(got[-3:]) == shown(later)
     assert n_letters == len(messages)
+
+
+@pytest.mark.parametrize("k_logged", [None, 0, 1])
+def test_what_waits_to_be_told_its_time_outlives_the_process(
+    tmp_path: Path, k_logged: int | None
+) -> None:
+    """It is replayed last and has a row from then on; in a table already, it counts once."""
+    messages = mixed(40)
+    log = log_of(tmp_path / "log", messages[:30])
+    pings = [Ping(9.0 + k, (0.1, -0.2, 0.3, 0.01 * k)) for k in range(3)]
+    ways = [(ping, replace(ping, time_s=ping.time_s + 0.5)) for ping in pings]
+    log.hold(ways[:1])
+    log.hold(ways)
+    logged = [] if k_logged is None else [ways[0][k_logged]]
+    for message in logged:  # killed before it was noted that it waits no more
+        log.append(message)
+    left = [one for one, _ in ways][len(logged) :]
+    expected = shown([*messages[:30], *logged, *left])
+    for _ in range(2):
+        assert shown(replayed(tmp_path / "log")) == expected
+    with RawLog.reopen(tmp_path / "log", VEHICLE) as log:
+        assert not (tmp_path / "log" / WAITING).exists()
+        log.append(messages[30])
+    assert shown(replayed(tmp_path / "log")) == [*expected, *shown(messages[30:31])]
+
+
+@pytest.mark.parametrize(
+    "damage", [b"", b"\0" * 50, b"d1,2", b"d1,2\n|\n", b"|d1.0,x\n", b"\xff\n\n"]
+)
+def test_damage_to_what_waits_costs_what_is_damaged(tmp_path: Path, damage: bytes) -> None:
+    """A power failure took it; the tables are gone on with."""
+    messages = mixed(20)
+    log_of(tmp_path / "log", messages).close()
+    (tmp_path / "log" / WAITING).write_bytes(damage)
+    assert shown(replayed(tmp_path / "log")) == shown(messages)
+    RawLog.reopen(tmp_path / "log", VEHICLE).close()
+    assert shown(replayed(tmp_path / "log")) == shown(messages)
+
+
+def test_what_waits_on_a_full_disk_is_said(tmp_path: Path) -> None:
+    """And forgotten once it can be written again."""
+    log = log_of(tmp_path / "log", mixed(5))
+    in_the_way = tmp_path / "log" / f"{WAITING}.part"
+    in_the_way.mkdir()
+    log.hold([(mixed(1)[0],)])
+    assert WAITING in (log.problems() or "")
+    in_the_way.rmdir()
+    log.hold([(mixed(1)[0],)])
+    assert log.problems() is None
+    log.close()
 
 
 def test_rows_without_letters_come_last_in_order_of_time(tmp_path: Path) -> None:

@@ -182,7 +182,22 @@ def test_a_receiver_is_dated_by_its_own_sentences(tmp_path: Path) -> None:
     assert {one.height for one in fixes} == {60.75}
     turns = [one for one in found.messages if isinstance(one, HeadingReading)]
     assert [one.time_s - DAY_S for one in turns] == [-1.0, 0.0, 1.0]
-    assert "GGA and HDT read, not RMC." in found.notes
+    assert {"GGA read, RMC where none of that came for 5 s.", "HDT read."} <= set(found.notes)
+
+
+def test_a_second_receiver_in_one_file(tmp_path: Path) -> None:
+    """One that knows less is read where the first one is silent, as live."""
+    place = "6326.0000,N,01024.0000,E"
+    data = b""
+    for k in range(40):
+        data += nmea(f"GNRMC,1200{k:02d}.00,A,{place},0.5,54.7,240625,,,A")
+        if 10 <= k < 20:
+            data += nmea(f"GPGGA,1200{k:02d}.00,{place},1,10,0.8,20.5,M,40.2,M,,")
+    found = read(tmp_path / "two.log", data)
+    begin_s = found.messages[0].time_s
+    assert [one.time_s - begin_s for one in found.messages] == [float(k) for k in range(40)]
+    heights = [one.height for one in found.messages if isinstance(one, Fix)]
+    assert heights[11:20] == [pytest.approx(60.7)] * 9  # the first came after another was read
 
 
 def test_a_receiver_without_dates(tmp_path: Path) -> None:

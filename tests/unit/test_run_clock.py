@@ -130,8 +130,10 @@ def test_the_clock_is_set_under_a_hub() -> None:
             recorder = Recorder()
             recorder.set_by_s = hub.set_by_s
             Publisher().send(recorder, OutputFormat.JSON, a_navigation(hub.time_s, 1.0))
-            stamp_s = json.loads(recorder.sent[0][1])["time_s"]
-            assert stamp_s == pytest.approx(clocks.wall_s(), abs=1e-6)
+            fields = json.loads(recorder.sent[0][1])
+            assert fields["time_s"] == pytest.approx(clocks.wall_s(), abs=1e-6)
+            own_s = fields["time_s"] - fields["clock_set_by_s"]
+            assert own_s == pytest.approx(WALL_S + clocks.steady, abs=1e-6)
         sender.close()
     begin_s = WALL_S + 5000.0
     times = [message.time_s - begin_s for message in receiver.messages]

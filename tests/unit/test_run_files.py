@@ -8,6 +8,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -17,8 +18,9 @@ from ssm_graph.io.raw_log.log import RawLog, replay
 from ssm_graph.io.tables.append_file import TORN_ROW, AppendFile
 from ssm_graph.live.run.run_folder import RunFolder
 from ssm_graph.live.run.runner import Runner, RunnerConfig
+from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.imu import ImuSample
-from ssm_graph.sensors.messages import Message
+from ssm_graph.sensors.messages import Message, Readings
 from tests.live_fixture import FAKE, Crash, ListSource, connect, run_folder, some_messages, vehicle
 
 OFTEN = RunnerConfig(checkpoint_every_s=2.0)
@@ -38,6 +40,28 @@ class Meddled(ListSource):
             self._after = -1
             self._act()
         return super().poll(timeout_s)
+
+
+class Waiting(ListSource):
+    """Knows the times of pings only once there are five of them."""
+
+    def __init__(self, messages: list[Message], **settings: int) -> None:
+        super().__init__(messages, **settings)
+        self._pings: list[Message] = []
+
+    def poll(self, timeout_s: float) -> list[Message]:
+        """Give back all but pings, or them too."""
+        taken: list[Message] = []
+        for message in super().poll(timeout_s):
+            (self._pings if isinstance(message, Ping) else taken).append(message)
+        if len(self._pings) < 5:
+            return taken
+        released, self._pings = self._pings, []
+        return [*taken, *released]
+
+    def waiting(self) -> list[Readings]:
+        """Return them, in two readings."""
+        return [(ping, replace(ping, time_s=ping.time_s + 3.0)) for ping in self._pings]
 
 
 def run(path: Path, source: ListSource) -> None:
@@ -69,6 +93,20 @@ def crashed(tmp_path: Path) -> Path:
     with pytest.raises(Crash):
         run(path, ListSource(some_messages(), crash_after=400))
     return path
+
+
+@pytest.mark.parametrize("crash_after", [203, 231, 252])
+def test_what_waits_in_the_source_outlives_the_process(tmp_path: Path, crash_after: int) -> None:
+    """Not a message of one that was killed is missing; states are those of the log as it is."""
+    messages = some_messages(300)
+    with pytest.raises(Crash):
+        run(tmp_path / "run", Waiting(messages, crash_after=crash_after))
+    run(tmp_path / "run", Waiting(messages))
+    logged = list(replay(tmp_path / "run" / "log", vehicle(), {}))
+    assert sorted(map(repr, logged)) == sorted(map(repr, messages))
+    run(tmp_path / "again", ListSource(logged))
+    for name in ("trajectory.csv", "beams.csv"):
+        assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "again" / name).read_bytes()
 
 
 @pytest.mark.parametrize(

@@ -3,14 +3,15 @@
 The folder is a mission folder in order of arrival (``mission.toml`` and its tables) with one file
 more, ``arrivals``: a letter per row, in the order in which the rows of all tables came. Where a
 process went on with the log of another, ``arrivals`` holds a line with the sizes of the tables at
-that moment, so that a row that was written without its letter shifts no other.
+that moment, so that a row that was written without its letter shifts no other. What has come and
+waits to be told its time stands in ``waiting`` until it has a row (`waiting.WaitingFile`).
 """
 
 from __future__ import annotations
 
 import contextlib
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Self
@@ -18,10 +19,12 @@ from typing import Final, Self
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.io.mission_folder.toml import TOML_NAME
 from ssm_graph.io.mission_folder.vehicle import check_same_vehicle, write_vehicle
-from ssm_graph.io.raw_log.rows import ALWAYS, ARRIVALS, RowKind, check_columns, replay, row_kinds
+from ssm_graph.io.raw_log.kinds import RowKind, row_kinds
+from ssm_graph.io.raw_log.rows import ALWAYS, ARRIVALS, check_columns, replay
+from ssm_graph.io.raw_log.waiting import WAITING, WaitingFile, left_waiting
 from ssm_graph.io.tables.append_file import TORN_ROW, AppendFile, sync_path
 from ssm_graph.mission.vehicle import Vehicle
-from ssm_graph.sensors.messages import Message
+from ssm_graph.sensors.messages import Message, Readings
 
 __all__ = ["RawLog", "replay"]
 
@@ -90,6 +93,7 @@ class RawLog:
         log._vehicle = vehicle
         log._open(Path(folder), kinds, **limits)
         log._go_on()
+        log._take_up()
         return log
 
     def regain(self) -> list[str]:
@@ -109,6 +113,23 @@ class RawLog:
         if altered:
             self._go_on()
         return texts + altered
+
+    def hold(self, waiting: Sequence[Readings]) -> None:
+        """Keep messages that wait to be told their times, in place of those that did before.
+
+        They survive the end of the process; :func:`replay` and :meth:`reopen` find those that came
+        to no row of their own, read as was likelier then. Raises nothing.
+        """
+        self._held.keep(waiting)
+
+    def _take_up(self) -> None:
+        """Give rows to what waited when the process before ended."""
+        for kind, record in left_waiting(self._folder, self._kinds.values()):
+            if (table := self._tables.get(kind.file) or self._begin_table(kind)) is not None:
+                self._add(_Row(table, record, kind.letter))
+        self._write_waiting(len(self._waiting))
+        if not self._waiting:
+            self._held.clear()
 
     def _go_on(self) -> None:
         """Note how large the tables are, before all rows that wait: letters count from here on."""
@@ -140,6 +161,7 @@ class RawLog:
             if kind.file in ALWAYS or (folder / kind.file).exists()
         }
         self._arrivals = AppendFile(folder / ARRIVALS, ending=b"\n")
+        self._held = WaitingFile(folder, kinds)
         self._offsets: dict[str, int] = {}
         self._waiting: deque[_Row] = deque()
         self._max_waiting, self._retry_every = max_waiting, retry_every
@@ -157,13 +179,17 @@ class RawLog:
         table = self._tables.get(kind.file) or self._begin_table(kind)
         if table is None:
             return
-        row = _Row(table, kind.row(message), kind.letter)
-        if self._waiting:
-            self._wait(row)
+        if self._add(_Row(table, kind.row(message), kind.letter)):
             self._retry(message.time_s)
-        elif not self._write(row):
-            self._wait(row)
+        elif self._waiting:
             self._tried_s, self._since_tried = message.time_s, 0
+
+    def _add(self, row: _Row) -> bool:
+        """Write a row, or have it wait; return whether others had waited before it."""
+        is_behind = bool(self._waiting)
+        if is_behind or not self._write(row):
+            self._wait(row)
+        return is_behind
 
     def _begin_table(self, kind: RowKind) -> AppendFile | None:
         """Return the table of an instrument that is heard for the first time; None if refused."""
@@ -193,7 +219,8 @@ class RawLog:
             parts.append(f"rows that wait in memory for the disk: {n_rows} ({self._reason})")
         if self._n_lost:
             parts.append(f"rows lost because {self._max_waiting} waited already: {self._n_lost}")
-        parts += [file.problem for file in self._files() if file.problem]
+        problems = (*(file.problem for file in self._files()), self._held.problem)
+        parts += [problem for problem in problems if problem]
         if self._sync_failure:
             parts.append(f"the disk does not confirm what it was given ({self._sync_failure})")
         return f"raw log: {'; '.join(parts)}" if parts else None
@@ -265,7 +292,7 @@ class RawLog:
 
 def _refuse_content(folder: Path, kinds: Iterable[RowKind]) -> None:
     """Raise where a folder holds a mission; remove what a start that was cut short left there."""
-    heads = {kind.file: kind.header for kind in kinds} | {ARRIVALS: b""}
+    heads = {kind.file: kind.header for kind in kinds} | {ARRIVALS: b"", WAITING: b""}
     begun = [folder / name for name in heads if (folder / name).exists()]
     is_used = any(path.stat().st_size > len(heads[path.name]) for path in begun)
     if is_used or (folder / TOML_NAME).exists():

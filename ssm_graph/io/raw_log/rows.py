@@ -1,4 +1,4 @@
-"""A raw log's rows: messages as rows of a mission folder's tables, and read again as they came."""
+"""What a raw log holds, read again as it came."""
 
 from __future__ import annotations
 
@@ -6,89 +6,26 @@ import heapq
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
+from itertools import chain
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
-from ssm_graph.base.tables import TIME
-from ssm_graph.base.units import exactly_in_unit
 from ssm_graph.io.mission_folder.vehicle import check_same_vehicle
+from ssm_graph.io.raw_log.kinds import RowKind, row_kinds
+from ssm_graph.io.raw_log.waiting import left_waiting
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.vehicle import Vehicle
-from ssm_graph.sensors.instrument import Instrument
 from ssm_graph.sensors.messages import Message
-from ssm_graph.sensors.registry import BY_LOG, INSTRUMENTS
+from ssm_graph.sensors.registry import INSTRUMENTS
 
 ARRIVALS: Final = "arrivals"
 """The file of a log that has a letter for every row, in order of arrival."""
 _FEWEST_TABLES = 4
 _SIZES = re.compile(rb"@(\d+(?:,\d+)*);")
-
-
-class RowKind:
-    """How messages of one instrument are written.
-
-    What is known of the instrument, ``bare``, says how many numbers a message has.
-    """
-
-    def __init__(self, instrument: Instrument, bare: Any) -> None:
-        columns = instrument.live_columns(bare)
-        self._instrument, self._bare = instrument, bare
-        self._units = [1.0, *(c.unit for c in columns for _ in c.names)]
-        self._scaled = [i for i, unit in enumerate(self._units) if unit != 1.0]
-        self._may_miss = [False, *(c.optional or c.blank for c in columns for _ in c.names)]
-        self._has_blanks = any(self._may_miss)
-        self.file = f"{instrument.section}.csv"
-        self.letter = instrument.letter.encode()
-        """One byte that stands for such a message where only the order of arrival is kept."""
-        self.columns = (TIME, *(name for c in columns for name in c.names))
-
-    @property
-    def header(self) -> bytes:
-        """The first line of the table."""
-        return f"{','.join(self.columns)}\n".encode()
-
-    def row(self, message: Message) -> bytes:
-        """Return a message as a line of the table; a number that is missing is an empty cell."""
-        cells = self._instrument.numbers(message)
-        for i in self._scaled:
-            cells[i] = exactly_in_unit(cells[i], self._units[i])
-        line = ",".join([repr(float(cell)) for cell in cells])
-        return f"{line.replace('nan', '') if self._has_blanks else line}\n".encode()
-
-    def parse(self, line: bytes) -> Message | None:
-        """Return the message of a line; None for the header and for a torn line."""
-        cells = line.split(b",")
-        if len(cells) != len(self.columns):
-            return None
-        try:
-            numbers = [
-                math.nan if not cell and may_miss else float(cell)
-                for cell, may_miss in zip(cells, self._may_miss, strict=True)
-            ]
-        except ValueError:
-            return None
-        for i in self._scaled:
-            numbers[i] *= self._units[i]
-        return self._instrument.message_of(numbers, self._bare)
-
-
-def row_kinds(vehicle: Vehicle) -> dict[type[Message], RowKind]:
-    """Return by the type of the message how each is written, in the order of a log's tables.
-
-    What the vehicle does not have is logged as well where it comes.
-    """
-    logs = {BY_LOG[kind].section: log for kind, log in vehicle.bare_logs.items()}
-    return {
-        one.message: RowKind(one, logs.get(one.section))
-        for one in INSTRUMENTS
-        if one.message is not None
-    }
-
-
 ALWAYS: Final = ("imu.csv", "dvl.csv", "depth.csv", "gnss.csv")
 """Tables that every log has, whatever came."""
 
@@ -139,7 +76,8 @@ def replay(
     """Return what was logged after a checkpoint, in order of arrival.
 
     Rows whose letter was not written come last in the log of their process, the tables merged by
-    time. Rows that are appended after this call are not among them.
+    time. What waited to be told its time when the process ended comes last of all. Rows that are
+    appended after this call are not among them.
 
     Raises :class:`ConfigError` for a folder without a log, and for the log of another vehicle or of
     another version.
@@ -156,7 +94,8 @@ def replay(
         kind.letter[0]: _Rows(Path(folder) / kind.file, kind, starts.get(kind.file, 0))
         for kind in kinds.values()
     }
-    return _in_order_of_arrival(arrivals, tables)
+    waited = (row.kind.parse(row.record) for row in left_waiting(Path(folder), kinds.values()))
+    return chain(_in_order_of_arrival(arrivals, tables), filter(None, list(waited)))
 
 
 def check_columns(folder: Path | str, kinds: Iterable[RowKind]) -> None:

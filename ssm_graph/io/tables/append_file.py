@@ -61,7 +61,7 @@ class AppendFile:
             return None
         try:
             if not _begins(self.path, head):
-                aside = _free_name(self.path)
+                aside = free_name(self.path)
                 self.path.rename(aside)
                 what += f", what was found there is {aside.name} now"
             file = _opened(self.path)
@@ -128,7 +128,8 @@ def _begins(path: Path, head: bytes) -> bool:
         return head.startswith(stream.read(len(head)))
 
 
-def _free_name(path: Path) -> Path:
+def free_name(path: Path) -> Path:
+    """Return a name beside a path for what stands in its way."""
     names = (path.with_name(f"{path.name}.aside{k or ''}") for k in count())
     return next(name for name in names if not name.exists())
 

@@ -28,6 +28,8 @@ OFF_WATER: Final = -1
 """Column of a ping's row that is 1 off the water."""
 FROZEN_REACH_S: Final = 30.0
 """An axis that has repeated itself for longer is not told from one that always did."""
+MOST_MISSING: Final = 0.3
+"""A larger share of the inertial samples missing leaves turns and shocks unseen."""
 PERIOD_EVERY: Final = 100
 DEFAULT_PERIOD_S: Final = 0.01
 """Sampling interval of the inertial data before there are two samples."""
@@ -145,6 +147,17 @@ class Buffers:
                 if len(times) > PERIOD_EVERY:
                     self.shortest_period_s = min(self.shortest_period_s, self._period_s)
         return self._period_s
+
+    def missing(self, begin_s: float, end_s: float) -> tuple[float, float]:
+        """Return how much of a span is without inertial samples.
+
+        That is the share of the samples due that have not come, and the longest step to one that
+        has, s.
+        """
+        time_s = self.imu.between(begin_s, end_s)[:, 0]
+        n_due = np.floor((end_s - begin_s) / self.shortest_period_s - 1.0)
+        share = 1.0 - len(time_s) / n_due if n_due > 0 else 0.0
+        return share, float(np.max(np.diff(time_s, prepend=begin_s), initial=0.0))
 
     def imu_log(self, begin_s: float, end_s: float, *, margin: int = 3) -> ImuLog:
         """Return the samples that cover a span, and a few on both sides, known errors taken off."""

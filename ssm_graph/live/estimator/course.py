@@ -226,11 +226,10 @@ class Course:
         return Step(window, watch, last.window.all, reserve, guard)
 
     def _observed(self, keyframe: Keyframe, window: Window, *, parity: bool) -> Watch:
-        last, period_s = self.newest, self._buffers.shortest_period_s
-        buffers = self._buffers
+        last, buffers = self.newest, self._buffers
         samples = buffers.inertial(buffers.imu.between(last.time_s, keyframe.time_s))
         force = float(np.linalg.norm(samples[:, 4:], axis=1).mean()) if len(samples) else 9.8
-        n_due = np.floor((keyframe.time_s - last.time_s) / period_s - 1.0)
+        missing, gap_s = buffers.missing(last.time_s, keyframe.time_s)
         return observe(
             last.watch,
             keyframe,
@@ -238,8 +237,8 @@ class Course:
             last_s=last.time_s,
             parity=parity,
             force=force,
-            gap_s=float(np.max(np.diff(samples[:, 0], prepend=last.time_s), initial=0.0)),
-            missing=1.0 - len(samples) / n_due if n_due > 0 else 0.0,
+            gap_s=gap_s,
+            missing=missing,
             frozen=buffers.frozen_until(keyframe.time_s),
         )
 

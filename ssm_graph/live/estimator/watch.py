@@ -16,6 +16,7 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import POSITION, VELOCITY
 from ssm_graph.graph.aids.depth import DepthMeans
 from ssm_graph.graph.aids.gnss import Fixes
+from ssm_graph.live.estimator.buffers import MOST_MISSING
 from ssm_graph.live.estimator.guard import Guarded
 from ssm_graph.mission.answer import LARGEST_SPEED, LOW_WEIGHT, MISFIT, TRUSTED
 from ssm_graph.mission.navigation import Health
@@ -42,8 +43,6 @@ FEW: Final = 0.5
 GAP_S: Final = 0.3
 """So long without an inertial sample leaves an attitude that the next pings have to confirm."""
 SILENT_IMU_S: Final = 1.0
-MOST_MISSING: Final = 0.3
-"""A larger share of the inertial samples missing leaves turns and shocks unseen."""
 
 
 class Contradicted(NamedTuple):

@@ -11,7 +11,7 @@ from decimal import Decimal
 from enum import Enum
 from typing import Any, Final
 
-from ssm_graph.base.errors import nearest_hint
+from ssm_graph.base.errors import nearest_hint, printable
 from ssm_graph.live.protocols.framing import LineFramer, ObjectFramer, SentenceFramer
 from ssm_graph.sensors.messages import Message
 
@@ -48,7 +48,7 @@ class Refusals:
         """Keep or count one sentence."""
         self.n_total += 1
         if len(self._texts) < MAX_REFUSALS:
-            self._texts.append(text)
+            self._texts.append(printable(text))
         else:
             self._n_more += 1
 
@@ -146,6 +146,14 @@ class Decoder(ABC):
                 self._refuse(str(error))
             self.n_sound += self.n_refused == n_before
         return messages + self._overdue(arrival_s)
+
+    def waiting(self) -> list[Message]:
+        """Return complete messages that wait for others; most protocols have none."""
+        return []
+
+    def take_waiting(self) -> list[Message]:
+        """Return them for good: nothing more will come."""
+        return []
 
     def take_refusals(self) -> list[str]:
         """Return what was refused since the last call, a sentence each, and forget it."""

@@ -17,7 +17,7 @@ MAX_LENGTH: Final = 64 * 1024
 MAX_DEPTH: Final = 32
 _TOKEN = re.compile(rb'\\[^\n]|\n\{|["{}\n]')
 _BETWEEN = b"[], \t\r\n"
-_LINE_END = re.compile(rb"[\r\n]")
+_LINE_END = re.compile(rb"[\r\n]|(?<=\*[0-9A-Fa-f]{2})(?=\$)")
 _TOO_LONG: Final = (
     "expected lines of at most {} bytes, got a longer one; is the port another instrument's?"
 )
@@ -60,6 +60,8 @@ class LineFramer:
 
 class SentenceFramer:
     """Lines that end in CR, LF or both, one character a byte, whatever the bytes are.
+
+    A checksum ends a sentence, too, where the next begins: line ends may have been lost.
 
     What is longer than ``max_length`` is cut before its last ``$``: binary frames may stand before
     a sentence. Text that is longer is dropped, up to the next ``$``, and told to ``refuse``.

@@ -159,9 +159,15 @@ def navigation_fields(navigation: Navigation) -> dict[str, Any]:
     return {key: _finite(value) for key, value in fields.items()}
 
 
-def encode_navigation(navigation: Navigation) -> bytes:
-    """Return :func:`navigation_fields` as one line of JSON."""
-    return (json.dumps(navigation_fields(navigation), allow_nan=False) + "\n").encode("ascii")
+def encode_navigation(navigation: Navigation, *, set_by_s: float = 0.0) -> bytes:
+    """Return :func:`navigation_fields` as one line of JSON, stamped by the vehicle's clock.
+
+    That is ``set_by_s`` ahead of the time of the run, which the line says: times of two answers
+    can be told apart from a clock that was set between them.
+    """
+    fields = navigation_fields(navigation)
+    fields |= {"time_s": navigation.time_s + set_by_s, "clock_set_by_s": set_by_s}
+    return (json.dumps(fields, allow_nan=False) + "\n").encode("ascii")
 
 
 def _spread(pattern: str, names: tuple[str, ...], values: Any) -> dict[str, float]:

@@ -135,7 +135,7 @@ class NmeaDecoder(Decoder):
     """Positions (with GST) to fixes, pressures to depths, headings; other sentences are ignored.
 
     Of GGA, GNS, RMC and GLL the first that comes is read, of HDT, THS, PASHR and HDG too; ``only``
-    names one of each that alone is read, whatever comes. ``height`` is that above the geoid plus
+    names those that are read, whatever comes. ``height`` is that above the geoid plus
     the geoid's separation: above the ellipsoid. Sigmas are those of a GST of the same time of day,
     before or after its position, else from HDOP. A position that is estimated, typed in or
     simulated (quality 6, 7, 8) is refused: dead reckoning is no measurement, it might be our own.
@@ -321,6 +321,25 @@ class NmeaDecoder(Decoder):
         time_s = self._stamper.stamp(utc_seconds(found.utc, arrival_s), arrival_s)
         return [HeadingReading(time_s, found.heading)]
 
+    def waiting(self) -> list[Message]:
+        """Return the fixes that wait, for a GST or for a sentence that says more."""
+        return [self._fix(one, None) for one in self._held()]
+
+    def take_waiting(self) -> list[Message]:
+        """Return them for good."""
+        held = self._held()
+        self._pending = None
+        self._waiting.clear()
+        return [fix for self._pending in held for fix in self._release(None)]
+
+    def _held(self) -> list[_Pending]:
+        """Return positions that wait, one of each moment: of the sentence that says most."""
+        found = {} if self._pending is None else {self._pending.position.utc: self._pending}
+        for kind in POSITIONS:
+            for one in self._waiting.get(kind, ()):
+                found.setdefault(one.position.utc, one)
+        return sorted(found.values(), key=lambda one: one.time_s)
+
     def _release(self, sigma_enu: Vector | None) -> list[Message]:
         """Return the fix that waits, by HDOP where its sigmas are not known."""
         pending, self._pending = self._pending, None
@@ -331,26 +350,34 @@ class NmeaDecoder(Decoder):
             self._gst_follows = False
             if not place.hdop or place.hdop < 0.0:
                 self._say_once("hdop", f"{pending.kind}: no HDOP, no GST: {ASSUMED_HDOP} is taken")
-            hdop = place.hdop if place.hdop and place.hdop > 0.0 else ASSUMED_HDOP
-            sigma = hdop * self._options.user_range_error_m
-            sigma_enu = sigma, sigma, 2.0 * sigma
-        separation = place.separation
-        if separation is None:
-            separation = self._options.geoid_separation_m
         if place.altitude is None:
-            height = self._options.surface_height_m
             self._say_once("height", f"{pending.kind}: no height: the water's surface, to 100 m")
-        else:
-            height = place.altitude + (separation or 0.0)
-        if place.altitude is None or separation is None:
-            sigma_enu = (*sigma_enu[:2], max(sigma_enu[2], HEIGHT_SIGMA_M))
-        if place.altitude is not None and separation is None:
+        elif self._separation(place) is None:
             self._say_once(
                 "geoid",
                 f"{pending.kind}: geoid separation is empty: heights count to 100 m; set "
                 "NmeaOptions.geoid_separation_m (--geoid-separation)",
             )
-        return [Fix(pending.time_s, place.lat, place.lon, height, sigma_enu)]
+        return [self._fix(pending, sigma_enu)]
+
+    def _separation(self, place: Position) -> float | None:
+        own = place.separation
+        return self._options.geoid_separation_m if own is None else own
+
+    def _fix(self, pending: _Pending, sigma_enu: Vector | None) -> Fix:
+        place = pending.position
+        if sigma_enu is None:
+            hdop = place.hdop if place.hdop and place.hdop > 0.0 else ASSUMED_HDOP
+            sigma = hdop * self._options.user_range_error_m
+            sigma_enu = sigma, sigma, 2.0 * sigma
+        separation = self._separation(place)
+        if place.altitude is None:
+            height = self._options.surface_height_m
+        else:
+            height = place.altitude + (separation or 0.0)
+        if place.altitude is None or separation is None:
+            sigma_enu = (*sigma_enu[:2], max(sigma_enu[2], HEIGHT_SIGMA_M))
+        return Fix(pending.time_s, place.lat, place.lon, height, sigma_enu)
 
     def _position(self, kind: str, fields: list[str], arrival_s: float) -> _Pending | None:
         """Return a position, None where the receiver has none."""

@@ -57,6 +57,9 @@ _IGNORED: Final = frozenset({"response"})
 """Types of the protocol that say nothing of the motion."""
 _NUMBERS: Final = ([0, 1, 2], [0, 1, 2, 3])
 """Of the transducers of an instrument."""
+_GROUND_ALONE: Final = ("json_v1", "json_v2", "json_v2.1", "json_v3", "json_v3.1")
+"""Formats of software before 2.7, which knew no water track: the first has no type, and what passes
+reports on may leave it out."""
 
 
 class BeamRule(Enum):
@@ -106,8 +109,7 @@ class WaterLinkedDecoder(Decoder):
 
     def _decode(self, text: str, arrival_s: float) -> list[Message]:
         report = parse_object(text)
-        is_first_format = "type" not in report and report.get("format") == "json_v1"
-        kind = "velocity" if is_first_format else require(report, "type")
+        kind = "velocity" if _is_without_type(report) else require(report, "type")
         if not isinstance(kind, str) or kind not in {*_TRACKS, _DEAD_RECKONING, *_IGNORED}:
             raise RefusedError(f"expected a report of type 'velocity', got {shown(kind)}")
         if kind in _IGNORED or (kind == _DEAD_RECKONING and not self._reads_heading):
@@ -160,6 +162,13 @@ class WaterLinkedDecoder(Decoder):
         if self._beam_rule is BeamRule.BOTTOM:
             return has_altitude
         return self._beam_rule is BeamRule.EACH
+
+
+def _is_without_type(report: dict[str, Any]) -> bool:
+    """Return whether a report says by what it holds that it is of a velocity off the ground."""
+    if "type" in report or not {"transducers", "velocity_valid"} <= report.keys():
+        return False
+    return report.get("format", "json_v1") in _GROUND_ALONE
 
 
 def _transducers(report: dict[str, Any]) -> list[dict[str, Any]]:

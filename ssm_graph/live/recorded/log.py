@@ -25,7 +25,7 @@ from ssm_graph.base.progress import told
 from ssm_graph.base.times import UNIX_FROM_S
 from ssm_graph.io.nortek.nortek import read_nortek
 from ssm_graph.io.nortek.packets import is_nortek
-from ssm_graph.io.raw_log.rows import RowKind
+from ssm_graph.io.raw_log.kinds import RowKind
 from ssm_graph.io.recording import whole
 from ssm_graph.io.tables.append_file import write_through
 from ssm_graph.io.teledyne.ensembles import is_pd0
@@ -33,7 +33,7 @@ from ssm_graph.io.teledyne.pd0 import read_pd0
 from ssm_graph.io.teledyne.short_formats import is_pd6, is_pd45, read_pd6, read_pd45
 from ssm_graph.live.protocols.decoder import RefusedError, parse_object
 from ssm_graph.live.protocols.framing import ObjectFramer, SentenceFramer
-from ssm_graph.live.protocols.nmea import MAX_SENTENCE, NmeaDecoder, NmeaOptions
+from ssm_graph.live.protocols.nmea import MAX_SENTENCE, PREFERRED_S, NmeaDecoder, NmeaOptions
 from ssm_graph.live.protocols.nmea_fields import (
     DAY_S,
     HEADINGS,
@@ -254,12 +254,7 @@ def _nmea(data: bytes, options: NmeaOptions) -> Recorded:
         kinds[kind] += _is_read(kind, fields)
         dated = _date(kind, fields) if math.isnan(dated) else dated
         first = _stamp(kind, fields, _NOON_S) if first is None else first
-    order = (*POSITIONS, *HEADINGS)
-    only = tuple(
-        next(kind for kind in some if kinds[kind])
-        for some in (POSITIONS, HEADINGS)
-        if any(kinds[kind] for kind in some)
-    )
+    only = tuple(kind for kind in (*POSITIONS, *HEADINGS) if kinds[kind])
     decoder = NmeaDecoder(replace(options, max_clock_error_s=_ANY_CLOCK_S), only=only)
     messages: list[Message] = []
     time_s = (first or 0.0) if math.isnan(dated) else dated
@@ -274,9 +269,13 @@ def _nmea(data: bytes, options: NmeaOptions) -> Recorded:
     notes = _said(decoder.take_refusals(), decoder.n_refused)
     if decoder.n_without_fix:
         notes.append(f"{decoder.n_without_fix} sentences say that the receiver has no fix.")
-    if only:
-        others = [kind for kind in order if kinds[kind] and kind not in only]
-        notes.append(f"{' and '.join(only)} read, not {', '.join(others) or 'others'}.")
+    for some in (POSITIONS, HEADINGS):
+        first_kind, *others = [kind for kind in some if kind in only] or [""]
+        if others:
+            where = f"where none of that came for {PREFERRED_S:g} s"
+            notes.append(f"{first_kind} read, {', '.join(others)} {where}.")
+        elif first_kind:
+            notes.append(f"{first_kind} read.")
     if math.isnan(dated):
         notes.append("No sentence states a date: time_s is UTC of the day.")
     if not messages:

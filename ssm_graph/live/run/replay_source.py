@@ -15,7 +15,7 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.mission.navigation import Event
 from ssm_graph.mission.run_status import LinkState, SourceStatus
 from ssm_graph.sensors.imu import ImuSample
-from ssm_graph.sensors.messages import Message
+from ssm_graph.sensors.messages import Message, Readings
 
 MOST: Final = 1000
 """Messages of one poll."""
@@ -72,8 +72,8 @@ class ReplaySource:
         """Time of the mission since the first message of this process, s."""
         return self.time_s - self._begin_s
 
-    def rest(self) -> list[Message]:
-        """Return what waited until the end: nothing does."""
+    def waiting(self) -> list[Readings]:
+        """Return what has come and waits: nothing does."""
         return []
 
     def poll(self, timeout_s: float) -> list[Message]:

@@ -17,18 +17,14 @@
 from __future__ import annotations
 
 import contextlib
-import copy
 import json
 import os
 import sys
-import threading
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import IO, Any, Final
-
-import numpy as np
 
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
@@ -36,7 +32,7 @@ from ssm_graph.base.settings import parse_json
 from ssm_graph.io.mission_folder.toml import TOML_NAME
 from ssm_graph.io.mission_folder.vehicle import check_same_vehicle
 from ssm_graph.io.raw_log.log import RawLog
-from ssm_graph.io.raw_log.rows import ALWAYS, ARRIVALS, replay
+from ssm_graph.io.raw_log.rows import ARRIVALS, replay
 from ssm_graph.io.results.place import RUN_NAME, SUMMARY_NAME
 from ssm_graph.io.results.summary import as_json
 from ssm_graph.io.results.tables import (
@@ -45,13 +41,13 @@ from ssm_graph.io.results.tables import (
     TRAJECTORY_NAME,
     GrowingResults,
 )
-from ssm_graph.io.tables.append_file import AppendFile, sync_path, write_through
+from ssm_graph.io.tables.append_file import AppendFile, write_through
 from ssm_graph.io.tables.checkpoint import (
     CHECKPOINT_NAME,
     newest_checkpoint,
     older_name,
-    write_checkpoint,
 )
+from ssm_graph.live.run.disk import CheckpointWriter, Syncer
 from ssm_graph.mission.navigation import Event
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.messages import Message
@@ -82,53 +78,6 @@ class Resumed:
     """Time of the last inertial one of them."""
     notes: tuple[str, ...] = ()
     """What a person should know, one sentence each."""
-
-
-class CheckpointWriter:
-    """Writes one checkpoint at a time in a thread of its own.
-
-    Files that are ``synced`` have to be on the disk before the checkpoint that counts on them.
-    """
-
-    def __init__(self, folder: Path, synced: Sequence[Path] = ()) -> None:
-        self._path = folder / CHECKPOINT_NAME
-        self._synced = synced
-        self._thread: threading.Thread | None = None
-        self._error: Exception | None = None
-
-    @property
-    def is_busy(self) -> bool:
-        """Whether the last one is still on its way to the disk."""
-        return self._thread is not None and self._thread.is_alive()
-
-    def write(self, arrays: Mapping[str, Array], meta: Mapping[str, Any]) -> None:
-        """Begin to write a checkpoint; what it holds is copied first. Not while busy."""
-        assert not self.is_busy
-        own = {name: np.array(array) for name, array in arrays.items()}
-        self._thread = threading.Thread(
-            target=self._write, args=(own, copy.deepcopy(dict(meta))), name="checkpoint"
-        )
-        self._thread.start()
-
-    def wait(self) -> None:
-        """Wait for the disk."""
-        if self._thread is not None:
-            self._thread.join()
-            self._thread = None
-
-    def take_error(self) -> Exception | None:
-        """Return why the last one could not be written, once."""
-        error, self._error = self._error, None
-        return error
-
-    def _write(self, arrays: dict[str, Array], meta: dict[str, Any]) -> None:
-        try:
-            for path in self._synced:
-                with contextlib.suppress(FileNotFoundError):
-                    sync_path(path)
-            write_checkpoint(self._path, arrays, meta)
-        except Exception as error:  # told by the thread that navigates
-            self._error = error
 
 
 class RunFolder:
@@ -163,9 +112,9 @@ class RunFolder:
         self.event_problem: str | None = None
         self.results: GrowingResults | None = None
         self.log: RawLog | None = None
-        log_names = [f"{LOG_NAME}/{name}" for name in (*ALWAYS, ARRIVALS)]
-        names = (*log_names, TRAJECTORY_NAME, BEAMS_NAME, PROTECTION_NAME)
-        self.writer = CheckpointWriter(folder, [folder / name for name in names])
+        results = [folder / name for name in (TRAJECTORY_NAME, BEAMS_NAME, PROTECTION_NAME)]
+        self.writer = CheckpointWriter(folder, folder / LOG_NAME, results)
+        self.syncer = Syncer(folder / LOG_NAME)
         self._known: Counter[bytes] = Counter()
 
     def resume(self) -> Resumed:
@@ -253,6 +202,7 @@ class RunFolder:
             self.event_problem,
             self._events.problem,
             self._folder_problem,
+            self.syncer.problem,
         ]
         return "; ".join(text for text in found if text) or None
 
@@ -266,6 +216,7 @@ class RunFolder:
     def close(self) -> None:
         """Wait for the disk, and let others have the folder."""
         self.writer.wait()
+        self.syncer.wait()
         if self.log is not None:
             self.log.sync()
             self.log.close()

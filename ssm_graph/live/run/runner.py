@@ -30,7 +30,7 @@ from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.navigation import Event, Health, Navigation, Severity
 from ssm_graph.mission.run_status import Latency, RunStatus, SourceStatus
 from ssm_graph.sensors.imu import ImuSample
-from ssm_graph.sensors.messages import Message
+from ssm_graph.sensors.messages import Message, Readings
 
 POLL_S: Final = 0.05
 LATE_S: Final = 5.0
@@ -117,7 +117,7 @@ class Source(Protocol):
     @property
     def elapsed_s(self) -> float: ...  # noqa: D102
     def poll(self, timeout_s: float) -> list[Message]: ...  # noqa: D102
-    def rest(self) -> list[Message]: ...  # noqa: D102
+    def waiting(self) -> Sequence[Readings]: ...  # noqa: D102
     def take_events(self) -> Sequence[Event]: ...  # noqa: D102
     def source_status(self) -> tuple[SourceStatus, ...]: ...  # noqa: D102
 
@@ -202,21 +202,24 @@ class Runner:
             while (reason := self._reason(source)) is None:
                 messages = source.poll(POLL_S)
                 begin_s = self._steady_s()
-                self._take(messages, log)
+                self._take(messages, source.waiting(), log)
                 if messages:
                     self._publish(outlet, source.time_s)
                     self._latencies.append(self._steady_s() - begin_s)
                 self._keep(source)
-            self._take(source.rest(), log)
+            self._take([readings[0] for readings in source.waiting()], (), log)
             return self._end(reason)
         finally:
             self.folder.close()
 
-    def _take(self, messages: Sequence[Message], log: RawLog) -> None:
-        """Log messages, then use them."""
+    def _take(self, messages: Sequence[Message], waiting: Sequence[Readings], log: RawLog) -> None:
+        """Log messages, all that have come and what waits; then use them."""
         for message in messages:
             with self._events.surviving("raw log", "log_failed"):
                 log.append(message)
+        with self._events.surviving("raw log", "log_failed"):
+            log.hold(waiting)
+        for message in messages:
             self._push(message)
 
     def _reason(self, source: Source) -> StopReason | None:
@@ -305,13 +308,13 @@ class Runner:
         for event in source.take_events():
             self._note_event(event)
         if self._watch.is_due(self._steady_s()):
+            self.folder.syncer.begin()
             for text in self.folder.regain():
                 self._events.note("disk", "file_altered", text, Severity.ERROR, burst=20)
                 self._is_checkpoint_due = True  # the last one knows the files of before
         self._keep_results()
         self._keep_checkpoint()
-        problem = self.folder.problems()
-        if problem is not None:
+        if (problem := self.folder.problems()) is not None:
             self._events.note("disk", "disk", problem, Severity.ERROR)
         self._show()
 

@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 
 from ssm_graph.live.sockets.doubt import Arrival, Doubt, Lags, Setting, Told
 from ssm_graph.sensors.imu import ImuSample
-from ssm_graph.sensors.messages import Message
+from ssm_graph.sensors.messages import Message, Readings
 from ssm_graph.sensors.registry import BY_MESSAGE
 
 SET_S: Final = 0.02
@@ -211,9 +211,21 @@ class StampClock:
             return [], self._doubt.give_up(self._run_s(now))
         return self._heed(told, now), []
 
-    def rest(self, now: Now) -> list[Message]:
-        """Return messages that still wait, their stamps read as is likelier: nothing more comes."""
-        return [] if self._doubt is None else self._heed(self._doubt.likelier(), now)
+    def waiting(self) -> list[Readings]:
+        """Return messages whose stamps wait to be read, in the time of the run."""
+        return [] if self._doubt is None else self._doubt.waiting()
+
+    def readings(self, message: Message, now: Now) -> Readings:
+        """Return how a message that is held elsewhere would be read if it came now."""
+        if self._doubt is not None:
+            return self._doubt.readings(message)
+        shift_s = self._shift_of(message.time_s, now)
+        return (replace(message, time_s=message.time_s - shift_s),)
+
+    @property
+    def n_strangers(self) -> int:
+        """How many messages of another clock wait for that to be believed."""
+        return len(self._strangers)
 
     def _heed(self, told: Told, now: Now) -> list[Message]:
         """Read stamps as is told from now on; return what waited for that."""
@@ -397,9 +409,9 @@ class StampClocks:
         found = [clock.settle(now) for (of, _), clock in self._clocks.items() if of == source]
         return [m for passed, _ in found for m in passed], [m for _, late in found for m in late]
 
-    def rest(self, now: Now) -> list[Message]:
-        """Return what waits of all sources, as :meth:`StampClock.rest` does."""
-        return [message for clock in self._clocks.values() for message in clock.rest(now)]
+    def waiting(self) -> list[Readings]:
+        """Return what waits of all sources, as :meth:`StampClock.waiting` does."""
+        return [readings for clock in self._clocks.values() for readings in clock.waiting()]
 
 
 def called(message: Message) -> str:

@@ -13,7 +13,7 @@ from collections import deque
 from dataclasses import replace
 from typing import Final, NamedTuple
 
-from ssm_graph.sensors.messages import Message
+from ssm_graph.sensors.messages import Message, Readings
 
 DOUBT_S: Final = 8.0
 """No message waits longer: a window would not take it any more."""
@@ -179,13 +179,33 @@ class Doubt:
         patience_s = max(DOUBT_S, GUESS_AFTER * min(off_s, 0.5))
         if not is_sure and not now_s - self._begun_s > patience_s:
             return None
-        told = self._read_as(self._following if following > own else self._own)
+        told = self.likelier()
         return told._replace(other_s=None) if is_sure else told
 
     def likelier(self) -> Told:
         """Return what seems true so far, where nothing more will come to tell it."""
+        return self._read_as(self._likelier_first()[0])
+
+    def waiting(self) -> list[Readings]:
+        """Return what waits."""
+        likelier, other = self._likelier_first()
+        return [
+            tuple(replace(message, time_s=time_s) for time_s in times_s)
+            for (_, message), *times_s in zip(
+                self._waiting, likelier.times_s, other.times_s, strict=True
+            )
+        ]
+
+    def readings(self, message: Message) -> Readings:
+        """Return how a message that has not come here yet would be read."""
+        times_s = (way.read(message.time_s, self._period_s) for way in self._likelier_first())
+        return tuple(replace(message, time_s=time_s) for time_s in times_s)
+
+    def _likelier_first(self) -> tuple[_Reading, _Reading]:
         own, following = (self._probability(x) for x in (self._own, self._following))
-        return self._read_as(self._following if following > own else self._own)
+        if following > own:
+            return self._following, self._own
+        return self._own, self._following
 
     def _read_as(self, right: _Reading) -> Told:
         wrong = self._own if right is self._following else self._following

@@ -16,7 +16,7 @@ from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.navigation import Severity
 from ssm_graph.mission.run_status import LinkState, SourceStatus
 from ssm_graph.sensors.imu import ImuSample
-from ssm_graph.sensors.messages import Message
+from ssm_graph.sensors.messages import Message, Readings
 
 IDLE_S: Final = 1.0
 """A source that is silent so long gets to feed nothing, which lets a decoder release what waits."""
@@ -170,6 +170,17 @@ class Feed:
     def idle(self, channel: Channel, now: Now) -> list[Message]:
         """Return what the decoder releases where nothing has come for a second."""
         return self.take(channel, b"", now) if now.steady_s - channel.fed_s >= IDLE_S else []
+
+    def held(self, channel: Channel, now: Now) -> list[Readings]:
+        """Return complete messages that a decoder holds, as they would be read now."""
+        waiting = channel.decoder.waiting()
+        return [self._clocks.of(self.name, one).readings(one, now) for one in waiting]
+
+    def end(self, channel: Channel, now: Now) -> list[Message]:
+        """Return what the decoder of a connection that is over still gives."""
+        messages = self.take(channel, b"\n", now)
+        left = channel.decoder.take_waiting()
+        return messages + self._in_run_time(self._limited(left, now), now)
 
     def is_over(self, now: Now) -> bool:
         """Return whether it has sent so many bytes that it has to wait."""

@@ -22,7 +22,7 @@ from ssm_graph.live.sockets.endpoints import (
 from ssm_graph.live.sockets.feed import AHEAD_S, Channel, Feed
 from ssm_graph.mission.navigation import Severity
 from ssm_graph.mission.run_status import LinkState, SourceStatus
-from ssm_graph.sensors.messages import Message
+from ssm_graph.sensors.messages import Message, Readings
 
 YOUNG_S: Final = 2.0
 """A client that has sent no sound message for so long makes room for another one."""
@@ -94,6 +94,10 @@ class Input(ABC):
         """Bytes held of messages that are not complete."""
         return sum(channel.decoder.n_held for channel in self._reading.values())
 
+    def waiting(self, now: Now) -> list[Readings]:
+        """Return complete messages that decoders hold, as they would be read now."""
+        return [one for held in self._reading.values() for one in self.feed.held(held, now)]
+
     def abandon(self, sock: socket.socket) -> None:
         """Let go of a socket that made something fail."""
         if sock in self._reading:
@@ -119,7 +123,7 @@ class Input(ABC):
         """Hang up; a message that was cut off ends here and does not meet the next one's begin."""
         channel = self._reading[sock]
         self._forget(sock)
-        return self.feed.take(channel, b"\n", now)
+        return self.feed.end(channel, now)
 
     def _pause_if_over(self, now: Now) -> None:
         """Stop reading a source that sends too much: TCP holds it back, of UDP the rest is lost."""

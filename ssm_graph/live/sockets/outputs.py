@@ -261,10 +261,10 @@ class Publisher:
             navigation = replace(
                 navigation, health=Health.DEGRADED, reason=BEHIND, confidence=BEHIND_CONFIDENCE
             )
-        if outlet.set_by_s:
-            navigation = replace(navigation, time_s=navigation.time_s + outlet.set_by_s)
+        set_by_s = outlet.set_by_s
         if form is OutputFormat.JSON:
-            outlet.send(form, encode_navigation(navigation))
+            outlet.send(form, encode_navigation(navigation, set_by_s=set_by_s))
         else:
+            navigation = replace(navigation, time_s=navigation.time_s + set_by_s)
             separation_m = self._geoid_separation_m
             outlet.send(form, encode_nmea(navigation, geoid_separation_m=separation_m))

@@ -18,7 +18,7 @@ from ssm_graph.live.sockets.serial_port import SerialInput
 from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.navigation import Event, Severity
 from ssm_graph.mission.run_status import OutputStatus, SourceStatus
-from ssm_graph.sensors.messages import Message
+from ssm_graph.sensors.messages import Message, Readings
 
 STANDSTILL_S: Final = 2.0
 """Nobody has looked after the sockets for longer: the process was stopped, or something hung."""
@@ -140,9 +140,11 @@ class SocketHub:
                 messages += link.tick(now) or []  # outputs have none
         return messages
 
-    def rest(self) -> list[Message]:
-        """Return what waited until the end to be told how its stamps are to be read."""
-        return self._stamps.rest(self._clock.read()[0])
+    def waiting(self) -> list[Readings]:
+        """Return what has come and waits: for what tells its time, or for a sentence beside it."""
+        now = Now(self._clock.time_s + self._clock.set_by_s, self._steady_s())
+        held = [readings for source in self.inputs for readings in source.waiting(now)]
+        return [*self._stamps.waiting(), *held]
 
     def _keep_clock(self, now: Now) -> None:
         """Have it remembered how far the vehicle's clock is ahead of the time of the run."""

@@ -105,24 +105,25 @@ def _squares_beside_median(whitened: Array) -> Array:
     return np.asarray(np.sum(off**2, axis=1))
 
 
-def noisier_than_others(whitened: Array, beam: NDArray[np.intp], *, n_beams: int) -> Array:
+def noisier_than_others(whitened: Array, beam: NDArray[np.intp], n_beams: int) -> Array:
     """Return the sigma of each beam by that of the others, 1.0 where it is no more than chance.
+
+    A beam that is never heard is no noisier than others.
 
     Parameters
     ----------
     whitened : (M,) what beams miss, in their stated sigmas.
     beam : (M,) from 0.
-    n_beams : of the instrument; some may have no speed at all.
+    n_beams : of the instrument.
     """
     each = [_squares_beside_median(whitened[beam == b][:, None]) for b in range(n_beams)]
     each = [x[x < REACH_SQ] for x in each]  # gross errors are weighed away one by one
     variance = np.array([np.mean(x) if len(x) else 0.0 for x in each])
     count = np.array([len(x) for x in each])
     factor = np.ones(n_beams)
-    for b in np.flatnonzero(count).tolist():
-        others = np.delete(variance, b)[np.delete(count, b) > 0]
-        if len(others) < 2:
-            break
+    heard = np.flatnonzero(count)
+    for b in heard if len(heard) > 2 else ():
+        others = variance[heard[heard != b]]
         ratio = variance[b] / max(float(np.median(others)), 1e-12)
         chance = NOISIER_DEVIATIONS * np.sqrt(4.0 / count[b])
         if ratio > NOISIER and np.log(ratio) > chance and variance[b] > 1.0:
@@ -222,7 +223,7 @@ def linear_of_steps(
         states=states,
         beam_weights=beam_weights,
         beam_noise=noisier_than_others(
-            beams.error / problem.beams.sigma, problem.beams.beam, n_beams=problem.beams.n_beams
+            beams.error / problem.beams.sigma, problem.beams.beam, problem.beams.n_beams
         ),
         aids=weighted.all,
         aid_weights={aid.name: weighted.of(aid, weights) for aid in weighted.all},
