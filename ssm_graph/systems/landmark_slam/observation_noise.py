@@ -142,7 +142,8 @@ def _law(
     """Return what the expected squares of a pass ask for; ``used`` (M, 2) sigmas whitened it."""
     counts = (found.weights > NO_OUTLIER)[:, None] & there
     squares, w = found.expected.own * used**2, found.weights
-    near, share, bearing = (1.0, 0.0, 1.0) if before is None else before[:3]
+    mean = used.mean(axis=0)
+    near, share, bearing = (mean[0], 0.0, mean[1]) if before is None else before[:3]
     if counts[:, 0].sum() >= FEWEST:
         at = counts[:, 0]
         near, share = _growing(squares[at, 0], ranges[at], w[at])
