@@ -93,7 +93,8 @@ def learn_observations(
     there = np.isfinite(problem.measured)
     ranges = np.where(there[:, 0], problem.measured[:, 0], 0.0)
     pairs = _successive(problem)
-    now, noise, law, before = problem, stated, None, given
+    now, noise, before = problem, stated, given
+    law: _Law | None = None
     estimate = smooth_landmarks(now, noise, first, how)
     for _ in range(ROUNDS):
         values = Values(estimate.pose, estimate.landmarks, estimate.drift)
@@ -142,7 +143,7 @@ def _law(
     """Return what the expected squares of a pass ask for; ``used`` (M, 2) sigmas whitened it."""
     counts = (found.weights > NO_OUTLIER)[:, None] & there
     squares, w = found.expected.own * used**2, found.weights
-    mean = used.mean(axis=0)
+    mean: list[float] = used.mean(axis=0).tolist()
     near, share, bearing = (mean[0], 0.0, mean[1]) if before is None else before[:3]
     if counts[:, 0].sum() >= FEWEST:
         at = counts[:, 0]
@@ -156,7 +157,7 @@ def _law(
     for i in range(2):
         a, b = (side[there[pairs[0], i] & there[pairs[1], i]] for side in pairs)
         if len(a) >= FEWEST:
-            c = float(np.mean(z[a, i] * z[b, i]) / max(np.mean(z[a, i] ** 2), 1e-300))
+            c = float(np.mean(z[a, i] * z[b, i])) / max(float(np.mean(z[a, i] ** 2)), 1e-300)
             alike[i] = min(c, MOST_ALIKE) if c > 2.0 / np.sqrt(len(a)) else 0.0
     return law._replace(alike=alike)
 
