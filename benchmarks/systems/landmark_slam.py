@@ -22,7 +22,7 @@ METHODS = ("smoother", "smoother-em", "smoother-oracle")
 SIGMAS = ("distance", "steering", "range", "bearing")
 WAYS = {
     "smoother": Asked(),
-    "smoother, sigmas of observations learnt": Asked(learns_observations=True),
+    "smoother, noise as guessed": Asked(learns_observations=False),
     "isam2, nothing dropped": Asked("isam2"),
     "fixed lag of 60 s": Asked("fixed-lag", lag_s=60.0),
     "on-line filter, similarity weights": Asked("ekf-weighted"),
@@ -83,7 +83,8 @@ def real(folder: Path, robots: Sequence[int]) -> Iterator[str]:
             asked = replace(asked, robot=robot)
             rows.append(_told(str(robot), name, solve_input(folder, asked), began))
     yield ""
-    yield f"{folder.name}, unknown landmarks, frame of the start; noise as stated in `recorded.py`."
+    yield f"{folder.name}, unknown landmarks, frame of the start; noise guessed, see `recorded.py`,"
+    yield "that of the smoother's observations found in the log where nothing else is said."
     yield ""
     header = ("robot", "method", "position rms, m", "aligned, m", "heading rms, deg")
     yield from table((*header, "association wrong, left out", "CPU s"), rows)

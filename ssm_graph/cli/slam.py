@@ -72,8 +72,9 @@ def declare(parser: argparse.ArgumentParser) -> None:
     )
     text = "of --method fixed-lag: older poses are dropped (default: 20)"
     number_option(parser, "--lag", "S", text)
-    text = "stated, or estimated from the log: those of the observations, or all (default: stated)"
-    choice_option(parser, "--noise", NoiseUsed, text, NoiseUsed.STATED)
+    text = "stated, or found from the log: that of the observations, or all, taken for white "
+    text += "(default: stated; observations where the log states none)"
+    choice_option(parser, "--noise", NoiseUsed, text, None)
     text = "landmarks by their names, by the nearest in a gate, or jointly (default: known)"
     choice_option(parser, "--association", AssociationUsed, text, AssociationUsed.KNOWN)
     add_kernel_options(parser, KERNELS)
@@ -113,12 +114,12 @@ def asked_of(arguments: argparse.Namespace) -> Asked:
             f"--lag {arguments.lag:g}: expected seconds above 0, with --method fixed-lag, got "
             f"{method}"
         )
-    noise: NoiseUsed = arguments.noise
-    if method != "smoother" and noise is not NoiseUsed.STATED:
+    noise: NoiseUsed | None = arguments.noise
+    if method != "smoother" and noise not in (None, NoiseUsed.STATED):
         raise ConfigError(f"--noise {noise.value}: expected with --method smoother, got {method}")
     return Asked(
         method,
-        learns_observations=noise is not NoiseUsed.STATED,
+        learns_observations=None if noise is None else noise is not NoiseUsed.STATED,
         learns_control=noise is NoiseUsed.ALL,
         association=Association[arguments.association.name],
         kernel=kernel_of(arguments, KERNELS),

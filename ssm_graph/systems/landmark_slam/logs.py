@@ -54,6 +54,8 @@ class LandmarkLog(ReadOnlyArrays):
     """(T, 3) m, m, rad; a heading may be NaN; no rows where there is none."""
     range_sigma_grows: bool = False
     """The sigma of a range is a share of it, as where a camera tells it from a known size."""
+    noise_is_a_guess: bool = False
+    """Nobody stated it: that of the observations is to be found from the log."""
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

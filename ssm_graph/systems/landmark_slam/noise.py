@@ -60,9 +60,6 @@ class NoiseSettings:
     """Solutions of the log at most."""
     median_rounds: int = 8
     """Of these, for the medians."""
-    learns_control: bool = True
-    """False keeps the noise of the motion as stated, and learns that of the observations alone.
-    Where errors of successive observations are alike, they would pass for noise of motion."""
 
 
 class SigmaFound(NamedTuple):
@@ -109,8 +106,6 @@ def estimate_noise(
             continue
         past.append(np.log(_variances(state.noise)))
         wanted = np.log(_variances(_maximised(problem, state.noise, found, gated)))
-        if not limits.learns_control:
-            wanted[: len(stated.control)] = past[-1][: len(stated.control)]
         wanted = past[-1] + np.clip(wanted - past[-1], -np.log(MOST_CHANGE), np.log(MOST_CHANGE))
         is_settled = bool(np.max(np.abs(wanted - past[-1])) < SETTLED_LOG)
         past.append(wanted)

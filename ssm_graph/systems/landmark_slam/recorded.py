@@ -25,8 +25,8 @@ from ssm_graph.systems.landmark_slam.problem import SlamNoise, SlamProblem
 
 MRCLAM_ROBOTS: Final = range(1, 6)
 """Subjects that are robots: they move, and are no landmarks."""
-MRCLAM_NOISE: Final = SlamNoise(np.array([0.02, 0.01, 0.04]), np.array([0.05, 0.02]))
-"""A guess of such robots and cameras: from it the noise of a log is estimated."""
+MRCLAM_NOISE: Final = SlamNoise(np.array([0.02, 0.01, 0.04]), np.array([0.1, 0.02]))
+"""A guess of such robots and cameras, 10 cm and a degree: with it the noise of a log is found."""
 
 
 def read_mrclam(folder: Path, robot: int) -> LandmarkLog:
@@ -58,7 +58,7 @@ def read_mrclam(folder: Path, robot: int) -> LandmarkLog:
         MRCLAM_NOISE,
         truth[:, 0] - begin,
         truth[:, 1:],
-        range_sigma_grows=True,
+        noise_is_a_guess=True,
         notes=notes,
     )
 

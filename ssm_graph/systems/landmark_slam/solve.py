@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -45,7 +45,8 @@ from ssm_graph.systems.landmark_slam.logs import (
     truth_at,
 )
 from ssm_graph.systems.landmark_slam.methods import INCREMENTAL
-from ssm_graph.systems.landmark_slam.noise import NoiseSettings, SigmaFound, estimate_noise
+from ssm_graph.systems.landmark_slam.noise import SigmaFound, estimate_noise
+from ssm_graph.systems.landmark_slam.observation_noise import learn_observations
 from ssm_graph.systems.landmark_slam.problem import (
     UNKNOWN,
     SlamEstimate,
@@ -70,10 +71,11 @@ class Asked:
 
     method: str = "smoother"
     """Or `methods.INCREMENTAL`, or a filter of `methods.FILTERS`."""
-    learns_observations: bool = False
-    """The sigmas of the observations are estimated, from the stated ones on."""
+    learns_observations: bool | None = None
+    """The noise of the observations is estimated, from the stated one on; None: where the log
+    states none (MRCLAM), by the smoother."""
     learns_control: bool = False
-    """Those of the odometry too."""
+    """The sigmas of the odometry too, all errors taken for white."""
     association: Association = Association.KNOWN
     kernel: Kernel = LogKernel(5.0)
     robot: int | None = None
@@ -172,6 +174,9 @@ def solve_input(path: Path, asked: Asked) -> Solved:
             f"{path}: expected a folder with {TOML_NAME}, MRCLAM's Barcodes.dat or Victoria Park's "
             f"{VICTORIA_ODOMETRY}, or a graph file"
         )
+    if asked.learns_observations is None:
+        learns = log.noise_is_a_guess and asked.method == "smoother"
+        asked = replace(asked, learns_observations=learns)
     problem = problem_of_log(log)
     truth, known = truth_at(log, problem.time_s)
     truth = np.where(known[:, None], truth, np.nan) if len(log.truth_s) > 1 else np.zeros((0, 3))
@@ -244,10 +249,12 @@ def solve(
     else:
         values = first or first_values(named, noise)
         settings = SmootherSettings(asked.kernel)
-        if asked.learns_observations:
-            learning = NoiseSettings(learns_control=asked.learns_control)
-            learnt = estimate_noise(named, noise, values, settings, learning)
+        if asked.learns_control:
+            learnt = estimate_noise(named, noise, values, settings)
             answer, sigmas = learnt.estimate, learnt.sigmas
+        elif asked.learns_observations:
+            own = learn_observations(named, noise, values, settings)
+            named, answer, sigmas, notes = own.problem, own.estimate, own.sigmas, notes + own.notes
         else:
             answer = smooth_landmarks(named, noise, values, settings)
     notes = (*notes, *answer.notes)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from factors.similarity import GaussianKernel, Kernel, LogKernel
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.systems.landmark_slam.models import Odometry
 from ssm_graph.systems.landmark_slam.noise import NoiseSettings, estimate_noise
+from ssm_graph.systems.landmark_slam.observation_noise import learn_observations
 from ssm_graph.systems.landmark_slam.problem import SlamEstimate, SlamNoise, SlamProblem, SlamStatus
 from ssm_graph.systems.landmark_slam.simulator import CASES, Sigmas, World, simulate
 from ssm_graph.systems.landmark_slam.smoother import SmootherSettings, Values, smooth_landmarks
@@ -204,3 +207,38 @@ def test_sigmas_of_nothing_are_refused() -> None:
     for bad in (0.0, -1.0, np.nan):
         with pytest.raises(ConfigError, match="expected sigmas above 0"):
             SlamNoise(np.array([0.1, bad]), np.array([0.1, 0.1]))
+
+
+def test_a_range_that_grows_and_repeats_itself_is_found() -> None:
+    """Its law, how alike its errors are, and the sigma of bearings, from a constant guess."""
+    rng = np.random.default_rng(3)
+    problem, true = small(rng, n_poses=200, noise=FINE)
+    every = replace(problem, time_s=0.2 * problem.time_s)
+    seen = range_bearing(true.pose[every.keyframe], true.landmarks[every.landmark])
+    errors = rng.standard_normal(seen.shape)
+    for i in range(4, len(errors)):  # the landmark's sighting before this one
+        errors[i, 0] = 0.7 * errors[i - 4, 0] + np.sqrt(1.0 - 0.7**2) * errors[i, 0]
+    sigma = np.hypot(0.03, 0.05 * seen[:, 0])
+    every = replace(
+        every, measured=seen + errors * np.column_stack([sigma, np.full_like(sigma, 0.01)])
+    )
+    guess = SlamNoise(FINE.control, np.array([0.1, 0.02]))
+    found = learn_observations(every, guess, true)
+    of_range, bearing = found.sigmas
+    middle = np.median(seen[:, 0])
+    assert of_range.found.value == pytest.approx(np.hypot(0.03, 0.05 * middle), rel=0.15)
+    assert bearing.found.value == pytest.approx(0.01, rel=0.15)
+    used = found.estimate.noise.observation[0] * found.problem.scales[:, 0]
+    far, near = used[seen[:, 0] > 6.0].mean(), used[seen[:, 0] < 2.5].mean()
+    assert far > 1.8 * near
+    assert used / sigma == pytest.approx(np.sqrt(1.7 / 0.3), rel=0.3)
+    assert "successive errors of ranges" in found.notes[0]
+
+
+def test_too_few_observations_teach_nothing() -> None:
+    """They keep what was stated, and that is said."""
+    problem, true = small(np.random.default_rng(1), n_poses=6)
+    found = learn_observations(problem, NOISE, true)
+    assert found.sigmas == ()
+    assert "too few to learn from" in found.notes[0]
+    assert found.estimate.noise.observation == pytest.approx(NOISE.observation)
