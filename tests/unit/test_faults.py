@@ -358,7 +358,11 @@ def test_residuals_that_last_are_said() -> None:
         Readings("GNSS", time_s, wild, 0.25),
         Readings("USBL", time_s[:20], 5.0 + white[0, :20], 0.25),
     ]
-    assert disagreeing(sound, time_s) == []
+    seldom_s = np.arange(0.0, 3600.0, 30.0)
+    pair = white[0, : len(seldom_s)] + 20.0 * np.isin(np.arange(len(seldom_s)), (40, 41, 42))
+    sound.append(Readings("USBL", seldom_s, pair, 0.25))
+    assert disagreeing(sound, np.arange(3600.0)) == []
+    sound.pop()
     wave = 2.0 * np.sin(time_s / 30.0) * (time_s >= 120.0)
     (found,) = disagreeing([*sound, Readings("range", time_s, white[1] + wave, 0.25)], time_s)
     assert (found.sensor, found.treatment) == ("range", Treatment.SAID)

@@ -68,6 +68,16 @@ def test_readings_far_noisier_than_stated_say_no_more_than_their_variance() -> N
     assert np.isinf(most_by_noise(t[1000:1010], weights[1000:1010], np.arange(10.0))).all()
 
 
+@pytest.mark.parametrize("n", [30, 60, 150])
+def test_few_readings_are_not_noisy_by_chance(n: int) -> None:
+    """Of thirty the median square is twice its mean once in twenty; three times the noise shows."""
+    rng, kernel, time_s = np.random.default_rng(5), LogKernel(), np.arange(float(n))
+    for noise, is_usual in ((1.0, True), (3.0, False)):
+        t = (noise * rng.standard_normal((200, n))) ** 2
+        found = [np.isinf(most_by_noise(one, kernel.weight(one), time_s)).all() for one in t]
+        assert np.mean(found) == 1.0 if is_usual else np.mean(found) < 0.3
+
+
 @pytest.mark.parametrize(
     ("noise", "expected"),
     [(lambda rng, n: rng.standard_normal(n), 0.908), (workhorse, 1.256)],

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator
 from typing import Final, NamedTuple
 
 import numpy as np
+from scipy.special import bdtrc
 
 from factors.similarity import WEIGHT_FLOOR, Kernel
 from ssm_graph.base import chi2
@@ -30,7 +31,7 @@ USUAL: Final = 2.0
 and quantisation make it up to 1.25, of MEMS units up to 1.6, over realistic missions (30 a grade,
 seeds 100 to 129)."""
 TAIL: Final = 1e-6
-"""Probability of a stretch's chi-square where it is as large as is usual."""
+"""Probability of a stretch's chi-square where it is as large as is usual, and of a median."""
 MOST: Final = 3
 """Stretches that are named."""
 OTHERS: Final = "DVL or aids, whose lie the inertial data contradict"
@@ -48,9 +49,9 @@ CONTRADICTING: Final = "what it is compared with"
 GROUP: Final = 100
 """Successive readings whose median tells their noise,"""
 FEWEST: Final = 30
-"""the fewest that do,"""
+"""the fewest that do, and that a stretch has which is said to last,"""
 NOTABLE_SQUARE: Final = 2.0
-"""and their variance by that stated, from which on they are noisier: six deviations of it."""
+"""and their variance by that stated, from which on they are noisier if that is no chance."""
 LEAST_SHARE: Final = 1e-3
 
 
@@ -152,7 +153,7 @@ def disagreeing(readings: Iterable[Readings], keyframe_s: Array) -> list[Detecte
     """
     found: dict[str, DetectedFault] = {}
     for one in readings:
-        if len(one.error) < FEWEST:
+        if len(one.error) <= FEWEST:
             continue
         error, usual = np.clip(one.error, -CLIP, CLIP), SAFE * one.slow
         product = error[1:] * error[:-1] - usual
@@ -165,7 +166,7 @@ def disagreeing(readings: Iterable[Readings], keyframe_s: Array) -> list[Detecte
         sums = [np.concatenate([[0.0], np.cumsum(x)]) for x in (total, count)]
         more, n = (x[end] - x[begin] for x in sums)
         sigmas = more / np.sqrt(np.maximum(n, 1.0)) / (1.0 + usual)
-        sigmas[more < LEAST * n] = 0.0
+        sigmas[(more < LEAST * n) | (n < FEWEST)] = 0.0
         best = int(np.argmax(sigmas))
         if sigmas[best] <= DEVIATIONS:
             continue
@@ -225,7 +226,7 @@ def most_by_noise(t: Array, weights: Array, time_s: Array, *, dim: int = 1) -> A
 
     A weight lets go of what sticks out; where most readings do, it leaves them more than the
     inverse of their variance, which medians of successive ones tell. Infinite where they err no
-    more than stated.
+    more than stated, or by a chance of :data:`TAIL`.
 
     Parameters
     ----------
@@ -239,7 +240,10 @@ def most_by_noise(t: Array, weights: Array, time_s: Array, *, dim: int = 1) -> A
     for own in np.array_split(counts, max(len(counts) // GROUP, 1)):
         if len(own) * dim < FEWEST:
             continue
-        scale_sq = float(np.median(t[own]) / chi2.isf(0.5, dim))
-        if scale_sq > NOTABLE_SQUARE:
+        median = float(np.median(t[own]))
+        scale_sq = median / float(chi2.isf(0.5, dim))
+        # The median is as large where half of the readings are, each with the same probability.
+        chance = bdtrc((len(own) - 1) // 2, len(own), chi2.sf(median, dim))
+        if scale_sq > NOTABLE_SQUARE and chance < TAIL:
             most[own] = max(1.0 / (scale_sq * float(np.mean(weights[own]))), LEAST_SHARE)
     return most
