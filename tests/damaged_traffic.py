@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
+from ssm_graph.base.errors import printable
 from ssm_graph.io.nmea_sentences import checksum
 from ssm_graph.live.protocols.decoder import MAX_REFUSALS, Decoder
 from ssm_graph.live.protocols.framing import MAX_LENGTH
@@ -164,7 +165,7 @@ class Target:
         if len(texts) > MAX_REFUSALS + 1:
             self.fail(f"kept {len(texts)} refusals", b"")
         for text in texts:
-            if len(text) > 400 or not text.isprintable():
+            if len(text) > 400 or "\n" in text or printable(text) != text:
                 self.fail(f"refusal {text!r:.200}", b"")
 
     def fail(self, what: str, chunk: bytes) -> None:

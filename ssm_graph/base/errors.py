@@ -4,14 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from unicodedata import category
 
 
 def printable(text: str) -> str:
-    """Return a text with all that is no print or line end as escapes: it may come out of a file."""
+    """Return a text with all that is no print, space or line end as escapes.
+
+    It may come out of a file. Spaces of any width are in the names of people's files.
+    """
     if text.isprintable():
         return text
-    escaped = (x if x.isprintable() or x == "\n" else ascii(x)[1:-1] for x in text)
-    return "".join(escaped)
+    return "".join(x if _is_plain(x) else ascii(x)[1:-1] for x in text)
+
+
+def _is_plain(x: str) -> bool:
+    return x.isprintable() or x == "\n" or category(x) == "Zs"
 
 
 class SsmGraphError(Exception):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ssm_graph.base.times import UNIX_FROM_S, UNIX_UNTIL_S
-from ssm_graph.cli.terminal import say
+from ssm_graph.cli.terminal import say, say_json
 from ssm_graph.io.file_kind import check_is_file
 from ssm_graph.report.terminal.progress import ProgressDisplay
 
@@ -57,7 +56,7 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     if arguments.draft_map is not None:
         _draft(arguments.path, arguments.draft_map, errors)
     if arguments.json:
-        say(console, json.dumps(found.as_dict(), indent=2, allow_nan=False, ensure_ascii=False))
+        say_json(console, found.as_dict())
     else:
         _tell(found, console)
     if arguments.figure is not None:

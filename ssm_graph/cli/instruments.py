@@ -10,7 +10,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from ssm_graph.cli.terminal import say
+from ssm_graph.cli.terminal import say, say_json
 from ssm_graph.io.instruments.library import KEY, Preset, asked_for, preset, presets
 
 DESCRIPTION = f"""\
@@ -40,7 +40,7 @@ def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
     if arguments.name is not None:
         found = (preset(None, arguments.name, place="NAME"),)
     if arguments.json:
-        say(console, json.dumps([_as_dict(one) for one in found], indent=2, ensure_ascii=False))
+        say_json(console, [_as_dict(one) for one in found])
     elif arguments.name is None:
         _list(found, console)
     else:

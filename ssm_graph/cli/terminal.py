@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import signal
 import threading
@@ -86,6 +87,11 @@ def silent() -> Console:
 def say(console: Console, text: str) -> None:
     """Print a text as it is, whatever it holds and however long it is."""
     console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def say_json(console: Console, value: Any) -> None:
+    """Print a value as JSON that stays so: nothing of it is left for the console to escape."""
+    say(console, json.dumps(value, indent=2, allow_nan=False).replace("\x7f", "\\u007f"))
 
 
 def occupy_closed_streams() -> None:

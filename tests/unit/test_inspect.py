@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import warnings
 from dataclasses import replace
@@ -13,6 +14,7 @@ import pytest
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.cli.main import main
+from ssm_graph.cli.terminal import console_on, say_json
 from ssm_graph.inspection.look import inspect_mission, inspect_path
 from ssm_graph.inspection.picture import save_picture
 from ssm_graph.inspection.timing import timing_of
@@ -47,18 +49,26 @@ def test_a_mission_folder_can_be_smoothed(
     mission: Mission, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Rates, gravity and beams are those of the simulation; the picture and JSON say the same."""
-    folder = tmp_path / "demo"
+    folder = tmp_path / "d\u00e9mo 9.41\u202fAM"
     write_mission(folder, mission)
     picture = tmp_path / "inspect.png"
     assert main(["inspect", str(folder), "--json", "--figure", str(picture)]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["verdict"] == "can be smoothed"
+    assert told["path"] == str(folder)
     rates = {one["name"]: round(one["rate_hz"]) for one in told["sensors"]}
     assert rates == {"IMU": 100, "DVL": 1, "depth": 2, "GNSS": 1}
     assert "specific force 9.8" in told["sensors"][0]["facts"][0]
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert main(["inspect", str(folder)]) == 0
     assert "verdict: can be smoothed" in capsys.readouterr().out
+
+
+def test_json_stays_json() -> None:
+    """Whatever a name holds that the console would escape."""
+    stream, name = io.StringIO(), "a\u202fb\x7f\x1b[2J\u200f\n"
+    say_json(console_on(stream), name)
+    assert json.loads(stream.getvalue()) == name
 
 
 def test_what_is_missing_is_said(mission: Mission) -> None:
