@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from typing import Any, TypeVar
 
 from benchmarks.report import note
+from ssm_graph.base.errors import SsmGraphError
+from ssm_graph.study.ledger import ERROR, Key, Row
 
 T = TypeVar("T")
 
@@ -15,6 +17,17 @@ T = TypeVar("T")
 def tell(number: int, of: int, what: object) -> None:
     """Say that one of many is done."""
     note(f"{number} of {of}: {what} done")
+
+
+def all_done(rows: Mapping[Key, Row]) -> Mapping[Key, Row]:
+    """Return rows of which a page is made; raise :class:`SsmGraphError` for one that has none."""
+    for key, row in rows.items():
+        if ERROR in row:
+            raise SsmGraphError(
+                f"trial {key}: expected a row, got an error: {row[ERROR]}; its line of the ledger "
+                "stays until the code is another, or is taken out"
+            )
+    return rows
 
 
 def side_by_side(

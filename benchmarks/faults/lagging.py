@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from benchmarks.faults.case import Stage, stage_config
-from benchmarks.processes import tell
+from benchmarks.processes import all_done, tell
 from benchmarks.report import Option, Report, table
 from ssm_graph.base.code_version import code_version
 from ssm_graph.simulation import simulate
@@ -76,7 +76,7 @@ def main() -> None:
         (lag, by_s, k, seed) for seed in seeds for lag, by_s in cases for k in (0, 1)
     ]
     ledger = Ledger(a.out / f"{code_version()}.jsonl", {"benchmark": "faults.lagging"})
-    found = run_trials(one_run, keys, ledger, n_jobs=a.jobs, on_progress=tell)
+    found = all_done(run_trials(one_run, keys, ledger, n_jobs=a.jobs, on_progress=tell))
     rows = []
     for case in cases:
         of = [found[key] for key in keys if key[:2] == case]

@@ -8,7 +8,7 @@ version, and the same command goes on. Exit code 1 if a row fails.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from benchmarks.faults.case import (
@@ -35,7 +35,7 @@ from benchmarks.processes import tell
 from benchmarks.report import Option, Report, table
 from ssm_graph.base.code_version import code_version
 from ssm_graph.mission.navigation import Health
-from ssm_graph.study.ledger import Key, Ledger, run_trials
+from ssm_graph.study.ledger import ERROR, Key, Ledger, run_trials
 
 PROCESS = """\
 Kills and disks: `ssm-graph online` replays 40 s as fast as it goes, a checkpoint every 3 s; the
@@ -63,6 +63,13 @@ def run_row(key: Key) -> dict[str, Any]:
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
         return judge(case, run_case(case))._asdict()
+
+
+def row_of(key: Key, made: Mapping[str, Any]) -> Row:
+    """Return the row that a trial came to; one that raised fails, by the first rule."""
+    if ERROR in made:
+        return Row((str(key[0]), *("–",) * (len(HEADER) - 2)), (f"raised: {made[ERROR]}",))
+    return Row(tuple(made["cells"]), tuple(made["faults"]))
 
 
 def summary(data: Sequence[Row], process: Sequence[Row]) -> str:
@@ -104,7 +111,7 @@ def main() -> int:
     ledger = Ledger(report.args.out / f"{code_version()}.jsonl", {"benchmark": "faults.run"})
     keys: list[Key] = [(name,) for name in (*of_data, *of_process)]
     found = run_trials(run_row, keys, ledger, n_jobs=report.args.jobs, on_progress=tell)
-    rows = [Row(tuple(found[key]["cells"]), tuple(found[key]["faults"])) for key in keys]
+    rows = [row_of(key, found[key]) for key in keys]
     report.write(lines_of(rows[: len(of_data)], rows[len(of_data) :]))
     return 0 if all(row.has_passed for row in rows) else 1
 

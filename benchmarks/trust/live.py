@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.online.stream import run_stream
-from benchmarks.processes import tell
+from benchmarks.processes import all_done, tell
 from benchmarks.report import Option, Report, number_text, table
 from benchmarks.soak.stream import GOOD, errors_of, longest_run
 from benchmarks.trust.lies import LIVE
@@ -198,7 +198,7 @@ def main() -> None:
     kinds |= {CLEAN: (False, args.clean_s), REALISTIC: (True, args.clean_s)}
     keys: list[Key] = [(*cell, seed, *kinds[cell[0]]) for cell in cells for seed in seeds]
     ledger = Ledger(args.out / f"{code_version()}.jsonl", {"benchmark": "trust.live"})
-    made = run_trials(run, keys, ledger, n_jobs=args.jobs, on_progress=tell)
+    made = all_done(run_trials(run, keys, ledger, n_jobs=args.jobs, on_progress=tell))
     runs = [Run(**made[key]) for key in keys]
     rows: dict[bool, list[list[str]]] = {True: [], False: []}
     for i, (label, grade) in enumerate(cells):

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.processes import tell
+from benchmarks.processes import all_done, tell
 from benchmarks.report import Option, Report, number_text, table
 from benchmarks.trust.lies import LIES
 from ssm_graph import Estimate, SsmGraphError, evaluate, smooth
@@ -223,7 +223,7 @@ def main() -> None:
     cells = [(label, grade) for label in labels for grade in args.grades.split(",")]
     cases: list[Key] = [(*cell, seed, args.realistic) for cell in cells for seed in seeds]
     ledger = Ledger(args.out / f"{code_version()}.jsonl", {"benchmark": "trust.run"})
-    made = run_trials(run, cases, ledger, n_jobs=args.jobs, on_progress=tell)
+    made = all_done(run_trials(run, cases, ledger, n_jobs=args.jobs, on_progress=tell))
     runs = [Run(**made[key]) for key in cases]
     rows = [
         line(*cell, runs[i * len(seeds) : (i + 1) * len(seeds)]) for i, cell in enumerate(cells)
