@@ -9,13 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.errors import ConfigError, SsmGraphError
 from ssm_graph.base.tables import Order
+from ssm_graph.imu.preintegration import GAP_GYRO_RATE
 from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle, vehicle_of, write_vehicle
 from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator.buffers import Buffers
+from ssm_graph.live.estimator.keyframes import KeyframeMaker
 from ssm_graph.mission.mission import LocalStart, Mission
+from ssm_graph.mission.problem import ProblemConfig
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.current import CurrentModel
 from ssm_graph.sensors.depth import DepthReading
@@ -175,6 +179,23 @@ def test_live_pings_count_with_the_sigma_of_what_they_are_off() -> None:
     np.testing.assert_array_equal(
         buffers.pings.all[:, buffers.sigmas], [[0.01] * 4, [0.08] * 4, [0.5, 0.08, 0.5, 0.5]]
     )
+
+
+@pytest.mark.parametrize("gap_s", [0.0, 0.2])
+def test_where_many_samples_are_missing_turns_are_unseen(gap_s: float) -> None:
+    """By the longest step, and whether or not there is a gap before; a fifth may be missing."""
+    turn = {}
+    for every in (1, 5, 3):
+        buffers = Buffers(vehicle_of(make_mission()))
+        for k in range(1, 500):
+            is_there = k <= 300 or (k % every == 0 if every == 3 else k % every > 0 or every == 1)
+            if is_there and not 3.98 - gap_s < 0.01 * k < 3.98:
+                buffers.add(ImuSample(0.01 * k, (0.0,) * 3, (0.0, 0.0, -9.8)))
+                assert buffers.period_s > 0.0
+        maker = KeyframeMaker(buffers, LocalFrame(0.1, 0.1, 0.0), ProblemConfig(), begin_s=0.0)
+        turn[every] = float(np.sqrt(maker.inertial(4.0, 4.5).covariance[0, 0, 0]))
+    assert turn[5] == pytest.approx(turn[1], rel=0.01)
+    assert turn[3] == pytest.approx(0.02 * GAP_GYRO_RATE, rel=0.01)
 
 
 def test_messages_come_in_order_of_time() -> None:

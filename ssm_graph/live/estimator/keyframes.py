@@ -129,12 +129,16 @@ class KeyframeMaker:
     def _unseen_s(self, imu: ImuLog, begin_s: float, end_s: float) -> float:
         """Return how long of the steps nothing is seen of where many samples are missing, s.
 
-        Long steps are gaps, which are bridged.
+        Long steps are gaps, which are bridged; where a longer part of one is in the span, that is
+        what is unseen of it.
         """
-        missing, longest_s = self._buffers.missing(begin_s, end_s)
-        if missing <= MOST_MISSING or len(imu_gaps(imu)[0]) > 0:
+        if self._buffers.missing(begin_s, end_s)[0] <= MOST_MISSING:
             return 0.0
-        return longest_s - self._buffers.shortest_period_s
+        edges = np.concatenate([[imu.start_s], imu.time_s])
+        inside_s = np.minimum(edges[1:], end_s) - np.maximum(edges[:-1], begin_s)
+        is_gap = np.isin(edges[:-1], imu_gaps(imu)[0])
+        gap_s, step_s = (np.max(inside_s[x], initial=0.0) for x in (is_gap, ~is_gap))
+        return 0.0 if gap_s > step_s else float(step_s) - self._buffers.shortest_period_s
 
     def _beams(self, pings: Array, gyro_b: Array) -> Beams:
         speed, sigma = pings[:, self._buffers.speeds], pings[:, self._buffers.sigmas]
