@@ -536,6 +536,16 @@ def test_dates_that_are_missing_are_none() -> None:
     np.testing.assert_array_equal(found, [UNIX, np.nan])
 
 
+@pytest.mark.parametrize("cell", ["10:61:00", "25:00:00", "10:00:75"])
+def test_a_time_that_no_day_has_is_refused(cell: str) -> None:
+    """Rather than counted on into the next hour; a leap second is one."""
+    asked = Times("map time", ("t",), ("iso",), 0.0)
+    found = times(asked, Source("a.csv", {"t": ["09:05:59.5", "23:59:60"]}))
+    np.testing.assert_array_equal(found, [32759.5, 86400.0])
+    with pytest.raises(DataError, match="expected a time like"):
+        times(asked, Source("a.csv", {"t": ["10:00:00", cell]}))
+
+
 def test_files_that_only_say_that_they_are_tables(tmp_path: Path) -> None:
     """A quotation mark that is never closed; a matrix of a terabyte that was never written."""
     path = tmp_path / "a.csv"

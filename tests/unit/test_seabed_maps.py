@@ -199,6 +199,23 @@ def test_land_and_water_need_a_word(tmp_path: Path) -> None:
     assert grid.height[0, 5] == -3.0
 
 
+def test_what_stands_for_no_reading_is_no_height(tmp_path: Path) -> None:
+    """Neither turns it heights into depths by its sign, nor do triangles lead up to it."""
+    path = tmp_path / "m.nc"
+    write_turned(path)
+    with netcdf_file(path, "a") as file:
+        file.variables["depth"][0, 0, :5] = 99999.0
+    assert np.nanmax(read_seabed(path, FRAME).height) < 0.0
+    rng = np.random.default_rng(2)
+    soundings = np.column_stack([rng.uniform(0.0, 100.0, (400, 2)), rng.uniform(29.0, 31.0, 400)])
+    soundings[:40, 2] = 9999.0
+    path = tmp_path / "m.xyz"
+    np.savetxt(path, soundings)
+    height = read_seabed(path, FRAME, crs="local").height
+    assert np.nanmin(height) >= -31.0
+    assert np.nanmax(height) <= -29.0
+
+
 def test_what_no_map_is(tmp_path: Path) -> None:
     """Each with file, place and what to try."""
     path = tmp_path / "m.asc"

@@ -43,7 +43,7 @@ from ssm_graph.sensors.imu import interval_ends
 from ssm_graph.sensors.instrument import Instrument, read_columns
 from ssm_graph.sensors.registry import BY_LOG, BY_SECTION
 
-_OF_DAY: Final = re.compile(r"(\d{1,2}):(\d{2}):(\d{2}(?:[.,]\d*)?)")
+_OF_DAY: Final = re.compile(r"([01]?\d|2[0-3]):([0-5]\d):((?:[0-5]\d|60)(?:[.,]\d*)?)")
 
 
 def convert_columns(

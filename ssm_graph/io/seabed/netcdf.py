@@ -10,7 +10,7 @@ import numpy as np
 
 from ssm_graph.base.errors import DataError, MissingExtraError
 from ssm_graph.base.frozen import Array
-from ssm_graph.io.seabed.raster import GEOGRAPHIC, Raster
+from ssm_graph.io.seabed.raster import GEOGRAPHIC, Raster, known
 
 _X: Final = ("lon", "longitude", "x", "easting")
 _Y: Final = ("lat", "latitude", "y", "northing")
@@ -58,7 +58,8 @@ def read_netcdf(path: Path) -> Raster:
     if positive in ("up", "down"):
         is_down: bool | None = positive == "down"
     elif z.lower() in _DOWN:
-        is_down = not np.all(values[np.isfinite(values)] < 0.0)  # heights by the name of depths
+        heights = known(values)
+        is_down = not np.all(heights[np.isfinite(heights)] < 0.0)  # by the name of depths
     else:
         is_down = None if z.lower() in _EITHER else False
     crs = GEOGRAPHIC if x.lower() in _X[:2] else ""

@@ -26,10 +26,20 @@ MOST_CELLS: Final = 6_000_000
 """Of a map about a mission; a larger one is cut, or made coarser."""
 FARTHEST_M: Final = 30_000.0
 """From the origin of a frame; what lies beyond is left out."""
+DEEPEST_M: Final = 12_000.0
+"""No place on Earth is so far from the sea's surface: 1e35, 99999 and -32768 stand for none."""
+NO_DATA: Final = (-9999.0, 9999.0)
+"""So do these, whole and to the digit."""
 _TRY: Final = (
     "expected local, EPSG:4326 (degrees) or a UTM zone as EPSG:326zz, EPSG:327zz or EPSG:258zz; "
     "convert other maps, for example with  gdalwarp -t_srs EPSG:4326"
 )
+
+
+def known(values: Array) -> Array:
+    """Return heights, m, with NaN for what stands for none, whether its file says so or not."""
+    none = (np.abs(values) > DEEPEST_M) | np.isin(values, NO_DATA)
+    return np.where(none, np.nan, values)
 
 
 @dataclass(frozen=True, slots=True)

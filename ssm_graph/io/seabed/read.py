@@ -14,14 +14,18 @@ from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.io.seabed.geotiff import read_geotiff
 from ssm_graph.io.seabed.netcdf import read_netcdf
-from ssm_graph.io.seabed.raster import GEOGRAPHIC, Plane, Raster, frame_of, grid_of, plane_of
+from ssm_graph.io.seabed.raster import (
+    GEOGRAPHIC,
+    Plane,
+    Raster,
+    frame_of,
+    grid_of,
+    known,
+    plane_of,
+)
 from ssm_graph.io.seabed.text import read_ascii_grid, read_xyz
 from ssm_graph.sensors.seabed import SeabedGrid
 
-DEEPEST_M: Final = 12_000.0
-"""No place on Earth is so far from the sea's surface: 1e35, 99999 and -32768 stand for none."""
-NO_DATA: Final = (-9999.0, 9999.0)
-"""So do these, whole and to the digit."""
 _BOTH_SIGNS: Final = 0.01
 """Share of the values beyond which those of the other sign are no tidal flats' edge."""
 
@@ -69,7 +73,8 @@ def read_seabed(
     datum_m : height of its zero above the ellipsoid, m.
     sigma : a map of the same raster with standard deviations, m.
     """
-    raster = _known(read_raster(path))
+    raster = read_raster(path)
+    raster = replace(raster, values=known(raster.values))
     if not np.isfinite(raster.values).any():
         raise DataError(f"{path.name}: no cell has a height; is the no-data value right?")
     if sigma is not None:
@@ -105,17 +110,11 @@ def read_seabed(
     )
 
 
-def _known(raster: Raster) -> Raster:
-    """Return a raster without what stands for no data, whether its file says so or not."""
-    none = (np.abs(raster.values) > DEEPEST_M) | np.isin(raster.values, NO_DATA)
-    return replace(raster, values=np.where(none, np.nan, raster.values)) if none.any() else raster
-
-
 def _is_down(raster: Raster) -> bool:
     """Whether values are depths, by their sign; raise :class:`ConfigError` where they have both."""
-    known = raster.values[np.isfinite(raster.values)]
-    positive = float(np.mean(known > 0.0))
-    if min(positive, float(np.mean(known < 0.0))) > _BOTH_SIGNS:
+    heights = raster.values[np.isfinite(raster.values)]
+    positive = float(np.mean(heights > 0.0))
+    if min(positive, float(np.mean(heights < 0.0))) > _BOTH_SIGNS:
         raise ConfigError(
             f"{raster.name}: {100.0 * positive:.0f} % of the values are above zero and others "
             'below, and the file does not say which way they count; give values = "heights" or '

@@ -10,7 +10,7 @@ import numpy as np
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
-from ssm_graph.io.seabed.raster import Raster
+from ssm_graph.io.seabed.raster import Raster, known
 from ssm_graph.sensors.seabed import SeabedGrid
 
 _HEADER: Final = ("ncols", "nrows", "xllcorner", "xllcenter", "yllcorner", "yllcenter", "cellsize")
@@ -155,8 +155,8 @@ def _is_number(word: str) -> bool:
 def _columns(words: list[str], path: Path, line: int) -> dict[str, int]:
     lowered = [word.lower() for word in words]
     found = {}
-    for name, known in _NAMES.items():
-        at = [i for i, word in enumerate(lowered) if word in known]
+    for name, usual in _NAMES.items():
+        at = [i for i, word in enumerate(lowered) if word in usual]
         if at:
             found[name] = at[0]
     for name in ("x", "y", "z"):
@@ -207,6 +207,11 @@ def _triangulated(name: str, x: Array, y: Array, z: Array, sigma: Array | None) 
     from scipy.interpolate import LinearNDInterpolator
     from scipy.spatial import Delaunay, QhullError, cKDTree
 
+    there = np.isfinite(known(z))  # between one that is none and a sounding lies nothing
+    if there.sum() < 3:
+        raise DataError(f"{name}: expected soundings with heights, got {there.sum()} of {len(z)}")
+    x, y, z = x[there], y[there], z[there]
+    sigma = None if sigma is None else sigma[there]
     on_line = DataError(f"{name}: expected soundings over an area, got them on a line")
     cell = float(np.sqrt(np.ptp(x) * np.ptp(y) / len(x)))
     if not cell > 0.0:

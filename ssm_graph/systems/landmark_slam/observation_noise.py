@@ -17,10 +17,11 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.kernels import TruncatedKernel
 from ssm_graph.base import chi2
 from ssm_graph.base.frozen import Array
 from ssm_graph.evaluation.statistics import Interval
-from ssm_graph.systems.landmark_slam.noise import SigmaFound
+from ssm_graph.systems.landmark_slam.noise import GATE, SigmaFound
 from ssm_graph.systems.landmark_slam.problem import SlamEstimate, SlamNoise, SlamProblem
 from ssm_graph.systems.landmark_slam.smoother import (
     Pass,
@@ -29,10 +30,13 @@ from ssm_graph.systems.landmark_slam.smoother import (
     one_pass,
     smooth_landmarks,
 )
+from ssm_graph.systems.landmark_slam.weights import square_share, weights_of
 
 ROUNDS: Final = 4
-"""At most. More of them let the white noise of the motion take what the bearings miss: on MRCLAM,
-6 robot 1 and 7 robot 4, their sigma goes on to shrink, past its true one, and nothing improves."""
+"""At most. White noise has settled by then; where errors are alike more rounds let the white noise
+of the motion take what the bearings miss: on MRCLAM, 6 robot 1 and 7 robot 4, their sigma goes on
+to shrink, past that of their errors against the truth, and nothing improves. Chosen on these two,
+with their truth."""
 SETTLED_LOG: Final = 0.02
 """Change of the logarithm of any sigma at which they are settled."""
 LAW_ROUNDS: Final = 200
@@ -42,9 +46,12 @@ FEWEST: Final = 30
 SUCCESSIVE_S: Final = 1.0
 """Sightings of a landmark nearer than this in time are successive."""
 MOST_ALIKE: Final = 0.9
-"""Correlation; more would leave next to nothing of a log (sigmas 4.4 times as large)."""
-NO_OUTLIER: Final = 0.3
-"""Weight of what counts."""
+"""Correlation; more would leave next to nothing of a log (sigmas 4.4 times as large). A choice: the
+ranges of every robot of MRCLAM that was looked at reach it, so that there it sets their sigma."""
+GATINGS: Final = 6
+"""Of what a pass found, each by the sigmas that the one before asks for: from a third of normal
+noise to 1 percent of it."""
+_GATED: Final = TruncatedKernel(GATE)
 FAR: Final = 3.0
 """Sigmas to which residuals are cut where their correlation is taken."""
 
@@ -141,18 +148,25 @@ def _law(
     before: _Law | None,
 ) -> _Law:
     """Return what the expected squares of a pass ask for; ``used`` (M, 2) sigmas whitened it."""
-    counts = (found.weights > NO_OUTLIER)[:, None] & there
-    squares, w = found.expected.own * used**2, found.weights
+    squares, n_rows = found.expected.own * used**2, found.rows.n_rows
     mean: list[float] = used.mean(axis=0).tolist()
-    near, share, bearing = (mean[0], 0.0, mean[1]) if before is None else before[:3]
-    if counts[:, 0].sum() >= FEWEST:
-        at = counts[:, 0]
-        near, share = _growing(squares[at, 0], ranges[at], w[at])
-    if counts[:, 1].sum() >= FEWEST:
-        at = counts[:, 1]
-        bearing = float(np.sqrt(np.average(squares[at, 1], weights=w[at])))
-    law = _Law(near, share, bearing, np.zeros(2))
-    z = np.clip(found.rows.own_error * used / law.sigmas(ranges), -FAR, FAR)
+    law = before or _Law(mean[0], 0.0, mean[1], np.zeros(2))
+    share = np.array([1.0, *(square_share(_GATED, dim) for dim in (1, 2))])[n_rows.astype(int)]
+    own = law.sigmas(ranges) if before else used
+    for _ in range(GATINGS):
+        # By what one observation alone may miss. A soft weight would make white noise too small.
+        w = weights_of(_GATED, np.where(there, squares / own**2, 0.0).sum(axis=1), n_rows)
+        counts = (w > 0.0)[:, None] & there
+        near, part, bearing = law[:3]
+        if counts[:, 0].sum() >= FEWEST:
+            at = counts[:, 0]
+            near, part = _growing(squares[at, 0] / share[at], ranges[at], w[at])
+        if counts[:, 1].sum() >= FEWEST:
+            at = counts[:, 1]
+            bearing = float(np.sqrt(np.average(squares[at, 1] / share[at], weights=w[at])))
+        law = _Law(near, part, bearing, np.zeros(2))
+        own = law.sigmas(ranges)
+    z = np.clip(found.rows.own_error * used / own, -FAR, FAR)
     alike = np.zeros(2)
     for i in range(2):
         a, b = (side[there[pairs[0], i] & there[pairs[1], i]] for side in pairs)
@@ -191,7 +205,8 @@ def _told(
         if n < FEWEST:
             notes.append(f"{n} observations of {label}: too few to learn from, noise as stated")
             continue
-        dof = max(n * (1.0 - law.alike[i]) / (1.0 + law.alike[i]), 1.0)
+        alike = law.alike[i] ** 2  # of squares
+        dof = max(n * (1.0 - alike) / (1.0 + alike), 1.0)
         low, high = np.sqrt(dof / chi2.ppf([0.975, 0.025], dof)) * own[i]
         stated = float(np.median(given[there[:, i], i]))
         sigmas.append(SigmaFound(label, stated, Interval(float(own[i]), float(low), float(high))))

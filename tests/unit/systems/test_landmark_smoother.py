@@ -227,12 +227,23 @@ def test_a_range_that_grows_and_repeats_itself_is_found() -> None:
     of_range, bearing = found.sigmas
     middle = np.median(seen[:, 0])
     assert of_range.found.value == pytest.approx(np.hypot(0.03, 0.05 * middle), rel=0.15)
-    assert bearing.found.value == pytest.approx(0.01, rel=0.15)
+    assert bearing.found.value == pytest.approx(0.01, rel=0.1)  # 1 / sqrt(2 n) is 3.5 percent
     used = found.estimate.noise.observation[0] * found.problem.scales[:, 0]
     far, near = used[seen[:, 0] > 6.0].mean(), used[seen[:, 0] < 2.5].mean()
     assert far > 1.8 * near
-    assert used / sigma == pytest.approx(np.sqrt(1.7 / 0.3), rel=0.3)
+    ratio = (used / sigma)[seen[:, 0] > 2.0]  # the part of no distance, from few, is hardly known
+    assert ratio == pytest.approx(np.sqrt(1.7 / 0.3), rel=0.2)
     assert "successive errors of ranges" in found.notes[0]
+
+
+def test_white_noise_of_three_times_the_stated_size_comes_back() -> None:
+    """Within 5 percent: soft weights alone would leave it 12 percent too small."""
+    stated = SlamNoise(FINE.control, NOISE.observation / 3.0)
+    problem, true = small(np.random.default_rng(5), n_poses=200, noise=FINE)
+    found = learn_observations(problem, stated, true)
+    seen = range_bearing(true.pose[problem.keyframe], true.landmarks[problem.landmark])
+    drawn = np.sqrt(np.mean(np.square(problem.measured - seen), axis=0))
+    assert [one.found.value for one in found.sigmas] == pytest.approx(drawn, rel=0.05)
 
 
 def test_too_few_observations_teach_nothing() -> None:
