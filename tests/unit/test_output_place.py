@@ -96,7 +96,7 @@ def test_out_is_looked_at_before_the_work(
         raise AssertionError("the work was begun")
 
     monkeypatch.setattr(batch, "read_mission", read)
-    monkeypatch.setattr("ssm_graph.cli.compare.run_study", read)
+    monkeypatch.setattr("ssm_graph.cli.compare_run.run_study", read)
     (tmp_path / "file").write_text("mine")
     for out, said in (
         (tmp_path / "file", "expected a folder, got the file"),

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.progress import teller
 from ssm_graph.io.recording import running_sums
 
 _HEADER: Final = b"\x7f\x7f"
@@ -80,9 +81,10 @@ class Found:
 def find_ensembles(data: bytes) -> Found:
     """Return the ensembles of a recording in order; NMEA and anything else between is skipped."""
     found: list[Ensemble] = []
-    sums = running_sums(data)
+    sums, tell = running_sums(data), teller(len(data))
     n_damaged, used, at = 0, 0, data.find(_HEADER)
     while at >= 0:
+        tell(at)
         size = _sound_size(data, at, sums)
         ensemble = _ensemble(memoryview(data)[at : at + size]) if size else None
         if ensemble is not None:
