@@ -43,10 +43,6 @@ misalignment_sigma_deg = 0.5
 
 [gnss]
 lever_arm_m = [-0.3, 0.0, -0.6]
-
-[depth]
-sigma_m = 0.05
-lever_arm_m = [0.0, 0.0, 0.0]
 """
 """Of the tables: what no column says. The page on tables shows it."""
 

@@ -192,7 +192,13 @@ def _turned(message: Message) -> Message:
 def _write_tables(recorded: Recorded, out: Path, console: Console) -> bool:
     written = write_tables(out, recorded.messages)
     rows = ", ".join(f"{name} with {count} rows" for name, count in written.items())
-    say(console, f"{out}: {rows}; imu.csv and mission.toml beside them make a mission")
+    is_whole = "imu.csv" in written and "dvl.csv" in written
+    lacking = (
+        "mission.toml beside them makes"
+        if is_whole
+        else "imu.csv and mission.toml beside them make"
+    )
+    say(console, f"{out}: {rows}; {lacking} a mission")
     _say_notes(recorded.notes, console)
     return True
 

@@ -16,6 +16,7 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.cli.main import main
 from ssm_graph.io.teledyne.ensembles import find_ensembles, is_pd0
 from ssm_graph.io.teledyne.pd0 import read_pd0
+from ssm_graph.live.recorded.log import read_recorded
 from ssm_graph.sensors.compass import HeadingReading
 from ssm_graph.sensors.dvl import Ping
 
@@ -183,9 +184,6 @@ def test_instruments_that_are_set_otherwise(tmp_path: Path) -> None:
     cases = {
         "the angle of the beams is not told": no_angle,
         "the instrument's clock is not set": [undated],
-        "without a single speed along a beam": [
-            changed(one, 2, 24, *[-32768] * 4, kind="h") for one in sound
-        ],
         "3 beams in earth coordinates": [
             changed(ensemble(1, np.full(4, 0.1), coordinates=3), 0, 8, 3)
         ],
@@ -194,6 +192,16 @@ def test_instruments_that_are_set_otherwise(tmp_path: Path) -> None:
     for cause, ensembles in cases.items():
         with pytest.raises(DataError, match=re.escape(cause)):
             read_pd0(written(tmp_path, *ensembles))
+
+
+def test_a_recording_that_never_saw_the_bottom_is_none(tmp_path: Path) -> None:
+    """Of any maker: tables without a single speed would only be refused later."""
+    blind = [changed(ensemble(k, np.ones(4)), 2, 24, *[-32768] * 4, kind="h") for k in range(4)]
+    with pytest.raises(DataError, match="4 pings and not one speed along a beam"):
+        read_recorded(written(tmp_path, *blind))
+    restored = [ensemble(k, np.array([0.1, 0.2, 0.3, np.nan]), coordinates=1) for k in range(4)]
+    with pytest.raises(DataError, match="made of three beams"):
+        read_recorded(written(tmp_path, *restored))
 
 
 def test_every_truncation_and_any_damage_leaves_the_sound_ensembles(tmp_path: Path) -> None:

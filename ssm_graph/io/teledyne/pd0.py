@@ -56,12 +56,6 @@ def read_pd0(path: Path) -> Recording:
         )
     pings, n_without, n_repeats = _pings(path, setup, with_bottom)
     known = sum(bool(np.isfinite(ping.speed).any()) for ping in pings)
-    if not known:
-        why = "made of three beams, cannot be restored" if n_without else "the bottom was not seen"
-        raise DataError(
-            f"{path}: {len(with_bottom)} pings without a single speed along a beam: {why}; "
-            "expected bottom track within its range, best in beam coordinates (command EX00xxx)"
-        )
     about = (
         f"Teledyne PD0, {len(down)} ensembles, {setup.coordinates} coordinates, bottom track in "
         f"{100.0 * known / (len(down) - n_repeats):.0f} %"

@@ -48,7 +48,8 @@ def is_pd45(head: bytes) -> bool:
 
 def is_pd6(head: bytes) -> bool:
     """Return whether the first bytes of a file hold sentences of PD6."""
-    return len({match[1] for match in _SENTENCE.finditer(head)} & {b"TS", b"BI"}) == 2
+    kinds = {match[1] for match in _SENTENCE.finditer(head)}
+    return b"TS" in kinds and len(kinds) > 1
 
 
 def read_pd45(path: Path) -> Recording:

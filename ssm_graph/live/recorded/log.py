@@ -43,7 +43,7 @@ from ssm_graph.live.protocols.nmea_fields import (
 )
 from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
 from ssm_graph.live.recorded.water_linked_table import SIGN, rows_of
-from ssm_graph.sensors.dvl import DvlMount, empty_dvl
+from ssm_graph.sensors.dvl import DvlMount, Ping, empty_dvl
 from ssm_graph.sensors.messages import Message
 from ssm_graph.sensors.registry import BY_MESSAGE
 
@@ -101,6 +101,12 @@ def read_recorded(log: Path, options: NmeaOptions | None = None) -> Recorded | N
         return None
     if not found.messages:
         raise DataError(f"{log}: not one report that is read; {'; '.join(found.notes) or 'empty'}")
+    pings = [message for message in found.messages if isinstance(message, Ping)]
+    if pings and not any(math.isfinite(speed) for ping in pings for speed in ping.speed):
+        raise DataError(
+            f"{log}: {len(pings)} pings and not one speed along a beam; expected bottom track "
+            f"within its range; {'; '.join(found.notes)}"
+        )
     return _in_order(log, found)
 
 
