@@ -33,7 +33,7 @@ from benchmarks.faults.case import (
     undisturbed_stream,
 )
 from benchmarks.faults.transforms import untouched
-from ssm_graph.cli.online import engine_of
+from ssm_graph.cli.online_run import engine_of
 from ssm_graph.io.raw_log.log import replay
 from ssm_graph.live.estimator import ONLINE
 from ssm_graph.live.protocols.json_messages import JsonDecoder, encode_message

@@ -15,7 +15,7 @@ from benchmarks.online.stream import HEALTHS, NOT_SCORED, Accuracy, accuracy, rs
 from benchmarks.online.theirs import TheirConfig, run_theirs
 from benchmarks.report import rms
 from ssm_graph.base.frozen import Array
-from ssm_graph.cli.online import pass_over_imports
+from ssm_graph.cli.online_run import pass_over_imports
 from ssm_graph.evaluation.errors import error_series, withhold_gnss
 from ssm_graph.io.blueye.convert import convert_blueye
 from ssm_graph.io.mission_folder.vehicle import vehicle_of

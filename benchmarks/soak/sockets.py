@@ -25,7 +25,7 @@ from benchmarks.faults.case import INSIDE, WORSE, Stage, stage_config
 from benchmarks.faults.sockets import EPOCH_S, Dvl, report
 from benchmarks.report import Option, Report, note, table
 from benchmarks.soak.storms import STORMS, TICK_S, Place, Shore
-from ssm_graph.cli.online import engine_of
+from ssm_graph.cli.online_run import engine_of
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator import ONLINE

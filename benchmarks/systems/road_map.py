@@ -11,8 +11,8 @@ from pathlib import Path
 
 from benchmarks.report import ROOT, Option, Report, note, table
 from ssm_graph.study.ledger import Ledger, run_trials
+from ssm_graph.systems.road_map.cases import CASES
 from ssm_graph.systems.road_map.study import (
-    CASES,
     FIRST_HELD_OUT,
     HEADER,
     keys_of,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import csv
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -13,11 +13,11 @@ from rich.console import Console
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.cli.options import number_option
-from ssm_graph.io.export.track import Track, parse_epoch, track_of
 from ssm_graph.io.file_kind import check_is_file
-from ssm_graph.io.results.tables import read_results
-from ssm_graph.mission.posterior import Posterior
-from ssm_graph.report.terminal.progress import ProgressDisplay
+
+if TYPE_CHECKING:
+    from ssm_graph.io.export.track import Track
+    from ssm_graph.mission.posterior import Posterior
 
 ABOUT = """\
 Answers are at the keyframes and of the inertial unit, unless asked for at the times of a file
@@ -80,6 +80,10 @@ def asked_track(arguments: argparse.Namespace, result: Path, errors: Console) ->
     does not have, or inertial data that are not those of the result; :class:`DataError` for times
     that cannot be read or lie outside.
     """
+    from ssm_graph.io.export.track import parse_epoch, track_of
+    from ssm_graph.io.results.tables import read_results
+    from ssm_graph.report.terminal.progress import ProgressDisplay
+
     if not asks(arguments):
         epoch_s = None if arguments.epoch is None else parse_epoch(arguments.epoch)
         return Asked(track_of(read_results(result), epoch_s=epoch_s), "", ())
@@ -137,6 +141,8 @@ def read_times(path: Path, epoch_s: float | None) -> Array:
 
     Raises :class:`DataError` naming the line.
     """
+    from ssm_graph.io.export.track import parse_epoch
+
     check_is_file(path)
     try:
         rows = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))

@@ -13,8 +13,6 @@ from ssm_graph.cli.answers import add_answer_arguments, asked_track
 from ssm_graph.cli.terminal import say
 from ssm_graph.io.export.formats import FORMATS, export_track
 from ssm_graph.io.results.place import check_output_file
-from ssm_graph.io.results.tables import read_results
-from ssm_graph.report.terminal.progress import ProgressDisplay
 
 DESCRIPTION = f"""\
 Write the trajectory of a result folder in other formats:
@@ -83,6 +81,9 @@ def export(
     is_file: bool = False,
 ) -> None:
     """Write the track that was asked for in formats; ``out`` may be a file where there is one."""
+    from ssm_graph.io.results.tables import read_results
+    from ssm_graph.report.terminal.progress import ProgressDisplay
+
     asked = asked_track(arguments, result, errors)
     for note in asked.notes:
         say(console, note)

@@ -3,25 +3,27 @@
 from __future__ import annotations
 
 import argparse
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from rich.console import Console
 
 from ssm_graph.base.errors import ConfigError
-from ssm_graph.cli.options import method_lines
+from ssm_graph.base.usual import FILTER
 from ssm_graph.cli.run_mission import add_mission_arguments, run_mission
-from ssm_graph.mission.estimate import Estimate
-from ssm_graph.mission.mission import Mission
-from ssm_graph.mission.problem import ProblemConfig
-from ssm_graph.report.terminal.progress import ProgressDisplay
-from ssm_graph.study.methods import DEFAULT_FILTER, RECURSIVE, filter_mission, parse_filter
 
-DESCRIPTION: Final = f"""\
+if TYPE_CHECKING:
+    from ssm_graph.mission.estimate import Estimate
+    from ssm_graph.mission.mission import Mission
+    from ssm_graph.mission.problem import ProblemConfig
+    from ssm_graph.report.terminal.progress import ProgressDisplay
+
+DESCRIPTION: Final = """\
 Filter a recorded mission; writes trajectory.csv, beams.csv, summary.json and figure.png as smooth
 does. Without [initial] the start is aligned as for smooth: the whole mission has its say in that.
 
-methods:
-{method_lines(RECURSIVE)}"""
+Kalman filters, their robust relatives, similarity weights for a ping or for every beam, fixed lags:
+ssm-graph help methods lists them.
+"""
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
@@ -29,15 +31,17 @@ def declare(parser: argparse.ArgumentParser) -> None:
     add_mission_arguments(parser)
     parser.add_argument(
         "--method",
-        default=DEFAULT_FILTER,
+        default=FILTER,
         metavar="NAME[:NUMBER]",
-        help="one of those above; the number is its parameter (default: %(default)s)",
+        help="one of ssm-graph help methods; the number is its parameter (default: %(default)s)",
     )
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace, console: Console, errors: Console) -> bool:
     """Filter by the method that was asked for."""
+    from ssm_graph.study.methods import filter_mission
+
     method = method_from(arguments.method)
 
     def solve(mission: Mission, graph: ProblemConfig, show: ProgressDisplay) -> Estimate:
@@ -50,6 +54,8 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
 
 def method_from(text: str) -> str:
     """Return the checked name of a filter; one that solves for all keyframes at once is refused."""
+    from ssm_graph.study.methods import parse_filter
+
     try:
         return parse_filter(text).name
     except ConfigError as error:

@@ -14,8 +14,8 @@ from ssm_graph.cli.terminal import say, say_json
 from ssm_graph.io.instruments.library import KEY, Preset, asked_for, preset, presets
 
 DESCRIPTION = f"""\
-List the instruments whose noise, bias, scale and geometry are known by name, with the data sheet
-that they are of; with a NAME, its figures and the keys of mission.toml that they make.
+List the instruments whose noise, bias, scale and geometry are known by name, with what these are
+of; with a NAME, its figures and the keys of mission.toml that they make.
 
   [imu]
   {KEY} = "VN-100"              # keys beside it win; what no source gives is asked for
@@ -23,7 +23,7 @@ that they are of; with a NAME, its figures and the keys of mission.toml that the
   {KEY} = "DVL1000"
 
 basis: 'read' is the maker's sheet, read for this list; 'quoted' is the sheet as other sources
-quote it; 'published' are generally published figures that were not checked against the sheet.
+quote it; 'published' are published figures, not read from a sheet here; '-' has no figures.
 """
 
 
@@ -66,7 +66,13 @@ def _list(found: tuple[Preset, ...], console: Console) -> None:
     for heading in ("section", "name", "maker", "figures", "basis"):
         table.add_column(heading, no_wrap=heading == "name")
     for one in found:
-        table.add_row(one.section, one.name, one.maker, str(len(one.figures)), one.basis)
+        table.add_row(
+            one.section,
+            one.name,
+            one.maker,
+            str(len(one.figures)),
+            one.basis if one.figures else "-",
+        )
     console.print(table)
     say(console, "ssm-graph instruments NAME  shows one; figures that have no source are absent")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from rich.console import Console
@@ -13,13 +13,10 @@ from rich.console import Console
 from ssm_graph.cli.options import number_option
 from ssm_graph.cli.terminal import say
 from ssm_graph.io.results.place import check_is_free
-from ssm_graph.systems.road_map.drive import Drive
-from ssm_graph.systems.road_map.folder import read_drive
-from ssm_graph.systems.road_map.locate import locate
-from ssm_graph.systems.road_map.maps.road_map import RoadMap
-from ssm_graph.systems.road_map.patent import locate_by_patent
-from ssm_graph.systems.road_map.results import write_located
-from ssm_graph.systems.road_map.simulate import indices_of
+
+if TYPE_CHECKING:
+    from ssm_graph.systems.road_map.drive import Drive
+    from ssm_graph.systems.road_map.maps.road_map import RoadMap
 
 DESCRIPTION: Final = """\
 Find the lane of a road vehicle in an HD map, from one poor fix, speed and yaw rate, and the curves
@@ -52,6 +49,10 @@ def declare(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
     """Locate a drive and say in which lane it ends."""
+    from ssm_graph.systems.road_map.folder import read_drive
+    from ssm_graph.systems.road_map.locate import locate
+    from ssm_graph.systems.road_map.results import write_located
+
     if arguments.out is not None:
         check_is_free(arguments.out, may_overwrite=arguments.overwrite)
     drive, road_map = read_drive(arguments.drive)
@@ -85,6 +86,9 @@ def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
 def _run_patent(
     arguments: argparse.Namespace, drive: Drive, road_map: RoadMap, console: Console
 ) -> bool:
+    from ssm_graph.systems.road_map.patent import locate_by_patent
+    from ssm_graph.systems.road_map.simulate import indices_of
+
     area = road_map.within(drive.gnss.x_y, 110.0)
     found = locate_by_patent(drive, indices_of(area), seed=arguments.seed)
     x, y, yaw = found.refined

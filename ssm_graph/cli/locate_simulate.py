@@ -12,9 +12,6 @@ from ssm_graph.base.errors import ConfigError
 from ssm_graph.cli.options import number_option
 from ssm_graph.cli.terminal import say
 from ssm_graph.io.results.place import check_is_free
-from ssm_graph.systems.road_map.av2_log import MAP
-from ssm_graph.systems.road_map.folder import write_drive
-from ssm_graph.systems.road_map.study import drive_of
 
 DESCRIPTION: Final = """\
 Drive a random route over a map (lanelet2 .osm, CommonRoad .xml, OpenDRIVE .xodr), or the way of an
@@ -38,6 +35,10 @@ def declare(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace, console: Console, _: Console) -> bool:
     """Simulate a drive and write it."""
+    from ssm_graph.systems.road_map.av2_log import MAP
+    from ssm_graph.systems.road_map.folder import write_drive
+    from ssm_graph.systems.road_map.study import drive_of
+
     if arguments.case == "damaged":
         raise ConfigError("--case damaged: the damage is to the map; damage the map file instead")
     check_is_free(arguments.out, may_overwrite=arguments.overwrite)

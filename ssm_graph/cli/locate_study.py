@@ -12,16 +12,7 @@ from rich.console import Console
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.cli.options import number_option
 from ssm_graph.cli.terminal import say
-from ssm_graph.study.ledger import ERROR, Ledger, run_trials
-from ssm_graph.systems.road_map.study import (
-    CASES,
-    HEADER,
-    METHODS,
-    keys_of,
-    settings_of,
-    summary,
-    trial,
-)
+from ssm_graph.systems.road_map.cases import CASES, METHODS
 
 DESCRIPTION: Final = """\
 Simulate drives over maps and Argoverse 2 logs, locate them, and tell how often the lane is right,
@@ -45,6 +36,9 @@ def declare(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace, console: Console, errors: Console) -> bool:
     """Simulate, locate, and tell how often it is right."""
+    from ssm_graph.study.ledger import ERROR, Ledger, run_trials
+    from ssm_graph.systems.road_map.study import HEADER, keys_of, settings_of, summary, trial
+
     methods = [name.strip() for name in arguments.methods.split(",")]
     unknown = [name for name in methods if name not in METHODS]
     if unknown:

@@ -15,7 +15,6 @@ from ssm_graph.cli.terminal import say
 from ssm_graph.io.export.track import check_rows
 from ssm_graph.io.results.place import PAGE_NAME, check_output_file
 from ssm_graph.io.results.tables import read_aids, read_protection
-from ssm_graph.report.terminal.progress import ProgressDisplay
 
 if TYPE_CHECKING:
     from ssm_graph.base.frozen import Array
@@ -62,15 +61,16 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     check_output_file(path)
     from ssm_graph.report.page.content import Content
     from ssm_graph.report.page.page import write_page
+    from ssm_graph.report.terminal.progress import ProgressDisplay
     from ssm_graph.result import Result
 
-    result = Result(arguments.result, mission=arguments.mission, epoch=arguments.epoch)
-    results = result.tables
-    check_rows(results)
     with ProgressDisplay(errors) as show:
+        show.stage("reading the result")
+        result = Result(arguments.result, mission=arguments.mission, epoch=arguments.epoch)
+        results = result.tables
+        check_rows(results)
         show.stage("reading the mission")
         altitude, of_errors, note = _of_mission(result)
-        show.stage("drawing")
         content = Content(
             trajectory=results.trajectory,
             beams=results.beams,
@@ -81,9 +81,10 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
             altitude=altitude,
             errors=of_errors,
         )
-    now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
-    version = (results.summary.get("versions") or {}).get("ssm_graph")
-    write_page(content, path, footer=f"ssm-graph {version}; {arguments.result}; page of {now}")
+        now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+        version = (results.summary.get("versions") or {}).get("ssm_graph")
+        show.stage("drawing")
+        write_page(content, path, footer=f"ssm-graph {version}; {arguments.result}; page of {now}")
     say(console, f"{path}: {path.stat().st_size:,} bytes")
     if note:
         say(console, f"note: {note}")

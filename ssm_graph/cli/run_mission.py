@@ -6,39 +6,36 @@ import argparse
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from rich.console import Console
 
 from ssm_graph.base.errors import ConfigError, DataError
+from ssm_graph.base.usual import KEYFRAME_INTERVAL_S, MERGE_RATE_HZ
 from ssm_graph.cli.options import number_option
 from ssm_graph.cli.terminal import say
-from ssm_graph.evaluation.errors import Metrics, evaluate, reference_from_gnss, withhold_gnss
-from ssm_graph.io.mission_folder.folder import CALIBRATION_NAME, read_mission
-from ssm_graph.io.mission_folder.toml import read_mission_toml
 from ssm_graph.io.results.place import FIGURES, check_result_place
-from ssm_graph.io.results.summary import input_fields
-from ssm_graph.io.results.tables import write_results
-from ssm_graph.mission.estimate import Estimate
-from ssm_graph.mission.mission import Mission, Reference
-from ssm_graph.mission.problem import ProblemConfig
-from ssm_graph.report.mission.summary import summary_table
-from ssm_graph.report.terminal.progress import ProgressDisplay
-from ssm_graph.sensors.gnss import GnssLog
 
-Solve = Callable[[Mission, ProblemConfig, ProgressDisplay], Estimate]
+if TYPE_CHECKING:
+    from ssm_graph.evaluation.errors import Metrics
+    from ssm_graph.mission.estimate import Estimate
+    from ssm_graph.mission.mission import Mission, Reference
+    from ssm_graph.mission.problem import ProblemConfig
+    from ssm_graph.report.terminal.progress import ProgressDisplay
+    from ssm_graph.sensors.gnss import GnssLog
+
+Solve: TypeAlias = "Callable[[Mission, ProblemConfig, ProgressDisplay], Estimate]"
 """Estimates a mission and tells the display how far it is."""
 
 
 def add_mission_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the mission folder, the result folder, and what belongs to neither estimator."""
-    graph = ProblemConfig()
     parser.add_argument("mission", type=Path, metavar="MISSION", help="mission folder")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="result folder")
     merged = "rate to which inertial samples are merged"
-    number_option(parser, "--merge-rate", "HZ", merged, graph.merge_rate_hz)
+    number_option(parser, "--merge-rate", "HZ", merged, MERGE_RATE_HZ)
     apart = "keyframes this far apart while DVL and GNSS are silent"
-    number_option(parser, "--keyframe-interval", "SECONDS", apart, graph.keyframe_interval_s)
+    number_option(parser, "--keyframe-interval", "SECONDS", apart, KEYFRAME_INTERVAL_S)
     until = "use GNSS only so long from the begin of the inertial data; the rest becomes the "
     number_option(parser, "--gnss-until", "SECONDS", until + "reference")
     parser.add_argument(
@@ -58,6 +55,15 @@ def run_mission(
 
     The settings are those of the estimator, for ``summary.json``.
     """
+    from ssm_graph.evaluation.errors import withhold_gnss
+    from ssm_graph.io.mission_folder.folder import CALIBRATION_NAME, read_mission
+    from ssm_graph.io.mission_folder.toml import read_mission_toml
+    from ssm_graph.io.results.summary import input_fields
+    from ssm_graph.io.results.tables import write_results
+    from ssm_graph.mission.problem import ProblemConfig
+    from ssm_graph.report.mission.summary import summary_table
+    from ssm_graph.report.terminal.progress import ProgressDisplay
+
     graph = ProblemConfig(arguments.merge_rate, arguments.keyframe_interval)
     check_result_place(arguments.out)
     with ProgressDisplay(errors) as show:
@@ -108,6 +114,8 @@ def _compare(
     estimate: Estimate, mission: Mission, withheld: GnssLog | None
 ) -> tuple[Estimate, Reference | None, Metrics | None]:
     """Compare with the mission's reference or the withheld fixes; a note where that fails."""
+    from ssm_graph.evaluation.errors import evaluate, reference_from_gnss
+
     reference = mission.reference
     if withheld is not None:
         reference = reference_from_gnss(withheld, estimate.trajectory)

@@ -12,9 +12,7 @@ from rich.console import Console
 from ssm_graph.base.frozen import Array
 from ssm_graph.cli.options import add_mission_output, choice_option
 from ssm_graph.cli.terminal import say
-from ssm_graph.io.mission_folder.folder import write_mission
 from ssm_graph.io.results.place import check_is_free
-from ssm_graph.report.terminal.progress import ProgressDisplay
 from ssm_graph.sensors.dvl import MOST_BEAMS
 from ssm_graph.simulation import (
     SCENARIOS,
@@ -72,6 +70,9 @@ def declare(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace, console: Console, errors: Console) -> bool:
     """Simulate and write."""
+    from ssm_graph.io.mission_folder.folder import write_mission
+    from ssm_graph.report.terminal.progress import ProgressDisplay
+
     check_is_free(arguments.out, may_overwrite=arguments.overwrite)
     usual = scenario_config(arguments.scenario)
     told: dict[str, Any] = {

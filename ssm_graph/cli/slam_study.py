@@ -11,12 +11,9 @@ from typing import Final
 
 from rich.console import Console
 
-from ssm_graph.cli.compare import FIGURES_NAME, StudyDisplay
 from ssm_graph.cli.options import number_option
 from ssm_graph.cli.terminal import say
 from ssm_graph.io.tables.append_file import write_through
-from ssm_graph.study.ledger import ERROR, Key, Ledger, run_trials
-from ssm_graph.study.runner import Progress
 
 DESCRIPTION: Final = """\
 The study of Wang, Qin and Liang (2014) on a vehicle in 40 x 40 m among landmarks: extended,
@@ -50,6 +47,9 @@ def declare(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace, console: Console, errors: Console) -> bool:
     """Run what is missing, then write summary and figures."""
+    from ssm_graph.cli.compare_run import FIGURES_NAME, StudyDisplay
+    from ssm_graph.study.ledger import ERROR, Key, Ledger, run_trials
+    from ssm_graph.study.runner import Progress
     from ssm_graph.systems.landmark_slam.methods import DEFAULT_STUDY
     from ssm_graph.systems.landmark_slam.page import study_page
     from ssm_graph.systems.landmark_slam.study import STUDY_CASES, StudyPlan, cells_of, run_batch

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from rich.console import Console
 
 from factors.kernels import KERNELS, GeneralKernel, KernelChoice, TruncatedKernel
 from factors.similarity import Kernel, Similarity
 from ssm_graph.base.errors import ConfigError
+from ssm_graph.base.usual import MAX_ITERATIONS
 from ssm_graph.cli.answers import add_answer_arguments, asks, read_times
-from ssm_graph.cli.export import export, exports_of
 from ssm_graph.cli.options import (
     add_kernel_options,
     choice_option,
@@ -21,15 +21,13 @@ from ssm_graph.cli.options import (
 )
 from ssm_graph.cli.run_mission import add_mission_arguments, run_mission
 from ssm_graph.engine.reweighting import GncStart, Graduation
-from ssm_graph.io.seabed.section import with_map_file
-from ssm_graph.mission.estimate import Estimate
-from ssm_graph.mission.mission import Mission
-from ssm_graph.mission.problem import ProblemConfig
-from ssm_graph.report.terminal.progress import ProgressDisplay
-from ssm_graph.sensors.seabed import TerrainLog
-from ssm_graph.smoothers.faults.search import FaultSearch
-from ssm_graph.smoothers.mission import smooth
-from ssm_graph.smoothers.settings import SmootherConfig
+
+if TYPE_CHECKING:
+    from ssm_graph.mission.estimate import Estimate
+    from ssm_graph.mission.mission import Mission
+    from ssm_graph.mission.problem import ProblemConfig
+    from ssm_graph.report.terminal.progress import ProgressDisplay
+    from ssm_graph.smoothers.settings import SmootherConfig
 
 GNC = "gnc-tls"
 ADAPTIVE = "adaptive"
@@ -92,8 +90,8 @@ def _add_kernel_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_loop_options(parser: argparse.ArgumentParser) -> None:
-    limit, most = "limit of the similarity loop", SmootherConfig().max_iterations
-    number_option(parser, "--max-iterations", "N", limit, most, kind=int)
+    limit = "limit of the similarity loop"
+    number_option(parser, "--max-iterations", "N", limit, MAX_ITERATIONS, kind=int)
     parser.add_argument(
         "--adapt-noise",
         action="store_true",
@@ -112,6 +110,11 @@ def _add_loop_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace, console: Console, errors: Console) -> bool:
     """Smooth, with the loop that was asked for."""
+    from ssm_graph.cli.export import export, exports_of
+    from ssm_graph.io.seabed.section import with_map_file
+    from ssm_graph.sensors.seabed import TerrainLog
+    from ssm_graph.smoothers.mission import smooth
+
     loop = loop_from(arguments)
 
     def solve(mission: Mission, graph: ProblemConfig, show: ProgressDisplay) -> Estimate:
@@ -140,6 +143,9 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
 
 def loop_from(arguments: argparse.Namespace) -> SmootherConfig:
     """Return the settings of the loop; what does not belong to the kernel is refused."""
+    from ssm_graph.smoothers.faults.search import FaultSearch
+    from ssm_graph.smoothers.settings import SmootherConfig
+
     graduation = None
     if arguments.kernel == GNC:
         graduation = Graduation(arguments.gnc_start or GncStart.ONES)

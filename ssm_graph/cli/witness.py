@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ssm_graph.cli.options import number_option
-from ssm_graph.live.run.runner import Engine, Estimator
+
+if TYPE_CHECKING:
+    from ssm_graph.live.run.runner import Engine, Estimator
 
 
 def add_witness(group: argparse._ArgumentGroup) -> None:
@@ -24,6 +26,7 @@ def witnessed(engine: Engine, arguments: argparse.Namespace, lag_s: float) -> En
     """Return an engine whose estimators have a witness beside them, if it was asked for."""
     if not arguments.witness:
         return engine
+    from ssm_graph.live.run.runner import Engine
     from ssm_graph.systems.sensor_network.live import Witnessed
     from ssm_graph.systems.sensor_network.witness import WitnessBounds
 

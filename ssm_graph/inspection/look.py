@@ -30,6 +30,8 @@ from ssm_graph.live.recorded.log import read_recorded
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.suspects.find import find_suspects
 from ssm_graph.mission.usable import require_usable
+from ssm_graph.sensors.dvl import Ping
+from ssm_graph.sensors.imu import ImuSample
 
 LEAST_S: Final = 30.0
 """Of a mission without a start: alignment needs about as much."""
@@ -202,6 +204,11 @@ def _without_mission(path: Path) -> Inspection:
     kind = "instrument's own output: "
     kind += ", ".join(f"{one.timing.n} {one.name}" for one in sensors)
     missing = "it holds no inertial data; ssm-graph convert makes tables of it for a mission folder"
+    if {ImuSample.__name__, Ping.__name__} <= set(times):
+        missing = (
+            "it says nothing of noise, mounting and place; ssm-graph convert with  --vehicle  "
+            "makes a mission of it"
+        )
     return Inspection(path, kind, sensors, recorded.notes, (), (missing,), None)
 
 

@@ -15,6 +15,7 @@ from ssm_graph.base.frames import R_lb_from_roll_pitch_heading, phi_D_roll_pitch
 from ssm_graph.base.frozen import Array, ReadOnlyArrays
 from ssm_graph.base.stepwise import Steps, at_once
 from ssm_graph.base.times import MIN_SPACING_S, Indices, is_inside, nearest
+from ssm_graph.base.usual import KEYFRAME_INTERVAL_S, MERGE_RATE_HZ
 from ssm_graph.engine.error_state import POSITION, ROTATION, STATE_DIM, VELOCITY, InitialMoments
 from ssm_graph.engine.extras import Extras
 from ssm_graph.graph.aids import AIDS
@@ -50,9 +51,9 @@ A = TypeVar("A", bound=Aid)
 class ProblemConfig:
     """How a mission becomes a graph."""
 
-    merge_rate_hz: float = 20.0
+    merge_rate_hz: float = MERGE_RATE_HZ
     """Raw inertial samples are merged to this rate before preintegration."""
-    keyframe_interval_s: float = 1.0
+    keyframe_interval_s: float = KEYFRAME_INTERVAL_S
     """Longest time between keyframes while DVL and GNSS are silent."""
 
     def __post_init__(self) -> None:

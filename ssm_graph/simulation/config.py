@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any, Final
@@ -152,23 +152,30 @@ class Scenario:
     """Settings that belong together, with a line of description."""
 
     description: str
-    config: SimulationConfig
+    make: Callable[[], SimulationConfig]
+
+    @property
+    def config(self) -> SimulationConfig:
+        """The settings, made when they are asked for: a list of names needs none."""
+        return self.make()
 
 
-_DEMO = SimulationConfig(
-    name="demo",
-    route=SurveyRoute(
-        line_m=225.0, depth=DepthProfile(start_m=0.3, end_m=25.0, mid_s=110.0, tau_s=25.0)
-    ),
-    duration_s=1200.0,
-    seed=1,
-    dvl=DvlSettings(first_s=0.903, jitter_s=0.02, seabed_depth_m=45.0),
-    outliers=Outliers(OutlierKind.SPARSE, rate=0.1),
-    faults=(Fault(beams=(1,), start_s=600.0, end_s=615.0, offset_m_per_s=0.8),),
-    losses=(Loss(start_s=800.0, end_s=840.0),),
-    dropout_rate=0.03,
-    gnss=GnssSettings(),
-)
+def _demo() -> SimulationConfig:
+    return SimulationConfig(
+        name="demo",
+        route=SurveyRoute(
+            line_m=225.0, depth=DepthProfile(start_m=0.3, end_m=25.0, mid_s=110.0, tau_s=25.0)
+        ),
+        duration_s=1200.0,
+        seed=1,
+        dvl=DvlSettings(first_s=0.903, jitter_s=0.02, seabed_depth_m=45.0),
+        outliers=Outliers(OutlierKind.SPARSE, rate=0.1),
+        faults=(Fault(beams=(1,), start_s=600.0, end_s=615.0, offset_m_per_s=0.8),),
+        losses=(Loss(start_s=800.0, end_s=840.0),),
+        dropout_rate=0.03,
+        gnss=GnssSettings(),
+    )
+
 
 _AIDED = AidSettings(
     usbl=UsblSettings(interval_s=10.0, gross=GrossErrors(0.05, (20.0, 100.0))),
@@ -198,42 +205,44 @@ SCENARIOS: Final[Mapping[str, Scenario]] = MappingProxyType(
     {
         "survey": Scenario(
             "lawn-mower lines of 300 m at 30 m depth, 20 min, in waves",
-            SimulationConfig(name="survey"),
+            lambda: SimulationConfig(name="survey"),
         ),
         "spiral": Scenario(
             "flat spiral outwards from a radius of 15 m at 20 m depth, 20 min, in waves",
-            SimulationConfig(name="spiral", route=SpiralRoute()),
+            lambda: SimulationConfig(name="spiral", route=SpiralRoute()),
         ),
         "dive": Scenario(
             "helix from the surface to 60 m and up again within 20 min, GNSS at the surface",
-            SimulationConfig(name="dive", route=DiveRoute(), gnss=GnssSettings()),
+            lambda: SimulationConfig(name="dive", route=DiveRoute(), gnss=GnssSettings()),
         ),
         "hover": Scenario(
             "station keeping with slow sway at 15 m depth, 20 min, in waves",
-            SimulationConfig(name="hover", route=HoverRoute()),
+            lambda: SimulationConfig(name="hover", route=HoverRoute()),
         ),
         "transit": Scenario(
             "straight run of 14.4 km at 40 m depth, 2 h, in waves",
-            SimulationConfig(name="transit", route=TransitRoute(), duration_s=7200.0),
+            lambda: SimulationConfig(name="transit", route=TransitRoute(), duration_s=7200.0),
         ),
         "aided": Scenario(
             "survey with late acoustic fixes, ranges to a known and an unknown beacon, a compass; "
             "5 % of them grossly wrong",
-            SimulationConfig(name="aided", aids=_AIDED),
+            lambda: SimulationConfig(name="aided", aids=_AIDED),
         ),
         "three-beams": Scenario(
             "survey with a DVL of three beams around",
-            SimulationConfig(
+            lambda: SimulationConfig(
                 name="three-beams", dvl=DvlSettings(mount=default_mount(janus_beams(3)))
             ),
         ),
         "velocity": Scenario(
             "survey with a DVL that gives a velocity alone: three beams along its axes",
-            SimulationConfig(name="velocity", dvl=DvlSettings(mount=default_mount(np.eye(3)))),
+            lambda: SimulationConfig(
+                name="velocity", dvl=DvlSettings(mount=default_mount(np.eye(3)))
+            ),
         ),
         "midwater": Scenario(
             "survey lines at 30 m depth, 40 min, a tide of 0.5 m/s: half without bottom lock",
-            SimulationConfig(
+            lambda: SimulationConfig(
                 name="midwater",
                 duration_s=2400.0,
                 losses=(Loss(start_s=600.0, end_s=1800.0),),
@@ -243,7 +252,7 @@ SCENARIOS: Final[Mapping[str, Scenario]] = MappingProxyType(
         ),
         "demo": Scenario(
             "GNSS start, dive, 20 min of survey lines: outliers, a burst, dropouts, a bottom loss",
-            _DEMO,
+            _demo,
         ),
     }
 )

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ssm_graph.base.earth import R_el_from_lat_lon, geodetic_from_ecef
 from ssm_graph.base.frozen import Array
@@ -32,6 +31,8 @@ def janus_beams(
     towards y, rad. Without azimuths the beams are spread evenly, half a step from x on; of five
     one looks straight down, as makers of such instruments have it.
     """
+    from scipy.spatial.transform import Rotation
+
     has_vertical = azimuth is None and n_beams == 5
     n_slanted = n_beams - has_vertical
     even = 2.0 * math.pi * (np.arange(n_slanted) + 0.5) / n_slanted
@@ -47,6 +48,8 @@ def default_mount(beams_d: Array | None = None) -> DvlMount:
     Its beams (B, 3) are a 30-degree Janus array of four unless given; ``numpy.eye(3)`` is an
     instrument that gives a velocity alone.
     """
+    from scipy.spatial.transform import Rotation
+
     askew = Rotation.from_euler("ZYX", np.radians([2.0, -1.0, 0.5]))
     return DvlMount(
         beams_d=janus_beams() if beams_d is None else beams_d,
@@ -162,6 +165,8 @@ def _true_lever_arm_b(settings: DvlSettings) -> Array:
 
 def _true_beams_b(settings: DvlSettings) -> Array:
     """Return the beams (B, 3) in body axes as they really point."""
+    from scipy.spatial.transform import Rotation
+
     R_dd = Rotation.from_rotvec(settings.misalignment).as_matrix()
     return np.asarray(settings.mount.beams_d @ (settings.mount.R_bd @ R_dd).T)
 

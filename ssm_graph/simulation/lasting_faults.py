@@ -9,7 +9,6 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from ssm_graph.base.earth import R_el_from_lat_lon, ecef_from_geodetic, geodetic_from_ecef
 from ssm_graph.base.errors import ConfigError, DataError
@@ -198,6 +197,8 @@ def _break_dvl(
     log: Any, fault: Fault, truth: Truth, mission: Mission, rng: Rng
 ) -> tuple[Any, Mask]:
     """Break beams; one that is missing stays so."""
+    from scipy.spatial.transform import Rotation
+
     checked.require_beams("Fault.beams", fault.beams, log.mount.n_beams)
     rows, speed = fault.inside(log.time_s), log.speed.copy()
     beams = fault.beams_of(log.mount.n_beams)
@@ -280,6 +281,8 @@ def _instrument_velocity(truth: Truth, mission: Mission, time_s: Array) -> Array
 
 
 def _body_from_enu(now: Reference, v_enu: Array) -> Array:
+    from scipy.spatial.transform import Rotation
+
     roll, pitch, heading = now.roll_pitch_heading.T
     R_nb = Rotation.from_euler("ZYX", np.column_stack([heading, pitch, roll]))  # of local NED
     return np.asarray(R_nb.inv().apply(v_enu[:, [1, 0, 2]] * [1.0, 1.0, -1.0]))

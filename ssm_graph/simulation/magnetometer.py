@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.sensors.magnetometer import EarthField, MagneticErrors, MagnetometerLog
@@ -67,6 +66,8 @@ class MagnetometerSettings(checked.Settings):
 
 def _in_the_body(trajectory: Trajectory, time_s: Array, field_enu: Array) -> Array:
     """Return a field (3,) along east, north, up as the body (N, 3) turns in it."""
+    from scipy.spatial.transform import Rotation
+
     roll, pitch, heading = trajectory.truth(time_s).roll_pitch_heading.T
     body = Rotation.from_euler("ZYX", np.column_stack([heading, pitch, roll]))  # of local NED
     east, north, up = field_enu

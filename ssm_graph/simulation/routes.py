@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
-from scipy.special import ellipkinc
 
 from ssm_graph.simulation import checked
 from ssm_graph.simulation.taylor import Series, antiderivative, constant, log, sin_cos, sqrt, tanh
@@ -90,6 +89,8 @@ class SurveyRoute(Route):
 
     def east_north_height(self, t: Series) -> Position:
         """Return metres east and north of the start, and metres above the ellipsoid."""
+        from scipy.special import ellipkinc
+
         rate = math.pi * self.speed / self.line_m
         theta = t * rate
         # One order less: `antiderivative` gains it back.

@@ -10,11 +10,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from ssm_graph.base.earth import (
     EARTH_RATE,
@@ -41,6 +40,9 @@ _LON = checked.Rule(
     "a longitude in radians",
     "convert degrees with math.radians",
 )
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,6 +265,8 @@ class Trajectory(checked.Settings):
 
     def R_eb(self, time_s: ArrayLike) -> Rotation:
         """Return the rotations from body to Earth-fixed axes."""
+        from scipy.spatial.transform import Rotation
+
         motion = self.at(np.atleast_1d(time_s))
         level = np.stack([turn.angle.value for turn in motion.to_level], axis=-1)
         body = np.stack(

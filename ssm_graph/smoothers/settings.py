@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from factors.kernels import GeneralKernel, TruncatedKernel
 from factors.similarity import Kernel, LogKernel, Similarity
 from ssm_graph.base.errors import ConfigError
+from ssm_graph.base.usual import MAX_ITERATIONS
 from ssm_graph.engine.reweighting import (
     AdaptiveSchedule,
     GncSchedule,
@@ -35,7 +36,7 @@ class SmootherConfig:
     """Look for sensors that are off for long, and take that off; None does not."""
     adapt_noise: bool = False
     """Repeat the solution with the sigma of each beam that its errors ask for."""
-    max_iterations: int = 100
+    max_iterations: int = MAX_ITERATIONS
     tolerance: float = 1e-3
     """Updates in their own posterior sigmas, and changes of weights, below which it has settled."""
 

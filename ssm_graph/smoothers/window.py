@@ -15,6 +15,7 @@ from ssm_graph.base.errors import ConfigError, SolverError
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps, at_once
 from ssm_graph.base.times import MIN_SPACING_S
+from ssm_graph.base.usual import LAG_S
 from ssm_graph.engine.error_state import InitialMoments, Linearised
 from ssm_graph.engine.marginal_prior import moved_chart
 from ssm_graph.engine.reweighting import Anderson
@@ -31,7 +32,7 @@ from ssm_graph.smoothers.window_graph import WindowGraph, inertial_data
 class FixedLagConfig:
     """Settings of the fixed-lag smoother."""
 
-    lag_s: float = 30.0
+    lag_s: float = LAG_S
     """Keyframes older than this are marginalised; zero makes it the filter."""
     kernel: Kernel = field(default_factory=LogKernel)
     similarity: Similarity = Similarity.EXPECTED

@@ -10,6 +10,7 @@ from typing import Any, Final
 from factors.kernels import KERNELS, GeneralKernel, KernelChoice, TruncatedKernel
 from factors.similarity import GaussianKernel, Similarity
 from ssm_graph.base.errors import ConfigError, SsmGraphError, nearest_hint
+from ssm_graph.base.usual import FILTER
 from ssm_graph.engine.reweighting import Graduation
 from ssm_graph.filters.geodetic.filter import GeodeticConfig
 from ssm_graph.filters.navigation.named import FILTERS, filter_geodetic, filter_problems
@@ -239,7 +240,6 @@ FAMILIES: Final[Mapping[str, Family]] = {
 """All methods by the name in front of the colon."""
 RECURSIVE: Final = {n: f for n, f in FAMILIES.items() if f.is_recursive and not f.is_oracle}
 """Those that need nothing but the mission and go keyframe by keyframe."""
-DEFAULT_FILTER: Final = "ssm-log"
 
 
 def parse_method(text: str) -> Method:
@@ -288,7 +288,7 @@ def parse_filter(text: str) -> Method:
 
 def filter_mission(
     mission: Mission,
-    method: str = DEFAULT_FILTER,
+    method: str = FILTER,
     *,
     problem_config: ProblemConfig | None = None,
     on_keyframe: OnKeyframe | None = None,
@@ -302,7 +302,7 @@ def filter_mission(
     Parameters
     ----------
     mission : from :func:`ssm_graph.read_mission` or a simulation.
-    method : one of ``ssm-graph filter --help``, for example ``ssm-log``, ``ekf-gate-beam:0.99`` or
+    method : one of ``ssm-graph help methods``, for example ``ssm-log``, ``ekf-gate-beam:0.99`` or
         ``fixed-lag:10``.
     problem_config : rates and intervals of the keyframes.
     on_keyframe : called with number and total after each keyframe.

@@ -21,7 +21,7 @@ import pytest
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.cli.main import ExitCode
-from ssm_graph.cli.online import engine_of
+from ssm_graph.cli.online_run import engine_of
 from ssm_graph.io.mission_folder.folder import write_mission
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.io.raw_log.rows import messages_of

@@ -30,6 +30,10 @@ def test_help_names_every_command_once(capsys: pytest.CaptureFixture[str]) -> No
         assert f"\n  {code.value:<4} " in codes, code
     assert main(["help", "smooth"]) == 0
     assert "--find-faults" in capsys.readouterr().out
+    assert main(["help", "methods"]) == 0
+    own, others = capsys.readouterr().out.split("of compare alone:")
+    assert "\n  ssm-log[:5] " in own
+    assert "\n  oracle " in others
     assert main(["help", "smoth"]) == ExitCode.USAGE
     assert "did you mean 'smooth'" in capsys.readouterr().err
 

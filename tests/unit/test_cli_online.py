@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ssm_graph.cli.main import ExitCode, build_parser, main
-from ssm_graph.cli.online import input_configs, output_configs, replay_speed
+from ssm_graph.cli.online_run import input_configs, output_configs, replay_speed
 from ssm_graph.io.mission_folder.folder import read_mission, write_mission
 from ssm_graph.io.nmea_sentences import checksum
 from ssm_graph.io.results.tables import read_results

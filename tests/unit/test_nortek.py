@@ -13,6 +13,7 @@ import pytest
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.cli.main import main
+from ssm_graph.inspection.look import inspect_path
 from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.io.nortek.nortek import read_nortek
 from ssm_graph.io.nortek.packets import checksum, find_packets, is_nortek
@@ -169,6 +170,15 @@ def test_convert_writes_tables_and_turns_the_sign(
         for name in "ab"
     )
     np.testing.assert_array_equal(a, -b)
+
+
+def test_inspect_says_what_a_nucleus_lacks(tmp_path: Path) -> None:
+    """It has beams and inertial data; a DVL alone has no inertial data."""
+    (missing,) = inspect_path(_file(tmp_path, nucleus_log())).missing
+    assert "--vehicle  makes a mission of it" in missing
+    pings = b"".join(dvl(k, velocity) for k, velocity in enumerate(velocities(3)))
+    (missing,) = inspect_path(_file(tmp_path, pings)).missing
+    assert "it holds no inertial data" in missing
 
 
 def test_a_nucleus_alone_is_a_mission(tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from ssm_graph.base.errors import ConfigError
-from ssm_graph.cli import run_mission as batch
 from ssm_graph.cli.main import ExitCode, main
 from ssm_graph.io.mission_folder.folder import write_mission
 from ssm_graph.io.results.place import LEAST_FREE, check_place
@@ -95,8 +94,8 @@ def test_out_is_looked_at_before_the_work(
     def read(*_: object) -> None:
         raise AssertionError("the work was begun")
 
-    monkeypatch.setattr(batch, "read_mission", read)
-    monkeypatch.setattr("ssm_graph.cli.compare.run_study", read)
+    monkeypatch.setattr("ssm_graph.io.mission_folder.folder.read_mission", read)
+    monkeypatch.setattr("ssm_graph.cli.compare_run.run_study", read)
     (tmp_path / "file").write_text("mine")
     for out, said in (
         (tmp_path / "file", "expected a folder, got the file"),

@@ -16,6 +16,7 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.cli.main import main
 from ssm_graph.io.teledyne.ensembles import find_ensembles, is_pd0
 from ssm_graph.io.teledyne.pd0 import read_pd0
+from ssm_graph.live.recorded.log import read_recorded
 from ssm_graph.sensors.compass import HeadingReading
 from ssm_graph.sensors.dvl import Ping
 
@@ -154,6 +155,53 @@ def test_files_of_no_use_are_refused_with_the_cause(tmp_path: Path) -> None:
     assert "1 ensembles that look up are left out" in read_pd0(written(tmp_path, *mixed)).notes
     with pytest.raises(DataError, match="cannot be read"):
         read_pd0(tmp_path)
+
+
+def changed(whole: bytes, part: int, offset: int, *values: int, kind: str = "B") -> bytes:
+    """Return an ensemble with other bytes in one of its parts, and the checksum of those."""
+    data = bytearray(whole)
+    (size,) = struct.unpack_from("<H", data, 2)
+    (begin,) = struct.unpack_from("<H", data, 6 + 2 * part)
+    struct.pack_into(f"<{len(values)}{kind}", data, begin + offset, *values)
+    struct.pack_into("<H", data, size, sum(data[:size]) & 0xFFFF)
+    return bytes(data)
+
+
+def test_instruments_that_are_set_otherwise(tmp_path: Path) -> None:
+    """Three beams, no angle, no date, nothing seen: read as far as that is right, or the cause."""
+    sound = [ensemble(k, np.array([0.1, -0.2, 0.3, 0.4])) for k in range(4)]
+    three = [changed(one, 0, 8, 3) for one in sound]
+    assert [len(ping.speed) for ping in pings_of(written(tmp_path, *three))] == [3] * 4
+    assert "azimuths are not told" in read_pd0(written(tmp_path, *three)).notes[0]
+    twice = read_pd0(written(tmp_path, *sound, sound[-1]))
+    assert "1 pings of a time that an earlier one has were left out" in twice.notes
+    assert twice.about.endswith("in 100 %")
+    undated = changed(changed(sound[0], 1, 4, *[0] * 7), 1, 57, *[0] * 8)
+    assert "1 ensembles whose clock has no date" in "".join(
+        read_pd0(written(tmp_path, undated, *sound)).notes
+    )
+    no_angle = [changed(changed(one, 0, 5, 0x43), 0, 58, 0) for one in sound]
+    cases = {
+        "the angle of the beams is not told": no_angle,
+        "the instrument's clock is not set": [undated],
+        "3 beams in earth coordinates": [
+            changed(ensemble(1, np.full(4, 0.1), coordinates=3), 0, 8, 3)
+        ],
+        "beam angle 30.0 and 25.0, from ensemble 3 on": [*sound[:3], changed(sound[3], 0, 58, 25)],
+    }
+    for cause, ensembles in cases.items():
+        with pytest.raises(DataError, match=re.escape(cause)):
+            read_pd0(written(tmp_path, *ensembles))
+
+
+def test_a_recording_that_never_saw_the_bottom_is_none(tmp_path: Path) -> None:
+    """Of any maker: tables without a single speed would only be refused later."""
+    blind = [changed(ensemble(k, np.ones(4)), 2, 24, *[-32768] * 4, kind="h") for k in range(4)]
+    with pytest.raises(DataError, match="4 pings and not one speed along a beam"):
+        read_recorded(written(tmp_path, *blind))
+    restored = [ensemble(k, np.array([0.1, 0.2, 0.3, np.nan]), coordinates=1) for k in range(4)]
+    with pytest.raises(DataError, match="made of three beams"):
+        read_recorded(written(tmp_path, *restored))
 
 
 def test_every_truncation_and_any_damage_leaves_the_sound_ensembles(tmp_path: Path) -> None:

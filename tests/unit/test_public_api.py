@@ -64,6 +64,20 @@ def test_to_import_costs_nothing(start: str) -> None:
     assert run("-c", code).splitlines()[-1] == "set()"
 
 
+def test_help_of_every_command_loads_no_estimator() -> None:
+    """What a command is told is declared without what it takes to run it."""
+    heavy = "{'gtsam', 'scipy', 'matplotlib', 'pyarrow', 'pandas', 'cv2', 'rosbags'}"
+    code = (
+        "import sys; from ssm_graph.cli.main import COMMANDS, command_parser\n"
+        "loaded = {}\n"
+        "for name in COMMANDS:\n"
+        "    command_parser(name).format_help()\n"
+        f"    loaded[name] = sorted({heavy} & set(sys.modules))\n"
+        "print({name: found for name, found in loaded.items() if found})"
+    )
+    assert run("-c", code).strip() == "{}"
+
+
 def test_the_package_runs_as_a_module() -> None:
     """As the command does."""
     assert run("-m", "ssm_graph", "--version").strip() == sg.__version__

@@ -109,6 +109,13 @@ def sentences(second: int, x: int, status: str = "A", heading: str = "90.50") ->
     ).encode()
 
 
+def test_pd6_without_axes_of_the_instrument_is_refused_as_that(tmp_path: Path) -> None:
+    """It is PD6 all the same, and the message says what it has instead."""
+    data = b"".join(sentences(k, 100).replace(b":BI", b":BE") for k in range(3))
+    with pytest.raises(DataError, match=r"no bottom track in axes of the instrument.* 3 BE"):
+        read_recorded(_file(tmp_path, data))
+
+
 def test_velocities_of_pd6(tmp_path: Path) -> None:
     """Instrument axes, mm/s, the vehicle's sign; V is none; a heading of zero is no heading."""
     parts = [sentences(1, 1500), sentences(2, 1400, "V"), sentences(3, 1300, heading="00.00")]

@@ -288,7 +288,7 @@ def test_failed_runs_are_not_good(
         raise ZeroDivisionError("oh")
 
     monkeypatch.setattr("ssm_graph.study.methods.SsmSmoother.solve", broken)
-    monkeypatch.setattr("ssm_graph.cli.compare.execute_from", lambda _: in_this_process)
+    monkeypatch.setattr("ssm_graph.cli.compare_run.execute_from", lambda _: in_this_process)
     out = tmp_path / "out"
     words = ["compare", str(tmp_path / "tiny.toml"), "--out", str(out), "--no-figures"]
     assert main(words) == ExitCode.NOT_GOOD

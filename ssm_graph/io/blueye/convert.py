@@ -28,7 +28,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from scipy.ndimage import median_filter, uniform_filter1d
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frames import wrap_to_pi
@@ -133,6 +132,8 @@ def smooth_arrivals(time_s: Array, *, window: int = CLOCK_WINDOW) -> Array:
     That is a straight line fitted locally to time over count; near gaps and ends the window
     shrinks, so that gaps stay what they are and order is kept.
     """
+    from scipy.ndimage import uniform_filter1d
+
     smooth = time_s - time_s[0]
     edges = [0, *(np.flatnonzero(np.diff(time_s) > GAP_S) + 1), len(time_s)]
     for begin, end in pairwise(edges):
@@ -200,6 +201,8 @@ def _check_gyro_unit(gyro_z: Array, yaw_rate: Array) -> None:
 
 def _dvl(tables: BlueyeTables, imu: ImuLog) -> tuple[DvlLog, tuple[str, ...]]:
     """Return new reports with beam speeds on the instrument's own clock."""
+    from scipy.ndimage import median_filter
+
     table = tables.dvl[_is_new(tables.dvl[:, 1:])]
     clock = 1e-3 * np.r_[0.0, np.cumsum(table[1:, 1])]
     time_s = clock + median_filter(table[:, 0] - clock, DVL_CLOCK_WINDOW, mode="reflect")

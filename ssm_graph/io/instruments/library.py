@@ -69,7 +69,7 @@ class Preset:
     """imu or dvl."""
     maker: str
     sheet: str
-    """The data sheet that the figures are of, and where it was read or is quoted."""
+    """What the figures are of, mostly a data sheet, and where it was read or is quoted."""
     basis: str
     """read, quoted or published; see the head of the table."""
     published: tuple[str, ...]
@@ -95,9 +95,11 @@ class Preset:
         how = {
             "read": "read",
             "quoted": "as quoted elsewhere",
-            "published": "generally published, not read",
+            "published": "published figures, not read from a sheet here",
         }[self.basis]
-        less = f"; {', '.join(self.published)} generally published" if self.published else ""
+        if not self.figures:
+            return f"no figures: {self.sheet}"
+        less = f"; {', '.join(self.published)}: published, not read here" if self.published else ""
         return f"{self.sheet} ({how}{less})"
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.progress import told
 from ssm_graph.io.nortek.packets import NUCLEUS_FAMILY, Packet, find_packets
 from ssm_graph.io.nortek.reports import Report, nucleus_heading, nucleus_imu, report_of
 from ssm_graph.io.recording import Recording, whole
@@ -73,7 +74,7 @@ def _reports(path: Path, packets: tuple[Packet, ...]) -> tuple[list[Report], lis
     refused: Counter[str] = Counter()
     last = {False: -np.inf, True: -np.inf}
     n_repeats = 0
-    for packet in packets:
+    for packet in told(packets, len(packets)):
         try:
             report = report_of(packet)
         except ValueError as error:

@@ -14,6 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ssm_graph.base.progress import teller
 from ssm_graph.io.recording import running_sums
 
 SYNC: Final = 0xA5
@@ -67,10 +68,11 @@ def is_nortek(head: bytes) -> bool:
 def find_packets(data: bytes) -> Packets:
     """Return the packets of a recording in order."""
     found: list[Packet] = []
-    view = memoryview(data)
+    view, tell = memoryview(data), teller(len(data))
     sums = [running_sums(data, 2, offset) for offset in (0, 1)]
     n_damaged, used, at = 0, 0, data.find(SYNC)
     while at >= 0:
+        tell(at)
         header = _header(data, at)
         if header is None:
             at = data.find(SYNC, at + 1)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.progress import teller
 from ssm_graph.io.recording import running_sums
 
 _HEADER: Final = b"\x7f\x7f"
@@ -31,8 +32,8 @@ _COORDINATES: Final = ("beam", "instrument", "ship", "earth")
 class Setup:
     """What the fixed leader says of the instrument."""
 
-    beam_angle_deg: float
-    """From the axis; NaN where it is not told."""
+    beam_angle_deg: float | None
+    """From the axis; None where it is not told."""
     is_convex: bool
     is_up: bool
     """Looking up at the surface."""
@@ -42,6 +43,7 @@ class Setup:
     """Whether ship coordinates are level."""
     heading_alignment_deg: float
     n_beams: int
+    """Four where it is not told; bottom track has no more."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,6 +75,8 @@ class Found:
     ensembles: tuple[Ensemble, ...]
     n_damaged: int
     """Headers whose ensemble is torn, or whose checksum is wrong."""
+    n_undated: int
+    """Sound ensembles whose clock has no date."""
     n_other: int
     """Bytes that belong to no ensemble."""
 
@@ -80,20 +84,23 @@ class Found:
 def find_ensembles(data: bytes) -> Found:
     """Return the ensembles of a recording in order; NMEA and anything else between is skipped."""
     found: list[Ensemble] = []
-    sums = running_sums(data)
-    n_damaged, used, at = 0, 0, data.find(_HEADER)
+    sums, tell = running_sums(data), teller(len(data))
+    n_damaged, n_undated, used, at = 0, 0, 0, data.find(_HEADER)
     while at >= 0:
+        tell(at)
         size = _sound_size(data, at, sums)
-        ensemble = _ensemble(memoryview(data)[at : at + size]) if size else None
-        if ensemble is not None:
-            found.append(ensemble)
+        leaders = _leaders(memoryview(data)[at : at + size]) if size else None
+        if leaders is not None:
+            ensemble = _ensemble(*leaders)
+            n_undated += ensemble is None
+            found += [ensemble] if ensemble is not None else []
             used += size + 2
             at = data.find(_HEADER, at + size + 2)
             continue
         # A header by chance has no length that could be one.
         n_damaged += size > 0 or _is_plausible(data, at)
         at = data.find(_HEADER, at + 1)
-    return Found(tuple(found), n_damaged, len(data) - used)
+    return Found(tuple(found), n_damaged, n_undated, len(data) - used)
 
 
 def is_pd0(head: bytes) -> bool:
@@ -129,8 +136,10 @@ def _sound_size(data: bytes, at: int, sums: NDArray[np.uint16]) -> int:
     return size if (int(sums[at + size]) - int(sums[at])) & 0xFFFF == told else 0
 
 
-def _ensemble(data: memoryview) -> Ensemble | None:
-    """Return what a sound ensemble says; None where a leader is missing."""
+def _leaders(
+    data: memoryview,
+) -> tuple[memoryview, memoryview, memoryview | None] | None:
+    """Return fixed and variable leader and bottom track; None where a leader is missing."""
     n_types = data[5]
     starts = struct.unpack_from(f"<{n_types}H", data, _LEAST)
     parts = {}
@@ -140,13 +149,20 @@ def _ensemble(data: memoryview) -> Ensemble | None:
     fixed, variable = parts.get(_FIXED), parts.get(_VARIABLE)
     if fixed is None or variable is None or len(fixed) < 42 or len(variable) < 28:
         return None
+    return fixed, variable, parts.get(_BOTTOM)
+
+
+def _ensemble(
+    fixed: memoryview, variable: memoryview, bottom_track: memoryview | None
+) -> Ensemble | None:
+    """Return what a sound ensemble says; None for a clock without a date."""
     when = _when(variable)
     if when is None:
         return None
     number, number_msb = struct.unpack_from("<H", variable, 2)[0], variable[11]
     depth, heading, pitch, roll = struct.unpack_from("<HHhh", variable, 16)
     pressure = struct.unpack_from("<I", variable, 48)[0] if len(variable) >= 52 else 0
-    bottom, ranges = _bottom(parts.get(_BOTTOM))
+    bottom, ranges = _bottom(bottom_track)
     return Ensemble(
         setup=_setup(fixed),
         number=number + 65536 * number_msb,
@@ -167,7 +183,7 @@ def _setup(fixed: memoryview) -> Setup:
     low, high, transform = fixed[4], fixed[5], fixed[25]
     told = fixed[58] if len(fixed) > 58 else 0
     coded = high & 0x03
-    angle = float(told) if told else _BEAM_ANGLES[coded] if coded < 3 else float("nan")
+    angle = float(told) if told else _BEAM_ANGLES[coded] if coded < 3 else None
     return Setup(
         beam_angle_deg=angle,
         is_convex=bool(low & 0x08),
@@ -175,7 +191,7 @@ def _setup(fixed: memoryview) -> Setup:
         coordinates=_COORDINATES[(transform >> 3) & 0x03],
         uses_tilts=bool(transform & 0x04),
         heading_alignment_deg=struct.unpack_from("<h", fixed, 26)[0] / 100.0,
-        n_beams=fixed[8],
+        n_beams=fixed[8] or 4,
     )
 
 

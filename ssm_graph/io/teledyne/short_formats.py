@@ -20,6 +20,7 @@ from typing import Final
 import numpy as np
 
 from ssm_graph.base.errors import DataError
+from ssm_graph.base.progress import told
 from ssm_graph.io.recording import Recording, whole
 from ssm_graph.sensors.compass import HeadingReading
 from ssm_graph.sensors.dvl import Ping
@@ -47,7 +48,8 @@ def is_pd45(head: bytes) -> bool:
 
 def is_pd6(head: bytes) -> bool:
     """Return whether the first bytes of a file hold sentences of PD6."""
-    return len({match[1] for match in _SENTENCE.finditer(head)} & {b"TS", b"BI"}) == 2
+    kinds = {match[1] for match in _SENTENCE.finditer(head)}
+    return b"TS" in kinds and len(kinds) > 1
 
 
 def read_pd45(path: Path) -> Recording:
@@ -56,7 +58,7 @@ def read_pd45(path: Path) -> Recording:
     Raises :class:`DataError` for ship and earth coordinates and for settings that change.
     """
     data = whole(path)
-    found = list(_ensembles(data))
+    found = list(told(_ensembles(data), len(data), size=len))
     if not found:
         raise DataError(f"{path}: no sound PD4 or PD5; was it transferred as text?")
     (setting, _), *others = Counter((body[1], body[4] >> 6) for body in found).most_common()
@@ -140,7 +142,8 @@ def read_pd6(path: Path) -> Recording:
     messages: list[Message] = []
     kinds: Counter[str] = Counter()
     heading, time_s, last, n_bad, n_torn = float("nan"), float("nan"), -np.inf, 0, 0
-    for match in _SENTENCE.finditer(whole(path)):
+    data = whole(path)
+    for match in told(_SENTENCE.finditer(data), len(data), size=_length):
         kind = match[1].decode()
         fields = [field.strip() for field in match[2].decode("ascii", "replace").split(",")]
         kinds[kind] += 1
@@ -182,6 +185,10 @@ def read_pd6(path: Path) -> Recording:
     if n_torn:
         notes.append(f"{n_torn} torn sentences left out")
     return Recording(about, tuple(messages), tuple(notes))
+
+
+def _length(match: re.Match[bytes]) -> int:
+    return match.end() - match.start()
 
 
 def _instant(text: str) -> float:

@@ -21,6 +21,7 @@ from scipy.special import ndtri
 from ssm_graph.base import chi2
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.usual import FALSE_ALERTS_PER_H, MISSED_DETECTION
 from ssm_graph.engine.error_state import GYRO_BIAS, POSITION, VELOCITY
 from ssm_graph.live.estimator.lanes import (
     DEPTH,
@@ -84,11 +85,11 @@ VERTICAL: Final = np.array([0.0, 1.0])
 class IntegrityConfig:
     """How often lanes may be wrong, and what the user asks for."""
 
-    false_alerts_per_h: float = 1e-3
+    false_alerts_per_h: float = FALSE_ALERTS_PER_H
     """Of all lanes together, while every sensor is as it is stated."""
     suspicions_per_h: float = 0.5
     """False ones, of all lanes together: each costs GOOD for a minute or so; none is remembered."""
-    missed_detection: float = 1e-3
+    missed_detection: float = MISSED_DETECTION
     """Probability that a fault moves the answer out of its protection level unseen."""
     protection_m: float = np.inf
     """A health of GOOD asks for a horizontal protection level below this, m."""

@@ -43,7 +43,7 @@ from ssm_graph.live.protocols.nmea_fields import (
 )
 from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
 from ssm_graph.live.recorded.water_linked_table import SIGN, rows_of
-from ssm_graph.sensors.dvl import DvlMount, empty_dvl
+from ssm_graph.sensors.dvl import DvlMount, Ping, empty_dvl
 from ssm_graph.sensors.messages import Message
 from ssm_graph.sensors.registry import BY_MESSAGE
 
@@ -101,6 +101,12 @@ def read_recorded(log: Path, options: NmeaOptions | None = None) -> Recorded | N
         return None
     if not found.messages:
         raise DataError(f"{log}: not one report that is read; {'; '.join(found.notes) or 'empty'}")
+    pings = [message for message in found.messages if isinstance(message, Ping)]
+    if pings and not any(math.isfinite(speed) for ping in pings for speed in ping.speed):
+        raise DataError(
+            f"{log}: {len(pings)} pings and not one speed along a beam; expected bottom track "
+            f"within its range; {'; '.join(found.notes)}"
+        )
     return _in_order(log, found)
 
 
@@ -206,7 +212,7 @@ def _water_linked_table(data: bytes) -> Recorded:
     messages: list[Message] = []
     torn: list[str] = []
     try:
-        for report, arrival_s in rows_of(data):
+        for report, arrival_s in told(rows_of(data), data.count(b"\n")):
             messages += decoder.feed(report, arrival_s=arrival_s)
     except csv.Error as error:
         torn.append(f"water linked: no table from there on: {error}")
@@ -237,9 +243,15 @@ def _unix(report: Mapping[str, Any], time_s: float) -> float:
     return time_s
 
 
-def _sentences(data: bytes) -> Iterator[tuple[str, list[str]]]:
-    """Yield kind and fields of the sentences of a recording that are sound."""
-    for text in SentenceFramer(lambda _: None, max_length=MAX_SENTENCE).feed(data + b"\n"):
+def _lines(data: bytes) -> Iterable[str]:
+    """Return the lines of a recording of sentences, and tell how many of them are done."""
+    framer = SentenceFramer(lambda _: None, max_length=MAX_SENTENCE)
+    return told(framer.feed(data + b"\n"), len(data), size=len)
+
+
+def _sentences(lines: Iterable[str]) -> Iterator[tuple[str, list[str]]]:
+    """Yield kind and fields of the sentences that are sound."""
+    for text in lines:
         begin = text.rfind("$")
         try:
             name, *fields = split_sentence(text[begin + 1 :] if begin >= 0 else "")
@@ -250,7 +262,7 @@ def _sentences(data: bytes) -> Iterator[tuple[str, list[str]]]:
 
 def _nmea(data: bytes, options: NmeaOptions) -> Recorded:
     kinds, dated, first = Counter[str](), math.nan, None
-    for kind, fields in _sentences(data):
+    for kind, fields in _sentences(_lines(data)):
         kinds[kind] += _is_read(kind, fields)
         dated = _date(kind, fields) if math.isnan(dated) else dated
         first = _stamp(kind, fields, _NOON_S) if first is None else first
@@ -258,10 +270,10 @@ def _nmea(data: bytes, options: NmeaOptions) -> Recorded:
     decoder = NmeaDecoder(replace(options, max_clock_error_s=_ANY_CLOCK_S), only=only)
     messages: list[Message] = []
     time_s = (first or 0.0) if math.isnan(dated) else dated
-    for text in SentenceFramer(lambda _: None, max_length=MAX_SENTENCE).feed(data + b"\n"):
+    for text in _lines(data):
         if text.startswith("#"):  # a comment of who recorded
             continue
-        for kind, fields in _sentences(text.encode("latin-1")):
+        for kind, fields in _sentences([text]):
             stated = _stamp(kind, fields, time_s)
             time_s = time_s if stated is None else stated
         messages += decoder.feed(text.encode("latin-1") + b"\r\n", arrival_s=time_s)

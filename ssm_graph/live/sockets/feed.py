@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from ssm_graph.base.errors import ConfigError
+from ssm_graph.base.usual import MESSAGES_PER_S, STALL_S
 from ssm_graph.live.protocols.decoder import Decoder
 from ssm_graph.live.protocols.framing import TokenBucket
 from ssm_graph.live.sockets.clocks import Now, StampClocks, called
@@ -32,13 +33,13 @@ AHEAD_S: Final = 0.1
 class Limits:
     """What one source may do."""
 
-    messages_per_s: float = 2000.0
+    messages_per_s: float = MESSAGES_PER_S
     """Inertial samples; of every other kind a tenth, so that none crowds out another."""
     burst: int = 4000
     """Inertial samples at once; of every other kind a tenth."""
     bytes_per_s: float = 6e5
     """In the mean, 300 for every message; a source that sends more is read no faster."""
-    stall_s: float = 10.0
+    stall_s: float = STALL_S
     """Time without a sound message after which a connection is given up."""
     max_clients: int = 4
     """Connections to one server."""

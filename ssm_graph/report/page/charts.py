@@ -12,6 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.progress import told
 from ssm_graph.base.runs import runs_of
 from ssm_graph.mission.estimate import OUTLIER_WEIGHT
 from ssm_graph.report.page.content import Content
@@ -103,17 +104,18 @@ MINUTES: Final = "minutes since start"
 
 def charts_of(content: Content) -> list[Chart]:
     """Return all charts for which the result has data; axes of time show all of it at first."""
-    charts = [_track(content), *_series(content), *_beams(content), *_aids(content)]
+    parts = (_track, _series, _beams, _aids, _whiteness)
+    charts = [chart for part in told(parts, len(parts)) for chart in part(content)]
     whole = {"range": [0.0, float(content.since_min[-1])]}
     return [
         replace(chart, layout={**chart.layout, "xaxis": {**chart.layout["xaxis"], **whole}})
         if chart.is_time
         else chart
-        for chart in (*charts, *_whiteness(content))
+        for chart in charts
     ]
 
 
-def _track(content: Content) -> Chart:
+def _track(content: Content) -> list[Chart]:
     """Return the map: local metres, equal scales, ellipses of three sigma."""
     enu, rows = content.local_enu, content.trajectory
     kept = thinned(len(enu))
@@ -151,7 +153,7 @@ def _track(content: Content) -> Chart:
         yaxis={"scaleanchor": "x", "scaleratio": 1},
     )
     note = "Ellipses are three sigma. Where the answer is suspect the track is thick and vermilion."
-    return Chart("track", "Track", note, traces, layout, is_time=False, height=520)
+    return [Chart("track", "Track", note, traces, layout, is_time=False, height=520)]
 
 
 def _clock(content: Content, time_s: float) -> str:

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
@@ -87,6 +86,8 @@ def cut(route: Array, first_m: float, last_m: float) -> Array:
 
 def driven(route: Array, model: DriveModel, rng: np.random.Generator) -> Poses:
     """Return the poses of a vehicle along a route (N, 2) at steady speed, near its middle."""
+    from scipy.ndimage import uniform_filter1d
+
     fine = resampled(route, _STEP_M)
     n = max(3, int(_SMOOTHING_M / _STEP_M))
     smooth = uniform_filter1d(uniform_filter1d(fine, n, axis=0), n, axis=0)

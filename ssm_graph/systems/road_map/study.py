@@ -17,6 +17,7 @@ from ssm_graph.evaluation.consistency import rate_with_interval
 from ssm_graph.study.ledger import ERROR, Key, Row
 from ssm_graph.systems.road_map.av2_log import MAP, POSES, av2_poses
 from ssm_graph.systems.road_map.camera import CameraModel
+from ssm_graph.systems.road_map.cases import CASES, METHODS
 from ssm_graph.systems.road_map.drive import Drive, Poses
 from ssm_graph.systems.road_map.hypotheses import apart, aside, is_same_lane
 from ssm_graph.systems.road_map.locate import locate
@@ -38,16 +39,6 @@ BESIDE_M: Final = 4.0
 """Lines farther from a vehicle are not those of its lane."""
 LANE_M: Final = 1.75
 """Across: a vehicle nearer to where it is held to be is in that lane."""
-METHODS: Final = ("annealed", "patent", "patent-min-max", "patent-sum")
-CASES: Final[Mapping[str, str]] = {
-    "plain": "200 m at 8 m/s, the map is true",
-    "damaged": "5 % of the boundaries missing in the map, 2 % shifted by 0.5 m",
-    "traffic": "30 % of the pictures occluded beyond 8 to 20 m, 3 % of the curves false",
-    "motorway": "400 m at 25 m/s",
-    "short": "80 m at 8 m/s, for maps of one junction",
-    "left-hand": "as plain, the map seen in a mirror",
-    "no course": "as plain, by a receiver that gives no course",
-}
 FIRST_HELD_OUT: Final = 1000
 """Seeds from here on have chosen nothing; those below 100 have."""
 

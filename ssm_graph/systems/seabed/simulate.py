@@ -8,6 +8,7 @@ import numpy as np
 
 from ssm_graph.base.frames import R_lb_from_roll_pitch_heading
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.usual import SEABED_DIVE_S
 from ssm_graph.mission.mission import InitialState, Mission
 from ssm_graph.sensors.depth import DepthLog
 from ssm_graph.sensors.drift import Drift
@@ -28,7 +29,7 @@ LONGEST_M = 200.0
 DIVE = SimulationConfig(
     name="dive over rough ground",
     route=SurveyRoute(line_m=250.0, depth=DepthProfile(40.0, 40.0)),
-    duration_s=600.0,
+    duration_s=SEABED_DIVE_S,
 )
 
 

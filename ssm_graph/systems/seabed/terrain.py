@@ -9,6 +9,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.usual import SEABED_RELIEF_M
 from ssm_graph.sensors.seabed import MapErrors, SeabedGrid
 from ssm_graph.simulation import checked
 
@@ -28,7 +29,7 @@ class TerrainSettings(checked.Settings):
 
     depth_m: float = checked.positive(80.0, hint="try 80 m")
     """In the middle."""
-    relief_m: float = checked.not_negative(6.0, hint="0 is flat")
+    relief_m: float = checked.not_negative(SEABED_RELIEF_M, hint="0 is flat")
     """Standard deviation of the field."""
     corner_m: float = checked.positive(400.0, hint="try 400 m")
     """Longer waves are no higher."""

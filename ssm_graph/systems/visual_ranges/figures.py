@@ -216,6 +216,9 @@ def _draw_scale(axes: Axes, ranging: RangingResult, begin: float) -> None:
 
 
 def _draw_states(axes: Axes, ranging: RangingResult) -> None:
+    if not ranging.anchors:
+        axes.set_axis_off()
+        return
     for n, anchor in enumerate(ranging.anchors):
         with np.errstate(invalid="ignore"):
             sigma = float(np.sqrt(np.trace(anchor.covariance)))

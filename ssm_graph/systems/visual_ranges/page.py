@@ -118,6 +118,8 @@ def _sections(
 def _anchors(ranging: RangingResult | None, errors: Accuracy | None) -> str:
     if ranging is None:
         return "<p>There were no ranges.</p>"
+    if not ranging.anchors:
+        return "<p>There were no anchors.</p>"
     rows = []
     for j, a in enumerate(ranging.anchors):
         own = np.flatnonzero((ranging.anchor_of == j) & np.isfinite(ranging.error_m))

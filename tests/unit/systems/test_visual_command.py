@@ -172,6 +172,7 @@ def test_an_answer_by_the_vehicle_alone(tmp_path: Path) -> None:
     write_outputs(tmp_path, sequence, result, found, off, ())
     figures = write_figures(tmp_path, sequence, result, found, off)
     write_page(tmp_path / "report.html", sequence, result, found, off, figures, ())
+    assert "There were no anchors." in (tmp_path / "report.html").read_text()
     answer = json.loads((tmp_path / "result.json").read_text())
     assert answer["vehicle"]["down_map_axes"] == [0.0, 0.8, 0.6]
     assert answer["vehicle"]["range_unit_m"] is None

@@ -13,7 +13,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.systems.road_map.maps.road_map import RoadLine
@@ -73,6 +72,8 @@ class LineIndex:
         self._slots[:, [0, -1]] = 0
 
     def _make_tree(self) -> None:
+        from scipy.spatial import cKDTree
+
         step = self.step[:-1]
         n = np.maximum(1, np.ceil(np.hypot(*step.T) / SPACING_M).astype(np.int64))
         self.owner = np.repeat(np.arange(len(n)), n)

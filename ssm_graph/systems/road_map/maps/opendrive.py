@@ -9,7 +9,6 @@ from typing import Final
 from xml.etree import ElementTree
 
 import numpy as np
-from scipy.special import fresnel
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
@@ -126,6 +125,8 @@ def _versine(turn: Array) -> Array:
 
 def _spiral(first: float, last: float, length: float, d: Array) -> tuple[Array, Array, Array]:
     """Return a clothoid whose curvature goes evenly from first to last, by Fresnel integrals."""
+    from scipy.special import fresnel
+
     rate = (last - first) / length
     turn = d * (first + 0.5 * rate * d)
     if abs(rate) < 1e-12:
