@@ -178,6 +178,15 @@ def of_aid(name: str, dim: int) -> Iterator[Hypothesis]:
     for course in Course:
         is_usual = name == "depth" and course is Course.RAMP
         yield replace(one, course=course, handicap=USUAL if is_usual else 0.0)
+    if dim < 3:
+        return
+    # Level and up by themselves: against the velocity of a bottom, or a depth, which have no more
+    # numbers, a place of three pays for what it does not need.
+    for part, words in ((slice(0, 2), _level), (slice(2, 3), lambda s: f"{s[0]:+.2g} m up")):
+        own = np.eye(dim)[:, part]
+        small = replace(one, combined=own, sigma=np.full(own.shape[1], size), say=words)
+        for course in (Course.CONSTANT, Course.RAMP):
+            yield replace(small, course=course)
 
 
 def _of_mode(aid: str, name: str) -> tuple[float, Callable[[Array], str]]:
@@ -248,6 +257,10 @@ def _rates(s: Array) -> str:
     return f"off by {x:+.2g}, {y:+.2g}, {z:+.2g} deg/s about x, y, z"
 
 
-def _place(s: Array) -> str:
+def _level(s: Array) -> str:
     level, to = math.hypot(s[0], s[1]), math.degrees(math.atan2(s[0], s[1])) % 360.0
-    return f"{level:.2g} m towards {to:.0f} deg and {s[2]:+.2g} m up"
+    return f"{level:.2g} m towards {to:.0f} deg"
+
+
+def _place(s: Array) -> str:
+    return f"{_level(s)} and {s[2]:+.2g} m up"
