@@ -41,6 +41,8 @@ ALLOWED = 4.0
 Of less no harm comes: the DVL's own vertical says by how much at most."""
 ALLOWED_M = 0.1
 """Prior sigma of that in 100 s: 1 mm/s. A tide of 4 m runs at 0.3 mm/s, warm-up is faster."""
+SEEN_M = 2.0 * ALLOWED_M
+"""And that by which it is looked for: larger ones are no longer usual."""
 NOISY = 24.0
 """Chi-square that a beam noisier than the others needs less: whatever makes it so, weak echoes or
 a foul transducer, seldom has a mean of zero. Over the whole mission it is freed in any case."""
