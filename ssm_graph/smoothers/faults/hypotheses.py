@@ -184,7 +184,7 @@ def of_aid(name: str, dim: int) -> Iterator[Hypothesis]:
         return
     # Level and up by themselves: against the velocity of a bottom, or a depth, which have no more
     # numbers, a place of three pays for what it does not need.
-    for part, words in ((slice(0, 2), _level), (slice(2, 3), lambda s: f"{s[0]:+.2g} m up")):
+    for part, words in ((slice(0, 2), _level), (slice(2, 3), _up)):
         own = np.eye(dim)[:, part]
         small = replace(one, combined=own, sigma=np.full(own.shape[1], size), say=words)
         for course in (Course.CONSTANT, Course.RAMP):
@@ -264,5 +264,9 @@ def _level(s: Array) -> str:
     return f"{level:.2g} m towards {to:.0f} deg"
 
 
+def _up(s: Array) -> str:
+    return f"{s[0]:+.2g} m up"
+
+
 def _place(s: Array) -> str:
-    return f"{_level(s)} and {s[2]:+.2g} m up"
+    return f"{_level(s)} and {_up(s[2:])}"
