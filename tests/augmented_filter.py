@@ -85,18 +85,20 @@ class Variables:
     def walk(self, span_s: float) -> tuple[Array, Array]:
         """Return factors and variances (E,) of how all of them go on."""
         steps = [_walk(block, span_s) for block in self._blocks]
+        factor, variance = zip(*steps, strict=True)
         sizes = [len(block.sigma) for block in self._blocks]
-        factor, variance = np.array(steps).T
-        return np.repeat(factor, sizes), np.repeat(variance, sizes)
+        return np.repeat(np.array(factor), sizes), np.concatenate(variance)
 
 
-def _walk(block: Extra, span_s: float) -> tuple[float, float]:
+def _walk(block: Extra, span_s: float) -> tuple[float, Array]:
+    size = len(block.sigma)
     if not block.is_walk:  # it may wander by a thousandth of its sigma in an hour
-        return 1.0, float((1e-3 * block.sigma[0]) ** 2 * span_s / 3600.0)
+        return 1.0, np.full(size, (1e-3 * block.sigma[0]) ** 2 * span_s / 3600.0)
+    density_sq = np.broadcast_to(block.walk_density, size) ** 2
     if math.isinf(block.correlation_s):
-        return 1.0, block.walk_density**2 * span_s
+        return 1.0, density_sq * span_s
     kept = math.exp(-span_s / block.correlation_s)
-    return kept, block.walk_density**2 * block.correlation_s * (1.0 - kept**2) / 2.0
+    return kept, density_sq * block.correlation_s * (1.0 - kept**2) / 2.0
 
 
 @dataclass(frozen=True, slots=True)

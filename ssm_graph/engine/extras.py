@@ -36,8 +36,8 @@ class Extra(ReadOnlyArrays):
     """(d,) of its prior; of a walk, at the first keyframe."""
     unit: float = 1.0
     """SI units in one of those shown."""
-    walk_density: float = 0.0
-    """Per square root of a second; zero for a constant."""
+    walk_density: float | Array = 0.0
+    """Per square root of a second, of all components or (d,) of each; zero for a constant."""
     correlation_s: float = math.inf
     """A walk forgets within so much; infinite for a random walk, which does not."""
     as_a_turn: float = 1e6
@@ -49,14 +49,15 @@ class Extra(ReadOnlyArrays):
         cls,
         name: str,
         labels: tuple[str, ...],
-        sigma: float,
+        sigma: float | Array,
         *,
         correlation_s: float,
         unit: float = 1.0,
     ) -> Self:
-        """Return a walk that keeps its variance; each component has the same ``sigma``."""
-        density = sigma * math.sqrt(2.0 / correlation_s)
-        return cls(name, labels, np.full(len(labels), sigma), unit, density, correlation_s)
+        """Return a walk that keeps its variance; ``sigma`` is of all components, or (d,)."""
+        of_each = np.broadcast_to(sigma, len(labels))
+        density = of_each * math.sqrt(2.0 / correlation_s)
+        return cls(name, labels, of_each, unit, density, correlation_s)
 
     @property
     def is_lasting(self) -> bool:
@@ -66,7 +67,7 @@ class Extra(ReadOnlyArrays):
     @property
     def is_walk(self) -> bool:
         """Whether it has a value at every keyframe."""
-        return self.walk_density > 0.0
+        return bool(np.all(np.asarray(self.walk_density) > 0.0))
 
 
 class Extras:
@@ -177,9 +178,9 @@ class Extras:
             grown_s = span_s
             if math.isfinite(block.correlation_s):
                 grown_s = 0.5 * block.correlation_s * (1.0 - kept**2)
-            sigma = block.walk_density * np.sqrt(grown_s)
+            density = np.broadcast_to(block.walk_density, len(block.sigma))
             factors.append(np.repeat(kept[:, None], len(block.sigma), axis=1))
-            sigmas.append(np.repeat(sigma[:, None], len(block.sigma), axis=1))
+            sigmas.append(np.sqrt(grown_s)[:, None] * density)
         return np.hstack(factors), np.hstack(sigmas)
 
 

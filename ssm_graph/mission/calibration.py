@@ -119,7 +119,12 @@ def calibration_extras(
             as_a_turn=1e2,
         ),
         Extra(DVL_TIME_OFFSET, ("dvl_time_offset_s",), np.array([mount.time_offset_sigma_s])),
-        *drift_variable(DVL_DRIFT, along_axes("dvl_drift_{}_m_per_s"), mount.drift),
+        *drift_variable(
+            DVL_DRIFT,
+            along_axes("dvl_drift_{}_m_per_s"),
+            mount.drift,
+            shares=np.array([1.0, 1.0, mount.drift_z_share]),
+        ),
     ]
     if depth is not None:
         extras += depth_variables(depth)

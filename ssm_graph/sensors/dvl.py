@@ -52,6 +52,9 @@ class DvlMount(FrozenArrays):
     """Prior sigma of each component of the lever arm, m; above zero asks for its calibration."""
     drift: Drift = Drift()
     """What the velocity is off by slowly, each of three components in instrument axes, m/s."""
+    drift_z_share: float = 1.0
+    """Of its sigma, what the component along the z axis has. Four beams at 30 degrees that err each
+    for itself make it 0.41: what they have in common is read along z, ``tan(30) / sqrt(2)``."""
 
     def __post_init__(self) -> None:
         super(DvlMount, self).__post_init__()
@@ -103,6 +106,7 @@ class DvlMount(FrozenArrays):
             lever_arm_sigma=0.0,
             time_offset_sigma_s=0.0,
             drift=Drift(),
+            drift_z_share=1.0,
         )
 
 

@@ -137,6 +137,11 @@ _KEYS: Final = {
     "lever_arm_sigma_m": optional_key("mount.lever_arm_sigma", *ARM_SIGMA),
     "water_noise_m_per_s": sigma_key("", 5.0, _SPEED_UNIT, required=False),
     **drift_keys("drift_sigma_m_per_s", "mount.drift", 5.0, _SPEED_UNIT),
+    "drift_z_share": sigma_key(
+        *("mount.drift_z_share", 10.0, "four beams at 30 degrees make it 0.41"),
+        required=False,
+        beside=("drift_sigma_m_per_s", "expected with a drift_sigma_m_per_s above 0, got none"),
+    ),
 }
 
 

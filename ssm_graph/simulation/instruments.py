@@ -361,10 +361,11 @@ def stating(mission: Mission, errors: InstrumentErrors) -> Mission:
     if errors.beams and errors.beams.slow:
         # Of a velocity along each axis of the instrument from beams that err each for itself.
         mount = dvl.mount
-        covariance = np.linalg.inv(mount.beams_d.T @ mount.beams_d)
-        of_axis = math.sqrt(float(np.trace(covariance)) / 3.0)
-        drift = errors.beams.slow.drift(of_axis * float(np.mean(dvl.sigma)))
-        dvl = replace(dvl, mount=replace(mount, drift=drift))
+        x_sq, y_sq, z_sq = np.diagonal(np.linalg.inv(mount.beams_d.T @ mount.beams_d)).tolist()
+        level = math.sqrt(0.5 * (x_sq + y_sq))
+        drift = errors.beams.slow.drift(level * float(np.mean(dvl.sigma)))
+        share = math.sqrt(z_sq) / level
+        dvl = replace(dvl, mount=replace(mount, drift=drift, drift_z_share=share))
     if gnss and errors.gnss:
         sigma = float(np.mean(gnss.sigma_enu))
         known = replace(gnss.calibration, drift=errors.gnss.drift(sigma))

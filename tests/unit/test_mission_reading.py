@@ -10,7 +10,9 @@ import pytest
 
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
+from ssm_graph.engine.extras import Extras
 from ssm_graph.io.mission_folder.folder import read_mission
+from ssm_graph.mission.calibration import DVL_DRIFT, extras_of
 from ssm_graph.mission.mission import Mission
 from ssm_graph.sensors.drift import Drift
 from tests.mission_damage import (
@@ -346,12 +348,19 @@ def test_no_folder(tmp_path: Path) -> None:
 def test_drifts_are_read(tmp_path: Path) -> None:
     """Of DVL and GNSS; all of the noise stays white unless a share is given."""
     dvl = "drift_sigma_m_per_s = 0.006\ndrift_correlation_s = 20\ndrift_white_share = 0.25"
+    dvl += "\ndrift_z_share = 0.41"
     gnss = "drift_sigma_m = 0.5\ndrift_correlation_s = 120"
     mission = read_after(
         tmp_path, toml("\n[depth]", f"{dvl}\n\n[depth]"), toml("\n[gnss]", f"\n[gnss]\n{gnss}")
     )
     assert mission.gnss is not None
     assert mission.dvl.mount.drift == Drift(0.006, 20.0, 0.25)
+    assert mission.dvl.mount.drift_z_share == 0.41
+    drift = next(one for one in extras_of(mission).blocks if one.name == DVL_DRIFT)
+    np.testing.assert_allclose(drift.sigma, [0.006, 0.006, 0.00246])
+    steady = np.tile(drift.sigma, (2, 1))
+    kept, grown = Extras((drift,)).transitions(np.array([1.0, 1e4]))
+    np.testing.assert_allclose(np.hypot(kept * steady, grown), steady)
     assert mission.gnss.calibration.drift == Drift(0.5, 120.0, 1.0)
 
 
@@ -361,6 +370,7 @@ def test_drifts_are_read(tmp_path: Path) -> None:
         ("drift_sigma_m_per_s = 0.006", "expected with a drift_correlation_s"),
         ("drift_correlation_s = 20.0", "expected with a drift_sigma_m_per_s above 0"),
         ("drift_white_share = 0.5", "expected with a drift_sigma_m_per_s above 0"),
+        ("drift_z_share = 0.5", "expected with a drift_sigma_m_per_s above 0"),
         ("drift_correlation_s = 20.0\ndrift_white_share = 1.5", "above 0 and up to 1"),
     ],
 )

@@ -233,8 +233,14 @@ def along_axes(pattern: str) -> tuple[str, ...]:
     return tuple(pattern.format(axis) for axis in "xyz")
 
 
-def drift_variable(name: str, labels: tuple[str, ...], drift: Drift) -> tuple[Extra, ...]:
-    """Return a drift with a component for each label, or nothing."""
+def drift_variable(
+    name: str, labels: tuple[str, ...], drift: Drift, *, shares: Array | float = 1.0
+) -> tuple[Extra, ...]:
+    """Return a drift with a component for each label, or nothing.
+
+    ``shares`` are those of its sigma that the components (d,) have.
+    """
     if drift.sigma == 0.0:
         return ()
-    return (Extra.gauss_markov(name, labels, drift.sigma, correlation_s=drift.correlation_s),)
+    sigma = drift.sigma * shares
+    return (Extra.gauss_markov(name, labels, sigma, correlation_s=drift.correlation_s),)

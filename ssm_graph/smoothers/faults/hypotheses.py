@@ -41,6 +41,8 @@ ALLOWED = 4.0
 Of less no harm comes: the DVL's own vertical says by how much at most."""
 ALLOWED_M = 0.1
 """Prior sigma of that in 100 s: 1 mm/s. A tide of 4 m runs at 0.3 mm/s, warm-up is faster."""
+SEEN_M = 2.0 * ALLOWED_M
+"""And that by which it is looked for: larger ones are no longer usual."""
 NOISY = 24.0
 """Chi-square that a beam noisier than the others needs less: whatever makes it so, weak echoes or
 a foul transducer, seldom has a mean of zero. Over the whole mission it is freed in any case."""
@@ -178,6 +180,15 @@ def of_aid(name: str, dim: int) -> Iterator[Hypothesis]:
     for course in Course:
         is_usual = name == "depth" and course is Course.RAMP
         yield replace(one, course=course, handicap=USUAL if is_usual else 0.0)
+    if dim < 3:
+        return
+    # Level and up by themselves: against the velocity of a bottom, or a depth, which have no more
+    # numbers, a place of three pays for what it does not need.
+    for part, words in ((slice(0, 2), _level), (slice(2, 3), _up)):
+        own = np.eye(dim)[:, part]
+        small = replace(one, combined=own, sigma=np.full(own.shape[1], size), say=words)
+        for course in (Course.CONSTANT, Course.RAMP):
+            yield replace(small, course=course)
 
 
 def _of_mode(aid: str, name: str) -> tuple[float, Callable[[Array], str]]:
@@ -248,6 +259,14 @@ def _rates(s: Array) -> str:
     return f"off by {x:+.2g}, {y:+.2g}, {z:+.2g} deg/s about x, y, z"
 
 
-def _place(s: Array) -> str:
+def _level(s: Array) -> str:
     level, to = math.hypot(s[0], s[1]), math.degrees(math.atan2(s[0], s[1])) % 360.0
-    return f"{level:.2g} m towards {to:.0f} deg and {s[2]:+.2g} m up"
+    return f"{level:.2g} m towards {to:.0f} deg"
+
+
+def _up(s: Array) -> str:
+    return f"{s[0]:+.2g} m up"
+
+
+def _place(s: Array) -> str:
+    return f"{_level(s)} and {_up(s[2:])}"

@@ -20,6 +20,7 @@ from ssm_graph.smoothers.faults.grid import Grid
 from ssm_graph.smoothers.faults.hypotheses import (
     ALLOWED,
     ALLOWED_M,
+    SEEN_M,
     Course,
     Hypothesis,
     hypotheses_of,
@@ -47,6 +48,9 @@ SAME_STRETCH = 0.5
 SAME_ANSWER_SIGMAS = 1.0
 """Explanations whose answers are nowhere further apart are one."""
 MOST_RIVALS = 2
+AS_ALONE = 2.0
+"""Prior sigma of rivals that are free together, by what each would be alone. Either is at most
+one such size off what both make of it, half of that sigma."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +195,9 @@ class Look:
             if not one.is_usual:
                 continue
             small = replace(one, sigma=np.full_like(one.sigma, ALLOWED_M))
-            chi_sq = judged.table(small)[0][:-1, -1]
+            # Where the data say little, so small a prior would hide it.
+            seen = replace(one, sigma=np.full_like(one.sigma, SEEN_M))
+            chi_sq = judged.table(seen)[0][:-1, -1]
             begin = int(np.argmax(chi_sq))
             if chi_sq[begin] > ALLOWED:
                 fault = Fault(small, int(edges[begin]), int(edges[-1]), float(chi_sq[begin]))
@@ -219,7 +225,10 @@ class Look:
             if apart.sigmas > SAME_ANSWER_SIGMAS:
                 kept.append(rival)
                 cost_m = max(cost_m, apart.level_m)
-        return replace(best, rivals=tuple(kept[:MOST_RIVALS]), cost_m=cost_m)
+        if not kept:
+            return best
+        sized = [as_large_as_alone(one, fine, others) for one in (best, *kept[:MOST_RIVALS])]
+        return replace(sized[0], rivals=tuple(sized[1:]), cost_m=cost_m)
 
     def _grid(self, faults: Iterable[Fault], *, around: Iterable[Fault] = ()) -> Grid:
         """Return blocks that begin and end where faults do, and fine ones about some."""
@@ -286,6 +295,21 @@ def onsets_of(ramp: Fault, judged: Judged) -> tuple[Fault, ...]:
         if np.min(np.abs(edge_s[known] - edge_s[at])) >= grid.block_s:
             known.append(int(at))
     return tuple(replace(ramp, begin=int(grid.edges[at])) for at in known[1:])
+
+
+def as_large_as_alone(fault: Fault, judged: Judged, others: Sequence[Fault]) -> Fault:
+    """Return a fault that is about as large as it would have to be by itself.
+
+    Where it and a rival are both free the data tell their difference alone, and what both have in
+    common would be free as well. ``others`` are freed besides.
+    """
+    hypothesis = fault.hypothesis
+    if hypothesis.course is Course.ANYTHING:
+        return fault
+    alone = float(np.linalg.norm(judged.sizes([*others, replace(fault, onsets=())])[-1]))
+    sized = replace(hypothesis, sigma=np.minimum(hypothesis.sigma, AS_ALONE * alone))
+    onsets = tuple(replace(ramp, hypothesis=sized) for ramp in fault.onsets)
+    return replace(fault, hypothesis=sized, onsets=onsets)
 
 
 def is_part_of(one: Fault, other: Fault) -> bool:
