@@ -122,6 +122,7 @@ class ListSource:
         self._n_given = 0
         self.time_s = self.elapsed_s = 0.0
         self.events: list[Event] = []
+        self.last_events: list[Event] = []
 
     @property
     def is_finished(self) -> bool:
@@ -130,6 +131,11 @@ class ListSource:
 
     def waiting(self) -> list[Readings]:
         """Return what has come and waits: nothing."""
+        return []
+
+    def end(self) -> list[Message]:
+        """Return what waits at the end, and tell of it: a test may want something to happen."""
+        self.events, self.last_events = [*self.events, *self.last_events], []
         return []
 
     def poll(self, timeout_s: float) -> list[Message]:  # noqa: ARG002

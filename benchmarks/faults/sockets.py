@@ -335,6 +335,10 @@ class Voyage:
         """Return what has come and waits."""
         return self.vessel.hub.waiting()
 
+    def end(self) -> list[Message]:
+        """Return what waits when the run ends."""
+        return self.vessel.hub.end()
+
     def poll(self, timeout_s: float) -> list[Message]:
         """Send all messages up to the next inertial sample and receive what comes of it."""
         del timeout_s

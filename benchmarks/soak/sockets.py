@@ -118,6 +118,10 @@ class Ear:
         """Return what has come and waits."""
         return self._hub.waiting()
 
+    def end(self) -> list[Message]:
+        """Return what waits when the run ends."""
+        return self._hub.end()
+
     def poll(self, timeout_s: float) -> list[Message]:
         """Return what has come; tell of it once a second."""
         messages = self._hub.poll(timeout_s)

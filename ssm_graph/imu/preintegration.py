@@ -19,6 +19,7 @@ from ssm_graph.base.progress import told
 from ssm_graph.base.stepwise import Steps, at_once, finished
 from ssm_graph.base.times import usual_interval
 from ssm_graph.imu.increments import MergedSamples, merge_samples_steps
+from ssm_graph.imu.thinned import sampling_interval, unseen_steps
 from ssm_graph.sensors.imu import FrozenAxis, ImuLog, ImuNoise, frozen_axes
 
 AT_ONCE = 16
@@ -148,7 +149,7 @@ def preintegrate_steps(
     errors: Array | None = None,
     frozen: Sequence[FrozenAxis] = (),
     cuts_gaps: bool = False,
-    unseen_s: float = 0.0,
+    period_s: float | None = None,
 ) -> Steps[InertialChain]:
     """Preintegrate the inertial data between keyframes.
 
@@ -164,8 +165,7 @@ def preintegrate_steps(
     frozen : axes that repeat themselves by what came before these samples; all that they have
         missed is uncertain in the first interval.
     cuts_gaps : the times cut gaps to pieces, which are off together, not each for itself.
-    unseen_s : of the first interval, where many samples are missing here and there: how long of a
-        step between two nothing is seen of, s. What is taken for it is late by that, all the time.
+    period_s : the interval between samples where all come, s; that of the log when left out.
     """
     source = None
     if errors is not None:
@@ -173,9 +173,13 @@ def preintegrate_steps(
         imu = without_errors(imu, errors)
     gaps, repeating = imu_gaps(imu), frozen_axes(imu)
     motions = _unseen(imu, keyframe_s, gaps, repeating, frozen, cuts_gaps=cuts_gaps)
-    if unseen_s > 0.0:
-        every = np.ones(3)
-        motions[0] = _more_unseen(motions[0], unseen_s, GAP_GYRO_RATE * every, GAP_ACCEL * every)
+    if not cuts_gaps:  # pieces are too short to tell what is missing of them
+        edges = np.concatenate([[imu.start_s], imu.time_s])
+        period_s = sampling_interval(edges) if period_s is None else period_s
+        unseen_s = unseen_steps(imu.time_s, keyframe_s, gaps, period_s)
+        for k in np.flatnonzero(unseen_s).tolist():
+            turn, push = np.full(3, GAP_GYRO_RATE), np.full(3, GAP_ACCEL)
+            motions[k] = _more_unseen(motions[k], float(unseen_s[k]), turn, push)
     unseen = tuple(motions)
     imu = thawed(imu, repeating)
     yield 3e-4 * len(imu.time_s)

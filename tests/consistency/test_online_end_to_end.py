@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -43,10 +44,10 @@ from ssm_graph.sensors.gnss import Fix
 from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.sensors.messages import Message
 from tests.instrument_fixture import A50, UdpSender, free_port, gga, pips
-from tests.mission_fixture import LENGTH_S, make_mission
+from tests.mission_fixture import make_mission
 
-SPEED = 5.0
-"""So many times as fast as the vehicle."""
+TURN_S = 0.02
+"""What the vehicle's clock goes on by while an instrument waits to be called."""
 ROOT = Path(__file__).parents[2]
 PATIENCE_S = 60.0
 
@@ -210,29 +211,45 @@ def connected(port: int) -> Iterator[socket.socket]:
 
 
 class Ship:
-    """Instruments that play a mission on their own sockets, in a thread, with mishaps."""
+    """Instruments that play a mission on their own sockets, in a thread, with mishaps.
 
-    def __init__(self, hub: SocketHub, a50: A50, wall_s: Callable[[], float]) -> None:
-        self.a50, self._wall_s = a50, wall_s
+    The vehicle's clock goes with what is played, 0.1 s after it, and no further than what has been
+    taken: however busy the computer is, everything comes at the same times.
+    """
+
+    def __init__(self, hub: SocketHub, a50: A50, time_s: list[float]) -> None:
+        self._hub, self.a50, self._time_s = hub, a50, time_s
         ports = {s.feed.name: s.port for s in hub.inputs if isinstance(s, UdpInput)}
         self._senders = {name: UdpSender(port) for name, port in ports.items()}
-        self._is_calling = True
+        self._n_sent = Counter[str]()
         self.failure: BaseException | None = None
+        self.on_end: Callable[[], object] = lambda: None
         self.thread = threading.Thread(target=self._play, name="ship")
+
+    def wait(self) -> None:
+        """Have time go on, where nothing is played."""
+        self._time_s[0] += TURN_S
+        time.sleep(0.001)
 
     def _play(self) -> None:
         try:
             self.a50.accept()
             for message in messages_of(make_mission()):
-                while self._wall_s() < message.time_s + 0.1:
-                    time.sleep(0.001)
+                self._time_s[0] = max(self._time_s[0], message.time_s + 0.1)
                 self._mishap(message)
                 self._send(message)
+                wait_for(self._is_taken, f"all up to {message}")
+            self._time_s[0] += 1.0  # for a fix that waits for its GST
         except BaseException as error:
             self.failure = error
         finally:
             for sender in self._senders.values():
                 sender.close()
+            self.on_end()
+
+    def _is_taken(self) -> bool:
+        taken = {status.name: status.n_messages for status in self._hub.source_status()}
+        return all(taken[name] >= n for name, n in self._n_sent.items())
 
     def _mishap(self, message: Message) -> None:
         """Break the connection amid a report, send garbage and repeat what was sent."""
@@ -251,13 +268,18 @@ class Ship:
     def _send(self, message: Message) -> None:
         match message:
             case Ping():
+                name = "dvl"
                 self.a50.send(message)
             case ImuSample():
-                self._senders["imu"].send(encode_message(message))
+                name = "imu"
+                self._senders[name].send(encode_message(message))
             case Fix():
-                self._senders["gnss"].send(gga(message))
+                name = "gnss"
+                self._senders[name].send(gga(message))
             case DepthReading():
-                self._senders["depth"].send(pips(message))
+                name = "depth"
+                self._senders[name].send(pips(message))
+        self._n_sent[name] += 1
 
 
 class Reader:
@@ -280,16 +302,16 @@ class Reader:
             self._lines = stream.readlines()
 
 
-def test_instruments_on_sockets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_instruments_on_sockets(tmp_path: Path) -> None:
     """A50 over TCP, GNSS and depth as NMEA, IMU as JSON: the answer is where the vehicle is."""
-    monkeypatch.setattr("ssm_graph.live.sockets.sockets.STANDSTILL_S", 2.0 * SPEED)
-    mission, begin_s = make_mission(), time.monotonic() + 0.5
-    vehicle, a50 = vehicle_of(mission), A50()
+    mission, time_s = make_mission(), [0.0]
+    a50 = A50(on_idle=lambda: ship.wait())
+    vehicle = vehicle_of(mission)
 
     def wall_s() -> float:
-        return (time.monotonic() - begin_s) * SPEED
+        return time_s[0]
 
-    limits = Limits(retry_s=(0.02, 0.1), stall_s=10.0 * SPEED, connect_s=5.0 * SPEED)
+    limits = Limits(retry_s=(0.02, 0.1))
     nothing = Endpoint(Transport.UDP, LOOPBACK, 0)
     inputs = [
         InputConfig(
@@ -302,7 +324,7 @@ def test_instruments_on_sockets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     serving = Endpoint(Transport.TCP_SERVER, LOOPBACK, 0)
     outputs = [OutputConfig(form, serving) for form in OutputFormat]
     with SocketHub(inputs, outputs, wall_s=wall_s, steady_s=wall_s) as hub:
-        ship = Ship(hub, a50, wall_s)
+        ship = Ship(hub, a50, time_s)
         readers = [
             Reader(output.port) for output in hub.outputs if isinstance(output, TcpServerOutput)
         ]
@@ -311,12 +333,10 @@ def test_instruments_on_sockets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
             engine_of(vehicle, ONLINE),
             lambda _: Connections(hub, hub),
         )
-        stopper = threading.Timer((LENGTH_S + 1.0) / SPEED + 0.5, runner.stop)
+        ship.on_end = runner.stop
         ship.thread.start()
-        stopper.start()
         end = runner.run()
         ship.thread.join()
-        stopper.join()
         a50.vanish()
         statuses = {status.name: status for status in hub.source_status()}
     assert ship.failure is None, ship.failure

@@ -299,13 +299,56 @@ def test_what_waits_to_be_read_is_not_lost_at_the_end() -> None:
         sifted.give([time_s], time_s + (1.1 if k % 2 else 0.1))
     n_waiting = 44 - len(sifted.passed)
     assert 0 < n_waiting <= 4
-    waiting = sifted.clock.waiting()
+    waiting = sifted.clock.waiting(sifted.now)
     rest, others = ([readings[k] for readings in waiting] for k in range(2))
     np.testing.assert_allclose(
         [message.time_s for message in rest], 100.0 + 0.7 * np.arange(44 - n_waiting, 44), atol=1e-6
     )
     off_s = [one.time_s - other.time_s for one, other in zip(rest, others, strict=True)]
     np.testing.assert_allclose(off_s[1:], 0.5)  # the first was stamped before it was set
+
+
+@pytest.mark.parametrize(
+    ("off_s", "is_steady"),
+    [(3600.0, True), (-3600.0, True), (0.5, True), (3600.0, False), (0.5, False)],
+)
+def test_a_clock_in_judgement_at_the_end(off_s: float, *, is_steady: bool) -> None:
+    """Once the known one has missed its turn, it was set; read as if it had been believed."""
+    sifted, believed = (Sifted(is_steady=is_steady) for _ in range(2))
+    n_before = 200
+    for one, end_s in ((sifted, 102.8), (believed, 104.0)):
+        one.run(100.0, 102.0)
+        one.run(102.0, end_s, offset_s=off_s)
+    assert len(sifted.passed) == n_before
+    waiting = [readings[0].time_s for readings in sifted.clock.waiting(sifted.now)]
+    assert waiting == believed.passed[n_before : n_before + 80]  # bit for bit: it counts once
+    passed, refused = sifted.clock.end(sifted.now)
+    assert ([message.time_s for message in passed], refused) == (waiting, [])
+    assert sifted.clock.end(sifted.now) == ([], [])
+
+
+@pytest.mark.parametrize("off_s", [3600.0, -3600.0, 3.0])
+def test_strays_at_the_end_are_refused_and_told(off_s: float) -> None:
+    """The known clock has not missed its turn: nothing says that it was set."""
+    clock = Steady()
+    with hub_with(Transport.UDP, clock) as hub:
+        receiver = Receiver(hub)
+        receiver.poll()
+        sender = UdpSender(port_of(hub))
+        for k in range(20):
+            clock.now_s += PERIOD_S
+            sender.send(encode_message(sample(50.0 + k * PERIOD_S)))
+            receiver.until(lambda n=k: len(receiver.messages) == n + 1)  # type: ignore[misc]
+        strays = [encode_message(sample(50.0 + off_s + k * PERIOD_S)) for k in range(20)]
+        n_bytes = hub.source_status()[0].n_bytes + sum(map(len, strays))
+        sender.send(b"".join(strays))
+        receiver.until(lambda: hub.source_status()[0].n_bytes == n_bytes)
+        assert not hub.waiting()
+        assert not hub.end()
+        receiver.poll()
+        (said,) = (event.text for event in receiver.events if event.kind == "clock_refused")
+        assert said.startswith("imu: 20 inertial samples of another clock, which waited")
+        sender.close()
 
 
 def test_strays_are_refused_while_others_wait_to_be_read() -> None:

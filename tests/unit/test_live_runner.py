@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import threading
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +18,7 @@ from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.io.raw_log.log import RawLog
 from ssm_graph.io.results.tables import read_results
 from ssm_graph.io.tables.checkpoint import CHECKPOINT_NAME, older_name
+from ssm_graph.live.run.clock_file import ClockFile
 from ssm_graph.live.run.disk import CheckpointWriter
 from ssm_graph.live.run.replay_source import ReplaySource
 from ssm_graph.live.run.run_folder import RunFolder
@@ -351,6 +354,39 @@ def test_a_slow_disk_does_not_hold_up_the_loop(
     ticks = iter(range(100_000))
     run(tmp_path, ListSource(some_messages()), steady_s=lambda: float(next(ticks)))
     assert "checkpoint_late" in kinds(tmp_path)
+
+
+def test_no_message_waits_for_the_disk_to_confirm(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While a run goes on only threads of the disk wait for fsync, each second of it anew."""
+    waited: list[tuple[bool, int]] = []
+    source = ListSource(some_messages())
+    clock_file = ClockFile(tmp_path, boot="a")
+
+    def fsync(_: int) -> None:
+        waited.append((threading.current_thread() is threading.main_thread(), source._n_given))
+
+    class Setting(FakeEstimator):
+        def push(self, message: Message) -> None:
+            """Have the clock be set as well."""
+            super().push(message)
+            assert clock_file.note(message.time_s, 30.0, 0.0) is None
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    ticks = iter(range(100_000))
+    run(tmp_path, source, Engine(Setting, Setting.restore), steady_s=lambda: float(next(ticks)))
+    on_the_way = [is_main for is_main, n_given in waited if 0 < n_given < len(some_messages())]
+    assert len(on_the_way) > 10
+    assert not any(on_the_way)
+
+
+def test_what_a_source_says_at_the_end_is_an_event(tmp_path: Path) -> None:
+    """It is told what was refused then."""
+    source = ListSource(some_messages())
+    source.last_events = [Event(1.0, Severity.WARNING, "clock_refused", "3 pings")]
+    run(tmp_path, source)
+    assert "clock_refused" in kinds(tmp_path)
 
 
 def test_a_checkpoint_that_fails_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -64,6 +64,24 @@ def test_pings_off_the_water_do_not_count() -> None:
     assert "dvl_water_track" in kinds(smoother)
 
 
+def test_two_receivers_at_one_port() -> None:
+    """Of two fixes of one moment the first counts, the other is counted and told; later ones do."""
+    fixes = [m for m in messages() if isinstance(m, Fix)]
+    others = [replace(fix, lat=fix.lat + 1e-6, height=fix.height + 1.0) for fix in fixes]
+    smoother = pushed(sorted([*messages(), *others, *others[:3]], key=lambda m: m.time_s))
+    newest, expected = smoother.newest(), undisturbed()
+    assert newest is not None
+    assert (newest.lat, newest.lon, newest.height) == (expected.lat, expected.lon, expected.height)
+    assert smoother.counts["gnss contrary"] == len(fixes) + 3
+    assert "gnss repeated" not in smoother.counts
+    assert "gnss_contrary" in kinds(smoother)
+    later = [replace(fix, time_s=fix.time_s + 0.3) for fix in fixes[:-1]]
+    smoother = pushed(sorted([*messages(), *later], key=lambda m: m.time_s))
+    assert not [what for what in smoother.counts if what.startswith("gnss")]
+    assert (newest := smoother.newest()) is not None
+    assert newest.position_sigma_enu[0] < expected.position_sigma_enu[0]
+
+
 def test_a_frozen_report_counts_once() -> None:
     """Every copy with a new stamp is refused, not every other one."""
     pings = [m for m in messages() if isinstance(m, Ping) and m.time_s > 6.0]

@@ -64,6 +64,39 @@ def test_no_covariance_of_an_interval_comes_near_identity(noise: ImuNoise) -> No
     assert np.linalg.eigvalsh(covariance / np.sqrt(np.outer(*[np.diagonal(covariance)] * 2)))[0] > 0
 
 
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.5])
+def test_many_missing_samples_make_sigmas_grow(share: float) -> None:
+    """More than 30 % missing here and there; a log says by itself how many there would be."""
+    rng = np.random.default_rng(7)
+    edges = np.arange(0, 1001) / 100.0
+    kept = (edges[1:] <= 4.0) | (edges[1:] > 6.0) | (rng.random(1000) >= share)
+    log = ImuLog(
+        0.0,
+        NOISE,
+        edges[1:][kept],
+        np.zeros((kept.sum(), 3)),
+        np.tile([0, 0, -9.8], (kept.sum(), 1)),
+    )
+    keyframe_s = np.arange(0.0, 10.5, 0.5)
+    chain = preintegrate(log, keyframe_s, frame=FRAME, rate_hz=100.0)
+    sigma = np.sqrt([np.diagonal(one)[:9] for one in chain.intervals.covariance])
+    is_thin = (keyframe_s[:-1] >= 4.0) & (keyframe_s[1:] <= 6.0) & (share > 0.3)
+    assert np.all(sigma[is_thin] > 3.0 * sigma[0])
+    np.testing.assert_allclose(
+        sigma[~is_thin], np.broadcast_to(sigma[0], sigma[~is_thin].shape), rtol=0.2
+    )
+    for k in np.flatnonzero(is_thin):  # on the way, by the interval that was usual before
+        near = (log.time_s > keyframe_s[k] - 0.2) & (log.time_s < keyframe_s[k + 1] + 0.2)
+        some = ImuLog(
+            float(log.time_s[near][0]),
+            NOISE,
+            *(x[near][1:] for x in (log.time_s, log.gyro_b, log.accel_b)),
+        )
+        own = preintegrate(some, keyframe_s[k : k + 2], frame=FRAME, rate_hz=100.0, period_s=0.01)
+        assert own.unseen[0].gap_s == pytest.approx(chain.unseen[k].gap_s)
+        assert own.unseen[0][1:] == chain.unseen[k][1:]
+
+
 def test_a_bias_that_does_not_walk_still_has_a_covariance() -> None:
     """A thousandth of the turn-on sigma within an hour keeps the chain regular."""
     still = ImuNoise(1e-5, 2e-4, gyro_bias_sigma=3e-6, accel_bias_sigma=4e-3)

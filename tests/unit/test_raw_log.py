@@ -314,6 +314,33 @@ def test_what_waits_to_be_told_its_time_outlives_the_process(
     assert shown(replayed(tmp_path / "log")) == [*expected, *shown(messages[30:31])]
 
 
+@pytest.mark.parametrize("n_torn", [0, 5])
+def test_a_mission_has_what_waited_when_its_log_ended(tmp_path: Path, n_torn: int) -> None:
+    """Killed and not gone on with: rows without a place count where the log is read, and are told.
+
+    A row that was torn at the end of its table stays what it is.
+    """
+    messages = list(messages_of(make_mission()))
+    pings = [one for one in messages if isinstance(one, Ping)][-3:]
+    with log_of(tmp_path, [one for one in messages if one not in pings]) as log:
+        log.hold([(one, replace(one, time_s=one.time_s + 0.5)) for one in pings[:2]])
+        whole = read_mission(tmp_path)
+        log.append(replace(pings[0], time_s=pings[0].time_s + 0.5))
+        other = read_mission(tmp_path)
+        log.hold([(one,) for one in pings])
+    with (tmp_path / "dvl.csv").open("a") as stream:
+        stream.write("12345"[:n_torn])
+    want_s = make_mission().dvl.time_s
+    np.testing.assert_array_equal(whole.dvl.time_s, want_s[:-1])
+    assert whole.notes[0].endswith("at their likelier times: 2 of [dvl]")
+    np.testing.assert_allclose(other.dvl.time_s[-2:], np.sort([want_s[-3] + 0.5, want_s[-2]]))
+    assert other.notes[0].endswith("at their likelier times: 1 of [dvl]")
+    got = read_mission(tmp_path)
+    np.testing.assert_array_equal(np.setdiff1d(want_s, got.dvl.time_s), [])
+    assert any("no end" in note for note in got.notes) == bool(n_torn)
+    assert not any("torn line" in note for note in got.notes)
+
+
 @pytest.mark.parametrize(
     "damage", [b"", b"\0" * 50, b"d1,2", b"d1,2\n|\n", b"|d1.0,x\n", b"\xff\n\n"]
 )

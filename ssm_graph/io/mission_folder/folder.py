@@ -30,6 +30,8 @@ from ssm_graph.io.mission_folder.toml import (
     read_mission_toml,
     table_path,
 )
+from ssm_graph.io.raw_log.kinds import RowKind
+from ssm_graph.io.raw_log.waiting import WAITING, left_waiting
 from ssm_graph.io.seabed.section import map_settings, with_map, write_map
 from ssm_graph.io.tables.append_file import write_through
 from ssm_graph.io.tables.files import TableFormat, read_arrival_table, read_table, write_table
@@ -111,8 +113,7 @@ def read_log(toml: MissionToml, one: Instrument) -> Any:
 
 def _read_tables(toml: MissionToml, bare: dict[str, Any]) -> tuple[dict[str, Table], list[str]]:
     tables: dict[str, Table] = {}
-    notes: list[str] = []
-    read = read_table if toml.order is Order.TIME else read_arrival_table
+    waited, notes = _waited(toml, bare)
     for one in TABLES:
         section = one.section
         if section not in bare:
@@ -122,13 +123,34 @@ def _read_tables(toml: MissionToml, bare: dict[str, Any]) -> tuple[dict[str, Tab
         if path is None:
             notes.append(f"{label}: there is no such file; going on without [{section}]")
             continue
-        table = read(path, label, one.spec(bare[section]))
+        spec = one.spec(bare[section])
+        if toml.order is Order.TIME:
+            table = read_table(path, label, spec)
+        else:
+            table = read_arrival_table(path, label, spec, waited.get(section, ()))
         notes += table.notes
         if len(table) or section in REQUIRED_SECTIONS:
             tables[section] = table
         else:
             notes.append(f"{label}: the table has no rows; going on without [{section}]")
     return tables, notes
+
+
+def _waited(
+    toml: MissionToml, bare: dict[str, Any]
+) -> tuple[dict[str, tuple[str, ...]], list[str]]:
+    """Return by section the lines of a live run's log that had no row yet, and a note on them."""
+    if toml.order is Order.TIME:
+        return {}, []
+    live = [one for one in TABLES if one.section in bare and one.message is not None]
+    kinds = {RowKind(one, bare[one.section]): one.section for one in live}
+    rows: dict[str, tuple[str, ...]] = {}
+    for kind, record in left_waiting(toml.folder, kinds):
+        rows[kinds[kind]] = (*rows.get(kinds[kind], ()), record.decode())
+    counts = ", ".join(f"{len(lines)} of [{section}]" for section, lines in rows.items())
+    said = f"{WAITING}: rows that waited for a place in their tables when the log was written last "
+    said += "are read from there, at their likelier times"
+    return rows, [f"{said}: {counts}"] if rows else []
 
 
 def _lists_without_section(toml: MissionToml) -> list[str]:

@@ -9,6 +9,7 @@ import csv
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import TextIO
 
@@ -41,6 +42,8 @@ class CsvFile(TableFile):
     path: Path
     errors: str = "strict"
     """What to do with bytes that are no UTF-8, as in :func:`open`."""
+    also: tuple[str, ...] = ()
+    """Lines that stand elsewhere and count as the last of the file."""
 
     def place(self, row: int) -> str:  # noqa: D102
         return f"{self.label}:{self._line(row)[0]}"
@@ -60,7 +63,7 @@ class CsvFile(TableFile):
     def lines(self) -> Iterator[tuple[int, str]]:
         """Yield number and text of every line below the header that is not blank."""
         with self.open() as file:
-            for number, line in enumerate(file, start=1):
+            for number, line in enumerate(chain(file, self.also), start=1):
                 if number > 1 and line.strip():
                     yield number, line
 

@@ -199,7 +199,9 @@ def _note(counts: Counter[str], label: str) -> tuple[str, ...]:
     return (f"{label}: {'; '.join(parts)}",) if parts else ()
 
 
-def read_arrival_table(path: Path, label: str, spec: TableSpec) -> Table:
+def read_arrival_table(
+    path: Path, label: str, spec: TableSpec, also: tuple[str, ...] = ()
+) -> Table:
     """Read a table in order of arrival; return it in order of time, each time once.
 
     Left out and counted in one note are rows that repeat a time (the first stays), lines that are
@@ -210,18 +212,21 @@ def read_arrival_table(path: Path, label: str, spec: TableSpec) -> Table:
     Raises :class:`DataError` for a file that is no table, a missing, unknown or repeated column,
     rows most of which cannot be read, and a clock that was begun anew or set back on the way.
 
-    The ending of ``path`` decides the format; ``label`` is its name in messages.
+    The ending of ``path`` decides the format; ``label`` is its name in messages; ``also`` are lines
+    that stand elsewhere and count as the last of a CSV file.
     """
     counts: Counter[str] = Counter()
-    table = _read(path, label, spec, partial(_read_csv_as_it_came, counts=counts))
+    table = _read(path, label, spec, partial(_read_csv_as_it_came, counts=counts, also=also))
     table = _without_impossible(table, spec, counts)
     _check_one_clock(table)
     table = _in_order_of_time(table, spec, counts)
     return replace(table, notes=_note(counts, label))
 
 
-def _read_csv_as_it_came(path: Path, label: str, spec: TableSpec, counts: Counter[str]) -> Table:
-    file = CsvFile(label, path, errors="replace")
+def _read_csv_as_it_came(
+    path: Path, label: str, spec: TableSpec, counts: Counter[str], also: tuple[str, ...]
+) -> Table:
+    file = CsvFile(label, path, errors="replace", also=also)
     check_is_text(file, may_hold_zeros=True)
     names = read_csv_header(file)
     check_names(f"{label}:1", names, spec)
@@ -240,14 +245,15 @@ def _read_lines(
     stream = (line for _, line in file.lines())
     while chunk := list(islice(stream, _CHUNK)):
         first, row = row, row + len(chunk)
-        if not chunk[-1].endswith("\n"):  # only the last line of all
-            counts["torn_end"] = 1
-            del chunk[-1]
-        values = _numbers(chunk, len(names))
+        n_open = sum(not line.endswith("\n") for line in chunk)
+        if n_open:  # the last line of the file
+            counts["torn_end"] = n_open
+            chunk = [line if line.endswith("\n") else "" for line in chunk]
+        values = None if n_open else _numbers(chunk, len(names))
         kept = np.arange(len(chunk), dtype=np.int64)
         if values is None:
             good = list(_good_rows(chunk, names, blank))
-            counts["torn"] += len(chunk) - len(good)
+            counts["torn"] += len(chunk) - len(good) - n_open
             values = np.array([cells for _, cells in good]).reshape(len(good), len(names))
             kept = np.array([index for index, _ in good], dtype=np.int64)
         found.append(values)

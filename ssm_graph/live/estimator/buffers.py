@@ -12,6 +12,7 @@ from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.times import MIN_SPACING_S, usual_interval
 from ssm_graph.graph.aids import AIDS
+from ssm_graph.imu.thinned import missing_samples
 from ssm_graph.live.estimator.rows import TimedRows
 from ssm_graph.mission.mission import Aids, Mission
 from ssm_graph.mission.vehicle import Vehicle
@@ -28,8 +29,6 @@ OFF_WATER: Final = -1
 """Column of a ping's row that is 1 off the water."""
 FROZEN_REACH_S: Final = 30.0
 """An axis that has repeated itself for longer is not told from one that always did."""
-MOST_MISSING: Final = 0.3
-"""A larger share of the inertial samples missing leaves turns and shocks unseen."""
 PERIOD_EVERY: Final = 100
 DEFAULT_PERIOD_S: Final = 0.01
 """Sampling interval of the inertial data before there are two samples."""
@@ -71,19 +70,26 @@ class Buffers:
 
     def add(self, message: Message) -> bool:
         """Take a message; return False if one of its time is known."""
-        one = BY_MESSAGE[type(message)]
-        row = np.array(one.numbers(message))
+        self._n_imu += isinstance(message, ImuSample)
+        return self.rows[BY_MESSAGE[type(message)].section].add(self._row(message))
+
+    def has(self, message: Message) -> bool:
+        """Return whether this very message is known, not only one of its time."""
+        rows, row = self.rows[BY_MESSAGE[type(message)].section], self._row(message)
+        here = slice(rows.index(row[0]), rows.index(row[0], after=True))
+        return any(np.array_equal(row, known, equal_nan=True) for known in rows.all[here])
+
+    def _row(self, message: Message) -> Array:
+        row = np.array(BY_MESSAGE[type(message)].numbers(message))
         row[0] = self.time_of(message)
-        if isinstance(message, ImuSample):
-            self._n_imu += 1
-        elif isinstance(message, Ping):
+        if isinstance(message, Ping):
             row[self.sigmas] = counted_sigma(
                 row[self.sigmas],
                 message.is_water,
                 ground_sigma=self.vehicle.beam_sigma,
                 water_sigma=self.vehicle.water_sigma,
             )
-        return self.rows[one.section].add(row)
+        return row
 
     def logs_between(self, begin_s: float, end_s: float) -> Logs:
         """Return what beside IMU and DVL belongs to a keyframe at ``end_s`` after ``begin_s``.
@@ -154,10 +160,9 @@ class Buffers:
         That is the share of the samples due that have not come, and the longest step to one that
         has, s.
         """
-        time_s = self.imu.between(begin_s, end_s)[:, 0]
-        n_due = np.floor((end_s - begin_s) / self.shortest_period_s - 1.0)
-        share = 1.0 - len(time_s) / n_due if n_due > 0 else 0.0
-        return share, float(np.max(np.diff(time_s, prepend=begin_s), initial=0.0))
+        time_s, edge_s = self.imu.between(begin_s, end_s)[:, 0], np.array([begin_s, end_s])
+        share, longest_s = missing_samples(time_s, edge_s, self.shortest_period_s)
+        return float(share[0]), float(longest_s[0])
 
     def imu_log(self, begin_s: float, end_s: float, *, margin: int = 3) -> ImuLog:
         """Return the samples that cover a span, and a few on both sides, known errors taken off."""

@@ -172,8 +172,13 @@ class Intake:
 
     def _add(self, message: Message) -> bool:
         is_new = self.buffers.add(message)
-        if not is_new:
+        if not is_new and self.buffers.has(message):
             self.counts[f"{_name(message)} repeated"] += 1
+        elif not is_new:
+            text = (
+                "another one of its time came first, with other numbers: two of them at one port?"
+            )
+            self._refuse(message, message.time_s, "contrary", text)
         return is_new
 
     def _refuse(self, message: Message, now_s: float, kind: str, text: str) -> None:

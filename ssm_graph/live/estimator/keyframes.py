@@ -23,7 +23,7 @@ from ssm_graph.graph.aids.depth import DepthMeans, Depths
 from ssm_graph.graph.aids.gnss import Fixes
 from ssm_graph.imu.ping_motion import PING_WINDOW_S, mean_gyro
 from ssm_graph.imu.preintegration import LIVELY_S, InertialChain, imu_gaps, preintegrate
-from ssm_graph.live.estimator.buffers import MOST_MISSING, OFF_WATER, Buffers, Logs, Measured
+from ssm_graph.live.estimator.buffers import OFF_WATER, Buffers, Logs, Measured
 from ssm_graph.mission.problem import Beams, ProblemConfig
 from ssm_graph.sensors.imu import ImuLog
 from ssm_graph.smoothers.keyframe import Keyframe
@@ -123,22 +123,8 @@ class KeyframeMaker:
             rate_hz=self._config.merge_rate_hz,
             errors=NONE if self._buffers.vehicle.imu_calibration.is_asked else None,
             frozen=frozen,
-            unseen_s=self._unseen_s(imu, begin_s, end_s),
+            period_s=self._buffers.shortest_period_s,
         )
-
-    def _unseen_s(self, imu: ImuLog, begin_s: float, end_s: float) -> float:
-        """Return how long of the steps nothing is seen of where many samples are missing, s.
-
-        Long steps are gaps, which are bridged; where a longer part of one is in the span, that is
-        what is unseen of it.
-        """
-        if self._buffers.missing(begin_s, end_s)[0] <= MOST_MISSING:
-            return 0.0
-        edges = np.concatenate([[imu.start_s], imu.time_s])
-        inside_s = np.minimum(edges[1:], end_s) - np.maximum(edges[:-1], begin_s)
-        is_gap = np.isin(edges[:-1], imu_gaps(imu)[0])
-        gap_s, step_s = (np.max(inside_s[x], initial=0.0) for x in (is_gap, ~is_gap))
-        return 0.0 if gap_s > step_s else float(step_s) - self._buffers.shortest_period_s
 
     def _beams(self, pings: Array, gyro_b: Array) -> Beams:
         speed, sigma = pings[:, self._buffers.speeds], pings[:, self._buffers.sigmas]

@@ -16,7 +16,7 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import POSITION, VELOCITY
 from ssm_graph.graph.aids.depth import DepthMeans
 from ssm_graph.graph.aids.gnss import Fixes
-from ssm_graph.live.estimator.buffers import MOST_MISSING
+from ssm_graph.imu.thinned import MOST_MISSING
 from ssm_graph.live.estimator.guard import Guarded
 from ssm_graph.mission.answer import LARGEST_SPEED, LOW_WEIGHT, MISFIT, TRUSTED
 from ssm_graph.mission.navigation import Health

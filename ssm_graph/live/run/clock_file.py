@@ -66,9 +66,8 @@ class ClockFile:
         row = f"{time_s!r},{set_by_s!r},{steady_s!r},{self._boot}\n".encode()
         try:
             file = AppendFile(self._path, ending=TORN_ROW)
-            try:
+            try:  # a power failure ends the start of the computer that it is about: no sync
                 file.append(row if file.size else _HEAD + row)
-                file.sync()
             finally:
                 file.close()
         except OSError as error:

@@ -76,6 +76,10 @@ class ReplaySource:
         """Return what has come and waits: nothing does."""
         return []
 
+    def end(self) -> list[Message]:
+        """Return what has come and waits when the run ends: nothing does."""
+        return []
+
     def poll(self, timeout_s: float) -> list[Message]:
         """Return the messages whose time has come; wait for the next where there are none.
 

@@ -118,6 +118,7 @@ class Source(Protocol):
     def elapsed_s(self) -> float: ...  # noqa: D102
     def poll(self, timeout_s: float) -> list[Message]: ...  # noqa: D102
     def waiting(self) -> Sequence[Readings]: ...  # noqa: D102
+    def end(self) -> Sequence[Message]: ...  # noqa: D102
     def take_events(self) -> Sequence[Event]: ...  # noqa: D102
     def source_status(self) -> tuple[SourceStatus, ...]: ...  # noqa: D102
 
@@ -206,8 +207,8 @@ class Runner:
                 if messages:
                     self._publish(outlet, source.time_s)
                     self._latencies.append(self._steady_s() - begin_s)
-                self._keep(source)
-            self._take([readings[0] for readings in source.waiting()], (), log)
+                self._keep()
+            self._take(source.end(), (), log)
             return self._end(reason)
         finally:
             self.folder.close()
@@ -303,10 +304,8 @@ class Runner:
             found = self._estimator.found()
         return found
 
-    def _keep(self, source: Source) -> None:
+    def _keep(self) -> None:
         """Write what has come about, and show it."""
-        for event in source.take_events():
-            self._note_event(event)
         if self._watch.is_due(self._steady_s()):
             self.folder.syncer.begin()
             for text in self.folder.regain():
@@ -324,6 +323,9 @@ class Runner:
             self._write_delayed(self._estimator.take_delayed)
 
     def _take_events(self) -> None:
+        if self._connections is not None:
+            for event in self._connections.source.take_events():
+                self._note_event(event)
         with self._of_estimator():
             for event in self._estimator.take_events():
                 self._note_event(event)

@@ -165,7 +165,7 @@ class StampClock:
         self._lag_s, self._lead_s = 0.0, -math.inf
         self._interval_s, self._period_s = 0.0, 0.0
         self._strangers: list[Message] = []
-        self._stranger_s = self._met_s = 0.0
+        self._stranger_s = self._met_s = self._come_s = 0.0
         self._found_s = 0.0
         self._n_set = clock.n_set
         self._others_s: tuple[float, ...] = ()
@@ -211,9 +211,27 @@ class StampClock:
             return [], self._doubt.give_up(self._run_s(now))
         return self._heed(told, now), []
 
-    def waiting(self) -> list[Readings]:
-        """Return messages whose stamps wait to be read, in the time of the run."""
-        return [] if self._doubt is None else self._doubt.waiting()
+    def waiting(self, now: Now) -> list[Readings]:
+        """Return messages whose stamps wait to be read, in the time of the run.
+
+        Strangers are among them once the known clock has missed its turn, as they will be read if
+        they are believed: from then on it is likelier that it was set than that it goes on.
+        """
+        if self._doubt is not None:
+            return self._doubt.waiting()
+        turn_s = SILENT_TIMES * self._interval_s or STRANGER_S
+        has_missed = now.steady_s - self._heard_s > turn_s
+        if not (self._strangers and has_missed):
+            return []
+        shift_s = self._strangers_shift_s()
+        return [(replace(one, time_s=one.time_s - shift_s),) for one in self._strangers]
+
+    def end(self, now: Now) -> tuple[list[Message], list[Message]]:
+        """Return what waits, read as is likelier now that nothing more comes, and the strangers."""
+        passed = [readings[0] for readings in self.waiting(now)]
+        refused = self._strangers if self._doubt is not None or not passed else []
+        self._doubt, self._strangers = None, []
+        return passed, refused
 
     def readings(self, message: Message, now: Now) -> Readings:
         """Return how a message that is held elsewhere would be read if it came now."""
@@ -221,11 +239,6 @@ class StampClock:
             return self._doubt.readings(message)
         shift_s = self._shift_of(message.time_s, now)
         return (replace(message, time_s=message.time_s - shift_s),)
-
-    @property
-    def n_strangers(self) -> int:
-        """How many messages of another clock wait for that to be believed."""
-        return len(self._strangers)
 
     def _heed(self, told: Told, now: Now) -> list[Message]:
         """Read stamps as is told from now on; return what waited for that."""
@@ -353,36 +366,36 @@ class StampClock:
         if waiting and abs(message.time_s - waiting[-1].time_s) > SAME_CLOCK_S + self._interval_s:
             third, self._strangers = waiting, []
         if not self._strangers:
-            self._stranger_s = now.steady_s
+            self._stranger_s, self._come_s = now.steady_s, self._run_s(now)
         self._strangers.append(message)
         self._met_s = now.steady_s
         since_s = now.steady_s - max(self._heard_s, self._stranger_s)
         is_silent = since_s >= max(STRANGER_S, SILENT_TIMES * self._interval_s)
         if is_silent or len(self._strangers) > MOST_STRANGERS:
-            waiting, self._strangers = self._strangers, []
             if self._doubt is not None:  # of a clock that is no more
                 passed += self._heed(self._doubt.likelier(), now)
-            self._believe(waiting[0].time_s, now)
+            was_s, self._shift_s = self._shift_s, self._strangers_shift_s()
+            self._found_s = self._shift_s - was_s
+            self._lead_s = -math.inf
+            waiting, self._strangers = self._strangers, []
             passed += [self._passed(one, now) for one in waiting]
         return third
 
-    def _believe(self, first_s: float, now: Now) -> None:
-        """Take a stranger's clock for the known one, which was set: time goes on as it did."""
+    def _strangers_shift_s(self) -> float:
+        """Return what stamps are ahead by if the strangers' clock is the known one, which was set.
+
+        Time then goes on as it did. Asked again and again the answer is the same.
+        """
         gap_s = self._stranger_s - self._heard_s
-        was_s = self._shift_s
-        lag_s = self._lag_s if self._is_steady else -self._lead(now)
-        come_s = self._run_s(now) - (now.steady_s - self._stranger_s)
+        first_s = self._strangers[0].time_s
         was_right = abs(self._lag_s) < RIGHT_S
-        if not was_right and abs(come_s - (first_s - self._clock.set_by_s)) < RIGHT_S:
-            self._shift_s = self._clock.set_by_s  # it is right at last
-        elif self._is_steady:
+        if not was_right and abs(self._come_s - (first_s - self._clock.set_by_s)) < RIGHT_S:
+            return self._clock.set_by_s  # it is right at last
+        if self._is_steady:
             period_s = self._period_s or gap_s
             n_periods = max(1, round(gap_s / period_s)) if period_s else 1
-            self._shift_s = first_s - (self._stamp_s + n_periods * period_s)
-        else:
-            self._shift_s = first_s - (come_s - lag_s)
-        self._found_s = self._shift_s - was_s
-        self._lead_s = -math.inf
+            return first_s - (self._stamp_s + n_periods * period_s)
+        return first_s - (self._come_s + self._lead_s - LEAD_DECAY * gap_s)
 
 
 class StampClocks:
@@ -409,9 +422,15 @@ class StampClocks:
         found = [clock.settle(now) for (of, _), clock in self._clocks.items() if of == source]
         return [m for passed, _ in found for m in passed], [m for _, late in found for m in late]
 
-    def waiting(self) -> list[Readings]:
+    def waiting(self, now: Now) -> list[Readings]:
         """Return what waits of all sources, as :meth:`StampClock.waiting` does."""
-        return [readings for clock in self._clocks.values() for readings in clock.waiting()]
+        return [readings for clock in self._clocks.values() for readings in clock.waiting(now)]
+
+    def end(self, now: Now) -> tuple[list[Message], list[tuple[str, list[Message]]]]:
+        """Return what waits of all sources, and the strangers of each, where there are any."""
+        found = {key: clock.end(now) for key, clock in self._clocks.items()}
+        strangers = [(source, left) for (source, _), (_, left) in found.items() if left]
+        return [one for passed, _ in found.values() for one in passed], strangers
 
 
 def called(message: Message) -> str:

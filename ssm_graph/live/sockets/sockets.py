@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Final, Self
 
 from ssm_graph.live.protocols.decoder import Decoder
-from ssm_graph.live.sockets.clocks import Now, RunClock, StampClocks, boot_s
+from ssm_graph.live.sockets.clocks import Now, RunClock, StampClocks, boot_s, called
 from ssm_graph.live.sockets.endpoints import Endpoint, Transport
 from ssm_graph.live.sockets.feed import Feed, Limits
 from ssm_graph.live.sockets.inputs import Input, TcpClientInput, TcpServerInput, UdpInput
@@ -142,9 +142,25 @@ class SocketHub:
 
     def waiting(self) -> list[Readings]:
         """Return what has come and waits: for what tells its time, or for a sentence beside it."""
-        now = Now(self._clock.time_s + self._clock.set_by_s, self._steady_s())
-        held = [readings for source in self.inputs for readings in source.waiting(now)]
-        return [*self._stamps.waiting(), *held]
+        now = self._now()
+        return [*self._stamps.waiting(now), *self._held(now)]
+
+    def end(self) -> list[Message]:
+        """Return what waits, as is likelier now that nothing more comes; tell what is refused."""
+        now = self._now()
+        held = [readings[0] for readings in self._held(now)]
+        messages, strangers = self._stamps.end(now)
+        for source, left in strangers:
+            text = f"{len(left)} {called(left[0])} of another clock, which waited for that to be "
+            text += "believed when the run ended: refused"
+            self._events.note(source or "imu", "clock_refused", text, Severity.WARNING, burst=20)
+        return [*messages, *held]
+
+    def _held(self, now: Now) -> list[Readings]:
+        return [readings for source in self.inputs for readings in source.waiting(now)]
+
+    def _now(self) -> Now:
+        return Now(self._clock.time_s + self._clock.set_by_s, self._steady_s())
 
     def _keep_clock(self, now: Now) -> None:
         """Have it remembered how far the vehicle's clock is ahead of the time of the run."""
@@ -190,7 +206,7 @@ class SocketHub:
 
     def source_status(self) -> tuple[SourceStatus, ...]:
         """Return how the sources are doing."""
-        now = Now(self.time_s + self.set_by_s, self._steady_s())
+        now = self._now()
         return tuple(source.status(now) for source in self.inputs)
 
     def output_status(self) -> tuple[OutputStatus, ...]:
