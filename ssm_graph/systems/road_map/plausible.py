@@ -27,7 +27,7 @@ _TURNED: Final = 60.0 * DEGREE
 _BESIDE: Final = 3.0 * np.sqrt(2.0)
 """Sigmas of the fixes' noise beyond which a way is not theirs."""
 _BETTER: Final = 2.5
-"""So much nearer to the fixes another reading has to be."""
+"""So much nearer to the fixes another reading has to be, and theirs."""
 _READ_WRONGLY: Final = {
     -1.0: "is it clockwise?",
     1.0 / DEGREE: "is it in rad/s?",
@@ -118,7 +118,7 @@ def _require_turns(drive: Drive, inside: NDArray[np.int64], off: float, noise: f
         other = replace(chassis, yaw_rate=factor * chassis.yaw_rate)
         way = dead_reckoned(np.zeros(3), drive.gnss.time_s[inside], other)[:, :2]
         found = _beside(way - way.mean(axis=0), b)
-        if found < off / _BETTER:
+        if found < min(off / _BETTER, _BESIDE * noise):
             raise DataError(
                 f"{drive.name} chassis: the yaw rate turns the way {off:.0f} m beside the fixes, "
                 f"times {factor:.4g} it would be {found:.1f} m; {what}; expected deg/s, "
