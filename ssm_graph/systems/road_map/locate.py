@@ -183,8 +183,7 @@ class Localiser:
                 "the course; give a heading in [gnss], or a longer drive"
             )
         self._judge(len(self.rows) - 1)
-        cpu_ms = 1e3 * (time.process_time() - began) / len(self.rows)
-        return self._answer(cpu_ms)
+        return self._answer(began)
 
     def _picture(self, number: int) -> None:
         when, group = self.groups[number]
@@ -336,7 +335,7 @@ class Localiser:
         row = int(np.searchsorted(self.drive.chassis.time_s, when - 1e-6))
         return np.asarray(self.reckoned[min(row, len(self.reckoned) - 1)])
 
-    def _answer(self, cpu_ms: float) -> Located:
+    def _answer(self, began: float) -> Located:
         v = self.when
         _, mean, cov, _, _ = self.rows[-1]
         across, along = sigmas_of(mean, cov)
@@ -372,7 +371,7 @@ class Localiser:
             refined,
             window,
             tuple(self.snapshots),
-            cpu_ms,
+            1e3 * (time.process_time() - began) / len(self.rows),
         )
 
     def _joined(

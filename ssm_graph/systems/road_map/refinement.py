@@ -323,25 +323,22 @@ def _system(
     off[2] = wrapped(off[2])
     hessian[np.ix_(head, head)] += prior.information
     slope[head] += prior.information @ off
-    error, block, weight, whole = lines.rows(poses, covs)
-    own = np.zeros((n, 3, 3))
-    np.add.at(own, lines.of, np.einsum("cmi,cmj->cij", block, block))
-    pull = np.zeros((n, 3))
-    np.add.at(pull, lines.of, np.einsum("cmi,cm->ci", block, error))
-    change = hessian.copy()
-    felt = np.zeros((n, 3, 3))
-    np.add.at(felt, lines.of, np.einsum("cmi,cmj->cij", block, whole))
-    for k in range(n):
-        hessian[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += own[k]
-        change[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += felt[k]
-    slope[: 3 * n] += pull.ravel()
     moved, blocks = _motion(window, poses, extra, s)
-    for k in range(n - 1):
-        at = np.array([*range(3 * k, 3 * k + 6), size - 2, size - 1])
-        both = blocks[k].T @ blocks[k]
-        hessian[np.ix_(at, at)] += both
-        change[np.ix_(at, at)] += both
-        slope[at] += blocks[k].T @ moved[k]
+    at = np.empty((n - 1, 8), dtype=int)
+    at[:, :6], at[:, 6:] = 3 * np.arange(n - 1)[:, None] + np.arange(6), [size - 2, size - 1]
+    steps = np.einsum("kia,kib->kab", blocks, blocks)
+    np.add.at(hessian, (at[:, :, None], at[:, None]), steps)
+    np.add.at(slope, at, np.einsum("kia,ki->ka", blocks, moved))
+    change = hessian.copy()
+    error, block, weight, whole = lines.rows(poses, covs)
+    own, felt, pull = np.zeros((n, 3, 3)), np.zeros((n, 3, 3)), np.zeros((n, 3))
+    np.add.at(own, lines.of, np.einsum("cmi,cmj->cij", block, block))
+    np.add.at(felt, lines.of, np.einsum("cmi,cmj->cij", block, whole))
+    np.add.at(pull, lines.of, np.einsum("cmi,cm->ci", block, error))
+    at = 3 * np.arange(n)[:, None] + np.arange(3)
+    hessian[at[:, :, None], at[:, None]] += own
+    change[at[:, :, None], at[:, None]] += felt
+    slope[: 3 * n] += pull.ravel()
     return hessian, slope, weight, change
 
 
