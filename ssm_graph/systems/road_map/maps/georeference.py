@@ -48,7 +48,7 @@ def _mercator(text: str, x: float, y: float) -> TransverseMercator:
     code = _UTM_CODE.fullmatch(text.split()[0])
     if code is not None:
         return _utm(int(code[2]), x, y, is_south=code[1] == "327")
-    said = dict(re.findall(r"\+(\w+)(?:=(\S+))?", text))
+    said: dict[str, str] = dict(re.findall(r"\+(\w+)(?:=(\S+))?", text))
     kind = said.get("proj", "")
     if kind not in {"utm", "tmerc"}:
         raise ValueError(f"a projection {kind!r}; {_READ}")
