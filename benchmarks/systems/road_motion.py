@@ -30,7 +30,8 @@ HEADER = (
         "delay, s",
         "delay by the reference, s",
     ),
-    *("dead reckoning off after 10 s, m", "at the end, m", "at the end without, m"),
+    *("fixes off east, north, m", "dead reckoning off after 10 s, m", "at the end, m"),
+    *("at the end, were the fixes right, m", "at the end without, m"),
 )
 
 
@@ -55,13 +56,16 @@ def main() -> None:
                 cells.append((name, f"0 to {last:.0f}", str(error), *["–"] * (len(HEADER) - 3)))
                 continue
             told = _delay(segment, fixes) - reference.delay_s
-            cells.append((name, f"0 to {last:.0f}", *_cells(segment, found, told)))
+            off, right = _right(segment, fixes, found.delay_s, last)
+            cells.append((name, f"0 to {last:.0f}", *_cells(segment, found, told, off, right)))
     lines = [
         "Dead reckoning begins at the reference's pose after 1 s and goes on to "
         f"{end - 1.0:.0f} s, by speed and yaw rate alone; *without* is without scale and bias. "
         "Sigmas in brackets. The delay by the reference is that by which the fixes lie best on it, "
         "less by how much the chassis' clock is behind the reference's "
-        f"({1e3 * reference.delay_s:.0f} ms).",
+        f"({1e3 * reference.delay_s:.0f} ms). *Fixes off* is by how much they scatter about the "
+        "reference (standard deviation, a constant and the delay left out); *were the fixes right* "
+        "takes the reference's places at the same times: what is left is not the receiver's.",
         "",
         *table(HEADER, cells),
     ]
@@ -81,18 +85,35 @@ def _delay(segment: Comma2k19, fixes: GnssFixes) -> float:
     return float(min(np.arange(-0.5, 1.0, 0.002), key=off))
 
 
-def _cells(segment: Comma2k19, found: MotionErrors, told_s: float) -> tuple[str, ...]:
+def _right(
+    segment: Comma2k19, fixes: GnssFixes, delay_s: float, last_s: float
+) -> tuple[Array, MotionErrors]:
+    """Return how far fixes scatter, (2,) m, and what the reference in their place would tell."""
+    t = segment.truth
+    use = (fixes.time_s > t.time_s[0] + 1.0) & (fixes.time_s < min(last_s, t.time_s[-1] - 1.0))
+    time_s, sigma = fixes.time_s[use], fixes.sigma_m[use]
+    off = np.std(fixes.x_y[use] - t.at(time_s - delay_s)[:, :2], axis=0)
+    right = GnssFixes(time_s, t.at(time_s)[:, :2], sigma)
+    return off, motion_errors(segment.chassis, right, last_s=last_s)
+
+
+def _cells(
+    segment: Comma2k19, found: MotionErrors, told_s: float, off: Array, right: MotionErrors
+) -> tuple[str, ...]:
     sigma = found.sigma[3:]
-    ours, without = (
-        _error(segment, scale=1.0 + f * found.scale, bias=f * found.bias) for f in (1.0, 0.0)
+    ours, best, without = (
+        _error(segment, scale=1.0 + scale, bias=bias)
+        for scale, bias in ((found.scale, found.bias), (right.scale, right.bias), (0.0, 0.0))
     )
     return (
         f"{100.0 * found.scale:+.2f} ({100.0 * sigma[0]:.2f})",
         f"{math.degrees(found.bias):.3f} ({math.degrees(sigma[1]):.3f})",
         f"{found.delay_s:.3f} ({sigma[2]:.3f})",
         f"{told_s:.3f}",
+        f"{off[0]:.1f}, {off[1]:.1f}",
         f"{ours[0]:.1f}",
         f"{ours[1]:.1f}",
+        f"{best[1]:.1f}",
         f"{without[1]:.1f}",
     )
 

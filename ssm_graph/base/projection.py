@@ -47,17 +47,20 @@ class TransverseMercator:
     """On the meridian."""
     x0: float = 0.0
     """x of the origin, m."""
+    y0: float = 0.0
+    """y of the origin, m."""
 
     def forward(self, lat: ArrayLike, lon: ArrayLike) -> Array:
         """Return x and y (..., 2), m, of latitudes and longitudes (...), rad."""
         x, y = self._raw(np.asarray(lat, dtype=np.float64), np.asarray(lon, dtype=np.float64))
         _, y0 = self._raw(np.asarray(self.lat0), np.asarray(self.lon0))
-        return np.stack([x + self.x0, y - y0], axis=-1)
+        return np.stack([x + self.x0, y - y0 + self.y0], axis=-1)
 
     def inverse(self, x_y: Array) -> tuple[Array, Array]:
         """Return latitudes and longitudes (...), rad, of points (..., 2), m."""
         _, y0 = self._raw(np.asarray(self.lat0), np.asarray(self.lon0))
-        zeta = ((x_y[..., 1] + y0) + 1j * (x_y[..., 0] - self.x0)) / (self.scale * _RADIUS)
+        raw = (x_y[..., 1] - self.y0 + y0) + 1j * (x_y[..., 0] - self.x0)
+        zeta = raw / (self.scale * _RADIUS)
         plane = zeta - sum(b * np.sin(2 * k * zeta) for k, b in enumerate(_BETA, 1))
         xi, eta = plane.real, plane.imag
         tau_ = np.sin(xi) / np.hypot(np.sinh(eta), np.cos(xi))

@@ -121,6 +121,7 @@ def _gnss(table: Table, delay_s: float, road_map: RoadMap) -> GnssFixes:
             raise DataError(
                 f"{table.label}: fixes are in degrees and {road_map.name} does not say where its "
                 "plane is; give x_m and y_m in the plane of the map"
+                + "".join(f" ({note})" for note in road_map.notes if note.startswith("geoRef"))
             )
         lat, lon = np.radians(table["lat_deg"]), np.radians(table["lon_deg"])
         x_y = road_map.projection.forward(lat, lon)

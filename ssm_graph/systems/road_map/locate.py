@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -48,6 +49,7 @@ from ssm_graph.systems.road_map.refinement import (
     RefinementSettings,
     refine,
     sigmas_of,
+    without_chance,
 )
 from ssm_graph.systems.road_map.simulate import indices_of
 from ssm_graph.systems.road_map.verdict import (
@@ -181,8 +183,7 @@ class Localiser:
                 "the course; give a heading in [gnss], or a longer drive"
             )
         self._judge(len(self.rows) - 1)
-        cpu_ms = 1e3 * (time.process_time() - began) / len(self.rows)
-        return self._answer(cpu_ms)
+        return self._answer(began)
 
     def _picture(self, number: int) -> None:
         when, group = self.groups[number]
@@ -334,7 +335,7 @@ class Localiser:
         row = int(np.searchsorted(self.drive.chassis.time_s, when - 1e-6))
         return np.asarray(self.reckoned[min(row, len(self.reckoned) - 1)])
 
-    def _answer(self, cpu_ms: float) -> Located:
+    def _answer(self, began: float) -> Located:
         v = self.when
         _, mean, cov, _, _ = self.rows[-1]
         across, along = sigmas_of(mean, cov)
@@ -348,7 +349,7 @@ class Localiser:
             except SolverError as error:
                 reason = str(error)
         if refined is not None:
-            pose, sigmas = self._joined(refined, mean, along)
+            pose, sigmas, refined = self._joined(refined, mean, along)
         hypotheses = known_along(self.hypotheses, pose, sigmas[1]) if self.hypotheses else []
         if verdict is Verdict.CONVERGED:
             if lane_share(hypotheses, pose) < 1.0 - CARRIED:
@@ -370,31 +371,38 @@ class Localiser:
             refined,
             window,
             tuple(self.snapshots),
-            cpu_ms,
+            1e3 * (time.process_time() - began) / len(self.rows),
         )
 
     def _joined(
         self, refined: Refined, mean: Array, along: float
-    ) -> tuple[Array, tuple[float, float, float]]:
+    ) -> tuple[Array, tuple[float, float, float], Refined]:
         """Return the refined pose (3,) and sigmas, or along the road what the particles know.
 
-        That counts where the window has no bend; where both cannot be right the stretch decides.
+        That counts where they know more; the window is then laid on the map there, whose lines lie
+        otherwise. Where both cannot be right the stretch decides.
         """
-        pose, sigmas = refined.poses[-1], refined.sigmas
-        shift = float((mean - pose)[:2] @ refined.ahead)
-        moved = pose + shift * np.array([*refined.ahead, 0.0])
-        is_moved = sigmas[1] > 0.5 * along
-        if abs(shift) > 3.0 * np.hypot(along, sigmas[1]):
+        pose, sigmas, moved = refined.poses[-1], refined.sigmas, refined.beside(mean)
+        shift = float(np.hypot(*(moved - pose)[:2]))
+        is_moved = sigmas[1] > along
+        if shift > 3.0 * np.hypot(along, sigmas[1]):
             window = self._stretch(len(self.rows) - 1)
             assert window is not None
             found = evidence_of(window, np.stack([pose, moved]), self.indices, self.settings)
             better = float(found[0] - found[1])
             is_moved = better < LOST
             along = along if abs(better) > LOST else float(np.hypot(along, 0.5 * shift))
-        return (moved, refined.with_along(along)) if is_moved else (pose, sigmas)
+        if not is_moved:
+            return pose, sigmas, refined
+        with suppress(SolverError):
+            refined = self._refine(mean)[0] or refined
+        return refined.beside(mean), refined.with_along(along), refined
 
-    def _refine(self) -> tuple[Refined | None, Window | None]:
-        """Lay the last pictures on the map as a graph, begun by the particles before them."""
+    def _refine(self, last: Array | None = None) -> tuple[Refined | None, Window | None]:
+        """Lay the last pictures on the map as a graph, begun by the particles before them.
+
+        ``last`` (3,), where given, is where they are held to be in place of what came before.
+        """
         n = min(self.when.refined_pictures, len(self.rows))
         groups = self.groups[len(self.rows) - n : len(self.rows)]
         window = self._window(groups)
@@ -405,11 +413,13 @@ class Localiser:
         if first < self.put_row:  # the particles were elsewhere then
             mean, cov = self.extras[-1][0].copy(), 4.0 * self.extras[-1][1]
             mean[:3] = window.poses_from(mean[:3])[0]
+        if last is not None:
+            mean = np.concatenate([window.poses_from(last)[0], mean[3:]])
         floor = np.diag([0.05, 0.05, 0.2 * DEGREE, 1e-3, 1e-5]) ** 2
         cov = cov + floor
         if n == len(self.rows):
             cov = cov + np.diag([self.half_m**2 / 3.0, self.half_m**2 / 3.0, 0.0, 0.0, 0.0])
-        cov = ALONG_INFLATION**2 * _without_chance(mean, cov)
+        cov = ALONG_INFLATION**2 * without_chance(mean, cov)
         prior = Prior(mean, np.asarray(np.linalg.inv(cov), dtype=np.float64))
         start = window.poses_from(self.rows[-1][1])
         return refine(window, start, prior, self.indices, self.refinement), window
@@ -424,20 +434,6 @@ def square_of(drive: Drive) -> float:
     """Return half the side of the square about a fix in which the vehicle is, m."""
     noise = 3.0 * float(drive.gnss.sigma_m[0]) if drive.gnss_bias_m == 0.0 else 2.0
     return drive.gnss_bias_m + noise
-
-
-def _without_chance(mean: Array, cov: Array) -> Array:
-    """Return a covariance (5, 5) of particles with what is along the pose tied to nothing else.
-
-    Few ancestors share all that is known along a road; how they happen to lie across it or turned
-    would, once that is known to centimetres, be taken for knowledge of the place along it.
-    """
-    c, s = np.cos(mean[2]), np.sin(mean[2])
-    turned = np.eye(5)
-    turned[:2, :2] = [[c, s], [-s, c]]
-    own = turned @ cov @ turned.T
-    own[0, 1:], own[1:, 0] = 0.0, 0.0
-    return np.asarray(turned.T @ own @ turned)
 
 
 def _track(rows: list[tuple[float, Array, Array, float, int]]) -> Track:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ssm_graph.base.errors import DataError
+from ssm_graph.base.frozen import Array
 from ssm_graph.base.units import DEGREE, wrapped
 from ssm_graph.systems.road_map.drive import Drive, dead_reckoned
 from ssm_graph.systems.road_map.motion import noise_of, turn_between
@@ -20,6 +23,17 @@ _FACTOR: Final = 1.3
 """No wheel is so far from its size; km/h for m/s is 3.6."""
 _TURNED: Final = 60.0 * DEGREE
 """No course over ground is so far off; clockwise for anticlockwise, or from east, is."""
+
+_BESIDE: Final = 3.0 * np.sqrt(2.0)
+"""Sigmas of the fixes' noise beyond which a way is not theirs."""
+_BETTER: Final = 2.5
+"""So much nearer to the fixes another reading has to be, and theirs."""
+_READ_WRONGLY: Final = {
+    -1.0: "is it clockwise?",
+    1.0 / DEGREE: "is it in rad/s?",
+    -1.0 / DEGREE: "is it in rad/s, and clockwise?",
+    DEGREE: "was it turned from rad/s into deg/s twice?",
+}
 
 
 def require_plausible(drive: Drive) -> None:
@@ -67,8 +81,9 @@ def _require_one_way(drive: Drive) -> None:
         return
     way = dead_reckoned(np.zeros(3), gnss.time_s[inside], drive.chassis)
     a, b = (x - x.mean(axis=0) for x in (way[:, :2], gnss.x_y[inside]))
-    length, seen = (float(np.sqrt(np.square(x).sum(axis=1).mean())) for x in (a, b))
+    length, seen = _spread(a), _spread(b)
     noise = noise_of(drive)
+    _require_turns(drive, inside, _beside(a, b), noise)
     is_other = not 1.0 / _FACTOR < (length + noise) / (seen + noise) < _FACTOR
     if is_other and abs(length - seen) > _CLEAR * noise + drive.gnss_bias_m:
         raise DataError(
@@ -88,3 +103,35 @@ def _require_one_way(drive: Drive) -> None:
             "(anticlockwise) the way that the fixes go; expected the course over ground, degrees "
             "clockwise from north; leave the column out, and the way tells it"
         )
+
+
+def _require_turns(drive: Drive, inside: NDArray[np.int64], off: float, noise: float) -> None:
+    """Compare the way as it is, ``off`` m beside the fixes, with those of yaw rates read wrongly.
+
+    A straight road tells nothing of them.
+    """
+    if off < _BESIDE * noise:
+        return
+    chassis, fixes = drive.chassis, drive.gnss.x_y[inside]
+    b = fixes - fixes.mean(axis=0)
+    for factor, what in _READ_WRONGLY.items():
+        other = replace(chassis, yaw_rate=factor * chassis.yaw_rate)
+        way = dead_reckoned(np.zeros(3), drive.gnss.time_s[inside], other)[:, :2]
+        found = _beside(way - way.mean(axis=0), b)
+        if found < min(off / _BETTER, _BESIDE * noise):
+            raise DataError(
+                f"{drive.name} chassis: the yaw rate turns the way {off:.0f} m beside the fixes, "
+                f"times {factor:.4g} it would be {found:.1f} m; {what}; expected deg/s, "
+                "anticlockwise above zero"
+            )
+
+
+def _spread(x_y: Array) -> float:
+    return float(np.sqrt(np.square(x_y).sum(axis=1).mean()))
+
+
+def _beside(a: Array, b: Array) -> float:
+    """Return how far points (N, 2) about their mean stay from others once turned onto them, m."""
+    turn = turn_between(a, b)
+    c, s = np.cos(turn), np.sin(turn)
+    return _spread(a @ np.array([[c, s], [-s, c]]) - b)

@@ -102,6 +102,11 @@ class Refined(ReadOnlyArrays):
         cov = self.covs[-1]
         return *sigmas_of(self.poses[-1], cov), float(np.sqrt(cov[2, 2]))
 
+    def beside(self, place: Array) -> Array:
+        """Return the last pose (3,) moved along the road until it is beside a place (2+,)."""
+        shift = float((place[:2] - self.poses[-1, :2]) @ self.ahead)
+        return np.asarray(self.poses[-1] + shift * np.array([*self.ahead, 0.0]))
+
     def with_along(self, along_m: float) -> tuple[float, float, float]:
         """Return the same sigmas where the place along the road is known so well by other means."""
         across = np.array([-self.ahead[1], self.ahead[0]])
@@ -118,6 +123,20 @@ def sigmas_of(pose: Array, cov: Array) -> tuple[float, float]:
         float(np.sqrt(across @ cov[:2, :2] @ across)),
         float(np.sqrt(along @ cov[:2, :2] @ along)),
     )
+
+
+def without_chance(mean: Array, cov: Array) -> Array:
+    """Return a covariance (5, 5) of particles with what is along the pose tied to nothing else.
+
+    Few ancestors share all that is known along a road; how they happen to lie across it or turned
+    would, once that is known to centimetres, be taken for knowledge of the place along it.
+    """
+    c, s = np.cos(mean[2]), np.sin(mean[2])
+    turned = np.eye(5)
+    turned[:2, :2] = [[c, s], [-s, c]]
+    own = turned @ cov @ turned.T
+    own[0, 1:], own[1:, 0] = 0.0, 0.0
+    return np.asarray(turned.T @ own @ turned)
 
 
 class _Lines:
@@ -185,8 +204,11 @@ class _Lines:
         off = x_y - last
         return self.ahead + self.bend * np.stack([-off[..., 1], off[..., 0]], axis=-1)
 
-    def rows(self, poses: Array, covs: Array | None) -> tuple[Array, Array, Array]:
-        """Return whitened errors (C, m), blocks (C, m, 3) in plane axes, and weights (C, m)."""
+    def rows(self, poses: Array, covs: Array | None) -> tuple[Array, Array, Array, Array]:
+        """Return whitened errors (C, m), blocks (C, m, 3) in plane axes, and weights (C, m).
+
+        Last come the blocks without what is left out of the first ones: how the errors change.
+        """
         w, s = self.window, self.settings
         pose = poses[self.of]
         found = line_residual(
@@ -203,7 +225,9 @@ class _Lines:
         slant = np.where(np.abs(slant) < _SLANTED, slant, 0.0)
         said = self.normals - slant[..., None] * own[:, None]
         block = np.concatenate([said, found.error_D_pose[..., 2:]], axis=-1)
-        block *= (self.trust > 0.0)[..., None]  # a point on no line says nothing
+        whole = np.concatenate([self.normals, found.error_D_pose[..., 2:]], axis=-1)
+        is_on = (self.trust > 0.0)[..., None]  # a point on no line says nothing
+        block, whole = block * is_on, whole * is_on
         x = w.points[..., 0]
         variance = w.sigma_m[:, None] ** 2 + (s.slope_sigma * x) ** 2 + self.scatter_m**2
         spread = np.zeros(x.shape)
@@ -220,8 +244,8 @@ class _Lines:
         )
         root = np.linalg.cholesky(cov)
         error = np.where(self.trust > 0.0, found.error, 0.0)
-        both = np.linalg.solve(root, np.concatenate([error[..., None], block], axis=-1))
-        return both[..., 0], both[..., 1:], weight
+        both = np.linalg.solve(root, np.concatenate([error[..., None], block, whole], axis=-1))
+        return both[..., 0], both[..., 1:4], weight, both[..., 4:]
 
 
 def refine(
@@ -241,7 +265,7 @@ def refine(
     covs, has_settled = None, False
     for _ in range(s.rounds):
         lines.tie(poses)
-        hessian, slope, weight = _system(window, lines, poses, extra, prior, s, covs)
+        hessian, slope, weight, change = _system(window, lines, poses, extra, prior, s, covs)
         cov = np.linalg.inv(hessian)
         step = -cov @ slope
         moved = step[:-2].reshape(-1, 3)
@@ -255,6 +279,9 @@ def refine(
         if shift < _CLOSE_M + 0.03 * np.sqrt(covs[-1, :2, :2].trace()) and turn < _CLOSE_RAD:
             has_settled = True
             break
+    back = np.linalg.inv(change)
+    cov = back @ hessian @ back.T  # the errors change by more than what is held to be said
+    covs = np.stack([cov[i : i + 3, i : i + 3] for i in range(0, 3 * len(poses), 3)])
     return Refined(
         poses,
         float(extra[0]),
@@ -283,8 +310,11 @@ def _system(
     prior: Prior,
     s: RefinementSettings,
     covs: Array | None,
-) -> tuple[Array, Array, Array]:
-    """Return the normal equations of all poses, scale and bias, and the weights of the points."""
+) -> tuple[Array, Array, Array, Array]:
+    """Return the normal equations of all poses, scale and bias, and the weights of the points.
+
+    Last comes how the slope changes with the poses.
+    """
     n = len(poses)
     size = 3 * n + 2
     hessian, slope = np.zeros((size, size)), np.zeros(size)
@@ -293,20 +323,23 @@ def _system(
     off[2] = wrapped(off[2])
     hessian[np.ix_(head, head)] += prior.information
     slope[head] += prior.information @ off
-    error, block, weight = lines.rows(poses, covs)
-    own = np.zeros((n, 3, 3))
-    np.add.at(own, lines.of, np.einsum("cmi,cmj->cij", block, block))
-    pull = np.zeros((n, 3))
-    np.add.at(pull, lines.of, np.einsum("cmi,cm->ci", block, error))
-    for k in range(n):
-        hessian[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += own[k]
-    slope[: 3 * n] += pull.ravel()
     moved, blocks = _motion(window, poses, extra, s)
-    for k in range(n - 1):
-        at = np.array([*range(3 * k, 3 * k + 6), size - 2, size - 1])
-        hessian[np.ix_(at, at)] += blocks[k].T @ blocks[k]
-        slope[at] += blocks[k].T @ moved[k]
-    return hessian, slope, weight
+    at = np.empty((n - 1, 8), dtype=int)
+    at[:, :6], at[:, 6:] = 3 * np.arange(n - 1)[:, None] + np.arange(6), [size - 2, size - 1]
+    steps = np.einsum("kia,kib->kab", blocks, blocks)
+    np.add.at(hessian, (at[:, :, None], at[:, None]), steps)
+    np.add.at(slope, at, np.einsum("kia,ki->ka", blocks, moved))
+    change = hessian.copy()
+    error, block, weight, whole = lines.rows(poses, covs)
+    own, felt, pull = np.zeros((n, 3, 3)), np.zeros((n, 3, 3)), np.zeros((n, 3))
+    np.add.at(own, lines.of, np.einsum("cmi,cmj->cij", block, block))
+    np.add.at(felt, lines.of, np.einsum("cmi,cmj->cij", block, whole))
+    np.add.at(pull, lines.of, np.einsum("cmi,cm->ci", block, error))
+    at = 3 * np.arange(n)[:, None] + np.arange(3)
+    hessian[at[:, :, None], at[:, None]] += own
+    change[at[:, :, None], at[:, None]] += felt
+    slope[: 3 * n] += pull.ravel()
+    return hessian, slope, weight, change
 
 
 def _motion(
@@ -359,7 +392,7 @@ def _leave_first(
     """Return the prior of the second pose once the first one is eliminated, with all it saw."""
     if len(poses) < 2:
         return None
-    error, block, _ = lines.rows(poses, covs)
+    error, block, _, _ = lines.rows(poses, covs)
     mine = lines.of == 0
     hessian, slope = np.zeros((8, 8)), np.zeros(8)
     hessian[:3, :3] = np.einsum("cmi,cmj->ij", block[mine], block[mine])

@@ -59,7 +59,8 @@ def reason_of(
     if verdict is Verdict.FAILED:
         return (
             f"the best place explains the curves with a loss of {best.misfit:.1f} each, expected "
-            f"below {most_misfit:.1f}: another place, an old map, or curves in other axes"
+            f"below {most_misfit:.1f}: another place, an old map, curves in other axes, or a yaw "
+            "rate of the other sign"
         )
     rival = next((h for h in hypotheses if not is_same_lane(h, pose)), None)
     told = ""

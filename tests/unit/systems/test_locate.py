@@ -330,6 +330,9 @@ def test_bad_times_are_named() -> None:
     ("log", "change", "message"),
     [
         ("chassis", {"speed": 3.6}, "its way spreads over"),
+        ("chassis", {"yaw_rate": -1.0}, "times -1 it would be .* is it clockwise"),
+        ("chassis", {"yaw_rate": np.pi / 180.0}, "is it in rad/s"),
+        ("chassis", {"yaw_rate": 180.0 / np.pi}, "turned from rad/s into deg/s twice"),
         ("curves", {"side": -1.0}, "lie on the other side than they say"),
         ("gnss", {"yaw": -1.0}, "the heading is [-+][0-9]+ deg off"),
     ],

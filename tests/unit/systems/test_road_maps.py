@@ -236,6 +236,89 @@ def test_opendrive_lanes_run_as_traffic_does(tmp_path: Path) -> None:
         assert (LineKind.BOUNDARY, Mark.UNKNOWN) in marks
 
 
+def test_opendrive_borders_are_widths(tmp_path: Path) -> None:
+    """A border is where the lane ends, from the reference line; not where that is shifted."""
+    path = tmp_path / "road.xodr"
+    text = ROAD.format(length=40.0, shape="<line/>", rule="RHT")
+    text = text.replace('a="0.5"', 'a="0"')
+    path.write_text(text)
+    by_width = read_opendrive(path)
+    borders = (
+        '<border sOffset="0" a="-3.5" b="0" c="0" d="0"/>'
+        '<border sOffset="20" a="-3.5" b="-0.1" c="0" d="0"/>'
+    )
+    width = '<width sOffset="0" a="3.5" b="0" c="0" d="0"/>'
+    path.write_text(text.replace(width, borders))
+    by_border = read_opendrive(path)
+    (one,), (other,) = (tuple(m.lanes.values()) for m in (by_width, by_border))
+    np.testing.assert_allclose(other.left, one.left, atol=1e-12)
+    wider = np.linalg.norm(other.right - one.right, axis=1)
+    np.testing.assert_allclose(wider, 0.1 * np.maximum(np.arange(41.0) - 20.0, 0.0), atol=1e-9)
+    path.write_text(text.replace(width, width + borders))
+    np.testing.assert_array_equal(read_opendrive(path).lines[1].points, by_width.lines[1].points)
+    for wrong, message in (
+        (text.replace('"0" a="0"', '"0" a="0.5"').replace(width, borders), "beside a laneOffset"),
+        (text.replace(width, borders.replace("-3.5", "3.5")), "on the other side"),
+    ):
+        path.write_text(wrong)
+        with pytest.raises(DataError, match=message):
+            read_opendrive(path)
+
+
+@pytest.mark.parametrize(
+    ("said", "offset", "wanted"),
+    [
+        ("+proj=utm +zone=32 +datum=WGS84 +units=m", (0, 0), (691596.710, 5334746.441)),
+        ("EPSG:25832", (691000, 5334000), (596.710, 746.441)),
+        (
+            "+proj=tmerc +lat_0=48 +lon_0=9 +k=0.9996 +x_0=500000 +ellps=GRS80",
+            (0, 0),
+            (691596.710, 18446.216),
+        ),
+        ("+proj=utm +zone=32 +south +ellps=WGS84", (0, 0), (691596.710, 15334746.441)),
+    ],
+)
+def test_opendrive_knows_its_place(
+    tmp_path: Path, said: str, offset: tuple[int, int], wanted: tuple[float, float]
+) -> None:
+    """A place in Munich, against numbers by PROJ."""
+    road_map = with_header(tmp_path, said, '<offset x="{}" y="{}"/>'.format(*offset))
+    assert road_map.projection is not None
+    assert road_map.notes == ()
+    at = np.radians([48.1371, 11.5754])
+    x_y = road_map.projection.forward(*at)
+    np.testing.assert_allclose(x_y, wanted, atol=1e-3)
+    np.testing.assert_allclose(road_map.projection.inverse(x_y), at, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("said", "offset", "message"),
+    [
+        ("+proj=merc +datum=WGS84", "", "projection 'merc'"),
+        ("+proj=tmerc +ellps=bessel", "", "Earth of bessel"),
+        ("+proj=utm +zone=99 +datum=WGS84", "", "zone of 99"),
+        ("+proj=utm +zone=32 +datum=WGS84 +units=us-ft", "", "other than metres"),
+        ("+proj=utm +zone=32 +datum=WGS84", '<offset x="0" y="0" hdg="0.1"/>', "hdg"),
+    ],
+)
+def test_opendrive_says_what_it_does_not_know(
+    tmp_path: Path, said: str, offset: str, message: str
+) -> None:
+    """The map is read; where it lies is not, and a note says why."""
+    road_map = with_header(tmp_path, said, offset)
+    assert road_map.projection is None
+    assert message in road_map.notes[0]
+
+
+def with_header(tmp_path: Path, said: str, offset: str) -> RoadMap:
+    """Return the map of one road that says where it lies."""
+    path = tmp_path / "road.xodr"
+    text = ROAD.format(length=40.0, shape="<line/>", rule="RHT")
+    header = f"<header><geoReference><![CDATA[{said}]]></geoReference>{offset}</header>"
+    path.write_text(text.replace("<OpenDRIVE>", "<OpenDRIVE>" + header))
+    return read_opendrive(path)
+
+
 def test_lanelet2_agrees_with_the_library() -> None:
     """Bounds of all lanelets within a centimetre of those of the reference implementation."""
     lanelet2 = pytest.importorskip("lanelet2")

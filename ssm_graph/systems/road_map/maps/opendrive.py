@@ -12,6 +12,7 @@ import numpy as np
 
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
+from ssm_graph.systems.road_map.maps.georeference import plane_of
 from ssm_graph.systems.road_map.maps.road_map import (
     Lane,
     LineKind,
@@ -43,9 +44,10 @@ def read_opendrive(path: Path, step_m: float = STEP_M) -> RoadMap:
         for road in root.iterfind("road"):
             _add_road(road, step_m, lines, lanes)
         joined = _joined(lanes)
+        projection, notes = plane_of(root)
     except (ElementTree.ParseError, KeyError, ValueError) as error:
         raise DataError(f"{path}: expected OpenDRIVE, got {error!r}") from error
-    return RoadMap(path.name, tuple(lines), joined)
+    return RoadMap(path.name, tuple(lines), joined, projection, notes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,9 +177,7 @@ def _add_road(
             t, inner, last_road = middle.copy(), centre, None
             group = list(section.iterfind(f"{side}/lane"))
             for lane in sorted(group, key=lambda e: abs(int(e.attrib["id"]))):
-                t = t + sign * np.maximum(
-                    _Cubic.of(list(lane.iterfind("width")), "sOffset").at(s - start), 0.0
-                )
+                t = _outer(lane, t, s - start, middle, sign, name)
                 outer = at[:, :2] + t[:, None] * normal
                 has_curb = _add_marks(lane, name, s - start, outer, lines)
                 if lane.get("type") in _ROADWAY:
@@ -190,6 +190,28 @@ def _add_road(
                 points = without_repeats(last_road)
                 if len(points) > 1:
                     lines.append(RoadLine(f"{name} {side} edge", LineKind.BOUNDARY, points))
+
+
+def _outer(
+    lane: ElementTree.Element, t: Array, s: Array, middle: Array, sign: float, name: str
+) -> Array:
+    """Return how far to the left of the reference line a lane's outer edge is, (N,) m.
+
+    By the lane's widths from its inner edge ``t`` on, else by its borders, which count from the
+    reference line; lengths ``s`` are those from the section's beginning.
+    """
+    widths, borders = list(lane.iterfind("width")), list(lane.iterfind("border"))
+    if widths or not borders:
+        return np.asarray(t + sign * np.maximum(_Cubic.of(widths, "sOffset").at(s), 0.0))
+    if np.any(middle != 0.0):
+        raise ValueError(
+            f"{name} lane {lane.get('id')}: a border beside a laneOffset; tools differ in from "
+            "where it counts: give widths"
+        )
+    border = _Cubic.of(borders, "sOffset").at(s)
+    if np.any(sign * border < -0.01):
+        raise ValueError(f"{name} lane {lane.get('id')}: a border on the other side of the road")
+    return np.asarray(t + sign * np.maximum(sign * (border - t), 0.0))
 
 
 def _add_lane(
