@@ -103,10 +103,8 @@ def read_recorded(log: Path, options: NmeaOptions | None = None) -> Recorded | N
         raise DataError(f"{log}: not one report that is read; {'; '.join(found.notes) or 'empty'}")
     pings = [message for message in found.messages if isinstance(message, Ping)]
     if pings and not any(math.isfinite(speed) for ping in pings for speed in ping.speed):
-        raise DataError(
-            f"{log}: {len(pings)} pings and not one speed along a beam; expected bottom track "
-            f"within its range; {'; '.join(found.notes)}"
-        )
+        said = f"{len(pings)} pings and not one speed along a beam: the bottom was never in range?"
+        found = Recorded(found.messages, (said, *found.notes))
     return _in_order(log, found)
 
 
