@@ -179,7 +179,7 @@ class JobProcesses:
             workers = [_Worker.start() for _ in range(min(self.n_processes, len(waiting)))]
             try:
                 while waiting or any(worker.job for worker in workers):
-                    self._hand_out(waiting, workers)
+                    self._hand_out(waiting, workers, deaths)
                     yield from self._collect(waiting, workers, deaths)
             finally:
                 for worker in workers:
@@ -188,14 +188,14 @@ class JobProcesses:
                     worker.process.join()
                     worker.pipe.close()
 
-    def _hand_out(self, waiting: list[Job], workers: list[_Worker]) -> None:
+    def _hand_out(self, waiting: list[Job], workers: list[_Worker], deaths: _Deaths) -> None:
         for i, worker in enumerate(workers):
             if worker.job is None and waiting:
                 others = [other.seen for other in workers if other is not worker]
                 job = waiting.pop(best_job(waiting, worker.seen, others))
-                if not worker.give(job):  # died while idle
-                    waiting.insert(0, job)
-                    workers[i] = worker.replaced()
+                while not workers[i].give(job):  # died while idle
+                    dead, workers[i] = workers[i], workers[i].replaced()
+                    deaths.count(how=dead.ending())
 
     def _collect(
         self, waiting: list[Job], workers: list[_Worker], deaths: _Deaths
@@ -243,14 +243,18 @@ class _Deaths:
 
     def is_last(self, job: Job, *, how: str) -> bool:
         """Count one, and return whether a job of a single run is to be given up."""
+        self.count(how=how)
+        self.of_job[job] = self.of_job.get(job, 0) + 1
+        return job.n_runs == 1 and self.of_job[job] >= MAX_DEATHS
+
+    def count(self, *, how: str) -> None:
+        """Count one; raises :class:`SsmGraphError` where there is no end of them."""
         self.in_a_row += 1
         if self.in_a_row >= MAX_DEATHS_IN_A_ROW:
             raise SsmGraphError(
                 f"--jobs: {self.in_a_row} processes in a row ended {how} without a result; is "
                 "there memory for so many? try --jobs 1; what is done is kept"
             )
-        self.of_job[job] = self.of_job.get(job, 0) + 1
-        return job.n_runs == 1 and self.of_job[job] >= MAX_DEATHS
 
 
 @dataclass(eq=False)

@@ -133,8 +133,9 @@ def test_number_of_processes_is_checked() -> None:
 
 
 @pytest.mark.slow
-def test_dead_processes_lose_nothing(tmp_path: Path) -> None:
-    """Killed at work or idle, what they were at is done by others."""
+@pytest.mark.parametrize("n_processes", [1, 2])
+def test_dead_processes_lose_nothing(n_processes: int, tmp_path: Path) -> None:
+    """Killed at work or idle, what they were at is done by others, also where none is left."""
     study = tiny_study(methods=[{"names": ["smoother-log", "oracle"], "seeds": 12}])
     expected = run_study(study, open_store(study, tmp_path / "a"))
     killed: list[int] = []
@@ -142,12 +143,13 @@ def test_dead_processes_lose_nothing(tmp_path: Path) -> None:
     def kill_all(_: Progress) -> None:
         if not killed:
             killed.extend(child.pid or 0 for child in multiprocessing.active_children())
-            for pid in killed:
-                os.kill(pid, signal.SIGKILL)
+            for child in multiprocessing.active_children():
+                child.kill()
+                child.join()
 
     store = open_store(study, tmp_path / "b")
-    found = run_study(study, store, execute=JobProcesses(2), on_progress=kill_all)
-    assert len(killed) == 2
+    found = run_study(study, store, execute=JobProcesses(n_processes), on_progress=kill_all)
+    assert len(killed) == n_processes
     assert [untimed(row) for row in found.rows] == [untimed(row) for row in expected.rows]
 
 
