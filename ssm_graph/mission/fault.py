@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
 
@@ -54,6 +55,16 @@ class DetectedFault(ShortRepr):
     """What to look at, or the line of ``mission.toml`` that mends it."""
     late_s: float | None = None
     """How late its stamps are, s, if that is what is off."""
+
+    def is_rest_of(self, others: Iterable[DetectedFault]) -> bool:
+        """Return whether it is what is left of a lie of the same sensor that has been taken off."""
+        return self.treatment is Treatment.SAID and any(
+            other.treatment is Treatment.FREED
+            and other.sensor == self.sensor
+            and other.begin_s < self.end_s
+            and other.end_s > self.begin_s
+            for other in others
+        )
 
     @property
     def is_decided(self) -> bool:

@@ -256,7 +256,8 @@ class SsmSmoother:
             this, left = yield from self._with_sigmas_steps(linearizer, this, weights, faults)
         inertial = inertial_fit(linearizer.inertial_rows(this.states), this.step)
         yield 0.02 * problem.n_keyframes
-        found = (*problem.faults, *faults.faults(this.states, inertial), *left)
+        freed = faults.faults(this.states, inertial)
+        found = (*problem.faults, *freed, *(one for one in left if not one.is_rest_of(freed)))
         kernel = weights.of_beams.wanted
         notes = (*problem.notes, *(fault.sentence for fault in found), *_notes_of(first))
         ended = (linearizer, this, tuple(iterations), status)
@@ -265,10 +266,7 @@ class SsmSmoother:
     def _with_sigmas_steps(
         self, linearizer: GraphLinearizer, last: Pass, used: Weights, faults: FaultWatch
     ) -> Steps[tuple[Pass, list[DetectedFault]]]:
-        """Return the last pass with the covariance that its residuals ask for, and what they say.
-
-        Who errs more than stated, at random or for long.
-        """
+        """Return the last pass with the covariance that residuals ask for, and who errs more."""
         problem, aids, known = linearizer.problem, linearizer.weighted, np.ones(len(used.aids))
         t, weights, keyframe_s = last.mahalanobis_sq, last.weights, problem.keyframe_s
         beams_s = keyframe_s[problem.beams.keyframe]
