@@ -53,6 +53,7 @@ FEWEST: Final = 30
 NOTABLE_SQUARE: Final = 2.0
 """and their variance by that stated, from which on they are noisier if that is no chance."""
 LEAST_SHARE: Final = 1e-3
+"""What a measurement says is never less than this share of its weight: sigmas 30 times as large."""
 
 
 def noisier_than_stated(fit: InertialFit, keyframe_s: Array) -> list[DetectedFault]:
