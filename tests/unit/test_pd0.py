@@ -198,11 +198,13 @@ def test_a_recording_that_never_saw_the_bottom_says_so(tmp_path: Path) -> None:
     """Of any maker: its pings stay, for what else they hold, and the first note says it."""
     blind = [changed(ensemble(k, np.ones(4)), 2, 24, *[-32768] * 4, kind="h") for k in range(4)]
     restored = [ensemble(k, np.array([0.1, 0.2, 0.3, np.nan]), coordinates=1) for k in range(4)]
-    for ensembles in (blind, restored):
+    notes: dict[str, tuple[str, ...]] = {}
+    for name, ensembles in {"blind": blind, "restored": restored}.items():
         found = read_recorded(written(tmp_path, *ensembles))
         assert found is not None
+        notes[name] = found.notes
         assert found.notes[0].startswith("4 pings and not one speed along a beam")
-    assert any("made of three beams" in note for note in found.notes)
+    assert any("made of three beams" in note for note in notes["restored"])
 
 
 def test_every_truncation_and_any_damage_leaves_the_sound_ensembles(tmp_path: Path) -> None:
