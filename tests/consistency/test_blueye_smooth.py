@@ -121,6 +121,7 @@ def test_the_dive_says_that_its_heading_is_hardly_observable() -> None:
     assert np.degrees(estimate.trajectory.attitude_sigma[0, 2]) > 3.0
 
 
+@pytest.mark.slow
 def test_a_long_fault_of_one_beam_does_not_fool_the_start() -> None:
     """40 s of 1 m/s in one beam: within 0.2 m of the run without fault, not tens of metres.
 

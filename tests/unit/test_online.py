@@ -98,6 +98,7 @@ def test_out_of_order_is_in_order(seed: int) -> None:
         np.testing.assert_allclose(joined(other, name), joined(delayed, name), rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_what_comes_late_by_more_than_is_kept_in_full_changes_nothing() -> None:
     """Of steps that are no longer fresh one in two seconds is kept: the rest is made anew."""
     _, vehicle = stream(24.0, 4.0)
