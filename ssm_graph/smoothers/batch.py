@@ -270,7 +270,9 @@ class SsmSmoother:
         problem, aids, known = linearizer.problem, linearizer.weighted, np.ones(len(used.aids))
         t, weights, keyframe_s = last.mahalanobis_sq, last.weights, problem.keyframe_s
         beams_s = keyframe_s[problem.beams.keyframe]
-        says, *found = informative(DVL, t, weights, beams_s, used.of_beams.kernel)
+        says, *found = informative(
+            DVL, t, weights, beams_s, used.of_beams.kernel, beam=problem.beams.beam
+        )
         beams = says / faults.inflation_of(DVL)
         for aid in aids.all:
             own = aids.of(aid, last.aid_mahalanobis_sq), aids.of(aid, last.aid_weights)

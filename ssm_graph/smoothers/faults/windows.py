@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import bdtrc
 
 from factors.similarity import WEIGHT_FLOOR, Kernel
@@ -189,7 +190,14 @@ def disagreeing(readings: Iterable[Readings], keyframe_s: Array) -> list[Detecte
 
 
 def informative(
-    sensor: str, t: Array, weights: Array, time_s: Array, kernel: Kernel, *, dim: int = 1
+    sensor: str,
+    t: Array,
+    weights: Array,
+    time_s: Array,
+    kernel: Kernel,
+    *,
+    dim: int = 1,
+    beam: NDArray[np.intp] | None = None,
 ) -> tuple[Array, DetectedFault | None]:
     """Return how much each measurement says (M,), by its weight, and whether a sensor is noisy.
 
@@ -199,18 +207,18 @@ def informative(
     t, weights, time_s : (M,) squared Mahalanobis lengths, what the kernel made of these, s.
     kernel : that of the weights.
     dim : of the measurements.
+    beam : (M,) whose each is, from 0 on; None where they have none.
     """
-    most = most_by_noise(t, weights, time_s, dim=dim)
+    most = most_by_noise(t, weights, time_s, dim=dim, beam=beam)
     says = np.minimum(efficiency(t, weights, kernel, dim=dim), most)
-    return says, _noisy(sensor, t, most, time_s, dim=dim)
-
-
-def _noisy(sensor: str, t: Array, most: Array, time_s: Array, *, dim: int) -> DetectedFault | None:
     own = np.isfinite(most)
     if not own.any():
-        return None
+        return says, None
+    if beam is not None and len(noisy := np.unique(beam[own])) < len(np.unique(beam)):
+        numbers = " and ".join(str(one + 1) for one in noisy)
+        sensor = f"{sensor} beam{'s' * (len(noisy) > 1)} {numbers}"
     factor = float(np.sqrt(np.median(t[own]) / chi2.isf(0.5, dim)))
-    return DetectedFault(
+    return says, DetectedFault(
         sensor=sensor,
         what=f"errs {factor:.1f} times as much as stated, at random",
         begin_s=float(time_s[own].min()),
@@ -222,12 +230,15 @@ def _noisy(sensor: str, t: Array, most: Array, time_s: Array, *, dim: int) -> De
     )
 
 
-def most_by_noise(t: Array, weights: Array, time_s: Array, *, dim: int = 1) -> Array:
+def most_by_noise(
+    t: Array, weights: Array, time_s: Array, *, dim: int = 1, beam: NDArray[np.intp] | None = None
+) -> Array:
     """Return the share (M,) of its weight that each measurement says at most, for its noise.
 
     A weight lets go of what sticks out; where most readings do, it leaves them more than the
     inverse of their variance, which medians of successive ones tell. Infinite where they err no
-    more than stated, or by a chance of :data:`TAIL`.
+    more than stated, or by a chance of :data:`TAIL`. A beam that is noisy by itself says nothing
+    of the others; these are judged together besides, which shows what befalls all for a while.
 
     Parameters
     ----------
@@ -235,16 +246,22 @@ def most_by_noise(t: Array, weights: Array, time_s: Array, *, dim: int = 1) -> A
     weights : (M,) those at the floor do not count.
     time_s : (M,)
     dim : of the measurements.
+    beam : (M,) whose each is; None where they have none.
     """
+    beam = np.zeros(len(t), np.intp) if beam is None else beam
     counts = np.flatnonzero(weights > WEIGHT_FLOOR)
     most, counts = np.full(len(t), np.inf), counts[np.argsort(time_s[counts], kind="stable")]
-    for own in np.array_split(counts, max(len(counts) // GROUP, 1)):
-        if len(own) * dim < FEWEST:
-            continue
-        median = float(np.median(t[own]))
-        scale_sq = median / float(chi2.isf(0.5, dim))
-        # The median is as large where half of the readings are, each with the same probability.
-        chance = bdtrc((len(own) - 1) // 2, len(own), chi2.sf(median, dim))
-        if scale_sq > NOTABLE_SQUARE and chance < TAIL:
-            most[own] = max(1.0 / (scale_sq * float(np.mean(weights[own]))), LEAST_SHARE)
+    beams = np.unique(beam)
+    for chosen in (*beams, None) if len(beams) > 1 else (None,):
+        is_open = np.isinf(most[counts]) & (True if chosen is None else beam[counts] == chosen)
+        of_it = counts[is_open]
+        for own in np.array_split(of_it, max(len(of_it) // GROUP, 1)):
+            if len(own) * dim < FEWEST:
+                continue
+            median = float(np.median(t[own]))
+            scale_sq = median / float(chi2.isf(0.5, dim))
+            # The median is as large where half of the readings are, each as probable.
+            chance = bdtrc((len(own) - 1) // 2, len(own), chi2.sf(median, dim))
+            if scale_sq > NOTABLE_SQUARE and chance < TAIL:
+                most[own] = max(1.0 / (scale_sq * float(np.mean(weights[own]))), LEAST_SHARE)
     return most
