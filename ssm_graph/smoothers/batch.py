@@ -239,7 +239,7 @@ class SsmSmoother:
             changed = None
             if number + 1 < self.config.max_iterations:
                 changed = yield from faults.look_steps(
-                    linearizer, states, this.step, update_sigmas=this.update_sigmas
+                    linearizer, states, update_sigmas=this.update_sigmas
                 )
             if changed is not None:
                 linearizer, states = changed.linearizer, changed.states
