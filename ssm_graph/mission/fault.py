@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
@@ -58,24 +57,14 @@ class DetectedFault(ShortRepr):
     """How late its stamps are, s, if that is what is off."""
 
     def is_rest_of(self, others: Iterable[DetectedFault]) -> bool:
-        """Return whether it is what is left of a lie that has been taken off, of the same sensor.
-
-        Noise at random may be left by a lie of the whole instrument, too.
-        """
-        is_noise = self.treatment is Treatment.WIDENED
-        return (is_noise or self.treatment is Treatment.SAID) and any(
+        """Return whether it is what is left of a lie of the same sensor that has been taken off."""
+        return self.treatment is Treatment.SAID and any(
             other.treatment is Treatment.FREED
-            and (other.sensor == self.sensor or (is_noise and self._is_part_of(other)))
+            and other.sensor == self.sensor
             and other.begin_s < self.end_s
             and other.end_s > self.begin_s
             for other in others
         )
-
-    def _is_part_of(self, other: DetectedFault) -> bool:
-        """Return whether all beams of one are beams of the other."""
-        (name, *own), (whole, *among) = self.sensor.split(" beam"), other.sensor.split(" beam")
-        numbers, others = (set(re.findall(r"\d+", "".join(x))) for x in (own, among))
-        return name == whole and (not others or (bool(numbers) and numbers <= others))
 
     @property
     def is_decided(self) -> bool:

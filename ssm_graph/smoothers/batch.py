@@ -271,13 +271,14 @@ class SsmSmoother:
         t, weights, keyframe_s = last.mahalanobis_sq, last.weights, problem.keyframe_s
         beams_s = keyframe_s[problem.beams.keyframe]
         says, *found = informative(
-            DVL, t, weights, beams_s, used.of_beams.kernel, beam=problem.beams.beam
+            DVL, t, weights, beams_s, used.of_beams.kernel, freed=linearizer.has_freed_beam
         )
         beams = says / faults.inflation_of(DVL)
         for aid in aids.all:
             own = aids.of(aid, last.aid_mahalanobis_sq), aids.of(aid, last.aid_weights)
             of = keyframe_s[aid.keyframe], used.of_aids.kernel
-            says, noise = informative(aid.name, *own, *of, dim=aid.dim)
+            whole = np.zeros(len(aid), np.bool_)
+            says, noise = informative(aid.name, *own, *of, dim=aid.dim, freed=whole)
             aids.of(aid, known)[:] = says / faults.inflation_of(aid.name)
             found.append(noise)
         step = yield from linearizer.solve_steps(

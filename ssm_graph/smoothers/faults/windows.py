@@ -197,9 +197,12 @@ def informative(
     kernel: Kernel,
     *,
     dim: int = 1,
-    beam: NDArray[np.intp] | None = None,
+    freed: NDArray[np.bool_],
 ) -> tuple[Array, DetectedFault | None]:
     """Return how much each measurement says (M,), by its weight, and whether a sensor is noisy.
+
+    What a lie leaves says nothing of the noise, and is judged apart: it counts for less, but larger
+    sigmas would not mend it.
 
     Parameters
     ----------
@@ -207,18 +210,22 @@ def informative(
     t, weights, time_s : (M,) squared Mahalanobis lengths, what the kernel made of these, s.
     kernel : that of the weights.
     dim : of the measurements.
-    beam : (M,) whose each is, from 0 on; None where they have none.
+    freed : (M,) those that a lie was taken off; if it was off all, all count alike.
     """
-    most = most_by_noise(t, weights, time_s, dim=dim, beam=beam)
+    freed = freed & ~freed.all()
+    most = np.full(len(t), np.inf)
+    for own in (freed, ~freed):
+        most[own] = most_by_noise(t[own], weights[own], time_s[own], dim=dim)
     says = np.minimum(efficiency(t, weights, kernel, dim=dim), most)
+    return says, _noisy(sensor, t, np.where(freed, np.inf, most), time_s, dim=dim)
+
+
+def _noisy(sensor: str, t: Array, most: Array, time_s: Array, *, dim: int) -> DetectedFault | None:
     own = np.isfinite(most)
     if not own.any():
-        return says, None
-    if beam is not None and len(noisy := np.unique(beam[own])) < len(np.unique(beam)):
-        numbers = " and ".join(str(one + 1) for one in noisy)
-        sensor = f"{sensor} beam{'s' * (len(noisy) > 1)} {numbers}"
+        return None
     factor = float(np.sqrt(np.median(t[own]) / chi2.isf(0.5, dim)))
-    return says, DetectedFault(
+    return DetectedFault(
         sensor=sensor,
         what=f"errs {factor:.1f} times as much as stated, at random",
         begin_s=float(time_s[own].min()),
@@ -230,15 +237,12 @@ def informative(
     )
 
 
-def most_by_noise(
-    t: Array, weights: Array, time_s: Array, *, dim: int = 1, beam: NDArray[np.intp] | None = None
-) -> Array:
+def most_by_noise(t: Array, weights: Array, time_s: Array, *, dim: int = 1) -> Array:
     """Return the share (M,) of its weight that each measurement says at most, for its noise.
 
     A weight lets go of what sticks out; where most readings do, it leaves them more than the
     inverse of their variance, which medians of successive ones tell. Infinite where they err no
-    more than stated, or by a chance of :data:`TAIL`. A beam that is noisy by itself says nothing
-    of the others; these are judged together besides, which shows what befalls all for a while.
+    more than stated, or by a chance of :data:`TAIL`.
 
     Parameters
     ----------
@@ -246,22 +250,16 @@ def most_by_noise(
     weights : (M,) those at the floor do not count.
     time_s : (M,)
     dim : of the measurements.
-    beam : (M,) whose each is; None where they have none.
     """
-    beam = np.zeros(len(t), np.intp) if beam is None else beam
     counts = np.flatnonzero(weights > WEIGHT_FLOOR)
     most, counts = np.full(len(t), np.inf), counts[np.argsort(time_s[counts], kind="stable")]
-    beams = np.unique(beam)
-    for chosen in (*beams, None) if len(beams) > 1 else (None,):
-        is_open = np.isinf(most[counts]) & (True if chosen is None else beam[counts] == chosen)
-        of_it = counts[is_open]
-        for own in np.array_split(of_it, max(len(of_it) // GROUP, 1)):
-            if len(own) * dim < FEWEST:
-                continue
-            median = float(np.median(t[own]))
-            scale_sq = median / float(chi2.isf(0.5, dim))
-            # The median is as large where half of the readings are, each as probable.
-            chance = bdtrc((len(own) - 1) // 2, len(own), chi2.sf(median, dim))
-            if scale_sq > NOTABLE_SQUARE and chance < TAIL:
-                most[own] = max(1.0 / (scale_sq * float(np.mean(weights[own]))), LEAST_SHARE)
+    for own in np.array_split(counts, max(len(counts) // GROUP, 1)):
+        if len(own) * dim < FEWEST:
+            continue
+        median = float(np.median(t[own]))
+        scale_sq = median / float(chi2.isf(0.5, dim))
+        # The median is as large where half of the readings are, each with the same probability.
+        chance = bdtrc((len(own) - 1) // 2, len(own), chi2.sf(median, dim))
+        if scale_sq > NOTABLE_SQUARE and chance < TAIL:
+            most[own] = max(1.0 / (scale_sq * float(np.mean(weights[own]))), LEAST_SHARE)
     return most
