@@ -277,8 +277,7 @@ class SsmSmoother:
         for aid in aids.all:
             own = aids.of(aid, last.aid_mahalanobis_sq), aids.of(aid, last.aid_weights)
             of = keyframe_s[aid.keyframe], used.of_aids.kernel
-            whole = np.zeros(len(aid), np.bool_)
-            says, noise = informative(aid.name, *own, *of, dim=aid.dim, freed=whole)
+            says, noise = informative(aid.name, *own, *of, dim=aid.dim)
             aids.of(aid, known)[:] = says / faults.inflation_of(aid.name)
             found.append(noise)
         step = yield from linearizer.solve_steps(

@@ -197,7 +197,7 @@ def informative(
     kernel: Kernel,
     *,
     dim: int = 1,
-    freed: NDArray[np.bool_],
+    freed: NDArray[np.bool_] | None = None,
 ) -> tuple[Array, DetectedFault | None]:
     """Return how much each measurement says (M,), by its weight, and whether a sensor is noisy.
 
@@ -210,9 +210,9 @@ def informative(
     t, weights, time_s : (M,) squared Mahalanobis lengths, what the kernel made of these, s.
     kernel : that of the weights.
     dim : of the measurements.
-    freed : (M,) those that a lie was taken off; if it was off all, all count alike.
+    freed : (M,) those that a lie was taken off; if off all of them, all count alike.
     """
-    freed = freed & ~freed.all()
+    freed = np.zeros(len(t), np.bool_) if freed is None else freed & ~freed.all()
     most = np.full(len(t), np.inf)
     for own in (freed, ~freed):
         most[own] = most_by_noise(t[own], weights[own], time_s[own], dim=dim)
